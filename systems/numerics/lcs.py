@@ -1,0 +1,74 @@
+"""Linear complementarity system (LCS): one linearised time step with contact.
+
+    x_next = A x + B u + D lam + d,   0 <= lam  perp  w = E x + F lam + H u + c >= 0
+
+lam is a force [N] everywhere in makebreak; w is a velocity (gap over time step) [m/s].
+
+Source: Huang, Aydinoglu, Jin, Posa, "Adaptive contact-implicit model predictive
+control with online residual learning" (ACI-MPC), definition 2.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from makebreak.systems.numerics.lcp import solve_lcp
+
+
+@dataclass(frozen=True, eq=False)  # eq=False: == on arrays has no truth value.
+class LCS:
+    """State x [SI], input u [SI], contact force lam [N], gap velocity w [m/s]."""
+
+    A: np.ndarray  # (n_x, n_x)
+    B: np.ndarray  # (n_x, n_u)
+    D: np.ndarray  # (n_x, n_lam)
+    d: np.ndarray  # (n_x,)
+    E: np.ndarray  # (n_lam, n_x)
+    F: np.ndarray  # (n_lam, n_lam)
+    H: np.ndarray  # (n_lam, n_u)
+    c: np.ndarray  # (n_lam,)
+    dt: float  # Time step [s].
+    # Gap of the contact that each force acts at, where the system was linearised [m];
+    # None where the LCS does not come from geometry. It informs, w does not use it.
+    phi: np.ndarray | None = None  # (n_lam,)
+
+    def __post_init__(self):
+        if not self.dt > 0.0:
+            raise ValueError(f"LCS.dt is {self.dt}, expected a positive time [s]")
+        (n_x, n_lam), n_u = np.shape(self.D), np.shape(self.B)[-1]
+        shapes = dict(A=(n_x, n_x), B=(n_x, n_u), D=(n_x, n_lam), d=(n_x,))
+        shapes |= dict(E=(n_lam, n_x), F=(n_lam, n_lam), H=(n_lam, n_u), c=(n_lam,))
+        if self.phi is not None:
+            shapes["phi"] = (n_lam,)
+        for name, shape in shapes.items():
+            value = np.array(getattr(self, name), dtype=float)  # Our own copy.
+            if value.shape != shape:
+                raise ValueError(f"LCS.{name} is {value.shape}, expected {shape}")
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    @property
+    def n_x(self) -> int:
+        return self.D.shape[0]
+
+    @property
+    def n_u(self) -> int:
+        return self.B.shape[1]
+
+    @property
+    def n_lam(self) -> int:
+        return self.D.shape[1]
+
+    def with_residual(self, r_comp) -> "LCS":
+        """This LCS with the offset c + r_comp, r_comp (n_lam,) [m/s] (eq. 12)."""
+        return replace(self, c=self.c + r_comp)
+
+
+def simulate(lcs: LCS, x, u):
+    """One time step after x (n_x,) under u (n_u,).
+
+    Returns: x_next (n_x,) and lam (n_lam,) [N].
+    Raises: ValueError if no contact force satisfies the complementarity (lcp.py).
+    """
+    lam = solve_lcp(lcs.F, lcs.E @ x + lcs.H @ u + lcs.c)
+    return lcs.A @ x + lcs.B @ u + lcs.D @ lam + lcs.d, lam
