@@ -1,0 +1,86 @@
+"""What the planner knows of an arm that rolls a ball: a point of some mass, pushed by
+a force, above a free ball on a table. No arm: the impedance controller is the arm."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.geometry import HalfSpace, Sphere
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
+from pydrake.multibody.tree import (
+    PrismaticJoint,
+    SpatialInertia,
+    UnitInertia,
+)
+from pydrake.systems.framework import DiagramBuilder
+
+from makebreak.systems.numerics.ball_state import N_X, P_BALL, P_TIP, V_BALL, V_TIP
+
+
+@dataclass
+class TipAndBall:
+    tip_mass: float = 1.0  # [kg]
+    tip_radius: float = 0.0195  # [m]
+    ball_mass: float = 0.07  # [kg]
+    ball_radius: float = 0.0315  # [m]
+
+
+def make_tip_and_ball(config: TipAndBall):
+    """Returns: (diagram, plant, scene_graph): bodies `tip` and `ball`, both spheres,
+    and `table`, a half-space at z = 0; u (3,) is the force on the tip [N]. The tip has
+    no weight (the arm carries it). The state is laid out as numerics/ball_state.py.
+    """
+    for name in ("tip_mass", "tip_radius", "ball_mass", "ball_radius"):
+        if not getattr(config, name) > 0.0:
+            raise ValueError(f"{name} is {getattr(config, name)}, expected > 0")
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
+    friction = CoulombFriction(
+        1.0, 1.0
+    )  # The contact pairs of the LCS state their own.
+    I = RigidTransform.Identity()
+    arm = plant.AddModelInstance("tip")
+    no_mass = SpatialInertia(
+        0.0, np.zeros(3), UnitInertia(0.0, 0.0, 0.0), skip_validity_check=True
+    )
+    tip_inertia = SpatialInertia.SolidSphereWithMass(config.tip_mass, config.tip_radius)
+    parent = plant.world_body()
+    for axis, name in enumerate("xyz"):
+        last = name == "z"
+        body = plant.AddRigidBody(
+            "tip" if last else f"tip_{name}", arm, tip_inertia if last else no_mass
+        )
+        joint = plant.AddJoint(
+            PrismaticJoint(
+                f"tip_{name}", parent.body_frame(), body.body_frame(), np.eye(3)[axis]
+            )
+        )
+        plant.AddJointActuator(f"tip_{name}", joint)
+        parent = body
+    plant.RegisterCollisionGeometry(
+        parent, I, Sphere(config.tip_radius), "tip", friction
+    )
+    plant.set_gravity_enabled(arm, False)
+    ball = plant.AddRigidBody(
+        "ball",
+        plant.AddModelInstance("ball"),
+        SpatialInertia.SolidSphereWithMass(config.ball_mass, config.ball_radius),
+    )
+    plant.RegisterCollisionGeometry(
+        ball, I, Sphere(config.ball_radius), "ball", friction
+    )
+    table = plant.AddRigidBody("table", plant.AddModelInstance("table"))
+    plant.WeldFrames(plant.world_frame(), table.body_frame())
+    plant.RegisterCollisionGeometry(table, I, HalfSpace(), "table", friction)
+    plant.Finalize()
+    nq = plant.num_positions()
+    starts = (
+        plant.GetJointByName("tip_x").position_start(),
+        ball.floating_positions_start() + 4,
+        nq + plant.GetJointByName("tip_x").velocity_start(),
+        ball.floating_velocities_start_in_v() + nq + 3,
+    )
+    expected = tuple(part.start for part in (P_TIP, P_BALL, V_TIP, V_BALL))
+    if starts != expected or nq + plant.num_velocities() != N_X:
+        raise RuntimeError(f"state starts {starts}, expected {expected}")
+    return builder.Build(), plant, scene_graph

@@ -1,0 +1,30 @@
+"""The LCS state of "a tip moves a ball on a table", and what a robot can know of it.
+
+    x = [p_tip 3, q_ball wxyz 4, p_ball 3, v_tip 3, omega_ball 3, v_ball 3]   [SI, world]
+
+Nobody sees how a plain ball is turned, and no distance depends on it: q_ball is
+always the identity in an estimate.
+"""
+
+import numpy as np
+
+N_X = 19
+P_TIP, Q_BALL, P_BALL = slice(0, 3), slice(3, 7), slice(7, 10)
+V_TIP, W_BALL, V_BALL = slice(10, 13), slice(13, 16), slice(16, 19)
+
+
+def rolling_velocity(v_ball, radius):
+    """Angular velocity (3,) [rad/s] of a ball of radius [m] that rolls on a level
+    table at v_ball (3,) [m/s]: the v_ball = omega x (radius z), spin about z unseen.
+    """
+    return np.array([-v_ball[1], v_ball[0], 0.0]) / radius
+
+
+def pack(p_tip, v_tip, p_ball, v_ball, radius):
+    """The state x (19,) of a tip and a rolling ball, each (3,) [m], [m/s]."""
+    x = np.zeros(N_X)
+    x[P_TIP], x[V_TIP] = p_tip, v_tip
+    x[Q_BALL] = 1.0, 0.0, 0.0, 0.0
+    x[P_BALL], x[V_BALL] = p_ball, v_ball
+    x[W_BALL] = rolling_velocity(v_ball, radius)
+    return x

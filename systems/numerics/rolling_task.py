@@ -1,0 +1,199 @@
+"""What the tip has to do to roll a ball along a circle: push, lift, go back, land.
+
+A tip on top of a rolling ball moves twice as fast as the ball and so leaves it in
+front. The task therefore alternates between
+
+    ROLL        the tip follows C3, which pushes the ball along the path,
+    REPOSITION  the tip lifts, passes over the ball and lands behind it, on
+                quintics in time that end where the ball is expected to be, and
+    WAIT        the ball is not seen: the tip lifts and stays, and nothing is pushed.
+
+Source: ACI-MPC VII-B describes the behaviour (a push, then a new push from behind);
+times and distances are ours (docs/ball_rolling.md).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from makebreak.systems.numerics.ball_state import P_BALL, P_TIP, V_BALL, V_TIP, pack
+
+ROLL, REPOSITION, WAIT = 0, 1, 2
+
+
+@dataclass(frozen=True, eq=False)
+class CirclePath:
+    """A circle on the table, run through counter-clockwise seen from above."""
+
+    center: np.ndarray  # (2,) [m]
+    radius: float  # [m]
+
+    def angle(self, p):
+        """Where p (2,) or (3,) lies on the circle, as an angle [rad]."""
+        return np.arctan2(p[1] - self.center[1], p[0] - self.center[0])
+
+    def point(self, angle):
+        """(2,) [m]"""
+        return self.center + self.radius * np.array([np.cos(angle), np.sin(angle)])
+
+    def tangent(self, angle):
+        """(2,) unit vector in the direction of travel."""
+        return np.array([-np.sin(angle), np.cos(angle)])
+
+
+def quintic(t, T, start, end):
+    """Position, velocity, acceleration at t of the quintic from start to end.
+
+    Args:
+        t, T: time and duration [s], 0 <= t <= T.
+        start, end: (position, velocity, acceleration) at 0 and T, scalars or arrays.
+    Returns: (p, v, a) at t.
+    """
+    (p0, v0, a0), (p1, v1, a1) = start, end
+    h = p1 - p0 - v0 * T - 0.5 * a0 * T**2
+    k = (v1 - v0 - a0 * T) * T
+    m = (a1 - a0) * T**2
+    c3, c4, c5 = 10 * h - 4 * k + m / 2, -15 * h + 7 * k - m, 6 * h - 3 * k + m / 2
+    s = t / T
+    p = p0 + v0 * t + 0.5 * a0 * t**2 + s**3 * (c3 + s * (c4 + s * c5))
+    v = v0 + a0 * t + s**2 * (3 * c3 + s * (4 * c4 + s * 5 * c5)) / T
+    a = a0 + s * (6 * c3 + s * (12 * c4 + s * 20 * c5)) / T**2
+    return p, v, a
+
+
+@dataclass(frozen=True, eq=False)
+class TaskState:
+    """Memory of the task between two ticks; `p`, `v`, `a` is the last reference."""
+
+    phase: int
+    since_sec: float
+    p: np.ndarray  # (3,) [m]
+    v: np.ndarray  # (3,) [m/s]
+    a: np.ndarray  # (3,) [m/s2]
+    z_start: float = 0.0  # Height and climb where the reposition began [m], [m/s].
+    vz_start: float = 0.0
+
+    def __post_init__(self):
+        for name in ("p", "v", "a"):
+            value = np.array(getattr(self, name), dtype=float)
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+
+@dataclass
+class RollingConfig:
+    roll_sec: float = 1.0
+    roll_ahead: float = 1.0  # Tip at most so far in front of the ball [m].
+    reposition_sec: float = 0.7
+    lift: float = 0.015  # Clearance over the ball while passing it [m].
+    land_behind: float = 0.018  # [m]
+    land_above: float = 0.003  # Above the surface as it is believed to be [m].
+    ease: float = 0.35  # Share of the reposition for going up, and for coming down.
+
+
+def surface_height(offset, radius_ball, radius_tip):
+    """Height of the tip's centre over the table where tip and ball touch [m], when
+    the two centres are `offset` [m] apart seen from above."""
+    reach = radius_ball + radius_tip
+    return radius_ball + np.sqrt(max(reach**2 - offset**2, 0.0))
+
+
+def landing(config, path, x, gap, time_left, radius_ball, radius_tip):
+    """Where and how fast the tip should land: p (3,) [m], v (3,) [m/s].
+
+    Args:
+        x: (19,) state; the ball is expected to keep its velocity for time_left [s].
+        gap: how much lower the surface is believed to be than modelled [m].
+    """
+    p_ball = x[P_BALL][:2] + x[V_BALL][:2] * time_left
+    behind = -path.tangent(path.angle(p_ball)) * config.land_behind
+    z = surface_height(config.land_behind, radius_ball, radius_tip)
+    p = np.append(p_ball + behind, z + config.land_above - gap)
+    return p, np.append(x[V_BALL][:2], 0.0)
+
+
+def reposition_step(config, path, state, t, dt, x, gap, radius_ball, radius_tip):
+    """The reference (p, v, a), each (3,), a tick dt [s] after the last one.
+
+    Seen from above: a quintic from the last reference to the landing point, which is
+    planned anew each tick, so that a rolling ball is met where it will be. Height: up
+    to the clearance in the first `ease` of the time, down in the last, both quintics.
+    """
+    T, T_ease = config.reposition_sec, config.ease * config.reposition_sec
+    elapsed = min(t + dt - state.since_sec, T)
+    left = max(T - (elapsed - dt), dt)
+    p_land, v_land = landing(config, path, x, gap, left, radius_ball, radius_tip)
+    start = state.p[:2], state.v[:2], state.a[:2]
+    end = p_land[:2], v_land[:2], np.zeros(2)
+    p, v, a = (np.zeros(3) for _ in range(3))
+    p[:2], v[:2], a[:2] = quintic(min(dt, left), left, start, end)
+    top = 2.0 * radius_ball + radius_tip
+    z_clear = max(top - min(gap, 0.0) + config.lift, state.z_start)
+    if elapsed < T_ease:
+        begin = state.z_start, state.vz_start, 0.0
+        p[2], v[2], a[2] = quintic(elapsed, T_ease, begin, (z_clear, 0.0, 0.0))
+    elif elapsed < T - T_ease:
+        p[2] = z_clear
+    else:
+        down = elapsed - (T - T_ease)
+        begin = z_clear, 0.0, 0.0
+        p[2], v[2], a[2] = quintic(down, T_ease, begin, (p_land[2], 0.0, 0.0))
+    return p, v, a
+
+
+def target_over_horizon(path, x, lead, z_tip, radius_ball, n_knots):
+    """The target (n_knots, 19) of C3: the ball at `lead` [rad] further along the circle
+    than it is, the tip above where the ball is to be at the height z_tip [m]; at rest.
+    """
+    point = path.point(path.angle(x[P_BALL]) + lead)
+    goal = pack(
+        [*x[P_BALL][:2], z_tip], np.zeros(3), [*point, radius_ball], np.zeros(3), 1.0
+    )
+    return np.tile(goal, (n_knots, 1))
+
+
+def next_state(config, path, state, t, dt, x, gap, valid, radius_ball, radius_tip):
+    """One tick of the task.
+
+    Args:
+        t, dt: time now and period of the ticks [s].
+        x: (19,) estimated state. gap: mean residual of tip and ball as a length [m].
+        valid: whether x can be trusted (the ball is seen).
+    Returns: TaskState: the phase, and in REPOSITION and WAIT the reference at t + dt.
+    """
+
+    def lift_from(phase):
+        p, v = x[P_TIP], x[V_TIP]
+        return TaskState(phase, t, p, v, np.zeros(3), p[2], v[2])
+
+    if not valid:
+        if state.phase != WAIT:
+            state = lift_from(WAIT)
+        T = config.reposition_sec
+        elapsed = min(t + dt - state.since_sec, T)
+        begin = state.z_start, state.vz_start, 0.0
+        z_end = max(2 * radius_ball + radius_tip + 2 * config.lift, state.z_start)
+        z, vz, az = quintic(elapsed, T, begin, (z_end, 0.0, 0.0))
+        slow = max(0.0, 1.0 - 5.0 * dt / T)
+        v_xy = state.v[:2] * slow
+        p = np.array([*(state.p[:2] + v_xy * dt), z])
+        return TaskState(
+            WAIT, state.since_sec, p, [*v_xy, vz], [0, 0, az],
+            state.z_start, state.vz_start,
+        )  # fmt: skip
+    if state.phase == WAIT:
+        state = lift_from(REPOSITION)
+    if state.phase == ROLL:
+        ball = x[P_BALL]
+        ahead = path.tangent(path.angle(ball)) @ (x[P_TIP] - ball)[:2]
+        if t - state.since_sec < config.roll_sec and ahead < config.roll_ahead:
+            return state
+        state = lift_from(REPOSITION)
+    if t - state.since_sec >= config.reposition_sec - 0.5 * dt:
+        return TaskState(ROLL, t, state.p, state.v, state.a)
+    p, v, a = reposition_step(
+        config, path, state, t, dt, x, gap, radius_ball, radius_tip
+    )
+    return TaskState(
+        REPOSITION, state.since_sec, p, v, a, state.z_start, state.vz_start
+    )

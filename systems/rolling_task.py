@@ -1,0 +1,96 @@
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import LeafSystem
+
+from makebreak.systems.numerics.ball_state import N_X
+from makebreak.systems.numerics.rolling_task import (
+    REPOSITION,
+    WAIT,
+    CirclePath,
+    RollingConfig,
+    TaskState,
+    next_state,
+    target_over_horizon,
+)
+from makebreak.systems.numerics.timing import timed
+
+
+@dataclass
+class RollingTaskConfig:
+    center: list[float] = field(default_factory=lambda: [0.5, 0.0])  # [m]
+    radius: float = 0.1  # Of the circle [m].
+    lead_deg: float = 18.0  # The target runs so far ahead of the ball.
+    press: float = 0.020  # Tip target below the top of the modelled ball [m].
+    rolling: RollingConfig = field(default_factory=RollingConfig)
+    period_sec: float = 0.0125
+    offset_sec: float = 0.0
+
+
+class RollingTask(LeafSystem):
+    """Phases of rolling a ball along a circle, the target of C3 and the reposition.
+
+    Inputs:  x (19,); valid (1,); r_comp (n_lam,) [m/s] of the learner, whose first
+             n_tip entries belong to tip and ball.
+    Outputs: x_desired ((N+1) 19,) for C3; reference (9,) = p, v, a of the tip at the
+             next tick, used unless rolling; phase (1,): 0 roll, 1 reposition, 2 wait.
+
+    Before the first update the phase is WAIT at the height of the tip that was given.
+    """
+
+    def __init__(
+        self,
+        config: RollingTaskConfig,
+        n_knots: int,
+        radius_ball: float,
+        radius_tip: float,
+        n_lam: int,
+        n_tip: int,
+        residual_dt_sec: float,
+        p_tip=(0.5, 0.0, 0.15),
+    ):
+        super().__init__()
+        self._config, self._n_knots = config, n_knots
+        self._radius_ball, self._radius_tip = radius_ball, radius_tip
+        self._n_tip, self._residual_dt_sec = n_tip, residual_dt_sec
+        self._path = CirclePath(np.array(config.center), config.radius)
+        self._x = self.DeclareVectorInputPort("x", N_X)
+        self._valid = self.DeclareVectorInputPort("valid", 1)
+        self._r_comp = self.DeclareVectorInputPort("r_comp", n_lam)
+        start = TaskState(WAIT, 0.0, p_tip, np.zeros(3), np.zeros(3))
+        self._task = self.DeclareAbstractState(AbstractValue.Make(start))
+        x_desired = np.tile(np.eye(N_X)[3], n_knots)
+        self._x_desired = self.DeclareDiscreteState(x_desired)
+        self._reference = self.DeclareDiscreteState([*p_tip, *np.zeros(6)])
+        self._phase = self.DeclareDiscreteState([float(WAIT)])
+        self.DeclareStateOutputPort("x_desired", self._x_desired)
+        self.DeclareStateOutputPort("reference", self._reference)
+        self.DeclareStateOutputPort("phase", self._phase)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(
+            config.period_sec, config.offset_sec, self._update
+        )
+
+    @timed
+    def _update(self, context, state):
+        c = self._config
+        x, t = self._x.Eval(context), context.get_time()
+        task = context.get_abstract_state(int(self._task)).get_value()
+        gap = self._r_comp.Eval(context)[: self._n_tip].mean() * self._residual_dt_sec
+        valid = self._valid.Eval(context)[0] > 0.5
+        task = next_state(
+            c.rolling, self._path, task, t, c.period_sec, x, gap, valid,
+            self._radius_ball, self._radius_tip,
+        )  # fmt: skip
+        z_tip = 2.0 * self._radius_ball + self._radius_tip - c.press
+        goal = target_over_horizon(
+            self._path, x, np.deg2rad(c.lead_deg), z_tip, self._radius_ball,
+            self._n_knots,
+        )  # fmt: skip
+        state.get_mutable_abstract_state(int(self._task)).set_value(task)
+        discrete = state.get_mutable_discrete_state()
+        discrete.set_value(int(self._x_desired), goal.ravel())
+        discrete.set_value(
+            int(self._reference), np.concatenate([task.p, task.v, task.a])
+        )
+        discrete.set_value(int(self._phase), [float(task.phase)])
