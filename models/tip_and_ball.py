@@ -35,10 +35,8 @@ def make_tip_and_ball(config: TipAndBall):
             raise ValueError(f"{name} is {getattr(config, name)}, expected > 0")
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
-    friction = CoulombFriction(
-        1.0, 1.0
-    )  # The contact pairs of the LCS state their own.
-    I = RigidTransform.Identity()
+    friction = CoulombFriction(1.0, 1.0)  # Unused: contact pairs state their own.
+    at_origin = RigidTransform.Identity()
     arm = plant.AddModelInstance("tip")
     no_mass = SpatialInertia(
         0.0, np.zeros(3), UnitInertia(0.0, 0.0, 0.0), skip_validity_check=True
@@ -58,7 +56,7 @@ def make_tip_and_ball(config: TipAndBall):
         plant.AddJointActuator(f"tip_{name}", joint)
         parent = body
     plant.RegisterCollisionGeometry(
-        parent, I, Sphere(config.tip_radius), "tip", friction
+        parent, at_origin, Sphere(config.tip_radius), "tip", friction
     )
     plant.set_gravity_enabled(arm, False)
     ball = plant.AddRigidBody(
@@ -67,11 +65,11 @@ def make_tip_and_ball(config: TipAndBall):
         SpatialInertia.SolidSphereWithMass(config.ball_mass, config.ball_radius),
     )
     plant.RegisterCollisionGeometry(
-        ball, I, Sphere(config.ball_radius), "ball", friction
+        ball, at_origin, Sphere(config.ball_radius), "ball", friction
     )
     table = plant.AddRigidBody("table", plant.AddModelInstance("table"))
     plant.WeldFrames(plant.world_frame(), table.body_frame())
-    plant.RegisterCollisionGeometry(table, I, HalfSpace(), "table", friction)
+    plant.RegisterCollisionGeometry(table, at_origin, HalfSpace(), "table", friction)
     plant.Finalize()
     nq = plant.num_positions()
     starts = (

@@ -6,7 +6,6 @@ from pydrake.systems.framework import LeafSystem
 
 from makebreak.systems.numerics.ball_state import N_X
 from makebreak.systems.numerics.rolling_task import (
-    REPOSITION,
     WAIT,
     CirclePath,
     RollingConfig,

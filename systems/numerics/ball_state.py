@@ -1,8 +1,8 @@
 """The LCS state of "a tip moves a ball on a table", and what a robot can know of it.
 
-    x = [p_tip 3, q_ball wxyz 4, p_ball 3, v_tip 3, omega_ball 3, v_ball 3]   [SI, world]
+    x = [p_tip 3, q_ball wxyz 4, p_ball 3, v_tip 3, omega_ball 3, v_ball 3]   [SI]
 
-Nobody sees how a plain ball is turned, and no distance depends on it: q_ball is
+All in the world frame. Nobody sees how a plain ball is turned, and no distance depends on it: q_ball is
 always the identity in an estimate.
 """
 

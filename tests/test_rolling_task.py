@@ -1,0 +1,122 @@
+import numpy as np
+import pytest
+from scipy.interpolate import BPoly
+
+from makebreak.systems.numerics.ball_state import P_BALL, W_BALL, pack
+from makebreak.systems.numerics.rolling_task import (
+    REPOSITION,
+    ROLL,
+    WAIT,
+    CirclePath,
+    RollingConfig,
+    TaskState,
+    next_state,
+    quintic,
+    surface_height,
+    target_over_horizon,
+)
+
+PATH = CirclePath(np.array([0.5, 0.0]), 0.1)
+R_BALL, R_TIP, DT = 0.0315, 0.0195, 0.0125
+
+
+def test_quintic_is_the_hermite_polynomial_of_its_ends():
+    rng = np.random.default_rng(0)
+    T, ends = 0.7, rng.normal(size=(2, 3))
+    expected = BPoly.from_derivatives([0.0, T], ends)
+    for t in np.linspace(0.0, T, 9):
+        values = [expected(t), expected.derivative(1)(t), expected.derivative(2)(t)]
+        # Degree 5 in t/T with coefficients of order 100: 1e-11 is round-off.
+        np.testing.assert_allclose(quintic(t, T, *ends), values, atol=1e-11)
+
+
+def test_tip_at_surface_height_touches_the_ball():
+    for offset in (0.0, 0.01, 0.018, 0.03):
+        z = surface_height(offset, R_BALL, R_TIP)
+        distance = np.hypot(offset, z - R_BALL) - R_BALL - R_TIP
+        np.testing.assert_allclose(distance, 0.0, atol=1e-15)
+
+
+def test_estimated_ball_rolls_without_slip():
+    v = np.array([0.03, -0.05, 0.0])
+    x = pack(np.zeros(3), np.zeros(3), [0.5, 0.1, R_BALL], v, R_BALL)
+    slip = v + np.cross(x[W_BALL], [0.0, 0.0, -R_BALL])  # Where it touches the table.
+    np.testing.assert_allclose(slip, 0.0, atol=1e-17)
+
+
+def run_task(state, t_end, ball, v_ball, valid=lambda t: True, gap=0.0):
+    """The tip follows the reference exactly; the ball coasts. Returns the history."""
+    config, history = RollingConfig(), []
+    n = round(t_end / DT)
+    for k in range(n):
+        t = k * DT
+        p_ball = np.array([*(ball + v_ball * t), R_BALL])
+        x = pack(state.p, state.v, p_ball, [*v_ball, 0.0], R_BALL)
+        state = next_state(
+            config, PATH, state, t, DT, x, gap, valid(t), R_BALL, R_TIP
+        )  # fmt: skip
+        history.append((t + DT, state, p_ball))
+    return config, history
+
+
+@pytest.mark.parametrize("v_ball", [(0.0, 0.0), (0.03, 0.05)])
+def test_reposition_passes_over_the_ball_and_lands_behind_a_rolling_one(v_ball):
+    ball, v_ball = np.array([0.6, 0.0]), np.array(v_ball)
+    tip = [*(ball + [0.0, 0.015]), surface_height(0.015, R_BALL, R_TIP)]
+    v_tip = [*(2.0 * v_ball), 0.0]  # On top of a rolling ball.
+    start = TaskState(ROLL, -10.0, tip, v_tip, np.zeros(3))
+    config, history = run_task(start, RollingConfig().reposition_sec, ball, v_ball)
+    for t, state, _ in history[:-1]:
+        assert state.phase == REPOSITION
+        p_ball = np.array([*(ball + v_ball * t), R_BALL])
+        assert np.linalg.norm(state.p - p_ball) > R_BALL + R_TIP - 1e-9
+    t, state, _ = history[-1]
+    p_ball = ball + v_ball * t
+    behind = p_ball - PATH.tangent(PATH.angle(p_ball)) * config.land_behind
+    # The landing point turns with the path while the ball rolls the last 12.5 ms.
+    np.testing.assert_allclose(state.p[:2], behind, atol=2e-4)
+    z = surface_height(config.land_behind, R_BALL, R_TIP) + config.land_above
+    np.testing.assert_allclose(state.p[2], z, atol=1e-9)
+
+
+def test_reference_of_the_reposition_is_smooth():
+    ball = np.array([0.6, 0.0])
+    tip = [0.55, 0.05, 0.15]
+    start = TaskState(ROLL, -10.0, tip, np.zeros(3), np.zeros(3))
+    _, history = run_task(start, 0.7, ball, np.zeros(2))
+    p = np.array([state.p for _, state, _ in history])
+    v = np.array([state.v for _, state, _ in history])
+    # Velocity is the slope of the position: trapezoids are good to dt^2 jerk / 12,
+    # and a quintic over 0.1 m in 0.25 s has a jerk below 60 * 0.1 / 0.25^3 = 384 m/s3.
+    np.testing.assert_allclose(
+        np.diff(p, axis=0), DT * (v[1:] + v[:-1]) / 2, atol=DT**3 * 384 / 12
+    )
+
+
+def test_learned_gap_lowers_the_landing_by_as_much():
+    ball = np.array([0.6, 0.0])
+    start = TaskState(ROLL, -10.0, [0.6, 0.0, 0.1], np.zeros(3), np.zeros(3))
+    low, high = (
+        run_task(start, 0.7, ball, np.zeros(2), gap=g)[1][-1][1].p[2]
+        for g in (0.01, 0.0)
+    )
+    np.testing.assert_allclose(high - low, 0.01, atol=1e-12)
+
+
+def test_a_ball_that_is_not_seen_stops_the_push_and_lifts_the_tip():
+    ball = np.array([0.6, 0.0])
+    start = TaskState(ROLL, 0.0, [0.6, 0.0, 0.08], np.zeros(3), np.zeros(3))
+    _, history = run_task(
+        start, 2.5, ball, np.zeros(2), valid=lambda t: not 0.2 < t < 1.5
+    )
+    phases = {round(t, 4): state.phase for t, state, _ in history}
+    assert phases[0.2] == ROLL and phases[0.5] == WAIT and phases[1.6] == REPOSITION
+    z = [state.p[2] for t, state, _ in history if t > 1.3 and state.phase == WAIT]
+    np.testing.assert_allclose(z, 2 * R_BALL + R_TIP + 0.03, atol=1e-12)
+
+
+def test_target_leads_the_ball_along_the_circle():
+    x = pack([0.6, 0, 0.1], np.zeros(3), [0.6, 0.0, R_BALL], np.zeros(3), R_BALL)
+    target = target_over_horizon(PATH, x, np.pi / 2, 0.07, R_BALL, 6)
+    assert target.shape == (6, 19)
+    np.testing.assert_allclose(target[:, P_BALL], [[0.5, 0.1, R_BALL]] * 6, atol=1e-15)
