@@ -1,0 +1,497 @@
+"""LCS of any MultibodyPlant with named contacts: AnitescuLcs and its LeafSystem.
+
+The caller makes a diagram of a plant and its scene graph and hands it over; nothing is
+added to it:
+
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, 0.0)
+    Parser(plant).AddModels("ball_on_table.sdf")
+    plant.Finalize()
+    lcs = AnitescuLcs(builder.Build(), [ContactPair("finger_link", "ball_link", 0.5)])
+
+See docs/lcs.md for the state's layout, quaternions, units and limits.
+"""
+
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+
+import numpy as np
+from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, InitializeAutoDiff
+from pydrake.common.value import Value
+from pydrake.geometry import Box, GeometryId, HalfSpace, SceneGraph, Sphere
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    BodyIndex,
+    JacobianWrtVariable,
+    MultibodyForces,
+    MultibodyForces_,
+)
+from pydrake.systems.framework import Diagram, LeafSystem
+
+from makebreak.systems.numerics.lcs import LCS
+from makebreak.systems.numerics.lcs_builder import (
+    BOX,
+    HALF_SPACE,
+    SPHERE,
+    ConstantMassModel,
+    assemble_anitescu,
+    friction_rows,
+    tangent_basis,
+    velocity_maps,
+)
+from makebreak.systems.numerics.timing import timed
+
+
+@dataclass
+class ContactPair:
+    """Two bodies or collision geometries that may touch.
+
+    A body is named "model::body", or "body" where that is unique; a geometry by its
+    name in the scene graph ("ball::ball_collision"). A body stands for all of its
+    collision geometries: every combination is a contact of its own.
+    """
+
+    a: str = ""
+    b: str = ""
+    friction: float = 1.0  # Coulomb coefficient mu.
+    friction_directions: int = 2  # n_f; 2 n_f friction edges, so 2 n_f forces.
+    # World direction that the first friction edge follows (its projection); empty: the
+    # basis of Drake's MakeFromOneVector, which jumps as the normal turns.
+    tangent: list[float] = field(default_factory=list)
+
+
+class AnitescuLcs:
+    """Builds the LCS of a plant's contacts about any state (ACI-MPC eq. 5-8).
+
+    Args:
+        diagram: holds one finalized MultibodyPlant connected to a SceneGraph.
+        pairs: the contacts; their order is the order of the forces.
+        dt_sec: time step [s].
+        eps_c: added to F's diagonal, for lam in newtons [m/s per N]; None: 0.01 dt_sec,
+            the paper's 0.01 for lam as an impulse.
+        analytic: use the fast path where the model allows it; False: never.
+
+    Attributes:
+        n_q, n_v, n_x, n_u, n_lam: sizes; x = [q, v] in the plant's order.
+        x_default: (n_x,) the plant's default state.
+        lam_names: of each force, "geometry~geometry edge".
+        is_analytic: which of the two paths `build` takes.
+
+    Raises: ValueError naming a pair that does not exist, a body without collision
+        geometry, shapes without a distance, or a parameter out of range.
+    """
+
+    def __init__(self, diagram, pairs, dt_sec=0.1, eps_c=None, analytic=True):
+        self._plant, scene_graph = _plant_and_scene_graph(diagram)
+        plant, pairs = self._plant, list(pairs)
+        if not (np.isfinite(dt_sec) and dt_sec > 0.0):
+            raise ValueError(f"dt_sec is {dt_sec}, expected a positive time [s]")
+        self.dt_sec = float(dt_sec)
+        self.eps_c = 0.01 * self.dt_sec if eps_c is None else float(eps_c)
+        if not (np.isfinite(self.eps_c) and self.eps_c >= 0.0):
+            raise ValueError(f"eps_c is {eps_c}, expected at least 0 [m/s per N]")
+        self.n_q, self.n_v = plant.num_positions(), plant.num_velocities()
+        self.n_x, self.n_u = self.n_q + self.n_v, plant.num_actuated_dofs()
+        self._check_model()
+        self._resolve(scene_graph.model_inspector(), pairs)
+
+        # Scratch: overwritten before each read.
+        self._context = diagram.CreateDefaultContext()
+        self._plant_context = plant.GetMyContextFromRoot(self._context)
+        self._forces = MultibodyForces(plant)
+        self._plant_ad = plant.ToAutoDiffXd()
+        self._context_ad = self._plant_ad.CreateDefaultContext()
+        self._forces_ad = MultibodyForces_[AutoDiffXd](self._plant_ad)
+
+        self._B_tau = plant.MakeActuationMatrix()
+        self._query_port = plant.get_geometry_query_input_port()
+        self._plain, self._floating, self._maps_known = self._velocity_layout()
+        self.x_default = plant.GetPositionsAndVelocities(self._plant_context).copy()
+        self._check_distances()
+        self._model = self._constant_mass_model(scene_graph) if analytic else None
+        self.is_analytic = self._model is not None
+        self.build(self.x_default, np.zeros(self.n_u))  # Compiles, and proves it works.
+
+    def build(self, x, u) -> LCS:
+        """The LCS about the state x = [q, v] (n_x,) and the input u (n_u,).
+
+        Quaternions in x are normalised first; the LCS's d and c refer to the
+        normalised state.
+
+        Raises: ValueError on a wrong size, an entry that is not finite, a quaternion
+            whose norm is not between 0.5 and 2, or geometry without a unique normal.
+        """
+        x, u = np.array(x, dtype=float), np.array(u, dtype=float)
+        if x.shape != (self.n_x,) or u.shape != (self.n_u,):
+            raise ValueError(
+                f"x is {x.shape} and u is {u.shape}, "
+                f"expected ({self.n_x},) and ({self.n_u},)"
+            )
+        if not (np.isfinite(x).all() and np.isfinite(u).all()):
+            raise ValueError("x or u holds an entry that is not finite")
+        for start, _ in self._floating:
+            norm = np.linalg.norm(x[start : start + 4])
+            if not 0.5 <= norm <= 2.0:
+                raise ValueError(
+                    f"the quaternion x[{start}:{start + 4}] has norm {norm:.3g}, "
+                    "expected 1"
+                )
+            x[start : start + 4] /= norm
+        if self._model is not None:
+            return self._model.build(x, u, self.dt_sec, self.eps_c)
+        return self._build_general(x, u)
+
+    def gaps(self, x) -> np.ndarray:
+        """Signed distance of each force's contact at the state x: phi (n_lam,) [m]."""
+        return self.build(x, np.zeros(self.n_u)).phi
+
+    # The general path: AutoDiff for the smooth dynamics, witness points for contact.
+
+    def _build_general(self, x, u):
+        f, J_q, J_v, J_u, M = self._smooth(x, u)
+        phi, J_n, J_c = self._contact()
+        N, N_plus = self._velocity_maps(x[: self.n_q])
+        return assemble_anitescu(
+            x, f, J_q, J_v, J_u, u, M, N, N_plus, phi, J_n, J_c, self._contact_index,
+            self.dt_sec, self.eps_c,
+        )  # fmt: skip
+
+    def _smooth(self, x, u):
+        """f, its derivatives in q, v and u, and M; leaves the plant's context at x.
+
+        M f = tau(u) - r(q, v), so M df = dtau - d(M(q) f* + r) at the fixed f*: one
+        inverse dynamics in AutoDiff, and no derivative of a factorised M.
+        """
+        plant, context = self._plant, self._plant_context
+        plant.SetPositionsAndVelocities(context, x)
+        M = plant.CalcMassMatrix(context)
+        plant.CalcForceElementsContribution(context, self._forces)
+        r = plant.CalcInverseDynamics(context, np.zeros(self.n_v), self._forces)
+        f = np.linalg.solve(M, self._B_tau @ u - r)
+
+        plant_ad, context_ad = self._plant_ad, self._context_ad
+        plant_ad.SetPositionsAndVelocities(context_ad, InitializeAutoDiff(x)[:, 0])
+        plant_ad.CalcForceElementsContribution(context_ad, self._forces_ad)
+        f_ad = np.array([AutoDiffXd(value) for value in f])
+        tau = plant_ad.CalcInverseDynamics(context_ad, f_ad, self._forces_ad)
+        dtau = ExtractGradient(tau)
+        if dtau.shape[1] == 0:  # Nothing depends on the state.
+            dtau = np.zeros((self.n_v, self.n_x))
+        J = np.linalg.solve(M, np.hstack([-dtau, self._B_tau]))
+        J_q, J_v, J_u = np.split(J, [self.n_q, self.n_x], axis=1)
+        return f, J_q, J_v, J_u, M
+
+    def _contact(self):
+        """phi, J_n and J_c at the state that the plant's context is at."""
+        plant, context = self._plant, self._plant_context
+        world, wrt = plant.world_frame(), JacobianWrtVariable.kV
+        query = self._query_port.Eval(context)
+        n_c = len(self._geometries)
+        phi, J = np.empty(n_c), np.empty((n_c, 3, self.n_v))
+        for i, (id_A, id_B) in enumerate(self._geometries):
+            pair = query.ComputeSignedDistancePairClosestPoints(id_A, id_B)
+            n, p_A, p_B = pair.nhat_BA_W, pair.p_ACa, pair.p_BCb
+            if pair.id_A != id_A:
+                n, p_A, p_B = -n, p_B, p_A
+            if not abs(n @ n - 1.0) < 1e-6:
+                raise ValueError(f"{self._pair_names[i]}: no unique normal at {n}")
+            phi[i] = pair.distance
+            (frame_A, X_A), (frame_B, X_B) = self._frames[id_A], self._frames[id_B]
+            J_w = plant.CalcJacobianTranslationalVelocity(
+                context, wrt, frame_A, X_A @ p_A, world, world
+            ) - plant.CalcJacobianTranslationalVelocity(
+                context, wrt, frame_B, X_B @ p_B, world, world
+            )
+            t1, t2 = tangent_basis(np.ascontiguousarray(n), self._reference[i])
+            J[i] = np.stack([n, t1, t2]) @ J_w
+        on = self._contact_index
+        J_t = (self._edge[:, :, None] * J[on, 1:]).sum(axis=1)
+        return phi, J[:, 0], J[on, 0] + self._mu[on, None] * J_t
+
+    def _velocity_maps(self, q):
+        if self._maps_known:
+            return velocity_maps(q, self._plain, self._floating, self.n_v)
+        N = self._plant.MakeVelocityToQDotMap(self._plant_context).toarray()
+        return N, self._plant.MakeQDotToVelocityMap(self._plant_context).toarray()
+
+    # Construction.
+
+    def _check_model(self):
+        plant = self._plant
+        if plant.num_constraints() > 0:
+            raise ValueError(
+                f"the plant has {plant.num_constraints()} constraints, expected none "
+                "(an LCS cannot hold them)"
+            )
+        for index in plant.GetJointActuatorIndices():
+            actuator = plant.get_joint_actuator(index)
+            if actuator.has_controller():
+                raise ValueError(
+                    f"actuator {actuator.name()} has a PD controller, expected none "
+                    "(the LCS's u is effort)"
+                )
+
+    def _resolve(self, inspector, pairs):
+        """Names to geometries: fills what `_contact` reads."""
+        plant = self._plant
+        bodies, ambiguous = {}, set()
+        collision = {}
+        for i in range(plant.num_bodies()):
+            body = plant.get_body(BodyIndex(i))
+            geometries = plant.GetCollisionGeometriesForBody(body)
+            bodies[body.scoped_name().get_full()] = geometries
+            if body.name() in bodies:
+                ambiguous.add(body.name())
+            bodies[body.name()] = geometries
+            for geometry in geometries:
+                collision[inspector.GetName(geometry)] = geometry
+        self._geometries: list[tuple[GeometryId, GeometryId]] = []
+        self._pair_names: list[str] = []
+        self._frames = {}
+        mu, n_f, reference = [], [], []
+        for pair in pairs:
+            a = _geometries_named(pair.a, bodies, ambiguous, collision)
+            b = _geometries_named(pair.b, bodies, ambiguous, collision)
+            name = f"{pair.a}~{pair.b}"
+            if not (np.isfinite(pair.friction) and pair.friction >= 0.0):
+                raise ValueError(
+                    f"{name}: friction is {pair.friction}, expected at least 0"
+                )
+            if pair.friction_directions != int(pair.friction_directions) or not (
+                pair.friction_directions >= 1
+            ):
+                raise ValueError(
+                    f"{name}: friction_directions is {pair.friction_directions}, "
+                    "expected an integer of at least 1"
+                )
+            tangent = np.array(pair.tangent or [0.0, 0.0, 0.0], dtype=float)
+            if tangent.shape != (3,) or not np.isfinite(tangent).all():
+                raise ValueError(f"{name}: tangent is {pair.tangent}, expected (3,)")
+            for one in a:
+                for other in b:
+                    # As in c3_reference: A is the geometry that was registered first.
+                    id_A, id_B = sorted([one, other], key=lambda g: g.get_value())
+                    if inspector.GetFrameId(id_A) == inspector.GetFrameId(id_B):
+                        raise ValueError(f"{name}: both are on the same body")
+                    self._geometries.append((id_A, id_B))
+                    self._pair_names.append(
+                        f"{inspector.GetName(id_A)}~{inspector.GetName(id_B)}"
+                    )
+                    mu.append(float(pair.friction))
+                    n_f.append(int(pair.friction_directions))
+                    length = np.linalg.norm(tangent)
+                    reference.append(tangent / length if length > 0.0 else tangent)
+        for id in {id for ids in self._geometries for id in ids}:
+            body = plant.GetBodyFromFrameId(inspector.GetFrameId(id))
+            self._frames[id] = (body.body_frame(), inspector.GetPoseInFrame(id))
+        if not self._geometries:
+            raise ValueError("no contact pairs came, expected at least one")
+        self._mu, self._reference = np.array(mu), np.array(reference).reshape(-1, 3)
+        self._contact_index, self._edge = friction_rows(n_f)
+        self.n_lam = len(self._contact_index)
+        first = np.searchsorted(self._contact_index, self._contact_index)
+        self.lam_names = [
+            f"{self._pair_names[i]} {k}"
+            for i, k in zip(
+                self._contact_index, np.arange(self.n_lam) - first, strict=True
+            )
+        ]
+
+    def _check_distances(self):
+        query = self._query_port.Eval(self._plant_context)
+        for name, (id_A, id_B) in zip(self._pair_names, self._geometries, strict=True):
+            try:
+                query.ComputeSignedDistancePairClosestPoints(id_A, id_B)
+            except RuntimeError as error:
+                shapes = [
+                    type(query.inspector().GetShape(g)).__name__ for g in (id_A, id_B)
+                ]
+                raise ValueError(
+                    f"{name}: Drake has no signed distance of {shapes[0]} and "
+                    f"{shapes[1]}, expected convex shapes (a half-space only with a "
+                    "sphere)"
+                ) from error
+
+    def _velocity_layout(self):
+        """Where qdot = v, where quaternions are, and whether that is all there is."""
+        plant, plain, floating, known = self._plant, [], [], True
+        for index in plant.GetJointIndices():
+            joint = plant.get_joint(index)
+            q, v = joint.position_start(), joint.velocity_start()
+            if joint.type_name() == "quaternion_floating":
+                floating.append((q, v))
+            elif joint.type_name() in ("prismatic", "revolute"):
+                plain.append((q, v))
+            else:
+                known = known and joint.num_velocities() == 0
+        as_pairs = [
+            np.array(p, dtype=np.int64).reshape(-1, 2) for p in (plain, floating)
+        ]
+        return *as_pairs, known
+
+    def _constant_mass_model(self, scene_graph):
+        """The fast path's data; None where it does not apply (see ConstantMassModel)."""
+        plant, inspector = self._plant, scene_graph.model_inspector()
+        if plant.num_force_elements() != 1:  # Gravity is always there, and constant.
+            return None
+        floating_bodies = {}
+        joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+        for joint in joints:
+            if joint.type_name() == "quaternion_floating":
+                body = joint.child_body()
+                I_B = body.default_spatial_inertia()
+                I = I_B.CalcRotationalInertia().CopyToFullMatrix3()
+                at_origin = not I_B.get_com().any()
+                isotropic = np.abs(I - I[0, 0] * np.eye(3)).max() <= 1e-12 * I[0, 0]
+                frames = joint.frame_on_parent(), joint.frame_on_child()
+                if not (
+                    at_origin
+                    and isotropic
+                    and frames[0] == plant.world_frame()
+                    and frames[1] == body.body_frame()
+                ):
+                    return None
+                floating_bodies[body.index()] = joint
+            elif joint.type_name() not in ("prismatic", "weld"):
+                return None
+        if any(joint.parent_body().index() in floating_bodies for joint in joints):
+            return None
+
+        f, J_q, J_v, J_u, M = self._smooth(self.x_default, np.zeros(self.n_u))
+        f_0 = f - J_v @ self.x_default[self.n_q :]
+        ids = list(self._frames)
+        rows = dict(shape=[], size=[], quaternion=[], omega=[])
+        R, p_0, P, J_p = [], [], [], []
+        for id in ids:
+            shape = inspector.GetShape(id)
+            frame, X_BG = self._frames[id]
+            if isinstance(shape, Sphere):
+                rows["shape"].append(SPHERE)
+                rows["size"].append([shape.radius()] * 3)
+            elif isinstance(shape, Box):
+                rows["shape"].append(BOX)
+                rows["size"].append(0.5 * shape.size())
+            elif isinstance(shape, HalfSpace):
+                rows["shape"].append(HALF_SPACE)
+                rows["size"].append([0.0] * 3)
+            else:
+                return None
+            P_G, J_G = np.zeros((3, self.n_q)), np.zeros((3, self.n_v))
+            joint = floating_bodies.get(frame.body().index())
+            if joint is not None:
+                rows["quaternion"].append(joint.position_start())
+                rows["omega"].append(joint.velocity_start())
+                X = X_BG
+            else:
+                rows["quaternion"].append(-1)
+                rows["omega"].append(-1)
+                X = frame.CalcPoseInWorld(self._plant_context) @ X_BG
+                world = plant.world_frame()
+                J_G = plant.CalcJacobianTranslationalVelocity(
+                    self._plant_context, JacobianWrtVariable.kV, frame, np.zeros(3),
+                    world, world,
+                )  # fmt: skip
+                P_G[:, self._plain[:, 0]] = J_G[:, self._plain[:, 1]]
+            R.append(X.rotation().matrix())
+            p_0.append(X.translation() - P_G @ self.x_default[: self.n_q])
+            P.append(P_G)
+            J_p.append(J_G)
+        number = {id: i for i, id in enumerate(ids)}
+        ab = [(number[a], number[b]) for a, b in self._geometries]
+        if not all(SPHERE in (rows["shape"][a], rows["shape"][b]) for a, b in ab):
+            return None
+
+        def array(values, dtype=float):
+            return np.ascontiguousarray(np.array(values, dtype=dtype))
+
+        return ConstantMassModel(
+            M_inv=array(np.linalg.inv(M)), f_0=array(f_0), J_v=array(J_v),
+            J_u=array(J_u), plain=self._plain, floating=self._floating,
+            shape=array(rows["shape"], np.int64), size=array(rows["size"]),
+            quaternion=array(rows["quaternion"], np.int64),
+            omega=array(rows["omega"], np.int64), R=array(R), p_0=array(p_0),
+            P=array(P), J_p=array(J_p), pairs=array(ab, np.int64), mu=self._mu,
+            reference=self._reference, contact=self._contact_index, edge=self._edge,
+        )  # fmt: skip
+
+
+@dataclass
+class LcsBuilderConfig:
+    contacts: list[ContactPair] = field(default_factory=list)
+    dt_sec: float = 0.1  # Time step of the LCS [s].
+    eps_c: float | None = None  # [m/s per N]; None: 0.01 dt_sec.
+    period_sec: float = 0.0125  # Between two linearisations [s].
+    offset_sec: float = 0.0  # Of the first one [s].
+
+
+class AnitescuLcsBuilder(LeafSystem):
+    """The LCS about the present state, held between updates.
+
+    Inputs:  x (n_x,) state [q, v] of the model plant; u (n_u,) its actuation.
+    Outputs: lcs (abstract, LCS) with dt and phi; status (1,): 1.0, or 0.0 while the
+             last LCS is held because x or u was not usable.
+
+    Before the first update: the LCS about the plant's default state with u = 0.
+
+    Args: diagram, see AnitescuLcs; config.
+    """
+
+    def __init__(self, diagram, config: LcsBuilderConfig):
+        super().__init__()
+        c = config
+        self.model = AnitescuLcs(diagram, c.contacts, c.dt_sec, c.eps_c)
+        initial = self.model.build(self.model.x_default, np.zeros(self.model.n_u))
+        self._x = self.DeclareVectorInputPort("x", self.model.n_x)
+        self._u = self.DeclareVectorInputPort("u", self.model.n_u)
+        self._lcs = self.DeclareAbstractState(Value(initial))
+        self._status = self.DeclareDiscreteState([1.0])
+        self.DeclareStateOutputPort("lcs", self._lcs)
+        self.DeclareStateOutputPort("status", self._status)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(
+            c.period_sec, c.offset_sec, self._update
+        )
+
+    @timed
+    def _update(self, context, state):
+        x, u = self._x.Eval(context), self._u.Eval(context)
+        try:
+            lcs = self.model.build(x, u)
+        except (ValueError, RuntimeError, np.linalg.LinAlgError):
+            state.get_mutable_discrete_state(self._status).set_value([0.0])
+            return
+        state.get_mutable_abstract_state(int(self._lcs)).set_value(lcs)
+        state.get_mutable_discrete_state(self._status).set_value([1.0])
+
+
+def _plant_and_scene_graph(diagram):
+    if not isinstance(diagram, Diagram):
+        raise ValueError(
+            f"diagram is a {type(diagram).__name__}, expected the Diagram that holds "
+            "the plant and its scene graph"
+        )
+    systems = diagram.GetSystems()
+    plants = [s for s in systems if isinstance(s, MultibodyPlant)]
+    graphs = [s for s in systems if isinstance(s, SceneGraph)]
+    if len(plants) != 1 or len(graphs) != 1:
+        raise ValueError(
+            f"diagram holds {len(plants)} MultibodyPlants and {len(graphs)} "
+            "SceneGraphs, expected one of each"
+        )
+    if not plants[0].is_finalized():
+        raise ValueError("the plant is not finalized, expected plant.Finalize() before")
+    return plants[0], graphs[0]
+
+
+def _geometries_named(name, bodies, ambiguous, collision):
+    if name in ambiguous:
+        scoped = sorted(n for n in bodies if n.endswith(f"::{name}"))
+        raise ValueError(f"body {name!r} is not unique, expected one of {scoped}")
+    if name in bodies:
+        if not bodies[name]:
+            raise ValueError(f"body {name!r} has no collision geometry")
+        return bodies[name]
+    if name in collision:
+        return [collision[name]]
+    names = [*bodies, *collision]
+    near = get_close_matches(name, names, n=3, cutoff=0.3) or sorted(names)
+    raise ValueError(f"no body or geometry is named {name!r}; nearest: {near}")

@@ -1,0 +1,351 @@
+"""Anitescu's contact, linearised about one state: arrays of a multibody model -> LCS.
+
+    v_next = v + dt f(q, v, u) + dt M^-1 J_c' lam,   q_next = q + dt N v_next
+    0 <= lam  perp  E_t' (phi + J_n N+ (q - q*)) / dt + J_c v_next + eps_c lam >= 0
+
+f is the acceleration without contact; N maps v to qdot and N+ back, both frozen at the
+nominal q*. Each contact has 2 n_f friction edges; row i of J_c is the normal Jacobian
+of its contact plus mu times the tangent Jacobian of its edge. lam is in newtons.
+
+The gap that the forces see moves with q through E, so it changes along a horizon: a
+gap frozen at q* would let a plan push through what it has not touched yet.
+
+Source: ACI-MPC section V, eq. 5-8 (there lam is an impulse: lam_impulse = dt lam, and
+so eps_c here is dt times theirs); Anitescu, Math. Programming 105 (2006).
+"""
+
+from dataclasses import dataclass
+from math import cos, pi, sin, sqrt
+
+import numpy as np
+from numba import njit
+
+from makebreak.systems.numerics.lcs import LCS
+
+# Shapes that the fast path knows.
+SPHERE, BOX, HALF_SPACE = 0, 1, 2
+
+
+def friction_rows(n_f):
+    """Which contact, and which direction in its tangent plane, each force acts along.
+
+    Args: n_f (n_contacts,) integers, friction directions of each contact.
+
+    Returns: contact (n_lam,) index, and edge (n_lam, 2), the unit vector (cos, sin) in
+        the tangent basis: theta = 0, pi, pi/n_f, pi/n_f + pi, ... as in c3_reference.
+    """
+    contact, edge = [], []
+    for i, n in enumerate(n_f):
+        for k in range(n):
+            direction = np.array([cos(pi * k / n), sin(pi * k / n)])
+            contact += [i, i]
+            edge += [direction, -direction]
+    return np.array(contact, dtype=np.int64), np.array(edge).reshape(-1, 2)
+
+
+@njit(cache=True)
+def tangent_basis(n, reference):
+    """Two unit tangents t1, t2 with t1 x t2 = n, for a unit normal n (3,).
+
+    reference (3,): t1 is its projection on the tangent plane. If it is zero (or along
+    n): t1 = e x n, where e is the axis along which n is smallest, the basis of Drake's
+    RotationMatrix.MakeFromOneVector. That one jumps by 90 degrees where two entries of
+    n change places in size; a reference direction does not jump.
+    """
+    along = reference @ n
+    t1 = reference - along * n
+    length = sqrt(t1 @ t1)
+    if length < 1e-6:
+        i = 0
+        if abs(n[1]) < abs(n[i]):
+            i = 1
+        if abs(n[2]) < abs(n[i]):
+            i = 2
+        j, k = (i + 1) % 3, (i + 2) % 3
+        t1[i], t1[j], t1[k] = 0.0, -n[k], n[j]
+        length = sqrt(n[j] * n[j] + n[k] * n[k])
+    t1 /= length
+    t2 = np.empty(3)
+    t2[0] = n[1] * t1[2] - n[2] * t1[1]
+    t2[1] = n[2] * t1[0] - n[0] * t1[2]
+    t2[2] = n[0] * t1[1] - n[1] * t1[0]
+    return t1, t2
+
+
+def assemble_anitescu(
+    x, f, J_q, J_v, J_u, u, M, N, N_plus, phi, J_n, J_c, contact, dt, eps_c
+):
+    """The LCS of one linearised time step.
+
+    Args:
+        x: (n_q + n_v,) nominal state [q, v]; u: (n_u,) nominal input.
+        f: (n_v,) acceleration without contact at (x, u); J_q (n_v, n_q), J_v
+            (n_v, n_v), J_u (n_v, n_u) its derivatives.
+        M: (n_v, n_v) mass matrix. N: (n_q, n_v), qdot = N v. N_plus: (n_v, n_q).
+        phi: (n_contacts,) gaps [m]; J_n: (n_contacts, n_v), their rates per v.
+        J_c: (n_lam, n_v), J_n of each force's contact plus mu times its edge's J_t.
+        contact: (n_lam,) integers, the contact of each force.
+        dt: time step [s]. eps_c: added to the diagonal of F [m/s per N].
+
+    Returns: LCS with dt and phi (per force).
+
+    Raises: ValueError if the model's arrays lead to an entry that is not finite.
+
+    Source: ACI-MPC eq. 7, 8, with lam in newtons.
+    """
+    A, B, D, d, E, F, H, c = _assemble(
+        np.ascontiguousarray(x, dtype=float),
+        np.ascontiguousarray(f, dtype=float),
+        np.ascontiguousarray(J_q, dtype=float),
+        np.ascontiguousarray(J_v, dtype=float),
+        np.ascontiguousarray(J_u, dtype=float),
+        np.ascontiguousarray(u, dtype=float),
+        np.linalg.solve(M, J_c.T),
+        np.ascontiguousarray(N, dtype=float),
+        np.ascontiguousarray(N_plus, dtype=float),
+        np.ascontiguousarray(phi, dtype=float),
+        np.ascontiguousarray(J_n, dtype=float),
+        np.ascontiguousarray(J_c, dtype=float),
+        contact,
+        dt,
+        eps_c,
+    )
+    return _finite(LCS(A, B, D, d, E, F, H, c, dt, phi[contact]))
+
+
+def _finite(lcs):
+    # c, d and F together contain every ingredient.
+    if not (
+        np.isfinite(lcs.c).all()
+        and np.isfinite(lcs.d).all()
+        and np.isfinite(lcs.F).all()
+    ):
+        raise ValueError("the linearised contact model has an entry that is not finite")
+    return lcs
+
+
+@njit(cache=True)
+def _assemble(
+    x, f, J_q, J_v, J_u, u, M_inv_J_cT, N, N_plus, phi, J_n, J_c, contact, dt, eps_c
+):
+    n_v, n_q = J_q.shape
+    n_x, n_u, n_lam = n_q + n_v, J_u.shape[1], contact.size
+    q, v = x[:n_q].copy(), x[n_q:].copy()
+    d_v = f - J_q @ q - J_v @ v - J_u @ u
+    A, B, d = np.zeros((n_x, n_x)), np.empty((n_x, n_u)), np.empty(n_x)
+    D, E = np.empty((n_x, n_lam)), np.empty((n_lam, n_x))
+    # Velocity rows first; the position rows follow from q_next = q + dt N v_next.
+    V = np.empty((n_v, n_x))  # Derivative of v_next.
+    V[:, :n_q] = dt * J_q
+    V[:, n_q:] = dt * J_v
+    for i in range(n_v):
+        V[i, n_q + i] += 1.0
+    A[n_q:] = V
+    A[:n_q] = dt * (N @ V)
+    for i in range(n_q):
+        A[i, i] += 1.0
+    V_u, V_0, V_lam = dt * J_u, dt * d_v, dt * M_inv_J_cT
+    B[n_q:], B[:n_q] = V_u, dt * (N @ V_u)
+    d[n_q:], d[:n_q] = V_0, dt * (N @ V_0)
+    D[n_q:], D[:n_q] = V_lam, dt * (N @ V_lam)
+    gap_rate = (J_n @ N_plus) / dt  # Of the gaps per q, over dt.
+    gap_0 = phi / dt - gap_rate @ q
+    E[:] = J_c @ V
+    H = J_c @ V_u
+    F = J_c @ V_lam
+    c = J_c @ V_0
+    for i in range(n_lam):
+        E[i, :n_q] += gap_rate[contact[i]]
+        c[i] += gap_0[contact[i]]
+        F[i, i] += eps_c
+    return A, B, D, d, E, F, H, c
+
+
+@dataclass(frozen=True, eq=False)
+class ConstantMassModel:
+    """A model whose mass matrix does not depend on its state, and its contacts.
+
+    Every body either never turns (prismatic joints and welds) or floats freely with
+    its centre of mass at its origin and equal moments of inertia. Then f = f_0 + J_v v
+    + J_u u exactly and only contact geometry depends on q. Made by systems/lcs_builder.
+
+    Row g of the geometry arrays is one collision shape. `quaternion` and `omega` are
+    where its body's quaternion is in q and its angular velocity in v (the body's
+    position and velocity follow right after); both -1 for a body that never turns,
+    whose shape is at p_0 + P q with the constant orientation R.
+    """
+
+    M_inv: np.ndarray  # (n_v, n_v)
+    f_0: np.ndarray  # (n_v,) [m/s2, rad/s2]
+    J_v: np.ndarray  # (n_v, n_v) from joint damping
+    J_u: np.ndarray  # (n_v, n_u)
+    plain: np.ndarray  # (n, 2) pairs (index in q, index in v) with qdot = v
+    floating: np.ndarray  # (m, 2) starts (in q, in v) of each floating body
+    shape: np.ndarray  # (n_g,) SPHERE, BOX or HALF_SPACE
+    size: np.ndarray  # (n_g, 3) radius; half extents of a box [m]
+    quaternion: np.ndarray  # (n_g,)
+    omega: np.ndarray  # (n_g,)
+    R: np.ndarray  # (n_g, 3, 3) in the world, or in the floating body
+    p_0: np.ndarray  # (n_g, 3) in the world at q = 0, or in the floating body [m]
+    P: np.ndarray  # (n_g, 3, n_q)
+    J_p: np.ndarray  # (n_g, 3, n_v) velocity of a body that never turns
+    pairs: np.ndarray  # (n_contacts, 2) geometry A, geometry B
+    mu: np.ndarray  # (n_contacts,)
+    reference: np.ndarray  # (n_contacts, 3) see tangent_basis
+    contact: np.ndarray  # (n_lam,)
+    edge: np.ndarray  # (n_lam, 2)
+
+    def build(self, x, u, dt, eps_c) -> LCS:
+        """The LCS at x (n_x,), with unit quaternions, and u (n_u,).
+
+        Raises: ValueError as assemble_anitescu.
+        """
+        A, B, D, d, E, F, H, c, phi = _build_constant_mass(
+            x, u, self.M_inv, self.f_0, self.J_v, self.J_u, self.plain, self.floating,
+            self.shape, self.size, self.quaternion, self.omega, self.R, self.p_0,
+            self.P, self.J_p, self.pairs, self.mu, self.reference, self.contact,
+            self.edge, dt, eps_c,
+        )  # fmt: skip
+        return _finite(LCS(A, B, D, d, E, F, H, c, dt, phi))
+
+
+@njit(cache=True)
+def _build_constant_mass(
+    x, u, M_inv, f_0, J_v, J_u, plain, floating, shape, size, quaternion, omega, R,
+    p_0, P, J_p, pairs, mu, reference, contact, edge, dt, eps_c,
+):  # fmt: skip
+    n_v = f_0.size
+    n_q = x.size - n_v
+    q, v = x[:n_q].copy(), x[n_q:].copy()
+    N, N_plus = velocity_maps(q, plain, floating, n_v)
+    # Poses of the shapes, and of the origins that their bodies turn about.
+    n_g = shape.size
+    R_W, p_W, origin = np.empty((n_g, 3, 3)), np.empty((n_g, 3)), np.zeros((n_g, 3))
+    for g in range(n_g):
+        if quaternion[g] < 0:
+            R_W[g] = R[g]
+            p_W[g] = p_0[g] + P[g] @ q
+        else:
+            k = quaternion[g]
+            R_WB = _rotation(q[k], q[k + 1], q[k + 2], q[k + 3])
+            origin[g] = q[k + 4 : k + 7]
+            R_W[g] = R_WB @ R[g]
+            p_W[g] = origin[g] + R_WB @ p_0[g]
+    n_c, n_lam = pairs.shape[0], contact.size
+    phi, J = np.empty(n_c), np.empty((n_c, 3, n_v))
+    J_n = np.empty((n_c, n_v))
+    for i in range(n_c):
+        a, b = pairs[i]
+        if shape[a] == SPHERE:
+            gap, n, on_a, on_b = _sphere_against(
+                p_W[a], size[a, 0], shape[b], size[b], R_W[b], p_W[b]
+            )
+        else:
+            gap, n, on_b, on_a = _sphere_against(
+                p_W[b], size[b, 0], shape[a], size[a], R_W[a], p_W[a]
+            )
+            n = -n
+        phi[i] = gap
+        J_w = _point_jacobian(on_a - origin[a], omega[a], J_p[a])
+        J_w -= _point_jacobian(on_b - origin[b], omega[b], J_p[b])
+        t1, t2 = tangent_basis(n, reference[i])
+        J[i, 0], J[i, 1], J[i, 2] = n @ J_w, t1 @ J_w, t2 @ J_w
+        J_n[i] = J[i, 0]
+    J_c, phi_lam = np.empty((n_lam, n_v)), np.empty(n_lam)
+    for k in range(n_lam):
+        i = contact[k]
+        J_c[k] = J[i, 0] + mu[i] * (edge[k, 0] * J[i, 1] + edge[k, 1] * J[i, 2])
+        phi_lam[k] = phi[i]
+    f = f_0 + J_v @ v + J_u @ u
+    A, B, D, d, E, F, H, c = _assemble(
+        x, f, np.zeros((n_v, n_q)), J_v, J_u, u, M_inv @ J_c.T, N, N_plus, phi, J_n,
+        J_c, contact, dt, eps_c,
+    )  # fmt: skip
+    return A, B, D, d, E, F, H, c, phi_lam
+
+
+@njit(cache=True)
+def velocity_maps(q, plain, floating, n_v):
+    """N (n_q, n_v) with qdot = N v, and N+ (n_v, n_q) with v = N+ qdot.
+
+    Args: q (n_q,) with unit quaternions [w x y z]; plain and floating as in
+        ConstantMassModel; a floating body's v is [omega 3, velocity 3] in the world.
+    """
+    N, N_plus = np.zeros((q.size, n_v)), np.zeros((n_v, q.size))
+    for i in range(plain.shape[0]):
+        N[plain[i, 0], plain[i, 1]] = 1.0
+        N_plus[plain[i, 1], plain[i, 0]] = 1.0
+    L = np.empty((4, 3))  # qdot = L omega / 2, omega = 2 L' qdot.
+    for i in range(floating.shape[0]):
+        a, b = floating[i]
+        w, x, y, z = q[a], q[a + 1], q[a + 2], q[a + 3]
+        L[0, 0], L[0, 1], L[0, 2] = -x, -y, -z
+        L[1, 0], L[1, 1], L[1, 2] = w, z, -y
+        L[2, 0], L[2, 1], L[2, 2] = -z, w, x
+        L[3, 0], L[3, 1], L[3, 2] = y, -x, w
+        N[a : a + 4, b : b + 3] = 0.5 * L
+        N_plus[b : b + 3, a : a + 4] = 2.0 * L.T
+        for k in range(3):
+            N[a + 4 + k, b + 3 + k] = 1.0
+            N_plus[b + 3 + k, a + 4 + k] = 1.0
+    return N, N_plus
+
+
+@njit(cache=True)
+def _rotation(w, x, y, z):
+    R = np.empty((3, 3))
+    R[0, 0], R[1, 1] = 1 - 2 * (y * y + z * z), 1 - 2 * (x * x + z * z)
+    R[2, 2] = 1 - 2 * (x * x + y * y)
+    R[0, 1], R[1, 0] = 2 * (x * y - w * z), 2 * (x * y + w * z)
+    R[0, 2], R[2, 0] = 2 * (x * z + w * y), 2 * (x * z - w * y)
+    R[1, 2], R[2, 1] = 2 * (y * z - w * x), 2 * (y * z + w * x)
+    return R
+
+
+@njit(cache=True)
+def _point_jacobian(r, omega, J_p):
+    """Velocity of a body's point at r (3,) from its origin, per v: (3, n_v)."""
+    J = J_p.copy()
+    if omega >= 0:
+        for k in range(3):
+            J[k, omega + 3 + k] = 1.0
+        J[0, omega + 1], J[0, omega + 2] = r[2], -r[1]
+        J[1, omega], J[1, omega + 2] = -r[2], r[0]
+        J[2, omega], J[2, omega + 1] = r[1], -r[0]
+    return J
+
+
+@njit(cache=True)
+def _sphere_against(p_S, radius, shape, size, R_G, p_G):
+    """Gap, unit normal towards the sphere, nearest points on the sphere and the other.
+
+    The other shape: a sphere, a box (half extents `size`), or the half-space below the
+    z axis of its frame.
+    """
+    if shape == HALF_SPACE:
+        n = R_G[:, 2].copy()
+        height = n @ (p_S - p_G)
+        return height - radius, n, p_S - radius * n, p_S - height * n
+    if shape == SPHERE:
+        n = p_S - p_G
+        distance = sqrt(n @ n)
+        if distance > 1e-12:
+            n /= distance
+        else:  # Concentric: any direction is right; that of the general path.
+            n[0], n[1], n[2] = 1.0, 0.0, 0.0
+        on_other = p_G + size[0] * n
+        return distance - size[0] - radius, n, p_S - radius * n, on_other
+    p = R_G.T @ (p_S - p_G)
+    nearest = np.minimum(np.maximum(p, -size), size)
+    n_G = p - nearest
+    distance = sqrt(n_G @ n_G)
+    if distance > 0.0:
+        n_G /= distance
+    else:  # The centre is in the box: out through the nearest face.
+        axis = np.argmin(size - np.abs(p))
+        side = 1.0 if p[axis] >= 0.0 else -1.0
+        distance = -(size[axis] - abs(p[axis]))
+        n_G[axis] = side
+        nearest[axis] = side * size[axis]
+    n = R_G @ n_G
+    return distance - radius, n, p_S - radius * n, p_G + R_G @ nearest
