@@ -1,0 +1,316 @@
+"""The command line: `makebreak list | run | reproduce | bench`.
+
+Exit status: 0 done; 1 it ran and did not meet its criterion; 2 bad input, one line on
+stderr; 3 a fault of makebreak itself, with a traceback; 130 ended by Ctrl-C.
+"""
+
+import argparse
+import dataclasses
+import sys
+import traceback
+from datetime import datetime
+from pathlib import Path
+
+import yaml
+
+from makebreak.scripts.experiments import EXPERIMENTS, load_experiment
+from makebreak.scripts.settings import (
+    apply_settings,
+    dump_config,
+    load_config,
+    nearest,
+)
+
+_MODELS = Path(__file__).resolve().parent.parent / "models"
+
+
+class _Parser(argparse.ArgumentParser):
+    """argparse, but with one line on stderr where the input is wrong."""
+
+    def error(self, message):
+        raise ValueError(f"{message} (see {self.prog} --help)")
+
+
+def _number(text: str, name: str, least: float, whole: bool = False) -> float:
+    """A number of the command line. Raises: ValueError below `least`, or if not one."""
+    try:
+        value = int(text) if whole else float(text)
+    except ValueError:
+        value = float("nan")
+    good = value >= least if whole else least < value < float("inf")
+    if not good:
+        kind = (
+            f"a whole number, {least} or more" if whole else f"a number above {least}"
+        )
+        raise ValueError(f'{name}: got "{text}", expected a {kind}')
+    return value
+
+
+def _experiment(name: str):
+    """The module of an experiment. Raises: ValueError for an unknown name."""
+    if name not in EXPERIMENTS:
+        raise ValueError(f"unknown experiment {name}; {nearest(name, EXPERIMENTS)}")
+    return load_experiment(name)
+
+
+def scenes() -> dict[str, Path]:
+    """{name: file} of the scenes that come with makebreak."""
+    found = {}
+    for path in sorted(_MODELS.rglob("*.yaml")):
+        try:
+            content = yaml.safe_load(path.read_text())
+        except yaml.YAMLError:
+            continue
+        if isinstance(content, dict) and "directives" in content:
+            found[path.relative_to(_MODELS).as_posix().removesuffix(".yaml")] = path
+    return found
+
+
+def _scene(text: str, option: str) -> str:
+    """The file of a scene that is given by its path or by its name in `list`."""
+    if Path(text).is_file():
+        return str(Path(text).resolve())
+    shipped = scenes()
+    if text.removesuffix(".yaml") in shipped:
+        return str(shipped[text.removesuffix(".yaml")])
+    hint = f" ({nearest(text, shipped)})" if shipped else ""
+    raise ValueError(f'{option}: got "{text}", expected a scene file{hint}')
+
+
+def _config(module, args: argparse.Namespace):
+    """The experiment's config: --config, then --world and --model, --set, --seed."""
+    if args.config is None:
+        config = module.Config()
+    else:
+        config = load_config(module.Config, Path(args.config))
+    fields = {f.name for f in dataclasses.fields(config)}
+    for option in ("world", "model"):
+        text = getattr(args, option)
+        if text is None:
+            continue
+        if option not in fields:
+            raise ValueError(f"--{option}: {args.experiment} has no {option} scene")
+        path = _scene(text, f"--{option}")
+        config = dataclasses.replace(config, **{option: path})
+    config = apply_settings(config, args.set)
+    if args.seed is not None:
+        seed = int(_number(args.seed, "--seed", 0, whole=True))
+        config = apply_settings(config, [f"seed={seed}"])
+    if getattr(config, "seed", 0) < 0:
+        raise ValueError(f"seed: got {config.seed}, expected 0 or more")
+    return config
+
+
+def _default_out(name: str) -> Path:
+    """runs/<name>-<time>, or with -2, -3 ... where that is taken."""
+    stem = f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
+    path, n = Path("runs") / stem, 1
+    while path.exists():
+        n += 1
+        path = Path("runs") / f"{stem}-{n}"
+    return path
+
+
+def _list(args) -> int:
+    names: dict[str, dict[str, str]] = {"experiments": {}, "scenes": {}}
+    for name in EXPERIMENTS:
+        try:
+            names["experiments"][name] = load_experiment(name).SUMMARY
+        except ImportError as error:
+            names["experiments"][name] = f"(cannot be loaded: {error})"
+    for name, path in scenes().items():
+        first = path.read_text().splitlines()[0]
+        names["scenes"][name] = first.lstrip("# ") if first.startswith("#") else ""
+    width = max((len(n) for group in names.values() for n in group), default=0)
+    for group, lines in names.items():
+        print(f"{group}:")
+        for name, line in lines.items():
+            print(f"  {name:{width}}  {line}".rstrip())
+    return 0
+
+
+def _open_meshcat():
+    """Drake's viewer, with the address printed.
+
+    Raises: ValueError if it cannot be opened.
+    """
+    from pydrake.geometry import Meshcat
+
+    try:
+        meshcat = Meshcat()
+    except RuntimeError as error:
+        raise ValueError(f"Meshcat: {error}; --no-meshcat runs without") from error
+    print(f"Meshcat: {meshcat.web_url()}", flush=True)
+    return meshcat
+
+
+def _run(args) -> int:
+    from makebreak.scripts.session import Session
+    from makebreak.scripts.table import Table
+    from makebreak.scripts.trials import duration_line
+
+    module = _experiment(args.experiment)
+    duration = None
+    if args.duration is not None:
+        duration = _number(args.duration, "--duration", 0.0)
+    realtime = 0.0
+    if args.realtime is not None:
+        realtime = _number(args.realtime, "--realtime", 0.0)
+    config = _config(module, args)
+    out = Path(args.out) if args.out else _default_out(args.experiment)
+    session = Session(out, None, duration, realtime)
+    session.write_text("config.yaml", duration_line(duration) + dump_config(config))
+    if not args.no_meshcat:
+        session.meshcat = _open_meshcat()
+
+    result = None
+    try:
+        result = dict(module.run(config, session))
+    except KeyboardInterrupt:
+        session.interrupted = True
+    except Exception as error:
+        session.write_text("error.txt", traceback.format_exc())
+        if session.interrupted:  # Too short a recording to be scored.
+            pass
+        elif not session.started and isinstance(
+            error, ValueError | OSError | RuntimeError
+        ):
+            # Before anything was simulated: the input does not fit. (Drake's parser
+            # raises RuntimeError.)
+            raise ValueError(str(error)) from error
+        else:
+            traceback.print_exc()
+            session.keep_partial()
+            session.finish()
+            return 3
+    if result is None:
+        session.keep_partial()
+    else:
+        result["interrupted"] = session.interrupted
+        session.write_result(result)
+    files = session.finish()
+    if result is not None:
+        print(
+            Table(args.experiment, ("result", "value"), list(result.items())).to_text()
+        )
+    print(f"Files in {session.out_dir}: " + " ".join(p.name for p in files), flush=True)
+    if session.interrupted:
+        print("makebreak: interrupted; what was recorded is kept", file=sys.stderr)
+        return 130
+    if session.meshcat is not None and sys.stdin is not None and sys.stdin.isatty():
+        try:
+            input("Meshcat stays open; press Enter to leave")
+        except (EOFError, KeyboardInterrupt):
+            print()
+    return 0 if result is not None and result["success"] else 1
+
+
+def _reproduce(args) -> int:
+    from makebreak.scripts.session import Session
+
+    names = args.experiments or list(EXPERIMENTS)
+    modules = {name: _experiment(name) for name in names}
+    if args.experiments:
+        for name, module in modules.items():
+            if not hasattr(module, "reproduce"):
+                raise ValueError(f"{name} has nothing to reproduce")
+    seeds = int(_number(args.seeds, "--seeds", 1, whole=True))
+    jobs = int(_number(args.jobs, "--jobs", 1, whole=True))
+    out = Path(args.out) if args.out else _default_out("reproduce")
+    session = Session(out)
+    tables = {}
+    for name, module in modules.items():
+        if hasattr(module, "reproduce"):
+            try:
+                table = module.reproduce(session.child(name), seeds, jobs)
+            except Exception:  # Not the user's doing: all input is checked above.
+                traceback.print_exc()
+                return 3
+            tables[name] = table
+            print(tables[name].to_text(), flush=True)
+            # Written after each: an interrupted run keeps what is done.
+            session.write_json(
+                "reproduce.json", {n: t.to_dict() for n, t in tables.items()}
+            )
+            session.write_text(
+                "reproduce.md", "\n".join(t.to_markdown() for t in tables.values())
+            )
+    print(f"Files in {out}: reproduce.json reproduce.md")
+    missed = sum(table.missed for table in tables.values())
+    if missed:
+        print(f"makebreak: {missed} rows miss their target", file=sys.stderr)
+    return 1 if missed else 0
+
+
+def _bench(args) -> int:
+    import json
+
+    from makebreak.scripts.bench import bench
+
+    table = bench(args.names)
+    print(table.to_text())
+    print(json.dumps(table.to_dict(), indent=2))
+    return 1 if table.missed else 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="makebreak",
+        description="Adaptive control for robots that make and break contact.",
+        allow_abbrev=False,
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    p = commands.add_parser("list", help="experiments and scenes, a line each")
+    p.set_defaults(function=_list)
+
+    p = commands.add_parser("run", help="one experiment, seen in Meshcat")
+    p.add_argument("experiment", nargs="?", default="ball_rolling")
+    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", nargs="+")
+    p.add_argument("--config", metavar="FILE", help="a YAML file of settings")
+    p.add_argument("--world", metavar="SCENE", help="the scene that is simulated")
+    p.add_argument("--model", metavar="SCENE", help="the scene that control believes")
+    p.add_argument("--seed", metavar="N", help="all randomness comes from it")
+    p.add_argument("--duration", metavar="S", help="simulated seconds")
+    p.add_argument("--no-meshcat", action="store_true", help="no viewer, no html")
+    p.add_argument("--realtime", metavar="RATE", help="at most so fast; 1: real time")
+    p.add_argument("--out", metavar="DIR", help="default: runs/<experiment>-<time>")
+    p.set_defaults(function=_run)
+
+    p = commands.add_parser("reproduce", help="the paper's figure or table beside ours")
+    p.add_argument("experiments", nargs="*", metavar="EXPERIMENT")
+    p.add_argument("--seeds", default="10", metavar="N", help="trials per case (10)")
+    p.add_argument("--jobs", default="1", metavar="N", help="processes at once (1)")
+    p.add_argument("--out", metavar="DIR", help="default: runs/reproduce-<time>")
+    p.set_defaults(function=_reproduce)
+
+    p = commands.add_parser("bench", help="how long the parts take, as table and JSON")
+    p.add_argument("names", nargs="*", metavar="NAME")
+    p.set_defaults(function=_bench)
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs one command.
+
+    Args:
+        argv: the words after `makebreak`; None: those of the process.
+    Returns: the exit status.
+    """
+    try:
+        args = _parser().parse_args(argv)
+        if hasattr(args, "set"):
+            args.set = [setting for group in args.set for setting in group]
+            for setting in args.set:
+                if setting in EXPERIMENTS:
+                    raise ValueError(f"EXPERIMENT comes before --set, got {setting}")
+        return args.function(args)
+    except ValueError as error:
+        print(f"makebreak: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("makebreak: interrupted", file=sys.stderr)
+        return 130
+    except Exception:
+        traceback.print_exc()
+        return 3

@@ -1,0 +1,30 @@
+"""The experiments that `makebreak run` knows, by name.
+
+Each is a module with
+
+    SUMMARY     one line for `makebreak list`
+    Config      the diagram's config dataclass, with a field `seed`
+    run(config, session) -> dict
+                simulates and scores; flat, with at least `success`
+    reproduce(session, seeds, jobs) -> Table
+                optional: the paper's figure or table beside ours
+    BENCH       optional: {label: {field: value}}, the settings with which
+                `makebreak bench diagrams` takes its real-time factor
+"""
+
+from importlib import import_module
+from types import ModuleType
+
+# The name on the command line -> the module, imported when it is asked for.
+EXPERIMENTS: dict[str, str] = {
+    "ball_rolling": "makebreak.scripts.experiments.ball_rolling",
+    "cartpole_walls": "makebreak.scripts.experiments.cartpole_walls",
+}
+
+
+def load_experiment(name: str) -> ModuleType:
+    """The module of the experiment `name`.
+
+    Raises: KeyError if there is no experiment of that name.
+    """
+    return import_module(EXPERIMENTS[name])

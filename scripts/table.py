@@ -1,0 +1,128 @@
+"""A table of results: plain text for the terminal, Markdown and JSON for files."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text and numbers under a title.
+
+    Args:
+        title: what the table shows; one line.
+        columns: the heads; a table of `reproduce` has
+            ("what", "paper", "ours", "command").
+        rows: one sequence per row, as long as `columns`.
+        met: per row, whether it meets its stated target; None where it has none.
+            Empty: no row has a target.
+        notes: lines that stand under the table.
+    Raises: ValueError if a row or `met` is of the wrong length.
+    """
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence]
+    met: Sequence[bool | None] = field(default=())
+    notes: Sequence[str] = field(default=())
+
+    def __post_init__(self):
+        for i, row in enumerate(self.rows):
+            if len(row) != len(self.columns):
+                raise ValueError(
+                    f"Table row {i} has {len(row)} cells, expected "
+                    f"{len(self.columns)} ({', '.join(self.columns)})"
+                )
+        if len(self.met) not in (0, len(self.rows)):
+            raise ValueError(
+                f"Table.met has {len(self.met)} entries, expected one per row "
+                f"({len(self.rows)})"
+            )
+
+    @property
+    def missed(self) -> int:
+        """How many rows miss their stated target."""
+        return sum(1 for met in self.met if met is not None and not met)
+
+    def _cells(self) -> tuple[list[str], list[list[str]]]:
+        """Heads and rows as text; with a last column for the targets, if any."""
+        heads = [str(c) for c in self.columns]
+        rows = [[format_cell(value) for value in row] for row in self.rows]
+        if any(met is not None for met in self.met):
+            heads.append("target")
+            for row, met in zip(rows, self.met, strict=True):
+                row.append("" if met is None else "met" if met else "MISSED")
+        return heads, rows
+
+    def to_text(self) -> str:
+        """Aligned columns; numbers at the right, the title above."""
+        heads, rows = self._cells()
+        widths = [max(map(len, col)) for col in zip(heads, *rows, strict=True)]
+        right = [
+            bool(self.rows) and all(_is_number(row[j]) for row in self.rows)
+            for j in range(len(self.columns))
+        ] + [False] * (len(heads) - len(self.columns))
+
+        def line(cells):
+            pad = [
+                c.rjust(w) if r else c.ljust(w)
+                for c, w, r in zip(cells, widths, right, strict=True)
+            ]
+            return "  ".join(pad).rstrip()
+
+        rule = "  ".join("-" * w for w in widths)
+        lines = [self.title, "", line(heads), rule, *map(line, rows), *self.notes]
+        return "\n".join(lines) + "\n"
+
+    def to_markdown(self) -> str:
+        """The same as a Markdown section."""
+        heads, rows = self._cells()
+
+        def line(cells):
+            return "| " + " | ".join(c.replace("|", "\\|") for c in cells) + " |"
+
+        lines = [f"## {self.title}", "", line(heads), "|" + "---|" * len(heads)]
+        lines += map(line, rows)
+        if self.notes:
+            lines += ["", *self.notes]
+        return "\n".join(lines) + "\n"
+
+    def to_dict(self) -> dict:
+        """For JSON: title, columns, one {column: value} per row with `met`, notes."""
+        met = self.met or [None] * len(self.rows)
+        rows = [
+            dict(zip(self.columns, map(json_value, row), strict=True))
+            | ({} if m is None else {"met": bool(m)})
+            for row, m in zip(self.rows, met, strict=True)
+        ]
+        return {
+            "title": self.title,
+            "columns": list(self.columns),
+            "rows": rows,
+            "notes": list(self.notes),
+        }
+
+
+def _is_number(value) -> bool:
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
+
+
+def format_cell(value) -> str:
+    """A value as a person reads it: four significant digits, yes and no, - for none."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, float | np.floating):
+        return f"{float(value):.4g}"
+    return " ".join(str(value).split())
+
+
+def json_value(value):
+    """A scalar as JSON has it: numpy becomes Python, NaN and infinity become None."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value

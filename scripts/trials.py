@@ -1,0 +1,180 @@
+"""Runs one experiment many times, each in a process of its own, several at once."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from tqdm import tqdm
+
+import makebreak
+from makebreak.scripts.experiments import load_experiment
+from makebreak.scripts.settings import apply_settings, dump_config
+
+_COMMAND = (sys.executable, "-m", "makebreak")
+
+
+def setting_texts(settings: Mapping) -> list[str]:
+    """{field: value} as the texts that follow --set."""
+    return [
+        f"{key}={value if isinstance(value, str) else json.dumps(value)}"
+        for key, value in settings.items()
+    ]
+
+
+def config_text(experiment: str, settings: Sequence[str], seed: int | None) -> str:
+    """The config.yaml that a run of these settings writes."""
+    config = apply_settings(load_experiment(experiment).Config(), settings)
+    if seed is not None:
+        config = apply_settings(config, [f"seed={seed}"])
+    return dump_config(config)
+
+
+def _folder(settings: Mapping, seed: int) -> str:
+    """A folder name that tells what was run."""
+    texts = [re.sub(r"[^\w.=+-]", "", text) for text in setting_texts(settings)]
+    return "_".join([*texts, f"seed={seed}"])[:120]
+
+
+def _environment() -> dict[str, str]:
+    """One thread per process, and this very package on the path."""
+    env = dict(os.environ)
+    for name in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
+        env[f"{name}_NUM_THREADS"] = "1"
+    root = str(Path(makebreak.__file__).resolve().parent.parent)
+    env["PYTHONPATH"] = os.pathsep.join(filter(None, [root, env.get("PYTHONPATH")]))
+    return env
+
+
+def _read(folder: Path, status: int | None) -> dict:
+    """The result of a run that has ended, or what its last line on stderr says."""
+    if status in (0, 1):
+        try:
+            return json.loads((folder / "result.json").read_text())
+        except (OSError, ValueError):
+            pass
+    try:
+        log = (folder / "log.txt").read_text(errors="replace")
+    except OSError:
+        log = ""
+    lines = [line.strip() for line in re.split(r"[\r\n]+", log) if line.strip()]
+    error = lines[-1] if lines else "no output"
+    return {"success": False, "error": f"exit status {status}: {error}"}
+
+
+def run_many(
+    experiment: str,
+    runs: Sequence[tuple[Mapping, int]],
+    jobs: int,
+    out_dir: Path,
+    duration: float | None = None,
+    reuse: bool = False,
+    command: Sequence[str] = _COMMAND,
+) -> list[dict]:
+    """Runs `makebreak run experiment` once per (settings, seed), `jobs` at a time.
+
+    A run that fails is reported and does not stop the others. Ctrl-C, or SIGTERM, ends
+    all of them.
+
+    Args:
+        experiment: its name.
+        runs: ({field: value}, seed) of each run.
+        jobs: how many run at once.
+        out_dir: each run's files go to a subfolder, named after its settings.
+        duration: overrides the experiment's own [s].
+        reuse: whether a run that has already ended there, with the same settings and
+            duration, is read instead of repeated.
+        command: what starts makebreak.
+    Returns: per run its result.json with `seed` and `out_dir` added; of a failed one
+        `success` False and `error`, the last line that it printed.
+    Raises: ValueError if jobs is below 1 or two runs are the same.
+    """
+    if jobs < 1:
+        raise ValueError(f"jobs: got {jobs}, expected 1 or more")
+    folders = [Path(out_dir) / _folder(settings, seed) for settings, seed in runs]
+    for i, folder in enumerate(folders):
+        if folder in folders[:i]:
+            raise ValueError(f"runs: {folder.name} is there twice, expected once")
+    results: list[dict | None] = [None] * len(runs)
+    waiting = list(range(len(runs)))
+    running: dict[int, subprocess.Popen] = {}
+    env = _environment()
+
+    def terminate(*_):
+        raise SystemExit(143)
+
+    try:
+        old = signal.signal(signal.SIGTERM, terminate)
+    except ValueError:  # Not in the main thread: nobody sends it there.
+        old = None
+    try:
+        with tqdm(total=len(runs), desc=experiment, unit="run", file=sys.stderr) as bar:
+            while waiting or running:
+                while waiting and len(running) < jobs:
+                    i = waiting.pop(0)
+                    settings, seed = runs[i]
+                    texts = setting_texts(settings)
+                    if reuse and _is_done(
+                        folders[i], experiment, texts, seed, duration
+                    ):
+                        results[i] = _read(folders[i], 0)
+                        bar.update()
+                        continue
+                    args = [*command, "run", experiment, "--no-meshcat"]
+                    args += ["--seed", str(seed), "--out", str(folders[i])]
+                    args += [a for text in texts for a in ("--set", text)]
+                    if duration is not None:
+                        args += ["--duration", repr(float(duration))]
+                    folders[i].mkdir(parents=True, exist_ok=True)
+                    with (folders[i] / "log.txt").open("wb") as log:
+                        running[i] = subprocess.Popen(
+                            args,
+                            stdin=subprocess.DEVNULL,
+                            stdout=log,
+                            stderr=subprocess.STDOUT,
+                            env=env,
+                            start_new_session=True,  # Ctrl-C reaches us alone.
+                        )
+                for i, process in list(running.items()):
+                    status = process.poll()
+                    if status is None:
+                        continue
+                    del running[i]
+                    results[i] = result = _read(folders[i], status)
+                    if "error" in result:
+                        bar.write(f"{folders[i].name}: {result['error']}", sys.stderr)
+                    bar.update()
+                if running:
+                    time.sleep(0.05)
+    finally:
+        for process in running.values():
+            process.kill()
+        for process in running.values():
+            process.wait()
+        if old is not None:
+            signal.signal(signal.SIGTERM, old)
+    return [
+        {**(result or {}), "seed": seed, "out_dir": str(folder)}
+        for result, (_, seed), folder in zip(results, runs, folders, strict=True)
+    ]
+
+
+def duration_line(duration: float | None) -> str:
+    """The comment at the head of config.yaml, which tells of --duration."""
+    return f"# duration_sec: {'default' if duration is None else float(duration)}\n"
+
+
+def _is_done(folder: Path, experiment: str, texts, seed, duration) -> bool:
+    """Whether the folder holds the result of the very same run."""
+    try:
+        text = (folder / "config.yaml").read_text()
+        result = json.loads((folder / "result.json").read_text())
+    except (OSError, ValueError):
+        return False
+    same = text == duration_line(duration) + config_text(experiment, texts, seed)
+    return same and not result.get("interrupted")
