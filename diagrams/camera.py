@@ -1,0 +1,179 @@
+"""The overhead camera: rendered where the graphics libraries are, else drawn."""
+
+import functools
+import subprocess
+import sys
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.geometry import (
+    ClippingRange,
+    ColorRenderCamera,
+    DepthRange,
+    DepthRenderCamera,
+    LightParameter,
+    MakeRenderEngineVtk,
+    RenderCameraCore,
+    RenderEngineVtkParams,
+    SceneGraph,
+)
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import DiagramBuilder, OutputPort
+from pydrake.systems.sensors import CameraInfo, RgbdSensor
+
+from makebreak.systems.camera_shake import CameraShake
+from makebreak.systems.numerics.pinhole import LIGHTS, Pinhole, look_down
+from makebreak.systems.pinhole_camera import PinholeCamera
+
+# Drake's VTK picture lies half a pixel towards -u and -v of what its CameraInfo says
+# (tests/test_camera.py measures it); the drawn one lies where VTK's does.
+VTK_CENTER_SHIFT = -0.5  # [px]
+
+# Run in a process of its own: with libegl1 but without Mesa's drivers Drake does not
+# raise, it crashes.
+_PROBE = """
+from pydrake.geometry import (ClippingRange, ColorRenderCamera, MakeRenderEngineVtk,
+                              RenderCameraCore, RenderEngineVtkParams)
+from pydrake.math import RigidTransform
+from pydrake.systems.sensors import CameraInfo, ImageRgba8U
+engine = MakeRenderEngineVtk(RenderEngineVtkParams())
+core = RenderCameraCore("", CameraInfo(8, 8, 1.0), ClippingRange(0.1, 1.0),
+                        RigidTransform())
+engine.RenderColorImage(ColorRenderCamera(core, False), ImageRgba8U(8, 8))
+"""
+
+
+@dataclass
+class CameraConfig:
+    width: int = 320  # [px]
+    height: int = 240  # [px]
+    fov_y: float = 0.7  # [rad], of the picture's height (along world x).
+    position: list[float] = field(default_factory=lambda: [0.5, 0.0, 0.8])  # [m]
+    renderer: str = "auto"  # "vtk", "drawn", or "auto": vtk where it works.
+    position_noise_m: float = 0.0  # Standard deviation of a frame's shift, each way,
+    noise_height: float = 0.0315  # as seen at this height above the world's z = 0 [m].
+    period_sec: float = 0.0125  # Of a frame.
+
+
+@functools.cache
+def vtk_works() -> bool:
+    """Whether Drake can render here; tried once, in a process of its own."""
+    try:
+        probe = subprocess.run(
+            [sys.executable, "-c", _PROBE], capture_output=True, timeout=120
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return probe.returncode == 0
+
+
+def resolve_renderer(config: CameraConfig) -> str:
+    """ "vtk" or "drawn": which one this config means on this machine.
+
+    Raises: ValueError for another name, and for "vtk" where Drake cannot render.
+    """
+    if config.renderer not in ("auto", "vtk", "drawn"):
+        raise ValueError(
+            f"camera.renderer is {config.renderer!r}, expected auto, vtk or drawn"
+        )
+    if config.renderer == "drawn":
+        return "drawn"
+    if vtk_works():
+        return "vtk"
+    if config.renderer == "vtk":
+        raise ValueError(
+            "camera.renderer is 'vtk', but Drake cannot render here (it needs the "
+            "packages libegl1 and libgl1-mesa-dri); expected auto or drawn"
+        )
+    return "drawn"
+
+
+def describe_camera(config: CameraConfig) -> str:
+    """As result.json has it, like "vtk 320x240"."""
+    return f"{resolve_renderer(config)} {config.width}x{config.height}"
+
+
+def camera_model(config: CameraConfig) -> Pinhole:
+    """The pinhole model that fits the pictures of either renderer."""
+    return look_down(
+        config.width, config.height, config.fov_y, config.position, VTK_CENTER_SHIFT
+    )
+
+
+def add_camera(
+    builder: DiagramBuilder,
+    scene_graph: SceneGraph,
+    plant: MultibodyPlant,
+    config: CameraConfig,
+    seed: int,
+    name: str = "overhead",
+) -> OutputPort:
+    """Adds a camera that looks straight down, +x of the world up in its picture.
+
+    Args: plant, finalized; seed of the random shifts.
+    Returns: the abstract ImageRgba8U port; a picture is made when it is evaluated.
+    Raises: ValueError for a config that makes no camera.
+    """
+    if not config.position_noise_m >= 0.0:
+        raise ValueError(
+            f"position_noise_m must be at least 0, got {config.position_noise_m}"
+        )
+    depth = config.position[2] - config.noise_height
+    if not depth > 0.0:
+        raise ValueError(
+            f"the camera at height {config.position[2]} must be above noise_height, "
+            f"{config.noise_height}"
+        )
+    camera = camera_model(config)
+    if resolve_renderer(config) == "vtk":
+        port = _add_vtk(builder, scene_graph, config, camera, name)
+    else:
+        drawn = builder.AddNamedSystem(
+            f"{name}_camera", PinholeCamera(camera, plant, scene_graph)
+        )
+        builder.Connect(
+            plant.get_body_poses_output_port(), drawn.GetInputPort("body_poses")
+        )
+        port = drawn.GetOutputPort("rgb_image")
+    if config.position_noise_m == 0.0:
+        return port
+    shift_std_px = config.position_noise_m * camera.focal / depth
+    shake = builder.AddNamedSystem(
+        f"{name}_shake",
+        CameraShake(config.width, config.height, shift_std_px, seed, config.period_sec),
+    )
+    builder.Connect(port, shake.GetInputPort("image"))
+    return shake.GetOutputPort("rgb_image")
+
+
+def _add_vtk(builder, scene_graph, config, camera, name):
+    renderer = f"{name}_renderer"
+    lights = [
+        LightParameter(
+            type="directional",
+            frame="camera",
+            intensity=light[0],
+            direction=light[1:],
+        )
+        for light in LIGHTS
+    ]
+    engine = MakeRenderEngineVtk(RenderEngineVtkParams(lights=lights))
+    scene_graph.AddRenderer(renderer, engine)
+    core = RenderCameraCore(
+        renderer,
+        CameraInfo(config.width, config.height, config.fov_y),
+        ClippingRange(0.01, 10.0),
+        RigidTransform(),
+    )
+    sensor = RgbdSensor(
+        scene_graph.world_frame_id(),
+        RigidTransform(RotationMatrix(camera.R_WC), camera.p_WC),
+        ColorRenderCamera(core, False),
+        DepthRenderCamera(core, DepthRange(0.01, 10.0)),
+    )
+    builder.AddNamedSystem(f"{name}_camera", sensor)
+    builder.Connect(
+        scene_graph.get_query_output_port(), sensor.query_object_input_port()
+    )
+    return sensor.color_image_output_port()
