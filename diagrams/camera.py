@@ -5,7 +5,6 @@ import subprocess
 import sys
 from dataclasses import dataclass, field
 
-import numpy as np
 from pydrake.geometry import (
     ClippingRange,
     ColorRenderCamera,
