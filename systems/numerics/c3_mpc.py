@@ -1,0 +1,464 @@
+"""Consensus complementarity control: model predictive control through contact.
+
+ADMM on z_k = [x_k, lam_k, u_k] (for C3+ also eta_k, the gap velocity): copies delta of
+z obey the complementarity, z obeys the dynamics, and w drives them together. A round:
+
+    1. z <- argmin  sum (x - x_desired)'Q(x - x_desired) + (u - u_prev)'R(u - u_prev)
+                        + |z - (delta - w)|^2_G  subject to dynamics, x_0, bounds
+       (c3_qp.py; the last knot's state is weighed by Q_N)
+    2. delta <- projection of z + w, knot by knot (c3_projections.py)
+    3. w <- (w + z - delta) / rho,  G <- rho G
+
+and after the last round step 1 once more gives the plan (for C3+ with the target delta
+instead of delta - w). Where u does not act on the gap (H = 0), lam_0 follows from x_0
+alone and is fixed beforehand.
+
+Source: Aydinoglu, Wei, Huang, Posa, arXiv:2304.11259, algorithm 1; ACI-MPC section IV.
+docs/c3.md lists every choice in which implementations differ.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from makebreak.systems.numerics import c3_projections as projections
+from makebreak.systems.numerics.c3_projections import (
+    PlusProjection,
+    Projection,
+    QpProjection,
+)
+from makebreak.systems.numerics.c3_qp import (
+    factor,
+    new_factor,
+    solve,
+    solve_bounded,
+    within,
+)
+from makebreak.systems.numerics.lcp import SOLVED, solve_lcp_kernel
+from makebreak.systems.numerics.lcs import LCS, simulate
+
+
+class C3Failure(RuntimeError):
+    """A solve that has no result, with the reason: bounds, an LCP, an indefinite QP."""
+
+
+@dataclass
+class C3Weights:
+    """Diagonals, or matrices (G and U: diagonal ones), in the units of 1 / z^2."""
+
+    Q: np.ndarray  # (n_x,) state, >= 0.
+    R: np.ndarray  # (n_u,) input, >= 0, and with G's u part > 0.
+    G: np.ndarray  # (n_z,) consensus; lam and eta > 0, x and u >= 0.
+    U: np.ndarray  # (n_z,) projection; lam and eta > 0, x and u >= 0.
+    Q_N: np.ndarray | None = None  # (n_x,) last state; None: Q.
+
+
+@dataclass
+class C3Options:
+    N: int = 5  # Knots, each lcs.dt long.
+    rounds: int = 3  # ADMM rounds.
+    rho: float = 2.0  # Growth of G per round, >= 1.
+    penalise_input_change: bool = False  # (u - u_prev)'R(u - u_prev), else u'R u.
+    scale_lam: bool = False  # Solve in lam / s, s = |A|_F / |D|_F.
+    start_at_x0: bool = False  # delta starts with x_0 in its x part instead of zero.
+    warm_start: bool = False  # delta and w start where the last solve ended.
+
+
+@dataclass
+class C3Bounds:
+    """Of every u_k and of x_1 .. x_N; None, or infinite entries: no bound."""
+
+    u_lower: np.ndarray | None = None  # (n_u,) [N]
+    u_upper: np.ndarray | None = None  # (n_u,) [N]
+    x_lower: np.ndarray | None = None  # (n_x,) [SI]
+    x_upper: np.ndarray | None = None  # (n_x,) [SI]
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What C3 intends; u obeys its bounds exactly, x to 1e-6 of their size."""
+
+    x: np.ndarray  # (N + 1, n_x) [SI]
+    u: np.ndarray  # (N, n_u) [N]
+    lam: np.ndarray  # (N, n_lam) [N]; complementary only as far as ADMM got.
+    status: int = 0  # 0: of this tick. Else the reason why it is an older one.
+
+    def __post_init__(self):
+        for name in ("x", "u", "lam"):
+            getattr(self, name).setflags(write=False)
+
+
+@dataclass(frozen=True, eq=False)
+class WarmStart:
+    """A solve's memory; lam and eta parts are unscaled, w is that of the first G."""
+
+    u: np.ndarray  # (N, n_u) last inputs, for the input-change penalty [N]
+    delta: np.ndarray  # (N, n_z)
+    w: np.ndarray  # (N, n_z)
+
+    def shifted(self, knots: float) -> "WarmStart":
+        """delta and w moved ahead in time by knots (0 .. 1), linear between knots."""
+
+        def ahead(a):
+            return (1.0 - knots) * a + knots * np.vstack([a[1:], a[-1:]])
+
+        return WarmStart(self.u, ahead(self.delta), ahead(self.w))
+
+
+class C3Problem:
+    """Weights, projection, options and bounds, checked once and ready for `solve_c3`.
+
+    Raises: ValueError, naming the entry, where one is of the wrong shape or sign.
+    """
+
+    def __init__(
+        self,
+        weights: C3Weights,
+        projection: Projection | None = None,
+        options: C3Options | None = None,
+        bounds: C3Bounds | None = None,
+    ):
+        self.projection = PlusProjection() if projection is None else projection
+        self.options = C3Options() if options is None else options
+        _check_options(self.options, self.projection)
+        self.is_plus = isinstance(self.projection, PlusProjection)
+        self.Q, self.R = _square("Q", weights.Q), _square("R", weights.R)
+        self.Q_N = self.Q if weights.Q_N is None else _square("Q_N", weights.Q_N)
+        self.n_x, self.n_u = len(self.Q), len(self.R)
+        if self.Q_N.shape != self.Q.shape:
+            raise ValueError(
+                f"C3Weights.Q_N is {self.Q_N.shape}, expected {self.Q.shape} as Q"
+            )
+        self.G, self.U = _diagonal("G", weights.G), _diagonal("U", weights.U)
+        self.n_z = self.G.size
+        n_contact = self.n_z - self.n_x - self.n_u
+        self.n_lam = n_contact // 2 if self.is_plus else n_contact
+        self._check_consensus_weights(n_contact)
+        bounds = C3Bounds() if bounds is None else bounds
+        self.lower = self._bound(-np.inf, u=bounds.u_lower, x=bounds.x_lower)
+        self.upper = self._bound(np.inf, u=bounds.u_upper, x=bounds.x_upper)
+        for i in np.flatnonzero(~(self.lower < self.upper)):
+            raise ValueError(
+                f"C3Bounds: {self.lower[i]} to {self.upper[i]} for entry "
+                f"{i - self.n_lam} of [u, x], expected lower < upper"
+            )
+
+    def _check_consensus_weights(self, n_contact):
+        parts = "[x, lam, u, eta]" if self.is_plus else "[x, lam, u]"
+        odd = self.is_plus and n_contact % 2
+        if n_contact < 1 or odd or self.U.size != self.n_z:
+            raise ValueError(
+                f"C3Weights: G has {self.n_z} and U {self.U.size} entries, expected one "
+                f"per entry of {parts} with {self.n_x} of x and {self.n_u} of u"
+            )
+        i_u = self.n_x + self.n_lam
+        needed = np.zeros(self.n_z, bool)
+        needed[self.n_x : i_u] = needed[i_u + self.n_u :] = True
+        for name, weight in (("G", self.G), ("U", self.U)):
+            if name == "U" and not self.is_plus:
+                needed[: self.n_x] = True  # That projection moves x.
+            for i in np.flatnonzero((weight < 0.0) | (needed & (weight == 0.0))):
+                raise ValueError(
+                    f"C3Weights.{name}[{i}] is {weight[i]}, expected "
+                    f"{'> 0' if needed[i] else '>= 0'} (order {parts})"
+                )
+        G_u = self.G[i_u : i_u + self.n_u]
+        if not np.linalg.eigvalsh(self.R + np.diag(G_u))[0] > 0.0:
+            raise ValueError(
+                f"C3Weights: R = {self.R.tolist()} and G of u = {G_u} leave an input "
+                "without cost, expected R + G > 0"
+            )
+
+    def _bound(self, unbounded, u, x):
+        """A bound over [lam, u, x]; lam has none here (the projection keeps it)."""
+        parts = [np.full(self.n_lam, unbounded)]
+        for name, value, n in (("u", u, self.n_u), ("x", x, self.n_x)):
+            part = np.full(n, unbounded) if value is None else np.asarray(value, float)
+            if part.shape != (n,) or np.isnan(part).any():
+                raise ValueError(
+                    f"C3Bounds: {name} is bounded by {part}, expected {n} numbers"
+                )
+            parts.append(part)
+        return _read_only(np.concatenate(parts))
+
+    def cold_start(self) -> WarmStart:
+        N = self.options.N
+        z = np.zeros((N, self.n_z))
+        return WarmStart(np.zeros((N, self.n_u)), z, z)
+
+
+def _check_options(o: C3Options, projection: Projection):
+    if o.N < 1 or o.rounds < 0:
+        raise ValueError(
+            f"C3Options: N = {o.N} knots and rounds = {o.rounds}, expected N >= 1 and "
+            "rounds >= 0"
+        )
+    if not 1.0 <= o.rho < np.inf:
+        raise ValueError(f"C3Options.rho is {o.rho}, expected a number >= 1")
+    if isinstance(projection, QpProjection) and not 0.0 < projection.alpha <= 1.0:
+        raise ValueError(
+            f"QpProjection.alpha is {projection.alpha}, expected more than 0, at most 1"
+        )
+
+
+def _read_only(a):
+    a = np.array(a, dtype=float, order="C")
+    a.setflags(write=False)
+    return a
+
+
+def _square(name, weight):
+    """A symmetric positive semi-definite matrix, from it or from its diagonal."""
+    weight = np.atleast_1d(np.asarray(weight, dtype=float))
+    matrix = np.diag(weight) if weight.ndim == 1 else weight
+    n = matrix.shape[0]
+    if matrix.shape != (n, n) or n == 0 or not np.isfinite(matrix).all():
+        raise ValueError(
+            f"C3Weights.{name} is {weight}, expected finite numbers, a diagonal or a "
+            "square matrix"
+        )
+    size = abs(matrix).max()
+    if abs(matrix - matrix.T).max() > 1e-9 * size:
+        raise ValueError(f"C3Weights.{name} is not symmetric: {matrix.tolist()}")
+    least = np.linalg.eigvalsh(matrix)[0]
+    if least < -1e-9 * size:
+        raise ValueError(
+            f"C3Weights.{name} has the eigenvalue {least:.3g}, expected none below 0"
+        )
+    return _read_only(0.5 * (matrix + matrix.T))
+
+
+def _diagonal(name, weight):
+    weight = np.asarray(weight, dtype=float)
+    if weight.ndim == 2 and weight.shape[0] == weight.shape[1]:
+        if np.count_nonzero(weight - np.diag(np.diag(weight))):
+            raise ValueError(f"C3Weights.{name} is not diagonal, expected a diagonal")
+        weight = np.diag(weight)
+    if weight.ndim != 1 or not np.isfinite(weight).all():
+        raise ValueError(f"C3Weights.{name} is {weight}, expected finite numbers")
+    return _read_only(weight)
+
+
+# What the compiled loop returns.
+_FAILURES = {
+    1: "lam_0: the LCP at x_0 has no solution",
+    2: "the QP is not strictly convex, or its numbers are not finite",
+    3: "no plan meets the bounds",
+    4: "the projection's LCP was not solved",
+}
+
+
+def solve_c3(lcs: LCS, x0, x_desired, problem: C3Problem, warm: WarmStart | None = None):
+    """One solve of C3, from the state x0.
+
+    Args:
+        lcs: the model, one for the whole horizon.
+        x0: (n_x,) [SI].
+        x_desired: (N + 1, n_x), row k the target at knot k.
+        problem: weights, projection, options, bounds.
+        warm: what the last solve returned; None: a first solve. Its u is the u_prev of
+            the input-change penalty; its delta and w are used if options.warm_start.
+
+    Returns: Plan, and the WarmStart for the next solve.
+    Raises: ValueError on wrong shapes; C3Failure where there is no result.
+    """
+    p, o = problem, problem.options
+    x0, x_desired = np.asarray(x0, float), np.asarray(x_desired, float)
+    if (lcs.n_x, lcs.n_u, lcs.n_lam) != (p.n_x, p.n_u, p.n_lam):
+        raise ValueError(
+            f"solve_c3: the LCS has (n_x, n_u, n_lam) = {lcs.n_x, lcs.n_u, lcs.n_lam}, "
+            f"expected {p.n_x, p.n_u, p.n_lam} as the weights"
+        )
+    if x0.shape != (p.n_x,) or x_desired.shape != (o.N + 1, p.n_x):
+        raise ValueError(
+            f"solve_c3: x0 is {x0.shape} and x_desired {x_desired.shape}, expected "
+            f"{(p.n_x,)} and {(o.N + 1, p.n_x)}"
+        )
+    kind, alpha = projections.PLUS, 0.0
+    if isinstance(p.projection, QpProjection):
+        kind, alpha = projections.QP, p.projection.alpha
+    elif not p.is_plus:
+        kind = projections.EXACT
+    if kind != projections.PLUS:
+        U_u = p.U[p.n_x + p.n_lam :]
+        for i in np.flatnonzero((U_u == 0.0) & lcs.H.any(axis=0)):
+            raise ValueError(
+                f"C3Weights.U is 0 for u[{i}], expected > 0 where it acts on the gap"
+            )
+    warm = problem.cold_start() if warm is None else warm
+    delta, w = np.array(warm.delta), np.array(warm.w)
+    if not o.warm_start:
+        delta[:], w[:] = 0.0, 0.0
+        if o.start_at_x0:
+            delta[:, : p.n_x] = x0
+    scale = 1.0
+    if o.scale_lam:
+        scale = np.linalg.norm(lcs.A) / np.linalg.norm(lcs.D)
+        if not np.isfinite(scale):
+            raise C3Failure("D is zero or not finite: there is no scale for lam")
+    # Contact entries of z count in units of scale.
+    unit = np.ones(p.n_z)
+    unit[p.n_x : p.n_x + p.n_lam] = unit[p.n_x + p.n_lam + p.n_u :] = scale
+    delta /= unit
+    w /= unit
+    Ru = warm.u @ p.R if o.penalise_input_change else np.zeros((o.N, p.n_u))
+    status, x, v = _admm(
+        kind, alpha, o.rounds, o.rho,
+        (lcs.A, lcs.B, lcs.D * scale, lcs.d, lcs.E / scale, lcs.F, lcs.H / scale,
+         lcs.c / scale),
+        (p.Q, p.R, p.Q_N, p.G, p.U), (p.lower, p.upper),
+        x0, x_desired, Ru, delta, w,
+    )
+    if status:
+        raise C3Failure(_FAILURES[status])
+    plan = Plan(x, np.ascontiguousarray(v[:, p.n_lam :]), v[:, : p.n_lam] * scale)
+    return plan, WarmStart(plan.u, delta * unit, w * (unit * o.rho**o.rounds))
+
+
+@njit(cache=True)
+def _admm(
+    kind, alpha, rounds, rho, lcs, weights, bounds, x0, x_desired, Ru, delta, w
+):
+    """The rounds and the last QP; delta and w (N, n_z) are updated in place.
+
+    Returns: a status (_FAILURES; 0: solved), x (N + 1, n_x) and v (N, n_lam + n_u).
+    """
+    A, B, D, d, E, F, H, c = lcs
+    Q, R, Q_N, G0, U = weights
+    lower, upper = bounds
+    n_x, n_u = B.shape
+    n_lam = D.shape[1]
+    n_v, i_u, i_eta = n_lam + n_u, n_x + n_lam, n_x + n_lam + n_u
+    n = n_v + n_x
+    N, n_z = delta.shape
+    plus = kind == projections.PLUS
+    AB, C = np.empty((n_x, n)), np.empty((n_lam, n))
+    AB[:, :n_lam], AB[:, n_lam:n_v], AB[:, n_v:] = D, B, A
+    C[:, :n_lam], C[:, n_lam:n_v], C[:, n_v:] = F, H, E
+    x, v = np.zeros((N + 1, n_x)), np.zeros((N, n_v))
+    lam0 = np.empty(0)
+    if not H.any():
+        q = c.copy()
+        for i in range(n_lam):
+            for j in range(n_x):
+                q[i] += E[i, j] * x0[j]
+        lam0, lcp_status = solve_lcp_kernel(np.ascontiguousarray(F), q)
+        if lcp_status != SOLVED:
+            return 1, x, v
+    V, K = np.zeros((0, 0)), np.zeros((0, 0))
+    if not plus:
+        V, K = projections.projection_matrices(U, E, F, H)
+    bounded = False
+    for i in range(n):
+        bounded = bounded or np.isfinite(lower[i]) or np.isfinite(upper[i])
+    h_desired = np.empty((N + 1, n_x))
+    for k in range(N + 1):
+        for i in range(n_x):
+            total = 0.0
+            for j in range(n_x):
+                total += (Q_N[i, j] if k == N else Q[i, j]) * x_desired[k, j]
+            h_desired[k, i] = total
+    fac = new_factor(AB, d, N)
+    no_barrier = np.zeros((0, 0))
+    G, T, h = G0.copy(), np.empty((n, n)), np.zeros((N + 1, n))
+    z, target = np.empty((N, n_z)), np.empty(n_z)
+    zw = np.empty(n_z)
+    h[N, n_v:] = h_desired[N]
+    for it in range(rounds + 1):
+        # Stage cost and right-hand side: the planning cost, and |z - target|^2_G with
+        # eta = C [v, x] + c put in.
+        T[:] = 0.0
+        for i in range(n_x):
+            for j in range(n_x):
+                T[n_v + i, n_v + j] = Q[i, j]
+            T[n_v + i, n_v + i] += G[i]
+        for i in range(n_u):
+            for j in range(n_u):
+                T[n_lam + i, n_lam + j] = R[i, j]
+            T[n_lam + i, n_lam + i] += G[i_u + i]
+        for i in range(n_lam):
+            T[i, i] = G[n_x + i]
+        if plus:
+            for m in range(n_lam):
+                for i in range(n):
+                    a = C[m, i] * G[i_eta + m]
+                    if a != 0.0:
+                        for j in range(n):
+                            T[i, j] += a * C[m, j]
+        for k in range(N):
+            for i in range(n_z):
+                target[i] = delta[k, i]
+                if not (plus and it == rounds):
+                    target[i] -= w[k, i]
+            for i in range(n_lam):
+                h[k, i] = G[n_x + i] * target[n_x + i]
+            for i in range(n_u):
+                h[k, n_lam + i] = Ru[k, i] + G[i_u + i] * target[i_u + i]
+            for i in range(n_x):
+                h[k, n_v + i] = h_desired[k, i] + G[i] * target[i]
+            if plus:
+                for m in range(n_lam):
+                    a = G[i_eta + m] * (target[i_eta + m] - c[m])
+                    for i in range(n):
+                        h[k, i] += a * C[m, i]
+        if not factor(fac, T, Q_N, no_barrier, lam0.size):
+            return 2, x, v
+        solve(fac, h, x0, lam0, x, v)
+        if bounded and not within(x, v, lower, upper):
+            if not solve_bounded(fac, T, Q_N, h, x0, lam0, lower, upper, x, v):
+                return 3, x, v
+        if it == rounds:
+            break
+        for k in range(N):
+            z[k, :n_x] = x[k]
+            z[k, n_x:i_eta] = v[k]
+            if plus:
+                for m in range(n_lam):
+                    total = c[m]
+                    for i in range(n_v):
+                        total += C[m, i] * v[k, i]
+                    for i in range(n_x):
+                        total += C[m, n_v + i] * x[k, i]
+                    z[k, i_eta + m] = total
+            for i in range(n_z):
+                zw[i] = z[k, i] + w[k, i]
+            if kind == projections.PLUS:
+                projections.project_plus(zw, U, n_x, n_lam, n_u, delta[k])
+            elif kind == projections.QP:
+                if not projections.project_qp(
+                    zw, alpha, E, F, H, c, V, K, delta[k]
+                ):
+                    return 4, x, v
+            elif not projections.project_exact(
+                zw, U, E, F, H, c, V, K, delta[k]
+            ):
+                return 4, x, v
+            for i in range(n_z):
+                w[k, i] = (zw[i] - delta[k, i]) / rho
+        for i in range(n_z):
+            G[i] *= rho
+    for k in range(N):
+        for i in range(n_v):
+            if not np.isfinite(v[k, i]):
+                return 2, x, v
+        for i in range(n_x):
+            if not np.isfinite(x[k + 1, i]):
+                return 2, x, v
+    return 0, x, v
+
+
+def plan_cost(lcs: LCS, x0, u, x_desired, problem: C3Problem) -> float:
+    """What the inputs u (N, n_u) really cost: rolled out with exact contact forces.
+
+    Returns: sum (x - x_desired)'Q(x - x_desired) + u'R u, Q_N at the last state. The
+        input-change penalty, ADMM's own terms and the bounds are no part of it.
+    Raises: ValueError if an LCP of the rollout has no solution.
+    """
+    x, cost = np.asarray(x0, float), 0.0
+    for k in range(len(u)):
+        e = x - x_desired[k]
+        cost += e @ problem.Q @ e + u[k] @ problem.R @ u[k]
+        x, _ = simulate(lcs, x, u[k])
+    e = x - x_desired[len(u)]
+    return float(cost + e @ problem.Q_N @ e)
