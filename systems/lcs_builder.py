@@ -14,6 +14,7 @@ See docs/lcs.md for the state's layout, quaternions, units and limits.
 
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from typing import Any
 
 import numpy as np
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, InitializeAutoDiff
@@ -26,7 +27,7 @@ from pydrake.multibody.tree import (
     MultibodyForces,
     MultibodyForces_,
 )
-from pydrake.systems.framework import Diagram, LeafSystem
+from pydrake.systems.framework import BasicVector, Diagram, LeafSystem
 
 from makebreak.systems.numerics.lcs import LCS
 from makebreak.systems.numerics.lcs_builder import (
@@ -141,10 +142,6 @@ class AnitescuLcs:
             return self._model.build(x, u, self.dt_sec, self.eps_c)
         return self._build_general(x, u)
 
-    def gaps(self, x) -> np.ndarray:
-        """Signed distance of each force's contact at the state x: phi (n_lam,) [m]."""
-        return self.build(x, np.zeros(self.n_u)).phi
-
     # The general path: AutoDiff for the smooth dynamics, witness points for contact.
 
     def _build_general(self, x, u):
@@ -190,7 +187,8 @@ class AnitescuLcs:
         phi, J = np.empty(n_c), np.empty((n_c, 3, self.n_v))
         for i, (id_A, id_B) in enumerate(self._geometries):
             pair = query.ComputeSignedDistancePairClosestPoints(id_A, id_B)
-            n, p_A, p_B = pair.nhat_BA_W, pair.p_ACa, pair.p_BCb
+            n: Any = pair.nhat_BA_W  # (3,); the stubs say float.
+            p_A, p_B = pair.p_ACa, pair.p_BCb
             if pair.id_A != id_A:
                 n, p_A, p_B = -n, p_B, p_A
             if not abs(n @ n - 1.0) < 1e-6:
@@ -202,7 +200,7 @@ class AnitescuLcs:
             ) - plant.CalcJacobianTranslationalVelocity(
                 context, wrt, frame_B, X_B @ p_B, world, world
             )
-            t1, t2 = tangent_basis(np.ascontiguousarray(n), self._reference[i])
+            t1, t2 = tangent_basis(n, self._reference[i])
             J[i] = np.stack([n, t1, t2]) @ J_w
         on = self._contact_index
         J_t = (self._edge[:, :, None] * J[on, 1:]).sum(axis=1)
@@ -330,7 +328,7 @@ class AnitescuLcs:
         return *as_pairs, known
 
     def _constant_mass_model(self, scene_graph):
-        """The fast path's data; None where it does not apply (see ConstantMassModel)."""
+        """The fast path's data; None where it does not apply: ConstantMassModel."""
         plant, inspector = self._plant, scene_graph.model_inspector()
         if plant.num_force_elements() != 1:  # Gravity is always there, and constant.
             return None
@@ -340,9 +338,10 @@ class AnitescuLcs:
             if joint.type_name() == "quaternion_floating":
                 body = joint.child_body()
                 I_B = body.default_spatial_inertia()
-                I = I_B.CalcRotationalInertia().CopyToFullMatrix3()
+                inertia = I_B.CalcRotationalInertia().CopyToFullMatrix3()
                 at_origin = not I_B.get_com().any()
-                isotropic = np.abs(I - I[0, 0] * np.eye(3)).max() <= 1e-12 * I[0, 0]
+                unlike = np.abs(inertia - inertia[0, 0] * np.eye(3)).max()
+                isotropic = unlike <= 1e-12 * inertia[0, 0]
                 frames = joint.frame_on_parent(), joint.frame_on_child()
                 if not (
                     at_origin
@@ -360,7 +359,7 @@ class AnitescuLcs:
         f, J_q, J_v, J_u, M = self._smooth(self.x_default, np.zeros(self.n_u))
         f_0 = f - J_v @ self.x_default[self.n_q :]
         ids = list(self._frames)
-        rows = dict(shape=[], size=[], quaternion=[], omega=[])
+        rows: dict[str, list] = dict(shape=[], size=[], quaternion=[], omega=[])
         R, p_0, P, J_p = [], [], [], []
         for id in ids:
             shape = inspector.GetShape(id)
@@ -370,7 +369,7 @@ class AnitescuLcs:
                 rows["size"].append([shape.radius()] * 3)
             elif isinstance(shape, Box):
                 rows["shape"].append(BOX)
-                rows["size"].append(0.5 * shape.size())
+                rows["size"].append([0.5 * length for length in np.array(shape.size())])
             elif isinstance(shape, HalfSpace):
                 rows["shape"].append(HALF_SPACE)
                 rows["size"].append([0.0] * 3)
@@ -444,7 +443,7 @@ class AnitescuLcsBuilder(LeafSystem):
         self._x = self.DeclareVectorInputPort("x", self.model.n_x)
         self._u = self.DeclareVectorInputPort("u", self.model.n_u)
         self._lcs = self.DeclareAbstractState(Value(initial))
-        self._status = self.DeclareDiscreteState([1.0])
+        self._status = self.DeclareDiscreteState(BasicVector([1.0]))
         self.DeclareStateOutputPort("lcs", self._lcs)
         self.DeclareStateOutputPort("status", self._status)
         self.DeclarePeriodicUnrestrictedUpdateEvent(
