@@ -105,7 +105,7 @@ class ResidualLearner(LeafSystem):
         self._dt, self._n_lam = lcs.dt, lcs.n_lam
         self._Q_d = np.array(config.Q_d or np.ones(lcs.n_x), dtype=float)
         self._group = group_of_entry(config.groups, lcs.n_lam)
-        n_groups = self._group.max() + 1
+        n_groups = int(self._group.max()) + 1
         self._x = self.DeclareVectorInputPort("x", lcs.n_x)
         self._u = self.DeclareVectorInputPort("u_measured", lcs.n_u)
         self._lcs = self.DeclareAbstractInputPort("lcs", Value(lcs))
@@ -134,7 +134,9 @@ class ResidualLearner(LeafSystem):
         memory = self._memory_of(context)
         x, u = self._x.Eval(context), self._u.Eval(context)
         lcs = self._lcs.Eval(context)
-        enabled = not self._enable.HasValue(context) or self._enable.Eval(context)[0]
+        enabled = True
+        if self._enable.HasValue(context):
+            enabled = bool(np.greater(self._enable.Eval(context), 0.5).all())
         state.get_mutable_abstract_state(self._memory).set_value(
             self._after(memory, x, u, lcs, enabled)
         )

@@ -185,10 +185,9 @@ def learn(
         QPs were solved (if not, the residual comes back as it was and the loss is nan).
     """
     state = np.stack([getattr(residual, field.name) for field in fields(residual)])
-    solved, loss = _adam(
-        *(getattr(steps, field.name) for field in fields(steps)),
-        *(group, state, eps, gamma, learning_rate, n_steps, r_max, *decay),
-    )
+    data = (steps.P, steps.p, steps.F, steps.q, steps.constant)
+    tuning = (eps, gamma, learning_rate, n_steps, r_max, decay[0], decay[1])
+    solved, loss = _adam(*data, group, state, *tuning)
     return Residual(*state) if solved else residual, loss, solved
 
 
