@@ -1,0 +1,16 @@
+#!/usr/bin/env bash
+# `scripts/run.sh ARGS` is `makebreak run ARGS`, after setting up what is missing.
+# Without arguments: the main job, ball_rolling. Other commands pass as they are:
+# `scripts/run.sh list`, `scripts/run.sh bench`, ...
+set -euo pipefail
+
+here="$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")"
+"$here/setup.sh"
+
+case "${1:-}" in
+    list | run | reproduce | sweep | gap | export-tests | bench) ;;
+    *) set -- run "$@" ;;
+esac
+unset PYTHONPATH PYTHONHOME                     # As in setup.sh.
+export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}" # The matrices are small.
+exec "$here/../.venv/bin/makebreak" "$@"
