@@ -27,7 +27,7 @@ from pydrake.multibody.tree import (
     MultibodyForces,
     MultibodyForces_,
 )
-from pydrake.systems.framework import BasicVector, Diagram, LeafSystem
+from pydrake.systems.framework import Diagram, LeafSystem
 
 from makebreak.systems.numerics.lcs import LCS
 from makebreak.systems.numerics.lcs_builder import (
@@ -171,7 +171,7 @@ class AnitescuLcs:
         plant_ad.CalcForceElementsContribution(context_ad, self._forces_ad)
         f_ad = np.array([AutoDiffXd(value) for value in f])
         tau = plant_ad.CalcInverseDynamics(context_ad, f_ad, self._forces_ad)
-        dtau = ExtractGradient(tau)
+        dtau: Any = ExtractGradient(tau)  # The stubs' array shapes are wrong.
         if dtau.shape[1] == 0:  # Nothing depends on the state.
             dtau = np.zeros((self.n_v, self.n_x))
         J = np.linalg.solve(M, np.hstack([-dtau, self._B_tau]))
@@ -443,7 +443,8 @@ class AnitescuLcsBuilder(LeafSystem):
         self._x = self.DeclareVectorInputPort("x", self.model.n_x)
         self._u = self.DeclareVectorInputPort("u", self.model.n_u)
         self._lcs = self.DeclareAbstractState(Value(initial))
-        self._status = self.DeclareDiscreteState(BasicVector([1.0]))
+        status: Any = [1.0]  # The stubs know no list.
+        self._status = self.DeclareDiscreteState(status)
         self.DeclareStateOutputPort("lcs", self._lcs)
         self.DeclareStateOutputPort("status", self._status)
         self.DeclarePeriodicUnrestrictedUpdateEvent(

@@ -91,8 +91,8 @@ def solve_lcp_kernel(F, q):
                     lam[i] = scale[i] * largest * z[i]
                 return lam, SOLVED
             status = NOT_PRECISE
-    # Where feasible w leave no room (a wedge), rounding in q alone makes a ray. Then the
-    # least regularised F tells: its w is wrong by 1e-12 z, which stays below 1e-9 if
+    # Where feasible w leave no room (a wedge), rounding in q alone makes a ray. Then a
+    # slightly regular F tells: its w is wrong by 1e-12 z, which stays below 1e-9 if
     # there is a solution, and does not shrink with the 1e-12 if there is none.
     for i in range(n):
         M[i, i] += 1e-12
