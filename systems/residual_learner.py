@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from pydrake.common.value import Value
@@ -134,9 +135,10 @@ class ResidualLearner(LeafSystem):
         memory = self._memory_of(context)
         x, u = self._x.Eval(context), self._u.Eval(context)
         lcs = self._lcs.Eval(context)
-        enabled = True
+        enable: Any = [1.0]
         if self._enable.HasValue(context):
-            enabled = bool(np.greater(self._enable.Eval(context), 0.5).all())
+            enable = self._enable.Eval(context)
+        enabled = bool(enable[0] > 0.5)  # False for a NaN, too.
         state.get_mutable_abstract_state(self._memory).set_value(
             self._after(memory, x, u, lcs, enabled)
         )
