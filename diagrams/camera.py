@@ -148,14 +148,17 @@ def add_camera(
 
 def _add_vtk(builder, scene_graph, config, camera, name):
     renderer = f"{name}_renderer"
-    lights = [
+    # The light at the camera is a point, not a direction: so the rim of a sphere is
+    # lit evenly wherever it lies in the picture.
+    lights = [LightParameter(type="point", frame="camera", intensity=LIGHTS[0, 0])]
+    lights += [
         LightParameter(
             type="directional",
             frame="camera",
             intensity=light[0],
             direction=light[1:],
         )
-        for light in LIGHTS
+        for light in LIGHTS[1:]
     ]
     engine = MakeRenderEngineVtk(RenderEngineVtkParams(lights=lights))
     scene_graph.AddRenderer(renderer, engine)

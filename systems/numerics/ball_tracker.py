@@ -1,0 +1,306 @@
+"""Finds a ball of known colour and radius in a picture, and where it lies on a table.
+
+1. "Strength": how much of the ball's hue a pixel has; 0 for every grey.
+2. Hough circles on the strength find the ball.
+3. Rays from beyond the circle inwards: where the strength first rises half-way, there
+   is a point of the outline. Where a ray comes from something other than the table
+   (the finger, which hides a part of the ball), it is dropped.
+4. A sphere's outline is where a cone of rays from the camera touches it: for unit
+   vectors n_i to the outline, axis a and half-angle alpha, n_i . a = cos(alpha). With
+   m = a / cos(alpha) this is linear, n_i . m = 1: exact in perspective, where the
+   outline is an ellipse that is not centred on the sphere's centre.
+5. The axis meets the plane in which the ball's centre lies: the table's height plus
+   the model's radius. The radius that is seen serves only to reject what is no ball.
+"""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numba import njit
+
+from makebreak.systems.numerics.pinhole import Pinhole
+
+N_RAYS = 96
+STEP = 0.5  # [px] along a ray.
+MARGIN = 2  # Rays beside a hidden one that are left out too.
+THIN = 0.85  # Of the usual strength: less, just inside, is a sliver beside the finger.
+SMALLEST, LARGEST = 0.6, 1.6  # Of what the seen radius may be of the model's.
+MIN_STRENGTH = 40.0  # Of 255: less is not the ball's colour.
+MIN_SEEN = 0.3  # Part of the outline that must be seen.
+MAX_MISFIT = 0.75  # [px], rms of the points that a fitted outline keeps.
+OTHER_THAN_TABLE = 80.0  # Of 765 (r + g + b): so different is not the table.
+
+
+class Detection(NamedTuple):
+    """A ball in a picture. The radius is for rejection and reports only."""
+
+    p_WB: np.ndarray  # (3,) [m]
+    seen_radius: float  # [m]
+    seen_part: float  # Of the outline, 0..1.
+
+
+def strength_weights(hue):
+    """Weights (1, 4) of r, g, b, alpha whose sum is the colour's part along a hue.
+
+    Every grey has 0, the pure colour of that hue 2/3 of its value or a little more.
+
+    Args: hue [rad], 0 red, 2 pi / 3 green, 4 pi / 3 blue.
+    """
+    turn = 2.0 * np.pi / 3.0
+    weights = [np.cos(hue), np.cos(hue - turn), np.cos(hue + turn), 0.0]
+    return np.array([weights], dtype=np.float32)
+
+
+def find_ball(image, camera: Pinhole, hue_weights, radius, table_z, guess_p=None):
+    """The ball in a picture.
+
+    Args:
+        image: (height, width, 4) uint8 RGBA.
+        camera: the pinhole model; hue_weights from `strength_weights`.
+        radius: of the model's ball [m]; table_z, height of the table [m].
+        guess_p: (3,) where the ball's centre should be [m]: only the surroundings are
+            searched. None: everywhere.
+
+    Returns: a Detection, or None if there is no ball to be seen.
+    """
+    if guess_p is None:
+        depth = camera.p_WC[2] - table_z - radius
+        low, high = (0, 0), (camera.width, camera.height)
+    else:
+        p_C = camera.to_camera(guess_p)
+        depth = p_C[2]
+        if not depth > radius:
+            return None
+        center = camera.project(p_C[None])[0]
+        half = 1.8 * camera.focal * radius / depth + 6.0
+        size = (camera.width, camera.height)
+        if not (np.abs(center) < 1e6).all():
+            return None
+        low = [min(max(int(c - half), 0), n) for c, n in zip(center, size, strict=True)]
+        high = [
+            min(max(int(c + half) + 2, 0), n) for c, n in zip(center, size, strict=True)
+        ]
+        if high[0] - low[0] < 8 or high[1] - low[1] < 8:
+            return None
+    if not depth > radius:
+        return None
+    region = image[low[1] : high[1], low[0] : high[0]]
+    strength = cv2.transform(region, hue_weights)
+    strength = cv2.GaussianBlur(strength, (3, 3), 0.0)
+    radius_px = camera.focal * radius / depth
+    start = find_circle(strength, radius_px)
+    if start is None:
+        return None
+    points = outline_points(
+        strength, region, start[0], start[1], LARGEST * radius_px, _ANGLES
+    )
+    if len(points) < MIN_SEEN * N_RAYS:
+        return None
+    rays = camera.rays(points + np.asarray(low))
+    m, n_kept, misfit = fit_cone(rays, 1.0 / camera.focal)
+    norm = np.sqrt(m @ m)
+    if n_kept < MIN_SEEN * N_RAYS or misfit * camera.focal > MAX_MISFIT:
+        return None
+    p_WB = camera.meet_plane(m / norm, table_z + radius)
+    if p_WB is None:
+        return None
+    sine = np.sqrt(max(1.0 - 1.0 / norm**2, 0.0))
+    seen_radius = float(np.sqrt(((p_WB - camera.p_WC) ** 2).sum()) * sine)
+    if not SMALLEST < seen_radius / radius < LARGEST:
+        return None
+    return Detection(p_WB, seen_radius, n_kept / N_RAYS)
+
+
+def find_circle(strength, radius_px):
+    """The best Hough circle's (u, v, radius) [px], or None.
+
+    Args: strength (h, w) uint8; radius_px as expected.
+    """
+    circles = cv2.HoughCircles(
+        strength,
+        cv2.HOUGH_GRADIENT,
+        dp=1,
+        minDist=10 * max(strength.shape),
+        param1=100,
+        param2=8,
+        minRadius=int(SMALLEST * radius_px),
+        maxRadius=int(np.ceil(LARGEST * radius_px)),
+    )
+    if circles is None or circles.size == 0:
+        return None
+    u, v, r = circles[0, 0]
+    return float(u), float(v), float(r)
+
+
+@njit(cache=True)
+def _sample(image, u, v):
+    """Bilinear; u, v inside of the picture."""
+    i, j = int(v), int(u)
+    b, a = v - i, u - j
+    i1, j1 = min(i + 1, image.shape[0] - 1), min(j + 1, image.shape[1] - 1)
+    return (1.0 - b) * ((1.0 - a) * image[i, j] + a * image[i, j1]) + b * (
+        (1.0 - a) * image[i1, j] + a * image[i1, j1]
+    )
+
+
+@njit(cache=True)
+def outline_points(strength, region, u0, v0, reach, angles):
+    """Where the ball's picture ends towards the table.
+
+    Args:
+        strength: (h, w) uint8; region: (h, w, 4) uint8, the same part of the picture.
+        u0, v0: a point inside of the outline [px]; reach: start of the rays [px].
+        angles: (n, 2) cosine and sine of the rays, once around.
+
+    Returns: points (k, 2) [px] in order of angle. Rays on which the outline is hidden
+        or in doubt give none.
+    """
+    h, w = strength.shape
+    n = len(angles)
+    start, ground, edge = np.zeros(n), np.zeros(n), np.zeros(n)
+    top, outside = np.zeros(n), np.zeros(n)
+    found = np.zeros(n, dtype=np.bool_)
+    for i in range(n):
+        c, s = angles[i]
+        start[i] = _within(reach, u0, v0, c, s, w, h)
+        ground[i] = _sample(strength, u0 + start[i] * c, v0 + start[i] * s)
+        foot = ground[i] + MIN_STRENGTH / 2
+        edge[i] = _rise(strength, u0, v0, c, s, start[i], foot)
+        if edge[i] < 0.0:
+            continue
+        for d in range(1, 7):  # How strong is the ball, just inside?
+            r = edge[i] - d * STEP
+            top[i] = max(top[i], _sample(strength, u0 + r * c, v0 + r * s))
+        u = int(u0 + (edge[i] + 2.5) * c + 0.5)
+        v = int(v0 + (edge[i] + 2.5) * s + 0.5)
+        if 0 <= u < w and 0 <= v < h:
+            outside[i] = float(region[v, u, 0]) + region[v, u, 1] + region[v, u, 2]
+            found[i] = top[i] - ground[i] >= MIN_STRENGTH
+    points = np.empty((n, 2))
+    if not found.any():
+        return points[:0]
+    usual, full = np.median(outside[found]), np.median(top[found])
+    clear = found & (np.abs(outside - usual) <= OTHER_THAN_TABLE)
+    clear &= top >= THIN * full
+    k = 0
+    for i in range(n):
+        hidden = False
+        for d in range(-MARGIN, MARGIN + 1):  # Edges near a hidden part are blurred.
+            hidden |= not clear[(i + d) % n]
+        if hidden:
+            continue
+        c, s = angles[i]
+        level = 0.5 * (ground[i] + full)
+        r = _rise(strength, u0, v0, c, s, start[i], level)
+        if r > 0.0:
+            points[k, 0], points[k, 1] = u0 + r * c, v0 + r * s
+            k += 1
+    return points[:k]
+
+
+@njit(cache=True)
+def _within(reach, u0, v0, c, s, w, h):
+    """The part of a ray's reach that lies in the picture [px]."""
+    if c > 0.0:
+        reach = min(reach, (w - 1 - u0) / c)
+    elif c < 0.0:
+        reach = min(reach, -u0 / c)
+    if s > 0.0:
+        reach = min(reach, (h - 1 - v0) / s)
+    elif s < 0.0:
+        reach = min(reach, -v0 / s)
+    return reach
+
+
+@njit(cache=True)
+def _rise(strength, u0, v0, c, s, start, level):
+    """Where, from start inwards, strength first reaches level [px]; -1 for nowhere."""
+    r = start
+    last = _sample(strength, u0 + r * c, v0 + r * s)
+    while r > 4.0:
+        r -= STEP
+        now = _sample(strength, u0 + r * c, v0 + r * s)
+        if now >= level:
+            if now <= last:  # It was there from the start: cut by the picture's edge.
+                return -1.0
+            return r + STEP * (now - level) / (now - last)
+        last = now
+    return -1.0
+
+
+@njit(cache=True)
+def fit_cone(rays, tolerance):
+    """The cone that touches a sphere, from unit vectors to its outline.
+
+    Triples of rays, spread evenly, each give a cone; the one that most rays agree with
+    wins, and least squares over these, repeated once, gives the answer.
+
+    Args: rays (k, 3), in order around the cone; tolerance [rad] of agreement.
+    Returns: m (3,), the axis over the cosine of the half-angle; how many rays agree;
+        their rms misfit [rad]. Zero rays agree if there is no such cone.
+    """
+    k = len(rays)
+    best, best_count = np.zeros(3), 0
+    if k < 3:
+        return best, 0, np.inf
+    third = k // 3
+    for i in range(third):
+        m, ok = _solve3(rays[i], rays[i + third], rays[i + 2 * third])
+        if not ok:
+            continue
+        count = 0
+        scale = tolerance * np.sqrt(max(m @ m - 1.0, 1e-12))
+        for j in range(k):
+            if abs(rays[j] @ m - 1.0) < scale:
+                count += 1
+        if count > best_count:
+            best, best_count = m, count
+    misfit = np.inf
+    for _ in range(2):
+        if best_count < 3:
+            return best, 0, np.inf
+        N, b = np.zeros((3, 3)), np.zeros(3)
+        scale = tolerance * np.sqrt(max(best @ best - 1.0, 1e-12))
+        for j in range(k):
+            if abs(rays[j] @ best - 1.0) < scale:
+                b += rays[j]
+                for a in range(3):
+                    N[a] += rays[j, a] * rays[j]
+        m, ok = _solve3_matrix(N, b)
+        if not ok:
+            return best, 0, np.inf
+        best = m
+        sine = np.sqrt(max(best @ best - 1.0, 1e-12))  # |m| sin(alpha)
+        best_count, total = 0, 0.0
+        for j in range(k):
+            error = abs(rays[j] @ best - 1.0) / sine
+            if error < tolerance:
+                best_count += 1
+                total += error**2
+        if best_count > 0:
+            misfit = np.sqrt(total / best_count)
+    return best, best_count, misfit
+
+
+@njit(cache=True)
+def _solve3(a, b, c):
+    A = np.empty((3, 3))
+    A[0], A[1], A[2] = a, b, c
+    return _solve3_matrix(A, np.ones(3))
+
+
+@njit(cache=True)
+def _solve3_matrix(A, b):
+    """Cramer's rule; (x, whether A is regular)."""
+    c0 = np.cross(A[1], A[2])
+    det = A[0] @ c0
+    size = np.sqrt((A[0] @ A[0]) * (c0 @ c0))
+    if not abs(det) > 1e-9 * size or size == 0.0:
+        return np.zeros(3), False
+    c1, c2 = np.cross(A[2], A[0]), np.cross(A[0], A[1])
+    return (b[0] * c0 + b[1] * c1 + b[2] * c2) / det, True
+
+
+_angle = np.linspace(0.0, 2.0 * np.pi, N_RAYS, endpoint=False)
+_ANGLES = np.stack([np.cos(_angle), np.sin(_angle)], axis=1)
