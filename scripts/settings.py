@@ -18,9 +18,16 @@ _EXPECTED = {int: "an integer", float: "a number", bool: "true or false", str: "
 def nearest(name: str, valid: Iterable[str]) -> str:
     """The end of a refusal: the valid names nearest to `name`, or all of them."""
     valid = list(valid)
-    close = difflib.get_close_matches(name, valid, n=3, cutoff=0.5)
-    # A nested key is often given by its last part alone.
-    close = close or [v for v in valid if v.rpartition(".")[2] == name]
+
+    def likeness(other: str) -> tuple[float, float]:
+        """Of the last parts, as often only that is given; then of the whole names."""
+        pairs = [(name.rpartition(".")[2], other.rpartition(".")[2]), (name, other)]
+        last, whole = (difflib.SequenceMatcher(None, *p).ratio() for p in pairs)
+        return last, whole
+
+    ranked = sorted(valid, key=likeness, reverse=True)
+    least = max([0.6, *(likeness(v)[0] - 0.1 for v in ranked[:1])])
+    close = [v for v in ranked[:3] if likeness(v)[0] >= least]
     if close:
         return f"did you mean {' or '.join(close)}?"
     return f"expected one of: {', '.join(valid)}"

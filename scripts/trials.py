@@ -74,7 +74,7 @@ def run_many(
     out_dir: Path,
     duration: float | None = None,
     reuse: bool = False,
-    command: Sequence[str] = _COMMAND,
+    command: Sequence[str] = (),
 ) -> list[dict]:
     """Runs `makebreak run experiment` once per (settings, seed), `jobs` at a time.
 
@@ -89,7 +89,7 @@ def run_many(
         duration: overrides the experiment's own [s].
         reuse: whether a run that has already ended there, with the same settings and
             duration, is read instead of repeated.
-        command: what starts makebreak.
+        command: what starts makebreak; empty: this interpreter with -m makebreak.
     Returns: per run its result.json with `seed` and `out_dir` added; of a failed one
         `success` False and `error`, the last line that it printed.
     Raises: ValueError if jobs is below 1 or two runs are the same.
@@ -125,7 +125,7 @@ def run_many(
                         results[i] = _read(folders[i], 0)
                         bar.update()
                         continue
-                    args = [*command, "run", experiment, "--no-meshcat"]
+                    args = [*(command or _COMMAND), "run", experiment, "--no-meshcat"]
                     args += ["--seed", str(seed), "--out", str(folders[i])]
                     args += [a for text in texts for a in ("--set", text)]
                     if duration is not None:

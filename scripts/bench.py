@@ -1,0 +1,73 @@
+"""Measures how long the parts take; the figures of `makebreak bench`.
+
+Each bench is a module with `rows() -> list[dict]`: what is measured, value, unit, and
+whatever stands beside it. Figures are process CPU time, or ratios taken in one run.
+"""
+
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from importlib.util import find_spec
+from time import process_time
+
+import numpy as np
+
+from makebreak.scripts.settings import nearest
+from makebreak.scripts.table import Table
+
+# The name on the command line -> the module, imported when it is asked for.
+BENCHES: dict[str, str] = {
+    "c3": "makebreak.scripts.bench_c3",
+    "lcs": "makebreak.scripts.bench_lcs",
+    "learner": "makebreak.scripts.bench_learner",
+    "impedance": "makebreak.scripts.bench_impedance",
+    "camera": "makebreak.scripts.bench_camera",
+    "diagrams": "makebreak.scripts.bench_diagrams",
+}
+
+
+def median_cpu_ms(call: Callable[[], object], n: int = 200) -> float:
+    """The median process CPU time of a call [ms]; the first, which may compile, apart.
+
+    Args:
+        call: what is timed.
+        n: how many calls.
+    """
+    call()
+    times = np.empty(n)
+    for i in range(n):
+        start = process_time()
+        call()
+        times[i] = process_time() - start
+    return 1e3 * float(np.median(times))
+
+
+def bench(names: Sequence[str] = ()) -> Table:
+    """Runs the benches of these names, or all.
+
+    A bench that fails is a note under the table; the others still run.
+
+    Returns: the table; its first column is the bench.
+    Raises: ValueError for an unknown name, with the nearest valid ones.
+    """
+    here = [name for name, module in BENCHES.items() if find_spec(module)]
+    for name in names:
+        if name not in here:
+            raise ValueError(f"unknown bench {name}; {nearest(name, here)}")
+    found: list[dict] = []
+    notes = []
+    for name in names or here:
+        try:
+            rows = import_module(BENCHES[name]).rows()
+        except Exception as error:  # Whatever it is, the other figures are wanted.
+            notes.append(f"{name} failed: {type(error).__name__}: {error}")
+            continue
+        found += [{"bench": name, **row} for row in rows]
+    # A row's target, where it has one, is whether it was met.
+    columns = list(dict.fromkeys(c for row in found for c in row if c != "met"))
+    return Table(
+        "makebreak bench",
+        columns,
+        [[row.get(c) for c in columns] for row in found],
+        met=[row.get("met") for row in found],
+        notes=notes,
+    )

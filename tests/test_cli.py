@@ -1,0 +1,332 @@
+"""The command line: what it refuses, what it writes, how it ends."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import spring_mass
+
+from makebreak.scripts import bench, cli, experiments, trials
+
+
+@pytest.fixture(autouse=True)
+def _registered(monkeypatch, tmp_path):
+    """Each test has the one experiment, and a folder of its own to run in."""
+    monkeypatch.setattr(experiments, "EXPERIMENTS", {"spring_mass": "spring_mass"})
+    monkeypatch.setattr(cli, "EXPERIMENTS", experiments.EXPERIMENTS)
+    monkeypatch.chdir(tmp_path)
+
+
+def run(*args, out="out"):
+    return cli.main(["run", "spring_mass", "--no-meshcat", "--out", out, *args])
+
+
+def read(name, out="out"):
+    return json.loads((Path(out) / name).read_text())
+
+
+def test_a_run_writes_its_files_and_a_table(capsys):
+    assert run("--seed", "3", "--duration", "10") == 0
+    written = {path.name for path in Path("out").iterdir()} - {"running"}
+    names = "config.yaml result.json timing.json recording.csv noise.json position.png"
+    assert written == set(names.split())
+    shown = capsys.readouterr()
+    for name in names.split():
+        assert name in shown.out
+    assert "position_end_m" in shown.out and "success" in shown.out
+    assert "x real time" in shown.err
+    assert read("result.json")["settled_s"] is None  # Infinity is not JSON.
+    timing = read("timing.json")
+    assert timing["simulated_s"] == 10.0
+    assert timing["systems"]["mass"]["updates"] == 1000
+    assert timing["real_time_factor"] > 0 and timing["cpu_s"] > 0
+
+
+def test_a_run_that_misses_its_criterion_exits_with_1():
+    assert run("--set", "damped=false", "noise=0", "spring.stiffness=1e-6") == 1
+    assert read("result.json")["success"] is False
+
+
+def test_the_same_seed_gives_the_same_result_bit_for_bit():
+    for out, seed in (("a", "5"), ("b", "5"), ("c", "6")):
+        assert run("--seed", seed, out=out) == 0
+    a, b, c = (Path(out, "result.json").read_bytes() for out in "abc")
+    assert a == b and a != c
+    recordings = [Path(out, "recording.csv").read_bytes() for out in "ab"]
+    assert recordings[0] == recordings[1]
+
+
+def test_the_written_config_runs_again_to_the_same_result():
+    settings = ("spring.stiffness=5", "weights=[1, 2e-3]", "noise=1e-2", "limit=2")
+    assert run("--seed", "4", "--set", *settings, out="a") == 0
+    assert run("--config", "a/config.yaml", out="b") == 0
+    assert Path("a/result.json").read_bytes() == Path("b/result.json").read_bytes()
+    assert Path("a/config.yaml").read_text() == Path("b/config.yaml").read_text()
+
+
+def test_settings_come_after_the_config_file_and_the_seed_last():
+    Path("c.yaml").write_text("spring: {stiffness: 9.0}\nseed: 8\nnoise: 0.0\n")
+    settings = ("--set", "spring.stiffness=7", "--seed", "2")
+    assert run("--config", "c.yaml", *settings) == 0
+    text = Path("out/config.yaml").read_text()
+    assert "stiffness: 7.0" in text and "seed: 2" in text and "noise: 0.0" in text
+
+
+def test_without_out_each_run_has_a_folder_of_its_own():
+    for _ in range(2):
+        assert cli.main(["run", "spring_mass", "--no-meshcat", "--duration", "1"]) < 2
+    assert len(list(Path("runs").glob("spring_mass-*/result.json"))) == 2
+
+
+def test_an_old_result_does_not_outlive_a_run_that_is_refused():
+    assert run() == 0
+    assert run("--set", "spring.stiffness=-1") == 2
+    assert not Path("out/result.json").exists()
+
+
+BAD = [
+    (["run", "spring_mas"], "unknown experiment spring_mas; did you mean spring_mass?"),
+    (["run", "x", "--no-meshcat"], "unknown experiment x; expected one of: spring_"),
+    (["runn"], "invalid choice: 'runn'"),
+    ([], "COMMAND"),
+    (["run", "spring_mass", "--sed", "1"], "--sed"),
+    (["run", "--set", "noise=1", "spring_mass"], "EXPERIMENT comes before --set"),
+    (["reproduce", "spring"], "unknown experiment spring; did you mean spring_mass?"),
+    (["reproduce", "--seeds", "0"], '--seeds: got "0", expected a whole number, 1'),
+    (["reproduce", "--jobs", "two"], '--jobs: got "two", expected a whole number, 1'),
+    (["bench", "lsc"], "unknown bench lsc; did you mean lcs?"),
+]
+BAD_RUN = [
+    (["--set", "nois=1"], "unknown key nois; did you mean noise?"),
+    (["--set", "stiffness=1"], "unknown key stiffness; did you mean spring.stiffness?"),
+    (["--set", "spring.stifness=1"], "did you mean spring.stiffness?"),
+    (["--set", "noise"], '--set: got "noise", expected key=value'),
+    (["--set", "noise=abc"], '--set noise: got "abc", expected a number'),
+    (["--set", "noise=true"], '--set noise: got "true", expected a number'),
+    (["--set", "noise=.nan"], '--set noise: got ".nan", expected a number'),
+    (["--set", "noise="], '--set noise: got "null", expected a number'),
+    (["--set", "noise=[1"], '--set noise: got "[1", not YAML'),
+    (["--set", "steps=2.5"], '--set steps: got "2.5", expected an integer'),
+    (["--set", "damped=1"], '--set damped: got "1", expected true or false'),
+    (["--set", "weights=3"], '--set weights: got "3", expected a list'),
+    (["--set", "weights=[1, a]"], '--set weights[1]: got "a", expected a number'),
+    (["--set", "limit=a"], '--set limit: got "a", expected a number'),
+    (["--set", "spring=4"], '--set spring: got "4", expected spring.FIELD=value'),
+    (["--set", "spring={soft: 1}"], "unknown key spring.soft; expected one of: spring"),
+    (["--set", "spring.stiffness=-1"], "spring.stiffness: got -1.0, expected > 0"),
+    (["--config", "no.yaml"], '--config: got "no.yaml", expected a YAML file'),
+    (["--config", "broken.yaml"], "--config broken.yaml: not YAML"),
+    (["--config", "list.yaml"], "--config list.yaml: got [1, 2], expected key: value"),
+    (["--config", "key.yaml"], "--config key.yaml: unknown key spring.stifness; did"),
+    (["--config", "type.yaml"], 'type.yaml: noise: got "abc", expected a number'),
+    (["--seed", "-1"], '--seed: got "-1", expected a whole number, 0 or more'),
+    (["--seed", "1.5"], '--seed: got "1.5", expected a whole number'),
+    (["--set", "seed=-1"], "seed: got -1, expected 0 or more"),
+    (["--duration", "0"], '--duration: got "0", expected a number above 0'),
+    (["--duration", "nan"], '--duration: got "nan", expected a number above 0'),
+    (["--duration", "inf"], '--duration: got "inf", expected a number above 0'),
+    (["--realtime", "fast"], '--realtime: got "fast", expected a number above 0'),
+    (["--model", "scene.yaml"], "--model: spring_mass has no model scene"),
+    (["--world", "no.yaml"], '--world: got "no.yaml", expected a scene file'),
+    (["--out", "a_file"], '--out: got "a_file", expected a folder to write in'),
+    (["--out", "a_file/sub"], '--out: got "a_file/sub", expected a folder'),
+    (["--out", "/proc/nowhere"], '--out: got "/proc/nowhere", expected a folder'),
+]
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    BAD + [(["run", "spring_mass", "--no-meshcat", *a], m) for a, m in BAD_RUN],
+)
+def test_bad_input_is_one_line_on_stderr_and_status_2(args, message, capsys):
+    Path("a_file").write_text("")
+    Path("broken.yaml").write_text("noise: [1\nseed: 2")
+    Path("list.yaml").write_text("[1, 2]")
+    Path("key.yaml").write_text("spring: {stifness: 1}")
+    Path("type.yaml").write_text("noise: abc")
+    assert cli.main(args) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and error.startswith("makebreak: ")
+    assert message in error
+
+
+def test_a_fault_of_the_program_is_not_called_bad_input(capsys):
+    assert run("--set", "fail_at_sec=1") == 3
+    assert "Traceback" in capsys.readouterr().err
+    assert "a fault in the middle" in Path("out/error.txt").read_text()
+    with np.load("out/partial.npz") as partial:  # Samples every 1/80 s, to 1 s.
+        np.testing.assert_allclose(partial["time"][-1], 1.0, atol=1e-12)
+
+
+def test_a_world_is_found_by_path_or_by_name(monkeypatch):
+    models = Path("models/rooms").absolute()
+    models.mkdir(parents=True)
+    (models / "attic.yaml").write_text("# An attic.\ndirectives: []\n")
+    (models / "weights.yaml").write_text("a: 1\n")  # YAML, but no scene.
+    monkeypatch.setattr(cli, "_MODELS", models.parent)
+    assert list(cli.scenes()) == ["rooms/attic"]
+    for name in ("rooms/attic", "rooms/attic.yaml", "models/rooms/attic.yaml"):
+        assert run("--world", name, "--duration", "5") < 2
+        assert f"world: {models}/attic.yaml" in Path("out/config.yaml").read_text()
+
+
+def test_list_names_experiments_and_scenes_with_a_line_each(capsys, monkeypatch):
+    Path("models").mkdir()
+    Path("models/attic.yaml").write_text("# An attic.\ndirectives: []\n")
+    monkeypatch.setattr(cli, "_MODELS", Path("models"))
+    assert cli.main(["list"]) == 0
+    lines = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
+    assert ["spring_mass", spring_mass.SUMMARY] in lines
+    assert ["attic", "An attic."] in lines
+
+
+def start(*args, **more):
+    """The command line in a process of its own."""
+    return subprocess.Popen(
+        [*spring_mass.COMMAND, *args],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        stdin=subprocess.DEVNULL,
+        text=True,
+        env=trials._environment() | more,
+    )
+
+
+def wait_for(paths):
+    """Until all these files have content; generous, as the machine may be busy."""
+    end = time.monotonic() + 60
+    while not all(p.exists() and p.read_text() for p in paths):
+        assert time.monotonic() < end, f"none of {paths} came"
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize("whole_only", [False, True])
+def test_ctrl_c_ends_a_run_cleanly_and_keeps_what_was_recorded(whole_only):
+    settings = ["steps=100000000", f"whole_only={str(whole_only).lower()}"]
+    process = start("run", "spring_mass", "--no-meshcat", "--out", "out", "--set",
+                    *settings)  # fmt: skip
+    wait_for([Path("out/running")])
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in error
+    assert error.splitlines()[-1].startswith("makebreak: interrupted")
+    assert read("timing.json")["simulated_s"] > 1.0
+    if whole_only:  # It could not be scored; the samples are there all the same.
+        assert not Path("out/result.json").exists()
+        with np.load("out/partial.npz") as partial:
+            assert partial["time"][-1] > 1.0 and len(partial["x"]) > 80
+    else:
+        assert read("result.json")["interrupted"] is True
+        table = np.genfromtxt("out/recording.csv", delimiter=",", names=True)
+        assert table["time"][-1] > 1.0
+
+
+def test_ctrl_c_ends_reproduce_and_all_its_runs():
+    process = start("reproduce", "--seeds", "2", "--jobs", "2", "--out", "out",
+                    SPRING_MASS_SECONDS="1e6")  # fmt: skip
+    folder = Path("out/spring_mass")
+    marks = [folder / f"damped=true_seed={s}" / "running" for s in (0, 1)]
+    wait_for(marks)
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130 and "Traceback" not in error
+    for mark in marks:
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(mark.read_text()), 0)
+
+
+def test_reproduce_prints_and_writes_its_table_and_fails_on_a_missed_row(capsys):
+    args = ["reproduce", "--seeds", "1", "--jobs", "2", "--out", "out"]
+    assert cli.main(args) == 1  # The row "without damping" has a target that it misses.
+    shown = capsys.readouterr().out
+    assert "MISSED" in shown and "comes to rest" in shown
+    [table] = read("reproduce.json").values()
+    assert [row["ours"] for row in table["rows"]] == [1, 0]
+    assert [row["met"] for row in table["rows"]] == [True, False]
+    assert "| comes to rest | 1 | 1 |" in Path("out/reproduce.md").read_text()
+
+
+def test_a_failing_run_is_reported_and_the_others_go_on(capsys):
+    runs = [({"noise": "abc"}, 0), ({"fail_at_sec": 0.5}, 0), ({"noise": 0.0}, 1)]
+    results = trials.run_many(
+        "spring_mass", runs, 2, Path("out"), 10.0, command=spring_mass.COMMAND
+    )
+    assert [r["success"] for r in results] == [False, False, True]
+    assert results[0]["error"] == (
+        'exit status 2: makebreak: --set noise: got "abc", expected a number'
+    )
+    assert "a fault in the middle" in results[1]["error"]
+    assert results[2]["seed"] == 1 and "error" not in results[2]
+    assert "expected a number" in capsys.readouterr().err
+
+
+def test_runs_are_reused_only_when_asked_and_only_the_same_ones():
+    def go(settings, duration, reuse):
+        runs = [(settings, 0)]
+        command = spring_mass.COMMAND
+        [result] = trials.run_many(
+            "spring_mass", runs, 1, Path("out"), duration, reuse, command
+        )
+        return result
+
+    first = go({"noise": 0.0}, 5.0, False)
+    path = Path(first["out_dir"]) / "result.json"
+    path.write_text(path.read_text().replace('"success": ', '"mark": 1, "success": '))
+    assert go({"noise": 0.0}, 5.0, True)["mark"] == 1
+    assert "mark" not in go({"noise": 0.0}, 6.0, True)
+    assert "mark" not in go({"noise": 0.0}, 6.0, False)
+
+
+def test_run_many_refuses_no_jobs_and_the_same_run_twice():
+    with pytest.raises(ValueError, match="jobs: got 0, expected 1 or more"):
+        trials.run_many("spring_mass", [({}, 0)], 0, Path("out"))
+    with pytest.raises(ValueError, match="seed=0 is there twice"):
+        trials.run_many("spring_mass", [({}, 0), ({}, 0)], 1, Path("out"))
+
+
+def test_bench_prints_table_and_json_and_outlives_a_failing_bench(
+    capsys, monkeypatch, tmp_path
+):
+    (tmp_path / "bench_good.py").write_text(
+        "def rows():\n    return [{'what': 'a', 'value': 1.5, 'unit': 'ms'}]\n"
+    )
+    (tmp_path / "bench_bad.py").write_text("def rows():\n    raise ValueError('no')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    benches = {"good": "bench_good", "bad": "bench_bad", "gone": "bench_gone"}
+    monkeypatch.setattr(bench, "BENCHES", benches)
+    assert cli.main(["bench", "good"]) == 0
+    text = capsys.readouterr().out
+    assert json.loads(text[text.index("{") :])["rows"] == [
+        {"bench": "good", "what": "a", "value": 1.5, "unit": "ms"}
+    ]
+    assert cli.main(["bench"]) == 1
+    text = capsys.readouterr().out
+    assert "bad failed: ValueError: no" in text and "1.5" in text
+
+
+def test_bench_diagrams_gives_the_real_time_factor_of_each_setting(monkeypatch):
+    from makebreak.scripts import bench_diagrams
+
+    monkeypatch.setattr(trials, "_COMMAND", spring_mass.COMMAND)
+    monkeypatch.setattr(bench_diagrams, "EXPERIMENTS", experiments.EXPERIMENTS)
+    [row] = bench_diagrams.rows()
+    assert row["what"] == "spring_mass, soft" and row["value"] > 0
+
+
+def test_python_m_makebreak_is_the_command():
+    done = subprocess.run(
+        [sys.executable, "-m", "makebreak", "run", "no_such_experiment"],
+        capture_output=True,
+        text=True,
+        env=trials._environment(),
+    )
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.startswith("makebreak: unknown experiment no_such_experiment")
+    assert done.stderr.count("\n") == 1
