@@ -91,7 +91,7 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class WarmStart:
-    """A solve's memory; lam and eta parts are unscaled, w is that of the first G."""
+    """A solve's memory; the lam and eta parts are in newtons and m/s, not scaled."""
 
     u: np.ndarray  # (N, n_u) last inputs, for the input-change penalty [N]
     delta: np.ndarray  # (N, n_z)
@@ -249,7 +249,9 @@ _FAILURES = {
 }
 
 
-def solve_c3(lcs: LCS, x0, x_desired, problem: C3Problem, warm: WarmStart | None = None):
+def solve_c3(
+    lcs: LCS, x0, x_desired, problem: C3Problem, warm: WarmStart | None = None
+):
     """One solve of C3, from the state x0.
 
     Args:
@@ -264,7 +266,8 @@ def solve_c3(lcs: LCS, x0, x_desired, problem: C3Problem, warm: WarmStart | None
     Raises: ValueError on wrong shapes; C3Failure where there is no result.
     """
     p, o = problem, problem.options
-    x0, x_desired = np.asarray(x0, float), np.asarray(x_desired, float)
+    x0 = np.array(x0, float, order="C")
+    x_desired = np.array(x_desired, float, order="C")
     if (lcs.n_x, lcs.n_u, lcs.n_lam) != (p.n_x, p.n_u, p.n_lam):
         raise ValueError(
             f"solve_c3: the LCS has (n_x, n_u, n_lam) = {lcs.n_x, lcs.n_u, lcs.n_lam}, "
@@ -283,11 +286,9 @@ def solve_c3(lcs: LCS, x0, x_desired, problem: C3Problem, warm: WarmStart | None
     if kind != projections.PLUS:
         U_u = p.U[p.n_x + p.n_lam :]
         for i in np.flatnonzero((U_u == 0.0) & lcs.H.any(axis=0)):
-            raise ValueError(
-                f"C3Weights.U is 0 for u[{i}], expected > 0 where it acts on the gap"
-            )
+            raise C3Failure(f"U is 0 for u[{i}], expected > 0 where H is not zero")
     warm = problem.cold_start() if warm is None else warm
-    delta, w = np.array(warm.delta), np.array(warm.w)
+    delta, w = np.array(warm.delta, order="C"), np.array(warm.w, order="C")
     if not o.warm_start:
         delta[:], w[:] = 0.0, 0.0
         if o.start_at_x0:
@@ -304,22 +305,40 @@ def solve_c3(lcs: LCS, x0, x_desired, problem: C3Problem, warm: WarmStart | None
     w /= unit
     Ru = warm.u @ p.R if o.penalise_input_change else np.zeros((o.N, p.n_u))
     status, x, v = _admm(
-        kind, alpha, o.rounds, o.rho,
-        (lcs.A, lcs.B, lcs.D * scale, lcs.d, lcs.E / scale, lcs.F, lcs.H / scale,
-         lcs.c / scale),
-        (p.Q, p.R, p.Q_N, p.G, p.U), (p.lower, p.upper),
-        x0, x_desired, Ru, delta, w,
+        kind,
+        alpha,
+        o.rounds,
+        o.rho,
+        tuple(
+            # Fresh arrays: one compiled version whatever order or flags came in.
+            np.array(a, order="C")
+            for a in (
+                lcs.A,
+                lcs.B,
+                lcs.D * scale,
+                lcs.d,
+                lcs.E / scale,
+                lcs.F,
+                lcs.H / scale,
+                lcs.c / scale,
+            )
+        ),
+        (p.Q, p.R, p.Q_N, p.G, p.U),
+        (p.lower, p.upper),
+        x0,
+        x_desired,
+        Ru,
+        delta,
+        w,
     )
     if status:
         raise C3Failure(_FAILURES[status])
     plan = Plan(x, np.ascontiguousarray(v[:, p.n_lam :]), v[:, : p.n_lam] * scale)
-    return plan, WarmStart(plan.u, delta * unit, w * (unit * o.rho**o.rounds))
+    return plan, WarmStart(plan.u, delta * unit, w * unit)
 
 
 @njit(cache=True)
-def _admm(
-    kind, alpha, rounds, rho, lcs, weights, bounds, x0, x_desired, Ru, delta, w
-):
+def _admm(kind, alpha, rounds, rho, lcs, weights, bounds, x0, x_desired, Ru, delta, w):
     """The rounds and the last QP; delta and w (N, n_z) are updated in place.
 
     Returns: a status (_FAILURES; 0: solved), x (N + 1, n_x) and v (N, n_lam + n_u).
@@ -426,13 +445,9 @@ def _admm(
             if kind == projections.PLUS:
                 projections.project_plus(zw, U, n_x, n_lam, n_u, delta[k])
             elif kind == projections.QP:
-                if not projections.project_qp(
-                    zw, alpha, E, F, H, c, V, K, delta[k]
-                ):
+                if not projections.project_qp(zw, alpha, E, F, H, c, V, K, delta[k]):
                     return 4, x, v
-            elif not projections.project_exact(
-                zw, U, E, F, H, c, V, K, delta[k]
-            ):
+            elif not projections.project_exact(zw, U, E, F, H, c, V, K, delta[k]):
                 return 4, x, v
             for i in range(n_z):
                 w[k, i] = (zw[i] - delta[k, i]) / rho
@@ -462,3 +477,43 @@ def plan_cost(lcs: LCS, x0, u, x_desired, problem: C3Problem) -> float:
         x, _ = simulate(lcs, x, u[k])
     e = x - x_desired[len(u)]
     return float(cost + e @ problem.Q_N @ e)
+
+
+def with_gap_residual(lcs: LCS, r_comp, residual_dt_sec, clamp: bool) -> LCS:
+    """lcs with the learned residual of its gaps.
+
+    Args:
+        r_comp: (n_lam,) residual [m/s] at the time step residual_dt_sec [s]; as a gap
+            [m] it does not depend on the step, so it counts as r_comp residual_dt / dt.
+        clamp: where the gap phi + r (of geometry) is negative, take it for zero.
+    """
+    r = r_comp * (residual_dt_sec / lcs.dt)
+    if clamp and lcs.phi is not None:
+        r = r + np.maximum(0.0, -(lcs.phi + r * lcs.dt)) / lcs.dt
+    return lcs.with_residual(r)
+
+
+def command_step(lcs: LCS, x, u):
+    """x_next (n_x,) and lam (n_lam,) after x under u; C3Failure if there are none."""
+    try:
+        x_next, lam = simulate(lcs, x, u)
+    except ValueError as error:
+        raise C3Failure(f"the command's step: {error}") from error
+    if not (np.isfinite(x_next).all() and np.isfinite(lam).all()):
+        raise C3Failure("the command's step is not finite")
+    return x_next, lam
+
+
+def warm_up(problem: C3Problem):
+    """Compiles what a solve of this problem needs, so that the first is no slower."""
+    p = problem
+    D, E = np.eye(p.n_x, p.n_lam), -np.eye(p.n_lam, p.n_x)
+    H, c = np.zeros((p.n_lam, p.n_u)), -np.ones(p.n_lam)
+    B, I = np.zeros((p.n_x, p.n_u)), np.eye(p.n_lam)
+    lcs = LCS(0.5 * np.eye(p.n_x), B, D, np.zeros(p.n_x), E, I, H, c, 1.0)
+    x0 = np.zeros(p.n_x)
+    try:
+        solve_c3(lcs, x0, np.zeros((p.options.N + 1, p.n_x)), p)
+    except C3Failure:
+        pass  # The bounds may exclude this made-up problem; it is compiled all the same.
+    simulate(lcs, x0, np.zeros(p.n_u))

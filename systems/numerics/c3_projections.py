@@ -161,9 +161,7 @@ def project_exact(z, U, E, F, H, c, V, K, delta):
     while depth > 0:
         depth -= 1
         mode = stack[depth].copy()
-        cost = _solve_node(
-            mode, z_lam, U_lam, gap, F, K, lam, slack, multiplier, best
-        )
+        cost = _solve_node(mode, z_lam, U_lam, gap, F, K, lam, slack, multiplier, best)
         if cost == -1.0:
             return False
         if not cost < best - 1e-12 * size * size:
@@ -185,9 +183,11 @@ def project_exact(z, U, E, F, H, c, V, K, delta):
                 open_gap = slack[i] / scale[i] > np.sqrt(U_lam[i]) * lam[i]
                 delta[n_x + i] = 0.0 if open_gap else lam[i]
             continue
-        first = 2 if np.sqrt(U_lam[branch]) * lam[branch] > (
-            slack[branch] / scale[branch]
-        ) else 1
+        first = (
+            2
+            if np.sqrt(U_lam[branch]) * lam[branch] > (slack[branch] / scale[branch])
+            else 1
+        )
         stack[depth] = mode
         stack[depth, branch] = 3 - first  # The less likely one waits below.
         stack[depth + 1] = mode
