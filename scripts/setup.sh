@@ -126,7 +126,7 @@ install_packages() {
         if ! command -v apt-get >/dev/null; then
             fail "please install what Debian calls: ${required[*]} ${optional[*]}"
         elif may_install; then
-            fail "apt-get could not install ${required[*]} (no network?); log: $log"
+            fail "apt-get could not install ${required[*]} (no network?) (log: $log)"
         fi
         fail "type this once, then try again:" \
             "$(apt_command "${required[@]}" "${optional[@]}")"
@@ -140,10 +140,11 @@ install_packages() {
 pip_install() {
     "$venv/bin/python" -m pip install --quiet --no-input --progress-bar off \
         --disable-pip-version-check "$@" >>"$log" 2>&1 && return
-    if grep -qiE 'NewConnectionError|NameResolution|name resolution|ConnectTimeout|ReadTimeout|timed out|Max retries|Connection (refused|reset|aborted)|Network is unreachable' "$log"; then
-        fail "no connection to the Python package index; log: $log"
+    if grep -qE 'Retrying|[Tt]imed out|Timeout|ConnectionError|IncompleteRead' "$log"; then
+        fail "the Python package index cannot be reached; check the network," \
+            "then try again (log: $log)"
     fi
-    fail "pip failed: $(grep '^ERROR' "$log" | tail -n 1); log: $log"
+    fail "pip failed: $(grep '^ERROR' "$log" | tail -n 1) (log: $log)"
 }
 
 is_ready && exit 0
@@ -170,6 +171,7 @@ if command -v flock >/dev/null; then
 fi
 
 log="$(mktemp "${TMPDIR:-/tmp}/makebreak-setup.XXXXXX")"
+trap '[[ -s "$log" ]] || rm -f "$log"' EXIT # Kept only where it tells something.
 install_packages
 
 # What an interrupted set-up or a move of the folder left is not to be trusted.
@@ -182,7 +184,7 @@ mkdir -p "$venv" 2>/dev/null || fail "cannot write in $root"
 touch "$unfinished"
 rm -f "$ready"
 [[ -x "$venv/bin/python" ]] || "$python" -m venv "$venv" >>"$log" 2>&1 ||
-    fail "$python -m venv failed; log: $log"
+    fail "$python -m venv failed (log: $log)"
 pip_install -r "$root/requirements.lock"
 pip_install --no-deps --no-build-isolation -e "$root"
 "$venv/bin/python" -c 'import pydrake.multibody.plant' >>"$log" 2>&1 ||
