@@ -75,7 +75,7 @@ class AnitescuLcs:
     Attributes:
         n_q, n_v, n_x, n_u, n_lam: sizes; x = [q, v] in the plant's order.
         x_default: (n_x,) the plant's default state.
-        lam_names: of each force, "geometry~geometry edge".
+        x_names, lam_names: of each state, and of each force, "geometry~geometry edge".
         is_analytic: which of the two paths `build` takes.
 
     Raises: ValueError naming a pair that does not exist, a body without collision
@@ -93,6 +93,7 @@ class AnitescuLcs:
             raise ValueError(f"eps_c is {eps_c}, expected at least 0 [m/s per N]")
         self.n_q, self.n_v = plant.num_positions(), plant.num_velocities()
         self.n_x, self.n_u = self.n_q + self.n_v, plant.num_actuated_dofs()
+        self.x_names = list(plant.GetStateNames())
         self._check_model()
         self._resolve(scene_graph.model_inspector(), pairs)
 
@@ -164,7 +165,10 @@ class AnitescuLcs:
         M = plant.CalcMassMatrix(context)
         plant.CalcForceElementsContribution(context, self._forces)
         r = plant.CalcInverseDynamics(context, np.zeros(self.n_v), self._forces)
-        f = np.linalg.solve(M, self._B_tau @ u - r)
+        try:
+            f = np.linalg.solve(M, self._B_tau @ u - r)
+        except np.linalg.LinAlgError as error:
+            raise ValueError("the mass matrix is singular (a massless body)") from error
 
         plant_ad, context_ad = self._plant_ad, self._context_ad
         plant_ad.SetPositionsAndVelocities(context_ad, InitializeAutoDiff(x)[:, 0])
@@ -456,7 +460,7 @@ class AnitescuLcsBuilder(LeafSystem):
         x, u = self._x.Eval(context), self._u.Eval(context)
         try:
             lcs = self.model.build(x, u)
-        except (ValueError, RuntimeError, np.linalg.LinAlgError):
+        except (ValueError, RuntimeError):
             state.get_mutable_discrete_state(self._status).set_value([0.0])
             return
         state.get_mutable_abstract_state(int(self._lcs)).set_value(lcs)

@@ -1,0 +1,702 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.geometry import HalfSpace
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import (
+    AddMultibodyPlantSceneGraph,
+    CoulombFriction,
+    ExternallyAppliedSpatialForce,
+    MultibodyPlant,
+)
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    LinearSpringDamper,
+    PdControllerGains,
+    SpatialInertia,
+)
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from makebreak.systems.lcs_builder import (
+    AnitescuLcs,
+    AnitescuLcsBuilder,
+    ContactPair,
+    LcsBuilderConfig,
+)
+from makebreak.systems.numerics.lcs import simulate
+from makebreak.systems.numerics.lcs_builder import friction_rows, tangent_basis
+
+REFERENCE = Path(__file__).parent / "reference"
+SDF = (REFERENCE / "ball_on_table.sdf").read_text()
+MATRICES = ("A", "B", "D", "d", "E", "F", "H", "c")
+G = 9.81
+# In ball_on_table: q = [finger 3, quaternion 4, ball 3], v = [finger 3, omega 3, v 3].
+BALL_Z, BALL_VZ = 9, 18
+
+
+def diagram_of(text, extend=None, time_step=0.0):
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, time_step)
+    Parser(plant).AddModelsFromString(text, "sdf")
+    if extend is not None:
+        extend(plant)
+    plant.Finalize()
+    return builder.Build()
+
+
+def ball_pairs(mu=0.5, n_f=2):
+    return [
+        ContactPair("finger_link", "ball_link", mu, n_f),
+        ContactPair("ball_link", "table_link", mu, n_f),
+    ]
+
+
+@pytest.fixture(scope="module")
+def ball_diagram():
+    return diagram_of(SDF)
+
+
+@pytest.fixture(scope="module")
+def reference():
+    return np.load(REFERENCE / "anitescu_ball_on_table.npz")
+
+
+def random_state(rng, x_default, quaternions=(3,)):
+    x = x_default + 0.1 * rng.normal(size=x_default.size)
+    for k in quaternions:
+        x[k : k + 4] = rng.normal(size=4)
+        x[k : k + 4] /= np.linalg.norm(x[k : k + 4])
+    return x
+
+
+# The numbers of the reference implementation.
+
+
+@pytest.mark.parametrize("analytic", [True, False])
+def test_both_paths_reproduce_the_reference_implementation(
+    ball_diagram, reference, analytic
+):
+    model = AnitescuLcs(ball_diagram, ball_pairs(), 0.05, 0.0, analytic)
+    assert model.is_analytic == analytic
+    lcs = model.build(reference["x_touch"], reference["u_touch"])
+    for name in MATRICES:
+        expected = reference[f"anitescu_2_touch_{name}"]
+        np.testing.assert_allclose(getattr(lcs, name), expected, atol=1e-9)
+    assert lcs.dt == 0.05
+    # The reference's witness points are 0.01 m apart and coincide.
+    np.testing.assert_allclose(lcs.phi, [0.01] * 4 + [0.0] * 4, atol=1e-9)
+
+
+def test_four_friction_directions_reproduce_the_reference_problem(ball_diagram):
+    z = np.load(REFERENCE / "ball_mpc_problem.npz")
+    model = AnitescuLcs(ball_diagram, ball_pairs(n_f=4), 0.05, 0.0)
+    lcs = model.build(z["x0"], np.zeros(3))
+    for name in MATRICES:
+        np.testing.assert_allclose(getattr(lcs, name), z[name], atol=1e-9)
+
+
+def test_the_order_of_a_pairs_bodies_does_not_matter(ball_diagram, reference):
+    swapped = [ContactPair(p.b, p.a, p.friction) for p in ball_pairs()]
+    x, u = reference["x_touch"], reference["u_touch"]
+    one = AnitescuLcs(ball_diagram, ball_pairs(), 0.05).build(x, u)
+    other = AnitescuLcs(ball_diagram, swapped, 0.05).build(x, u)
+    np.testing.assert_array_equal(one.F, other.F)
+    np.testing.assert_array_equal(one.D, other.D)
+
+
+def test_names_of_bodies_and_geometries_mean_the_same(ball_diagram):
+    by_geometry = [
+        ContactPair("finger::finger_collision", "ball::ball_collision", 0.5),
+        ContactPair("ball::ball_link", "table_link", 0.5),
+    ]
+    x = random_state(np.random.default_rng(0), np.zeros(19))
+    one = AnitescuLcs(ball_diagram, ball_pairs(), 0.05).build(x, np.zeros(3))
+    other = AnitescuLcs(ball_diagram, by_geometry, 0.05).build(x, np.zeros(3))
+    np.testing.assert_array_equal(one.E, other.E)
+
+
+# The maths: bases, edges, eps_c.
+
+
+def test_the_tangent_basis_is_drakes():
+    rng = np.random.default_rng(0)
+    axes = [s * np.eye(3)[i] for i in range(3) for s in (1.0, -1.0)]
+    for n in [*axes, *rng.normal(size=(50, 3))]:
+        n = n / np.linalg.norm(n)
+        R = RotationMatrix.MakeFromOneVector(n, 0).matrix()
+        np.testing.assert_allclose(tangent_basis(n, np.zeros(3)), R.T[1:], atol=1e-15)
+
+
+def test_a_reference_direction_keeps_the_tangent_from_jumping():
+    reference = np.array([1.0, 0.0, 0.0])
+    for k in range(12):  # A normal that wobbles about the vertical by 0.05 rad.
+        n = np.array([0.05 * np.cos(k), 0.05 * np.sin(k), 1.0])
+        n /= np.linalg.norm(n)
+        t1, t2 = tangent_basis(n, reference)
+        np.testing.assert_allclose(np.cross(t1, t2), n, atol=1e-15)
+        assert t1[0] > 0.99
+    # Along the normal there is no projection: Drake's basis, not NaN.
+    t1, t2 = tangent_basis(reference, reference)
+    np.testing.assert_allclose(np.cross(t1, t2), reference, atol=1e-15)
+
+
+def test_friction_edges_are_opposite_pairs_at_equal_angles():
+    contact, edge = friction_rows([1, 3])
+    np.testing.assert_array_equal(contact, [0, 0, 1, 1, 1, 1, 1, 1])
+    np.testing.assert_array_equal(edge[::2], -edge[1::2])
+    angles = np.sort(np.arctan2(edge[2:, 1], edge[2:, 0]))
+    np.testing.assert_allclose(np.diff(angles), np.pi / 3, atol=1e-12)
+
+
+def test_eps_c_is_added_to_F_and_is_the_least_eigenvalue(ball_diagram, reference):
+    x, u = reference["x_touch"], reference["u_touch"]
+    plain = AnitescuLcs(ball_diagram, ball_pairs(), 0.05, 0.0).build(x, u)
+    default = AnitescuLcs(ball_diagram, ball_pairs(), 0.05).build(x, u)
+    np.testing.assert_allclose(default.F - plain.F, 5e-4 * np.eye(8), atol=1e-15)
+    # Eight forces in six directions at most: singular without eps_c.
+    assert np.linalg.eigvalsh(default.F)[0] == pytest.approx(5e-4, rel=1e-9)
+
+
+def test_lam_is_in_newtons(ball_diagram):
+    # A ball at rest on the table: every edge has a share of the normal, sum = m g.
+    model = AnitescuLcs(ball_diagram, ball_pairs(), 0.05, 0.0)
+    x = np.zeros(19)
+    x[:4] = [-1.0, 0.0, 0.05, 1.0]
+    x[BALL_Z] = 0.05
+    x_next, lam = simulate(model.build(x, np.zeros(3)), x, [0.0, 0.0, 0.1 * G])
+    assert lam.sum() == pytest.approx(0.2 * G, rel=1e-9)
+    np.testing.assert_allclose(x_next[3:10], x[3:10], atol=1e-12)
+
+
+# Fast path against general path.
+
+SPHERES = """<sdf version="1.7"><world name="w">
+  <model name="post"><static>true</static><link name="post">
+    <pose>0.3 -0.2 0.1 0.4 0.5 -0.6</pose>
+    <collision name="post"><geometry><box><size>.2 .3 .4</size></box></geometry>
+    </collision></link></model>
+  <model name="one"><link name="one"><inertial><mass>0.2</mass>
+      <inertia><ixx>2e-4</ixx><iyy>2e-4</iyy><izz>2e-4</izz></inertia></inertial>
+    <collision name="s"><pose>.01 -.02 .03 .1 .2 .3</pose>
+      <geometry><sphere><radius>.05</radius></sphere></geometry></collision></link>
+  </model>
+  <model name="two"><link name="two"><inertial><mass>0.3</mass>
+      <inertia><ixx>3e-4</ixx><iyy>3e-4</iyy><izz>3e-4</izz></inertia></inertial>
+    <collision name="b"><pose>.02 .01 .01 .3 .1 .2</pose>
+      <geometry><box><size>.1 .08 .06</size></box></geometry></collision></link></model>
+  <model name="slide"><link name="s1"><pose>.1 .2 .3 .5 .1 .2</pose>
+      <inertial><mass>.1</mass></inertial></link>
+    <link name="s2"><pose>.1 .2 .35 -.4 .1 .9</pose><inertial><mass>.4</mass></inertial>
+      <collision name="s"><pose>.03 0 .01 0 0 0</pose>
+        <geometry><sphere><radius>.03</radius></sphere></geometry></collision></link>
+    <joint name="j1" type="prismatic"><parent>world</parent><child>s1</child>
+      <axis><xyz>1 2 .5</xyz><dynamics><damping>.7</damping></dynamics></axis></joint>
+    <joint name="j2" type="prismatic"><parent>s1</parent><child>s2</child>
+      <axis><xyz>0 1 -1</xyz><limit><effort>5</effort></limit></axis></joint></model>
+</world></sdf>"""
+
+
+def add_slope(plant):
+    X = RigidTransform(RotationMatrix.MakeXRotation(0.3), [0.0, 0.0, -0.4])
+    plant.RegisterCollisionGeometry(
+        plant.world_body(), X, HalfSpace(), "slope", CoulombFriction(1.0, 1.0)
+    )
+
+
+def test_the_fast_path_agrees_with_the_general_one_at_random_states():
+    diagram = diagram_of(SPHERES, add_slope)
+    pairs = [
+        ContactPair("one", "slide::s2", 0.3),
+        ContactPair("one", "post", 0.7, 3),
+        ContactPair("one", "two", 0.5, 1, [1.0, 0.5, 0.0]),
+        ContactPair("two", "slide::s2", 0.4),
+        ContactPair("one", "world", 0.6),
+        ContactPair("slide::s2", "world", 0.2),
+    ]
+    fast = AnitescuLcs(diagram, pairs, 0.05)
+    general = AnitescuLcs(diagram, pairs, 0.05, analytic=False)
+    assert fast.is_analytic and not general.is_analytic
+    rng = np.random.default_rng(0)
+    quaternions = [k for k in range(fast.n_q) if fast.x_default[k] == 1.0]
+    deep = 0
+    for _ in range(40):
+        x = random_state(rng, fast.x_default, quaternions)
+        if rng.random() < 0.5:  # The ball "one" around and inside the post.
+            first = fast.x_names.index("one_one_x")
+            x[first : first + 3] = [0.3, -0.2, 0.1] + 0.08 * rng.normal(size=3)
+        u = rng.normal(size=fast.n_u)
+        one, other = fast.build(x, u), general.build(x, u)
+        deep += one.phi.min() < -0.06  # More than the radius.
+        for name in (*MATRICES, "phi"):
+            a, b = getattr(one, name), getattr(other, name)
+            # Rounding: 1e-16 of the largest entry, through a few dozen sums.
+            np.testing.assert_allclose(a, b, atol=1e-13 * max(1.0, np.abs(b).max()))
+    assert deep > 5  # The ball's centre was inside the box too.
+
+
+# The general path against the plant itself.
+
+ARM = """<sdf version="1.7" xmlns:drake="http://drake.mit.edu"><world name="w">
+  <model name="arm">
+    <link name="l1"><pose>0 0 .2 0 .3 0</pose><inertial><pose>.01 .02 .1 0 0 0</pose>
+      <mass>1.2</mass><inertia><ixx>.02</ixx><iyy>.03</iyy><izz>.015</izz>
+      <ixy>.002</ixy></inertia></inertial></link>
+    <link name="l2"><pose>.1 0 .5 .2 .3 .1</pose><inertial><pose>0 .01 .1 0 0 0</pose>
+      <mass>.7</mass><inertia><ixx>.01</ixx><iyy>.012</iyy><izz>.004</izz></inertia>
+      </inertial>
+      <collision name="tip"><pose>0 0 .3 0 0 0</pose><geometry><{tip}></geometry>
+      </collision></link>
+    <joint name="j1" type="revolute"><parent>world</parent><child>l1</child>
+      <axis><xyz>0 .6 .8</xyz><dynamics><damping>.3</damping></dynamics></axis></joint>
+    <joint name="j2" type="revolute"><parent>l1</parent><child>l2</child>
+      <axis><xyz>0 1 0</xyz></axis><drake:rotor_inertia>.002</drake:rotor_inertia>
+      <drake:gear_ratio>4</drake:gear_ratio></joint></model>
+  <model name="object"><link name="object"><pose>.4 .1 .9 0 0 0</pose>
+    <inertial><pose>.01 .02 -.01 0 0 0</pose><mass>.5</mass>
+      <inertia><ixx>.001</ixx><iyy>.002</iyy><izz>.0015</izz></inertia></inertial>
+    <collision name="c"><geometry><{object}></geometry></collision></link></model>
+</world></sdf>"""
+SPHERE = "sphere><radius>.04</radius></sphere"
+BOX = "box><size>.1 .12 .08</size></box"
+CAPSULE = "capsule><radius>.03</radius><length>.1</length></capsule"
+
+
+class Arm:
+    """The two-link arm, an object with an uneven inertia, and the plant as truth."""
+
+    def __init__(self, tip=SPHERE, target=SPHERE, time_step=0.0):
+        text = ARM.format(tip=tip, object=target)
+        self.diagram = diagram_of(text, time_step=time_step)
+        self.plant = self.diagram.GetSubsystemByName("plant")
+        self.scene_graph = self.diagram.GetSubsystemByName("scene_graph")
+        self.context = self.diagram.CreateDefaultContext()
+        self.own = self.plant.GetMyContextFromRoot(self.context)
+        self.pairs = [ContactPair("l2", "object", 0.6)]
+        self.port = self.plant.get_applied_spatial_force_input_port()
+
+    def acceleration(self, x, u, forces=()):
+        self.plant.SetPositionsAndVelocities(self.own, x)
+        self.plant.get_actuation_input_port().FixValue(self.own, u)
+        self.port.FixValue(self.own, list(forces))
+        return self.plant.EvalTimeDerivatives(self.own).CopyToVector()[9:]
+
+    def step(self, x, u, dt):
+        """The discrete step without contact; x = [q 9, v 8], N taken at x."""
+        v_next = x[9:] + dt * self.acceleration(x, u)
+        return np.hstack([x[:9] + dt * self.N(x) @ v_next, v_next])
+
+    def N(self, x):
+        self.plant.SetPositionsAndVelocities(self.own, x)
+        return self.plant.MakeVelocityToQDotMap(self.own).toarray()
+
+    def distance(self, x):
+        self.plant.SetPositionsAndVelocities(self.own, x)
+        query = self.plant.get_geometry_query_input_port().Eval(self.own)
+        ids = query.inspector().GetAllGeometryIds()
+        return query.ComputeSignedDistancePairClosestPoints(ids[0], ids[1])
+
+    def world_points(self, pair):
+        inspector = self.scene_graph.model_inspector()
+        points = []
+        for id, p in ((pair.id_A, pair.p_ACa), (pair.id_B, pair.p_BCb)):
+            frame = self.plant.GetBodyFromFrameId(inspector.GetFrameId(id)).body_frame()
+            X_WF = frame.CalcPoseInWorld(self.own)
+            points.append((frame.body(), X_WF @ inspector.GetPoseInFrame(id) @ p))
+        return points
+
+
+def arm_state(rng):
+    x = rng.normal(size=17) * 0.5
+    x[2:6] /= np.linalg.norm(x[2:6])
+    x[6:9] = [0.4, 0.1, 1.6]  # Clear of the arm, so that the plant feels no contact.
+    return x
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return Arm()
+
+
+def test_A_and_B_are_the_derivatives_of_the_true_step(arm):
+    dt, rng = 0.05, np.random.default_rng(0)
+    model = AnitescuLcs(arm.diagram, arm.pairs, dt)
+    assert not model.is_analytic and model.n_u == 2
+    for _ in range(5):
+        x, u = arm_state(rng), rng.normal(size=model.n_u)
+        lcs = model.build(x, u)
+        N, h = arm.N(x), 1e-6
+        x_next = lcs.A @ x + lcs.B @ u + lcs.d
+        np.testing.assert_allclose(x_next, arm.step(x, u, dt), atol=1e-12)
+        for k in range(model.n_u):  # The step is linear in u.
+            dx = arm.step(x, u + np.eye(model.n_u)[k], dt) - arm.step(x, u, dt)
+            np.testing.assert_allclose(lcs.B[:, k], dx, atol=1e-12)
+        for k in range(17):
+            e = h * np.eye(17)[k]
+            plus, minus = (
+                x[9:] + s[9:] + dt * arm.acceleration(x + s, u) for s in (e, -e)
+            )
+            dv = (plus - minus) / (2 * h)
+            dq = np.eye(17)[k][:9] + dt * N @ dv  # N frozen at x.
+            # Central differences: h^2 times the third derivative, and 1e-16/h.
+            np.testing.assert_allclose(lcs.A[:, k], [*dq, *dv], atol=1e-7)
+
+
+def test_E_and_H_carry_the_gap_and_the_velocity_after_the_step():
+    # w = gap(q)/dt + J_c v_next, where only the first term and v_next depend on x.
+    arm = Arm()
+    dt, rng = 0.05, np.random.default_rng(1)
+    model = AnitescuLcs(arm.diagram, arm.pairs, dt, 0.0)
+    x, u, h = arm_state(rng), rng.normal(size=model.n_u), 1e-6
+    lcs = model.build(x, u)
+    J_c = np.linalg.lstsq(
+        np.linalg.inv(mass_matrix(arm, x)), lcs.D[9:] / dt, rcond=None
+    )[0].T
+    w = lcs.E @ x + lcs.H @ u + lcs.c
+    gap = arm.distance(x).distance
+    assert lcs.phi == pytest.approx([gap] * 4, abs=1e-12)
+    v_next = arm.step(x, u, dt)[9:]
+    np.testing.assert_allclose(w, gap / dt + J_c @ v_next, atol=1e-9)
+    for k in range(17):
+        e = h * np.eye(17)[k]
+        ends = [
+            arm.distance(x + s).distance / dt
+            + J_c @ (x[9:] + s[9:] + dt * arm.acceleration(x + s, u))
+            for s in (e, -e)
+        ]
+        slope = (ends[0] - ends[1]) / (2 * h)
+        np.testing.assert_allclose(lcs.E[:, k], slope, atol=1e-5)  # |w| ~ 10.
+
+
+def mass_matrix(arm, x):
+    arm.plant.SetPositionsAndVelocities(arm.own, x)
+    return arm.plant.CalcMassMatrix(arm.own)
+
+
+@pytest.mark.parametrize(
+    "tip, target", [(SPHERE, SPHERE), (BOX, SPHERE), (CAPSULE, SPHERE), (BOX, CAPSULE)]
+)
+def test_a_force_accelerates_as_the_same_force_pair_applied_to_the_plant(tip, target):
+    arm = Arm(tip, target)
+    dt, mu, rng = 0.05, 0.6, np.random.default_rng(2)
+    model = AnitescuLcs(arm.diagram, arm.pairs, dt)
+    x, u = arm_state(rng), rng.normal(size=model.n_u)
+    lcs = model.build(x, u)
+    free, pair = arm.acceleration(x, u), arm.distance(x)
+    n, t1, t2 = RotationMatrix.MakeFromOneVector(pair.nhat_BA_W, 0).matrix().T
+    for k, t in enumerate((t1, -t1, t2, -t2)):
+        forces = []
+        for (body, p_W), sign in zip(arm.world_points(pair), (1.0, -1.0), strict=True):
+            force = ExternallyAppliedSpatialForce()
+            force.body_index = body.index()
+            X_WB = arm.plant.EvalBodyPoseInWorld(arm.own, body)
+            force.p_BoBq_B = X_WB.inverse() @ p_W
+            force.F_Bq_W = SpatialForce(np.zeros(3), sign * (n + mu * t))
+            forces.append(force)
+        pushed = arm.acceleration(x, u, forces)
+        # D is dt times the acceleration per newton; accelerations are near 100.
+        np.testing.assert_allclose(lcs.D[9:, k] / dt, pushed - free, atol=1e-9)
+
+
+def test_a_discrete_plant_gives_the_lcs_of_a_continuous_one():
+    arm = Arm()
+    # A discrete plant gives the same LCS: only its model is asked, not its steps.
+    discrete = Arm(time_step=0.001)
+    x, u = arm_state(np.random.default_rng(3)), np.array([1.0, -2.0])
+    one = AnitescuLcs(arm.diagram, arm.pairs, 0.05).build(x, u)
+    other = AnitescuLcs(discrete.diagram, discrete.pairs, 0.05).build(x, u)
+    np.testing.assert_allclose(one.A, other.A, atol=1e-12)
+    np.testing.assert_allclose(one.d, other.d, atol=1e-12)
+
+
+# Along a horizon.
+
+
+def test_a_falling_ball_rolled_out_through_one_lcs_lands_at_the_right_step(
+    ball_diagram,
+):
+    # Semi-implicit Euler: after k steps the gap is h - G dt^2 k (k + 1)/2. The force
+    # acts from the step in which that would turn negative, and stops the ball at 0.
+    h, dt = 0.2, 0.02
+    model = AnitescuLcs(ball_diagram, ball_pairs(), dt, 0.0)
+    x = np.zeros(19)
+    x[:4], x[BALL_Z] = [-1.0, 0.0, 0.5, 1.0], 0.05 + h
+    u = [0.0, 0.0, 0.1 * G]
+    lcs = model.build(x, u)  # One linearisation for the whole horizon.
+    k = np.arange(1, 15)
+    free = h - G * dt**2 * k * (k + 1) / 2
+    for gap in free:
+        x, lam = simulate(lcs, x, u)
+        assert x[BALL_Z] - 0.05 == pytest.approx(max(gap, 0.0), abs=1e-12)
+        assert (lam.sum() > 0.0) == (gap < 0.0)
+    assert (free < 0.0).any() and (free > 0.0).any()
+
+
+def test_a_pushed_ball_rolls_through_the_lcs():
+    # Finger on top of the ball, moving at s: a ball that rolls without slip goes s/2
+    # and turns s/(2 R). (Friction 1 and eps_c keep it from slipping in 20 steps.)
+    diagram = diagram_of(SDF)
+    model = AnitescuLcs(diagram, ball_pairs(1.0), 0.01)
+    x = np.zeros(19)
+    x[:4], x[BALL_Z] = [0.0, 0.0, 0.12, 1.0], 0.05
+    for _ in range(20):
+        # 0.5 N down beyond its weight, and a stiff servo to 0.05 m/s along x.
+        u = [2.0 * (0.05 - x[10]), -2.0 * x[11], 0.1 * G - 0.5]
+        x, _ = simulate(model.build(x, u), x, u)
+        x[3:7] /= np.linalg.norm(x[3:7])
+    v_finger, omega_y, v_ball = x[10], x[14], x[16]
+    assert v_finger > 0.02
+    # The friction edges are soft by eps_c, and the contact lags by one step.
+    assert v_ball == pytest.approx(v_finger / 2, rel=0.05)
+    assert omega_y == pytest.approx(v_ball / 0.05, rel=0.05)
+
+
+# Quaternions.
+
+
+def test_position_rows_integrate_the_quaternion_to_first_order(ball_diagram):
+    model = AnitescuLcs(ball_diagram, ball_pairs(), 1e-3)
+    rng = np.random.default_rng(4)
+    x = random_state(rng, model.x_default)
+    x[BALL_Z] = 1.0
+    x[13:16] = [1.0, -2.0, 0.5]
+    lcs = model.build(x, np.zeros(3))
+    x_next = lcs.A @ x + lcs.d
+    w, q = 1e-3 * x[13:16], x[3:7]  # omega in the world: q_next = exp(w/2) q.
+    angle = np.linalg.norm(w)
+    p = np.array([np.cos(angle / 2), *np.sin(angle / 2) * w / angle])
+    exact = np.array(
+        [p[0] * q[0] - p[1:] @ q[1:]]
+        + [*(p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:]))]
+    )
+    np.testing.assert_allclose(x_next[3:7], exact, atol=angle**2)
+
+
+@pytest.mark.parametrize("analytic", [True, False])
+def test_a_quaternion_is_normalised(ball_diagram, analytic):
+    model = AnitescuLcs(ball_diagram, ball_pairs(), 0.05, analytic=analytic)
+    x = random_state(np.random.default_rng(5), model.x_default)
+    scaled = x.copy()
+    scaled[3:7] *= 1.3
+    one, other = (model.build(y, np.zeros(3)) for y in (x, scaled))
+    for name in MATRICES:
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-12)
+    assert scaled[3:7] @ scaled[3:7] == pytest.approx(1.69)  # The input is untouched.
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.1, 10.0])
+def test_a_quaternion_that_is_none_is_refused(ball_diagram, factor):
+    model = AnitescuLcs(ball_diagram, ball_pairs(), 0.05)
+    x = model.x_default.copy()
+    x[3:7] *= factor
+    with pytest.raises(ValueError, match=r"quaternion x\[3:7\] has norm"):
+        model.build(x, np.zeros(3))
+
+
+# Bad input.
+
+
+def test_a_name_that_does_not_exist_is_refused_with_the_nearest(ball_diagram):
+    with pytest.raises(ValueError, match="named 'bal_link'; nearest: .*ball_link"):
+        AnitescuLcs(ball_diagram, [ContactPair("bal_link", "table_link")])
+
+
+def test_a_body_without_collision_geometry_is_refused(ball_diagram):
+    with pytest.raises(ValueError, match="'fx' has no collision geometry"):
+        AnitescuLcs(ball_diagram, [ContactPair("fx", "ball_link")])
+
+
+def test_an_ambiguous_name_is_refused_with_the_scoped_ones():
+    two = SDF.replace('<model name="ball">', '<model name="b2">', 1)
+    model = two[two.index('<model name="b2">') :].split("</model>")[0] + "</model>"
+    diagram = diagram_of(SDF.replace("</world>", model + "</world>"))
+    with pytest.raises(ValueError, match="ball::ball_link.*b2::ball_link|b2::ball_l"):
+        AnitescuLcs(diagram, [ContactPair("ball_link", "table_link")])
+    AnitescuLcs(diagram, [ContactPair("b2::ball_link", "ball::ball_link")])
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (dict(friction=-0.1), "friction is -0.1"),
+        (dict(friction=np.nan), "friction is nan"),
+        (dict(friction_directions=0), "friction_directions is 0"),
+        (dict(friction_directions=1.5), "friction_directions is 1.5"),
+        (dict(tangent=[1.0]), "tangent is"),
+        (dict(b="ball_link"), "same body"),
+    ],
+)
+def test_a_bad_pair_is_refused(ball_diagram, change, message):
+    pair = ContactPair("ball_link", "table_link")
+    for name, value in change.items():
+        setattr(pair, name, value)
+    with pytest.raises(ValueError, match=message):
+        AnitescuLcs(ball_diagram, [pair])
+
+
+def test_bad_parameters_are_refused(ball_diagram):
+    for dt in (0.0, -0.1, np.nan):
+        with pytest.raises(ValueError, match="dt_sec is"):
+            AnitescuLcs(ball_diagram, ball_pairs(), dt)
+    with pytest.raises(ValueError, match="eps_c is -1"):
+        AnitescuLcs(ball_diagram, ball_pairs(), 0.1, -1.0)
+    with pytest.raises(ValueError, match="no contact pairs"):
+        AnitescuLcs(ball_diagram, [])
+    with pytest.raises(ValueError, match="expected the Diagram"):
+        AnitescuLcs(MultibodyPlant(0.0), ball_pairs())
+
+
+def test_a_plant_that_is_not_finalized_is_refused():
+    builder = DiagramBuilder()
+    AddMultibodyPlantSceneGraph(builder, 0.0)
+    with pytest.raises((ValueError, RuntimeError), match="[Ff]inalize"):
+        AnitescuLcs(builder.Build(), ball_pairs())
+
+
+def test_wrong_sizes_and_nan_are_refused(ball_diagram):
+    model = AnitescuLcs(ball_diagram, ball_pairs())
+    x, u = model.x_default, np.zeros(3)
+    with pytest.raises(ValueError, match=r"x is \(18,\)"):
+        model.build(x[1:], u)
+    with pytest.raises(ValueError, match="not finite"):
+        model.build(np.where(np.arange(19) == 4, np.nan, x), u)
+    with pytest.raises(ValueError, match="not finite"):
+        model.build(x, [0.0, np.inf, 0.0])
+
+
+def test_shapes_without_a_distance_are_refused_by_name():
+    with pytest.raises(ValueError, match="no signed distance of Box and HalfSpace"):
+        AnitescuLcs(diagram_of(SPHERES, add_slope), [ContactPair("two", "world")])
+
+
+def test_what_an_lcs_cannot_hold_is_refused():
+    def constrain(plant):
+        p = np.zeros(3)
+        a, b = plant.GetBodyByName("ball_link"), plant.GetBodyByName("fx")
+        plant.AddBallConstraint(a, p, b, p)
+
+    with pytest.raises(ValueError, match="1 constraints"):
+        AnitescuLcs(diagram_of(SDF, constrain, 0.001), ball_pairs())
+
+
+def test_an_actuator_with_a_pd_controller_is_refused():
+    def control(plant):
+        plant.GetJointActuatorByName("jx").set_controller_gains(PdControllerGains(1, 1))
+
+    with pytest.raises(ValueError, match="jx has a PD controller"):
+        AnitescuLcs(diagram_of(SDF, control, 0.001), ball_pairs())
+
+
+def test_a_plant_without_actuators_has_no_input():
+    text = SDF.replace("<effort>20</effort>", "<effort>0</effort>")
+    model = AnitescuLcs(diagram_of(text), ball_pairs())
+    assert model.build(model.x_default, np.zeros(0)).B.shape == (19, 0)
+    assert model.is_analytic
+
+
+# Where the fast path must not be taken.
+
+
+@pytest.mark.parametrize("what", ["spring", "uneven", "offset", "welded", "revolute"])
+def test_a_model_that_is_not_constant_takes_the_general_path(what):
+    text, extend = SDF, None
+    if what == "uneven":
+        text = SDF.replace("<ixx>2e-4", "<ixx>2.1e-4", 1)
+    if what == "offset":
+        pose = "<inertial><pose>.01 0 0 0 0 0</pose><mass>0.2</mass>"
+        text = SDF.replace("<inertial><mass>0.2</mass>", pose)
+    if what == "revolute":
+        text = SDF.replace('name="jx" type="prismatic"', 'name="jx" type="revolute"')
+
+    def add(plant):
+        ball, table = (plant.GetBodyByName(n) for n in ("ball_link", "table_link"))
+        if what == "spring":
+            p = np.zeros(3)
+            plant.AddForceElement(LinearSpringDamper(ball, p, table, p, 0.1, 9.0, 1.0))
+        if what == "welded":
+            inertia = SpatialInertia.SolidSphereWithMass(0.1, 0.01)
+            extra = plant.AddRigidBody("extra", ball.model_instance(), inertia)
+            at = plant.AddFrame(
+                FixedOffsetFrame("at", ball.body_frame(), RigidTransform([0.1, 0, 0]))
+            )
+            plant.WeldFrames(at, extra.body_frame())
+
+    extend = add if what in ("spring", "welded") else None
+    assert not AnitescuLcs(diagram_of(text, extend), ball_pairs()).is_analytic
+
+
+# The system.
+
+
+def system_of(ball_diagram, dt_sec=0.05, period_sec=0.0125):
+    config = LcsBuilderConfig(ball_pairs(), dt_sec, period_sec=period_sec)
+    return AnitescuLcsBuilder(ball_diagram, config)
+
+
+def run_with(systems, x, u):
+    builder = DiagramBuilder()
+    sources = [builder.AddSystem(ConstantVectorSource(value)) for value in (x, u)]
+    for system in systems:
+        builder.AddSystem(system)
+        for source, name in zip(sources, ("x", "u"), strict=True):
+            builder.Connect(source.get_output_port(), system.GetInputPort(name))
+    return Simulator(builder.Build())
+
+
+def outputs(simulator, system):
+    context = system.GetMyContextFromRoot(simulator.get_context())
+    lcs = system.GetOutputPort("lcs").Eval(context)
+    return lcs, system.GetOutputPort("status").Eval(context)[0]
+
+
+def test_the_port_starts_with_the_default_state_and_then_follows_x(
+    ball_diagram, reference
+):
+    system = system_of(ball_diagram)
+    x, u = reference["x_touch"], reference["u_touch"]
+    simulator = run_with([system], x, u)
+    lcs, status = outputs(simulator, system)
+    default = system.model.build(system.model.x_default, np.zeros(3))
+    np.testing.assert_array_equal(lcs.c, default.c)
+    assert status == 1.0
+    simulator.AdvanceTo(0.001)
+    lcs, status = outputs(simulator, system)
+    np.testing.assert_array_equal(lcs.c, system.model.build(x, u).c)
+    assert status == 1.0 and lcs.dt == 0.05
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, "quaternion"])
+def test_a_bad_state_holds_the_last_lcs_and_says_so(ball_diagram, reference, bad):
+    system = system_of(ball_diagram)
+    x = reference["x_touch"].copy()
+    if bad == "quaternion":
+        x[3:7] = 0.0
+    else:
+        x[0] = bad
+    simulator = run_with([system], x, np.zeros(3))
+    before, _ = outputs(simulator, system)
+    simulator.AdvanceTo(0.03)
+    after, status = outputs(simulator, system)
+    assert status == 0.0
+    np.testing.assert_array_equal(after.c, before.c)
+    assert np.isfinite(after.c).all()
+
+
+def test_three_builders_in_one_diagram_do_not_disturb_each_other(
+    ball_diagram, reference
+):
+    x, u = reference["x_touch"], reference["u_touch"]
+    times = (0.1, 0.05, 0.0125)
+    systems = [system_of(ball_diagram, dt, 0.01) for dt in times]
+    simulator = run_with(systems, x, u)
+    simulator.AdvanceTo(0.025)
+    for dt, system in zip(times, systems, strict=True):
+        lcs, _ = outputs(simulator, system)
+        alone = AnitescuLcs(ball_diagram, ball_pairs(), dt).build(x, u)
+        assert lcs.dt == dt
+        np.testing.assert_array_equal(lcs.E, alone.E)
+        np.testing.assert_array_equal(lcs.F, alone.F)
