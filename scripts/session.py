@@ -212,7 +212,9 @@ class Session:
         # The last chunk may be shorter; 1e-9 forgives duration/period's rounding.
         n_chunks = int(np.ceil(duration / period_sec - 1e-9))
         if self.meshcat is not None:
-            self.meshcat.StartRecording(frames_per_second=32.0)
+            # A long run has fewer pictures per second, so that the page stays light.
+            fps = float(np.clip(3600 // duration, 10, 32))
+            self.meshcat.StartRecording(frames_per_second=fps)
         wall_start, cpu_start = perf_counter(), process_time()
         with _CatchInterrupt() as interrupt, self._bar(duration, label) as bar:
             try:

@@ -1,0 +1,76 @@
+"""A picture of a meshcat.html, taken without a screen: needs Debian's chromium.
+
+python -m makebreak.scripts.screenshot runs/<run>/meshcat.html picture.png
+"""
+
+import argparse
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+
+
+def screenshot(page: Path, picture: Path, size=(1280, 800), wait_ms: int = 15000):
+    """Draws `page` with a browser's software renderer and writes `picture`.
+
+    Args:
+        page: an HTML file.
+        picture: the PNG to write.
+        size: width and height [pixels].
+        wait_ms: how long the page may take, on its own clock [ms].
+    Raises: ValueError if there is no page or no browser; RuntimeError if the browser
+        writes no picture.
+    """
+    if not page.is_file():
+        raise ValueError(f'page: got "{page}", expected an HTML file')
+    browser = next(filter(None, map(shutil.which, _BROWSERS)), None)
+    if browser is None:
+        raise ValueError("no browser found, expected one of: " + ", ".join(_BROWSERS))
+    picture = picture.resolve()
+    picture.unlink(missing_ok=True)
+    with TemporaryDirectory() as profile:
+        options = [
+            "--headless=new",
+            "--no-sandbox",
+            "--use-angle=swiftshader",
+            "--enable-unsafe-swiftshader",
+            "--ignore-gpu-blocklist",
+            "--disable-quic",
+            "--no-first-run",
+            "--disable-background-networking",
+            "--disable-component-update",
+            "--disable-sync",
+            f"--user-data-dir={profile}",
+            f"--window-size={size[0]},{size[1]}",
+            f"--virtual-time-budget={wait_ms}",
+            f"--screenshot={picture}",
+            page.resolve().as_uri(),
+        ]
+        done = subprocess.run(
+            [browser, *options], capture_output=True, text=True, timeout=300
+        )
+    if not picture.is_file():
+        lines = done.stderr.strip().splitlines() or ["no output"]
+        raise RuntimeError(f"{browser} wrote no picture: {lines[-1]}")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description="A picture of a meshcat.html, taken without a screen."
+    )
+    parser.add_argument("page", type=Path)
+    parser.add_argument("picture", type=Path)
+    args = parser.parse_args()
+    try:
+        screenshot(args.page, args.picture)
+    except (ValueError, RuntimeError) as error:
+        print(f"screenshot: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,342 @@
+"""What a run simulates, samples and writes."""
+
+import base64
+import csv
+import json
+import re
+import signal
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from pydrake.geometry import Box, Meshcat, MeshcatVisualizer
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.multibody.tree import SpatialInertia
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import ConstantVectorSource, Integrator
+
+from makebreak.scripts.recording import check_columns, write_recording
+from makebreak.scripts.session import Session
+from makebreak.scripts.settings import convert
+from makebreak.scripts.table import Table
+from makebreak.systems.numerics.timing import timed
+
+
+def ramp():
+    """A diagram whose port q is (t, 2 t), inside a diagram of its own."""
+    inner = DiagramBuilder()
+    source = inner.AddSystem(ConstantVectorSource([1.0, 2.0]))
+    integrator = inner.AddNamedSystem("integrator", Integrator(2))
+    inner.Connect(source.get_output_port(), integrator.get_input_port())
+    inner.ExportOutput(integrator.get_output_port(), "q")
+    builder = DiagramBuilder()
+    part = builder.AddSystem(inner.Build())
+    builder.ExportOutput(part.GetOutputPort("q"), "q")
+    return builder.Build(), integrator
+
+
+def session(tmp_path, **more):
+    return Session(tmp_path / "out", progress=False, **more)
+
+
+def test_samples_are_taken_at_multiples_of_the_period_and_at_the_end(tmp_path):
+    diagram, integrator = ramp()
+    record = {"outer": diagram.GetOutputPort("q"), "deep": integrator.get_output_port()}
+    log = session(tmp_path).simulate(diagram, 0.35, record, period_sec=0.1)
+    np.testing.assert_allclose(log.time, [0.0, 0.1, 0.2, 0.3, 0.35], atol=1e-15)
+    # The integrand is constant: any Runge-Kutta method is exact but for rounding.
+    expected = np.outer(log.time, [1.0, 2.0])
+    np.testing.assert_allclose(log["outer"], expected, atol=1e-13)
+    np.testing.assert_array_equal(log["deep"], log["outer"])
+    assert not log.interrupted and log.diagram is diagram
+    assert log.context.get_time() == 0.35
+    assert list(log) == ["outer", "deep"]
+
+
+def test_the_number_of_samples_does_not_suffer_from_rounding(tmp_path):
+    diagram, _ = ramp()
+    log = session(tmp_path).simulate(diagram, 0.3, {}, period_sec=0.1)
+    np.testing.assert_allclose(log.time, [0.0, 0.1, 0.2, 0.3], atol=1e-15)
+
+
+def test_until_sees_each_sample_and_ends_the_simulation(tmp_path):
+    diagram, _ = ramp()
+    seen = []
+
+    def until(t, sample):
+        seen.append(t)
+        return sample["q"][1] > 0.5
+
+    log = session(tmp_path).simulate(
+        diagram, 9.0, {"q": diagram.GetOutputPort("q")}, 0.1, until
+    )
+    np.testing.assert_allclose(log.time[-1], 0.3, atol=1e-12)  # 2 * 0.3 > 0.5.
+    assert seen == list(log.time)
+
+
+def test_it_starts_from_the_context_that_it_is_given(tmp_path):
+    diagram, integrator = ramp()
+    context = diagram.CreateDefaultContext()
+    integrator.set_integral_value(integrator.GetMyContextFromRoot(context), [5.0, 7.0])
+    log = session(tmp_path).simulate(
+        diagram, 0.1, {"q": diagram.GetOutputPort("q")}, context=context
+    )
+    np.testing.assert_array_equal(log["q"][0], [5.0, 7.0])
+
+
+def test_the_sessions_duration_overrides_the_experiments(tmp_path):
+    diagram, _ = ramp()
+    log = session(tmp_path, duration_sec=0.2).simulate(diagram, 50.0, {})
+    np.testing.assert_allclose(log.time[-1], 0.2, atol=1e-15)
+
+
+def test_simulated_time_passes_no_faster_than_the_rate_allows(tmp_path):
+    diagram, _ = ramp()
+    own = session(tmp_path, realtime=2.0)
+    own.simulate(diagram, 0.4, {})
+    own.finish()
+    timing = json.loads((own.out_dir / "timing.json").read_text())
+    assert timing["real_time_factor"] < 2.2  # A bound from above holds on any machine.
+
+
+class Ticker(LeafSystem):
+    """Counts at 100 Hz. Outputs: n (1,); words (abstract)."""
+
+    def __init__(self):
+        super().__init__()
+        n = self.DeclareDiscreteState(1)
+        self.DeclareStateOutputPort("n", n)
+        self.DeclareAbstractOutputPort("words", lambda: _value(), lambda *_: None)
+        self.DeclarePeriodicDiscreteUpdateEvent(0.01, 0.0, self._update)
+
+    @timed
+    def _update(self, context, discrete_state):
+        discrete_state.set_value(context.get_discrete_state_vector().value() + 1.0)
+
+
+def _value():
+    from pydrake.common.value import Value
+
+    return Value("")
+
+
+def ticking():
+    builder = DiagramBuilder()
+    ticker = builder.AddNamedSystem("ticker", Ticker())
+    return builder.Build(), ticker
+
+
+def test_a_sample_is_taken_before_the_update_at_its_time(tmp_path):
+    diagram, ticker = ticking()
+    log = session(tmp_path).simulate(
+        diagram, 0.03, {"n": ticker.GetOutputPort("n")}, 0.01
+    )
+    np.testing.assert_array_equal(log["n"][:, 0], [0.0, 1.0, 2.0, 3.0])
+
+
+def test_timing_counts_the_updates_of_each_simulation_apart(tmp_path):
+    diagram, _ = ticking()
+    own = session(tmp_path)
+    own.simulate(diagram, 0.5, {}, label="first")
+    own.simulate(diagram, 1.0, {}, label="second")
+    assert own.finish() == [own.out_dir / "timing.json"]
+    timing = json.loads((own.out_dir / "timing.json").read_text())
+    assert timing["simulated_s"] == 1.5
+    updates = [
+        timing["simulations"][k]["systems"]["ticker"]["updates"]
+        for k in ("first", "second")
+    ]
+    assert updates == [50, 100]
+
+
+def test_a_port_that_cannot_be_sampled_is_refused_by_name(tmp_path):
+    diagram, ticker = ticking()
+    _, other = ticking()
+    own = session(tmp_path)
+    with pytest.raises(ValueError, match="record: words is an abstract port"):
+        own.simulate(diagram, 1.0, {"words": ticker.GetOutputPort("words")})
+    with pytest.raises(ValueError, match="record: n is a port of ticker, expected one"):
+        own.simulate(diagram, 1.0, {"n": other.GetOutputPort("n")})
+    for bad in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="duration_sec: got"):
+            own.simulate(diagram, bad, {})
+        with pytest.raises(ValueError, match="period_sec: got"):
+            own.simulate(diagram, 1.0, {}, period_sec=bad)
+
+
+def test_ctrl_c_ends_the_simulation_and_forbids_the_next(tmp_path):
+    diagram, _ = ramp()
+    own = session(tmp_path)
+    before = signal.getsignal(signal.SIGINT)
+
+    def until(t, sample):
+        if t > 0.45:
+            signal.raise_signal(signal.SIGINT)
+        return False
+
+    record = {"q": diagram.GetOutputPort("q")}
+    log = own.simulate(diagram, 1e6, record, 0.1, until)
+    assert log.interrupted and own.interrupted
+    np.testing.assert_allclose(log.time[-1], 0.5, atol=1e-12)
+    assert log["q"].shape == (6, 2)
+    assert signal.getsignal(signal.SIGINT) is before
+    with pytest.raises(KeyboardInterrupt):
+        own.simulate(diagram, 1.0, {})
+
+
+def test_a_second_ctrl_c_does_not_wait(tmp_path):
+    diagram, _ = ramp()
+
+    def until(t, sample):
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+
+    own = session(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        own.simulate(diagram, 1e6, {"q": diagram.GetOutputPort("q")}, until=until)
+    assert own.keep_partial() == own.out_dir / "partial.npz"
+
+
+def test_meshcat_html_holds_the_whole_animation(tmp_path):
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.001)
+    inertia = SpatialInertia.SolidSphereWithMass(1.0, 0.1)
+    body = plant.AddRigidBody("falling_box", inertia)
+    box = Box(0.1, 0.1, 0.1)
+    plant.RegisterVisualGeometry(body, RigidTransform(), box, "box", [1, 0, 0, 1])
+    plant.Finalize()
+    meshcat = Meshcat()
+    MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
+    own = session(tmp_path, meshcat=meshcat)
+    own.simulate(builder.Build(), 0.5, {})
+    assert own.finish()[-1] == own.out_dir / "meshcat.html"
+    html = (own.out_dir / "meshcat.html").read_text()
+    blobs = [base64.b64decode(b) for b in re.findall(r"base64,([\w+/=]+)", html)]
+    [animation] = [b for b in blobs if b"set_animation" in b and b"keys" in b]
+    # A key is a time and a position; at 32 pictures per second there are 17 in 0.5 s.
+    assert b"falling_box" in animation and animation.count(b"time") >= 17
+
+
+def test_result_json_is_flat_in_the_given_order_and_without_nan(tmp_path):
+    own = session(tmp_path)
+    result = {
+        "b_m": np.float64(0.1),
+        "success": np.True_,
+        "a": np.nan,
+        "n": np.int64(3),
+    }
+    text = own.write_result(result).read_text()
+    assert json.loads(text) == {"b_m": 0.1, "success": True, "a": None, "n": 3}
+    assert list(json.loads(text)) == ["b_m", "success", "a", "n"]
+    with pytest.raises(ValueError, match="result x: got list, expected a scalar"):
+        own.write_result({"success": True, "x": [1.0]})
+    with pytest.raises(ValueError, match="result success: got None, expected True or"):
+        own.write_result({"x": 1.0})
+
+
+def test_a_plot_is_a_picture_and_needs_no_display(tmp_path, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    own = session(tmp_path)
+    figure = Figure()
+    figure.subplots().plot([0.0, 1.0])
+    path = own.save_plot(figure, "line")
+    assert path == own.out_dir / "line.png"
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_child_session_writes_in_a_folder_below(tmp_path):
+    own = session(tmp_path, duration_sec=3.0)
+    child = own.child("trial")
+    assert child.out_dir == own.out_dir / "trial" and child.out_dir.is_dir()
+    assert child.duration_sec == 3.0 and child.meshcat is None
+
+
+def test_a_recording_reads_back_as_the_very_same_numbers(tmp_path):
+    rng = np.random.default_rng(0)
+    columns = {
+        "panda.joint1.position": rng.normal(size=50),
+        "ball.ball.x": rng.normal(size=50) * 1e-9,
+        "time": np.cumsum(rng.uniform(size=50)),
+    }
+    columns["ball.ball.x"][7] = np.nan  # A missing sample.
+    noise = {"ball.ball.x": 0.001}
+    path, beside = write_recording(tmp_path / "recording.csv", columns, noise)
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0])[0] == "time"
+    assert rows[7]["ball.ball.x"] == ""
+    for name, value in columns.items():
+        read = [float(row[name] or "nan") for row in rows]
+        np.testing.assert_array_equal(read, value)
+    assert json.loads(beside.read_text()) == noise
+    [path] = write_recording(tmp_path / "recording.npz", columns)
+    with np.load(path) as table:
+        for name, value in columns.items():
+            np.testing.assert_array_equal(table[name], value)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"a.b.x": [1.0]}, "needs the column time"),
+        ({"time": [0.0], "speed": [1.0]}, 'recording column "speed", expected <model>'),
+        ({"time": [0.0], "a.b.c": [1.0]}, 'recording column "a.b.c", expected <model>'),
+        ({"time": [0.0], "a.b.x": [1.0, 2.0]}, r"a.b.x is \(2,\), expected \(1,\)"),
+        ({"time": [0.0, 1.0, 1.0]}, "time does not increase at row 2: 1.0 after 1.0"),
+        ({"time": [0.0, np.nan]}, "time is not finite"),
+    ],
+)
+def test_a_wrong_recording_is_refused_by_column_and_row(columns, message):
+    with pytest.raises(ValueError, match=message):
+        check_columns({k: np.array(v) for k, v in columns.items()})
+
+
+def test_time_starts_again_with_each_episode():
+    time, episode = np.array([0.0, 1.0, 0.0]), np.array([0, 0, 1])
+    assert list(check_columns({"time": time, "episode": episode})) == [
+        "time",
+        "episode",
+    ]
+
+
+def test_a_table_is_aligned_and_says_which_rows_miss_their_target():
+    rows = [("short", 1.23456789, None), ("a longer one", 20, True)]
+    table = Table("Title", ("what", "ours", "ok"), rows, met=(True, False))
+    assert table.missed == 1
+    assert table.to_text().splitlines() == [
+        "Title",
+        "",
+        "what           ours  ok   target",
+        "------------  -----  ---  ------",
+        "short         1.235  -    met",
+        "a longer one     20  yes  MISSED",
+    ]
+    assert "| a longer one | 20 | yes | MISSED |" in table.to_markdown()
+    assert table.to_dict()["rows"][1] == {
+        "what": "a longer one",
+        "ours": 20,
+        "ok": True,
+        "met": False,
+    }
+    with pytest.raises(ValueError, match="row 0 has 1 cells, expected 2"):
+        Table("Title", ("a", "b"), [(1,)])
+    with pytest.raises(ValueError, match="met has 1 entries, expected one per row"):
+        Table("Title", ("a",), [(1,), (2,)], met=(True,))
+
+
+@pytest.mark.parametrize(
+    ("value", "hint", "expected"),
+    [
+        (3, float, 3.0),
+        ("1e-3", float, 1e-3),  # YAML 1.1 reads it as a text.
+        (2.0, int, 2),
+        (None, float | None, None),
+        ([1, 2], list[float], [1.0, 2.0]),
+        ([1, True], tuple[int, bool], (1, True)),
+        ({"a": 1}, dict[str, float], {"a": 1.0}),
+    ],
+)
+def test_values_become_the_declared_type(value, hint, expected):
+    got = convert("name", value, hint)
+    assert got == expected and type(got) is type(expected)
