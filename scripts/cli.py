@@ -7,6 +7,7 @@ stderr; 3 a fault of makebreak itself, with a traceback; 130 ended by Ctrl-C.
 import argparse
 import dataclasses
 import logging
+import os
 import sys
 import traceback
 from datetime import datetime
@@ -219,9 +220,10 @@ def _reproduce(args) -> int:
             if not hasattr(module, "reproduce"):
                 raise ValueError(f"{name} has nothing to reproduce")
     seeds = int(_number(args.seeds, "--seeds", 1, whole=True))
-    jobs = int(_number(args.jobs, "--jobs", 1, whole=True))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    jobs = int(_number(args.jobs or str(cores), "--jobs", 1, whole=True))
     out = Path(args.out) if args.out else _default_out("reproduce")
-    session = Session(out)
+    session = Session(out, reuse=args.reuse)
     tables = {}
     for name, module in modules.items():
         if hasattr(module, "reproduce"):
@@ -284,7 +286,10 @@ def _parser() -> argparse.ArgumentParser:
     p = commands.add_parser("reproduce", help="the paper's figure or table beside ours")
     p.add_argument("experiments", nargs="*", metavar="EXPERIMENT")
     p.add_argument("--seeds", default="10", metavar="N", help="trials per case (10)")
-    p.add_argument("--jobs", default="1", metavar="N", help="processes at once (1)")
+    p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
+    p.add_argument(
+        "--reuse", action="store_true", help="keep trials of an earlier time"
+    )
     p.add_argument("--out", metavar="DIR", help="default: runs/reproduce-<time>")
     p.set_defaults(function=_reproduce)
 

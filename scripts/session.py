@@ -101,6 +101,8 @@ class Session:
         realtime: the fastest that simulated time may pass, in simulated seconds per
             second; 0: as fast as possible.
         progress: whether a progress bar is shown.
+        reuse: whether trials that have ended in an earlier session with the same
+            settings are taken as they are; run_many is to be told.
     Raises: ValueError for an out_dir that cannot be made or written to.
     """
 
@@ -111,11 +113,13 @@ class Session:
         duration_sec: float | None = None,
         realtime: float = 0.0,
         progress: bool = True,
+        reuse: bool = False,
     ):
         self.out_dir = Path(out_dir)
         self.meshcat = meshcat
         self.duration_sec = duration_sec
         self.realtime = realtime
+        self.reuse = reuse
         self.files: list[Path] = []  # All that was written.
         self.started = False  # Whether anything has been simulated yet.
         self.interrupted = False
@@ -138,7 +142,10 @@ class Session:
     def child(self, name: str) -> "Session":
         """A session of its own for one of several trials, in the subfolder `name`."""
         return Session(
-            self.out_dir / name, None, self.duration_sec, 0.0, self._progress
+            self.out_dir / name,
+            duration_sec=self.duration_sec,
+            progress=self._progress,
+            reuse=self.reuse,
         )
 
     def simulate(
@@ -177,7 +184,7 @@ class Session:
         for name, value in (("duration_sec", duration), ("period_sec", period_sec)):
             if not 0 < value < np.inf:
                 raise ValueError(f"{name}: got {value}, expected a positive time [s]")
-        # A context that Simulator owns must come from the caller: it takes it over.
+        self.started = True
         simulator = Simulator(diagram, context or diagram.CreateDefaultContext())
         root = simulator.get_mutable_context()
         simulator.set_target_realtime_rate(self.realtime)
@@ -197,7 +204,6 @@ class Session:
         for system in timed:
             system.compute_sec.clear()
 
-        self.started = True
         label = label or f"simulation_{len(self._timing)}" * bool(self._timing)
         time: list[float] = []
         samples: dict[str, list[np.ndarray]] = {name: [] for name in record}
@@ -214,6 +220,7 @@ class Session:
         if self.meshcat is not None:
             # A long run has fewer pictures per second, so that the page stays light.
             fps = float(np.clip(3600 // duration, 10, 32))
+            self.meshcat.DeleteRecording()  # Of an earlier simulation.
             self.meshcat.StartRecording(frames_per_second=fps)
         wall_start, cpu_start = perf_counter(), process_time()
         with _CatchInterrupt() as interrupt, self._bar(duration, label) as bar:

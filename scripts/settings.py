@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import yaml
-from pydrake.common.yaml import yaml_load_typed
 
 _EXPECTED = {int: "an integer", float: "a number", bool: "true or false", str: "a text"}
 
@@ -46,7 +45,11 @@ def field_types(schema: type) -> dict[str, Any]:
 
 
 def _refuse(name: str, value, expected: str):
-    text = value if isinstance(value, str) else yaml.safe_dump(value, width=1000)
+    text = (
+        value
+        if isinstance(value, str)
+        else yaml.safe_dump(value, width=1000, default_flow_style=True)
+    )
     text = " ".join(text.replace("\n...", "").split())
     raise ValueError(f'{name}: got "{text}", expected {expected}')
 
@@ -116,7 +119,7 @@ def convert(name: str, value, hint, raw: str | None = None):
     if dataclasses.is_dataclass(hint):
         if not isinstance(value, dict):
             _refuse(name, value, f"{name}.FIELD=value, or a mapping")
-        return _merge(hint, value, typing.cast(type, hint)(), name + ".")  # type: ignore[operator]
+        return _merge(typing.cast(type, hint), value, None, name + ".")
     if origin is dict:
         if not isinstance(value, dict):
             _refuse(name, value, "a mapping, as {a: 1}")
@@ -124,21 +127,28 @@ def convert(name: str, value, hint, raw: str | None = None):
     return value
 
 
-def _merge(schema, mapping: dict, config, prefix: str = ""):
-    """`config` with the fields that `mapping` names replaced; nested ones merged."""
+def _merge(schema: type, mapping: dict, config=None, prefix: str = ""):
+    """`config` with the fields that `mapping` names replaced, nested ones merged; a new
+    one if `config` is None."""
     hints = typing.get_type_hints(schema)
-    valid = [prefix + f.name for f in dataclasses.fields(schema)]
+    fields = {prefix + f.name: f for f in dataclasses.fields(schema)}
     changes = {}
     for key, value in mapping.items():
         name = f"{prefix}{key}"
-        if name not in valid:
-            raise ValueError(f"unknown key {name}; {nearest(name, valid)}")
-        old = getattr(config, key)
+        if name not in fields:
+            raise ValueError(f"unknown key {name}; {nearest(name, fields)}")
+        old = getattr(config, key, None)
         if dataclasses.is_dataclass(old) and isinstance(value, dict):
             changes[key] = _merge(type(old), value, old, name + ".")
         else:
             changes[key] = convert(name, value, hints[key])
-    return dataclasses.replace(config, **changes)
+    if config is not None:
+        return dataclasses.replace(config, **changes)
+    for name, f in fields.items():
+        required = f.default is f.default_factory is dataclasses.MISSING
+        if required and f.name not in changes:
+            raise ValueError(f"{name}: missing, expected a value")
+    return schema(**changes)
 
 
 def load_config(schema: type, path: Path):
@@ -150,18 +160,16 @@ def load_config(schema: type, path: Path):
     if not path.is_file():
         raise ValueError(f'--config: got "{path}", expected a YAML file')
     try:
-        text = path.read_text()
-        mapping = yaml.safe_load(text)
+        mapping = yaml.safe_load(path.read_text())
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"--config {path}: not YAML: {_one_line(error)}") from error
-    if mapping is None:
-        return schema()
-    if not isinstance(mapping, dict):
+    if not isinstance(mapping, dict | None):
         raise ValueError(f"--config {path}: got {mapping!r}, expected key: value lines")
+    # Not yaml_load_typed: its messages do not name the field's path, it has no nearest
+    # names, and it takes no tuple.
     try:
-        _merge(schema, mapping, schema())  # Names the key, and the nearest valid ones.
-        return yaml_load_typed(schema=schema, data=text)
-    except Exception as error:  # yaml_load_typed raises several kinds.
+        return _merge(schema, mapping or {}, schema())
+    except ValueError as error:
         raise ValueError(f"--config {path}: {_one_line(error)}") from error
 
 

@@ -112,6 +112,7 @@ def reproduce(session, seeds, jobs):
         jobs,
         session.out_dir,
         session.duration_sec or float(os.environ.get("SPRING_MASS_SECONDS", "10")),
+        reuse=session.reuse,
         command=COMMAND,
     )
     rest = [sum(r["success"] for r in part) for part in np.split(np.array(results), 2)]

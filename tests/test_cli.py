@@ -1,7 +1,9 @@
 """The command line: what it refuses, what it writes, how it ends."""
 
+import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -186,16 +188,28 @@ def test_list_names_experiments_and_scenes_with_a_line_each(capsys, monkeypatch)
     assert ["attic", "An attic."] in lines
 
 
-def start(*args, **more):
-    """The command line in a process of its own."""
-    return subprocess.Popen(
-        [*spring_mass.COMMAND, *args],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        stdin=subprocess.DEVNULL,
-        text=True,
-        env=trials._environment() | more,
-    )
+@pytest.fixture
+def start():
+    """Starts the command line in a process of its own, which the test's end ends."""
+    processes = []
+
+    def start(*args, **more):
+        processes.append(
+            subprocess.Popen(
+                [*spring_mass.COMMAND, *args],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                stdin=subprocess.DEVNULL,
+                text=True,
+                env=trials._environment() | more,
+            )
+        )
+        return processes[-1]
+
+    yield start
+    for process in processes:
+        if process.poll() is None:
+            process.terminate()  # reproduce ends its own runs when it is told so.
 
 
 def wait_for(paths):
@@ -207,7 +221,7 @@ def wait_for(paths):
 
 
 @pytest.mark.parametrize("whole_only", [False, True])
-def test_ctrl_c_ends_a_run_cleanly_and_keeps_what_was_recorded(whole_only):
+def test_ctrl_c_ends_a_run_cleanly_and_keeps_what_was_recorded(whole_only, start):
     settings = ["steps=100000000", f"whole_only={str(whole_only).lower()}"]
     process = start("run", "spring_mass", "--no-meshcat", "--out", "out", "--set",
                     *settings)  # fmt: skip
@@ -228,7 +242,7 @@ def test_ctrl_c_ends_a_run_cleanly_and_keeps_what_was_recorded(whole_only):
         assert table["time"][-1] > 1.0
 
 
-def test_ctrl_c_ends_reproduce_and_all_its_runs():
+def test_ctrl_c_ends_reproduce_and_all_its_runs(start):
     process = start("reproduce", "--seeds", "2", "--jobs", "2", "--out", "out",
                     SPRING_MASS_SECONDS="1e6")  # fmt: skip
     folder = Path("out/spring_mass")
@@ -251,6 +265,37 @@ def test_reproduce_prints_and_writes_its_table_and_fails_on_a_missed_row(capsys)
     assert [row["ours"] for row in table["rows"]] == [1, 0]
     assert [row["met"] for row in table["rows"]] == [True, False]
     assert "| comes to rest | 1 | 1 |" in Path("out/reproduce.md").read_text()
+
+
+def test_reproduce_keeps_earlier_trials_when_told_so(capsys):
+    args = ["reproduce", "--seeds", "1", "--out", "out"]
+    cli.main(args)
+    path = Path("out/spring_mass/damped=true_seed=0/result.json")
+    path.write_text(path.read_text().replace('"success": true', '"success": false'))
+    cli.main([*args, "--reuse"])
+    [table] = read("reproduce.json").values()
+    assert [row["ours"] for row in table["rows"]] == [0, 0]
+    cli.main(args)
+    [table] = read("reproduce.json").values()
+    assert [row["ours"] for row in table["rows"]] == [1, 0]
+
+
+def test_meshcat_is_announced_and_stays_until_enter_at_a_terminal(capsys, monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    terminal = Terminal("\nmore\n")
+    monkeypatch.setattr("sys.stdin", terminal)
+    assert cli.main(["run", "spring_mass", "--out", "out"]) == 0
+    shown = capsys.readouterr().out
+    assert re.search(r"Meshcat: http://\S+:\d+", shown)
+    assert "Meshcat stays open; press Enter to leave" in shown
+    assert terminal.read() == "more\n"  # One line was waited for.
+    assert "<html" in Path("out/meshcat.html").read_text()[:200].lower()
+    monkeypatch.setattr("sys.stdin", io.StringIO("more"))  # No terminal: ends at once.
+    assert cli.main(["run", "spring_mass", "--out", "out"]) == 0
+    assert "press Enter" not in capsys.readouterr().out
 
 
 def test_a_failing_run_is_reported_and_the_others_go_on(capsys):

@@ -5,6 +5,8 @@ import csv
 import json
 import re
 import signal
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +20,12 @@ from pydrake.systems.primitives import ConstantVectorSource, Integrator
 
 from makebreak.scripts.recording import check_columns, write_recording
 from makebreak.scripts.session import Session
-from makebreak.scripts.settings import convert
+from makebreak.scripts.settings import (
+    apply_settings,
+    convert,
+    dump_config,
+    load_config,
+)
 from makebreak.scripts.table import Table
 from makebreak.systems.numerics.timing import timed
 
@@ -340,3 +347,39 @@ def test_a_table_is_aligned_and_says_which_rows_miss_their_target():
 def test_values_become_the_declared_type(value, hint, expected):
     got = convert("name", value, hint)
     assert got == expected and type(got) is type(expected)
+
+
+@dataclass(frozen=True)
+class Pair:
+    a: str
+    b: str = "table"
+
+
+@dataclass
+class Pairs:
+    pairs: list[Pair] = field(default_factory=list)
+    size: tuple[int, int] = (3, 4)
+    path: Path = Path("scene.yaml")
+    gains: np.ndarray = field(default_factory=lambda: np.ones(3))
+    best: Pair = field(default_factory=lambda: Pair("ball", "wall"))
+
+
+def test_any_config_reads_back_from_what_is_written(tmp_path):
+    settings = ["pairs=[{a: tip, b: ball}]", "size=[1, 2]", "path=a b.yaml"]
+    settings += ["gains=[1, 1e-7, 3]", "best.a=tip"]
+    config = apply_settings(Pairs(), settings)
+    assert config.pairs == [Pair("tip", "ball")] and config.best == Pair("tip", "wall")
+    path = tmp_path / "config.yaml"
+    path.write_text(dump_config(config))
+    again = load_config(Pairs, path)
+    np.testing.assert_array_equal(again.gains, [1.0, 1e-7, 3.0])
+    for name in ("pairs", "size", "path", "best"):
+        assert getattr(again, name) == getattr(config, name)
+    for text, message in (
+        ("pairs: [{b: ball}]", r"pairs\[0\].a: missing, expected a value"),
+        ("pairs: [{a: x, c: y}]", r"unknown key pairs\[0\].c"),
+        ("size: [1]", r'size: got "\[1\]", expected a list of 2'),
+    ):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=message):
+            load_config(Pairs, path)
