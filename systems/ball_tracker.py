@@ -1,4 +1,5 @@
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -69,7 +70,7 @@ class BallTracker(LeafSystem):
         self._weights = strength_weights(config.hue)
         self._shape = (camera.height, camera.width, 4)
         self._image = self.DeclareAbstractInputPort("image", Value(ImageRgba8U()))
-        start = np.zeros(10)
+        start: Any = np.zeros(10)
         start[_P] = camera.p_WC[:2]
         start[_COVARIANCE] = 1.0, 0.0, START_SPEED**2
         start[_UNSEEN_SEC], start[_STATUS] = 2.0 * HOLD_SEC, NOT_FOUND
@@ -101,7 +102,8 @@ class BallTracker(LeafSystem):
         p_next, _, P_next = constant_velocity.predict(
             p, v, P, c.period_sec, c.acceleration_density
         )
-        image = self._image.Eval(context).data
+        picture: Any = self._image.Eval(context)
+        image = picture.data
         measured, status = None, WRONG_IMAGE
         if image.shape == self._shape:
             status = NOT_FOUND

@@ -1,3 +1,5 @@
+from typing import Any
+
 import cv2
 import numpy as np
 from pydrake.common.value import Value
@@ -41,7 +43,8 @@ class CameraShake(LeafSystem):
     def _shake(self, context, output):
         frame = int(context.get_time() / self._period_sec + 1e-6)
         u, v = self._shift_std_px * frame_shift(self._seed, frame)
-        source = self._image.Eval(context).data
+        image: Any = self._image.Eval(context)
+        source = image.data
         shifted = output.get_mutable_value().mutable_data
         cv2.warpAffine(
             source,

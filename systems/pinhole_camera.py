@@ -1,4 +1,5 @@
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pydrake.common.value import Value
@@ -15,6 +16,7 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import LeafSystem
 from pydrake.systems.sensors import ImageRgba8U
 
@@ -47,6 +49,7 @@ def painted_shapes(plant: MultibodyPlant, scene_graph: SceneGraph):
         for geometry_id in inspector.GetGeometries(frame_id, Role.kPerception):
             X_BG = inspector.GetPoseInFrame(geometry_id)
             shape = inspector.GetShape(geometry_id)
+            size: tuple[float, ...]
             match shape:
                 case Sphere():
                     kind, size = "sphere", (shape.radius(),)
@@ -63,13 +66,18 @@ def painted_shapes(plant: MultibodyPlant, scene_graph: SceneGraph):
                 case _:
                     continue
             properties = inspector.GetPerceptionProperties(geometry_id)
-            rgba = properties.GetPropertyOrDefault(
+            rgba: Any = properties.GetPropertyOrDefault(
                 "phong", "diffuse", Rgba(0.9, 0.9, 0.9, 1.0)
             )
             if rgba.a() > 0.0:
                 color = 255.0 * np.array([rgba.r(), rgba.g(), rgba.b()])
                 shapes.append(PaintedShape(int(body.index()), X_BG, kind, size, color))
     return shapes
+
+
+def _pose_if_anchored(plant, context, shape):
+    body = plant.get_body(BodyIndex(shape.body_index))
+    return plant.EvalBodyPoseInWorld(context, body) if plant.IsAnchored(body) else None
 
 
 class PinholeCamera(LeafSystem):
@@ -83,16 +91,23 @@ class PinholeCamera(LeafSystem):
     def __init__(self, camera: Pinhole, plant: MultibodyPlant, scene_graph: SceneGraph):
         super().__init__()
         self._camera = camera
-        X_CW = RigidTransform(RotationMatrix(camera.R_WC), camera.p_WC).inverse()
+        X_CW = RigidTransform(
+            RotationMatrix(camera.R_WC), camera.p_WC.tolist()
+        ).inverse()
         self._X_CW = X_CW
         shapes = painted_shapes(plant, scene_graph)
-        world = int(plant.world_body().index())
-        self._moving = [shape for shape in shapes if shape.body_index != world]
+        still = plant.CreateDefaultContext()
+        X_WB = {s.body_index: _pose_if_anchored(plant, still, s) for s in shapes}
+        self._moving = [s for s in shapes if X_WB[s.body_index] is None]
         self._background = np.empty((camera.height, camera.width, 3), np.uint8)
         self._background[:] = SKY
         self._paint(
             self._background,
-            [(s, X_CW @ s.X_BG) for s in shapes if s.body_index == world],
+            [
+                (s, X_CW @ X_WB[s.body_index] @ s.X_BG)
+                for s in shapes
+                if X_WB[s.body_index] is not None
+            ],
         )
         self._poses = self.DeclareAbstractInputPort(
             "body_poses", Value[list[RigidTransform]]()
@@ -105,7 +120,7 @@ class PinholeCamera(LeafSystem):
         )
 
     def _draw(self, context, output):
-        poses = self._poses.Eval(context)
+        poses: Any = self._poses.Eval(context)
         picture = self._background.copy()
         self._paint(
             picture,

@@ -27,7 +27,7 @@ MARGIN = 2  # Rays beside a hidden one that are left out too.
 THIN = 0.85  # Of the usual strength: less, just inside, is a sliver beside the finger.
 SMALLEST, LARGEST = 0.6, 1.6  # Of what the seen radius may be of the model's.
 MIN_STRENGTH = 40.0  # Of 255: less is not the ball's colour.
-MIN_SEEN = 0.3  # Part of the outline that must be seen.
+MIN_SEEN = 0.2  # Part of the outline that must be seen.
 MAX_MISFIT = 0.75  # [px], rms of the points that a fitted outline keeps.
 OTHER_THAN_TABLE = 80.0  # Of 765 (r + g + b): so different is not the table.
 
@@ -66,42 +66,38 @@ def find_ball(image, camera: Pinhole, hue_weights, radius, table_z, guess_p=None
     """
     if guess_p is None:
         depth = camera.p_WC[2] - table_z - radius
-        low, high = (0, 0), (camera.width, camera.height)
+        low, high = np.zeros(2, int), np.array([camera.width, camera.height])
     else:
         p_C = camera.to_camera(guess_p)
         depth = p_C[2]
-        if not depth > radius:
-            return None
-        center = camera.project(p_C[None])[0]
-        half = 1.8 * camera.focal * radius / depth + 6.0
-        size = (camera.width, camera.height)
-        if not (np.abs(center) < 1e6).all():
-            return None
-        low = [min(max(int(c - half), 0), n) for c, n in zip(center, size, strict=True)]
-        high = [
-            min(max(int(c + half) + 2, 0), n) for c, n in zip(center, size, strict=True)
-        ]
-        if high[0] - low[0] < 8 or high[1] - low[1] < 8:
-            return None
-    if not depth > radius:
+        if depth > radius:
+            radius_px = camera.focal * radius / depth
+            low, high = _window(camera, p_C, (LARGEST + 0.2) * radius_px + 6.0)
+    if not depth > radius or (high - low < 8).any():
         return None
+    radius_px = camera.focal * radius / depth
     region = image[low[1] : high[1], low[0] : high[0]]
     strength = cv2.transform(region, hue_weights)
     strength = cv2.GaussianBlur(strength, (3, 3), 0.0)
-    radius_px = camera.focal * radius / depth
-    start = find_circle(strength, radius_px)
-    if start is None:
+    m, n_kept, misfit = np.zeros(3), 0, np.inf
+    for start in find_circles(strength, radius_px):
+        # The circle may be the finger's tip, whose edge is round, too: rays from there
+        # find a part of the ball, and those from that fit's centre all there is to see.
+        for _ in range(2):
+            points = outline_points(
+                strength, region, start[0], start[1], LARGEST * radius_px, _ANGLES
+            )
+            m, n_kept, misfit = fit_cone(camera.rays(points + low), 1.0 / camera.focal)
+            if n_kept < 6 or not m[2] > 0.0:
+                break
+            start = camera.project(m[None])[0] - low
+            if not ((start > 0.0) & (start < high - low - 1)).all():
+                break
+        if n_kept >= MIN_SEEN * N_RAYS and misfit * camera.focal <= MAX_MISFIT:
+            break
+    else:
         return None
-    points = outline_points(
-        strength, region, start[0], start[1], LARGEST * radius_px, _ANGLES
-    )
-    if len(points) < MIN_SEEN * N_RAYS:
-        return None
-    rays = camera.rays(points + np.asarray(low))
-    m, n_kept, misfit = fit_cone(rays, 1.0 / camera.focal)
     norm = np.sqrt(m @ m)
-    if n_kept < MIN_SEEN * N_RAYS or misfit * camera.focal > MAX_MISFIT:
-        return None
     p_WB = camera.meet_plane(m / norm, table_z + radius)
     if p_WB is None:
         return None
@@ -112,8 +108,18 @@ def find_ball(image, camera: Pinhole, hue_weights, radius, table_z, guess_p=None
     return Detection(p_WB, seen_radius, n_kept / N_RAYS)
 
 
-def find_circle(strength, radius_px):
-    """The best Hough circle's (u, v, radius) [px], or None.
+def _window(camera, p_C, half_px):
+    """Corners low and high (2,) [px] of the square about a point (3,) in C, cut to the
+    picture: rows low[1] to high[1] - 1 and so on.
+    """
+    size = np.array([camera.width, camera.height])
+    center = camera.project(p_C[None])[0]
+    low, high = center - half_px, center + half_px + 2.0
+    return [np.clip(corner, 0, size).astype(int) for corner in (low, high)]
+
+
+def find_circles(strength, radius_px, n=3):
+    """The n best Hough circles (k, 3) [px], k <= n: u, v, radius.
 
     Args: strength (h, w) uint8; radius_px as expected.
     """
@@ -121,16 +127,13 @@ def find_circle(strength, radius_px):
         strength,
         cv2.HOUGH_GRADIENT,
         dp=1,
-        minDist=10 * max(strength.shape),
+        minDist=max(radius_px / 2, 1.0),
         param1=100,
         param2=8,
         minRadius=int(SMALLEST * radius_px),
         maxRadius=int(np.ceil(LARGEST * radius_px)),
     )
-    if circles is None or circles.size == 0:
-        return None
-    u, v, r = circles[0, 0]
-    return float(u), float(v), float(r)
+    return np.empty((0, 3)) if circles is None else circles[0, :n].astype(float)
 
 
 @njit(cache=True)
@@ -244,13 +247,13 @@ def fit_cone(rays, tolerance):
     best, best_count = np.zeros(3), 0
     if k < 3:
         return best, 0, np.inf
-    third = k // 3
+    third: int = k // 3
     for i in range(third):
         m, ok = _solve3(rays[i], rays[i + third], rays[i + 2 * third])
         if not ok:
             continue
         count = 0
-        scale = tolerance * np.sqrt(max(m @ m - 1.0, 1e-12))
+        scale = tolerance * _norm_times_sine(m)
         for j in range(k):
             if abs(rays[j] @ m - 1.0) < scale:
                 count += 1
@@ -261,7 +264,7 @@ def fit_cone(rays, tolerance):
         if best_count < 3:
             return best, 0, np.inf
         N, b = np.zeros((3, 3)), np.zeros(3)
-        scale = tolerance * np.sqrt(max(best @ best - 1.0, 1e-12))
+        scale = tolerance * _norm_times_sine(best)
         for j in range(k):
             if abs(rays[j] @ best - 1.0) < scale:
                 b += rays[j]
@@ -271,16 +274,25 @@ def fit_cone(rays, tolerance):
         if not ok:
             return best, 0, np.inf
         best = m
-        sine = np.sqrt(max(best @ best - 1.0, 1e-12))  # |m| sin(alpha)
+        scale = _norm_times_sine(best)
         best_count, total = 0, 0.0
         for j in range(k):
-            error = abs(rays[j] @ best - 1.0) / sine
+            error = abs(rays[j] @ best - 1.0) / scale
             if error < tolerance:
                 best_count += 1
                 total += error**2
         if best_count > 0:
             misfit = np.sqrt(total / best_count)
     return best, best_count, misfit
+
+
+@njit(cache=True)
+def _norm_times_sine(m):
+    """|m| sin(alpha): how fast n . m changes with the angle of a ray n on the cone."""
+    square = 0.0
+    for i in range(3):
+        square += m[i] * m[i]
+    return np.sqrt(max(square - 1.0, 1e-12))
 
 
 @njit(cache=True)

@@ -11,7 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 FIXED_POINT_BITS = 8  # cv2 draws polygons at 1/256 of a (fine) pixel.
-FINE = 8  # Fine pixels to a pixel, each way: a polygon's antialiasing.
+FINE = 8  # Fine pixels to a pixel, each way: a polygon's antialiasing;
+FINE_LARGE, LARGE = 2, 10_000  # of one that covers more pixels than LARGE.
 BANDS = (0.3, 0.55, 0.8, 1.0)  # Cosines between which a drawn sphere is one shade.
 N_OUTLINE = 48  # Corners of a circle; its sagitta is 0.002 of the radius.
 
@@ -20,10 +21,14 @@ def _even_lights():
     """One light at the camera and four from the sides: with the first alone the rim
     of a sphere is dark, and its picture's centre is pushed outwards.
     """
-    tilt = 0.075
-    sides = [(1, 0), (0, 1), (-1, 0), (0, -1)]
-    sides = [(0.42, x, y, tilt) for x, y in sides]
-    lights = np.array([(1.0 - 4 * 0.42 * tilt, 0.0, 0.0, 1.0), *sides])
+    side, tilt = 0.42, 0.075
+    ways = [(1, 0), (0, 1), (-1, 0), (0, -1)]
+    lights = np.array(
+        [
+            (1.0 - 4 * side * tilt, 0.0, 0.0, 1.0),
+            *((side, x, y, tilt) for x, y in ways),
+        ]
+    )
     lights[:, 1:] /= np.linalg.norm(lights[:, 1:], axis=1, keepdims=True)
     lights.setflags(write=False)
     return lights
@@ -196,10 +201,12 @@ def paint(image, corners, color):
     if (high <= low).any():
         return
     n_u, n_v = high - low
-    fine = (corners - low + 0.5) * FINE - 0.5
-    fixed = np.round(fine * 2**FIXED_POINT_BITS).clip(-(2**30), 2**30)
+    fine = FINE if n_u * n_v < LARGE else FINE_LARGE
+    fixed = np.round(((corners - low + 0.5) * fine - 0.5) * 2**FIXED_POINT_BITS).clip(
+        -(2**30), 2**30
+    )
     hull = cv2.convexHull(fixed.astype(np.int32))
-    mask = np.zeros((n_v * FINE, n_u * FINE), np.uint8)
+    mask = np.zeros((n_v * fine, n_u * fine), np.uint8)
     cv2.fillConvexPoly(mask, hull, 255, cv2.LINE_8, FIXED_POINT_BITS)
     cover = cv2.resize(mask, (n_u, n_v), interpolation=cv2.INTER_AREA)
     region = image[low[1] : high[1], low[0] : high[0]]
