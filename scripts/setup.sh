@@ -92,11 +92,16 @@ look_for_packages() {
     done < <(missing_needs)
 }
 
-# One command that a person can type.
+# The one command for a person to type.
 apt_command() {
-    local sudo=""
-    [[ $EUID -eq 0 ]] || sudo="sudo "
-    echo "${sudo}apt-get update && ${sudo}apt-get install -y --no-install-recommends $*"
+    local install="apt-get install -y --no-install-recommends $*"
+    if [[ $EUID -eq 0 ]]; then
+        echo "apt-get update && $install"
+    elif command -v sudo >/dev/null; then
+        echo "sudo apt-get update && sudo $install"
+    else
+        echo "su -c 'apt-get update && $install'"
+    fi
 }
 
 apt_get() {

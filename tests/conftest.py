@@ -1,0 +1,13 @@
+"""For all tests: one thread, no window, nothing that depends on the clock."""
+
+import os
+
+# Before numpy is imported: one thread per test process, and no matplotlib window.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+from hypothesis import settings  # noqa: E402  (numpy's threads must be set first)
+
+# The same examples in each run, and no deadline: a slow machine is no failure.
+settings.register_profile("makebreak", derandomize=True, deadline=None)
+settings.load_profile("makebreak")

@@ -1,0 +1,186 @@
+"""The code itself: style, types, the direction of imports, what the rooms promise."""
+
+import ast
+import dataclasses
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from makebreak.scripts.experiments import EXPERIMENTS, load_experiment
+
+ROOT = Path(__file__).resolve().parent.parent
+ROOMS = ("models", "systems", "diagrams", "gap", "scripts")
+
+# Room -> what it may import: numerics <- systems <- diagrams <- gap <- scripts, and
+# models <- diagrams. Systems meet at ports, so they never import each other.
+MAY_IMPORT = {
+    "numerics": {"numerics"},
+    "systems": {"numerics"},
+    "models": {"numerics", "models"},
+    "diagrams": {"numerics", "systems", "models", "diagrams"},
+    "gap": {"numerics", "systems", "models", "diagrams", "gap"},
+    "scripts": {"numerics", "systems", "models", "diagrams", "gap", "scripts"},
+    "tests": {"numerics", "systems", "models", "diagrams", "gap", "scripts"},
+}
+
+
+def room_of(parts):
+    """The room of ("systems", "numerics", "lcs"): "numerics"."""
+    return "numerics" if parts[:2] == ("systems", "numerics") else parts[0]
+
+
+def imported_modules(tree, package):
+    """(line, dotted name) of each import anywhere in a syntax tree. `package`: dotted
+    name of the package that the file is in, for relative imports. A string that is a
+    dotted name in makebreak counts too: it is there to be imported."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield node.lineno, alias.name
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                above = package.split(".")[: 1 - node.level or None]
+                base = ".".join([*above, *([base] if base else [])])
+            for alias in node.names:
+                yield node.lineno, f"{base}.{alias.name}"
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            if re.fullmatch(r"makebreak(\.\w+)+", node.value):
+                yield node.lineno, node.value
+
+
+def breaches(root):
+    """One line for each import under `root` that goes the wrong way."""
+    found = []
+    for path in sorted(
+        p for room in (*ROOMS, "tests") for p in root.glob(f"{room}/**/*.py")
+    ):
+        parts = path.relative_to(root).parts
+        here = room_of(parts)
+        package = ".".join(("makebreak", *parts[:-1]))
+        for line, name in imported_modules(ast.parse(path.read_text()), package):
+            where = f"{'/'.join(parts)}:{line}: {name}"
+            first, *rest = name.split(".")
+            if first in (*ROOMS, "tests"):
+                found.append(f"{where}: expected makebreak.{name}")
+            elif first == "pydrake" and here == "numerics":
+                found.append(f"{where}: numerics must not import pydrake")
+            elif first == "makebreak" and rest and rest[0] in ROOMS:
+                there = room_of(tuple(rest))
+                if there not in MAY_IMPORT[here]:
+                    found.append(f"{where}: {here} must not import {there}")
+    return found
+
+
+def run_module(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", *arguments], cwd=ROOT, capture_output=True, text=True
+    )
+
+
+def test_ruff_finds_nothing():
+    done = run_module("ruff", "check", "--output-format=concise", ".")
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_code_is_formatted():
+    done = run_module("ruff", "format", "--check", ".")
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_types_are_right():
+    done = run_module("mypy")
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_imports_go_one_way():
+    assert breaches(ROOT) == []
+
+
+@pytest.mark.parametrize(
+    ("file", "code"),
+    [
+        ("systems/numerics/a.py", "import pydrake.math"),
+        (
+            "systems/numerics/a.py",
+            "def f():\n    from pydrake.math import RigidTransform",
+        ),
+        ("systems/numerics/a.py", "from makebreak.systems.lcs_plant import LcsPlant"),
+        ("systems/numerics/a.py", "from ..lcs_plant import LcsPlant"),
+        ("systems/a.py", "from makebreak.systems.b import B"),
+        ("systems/a.py", "from makebreak.systems import b"),
+        ("systems/a.py", "from . import b"),
+        ("systems/a.py", "from .b import B"),
+        ("systems/baselines/a.py", "import makebreak.systems.b as b"),
+        ("systems/a.py", "from makebreak.models import scene"),
+        ("systems/a.py", "import_module('makebreak.diagrams.station')"),
+        ("models/a.py", "from makebreak import diagrams"),
+        ("diagrams/a.py", "if True:\n    import makebreak.gap.fit"),
+        ("gap/a.py", "from makebreak.scripts.cli import main"),
+        ("scripts/a.py", "from systems.numerics.lcs import LCS"),
+        ("tests/a.py", "import models"),
+    ],
+)
+def test_a_planted_breach_is_found(tmp_path, file, code):
+    path = tmp_path / file
+    path.parent.mkdir(parents=True)
+    path.write_text(code)
+    assert len(breaches(tmp_path)) == 1, breaches(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("file", "code"),
+    [
+        ("systems/numerics/a.py", "from makebreak.systems.numerics.lcs import LCS"),
+        ("systems/numerics/a.py", "from .lcs import LCS"),
+        ("systems/a.py", "from makebreak.systems.numerics import lcs\nimport pydrake"),
+        ("systems/a.py", "from .numerics.lcs import LCS"),
+        ("models/a.py", "import makebreak.models.b"),
+        (
+            "diagrams/a.py",
+            "from makebreak.systems.b import B\nimport makebreak.models.c",
+        ),
+        ("scripts/a.py", "import makebreak\nimport modelsearch\nx = 'makebreak'"),
+    ],
+)
+def test_a_right_import_is_accepted(tmp_path, file, code):
+    path = tmp_path / file
+    path.parent.mkdir(parents=True)
+    path.write_text(code)
+    assert breaches(tmp_path) == []
+
+
+def test_numerics_load_without_pydrake():
+    names = [p.stem for p in (ROOT / "systems/numerics").glob("*.py")]
+    code = "import importlib, sys\n"
+    code += f"for name in {names}:\n"
+    code += "    importlib.import_module(f'makebreak.systems.numerics.{name}')\n"
+    code += "sys.exit('pydrake' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr or "numerics loads pydrake"
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_experiment_has_what_the_command_line_needs(name):
+    module = load_experiment(name)
+    assert module.SUMMARY and "\n" not in module.SUMMARY
+    assert dataclasses.is_dataclass(module.Config)
+    assert "seed" in {field.name for field in dataclasses.fields(module.Config)}
+    assert list(inspect.signature(module.run).parameters) == ["config", "session"]
+
+
+def links():
+    """(document, target) of the links to files of this project in its documents."""
+    for document in [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")]:
+        for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", document.read_text()):
+            if "://" not in target and not target.startswith("mailto:"):
+                yield document, target
+
+
+def test_linked_files_exist():
+    dead = [f"{d.name}: {t}" for d, t in links() if not (d.parent / t).exists()]
+    assert dead == []
