@@ -1,0 +1,199 @@
+"""The station: a Panda with a tool at a table, its sensors, and a camera above it."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.primitives import Demultiplexer
+
+from makebreak.diagrams.camera import CameraConfig, add_camera
+from makebreak.models.scene import InitialSection, Scene, load_scene, read_scene
+from makebreak.systems.contact_probe import ContactProbe
+from makebreak.systems.noisy_sensor import NoisySensor
+from makebreak.systems.tool_wrench import ToolWrench
+
+MODELS = Path(__file__).resolve().parent.parent / "models"
+BALL_ROLLING = str(MODELS / "ball_rolling.scene.yaml")
+ARM, TOOL, TIP_FRAME = "panda", "finger", "tip"
+TORQUE_RATE_MAX = 1000.0  # [N m/s] of the real Panda.
+
+
+@dataclass
+class SensorNoise:
+    """Standard deviations of the sensors' Gaussian noise, white at 1 kHz."""
+
+    position: float = 1e-5  # [rad]
+    velocity: float = 1e-3  # [rad/s]
+    torque: float = 0.1  # [N m]
+    force: float = 0.1  # [N]
+    moment: float = 0.01  # [N m]
+
+
+@dataclass
+class StationConfig:
+    scene: str = BALL_ROLLING  # Path of the world's scene file.
+    noise: SensorNoise = field(default_factory=SensorNoise)
+    camera: CameraConfig | None = None
+    contact: list[str] = field(default_factory=lambda: [TOOL, "ball"])  # To be scored.
+    seed: int = 0
+    meshcat_period_sec: float = 1.0 / 30.0
+
+
+def make_station(
+    config: StationConfig, meshcat: Meshcat | None = None, scene: Scene | None = None
+) -> Diagram:
+    """The plant, its sensors and actuators.
+
+    Inputs:  panda.torque_commanded (7,) the motors' torque [N m], clipped to the
+             effort limits.
+    Outputs: panda.position_measured (7,) [rad], panda.velocity_measured (7,) [rad/s],
+             panda.torque_measured (7,) of the motors, after the limits [N m], all with
+             noise;
+             panda.external_wrench (6,) on the tool at its tip, world axes, force first,
+             the tool's weight removed, with noise [N], [N m];
+             overhead.rgb_image (ImageRgba8U), if there is a camera;
+             and the truth, for scoring and tests alone: state (n_x,);
+             contact_force (4,) = [normal, x, y, z] [N] of the tool on the ball;
+             contact_results, body_poses (abstract).
+
+    The subsystems `plant` and `scene_graph` can be asked for by name. The plant steps
+    at multiples of its time step; a torque written at such an instant acts from the
+    next one on, a torque written just before it acts at once.
+
+    Args: scene, in place of the file, for a world that was changed in memory.
+    """
+    builder = DiagramBuilder()
+    loaded = load_scene(read_scene(config.scene) if scene is None else scene, builder)
+    plant, scene_graph = loaded.plant, loaded.scene_graph
+    arm = plant.GetModelInstanceByName(ARM)
+    tool = plant.GetModelInstanceByName(TOOL)
+    n = plant.num_velocities(arm)
+    builder.ExportInput(plant.get_actuation_input_port(arm), f"{ARM}.torque_commanded")
+    noise = config.noise
+    if len(config.contact) != 2:
+        raise ValueError(f"contact is {config.contact}, expected two models")
+    seeds = np.random.SeedSequence(config.seed).generate_state(4)
+    period = plant.time_step() or 0.001
+
+    def noisy(name: str, port: OutputPort, std, seed) -> OutputPort:
+        if not np.any(std):
+            return port
+        sensor = NoisySensor(std, int(seed), period)
+        builder.AddNamedSystem(name, sensor)
+        builder.Connect(port, sensor.GetInputPort("value"))
+        return sensor.GetOutputPort("measured")
+
+    # Position and velocity are read at once, then taken apart.
+    n_q = plant.num_positions()
+    joints = [plant.get_joint(i) for i in plant.GetJointIndices(arm)]
+    moving = [joint for joint in joints if joint.num_velocities() == 1]
+    q_first = min(joint.position_start() for joint in moving)
+    v_first = n_q + min(joint.velocity_start() for joint in moving)
+    std = np.zeros(plant.num_multibody_states())
+    std[q_first : q_first + n] = noise.position
+    std[v_first : v_first + n] = noise.velocity
+    encoders = noisy(f"{ARM}_encoders", plant.get_state_output_port(), std, seeds[0])
+    sizes = [q_first, n, v_first - q_first - n, n, len(std) - v_first - n]
+    kept = [size for size in sizes if size > 0]  # Demultiplexer has no empty outputs.
+    split = builder.AddNamedSystem(f"{ARM}_encoders_split", Demultiplexer(kept))
+    builder.Connect(encoders, split.get_input_port())
+    first = 1 if q_first > 0 else 0
+    builder.ExportOutput(split.get_output_port(first), f"{ARM}.position_measured")
+    between = 1 if sizes[2] > 0 else 0
+    builder.ExportOutput(
+        split.get_output_port(first + 1 + between), f"{ARM}.velocity_measured"
+    )
+
+    torque = plant.get_net_actuation_output_port(arm)
+    builder.ExportOutput(
+        noisy(f"{ARM}_torque", torque, np.full(n, noise.torque), seeds[1]),
+        f"{ARM}.torque_measured",
+    )
+
+    mount = next(
+        joint
+        for joint in (plant.get_joint(i) for i in plant.GetJointIndices())
+        if joint.child_body().model_instance() == tool
+    )
+    wrench = builder.AddNamedSystem(
+        f"{ARM}_tool_wrench", ToolWrench(plant, mount.name(), TIP_FRAME)
+    )
+    builder.Connect(
+        plant.get_reaction_forces_output_port(), wrench.GetInputPort("reaction_forces")
+    )
+    builder.Connect(plant.get_state_output_port(), wrench.GetInputPort("state"))
+    std_wrench = np.repeat([noise.force, noise.moment], 3)
+    builder.ExportOutput(
+        noisy(
+            f"{ARM}_external_wrench",
+            wrench.GetOutputPort("wrench"),
+            std_wrench,
+            seeds[2],
+        ),
+        f"{ARM}.external_wrench",
+    )
+
+    probe = builder.AddNamedSystem(
+        "contact_probe", ContactProbe(*(_only_body(plant, m) for m in config.contact))
+    )
+    builder.Connect(
+        plant.get_contact_results_output_port(), probe.GetInputPort("contact_results")
+    )
+    builder.ExportOutput(probe.GetOutputPort("contact_force"), "contact_force")
+    builder.ExportOutput(plant.get_state_output_port(), "state")
+    builder.ExportOutput(plant.get_contact_results_output_port(), "contact_results")
+    builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")
+
+    if config.camera is not None:
+        image = add_camera(builder, scene_graph, plant, config.camera, int(seeds[3]))
+        builder.ExportOutput(image, "overhead.rgb_image")
+    if meshcat is not None:
+        parameters = MeshcatVisualizerParams(publish_period=config.meshcat_period_sec)
+        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, parameters)
+    diagram = builder.Build()
+    diagram.set_name("station")
+    return diagram
+
+
+def _only_body(plant: MultibodyPlant, model: str):
+    if not plant.HasModelInstanceNamed(model):
+        raise ValueError(f"contact names {model!r}, which is not in the scene")
+    bodies = plant.GetBodyIndices(plant.GetModelInstanceByName(model))
+    if len(bodies) != 1:
+        raise ValueError(f"contact names {model!r}, expected a model of one body")
+    return plant.get_body(bodies[0])
+
+
+def make_control_plant(scene: Scene | str | Path = BALL_ROLLING) -> MultibodyPlant:
+    """The arm with its tool alone, as the controllers believe it: for their own use.
+
+    Its default positions are the scene's initial ones. Effects on arm and tool count.
+    """
+    if not isinstance(scene, Scene):
+        scene = read_scene(scene)
+    own = (ARM, TOOL)
+    directives = [
+        d
+        for d in scene.directives
+        if (d.add_model is not None and d.add_model.name in own)
+        or (d.add_weld is not None and d.add_weld.child.split("::")[0] in own)
+    ]
+    initial = InitialSection(
+        positions={
+            name: value
+            for name, value in scene.initial.positions.items()
+            if name.split(".")[0] in own
+        }
+    )
+    effects = [
+        effect
+        for effect in scene.effects
+        if all(
+            at.split(".")[0].split("~")[0] in own and "~" not in at for at in effect.at
+        )
+    ]
+    part = replace(scene, directives=directives, initial=initial, effects=effects)
+    return load_scene(part, DiagramBuilder()).plant

@@ -1,0 +1,226 @@
+"""The arm's 1 kHz controller: a Cartesian spring and damper at the tool's tip."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import JointActuator, RevoluteJoint
+from pydrake.systems.framework import Context, LeafSystem
+
+from makebreak.systems.numerics.impedance_controller import (
+    Law,
+    memory_size,
+    tick,
+    warm_up,
+)
+from makebreak.systems.numerics.serial_chain import SerialChain, chain_state
+from makebreak.systems.numerics.timing import timed
+
+
+@dataclass
+class ImpedanceConfig:
+    stiffness: list[float] = field(  # [N/m] x 3, [N m/rad] x 3
+        default_factory=lambda: [1000.0] * 3 + [20.0] * 3
+    )
+    damping: list[float] = field(  # [N s/m] x 3, [N m s/rad] x 3
+        default_factory=lambda: [400.0] * 3 + [2.0] * 3
+    )
+    control_orientation: bool = False  # False: position only, kept upright by posture.
+    posture_stiffness: float = 100.0  # [1/s2]
+    posture_damping: float = 20.0  # [1/s]
+    period_sec: float = 0.001
+    offset_sec: float = 0.0
+
+
+class ImpedanceController(LeafSystem):
+    """Joint torques that make the tool's tip E a spring and damper.
+
+        F = K (x_d - x) + D (v_d - v) + f_ff + Lambda (a_d - Jdot qdot)
+        tau = J' F + bias + posture in the dynamically consistent null space of J
+
+    With `control_orientation` False the task is the tip's position; the posture keeps
+    the tool as upright, and turned, as at the control plant's default positions. With
+    True it is the full pose.
+    tau is the motors' torque: the mass matrix contains the rotors' inertia.
+
+    tau never leaves the effort limits of the control plant and never changes by more
+    than torque_rate_max x period. If q or v is NaN, tau goes, at that rate, to what
+    carries the arm at its last good position; if the reference is NaN (or a stiffness
+    or damping is negative), the last good pose is held at rest. `status` says so.
+
+    Inputs:  q (n,) [rad], v (n,) [rad/s]; x_desired (19,) = [p_WE 3, quaternion wxyz 4,
+             v 3, w 3, a 3, alpha 3] of E in the world; optional stiffness (6,),
+             damping (6,) in place of the config's; optional wrench_feedforward (6,),
+             force first [N], [N m] (its torque acts only if orientation is controlled).
+    Outputs: tau (n,) [N m]; status (1,), a sum: 1 reference held, 2 sensors held,
+             4 effort limit reached, 8 torque rate limit reached.
+
+    Args: plant, finalized, the arm with its tool alone, never the simulated one;
+        tip_frame, name of E; torque_rate_max [N m/s].
+    Raises: ValueError for a plant that is not one chain of revolute joints with a motor
+        each, and for gains that are negative.
+    """
+
+    def __init__(
+        self,
+        config: ImpedanceConfig,
+        plant: MultibodyPlant,
+        tip_frame: str = "tip",
+        torque_rate_max: float = 1000.0,
+    ):
+        super().__init__()
+        for name in ("stiffness", "damping"):
+            gains = np.asarray(getattr(config, name), dtype=float)
+            if gains.shape != (6,) or not np.all(gains >= 0.0):
+                raise ValueError(f"{name} is {gains}, expected 6 numbers of 0 or more")
+        for name in ("posture_stiffness", "posture_damping"):
+            if not getattr(config, name) >= 0.0:
+                raise ValueError(f"{name} is {getattr(config, name)}, expected >= 0")
+        for name, number in (
+            ("period_sec", config.period_sec),
+            ("torque_rate_max", torque_rate_max),
+        ):
+            if not number > 0.0:
+                raise ValueError(f"{name} is {number}, expected > 0")
+        self._chain = serial_chain_of(plant, tip_frame)
+        context = plant.CreateDefaultContext()
+        n = plant.num_positions()
+        q_nominal = plant.GetPositions(context)
+        frame = plant.GetFrameByName(tip_frame)
+        self._law = Law(
+            effort_max=plant.GetEffortUpperLimits()[_actuator_order(plant)],
+            step_max=np.full(n, torque_rate_max * config.period_sec),
+            q_lower=plant.GetPositionLowerLimits(),
+            q_upper=plant.GetPositionUpperLimits(),
+            q_nominal=q_nominal,
+            R_upright=np.ascontiguousarray(
+                frame.CalcPoseInWorld(context).rotation().matrix()
+            ),
+            stiffness=np.array(config.stiffness, dtype=float),
+            damping=np.array(config.damping, dtype=float),
+            posture_stiffness=float(config.posture_stiffness),
+            posture_damping=float(config.posture_damping),
+            posture_every=max(1, round(0.012 / config.period_sec)),
+            control_orientation=bool(config.control_orientation),
+            period=float(config.period_sec),
+        )
+        warm_up(self._chain, self._law)
+        self._q = self.DeclareVectorInputPort("q", n)
+        self._v = self.DeclareVectorInputPort("v", n)
+        self._x_desired = self.DeclareVectorInputPort("x_desired", 19)
+        self._stiffness = self.DeclareVectorInputPort("stiffness", 6)
+        self._damping = self.DeclareVectorInputPort("damping", 6)
+        self._wrench = self.DeclareVectorInputPort("wrench_feedforward", 6)
+        # The first torque carries the arm at its nominal position.
+        carrying = chain_state(self._chain, q_nominal, np.zeros(n)).bias
+        self._tau = self.DeclareDiscreteState(carrying)
+        self._status = self.DeclareDiscreteState(1)
+        self._memory = self.DeclareDiscreteState(memory_size(n))
+        self._no_wrench = np.zeros(6)
+        self.DeclareStateOutputPort("tau", self._tau)
+        self.DeclareStateOutputPort("status", self._status)
+        self.DeclarePeriodicDiscreteUpdateEvent(
+            config.period_sec, config.offset_sec, self._update
+        )
+
+    @timed
+    def _update(self, context: Context, discrete_state):
+        tau, status, memory = tick(
+            self._chain,
+            self._law,
+            context.get_discrete_state(self._tau).value(),
+            context.get_discrete_state(self._memory).value(),
+            self._q.Eval(context),
+            self._v.Eval(context),
+            self._x_desired.Eval(context),
+            self._or(self._stiffness, context, self._law.stiffness),
+            self._or(self._damping, context, self._law.damping),
+            self._or(self._wrench, context, self._no_wrench),
+        )
+        discrete_state.set_value(self._tau, tau)
+        discrete_state.set_value(self._status, [status])
+        discrete_state.set_value(self._memory, memory)
+
+    def _or(self, port, context, otherwise):
+        return port.Eval(context) if port.HasValue(context) else otherwise
+
+
+def _actuator_order(plant: MultibodyPlant) -> list[int]:
+    """Index of each joint's actuator, in the order of the joints' positions."""
+    by_start = {
+        actuator.joint().position_start(): i
+        for i, actuator in enumerate(_motors(plant))
+    }
+    return [by_start[i] for i in range(plant.num_positions())]
+
+
+def _motors(plant: MultibodyPlant) -> list[JointActuator]:
+    return [
+        plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()
+    ]
+
+
+def serial_chain_of(plant: MultibodyPlant, tip_frame: str) -> SerialChain:
+    """The constants of a plant that is one chain of revolute joints, a motor each.
+
+    Args: plant, finalized; tip_frame, name of a frame on the last link or on what is
+        welded to it.
+    Raises: ValueError if it is anything else.
+    """
+    moving = [
+        joint
+        for joint in (plant.get_joint(i) for i in plant.GetJointIndices())
+        if joint.num_velocities() > 0
+    ]
+    moving.sort(key=lambda joint: joint.position_start())
+    motors = _motors(plant)
+    motor_of = {motor.joint().index(): motor for motor in motors}
+    welded_to = [plant.GetBodiesWeldedTo(joint.child_body()) for joint in moving]
+    before = [plant.GetBodiesWeldedTo(plant.world_body()), *welded_to[:-1]]
+    for joint, parents in zip(moving, before, strict=True):
+        name = joint.name()
+        if not isinstance(joint, RevoluteJoint):
+            raise ValueError(f"joint {name!r} is not revolute; the law needs an arm")
+        if joint.parent_body() not in parents:
+            raise ValueError(f"joint {name!r} does not continue the chain before it")
+        if joint.index() not in motor_of:
+            raise ValueError(f"joint {name!r} has no actuator")
+        if joint.default_damping() != 0.0:
+            raise ValueError(f"joint {name!r} has damping; the law does not know it")
+    if not moving:
+        raise ValueError("the control plant has no joint that moves")
+    if not plant.HasFrameNamed(tip_frame):
+        raise ValueError(f"the control plant has no frame {tip_frame!r}")
+    tip = plant.GetFrameByName(tip_frame)
+    if tip.body() not in welded_to[-1]:
+        raise ValueError(f"frame {tip_frame!r} is not on the last link")
+
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, np.zeros(plant.num_positions()))
+    X_WJ = [joint.frame_on_child().CalcPoseInWorld(context) for joint in moving]
+    R_PJ, p_PJ, mass, p_com, I_com = [], [], [], [], []
+    for i, (joint, bodies) in enumerate(zip(moving, welded_to, strict=True)):
+        X_PJ = X_WJ[0] if i == 0 else X_WJ[i - 1].inverse() @ X_WJ[i]
+        R_PJ.append(X_PJ.rotation().matrix())
+        p_PJ.append(X_PJ.translation())
+        inertia = plant.CalcSpatialInertia(
+            context, joint.frame_on_child(), [body.index() for body in bodies]
+        )
+        mass.append(inertia.get_mass())
+        p_com.append(inertia.get_com())
+        about_com = inertia.Shift(inertia.get_com()).CalcRotationalInertia()
+        I_com.append(about_com.CopyToFullMatrix3())
+    X_LE = X_WJ[-1].inverse() @ tip.CalcPoseInWorld(context)
+    rotor = [
+        motor_of[joint.index()].default_rotor_inertia()
+        * motor_of[joint.index()].default_gear_ratio() ** 2
+        for joint in moving
+    ]
+    return SerialChain(
+        *(np.array(part, dtype=float) for part in (R_PJ, p_PJ)),
+        np.array([joint.revolute_axis() for joint in moving]),
+        *(np.array(part, dtype=float) for part in (mass, p_com, I_com, rotor)),
+        np.array(plant.gravity_field().gravity_vector(), dtype=float),
+        np.ascontiguousarray(X_LE.rotation().matrix()),
+        np.array(X_LE.translation()),
+    )

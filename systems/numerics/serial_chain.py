@@ -1,0 +1,204 @@
+"""Kinematics and dynamics of an arm of revolute joints, in world axes.
+
+Mass matrix, Coriolis, centrifugal and gravity torque and the tip's Jacobian in one
+compiled pass (about a tenth of the time of asking a general plant for each of them).
+
+Spatial vectors are angular first and taken at the world's origin, so that they add
+without a shift: twist [w, v0], force [n0, f].
+
+Source: Featherstone, "Rigid Body Dynamics Algorithms" (2008): recursive Newton-Euler
+section 5.3, composite rigid body section 6.2.
+"""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+
+class SerialChain(NamedTuple):
+    """Constants of the arm: link i moves about joint i, its frame is the joint's."""
+
+    R_PJ: np.ndarray  # (n, 3, 3) joint i in link i - 1's frame (the world's for i = 0),
+    p_PJ: np.ndarray  # (n, 3) [m] at zero angle.
+    axis: np.ndarray  # (n, 3) unit axis in its own frame.
+    mass: np.ndarray  # (n,) [kg] with what is welded to the link.
+    p_com: np.ndarray  # (n, 3) centre of mass in the link's frame [m].
+    I_com: np.ndarray  # (n, 3, 3) inertia about it, in the link's axes [kg m2].
+    rotor: np.ndarray  # (n,) inertia of the motors, reflected at the joints [kg m2].
+    gravity: np.ndarray  # (3,) [m/s2]
+    R_LE: np.ndarray  # (3, 3) tip frame E in the last link's frame,
+    p_LE: np.ndarray  # (3,) [m].
+
+
+class ChainState(NamedTuple):
+    M: np.ndarray  # (n, n) mass matrix with the rotors [kg m2].
+    bias: np.ndarray  # (n,) torque for zero joint acceleration [N m].
+    J: np.ndarray  # (6, n) of the tip: linear rows first, world axes.
+    bias_a: np.ndarray  # (6,) the tip's acceleration at zero joint acceleration.
+    p_WE: np.ndarray  # (3,) [m]
+    R_WE: np.ndarray  # (3, 3)
+
+
+@numba.njit(cache=True, inline="always")
+def _cross(out, a, b):
+    out[0] = a[1] * b[2] - a[2] * b[1]
+    out[1] = a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
+
+
+@numba.njit(cache=True)
+def _matmul3(out, A, B):
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+
+
+@numba.njit(cache=True)
+def _forward(chain, q, R, p, z):
+    """Fills each joint's rotation R (n, 3, 3), origin p (n, 3), axis z (n, 3)."""
+    turn = np.empty((3, 3))
+    fixed = np.empty((3, 3))
+    for i in range(q.shape[0]):
+        x, y, w = chain.axis[i]
+        s, c = np.sin(q[i]), np.cos(q[i])
+        t = 1.0 - c
+        turn[0, 0], turn[0, 1], turn[0, 2] = t * x * x + c, t * x * y - s * w, t * x * w
+        turn[0, 2] += s * y
+        turn[1, 0], turn[1, 1], turn[1, 2] = t * x * y + s * w, t * y * y + c, t * y * w
+        turn[1, 2] -= s * x
+        turn[2, 0], turn[2, 1], turn[2, 2] = t * x * w - s * y, t * y * w, t * w * w + c
+        turn[2, 1] += s * x
+        if i == 0:
+            fixed[:] = chain.R_PJ[0]
+            p[0] = chain.p_PJ[0]
+        else:
+            _matmul3(fixed, R[i - 1], chain.R_PJ[i])
+            for k in range(3):
+                p[i, k] = p[i - 1, k]
+                for j in range(3):
+                    p[i, k] += R[i - 1, k, j] * chain.p_PJ[i, j]
+        _matmul3(R[i], fixed, turn)
+        for k in range(3):
+            z[i, k] = R[i, k, 0] * x + R[i, k, 1] * y + R[i, k, 2] * w
+
+
+@numba.njit(cache=True)
+def tip_kinematics(chain, q):
+    """p_WE (3,) [m], R_WE (3, 3) and the tip's Jacobian J (6, n), linear rows first."""
+    n = q.shape[0]
+    R, p, z = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3))
+    _forward(chain, q, R, p, z)
+    R_WE, p_WE, J = np.empty((3, 3)), np.empty(3), np.empty((6, n))
+    _tip(chain, R, p, z, R_WE, p_WE, J)
+    return p_WE, R_WE, J
+
+
+@numba.njit(cache=True)
+def _tip(chain, R, p, z, R_WE, p_WE, J):
+    n = p.shape[0]
+    _matmul3(R_WE, R[n - 1], chain.R_LE)
+    for k in range(3):
+        p_WE[k] = p[n - 1, k]
+        for j in range(3):
+            p_WE[k] += R[n - 1, k, j] * chain.p_LE[j]
+    column = np.empty(3)
+    for i in range(n):
+        _cross(column, z[i], p_WE - p[i])
+        J[:3, i] = column
+        J[3:, i] = z[i]
+
+
+@numba.njit(cache=True)
+def chain_state(chain, q, v):
+    """All of ChainState at joint angles q (n,) [rad] and rates v (n,) [rad/s]."""
+    n = q.shape[0]
+    R, p, z = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3))
+    _forward(chain, q, R, p, z)
+    R_WE, p_WE, J = np.empty((3, 3)), np.empty(3), np.empty((6, n))
+    _tip(chain, R, p, z, R_WE, p_WE, J)
+
+    # Each link's inertia about the world's origin: mass m, first moment h, matrix I.
+    h, inertia = np.empty((n, 3)), np.empty((n, 3, 3))
+    half, turned, com = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    for i in range(n):
+        _matmul3(half, R[i], chain.I_com[i])
+        _matmul3(turned, half, R[i].T)
+        for k in range(3):
+            com[k] = p[i, k]
+            for j in range(3):
+                com[k] += R[i, k, j] * chain.p_com[i, j]
+        m = chain.mass[i]
+        square = com[0] ** 2 + com[1] ** 2 + com[2] ** 2
+        for k in range(3):
+            h[i, k] = m * com[k]
+            for j in range(3):
+                inertia[i, k, j] = turned[k, j] - m * com[k] * com[j]
+            inertia[i, k, k] += m * square
+
+    # Outward: twist V and acceleration A (without gravity) of each link at v, no vdot.
+    S = np.empty((n, 6))
+    V, A = np.zeros((n + 1, 6)), np.zeros((n + 1, 6))
+    a, b = np.empty(3), np.empty(3)
+    for i in range(n):
+        _cross(a, p[i], z[i])
+        S[i, :3], S[i, 3:] = z[i], a
+        w, u = V[i, :3], V[i, 3:]
+        _cross(a, w, z[i])
+        A[i + 1, :3] = A[i, :3] + a * v[i]
+        _cross(a, w, S[i, 3:])
+        _cross(b, u, z[i])
+        A[i + 1, 3:] = A[i, 3:] + (a + b) * v[i]
+        V[i + 1] = V[i] + S[i] * v[i]
+
+    # Inward: forces for the bias, composite inertias for the mass matrix.
+    M, bias = np.empty((n, n)), np.empty(n)
+    f, momentum, total = np.zeros(6), np.empty(6), np.empty(6)
+    m_c, h_c, I_c = 0.0, np.zeros(3), np.zeros((3, 3))
+    lifted = np.empty(6)
+    for i in range(n - 1, -1, -1):
+        lifted[:3] = A[i + 1, :3]
+        lifted[3:] = A[i + 1, 3:] - chain.gravity
+        _momentum(total, chain.mass[i], h[i], inertia[i], lifted)
+        _momentum(momentum, chain.mass[i], h[i], inertia[i], V[i + 1])
+        w, u = V[i + 1, :3], V[i + 1, 3:]
+        _cross(a, w, momentum[:3])
+        _cross(b, u, momentum[3:])
+        total[:3] += a + b
+        _cross(a, w, momentum[3:])
+        total[3:] += a
+        f += total
+        bias[i] = np.dot(S[i], f)
+        m_c += chain.mass[i]
+        h_c += h[i]
+        I_c += inertia[i]
+        _momentum(momentum, m_c, h_c, I_c, S[i])
+        for j in range(i + 1):
+            M[i, j] = M[j, i] = np.dot(S[j], momentum)
+        M[i, i] += chain.rotor[i]
+
+    # Acceleration of the tip's point, from the twist's at the origin.
+    bias_a = np.empty(6)
+    w, alpha = V[n, :3], A[n, :3]
+    _cross(a, w, p_WE)
+    velocity = V[n, 3:] + a
+    _cross(a, alpha, p_WE)
+    _cross(b, w, velocity)
+    bias_a[:3] = A[n, 3:] + a + b
+    bias_a[3:] = alpha
+    return ChainState(M, bias, J, bias_a, p_WE, R_WE)
+
+
+@numba.njit(cache=True)
+def _momentum(out, m, h, inertia, twist):
+    """Spatial momentum [k0, l] of a body of mass m, first moment h, at the origin."""
+    w, u = twist[:3], twist[3:]
+    out[0] = h[1] * u[2] - h[2] * u[1]
+    out[1] = h[2] * u[0] - h[0] * u[2]
+    out[2] = h[0] * u[1] - h[1] * u[0]
+    out[3] = w[1] * h[2] - w[2] * h[1]
+    out[4] = w[2] * h[0] - w[0] * h[2]
+    out[5] = w[0] * h[1] - w[1] * h[0]
+    for k in range(3):
+        out[k] += inertia[k, 0] * w[0] + inertia[k, 1] * w[1] + inertia[k, 2] * w[2]
+        out[3 + k] += m * u[k]
