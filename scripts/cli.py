@@ -62,8 +62,12 @@ def scenes() -> dict[str, Path]:
         except yaml.YAMLError:
             continue
         if isinstance(content, dict) and "directives" in content:
-            found[path.relative_to(_MODELS).as_posix().removesuffix(".yaml")] = path
+            found[_scene_name(path.relative_to(_MODELS).as_posix())] = path
     return found
+
+
+def _scene_name(file: str) -> str:
+    return file.removesuffix(".yaml").removesuffix(".scene")
 
 
 def _scene(text: str, option: str) -> str:
@@ -71,8 +75,8 @@ def _scene(text: str, option: str) -> str:
     if Path(text).is_file():
         return str(Path(text).resolve())
     shipped = scenes()
-    if text.removesuffix(".yaml") in shipped:
-        return str(shipped[text.removesuffix(".yaml")])
+    if _scene_name(text) in shipped:
+        return str(shipped[_scene_name(text)])
     hint = f" ({nearest(text, shipped)})" if shipped else ""
     raise ValueError(f'{option}: got "{text}", expected a scene file{hint}')
 

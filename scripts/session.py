@@ -282,7 +282,10 @@ class Session:
         for system in systems:
             ms = 1e3 * np.array(getattr(system, "compute_sec", ()))
             if ms.size:
-                entry["systems"][system.get_name()] = {
+                name = system.get_name()  # Unique in one diagram, not in nested ones.
+                if name in entry["systems"]:
+                    name = system.GetSystemPathname()
+                entry["systems"][name] = {
                     "updates": int(ms.size),
                     "p50_ms": float(np.percentile(ms, 50)),
                     "p99_ms": float(np.percentile(ms, 99)),

@@ -169,13 +169,19 @@ def test_a_fault_of_the_program_is_not_called_bad_input(capsys):
 def test_a_world_is_found_by_path_or_by_name(monkeypatch):
     models = Path("models/rooms").absolute()
     models.mkdir(parents=True)
-    (models / "attic.yaml").write_text("# An attic.\ndirectives: []\n")
+    (models / "attic.scene.yaml").write_text("# An attic.\ndirectives: []\n")
     (models / "weights.yaml").write_text("a: 1\n")  # YAML, but no scene.
     monkeypatch.setattr(cli, "_MODELS", models.parent)
     assert list(cli.scenes()) == ["rooms/attic"]
-    for name in ("rooms/attic", "rooms/attic.yaml", "models/rooms/attic.yaml"):
+    for name in (
+        "rooms/attic",
+        "rooms/attic.scene.yaml",
+        "models/rooms/attic.scene.yaml",
+    ):
         assert run("--world", name, "--duration", "5") < 2
-        assert f"world: {models}/attic.yaml" in Path("out/config.yaml").read_text()
+        assert (
+            f"world: {models}/attic.scene.yaml" in Path("out/config.yaml").read_text()
+        )
 
 
 def test_list_names_experiments_and_scenes_with_a_line_each(capsys, monkeypatch):

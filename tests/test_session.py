@@ -157,6 +157,19 @@ def test_timing_counts_the_updates_of_each_simulation_apart(tmp_path):
     assert updates == [50, 100]
 
 
+def test_systems_of_one_name_in_nested_diagrams_are_told_apart(tmp_path):
+    builder = DiagramBuilder()
+    for name in ("left", "right"):
+        part, _ = ticking()
+        builder.AddNamedSystem(name, part)
+    own = session(tmp_path)
+    own.simulate(builder.Build(), 0.1, {})
+    own.finish()
+    timing = json.loads((own.out_dir / "timing.json").read_text())
+    first, second = timing["systems"]
+    assert first == "ticker" and second.endswith("::right::ticker")
+
+
 def test_a_port_that_cannot_be_sampled_is_refused_by_name(tmp_path):
     diagram, ticker = ticking()
     _, other = ticking()
