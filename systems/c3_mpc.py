@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -106,7 +107,7 @@ class C3Mpc(LeafSystem):
         self._u_idle = np.clip(np.zeros(p.n_u), u_lower, u_upper)
 
         def state(*shape, value=0.0):
-            flat = np.broadcast_to(value, shape).ravel()
+            flat = np.array(np.broadcast_to(value, shape), dtype=float).ravel()
             return self.DeclareDiscreteState(flat), shape
 
         self._u = state(p.n_u, value=self._u_idle)
@@ -133,7 +134,7 @@ class C3Mpc(LeafSystem):
         warm_up(p)
 
     def _initialize(self, context, discrete_state):
-        x = self._x_in.Eval(context)
+        x = np.asarray(self._x_in.Eval(context))
         if np.isfinite(x).all():
             discrete_state.set_value(self._x_next[0], x)
             N = self._problem.options.N
@@ -176,13 +177,14 @@ class C3Mpc(LeafSystem):
         write(self._lam, lam)
 
     def _read_inputs(self, context):
-        """C3Status.SOLVED and (x, x_desired, lcs, lcs_command); or why not, and None."""
+        """SOLVED and (x, x_desired, lcs, lcs_command); or why not, and None."""
         p = self._problem
-        x, x_desired = self._x_in.Eval(context), self._x_desired.Eval(context)
+        x = np.asarray(self._x_in.Eval(context))
+        x_desired = np.asarray(self._x_desired.Eval(context))
         r_comp = np.zeros(p.n_lam)
         if self._r_comp.HasValue(context):
-            r_comp = self._r_comp.Eval(context)
-        lcs = self._lcs.Eval(context)
+            r_comp = np.asarray(self._r_comp.Eval(context))
+        lcs: Any = self._lcs.Eval(context)
         lcs_command = lcs
         if self._lcs_command.HasValue(context):
             lcs_command = self._lcs_command.Eval(context)

@@ -149,8 +149,8 @@ class C3Problem:
         odd = self.is_plus and n_contact % 2
         if n_contact < 1 or odd or self.U.size != self.n_z:
             raise ValueError(
-                f"C3Weights: G has {self.n_z} and U {self.U.size} entries, expected one "
-                f"per entry of {parts} with {self.n_x} of x and {self.n_u} of u"
+                f"C3Weights: G has {self.n_z} and U {self.U.size} entries, expected "
+                f"one per entry of {parts} with {self.n_x} of x and {self.n_u} of u"
             )
         i_u = self.n_x + self.n_lam
         needed = np.zeros(self.n_z, bool)
@@ -295,7 +295,7 @@ def solve_c3(
             delta[:, : p.n_x] = x0
     scale = 1.0
     if o.scale_lam:
-        scale = np.linalg.norm(lcs.A) / np.linalg.norm(lcs.D)
+        scale = float(np.linalg.norm(lcs.A) / np.linalg.norm(lcs.D))
         if not np.isfinite(scale):
             raise C3Failure("D is zero or not finite: there is no scale for lam")
     # Contact entries of z count in units of scale.
@@ -509,11 +509,11 @@ def warm_up(problem: C3Problem):
     p = problem
     D, E = np.eye(p.n_x, p.n_lam), -np.eye(p.n_lam, p.n_x)
     H, c = np.zeros((p.n_lam, p.n_u)), -np.ones(p.n_lam)
-    B, I = np.zeros((p.n_x, p.n_u)), np.eye(p.n_lam)
-    lcs = LCS(0.5 * np.eye(p.n_x), B, D, np.zeros(p.n_x), E, I, H, c, 1.0)
+    B, F = np.zeros((p.n_x, p.n_u)), np.eye(p.n_lam)
+    lcs = LCS(0.5 * np.eye(p.n_x), B, D, np.zeros(p.n_x), E, F, H, c, 1.0)
     x0 = np.zeros(p.n_x)
     try:
         solve_c3(lcs, x0, np.zeros((p.options.N + 1, p.n_x)), p)
     except C3Failure:
-        pass  # The bounds may exclude this made-up problem; it is compiled all the same.
+        pass  # Bounds may exclude this made-up problem; it is compiled all the same.
     simulate(lcs, x0, np.zeros(p.n_u))

@@ -10,7 +10,7 @@ serves any number of right-hand sides h. Bounds are met by a primal-dual interio
 method whose Newton steps are the same recursion with a larger diagonal.
 
 Everything here is compiled and works on contiguous float64 arrays; the loops are our
-own rather than BLAS calls, so that a solve repeats bit for bit on any number of threads.
+own rather than BLAS calls, so that a solve repeats bit for bit whatever the threads.
 
 Source: Rawlings, Mayne, Diehl, "Model Predictive Control", section 8.8 (Riccati);
 Nocedal, Wright, "Numerical Optimization", algorithm 16.4 (predictor-corrector).
@@ -23,7 +23,7 @@ from numba import njit
 
 # An interior point solve ends when its complementarity and its residuals are this
 # small relative to where it started ...
-IPM_TOLERANCE = 1e-11
+IPM_TOLERANCE = 1e-13
 # ... and has failed (as a rule: the bounds cannot be met) after so many steps.
 IPM_STEPS = 60
 
@@ -214,10 +214,15 @@ def solve_bounded(fac, T, T_N, h, x0, v0_fixed, lower, upper, x, v):
     N, n_v = v.shape
     n_x = x.shape[1]
     n = n_v + n_x
-    # Row k holds [v_k, x_k]; x_0 is given, and v_N does not exist.
-    y, y_new = np.zeros((N + 1, n)), np.zeros((N + 1, n))
+    # Row k holds [v_k, x_k]; x_0 is given, and v_N does not exist. A step dy obeys the
+    # dynamics with d = 0 and x_0 = 0; solving for dy rather than for y keeps the
+    # large barrier terms from cancelling.
+    step = new_factor(fac.AB, np.zeros(n_x), N)
+    dx, dv, zero_x, zero_v = x.copy(), v.copy(), np.zeros(n_x), 0.0 * v0_fixed
+    y, dy = np.zeros((N + 1, n)), np.zeros((N + 1, n))
     s, z = np.ones((2, N + 1, n)), np.zeros((2, N + 1, n))
     ds, dz = np.zeros((2, N + 1, n)), np.zeros((2, N + 1, n))
+    gap = np.zeros((2, N + 1, n))
     active = np.zeros((2, N + 1, n), np.bool_)
     _pack(x, v, y)
     count, mu = 0, 0.0
@@ -225,33 +230,54 @@ def solve_bounded(fac, T, T_N, h, x0, v0_fixed, lower, upper, x, v):
         for k in range(N + 1):
             for i in range(n):
                 bound = lower[i] if side == 0 else upper[i]
-                if (
-                    not np.isfinite(bound)
-                    or (i >= n_v and k == 0)
-                    or (i < n_v and k == N)
-                ):
+                exists = k > 0 if i >= n_v else (i >= v0_fixed.size or k > 0) and k < N
+                if not (exists and np.isfinite(bound)):
                     continue
                 active[side, k, i] = True
-                gap = y[k, i] - bound if side == 0 else bound - y[k, i]
+                breach = bound - y[k, i] if side == 0 else y[k, i] - bound
                 width = upper[i] - lower[i]
                 least = 0.1 * width if np.isfinite(width) else 0.1 * (1.0 + abs(bound))
-                s[side, k, i] = max(abs(gap), least)
+                s[side, k, i] = max(abs(breach), least)
                 # A multiplier of the size that undoes the breach.
                 weight = T_N[i - n_v, i - n_v] if k == N else T[i, i]
-                z[side, k, i] = max(weight, 1e-8) * max(-gap, least)
+                z[side, k, i] = max(weight, 1e-8) * max(breach, least)
                 mu += s[side, k, i] * z[side, k, i]
                 count += 1
     if count == 0:
         return True
     mu /= count
-    mu_start, residual = mu, 1.0
-    diagonal, h_new = np.zeros((N + 1, n)), np.empty((N + 1, n))
+    mu_start, residual, careful = mu, 1.0, False
+    diagonal, g, h_step = (
+        np.zeros((N + 1, n)),
+        np.empty((N + 1, n)),
+        np.empty((N + 1, n)),
+    )
     for _ in range(IPM_STEPS):
+        for k in range(N + 1):
+            for i in range(n):
+                total = h[k, i]
+                if k < N:
+                    for j in range(n):
+                        total -= T[i, j] * y[k, j]
+                elif i >= n_v:
+                    for j in range(n_x):
+                        total -= T_N[i - n_v, j] * y[k, n_v + j]
+                g[k, i] = total
+                gap[0, k, i] = y[k, i] - lower[i]
+                gap[1, k, i] = upper[i] - y[k, i]
+                diagonal[k, i] = 0.0
+                for side in range(2):
+                    if active[side, k, i]:
+                        diagonal[k, i] += z[side, k, i] / s[side, k, i]
+        if not factor(step, T, T_N, diagonal, v0_fixed.size):
+            break
         for predictor in (True, False):
-            target = 0.0
+            target = 0.3 * mu if careful else 0.0
+            if not predictor and careful:
+                break  # The one step has been found.
             if not predictor:
                 # How far the predictor got says how much to centre.
-                alpha = _step_length(s, z, ds, dz, active)
+                alpha = min(1.0, _step_length(s, z, ds, dz, active))
                 mu_affine = 0.0
                 for side in range(2):
                     for k in range(N + 1):
@@ -260,52 +286,40 @@ def solve_bounded(fac, T, T_N, h, x0, v0_fixed, lower, upper, x, v):
                                 mu_affine += (
                                     s[side, k, i] + alpha * ds[side, k, i]
                                 ) * (z[side, k, i] + alpha * dz[side, k, i])
-                mu_affine /= count
-                target = mu * (mu_affine / mu) ** 3
+                target = mu * (mu_affine / count / mu) ** 3
             for k in range(N + 1):
                 for i in range(n):
-                    diagonal[k, i] = 0.0
-                    h_new[k, i] = h[k, i]
+                    h_step[k, i] = g[k, i]
                     for side in range(2):
                         if not active[side, k, i]:
                             continue
-                        ratio = z[side, k, i] / s[side, k, i]
-                        correction = 0.0
-                        if not predictor:
-                            correction = ds[side, k, i] * dz[side, k, i]
-                        push = (target - correction) / s[side, k, i] + z[side, k, i]
-                        diagonal[k, i] += ratio
-                        if side == 0:
-                            h_new[k, i] += push + ratio * lower[i]
-                        else:
-                            h_new[k, i] += ratio * upper[i] - push
-            if predictor and not factor(fac, T, T_N, diagonal, v0_fixed.size):
-                return False
-            solve(fac, h_new, x0, v0_fixed, x, v)
-            _pack(x, v, y_new)
+                        if predictor:
+                            ds[side, k, i] = 0.0  # No second-order term yet.
+                        dz[side, k, i] = target - ds[side, k, i] * dz[side, k, i]
+                        push = (
+                            dz[side, k, i]
+                            - z[side, k, i] * (gap[side, k, i] - s[side, k, i])
+                        ) / s[side, k, i]
+                        h_step[k, i] += push if side == 0 else -push
+            solve(step, h_step, zero_x, zero_v, dx, dv)
+            _pack(dx, dv, dy)
             for side in range(2):
                 for k in range(N + 1):
                     for i in range(n):
-                        if not active[side, k, i]:
-                            continue
-                        gap = y_new[k, i] - lower[i]
-                        if side == 1:
-                            gap = upper[i] - y_new[k, i]
-                        correction = 0.0
-                        if not predictor:
-                            correction = ds[side, k, i] * dz[side, k, i]
-                        ds_new = gap - s[side, k, i]
-                        dz[side, k, i] = (
-                            target - correction - z[side, k, i] * gap
-                        ) / s[side, k, i]
-                        ds[side, k, i] = ds_new
+                        if active[side, k, i]:
+                            move = dy[k, i] if side == 0 else -dy[k, i]
+                            s_new = gap[side, k, i] + move
+                            ds[side, k, i] = s_new - s[side, k, i]
+                            dz[side, k, i] = (
+                                dz[side, k, i] - z[side, k, i] * s_new
+                            ) / s[side, k, i]
         alpha = min(1.0, 0.995 * _step_length(s, z, ds, dz, active))
-        if not alpha > 1e-10:
-            return False
-        mu = 0.0
+        if not alpha > 1e-8:
+            break
+        mu_last, mu = mu, 0.0
         for k in range(N + 1):
             for i in range(n):
-                y[k, i] += alpha * (y_new[k, i] - y[k, i])
+                y[k, i] += alpha * dy[k, i]
                 for side in range(2):
                     if active[side, k, i]:
                         s[side, k, i] += alpha * ds[side, k, i]
@@ -313,8 +327,10 @@ def solve_bounded(fac, T, T_N, h, x0, v0_fixed, lower, upper, x, v):
                         mu += s[side, k, i] * z[side, k, i]
         mu /= count
         residual *= 1.0 - alpha
+        # The second-order correction can cycle; a plain centred step does not.
+        careful = mu > 0.7 * mu_last
         if not np.isfinite(mu):
-            return False
+            break
         if mu < IPM_TOLERANCE * mu_start and residual < IPM_TOLERANCE:
             for k in range(N):
                 for i in range(n_v):
