@@ -1,0 +1,265 @@
+"""scripts/setup.sh, run.sh and test.sh, with a stand-in for Python that records what it
+is asked to do; and what a wheel contains."""
+
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+ROOMS = ("models", "systems", "diagrams", "gap", "scripts")
+
+# Answers like a Python that lacks nothing. Each call is a line of calls.txt; a file
+# `fail` makes pip fail with that output, a file `kill` kills the set-up in pip.
+STAND_IN = r"""#!/bin/bash
+here="$STAND_IN_DIR"
+case "$1 ${2:-}" in
+    "-c import sys"*) echo "${STAND_IN_VERSION:-3.12}" ;;
+    "- ") [[ ! -e "$here/missing" ]] || cat "$here/missing" ;;
+    "-c "*) echo check >>"$here/calls.txt" ;;
+    "-m venv")
+        echo venv >>"$here/calls.txt"
+        mkdir -p "$3/bin"
+        cp "$here/python" "$3/bin/python"
+        printf '#!/bin/bash\nprintf "%%s\\n" "$@" "$PWD"\n' >"$3/bin/makebreak"
+        chmod +x "$3/bin/makebreak"
+        ;;
+    "-m pip")
+        echo pip >>"$here/calls.txt"
+        if [[ -e "$here/kill" ]]; then kill -KILL $PPID; exit 1; fi
+        if [[ -e "$here/fail" ]]; then cat "$here/fail"; exit 1; fi
+        ;;
+    "-m pytest") printf '%s\n' "${@:3}" "$PWD" ;;
+esac
+"""
+
+pytestmark = pytest.mark.skipif(
+    sys.platform != "linux", reason="the scripts are for Debian and Ubuntu"
+)
+
+
+class Checkout:
+    """A copy of what the set-up reads, in a folder with a space in its name."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self.tools = folder.parent / "tools"
+        for path in ("scripts", "tools"):
+            (folder.parent / path).mkdir()
+        folder.mkdir()
+        (folder / "scripts").mkdir()
+        for name in ("setup.sh", "run.sh", "test.sh"):
+            shutil.copy(ROOT / "scripts" / name, folder / "scripts" / name)
+        for name in ("pyproject.toml", "requirements.lock"):
+            shutil.copy(ROOT / name, folder / name)
+        python = self.tools / "python"
+        python.write_text(STAND_IN)
+        python.chmod(0o755)
+
+    def __call__(self, script, *arguments, **environment):
+        environment = {
+            "STAND_IN_DIR": str(self.tools),
+            "MAKEBREAK_PYTHON": str(self.tools / "python"),
+            "TMPDIR": str(self.tools),
+            "PATH": os.environ["PATH"],
+            **environment,
+        }
+        return subprocess.run(
+            [self.folder / "scripts" / script, *arguments],
+            cwd=self.tools,
+            env=environment,
+            capture_output=True,
+            text=True,
+        )
+
+    def calls(self):
+        """What Python was asked since the last time."""
+        path = self.tools / "calls.txt"
+        calls = path.read_text().split() if path.exists() else []
+        path.unlink(missing_ok=True)
+        return calls
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    return Checkout(tmp_path / "a checkout")
+
+
+def test_first_call_sets_up_and_the_second_does_nothing(checkout):
+    done = checkout("setup.sh")
+    assert done.returncode == 0, done.stderr
+    assert checkout.calls() == ["venv", "pip", "pip", "check"]
+    assert (checkout("setup.sh").stderr, checkout.calls()) == ("", [])
+    assert list(checkout.tools.glob("makebreak-setup.*")) == []  # No log is left.
+
+
+@pytest.mark.parametrize("name", ["pyproject.toml", "requirements.lock"])
+def test_changed_dependencies_are_installed_into_the_same_venv(checkout, name):
+    checkout("setup.sh")
+    checkout.calls()
+    with (checkout.folder / name).open("a") as file:
+        file.write("# changed\n")
+    assert checkout("setup.sh").returncode == 0
+    assert checkout.calls() == ["pip", "pip", "check"]
+
+
+def test_interrupted_set_up_starts_again_from_nothing(checkout):
+    (checkout.tools / "kill").touch()
+    assert checkout("setup.sh").returncode != 0
+    (checkout.folder / ".venv" / "half_a_package").touch()
+    (checkout.tools / "kill").unlink()
+    checkout.calls()
+    assert checkout("setup.sh").returncode == 0
+    assert checkout.calls() == ["venv", "pip", "pip", "check"]
+    assert not (checkout.folder / ".venv" / "half_a_package").exists()
+
+
+def test_moved_checkout_gets_a_new_venv(checkout):
+    checkout("setup.sh")
+    checkout.calls()
+    checkout.folder = checkout.folder.rename(checkout.folder.with_name("elsewhere"))
+    assert checkout("setup.sh").returncode == 0
+    assert checkout.calls() == ["venv", "pip", "pip", "check"]
+
+
+def test_network_failure_is_one_line(checkout):
+    failure = (
+        "WARNING: Retrying (Retry(total=0)) after connection broken\nERROR: none\n"
+    )
+    (checkout.tools / "fail").write_text(failure)
+    done = checkout("setup.sh")
+    first, last = done.stderr.splitlines()
+    assert (done.returncode, done.stdout) == (4, "")
+    assert "index cannot be reached; check the network" in last
+    assert "setting up .venv" in first
+
+
+def test_other_pip_failure_gives_its_last_error(checkout):
+    (checkout.tools / "fail").write_text("ERROR: a\nERROR: disk is full\nhint\n")
+    done = checkout("run.sh")
+    assert done.returncode == 4
+    assert "pip failed: ERROR: disk is full (log: " in done.stderr.splitlines()[-1]
+
+
+def test_unsuitable_python_is_refused_by_version(checkout):
+    done = checkout("setup.sh", STAND_IN_VERSION="3.9")
+    assert done.returncode == 4
+    assert "is Python 3.9, expected 3.10 to 3.14" in done.stderr
+    assert checkout.calls() == []
+
+
+APT_GET = r"""#!/bin/bash
+[[ " $* " != *" install "* ]] || echo "$@" >>"$STAND_IN_DIR/apt.txt"
+[[ ! -e "$STAND_IN_DIR/offline" ]] || exit 100
+[[ " $* " != *" install "* ]] || rm -f "$STAND_IN_DIR/missing"
+"""
+
+
+def plant_apt(checkout, missing, packages):
+    """Stand-ins for apt-get, for apt-cache that knows `packages`, and for a sudo that
+    needs no password; `missing` is what Python finds missing until apt-get installs."""
+    show = f'[[ " {packages} " == *" $2 "* ]]'
+    sudo = '[[ "$1" != -n ]] || shift; "$@"'
+    for name, text in {"apt-get": APT_GET, "apt-cache": show, "sudo": sudo}.items():
+        text = text if text.startswith("#!") else f"#!/bin/bash\n{text}\n"
+        (checkout.tools / name).write_text(text)
+        (checkout.tools / name).chmod(0o755)
+    (checkout.tools / "missing").write_text("\n".join(missing) + "\n")
+    return f"{checkout.tools}:{os.environ['PATH']}"
+
+
+@pytest.mark.parametrize(
+    ("packages", "expected"),
+    [
+        ("", "python3-venv libx11-6 libglib2.0-0 libegl1"),
+        (
+            "python3.12-venv libglib2.0-0t64",
+            "python3.12-venv libx11-6 libglib2.0-0t64 libegl1",
+        ),
+    ],
+)
+def test_missing_packages_are_installed_by_the_names_of_the_release(
+    checkout, packages, expected
+):
+    missing = ["venv", "libX11.so.6", "libglib-2.0.so.0", "libEGL.so.1"]
+    path = plant_apt(checkout, missing, packages)
+    done = checkout("setup.sh", PATH=path)
+    assert done.returncode == 0, done.stderr
+    asked = (checkout.tools / "apt.txt").read_text()
+    assert asked == f"-qq install -y --no-install-recommends {expected}\n"
+
+
+def test_required_package_that_cannot_be_installed_ends_the_set_up(checkout):
+    path = plant_apt(checkout, ["libSM.so.6", "swrast_dri.so"], "")
+    (checkout.tools / "offline").touch()
+    done = checkout("setup.sh", PATH=path)
+    assert done.returncode == 4
+    assert "could not install libsm6 (no network?)" in done.stderr.splitlines()[-1]
+    assert checkout.calls() == []
+
+
+def test_missing_opengl_is_said_and_does_not_end_the_set_up(checkout):
+    path = plant_apt(checkout, ["swrast_dri.so"], "")
+    (checkout.tools / "offline").touch()
+    done = checkout("setup.sh", PATH=path)
+    assert done.returncode == 0, done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if "OpenCV draws" in line]
+    assert line.endswith("--no-install-recommends libgl1-mesa-dri)")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root installs what is missing")
+def test_without_rights_one_command_is_named(checkout):
+    path = plant_apt(checkout, ["venv", "libSM.so.6"], "")
+    (checkout.tools / "sudo").write_text("#!/bin/bash\nexit 1\n")
+    done = checkout("setup.sh", PATH=path)
+    (line,) = done.stderr.splitlines()
+    assert done.returncode == 4
+    assert line.endswith("install -y --no-install-recommends python3-venv libsm6")
+
+
+@pytest.mark.parametrize(
+    ("given", "passed"),
+    [
+        ([], ["run"]),
+        (["--set", "a=b c"], ["run", "--set", "a=b c"]),
+        (["cartpole_walls", "--seed", "3"], ["run", "cartpole_walls", "--seed", "3"]),
+        (["list"], ["list"]),
+        (["bench", "c3"], ["bench", "c3"]),
+        (["run", "ball_rolling"], ["run", "ball_rolling"]),
+    ],
+)
+def test_run_passes_its_arguments_and_keeps_the_folder(checkout, given, passed):
+    done = checkout("run.sh", *given)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [*passed, str(checkout.tools)]
+
+
+def test_test_script_runs_pytest_in_the_checkout(checkout):
+    done = checkout("test.sh", "-k", "a or b")
+    assert done.stdout.splitlines() == ["-k", "a or b", str(checkout.folder)]
+    cores = len(os.sched_getaffinity(0))  # OMP_NUM_THREADS does not bind it.
+    done = checkout("test.sh", OMP_NUM_THREADS="1")
+    assert done.stdout.splitlines()[:2] == ["-n", str(cores)]
+
+
+def test_wheel_has_every_file_of_the_rooms(tmp_path):
+    copy = tmp_path / "copy"
+    rooms = [room for room in ROOMS if (ROOT / room).exists()]
+    for name in ("makebreak", *rooms):
+        ignore = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(ROOT / name, copy / name, symlinks=True, ignore=ignore)
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, copy / name)
+    pip = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-index"]
+    pip += ["--no-build-isolation", "-w", str(tmp_path), str(copy)]
+    done = subprocess.run(pip, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    held = {n for n in zipfile.ZipFile(wheel).namelist() if n.startswith("makebreak/")}
+    files = [p for room in rooms for p in (copy / room).rglob("*") if p.is_file()]
+    expected = {f"makebreak/{p.relative_to(copy)}" for p in files if p.suffix != ".sh"}
+    assert expected | {"makebreak/__init__.py", "makebreak/__main__.py"} == held
