@@ -170,10 +170,10 @@ def set_initial_velocities(loaded: LoadedScene, plant_context: Context) -> None:
         v = plant.GetVelocities(plant_context)
         v[joint.velocity_start()] = value
         plant.SetVelocities(plant_context, v)
-    for name, value in initial.body_velocities.items():
+    for name, twist in initial.body_velocities.items():
         body = _find(plant, name, "body")
         plant.SetFreeBodySpatialVelocity(
-            body, SpatialVelocity(value[:3], value[3:]), plant_context
+            body, SpatialVelocity(twist[:3], twist[3:]), plant_context
         )
 
 

@@ -217,10 +217,14 @@ def serial_chain_of(plant: MultibodyPlant, tip_frame: str) -> SerialChain:
         for joint in moving
     ]
     return SerialChain(
-        *(np.array(part, dtype=float) for part in (R_PJ, p_PJ)),
-        np.array([joint.revolute_axis() for joint in moving]),
-        *(np.array(part, dtype=float) for part in (mass, p_com, I_com, rotor)),
-        np.array(plant.gravity_field().gravity_vector(), dtype=float),
-        np.ascontiguousarray(X_LE.rotation().matrix()),
-        np.array(X_LE.translation()),
+        R_PJ=np.array(R_PJ),
+        p_PJ=np.array(p_PJ),
+        axis=np.array([joint.revolute_axis() for joint in moving]),
+        mass=np.array(mass),
+        p_com=np.array(p_com),
+        I_com=np.array(I_com),
+        rotor=np.array(rotor),
+        gravity=np.array(plant.gravity_field().gravity_vector(), dtype=float),
+        R_LE=np.ascontiguousarray(X_LE.rotation().matrix()),
+        p_LE=np.array(X_LE.translation()),
     )

@@ -29,8 +29,8 @@ class EffectKind:
 
     edit_text(effect, link): the link's element in the model's URDF or SDF text.
     before_finalize(effect, plant, scene_graph): shapes and their properties.
-    after_finalize(effect, plant, scene_graph, builder): adds systems; the port returned gives
-        generalized forces (n_v,) on the plant.
+    after_finalize(effect, plant, scene_graph, builder): adds systems; the port that it
+        returns gives generalized forces (n_v,) on the plant.
     """
 
     parameters: tuple[str, ...]

@@ -65,7 +65,10 @@ def text(element: minidom.Element) -> str:
 def set_text(element: minidom.Element, value: str) -> None:
     while element.firstChild is not None:
         element.removeChild(element.firstChild)
-    element.appendChild(element.ownerDocument.createTextNode(value))
+    node = minidom.Text()
+    node.data = value
+    node.ownerDocument = element.ownerDocument
+    element.appendChild(node)
 
 
 def children(element: minidom.Element, *path: str) -> list[minidom.Element]:

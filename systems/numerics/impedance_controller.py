@@ -1,7 +1,8 @@
 """Cartesian impedance of a redundant arm: one tick, from measurement to joint torque.
 
     F = K (x_d - x) + D (v_d - v) + f_ff + Lambda (a_d - Jdot qdot)
-    tau = J' F + bias + N' M (k_q (q_n - q) + k_v (v_n - v)),   N' = I - J' Lambda J inv(M)
+    tau = J' F + bias + N' M (k_q (q_n - q) + k_v (v_n - v))
+    N' = I - J' Lambda J inv(M)
 
 M is the mass matrix with the motors' rotors, so tau is a motor's torque; Lambda is the
 inverse of J inv(M) J'. Stiffness K and damping D are plain N/m and N s/m, not scaled by
@@ -178,9 +179,9 @@ def _damped_inverse(J, y):
 def impedance_torque(chain, law, q, v, q_n, x_d, R_d, stiffness, damping, wrench):
     """The law, without limits.
 
-    Args: chain, law: constants. q, v, q_n (n,) [rad], [rad/s]. x_d (19,) = [p, quaternion
-        (unused), v, w, a, alpha] of the tip in the world; R_d (3, 3) its orientation.
-        stiffness, damping (6,); wrench (6,) fed forward, force first [N], [N m].
+    Args: chain, law: constants. q, v, q_n (n,) [rad], [rad/s]. x_d (19,) =
+        [p, quaternion (unused), v, w, a, alpha] of the tip in the world; R_d (3, 3)
+        its orientation. stiffness, damping (6,); wrench (6,) fed forward, force first [N], [N m].
     Returns: tau (n,) [N m] and the tip's position p_WE (3,) [m].
     """
     n = q.shape[0]
