@@ -348,7 +348,7 @@ def test_A_and_B_are_the_derivatives_of_the_true_step(arm):
 
 def test_E_and_H_carry_the_gap_and_the_velocity_after_the_step():
     # w = gap(q)/dt + J_c v_next, where only the first term and v_next depend on x.
-    arm = Arm()
+    arm = Arm(SPHERE, BOX)  # A box: the gap depends on the quaternion too.
     dt, rng = 0.05, np.random.default_rng(1)
     model = AnitescuLcs(arm.diagram, arm.pairs, dt, 0.0)
     x, u, h = arm_state(rng), rng.normal(size=model.n_u), 1e-6
@@ -585,7 +585,8 @@ def test_what_an_lcs_cannot_hold_is_refused():
 
 def test_an_actuator_with_a_pd_controller_is_refused():
     def control(plant):
-        plant.GetJointActuatorByName("jx").set_controller_gains(PdControllerGains(1, 1))
+        gains = PdControllerGains(p=1.0, d=1.0)
+        plant.GetJointActuatorByName("jx").set_controller_gains(gains)
 
     with pytest.raises(ValueError, match="jx has a PD controller"):
         AnitescuLcs(diagram_of(SDF, control, 0.001), ball_pairs())
