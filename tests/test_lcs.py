@@ -2,6 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
@@ -61,6 +62,12 @@ def test_arrays_are_copies_and_cannot_be_changed():
     assert mine.A[0, 0] == 1.0
     with pytest.raises(ValueError, match="read-only"):
         mine.c[0] = 1.0
+
+
+def test_a_copied_context_keeps_the_read_only_lcs():
+    value = Value(wall()).Clone().get_value()
+    with pytest.raises(ValueError, match="read-only"):
+        value.A[0, 0] = 1.0
 
 
 def test_wrong_shapes_and_time_steps_are_refused_by_name():

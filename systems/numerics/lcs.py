@@ -47,6 +47,10 @@ class LCS:
             value.setflags(write=False)
             object.__setattr__(self, name, value)
 
+    def __deepcopy__(self, memo) -> "LCS":
+        """Itself: nothing in it can change. Drake copies all state at each update."""
+        return self
+
     @property
     def n_x(self) -> int:
         return self.D.shape[0]
