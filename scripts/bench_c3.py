@@ -1,0 +1,328 @@
+"""C3 and C3+ beside a re-creation of the reference implementation with Drake's OSQP.
+
+The re-creation is the public C++ library's algorithm in pydrake: a MathematicalProgram
+whose consensus cost is replaced in every ADMM round, solved by OSQP, which sets itself
+up afresh each time; for C3 one more small program per knot and round, the projection.
+Its settings are the library's; it repeats tests/reference/c3_cartpole.npz to 1e-9
+(tests/test_c3_mpc.py). What is timed is the solve alone, with the program already
+built: Python's own work in it is small beside OSQP's. Ours is timed as it is called.
+
+Both do the same: rounds, rho, weights, scaling of lam, first solve from delta = w = 0.
+The cost is that of the inputs, rolled out through the LCS with exact contact forces.
+"""
+
+import os
+import sys
+from collections.abc import Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from time import process_time
+
+import numpy as np
+from pydrake.solvers import MathematicalProgram, OsqpSolver, SolverOptions
+
+from makebreak.systems.numerics.c3_mpc import (
+    C3Options,
+    C3Problem,
+    C3Weights,
+    plan_cost,
+    solve_c3,
+)
+from makebreak.systems.numerics.c3_projections import PlusProjection, QpProjection
+from makebreak.systems.numerics.lcp import solve_lcp
+from makebreak.systems.numerics.lcs import LCS
+
+REFERENCE = Path(__file__).resolve().parents[1] / "tests" / "reference"
+# Options of the library's QP step, and of its QP projection.
+QP_OPTIONS = dict(
+    max_iter=1000,
+    check_termination=25,
+    polishing=1,
+    polish_refine_iter=3,
+    scaled_termination=1,
+    scaling=10,
+    adaptive_rho=1,
+    adaptive_rho_interval=0,
+    adaptive_rho_tolerance=5.0,
+    adaptive_rho_fraction=0.4,
+    rho=1e-4,
+    sigma=1e-6,
+    alpha=1.6,
+    delta=1e-6,
+    eps_abs=1e-5,
+    eps_rel=1e-5,
+    eps_prim_inf=1e-5,
+    eps_dual_inf=1e-5,
+    time_limit=1.0,
+)
+PROJECTION_OPTIONS = dict(
+    max_iter=500, polishing=1, polish_refine_iter=1, rho=1e-4, scaled_termination=1
+)
+# rho of the ball problem; its file does not give one. It is that of the ball-rolling
+# controller; of the cart-pole the reference's.
+BALL_RHO, CARTPOLE_RHO = 2.2, 2.0
+
+
+def osqp_options(options: dict) -> SolverOptions:
+    solver_options = SolverOptions()
+    for name, value in options.items():
+        solver_options.SetOption(OsqpSolver.id(), name, value)
+    return solver_options
+
+
+class OsqpC3:
+    """The reference's C3 (QP projection) or C3+, as Drake programs.
+
+    Args:
+        lcs: the model, in its own units.
+        problem: what `solve_c3` takes; without bounds and without input-change penalty.
+        scaling: divides the slack's rows in the projection, as the library does.
+    """
+
+    def __init__(self, lcs: LCS, problem: C3Problem, scaling: float = 1e3):
+        o, p = problem.options, problem
+        self.problem, self.scaling, N = problem, scaling, problem.options.N
+        s = np.linalg.norm(lcs.A) / np.linalg.norm(lcs.D) if o.scale_lam else 1.0
+        self.s = s
+        self.lcs = lcs = LCS(
+            lcs.A,
+            lcs.B,
+            lcs.D * s,
+            lcs.d,
+            lcs.E / s,
+            lcs.F,
+            lcs.H / s,
+            lcs.c / s,
+            lcs.dt,
+        )
+        self.osqp = OsqpSolver()
+        self.qp_options = osqp_options(QP_OPTIONS)
+        self.projection_options = osqp_options(PROJECTION_OPTIONS)
+        self.prog = prog = MathematicalProgram()
+        self.x, self.z, targets = [], [], []
+        for k in range(N + 1):
+            x = prog.NewContinuousVariables(p.n_x)
+            self.x.append(x)
+            if k < N:
+                rest = prog.NewContinuousVariables(p.n_z - p.n_x)
+                self.z.append(np.concatenate([x, rest]))
+            Q = p.Q_N if k == N else p.Q
+            cost = prog.AddQuadraticCost(2.0 * Q, np.zeros(p.n_x), x, is_convex=True)
+            targets.append((cost.evaluator(), Q))
+        self.targets = targets
+        n_v = p.n_x + p.n_lam + p.n_u
+        minus_one = -np.eye(p.n_x)
+        for k in range(N):
+            z = self.z[k]
+            prog.AddLinearEqualityConstraint(
+                np.hstack([lcs.A, lcs.D, lcs.B, minus_one]),
+                -lcs.d,
+                np.concatenate([z[:n_v], self.x[k + 1]]),
+            )
+            u = z[p.n_x + p.n_lam : n_v]
+            prog.AddQuadraticCost(2.0 * p.R, np.zeros(p.n_u), u, is_convex=True)
+            if p.is_plus:
+                prog.AddLinearEqualityConstraint(
+                    np.hstack([lcs.E, lcs.F, lcs.H, -np.eye(p.n_lam)]), -lcs.c, z
+                )
+        zeros = np.zeros(p.n_x)
+        start = prog.AddLinearEqualityConstraint(np.eye(p.n_x), zeros, self.x[0])
+        self.start, self.force = start.evaluator(), None
+        if not lcs.H.any():
+            lam0 = self.z[0][p.n_x : p.n_x + p.n_lam]
+            self.force = prog.AddLinearEqualityConstraint(
+                np.eye(p.n_lam), np.zeros(p.n_lam), lam0
+            ).evaluator()
+        self.consensus: list = []
+
+    def solve(self, x0, x_desired):
+        """Inputs u (N, n_u) from the state x0 (n_x,); x_desired (N + 1, n_x)."""
+        o, p, lcs = self.problem.options, self.problem, self.lcs
+        self.start.UpdateCoefficients(np.eye(p.n_x), x0)
+        if self.force is not None:
+            lam0 = solve_lcp(lcs.F, lcs.E @ x0 + lcs.c)
+            self.force.UpdateCoefficients(np.eye(p.n_lam), lam0)
+        for (cost, Q), target in zip(self.targets, x_desired, strict=True):
+            cost.UpdateCoefficients(2.0 * Q, -2.0 * Q @ target)
+        delta, w = np.zeros((o.N, p.n_z)), np.zeros((o.N, p.n_z))
+        if o.start_at_x0:
+            delta[:, : p.n_x] = x0
+        G = np.diag(p.G)
+        for _ in range(o.rounds):
+            z = self._solve_qp(G, delta - w)
+            delta = np.array([self._project(zw) for zw in z + w])
+            w = (w + z - delta) / o.rho
+            G = o.rho * G
+        z = self._solve_qp(G, delta if p.is_plus else delta - w)
+        return z[:, p.n_x + p.n_lam : p.n_x + p.n_lam + p.n_u]
+
+    def _solve_qp(self, G, target):
+        p = self.problem
+        for cost in self.consensus:
+            self.prog.RemoveCost(cost)
+        self.consensus = []
+        parts: list[slice] = [slice(0, p.n_z)]
+        if p.is_plus:
+            i_eta = p.n_z - p.n_lam
+            parts = [slice(p.n_x, p.n_x + p.n_lam), slice(i_eta, p.n_z)]
+        for z, t in zip(self.z, target, strict=True):
+            for i in parts:
+                H, b = 2.0 * G[i, i], -2.0 * G[i, i] @ t[i]
+                self.consensus.append(
+                    self.prog.AddQuadraticCost(H, b, z[i], is_convex=True)
+                )
+        result = self.osqp.Solve(self.prog, None, self.qp_options)
+        if not result.is_success():
+            raise RuntimeError(f"OSQP: {result.get_solution_result()}")
+        return np.array([result.GetSolution(z) for z in self.z])
+
+    def _project(self, z):
+        p, lcs = self.problem, self.lcs
+        i_lam, i_u = slice(p.n_x, p.n_x + p.n_lam), p.n_x + p.n_lam
+        if p.is_plus:
+            delta, i_eta = z.copy(), slice(i_u + p.n_u, p.n_z)
+            lam, eta = z[i_lam], z[i_eta]
+            open_gap = np.sqrt(p.U[i_eta]) * eta > np.sqrt(p.U[i_lam]) * lam
+            delta[i_lam] = np.where(open_gap, 0.0, np.maximum(lam, 0.0))
+            delta[i_eta] = np.where(open_gap, np.maximum(eta, 0.0), 0.0)
+            return delta
+        assert isinstance(p.projection, QpProjection)
+        alpha, infinity = p.projection.alpha, np.full(p.n_lam, np.inf)
+        prog = MathematicalProgram()
+        v = prog.NewContinuousVariables(p.n_z)
+        prog.AddLinearConstraint(
+            np.hstack([lcs.E, lcs.F, lcs.H]) / self.scaling,
+            -lcs.c / self.scaling,
+            infinity,
+            v,
+        )
+        prog.AddLinearConstraint(np.eye(p.n_lam), np.zeros(p.n_lam), infinity, v[i_lam])
+        V = np.diag(p.U)
+        V[i_lam, i_lam] = alpha * lcs.F
+        prog.AddQuadraticCost(V, -V @ z, v, is_convex=True)
+        prog.AddQuadraticCost(
+            (1.0 - alpha) * lcs.F, np.zeros(p.n_lam), v[i_lam], is_convex=True
+        )
+        result = self.osqp.Solve(prog, None, self.projection_options)
+        return result.GetSolution(v)
+
+
+def load(name: str) -> dict:
+    """A file of tests/reference; FileNotFoundError where there is no checkout."""
+    path = REFERENCE / name
+    if not path.exists():
+        raise FileNotFoundError(
+            f"{path} is missing: this bench needs a checkout with tests/reference"
+        )
+    return dict(np.load(path))
+
+
+def ball(plus: bool, N: int):
+    """LCS, x0, x_desired and problem of the ball on the table (19 x, 16 lam, 3 u)."""
+    data = load("ball_mpc_problem.npz")
+    lcs = LCS(**{k: data[k] for k in "ABDdEFHc"}, dt=float(data["dt"]))
+    Q, R, G, U = (data[("plus_" if plus else "qp_") + k] for k in "QRGU")
+    options = C3Options(N=N, rounds=3, rho=BALL_RHO, scale_lam=True)
+    projection = PlusProjection() if plus else QpProjection()
+    problem = C3Problem(C3Weights(Q, R, G, U), projection, options)
+    return lcs, data["x0"], np.tile(data["xdes"], (N + 1, 1)), problem
+
+
+def cartpole(plus: bool, N: int):
+    """LCS, x0, x_desired and problem of the soft-wall cart-pole (4 x, 2 lam, 1 u)."""
+    data = load("c3_cartpole.npz")
+    lcs = LCS(**{k: data[k] for k in "ABDdEFHc"}, dt=float(data["dt"]))
+    kind = "plus" if plus else "c3"
+    weights = C3Weights(
+        data["Q"], data["R"], data["G_" + kind], data["U_" + kind], data["QN"]
+    )
+    options = C3Options(N=N, rounds=10, rho=CARTPOLE_RHO)
+    projection = PlusProjection() if plus else QpProjection()
+    problem = C3Problem(weights, projection, options)
+    return lcs, data["x0"], np.tile(data["xdes"], (N + 1, 1)), problem
+
+
+@contextmanager
+def quiet():
+    """Sends what compiled code prints to nowhere (OSQP reports its polishing)."""
+    sys.stdout.flush()
+    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+        os.close(nowhere)
+
+
+def interleaved_ms(calls, n):
+    """Median process CPU time of each call [ms], taken in turns; the first is apart."""
+    times = np.empty((n + 1, len(calls)))
+    for row in times:
+        for j, call in enumerate(calls):
+            start = process_time()
+            call()
+            row[j] = process_time() - start
+    return 1e3 * np.median(times[1:], axis=0)
+
+
+def measure(name: str, make, plus: bool, N: int, repeats: int) -> dict:
+    """One row: our time and cost, the re-creation's, and their ratios."""
+    lcs, x0, x_desired, problem = make(plus, N)
+    osqp = OsqpC3(lcs, problem)
+    ours = partial(solve_c3, lcs, x0, x_desired, problem)
+    theirs = partial(osqp.solve, x0, x_desired)
+    with quiet():
+        ms, osqp_ms = interleaved_ms([ours, theirs], repeats)
+        inputs = ours()[0].u, theirs()
+    cost, osqp_cost = (plan_cost(lcs, x0, u, x_desired, problem) for u in inputs)
+    return {
+        "what": f"{'C3+' if plus else 'C3'}, {name}, N {N}, "
+        f"{problem.options.rounds} rounds",
+        "value": ms,
+        "unit": "ms",
+        "osqp_ms": osqp_ms,
+        "speed_ratio": osqp_ms / ms,
+        "cost_ratio": cost / osqp_cost,
+        "cost": cost,
+    }
+
+
+def rows(horizons: Sequence[int] = (5, 10, 20, 40, 80), repeats: int = 41):
+    """The rows of `makebreak bench c3`, and the growth with N as the last ones."""
+    found = []
+    for plus in (True, False):
+        times = []
+        for N in horizons:
+            few = max(3, repeats * 5 // N // 2)  # OSQP takes long at a large N.
+            row = measure("ball 19/16/3", ball, plus, N, few)
+            if plus and N <= 10:
+                row["met"] = row["speed_ratio"] >= 8.0 and row["cost_ratio"] <= 1.01
+            times.append(row["value"])
+            found.append(row)
+        if len(horizons) > 1:
+            # The exponent of time ~ N^e over the upper half of the horizons.
+            first, last = len(horizons) // 2, -1
+            e = np.log(times[last] / times[first]) / np.log(
+                horizons[last] / horizons[first]
+            )
+            found.append(
+                {
+                    "what": f"{'C3+' if plus else 'C3'}, ball, time ~ N^e, N "
+                    f"{horizons[first]} to {horizons[last]}: e",
+                    "value": float(e),
+                    "unit": "-",
+                    "met": bool(e < 1.2),
+                }
+            )
+        found += [
+            measure("cart-pole 4/2/1", cartpole, plus, N, repeats // 2) for N in (5, 10)
+        ]
+    return found
+
+
+if __name__ == "__main__":
+    for row in rows():
+        print(*(f"{v:.4g}" if isinstance(v, float) else v for v in row.values()))
