@@ -97,7 +97,7 @@ def find_ball(image, camera: Pinhole, hue_weights, radius, table_z, guess_p=None
             break
     else:
         return None
-    norm = np.sqrt(m @ m)
+    norm = float(np.linalg.norm(m))
     p_WB = camera.meet_plane(m / norm, table_z + radius)
     if p_WB is None:
         return None

@@ -8,34 +8,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numba import njit
 from scipy.spatial.transform import Rotation
 
 FIXED_POINT_BITS = 8  # cv2 draws polygons at 1/256 of a (fine) pixel.
-FINE = 8  # Fine pixels to a pixel, each way: a polygon's antialiasing;
-FINE_LARGE, LARGE = 2, 10_000  # of one that covers more pixels than LARGE.
-BANDS = (0.3, 0.55, 0.8, 1.0)  # Cosines between which a drawn sphere is one shade.
+FINE = 8  # Fine pixels to a pixel, each way, where an outline must be exact.
 N_OUTLINE = 48  # Corners of a circle; its sagitta is 0.002 of the radius.
-
-
-def _even_lights():
-    """One light at the camera and four from the sides: with the first alone the rim
-    of a sphere is dark, and its picture's centre is pushed outwards.
-    """
-    side, tilt = 0.42, 0.075
-    ways = [(1, 0), (0, 1), (-1, 0), (0, -1)]
-    lights = np.array(
-        [
-            (1.0 - 4 * side * tilt, 0.0, 0.0, 1.0),
-            *((side, x, y, tilt) for x, y in ways),
-        ]
-    )
-    lights[:, 1:] /= np.linalg.norm(lights[:, 1:], axis=1, keepdims=True)
-    lights.setflags(write=False)
-    return lights
-
-
-# Of both renderers: intensity, direction (3,) of the light in C.
-LIGHTS = _even_lights()
+BANDS = (0.3, 0.55, 0.8, 1.0)  # Cosines between which a drawn sphere is one shade.
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,30 +82,30 @@ def look_down(width, height, fov_y, position, center_shift=0.0) -> Pinhole:
     return Pinhole(width, height, focal, center, np.asarray(position, float), R_WC)
 
 
-def sphere_circle(p, radius, cos_angle=None, n=N_OUTLINE):
-    """A circle (n, 3) [m] on a sphere, all round the line to the camera.
+@njit(cache=True)
+def sphere_circle(p, radius, cos_angle):
+    """A circle (N_OUTLINE, 3) [m] on a sphere, all round the line to the camera.
 
     Args:
         p: (3,) the sphere's centre in C [m]; the camera is outside of the sphere.
         radius: [m].
         cos_angle: cosine of the angle, seen from the sphere's centre, between the
-            circle and the camera. None: radius / |p|, where the cone of the camera's
-            rays touches the sphere, its outline in the picture.
+            circle and the camera. radius / |p| is where the cone of the camera's rays
+            touches the sphere: its outline in the picture.
     """
-    distance = np.sqrt(p @ p)
-    axis = p / distance
-    if cos_angle is None:
-        cos_angle = radius / distance
-    # Two directions square to the axis, which is nearer to z than to x.
-    e1 = np.array([axis[2], 0.0, -axis[0]])
-    e1 /= np.sqrt(e1 @ e1)
-    e2 = np.array(  # axis x e1
-        [axis[1] * e1[2], axis[2] * e1[0] - axis[0] * e1[2], -axis[1] * e1[0]]
-    )
-    angle = np.linspace(0.0, 2.0 * np.pi, n, endpoint=False)
-    rim = np.cos(angle)[:, None] * e1 + np.sin(angle)[:, None] * e2
-    rim *= radius * np.sqrt(1.0 - cos_angle**2)
-    return rim + (distance - radius * cos_angle) * axis
+    distance = np.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2)
+    x, y, z = p / distance
+    # Two directions square to the axis, which is nearer to C's z than to its x.
+    side = np.sqrt(z**2 + x**2)
+    rim = radius * np.sqrt(1.0 - cos_angle**2)
+    e1 = np.array([z, 0.0, -x]) * (rim / side)
+    e2 = np.array([-x * y, z**2 + x**2, -y * z]) * (rim / side)  # axis x e1
+    center = p * (1.0 - radius * cos_angle / distance)
+    points = np.empty((N_OUTLINE, 3))
+    for i in range(N_OUTLINE):
+        angle = 2.0 * np.pi * i / N_OUTLINE
+        points[i] = center + np.cos(angle) * e1 + np.sin(angle) * e2
+    return points
 
 
 def outline(shape, size, p, R, near=0.01):
@@ -139,25 +118,22 @@ def outline(shape, size, p, R, near=0.01):
         p, R: (3,), (3, 3) pose of the shape in C [m].
         near: nothing that reaches nearer to the camera's plane is seen [m].
 
-    Returns: None for a shape that reaches behind `near`.
+    Returns: None for a shape that reaches nearer.
     """
-    if shape == "sphere":
-        balls = [p]
-    elif shape == "capsule":
-        half = R[:, 2] * size[1] / 2
-        balls = [p - half, p + half]
-    else:
-        balls = []
-        points = _BODIES[shape] * _scale(shape, size) @ R.T + p
-    if balls:
-        if min(ball[2] for ball in balls) < near + size[0]:
+    if shape in ("sphere", "capsule"):
+        half = R[:, 2] * (size[1] / 2 if shape == "capsule" else 0.0)
+        if p[2] - abs(half[2]) < near + size[0]:
             return None
-        points = np.concatenate([sphere_circle(ball, size[0]) for ball in balls])
+        ends = [p] if shape == "sphere" else [p - half, p + half]
+        return np.concatenate(
+            [sphere_circle(end, size[0], size[0] / np.sqrt(end @ end)) for end in ends]
+        )
+    points = (_BODIES[shape] * _scale(shape, size)) @ R.T + p
     return points if points[:, 2].min() > near else None
 
 
 def draw(picture, camera, shape, size, p, R, color):
-    """Paints one shape, a sphere with its rim as dim as LIGHTS make it.
+    """Paints one shape, lit from the camera: a sphere is dim at its rim.
 
     Args: picture (height, width, 3) uint8; camera, a Pinhole; shape, size, p and R as
         `outline`; color (3,), 0..255, in full light.
@@ -165,54 +141,53 @@ def draw(picture, camera, shape, size, p, R, color):
     points = outline(shape, size, p, R)
     if points is None:
         return
-    color = np.asarray(color, dtype=float)
-    if shape != "sphere":
-        paint(picture, camera.project(points), color * brightness(1.0))
+    corners = camera.project(points)
+    if (corners.max(axis=0) < -1.0).any() or (
+        corners.min(axis=0) > [camera.width, camera.height]
+    ).any():
         return
-    paint(picture, camera.project(points), color * brightness(BANDS[0] / 2))
+    if shape != "sphere":
+        paint(picture, corners, color)
+        return
+    paint_exactly(picture, corners, np.multiply(color, BANDS[0] / 2))
     for low, high in zip(BANDS[:-1], BANDS[1:], strict=True):
-        points = sphere_circle(p, size[0], low)
-        paint(picture, camera.project(points), color * brightness((low + high) / 2))
+        corners = camera.project(sphere_circle(p, size[0], low))
+        paint(picture, corners, np.multiply(color, (low + high) / 2))
 
 
-def brightness(cos_angle):
-    """How bright LIGHTS make a surface whose normal leans from the way to the camera
-    by an angle: the mean over all ways to lean, 1 for white that faces the camera.
+def paint(image, corners, color, line=cv2.LINE_AA):
+    """Fills the convex hull of corners (n, 2) [px] in image (h, w) or (h, w, 3).
+
+    OpenCV's antialiasing adds half a pixel all around.
     """
-    lean = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
-    sine = np.sqrt(1.0 - cos_angle**2)
-    normal = np.stack(
-        [sine * np.cos(lean), sine * np.sin(lean), np.full(16, -cos_angle)], axis=1
-    )
-    facing = np.maximum(normal @ -LIGHTS[:, 1:].T, 0.0)
-    return float((facing @ LIGHTS[:, 0]).mean())
+    fixed = np.rint(corners * 2**FIXED_POINT_BITS).clip(-(2**30), 2**30)
+    hull = cv2.convexHull(fixed.astype(np.int32))
+    shade: list[float] = np.atleast_1d(color).tolist()
+    cv2.fillConvexPoly(image, hull, shade, line, FIXED_POINT_BITS)
 
 
-def paint(image, corners, color):
-    """Fills the convex hull of corners (n, 2) [px] in image (h, w, 3), antialiased.
-
-    Each pixel on the edge is mixed by the part of it that is covered.
-
-    Args: color (3,), 0..255.
-    """
+def paint_exactly(image, corners, color):
+    """As paint; each pixel (h, w, 3) on the edge is mixed by how much is covered."""
     height, width = image.shape[:2]
     low = np.maximum(np.floor(corners.min(axis=0)).astype(int) - 1, 0)
     high = np.minimum(np.ceil(corners.max(axis=0)).astype(int) + 2, [width, height])
     if (high <= low).any():
         return
     n_u, n_v = high - low
-    fine = FINE if n_u * n_v < LARGE else FINE_LARGE
-    fixed = np.round(((corners - low + 0.5) * fine - 0.5) * 2**FIXED_POINT_BITS).clip(
-        -(2**30), 2**30
-    )
-    hull = cv2.convexHull(fixed.astype(np.int32))
-    mask = np.zeros((n_v * fine, n_u * fine), np.uint8)
-    cv2.fillConvexPoly(mask, hull, 255, cv2.LINE_8, FIXED_POINT_BITS)
+    mask = np.zeros((n_v * FINE, n_u * FINE), np.uint8)
+    paint(mask, (corners - low + 0.5) * FINE - 0.5, 255.0, cv2.LINE_8)
     cover = cv2.resize(mask, (n_u, n_v), interpolation=cv2.INTER_AREA)
-    region = image[low[1] : high[1], low[0] : high[0]]
-    region += (
-        (np.asarray(color, np.float32) - region) * (cover[:, :, None] / np.float32(255))
-    ).astype(region.dtype)
+    _mix(image[low[1] : high[1], low[0] : high[0]], cover, np.asarray(color))
+
+
+@njit(cache=True)
+def _mix(region, cover, color):
+    for i in range(region.shape[0]):
+        for j in range(region.shape[1]):
+            part = cover[i, j] / 255.0
+            for k in range(3):
+                mixed = region[i, j, k] * (1.0 - part) + color[k] * part
+                region[i, j, k] = np.uint8(mixed + 0.5)
 
 
 def _scale(shape, size):
