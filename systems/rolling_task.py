@@ -20,8 +20,9 @@ from makebreak.systems.numerics.timing import timed
 class RollingTaskConfig:
     center: list[float] = field(default_factory=lambda: [0.5, 0.0])  # [m]
     radius: float = 0.1  # Of the circle [m].
-    lead_deg: float = 18.0  # The target runs so far ahead of the ball.
-    press: float = 0.020  # Tip target below the top of the modelled ball [m].
+    lead_deg: float = 6.0  # The target runs so far ahead of the ball ...
+    speed: float = 0.06  # ... and moves along the circle with it [m/s].
+    press: float = 0.045  # Tip target below the top of the modelled ball [m].
     rolling: RollingConfig = field(default_factory=RollingConfig)
     period_sec: float = 0.0125
     offset_sec: float = 0.0
@@ -42,6 +43,7 @@ class RollingTask(LeafSystem):
         self,
         config: RollingTaskConfig,
         n_knots: int,
+        knot_sec: float,
         radius_ball: float,
         radius_tip: float,
         n_lam: int,
@@ -50,7 +52,7 @@ class RollingTask(LeafSystem):
         p_tip=(0.5, 0.0, 0.15),
     ):
         super().__init__()
-        self._config, self._n_knots = config, n_knots
+        self._config, self._n_knots, self._knot_sec = config, n_knots, knot_sec
         self._radius_ball, self._radius_tip = radius_ball, radius_tip
         self._n_tip, self._residual_dt_sec = n_tip, residual_dt_sec
         self._path = CirclePath(np.array(config.center), config.radius)
@@ -83,8 +85,8 @@ class RollingTask(LeafSystem):
         )  # fmt: skip
         z_tip = 2.0 * self._radius_ball + self._radius_tip - c.press
         goal = target_over_horizon(
-            self._path, x, np.deg2rad(c.lead_deg), z_tip, self._radius_ball,
-            self._n_knots,
+            self._path, x, np.deg2rad(c.lead_deg), c.speed, z_tip, self._radius_ball,
+            self._knot_sec, self._n_knots,
         )  # fmt: skip
         state.get_mutable_abstract_state(int(self._task)).set_value(task)
         discrete = state.get_mutable_discrete_state()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BPoly
 
-from makebreak.systems.numerics.ball_state import P_BALL, W_BALL, pack
+from makebreak.systems.numerics.ball_state import P_BALL, P_TIP, V_BALL, V_TIP, W_BALL, pack
 from makebreak.systems.numerics.rolling_task import (
     REPOSITION,
     ROLL,
@@ -115,8 +115,13 @@ def test_a_ball_that_is_not_seen_stops_the_push_and_lifts_the_tip():
     np.testing.assert_allclose(z, 2 * R_BALL + R_TIP + 0.03, atol=1e-12)
 
 
-def test_target_leads_the_ball_along_the_circle():
+def test_target_leads_the_ball_and_moves_along_the_circle():
     x = pack([0.6, 0, 0.1], np.zeros(3), [0.6, 0.0, R_BALL], np.zeros(3), R_BALL)
-    target = target_over_horizon(PATH, x, np.pi / 2, 0.07, R_BALL, 6)
-    assert target.shape == (6, 19)
-    np.testing.assert_allclose(target[:, P_BALL], [[0.5, 0.1, R_BALL]] * 6, atol=1e-15)
+    speed, dt = 0.1 * np.pi / 2, 0.1  # A quarter of the circle each second.
+    target = target_over_horizon(PATH, x, np.pi / 2, speed, 0.07, R_BALL, dt, 11)
+    assert target.shape == (11, 19)
+    np.testing.assert_allclose(target[0, P_BALL], [0.5, 0.1, R_BALL], atol=1e-15)
+    np.testing.assert_allclose(target[10, P_BALL], [0.4, 0.0, R_BALL], atol=1e-15)
+    np.testing.assert_allclose(target[10, V_BALL], [0.0, -speed, 0.0], atol=1e-15)
+    np.testing.assert_allclose(target[:, V_TIP], 2 * target[:, V_BALL], atol=1e-15)
+    np.testing.assert_allclose(target[:, P_TIP][:, 2], 0.07)

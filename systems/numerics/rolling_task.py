@@ -141,15 +141,21 @@ def reposition_step(config, path, state, t, dt, x, gap, radius_ball, radius_tip)
     return p, v, a
 
 
-def target_over_horizon(path, x, lead, z_tip, radius_ball, n_knots):
-    """The target (n_knots, 19) of C3: the ball at `lead` [rad] further along the circle
-    than it is, the tip above where the ball is to be at the height z_tip [m]; at rest.
+def target_over_horizon(path, x, lead, speed, z_tip, radius_ball, dt, n_knots):
+    """The target of C3, (n_knots, 19), one row per knot dt [s] after the other.
+
+    The ball: `lead` [rad] further along the circle than it is now, and moving along it
+    at `speed` [m/s]. The tip: above the ball, at the height z_tip [m], and twice as
+    fast, as a tip on a rolling ball is. Targets that stand still brake at every knot.
     """
-    point = path.point(path.angle(x[P_BALL]) + lead)
-    goal = pack(
-        [*x[P_BALL][:2], z_tip], np.zeros(3), [*point, radius_ball], np.zeros(3), 1.0
-    )
-    return np.tile(goal, (n_knots, 1))
+    now = path.angle(x[P_BALL])
+    rows = []
+    for k in range(n_knots):
+        angle = now + lead + speed * k * dt / path.radius
+        p, v = path.point(angle), speed * path.tangent(angle)
+        tip = [*p, z_tip], [*(2.0 * v), 0.0]
+        rows.append(pack(*tip, [*p, radius_ball], [*v, 0.0], radius_ball))
+    return np.array(rows)
 
 
 def next_state(config, path, state, t, dt, x, gap, valid, radius_ball, radius_tip):
