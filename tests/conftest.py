@@ -1,10 +1,15 @@
 """For all tests: one thread, no window, nothing that depends on the clock."""
 
 import os
+import signal
 
 # Before numpy is imported: one thread per test process, and no matplotlib window.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
+
+# A shell starts background jobs with SIGINT ignored, and a program inherits that: the
+# tests that press Ctrl-C would press it in vain.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 from hypothesis import settings  # noqa: E402  (numpy's threads must be set first)
 
