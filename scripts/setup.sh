@@ -171,7 +171,7 @@ esac
 # Two scripts started at once: the second waits here, and then has nothing to do.
 if command -v flock >/dev/null; then
     { exec 9>"$root/.venv.lock"; } 2>/dev/null || fail "cannot write in $root"
-    flock 9
+    flock -n 9 || { say "waiting for another set-up to end" && flock 9; }
     is_ready && exit 0
 fi
 
