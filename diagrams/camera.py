@@ -5,6 +5,7 @@ import subprocess
 import sys
 from dataclasses import dataclass, field
 
+import numpy as np
 from pydrake.geometry import (
     ClippingRange,
     ColorRenderCamera,
@@ -118,6 +119,8 @@ def add_camera(
         raise ValueError(
             f"position_noise_m must be at least 0, got {config.position_noise_m}"
         )
+    if len(config.position) != 3 or not np.isfinite(config.position).all():
+        raise ValueError(f"camera position must be 3 numbers, got {config.position}")
     depth = config.position[2] - config.noise_height
     if not depth > 0.0:
         raise ValueError(

@@ -56,11 +56,18 @@ class BallTracker(LeafSystem):
 
     def __init__(self, config: BallTrackerConfig, camera: Pinhole):
         super().__init__()
-        for name in ("ball_radius", "position_std", "acceleration_density"):
+        for name in (
+            "ball_radius",
+            "position_std",
+            "acceleration_density",
+            "period_sec",
+        ):
             if not 0.0 < getattr(config, name) < np.inf:
                 raise ValueError(
                     f"{name} must be positive, got {getattr(config, name)}"
                 )
+        if not np.isfinite(config.hue):
+            raise ValueError(f"hue must be finite, got {config.hue}")
         if not config.table_z + config.ball_radius < camera.p_WC[2]:
             raise ValueError(
                 f"the camera at height {camera.p_WC[2]} must be above the ball, whose "

@@ -156,14 +156,35 @@ def draw(picture, camera, shape, size, p, R, color):
 
 
 def paint(image, corners, color, line=cv2.LINE_AA):
-    """Fills the convex hull of corners (n, 2) [px] in image (h, w) or (h, w, 3).
-
-    OpenCV's antialiasing adds half a pixel all around.
-    """
-    fixed = np.rint(corners * 2**FIXED_POINT_BITS).clip(-(2**30), 2**30)
-    hull = cv2.convexHull(fixed.astype(np.int32))
+    """Fills the convex hull of corners (n, 2) [px] in image (h, w) or (h, w, 3)."""
+    hull = cv2.convexHull(corners.astype(np.float32))[:, 0]
+    fixed = np.rint(_inset(hull, 0.5) * 2**FIXED_POINT_BITS).clip(-(2**30), 2**30)
     shade: list[float] = np.atleast_1d(color).tolist()
-    cv2.fillConvexPoly(image, hull, shade, line, FIXED_POINT_BITS)
+    cv2.fillConvexPoly(image, fixed.astype(np.int32), shade, line, FIXED_POINT_BITS)
+
+
+@njit(cache=True)
+def _inset(hull, by):
+    """A convex polygon (n, 2) whose edges lie further inside [px]: what OpenCV fills
+    is as much larger than the polygon.
+    """
+    n = len(hull)
+    inner = hull.copy()
+    for i in range(n):
+        before = hull[i] - hull[i - 1]
+        after = hull[(i + 1) % n] - hull[i]
+        a = np.sqrt(before[0] ** 2 + before[1] ** 2)
+        b = np.sqrt(after[0] ** 2 + after[1] ** 2)
+        if a == 0.0 or b == 0.0:
+            continue
+        before, after = before / a, after / b
+        # v = hull[i] + step (normal before + normal after), both normals unit.
+        turn = before[0] * after[1] - before[1] * after[0]  # Its sign: the way round.
+        side = 1.0 if turn > 0.0 else -1.0
+        step = side * by / max(1.0 + before[0] * after[0] + before[1] * after[1], 0.3)
+        inner[i, 0] -= step * (before[1] + after[1])
+        inner[i, 1] += step * (before[0] + after[0])
+    return inner
 
 
 def paint_exactly(image, corners, color):
