@@ -1,0 +1,195 @@
+"""A cart-pole between two soft walls whose places it believes wrongly (ACI-MPC VII-A).
+
+    plant --x--> learner --r_comp--> c3 --u--> plant (and, as measured, the learner)
+                    ^ lcs             ^ lcs: the model, its walls wrong by gap_error
+
+The plant is either the LCS itself, with the right walls, or a scene's MultibodyPlant:
+the pole then swings nonlinearly and the walls are Drake's compliant point contact.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
+
+from makebreak.models.scene import load_scene
+from makebreak.systems.c3_mpc import C3Config, C3Mpc
+from makebreak.systems.lcs_plant import LcsPlant, LcsPlantConfig
+from makebreak.systems.numerics.c3_mpc import C3Options, C3Weights
+from makebreak.systems.numerics.c3_projections import QpProjection
+from makebreak.systems.numerics.cartpole import CartPole, cartpole_lcs, cost_to_go
+from makebreak.systems.numerics.lcs import LCS
+from makebreak.systems.residual_learner import ResidualLearner, ResidualLearnerConfig
+from makebreak.systems.walls_view import WallsView, WallsViewConfig
+
+MODELS = Path(__file__).resolve().parent.parent / "models"
+SCENE = str(MODELS / "cartpole_walls.scene.yaml")
+DT = 0.01  # Time step of the LCS, of C3 and of the learner [s].
+# Learner, C3, then the LCS as plant: no value waits for the next period. (The
+# MultibodyPlant steps every millisecond, and holds u from C3 on.)
+LEARNER_OFFSET, C3_OFFSET, PLANT_OFFSET = 1e-4, 2e-4, 3e-4
+
+
+def _learner() -> ResidualLearnerConfig:
+    """For a gap in metres: eps in m/N per squared SI unit, gamma in m/N."""
+    return ResidualLearnerConfig(
+        eps=10.0, gamma=0.01, n_b=10, learning_rate=3e-3, n_steps=5, r_max=0.5
+    )
+
+
+@dataclass
+class CartpoleWallsConfig:
+    seed: int = 0  # Draws where around x_initial a run starts.
+    # Cart [m], pole [rad], and velocities. At rest, the tip 24 cm towards wall 0.
+    x_initial: list[float] = field(default_factory=lambda: [0.0, -0.4, 0.0, 0.0])
+    # Half width of the uniform draw in each entry [SI].
+    x_spread: list[float] = field(default_factory=lambda: [0.02, 0.02, 0.02, 0.02])
+    adapt: bool = True
+    # True distance of each wall minus the distance that the model starts with [m].
+    gap_error: list[float] = field(default_factory=lambda: [-0.15, 0.15])
+    world: str = SCENE  # Scene file of the MultibodyPlant.
+    learner: ResidualLearnerConfig = field(default_factory=_learner)
+
+
+def true_lcs() -> LCS:
+    return cartpole_lcs(CartPole(), DT)
+
+
+def model_lcs(config: CartpoleWallsConfig) -> LCS:
+    """What the controllers start from: c = c_true - gap_error."""
+    truth = true_lcs()
+    error = np.array(config.gap_error, dtype=float)
+    if error.shape != (truth.n_lam,) or not np.isfinite(error).all():
+        raise ValueError(f"gap_error is {config.gap_error}, expected 2 lengths [m]")
+    return truth.with_residual(-error)
+
+
+def c3_config(N: int = 10) -> C3Config:
+    """C3 with the convex projection, 10 rounds, rho 2, and the public weights.
+
+    The penetration of a soft wall is its force, so no gap is clamped.
+    """
+    lcs, n_x = true_lcs(), 4
+    Q, R = np.diag([10.0, 2.0, 1.0, 1.0]), np.eye(1)
+    weights = C3Weights(
+        Q=Q,
+        R=R,
+        G=np.array(n_x * [0.1] + 2 * [0.1] + [0.0]),
+        U=np.array(n_x * [1000.0] + 2 * [1.0] + [0.0]),
+        Q_N=cost_to_go(lcs, Q, R),
+    )
+    return C3Config(
+        weights,
+        projection=QpProjection(),
+        options=C3Options(N=N, rounds=10, rho=2.0),
+        residual_dt_sec=DT,
+        clamp_command_gap=False,
+    )
+
+
+def initial_state(config: CartpoleWallsConfig) -> np.ndarray:
+    """Where the run of config.seed starts, (n_x,)."""
+    x = np.array(config.x_initial, dtype=float)
+    if x.shape != (4,) or not np.isfinite(x).all():
+        raise ValueError(f"x_initial is {config.x_initial}, expected 4 numbers")
+    spread = np.array(config.x_spread, dtype=float)
+    if spread.shape != (4,) or not ((spread >= 0.0) & np.isfinite(spread)).all():
+        raise ValueError(f"x_spread is {config.x_spread}, expected 4 numbers >= 0")
+    rng = np.random.default_rng(config.seed)
+    return x + spread * rng.uniform(-1.0, 1.0, size=4)
+
+
+def make_cartpole_walls(
+    config: CartpoleWallsConfig, multibody: bool = False, meshcat: Meshcat | None = None
+) -> Diagram:
+    """The closed loop.
+
+    Outputs: x (4,) the plant's state; u (1,) [N]; r_comp (2,) [m], zero without
+        adaptation; loss (1,) and learner_status (1,), with adaptation only;
+        c3_status (1,).
+
+    Args: multibody: the plant is the scene's, else the LCS with the right walls;
+        meshcat: where a multibody plant is seen, with the walls as they are believed.
+    """
+    builder = DiagramBuilder()
+    model = model_lcs(config)
+    if multibody:
+        loaded = load_scene(config.world, builder)
+        plant = loaded.plant
+        if (plant.num_multibody_states(), plant.num_actuated_dofs()) != (4, 1):
+            raise ValueError(
+                f"the scene {config.world} has {plant.num_multibody_states()} states "
+                f"and {plant.num_actuated_dofs()} actuators, expected 4 and 1"
+            )
+        x, u_of_plant = (
+            plant.get_state_output_port(),
+            plant.get_actuation_input_port(),
+        )
+        if meshcat is not None:
+            MeshcatVisualizer.AddToBuilder(
+                builder,
+                loaded.scene_graph,
+                meshcat,
+                MeshcatVisualizerParams(publish_period=1.0 / 30.0),
+            )
+    else:
+        lcs_plant = LcsPlant(true_lcs(), config=LcsPlantConfig(offset_sec=PLANT_OFFSET))
+        builder.AddNamedSystem("plant", lcs_plant)
+        x, u_of_plant = lcs_plant.GetOutputPort("x"), lcs_plant.GetInputPort("u")
+
+    lcs = builder.AddNamedSystem("lcs", ConstantValueSource(Value(model)))
+    c3 = builder.AddNamedSystem("c3", C3Mpc(c3_config(), DT, C3_OFFSET))
+    N = c3_config().options.N
+    goal = builder.AddNamedSystem(
+        "x_desired", ConstantVectorSource(np.zeros((N + 1) * model.n_x))
+    )
+    u = c3.GetOutputPort("u")
+    builder.Connect(x, c3.GetInputPort("x"))
+    builder.Connect(goal.get_output_port(), c3.GetInputPort("x_desired"))
+    builder.Connect(lcs.get_output_port(), c3.GetInputPort("lcs"))
+    builder.Connect(u, u_of_plant)
+    if config.adapt:
+        learner = builder.AddNamedSystem(
+            "learner", ResidualLearner(config.learner, model, DT, LEARNER_OFFSET)
+        )
+        builder.Connect(x, learner.GetInputPort("x"))
+        # Until C3's next update this is what acted since its last one.
+        builder.Connect(u, learner.GetInputPort("u_measured"))
+        builder.Connect(lcs.get_output_port(), learner.GetInputPort("lcs"))
+        r_comp = learner.GetOutputPort("r_comp")
+        builder.ExportOutput(learner.GetOutputPort("loss"), "loss")
+        builder.ExportOutput(learner.GetOutputPort("status"), "learner_status")
+    else:
+        zero = builder.AddNamedSystem(
+            "no_residual", ConstantVectorSource(np.zeros(model.n_lam))
+        )
+        r_comp = zero.get_output_port()
+    builder.Connect(r_comp, c3.GetInputPort("r_comp"))
+    if multibody and meshcat is not None:
+        view = builder.AddNamedSystem(
+            "walls_view", WallsView(WallsViewConfig(gap=list(model.c)), meshcat)
+        )
+        builder.Connect(r_comp, view.GetInputPort("r_comp"))
+    builder.ExportOutput(x, "x")
+    builder.ExportOutput(u, "u")
+    builder.ExportOutput(r_comp, "r_comp")
+    builder.ExportOutput(c3.GetOutputPort("status"), "c3_status")
+    diagram = builder.Build()
+    diagram.set_name("cartpole_walls")
+    return diagram
+
+
+def start(diagram: Diagram, x) -> Context:
+    """A context of make_cartpole_walls in which the plant's state is x (4,)."""
+    context = diagram.CreateDefaultContext()
+    plant = diagram.GetSubsystemByName("plant")
+    plant_context = plant.GetMyContextFromRoot(context)
+    if isinstance(plant, LcsPlant):
+        plant_context.SetDiscreteState(0, x)
+    else:
+        plant.SetPositionsAndVelocities(plant_context, x)
+    return context
