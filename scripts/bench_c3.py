@@ -110,7 +110,7 @@ class OsqpC3:
             Q = p.Q_N if k == N else p.Q
             cost = prog.AddQuadraticCost(2.0 * Q, np.zeros(p.n_x), x, is_convex=True)
             targets.append((cost.evaluator(), Q))
-        self.targets = targets
+        self.targets, self.inputs = targets, []
         n_v = p.n_x + p.n_lam + p.n_u
         minus_one = -np.eye(p.n_x)
         for k in range(N):
@@ -121,7 +121,8 @@ class OsqpC3:
                 np.concatenate([z[:n_v], self.x[k + 1]]),
             )
             u = z[p.n_x + p.n_lam : n_v]
-            prog.AddQuadraticCost(2.0 * p.R, np.zeros(p.n_u), u, is_convex=True)
+            cost = prog.AddQuadraticCost(2.0 * p.R, np.zeros(p.n_u), u, is_convex=True)
+            self.inputs.append(cost.evaluator())
             if p.is_plus:
                 prog.AddLinearEqualityConstraint(
                     np.hstack([lcs.E, lcs.F, lcs.H, -np.eye(p.n_lam)]), -lcs.c, z
@@ -136,8 +137,11 @@ class OsqpC3:
             ).evaluator()
         self.consensus: list = []
 
-    def solve(self, x0, x_desired):
-        """Inputs u (N, n_u) from the state x0 (n_x,); x_desired (N + 1, n_x)."""
+    def solve(self, x0, x_desired, u_prev=None):
+        """Inputs u (N, n_u) from the state x0 (n_x,); x_desired (N + 1, n_x).
+
+        u_prev (N, n_u): centre of the input cost (the library's last solution, always).
+        """
         o, p, lcs = self.problem.options, self.problem, self.lcs
         self.start.UpdateCoefficients(np.eye(p.n_x), x0)
         if self.force is not None:
@@ -145,6 +149,9 @@ class OsqpC3:
             self.force.UpdateCoefficients(np.eye(p.n_lam), lam0)
         for (cost, Q), target in zip(self.targets, x_desired, strict=True):
             cost.UpdateCoefficients(2.0 * Q, -2.0 * Q @ target)
+        if u_prev is not None:
+            for cost, u in zip(self.inputs, u_prev, strict=True):
+                cost.UpdateCoefficients(2.0 * p.R, -2.0 * p.R @ u)
         delta, w = np.zeros((o.N, p.n_z)), np.zeros((o.N, p.n_z))
         if o.start_at_x0:
             delta[:, : p.n_x] = x0

@@ -45,7 +45,7 @@ class C3Status(IntEnum):
 
 @dataclass
 class C3Config:
-    weights: C3Weights
+    weights: C3Weights = field(default_factory=C3Weights)  # Must be given.
     # In YAML `projection: !PlusProjection {}`, `!QpProjection {alpha: 0.01}`,
     # `!ExactProjection {}`: each carries its own numbers and no others.
     projection: PlusProjection | QpProjection | ExactProjection = field(

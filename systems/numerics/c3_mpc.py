@@ -17,7 +17,8 @@ Source: Aydinoglu, Wei, Huang, Posa, arXiv:2304.11259, algorithm 1; ACI-MPC sect
 docs/c3.md lists every choice in which implementations differ.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -43,14 +44,22 @@ class C3Failure(RuntimeError):
     """A solve that has no result, with the reason: bounds, an LCP, an indefinite QP."""
 
 
+def _required() -> Any:
+    return field(default_factory=lambda: np.zeros(0))
+
+
 @dataclass
 class C3Weights:
-    """Diagonals, or matrices (G and U: diagonal ones), in the units of 1 / z^2."""
+    """Diagonals, or matrices (G and U: diagonal ones), in the units of 1 / z^2.
 
-    Q: np.ndarray  # (n_x,) state, >= 0.
-    R: np.ndarray  # (n_u,) input, >= 0, and with G's u part > 0.
-    G: np.ndarray  # (n_z,) consensus; lam and eta > 0, x and u >= 0.
-    U: np.ndarray  # (n_z,) projection; lam and eta > 0, x and u >= 0.
+    z = [x, lam, u] for C3 and [x, lam, u, eta] for C3+. All but Q_N must be given (the
+    empty defaults, which C3Problem refuses, are what yaml_load_typed needs).
+    """
+
+    Q: np.ndarray = _required()  # (n_x,) state, >= 0.
+    R: np.ndarray = _required()  # (n_u,) input, >= 0, and with G's u part > 0.
+    G: np.ndarray = _required()  # (n_z,) consensus; lam and eta > 0, x and u >= 0.
+    U: np.ndarray = _required()  # (n_z,) projection; lam and eta (C3: and x) > 0.
     Q_N: np.ndarray | None = None  # (n_x,) last state; None: Q.
 
 

@@ -1,0 +1,729 @@
+"""C3: the QP step, the projections, whole solves, and the system."""
+
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.common.value import AbstractValue
+from pydrake.common.yaml import yaml_load_typed
+from pydrake.solvers import ClarabelSolver, MathematicalProgram, SolverOptions
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+
+from makebreak.scripts.bench_c3 import (
+    OsqpC3,
+    ball,
+    cartpole,
+    measure,
+    osqp_options,
+    quiet,
+)
+from makebreak.systems.c3_mpc import C3Config, C3Mpc, C3Status
+from makebreak.systems.lcs_plant import LcsPlant
+from makebreak.systems.numerics.c3_mpc import (
+    C3Bounds,
+    C3Failure,
+    C3Options,
+    C3Problem,
+    C3Weights,
+    WarmStart,
+    plan_cost,
+    solve_c3,
+    with_gap_residual,
+)
+from makebreak.systems.numerics.c3_projections import (
+    ExactProjection,
+    PlusProjection,
+    QpProjection,
+    project_exact,
+    project_plus,
+    project_qp,
+    projection_matrices,
+)
+from makebreak.systems.numerics.c3_qp import (
+    factor,
+    new_factor,
+    solve,
+    solve_bounded,
+    within,
+)
+from makebreak.systems.numerics.lcs import LCS, simulate
+
+REFERENCE = Path(__file__).parent / "reference"
+CARTPOLE = np.load(REFERENCE / "c3_cartpole.npz")
+PROJECTIONS = np.load(REFERENCE / "projections.npz")
+NO_BARRIER = np.zeros((0, 0))
+PLUS, C3_QP, EXACT = PlusProjection(), QpProjection(), ExactProjection()
+
+
+def cartpole_lcs():
+    return LCS(**{k: CARTPOLE[k] for k in "ABDdEFHc"}, dt=0.01)
+
+
+def cartpole_problem(projection=PLUS, bounds=None, **options):
+    kind = "plus" if isinstance(projection, PlusProjection) else "c3"
+    weights = C3Weights(
+        CARTPOLE["Q"],
+        CARTPOLE["R"],
+        CARTPOLE["G_" + kind],
+        CARTPOLE["U_" + kind],
+        CARTPOLE["QN"],
+    )
+    options = C3Options(**({"N": 5, "rounds": 10, "rho": 2.0} | options))
+    return C3Problem(weights, projection, options, bounds)
+
+
+# The QP step.
+
+
+def random_qp(rng, bounded=False):
+    """A strictly convex linear-quadratic problem; see c3_qp.solve_bounded."""
+    n_x, n_u, n_lam, N = rng.integers(1, 6), *rng.integers(1, 4, 2), rng.integers(1, 9)
+    n_v, n = n_lam + n_u, n_x + n_lam + n_u
+    A = rng.normal(size=(n_x, n_x))
+    A *= rng.uniform(0.5, 1.2) / abs(np.linalg.eigvals(A)).max()
+    B, d = rng.normal(size=(n_x, n_v)), 0.1 * rng.normal(size=n_x)
+    L, L_N = rng.normal(size=(n, n)), rng.normal(size=(n_x, n_x))
+    T = L @ L.T + np.diag(10.0 ** rng.uniform(-2, 2, n))
+    h = 10.0 * rng.normal(size=(N + 1, n))
+    v0 = 0.3 * rng.normal(size=n_lam) if rng.random() < 0.5 else np.empty(0)
+    lower, upper = np.full(n, -np.inf), np.full(n, np.inf)
+    for i in range(n_lam, n) if bounded else ():
+        size = 1.0 if i < n_v else 3.0
+        if rng.random() < 0.7 / size:
+            lower[i] = -size * 10.0 ** rng.uniform(-1, 1)
+        if rng.random() < 0.7 / size:
+            upper[i] = size * 10.0 ** rng.uniform(-1, 1)
+    x0 = rng.normal(size=n_x)
+    return A, B, d, T, L_N @ L_N.T, h, x0, v0, lower, upper
+
+
+def riccati(qp):
+    A, B, d, T, T_N, h, x0, v0, lower, upper = qp
+    N, n_x = len(h) - 1, len(d)
+    fac = new_factor(np.hstack([B, A]), d, N)
+    x, v = np.empty((N + 1, n_x)), np.empty((N, B.shape[1]))
+    assert factor(fac, T, T_N, NO_BARRIER, v0.size)
+    solve(fac, h, x0, v0, x, v)
+    return fac, x, v
+
+
+def test_qp_step_agrees_with_a_dense_kkt_solve():
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        qp = A, B, d, T, T_N, h, x0, v0, *_ = random_qp(rng)
+        N, n_x, n_v = len(h) - 1, len(d), B.shape[1]
+        n = n_x + n_v
+        # Unknowns: [v_k, x_k] for k < N, then x_N.
+        size = N * n + n_x
+        H = np.zeros((size, size))
+        for k in range(N):
+            H[k * n : (k + 1) * n, k * n : (k + 1) * n] = T
+        H[N * n :, N * n :] = T_N
+        rhs = np.concatenate([h[:N].ravel(), h[N, n_v:]])
+        C = np.zeros((n_x + v0.size + N * n_x, size))
+        e = np.concatenate([x0, v0, np.tile(-d, N)])
+        C[:n_x, n_v:n] = np.eye(n_x)
+        C[n_x : n_x + v0.size, : v0.size] = np.eye(v0.size)
+        for k in range(N):
+            rows = slice(n_x + v0.size + k * n_x, n_x + v0.size + (k + 1) * n_x)
+            C[rows, k * n : (k + 1) * n] = np.hstack([B, A])
+            at = (k + 1) * n + (n_v if k + 1 < N else 0)
+            C[rows, at : at + n_x] = -np.eye(n_x)
+        kkt = np.block([[H, C.T], [C, np.zeros((len(C), len(C)))]])
+        y = np.linalg.solve(kkt, np.concatenate([rhs, e]))[:size]
+        _, x, v = riccati(qp)
+        ours = np.concatenate([*(np.concatenate([v[k], x[k]]) for k in range(N)), x[N]])
+        # Condition up to 1e6: 1e-16 grows to 1e-10 of the largest entry.
+        np.testing.assert_allclose(ours, y, rtol=1e-9, atol=1e-9 * abs(y).max())
+
+
+def clarabel(qp):
+    """x and v of the bounded problem, or None where it is infeasible."""
+    A, B, d, T, T_N, h, x0, v0, lower, upper = qp
+    N, n_x, n_v = len(h) - 1, len(d), B.shape[1]
+    prog = MathematicalProgram()
+    x = prog.NewContinuousVariables(N + 1, n_x)
+    v = prog.NewContinuousVariables(N, n_v)
+    prog.AddLinearEqualityConstraint(np.eye(n_x), x0, x[0])
+    if v0.size:
+        prog.AddLinearEqualityConstraint(np.eye(v0.size), v0, v[0, : v0.size])
+    for k in range(N):
+        M = np.hstack([B, A, -np.eye(n_x)])
+        prog.AddLinearEqualityConstraint(M, -d, np.r_[v[k], x[k], x[k + 1]])
+        prog.AddQuadraticCost(T, -h[k], np.r_[v[k], x[k]], is_convex=True)
+        y = np.r_[v[k], x[k + 1]]
+        for i in np.flatnonzero(np.isfinite(lower) | np.isfinite(upper)):
+            prog.AddBoundingBoxConstraint(lower[i], upper[i], y[i])
+    prog.AddQuadraticCost(T_N, -h[N, n_v:], x[N], is_convex=True)
+    options = SolverOptions()
+    for name in ("tol_gap_abs", "tol_gap_rel", "tol_feas"):
+        options.SetOption(ClarabelSolver.id(), name, 1e-11)
+    result = ClarabelSolver().Solve(prog, None, options)
+    if not result.is_success():
+        return None
+    return (
+        result.GetSolution(x).reshape(N + 1, n_x),
+        result.GetSolution(v).reshape(N, n_v),
+    )
+
+
+def test_bounded_qp_step_agrees_with_clarabel_and_sees_infeasibility():
+    rng = np.random.default_rng(0)
+    met, infeasible = 0, 0
+    for _ in range(60):
+        qp = *_, T, T_N, h, x0, v0, lower, upper = random_qp(rng, bounded=True)
+        fac, x, v = riccati(qp)
+        if within(x, v, lower, upper):
+            continue
+        solved = solve_bounded(fac, T, T_N, h, x0, v0, lower, upper, x, v)
+        expected = clarabel(qp)
+        assert solved == (expected is not None)
+        if not solved:
+            infeasible += 1
+            continue
+        met += 1
+        n_v = v.shape[1]
+        assert (v >= lower[:n_v]).all() and (v <= upper[:n_v]).all()
+        # What Plan promises of x.
+        assert (x[1:] >= lower[n_v:] - 1e-6).all()
+        assert (x[1:] <= upper[n_v:] + 1e-6).all()
+        # Clarabel's own accuracy: the square root of its gap of 1e-11, times scale.
+        np.testing.assert_allclose(v, expected[1], atol=2e-5 * (1 + abs(v).max()))
+        np.testing.assert_allclose(x, expected[0], atol=2e-5 * (1 + abs(x).max()))
+    assert met > 20 and infeasible > 0
+
+
+def test_a_qp_that_is_not_convex_is_refused():
+    fac = new_factor(np.ones((1, 2)), np.zeros(1), 3)
+    T = np.diag([-1.0, 0.0])
+    assert not factor(fac, T, np.zeros((1, 1)), NO_BARRIER, 0)
+
+
+# The projections.
+
+
+def projection_problem():
+    E, F, H, c = (np.ascontiguousarray(PROJECTIONS[k]) for k in "EFHc")
+    U = np.diag(PROJECTIONS["qp_U"]).copy()
+    return U, E, F, H, c, *projection_matrices(U, E, F, H)
+
+
+def test_plus_projection_repeats_the_reference():
+    U = np.diag(PROJECTIONS["plus_U"]).copy()
+    delta = np.empty(9)
+    for z, expected in zip(
+        PROJECTIONS["plus_in"], PROJECTIONS["plus_out"], strict=True
+    ):
+        project_plus(z, U, 4, 2, 1, delta)
+        np.testing.assert_array_equal(delta, expected)
+
+
+def test_qp_projection_is_feasible_and_no_worse_than_the_reference():
+    U, E, F, H, c, V, K = projection_problem()
+    alpha, delta = float(PROJECTIONS["qp_alpha"]), np.empty(7)
+
+    def objective(v, z):
+        weight = np.diag(U)
+        weight[4:6, 4:6] = alpha * F
+        lam = v[4:6]
+        return 0.5 * v @ weight @ v - z @ weight @ v + 0.5 * (1 - alpha) * lam @ F @ lam
+
+    close = 0
+    for z, saved in zip(PROJECTIONS["qp_in"], PROJECTIONS["qp_out"], strict=True):
+        assert project_qp(z, alpha, E, F, H, c, V, K, delta)
+        assert delta[4:6].min() >= 0.0
+        assert (E @ delta[:4] + F @ delta[4:6] + c).min() >= -1e-12
+        # The saved points breach a constraint by up to 1e-8, which is worth 1e-8 of
+        # the objective's slope (1e3) in their favour.
+        assert objective(delta, z) <= objective(saved, z) + 1e-5
+        close += abs(delta - saved)[:6].max() < 1e-3
+    # OSQP ended one of them early (lam_0 = 7.5 instead of 10.4); the rest are to its
+    # tolerance. u, without weight, passes through here and is 0 there.
+    assert close == 11
+
+
+def test_qp_projection_agrees_with_clarabel_where_that_is_well_determined():
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        n_x, n_lam = 4, 3
+        J = rng.normal(size=(n_lam, n_lam))
+        F, E, H = (
+            J @ J.T + np.eye(n_lam),
+            *(rng.normal(size=(n_lam, n)) for n in (4, 2)),
+        )
+        c, z = rng.normal(size=n_lam), 2.0 * rng.normal(size=9)
+        U = 10.0 ** rng.uniform(-1, 1, 9)
+        delta, alpha = np.empty(9), 0.3
+        V, K = projection_matrices(U, E, F, H)
+        assert project_qp(z, alpha, E, F, H, c, V, K, delta)
+        prog = MathematicalProgram()
+        v = prog.NewContinuousVariables(9)
+        S = np.hstack([E, F, H])
+        prog.AddLinearConstraint(S, -c, np.full(n_lam, np.inf), v)
+        lam = v[n_x : n_x + n_lam]
+        prog.AddBoundingBoxConstraint(0.0, np.inf, lam)
+        weight = np.diag(U)
+        weight[n_x : n_x + n_lam, n_x : n_x + n_lam] = alpha * F
+        prog.AddQuadraticCost(weight, -weight @ z, v, is_convex=True)
+        prog.AddQuadraticCost((1 - alpha) * F, np.zeros(n_lam), lam, is_convex=True)
+        expected = ClarabelSolver().Solve(prog).GetSolution(v)
+        # Clarabel stops at a gap of 1e-8: 1e-4 of distance in the flattest direction.
+        np.testing.assert_allclose(delta, expected, atol=1e-4)
+
+
+def brute_force_projection(z, U, E, F, H, c):
+    """Smallest |v - z|^2_U over all contact modes: one convex QP for each."""
+    n_lam, n_x = E.shape
+    S, best = np.hstack([E, F, H]), np.inf
+    for mode in product([False, True], repeat=n_lam):
+        prog = MathematicalProgram()
+        v = prog.NewContinuousVariables(len(z))
+        prog.AddQuadraticErrorCost(np.diag(U), z, v)
+        touch = np.array(mode)
+        lam_upper = np.where(touch, np.inf, 0.0)
+        gap_upper = np.where(touch, -c, np.inf)
+        prog.AddBoundingBoxConstraint(np.zeros(n_lam), lam_upper, v[n_x : n_x + n_lam])
+        for i in range(n_lam):
+            if touch[i]:
+                prog.AddLinearEqualityConstraint(S[i : i + 1], [-c[i]], v)
+            else:
+                prog.AddLinearConstraint(S[i : i + 1], [-c[i]], gap_upper[i : i + 1], v)
+        result = ClarabelSolver().Solve(prog)
+        if result.is_success():
+            best = min(best, result.get_optimal_cost())
+    return best
+
+
+@pytest.mark.parametrize(("n_lam", "trials"), [(2, 12), (4, 4), (8, 1)])
+def test_exact_projection_agrees_with_brute_force_over_all_modes(n_lam, trials):
+    rng = np.random.default_rng(0)
+    for trial in range(trials):
+        # As friction edges do, the rows of E, F and H depend on each other.
+        J = rng.normal(size=(n_lam, n_lam // 2 + 2))
+        F, E = 0.1 * J @ J.T, J @ rng.normal(size=(n_lam // 2 + 2, 4))
+        H = J @ rng.normal(size=(n_lam // 2 + 2, 2)) * (trial % 2)
+        c = 0.3 * abs(rng.normal(size=n_lam))  # x = lam = u = 0 is feasible.
+        U, z = 10.0 ** rng.uniform(-1, 2, n_lam + 6), rng.normal(size=n_lam + 6)
+        delta = np.empty(n_lam + 6)
+        V, K = projection_matrices(U, E, F, H)
+        assert project_exact(z, U, E, F, H, c, V, K, delta)
+        lam, gap = delta[4 : 4 + n_lam], np.hstack([E, F, H]) @ delta + c
+        # The LCPs hold to 1e-9 of their own scale.
+        assert lam.min() >= 0.0 and gap.min() >= -1e-8 and abs(lam * gap).max() < 1e-8
+        best = brute_force_projection(z, U, E, F, H, c)
+        # Clarabel: a relative gap of 1e-8, on 256 problems.
+        np.testing.assert_allclose(U @ (delta - z) ** 2, best, rtol=1e-6, atol=1e-7)
+
+
+# Whole solves.
+
+
+def test_c3_plus_repeats_the_reference_on_the_cartpole():
+    problem = cartpole_problem(PLUS)
+    plan, warm = solve_c3(cartpole_lcs(), CARTPOLE["x0"], np.zeros((6, 4)), problem)
+    # Both solve the same linear systems; theirs by OSQP with polishing, to 1e-9.
+    for ours, name in (
+        (plan.u, "u"),
+        (plan.x[:5], "x"),
+        (plan.lam, "lam"),
+        (warm.delta, "delta"),
+        (warm.w, "w"),
+    ):
+        expected = CARTPOLE["plus_first_" + name]
+        np.testing.assert_allclose(ours, expected, rtol=1e-8, atol=1e-9, err_msg=name)
+
+
+def test_recreation_repeats_the_reference_to_the_last_digit_it_gives():
+    for plus, name in ((True, "plus_first_u"), (False, "qp_first_u")):
+        lcs, x0, x_desired, problem = cartpole(plus, 5)
+        with quiet():
+            u = OsqpC3(lcs, problem).solve(x0, x_desired)
+        # The same operations by the same solver.
+        np.testing.assert_allclose(u, CARTPOLE[name], rtol=1e-8)
+
+
+def test_c3_equals_the_recreation_once_osqp_is_told_to_finish_its_projections():
+    """With the library's settings OSQP leaves the projection early, and u differs by a
+    fifth (docs/c3.md); with tight ones the same program gives our plan."""
+    lcs, x0, x_desired, problem = cartpole(False, 5)
+    osqp = OsqpC3(lcs, problem, scaling=1.0)
+    osqp.projection_options = osqp_options(
+        dict(eps_abs=1e-9, eps_rel=1e-9, max_iter=100_000, polishing=1)
+    )
+    with quiet():
+        expected = osqp.solve(x0, x_desired)
+    plan, _ = solve_c3(lcs, x0, x_desired, problem)
+    # OSQP's 1e-9 in a weight of 1e-4 (alpha F) is 1e-5 in lam.
+    np.testing.assert_allclose(plan.u, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("projection", "steps"), [(PLUS, 184), (EXACT, 178), (C3_QP, 176)]
+)
+def test_closed_loop_settles_in_as_many_steps_as_the_reference(projection, steps):
+    """Until max|x| <= 0.1 for 30 steps. C3+ and exact: c3_reference. QP projection: the
+    re-creation with tight projections (107 with the early-ending ones)."""
+    problem = cartpole_problem(projection, penalise_input_change=True)
+    lcs, x, warm, still = cartpole_lcs(), CARTPOLE["x0"], None, 0
+    taken = 0
+    while still < 30 and taken < 1000:
+        plan, warm = solve_c3(lcs, x, np.zeros((6, 4)), problem, warm)
+        x, _ = simulate(lcs, x, plan.u[0])
+        still = still + 1 if abs(x).max() <= 0.1 else 0
+        taken += 1
+    assert taken == steps
+
+
+def test_c3_plus_on_the_ball_costs_no_more_than_the_recreation():
+    row = measure("ball", ball, True, 5, repeats=1)
+    assert row["cost_ratio"] <= 1.01
+
+
+@pytest.mark.parametrize("projection", [PLUS, C3_QP, EXACT])
+def test_bounds_hold_and_far_ones_change_nothing(projection):
+    lcs, x0, x_desired = cartpole_lcs(), CARTPOLE["x0"], np.zeros((6, 4))
+    free, _ = solve_c3(lcs, x0, x_desired, cartpole_problem(projection))
+    far = C3Bounds(u_lower=[-1e3], u_upper=[1e3], x_upper=np.full(4, 1e3))
+    same, _ = solve_c3(lcs, x0, x_desired, cartpole_problem(projection, far))
+    np.testing.assert_array_equal(same.u, free.u)
+    u_max = 0.6 * free.u.max()
+    near = C3Bounds(u_lower=[-2.0], u_upper=[u_max])
+    plan, _ = solve_c3(lcs, x0, x_desired, cartpole_problem(projection, near))
+    assert u_max - 1e-6 < plan.u.max() <= u_max and plan.u.min() >= -2.0
+    v_max = 0.5 * (x0[2] + free.x[1:, 2].max())
+    near.x_upper = np.array([np.inf, np.inf, v_max, np.inf])
+    plan, _ = solve_c3(lcs, x0, x_desired, cartpole_problem(projection, near))
+    assert plan.x[1:, 2].max() == pytest.approx(v_max, abs=1e-6)
+    assert -2.0 <= plan.u.min() and plan.u.max() <= u_max
+    step = plan.x[:-1] @ lcs.A.T + plan.u @ lcs.B.T + plan.lam @ lcs.D.T + lcs.d
+    np.testing.assert_allclose(plan.x[1:], step, atol=1e-9)  # Still the dynamics.
+
+
+def test_bounds_that_cannot_be_met_are_a_failure():
+    bounds = C3Bounds(x_upper=[0.0, np.inf, np.inf, np.inf])  # x_1 = .105 whatever u.
+    problem = cartpole_problem(PLUS, bounds)
+    with pytest.raises(C3Failure, match="no plan meets the bounds"):
+        solve_c3(cartpole_lcs(), CARTPOLE["x0"], np.zeros((6, 4)), problem)
+
+
+def test_scaling_lam_is_solving_the_scaled_lcs():
+    lcs, x_desired = cartpole_lcs(), np.zeros((6, 4))
+    s = np.linalg.norm(lcs.A) / np.linalg.norm(lcs.D)
+    assert s == pytest.approx(15.923825, rel=1e-7)  # c3_reference.
+    scaled = replace(lcs, D=lcs.D * s, E=lcs.E / s, c=lcs.c / s, H=lcs.H / s)
+    ours, _ = solve_c3(lcs, CARTPOLE["x0"], x_desired, cartpole_problem(scale_lam=True))
+    plan, _ = solve_c3(scaled, CARTPOLE["x0"], x_desired, cartpole_problem())
+    np.testing.assert_allclose(ours.u, plan.u, rtol=1e-9)
+    np.testing.assert_allclose(ours.lam, plan.lam * s, rtol=1e-9, atol=1e-9)
+
+
+def test_input_change_penalty_can_be_switched_off():
+    lcs, x0, x_desired = cartpole_lcs(), CARTPOLE["x0"], np.zeros((6, 4))
+    z = np.zeros((5, 9))
+    last = WarmStart(np.full((5, 1), 7.0), z, z)
+    off, on = (cartpole_problem(penalise_input_change=p) for p in (False, True))
+    cold, _ = solve_c3(lcs, x0, x_desired, off)
+    np.testing.assert_array_equal(solve_c3(lcs, x0, x_desired, off, last)[0].u, cold.u)
+    # With u = 0 last, both penalties are the same; a heavy one keeps u where it was.
+    np.testing.assert_array_equal(solve_c3(lcs, x0, x_desired, on)[0].u, cold.u)
+    heavy = C3Weights(CARTPOLE["Q"], [1e9], CARTPOLE["G_plus"], CARTPOLE["U_plus"])
+    heavy_problem = C3Problem(heavy, PLUS, on.options)
+    plan, _ = solve_c3(lcs, x0, x_desired, heavy_problem, last)
+    np.testing.assert_allclose(plan.u, 7.0, atol=1e-4)  # Other costs are 1e-5 of R.
+
+
+def test_the_target_may_move_over_the_horizon():
+    """Free motion, one round: the plan is the least-squares answer, written densely."""
+    lcs = replace(cartpole_lcs(), D=np.zeros((4, 2)), E=np.zeros((2, 4)))
+    x0, x_desired = CARTPOLE["x0"], np.random.default_rng(0).normal(size=(6, 4))
+    problem = cartpole_problem(PLUS, rounds=0)
+    plan, _ = solve_c3(lcs, x0, x_desired, problem)
+    free, effect = [x0], [np.zeros((4, 5))]
+    for k in range(5):
+        free.append(lcs.A @ free[-1])
+        effect.append(lcs.A @ effect[-1])
+        effect[-1][:, k] += lcs.B[:, 0]
+    weights = [problem.Q] * 5 + [problem.Q_N]
+    H, b = np.eye(5) * CARTPOLE["R"], np.zeros(5)
+    for M, x, target, Q in zip(effect, free, x_desired, weights, strict=True):
+        H, b = H + M.T @ Q @ M, b + M.T @ Q @ (target - x)
+    np.testing.assert_allclose(plan.u[:, 0], np.linalg.solve(H, b), rtol=1e-9)
+    cost = plan_cost(lcs, x0, plan.u, x_desired, problem)
+    by_hand = plan.u[:, 0] @ plan.u[:, 0]
+    for x, target, Q in zip(plan.x, x_desired, weights, strict=True):
+        by_hand += (x - target) @ Q @ (x - target)
+    assert cost == pytest.approx(by_hand, rel=1e-12)
+
+
+def test_warm_start_is_passed_in_and_a_solve_depends_on_nothing_else():
+    lcs, x0, x_desired = cartpole_lcs(), CARTPOLE["x0"], np.zeros((6, 4))
+    problem = cartpole_problem(warm_start=True, rounds=3)
+    cold, warm = solve_c3(lcs, x0, x_desired, problem)
+    first, _ = solve_c3(lcs, x0, x_desired, problem, warm)
+    solve_c3(lcs, -x0, x_desired, problem)
+    again, _ = solve_c3(lcs, x0, x_desired, problem, warm)
+    np.testing.assert_array_equal(first.u, again.u)
+    assert abs(first.u - cold.u).max() > 1e-3
+
+
+def test_shifting_a_warm_start_moves_it_along_the_horizon():
+    delta = np.arange(3.0)[:, None] * np.ones(9)
+    shifted = WarmStart(np.zeros((3, 1)), delta, -delta).shifted(0.25)
+    np.testing.assert_allclose(shifted.delta[:, 0], [0.25, 1.25, 2.0])
+    np.testing.assert_allclose(shifted.w[:, 0], [-0.25, -1.25, -2.0])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (dict(Q=[10, 2, 1, -1]), r"C3Weights.Q has the eigenvalue -1"),
+        (dict(R=[0.0]), r"leave an input without cost"),
+        (dict(G=np.array([0, 0, 0, 0, 1, 0, 0, 1, 1.0])), r"C3Weights.G\[5\] is 0.0"),
+        (dict(U=np.array([0, 0, 0, 0, 1, 1, 0, 1, -1.0])), r"C3Weights.U\[8\] is -1.0"),
+        (dict(G=np.ones(8)), r"G has 8 and U 9 entries, expected one per entry of \[x"),
+        (dict(G=np.ones((9, 9))), r"C3Weights.G is not diagonal"),
+        (dict(U=np.full(9, np.nan)), r"C3Weights.U is .* expected finite"),
+        (dict(Q=np.ones((2, 3))), r"expected finite numbers, a diagonal or a square"),
+        (dict(Q=np.triu(np.ones((4, 4)))), r"C3Weights.Q is not symmetric"),
+        (dict(Q_N=np.ones(3)), r"C3Weights.Q_N is \(3, 3\), expected \(4, 4\)"),
+    ],
+)
+def test_bad_weights_are_refused_by_name(change, message):
+    good = dict(Q=[10, 2, 1, 1], R=[1.0], G=CARTPOLE["G_plus"], U=CARTPOLE["U_plus"])
+    with pytest.raises(ValueError, match=message):
+        C3Problem(C3Weights(**(good | change)))
+
+
+@pytest.mark.parametrize(
+    ("options", "bounds", "message"),
+    [
+        (dict(N=0), None, "N = 0 knots"),
+        (dict(rounds=-1), None, "rounds = -1"),
+        (dict(rho=0.5), None, "rho is 0.5"),
+        (dict(rho=np.nan), None, "rho is nan"),
+        ({}, C3Bounds(u_lower=[1.0], u_upper=[1.0]), "1.0 to 1.0 for entry 0"),
+        ({}, C3Bounds(u_lower=[1.0, 2.0]), "u is bounded by .* expected 1 numbers"),
+        ({}, C3Bounds(x_upper=[np.nan] * 4), "x is bounded by"),
+    ],
+)
+def test_bad_options_and_bounds_are_refused_by_name(options, bounds, message):
+    with pytest.raises(ValueError, match=message):
+        cartpole_problem(PLUS, bounds, **options)
+
+
+def test_shapes_that_do_not_fit_the_weights_are_refused():
+    problem = cartpole_problem()
+    with pytest.raises(ValueError, match=r"x0 is \(3,\) and x_desired \(6, 4\)"):
+        solve_c3(cartpole_lcs(), np.zeros(3), np.zeros((6, 4)), problem)
+    lcs, *_ = ball(True, 5)
+    with pytest.raises(ValueError, match=r"\(19, 3, 16\), expected \(4, 1, 2\)"):
+        solve_c3(lcs, np.zeros(4), np.zeros((6, 4)), problem)
+
+
+def test_numbers_that_are_not_finite_are_a_failure_and_not_a_plan():
+    for projection in (PLUS, C3_QP, EXACT):
+        problem = cartpole_problem(projection)
+        for x0 in (np.full(4, np.nan), np.full(4, 1e308)):
+            with pytest.raises(C3Failure):
+                solve_c3(cartpole_lcs(), x0, np.zeros((6, 4)), problem)
+
+
+# The residual and the command.
+
+
+def test_residual_scales_with_the_time_step_and_penetration_is_taken_for_touching():
+    lcs = replace(cartpole_lcs(), phi=np.array([0.002, -0.001]))  # dt .01.
+    r_comp = np.array([-0.1, 0.04])  # At .05 s: gaps of -5 mm and +2 mm.
+    plain = with_gap_residual(lcs, r_comp, 0.05, clamp=False)
+    np.testing.assert_allclose(plain.c - lcs.c, [-0.5, 0.2])
+    clamped = with_gap_residual(lcs, r_comp, 0.05, clamp=True)
+    # phi + r is -3 mm and +1 mm: the first is raised to zero, 3 mm / .01 s.
+    np.testing.assert_allclose(clamped.c - plain.c, [0.3, 0.0], atol=1e-12)
+
+
+# The system.
+
+
+def config(bounds=None, projection=PLUS, **options):
+    kind = "plus" if isinstance(projection, PlusProjection) else "c3"
+    weights = C3Weights(
+        CARTPOLE["Q"],
+        CARTPOLE["R"],
+        CARTPOLE["G_" + kind],
+        CARTPOLE["U_" + kind],
+        CARTPOLE["QN"],
+    )
+    options = C3Options(**({"N": 5, "rounds": 10} | options))
+    return C3Config(weights, projection, options, bounds or C3Bounds())
+
+
+def fixed(system, x=None, x_desired=None, lcs=None, **others):
+    """A simulator of the system alone, all its inputs fixed."""
+    simulator = Simulator(system)
+    values = dict(
+        x=CARTPOLE["x0"] if x is None else x,
+        x_desired=np.zeros(24) if x_desired is None else x_desired,
+        lcs=AbstractValue.Make(cartpole_lcs() if lcs is None else lcs),
+    )
+    for name, value in (values | others).items():
+        fix(simulator, name, value)
+    simulator.Initialize()
+    return simulator
+
+
+def fix(simulator, name, value):
+    port = simulator.get_system().GetInputPort(name)
+    port.FixValue(simulator.get_mutable_context(), value)
+
+
+def read(simulator, name):
+    port = simulator.get_system().GetOutputPort(name)
+    return port.Eval(simulator.get_context())
+
+
+def test_system_gives_the_plan_and_one_step_of_its_model():
+    simulator = fixed(C3Mpc(config(), 0.01))
+    assert read(simulator, "status") == C3Status.NO_PLAN_YET
+    np.testing.assert_array_equal(read(simulator, "u"), [0.0])
+    np.testing.assert_array_equal(read(simulator, "x_next"), CARTPOLE["x0"])
+    simulator.AdvanceTo(0.005)
+    u = read(simulator, "u")
+    np.testing.assert_allclose(u, CARTPOLE["plus_first_u"][0], rtol=1e-8)
+    x_next, lam = simulate(cartpole_lcs(), CARTPOLE["x0"], u)
+    np.testing.assert_array_equal(read(simulator, "x_next"), x_next)
+    np.testing.assert_array_equal(read(simulator, "lam"), lam)
+    plan = read(simulator, "plan")
+    np.testing.assert_array_equal(plan.u[0], u)
+    assert plan.status == 0 and read(simulator, "status") == 0
+    with pytest.raises(ValueError, match="read-only"):
+        plan.u[0] = 0.0
+
+
+def test_command_takes_one_step_of_its_own_model_with_the_residual():
+    r_comp = np.array([0.02, -0.03])
+    command = replace(cartpole_lcs(), dt=0.002, phi=np.array([0.1, 0.001]))
+    simulator = fixed(
+        C3Mpc(replace(config(), residual_dt_sec=0.05), 0.01),
+        lcs_command=AbstractValue.Make(command),
+        r_comp=r_comp,
+    )
+    simulator.AdvanceTo(0.005)
+    plan_lcs = cartpole_lcs().with_residual(5.0 * r_comp)
+    plan, _ = solve_c3(plan_lcs, CARTPOLE["x0"], np.zeros((6, 4)), cartpole_problem())
+    np.testing.assert_array_equal(read(simulator, "u"), plan.u[0])
+    model = command.with_residual(25.0 * r_comp + [0.0, 0.25])  # -.5 mm / .002 s.
+    x_next, lam = simulate(model, CARTPOLE["x0"], plan.u[0])
+    np.testing.assert_allclose(read(simulator, "x_next"), x_next, rtol=1e-12)
+    np.testing.assert_allclose(read(simulator, "lam"), lam, rtol=1e-12)
+
+
+def not_finite(a):
+    a = np.array(a, dtype=float)
+    a.flat[-1] = np.nan
+    return a
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "status"),
+    [
+        ("x", not_finite(CARTPOLE["x0"]), C3Status.BAD_X),
+        ("x_desired", not_finite(np.zeros(24)), C3Status.BAD_X_DESIRED),
+        ("r_comp", not_finite(np.zeros(2)), C3Status.BAD_R_COMP),
+        ("lcs", replace(cartpole_lcs(), c=[0.0, np.inf]), C3Status.BAD_LCS),
+        ("lcs", object(), C3Status.BAD_LCS),
+        ("lcs", ball(True, 5)[0], C3Status.BAD_LCS),
+        ("x", np.full(4, 1e200), C3Status.SOLVE_FAILED),
+    ],
+)
+def test_a_bad_input_holds_the_last_plan_as_time_goes_on(name, value, status):
+    bounds = C3Bounds(u_lower=[1.0], u_upper=[100.0])
+    simulator = fixed(C3Mpc(config(bounds), 0.005), r_comp=np.zeros(2))
+    simulator.AdvanceTo(0.001)
+    u = read(simulator, "plan").u[:, 0]
+    x_next = read(simulator, "x_next")
+    fix(simulator, name, AbstractValue.Make(value) if name == "lcs" else value)
+    held = []
+    for tick in range(1, 14):
+        simulator.AdvanceTo(0.005 * tick + 0.001)
+        held.append(read(simulator, "u")[0])
+        assert read(simulator, "status") == status
+        assert read(simulator, "plan").status == status
+        np.testing.assert_array_equal(read(simulator, "x_next"), x_next)
+    # Knots are two periods long; behind the plan's end comes the smallest input.
+    np.testing.assert_array_equal(held, [u[0], *np.repeat(u[1:], 2), *[1.0] * 4])
+    fix(simulator, "x", CARTPOLE["x0"])
+    fix(simulator, "x_desired", np.zeros(24))
+    fix(simulator, "r_comp", np.zeros(2))
+    fix(simulator, "lcs", AbstractValue.Make(cartpole_lcs()))
+    simulator.AdvanceTo(0.075)
+    assert read(simulator, "status") == C3Status.SOLVED
+    assert read(simulator, "u") == u[0]
+
+
+def test_a_stream_that_never_was_good_gives_the_smallest_input():
+    bounds = C3Bounds(u_lower=[0.5], u_upper=[9.0])
+    simulator = fixed(C3Mpc(config(bounds), 0.01), x=np.full(4, np.nan))
+    simulator.AdvanceTo(0.035)
+    np.testing.assert_array_equal(read(simulator, "u"), [0.5])
+    assert np.isfinite(read(simulator, "x_next")).all()
+
+
+def test_a_context_saved_and_restored_replays_bit_for_bit():
+    def closed_loop():
+        builder = DiagramBuilder()
+        lcs = cartpole_lcs()
+        plant = builder.AddNamedSystem("plant", LcsPlant(lcs, CARTPOLE["x0"]))
+        options = dict(penalise_input_change=True, warm_start=True)
+        mpc = builder.AddNamedSystem("mpc", C3Mpc(config(**options), 0.01, 0.005))
+        builder.Connect(plant.GetOutputPort("x"), mpc.GetInputPort("x"))
+        builder.Connect(mpc.GetOutputPort("u"), plant.GetInputPort("u"))
+        builder.ExportInput(mpc.GetInputPort("x_desired"), "x_desired")
+        builder.ExportInput(mpc.GetInputPort("lcs"), "lcs")
+        builder.ExportOutput(mpc.GetOutputPort("plan"), "plan")
+        builder.ExportOutput(plant.GetOutputPort("x"), "x")
+        return builder.Build()
+
+    diagram = closed_loop()
+    simulator = Simulator(diagram)
+    fix(simulator, "x_desired", np.zeros(24))
+    fix(simulator, "lcs", AbstractValue.Make(cartpole_lcs()))
+    simulator.AdvanceTo(0.102)
+    saved = simulator.get_context().Clone()
+    simulator.AdvanceTo(0.302)
+    # Another diagram, which never ran, goes on from the saved Context.
+    other = closed_loop()
+    context = other.CreateDefaultContext()
+    context.SetTimeStateAndParametersFrom(saved)
+    replay = Simulator(other, context)
+    fix(replay, "x_desired", np.zeros(24))
+    fix(replay, "lcs", AbstractValue.Make(cartpole_lcs()))
+    replay.Initialize(params_without_initialization())
+    replay.AdvanceTo(0.302)
+    for name in ("u", "x", "lam"):
+        ours, again = (getattr(read(s, "plan"), name) for s in (simulator, replay))
+        np.testing.assert_array_equal(ours, again)
+    np.testing.assert_array_equal(read(simulator, "x"), read(replay, "x"))
+
+
+def params_without_initialization():
+    from pydrake.systems.analysis import InitializeParams
+
+    return InitializeParams(suppress_initialization_events=True)
+
+
+def test_config_reads_from_yaml_with_the_projection_as_a_tag():
+    text = """
+    weights: {Q: [1, 1], R: [0.1], G: [0, 0, 1, 0], U: [1, 1, 1, 0]}
+    projection: !QpProjection {alpha: 0.02}
+    options: {N: 7, penalise_input_change: true}
+    bounds: {u_lower: [-1], u_upper: [1]}
+    clamp_command_gap: false
+    """
+    loaded = yaml_load_typed(schema=C3Config, data=text)
+    assert loaded.projection == QpProjection(alpha=0.02)
+    assert loaded.options == C3Options(N=7, penalise_input_change=True)
+    system = C3Mpc(loaded, 0.0125)
+    assert system.GetInputPort("x_desired").size() == 8 * 2
