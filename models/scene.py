@@ -171,9 +171,10 @@ def set_initial_velocities(loaded: LoadedScene, plant_context: Context) -> None:
         v[joint.velocity_start()] = value
         plant.SetVelocities(plant_context, v)
     for name, twist in initial.body_velocities.items():
-        body = _find(plant, name, "body")
         plant.SetFreeBodySpatialVelocity(
-            body, SpatialVelocity(twist[:3], twist[3:]), plant_context
+            context=plant_context,
+            body=_find(plant, name, "body"),
+            V_JpJc=SpatialVelocity(twist[:3], twist[3:]),
         )
 
 

@@ -28,13 +28,19 @@ class ToolWrench(LeafSystem):
         mount = plant.GetJointByName(joint)
         self._ordinal = int(mount.index())  # Equal where no joint was removed.
         self._mount = mount.frame_on_child()
-        self._tip = plant.GetFrameByName(tip)
         self._plant_context = plant.CreateDefaultContext()
         inertia = mount.child_body().CalcSpatialInertiaInBodyFrame(self._plant_context)
-        gravity = plant.gravity_field().gravity_vector()
-        self._weight = inertia.get_mass() * np.array(gravity)
-        self._tool = mount.child_body().body_frame()
-        self._com = np.array(inertia.get_com())
+        self._weight = inertia.get_mass() * np.array(
+            plant.gravity_field().gravity_vector()
+        )
+        X_BC = self._mount.CalcPoseInBodyFrame(self._plant_context)
+        self._p_CM = X_BC.inverse() @ np.array(inertia.get_com())
+        self._p_CE = plant.CalcRelativeTransform(
+            self._plant_context, self._mount, plant.GetFrameByName(tip)
+        ).translation()
+        zero = np.zeros(3)  # Compiles it.
+        R = self._mount.CalcRotationMatrixInWorld(self._plant_context).matrix()
+        external_wrench(zero, zero, R, self._weight, self._p_CM, self._p_CE)
         self._reactions = self.DeclareAbstractInputPort(
             "reaction_forces", AbstractValue.Make([SpatialForce.Zero()])
         )
@@ -46,15 +52,13 @@ class ToolWrench(LeafSystem):
             self._plant_context, self._x.Eval(context)
         )
         reaction = self._reactions.Eval(context)[self._ordinal]
-        X_WC = self._mount.CalcPoseInWorld(self._plant_context)
         output.SetFromVector(
             external_wrench(
                 reaction.translational(),
                 reaction.rotational(),
-                X_WC.rotation().matrix(),
-                X_WC.translation(),
+                self._mount.CalcRotationMatrixInWorld(self._plant_context).matrix(),
                 self._weight,
-                self._tool.CalcPoseInWorld(self._plant_context) @ self._com,
-                self._tip.CalcPoseInWorld(self._plant_context).translation(),
+                self._p_CM,
+                self._p_CE,
             )
         )

@@ -1,5 +1,6 @@
 """Effects in the contact of two bodies: friction, rolling resistance."""
 
+import numba
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.geometry import ProximityProperties, Role, RoleAssign, SceneGraph, Sphere
@@ -98,43 +99,69 @@ class RollingResistance(LeafSystem):
     ):
         super().__init__()
         self._lever = coefficient * radius
-        self._pair = {ball.index(), other.index()}
-        nq = plant.num_positions()
-        # Where each body's rate of turn is in the state, and its torque in v; both
-        # are in the world's axes. A body that is anchored has neither.
-        self._turn = [
-            (sign, body.floating_velocities_start_in_v(), nq)
-            for sign, body in ((1.0, ball), (-1.0, other))
-            if body.is_floating_base_body()
-        ]
-        self._zero = np.zeros(plant.num_velocities())
+        self._pair = (int(ball.index()), int(other.index()))
+        # Where each body's torque is in v, and its rate of turn in the state after
+        # the n_q positions, both in the world's axes. -1: anchored, it has neither.
+        self._at = np.array(
+            [
+                body.floating_velocities_start_in_v()
+                if body.is_floating_base_body()
+                else -1
+                for body in (ball, other)
+            ]
+        )
+        self._n_q, self._n_v = plant.num_positions(), plant.num_velocities()
         self._results = self.DeclareAbstractInputPort(
             "contact_results", AbstractValue.Make(ContactResults())
         )
-        self._x = self.DeclareVectorInputPort("state", nq + plant.num_velocities())
-        self._force = self.DeclareDiscreteState(plant.num_velocities())
+        self._x = self.DeclareVectorInputPort("state", self._n_q + self._n_v)
+        self._force = self.DeclareDiscreteState(self._n_v)
         self.DeclareStateOutputPort("generalized_force", self._force)
         self.DeclarePeriodicDiscreteUpdateEvent(
             plant.time_step() or 0.001, 0.0, self._update
         )
+        zero = np.zeros(self._n_v)
+        add_rolling_torque(zero, zero, np.ones(3), np.ones(3), 0.0, self._at, FADE_RATE)
 
     def _update(self, context, discrete_state):
-        generalized = self._zero.copy()
+        generalized = np.zeros(self._n_v)
         results = self._results.Eval(context)
+        ball, other = self._pair
         for i in range(results.num_point_pair_contacts()):
             contact = results.point_pair_contact_info(i)
-            if {contact.bodyA_index(), contact.bodyB_index()} != self._pair:
-                continue
-            normal = contact.point_pair().nhat_BA_W
-            f_n = abs(normal @ contact.contact_force())
-            x = self._x.Eval(context)
-            omega = sum(s * x[nq + at : nq + at + 3] for s, at, nq in self._turn)
-            omega_t = omega - (omega @ normal) * normal
-            rate = max(float(np.sqrt(omega_t @ omega_t)), FADE_RATE)
-            torque = (-self._lever * f_n / rate) * omega_t
-            for sign, at, _ in self._turn:
-                generalized[at : at + 3] += sign * torque
+            a, b = int(contact.bodyA_index()), int(contact.bodyB_index())
+            if (a == ball and b == other) or (a == other and b == ball):
+                add_rolling_torque(
+                    generalized,
+                    self._x.Eval(context)[self._n_q :],
+                    contact.contact_force(),
+                    contact.point_pair().nhat_BA_W,
+                    self._lever,
+                    self._at,
+                    FADE_RATE,
+                )
         discrete_state.set_value(self._force, generalized)
+
+
+@numba.njit(cache=True)
+def add_rolling_torque(generalized, v, force, normal, lever, at, fade_rate):
+    """Adds the torque of rolling resistance to generalized (n_v,), in place.
+
+    Args: v (n_v,); force (3,) of the contact [N] and its unit normal (3,), either sign;
+        lever [m]; at (2,): where ball and other body turn in v, or -1; fade_rate
+        [rad/s].
+    """
+    f_n = np.abs(np.sum(force * normal))
+    omega = np.zeros(3)
+    for body in range(2):
+        if at[body] >= 0:
+            omega += (1 - 2 * body) * v[at[body] : at[body] + 3]
+    omega = omega - np.sum(omega * normal) * normal
+    rate = np.sqrt(np.sum(omega * omega))
+    torque = (-lever * f_n / np.maximum(rate, fade_rate)) * omega
+    for body in range(2):
+        if at[body] >= 0:
+            generalized[at[body] : at[body] + 3] += (1 - 2 * body) * torque
 
 
 def _add_rolling_resistance(

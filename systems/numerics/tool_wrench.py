@@ -1,27 +1,25 @@
 """What acts on a tool from outside, from what its mount carries."""
 
+import numba
 import numpy as np
 
 
-def external_wrench(f_C, t_C, R_WC, p_WC, weight, p_Wcom, p_WE):
+@numba.njit(cache=True)
+def external_wrench(f_C, t_C, R_WC, weight, p_CM, p_CE):
     """The wrench on a tool at rest that balances mount and weight, taken at E.
 
     Args: f_C, t_C (3,): force [N] and torque [N m] of the mount on the tool at the
-        mount's frame C, in its axes. R_WC (3, 3), p_WC (3,) that frame. weight (3,) of
-        the tool [N] in the world, at p_Wcom (3,). p_WE (3,) the tip [m].
+        mount's frame C, in its axes. R_WC (3, 3) that frame's orientation. weight (3,)
+        of the tool [N] in the world, at its centre of mass p_CM (3,); p_CE (3,) the
+        tip: both from C in C's axes [m].
     Returns: (6,) force first, in world axes: 0 = f + f_mount + weight, and the same
         for the moments about E.
     """
     f_mount = R_WC @ f_C
-    moment = R_WC @ t_C + _cross(p_WC - p_WE, f_mount) + _cross(p_Wcom - p_WE, weight)
-    return np.concatenate([-(f_mount + weight), -moment])
-
-
-def _cross(a, b):  # np.cross is ten times slower.
-    return np.array(
-        [
-            a[1] * b[2] - a[2] * b[1],
-            a[2] * b[0] - a[0] * b[2],
-            a[0] * b[1] - a[1] * b[0],
-        ]
-    )
+    moment = R_WC @ t_C
+    moment += np.cross(R_WC @ -p_CE, f_mount)
+    moment += np.cross(R_WC @ (p_CM - p_CE), weight)
+    out = np.empty(6)
+    out[:3] = -f_mount - weight
+    out[3:] = -moment
+    return out
