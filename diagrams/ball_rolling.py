@@ -1,10 +1,11 @@
 """A Panda rolls a ball, which it models wrongly, along a circle (ACI-MPC VII-B).
 
-    station --image--> tracker --> estimator --x--> task --x_desired--> c3
-       ^                  q, v, torque --^  |        |                   ^  |
-       |                                    +--> lcs_plan, lcs_command --+  | x_next, lam
-       |                                    +--> lcs_learn -> learner --r_comp
-       +---tau--- impedance <-- reference <-- task (reposition), c3 (roll)
+    station --image--> ball_tracker --> state_estimator <-- q, v, torque -- station
+    state_estimator --x--> lcs_plan, lcs_command, lcs_learn, rolling_task
+    lcs_learn --> residual_learner --r_comp--> c3_mpc, rolling_task
+    lcs_plan, lcs_command, rolling_task --x_desired--> c3_mpc
+    c3_mpc (roll), rolling_task (reposition) --> arm_reference
+    arm_reference --> impedance_controller --tau--> station
 
 Nothing passes from the world to the controllers but encoders, torques and pictures.
 """
@@ -12,12 +13,12 @@ Nothing passes from the world to the controllers but encoders, torques and pictu
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from pydrake.geometry import Meshcat, SceneGraph, Sphere
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 
 from makebreak.diagrams.camera import CameraConfig, camera_model
+from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.station import (
     ARM,
     BALL_ROLLING,
@@ -35,13 +36,18 @@ from makebreak.systems.ball_tracker import BallTracker, BallTrackerConfig
 from makebreak.systems.c3_mpc import C3Config, C3Mpc
 from makebreak.systems.impedance_controller import ImpedanceConfig, ImpedanceController
 from makebreak.systems.lcs_builder import (
-    AnitescuLcs,
     AnitescuLcsBuilder,
     ContactPair,
     LcsBuilderConfig,
 )
-from makebreak.systems.numerics.ball_state import N_X, P_BALL, P_TIP, V_BALL, V_TIP
-from makebreak.systems.numerics.ball_state import W_BALL
+from makebreak.systems.numerics.ball_state import (
+    N_X,
+    P_BALL,
+    P_TIP,
+    V_BALL,
+    V_TIP,
+    W_BALL,
+)
 from makebreak.systems.numerics.c3_mpc import C3Options, C3Weights
 from makebreak.systems.peak_meter import PeakMeter, PeakMeterConfig
 from makebreak.systems.residual_learner import ResidualLearner, ResidualLearnerConfig
@@ -106,7 +112,7 @@ class BallRollingConfig:
 
 
 def world_scene(config: BallRollingConfig) -> Scene:
-    """The scene that is simulated: friction, rolling resistance, where the ball lies."""
+    """The scene that is simulated: friction, resistance, where the ball lies."""
     scene = read_scene(config.world)
     angle = config.start_angle_rad
     if angle is None:
@@ -114,7 +120,15 @@ def world_scene(config: BallRollingConfig) -> Scene:
     center, radius = np.array(config.task.center), config.task.radius
     xy = center + radius * np.array([np.cos(angle), np.sin(angle)])
     z = scene.initial.poses["ball.ball"][6]
-    scene.initial.poses["ball.ball"] = [1.0, 0.0, 0.0, 0.0, float(xy[0]), float(xy[1]), z]
+    scene.initial.poses["ball.ball"] = [
+        1.0,
+        0.0,
+        0.0,
+        0.0,
+        float(xy[0]),
+        float(xy[1]),
+        z,
+    ]
     if not config.friction > 0.0:
         raise ValueError(f"friction is {config.friction}, expected > 0")
     if not config.rolling_resistance >= 0.0:
@@ -129,21 +143,6 @@ def world_scene(config: BallRollingConfig) -> Scene:
         resistance = {"coefficient": config.rolling_resistance}
         scene.effects.append(Effect("rolling_resistance", ["ball~table"], resistance))
     return scene
-
-
-def sphere_radius(plant: MultibodyPlant, scene_graph: SceneGraph, model: str) -> float:
-    """Radius [m] of the only collision sphere of the model's bodies."""
-    inspector = scene_graph.model_inspector()
-    bodies = plant.GetBodyIndices(plant.GetModelInstanceByName(model))
-    shapes = [
-        inspector.GetShape(geometry)
-        for body in bodies
-        for geometry in plant.GetCollisionGeometriesForBody(plant.get_body(body))
-    ]
-    radii = [shape.radius() for shape in shapes if isinstance(shape, Sphere)]
-    if len(radii) != 1:
-        raise ValueError(f"{model} has {len(radii)} collision spheres, expected one")
-    return radii[0]
 
 
 def believed(config: BallRollingConfig) -> tuple[TipAndBall, Scene]:

@@ -1,0 +1,240 @@
+"""Adaptive rolling of a ball that is modelled wrongly (ACI-MPC VII-B, Fig. 5, 6)."""
+
+from dataclasses import dataclass
+
+import matplotlib.pyplot as plt
+import numpy as np
+from pydrake.systems.framework import DiagramBuilder
+
+from makebreak.diagrams.ball_rolling import (
+    BallRollingConfig,
+    believed,
+    make_ball_rolling,
+)
+from makebreak.diagrams.camera import describe_camera
+from makebreak.diagrams.scene_facts import sphere_radius
+from makebreak.diagrams.station import ARM, TIP_FRAME, TOOL
+from makebreak.models.scene import load_scene
+from makebreak.systems.numerics.ball_state import P_BALL, P_TIP
+
+SUMMARY = "a Panda rolls a ball that it models wrongly, along a circle (ACI-MPC VII-B)"
+Config = BallRollingConfig
+
+DURATION_SEC = 240.0
+CIRCLES = 4
+GIVE_UP_SEC = 60.0  # A run in which nothing rolls by then ends.
+LOST = 0.2  # So far from the circle's centre the ball is out of reach [m].
+ERROR_MAX = 0.004  # Success: mean distance to the path of at most this [m].
+SAMPLE = 0.0125  # [s]
+# What `makebreak bench diagrams` takes the real-time factor of.
+BENCH = {
+    "drawn 320x240": {"camera.renderer": "drawn"},
+    "VTK 320x240": {"camera.renderer": "vtk"},
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """The run as ground truth has it, a row per sample."""
+
+    time: np.ndarray  # (n,) [s]
+    p_ball: np.ndarray  # (n, 3) [m]
+    p_tip: np.ndarray  # (n, 3) [m]
+    progress: np.ndarray  # (n,) angle run through along the circle [rad].
+    error: np.ndarray  # (n,) distance to the path [m].
+    gap: np.ndarray  # (n,) learned residual as a length [m].
+    gap_true: np.ndarray  # (n,) true minus modelled distance of tip and ball [m].
+
+
+def progress_of(p, center):
+    """Angle (n,) [rad] that the points p (n, 3) have run through about center."""
+    angle = np.unwrap(np.arctan2(p[:, 1] - center[1], p[:, 0] - center[0]))
+    return angle - angle[0]
+
+
+def first_time(time, condition):
+    """The first time at which the condition (n,) holds; NaN if never."""
+    return float(time[np.argmax(condition)]) if condition.any() else float("nan")
+
+
+def run(config, session):
+    """Rolls until four circles are done, the time is over or nothing rolls.
+
+    `success`: four circles within 240 s with a mean distance to the path of at most
+    4 mm after the first quarter.
+    """
+    diagram = make_ball_rolling(config, session.meshcat)
+    system = diagram.GetSubsystemByName
+    station, plant = system("station"), system("station").GetSubsystemByName("plant")
+    record = {
+        "state": station.GetOutputPort("state"),
+        "x": system("state_estimator").GetOutputPort("x"),
+        "gap": system("learned_gap").get_output_port(),
+        "phase": system("rolling_task").GetOutputPort("phase"),
+        "seen": system("ball_tracker").GetOutputPort("seen"),
+        "c3_status": system("c3_mpc").GetOutputPort("status"),
+        "lam": system("c3_mpc").GetOutputPort("lam"),
+        "q": station.GetOutputPort(f"{ARM}.position_measured"),
+        "v": station.GetOutputPort(f"{ARM}.velocity_measured"),
+        "torque": station.GetOutputPort(f"{ARM}.torque_measured"),
+        "tau": system("impedance_controller").GetOutputPort("tau"),
+        "arm_status": system("impedance_controller").GetOutputPort("status"),
+        "wrench": station.GetOutputPort(f"{ARM}.external_wrench"),
+        "contact_peak": system("contact_meter").GetOutputPort("peak"),
+        "contact_first": system("contact_meter").GetOutputPort("first_time"),
+        "torque_peak": system("torque_meter").GetOutputPort("peak"),
+    }
+    if config.adapt:
+        record["loss"] = system("residual_learner").GetOutputPort("loss")
+        record["r_comp"] = system("residual_learner").GetOutputPort("r_comp")
+    at = plant.GetBodyByName("ball").floating_positions_start() + 4
+    center = np.array(config.task.center)
+    run_through = [0.0, None]  # Progress and the last angle.
+
+    def done(t, sample):
+        p = sample["state"][at : at + 2] - center
+        angle = np.arctan2(p[1], p[0])
+        if run_through[1] is not None:
+            turn = angle - run_through[1]
+            run_through[0] += (turn + np.pi) % (2.0 * np.pi) - np.pi
+        run_through[1] = angle
+        stuck = t >= GIVE_UP_SEC and run_through[0] < np.pi / 2
+        return (
+            run_through[0] >= 2.0 * np.pi * CIRCLES
+            or stuck
+            or bool(np.hypot(*p) > LOST)
+        )
+
+    log = session.simulate(diagram, DURATION_SEC, record, SAMPLE, until=done)
+    track = ground_truth(config, log, plant)
+    result = score(config, log, track)
+    write_recording(session, log, plant)
+    plot_path(session, config, track)
+    plot_residual(session, log, track)
+    return result
+
+
+def ground_truth(config, log, plant) -> Track:
+    """Where ball and tip really were, for scoring alone."""
+    context = plant.CreateDefaultContext()
+    tip, ball = plant.GetFrameByName(TIP_FRAME), plant.GetBodyByName("ball")
+    p_tip, p_ball = np.zeros((2, len(log.time), 3))
+    for i, state in enumerate(log["state"]):
+        plant.SetPositionsAndVelocities(context, state)
+        p_tip[i] = tip.CalcPoseInWorld(context).translation()
+        p_ball[i] = plant.EvalBodyPoseInWorld(context, ball).translation()
+    center = np.array(config.task.center)
+    model, _ = believed(config)
+    world = load_scene(config.world, DiagramBuilder())
+    reach_true = sum(
+        sphere_radius(world.plant, world.scene_graph, name) for name in (TOOL, "ball")
+    )
+    reach_model = model.tip_radius + model.ball_radius
+    x = log["x"]
+    distance = np.linalg.norm(p_tip - p_ball, axis=1) - reach_true
+    modelled = np.linalg.norm(x[:, P_TIP] - x[:, P_BALL], axis=1) - reach_model
+    return Track(
+        time=log.time,
+        p_ball=p_ball,
+        p_tip=p_tip,
+        progress=progress_of(p_ball, center),
+        error=abs(np.linalg.norm(p_ball[:, :2] - center, axis=1) - config.task.radius),
+        gap=log["gap"][:, 0],
+        gap_true=distance - modelled,
+    )
+
+
+def score(config, log, track):
+    """The flat result; NaN (null in the file) for what did not happen."""
+    circles = track.progress.max() / (2.0 * np.pi)
+    initiated = bool(track.progress.max() >= np.pi / 2)
+    after = slice(int(np.argmax(track.progress >= np.pi / 2)), None)
+    error = track.error[after] if initiated else np.array([np.nan])
+    last = track.progress >= track.progress.max() - 2.0 * np.pi
+    settled = circles >= 1.0
+    gap_error = float("nan")
+    if settled:
+        gap_error = float((track.gap[last] - track.gap_true[last]).mean())
+    mean = float(error.mean())
+    loss = log["loss"][:, 0] if config.adapt else np.array([])
+    learned = loss[loss > 0.0]
+    # A tenth of a minute at either end: a single sample says little.
+    span = round(6.0 / SAMPLE)
+    return {
+        "success": bool(circles >= CIRCLES and mean <= ERROR_MAX),
+        "initiated": initiated,
+        "circles_completed": float(circles),
+        "time_to_first_contact_s": float(log["contact_first"][-1, 0]),
+        "time_to_quarter_circle_s": first_time(track.time, track.progress >= np.pi / 2),
+        "time_to_circles_s": first_time(
+            track.time, track.progress >= 2.0 * np.pi * CIRCLES
+        ),
+        "tracking_error_mean_m": mean,
+        "tracking_error_p95_m": float(np.percentile(error, 95)),
+        "tracking_error_max_m": float(error.max()),
+        "r_gap_m": float(track.gap[last].mean()) if settled else float(track.gap[-1]),
+        "r_gap_error_m": gap_error,
+        "residual_loss_first": float(learned[:span].mean()) if learned.size else None,
+        "residual_loss_last": float(learned[-span:].mean()) if learned.size else None,
+        "contact_force_peak_N": float(log["contact_peak"][-1, 0]),
+        "torque_peak_Nm": float(log["torque_peak"][-1].max()),
+        "seen_share": float((log["seen"] > 0.5).mean()),
+        "c3_held_share": float((log["c3_status"] > 0.5).mean()),
+        "torque_rate_limited_share": float((log["arm_status"] >= 8.0).mean()),
+        "simulated_s": float(track.time[-1]),
+        "camera": describe_camera(config.camera),
+        "seed": config.seed,
+        "adapt": config.adapt,
+        "radius_error_m": config.radius_error_m,
+    }
+
+
+def write_recording(session, log, plant):
+    """What a real robot could have recorded, and the ball as the camera saw it."""
+    columns = {"time": log.time}
+    for i in range(7):
+        joint = f"{ARM}.panda_joint{i + 1}"
+        columns[f"{joint}.position"] = log["q"][:, i]
+        columns[f"{joint}.velocity"] = log["v"][:, i]
+        columns[f"{joint}.effort_command"] = log["tau"][:, i]
+        columns[f"{joint}.effort_measured"] = log["torque"][:, i]
+    for i, axis in enumerate("xyz"):
+        ball = log["x"][:, P_BALL.start + i]
+        columns[f"ball.ball.{axis}"] = np.where(log["seen"][:, 0] > 0.5, ball, np.nan)
+    for i, name in enumerate(("fx", "fy", "fz", "tx", "ty", "tz")):
+        columns[f"{TOOL}.{TIP_FRAME}.{name}"] = log["wrench"][:, i]
+    session.write_recording(columns)
+
+
+def plot_path(session, config, track):
+    """Fig. 5: the ball's track beside the target path."""
+    fig, ax = plt.subplots(figsize=(5, 5), layout="constrained")
+    angle = np.linspace(0.0, 2.0 * np.pi, 200)
+    x, y = config.task.center
+    radius = config.task.radius
+    ax.plot(
+        x + radius * np.cos(angle), y + radius * np.sin(angle), "k--", label="target"
+    )
+    ax.plot(track.p_ball[:, 0], track.p_ball[:, 1], color="tab:orange", label="ball")
+    ax.plot(*track.p_ball[0, :2], "o", color="tab:orange", label="start")
+    ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title="Track of the ball")
+    ax.legend(loc="center")
+    session.save_plot(fig, "path")
+
+
+def plot_residual(session, log, track):
+    """Fig. 6: residual and loss over time; and the error of the track."""
+    fig, axes = plt.subplots(3, 1, figsize=(7, 7), sharex=True, layout="constrained")
+    axes[0].plot(track.time, 1e3 * track.gap_true, lw=0.4, color="0.7", label="true")
+    axes[0].plot(track.time, 1e3 * track.gap, label="learned r_comp dt")
+    axes[0].set_ylabel("gap, true - modelled [mm]")
+    axes[0].legend(loc="lower right")
+    if "loss" in log:
+        loss = log["loss"][:, 0]
+        axes[1].semilogy(track.time, np.where(loss > 0.0, loss, np.nan), lw=0.8)
+    else:
+        axes[1].text(0.5, 0.5, "no adaptation", transform=axes[1].transAxes)
+    axes[1].set_ylabel("loss")
+    axes[2].plot(track.time, 1e3 * track.error, lw=0.8)
+    axes[2].set(ylabel="distance to the path [mm]", xlabel="time [s]")
+    session.save_plot(fig, "residual")
