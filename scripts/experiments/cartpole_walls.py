@@ -28,12 +28,12 @@ from makebreak.diagrams.cartpole_walls import (
     CartpoleWallsConfig,
     initial_state,
     make_cartpole_walls,
-    model_lcs,
     start,
     true_lcs,
 )
 from makebreak.scripts.session import Log, Session, run_many
 from makebreak.scripts.table import Table
+from makebreak.systems.numerics.lcp import solve_lcp
 from makebreak.systems.numerics.lcs import simulate
 from makebreak.systems.numerics.residual_learner import measured_step, violation_loss
 
@@ -55,12 +55,19 @@ QUADRANTS = {
 
 def run(config: CartpoleWallsConfig, session: Session) -> dict:
     """Both plants, scored; see the module for the criterion."""
-    logs: dict[str, Log] = {}
     x = initial_state(config)
-
-    def simulate_one(name, config, multibody, meshcat=None):
-        diagram = make_cartpole_walls(config, multibody, meshcat)
-        columns = {name: diagram.GetOutputPort(name) for name in ("x", "u", "r_comp")}
+    plain = replace(config, adapt=False)
+    # All are built before any is run, so that bad input is refused at once. The last
+    # one is what Meshcat's recording shows.
+    diagrams = {}
+    if config.adapt:
+        diagrams["lcs_plain"] = make_cartpole_walls(plain)
+        diagrams["multibody_plain"] = make_cartpole_walls(plain, multibody=True)
+    diagrams["lcs"] = make_cartpole_walls(config)
+    diagrams["multibody"] = make_cartpole_walls(config, True, session.meshcat)
+    logs: dict[str, Log] = {}
+    for name, diagram in diagrams.items():
+        columns = {c: diagram.GetOutputPort(c) for c in ("x", "u", "r_comp")}
         logs[name] = session.simulate(
             diagram,
             DURATION,
@@ -70,13 +77,6 @@ def run(config: CartpoleWallsConfig, session: Session) -> dict:
             label=name,
             context=start(diagram, x),
         )
-
-    plain = replace(config, adapt=False)
-    if config.adapt:
-        simulate_one("lcs_plain", plain, False)
-        simulate_one("multibody_plain", plain, True)
-    simulate_one("lcs", config, False)
-    simulate_one("multibody", config, True, session.meshcat)  # Last: it is recorded.
 
     truth = np.array(config.gap_error)
     result: dict = {"success": False}
@@ -133,22 +133,23 @@ def time_to_stay(time, error, bound) -> float | None:
 
 def contact_and_gradient(config: CartpoleWallsConfig, gap_error, x):
     """One step from each state x (n, 4) without input, and what the learner makes of it
-    at r = 0. Neither speed nor input would change it: they enter no gap, and the rest
-    of the dynamics is known.
+    at r = 0, its walls wrong by gap_error (2,) or (n, 2) [m]. Neither speed nor input
+    would change it: they enter no gap, and the rest of the dynamics is known.
 
     Returns: happened, predicted (n, 2) whether a force acts in truth and in the model;
         force (n, 2) eps times the gradient [N].
     """
     truth, u = true_lcs(), np.zeros(1)
-    model = model_lcs(replace(config, gap_error=list(gap_error)))
+    error = np.broadcast_to(gap_error, (len(x), 2))
     c = config.learner
     Q_d = np.array(c.Q_d or np.ones(truth.n_x))
     happened, predicted, force = (np.zeros((len(x), 2)) for _ in range(3))
     for k, x_k in enumerate(x):
         x_next, happened[k] = simulate(truth, x_k, u)
-        _, predicted[k] = simulate(model, x_k, u)
-        step = measured_step(model, x_k, u, x_next, Q_d, c.eps)
-        force[k] = c.eps * violation_loss(step, np.zeros(2), c.eps, c.gamma)[1][0]
+        predicted[k] = solve_lcp(truth.F, truth.E @ x_k + truth.c - error[k])
+        step = measured_step(truth, x_k, u, x_next, Q_d, c.eps)
+        # The wrong model is the right one with the residual -error.
+        force[k] = c.eps * violation_loss(step, -error[k], c.eps, c.gamma)[1][0]
     return happened > 0.0, predicted > 0.0, force
 
 
@@ -178,32 +179,30 @@ def gradient_map(config: CartpoleWallsConfig):
         image = kind[:, wall].reshape(62, 52).T
         ax.pcolormesh(cart, angle, image, cmap=colors, vmin=0, vmax=3)
         there = zero[:, wall]
-        ax.plot(*grid[there].T, ".", ms=1.5, color="0.55")
+        ax.plot(*grid[there].T, ".", ms=1.5, color="0.4")
         ax.set(title=f"wall {wall}", xlabel="cart [m]", ylabel="pole [rad]")
     handles: list = [
         plt.Rectangle((0, 0), 1, 1, fc=colors(i), ec="0.6") for i in range(4)
     ]
-    handles.append(plt.Line2D([], [], marker=".", ls="", color="0.55"))
+    handles.append(plt.Line2D([], [], marker=".", ls="", color="0.4"))
     axes[0].legend(handles, [*labels, "gradient is zero"], loc="lower left", fontsize=8)
 
     # The same for any error: true against modelled gap of wall 0, the pole upright.
-    gaps = np.linspace(-0.2, 0.2, 61)
-    distance = true_lcs().c[0]
-    size = np.zeros((61, 61))
-    for j, error in enumerate(gaps):
-        x = np.zeros((61, 4))
-        x[:, 0] = distance - gaps  # True gap.
-        # This row's modelled gap is gaps[j]; it would be the true gap plus an error.
-        for i in range(61):
-            _, _, f = contact_and_gradient(config, [gaps[i] - error, 0.0], x[i : i + 1])
-            size[j, i] = abs(f[0, 0])
+    gaps = np.linspace(-0.2, 0.2, 41)
+    modelled, true = (g.ravel() for g in np.meshgrid(gaps, gaps, indexing="ij"))
+    x, error = np.zeros((true.size, 4)), np.zeros((true.size, 2))
+    x[:, 0], error[:, 0] = true_lcs().c[0] - true, true - modelled
+    size = abs(contact_and_gradient(config, error, x)[2][:, 0]).reshape(41, 41)
     shown = np.ma.masked_less(size, 1e-9)
     image = axes[2].pcolormesh(gaps, gaps, shown, norm=LogNorm(1e-3, size.max()))
     figure.colorbar(image, ax=axes[2], label="eps |gradient| [N]; white: zero")
     axes[2].axhline(0, color="0.5", lw=0.8)
     axes[2].axvline(0, color="0.5", lw=0.8)
     axes[2].set(
-        title="any error", xlabel="true gap [m]", ylabel="modelled gap [m]", aspect=1
+        title="wall 0, any error",
+        xlabel="true gap [m]",
+        ylabel="modelled gap [m]",
+        aspect=1,
     )
     return figure, shares
 
