@@ -34,7 +34,11 @@ from makebreak.models.tip_and_ball import TipAndBall, make_tip_and_ball
 from makebreak.systems.arm_reference import ArmReference, ArmReferenceConfig
 from makebreak.systems.ball_tracker import BallTracker, BallTrackerConfig
 from makebreak.systems.c3_mpc import C3Config, C3Mpc
-from makebreak.systems.impedance_controller import ImpedanceConfig, ImpedanceController
+from makebreak.systems.impedance_controller import (
+    ImpedanceConfig,
+    ImpedanceController,
+    serial_chain_of,
+)
 from makebreak.systems.lcs_builder import (
     AnitescuLcsBuilder,
     ContactPair,
@@ -274,8 +278,8 @@ def make_ball_rolling(
                 period_sec=ESTIMATE,
                 offset_sec=OFFSET["estimator"],
             ),
-            arm,
-            tip,
+            serial_chain_of(arm, TIP_FRAME),
+            arm.GetPositions(arm.CreateDefaultContext()),
         ),
     )
     c3 = builder.AddNamedSystem(

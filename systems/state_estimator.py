@@ -1,11 +1,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import Frame, JacobianWrtVariable, MultibodyForces
 from pydrake.systems.framework import LeafSystem
 
 from makebreak.systems.numerics.ball_state import pack
+from makebreak.systems.numerics.serial_chain import SerialChain
+from makebreak.systems.numerics.state_estimator import tip_motion
 from makebreak.systems.numerics.timing import timed
 
 
@@ -21,13 +21,9 @@ class StateEstimatorConfig:
 class StateEstimator(LeafSystem):
     """Joint sensors and the ball tracker, as the state and input of the LCS.
 
-    The LCS knows the arm as a point of mass m that a force u pushes. The force that
-    explains the tip's motion with *that* mass is
-
-        u = m J_v M^-1 (tau - bias),     bias = C(q, v) v - tau_gravity,
-
-    the tip's acceleration without contact, times m (J_v_dot v is small and left out);
-    its mean over the window is what the residual learner needs.
+    The LCS knows the arm as a point of some mass; u_measured is the force on it that
+    explains the tip's motion (numerics/state_estimator.py), as a mean over the window,
+    which is what the residual learner needs.
 
     Inputs:  q (7,), v (7,), torque (7,) motor side [rad, rad/s, N m]; p_ball (3,),
              v_ball (3,) [m, m/s]; seen (1,).
@@ -37,17 +33,19 @@ class StateEstimator(LeafSystem):
     A reading that is not finite leaves x and u_measured as they were.
     """
 
-    def __init__(self, config: StateEstimatorConfig, arm: MultibodyPlant, tip: Frame):
+    def __init__(self, config: StateEstimatorConfig, chain: SerialChain, q_default):
+        """Args: chain, the arm with its tool as the model has it; q_default (n,) [rad],
+        where x is before the first reading."""
         super().__init__()
         if not config.ball_radius > 0.0 or not config.tip_mass > 0.0:
             raise ValueError(
                 "ball_radius and tip_mass must be positive, got "
                 f"{config.ball_radius}, {config.tip_mass}"
             )
-        self._config, self._arm, self._tip = config, arm, tip
-        self._arm_context = arm.CreateDefaultContext()  # Scratch.
-        self._forces = MultibodyForces(arm)  # Scratch.
-        n = arm.num_velocities()
+        self._config, self._chain = config, chain
+        n = len(chain.mass)
+        q_default = np.array(q_default, dtype=float)
+        p_tip, _, _ = tip_motion(chain, q_default, np.zeros(n), np.zeros(n), 1.0)
         n_window = max(1, round(config.window_sec / config.period_sec))
         self._q = self.DeclareVectorInputPort("q", n)
         self._v = self.DeclareVectorInputPort("v", n)
@@ -55,8 +53,7 @@ class StateEstimator(LeafSystem):
         self._p_ball = self.DeclareVectorInputPort("p_ball", 3)
         self._v_ball = self.DeclareVectorInputPort("v_ball", 3)
         self._seen = self.DeclareVectorInputPort("seen", 1)
-        p_WT = self._tip.CalcPoseInWorld(self._arm_context).translation()
-        x0 = pack(p_WT, np.zeros(3), [0, 0, config.ball_radius], np.zeros(3), 1.0)
+        x0 = pack(p_tip, np.zeros(3), [0, 0, config.ball_radius], np.zeros(3), 1.0)
         self._x = self.DeclareDiscreteState(x0)
         self._window = self.DeclareDiscreteState(3 * n_window)
         self._valid = self.DeclareDiscreteState(1)
@@ -86,20 +83,8 @@ class StateEstimator(LeafSystem):
         if not np.isfinite(total):
             discrete_state.set_value(self._valid, [0.0])
             return
-        arm, arm_context = self._arm, self._arm_context
-        arm.SetPositions(arm_context, q)
-        arm.SetVelocities(arm_context, v)
-        M = arm.CalcMassMatrix(arm_context)
-        # One call gives bias and gravity together: the torque that holds vdot = 0.
-        arm.CalcForceElementsContribution(arm_context, self._forces)
-        bias = arm.CalcInverseDynamics(arm_context, np.zeros_like(v), self._forces)
-        world = arm.world_frame()
-        J = arm.CalcJacobianTranslationalVelocity(
-            arm_context, JacobianWrtVariable.kV, self._tip, np.zeros(3), world, world
-        )
-        u = self._config.tip_mass * (J @ np.linalg.solve(M, torque - bias))
-        p_tip = self._tip.CalcPoseInWorld(arm_context).translation()
-        x = pack(p_tip, J @ v, p_ball, v_ball, self._config.ball_radius)
+        p_tip, v_tip, u = tip_motion(self._chain, q, v, torque, self._config.tip_mass)
+        x = pack(p_tip, v_tip, p_ball, v_ball, self._config.ball_radius)
         window = context.get_discrete_state(self._window).value()
         discrete_state.set_value(self._x, x)
         discrete_state.set_value(self._window, np.append(window[3:], u))
