@@ -20,10 +20,10 @@ from makebreak.systems.numerics.timing import timed
 @dataclass
 class ImpedanceConfig:
     stiffness: list[float] = field(  # [N/m] x 3, [N m/rad] x 3
-        default_factory=lambda: [1000.0] * 3 + [20.0] * 3
+        default_factory=lambda: [1000.0] * 3 + [50.0] * 3
     )
     damping: list[float] = field(  # [N s/m] x 3, [N m s/rad] x 3
-        default_factory=lambda: [400.0] * 3 + [2.0] * 3
+        default_factory=lambda: [400.0] * 3 + [15.0] * 3
     )
     control_orientation: bool = False  # False: position only, kept upright by posture.
     posture_stiffness: float = 100.0  # [1/s2]

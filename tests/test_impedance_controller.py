@@ -1,0 +1,500 @@
+import numpy as np
+import pytest
+from pydrake.math import RotationMatrix
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import JacobianWrtVariable
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from scipy.spatial.transform import Rotation
+
+from makebreak.diagrams.station import (
+    MODELS,
+    SensorNoise,
+    StationConfig,
+    make_control_plant,
+    make_station,
+)
+from makebreak.models.scene import read_scene
+from makebreak.systems.impedance_controller import (
+    ImpedanceConfig,
+    ImpedanceController,
+    serial_chain_of,
+)
+from makebreak.systems.numerics.impedance_controller import (
+    EFFORT_LIMITED,
+    RATE_LIMITED,
+    REFERENCE_HELD,
+    SENSORS_HELD,
+    impedance_torque,
+    memory_size,
+    quaternion_of,
+    rotation_error,
+    rotation_of,
+    tick,
+)
+from makebreak.systems.numerics.serial_chain import chain_state, tip_kinematics
+
+EFFORT = np.repeat([87.0, 12.0], [4, 3])
+NO_NOISE = SensorNoise(0.0, 0.0, 0.0, 0.0, 0.0)
+P_TIP = np.array([0.5, 0.0, 0.1])
+
+
+@pytest.fixture(scope="module")
+def plant():
+    return make_control_plant()
+
+
+@pytest.fixture(scope="module")
+def law(plant):
+    return ImpedanceController(ImpedanceConfig(), plant)._law
+
+
+@pytest.fixture(scope="module")
+def chain(plant):
+    return serial_chain_of(plant, "tip")
+
+
+def reference(p=P_TIP, v=(0, 0, 0), a=(0, 0, 0), quaternion=(1, 0, 0, 0)):
+    x_d = np.zeros(19)
+    x_d[:3], x_d[3:7], x_d[7:10], x_d[13:16] = p, quaternion, v, a
+    return x_d
+
+
+def random_states(n):
+    rng = np.random.default_rng(0)
+    return [(rng.uniform(-2.5, 2.5, 7), rng.uniform(-2, 2, 7)) for _ in range(n)]
+
+
+class Loop:
+    """Station without noise and controller, closed."""
+
+    def __init__(self, config=None, ball=(0.8, 0.3), effects=None):
+        scene = read_scene(StationConfig().scene)
+        scene.initial.poses["ball.ball"] = [1, 0, 0, 0, *ball, 0.0315]
+        builder = DiagramBuilder()
+        self.station = builder.AddSystem(
+            make_station(StationConfig(noise=NO_NOISE), scene=scene)
+        )
+        self.controller = builder.AddSystem(
+            ImpedanceController(
+                config or ImpedanceConfig(offset_sec=0.0005), make_control_plant()
+            )
+        )
+        for port, name in (("position", "q"), ("velocity", "v")):
+            builder.Connect(
+                self.station.GetOutputPort(f"panda.{port}_measured"),
+                self.controller.GetInputPort(name),
+            )
+        builder.Connect(
+            self.controller.GetOutputPort("tau"),
+            self.station.GetInputPort("panda.torque_commanded"),
+        )
+        self.simulator = Simulator(builder.Build())
+        root = self.simulator.get_mutable_context()
+        self.root = root
+        self.context = self.controller.GetMyMutableContextFromRoot(root)
+        self.plant = self.station.GetSubsystemByName("plant")
+        self.plant_context = self.plant.GetMyMutableContextFromRoot(root)
+        self.tip = self.plant.GetFrameByName("tip")
+        self.set(reference())
+
+    def set(self, x_d, **ports):
+        self.controller.GetInputPort("x_desired").FixValue(self.context, x_d)
+        for name, value in ports.items():
+            self.controller.GetInputPort(name).FixValue(self.context, value)
+
+    def run(self, seconds):
+        self.simulator.AdvanceTo(self.root.get_time() + seconds)
+
+    def tau(self):
+        return self.controller.GetOutputPort("tau").Eval(self.context)
+
+    def status(self):
+        return int(self.controller.GetOutputPort("status").Eval(self.context)[0])
+
+    def pose(self):
+        return self.tip.CalcPoseInWorld(self.plant_context)
+
+    def push(self, force):
+        """A force on the tip in the world [N], as the torques that it makes."""
+        J = self.plant.CalcJacobianTranslationalVelocity(
+            self.plant_context,
+            JacobianWrtVariable.kV,
+            self.tip,
+            [0, 0, 0],
+            self.plant.world_frame(),
+            self.plant.world_frame(),
+        )
+        port = self.plant.get_applied_generalized_force_input_port()
+        port.FixValue(self.plant_context, J.T @ np.asarray(force, dtype=float))
+
+
+# The arm's dynamics.
+
+
+def test_chain_agrees_with_drake(plant, chain):
+    # Both are exact; numbers up to 1e2 keep 13 digits.
+    context = plant.CreateDefaultContext()
+    tip, world = plant.GetFrameByName("tip"), plant.world_frame()
+    for q, v in random_states(20):
+        plant.SetPositions(context, q)
+        plant.SetVelocities(context, v)
+        s = chain_state(chain, q, v)
+        close = dict(atol=1e-12, rtol=1e-12)
+        np.testing.assert_allclose(s.M, plant.CalcMassMatrix(context), **close)
+        gravity = plant.CalcGravityGeneralizedForces(context)
+        np.testing.assert_allclose(
+            s.bias, plant.CalcBiasTerm(context) - gravity, **close
+        )
+        kind = JacobianWrtVariable.kV
+        args = (context, kind, tip, [0, 0, 0], world, world)
+        J = plant.CalcJacobianSpatialVelocity(*args)
+        np.testing.assert_allclose(s.J, np.vstack([J[3:], J[:3]]), **close)
+        a = plant.CalcBiasSpatialAcceleration(*args).get_coeffs()
+        np.testing.assert_allclose(s.bias_a, np.concatenate([a[3:], a[:3]]), **close)
+        X = tip.CalcPoseInWorld(context)
+        np.testing.assert_allclose(s.p_WE, X.translation(), **close)
+        np.testing.assert_allclose(s.R_WE, X.rotation().matrix(), **close)
+        p, R, J_again = tip_kinematics(chain, q)
+        np.testing.assert_array_equal(p, s.p_WE)
+        np.testing.assert_array_equal(R, s.R_WE)
+        np.testing.assert_array_equal(J_again, s.J)
+
+
+def test_rotations_agree_with_scipy():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        A, B = Rotation.random(rng=rng), Rotation.random(rng=rng)
+        wxyz = np.roll(A.as_quat(), 1)
+        np.testing.assert_allclose(rotation_of(3.0 * wxyz), A.as_matrix(), atol=1e-14)
+        same = quaternion_of(A.as_matrix())
+        np.testing.assert_allclose(same, wxyz * np.sign(wxyz[0]), atol=1e-14)
+        expected = (A * B.inv()).as_rotvec()
+        error = rotation_error(A.as_matrix(), B.as_matrix())
+        np.testing.assert_allclose(error, expected, atol=1e-12)
+
+
+# The law.
+
+
+@pytest.mark.parametrize("control_orientation", [False, True])
+def test_torque_is_the_law_written_out(law, chain, control_orientation):
+    law = law._replace(control_orientation=control_orientation)
+    rng = np.random.default_rng(1)
+    m = 6 if control_orientation else 3
+    for q, v in random_states(5):
+        q_n, x_d, wrench = (
+            q + 0.1 * rng.normal(size=7),
+            rng.normal(size=19),
+            np.arange(6.0),
+        )
+        R_d = Rotation.random(rng=rng).as_matrix()
+        K, D = law.stiffness, law.damping
+        s = chain_state(chain, q, v)
+        J, M_inv = s.J[:m], np.linalg.inv(s.M)
+        Lambda = np.linalg.inv(J @ M_inv @ J.T)
+        turn = Rotation.from_matrix(R_d @ s.R_WE.T).as_rotvec()
+        error = np.concatenate([x_d[:3] - s.p_WE, turn])[:m]
+        F = K[:m] * error + D[:m] * (x_d[7:13] - s.J @ v)[:m] + wrench[:m]
+        F += Lambda @ (x_d[13:19][:m] - s.bias_a[:m])
+        follow = np.concatenate([J @ v, np.zeros(6 - m)])
+        damped = s.J.T @ np.linalg.inv(s.J @ s.J.T + 0.02**2 * np.eye(6))
+        qdd = 100.0 * (q_n - q) + 20.0 * (damped @ follow - v)
+        N_T = np.eye(7) - J.T @ Lambda @ J @ M_inv
+        expected = J.T @ F + s.bias + N_T @ s.M @ qdd
+        tau, p = impedance_torque(chain, law, q, v, q_n, x_d, R_d, K, D, wrench)
+        np.testing.assert_allclose(p, s.p_WE)
+        # Lambda is regularised by 1e-9 of its inverse's size.
+        np.testing.assert_allclose(tau, expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("control_orientation", [False, True])
+def test_posture_never_accelerates_the_task(law, chain, control_orientation):
+    # J inv(M) N' = 0: the tip's acceleration is the same for any posture.
+    law = law._replace(control_orientation=control_orientation)
+    m = 6 if control_orientation else 3
+    for q, v in random_states(10):
+        s = chain_state(chain, q, v)
+        x_d = reference()
+        args = (x_d, np.eye(3), law.stiffness, law.damping, np.zeros(6))
+        tau = [
+            impedance_torque(chain, law, q, v, q_n, *args)[0] for q_n in (q, q + 0.5)
+        ]
+        assert np.abs(tau[1] - tau[0]).max() > 1.0
+        change = s.J[:m] @ np.linalg.solve(s.M, tau[1] - tau[0])
+        # Exact but for Lambda's regularisation, by 1e-9 of its inverse's largest entry.
+        J = s.J[:m]
+        mobility = J @ np.linalg.solve(s.M, J.T)
+        left = 1e-9 * mobility.max() * np.linalg.solve(mobility, J @ np.full(7, 50.0))
+        atol = 1.1 * np.abs(left).max() + 1e-10
+        np.testing.assert_allclose(change, 0.0, atol=atol)
+
+
+def test_rotational_gains_are_lessened_where_the_wrist_is_light(law, chain):
+    # Without rotors the wrist has 0.005 kg m2: explicit damping of 20 N m s/rad would
+    # be unstable at 1 kHz. One explicit step must not reverse the rate of turning.
+    light = chain._replace(rotor=np.zeros(7))
+    law = law._replace(control_orientation=True)
+    D = np.array([0.0, 0, 0, 20, 20, 20])
+    q = law.q_nominal
+    s = chain_state(light, q, np.zeros(7))
+    for w in np.eye(3):
+        v = np.linalg.pinv(s.J) @ np.concatenate([np.zeros(3), w])
+        at_v = chain_state(light, q, v)
+        x_d = reference(s.p_WE)
+        tau, _ = impedance_torque(
+            light, law, q, v, q, x_d, s.R_WE, np.zeros(6), D, np.zeros(6)
+        )
+        v_next = v + 1e-3 * np.linalg.solve(at_v.M, tau - at_v.bias)
+        assert (s.J[3:] @ v_next) @ w > 0.0
+
+
+# Limits and bad input, one tick at a time.
+
+
+def run_ticks(chain, law, inputs):
+    """tau, status after each of a sequence of (q, v, x_d[, K, D, wrench])."""
+    tau = chain_state(chain, law.q_nominal, np.zeros(7)).bias
+    memory, rows = np.zeros(memory_size(7)), []
+    for q, v, x_d, *rest in inputs:
+        K, D, wrench = (*rest, *(law.stiffness, law.damping, np.zeros(6))[len(rest) :])
+        tau, status, memory = tick(chain, law, tau, memory, q, v, x_d, K, D, wrench)
+        rows.append((tau, status))
+    return rows
+
+
+@pytest.mark.parametrize("size", [1.0, 1e3, 1e12, 1e200, 1e307])
+def test_limits_hold_under_absurd_inputs(law, chain, size):
+    rng = np.random.default_rng(2)
+    inputs = [
+        (
+            law.q_nominal + 0.3 * rng.normal(size=7),
+            size * rng.normal(size=7),
+            reference(size * rng.normal(size=3), size * rng.normal(size=3)),
+            law.stiffness,
+            law.damping,
+            size * rng.normal(size=6),
+        )
+        for _ in range(300)
+    ]
+    before = chain_state(chain, law.q_nominal, np.zeros(7)).bias
+    flags = 0
+    for tau, status in run_ticks(chain, law, inputs):
+        assert np.all(np.isfinite(tau))
+        assert np.all(np.abs(tau) <= EFFORT)
+        assert np.all(np.abs(tau - before) <= 1.0 + 1e-12)  # 1000 N m/s x 1 ms.
+        before, flags = tau, flags | status
+    assert flags & RATE_LIMITED
+
+
+def test_effort_limit_is_reached_and_said(law, chain):
+    rows = run_ticks(
+        chain, law, [(law.q_nominal, np.zeros(7), reference([0.5, 0.0, 5.0]))] * 150
+    )
+    tau, status = rows[-1]
+    assert status & EFFORT_LIMITED
+    assert np.abs(tau / EFFORT).max() == 1.0
+
+
+@pytest.mark.parametrize("which", ["q", "v"])
+def test_nan_sensors_ramp_to_carrying_the_arm(law, chain, which):
+    still = np.zeros(7)
+    good = (law.q_nominal, still, reference([0.5, 0.0, 0.13]))  # 30 N upwards.
+    bad_q, bad_v = law.q_nominal.copy(), still.copy()
+    (bad_q if which == "q" else bad_v)[3] = np.nan
+    rows = run_ticks(chain, law, [good] * 30 + [(bad_q, bad_v, good[2])] * 60)
+    carrying = chain_state(chain, law.q_nominal, still).bias
+    assert not rows[29][1] & SENSORS_HELD
+    assert np.abs(rows[29][0] - carrying).max() > 5.0
+    assert all(status & SENSORS_HELD for _, status in rows[30:])
+    steps = np.diff([tau for tau, _ in rows], axis=0)
+    assert np.abs(steps).max() <= 1.0 + 1e-12
+    np.testing.assert_allclose(rows[-1][0], carrying, atol=1e-12)
+
+
+def test_nan_sensors_from_the_start_carry_the_nominal_arm(law, chain):
+    nan = np.full(7, np.nan)
+    rows = run_ticks(chain, law, [(nan, nan, reference())] * 3)
+    carrying = chain_state(chain, law.q_nominal, np.zeros(7)).bias
+    np.testing.assert_allclose(rows[-1][0], carrying, atol=1e-12)
+
+
+@pytest.mark.parametrize("index", [0, 4, 8, 14])
+def test_nan_reference_holds_the_last_good_pose_at_rest(law, chain, index):
+    moving = reference([0.5, 0.0, 0.102], v=[0.02, 0, 0])
+    at_rest = reference([0.5, 0.0, 0.102])
+    bad = moving.copy()
+    bad[index] = np.nan
+    state = (law.q_nominal, np.zeros(7))
+    rows = run_ticks(chain, law, [(*state, moving)] * 30 + [(*state, bad)] * 30)
+    held = run_ticks(chain, law, [(*state, moving)] * 30 + [(*state, at_rest)] * 30)
+    np.testing.assert_array_equal(rows[-1][0], held[-1][0])
+    assert rows[-1][1] == REFERENCE_HELD and held[-1][1] == 0
+
+
+def test_without_any_good_reference_the_arm_stays(law, chain):
+    state = (law.q_nominal, np.zeros(7))
+    bad = np.full(19, np.nan)
+    rows = run_ticks(chain, law, [(*state, bad)] * 30)
+    carrying = chain_state(chain, *state).bias
+    # The posture takes a step every 12 ticks, from nominal angles of six digits.
+    np.testing.assert_allclose(rows[-1][0], carrying, atol=1e-3)
+    assert rows[-1][1] == REFERENCE_HELD
+
+
+@pytest.mark.parametrize(  # A wrench may be negative.
+    "port, value", [(0, np.nan), (0, -1.0), (1, np.nan), (1, -1.0), (2, np.nan)]
+)
+def test_bad_gains_and_wrench_fall_back_and_are_said(law, chain, port, value):
+    state = (law.q_nominal, np.zeros(7), reference([0.5, 0.0, 0.101]))
+    rest = [law.stiffness, law.damping, np.zeros(6)]
+    expected = run_ticks(chain, law, [(*state, *rest)] * 5)[-1]
+    rest[port] = np.full(6, value)
+    tau, status = run_ticks(chain, law, [(*state, *rest)] * 5)[-1]
+    assert status == REFERENCE_HELD and expected[1] == 0
+    np.testing.assert_array_equal(tau, expected[0])
+
+
+# On the simulated arm.
+
+
+def test_arm_is_held_still_against_gravity():
+    loop = Loop()
+    loop.run(1.0)
+    # The scene's angles have six digits: the posture settles within 1e-5 m.
+    np.testing.assert_allclose(loop.pose().translation(), P_TIP, atol=1e-5)
+    assert np.abs(loop.plant.GetVelocities(loop.plant_context)[:7]).max() < 1e-4
+    assert loop.status() == 0
+
+
+@pytest.mark.parametrize("control_orientation", [False, True])
+def test_a_pushed_tip_yields_by_force_over_stiffness(control_orientation):
+    loop = Loop(
+        ImpedanceConfig(control_orientation=control_orientation, offset_sec=0.0005)
+    )
+    force = np.array([4.0, -3.0, 5.0])
+    stiffness = np.array([500.0, 1000.0, 2000.0, 50.0, 50.0, 50.0])
+    damping = np.array([120.0, 150.0, 200.0, 15.0, 15.0, 15.0])
+    loop.set(reference(), stiffness=stiffness, damping=damping)
+    for _ in range(10):
+        loop.push(force)
+        loop.run(0.25)
+    yielded = loop.pose().translation() - P_TIP
+    # Slowest: 120/500 s, so 2.5 s leave e^-10 of 8 mm.
+    np.testing.assert_allclose(yielded, force / stiffness[:3], atol=1e-5)
+
+
+def test_feed_forward_adds_to_the_spring():
+    loop = Loop()
+    damping = [150.0] * 3 + [0.0] * 3
+    wrench = [0.0, 0.0, 5.0, 0.0, 0.0, 0.0]
+    loop.set(reference(), damping=damping, wrench_feedforward=wrench)
+    loop.run(1.5)
+    moved = loop.pose().translation() - P_TIP
+    np.testing.assert_allclose(moved, [0.0, 0.0, 5.0 / 1000.0], atol=2e-5)
+
+
+def test_reference_acceleration_is_followed_without_lag():
+    # A quintic over 40 mm with its acceleration: only the 1 ms hold is left. Without
+    # a_d the tip would be behind by Lambda a/K, 4 kg 0.9 m/s2/(1000 N/m) = 4 mm.
+    loop = Loop()
+    worst = 0.0
+    for k in range(500):
+        s = k / 500.0
+        p = P_TIP + [0.0, 0.0, 0.04 * (10 * s**3 - 15 * s**4 + 6 * s**5)]
+        v = [0.0, 0.0, 0.04 / 0.5 * (30 * s**2 - 60 * s**3 + 30 * s**4)]
+        a = [0.0, 0.0, 0.04 / 0.25 * (60 * s - 180 * s**2 + 120 * s**3)]
+        loop.set(reference(p, v, a))
+        error = loop.pose().translation() - p
+        worst = max(worst, np.linalg.norm(error))
+        loop.run(0.001)
+    assert worst < 5e-4
+
+
+def test_finger_stays_upright_while_the_tip_circles():
+    loop = Loop()
+    worst, rate = 0.0, 2.0 * np.pi / 3.0
+    for k in range(800):
+        t = 0.004 * k
+        s = min(t / 0.8, 1.0)
+        radius = 0.12 * (10 * s**3 - 15 * s**4 + 6 * s**5)
+        spoke = np.array([np.cos(rate * t), np.sin(rate * t), 0.0])
+        along = np.array([-spoke[1], spoke[0], 0.0])
+        p, v = P_TIP + radius * spoke, radius * rate * along
+        loop.set(reference(p, v, -radius * rate**2 * spoke))
+        loop.run(0.004)
+        up = loop.pose().rotation().matrix()[2, 2]
+        worst = max(worst, np.degrees(np.arccos(min(up, 1.0))))
+    assert worst < 3.0
+
+
+def test_full_pose_is_reached_when_orientation_is_controlled():
+    # The slowest part takes 15/50 s, so 3 s leave e^-10 of 0.36 rad.
+    loop = Loop(
+        ImpedanceConfig(
+            control_orientation=True, damping=[200.0] * 3 + [15.0] * 3, offset_sec=5e-4
+        )
+    )
+    turned = RotationMatrix.MakeXRotation(0.2) @ RotationMatrix.MakeZRotation(0.3)
+    wxyz = turned.ToQuaternion().wxyz()
+    loop.set(reference([0.52, 0.03, 0.12], quaternion=wxyz))
+    loop.run(3.0)
+    X = loop.pose()
+    np.testing.assert_allclose(X.translation(), [0.52, 0.03, 0.12], atol=1e-4)
+    np.testing.assert_allclose(X.rotation().matrix(), turned.matrix(), atol=1e-3)
+
+
+def test_a_restored_context_replays_bit_for_bit():
+    loop = Loop(ball=(0.5, 0.0))
+    loop.set(reference([0.5, 0.02, 0.08]))  # Presses on the ball's side.
+    loop.run(0.2)
+    saved = loop.root.Clone()
+    loop.run(0.2)
+    first = (loop.tau(), loop.plant.GetPositions(loop.plant_context))
+    again = Simulator(loop.simulator.get_system(), saved)
+    again.AdvanceTo(0.4)
+    context = loop.controller.GetMyContextFromRoot(saved)
+    np.testing.assert_array_equal(
+        loop.controller.GetOutputPort("tau").Eval(context), first[0]
+    )
+    q = loop.plant.GetPositions(loop.plant.GetMyContextFromRoot(saved))
+    np.testing.assert_array_equal(q, first[1])
+
+
+def test_the_default_torque_carries_the_arm(plant, chain):
+    controller = ImpedanceController(ImpedanceConfig(), plant)
+    tau = controller.GetOutputPort("tau").Eval(controller.CreateDefaultContext())
+    context = plant.CreateDefaultContext()
+    expected = -plant.CalcGravityGeneralizedForces(context)
+    np.testing.assert_allclose(tau, expected, atol=1e-12)
+
+
+# Refusals.
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"stiffness": [1.0] * 5}, "stiffness is .* expected 6 numbers"),
+        ({"damping": [-1.0] * 6}, "damping is .* expected 6 numbers"),
+        ({"stiffness": [np.nan] * 6}, "stiffness is .* expected 6 numbers"),
+        ({"posture_stiffness": -1.0}, "posture_stiffness is -1.0"),
+        ({"period_sec": 0.0}, "period_sec is 0.0, expected > 0"),
+    ],
+)
+def test_bad_configs_are_refused(plant, change, words):
+    with pytest.raises(ValueError, match=words):
+        ImpedanceController(ImpedanceConfig(**change), plant)
+
+
+def test_plants_that_are_no_arm_are_refused(plant):
+    with pytest.raises(ValueError, match="no frame 'tap'"):
+        ImpedanceController(ImpedanceConfig(), plant, "tap")
+    ball = MultibodyPlant(0.0)
+    Parser(ball).AddModels(str(MODELS / "ball.sdf"))
+    ball.Finalize()
+    with pytest.raises(ValueError, match="is not revolute"):
+        ImpedanceController(ImpedanceConfig(), ball, "ball")
+    with pytest.raises(ValueError, match="torque_rate_max is 0"):
+        ImpedanceController(ImpedanceConfig(), plant, torque_rate_max=0.0)
