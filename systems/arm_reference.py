@@ -4,7 +4,7 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import LeafSystem
 
-from makebreak.systems.numerics.arm_reference import approach, clip_norm, ticks_left
+from makebreak.systems.numerics.arm_reference import clip_norm, step, ticks_left
 from makebreak.systems.numerics.ball_state import N_X, P_TIP, V_TIP
 from makebreak.systems.numerics.lcs import LCS
 from makebreak.systems.numerics.rolling_task import ROLL
@@ -37,18 +37,21 @@ class ArmReference(LeafSystem):
 
     def __init__(self, config: ArmReferenceConfig, n_lam: int, p_tip, lcs: LCS):
         super().__init__()
+        step(
+            np.zeros(12), np.zeros(12), ticks_left(0.0, 1.0, 0.0, 1.0), np.inf
+        )  # Compiles.
         self._config = config
         self._phase = self.DeclareVectorInputPort("phase", 1)
         self._reference = self.DeclareVectorInputPort("reference", 9)
         self._x_next = self.DeclareVectorInputPort("x_next", N_X)
         self._lam = self.DeclareVectorInputPort("lam", n_lam)
         self._lcs = self.DeclareAbstractInputPort("lcs", AbstractValue.Make(lcs))
-        pose = np.zeros(19)
-        pose[0:3], pose[3] = p_tip, 1.0
-        self._pose = self.DeclareDiscreteState(pose)
-        self._wrench = self.DeclareDiscreteState(6)
-        self.DeclareStateOutputPort("x_desired", self._pose)
-        self.DeclareStateOutputPort("wrench", self._wrench)
+        self._zero = np.zeros(3)
+        self._level = np.eye(19)[3]  # No rotation; position and the rest are filled in.
+        self._state = self.DeclareDiscreteState([*p_tip, *np.zeros(9)])
+        ticket = {self.discrete_state_ticket(self._state)}
+        self.DeclareVectorOutputPort("x_desired", 19, self._pose, ticket)
+        self.DeclareVectorOutputPort("wrench", 6, self._wrench, ticket)
         self.DeclarePeriodicDiscreteUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
@@ -56,27 +59,30 @@ class ArmReference(LeafSystem):
     @timed
     def _update(self, context, discrete_state):
         c = self._config
-        pose = context.get_discrete_state(self._pose).value().copy()
-        force = context.get_discrete_state(self._wrench).value()[:3]
+        reference = context.get_discrete_state(self._state).value()
         n_left = ticks_left(
             context.get_time(), c.command_period_sec, c.command_offset_sec, c.period_sec
         )
+        dv_max = np.inf
         if self._phase.Eval(context)[0] == ROLL:
             x_next = self._x_next.Eval(context)
-            p, v, a = x_next[P_TIP], x_next[V_TIP], np.zeros(3)
             # D lam is the change of velocity that the contact gives the tip.
             lcs = self._lcs.Eval(context)
             on_tip = c.tip_mass / lcs.dt * (lcs.D[V_TIP] @ self._lam.Eval(context))
-            f = clip_norm(-on_tip, c.force_max)
+            force = clip_norm(-on_tip, c.force_max)
+            target = np.concatenate((x_next[P_TIP], x_next[V_TIP], self._zero, force))
             dv_max = c.acceleration_max * c.period_sec
         else:
-            reference = self._reference.Eval(context)
-            p, v, a, f = *reference.reshape(3, 3), np.zeros(3)
-            dv_max = np.inf
-        pose[0:3] = approach(pose[0:3], p, n_left, np.inf)
-        pose[7:10] = approach(pose[7:10], v, n_left, dv_max)
-        pose[13:16] = approach(pose[13:16], a, n_left, np.inf)
-        force = approach(force, f, n_left, np.inf)
-        if np.isfinite(pose.sum() + force.sum()):
-            discrete_state.set_value(self._pose, pose)
-            discrete_state.set_value(self._wrench, np.append(force, np.zeros(3)))
+            target = np.concatenate((self._reference.Eval(context), self._zero))
+        discrete_state.set_value(self._state, step(reference, target, n_left, dv_max))
+
+    def _pose(self, context, output):
+        reference = context.get_discrete_state(self._state).value()
+        pose = self._level.copy()
+        pose[0:3], pose[7:10] = reference[0:3], reference[3:6]
+        pose[13:16] = reference[6:9]
+        output.SetFromVector(pose)
+
+    def _wrench(self, context, output):
+        reference = context.get_discrete_state(self._state).value()
+        output.SetFromVector(np.concatenate((reference[9:], self._zero)))

@@ -38,7 +38,8 @@ class ToolWrench(LeafSystem):
         self._p_CE = plant.CalcRelativeTransform(
             self._plant_context, self._mount, plant.GetFrameByName(tip)
         ).translation()
-        zero = np.zeros(3)  # Compiles it.
+        zero = np.zeros(3)  # Compiles it, for arrays of the kind that Drake gives.
+        zero.setflags(write=False)
         R = self._mount.CalcRotationMatrixInWorld(self._plant_context).matrix()
         external_wrench(zero, zero, R, self._weight, self._p_CM, self._p_CE)
         self._reactions = self.DeclareAbstractInputPort(

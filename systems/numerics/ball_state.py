@@ -2,8 +2,8 @@
 
     x = [p_tip 3, q_ball wxyz 4, p_ball 3, v_tip 3, omega_ball 3, v_ball 3]   [SI]
 
-All in the world frame. Nobody sees how a plain ball is turned, and no distance depends on it: q_ball is
-always the identity in an estimate.
+All in the world frame. Nobody sees how a plain ball is turned, and no distance depends
+on it: q_ball is always the identity in an estimate.
 """
 
 import numpy as np

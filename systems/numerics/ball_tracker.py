@@ -28,7 +28,7 @@ THIN = 0.85  # Of the usual strength: less, just inside, is a sliver beside the 
 SMALLEST, LARGEST = 0.6, 1.6  # Of what the seen radius may be of the model's.
 MIN_STRENGTH = 40.0  # Of 255: less is not the ball's colour.
 MIN_SEEN = 0.2  # Part of the outline that must be seen.
-MAX_MISFIT = 0.75  # [px], rms of the points that a fitted outline keeps.
+AGREE = 1.0  # [px] A point so near to a fitted outline agrees with it.
 OTHER_THAN_TABLE = 80.0  # Of 765 (r + g + b): so different is not the table.
 
 
@@ -79,7 +79,7 @@ def find_ball(image, camera: Pinhole, hue_weights, radius, table_z, guess_p=None
     region = image[low[1] : high[1], low[0] : high[0]]
     strength = cv2.transform(region, hue_weights)
     strength = cv2.GaussianBlur(strength, (3, 3), 0.0)
-    m, n_kept, misfit = np.zeros(3), 0, np.inf
+    m, n_kept = np.zeros(3), 0
     for start in find_circles(strength, radius_px):
         # The circle may be the finger's tip, whose edge is round, too: rays from there
         # find a part of the ball, and those from that fit's centre all there is to see.
@@ -87,13 +87,13 @@ def find_ball(image, camera: Pinhole, hue_weights, radius, table_z, guess_p=None
             points = outline_points(
                 strength, region, start[0], start[1], LARGEST * radius_px, _ANGLES
             )
-            m, n_kept, misfit = fit_cone(camera.rays(points + low), 1.0 / camera.focal)
+            m, n_kept = fit_cone(camera.rays(points + low), AGREE / camera.focal)
             if n_kept < 6 or not m[2] > 0.0:
                 break
             start = camera.project(m[None])[0] - low
             if not ((start > 0.0) & (start < high - low - 1)).all():
                 break
-        if n_kept >= MIN_SEEN * N_RAYS and misfit * camera.focal <= MAX_MISFIT:
+        if n_kept >= MIN_SEEN * N_RAYS:
             break
     else:
         return None
@@ -240,13 +240,13 @@ def fit_cone(rays, tolerance):
     wins, and least squares over these, repeated once, gives the answer.
 
     Args: rays (k, 3), in order around the cone; tolerance [rad] of agreement.
-    Returns: m (3,), the axis over the cosine of the half-angle; how many rays agree;
-        their rms misfit [rad]. Zero rays agree if there is no such cone.
+    Returns: m (3,), the axis over the cosine of the half-angle; how many rays agree,
+        0 if there is no such cone.
     """
     k = len(rays)
     best, best_count = np.zeros(3), 0
     if k < 3:
-        return best, 0, np.inf
+        return best, 0
     third: int = k // 3
     for i in range(third):
         m, ok = _solve3(rays[i], rays[i + third], rays[i + 2 * third])
@@ -259,10 +259,9 @@ def fit_cone(rays, tolerance):
                 count += 1
         if count > best_count:
             best, best_count = m, count
-    misfit = np.inf
     for _ in range(2):
         if best_count < 3:
-            return best, 0, np.inf
+            return best, 0
         N, b = np.zeros((3, 3)), np.zeros(3)
         scale = tolerance * _norm_times_sine(best)
         for j in range(k):
@@ -272,18 +271,14 @@ def fit_cone(rays, tolerance):
                     N[a] += rays[j, a] * rays[j]
         m, ok = _solve3_matrix(N, b)
         if not ok:
-            return best, 0, np.inf
+            return best, 0
         best = m
         scale = _norm_times_sine(best)
-        best_count, total = 0, 0.0
+        best_count = 0
         for j in range(k):
-            error = abs(rays[j] @ best - 1.0) / scale
-            if error < tolerance:
+            if abs(rays[j] @ best - 1.0) < scale:
                 best_count += 1
-                total += error**2
-        if best_count > 0:
-            misfit = np.sqrt(total / best_count)
-    return best, best_count, misfit
+    return best, best_count
 
 
 @njit(cache=True)

@@ -23,11 +23,12 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from makebreak.systems.numerics import c3_projections as projections
 from makebreak.systems.numerics.c3_projections import (
     PlusProjection,
     Projection,
     QpProjection,
+    project,
+    projection_matrices,
 )
 from makebreak.systems.numerics.c3_qp import (
     factor,
@@ -249,12 +250,11 @@ def _diagonal(name, weight):
     return _read_only(weight)
 
 
-# What the compiled loop returns.
+# What _qp_step returns beside SOLVED.
+NOT_CONVEX, INFEASIBLE = 1, 2
 _FAILURES = {
-    1: "lam_0: the LCP at x_0 has no solution",
-    2: "the QP is not strictly convex, or its numbers are not finite",
-    3: "no plan meets the bounds",
-    4: "the projection's LCP was not solved",
+    NOT_CONVEX: "the QP is not strictly convex, or its numbers are not finite",
+    INFEASIBLE: "no plan meets the bounds",
 }
 
 
@@ -287,189 +287,140 @@ def solve_c3(
             f"solve_c3: x0 is {x0.shape} and x_desired {x_desired.shape}, expected "
             f"{(p.n_x,)} and {(o.N + 1, p.n_x)}"
         )
-    kind, alpha = projections.PLUS, 0.0
-    if isinstance(p.projection, QpProjection):
-        kind, alpha = projections.QP, p.projection.alpha
-    elif not p.is_plus:
-        kind = projections.EXACT
-    if kind != projections.PLUS:
-        U_u = p.U[p.n_x + p.n_lam :]
-        for i in np.flatnonzero((U_u == 0.0) & lcs.H.any(axis=0)):
-            raise C3Failure(f"U is 0 for u[{i}], expected > 0 where H is not zero")
     warm = problem.cold_start() if warm is None else warm
-    delta, w = np.array(warm.delta, order="C"), np.array(warm.w, order="C")
-    if not o.warm_start:
-        delta[:], w[:] = 0.0, 0.0
-        if o.start_at_x0:
-            delta[:, : p.n_x] = x0
+    if warm.u.shape != (o.N, p.n_u) or warm.delta.shape != (o.N, p.n_z):
+        raise ValueError(
+            f"solve_c3: warm.u is {warm.u.shape} and warm.delta {warm.delta.shape}, "
+            f"expected {(o.N, p.n_u)} and {(o.N, p.n_z)}"
+        )
     scale = 1.0
     if o.scale_lam:
-        scale = float(np.linalg.norm(lcs.A) / np.linalg.norm(lcs.D))
-        if not np.isfinite(scale):
+        A_norm, D_norm = np.linalg.norm(lcs.A), np.linalg.norm(lcs.D)
+        if not 0.0 < D_norm < np.inf:
             raise C3Failure("D is zero or not finite: there is no scale for lam")
+        scale = float(A_norm / D_norm)
     # Contact entries of z count in units of scale.
+    i_u = p.n_x + p.n_lam
     unit = np.ones(p.n_z)
-    unit[p.n_x : p.n_x + p.n_lam] = unit[p.n_x + p.n_lam + p.n_u :] = scale
-    delta /= unit
-    w /= unit
-    Ru = warm.u @ p.R if o.penalise_input_change else np.zeros((o.N, p.n_u))
-    status, x, v = _admm(
-        kind,
-        alpha,
-        o.rounds,
-        o.rho,
-        tuple(
-            # Fresh arrays: one compiled version whatever order or flags came in.
-            np.array(a, order="C")
-            for a in (
-                lcs.A,
-                lcs.B,
-                lcs.D * scale,
-                lcs.d,
-                lcs.E / scale,
-                lcs.F,
-                lcs.H / scale,
-                lcs.c / scale,
-            )
-        ),
-        (p.Q, p.R, p.Q_N, p.G, p.U),
-        (p.lower, p.upper),
-        x0,
-        x_desired,
-        Ru,
-        delta,
-        w,
+    unit[p.n_x : i_u] = unit[i_u + p.n_u :] = scale
+    AB = np.ascontiguousarray(np.hstack([lcs.D * scale, lcs.B, lcs.A]))
+    # Fresh arrays, so that there is one compiled version whatever order came in.
+    E, F, H, c = (
+        np.array(a, order="C")
+        for a in (lcs.E / scale, lcs.F, lcs.H / scale, lcs.c / scale)
     )
-    if status:
-        raise C3Failure(_FAILURES[status])
+    matrices: tuple = ()
+    if not p.is_plus:
+        for i in np.flatnonzero((p.U[i_u:] == 0.0) & H.any(axis=0)):
+            raise C3Failure(f"U is 0 for u[{i}], expected > 0 where H is not zero")
+        matrices = projection_matrices(p.U, E, F, H)
+    lam0 = np.empty(0)
+    if not H.any():
+        lam0, status = solve_lcp_kernel(F, E @ x0 + c)
+        if status != SOLVED:
+            raise C3Failure("lam_0: the LCP at x_0 has no solution")
+    h = np.zeros((o.N + 1, AB.shape[1]))  # What stays of the QP's linear term.
+    h[:, p.n_lam + p.n_u :] = x_desired @ p.Q
+    h[o.N, p.n_lam + p.n_u :] = p.Q_N @ x_desired[o.N]
+    if o.penalise_input_change:
+        h[: o.N, p.n_lam : p.n_lam + p.n_u] = warm.u @ p.R
+    delta, w = np.zeros((o.N, p.n_z)), np.zeros((o.N, p.n_z))
+    if o.warm_start:
+        delta, w = warm.delta / unit, warm.w / unit
+    elif o.start_at_x0:
+        delta[:, : p.n_x] = x0
+
+    def qp_step(G, target):
+        x, v = np.empty((o.N + 1, p.n_x)), np.empty((o.N, p.n_lam + p.n_u))
+        z = np.empty((o.N, p.n_z))
+        status = _qp_step(
+            (AB, np.array(lcs.d), np.hstack([F, H, E]), c),
+            (p.Q, p.R, p.Q_N, G),
+            (p.lower, p.upper),
+            (h, target, x0, lam0),
+            (z, x, v),
+        )
+        if status != SOLVED:
+            raise C3Failure(_FAILURES[status])
+        return z, x, v
+
+    G = p.G.copy()
+    for _ in range(o.rounds):
+        z, _, _ = qp_step(G, delta - w)
+        delta = np.empty((o.N, p.n_z))
+        if not project(p.projection, z + w, p.U, (E, F, H, c), matrices, delta):
+            raise C3Failure("the projection's LCP was not solved")
+        w = (w + z - delta) / o.rho
+        G = o.rho * G
+    _, x, v = qp_step(G, delta if p.is_plus else delta - w)
     plan = Plan(x, np.ascontiguousarray(v[:, p.n_lam :]), v[:, : p.n_lam] * scale)
     return plan, WarmStart(plan.u, delta * unit, w * unit)
 
 
 @njit(cache=True)
-def _admm(kind, alpha, rounds, rho, lcs, weights, bounds, x0, x_desired, Ru, delta, w):
-    """The rounds and the last QP; delta and w (N, n_z) are updated in place.
+def _qp_step(model, weights, bounds, given, found):
+    """One QP of C3; fills found and returns SOLVED, NOT_CONVEX or INFEASIBLE.
 
-    Returns: a status (_FAILURES; 0: solved), x (N + 1, n_x) and v (N, n_lam + n_u).
+    Args:
+        model: AB = [D B A], d, C = [F H E], c.
+        weights: Q, R, Q_N and the diagonal G.
+        bounds: lower, upper over [lam, u, x].
+        given: h (N + 1, n) the linear term of the planning cost over [lam, u, x],
+            target (N, n_z) of the consensus, x0, lam0 (empty: free).
+        found: z (N, n_z), x (N + 1, n_x), v = [lam, u] (N, n_v), overwritten.
     """
-    A, B, D, d, E, F, H, c = lcs
-    Q, R, Q_N, G0, U = weights
+    AB, d, C, c = model
+    Q, R, Q_N, G = weights
     lower, upper = bounds
-    n_x, n_u = B.shape
-    n_lam = D.shape[1]
-    n_v, i_u, i_eta = n_lam + n_u, n_x + n_lam, n_x + n_lam + n_u
-    n = n_v + n_x
-    N, n_z = delta.shape
-    plus = kind == projections.PLUS
-    AB, C = np.empty((n_x, n)), np.empty((n_lam, n))
-    AB[:, :n_lam], AB[:, n_lam:n_v], AB[:, n_v:] = D, B, A
-    C[:, :n_lam], C[:, n_lam:n_v], C[:, n_v:] = F, H, E
-    x, v = np.zeros((N + 1, n_x)), np.zeros((N, n_v))
-    lam0 = np.empty(0)
-    if not H.any():
-        q = c.copy()
-        for i in range(n_lam):
-            for j in range(n_x):
-                q[i] += E[i, j] * x0[j]
-        lam0, lcp_status = solve_lcp_kernel(np.ascontiguousarray(F), q)
-        if lcp_status != SOLVED:
-            return 1, x, v
-    V, K = np.zeros((0, 0)), np.zeros((0, 0))
-    if not plus:
-        V, K = projections.projection_matrices(U, E, F, H)
-    bounded = False
+    h_plan, target, x0, lam0 = given
+    z, x, v = found
+    n_x, n = AB.shape
+    n_lam, n_v, n_z, N = C.shape[0], n - n_x, G.size, v.shape[0]
+    i_u, i_eta = n_x + n_lam, n
+    plus = n_z > n
+    # Stage cost and linear term: the planning cost, and |z - target|^2_G with
+    # eta = C [v, x] + c put in.
+    T, h = np.zeros((n, n)), h_plan.copy()
+    T[n_lam:n_v, n_lam:n_v] = R
+    T[n_v:, n_v:] = Q
     for i in range(n):
-        bounded = bounded or np.isfinite(lower[i]) or np.isfinite(upper[i])
-    h_desired = np.empty((N + 1, n_x))
-    for k in range(N + 1):
-        for i in range(n_x):
-            total = 0.0
-            for j in range(n_x):
-                total += (Q_N[i, j] if k == N else Q[i, j]) * x_desired[k, j]
-            h_desired[k, i] = total
+        at = n_x + i if i < n_v else i - n_v  # Of [v, x] in z = [x, v, eta].
+        T[i, i] += G[at]
+        for k in range(N):
+            h[k, i] += G[at] * target[k, at]
+    if plus:
+        for m in range(n_lam):
+            for i in range(n):
+                a = C[m, i] * G[i_eta + m]
+                if a != 0.0:
+                    for j in range(n):
+                        T[i, j] += a * C[m, j]
+        for k in range(N):
+            for m in range(n_lam):
+                a = G[i_eta + m] * (target[k, i_eta + m] - c[m])
+                for i in range(n):
+                    h[k, i] += a * C[m, i]
     fac = new_factor(AB, d, N)
-    no_barrier = np.zeros((0, 0))
-    G, T, h = G0.copy(), np.empty((n, n)), np.zeros((N + 1, n))
-    z, target = np.empty((N, n_z)), np.empty(n_z)
-    zw = np.empty(n_z)
-    h[N, n_v:] = h_desired[N]
-    for it in range(rounds + 1):
-        # Stage cost and right-hand side: the planning cost, and |z - target|^2_G with
-        # eta = C [v, x] + c put in.
-        T[:] = 0.0
-        for i in range(n_x):
-            for j in range(n_x):
-                T[n_v + i, n_v + j] = Q[i, j]
-            T[n_v + i, n_v + i] += G[i]
-        for i in range(n_u):
-            for j in range(n_u):
-                T[n_lam + i, n_lam + j] = R[i, j]
-            T[n_lam + i, n_lam + i] += G[i_u + i]
-        for i in range(n_lam):
-            T[i, i] = G[n_x + i]
+    if not factor(fac, T, Q_N, np.zeros((0, 0)), lam0.size):
+        return NOT_CONVEX
+    solve(fac, h, x0, lam0, x, v)
+    if not within(x, v, lower, upper):
+        if not solve_bounded(fac, T, Q_N, h, x0, lam0, lower, upper, x, v):
+            return INFEASIBLE
+    for k in range(N):
+        z[k, :n_x] = x[k]
+        z[k, n_x:i_eta] = v[k]
         if plus:
             for m in range(n_lam):
-                for i in range(n):
-                    a = C[m, i] * G[i_eta + m]
-                    if a != 0.0:
-                        for j in range(n):
-                            T[i, j] += a * C[m, j]
-        for k in range(N):
-            for i in range(n_z):
-                target[i] = delta[k, i]
-                if not (plus and it == rounds):
-                    target[i] -= w[k, i]
-            for i in range(n_lam):
-                h[k, i] = G[n_x + i] * target[n_x + i]
-            for i in range(n_u):
-                h[k, n_lam + i] = Ru[k, i] + G[i_u + i] * target[i_u + i]
-            for i in range(n_x):
-                h[k, n_v + i] = h_desired[k, i] + G[i] * target[i]
-            if plus:
-                for m in range(n_lam):
-                    a = G[i_eta + m] * (target[i_eta + m] - c[m])
-                    for i in range(n):
-                        h[k, i] += a * C[m, i]
-        if not factor(fac, T, Q_N, no_barrier, lam0.size):
-            return 2, x, v
-        solve(fac, h, x0, lam0, x, v)
-        if bounded and not within(x, v, lower, upper):
-            if not solve_bounded(fac, T, Q_N, h, x0, lam0, lower, upper, x, v):
-                return 3, x, v
-        if it == rounds:
-            break
-        for k in range(N):
-            z[k, :n_x] = x[k]
-            z[k, n_x:i_eta] = v[k]
-            if plus:
-                for m in range(n_lam):
-                    total = c[m]
-                    for i in range(n_v):
-                        total += C[m, i] * v[k, i]
-                    for i in range(n_x):
-                        total += C[m, n_v + i] * x[k, i]
-                    z[k, i_eta + m] = total
-            for i in range(n_z):
-                zw[i] = z[k, i] + w[k, i]
-            if kind == projections.PLUS:
-                projections.project_plus(zw, U, n_x, n_lam, n_u, delta[k])
-            elif kind == projections.QP:
-                if not projections.project_qp(zw, alpha, E, F, H, c, V, K, delta[k]):
-                    return 4, x, v
-            elif not projections.project_exact(zw, U, E, F, H, c, V, K, delta[k]):
-                return 4, x, v
-            for i in range(n_z):
-                w[k, i] = (zw[i] - delta[k, i]) / rho
-        for i in range(n_z):
-            G[i] *= rho
-    for k in range(N):
-        for i in range(n_v):
-            if not np.isfinite(v[k, i]):
-                return 2, x, v
-        for i in range(n_x):
-            if not np.isfinite(x[k + 1, i]):
-                return 2, x, v
-    return 0, x, v
+                total = c[m]
+                for i in range(n_v):
+                    total += C[m, i] * v[k, i]
+                for i in range(n_x):
+                    total += C[m, n_v + i] * x[k, i]
+                z[k, i_eta + m] = total
+    if not (np.isfinite(x).all() and np.isfinite(v).all()):
+        return NOT_CONVEX
+    return SOLVED
 
 
 def plan_cost(lcs: LCS, x0, u, x_desired, problem: C3Problem) -> float:

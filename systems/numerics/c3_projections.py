@@ -1,7 +1,7 @@
 """The three projections of C3: onto  0 <= lam  perp  s = E x + F lam + H u + c >= 0.
 
-Each takes z (n_z,), one knot of the QP's plan plus its scaled multiplier, and gives the
-delta near it (nearness in the weight U) that obeys the complementarity, or nearly:
+Each takes z (N, n_z), the QP's plan plus its scaled multiplier, and gives for each knot
+the delta near it (nearness in the weight U) that obeys the complementarity, or nearly:
 
     PlusProjection   C3+: z = [x, lam, u, eta], eta stands for s. Elementwise.
     QpProjection     C3 : z = [x, lam, u]. A convex QP; leaves some lam * s.
@@ -18,9 +18,6 @@ import numpy as np
 from numba import njit
 
 from makebreak.systems.numerics.lcp import SOLVED, solve_lcp_kernel
-
-# Which projection, in the compiled loop.
-PLUS, QP, EXACT = 0, 1, 2
 
 
 @dataclass
@@ -43,16 +40,35 @@ class ExactProjection:
 Projection = PlusProjection | QpProjection | ExactProjection
 
 
+def project(projection: Projection, z, U, lcs, matrices, delta) -> bool:
+    """Fills delta (N, n_z) with the projection of each knot of z (N, n_z).
+
+    Args:
+        U: (n_z,) diagonal weight. lcs: (E, F, H, c). matrices: projection_matrices of
+            them, which C3+ does not need.
+    Returns: False if a knot's projection failed.
+    """
+    if isinstance(projection, PlusProjection):
+        n_lam, n_x = lcs[0].shape
+        project_plus(z, U, n_x, n_lam, delta)
+        return True
+    if isinstance(projection, QpProjection):
+        return project_qp(z, projection.alpha, *lcs, *matrices, delta)
+    return project_exact(z, U, *lcs, *matrices, delta)
+
+
 @njit(cache=True)
-def project_plus(z, U, n_x, n_lam, n_u, delta):
-    """delta (n_z,) of z (n_z,) = [x, lam, u, eta]; U (n_z,) the diagonal weight."""
+def project_plus(z, U, n_x, n_lam, delta):
+    """delta (N, n_z) of z (N, n_z) = [x, lam, u, eta]; U (n_z,)."""
+    n_eta = U.size - n_lam
     delta[:] = z
-    for i in range(n_x, n_x + n_lam):
-        j = i + n_lam + n_u
-        if np.sqrt(U[j]) * z[j] > np.sqrt(U[i]) * z[i]:
-            delta[i], delta[j] = 0.0, max(z[j], 0.0)
-        else:
-            delta[i], delta[j] = max(z[i], 0.0), 0.0
+    for k in range(len(z)):
+        for i in range(n_lam):
+            lam, eta = z[k, n_x + i], z[k, n_eta + i]
+            if np.sqrt(U[n_eta + i]) * eta > np.sqrt(U[n_x + i]) * lam:
+                delta[k, n_x + i], delta[k, n_eta + i] = 0.0, max(eta, 0.0)
+            else:
+                delta[k, n_x + i], delta[k, n_eta + i] = max(lam, 0.0), 0.0
 
 
 @njit(cache=True)
@@ -95,7 +111,7 @@ def _gap(z, E, H, c):
 
 @njit(cache=True)
 def project_qp(z, alpha, E, F, H, c, V, K, delta):
-    """delta (n_z,) = [y, lam]: the minimiser over lam >= 0, s >= 0 of
+    """delta (N, n_z), of each knot [y, lam] the minimiser over lam >= 0, s >= 0 of
 
         1/2 |y - z_y|^2_W + 1/2 lam' F lam - alpha z_lam' F lam.
 
@@ -108,31 +124,33 @@ def project_qp(z, alpha, E, F, H, c, V, K, delta):
     n_lam, n_x = E.shape
     n_u = H.shape[1]
     M, q = np.empty((2 * n_lam, 2 * n_lam)), np.empty(2 * n_lam)
-    q[:n_lam] = _gap(z, E, H, c)
-    for i in range(n_lam):
-        total = 0.0
-        for j in range(n_lam):
-            total += F[j, i] * z[n_x + j]
-            M[i, j] = K[i, j]
-            M[i, n_lam + j] = F[i, j]
-            M[n_lam + i, j] = -F[j, i]
-            M[n_lam + i, n_lam + j] = 0.5 * (F[i, j] + F[j, i])
-        q[n_lam + i] = -alpha * total
-    mu_lam, status = solve_lcp_kernel(M, q)
-    if status != SOLVED:
-        return False
-    delta[:] = z
-    for j in range(n_x + n_u):
-        at = j if j < n_x else j + n_lam
+    for k in range(len(z)):
+        q[:n_lam] = _gap(z[k], E, H, c)
         for i in range(n_lam):
-            delta[at] += V[j, i] * mu_lam[i]
-    delta[n_x : n_x + n_lam] = mu_lam[n_lam:]
+            total = 0.0
+            for j in range(n_lam):
+                total += F[j, i] * z[k, n_x + j]
+                M[i, j] = K[i, j]
+                M[i, n_lam + j] = F[i, j]
+                M[n_lam + i, j] = -F[j, i]
+                M[n_lam + i, n_lam + j] = 0.5 * (F[i, j] + F[j, i])
+            q[n_lam + i] = -alpha * total
+        mu_lam, status = solve_lcp_kernel(M, q)
+        if status != SOLVED:
+            return False
+        delta[k] = z[k]
+        for j in range(n_x + n_u):
+            at = j if j < n_x else j + n_lam
+            for i in range(n_lam):
+                delta[k, at] += V[j, i] * mu_lam[i]
+        delta[k, n_x : n_x + n_lam] = mu_lam[n_lam:]
     return True
 
 
 @njit(cache=True)
 def project_exact(z, U, E, F, H, c, V, K, delta):
-    """delta (n_z,): the nearest point to z in the weight U with 0 <= lam perp s >= 0.
+    """delta (N, n_z): the nearest point to each knot in the weight U that obeys the
+    complementarity 0 <= lam perp s >= 0.
 
     Branch and bound: a node has decided lam_i = 0 or s_i = 0 for some i and asks only
     lam_i >= 0, s_i >= 0 of the others, a convex QP whose optimum bounds what lies
@@ -142,58 +160,64 @@ def project_exact(z, U, E, F, H, c, V, K, delta):
     """
     n_lam, n_x = E.shape
     n_u = H.shape[1]
-    z_lam, U_lam = z[n_x : n_x + n_lam], U[n_x : n_x + n_lam]
-    gap = _gap(z, E, H, c)
-    scale = np.empty(n_lam)  # s / scale is a distance in the weight U.
-    for i in range(n_lam):
-        total = K[i, i]
-        for j in range(n_lam):
-            total += F[i, j] ** 2 / U_lam[j]
-        scale[i] = np.sqrt(total) if total > 0.0 else 1.0
-    size = 1.0
-    for i in range(n_lam):
-        size = max(size, abs(gap[i]) / scale[i], np.sqrt(U_lam[i]) * abs(z_lam[i]))
-    # Modes: 0 undecided, 1 lam_i = 0, 2 s_i = 0. Depth first, at most two per level.
-    stack = np.zeros((n_lam + 2, n_lam), np.int64)
-    depth, best = 1, np.inf
-    lam, slack = np.empty(n_lam), np.empty(n_lam)
-    multiplier = np.empty(n_lam)
-    while depth > 0:
-        depth -= 1
-        mode = stack[depth].copy()
-        cost = _solve_node(mode, z_lam, U_lam, gap, F, K, lam, slack, multiplier, best)
-        if cost == -1.0:
-            return False
-        if not cost < best - 1e-12 * size * size:
-            continue
-        branch, worst = -1, 1e-9 * size
+    U_lam = U[n_x : n_x + n_lam]
+    for knot in range(len(z)):
+        z_lam, gap = z[knot, n_x : n_x + n_lam], _gap(z[knot], E, H, c)
+        scale = np.empty(n_lam)  # s / scale is a distance in the weight U.
         for i in range(n_lam):
-            if mode[i] == 0:
-                both = min(np.sqrt(U_lam[i]) * lam[i], slack[i] / scale[i])
-                if both > worst:
-                    branch, worst = i, both
-        if branch < 0:
-            best = cost
-            delta[:] = z
-            for j in range(n_x + n_u):
-                at = j if j < n_x else j + n_lam
-                for i in range(n_lam):
-                    delta[at] += V[j, i] * multiplier[i]
+            total = K[i, i]
+            for j in range(n_lam):
+                total += F[i, j] ** 2 / U_lam[j]
+            scale[i] = np.sqrt(total) if total > 0.0 else 1.0
+        size = 1.0
+        for i in range(n_lam):
+            size = max(size, abs(gap[i]) / scale[i], np.sqrt(U_lam[i]) * abs(z_lam[i]))
+        # Modes: 0 undecided, 1 lam_i = 0, 2 s_i = 0. Depth first, at most two per level.
+        stack = np.zeros((n_lam + 2, n_lam), np.int64)
+        depth, best = 1, np.inf
+        lam, slack = np.empty(n_lam), np.empty(n_lam)
+        multiplier = np.empty(n_lam)
+        while depth > 0:
+            depth -= 1
+            mode = stack[depth].copy()
+            cost = _solve_node(
+                mode, z_lam, U_lam, gap, F, K, lam, slack, multiplier, best
+            )
+            if cost == -1.0:
+                return False
+            if not cost < best - 1e-12 * size * size:
+                continue
+            branch, worst = -1, 1e-9 * size
             for i in range(n_lam):
-                open_gap = slack[i] / scale[i] > np.sqrt(U_lam[i]) * lam[i]
-                delta[n_x + i] = 0.0 if open_gap else lam[i]
-            continue
-        first = (
-            2
-            if np.sqrt(U_lam[branch]) * lam[branch] > (slack[branch] / scale[branch])
-            else 1
-        )
-        stack[depth] = mode
-        stack[depth, branch] = 3 - first  # The less likely one waits below.
-        stack[depth + 1] = mode
-        stack[depth + 1, branch] = first
-        depth += 2
-    return best < np.inf
+                if mode[i] == 0:
+                    both = min(np.sqrt(U_lam[i]) * lam[i], slack[i] / scale[i])
+                    if both > worst:
+                        branch, worst = i, both
+            if branch < 0:
+                best = cost
+                delta[knot] = z[knot]
+                for j in range(n_x + n_u):
+                    at = j if j < n_x else j + n_lam
+                    for i in range(n_lam):
+                        delta[knot, at] += V[j, i] * multiplier[i]
+                for i in range(n_lam):
+                    open_gap = slack[i] / scale[i] > np.sqrt(U_lam[i]) * lam[i]
+                    delta[knot, n_x + i] = 0.0 if open_gap else lam[i]
+                continue
+            first = (
+                2
+                if np.sqrt(U_lam[branch]) * lam[branch]
+                > (slack[branch] / scale[branch])
+                else 1
+            )
+            stack[depth] = mode
+            stack[depth, branch] = 3 - first  # The less likely one waits below.
+            stack[depth + 1] = mode
+            stack[depth + 1, branch] = first
+            depth += 2
+        if best == np.inf:
+            return False
+    return True
 
 
 @njit(cache=True)

@@ -312,8 +312,14 @@ def _reference(chain, memory, q, x_d, has_pose, n):
 
 
 def warm_up(chain: SerialChain, law: Law) -> None:
-    """Compiles the law, so that no tick has to wait for it."""
+    """Compiles the law, so that no tick has to wait for it.
+
+    tau and memory are read-only, as a Context's state is: to the compiler those are
+    arrays of another type.
+    """
     n = len(law.effort_max)
-    x_d = np.full(19, np.nan)
-    args = (np.zeros(n), np.zeros(memory_size(n)), law.q_nominal, np.zeros(n), x_d)
-    tick(chain, law, *args, law.stiffness, law.damping, np.zeros(6))
+    tau, memory = np.zeros(n), np.zeros(memory_size(n))
+    for state in (tau, memory):
+        state.setflags(write=False)
+    args = (law.q_nominal, np.zeros(n), np.full(19, np.nan))
+    tick(chain, law, tau, memory, *args, law.stiffness, law.damping, np.zeros(6))
