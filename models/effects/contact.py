@@ -120,8 +120,10 @@ class RollingResistance(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(
             plant.time_step() or 0.001, 0.0, self._update
         )
-        zero = np.zeros(self._n_v)
-        add_rolling_torque(zero, zero, np.ones(3), np.ones(3), 0.0, self._at, FADE_RATE)
+        # Compiles it, for arrays of the kind that Drake gives.
+        zero, up = np.zeros(self._n_v), np.ones(3)
+        up.setflags(write=False)
+        add_rolling_torque(zero, zero, np.ones(3), up, 0.0, self._at, FADE_RATE)
 
     def _update(self, context, discrete_state):
         generalized = np.zeros(self._n_v)
