@@ -75,6 +75,8 @@ def make_station(
     noise = config.noise
     if len(config.contact) != 2:
         raise ValueError(f"contact is {config.contact}, expected two models")
+    if config.seed < 0:
+        raise ValueError(f"seed is {config.seed}, expected an integer of 0 or more")
     seeds = np.random.SeedSequence(config.seed).generate_state(4)
     period = plant.time_step() or 0.001
 
