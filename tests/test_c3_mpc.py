@@ -217,7 +217,7 @@ def test_plus_projection_repeats_the_reference():
     for z, expected in zip(
         PROJECTIONS["plus_in"], PROJECTIONS["plus_out"], strict=True
     ):
-        project_plus(z, U, 4, 2, 1, delta)
+        project_plus(z[None], U, 4, 2, delta[None])
         np.testing.assert_array_equal(delta, expected)
 
 
@@ -233,7 +233,7 @@ def test_qp_projection_is_feasible_and_no_worse_than_the_reference():
 
     close = 0
     for z, saved in zip(PROJECTIONS["qp_in"], PROJECTIONS["qp_out"], strict=True):
-        assert project_qp(z, alpha, E, F, H, c, V, K, delta)
+        assert project_qp(z[None], alpha, E, F, H, c, V, K, delta[None])
         assert delta[4:6].min() >= 0.0
         assert (E @ delta[:4] + F @ delta[4:6] + c).min() >= -1e-12
         # The saved points breach a constraint by up to 1e-8, which is worth 1e-8 of
@@ -258,7 +258,7 @@ def test_qp_projection_agrees_with_clarabel_where_that_is_well_determined():
         U = 10.0 ** rng.uniform(-1, 1, 9)
         delta, alpha = np.empty(9), 0.3
         V, K = projection_matrices(U, E, F, H)
-        assert project_qp(z, alpha, E, F, H, c, V, K, delta)
+        assert project_qp(z[None], alpha, E, F, H, c, V, K, delta[None])
         prog = MathematicalProgram()
         v = prog.NewContinuousVariables(9)
         S = np.hstack([E, F, H])
@@ -309,7 +309,7 @@ def test_exact_projection_agrees_with_brute_force_over_all_modes(n_lam, trials):
         U, z = 10.0 ** rng.uniform(-1, 2, n_lam + 6), rng.normal(size=n_lam + 6)
         delta = np.empty(n_lam + 6)
         V, K = projection_matrices(U, E, F, H)
-        assert project_exact(z, U, E, F, H, c, V, K, delta)
+        assert project_exact(z[None], U, E, F, H, c, V, K, delta[None])
         lam, gap = delta[4 : 4 + n_lam], np.hstack([E, F, H]) @ delta + c
         # The LCPs hold to 1e-9 of their own scale.
         assert lam.min() >= 0.0 and gap.min() >= -1e-8 and abs(lam * gap).max() < 1e-8

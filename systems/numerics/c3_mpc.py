@@ -376,8 +376,7 @@ def _qp_step(model, weights, bounds, given, found):
     z, x, v = found
     n_x, n = AB.shape
     n_lam, n_v, n_z, N = C.shape[0], n - n_x, G.size, v.shape[0]
-    i_u, i_eta = n_x + n_lam, n
-    plus = n_z > n
+    i_eta, plus = n, n_z > n
     # Stage cost and linear term: the planning cost, and |z - target|^2_G with
     # eta = C [v, x] + c put in.
     T, h = np.zeros((n, n)), h_plan.copy()

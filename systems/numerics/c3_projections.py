@@ -48,13 +48,14 @@ def project(projection: Projection, z, U, lcs, matrices, delta) -> bool:
             them, which C3+ does not need.
     Returns: False if a knot's projection failed.
     """
+    E, F, H, c = lcs
     if isinstance(projection, PlusProjection):
-        n_lam, n_x = lcs[0].shape
-        project_plus(z, U, n_x, n_lam, delta)
+        project_plus(z, U, E.shape[1], E.shape[0], delta)
         return True
+    V, K = matrices
     if isinstance(projection, QpProjection):
-        return project_qp(z, projection.alpha, *lcs, *matrices, delta)
-    return project_exact(z, U, *lcs, *matrices, delta)
+        return project_qp(z, projection.alpha, E, F, H, c, V, K, delta)
+    return project_exact(z, U, E, F, H, c, V, K, delta)
 
 
 @njit(cache=True)
@@ -172,7 +173,7 @@ def project_exact(z, U, E, F, H, c, V, K, delta):
         size = 1.0
         for i in range(n_lam):
             size = max(size, abs(gap[i]) / scale[i], np.sqrt(U_lam[i]) * abs(z_lam[i]))
-        # Modes: 0 undecided, 1 lam_i = 0, 2 s_i = 0. Depth first, at most two per level.
+        # Modes: 0 undecided, 1 lam_i = 0, 2 s_i = 0. Depth first: two per level.
         stack = np.zeros((n_lam + 2, n_lam), np.int64)
         depth, best = 1, np.inf
         lam, slack = np.empty(n_lam), np.empty(n_lam)
