@@ -29,8 +29,10 @@ from makebreak.systems.numerics.c3_mpc import (
     C3Problem,
     C3Weights,
     WarmStart,
+    _qp_step,
     plan_cost,
     solve_c3,
+    warm_up,
     with_gap_residual,
 )
 from makebreak.systems.numerics.c3_projections import (
@@ -474,6 +476,21 @@ def test_shifting_a_warm_start_moves_it_along_the_horizon():
     shifted = WarmStart(np.zeros((3, 1)), delta, -delta).shifted(0.25)
     np.testing.assert_allclose(shifted.delta[:, 0], [0.25, 1.25, 2.0])
     np.testing.assert_allclose(shifted.w[:, 0], [-0.25, -1.25, -2.0])
+
+
+def test_nothing_is_compiled_after_warm_up():
+    problem = cartpole_problem(warm_start=True)
+    warm_up(problem)
+    compiled = len(_qp_step.signatures)
+    # Fortran order and a free lam_0: other layouts than those of the warm-up.
+    lcs = LCS(
+        **{k: np.asfortranarray(CARTPOLE[k]) for k in "ABDdEFc"},
+        H=CARTPOLE["H"] + 0.1,
+        dt=0.01,
+    )
+    _, warm = solve_c3(lcs, CARTPOLE["x0"], np.zeros((6, 4), order="F"), problem)
+    solve_c3(lcs, CARTPOLE["x0"], np.zeros((6, 4)), problem, warm)
+    assert len(_qp_step.signatures) == compiled
 
 
 @pytest.mark.parametrize(
