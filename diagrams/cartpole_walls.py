@@ -17,6 +17,10 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
 from makebreak.models.scene import load_scene
+from makebreak.systems.baselines.dynamics_residual_learner import (
+    DynamicsResidualLearner,
+    DynamicsResidualLearnerConfig,
+)
 from makebreak.systems.c3_mpc import C3Config, C3Mpc
 from makebreak.systems.lcs_plant import LcsPlant, LcsPlantConfig
 from makebreak.systems.numerics.c3_mpc import C3Options, C3Weights
@@ -49,6 +53,8 @@ class CartpoleWallsConfig:
     # Half width of the uniform draw in each entry [SI].
     x_spread: list[float] = field(default_factory=lambda: [0.02, 0.02, 0.02, 0.02])
     adapt: bool = True
+    # Adapt the dynamics (eq. 10) instead of the contact: the baseline.
+    dynamics_residual: bool = False
     # True distance of each wall minus the distance that the model starts with [m].
     gap_error: list[float] = field(default_factory=lambda: [-0.15, 0.15])
     world: str = SCENE  # Scene file of the MultibodyPlant.
@@ -109,7 +115,7 @@ def make_cartpole_walls(
     """The closed loop.
 
     Outputs: x (4,) the plant's state; u (1,) [N]; r_comp (2,) [m], zero without
-        adaptation; loss (1,) and learner_status (1,), with adaptation only;
+        adaptation of the contact; with it loss (1,), learner_status (1,);
         c3_status (1,).
 
     Args: multibody: the plant is the scene's, else the LCS with the right walls;
@@ -150,9 +156,9 @@ def make_cartpole_walls(
     u = c3.GetOutputPort("u")
     builder.Connect(x, c3.GetInputPort("x"))
     builder.Connect(goal.get_output_port(), c3.GetInputPort("x_desired"))
-    builder.Connect(lcs.get_output_port(), c3.GetInputPort("lcs"))
     builder.Connect(u, u_of_plant)
-    if config.adapt:
+    lcs_of_c3 = lcs.get_output_port()
+    if config.adapt and not config.dynamics_residual:
         learner = builder.AddNamedSystem(
             "learner", ResidualLearner(config.learner, model, DT, LEARNER_OFFSET)
         )
@@ -168,6 +174,21 @@ def make_cartpole_walls(
             "no_residual", ConstantVectorSource(np.zeros(model.n_lam))
         )
         r_comp = zero.get_output_port()
+    if config.adapt and config.dynamics_residual:
+        baseline = builder.AddNamedSystem(
+            "learner",
+            DynamicsResidualLearner(
+                DynamicsResidualLearnerConfig(config.learner.n_b),
+                model,
+                DT,
+                LEARNER_OFFSET,
+            ),
+        )
+        builder.Connect(x, baseline.GetInputPort("x"))
+        builder.Connect(u, baseline.GetInputPort("u_measured"))
+        builder.Connect(lcs.get_output_port(), baseline.GetInputPort("lcs"))
+        lcs_of_c3 = baseline.GetOutputPort("lcs")
+    builder.Connect(lcs_of_c3, c3.GetInputPort("lcs"))
     builder.Connect(r_comp, c3.GetInputPort("r_comp"))
     if multibody and meshcat is not None:
         view = builder.AddNamedSystem(

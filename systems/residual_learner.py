@@ -33,6 +33,7 @@ class LearnerStatus(IntEnum):
     NOT_FINITE = 4  # x, u_measured or lcs was not finite: the pair was dropped.
     GAMMA_REFUSED = 5  # gamma is beyond the bound of this pair's F: it was dropped.
     NOT_SOLVED = 6  # A QP of the buffer was not solved.
+    BAD_LCS = 7  # lcs is of other sizes or another dt: the pair was dropped.
 
 
 @dataclass
@@ -103,7 +104,7 @@ class ResidualLearner(LeafSystem):
         """
         super().__init__()
         self._config = _checked(config, lcs, period_sec)
-        self._dt, self._n_lam = lcs.dt, lcs.n_lam
+        self._dt, self._sizes = lcs.dt, (lcs.n_x, lcs.n_u, lcs.n_lam)
         self._Q_d = np.array(config.Q_d or np.ones(lcs.n_x), dtype=float)
         self._group = group_of_entry(config.groups, lcs.n_lam)
         n_groups = int(self._group.max()) + 1
@@ -147,6 +148,8 @@ class ResidualLearner(LeafSystem):
         """The memory after the sample x, u, lcs."""
         if not enabled:
             return _held(memory, None, LearnerStatus.DISABLED)
+        if not self._fits(lcs):
+            return _held(memory, None, LearnerStatus.BAD_LCS)
         if not (np.isfinite(x).all() and _is_finite(lcs)):
             return _held(memory, None, LearnerStatus.NOT_FINITE)
         x.setflags(write=False)
@@ -180,6 +183,13 @@ class ResidualLearner(LeafSystem):
         at_bound = (abs(residual.value) >= c.r_max).any()
         status = LearnerStatus.AT_BOUND if at_bound else LearnerStatus.LEARNED
         return residual, loss, status
+
+    def _fits(self, lcs) -> bool:
+        if not isinstance(lcs, LCS):
+            return False
+        return (lcs.n_x, lcs.n_u, lcs.n_lam) == self._sizes and bool(
+            abs(lcs.dt - self._dt) <= 1e-9 * self._dt
+        )
 
     def _memory_of(self, context) -> LearnerMemory:
         return context.get_abstract_state(self._memory).get_value()

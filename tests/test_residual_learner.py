@@ -473,10 +473,14 @@ def test_the_builder_must_run_before_the_learner_and_then_pairs_fit():
     assert final_loss(offset_sec=0.003) > 0.0  # Too late: it is the last sample's.
 
 
-@pytest.mark.parametrize("what", ["x", "u", "lcs", "enable", "enable_nan"])
+@pytest.mark.parametrize(
+    "what", ["x", "u", "lcs", "lcs_of_another_dt", "enable", "enable_nan"]
+)
 def test_bad_samples_are_dropped_and_r_is_held(what):
     bad = 3
     expected = LearnerStatus.DISABLED if "enable" in what else LearnerStatus.NOT_FINITE
+    if what == "lcs_of_another_dt":
+        expected = LearnerStatus.BAD_LCS
 
     def edit(x, u, lcs, enable):
         if what == "x":
@@ -485,6 +489,8 @@ def test_bad_samples_are_dropped_and_r_is_held(what):
             u[bad] = np.inf
         elif what == "lcs":
             lcs[bad] = replace(lcs[bad], d=[np.nan, 0.0])
+        elif what == "lcs_of_another_dt":
+            lcs[bad] = replace(lcs[bad], dt=0.1)
         else:
             enable[bad] = np.nan if what == "enable_nan" else 0.0
 
