@@ -137,14 +137,13 @@ def test_the_fitted_cone_is_the_one_that_touches_the_sphere(seed):
     p, radius = rng.uniform([-0.3, -0.3, 0.5], [0.3, 0.3, 1.0]), 0.06
     points = sphere_circle(p, radius, radius / np.linalg.norm(p))
     rays = points / np.linalg.norm(points, axis=1, keepdims=True)
-    m, n_kept, misfit = fit_cone(rays, 1e-4)
+    m, n_kept = fit_cone(rays, 1e-4)
     assert n_kept == len(rays)
     # Normal equations of a cone of 5 degrees: condition 1e3 squared, times 1e-16.
     np.testing.assert_allclose(m / np.linalg.norm(m), p / np.linalg.norm(p), atol=1e-9)
     np.testing.assert_allclose(
         1.0 / np.linalg.norm(m), np.sqrt(1.0 - radius**2 / (p @ p)), atol=1e-9
     )
-    assert misfit < 1e-8
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -156,7 +155,7 @@ def test_the_cone_withstands_a_hidden_third_and_false_points(seed):
     wrong = rng.choice(len(rays), 6, replace=False)
     rays[wrong] = rays[wrong] * 0.7 + 0.3 * p / np.linalg.norm(p)  # Further inside.
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    m, n_kept, _ = fit_cone(rays, 1e-4)
+    m, n_kept = fit_cone(rays, 1e-4)
     assert n_kept == len(rays) - 6
     np.testing.assert_allclose(m / np.linalg.norm(m), p / np.linalg.norm(p), atol=1e-9)
 
@@ -176,7 +175,7 @@ def test_outline_points_keep_to_the_edge_against_the_table():
     strength[finger], region[finger] = 0, 40
     angle = np.linspace(0.0, 2.0 * np.pi, 96, endpoint=False)
     angles = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    points = outline_points(strength, region, 33.0, 27.0, 22.0, angles)
+    points = outline_points(strength, region, 32.0, 22.0, 24.0, angles)
     assert 50 < len(points) < 90
     # A picture without antialiasing: half a pixel's diagonal.
     np.testing.assert_allclose(np.hypot(*(points - 30.0).T), 14.0, atol=0.71)
@@ -187,7 +186,7 @@ def test_outline_points_keep_to_the_edge_against_the_table():
 
 
 @pytest.mark.parametrize("hidden", [False, True], ids=["seen", "part hidden"])
-@pytest.mark.parametrize("size, limit", [((320, 240), 2e-3), ((640, 480), 1e-3)])
+@pytest.mark.parametrize("size, limit", [((320, 240), 4e-4), ((640, 480), 2e-4)])
 @pytest.mark.parametrize("renderer", RENDERERS)
 def test_median_error_over_the_workspace(renderer, size, limit, hidden):
     config = CameraConfig(width=size[0], height=size[1], renderer=renderer)
@@ -203,7 +202,7 @@ def test_median_error_over_the_workspace(renderer, size, limit, hidden):
             found = find_ball(picture, camera, WEIGHTS, RADIUS, 0.0, guess)
             errors.append(np.inf if found is None else found.p_WB - ball)
     errors = np.linalg.norm(errors, axis=1)
-    assert np.median(errors) < limit
+    assert np.median(errors) < limit  # A fifth of a pixel. Needed: 2 mm and 1 mm.
     assert errors.max() < 1.5e-3  # Not one position is lost or far off.
 
 
@@ -234,13 +233,19 @@ def test_pictures_without_the_ball_give_none():
     orange = np.full((240, 320, 4), (*ORANGE, 255.0)).astype(np.uint8)
     square = sketch()
     square[100:140, 100:140, :3] = ORANGE
-    small = sketch([0.5, 0.0, RADIUS], radius=RADIUS / 3)
     finger = sketch(None, np.array([0.5, 0.0, 0.08]))
     black = np.zeros((240, 320, 4), np.uint8)
     guess = np.array([0.5, 0.0, RADIUS])
-    for picture in (noise, orange, square, small, finger, black, sketch()):
+    for picture in (noise, orange, square, finger, black, sketch()):
         for p in (None, guess, guess + [9.0, 0.0, 0.0], guess + [0.0, 0.0, 5.0]):
             assert find_ball(picture, CAMERA, WEIGHTS, RADIUS, 0.0, p) is None
+
+
+@pytest.mark.parametrize("factor", [0.3, 0.5, 0.57, 1.75, 2.0, 3.0])
+def test_a_ball_of_quite_another_size_gives_none(factor):
+    for x, y in [(0.5, 0.0), (0.6, 0.1), (0.38, -0.12)]:
+        picture = sketch([x, y, RADIUS], radius=factor * RADIUS)
+        assert find_ball(picture, CAMERA, WEIGHTS, RADIUS, 0.0) is None
 
 
 def test_a_ball_of_another_hue_gives_none():

@@ -179,7 +179,7 @@ def outline_points(strength, region, u0, v0, reach, angles):
         v = int(v0 + (edge[i] + 2.5) * s + 0.5)
         if 0 <= u < w and 0 <= v < h:
             outside[i] = float(region[v, u, 0]) + region[v, u, 1] + region[v, u, 2]
-            found[i] = top[i] - ground[i] >= MIN_STRENGTH
+            found[i] = top[i] - ground[i] >= MIN_STRENGTH and ground[i] <= top[i] / 3.0
     points = np.empty((n, 2))
     if not found.any():
         return points[:0]
@@ -273,7 +273,7 @@ def fit_cone(rays, tolerance):
         if not ok:
             return best, 0
         best = m
-        scale = _norm_times_sine(best)
+        scale = tolerance * _norm_times_sine(best)
         best_count = 0
         for j in range(k):
             if abs(rays[j] @ best - 1.0) < scale:
