@@ -108,7 +108,8 @@ def read_scene(path: str | Path) -> Scene:
     for directive in scene.directives:
         for part in (directive.add_model, directive.add_directives):
             if part is not None and "://" not in part.file:
-                part.file = (path.parent / part.file).resolve().as_uri()
+                # Not as_uri(): Drake does not decode %20.
+                part.file = f"file://{(path.parent / part.file).resolve()}"
     _check(scene)
     return scene
 

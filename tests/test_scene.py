@@ -275,3 +275,18 @@ def test_missing_scene_file_is_named(tmp_path):
 def test_nearest_name_or_all_names():
     assert nearest("object_sise", KINDS) == "did you mean 'object_size'?"
     assert nearest("zzz", ["b", "a"]) == "known: a, b"
+
+
+def test_model_files_are_found_in_a_folder_with_an_odd_name(tmp_path):
+    folder = tmp_path / "a b%20c#d \u00fc"
+    folder.mkdir()
+    for name in ("table.sdf", "ball.sdf"):
+        (folder / name).write_text((MODELS / name).read_text())
+    path = folder / "s.yaml"
+    path.write_text(BALL_SCENE.replace(f"{MODELS}/", ""))
+    scene = read_scene(path)
+    edited = with_effect(scene, "object_size", "ball", scale=1.0)  # Writes a copy.
+    for each in (scene, edited):
+        rows, _ = simulate(each, [0.1])
+        # The contact gives way by m g / stiffness = 7 um.
+        np.testing.assert_allclose(rows[0, :3], [0.1, 0, RADIUS], atol=2e-5)

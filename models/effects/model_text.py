@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from urllib.parse import unquote, urlparse
 from xml.dom import minidom
 
 from pydrake.multibody.parsing import PackageMap
@@ -25,11 +24,12 @@ def edited_model_file(
     Returns: the copy's URI.
     Raises: ValueError if the file is neither URDF nor SDF, or has no such link.
     """
-    parsed = urlparse(uri)
-    if parsed.scheme == "package":
-        path = Path(package_map.GetPath(parsed.netloc)) / unquote(parsed.path[1:])
-    else:
-        path = Path(unquote(parsed.path))
+    # As Drake reads it: no %20, and "#" is part of the name.
+    scheme, _, rest = uri.partition("://")
+    path = Path(rest)
+    if scheme == "package":
+        package, *inside = path.parts
+        path = Path(package_map.GetPath(package)).joinpath(*inside)
     where = f"effect {effect.kind} at {effect.at}"
     if path.suffix not in (".urdf", ".sdf"):
         raise ValueError(f"{where}: {path.name} is neither URDF nor SDF")
@@ -48,14 +48,14 @@ def edited_model_file(
     for element in document.getElementsByTagName("uri"):
         uri = text(element)
         if "://" not in uri:
-            set_text(element, (path.parent / uri).resolve().as_uri())
+            set_text(element, f"file://{(path.parent / uri).resolve()}")
     for element in document.getElementsByTagName("mesh"):
         uri = element.getAttribute("filename")
         if uri and "://" not in uri:
-            element.setAttribute("filename", (path.parent / uri).resolve().as_uri())
+            element.setAttribute("filename", f"file://{(path.parent / uri).resolve()}")
     target = copy.with_suffix(path.suffix)
     target.write_text(document.toxml())
-    return target.as_uri()
+    return f"file://{target}"
 
 
 def text(element: minidom.Element) -> str:
