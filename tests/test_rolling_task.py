@@ -2,7 +2,14 @@ import numpy as np
 import pytest
 from scipy.interpolate import BPoly
 
-from makebreak.systems.numerics.ball_state import P_BALL, P_TIP, V_BALL, V_TIP, W_BALL, pack
+from makebreak.systems.numerics.ball_state import (
+    P_BALL,
+    P_TIP,
+    V_BALL,
+    V_TIP,
+    W_BALL,
+    pack,
+)
 from makebreak.systems.numerics.rolling_task import (
     REPOSITION,
     ROLL,

@@ -91,7 +91,7 @@ def run(config, session):
         record["r_comp"] = system("residual_learner").GetOutputPort("r_comp")
     at = plant.GetBodyByName("ball").floating_positions_start() + 4
     center = np.array(config.task.center)
-    run_through = [0.0, None]  # Progress and the last angle.
+    run_through: list = [0.0, None]  # Progress and the last angle.
 
     def done(t, sample):
         p = sample["state"][at : at + 2] - center

@@ -181,7 +181,8 @@ def impedance_torque(chain, law, q, v, q_n, x_d, R_d, stiffness, damping, wrench
 
     Args: chain, law: constants. q, v, q_n (n,) [rad], [rad/s]. x_d (19,) =
         [p, quaternion (unused), v, w, a, alpha] of the tip in the world; R_d (3, 3)
-        its orientation. stiffness, damping (6,); wrench (6,) fed forward, force first [N], [N m].
+        its orientation. stiffness, damping (6,); wrench (6,) fed forward, force first
+        [N], [N m].
     Returns: tau (n,) [N m] and the tip's position p_WE (3,) [m].
     """
     n = q.shape[0]

@@ -184,7 +184,7 @@ def next_state(config, path, state, t, dt, x, gap, valid, radius_ball, radius_ti
         v_xy = state.v[:2] * slow
         p = np.array([*(state.p[:2] + v_xy * dt), z])
         return TaskState(
-            WAIT, state.since_sec, p, [*v_xy, vz], [0, 0, az],
+            WAIT, state.since_sec, p, np.array([*v_xy, vz]), np.array([0, 0, az]),
             state.z_start, state.vz_start,
         )  # fmt: skip
     if state.phase == WAIT:
