@@ -7,7 +7,7 @@ import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import Demultiplexer
+from pydrake.systems.primitives import Demultiplexer, Saturation
 
 from makebreak.diagrams.camera import CameraConfig, add_camera
 from makebreak.models.scene import InitialSection, Scene, load_scene, read_scene
@@ -109,9 +109,21 @@ def make_station(
         split.get_output_port(first + 1 + between), f"{ARM}.velocity_measured"
     )
 
-    torque = plant.get_net_actuation_output_port(arm)
+    # What the motors give within the effort limits that Drake keeps, too. Drake's own
+    # port for it would solve the contact once more.
+    limit = np.array([
+        plant.get_joint_actuator(index).effort_limit()
+        for index in plant.GetJointActuatorIndices(arm)
+    ])  # fmt: skip
+    motors = builder.AddNamedSystem(f"{ARM}_motors", Saturation(-limit, limit))
+    builder.ConnectInput(f"{ARM}.torque_commanded", motors.get_input_port())
     builder.ExportOutput(
-        noisy(f"{ARM}_torque", torque, np.full(n, noise.torque), seeds[1]),
+        noisy(
+            f"{ARM}_torque",
+            motors.get_output_port(),
+            np.full(n, noise.torque),
+            seeds[1],
+        ),
         f"{ARM}.torque_measured",
     )
 
