@@ -41,7 +41,7 @@ LEARNER_OFFSET, C3_OFFSET, PLANT_OFFSET = 1e-4, 2e-4, 3e-4
 def _learner() -> ResidualLearnerConfig:
     """For a gap in metres: eps in m/N per squared SI unit, gamma in m/N."""
     return ResidualLearnerConfig(
-        eps=10.0, gamma=0.01, n_b=10, learning_rate=3e-3, n_steps=5, r_max=0.5
+        eps=30.0, gamma=0.01, n_b=10, learning_rate=3e-3, n_steps=5, r_max=0.5
     )
 
 
@@ -136,6 +136,7 @@ def make_cartpole_walls(
             plant.get_actuation_input_port(),
         )
         if meshcat is not None:
+            meshcat.SetCameraPose([0.25, -1.3, 0.6], [0.0, 0.0, 0.35])
             MeshcatVisualizer.AddToBuilder(
                 builder,
                 loaded.scene_graph,

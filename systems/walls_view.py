@@ -32,7 +32,7 @@ class WallsView(LeafSystem):
         self._height = config.height
         self._r_comp = self.DeclareVectorInputPort("r_comp", 2)
         for path in self._paths():
-            meshcat.SetObject(path, Box(0.01, 0.3, 0.5), Rgba(0.2, 0.45, 1.0, 0.4))
+            meshcat.SetObject(path, Box(0.01, 0.34, 0.56), Rgba(0.2, 0.45, 1.0, 0.4))
         self._show(self._gap, 0.0)
         self.DeclarePeriodicPublishEvent(config.period_sec, offset_sec, self._publish)
 

@@ -11,6 +11,11 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 from scipy.optimize import lsq_linear
 
+from makebreak.systems.baselines.dynamics_residual_learner import (
+    DynamicsResidualLearner,
+    DynamicsResidualLearnerConfig,
+    DynamicsStatus,
+)
 from makebreak.systems.lcs_plant import LcsPlant
 from makebreak.systems.numerics import residual_learner as numerics
 from makebreak.systems.numerics.lcs import LCS, simulate
@@ -584,3 +589,51 @@ def test_wrong_settings_are_refused_by_name(changes, message):
 def test_a_period_that_is_not_the_lcs_time_step_is_refused():
     with pytest.raises(ValueError, match="period_sec is 0.1, expected the LCS's dt"):
         ResidualLearner(ResidualLearnerConfig(), point_mass(), 0.1)
+
+
+# The baseline: a residual on the dynamics.
+
+
+def baseline(n, edit=None):
+    """The scripted mass, whose true step is 0.01, -0.02 more than the model's."""
+    base, period = point_mass(1e3), 0.05
+    truth = replace(base, d=[0.01, -0.02])
+    x, u = np.zeros((n, 2)), np.zeros((n, 1))
+    for k in range(n - 1):
+        u[k + 1] = np.sin(k)  # Acts before sample k + 1.
+        x[k + 1] = simulate(truth, x[k], u[k + 1])[0]
+    if edit:
+        edit(x)
+    builder = DiagramBuilder()
+    script = builder.AddSystem(Script(x, u, [base], np.ones((1, 1)), period))
+    config = DynamicsResidualLearnerConfig()
+    learner = builder.AddSystem(DynamicsResidualLearner(config, base, period, 1e-3))
+    for port, name in (("x", "x"), ("u", "u_measured"), ("lcs", "lcs")):
+        builder.Connect(script.GetOutputPort(port), learner.GetInputPort(name))
+    return Simulator(builder.Build()), learner
+
+
+def test_baseline_finds_a_constant_error_of_the_dynamics_and_adds_it_to_d():
+    simulator, learner = baseline(8)
+    after_tick(simulator, 1)
+    context = learner.GetMyContextFromRoot(simulator.get_context())
+    r_dyn = learner.GetOutputPort("r_dyn")
+    np.testing.assert_allclose(r_dyn.Eval(context), [0.01, -0.02], atol=1e-14)
+    after_tick(simulator, 7)
+    np.testing.assert_allclose(r_dyn.Eval(context), [0.01, -0.02], atol=1e-14)
+    lcs = learner.GetOutputPort("lcs").Eval(context)
+    np.testing.assert_allclose(lcs.d, [0.01, -0.02], atol=1e-14)
+    np.testing.assert_array_equal(lcs.A, point_mass(1e3).A)
+
+
+def test_baseline_drops_a_sample_that_is_not_finite():
+    def edit(x):
+        x[3, 0] = np.nan
+
+    simulator, learner = baseline(8, edit)
+    context = learner.GetMyContextFromRoot(simulator.get_context())
+    for k, expected in ((3, DynamicsStatus.BAD_SAMPLE), (4, DynamicsStatus.WAITING)):
+        after_tick(simulator, k)
+        assert learner.GetOutputPort("status").Eval(context)[0] == expected
+    r_dyn = learner.GetOutputPort("r_dyn").Eval(context)
+    np.testing.assert_allclose(r_dyn, [0.01, -0.02], atol=1e-14)
