@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram, DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
+from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, MatrixGain
 
 from makebreak.diagrams.camera import CameraConfig, camera_model
 from makebreak.diagrams.scene_facts import sphere_radius
@@ -53,7 +53,6 @@ from makebreak.systems.numerics.ball_state import (
     W_BALL,
 )
 from makebreak.systems.numerics.c3_mpc import C3Options, C3Weights
-from makebreak.systems.peak_meter import PeakMeter, PeakMeterConfig
 from makebreak.systems.residual_learner import ResidualLearner, ResidualLearnerConfig
 from makebreak.systems.rolling_task import RollingTask, RollingTaskConfig
 from makebreak.systems.rolling_view import RollingView, RollingViewConfig
@@ -65,7 +64,7 @@ TRACK, ESTIMATE, CONTROL, LEARN, ARM_TICK = 0.0125, 0.0025, 0.0125, 0.05, 0.001
 # millisecond between two steps of the plant: no value waits for the next period.
 OFFSET = dict(
     tracker=1e-4, estimator=2e-4, task=3e-4, lcs=3e-4, learner=3.5e-4, c3=4e-4,
-    reference=6e-4, impedance=7e-4, meter=8e-4,
+    reference=4.5e-4, impedance=7e-4,
 )  # fmt: skip
 PLAN_DT, TIP_MASS, N_TIP = 0.1, 1.0, 4  # N_TIP: forces of tip and ball, the first ones.
 
@@ -215,7 +214,8 @@ def make_ball_rolling(
     config: BallRollingConfig, meshcat: Meshcat | None = None
 ) -> Diagram:
     """The whole experiment: the station and its controllers, each by name in the
-    diagram. Outputs for scoring: ball and tip positions (3,), contact and torque peaks.
+    diagram. For scoring, `state_log`, `contact_log` and `torque_log` log the truth at
+    1 kHz: the plant's state, the contact's torque on the arm, the commanded torque.
     """
     model, model_scene = believed(config)
     builder = DiagramBuilder()
@@ -304,9 +304,7 @@ def make_ball_rolling(
         ArmReference(
             ArmReferenceConfig(
                 tip_mass=model.tip_mass,
-                command_period_sec=CONTROL,
-                command_offset_sec=OFFSET["c3"],
-                period_sec=ARM_TICK,
+                period_sec=CONTROL,
                 offset_sec=OFFSET["reference"],
             ),
             n_lam,
@@ -384,15 +382,12 @@ def make_ball_rolling(
 
     # For scoring and for the eye alone.
     plant = station.GetSubsystemByName("plant")
-    for name, n, cutoff_hz, source in (
-        ("contact_meter", 4, 100.0, station.GetOutputPort("contact_force")),
-        ("torque_meter", 7, 0.0, impedance.GetOutputPort("tau")),
+    for name, source in (
+        ("state_log", station.GetOutputPort("state")),
+        ("contact_log", station.GetOutputPort(f"{ARM}.contact_torque")),
+        ("torque_log", impedance.GetOutputPort("tau")),
     ):
-        meter_config = PeakMeterConfig(
-            cutoff_hz=cutoff_hz, period_sec=ARM_TICK, offset_sec=OFFSET["meter"]
-        )
-        meter = builder.AddNamedSystem(name, PeakMeter(meter_config, n))
-        builder.Connect(source, meter.GetInputPort("value"))
+        LogVectorOutput(source, builder, ARM_TICK).set_name(name)
     gap = np.zeros((1, n_lam))
     gap[0, :N_TIP] = LEARN / N_TIP
     gap_of_r = builder.AddNamedSystem("learned_gap", MatrixGain(gap))

@@ -57,6 +57,7 @@ def make_station(
              overhead.rgb_image (ImageRgba8U), if there is a camera;
              and the truth, for scoring and tests alone: state (n_x,);
              contact_force (4,) = [normal, x, y, z] [N] of the tool on the ball;
+             panda.contact_torque (7,) [N m] of all contacts on the arm's joints;
              contact_results, body_poses (abstract).
 
     The subsystems `plant` and `scene_graph` can be asked for by name. The plant steps
@@ -88,26 +89,16 @@ def make_station(
         builder.Connect(port, sensor.GetInputPort("value"))
         return sensor.GetOutputPort("measured")
 
-    # Position and velocity are read at once, then taken apart.
-    n_q = plant.num_positions()
-    joints = [plant.get_joint(i) for i in plant.GetJointIndices(arm)]
-    moving = [joint for joint in joints if joint.num_velocities() == 1]
-    q_first = min(joint.position_start() for joint in moving)
-    v_first = n_q + min(joint.velocity_start() for joint in moving)
-    std = np.zeros(plant.num_multibody_states())
-    std[q_first : q_first + n] = noise.position
-    std[v_first : v_first + n] = noise.velocity
-    encoders = noisy(f"{ARM}_encoders", plant.get_state_output_port(), std, seeds[0])
-    sizes = [q_first, n, v_first - q_first - n, n, len(std) - v_first - n]
-    kept = [size for size in sizes if size > 0]  # Demultiplexer has no empty outputs.
-    split = builder.AddNamedSystem(f"{ARM}_encoders_split", Demultiplexer(kept))
-    builder.Connect(encoders, split.get_input_port())
-    first = 1 if q_first > 0 else 0
-    builder.ExportOutput(split.get_output_port(first), f"{ARM}.position_measured")
-    between = 1 if sizes[2] > 0 else 0
-    builder.ExportOutput(
-        split.get_output_port(first + 1 + between), f"{ARM}.velocity_measured"
+    encoders = noisy(
+        f"{ARM}_encoders",
+        plant.get_state_output_port(arm),
+        np.repeat([noise.position, noise.velocity], n),
+        seeds[0],
     )
+    split = builder.AddNamedSystem(f"{ARM}_encoders_split", Demultiplexer([n, n]))
+    builder.Connect(encoders, split.get_input_port())
+    for i, name in enumerate(("position", "velocity")):
+        builder.ExportOutput(split.get_output_port(i), f"{ARM}.{name}_measured")
 
     # What the motors give within the effort limits that Drake keeps, too. Drake's own
     # port for it would solve the contact once more.
@@ -158,6 +149,9 @@ def make_station(
     )
     builder.ExportOutput(probe.GetOutputPort("contact_force"), "contact_force")
     builder.ExportOutput(plant.get_state_output_port(), "state")
+    builder.ExportOutput(
+        plant.get_generalized_contact_forces_output_port(arm), f"{ARM}.contact_torque"
+    )
     builder.ExportOutput(plant.get_contact_results_output_port(), "contact_results")
     builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")
 

@@ -5,35 +5,28 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
 from makebreak.systems.arm_reference import ArmReference, ArmReferenceConfig
-from makebreak.systems.numerics.arm_reference import approach, clip_norm, ticks_left
+from makebreak.systems.numerics.arm_reference import clip_norm, next_end, on_the_line
 from makebreak.systems.numerics.lcs import LCS
 from makebreak.systems.numerics.rolling_task import REPOSITION, ROLL
 
 
-def test_ticks_left_counts_down_to_the_next_command():
-    # Commands every 12.5 ms from 0.3 ms on, ticks every 1 ms from 0.5 ms on: 13 and 12
-    # ticks fall between two commands in turn.
-    left = [ticks_left(0.5e-3 + k * 1e-3, 0.0125, 0.3e-3, 1e-3) for k in range(26)]
-    assert left == [13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1,
-                    12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 13]  # fmt: skip
+def test_line_is_straight_and_stays_at_its_end():
+    start, end = np.array([1.0, -2.0, 0.5]), np.array([2.0, 2.0, 2.0])
+    for share in (0.0, 0.25, 1.0):
+        expected = (1 - share) * start + share * end
+        np.testing.assert_allclose(on_the_line(start, end, share), expected)
+    np.testing.assert_allclose(on_the_line(start, end, 1.3), end)
+    np.testing.assert_allclose(on_the_line(start, end, -0.1), start)
 
 
-def test_approach_arrives_on_the_last_tick_along_a_straight_line():
-    value, target = np.array([1.0, -2.0, 0.5]), np.array([2.0, 2.0, 2.0])
-    start, steps = value, []
-    for n_left in range(12, 0, -1):
-        new = approach(value, target, n_left, np.inf)
-        steps.append(new - value)
-        value = new
-    np.testing.assert_allclose(value, target, atol=1e-15)
-    np.testing.assert_allclose(steps, [(target - start) / 12] * 12, atol=1e-14)
-
-
-def test_steps_and_norms_are_bounded():
-    step = approach(np.zeros(3), np.array([3.0, 4.0, 0.0]), 1, 0.5)
-    np.testing.assert_allclose(step, [0.3, 0.4, 0.0], atol=1e-15)
+def test_norms_and_the_change_of_velocity_are_bounded():
     np.testing.assert_allclose(clip_norm(np.array([0.0, 6.0, 8.0]), 5.0), [0, 3, 4])
     np.testing.assert_allclose(clip_norm(np.array([0.0, 0.3]), 5.0), [0.0, 0.3])
+    target = np.arange(12.0)
+    target[3:6] = [3.0, 4.0, 0.0]
+    end = next_end(np.zeros(12), target, 0.5)
+    np.testing.assert_allclose(end[3:6], [0.3, 0.4, 0.0], atol=1e-15)
+    np.testing.assert_allclose(np.delete(end, [3, 4, 5]), np.delete(target, [3, 4, 5]))
 
 
 def one_force_lcs(tip_mass):
@@ -47,10 +40,10 @@ def one_force_lcs(tip_mass):
     )  # fmt: skip
 
 
-def run(phase, x_next, lam, t_end=0.0125):
+def run(phase, x_next, lam, t_end=0.0126):
     builder = DiagramBuilder()
     lcs = one_force_lcs(2.0)
-    config = ArmReferenceConfig(tip_mass=2.0, offset_sec=1e-4)
+    config = ArmReferenceConfig(tip_mass=2.0)
     arm = builder.AddNamedSystem("arm", ArmReference(config, 1, np.zeros(3), lcs))
     reference = np.arange(9.0)
     for name, value in dict(
@@ -82,7 +75,15 @@ def test_feed_forward_and_the_slope_of_the_velocity_are_bounded():
     x_next[10:13] = [5.0, 0.0, 0.0]
     pose, wrench = run(ROLL, x_next, [1e3])
     assert np.linalg.norm(wrench) <= 3.0 + 1e-12
-    assert 0.0 < pose[7] <= 13 * 1.5 * 1e-3 + 1e-12  # 13 ticks of 1.5 m/s2.
+    # At 12.5 ms a period of 1.5 m/s2 is over, and 0.1 ms of the next.
+    np.testing.assert_allclose(pose[7], 1.5 * 0.0126, atol=1e-12)
+
+
+def test_half_a_period_later_the_reference_is_half_way():
+    x_next = np.zeros(19)
+    x_next[0] = 0.002
+    pose, _ = run(ROLL, x_next, [0.0], t_end=0.00625)
+    np.testing.assert_allclose(pose[0], 0.001, atol=1e-15)
 
 
 def test_reposition_follows_the_task_and_pushes_nothing():

@@ -1,45 +1,29 @@
 """Between two commands of a slow planner: straight lines and bounded slopes."""
 
-import numba
 import numpy as np
 
 
-@numba.njit(cache=True)
-def ticks_left(t, period_sec, offset_sec, tick_sec):
-    """How many ticks, this one counted, until the planner's next command is due.
-
-    The planner speaks at offset_sec + k period_sec; a tick at exactly that time still
-    belongs to the command before.
-    """
-    since = (t - offset_sec) % period_sec
-    return max(1, int(np.ceil((period_sec - since) / tick_sec - 1e-6)))
-
-
-@numba.njit(cache=True)
-def approach(value, target, n_left, step_max):
-    """One tick from value (n,) towards target (n,), due in n_left ticks; the step's
-    norm is at most step_max."""
-    return value + clip_norm((target - value) / n_left, step_max)
-
-
-@numba.njit(cache=True)
 def clip_norm(vector, limit):
     """vector (n,), shortened to the norm limit if it is longer."""
-    size = np.sqrt(np.sum(vector * vector))
-    return vector * (limit / size) if size > limit else vector * 1.0
+    size = np.sqrt(vector @ vector)
+    return vector if size <= limit else vector * (limit / size)
 
 
-@numba.njit(cache=True)
-def step(reference, target, n_left, dv_max):
-    """One tick of the whole reference.
+def on_the_line(start, end, share):
+    """The point of the line from start to end (n,) after `share` of the time; before 0
+    the start, after 1 the end."""
+    return start + min(max(share, 0.0), 1.0) * (end - start)
 
-    Args: reference, target: (12,) = [p, v, a, feed-forward force], each (3,);
-        dv_max: bound on the step of v [m/s].
-    Returns: (12,); the reference as it was if anything is not finite.
+
+def next_end(start, target, dv_max):
+    """Where the line from `start` towards `target` ends.
+
+    Args: start, target: (12,) = [p, v, a, feed-forward force], each (3,); dv_max: bound
+        on how far v goes [m/s].
+    Returns: (12,); start itself if target is not finite.
     """
-    new = np.empty(12)
-    for i in range(4):
-        part = slice(3 * i, 3 * i + 3)
-        bound = dv_max if i == 1 else np.inf
-        new[part] = approach(reference[part], target[part], n_left, bound)
-    return new if np.isfinite(new).all() else reference * 1.0
+    if not np.isfinite(target).all():
+        return start.copy()
+    end = target.copy()
+    end[3:6] = start[3:6] + clip_norm(target[3:6] - start[3:6], dv_max)
+    return end

@@ -15,9 +15,10 @@ V_TIP, W_BALL, V_BALL = slice(10, 13), slice(13, 16), slice(16, 19)
 
 def rolling_velocity(v_ball, radius):
     """Angular velocity (3,) [rad/s] of a ball of radius [m] that rolls on a level
-    table at v_ball (3,) [m/s]: the v_ball = omega x (radius z), spin about z unseen.
+    table at v_ball [m/s], of which x and y count: v = omega x (radius z), and no spin
+    about z. v_ball may be (3, n) or (2, n), the result is (3, n) then.
     """
-    return np.array([-v_ball[1], v_ball[0], 0.0]) / radius
+    return np.array([-v_ball[1], v_ball[0], 0.0 * v_ball[0]]) / radius
 
 
 def pack(p_tip, v_tip, p_ball, v_ball, radius):

@@ -16,7 +16,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from makebreak.systems.numerics.ball_state import P_BALL, P_TIP, V_BALL, V_TIP, pack
+from makebreak.systems.numerics.ball_state import (
+    N_X,
+    P_BALL,
+    P_TIP,
+    Q_BALL,
+    V_BALL,
+    V_TIP,
+    W_BALL,
+    rolling_velocity,
+)
 
 ROLL, REPOSITION, WAIT = 0, 1, 2
 
@@ -148,14 +157,19 @@ def target_over_horizon(path, x, lead, speed, z_tip, radius_ball, dt, n_knots):
     at `speed` [m/s]. The tip: above the ball, at the height z_tip [m], and twice as
     fast, as a tip on a rolling ball is. Targets that stand still brake at every knot.
     """
-    now = path.angle(x[P_BALL])
-    rows = []
-    for k in range(n_knots):
-        angle = now + lead + speed * k * dt / path.radius
-        p, v = path.point(angle), speed * path.tangent(angle)
-        tip = [*p, z_tip], [*(2.0 * v), 0.0]
-        rows.append(pack(*tip, [*p, radius_ball], [*v, 0.0], radius_ball))
-    return np.array(rows)
+    angle = path.angle(x[P_BALL]) + lead + speed / path.radius * dt * np.arange(n_knots)
+    cos, sin = np.cos(angle), np.sin(angle)
+    v = speed * np.stack([-sin, cos], axis=1)
+    goal = np.zeros((n_knots, N_X))
+    goal[:, P_BALL][:, :2] = path.center + path.radius * np.stack([cos, sin], axis=1)
+    goal[:, P_BALL][:, 2] = radius_ball
+    goal[:, P_TIP] = goal[:, P_BALL]
+    goal[:, P_TIP][:, 2] = z_tip
+    goal[:, V_BALL][:, :2] = v
+    goal[:, V_TIP][:, :2] = 2.0 * v
+    goal[:, Q_BALL][:, 0] = 1.0
+    goal[:, W_BALL] = rolling_velocity(v.T, radius_ball).T
+    return goal
 
 
 def next_state(config, path, state, t, dt, x, gap, valid, radius_ball, radius_tip):
