@@ -87,7 +87,8 @@ class PlannerConfig:
 class LearnerConfig:
     learning_rate: float = 3e-3  # [m/s] per update.
     n_b: int = 10
-    weight: float = 1e5  # Q_d of the ball's v_x, v_y and the tip's v_z.
+    weight_ball: float = 1e5  # Q_d of the ball's v_x, v_y, seen by the camera, ...
+    weight_tip: float = 1e5  # ... and of the tip's v_z, felt by the joints.
     eps: float = 2e-6  # 1e-7 / 0.05 s: the paper's, for forces in newtons.
     gamma: float = 5e-4  # 1e-2 * 0.05 s, likewise.
     r_max: float = 1.0  # [m/s]: 50 mm.
@@ -108,6 +109,7 @@ class BallRollingConfig:
     model: str = BALL_ROLLING
     seed: int = 0
     camera: CameraConfig = field(default_factory=CameraConfig)
+    tracker: BallTrackerConfig = field(default_factory=BallTrackerConfig)
     task: RollingTaskConfig = field(default_factory=RollingTaskConfig)
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     learner: LearnerConfig = field(default_factory=LearnerConfig)
@@ -196,7 +198,8 @@ def learner_config(learner: LearnerConfig) -> ResidualLearnerConfig:
     Q_d = np.zeros(N_X)
     # A tip pressed on a surface that is not there is also explained by two friction
     # forces that cancel; only its missing rebound, v_z, shows that nothing touched.
-    Q_d[[V_BALL.start, V_BALL.start + 1, V_TIP.start + 2]] = learner.weight
+    Q_d[V_TIP.start + 2] = learner.weight_tip
+    Q_d[[V_BALL.start, V_BALL.start + 1]] = learner.weight_ball
     return ResidualLearnerConfig(
         Q_d=list(Q_d),
         eps=learner.eps,
@@ -260,7 +263,8 @@ def make_ball_rolling(
     tracker = builder.AddNamedSystem(
         "ball_tracker",
         BallTracker(
-            BallTrackerConfig(
+            replace(
+                config.tracker,
                 ball_radius=model.ball_radius,
                 period_sec=TRACK,
                 offset_sec=OFFSET["tracker"],
