@@ -79,7 +79,7 @@ def test_reposition_passes_over_the_ball_and_lands_behind_a_rolling_one(v_ball):
         assert np.linalg.norm(state.p - p_ball) > R_BALL + R_TIP - 1e-9
     t, state, _ = history[-1]
     p_ball = ball + v_ball * t
-    behind = p_ball - PATH.tangent(PATH.angle(p_ball)) * config.land_behind
+    behind = p_ball - PATH.heading(p_ball) * config.land_behind
     # The landing point turns with the path while the ball rolls the last 12.5 ms.
     np.testing.assert_allclose(state.p[:2], behind, atol=2e-4)
     z = surface_height(config.land_behind, R_BALL, R_TIP) + config.land_above
@@ -125,10 +125,33 @@ def test_a_ball_that_is_not_seen_stops_the_push_and_lifts_the_tip():
 def test_target_leads_the_ball_and_moves_along_the_circle():
     x = pack([0.6, 0, 0.1], np.zeros(3), [0.6, 0.0, R_BALL], np.zeros(3), R_BALL)
     speed, dt = 0.1 * np.pi / 2, 0.1  # A quarter of the circle each second.
-    target = target_over_horizon(PATH, x, np.pi / 2, speed, 0.07, R_BALL, dt, 11)
+    target = target_over_horizon(PATH, x, 0.1, speed, 0.07, R_BALL, dt, 11)
     assert target.shape == (11, 19)
-    np.testing.assert_allclose(target[0, P_BALL], [0.5, 0.1, R_BALL], atol=1e-15)
-    np.testing.assert_allclose(target[10, P_BALL], [0.4, 0.0, R_BALL], atol=1e-15)
-    np.testing.assert_allclose(target[10, V_BALL], [0.0, -speed, 0.0], atol=1e-15)
+    c, s = 0.1 * np.cos(0.1), 0.1 * np.sin(0.1)
+    np.testing.assert_allclose(target[0, P_BALL], [0.5 + c, s, R_BALL], atol=1e-15)
+    np.testing.assert_allclose(target[10, P_BALL], [0.5 - s, c, R_BALL], atol=1e-15)
+    v = speed * np.array([-10 * c, -10 * s, 0.0])  # Turned by a quarter from [-s, c].
+    np.testing.assert_allclose(target[10, V_BALL], v, atol=1e-15)
     np.testing.assert_allclose(target[:, V_TIP], 2 * target[:, V_BALL], atol=1e-15)
     np.testing.assert_allclose(target[:, P_TIP][:, 2], 0.07)
+
+
+def test_target_of_a_ball_far_off_the_path_is_within_reach_and_towards_the_path():
+    ball = np.array([0.65, 0.0, R_BALL])
+    x = pack([0.6, 0, 0.1], np.zeros(3), ball, np.zeros(3), R_BALL)
+    way = target_over_horizon(PATH, x, 0.1, 0.0, 0.07, R_BALL, 0.1, 3)[:, P_BALL] - ball
+    on_path = np.array([0.5 + 0.1 * np.cos(0.1), 0.1 * np.sin(0.1), R_BALL]) - ball
+    expected = 0.015 * on_path / np.linalg.norm(on_path)
+    np.testing.assert_allclose(way, [expected] * 3, atol=1e-15)
+
+
+def test_push_is_over_when_the_tip_is_in_front_of_the_ball():
+    ball = np.array([0.6, 0.0, R_BALL])
+    for ahead, phase in ((0.02, ROLL), (0.03, REPOSITION)):
+        tip = ball + [0.0, ahead, 0.04]
+        x = pack(tip, np.zeros(3), ball, np.zeros(3), R_BALL)
+        state = TaskState(ROLL, 0.0, tip, np.zeros(3), np.zeros(3))
+        state = next_state(
+            RollingConfig(), PATH, state, 0.1, DT, x, 0.0, True, R_BALL, R_TIP
+        )  # fmt: skip
+        assert state.phase == phase

@@ -28,6 +28,9 @@ from makebreak.systems.numerics.ball_state import (
 )
 
 ROLL, REPOSITION, WAIT = 0, 1, 2
+LOOK_AHEAD = 0.35  # A push is directed at the point so far along the circle [rad].
+REACH = 0.015  # The ball's target is at most so far away; a tip that were to go further
+# at once would slip over the ball and leave it behind [m].
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +48,10 @@ class CirclePath:
         """(2,) [m]"""
         return self.center + self.radius * np.array([np.cos(angle), np.sin(angle)])
 
-    def tangent(self, angle):
-        """(2,) unit vector in the direction of travel."""
-        return np.array([-np.sin(angle), np.cos(angle)])
+    def heading(self, p):
+        """(2,) unit vector from p, on the circle or off it, to where it should go."""
+        goal = self.point(self.angle(p) + LOOK_AHEAD) - p[:2]
+        return goal / max(np.sqrt(goal @ goal), 1e-9)
 
 
 def quintic(t, T, start, end):
@@ -92,7 +96,7 @@ class TaskState:
 @dataclass
 class RollingConfig:
     roll_sec: float = 1.0
-    roll_ahead: float = 1.0  # Tip at most so far in front of the ball [m].
+    roll_ahead: float = 0.025  # Tip at most so far in front of the ball [m].
     reposition_sec: float = 0.7
     lift: float = 0.015  # Clearance over the ball while passing it [m].
     land_behind: float = 0.018  # [m]
@@ -115,7 +119,7 @@ def landing(config, path, x, gap, time_left, radius_ball, radius_tip):
         gap: how much lower the surface is believed to be than modelled [m].
     """
     p_ball = x[P_BALL][:2] + x[V_BALL][:2] * time_left
-    behind = -path.tangent(path.angle(p_ball)) * config.land_behind
+    behind = -path.heading(p_ball) * config.land_behind
     z = surface_height(config.land_behind, radius_ball, radius_tip)
     p = np.append(p_ball + behind, z + config.land_above - gap)
     return p, np.append(x[V_BALL][:2], 0.0)
@@ -154,14 +158,18 @@ def target_over_horizon(path, x, lead, speed, z_tip, radius_ball, dt, n_knots):
     """The target of C3, (n_knots, 19), one row per knot dt [s] after the other.
 
     The ball: `lead` [rad] further along the circle than it is now, and moving along it
-    at `speed` [m/s]. The tip: above the ball, at the height z_tip [m], and twice as
+    at `speed` [m/s]; all of it nearer, if the first point is further off than REACH.
+    The tip: above the ball, at the height z_tip [m], and twice as
     fast, as a tip on a rolling ball is. Targets that stand still brake at every knot.
     """
     angle = path.angle(x[P_BALL]) + lead + speed / path.radius * dt * np.arange(n_knots)
     cos, sin = np.cos(angle), np.sin(angle)
     v = speed * np.stack([-sin, cos], axis=1)
     goal = np.zeros((n_knots, N_X))
-    goal[:, P_BALL][:, :2] = path.center + path.radius * np.stack([cos, sin], axis=1)
+    points = path.center + path.radius * np.stack([cos, sin], axis=1)
+    way = points[0] - x[P_BALL][:2]
+    too_far = max(0.0, 1.0 - REACH / max(np.sqrt(way @ way), 1e-9))
+    goal[:, P_BALL][:, :2] = points - too_far * way
     goal[:, P_BALL][:, 2] = radius_ball
     goal[:, P_TIP] = goal[:, P_BALL]
     goal[:, P_TIP][:, 2] = z_tip
@@ -205,7 +213,7 @@ def next_state(config, path, state, t, dt, x, gap, valid, radius_ball, radius_ti
         state = lift_from(REPOSITION)
     if state.phase == ROLL:
         ball = x[P_BALL]
-        ahead = path.tangent(path.angle(ball)) @ (x[P_TIP] - ball)[:2]
+        ahead = path.heading(ball) @ (x[P_TIP] - ball)[:2]
         if t - state.since_sec < config.roll_sec and ahead < config.roll_ahead:
             return state
         state = lift_from(REPOSITION)
