@@ -85,10 +85,10 @@ class PlannerConfig:
 
 @dataclass
 class LearnerConfig:
-    learning_rate: float = 3e-3  # [m/s] per update.
+    learning_rate: float = 8e-3  # [m/s] per update, 0.4 mm of gap.
     n_b: int = 10
-    weight_ball: float = 1e5  # Q_d of the ball's v_x, v_y, seen by the camera, ...
-    weight_tip: float = 1e5  # ... and of the tip's v_z, felt by the joints.
+    weight_ball: float = 2e4  # Q_d of the ball's v_x, v_y, seen by the camera, ...
+    weight_tip: float = 1e5  # ... and of the tip's v_z, felt by the joints: less noise.
     eps: float = 2e-6  # 1e-7 / 0.05 s: the paper's, for forces in newtons.
     gamma: float = 5e-4  # 1e-2 * 0.05 s, likewise.
     r_max: float = 1.0  # [m/s]: 50 mm.
@@ -109,7 +109,11 @@ class BallRollingConfig:
     model: str = BALL_ROLLING
     seed: int = 0
     camera: CameraConfig = field(default_factory=CameraConfig)
-    tracker: BallTrackerConfig = field(default_factory=BallTrackerConfig)
+    tracker: BallTrackerConfig = field(
+        default_factory=lambda: BallTrackerConfig(
+            position_std=1.5e-3, acceleration_density=4e-3
+        )
+    )
     task: RollingTaskConfig = field(default_factory=RollingTaskConfig)
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     learner: LearnerConfig = field(default_factory=LearnerConfig)

@@ -21,7 +21,7 @@ class RollingTaskConfig:
     center: list[float] = field(default_factory=lambda: [0.5, 0.0])  # [m]
     radius: float = 0.1  # Of the circle [m].
     lead_deg: float = 6.0  # The target runs so far ahead of the ball ...
-    speed: float = 0.06  # ... and moves along the circle with it [m/s].
+    speed: float = 0.045  # ... and moves along the circle with it [m/s].
     press: float = 0.045  # Tip target below the top of the modelled ball [m].
     rolling: RollingConfig = field(default_factory=RollingConfig)
     period_sec: float = 0.0125

@@ -97,11 +97,11 @@ class TaskState:
 class RollingConfig:
     roll_sec: float = 1.0
     roll_ahead: float = 0.025  # Tip at most so far in front of the ball [m].
-    reposition_sec: float = 0.7
+    reposition_sec: float = 0.55
     lift: float = 0.015  # Clearance over the ball while passing it [m].
     land_behind: float = 0.018  # [m]
     land_above: float = 0.003  # Above the surface as it is believed to be [m].
-    ease: float = 0.35  # Share of the reposition for going up, and for coming down.
+    ease: float = 0.42  # Share of the reposition for going up, and for coming down.
 
 
 def surface_height(offset, radius_ball, radius_tip):
