@@ -2,12 +2,14 @@ import logging
 
 import numpy as np
 import pytest
+from pydrake.geometry import PerceptionProperties, Role
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from pydrake.systems.framework import DiagramBuilder
 
+from makebreak.diagrams.camera import CameraConfig, add_camera
 from makebreak.diagrams.station import BALL_ROLLING, MODELS, make_control_plant
 from makebreak.models.scene import load_scene, read_scene
 from makebreak.systems.impedance_controller import (
@@ -208,3 +210,51 @@ def test_ball_and_table_and_finger_meet_with_the_stated_friction():
     for other in ("table", "finger"):
         pair = 2 * mu["ball"] * mu[other] / (mu["ball"] + mu[other])
         np.testing.assert_allclose(pair, 0.5, rtol=1e-12)
+
+
+def test_a_camera_sees_the_ball_as_past_the_arm_on_display(postures):
+    # The same pictures once with what a camera is shown and once with all that is on
+    # display, for a ball within 20 mm of the tip.
+    pictures = []
+    for on_display in (False, True):
+        builder = DiagramBuilder()
+        loaded = load_scene(read_scene(BALL_ROLLING), builder)
+        plant, scene_graph = loaded.plant, loaded.scene_graph
+        source, inspector = plant.get_source_id(), scene_graph.model_inspector()
+        n_shown = 0
+        for index in plant.GetBodyIndices(plant.GetModelInstanceByName("panda")):
+            frame = plant.GetBodyFrameIdOrThrow(index)
+            for g in inspector.GetGeometries(frame):
+                shown = inspector.GetIllustrationProperties(g)
+                seen = inspector.GetPerceptionProperties(g)
+                n_shown += shown is not None
+                if on_display and seen is not None and shown is None:
+                    scene_graph.RemoveRole(source, g, Role.kPerception)
+                if on_display and seen is None and shown is not None:
+                    properties = PerceptionProperties(shown)
+                    scene_graph.AssignRole(source, g, properties)
+        assert n_shown == 36
+        config = CameraConfig(renderer="drawn", position=CAMERA.tolist())
+        port = add_camera(builder, scene_graph, plant, config, seed=0)
+        builder.ExportOutput(port, "image")
+        diagram = builder.Build()
+        context = diagram.CreateDefaultContext()
+        rng, balls, arms = np.random.default_rng(0), [], []
+        for tip, q in postures[2]:
+            if tip[2] < 0.05:  # The tip would be in the ball.
+                continue
+            ball = [*(tip[:2] + rng.uniform(-0.014, 0.014, 2)), 0.0315]
+            plant.SetPositions(
+                plant.GetMyMutableContextFromRoot(context), [*q, 1, 0, 0, 0, *ball]
+            )
+            rgb = diagram.GetOutputPort("image").Eval(context).data[:, :, :3]
+            balls.append(np.ptp(rgb, axis=2) > 40)
+            arms.append(rgb.min(axis=2) > 230)
+        pictures.append((np.array(balls), np.array(arms)))
+    (ball, arm), (ball_before, arm_before) = pictures
+    sizes, sizes_before = ball.sum(axis=(1, 2)), ball_before.sum(axis=(1, 2))
+    assert (sizes <= sizes_before).all()
+    assert (sizes >= 0.98 * sizes_before).all()
+    # Nothing of the arm but a few blended pixels of its edge is missing.
+    assert (arm_before & ~arm).sum(axis=(1, 2)).max() <= 10
+    assert arm.sum() < 1.2 * arm_before.sum()
