@@ -58,8 +58,9 @@ from makebreak.systems.rolling_task import RollingTask, RollingTaskConfig
 from makebreak.systems.rolling_view import RollingView, RollingViewConfig
 from makebreak.systems.state_estimator import StateEstimator, StateEstimatorConfig
 
-# Periods [s]. The estimator's divides C3's and the learner's.
-TRACK, ESTIMATE, CONTROL, LEARN, ARM_TICK = 0.0125, 0.0025, 0.0125, 0.05, 0.001
+# Periods [s]. The estimator's divides C3's and the learner's: no reading is stale.
+TRACK = CONTROL = 0.0125
+ESTIMATE, LEARN, ARM_TICK = CONTROL / 3.0, 0.05, 0.001
 # Each system runs a little after the one that it listens to, and all within the
 # millisecond between two steps of the plant: no value waits for the next period.
 OFFSET = dict(

@@ -4,7 +4,12 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import LeafSystem
 
-from makebreak.systems.numerics.arm_reference import clip_norm, next_end, on_the_line
+from makebreak.systems.numerics.arm_reference import (
+    clip_norm,
+    next_end,
+    on_the_line,
+    pose_and_wrench,
+)
 from makebreak.systems.numerics.ball_state import N_X, P_TIP, V_TIP
 from makebreak.systems.numerics.lcs import LCS
 from makebreak.systems.numerics.rolling_task import ROLL
@@ -36,15 +41,15 @@ class ArmReference(LeafSystem):
 
     def __init__(self, config: ArmReferenceConfig, n_lam: int, p_tip, lcs: LCS):
         super().__init__()
-        self._config = config
+        self._config, self._period = config, config.period_sec
         self._phase = self.DeclareVectorInputPort("phase", 1)
         self._reference = self.DeclareVectorInputPort("reference", 9)
         self._x_next = self.DeclareVectorInputPort("x_next", N_X)
         self._lam = self.DeclareVectorInputPort("lam", n_lam)
         self._lcs = self.DeclareAbstractInputPort("lcs", AbstractValue.Make(lcs))
         self._zero = np.zeros(3)
-        self._pose_scratch = np.eye(19)[3]  # No rotation; the rest is filled in.
         at_rest = np.concatenate([p_tip, np.zeros(9)])
+        pose_and_wrench(np.zeros(25), 0.0, 1.0)  # Compiled now, not at the first tick.
         # The line's start and end, and when it starts [s].
         self._line = self.DeclareDiscreteState(np.concatenate([at_rest, at_rest, [0]]))
         ticket = {self.discrete_state_ticket(self._line), self.time_ticket()}
@@ -53,11 +58,6 @@ class ArmReference(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
-
-    def _now(self, context):
-        line = context.get_discrete_state(self._line).value()
-        share = (context.get_time() - line[24]) / self._config.period_sec
-        return on_the_line(line[:12], line[12:24], share)
 
     @timed
     def _update(self, context, discrete_state):
@@ -73,17 +73,16 @@ class ArmReference(LeafSystem):
             dv_max = c.acceleration_max * c.period_sec
         else:
             target = np.concatenate((self._reference.Eval(context), self._zero))
-        start = self._now(context)
-        line = np.concatenate(
-            (start, next_end(start, target, dv_max), [context.get_time()])
-        )
-        discrete_state.set_value(self._line, line)
+        t = context.get_time()
+        line = context.get_discrete_state(self._line).value()
+        start = on_the_line(line, t, c.period_sec)
+        end = next_end(start, target, dv_max)
+        discrete_state.set_value(self._line, np.concatenate((start, end, [t])))
 
     def _pose(self, context, output):
-        reference, pose = self._now(context), self._pose_scratch
-        pose[0:3], pose[7:10] = reference[0:3], reference[3:6]
-        pose[13:16] = reference[6:9]
-        output.SetFromVector(pose)
+        line = context.get_discrete_state(self._line).value()
+        output.SetFromVector(pose_and_wrench(line, context.get_time(), self._period)[0])
 
     def _wrench(self, context, output):
-        output.SetFromVector(np.concatenate((self._now(context)[9:], self._zero)))
+        line = context.get_discrete_state(self._line).value()
+        output.SetFromVector(pose_and_wrench(line, context.get_time(), self._period)[1])

@@ -14,7 +14,7 @@ class StateEstimatorConfig:
     ball_radius: float = 0.0315  # [m] as the model has it.
     tip_mass: float = 1.0  # [kg] of the tip in the LCS.
     window_sec: float = 0.05  # Of the mean force: the learner's period.
-    period_sec: float = 0.0025  # Divides the periods of C3 and of the learner.
+    period_sec: float = 0.0125 / 3.0  # Divides the periods of C3 and of the learner.
     offset_sec: float = 0.0
 
 

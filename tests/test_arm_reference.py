@@ -11,12 +11,13 @@ from makebreak.systems.numerics.rolling_task import REPOSITION, ROLL
 
 
 def test_line_is_straight_and_stays_at_its_end():
-    start, end = np.array([1.0, -2.0, 0.5]), np.array([2.0, 2.0, 2.0])
-    for share in (0.0, 0.25, 1.0):
+    rng = np.random.default_rng(0)
+    start, end = rng.normal(size=(2, 12))
+    line = np.concatenate([start, end, [3.0]])
+    for t, share in ((2.9, 0.0), (3.0, 0.0), (3.1, 0.25), (3.4, 1.0), (3.5, 1.0)):
         expected = (1 - share) * start + share * end
-        np.testing.assert_allclose(on_the_line(start, end, share), expected)
-    np.testing.assert_allclose(on_the_line(start, end, 1.3), end)
-    np.testing.assert_allclose(on_the_line(start, end, -0.1), start)
+        # 3.1 - 3.0 is 0.1 to 1e-16 / 0.4 of a line of length 2.
+        np.testing.assert_allclose(on_the_line(line, t, 0.4), expected, atol=1e-14)
 
 
 def test_norms_and_the_change_of_velocity_are_bounded():

@@ -1,5 +1,6 @@
 """Between two commands of a slow planner: straight lines and bounded slopes."""
 
+import numba
 import numpy as np
 
 
@@ -9,10 +10,27 @@ def clip_norm(vector, limit):
     return vector if size <= limit else vector * (limit / size)
 
 
-def on_the_line(start, end, share):
-    """The point of the line from start to end (n,) after `share` of the time; before 0
-    the start, after 1 the end."""
-    return start + min(max(share, 0.0), 1.0) * (end - start)
+@numba.njit(cache=True)
+def on_the_line(line, t, period_sec):
+    """Where the reference is at time t [s] on a line that takes period_sec.
+
+    Args: line: (25,) = [start 12, end 12, time of the start].
+    Returns: (12,); before the line the start, after it the end.
+    """
+    share = min(max((t - line[24]) / period_sec, 0.0), 1.0)
+    return line[:12] + share * (line[12:24] - line[:12])
+
+
+@numba.njit(cache=True)
+def pose_and_wrench(line, t, period_sec):
+    """The same as x_desired (19,) = [p, quaternion, v, w, a, alpha], unturned, and as
+    wrench (6,), force first."""
+    now = on_the_line(line, t, period_sec)
+    pose, wrench = np.zeros(19), np.zeros(6)
+    pose[0:3], pose[3] = now[0:3], 1.0
+    pose[7:10], pose[13:16] = now[3:6], now[6:9]
+    wrench[0:3] = now[9:12]
+    return pose, wrench
 
 
 def next_end(start, target, dv_max):
