@@ -14,15 +14,22 @@ from pydrake.geometry import (
     SceneGraph,
     Sphere,
 )
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import LeafSystem
 from pydrake.systems.sensors import ImageRgba8U
 
-from makebreak.systems.numerics.pinhole import Pinhole, draw
+from makebreak.systems.numerics.pinhole import (
+    SHAPES,
+    Pinhole,
+    draw,
+    draw_visible,
+    extents,
+    visible,
+)
 
-SKY = (204.0, 229.0, 255.0)  # Drake's own clear colour for rendering.
+SKY = (204, 229, 255, 255)  # Drake's own clear colour for rendering.
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +38,8 @@ class PaintedShape:
 
     body_index: int
     X_BG: RigidTransform  # Pose in its body.
-    kind: str  # See numerics/pinhole.py, `outline`.
-    size: tuple[float, ...]  # [m]
+    kind: int  # Its place in SHAPES of numerics/pinhole.py.
+    extent: np.ndarray  # (3,) [m], see `extents` there.
     color: np.ndarray  # (3,) 0..255
 
 
@@ -71,7 +78,15 @@ def painted_shapes(plant: MultibodyPlant, scene_graph: SceneGraph):
             )
             if rgba.a() > 0.0:
                 color = 255.0 * np.array([rgba.r(), rgba.g(), rgba.b()])
-                shapes.append(PaintedShape(int(body.index()), X_BG, kind, size, color))
+                shapes.append(
+                    PaintedShape(
+                        body_index=int(body.index()),
+                        X_BG=X_BG,
+                        kind=SHAPES.index(kind),
+                        extent=extents(kind, size),
+                        color=color,
+                    )
+                )
     return shapes
 
 
@@ -91,24 +106,25 @@ class PinholeCamera(LeafSystem):
     def __init__(self, camera: Pinhole, plant: MultibodyPlant, scene_graph: SceneGraph):
         super().__init__()
         self._camera = camera
-        X_CW = RigidTransform(
-            RotationMatrix(camera.R_WC), camera.p_WC.tolist()
-        ).inverse()
-        self._X_CW = X_CW
         shapes = painted_shapes(plant, scene_graph)
         still = plant.CreateDefaultContext()
         X_WB = {s.body_index: _pose_if_anchored(plant, still, s) for s in shapes}
+        anchored = [s for s in shapes if X_WB[s.body_index] is not None]
         self._moving = [s for s in shapes if X_WB[s.body_index] is None]
-        self._background = np.empty((camera.height, camera.width, 3), np.uint8)
+        self._bodies = sorted({s.body_index for s in self._moving})
+        self._in_body = self._prepared(self._moving, self._bodies)
+        self._background = np.empty((camera.height, camera.width, 4), np.uint8)
         self._background[:] = SKY
+        bodies = sorted({s.body_index for s in anchored})
         self._paint(
             self._background,
-            [
-                (s, X_CW @ X_WB[s.body_index] @ s.X_BG)
-                for s in shapes
-                if X_WB[s.body_index] is not None
-            ],
+            anchored,
+            self._prepared(anchored, bodies),
+            [X_WB[i] for i in bodies],
         )
+        scratch, ahead = self._background.copy(), np.array([0.0, 0.0, 1.0])
+        # Compiles; no stall in the first picture.
+        draw(scratch, camera, "sphere", (0.1,), ahead, np.eye(3), np.zeros(3))
         self._poses = self.DeclareAbstractInputPort(
             "body_poses", Value[list[RigidTransform]]()
         )
@@ -119,18 +135,34 @@ class PinholeCamera(LeafSystem):
             prerequisites_of_calc={self.input_port_ticket(self._poses.get_index())},
         )
 
+    @staticmethod
+    def _prepared(shapes, bodies):
+        """Of n shapes: where its body is in `bodies` (n,), p_BG (n, 3), R_BG
+        (n, 3, 3), extents (n, 3)."""
+        n = len(shapes)
+        return (
+            np.array([bodies.index(s.body_index) for s in shapes], int),
+            np.array([s.X_BG.translation() for s in shapes]).reshape(n, 3),
+            np.array([s.X_BG.rotation().matrix() for s in shapes]).reshape(n, 3, 3),
+            np.array([s.extent for s in shapes]).reshape(n, 3),
+        )
+
     def _draw(self, context, output):
         poses: Any = self._poses.Eval(context)
-        picture = self._background.copy()
-        self._paint(
-            picture,
-            [(s, self._X_CW @ poses[s.body_index] @ s.X_BG) for s in self._moving],
-        )
         pixels = output.get_mutable_value().mutable_data
-        pixels[:, :, :3] = picture
-        pixels[:, :, 3] = 255
+        pixels[:] = self._background
+        X_WB = [poses[i] for i in self._bodies]
+        self._paint(pixels, self._moving, self._in_body, X_WB)
 
-    def _paint(self, picture, placed):
-        placed = [(s, X.translation(), X.rotation().matrix()) for s, X in placed]
-        for s, p, R in sorted(placed, key=lambda item: -item[1][2]):
-            draw(picture, self._camera, s.kind, s.size, p, R, s.color)
+    def _paint(self, picture, shapes, in_body, X_WB):
+        if not shapes:
+            return
+        camera, (body, p_BG, R_BG, extent) = self._camera, in_body
+        X = np.array([pose.GetAsMatrix34() for pose in X_WB])[body]
+        R_WB, p_WB = X[:, :, :3], X[:, :, 3]
+        p = camera.to_camera(p_WB + (R_WB @ p_BG[:, :, None])[:, :, 0])
+        R = camera.R_WC.T @ R_WB @ R_BG
+        seen = np.flatnonzero(visible(p, extent, camera))
+        for i in seen[np.argsort(-p[seen, 2], kind="stable")]:
+            s = shapes[i]
+            draw_visible(picture, camera, s.kind, s.extent, p[i], R[i], s.color)

@@ -11,10 +11,30 @@ import numpy as np
 from numba import njit
 from scipy.spatial.transform import Rotation
 
-FIXED_POINT_BITS = 8  # cv2 draws polygons at 1/256 of a (fine) pixel.
-FINE = 8  # Fine pixels to a pixel, each way, where an outline must be exact.
+FIXED_POINT_BITS = 8  # cv2 draws polygons at 1/256 of a pixel.
+NEAR = 0.01  # [m] Nothing that reaches nearer to the camera's plane is seen.
 N_OUTLINE = 48  # Corners of a circle; its sagitta is 0.002 of the radius.
 BANDS = (0.3, 0.55, 0.8, 1.0)  # Cosines between which a drawn sphere is one shade.
+
+
+SHAPES = ("sphere", "capsule", "cylinder", "box", "ellipsoid")
+SPHERE, CAPSULE, CYLINDER, BOX, ELLIPSOID = range(5)
+
+
+def _unit_bodies():
+    """Points all over a cylinder, a box and an ellipsoid of extents 1, 1, 1."""
+    angle = np.linspace(0.0, 2.0 * np.pi, N_OUTLINE, endpoint=False)
+    ring = np.stack([np.cos(angle), np.sin(angle), np.ones(N_OUTLINE)], axis=1)
+    corners = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, 8).T
+    turns = Rotation.from_euler(
+        "x", np.linspace(0.0, np.pi, 24, endpoint=False)[:, None]
+    )
+    sphere = np.concatenate([R.apply(ring * [1.0, 1.0, 0.0]) for R in turns])
+    cylinder = np.concatenate([ring, ring * [1.0, 1.0, -1.0]])
+    return cylinder, np.ascontiguousarray(corners), sphere
+
+
+_CYLINDER, _BOX, _ELLIPSOID = _unit_bodies()
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,133 +128,171 @@ def sphere_circle(p, radius, cos_angle):
     return points
 
 
-def outline(shape, size, p, R, near=0.01):
-    """Points (n, 3) [m] in C whose convex hull in the picture is the shape's.
+def draw(picture, camera, shape, size, p, R, color):
+    """Paints one shape, lit from the camera: a sphere is dim at its rim.
 
     Args:
+        picture: (height, width, 3) uint8, or 4 with an opacity.
+        camera: a Pinhole.
         shape: "sphere", "capsule", "cylinder", "box" or "ellipsoid".
         size: [m] as Drake has it: (radius,), (radius, length), (radius, length),
             (width, depth, height), (a, b, c).
         p, R: (3,), (3, 3) pose of the shape in C [m].
-        near: nothing that reaches nearer to the camera's plane is seen [m].
-
-    Returns: None for a shape that reaches nearer.
+        color: (3,), 0..255, in full light.
     """
-    if shape in ("sphere", "capsule"):
-        half = R[:, 2] * (size[1] / 2 if shape == "capsule" else 0.0)
-        if p[2] - abs(half[2]) < near + size[0]:
-            return None
-        ends = [p] if shape == "sphere" else [p - half, p + half]
-        return np.concatenate(
-            [sphere_circle(end, size[0], size[0] / np.sqrt(end @ end)) for end in ends]
-        )
-    points = (_BODIES[shape] * _scale(shape, size)) @ R.T + p
-    return points if points[:, 2].min() > near else None
+    extent = extents(shape, size)
+    if visible(p[None], extent[None], camera)[0]:
+        draw_visible(picture, camera, SHAPES.index(shape), extent, p, R, color)
 
 
-def draw(picture, camera, shape, size, p, R, color):
-    """Paints one shape, lit from the camera: a sphere is dim at its rim.
-
-    Args: picture (height, width, 3) uint8; camera, a Pinhole; shape, size, p and R as
-        `outline`; color (3,), 0..255, in full light.
+def extents(shape, size):
+    """(3,) [m] half of what a shape measures along its axes; a capsule without its
+    caps, whose radius is the first.
     """
-    points = outline(shape, size, p, R)
-    if points is None:
+    if shape == "sphere":
+        return np.array([size[0], size[0], 0.0])
+    if shape in ("capsule", "cylinder"):
+        return np.array([size[0], size[0], size[1] / 2])
+    return np.asarray(size, float) / (2.0 if shape == "box" else 1.0)
+
+
+def visible(p, extent, camera):
+    """Which shapes may be in the picture: (n,) bool, by spheres around them.
+
+    Args: p (n, 3) their centres in C [m]; extent (n, 3) as `extents` [m].
+    """
+    # Of a box's corner, or more; a capsule's end is at half its length and a radius.
+    radius = np.hypot(extent[:, 0], extent[:, 1]) + extent[:, 2]
+    seen = p[:, 2] + radius > NEAR
+    for i, n in enumerate((camera.width, camera.height)):
+        # The planes through the camera and a pixel beyond the picture's edges.
+        for edge, sign in ((-1.0, 1.0), (float(n), -1.0)):
+            slope = (edge - camera.center[i]) / camera.focal
+            away = sign * (slope * p[:, 2] - p[:, i]) / np.sqrt(1.0 + slope**2)
+            seen &= away < radius
+    return seen
+
+
+def draw_visible(picture, camera, kind, extent, p, R, color):
+    """As draw, of a shape that `visible` lets through; kind is its place in SHAPES."""
+    corners = _corners(kind, extent, p, R, camera.focal, camera.center)
+    if len(corners) == 0:
         return
-    corners = camera.project(points)
-    if (corners.max(axis=0) < -1.0).any() or (
-        corners.min(axis=0) > [camera.width, camera.height]
-    ).any():
-        return
-    if shape != "sphere":
+    if kind != SPHERE:
         paint(picture, corners, color)
         return
     paint_exactly(picture, corners, np.multiply(color, BANDS[0] / 2))
     for low, high in zip(BANDS[:-1], BANDS[1:], strict=True):
-        corners = camera.project(sphere_circle(p, size[0], low))
+        corners = camera.project(sphere_circle(p, extent[0], low))
         paint(picture, corners, np.multiply(color, (low + high) / 2))
 
 
-def paint(image, corners, color, line=cv2.LINE_AA):
-    """Fills the convex hull of corners (n, 2) [px] in image (h, w) or (h, w, 3)."""
+@njit(cache=True)
+def _corners(kind, extent, p, R, focal, center):
+    """Pixels (n, 2) whose convex hull is the shape's in the picture; none (0, 2) of a
+    shape that reaches nearer to the camera's plane than NEAR.
+    """
+    if kind == SPHERE or kind == CAPSULE:
+        half = np.ascontiguousarray(R[:, 2]) * extent[2]
+        radius = extent[0]
+        if p[2] - abs(half[2]) < NEAR + radius:
+            return np.empty((0, 2))
+        n = 1 if kind == SPHERE else 2
+        points = np.empty((n * N_OUTLINE, 3))
+        for i in range(n):
+            end = p + (2 * i - 1) * half
+            cos_angle = radius / np.sqrt(end[0] ** 2 + end[1] ** 2 + end[2] ** 2)
+            circle = sphere_circle(end, radius, cos_angle)
+            points[i * N_OUTLINE : (i + 1) * N_OUTLINE] = circle
+    else:
+        unit = _CYLINDER if kind == CYLINDER else _BOX if kind == BOX else _ELLIPSOID
+        points = np.empty((len(unit), 3))
+        for i in range(len(unit)):
+            for j in range(3):
+                points[i, j] = p[j]
+                for k in range(3):
+                    points[i, j] += R[j, k] * extent[k] * unit[i, k]
+    corners = np.empty((len(points), 2))
+    for i in range(len(points)):
+        if points[i, 2] <= NEAR:
+            return np.empty((0, 2))
+        for j in range(2):
+            corners[i, j] = focal * points[i, j] / points[i, 2] + center[j]
+    return corners
+
+
+def paint(image, corners, color):
+    """Fills the convex hull of corners (n, 2) [px] in image (h, w, 3) or (h, w, 4)."""
     hull = cv2.convexHull(corners.astype(np.float32))[:, 0]
-    fixed = np.rint(_inset(hull, 0.5) * 2**FIXED_POINT_BITS).clip(-(2**30), 2**30)
-    shade: list[float] = np.atleast_1d(color).tolist()
-    cv2.fillConvexPoly(image, fixed.astype(np.int32), shade, line, FIXED_POINT_BITS)
+    shade = [float(color[0]), float(color[1]), float(color[2]), 255.0]
+    cv2.fillConvexPoly(image, _inset(hull, 0.5), shade, cv2.LINE_AA, FIXED_POINT_BITS)
 
 
 @njit(cache=True)
 def _inset(hull, by):
-    """A convex polygon (n, 2) whose edges lie further inside [px]: what OpenCV fills
-    is as much larger than the polygon.
+    """A convex polygon (n, 2) whose edges lie further inside [px], in cv2's fixed point
+    numbers: what OpenCV fills is as much larger than the polygon.
     """
     n = len(hull)
-    inner = hull.copy()
+    fixed = np.empty((n, 2), np.int32)
+    limit = 2.0**30
     for i in range(n):
         before = hull[i] - hull[i - 1]
         after = hull[(i + 1) % n] - hull[i]
+        inner_u, inner_v = hull[i]
         a = np.sqrt(before[0] ** 2 + before[1] ** 2)
         b = np.sqrt(after[0] ** 2 + after[1] ** 2)
-        if a == 0.0 or b == 0.0:
-            continue
-        before, after = before / a, after / b
-        # v = hull[i] + step (normal before + normal after), both normals unit.
-        turn = before[0] * after[1] - before[1] * after[0]  # Its sign: the way round.
-        side = 1.0 if turn > 0.0 else -1.0
-        step = side * by / max(1.0 + before[0] * after[0] + before[1] * after[1], 0.3)
-        inner[i, 0] -= step * (before[1] + after[1])
-        inner[i, 1] += step * (before[0] + after[0])
-    return inner
+        if a > 0.0 and b > 0.0:
+            before, after = before / a, after / b
+            # v = hull[i] + step (normal before + normal after), both normals unit.
+            turn = before[0] * after[1] - before[1] * after[0]  # Sign: the way round.
+            side = 1.0 if turn > 0.0 else -1.0
+            cosine = before[0] * after[0] + before[1] * after[1]
+            step = side * by / max(1.0 + cosine, 0.3)
+            inner_u -= step * (before[1] + after[1])
+            inner_v += step * (before[0] + after[0])
+        fixed[i, 0] = min(max(np.rint(inner_u * 2**FIXED_POINT_BITS), -limit), limit)
+        fixed[i, 1] = min(max(np.rint(inner_v * 2**FIXED_POINT_BITS), -limit), limit)
+    return fixed
 
 
 def paint_exactly(image, corners, color):
-    """As paint; each pixel (h, w, 3) on the edge is mixed by how much is covered."""
-    height, width = image.shape[:2]
-    low = np.maximum(np.floor(corners.min(axis=0)).astype(int) - 1, 0)
-    high = np.minimum(np.ceil(corners.max(axis=0)).astype(int) + 2, [width, height])
-    if (high <= low).any():
-        return
-    n_u, n_v = high - low
-    mask = np.zeros((n_v * FINE, n_u * FINE), np.uint8)
-    paint(mask, (corners - low + 0.5) * FINE - 0.5, 255.0, cv2.LINE_8)
-    cover = cv2.resize(mask, (n_u, n_v), interpolation=cv2.INTER_AREA)
-    _mix(image[low[1] : high[1], low[0] : high[0]], cover, np.asarray(color))
+    """As paint; each pixel on the edge is mixed by how much of it is covered."""
+    hull = cv2.convexHull(corners.astype(np.float32))[:, 0]
+    _mix(image, hull, np.asarray(color, float))
 
 
 @njit(cache=True)
-def _mix(region, cover, color):
-    for i in range(region.shape[0]):
-        for j in range(region.shape[1]):
-            part = cover[i, j] / 255.0
-            for k in range(3):
-                mixed = region[i, j, k] * (1.0 - part) + color[k] * part
-                region[i, j, k] = np.uint8(mixed + 0.5)
-
-
-def _scale(shape, size):
-    return (
-        [size[0], size[0], size[1] / 2]
-        if shape == "cylinder"
-        else np.divide(size, 2.0 if shape == "box" else 1.0)
-    )
-
-
-def _unit_bodies():
-    angle = np.linspace(0.0, 2.0 * np.pi, N_OUTLINE, endpoint=False)
-    ring = np.stack([np.cos(angle), np.sin(angle), np.ones(N_OUTLINE)], axis=1)
-    corners = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, 8).T
-    turns = Rotation.from_euler(
-        "x", np.linspace(0.0, np.pi, 24, endpoint=False)[:, None]
-    )
-    sphere = np.concatenate([R.apply(ring * [1.0, 1.0, 0.0]) for R in turns])
-    return {
-        "cylinder": np.concatenate([ring, ring * [1.0, 1.0, -1.0]]),
-        "box": corners,
-        "ellipsoid": sphere,
-    }
-
-
-_BODIES = _unit_bodies()
+def _mix(image, hull, color):
+    n = len(hull)
+    # Edges as normal (a, b) outwards and offset c, per a pixel's extent along it.
+    edge = np.zeros((n, 3))
+    middle_u, middle_v = hull[:, 0].mean(), hull[:, 1].mean()
+    for i in range(n):
+        u, v = hull[i]
+        a, b = hull[(i + 1) % n, 1] - v, u - hull[(i + 1) % n, 0]
+        extent = abs(a) + abs(b)
+        if extent == 0.0:
+            continue
+        if a * (u - middle_u) + b * (v - middle_v) < 0.0:
+            a, b = -a, -b
+        edge[i] = a / extent, b / extent, (a * u + b * v) / extent
+    left = max(int(np.floor(hull[:, 0].min())), 0)
+    right = min(int(np.ceil(hull[:, 0].max())) + 1, image.shape[1])
+    top = max(int(np.floor(hull[:, 1].min())), 0)
+    bottom = min(int(np.ceil(hull[:, 1].max())) + 1, image.shape[0])
+    for v in range(top, bottom):
+        for u in range(left, right):
+            # The edge that cuts off most; 0.5 of a pixel if it passes the centre.
+            part = 1.0
+            for i in range(n):
+                part = min(part, 0.5 - (edge[i, 0] * u + edge[i, 1] * v - edge[i, 2]))
+                if part <= 0.0:
+                    break
+            if part > 0.0:
+                for k in range(3):
+                    mixed = image[v, u, k] * (1.0 - part) + color[k] * part
+                    image[v, u, k] = np.uint8(mixed + 0.5)
 
 
 def frame_shift(seed, frame):
