@@ -1,0 +1,85 @@
+"""What Meshcat shows of a roll."""
+
+import numpy as np
+import pytest
+from pydrake.geometry import Meshcat
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from makebreak.systems.numerics.ball_state import pack
+from makebreak.systems.rolling_view import RollingView, RollingViewConfig
+
+SLIDER = "r_comp as a gap [mm]"
+BALL = np.array([0.6, 0.1, 0.0315])
+
+
+@pytest.fixture(scope="module")
+def meshcat():
+    return Meshcat()
+
+
+def show(meshcat, gap, seconds=0.35):
+    builder = DiagramBuilder()
+    view = builder.AddSystem(RollingView(RollingViewConfig(), meshcat))
+    x = pack([0.5, 0.0, 0.1], np.zeros(3), BALL, np.zeros(3), 0.0315)
+    for name, value in dict(p_ball=BALL, x=x, gap=[gap]).items():
+        source = builder.AddSystem(ConstantVectorSource(value))
+        builder.Connect(source.get_output_port(), view.GetInputPort(name))
+    simulator = Simulator(builder.Build())
+    simulator.AdvanceTo(seconds)
+
+
+def test_path_ghost_and_bar_are_there_at_once_and_the_track_after_it_moved(meshcat):
+    meshcat.Delete("/makebreak")
+    builder = DiagramBuilder()
+    builder.AddSystem(RollingView(RollingViewConfig(), meshcat))
+    for name in ("path", "model_ball", "r_comp"):
+        assert meshcat.HasPath(f"/makebreak/{name}"), name
+    assert not meshcat.HasPath("/makebreak/track")
+    meshcat.DeleteSlider(SLIDER)
+    show(meshcat, 0.01)
+    assert meshcat.HasPath("/makebreak/track")
+    meshcat.DeleteSlider(SLIDER)
+
+
+@pytest.mark.parametrize("gap, mm", [(0.0073, 7.3), (-0.004, -4.0), (np.nan, 0.0)])
+def test_slider_shows_the_gap_in_millimetres_and_a_nan_breaks_nothing(meshcat, gap, mm):
+    show(meshcat, gap)
+    assert meshcat.GetSliderValue(SLIDER) == pytest.approx(mm)
+    meshcat.DeleteSlider(SLIDER)
+
+
+class Recorder:
+    """Stands for Meshcat, and remembers what it was last told of each path."""
+
+    def __init__(self):
+        self.pose, self.scale = {}, {}
+
+    def SetTransform(self, path, X, *_):
+        self.pose[path] = X.translation()
+
+    def SetProperty(self, path, name, value, *_):
+        self.scale[path] = np.array(value)
+
+    def __getattr__(self, _):
+        return lambda *_: None
+
+
+@pytest.mark.parametrize("gap", [0.01, 0.005])
+def test_bar_stands_on_the_table_and_is_as_high_as_the_gap_times_its_scale(gap):
+    recorder = Recorder()
+    show(recorder, gap)
+    height = 10.0 * gap  # The box is 1 m high and centred.
+    np.testing.assert_allclose(recorder.scale[RollingView.BAR], [1, 1, height])
+    np.testing.assert_allclose(recorder.pose[RollingView.BAR][2], height / 2)
+    np.testing.assert_allclose(recorder.pose["/makebreak/model_ball"], BALL)
+
+
+@pytest.mark.parametrize("gap", [np.nan, np.inf, -0.02])
+def test_bar_is_never_without_a_height(gap):
+    recorder = Recorder()
+    show(recorder, gap)
+    assert np.isfinite(recorder.scale[RollingView.BAR]).all()
+    assert recorder.scale[RollingView.BAR].min() > 0.0
+    assert np.isfinite(recorder.pose[RollingView.BAR]).all()
