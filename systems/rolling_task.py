@@ -52,6 +52,7 @@ class RollingTask(LeafSystem):
         p_tip=(0.5, 0.0, 0.15),
     ):
         super().__init__()
+        _check(config)
         self._config, self._n_knots, self._knot_sec = config, n_knots, knot_sec
         self._radius_ball, self._radius_tip = radius_ball, radius_tip
         self._n_tip, self._residual_dt_sec = n_tip, residual_dt_sec
@@ -95,3 +96,24 @@ class RollingTask(LeafSystem):
             int(self._reference), np.concatenate([task.p, task.v, task.a])
         )
         discrete.set_value(int(self._phase), [float(task.phase)])
+
+
+def _check(config: RollingTaskConfig):
+    """Raises: ValueError for a config that makes no task, by name."""
+    rolling = config.rolling
+    if np.shape(config.center) != (2,) or not np.isfinite(config.center).all():
+        raise ValueError(f"task.center is {config.center}, expected 2 numbers")
+    if not 0.0 < config.radius < np.inf:
+        raise ValueError(f"task.radius is {config.radius}, expected > 0")
+    for name in ("speed", "lead_deg", "press"):
+        if not np.isfinite(getattr(config, name)):
+            raise ValueError(f"task.{name} is {getattr(config, name)}, expected finite")
+    for name in ("roll_sec", "reposition_sec"):
+        if not 0.0 < getattr(rolling, name) < np.inf:
+            raise ValueError(
+                f"task.rolling.{name} is {getattr(rolling, name)}, expected > 0"
+            )
+    if not 0.0 < rolling.ease <= 0.5:
+        raise ValueError(
+            f"task.rolling.ease is {rolling.ease}, expected > 0 and at most 0.5"
+        )
