@@ -4,7 +4,7 @@ a force, above a free ball on a table. No arm: the impedance controller is the a
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.geometry import HalfSpace, Sphere
+from pydrake.geometry import Box, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.multibody.tree import (
@@ -27,8 +27,9 @@ class TipAndBall:
 
 def make_tip_and_ball(config: TipAndBall):
     """Returns: (diagram, plant, scene_graph): bodies `tip` and `ball`, both spheres,
-    and `table`, a half-space at z = 0; u (3,) is the force on the tip [N]. The tip has
-    no weight (the arm carries it). The state is laid out as numerics/ball_state.py.
+    and `table`, a wide box with its top at z = 0. u (3,) is the force on the tip [N],
+    which has no weight (the arm carries it). The state is laid out as in
+    numerics/ball_state.py.
     """
     for name in ("tip_mass", "tip_radius", "ball_mass", "ball_radius"):
         if not getattr(config, name) > 0.0:
@@ -69,7 +70,10 @@ def make_tip_and_ball(config: TipAndBall):
     )
     table = plant.AddRigidBody("table", plant.AddModelInstance("table"))
     plant.WeldFrames(plant.world_frame(), table.body_frame())
-    plant.RegisterCollisionGeometry(table, at_origin, HalfSpace(), "table", friction)
+    below = RigidTransform([0.0, 0.0, -0.5])
+    plant.RegisterCollisionGeometry(
+        table, below, Box(10.0, 10.0, 1.0), "table", friction
+    )
     plant.Finalize()
     nq = plant.num_positions()
     starts = (

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import yaml
 
+import makebreak.systems.numerics
 from makebreak.scripts.experiments import EXPERIMENTS, load_experiment
 from makebreak.scripts.settings import (
     apply_settings,
@@ -172,6 +173,9 @@ def _run(args) -> int:
     if not args.no_meshcat:
         session.meshcat = _open_meshcat()
 
+    compiled = Path(makebreak.systems.numerics.__path__[0]) / "__pycache__"
+    if not list(compiled.glob("*.nbi")):
+        print("Compiling, the first time only: a minute or two", flush=True)
     result = None
     try:
         result = dict(module.run(config, session))

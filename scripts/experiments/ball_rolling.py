@@ -278,12 +278,15 @@ def plot_residual(session, log, track):
     session.save_plot(fig, "residual")
 
 
-# What `reproduce` runs, beside random conditions.
+# What `reproduce` runs, beside random conditions. Rendering with VTK takes most of the
+# time of a run and the drawn picture is as good to the tracker, so the first case alone
+# has whichever the machine can do.
+DRAWN = {"camera.renderer": "drawn"}
 CASES = (
-    ("adapt, radius 5 mm too large", {"adapt": True, "radius_error_m": 0.005}),
-    ("the same, no adaptation", {"adapt": False, "radius_error_m": 0.005}),
-    ("no adaptation, right radius", {"adapt": False, "radius_error_m": 0.0}),
-    ("adapt, radius 8 mm too large", {"adapt": True, "radius_error_m": 0.008}),
+    {"adapt": True, "radius_error_m": 0.005},
+    {"adapt": False, "radius_error_m": 0.005} | DRAWN,
+    {"adapt": False, "radius_error_m": 0.0} | DRAWN,
+    {"adapt": True, "radius_error_m": 0.008} | DRAWN,
 )
 
 
@@ -296,13 +299,13 @@ def conditions(seed):
         "friction": round(float(rng.uniform(0.3, 0.8)), 3),
         "rolling_resistance": round(float(rng.uniform(0.002, 0.02)), 4),
         "ball_noise_m": round(float(rng.uniform(0.0, 0.002)), 5),
-    }
+    } | DRAWN
 
 
 def reproduce(session, seeds, jobs) -> Table:
     """The paper's ball rolling beside ours, over seeds 0 .. seeds - 1, camera in the
     loop; and the same over conditions drawn at random."""
-    trials = [(settings, s) for _, settings in CASES for s in range(seeds)]
+    trials = [(settings, s) for settings in CASES for s in range(seeds)]
     trials += [(conditions(s), s) for s in range(seeds)]
     results = run_many(
         "ball_rolling", trials, jobs, session.out_dir, reuse=session.reuse
@@ -362,7 +365,9 @@ def reproduce(session, seeds, jobs) -> Table:
     add_adaptive("adapt, +8 mm", adapt_8, 0.8, "adapts in ~10 pushes", "-")
     add_adaptive("adapt, random conditions", varied, 0.8, "-", "-")
     failed = [r for r in results if "error" in r]
+    cameras = sorted({r["camera"] for r in adapt if "error" not in r})
     notes = [
+        f"Camera: {', '.join(cameras)} in the first group, drawn in the others.",
         "Ours: mean (least .. largest) over the seeds, in simulation; the paper's is a "
         "hardware run.",
         "Random conditions: radius error 3-8 mm, friction 0.3-0.8, rolling resistance "
