@@ -178,6 +178,13 @@ def believed(config: BallRollingConfig) -> tuple[TipAndBall, Scene]:
 
 
 def c3_config(planner: PlannerConfig, n_lam: int) -> C3Config:
+    for name in ("tip", "ball", "ball_velocity"):
+        if not getattr(planner, name) >= 0.0:
+            raise ValueError(
+                f"planner.{name} is {getattr(planner, name)}, expected >= 0"
+            )
+    if not planner.force > 0.0:
+        raise ValueError(f"planner.force is {planner.force}, expected > 0")
     Q = np.zeros(N_X)
     Q[P_TIP], Q[V_TIP] = planner.tip, planner.tip / 50.0
     Q[P_BALL] = planner.ball
@@ -200,13 +207,18 @@ def c3_config(planner: PlannerConfig, n_lam: int) -> C3Config:
 
 
 def learner_config(learner: LearnerConfig) -> ResidualLearnerConfig:
+    for name in ("weight_ball", "weight_tip"):
+        if not getattr(learner, name) >= 0.0:
+            raise ValueError(
+                f"learner.{name} is {getattr(learner, name)}, expected >= 0"
+            )
     Q_d = np.zeros(N_X)
     # A tip pressed on a surface that is not there is also explained by two friction
     # forces that cancel; only its missing rebound, v_z, shows that nothing touched.
     Q_d[V_TIP.start + 2] = learner.weight_tip
     Q_d[[V_BALL.start, V_BALL.start + 1]] = learner.weight_ball
     return ResidualLearnerConfig(
-        Q_d=list(Q_d),
+        Q_d=Q_d.tolist(),
         eps=learner.eps,
         gamma=learner.gamma,
         n_b=learner.n_b,
@@ -227,8 +239,14 @@ def make_ball_rolling(
     """
     model, model_scene = believed(config)
     builder = DiagramBuilder()
-    camera = config.camera
-    camera.position_noise_m = config.ball_noise_m
+    if config.camera.position_noise_m != 0.0:
+        raise ValueError(
+            f"camera.position_noise_m is {config.camera.position_noise_m}, expected 0: "
+            "ball_noise_m sets it"
+        )
+    if not config.ball_noise_m >= 0.0:
+        raise ValueError(f"ball_noise_m is {config.ball_noise_m}, expected >= 0")
+    camera = replace(config.camera, position_noise_m=config.ball_noise_m)
     station = builder.AddNamedSystem(
         "station",
         make_station(
