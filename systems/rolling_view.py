@@ -19,7 +19,7 @@ class RollingViewConfig:
 
 
 class RollingView(LeafSystem):
-    """Meshcat's live view of an adaptive roll: the target path (white), the ball's
+    """Meshcat's live view of an adaptive roll: the target path (dark), the ball's
     track (orange), the ball as the model has it (a ghost), and a bar beside the path
     whose height is the learned residual as a length; a slider shows the same in mm.
 
@@ -36,6 +36,9 @@ class RollingView(LeafSystem):
         self._x = self.DeclareVectorInputPort("x", N_X)
         self._gap = self.DeclareVectorInputPort("gap", 1)
         self._track = self.DeclareAbstractState(AbstractValue.Make(np.zeros((0, 3))))
+        meshcat.SetProperty("/Grid", "visible", False)
+        meshcat.SetProperty("/Axes", "visible", False)
+        meshcat.SetCameraPose([1.12, -0.62, 0.52], [0.4, 0.0, 0.16])
         angle = np.linspace(0.0, 2.0 * np.pi, 121)
         c = config
         path = [
@@ -43,7 +46,7 @@ class RollingView(LeafSystem):
             c.center[1] + c.radius * np.sin(angle),
             np.full_like(angle, 0.002),
         ]
-        meshcat.SetLine("/makebreak/path", np.array(path), 6.0, Rgba(1, 1, 1, 1))
+        meshcat.SetLine("/makebreak/path", np.array(path), 3.0, Rgba(0.1, 0.1, 0.2, 1))
         meshcat.SetObject(
             "/makebreak/model_ball", Sphere(c.ball_radius), Rgba(0.3, 0.5, 1, 0.25)
         )
