@@ -278,8 +278,8 @@ def plot_residual(session, log, track):
     session.save_plot(fig, "residual")
 
 
-# What `reproduce` runs, beside random conditions. To the tracker the drawn picture is as
-# good as VTK's, whose rendering takes most of a run's time: a few seeds show that.
+# What `reproduce` runs, beside random conditions. The drawn picture is as good to the
+# tracker as VTK's, whose rendering takes most of a run's time: a few seeds show that.
 DRAWN = {"camera.renderer": "drawn"}
 CASES = (
     {"adapt": True, "radius_error_m": 0.005} | DRAWN,
