@@ -617,10 +617,7 @@ def test_bad_settings_are_one_line_and_no_traceback(tmp_path, capfd, setting, me
     # If it were not refused it would run: shortly.
     arguments += ["--duration", "0.01", "--set", "camera.renderer=drawn", setting]
     assert main(arguments) == 2
-    lines = [
-        line for line in capfd.readouterr().err.splitlines()
-        if "half spaces are not currently supported for deformable" not in line
-    ]  # fmt: skip
+    lines = capfd.readouterr().err.splitlines()
     assert len(lines) == 1 and lines[0].startswith("makebreak: ")
     assert message in lines[0]
 
