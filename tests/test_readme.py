@@ -1,0 +1,19 @@
+"""What the README shows, runs."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+README = Path(__file__).parent.parent / "README.md"
+
+
+def test_the_readmes_diagram_pushes_its_puck_to_the_goal(tmp_path):
+    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    (tmp_path / "example.py").write_text(code)
+    done = subprocess.run(
+        [sys.executable, "example.py"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    # The goal is 0.5 m; the finger cannot pull the puck back once it is too far.
+    assert abs(float(done.stdout.split()[2]) - 0.5) < 0.01, done.stdout
