@@ -281,7 +281,7 @@ def plot_residual(session, log, track):
 # What `reproduce` runs, beside random conditions. The drawn picture is as good to the
 # tracker as VTK's, whose rendering takes most of a run's time: a few seeds show that.
 DRAWN = {"camera.renderer": "drawn"}
-CASES = (
+CASES: tuple[dict, ...] = (
     {"adapt": True, "radius_error_m": 0.005} | DRAWN,
     {"adapt": False, "radius_error_m": 0.005} | DRAWN,
     {"adapt": False, "radius_error_m": 0.0} | DRAWN,
