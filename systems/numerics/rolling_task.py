@@ -92,6 +92,9 @@ class TaskState:
             value.setflags(write=False)
             object.__setattr__(self, name, value)
 
+    def __deepcopy__(self, memo):
+        return self  # Nothing in it can change, so a Context may share it.
+
 
 @dataclass
 class RollingConfig:
