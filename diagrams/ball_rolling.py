@@ -62,7 +62,8 @@ from makebreak.systems.state_estimator import StateEstimator, StateEstimatorConf
 TRACK = CONTROL = 0.0125
 ESTIMATE, LEARN, ARM_TICK = CONTROL / 3.0, 0.05, 0.001
 # Each system runs a little after the one that it listens to, and all within the
-# millisecond between two steps of the plant: no value waits for the next period.
+# millisecond between two steps of the plant: no value waits for the next period. (But
+# for r_comp in the task's landing height, which may be 12.5 ms old.)
 OFFSET = dict(
     tracker=1e-4, estimator=2e-4, task=3e-4, lcs=3e-4, learner=3.5e-4, c3=4e-4,
     reference=4.5e-4, impedance=7e-4,
@@ -81,7 +82,7 @@ class PlannerConfig:
     ball: float = 5000.0  # Position of the ball, across the table.
     ball_velocity: float = 300.0  # And angular velocity.
     force: float = 5.0  # G of lam of tip and ball; eta's is 1/10 of it.
-    friction: float = 1.0  # As the model has it, for both contacts.
+    friction: float = 1.0  # Of both contacts, for planning and learning.
 
 
 @dataclass
@@ -237,6 +238,20 @@ def make_ball_rolling(
     diagram. For scoring, `state_log`, `contact_log` and `torque_log` log the truth at
     1 kHz: the plant's state, the contact's torque on the arm, the commanded torque.
     """
+    for name, own in (
+        ("tracker", ("ball_radius", "period_sec", "offset_sec")),
+        ("task", ("period_sec", "offset_sec")),
+        ("impedance", ("period_sec", "offset_sec")),
+        ("camera", ("period_sec",)),
+    ):
+        part = getattr(config, name)
+        for key in own:
+            default = getattr(type(part)(), key)
+            if getattr(part, key) != default:
+                raise ValueError(
+                    f"{name}.{key} is {getattr(part, key)}, expected {default}: the "
+                    "diagram sets it"
+                )
     model, model_scene = believed(config)
     builder = DiagramBuilder()
     if config.camera.position_noise_m != 0.0:
@@ -380,7 +395,7 @@ def make_ball_rolling(
         )
         connect(estimator, "x", learner, "x")
         connect(estimator, "u_measured", learner, "u_measured")
-        connect(estimator, "valid", learner, "enable")
+        connect(estimator, "window_valid", learner, "enable")
         connect(lcs["learn"], "lcs", learner, "lcs")
         r_comp = learner.GetOutputPort("r_comp")
     else:
@@ -400,6 +415,7 @@ def make_ball_rolling(
     connect(task, "reference", reference, "reference")
     connect(c3, "x_next", reference, "x_next")
     connect(c3, "lam", reference, "lam")
+    connect(c3, "status", reference, "status")
     connect(lcs["command"], "lcs", reference, "lcs")
     connect(station, f"{ARM}.position_measured", impedance, "q")
     connect(station, f"{ARM}.velocity_measured", impedance, "v")

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from hashlib import sha256
 from pathlib import Path
 
 from tqdm import tqdm
@@ -38,7 +39,10 @@ def config_text(experiment: str, settings: Sequence[str], seed: int | None) -> s
 def _folder(settings: Mapping, seed: int) -> str:
     """A folder name that tells what was run."""
     texts = [re.sub(r"[^\w.=+-]", "", text) for text in setting_texts(settings)]
-    return "_".join([*texts, f"seed={seed}"])[:120]
+    name = "_".join([f"seed={seed}", *texts])
+    if len(name) > 120:  # Cut, and told apart by what was cut off.
+        name = f"{name[:110]}_{sha256(name.encode()).hexdigest()[:8]}"
+    return name
 
 
 def _environment() -> dict[str, str]:
@@ -131,6 +135,8 @@ def run_many(
                     if duration is not None:
                         args += ["--duration", repr(float(duration))]
                     folders[i].mkdir(parents=True, exist_ok=True)
+                    # Else a run that fails early would show an older run's result.
+                    (folders[i] / "result.json").unlink(missing_ok=True)
                     with (folders[i] / "log.txt").open("wb") as log:
                         running[i] = subprocess.Popen(
                             args,

@@ -33,8 +33,11 @@ class ArmReference(LeafSystem):
     the reference is to the new command, which it reaches one period later, so that no
     step reaches the arm; a step in torque would meet its rate limit.
 
-    Inputs:  phase (1,), reference (9,) of RollingTask; x_next (19,), lam (n_lam,) of
-             C3; lcs (abstract), the one-step LCS that made them.
+    While C3 holds an old command (its status is not 0), a rolling reference stays where
+    it is and pushes nothing.
+
+    Inputs:  phase (1,), reference (9,) of RollingTask; x_next (19,), lam (n_lam,),
+             status (1,) of C3; lcs (abstract), the one-step LCS that made them.
     Outputs: x_desired (19,) = [p, quaternion, v, w, a, alpha], position and its
              derivatives only (the quaternion is the identity); wrench (6,) force first.
     """
@@ -46,6 +49,7 @@ class ArmReference(LeafSystem):
         self._reference = self.DeclareVectorInputPort("reference", 9)
         self._x_next = self.DeclareVectorInputPort("x_next", N_X)
         self._lam = self.DeclareVectorInputPort("lam", n_lam)
+        self._status = self.DeclareVectorInputPort("status", 1)
         self._lcs = self.DeclareAbstractInputPort("lcs", AbstractValue.Make(lcs))
         self._zero = np.zeros(3)
         at_rest = np.concatenate([p_tip, np.zeros(9)])
@@ -63,7 +67,13 @@ class ArmReference(LeafSystem):
     def _update(self, context, discrete_state):
         c = self._config
         dv_max = np.inf
-        if self._phase.Eval(context)[0] == ROLL:
+        t = context.get_time()
+        line = context.get_discrete_state(self._line).value()
+        start = on_the_line(line, t, c.period_sec)
+        rolling = self._phase.Eval(context)[0] == ROLL
+        if rolling and self._status.Eval(context)[0] != 0.0:
+            target = np.concatenate((start[:3], np.zeros(9)))
+        elif rolling:
             x_next = self._x_next.Eval(context)
             # D lam is the change of velocity that the contact gives the tip.
             lcs = self._lcs.Eval(context)
@@ -73,9 +83,6 @@ class ArmReference(LeafSystem):
             dv_max = c.acceleration_max * c.period_sec
         else:
             target = np.concatenate((self._reference.Eval(context), self._zero))
-        t = context.get_time()
-        line = context.get_discrete_state(self._line).value()
-        start = on_the_line(line, t, c.period_sec)
         end = next_end(start, target, dv_max)
         discrete_state.set_value(self._line, np.concatenate((start, end, [t])))
 

@@ -60,7 +60,7 @@ class RollingTask(LeafSystem):
         self._x = self.DeclareVectorInputPort("x", N_X)
         self._valid = self.DeclareVectorInputPort("valid", 1)
         self._r_comp = self.DeclareVectorInputPort("r_comp", n_lam)
-        start = TaskState(WAIT, 0.0, p_tip, np.zeros(3), np.zeros(3))
+        start = TaskState(WAIT, 0.0, p_tip, np.zeros(3), np.zeros(3), p_tip[2])
         self._task = self.DeclareAbstractState(AbstractValue.Make(start))
         x_desired = np.tile(np.eye(N_X)[3], n_knots)
         self._x_desired = self.DeclareDiscreteState(x_desired)

@@ -28,7 +28,8 @@ class StateEstimator(LeafSystem):
     Inputs:  q (7,), v (7,), torque (7,) motor side [rad, rad/s, N m]; p_ball (3,),
              v_ball (3,) [m, m/s]; seen (1,).
     Outputs: x (19,), the layout of numerics/ball_state.py; u_measured (3,) [N];
-             valid (1,): 1 if every reading was finite and the ball is seen.
+             valid (1,): 1 if every reading was finite and the ball is seen;
+             window_valid (1,): 1 if that was so all over the window.
 
     A reading that is not finite leaves x and u_measured as they were.
     """
@@ -64,7 +65,16 @@ class StateEstimator(LeafSystem):
             self._mean_force,
             prerequisites_of_calc={self.discrete_state_ticket(self._window)},
         )
+        # How many readings in a row were valid; a learner that starts is told so.
+        self._n_window = n_window
+        self._n_valid = self.DeclareDiscreteState([float(n_window)])
         self.DeclareStateOutputPort("valid", self._valid)
+        self.DeclareVectorOutputPort(
+            "window_valid",
+            1,
+            self._all_valid,
+            prerequisites_of_calc={self.discrete_state_ticket(self._n_valid)},
+        )
         self.DeclarePeriodicDiscreteUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
@@ -72,6 +82,10 @@ class StateEstimator(LeafSystem):
     def _mean_force(self, context, output):
         window = context.get_discrete_state(self._window).value()
         output.SetFromVector(window.reshape(-1, 3).mean(axis=0))
+
+    def _all_valid(self, context, output):
+        n_valid = context.get_discrete_state(self._n_valid).value()[0]
+        output.SetFromVector([1.0 if n_valid >= self._n_window else 0.0])
 
     @timed
     def _update(self, context, discrete_state):
@@ -82,10 +96,16 @@ class StateEstimator(LeafSystem):
         total = q.sum() + v.sum() + torque.sum() + p_ball.sum() + v_ball.sum()
         if not np.isfinite(total):
             discrete_state.set_value(self._valid, [0.0])
+            discrete_state.set_value(self._n_valid, [0.0])
             return
         p_tip, v_tip, u = tip_motion(self._chain, q, v, torque, self._config.tip_mass)
         x = pack(p_tip, v_tip, p_ball, v_ball, self._config.ball_radius)
         window = context.get_discrete_state(self._window).value()
         discrete_state.set_value(self._x, x)
         discrete_state.set_value(self._window, np.append(window[3:], u))
-        discrete_state.set_value(self._valid, [1.0 if seen > 0.5 else 0.0])
+        valid = 1.0 if seen > 0.5 else 0.0
+        n_valid = context.get_discrete_state(self._n_valid).value()[0]
+        discrete_state.set_value(self._valid, [valid])
+        discrete_state.set_value(
+            self._n_valid, [min(valid * (n_valid + 1.0), self._n_window)]
+        )

@@ -41,14 +41,14 @@ def one_force_lcs(tip_mass):
     )  # fmt: skip
 
 
-def run(phase, x_next, lam, t_end=0.0126):
+def run(phase, x_next, lam, t_end=0.0126, status=0.0):
     builder = DiagramBuilder()
     lcs = one_force_lcs(2.0)
     config = ArmReferenceConfig(tip_mass=2.0)
     arm = builder.AddNamedSystem("arm", ArmReference(config, 1, np.zeros(3), lcs))
     reference = np.arange(9.0)
     for name, value in dict(
-        phase=[phase], reference=reference, x_next=x_next, lam=lam
+        phase=[phase], reference=reference, x_next=x_next, lam=lam, status=[status]
     ).items():
         source = builder.AddSystem(ConstantVectorSource(value))
         builder.Connect(source.get_output_port(), arm.GetInputPort(name))
@@ -85,6 +85,12 @@ def test_half_a_period_later_the_reference_is_half_way():
     x_next[0] = 0.002
     pose, _ = run(ROLL, x_next, [0.0], t_end=0.00625)
     np.testing.assert_allclose(pose[0], 0.001, atol=1e-15)
+
+
+def test_an_old_command_of_c3_is_not_followed():
+    pose, wrench = run(ROLL, np.ones(19), [1.5], status=6.0)
+    np.testing.assert_allclose(pose, np.eye(19)[3])
+    np.testing.assert_allclose(wrench, 0.0)
 
 
 def test_reposition_follows_the_task_and_pushes_nothing():

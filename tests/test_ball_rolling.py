@@ -598,6 +598,8 @@ def test_true_gap_is_the_radius_error_where_the_estimate_is_right(diagram):
         ("learner.weight_ball=-1", "learner.weight_ball is -1.0, expected >= 0"),
         ("learner.weight_tip=-1", "learner.weight_tip is -1.0, expected >= 0"),
         ("learner.n_b=0", "n_b is 0, expected 1 or more"),
+        ("tracker.ball_radius=0.03", "tracker.ball_radius is 0.03, expected 0.0315"),
+        ("task.period_sec=0.1", "task.period_sec is 0.1, expected 0.0125"),
         (
             "camera.renderer=foo",
             "camera.renderer is 'foo', expected auto, vtk or drawn",

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from pydrake.systems.analysis import Simulator
 from scipy.interpolate import BPoly
 
 from makebreak.systems.numerics.ball_state import (
@@ -22,6 +23,7 @@ from makebreak.systems.numerics.rolling_task import (
     surface_height,
     target_over_horizon,
 )
+from makebreak.systems.rolling_task import RollingTask, RollingTaskConfig
 
 PATH = CirclePath(np.array([0.5, 0.0]), 0.1)
 R_BALL, R_TIP, DT = 0.0315, 0.0195, 0.0125
@@ -120,6 +122,23 @@ def test_a_ball_that_is_not_seen_stops_the_push_and_lifts_the_tip():
     assert phases[0.2] == ROLL and phases[0.5] == WAIT and phases[1.6] == REPOSITION
     z = [state.p[2] for t, state, _ in history if t > 1.3 and state.phase == WAIT]
     np.testing.assert_allclose(z, 2 * R_BALL + R_TIP + 0.03, atol=1e-12)
+
+
+def test_a_ball_that_is_not_seen_at_the_start_lifts_the_tip_from_where_it_is():
+    system = RollingTask(RollingTaskConfig(), 6, 0.1, R_BALL, R_TIP, 8, 4, 0.05)
+    z_tip = 0.15  # The default p_tip.
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    for name, value in (
+        ("x", np.eye(19)[3]),
+        ("valid", [0.0]),
+        ("r_comp", np.zeros(8)),
+    ):
+        system.GetInputPort(name).FixValue(context, value)
+    for k in range(60):
+        simulator.AdvanceTo(k * DT)
+        assert system.GetOutputPort("reference").Eval(context)[2] >= z_tip - 1e-12
+        assert system.GetOutputPort("phase").Eval(context)[0] == WAIT
 
 
 def test_target_leads_the_ball_and_moves_along_the_circle():

@@ -161,6 +161,23 @@ def test_a_ball_that_is_not_seen_is_not_valid_but_the_tip_is_followed(bench, see
     assert np.linalg.norm(x[P_TIP] - before[P_TIP]) > 0.01
 
 
+@pytest.mark.parametrize("fault", [{"seen": [0.0]}, {"v": np.full(7, np.nan)}])
+def test_a_fault_spoils_the_window_until_it_has_left_it(bench, fault):
+    def window_valid():
+        port = bench.estimator.GetOutputPort("window_valid")
+        return port.Eval(bench.context)[0]
+
+    bench.tick()
+    assert window_valid() == 1.0
+    bench.tick(**fault)
+    for _ in range(N_WINDOW - 1):
+        assert window_valid() == 0.0
+        bench.tick()
+    assert window_valid() == 0.0
+    bench.tick()
+    assert window_valid() == 1.0
+
+
 @pytest.mark.parametrize("name", ["ball_radius", "tip_mass"])
 def test_wrong_settings_are_refused_by_name(arm, chain, name):
     config = StateEstimatorConfig(**{name: -1.0})

@@ -18,6 +18,7 @@ from makebreak.diagrams.station import (
     ARM,
     TIP_FRAME,
     TOOL,
+    TORQUE_RATE_MAX,
     make_control_plant,
 )
 from makebreak.models.scene import load_scene
@@ -34,7 +35,7 @@ Config = BallRollingConfig
 DURATION_SEC = 240.0
 CIRCLES = 4
 GIVE_UP_SEC = 60.0  # A run in which nothing rolls by then ends.
-LOST = 0.2  # So far from the circle's centre the ball is out of reach [m].
+LOST = 0.1  # So far outside the circle the ball is out of reach [m].
 ERROR_MAX = 0.004  # Success: mean distance to the path of at most this [m].
 SAMPLE = 0.0125  # [s]
 # What `makebreak bench diagrams` takes the real-time factor of.
@@ -89,7 +90,6 @@ def run(config, session):
         "v": station.GetOutputPort(f"{ARM}.velocity_measured"),
         "torque": station.GetOutputPort(f"{ARM}.torque_measured"),
         "tau": system("impedance_controller").GetOutputPort("tau"),
-        "arm_status": system("impedance_controller").GetOutputPort("status"),
         "wrench": station.GetOutputPort(f"{ARM}.external_wrench"),
     }
     if config.adapt:
@@ -110,7 +110,7 @@ def run(config, session):
         return (
             run_through[0] >= 2.0 * np.pi * CIRCLES
             or stuck
-            or bool(np.hypot(*p) > LOST)
+            or bool(np.hypot(*p) > config.task.radius + LOST)
         )
 
     log = session.simulate(diagram, DURATION_SEC, record, SAMPLE, until=done)
@@ -119,6 +119,8 @@ def run(config, session):
     result = score(config, log, track, contact)
     torque = system("torque_log").FindLog(log.context).data()
     result["torque_peak_Nm"] = float(abs(torque).max())
+    at_limit = abs(np.diff(torque, axis=1)) >= TORQUE_RATE_MAX * 1e-3 * (1.0 - 1e-9)
+    result["torque_rate_limited_share"] = float(at_limit.any(axis=0).mean())
     write_recording(session, log, plant)
     plot_path(session, config, track)
     plot_residual(session, log, track)
@@ -199,7 +201,11 @@ def score(config, log, track, contact):
     # A tenth of a minute at either end: a single sample says little.
     span = round(6.0 / SAMPLE)
     return {
-        "success": bool(circles >= CIRCLES and mean <= ERROR_MAX),
+        "success": bool(
+            circles >= CIRCLES
+            and mean <= ERROR_MAX
+            and track.time[-1] <= DURATION_SEC + SAMPLE
+        ),
         "initiated": initiated,
         "circles_completed": float(circles),
         "time_to_first_contact_s": first_time(time, force > 0.05),
@@ -217,7 +223,6 @@ def score(config, log, track, contact):
         "contact_force_peak_N": float(filtered.max()),
         "seen_share": float((log["seen"] > 0.5).mean()),
         "c3_held_share": float((log["c3_status"] > 0.5).mean()),
-        "torque_rate_limited_share": float((log["arm_status"] >= 8.0).mean()),
         "simulated_s": float(track.time[-1]),
         "camera": describe_camera(config.camera),
         "seed": config.seed,
@@ -316,10 +321,13 @@ def reproduce(session, seeds, jobs) -> Table:
     groups = [results[i * seeds : (i + 1) * seeds] for i in range(len(CASES) + 1)]
     adapt, frozen, right, adapt_8, varied = groups
     rendered = results[len(groups) * seeds :]
+    failed = [r for r in results if "error" in r]
     rows: list[tuple] = []
     met: list[bool | None] = []
 
     def add(what, paper, ours, goal=None):
+        if failed and goal:
+            goal = False  # A run that ended in an error proves nothing.
         rows.append((what, paper, ours, "makebreak reproduce ball_rolling"))
         met.append(goal)
 
@@ -330,32 +338,32 @@ def reproduce(session, seeds, jobs) -> Table:
         values = [r[key] * scale for r in group if r.get(key) is not None]
         if not values:
             return "-"
-        return f"{np.mean(values):.2f} {unit} ({min(values):.2f} .. {max(values):.2f})"
+        text = f"{np.mean(values):.2f} {unit} ({min(values):.2f} .. {max(values):.2f})"
+        return text if len(values) == len(group) else f"{text}, {len(values)} runs"
 
     def add_adaptive(name, group, share, paper_done, paper_time):
-        n = count(group, lambda r: r["success"])
-        add(
-            f"{name}: four circles, mean error <= 4 mm",
-            paper_done,
-            f"{n} of {seeds}",
-            n >= share * seeds,
-        )
-        n = count(group, lambda r: (r["time_to_first_contact_s"] or np.inf) <= 8.0)
-        add(f"{name}: first contact within 8 s", "-", f"{n} of {seeds}",
-            n >= share * seeds)  # fmt: skip
-        add(f"{name}: time to four circles", paper_time,
-            spread(group, "time_to_circles_s", 1.0, "s"))  # fmt: skip
-        add(f"{name}: first contact", "-",
-            spread(group, "time_to_first_contact_s", 1.0, "s"))  # fmt: skip
-        add(f"{name}: error after the first quarter, mean", "-",
-            spread(group, "tracking_error_mean_m", 1e3, "mm"))  # fmt: skip
-        add(f"{name}: error after the first quarter, 95 %", "-",
-            spread(group, "tracking_error_p95_m", 1e3, "mm"))  # fmt: skip
-        n = count(group, lambda r: abs(r["r_gap_error_m"] or np.inf) <= 3e-3)
-        add(f"{name}: r_comp within 3 mm of the gap", "-", f"{n} of {seeds}",
-            n >= share * seeds)  # fmt: skip
-        add(f"{name}: r_comp - gap, last circle", "-",
-            spread(group, "r_gap_error_m", 1e3, "mm"))  # fmt: skip
+        tests = {
+            "four circles, mean error <= 4 mm": lambda r: r["success"],
+            "first contact within 8 s": (
+                lambda r: (r["time_to_first_contact_s"] or np.inf) <= 8.0
+            ),
+            "r_comp within 3 mm of the gap": (
+                lambda r: abs(r["r_gap_error_m"] or np.inf) <= 3e-3
+            ),
+        }
+        n = count(group, lambda r: all(test(r) for test in tests.values()))
+        add(f"{name}: all three of", paper_done, f"{n} of {seeds}", n >= share * seeds)
+        for what, test in tests.items():
+            add(f"{name}: {what}", "-", f"{count(group, test)} of {seeds}")
+        for what, key, scale, unit, paper in (
+            ("time to four circles", "time_to_circles_s", 1.0, "s", paper_time),
+            ("first contact", "time_to_first_contact_s", 1.0, "s", "-"),
+            ("mean error", "tracking_error_mean_m", 1e3, "mm", "-"),
+            ("95 % of the error", "tracking_error_p95_m", 1e3, "mm", "-"),
+            ("r_comp - gap, last circle", "r_gap_error_m", 1e3, "mm", "-"),
+            ("contact force peak", "contact_force_peak_N", 1.0, "N", "-"),
+        ):
+            add(f"{name}: {what}", paper, spread(group, key, scale, unit))
 
     add_adaptive("adapt, +5 mm", adapt, 0.9, "done (1 run shown)", "315 s")
     n = count(frozen, lambda r: r["initiated"])
@@ -368,7 +376,6 @@ def reproduce(session, seeds, jobs) -> Table:
         spread(right, "tracking_error_mean_m", 1e3, "mm"))  # fmt: skip
     add_adaptive("adapt, +8 mm", adapt_8, 0.8, "adapts in ~10 pushes", "-")
     add_adaptive("adapt, random conditions", varied, 0.8, "-", "-")
-    failed = [r for r in results if "error" in r]
     if rendered:
         n = count(rendered, lambda r: r["success"])
         add("adapt, +5 mm, pictures by VTK: four circles, mean error <= 4 mm", "-",

@@ -83,7 +83,7 @@ class TaskState:
     p: np.ndarray  # (3,) [m]
     v: np.ndarray  # (3,) [m/s]
     a: np.ndarray  # (3,) [m/s2]
-    z_start: float = 0.0  # Height and climb where the reposition began [m], [m/s].
+    z_start: float = 0.0  # Height and climb where the phase began [m], [m/s].
     vz_start: float = 0.0
 
     def __post_init__(self):

@@ -19,7 +19,7 @@ def timed(update):
             return update(self, *args)
         finally:
             if not hasattr(self, "compute_sec"):
-                self.compute_sec = deque(maxlen=200_000)
+                self.compute_sec = deque(maxlen=1_000_000)
             self.compute_sec.append(perf_counter() - start)
 
     return wrapper
