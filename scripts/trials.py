@@ -39,7 +39,7 @@ def config_text(experiment: str, settings: Sequence[str], seed: int | None) -> s
 def _folder(settings: Mapping, seed: int) -> str:
     """A folder name that tells what was run."""
     texts = [re.sub(r"[^\w.=+-]", "", text) for text in setting_texts(settings)]
-    name = "_".join([f"seed={seed}", *texts])
+    name = "_".join([*texts, f"seed={seed}"])
     if len(name) > 120:  # Cut, and told apart by what was cut off.
         name = f"{name[:110]}_{sha256(name.encode()).hexdigest()[:8]}"
     return name
