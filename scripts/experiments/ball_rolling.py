@@ -82,10 +82,8 @@ def run(config, session):
         "state": station.GetOutputPort("state"),
         "x": system("state_estimator").GetOutputPort("x"),
         "gap": system("learned_gap").get_output_port(),
-        "phase": system("rolling_task").GetOutputPort("phase"),
         "seen": system("ball_tracker").GetOutputPort("seen"),
         "c3_status": system("c3_mpc").GetOutputPort("status"),
-        "lam": system("c3_mpc").GetOutputPort("lam"),
         "q": station.GetOutputPort(f"{ARM}.position_measured"),
         "v": station.GetOutputPort(f"{ARM}.velocity_measured"),
         "torque": station.GetOutputPort(f"{ARM}.torque_measured"),
@@ -94,7 +92,6 @@ def run(config, session):
     }
     if config.adapt:
         record["loss"] = system("residual_learner").GetOutputPort("loss")
-        record["r_comp"] = system("residual_learner").GetOutputPort("r_comp")
     at = plant.GetBodyByName("ball").floating_positions_start() + 4
     center = np.array(config.task.center)
     run_through: list = [0.0, None]  # Progress and the last angle.
