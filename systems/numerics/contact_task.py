@@ -71,10 +71,14 @@ class ExpectedContact:
     def __post_init__(self):
         if self.impacts is None:
             object.__setattr__(self, "impacts", np.zeros((0, 2)))
-        shapes = {"mean": (3,), "covariance": (3, 3), "direction": (3,)}
+        shapes: dict[str, tuple[int, ...]] = {
+            "mean": (3,),
+            "covariance": (3, 3),
+            "direction": (3,),
+        }
         shapes["impacts"] = (len(self.impacts), 2)
         for name, shape in shapes.items():
-            value = np.array(getattr(self, name), dtype=float).reshape(-1)
+            value: np.ndarray = np.array(getattr(self, name), dtype=float).ravel()
             if value.size != np.prod(shape) or not np.all(np.isfinite(value)):
                 raise ValueError(
                     f"expected contact: {name} is {getattr(self, name)}, expected "
