@@ -313,15 +313,20 @@ class Session:
     def write_result(self, result: Mapping) -> Path:
         """Writes result.json: flat, keys in the order given, NaN and infinity as null.
 
-        Raises: ValueError for a value that is neither a number, a text, a truth value
-            nor None, and if `success` is missing or no truth value.
+        A value is a number, a text, a truth value or None, or a list of such (one per
+        trial or per contact).
+
+        Raises: ValueError for any other value, and if `success` is missing or no truth
+            value.
         """
         plain = {str(key): json_value(value) for key, value in result.items()}
         for key, value in plain.items():
-            if not isinstance(value, bool | int | float | str | None):
-                raise ValueError(
-                    f"result {key}: got {type(value).__name__}, expected a scalar"
-                )
+            for one in value if isinstance(value, list) else [value]:
+                if not isinstance(one, bool | int | float | str | None):
+                    raise ValueError(
+                        f"result {key}: got {type(one).__name__}, expected a scalar or "
+                        "a list of scalars"
+                    )
         if not isinstance(plain.get("success"), bool):
             raise ValueError(
                 f"result success: got {plain.get('success')}, expected True or False"

@@ -110,6 +110,8 @@ def _is_number(value) -> bool:
 
 def format_cell(value) -> str:
     """A value as a person reads it: four significant digits, yes and no, - for none."""
+    if isinstance(value, list | tuple | np.ndarray):
+        return ", ".join(map(format_cell, value))
     if value is None:
         return "-"
     if isinstance(value, bool | np.bool_):
@@ -120,7 +122,10 @@ def format_cell(value) -> str:
 
 
 def json_value(value):
-    """A scalar as JSON has it: numpy becomes Python, NaN and infinity become None."""
+    """A scalar, or a list of them, as JSON has it: numpy becomes Python, NaN and
+    infinity become None."""
+    if isinstance(value, list | tuple | np.ndarray):
+        return [json_value(one) for one in value]
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not np.isfinite(value):

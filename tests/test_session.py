@@ -249,8 +249,11 @@ def test_result_json_is_flat_in_the_given_order_and_without_nan(tmp_path):
     text = own.write_result(result).read_text()
     assert json.loads(text) == {"b_m": 0.1, "success": True, "a": None, "n": 3}
     assert list(json.loads(text)) == ["b_m", "success", "a", "n"]
-    with pytest.raises(ValueError, match="result x: got list, expected a scalar"):
-        own.write_result({"success": True, "x": [1.0]})
+    listed = {"success": True, "x_m": np.array([1.0, np.nan]), "n": (1, None)}
+    text = own.write_result(listed).read_text()
+    assert json.loads(text) == {"success": True, "x_m": [1.0, None], "n": [1, None]}
+    with pytest.raises(ValueError, match="result x: got dict, expected a scalar"):
+        own.write_result({"success": True, "x": [{}]})
     with pytest.raises(ValueError, match="result success: got None, expected True or"):
         own.write_result({"x": 1.0})
 
