@@ -1,4 +1,4 @@
-"""The station: a Panda with a tool at a table, its sensors, and a camera above it."""
+"""The station: a Panda with a tool, its sensors, and a camera above it."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import Demultiplexer, Saturation
 
 from makebreak.diagrams.camera import CameraConfig, add_camera
 from makebreak.models.scene import InitialSection, Scene, load_scene, read_scene
-from makebreak.systems.contact_probe import ContactProbe
+from makebreak.systems.contact_probe import BodyContactForce, ContactProbe
 from makebreak.systems.noisy_sensor import NoisySensor
 from makebreak.systems.tool_wrench import ToolWrench
 
@@ -37,6 +38,7 @@ class StationConfig:
     scene: str = BALL_ROLLING  # Path of the world's scene file.
     noise: SensorNoise = field(default_factory=SensorNoise)
     camera: CameraConfig | None = None
+    tool: str = TOOL  # The scene's model that is mounted on the arm.
     contact: list[str] = field(default_factory=lambda: [TOOL, "ball"])  # To be scored.
     seed: int = 0
     meshcat_period_sec: float = 1.0 / 30.0
@@ -56,7 +58,10 @@ def make_station(
              the tool's weight removed, with noise [N], [N m];
              overhead.rgb_image (ImageRgba8U), if there is a camera;
              and the truth, for scoring and tests alone: state (n_x,);
-             contact_force (4,) = [normal, x, y, z] [N] of the tool on the ball;
+             contact_force (4,) = [normal, x, y, z] [N] of the first body of
+             config.contact on the second (4 more for each further one);
+             {tool}.contact_force (3,) on the tool, of all its contacts, in the world
+             [N], found when asked for: each contact costs some 5 us;
              panda.contact_torque (7,) [N m] of all contacts on the arm's joints;
              contact_results, body_poses (abstract).
 
@@ -70,12 +75,15 @@ def make_station(
     loaded = load_scene(read_scene(config.scene) if scene is None else scene, builder)
     plant, scene_graph = loaded.plant, loaded.scene_graph
     arm = plant.GetModelInstanceByName(ARM)
-    tool = plant.GetModelInstanceByName(TOOL)
+    tool_body = _only_body(plant, config.tool, "tool")
+    tool = tool_body.model_instance()
     n = plant.num_velocities(arm)
     builder.ExportInput(plant.get_actuation_input_port(arm), f"{ARM}.torque_commanded")
     noise = config.noise
-    if len(config.contact) != 2:
-        raise ValueError(f"contact is {config.contact}, expected two models")
+    if len(config.contact) < 2:
+        raise ValueError(
+            f"contact is {config.contact}, expected two models, or one and several"
+        )
     if config.seed < 0:
         raise ValueError(f"seed is {config.seed}, expected an integer of 0 or more")
     seeds = np.random.SeedSequence(config.seed).generate_state(4)
@@ -142,12 +150,20 @@ def make_station(
     )
 
     probe = builder.AddNamedSystem(
-        "contact_probe", ContactProbe(*(_only_body(plant, m) for m in config.contact))
+        "contact_probe",
+        ContactProbe(*(_only_body(plant, m, "contact") for m in config.contact)),
     )
     builder.Connect(
         plant.get_contact_results_output_port(), probe.GetInputPort("contact_results")
     )
     builder.ExportOutput(probe.GetOutputPort("contact_force"), "contact_force")
+    touch = builder.AddNamedSystem("tool_contact", BodyContactForce(tool_body))
+    builder.Connect(
+        plant.get_contact_results_output_port(), touch.GetInputPort("contact_results")
+    )
+    builder.ExportOutput(
+        touch.GetOutputPort("contact_force"), f"{config.tool}.contact_force"
+    )
     builder.ExportOutput(plant.get_state_output_port(), "state")
     builder.ExportOutput(
         plant.get_generalized_contact_forces_output_port(arm), f"{ARM}.contact_torque"
@@ -166,23 +182,25 @@ def make_station(
     return diagram
 
 
-def _only_body(plant: MultibodyPlant, model: str):
+def _only_body(plant: MultibodyPlant, model: str, where: str) -> RigidBody:
     if not plant.HasModelInstanceNamed(model):
-        raise ValueError(f"contact names {model!r}, which is not in the scene")
+        raise ValueError(f"{where} names {model!r}, which is not in the scene")
     bodies = plant.GetBodyIndices(plant.GetModelInstanceByName(model))
     if len(bodies) != 1:
-        raise ValueError(f"contact names {model!r}, expected a model of one body")
+        raise ValueError(f"{where} names {model!r}, expected a model of one body")
     return plant.get_body(bodies[0])
 
 
-def make_control_plant(scene: Scene | str | Path = BALL_ROLLING) -> MultibodyPlant:
+def make_control_plant(
+    scene: Scene | str | Path = BALL_ROLLING, tool: str = TOOL
+) -> MultibodyPlant:
     """The arm with its tool alone, as the controllers believe it: for their own use.
 
     Its default positions are the scene's initial ones. Effects on arm and tool count.
     """
     if not isinstance(scene, Scene):
         scene = read_scene(scene)
-    own = (ARM, TOOL)
+    own = (ARM, tool)
     directives = [
         d
         for d in scene.directives

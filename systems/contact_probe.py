@@ -1,4 +1,4 @@
-"""Ground truth of one contact, for scoring."""
+"""Ground truth of contacts, for scoring."""
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -8,34 +8,62 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 
 class ContactProbe(LeafSystem):
-    """The force between two bodies (point contact), found when it is asked for.
+    """The force between a body and others (point contact), found when it is asked for.
 
     Inputs:  contact_results (abstract).
-    Outputs: contact_force (4,) = [normal force, force on the second body xyz in the
-             world] [N]; zeros while they do not touch.
+    Outputs: contact_force (4 n,): for each of n others [normal force, force on it xyz
+             in the world] [N]; zeros while they do not touch.
     """
 
-    def __init__(self, first: RigidBody, second: RigidBody):
+    def __init__(self, first: RigidBody, *others: RigidBody):
         super().__init__()
-        self._first, self._second = int(first.index()), int(second.index())
+        self._first = int(first.index())
+        self._row = {int(body.index()): i for i, body in enumerate(others)}
         self._results = self.DeclareAbstractInputPort(
             "contact_results", AbstractValue.Make(ContactResults())
         )
-        self.DeclareVectorOutputPort("contact_force", 4, self._calc)
+        self.DeclareVectorOutputPort("contact_force", 4 * len(others), self._calc)
 
     def _calc(self, context: Context, output: BasicVector):
-        force = np.zeros(4)
+        force = np.zeros((len(self._row), 4))
         results = self._results.Eval(context)
         for i in range(results.num_point_pair_contacts()):
             contact = results.point_pair_contact_info(i)
             a, b = int(contact.bodyA_index()), int(contact.bodyB_index())
-            if (a, b) == (self._first, self._second):
-                sign = 1.0  # Drake's force acts on B.
-            elif (b, a) == (self._first, self._second):
-                sign = -1.0
+            if a == self._first and b in self._row:
+                row, sign = self._row[b], 1.0  # Drake's force acts on B.
+            elif b == self._first and a in self._row:
+                row, sign = self._row[a], -1.0
             else:
                 continue
             f_B = contact.contact_force()
-            force[0] += abs(f_B @ contact.point_pair().nhat_BA_W)
-            force[1:] += sign * f_B
+            force[row, 0] += abs(f_B @ contact.point_pair().nhat_BA_W)
+            force[row, 1:] += sign * f_B
+        output.SetFromVector(force.ravel())
+
+
+class BodyContactForce(LeafSystem):
+    """The force of all contacts on a body (point contact), found when it is asked for.
+
+    Inputs:  contact_results (abstract).
+    Outputs: contact_force (3,) on the body in the world [N].
+    """
+
+    def __init__(self, body: RigidBody):
+        super().__init__()
+        self._body = body.index()
+        self._results = self.DeclareAbstractInputPort(
+            "contact_results", AbstractValue.Make(ContactResults())
+        )
+        self.DeclareVectorOutputPort("contact_force", 3, self._calc)
+
+    def _calc(self, context: Context, output: BasicVector):
+        force = np.zeros(3)
+        results = self._results.Eval(context)
+        for i in range(results.num_point_pair_contacts()):
+            contact = results.point_pair_contact_info(i)
+            if contact.bodyB_index() == self._body:
+                force += contact.contact_force()  # Drake's force acts on B.
+            elif contact.bodyA_index() == self._body:
+                force -= contact.contact_force()
         output.SetFromVector(force)
