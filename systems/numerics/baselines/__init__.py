@@ -1,0 +1,1 @@
+"""The maths of the baselines: other people's answers, to compare with."""
