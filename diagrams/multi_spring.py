@@ -1,0 +1,109 @@
+"""A circle in the plane while three springs pull (CC 4.2, Fig. 5 to 7)."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import Diagram, LeafSystem
+
+from makebreak.diagrams.planar import (
+    FORCE_MAX,
+    MASS,
+    PERIOD,
+    circle_of_seed,
+    make_planar,
+)
+from makebreak.systems.baselines.active_inference import (
+    ActiveInference,
+    ActiveInferenceConfig,
+)
+from makebreak.systems.baselines.biomimetic import Biomimetic, BiomimeticConfig
+from makebreak.systems.baselines.mrac import Mrac, MracConfig
+from makebreak.systems.planar_impedance import (
+    ForceModelConfig,
+    PlanarImpedance,
+    PlanarImpedanceConfig,
+)
+from makebreak.systems.planar_world import CircleTargetConfig, PlanarWorldConfig
+
+# Before the seed varies them: the springs' anchors [m], stiffness [N/m], rest length
+# [m]. On the circle they pull with 7 to 40 N.
+DISTANCE, DIRECTIONS = 0.75, np.radians([90.0, 210.0, 330.0])
+STIFFNESS, REST_LENGTH = np.array([20.0, 40.0, 60.0]), 0.3
+
+
+@dataclass
+class BaselinesConfig:
+    mrac: MracConfig = field(default_factory=MracConfig)
+    active_inference: ActiveInferenceConfig = field(
+        default_factory=ActiveInferenceConfig
+    )
+    biomimetic: BiomimeticConfig = field(default_factory=BiomimeticConfig)
+
+
+@dataclass
+class MultiSpringConfig:
+    seed: int = 0  # Draws start, direction, springs and noise.
+    trials: int = 30  # Of the biomimetic controller.
+    # Half width of the uniform draw of each spring's stiffness and distance.
+    spread: float = 0.2
+    force_noise: float = 0.2  # Standard deviation, each axis [N].
+    impedance: PlanarImpedanceConfig = field(default_factory=PlanarImpedanceConfig)
+    model: ForceModelConfig = field(default_factory=ForceModelConfig)
+    baselines: BaselinesConfig = field(default_factory=BaselinesConfig)
+
+
+def draw(config: MultiSpringConfig) -> tuple[PlanarWorldConfig, CircleTargetConfig]:
+    """The world and the circle of the config's seed."""
+    c = config
+    if c.seed < 0:
+        raise ValueError(f"seed is {c.seed}, expected 0 or more")
+    if c.trials < 1:
+        raise ValueError(f"trials is {c.trials}, expected 1 or more")
+    if not 0.0 <= c.spread < 1.0:
+        raise ValueError(f"spread is {c.spread}, expected 0 <= spread < 1")
+    if not 0.0 <= c.force_noise < np.inf:
+        raise ValueError(f"force_noise is {c.force_noise}, expected >= 0")
+    rng = np.random.default_rng(c.seed)
+    target = circle_of_seed(rng)
+    distance = DISTANCE * (1.0 + c.spread * rng.uniform(-1.0, 1.0, 3))
+    stiffness = STIFFNESS * (1.0 + c.spread * rng.uniform(-1.0, 1.0, 3))
+    anchors = distance[:, None] * np.column_stack(
+        [np.cos(DIRECTIONS), np.sin(DIRECTIONS)]
+    )
+    world = PlanarWorldConfig(
+        mass=MASS,
+        anchors=anchors.tolist(),
+        stiffness=stiffness.tolist(),
+        rest_length=3 * [REST_LENGTH],
+        period_sec=PERIOD,
+    )
+    return world, target
+
+
+def make_multi_spring(
+    config: MultiSpringConfig, controller: LeafSystem, meshcat: Meshcat | None = None
+) -> Diagram:
+    """The closed loop of make_planar with this controller, in the seed's world."""
+    world, target = draw(config)
+    return make_planar(
+        controller, world, target, config.force_noise, config.seed, meshcat
+    )
+
+
+def impedance(config: PlanarImpedanceConfig, model: ForceModelConfig, knowledge=None):
+    """Our controller."""
+    return PlanarImpedance(config, model, MASS, FORCE_MAX, knowledge, PERIOD)
+
+
+def mrac(config: MracConfig):
+    return Mrac(config, FORCE_MAX, PERIOD)
+
+
+def active_inference(config: ActiveInferenceConfig):
+    return ActiveInference(config, FORCE_MAX, PERIOD)
+
+
+def biomimetic(config: BiomimeticConfig, knowledge=None, duration_sec: float = 6.0):
+    """Args: knowledge, what earlier trials taught."""
+    return Biomimetic(config, duration_sec, knowledge, MASS, FORCE_MAX, PERIOD)

@@ -1,0 +1,88 @@
+"""Active inference control of a point in the plane, a baseline."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from makebreak.systems.numerics.active_inference import MEMORY, tick
+from makebreak.systems.numerics.timing import timed
+
+HELD, AT_LIMIT = 1, 2  # Status, a sum.
+
+
+@dataclass
+class ActiveInferenceConfig:
+    # Of position and velocity as sensed, and of the belief and of its rate.
+    variance: list[float] = field(default_factory=lambda: [1.0, 1.0, 5.0, 5.0])
+    k_belief: float = 20.0  # k_mu [1/s].
+    k_action: float = 1200.0  # k_a [N/(m s)].
+
+
+class ActiveInference(LeafSystem):
+    """Believes that it goes to the goal, and acts until what it senses agrees.
+
+    Inputs:  state (4,) p, v; x_desired (6,) p, v, a, of which p is the goal.
+    Outputs: u (2,) [N]; status (1,), a sum: 1 not finite, u held; 2 u at its limit;
+             belief (6,) mu, mu', mu''.
+
+    Args: force_max, the limit of |u| [N].
+    Raises: ValueError for numbers that are not positive.
+    Source: Pezzato et al. (2020); see numerics/active_inference.py.
+    """
+
+    def __init__(
+        self,
+        config: ActiveInferenceConfig,
+        force_max: float = 100.0,
+        period_sec: float = 0.001,
+        offset_sec: float = 0.0,
+    ):
+        super().__init__()
+        c = config
+        variance = np.array(c.variance, dtype=float)
+        if variance.shape != (4,) or not np.all(variance > 0.0):
+            raise ValueError(f"variance is {c.variance}, expected 4 numbers > 0")
+        for name, number in (
+            ("k_belief", c.k_belief),
+            ("k_action", c.k_action),
+            ("force_max", force_max),
+            ("period_sec", period_sec),
+        ):
+            if not 0.0 < number < np.inf:
+                raise ValueError(f"{name} is {number}, expected > 0")
+        self._law = (
+            1.0 / variance,
+            float(c.k_belief),
+            float(c.k_action),
+            float(period_sec),
+            float(force_max),
+        )
+        self._state = self.DeclareVectorInputPort("state", 4)
+        self._target = self.DeclareVectorInputPort("x_desired", 6)
+        self._memory = self.DeclareDiscreteState(MEMORY)
+        self._status = self.DeclareDiscreteState(1)
+        ticket = {self.discrete_state_ticket(self._memory)}
+        self.DeclareVectorOutputPort("u", 2, self._calc_u, ticket)
+        self.DeclareVectorOutputPort("belief", 6, self._calc_belief, ticket)
+        self.DeclareStateOutputPort("status", self._status)
+        self.DeclarePeriodicDiscreteUpdateEvent(period_sec, offset_sec, self._update)
+        tick(np.zeros(MEMORY), np.zeros(4), np.zeros(2), *self._law)  # Compiles it.
+
+    @timed
+    def _update(self, context: Context, discrete_state):
+        # A Context's arrays are read-only, another type for the compiled law.
+        memory = context.get_discrete_state(self._memory).value().copy()
+        goal = np.ascontiguousarray(self._target.Eval(context)[:2])
+        _, memory, limit = tick(memory, self._state.Eval(context), goal, *self._law)
+        if np.isfinite(memory).all():
+            discrete_state.set_value(self._memory, memory)
+            discrete_state.set_value(self._status, [AT_LIMIT if limit else 0])
+        else:
+            discrete_state.set_value(self._status, [HELD])
+
+    def _calc_u(self, context: Context, output: BasicVector):
+        output.SetFromVector(context.get_discrete_state(self._memory).value()[6:8])
+
+    def _calc_belief(self, context: Context, output: BasicVector):
+        output.SetFromVector(context.get_discrete_state(self._memory).value()[:6])

@@ -1,0 +1,111 @@
+"""A point effector in the plane, in something that thickens, and pulled by springs.
+
+    m dv/dt = u + F,    F = -c(t) v + sum_i k_i (|d_i| - l_i) d_i / |d_i|,
+    d_i = anchor_i - p,    c(t) = c_0 + (c_1 - c_0) min(t / T, 1)
+
+u is held over each period. A period is integrated by four Runge-Kutta steps of fourth
+order; tests/test_planar_world.py holds the result against closed forms, scipy and
+Drake's own springs.
+
+Source: "Changing-contact manipulation" (CC) sections 4.1 and 4.2, Fig. 1c: "porridge
+stirring" and "multi-spring". Its worlds are drawn, not given in numbers.
+"""
+
+import numpy as np
+from numba import njit
+
+SUBSTEPS = 4
+_NEAR = 1e-9  # Closer to an anchor than this a spring has no direction [m].
+
+
+@njit(cache=True)
+def viscosity_at(t, viscosity, ramp):
+    """c(t) [N s/m]: from viscosity[0] at t = 0 to viscosity[1] at t = ramp [s]."""
+    share = min(max(t / ramp, 0.0), 1.0)
+    return viscosity[0] + (viscosity[1] - viscosity[0]) * share
+
+
+@njit(cache=True)
+def external_force(state, t, viscosity, ramp, anchors, springs):
+    """What the world does to the effector.
+
+    Args:
+        state: (4,) p, v [m], [m/s].
+        t: time [s].
+        viscosity: (2,) first and last [N s/m]; ramp [s].
+        anchors: (n, 2) [m].
+        springs: (n, 2) stiffness [N/m] and rest length [m] of each.
+    Returns: F (2,) [N].
+    """
+    c = viscosity_at(t, viscosity, ramp)
+    out = np.empty(2)
+    out[0], out[1] = -c * state[2], -c * state[3]
+    for i in range(anchors.shape[0]):
+        dx, dy = anchors[i, 0] - state[0], anchors[i, 1] - state[1]
+        length = np.sqrt(dx * dx + dy * dy)
+        if length > _NEAR:
+            pull = springs[i, 0] * (length - springs[i, 1]) / length
+            out[0] += pull * dx
+            out[1] += pull * dy
+    return out
+
+
+@njit(cache=True)
+def _slope(state, t, u, mass, viscosity, ramp, anchors, springs):
+    F = external_force(state, t, viscosity, ramp, anchors, springs)
+    out = np.empty(4)
+    out[0], out[1] = state[2], state[3]
+    out[2], out[3] = (u[0] + F[0]) / mass, (u[1] + F[1]) / mass
+    return out
+
+
+@njit(cache=True)
+def step(state, t, u, period, mass, viscosity, ramp, anchors, springs):
+    """The state (4,) one period after t, with u (2,) [N] held; mass [kg]."""
+    h = period / SUBSTEPS
+    for i in range(SUBSTEPS):
+        s = t + i * h
+        a = _slope(state, s, u, mass, viscosity, ramp, anchors, springs)
+        b = _slope(
+            state + 0.5 * h * a, s + 0.5 * h, u, mass, viscosity, ramp, anchors, springs
+        )
+        c = _slope(
+            state + 0.5 * h * b, s + 0.5 * h, u, mass, viscosity, ramp, anchors, springs
+        )
+        d = _slope(state + h * c, s + h, u, mass, viscosity, ramp, anchors, springs)
+        state = state + h / 6.0 * (a + 2.0 * b + 2.0 * c + d)
+    return state
+
+
+@njit(cache=True)
+def circle_target(t, radius, duration, phase, turn):
+    """Once around a circle about the origin, from rest to rest.
+
+    The angle follows the polynomial of least jerk, so the speed peaks at 1.875 times
+    its mean.
+
+    Args: t [s]; radius [m]; duration [s]; phase, angle of the start [rad]; turn, +1 is
+        counter-clockwise, -1 clockwise.
+    Returns: (6,) p, v, a [m], [m/s], [m/s2]; at rest before 0 and after duration.
+    """
+    s = min(max(t / duration, 0.0), 1.0)
+    sweep = turn * 2.0 * np.pi
+    angle = phase + sweep * s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
+    rate = sweep * 30.0 * s * s * (1.0 - s) ** 2 / duration
+    change = sweep * 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / duration**2
+    c, n = np.cos(angle), np.sin(angle)
+    out = np.empty(6)
+    out[0], out[1] = radius * c, radius * n
+    out[2], out[3] = -radius * rate * n, radius * rate * c
+    out[4] = -radius * (rate * rate * c + change * n)
+    out[5] = -radius * (rate * rate * n - change * c)
+    return out
+
+
+@njit(cache=True)
+def limited(u, force_max):
+    """u (2,) [N] scaled down to at most force_max [N] in norm."""
+    size = np.sqrt(u[0] * u[0] + u[1] * u[1])
+    if size > force_max:
+        return u * (force_max / size)
+    return u

@@ -1,0 +1,98 @@
+"""Meshcat's view of a point effector in the plane."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.geometry import Box, Cylinder, Meshcat, Rgba, Sphere
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import LeafSystem
+
+_HEIGHT = 0.02  # Of all that moves, above the floor [m].
+_TRACE_DOTS = 120
+_ROOT = "/makebreak/planar"
+
+
+@dataclass
+class PlanarViewConfig:
+    anchors: list[list[float]] = field(default_factory=list)  # Of the springs [m].
+    stiffness: list[float] = field(default_factory=list)  # One per anchor [N/m].
+    # First and last viscosity [N s/m], over ramp_sec: how dark the porridge gets.
+    viscosity: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    ramp_sec: float = 6.0
+    period_sec: float = 1.0 / 30.0
+
+
+class PlanarView(LeafSystem):
+    """Shows effector, target and springs, the path of both, and the porridge's colour.
+
+    A spring is as thick as it is stiff. The effector's path is a row of dots, laid down
+    over ramp_sec.
+
+    Inputs: state (4,) p, v; x_desired (6,) p, v, a.
+    """
+
+    def __init__(
+        self, config: PlanarViewConfig, meshcat: Meshcat, offset_sec: float = 0.0
+    ):
+        super().__init__()
+        c = config
+        self._meshcat = meshcat
+        self._anchors = np.array(c.anchors, dtype=float).reshape(-1, 2)
+        self._viscosity, self._ramp = c.viscosity, c.ramp_sec
+        self._state = self.DeclareVectorInputPort("state", 4)
+        self._target = self.DeclareVectorInputPort("x_desired", 6)
+        meshcat.SetCameraPose([0.0, -0.35, 2.1], [0.0, 0.0, 0.0])
+        meshcat.SetObject(f"{_ROOT}/floor", Box(2.0, 2.0, 0.002), self._floor(0.0))
+        meshcat.SetObject(f"{_ROOT}/effector", Sphere(0.02), Rgba(0.13, 0.4, 0.9))
+        meshcat.SetObject(f"{_ROOT}/target", Sphere(0.012), Rgba(0.95, 0.55, 0.1))
+        for i in range(_TRACE_DOTS):
+            meshcat.SetObject(self._dot(i), Sphere(0.005), Rgba(0.13, 0.4, 0.9))
+            meshcat.SetTransform(self._dot(i), RigidTransform([0.0, 0.0, -0.1]))
+            meshcat.SetObject(f"{_ROOT}/goal/{i}", Sphere(0.003), Rgba(0.95, 0.55, 0.1))
+            meshcat.SetTransform(f"{_ROOT}/goal/{i}", RigidTransform([0.0, 0.0, -0.1]))
+        for i, (anchor, k) in enumerate(zip(self._anchors, c.stiffness, strict=True)):
+            radius = 0.002 + 0.006 * k / max(c.stiffness)
+            name = self._spring(i)
+            meshcat.SetObject(
+                f"{name}/coil", Cylinder(radius, 1.0), Rgba(0.4, 0.4, 0.4)
+            )
+            meshcat.SetObject(f"{name}_anchor", Sphere(0.02), Rgba(0.2, 0.2, 0.2))
+            meshcat.SetTransform(f"{name}_anchor", RigidTransform([*anchor, _HEIGHT]))
+        self.DeclarePeriodicPublishEvent(c.period_sec, offset_sec, self._publish)
+
+    def _dot(self, i):
+        return f"{_ROOT}/trace/{i}"
+
+    def _spring(self, i):
+        return f"{_ROOT}/spring_{i}"
+
+    def _floor(self, t):
+        """Light where it is thin; 200 N s/m is dark."""
+        first, last = self._viscosity
+        c = first + (last - first) * min(t / self._ramp, 1.0)
+        share = min(c / 200.0, 1.0)
+        return Rgba(0.96 - 0.3 * share, 0.94 - 0.42 * share, 0.88 - 0.6 * share)
+
+    def _publish(self, context):
+        t = context.get_time()
+        p = np.array([*self._state.Eval(context)[:2], _HEIGHT])
+        goal = np.array([*self._target.Eval(context)[:2], _HEIGHT])
+        meshcat = self._meshcat
+        meshcat.SetTransform(f"{_ROOT}/effector", RigidTransform(p), t)
+        meshcat.SetTransform(f"{_ROOT}/target", RigidTransform(goal), t)
+        dot = int(t / self._ramp * _TRACE_DOTS)
+        if dot < _TRACE_DOTS:
+            meshcat.SetTransform(self._dot(dot), RigidTransform(p), t)
+            meshcat.SetTransform(f"{_ROOT}/goal/{dot}", RigidTransform(goal), t)
+        for i, anchor in enumerate(self._anchors):
+            a = np.array([*anchor, _HEIGHT])
+            length = max(float(np.linalg.norm(p - a)), 1e-6)
+            R = RotationMatrix.MakeFromOneVector((p - a) / length, 2)
+            X = RigidTransform(R, 0.5 * (p + a))
+            meshcat.SetTransform(self._spring(i), X, t)
+            coil = f"{self._spring(i)}/coil"
+            meshcat.SetProperty(coil, "scale", [1.0, 1.0, length], t)
+        if self._viscosity[0] != self._viscosity[1]:
+            color = self._floor(t)
+            rgba = [color.r(), color.g(), color.b(), 1.0]
+            meshcat.SetProperty(f"{_ROOT}/floor/<object>", "color", rgba, t)
