@@ -1,4 +1,4 @@
-"""The command line: `makebreak list | run | reproduce | bench`.
+"""The command line: `makebreak list | run | reproduce | export-tests | bench`.
 
 Exit status: 0 done; 1 it ran and did not meet its criterion; 2 bad input, one line on
 stderr; 3 a fault of makebreak itself, with a traceback; 130 ended by Ctrl-C.
@@ -256,6 +256,24 @@ def _reproduce(args) -> int:
     return 1 if missed else 0
 
 
+def _export_tests(args) -> int:
+    from makebreak.scripts.export_tests import export_tests
+
+    module = _experiment(args.experiment)
+    config = _config(module, args)
+    seconds = _number(args.seconds, "--seconds", 0.0)
+    wanted = [name for name in (args.systems or "").split(",") if name]
+    out = Path(args.out)
+    done, left_out = export_tests(args.experiment, module, config, out, wanted, seconds)
+    for name, updates in done.items():
+        print(f"test_{name}.py  {updates} updates")
+    for name, reason in left_out.items():
+        print(f"left out: {name}: {reason}")
+    size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
+    print(f"Files in {out}, {size / 1e6:.1f} MB; run them with: pytest {out}")
+    return 0
+
+
 def _bench(args) -> int:
     import json
 
@@ -300,6 +318,20 @@ def _parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--out", metavar="DIR", help="default: runs/reproduce-<time>")
     p.set_defaults(function=_reproduce)
+
+    p = commands.add_parser(
+        "export-tests", help="a test of each system alone, from what it did in a run"
+    )
+    p.add_argument("experiment", metavar="EXPERIMENT")
+    p.add_argument("--systems", metavar="A,B", help="by name; default: all that update")
+    p.add_argument("--out", metavar="DIR", required=True, help="a new folder")
+    p.add_argument("--seconds", metavar="S", default="5", help="recorded (default 5)")
+    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", nargs="+")
+    p.add_argument("--config", metavar="FILE", help="a YAML file of settings")
+    p.add_argument("--world", metavar="SCENE", help="the scene that is simulated")
+    p.add_argument("--model", metavar="SCENE", help="the scene that control believes")
+    p.add_argument("--seed", metavar="N", help="all randomness comes from it")
+    p.set_defaults(function=_export_tests)
 
     p = commands.add_parser("bench", help="how long the parts take, as table and JSON")
     p.add_argument("names", nargs="*", metavar="NAME")

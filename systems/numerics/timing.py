@@ -1,8 +1,15 @@
-"""How long each update of a system took: a diagnostic, never an input to anything."""
+"""Watching the updates of systems from outside: how long each took, and what it saw.
+
+Diagnostics, never an input to anything that is simulated.
+"""
 
 from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import wraps
 from time import perf_counter
+
+_observers: list[Callable] = []
 
 
 def timed(update):
@@ -13,13 +20,25 @@ def timed(update):
     """
 
     @wraps(update)
-    def wrapper(self, *args):
+    def wrapper(self, context, *args):
+        for observer in _observers:
+            observer(self, context)
         start = perf_counter()
         try:
-            return update(self, *args)
+            return update(self, context, *args)
         finally:
             if not hasattr(self, "compute_sec"):
                 self.compute_sec = deque(maxlen=1_000_000)
             self.compute_sec.append(perf_counter() - start)
 
     return wrapper
+
+
+@contextmanager
+def observed(observer: Callable) -> Iterator[None]:
+    """While entered, observer(system, context) is called just before each update."""
+    _observers.append(observer)
+    try:
+        yield
+    finally:
+        _observers.remove(observer)

@@ -1,0 +1,416 @@
+"""Writes tests of single systems, from what they saw and said in a run.
+
+One file per system: it builds that system alone, replays its inputs at its own rate
+and offset, and compares its outputs. Neither the plant nor a camera is needed there.
+"""
+
+import dataclasses
+import importlib
+import inspect
+import pkgutil
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import wraps
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from pydrake.common.yaml import yaml_dump_typed
+from pydrake.systems.framework import Context, Diagram, LeafSystem
+
+import makebreak.systems
+from makebreak.diagrams.station import make_control_plant
+from makebreak.models.scene import Scene, read_scene
+from makebreak.models.tip_and_ball import make_tip_and_ball
+from makebreak.scripts.replay import Track, Unsupported
+from makebreak.scripts.session import Log, Session, leaf_systems
+from makebreak.scripts.settings import nearest
+from makebreak.systems.impedance_controller import serial_chain_of
+from makebreak.systems.numerics.timing import observed
+
+# What makes a plant, or constants of one, that a system is built with: such an argument
+# is written as the call that made it.
+MAKERS: tuple[Callable, ...] = (make_control_plant, make_tip_and_ball, serial_chain_of)
+INLINE = 12  # Longer arrays go to the data file.
+
+
+@dataclasses.dataclass(frozen=True)
+class Call:
+    """A call that made something."""
+
+    function: Callable
+    args: tuple
+    kwargs: dict
+    result: Any  # Kept, so that no other object gets its id.
+
+
+class _Done(Exception):
+    """All that was asked for has been recorded."""
+
+
+@contextmanager
+def calls_kept() -> Iterator[dict[int, Call]]:
+    """While entered, notes how each system and plant is made: {id(object): Call}."""
+    made: dict[int, Call] = {}
+    undo: list[tuple[Any, str, Any]] = []
+
+    def replace(owner, name, new):
+        undo.append((owner, name, getattr(owner, name)))
+        setattr(owner, name, new)
+
+    def keeping(cls, init):
+        @wraps(init)
+        def wrapper(self, *args, **kwargs):
+            # Before the constructor: what it is given may not be changed by it.
+            made.setdefault(id(self), Call(cls, args, kwargs, self))
+            init(self, *args, **kwargs)
+
+        return wrapper
+
+    def noting(function):
+        @wraps(function)
+        def wrapper(*args, **kwargs):
+            result = function(*args, **kwargs)
+            made[id(result)] = Call(function, args, kwargs, result)
+            if type(result) is tuple:
+                for part in result:
+                    made[id(part)] = made[id(result)]
+            return result
+
+        return wrapper
+
+    wrapped = {id(function): noting(function) for function in MAKERS}
+    for module in _modules(makebreak.systems):
+        for cls in vars(module).values():
+            if inspect.isclass(cls) and issubclass(cls, LeafSystem):
+                if cls.__module__ == module.__name__:
+                    replace(cls, "__init__", keeping(cls, cls.__init__))
+    for module in list(sys.modules.values()):
+        if getattr(module, "__name__", "").startswith("makebreak."):
+            for name, value in list(vars(module).items()):
+                if id(value) in wrapped and module.__name__ != __name__:
+                    replace(module, name, wrapped[id(value)])
+    try:
+        yield made
+    finally:
+        for owner, name, old in reversed(undo):
+            setattr(owner, name, old)
+
+
+def _modules(package: ModuleType) -> list[ModuleType]:
+    names = [
+        info.name
+        for info in pkgutil.walk_packages(package.__path__, package.__name__ + ".")
+    ]
+    return [importlib.import_module(name) for name in names]
+
+
+class _Source:
+    """Python source of values: the code, its imports, the arrays beside it."""
+
+    def __init__(self, made: dict[int, Call], folder: Path):
+        self.imports: set[tuple[str, str]] = set()
+        self.arrays: dict[str, np.ndarray] = {}
+        self._made, self._folder = made, folder
+
+    def of_call(self, call: Call) -> str:
+        parts = [self.of(value) for value in call.args]
+        parts += [f"{name}={self.of(value)}" for name, value in call.kwargs.items()]
+        return f"{self._named(call.function)}({', '.join(parts)})"
+
+    def _named(self, thing) -> str:
+        self.imports.add((thing.__module__, thing.__qualname__.partition(".")[0]))
+        return thing.__qualname__
+
+    def of(self, value) -> str:
+        """The code of one value. Raises: Unsupported."""
+        if id(value) in self._made and not isinstance(value, str | int | float):
+            call = self._made[id(value)]
+            code = self.of_call(call)
+            if type(call.result) is tuple and value is not call.result:
+                code += f"[{next(i for i, p in enumerate(call.result) if p is value)}]"
+            return code
+        if value is None or isinstance(value, bool | str):
+            return repr(value)
+        if isinstance(value, Path):
+            return repr(str(value))
+        if isinstance(value, int | float | np.number) and not hasattr(value, "name"):
+            number = value.item() if isinstance(value, np.number) else value
+            plain = np.isfinite(number)
+            return repr(number) if plain else f'float("{number}")'
+        if isinstance(value, np.ndarray):
+            if value.size > INLINE:
+                name = f"constant_{len(self.arrays)}"
+                self.arrays[name] = value
+                return f'DATA["{name}"]'
+            self.imports.add(("numpy", ""))
+            return f"np.array({value.tolist()!r})"
+        if isinstance(value, Scene):
+            return self._scene(value)
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            parts = [
+                f"{f.name}={self.of(getattr(value, f.name))}"
+                for f in dataclasses.fields(value)
+                if f.init and not _is_default(f, getattr(value, f.name))
+            ]
+            return f"{self._named(type(value))}({', '.join(parts)})"
+        if isinstance(value, tuple) and hasattr(value, "_fields"):
+            parts = [
+                f"{name}={self.of(getattr(value, name))}" for name in value._fields
+            ]
+            return f"{self._named(type(value))}({', '.join(parts)})"
+        if isinstance(value, tuple):
+            return f"({', '.join(map(self.of, value))}{',' * (len(value) == 1)})"
+        if isinstance(value, list):
+            return f"[{', '.join(map(self.of, value))}]"
+        if isinstance(value, dict):
+            pairs = (f"{self.of(k)}: {self.of(v)}" for k, v in value.items())
+            return f"{{{', '.join(pairs)}}}"
+        raise Unsupported(f"it is built with a {type(value).__name__}")
+
+    def _scene(self, scene: Scene) -> str:
+        """A scene becomes a file beside the tests, with copies of its models."""
+        models = self._folder / "models"
+        models.mkdir(exist_ok=True)
+        text = yaml_dump_typed(scene)
+        for directive in scene.directives:
+            if directive.add_model is not None:
+                file = directive.add_model.file
+                source = Path(file.removeprefix("file://"))
+                if source.is_file():
+                    shutil.copyfile(source, models / source.name)
+                    text = text.replace(file, source.name)
+        for i in range(1000):
+            path = models / f"scene_{i}.yaml"
+            if not path.exists() or path.read_text() == text:
+                path.write_text(text)
+                break
+        self.imports.add((read_scene.__module__, "read_scene"))
+        return f'read_scene(HERE / "models" / "{path.name}")'
+
+
+def _is_default(f: dataclasses.Field, value) -> bool:
+    if f.default is not dataclasses.MISSING:
+        default = f.default
+    elif f.default_factory is not dataclasses.MISSING:
+        default = f.default_factory()
+    else:
+        return False
+    try:
+        return type(value) is type(default) and bool(value == default)
+    except ValueError:  # Arrays.
+        return False
+
+
+class _Recorder:
+    """What the systems of one diagram saw and said at each update."""
+
+    def __init__(
+        self, diagram: Diagram, wanted: Sequence[str], seconds: float, initial: Context
+    ):
+        self.seconds = seconds
+        self._initial = initial
+        self.systems: dict[str, LeafSystem] = {}
+        own = {s.get_name(): s for s in diagram.GetSystems()}
+        for name in wanted or own:
+            if isinstance(own.get(name), LeafSystem):
+                self.systems[name] = own[name]
+        self._names = {id(s): name for name, s in self.systems.items()}
+        self.time: dict[str, list[float]] = {}
+        self.tracks: dict[str, dict[str, dict[str, Track]]] = {}
+        self.refused: dict[str, str] = {}
+
+    def __call__(self, system, context) -> None:
+        name = self._names.get(id(system))
+        now = context.get_time()
+        if name is None or name in self.refused or now > self.seconds:
+            return
+        if name not in self.tracks:
+            self._start(name, system, system.GetMyContextFromRoot(self._initial))
+        self._append(name, "in", system, context)
+        self._append(name, "out", system, context)
+        self.time[name].append(now)
+
+    def _start(self, name, system, context) -> None:
+        """The first inputs are those of an initialization: before any update."""
+        self.time[name] = []
+        self.tracks[name] = {"in": {}, "out": {}}
+        for i in range(system.num_input_ports()):
+            port = system.get_input_port(i)
+            if port.HasValue(context):
+                self.tracks[name]["in"][port.get_name()] = Track()
+        for i in range(system.num_output_ports()):
+            self.tracks[name]["out"][system.get_output_port(i).get_name()] = Track()
+        self._append(name, "in", system, context)
+
+    def _append(self, name, way, system, context) -> None:
+        get = system.GetInputPort if way == "in" else system.GetOutputPort
+        try:
+            for port, track in self.tracks[name][way].items():
+                track.append(get(port).Eval(context))
+        except Unsupported as error:
+            self.refused[name] = f"a port carries {error}"
+
+
+class _RecordingSession(Session):
+    """A session whose simulations are recorded, until all is there."""
+
+    def __init__(self, out_dir: Path, wanted: Sequence[str], seconds: float):
+        super().__init__(out_dir)
+        self._wanted, self._seconds = list(wanted), seconds
+        self.recorders: list[_Recorder] = []
+        self.seen: set[str] = set()
+
+    def simulate(self, diagram, duration_sec, record, *args, **kwargs) -> Log:
+        self.seen |= {s.get_name() for s in leaf_systems(diagram)}
+        kwargs["context"] = kwargs.get("context") or diagram.CreateDefaultContext()
+        initial = kwargs["context"].Clone()
+        recorder = _Recorder(diagram, self._wanted, self._seconds, initial)
+        self.recorders.append(recorder)
+        if self._wanted:  # Else the whole run: a later simulation may have more.
+            duration_sec = min(duration_sec, self._seconds)
+        with observed(recorder):
+            log = super().simulate(diagram, duration_sec, record, *args, **kwargs)
+        if log.interrupted:
+            raise KeyboardInterrupt
+        there = {n for r in self.recorders for n in r.tracks}
+        if self._wanted and there >= set(self._wanted):
+            raise _Done
+        return log
+
+
+def export_tests(
+    name: str,
+    module: ModuleType,
+    config,
+    out: Path,
+    wanted: Sequence[str] = (),
+    seconds: float = 5.0,
+) -> tuple[dict[str, int], dict[str, str]]:
+    """Runs the experiment's first seconds and writes a test of each system.
+
+    Args:
+        name, module, config: of the experiment.
+        out: folder to be made; it must not exist, or be empty.
+        wanted: names of systems in the experiment's diagram, which is then run no
+            longer than needed; empty: all that update, and the whole experiment is run.
+        seconds: how long is recorded [s].
+    Returns: {system: number of updates}, and {system: why it was left out}.
+    Raises: ValueError for a folder that is in use, an unknown system, a system that
+        cannot be exported and was asked for, an experiment that fails, and where the
+        files cannot be written. Then nothing is left of the folder.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ValueError(f'--out: got "{out}", expected a new or an empty folder')
+    part = out.with_name(out.name + ".part")
+    shutil.rmtree(part, ignore_errors=True)
+    try:
+        part.mkdir(parents=True)
+        with calls_kept() as made:
+            session = _RecordingSession(part / "run", wanted, seconds)
+            try:
+                module.run(config, session)
+            except _Done:
+                pass
+            except KeyboardInterrupt:
+                raise
+            except OSError:
+                raise
+            except Exception as error:
+                raise ValueError(
+                    f"{name} failed while it was recorded: {type(error).__name__}: "
+                    f"{' '.join(str(error).split())}"
+                ) from error
+            unknown = [w for w in wanted if w not in session.seen]
+            if unknown:
+                raise ValueError(
+                    f"--systems: {name} has no system {unknown[0]}; "
+                    f"{nearest(unknown[0], sorted(session.seen))}"
+                )
+            shutil.rmtree(part / "run")
+            done, left_out = _write(name, session.recorders, made, part, wanted)
+        if out.exists():
+            out.rmdir()
+        part.rename(out)
+    except OSError as error:
+        raise ValueError(
+            f'--out: "{out}" cannot be written: {error.strerror or error}'
+        ) from error
+    finally:
+        with suppress(OSError):
+            shutil.rmtree(part, ignore_errors=True)
+    return done, left_out
+
+
+def _write(experiment, recorders, made, folder, wanted):
+    done: dict[str, int] = {}
+    left_out: dict[str, str] = {}
+    for recorder in recorders:
+        for system, reason in recorder.refused.items():
+            left_out[system] = reason
+        for system, tracks in recorder.tracks.items():
+            if system in done or system in recorder.refused:
+                continue
+            source = _Source(made, folder)
+            try:
+                code = source.of_call(made[id(recorder.systems[system])])
+            except Unsupported as error:
+                left_out[system] = str(error)
+                continue
+            time = np.array(recorder.time[system])
+            arrays: dict[str, np.ndarray] = {"time": time, **source.arrays}
+            for way, plural in (("in", "inputs"), ("out", "outputs")):
+                arrays[plural] = np.array(list(tracks[way]), dtype=np.str_)
+                for port, track in tracks[way].items():
+                    arrays |= track.arrays(f"{way}/{port}")
+            with (folder / f"{system}.npz").open("wb") as file:
+                np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+            text = _test_text(experiment, system, code, source, len(time), time[-1])
+            (folder / f"test_{system}.py").write_text(text)
+            done[system] = len(time)
+    refused = [w for w in wanted if w not in done]
+    if refused:
+        reason = left_out.get(refused[0], "it has no periodic update")
+        raise ValueError(f"--systems: {refused[0]} cannot be exported: {reason}")
+    if not done:
+        raise ValueError(f"{experiment} has no system that can be exported")
+    return done, left_out
+
+
+def _test_text(experiment, system, code, source, updates, last) -> str:
+    imports: dict[str, set[str]] = {"makebreak.scripts.replay": {"replay"}}
+    for module, name in source.imports:
+        if name:
+            imports.setdefault(module, set()).add(name)
+    lines = [
+        f'"""{system} of {experiment}, alone: {updates} updates, to {last:.3f} s.',
+        "",
+        "Written by makebreak export-tests. A difference means that this system no",
+        "longer does what it did; RTOL and ATOL of makebreak.scripts.replay are the",
+        'tolerance."""',
+        "",
+        "from pathlib import Path",
+        "",
+    ]
+    if ("numpy", "") in source.imports or source.arrays:
+        lines += ["import numpy as np", ""]
+    for module in sorted(imports):
+        lines.append(f"from {module} import {', '.join(sorted(imports[module]))}")
+    lines += ["", "HERE = Path(__file__).resolve().parent"]
+    if source.arrays:
+        lines.append(f'DATA = np.load(HERE / "{system}.npz")')
+    lines += [
+        "",
+        "",
+        "def make_system():",
+        f"    return {code}",
+        "",
+        "",
+        f"def test_{system}_gives_what_it_gave():",
+        f'    assert replay(make_system(), HERE / "{system}.npz") == {updates}',
+        "",
+    ]
+    return "\n".join(lines)
