@@ -27,7 +27,7 @@ from pydrake.systems.framework import (
 )
 from tqdm import tqdm
 
-from makebreak.scripts.recording import write_recording
+from makebreak.gap.table import write_recording
 from makebreak.scripts.table import json_value
 from makebreak.scripts.trials import run_many
 
@@ -305,7 +305,7 @@ class Session:
     ) -> Path:
         """Writes recording.csv, and noise.json where the noise is known.
 
-        See scripts/recording.py for the columns' names.
+        See gap/table.py for the columns' names.
         """
         written = write_recording(self.out_dir / "recording.csv", columns, noise)
         return [self._wrote(path) for path in written][0]

@@ -18,7 +18,7 @@ from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource, Integrator
 
-from makebreak.scripts.recording import check_columns, write_recording
+from makebreak.gap.table import check_columns, write_recording
 from makebreak.scripts.session import Session
 from makebreak.scripts.settings import (
     apply_settings,
@@ -306,7 +306,7 @@ def test_a_recording_reads_back_as_the_very_same_numbers(tmp_path):
         ({"time": [0.0], "speed": [1.0]}, 'recording column "speed", expected <model>'),
         ({"time": [0.0], "a.b.c": [1.0]}, 'recording column "a.b.c", expected <model>'),
         ({"time": [0.0], "a.b.x": [1.0, 2.0]}, r"a.b.x is \(2,\), expected \(1,\)"),
-        ({"time": [0.0, 1.0, 1.0]}, "time does not increase at row 2: 1.0 after 1.0"),
+        ({"time": [0.0, 1.0, 1.0]}, "time does not increase at row 3: 1.0 after 1.0"),
         ({"time": [0.0, np.nan]}, "time is not finite"),
     ],
 )

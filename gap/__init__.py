@@ -1,0 +1,1 @@
+"""The gap workflow: where a simulation and measured data disagree, and why."""

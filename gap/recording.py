@@ -1,0 +1,502 @@
+"""A recording in memory: channels with names, episodes, rates and noise."""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from makebreak.gap.table import (
+    COMMANDS,
+    JOINT_QUANTITIES,
+    MOST_CELLS,
+    QUANTITIES,
+    TWIST,
+    check_columns,
+    is_channel,
+    read_table,
+)
+from makebreak.systems.numerics.signal_noise import estimate_noise
+
+FEWEST_ROWS = 10  # In an episode: fewer hold no window and no noise.
+_SIDECAR = ("noise", "filters", "columns", "provenance")
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_UNITS = {q: "N" for q in ("fx", "fy", "fz")} | {q: "N m" for q in ("tx", "ty", "tz")}
+_UNITS |= {q: "m" for q in "xyz"} | {q: "1" for q in _QUATERNION}
+_UNITS |= {q: "m/s" for q in TWIST[:3]} | {q: "rad/s" for q in TWIST[3:]}
+
+
+def unit_of(quantity: str, prismatic: bool = False) -> str:
+    """The unit of a quantity; of a joint's, that of a revolute one unless said."""
+    if quantity in _UNITS:
+        return _UNITS[quantity]
+    if "position" in quantity:
+        return "m" if prismatic else "rad"
+    if "velocity" in quantity:
+        return "m/s" if prismatic else "rad/s"
+    return "N" if prismatic else "N m"
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """One column. `<model>.<element>.<quantity>`: an element is a joint, body or frame.
+
+    noise: standard deviation, in the channel's unit; for a command 0.
+    noise_from: "given", "estimated", or "none" for a command.
+    noise_pole: 0 for white noise; else the estimated pole of its filter, a sample.
+    step: the channel's resolution if it is quantised, else 0.
+    rate_hz: samples that are there per second. filter: what the sidecar says.
+    """
+
+    name: str
+    values: np.ndarray  # (n,), NaN where a sample is missing; read-only.
+    noise: float = 0.0
+    noise_from: str = "none"
+    noise_pole: float = 0.0
+    step: float = 0.0
+    rate_hz: float = 0.0
+    filter: str = ""
+
+    @property
+    def model(self) -> str:
+        return self.name.split(".")[0]
+
+    @property
+    def element(self) -> str:
+        return self.name.split(".", 1)[1].rsplit(".", 1)[0]
+
+    @property
+    def quantity(self) -> str:
+        return self.name.rsplit(".", 1)[1]
+
+    @property
+    def at(self) -> str:
+        """`<model>.<element>`."""
+        return self.name.rsplit(".", 1)[0]
+
+    @property
+    def is_command(self) -> bool:
+        return self.quantity in COMMANDS
+
+
+@dataclass(frozen=True)
+class Episode:
+    """Rows [first, last) of a recording, without a break.
+
+    number: that of the column `episode`, 0 where there is none. stretch: counts the
+    parts of an episode of which rows were left out because the table is too long.
+    """
+
+    number: int
+    first: int
+    last: int
+    stretch: int = 0
+
+    @property
+    def rows(self) -> slice:
+        return slice(self.first, self.last)
+
+    @property
+    def is_start(self) -> bool:
+        """Whether its first row is the episode's own, where `initial` holds."""
+        return self.stretch == 0
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A recording. All arrays are read-only.
+
+    name: unique among the recordings read together. notes: what was done to the table
+    in reading: (kind, sentence).
+    """
+
+    name: str
+    path: Path
+    time: np.ndarray  # (n,) [s]
+    row: np.ndarray  # (n,) number of each row in the file, from 1.
+    episodes: tuple[Episode, ...]
+    channels: Mapping[str, Channel]
+    n_rows_in_file: int
+    provenance: str = ""
+    notes: tuple[tuple[str, str], ...] = ()
+    quaternion_flips: Mapping[str, int] = field(default_factory=dict)
+    quaternion_norm_error: Mapping[str, float] = field(default_factory=dict)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.channels
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """(n,) values of a channel, NaN where a sample is missing."""
+        return self.channels[name].values
+
+    def commands(self) -> list[Channel]:
+        return [c for c in self.channels.values() if c.is_command]
+
+    def measured(self) -> list[Channel]:
+        return [c for c in self.channels.values() if not c.is_command]
+
+    def places(self, quantities: Iterable[str] = QUANTITIES) -> list[str]:
+        """`<model>.<element>` that have any of the quantities, in the file's order."""
+        wanted = set(quantities)
+        found = (c.at for c in self.channels.values() if c.quantity in wanted)
+        return list(dict.fromkeys(found))
+
+    def stack(self, at: str, quantities: Iterable[str]) -> np.ndarray | None:
+        """(n, k) of channels `<at>.<quantity>`; None if one of them is missing."""
+        names = [f"{at}.{q}" for q in quantities]
+        if not all(name in self.channels for name in names):
+            return None
+        return np.stack([self[name] for name in names], axis=1)
+
+    def samples(self, name: str, episode: Episode) -> tuple[np.ndarray, np.ndarray]:
+        """Times [s] and values of the samples of an episode that are there."""
+        y, t = self[name][episode.rows], self.time[episode.rows]
+        there = ~np.isnan(y)
+        return t[there], y[there]
+
+    def held(self, name: str) -> np.ndarray:
+        """(n,) a command, held from its row on; NaN before an episode's first one."""
+        y = self[name]
+        index = np.where(np.isnan(y), -1, np.arange(len(y)))
+        out = np.empty(len(y))
+        for episode in self.episodes:
+            last = np.maximum.accumulate(index[episode.rows])
+            out[episode.rows] = np.where(last >= 0, y[last], np.nan)
+        return out
+
+    def duration_sec(self) -> float:
+        """Of all episodes together."""
+        return float(
+            sum(self.time[e.last - 1] - self.time[e.first] for e in self.episodes)
+        )
+
+
+def read_recordings(paths: Iterable[str | Path]) -> list[Recording]:
+    """Several recordings, with names that tell them apart.
+
+    Raises: ValueError as read_recording; if a file is given twice; for no file.
+    """
+    files = [Path(path) for path in paths]
+    if not files:
+        raise ValueError("expected at least one recording")
+    seen: dict[Path, Path] = {}
+    for path in files:
+        if path.resolve() in seen:
+            raise ValueError(f"recording {path} is given twice")
+        seen[path.resolve()] = path
+    stems = [path.stem for path in files]
+    if len(set(stems)) < len(stems):  # runs/a/recording.csv, runs/b/recording.csv
+        stems = [f"{path.resolve().parent.name}/{path.stem}" for path in files]
+    if len(set(stems)) < len(stems):
+        stems = [str(path) for path in files]
+    return [read_recording(path, name) for path, name in zip(files, stems, strict=True)]
+
+
+def read_recording(
+    path: str | Path, name: str | None = None, most_cells: int = MOST_CELLS
+) -> Recording:
+    """Reads a .csv, .npz or .parquet table, and what its sidecars say of it.
+
+    Quaternions are given unit length and one sign without jumps; what was done is in
+    the recording's fields and notes.
+
+    Raises: ValueError: one line with file, column, row, what came, what was expected.
+    """
+    path = Path(path)
+    table = read_table(path, most_cells)
+    sidecar = _read_sidecars(path)
+    columns = _renamed(path, table.columns, sidecar.get("columns") or {})
+    number = columns.get("episode")
+    try:
+        columns = check_columns(columns | {"episode": _parts(path, columns, table.row)})
+    except ValueError as error:
+        raise ValueError(_with_rows(path, error, table.row)) from None
+    time, part = columns.pop("time"), columns.pop("episode")
+    if not columns:
+        raise ValueError(f"recording {path} has no channel beside time")
+    episodes = _episodes(path, number, part, time, table.row)
+    flips, norm_errors = _mend_quaternions(path, columns, episodes, table.row)
+    notes = []
+    if len(time) < table.n_rows:
+        notes.append(
+            (
+                "rows_left_out",
+                f"{path.name} has {table.n_rows} rows, too many to hold: "
+                f"{len(time)} of them are used, in evenly spread stretches",
+            )
+        )
+    noise, filters = sidecar.get("noise") or {}, sidecar.get("filters") or {}
+    for section, known in (("noise", noise), ("filters", filters)):
+        for key in known:
+            if key not in columns:
+                if is_channel(key):  # noise.json may speak of several recordings.
+                    continue
+                raise ValueError(
+                    f'sidecar of {path}: {section} of "{key}", expected the name of a '
+                    "channel"
+                )
+    for value in (time, *columns.values()):
+        value.setflags(write=False)
+    channels = {
+        key: _channel(key, value, time, episodes, noise, filters)
+        for key, value in columns.items()
+    }
+    return Recording(
+        name=name or path.stem,
+        path=path,
+        time=time,
+        row=table.row,
+        episodes=episodes,
+        channels=channels,
+        n_rows_in_file=table.n_rows,
+        provenance=str(sidecar.get("provenance") or ""),
+        notes=tuple(notes),
+        quaternion_flips=flips,
+        quaternion_norm_error=norm_errors,
+    )
+
+
+def check_against_scene(
+    recording: Recording, joints: Iterable[str], bodies: Iterable[str]
+) -> None:
+    """Refuses channels of what a scene does not have.
+
+    Args: joints, bodies: `<model>.<name>` of the scene's joints; bodies and frames.
+    Raises: ValueError, naming all of them and the nearest name of the first.
+    """
+    joints, bodies = set(joints), set(bodies)
+    lacking = {
+        c.name: (joints if c.quantity in JOINT_QUANTITIES else bodies, c)
+        for c in recording.channels.values()
+        if c.at not in (joints if c.quantity in JOINT_QUANTITIES else bodies)
+    }
+    if not lacking:
+        return
+    known, first = next(iter(lacking.values()))
+    what = "joint" if first.quantity in JOINT_QUANTITIES else "body or frame"
+    close = get_close_matches(first.at, known, n=1, cutoff=0.5)
+    hint = f'did you mean "{close[0]}"?' if close else f"it has {sorted(known)}"
+    others = f" (and {len(lacking) - 1} more)" if len(lacking) > 1 else ""
+    raise ValueError(
+        f"recording {recording.path}: column {first.name}{others}: no {what} "
+        f'"{first.at}" in the scene: {hint}; to leave a column out, map it to null '
+        "under `columns` "
+        f"in {recording.path.with_suffix('.yaml').name}"
+    )
+
+
+def _read_sidecars(path: Path) -> dict:
+    """noise.json in the folder, and `<recording>.yaml`, which wins."""
+    merged: dict = {}
+    for file in (path.with_name("noise.json"), path.with_suffix(".yaml")):
+        if not file.is_file():
+            continue
+        try:
+            # Not YAML for both: YAML reads 1e-5 as a text.
+            text = file.read_text()
+            data = json.loads(text) if file.suffix == ".json" else yaml.safe_load(text)
+        except (ValueError, yaml.YAMLError) as error:
+            raise ValueError(f"{file}: {' '.join(str(error).split())}") from None
+        if data is None:
+            continue
+        if not isinstance(data, dict):
+            raise ValueError(f"{file}: expected names with values")
+        if file.suffix == ".json" and not set(data) & set(_SIDECAR):
+            data = {"noise": data}  # {channel: standard deviation}
+        for key, value in data.items():
+            if key not in _SIDECAR:
+                raise ValueError(
+                    f'{file}: "{key}", expected one of {", ".join(_SIDECAR)}'
+                )
+            if (
+                key != "provenance"
+                and value is not None
+                and not isinstance(value, dict)
+            ):
+                raise ValueError(f"{file}: {key} must be names with values")
+            if isinstance(value, dict) and key != "provenance":
+                value = (merged.get(key) or {}) | value
+            merged[key] = value
+        for key, value in (data.get("noise") or {}).items():
+            merged["noise"][key] = _number(f"{file}: noise of {key}", value, least=0.0)
+    return merged
+
+
+def _number(what: str, value, least: float = -np.inf) -> float:
+    try:
+        number = float(value)  # YAML reads 1e-5, without a point, as a text.
+    except (TypeError, ValueError):
+        number = np.nan
+    if not (np.isfinite(number) and number >= least) or isinstance(value, bool):
+        tail = f" of {least:g} or more" if np.isfinite(least) else ""
+        raise ValueError(f"{what} is {value!r}, expected a finite number{tail}")
+    return number
+
+
+def _renamed(path: Path, columns: Mapping, names: Mapping) -> dict[str, np.ndarray]:
+    """The columns under our names.
+
+    names: {foreign: ours}, {foreign: null} to leave one out, or {foreign: {channel:
+    ours, scale: factor, offset: added after it}}.
+    """
+    file, result = path.with_suffix(".yaml"), {}
+    for foreign in names:
+        if foreign not in columns:
+            raise ValueError(
+                f'{file}: columns names "{foreign}", {path.name} has '
+                f"{', '.join(columns)}"
+            )
+    for name, value in columns.items():
+        target = names.get(name, name)
+        if target is None:
+            continue
+        if isinstance(target, dict):
+            unknown = set(target) - {"channel", "scale", "offset"}
+            if unknown or "channel" not in target:
+                raise ValueError(
+                    f'{file}: columns, "{name}": got {sorted(target)}, expected '
+                    "channel, and scale or offset"
+                )
+            what = f'{file}: columns, "{name}":'
+            scale = _number(f"{what} scale", target.get("scale", 1.0))
+            offset = _number(f"{what} offset", target.get("offset", 0.0))
+            value, target = scale * value + offset, target["channel"]
+        if target in result:
+            raise ValueError(f'{file}: two columns are mapped to "{target}"')
+        result[str(target)] = value
+    return result
+
+
+def _parts(path: Path, columns: Mapping, row: np.ndarray) -> np.ndarray:
+    """(n,) counts from 0 the parts of the table in which time must increase."""
+    new = np.concatenate([[0], np.diff(row) > 1])
+    episode = columns.get("episode")
+    if episode is not None:
+        bad = np.flatnonzero(~(np.mod(episode, 1.0) == 0.0))
+        if bad.size:
+            raise ValueError(
+                f"recording {path}: column episode, row {row[bad[0]]}: got "
+                f"{episode[bad[0]]}, expected an integer"
+            )
+        new = new | np.concatenate([[0], np.diff(episode) != 0])
+    return np.cumsum(new).astype(float)
+
+
+def _with_rows(path: Path, error: ValueError, row: np.ndarray) -> str:
+    """The message about a column, with the file's name."""
+    text = str(error).removeprefix("a recording ").removeprefix("recording ")
+    if len(row) and row[-1] != len(row):
+        text += " (rows counted among those that are used)"
+    return f"recording {path}: {text}"
+
+
+def _episodes(
+    path: Path,
+    number: np.ndarray | None,
+    part: np.ndarray,
+    time: np.ndarray,
+    row: np.ndarray,
+) -> tuple[Episode, ...]:
+    starts = np.flatnonzero(np.diff(part, prepend=-1.0))
+    ends = [*starts[1:], len(part)]
+    episodes: list[Episode] = []
+    stretches: dict[int, int] = {}
+    for first, last in zip(starts, ends, strict=True):
+        n = 0 if number is None else int(number[first])
+        if n in stretches and episodes[-1].number != n:
+            raise ValueError(
+                f"recording {path}: episode {n} comes back after episode "
+                f"{episodes[-1].number}: rows out of order"
+            )
+        # An episode of which the first rows were left out starts with stretch 1.
+        whole = row[first] == 1 or (first > 0 and row[first] == row[first - 1] + 1)
+        stretches[n] = stretches.get(n, -1 if whole else 0) + 1
+        if last - first < FEWEST_ROWS:
+            raise ValueError(
+                f"recording {path}: episode {n} has {last - first} rows, from "
+                f"{time[first]} s on; expected at least {FEWEST_ROWS}"
+            )
+        episodes.append(Episode(n, int(first), int(last), stretches[n]))
+    return tuple(episodes)
+
+
+def _mend_quaternions(
+    path: Path, columns: dict, episodes: Iterable[Episode], row: np.ndarray
+) -> tuple[dict[str, int], dict[str, float]]:
+    """Unit length, and the sign of the sample before; in place.
+
+    Returns: for each body the number of flips, and the largest error of the norm.
+    """
+    flips, errors = {}, {}
+    names = [name.rsplit(".", 1) for name in columns]
+    for at in dict.fromkeys(at for at, quantity in names if quantity in _QUATERNION):
+        keys = [f"{at}.{q}" for q in _QUATERNION]
+        missing = [key for key in keys if key not in columns]
+        if missing:
+            raise ValueError(
+                f"recording {path}: column {missing[0]} is missing: a quaternion has "
+                "qw qx qy qz"
+            )
+        q = np.stack([columns[key] for key in keys], axis=1)
+        hole = np.isnan(q)
+        half = np.flatnonzero(hole.any(axis=1) & ~hole.all(axis=1))
+        if half.size:
+            raise ValueError(
+                f"recording {path}: column {keys[np.argmax(hole[half[0]])]}, row "
+                f"{row[half[0]]}: empty while other parts of the quaternion are there"
+            )
+        there = np.flatnonzero(~hole[:, 0])
+        norm = np.linalg.norm(q[there], axis=1)
+        error = np.abs(norm - 1.0)
+        if error.size and error.max() > 0.05:
+            i = there[np.argmax(error > 0.05)]
+            raise ValueError(
+                f"recording {path}: column {keys[0]}, row {row[i]}: quaternion "
+                f"{np.round(q[i], 4).tolist()}, expected unit length"
+            )
+        q[there] /= norm[:, None]
+        flipped = 0
+        for episode in episodes:
+            i = there[(there >= episode.first) & (there < episode.last)]
+            jumps = np.sum(q[i[1:]] * q[i[:-1]], axis=1) < 0.0
+            flipped += int(jumps.sum())
+            q[i[1:]] *= np.where(np.cumsum(jumps) % 2, -1.0, 1.0)[:, None]
+        for j, key in enumerate(keys):
+            columns[key] = np.ascontiguousarray(q[:, j])
+        flips[at], errors[at] = flipped, float(error.max(initial=0.0))
+    return flips, errors
+
+
+def _channel(name, values, time, episodes, noise, filters) -> Channel:
+    there, breaks, duration = [], [], 0.0
+    n = 0
+    for episode in episodes:
+        i = np.flatnonzero(~np.isnan(values[episode.rows])) + episode.first
+        if len(i) > 1:
+            duration += time[i[-1]] - time[i[0]] + np.median(np.diff(time[i]))
+        there.append(i)
+        n += len(i)
+        breaks.append(n)
+    rate = n / duration if duration > 0.0 else 0.0
+    text = str(filters.get(name, ""))
+    if name.rsplit(".", 1)[1] in COMMANDS:  # Known, not measured.
+        return Channel(name, values, rate_hz=rate, filter=text)
+    own = estimate_noise(values[np.concatenate(there)], breaks[:-1])
+    if noise.get(name, 0.0) > 0.0:  # A given zero says nothing that one can weigh by.
+        std = max(noise[name], own.step / np.sqrt(12.0))
+        return Channel(name, values, std, "given", own.pole, own.step, rate, text)
+    return Channel(name, values, own.std, "estimated", own.pole, own.step, rate, text)
+
+
+def windows(episode: Episode, time: np.ndarray, length_sec: float) -> Iterator[slice]:
+    """Rows of windows of one length [s], one after the other, of an episode."""
+    t, first = time[episode.rows], 0
+    while first < len(t) - 1:
+        last = int(np.searchsorted(t, t[first] + length_sec, side="right"))
+        if t[-1] - t[first] < 0.9 * length_sec:
+            return
+        yield slice(episode.first + first, episode.first + last)
+        first = max(last - 1, first + 1)

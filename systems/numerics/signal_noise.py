@@ -1,0 +1,142 @@
+"""The noise of a measured signal, estimated from the signal alone.
+
+The k-th difference of a smooth signal sampled often is small, that of white noise is
+not: its variance is binom(2k, k) times the noise's. A median makes it robust: impacts,
+reversals and outliers are few.
+"""
+
+from dataclasses import dataclass
+from math import comb
+
+import numpy as np
+
+_ORDERS = (2, 3, 4, 5, 6)
+_MOST = 200_000  # Samples that are looked at: 0.3 % precision is plenty.
+_NORMAL = 1.4826  # Standard deviation over median absolute deviation, if normal.
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What a signal's noise looks like.
+
+    std: standard deviation [unit of the signal]. step: the signal's resolution if its
+    values lie on a grid, else 0. pole: 0 if the noise is white; a filter that passes
+    `x += (1 - pole) (new - x)` a sample leaves it so.
+    """
+
+    std: float
+    step: float
+    pole: float
+
+
+def estimate_noise(values, breaks=None) -> Noise:
+    """Standard deviation, resolution and colour of a signal's noise.
+
+    A filtered channel's noise is coloured: high differences see only what the filter
+    left at high frequency, so the correlation of neighbouring differences tells the
+    pole of a first-order filter, and the level follows from it. A quantised channel's
+    noise is at least that of its grid, step/sqrt(12), even where it stands still.
+
+    Args:
+        values: (n,) samples in order, without NaN.
+        breaks: (m,) indices at which a new stretch of time begins; none if None.
+    """
+    y = np.asarray(values, dtype=float)
+    pieces = np.split(y, breaks) if breaks is not None and len(breaks) else [y]
+    pieces = _some_of(pieces)
+    step = resolution(np.concatenate(pieces)) if pieces else 0.0
+    found: list[tuple[float, float]] = []
+    for order in _ORDERS:
+        d = [np.diff(piece, order) for piece in pieces if len(piece) > order + 4]
+        if sum(map(len, d)) < 8:
+            break
+        pole = _pole(d, order)
+        spread = _NORMAL * np.median(np.abs(np.concatenate(d)))
+        found.append((float(spread / np.sqrt(_gain(order, pole))), pole))
+    std, pole = _first_settled(found)
+    return Noise(max(std, float(step / np.sqrt(12.0))), step, pole)
+
+
+def _first_settled(found: list[tuple[float, float]]) -> tuple[float, float]:
+    """The first estimate that the next order confirms; else the smallest.
+
+    A higher order removes more of the signal, and leaves the noise's share as it is:
+    what no longer falls is noise.
+    """
+    for (std, pole), (following, _) in zip(found, found[1:], strict=False):
+        if std < 1.12 * following:
+            return std, pole
+    return min(found, default=(0.0, 0.0))
+
+
+def resolution(values) -> float:
+    """The step of the grid that all values lie on, 0 if there is none.
+
+    A grid is believed if values come back often and all jumps are multiples of the
+    smallest: noise of double precision never does.
+    """
+    unique = np.unique(np.asarray(values, dtype=float))
+    if len(unique) < 3 or len(unique) > 0.5 * np.size(values):
+        return 0.0
+    gaps = np.diff(unique)
+    # What prints as one decimal may differ in the last bits.
+    gaps = gaps[gaps > 1e-9 * max(np.abs(unique).max(), 1e-300)]
+    if gaps.size < 2:
+        return 0.0
+    step = float(gaps.min())
+    counts = np.rint(gaps / step)
+    step = float(gaps.sum() / counts.sum())  # Averages what rounding did to each.
+    return step if np.all(np.abs(gaps / step - counts) < 0.05) else 0.0
+
+
+def _some_of(pieces: list[np.ndarray]) -> list[np.ndarray]:
+    """The pieces; the middle part of each where they are very long together."""
+    total = sum(map(len, pieces))
+    if total <= _MOST:
+        return pieces
+    share = _MOST / total
+    cut = []
+    for piece in pieces:
+        keep = max(int(len(piece) * share), 1)
+        start = (len(piece) - keep) // 2
+        cut.append(piece[start : start + keep])
+    return cut
+
+
+def _autocovariance(order: int, lag: int) -> float:
+    """Of the order-th difference of white noise of variance 1."""
+    if lag > order:
+        return 0.0
+    return (-1.0) ** lag * comb(2 * order, order - lag)
+
+
+def _gain(order: int, pole: float, lag: int = 0) -> float:
+    """Autocovariance at a lag of the order-th difference of first-order noise.
+
+    The noise has variance 1 and autocorrelation pole^|h|.
+    """
+    return sum(
+        _autocovariance(order, abs(k)) * pole ** abs(lag - k)
+        for k in range(-order, order + 1)
+    )
+
+
+_POLES = np.linspace(0.0, 0.95, 50)
+
+
+def _pole(differences: list[np.ndarray], order: int) -> float:
+    """The pole with which neighbouring differences would correlate as they do."""
+    a = np.concatenate([d[:-1] for d in differences])
+    b = np.concatenate([d[1:] for d in differences])
+    limit = 6.0 * _NORMAL * np.median(np.abs(a)) + 1e-300
+    keep = (np.abs(a) < limit) & (np.abs(b) < limit)  # No impacts, no outliers.
+    a, b = a[keep], b[keep]
+    power = np.mean(a * a)
+    if len(a) < 100 or not power > 0.0:
+        return 0.0
+    seen = np.mean(a * b) / power
+    table = np.array([_gain(order, p, 1) / _gain(order, p) for p in _POLES])
+    # Within four standard errors of white noise it is taken as white.
+    if seen < table[0] + 4.0 * (1.0 - table[0] ** 2) / np.sqrt(len(a)):
+        return 0.0
+    return float(np.interp(seen, table, _POLES))
