@@ -298,7 +298,7 @@ def _learn(
     if not 0.5 * nearest <= -np.log(tau_nov):
         j = count
         if count == mean.shape[0]:
-            j = np.argmin(support[:count])
+            j = int(np.argmin(support[:count]))
         else:
             count += 1
         mean[j] = x
