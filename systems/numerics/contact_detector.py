@@ -8,15 +8,15 @@ innovation's slow mean is taken off instead. A contact is *made* when
   1. the innovation exceeds a threshold for three samples, and then
   2. friction cannot be the cause (f > mu_max sum of normal forces + threshold) and the
      tip is losing speed; or the tip has lost half of its speed along d, under a force
-     that grew with the way. An impact removes a degree of freedom: its force is
-     about k x, so its mean over the way is half of its last value and last value over
-     way is a stiffness. A friction step has all its force at once, a friction ramp
-     grows over too long a way.
+     that F = k x fits better over the way x than a constant does, with a k that is a
+     contact's. An impact removes a degree of freedom. A friction step has all its force
+     at once, a friction ramp grows over too long a way.
 
 A tip that was not moving has no speed to lose: there only a force that no friction can
-make, by twice the threshold, is a contact. An innovation that ends otherwise is a change of friction, which is learned anew.
-Time, position and speed are those of the first sample that departs. The peak force is
-the largest f, less its value before the contact, in the 80 ms after that.
+make, by twice the threshold, is a contact. An innovation that ends otherwise is a
+change of friction, which is learned anew. Time, position and speed are those of the
+first sample that departs. The peak force is the largest f, less its value before the
+contact, in the 80 ms after that.
 
 A contact is *broken* when a normal force that was there falls below a threshold for
 8 ms.
@@ -61,7 +61,7 @@ ZERO_SKIP_SEC, ZERO_SEC = 0.01, 0.1  # Bias of the wrench, at rest.
 STUCK_SEC = 0.05
 STUCK_SPEED = 0.005  # [m/s]
 SPEED_LOST, SPEED_LOST_FREE = 0.5, 0.1  # Shares of the speed before.
-SHAPE_MAX = 0.75  # Mean force over the way to last force: spring 1/2, step 1.
+SPRING_OVER_STEP = 0.3  # Squared misfit of F = k x to that of F = constant.
 
 RING, ROW = 48, 6  # Samples kept; [time, p_WE 3, innovation, speed along d].
 
@@ -89,8 +89,8 @@ _SLOTS = (
     ("pending", 1),  # Ticks since the first sample; 0: nothing is pending.
     ("before", 1),  # The predicted f before the contact [N],
     ("before_speed", 1),  # and the speed [m/s].
-    ("work", 1),  # Integral of innovation over the way since then [N m],
-    ("way", 1),  # the way [m],
+    ("way", 1),  # the way since then [m],
+    ("sums", 4),  # sums over the samples of x^2, F x, F and F^2,
     ("earlier", 1),  # the innovation 20 ms ago or less [N],
     ("highest", 1),  # and the largest force against the motion [N].
     ("first", 4),  # Time and position of the first sample.
@@ -124,7 +124,7 @@ _D, _N, _SEGMENT = _START["d"], _START["n"], _START["segment"]
 _MU, _OFFSET, _LEARNED = _START["mu"], _START["offset"], _START["learned"]
 _OVER, _UNDER, _PENDING = _START["over"], _START["under"], _START["pending"]
 _BEFORE, _BEFORE_SPEED = _START["before"], _START["before_speed"]
-_WORK, _WAY, _EARLIER = _START["work"], _START["way"], _START["earlier"]
+_SUMS, _WAY, _EARLIER = _START["sums"], _START["way"], _START["earlier"]
 _HIGHEST, _FIRST, _QUIET = _START["highest"], _START["first"], _START["quiet"]
 _TOUCHED = _START["touched"]
 _PEAK_LEFT, _PEAK = _START["peak_left"], _START["peak"]
@@ -293,12 +293,22 @@ def _begin(limits, m):
     row = _RING + ROW * (first % RING)
     m[_FIRST : _FIRST + 4] = m[row : row + 4]
     m[_PENDING] = k - first + 1.0
-    m[_WORK] = m[_WAY] = m[_EARLIER] = m[_HIGHEST] = 0.0
+    m[_WAY] = m[_EARLIER] = m[_HIGHEST] = 0.0
+    m[_SUMS : _SUMS + 4] = 0.0
     for i in range(first, k + 1):
         row = _RING + ROW * (i % RING)
-        step = max(m[row + 5], 0.0) * limits.period
-        m[_WAY] += step
-        m[_WORK] += max(m[row + 4], 0.0) * step
+        _add(limits, m, m[row + 4], m[row + 5])
+
+
+@numba.njit(cache=True)
+def _add(limits, m, F, speed):
+    """A sample of what is pending: its innovation F and its speed."""
+    m[_WAY] += max(speed, 0.0) * limits.period
+    x = m[_WAY]
+    m[_SUMS] += x * x
+    m[_SUMS + 1] += F * x
+    m[_SUMS + 2] += F
+    m[_SUMS + 3] += F * F
 
 
 @numba.njit(cache=True)
@@ -312,9 +322,11 @@ def _is_impact(limits, m, f, total, innovation, speed, learning):
     if beyond > 0.0 and (lost > SPEED_LOST_FREE or beyond > limits.impact_force):
         return 1
     if lost > SPEED_LOST and not learning:
-        way = max(m[_WAY], 1e-9)
-        shape = m[_WORK] / (way * innovation)
-        if shape < SHAPE_MAX and innovation / way > limits.stiffness_min:
+        xx, Fx, F, FF = m[_SUMS], m[_SUMS + 1], m[_SUMS + 2], m[_SUMS + 3]
+        as_spring = FF - Fx * Fx / max(xx, 1e-18)
+        as_step = FF - F * F / m[_PENDING]
+        stiff = Fx > limits.stiffness_min * xx
+        if stiff and as_spring < SPRING_OVER_STEP * as_step:
             return 1
     elapsed = m[_PENDING] * limits.period
     grows = innovation > 1.15 * m[_EARLIER]
@@ -371,8 +383,6 @@ def detect(limits, memory, contact, time, wrench, pose, velocity, d, n, phase):
     f_raw = -_dot(m, _F, d)
     f = f_raw - limits.tool_mass * _dot(m, _A, d)
     predicted = m[_MU] * total if in_contact else m[_OFFSET]
-    if m[_PENDING] > 0.0:
-        predicted = m[_BEFORE]
     innovation = f - predicted
     m[_ALONG], m[_ALONG + 1] = f, predicted
     k = int(m[_TICKS])
@@ -400,9 +410,7 @@ def detect(limits, memory, contact, time, wrench, pose, velocity, d, n, phase):
     if idle or quiet or m[_FILLED] * limits.period < 0.02:
         m[_OVER] = m[_PENDING] = 0.0
     elif m[_PENDING] > 0.0:
-        step = max(speed, 0.0) * limits.period
-        m[_WAY] += step
-        m[_WORK] += innovation * step
+        _add(limits, m, innovation, speed)
         m[_PENDING] += 1.0
         m[_HIGHEST] = max(m[_HIGHEST], f_raw)
         if k >= 20:
