@@ -155,6 +155,7 @@ def _open_meshcat():
 
 
 def _run(args) -> int:
+    from makebreak.scripts.diagram_picture import FORMATS
     from makebreak.scripts.session import Session
     from makebreak.scripts.table import Table
     from makebreak.scripts.trials import duration_line
@@ -168,7 +169,12 @@ def _run(args) -> int:
         realtime = _number(args.realtime, "--realtime", 0.0)
     config = _config(module, args)
     out = Path(args.out) if args.out else _default_out(args.experiment)
+    if args.diagram is not None and Path(args.diagram).suffix not in FORMATS:
+        raise ValueError(
+            f'--diagram: got "{args.diagram}", expected a file {", ".join(FORMATS)}'
+        )
     session = Session(out, None, duration, realtime)
+    session.picture = Path(args.diagram) if args.diagram is not None else None
     session.write_text("config.yaml", duration_line(duration) + dump_config(config))
     if not args.no_meshcat:
         session.meshcat = _open_meshcat()
@@ -306,6 +312,9 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--duration", metavar="S", help="simulated seconds")
     p.add_argument("--no-meshcat", action="store_true", help="no viewer, no html")
     p.add_argument("--realtime", metavar="RATE", help="at most so fast; 1: real time")
+    p.add_argument(
+        "--diagram", metavar="FILE", help="a picture of it: .svg, .png, .pdf"
+    )
     p.add_argument("--out", metavar="DIR", help="default: runs/<experiment>-<time>")
     p.set_defaults(function=_run)
 

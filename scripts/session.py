@@ -28,6 +28,7 @@ from pydrake.systems.framework import (
 from tqdm import tqdm
 
 from makebreak.gap.table import write_recording
+from makebreak.scripts.diagram_picture import draw_diagram
 from makebreak.scripts.table import json_value
 from makebreak.scripts.trials import run_many
 
@@ -124,6 +125,8 @@ class Session:
         self.started = False  # Whether anything has been simulated yet.
         self.interrupted = False
         self._progress = progress
+        self.picture: Path | None = None  # Where the diagram is to be drawn.
+        self._drawn = 0  # Systems in the diagram that was.
         self._partial: dict[str, dict[str, np.ndarray]] = {}
         self._timing: dict[str, dict] = {}
         try:
@@ -184,6 +187,10 @@ class Session:
         for name, value in (("duration_sec", duration), ("period_sec", period_sec)):
             if not 0 < value < np.inf:
                 raise ValueError(f"{name}: got {value}, expected a positive time [s]")
+        systems = len(diagram.GetSystems())
+        if self.picture is not None and systems > self._drawn:
+            draw_diagram(diagram, self.picture)  # The richest, if several are run.
+            self._drawn = systems
         self.started = True
         simulator = Simulator(diagram, context or diagram.CreateDefaultContext())
         root = simulator.get_mutable_context()

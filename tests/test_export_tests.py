@@ -1,5 +1,6 @@
 """makebreak export-tests: tests of single systems, from what they did in a run."""
 
+import dataclasses
 import runpy
 import shutil
 import subprocess
@@ -68,7 +69,7 @@ def test_exactly_the_system_that_was_changed_fails(exported, monkeypatch):
 
     def stronger(*args):
         plan, warm = plain(*args)
-        return plan._replace(u=1.001 * plan.u), warm
+        return dataclasses.replace(plan, u=1.001 * plan.u), warm
 
     with monkeypatch.context() as patch:
         patch.setattr(c3_mpc, "solve_c3", stronger)
