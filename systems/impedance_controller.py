@@ -8,6 +8,7 @@ from pydrake.multibody.tree import JointActuator, RevoluteJoint
 from pydrake.systems.framework import Context, LeafSystem
 
 from makebreak.systems.numerics.impedance_controller import (
+    ForceLaw,
     Law,
     memory_size,
     tick,
@@ -32,11 +33,34 @@ class ImpedanceConfig:
     offset_sec: float = 0.0
 
 
-class ImpedanceController(LeafSystem):
-    """Joint torques that make the tool's tip E a spring and damper.
+@dataclass
+class HybridConfig:
+    """Force control, and damping that goes with the stiffness."""
 
-        F = K (x_d - x) + D (v_d - v) + f_ff + Lambda (a_d - Jdot qdot)
+    # 0: damping as given. Else 2 damping_ratio sqrt(K lambda_i) in place of the config
+    # one, lambda_i the tip's mass along each axis; a connected port `damping` wins.
+    damping_ratio: float = 0.0
+    integral_gain: float = 0.5  # k_i [1/s]
+    integral_max: float = 8.0  # [N]
+    normal_damping: float = 200.0  # D_n at least [N s/m].
+    closing_speed: float = 0.012  # [m/s] D_n is such that F_c alone moves no faster.
+    ramp_sec: float = 0.1  # From no force to its target.
+    release_sec: float = 0.12  # A direction that is dropped fades so long.
+
+
+class ImpedanceController(LeafSystem):
+    """Joint torques that make the tool's tip E a spring and damper, and let it press
+    along up to two directions n.
+
+        F = S (K (x_d - x) + D (v_d - v)) + f_fc + f_ff + Lambda (S a_d - Jdot qdot)
+        S = I - sum n n',  f_fc = sum n (F_c + k_i integral (F_c - F) dt - D_n n'v)
         tau = J' F + bias + posture in the dynamically consistent null space of J
+
+    Two directions that are not orthogonal are made so, the first one kept. F_c rises in
+    ramp_sec; D_n >= F_c/closing_speed bounds the speed of a lost contact's return. The
+    integral waits while less than 0.5 N is felt, and goes on where the next segment has
+    (nearly) the same n. A dropped n fades over release_sec, and stiffness along it
+    returns as it fades.
 
     With `control_orientation` False the task is the tip's position; the posture keeps
     the tool as upright, and turned, as at the control plant's default positions. With
@@ -51,12 +75,17 @@ class ImpedanceController(LeafSystem):
     Inputs:  q (n,) [rad], v (n,) [rad/s]; x_desired (19,) = [p_WE 3, quaternion wxyz 4,
              v 3, w 3, a 3, alpha 3] of E in the world; optional stiffness (6,),
              damping (6,) in place of the config's; optional wrench_feedforward (6,),
-             force first [N], [N m] (its torque acts only if orientation is controlled).
+             force first [N], [N m] (its torque acts only if orientation is controlled);
+             optional force_directions (6,), two rows n, unit vectors into the surface,
+             zero for none, force_targets (2,) F_c [N], wrench_measured (6,) on the tool
+             [N], [N m]: without it, or while it is NaN, F_c is fed forward alone;
+             optional damping_stiffness (6,): with a damping ratio, the stiffness that
+             the damping belongs to, where that is not the stiffness itself.
     Outputs: tau (n,) [N m]; status (1,), a sum: 1 reference held, 2 sensors held,
-             4 effort limit reached, 8 torque rate limit reached.
+             4 effort limit reached, 8 torque rate limit reached, 16 wrench not used.
 
     Args: plant, finalized, the arm with its tool alone, never the simulated one;
-        tip_frame, name of E; torque_rate_max [N m/s].
+        tip_frame, name of E; torque_rate_max [N m/s]; hybrid, of force and damping.
     Raises: ValueError for a plant that is not one chain of revolute joints with a motor
         each, and for gains that are negative.
     """
@@ -67,8 +96,16 @@ class ImpedanceController(LeafSystem):
         plant: MultibodyPlant,
         tip_frame: str = "tip",
         torque_rate_max: float = 1000.0,
+        hybrid: HybridConfig | None = None,
     ):
         super().__init__()
+        hybrid = HybridConfig() if hybrid is None else hybrid
+        for name, number in vars(hybrid).items():
+            least = name in ("closing_speed", "ramp_sec", "release_sec")
+            if not (number > 0.0 if least else number >= 0.0):
+                raise ValueError(
+                    f"{name} is {number}, expected {'> 0' if least else '0 or more'}"
+                )
         for name in ("stiffness", "damping"):
             gains = np.asarray(getattr(config, name), dtype=float)
             if gains.shape != (6,) or not np.all(gains >= 0.0):
@@ -103,7 +140,16 @@ class ImpedanceController(LeafSystem):
             posture_every=max(1, round(0.012 / config.period_sec)),
             control_orientation=bool(config.control_orientation),
             period=float(config.period_sec),
+            force=ForceLaw(
+                integral_gain=float(hybrid.integral_gain),
+                integral_max=float(hybrid.integral_max),
+                normal_damping=float(hybrid.normal_damping),
+                closing_speed=float(hybrid.closing_speed),
+                ramp_sec=float(hybrid.ramp_sec),
+                release_sec=float(hybrid.release_sec),
+            ),
         )
+        self._ratio = float(hybrid.damping_ratio)
         warm_up(self._chain, self._law)
         self._q = self.DeclareVectorInputPort("q", n)
         self._v = self.DeclareVectorInputPort("v", n)
@@ -111,12 +157,16 @@ class ImpedanceController(LeafSystem):
         self._stiffness = self.DeclareVectorInputPort("stiffness", 6)
         self._damping = self.DeclareVectorInputPort("damping", 6)
         self._wrench = self.DeclareVectorInputPort("wrench_feedforward", 6)
+        self._directions = self.DeclareVectorInputPort("force_directions", 6)
+        self._targets = self.DeclareVectorInputPort("force_targets", 2)
+        self._measured = self.DeclareVectorInputPort("wrench_measured", 6)
+        self._damped = self.DeclareVectorInputPort("damping_stiffness", 6)
         # The first torque carries the arm at its nominal position.
         carrying = chain_state(self._chain, q_nominal, np.zeros(n)).bias
         self._tau = self.DeclareDiscreteState(carrying)
         self._status = self.DeclareDiscreteState(1)
         self._memory = self.DeclareDiscreteState(memory_size(n))
-        self._no_wrench = np.zeros(6)
+        self._none, self._no_targets = np.zeros(6), np.zeros(2)
         self.DeclareStateOutputPort("tau", self._tau)
         self.DeclareStateOutputPort("status", self._status)
         self.DeclarePeriodicDiscreteUpdateEvent(
@@ -125,6 +175,14 @@ class ImpedanceController(LeafSystem):
 
     @timed
     def _update(self, context: Context, discrete_state):
+        stiffness = self._or(self._stiffness, context, self._law.stiffness)
+        ratio = self._ratio
+        if self._damping.HasValue(context):
+            damping, ratio = self._damping.Eval(context), 0.0
+        elif ratio > 0.0:
+            damping = self._or(self._damped, context, stiffness)
+        else:
+            damping = self._law.damping
         tau, status, memory = tick(
             self._chain,
             self._law,
@@ -133,9 +191,13 @@ class ImpedanceController(LeafSystem):
             self._q.Eval(context),
             self._v.Eval(context),
             self._x_desired.Eval(context),
-            self._or(self._stiffness, context, self._law.stiffness),
-            self._or(self._damping, context, self._law.damping),
-            self._or(self._wrench, context, self._no_wrench),
+            stiffness,
+            damping,
+            ratio,
+            self._or(self._wrench, context, self._none),
+            self._or(self._directions, context, self._none),
+            self._or(self._targets, context, self._no_targets),
+            self._or(self._measured, context, self._none),
         )
         discrete_state.set_value(self._tau, tau)
         discrete_state.set_value(self._status, [status])

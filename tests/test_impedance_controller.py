@@ -23,9 +23,11 @@ from makebreak.systems.impedance_controller import (
 )
 from makebreak.systems.numerics.impedance_controller import (
     EFFORT_LIMITED,
+    N_SLOTS,
     RATE_LIMITED,
     REFERENCE_HELD,
     SENSORS_HELD,
+    SLOT,
     impedance_torque,
     memory_size,
     quaternion_of,
@@ -38,6 +40,8 @@ from makebreak.systems.numerics.serial_chain import chain_state, tip_kinematics
 EFFORT = np.repeat([87.0, 12.0], [4, 3])
 NO_NOISE = SensorNoise(0.0, 0.0, 0.0, 0.0, 0.0)
 P_TIP = np.array([0.5, 0.0, 0.1])
+NO_SLOTS = np.zeros((N_SLOTS, SLOT))
+NO_FORCE = (np.zeros(6), np.zeros(2), np.zeros(6))  # Directions, targets, measured.
 
 
 @pytest.fixture(scope="module")
@@ -203,7 +207,9 @@ def test_torque_is_the_law_written_out(law, chain, control_orientation):
         qdd = 100.0 * (q_n - q) + 20.0 * (damped @ follow - v)
         N_T = np.eye(7) - J.T @ Lambda @ J @ M_inv
         expected = J.T @ F + s.bias + N_T @ s.M @ qdd
-        tau, p = impedance_torque(chain, law, q, v, q_n, x_d, R_d, K, D, wrench)
+        tau, p = impedance_torque(
+            chain, law, q, v, q_n, x_d, R_d, K, D, 0.0, wrench, NO_SLOTS
+        )
         np.testing.assert_allclose(p, s.p_WE)
         # Lambda is regularised by 1e-9 of its inverse's size.
         np.testing.assert_allclose(tau, expected, rtol=1e-5, atol=1e-5)
@@ -217,7 +223,7 @@ def test_posture_never_accelerates_the_task(law, chain, control_orientation):
     for q, v in random_states(10):
         s = chain_state(chain, q, v)
         x_d = reference()
-        args = (x_d, np.eye(3), law.stiffness, law.damping, np.zeros(6))
+        args = (x_d, np.eye(3), law.stiffness, law.damping, 0.0, np.zeros(6), NO_SLOTS)
         tau = [
             impedance_torque(chain, law, q, v, q_n, *args)[0] for q_n in (q, q + 0.5)
         ]
@@ -244,7 +250,7 @@ def test_rotational_gains_are_lessened_where_the_wrist_is_light(law, chain):
         at_v = chain_state(light, q, v)
         x_d = reference(s.p_WE)
         tau, _ = impedance_torque(
-            light, law, q, v, q, x_d, s.R_WE, np.zeros(6), D, np.zeros(6)
+            light, law, q, v, q, x_d, s.R_WE, np.zeros(6), D, 0.0, np.zeros(6), NO_SLOTS
         )
         v_next = v + 1e-3 * np.linalg.solve(at_v.M, tau - at_v.bias)
         assert (s.J[3:] @ v_next) @ w > 0.0
@@ -259,7 +265,9 @@ def run_ticks(chain, law, inputs):
     memory, rows = np.zeros(memory_size(7)), []
     for q, v, x_d, *rest in inputs:
         K, D, wrench = (*rest, *(law.stiffness, law.damping, np.zeros(6))[len(rest) :])
-        tau, status, memory = tick(chain, law, tau, memory, q, v, x_d, K, D, wrench)
+        tau, status, memory = tick(
+            chain, law, tau, memory, q, v, x_d, K, D, 0.0, wrench, *NO_FORCE
+        )
         rows.append((tau, status))
     return rows
 

@@ -1,16 +1,18 @@
 """Cartesian impedance of a redundant arm: one tick, from measurement to joint torque.
 
-    F = K (x_d - x) + D (v_d - v) + f_ff + Lambda (a_d - Jdot qdot)
+    F = S (K (x_d - x) + D (v_d - v)) + f_fc + f_ff + Lambda (S a_d - Jdot qdot)
     tau = J' F + bias + N' M (k_q (q_n - q) + k_v (v_n - v))
     N' = I - J' Lambda J inv(M)
+    S = I - sum n n',  f_fc = sum n (F_c + k_i integral (F_c - F) dt - D_n n' v)
 
+with the directions n along which force, not motion, is controlled: none, one or two.
 M is the mass matrix with the motors' rotors, so tau is a motor's torque; Lambda is the
 inverse of J inv(M) J'. Stiffness K and damping D are plain N/m and N s/m, not scaled by
 Lambda, which multiplies the reference's acceleration alone. The posture q_n follows the
 tip with the tool upright; v_n is the joint velocity that does so.
 
 Source: Khatib, "A unified approach for motion and force control of robot manipulators:
-the operational space formulation" (1987), sections III and V.
+the operational space formulation" (1987), sections III and V; CC eq. 1 and 4a.
 """
 
 from typing import NamedTuple
@@ -29,10 +31,30 @@ REFERENCE_HELD = 1
 SENSORS_HELD = 2
 EFFORT_LIMITED = 4
 RATE_LIMITED = 8
+FORCE_SENSOR_HELD = 16
 
 IK_DAMPING = 0.02  # [m] and [rad]: of the posture's inverse kinematics.
 IK_STEP_MAX = 0.05  # [rad] a joint of the posture moves in one step.
 LIMIT_MARGIN = 0.03  # [rad] that the posture keeps from the joint limits.
+
+CONTACT_FORCE_MIN = 0.5  # [N] Below it the integral of the force waits.
+SAME_DIRECTION = 0.98  # Cosine above which a direction goes on as the one before.
+ENGAGE_SEC = 0.02  # In which stiffness along a new direction fades.
+# Directions under force control, those being released included: [n (3), force asked
+# for now, integral, weight 0 to 1, D_n, 1 while asked for].
+N_SLOTS, SLOT = 4, 8
+LEVEL, INTEGRAL, WEIGHT, DAMPING, ACTIVE = 3, 4, 5, 6, 7
+
+
+class ForceLaw(NamedTuple):
+    """Constants of force control."""
+
+    integral_gain: float  # k_i [1/s]
+    integral_max: float  # [N] of either sign.
+    normal_damping: float  # D_n at least [N s/m].
+    closing_speed: float  # [m/s] at which F_c alone would close a gap: F_c / D_n.
+    ramp_sec: float  # In which the force rises to its target.
+    release_sec: float  # In which a direction that is dropped fades.
 
 
 class Law(NamedTuple):
@@ -51,11 +73,13 @@ class Law(NamedTuple):
     posture_every: int  # Ticks between two steps of the posture.
     control_orientation: bool  # The task is the full pose, not the position alone.
     period: float  # Of a tick [s].
+    force: ForceLaw
 
 
 def memory_size(n: int) -> int:
-    """[q_n, last good q, last good pose (7), ticks, has a good pose, has a good q]."""
-    return 2 * n + 10
+    """[q_n, last good q, last good pose (7), ticks, has a good pose, has a good q,
+    last good force directions (6) and targets (2), slots (N_SLOTS x SLOT)]."""
+    return 2 * n + 18 + N_SLOTS * SLOT
 
 
 @numba.njit(cache=True)
@@ -176,13 +200,88 @@ def _damped_inverse(J, y):
 
 
 @numba.njit(cache=True)
-def impedance_torque(chain, law, q, v, q_n, x_d, R_d, stiffness, damping, wrench):
+def _orthonormal(directions):
+    """Two rows (6,) as orthonormal rows (2, 3); a zero row stays zero, and a second one
+    that (nearly) repeats the first becomes zero."""
+    out = np.zeros((2, 3))
+    for k in range(2):
+        row = directions[3 * k : 3 * k + 3].copy()
+        length = np.sqrt(np.sum(row**2))
+        if length < 1e-6:
+            continue
+        row /= length
+        if k == 1:
+            row -= np.sum(row * out[0]) * out[0]
+            length = np.sqrt(np.sum(row**2))
+            if length < 0.1:
+                continue
+            row /= length
+        out[k] = row
+    return out
+
+
+@numba.njit(cache=True)
+def force_control(law, slots, directions, targets, measured):
+    """One tick of force control.
+
+    Args: slots (N_SLOTS, SLOT), changed in place. directions (6,): two rows n, zero for
+        none; targets (2,) [N]; measured (6,) wrench on the tool [N]: all finite.
+    Returns: nothing; the force that is added along a slot's n is its
+        weight (level + integral - D_n n'v), at least 0 at rest.
+    """
+    force = law.force
+    rows = _orthonormal(directions)
+    slots[:, ACTIVE] = 0.0
+    for k in range(2):
+        n = rows[k]
+        if np.sum(n**2) == 0.0:
+            continue
+        best, likeness = -1, SAME_DIRECTION
+        for j in range(N_SLOTS):
+            alike = np.sum(slots[j, :3] * n)
+            if slots[j, WEIGHT] > 0.0 and slots[j, ACTIVE] == 0.0 and alike > likeness:
+                best, likeness = j, alike
+        if best < 0:  # A direction that was not there: in the slot that is least used.
+            least = np.inf
+            for j in range(N_SLOTS):
+                if slots[j, ACTIVE] == 0.0 and slots[j, WEIGHT] < least:
+                    best, least = j, slots[j, WEIGHT]
+            slots[best] = 0.0
+        slot = slots[best]
+        slot[:3] = n
+        slot[ACTIVE] = 1.0
+        target = max(targets[k], 0.0)
+        # In proportion, so that the ramp takes the same time whatever the force.
+        step = max(target, slot[LEVEL]) * law.period / force.ramp_sec
+        slot[LEVEL] += min(max(target - slot[LEVEL], -step), step)
+        slot[DAMPING] = max(target / force.closing_speed, force.normal_damping)
+        felt = -np.sum(n * measured[:3])
+        if felt >= CONTACT_FORCE_MIN:
+            most = force.integral_max
+            grown = slot[INTEGRAL] + (
+                force.integral_gain * (slot[LEVEL] - felt) * law.period
+            )
+            slot[INTEGRAL] = min(max(grown, -most), most)
+    for j in range(N_SLOTS):
+        slot = slots[j]
+        if slot[ACTIVE] > 0.0:
+            slot[WEIGHT] = min(slot[WEIGHT] + law.period / ENGAGE_SEC, 1.0)
+        elif slot[WEIGHT] > 0.0:
+            slot[WEIGHT] = max(slot[WEIGHT] - law.period / force.release_sec, 0.0)
+
+
+@numba.njit(cache=True)
+def impedance_torque(
+    chain, law, q, v, q_n, x_d, R_d, stiffness, damping, ratio, wrench, slots
+):
     """The law, without limits.
 
     Args: chain, law: constants. q, v, q_n (n,) [rad], [rad/s]. x_d (19,) =
         [p, quaternion (unused), v, w, a, alpha] of the tip in the world; R_d (3, 3)
-        its orientation. stiffness, damping (6,); wrench (6,) fed forward, force first
-        [N], [N m].
+        its orientation. stiffness, damping (6,). ratio: 0, or the damping ratio, and
+        then `damping` is the stiffness that it belongs to: along each axis D becomes
+        2 ratio sqrt(damping lambda), lambda = 1/(J inv(M) J')_ii. wrench (6,) fed
+        forward, force first [N], [N m]. slots (N_SLOTS, SLOT) of force_control.
     Returns: tau (n,) [N m] and the tip's position p_WE (3,) [m].
     """
     n = q.shape[0]
@@ -206,6 +305,10 @@ def impedance_torque(chain, law, q, v, q_n, x_d, R_d, stiffness, damping, wrench
     L_task = np.zeros((m, m))
     cholesky(L_task, mobility)
 
+    if ratio > 0.0:
+        damping = damping.copy()
+        for i in range(m):
+            damping[i] = 2.0 * ratio * np.sqrt(damping[i] / mobility[i, i])
     twist = J @ v
     F = np.empty(m)
     F[:3] = stiffness[:3] * (x_d[:3] - s.p_WE) + damping[:3] * (x_d[7:10] - twist[:3])
@@ -220,6 +323,14 @@ def impedance_torque(chain, law, q, v, q_n, x_d, R_d, stiffness, damping, wrench
         turn = rotation_error(R_d, s.R_WE)
         F[3:] = scale * (stiffness[3:] * turn + damping[3:] * (x_d[10:13] - twist[3:]))
         a_ref[3:] = x_d[16:19]
+    for j in range(slots.shape[0]):
+        weight = slots[j, WEIGHT]
+        if weight > 0.0:  # Of motion, the part across n; along n, the push.
+            n_j = slots[j, :3]
+            push = max(slots[j, LEVEL] + slots[j, INTEGRAL], 0.0)
+            push -= slots[j, DAMPING] * np.sum(n_j * twist[:3])
+            F[:3] += weight * (push - np.sum(n_j * F[:3])) * n_j
+            a_ref[:3] -= weight * np.sum(n_j * a_ref[:3]) * n_j
     F += wrench[:m]
 
     # Posture: the acceleration it asks for, less the part that the tip would feel.
@@ -233,11 +344,26 @@ def impedance_torque(chain, law, q, v, q_n, x_d, R_d, stiffness, damping, wrench
 
 
 @numba.njit(cache=True)
-def tick(chain, law, tau, memory, q, v, x_d, stiffness, damping, wrench):
+def tick(
+    chain,
+    law,
+    tau,
+    memory,
+    q,
+    v,
+    x_d,
+    stiffness,
+    damping,
+    ratio,
+    wrench,
+    directions,
+    targets,
+    measured,
+):
     """One tick of the controller.
 
     Args: tau (n,) of the last tick; memory as memory_size says; the rest as in
-        impedance_torque, measured or received: anything may be NaN.
+        impedance_torque and force_control, measured or received: anything may be NaN.
     Returns: tau (n,) within all limits, status (bits), memory.
     """
     n = q.shape[0]
@@ -263,15 +389,38 @@ def tick(chain, law, tau, memory, q, v, x_d, stiffness, damping, wrench):
         stiffness = law.stiffness
         status |= REFERENCE_HELD
     if not (np.all(np.isfinite(damping)) and np.all(damping >= 0.0)):
-        damping = law.damping
+        damping = law.stiffness if ratio > 0.0 else law.damping
         status |= REFERENCE_HELD
     if not np.all(np.isfinite(wrench)):
         wrench = np.zeros(6)
         status |= REFERENCE_HELD
 
+    kept = memory[2 * n + 10 : 2 * n + 18]
+    if np.all(np.isfinite(directions)) and np.all(np.isfinite(targets)):
+        kept[:6] = directions
+        kept[6:] = targets
+    else:
+        status |= REFERENCE_HELD
+    if not np.all(np.isfinite(measured)):
+        measured = np.zeros(6)  # Below CONTACT_FORCE_MIN: the integral waits.
+        status |= FORCE_SENSOR_HELD
+    slots = memory[2 * n + 18 :].reshape(N_SLOTS, SLOT)
+
     if sensed:
+        force_control(law, slots, kept[:6], kept[6:], measured)
         asked, p_tip = impedance_torque(
-            chain, law, q, v, memory[:n], x_d, R_d, stiffness, damping, wrench
+            chain,
+            law,
+            q,
+            v,
+            memory[:n],
+            x_d,
+            R_d,
+            stiffness,
+            damping,
+            ratio,
+            wrench,
+            slots,
         )
         if count % law.posture_every == 0:
             memory[:n] = posture_step(chain, law, memory[:n].copy(), p_tip)
@@ -323,4 +472,6 @@ def warm_up(chain: SerialChain, law: Law) -> None:
     for state in (tau, memory):
         state.setflags(write=False)
     args = (law.q_nominal, np.zeros(n), np.full(19, np.nan))
-    tick(chain, law, tau, memory, *args, law.stiffness, law.damping, np.zeros(6))
+    gains = (law.stiffness, law.damping, 0.0)
+    none = np.zeros(6)
+    tick(chain, law, tau, memory, *args, *gains, none, none, np.zeros(2), none)
