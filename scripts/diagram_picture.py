@@ -8,6 +8,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 from matplotlib.patches import FancyBboxPatch
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Diagram, System
 
 WIDTH, HEIGHT, GAP_X, GAP_Y = 2.2, 0.62, 1.5, 0.6  # Of a box, and between boxes.
@@ -16,13 +17,13 @@ COLORS = ("#4c72b0", "#dd8452", "#55a868", "#c44e52", "#8172b3", "#937860", "#da
 
 
 def shown_systems(diagram: Diagram) -> list[System]:
-    """The diagrams in `diagram` and the systems of this project that give something."""
+    """What gives something: diagrams in `diagram`, plants, systems of this project."""
     return [
         system
         for system in diagram.GetSystems()
         if system.num_output_ports() > 0
         and (
-            isinstance(system, Diagram)
+            isinstance(system, Diagram | MultibodyPlant)
             or type(system).__module__.startswith("makebreak.")
         )
     ]

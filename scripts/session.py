@@ -28,7 +28,7 @@ from pydrake.systems.framework import (
 from tqdm import tqdm
 
 from makebreak.gap.table import write_recording
-from makebreak.scripts.diagram_picture import draw_diagram
+from makebreak.scripts.diagram_picture import draw_diagram, shown_systems
 from makebreak.scripts.table import json_value
 from makebreak.scripts.trials import run_many
 
@@ -187,10 +187,11 @@ class Session:
         for name, value in (("duration_sec", duration), ("period_sec", period_sec)):
             if not 0 < value < np.inf:
                 raise ValueError(f"{name}: got {value}, expected a positive time [s]")
-        systems = len(diagram.GetSystems())
-        if self.picture is not None and systems > self._drawn:
-            draw_diagram(diagram, self.picture)  # The richest, if several are run.
-            self._drawn = systems
+        if self.picture is not None:
+            systems = len(shown_systems(diagram))
+            if systems >= self._drawn:  # The richest, if several are run.
+                draw_diagram(diagram, self.picture)
+                self._drawn = systems
         self.started = True
         simulator = Simulator(diagram, context or diagram.CreateDefaultContext())
         root = simulator.get_mutable_context()
