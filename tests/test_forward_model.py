@@ -1,0 +1,328 @@
+"""Forward models: the bank's maths, then the system in a small diagram."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+
+from makebreak.systems.forward_model import ForwardModelBank, ForwardModelConfig
+from makebreak.systems.numerics.contact_task import FREE_MODE, UNKNOWN_MODE
+from makebreak.systems.numerics.forward_model import (
+    BAD_WRENCH,
+    NO_MODEL,
+    OK,
+    BankMemory,
+    BankTuning,
+    ModelBank,
+    against_motion,
+    bank_tuning,
+    observe,
+)
+from makebreak.systems.numerics.igmm import as_vector, empty_mixture, learned, regress
+from makebreak.systems.numerics.motion_feature import magnitudes, motion_wrench
+
+DOWN = np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0])
+
+
+def tuning(**changes):
+    values = dict(
+        mixtures=bank_tuning(changes.get("with_torque", True)),
+        with_torque=True,
+        learns=True,
+        smoothing=0.3,
+        wrench_limit=200.0,
+        error_unknown=10.0,
+    )
+    return BankTuning(**(values | changes))
+
+
+class Slide:
+    """A tool that slides in a circle over a surface: Coulomb friction and noise."""
+
+    def __init__(self, seed=0, noise=0.1, R=8.0, speed=0.1):
+        self.rng = np.random.default_rng(seed)
+        self.noise, self.R, self.speed, self.k = noise, R, speed, 0
+
+    def sample(self, mu):
+        """wrench, velocity, direction."""
+        d = np.array([np.cos(0.004 * self.k), np.sin(0.004 * self.k), 0.0])
+        self.k += 1
+        wrench = np.zeros(6)
+        wrench[:3] = -mu * self.R * d
+        wrench[2] = self.R
+        wrench[3:] = 0.015 * mu * self.R * np.array([-d[1], d[0], 0.0])
+        wrench += self.noise * self.rng.normal(size=6) * np.repeat([1.0, 0.1], 3)
+        velocity = np.concatenate([self.speed * d, np.zeros(3)])
+        velocity += 1e-3 * self.rng.normal(size=6)
+        return wrench, velocity, d
+
+
+def feed(memory, t, slide, mu, mode, n):
+    """Memories after each of n samples."""
+    memories = []
+    for _ in range(n):
+        memory = observe(memory, t, *slide.sample(mu), DOWN, mode)
+        memories.append(memory)
+    return memories
+
+
+def test_motion_wrench_is_the_projection_of_numpy():
+    rng = np.random.default_rng(0)
+    for rows in (0, 1, 2):
+        for _ in range(20):
+            wrench, n = rng.normal(size=6), np.zeros((2, 3))
+            n[:rows] = rng.normal(size=(rows, 3))
+            out = motion_wrench(wrench, n.ravel())
+            basis = n[:rows].T
+            F_t = wrench[:3] - basis @ np.linalg.pinv(basis) @ wrench[:3]
+            unit = n[:rows] / np.linalg.norm(n[:rows], axis=1)[:, None]
+            np.testing.assert_allclose(out[:3], F_t, atol=1e-12)
+            np.testing.assert_array_equal(out[3:6], wrench[3:])
+            R = np.maximum(-unit @ wrench[:3], 0.0).sum()
+            np.testing.assert_allclose(out[6:], [R, rows], atol=1e-12)
+
+
+def test_a_row_given_twice_counts_once():
+    wrench, n = np.array([1.0, 2.0, 8.0, 0, 0, 0]), np.tile([0.0, 0.0, -2.0], 2)
+    expected = [1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 8.0, 1.0]
+    np.testing.assert_allclose(motion_wrench(wrench, n), expected, atol=1e-12)
+
+
+def test_magnitudes_leave_out_what_presses():
+    wrench = np.array([-3.0, 4.0, 9.0, 0.3, 0.0, 0.4])
+    velocity = np.array([0.3, 0.4, -0.7, 0.0, 2.0, 0.0])
+    out = magnitudes(wrench, velocity, DOWN)
+    np.testing.assert_allclose(out, [0.5, 2.0, 5.0, 0.5, 9.0], rtol=1e-12)
+
+
+def test_a_bank_is_the_mixture_over_eq_2_and_3_and_its_regression():
+    """The same by hand: X_t = [S_{t-1}, D_t], f(S_t), eps low-passed."""
+    t, slide = tuning(), Slide()
+    memory, mixture, S, eps = BankMemory(ModelBank()), None, None, 0.0
+    predicted = np.zeros(2)
+    mixture = empty_mixture(t.mixtures)
+    for k in range(200):
+        wrench, velocity, d = slide.sample(0.4)
+        memory = observe(memory, t, wrench, velocity, d, DOWN, 1)
+        F = np.hypot(wrench[0], wrench[1])
+        D = np.array([F, np.linalg.norm(wrench[3:])])
+        eps += 0.3 * (abs(F - predicted[0]) - eps)
+        np.testing.assert_allclose(memory.error, eps, atol=1e-12)
+        if S is not None:
+            mixture, _ = learned(mixture, [*S, *D], t.mixtures)
+        v, w = np.hypot(*velocity[:2]), np.linalg.norm(velocity[3:])
+        S = [v, w, *D]
+        predicted = regress(mixture, S)[0] if k else D
+        # The same operations but for the order of sums under the roots.
+        np.testing.assert_allclose(memory.predicted, predicted, rtol=1e-9)
+        np.testing.assert_allclose(memory.wrench[:3], -predicted[0] * d, rtol=1e-9)
+
+
+@pytest.mark.parametrize("with_torque", [True, False])
+def test_prediction_comes_as_near_as_the_noise_lets_it(with_torque):
+    t = tuning(with_torque=with_torque, mixtures=bank_tuning(with_torque))
+    slide = Slide()
+    memories = feed(BankMemory(ModelBank()), t, slide, 0.4, 1, 2000)
+    raw = [abs(m.predicted[0] - 3.2) for m in memories[500:]]
+    # Of white noise 0.1 N nothing can be foretold; the mean can: to a fraction of it.
+    assert np.mean(raw) < 0.03
+    # E|noise| = 0.1 sqrt(2/pi) = 0.080 N.
+    errors = [m.error for m in memories[500:]]
+    np.testing.assert_allclose(np.mean(errors), 0.080, atol=0.01)
+
+
+def test_each_mode_keeps_its_own_model_and_uses_it_again():
+    t, slide = tuning(), Slide()
+    memory = feed(BankMemory(ModelBank()), t, slide, 0.2, 1, 400)[-1]
+    first = as_vector(memory.bank.get(1))
+    memories = feed(memory, t, slide, 0.5, 2, 400)
+    memory = memories[-1]
+    np.testing.assert_array_equal(as_vector(memory.bank.get(1)), first)
+    np.testing.assert_allclose(memory.predicted[0], 4.0, atol=0.1)
+    # Back on surface 1 the force falls by 2.4 N; its model knows where to.
+    memories = feed(memory, t, slide, 0.2, 1, 5)
+    assert all(abs(m.predicted[0] - 1.6) < 0.15 for m in memories)
+
+
+def test_a_new_model_starts_from_the_force_that_is_there():
+    t, slide = tuning(), Slide()
+    memory = feed(BankMemory(ModelBank()), t, slide, 0.5, 1, 1)[0]
+    np.testing.assert_allclose(memory.predicted[0], 4.0, atol=0.5)
+    assert memory.status == OK
+
+
+def test_without_learning_the_models_stay_and_unknown_modes_predict_zero():
+    memory = feed(BankMemory(ModelBank()), tuning(), Slide(), 0.3, 1, 300)[-1]
+    before = as_vector(memory.bank.get(1))
+    fixed = tuning(learns=False)
+    memories = feed(BankMemory(memory.bank), fixed, Slide(1), 0.6, 1, 100)
+    np.testing.assert_array_equal(as_vector(memories[-1].bank.get(1)), before)
+    # Trained on 2.4 N it does not come up to the 4.8 N that are there.
+    assert memories[-1].error > 1.0
+    last = feed(memories[-1], fixed, Slide(2), 0.6, 2, 3)[-1]
+    np.testing.assert_array_equal(last.wrench, 0.0)
+    assert last.status == NO_MODEL
+
+
+@pytest.mark.parametrize("mode", [FREE_MODE, UNKNOWN_MODE])
+def test_without_a_mode_it_predicts_nothing_and_says_what_that_misses(mode):
+    t = tuning(smoothing=1.0)
+    memory = feed(BankMemory(ModelBank()), t, Slide(noise=0.0), 0.5, mode, 3)[-1]
+    np.testing.assert_array_equal(memory.wrench, 0.0)
+    np.testing.assert_allclose(memory.error, 4.0, rtol=1e-12)
+    assert memory.status == NO_MODEL and not memory.bank.models
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 200.0, -250.0])
+def test_a_wrench_that_cannot_be_used_is_said_and_teaches_nothing(bad):
+    t, slide = tuning(), Slide()
+    memory = feed(BankMemory(ModelBank()), t, slide, 0.4, 1, 300)[-1]
+    wrench, velocity, d = slide.sample(0.4)
+    wrench[1] = bad
+    held = observe(memory, t, wrench, velocity, d, DOWN, 1)
+    assert held.bank is memory.bank and held.status == BAD_WRENCH
+    np.testing.assert_array_equal(held.wrench, 0.0)
+    assert held.error == 10.0
+    after = feed(held, t, slide, 0.4, 1, 20)
+    # The pair of the gap is not learned, and the next sample predicts again.
+    assert after[0].bank is memory.bank
+    np.testing.assert_allclose(after[0].predicted[0], 3.2, atol=0.1)
+    assert after[-1].error < 0.3
+
+
+def test_the_force_is_against_the_motion_in_the_motion_subspace():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        n, d = rng.normal(size=3), rng.normal(size=3)
+        w = rng.normal(size=3)
+        velocity = np.concatenate([d, w])
+        out = against_motion([2.0, 0.5], d, velocity, np.r_[n, 0, 0, 0])
+        tangent = d - n * (n @ d) / (n @ n)
+        expected = -2.0 * tangent / np.linalg.norm(tangent)
+        np.testing.assert_allclose(out[:3], expected, atol=1e-12)
+        np.testing.assert_allclose(out[3:], -0.5 * w / np.linalg.norm(w), atol=1e-12)
+    # At rest, and straight into the surface, there is no direction.
+    for d in ([0.0, 0.0, 0.0], [0.0, 0.0, -1.0]):
+        np.testing.assert_array_equal(
+            against_motion([2.0, 0.5], d, np.zeros(6), DOWN), np.zeros(6)
+        )
+
+
+def test_a_bank_comes_back_from_its_file(tmp_path):
+    t = tuning()
+    memory = feed(BankMemory(ModelBank()), t, Slide(), 0.3, 1, 200)[-1]
+    bank = feed(memory, t, Slide(1), 0.6, 4, 200)[-1].bank
+    bank.save(tmp_path / "models.json")
+    again = ModelBank.load(tmp_path / "models.json")
+    assert [mode for mode, _ in again.models] == [1, 4]
+    for mode in (1, 4):
+        np.testing.assert_array_equal(
+            as_vector(again.get(mode)), as_vector(bank.get(mode))
+        )
+    (tmp_path / "models.json").write_text('{"with_torque": true}')
+    with pytest.raises(ValueError, match="forward models .*models.json"):
+        ModelBank.load(tmp_path / "models.json")
+    with pytest.raises(ValueError, match="forward models .*absent"):
+        ModelBank.load(tmp_path / "absent.json")
+
+
+# The system.
+
+
+class Surface(LeafSystem):
+    """Slide.sample as ports, a function of time; mode 1 before t = 0.5 s, 2 after."""
+
+    def __init__(self, period=0.005):
+        super().__init__()
+
+        def sample(time):
+            slide = Slide(seed=int(round(time / period)))
+            slide.k = int(round(time / period))
+            return (*slide.sample(0.3 if time < 0.5 else 0.6), DOWN)
+
+        for i, (name, size) in enumerate(
+            (("wrench", 6), ("ee_velocity", 6), ("direction", 3), ("rows", 6))
+        ):
+            self.DeclareVectorOutputPort(
+                name,
+                size,
+                lambda c, out, i=i: out.SetFromVector(sample(c.get_time())[i]),
+                {self.time_ticket()},
+            )
+        self.DeclareVectorOutputPort(
+            "mode",
+            1,
+            lambda c, out: out.SetFromVector([1.0 if c.get_time() < 0.5 else 2.0]),
+            {self.time_ticket()},
+        )
+
+
+def small_diagram(config=None, knowledge=None):
+    builder = DiagramBuilder()
+    surface = builder.AddSystem(Surface())
+    bank = builder.AddSystem(
+        ForwardModelBank(config or ForwardModelConfig(), knowledge, 0.005, 1e-4)
+    )
+    for port in ("wrench", "ee_velocity", "direction", "mode"):
+        builder.Connect(surface.GetOutputPort(port), bank.GetInputPort(port))
+    builder.Connect(
+        surface.GetOutputPort("rows"), bank.GetInputPort("force_directions")
+    )
+    simulator = Simulator(builder.Build())
+    return simulator, bank
+
+
+def outputs(simulator, bank):
+    context = bank.GetMyContextFromRoot(simulator.get_context())
+    names = ("wrench_predicted", "prediction_error", "status")
+    return np.concatenate([bank.GetOutputPort(n).Eval(context) for n in names])
+
+
+def test_the_system_predicts_for_the_mode_it_is_told():
+    simulator, bank = small_diagram()
+    np.testing.assert_array_equal(outputs(simulator, bank), [0] * 7 + [NO_MODEL])
+    for time, force in ((0.45, 2.4), (1.0, 4.8)):
+        simulator.AdvanceTo(time)
+        out = outputs(simulator, bank)
+        np.testing.assert_allclose(np.linalg.norm(out[:3]), force, atol=0.15)
+        assert out[6] < 0.3 and out[7] == OK
+    context = bank.GetMyContextFromRoot(simulator.get_context())
+    assert [mode for mode, _ in bank.knowledge(context).models] == [1, 2]
+
+
+def test_a_restored_context_replays_and_knowledge_starts_the_next_trial():
+    simulator, bank = small_diagram()
+    simulator.AdvanceTo(0.4)
+    saved = simulator.get_context().Clone()
+    simulator.AdvanceTo(0.7)
+    expected = outputs(simulator, bank)
+    simulator.reset_context(saved)
+    simulator.AdvanceTo(0.7)
+    np.testing.assert_array_equal(outputs(simulator, bank), expected)
+    known = bank.knowledge(bank.GetMyContextFromRoot(simulator.get_context()))
+    simulator, bank = small_diagram(ForwardModelConfig(learns=False), known)
+    simulator.AdvanceTo(0.01)
+    assert abs(np.linalg.norm(outputs(simulator, bank)[:3]) - 2.4) < 0.15
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        (dict(smoothing=0.0), "smoothing is 0.0"),
+        (dict(wrench_limit=np.nan), "wrench_limit is nan"),
+        (dict(error_unknown=-1.0), "error_unknown is -1.0"),
+        (dict(n_max=0), "n_max is 0"),
+        (dict(tau_nov=2.0), "tau_nov is 2.0"),
+    ],
+)
+def test_wrong_settings_are_refused_by_name(changes, message):
+    with pytest.raises(ValueError, match=message):
+        ForwardModelBank(ForwardModelConfig(**changes))
+
+
+def test_knowledge_over_other_entries_is_refused():
+    memory = feed(BankMemory(ModelBank()), tuning(), Slide(), 0.3, 1, 5)[-1]
+    with pytest.raises(ValueError, match="over 6 entries, expected 20 over 3"):
+        ForwardModelBank(ForwardModelConfig(with_torque=False), memory.bank)
+    with pytest.raises(ValueError, match="period_sec is 0"):
+        ForwardModelBank(ForwardModelConfig(), period_sec=0.0)
