@@ -1,0 +1,275 @@
+"""A Panda follows a motion that makes, keeps and breaks contact (CC section 3).
+
+    station --q, v, wrench--> tip_state --ee_pose, ee_velocity--> all
+    contact_detector --contact--> contact_anticipator, velocity_shaper
+    mode_detector --mode--> forward_model_bank --prediction--> variable_impedance
+    contact_anticipator --contacts--> velocity_shaper; --mode_hint--> mode_detector
+    velocity_shaper --x_desired, force directions and targets--> impedance_controller
+    variable_impedance --stiffness, feed-forward--> impedance_controller
+    impedance_controller --tau--> station
+
+Experiments choose the world, the motion and what is known beforehand. A trial is one
+simulation; `knowledge` reads what was learned in it, for the next one.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from makebreak.systems.contact_anticipator import (
+    ContactAnticipatorConfig,
+    KalmanContactAnticipator,
+)
+from makebreak.systems.contact_view import ContactView, ContactViewConfig
+from makebreak.systems.mode_detector import ModeDetector, ModeDetectorConfig
+from makebreak.systems.variable_impedance import (
+    VariableImpedance,
+    VariableImpedanceConfig,
+)
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.primitives import LogVectorOutput, Multiplexer
+
+from makebreak.diagrams.station import (
+    ARM,
+    TIP_FRAME,
+    SensorNoise,
+    StationConfig,
+    make_control_plant,
+    make_station,
+)
+from makebreak.diagrams.tabletop import TOOL, objects
+from makebreak.models.scene import Scene
+from makebreak.systems.contact_detector import ContactDetector, ContactDetectorConfig
+from makebreak.systems.forward_model import ForwardModelBank, ForwardModelConfig
+from makebreak.systems.impedance_controller import (
+    ImpedanceConfig,
+    ImpedanceController,
+    serial_chain_of,
+)
+from makebreak.systems.numerics.contact_task import ContactBelief
+from makebreak.systems.numerics.motion_pattern import MotionPattern
+from makebreak.systems.tip_state import TipState
+from makebreak.systems.velocity_shaper import VelocityShaper, VelocityShaperConfig
+
+# Periods [s].
+TICK, ESTIMATE, ANTICIPATE = 0.001, 0.005, 0.01
+# All that estimates or plans runs at one instant, 0.1 ms after the plant's step, and
+# reads the others' values of the millisecond before; the arm's law runs last. One more
+# instant per millisecond would cost more than these systems' own work.
+OFFSET, IMPEDANCE_OFFSET = 1e-4, 7e-4
+
+
+@dataclass
+class ChangingContactConfig:
+    detector: ContactDetectorConfig = field(default_factory=ContactDetectorConfig)
+    modes: ModeDetectorConfig = field(default_factory=ModeDetectorConfig)
+    forward_model: ForwardModelConfig = field(default_factory=ForwardModelConfig)
+    anticipator: ContactAnticipatorConfig = field(
+        default_factory=ContactAnticipatorConfig
+    )
+    shaper: VelocityShaperConfig = field(default_factory=VelocityShaperConfig)
+    variable_impedance: VariableImpedanceConfig = field(
+        default_factory=VariableImpedanceConfig
+    )
+    impedance: ImpedanceConfig = field(
+        default_factory=lambda: ImpedanceConfig(control_orientation=True)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Knowledge:
+    """What is known before a trial, or was learned in it."""
+
+    contacts: ContactBelief = ContactBelief()
+    modes: object | None = None  # ModeDetector.knowledge
+    models: object | None = None  # ForwardModelBank.knowledge
+
+
+# What `telemetry` gives: name -> (system, port, size).
+SIGNALS = {
+    "ee_pose": ("tip_state", "ee_pose", 7),
+    "ee_velocity": ("tip_state", "ee_velocity", 6),
+    "wrench": ("station", f"{ARM}.external_wrench", 6),
+    "contact_force": ("station", f"{TOOL}.contact_force", 3),
+    "x_desired": ("velocity_shaper", "x_desired", 19),
+    "direction": ("velocity_shaper", "direction", 3),
+    "force_directions": ("velocity_shaper", "force_directions", 6),
+    "phase": ("velocity_shaper", "phase", 6),
+    "contact": ("contact_detector", "contact", 14),
+    "transition": ("mode_detector", "transition", 6),
+    "mode": ("mode_detector", "mode", 1),
+    "confidence": ("mode_detector", "confidence", 2),
+    "collecting": ("mode_detector", "collecting", 1),
+    "wrench_predicted": ("forward_model_bank", "wrench_predicted", 6),
+    "prediction_error": ("forward_model_bank", "prediction_error", 1),
+    "approach_speed": ("contact_anticipator", "approach_speed", 1),
+    "stiffness": ("variable_impedance", "stiffness", 6),
+    "wrench_feedforward": ("variable_impedance", "wrench_feedforward", 6),
+    "tau": ("impedance_controller", "tau", 7),
+    "status": ("impedance_controller", "status", 1),
+}
+
+
+def make_changing_contact(
+    config: ChangingContactConfig,
+    world: Scene,
+    model: Scene,
+    pattern: MotionPattern,
+    knowledge: Knowledge | None = None,
+    tool: str = TOOL,
+    noise: SensorNoise | None = None,
+    seed: int = 0,
+    meshcat: Meshcat | None = None,
+) -> Diagram:
+    """The station and the systems of both levels, each by name in the diagram.
+
+    Args:
+        config: of the systems; their periods and offsets are set here.
+        world: the scene that is simulated; only sensor readings leave it.
+        model: the scene from which the arm's control plant is made.
+        pattern: the motion to follow.
+        knowledge: what is known beforehand; None: nothing.
+        tool: name of the model instance of the tool.
+        noise: of the sensors; None: the station's default.
+        seed: of the sensors' noise.
+        meshcat: where it is seen; None: nowhere.
+    Raises: ValueError for periods or offsets in config that are not the defaults.
+    """
+    known = knowledge or Knowledge()
+    builder = DiagramBuilder()
+    station = builder.AddNamedSystem(
+        "station",
+        make_station(
+            StationConfig(
+                noise=noise or SensorNoise(),
+                tool=tool,
+                contact=[tool, *objects(world)],
+                seed=seed,
+            ),
+            meshcat,
+            world,
+        ),
+    )
+    arm = make_control_plant(model, tool)
+    chain = serial_chain_of(arm, TIP_FRAME)
+
+    def timed(part, period, offset=OFFSET):
+        for key, value in (("period_sec", period), ("offset_sec", offset)):
+            default = getattr(type(part)(), key)
+            if getattr(part, key) != default:
+                raise ValueError(
+                    f"{type(part).__name__}.{key} is {getattr(part, key)}, expected "
+                    f"{default}: the diagram sets it"
+                )
+            part = replace(part, **{key: value})
+        return part
+
+    def add(name, system):
+        return builder.AddNamedSystem(name, system)
+
+    tip = add("tip_state", TipState(chain))
+    detector = add("contact_detector", ContactDetector(timed(config.detector, TICK)))
+    modes = add(
+        "mode_detector", ModeDetector(timed(config.modes, ESTIMATE), known.modes)
+    )
+    forward = add(
+        "forward_model_bank",
+        ForwardModelBank(timed(config.forward_model, ESTIMATE), known.models),
+    )
+    anticipator = add(
+        "contact_anticipator",
+        KalmanContactAnticipator(timed(config.anticipator, ANTICIPATE), known.contacts),
+    )
+    shaper = add("velocity_shaper", VelocityShaper(timed(config.shaper, TICK), pattern))
+    variable = add(
+        "variable_impedance",
+        VariableImpedance(timed(config.variable_impedance, TICK)),
+    )
+    impedance = add(
+        "impedance_controller",
+        ImpedanceController(
+            timed(config.impedance, TICK, IMPEDANCE_OFFSET), arm, TIP_FRAME
+        ),
+    )
+
+    def connect(source, output, *targets, port=None):
+        for target in targets:
+            if target.HasInputPort(port or output):
+                builder.Connect(
+                    source.GetOutputPort(output), target.GetInputPort(port or output)
+                )
+
+    for q, measured in (("q", "position"), ("v", "velocity")):
+        connect(station, f"{ARM}.{measured}_measured", tip, impedance, port=q)
+    felt = f"{ARM}.external_wrench"
+    connect(station, felt, detector, modes, forward, variable, port="wrench")
+    connect(station, felt, impedance, port="wrench_measured")
+    connect(tip, "ee_pose", detector, anticipator, shaper)
+    connect(tip, "ee_velocity", detector, modes, forward, variable, anticipator)
+    connect(shaper, "direction", detector, modes, forward, variable)
+    connect(shaper, "force_directions", detector, modes, forward, variable, impedance)
+    connect(shaper, "force_targets", detector, variable, impedance)
+    connect(shaper, "phase", detector, anticipator, variable)
+    connect(shaper, "x_desired", impedance)
+    connect(detector, "contact", anticipator, shaper, variable)
+    connect(modes, "transition", anticipator)
+    connect(modes, "mode", forward)
+    connect(modes, "collecting", variable)
+    connect(forward, "wrench_predicted", variable)
+    connect(forward, "prediction_error", variable)
+    connect(anticipator, "contacts", shaper)
+    connect(anticipator, "mode_hint", modes)
+    for port in ("stiffness", "damping", "wrench_feedforward"):
+        if variable.HasOutputPort(port):
+            connect(variable, port, impedance)
+    connect(impedance, "tau", station, port=f"{ARM}.torque_commanded")
+
+    # For scoring and for the eye alone.
+    _add_telemetry(builder, SIGNALS)
+    if meshcat is not None:
+        view = add("contact_view", ContactView(ContactViewConfig(), meshcat))
+        connect(anticipator, "contacts", view)
+        connect(station, felt, view, port="wrench")
+        connect(tip, "ee_pose", view)
+        connect(modes, "mode", view)
+        connect(shaper, "phase", view)
+        connect(shaper, "x_desired", view)
+    diagram = builder.Build()
+    diagram.set_name("changing_contact")
+    return diagram
+
+
+def _add_telemetry(builder: DiagramBuilder, signals) -> None:
+    """One log at 1 kHz of all signals side by side."""
+    bundle = builder.AddNamedSystem(
+        "telemetry", Multiplexer([size for _, _, size in signals.values()])
+    )
+    for i, (system, port, _) in enumerate(signals.values()):
+        source = builder.GetSubsystemByName(system).GetOutputPort(port)
+        builder.Connect(source, bundle.get_input_port(i))
+    log = LogVectorOutput(bundle.get_output_port(), builder, TICK)
+    log.set_name("telemetry_log")
+
+
+def telemetry(diagram: Diagram, context: Context) -> dict[str, np.ndarray]:
+    """What was logged in a simulation that ended in `context`: time (n,), and each of
+    SIGNALS (n, k), a row per millisecond, taken before the events of that instant."""
+    log = diagram.GetSubsystemByName("telemetry_log").FindLog(context)
+    out = {"time": np.array(log.sample_times())}
+    data, start = log.data(), 0
+    for name, (_, _, size) in SIGNALS.items():
+        out[name] = np.array(data[start : start + size].T)
+        start += size
+    return out
+
+
+def learned(diagram: Diagram, context: Context) -> Knowledge:
+    """What the systems know at the end of a trial, for the next one."""
+
+    def of(name):
+        system = diagram.GetSubsystemByName(name)
+        return system.knowledge(system.GetMyContextFromRoot(context))
+
+    return Knowledge(
+        of("contact_anticipator"), of("mode_detector"), of("forward_model_bank")
+    )
