@@ -136,6 +136,8 @@ def _pole(differences: list[np.ndarray], order: int) -> float:
         return 0.0
     seen = np.mean(a * b) / power
     table = np.array([_gain(order, p, 1) / _gain(order, p) for p in _POLES])
+    if seen > table[-5]:  # So smooth is the signal itself: this order sees no noise.
+        return 0.0
     # Within four standard errors of white noise it is taken as white.
     if seen < table[0] + 4.0 * (1.0 - table[0] ** 2) / np.sqrt(len(a)):
         return 0.0
