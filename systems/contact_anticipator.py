@@ -24,6 +24,7 @@ from makebreak.systems.numerics.contact_anticipator import (
 )
 from makebreak.systems.numerics.contact_task import (
     BAD_INPUT,
+    BROKEN,
     CHANGE_TIME,
     COUNT,
     DIRECTION,
@@ -91,12 +92,13 @@ class AnticipatorMemory:
     belief: ContactBelief
     history: np.ndarray  # (n, 5): time, p_WE, segment; oldest first.
     made: float = 0.0  # Counters that were seen last.
+    broken: float = 0.0
     measured: float = 0.0
     count: float = 0.0
     updated: tuple[int, ...] = ()  # Contacts felt in this trial,
     passed: tuple[int, ...] = ()  # and those that were passed without.
     last: int = -1  # The contact that was made last; -1: none that is to learn.
-    last_time: float = -np.inf  # When [s].
+    last_time: float = -np.inf  # When one was made or broken [s].
     segment_time: float = 0.0  # When this segment began [s].
     status: int = 0
 
@@ -123,8 +125,8 @@ class KalmanContactAnticipator(LeafSystem):
     it passes is updated, once a trial; if there is none, it is added. A change of mode
     without an impact, from `transition`, is an impact-less contact: its place is looked
     up in the recent past, at its change time, not where it was confirmed. A learned
-    contact that is passed and not felt doubles its standard deviation and is given up
-    in the end.
+    contact that is passed and not felt doubles its standard deviation; above FORGET_STD
+    it is given up before the next trial.
 
     The peak force of an impact gives the next approach speed: by regression of force on
     speed, or by eq. 9, at most `growth` times faster than before.
@@ -176,6 +178,9 @@ class KalmanContactAnticipator(LeafSystem):
         contacts = []
         for contact in given.contacts:
             if contact.seen > 0:
+                # Within a trial none is dropped: others know it by its index.
+                if spread_along(contact.covariance, contact.direction) > FORGET_STD:
+                    continue
                 mean, covariance = predict(contact.mean, contact.covariance, drift)
                 contact = replace(contact, mean=mean, covariance=covariance)
             if len(contact.impacts) == 0:
@@ -265,6 +270,8 @@ class KalmanContactAnticipator(LeafSystem):
             status=status,
             segment_time=time if began else memory.segment_time,
         )
+        if contact[BROKEN] > memory.broken:
+            memory = replace(memory, broken=contact[BROKEN], last_time=time)
         if contact[MADE] > memory.made:
             memory = self._felt(memory, contact)
         if contact[MEASURED] > memory.measured:
@@ -426,29 +433,9 @@ class KalmanContactAnticipator(LeafSystem):
             if past < self._filter.gate * sigma + margin:
                 continue
             memory = replace(memory, passed=(*memory.passed, k))
-            if 2.0 * sigma > FORGET_STD:
-                memory = _dropped(memory, k)
-                break  # The indices behind it have moved; the rest next time.
             belief = memory.belief.changed(k, covariance=4.0 * contact.covariance)
             memory = replace(memory, belief=belief)
         return memory
-
-
-def _dropped(memory: AnticipatorMemory, k: int) -> AnticipatorMemory:
-    """Without contact k."""
-
-    def moved(indices):
-        return tuple(i - (i > k) for i in indices if i != k)
-
-    contacts = memory.belief.contacts
-    last = -1 if memory.last == k else memory.last - (memory.last > k)
-    return replace(
-        memory,
-        belief=ContactBelief(contacts[:k] + contacts[k + 1 :]),
-        updated=moved(memory.updated),
-        passed=moved(memory.passed),
-        last=last,
-    )
 
 
 def _segment_at(history, time) -> int:
