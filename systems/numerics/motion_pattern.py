@@ -138,16 +138,18 @@ class Segment:
 class MotionPattern:
     """Segments in a row; see the module.
 
-    Args: segments; acceleration_max, along the path, of every change of speed [m/s2].
+    Args: segments; acceleration_max, along the path, of every change of speed [m/s2];
+        base, quaternion wxyz from which rotation vectors are taken, None: the first
+        orientation (it matters only where two patterns are to be blended).
     Raises: ValueError that names the segment: times that are not in order, a gap to the
         one before, too little time for its length.
     """
 
     segments: tuple[Segment, ...]
     acceleration_max: float = 1.0
+    base: np.ndarray = None  # type: ignore[assignment]
     # What the compiled code reads; see path_geometry.
     table: np.ndarray = field(init=False, repr=False)
-    base: np.ndarray = field(init=False, repr=False)  # First orientation, wxyz.
 
     def __post_init__(self):
         segments = tuple(self.segments)
@@ -157,7 +159,7 @@ class MotionPattern:
             raise ValueError(f"acceleration_max is {a}, expected > 0 [m/s2]")
         if not segments:
             raise ValueError("a motion pattern has no segments, expected at least one")
-        base = segments[0].quaternions[0]
+        base = segments[0].quaternions[0] if self.base is None else self.base
         poses = [
             np.hstack([one.positions, _rotation_vectors(one.quaternions, base, k)])
             for k, one in enumerate(segments)
@@ -299,8 +301,8 @@ def _rotation_vectors(quaternions, base, k):
     angle = np.linalg.norm(r, axis=1).max()
     if angle > _TURN_MAX:
         raise ValueError(
-            f"segment {k} turns {np.rad2deg(angle):.0f} degrees from the pattern's "
-            "first orientation, expected at most 170"
+            f"segment {k} turns {np.rad2deg(angle):.0f} degrees from the first "
+            "orientation, expected at most 170"
         )
     return r
 
@@ -329,8 +331,8 @@ def _check_join(segments, poses, k):
     # Along a force direction the contact decides where the tip is, not the plan.
     controlled = np.vstack([one.force_directions, after.force_directions])
     if len(controlled):
-        basis = np.linalg.svd(controlled.T, full_matrices=False)
-        basis = basis[0][:, basis[1] > 1e-6]
+        U, sizes, _ = np.linalg.svd(controlled.T, full_matrices=False)
+        basis = U[:, sizes > 1e-6]
         gap[:3] -= basis @ (basis.T @ gap[:3])
     if np.linalg.norm(gap[:3]) > _POSITION_TOL or np.linalg.norm(gap[3:]) > _ANGLE_TOL:
         raise ValueError(
@@ -545,10 +547,10 @@ def pattern_from_demonstration(
     for i, normal in enumerate(normals):
         load = -f @ normal
         free = moving & (abs(d @ normal) > 0.3)
-        on = False
         for j in range(len(grid)):
-            on = load[j] > (0.5 if on else 1.0) * force_threshold and not free[j]
-            pressed[j, i] = on
+            held = j > 0 and pressed[j - 1, i]
+            enough = load[j] > (0.5 if held else 1.0) * force_threshold
+            pressed[j, i] = enough and not free[j]
         _drop_short(pressed[:, i], max(1, round(contact_sec_min / dt)))
     codes = pressed @ (1 << np.arange(len(normals)))
     cuts = [0, *(np.flatnonzero(np.diff(codes)) + 1), len(grid)]
