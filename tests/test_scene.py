@@ -225,7 +225,6 @@ def test_two_resistances_add_up(ball_scene):
             "is -0.1, expected >= 0",
         ),
         ("contact_friction", "ball~table", {"friction": np.nan}, "friction is nan"),
-        ("contact_friction", "ball~table", {"friction": 3.0}, "above 1.5, it has 1.0"),
         ("contact_friction", "ball~chair", {"friction": 1}, "no model 'chair'"),
         ("contact_friction", "ball", {"friction": 1}, "expected one contact pair"),
         ("contact_friction", "ball~ball", {"friction": 1}, "names one body twice"),

@@ -3,7 +3,31 @@
 One file a family; a new kind is one entry of its family's KINDS.
 """
 
-from makebreak.models.effects import contact, objects
+from makebreak.models.effects import (
+    actuation,
+    contact,
+    forces,
+    ground,
+    joints,
+    loads,
+    measurement,
+    objects,
+    transmission,
+)
 from makebreak.models.effects.kind import EffectKind
 
-KINDS: dict[str, EffectKind] = objects.KINDS | contact.KINDS
+KINDS: dict[str, EffectKind] = {
+    name: kind
+    for family in (
+        joints,
+        transmission,
+        loads,
+        actuation,
+        measurement,
+        forces,
+        objects,
+        contact,
+        ground,
+    )
+    for name, kind in family.KINDS.items()
+}

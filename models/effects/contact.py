@@ -1,18 +1,38 @@
-"""Effects in the contact of two bodies: friction, rolling resistance."""
+"""Effects in the contact of two bodies: friction, stiffness, rolling resistance."""
 
 import numba
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.geometry import ProximityProperties, Role, RoleAssign, SceneGraph, Sphere
+from pydrake.geometry import (
+    Box,
+    HalfSpace,
+    ProximityProperties,
+    RoleAssign,
+    SceneGraph,
+    Sphere,
+)
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import ContactResults, CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import DiagramBuilder, LeafSystem, OutputPort
 
-from makebreak.models.effects.kind import Effect, EffectKind, find_pair, parameter
+from makebreak.models.effects.kind import (
+    Effect,
+    EffectKind,
+    Parameter,
+    find_pair,
+    full_name,
+    parameter,
+)
 
 # Below this rate of rolling [rad/s] the resistance fades to zero (2 mm/s at the rim of
 # a ball of 30 mm): it acts one step late, and without fading it would chatter.
 FADE_RATE = 0.05
+
+
+# What Drake takes where a shape has none of its own [N/m], [s/m]: MultibodyPlant's
+# contact parameters of its defaults.
+DEFAULT_DISSIPATION = 50.0
 
 
 def _set_friction(
@@ -24,44 +44,251 @@ def _set_friction(
     mu mu2/(2 mu2 - mu). It is put on the body that is not free to move, so that a
     free ball's friction with table and with finger are set apart; if both or neither
     are free, on the first one named. Its pairs with third bodies change with it.
+    A value of twice mu2 or more cannot be had so: then both surfaces become mu.
     """
     mu = parameter(effect, "friction")
-    if not mu >= 0.0:
-        raise ValueError(f"effect contact_friction: friction is {mu}, expected >= 0")
+    changed, other = _changed_and_other(effect, plant)
+    mu_other = _only(effect, plant, scene_graph, other, _friction, "friction")
+    if 2.0 * mu_other > mu:
+        mu_changed = mu * mu_other / (2.0 * mu_other - mu)
+    else:
+        mu_changed = mu
+        _set_surface(plant, scene_graph, other, "coulomb_friction", _coulomb(mu))
+    _set_surface(plant, scene_graph, changed, "coulomb_friction", _coulomb(mu_changed))
+
+
+def _coulomb(mu: float) -> CoulombFriction:
+    return CoulombFriction(mu, mu)
+
+
+def _changed_and_other(effect: Effect, plant) -> tuple[RigidBody, RigidBody]:
     changed, other = find_pair(effect, plant)
     if _is_free(plant, changed) and not _is_free(plant, other):
         changed, other = other, changed
-    others = {
-        _friction(scene_graph, g) for g in plant.GetCollisionGeometriesForBody(other)
-    }
-    if len(others) != 1:
-        raise ValueError(
-            f"effect contact_friction at {effect.at[0]!r}: {other.scoped_name()} has "
-            f"surfaces of different friction, {sorted(others)}"
-        )
-    mu_other = others.pop()
-    if not 2.0 * mu_other > mu:
-        raise ValueError(
-            f"effect contact_friction at {effect.at[0]!r}: friction {mu} needs a "
-            f"surface of {other.scoped_name()} above {mu / 2.0}, it has {mu_other}"
-        )
-    mu_changed = mu * mu_other / (2.0 * mu_other - mu)
-    for geometry in plant.GetCollisionGeometriesForBody(changed):
-        properties = ProximityProperties(
-            scene_graph.model_inspector().GetProximityProperties(geometry)
-        )
-        properties.UpdateProperty(
-            "material", "coulomb_friction", CoulombFriction(mu_changed, mu_changed)
-        )
+    return changed, other
+
+
+def _shapes(plant, scene_graph, body):
+    """Ids and properties of the shapes of a body that can be touched."""
+    inspector = scene_graph.model_inspector()
+    for geometry in plant.GetCollisionGeometriesForBody(body):
+        properties = inspector.GetProximityProperties(geometry)
+        if properties is not None:
+            yield geometry, properties
+
+
+def _set_surface(plant, scene_graph, body, name: str, value) -> None:
+    for geometry, old in list(_shapes(plant, scene_graph, body)):
+        properties = ProximityProperties(old)
+        properties.UpdateProperty("material", name, value)
         scene_graph.AssignRole(
             plant.get_source_id(), geometry, properties, RoleAssign.kReplace
         )
 
 
-def _friction(scene_graph, geometry) -> float:
-    inspector = scene_graph.model_inspector()
-    properties = inspector.GetProperties(geometry, Role.kProximity)
+def _only(effect, plant, scene_graph, body, read, what: str) -> float:
+    """The one value that all shapes of a body have. Raises: ValueError."""
+    values = {read(properties) for _, properties in _shapes(plant, scene_graph, body)}
+    if len(values) != 1:
+        raise ValueError(
+            f"effect {effect.kind} at {effect.at[0]!r}: {body.scoped_name()} has "
+            f"surfaces of different {what}, {sorted(values)}"
+        )
+    return values.pop()
+
+
+def _friction(properties: ProximityProperties) -> float:
     return properties.GetProperty("material", "coulomb_friction").dynamic_friction()
+
+
+def _stiffness(properties: ProximityProperties) -> float:
+    """inf where the shape has none of its own: Drake guesses it from the weights."""
+    return properties.GetPropertyOrDefault(
+        "material", "point_contact_stiffness", np.inf
+    )
+
+
+def _dissipation(properties: ProximityProperties) -> float:
+    return properties.GetPropertyOrDefault(
+        "material", "hunt_crossley_dissipation", DEFAULT_DISSIPATION
+    )
+
+
+def _set_stiffness(
+    effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph
+) -> None:
+    """Drake combines two surfaces as springs in a row, k = k1 k2/(k1 + k2). As with
+    friction one surface is changed if that will do, else both become 2 k."""
+    k = parameter(effect, "stiffness")
+    changed, other = _changed_and_other(effect, plant)
+    k_other = _only(effect, plant, scene_graph, other, _stiffness, "stiffness")
+    if np.isfinite(k_other) and k_other > 1.01 * k:
+        k_changed = k * k_other / (k_other - k)
+    else:
+        k_changed = 2.0 * k
+        _set_surface(plant, scene_graph, other, "point_contact_stiffness", 2.0 * k)
+    _set_surface(plant, scene_graph, changed, "point_contact_stiffness", k_changed)
+
+
+def _set_dissipation(
+    effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph
+) -> None:
+    """Drake weighs two surfaces by their stiffness, the softer one counts more:
+    d = (k2 d1 + k1 d2)/(k1 + k2). As with friction one is changed if that will do, else
+    both become d."""
+    if (
+        plant.get_discrete_contact_approximation().name == "kSap"
+        and plant.is_discrete()
+    ):
+        raise ValueError(
+            "effect contact_dissipation: the approximation `sap` has no Hunt-Crossley "
+            "dissipation; expected `lagged`, `similar` or `tamsi`"
+        )
+    d = parameter(effect, "dissipation")
+    changed, other = _changed_and_other(effect, plant)
+    k1 = _only(effect, plant, scene_graph, changed, _stiffness, "stiffness")
+    k2 = _only(effect, plant, scene_graph, other, _stiffness, "stiffness")
+    d2 = _only(effect, plant, scene_graph, other, _dissipation, "dissipation")
+    d1 = -1.0
+    if np.isfinite([k1, k2]).all():
+        d1 = (d * (k1 + k2) - k1 * d2) / k2
+    if d1 < 0.0:
+        d1 = d
+        _set_surface(plant, scene_graph, other, "hunt_crossley_dissipation", d)
+    _set_surface(plant, scene_graph, changed, "hunt_crossley_dissipation", d1)
+
+
+def _now(effect: Effect, plant: MultibodyPlant, scene_graph) -> dict[str, float]:
+    """The pair's values as Drake combines them."""
+    a, b = find_pair(effect, plant)
+
+    def both(read, what):
+        return (_only(effect, plant, scene_graph, body, read, what) for body in (a, b))
+
+    k1, k2 = both(_stiffness, "stiffness")
+    if effect.kind == "contact_stiffness":
+        # What Drake guesses where none is given it does not say: a stiff value.
+        finite = [k for k in (k1, k2) if np.isfinite(k)]
+        stiffness = 1.0 / sum(1.0 / k for k in finite) if finite else 1e6
+        return {"stiffness": stiffness}
+    if effect.kind == "contact_dissipation":
+        d1, d2 = both(_dissipation, "dissipation")
+        if not np.isfinite([k1, k2]).all():
+            return {"dissipation": (d1 + d2) / 2.0}
+        return {"dissipation": (k2 * d1 + k1 * d2) / (k1 + k2)}
+    mu1, mu2 = both(_friction, "friction")
+    mu = 2.0 * mu1 * mu2 / (mu1 + mu2) if mu1 + mu2 else 0.0
+    return {"friction": mu}
+
+
+# ----- friction_patch
+
+FAR = 100.0  # Half width of what a half-space becomes, and a box's depth [m].
+
+
+def _patch(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+    """Cuts the ground's one box or half-space into the patch and what is around it.
+
+    Tops are flush. What slides over the edge touches both for a moment; a sphere of
+    radius R that sinks in by s does so for sqrt(8 R s).
+    """
+    p = effect.parameters
+    ground, thing = _changed_and_other(effect, plant)
+    where = f"effect friction_patch at {effect.at[0]!r}"
+    if p["x_min"] >= p["x_max"] or p["y_min"] >= p["y_max"]:
+        raise ValueError(f"{where}: the patch is empty: {p}")
+    X_WB = anchored_pose(effect, plant, ground)
+    shapes = list(_shapes(plant, scene_graph, ground))
+    inspector = scene_graph.model_inspector()
+    shape = inspector.GetShape(shapes[0][0]) if len(shapes) == 1 else None
+    if not isinstance(shape, (Box, HalfSpace)):
+        raise ValueError(
+            f"{where}: expected {full_name(plant, ground)} to have one collision shape,"
+            " a box or a half-space"
+        )
+    ((geometry, old),) = shapes
+    X_WG = X_WB @ inspector.GetPoseInFrame(geometry)
+    R = X_WG.rotation().matrix()
+    level = abs(R[2, 2]) > 1.0 - 1e-9
+    square = np.allclose(np.sort(abs(R), axis=0)[:2], 0.0, atol=1e-6)
+    if not level or (isinstance(shape, Box) and not square):
+        raise ValueError(
+            f"{where}: expected {full_name(plant, ground)} level, its sides along x, y"
+        )
+    centre = X_WG.translation()
+    if isinstance(shape, Box):
+        half = abs(R) @ (shape.size() / 2.0)
+        top, depth = centre[2] + half[2], 2.0 * half[2]
+    else:
+        half, top, depth = np.full(3, FAR), centre[2], FAR
+        centre = np.zeros(3)
+    low, high = centre - half, centre + half
+    x = np.clip([low[0], p["x_min"], p["x_max"], high[0]], low[0], high[0])
+    y = np.clip([low[1], p["y_min"], p["y_max"], high[1]], low[1], high[1])
+    if not (x[1] < x[2] and y[1] < y[2]):
+        raise ValueError(f"{where}: the patch is off {full_name(plant, ground)}")
+    mu_other = _only(effect, plant, scene_graph, thing, _friction, "friction")
+    mu = p["friction"]
+    if not 2.0 * mu_other > mu:
+        raise ValueError(
+            f"{where}: friction {mu} needs a surface of {thing.scoped_name()} above "
+            f"{mu / 2.0}, it has {mu_other}"
+        )
+    # Patch; strips left and right; strips before and behind it.
+    pieces = [
+        (x[1], x[2], y[1], y[2]),
+        (x[0], x[1], y[0], y[3]),
+        (x[2], x[3], y[0], y[3]),
+        (x[1], x[2], y[0], y[1]),
+        (x[1], x[2], y[2], y[3]),
+    ]
+    source = plant.get_source_id()
+    for i, (x0, x1, y0, y1) in enumerate(pieces):
+        if not (x0 < x1 and y0 < y1):
+            continue
+        box = Box(x1 - x0, y1 - y0, depth)
+        p_WG = [(x0 + x1) / 2.0, (y0 + y1) / 2.0, top - depth / 2.0]
+        X_BG = X_WB.inverse() @ RigidTransform(p_WG)
+        properties = ProximityProperties(old)
+        if i == 0:
+            mu_patch = mu * mu_other / (2.0 * mu_other - mu)
+            properties.UpdateProperty(
+                "material", "coulomb_friction", _coulomb(mu_patch)
+            )
+            scene_graph.ChangeShape(source, geometry, box, X_BG)
+            scene_graph.AssignRole(source, geometry, properties, RoleAssign.kReplace)
+        else:
+            plant.RegisterCollisionGeometry(
+                ground, X_BG, box, f"{ground.name()}_around_patch_{i}", properties
+            )
+
+
+def anchored_pose(
+    effect: Effect, plant: MultibodyPlant, body: RigidBody
+) -> RigidTransform:
+    """Pose in the world of a body that welds hold there, before the plant is finalized.
+
+    Raises: ValueError if something moves it.
+    """
+    X = RigidTransform()  # From the body's frame to the frame reached.
+    here = body
+    while here.index() != plant.world_body().index():
+        up = [
+            joint
+            for joint in (plant.get_joint(i) for i in plant.GetJointIndices())
+            if joint.child_body().index() == here.index()
+        ]
+        if not up or up[0].num_velocities() > 0:
+            raise ValueError(
+                f"effect {effect.kind} at {effect.at}: expected "
+                f"{full_name(plant, body)} to be welded to the world"
+            )
+        (weld,) = up
+        X_PF = weld.frame_on_parent().GetFixedPoseInBodyFrame()
+        X_CM = weld.frame_on_child().GetFixedPoseInBodyFrame()
+        X = X_PF @ weld.X_FM() @ X_CM.inverse() @ X
+        here = weld.parent_body()
+    return X
 
 
 def _is_free(plant: MultibodyPlant, body: RigidBody) -> bool:
@@ -173,10 +400,6 @@ def _add_rolling_resistance(
     builder: DiagramBuilder,
 ) -> OutputPort:
     coefficient = parameter(effect, "coefficient")
-    if not coefficient >= 0.0:
-        raise ValueError(
-            f"effect rolling_resistance: coefficient is {coefficient}, expected >= 0"
-        )
     ball, other = find_pair(effect, plant)
     if not ball.is_floating_base_body():
         ball, other = other, ball
@@ -208,9 +431,57 @@ def _add_rolling_resistance(
 
 KINDS = {
     "contact_friction": EffectKind(
-        parameters=("friction",), before_finalize=_set_friction
+        at="pair",
+        parameters=(Parameter("friction", "", 0.01, 1.5, None, valid=">= 0"),),
+        says="the friction coefficient of {at} is {friction}",
+        confused_with=("plane_tilt", "contact_dissipation", "object_com"),
+        tell_apart="let it slide both ways, and look at windows of 0.1 s or longer",
+        before_finalize=_set_friction,
+        now=_now,
+    ),
+    "friction_patch": EffectKind(
+        at="pair",
+        parameters=(
+            Parameter("friction", "", 0.01, 1.5, None, valid=">= 0"),
+            *(
+                Parameter(f"{a}_{end}", "m", -2.0, 2.0, None)
+                for a in "xy"
+                for end in ("min", "max")
+            ),
+        ),
+        says="where x is {x_min} to {x_max} and y is {y_min} to {y_max}, the friction "
+        "coefficient of {at} is {friction}",
+        confused_with=("contact_friction", "plane_tilt"),
+        tell_apart="slide over the place in another direction, and beside it",
+        rank=1,
+        before_finalize=_patch,
     ),
     "rolling_resistance": EffectKind(
-        parameters=("coefficient",), after_finalize=_add_rolling_resistance
+        at="pair",
+        parameters=(Parameter("coefficient", "", 0.0, 0.1, valid=">= 0"),),
+        says="{at} rolls against a resistance of {coefficient} (times the radius: the "
+        "lever arm) that the model lacks",
+        confused_with=("body_drag", "plane_tilt"),
+        tell_apart="roll at two speeds, and both ways: the resistance slows evenly",
+        after_finalize=_add_rolling_resistance,
+    ),
+    "contact_stiffness": EffectKind(
+        at="pair",
+        parameters=(Parameter("stiffness", "N/m", 300.0, 1e6, None, valid="> 0"),),
+        says="the contact of {at} has a stiffness of {stiffness}",
+        confused_with=("plane_height", "object_size", "contact_dissipation"),
+        tell_apart="compare impacts with how deep it lies at rest",
+        before_finalize=_set_stiffness,
+        now=_now,
+    ),
+    "contact_dissipation": EffectKind(
+        at="pair",
+        parameters=(Parameter("dissipation", "s/m", 0.0, 100.0, None, valid=">= 0"),),
+        says="the contact of {at} has a dissipation of {dissipation}",
+        confused_with=("contact_stiffness", "contact_friction", "corner_radius"),
+        tell_apart="let it hit at two speeds",
+        rank=1,
+        before_finalize=_set_dissipation,
+        now=_now,
     ),
 }

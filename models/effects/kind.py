@@ -1,21 +1,32 @@
-"""What an effect is in a scene file, and what a kind of effect can do to a model."""
+"""What an effect is in a scene file, and what a kind of effect is to the project."""
 
-from collections.abc import Callable
+import math
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from difflib import get_close_matches
+from typing import Any
 from xml.dom.minidom import Element
 
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
-from pydrake.systems.framework import DiagramBuilder, OutputPort
+from pydrake.multibody.tree import (
+    Joint,
+    ModelInstanceIndex,
+    PrismaticJoint,
+    RevoluteJoint,
+    RigidBody,
+)
+from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 
 
 @dataclass
 class Effect:
     """One effect of a scene.
 
-    at: where it acts: `<model>.<body>`, `<a>~<b>` for a contact pair of bodies, ...;
-    where a model has one body only, the model's name will do. parameters: SI units.
+    at: where it acts: `<model>.<joint>`, `<model>.<body>`, `<model>.<joint>.<channel>`,
+    `<model>` for all its joints (or, where it has one, its body), `<a>~<b>` for a
+    contact pair of bodies, `world`. parameters: SI units.
     """
 
     kind: str = ""
@@ -24,22 +35,173 @@ class Effect:
 
 
 @dataclass(frozen=True)
-class EffectKind:
-    """The steps at which a kind of effect acts; it has those that it needs.
+class Parameter:
+    """One parameter of a kind.
 
-    edit_text(effect, link): the link's element in the model's URDF or SDF text.
-    before_finalize(effect, plant, scene_graph): shapes and their properties.
-    after_finalize(effect, plant, scene_graph, builder): adds systems; the port that it
-        returns gives generalized forces (n_v,) on the plant.
+    low, high: where to search for it in robots that people build; not limits.
+    neutral: the value that changes nothing; None where that is the model's own value
+        (EffectKind.now) or where another parameter must be neutral instead.
+    valid: what is refused: "any" number, ">= 0" or "> 0".
     """
 
-    parameters: tuple[str, ...]
+    name: str
+    unit: str
+    low: float
+    high: float
+    neutral: float | None = 0.0
+    valid: str = "any"
+    optional: bool = False
+
+
+@dataclass(frozen=True)
+class EffectKind:
+    """A kind of effect: what it is called, what it does, how it shows.
+
+    at: what it acts on: "joint" (with one degree of freedom), "actuator" (a joint that
+        scene.actuation drives or that has an actuator), "body", "free body", "ground"
+        (an anchored body with shapes), "pair" (of bodies that touch), "channel",
+        "length" (channels that are lengths), "base" (a model that stands on the world,
+        or the world).
+    says: the report's sentence; {at} and the parameters' names are filled in.
+    confused_with, tell_apart: kinds that look alike, and what tells them apart.
+    time: "both", or "discrete"/"continuous" where it makes sense in one only.
+    rank: effects of lower rank are applied first, else in the scene's order.
+    hidden_state: it adds coordinates that no channel measures.
+
+    What it does; a kind has those steps that it needs:
+    edit_text(effect, link): the link's element in the model's URDF or SDF text.
+    before_finalize(effect, plant, scene_graph): bodies, shapes and their properties.
+    after_finalize(effect, plant, scene_graph, builder): adds systems; the port that it
+        returns gives generalized forces (n_v,) on the plant.
+    joint_law: compiled (q, v, t, p) -> force of the effect on the joint [N m] or [N];
+        joint_numbers(effect, plant, joint) -> its numbers p, up to four.
+    body_law: compiled (V_WB (6,), t, p, F (6,)): adds to F the spatial force, torque
+        first, on the body at its origin; body_numbers(effect) -> its numbers p.
+    path: what it does between command and plant, of a name in actuation_path.STEPS.
+    channel: what it does to a measured channel, of a name in measurement.STEPS.
+    set_in_context(effect, plant, plant_context): new parameters without a new plant.
+    now(effect, plant, scene_graph): the parameters at which `effect` (whose own do not
+        matter) would leave the model as it is; None: the neutral values.
+    signature: see models/effects/signature.py; None: it is seen in simulation alone.
+    """
+
+    at: str
+    parameters: tuple[Parameter, ...]
+    says: str
+    confused_with: tuple[str, ...] = ()
+    tell_apart: str = ""
+    time: str = "both"
+    rank: int = 0
+    hidden_state: bool = False
+    check: Callable[[Effect], None] | None = None
     edit_text: Callable[[Effect, Element], None] | None = None
     before_finalize: Callable[[Effect, MultibodyPlant, SceneGraph], None] | None = None
     after_finalize: (
         Callable[[Effect, MultibodyPlant, SceneGraph, DiagramBuilder], OutputPort]
         | None
     ) = None
+    joint_law: Callable | None = None
+    joint_numbers: Callable[[Effect, MultibodyPlant, Joint], list[float]] | None = None
+    body_law: Callable | None = None
+    body_numbers: Callable[[Effect], list[float]] | None = None
+    path: str = ""
+    channel: str = ""
+    set_in_context: Callable[[Effect, MultibodyPlant, Context], None] | None = None
+    now: Callable[[Effect, MultibodyPlant, SceneGraph], Mapping[str, float]] | None = (
+        None
+    )
+    signature: Callable[..., list[Any]] | None = None
+
+    def parameter(self, name: str) -> Parameter:
+        for each in self.parameters:
+            if each.name == name:
+                return each
+        raise KeyError(name)
+
+
+def check_parameters(effect: Effect, kind: EffectKind) -> None:
+    """Raises: ValueError for a parameter that is unknown, missing or not valid."""
+    known = [each.name for each in kind.parameters]
+    for name, value in effect.parameters.items():
+        if name not in known:
+            close = get_close_matches(name, known, n=1, cutoff=0.5)
+            hint = (
+                f"did you mean {close[0]!r}?"
+                if close
+                else f"known: {', '.join(sorted(known))}"
+            )
+            raise ValueError(f"effect {effect.kind} has no parameter {name!r}: {hint}")
+        if not math.isfinite(value):
+            raise ValueError(f"effect {effect.kind}: {name} is {value}")
+    for each in kind.parameters:
+        if each.name not in effect.parameters:
+            if not each.optional:
+                raise ValueError(
+                    f"effect {effect.kind} at {effect.at} needs `{each.name}`"
+                )
+            continue
+        value = effect.parameters[each.name]
+        if (each.valid == ">= 0" and not value >= 0.0) or (
+            each.valid == "> 0" and not value > 0.0
+        ):
+            raise ValueError(
+                f"effect {effect.kind}: {each.name} is {value}, expected {each.valid}"
+            )
+    if kind.check is not None:
+        kind.check(effect)
+
+
+def sentence(
+    effect: Effect, kind: EffectKind, std: Mapping[str, float] | None = None
+) -> str:
+    """The report's sentence on an effect, numbers to three digits.
+
+    Args: std, of the parameters where they are known: told as "+- ...".
+    """
+    words: dict[str, str] = {"at": "nothing" if not effect.at else _place(effect, kind)}
+    for each in kind.parameters:
+        value = effect.parameters.get(each.name)
+        if value is None:
+            words[each.name] = "(unset)"
+            continue
+        text = f"{value:.3g}"
+        if std is not None and each.name in std:
+            text += f" +- {std[each.name]:.1g}"
+        words[each.name] = f"{text} {each.unit}".rstrip()
+    # An optional parameter that is not there takes its [bracket] with it.
+    says = re.sub(
+        r"\[([^\]]*)\]", lambda m: "" if "(unset)" in _fill(m[1], words) else m[1],
+        kind.says,
+    )  # fmt: skip
+    return _fill(says, words)
+
+
+def _fill(template: str, words: Mapping[str, str]) -> str:
+    return template.format(**words)
+
+
+def _place(effect: Effect, kind: EffectKind) -> str:
+    what = {
+        "joint": "joint",
+        "actuator": "the actuator of",
+        "body": "body",
+        "free body": "body",
+        "ground": "body",
+        "channel": "channel",
+        "length": "body",
+        "base": "",
+        "pair": "",
+    }[kind.at]
+    places = [at.replace("~", " on ") for at in effect.at]
+    if kind.at in ("joint", "actuator") and all("." not in at for at in effect.at):
+        what = "each joint of" if kind.at == "joint" else "each actuator of"
+    elif kind.at == "channel" and all(at.count(".") < 2 for at in effect.at):
+        what = "each channel of"
+    elif len(places) > 1 and what == "joint":
+        what = "each of the joints"
+    if len(places) > 1:
+        places = [f"{', '.join(places[:-1])} and {places[-1]}"]
+    return f"{what} {places[0]}".strip()
 
 
 def parameter(effect: Effect, name: str) -> float:
@@ -49,13 +211,22 @@ def parameter(effect: Effect, name: str) -> float:
     return effect.parameters[name]
 
 
-def find_body(effect: Effect, plant: MultibodyPlant, name: str) -> RigidBody:
-    """The body `<model>.<body>`, or the only body of `<model>`. Raises: ValueError."""
-    model, _, body = name.partition(".")
-    models = [
+def model_names(plant: MultibodyPlant) -> list[str]:
+    return [
         plant.GetModelInstanceName(ModelInstanceIndex(i))
         for i in range(plant.num_model_instances())
     ]
+
+
+def find_body(effect: Effect, plant: MultibodyPlant, name: str) -> RigidBody:
+    """The body `<model>.<body>`, or the only body of `<model>`, or the world's.
+
+    Raises: ValueError.
+    """
+    if name == "world":
+        return plant.world_body()
+    model, _, body = name.partition(".")
+    models = model_names(plant)
     if model not in models:
         raise ValueError(
             f"effect {effect.kind} at {name!r}: no model {model!r}, "
@@ -72,6 +243,13 @@ def find_body(effect: Effect, plant: MultibodyPlant, name: str) -> RigidBody:
         f"effect {effect.kind} at {name!r}: expected a body of {model!r}: "
         f"{', '.join(f'{model}.{b.name()}' for b in bodies)}"
     )
+
+
+def find_bodies(effect: Effect, plant: MultibodyPlant) -> list[RigidBody]:
+    """The bodies that `at` names, each once. Raises: ValueError."""
+    bodies = [find_body(effect, plant, name) for name in effect.at]
+    _refuse_twice(effect, [body.scoped_name().get_full() for body in bodies])
+    return bodies
 
 
 def find_pair(effect: Effect, plant: MultibodyPlant) -> tuple[RigidBody, RigidBody]:
@@ -92,3 +270,72 @@ def find_pair(effect: Effect, plant: MultibodyPlant) -> tuple[RigidBody, RigidBo
                 "geometry"
             )
     return first, second
+
+
+def one_dof_joints(plant: MultibodyPlant, model: str | None = None) -> list[Joint]:
+    """Joints with one degree of freedom, in the order of their velocities' owners."""
+    joints = [plant.get_joint(i) for i in plant.GetJointIndices()]
+    return [
+        joint
+        for joint in joints
+        if isinstance(joint, (RevoluteJoint, PrismaticJoint))
+        and (model is None or model_of(plant, joint) == model)
+    ]
+
+
+def model_of(plant: MultibodyPlant, element: Joint | RigidBody) -> str:
+    return plant.GetModelInstanceName(element.model_instance())
+
+
+def full_name(plant: MultibodyPlant, element: Joint | RigidBody) -> str:
+    """`<model>.<joint>` or `<model>.<body>`, as scenes and recordings name it."""
+    return f"{model_of(plant, element)}.{element.name()}"
+
+
+def find_joints(effect: Effect, plant: MultibodyPlant) -> list[Joint]:
+    """The one-dof joints that `at` names: `<model>.<joint>`, or all of `<model>`.
+
+    Raises: ValueError, also for a joint that is named twice.
+    """
+    found: list[Joint] = []
+    for name in effect.at:
+        model, _, joint = name.partition(".")
+        models = model_names(plant)
+        if model not in models:
+            raise ValueError(
+                f"effect {effect.kind} at {name!r}: no model {model!r}, "
+                f"the scene has {', '.join(models)}"
+            )
+        joints = one_dof_joints(plant, model)
+        chosen = [each for each in joints if not joint or each.name() == joint]
+        if not chosen:
+            raise ValueError(
+                f"effect {effect.kind} at {name!r}: expected a joint of {model!r} that "
+                "turns or slides: "
+                f"{', '.join(f'{model}.{each.name()}' for each in joints) or 'none'}"
+            )
+        found += chosen
+    _refuse_twice(effect, [full_name(plant, joint) for joint in found])
+    return found
+
+
+def _refuse_twice(effect: Effect, names: list[str]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(
+                f"effect {effect.kind} at {effect.at} names {name} more than once"
+            )
+
+
+def velocity_unit(joint: Joint) -> float:
+    """A slow speed of the joint: 0.005 rad/s, or 0.001 m/s where it slides."""
+    return 0.001 if isinstance(joint, PrismaticJoint) else 0.005
+
+
+def actuator_of(plant: MultibodyPlant, joint: Joint):
+    """The joint's actuator, or None."""
+    for i in plant.GetJointActuatorIndices():
+        actuator = plant.get_joint_actuator(i)
+        if actuator.joint().index() == joint.index():
+            return actuator
+    return None

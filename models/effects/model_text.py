@@ -1,9 +1,12 @@
 """Edits of a model's URDF or SDF text: what Drake can take only from a file."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from xml.dom import minidom
 
+import numpy as np
+from pydrake.math import RollPitchYaw
 from pydrake.multibody.parsing import PackageMap
 
 from makebreak.models.effects.kind import Effect
@@ -106,3 +109,98 @@ def _scaled(numbers: str, scale: float) -> str:
     """The first three numbers times scale, the others as they are."""
     values = [float(x) for x in numbers.split()]
     return " ".join(repr(scale * x if i < 3 else x) for i, x in enumerate(values))
+
+
+@dataclass
+class Inertial:
+    """A link's inertia: mass [kg], com (3,) [m] in the link's frame, central (3, 3)
+    about the centre of mass in the link's axes [kg m2]."""
+
+    mass: float
+    com: np.ndarray
+    central: np.ndarray
+
+
+MOMENTS = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2)}
+PRODUCTS = {"xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
+
+
+def read_inertial(link: minidom.Element) -> Inertial:
+    """Raises: ValueError where a number is missing or a pose is given otherwise than
+    by six numbers in radians."""
+    name = link.getAttribute("name")
+    inertia = children(link, "inertial", "inertia")
+    mass = children(link, "inertial", "mass")
+    if not inertia or not mass:
+        raise ValueError(f"link {name!r} has no mass and inertia to change")
+    m = mass[0].getAttribute("value") or text(mass[0])
+    I_S = np.zeros((3, 3))
+    for key, (i, j) in (MOMENTS | PRODUCTS).items():
+        value = inertia[0].getAttribute(f"i{key}")
+        for element in children(inertia[0], f"i{key}"):
+            value = text(element)
+        I_S[i, j] = I_S[j, i] = float(value or 0.0)
+    pose = np.zeros(6)
+    for element in children(link, "inertial", "pose"):
+        if any(element.hasAttribute(a) for a in ("relative_to", "rotation_format")) or (
+            element.getAttribute("degrees") == "true"
+        ):
+            raise ValueError(
+                f"link {name!r}: its inertial pose has attributes; expected six "
+                "numbers x y z roll pitch yaw in the link's frame"
+            )
+        pose = np.array([float(x) for x in text(element).split()])
+    for element in children(link, "inertial", "origin"):
+        for at, key in ((0, "xyz"), (3, "rpy")):
+            if element.hasAttribute(key):
+                pose[at : at + 3] = [
+                    float(x) for x in element.getAttribute(key).split()
+                ]
+    R = RollPitchYaw(*pose[3:]).ToRotationMatrix().matrix()
+    return Inertial(float(m), pose[:3], R @ I_S @ R.T)
+
+
+def write_inertial(link: minidom.Element, inertial: Inertial) -> None:
+    """Writes what read_inertial reads, its axes the link's.
+
+    Raises: ValueError for an inertia that no body has: Drake would replace it by
+        another.
+    """
+    least, middle, greatest = np.linalg.eigvalsh(inertial.central)
+    if not (least >= 0.0 and least + middle >= greatest * (1.0 - 1e-9)):
+        raise ValueError(
+            f"link {link.getAttribute('name')!r}: no body has the central moments of "
+            f"inertia {least:g}, {middle:g}, {greatest:g} [kg m2]"
+        )
+    mass = children(link, "inertial", "mass")[0]
+    if mass.hasAttribute("value"):
+        mass.setAttribute("value", repr(inertial.mass))
+    else:
+        set_text(mass, repr(inertial.mass))
+    inertia = children(link, "inertial", "inertia")[0]
+    for key, (i, j) in (MOMENTS | PRODUCTS).items():
+        value = repr(float(inertial.central[i, j]))
+        elements = children(inertia, f"i{key}")
+        for element in elements:
+            set_text(element, value)
+        if not elements and not inertia.hasChildNodes():
+            inertia.setAttribute(f"i{key}", value)
+        elif not elements:  # SDF may leave products out.
+            element = minidom.Document().createElement(f"i{key}")
+            element.ownerDocument = link.ownerDocument
+            inertia.appendChild(element)
+            set_text(element, value)
+    com = " ".join(repr(float(x)) for x in inertial.com)
+    is_urdf = mass.hasAttribute("value")
+    tag = "origin" if is_urdf else "pose"
+    places = children(link, "inertial", tag)
+    if not places:
+        place = minidom.Document().createElement(tag)
+        place.ownerDocument = link.ownerDocument
+        children(link, "inertial")[0].appendChild(place)
+        places = [place]
+    if is_urdf:
+        places[0].setAttribute("xyz", com)
+        places[0].setAttribute("rpy", "0 0 0")
+    else:
+        set_text(places[0], f"{com} 0 0 0")

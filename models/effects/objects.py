@@ -1,21 +1,40 @@
-"""Effects on a free object itself: its size."""
+"""Effects on an object itself: its size, edges, mass, centre of mass and inertia."""
 
+from itertools import product
 from xml.dom.minidom import Element
 
+import numpy as np
 from pydrake.geometry import (
     Box,
     Capsule,
     Cylinder,
     Ellipsoid,
+    ProximityProperties,
     SceneGraph,
     Shape,
     Sphere,
 )
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import RigidBody, RotationalInertia, SpatialInertia
 
-from makebreak.models.effects.kind import Effect, EffectKind, find_body
-from makebreak.models.effects.model_text import children, scale_inertia, text
+from makebreak.models.effects.kind import (
+    Effect,
+    EffectKind,
+    Parameter,
+    find_bodies,
+    find_body,
+)
+from makebreak.models.effects.loads import inertial_signature
+from makebreak.models.effects.model_text import (
+    MOMENTS,
+    children,
+    read_inertial,
+    scale_inertia,
+    text,
+    write_inertial,
+)
+from makebreak.models.effects.signature import Signature
 
 
 def _scale_in_text(effect: Effect, link: Element) -> None:
@@ -89,12 +108,285 @@ def _scale_shapes(
             scene_graph.ChangeShape(source, g, _scaled_shape(shape, scale), moved)
 
 
+def _size_now(effect: Effect, plant: MultibodyPlant, scene_graph) -> dict[str, float]:
+    shapes = _touched(find_bodies(effect, plant)[0], plant, scene_graph)
+    radii = [shape.radius() for _, shape, _ in shapes if isinstance(shape, Sphere)]
+    return {"scale": 1.0, "radius": radii[0]} if len(radii) == 1 else {"scale": 1.0}
+
+
+def _touched(body: RigidBody, plant: MultibodyPlant, scene_graph: SceneGraph):
+    """(id, shape, pose in the body) of what can be touched."""
+    inspector = scene_graph.model_inspector()
+    return [
+        (g, inspector.GetShape(g), inspector.GetPoseInFrame(g))
+        for g in plant.GetCollisionGeometriesForBody(body)
+        if inspector.GetProximityProperties(g) is not None
+    ]
+
+
+# ----- corner_radius
+
+
+def _block(effect: Effect, body: RigidBody, plant, scene_graph):
+    """Half sizes (3,) and frame of the block that the body is: one box, or the eight
+    spheres of its corners; with their present radius.
+
+    Raises: ValueError if it is neither.
+    """
+    shapes = _touched(body, plant, scene_graph)
+    if len(shapes) == 1 and isinstance(shapes[0][1], Box):
+        return shapes[0][1].size() / 2.0, shapes[0][2], 0.0
+    centres = np.array([X.translation() for _, _, X in shapes])
+    if len(shapes) == 8 and all(isinstance(shape, Sphere) for _, shape, _ in shapes):
+        radius = shapes[0][1].radius()
+        middle = centres.mean(axis=0)
+        half = abs(centres - middle).mean(axis=0)
+        if np.allclose(abs(centres - middle), half, atol=1e-6):
+            return half + radius, RigidTransform(middle), radius
+    raise ValueError(
+        f"effect corner_radius at {effect.at}: expected {body.scoped_name()} to have "
+        "one collision box, or eight spheres at the corners of one"
+    )
+
+
+def _round_corners(
+    effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph
+) -> None:
+    """Eight spheres, each touching three faces of the block from inside."""
+    radius = effect.parameters["radius"]
+    for body in find_bodies(effect, plant):
+        half, X_BG, _ = _block(effect, body, plant, scene_graph)
+        if not 0.0 < radius <= min(half):
+            raise ValueError(
+                f"effect corner_radius: radius is {radius}, expected above 0 and at "
+                f"most half the block's least edge, {min(half)}"
+            )
+        corners = [
+            RigidTransform(
+                X_BG.rotation(), X_BG.multiply(np.array(sign) * (half - radius))
+            )
+            for sign in product((-1.0, 1.0), repeat=3)
+        ]
+        old = _touched(body, plant, scene_graph)
+        inspector = scene_graph.model_inspector()
+        properties = ProximityProperties(inspector.GetProximityProperties(old[0][0]))
+        for (g, _, _), X in zip(old, corners, strict=False):
+            scene_graph.ChangeShape(plant.get_source_id(), g, Sphere(radius), X)
+        for i, X in enumerate(corners[len(old) :]):
+            plant.RegisterCollisionGeometry(
+                body, X, Sphere(radius), f"{body.name()}_corner_{i}", properties
+            )
+
+
+def _radius_now(effect: Effect, plant: MultibodyPlant, scene_graph) -> dict[str, float]:
+    _, _, radius = _block(effect, find_bodies(effect, plant)[0], plant, scene_graph)
+    return {"radius": max(radius, 1e-4)}
+
+
+# ----- mass, centre of mass, inertia
+
+
+def _mass_in_text(effect: Effect, link: Element) -> None:
+    """The mass is spread as before: moments of inertia go with it."""
+    inertial = read_inertial(link)
+    mass = effect.parameters["mass"]
+    inertial.central *= mass / inertial.mass
+    inertial.mass = mass
+    write_inertial(link, inertial)
+
+
+def _com_in_text(effect: Effect, link: Element) -> None:
+    """The inertia about the centre of mass stays."""
+    inertial = read_inertial(link)
+    inertial.com = _new_com(effect, inertial.com)
+    write_inertial(link, inertial)
+
+
+def _inertia_in_text(effect: Effect, link: Element) -> None:
+    inertial = read_inertial(link)
+    inertial.central = _new_central(effect, inertial.central)
+    write_inertial(link, inertial)
+
+
+def _new_com(effect: Effect, com) -> np.ndarray:
+    return np.array([effect.parameters.get(a, com[i]) for i, a in enumerate("xyz")])
+
+
+def _new_central(effect: Effect, central) -> np.ndarray:
+    """Moments about the centre of mass along the body's axes; the products stay."""
+    new = np.array(central)
+    for key, at in MOMENTS.items():
+        new[at] = effect.parameters.get(f"i{key}", new[at])
+    return new
+
+
+def _central(M: SpatialInertia) -> np.ndarray:
+    mass, p = M.get_mass(), M.get_com()
+    about = M.CalcRotationalInertia().CopyToFullMatrix3()
+    return about - mass * (p @ p * np.eye(3) - np.outer(p, p))
+
+
+def _spatial(mass: float, com, central) -> SpatialInertia:
+    products = [central[0, 1], central[0, 2], central[1, 2]]
+    return SpatialInertia.MakeFromCentralInertia(
+        mass, com, RotationalInertia(*np.diag(central), *products)
+    )
+
+
+def _change(new_values):
+    """set_in_context by new_values(effect, mass, com, central) -> the same three."""
+
+    def set_in_context(old: Effect, new: Effect, plant: MultibodyPlant, context):
+        for body in find_bodies(new, plant):
+            M = body.CalcSpatialInertiaInBodyFrame(context)
+            values = new_values(new, M.get_mass(), M.get_com(), _central(M))
+            try:
+                changed = _spatial(*values)
+            except RuntimeError:
+                raise ValueError(
+                    f"effect {new.kind} at {new.at}: no body has the inertia of "
+                    f"{new.parameters}"
+                ) from None
+            body.SetSpatialInertiaInBodyFrame(context, changed)
+
+    return set_in_context
+
+
+def _inertial_now(effect: Effect, plant: MultibodyPlant, scene_graph):
+    M = find_bodies(effect, plant)[0].default_spatial_inertia()
+    if effect.kind == "object_mass":
+        return {"mass": M.get_mass()}
+    if effect.kind == "object_com":
+        return dict(zip("xyz", (float(x) for x in M.get_com()), strict=True))
+    central = _central(M)
+    return {f"i{key}": float(central[at]) for key, at in MOMENTS.items()}
+
+
+def _inertial_signature(effect: Effect, model, motion, grid=None) -> list[Signature]:
+    """Linear in the mass; in the centre of mass linearised, as the inertia about the
+    body's origin goes with its square; linear in the moments of inertia."""
+    body = find_bodies(effect, model.plant)[0]
+    M = body.default_spatial_inertia()
+    mass, com = M.get_mass(), M.get_com()
+    about = M.get_unit_inertia().CopyToFullMatrix3()  # Per kg, about the origin.
+    six = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
+    now = _inertial_now(effect, model.plant, None)
+    names = list(now)
+    mix = np.zeros((10, len(names)))
+    if effect.kind == "object_mass":
+        mix[:, 0] = [1.0, *com, *(about[at] for at in six)]
+    elif effect.kind == "object_com":
+        for i, e in enumerate(np.eye(3)):
+            mix[1:4, i] = mass * e
+            change = mass * (
+                2.0 * com[i] * np.eye(3) - np.outer(com, e) - np.outer(e, com)
+            )
+            mix[4:, i] = [change[at] for at in six]
+    else:
+        mix[4:7] = np.eye(3)
+
+    def to_parameters(c):
+        return {n: now[n] + float(x) for n, x in zip(names, c, strict=True)}
+
+    exact = effect.kind != "object_com"
+    unknowns = [f"{name}_change" for name in names]
+    return [
+        inertial_signature(
+            effect, model, motion, body, unknowns, mix, to_parameters, exact
+        )
+    ]
+
+
+def _some_are_given(effect: Effect) -> None:
+    if not effect.parameters:
+        names = (
+            "`x`, `y` or `z`" if effect.kind == "object_com" else "a moment of inertia"
+        )
+        raise ValueError(f"effect {effect.kind} at {effect.at} needs {names}")
+
+
 KINDS = {
     # The body's mass stays (object_mass is a kind of its own): com goes with the
     # scale, inertia with its square. The body's initial pose stays as well.
     "object_size": EffectKind(
-        parameters=("scale", "radius"),
+        at="body",
+        parameters=(
+            Parameter("scale", "", 0.5, 2.0, 1.0, valid="> 0", optional=True),
+            Parameter("radius", "m", 0.002, 0.5, None, valid="> 0", optional=True),
+        ),
+        says="{at} is {scale} times as large as modelled[, its radius is {radius}]",
+        confused_with=("plane_height", "contact_stiffness", "length_scale"),
+        tell_apart="let it rest on several faces, or roll: height and rate of rolling "
+        "both go with the size",
         edit_text=_scale_in_text,
         before_finalize=_scale_shapes,
+        now=_size_now,
+    ),
+    "corner_radius": EffectKind(
+        at="body",
+        parameters=(Parameter("radius", "m", 0.0002, 0.05, None, valid="> 0"),),
+        says="the corners of {at} are rounded with a radius of {radius}",
+        confused_with=("object_size", "contact_dissipation", "plane_height"),
+        tell_apart="touch with faces and with corners: a face rests as high as before",
+        rank=1,
+        before_finalize=_round_corners,
+        now=_radius_now,
+    ),
+    "object_mass": EffectKind(
+        at="body",
+        parameters=(Parameter("mass", "kg", 0.001, 50.0, None, valid="> 0"),),
+        says="{at} weighs {mass}",
+        confused_with=("contact_friction", "object_inertia", "payload"),
+        tell_apart="lift it or knock it: a slow push shows friction times weight only",
+        edit_text=_mass_in_text,
+        set_in_context=_change(
+            lambda effect, mass, com, central: (
+                effect.parameters["mass"],
+                com,
+                central * (effect.parameters["mass"] / mass),
+            )
+        ),
+        now=_inertial_now,
+        signature=_inertial_signature,
+    ),
+    "object_com": EffectKind(
+        at="body",
+        parameters=tuple(
+            Parameter(a, "m", -0.2, 0.2, None, optional=True) for a in "xyz"
+        ),
+        says="the centre of mass of {at} is at ({x}, {y}, {z}) in its frame",
+        confused_with=("object_inertia", "gravity_tilt", "joint_offset"),
+        tell_apart="let it fly and spin: the centre of mass alone moves on a parabola",
+        rank=1,
+        check=_some_are_given,
+        edit_text=_com_in_text,
+        set_in_context=_change(
+            lambda effect, mass, com, central: (mass, _new_com(effect, com), central)
+        ),
+        now=_inertial_now,
+        signature=_inertial_signature,
+    ),
+    "object_inertia": EffectKind(
+        at="body",
+        parameters=tuple(
+            Parameter(a, "kg m2", 1e-7, 5.0, None, valid="> 0", optional=True)
+            for a in ("ixx", "iyy", "izz")
+        ),
+        says="{at} has moments of inertia of {ixx}, {iyy} and {izz} about its centre "
+        "of mass",
+        confused_with=("object_com", "corner_radius", "rotor_inertia"),
+        tell_apart="spin it about several axes, or let it hit in many attitudes",
+        rank=1,
+        check=_some_are_given,
+        edit_text=_inertia_in_text,
+        set_in_context=_change(
+            lambda effect, mass, com, central: (
+                mass,
+                com,
+                _new_central(effect, central),
+            )
+        ),
+        now=_inertial_now,
+        signature=_inertial_signature,
     ),
 }

@@ -1,0 +1,141 @@
+"""Effects that are forces on a body: constant, sinusoidal, drag."""
+
+import math
+
+import numba
+import numpy as np
+
+from makebreak.models.effects.kind import (
+    Effect,
+    EffectKind,
+    Parameter,
+    find_bodies,
+)
+from makebreak.models.effects.signature import Signature, without_momentum
+
+AXES = ("fx", "fy", "fz")
+FREQUENCIES = tuple(np.round(np.geomspace(0.1, 20.0, 60), 4))  # [Hz]
+
+
+@numba.njit(cache=True)
+def constant_law(V, t, p, F):
+    for i in range(3):
+        F[3 + i] += p[i]
+
+
+@numba.njit(cache=True)
+def sinusoidal_law(V, t, p, F):
+    s = math.sin(2.0 * math.pi * p[3] * t + p[4])
+    for i in range(3):
+        F[3 + i] += p[i] * s
+
+
+@numba.njit(cache=True)
+def drag_law(V, t, p, F):
+    for i in range(3):
+        F[i] -= p[1] * V[i]
+        F[3 + i] -= p[0] * V[3 + i]
+
+
+def _numbers(*names):
+    return lambda effect: [effect.parameters[name] for name in names]
+
+
+def _jacobians(effect: Effect, model, motion):
+    """Jacobian (n, 6, n_v) and velocity (n, 6) of each body that `at` names."""
+    for body in find_bodies(effect, model.plant):
+        J, V, _, _ = model.body_motion(body, motion.q, motion.v, motion.vd)
+        yield J, V
+
+
+def _constant_signature(effect, model, motion, grid=None) -> list[Signature]:
+    columns = sum(
+        -J[:, 3:].swapaxes(1, 2) for J, _ in _jacobians(effect, model, motion)
+    )
+    return [without_momentum(effect, AXES, columns)]
+
+
+def _sinusoidal_signature(effect, model, motion, grid=None) -> list[Signature]:
+    """The direction is free, and the phase; one phase for all three axes: a force along
+    a line. Each alternative holds a frequency; its coefficients are sine and cosine of
+    each axis, and to_parameters takes the line along which the power is greatest."""
+    columns = sum(
+        -J[:, 3:].swapaxes(1, 2) for J, _ in _jacobians(effect, model, motion)
+    )
+    found = []
+    for f in (grid or {}).get("frequency", FREQUENCIES):
+        angle = 2.0 * np.pi * f * motion.time[:, None, None]
+        both = np.concatenate(
+            [columns * np.sin(angle), columns * np.cos(angle)], axis=2
+        )
+        names = [f"{axis}_{part}" for part in ("sin", "cos") for axis in AXES]
+
+        def to_parameters(c, f=f):
+            # c = [a cos(phase), a sin(phase)] for the amplitude's vector a.
+            a, b = np.reshape(c, (2, 3))
+            u, s, w = np.linalg.svd(np.stack([a, b], axis=1))
+            amplitude = u[:, 0] * s[0]
+            phase = math.atan2(w[0, 1], w[0, 0])
+            return {
+                **{name: float(x) for name, x in zip(AXES, amplitude, strict=True)},
+                "frequency": float(f),
+                "phase": phase,
+            }
+
+        found.append(
+            without_momentum(effect, names, both, {"frequency": f}, to_parameters)
+        )
+    return found
+
+
+def _drag_signature(effect, model, motion, grid=None) -> list[Signature]:
+    columns = np.zeros((*motion.v.shape, 2))
+    for J, V in _jacobians(effect, model, motion):
+        columns[:, :, 0] += np.einsum("nij,ni->nj", J[:, 3:], V[:, 3:])
+        columns[:, :, 1] += np.einsum("nij,ni->nj", J[:, :3], V[:, :3])
+    return [without_momentum(effect, ["linear", "angular"], columns)]
+
+
+KINDS = {
+    "constant_force": EffectKind(
+        at="body",
+        parameters=tuple(Parameter(axis, "N", -100.0, 100.0) for axis in AXES),
+        says="a constant force of ({fx}, {fy}, {fz}) in world pulls at {at}, which the "
+        "model lacks",
+        confused_with=("payload", "gravity_tilt", "actuator_bias"),
+        tell_apart="turn the body into other poses and accelerate it: a payload's "
+        "force changes with acceleration",
+        body_law=constant_law,
+        body_numbers=_numbers(*AXES),
+        signature=_constant_signature,
+    ),
+    "sinusoidal_force": EffectKind(
+        at="body",
+        parameters=(
+            *(Parameter(axis, "N", -100.0, 100.0) for axis in AXES),
+            Parameter("frequency", "Hz", 0.05, 50.0, None, valid="> 0"),
+            Parameter("phase", "rad", -math.pi, math.pi, None),
+        ),
+        says="a force of amplitude ({fx}, {fy}, {fz}) shakes {at} at {frequency} "
+        "(phase {phase} at time 0), which the model lacks",
+        confused_with=("torque_ripple",),
+        tell_apart="start the same motion at another time: the force stays with the "
+        "clock, a ripple with the position",
+        body_law=sinusoidal_law,
+        body_numbers=_numbers(*AXES, "frequency", "phase"),
+        signature=_sinusoidal_signature,
+    ),
+    "body_drag": EffectKind(
+        at="body",
+        parameters=(
+            Parameter("linear", "N s/m", 0.0, 100.0, valid=">= 0"),
+            Parameter("angular", "N m s/rad", 0.0, 10.0, valid=">= 0"),
+        ),
+        says="{at} is slowed by drag of {linear} and {angular} that the model lacks",
+        confused_with=("joint_viscous_damping", "joint_quadratic_drag"),
+        tell_apart="move several joints at once: drag acts along the body's velocity",
+        body_law=drag_law,
+        body_numbers=_numbers("linear", "angular"),
+        signature=_drag_signature,
+    ),
+}

@@ -1,0 +1,75 @@
+"""Effects on where the ground is: its height, its tilt."""
+
+import numpy as np
+from pydrake.geometry import SceneGraph
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import RigidBody
+
+from makebreak.models.effects.contact import anchored_pose
+from makebreak.models.effects.kind import Effect, EffectKind, Parameter, find_bodies
+from makebreak.models.effects.loads import rotation
+
+
+def _move(
+    effect: Effect,
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    body: RigidBody,
+    moved,
+) -> None:
+    """Moves all shapes of an anchored body: moved(X_WG, p_WB) is the new X_WG."""
+    X_WB = anchored_pose(effect, plant, body)
+    inspector = scene_graph.model_inspector()
+    frame = plant.GetBodyFrameIdOrThrow(body.index())
+    geometries = list(inspector.GetGeometries(frame))
+    if not geometries:
+        raise ValueError(
+            f"effect {effect.kind} at {effect.at}: {body.scoped_name()} has no shapes"
+        )
+    for g in geometries:
+        X_WG = moved(X_WB @ inspector.GetPoseInFrame(g), X_WB.translation())
+        scene_graph.ChangeShape(
+            plant.get_source_id(), g, inspector.GetShape(g), X_WB.inverse() @ X_WG
+        )
+
+
+def _lift(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+    up = RigidTransform(np.array([0.0, 0.0, effect.parameters["height"]]))
+    for body in find_bodies(effect, plant):
+        _move(effect, plant, scene_graph, body, lambda X_WG, p_WB: up @ X_WG)
+
+
+def _tilt(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+    """About the body's origin, along the world's axes."""
+    R = rotation(effect)
+
+    def moved(X_WG, p_WB):
+        about = RigidTransform(p_WB)
+        return about @ RigidTransform(R, np.zeros(3)) @ about.inverse() @ X_WG
+
+    for body in find_bodies(effect, plant):
+        _move(effect, plant, scene_graph, body, moved)
+
+
+KINDS = {
+    "plane_height": EffectKind(
+        at="ground",
+        parameters=(Parameter("height", "m", -0.05, 0.05),),
+        says="the surface of {at} lies higher than modelled by {height}",
+        confused_with=("object_size", "contact_stiffness", "length_scale"),
+        tell_apart="rest on several faces, or use a second object of another size",
+        before_finalize=_lift,
+    ),
+    "plane_tilt": EffectKind(
+        at="ground",
+        parameters=(
+            Parameter("roll", "rad", -0.1, 0.1),
+            Parameter("pitch", "rad", -0.1, 0.1),
+        ),
+        says="the surface of {at} is tilted by {roll} of roll and {pitch} of pitch",
+        confused_with=("contact_friction", "rolling_resistance", "gravity_tilt"),
+        tell_apart="let something roll or slide both ways: a tilt speeds it up one way",
+        before_finalize=_tilt,
+    ),
+}

@@ -1,0 +1,256 @@
+"""Effects on what a mechanism carries and on what it stands: payload, tilt."""
+
+from dataclasses import replace
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    RigidBody,
+    RotationalInertia,
+    SpatialInertia,
+    WeldJoint,
+)
+
+from makebreak.models.effects.kind import (
+    Effect,
+    EffectKind,
+    Parameter,
+    find_bodies,
+    full_name,
+    model_names,
+    model_of,
+    one_dof_joints,
+)
+from makebreak.models.effects.signature import Signature, without_momentum
+
+# ----- payload
+
+
+def _payload_name(plant: MultibodyPlant, body: RigidBody) -> str:
+    return f"payload_on_{full_name(plant, body).replace('.', '_')}"
+
+
+def _payload_inertia(effect: Effect) -> SpatialInertia:
+    p = effect.parameters
+    com = [p["com_x"], p["com_y"], p["com_z"]]
+    return SpatialInertia.MakeFromCentralInertia(
+        p["mass"], com, RotationalInertia(0.0, 0.0, 0.0)
+    )
+
+
+def _add_payload(effect: Effect, plant: MultibodyPlant, scene_graph) -> None:
+    """A point mass, welded on. It is a model of its own: the carrier's bodies and its
+    share of the state stay what they are."""
+    for body in find_bodies(effect, plant):
+        name = _payload_name(plant, body)
+        if plant.HasModelInstanceNamed(name):
+            raise ValueError(
+                f"effect payload at {effect.at}: {full_name(plant, body)} has one"
+            )
+        instance = plant.AddModelInstance(name)
+        added = plant.AddRigidBody("payload", instance, _payload_inertia(effect))
+        plant.WeldFrames(body.body_frame(), added.body_frame())
+
+
+def _change_payload(old: Effect, new: Effect, plant: MultibodyPlant, context) -> None:
+    for body in find_bodies(new, plant):
+        instance = plant.GetModelInstanceByName(_payload_name(plant, body))
+        plant.GetBodyByName("payload", instance).SetSpatialInertiaInBodyFrame(
+            context, _payload_inertia(new)
+        )
+
+
+def inertial_columns(model, motion, body: RigidBody) -> tuple[np.ndarray, np.ndarray]:
+    """How a body's inertial parameters enter the inverse dynamics.
+
+    Unknowns: mass m, h = m com (3), and the inertia about the body's origin ixx, iyy,
+    izz, ixy, ixz, iyz, in the body's axes.
+    Returns: columns and momentum (n, n_v, 10).
+    """
+
+    J, V, A, R = model.body_motion(body, motion.q, motion.v, motion.vd)
+    w, alpha, a = V[:, :3], A[:, :3], A[:, 3:] - model.gravity
+    n = len(w)
+    wrench = np.zeros((n, 6, 10))
+    momentum = np.zeros((n, 6, 10))
+    wrench[:, 3:, 0] = a
+    momentum[:, 3:, 0] = V[:, 3:]
+    for i in range(3):
+        h = R[:, :, i]
+        wrench[:, 3:, 1 + i] = np.cross(alpha, h) + np.cross(w, np.cross(w, h))
+        wrench[:, :3, 1 + i] = np.cross(h, a)
+        momentum[:, 3:, 1 + i] = np.cross(w, h)
+        momentum[:, :3, 1 + i] = np.cross(h, V[:, 3:])
+    for i, (row, column) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]):
+        E = np.zeros((3, 3))
+        E[row, column] = E[column, row] = 1.0
+        E_W = R @ E @ R.swapaxes(1, 2)
+        L = np.einsum("nij,nj->ni", E_W, w)
+        wrench[:, :3, 4 + i] = np.einsum("nij,nj->ni", E_W, alpha) + np.cross(w, L)
+        momentum[:, :3, 4 + i] = L
+    JT = J.swapaxes(1, 2)
+    return JT @ wrench, JT @ momentum
+
+
+def inertial_signature(
+    effect, model, motion, body, unknowns, mix, to_parameters, exact
+) -> Signature:
+    """A signature whose columns are inertial_columns @ mix (10, k). The rest is what is
+    there without acceleration, less the momentum's own rate along v."""
+    columns, momentum = inertial_columns(model, motion, body)
+
+    def at(q, vd):
+        return inertial_columns(model, replace(motion, q=q, vd=vd), body)
+
+    step = 1e-5  # [s]: central differences, so an error of step^2 = 1e-10 relative.
+    zero = np.zeros_like(motion.vd)
+    still, _ = at(motion.q, zero)
+    _, after = at(model.shifted(motion.q, motion.v, step), zero)
+    _, before = at(model.shifted(motion.q, motion.v, -step), zero)
+    rest = still - (after - before) / (2.0 * step)
+    return Signature(
+        effect,
+        tuple(unknowns),
+        columns @ mix,
+        momentum @ mix,
+        rest @ mix,
+        to_parameters,
+        exact=exact,
+    )
+
+
+def _payload_signature(effect, model, motion, grid=None) -> list[Signature]:
+    """Mass and mass times place. What is left out, the payload's own moment of inertia
+    m com^2, is small where |com| is small beside the distance to the joints."""
+    (body,) = find_bodies(effect, model.plant)[:1]
+
+    def to_parameters(c):
+        com = np.array(c[1:]) / c[0] if abs(c[0]) > 1e-12 else np.zeros(3)
+        return {
+            "mass": float(c[0]),
+            "com_x": float(com[0]),
+            "com_y": float(com[1]),
+            "com_z": float(com[2]),
+        }
+
+    unknowns = ("mass", "mass_com_x", "mass_com_y", "mass_com_z")
+    return [
+        inertial_signature(
+            effect, model, motion, body, unknowns, np.eye(10, 4), to_parameters, False
+        )
+    ]
+
+
+# ----- gravity_tilt
+
+
+def rotation(effect: Effect):
+    return RollPitchYaw(
+        effect.parameters["roll"], effect.parameters["pitch"], 0.0
+    ).ToRotationMatrix()
+
+
+def _tilt(effect: Effect, plant: MultibodyPlant, scene_graph) -> None:
+    """A model that is welded to the world turns about its base's origin; else, and at
+    `world`, gravity turns the other way."""
+    R = rotation(effect)
+    for at in effect.at:
+        if at != "world" and at not in model_names(plant):
+            raise ValueError(
+                f"effect gravity_tilt at {at!r}: expected `world` or a model: "
+                f"{', '.join(model_names(plant))}"
+            )
+        welds = [
+            joint
+            for joint in (plant.get_joint(i) for i in plant.GetJointIndices())
+            if isinstance(joint, WeldJoint)
+            and joint.parent_body().index() == plant.world_body().index()
+            and model_of(plant, joint.child_body()) == at
+        ]
+        if not welds:
+            others = {
+                model_of(plant, joint)
+                for joint in one_dof_joints(plant)
+                if model_of(plant, joint) != at
+            }
+            if at != "world" and others:
+                raise ValueError(
+                    f"effect gravity_tilt at {at!r}: it is not welded to the world and "
+                    f"the scene has other mechanisms, {sorted(others)}; say `world`"
+                )
+            field = plant.mutable_gravity_field()
+            field.set_gravity_vector(R.inverse() @ field.gravity_vector())
+            continue
+        for weld in welds:
+            M = weld.frame_on_child()
+            X_WF = weld.frame_on_parent().GetFixedPoseInBodyFrame()
+            X_BM = M.GetFixedPoseInBodyFrame()
+            X_WB = X_WF @ weld.X_FM() @ X_BM.inverse()
+            X_WB = RigidTransform(R @ X_WB.rotation(), X_WB.translation())
+            name = weld.name()
+            plant.RemoveJoint(weld)
+            plant.AddJoint(WeldJoint(name, plant.world_frame(), M, X_WB @ X_BM))
+
+
+def _tilt_signature(effect, model, motion, grid=None) -> list[Signature]:
+    """Gravity's generalized force is linear in gravity; R^T g = g - axis x g, nearly.
+    Free bodies feel a base's tilt only at `world`."""
+    plant = model.plant
+    mJ = model.mass_times_com_jacobian(motion.q)  # (n, 3, n_v)
+    e = np.eye(3)
+    columns = np.stack([np.cross(e[k], model.gravity) @ mJ for k in range(2)], axis=2)
+    if effect.at != ["world"]:
+        stay = np.ones(plant.num_velocities(), dtype=bool)
+        for joint in one_dof_joints(plant):
+            if _stands_on(plant, joint.child_body(), effect.at):
+                stay[joint.velocity_start()] = False
+        columns[:, stay] = 0.0
+    return [without_momentum(effect, ["roll", "pitch"], columns, exact=False)]
+
+
+def _stands_on(plant: MultibodyPlant, body: RigidBody, models: list[str]) -> bool:
+    """Whether the way from the body to the world leads over one of the models."""
+    parent = {
+        joint.child_body().index(): joint.parent_body()
+        for joint in (plant.get_joint(i) for i in plant.GetJointIndices())
+    }
+    while body.index() != plant.world_body().index():
+        if model_of(plant, body) in models:
+            return True
+        if body.index() not in parent:
+            return False
+        body = parent[body.index()]
+    return False
+
+
+KINDS = {
+    "payload": EffectKind(
+        at="body",
+        parameters=(
+            Parameter("mass", "kg", 0.0, 20.0, valid=">= 0"),
+            *(Parameter(f"com_{a}", "m", -0.5, 0.5, None) for a in "xyz"),
+        ),
+        says="{at} carries {mass} that the model lacks, at ({com_x}, {com_y}, {com_z}) "
+        "in its frame",
+        confused_with=("object_mass", "actuator_gain", "constant_force"),
+        tell_apart="hold three or more orientations of the wrist, and move it fast",
+        before_finalize=_add_payload,
+        set_in_context=_change_payload,
+        signature=_payload_signature,
+    ),
+    "gravity_tilt": EffectKind(
+        at="base",
+        parameters=(
+            Parameter("roll", "rad", -0.3, 0.3),
+            Parameter("pitch", "rad", -0.3, 0.3),
+        ),
+        says="the base of {at} is tilted by {roll} of roll and {pitch} of pitch, "
+        "relative to the model",
+        confused_with=("joint_offset", "object_com", "constant_force", "actuator_bias"),
+        tell_apart="turn the first joint through its range: the torque of a tilt goes "
+        "round with it",
+        before_finalize=_tilt,
+        signature=_tilt_signature,
+    ),
+}

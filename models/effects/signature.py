@@ -1,0 +1,164 @@
+"""How a kind of effect shows in measured motion: its columns in the residual.
+
+The residual of inverse dynamics is r = effort - ID(q, v, vd), generalized forces [N m]
+or [N] in the order of the plant's velocities, with the effort that the recording tells
+and the model's inverse dynamics at the measured motion. An effect that the model lacks
+shows as r = columns @ coefficients. For a free body the rows of r are the wrench on it
+that the model does not know: torque, then force at its origin, world axes.
+
+In weak form nothing needs vd: columns = d/dt momentum + rest, so with a test function w
+that is zero at both ends of a window, integral(w columns) = integral(w rest - w'
+momentum); and ID = d/dt (M v) + Dynamics.rest in the same way.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import RigidBody
+
+from makebreak.models.effects.kind import Effect
+
+Grid = Mapping[str, Sequence[float]]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Measured motion in the plant's own order; n samples of one episode.
+
+    effort: of the actuators as the recording tells, 0 where nothing drives (commanded
+        or measured, the caller decides which).
+    jerk: d/dt vd, for the kinds that shift time; differences of vd if None.
+    """
+
+    time: np.ndarray  # (n,) [s]
+    q: np.ndarray  # (n, n_q)
+    v: np.ndarray  # (n, n_v)
+    vd: np.ndarray  # (n, n_v)
+    effort: np.ndarray  # (n, n_v) [N m] or [N]
+    jerk: np.ndarray | None = None  # (n, n_v)
+
+    def __post_init__(self):
+        n = np.size(self.time)
+        for name in ("q", "v", "vd", "effort"):
+            value = getattr(self, name)
+            if value.ndim != 2 or len(value) != n:
+                raise ValueError(
+                    f"Motion.{name} is {value.shape}, expected ({n}, ...) as time"
+                )
+        if not self.v.shape == self.vd.shape == self.effort.shape:
+            raise ValueError(
+                f"Motion.v is {self.v.shape}, vd {self.vd.shape}, effort "
+                f"{self.effort.shape}: expected one shape"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Signature:
+    """Columns of one effect at one place; the nonlinear parameters are held.
+
+    columns, momentum, rest: (n, n_v, k). columns = d/dt momentum + rest.
+    unknowns: names of the k coefficients, for tables.
+    to_parameters(coefficients (k,)): the effect's parameters, the held ones too.
+    exact: the residual is linear in the coefficients, else linearised at no effect.
+    channels: what a unit of each coefficient adds to a measured channel, (n, k); for
+        the kinds that change measurement and not motion.
+    """
+
+    effect: Effect  # kind and at.
+    unknowns: tuple[str, ...]
+    columns: np.ndarray
+    momentum: np.ndarray
+    rest: np.ndarray
+    to_parameters: Callable[[np.ndarray], dict[str, float]]
+    held: Mapping[str, float] = field(default_factory=dict)
+    exact: bool = True
+    channels: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+
+class Dynamics(Protocol):
+    """What a signature asks of the model: models/dynamics.py gives it."""
+
+    plant: MultibodyPlant
+    gravity: np.ndarray  # (3,) [m/s2]
+
+    def inverse_dynamics(self, q, v, vd, time=None) -> np.ndarray: ...
+    def momentum(self, q, v) -> np.ndarray: ...
+    def rest(self, q, v, time=None) -> np.ndarray: ...
+    def body_motion(self, body: RigidBody, q, v, vd) -> Any: ...
+    def mass_times_com_jacobian(self, q) -> np.ndarray: ...
+    def shifted(self, q, dq, step: float) -> np.ndarray: ...
+    def coordinates(self, channel: str) -> tuple[str, int]: ...
+    def channels(self) -> list[str]: ...
+
+
+def at_joints(
+    effect: Effect,
+    unknowns: Sequence[str],
+    motion: Motion,
+    joints: Sequence,
+    entries: Sequence[Callable],
+    held: Mapping[str, float] | None = None,
+    to_parameters: Callable | None = None,
+    exact: bool = True,
+) -> Signature:
+    """A signature without momentum; column i of joint j is entries[i](q_j, v_j, j's
+    effort): one coefficient for all the joints that `at` names."""
+    columns = np.zeros((*motion.v.shape, len(unknowns)))
+    for joint in joints:
+        i_q, i_v = joint.position_start(), joint.velocity_start()
+        for k, entry in enumerate(entries):
+            columns[:, i_v, k] = entry(
+                motion.q[:, i_q], motion.v[:, i_v], motion.effort[:, i_v]
+            )
+    return without_momentum(effect, unknowns, columns, held, to_parameters, exact)
+
+
+def without_momentum(
+    effect: Effect,
+    unknowns: Sequence[str],
+    columns: np.ndarray,
+    held: Mapping[str, float] | None = None,
+    to_parameters: Callable | None = None,
+    exact: bool = True,
+    channels: Mapping[str, np.ndarray] | None = None,
+) -> Signature:
+    held = dict(held or {})
+    names = tuple(unknowns)
+
+    def named(coefficients):
+        return {
+            **{n: float(c) for n, c in zip(names, coefficients, strict=True)},
+            **held,
+        }
+
+    return Signature(
+        effect,
+        names,
+        columns,
+        np.zeros_like(columns),
+        columns,
+        to_parameters or named,
+        held,
+        exact,
+        channels or {},
+    )
+
+
+def lagged(time: np.ndarray, u: np.ndarray, delay: float) -> np.ndarray:
+    """u (n, ...) as it was `delay` earlier, linear between samples; before the first
+    sample u is the first sample."""
+    flat = u.reshape(len(time), -1)
+    out = [np.interp(time - delay, time, column) for column in flat.T]
+    return np.stack(out, axis=1).reshape(u.shape)
+
+
+def filtered(time: np.ndarray, u: np.ndarray, time_constant: float) -> np.ndarray:
+    """u (n, ...) after a first-order lag, each value held until the next sample."""
+    keep = np.exp(-np.diff(time) / time_constant)
+    out = np.array(u, dtype=float)
+    for i, a in enumerate(keep):
+        out[i + 1] = a * out[i] + (1.0 - a) * u[i]
+    return out

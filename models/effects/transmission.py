@@ -1,0 +1,239 @@
+"""Effects between a motor and its joint: elasticity, backlash.
+
+The motor becomes a coordinate of its own: a massless body on the joint's parent that
+turns about the joint's axis, with the rotor's reflected inertia; a force couples it
+with the joint. It is a model of its own, `motor_of_<model>_<joint>`, so the
+mechanism's share of the state stays what it is. The motor's torque goes to it
+(actuation_path.py), and position and velocity are measured at it, unless the scene's
+channels say `link`.
+"""
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    Joint,
+    PrismaticJoint,
+    RevoluteJoint,
+    SpatialInertia,
+)
+from pydrake.systems.framework import (
+    BasicVector,
+    DiagramBuilder,
+    LeafSystem,
+    OutputPort,
+)
+
+from makebreak.models.effects.kind import (
+    Effect,
+    EffectKind,
+    Parameter,
+    actuator_of,
+    find_joints,
+    full_name,
+)
+
+# A rotor where the model has none, as a share of the joint's inertia [-].
+ROTOR_SHARE = 0.01
+# Backlash: once the gap is closed, motor and joint swing at this many radians a time
+# step of a discrete plant, and at this rate [rad/s] in a continuous one.
+CONTACT_RATE, CONTACT_RATE_MAX = 0.3, 2000.0
+CONTACT_DAMPING = 0.3  # Damping ratio of that swing.
+
+
+def motor_model(plant: MultibodyPlant, joint: Joint) -> str:
+    return f"motor_of_{full_name(plant, joint).replace('.', '_')}"
+
+
+def motor_joint(plant: MultibodyPlant, joint: Joint) -> Joint | None:
+    """The motor's own joint, where the joint is driven through an elastic element."""
+    name = motor_model(plant, joint)
+    if not plant.HasModelInstanceNamed(name):
+        return None
+    return plant.GetJointByName(joint.name(), plant.GetModelInstanceByName(name))
+
+
+def _add_motor(effect: Effect, plant: MultibodyPlant, scene_graph) -> None:
+    for joint in find_joints(effect, plant):
+        name = motor_model(plant, joint)
+        if plant.HasModelInstanceNamed(name):
+            raise ValueError(
+                f"effect {effect.kind} at {effect.at}: {full_name(plant, joint)} is "
+                "driven through an elastic element already"
+            )
+        instance = plant.AddModelInstance(name)
+        motor = plant.AddRigidBody("motor", instance, SpatialInertia.Zero())
+        frames = joint.frame_on_parent(), motor.body_frame()
+        if isinstance(joint, RevoluteJoint):
+            own = plant.AddJoint(
+                RevoluteJoint(joint.name(), *frames, joint.revolute_axis())
+            )
+        else:
+            assert isinstance(joint, PrismaticJoint)
+            own = plant.AddJoint(
+                PrismaticJoint(joint.name(), *frames, joint.translation_axis())
+            )
+        own.set_default_positions(joint.default_positions())
+        old = actuator_of(plant, joint)
+        limit = np.inf if old is None else old.effort_limit()
+        new = plant.AddJointActuator(f"{joint.name()}_motor", own, limit)
+        if old is not None:
+            new.set_default_gear_ratio(old.default_gear_ratio())
+            new.set_default_rotor_inertia(old.default_rotor_inertia())
+            old.set_default_rotor_inertia(0.0)
+        if new.default_reflected_inertia() == 0.0:
+            share = ROTOR_SHARE * _inertia(plant, joint)
+            new.set_default_gear_ratio(1.0)
+            new.set_default_rotor_inertia(share)
+
+
+def _inertia(plant: MultibodyPlant, joint: Joint) -> float:
+    """Rough inertia of what the joint moves, before the plant is finalized: of the
+    bodies beyond it at its zero, about its axis."""
+    # Bodies beyond, with their poses in the joint's frame on the child.
+    children: dict = {}
+    for each in (plant.get_joint(i) for i in plant.GetJointIndices()):
+        children.setdefault(each.parent_body().index(), []).append(each)
+    axis = (
+        joint.revolute_axis()
+        if isinstance(joint, RevoluteJoint)
+        else joint.translation_axis()
+    )
+    X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
+    todo, total = [(joint.child_body(), X_MB)], 0.0
+    while todo:
+        body, X = todo.pop()
+        M = body.default_spatial_inertia()
+        if isinstance(joint, PrismaticJoint):
+            total += M.get_mass()
+        else:
+            com = X.multiply(M.get_com())
+            about = M.CalcRotationalInertia().CopyToFullMatrix3()
+            mass, p = M.get_mass(), M.get_com()
+            central = about - mass * (p @ p * np.eye(3) - np.outer(p, p))
+            R = X.rotation().matrix()
+            across = com - axis * (axis @ com)
+            total += axis @ R @ central @ R.T @ axis + mass * across @ across
+        for each in children.get(body.index(), []):
+            X_BF = each.frame_on_parent().GetFixedPoseInBodyFrame()
+            X_CM = each.frame_on_child().GetFixedPoseInBodyFrame()
+            todo.append((each.child_body(), X @ X_BF @ X_CM.inverse()))
+    return total
+
+
+class Coupling(LeafSystem):
+    """The force between motor and joint, with twist = q_motor - q_joint:
+
+        k deadzone(twist, gap/2) + d (v_motor - v_joint) while the gap is closed
+
+    on the joint, and its opposite on the motor. With a gap the damping fades in over
+    the first thousandth of the gap, and the force never pulls.
+
+    Inputs:  state (n_x,) of the plant.
+    Outputs: generalized_force (n_v,).
+
+    Numeric parameter 0 of the Context: k [N m/rad], d [N m s/rad], gap [rad].
+    """
+
+    def __init__(self, plant: MultibodyPlant, pairs, numbers):
+        super().__init__()
+        n_q, self._n_v = plant.num_positions(), plant.num_velocities()
+        joints, motors = zip(*pairs, strict=True)
+        self._q = [np.array([j.position_start() for j in x]) for x in (joints, motors)]
+        self._v = [np.array([j.velocity_start() for j in x]) for x in (joints, motors)]
+        self._n_q = n_q
+        self._state = self.DeclareVectorInputPort("state", n_q + self._n_v)
+        self._numbers = self.DeclareNumericParameter(BasicVector(np.ravel(numbers)))
+        self.DeclareVectorOutputPort("generalized_force", self._n_v, self._calc)
+
+    def set_numbers(self, context, numbers) -> None:
+        context.get_mutable_numeric_parameter(self._numbers).SetFromVector(
+            np.ravel(numbers)
+        )
+
+    def _calc(self, context, output):
+        x = self._state.Eval(context)
+        k, d, gap = (
+            context.get_numeric_parameter(self._numbers).value().reshape(-1, 3).T
+        )
+        q, v = x[: self._n_q], x[self._n_q :]
+        twist = q[self._q[1]] - q[self._q[0]]
+        rate = v[self._v[1]] - v[self._v[0]]
+        pressed = np.sign(twist) * np.maximum(abs(twist) - gap / 2.0, 0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.where(gap > 0.0, np.minimum(abs(pressed) / (1e-3 * gap), 1.0), 1)
+        force = k * pressed + d * share * rate
+        # Through a gap nothing pulls back.
+        force = np.where((gap > 0.0) & (force * pressed <= 0.0), 0.0, force)
+        out = np.zeros(self._n_v)
+        out[self._v[0]] += force
+        out[self._v[1]] -= force
+        output.SetFromVector(out)
+
+
+def coupling_numbers(effect: Effect, plant: MultibodyPlant) -> list[list[float]]:
+    """k, d, gap of each joint that `at` names."""
+    p, numbers = effect.parameters, []
+    for joint in find_joints(effect, plant):
+        if effect.kind == "joint_elasticity":
+            numbers.append([p["stiffness"], p["damping"], 0.0])
+            continue
+        # Stiff enough that the gap is all that shows, soft enough for the time step.
+        dt = plant.time_step()
+        rate = min(CONTACT_RATE / dt, CONTACT_RATE_MAX) if dt else CONTACT_RATE_MAX
+        motor = motor_joint(plant, joint)
+        assert motor is not None
+        context = plant.CreateDefaultContext()
+        M = plant.CalcMassMatrix(context)
+        i, j = joint.velocity_start(), motor.velocity_start()
+        both = 1.0 / (np.linalg.inv(M)[i, i] + 1.0 / M[j, j])
+        k = both * rate**2
+        numbers.append([k, 2.0 * CONTACT_DAMPING * np.sqrt(k * both), p["gap"]])
+    return numbers
+
+
+def coupling_name(effect: Effect) -> str:
+    return f"{effect.kind}_{'_'.join(effect.at)}".replace(".", "_")
+
+
+def _add_coupling(
+    effect: Effect, plant: MultibodyPlant, scene_graph, builder: DiagramBuilder
+) -> OutputPort:
+    joints = find_joints(effect, plant)
+    pairs = [(joint, motor_joint(plant, joint)) for joint in joints]
+    system = builder.AddNamedSystem(
+        coupling_name(effect), Coupling(plant, pairs, coupling_numbers(effect, plant))
+    )
+    builder.Connect(plant.get_state_output_port(), system.GetInputPort("state"))
+    return system.GetOutputPort("generalized_force")
+
+
+KINDS = {
+    "joint_elasticity": EffectKind(
+        at="joint",
+        parameters=(
+            Parameter("stiffness", "N m/rad", 10.0, 1e5, None, valid="> 0"),
+            Parameter("damping", "N m s/rad", 0.0, 100.0, None, valid=">= 0"),
+        ),
+        says="motor and link of {at} are joined by a spring of {stiffness} (damping "
+        "{damping}) that the model lacks",
+        confused_with=("input_delay", "actuator_lag", "joint_backlash"),
+        tell_apart="sweep the frequency of the command through the resonance",
+        rank=2,
+        hidden_state=True,
+        before_finalize=_add_motor,
+        after_finalize=_add_coupling,
+        now=lambda effect, plant, scene_graph: {"stiffness": 1e6, "damping": 0.0},
+    ),
+    "joint_backlash": EffectKind(
+        at="joint",
+        parameters=(Parameter("gap", "rad", 0.0, 0.1, valid=">= 0"),),
+        says="motor and link of {at} have {gap} of backlash that the model lacks",
+        confused_with=("joint_coulomb_friction", "joint_elasticity"),
+        tell_apart="reverse with small motions, once without load and once with "
+        "gravity pressing one way",
+        rank=2,
+        hidden_state=True,
+        before_finalize=_add_motor,
+        after_finalize=_add_coupling,
+    ),
+}
