@@ -42,6 +42,7 @@ from makebreak.models.scene import Scene
 from makebreak.systems.contact_detector import ContactDetector, ContactDetectorConfig
 from makebreak.systems.forward_model import ForwardModelBank, ForwardModelConfig
 from makebreak.systems.impedance_controller import (
+    HybridConfig,
     ImpedanceConfig,
     ImpedanceController,
     serial_chain_of,
@@ -73,6 +74,9 @@ class ChangingContactConfig:
     )
     impedance: ImpedanceConfig = field(
         default_factory=lambda: ImpedanceConfig(control_orientation=True)
+    )
+    hybrid: HybridConfig = field(
+        default_factory=lambda: HybridConfig(damping_ratio=0.9)
     )
 
 
@@ -188,7 +192,10 @@ def make_changing_contact(
     impedance = add(
         "impedance_controller",
         ImpedanceController(
-            timed(config.impedance, TICK, IMPEDANCE_OFFSET), arm, TIP_FRAME
+            timed(config.impedance, TICK, IMPEDANCE_OFFSET),
+            arm,
+            TIP_FRAME,
+            hybrid=config.hybrid,
         ),
     )
 
@@ -219,7 +226,7 @@ def make_changing_contact(
     connect(forward, "prediction_error", variable)
     connect(anticipator, "contacts", shaper)
     connect(anticipator, "mode_hint", modes)
-    for port in ("stiffness", "damping", "wrench_feedforward"):
+    for port in ("stiffness", "damping", "damping_stiffness", "wrench_feedforward"):
         if variable.HasOutputPort(port):
             connect(variable, port, impedance)
     connect(impedance, "tau", station, port=f"{ARM}.torque_commanded")
