@@ -39,6 +39,7 @@ class RegionConfig:
 class SearchConfig:
     speed: float = 0.05  # Where the pattern ends and no contact was expected [m/s].
     distance: float = 0.1  # How far beyond its end a contact is searched for [m].
+    go_on_unexpected: bool = False  # After a contact where none should be.
 
 
 @dataclass
@@ -46,9 +47,10 @@ class VelocityShaperConfig:
     acceleration_max: float = 0.9  # Along the path, of each change of speed [m/s2].
     speed_min: float = 0.004  # A lower approach speed is raised to it [m/s].
     release_sec: float = 1.0  # In which an offset from the pattern fades out.
-    go_on_unexpected: bool = False  # After a contact where none should be.
     region: RegionConfig = field(default_factory=RegionConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
+    period_sec: float = 0.001
+    offset_sec: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +77,9 @@ class VelocityShaper(LeafSystem):
     one starts at once. If it has not come at the end of the path, the motion goes on
     along it, search.distance far, then stops and holds (status CONTACT_MISSING). A
     contact in a segment that ends in none stops it as well (CONTACT_UNEXPECTED), unless
-    go_on_unexpected. Where a contact is lost on the way its direction is held where it
-    was (CONTACT_MISSING) until it is felt again. While `contact` is NaN or has a status
-    the motion pauses (HOLD, BAD_INPUT).
+    search.go_on_unexpected. Where a contact is lost on the way its direction is held
+    where it was (CONTACT_MISSING) until it is felt again. While `contact` is NaN or has
+    a status the motion pauses (HOLD, BAD_INPUT).
 
     Inputs:  contacts (ContactBelief); contact (14,); ee_pose (7,); optional motion
              (MotionPattern): another one that comes there is taken over, from where the
@@ -97,12 +99,10 @@ class VelocityShaper(LeafSystem):
         self,
         config: VelocityShaperConfig,
         pattern: MotionPattern,
-        period_sec: float = 0.001,
-        offset_sec: float = 0.0,
         plan_sec: float = 0.01,
     ):
         super().__init__()
-        self._law = law = _law(config, period_sec)
+        self._law = law = _law(config)
         if not 0.0 < plan_sec < np.inf:
             raise ValueError(f"plan_sec is {plan_sec}, expected > 0")
         self._pattern, self._blend_sec = pattern, law.blend_sec
@@ -140,8 +140,12 @@ class VelocityShaper(LeafSystem):
             state = self.DeclareDiscreteState(value)
             self.DeclareStateOutputPort(name, state)
             self._outputs.append(state)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(plan_sec, offset_sec, self._plan)
-        self.DeclarePeriodicDiscreteUpdateEvent(period_sec, offset_sec, self._update)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(
+            plan_sec, config.offset_sec, self._plan
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(
+            config.period_sec, config.offset_sec, self._update
+        )
 
     def _plan(self, context: Context, state):
         """Reads the belief and, if one is connected, the pattern."""
@@ -197,7 +201,7 @@ class VelocityShaper(LeafSystem):
             discrete_state.set_value(state, value)
 
 
-def _law(config: VelocityShaperConfig, period_sec: float) -> ShaperLaw:
+def _law(config: VelocityShaperConfig) -> ShaperLaw:
     """Raises: ValueError for a number that makes no law, by name."""
     c, region, search = config, config.region, config.search
     for name, value, least in (
@@ -210,7 +214,7 @@ def _law(config: VelocityShaperConfig, period_sec: float) -> ShaperLaw:
         ("region.blend_sec", region.blend_sec, 1e-6),
         ("search.speed", search.speed, 1e-6),
         ("search.distance", search.distance, 0.0),
-        ("period_sec", period_sec, 1e-6),
+        ("period_sec", c.period_sec, 1e-6),
     ):
         if not least <= value < np.inf:
             wanted = "0 or more" if least == 0.0 else "a positive number"
@@ -225,6 +229,6 @@ def _law(config: VelocityShaperConfig, period_sec: float) -> ShaperLaw:
         blend_sec=float(region.blend_sec),
         search_speed=float(search.speed),
         search_max=float(search.distance),
-        go_on_unexpected=bool(c.go_on_unexpected),
-        period=float(period_sec),
+        go_on_unexpected=bool(search.go_on_unexpected),
+        period=float(c.period_sec),
     )
