@@ -83,6 +83,8 @@ class ApproachSpeedConfig:
 class ContactAnticipatorConfig:
     filter: ContactFilterConfig = field(default_factory=ContactFilterConfig)
     speed: ApproachSpeedConfig = field(default_factory=ApproachSpeedConfig)
+    period_sec: float = 0.01
+    offset_sec: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,8 +150,6 @@ class KalmanContactAnticipator(LeafSystem):
         self,
         config: ContactAnticipatorConfig,
         knowledge: ContactBelief | None = None,
-        period_sec: float = 0.01,
-        offset_sec: float = 0.0,
         effective_mass: Callable[[np.ndarray, np.ndarray], float] = reduced_mass_one,
     ):
         """Args:
@@ -170,8 +170,8 @@ class KalmanContactAnticipator(LeafSystem):
                 raise ValueError(f"{name} is {value}, expected a positive number")
         if self._speed.growth < 1.0:
             raise ValueError(f"growth is {self._speed.growth}, expected 1 or more")
-        if not period_sec > 0.0:
-            raise ValueError(f"period_sec is {period_sec}, expected > 0")
+        if not config.period_sec > 0.0:
+            raise ValueError(f"period_sec is {config.period_sec}, expected > 0")
         self._mass = effective_mass
         given = ContactBelief() if knowledge is None else knowledge
         drift = self._filter.std_drift**2 * np.eye(3)
@@ -207,7 +207,7 @@ class KalmanContactAnticipator(LeafSystem):
         ):
             self.DeclareVectorOutputPort(name, 1, partial(self._put, calc), ticket)
         self.DeclarePeriodicUnrestrictedUpdateEvent(
-            period_sec, offset_sec, self._update
+            config.period_sec, config.offset_sec, self._update
         )
 
     def knowledge(self, context: Context) -> ContactBelief:

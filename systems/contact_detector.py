@@ -20,11 +20,11 @@ from makebreak.systems.numerics.timing import timed
 class ContactDetectorConfig:
     impact_force: float = 2.0  # What is beyond friction and may be an impact [N].
     loss_force: float = 1.0  # A normal force below it is no contact [N].
-    friction_max: float = 1.0  # No surface has more.
     stiffness_min: float = 1000.0  # Of a contact made while sliding [N/m].
     tool_mass: float = 0.3  # Between sensor and tip: its inertia is taken off [kg].
     wrench_limit: float = 200.0  # At which the sensor saturates [N], [N m].
-    speed_min: float = 0.001  # Slower than this nothing is an impact [m/s].
+    period_sec: float = 0.001
+    offset_sec: float = 0.0
 
 
 class ContactDetector(LeafSystem):
@@ -51,29 +51,26 @@ class ContactDetector(LeafSystem):
     Source: CC section 3.3.
     """
 
-    def __init__(
-        self,
-        config: ContactDetectorConfig,
-        period_sec: float = 0.001,
-        offset_sec: float = 0.0,
-    ):
-        """Raises: ValueError for a number that is not positive (tool_mass: negative),
-        a friction above 3 or a period above 2 ms."""
+    def __init__(self, config: ContactDetectorConfig):
+        """Raises: ValueError for a number that is not positive (tool_mass, offset_sec:
+        that is negative) or a period above 2 ms."""
         super().__init__()
         for name, value in vars(config).items():
-            least = 0.0 if name == "tool_mass" else np.nextafter(0.0, 1.0)
-            if not least <= value < np.inf:
+            may_be_zero = name in ("tool_mass", "offset_sec")
+            if not (0.0 < value or may_be_zero and value == 0.0) or value == np.inf:
                 raise ValueError(f"{name} is {value}, expected a positive number")
-        if config.friction_max > 3.0:
+        if config.period_sec > 0.002:
             raise ValueError(
-                f"friction_max is {config.friction_max}, expected 3 or less"
+                f"period_sec is {config.period_sec}, expected 0.002 s or less"
             )
-        if not 0.0 < period_sec <= 0.002:
-            raise ValueError(
-                f"period_sec is {period_sec}, expected a time of 0.002 s or less"
-            )
-        values = {name: float(value) for name, value in vars(config).items()}
-        self._limits = Thresholds(**values, period=float(period_sec))
+        self._limits = Thresholds(
+            impact_force=float(config.impact_force),
+            loss_force=float(config.loss_force),
+            stiffness_min=float(config.stiffness_min),
+            tool_mass=float(config.tool_mass),
+            wrench_limit=float(config.wrench_limit),
+            period=float(config.period_sec),
+        )
         warm_up(self._limits)
         self._ports = [
             self.DeclareVectorInputPort(name, size)
@@ -91,7 +88,9 @@ class ContactDetector(LeafSystem):
         self._memory = self.DeclareDiscreteState(new_memory())
         self.DeclareStateOutputPort("contact", self._contact)
         self.DeclareStateOutputPort("along", self._along)
-        self.DeclarePeriodicDiscreteUpdateEvent(period_sec, offset_sec, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(
+            config.period_sec, config.offset_sec, self._update
+        )
 
     @timed
     def _update(self, context: Context, discrete_state):

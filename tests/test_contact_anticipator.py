@@ -304,7 +304,7 @@ class Trial:
         builder = DiagramBuilder()
         self.system = builder.AddSystem(
             KalmanContactAnticipator(
-                config or ContactAnticipatorConfig(), knowledge, 0.01, **arguments
+                config or ContactAnticipatorConfig(), knowledge, **arguments
             )
         )
         self.sources = {}
