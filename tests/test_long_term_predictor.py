@@ -15,6 +15,7 @@ from makebreak.systems.numerics.baselines.long_term_predictor import (
     _OneMode,
     find_modes,
     fit_gp,
+    known,
     log_marginal_likelihood,
     merged,
     one_of_each_stratum,
@@ -115,12 +116,34 @@ def test_propagation_of_a_linear_system_is_kalmans_prediction(change):
         3,
     )
     m, C, u = rng.normal(size=3), 0.01 * np.eye(3), rng.normal(size=(20, 2))
-    got = predict_long_term(predictor, m, C, u)
+    got = predict_long_term(predictor, m, C, known(u), 20)
     for t in range(20):
         np.testing.assert_allclose(got.mean[t], m, atol=1e-9)
         # The jitter of the sigma points adds up to 20 JITTER |A|^40 < 1e-6.
         np.testing.assert_allclose(got.std[t], np.sqrt(np.diag(C)), rtol=1e-5)
         m, C = A @ m + B @ u[t], A @ C @ A.T + np.diag(W)
+
+
+def test_a_policy_closes_the_loop_of_the_propagated_distribution():
+    A, B = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.0], [0.1]])
+    gain, W = np.array([[3.0, 2.0]]), np.array([1e-4, 1e-3])
+    predictor = LongTermPredictor(
+        _OneMode(0),
+        {0: Linear(np.hstack([A, B]), W)},
+        {},
+        (0, 1, 2),
+        np.zeros(3),
+        np.ones(3),
+        False,
+        2,
+    )
+    m, C = np.array([1.0, 0.0]), 0.1 * np.eye(2)
+    got = predict_long_term(predictor, m, C, lambda t, x: -x @ gain.T, 30)
+    closed = A - B @ gain
+    for t in range(31):
+        np.testing.assert_allclose(got.mean[t], m, atol=1e-9)
+        np.testing.assert_allclose(got.std[t], np.sqrt(np.diag(C)), rtol=1e-5)
+        m, C = closed @ m, closed @ C @ closed.T + np.diag(W)
 
 
 def test_tracks_merge_to_the_moments_of_their_mixture():
@@ -169,11 +192,17 @@ def wall():
     return *train(trials, BUDGET), [wall_trial(rng) for _ in range(4)]
 
 
+def from_start(predictor, trial):
+    """All of a trial from its first sample."""
+    T = len(trial.x) - 1
+    return predict_long_term(predictor, trial.x[0], 1e-6 * np.eye(2), known(trial.u), T)
+
+
 def test_gating_switches_where_the_mass_meets_the_wall(wall):
     predictor, _, tests = wall
     for trial in tests:
         start = np.diag([1e-4, 1e-6])
-        got = predict_long_term(predictor, trial.x[0], start, trial.u[:-1])
+        got = predict_long_term(predictor, trial.x[0], start, known(trial.u), 59)
         contact = np.flatnonzero(trial.features[:, 2] > 2.0)[0]
         first, last = got.mode[contact - 8], got.mode[-1]
         assert first != last
@@ -186,7 +215,7 @@ def test_true_values_are_in_the_2_sigma_band(wall):
     predictor, _, tests = wall
     inside, error = [], []
     for trial in tests:
-        got = predict_long_term(predictor, trial.x[0], 1e-6 * np.eye(2), trial.u[:-1])
+        got = from_start(predictor, trial)
         inside.append(abs(trial.x - got.mean) <= 2.0 * got.std)
         error.append((trial.x - got.mean)[:, 0])
     # 95 % for a Gaussian; an impact at an uncertain time is none.
@@ -197,7 +226,7 @@ def test_true_values_are_in_the_2_sigma_band(wall):
 
 def test_a_band_that_is_no_band_would_be_noticed(wall):
     predictor, _, tests = wall
-    got = predict_long_term(predictor, tests[0].x[0], 1e-6 * np.eye(2), tests[0].u[:-1])
+    got = from_start(predictor, tests[0])
     # Neither collapsed below the sensor noise nor wider than the way.
     assert 1e-4 < got.std[10:, 0].min() and got.std[:, 0].max() < 0.1
 
@@ -210,7 +239,7 @@ def test_one_step_with_feedback_is_better_than_the_long_term(wall):
         mean, std, mode = predict_one_step(predictor, x, u, mode)
         assert np.all(std > 0.0)
         one.append(mean)
-    got = predict_long_term(predictor, trial.x[0], 1e-6 * np.eye(2), trial.u[:-1])
+    got = from_start(predictor, trial)
     long_term = np.square(got.mean[1:] - trial.x[1:]).mean()
     assert np.square(np.array(one) - trial.x[1:]).mean() < long_term
 
@@ -241,8 +270,7 @@ def test_the_same_seed_gives_the_same_prediction(wall):
     predictor, _, tests = wall
     rng = np.random.default_rng(0)
     again, _ = train([wall_trial(rng) for _ in range(8)], BUDGET)
-    args = (tests[0].x[0], 1e-6 * np.eye(2), tests[0].u[:-1])
-    first, second = predict_long_term(predictor, *args), predict_long_term(again, *args)
+    first, second = from_start(predictor, tests[0]), from_start(again, tests[0])
     np.testing.assert_array_equal(first.mean, second.mean)
 
 

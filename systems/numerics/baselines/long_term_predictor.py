@@ -8,8 +8,11 @@ propagation of a distribution over many steps.
     transitions  one GP per seen pair of modes and output: the same, at the change
     prediction   a track per (mode before, mode): mean, covariance, probability. Samples
                  of a track vote through the SVM; each vote's share goes its own way, by
-                 unscented transform through the expert or the transition; tracks that
-                 meet are merged by their moments, tracks below 1 % are dropped.
+                 unscented transform through policy and expert, or transition; tracks
+                 that meet are merged by their moments, tracks below 1 % are dropped.
+
+u is what acts on the system: known beforehand, or given by a policy u(t, x), through
+which the distribution of x passes too.
 
 Source: Khader, Yin, Falco, Kragic, "Data-efficient model learning and prediction for
 contact-rich manipulation tasks", IEEE RA-L 5 (2020): what its abstract and public
@@ -17,7 +20,7 @@ program tell of the method. Rasmussen and Williams, "Gaussian processes for mach
 learning" (2006), eq. 2.25, 2.26, 5.8, 5.9.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -395,6 +398,11 @@ def _fit_svm(xu, after, changed, group, budget: TrainingBudget, rng):
     return search.best_estimator_
 
 
+def known(u):
+    """A policy that is the sequence u (T, n_u), whatever x is."""
+    return lambda t, x: np.broadcast_to(u[t], (len(x), np.shape(u)[1]))
+
+
 class Prediction(NamedTuple):
     """Distribution over time, row 0 the start: moments of the mixture of all tracks."""
 
@@ -414,9 +422,9 @@ def sigma_points(mean, covariance):
 
 
 def through(model, points, weights, u, gp_inputs, predict_change):
-    """Moments (n_x,), (n_x, n_x) of x_{t+1}, from sigma points of x_t and u (n_u,)."""
-    xu = np.hstack([points, np.broadcast_to(u, (len(points), len(u)))])
-    xu = xu[:, list(gp_inputs)]
+    """Moments (n_x,), (n_x, n_x) of x_{t+1}, from sigma points (k, n_x) of x_t and
+    their u (k, n_u)."""
+    xu = np.hstack([points, u])[:, list(gp_inputs)]
     y = model.mean(xu)
     _, variance = model.predict(xu[:1])
     if predict_change:
@@ -431,21 +439,23 @@ def predict_long_term(
     predictor: LongTermPredictor,
     mean,
     covariance,
-    u,
+    policy: Callable[[int, np.ndarray], np.ndarray],
+    T: int,
     mode: int = 0,
     seed: int = 0,
     probability_min: float = 0.01,
 ) -> Prediction:
     """Where x will be, without any further measurement.
 
-    Args: mean (n_x,), covariance (n_x, n_x) of x_0; u (T, n_u); mode, of x_0; seed of
-        the samples that vote; probability_min, of a track that is followed.
+    Args: mean (n_x,), covariance (n_x, n_x) of x_0; policy(t, x (k, n_x)) gives the u
+        (k, n_u) of step t; T, steps; mode, of x_0; seed of the samples that vote;
+        probability_min, of a track that is followed.
     Returns: for x_0 ... x_T.
     """
     rng = np.random.default_rng(seed)
     p = predictor
-    n_x, T = p.n_x, len(u)
-    n_votes = SAMPLES_PER_DIMENSION * (n_x + np.shape(u)[1])
+    n_x = p.n_x
+    n_votes = SAMPLES_PER_DIMENSION * len(p.mean)
     # (mode before, mode) -> probability, mean, covariance.
     tracks = {(mode, mode): (1.0, np.array(mean, float), np.array(covariance, float))}
     means, stds, modes = np.empty((T + 1, n_x)), np.empty((T + 1, n_x)), np.empty(T + 1)
@@ -467,7 +477,7 @@ def predict_long_term(
         arriving: dict[tuple[int, int], list] = {}
         for (earlier, now), (share, mu, C) in tracks.items():
             samples = rng.multivariate_normal(mu, C, n_votes, method="eigh")
-            votes = p.next_modes(np.hstack([samples, np.tile(u[t], (n_votes, 1))]))
+            votes = p.next_modes(np.hstack([samples, policy(t, samples)]))
             allowed = np.array([p.reachable(now, int(v)) for v in votes])
             samples, votes = samples[allowed], votes[allowed]
             goals, counts = (
@@ -483,7 +493,7 @@ def predict_long_term(
                     p.model(now, goal),
                     points,
                     weights,
-                    u[t],
+                    policy(t, points),
                     p.gp_inputs,
                     p.predict_change,
                 )
