@@ -27,7 +27,7 @@ POINTS = [[0.5, 0.2, 0.1], [0.5, 0.1, 0.12], [0.45, 0.05, 0.1], [0.4, 0.0, 0.05]
 
 def turned(degrees, axis=(0.0, 0.0, 1.0)):
     turn = Rotation.from_rotvec(np.deg2rad(degrees) * np.array(axis))
-    return (turn * Rotation.from_quat([1, 0, 0, 0])).as_quat(scalar_first=True)
+    return turn.as_quat(scalar_first=True)
 
 
 def one(kind, positions, times=(0.0, 4.0), **more):

@@ -45,7 +45,7 @@ from makebreak.systems.numerics.velocity_profile import (
 )
 
 KINDS = ("line", "arc", "spline")
-UPRIGHT = (0.0, 1.0, 0.0, 0.0)  # Tool down: half a turn about x.
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # Tool down: then frame tip's axes are the world's.
 _POSITION_TOL, _ANGLE_TOL = 1e-6, 1e-6  # [m], [rad]: rounding of a file's digits.
 _TURN_MAX = np.deg2rad(170.0)  # Of any orientation from the first: rotation vectors.
 
