@@ -15,16 +15,6 @@ simulation; `knowledge` reads what was learned in it, for the next one.
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from makebreak.systems.contact_anticipator import (
-    ContactAnticipatorConfig,
-    KalmanContactAnticipator,
-)
-from makebreak.systems.contact_view import ContactView, ContactViewConfig
-from makebreak.systems.mode_detector import ModeDetector, ModeDetectorConfig
-from makebreak.systems.variable_impedance import (
-    VariableImpedance,
-    VariableImpedanceConfig,
-)
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer
@@ -39,7 +29,12 @@ from makebreak.diagrams.station import (
 )
 from makebreak.diagrams.tabletop import TOOL, objects
 from makebreak.models.scene import Scene
+from makebreak.systems.contact_anticipator import (
+    ContactAnticipatorConfig,
+    KalmanContactAnticipator,
+)
 from makebreak.systems.contact_detector import ContactDetector, ContactDetectorConfig
+from makebreak.systems.contact_view import ContactView, ContactViewConfig
 from makebreak.systems.forward_model import ForwardModelBank, ForwardModelConfig
 from makebreak.systems.impedance_controller import (
     HybridConfig,
@@ -47,9 +42,14 @@ from makebreak.systems.impedance_controller import (
     ImpedanceController,
     serial_chain_of,
 )
+from makebreak.systems.mode_detector import ModeDetector, ModeDetectorConfig
 from makebreak.systems.numerics.contact_task import ContactBelief
 from makebreak.systems.numerics.motion_pattern import MotionPattern
 from makebreak.systems.tip_state import TipState
+from makebreak.systems.variable_impedance import (
+    VariableImpedance,
+    VariableImpedanceConfig,
+)
 from makebreak.systems.velocity_shaper import VelocityShaper, VelocityShaperConfig
 
 # Periods [s].
@@ -174,11 +174,11 @@ def make_changing_contact(
     tip = add("tip_state", TipState(chain))
     detector = add("contact_detector", ContactDetector(timed(config.detector, TICK)))
     modes = add(
-        "mode_detector", ModeDetector(timed(config.modes, ESTIMATE), known.modes)
+        "mode_detector", ModeDetector(config.modes, known.modes, ESTIMATE, OFFSET)
     )
     forward = add(
         "forward_model_bank",
-        ForwardModelBank(timed(config.forward_model, ESTIMATE), known.models),
+        ForwardModelBank(config.forward_model, known.models, ESTIMATE, OFFSET),
     )
     anticipator = add(
         "contact_anticipator",
