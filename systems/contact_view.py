@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.geometry import Box, Cylinder, Meshcat, MeshcatCone, Rgba, Sphere
+from pydrake.geometry import Box, Meshcat, MeshcatCone, Rgba, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import LeafSystem
 
@@ -81,7 +81,7 @@ class ContactView(LeafSystem):
         for i, color in enumerate(_MODE_COLORS):
             self._draw(f"{_ROOT}/mode/{i}", Sphere(0.014), color)
         dark = Rgba(0.1, 0.1, 0.1)
-        self._draw(f"{_ROOT}/force/shaft", Cylinder(0.004, 1.0), dark)
+        self._draw(f"{_ROOT}/force/shaft", Box(0.006, 0.006, 1.0), dark)
         self._draw(f"{_ROOT}/force/head", MeshcatCone(0.025, 0.01, 0.01), dark)
         self._draw_bars()
         for name, most in ((FORCE_SLIDER, 60.0), (SPEED_SLIDER, 300.0)):
