@@ -252,7 +252,7 @@ def test_the_error_rule_converges_while_beta_is_below_twice_dv_by_df():
 def test_regression_is_the_weighted_least_squares_slope():
     rng = np.random.default_rng(9)
     impacts = rng.uniform(0.1, 1.0, (6, 2))
-    w = np.sqrt(0.5 ** np.arange(5, -1, -1))
+    w = np.sqrt(0.2 ** np.arange(5, -1, -1)) / impacts[:, 0]
     expected = np.linalg.lstsq(w[:, None] * impacts[:, :1], w * impacts[:, 1])[0][0]
     np.testing.assert_allclose(force_per_speed(impacts), expected)
     assert force_per_speed(np.zeros((0, 2))) is None

@@ -129,12 +129,14 @@ def speed_by_error(speed, force_desired, force, beta) -> float:
     return float(speed + beta * (force_desired - force))
 
 
-def force_per_speed(impacts, forget=0.5) -> float | None:
+def force_per_speed(impacts, forget=0.2) -> float | None:
     """Slope s of F = s v by least squares through the origin [N s/m].
 
+    What is squared are the errors relative to v: F = s v is only nearly true, and a
+    first impact at five times the speed must not outweigh those near the desired force.
+
     Args: impacts (n, 2) of [speed, peak force], oldest first; forget: weight of each
-        relative to the one after it. F = s v is only nearly true: the last impacts
-        are nearest to where the next one will be.
+        relative to the one after it: the last one is nearest to the next.
     Returns: None if there is no impact with a positive speed and force.
     """
     impacts = np.asarray(impacts, dtype=float).reshape(-1, 2)
@@ -143,7 +145,7 @@ def force_per_speed(impacts, forget=0.5) -> float | None:
     if v.size == 0:
         return None
     weight = forget ** np.arange(v.size - 1, -1, -1)
-    return float((weight * v * F).sum() / (weight * v * v).sum())
+    return float((weight * F / v).sum() / weight.sum())
 
 
 def speed_by_regression(impacts, force_desired) -> float | None:

@@ -15,8 +15,8 @@ innovation's slow mean is taken off instead. A contact is *made* when
 A tip that was not moving has no speed to lose: there only a force that no friction can
 make, by twice the threshold, is a contact. An innovation that ends otherwise is a
 change of friction, which is learned anew. Time, position and speed are those of the
-first sample that departs. The peak force is the largest f, less its value before the
-contact, in the 80 ms after that.
+first sample that departs. The peak force is the largest f in the 80 ms after that, less
+its mean over 50 ms, up to 20 ms before (as in numerics/impact_score.py).
 
 A contact is *broken* when a normal force that was there falls below a threshold for
 8 ms.
@@ -63,7 +63,10 @@ STUCK_SPEED = 0.005  # [m/s]
 SPEED_LOST, SPEED_LOST_FREE = 0.5, 0.1  # Shares of the speed before.
 SPRING_OVER_STEP = 0.3  # Squared misfit of F = k x to that of F = constant.
 
-RING, ROW = 48, 6  # Samples kept; [time, p_WE 3, innovation, speed along d].
+BEFORE_SEC, GAP_SEC = 0.05, 0.02  # The force before: this long, up to so long before.
+BACK = 28  # Samples at most from the decision that something is pending to its first.
+# Samples kept; [time, p_WE 3, innovation, speed along d, force against the motion].
+RING, ROW = 120, 7
 
 # The memory, one flat array: slots by name.
 _SLOTS = (
@@ -87,7 +90,7 @@ _SLOTS = (
     ("over", 1),  # Ticks in a row above the threshold,
     ("under", 1),  # and below its negative.
     ("pending", 1),  # Ticks since the first sample; 0: nothing is pending.
-    ("before", 1),  # The predicted f before the contact [N],
+    ("before", 1),  # The force against the motion before the contact [N],
     ("before_speed", 1),  # and the speed [m/s].
     ("way", 1),  # the way since then [m],
     ("sums", 4),  # sums over the samples of x^2, F x, F and F^2,
@@ -278,7 +281,7 @@ def _begin(limits, m):
     k = int(m[_TICKS])
     first = k
     # The first of those that depart, two samples earlier for the lag of the filter.
-    for back in range(1, RING - 20):
+    for back in range(1, BACK):
         row = _RING + ROW * ((k - back) % RING)
         if k - back < 0 or m[row + 4] < 0.25 * limits.impact_force:
             break
@@ -290,6 +293,17 @@ def _begin(limits, m):
             speed += m[_RING + ROW * ((first - back) % RING) + 5]
             n += 1
     m[_BEFORE_SPEED] = speed / n if n > 0 else 0.0
+    force, n = 0.0, 0
+    gap, last = (
+        int(GAP_SEC / limits.period),
+        int((GAP_SEC + BEFORE_SEC) / limits.period),
+    )
+    for back in range(gap, min(last, RING - BACK - 4)):
+        if first - back >= 0 and back < m[_FILLED] - BACK:
+            force += m[_RING + ROW * ((first - back) % RING) + 6]
+            n += 1
+    if n > 0:
+        m[_BEFORE] = force / n
     row = _RING + ROW * (first % RING)
     m[_FIRST : _FIRST + 4] = m[row : row + 4]
     m[_PENDING] = k - first + 1.0
@@ -389,7 +403,7 @@ def detect(limits, memory, contact, time, wrench, pose, velocity, d, n, phase):
     row = _RING + ROW * (k % RING)
     m[row] = time
     m[row + 1 : row + 4] = pose[:3]
-    m[row + 4], m[row + 5] = innovation, speed
+    m[row + 4], m[row + 5], m[row + 6] = innovation, speed, f_raw
 
     if m[_PEAK_LEFT] > 0.0:
         m[_PEAK] = max(m[_PEAK], -_dot(m, _F, m[_PEAK_D : _PEAK_D + 3]))
