@@ -13,6 +13,7 @@ from makebreak.systems.numerics.planar_impedance import (
     after_sample,
     force_command,
     new_model,
+    predicted_force,
     stiffness_of,
     trust,
 )
@@ -56,9 +57,10 @@ class PlanarImpedance(LeafSystem):
     Inputs:  state (4,) p, v; x_desired (6,) p, v, a; force (2,) measured, of the world
              on the effector [N].
     Outputs: u (2,) [N]; stiffness (1,) [N/m]; force_predicted (2,) for the next sample
-             of the model [N]; prediction_error (1,) of the newest sample, as |.| [N],
-             -1 where there was no prediction; trust (1,) lambda; status (1,), a sum: 1
-             inputs not finite, u held, 2 u at its limit, 4 no model yet.
+             of the model, along the motion of now [N]; prediction_error (1,) of the
+             newest sample, as |.| [N], -1 where there was no prediction; trust (1,)
+             lambda; status (1,), a sum: 1 inputs not finite, u held, 2 u at its limit,
+             4 no model yet.
 
     Args: mass [kg]; force_max, the limit of |u| [N]; knowledge, a mixture from earlier;
         see numerics/planar_impedance.py.
@@ -124,9 +126,10 @@ class PlanarImpedance(LeafSystem):
         self.DeclareVectorOutputPort("stiffness", 1, self._calc_stiffness, ticket)
         self.DeclareVectorOutputPort("status", 1, self._calc_status, ticket)
         ticket = {self.abstract_state_ticket(self._model)}
-        self.DeclareVectorOutputPort("force_predicted", 2, self._calc_force, ticket)
         self.DeclareVectorOutputPort("prediction_error", 1, self._calc_error, ticket)
         self.DeclareVectorOutputPort("trust", 1, self._calc_trust, ticket)
+        ticket = ticket | {self.input_port_ticket(self._state.get_index())}
+        self.DeclareVectorOutputPort("force_predicted", 2, self._calc_force, ticket)
         self.DeclarePeriodicUnrestrictedUpdateEvent(
             model.period_sec, offset_sec, self._update_model
         )
@@ -153,7 +156,6 @@ class PlanarImpedance(LeafSystem):
             self._tuning,
             self._state.Eval(context),
             self._force.Eval(context),
-            self._target.Eval(context),
             self._along_motion,
             self._config.learn,
         )
@@ -173,7 +175,7 @@ class PlanarImpedance(LeafSystem):
             target,
             lam,
             K,
-            model.force.copy(),
+            predicted_force(model, state, self._along_motion),
             self._mass,
             float(c.damping_ratio),
             self._force_max,
@@ -195,7 +197,8 @@ class PlanarImpedance(LeafSystem):
         output.SetFromVector(context.get_discrete_state(self._command).value()[3:])
 
     def _calc_force(self, context: Context, output: BasicVector):
-        output.SetFromVector(self._model_of(context).force)
+        model, state = self._model_of(context), self._state.Eval(context)
+        output.SetFromVector(predicted_force(model, state, self._along_motion))
 
     def _calc_error(self, context: Context, output: BasicVector):
         error = self._model_of(context).error

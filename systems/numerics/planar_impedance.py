@@ -33,7 +33,7 @@ from makebreak.systems.numerics.planar_world import limited
 
 # Weight of the newest prediction error; at 200 Hz it is a filter of 14 ms.
 ERROR_WEIGHT = 0.3
-SLOW = 1e-3  # A target slower than this has no direction [m/s].
+SLOW = 1e-3  # What is slower than this has no direction [m/s].
 
 
 def trust(error, steepness, midpoint):
@@ -81,7 +81,6 @@ class ForceModel:
     features: np.ndarray | None  # S of the last sample; None: there was none.
     measured: np.ndarray  # D of the last sample [N].
     predicted: np.ndarray  # D of the next sample, as expected [N].
-    force: np.ndarray  # (2,) the same as a vector in the plane [N].
     error: float  # |measured - predicted| of the last sample [N]; NaN: no prediction.
     filtered: float  # The same, low-passed; infinite: never a prediction [N].
 
@@ -97,8 +96,7 @@ def new_model(tuning: IgmmTuning, mixture: Mixture | None, along_motion: bool):
     n = 1 if along_motion else 2
     zero = _frozen(np.zeros(n))
     mixture = empty_mixture(tuning) if mixture is None else mixture
-    force = _frozen(np.zeros(2))
-    return ForceModel(mixture, None, zero, zero, force, np.nan, np.inf)
+    return ForceModel(mixture, None, zero, zero, np.nan, np.inf)
 
 
 def _frozen(array) -> np.ndarray:
@@ -106,18 +104,29 @@ def _frozen(array) -> np.ndarray:
     return array
 
 
-def features_of(state, force, target, along_motion: bool):
+def features_of(state, force, along_motion: bool):
     """S and D of one sample.
 
-    Args: state (4,); force (2,) measured, of the world on it [N]; target (6,).
-    Returns: S (n,), D (m,), direction (2,) of the target's motion, zero at rest.
+    Args: state (4,); force (2,) measured, of the world on the effector [N].
+    Returns: S (n,), D (m,).
     """
     if not along_motion:
-        return np.concatenate([state[2:], force]), force, np.zeros(2)
-    speed = np.hypot(target[2], target[3])
-    d = target[2:4] / speed if speed > SLOW else np.zeros(2)
-    against = np.array([-force @ d])
-    return np.array([np.hypot(state[2], state[3]), against[0]]), against, d
+        return np.concatenate([state[2:], force]), force
+    against = np.array([-force @ direction_of(state)])
+    return np.concatenate([[np.hypot(state[2], state[3])], against]), against
+
+
+def direction_of(state):
+    """Unit vector of the velocity, (2,); zero at rest."""
+    speed = np.hypot(state[2], state[3])
+    return state[2:] / speed if speed > SLOW else np.zeros(2)
+
+
+def predicted_force(model: ForceModel, state, along_motion: bool):
+    """F_pred as a vector, (2,) [N]; state (4,): where the effector moves to now."""
+    if along_motion:
+        return -model.predicted[0] * direction_of(state)
+    return model.predicted.copy()
 
 
 def after_sample(
@@ -125,7 +134,6 @@ def after_sample(
     tuning: IgmmTuning,
     state,
     force,
-    target,
     along_motion: bool,
     learn: bool,
 ) -> ForceModel:
@@ -135,19 +143,11 @@ def after_sample(
 
     Args: as features_of; learn: whether the mixture takes the sample in.
     """
-    S, D, d = features_of(state, force, target, along_motion)
-    if not (np.isfinite(S).all() and np.isfinite(D).all()):
-        nothing = _frozen(np.zeros(2))
-        return ForceModel(
-            model.mixture,
-            None,
-            model.measured,
-            _frozen(np.zeros_like(model.predicted)),
-            nothing,
-            np.nan,
-            np.inf,
-        )
+    S, D = features_of(state, force, along_motion)
     mixture, error, filtered = model.mixture, np.nan, model.filtered
+    if not (np.isfinite(S).all() and np.isfinite(D).all()):
+        nothing = _frozen(np.zeros_like(model.predicted))
+        return ForceModel(mixture, None, model.measured, nothing, np.nan, np.inf)
     if model.features is not None:
         if mixture.count > 0:
             error = float(np.sqrt(np.sum((D - model.predicted) ** 2)))
@@ -156,14 +156,22 @@ def after_sample(
             filtered = filtered if known else error
         if learn:
             mixture, _ = learned(mixture, np.concatenate([model.features, D]), tuning)
-    predicted = regress(mixture, S)[0]
-    vector = -predicted[0] * d if along_motion else predicted.copy()
+    predicted = _frozen(regress(mixture, S)[0])
     return ForceModel(
-        mixture,
-        _frozen(S),
-        _frozen(D.copy()),
-        _frozen(predicted),
-        _frozen(vector),
-        error,
-        filtered,
+        mixture, _frozen(S), _frozen(D.copy()), predicted, error, filtered
     )
+
+
+def persistence(n_in: int, n_out: int) -> Mixture:
+    """No model at all, as a mixture: the next D is the D in S, whatever S is.
+
+    For comparison: what of a controller's performance is the measured force alone.
+
+    Args: n_in, entries of S, of which the last n_out are D.
+    """
+    n, wide, narrow = n_in + n_out, 1e3, 1e-3
+    factor = np.zeros((1, n, n))
+    factor[0, :n_in, :n_in] = wide * np.eye(n_in)
+    factor[0, n_in:, n_in - n_out : n_in] = wide * np.eye(n_out)
+    factor[0, n_in:, n_in:] = narrow * np.eye(n_out)
+    return Mixture(np.zeros((1, n)), factor, np.ones(1), np.ones(1), 1)

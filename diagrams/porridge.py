@@ -1,0 +1,70 @@
+"""A circle in the plane through porridge that thickens (CC 4.1, Fig. 4; 4.2.1)."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import Diagram, LeafSystem
+
+from makebreak.diagrams.planar import MASS, PERIOD, circle_of_seed, make_planar
+from makebreak.systems.baselines.mrac import MracConfig
+from makebreak.systems.numerics.igmm import IgmmConfig
+from makebreak.systems.planar_impedance import ForceModelConfig, PlanarImpedanceConfig
+from makebreak.systems.planar_world import CircleTargetConfig, PlanarWorldConfig
+
+
+def _model() -> ForceModelConfig:
+    return ForceModelConfig(IgmmConfig(sigma_ini=[0.05, 1.0, 1.0]), along_motion=True)
+
+
+@dataclass
+class PorridgeConfig:
+    seed: int = 0  # Draws start, direction, final viscosity of the test, and noise.
+    # Final viscosity in training and in the test [N s/m]; it rises from 0.
+    viscosity: list[float] = field(default_factory=lambda: [80.0, 150.0])
+    spread: float = 0.2  # Half width of the uniform draw of the latter.
+    force_noise: float = 0.2  # Standard deviation, each axis [N].
+    impedance: PlanarImpedanceConfig = field(default_factory=PlanarImpedanceConfig)
+    model: ForceModelConfig = field(default_factory=_model)
+    mrac: MracConfig = field(default_factory=MracConfig)
+
+
+def draw(
+    config: PorridgeConfig, training: bool
+) -> tuple[PlanarWorldConfig, CircleTargetConfig, int]:
+    """The world, the circle and the noise's seed, for training or for the test."""
+    c = config
+    if c.seed < 0:
+        raise ValueError(f"seed is {c.seed}, expected 0 or more")
+    viscosity = np.array(c.viscosity, dtype=float)
+    if viscosity.shape != (2,) or not 0.0 <= viscosity[0] < viscosity[1] < np.inf:
+        raise ValueError(
+            f"viscosity is {c.viscosity}, expected 2 numbers, the second larger"
+        )
+    if not 0.0 <= c.spread < 1.0:
+        raise ValueError(f"spread is {c.spread}, expected 0 <= spread < 1")
+    if not 0.0 <= c.force_noise < np.inf:
+        raise ValueError(f"force_noise is {c.force_noise}, expected >= 0")
+    rng = np.random.default_rng(c.seed)
+    target = circle_of_seed(rng)
+    tested = viscosity[1] * (1.0 + c.spread * rng.uniform(-1.0, 1.0))
+    world = PlanarWorldConfig(
+        mass=MASS,
+        viscosity=[0.0, float(viscosity[0] if training else tested)],
+        ramp_sec=target.duration_sec,
+        period_sec=PERIOD,
+    )
+    return world, target, 2 * c.seed + int(training)
+
+
+def make_porridge(
+    config: PorridgeConfig,
+    controller: LeafSystem,
+    training: bool = False,
+    meshcat: Meshcat | None = None,
+) -> Diagram:
+    """The closed loop of make_planar with this controller, in the seed's porridge."""
+    world, target, noise_seed = draw(config, training)
+    return make_planar(
+        controller, world, target, config.force_noise, noise_seed, meshcat
+    )
