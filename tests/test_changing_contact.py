@@ -1,0 +1,186 @@
+"""The diagram of the changing-contact experiments: wiring, rates, replay, bad input."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import InitializeParams, Simulator
+
+from makebreak.diagrams.changing_contact import (
+    SIGNALS,
+    ChangingContactConfig,
+    Knowledge,
+    learned,
+    make_changing_contact,
+    telemetry,
+)
+from makebreak.diagrams.tabletop import TABLETOP_WALLS, move, set_friction, set_tool
+from makebreak.models.scene import read_scene
+from makebreak.systems.numerics.contact_task import (
+    DONE,
+    MADE,
+    PHASE_SEGMENT,
+    PHASE_STAGE,
+    POSITION,
+    ContactBelief,
+    ExpectedContact,
+)
+from makebreak.systems.numerics.motion_pattern import MotionPattern, Segment
+
+START = np.array([0.42, -0.16, 0.195])  # Of the sphere's centre [m].
+RAISED = 0.095  # The table, so that the way down is short [m].
+TOUCH = RAISED + 0.02  # Height at which the sphere meets it [m].
+DOWN, LEFT = np.array([0.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0])
+
+
+def pattern():
+    """Down onto the table, and 0.1 m along it."""
+    low = START * [1, 1, 0] + [0, 0, TOUCH - 0.005]
+    return MotionPattern((
+        Segment("line", [START, low], [0.0, 0.8]),
+        Segment("line", [low, low + 0.1 * LEFT], [0.8, 2.0], force_directions=[DOWN],
+                force_targets=[5.0]),
+    ))  # fmt: skip
+
+
+def scene():
+    made = read_scene(TABLETOP_WALLS)
+    set_tool(made, "sphere")
+    set_friction(made, {"table": 0.3})
+    for name in ("table", "red_block", "blue_wall"):
+        move(made, name, [0.0, 0.0, RAISED])
+    return made
+
+
+def knowledge(error=0.015):
+    mean = START * [1, 1, 0] + [0, 0, TOUCH + error]
+    contact = ExpectedContact(mean, 0.015**2 * np.eye(3), DOWN, approach_speed=0.02)
+    return Knowledge(ContactBelief((contact,)))
+
+
+def build(**changes):
+    arguments = dict(
+        config=ChangingContactConfig(), world=scene(), model=scene(), pattern=pattern(),
+        knowledge=knowledge(), seed=0,
+    )  # fmt: skip
+    return make_changing_contact(**(arguments | changes))
+
+
+@pytest.fixture(scope="module")
+def trial():
+    """One whole motion. Returns: diagram, context at its end, telemetry, counts."""
+    diagram = build()
+    for system in diagram.GetSystems():
+        if hasattr(system, "compute_sec"):
+            system.compute_sec.clear()
+    simulator = Simulator(diagram)
+    simulator.AdvanceTo(0.5)
+    counts = {
+        s.get_name(): len(s.compute_sec)
+        for s in diagram.GetSystems()
+        if hasattr(s, "compute_sec")
+    }
+    middle = simulator.get_context().Clone()
+    simulator.AdvanceTo(4.0)
+    context = simulator.get_context()
+    return diagram, context, telemetry(diagram, context), counts, middle
+
+
+def test_the_tool_touches_slides_and_arrives(trial):
+    _, _, log, _, _ = trial
+    assert log["phase"][-1, PHASE_STAGE] == DONE
+    assert log["contact"][-1, MADE] == 1.0
+    # The contact gives by 0.05 mm per newton; it is felt within 1.5 mm.
+    touched = log["contact"][-1, POSITION]
+    np.testing.assert_allclose(touched[2], TOUCH, atol=2e-3)
+    np.testing.assert_allclose(log["ee_pose"][-1, 1], START[1] + 0.1, atol=2e-3)
+    # While sliding it presses with its target: within the sensor's noise of 0.1 N and
+    # what the force control lets through.
+    sliding = log["phase"][:, PHASE_SEGMENT] == 1
+    late = np.flatnonzero(sliding)[-300:]
+    assert abs(np.mean(log["wrench"][late, 2]) - 5.0) < 0.3
+
+
+def test_every_system_runs_at_its_rate(trial):
+    assert trial[3] == dict(
+        contact_detector=500, mode_detector=100, forward_model_bank=100,
+        contact_anticipator=50, velocity_shaper=500, variable_impedance=500,
+        impedance_controller=500,
+    )  # fmt: skip
+
+
+def test_no_number_is_nan_and_no_torque_is_beyond_its_limits(trial):
+    log = trial[2]
+    for name in SIGNALS:
+        assert np.isfinite(log[name]).all(), name
+    limit = np.array([87.0] * 4 + [12.0] * 3)
+    assert (abs(log["tau"]) <= limit).all()
+    # 1000 N m/s, a millisecond; 1e-9 for rounding.
+    assert abs(np.diff(log["tau"], axis=0)).max() <= 1.0 + 1e-9
+
+
+def test_a_context_replays_bit_for_bit(trial):
+    diagram, _, log, _, middle = trial
+    again = Simulator(diagram, middle.Clone())
+    again.Initialize(InitializeParams(suppress_initialization_events=True))
+    again.AdvanceTo(2.0)
+    ours = telemetry(diagram, again.get_context())
+    # The copied log goes on, and initialising it takes the sample at 0.5 s once more.
+    _, once = np.unique(ours["time"], return_index=True)
+    assert len(once) == 2001
+    for name in SIGNALS:
+        np.testing.assert_array_equal(ours[name][once], log[name][:2001], name)
+
+
+def test_what_was_learned_makes_the_next_trial_shorter_and_as_sure(trial):
+    diagram, context, log, _, _ = trial
+    known = learned(diagram, context)
+    assert known.contacts.contacts[0].seen == 1
+    # 15 mm off before; a contact is felt within 1.5 mm of where it is.
+    assert abs(known.contacts.contacts[0].mean[2] - TOUCH) < 2e-3
+    again = build(knowledge=known)
+    simulator = Simulator(again)
+    simulator.AdvanceTo(4.0)
+    later = telemetry(again, simulator.get_context())
+
+    def end(log):
+        return log["time"][np.argmax(log["phase"][:, PHASE_STAGE] == DONE)]
+
+    assert later["contact"][-1, MADE] == 1.0
+    assert end(later) < end(log) - 0.2
+
+
+MEASURED = {"panda.position_measured", "panda.velocity_measured"}
+MEASURED |= {"panda.external_wrench"}
+
+
+def test_no_ground_truth_reaches_a_controller():
+    diagram = build()
+    wires = [
+        (source.get_name(), source.get_output_port(port).get_name(), to.get_name())
+        for (to, _), (source, port) in diagram.connection_map().items()
+    ]
+    used = {p for name, p, to in wires if name == "station" and to != "telemetry"}
+    assert used == MEASURED
+    readers = {to for name, _, to in wires if name == "telemetry"}
+    assert readers == {"telemetry_log"}
+
+
+def test_seed_decides_a_run():
+    def short(seed):
+        diagram = build(seed=seed)
+        simulator = Simulator(diagram)
+        simulator.AdvanceTo(0.05)
+        return telemetry(diagram, simulator.get_context())["tau"]
+
+    np.testing.assert_array_equal(short(3), short(3))
+    assert (short(3) != short(4)).any()
+
+
+def test_periods_are_the_diagrams():
+    config = ChangingContactConfig()
+    config.shaper = replace(config.shaper, period_sec=0.002)
+    with pytest.raises(ValueError, match="period_sec is 0.002, expected 0.001: the di"):
+        build(config=config)
+    with pytest.raises(ValueError, match="hammer"):
+        build(tool="hammer")
