@@ -252,13 +252,12 @@ class LoadedScene:
                 change = KINDS[effect.kind].set_in_context
                 if change is not None:
                     change(old, effect, plant, plant_context)
-        for system, each in (
-            (self.joint_forces, _joint_numbers),
-            (self.body_forces, _body_numbers),
-        ):
-            if system is not None:
-                own = system.GetMyMutableContextFromRoot(root_context)
-                system.set_numbers(own, each(plant, new))
+        if self.joint_forces is not None:
+            own = self.joint_forces.GetMyMutableContextFromRoot(root_context)
+            self.joint_forces.set_numbers(own, _joint_numbers(plant, new))
+        if self.body_forces is not None:
+            own = self.body_forces.GetMyMutableContextFromRoot(root_context)
+            self.body_forces.set_numbers(own, _body_numbers(plant, new))
         hidden = [effect for effect in new if KINDS[effect.kind].hidden_state]
         for system, effect in zip(self.couplings, hidden, strict=True):
             own = system.GetMyMutableContextFromRoot(root_context)
@@ -524,7 +523,7 @@ def _drive(
     driven = np.array([name in actuation.joints for name in names], dtype=bool)
     if actuation.type != "pd" or not driven.any():
         return None
-    gains = []
+    gains: list[np.ndarray] = []
     for key, values in (("kp", actuation.kp), ("kd", actuation.kd)):
         if len(values) not in (1, len(actuation.joints)) or not all(
             value >= 0.0 for value in values
@@ -546,7 +545,8 @@ def _drive(
     offsets = [effect for effect in effects if KINDS[effect.kind].channel == "offset"]
     maps = channel_maps(offsets, CHANNEL_STEPS, [f"{name}.position" for name in names])
     return Drive(
-        *gains,
+        gains[0],
+        gains[1],
         driven,
         np.array([joint.position_start() for joint in joints]),
         np.array([n_q + joint.velocity_start() for joint in joints]),

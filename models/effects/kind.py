@@ -79,7 +79,8 @@ class EffectKind:
         first, on the body at its origin; body_numbers(effect) -> its numbers p.
     path: what it does between command and plant, of a name in actuation_path.STEPS.
     channel: what it does to a measured channel, of a name in measurement.STEPS.
-    set_in_context(effect, plant, plant_context): new parameters without a new plant.
+    set_in_context(old, new, plant, plant_context): other parameters without a new
+        plant; old: the effect whose parameters the context has.
     now(effect, plant, scene_graph): the parameters at which `effect` (whose own do not
         matter) would leave the model as it is; None: the neutral values.
     signature: see models/effects/signature.py; None: it is seen in simulation alone.
@@ -106,7 +107,9 @@ class EffectKind:
     body_numbers: Callable[[Effect], list[float]] | None = None
     path: str = ""
     channel: str = ""
-    set_in_context: Callable[[Effect, MultibodyPlant, Context], None] | None = None
+    set_in_context: Callable[[Effect, Effect, MultibodyPlant, Context], None] | None = (
+        None
+    )
     now: Callable[[Effect, MultibodyPlant, SceneGraph], Mapping[str, float]] | None = (
         None
     )

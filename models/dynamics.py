@@ -1,0 +1,305 @@
+"""A scene's rigid-body dynamics on arrays of samples, for residuals and signatures.
+
+    effort = ID(q, v, vd) = d/dt (M v) + rest(q, v)
+
+with gravity, the model's own damping, rotors and the effects that the scene has. What
+is left out: contact, the actuation path (the effort is what acts on the joints), and
+effects with coordinates that no channel measures (elasticity, backlash).
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    BodyIndex,
+    JacobianWrtVariable,
+    MultibodyForces,
+    RigidBody,
+)
+from pydrake.systems.framework import DiagramBuilder
+
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.body_forces import MAX_NUMBERS as BODY_NUMBERS
+from makebreak.models.effects.kind import (
+    Effect,
+    find_bodies,
+    full_name,
+    model_names,
+    one_dof_joints,
+)
+from makebreak.models.effects.signature import Grid, Motion, Signature
+from makebreak.models.scene import LoadedScene, Scene, load_scene, read_scene
+
+
+class SceneDynamics:
+    """Residuals of a scene's model and what any kind of effect would add to them.
+
+    It has one Context of its own, so one of these serves one thread.
+    """
+
+    def __init__(self, scene: Scene | str | Path):
+        if not isinstance(scene, Scene):
+            scene = read_scene(scene)
+        measured = [
+            effect
+            for effect in scene.effects
+            if effect.kind not in KINDS or not KINDS[effect.kind].hidden_state
+        ]
+        self.loaded: LoadedScene = load_scene(
+            replace(scene, effects=measured), DiagramBuilder()
+        )
+        self.plant: MultibodyPlant = self.loaded.plant
+        self.gravity = np.array(self.plant.gravity_field().gravity_vector())
+        self._context = self.plant.CreateDefaultContext()
+        self._forces = MultibodyForces(self.plant)
+        self._joint_numbers, self._body_laws = _laws(self.loaded)
+        self._coordinates = _coordinates(self.plant)
+
+    # ----- The model
+
+    def inverse_dynamics(self, q, v, vd, time=None) -> np.ndarray:
+        """Effort (n, n_v) for the motion q (n, n_q), v, vd (n, n_v) at time (n,) [s],
+        which only matters for forces that depend on it."""
+        plant, context, forces = self.plant, self._context, self._forces
+        n = len(v)
+        time = np.zeros(n) if time is None else time
+        effort = np.empty((n, plant.num_velocities()))
+        joint_forces = self.loaded.joint_forces
+        for k in range(n):
+            plant.SetPositions(context, q[k])
+            plant.SetVelocities(context, v[k])
+            plant.CalcForceElementsContribution(context, forces)
+            if self._body_laws:
+                self._add_body_forces(time[k])
+            effort[k] = plant.CalcInverseDynamics(context, vd[k], forces)
+            if joint_forces is not None:
+                x = np.concatenate([q[k], v[k]]).tolist()
+                effort[k] -= joint_forces.force(x, time[k], self._joint_numbers)
+        return effort
+
+    def momentum(self, q, v) -> np.ndarray:
+        """M(q) v, (n, n_v) [kg m2/s] or [kg m/s]."""
+        out = np.empty_like(v)
+        for k in range(len(v)):
+            self.plant.SetPositions(self._context, q[k])
+            out[k] = self.plant.CalcMassMatrix(self._context) @ v[k]
+        return out
+
+    def rest(self, q, v, time=None) -> np.ndarray:
+        """ID(q, v, 0) - dM/dt v, (n, n_v): what the effort is beside d/dt (M v)."""
+        step = 1e-5  # [s]: central difference, error step^2.
+        after = self.momentum(self.shifted(q, v, step), v)
+        before = self.momentum(self.shifted(q, v, -step), v)
+        still = self.inverse_dynamics(q, v, np.zeros_like(v), time)
+        return still - (after - before) / (2.0 * step)
+
+    def residual(self, motion: Motion) -> np.ndarray:
+        """effort - ID, (n, n_v): what the model does not explain."""
+        return motion.effort - self.inverse_dynamics(
+            motion.q, motion.v, motion.vd, motion.time
+        )
+
+    def body_motion(self, body: RigidBody, q, v, vd):
+        """Of a body's origin in world, rotation first: Jacobian (n, 6, n_v), velocity
+        (n, 6), acceleration (n, 6); and the body's rotation (n, 3, 3)."""
+        plant, context, W = self.plant, self._context, self.plant.world_frame()
+        n, n_v = len(v), plant.num_velocities()
+        J, V, A = np.empty((n, 6, n_v)), np.empty((n, 6)), np.empty((n, 6))
+        R = np.empty((n, 3, 3))
+        wrt, B, zero = JacobianWrtVariable.kV, body.body_frame(), np.zeros(3)
+        for k in range(n):
+            plant.SetPositions(context, q[k])
+            plant.SetVelocities(context, v[k])
+            J[k] = plant.CalcJacobianSpatialVelocity(context, wrt, B, zero, W, W)
+            bias = plant.CalcBiasSpatialAcceleration(context, wrt, B, zero, W, W)
+            V[k], A[k] = J[k] @ v[k], J[k] @ vd[k] + bias.get_coeffs()
+            R[k] = plant.EvalBodyPoseInWorld(context, body).rotation().matrix()
+        return J, V, A, R
+
+    def mass_times_com_jacobian(self, q) -> np.ndarray:
+        """(n, 3, n_v): gravity's generalized force is its transpose times gravity."""
+        plant, context, W = self.plant, self._context, self.plant.world_frame()
+        out = np.zeros((len(q), 3, plant.num_velocities()))
+        if plant.num_velocities() == 0:
+            return out
+        mass = plant.CalcTotalMass(context)
+        for k in range(len(q)):
+            plant.SetPositions(context, q[k])
+            out[k] = mass * plant.CalcJacobianCenterOfMassTranslationalVelocity(
+                context, JacobianWrtVariable.kV, W, W
+            )
+        return out
+
+    def shifted(self, q, dq, step: float) -> np.ndarray:
+        """q (n, n_q) moved by step times dq (n, n_v), as a velocity would."""
+        out = np.array(q, dtype=float)
+        for k in range(len(out)):
+            self.plant.SetPositions(self._context, q[k])
+            out[k] += step * self.plant.MapVelocityToQDot(self._context, dq[k])
+        return out
+
+    # ----- Channels
+
+    def channels(self) -> list[str]:
+        """The channels of joints and free bodies that are coordinates of this model."""
+        return list(self._coordinates)
+
+    def coordinates(self, channel: str) -> tuple[str, int]:
+        """What a channel measures: "q", "v" or "effort", and its index in v's order."""
+        return self._coordinates[channel][:2]
+
+    def value(self, motion: Motion, channel: str) -> np.ndarray:
+        """(n,) the channel in a motion."""
+        what, i_v, i_q = self._coordinates[channel]
+        return (
+            motion.q[:, i_q]
+            if what == "q"
+            else (motion.v if what == "v" else motion.effort)[:, i_v]
+        )
+
+    # ----- Effects
+
+    def signatures(
+        self, kind: str, at: Sequence[str], motion: Motion, grid: Grid | None = None
+    ) -> list[Signature]:
+        """How an effect of a kind at a place would show in the residual.
+
+        Args: grid: values to hold for a kind's nonlinear parameters, in place of the
+            kind's own ({"periods_per_rev": [6, 12]}).
+        Returns: alternatives, one for each held value; empty if the kind shows in
+            simulation alone (contact, shapes, elasticity).
+        Raises: ValueError if `at` is not in the scene.
+        """
+        signature = KINDS[kind].signature
+        if signature is None:
+            return []
+        return signature(Effect(kind, list(at), {}), self, motion, grid)
+
+    def places(self, kind: str) -> list[str]:
+        """Where a kind could act in this scene: one `at` each.
+
+        For channels: those that this model has; a recording may have fewer."""
+        return places(self.loaded, KINDS[kind].at, self.channels())
+
+    def now(self, kind: str, at: Sequence[str]) -> dict[str, float]:
+        """The parameters at which the effect would change nothing: where a search
+        starts. Parameters that then have no meaning are left out."""
+        entry = KINDS[kind]
+        if entry.now is not None:
+            effect = Effect(kind, list(at), {})
+            return dict(entry.now(effect, self.plant, self.loaded.scene_graph))
+        return {
+            each.name: each.neutral
+            for each in entry.parameters
+            if each.neutral is not None
+        }
+
+    def _add_body_forces(self, time: float) -> None:
+        assert self.loaded.body_forces is not None
+        for law, body, p in self._body_laws:
+            V = self.plant.EvalBodySpatialVelocityInWorld(self._context, body)
+            F = np.zeros(6)
+            law(np.array(V.get_coeffs()), time, p, F)
+            body.AddInForceInWorld(self._context, SpatialForce(F), self._forces)
+
+
+def places(loaded: LoadedScene, at: str, channels: Sequence[str]) -> list[str]:
+    """The places of a scene at which an effect on `at` (EffectKind.at) can be."""
+    plant = loaded.plant
+    joints = [
+        joint
+        for joint in one_dof_joints(plant)
+        if joint.num_velocities()
+        and not plant.GetModelInstanceName(joint.model_instance()).startswith("motor_")
+    ]
+    bodies = [
+        plant.get_body(i)
+        for model in model_names(plant)
+        for i in plant.GetBodyIndices(plant.GetModelInstanceByName(model))
+        if plant.get_body(i).index() != plant.world_body().index()
+        and not model.startswith(("payload_on_", "motor_of_"))
+    ]
+    moving = [body for body in bodies if not plant.IsAnchored(body)]
+    free = [body for body in bodies if body.is_floating_base_body()]
+    shaped = [body for body in bodies if plant.GetCollisionGeometriesForBody(body)]
+
+    def named(elements) -> list[str]:
+        return [full_name(plant, each) for each in elements]
+
+    if at == "joint":
+        return named(joints)
+    if at == "actuator":
+        driven = {
+            plant.get_joint_actuator(i).joint().index()
+            for i in plant.GetJointActuatorIndices()
+        }
+        return named(joint for joint in joints if joint.index() in driven)
+    if at == "body":
+        return named(moving)
+    if at == "ground":
+        return named(body for body in shaped if plant.IsAnchored(body))
+    if at == "pair":
+        return [
+            f"{a}~{b}"
+            for i, a in enumerate(named(shaped))
+            for j, b in enumerate(named(shaped))
+            if shaped[i] in free and (shaped[j] not in free or i < j)
+        ]
+    if at == "channel":
+        return list(channels)
+    if at == "length":
+        return named(free)
+    # base: the models that hold a mechanism, and the world.
+    models = {plant.GetModelInstanceName(joint.model_instance()) for joint in joints}
+    return [*sorted(models), "world"]
+
+
+def _laws(loaded: LoadedScene):
+    """Numbers of the joint laws as built; body laws with their bodies and numbers."""
+    joint_numbers = np.zeros(0)
+    if loaded.joint_forces is not None:
+        context = loaded.joint_forces.CreateDefaultContext()
+        joint_numbers = np.array(context.get_numeric_parameter(0).value())
+    body_laws = []
+    for effect in loaded.effects:
+        kind = KINDS[effect.kind]
+        if kind.body_law is None or kind.body_numbers is None:
+            continue
+        p = np.zeros(BODY_NUMBERS)
+        numbers = kind.body_numbers(effect)
+        p[: len(numbers)] = numbers
+        body_laws += [
+            (kind.body_law, body, p) for body in find_bodies(effect, loaded.plant)
+        ]
+    return joint_numbers, body_laws
+
+
+def _coordinates(plant: MultibodyPlant) -> dict[str, tuple[str, int, int]]:
+    """Channel -> what, index in v, index in q (of positions)."""
+    found: dict[str, tuple[str, int, int]] = {}
+    driven = {
+        plant.get_joint_actuator(i).joint().index()
+        for i in plant.GetJointActuatorIndices()
+    }
+    for joint in one_dof_joints(plant):
+        name, i_v = full_name(plant, joint), joint.velocity_start()
+        found[f"{name}.position"] = ("q", i_v, joint.position_start())
+        found[f"{name}.velocity"] = ("v", i_v, -1)
+        if joint.index() in driven:
+            found[f"{name}.effort_measured"] = ("effort", i_v, -1)
+    for i in range(plant.num_bodies()):
+        body = plant.get_body(BodyIndex(i))
+        if not body.is_floating_base_body() or not body.has_quaternion_dofs():
+            continue
+        name = full_name(plant, body)
+        start = body.floating_velocities_start_in_v()
+        for k, suffix in enumerate("wx wy wz vx vy vz".split()):
+            found[f"{name}.{suffix}"] = ("v", start + k, -1)
+        for k, suffix in enumerate("xyz"):
+            i_q = body.floating_positions_start() + 4 + k
+            found[f"{name}.{suffix}"] = ("q", start + 3 + k, i_q)
+    return found
