@@ -8,7 +8,6 @@ from pydrake.systems.framework import Context, LeafSystem
 
 from makebreak.systems.numerics.contact_task import (
     N_CONTACT,
-    PHASE_SPEED,
     ContactBelief,
 )
 from makebreak.systems.numerics.motion_pattern import MotionPattern
@@ -18,10 +17,10 @@ from makebreak.systems.numerics.velocity_shaper import (
     N_REGIONS,
     ShaperLaw,
     blended,
-    continued,
     expected,
     plan,
     pose_output,
+    take_over,
     tick,
     warm_up,
 )
@@ -55,12 +54,13 @@ class VelocityShaperConfig:
 
 @dataclass(frozen=True, eq=False)
 class _Patterns:
-    """The pattern that runs, and the one that it replaces from time t on."""
+    """The pattern that runs, and the one that it replaces from time t on, within T."""
 
     now: MotionPattern
     given: MotionPattern  # As the port had it.
     old: MotionPattern | None = None
     t: float = 0.0
+    T: float = 0.0
 
     def __copy__(self):
         return self
@@ -83,7 +83,7 @@ class VelocityShaper(LeafSystem):
 
     Inputs:  contacts (ContactBelief); contact (14,); ee_pose (7,); optional motion
              (MotionPattern): another one that comes there is taken over, from where the
-             motion is and at its speed, blended in over blend_sec.
+             motion is and at its speed, blended in over blend_sec or more.
     Outputs, all of them state: x_desired (19,) = [p, quaternion wxyz, v, w, a, alpha]
              of the tip in the world; direction (3,) unit vector of the motion, zero at
              rest; force_directions (6,), two rows, zero: none; force_targets (2,) [N];
@@ -105,7 +105,7 @@ class VelocityShaper(LeafSystem):
         self._law = law = _law(config)
         if not 0.0 < plan_sec < np.inf:
             raise ValueError(f"plan_sec is {plan_sec}, expected > 0")
-        self._pattern, self._blend_sec = pattern, law.blend_sec
+        self._pattern = pattern
         self._no_regions, self._no_contact = np.zeros(N_REGIONS), np.zeros(N_CONTACT)
         warm_up(pattern, law)
         self._contacts = self.DeclareAbstractInputPort(
@@ -156,17 +156,18 @@ class VelocityShaper(LeafSystem):
         if self._motion.HasValue(context):
             given = self._motion.Eval(context)
             # A blend that runs is finished first; the newest pattern is taken then.
-            free = patterns.old is None or t >= patterns.t + self._blend_sec
+            free = patterns.old is None or t >= patterns.t + patterns.T
             if given is not patterns.given and free:
                 now = MotionPattern(
                     given.segments, given.acceleration_max, self._pattern.base
                 )
                 discrete.set_value(int(self._memory_old), memory)
-                phase = context.get_discrete_state(self._outputs[-1]).value()
                 contact = self._contact.Eval(context)
-                memory = continued(now.table, contact, t, phase[PHASE_SPEED])
+                memory, T = take_over(
+                    now.table, self._law, contact, t, patterns.now.table, memory
+                )
                 discrete.set_value(int(self._memory), memory)
-                patterns = _Patterns(now, given, patterns.now, t)
+                patterns = _Patterns(now, given, patterns.now, t, T)
                 state.get_mutable_abstract_state(int(self._patterns)).set_value(
                     patterns
                 )
@@ -188,13 +189,13 @@ class VelocityShaper(LeafSystem):
             patterns = self._now(context)
             table, old = patterns.now.table, patterns.old
         memory, X, *rest = tick(table, law, regions, memory, t, contact, pose)
-        if old is not None and t < patterns.t + self._blend_sec:
+        if old is not None and t < patterns.t + patterns.T:
             before = context.get_discrete_state(self._memory_old).value()
             before, X_old, *_ = tick(
                 old.table, law, self._no_regions, before, t, self._no_contact, pose
             )
             discrete_state.set_value(self._memory_old, before)
-            X = blended(X_old, X, t - patterns.t, self._blend_sec)
+            X = blended(X_old, X, t - patterns.t, patterns.T)
         discrete_state.set_value(self._memory, memory)
         discrete_state.set_value(self._outputs[0], pose_output(X, self._pattern.base))
         for state, value in zip(self._outputs[1:], rest, strict=True):

@@ -640,11 +640,35 @@ def tick(table, law, regions, memory, t, contact, pose):
 
 
 @numba.njit(cache=True)
-def continued(table, contact, t, speed):
-    """Memory for a pattern that takes over from another one, at that speed [m/s]."""
-    m = start(table, contact, t, min(speed, _head(table, 0, SPEED)))
+def take_over(table, law, contact, t, old_table, old_memory):
+    """Another pattern takes over: from the point of its first segment that is nearest
+    to the reference, at the speed that the reference has along it.
+
+    Returns: its memory, and how long the blend from the old one takes [s]: blend_sec,
+        or longer, so that what the blend adds stays about within a_max.
+    """
+    X, _, _ = _reference(old_table, old_memory, t)
+    L, n = _head(table, 0, LENGTH), 256
+    s, nearest = 0.0, np.inf
+    for i in range(n + 1):
+        D = path_point(table, 0, L * i / n)
+        _add_along(D[0], X[0], -1.0)
+        square = _dot(D[0], D[0])
+        if square < nearest:  # To first order in the rest along the path.
+            s, nearest = L * i / n - _dot(D[0], D[1]), square
+    s = min(max(s, 0.0), L)
+    D = path_point(table, 0, s)
+    speed = min(max(_dot(X[1], D[1]), 0.0), _head(table, 0, SPEED))
+    m = start(table, contact, t, speed)
     m[_INIT] = 2.0  # It does not wait for its first time.
-    return m
+    m[_NOW + _S0] = s
+    gap, dv = 0.0, 0.0
+    for i in range(6):
+        gap += (X[0, i] - D[0, i]) ** 2
+        dv += (X[1, i] - speed * D[1, i]) ** 2
+    T = np.sqrt(2.0 * BEND_MAX * np.sqrt(gap) / law.acceleration_max)
+    # The gap grows by dv t: S'' dv t and 2 S' dv add up to about 6 dv / T.
+    return m, max(law.blend_sec, T, 6.0 * np.sqrt(dv) / law.acceleration_max)
 
 
 @numba.njit(cache=True)
@@ -801,4 +825,4 @@ def warm_up(pattern: MotionPattern, law: ShaperLaw) -> None:
     _, X, *_ = tick(pattern.table, law, regions, memory, 0.0, contact, pose)
     pose_output(blended(X, X, 0.0, 1.0), pattern.base)
     plan(pattern.table, law, memory, 0.0, np.zeros((0, N_EXPECTED)))
-    continued(pattern.table, contact, 0.0, 0.0)
+    take_over(pattern.table, law, contact, 0.0, pattern.table, memory)
