@@ -16,9 +16,9 @@ feature.
 
 A *departure* is a difference to the reference of TRIGGER force_noise / R in SUSTAINED
 samples in a row, or of half of it in the mean over about 50 ms. The time of the change
-is that of the first departing sample. Nothing is decided before the tool has gone `crossing`
-on, the way that it needs to cross a seam: while it stands on both sides the feature is
-a mixture and no mode. Then the mode is
+is that of the first departing sample. Nothing is decided before the tool has gone
+`crossing` on, the way that it needs to cross a seam: while it stands on both sides the
+feature is a mixture and no mode. Then the mode is
 
   known   if EARLY samples in a row are near its centroid, or a share CONFIDENT of a
           batch belongs to it (mode_table.py);
@@ -193,7 +193,8 @@ def detect(
 
     Args: time [s]; wrench (6,) on the tool, force first [N], [N m]; velocity (6,)
         [m/s], [rad/s]; direction (3,) of the target motion, zero at rest;
-        force_directions (6,); hint: the number of the mode that begins here, UNKNOWN_MODE: none.
+        force_directions (6,); hint: the number of the mode that begins here,
+        UNKNOWN_MODE: none.
 
     A wrench that is not finite or at its limit changes nothing but the status, and the
     averages begin anew after it.

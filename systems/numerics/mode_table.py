@@ -8,9 +8,8 @@ Source: CC section 3.2; Zhang, Ramakrishnan, Livny, "BIRCH: a new data clusterin
 algorithm" (1997), as scikit-learn has it.
 """
 
-import copy
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,8 +28,11 @@ class ModeTable:
     threshold: float  # Radius of a subcluster, in units of the feature.
     centroids: np.ndarray  # (n_modes, d), mode k + 1 in row k.
     weights: np.ndarray  # (n_modes,) samples that each has had.
-    samples: np.ndarray  # (n, d) all that BIRCH has been given, in order.
-    tree: Birch | None = field(repr=False)  # Never changed once it is here.
+    # (n, d) All that BIRCH has been given, in order. Its tree is grown anew from them
+    # when a batch comes (5 us per sample): scikit-learn's tree cannot be copied, for
+    # its nodes hold views of their own arrays, and a tree that is shared would let a
+    # restored Context see what was learned after it.
+    samples: np.ndarray
     centres: np.ndarray  # (n_subclusters, d)
     labels: np.ndarray  # (n_subclusters,) mode of each, 0: none.
 
@@ -87,12 +89,10 @@ class ModeTable:
             share = len(batch) / (weights[mode - 1] + len(batch))
             centroids[mode - 1] += share * (batch.mean(axis=0) - centroids[mode - 1])
             weights[mode - 1] = min(weights[mode - 1] + len(batch), WEIGHT_MAX)
-        samples, tree = self.samples, self.tree
+        samples = self.samples
         if len(samples) + len(batch) <= SAMPLES_MAX:
             samples = np.vstack([samples, batch])
-            tree = _new_tree(self.threshold) if tree is None else copy.deepcopy(tree)
-            tree.partial_fit(batch)
-        return _labelled(self.threshold, centroids, weights, samples, tree)
+        return _labelled(self.threshold, centroids, weights, samples)
 
     def save(self, path: str | Path) -> None:
         """Writes it as JSON."""
@@ -103,8 +103,7 @@ class ModeTable:
 
     @staticmethod
     def load(path: str | Path) -> "ModeTable":
-        """What `save` wrote. BIRCH is given its samples again, in order: its tree does
-        not depend on how they came in batches.
+        """What `save` wrote.
 
         Raises: ValueError if the file is missing or is no table.
         """
@@ -119,8 +118,7 @@ class ModeTable:
                 raise ValueError("one weight per centroid is expected")
             if not all(np.all(np.isfinite(a)) for a in (samples, centroids, weights)):
                 raise ValueError("a number is not finite")
-            tree = _new_tree(threshold).partial_fit(samples) if len(samples) else None
-            return _labelled(threshold, centroids, weights, samples, tree)
+            return _labelled(threshold, centroids, weights, samples)
         except (OSError, KeyError, TypeError, IndexError, ValueError) as error:
             raise ValueError(f"modes {path}: {' '.join(str(error).split())}") from None
 
@@ -128,18 +126,15 @@ class ModeTable:
 def no_modes(n_features: int, threshold: float) -> ModeTable:
     """A table without modes."""
     none = np.zeros((0, n_features))
-    return _labelled(float(threshold), none, np.zeros(0), none, None)
+    return _labelled(float(threshold), none, np.zeros(0), none)
 
 
-def _new_tree(threshold: float) -> Birch:
-    return Birch(n_clusters=None, threshold=threshold, compute_labels=False)
-
-
-def _labelled(threshold, centroids, weights, samples, tree) -> ModeTable:
+def _labelled(threshold, centroids, weights, samples) -> ModeTable:
     """The table, with the subclusters told off to the modes."""
     centres = np.zeros((0, centroids.shape[1]))
-    if tree is not None:
-        centres = np.array(tree.subcluster_centers_, dtype=float)
+    if len(samples):
+        tree = Birch(n_clusters=None, threshold=threshold, compute_labels=False)
+        centres = np.array(tree.partial_fit(samples).subcluster_centers_, dtype=float)
     # A mode's own centroid counts as a subcluster: BIRCH may have merged it away.
     centres = np.vstack([centres, centroids])
     labels = np.zeros(len(centres), dtype=int)
@@ -148,4 +143,4 @@ def _labelled(threshold, centroids, weights, samples, tree) -> ModeTable:
         nearest = np.argmin(distance, axis=1)
         near = distance[np.arange(len(centres)), nearest] <= REACH * threshold
         labels[near] = nearest[near] + 1
-    return ModeTable(threshold, centroids, weights, samples, tree, centres, labels)
+    return ModeTable(threshold, centroids, weights, samples, centres, labels)
