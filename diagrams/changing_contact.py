@@ -149,6 +149,7 @@ def make_changing_contact(
                 tool=tool,
                 contact=[tool, *objects(world)],
                 seed=seed,
+                sampled=True,
             ),
             meshcat,
             world,

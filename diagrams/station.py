@@ -42,6 +42,9 @@ class StationConfig:
     contact: list[str] = field(default_factory=lambda: [TOOL, "ball"])  # To be scored.
     seed: int = 0
     meshcat_period_sec: float = 1.0 / 30.0
+    # Sensors are read once per step of the plant, and all who ask in it get that
+    # reading. Else each is worked out, with noise of its own, whenever it is asked for.
+    sampled: bool = False
 
 
 def make_station(
@@ -92,7 +95,7 @@ def make_station(
     def noisy(name: str, port: OutputPort, std, seed) -> OutputPort:
         if not np.any(std):
             return port
-        sensor = NoisySensor(std, int(seed), period)
+        sensor = NoisySensor(std, int(seed), period, held=config.sampled)
         builder.AddNamedSystem(name, sensor)
         builder.Connect(port, sensor.GetInputPort("value"))
         return sensor.GetOutputPort("measured")
@@ -132,7 +135,8 @@ def make_station(
         if joint.child_body().model_instance() == tool
     )
     wrench = builder.AddNamedSystem(
-        f"{ARM}_tool_wrench", ToolWrench(plant, mount.name(), TIP_FRAME)
+        f"{ARM}_tool_wrench",
+        ToolWrench(plant, mount.name(), TIP_FRAME, period if config.sampled else None),
     )
     builder.Connect(
         plant.get_reaction_forces_output_port(), wrench.GetInputPort("reaction_forces")

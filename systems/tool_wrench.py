@@ -18,11 +18,23 @@ class ToolWrench(LeafSystem):
     Inputs:  reaction_forces (abstract) and state (n_x,) of the plant.
     Outputs: wrench (6,) on the tool at its tip, world axes, force first [N], [N m].
 
+    It is worked out when asked for, from the torques and the state of that instant:
+    for a discrete plant, what the mount would carry in a step that begins with them.
+    With a period it is sampled just as the plant steps, and is what the mount carries
+    in the step that is then made (and costs no solution of the contact of its own).
+
     Args: plant, finalized; joint, name of the weld that mounts the tool, the tool its
-        child; tip, name of a frame on the tool.
+        child; tip, name of a frame on the tool; period_sec, the plant's time step, or
+        None.
     """
 
-    def __init__(self, plant: MultibodyPlant, joint: str, tip: str):
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        joint: str,
+        tip: str,
+        period_sec: float | None = None,
+    ):
         super().__init__()
         self._plant = plant
         mount = plant.GetJointByName(joint)
@@ -46,20 +58,29 @@ class ToolWrench(LeafSystem):
             "reaction_forces", AbstractValue.Make([SpatialForce.Zero()])
         )
         self._x = self.DeclareVectorInputPort("state", plant.num_multibody_states())
-        self.DeclareVectorOutputPort("wrench", 6, self._calc)
+        if period_sec is None:
+            self.DeclareVectorOutputPort("wrench", 6, self._calc)
+        else:
+            self._sampled = self.DeclareDiscreteState(6)
+            self.DeclareStateOutputPort("wrench", self._sampled)
+            self.DeclarePeriodicDiscreteUpdateEvent(period_sec, 0.0, self._sample)
 
     def _calc(self, context: Context, output: BasicVector):
+        output.SetFromVector(self._wrench(context))
+
+    def _sample(self, context: Context, discrete_state):
+        discrete_state.set_value(self._sampled, self._wrench(context))
+
+    def _wrench(self, context: Context) -> np.ndarray:
         self._plant.SetPositionsAndVelocities(
             self._plant_context, self._x.Eval(context)
         )
         reaction = self._reactions.Eval(context)[self._ordinal]
-        output.SetFromVector(
-            external_wrench(
-                reaction.translational(),
-                reaction.rotational(),
-                self._mount.CalcRotationMatrixInWorld(self._plant_context).matrix(),
-                self._weight,
-                self._p_CM,
-                self._p_CE,
-            )
+        return external_wrench(
+            reaction.translational(),
+            reaction.rotational(),
+            self._mount.CalcRotationMatrixInWorld(self._plant_context).matrix(),
+            self._weight,
+            self._p_CM,
+            self._p_CE,
         )

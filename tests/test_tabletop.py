@@ -2,9 +2,15 @@ import numpy as np
 import pytest
 from pydrake.geometry import Role
 from pydrake.math import RollPitchYaw
+from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.diagrams.station import StationConfig, make_control_plant, make_station
+from makebreak.diagrams.station import (
+    SensorNoise,
+    StationConfig,
+    make_control_plant,
+    make_station,
+)
 from makebreak.diagrams.tabletop import (
     SURFACE_SWITCH,
     TABLETOP_WALLS,
@@ -21,7 +27,7 @@ from makebreak.diagrams.tabletop import (
 from makebreak.models.scene import load_scene, read_scene
 from makebreak.systems.impedance_controller import serial_chain_of
 from makebreak.systems.numerics.impedance_controller import rotation_error
-from makebreak.systems.numerics.serial_chain import tip_kinematics
+from makebreak.systems.numerics.serial_chain import chain_state, tip_kinematics
 from makebreak.systems.numerics.tip_state import tip_pose, tip_velocity
 
 SCENES = [TABLETOP_WALLS, THREE_SURFACES, SURFACE_SWITCH]
@@ -258,3 +264,53 @@ def test_tip_pose_and_velocity_agree_with_drake():
         np.testing.assert_allclose(pose, expected, atol=1e-12)
         expected = [*V.translational(), *V.rotational()]
         np.testing.assert_allclose(tip_velocity(chain, q, v), expected, atol=1e-12)
+
+
+def test_sampled_sensors_are_read_once_per_step_and_cost_no_other_contact():
+    # The wrench of a step is what the contact of that very step gives: without noise the
+    # tool's m a is all that is left, 0.3 kg with (16 N / 5 kg) at most.
+    scene = read_scene(TABLETOP_WALLS)
+    plant = make_control_plant(scene, TOOL)
+    chain = serial_chain_of(plant, "tip")
+    q = plant.GetPositions(plant.CreateDefaultContext())
+    q = reach(chain, q, np.array([0.42, -0.16, BLOCK - 2e-4]))
+    for i in range(7):
+        scene.initial.positions[f"panda.panda_joint{i + 1}"] = float(q[i])
+    config = dict(scene=TABLETOP_WALLS, tool=TOOL, contact=[TOOL, "table"])
+    noise = SensorNoise(1e-5, 1e-3, 0.1, 0.0, 0.0)
+    station = make_station(
+        StationConfig(**config, sampled=True, noise=noise), scene=scene
+    )
+    simulator = Simulator(station)
+    context = simulator.get_mutable_context()
+    hold = chain_state(chain, q, np.zeros(7)).bias
+    station.GetInputPort("panda.torque_commanded").FixValue(context, hold)
+    read = {
+        name: station.GetOutputPort(name).Eval
+        for name in ("panda.external_wrench", "panda.position_measured")
+    }
+    np.testing.assert_array_equal(read["panda.external_wrench"](context), 0.0)
+    force = station.GetOutputPort("tool.contact_force")
+    previous = None
+    for step in range(5):
+        # Before the step: its contact, from the state and torque it starts with.
+        simulator.AdvanceTo(step * 1e-3)
+        context.SetTime(step * 1e-3)
+        before = force.Eval(context)
+        simulator.AdvanceTo(step * 1e-3 + 1e-4)
+        wrench = read["panda.external_wrench"](context)
+        np.testing.assert_allclose(wrench[:3], before, atol=0.3 * 16.0 / 5.0)
+        encoders = read["panda.position_measured"](context)
+        simulator.AdvanceTo(step * 1e-3 + 9e-4)
+        np.testing.assert_array_equal(wrench, read["panda.external_wrench"](context))
+        np.testing.assert_array_equal(
+            encoders, read["panda.position_measured"](context)
+        )
+        restored = station.CreateDefaultContext()
+        restored.SetTimeStateAndParametersFrom(context)
+        station.GetInputPort("panda.torque_commanded").FixValue(restored, hold)
+        np.testing.assert_array_equal(
+            encoders, read["panda.position_measured"](restored)
+        )
+        assert previous is None or np.abs(encoders - previous).min() > 0.0
+        previous = encoders
