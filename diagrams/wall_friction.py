@@ -1,0 +1,377 @@
+"""A Panda presses a block on a table and along a wall whose friction is not known
+(CC 4.4, figure 1b): an impedance controller of constant stiffness follows a motion.
+
+    motion --x_desired, gains, push--> impedance_controller --tau--> station
+    station --wrench, q, v--> mode_detector, forward_model_bank, one-step predictors
+
+From above the block comes down on the table, slides to the wall, and along wall and
+table. When a surface is reached the stiffness along its normal is faded out and a
+constant force faded in: the motion knows when, nothing is adapted. What predicts only
+watches: no prediction reaches the controller.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.primitives import (
+    LogVectorOutput,
+    Multiplexer,
+    TrajectorySource,
+    ZeroOrderHold,
+)
+from pydrake.trajectories import PiecewisePolynomial
+
+from makebreak.diagrams.station import (
+    ARM,
+    TIP_FRAME,
+    StationConfig,
+    make_control_plant,
+    make_station,
+)
+from makebreak.diagrams.tabletop import TABLETOP_WALLS, TOOL, set_friction
+from makebreak.models.scene import read_scene
+from makebreak.systems.baselines.long_term_predictor import OneStepPredictor
+from makebreak.systems.forward_model import ForwardModelBank, ForwardModelConfig
+from makebreak.systems.impedance_controller import (
+    ImpedanceConfig,
+    ImpedanceController,
+    serial_chain_of,
+)
+from makebreak.systems.mode_detector import ModeDetector, ModeDetectorConfig
+from makebreak.systems.numerics.baselines.long_term_predictor import (
+    LongTermPredictor,
+    TrainingBudget,
+)
+from makebreak.systems.numerics.serial_chain import tip_kinematics
+from makebreak.systems.numerics.tip_state import tip_pose, tip_velocity
+from makebreak.systems.tip_state import TipState
+
+WALL, N_ARM = "blue_wall", 7
+# Of the motion [s]: down, rest on the table, to the wall, rest, along it, rest.
+TIMES = np.cumsum([0.0, 2.4, 0.4, 2.6, 0.5, 3.0, 0.3])
+DURATION = float(TIMES[-1])
+TABLE_Z, WALL_X = 0.015, 0.62  # Of the tip, where the block touches them [m].
+BEYOND = 0.005  # The motion goes on behind the surface, so that the block meets it [m].
+ALONG = 0.26  # Of the wall [m].
+FADE = 0.25  # [s] from stiffness to force along a normal, just before the rest.
+NORMAL_DAMPING = 250.0  # Along it then, so that the block does not bounce [N s/m].
+DAMPING_RATIO, MASS = 0.9, 5.0  # [kg]: what the tip weighs, about; for the damping.
+TURNING_STIFFNESS, TURNING_DAMPING = 50.0, 15.0  # [N m/rad], [N m s/rad]
+TICK, ESTIMATE = 0.001, 0.005  # Periods [s].
+# After the plant's step, as in changing_contact.
+OFFSET, IMPEDANCE_OFFSET = 1e-4, 7e-4
+
+
+@dataclass
+class WallTraining:
+    """What the baseline learns from, and how much of it."""
+
+    trials: int = 14  # In each of the three training sets.
+    every: int = 5  # Samples of 5 ms between two steps in joint space.
+    joint: TrainingBudget = field(
+        default_factory=lambda: TrainingBudget(
+            points_per_mode=200, segment_min=4, predict_change=False
+        )
+    )
+    task: TrainingBudget = field(
+        default_factory=lambda: TrainingBudget(
+            points_per_mode=200, segment_min=20, predict_change=False
+        )
+    )
+
+
+@dataclass
+class WallFrictionConfig:
+    friction: float = 0.9  # Of the wall.
+    stiffness: float = 300.0  # [N/m] of the controller.
+    stiffness_high: float = 2000.0  # [N/m] of figure 12.
+    normal_force: float = 8.0  # [N] on the table, and on the wall.
+    start_spread: float = 0.003  # [m], standard deviation of the path's corners.
+    training: WallTraining = field(default_factory=WallTraining)
+    seed: int = 0
+
+
+def motion(config: WallFrictionConfig, p_start) -> dict[str, np.ndarray]:
+    """The plan, every 5 ms: what the controller is asked for, and what it means.
+
+    Args: p_start (3,) where the tip is at first [m].
+    Returns: time (n,); x_desired (n, 19); stiffness (n, 6); damping (n, 6); push (n, 6)
+        fed forward; direction (n, 3) of the motion, zero at rest; force_directions
+        (n, 6), two rows n that the block is pressed along, zero while there is none.
+    """
+    time = np.arange(0.0, DURATION + 0.0025, 0.005)
+    rng = np.random.default_rng([config.seed, 1])
+    start = np.array(p_start, dtype=float)
+    above = config.start_spread * rng.normal(size=2)
+    x0, y0 = start[:2] + above
+    y1 = y0 + ALONG + config.start_spread * rng.normal()
+    corners = np.array([
+        start,
+        [x0, y0, TABLE_Z - BEYOND],
+        [x0, y0, TABLE_Z - BEYOND],
+        [WALL_X + BEYOND, y0, TABLE_Z - BEYOND],
+        [WALL_X + BEYOND, y0, TABLE_Z - BEYOND],
+        [WALL_X + BEYOND, y1, TABLE_Z - BEYOND],
+        [WALL_X + BEYOND, y1, TABLE_Z - BEYOND],
+    ])  # fmt: skip
+    p, v, a = (np.zeros((len(time), 3)) for _ in range(3))
+    for i in range(len(TIMES) - 1):
+        span = TIMES[i + 1] - TIMES[i]
+        now = (time >= TIMES[i]) & (time <= TIMES[i + 1] + 1e-9)
+        s = ((time[now] - TIMES[i]) / span)[:, None]
+        way = corners[i + 1] - corners[i]
+        # Rest to rest with the least jerk.
+        p[now] = corners[i] + way * (10 * s**3 - 15 * s**4 + 6 * s**5)
+        v[now] = way * (30 * s**2 - 60 * s**3 + 30 * s**4) / span
+        a[now] = way * (60 * s - 180 * s**2 + 120 * s**3) / span**2
+    speed = np.linalg.norm(v, axis=1, keepdims=True)
+    direction = np.where(speed > 1e-9, v / np.maximum(speed, 1e-9), 0.0)
+
+    x_desired = np.zeros((len(time), 19))
+    x_desired[:, :3], x_desired[:, 3], x_desired[:, 7:10] = p, 1.0, v
+    x_desired[:, 13:16] = a
+    linear = 2.0 * DAMPING_RATIO * np.sqrt(MASS * config.stiffness)
+    stiffness, damping = (
+        np.tile(np.repeat(gains, 3), (len(time), 1))
+        for gains in ([config.stiffness, TURNING_STIFFNESS], [linear, TURNING_DAMPING])
+    )
+    push, normals = np.zeros((len(time), 6)), np.zeros((len(time), 6))
+    for row, (axis, sign, end) in enumerate(((2, -1.0, TIMES[1]), (0, 1.0, TIMES[3]))):
+        share = np.clip((time - end) / FADE + 1.0, 0.0, 1.0)
+        stiffness[:, axis] *= 1.0 - share
+        damping[:, axis] += share * max(NORMAL_DAMPING - linear, 0.0)
+        push[:, axis] = sign * config.normal_force * share
+        pressed = share > 0.0
+        normals[pressed, 3 * row + axis] = sign
+        # What is under force control has no reference of its own.
+        x_desired[:, 7 + axis] *= 1.0 - share
+        x_desired[:, 13 + axis] *= 1.0 - share
+    return {
+        "time": time,
+        "x_desired": x_desired,
+        "stiffness": stiffness,
+        "damping": damping,
+        "push": push,
+        "direction": direction,
+        "force_directions": normals,
+    }
+
+
+def make_wall_friction(
+    config: WallFrictionConfig,
+    meshcat: Meshcat | None = None,
+    predictors: Mapping[str, LongTermPredictor] | None = None,
+    knowledge: tuple | None = None,
+) -> Diagram:
+    """One trial, and a log of it: see `telemetry`.
+
+    Args:
+        config: its `training` is not used here.
+        meshcat: where it is seen; None: nowhere.
+        predictors: baselines that predict one step ahead, by name; their system in the
+            diagram is predictor_<name>.
+        knowledge: of the mode detector and the forward models, from an earlier trial
+            (`learned`); None: none.
+    Raises: ValueError for a stiffness or force that is not positive, a friction that
+        is not from 0 to 1.8.
+    """
+    for name in ("stiffness", "stiffness_high", "normal_force"):
+        if not 0.0 < getattr(config, name) < np.inf:
+            raise ValueError(f"{name} is {getattr(config, name)}, expected > 0")
+    if not config.start_spread >= 0.0:
+        raise ValueError(f"start_spread is {config.start_spread}, expected >= 0")
+    scene = read_scene(TABLETOP_WALLS)
+    control_plant = make_control_plant(scene, TOOL)
+    set_friction(scene, {WALL: config.friction})
+    builder = DiagramBuilder()
+
+    def add(name, system):
+        return builder.AddNamedSystem(name, system)
+
+    station = add(
+        "station",
+        make_station(
+            StationConfig(
+                scene=TABLETOP_WALLS,
+                tool=TOOL,
+                contact=[TOOL, WALL],
+                seed=config.seed,
+            ),
+            meshcat,
+            scene,
+        ),
+    )
+    chain = serial_chain_of(control_plant, TIP_FRAME)
+    plan = motion(config, start_of(control_plant))
+    sources = {}
+    for name, values in plan.items():
+        if name != "time":
+            held = name in ("direction", "force_directions")
+            kind = PiecewisePolynomial
+            line = (kind.ZeroOrderHold if held else kind.FirstOrderHold)(
+                plan["time"], values.T
+            )
+            sources[name] = add(name, TrajectorySource(line)).get_output_port()
+    impedance = add(
+        "impedance_controller",
+        ImpedanceController(
+            ImpedanceConfig(
+                control_orientation=True, period_sec=TICK, offset_sec=IMPEDANCE_OFFSET
+            ),
+            control_plant,
+            TIP_FRAME,
+        ),
+    )
+    tip = add("tip_state", TipState(chain))
+    q, v, wrench = (
+        station.GetOutputPort(f"{ARM}.{name}")
+        for name in ("position_measured", "velocity_measured", "external_wrench")
+    )
+    for system in (impedance, tip):
+        builder.Connect(q, system.GetInputPort("q"))
+        builder.Connect(v, system.GetInputPort("v"))
+    for name in ("x_desired", "stiffness", "damping"):
+        builder.Connect(sources[name], impedance.GetInputPort(name))
+    builder.Connect(sources["push"], impedance.GetInputPort("wrench_feedforward"))
+    builder.Connect(
+        impedance.GetOutputPort("tau"), station.GetInputPort(f"{ARM}.torque_commanded")
+    )
+
+    known_modes, known_models = knowledge or (None, None)
+    modes = add(
+        "mode_detector",
+        ModeDetector(ModeDetectorConfig(), known_modes, ESTIMATE, OFFSET),
+    )
+    forward = add(
+        "forward_model_bank",
+        ForwardModelBank(ForwardModelConfig(), known_models, ESTIMATE, OFFSET),
+    )
+    signals = {
+        "q": (q, N_ARM),
+        "v": (v, N_ARM),
+        "wrench": (wrench, 6),
+        "mode": (modes.GetOutputPort("mode"), 1),
+        "wrench_predicted": (forward.GetOutputPort("wrench_predicted"), 6),
+    }
+    watching = [modes, forward]
+    for name, predictor in (predictors or {}).items():
+        system = add(
+            f"predictor_{name}",
+            OneStepPredictor(predictor, period_sec=ESTIMATE, offset_sec=OFFSET),
+        )
+        watching.append(system)
+        signals[f"{name}.wrench_predicted"] = (
+            system.GetOutputPort("wrench_predicted"),
+            6,
+        )
+        signals[f"{name}.std"] = (system.GetOutputPort("std"), 3)
+    inputs = {
+        "wrench": wrench,
+        "ee_pose": tip.GetOutputPort("ee_pose"),
+        "ee_velocity": tip.GetOutputPort("ee_velocity"),
+        "direction": sources["direction"],
+        "force_directions": sources["force_directions"],
+        "mode": modes.GetOutputPort("mode"),
+    }
+    for system in watching:
+        for name, port in inputs.items():
+            if system.HasInputPort(name):
+                builder.Connect(port, system.GetInputPort(name))
+
+    # Sampled just before the predictors read, of the same plant step: a row of the log
+    # is what they are about to read, and what they had predicted for it. (At their own
+    # instant it would be what they predict next: abstract state is updated first.)
+    sizes = [size for _, size in signals.values()]
+    bundle = add("telemetry", Multiplexer(sizes))
+    for i, (port, _) in enumerate(signals.values()):
+        builder.Connect(port, bundle.get_input_port(i))
+    sampled = add("telemetry_hold", ZeroOrderHold(ESTIMATE, sum(sizes), 0.5 * OFFSET))
+    builder.Connect(bundle.get_output_port(), sampled.get_input_port())
+    log = LogVectorOutput(sampled.get_output_port(), builder, ESTIMATE)
+    log.set_name("telemetry_log")
+    builder.ExportOutput(wrench, "wrench")
+    return builder.Build()
+
+
+def plan_of(config: WallFrictionConfig) -> dict[str, np.ndarray]:
+    """The motion from where the tip is at first."""
+    return motion(config, start_of(make_control_plant(TABLETOP_WALLS, TOOL)))
+
+
+def policy(config: WallFrictionConfig, every: int):
+    """What the controller does, for the baseline: u(t, x) at steps of `every` samples.
+
+    Returns: a function of the step t and x (k, 14) = [q, v] that gives (k, 6): the
+        force that the impedance commands [N], and the plan's acceleration [m/s2].
+    """
+    control_plant = make_control_plant(TABLETOP_WALLS, TOOL)
+    chain = serial_chain_of(control_plant, TIP_FRAME)
+    rows = {
+        name: values[::every]
+        for name, values in motion(config, start_of(control_plant)).items()
+    }
+    x_desired, push = rows["x_desired"], rows["push"]
+
+    def u(t, x):
+        out = np.empty((len(x), 6))
+        for i, (q, v) in enumerate(zip(x[:, :N_ARM], x[:, N_ARM:], strict=True)):
+            p_WE, _, J = tip_kinematics(chain, np.ascontiguousarray(q))
+            out[i, :3] = rows["stiffness"][t, :3] * (x_desired[t, :3] - p_WE)
+            out[i, :3] += rows["damping"][t, :3] * (x_desired[t, 7:10] - J[:3] @ v)
+        out[:, :3] += push[t, :3]
+        out[:, 3:] = x_desired[t, 13:16]
+        return out
+
+    return u
+
+
+def tip_states(data: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (n, 3) [m] and velocities (n, 3) [m/s] of the tip, from the joints'."""
+    control_plant = make_control_plant(TABLETOP_WALLS, TOOL)
+    chain = serial_chain_of(control_plant, TIP_FRAME)
+    rows = list(zip(data["q"], data["v"], strict=True))
+    position = np.array([tip_pose(chain, q)[:3] for q, _ in rows])
+    return position, np.array([tip_velocity(chain, q, v)[:3] for q, v in rows])
+
+
+def start_of(control_plant) -> np.ndarray:
+    """(3,) where the tip is at first [m]."""
+    chain = serial_chain_of(control_plant, TIP_FRAME)
+    positions = control_plant.GetPositions(control_plant.CreateDefaultContext())
+    return tip_pose(chain, positions)[:3]
+
+
+def telemetry(
+    diagram: Diagram, context: Context, names: Sequence[str] = ()
+) -> dict[str, np.ndarray]:
+    """What was logged in a simulation that ended in `context`.
+
+    Args: names of the one-step predictors.
+    Returns: time (n,), every 5 ms; q, v (n, 7), wrench (n, 6) as measured then; mode
+        (n, 1), wrench_predicted (n, 6) and <name>.wrench_predicted (n, 6), <name>.std
+        (n, 3) that had been predicted for then.
+    """
+    log = diagram.GetSubsystemByName("telemetry_log").FindLog(context)
+    sizes = {"q": N_ARM, "v": N_ARM, "wrench": 6, "mode": 1, "wrench_predicted": 6}
+    for name in names:
+        sizes |= {f"{name}.wrench_predicted": 6, f"{name}.std": 3}
+    # The first row is from before the first sample; each is taken just before the next.
+    data, start = log.data()[:, 1:], 0
+    out = {"time": np.array(log.sample_times()[1:]) - ESTIMATE}
+    for name, size in sizes.items():
+        out[name] = np.array(data[start : start + size].T)
+        start += size
+    return out
+
+
+def learned(diagram: Diagram, context: Context) -> tuple:
+    """What mode detector and forward models know at the end of a trial."""
+    return tuple(
+        system.knowledge(system.GetMyContextFromRoot(context))
+        for system in map(
+            diagram.GetSubsystemByName, ("mode_detector", "forward_model_bank")
+        )
+    )
