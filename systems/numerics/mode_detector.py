@@ -240,7 +240,7 @@ def detect(
         return _tracked(memory, tuning, time, feature, R)
     if memory.stage == HINTED and not memory.departed:
         memory = _verified(memory, tuning, time, feature, R)
-        if memory.stage != HINTED:
+        if not memory.departed:
             return memory
     return _collected(memory, tuning, time, feature, R)
 
