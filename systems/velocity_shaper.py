@@ -45,7 +45,9 @@ class SearchConfig:
 class VelocityShaperConfig:
     acceleration_max: float = 0.9  # Along the path, of each change of speed [m/s2].
     speed_min: float = 0.004  # A lower approach speed is raised to it [m/s].
-    release_sec: float = 1.0  # In which an offset from the pattern fades out.
+    # After a contact or its loss the pattern is shifted to where the tip is. In this
+    # time it fades back to where it was planned; inf: it stays shifted.
+    release_sec: float = np.inf
     region: RegionConfig = field(default_factory=RegionConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     period_sec: float = 0.001
@@ -217,7 +219,8 @@ def _law(config: VelocityShaperConfig) -> ShaperLaw:
         ("search.distance", search.distance, 0.0),
         ("period_sec", c.period_sec, 1e-6),
     ):
-        if not least <= value < np.inf:
+        endless = name == "release_sec" and value == np.inf
+        if not (least <= value < np.inf or endless):
             wanted = "0 or more" if least == 0.0 else "a positive number"
             raise ValueError(f"{name} is {value}, expected {wanted}")
     return ShaperLaw(

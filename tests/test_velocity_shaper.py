@@ -58,6 +58,7 @@ PATTERNS = Path(__file__).resolve().parent.parent / "models" / "patterns"
 DOWN, LEFT, AHEAD = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
 DT, V_A = 1e-3, 0.03
 LAW = _law(VelocityShaperConfig())
+FADES = LAW._replace(release_sec=1.0)
 # Sixth-order central difference.
 WEIGHTS = np.array([-1, 9, -45, 0, 45, -9, 1]) / 60.0
 
@@ -314,7 +315,15 @@ def test_after_a_contact_the_next_segment_starts_at_once_from_where_it_is(three)
     np.testing.assert_array_equal(n, [DOWN, LEFT])
 
 
-def test_where_the_contact_decides_the_offset_stays_and_elsewhere_it_fades(three):
+def test_the_pattern_stays_shifted_by_what_its_contacts_have_taught(three):
+    last = three.segment == 3
+    # The first wall came 2.3 cm before the plan; then 10 cm back.
+    at_wall = three.p[~last][-1, 1]
+    assert three.p[last][-1, 1] == pytest.approx(at_wall - 0.1, abs=2e-3)
+
+
+def test_where_the_contact_decides_the_offset_stays_and_elsewhere_it_may_fade():
+    three = follow(THREE, BELIEF, WORLD, FADES)
     # The table came 3.5 cm early: while it is pressed on, the reference stays there.
     assert three.p[three.segment == 2][-1, 2] == pytest.approx(0.085, abs=2e-3)
     # The first wall, dropped with the last segment: its 2.3 cm fade within the segment.
@@ -328,7 +337,9 @@ def test_a_released_direction_is_put_to_the_measured_position_and_then_fades():
                 force_targets=[5]),
         Segment("line", [[0.3, 0, 0.1], [0.3, 0.4, 0.1]], (3, 7)),
     ))  # fmt: skip
-    log = follow(pattern, ContactBelief(), pose=lambda t, p: p + [0, 0, -0.01])
+    log = follow(
+        pattern, ContactBelief(), law=FADES, pose=lambda t, p: p + [0, 0, -0.01]
+    )
     first = np.flatnonzero(log.segment == 1)[0]
     # The reference feels its own measured offset once, at the release.
     assert log.p[first, 2] == pytest.approx(0.09, abs=1e-9)
@@ -359,7 +370,7 @@ UP = MotionPattern((
 
 @pytest.mark.parametrize("at", [0.8, 1.2, 1.5])
 def test_the_loss_of_a_contact_starts_the_next_segment_without_a_stop(at):
-    log = follow(UP, ContactBelief(), feel=loss(at))
+    log = follow(UP, ContactBelief(), law=FADES, feel=loss(at))
     first = np.flatnonzero(log.segment == 1)[0]
     assert log.t[first] == pytest.approx(at, abs=2 * DT)
     np.testing.assert_allclose(log.speed[first], log.speed[first - 1], atol=1e-3)

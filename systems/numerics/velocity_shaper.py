@@ -20,10 +20,11 @@ stays v_a until the contact comes.
 
 When it comes the next segment begins at once, from the reference as it is: the old
 segment's motion runs out (another step, to speed 0; it lies along a direction that is
-force-controlled from now on), and the constant c takes up the rest. What of c lies
-along force directions stays, for there the contact decides; the rest fades out with
-1 - S. Where a force direction is dropped the reference is first put to the measured
-position along it.
+force-controlled from now on), and the constant c takes up the rest. Where a force
+direction is dropped the reference is first put to the measured position along it. So
+the pattern is shifted by what its contacts have taught. It stays shifted, or fades back
+with 1 - S over release_sec; but for what of c lies along force directions, for there
+the contact decides.
 
 Source: Sidhik et al., section 3.5.2; the numbers of changing contact without time-outs.
 """
@@ -82,7 +83,8 @@ from makebreak.systems.numerics.velocity_profile import unit_step, unit_step_int
 BAD_SEC = 0.1  # A pause lasts so long after the last bad sample.
 STEP_SEC_MIN = 0.05  # Of a change of speed, however small: bounds the jerk.
 NEAR = 1e-3  # [m] from its end a segment that came to rest counts as ended.
-BEND_MAX = 9.85  # Of S'' .
+BEND_MAX = 9.85  # Of S''.
+TURN_BACK_SEC = 1.0  # In which an orientation fades out where positions stay.
 
 
 class ShaperLaw(NamedTuple):
@@ -90,7 +92,7 @@ class ShaperLaw(NamedTuple):
 
     acceleration_max: float  # Along the path [m/s2].
     speed_min: float  # Approach speeds below it are raised to it [m/s].
-    release_sec: float  # In which an offset fades out, at least.
+    release_sec: float  # In which an offset fades out, at least; inf: it stays.
     sigmas: float  # Half width of a region.
     margin: float  # Added to it [m].
     settle_sec: float  # And v_a times this.
@@ -272,7 +274,8 @@ def _fade_out(m, law, t, X):
     T = np.sqrt(2.0 * BEND_MAX * max(size, turn) / law.acceleration_max)
     for i in range(6):
         m[b + i] = X[i]
-    m[b + 6], m[b + 7] = t, max(law.release_sec, T)
+    least = law.release_sec if law.release_sec < np.inf else TURN_BACK_SEC
+    m[b + 6], m[b + 7] = t, max(least, T)
 
 
 @numba.njit(cache=True)
@@ -305,10 +308,11 @@ def _change_segment(table, m, law, t, pose, X, s_end, s_start):
             n = _row(table, k, row)
             if m[_OFF + row] == 0.0 and not _has_direction(table, k + 1, n):
                 _add_along(C, n, _dot(n, pose) - _dot(n, X))
-    # What lies along the new force directions stays.
     kept = np.zeros(6)
     rows = int(_head(table, k + 1, N_FORCE))
-    if rows > 0:
+    if law.release_sec == np.inf:
+        kept[:3] = C[:3]
+    elif rows > 0:  # What lies along the new force directions stays.
         n1 = _row(table, k + 1, 0)
         _add_along(kept, n1, _dot(n1, C))
         if rows > 1:
