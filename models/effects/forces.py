@@ -74,8 +74,10 @@ def _sinusoidal_signature(effect, model, motion, grid=None) -> list[Signature]:
             # c = [a cos(phase), a sin(phase)] for the amplitude's vector a.
             a, b = np.reshape(c, (2, 3))
             u, s, w = np.linalg.svd(np.stack([a, b], axis=1))
-            amplitude = u[:, 0] * s[0]
-            phase = math.atan2(w[0, 1], w[0, 0])
+            # Of the two that are the same force, its greatest component positive.
+            sign = 1.0 if u[abs(u[:, 0]).argmax(), 0] >= 0.0 else -1.0
+            amplitude = sign * u[:, 0] * s[0]
+            phase = math.atan2(sign * w[0, 1], sign * w[0, 0])
             return {
                 **{name: float(x) for name, x in zip(AXES, amplitude, strict=True)},
                 "frequency": float(f),

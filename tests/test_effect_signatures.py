@@ -1,0 +1,374 @@
+"""Columns of effects in the residual, and the residual itself."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from effect_scenes import (
+    LENGTH,
+    MASS,
+    G,
+    J,
+    double,
+    on_ground,
+    pendulum,
+    smooth_motion,
+    with_effects,
+)
+
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect, sentence
+from makebreak.models.effects.signature import Motion
+
+# Effects on the double pendulum whose columns are exact, with parameters to find.
+EXACT = {
+    "joint_viscous_damping": ("d.j2", dict(damping=0.4)),
+    "joint_coulomb_friction": ("d.j1", dict(coulomb=0.7)),
+    "joint_stribeck_friction": (
+        "d.j2",
+        dict(coulomb=0.5, static=0.9, stribeck_velocity=0.2),
+    ),
+    "joint_quadratic_drag": ("d", dict(coefficient=0.2)),
+    "rotor_inertia": ("d.j1", dict(inertia=0.15)),
+    "torque_ripple": ("d.j1", dict(amplitude=0.6, periods_per_rev=5.0, phase=-0.8)),
+    "joint_spring": ("d.j2", dict(stiffness=2.5, rest=-0.3)),
+    # Across the axis of the first joint no force at the second one's origin shows.
+    "constant_force": ("d.lower", dict(fx=2.0, fy=0.0, fz=0.5)),
+    "sinusoidal_force": (
+        "d.lower",
+        dict(fx=2.0, fy=0.0, fz=0.5, frequency=1.5, phase=0.4),
+    ),
+    "body_drag": ("d.lower", dict(linear=0.8, angular=0.05)),
+    "object_mass": ("d.lower", dict(mass=1.1)),
+    "object_inertia": ("d.lower", dict(ixx=0.03, iyy=0.035, izz=0.02)),
+}
+GRID = {
+    "stribeck_velocity": [0.1, 0.2],
+    "periods_per_rev": [4, 5],
+    "frequency": [1.0, 1.5],
+}
+# Linearised: small, and the error goes with the square.
+SMALL = {
+    "payload": ("d.lower", dict(mass=0.2, com_x=0.05, com_y=-0.04, com_z=-0.1)),
+    "gravity_tilt": ("d", dict(roll=0.02, pitch=-0.015)),
+    "object_com": ("d.lower", dict(x=0.004, y=0.036, z=-0.205)),
+}
+
+
+def motion_of(dynamics, n=81):
+    n_v = dynamics.plant.num_velocities()
+    time, q, v, vd = smooth_motion(n_v, n)
+    return Motion(time, q, v, vd, dynamics.inverse_dynamics(q, v, vd, time))
+
+
+def explained(signature, residual, coefficients=None):
+    """Least-squares coefficients, and what they leave of the residual, relative."""
+    A = signature.columns.reshape(-1, signature.columns.shape[2])
+    b = residual.ravel()
+    if coefficients is None:
+        coefficients = np.linalg.lstsq(A, b, rcond=None)[0]
+    left = np.linalg.norm(b - A @ coefficients) / np.linalg.norm(b)
+    return coefficients, left
+
+
+def test_inverse_dynamics_of_the_pendulum_is_the_closed_form(tmp_path):
+    dynamics = SceneDynamics(
+        with_effects(
+            pendulum(tmp_path), ("joint_spring", "p.j1", dict(stiffness=2, rest=1))
+        )
+    )
+    time, q, v, vd = smooth_motion(1)
+    expected = J * vd + MASS * G * LENGTH * np.sin(q) + 2.0 * (q - 1.0)
+    np.testing.assert_allclose(dynamics.inverse_dynamics(q, v, vd), expected, atol=1e-9)
+
+
+def test_inverse_dynamics_is_the_rate_of_momentum_and_the_rest(tmp_path):
+    dynamics = SceneDynamics(double(tmp_path))
+    time, q, v, vd = smooth_motion(2, 4001)
+    rate = np.gradient(dynamics.momentum(q, v), time, axis=0)[1:-1]
+    rest = dynamics.rest(q, v)[1:-1]
+    effort = dynamics.inverse_dynamics(q, v, vd)[1:-1]
+    # Differences over 0.25 ms of motion at up to 9 rad/s: (9 x 2.5e-4)^2/6 = 1e-6
+    # of the greatest effort of 30 N m.
+    np.testing.assert_allclose(rate + rest, effort, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", EXACT)
+def test_columns_explain_the_effect_and_give_its_parameters(tmp_path, kind):
+    at, parameters = EXACT[kind]
+    scene = double(tmp_path)
+    truth = SceneDynamics(with_effects(scene, (kind, at, parameters)))
+    model, motion = SceneDynamics(scene), motion_of(truth)
+    residual = model.residual(motion)
+    grid = {k: v for k, v in GRID.items() if k in parameters}
+    found = model.signatures(kind, [at], motion, grid or None)
+    fits = [explained(signature, residual) for signature in found]
+    best = int(np.argmin([left for _, left in fits]))
+    coefficients, left = fits[best]
+    assert left < 1e-7  # Finite differences and rounding.
+    assert found[best].exact
+    for name, value in found[best].to_parameters(coefficients).items():
+        np.testing.assert_allclose(
+            value, parameters[name], rtol=1e-5, atol=1e-9, err_msg=name
+        )
+
+
+@pytest.mark.parametrize("kind", SMALL)
+def test_linearised_columns_are_right_to_first_order(tmp_path, kind):
+    at, parameters = SMALL[kind]
+    scene = double(tmp_path)
+    model = SceneDynamics(scene)
+    now = {"mass": 0.0, **model.now(kind, [at])}
+    left = []
+    for share in (1.0, 0.5):
+        # Half the effect: a payload is half as heavy, what has a present value moves
+        # half way from it.
+        part = {
+            name: now[name] + share * (value - now[name]) if name in now else value
+            for name, value in parameters.items()
+        }
+        truth = SceneDynamics(with_effects(scene, (kind, at, part)))
+        motion = motion_of(truth)
+        residual = model.residual(motion)
+        (signature,) = model.signatures(kind, [at], motion)
+        coefficients = np.array([part[name] - now.get(name, 0) for name in part])
+        if kind == "payload":
+            coefficients[1:] = part["mass"] * np.array(
+                [part["com_x"], part["com_y"], part["com_z"]]
+            )
+        left.append(explained(signature, residual, coefficients)[1])
+        for name, value in signature.to_parameters(coefficients).items():
+            np.testing.assert_allclose(value, part[name], atol=1e-12, err_msg=name)
+    assert left[0] < 0.05
+    # Second order: half the effect, half of the relative error. (A payload's own moment
+    # of inertia is linear in its mass: the share stays.)
+    if kind != "payload":
+        np.testing.assert_allclose(left[1] / left[0], 0.5, atol=0.1)
+
+
+@pytest.mark.parametrize("kind", [*EXACT, *SMALL, "joint_offset"])
+def test_columns_are_the_rate_of_their_momentum_and_the_rest(tmp_path, kind):
+    at = {**EXACT, **SMALL}.get(kind, ("d.j2", {}))[0]
+    model = SceneDynamics(double(tmp_path))
+    time, q, v, vd = smooth_motion(2, 1001, duration=0.25)
+    motion = Motion(time, q, v, vd, model.inverse_dynamics(q, v, vd))
+    grid = {"stribeck_velocity": [0.2], "periods_per_rev": [5], "frequency": [1.5]}
+    (signature,) = model.signatures(kind, [at], motion, grid)
+    rate = np.gradient(signature.momentum, time, axis=0)[1:-1]
+    whole = signature.columns[1:-1]
+    scale = abs(whole).max(axis=(0, 1)) + 1e-12
+    # As above: 1e-6 of the greatest; differences of differences in joint_offset.
+    np.testing.assert_allclose(
+        (rate + signature.rest[1:-1]) / scale, whole / scale, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize(
+    "kind, at, parameters, applied",
+    [
+        ("actuator_gain", "d.j1", dict(gain=0.9), lambda t, u: 0.9 * u),
+        ("actuator_bias", "d.j2", dict(bias=-1.5), lambda t, u: u - 1.5),
+        ("actuator_saturation", "d.j1", dict(limit=8.0), lambda t, u: u.clip(-8, 8)),
+    ],
+)
+def test_actuator_columns_explain_what_the_command_does_not(
+    tmp_path, kind, at, parameters, applied
+):
+    model = SceneDynamics(double(tmp_path))
+    motion = motion_of(model)
+    j = int(at[-1]) - 1
+    # The motion is that of the applied effort; told is the command.
+    command = np.array(motion.effort)
+    if kind == "actuator_gain":
+        command[:, j] = motion.effort[:, j] / 0.9
+    elif kind == "actuator_bias":
+        command[:, j] = motion.effort[:, j] + 1.5
+    else:
+        # The pendulum is moved by what the limit leaves: an effort made for the test.
+        command[:, j] *= 1.4
+        effort = np.array(command)
+        effort[:, j] = applied(motion.time, command[:, j])
+        residual = command - effort
+        told = replace(motion, effort=command)
+        found = model.signatures(kind, [at], told, {"limit": [6.0, 8.0]})
+        left = [explained(s, residual)[1] for s in found]
+        assert np.argmin(left) == 1 and left[1] < 1e-12
+        assert found[1].to_parameters(np.ones(1)) == parameters
+        return
+    told = replace(motion, effort=command)
+    (signature,) = model.signatures(kind, [at], told)
+    coefficients, left = explained(signature, model.residual(told))
+    assert left < 1e-9
+    found = signature.to_parameters(coefficients)
+    np.testing.assert_allclose(list(found.values()), list(parameters.values()))
+
+
+@pytest.mark.parametrize(
+    "kind, name", [("input_delay", "delay"), ("actuator_lag", "time_constant")]
+)
+def test_delay_and_lag_columns_find_a_small_delay(tmp_path, kind, name):
+    # u = sin(5 t) late by d, or lagging with T: the sine's own closed form.
+    model = SceneDynamics(double(tmp_path))
+    t = np.linspace(0.0, 4.0, 4001)
+    u, d = np.sin(5.0 * t), 0.004
+    if kind == "input_delay":
+        applied = np.sin(5.0 * (t - d))
+    else:
+        applied = (np.sin(5 * t) - 5 * d * np.cos(5 * t)) / (1 + (5 * d) ** 2)
+    both = np.stack([u, 0 * u], axis=1)
+    zero = np.zeros_like(both)
+    motion = Motion(t, zero, zero, zero, both)
+    (signature,) = model.signatures(kind, ["d.j1"], motion, {name: [0.005]})
+    residual = np.stack([u - applied, 0 * u], axis=1)
+    since = t > 0.1  # What was before the recording nobody knows.
+    part = replace(signature, columns=signature.columns[since])
+    coefficients, left = explained(part, residual[since])
+    # Linearised: (5 rad/s x 5 ms) is the relative error; samples every ms, held.
+    np.testing.assert_allclose(signature.to_parameters(coefficients)[name], d, rtol=0.2)
+    assert left < 0.05
+
+
+@pytest.mark.parametrize(
+    "kind, at, parameters",
+    [
+        ("joint_offset", "d.j2", dict(offset=1e-3)),
+        ("sensor_bias", "d.j1.velocity", dict(bias=1e-3)),
+        ("sensor_bias", "d.j1.effort_measured", dict(bias=0.3)),
+        ("sensor_delay", "d", dict(delay=1e-4)),
+        ("clock_skew", "d", dict(skew=1e-4)),
+    ],
+)
+def test_measurement_columns_explain_what_the_true_motion_does_not(
+    tmp_path, kind, at, parameters
+):
+    model = SceneDynamics(double(tmp_path))
+    motion = motion_of(model, 4001)
+    (value,) = parameters.values()
+    q, v, vd, effort = (
+        np.array(x) for x in (motion.q, motion.v, motion.vd, motion.effort)
+    )
+    if kind == "joint_offset":
+        q[:, 1] += value
+    elif at.endswith("velocity"):
+        v[:, 0] += value
+    elif at.endswith("effort_measured"):
+        effort[:, 0] += value
+    else:
+        late = value if kind == "sensor_delay" else value * motion.time[:, None]
+        jerk = np.gradient(vd, motion.time, axis=0)
+        q, v, vd = q - late * v, v - late * vd, vd - late * jerk
+        effort = effort - late * np.gradient(effort, motion.time, axis=0)
+    measured = Motion(motion.time, q, v, vd, effort)
+    residual = model.residual(measured)
+    (signature,) = model.signatures(kind, [at], measured)
+    coefficients, left = explained(signature, residual)
+    if kind in ("sensor_delay", "clock_skew"):
+        # All channels late together: nothing shows, and the columns say so.
+        scale = abs(effort).max()
+        assert abs(residual).max() < 1e-3 * scale
+        assert (
+            abs(signature.columns * value - residual[:, :, None]).max() < 1e-3 * scale
+        )
+        return
+    np.testing.assert_allclose(coefficients[0], value, rtol=2e-2)
+    assert left < 2e-2
+
+
+def test_a_free_bodys_rows_are_the_wrench_that_is_unknown(tmp_path):
+    # A ball in flight with drag: the residual is the drag, force after torque.
+    scene = on_ground(tmp_path, "ball", 0.0)
+    model = SceneDynamics(scene)
+    n = 5
+    q = np.tile([1.0, 0, 0, 0, 0, 0, 1.0], (n, 1))
+    v = np.random.default_rng(0).normal(size=(n, 6))
+    k = 0.3 / 0.07
+    vd = np.hstack([np.zeros((n, 3)), [0, 0, -G] - k * v[:, 3:]])
+    motion = Motion(np.arange(n) * 0.1, q, v, vd, np.zeros((n, 6)))
+    residual = model.residual(motion)
+    np.testing.assert_allclose(residual[:, 3:], 0.3 * v[:, 3:], atol=1e-12)
+    (signature,) = model.signatures("body_drag", ["b.ball"], motion)
+    np.testing.assert_allclose(signature.columns @ [0.3, 0.0], residual, atol=1e-12)
+
+
+def test_every_kind_tells_its_columns_or_that_it_has_none(tmp_path):
+    scenes = {
+        "arm": SceneDynamics(double(tmp_path)),
+        "block": SceneDynamics(on_ground(tmp_path, "cube", 0.0)),
+    }
+    simulated_only = set()
+    for name, kind in KINDS.items():
+        model = scenes["block" if kind.at in ("pair", "ground", "length") else "arm"]
+        places = model.places(name)
+        assert places, name
+        n_v = model.plant.num_velocities()
+        if n_v == 6:
+            q = np.tile([1.0, 0, 0, 0, 0, 0, 1.0], (4, 1))
+            zero = np.zeros((4, 6))
+            motion = Motion(np.arange(4.0), q, zero, zero, zero)
+        else:
+            motion = motion_of(model, 11)
+        found = model.signatures(name, [places[0]], motion)
+        if not found:
+            simulated_only.add(name)
+        for signature in found:
+            k = len(signature.unknowns)
+            assert signature.columns.shape == (len(motion.time), n_v, k)
+            assert signature.momentum.shape == signature.rest.shape
+            parameters = signature.to_parameters(np.full(k, 0.5))
+            assert set(parameters) == {p.name for p in kind.parameters} or (
+                kind.parameters[0].optional
+            )
+    assert simulated_only == {
+        "joint_elasticity",
+        "joint_backlash",
+        "contact_friction",
+        "friction_patch",
+        "rolling_resistance",
+        "contact_stiffness",
+        "contact_dissipation",
+        "plane_height",
+        "plane_tilt",
+        "object_size",
+        "corner_radius",
+    }
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_every_kind_is_complete(name):
+    kind = KINDS[name]
+    at = {"pair": "a.b~c.d", "channel": "a.b.position"}.get(kind.at, "a.b")
+    parameters = {p.name: 0.5 for p in kind.parameters}
+    says = sentence(Effect(name, [at], parameters), kind, {"damping": 0.01})
+    assert "{" not in says and "[" not in says
+    assert ("a.b" in says) and len(says) < 200
+    for p in kind.parameters:
+        assert p.low < p.high, p.name
+        if p.valid != "any":
+            assert p.low >= 0.0, p.name
+    assert kind.confused_with and kind.tell_apart
+    assert set(kind.confused_with) <= set(KINDS)
+
+
+def test_a_sentence_reads_as_in_the_report():
+    def says(kind, at, **parameters):
+        return sentence(Effect(kind, at, parameters), KINDS[kind])
+
+    assert says("joint_coulomb_friction", ["panda.j4"], coulomb=1.8) == (
+        "joint panda.j4 has Coulomb friction of 1.8 N m that the model lacks"
+    )
+    assert says("joint_viscous_damping", ["a"], damping=2.0).startswith(
+        "each joint of a has 2 N m s/rad"
+    )
+    assert says("contact_friction", ["b~g"], friction=0.32) == (
+        "the friction coefficient of b on g is 0.32"
+    )
+    assert says("object_size", ["ball"], scale=0.9, radius=0.03) == (
+        "body ball is 0.9 times as large as modelled, its radius is 0.03 m"
+    )
+    assert says("object_size", ["box"], scale=0.9) == (
+        "body box is 0.9 times as large as modelled"
+    )
+    kind = KINDS["joint_coulomb_friction"]
+    effect = Effect("joint_coulomb_friction", ["a.b"], {"coulomb": 1.8})
+    assert "1.8 +- 0.1 N m" in sentence(effect, kind, {"coulomb": 0.1})
