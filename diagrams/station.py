@@ -12,7 +12,8 @@ from pydrake.systems.primitives import Demultiplexer, Saturation
 
 from makebreak.diagrams.camera import CameraConfig, add_camera
 from makebreak.models.scene import InitialSection, Scene, load_scene, read_scene
-from makebreak.systems.contact_probe import BodyContactForce, ContactProbe
+from makebreak.systems.contact_probe import ContactProbe, ToolContactForce
+from makebreak.systems.impedance_controller import serial_chain_of
 from makebreak.systems.noisy_sensor import NoisySensor
 from makebreak.systems.tool_wrench import ToolWrench
 
@@ -64,7 +65,7 @@ def make_station(
              contact_force (4,) = [normal, x, y, z] [N] of the first body of
              config.contact on the second (4 more for each further one);
              {tool}.contact_force (3,) on the tool, of all its contacts, in the world
-             [N], found when asked for: each contact costs some 5 us;
+             [N], found when asked for;
              panda.contact_torque (7,) [N m] of all contacts on the arm's joints;
              contact_results, body_poses (abstract).
 
@@ -161,9 +162,12 @@ def make_station(
         plant.get_contact_results_output_port(), probe.GetInputPort("contact_results")
     )
     builder.ExportOutput(probe.GetOutputPort("contact_force"), "contact_force")
-    touch = builder.AddNamedSystem("tool_contact", BodyContactForce(tool_body))
+    chain = serial_chain_of(make_control_plant(loaded.scene, config.tool), TIP_FRAME)
+    touch = builder.AddNamedSystem("tool_contact", ToolContactForce(chain))
+    builder.Connect(plant.get_state_output_port(arm), touch.GetInputPort("state"))
     builder.Connect(
-        plant.get_contact_results_output_port(), touch.GetInputPort("contact_results")
+        plant.get_generalized_contact_forces_output_port(arm),
+        touch.GetInputPort("contact_torque"),
     )
     builder.ExportOutput(
         touch.GetOutputPort("contact_force"), f"{config.tool}.contact_force"

@@ -6,6 +6,9 @@ from pydrake.multibody.plant import ContactResults
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from makebreak.systems.numerics.contact_force import tip_wrench
+from makebreak.systems.numerics.serial_chain import SerialChain
+
 
 class ContactProbe(LeafSystem):
     """The force between a body and others (point contact), found when it is asked for.
@@ -42,28 +45,29 @@ class ContactProbe(LeafSystem):
         output.SetFromVector(force.ravel())
 
 
-class BodyContactForce(LeafSystem):
-    """The force of all contacts on a body (point contact), found when it is asked for.
+class ToolContactForce(LeafSystem):
+    """The force of all contacts on the tool, found when it is asked for.
 
-    Inputs:  contact_results (abstract).
-    Outputs: contact_force (3,) on the body in the world [N].
+    It is the one that makes the joint torques of the contacts, so it takes no part of
+    Drake's contact results, whose copy costs more than a step of the plant. If a link
+    of the arm touches something, too, that is in it.
+
+    Inputs:  state (2 n,) of the arm; contact_torque (n,) of its contacts [N m].
+    Outputs: contact_force (3,) on the tool in the world [N].
+
+    Args: chain, constants of the arm with its tool.
     """
 
-    def __init__(self, body: RigidBody):
+    def __init__(self, chain: SerialChain):
         super().__init__()
-        self._body = body.index()
-        self._results = self.DeclareAbstractInputPort(
-            "contact_results", AbstractValue.Make(ContactResults())
-        )
+        self._chain = chain
+        self._n = len(chain.mass)
+        tip_wrench(chain, np.zeros(self._n), np.zeros(self._n))  # Compiles it.
+        self._state = self.DeclareVectorInputPort("state", 2 * self._n)
+        self._torque = self.DeclareVectorInputPort("contact_torque", self._n)
         self.DeclareVectorOutputPort("contact_force", 3, self._calc)
 
     def _calc(self, context: Context, output: BasicVector):
-        force = np.zeros(3)
-        results = self._results.Eval(context)
-        for i in range(results.num_point_pair_contacts()):
-            contact = results.point_pair_contact_info(i)
-            if contact.bodyB_index() == self._body:
-                force += contact.contact_force()  # Drake's force acts on B.
-            elif contact.bodyA_index() == self._body:
-                force -= contact.contact_force()
-        output.SetFromVector(force)
+        q = self._state.Eval(context)[: self._n]
+        wrench = tip_wrench(self._chain, q, self._torque.Eval(context))
+        output.SetFromVector(wrench[:3])
