@@ -1,0 +1,214 @@
+"""A chain of contacts made and lost (CC section 4.5.1, figures 15 and 16).
+
+Down onto the table, along it to the red block, along both to the blue wall, up this
+wall until it ends, free over the red block, down onto its top, and along it to the goal:
+four impacts and one loss of contact. Where the contacts are is known from estimates
+with errors, as a camera would give them. The world differs by seed: positions within
+5 cm, frictions 0.1 to 0.6, the errors of the estimates.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import Diagram
+
+from makebreak.diagrams.changing_contact import (
+    ChangingContactConfig,
+    Knowledge,
+    make_changing_contact,
+)
+from makebreak.diagrams.tabletop import (
+    TABLETOP_WALLS,
+    TOOL,
+    move,
+    objects,
+    position,
+    set_friction,
+    set_tool,
+    tool_half_width,
+)
+from makebreak.models.scene import Scene, read_scene
+from makebreak.systems.contact_anticipator import (
+    ApproachSpeedConfig,
+    ContactAnticipatorConfig,
+)
+from makebreak.systems.numerics.contact_task import ContactBelief, ExpectedContact
+from makebreak.systems.numerics.motion_pattern import (
+    MotionPattern,
+    Segment,
+    segment_time,
+)
+
+SURFACES = ("table", "red_block", "blue_wall")
+DOWN, LEFT, AHEAD = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+# The impacts: direction, the surface, and the segment that each of them ends.
+IMPACTS = ((DOWN, "table", 0), (LEFT, "red_block", 1), (AHEAD, "blue_wall", 2),
+           (DOWN, "red_top", 6))  # fmt: skip
+START = (0.42, -0.16, 0.195)  # Of the tip in the scene [m].
+RED_TOP, BLUE_TOP = 0.06, 0.09  # Above the table [m].
+SPREAD = 0.05  # Of the surfaces' positions [m].
+FRICTION = (0.1, 0.6)
+BEYOND = 0.06  # How far behind the nominal surfaces the pattern goes [m].
+CLEAR = 0.05  # Above the blue wall's top, before it turns [m].
+OVER, BACK, GOAL = 0.08, 0.05, 0.12  # Over the red block, and along its top [m].
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+A_MAX = 1.0  # Of the pattern [m/s2].
+
+
+@dataclass
+class MultipleCollisionsConfig:
+    handling: bool = True  # False: no anticipation, no transition-phase controllers.
+    tool: str = "block"  # Or "sphere".
+    speed: float = 0.2  # Of the motion pattern [m/s].
+    normal_force: float = 5.0  # On each surface that has been reached [N].
+    error_max: float = 0.03  # Of the initial estimates, along the motion [m].
+    trials: int = 3
+    seed: int = 0
+    control: ChangingContactConfig = field(
+        default_factory=lambda: ChangingContactConfig(
+            anticipator=ContactAnticipatorConfig(
+                speed=ApproachSpeedConfig(first=0.018, carry_over=True)
+            )
+        )
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class CollisionTask:
+    """What the trials of one seed have in common."""
+
+    world: Scene
+    model: Scene
+    pattern: MotionPattern
+    prior: ContactBelief
+    truth: np.ndarray  # (4,) p_WE . direction at each impact [m].
+    friction: dict[str, float]
+
+
+def make_task(config: MultipleCollisionsConfig) -> CollisionTask:
+    """The world, the motion and the initial estimates of config.seed.
+
+    Raises: ValueError for an unknown tool, or numbers out of their range.
+    """
+    for name in ("trials", "speed", "normal_force"):
+        if not 0.0 < getattr(config, name) < np.inf:
+            raise ValueError(
+                f"{name} is {getattr(config, name)}, expected a positive number"
+            )
+    if not 0.0 <= config.error_max <= 0.1:
+        raise ValueError(f"error_max is {config.error_max}, expected 0 to 0.1 m")
+    rng = np.random.default_rng([config.seed, 5])
+    half = tool_half_width(config.tool)
+    model, world = read_scene(TABLETOP_WALLS), read_scene(TABLETOP_WALLS)
+    for scene in (model, world):
+        set_tool(scene, config.tool)
+    friction = dict(zip(SURFACES, rng.uniform(*FRICTION, size=3).tolist(), strict=True))
+    set_friction(world, friction)
+    up, left, ahead = rng.uniform(-SPREAD, SPREAD, size=3)
+    for name in objects(world):  # All stand on the table.
+        move(world, name, [0.0, 0.0, up])
+    move(world, "red_block", left * LEFT)
+    move(world, "blue_wall", ahead * AHEAD)
+    pattern = make_pattern(config, half)
+    truth = surfaces(world, half)
+    prior = []
+    for (d, _, k), where in zip(IMPACTS, truth, strict=True):
+        estimate = where + rng.uniform(-config.error_max, config.error_max)
+        mean = pattern.segments[k].positions[0].copy()
+        mean += d * (estimate - mean @ d)
+        # Uniform errors up to error_max: two sigma hold them all.
+        sigma = max(0.55 * config.error_max, 0.001)
+        prior.append(ExpectedContact(mean, sigma**2 * np.eye(3), d, segment=k))
+    return CollisionTask(
+        world, model, pattern, ContactBelief(tuple(prior)), truth, friction
+    )
+
+
+def surfaces(scene: Scene, half: float) -> np.ndarray:
+    """p_WE . direction at each of the four impacts [m]."""
+    table, red, blue = (position(scene, name) for name in SURFACES)
+    return np.array([
+        DOWN @ table - half,
+        LEFT @ red - half,
+        AHEAD @ blue - half,
+        DOWN @ red - RED_TOP - half,
+    ])  # fmt: skip
+
+
+def make_pattern(config: MultipleCollisionsConfig, half: float) -> MotionPattern:
+    """The motion, for the surfaces where the scene file has them. Each segment that
+    ends in an impact goes BEYOND it, so that the impact is met at full speed."""
+    z_table, y_red, x_blue, z_top = (
+        abs(x) for x in surfaces(read_scene(TABLETOP_WALLS), half)
+    )
+    p0 = np.array(START)
+    p1 = np.array([p0[0], p0[1], z_table])
+    p2 = np.array([p0[0], y_red, z_table])
+    p3 = np.array([x_blue, y_red, z_table])
+    p4 = np.array([x_blue, y_red, BLUE_TOP + half])
+    p5 = p4 + [0.0, 0.0, CLEAR]
+    p6 = p5 + [-BACK, OVER, 0.0]
+    p7 = np.array([p6[0], p6[1], z_top])
+    p8 = p7 + [-GOAL, 0.0, 0.0]
+    plan = (  # Start, end, force directions, whether it goes beyond.
+        (p0, p1, [], DOWN),
+        (p1, p2, [DOWN], LEFT),
+        (p2, p3, [DOWN, LEFT], AHEAD),
+        (p3, p4, [AHEAD], None),
+        (p4, p5, [], None),
+        (p5, p6, [], None),
+        (p6, p7, [], DOWN),
+        (p7, p8, [DOWN], None),
+    )
+    segments, time, moving = [], 0.2, False
+    for k, (start, end, n, into) in enumerate(plan):
+        if into is not None:
+            end = end + BEYOND * into
+        length = float(np.linalg.norm(end - start))
+        goes_on = k == 3  # Up the wall and on, on one line.
+        duration = segment_time(
+            length, config.speed, A_MAX, not moving, into is None and not goes_on
+        )
+        segments.append(
+            Segment(
+                "line",
+                np.array([start, end]),
+                np.array([time, time + duration]),
+                np.array(UPRIGHT),
+                np.array(n).reshape(-1, 3),
+                np.full(len(n), config.normal_force),
+            )
+        )
+        time, moving = time + duration, goes_on
+    return MotionPattern(tuple(segments), acceleration_max=A_MAX)
+
+
+def make_multiple_collisions(
+    config: MultipleCollisionsConfig,
+    knowledge: Knowledge | None = None,
+    trial: int = 0,
+    meshcat: Meshcat | None = None,
+) -> Diagram:
+    """One trial; knowledge is what the one before has left (None: the estimates).
+
+    Without handling the belief is empty, the motion does not slow down where the plan
+    ends, and the base controller goes through the contacts.
+    """
+    task = make_task(config)
+    control = config.control
+    if knowledge is None:
+        knowledge = Knowledge(task.prior if config.handling else ContactBelief())
+    if not config.handling:
+        control = replace(
+            control,
+            shaper=replace(
+                control.shaper,
+                search=replace(control.shaper.search, speed=config.speed),
+            ),
+            variable_impedance=replace(control.variable_impedance, transition=False),
+        )
+    return make_changing_contact(
+        control, task.world, task.model, task.pattern, knowledge, TOOL,
+        seed=100 * config.seed + trial, meshcat=meshcat,
+    )  # fmt: skip
