@@ -89,9 +89,6 @@ def make_scene_diagram(
             plant.get_state_output_port(), builder, plant.time_step()
         )
         sink.set_name("state_log")
-        for model, path in loaded.paths.items():
-            sink = LogVectorOutput(path.effort, builder, plant.time_step())
-            sink.set_name(f"{model}_effort_log")
     diagram = builder.Build()
     diagram.set_name("scene")
     return diagram, loaded
@@ -235,7 +232,8 @@ class SceneSimulation:
         needed = np.unique(np.concatenate([times, *shown.values()]))
         needed = needed[needed >= start - 1e-9]
         self._set_commands(commands)
-        x, effort = self._simulate(initial, start, needed, initial_is_true)
+        efforts = any(self._channels[channel][0] == "effort" for channel in channels)
+        x, effort = self._simulate(initial, start, needed, initial_is_true, efforts)
         out = np.empty((len(times), len(channels)))
         poses: dict = {}
         for i, channel in enumerate(channels):
@@ -268,12 +266,10 @@ class SceneSimulation:
         ]
         self._default = np.array(plant.GetPositions(self._plant_context))
         self._scratch = plant.CreateDefaultContext()
-        self._logs = {}
+        self._log = None
         if plant.time_step() > 0.0:
-            names = ["state", *(f"{model}_effort" for model in self._loaded.paths)]
-            for name in names:
-                sink = self._diagram.GetSubsystemByName(f"{name}_log")
-                self._logs[name] = sink.FindLog(self._context)
+            sink = self._diagram.GetSubsystemByName("state_log")
+            self._log = sink.FindLog(self._context)
         self._index_channels()
         self._make_ports()
         self._read_effects()
@@ -493,8 +489,11 @@ class SceneSimulation:
                     q[joint.position_start()] -= twist
                 plant.SetPositions(self._plant_context, q)
 
-    def _simulate(self, initial, start: float, needed: np.ndarray, is_true: bool):
-        """States (n, n_x) at the needed times, and efforts {model: (n, n_u)}."""
+    def _simulate(
+        self, initial, start: float, needed: np.ndarray, is_true: bool, efforts: bool
+    ):
+        """States (n, n_x) at the needed times, and efforts {model: (n, n_u)} if they
+        are asked for. What changes at such a time has changed in them."""
         dt = self._plant.time_step()
         for i, value in enumerate(self._discrete):
             self._context.SetDiscreteState(i, value)
@@ -505,7 +504,9 @@ class SceneSimulation:
         self._write_commands(start)
         self._start_lags(start)
         self._untwist()
-        if dt == 0.0:
+        if self._log is not None:
+            self._log.Clear()
+        else:
             # Else its first step would be what the last run ended with.
             integrator = self._simulator.get_mutable_integrator()
             integrator.Reset()
@@ -513,10 +514,10 @@ class SceneSimulation:
             integrator.set_maximum_step_size(self._config.max_step_sec)
         self._simulator.Initialize()
         end = needed[-1] if len(needed) else start
-        events = self._events[(self._events > start + 1e-9) & (self._events < end)]
+        events = self._events[(self._events > start + 1e-9) & (self._events <= end)]
         if dt == 0.0:
-            return self._run_continuous(needed, events)
-        return self._run_discrete(needed, events, clock - start, dt)
+            return self._run_continuous(needed, events, efforts)
+        return self._run_discrete(needed, events, efforts, clock - start, dt)
 
     def _efforts(self) -> dict[str, np.ndarray]:
         now = {}
@@ -532,7 +533,7 @@ class SceneSimulation:
             now[model] = np.array(path.effort.Eval(own))
         return now
 
-    def _run_continuous(self, needed, events):
+    def _run_continuous(self, needed, events, want_efforts: bool):
         stops = np.union1d(needed, events)
         keep = np.isin(stops, needed)
         change = np.isin(stops, events)
@@ -546,36 +547,34 @@ class SceneSimulation:
                 self._write_commands(stop)
             if keep[k]:
                 x[row] = self._plant.GetPositionsAndVelocities(self._plant_context)
-                for model, value in self._efforts().items():
-                    efforts.setdefault(model, []).append(value)
                 row += 1
+                if want_efforts:
+                    for model, value in self._efforts().items():
+                        efforts.setdefault(model, []).append(value)
         return x, {model: np.array(each) for model, each in efforts.items()}
 
-    def _run_discrete(self, needed, events, shift: float, dt: float):
-        """Steps are at multiples of dt; between them a line, as the scheme has it."""
-        for log in self._logs.values():
-            log.Clear()
-        last = np.ceil((needed[-1] + shift) / dt - 1e-9) * dt if len(needed) else 0.0
-        for event in events:
-            # It acts from the first step at or after it.
-            step = np.ceil((event + shift) / dt - 1e-6) * dt
+    def _run_discrete(self, needed, events, want_efforts: bool, shift: float, dt):
+        """Steps are at multiples of dt, and a command acts from the first step at or
+        after it; between steps a line, as the scheme has it."""
+        stops = [(event, True) for event in events]
+        stops += [(time, False) for time in needed] if want_efforts else []
+        efforts: dict[str, list] = {}
+        # Events first where both are at one step.
+        for time, is_event in sorted(
+            stops, key=lambda s: (np.ceil((s[0] + shift) / dt - 1e-6), not s[1])
+        ):
+            step = np.ceil((time + shift) / dt - 1e-6) * dt
             if step > self._context.get_time():
                 self._simulator.AdvanceTo(step)
-            self._write_commands(event)
+            if is_event:
+                self._write_commands(time)
+            else:
+                for model, value in self._efforts().items():
+                    efforts.setdefault(model, []).append(value)
+        last = np.ceil((needed[-1] + shift) / dt - 1e-9) * dt if len(needed) else 0.0
         self._simulator.AdvanceTo(max(last, self._context.get_time()))
-        log = self._logs["state"]
-        time, x = log.sample_times() - shift, log.data().T
-        efforts = {}
-        for model in self._loaded.paths:
-            log = self._logs[f"{model}_effort"]
-            row = np.searchsorted(log.sample_times() - shift, needed + 1e-9) - 1
-            efforts[model] = log.data().T[np.maximum(row, 0)]
-        for model, what, delays, table, _ in self._tables:
-            if what == "effort_command" and model not in efforts:
-                efforts[model] = np.array(
-                    [self._command(table, delays, t) for t in needed]
-                ).reshape(len(needed), -1)
-        return _between(time, x, needed), efforts
+        x = _between(self._log.sample_times() - shift, self._log.data().T, needed)
+        return x, {model: np.array(each) for model, each in efforts.items()}
 
     def _true_channel(self, channel, x, efforts, poses) -> np.ndarray:
         what, *where = self._channels[channel]

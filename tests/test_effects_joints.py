@@ -75,6 +75,7 @@ def test_pendulum_moves_as_the_ode_says(tmp_path, kind, time_step):
     atol = 1e-4 if time_step == 0.0 else 0.02
     rows = simulated(scene)
     np.testing.assert_allclose(rows, expected, atol=atol)
+    np.testing.assert_array_equal(rows[0], [Q0, V0])
     without = exact(lambda q, v: 0.0)
     assert abs(without - expected).max() > 10 * atol  # What is tested is there.
 
