@@ -70,16 +70,13 @@ class WallTraining:
     """What the baseline learns from, and how much of it."""
 
     trials: int = 14  # In each of the three training sets.
-    every: int = 5  # Samples of 5 ms between two steps in joint space.
-    joint: TrainingBudget = field(
-        default_factory=lambda: TrainingBudget(
-            points_per_mode=200, segment_min=4, predict_change=False
-        )
+    every: int = 5  # Samples of 5 ms between two steps of a long-term prediction.
+    long_term: TrainingBudget = field(
+        default_factory=lambda: TrainingBudget(segment_min=4, predict_change=False)
     )
-    task: TrainingBudget = field(
-        default_factory=lambda: TrainingBudget(
-            points_per_mode=200, segment_min=20, predict_change=False
-        )
+    # At every sample; each once with the next force as output, once with its change.
+    one_step: TrainingBudget = field(
+        default_factory=lambda: TrainingBudget(segment_min=20, predict_change=False)
     )
 
 

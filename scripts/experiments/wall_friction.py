@@ -20,7 +20,9 @@ that of every variant of the baseline.
 Ours: everything that figure 1b does not show; docs/wall_friction.md says it all.
 """
 
+import json
 from dataclasses import replace
+from pathlib import Path
 from time import perf_counter
 
 import matplotlib.pyplot as plt
@@ -40,7 +42,8 @@ from makebreak.diagrams.wall_friction import (
     telemetry,
     tip_states,
 )
-from makebreak.scripts.session import Session
+from makebreak.scripts.session import Session, run_many
+from makebreak.scripts.table import Table
 from makebreak.systems.numerics.baselines.long_term_predictor import (
     Prediction,
     Trial,
@@ -59,34 +62,57 @@ SETS = {
     "varied": (VARIED, False, "11b"),
     "stiff": (VARIED, True, "12"),
 }
+# One step ahead: name -> whether the GPs' output is the change of force.
+ONE_STEP = {"one_step": False, "one_step_change": True}
 FORCE_INPUTS = range(6)  # F and velocity; the position is for the SVM.
 Y = 1  # The axis along the wall.
+TIMES_FILE = "training_times.json"
 CONTACT_FORCE = 3.0  # [N] of the wall, by which pictures mark the contact.
 
 
 def run(config: WallFrictionConfig, session: Session) -> dict:
     """Trains, predicts, scores; see the module."""
     make_wall_friction(config)  # Bad settings are refused at once.
-    if config.training.trials < 7:
+    if config.training.trials < len(VARIED):
         raise ValueError(
-            f"training.trials is {config.training.trials}, expected 7 or more: one of "
-            "each friction"
+            f"training.trials is {config.training.trials}, expected {len(VARIED)} or "
+            "more: one of each friction"
         )
-    seconds: dict[str, float] = {}
+    if config.training.every < 1:
+        raise ValueError(
+            f"training.every is {config.training.every}, expected 1 or more"
+        )
+    seconds: dict[str, float] = {}  # Not of the result: they differ from run to run.
     trials, knowledge = collect(config, seconds)
-
     result: dict = {"success": False}
-    predictors = {}
-    for form, change in (("one_step", False), ("one_step_change", True)):
-        budget = replace(config.training.task, predict_change=change)
-        start = perf_counter()
-        data = [force_trial(d) for _, d in trials["varied"]]
-        predictors[form], _ = train(data, budget, FORCE_INPUTS)
-        seconds[f"{form}_training_s"] = perf_counter() - start
+    data, scratch = one_step_ahead(config, session, trials, knowledge, seconds, result)
+    force = force_from_the_start(config, trials["varied"], data, seconds, result)
+    joints = joints_from_the_start(config, trials, data, seconds, result)
 
-    # The tested trial, with all that predicts one step ahead; twice, since our models
-    # are there with and without what they learned before.
-    logs = {}
+    ours = [result["ours_rmse_N"], result["ours_from_scratch_rmse_N"]]
+    best = min(result[f"{name}_rmse_N"] for name in (*ONE_STEP, "task_long"))
+    result["ours_to_best_baseline"] = ours[0] / best
+    result["success"] = bool(max(ours) < best)
+    session.write_json(TIMES_FILE, seconds)
+    session.save_plot(plot_joints(joints), "joint_prediction")
+    session.save_plot(plot_forces(data, scratch, force), "force_prediction")
+    write_recording(session, data)
+    return result
+
+
+def one_step_ahead(config, session, trials, knowledge, seconds, result):
+    """Figure 14: trains, simulates the tested trial with all that predicts, scores.
+
+    Returns: its log, and that of the same trial where our models begin with nothing.
+    """
+    measured = [force_trial(data) for _, data in trials["varied"]]
+    predictors = {}
+    for name, change in ONE_STEP.items():
+        budget = replace(config.training.one_step, predict_change=change)
+        start = perf_counter()
+        predictors[name], _ = train(measured, budget, FORCE_INPUTS)
+        seconds[f"{name}_training_s"] = perf_counter() - start
+    logs = []
     for label, known_before in (("ours", knowledge), ("ours_from_scratch", None)):
         diagram = make_wall_friction(config, session.meshcat, predictors, known_before)
         log = session.simulate(
@@ -96,85 +122,83 @@ def run(config: WallFrictionConfig, session: Session) -> dict:
             period_sec=0.02,
             label=label,
         )
-        logs[label] = telemetry(diagram, log.context, tuple(predictors))
-    data = logs["ours"]
-    window = along_the_wall(data["time"])
-    force = data["wrench"][:, Y]
+        if len(log.time) < DURATION / 0.02:
+            raise ValueError(f"the trial takes {DURATION:.1f} s, got {log.time[-1]} s")
+        data = telemetry(diagram, log.context, tuple(predictors))
+        logs.append(data)
+        window = along_the_wall(data["time"])
+        force = data["wrench"][window, Y]
+        result[f"{label}_rmse_N"] = rms(data["wrench_predicted"][window, Y] - force)
+        result[f"{label}_modes"] = len(np.unique(data["mode"][window]))
+    for name in predictors:
+        mean = data[f"{name}.wrench_predicted"][window, Y]
+        std = data[f"{name}.std"][window, Y]
+        result[f"{name}_rmse_N"] = rms(mean - force)
+        result[f"{name}_in_band"] = share_in_band(force, mean, std)
+    result["persistence_rmse_N"] = rms(np.diff(data["wrench"][:, Y])[window[1:]])
+    return logs
 
-    def error(predicted):
-        return float(np.sqrt(np.mean(np.square((predicted - force)[window]))))
 
-    for label, log in logs.items():
-        result[f"{label}_rmse_N"] = error(log["wrench_predicted"][:, Y])
-        result[f"{label}_modes"] = len(np.unique(log["mode"][window]))
-    for form in predictors:
-        mean = data[f"{form}.wrench_predicted"][:, Y]
-        std = data[f"{form}.std"][:, Y]
-        result[f"{form}_rmse_N"] = error(mean)
-        result[f"{form}_in_band"] = share_in_band(force, mean, std, window)
-    result["persistence_rmse_N"] = error(np.concatenate([[0.0], force[:-1]]))
+def force_from_the_start(config, trials, data, seconds, result):
+    """Figure 13: the force over the whole trial, from the plan alone.
 
-    # The whole trial beforehand: forces.
+    Returns: time (n,), mean (n,) and standard deviation (n,) of the force along y.
+    """
+    every = config.training.every
+
+    def thinned(data, config):
+        return Trial(*(values[::every] for values in force_trial(data, config)))
+
+    planned = [thinned(data, one) for one, data in trials]
     start = perf_counter()
-    planned = [force_trial(d, c) for c, d in trials["varied"]]
-    predictor, modes = train(planned, config.training.task, FORCE_INPUTS)
+    predictor, modes = train(planned, config.training.long_term, FORCE_INPUTS)
     seconds["task_long_training_s"] = perf_counter() - start
-    tested = force_trial(data, config)
+    tested = thinned(data, config)
     start = perf_counter()
-    force_ahead = from_the_start(
-        predictor, planned, modes, known(tested.u), tested, config.seed
+    ahead = from_the_start(
+        predictor, planned, modes, known(tested.u), len(tested.x) - 1, config.seed
     )
     seconds["task_long_prediction_s"] = perf_counter() - start
-    mean, std = force_ahead.mean[:, Y], force_ahead.std[:, Y]
-    result["task_long_rmse_N"] = error(mean)
-    result["task_long_in_band"] = share_in_band(force, mean, std, window)
+    time = data["time"][::every]
+    mean, std, w = ahead.mean[:, Y], ahead.std[:, Y], along_the_wall(time)
+    result["task_long_rmse_N"] = rms((mean - tested.x[:, Y])[w])
+    result["task_long_in_band"] = share_in_band(tested.x[w, Y], mean[w], std[w])
+    return time, mean, std
 
-    # And joints. The stiff controller has a tested trial of its own.
+
+def joints_from_the_start(config, trials, data, seconds, result):
+    """Figures 11 and 12: the joints over the whole trial, with the controller known.
+
+    Returns: {set: time (n,), joint 1 (n,), its mean and standard deviation (n,), time
+        of the contact with the wall}.
+    """
     every = config.training.every
     stiff = replace(config, stiffness=config.stiffness_high)
-    joint_ahead: dict[str, tuple] = {}
+    out = {}
     for name, (_, is_stiff, _) in SETS.items():
+        # The stiff controller has a tested trial of its own.
         tested_config = stiff if is_stiff else config
         truth = simulated(stiff)[0] if is_stiff else data
+        joints = [joint_trial(d, one, every) for one, d in trials[name]]
         start = perf_counter()
-        joints = [joint_trial(d, c, every) for c, d in trials[name]]
-        predictor, modes = train(joints, config.training.joint)
+        predictor, modes = train(joints, config.training.long_term)
         seconds[f"joint_{name}_training_s"] = perf_counter() - start
         tested = joint_trial(truth, tested_config, every)
+        u = policy(tested_config, every)
         start = perf_counter()
         ahead = from_the_start(
-            predictor,
-            joints,
-            modes,
-            policy(tested_config, every),
-            tested,
-            config.seed,
+            predictor, joints, modes, u, len(tested.x) - 1, config.seed
         )
         seconds[f"joint_{name}_prediction_s"] = perf_counter() - start
         time = truth["time"][::every]
-        w = along_the_wall(time)
         q, mean, std = tested.x[:, 0], ahead.mean[:, 0], ahead.std[:, 0]
-        result[f"joint_{name}_rmse_rad"] = float(
-            np.sqrt(np.mean(np.square((mean - q)[w])))
-        )
-        result[f"joint_{name}_end_error_rad"] = float((mean - q)[w][-1])
+        w = along_the_wall(time)
+        result[f"joint_{name}_rmse_rad"] = rms((mean - q)[w])
+        result[f"joint_{name}_lead_at_end_rad"] = float((mean - q)[w][-1])
         result[f"joint_{name}_band_rad"] = float(np.mean(2.0 * std[w]))
-        result[f"joint_{name}_in_band"] = share_in_band(q, mean, std, w)
-        joint_ahead[name] = (time, q, mean, std, contact_time(truth))
-
-    baselines = [result[f"{form}_rmse_N"] for form in predictors]
-    baselines.append(result["task_long_rmse_N"])
-    result["ours_to_best_baseline"] = result["ours_rmse_N"] / min(baselines)
-    result["success"] = bool(
-        max(result["ours_rmse_N"], result["ours_from_scratch_rmse_N"]) < min(baselines)
-    )
-    session.write_json("training_times.json", seconds)
-    session.save_plot(plot_joints(joint_ahead), "joint_prediction")
-    session.save_plot(
-        plot_forces(data, logs["ours_from_scratch"], force_ahead), "force_prediction"
-    )
-    write_recording(session, data)
-    return result
+        result[f"joint_{name}_in_band"] = share_in_band(q[w], mean[w], std[w])
+        out[name] = (time, q, mean, std, contact_time(truth))
+    return out
 
 
 def collect(config: WallFrictionConfig, seconds: dict):
@@ -233,12 +257,11 @@ def force_trial(data, config: WallFrictionConfig | None = None) -> Trial:
     return Trial(data["wrench"][:, :3], np.hstack([velocity, position]), features(data))
 
 
-def from_the_start(predictor, trials, modes, u, tested, seed) -> Prediction:
-    """The whole tested trial, from how training trials begin."""
+def from_the_start(predictor, trials, modes, u, T, seed) -> Prediction:
+    """The whole tested trial of T steps, from how training trials begin."""
     starts = np.array([trial.x[0] for trial in trials])
     covariance = np.cov(starts.T) + 1e-12 * np.eye(starts.shape[1])
     first = int(np.bincount([m[0] for m in modes]).argmax())
-    T = len(tested.x) - 1
     return predict_long_term(predictor, starts.mean(0), covariance, u, T, first, seed)
 
 
@@ -247,9 +270,14 @@ def along_the_wall(time) -> np.ndarray:
     return (time >= TIMES[4]) & (time <= TIMES[5])
 
 
-def share_in_band(truth, mean, std, window) -> float:
-    """Share of the samples in a window that are within two standard deviations."""
-    return float(np.mean((abs(truth - mean) <= 2.0 * std)[window]))
+def rms(values) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def share_in_band(truth, mean, std) -> float:
+    """Share of the samples that are within two standard deviations of the mean."""
+    return float(np.mean(abs(truth - mean) <= 2.0 * std))
 
 
 def contact_time(data) -> float:
@@ -283,20 +311,20 @@ def plot_joints(ahead: dict[str, tuple]):
     return figure
 
 
-def plot_forces(data, scratch, ahead: Prediction):
+def plot_forces(data, scratch, ahead):
     """Figures 13 and 14: the force along the wall, true and predicted."""
     figure, axes = plt.subplots(
         2, 3, figsize=(15, 7.5), sharex=True, height_ratios=(2, 1), layout="constrained"
     )
     time, force = data["time"], data["wrench"][:, Y]
-    contact = contact_time(data)
+    window, contact = along_the_wall(time), contact_time(data)
+    mean, std = (np.interp(time, ahead[0], values) for values in ahead[1:])
     one = data["one_step.wrench_predicted"][:, Y], data["one_step.std"][:, Y]
-    panels = (
-        ("fig. 13: baseline, from the start", ahead.mean[:, Y], ahead.std[:, Y]),
+    panels: tuple = (
+        ("fig. 13: baseline, from the start", mean, std),
         ("fig. 14a: baseline, one step with feedback", *one),
         ("fig. 14b: our forward models", data["wrench_predicted"][:, Y], None),
     )
-    window = along_the_wall(time)
     for k, (title, mean, std) in enumerate(panels):
         ax, below = axes[:, k]
         for a, centre in ((ax, mean), (below, mean - force)):
@@ -305,8 +333,8 @@ def plot_forces(data, scratch, ahead: Prediction):
                     time, centre - 2 * std, centre + 2 * std, alpha=0.3, label="2 std"
                 )
             a.axvline(contact, color="0.4", ls=":")
-        ax.plot(time, mean, color="C0", label="predicted")
         ax.plot(time, force, "k", lw=0.6, label="measured")
+        ax.plot(time, mean, color="C0", label="predicted")
         below.plot(time[window], (mean - force)[window], color="C0", lw=0.7)
         ax.set(title=title, ylim=(-14.0, 6.0))
         below.set(xlabel="time [s]", ylim=(-1.0, 1.0) if k else (-7.0, 7.0))
@@ -337,3 +365,102 @@ def write_recording(session: Session, data):
     for i, name in enumerate(("fx", "fy", "fz", "tx", "ty", "tz")):
         columns[f"{TOOL}.{TIP_FRAME}.{name}"] = data["wrench"][:, i]
     session.write_recording(columns)
+
+
+def reproduce(session: Session, seeds: int, jobs: int) -> Table:
+    """Figures 11 to 14 beside ours; each seed has its own training."""
+    results = run_many(
+        "wall_friction",
+        [({}, seed) for seed in range(seeds)],
+        jobs,
+        session.out_dir,
+        reuse=session.reuse,
+    )
+    done = [r for r in results if "error" not in r]
+    command = "makebreak run wall_friction --seed S"
+    rows: list[tuple] = []
+    met: list[bool | None] = []
+
+    def row(what, paper, ours, good=None):
+        rows.append((what, paper, ours, command))
+        met.append(good)
+
+    def mean(key):
+        return float(np.mean([r[key] for r in done])) if done else float("nan")
+
+    def error(key):
+        values = [r[key] for r in done]
+        if not values:
+            return "-"
+        return f"{np.mean(values):.3f} N ({min(values):.3f} to {max(values):.3f})"
+
+    def joint(name):
+        return (
+            f"{1e3 * mean(f'joint_{name}_rmse_rad'):.1f} mrad rms, band "
+            f"{1e3 * mean(f'joint_{name}_band_rad'):.1f}, "
+            f"{100 * mean(f'joint_{name}_in_band'):.0f} % in it"
+        )
+
+    row("fig. 11a: joint 1, learned at 0.6", "true one lags", joint("same"))
+    row("fig. 11b: learned at 0.1 to 0.7", "the same, wider band", joint("varied"))
+    row("fig. 12: the same, stiff", "narrow band, better", joint("stiff"))
+    ahead = f"{error('task_long_rmse_N')}, {100 * mean('task_long_in_band'):.0f} % in"
+    row("fig. 13: force, from the start", "not in the band", ahead + " band")
+    row("fig. 14a: one step, next force", "not accurate", error("one_step_rmse_N"))
+    row("one step, change of force", "-", error("one_step_change_rmse_N"))
+    row("the last force, unchanged", "-", error("persistence_rmse_N"))
+
+    def below(key):
+        variants = [f"{name}_rmse_N" for name in (*ONE_STEP, "task_long")]
+        wins = sum(r[key] < min(r[v] for v in variants) for r in done)
+        return f"{error(key)}; below all: {wins} of {len(results)}", (
+            bool(results) and wins == len(results)
+        )
+
+    row("fig. 14b: our forward models", "reliable", *below("ours_rmse_N"))
+    row("the same, from nothing", "-", *below("ours_from_scratch_rmse_N"))
+    seconds, online = times(done)
+    joints = [seconds.get(f"joint_{name}_training_s", np.nan) for name in SETS]
+    row("training, joint space", "55 min, 40 trials", f"{np.mean(joints):.0f} s")
+    row(
+        "training, one step", "-", f"{seconds.get('one_step_training_s', np.nan):.0f} s"
+    )
+    joints = [seconds.get(f"joint_{name}_prediction_s", np.nan) for name in SETS]
+    row("prediction of a trial, joints", "20 min", f"{np.mean(joints):.1f} s")
+    for name, label in (
+        ("forward_model_bank", "our learning and prediction, a sample"),
+        ("mode_detector", "our mode detection, a sample"),
+        ("predictor_one_step", "the baseline's prediction, a sample"),
+    ):
+        row(label, "-", f"{online.get(name, np.nan):.2f} ms")
+    return Table(
+        "A wall of unknown friction (CC 4.4)",
+        ("what", "paper", "ours", "command"),
+        rows,
+        met,
+        [
+            "Errors along the wall, rms, mean over seeds (least to greatest); the "
+            "sensor's noise alone is 0.1 N.",
+            "The baseline's GPs are given "
+            f"{Config().training.one_step.points_per_mode} points per mode of "
+            f"{Config().training.trials} trials; the paper's 55 min are for all points "
+            "of 40 trials.",
+        ],
+    )
+
+
+def times(results) -> tuple[dict, dict]:
+    """Means over runs: seconds of training and prediction; ms per sample, p50."""
+    seconds: dict[str, list[float]] = {}
+    online: dict[str, list[float]] = {}
+    for result in results:
+        folder = Path(result["out_dir"])
+        for key, value in json.loads((folder / TIMES_FILE).read_text()).items():
+            seconds.setdefault(key, []).append(value)
+        timing = json.loads((folder / "timing.json").read_text())
+        for key, value in timing["simulations"]["ours"]["systems"].items():
+            online.setdefault(key, []).append(value["p50_ms"])
+    return (
+        {key: float(np.mean(values)) for key, values in seconds.items()},
+        {key: float(np.mean(values)) for key, values in online.items()},
+    )

@@ -20,6 +20,7 @@ program tell of the method. Rasmussen and Williams, "Gaussian processes for mach
 learning" (2006), eq. 2.25, 2.26, 5.8, 5.9.
 """
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -27,6 +28,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.mixture import BayesianGaussianMixture
@@ -193,7 +195,11 @@ def fit_gp(X, Y, x_mean, x_scale, restarts=1, ard=True, seed=0) -> GaussianProce
             optimizer=maximise,
             n_restarts_optimizer=restarts,
             random_state=seed,
-        ).fit(Z, y)
+        )
+        with warnings.catch_warnings():
+            # A length at its bound is an input that does not matter.
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            gp.fit(Z, y)
         best = np.exp(gp.kernel_.theta)
         signal.append(best[0])
         length.append(np.broadcast_to(best[1:-1], d))
@@ -233,7 +239,11 @@ def find_modes(features: Sequence[np.ndarray], budget: TrainingBudget):
         max_iter=200,
         reg_covar=1e-4,
         random_state=budget.seed,
-    ).fit(flat[some])
+    )
+    with warnings.catch_warnings():
+        # It goes on for as long as told; components that are of no use fade slowly.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        mixture.fit(flat[some])
     labels, start = [], 0
     for trial in features:
         found = mixture.predict(flat[start : start + len(trial)])
