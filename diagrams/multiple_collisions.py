@@ -1,7 +1,7 @@
 """A chain of contacts made and lost (CC section 4.5.1, figures 15 and 16).
 
 Down onto the table, along it to the red block, along both to the blue wall, up this
-wall until it ends, free over the red block, down onto its top, and along it to the goal:
+wall until it ends, free over the red block, down onto its top, along it to the goal:
 four impacts and one loss of contact. Where the contacts are is known from estimates
 with errors, as a camera would give them. The world differs by seed: positions within
 5 cm, frictions 0.1 to 0.6, the errors of the estimates.
