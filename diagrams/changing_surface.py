@@ -1,0 +1,193 @@
+"""A block slides over three surfaces of unknown friction (CC section 4.3, figures 8-10).
+
+It comes down on the first surface and goes along a path of straight lines and an arc
+that crosses every seam in several directions; each segment presses with a force of its
+own. Nothing is known of the surfaces at first. The frictions (0.1 to 0.6, gaps of 0.1
+and more), the forces and the sensors' noise differ by seed.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import Diagram
+
+from makebreak.diagrams.changing_contact import (
+    ChangingContactConfig,
+    Knowledge,
+    make_changing_contact,
+)
+from makebreak.diagrams.tabletop import (
+    THREE_SURFACES,
+    TOOL,
+    set_friction,
+    set_tool,
+    tool_half_width,
+)
+from makebreak.models.scene import Scene, read_scene
+from makebreak.systems.numerics.contact_task import ContactBelief, ExpectedContact
+from makebreak.systems.numerics.motion_pattern import (
+    MotionPattern,
+    Segment,
+    segment_time,
+)
+
+SURFACES = ("surface_1", "surface_2", "surface_3")
+SEAM_X, SEAM_Y = 0.5, 0.0  # Where they meet [m].
+START = (0.42, -0.16, 0.195)  # Of the tip in the scene [m].
+DOWN = np.array([0.0, 0.0, -1.0])
+# The path on the surfaces [m]; three points: an arc.
+PATH: tuple[tuple[tuple[float, float], ...], ...] = (
+    ((0.42, -0.16), (0.42, 0.12)),  # 1 -> 2
+    ((0.42, 0.12), (0.58, 0.12)),  # 2 -> 3
+    ((0.58, 0.12), (0.58, -0.10)),  # 3: another direction, no seam.
+    ((0.58, -0.10), (0.43, -0.10)),  # 3 -> 1
+    ((0.43, -0.10), (0.41, 0.0), (0.43, 0.10)),  # 1 -> 2
+    ((0.43, 0.10), (0.59, 0.03)),  # 2 -> 3, slanting.
+    ((0.59, 0.03), (0.43, -0.09)),  # 3 -> 1, slanting.
+    ((0.43, -0.09), (0.44, 0.11)),  # 1 -> 2
+    ((0.44, 0.11), (0.58, 0.07)),  # 2 -> 3
+    ((0.58, 0.07), (0.43, 0.08)),  # 3 -> 2: a seam the other way.
+    ((0.43, 0.08), (0.42, -0.12)),  # 2 -> 1
+)
+FRICTION, GAP = (0.1, 0.6), 0.1
+FORCE = (0.75, 1.5)  # Of a segment, in shares of the config's.
+SPEED_DOWN = 0.1  # [m/s]
+# The corners on which the block stands, from its centre; along its sides [m].
+FEET = {"block": 0.012, "sphere": 0.0}
+
+
+@dataclass
+class ChangingSurfaceConfig:
+    seed: int = 0
+    tool: str = "block"  # Or "sphere".
+    speed: float = 0.1  # Of sliding [m/s].
+    normal_force: float = 8.0  # About; each segment has its own [N].
+    baselines: bool = True  # Constant K_max and constant K_free as well.
+    control: ChangingContactConfig = field(default_factory=ChangingContactConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceTask:
+    """The world and the motion of a seed."""
+
+    world: Scene
+    model: Scene
+    pattern: MotionPattern
+    prior: ContactBelief  # Where the table is is known.
+    friction: np.ndarray  # (3,)
+    forces: np.ndarray  # (n_segments - 1,) [N]
+    feet: float  # From the tip to the corners it stands on, along x and y [m].
+
+
+def draw_friction(rng: np.random.Generator) -> np.ndarray:
+    """(3,) at random, each GAP or more from the others."""
+    while True:
+        mu = rng.uniform(*FRICTION, size=3)
+        if np.diff(np.sort(mu)).min() >= GAP:
+            return mu
+
+
+def make_task(config: ChangingSurfaceConfig) -> SurfaceTask:
+    """The world and the motion of config.seed.
+
+    Raises: ValueError for an unknown tool, or numbers that are not positive.
+    """
+    for name in ("speed", "normal_force"):
+        value = getattr(config, name)
+        if not 0.0 < value < np.inf:
+            raise ValueError(f"{name} is {value}, expected a positive number")
+    if config.seed < 0:
+        raise ValueError(f"seed is {config.seed}, expected an integer of 0 or more")
+    rng = np.random.default_rng([config.seed, 7])
+    model, world = read_scene(THREE_SURFACES), read_scene(THREE_SURFACES)
+    half = tool_half_width(config.tool)
+    for scene in (model, world):
+        set_tool(scene, config.tool)
+    friction = draw_friction(rng)
+    set_friction(world, dict(zip(SURFACES, friction.tolist(), strict=True)))
+    forces = config.normal_force * rng.uniform(*FORCE, size=len(PATH))
+    contact = ExpectedContact(
+        np.array([START[0], START[1], half]), 1e-6 * np.eye(3), DOWN, segment=0
+    )
+    return SurfaceTask(
+        world,
+        model,
+        make_pattern(config, half, forces),
+        ContactBelief((contact,)),
+        friction,
+        forces,
+        FEET[config.tool],
+    )
+
+
+def make_pattern(config: ChangingSurfaceConfig, half: float, forces) -> MotionPattern:
+    """Down, then along PATH, at rest between its pieces."""
+    a_max = 1.0
+    down = np.array([START, (START[0], START[1], half)])
+    time = segment_time(START[2] - half, SPEED_DOWN, a_max, stops=False)
+    segments = [Segment("line", down, np.array([0.0, time]))]
+    for piece, force in zip(PATH, forces, strict=True):
+        points = np.column_stack([np.array(piece), np.full(len(piece), half)])
+        kind = "arc" if len(piece) == 3 else "line"
+        # The length of an arc is the pattern's to find; this one's to 1e-3.
+        length = float(np.linalg.norm(points[-1] - points[0]))
+        if kind == "arc":
+            sagitta = float(np.linalg.norm(points[1] - (points[0] + points[-1]) / 2))
+            radius = (length**2 / 4 + sagitta**2) / (2 * sagitta)
+            length = 2 * radius * float(np.arcsin(length / (2 * radius)))
+        duration = segment_time(length, config.speed, a_max)
+        segments.append(
+            Segment(
+                kind,
+                points,
+                np.array([time, time + duration]),
+                force_directions=DOWN[None],
+                force_targets=np.array([force]),
+            )
+        )
+        time += duration
+    return MotionPattern(tuple(segments), acceleration_max=a_max)
+
+
+def constant_stiffness(
+    config: ChangingSurfaceConfig, stiffness: float
+) -> ChangingSurfaceConfig:
+    """The baseline: the same but for a stiffness [N/m] that stays, no feed-forward."""
+    law = config.control.variable_impedance
+    fixed = replace(law.stiffness, free=stiffness, maximum=stiffness)
+    law = replace(law, stiffness=fixed, feedforward=False)
+    return replace(config, control=replace(config.control, variable_impedance=law))
+
+
+def make_changing_surface(
+    config: ChangingSurfaceConfig,
+    task: SurfaceTask,
+    knowledge: Knowledge | None = None,
+    meshcat: Meshcat | None = None,
+) -> Diagram:
+    """The station and all systems. Args: knowledge: of an earlier trial, if any."""
+    modes = config.control.modes
+    # A sphere is over a seam at once.
+    crossing = modes.crossing if task.feet else 0.0
+    return make_changing_contact(
+        replace(config.control, modes=replace(modes, crossing=crossing)),
+        task.world,
+        task.model,
+        task.pattern,
+        knowledge or Knowledge(contacts=task.prior),
+        tool=TOOL,
+        seed=config.seed,
+        meshcat=meshcat,
+    )
+
+
+def surface_at(p, feet: float):
+    """Which surface each foot stands on. Args: p (n, 3) of the tip [m].
+
+    Returns: (n, 4) numbers from 1 to 3.
+    """
+    p = np.asarray(p)
+    at = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * feet
+    x, y = p[:, None, 0] + at[:, 0], p[:, None, 1] + at[:, 1]
+    return np.where(x > SEAM_X, 3, np.where(y > SEAM_Y, 2, 1))
