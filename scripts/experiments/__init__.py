@@ -19,6 +19,7 @@ from types import ModuleType
 EXPERIMENTS: dict[str, str] = {
     "ball_rolling": "makebreak.scripts.experiments.ball_rolling",
     "cartpole_walls": "makebreak.scripts.experiments.cartpole_walls",
+    "contact_learning": "makebreak.scripts.experiments.contact_learning",
     "multi_spring": "makebreak.scripts.experiments.multi_spring",
     "porridge": "makebreak.scripts.experiments.porridge",
 }

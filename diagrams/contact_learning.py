@@ -1,0 +1,172 @@
+"""Three contacts, met again and again (CC section 4.5.1, figures 17, 18, table 1).
+
+A block comes down on a table, slides along it to a wall, and along both to a second
+wall. Where they are is known to 0.1 m at first; each trial begins with what the last
+one has learned. The world differs by seed: positions within 5 cm, frictions 0.1 to 0.6,
+the signs of the initial errors.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import Diagram
+
+from makebreak.diagrams.changing_contact import (
+    ChangingContactConfig,
+    Knowledge,
+    make_changing_contact,
+)
+from makebreak.diagrams.tabletop import (
+    TABLETOP_WALLS,
+    TOOL,
+    move,
+    objects,
+    position,
+    set_friction,
+    set_tool,
+    tool_half_width,
+)
+from makebreak.models.scene import Scene, read_scene
+from makebreak.systems.numerics.contact_task import ContactBelief, ExpectedContact
+from makebreak.systems.numerics.motion_pattern import (
+    MotionPattern,
+    Segment,
+    segment_time,
+)
+from makebreak.systems.velocity_shaper import RegionConfig, VelocityShaperConfig
+
+SURFACES = ("table", "red_block", "blue_wall")  # Of contacts 1, 2, 3.
+DIRECTIONS = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+ERRORS = (0.12, 0.09, 0.10)  # Of the initial estimates, along DIRECTIONS [m].
+SIGMA = 0.08  # Of them [m].
+SPREAD = 0.05  # Of the surfaces' positions [m].
+FRICTION = (0.1, 0.6)
+START = (0.42, -0.16, 0.195)  # Of the tip in the scene [m].
+BEYOND = 0.06  # How far behind the nominal surfaces the motion pattern goes [m].
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # Of the tip's frame: the flange straight down.
+BACK = 0.03  # Length of the last segment, which takes the third contact up [m].
+
+
+@dataclass
+class ContactLearningConfig:
+    seed: int = 0
+    tool: str = "block"  # Or "sphere".
+    trials: int = 5
+    speed: float = 0.25  # Of the motion pattern [m/s].
+    normal_force: float = 8.0  # On each surface that has been reached [N].
+    # Contacts are felt to 0.1 mm here, so the region's margin is less than elsewhere.
+    control: ChangingContactConfig = field(
+        default_factory=lambda: ChangingContactConfig(
+            shaper=VelocityShaperConfig(region=RegionConfig(margin=0.002))
+        )
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ContactTask:
+    """What the trials of one seed have in common."""
+
+    world: Scene
+    model: Scene
+    pattern: MotionPattern
+    truth: np.ndarray  # (3, 3) p_WE at each contact, along its direction only [m].
+    prior: ContactBelief
+    friction: np.ndarray  # (3,)
+
+
+def make_task(config: ContactLearningConfig) -> ContactTask:
+    """The world, the motion and the initial belief of config.seed.
+
+    Raises: ValueError for an unknown tool, or numbers that are not positive.
+    """
+    for name in ("trials", "speed", "normal_force"):
+        value = getattr(config, name)
+        if not 0.0 < value < np.inf:
+            raise ValueError(f"{name} is {value}, expected a positive number")
+    rng = np.random.default_rng([config.seed, 3])
+    model, world = read_scene(TABLETOP_WALLS), read_scene(TABLETOP_WALLS)
+    half = tool_half_width(config.tool)
+    for scene in (model, world):
+        set_tool(scene, config.tool)
+    friction = rng.uniform(*FRICTION, size=3)
+    set_friction(world, dict(zip(SURFACES, friction.tolist(), strict=True)))
+    shift = rng.uniform(-SPREAD, SPREAD, size=3)
+    for name in objects(world):  # All stand on the table.
+        move(world, name, [0.0, 0.0, -shift[0]])
+    move(world, "red_block", shift[1] * DIRECTIONS[1])
+    move(world, "blue_wall", shift[2] * DIRECTIONS[2])
+    places = np.array([position(world, name) for name in SURFACES])
+    truth = np.array(START) * np.ones((3, 1))
+    pattern = make_pattern(config, half)
+    for i, d in enumerate(DIRECTIONS):
+        axis = int(np.argmax(abs(d)))
+        # Across, where the motion comes: surfaces met before decide it.
+        truth[i:, axis] = places[i, axis] - half * d[axis]
+    prior = []
+    for i, d in enumerate(DIRECTIONS):
+        mean = pattern.segments[i].positions[0].copy()
+        sign = rng.choice([-1.0, 1.0])
+        axis = int(np.argmax(abs(d)))
+        mean[axis] = truth[i, axis] + sign * ERRORS[i]
+        prior.append(ExpectedContact(mean, SIGMA**2 * np.eye(3), d, segment=i))
+    return ContactTask(
+        world, model, pattern, truth, ContactBelief(tuple(prior)), friction
+    )
+
+
+def make_pattern(config: ContactLearningConfig, half: float) -> MotionPattern:
+    """Down, to the left, forwards, a little back; BEYOND each nominal surface."""
+    scene = read_scene(TABLETOP_WALLS)
+    corners, p = [np.array(START)], np.array(START)
+    for name, d in zip(SURFACES, DIRECTIONS, strict=True):
+        axis = int(np.argmax(abs(d)))
+        p = p.copy()
+        p[axis] = position(scene, name)[axis] + (BEYOND - half) * d[axis]
+        corners.append(p)
+    corners.append(p - BACK * DIRECTIONS[1])
+    forces = (
+        [],
+        [DIRECTIONS[0]],
+        [DIRECTIONS[0], DIRECTIONS[1]],
+        [DIRECTIONS[0], DIRECTIONS[2]],
+    )
+    segments, time = [], 0.0
+    a_max = 1.0
+    for k, n in enumerate(forces):
+        length = float(np.linalg.norm(corners[k + 1] - corners[k]))
+        last = k == len(forces) - 1
+        speed = min(0.1, config.speed) if last else config.speed
+        duration = segment_time(length, speed, a_max, stops=last)
+        segments.append(
+            Segment(
+                "line",
+                np.array(corners[k : k + 2]),
+                np.array([time, time + duration]),
+                quaternions=np.array(UPRIGHT),
+                force_directions=np.array(n).reshape(-1, 3),
+                force_targets=np.full(len(n), config.normal_force),
+            )
+        )
+        time += duration
+    return MotionPattern(tuple(segments), acceleration_max=a_max)
+
+
+def make_contact_learning(
+    config: ContactLearningConfig,
+    task: ContactTask,
+    knowledge: Knowledge | None = None,
+    trial: int = 0,
+    meshcat: Meshcat | None = None,
+) -> Diagram:
+    """One trial. Args: knowledge: of the trial before; None: the prior alone."""
+    return make_changing_contact(
+        config.control,
+        task.world,
+        task.model,
+        task.pattern,
+        knowledge or Knowledge(contacts=task.prior),
+        tool=TOOL,
+        seed=1000 * config.seed + trial,
+        meshcat=meshcat,
+    )
