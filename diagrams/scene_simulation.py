@@ -573,6 +573,7 @@ class SceneSimulation:
                     efforts.setdefault(model, []).append(value)
         last = np.ceil((needed[-1] + shift) / dt - 1e-9) * dt if len(needed) else 0.0
         self._simulator.AdvanceTo(max(last, self._context.get_time()))
+        assert self._log is not None
         x = _between(self._log.sample_times() - shift, self._log.data().T, needed)
         return x, {model: np.array(each) for model, each in efforts.items()}
 

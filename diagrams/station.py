@@ -11,6 +11,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import Demultiplexer, Saturation
 
 from makebreak.diagrams.camera import CameraConfig, add_camera
+from makebreak.models.effects import KINDS
 from makebreak.models.scene import InitialSection, Scene, load_scene, read_scene
 from makebreak.systems.contact_probe import ContactProbe, ToolContactForce
 from makebreak.systems.impedance_controller import serial_chain_of
@@ -82,7 +83,7 @@ def make_station(
     tool_body = _only_body(plant, config.tool, "tool")
     tool = tool_body.model_instance()
     n = plant.num_velocities(arm)
-    builder.ExportInput(plant.get_actuation_input_port(arm), f"{ARM}.torque_commanded")
+    builder.ExportInput(loaded.command_input_port(ARM), f"{ARM}.torque_commanded")
     noise = config.noise
     if len(config.contact) < 2:
         raise ValueError(
@@ -101,9 +102,19 @@ def make_station(
         builder.Connect(port, sensor.GetInputPort("value"))
         return sensor.GetOutputPort("measured")
 
+    joints = [
+        f"{ARM}.{plant.get_joint_actuator(index).joint().name()}"
+        for index in plant.GetJointActuatorIndices(arm)
+    ]
+
+    def measured(port: OutputPort, *what: str) -> OutputPort:
+        """The port as the scene's effects have it measured."""
+        channels = [f"{joint}.{each}" for each in what for joint in joints]
+        return loaded.measured_output_port(builder, port, channels)
+
     encoders = noisy(
         f"{ARM}_encoders",
-        plant.get_state_output_port(arm),
+        measured(plant.get_state_output_port(arm), "position", "velocity"),
         np.repeat([noise.position, noise.velocity], n),
         seeds[0],
     )
@@ -119,11 +130,15 @@ def make_station(
         for index in plant.GetJointActuatorIndices(arm)
     ])  # fmt: skip
     motors = builder.AddNamedSystem(f"{ARM}_motors", Saturation(-limit, limit))
-    builder.ConnectInput(f"{ARM}.torque_commanded", motors.get_input_port())
+    effort = loaded.effort_output_port(ARM)
+    if effort is None:
+        builder.ConnectInput(f"{ARM}.torque_commanded", motors.get_input_port())
+    else:
+        builder.Connect(effort, motors.get_input_port())
     builder.ExportOutput(
         noisy(
             f"{ARM}_torque",
-            motors.get_output_port(),
+            measured(motors.get_output_port(), "effort_measured"),
             np.full(n, noise.torque),
             seeds[1],
         ),
@@ -204,7 +219,8 @@ def make_control_plant(
 ) -> MultibodyPlant:
     """The arm with its tool alone, as the controllers believe it: for their own use.
 
-    Its default positions are the scene's initial ones. Effects on arm and tool count.
+    Its default positions are the scene's initial ones. Effects on arm, tool and world
+    count, but for those that add coordinates which nobody measures.
     """
     if not isinstance(scene, Scene):
         scene = read_scene(scene)
@@ -226,8 +242,10 @@ def make_control_plant(
         effect
         for effect in scene.effects
         if all(
-            at.split(".")[0].split("~")[0] in own and "~" not in at for at in effect.at
+            at.split(".")[0].split("~")[0] in (*own, "world") and "~" not in at
+            for at in effect.at
         )
+        and not (effect.kind in KINDS and KINDS[effect.kind].hidden_state)
     ]
     part = replace(scene, directives=directives, initial=initial, effects=effects)
     return load_scene(part, DiagramBuilder()).plant
