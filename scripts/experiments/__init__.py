@@ -19,9 +19,11 @@ from types import ModuleType
 EXPERIMENTS: dict[str, str] = {
     "ball_rolling": "makebreak.scripts.experiments.ball_rolling",
     "cartpole_walls": "makebreak.scripts.experiments.cartpole_walls",
+    "changing_surface": "makebreak.scripts.experiments.changing_surface",
     "contact_learning": "makebreak.scripts.experiments.contact_learning",
     "multi_spring": "makebreak.scripts.experiments.multi_spring",
     "porridge": "makebreak.scripts.experiments.porridge",
+    "wall_friction": "makebreak.scripts.experiments.wall_friction",
 }
 
 
