@@ -211,7 +211,8 @@ class SceneSimulation:
 
         Args:
             initial: the state at start_sec, by name, as measured; what is not named is
-                as in the scene, at rest. Of a delayed channel give the sample that
+                as in the scene, at rest. (A motor behind an elastic element is
+                `motor_of_<model>_<joint>.<joint>`.) Of a delayed channel give the sample that
                 shows the state of start_sec (true_at).
             times: (n,) [s], increasing: stamps of the measured samples.
             channels: of `channels()`.
@@ -283,9 +284,8 @@ class SceneSimulation:
         self._joints = {}
         for joint in one_dof_joints(plant):
             name = full_name(plant, joint)
-            if name.startswith("motor_of_"):
-                continue
-            self._joints[name] = joint
+            if not name.startswith("motor_of_"):
+                self._joints[name] = joint
             motor = motor_joint(plant, joint)
             for what in ("position", "velocity"):
                 channel = f"{name}.{what}"
@@ -443,31 +443,26 @@ class SceneSimulation:
                     raise ValueError(f"initial pose of {name!r}, which is no free body")
                 for suffix, each in zip(suffixes, values, strict=True):
                     put(f"{name}.{suffix}", each)
-        # A motor and its link start without twist, but for what the effort asks.
-        for joint in self._joints.values():
+        # A motor and its link start without twist, unless both are given.
+        for name, joint in self._joints.items():
             motor = motor_joint(plant, joint)
             if motor is None:
                 continue
-            name = full_name(plant, joint)
-            for what, a, b in (
-                ("position", joint.position_start(), motor.position_start()),
-                (
-                    "velocity",
-                    n_q + joint.velocity_start(),
-                    n_q + motor.velocity_start(),
-                ),
-            ):
-                given, other = (
-                    (a, b) if self._channels[f"{name}.{what}"][1] == a else (b, a)
-                )
-                x[other] = x[given]
+            own, a, b = full_name(plant, motor), joint, motor
+            if self._channels[f"{name}.position"][1] == motor.position_start():
+                a, b = motor, joint
+            if own not in initial.positions:
+                x[b.position_start()] = x[a.position_start()]
+            if own not in initial.velocities:
+                x[n_q + b.velocity_start()] = x[n_q + a.velocity_start()]
         plant.SetPositionsAndVelocities(self._plant_context, x)
 
-    def _untwist(self) -> None:
-        """The link lags its motor by effort over stiffness, as at rest."""
+    def _untwist(self, initial: InitialSection) -> None:
+        """A motor leads its link as it would at rest under its effort: by effort over
+        stiffness, or by half the gap."""
         plant = self._plant
         for effect in self._current:
-            if effect.kind != "joint_elasticity":
+            if not KINDS[effect.kind].hidden_state:
                 continue
             for name, joint in self._joints.items():
                 model = name.split(".")[0]
@@ -475,13 +470,18 @@ class SceneSimulation:
                     continue
                 motor, path = motor_joint(plant, joint), self._loaded.paths[model]
                 assert motor is not None and path.effort is not None
+                if full_name(plant, motor) in initial.positions:
+                    continue
                 own = path.path.GetMyContextFromRoot(self._context)
                 names = [
                     full_name(plant, a.joint())
                     for a in actuators_of_model(plant, model)
                 ]
                 effort = path.effort.Eval(own)[names.index(name)]
-                twist = effort / effect.parameters["stiffness"]
+                if effect.kind == "joint_elasticity":
+                    twist = effort / effect.parameters["stiffness"]
+                else:
+                    twist = np.sign(effort) * effect.parameters["gap"] / 2.0
                 q = plant.GetPositions(self._plant_context)
                 if self._channels[f"{name}.position"][1] == joint.position_start():
                     q[motor.position_start()] += twist
@@ -503,7 +503,7 @@ class SceneSimulation:
         self._set_state(initial, is_true)
         self._write_commands(start)
         self._start_lags(start)
-        self._untwist()
+        self._untwist(initial)
         if self._log is not None:
             self._log.Clear()
         else:

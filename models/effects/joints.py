@@ -16,6 +16,7 @@ from makebreak.models.effects.kind import (
     velocity_unit,
 )
 from makebreak.models.effects.signature import Signature, at_joints
+from makebreak.models.effects.transmission import motor_joint
 
 # ----- What they do
 
@@ -54,7 +55,7 @@ def _add_rotor(effect: Effect, plant: MultibodyPlant, scene_graph) -> None:
 def _change_rotor(old: Effect, new: Effect, plant: MultibodyPlant, context) -> None:
     change = new.parameters["inertia"] - old.parameters["inertia"]
     for joint in find_joints(new, plant):
-        actuator = actuator_of(plant, joint)
+        actuator = actuator_of(plant, motor_joint(plant, joint) or joint)
         inertia = actuator.rotor_inertia(context)
         inertia += change / actuator.gear_ratio(context) ** 2
         actuator.SetRotorInertia(context, max(inertia, 0.0))
