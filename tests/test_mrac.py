@@ -8,19 +8,20 @@ from pydrake.systems.primitives import ConstantVectorSource
 from scipy.linalg import solve_continuous_lyapunov
 from scipy.signal import StateSpace, lsim
 
-from makebreak.diagrams.planar import make_planar
 from makebreak.systems.baselines.mrac import Mrac, MracConfig
 from makebreak.systems.numerics.mrac import MEMORY, error_weights, tick
-from makebreak.systems.planar_world import CircleTargetConfig, PlanarWorldConfig
+from makebreak.systems.numerics.planar_world import circle_target, step
 
 DT = 1e-3
 
 
-@pytest.mark.parametrize("omega, zeta", [(1.0, 1.0), (1.5, 0.7), (20.0, 0.4)])
-def test_error_weights_are_the_last_row_of_lyapunovs_solution(omega, zeta):
+@pytest.mark.parametrize(
+    "omega, zeta, weight", [(1, 1, 1), (1.5, 0.7, 0.2), (20, 0.4, 3)]
+)
+def test_error_weights_are_the_last_row_of_lyapunovs_solution(omega, zeta, weight):
     A = np.array([[0.0, 1.0], [-(omega**2), -2.0 * zeta * omega]])
-    P = solve_continuous_lyapunov(A.T, -np.eye(2))
-    np.testing.assert_allclose(error_weights(omega, zeta), P[1], rtol=1e-12)
+    P = solve_continuous_lyapunov(A.T, -np.diag([1.0, weight]))
+    np.testing.assert_allclose(error_weights(omega, zeta, weight), P[1], rtol=1e-12)
 
 
 @pytest.mark.parametrize("lag", [False, True])
@@ -49,25 +50,27 @@ def test_ticks_agree_with_the_equations_written_as_matrices(lag):
         np.testing.assert_allclose(u, expected, rtol=1e-10, atol=1e-9)
 
 
-def run(config, world, seconds, stop=None, record=0.01):
-    target = CircleTargetConfig(duration_sec=seconds)
-    diagram = make_planar(Mrac(config), world, target, 0.0, 0)
-    simulator = Simulator(diagram)
-    context = simulator.get_context()
-    rows = []
-    for k in range(1, round((stop or seconds) / record) + 1):
-        simulator.AdvanceTo(k * record)
-        names = ("state", "x_desired", "x_model", "u")
-        rows.append([diagram.GetOutputPort(n).Eval(context) for n in names])
+def run(config, seconds, viscosity, anchor, spring, stop=None):
+    """The law and the world, tick by tick; every tenth tick's x, target, x_m, u."""
+    circle = (0.25, seconds, 0.0, 1.0)
+    weights = error_weights(config.omega, config.zeta, config.rate_weight)
+    gains = config.force_gains + config.position_gains + config.velocity_gains
+    world = (np.full(2, viscosity), 1.0, np.array([anchor]), np.array([spring]))
+    memory, x, rows = np.zeros(MEMORY), np.array([0.25, 0.0, 0.0, 0.0]), []
+    for k in range(round((stop or seconds) / DT)):
+        target = circle_target(k * DT, *circle)
+        law = (config.omega, config.zeta, *weights, np.array(gains), config.lag)
+        u, after, _ = tick(memory, x, target, *law, DT, 100.0)
+        if k % 10 == 0:
+            rows.append([x, target, memory[18:22] if k else target[:4], u])
+        memory, x = after, step(x, k * DT, u, DT, 1.0, *world)
     return [np.array(column) for column in zip(*rows, strict=True)]
 
 
 def test_adapts_until_a_known_plant_answers_as_the_reference_model():
     """A slow circle through viscosity and a spring, by the adaptive gains alone: f has
     no integral. And x_m is what scipy says that the reference model does."""
-    world = PlanarWorldConfig(
-        viscosity=[4.0, 4.0], anchors=[[0.0, 0.0]], stiffness=[9.0], rest_length=[0.1]
-    )
+    world = (4.0, [0.0, 0.0], [9.0, 0.1])  # Viscosity, anchor, spring.
     config = MracConfig(
         omega=1.5,
         force_gains=[200.0, 0.0],
@@ -75,31 +78,28 @@ def test_adapts_until_a_known_plant_answers_as_the_reference_model():
         velocity_gains=[0.0, 5000.0],
         lag=True,
     )
-    x, target, x_m, _ = run(config, world, 40.0)
+    x, target, x_m, _ = run(config, 40.0, *world)
     w = config.omega
     A = np.array([[0.0, 1.0], [-(w**2), -2.0 * w]])
     model = StateSpace(A, [[0.0], [w**2]], [[1.0, 0.0]], [[0.0]])
-    t = 0.01 * np.arange(len(x) + 1)
+    t = 0.01 * np.arange(len(x))
     for i, start in enumerate((0.25, 0.0)):
-        command = np.concatenate([[start], target[:, i]])
-        _, expected, _ = lsim(model, command, t, X0=[start, 0.0])
+        _, expected, _ = lsim(model, target[:, i], t, X0=[start, 0.0])
         # Euler's rule with 1 ms: half a step late, at up to 0.07 m/s.
-        np.testing.assert_allclose(x_m[:, i], expected[1:], atol=1e-4)
+        np.testing.assert_allclose(x_m[:, i], expected, atol=1e-4)
     # Without adaptation the spring's 9 (0.25 - 0.1) N stand against p2 a1 = 44 N/m and
     # the spring's own 9 N/m: 25 mm. With it, a tenth of that after the first seconds.
     error = np.linalg.norm(x[:, :2] - x_m[:, :2], axis=1)
     assert error[500:].max() < 2.5e-3
-    plain = MracConfig(1.5, 1.0, [200.0, 0.0], [0.0, 0.0], [0.0, 0.0], lag=True)
-    x, _, x_m, _ = run(plain, world, 40.0, stop=5.0)
+    plain = MracConfig(1.5, 1.0, 1.0, [200.0, 0.0], [0.0, 0.0], [0.0, 0.0], lag=True)
+    x, _, x_m, _ = run(plain, 40.0, *world, stop=5.0)
     error = np.linalg.norm(x[:, :2] - x_m[:, :2], axis=1)
     assert error[-1] == pytest.approx(9.0 * 0.15 / (44.4 + 9.0), rel=0.02)
 
 
 def test_integral_action_removes_a_constant_force():
     # A spring so long and soft that it pulls with 10 N wherever the effector is.
-    world = PlanarWorldConfig(anchors=[[1e4, 0.0]], stiffness=[1e-3], rest_length=[0.0])
-    config = MracConfig(force_gains=[400.0, 400.0])
-    x, target, _, u = run(config, world, 40.0)
+    x, target, _, u = run(MracConfig(), 40.0, 0.0, [1e4, 0.0], [1e-3, 0.0])
     np.testing.assert_allclose(u[-1], [-10.0, 0.0], atol=0.05)
     assert np.linalg.norm(x[-1, :2] - target[-1, :2]) < 1e-3
 
@@ -138,6 +138,7 @@ def test_a_state_that_is_not_finite_holds_the_last_force():
     [
         (dict(omega=0.0), "omega is 0.0"),
         (dict(zeta=-1.0), "zeta is -1.0"),
+        (dict(rate_weight=0.0), "rate_weight is 0.0"),
         (dict(position_gains=[1.0]), "position_gains"),
         (dict(force_gains=[1.0, -1.0]), "force_gains"),
         (dict(velocity_gains=[1.0, np.inf]), "velocity_gains"),

@@ -149,8 +149,10 @@ def joint_samples(log: Log, along: bool) -> np.ndarray:
 
 def regression_error(mixture, samples, n_in: int) -> float:
     """RMS of |predicted - next D| over joint samples (n, d) [N]; NaN for none."""
-    wrong = [regress(mixture, row[:n_in])[0] - row[n_in:] for row in samples]
-    return rms_or_nan(np.linalg.norm(np.reshape(wrong, (len(wrong), -1)), axis=1))
+    wrong = [
+        np.linalg.norm(regress(mixture, row[:n_in])[0] - row[n_in:]) for row in samples
+    ]
+    return rms_or_nan(wrong)
 
 
 def prediction_errors(log: Log, column: str) -> np.ndarray:

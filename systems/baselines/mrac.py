@@ -15,6 +15,7 @@ HELD, AT_LIMIT = 1, 2  # Status, a sum.
 class MracConfig:
     omega: float = 1.5  # Natural frequency of the reference model [1/s].
     zeta: float = 1.0  # Its damping ratio.
+    rate_weight: float = 1.0  # l: what a velocity error counts [s2].
     # Proportional and integral gain: of the auxiliary force f, of K0 and Q0, and of K1
     # and Q1.
     force_gains: list[float] = field(default_factory=lambda: [400.0, 400.0])
@@ -47,6 +48,7 @@ class Mrac(LeafSystem):
         for name, number in (
             ("omega", c.omega),
             ("zeta", c.zeta),
+            ("rate_weight", c.rate_weight),
             ("force_max", force_max),
             ("period_sec", period_sec),
         ):
@@ -61,7 +63,7 @@ class Mrac(LeafSystem):
         self._law = (
             float(c.omega),
             float(c.zeta),
-            *error_weights(float(c.omega), float(c.zeta)),
+            *error_weights(float(c.omega), float(c.zeta), float(c.rate_weight)),
             np.concatenate(gains),
             bool(c.lag),
             float(period_sec),

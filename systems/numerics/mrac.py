@@ -1,15 +1,15 @@
 """Model reference adaptive control of position, by hyperstability.
 
     reference:  x_m'' + 2 zeta w x_m' + w^2 x_m = w^2 r,   e = x_m - x
-    q  = p2 e + p3 e',   p2 = l1 / (2 w^2),  p3 = l2 / (4 zeta w) + l1 / (4 zeta w^3)
+    q  = p2 e + p3 e',   p2 = 1 / (2 w^2),  p3 = l / (4 zeta w) + 1 / (4 zeta w^3)
     f  = a1 q + a2 int q dt
     K0 = E1 q x' + E2 int q x' dt,     K1 the same with x'   (gains of x and of dx/dt)
     Q0 = F1 q x_m' + F2 int q x_m' dt, Q1 the same with dx_m/dt
     u  = f + K0 x + K1 dx/dt + Q0 x_m + Q1 dx_m/dt
 
-(p2, p3) is the last row of the P that solves A'P + P A = -diag(l1, l2) for the
-reference model's A. Here l1 = l2 = 1 and F1 = E1, F2 = E2, of a pair for x and x_m and
-a pair for their velocities. Nothing is known of the plant.
+(p2, p3) is the last row of the P that solves A'P + P A = -diag(1, l) for the reference
+model's A. Here F1 = E1 and F2 = E2, of a pair for x and x_m and a pair for their
+velocities. Nothing is known of the plant.
 
 The command r is the one whose response is the target, r = x_d + 2 zeta/w v_d + a_d/w^2,
 so that x_m is the target: the most that MRAC can be given. Driven by the target itself,
@@ -32,10 +32,10 @@ from makebreak.systems.numerics.planar_world import limited
 MEMORY = 23
 
 
-def error_weights(omega, zeta):
-    """p2 [s2], p3 [s] for l1 = 1, l2 = 1 s2."""
+def error_weights(omega, zeta, rate_weight=1.0):
+    """p2, p3 of a reference model omega [1/s], zeta; rate_weight is l [s2]."""
     p2 = 1.0 / (2.0 * omega**2)
-    return p2, 1.0 / (4.0 * zeta * omega) + 1.0 / (4.0 * zeta * omega**3)
+    return p2, (rate_weight + 1.0 / omega**2) / (4.0 * zeta * omega)
 
 
 @njit(cache=True)

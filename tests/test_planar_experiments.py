@@ -1,0 +1,223 @@
+"""The experiments porridge and multi_spring, run short."""
+
+import json
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from makebreak.diagrams import multi_spring as diagrams
+from makebreak.diagrams.multi_spring import MultiSpringConfig
+from makebreak.diagrams.planar import knowledge_of
+from makebreak.diagrams.porridge import PorridgeConfig
+from makebreak.scripts import tune_planar
+from makebreak.scripts.cli import main
+from makebreak.scripts.experiments import multi_spring, porridge
+from makebreak.scripts.planar_runs import median_range
+from makebreak.scripts.session import Session
+from makebreak.systems.numerics.planar_impedance import persistence
+
+
+def run_main(name, folder, *settings):
+    status = main(["run", name, "--no-meshcat", "--out", str(folder), *settings])
+    return status, json.loads((folder / "result.json").read_text())
+
+
+def test_multi_spring_writes_scores_and_figures_and_repeats_itself(tmp_path):
+    short = ["--seed", "3", "--duration", "0.4", "--set", "trials=2"]
+    _, result = run_main("multi_spring", tmp_path / "a", *short)
+    error = result["tracking_error_rms_m"]
+    for name in ("mrac", "active_inference"):
+        ratio = result[f"{name}_error_rms_m"] / error
+        assert result[f"ratio_{name}"] == pytest.approx(ratio)
+    curve = result["biomimetic_error_rms_m"]
+    assert len(curve) == 2 and len(result["tracking_error_rms_by_trial_m"]) == 2
+    assert result["ratio_biomimetic_last"] == pytest.approx(curve[-1] / error)
+    share = result["stiffness_mean_Npm"] / result["stiffness_share"]
+    assert share == pytest.approx(500.0)
+    n = len(multi_spring.OMEGAS)
+    assert len(result["mrac_omega_error_rms_m"]) == n
+    for figure in ("mrac", "active_inference", "biomimetic", "adaptive"):
+        assert (tmp_path / "a" / f"{figure}.png").stat().st_size > 10_000
+    header = (tmp_path / "a/recording.csv").read_text().splitlines()[0]
+    assert "effector.x.position" in header and "effector.tip.fy" in header
+    _, again = run_main("multi_spring", tmp_path / "b", *short)
+    assert again == result
+
+
+def test_multi_springs_criterion_is_the_stated_one(tmp_path):
+    """Success needs all four ratios and the stiffness; here from what the run wrote."""
+    short = ["--duration", "0.4", "--set", "trials=1"]
+    status, result = run_main("multi_spring", tmp_path, *short)
+    met = all(
+        result[f"ratio_{name}"] >= bound
+        for name, bound in (
+            ("mrac", 3.0),
+            ("active_inference", 3.0),
+            ("biomimetic_first", 3.0),
+        )
+    )
+    met = met and result["ratio_biomimetic_last"] > 1.0
+    met = met and result["stiffness_share"] <= 0.25
+    assert result["success"] == met and status == (0 if met else 1)
+
+
+def test_porridge_compares_models_on_the_same_samples(tmp_path):
+    status, result = run_main("porridge", tmp_path, "--seed", "2")
+    ratio = (
+        result["fixed_prediction_error_outside_N"]
+        / result["incremental_prediction_error_outside_N"]
+    )
+    assert result["fixed_over_incremental"] == pytest.approx(ratio)
+    assert result["success"] == (ratio >= 5.0) and status == (0 if ratio >= 5.0 else 1)
+    # The last measured force is off by two draws of the noise, one per sample, and by
+    # what the force changes in 5 ms: at most 0.15 N here.
+    expected = np.sqrt(2.0) * 0.2
+    found = result["measured_force_prediction_error_outside_N"]
+    assert expected * 0.9 < found < np.hypot(expected, 0.15) * 1.1
+    # No prediction beats the noise of the sensor that it is compared with.
+    for name in porridge.MODELS:
+        assert result[f"{name}_prediction_error_outside_N"] > 0.18, name
+    assert 0.2 < result["outside_share"] < 0.7
+    assert len(result["fixed_sizes_error_outside_N"]) == len(porridge.SIZES)
+    for figure in ("prediction", "tracking"):
+        assert (tmp_path / f"{figure}.png").stat().st_size > 10_000
+
+
+def test_regression_error_of_no_model_is_the_difference_of_forces():
+    samples = np.array([[0.3, 4.0, 5.0], [0.2, 5.0, 3.0]])
+    error = porridge.regression_error(persistence(2, 1), samples, 2)
+    assert error == pytest.approx(np.sqrt((1.0 + 4.0) / 2.0), rel=1e-5)
+    assert np.isnan(porridge.regression_error(persistence(2, 1), samples[:0], 2))
+
+
+@pytest.mark.parametrize(
+    "name, setting, message",
+    [
+        ("multi_spring", "trials=0", "trials is 0"),
+        ("multi_spring", "force_noise=-1", "force_noise is -1"),
+        ("multi_spring", "baselines.mrac.omega=0", "omega is 0"),
+        ("multi_spring", "impedance.stiffness_max=1", "stiffness_max is 1"),
+        ("porridge", "viscosity=[80,20]", "viscosity is"),
+        ("porridge", "model.mixture.tau_nov=2", "tau_nov is 2"),
+    ],
+)
+def test_bad_settings_are_one_line_and_status_2(
+    tmp_path, capsys, name, setting, message
+):
+    arguments = ["run", name, "--no-meshcat", "--out", str(tmp_path), "--set", setting]
+    assert main(arguments) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert message in lines[-1] and not any("Traceback" in line for line in lines)
+
+
+@pytest.mark.parametrize("module", [multi_spring, porridge])
+def test_reproduce_says_met_only_if_every_seed_ran_and_met(
+    tmp_path, monkeypatch, module
+):
+    """From results as run writes them; one seed's run is made to fail."""
+    name = module.__name__.rsplit(".", 1)[-1]
+    short = ["--duration", "0.4", "--set", "trials=1"] if name == "multi_spring" else []
+    _, result = run_main(name, tmp_path / "one", *short)
+    good = dict(result)
+    for key in result:
+        if key.startswith("ratio_") or key.endswith("_over_incremental"):
+            good[key] = 50.0
+    for results, everything_met in (
+        ([good, good], True),
+        ([good, {"success": False, "error": "exit status 3"}], False),
+    ):
+        monkeypatch.setattr(module, "run_many", lambda *a, r=results, **k: r)
+        table = module.reproduce(Session(tmp_path / "r"), 2, 1)
+        targets = [m for m in table.met if m is not None]
+        assert targets and all(targets) == everything_met
+        assert table.to_text()
+
+
+def test_median_and_range_of_what_is_there():
+    assert median_range([1.0, None, 3.0, 2.0], 10.0, "mm") == "20 (10 to 30) mm"
+    assert median_range([None]) == "-"
+
+
+def test_every_search_space_makes_a_controller_that_stays_within_its_bounds():
+    """At random settings: the gains that the tuning may not exceed."""
+    rng = np.random.default_rng(0)
+    for name, space in tune_planar.SPACES.items():
+        for _ in range(20):
+            p = {
+                key: float(np.exp(rng.uniform(*np.log(pair))))
+                for key, pair in space.items()
+            }
+            config = tune_planar.config_of(name, p)
+            if name in ("mrac", "porridge_mrac"):
+                p2, p3 = tune_planar.error_weights(
+                    config.omega, config.zeta, config.rate_weight
+                )
+                most = config.force_gains[0] + 2 * 0.25**2 * config.position_gains[0]
+                most += 2 * 0.49**2 * config.velocity_gains[0]
+                assert p2 * most <= 500.0 * (1 + 1e-9)
+                assert p3 * most <= 4.0 * np.sqrt(500.0) * (1 + 1e-9)
+            elif name.startswith("biomimetic"):
+                assert config.stiffness <= 500.0
+                assert config.damping <= 4.0 * np.sqrt(500.0) * (1 + 1e-9)
+            elif name.endswith("adaptive"):
+                law, _ = config
+                assert law.stiffness_max == 500.0 and law.damping_ratio <= 2.0
+
+
+def diagram_error(diagram):
+    """RMS tracking error [m], and what the controller learned, if it does."""
+    simulator = Simulator(diagram)
+    context = simulator.get_context()
+    errors = []
+    for k in range(1, 1201):
+        simulator.AdvanceTo(0.005 * k)
+        x, goal = (
+            diagram.GetOutputPort(name).Eval(context)[:2]
+            for name in ("state", "x_desired")
+        )
+        errors.append((x - goal) @ (x - goal))
+    learns = hasattr(diagram.GetSubsystemByName("controller"), "knowledge")
+    known = knowledge_of(diagram, context) if learns else None
+    return np.sqrt(np.mean(errors)), known
+
+
+def test_the_tunings_plain_loops_are_the_diagrams():
+    """Tick for tick: only the sum of the errors is taken in another order."""
+    springs = MultiSpringConfig(seed=7)
+    task = tune_planar.task_of(7)
+    c = springs.baselines
+    for controller, plain in (
+        (diagrams.mrac(c.mrac), tune_planar.mrac_error(c.mrac, task)),
+        (
+            diagrams.active_inference(c.active_inference),
+            tune_planar.active_inference_error(c.active_inference, task),
+        ),
+        (
+            diagrams.impedance(springs.impedance, springs.model),
+            tune_planar.adaptive_error(springs.impedance, springs.model, task)[0],
+        ),
+    ):
+        error, _ = diagram_error(diagrams.make_multi_spring(springs, controller))
+        assert error == pytest.approx(plain, rel=1e-12)
+    known, errors = None, []
+    for _ in range(3):
+        controller = diagrams.biomimetic(c.biomimetic, known)
+        error, known = diagram_error(diagrams.make_multi_spring(springs, controller))
+        errors.append(error)
+    curve = tune_planar.learning_curve(c.biomimetic, task, 3)
+    np.testing.assert_allclose(errors, curve, rtol=1e-12)
+    stirring = PorridgeConfig(seed=7)
+    for training in (True, False):
+        controller = diagrams.impedance(stirring.impedance, stirring.model)
+        diagram = porridge.make_porridge(stirring, controller, training)
+        plain = tune_planar.adaptive_error(
+            stirring.impedance, stirring.model, tune_planar.task_of(7, True, training)
+        )
+        assert diagram_error(diagram)[0] == pytest.approx(plain[0], rel=1e-12)
+
+
+def test_porridges_noise_and_viscosity_are_settings():
+    config = PorridgeConfig(seed=1, spread=0.0, viscosity=[10.0, 20.0])
+    world, _, _ = porridge.draw(config, training=False)
+    assert world.viscosity == [0.0, 20.0]
