@@ -259,16 +259,23 @@ def plot_trials(trials: list[Trial], task: ContactTask):
     trial."""
     shown = [0, len(trials) - 1] if len(trials) > 1 else [0]
     figure, axes = plt.subplots(
-        4, len(shown), figsize=(6.5 * len(shown), 9), sharey="row", squeeze=False,
+        4,
+        len(shown),
+        figsize=(6.5 * len(shown), 9),
+        sharex=True,
+        sharey="row",
+        squeeze=False,
         layout="constrained",
-    )  # fmt: skip
+    )
     for ax, k in zip(axes.T, shown, strict=True):
         log, trial = trials[k].log, trials[k]
         time, dt = log["time"], log["time"][1] - log["time"][0]
         v = log["ee_velocity"][:, :3]
         for i, axis in enumerate("xyz"):
             ax[0].plot(time, v[:, i], lw=0.9, label=axis)
-        a = low_pass(np.gradient(v, dt, axis=0), 10.0, dt)
+        a = np.gradient(v, dt, axis=0)
+        a[0] = 0.0  # The filter starts from it: at rest, not at its noise.
+        a = low_pass(a, 10.0, dt)
         ax[1].plot(time, np.linalg.norm(a, axis=1), lw=0.9)
         F = low_pass(log["wrench"][:, :3], 100.0, dt)
         ax[2].plot(time, np.linalg.norm(F, axis=1), lw=0.8, color="0.6", label="|F|")
@@ -278,8 +285,9 @@ def plot_trials(trials: list[Trial], task: ContactTask):
         stage = log["phase"][:, PHASE_STAGE]
         active = np.isin(stage, (ENTER, REGION, SETTLE))
         active &= log["phase"][:, PHASE_KIND] == IMPACT
-        ax[3].fill_between(time, 0, active, step="pre", alpha=0.4, lw=0)
-        ax[3].fill_between(time, 0, stage == REGION, step="pre", alpha=0.5, lw=0)
+        within = stage == REGION
+        ax[3].fill_between(time, 0, active, step="pre", color="C0", alpha=0.35, lw=0)
+        ax[3].fill_between(time, 0, within, step="pre", color="C0", alpha=0.6, lw=0)
         for row in ax:
             for when in trial.touched:
                 row.axvline(when, color="0.7", lw=0.8, ls="--")
