@@ -125,7 +125,7 @@ def make_pattern(config: ContactLearningConfig, half: float) -> MotionPattern:
         p[axis] = position(scene, name)[axis] + (BEYOND - half) * d[axis]
         corners.append(p)
     corners.append(p - BACK * DIRECTIONS[1])
-    forces = (
+    forces: tuple[list[np.ndarray], ...] = (
         [],
         [DIRECTIONS[0]],
         [DIRECTIONS[0], DIRECTIONS[1]],

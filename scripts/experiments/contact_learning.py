@@ -170,7 +170,7 @@ def scored(log: dict[str, np.ndarray], task: ContactTask, belief) -> Trial:
     for i, d in enumerate(DIRECTIONS):
         mine = [c for c in belief.contacts if c.kind == IMPACT and c.segment == i]
         if mine:  # The one that will be met first is what the next trial expects.
-            c = min(mine, key=lambda c, d=d: c.mean @ d)
+            c = mine[int(np.argmin([one.mean @ d for one in mine]))]
             error[i] = (c.mean - task.truth[i]) @ d
             std[i] = spread_along(c.covariance, d)
     handling = np.isin(stage, (ENTER, REGION, SETTLE)) & (
