@@ -8,6 +8,7 @@ from pydrake.multibody.tree import JointActuator, RevoluteJoint
 from pydrake.systems.framework import Context, LeafSystem
 
 from makebreak.systems.numerics.impedance_controller import (
+    SPEED_FILTER_SEC,
     ForceLaw,
     Law,
     memory_size,
@@ -147,6 +148,7 @@ class ImpedanceController(LeafSystem):
                 closing_speed=float(hybrid.closing_speed),
                 ramp_sec=float(hybrid.ramp_sec),
                 release_sec=float(hybrid.release_sec),
+                speed_keep=float(np.exp(-config.period_sec / SPEED_FILTER_SEC)),
             ),
         )
         self._ratio = float(hybrid.damping_ratio)

@@ -41,9 +41,12 @@ CONTACT_FORCE_MIN = 0.5  # [N] Below it the integral of the force waits.
 SAME_DIRECTION = 0.98  # Cosine above which a direction goes on as the one before.
 ENGAGE_SEC = 0.02  # In which stiffness along a new direction fades.
 # Directions under force control, those being released included: [n (3), force asked
-# for now, integral, weight 0 to 1, D_n, 1 while asked for].
-N_SLOTS, SLOT = 4, 8
-LEVEL, INTEGRAL, WEIGHT, DAMPING, ACTIVE = 3, 4, 5, 6, 7
+# for now, integral, weight 0 to 1, D_n, 1 while asked for, n'v filtered].
+N_SLOTS, SLOT = 4, 9
+LEVEL, INTEGRAL, WEIGHT, DAMPING, ACTIVE, SPEED = 3, 4, 5, 6, 7, 8
+# Of n'v [s]. D_n is large, and the encoders' velocity is noisy: without it the noise
+# alone reaches the torque's rate limit. A contact's own frequency is below 20 Hz.
+SPEED_FILTER_SEC = 0.003
 
 
 class ForceLaw(NamedTuple):
@@ -55,6 +58,7 @@ class ForceLaw(NamedTuple):
     closing_speed: float  # [m/s] at which F_c alone would close a gap: F_c / D_n.
     ramp_sec: float  # In which the force rises to its target.
     release_sec: float  # In which a direction that is dropped fades.
+    speed_keep: float  # Of the filtered n'v, per tick.
 
 
 class Law(NamedTuple):
@@ -281,7 +285,8 @@ def impedance_torque(
         its orientation. stiffness, damping (6,). ratio: 0, or the damping ratio, and
         then `damping` is the stiffness that it belongs to: along each axis D becomes
         2 ratio sqrt(damping lambda), lambda = 1/(J inv(M) J')_ii. wrench (6,) fed
-        forward, force first [N], [N m]. slots (N_SLOTS, SLOT) of force_control.
+        forward, force first [N], [N m]. slots (N_SLOTS, SLOT) of force_control; their
+        filtered speeds are brought up to date.
     Returns: tau (n,) [N m] and the tip's position p_WE (3,) [m].
     """
     n = q.shape[0]
@@ -327,8 +332,10 @@ def impedance_torque(
         weight = slots[j, WEIGHT]
         if weight > 0.0:  # Of motion, the part across n; along n, the push.
             n_j = slots[j, :3]
+            v_n = np.sum(n_j * twist[:3])
+            slots[j, SPEED] = v_n + law.force.speed_keep * (slots[j, SPEED] - v_n)
             push = max(slots[j, LEVEL] + slots[j, INTEGRAL], 0.0)
-            push -= slots[j, DAMPING] * np.sum(n_j * twist[:3])
+            push -= slots[j, DAMPING] * slots[j, SPEED]
             F[:3] += weight * (push - np.sum(n_j * F[:3])) * n_j
             a_ref[:3] -= weight * np.sum(n_j * a_ref[:3]) * n_j
     F += wrench[:m]
