@@ -212,8 +212,8 @@ class SceneSimulation:
         Args:
             initial: the state at start_sec, by name, as measured; what is not named is
                 as in the scene, at rest. (A motor behind an elastic element is
-                `motor_of_<model>_<joint>.<joint>`.) Of a delayed channel give the sample that
-                shows the state of start_sec (true_at).
+                `motor_of_<model>_<joint>.<joint>`.) Of a delayed channel give the
+                sample that shows the state of start_sec (true_at).
             times: (n,) [s], increasing: stamps of the measured samples.
             channels: of `channels()`.
             start_sec: the first of `times` if None. A sample that shows a time before

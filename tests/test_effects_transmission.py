@@ -117,7 +117,7 @@ def test_energy_of_the_undamped_spring_stays(tmp_path):
 
 @pytest.mark.parametrize("time_step", [0.0, 0.001])
 def test_a_motor_goes_through_the_gap_before_the_link_moves(tmp_path, time_step):
-    # Without gravity, from the middle of the gap: first the motor alone, by u/(2 I) t^2.
+    # Without gravity, from the middle of the gap: first the motor alone, u/(2 I) t^2.
     gap, u = 0.04, 0.5
     base = pendulum(tmp_path, time_step, gravity=0.0)
     scene = with_effects(

@@ -138,7 +138,7 @@ def _set_dissipation(
     both become d."""
     if (
         plant.get_discrete_contact_approximation().name == "kSap"
-        and plant.is_discrete()
+        and plant.time_step() > 0.0
     ):
         raise ValueError(
             "effect contact_dissipation: the approximation `sap` has no Hunt-Crossley "
@@ -206,7 +206,8 @@ def _patch(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> No
             f"{where}: expected {full_name(plant, ground)} to have one collision shape,"
             " a box or a half-space"
         )
-    ((geometry, old),) = shapes
+    geometry = shapes[0][0]
+    old = ProximityProperties(shapes[0][1])  # The original will have changed.
     X_WG = X_WB @ inspector.GetPoseInFrame(geometry)
     R = X_WG.rotation().matrix()
     level = abs(R[2, 2]) > 1.0 - 1e-9

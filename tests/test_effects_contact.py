@@ -1,0 +1,277 @@
+"""Friction, friction patch, stiffness, dissipation; the ground's height and tilt.
+
+Friction and rolling resistance on the project's own models: test_scene.py.
+"""
+
+import numpy as np
+import pytest
+from effect_scenes import G, at_rest_but, on_ground, surface, with_effects
+from pydrake.systems.framework import DiagramBuilder
+from scipy.integrate import solve_ivp
+
+from makebreak.diagrams.scene_simulation import SceneSimulation
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.scene import load_scene
+
+BALL_MASS, RADIUS = 0.07, 0.0315
+PAIR = "b~g"
+
+
+def combined(scene):
+    """The pair's friction, stiffness and dissipation as Drake combines two surfaces."""
+    loaded = load_scene(scene, DiagramBuilder())
+    inspector = loaded.scene_graph.model_inspector()
+    values = []
+    for name in ("box" if loaded.plant.HasBodyNamed("box") else "ball", "plate"):
+        body = loaded.plant.GetBodyByName(name)
+        p = inspector.GetProximityProperties(
+            loaded.plant.GetCollisionGeometriesForBody(body)[0]
+        )
+        values.append(
+            [
+                p.GetProperty("material", "coulomb_friction").dynamic_friction(),
+                p.GetProperty("material", "point_contact_stiffness"),
+                p.GetProperty("material", "hunt_crossley_dissipation"),
+            ]
+        )
+    (m1, k1, d1), (m2, k2, d2) = values
+    k = k1 * k2 / (k1 + k2)
+    return 2 * m1 * m2 / (m1 + m2), k, (k2 * d1 + k1 * d2) / (k1 + k2)
+
+
+def slowing_and_push(before, after, duration):
+    """Mean friction and mean normal force over the mass, from [vx, vz]: after 30 ms the
+    feet have settled in a discrete plant; in a continuous one the block rocks on."""
+    return (before[0] - after[0]) / duration, G + (after[1] - before[1]) / duration
+
+
+@pytest.mark.parametrize("mu", [0.0, 0.2, 0.9, 1.4])
+@pytest.mark.parametrize("time_step", [0.0, 0.001])
+def test_a_block_slows_by_mu_g(tmp_path, mu, time_step):
+    # 1.4 is more than twice what either surface has: then both are changed.
+    scene = with_effects(
+        on_ground(tmp_path, "block", time_step),
+        ("contact_friction", PAIR, dict(friction=mu)),
+    )
+    start = at_rest_but(
+        body="b.box", pose=[1, 0, 0, 0, 0, 0, 0.02], twist=[0] * 3 + [2, 0, 0]
+    )
+    times = np.array([0.0, 0.03, 0.1])
+    rows = SceneSimulation(scene).run(start, times, ["b.box.vx", "b.box.vz"])
+    slowing, push = slowing_and_push(rows[1], rows[2], 0.07)
+    np.testing.assert_allclose(slowing, mu * push, rtol=5e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("k", [3e3, 1.9e5, 1e6])
+@pytest.mark.parametrize("time_step", [0.0, 0.001])
+def test_a_ball_sinks_in_by_weight_over_stiffness(tmp_path, k, time_step):
+    scene = with_effects(
+        on_ground(tmp_path, "ball", time_step),
+        ("contact_stiffness", PAIR, dict(stiffness=k)),
+        ("contact_dissipation", PAIR, dict(dissipation=30.0)),
+    )
+    depth = BALL_MASS * G / k
+    start = at_rest_but(body="b.ball", pose=[1, 0, 0, 0, 0, 0, RADIUS - depth])
+    rows = SceneSimulation(scene).run(start, np.array([0.0, 0.2]), ["b.ball.z"])
+    np.testing.assert_allclose(RADIUS - rows[1, 0], depth, rtol=1e-3)
+    np.testing.assert_allclose(combined(scene)[1], k)
+
+
+@pytest.mark.parametrize("d", [0.0, 0.3, 4.0])
+@pytest.mark.parametrize("time_step", [0.0, 5e-6])
+def test_a_ball_bounces_as_hunt_and_crossley_say(tmp_path, d, time_step):
+    # m z'' = k x (1 + d x')+ - m g with x the penetration, against scipy.
+    k, v0 = 2e4, -1.0
+    scene = with_effects(
+        on_ground(tmp_path, "ball", time_step),
+        ("contact_stiffness", PAIR, dict(stiffness=k)),
+        ("contact_dissipation", PAIR, dict(dissipation=d)),
+    )
+    times = np.array([0.0, 0.003, 0.015])
+    start = at_rest_but(
+        body="b.ball", pose=[1, 0, 0, 0, 0, 0, RADIUS], twist=[0, 0, 0, 0, 0, v0]
+    )
+    rows = SceneSimulation(scene).run(start, times, ["b.ball.z", "b.ball.vz"])
+
+    def rate(t, y):
+        x, x_rate = max(RADIUS - y[0], 0.0), -y[1]
+        return [y[1], k * x * max(1 + d * x_rate, 0.0) / BALL_MASS - G]
+
+    expected = solve_ivp(
+        rate,
+        (0, 0.015),
+        [RADIUS, v0],
+        t_eval=times,
+        rtol=1e-10,
+        atol=1e-13,
+        max_step=1e-5,
+    ).y.T
+    # Discrete: 20 us of a contact of 6 ms, at 500 m/s2.
+    atol = 1e-5 if time_step == 0 else 5e-3
+    np.testing.assert_allclose(rows[:, 0], expected[:, 0], atol=atol * 1e-2)
+    np.testing.assert_allclose(rows[:, 1], expected[:, 1], atol=atol)
+
+
+def test_values_of_a_pair_are_what_was_asked_for_and_told_back(tmp_path):
+    ground = surface(0.3, 5e4, 2.0)
+    scene = on_ground(tmp_path, "ball", ground=ground)
+    model = SceneDynamics(scene)
+    mu, k, d = combined(scene)
+    assert model.now("contact_friction", [PAIR]) == {"friction": pytest.approx(mu)}
+    assert model.now("contact_stiffness", [PAIR]) == {"stiffness": pytest.approx(k)}
+    assert model.now("contact_dissipation", [PAIR]) == {"dissipation": pytest.approx(d)}
+    for wanted in ((0.2, 1e4, 0.5), (0.7, 3e5, 40.0)):
+        changed = with_effects(
+            scene,
+            # In any order, though dissipation is weighed by the stiffness.
+            ("contact_dissipation", PAIR, dict(dissipation=wanted[2])),
+            ("contact_stiffness", PAIR, dict(stiffness=wanted[1])),
+            ("contact_friction", PAIR, dict(friction=wanted[0])),
+        )
+        np.testing.assert_allclose(combined(changed), wanted)
+
+
+PATCH = dict(friction=0.1, x_min=0.2, x_max=0.5, y_min=-0.5, y_max=0.3)
+
+
+def slide(folder, time_step, x, y, vx, patch=PATCH):
+    scene = with_effects(
+        on_ground(folder, "block", time_step), ("friction_patch", PAIR, patch)
+    )
+    start = at_rest_but(
+        body="b.box", pose=[1, 0, 0, 0, x, y, 0.02], twist=[0, 0, 0, vx, 0, 0]
+    )
+    times = np.array([0.03, 0.08])
+    rows = SceneSimulation(scene).run(
+        start, times, ["b.box.vx", "b.box.vz"], start_sec=0.0
+    )
+    slowing, push = slowing_and_push(*rows, 0.05)
+    return slowing / push
+
+
+@pytest.mark.parametrize("time_step", [0.0, 0.001])
+@pytest.mark.parametrize(
+    "x, y, mu", [(0.32, 0.0, 0.1), (-0.5, 0.0, 0.5), (0.32, 0.5, 0.5)]
+)
+def test_friction_is_another_on_the_patch(tmp_path, time_step, x, y, mu):
+    # All four feet on the patch, before it, beside it.
+    np.testing.assert_allclose(slide(tmp_path, time_step, x, y, 0.8), mu, rtol=5e-3)
+
+
+def test_on_the_patchs_edge_each_foot_has_its_own_friction(tmp_path):
+    # Two feet at y = 0.25 are on it, two at 0.45 beside it: each bears a quarter of the
+    # weight. The block turns by and by; at first it slows by the mean.
+    mean = slide(tmp_path, 0.001, 0.3, 0.35, 0.8)
+    np.testing.assert_allclose(mean, (0.1 + 0.5) / 2, rtol=0.05)
+
+
+def test_the_ground_round_a_patch_is_flush_and_whole(tmp_path):
+    # A ball that rolls across both edges neither hops nor slows.
+    scene = with_effects(
+        on_ground(tmp_path, "ball", 0.001), ("friction_patch", PAIR, PATCH)
+    )
+    depth = BALL_MASS * G / 1e5
+    start = at_rest_but(
+        body="b.ball",
+        pose=[1, 0, 0, 0, 0.1, 0, RADIUS - depth],
+        twist=[0, 1.0 / RADIUS, 0, 1.0, 0, 0],
+    )
+    rows = SceneSimulation(scene).run(
+        start, np.linspace(0, 0.6, 301), ["b.ball.z", "b.ball.vx", "b.ball.x"]
+    )
+    assert rows[-1, 2] > 0.65
+    # On an edge two shapes bear it: half as deep. It lies there for sqrt(8 R s) =
+    # 1.3 mm and is lifted by less than its own depth of 7 um.
+    np.testing.assert_allclose(rows[:, 0], RADIUS, atol=2e-5)
+    np.testing.assert_allclose(rows[:, 1], 1.0, atol=2e-3)
+
+
+@pytest.mark.parametrize("time_step", [0.0, 0.001])
+def test_a_lifted_plane_bears_things_higher(tmp_path, time_step):
+    scene = with_effects(
+        on_ground(tmp_path, "ball", time_step), ("plane_height", "g", dict(height=0.01))
+    )
+    depth = BALL_MASS * G / 1e5
+    start = at_rest_but(body="b.ball", pose=[1, 0, 0, 0, 0, 0, RADIUS + 0.01 - depth])
+    rows = SceneSimulation(scene).run(start, np.array([0, 0.2]), ["b.ball.z"])
+    np.testing.assert_allclose(rows[1, 0], RADIUS + 0.01 - depth, atol=1e-6)
+
+
+@pytest.mark.parametrize("time_step", [0.0, 0.001])
+@pytest.mark.parametrize("roll, pitch", [(0.05, 0.0), (0.0, 0.03), (0.02, -0.04)])
+def test_a_ball_rolls_down_a_tilted_plane(tmp_path, time_step, roll, pitch):
+    # A solid sphere that rolls without slip: 5/7 of gravity along the plane.
+    scene = with_effects(
+        on_ground(tmp_path, "ball", time_step),
+        ("plane_tilt", "g.plate", dict(roll=roll, pitch=pitch)),
+    )
+    # The plane's normal, Ry(pitch) Rx(roll) z.
+    n = np.array(
+        [np.sin(pitch) * np.cos(roll), -np.sin(roll), np.cos(pitch) * np.cos(roll)]
+    )
+    depth = BALL_MASS * G * n[2] / 1e5
+    start = at_rest_but(body="b.ball", pose=[1, 0, 0, 0, *((RADIUS - depth) * n)])
+    times = np.array([0.1, 0.4])
+    rows = SceneSimulation(scene).run(
+        start, times, ["b.ball.vx", "b.ball.vy", "b.ball.vz"], start_sec=0.0
+    )
+    g = np.array([0, 0, -G])
+    along = g - (g @ n) * n
+    # The first steps settle (friction takes hold within a slip of 0.1 mm/s).
+    np.testing.assert_allclose((rows[1] - rows[0]) / 0.3, 5 / 7 * along, atol=5e-3)
+
+
+@pytest.mark.parametrize("time_step", [0.0, 0.0005])
+def test_rolling_resistance_slows_evenly(tmp_path, time_step):
+    c = 0.02
+    scene = with_effects(
+        on_ground(tmp_path, "ball", time_step),
+        ("rolling_resistance", PAIR, dict(coefficient=c)),
+    )
+    start = at_rest_but(
+        body="b.ball",
+        pose=[1, 0, 0, 0, 0, 0, RADIUS - BALL_MASS * G / 1e5],
+        twist=[0, 0.5 / RADIUS, 0, 0.5, 0, 0],
+    )
+    rows = SceneSimulation(scene).run(start, np.array([0.0, 0.05, 0.15]), ["b.ball.vx"])
+    slowing = (rows[1, 0] - rows[2, 0]) / 0.1
+    # As in test_scene.py: 5/7 c g; the torque is one step late.
+    np.testing.assert_allclose(slowing, 5 / 7 * c * G, rtol=1e-2)
+
+
+@pytest.mark.parametrize(
+    "kind, at, parameters, words",
+    [
+        ("contact_friction", PAIR, dict(friction=-1.0), "friction is -1.0, expected"),
+        (
+            "contact_stiffness",
+            PAIR,
+            dict(stiffness=0.0),
+            "stiffness is 0.0, expected >",
+        ),
+        ("contact_stiffness", "b", dict(stiffness=1.0), "expected one contact pair"),
+        ("contact_dissipation", PAIR, dict(dissipation=-1.0), "dissipation is -1.0"),
+        ("contact_dissipation", "b~h", dict(dissipation=1.0), "no model 'h'"),
+        ("friction_patch", PAIR, PATCH | dict(x_max=0.1), "the patch is empty"),
+        ("friction_patch", PAIR, PATCH | dict(x_min=8, x_max=9), "the patch is off"),
+        ("friction_patch", PAIR, dict(friction=0.1), "needs `x_min`"),
+        ("friction_patch", PAIR, PATCH | dict(friction=1.2), "needs a surface"),
+        ("plane_height", "b.ball", dict(height=0.1), "welded to the world"),
+        ("plane_tilt", "q", dict(roll=0.1, pitch=0.0), "no model 'q'"),
+        ("plane_tilt", "g", dict(roll=0.1), "needs `pitch`"),
+    ],
+)
+def test_bad_effects_are_refused_by_name(tmp_path, kind, at, parameters, words):
+    scene = with_effects(on_ground(tmp_path, "ball"), (kind, at, parameters))
+    with pytest.raises(ValueError, match=words):
+        load_scene(scene, DiagramBuilder())
+
+
+def test_dissipation_is_refused_where_the_solver_has_none(tmp_path):
+    scene = with_effects(
+        on_ground(tmp_path, "ball"),
+        ("contact_dissipation", PAIR, dict(dissipation=1.0)),
+    )
+    scene.plant.discrete_contact_approximation = "sap"
+    with pytest.raises(ValueError, match="`sap` has no Hunt-Crossley"):
+        load_scene(scene, DiagramBuilder())
