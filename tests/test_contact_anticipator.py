@@ -398,6 +398,14 @@ def test_five_trials_learn_place_and_speed():
     np.testing.assert_allclose(contact.approach_speed * slope, 8.0, rtol=1e-9)
 
 
+def test_from_trial_to_trial_a_contact_that_was_felt_drifts():
+    told, felt = prior(0.0, 1e-3), replace(prior(0.0, 1e-3), seen=1)
+    first, second = Trial(ContactBelief((told, felt))).belief().contacts
+    np.testing.assert_array_equal(first.covariance, told.covariance)
+    expected = (1e-3**2 + 3e-4**2) * np.eye(3)
+    np.testing.assert_allclose(second.covariance, expected)
+
+
 def test_speed_by_eq_9_and_its_caps():
     config = ContactAnticipatorConfig(speed=ApproachSpeedConfig(regression=False))
     trial = Trial(ContactBelief((prior(0.0),)), config)
@@ -472,7 +480,16 @@ def test_two_detections_of_one_contact_count_once():
     once = trial.belief()
     trial.impact([0.5, 0, 0.0005], DOWN, 0.01, 3.0)
     trial.step(segment=1)
+    trial.step()
     trial.impact([0.5, 0.001, 0.0005], DOWN, 0.01, 3.0, late=0.0)
+    assert trial.belief() is once
+    # Further away, but within the gate of a poor sensor: the same, too.
+    config = ContactAnticipatorConfig(filter=ContactFilterConfig(std_along=0.005))
+    trial = Trial(ContactBelief((prior(0.0),)), config)
+    trial.walk(np.array([0.5, 0, 0.05]), DOWN, 0.1, 0.5, 0)
+    trial.impact([0.5, 0, 0], DOWN, 0.05, 17.0)
+    once = trial.belief()
+    trial.impact([0.5, 0, -0.012], DOWN, 0.01, 3.0)
     assert trial.belief() is once
 
 
