@@ -36,6 +36,7 @@ from makebreak.systems.contact_anticipator import (
 from makebreak.systems.contact_detector import ContactDetector, ContactDetectorConfig
 from makebreak.systems.contact_view import ContactView, ContactViewConfig
 from makebreak.systems.forward_model import ForwardModelBank, ForwardModelConfig
+from makebreak.systems.impact_reflex import ImpactReflex, ImpactReflexConfig
 from makebreak.systems.impedance_controller import (
     HybridConfig,
     ImpedanceConfig,
@@ -78,6 +79,7 @@ class ChangingContactConfig:
     hybrid: HybridConfig = field(
         default_factory=lambda: HybridConfig(damping_ratio=0.9)
     )
+    reflex: ImpactReflexConfig = field(default_factory=ImpactReflexConfig)  # Off.
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +126,7 @@ def make_changing_contact(
     noise: SensorNoise | None = None,
     seed: int = 0,
     meshcat: Meshcat | None = None,
+    view: ContactViewConfig | None = None,
 ) -> Diagram:
     """The station and the systems of both levels, each by name in the diagram.
 
@@ -137,6 +140,7 @@ def make_changing_contact(
         noise: of the sensors; None: the station's default.
         seed: of the sensors' noise.
         meshcat: where it is seen; None: nowhere.
+        view: how it is seen there; None: as by default.
     Raises: ValueError for periods or offsets in config that are not the defaults.
     """
     known = knowledge or Knowledge()
@@ -228,14 +232,22 @@ def make_changing_contact(
     connect(anticipator, "contacts", shaper)
     connect(anticipator, "mode_hint", modes)
     for port in ("stiffness", "damping", "damping_stiffness", "wrench_feedforward"):
-        if variable.HasOutputPort(port):
-            connect(variable, port, impedance)
+        source = variable
+        if port == "wrench_feedforward" and config.reflex.gain > 0.0:
+            source = add("impact_reflex", ImpactReflex(timed(config.reflex, TICK)))
+            connect(variable, port, source)
+            connect(station, felt, source, port="wrench")
+            connect(tip, "ee_velocity", source)
+            connect(shaper, "direction", source)
+            connect(shaper, "phase", source)
+        if source.HasOutputPort(port):
+            connect(source, port, impedance)
     connect(impedance, "tau", station, port=f"{ARM}.torque_commanded")
 
     # For scoring and for the eye alone.
     _add_telemetry(builder, SIGNALS)
     if meshcat is not None:
-        view = add("contact_view", ContactView(ContactViewConfig(), meshcat))
+        view = add("contact_view", ContactView(view or ContactViewConfig(), meshcat))
         connect(anticipator, "contacts", view)
         connect(station, felt, view, port="wrench")
         connect(tip, "ee_pose", view)

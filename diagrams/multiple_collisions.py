@@ -33,6 +33,8 @@ from makebreak.systems.contact_anticipator import (
     ApproachSpeedConfig,
     ContactAnticipatorConfig,
 )
+from makebreak.systems.contact_view import ContactViewConfig
+from makebreak.systems.impact_reflex import ImpactReflexConfig
 from makebreak.systems.numerics.contact_task import ContactBelief, ExpectedContact
 from makebreak.systems.numerics.motion_pattern import (
     MotionPattern,
@@ -52,24 +54,33 @@ FRICTION = (0.1, 0.6)
 BEYOND = 0.06  # How far behind the nominal surfaces the pattern goes [m].
 CLEAR = 0.05  # Above the blue wall's top, before it turns [m].
 OVER, BACK, GOAL = 0.08, 0.05, 0.12  # Over the red block, and along its top [m].
+NORMAL_FORCE = 5.0  # On each surface that has been reached [N].
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 A_MAX = 1.0  # Of the pattern [m/s2].
+
+
+# v_a where no impact has been felt yet [m/s]. The block's face is four times as stiff as
+# the sphere. 30 v_a is what the 10 Hz acceleration of a stop comes to [m/s2].
+FIRST_SPEED = {"sphere": 0.028, "block": 0.016}
+MOST_SPEED = 0.028
 
 
 @dataclass
 class MultipleCollisionsConfig:
     handling: bool = True  # False: no anticipation, no transition-phase controllers.
-    tool: str = "block"  # Or "sphere".
+    tool: str = "sphere"  # Or "block".
     speed: float = 0.2  # Of the motion pattern [m/s].
-    normal_force: float = 5.0  # On each surface that has been reached [N].
     error_max: float = 0.03  # Of the initial estimates, along the motion [m].
-    trials: int = 3
+    trials: int = 2  # Each knows what the one before has learned.
     seed: int = 0
     control: ChangingContactConfig = field(
         default_factory=lambda: ChangingContactConfig(
             anticipator=ContactAnticipatorConfig(
-                speed=ApproachSpeedConfig(first=0.018, carry_over=True)
-            )
+                speed=ApproachSpeedConfig(
+                    force_desired=7.0, first=FIRST_SPEED["sphere"], most=MOST_SPEED
+                )
+            ),
+            reflex=ImpactReflexConfig(gain=4.0),
         )
     )
 
@@ -91,7 +102,7 @@ def make_task(config: MultipleCollisionsConfig) -> CollisionTask:
 
     Raises: ValueError for an unknown tool, or numbers out of their range.
     """
-    for name in ("trials", "speed", "normal_force"):
+    for name in ("trials", "speed"):
         if not 0.0 < getattr(config, name) < np.inf:
             raise ValueError(
                 f"{name} is {getattr(config, name)}, expected a positive number"
@@ -177,7 +188,7 @@ def make_pattern(config: MultipleCollisionsConfig, half: float) -> MotionPattern
                 np.array([time, time + duration]),
                 np.array(UPRIGHT),
                 np.array(n).reshape(-1, 3),
-                np.full(len(n), config.normal_force),
+                np.full(len(n), NORMAL_FORCE),
             )
         )
         time, moving = time + duration, goes_on
@@ -189,16 +200,25 @@ def make_multiple_collisions(
     knowledge: Knowledge | None = None,
     trial: int = 0,
     meshcat: Meshcat | None = None,
+    task: CollisionTask | None = None,
+    view: ContactViewConfig | None = None,
 ) -> Diagram:
     """One trial; knowledge is what the one before has left (None: the estimates).
 
     Without handling the belief is empty, the motion does not slow down where the plan
     ends, and the base controller goes through the contacts.
     """
-    task = make_task(config)
+    task = task or make_task(config)
     control = config.control
     if knowledge is None:
         knowledge = Knowledge(task.prior if config.handling else ContactBelief())
+    speed = control.anticipator.speed
+    if speed.first == FIRST_SPEED["sphere"]:  # Not set otherwise: as the tool needs it.
+        anticipator = replace(
+            control.anticipator,
+            speed=replace(speed, first=FIRST_SPEED[config.tool]),
+        )
+        control = replace(control, anticipator=anticipator)
     if not config.handling:
         control = replace(
             control,
@@ -207,8 +227,9 @@ def make_multiple_collisions(
                 search=replace(control.shaper.search, speed=config.speed),
             ),
             variable_impedance=replace(control.variable_impedance, transition=False),
+            reflex=replace(control.reflex, gain=0.0),
         )
     return make_changing_contact(
         control, task.world, task.model, task.pattern, knowledge, TOOL,
-        seed=100 * config.seed + trial, meshcat=meshcat,
+        seed=100 * config.seed + trial, meshcat=meshcat, view=view,
     )  # fmt: skip
