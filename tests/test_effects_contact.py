@@ -158,6 +158,13 @@ def test_friction_is_another_on_the_patch(tmp_path, time_step, x, y, mu):
     np.testing.assert_allclose(slide(tmp_path, time_step, x, y, 0.8), mu, rtol=5e-3)
 
 
+@pytest.mark.parametrize("x, mu", [(0.32, 1.3), (-0.5, 0.5)])
+def test_a_patch_can_be_rougher_than_either_surface_allows(tmp_path, x, mu):
+    patch = PATCH | dict(friction=1.3)
+    mean = slide(tmp_path, 0.001, x, 0.0, 1.2, patch)
+    np.testing.assert_allclose(mean, mu, rtol=5e-3)
+
+
 def test_on_the_patchs_edge_each_foot_has_its_own_friction(tmp_path):
     # Two feet at y = 0.25 are on it, two at 0.45 beside it: each bears a quarter of the
     # weight. The block turns by and by; at first it slows by the mean.
@@ -255,7 +262,7 @@ def test_rolling_resistance_slows_evenly(tmp_path, time_step):
         ("friction_patch", PAIR, PATCH | dict(x_max=0.1), "the patch is empty"),
         ("friction_patch", PAIR, PATCH | dict(x_min=8, x_max=9), "the patch is off"),
         ("friction_patch", PAIR, dict(friction=0.1), "needs `x_min`"),
-        ("friction_patch", PAIR, PATCH | dict(friction=1.2), "needs a surface"),
+        ("friction_patch", PAIR, PATCH | dict(friction=-1.0), "friction is -1.0"),
         ("plane_height", "b.ball", dict(height=0.1), "welded to the world"),
         ("plane_tilt", "q", dict(roll=0.1, pitch=0.0), "no model 'q'"),
         ("plane_tilt", "g", dict(roll=0.1), "needs `pitch`"),

@@ -49,8 +49,8 @@ def _set_friction(
     mu = parameter(effect, "friction")
     changed, other = _changed_and_other(effect, plant)
     mu_other = _only(effect, plant, scene_graph, other, _friction, "friction")
-    if 2.0 * mu_other > mu:
-        mu_changed = mu * mu_other / (2.0 * mu_other - mu)
+    if 2.0 * mu_other > mu or mu == 0.0:
+        mu_changed = mu * mu_other / (2.0 * mu_other - mu) if mu > 0.0 else 0.0
     else:
         mu_changed = mu
         _set_surface(plant, scene_graph, other, "coulomb_friction", _coulomb(mu))
@@ -177,8 +177,12 @@ def _now(effect: Effect, plant: MultibodyPlant, scene_graph) -> dict[str, float]
             return {"dissipation": (d1 + d2) / 2.0}
         return {"dissipation": (k2 * d1 + k1 * d2) / (k1 + k2)}
     mu1, mu2 = both(_friction, "friction")
-    mu = 2.0 * mu1 * mu2 / (mu1 + mu2) if mu1 + mu2 else 0.0
-    return {"friction": mu}
+    return {"friction": _both(mu1, mu2)}
+
+
+def _both(mu1: float, mu2: float) -> float:
+    """As Drake combines two surfaces' friction."""
+    return 2.0 * mu1 * mu2 / (mu1 + mu2) if mu1 + mu2 > 0.0 else 0.0
 
 
 # ----- friction_patch
@@ -189,8 +193,10 @@ FAR = 100.0  # Half width of what a half-space becomes, and a box's depth [m].
 def _patch(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
     """Cuts the ground's one box or half-space into the patch and what is around it.
 
-    Tops are flush. What slides over the edge touches both for a moment; a sphere of
-    radius R that sinks in by s does so for sqrt(8 R s).
+    Tops are flush. A friction that needs a rougher thing makes it so, and what is
+    around the patch smoother; the thing's pairs with third bodies change with it. What
+    slides over the edge touches both for a moment: a sphere of radius R that sinks in
+    by s does so for sqrt(8 R s).
     """
     p = effect.parameters
     ground, thing = _changed_and_other(effect, plant)
@@ -228,13 +234,15 @@ def _patch(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> No
     y = np.clip([low[1], p["y_min"], p["y_max"], high[1]], low[1], high[1])
     if not (x[1] < x[2] and y[1] < y[2]):
         raise ValueError(f"{where}: the patch is off {full_name(plant, ground)}")
-    mu_other = _only(effect, plant, scene_graph, thing, _friction, "friction")
-    mu = p["friction"]
-    if not 2.0 * mu_other > mu:
-        raise ValueError(
-            f"{where}: friction {mu} needs a surface of {thing.scoped_name()} above "
-            f"{mu / 2.0}, it has {mu_other}"
-        )
+    mu, mu_ground = p["friction"], _friction(old)
+    mu_thing = _only(effect, plant, scene_graph, thing, _friction, "friction")
+    if not 2.0 * mu_thing > mu:
+        # Only a rougher thing can have it: then the ground around becomes smoother.
+        around = _both(mu_ground, mu_thing)
+        mu_thing = mu
+        mu_ground = around * mu_thing / (2.0 * mu_thing - around)
+        _set_surface(plant, scene_graph, thing, "coulomb_friction", _coulomb(mu))
+    mu_patch = mu * mu_thing / (2.0 * mu_thing - mu) if mu > 0.0 else 0.0
     # Patch; strips left and right; strips before and behind it.
     pieces = [
         (x[1], x[2], y[1], y[2]),
@@ -251,11 +259,10 @@ def _patch(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> No
         p_WG = [(x0 + x1) / 2.0, (y0 + y1) / 2.0, top - depth / 2.0]
         X_BG = X_WB.inverse() @ RigidTransform(p_WG)
         properties = ProximityProperties(old)
+        properties.UpdateProperty(
+            "material", "coulomb_friction", _coulomb(mu_patch if i == 0 else mu_ground)
+        )
         if i == 0:
-            mu_patch = mu * mu_other / (2.0 * mu_other - mu)
-            properties.UpdateProperty(
-                "material", "coulomb_friction", _coulomb(mu_patch)
-            )
             scene_graph.ChangeShape(source, geometry, box, X_BG)
             scene_graph.AssignRole(source, geometry, properties, RoleAssign.kReplace)
         else:
