@@ -458,7 +458,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     )
     for label, settings in VARIANTS.items():
         runs = [
-            r for r in many(settings, max(1, seeds // 2)) if "completion_time_s" in r
+            r for r in many(settings, max(1, seeds // 4)) if "completion_time_s" in r
         ]
         if not runs:
             row(label, "-", "no run ended")
