@@ -59,8 +59,8 @@ UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 A_MAX = 1.0  # Of the pattern [m/s2].
 
 
-# v_a where no impact has been felt yet [m/s]. The block's face is four times as stiff as
-# the sphere. 30 v_a is what the 10 Hz acceleration of a stop comes to [m/s2].
+# v_a where no impact has been felt yet [m/s]. The block's face is four times as stiff
+# as the sphere. At 0.028 m/s a stop comes to just below 1 m/s2 at 10 Hz.
 FIRST_SPEED = {"sphere": 0.028, "block": 0.016}
 MOST_SPEED = 0.028
 
@@ -162,7 +162,7 @@ def make_pattern(config: MultipleCollisionsConfig, half: float) -> MotionPattern
     p6 = p5 + [-BACK, OVER, 0.0]
     p7 = np.array([p6[0], p6[1], z_top])
     p8 = p7 + [-GOAL, 0.0, 0.0]
-    plan = (  # Start, end, force directions, whether it goes beyond.
+    plan: tuple = (  # Start, end, force directions, whether it goes beyond.
         (p0, p1, [], DOWN),
         (p1, p2, [DOWN], LEFT),
         (p2, p3, [DOWN, LEFT], AHEAD),

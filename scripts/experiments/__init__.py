@@ -22,6 +22,7 @@ EXPERIMENTS: dict[str, str] = {
     "changing_surface": "makebreak.scripts.experiments.changing_surface",
     "contact_learning": "makebreak.scripts.experiments.contact_learning",
     "multi_spring": "makebreak.scripts.experiments.multi_spring",
+    "multiple_collisions": "makebreak.scripts.experiments.multiple_collisions",
     "porridge": "makebreak.scripts.experiments.porridge",
     "wall_friction": "makebreak.scripts.experiments.wall_friction",
 }
