@@ -273,10 +273,14 @@ def _active_inference_trial(precision, k_belief, k_action, circle, state, world)
 
 def mrac_error(config: MracConfig, task: Task) -> float:
     """RMS tracking error of a trial [m]."""
-    weights = error_weights(config.omega, config.zeta, config.rate_weight)
-    gains = config.force_gains + config.position_gains + config.velocity_gains
-    law = (config.omega, config.zeta, *weights, np.array(gains, dtype=float))
-    return float(_mrac_trial(*law, task.circle, _start(task), task.world))
+    p2, p3 = error_weights(config.omega, config.zeta, config.rate_weight)
+    gains = np.array(
+        config.force_gains + config.position_gains + config.velocity_gains, dtype=float
+    )
+    omega, zeta, start = config.omega, config.zeta, _start(task)
+    return float(
+        _mrac_trial(omega, zeta, p2, p3, gains, task.circle, start, task.world)
+    )
 
 
 def active_inference_error(config: ActiveInferenceConfig, task: Task) -> float:

@@ -26,6 +26,21 @@ def viscosity_at(t, viscosity, ramp):
 
 
 @njit(cache=True)
+def _force(x, y, vx, vy, t, viscosity, ramp, anchors, springs):
+    """external_force in scalars: arrays would cost most of the time."""
+    c = viscosity_at(t, viscosity, ramp)
+    fx, fy = -c * vx, -c * vy
+    for i in range(anchors.shape[0]):
+        dx, dy = anchors[i, 0] - x, anchors[i, 1] - y
+        length = np.sqrt(dx * dx + dy * dy)
+        if length > _NEAR:
+            pull = springs[i, 0] * (length - springs[i, 1]) / length
+            fx += pull * dx
+            fy += pull * dy
+    return fx, fy
+
+
+@njit(cache=True)
 def external_force(state, t, viscosity, ramp, anchors, springs):
     """What the world does to the effector.
 
@@ -37,44 +52,36 @@ def external_force(state, t, viscosity, ramp, anchors, springs):
         springs: (n, 2) stiffness [N/m] and rest length [m] of each.
     Returns: F (2,) [N].
     """
-    c = viscosity_at(t, viscosity, ramp)
-    out = np.empty(2)
-    out[0], out[1] = -c * state[2], -c * state[3]
-    for i in range(anchors.shape[0]):
-        dx, dy = anchors[i, 0] - state[0], anchors[i, 1] - state[1]
-        length = np.sqrt(dx * dx + dy * dy)
-        if length > _NEAR:
-            pull = springs[i, 0] * (length - springs[i, 1]) / length
-            out[0] += pull * dx
-            out[1] += pull * dy
-    return out
-
-
-@njit(cache=True)
-def _slope(state, t, u, mass, viscosity, ramp, anchors, springs):
-    F = external_force(state, t, viscosity, ramp, anchors, springs)
-    out = np.empty(4)
-    out[0], out[1] = state[2], state[3]
-    out[2], out[3] = (u[0] + F[0]) / mass, (u[1] + F[1]) / mass
-    return out
+    x, y, vx, vy = state
+    fx, fy = _force(x, y, vx, vy, t, viscosity, ramp, anchors, springs)
+    return np.array([fx, fy])
 
 
 @njit(cache=True)
 def step(state, t, u, period, mass, viscosity, ramp, anchors, springs):
     """The state (4,) one period after t, with u (2,) [N] held; mass [kg]."""
     h = period / SUBSTEPS
+    x, y, vx, vy = state
     for i in range(SUBSTEPS):
+        # The classical Runge-Kutta rule: a is evaluated at the beginning, twice in the
+        # middle and at the end; dx, dv sum the weighted slopes.
         s = t + i * h
-        a = _slope(state, s, u, mass, viscosity, ramp, anchors, springs)
-        b = _slope(
-            state + 0.5 * h * a, s + 0.5 * h, u, mass, viscosity, ramp, anchors, springs
-        )
-        c = _slope(
-            state + 0.5 * h * b, s + 0.5 * h, u, mass, viscosity, ramp, anchors, springs
-        )
-        d = _slope(state + h * c, s + h, u, mass, viscosity, ramp, anchors, springs)
-        state = state + h / 6.0 * (a + 2.0 * b + 2.0 * c + d)
-    return state
+        px, py, wx, wy = x, y, vx, vy
+        dx, dy, dvx, dvy = 0.0, 0.0, 0.0, 0.0
+        for stage in range(4):
+            later = 0.0 if stage == 0 else (1.0 if stage == 3 else 0.5)
+            weight = 1.0 / 6.0 if stage == 0 or stage == 3 else 1.0 / 3.0
+            fx, fy = _force(
+                px, py, wx, wy, s + later * h, viscosity, ramp, anchors, springs
+            )
+            ax, ay = (u[0] + fx) / mass, (u[1] + fy) / mass
+            dx, dy = dx + weight * wx, dy + weight * wy
+            dvx, dvy = dvx + weight * ax, dvy + weight * ay
+            ahead = h if stage == 2 else 0.5 * h
+            px, py = x + ahead * wx, y + ahead * wy
+            wx, wy = vx + ahead * ax, vy + ahead * ay
+        x, y, vx, vy = x + h * dx, y + h * dy, vx + h * dvx, vy + h * dvy
+    return np.array([x, y, vx, vy])
 
 
 @njit(cache=True)
