@@ -2,7 +2,7 @@
 
 import tempfile
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -110,6 +110,9 @@ class Scene:
     plant: PlantSection = field(default_factory=PlantSection)
     actuation: ActuationSection = field(default_factory=ActuationSection)
     initial: InitialSection = field(default_factory=InitialSection)
+    # Recording's file name -> episode -> its initial state. In a file: `initial`, with
+    # file names in place of positions, velocities, poses, body_velocities.
+    initial_of: dict[str, dict[str, InitialSection]] = field(default_factory=dict)
     tolerance: dict[str, float] = field(default_factory=dict)
     channels: dict[str, str] = field(default_factory=dict)
     effects: list[Effect] = field(default_factory=list)
@@ -283,6 +286,19 @@ def read_scene(path: str | Path) -> Scene:
         for effect in raw.get("effects") or []:
             if isinstance(effect.get("at"), str):
                 effect["at"] = [effect["at"]]  # The typed reader knows lists only.
+        initial = raw.get("initial") or {}
+        sections = {f.name for f in fields(InitialSection)}
+        # A misspelt section has numbers below it, a file has episodes.
+        if initial and all(
+            key not in sections
+            and isinstance(value, dict)
+            and all(isinstance(part, dict) for part in value.values())
+            for key, value in initial.items()
+        ):
+            raw["initial_of"] = {
+                file: {str(episode): part for episode, part in episodes.items()}
+                for file, episodes in raw.pop("initial").items()
+            }
         scene = yaml_load_typed(schema=Scene, data=yaml_dump(raw))
     except Exception as error:  # The reader raises several kinds.
         raise ValueError(f"scene file {path}: {' '.join(str(error).split())}") from None
@@ -293,6 +309,19 @@ def read_scene(path: str | Path) -> Scene:
                 part.file = f"file://{(path.parent / part.file).resolve()}"
     _check(scene)
     return scene
+
+
+def initial_for(scene: Scene, recording: str, episode: int | None) -> InitialSection:
+    """The initial state of an episode (None: of a recording without episodes).
+
+    Args: recording: name of its file, with or without its folder and suffix.
+    """
+    for name in (recording, Path(recording).name, Path(recording).stem):
+        episodes = scene.initial_of.get(name, {})
+        key = str(0 if episode is None else episode)
+        if key in episodes:
+            return episodes[key]
+    return scene.initial
 
 
 def load_scene(

@@ -9,6 +9,8 @@ from makebreak.diagrams.station import BALL_ROLLING, MODELS
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import (
+    InitialSection,
+    initial_for,
     load_scene,
     nearest,
     read_scene,
@@ -254,6 +256,7 @@ def test_bad_effects_are_refused_by_name(ball_scene, kind, at, parameters, words
         ("actuation: {type: motor}", "actuation.type is 'motor'"),
         ("effects: [{kind: object_size}]", "needs `at`"),
         ("initial: {positions: {panda.joint_1: 0}}", "no joint 'panda.joint_1'"),
+        ("initial: {position: {panda.joint_1: 0}}", "position"),
         ("initial: {poses: {ball.ball: [1, 0, 0]}}", "expected 7 numbers|no body"),
         ("directives: [{add_model: {name: a, file: none.sdf}}]", "none.sdf"),
         ("- a\n- b", "scene file"),
@@ -264,6 +267,25 @@ def test_bad_scene_files_are_refused_in_one_line(tmp_path, text, words):
     with pytest.raises(ValueError, match=words) as error:
         load_scene(tmp_path / "bad.yaml", DiagramBuilder())
     assert "\n" not in str(error.value)
+
+
+def test_each_episode_of_a_recording_may_start_from_its_own_state(tmp_path):
+    (tmp_path / "s.yaml").write_text(
+        BALL_SCENE[: BALL_SCENE.index("initial:")]
+        + """
+initial:
+  throw_1.csv:
+    0: {poses: {ball.ball: [1, 0, 0, 0, 0.1, 0, 0.5]}}
+    1: {poses: {ball.ball: [1, 0, 0, 0, 0.2, 0, 0.5]}}
+  throw_2: {0: {body_velocities: {ball.ball: [0, 0, 0, 1, 0, 0]}}}
+"""
+    )
+    scene = read_scene(tmp_path / "s.yaml")
+    assert initial_for(scene, "a/throw_1.csv", 1).poses["ball.ball"][4] == 0.2
+    assert initial_for(scene, "throw_1.csv", None).poses["ball.ball"][4] == 0.1
+    assert initial_for(scene, "throw_2.npz", 0).body_velocities["ball.ball"][3] == 1
+    assert initial_for(scene, "throw_3.csv", 0) == scene.initial == InitialSection()
+    load_scene(scene, DiagramBuilder())
 
 
 def test_missing_scene_file_is_named(tmp_path):
