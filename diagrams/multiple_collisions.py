@@ -205,8 +205,8 @@ def make_multiple_collisions(
 ) -> Diagram:
     """One trial; knowledge is what the one before has left (None: the estimates).
 
-    Without handling the belief is empty, the motion does not slow down where the plan
-    ends, and the base controller goes through the contacts.
+    Without handling nothing is anticipated, the motion does not slow down where the
+    plan ends, and the base controller goes through the contacts.
     """
     task = task or make_task(config)
     control = config.control
@@ -224,6 +224,7 @@ def make_multiple_collisions(
             control,
             shaper=replace(
                 control.shaper,
+                region=replace(control.shaper.region, anticipate=False),
                 search=replace(control.shaper.search, speed=config.speed),
             ),
             variable_impedance=replace(control.variable_impedance, transition=False),

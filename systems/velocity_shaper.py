@@ -32,6 +32,7 @@ class RegionConfig:
     margin: float = 0.004  # ... and this [m] ...
     settle_sec: float = 0.12  # ... and v_a times this.
     blend_sec: float = 0.1  # Of the controllers, done at the region's entry (eq. 10).
+    anticipate: bool = True  # False: no regions; contacts are met at any speed.
 
 
 @dataclass
@@ -107,7 +108,7 @@ class VelocityShaper(LeafSystem):
         self._law = law = _law(config)
         if not 0.0 < plan_sec < np.inf:
             raise ValueError(f"plan_sec is {plan_sec}, expected > 0")
-        self._pattern = pattern
+        self._pattern, self._anticipate = pattern, config.region.anticipate
         self._no_regions, self._no_contact = np.zeros(N_REGIONS), np.zeros(N_CONTACT)
         warm_up(pattern, law)
         self._contacts = self.DeclareAbstractInputPort(
@@ -173,7 +174,8 @@ class VelocityShaper(LeafSystem):
                 state.get_mutable_abstract_state(int(self._patterns)).set_value(
                     patterns
                 )
-        rows = expected(self._contacts.Eval(context))
+        belief = self._contacts.Eval(context) if self._anticipate else ContactBelief()
+        rows = expected(belief)
         regions = plan(patterns.now.table, self._law, memory, t, rows)
         discrete.set_value(int(self._regions), regions)
 
