@@ -48,13 +48,18 @@ class Case:
 
 @dataclass(frozen=True)
 class Written:
-    """What a case's folder holds as numbers, before it is files; and its truth."""
+    """What a case's folder holds as numbers, before it is files; and its truth.
+
+    states: of joints and bodies at each row, as they truly were, under the names of
+    the channels.
+    """
 
     columns: dict
     scene: str
     models: dict[str, str]
     noise: dict | None
     truth: dict
+    states: dict
 
 
 OUTSIDE = ("bouc_wen", "magnetic_pull")
@@ -142,11 +147,15 @@ def anonymous_name(case: Case) -> str:
     return f"case_{case.seed}"
 
 
-def make(case: Case) -> Written:
-    """Draws, simulates and records a case."""
+def make(case: Case, exact: bool = False) -> Written:
+    """Draws, simulates and records a case.
+
+    exact: without noise, jitter, losses and background; with all channels. The hidden
+    effects are the same.
+    """
     world = case.world.rstrip("!")
-    made = _mechanism(case, world) if world in MECHANISMS else _object(case, world)
-    columns, scene, models, noise, effects = made
+    draw = _mechanism if world in MECHANISMS else _object
+    columns, scene, models, noise, effects, states = draw(case, world, exact)
     outside = any(kind in OUTSIDE for kind in case.kinds)
     verdict = (
         "gap_unnamed"
@@ -165,12 +174,12 @@ def make(case: Case) -> Written:
         "background": case.background,
         "world": world,
     }
-    return Written(columns, scene, models, noise, truth)
+    return Written(columns, scene, models, noise, truth, states)
 
 
-def write(case: Case, folder: Path) -> dict:
+def write(case: Case, folder: Path, made: Written | None = None) -> dict:
     """Writes the case's folder. Returns: its truth, which is not in the folder."""
-    made = make(case)
+    made = made or make(case)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "scene.yaml").write_text(made.scene)
     for name, text in made.models.items():
@@ -188,7 +197,7 @@ def write(case: Case, folder: Path) -> dict:
 # ----- mechanisms
 
 
-def _mechanism(case: Case, world: str):
+def _mechanism(case: Case, world: str, exact: bool):
     rng = np.random.default_rng(case.seed)
     nominal = MECHANISMS[world](rng)
     true = (
@@ -219,16 +228,26 @@ def _mechanism(case: Case, world: str):
     with_effort = with_effort and not any(
         kind.startswith(("actuator", "input")) for kind in case.kinds
     )
+    if exact:
+        true, lost, with_velocity = nominal, 0.0, True
+        sampling = Sampling(200.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     true_world = MechanismWorld(nominal, true, effects, drive)
     seconds = 20.0 if calm < 1.0 else 12.0
     offsets = true_world.offset
     noise: dict[str, float] = {}
-    episodes = []
+    episodes, states = [], []
     for number, reference in enumerate(references):
         track = true_world.run(seconds, reference, sampling, rng)
         columns = {"time": track.tick, "episode": np.full(len(track.tick), number)}
         functions = {}
+        state = {}
         for i, joint in enumerate(nominal.joints):
+            state[f"{joint}.position"] = np.interp(
+                track.tick, track.time, track.q[:, i]
+            )
+            state[f"{joint}.velocity"] = np.interp(
+                track.tick, track.time, track.v[:, i]
+            )
             if i in nominal.driven:
                 for key, value in track.commands.items():
                     columns[f"{joint}.{key}"] = value[:, i]
@@ -246,11 +265,13 @@ def _mechanism(case: Case, world: str):
         episodes.append(
             measured(columns, functions, track.tick, effects, noise, lost, rng)
         )
+        states.append(state)
     table = {k: np.concatenate([e[k] for e in episodes]) for k in episodes[0]}
+    known = {k: np.concatenate([e[k] for e in states]) for k in states[0]}
     scene = _mechanism_scene(case, nominal, drive, table, rng)
     given = noise if rng.uniform() < 0.7 else None
     models = {f"{nominal.model}.urdf": to_urdf(nominal)}
-    return table, scene, models, given, effects
+    return table, scene, models, given, effects, known
 
 
 def _mechanism_effects(case, world, nominal, plain, references, rng) -> list[dict]:
@@ -417,7 +438,7 @@ def _mechanism_scene(case, nominal, drive, table, rng) -> str:
         actuation = (
             f"  type: pd\n  joints: [{', '.join(driven)}]\n"
             f"  kp: {nominal.extra['kp']}\n  kd: {nominal.extra['kd']}\n"
-            "  hold: zero_order\n  rate_hz: 1000\n"
+            "  hold: zero_order\n  rate_hz: 200\n"
         )
     else:
         actuation = (
@@ -443,7 +464,7 @@ def _mechanism_scene(case, nominal, drive, table, rng) -> str:
 # ----- objects
 
 
-def _object(case: Case, world: str):
+def _object(case: Case, world: str, exact: bool):
     rng = np.random.default_rng(case.seed)
     shape = {"bounce": "ball", "pushed": "sledge"}.get(world, world)
     body = {"ball": contact.ball, "cube": contact.cube, "sledge": contact.sledge}[
@@ -477,6 +498,9 @@ def _object(case: Case, world: str):
     with_turn = case.world != "ball!"
     scatter, lost = float(rng.choice([0.0, 0.05])), float(rng.choice([0.0, 0.01]))
     lost_rows = float(rng.choice([0.0, 0.002]))
+    if exact:
+        place_noise = turn_noise = scatter = lost = lost_rows = 0.0
+        with_twist = with_turn = True
     name = body.name
     noise = {f"{name}.{axis}": place_noise for axis in "xyz"}
     if with_turn:
@@ -484,7 +508,7 @@ def _object(case: Case, world: str):
     if with_twist and with_turn:
         noise |= {f"{name}.v{axis}": 150.0 * place_noise for axis in "xyz"}
         noise |= {f"{name}.w{axis}": 50.0 * turn_noise for axis in "xyz"}
-    episodes = []
+    episodes, states = [], []
     for number in range(n_episodes):
         n = int(seconds * rate)
         t = (np.arange(n) + scatter * np.clip(rng.normal(size=n), -2.5, 2.5)) / rate
@@ -511,6 +535,8 @@ def _object(case: Case, world: str):
                 functions[f"{name}.v{axis}"] = linear(t, rows[:, 7 + i])
                 functions[f"{name}.w{axis}"] = linear(t, rows[:, 10 + i])
         table = measured(columns, functions, t, effects, noise, 0.0, rng)
+        keys = "x y z qw qx qy qz vx vy vz wx wy wz".split()
+        states.append({f"{name}.{k}": rows[:, i] for i, k in enumerate(keys)})
         if with_turn:
             q = _turned(rows[:, 3:7], turn_noise, rng)
             table |= {f"{name}.q{k}": q[:, i] for i, k in enumerate("wxyz")}
@@ -520,8 +546,12 @@ def _object(case: Case, world: str):
             for key in table:
                 if key.startswith(name):
                     table[key] = np.where(gone, np.nan, table[key])
+        if pusher is not None:
+            states[-1]["pusher.slide.position"] = finger[:, 0]
+            states[-1]["pusher.slide.velocity"] = finger[:, 1]
         episodes.append(table)
     table = {k: np.concatenate([e[k] for e in episodes]) for k in episodes[0]}
+    known = {k: np.concatenate([e[k] for e in states]) for k in states[0]}
     models = {
         f"{shape}.sdf": contact.to_sdf(body, ground, pusher is not None),
         "ground.sdf": contact.ground_sdf(ground),
@@ -529,7 +559,8 @@ def _object(case: Case, world: str):
     if pusher is not None:
         models["pusher.sdf"] = contact.pusher_sdf(pusher, ground)
     scene = _object_scene(case, world, shape, pusher, table, rng)
-    return table, scene, models, noise if rng.uniform() < 0.7 else None, effects
+    given = noise if rng.uniform() < 0.7 else None
+    return table, scene, models, given, effects, known
 
 
 def _start(case, world, body, ground, rng) -> np.ndarray:

@@ -150,6 +150,8 @@ class MechanismWorld:
         self.plain_model = mujoco.MjModel.from_xml_string(plain)
         self.plain = mujoco.MjData(self.plain_model)
         self._controlling = False
+        self._held: dict = {}
+        self.kp, self.kd = (np.array(nominal.extra.get(k, [])) for k in ("kp", "kd"))
         self.hysteresis = np.zeros(n)  # State of the Bouc-Wen element.
         self.body_ids = [self.model.body(link.name).id for link in nominal.links]
 
@@ -167,6 +169,8 @@ class MechanismWorld:
             return
         q, v, t = data.qpos, data.qvel, data.time
         out = data.qfrc_passive
+        if self.drive == "pd":  # Analog: it knows no period.
+            out[self.motor_dof] += self._effort(self._held, q, v)
         for kind, where, p in self.laws:
             if kind == "joint_stribeck_friction":
                 for i in where:
@@ -239,7 +243,9 @@ class MechanismWorld:
         v0[free] = 0.0
         d.qpos[self.dof] = d.qpos[self.motor_dof] = q0 - self.offset
         d.qvel[self.dof] = d.qvel[self.motor_dof] = v0
+        self._controlling = True
         mujoco.mj_forward(m, d)
+        self._controlling = False
         self.hysteresis[:] = 0.0
         period = 1.0 / sampling.rate_hz
         n_ticks = int(seconds / period)
@@ -255,7 +261,7 @@ class MechanismWorld:
         sent: list = []  # (time, command)
         log: dict[str, list] = {}
         motor_effort = np.zeros(n)
-        if self.laws or self.motor:
+        if self.laws or self.motor or self.drive == "pd":
             mujoco.set_mjcb_passive(self._passive)
         try:
             for k, t in enumerate(ticks):
@@ -314,7 +320,8 @@ class MechanismWorld:
             pieces = int(np.ceil((b - a) / longest - 1e-6))
             for piece in range(pieces):
                 d.time = a + (b - a) * piece / pieces
-                wanted = self._effort(command)
+                self._held = command
+                wanted = self._effort(command, d.qpos, d.qvel)
                 h = (b - a) / pieces
                 n_steps = max(int(np.ceil(h / STEP - 1e-6)), 1)
                 m.opt.timestep = h / n_steps
@@ -328,21 +335,18 @@ class MechanismWorld:
                     mean = wanted + (effort - wanted) * np.minimum(-np.expm1(-x) / x, 1)
                     effort = wanted + (effort - wanted) * np.exp(-x)
                     d.qfrc_applied[:] = 0.0
-                    d.qfrc_applied[self.motor_dof] = np.where(
-                        self.lag > 0, mean, wanted
-                    )
+                    applied = np.where(self.lag > 0, mean, wanted)
+                    d.qfrc_applied[self.motor_dof] = 0.0 if drive else applied
                     mujoco.mj_step(m, d, 1 if self.lag.any() else n_steps)
                 rows[3].append(np.where(self.lag > 0, effort, wanted))
                 self._step_hysteresis(h)
         return effort
 
-    def _effort(self, command):
+    def _effort(self, command, q, v):
         if self.drive == "pd":
-            d, gains = self.data, self.nominal.extra
-            q = d.qpos[self.motor_dof] + self.offset
-            v = d.qvel[self.motor_dof]
-            u = np.array(gains["kp"]) * (command["position_command"] - q)
-            u += np.array(gains["kd"]) * (command["velocity_command"] - v)
+            q, v = q[self.motor_dof] + self.offset, v[self.motor_dof]
+            u = self.kp * (command["position_command"] - q)
+            u += self.kd * (command["velocity_command"] - v)
         else:
             u = command["effort_command"]
         driven = np.zeros(self.n)
