@@ -41,6 +41,7 @@ from makebreak.systems.numerics.motion_pattern import (
     Segment,
     segment_time,
 )
+from makebreak.systems.velocity_shaper import RegionConfig, VelocityShaperConfig
 
 SURFACES = ("table", "red_block", "blue_wall")
 DOWN, LEFT, AHEAD = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
@@ -79,6 +80,9 @@ class MultipleCollisionsConfig:
                 speed=ApproachSpeedConfig(
                     force_desired=7.0, first=FIRST_SPEED["sphere"], most=MOST_SPEED
                 )
+            ),
+            shaper=VelocityShaperConfig(
+                region=RegionConfig(margin=0.002, settle_sec=0.06)
             ),
             reflex=ImpactReflexConfig(gain=4.0),
         )
