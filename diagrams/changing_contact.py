@@ -224,7 +224,7 @@ def make_changing_contact(
     connect(shaper, "phase", detector, anticipator, variable)
     connect(shaper, "x_desired", impedance)
     connect(detector, "contact", anticipator, shaper, variable)
-    connect(modes, "transition", anticipator)
+    connect(modes, "transition", anticipator, forward)
     connect(modes, "mode", forward)
     connect(modes, "collecting", variable)
     connect(forward, "wrench_predicted", variable)

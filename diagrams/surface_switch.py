@@ -60,6 +60,13 @@ class Anticipation:
     models: bool = True  # And which mode begins there: its model is handed over.
 
 
+def _control() -> ChangingContactConfig:
+    """The defaults, with a lead for what a hint takes to reach the arm: up to 20 ms
+    through the estimators, and the 20 ms of the feed-forward's filter."""
+    config = ChangingContactConfig()
+    return replace(config, anticipator=replace(config.anticipator, hint_lead_sec=0.03))
+
+
 @dataclass
 class SurfaceSwitchConfig:
     seed: int = 0
@@ -68,7 +75,7 @@ class SurfaceSwitchConfig:
     speed: float = 0.1  # Of sliding [m/s].
     normal_force: float = 8.0  # On each surface that has been reached [N].
     anticipation: Anticipation = field(default_factory=Anticipation)
-    control: ChangingContactConfig = field(default_factory=ChangingContactConfig)
+    control: ChangingContactConfig = field(default_factory=_control)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,10 +189,17 @@ def make_surface_switch(
     meshcat: Meshcat | None = None,
 ) -> Diagram:
     """One trial. Args: knowledge: of the trial before; None: the prior alone."""
-    modes = config.control.modes
-    crossing = modes.crossing if task.feet else 0.0  # A sphere is across at once.
+    control = config.control
+    modes, models = control.modes, control.forward_model
+    # How the tool crosses a seam is its own geometry: a point is across at once.
+    crossing = modes.crossing if task.feet else 0.0
+    handover = replace(models.handover, rows=2.0 * task.feet)
     return make_changing_contact(
-        replace(config.control, modes=replace(modes, crossing=crossing)),
+        replace(
+            control,
+            modes=replace(modes, crossing=crossing),
+            forward_model=replace(models, handover=handover),
+        ),
         task.world,
         task.model,
         task.pattern,

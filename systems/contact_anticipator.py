@@ -83,6 +83,7 @@ class ApproachSpeedConfig:
 class ContactAnticipatorConfig:
     filter: ContactFilterConfig = field(default_factory=ContactFilterConfig)
     speed: ApproachSpeedConfig = field(default_factory=ApproachSpeedConfig)
+    hint_lead_sec: float = 0.0  # So long before its place a mode is hinted [s].
     period_sec: float = 0.01
     offset_sec: float = 0.0
 
@@ -139,8 +140,8 @@ class KalmanContactAnticipator(LeafSystem):
              approach_speed (1,) of the next impact of this segment, 0 if none is
              expected [m/s];
              mode_hint (1,) the mode that begins at the expected place of an impact-less
-             change, from the moment the tip passes it until HINT_WAY past its region;
-             -1: none;
+             change, from hint_lead_sec before the tip passes it until HINT_WAY past its
+             region; -1: none;
              status (1,) 0, or BAD_INPUT: the belief is held.
 
     Source: CC 3.3, 3.4.1.
@@ -172,6 +173,11 @@ class KalmanContactAnticipator(LeafSystem):
             raise ValueError(f"growth is {self._speed.growth}, expected 1 or more")
         if not config.period_sec > 0.0:
             raise ValueError(f"period_sec is {config.period_sec}, expected > 0")
+        if not 0.0 <= config.hint_lead_sec < np.inf:
+            raise ValueError(
+                f"hint_lead_sec is {config.hint_lead_sec}, expected 0 or more"
+            )
+        self._lead = float(config.hint_lead_sec)
         self._mass = effective_mass
         given = ContactBelief() if knowledge is None else knowledge
         drift = self._filter.std_drift**2 * np.eye(3)
@@ -232,6 +238,9 @@ class KalmanContactAnticipator(LeafSystem):
             return -1.0
         p, segment = memory.history[-1, 1:4], int(memory.history[-1, 4])
         best, least = -1.0, np.inf
+        if self._lead > 0.0 and len(memory.history) > 5:
+            before, now = memory.history[-6], memory.history[-1]
+            p = p + self._lead * (now[1:4] - before[1:4]) / (now[0] - before[0])
         for contact in memory.belief.contacts:
             if contact.kind != IMPACTLESS or contact.segment != segment:
                 continue

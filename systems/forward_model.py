@@ -1,12 +1,12 @@
 """Forward models of the contact modes: see numerics/forward_model.py."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from makebreak.systems.numerics.contact_task import UNKNOWN_MODE
+from makebreak.systems.numerics.contact_task import COUNT, N_TRANSITION, UNKNOWN_MODE
 from makebreak.systems.numerics.forward_model import (
     BankMemory,
     BankTuning,
@@ -19,14 +19,24 @@ from makebreak.systems.numerics.timing import timed
 
 
 @dataclass
+class HandoverConfig:
+    """How the model of a mode that was announced takes over."""
+
+    duration_sec: float = 0.05  # 0: by its one-step prediction, as any other.
+    # From the first row of the tool's feet to the second, along the motion; 0: it
+    # touches with one point [m].
+    rows: float = 0.0
+
+
+@dataclass
 class ForwardModelConfig:
     with_torque: bool = True  # False: models over |v| and |F_t| alone.
     learns: bool = True  # False: the models stay as given, the fixed GMM.
     smoothing: float = 0.3  # Of the error, per sample; 1: none.
-    tau_nov: float = 1e-3  # Of the mixtures: how unlikely a new component's sample is.
     n_max: int = 20  # Components of a mixture.
     wrench_limit: float = 200.0  # At which the sensor saturates [N], [N m].
     error_unknown: float = 10.0  # Said where the wrench cannot be used [N].
+    handover: HandoverConfig = field(default_factory=HandoverConfig)
 
 
 class ForwardModelBank(LeafSystem):
@@ -38,6 +48,8 @@ class ForwardModelBank(LeafSystem):
         direction (3,) unit vector of the target motion, zero at rest.
         force_directions (6,) two rows n, pressed along; a zero row: none.
         mode (1,) of the mode detector; a mode seen first gets a new model.
+        transition (6,) optional, of the mode detector: a mode that changes without a
+            new count there was announced, and its model is handed over.
 
     Outputs, all of them state:
         wrench_predicted (6,) on the tool, against the motion [N], [N m]; zero in
@@ -68,17 +80,24 @@ class ForwardModelBank(LeafSystem):
             raise ValueError(
                 f"smoothing is {config.smoothing}, expected a number in (0, 1]"
             )
+        for name in ("duration_sec", "rows"):
+            if not 0.0 <= getattr(config.handover, name) < np.inf:
+                raise ValueError(
+                    f"handover.{name} is {getattr(config.handover, name)}, expected a "
+                    "number of 0 or more"
+                )
         if not period_sec > 0.0:
             raise ValueError(f"period_sec is {period_sec}, expected > 0")
         self._tuning = BankTuning(
-            mixtures=bank_tuning(
-                config.with_torque, tau_nov=config.tau_nov, n_max=config.n_max
-            ),
+            mixtures=bank_tuning(config.with_torque, n_max=config.n_max),
             with_torque=bool(config.with_torque),
             learns=bool(config.learns),
             smoothing=float(config.smoothing),
             wrench_limit=float(config.wrench_limit),
             error_unknown=float(config.error_unknown),
+            handover=round(config.handover.duration_sec / period_sec),
+            rows=float(config.handover.rows),
+            period=float(period_sec),
         )
         shape = (config.n_max, self._tuning.mixtures.sigma_ini.size)
         for mode, mixture in knowledge.models if knowledge else ():
@@ -99,6 +118,7 @@ class ForwardModelBank(LeafSystem):
                 ("mode", 1),
             )
         ]
+        self._transition = self.DeclareVectorInputPort("transition", N_TRANSITION)
         empty = ModelBank((), self._tuning.with_torque)
         self._memory = self.DeclareAbstractState(Value(BankMemory(knowledge or empty)))
         ticket = {self.abstract_state_ticket(self._memory)}
@@ -121,6 +141,9 @@ class ForwardModelBank(LeafSystem):
         wrench, velocity, direction, rows, mode = [
             port.Eval(context) for port in self._ports
         ]
+        changes = None
+        if self._transition.HasValue(context):
+            changes = float(self._transition.Eval(context)[COUNT])
         memory = observe(
             self._memory_of(context),
             self._tuning,
@@ -129,6 +152,7 @@ class ForwardModelBank(LeafSystem):
             direction,
             rows,
             int(mode[0]) if np.isfinite(mode[0]) else UNKNOWN_MODE,
+            changes,
         )
         state.get_mutable_abstract_state(self._memory).set_value(memory)
 

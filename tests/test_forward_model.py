@@ -5,7 +5,11 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from makebreak.systems.forward_model import ForwardModelBank, ForwardModelConfig
+from makebreak.systems.forward_model import (
+    ForwardModelBank,
+    ForwardModelConfig,
+    HandoverConfig,
+)
 from makebreak.systems.numerics.contact_task import FREE_MODE, UNKNOWN_MODE
 from makebreak.systems.numerics.forward_model import (
     BAD_WRENCH,
@@ -312,7 +316,7 @@ def test_a_restored_context_replays_and_knowledge_starts_the_next_trial():
         (dict(wrench_limit=np.nan), "wrench_limit is nan"),
         (dict(error_unknown=-1.0), "error_unknown is -1.0"),
         (dict(n_max=0), "n_max is 0"),
-        (dict(tau_nov=2.0), "tau_nov is 2.0"),
+        (dict(handover=HandoverConfig(rows=-1.0)), "handover.rows is -1.0"),
     ],
 )
 def test_wrong_settings_are_refused_by_name(changes, message):
@@ -326,3 +330,68 @@ def test_knowledge_over_other_entries_is_refused():
         ForwardModelBank(ForwardModelConfig(with_torque=False), memory.bank)
     with pytest.raises(ValueError, match="period_sec is 0"):
         ForwardModelBank(ForwardModelConfig(), period_sec=0.0)
+
+
+# Hand-over.
+
+
+def known_bank(t):
+    """Mode 1 with friction 0.2, mode 2 with 0.5."""
+    memory = feed(BankMemory(ModelBank()), t, Slide(), 0.2, 1, 400)[-1]
+    return feed(memory, t, Slide(1), 0.5, 2, 400)[-1].bank
+
+
+def across(t, announced, n_before=60, n_after=40):
+    """Slides on 0.2 in mode 1, then mode 2 while the friction is 0.2 still."""
+    slide, memories = Slide(seed=3), []
+    memory = BankMemory(known_bank(t))
+    for k in range(n_before + n_after):
+        mode = 1 if k < n_before else 2
+        changes = 0.0 if announced else float(mode)
+        memory = observe(memory, t, *slide.sample(0.2), DOWN, mode, changes)
+        memories.append(memory)
+    return memories
+
+
+def test_an_announced_mode_is_asked_without_the_last_force():
+    t = tuning(handover=10)
+    memories = across(t, announced=True)
+    before = memories[59]
+    for memory in memories[60:70]:
+        # 0.5 x 8 N, though the force is 1.6 N still; and nothing is learned of it.
+        np.testing.assert_allclose(memory.predicted[0], 4.0, atol=0.1)
+        assert memory.bank is before.bank
+        assert memory.error == before.error
+    # Then what is felt counts again: no change has come.
+    assert abs(memories[75].predicted[0] - 1.6) < 0.3
+
+
+def test_a_confirmed_mode_is_not_handed_over():
+    t = tuning(handover=10)
+    memories = across(t, announced=False)
+    assert memories[60].before is None and memories[62].bank is not memories[60].bank
+    # As without the port.
+    alone = observe(memories[59], t, *Slide().sample(0.5), DOWN, 2)
+    assert alone.before is None
+
+
+def test_two_rows_of_feet_are_handed_over_in_two_steps():
+    t = tuning(handover=10, rows=0.024)
+    memories = across(t, announced=True, n_after=80)
+    half = [m.predicted[0] for m in memories[60:70]]
+    np.testing.assert_allclose(half, 2.8, atol=0.15)  # Between 1.6 and 4 N.
+    # The second row is 24 mm or 48 samples behind at 0.1 m/s.
+    whole = [k for k, m in enumerate(memories[60:]) if m.left and m.way >= 0.024]
+    assert abs(whole[0] - 48) <= 1 and len(whole) == 10
+    for k in whole:
+        np.testing.assert_allclose(memories[60 + k].predicted[0], 4.0, atol=0.1)
+    assert memories[-1].before is None
+
+
+def test_a_model_that_has_seen_little_is_not_handed_over():
+    t = tuning(handover=10)
+    memory = feed(BankMemory(ModelBank()), t, Slide(), 0.2, 1, 100)[-1]
+    memory = feed(memory, t, Slide(1), 0.5, 2, 10)[-1]
+    memory = feed(BankMemory(memory.bank), t, Slide(2), 0.2, 1, 3)[-1]
+    memory = observe(memory, t, *Slide(4).sample(0.2), DOWN, 2, 0.0)
+    assert memory.before is None

@@ -8,6 +8,13 @@ control: with the normal force in it the feed-forward would be several times too
 Magnitudes do not depend on the direction of motion; the wrench that is predicted acts
 against it.
 
+A model that sees the last force says, in the main, that nothing will change. So where a
+mode was announced before it begins, its model is asked without the last force, which is
+still the old surface's: E[D | |v|, |w|]. That is a *hand-over*. It lasts for a short
+time, in which nothing is learned. A tool that stands on two rows of feet crosses a seam
+in two steps: half of the difference is handed over at first, the whole when it has gone
+from one row to the other.
+
 Source: CC section 3.1, eq. 2, 3, 5, 6.
 """
 
@@ -120,6 +127,12 @@ class BankMemory:
     error: float = 0.0  # eps_t, low-passed [N].
     wrench: np.ndarray = None  # type: ignore[assignment]
     status: int = NO_MODEL
+    # A hand-over: |F_t|, |tau| before it, None: there is none; the way since [m], and
+    # the samples that the step of now is still handed over for.
+    before: np.ndarray | None = None
+    way: float = 0.0
+    left: int = 0
+    count: float = 0.0  # Of mode changes that were confirmed.
 
     def __post_init__(self):
         for name, size in (("predicted", 2), ("wrench", 6)):
@@ -144,6 +157,9 @@ class BankTuning:
     smoothing: float  # Of the error, per sample: 1 is none.
     wrench_limit: float  # At which the sensor saturates [N], [N m].
     error_unknown: float  # What the error is said to be without a wrench [N].
+    handover: int = 10  # Samples for which a step is handed over; 0: never.
+    rows: float = 0.0  # From the first row of feet to the second; 0: one point [m].
+    period: float = 0.005  # [s]
 
 
 def observe(
@@ -154,11 +170,14 @@ def observe(
     direction,
     force_directions,
     mode: int,
+    changes: float | None = None,
 ) -> BankMemory:
     """The memory after one sample: the last prediction's error, learning, the next one.
 
     Args: wrench (6,), velocity (6,), direction (3,) of the target motion, zero at rest,
-        force_directions (6,) as motion_wrench; mode, of contact_task.py.
+        force_directions (6,) as motion_wrench; mode, of contact_task.py; changes: how
+        many changes of mode were confirmed so far. A mode that changes without one was
+        announced; None: none is.
 
     A mode without a model gets an empty one, which predicts that nothing will change
     until it has learned (if nothing is learned: zero). In FREE_MODE and UNKNOWN_MODE
@@ -186,7 +205,12 @@ def observe(
         mixture = empty_mixture(tuning.mixtures)
         bank = bank.put(mode, mixture)
     state = size[:4].copy() if tuning.with_torque else size[[0, 2]]
-    if tuning.learns and memory.state is not None:
+    memory = _handing_over(memory, tuning, mixture, actual, size[0], mode, changes)
+    if memory.left > 0:
+        # What is fed forward belongs to a place that the tool is about to reach: it
+        # cannot be judged by what the sensor says meanwhile.
+        smoothed = memory.error
+    if tuning.learns and memory.state is not None and memory.left == 0:
         x = np.concatenate([memory.state, actual if tuning.with_torque else actual[:1]])
         mixture, _ = learned(mixture, x, tuning.mixtures)
         bank = bank.put(mode, mixture)
@@ -196,6 +220,12 @@ def observe(
         predicted[:n] = regress(mixture, state)[0]
     elif tuning.learns:
         predicted[:] = actual  # Nothing is known but this.
+    if memory.before is not None and memory.left > 0:
+        whole = memory.way >= tuning.rows
+        predicted = _without_force(mixture, state, tuning.with_torque)
+        predicted = memory.before + (1.0 if whole else 0.5) * (
+            predicted - memory.before
+        )
     # A magnitude; and an extrapolation is not to be trusted beyond what the sensor can
     # feel.
     predicted = np.clip(predicted, 0.0, tuning.wrench_limit)
@@ -207,7 +237,59 @@ def observe(
         smoothed,
         against_motion(predicted, direction, velocity, force_directions),
         OK if mixture.count or tuning.learns else NO_MODEL,
+        memory.before,
+        memory.way,
+        memory.left,
+        memory.count,
     )
+
+
+# A model that has seen fewer samples than this is not handed over.
+SUPPORT_MIN = 20.0
+
+
+def _handing_over(memory, tuning, mixture, actual, speed, mode, changes) -> BankMemory:
+    """The memory with the state of the hand-over: begun, gone on, or over."""
+    confirmed = changes is None or changes != memory.count
+    count = memory.count if changes is None else changes
+    if (
+        not confirmed
+        and tuning.handover > 0
+        and mode != memory.mode
+        and memory.mode >= 1
+        and mixture.support.sum() >= SUPPORT_MIN
+    ):
+        # The mean of what was said and what is: less noise than either.
+        before = 0.5 * (actual + memory.predicted)
+        return replace(
+            memory, before=before, way=0.0, left=tuning.handover, count=count
+        )
+    if memory.before is None:
+        return replace(memory, count=count)
+    way = memory.way + speed * tuning.period
+    left = max(memory.left - 1, 0)
+    before = memory.before
+    if memory.way < tuning.rows <= way:
+        left = tuning.handover
+    elif left == 0 and way >= tuning.rows or mode != memory.mode:
+        before, left = None, 0
+    return replace(memory, before=before, way=way, left=left, count=count)
+
+
+def _without_force(mixture, state, with_torque) -> np.ndarray:
+    """(2,) |F_t|, |tau| that a model has at this speed, whatever the last force was."""
+    n = 2 if with_torque else 1
+    j = int(np.argmax(mixture.support[: mixture.count]))
+    k = slice(j, j + 1)
+    best = Mixture(
+        mixture.mean[k], mixture.factor[k], mixture.support[k], mixture.age[k], 1
+    )
+    # The best supported component: a mean of all would be drawn by rare events, such as
+    # the impacts that end a motion.
+    mean = regress(best, state[:n])[0]  # Of [|F_t|, |tau|, |F_t|', |tau|'].
+    out = np.zeros(2)
+    out[:n] = mean[n:]
+    return out
 
 
 # Slower than this, a direction of turning is noise [rad/s].

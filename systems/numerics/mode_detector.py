@@ -340,9 +340,8 @@ def _watched(memory: ModeMemory, tuning: ModeTuning, time, feature, R):
     memory = replace(memory, slow=slow, over=over, quiet_time=quiet)
     departed = over >= SUSTAINED or abs(slow) > 0.5 * least
     if departed:
-        # The average lags by half its window.
-        lag = 0.5 * (WINDOW - 1) * tuning.period
-        change = min(quiet + tuning.period, time) - lag
+        # A step shows in the first average that it enters: it came between the two.
+        change = min(quiet + 0.5 * tuning.period, time)
         memory = replace(memory, change_time=change, over=0, slow=0.0)
     return memory, departed
 
