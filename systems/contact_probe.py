@@ -7,6 +7,7 @@ from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from makebreak.systems.numerics.contact_force import tip_wrench
+from makebreak.systems.numerics.packed import packed
 from makebreak.systems.numerics.serial_chain import SerialChain
 
 
@@ -60,9 +61,9 @@ class ToolContactForce(LeafSystem):
 
     def __init__(self, chain: SerialChain):
         super().__init__()
-        self._chain = chain
+        self._chain = packed(chain)
         self._n = len(chain.mass)
-        tip_wrench(chain, np.zeros(self._n), np.zeros(self._n))  # Compiles it.
+        tip_wrench(self._chain, np.zeros(self._n), np.zeros(self._n))  # Compiles it.
         self._state = self.DeclareVectorInputPort("state", 2 * self._n)
         self._torque = self.DeclareVectorInputPort("contact_torque", self._n)
         self.DeclareVectorOutputPort("contact_force", 3, self._calc)

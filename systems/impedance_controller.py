@@ -12,9 +12,10 @@ from makebreak.systems.numerics.impedance_controller import (
     ForceLaw,
     Law,
     memory_size,
-    tick,
+    packed_tick,
     warm_up,
 )
+from makebreak.systems.numerics.packed import packed
 from makebreak.systems.numerics.serial_chain import SerialChain, chain_state
 from makebreak.systems.numerics.timing import timed
 
@@ -152,7 +153,8 @@ class ImpedanceController(LeafSystem):
             ),
         )
         self._ratio = float(hybrid.damping_ratio)
-        warm_up(self._chain, self._law)
+        self._packed = packed(self._chain), packed(self._law)
+        warm_up(*self._packed)
         self._q = self.DeclareVectorInputPort("q", n)
         self._v = self.DeclareVectorInputPort("v", n)
         self._x_desired = self.DeclareVectorInputPort("x_desired", 19)
@@ -185,9 +187,8 @@ class ImpedanceController(LeafSystem):
             damping = self._or(self._damped, context, stiffness)
         else:
             damping = self._law.damping
-        tau, status, memory = tick(
-            self._chain,
-            self._law,
+        tau, status, memory = packed_tick(
+            *self._packed,
             context.get_discrete_state(self._tau).value(),
             context.get_discrete_state(self._memory).value(),
             self._q.Eval(context),

@@ -30,8 +30,9 @@ from makebreak.systems.numerics.impedance_controller import (
     force_control,
     impedance_torque,
     memory_size,
-    tick,
+    packed_tick,
 )
+from makebreak.systems.numerics.packed import packed
 from makebreak.systems.numerics.serial_chain import chain_state
 
 NO_NOISE = SensorNoise(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -408,9 +409,9 @@ def test_damping_rule_is_the_critical_one_times_its_ratio(law, chain, ratio):
 def run_ticks(chain, law, n, state, directions, targets, measured=None):
     tau, memory = state
     for _ in range(n):
-        tau, status, memory = tick(
-            chain, law, tau, memory, law.q_nominal, np.zeros(7), reference(),
-            law.stiffness, law.damping, 0.0, np.zeros(6), directions, targets,
+        tau, status, memory = packed_tick(
+            packed(chain), packed(law), tau, memory,
+            law.q_nominal, np.zeros(7), reference(), law.stiffness, law.damping, 0.0, np.zeros(6), directions, targets,
             np.zeros(6) if measured is None else measured,
         )  # fmt: skip
     return (tau, memory), status

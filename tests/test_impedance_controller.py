@@ -30,11 +30,12 @@ from makebreak.systems.numerics.impedance_controller import (
     SLOT,
     impedance_torque,
     memory_size,
+    packed_tick,
     quaternion_of,
     rotation_error,
     rotation_of,
-    tick,
 )
+from makebreak.systems.numerics.packed import packed
 from makebreak.systems.numerics.serial_chain import chain_state, tip_kinematics
 
 EFFORT = np.repeat([87.0, 12.0], [4, 3])
@@ -265,8 +266,19 @@ def run_ticks(chain, law, inputs):
     memory, rows = np.zeros(memory_size(7)), []
     for q, v, x_d, *rest in inputs:
         K, D, wrench = (*rest, *(law.stiffness, law.damping, np.zeros(6))[len(rest) :])
-        tau, status, memory = tick(
-            chain, law, tau, memory, q, v, x_d, K, D, 0.0, wrench, *NO_FORCE
+        tau, status, memory = packed_tick(
+            packed(chain),
+            packed(law),
+            tau,
+            memory,
+            q,
+            v,
+            x_d,
+            K,
+            D,
+            0.0,
+            wrench,
+            *NO_FORCE,
         )
         rows.append((tau, status))
     return rows

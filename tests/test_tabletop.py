@@ -27,6 +27,7 @@ from makebreak.diagrams.tabletop import (
 from makebreak.models.scene import load_scene, read_scene
 from makebreak.systems.impedance_controller import serial_chain_of
 from makebreak.systems.numerics.impedance_controller import rotation_error
+from makebreak.systems.numerics.packed import packed
 from makebreak.systems.numerics.serial_chain import chain_state, tip_kinematics
 from makebreak.systems.numerics.tip_state import tip_pose, tip_velocity
 
@@ -258,17 +259,19 @@ def test_tip_pose_and_velocity_agree_with_drake():
         plant.SetPositions(context, q)
         plant.SetVelocities(context, v)
         X, V = tip.CalcPoseInWorld(context), tip.CalcSpatialVelocityInWorld(context)
-        pose = tip_pose(chain, q)
+        pose = tip_pose(packed(chain), q)
         w_x_y_z = X.rotation().ToQuaternion().wxyz()
         expected = [*X.translation(), *(w_x_y_z * np.sign(w_x_y_z[0]))]
         np.testing.assert_allclose(pose, expected, atol=1e-12)
         expected = [*V.translational(), *V.rotational()]
-        np.testing.assert_allclose(tip_velocity(chain, q, v), expected, atol=1e-12)
+        np.testing.assert_allclose(
+            tip_velocity(packed(chain), q, v), expected, atol=1e-12
+        )
 
 
 def test_sampled_sensors_are_read_once_per_step_and_cost_no_other_contact():
-    # The wrench of a step is what the contact of that very step gives: without noise the
-    # tool's m a is all that is left, 0.3 kg with (16 N / 5 kg) at most.
+    # The wrench of a step is what the contact of that very step gives: without noise
+    # the tool's m a is all that is left, 0.3 kg with (16 N / 5 kg) at most.
     scene = read_scene(TABLETOP_WALLS)
     plant = make_control_plant(scene, TOOL)
     chain = serial_chain_of(plant, "tip")

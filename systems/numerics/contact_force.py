@@ -33,10 +33,10 @@ def contact_forces(chain, q, torque, offset):
 def tip_wrench(chain, q, torque):
     """The wrench at the tip that explains a contact's joint torques, tau = J' w.
 
-    Args: chain, of the arm with its tool; q (n,) [rad]; torque (n,) [N m].
+    Args: chain, of the arm with its tool, packed; q (n,) [rad]; torque (n,) [N m].
     Returns: (6,) on the tool, world axes, force first [N], [N m]; zero where torque is.
     """
     if not np.any(torque):
         return np.zeros(6)
-    J = tip_kinematics(chain, q)[2]
+    J = tip_kinematics(chain[0], q)[2]
     return np.linalg.solve(J @ J.T, J @ torque)

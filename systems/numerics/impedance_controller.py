@@ -20,11 +20,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from makebreak.systems.numerics.serial_chain import (
-    SerialChain,
-    chain_state,
-    tip_kinematics,
-)
+from makebreak.systems.numerics.serial_chain import chain_state, tip_kinematics
 
 # Status bits.
 REFERENCE_HELD = 1
@@ -387,16 +383,16 @@ def tick(
         q_now = q
     else:
         status |= SENSORS_HELD
-        q_now = memory[n : 2 * n].copy() if has_q else law.q_nominal
+        q_now = memory[n : 2 * n].copy() if has_q else law.q_nominal.copy()
 
     x_d, R_d, held = _reference(chain, memory, q_now, x_d, has_pose, n)
     if held:
         status |= REFERENCE_HELD
     if not (np.all(np.isfinite(stiffness)) and np.all(stiffness >= 0.0)):
-        stiffness = law.stiffness
+        stiffness = law.stiffness.copy()
         status |= REFERENCE_HELD
     if not (np.all(np.isfinite(damping)) and np.all(damping >= 0.0)):
-        damping = law.stiffness if ratio > 0.0 else law.damping
+        damping = law.stiffness.copy() if ratio > 0.0 else law.damping.copy()
         status |= REFERENCE_HELD
     if not np.all(np.isfinite(wrench)):
         wrench = np.zeros(6)
@@ -468,17 +464,29 @@ def _reference(chain, memory, q, x_d, has_pose, n):
     return held, rotation_of(held[3:7]), True
 
 
-def warm_up(chain: SerialChain, law: Law) -> None:
-    """Compiles the law, so that no tick has to wait for it.
+@numba.njit(cache=True)
+def packed_tick(
+    chain, law, tau, memory, q, v, x_d, stiffness, damping, ratio, wrench,
+    directions, targets, measured,
+):  # fmt: skip
+    """The tick, with chain and law packed (numerics/packed.py)."""
+    return tick(
+        chain[0], law[0], tau, memory, q, v, x_d, stiffness, damping, ratio, wrench,
+        directions, targets, measured,
+    )  # fmt: skip
+
+
+def warm_up(chain: np.ndarray, law: np.ndarray) -> None:
+    """Compiles the law, so that no tick has to wait for it. Both are packed.
 
     tau and memory are read-only, as a Context's state is: to the compiler those are
     arrays of another type.
     """
-    n = len(law.effort_max)
+    n = law["effort_max"].size
     tau, memory = np.zeros(n), np.zeros(memory_size(n))
     for state in (tau, memory):
         state.setflags(write=False)
-    args = (law.q_nominal, np.zeros(n), np.full(19, np.nan))
-    gains = (law.stiffness, law.damping, 0.0)
+    args = (np.zeros(n), np.zeros(n), np.full(19, np.nan))
     none = np.zeros(6)
-    tick(chain, law, tau, memory, *args, *gains, none, none, np.zeros(2), none)
+    gains = (none, none, 0.0)
+    packed_tick(chain, law, tau, memory, *args, *gains, none, none, np.zeros(2), none)
