@@ -70,9 +70,11 @@ class WallTraining:
     """What the baseline learns from, and how much of it."""
 
     trials: int = 14  # In each of the three training sets.
-    every: int = 5  # Samples of 5 ms between two steps of a long-term prediction.
+    every: int = 10  # Samples of 5 ms between two steps of a long-term prediction.
     long_term: TrainingBudget = field(
-        default_factory=lambda: TrainingBudget(segment_min=4, predict_change=False)
+        default_factory=lambda: TrainingBudget(
+            points_per_mode=120, segment_min=2, predict_change=False
+        )
     )
     # At every sample; each once with the next force as output, once with its change.
     one_step: TrainingBudget = field(
@@ -244,7 +246,13 @@ def make_wall_friction(
     )
     forward = add(
         "forward_model_bank",
-        ForwardModelBank(ForwardModelConfig(), known_models, ESTIMATE, OFFSET),
+        ForwardModelBank(
+            # A face slides: its torque says nothing of friction.
+            ForwardModelConfig(with_torque=False, tau_nov=0.01),
+            known_models,
+            ESTIMATE,
+            OFFSET,
+        ),
     )
     signals = {
         "q": (q, N_ARM),
