@@ -225,6 +225,7 @@ def _run(args) -> int:
 
 
 def _reproduce(args) -> int:
+    from makebreak.scripts.hypotheses import verdicts
     from makebreak.scripts.session import Session
 
     names = args.experiments or list(EXPERIMENTS)
@@ -239,6 +240,18 @@ def _reproduce(args) -> int:
     out = Path(args.out) if args.out else _default_out("reproduce")
     session = Session(out, reuse=args.reuse)
     tables = {}
+
+    def show(name, table):
+        tables[name] = table
+        print(table.to_text(), flush=True)
+        # Written after each: an interrupted run keeps what is done.
+        session.write_json(
+            "reproduce.json", {n: t.to_dict() for n, t in tables.items()}
+        )
+        session.write_text(
+            "reproduce.md", "\n".join(t.to_markdown() for t in tables.values())
+        )
+
     for name, module in modules.items():
         if hasattr(module, "reproduce"):
             try:
@@ -246,17 +259,12 @@ def _reproduce(args) -> int:
             except Exception:  # Not the user's doing: all input is checked above.
                 traceback.print_exc()
                 return 3
-            tables[name] = table
-            print(tables[name].to_text(), flush=True)
-            # Written after each: an interrupted run keeps what is done.
-            session.write_json(
-                "reproduce.json", {n: t.to_dict() for n, t in tables.items()}
-            )
-            session.write_text(
-                "reproduce.md", "\n".join(t.to_markdown() for t in tables.values())
-            )
+            show(name, table)
+    verdict = verdicts(tables)
+    if verdict is not None:
+        show("hypotheses", verdict)
     print(f"Files in {out}: reproduce.json reproduce.md")
-    missed = sum(table.missed for table in tables.values())
+    missed = sum(t.missed for name, t in tables.items() if name != "hypotheses")
     if missed:
         print(f"makebreak: {missed} rows miss their target", file=sys.stderr)
     return 1 if missed else 0
