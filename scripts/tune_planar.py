@@ -7,11 +7,12 @@ far, each tried on seeds 100 to 102 and scored by the mean RMS tracking error; t
 five are tried on seeds 100 to 113, and the one with the least median wins. A trial of
 the biomimetic controller is a whole learning run of 30 trials, scored by the last.
 
-All are as compliant as the adaptive controller must be at its stiffest: proportional
-stiffness at most stiffness_max, proportional damping at most twice critical there
-(else a high gain does what adaptation is to do; `mrac_free` shows it). Active
-inference has no such gains and is not bounded. What was found is in docs/planar.md and
-is the default of diagrams/multi_spring.py and diagrams/porridge.py.
+All are as compliant as the adaptive controller is at its stiffest: proportional
+stiffness at most stiffness_max, proportional damping at most twice critical there.
+(Else a high gain does what adaptation is to do; `mrac_free` and `active_inference_free`
+show it.) Active inference integrates its error of velocity, k_a P_y' int de/dt dt: that
+factor is its proportional stiffness. What was found is in docs/planar.md and is the
+default of diagrams/multi_spring.py and diagrams/porridge.py.
 
 Trials run as plain loops here, without a diagram; tests/test_planar_experiments.py
 holds them against the diagrams, tick for tick.
@@ -83,6 +84,13 @@ _MRAC = {
     "velocity_now": (0.01, 1e4),
     "velocity_summed": (0.01, 1e4),
 }
+_ACTIVE_INFERENCE = {
+    "variance_velocity": (0.1, 100.0),
+    "variance_belief": (1e-4, 100.0),
+    "variance_rate": (1e-4, 100.0),
+    "k_belief": (0.05, 200.0),
+    "stiffness": (5.0, K_MAX),  # k_a / variance_velocity.
+}
 _BIOMIMETIC = {
     "kappa": (1.0, 50.0),
     "rate_force": (0.1, 1e3),
@@ -100,13 +108,8 @@ SPACES = {
     "mrac": _MRAC,
     "mrac_free": _MRAC | {"stiffness": (5.0, 1e5)},
     "porridge_mrac": _MRAC,
-    "active_inference": {
-        "variance_velocity": (0.1, 100.0),
-        "variance_belief": (1e-4, 100.0),
-        "variance_rate": (1e-4, 100.0),
-        "k_belief": (0.05, 200.0),
-        "k_action": (10.0, 1e7),
-    },
+    "active_inference": _ACTIVE_INFERENCE,
+    "active_inference_free": _ACTIVE_INFERENCE | {"stiffness": (5.0, 1e5)},
     "biomimetic": _BIOMIMETIC,
     "biomimetic_first": _BIOMIMETIC,
 }
@@ -142,9 +145,10 @@ def config_of(name: str, p: dict[str, float]):
             [float(now[1]), p["position_summed"]],
             [float(now[2]), p["velocity_summed"]],
         )
-    if name == "active_inference":
+    if name.startswith("active_inference"):
         variance = [p[f"variance_{key}"] for key in ("velocity", "belief", "rate")]
-        return ActiveInferenceConfig([1.0, *variance], p["k_belief"], p["k_action"])
+        k_action = p["stiffness"] * p["variance_velocity"]
+        return ActiveInferenceConfig([1.0, *variance], p["k_belief"], k_action)
     return BiomimeticConfig(
         p["kappa"],
         [p["rate_force"], p["rate_stiffness"], p["rate_damping"]],
@@ -352,7 +356,7 @@ def rms_of(name: str, config, seed: int) -> float:
     task = task_of(seed, stirring=name.startswith("porridge"))
     if name.startswith("biomimetic"):
         return learning_curve(config, task, 1 if name.endswith("first") else TRIALS)[-1]
-    if name == "active_inference":
+    if name.startswith("active_inference"):
         return active_inference_error(config, task)
     if "mrac" in name:
         return mrac_error(config, task)
