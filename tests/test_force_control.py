@@ -411,7 +411,8 @@ def run_ticks(chain, law, n, state, directions, targets, measured=None):
     for _ in range(n):
         tau, status, memory = packed_tick(
             packed(chain), packed(law), tau, memory,
-            law.q_nominal, np.zeros(7), reference(), law.stiffness, law.damping, 0.0, np.zeros(6), directions, targets,
+            law.q_nominal, np.zeros(7), reference(), law.stiffness, law.damping, 0.0,
+            np.zeros(6), directions, targets,
             np.zeros(6) if measured is None else measured,
         )  # fmt: skip
     return (tau, memory), status
