@@ -46,7 +46,6 @@ from makebreak.systems.numerics.baselines.long_term_predictor import (
     TrainingBudget,
 )
 from makebreak.systems.numerics.serial_chain import tip_kinematics
-from makebreak.systems.numerics.tip_state import tip_pose, tip_velocity
 from makebreak.systems.tip_state import TipState
 
 WALL, N_ARM = "blue_wall", 7
@@ -337,16 +336,18 @@ def tip_states(data: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Positions (n, 3) [m] and velocities (n, 3) [m/s] of the tip, from the joints'."""
     control_plant = make_control_plant(TABLETOP_WALLS, TOOL)
     chain = serial_chain_of(control_plant, TIP_FRAME)
-    rows = list(zip(data["q"], data["v"], strict=True))
-    position = np.array([tip_pose(chain, q)[:3] for q, _ in rows])
-    return position, np.array([tip_velocity(chain, q, v)[:3] for q, v in rows])
+    position, velocity = np.empty((2, len(data["q"]), 3))
+    for i, (q, v) in enumerate(zip(data["q"], data["v"], strict=True)):
+        position[i], _, J = tip_kinematics(chain, q)
+        velocity[i] = J[:3] @ v
+    return position, velocity
 
 
 def start_of(control_plant) -> np.ndarray:
     """(3,) where the tip is at first [m]."""
     chain = serial_chain_of(control_plant, TIP_FRAME)
     positions = control_plant.GetPositions(control_plant.CreateDefaultContext())
-    return tip_pose(chain, positions)[:3]
+    return tip_kinematics(chain, positions)[0]
 
 
 def telemetry(
