@@ -15,6 +15,7 @@ from makebreak.diagrams.station import (
 from makebreak.models.scene import read_scene
 from makebreak.scripts.bench import median_cpu_ms
 from makebreak.systems.impedance_controller import (
+    HybridConfig,
     ImpedanceConfig,
     ImpedanceController,
     serial_chain_of,
@@ -76,12 +77,18 @@ def rows() -> list[dict]:
     """Microseconds per tick, the station's real-time factor, the tip's mass."""
     arm = make_control_plant()
     found: list[dict] = []
-    for orientation in (False, True):
-        config = ImpedanceConfig(control_orientation=orientation)
-        controller = ImpedanceController(config, arm)
+    for what in ("position only", "full pose", "full pose and two forces"):
+        config = ImpedanceConfig(control_orientation=what != "position only")
+        controller = ImpedanceController(
+            config, arm, hybrid=HybridConfig(damping_ratio=0.9)
+        )
         context = controller.CreateDefaultContext()
         q = arm.GetPositions(arm.CreateDefaultContext())
         values = {"q": q, "v": np.full(7, 0.05), "x_desired": _x_desired()}
+        if what.endswith("forces"):
+            values["force_directions"] = np.array([0.0, 0, -1, 0, 1, 0])
+            values["force_targets"] = np.array([8.0, 8.0])
+            values["wrench_measured"] = np.array([0.0, -8, 8, 0, 0, 0])
         for name, value in values.items():
             controller.GetInputPort(name).FixValue(context, value)
 
@@ -89,7 +96,6 @@ def rows() -> list[dict]:
             context.SetTime(context.get_time() + 0.001)  # Else the last one is kept.
             controller.EvalUniquePeriodicDiscreteUpdate(context)
 
-        what = "full pose" if orientation else "position only"
         found.append(
             {
                 "what": f"impedance tick, {what}",
