@@ -1,4 +1,4 @@
-"""A block slides over three surfaces of unknown friction (CC section 4.3, figures 8-10).
+"""A block slides over three surfaces of unknown friction (CC 4.3, figures 8 to 10).
 
 It comes down on the first surface and goes along a path of straight lines and an arc
 that crosses every seam in several directions; each segment presses with a force of its
@@ -55,6 +55,8 @@ FORCE = (0.75, 1.5)  # Of a segment, in shares of the config's.
 SPEED_DOWN = 0.1  # [m/s]
 # The corners on which the block stands, from its centre; along its sides [m].
 FEET = {"block": 0.012, "sphere": 0.0}
+# A sphere of 20 mm that sinks in by 0.4 mm touches over 8 mm.
+SPHERE_CROSSING = 0.01  # [m]
 
 
 @dataclass
@@ -168,8 +170,8 @@ def make_changing_surface(
 ) -> Diagram:
     """The station and all systems. Args: knowledge: of an earlier trial, if any."""
     modes = config.control.modes
-    # A sphere is over a seam at once.
-    crossing = modes.crossing if task.feet else 0.0
+    # How the tool crosses a seam is its own geometry.
+    crossing = modes.crossing if task.feet else SPHERE_CROSSING
     return make_changing_contact(
         replace(config.control, modes=replace(modes, crossing=crossing)),
         task.world,

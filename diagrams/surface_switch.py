@@ -50,6 +50,8 @@ LOW, HIGH, WALL = (0.1, 0.3), (0.4, 0.6), (0.1, 0.6)
 DOWN, Y = np.array([0.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0])
 CROSSINGS = (1, 3)  # Segments in which the surface changes.
 FEET = {"block": 0.012, "sphere": 0.0}  # From the tip to where it stands [m].
+# A sphere of 20 mm that sinks in by 0.4 mm touches over 8 mm.
+SPHERE_CROSSING = 0.01  # [m]
 
 
 @dataclass
@@ -147,7 +149,7 @@ def make_pattern(config: SurfaceSwitchConfig, half: float) -> MotionPattern:
         [x + ALONG_WALL, stop - BEYOND, half - BEYOND],
         [x + ALONG_WALL + BACK, stop - BEYOND, half - BEYOND],
     ])  # fmt: skip
-    forces = ([], [DOWN], [DOWN, Y], [DOWN], [DOWN, -Y])
+    forces: tuple[list, ...] = ([], [DOWN], [DOWN, Y], [DOWN], [DOWN, -Y])
     segments, time, a_max = [], 0.0, 1.0
     for k, n in enumerate(forces):
         length = float(np.linalg.norm(corners[k + 1] - corners[k]))
@@ -191,8 +193,8 @@ def make_surface_switch(
     """One trial. Args: knowledge: of the trial before; None: the prior alone."""
     control = config.control
     modes, models = control.modes, control.forward_model
-    # How the tool crosses a seam is its own geometry: a point is across at once.
-    crossing = modes.crossing if task.feet else 0.0
+    # How the tool crosses a seam is its own geometry.
+    crossing = modes.crossing if task.feet else SPHERE_CROSSING
     handover = replace(models.handover, rows=2.0 * task.feet)
     return make_changing_contact(
         replace(

@@ -335,7 +335,7 @@ def plot_stiffness(logs, changes: list[Change]):
         ylim=(0.01, None),
         xlabel="time [s]; grey: the block stands on two surfaces",
     )
-    axes[1].legend(loc="lower right", ncols=3)
+    axes[1].legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
     return figure
 
 
