@@ -16,17 +16,18 @@ _ROOT = "/makebreak/planar"
 class PlanarViewConfig:
     anchors: list[list[float]] = field(default_factory=list)  # Of the springs [m].
     stiffness: list[float] = field(default_factory=list)  # One per anchor [N/m].
-    # First and last viscosity [N s/m], over ramp_sec: how dark the porridge gets.
+    # First and last viscosity [N s/m], over ramp_sec: how long the bar gets.
     viscosity: list[float] = field(default_factory=lambda: [0.0, 0.0])
     ramp_sec: float = 6.0
     period_sec: float = 1.0 / 30.0
 
 
 class PlanarView(LeafSystem):
-    """Shows effector, target and springs, the path of both, and the porridge's colour.
+    """Shows effector (blue), target (orange) and springs, and the path of both.
 
-    A spring is as thick as it is stiff. The effector's path is a row of dots, laid down
-    over ramp_sec.
+    A spring is as thick as it is stiff. The paths are rows of dots, laid down over
+    ramp_sec. In porridge a bar beside the circle is as long as the viscosity is high,
+    0.5 m at 200 N s/m.
 
     Inputs: state (4,) p, v; x_desired (6,) p, v, a.
     """
@@ -41,8 +42,15 @@ class PlanarView(LeafSystem):
         self._viscosity, self._ramp = c.viscosity, c.ramp_sec
         self._state = self.DeclareVectorInputPort("state", 4)
         self._target = self.DeclareVectorInputPort("x_desired", 6)
-        meshcat.SetCameraPose([0.0, -0.35, 2.1], [0.0, 0.0, 0.0])
-        meshcat.SetObject(f"{_ROOT}/floor", Box(2.0, 2.0, 0.002), self._floor(0.0))
+        meshcat.SetProperty("/Grid", "visible", False)
+        meshcat.SetProperty("/Axes", "visible", False)
+        meshcat.SetCameraPose([0.0, -0.3, 1.25], [0.0, 0.0, 0.0])
+        floor = Rgba(0.96, 0.94, 0.88)
+        meshcat.SetObject(f"{_ROOT}/floor", Box(2.4, 2.4, 0.002), floor)
+        if c.viscosity[0] != c.viscosity[1]:
+            brown = Rgba(0.6, 0.42, 0.22)
+            meshcat.SetObject(f"{_ROOT}/viscosity", Box(0.03, 1.0, 0.01), brown)
+            self._show_viscosity(0.0)
         meshcat.SetObject(f"{_ROOT}/effector", Sphere(0.02), Rgba(0.13, 0.4, 0.9))
         meshcat.SetObject(f"{_ROOT}/target", Sphere(0.012), Rgba(0.95, 0.55, 0.1))
         for i in range(_TRACE_DOTS):
@@ -66,12 +74,13 @@ class PlanarView(LeafSystem):
     def _spring(self, i):
         return f"{_ROOT}/spring_{i}"
 
-    def _floor(self, t):
-        """Light where it is thin; 200 N s/m is dark."""
+    def _show_viscosity(self, t):
         first, last = self._viscosity
         c = first + (last - first) * min(t / self._ramp, 1.0)
-        share = min(c / 200.0, 1.0)
-        return Rgba(0.96 - 0.3 * share, 0.94 - 0.42 * share, 0.88 - 0.6 * share)
+        length, bar = 0.001 + 0.5 * c / 200.0, f"{_ROOT}/viscosity"
+        place = RigidTransform([0.4, -0.25 + 0.5 * length, _HEIGHT])
+        self._meshcat.SetProperty(bar, "scale", [1.0, length, 1.0], t)
+        self._meshcat.SetTransform(bar, place, t)
 
     def _publish(self, context):
         t = context.get_time()
@@ -93,6 +102,4 @@ class PlanarView(LeafSystem):
             coil = f"{self._spring(i)}/coil"
             meshcat.SetProperty(coil, "scale", [1.0, 1.0, length], t)
         if self._viscosity[0] != self._viscosity[1]:
-            color = self._floor(t)
-            rgba = [color.r(), color.g(), color.b(), 1.0]
-            meshcat.SetProperty(f"{_ROOT}/floor/<object>", "color", rgba, t)
+            self._show_viscosity(t)

@@ -22,7 +22,7 @@ from makebreak.diagrams.multi_spring import (
     draw,
     make_multi_spring,
 )
-from makebreak.diagrams.porridge import PorridgeConfig
+from makebreak.diagrams.porridge import PorridgeConfig, make_porridge
 from makebreak.diagrams.porridge import draw as draw_porridge
 from makebreak.systems.baselines.active_inference import ActiveInferenceConfig
 from makebreak.systems.numerics.planar_world import (
@@ -278,10 +278,17 @@ def test_other_bad_input_is_refused_by_name():
         draw_porridge(PorridgeConfig(force_noise=-1.0), True)
 
 
-def test_a_meshcat_shows_effector_springs_and_path():
+def test_a_meshcat_shows_effector_springs_path_and_viscosity():
     meshcat = Meshcat()
     controller = active_inference(ActiveInferenceConfig())
     diagram = make_multi_spring(MultiSpringConfig(), controller, meshcat)
     Simulator(diagram).AdvanceTo(0.2)
     for name in ("effector", "target", "spring_2/coil", "spring_0_anchor", "trace/3"):
         assert meshcat.HasPath(f"/makebreak/planar/{name}"), name
+    assert not meshcat.HasPath("/makebreak/planar/viscosity")
+    meshcat.Delete()
+    controller = active_inference(ActiveInferenceConfig())
+    diagram = make_porridge(PorridgeConfig(), controller, meshcat=meshcat)
+    Simulator(diagram).AdvanceTo(0.1)
+    assert meshcat.HasPath("/makebreak/planar/viscosity")
+    assert not meshcat.HasPath("/makebreak/planar/spring_0")
