@@ -19,6 +19,7 @@ from makebreak.systems.numerics.contact_task import (
 
 _ROOT = "/makebreak/contact"
 _NOWHERE = RigidTransform([0.0, 0.0, -5.0])
+_BESIDE = np.array([0.045, -0.045, 0.06])  # Of the tip, where the mode is seen [m].
 _REGIONS = 6  # Of each kind that can be seen at once.
 _KIND_COLORS = {IMPACT: Rgba(0.9, 0.2, 0.2, 0.3), IMPACTLESS: Rgba(0.2, 0.4, 0.95, 0.3)}
 # Unknown, free, then the modes in their order, again from the third on.
@@ -42,14 +43,14 @@ class ContactViewConfig:
     peaks: list[list[float]] = field(default_factory=list)
     peak_limit: float = 8.5  # Higher bars are red [N].
     bars_at: list[float] = field(default_factory=lambda: [0.25, -0.42])  # [m]
-    camera: list[float] = field(default_factory=lambda: [1.05, -0.75, 0.6])  # [m]
+    camera: list[float] = field(default_factory=lambda: [1.0, -0.6, 0.5])  # [m]
     period_sec: float = 1.0 / 15.0
 
 
 class ContactView(LeafSystem):
     """Draws the regions in which contacts are expected (ellipsoids: red for an impact,
     blue for a change without one), the contact force (an arrow from the tool), the mode
-    (colour of the ball above the tool), the target path (dark) and the tip's track
+    (colour of the ball beside the tool), the target path (dark) and the tip's track
     (orange), and the peak forces of the trials before (bars).
 
     Inputs: contacts (ContactBelief); wrench (6,) on the tool [N], [N m]; ee_pose (7,);
@@ -103,7 +104,7 @@ class ContactView(LeafSystem):
             for j, peak in enumerate(trial):
                 if not np.isfinite(peak):
                     continue
-                height = max(0.008 * min(peak, 40.0), 0.001)  # 8 mm per newton.
+                height = max(0.004 * min(peak, 50.0), 0.001)  # 4 mm per newton.
                 path = f"{_ROOT}/peaks/{i}/{j}"
                 good = peak <= c.peak_limit
                 color = Rgba(0.3, 0.7, 0.3) if good else Rgba(0.85, 0.25, 0.2)
@@ -133,7 +134,7 @@ class ContactView(LeafSystem):
         mode = int(mode) if np.isfinite(mode) else UNKNOWN_MODE
         shown = mode + 1 if mode < 1 else 2 + (mode - 1) % (len(_MODE_COLORS) - 2)
         for i in range(len(_MODE_COLORS)):
-            X = RigidTransform(p + [0.0, 0.0, 0.1]) if i == shown else _NOWHERE
+            X = RigidTransform(p + _BESIDE) if i == shown else _NOWHERE
             meshcat.SetTransform(f"{_ROOT}/mode/{i}", X, t)
         force = self._wrench.Eval(context)[:3]
         if not np.all(np.isfinite(force)):

@@ -241,6 +241,17 @@ def test_a_belief_that_changes_while_the_speed_changes_keeps_it_smooth():
     assert log.stage[-1] == DONE
 
 
+def test_a_step_down_that_begins_within_a_longer_step_up_never_turns_the_motion_back():
+    covers = contact([0.3, 0, 0.3], AHEAD, 0, sigma=0.2, speed=0.1)
+
+    def change(t, belief):  # Up to 0.17 m/s takes 0.38 s; down to 0.1 would take 0.16.
+        return ContactBelief((covers,) if t > 0.05 else ())
+
+    log = follow(LINE, BELIEF, change=change, seconds=1)
+    assert log.speed.min() >= 0.0 and np.all(np.diff(log.p[:, 0]) >= 0.0)
+    assert log.speed[-1] == pytest.approx(0.1, abs=1e-12)
+
+
 def test_quaternion_angular_velocity_and_acceleration_are_consistent():
     turn = Rotation.from_rotvec([0.3, -0.5, 0.8]) * Rotation.from_quat([1, 0, 0, 0])
     q = [[0, 1, 0, 0], turn.as_quat(scalar_first=True)]
