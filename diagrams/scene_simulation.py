@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus
 from pydrake.systems.primitives import Demultiplexer, LogVectorOutput
 
 from makebreak.models.effects import KINDS
@@ -137,6 +137,9 @@ class SimulationConfig:
 
     accuracy: float = 1e-6  # Relative error of a step [-].
     max_step_sec: float = 0.02
+    # A run whose steps are shorter than this, on average since its start and from the
+    # 2000th on, is given up: parameters that a search tries may make it endless.
+    least_step_sec: float = 5e-6
 
 
 class SceneSimulation:
@@ -156,6 +159,7 @@ class SceneSimulation:
         self._scene = scene if isinstance(scene, Scene) else read_scene(scene)
         self._config = config or SimulationConfig()
         self.builds = 0
+        self.failure = ""  # Why the last run stopped short, if it did.
         self._current: tuple[Effect, ...] = ()
         self._build()
 
@@ -178,6 +182,7 @@ class SceneSimulation:
                 self._build()
         except ValueError:
             self._scene = before
+            self._build()  # Some of it may have been set already.
             raise
         self._current = tuple(ranked)
         self._read_effects()
@@ -216,9 +221,10 @@ class SceneSimulation:
                 sample that shows the state of start_sec (true_at).
             times: (n,) [s], increasing: stamps of the measured samples.
             channels: of `channels()`.
-            start_sec: the first of `times` if None. A sample that shows a time before
-                it is NaN.
+            start_sec: the first of `times` if None.
             initial_is_true: whether `initial` has no offsets, biases and scales.
+        Returns: NaN from where Drake could not go on (`failure` then says why), and
+            where the time that a sample shows is before the window.
         Raises: ValueError for an unknown channel, joint, body or command.
         """
         times = np.asarray(times, dtype=float)
@@ -235,6 +241,9 @@ class SceneSimulation:
         self._set_commands(commands)
         efforts = any(self._channels[channel][0] == "effort" for channel in channels)
         x, effort = self._simulate(initial, start, needed, initial_is_true, efforts)
+        if not self.failure and not np.isfinite(x).all():
+            self.failure = "the state grew beyond all numbers"
+        x[~np.isfinite(x).all(axis=1)] = np.nan
         out = np.empty((len(times), len(channels)))
         poses: dict = {}
         for i, channel in enumerate(channels):
@@ -258,6 +267,8 @@ class SceneSimulation:
         self._plant = plant = self._loaded.plant
         self._current = self._loaded.effects
         self._simulator = Simulator(self._diagram)
+        if plant.time_step() == 0.0:
+            self._simulator.set_monitor(self._watch)
         self._context: Context = self._simulator.get_mutable_context()
         self._plant_context = plant.GetMyMutableContextFromRoot(self._context)
         discrete = self._context.get_discrete_state()
@@ -441,8 +452,16 @@ class SceneSimulation:
             for name, values in names.items():
                 if self._channels.get(f"{name}.x", ("",))[0] != "x":
                     raise ValueError(f"initial pose of {name!r}, which is no free body")
+                if len(values) != len(suffixes):
+                    raise ValueError(
+                        f"initial state of {name!r} is {values}, expected "
+                        f"[{' '.join(suffixes)}]"
+                    )
                 for suffix, each in zip(suffixes, values, strict=True):
                     put(f"{name}.{suffix}", each)
+                if suffixes is POSE:
+                    at = self._channels[f"{name}.qw"][1]
+                    x[at : at + 4] /= np.linalg.norm(x[at : at + 4])
         # A motor and its link start without twist, unless both are given.
         for name, joint in self._joints.items():
             motor = motor_joint(plant, joint)
@@ -494,11 +513,13 @@ class SceneSimulation:
     ):
         """States (n, n_x) at the needed times, and efforts {model: (n, n_u)} if they
         are asked for. What changes at such a time has changed in them."""
+        self.failure = ""
         dt = self._plant.time_step()
         for i, value in enumerate(self._discrete):
             self._context.SetDiscreteState(i, value)
         # A discrete plant steps at multiples of its step: the window is moved there.
         clock = start if dt == 0.0 else round(start / dt) * dt
+        self._clock, self._steps = clock, 0
         self._context.SetTime(clock)
         self._set_state(initial, is_true)
         self._write_commands(start)
@@ -537,12 +558,12 @@ class SceneSimulation:
         stops = np.union1d(needed, events)
         keep = np.isin(stops, needed)
         change = np.isin(stops, events)
-        x = np.empty((len(needed), self._plant.num_multibody_states()))
+        x = np.full((len(needed), self._plant.num_multibody_states()), np.nan)
         efforts: dict[str, list] = {}
         row = 0
         for k, stop in enumerate(stops):
-            if stop > self._context.get_time():
-                self._simulator.AdvanceTo(stop)
+            if not self._advance(stop):
+                break
             if change[k]:
                 self._write_commands(stop)
             if keep[k]:
@@ -551,7 +572,27 @@ class SceneSimulation:
                 if want_efforts:
                     for model, value in self._efforts().items():
                         efforts.setdefault(model, []).append(value)
-        return x, {model: np.array(each) for model, each in efforts.items()}
+        return x, _padded(efforts, len(needed))
+
+    def _advance(self, time: float) -> bool:
+        """Whether the simulation got there: parameters that a search tries may be too
+        much for the integrator or the contact solver."""
+        try:
+            if time > self._context.get_time():
+                self._simulator.AdvanceTo(time)
+        except RuntimeError as error:
+            self.failure = " ".join(str(error).split())
+        return not self.failure
+
+    def _watch(self, context: Context) -> EventStatus:
+        """After each step of a continuous plant."""
+        self._steps += 1
+        if self._steps > 2000:
+            done = context.get_time() - self._clock
+            if done < self._config.least_step_sec * self._steps:
+                self.failure = f"{self._steps} steps for {done:.3g} s of simulated time"
+                return EventStatus.ReachedTermination(self._plant, self.failure)
+        return EventStatus.DidNothing()
 
     def _run_discrete(self, needed, events, want_efforts: bool, shift: float, dt):
         """Steps are at multiples of dt, and a command acts from the first step at or
@@ -564,18 +605,21 @@ class SceneSimulation:
             stops, key=lambda s: (np.ceil((s[0] + shift) / dt - 1e-6), not s[1])
         ):
             step = np.ceil((time + shift) / dt - 1e-6) * dt
-            if step > self._context.get_time():
-                self._simulator.AdvanceTo(step)
+            if not self._advance(step):
+                break
             if is_event:
                 self._write_commands(time)
             else:
                 for model, value in self._efforts().items():
                     efforts.setdefault(model, []).append(value)
         last = np.ceil((needed[-1] + shift) / dt - 1e-9) * dt if len(needed) else 0.0
-        self._simulator.AdvanceTo(max(last, self._context.get_time()))
+        if not self.failure:
+            self._advance(last)
         assert self._log is not None
-        x = _between(self._log.sample_times() - shift, self._log.data().T, needed)
-        return x, {model: np.array(each) for model, each in efforts.items()}
+        time, data = self._log.sample_times() - shift, self._log.data().T
+        x = _between(time, data, needed)
+        x[needed > time[-1] + 1e-9] = np.nan
+        return x, _padded(efforts, len(needed))
 
     def _true_channel(self, channel, x, efforts, poses) -> np.ndarray:
         what, *where = self._channels[channel]
@@ -600,6 +644,9 @@ class SceneSimulation:
     def _motion_of(self, body, x) -> np.ndarray:
         out = np.empty((len(x), 13))
         for k, each in enumerate(x):
+            if not np.isfinite(each).all():
+                out[k] = np.nan
+                continue
             self._plant.SetPositionsAndVelocities(self._scratch, each)
             X_WB = self._plant.EvalBodyPoseInWorld(self._scratch, body)
             V_WB = self._plant.EvalBodySpatialVelocityInWorld(self._scratch, body)
@@ -607,6 +654,15 @@ class SceneSimulation:
             out[k, 4:7] = X_WB.translation()
             out[k, 7:] = V_WB.get_coeffs()
         return out
+
+
+def _padded(efforts: dict[str, list], n: int) -> dict[str, np.ndarray]:
+    """{model: (n, n_u)}, NaN where the simulation did not get to."""
+    found = {}
+    for model, rows in efforts.items():
+        found[model] = np.full((n, len(rows[0])), np.nan)
+        found[model][: len(rows)] = rows
+    return found
 
 
 def _between(time, x, needed) -> np.ndarray:

@@ -113,6 +113,26 @@ def test_light_joint_in_a_coarse_step_does_not_chatter(tmp_path):
     assert abs(rows[-1, 1]) < 1e-3  # and it stands.
 
 
+@pytest.mark.parametrize("time_step", [0.0, 0.01])
+def test_a_simulation_that_fails_says_so_and_is_not_a_number(tmp_path, time_step):
+    # A spring that pushes: the joint runs away, beyond what an integrator can do.
+    scene = with_effects(
+        pendulum(tmp_path, time_step),
+        ("joint_spring", "p.j1", dict(stiffness=-1e9, rest=0.0)),
+    )
+    simulation = SceneSimulation(scene)
+    times = np.linspace(0.0, 1.0, 101)
+    rows = simulation.run(at_rest_but({"p.j1": 0.1}), times, CHANNELS)
+    assert simulation.failure
+    good = np.isfinite(rows).all(axis=1)
+    assert good[0] and not good[-1]
+    # The next run starts afresh.
+    gentle = with_effects(scene, ("joint_spring", "p.j1", dict(stiffness=1, rest=0)))
+    simulation.set_effects(gentle.effects)
+    rows = simulation.run(at_rest_but({"p.j1": 0.1}), times, CHANNELS)
+    assert np.isfinite(rows).all() and not simulation.failure
+
+
 def test_damping_adds_to_the_models_own(tmp_path):
     own = '<dynamics damping="0.2"/>'
     scene = with_effects(

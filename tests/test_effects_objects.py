@@ -259,3 +259,8 @@ def test_an_inertia_that_no_body_has_is_refused_in_the_context_too(tmp_path):
     with pytest.raises(ValueError, match="no body has the inertia"):
         simulation.set_effects([bad])
     assert simulation.scene.effects == scene.effects
+    # And it still runs as before.
+    times, channels = np.array([0.0, 0.1]), ["b.box.z"]
+    rows = simulation.run(at_rest_but(), times, channels)
+    expected = SceneSimulation(scene).run(at_rest_but(), times, channels)
+    np.testing.assert_array_equal(rows, expected)

@@ -314,7 +314,8 @@ KINDS = {
             Parameter("scale", "", 0.5, 2.0, 1.0, valid="> 0", optional=True),
             Parameter("radius", "m", 0.002, 0.5, None, valid="> 0", optional=True),
         ),
-        says="{at} is {scale} times as large as modelled[, its radius is {radius}]",
+        says="{at} has another size than modelled[: it is {scale} times as large]"
+        "[, its radius is {radius}]",
         confused_with=("plane_height", "contact_stiffness", "length_scale"),
         tell_apart="let it rest on several faces, or roll: height and rate of rolling "
         "both go with the size",
@@ -354,7 +355,8 @@ KINDS = {
         parameters=tuple(
             Parameter(a, "m", -0.2, 0.2, None, optional=True) for a in "xyz"
         ),
-        says="the centre of mass of {at} is at ({x}, {y}, {z}) in its frame",
+        says="the centre of mass of {at} is at[ x = {x}][ y = {y}][ z = {z}] in its "
+        "frame",
         confused_with=("object_inertia", "gravity_tilt", "joint_offset"),
         tell_apart="let it fly and spin: the centre of mass alone moves on a parabola",
         rank=1,
@@ -372,8 +374,8 @@ KINDS = {
             Parameter(a, "kg m2", 1e-7, 5.0, None, valid="> 0", optional=True)
             for a in ("ixx", "iyy", "izz")
         ),
-        says="{at} has moments of inertia of {ixx}, {iyy} and {izz} about its centre "
-        "of mass",
+        says="{at} has moments of inertia[ ixx = {ixx}][ iyy = {iyy}][ izz = {izz}] "
+        "about its centre of mass",
         confused_with=("object_com", "corner_radius", "rotor_inertia"),
         tell_apart="spin it about several axes, or let it hit in many attitudes",
         rank=1,
