@@ -286,7 +286,7 @@ def test_a_meshcat_shows_effector_springs_path_and_viscosity():
     for name in ("effector", "target", "spring_2/coil", "spring_0_anchor", "trace/3"):
         assert meshcat.HasPath(f"/makebreak/planar/{name}"), name
     assert not meshcat.HasPath("/makebreak/planar/viscosity")
-    meshcat.Delete()
+    meshcat = Meshcat()
     controller = active_inference(ActiveInferenceConfig())
     diagram = make_porridge(PorridgeConfig(), controller, meshcat=meshcat)
     Simulator(diagram).AdvanceTo(0.1)
