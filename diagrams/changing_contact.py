@@ -45,6 +45,8 @@ from makebreak.systems.impedance_controller import (
 )
 from makebreak.systems.mode_detector import ModeDetector, ModeDetectorConfig
 from makebreak.systems.numerics.contact_task import ContactBelief
+from makebreak.systems.numerics.forward_model import ModelBank
+from makebreak.systems.numerics.mode_table import ModeTable
 from makebreak.systems.numerics.motion_pattern import MotionPattern
 from makebreak.systems.tip_state import TipState
 from makebreak.systems.variable_impedance import (
@@ -87,8 +89,8 @@ class Knowledge:
     """What is known before a trial, or was learned in it."""
 
     contacts: ContactBelief = ContactBelief()
-    modes: object | None = None  # ModeDetector.knowledge
-    models: object | None = None  # ForwardModelBank.knowledge
+    modes: ModeTable | None = None  # ModeDetector.knowledge
+    models: ModelBank | None = None  # ForwardModelBank.knowledge
 
 
 # What `telemetry` gives: name -> (system, port, size).

@@ -33,7 +33,7 @@ class ForwardModelConfig:
     with_torque: bool = True  # False: models over |v| and |F_t| alone.
     learns: bool = True  # False: the models stay as given, the fixed GMM.
     smoothing: float = 0.3  # Of the error, per sample; 1: none.
-    n_max: int = 20  # Components of a mixture.
+    tau_nov: float = 1e-3  # Of the mixtures: how unlikely a new component's sample is.
     wrench_limit: float = 200.0  # At which the sensor saturates [N], [N m].
     error_unknown: float = 10.0  # Said where the wrench cannot be used [N].
     handover: HandoverConfig = field(default_factory=HandoverConfig)
@@ -89,7 +89,7 @@ class ForwardModelBank(LeafSystem):
         if not period_sec > 0.0:
             raise ValueError(f"period_sec is {period_sec}, expected > 0")
         self._tuning = BankTuning(
-            mixtures=bank_tuning(config.with_torque, n_max=config.n_max),
+            mixtures=bank_tuning(config.with_torque, tau_nov=config.tau_nov),
             with_torque=bool(config.with_torque),
             learns=bool(config.learns),
             smoothing=float(config.smoothing),
@@ -99,7 +99,8 @@ class ForwardModelBank(LeafSystem):
             rows=float(config.handover.rows),
             period=float(period_sec),
         )
-        shape = (config.n_max, self._tuning.mixtures.sigma_ini.size)
+        mixtures = self._tuning.mixtures
+        shape = (mixtures.n_max, mixtures.sigma_ini.size)
         for mode, mixture in knowledge.models if knowledge else ():
             if mixture.mean.shape != shape:
                 raise ValueError(

@@ -315,7 +315,7 @@ def test_a_restored_context_replays_and_knowledge_starts_the_next_trial():
         (dict(smoothing=0.0), "smoothing is 0.0"),
         (dict(wrench_limit=np.nan), "wrench_limit is nan"),
         (dict(error_unknown=-1.0), "error_unknown is -1.0"),
-        (dict(n_max=0), "n_max is 0"),
+        (dict(tau_nov=2.0), "tau_nov is 2.0"),
         (dict(handover=HandoverConfig(rows=-1.0)), "handover.rows is -1.0"),
     ],
 )

@@ -103,8 +103,9 @@ def run(config: ChangingSurfaceConfig, session: Session) -> dict:
         logs[label] = telemetry(diagram, log.context)
         if label == "adaptive":
             known = learned(diagram, log.context)
-            known.modes.save(session.out_dir / "modes.json")  # type: ignore[attr-defined]
-            known.models.save(session.out_dir / "models.json")  # type: ignore[attr-defined]
+            for name, value in (("modes", known.modes), ("models", known.models)):
+                if value is not None:
+                    value.save(session.out_dir / f"{name}.json")
     main = logs["adaptive"]
     changes, surplus = changes_of(main, task.feet)
     session.save_plot(plot_modes(main, changes, task), "modes")
