@@ -62,7 +62,14 @@ def _active_inference() -> ActiveInferenceConfig:
 
 
 def _biomimetic() -> BiomimeticConfig:
-    return BiomimeticConfig()
+    return BiomimeticConfig(
+        kappa=12.0,
+        rates=[24.5, 21900.0, 71.4],
+        stiffness=188.0,
+        damping=9.187,
+        forget=0.00422,
+        forget_less=123.0,
+    )
 
 
 @dataclass
