@@ -368,7 +368,7 @@ def telemetry(
     data, start = log.data()[:, 1:], 0
     out = {"time": np.array(log.sample_times()[1:]) - ESTIMATE}
     for name, size in sizes.items():
-        out[name] = np.array(data[start : start + size].T)
+        out[name] = np.ascontiguousarray(data[start : start + size].T)
         start += size
     return out
 
