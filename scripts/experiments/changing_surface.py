@@ -103,9 +103,9 @@ def run(config: ChangingSurfaceConfig, session: Session) -> dict:
         logs[label] = telemetry(diagram, log.context)
         if label == "adaptive":
             known = learned(diagram, log.context)
-            for name, value in (("modes", known.modes), ("models", known.models)):
-                if value is not None:
-                    value.save(session.out_dir / f"{name}.json")
+            if known.modes is not None and known.models is not None:
+                known.modes.save(session.out_dir / "modes.json")
+                known.models.save(session.out_dir / "models.json")
     main = logs["adaptive"]
     changes, surplus = changes_of(main, task.feet)
     session.save_plot(plot_modes(main, changes, task), "modes")
