@@ -148,6 +148,7 @@ def test_a_live_diagram_measures_so_too(tmp_path):
         ("sensor_delay", "p.j1.position", dict(delay=0.02)),
     ]
     scene = with_effects(pendulum(tmp_path, 0.001), *effects)
+    scene.initial.positions = {"p.j1": 0.9}
     diagram, loaded = make_scene_diagram(scene)
     simulator = Simulator(diagram)
     context = simulator.get_mutable_context()
@@ -158,6 +159,7 @@ def test_a_live_diagram_measures_so_too(tmp_path):
         rows.append([diagram.GetOutputPort(n).Eval(context)[0] for n in names])
         rows[-1] += list(diagram.GetOutputPort("state").Eval(context))
     rows = np.array(rows)
+    np.testing.assert_allclose(rows[0, 2], 0.7)  # It swings.
     np.testing.assert_allclose(rows[1:, 0], rows[:-1, 2] + 0.2, atol=1e-12)
     np.testing.assert_allclose(rows[:, 1], rows[:, 3] - 0.1, atol=1e-12)
 

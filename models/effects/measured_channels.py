@@ -1,6 +1,6 @@
 """What lies between a true value and its measured channel, when it is not nothing."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,16 +27,12 @@ class ChannelMap:
     delay: float = 0.0  # [s]
     skew: float = 0.0  # [s/s]
 
-    def measured(self, true: Callable, time: np.ndarray) -> np.ndarray:
-        """Args: true: function of time [s]."""
-        return self.scale * true((time - self.delay) / (1.0 + self.skew)) + self.bias
-
     def true_value(self, measured):
         """The value that is measured so, without the shift in time."""
         return (measured - self.bias) / self.scale
 
     def stamp(self, time):
-        """When the value of `time` is measured: the inverse of what `measured` does."""
+        """The stamp under which the value of `time` is measured."""
         return time * (1.0 + self.skew) + self.delay
 
 
