@@ -568,6 +568,18 @@ def test_the_mode_is_hinted_from_the_expected_place_on():
     assert trial.out("mode_hint") == -1.0
 
 
+def test_a_hint_may_lead_by_a_time():
+    known = slid().belief()
+    config = ContactAnticipatorConfig(hint_lead_sec=0.05)
+    trial, hints = Trial(known, config), []
+    for k in range(150):  # 0.1 m/s: 5 mm ahead.
+        trial.step([0.5, 0.001 * k, 0.0], 1)
+        hints.append(trial.out("mode_hint"))
+    assert np.flatnonzero(np.array(hints) == 2.0)[0] in (65, 66)
+    with pytest.raises(ValueError, match="hint_lead_sec is -1"):
+        Trial(known, ContactAnticipatorConfig(hint_lead_sec=-1.0))
+
+
 @pytest.mark.parametrize("port", ["ee_pose", "contact", "transition", "phase"])
 def test_a_bad_input_holds_the_belief_and_is_said(port):
     trial = Trial(ContactBelief((prior(),)))
