@@ -36,7 +36,7 @@ from pydrake.systems.framework import DiagramBuilder  # noqa: E402
 
 from makebreak.gap.recording import check_against_scene, read_recording  # noqa: E402
 from makebreak.gap.scene_facts import scene_names  # noqa: E402
-from makebreak.models.scene import load_scene  # noqa: E402
+from makebreak.models.scene import load_scene, read_scene  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
 HERE = ROOT / "tests/gap_benchmark"
@@ -81,29 +81,32 @@ def test_there_are_enough_cases_kinds_and_seeds():
 
 
 QUICK = [c for c in cases() if c.name.split("_", 1)[1] in (
-    "pendulum_joint_coulomb_friction", "bounce_plane_height")]  # fmt: skip
+    "pendulum_joint_coulomb_friction", "sledge_plane_tilt")]  # fmt: skip
 
 
-@pytest.mark.parametrize("case", QUICK, ids=lambda c: c.name)
-def test_a_case_is_a_function_of_its_seed(case):
-    one, two = make(case), make(case)
+@pytest.fixture(scope="module", params=QUICK, ids=lambda c: c.name)
+def quick(request):
+    return request.param, make(request.param)
+
+
+def test_a_case_is_a_function_of_its_seed(quick):
+    case, one = quick
+    two = make(case)
     assert list(one.columns) == list(two.columns)
     for name in one.columns:
         np.testing.assert_array_equal(one.columns[name], two.columns[name])
     assert (one.truth, one.scene, one.models) == (two.truth, two.scene, two.models)
-    other = make(replace(case, seed=case.seed + 1000))
-    assert other.truth["effects"] != one.truth["effects"]
 
 
-@pytest.mark.parametrize("case", QUICK, ids=lambda c: c.name)
-def test_a_folder_is_a_scene_and_a_recording_and_holds_no_truth(case, tmp_path):
-    truth = write(case, tmp_path)
+def test_a_folder_is_a_scene_and_a_recording_and_holds_no_truth(quick, tmp_path):
+    case, made = quick
+    truth = write(case, tmp_path, made)
     [effect] = truth["effects"]
     for path in tmp_path.iterdir():
         text = path.read_text()
         assert effect["kind"] not in text and case.name not in text
         for value in effect["parameters"].values():
-            assert f"{value:.5g}" not in text
+            assert repr(value)[:12] not in text
     assert json.loads(json.dumps(truth)) == truth
     recording = read_recording(tmp_path / "recording.csv")
     builder = DiagramBuilder()
@@ -114,7 +117,7 @@ def test_a_folder_is_a_scene_and_a_recording_and_holds_no_truth(case, tmp_path):
 # ----- with no effect, both simulators agree
 
 
-def drake_plant(models, time_step, weld=None):
+def drake_plant(models, time_step, weld=None, accuracy=1e-6):
     builder = DiagramBuilder()
     plant, _ = AddMultibodyPlant(
         MultibodyPlantConfig(
@@ -131,7 +134,7 @@ def drake_plant(models, time_step, weld=None):
     plant.Finalize()
     simulator = Simulator(builder.Build())
     if time_step == 0.0:
-        simulator.get_mutable_integrator().set_target_accuracy(1e-9)
+        simulator.get_mutable_integrator().set_target_accuracy(accuracy)
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     return simulator, plant, context
 
@@ -141,11 +144,12 @@ def mechanism_gap(world, seed, length=0.2):
     commands from the same states."""
     rng = np.random.default_rng(seed)
     nominal = MECHANISMS[world](rng)
-    drive = "pd" if world == "scara" else "effort"
-    track = MechanismWorld(nominal, nominal, [], drive).run(
+    track = MechanismWorld(nominal, nominal, []).run(
         1.5, Reference(nominal, rng), EXACT, rng
     )
-    simulator, plant, context = drake_plant([(to_urdf(nominal), "urdf")], 0.0, ["base"])
+    simulator, plant, context = drake_plant(
+        [(to_urdf(nominal), "urdf")], 0.0, ["base"], 1e-9
+    )
     driven = list(nominal.driven)
     gaps = []
     ticks = track.tick
@@ -157,26 +161,15 @@ def mechanism_gap(world, seed, length=0.2):
         plant.SetVelocities(context, track.v[row])
         simulator.Initialize()
         for k in range(first, last):
-            times = np.arange(ticks[k], ticks[k + 1] - 1e-9, 0.001)
-            for _, end in zip(times, [*times[1:], ticks[k + 1]], strict=True):
-                if drive == "pd":
-                    q, v = plant.GetPositions(context), plant.GetVelocities(context)
-                    g = nominal.extra
-                    u = g["kp"] * (track.commands["position_command"][k] - q)
-                    u += g["kd"] * (track.commands["velocity_command"][k] - v)
-                else:
-                    u = track.commands["effort_command"][k][driven]
-                plant.get_actuation_input_port().FixValue(context, u)
-                simulator.AdvanceTo(end)
-                if drive != "pd":
-                    simulator.AdvanceTo(ticks[k + 1])
-                    break
+            u = track.commands["effort_command"][k][driven]
+            plant.get_actuation_input_port().FixValue(context, u)
+            simulator.AdvanceTo(ticks[k + 1])
         row = np.searchsorted(track.time, ticks[last] - 1e-9)
         gaps.append(np.abs(plant.GetPositions(context) - track.q[row]).max())
     return max(gaps)
 
 
-@pytest.mark.parametrize("world", MECHANISMS)
+@pytest.mark.parametrize("world", ["pendulum", "arm", "cartpole"])
 def test_mechanisms_without_an_effect_agree_with_drake_far_below_the_noise(world):
     # RK4 at 0.5 ms against Drake's error control at 1e-9.
     assert mechanism_gap(world, 0) < 0.05 * QUIETEST
@@ -507,3 +500,130 @@ def test_a_tossed_cube_keeps_its_energy_and_turns_as_euler_says():
     ode = contact.simulate(body, ground, contact.Around(), start, times)
     other = contact.simulate_in_mujoco(body, ground, contact.Around(), start, times)
     np.testing.assert_allclose(ode, other, atol=1e-7)
+
+
+# ----- the catalogue's effect closes the gap
+
+
+NOISE = {"position": 3e-5, "velocity": 3e-3} | dict.fromkeys("xyz", 1e-4)
+NOISE |= dict.fromkeys(("qw", "qx", "qy", "qz"), 1e-3)
+NOISE |= dict.fromkeys(("vx", "vy", "vz"), 2e-2)
+NOISE |= dict.fromkeys(("wx", "wy", "wz"), 5e-2)
+# What two right answers differ by, as shares of the gap that the effect makes: dry
+# friction is faded over a band of speed in Drake, a gear's teeth are stiff or stiffer,
+# MuJoCo's contact is damped in another way.
+SHARES = {"joint_coulomb_friction": 0.03, "joint_stribeck_friction": 0.03}
+SHARES |= {"joint_backlash": 0.2, "contact_friction": 0.15, "friction_patch": 0.1}
+SHARES |= {"object_mass": 0.03, "rolling_resistance": 0.03}
+
+
+def windows_of(made, object_world):
+    """(rows of the episode, first, last) of windows, in contact where it bounces."""
+    episode, time = made.columns["episode"], made.columns["time"]
+    numbers = np.unique(episode)
+    for j in range(4):
+        rows = np.flatnonzero(episode == numbers[j % len(numbers)])
+        first, length = int(len(rows) * (0.05 + 0.2 * j)), 0.2
+        if object_world in ("cube", "bounce"):
+            name = next(k for k in made.states if k.endswith(".vz"))
+            touch = int(np.argmax(np.diff(made.states[name][rows]) > 0))
+            first, length = max(touch - 3, 0), 0.08
+        if any(e["kind"].startswith(("joint_el", "joint_ba")) for e in
+               made.truth["effects"]):  # fmt: skip
+            first = 0  # Only there both sides of the gear are known.
+        t = time[rows]
+        last = int(np.searchsorted(t, t[first] + length))
+        yield rows, first, min(last, len(rows) - 1)
+
+
+def gap_in_noise(made, scene, effects):
+    """The worst channel's rms of measured - simulated, in standard deviations."""
+    from makebreak.diagrams.scene_simulation import (
+        Commands,
+        SceneSimulation,
+        SimulationConfig,
+    )
+    from makebreak.models.effects.kind import Effect
+    from makebreak.models.scene import InitialSection
+
+    hidden = [
+        Effect(e["kind"], [e["at"]] if isinstance(e["at"], str) else e["at"],
+               dict(e["parameters"]))
+        for e in effects
+    ]  # fmt: skip
+    simulation = SceneSimulation(
+        replace(scene, effects=hidden), SimulationConfig(accuracy=1e-7)
+    )
+    columns = made.columns
+    commands = [name for name in columns if name.endswith("_command")]
+    channels = [
+        name
+        for name in columns
+        if name not in ("time", "episode", *commands)
+        and not name.endswith("effort_measured")
+    ]
+    left = {name: [] for name in channels}
+    for rows, first, last in windows_of(made, made.truth["world"]):
+        state = {k: v[rows[first]] for k, v in made.states.items()}
+        initial = InitialSection()
+        for name in state:
+            at, quantity = name.rsplit(".", 1)
+            if quantity in ("position", "velocity"):
+                into = initial.positions
+                if quantity == "velocity":
+                    into = initial.velocities
+                into[at] = float(state[name])
+            elif quantity == "qw":
+                keys = "qw qx qy qz x y z wx wy wz vx vy vz".split()
+                values = [float(state[f"{at}.{k}"]) for k in keys]
+                initial.poses[at], initial.body_velocities[at] = values[:7], values[7:]
+        table = Commands(columns["time"][rows], {k: columns[k][rows] for k in commands})
+        span = rows[first : last + 1]
+        out = simulation.run(
+            initial, columns["time"][span], channels, table, initial_is_true=True
+        )
+        for k, name in enumerate(channels):
+            d = out[:, k] - columns[name][span]
+            left[name].append(d[np.isfinite(d)])
+    return max(
+        np.sqrt(np.mean(np.concatenate(d) ** 2)) / NOISE[name.rsplit(".", 1)[1]]
+        for name, d in left.items()
+    )
+
+
+def inside(case):
+    return not any(kind in OUTSIDE for kind in case.kinds) and not case.ties
+
+
+# One of each of a few families in the default suite, all others where there is time.
+FEW = ("cartpole_input_delay", "pendulum_joint_spring", "arm_gravity_tilt",
+       "ball_object_size")  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(c, marks=[] if c.name[3:] in FEW else [pytest.mark.slow])
+        for c in cases()
+        if inside(c)
+    ],
+    ids=lambda c: c.name,
+)
+def test_the_hidden_effect_closes_the_gap_in_drake(case, tmp_path):
+    """Without noise and background, in windows from the true state: what a case hides
+    is what the catalogue means by it, though neither knows the other."""
+    made = make(case, exact=True)
+    for name, text in made.models.items():
+        (tmp_path / name).write_text(text)
+    (tmp_path / "scene.yaml").write_text(made.scene)
+    scene = read_scene(tmp_path / "scene.yaml")
+    scene.plant.time_step = 0.0  # Its own error is not the matter here.
+    after = gap_in_noise(made, scene, made.truth["effects"])
+    if not case.kinds:
+        # MuJoCo's and Drake's damping at a touch differ; that is in `tolerance`.
+        assert after < (3.0 if case.world == "pushed" else 0.3)
+        return
+    before = gap_in_noise(made, scene, [])
+    assert before > 4.0
+    share = sum(SHARES.get(kind, 5e-3) for kind in case.kinds)
+    assert after < 0.3 + share * before

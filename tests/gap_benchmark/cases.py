@@ -345,7 +345,7 @@ def _mechanism_effects(case, world, nominal, plain, references, rng) -> list[dic
                 place[2] *= -1.0
                 place[0] += 0.05
             if case.world == "arm!":
-                place[:2] = 0.0
+                place[:] = 0.0
             p = {"mass": mass} | dict(
                 zip(("com_x", "com_y", "com_z"), place, strict=True)
             )
@@ -480,7 +480,7 @@ def _object(case: Case, world: str, exact: bool):
         ground = replace(ground, friction=0.6)
     pusher = None
     if world == "pushed":
-        x = -body.half[0] - 0.012 - 0.03
+        x = -body.half[0] - 0.012 - 0.0005  # A hair before it touches.
         z = body.half[2]
         pusher = contact.Pusher((x, 0.0, z))
     effects = _object_effects(case, world, body, ground, rng)
@@ -614,9 +614,10 @@ def _start(case, world, body, ground, rng) -> np.ndarray:
 
 
 def _push_path(rng):
-    """Forward in strokes of changing speed, with stops."""
+    """Forward, faster and slower, so gently that finger and object never part."""
     w, phase = 2 * np.pi * rng.uniform(0.3, 0.6), rng.uniform(0, 2 * np.pi)
-    mean, size = rng.uniform(0.08, 0.12), rng.uniform(0.08, 0.14)
+    mean = rng.uniform(0.08, 0.12)
+    size = mean * rng.uniform(0.5, 0.8)
 
     def path(t):
         fade = 1.0 - np.exp(-((t / 0.3) ** 2))
@@ -691,7 +692,7 @@ def _object_effects(case, world, body, ground, rng) -> list[dict]:
             each = f * np.array(body.inertia) * rng.uniform(0.93, 1.07, 3)
             p = dict(zip(("ixx", "iyy", "izz"), each, strict=True))
         elif kind == "body_drag":
-            p = {"linear": body.mass * rng.uniform(0.4, 0.9), "angular": 0.0}
+            p = {"linear": body.mass * rng.uniform(1.0, 2.0), "angular": 0.0}
         elif kind == "magnetic_pull":
             strength = body.mass * rng.uniform(0.02, 0.04)
             p = {"strength": strength, "x": 0.0, "y": 0.05, "z": 0.05}

@@ -309,6 +309,12 @@ def mjcf(body: Body, ground: Ground, pusher: "Pusher | None" = None) -> str:
     )
     finger = ""
     if pusher is not None:
+        # Of two bodies, MuJoCo's spring acts on the mass that both have together.
+        share = 1.0 + body.mass / pusher.mass
+        tip = (
+            f'solref="{-k * share:.17g} {-b * share:.17g}" '
+            f'solimp="{IMPEDANCE} {IMPEDANCE} 1"'
+        )
         top = body.half[2] - 0.5 * body.radius  # The block between feet and top.
         spheres += (
             f'<geom name="block" type="box" size="{body.half[0]} {body.half[1]} '
@@ -322,7 +328,7 @@ def mjcf(body: Body, ground: Ground, pusher: "Pusher | None" = None) -> str:
             f'size="{pusher.radius}" contype="0" conaffinity="0"/></body>'
         )
         pairs += (
-            f'<pair geom1="tip" geom2="block" condim="3" {contact} '
+            f'<pair geom1="tip" geom2="block" condim="1" {tip} '
             f'friction="{pusher.friction} {pusher.friction} 0 0 0"/>'
         )
     plane = quaternion((ground.roll, ground.pitch, 0.0))

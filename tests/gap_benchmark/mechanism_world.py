@@ -243,6 +243,14 @@ class MechanismWorld:
         v0[free] = 0.0
         d.qpos[self.dof] = d.qpos[self.motor_dof] = q0 - self.offset
         d.qvel[self.dof] = d.qvel[self.motor_dof] = v0
+        if self.drive == "effort":  # The link hangs behind its motor from the start.
+            load = self.inverse_dynamics(*reference.at(0.0))
+            for i, effect in self.motor.items():
+                p = effect["parameters"]
+                twist = np.sign(load[i]) * 0.5 * p.get("gap", 0.0)
+                if "stiffness" in p:
+                    twist = load[i] / p["stiffness"]
+                d.qpos[self.dof[i]] -= twist
         self._controlling = True
         mujoco.mj_forward(m, d)
         self._controlling = False
