@@ -79,3 +79,9 @@ def median_range(values, scale: float = 1.0, unit: str = "") -> str:
         return "-"
     text = f"{np.median(good):.3g} ({good.min():.3g} to {good.max():.3g})"
     return f"{text} {unit}".strip()
+
+
+def with_count(values, bound: float) -> str:
+    """median_range, and how many of the values reach the bound."""
+    reached = sum(value >= bound for value in values)
+    return f"{median_range(values)}; {reached} of {len(values)} reach {bound:g}"

@@ -13,7 +13,7 @@ from makebreak.diagrams.porridge import PorridgeConfig
 from makebreak.scripts import tune_planar
 from makebreak.scripts.cli import main
 from makebreak.scripts.experiments import multi_spring, porridge
-from makebreak.scripts.planar_runs import median_range
+from makebreak.scripts.planar_runs import median_range, with_count
 from makebreak.scripts.session import Session
 from makebreak.systems.numerics.planar_impedance import persistence
 
@@ -137,6 +137,7 @@ def test_reproduce_says_met_only_if_every_seed_ran_and_met(
 def test_median_and_range_of_what_is_there():
     assert median_range([1.0, None, 3.0, 2.0], 10.0, "mm") == "20 (10 to 30) mm"
     assert median_range([None]) == "-"
+    assert with_count([4.0, 5.0, 9.0], 5.0) == "5 (4 to 9); 2 of 3 reach 5"
 
 
 def test_every_search_space_makes_a_controller_that_stays_within_its_bounds():

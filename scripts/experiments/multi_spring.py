@@ -44,6 +44,7 @@ from makebreak.scripts.planar_runs import (
     recording,
     rms,
     trial,
+    with_count,
 )
 from makebreak.scripts.session import Log, Session, run_many
 from makebreak.scripts.table import Table
@@ -315,7 +316,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         ("biomimetic_last", "not converged in 30"),
     ):
         bound = 1.0 if name == "biomimetic_last" else RATIO_BOUND
-        text = median_range(values(f"ratio_{name}"))
+        text = with_count(values(f"ratio_{name}"), bound)
         label = name.replace("_", " ")
         good_enough = worst(f"ratio_{name}", False) >= bound
         row(f"error of {label} over ours, first trial", paper, text, good_enough)

@@ -39,6 +39,7 @@ from makebreak.scripts.planar_runs import (
     recording,
     rms,
     trial,
+    with_count,
 )
 from makebreak.scripts.session import Log, Session, run_many
 from makebreak.scripts.table import Table
@@ -236,7 +237,10 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
 
     def row(what, paper, key, scale, unit, bound=None):
         values = [r[key] for r in good]
-        rows.append((what, paper, median_range(values, scale, unit), command))
+        text = median_range(values, scale, unit)
+        if bound is not None:
+            text = with_count(values, bound)
+        rows.append((what, paper, text, command))
         met.append(
             None if bound is None else len(good) == seeds and min(values) >= bound
         )
