@@ -23,9 +23,24 @@ def run_main(name, folder, *settings):
     return status, json.loads((folder / "result.json").read_text())
 
 
-def test_multi_spring_writes_scores_and_figures_and_repeats_itself(tmp_path):
-    short = ["--seed", "3", "--duration", "0.4", "--set", "trials=2"]
-    _, result = run_main("multi_spring", tmp_path / "a", *short)
+SHORT = ["--seed", "3", "--duration", "0.4", "--set", "trials=2"]
+
+
+@pytest.fixture(scope="module")
+def springs(tmp_path_factory):
+    """Folder, exit status and result of a short run."""
+    folder = tmp_path_factory.mktemp("springs")
+    return folder, *run_main("multi_spring", folder, *SHORT)
+
+
+@pytest.fixture(scope="module")
+def stirred(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("porridge")
+    return folder, *run_main("porridge", folder, "--seed", "2")
+
+
+def test_multi_spring_writes_scores_and_figures_and_repeats_itself(springs, tmp_path):
+    folder, _, result = springs
     error = result["tracking_error_rms_m"]
     for name in ("mrac", "active_inference"):
         ratio = result[f"{name}_error_rms_m"] / error
@@ -38,17 +53,16 @@ def test_multi_spring_writes_scores_and_figures_and_repeats_itself(tmp_path):
     n = len(multi_spring.OMEGAS)
     assert len(result["mrac_omega_error_rms_m"]) == n
     for figure in ("mrac", "active_inference", "biomimetic", "adaptive"):
-        assert (tmp_path / "a" / f"{figure}.png").stat().st_size > 10_000
-    header = (tmp_path / "a/recording.csv").read_text().splitlines()[0]
+        assert (folder / f"{figure}.png").stat().st_size > 10_000
+    header = (folder / "recording.csv").read_text().splitlines()[0]
     assert "effector.x.position" in header and "effector.tip.fy" in header
-    _, again = run_main("multi_spring", tmp_path / "b", *short)
+    _, again = run_main("multi_spring", tmp_path, *SHORT)
     assert again == result
 
 
-def test_multi_springs_criterion_is_the_stated_one(tmp_path):
+def test_multi_springs_criterion_is_the_stated_one(springs):
     """Success needs all four ratios and the stiffness; here from what the run wrote."""
-    short = ["--duration", "0.4", "--set", "trials=1"]
-    status, result = run_main("multi_spring", tmp_path, *short)
+    _, status, result = springs
     met = all(
         result[f"ratio_{name}"] >= bound
         for name, bound in (
@@ -62,8 +76,8 @@ def test_multi_springs_criterion_is_the_stated_one(tmp_path):
     assert result["success"] == met and status == (0 if met else 1)
 
 
-def test_porridge_compares_models_on_the_same_samples(tmp_path):
-    status, result = run_main("porridge", tmp_path, "--seed", "2")
+def test_porridge_compares_models_on_the_same_samples(stirred):
+    folder, status, result = stirred
     ratio = (
         result["fixed_prediction_error_outside_N"]
         / result["incremental_prediction_error_outside_N"]
@@ -81,7 +95,7 @@ def test_porridge_compares_models_on_the_same_samples(tmp_path):
     assert 0.2 < result["outside_share"] < 0.7
     assert len(result["fixed_sizes_error_outside_N"]) == len(porridge.SIZES)
     for figure in ("prediction", "tracking"):
-        assert (tmp_path / f"{figure}.png").stat().st_size > 10_000
+        assert (folder / f"{figure}.png").stat().st_size > 10_000
 
 
 def test_regression_error_of_no_model_is_the_difference_of_forces():
@@ -111,14 +125,14 @@ def test_bad_settings_are_one_line_and_status_2(
     assert message in lines[-1] and not any("Traceback" in line for line in lines)
 
 
-@pytest.mark.parametrize("module", [multi_spring, porridge])
+@pytest.mark.parametrize(
+    "module, done", [(multi_spring, "springs"), (porridge, "stirred")]
+)
 def test_reproduce_says_met_only_if_every_seed_ran_and_met(
-    tmp_path, monkeypatch, module
+    tmp_path, monkeypatch, module, done, request
 ):
     """From results as run writes them; one seed's run is made to fail."""
-    name = module.__name__.rsplit(".", 1)[-1]
-    short = ["--duration", "0.4", "--set", "trials=1"] if name == "multi_spring" else []
-    _, result = run_main(name, tmp_path / "one", *short)
+    result = request.getfixturevalue(done)[2]
     good = dict(result)
     for key in result:
         if key.startswith("ratio_") or key.endswith("_over_incremental"):
