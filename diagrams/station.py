@@ -220,7 +220,8 @@ def make_control_plant(
     """The arm with its tool alone, as the controllers believe it: for their own use.
 
     Its default positions are the scene's initial ones. Effects on arm, tool and world
-    count, but for those that add coordinates which nobody measures.
+    count, but for those that add coordinates which nobody measures, and damping: the
+    impedance law leaves all friction to its feedback.
     """
     if not isinstance(scene, Scene):
         scene = read_scene(scene)
@@ -246,6 +247,7 @@ def make_control_plant(
             for at in effect.at
         )
         and not (effect.kind in KINDS and KINDS[effect.kind].hidden_state)
+        and effect.kind != "joint_viscous_damping"
     ]
     part = replace(scene, directives=directives, initial=initial, effects=effects)
     return load_scene(part, DiagramBuilder()).plant

@@ -182,8 +182,19 @@ class SceneDynamics:
     def places(self, kind: str) -> list[str]:
         """Where a kind could act in this scene: one `at` each.
 
-        For channels: those that this model has; a recording may have fewer."""
-        return places(self.loaded, KINDS[kind].at, self.channels())
+        For channels: those that this model has; a recording may have fewer. Pairs: of
+        a free body and another with shapes; whether they ever touch is not asked.
+        """
+        found = places(self.loaded, KINDS[kind].at, self.channels())
+        return [at for at in found if self._fits(kind, at)]
+
+    def _fits(self, kind: str, at: str) -> bool:
+        """Whether the model has there what the kind changes (a box to round, ...)."""
+        try:
+            self.now(kind, [at])
+        except ValueError:
+            return False
+        return True
 
     def now(self, kind: str, at: Sequence[str]) -> dict[str, float]:
         """The parameters at which the effect would change nothing: where a search
@@ -251,7 +262,7 @@ def places(loaded: LoadedScene, at: str, channels: Sequence[str]) -> list[str]:
         ]
     if at == "channel":
         return list(channels)
-    if at == "length":
+    if at in ("length", "free body"):
         return named(free)
     # base: the models that hold a mechanism, and the world.
     models = {plant.GetModelInstanceName(joint.model_instance()) for joint in joints}

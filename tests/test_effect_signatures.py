@@ -304,7 +304,8 @@ def test_every_kind_tells_its_columns_or_that_it_has_none(tmp_path):
     }
     simulated_only = set()
     for name, kind in KINDS.items():
-        model = scenes["block" if kind.at in ("pair", "ground", "length") else "arm"]
+        on = "block" if kind.at in ("pair", "ground", "length", "free body") else "arm"
+        model = scenes[on]
         places = model.places(name)
         assert places, name
         n_v = model.plant.num_velocities()
@@ -338,6 +339,25 @@ def test_every_kind_tells_its_columns_or_that_it_has_none(tmp_path):
         "object_size",
         "corner_radius",
     }
+
+
+def test_places_are_those_that_fit(tmp_path):
+    arm = SceneDynamics(double(tmp_path))
+    assert arm.places("rotor_inertia") == ["d.j1", "d.j2"]
+    assert arm.places("actuator_gain") == ["d.j1", "d.j2"]
+    assert arm.places("payload") == ["d.upper", "d.lower"]
+    assert arm.places("gravity_tilt") == ["d", "world"]
+    assert arm.places("contact_friction") == []
+    ball = SceneDynamics(on_ground(tmp_path, "ball"))
+    assert ball.places("contact_friction") == ["b.ball~g.plate"]
+    assert ball.places("friction_patch") == ["b.ball~g.plate"]
+    assert ball.places("rolling_resistance") == ["b.ball~g.plate"]
+    cube = SceneDynamics(on_ground(tmp_path, "cube"))
+    assert cube.places("rolling_resistance") == []  # It is no sphere.
+    assert ball.places("plane_height") == ["g.plate"]
+    assert ball.places("object_size") == ["b.ball"]
+    assert ball.places("corner_radius") == []  # It has no corners.
+    assert ball.places("joint_spring") == []
 
 
 @pytest.mark.parametrize("name", KINDS)

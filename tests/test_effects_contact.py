@@ -134,10 +134,15 @@ def test_values_of_a_pair_are_what_was_asked_for_and_told_back(tmp_path):
 PATCH = dict(friction=0.1, x_min=0.2, x_max=0.5, y_min=-0.5, y_max=0.3)
 
 
-def slide(folder, time_step, x, y, vx, patch=PATCH):
+def slide(folder, time_step, x, y, vx, patch=PATCH, half_space=False):
     scene = with_effects(
         on_ground(folder, "block", time_step), ("friction_patch", PAIR, patch)
     )
+    if half_space:
+        text = (folder / "g.sdf").read_text()
+        box = text[text.index("<pose>") : text.index("</geometry>")]
+        plane = "<geometry><plane><normal>0 0 1</normal><size>1 1</size></plane>"
+        (folder / "g.sdf").write_text(text.replace(box, plane))
     start = at_rest_but(
         body="b.box", pose=[1, 0, 0, 0, x, y, 0.02], twist=[0, 0, 0, vx, 0, 0]
     )
@@ -162,6 +167,12 @@ def test_friction_is_another_on_the_patch(tmp_path, time_step, x, y, mu):
 def test_a_patch_can_be_rougher_than_either_surface_allows(tmp_path, x, mu):
     patch = PATCH | dict(friction=1.3)
     mean = slide(tmp_path, 0.001, x, 0.0, 1.2, patch)
+    np.testing.assert_allclose(mean, mu, rtol=5e-3)
+
+
+@pytest.mark.parametrize("x, mu", [(0.32, 0.1), (-0.5, 0.5)])
+def test_a_half_space_can_have_a_patch(tmp_path, x, mu):
+    mean = slide(tmp_path, 0.001, x, 0.0, 0.8, half_space=True)
     np.testing.assert_allclose(mean, mu, rtol=5e-3)
 
 

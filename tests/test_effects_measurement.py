@@ -21,7 +21,12 @@ from makebreak.diagrams.scene_simulation import (
     SceneSimulation,
     make_scene_diagram,
 )
-from makebreak.diagrams.station import BALL_ROLLING, StationConfig, make_station
+from makebreak.diagrams.station import (
+    BALL_ROLLING,
+    StationConfig,
+    make_control_plant,
+    make_station,
+)
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import load_scene, read_scene
 
@@ -189,6 +194,25 @@ def test_the_station_measures_and_drives_as_its_scene_says():
     np.testing.assert_allclose(torque, [1, 2, 3, 2, 5, 6, 7.5])
     applied = plant.get_actuation_input_port(arm).Eval(own)
     np.testing.assert_allclose(applied, [1, 2, 3, 2, 5, 6, 7])
+
+
+def test_the_station_takes_every_friction_and_elasticity():
+    # Its controllers' plant has seven coordinates and no damping, whatever the scene.
+    scene = read_scene(BALL_ROLLING)
+    joint = ["panda.panda_joint4"]
+    scene.effects = [
+        Effect("joint_viscous_damping", joint, {"damping": 1.0}),
+        Effect("joint_coulomb_friction", joint, {"coulomb": 1.0}),
+        Effect("joint_elasticity", joint, {"stiffness": 5e3, "damping": 1.0}),
+        Effect("gravity_tilt", ["world"], {"roll": 0.1, "pitch": 0.0}),
+    ]
+    station = make_station(StationConfig(), scene=scene)
+    context = station.CreateDefaultContext()
+    assert station.GetOutputPort("panda.position_measured").Eval(context).shape == (7,)
+    control = make_control_plant(scene)
+    assert control.num_positions() == 7
+    gravity = control.gravity_field().gravity_vector()
+    np.testing.assert_allclose(gravity, [0, -G * np.sin(0.1), -G * np.cos(0.1)])
 
 
 def test_a_scene_without_such_effects_has_no_systems_of_theirs():

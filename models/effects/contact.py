@@ -190,6 +190,39 @@ def _both(mu1: float, mu2: float) -> float:
 FAR = 100.0  # Half width of what a half-space becomes, and a box's depth [m].
 
 
+def _level_ground(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph):
+    """The id of the ground's only shape, the shape, and its pose in the world.
+
+    Raises: ValueError if it is not a level box or half-space.
+    """
+    ground, _ = _changed_and_other(effect, plant)
+    where = f"effect friction_patch at {effect.at[0]!r}"
+    X_WB = anchored_pose(effect, plant, ground)
+    inspector = scene_graph.model_inspector()
+    shapes = list(_shapes(plant, scene_graph, ground))
+    shape = inspector.GetShape(shapes[0][0]) if len(shapes) == 1 else None
+    if not isinstance(shape, (Box, HalfSpace)):
+        raise ValueError(
+            f"{where}: expected {full_name(plant, ground)} to have one collision shape,"
+            " a box or a half-space"
+        )
+    X_WG = X_WB @ inspector.GetPoseInFrame(shapes[0][0])
+    R = X_WG.rotation().matrix()
+    level = abs(R[2, 2]) > 1.0 - 1e-9
+    square = np.allclose(np.sort(abs(R), axis=0)[:2], 0.0, atol=1e-6)
+    if not level or (isinstance(shape, Box) and not square):
+        raise ValueError(
+            f"{where}: expected {full_name(plant, ground)} level, its sides along x, y"
+        )
+    return shapes[0][0], shape, X_WG
+
+
+def _patch_now(effect: Effect, plant: MultibodyPlant, scene_graph) -> dict[str, float]:
+    """No values are neutral. Raises: ValueError where there can be no patch."""
+    _level_ground(effect, plant, scene_graph)
+    return {}
+
+
 def _patch(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
     """Cuts the ground's one box or half-space into the patch and what is around it.
 
@@ -199,29 +232,16 @@ def _patch(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> No
     by s does so for sqrt(8 R s).
     """
     p = effect.parameters
-    ground, thing = _changed_and_other(effect, plant)
     where = f"effect friction_patch at {effect.at[0]!r}"
     if p["x_min"] >= p["x_max"] or p["y_min"] >= p["y_max"]:
         raise ValueError(f"{where}: the patch is empty: {p}")
+    ground, thing = _changed_and_other(effect, plant)
+    geometry, shape, X_WG = _level_ground(effect, plant, scene_graph)
     X_WB = anchored_pose(effect, plant, ground)
-    shapes = list(_shapes(plant, scene_graph, ground))
     inspector = scene_graph.model_inspector()
-    shape = inspector.GetShape(shapes[0][0]) if len(shapes) == 1 else None
-    if not isinstance(shape, (Box, HalfSpace)):
-        raise ValueError(
-            f"{where}: expected {full_name(plant, ground)} to have one collision shape,"
-            " a box or a half-space"
-        )
-    geometry = shapes[0][0]
-    old = ProximityProperties(shapes[0][1])  # The original will have changed.
-    X_WG = X_WB @ inspector.GetPoseInFrame(geometry)
+    # A copy: the original will have changed.
+    old = ProximityProperties(inspector.GetProximityProperties(geometry))
     R = X_WG.rotation().matrix()
-    level = abs(R[2, 2]) > 1.0 - 1e-9
-    square = np.allclose(np.sort(abs(R), axis=0)[:2], 0.0, atol=1e-6)
-    if not level or (isinstance(shape, Box) and not square):
-        raise ValueError(
-            f"{where}: expected {full_name(plant, ground)} level, its sides along x, y"
-        )
     centre = X_WG.translation()
     if isinstance(shape, Box):
         half = abs(R) @ (shape.size() / 2.0)
@@ -300,10 +320,11 @@ def anchored_pose(
 
 
 def _is_free(plant: MultibodyPlant, body: RigidBody) -> bool:
-    """Before the plant is finalized: in no joint at all."""
+    """In no joint at all, but for the one that Finalize gives to each free body."""
     return not any(
         body.index() in (joint.child_body().index(), joint.parent_body().index())
         for joint in (plant.get_joint(i) for i in plant.GetJointIndices())
+        if not joint.is_ephemeral()
     )
 
 
@@ -401,13 +422,11 @@ def add_rolling_torque(generalized, v, force, normal, lever, at, fade_rate):
             generalized[at[body] : at[body] + 3] += (1 - 2 * body) * torque
 
 
-def _add_rolling_resistance(
-    effect: Effect,
-    plant: MultibodyPlant,
-    scene_graph: SceneGraph,
-    builder: DiagramBuilder,
-) -> OutputPort:
-    coefficient = parameter(effect, "coefficient")
+def _ball(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph):
+    """The free sphere of the pair, the other body, and the radius [m].
+
+    Raises: ValueError if it is no such pair.
+    """
     ball, other = find_pair(effect, plant)
     if not ball.is_floating_base_body():
         ball, other = other, ball
@@ -426,9 +445,26 @@ def _add_rolling_resistance(
             f"effect rolling_resistance at {at!r}: expected {ball.scoped_name()} to "
             "have one collision geometry, a sphere"
         )
+    return ball, other, shapes[0].radius()
+
+
+def _rolling_now(effect: Effect, plant: MultibodyPlant, scene_graph) -> dict:
+    _ball(effect, plant, scene_graph)
+    return {"coefficient": 0.0}
+
+
+def _add_rolling_resistance(
+    effect: Effect,
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    builder: DiagramBuilder,
+) -> OutputPort:
+    coefficient = parameter(effect, "coefficient")
+    ball, other, radius = _ball(effect, plant, scene_graph)
+    at = effect.at[0]
     system = builder.AddNamedSystem(
         f"rolling_resistance_{at.replace('.', '_').replace('~', '_')}",
-        RollingResistance(plant, ball, other, shapes[0].radius(), coefficient),
+        RollingResistance(plant, ball, other, radius, coefficient),
     )
     builder.Connect(
         plant.get_contact_results_output_port(), system.GetInputPort("contact_results")
@@ -463,6 +499,7 @@ KINDS = {
         tell_apart="slide over the place in another direction, and beside it",
         rank=1,
         before_finalize=_patch,
+        now=_patch_now,
     ),
     "rolling_resistance": EffectKind(
         at="pair",
@@ -472,6 +509,7 @@ KINDS = {
         confused_with=("body_drag", "plane_tilt"),
         tell_apart="roll at two speeds, and both ways: the resistance slows evenly",
         after_finalize=_add_rolling_resistance,
+        now=_rolling_now,
     ),
     "contact_stiffness": EffectKind(
         at="pair",

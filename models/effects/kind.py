@@ -58,10 +58,10 @@ class EffectKind:
     """A kind of effect: what it is called, what it does, how it shows.
 
     at: what it acts on: "joint" (with one degree of freedom), "actuator" (a joint that
-        scene.actuation drives or that has an actuator), "body", "free body", "ground"
-        (an anchored body with shapes), "pair" (of bodies that touch), "channel",
-        "length" (channels that are lengths), "base" (a model that stands on the world,
-        or the world).
+        scene.actuation drives or that has an actuator), "body", "free body" (where to
+        look for it; it may be on another), "ground" (an anchored body with shapes),
+        "pair" (of bodies that touch), "channel", "length" (channels that are lengths),
+        "base" (a model that stands on the world, or the world).
     says: the report's sentence; {at} and the parameters' names are filled in.
     confused_with, tell_apart: kinds that look alike, and what tells them apart.
     time: "both", or "discrete"/"continuous" where it makes sense in one only.

@@ -309,7 +309,7 @@ KINDS = {
     # The body's mass stays (object_mass is a kind of its own): com goes with the
     # scale, inertia with its square. The body's initial pose stays as well.
     "object_size": EffectKind(
-        at="body",
+        at="free body",
         parameters=(
             Parameter("scale", "", 0.5, 2.0, 1.0, valid="> 0", optional=True),
             Parameter("radius", "m", 0.002, 0.5, None, valid="> 0", optional=True),
@@ -324,7 +324,7 @@ KINDS = {
         now=_size_now,
     ),
     "corner_radius": EffectKind(
-        at="body",
+        at="free body",
         parameters=(Parameter("radius", "m", 0.0002, 0.05, None, valid="> 0"),),
         says="the corners of {at} are rounded with a radius of {radius}",
         confused_with=("object_size", "contact_dissipation", "plane_height"),
