@@ -61,8 +61,8 @@ A_MAX = 1.0  # Of the pattern [m/s2].
 
 
 # v_a where no impact has been felt yet [m/s]. The block's face is four times as stiff
-# as the sphere. At 0.028 m/s a stop comes to just below 1 m/s2 at 10 Hz.
-FIRST_SPEED = {"sphere": 0.028, "block": 0.016}
+# as the sphere. From 0.03 m/s a stop comes to 1 m/s2 at 10 Hz, so that is the most.
+FIRST_SPEED = {"sphere": 0.026, "block": 0.014}
 MOST_SPEED = 0.028
 
 
@@ -82,9 +82,10 @@ class MultipleCollisionsConfig:
                 )
             ),
             shaper=VelocityShaperConfig(
-                region=RegionConfig(margin=0.002, settle_sec=0.06)
+                acceleration_max=0.8, region=RegionConfig(margin=0.002, settle_sec=0.06)
             ),
-            reflex=ImpactReflexConfig(gain=4.0),
+            # Less force_least makes so soft a stop that it is taken for friction.
+            reflex=ImpactReflexConfig(gain=4.0, force_least=2.0),
         )
     )
 
