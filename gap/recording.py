@@ -484,7 +484,8 @@ def _channel(name, values, time, episodes, noise, filters) -> Channel:
     text = str(filters.get(name, ""))
     if name.rsplit(".", 1)[1] in COMMANDS:  # Known, not measured.
         return Channel(name, values, rate_hz=rate, filter=text)
-    own = estimate_noise(values[np.concatenate(there)], breaks[:-1])
+    rows = np.concatenate(there)
+    own = estimate_noise(values[rows], breaks[:-1], time[rows])
     if noise.get(name, 0.0) > 0.0:  # A given zero says nothing that one can weigh by.
         std = max(noise[name], own.step / np.sqrt(12.0))
         return Channel(name, values, std, "given", own.pole, own.step, rate, text)

@@ -142,6 +142,17 @@ def test_noise_of_a_smooth_signal_is_found(seed, std):
     assert estimate_noise(y).std == pytest.approx(std, rel=0.2)
 
 
+@pytest.mark.parametrize("std", [3e-5, 1e-3])
+def test_a_clock_that_jitters_and_loses_samples_adds_nothing_to_the_noise(std):
+    rng = np.random.default_rng(3)
+    t = (np.arange(4000) + 0.1 * np.clip(rng.normal(size=4000), -3, 3)) / 200
+    t = t[rng.uniform(size=4000) > 0.02]
+    y = np.sin(6 * t) + std * rng.normal(size=len(t))
+    # Without the time stamps: speed times jitter, 3e-3.
+    assert estimate_noise(y, times=t).std == pytest.approx(std, rel=0.2)
+    assert estimate_noise(y).std > 1.5e-3
+
+
 def test_a_quantised_signal_has_at_least_the_noise_of_its_grid():
     t = np.arange(4000) / 200
     y = np.round(np.sin(2 * t) / 0.002) * 0.002

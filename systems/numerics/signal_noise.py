@@ -29,7 +29,7 @@ class Noise:
     pole: float
 
 
-def estimate_noise(values, breaks=None) -> Noise:
+def estimate_noise(values, breaks=None, times=None) -> Noise:
     """Standard deviation, resolution and colour of a signal's noise.
 
     A filtered channel's noise is coloured: high differences see only what the filter
@@ -40,21 +40,46 @@ def estimate_noise(values, breaks=None) -> Noise:
     Args:
         values: (n,) samples in order, without NaN.
         breaks: (m,) indices at which a new stretch of time begins; none if None.
+        times: (n,) of the samples; even steps if None. A clock that jitters would add
+            speed times jitter to the noise, if its time stamps were not used.
     """
     y = np.asarray(values, dtype=float)
-    pieces = np.split(y, breaks) if breaks is not None and len(breaks) else [y]
-    pieces = _some_of(pieces)
+    t = np.arange(len(y), dtype=float) if times is None else np.asarray(times, float)
+    cuts = np.asarray([] if breaks is None else breaks, dtype=int)
+    pieces = _some_of(np.split(y, cuts))
+    stamps = _some_of(np.split(t, cuts))
     step = resolution(np.concatenate(pieces)) if pieces else 0.0
     found: list[tuple[float, float]] = []
     for order in _ORDERS:
-        d = [np.diff(piece, order) for piece in pieces if len(piece) > order + 4]
+        d = [
+            _differences(piece, stamp, order)
+            for piece, stamp in zip(pieces, stamps, strict=True)
+            if len(piece) > order + 4
+        ]
         if sum(map(len, d)) < 8:
             break
         pole = _pole(d, order)
         spread = _NORMAL * np.median(np.abs(np.concatenate(d)))
-        found.append((float(spread / np.sqrt(_gain(order, pole))), pole))
+        share = _gain(order, pole) / comb(2 * order, order)
+        found.append((float(spread / np.sqrt(share)), pole))
     std, pole = _first_settled(found)
     return Noise(max(std, float(step / np.sqrt(12.0))), step, pole)
+
+
+def _differences(y: np.ndarray, t: np.ndarray, order: int) -> np.ndarray:
+    """Differences that remove every polynomial of a degree below `order` at the very
+    times of the samples, scaled so that white noise keeps its standard deviation."""
+    n = len(y) - order
+    times = [t[i : i + n] for i in range(order + 1)]
+    total, power = np.zeros(n), np.zeros(n)
+    for i, here in enumerate(times):
+        weight = np.ones(n)
+        for j, other in enumerate(times):
+            if j != i:
+                weight /= other - here
+        total += weight * y[i : i + n]
+        power += weight * weight
+    return total / np.sqrt(power)
 
 
 def _first_settled(found: list[tuple[float, float]]) -> tuple[float, float]:
