@@ -301,11 +301,12 @@ def test_every_kind_tells_its_columns_or_that_it_has_none(tmp_path):
     scenes = {
         "arm": SceneDynamics(double(tmp_path)),
         "block": SceneDynamics(on_ground(tmp_path, "cube", 0.0)),
+        "ball": SceneDynamics(on_ground(tmp_path, "ball", 0.0)),
     }
     simulated_only = set()
     for name, kind in KINDS.items():
         on = "block" if kind.at in ("pair", "ground", "length", "free body") else "arm"
-        model = scenes[on]
+        model = scenes["ball" if name == "rolling_resistance" else on]
         places = model.places(name)
         assert places, name
         n_v = model.plant.num_velocities()
