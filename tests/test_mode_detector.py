@@ -125,8 +125,12 @@ def test_surfaces_are_told_apart_and_known_again_in_any_direction(seed, as_rows)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("speed, normal", [(0.1, 8.0), (0.05, 5.0), (0.2, 15.0)])
-def test_over_20_seeds_every_change_is_right(speed, normal):
+@pytest.mark.parametrize(
+    "speed, normal, known_sec, new_sec",
+    # A ramp of 0.5 N over 0.6 s is felt late, and its end is a matter of opinion.
+    [(0.1, 8.0, 0.2, 0.3), (0.05, 5.0, 0.4, 0.45), (0.2, 15.0, 0.15, 0.25)],
+)
+def test_over_20_seeds_every_change_is_right(speed, normal, known_sec, new_sec):
     n = 0
     for seed in range(20):
         slide = Slide(
@@ -138,7 +142,7 @@ def test_over_20_seeds_every_change_is_right(speed, normal):
             speed=speed,
         )
         rows = follow(slide, ModeTuning(crossing=0.03), 4.0 / speed)
-        n += len(check_changes(slide, rows, 0.2, 0.3))
+        n += len(check_changes(slide, rows, known_sec, new_sec))
     assert n >= 200
 
 

@@ -349,7 +349,9 @@ def _watched(memory: ModeMemory, tuning: ModeTuning, time, feature, R):
 def _tracked(memory: ModeMemory, tuning: ModeTuning, time, feature, R) -> ModeMemory:
     """TRACKING: waits for a departure."""
     memory, departed = _watched(memory, tuning, time, feature, R)
-    nearest, distance = memory.table.nearest(feature)
+    if memory.quiet_time == time:
+        memory = replace(memory, way=0.0)  # The way counts from the change on.
+    nearest, _ = memory.table.nearest(feature)
     strays = memory.strays + 1 if nearest != memory.mode else 0
     if departed or strays >= 2 * tuning.batch:
         return replace(
@@ -357,7 +359,7 @@ def _tracked(memory: ModeMemory, tuning: ModeTuning, time, feature, R) -> ModeMe
             stage=COLLECTING,
             change_time=memory.change_time if departed else time,
             strays=0,
-            way=0.0,
+            way=memory.way if departed else 0.0,
             slid=0,
             features=feature[None],
             forces=np.array([R]),
