@@ -131,9 +131,11 @@ def make_cartpole_walls(
                 f"the scene {config.world} has {plant.num_multibody_states()} states "
                 f"and {plant.num_actuated_dofs()} actuators, expected 4 and 1"
             )
+        actuator = plant.get_joint_actuator(plant.GetJointActuatorIndices()[0])
+        driven = plant.GetModelInstanceName(actuator.model_instance())
         x, u_of_plant = (
             plant.get_state_output_port(),
-            plant.get_actuation_input_port(),
+            loaded.command_input_port(driven),
         )
         if meshcat is not None:
             meshcat.SetCameraPose([0.25, -1.3, 0.6], [0.0, 0.0, 0.35])
