@@ -620,8 +620,10 @@ def test_the_hidden_effect_closes_the_gap_in_drake(case, tmp_path):
     scene.plant.time_step = 0.0  # Its own error is not the matter here.
     after = gap_in_noise(made, scene, made.truth["effects"])
     if not case.kinds:
-        # MuJoCo's and Drake's damping at a touch differ; that is in `tolerance`.
-        assert after < (3.0 if case.world == "pushed" else 0.3)
+        # In MuJoCo, damping at a touch is another than in Drake (it is in `tolerance`)
+        # and sliding feet rattle by 2 mm/s. A finger's velocity has a noise of 10 mm/s
+        # or more: 3.3 of the units used here.
+        assert after < {"pushed": 3.3, "sledge": 1.0}.get(case.world, 0.3)
         return
     before = gap_in_noise(made, scene, [])
     assert before > 4.0

@@ -524,7 +524,7 @@ def _object(case: Case, world: str, exact: bool):
             functions["pusher.slide.position"] = linear(t, finger[:, 0])
             functions["pusher.slide.velocity"] = linear(t, finger[:, 1])
             noise |= {"pusher.slide.position": place_noise}
-            noise |= {"pusher.slide.velocity": 100.0 * place_noise}
+            noise |= {"pusher.slide.velocity": 200.0 * place_noise}
         elif bouncing or true_ground.patch or any(around.pull):
             rows = contact.simulate(true_body, true_ground, around, start, t)
         else:
