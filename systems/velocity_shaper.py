@@ -80,9 +80,10 @@ class VelocityShaper(LeafSystem):
     one starts at once. If it has not come at the end of the path, the motion goes on
     along it, search.distance far, then stops and holds (status CONTACT_MISSING). A
     contact in a segment that ends in none stops it as well (CONTACT_UNEXPECTED), unless
-    search.go_on_unexpected. Where a contact is lost on the way its direction is held
-    where it was (CONTACT_MISSING) until it is felt again. While `contact` is NaN or has
-    a status the motion pauses (HOLD, BAD_INPUT).
+    search.go_on_unexpected. Where a contact is lost on the way it is pressed for; if
+    there is nothing for 5 mm, its direction is held there (CONTACT_MISSING) until a
+    contact is felt. While `contact` is NaN or has a status the motion pauses (HOLD,
+    BAD_INPUT).
 
     Inputs:  contacts (ContactBelief); contact (14,); ee_pose (7,); optional motion
              (MotionPattern): another one that comes there is taken over, from where the

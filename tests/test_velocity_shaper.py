@@ -396,26 +396,54 @@ def test_a_loss_that_does_not_come_is_waited_for_up_to_the_limit():
     assert log.p[first, 2] == pytest.approx(0.2 + LAW.search_max, abs=1e-3)
 
 
-def test_a_contact_lost_on_the_way_is_held_where_it_was_until_it_is_felt_again():
-    slide = MotionPattern((
-        Segment("line", [[0, 0, 0.1], [0.3, 0, 0.1]], (0, 3), force_directions=[DOWN],
-                force_targets=[5]),
-    ))  # fmt: skip
+SLIDE = MotionPattern((
+    Segment("line", [[0, 0, 0.1], [0.3, 0, 0.1]], (0, 3), force_directions=[DOWN],
+            force_targets=[5]),
+    Segment("line", [[0.3, 0, 0.1], [0.3, 0.2, 0.1]], (3, 5),
+            force_directions=[DOWN, AHEAD], force_targets=[5, 5]),
+))  # fmt: skip
 
+
+def off_the_edge(t, p):
+    """Measured: pressed down at 12 mm/s from 1 s on, to where something is at 2 s."""
+    return [p[0], 0, 0.1 - 0.012 * np.clip(t - 1.0, 0, 1)]
+
+
+def test_a_contact_lost_on_the_way_is_held_after_5_mm_until_it_is_felt_again():
     def feel(t, felt, rows):
-        felt[BROKEN] = t > 1.0
-        felt[MADE] = t > 2.0
+        felt[BROKEN], felt[MADE] = t > 1.0, t > 2.0
         return felt
 
-    log = follow(slide, ContactBelief(), feel=feel, pose=lambda t, p: [p[0], 0, 0.08])
-    lost = (log.t > 1.01) & (log.t < 2.0)
+    log = follow(SLIDE, ContactBelief(), feel=feel, pose=off_the_edge, seconds=2.5)
+    pressed = log.t < 1.0 + 0.005 / 0.012 - 0.01
+    np.testing.assert_array_equal(log.n[pressed][:, 2], -1.0)
+    lost = (log.t > 1.0 + 0.005 / 0.012 + 0.01) & (log.t < 2.0)
     np.testing.assert_array_equal(log.n[lost], 0.0)
     np.testing.assert_array_equal(log.targets[lost], 0.0)
-    np.testing.assert_allclose(log.p[lost, 2], 0.08, atol=1e-12)
+    np.testing.assert_allclose(log.p[lost, 2], 0.095, atol=1e-4)
     assert set(log.status[lost]) == {CONTACT_MISSING}
     again = log.t > 2.01
     np.testing.assert_array_equal(log.n[again][:, 2], -1.0)
-    assert set(log.status[again]) == {0} and log.stage[-1] == DONE
+    assert set(log.status[again]) == {0} and log.segment[-1] == 0
+
+
+def test_a_bounce_does_not_end_the_pressing_nor_hide_the_next_contact():
+    def feel(t, felt, rows):  # Off the table for a moment; then the wall.
+        felt[BROKEN], felt[MADE], felt[DIRECTION] = t > 1.0, t > 1.3, AHEAD
+        return felt
+
+    log = follow(SLIDE, ContactBelief(), feel=feel, seconds=1.5)
+    np.testing.assert_array_equal(log.n[:, 2], -1.0)
+    assert log.segment[-1] == 1 and set(log.status) == {0}
+
+
+def test_the_next_contact_counts_while_another_one_is_lost():
+    def feel(t, felt, rows):
+        felt[BROKEN], felt[MADE], felt[DIRECTION] = t > 1.0, t > 1.8, AHEAD
+        return felt
+
+    log = follow(SLIDE, ContactBelief(), feel=feel, pose=off_the_edge, seconds=2)
+    assert log.segment[-1] == 1 and log.status[-1] == 0
 
 
 def test_an_echo_of_the_last_contact_does_not_end_the_next_segment():

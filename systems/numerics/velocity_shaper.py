@@ -82,6 +82,9 @@ from makebreak.systems.numerics.velocity_profile import unit_step, unit_step_int
 
 BAD_SEC = 0.1  # A pause lasts so long after the last bad sample.
 STEP_SEC_MIN = 0.05  # Of a change of speed, however small: bounds the jerk.
+# A contact that was lost is pressed for. If the tip then goes so far within so long,
+# there is nothing: force control closes gaps at 12 mm/s or more.
+LOST_WAY, LOST_SEC = 0.005, 1.0
 NEAR = 1e-3  # [m] from its end a segment that came to rest counts as ended.
 BEND_MAX = 9.85  # Of S''.
 TURN_BACK_SEC = 1.0  # In which an orientation fades out where positions stay.
@@ -111,8 +114,9 @@ _TRACK = _STEP + 3 * _STEPS
     _INIT, _MADE, _BROKEN, _ENTER_TIME, _SETTLE_UNTIL, _SETTLE_KIND, _HELD, _ENDED,
     _OFF, _OFF1, _BAD_UNTIL, _STICKY, _IN_KIND, _BEGAN,
 ) = range(14)  # fmt: skip
-_C = 14  # (6,)
-_FADES, _FADE = 20, 8  # Four of [X 6, start, duration].
+_LOST, _LOST_AT = 14, 16  # Of each row: when it was lost, 0: not; and where, p.n.
+_C = 18  # (6,)
+_FADES, _FADE = 24, 8  # Four of [X 6, start, duration].
 _N_FADES = 4
 _NOW = _FADES + _N_FADES * _FADE
 _COASTS = _NOW + _TRACK  # Two of [track, s at its end].
@@ -325,6 +329,7 @@ def _change_segment(table, m, law, t, pose, X, s_end, s_start):
     _fade_out(m, law, t, C)
     m[_NOW + _SEG] = k + 1.0
     m[_OFF], m[_OFF1] = 0.0, 0.0
+    m[_LOST], m[_LOST + 1] = 0.0, 0.0
     m[_STICKY] = 0.0
     m[_ENTER_TIME], m[_IN_KIND] = -1.0, NO_CONTACT
     m[_BEGAN] = t
@@ -527,12 +532,15 @@ def _events(table, m, law, t, contact, pose):
     X, s, _ = _reference(table, m, t)
     if made:
         tangent = path_point(table, k, s)[1, :3]
+        aligned = _dot(contact[DIRECTION], tangent) > 0.5  # Else an echo of the last.
+        if aligned and _head(table, k, IN_CONTACT) > 0.0:
+            _after_contact(table, m, law, t, pose, X[0])
+            return
         if m[_OFF] > 0.0 or m[_OFF1] > 0.0:  # What was lost is there again.
             m[_OFF], m[_OFF1] = 0.0, 0.0
-        elif _dot(contact[DIRECTION], tangent) > 0.5:  # Else an echo of the last.
-            if _head(table, k, IN_CONTACT) > 0.0:
-                _after_contact(table, m, law, t, pose, X[0])
-                return
+        elif m[_LOST] > 0.0 or m[_LOST + 1] > 0.0:  # The same, sooner.
+            pass
+        elif aligned:
             m[_STICKY] = float(int(m[_STICKY]) | CONTACT_UNEXPECTED)
             if not law.go_on_unexpected:
                 m[_HELD] = 1.0
@@ -541,9 +549,23 @@ def _events(table, m, law, t, contact, pose):
         if _head(table, k, IN_LOSS) > 0.0:
             _go_on(table, m, law, t, pose, X[0], s)
         elif m[_OFF + row] == 0.0 and _finite(pose):
-            # Held where it is along that direction, until it is felt again.
-            m[_OFF + row] = 1.0
-            n = _row(table, k, row)
+            m[_LOST + row], m[_LOST_AT + row] = t, _dot(_row(table, k, row), pose)
+
+
+@numba.njit(cache=True)
+def _watch_lost(table, m, t, pose):
+    """A contact that was lost and not found again is given up: its direction is held
+    where the tip is, until a contact is felt."""
+    k = int(m[_NOW + _SEG])
+    for row in range(int(_head(table, k, N_FORCE))):
+        if m[_LOST + row] == 0.0 or not _finite(pose):
+            continue
+        n = _row(table, k, row)
+        if t > m[_LOST + row] + LOST_SEC:
+            m[_LOST + row] = 0.0
+        elif _dot(n, pose) - m[_LOST_AT + row] > LOST_WAY:
+            m[_LOST + row], m[_OFF + row] = 0.0, 1.0
+            X, _, _ = _reference(table, m, t)
             _add_along(m[_C : _C + 3], n, _dot(n, pose) - _dot(n, X[0]))
 
 
@@ -575,6 +597,7 @@ def tick(table, law, regions, memory, t, contact, pose):
     _fold(m, _NOW, t)
     if _finite(contact):
         _events(table, m, law, t, contact, pose)
+    _watch_lost(table, m, t, pose)
     if not (_finite(contact) and contact[STATUS] == 0.0):
         m[_BAD_UNTIL] = t + BAD_SEC
     bad = t < m[_BAD_UNTIL]
