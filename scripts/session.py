@@ -267,6 +267,7 @@ class Session:
             dynamic_ncols=tty,
             ncols=None if tty else 80,
             disable=not self._progress,
+            leave=len(self._timing) < 5,  # Many simulations: one line, drawn over.
             file=sys.stderr,
         )
 
