@@ -1,0 +1,220 @@
+"""What the gap workflow finds: the values that its files and pictures are made from."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from makebreak.gap.checks import Finding
+from makebreak.models.effects.kind import Effect
+
+VERDICTS = ("no_gap", "gap_named", "ambiguous", "gap_unnamed")
+
+
+@dataclass(frozen=True)
+class Where:
+    """A stretch in which a channel's disagreement stands out.
+
+    region: what the mechanism did there, in words. score: rms of the residual in units
+    of what noise would give.
+    """
+
+    channel: str
+    from_s: float
+    to_s: float
+    episode: int
+    recording: str
+    region: str
+    score: float
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter's value, and how sure it is."""
+
+    value: float
+    std: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Held-out error without and with an effect, all others being in the model.
+
+    runner_up: the best other explanation, "kind at place". margin: its held-out error
+    over that of the effect, less one.
+    """
+
+    held_out_before: float
+    held_out_after: float
+    runner_up: str
+    margin: float
+
+
+@dataclass(frozen=True)
+class NamedEffect:
+    """An effect that the model lacks.
+
+    indistinguishable_from: others that explain these data as well, with the parameters
+    that they would have. identifiable: "identifiable", "weak" or "not".
+    """
+
+    kind: str
+    at: tuple[str, ...]
+    parameters: Mapping[str, Estimate]
+    says: str
+    evidence: Evidence
+    indistinguishable_from: tuple[Effect, ...] = ()
+    tell_apart: str = ""
+    identifiable: str = "identifiable"
+
+    def effect(self) -> Effect:
+        """As a scene file lists it."""
+        return Effect(
+            self.kind,
+            list(self.at),
+            {name: each.value for name, each in self.parameters.items()},
+        )
+
+
+@dataclass(frozen=True)
+class GapMeasure:
+    """Rms over held-out windows of (measured - simulated) over the noise.
+
+    per_channel: {channel: {"before": , "after": }}, the same for each channel.
+    """
+
+    before: float
+    after: float
+    noise_floor: float
+    window_s: float
+    per_channel: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+    @property
+    def reduction(self) -> float:
+        """(before - after)/(before - floor); 0 where nothing was above the floor."""
+        above = self.before - self.noise_floor
+        return (self.before - self.after) / above if above > 1e-9 else 0.0
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """What is left that no kind explains. size: rms in units of noise."""
+
+    channel: str
+    region: str
+    size: float
+    correlates_with: str
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """One channel over neighbouring held-out windows of one episode, for a plot.
+
+    Windows follow one another and each starts anew from a measured state; starts: rows
+    at which one begins.
+    """
+
+    channel: str
+    recording: str
+    episode: int
+    time: np.ndarray  # (n,) [s]
+    measured: np.ndarray  # (n,)
+    before: np.ndarray  # (n,) Simulated by the scene as it came.
+    after: np.ndarray  # (n,) Simulated with the effects added.
+    starts: np.ndarray
+    noise: float
+
+
+@dataclass(frozen=True, eq=False)
+class GapResult:
+    """All that a run of the workflow found.
+
+    background: {what: value in units of its tolerance}, of the nuisance terms.
+    seconds: wall-clock time of each step; not in to_json, which is a function of the
+        inputs alone.
+    """
+
+    verdict: str
+    says: str  # The first screen's sentence.
+    where: Sequence[Where]
+    effects: Sequence[NamedEffect]
+    gap: GapMeasure
+    unexplained: Sequence[Unexplained]
+    background: Mapping[str, float]
+    checks: Sequence[Finding]
+    series: Sequence[Series] = ()
+    candidates: Sequence[Mapping[str, Any]] = ()  # The screen's table, best first.
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self):
+        if self.verdict not in VERDICTS:
+            raise ValueError(f"verdict is {self.verdict!r}, expected one of {VERDICTS}")
+
+    def scene_effects(self) -> list[Effect]:
+        """The effects to add to the scene."""
+        return [each.effect() for each in self.effects]
+
+    def to_json(self) -> dict[str, Any]:
+        """What result.json holds (DESIGN.md, section 6)."""
+        return {
+            "verdict": self.verdict,
+            "says": self.says,
+            "where": [dict(vars(each)) for each in self.where],
+            "effects": [_effect_json(each) for each in self.effects],
+            "gap": {
+                "before": _number(self.gap.before),
+                "after": _number(self.gap.after),
+                "noise_floor": _number(self.gap.noise_floor),
+                "reduction": _number(self.gap.reduction),
+                "metric": "rms over held-out windows of (measured - simulated)/noise",
+                "window_s": _number(self.gap.window_s),
+                "held_out": True,
+                "per_channel": {
+                    name: {k: _number(v) for k, v in each.items()}
+                    for name, each in self.gap.per_channel.items()
+                },
+            },
+            "unexplained": [dict(vars(each)) for each in self.unexplained],
+            "background": {k: _number(v) for k, v in self.background.items()},
+            "checks": [dict(vars(each)) for each in self.checks],
+        }
+
+    def with_seconds(self, seconds: Mapping[str, float]) -> "GapResult":
+        return replace(self, seconds=dict(seconds))
+
+
+def _effect_json(each: NamedEffect) -> dict[str, Any]:
+    at: str | list[str] = each.at[0] if len(each.at) == 1 else list(each.at)
+    return {
+        "kind": each.kind,
+        "at": at,
+        "parameters": {
+            name: {"value": _number(p.value), "std": _number(p.std), "unit": p.unit}
+            for name, p in each.parameters.items()
+        },
+        "says": each.says,
+        "evidence": {
+            "held_out_before": _number(each.evidence.held_out_before),
+            "held_out_after": _number(each.evidence.held_out_after),
+            "runner_up": each.evidence.runner_up,
+            "margin": _number(each.evidence.margin),
+        },
+        "identifiable": each.identifiable,
+        "indistinguishable_from": [
+            {
+                "kind": other.kind,
+                "at": other.at[0] if len(other.at) == 1 else list(other.at),
+                "parameters": {k: _number(v) for k, v in other.parameters.items()},
+            }
+            for other in each.indistinguishable_from
+        ],
+        "tell_apart": each.tell_apart,
+    }
+
+
+def _number(value: float) -> float | None:
+    """JSON has no infinity and no NaN."""
+    value = float(value)
+    return value if np.isfinite(value) else None
