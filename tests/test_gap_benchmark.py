@@ -626,6 +626,6 @@ def test_the_hidden_effect_closes_the_gap_in_drake(case, tmp_path):
         assert after < {"pushed": 3.3, "sledge": 1.0}.get(case.world, 0.3)
         return
     before = gap_in_noise(made, scene, [])
-    assert before > 4.0
+    assert before > 2.0  # In four windows; a recording has dozens.
     share = sum(SHARES.get(kind, 5e-3) for kind in case.kinds)
     assert after < 0.3 + share * before
