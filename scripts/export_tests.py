@@ -12,18 +12,19 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from copy import deepcopy
 from functools import wraps
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
-from pydrake.common.yaml import yaml_dump_typed
 from pydrake.systems.framework import Context, Diagram, LeafSystem
 
 import makebreak.systems
 from makebreak.diagrams.station import make_control_plant
 from makebreak.models.scene import Scene, read_scene
+from makebreak.models.scene_file import scene_text
 from makebreak.models.tip_and_ball import make_tip_and_ball
 from makebreak.scripts.replay import Track, Unsupported
 from makebreak.scripts.session import Log, Session, leaf_systems
@@ -175,14 +176,14 @@ class _Source:
         """A scene becomes a file beside the tests, with copies of its models."""
         models = self._folder / "models"
         models.mkdir(exist_ok=True)
-        text = yaml_dump_typed(scene)
+        scene = dataclasses.replace(scene, directives=deepcopy(scene.directives))
         for directive in scene.directives:
             if directive.add_model is not None:
-                file = directive.add_model.file
-                source = Path(file.removeprefix("file://"))
+                source = Path(directive.add_model.file.removeprefix("file://"))
                 if source.is_file():
                     shutil.copyfile(source, models / source.name)
-                    text = text.replace(file, source.name)
+                    directive.add_model.file = f"file://{models / source.name}"
+        text = scene_text(scene, models)
         for i in range(1000):
             path = models / f"scene_{i}.yaml"
             if not path.exists() or path.read_text() == text:
