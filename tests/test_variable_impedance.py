@@ -252,3 +252,27 @@ def test_the_paper_s_damping_is_a_port_of_its_own_and_light():
 def test_bad_settings_are_refused(config, message):
     with pytest.raises(ValueError, match=message):
         VariableImpedance(VariableImpedanceConfig(**config))
+
+
+@pytest.mark.parametrize(
+    "stage, kind, transition, held",
+    [
+        (REGION, IMPACT, True, True),
+        (REGION, IMPACTLESS, True, False),
+        (ENTER, IMPACT, True, False),
+        (SETTLE, IMPACT, True, False),
+        (REGION, IMPACT, False, False),
+    ],
+)
+def test_feed_forward_is_held_where_an_impact_is_expected(
+    stage, kind, transition, held
+):
+    """A model that follows the impact must not push on against it."""
+    law = law_of(transition=transition)
+    before = (0.0, W, 0.0, phase())
+    after = (0.0, 4.0 * W, 0.0, phase(stage, kind))
+    out = run(law, [before, after, after])
+    np.testing.assert_allclose(out[-1, 12:18], out[0, 12:18] * (1.0 if held else 4.0))
+    blind = (0.0, np.full(6, np.nan), 0.0, phase(stage, kind))
+    out = run(law, [before, blind])
+    np.testing.assert_allclose(out[-1, 12:18], out[0, 12:18] * (1.0 if held else 0.0))

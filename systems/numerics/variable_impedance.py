@@ -103,16 +103,28 @@ def tick(law, memory, error, predicted, collecting, phase):
     keep = law.decay if memory[STARTED] > 0.0 else 0.0
     memory[STARTED] = 1.0
     memory[STIFFNESS] = K_1 + keep * (memory[STIFFNESS] - K_1)
-    for i in range(6):
-        wanted = -weight * predicted[i] if law.feedforward and usable else 0.0
-        at = FEEDFORWARD.start + i
-        memory[at] = wanted + keep * (memory[at] - wanted)
+    told = np.all(np.isfinite(phase))
+    if not told:
+        status = BAD_INPUT
+    # A one-step model follows an impact as it would follow friction: fed forward, it
+    # would push on against what is being met. So it is held where one is expected.
+    waiting = (
+        law.transition
+        and told
+        and phase[PHASE_STAGE] == REGION
+        and phase[PHASE_KIND] == IMPACT
+    )
+    if not waiting:
+        for i in range(6):
+            wanted = -weight * predicted[i] if law.feedforward and usable else 0.0
+            at = FEEDFORWARD.start + i
+            memory[at] = wanted + keep * (memory[at] - wanted)
 
     kind = NO_CONTACT
-    if not np.all(np.isfinite(phase)):
-        status = BAD_INPUT
-    elif law.transition and (
-        phase[PHASE_STAGE] == ENTER or phase[PHASE_STAGE] == REGION
+    if (
+        told
+        and law.transition
+        and (phase[PHASE_STAGE] == ENTER or phase[PHASE_STAGE] == REGION)
     ):
         kind = int(phase[PHASE_KIND])
     step = 1.0 / law.blend_ticks
