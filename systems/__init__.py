@@ -1,13 +1,18 @@
 """The systems, in the order in which data flows.
 
 Sensing and estimation   pinhole_camera, camera_shake, noisy_sensor, tool_wrench,
-                         ball_tracker, state_estimator
-Modelling                lcs_builder
-Adaptation               residual_learner; baselines/dynamics_residual_learner
+                         ball_tracker, state_estimator, tip_state, contact_detector,
+                         mode_detector, contact_anticipator
+Modelling                lcs_builder, forward_model
+Adaptation               residual_learner
 Planning                 rolling_task, c3_mpc
-Control                  arm_reference, impedance_controller
-For scoring and the eye  contact_probe, rolling_view, walls_view
+Shaping                  velocity_shaper, variable_impedance
+Control                  arm_reference, impedance_controller, impact_reflex
+For scoring and the eye  contact_probe, rolling_view, walls_view, contact_view
 As a world               lcs_plant
+In the plane             planar_world, planar_impedance, planar_view
+Compared with            baselines/: dynamics_residual_learner, mrac, active_inference,
+                         biomimetic, long_term_predictor
 
 Each file has one LeafSystem and its config; its maths is in numerics/, under the same
 name. Systems do not import each other: they meet at ports.
