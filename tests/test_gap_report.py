@@ -1,0 +1,293 @@
+"""The report says what the result says, in one file."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from effect_scenes import pendulum
+
+from makebreak.diagrams.scene_simulation import Commands, SceneSimulation
+from makebreak.gap.checks import Finding
+from makebreak.gap.pictures import picture_of_where
+from makebreak.gap.recording import read_recordings
+from makebreak.gap.report import extents_of, summary_lines, write_report
+from makebreak.gap.result import (
+    Estimate,
+    Evidence,
+    GapMeasure,
+    GapResult,
+    NamedEffect,
+    Series,
+    Unexplained,
+    Where,
+)
+from makebreak.gap.table import write_recording
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect, sentence
+from makebreak.models.scene import InitialSection, read_scene
+from makebreak.models.scene_file import write_scene
+
+COULOMB = Effect("joint_coulomb_friction", ["p.j1"], {"coulomb": 0.35})
+VISCOUS = Effect("joint_viscous_damping", ["p.j1"], {"damping": 0.2})
+CHANNELS = ("p.j1.position", "p.j1.velocity")
+NOISE = (1e-3, 1e-2)
+WINDOW = 0.3
+
+
+def small_case(folder):
+    """A pendulum with friction that its scene lacks, recorded; the paths of both."""
+    scene = pendulum(folder)
+    write_scene(scene, folder / "scene.yaml")
+    rng = np.random.default_rng(0)
+    time = np.arange(600) * 0.01
+    effort = 2.5 * np.sin(3.0 * time) + 1.5 * np.sin(7.0 * time)
+    commands = Commands(time, {"p.j1.effort_command": effort})
+    start = InitialSection(positions={"p.j1": 0.4})
+    world = SceneSimulation(replace(scene, effects=[COULOMB]))
+    measured = world.run(start, time, CHANNELS, commands)
+    measured += rng.normal(size=measured.shape) * NOISE
+    columns = {"time": time, "p.j1.effort_command": effort}
+    columns |= dict(zip(CHANNELS, measured.T, strict=True))
+    write_recording(folder / "run.csv", columns)
+    return folder / "scene.yaml", folder / "run.csv"
+
+
+def simulated(scene, recording):
+    """Every window from its measured first row, (n, 2), and the first rows."""
+    simulation = SceneSimulation(scene)
+    time = recording.time
+    commands = Commands(time, {"p.j1.effort_command": recording["p.j1.effort_command"]})
+    length = round(WINDOW / 0.01)
+    starts = np.arange(0, len(time), length)
+    rows = []
+    for a in starts:
+        position, velocity = (float(recording[c][a]) for c in CHANNELS)
+        start = InitialSection({"p.j1": position}, {"p.j1": velocity})
+        rows.append(simulation.run(start, time[a : a + length], CHANNELS, commands))
+    return np.concatenate(rows), starts
+
+
+def made_by_hand(scene_path, recording_path) -> GapResult:
+    """What the workflow would find in the small case."""
+    scene = read_scene(scene_path)
+    [recording] = read_recordings([recording_path])
+    before, starts = simulated(scene, recording)
+    after, _ = simulated(replace(scene, effects=[COULOMB]), recording)
+    measured = np.column_stack([recording[c] for c in CHANNELS])
+    errors = [(measured - x) / NOISE for x in (before, after)]
+    rms = [np.sqrt(np.mean(e**2, axis=0)) for e in errors]
+    total = [float(np.sqrt(np.mean(e**2))) for e in errors]
+    series = [
+        Series(
+            c, recording.name, 0, recording.time, measured[:, i], before[:, i],
+            after[:, i], starts, NOISE[i],
+        )
+        for i, c in enumerate(CHANNELS)
+    ]  # fmt: skip
+    where = []
+    for k, a in enumerate(starts):
+        b = min(a + round(WINDOW / 0.01), len(recording.time)) - 1
+        for i, c in enumerate(CHANNELS):
+            score = float(np.sqrt(np.mean(errors[0][a : b + 1, i] ** 2)))
+            if score > 3.0:
+                span = recording.time[[a, b]].tolist()
+                region = "reversing" if k % 2 else "moving"
+                where.append(Where(c, *span, 0, recording.name, region, score))
+    says = sentence(COULOMB, KINDS[COULOMB.kind], {"coulomb": 0.01})
+    effect = NamedEffect(
+        COULOMB.kind,
+        ("p.j1",),
+        {"coulomb": Estimate(0.35, 0.01, "N m")},
+        says,
+        Evidence(total[0], total[1], "joint_viscous_damping at p.j1", 0.62),
+    )
+    return GapResult(
+        "gap_named",
+        says,
+        where,
+        [effect],
+        GapMeasure(
+            *total, 1.2, WINDOW,
+            {
+                c: {"before": float(rms[0][i]), "after": float(rms[1][i])}
+                for i, c in enumerate(CHANNELS)
+            },
+        ),
+        [],
+        {"mass of p.rod": 0.4, "centre of mass of p.rod, z": -0.9},
+        [
+            Finding("noise", "run", CHANNELS[0], 1e-3, "rad", "info", "Noise: 1 mrad."),
+            Finding("lag", "run", CHANNELS[1], 4e-3, "s", "warning", "It lags 4 ms."),
+        ],
+        series,
+        [
+            {"kind": "joint_coulomb_friction", "at": "p.j1", "held_out": 1.31},
+            {"kind": "joint_viscous_damping", "at": "p.j1", "held_out": 2.12},
+        ],
+        {"read": 0.1, "fit": 2.3},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("case")
+    paths = small_case(folder)
+    return (*paths, made_by_hand(*paths))
+
+
+def written(case, folder, result=None, **more):
+    scene_path, recording_path, made = case
+    recordings = read_recordings([recording_path])
+    write_report(
+        result or made, read_scene(scene_path), folder, recordings, scene_path, **more
+    )
+    return (folder / "report.html").read_text()
+
+
+def text_of(page: str) -> str:
+    """What a reader sees."""
+    page = re.sub(r"<style>.*?</style>", "", page, flags=re.S)
+    page = re.sub(r"<[^>]*>", " ", page)
+    page = page.replace("&plusmn;", "+-").replace("&#x27;", "'").replace("&gt;", ">")
+    return " ".join(page.split())
+
+
+def test_the_small_case_is_one(case):
+    """The hidden friction shows, and with it the model is good to the noise of the
+    first row, from which its windows start."""
+    gap = case[2].gap
+    assert gap.before > 5.0 and 1.0 < gap.after < 3.0
+
+
+def test_the_page_stands_alone_and_says_it_first(case, tmp_path):
+    page = written(case, tmp_path)
+    assert page.count("data:image/png;base64,") == 3
+    outside = re.findall(r'(?:src|href)="(?!data:)([^"]*)"', page)
+    assert outside == []
+    text = text_of(page)
+    first = text[: text.index(" Where ")]
+    assert "joint p.j1 has Coulomb friction of 0.35 +- 0.01 N m" in first.replace(
+        "Joint", "joint"
+    )
+    assert f"{case[2].gap.before:.3g}" in first and f"{case[2].gap.after:.3g}" in first
+    assert "0.35 +- 0.01 N m" in first
+    assert "Next best: joint_viscous_damping at p.j1, error 62 % larger." in first
+    assert "It lags 4 ms." in text and "1 note Noise" in text
+    assert f"makebreak run --model {tmp_path / 'scene.yaml'}" in text
+
+
+def test_the_files_are_those_of_the_design(case, tmp_path):
+    written(case, tmp_path, comparison="<html>moving</html>")
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == set(
+        "result.json scene.yaml report.html compare.html channels.png where.png "
+        "series.png".split()
+    )
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["verdict"] == "gap_named"
+    assert result["effects"][0]["at"] == "p.j1"
+    assert read_scene(tmp_path / "scene.yaml").effects == [COULOMB]
+    assert 'href="compare.html"' in (tmp_path / "report.html").read_text()
+
+
+def test_effects_that_the_scene_had_are_kept_before_the_new(case, tmp_path):
+    scene = replace(read_scene(case[0]), effects=[VISCOUS])
+    write_report(case[2], scene, tmp_path)
+    assert read_scene(tmp_path / "scene.yaml").effects == [VISCOUS, COULOMB]
+
+
+def test_a_tie_is_said_with_what_tells_it_apart(case, tmp_path):
+    effect = replace(
+        case[2].effects[0],
+        indistinguishable_from=(VISCOUS,),
+        tell_apart="move the joint at two speeds",
+    )
+    result = replace(case[2], verdict="ambiguous", effects=[effect])
+    text = text_of(written(case, tmp_path, result))
+    assert "These data cannot tell it from: " in text
+    assert "Joint p.j1 has 0.2 N m s/rad of viscous damping" in text
+    assert "To tell: Move the joint at two speeds" in text
+    assert "    to tell: move the joint at two speeds" in summary_lines(result)
+
+
+def test_no_gap_and_no_name_are_said_and_nothing_is_added(case, tmp_path):
+    nothing = replace(
+        case[2], verdict="no_gap", says="Nothing is missing.", effects=[], where=[],
+        gap=GapMeasure(1.02, 1.02, 1.0, WINDOW), series=[], candidates=[],
+    )  # fmt: skip
+    text = text_of(written(case, tmp_path / "none", nothing))
+    assert "No gap Nothing is missing." in text and "Nothing was added" in text
+    assert read_scene(tmp_path / "none" / "scene.yaml").effects == []
+    left = Unexplained("p.j1.velocity", "near q = 0.3", 12.3, "position of p.j1")
+    unnamed = replace(
+        nothing, verdict="gap_unnamed", says="Something is left.", unexplained=[left]
+    )
+    text = text_of(written(case, tmp_path / "left", unnamed))
+    assert "none is named" in text
+    assert "near q = 0.3: 12.3 times the noise; goes with position of p.j1" in text
+
+
+def test_numbers_that_are_none_do_not_break_it(case, tmp_path):
+    nan = float("nan")
+    effect = replace(
+        case[2].effects[0],
+        parameters={"coulomb": Estimate(0.35, nan, "N m")},
+        evidence=Evidence(nan, nan, "", nan),
+    )
+    gap = GapMeasure(nan, nan, nan, WINDOW, {"p.j1.position": {"before": nan}})
+    empty = replace(case[2].series[0], before=np.full(600, nan))
+    result = replace(case[2], effects=[effect], gap=gap, series=[empty])
+    page = written(case, tmp_path, result)
+    assert "nan" not in text_of(page)
+    json.loads((tmp_path / "result.json").read_text(), parse_constant=pytest.fail)
+
+
+def test_text_of_a_recording_is_no_html(case, tmp_path):
+    where = replace(case[2].where[0], region="<script>alert(1)</script>", score=1e9)
+    page = written(case, tmp_path, replace(case[2], where=[where]))
+    assert "<script" not in page
+
+
+def test_the_heat_map_shows_a_stretch_where_it_was(case):
+    """Episodes of 1 s and 3 s side by side: 600 columns, so 150 a second."""
+    extents = {("run", 0): (0.0, 1.0), ("run", 1): (10.0, 13.0)}
+    where = [Where("p.j1.position", 11.0, 12.0, 1, "run", "moving", 5.0)]
+    figure = picture_of_where(replace(case[2], where=where), extents)
+    [image] = figure.axes[0].images
+    shown = np.flatnonzero(np.isfinite(image.get_array().filled(np.nan)[0]))
+    assert (shown[0], shown[-1]) == (300, 449)
+
+
+def test_many_channels_episodes_and_findings_stay_readable(case, tmp_path):
+    names = [f"p.j{i}.position" for i in range(60)]
+    where = [
+        Where(name, e + 0.1, e + 0.2, e, "run", "moving", 4.0 + e)
+        for name in names
+        for e in range(40)
+    ]
+    finding = case[2].checks[1]
+    result = replace(
+        case[2],
+        where=where,
+        gap=replace(
+            case[2].gap, per_channel={n: {"before": 9.0, "after": 2.0} for n in names}
+        ),
+        checks=[finding] * 500,
+    )
+    page = written(case, tmp_path, result)
+    # Pictures hardly grow with the channels, and long tables are folded and cut.
+    assert len(page) < 600_000
+    assert "<details>" in page
+
+
+def test_a_folder_that_cannot_be_written_is_named(case, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match='--out: got ".*file"'):
+        write_report(case[2], read_scene(case[0]), tmp_path / "file")
+
+
+def test_extents_are_those_of_the_episodes(case):
+    recordings = read_recordings([case[1]])
+    assert extents_of(recordings) == {("run", 0): (0.0, 5.99)}
