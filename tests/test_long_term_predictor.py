@@ -188,7 +188,7 @@ BUDGET = TrainingBudget(points_per_mode=60, svm_points=400, modes_max=4, segment
 @pytest.fixture(scope="module")
 def wall():
     rng = np.random.default_rng(0)
-    trials = [wall_trial(rng) for _ in range(8)]
+    trials = [wall_trial(rng) for _ in range(40)]
     return *train(trials, BUDGET), [wall_trial(rng) for _ in range(4)]
 
 
@@ -269,7 +269,7 @@ def test_a_stratified_choice_has_a_point_of_each_share():
 def test_the_same_seed_gives_the_same_prediction(wall):
     predictor, _, tests = wall
     rng = np.random.default_rng(0)
-    again, _ = train([wall_trial(rng) for _ in range(8)], BUDGET)
+    again, _ = train([wall_trial(rng) for _ in range(40)], BUDGET)
     first, second = from_start(predictor, tests[0]), from_start(again, tests[0])
     np.testing.assert_array_equal(first.mean, second.mean)
 

@@ -42,7 +42,10 @@ NOISE_BOUNDS = (1e-6, 1e1)
 SVM_GRID = {"C": [1.0, 8.0, 64.0, 512.0], "gamma": [2.0**-8, 2.0**-6, 2.0**-4, 0.25]}
 KAPPA = 2.0  # Of the unscented transform, with alpha 1 and beta 0.
 SAMPLES_PER_DIMENSION = 3  # That vote for the next mode.
-POINTS_MIN = 5  # Fewer changes between two modes teach no transition of their own.
+# Fewer changes between two modes teach no transition of their own: the step is then the
+# expert's of the mode that is entered. (Of a dozen changes a GP of 20 inputs throws the
+# state so far off what the experts know that they never find back.)
+POINTS_MIN = 30
 JITTER = 1e-9
 
 
