@@ -204,11 +204,10 @@ def test_gating_switches_where_the_mass_meets_the_wall(wall):
         start = np.diag([1e-4, 1e-6])
         got = predict_long_term(predictor, trial.x[0], start, known(trial.u), 59)
         contact = np.flatnonzero(trial.features[:, 2] > 2.0)[0]
-        first, last = got.mode[contact - 8], got.mode[-1]
-        assert first != last
-        # Reached at 0.4 m/s: 3 samples are 24 mm of the servo's way.
-        switched = np.flatnonzero(got.mode == last)[0]
-        assert abs(switched - contact) <= 3 + 2  # The smoothing of labels: half of 5.
+        changes = np.flatnonzero(np.diff(got.mode)) + 1
+        # Two samples at 0.4 m/s are 16 mm, of a start that varies by 10 mm.
+        assert abs(changes - contact).min() <= 2
+        assert not set(got.mode[: contact - 3]) & set(got.mode[contact + 3 :])
 
 
 def test_true_values_are_in_the_2_sigma_band(wall):
