@@ -198,12 +198,10 @@ def _value_and_rate(
     if channel not in recording:
         return None
     t, value = recording.samples(channel, episode)
-    near = np.abs(t - time) <= _SMOOTHED_SEC
-    if near.sum() < 8:  # Slow sensors: as many as it takes.
-        near = np.argsort(np.abs(t - time))[:8]
+    near = np.flatnonzero(np.abs(t - time) <= _SMOOTHED_SEC)
+    if len(near) < 8:  # Slow sensors: as many as it takes.
+        near = np.sort(np.argsort(np.abs(t - time))[:8])
     t, value = t[near], value[near]
-    order = np.argsort(t)
-    t, value = t[order], value[order]
     if len(t) < 6:
         return None
     at = np.unique(np.append(t, time))

@@ -1,4 +1,4 @@
-"""The command line: `makebreak list | run | reproduce | export-tests | bench`.
+"""The command line: `makebreak list | run | reproduce | gap | export-tests | bench`.
 
 Exit status: 0 done; 1 it ran and did not meet its criterion; 2 bad input, one line on
 stderr; 3 a fault of makebreak itself, with a traceback; 130 ended by Ctrl-C.
@@ -45,6 +45,12 @@ def _number(text: str, name: str, least: float, whole: bool = False) -> float:
         kind = f"whole number, {least} or more" if whole else f"number above {least:g}"
         raise ValueError(f'{name}: got "{text}", expected a {kind}')
     return value
+
+
+def _jobs(text: str | None) -> int:
+    """How many processes at once; None: one per core that may be used."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    return int(_number(str(cores) if text is None else text, "--jobs", 1, whole=True))
 
 
 def _experiment(name: str):
@@ -235,8 +241,7 @@ def _reproduce(args) -> int:
             if not hasattr(module, "reproduce"):
                 raise ValueError(f"{name} has nothing to reproduce")
     seeds = int(_number(args.seeds, "--seeds", 1, whole=True))
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
-    jobs = int(_number(args.jobs or str(cores), "--jobs", 1, whole=True))
+    jobs = _jobs(args.jobs)
     out = Path(args.out) if args.out else _default_out("reproduce")
     session = Session(out, reuse=args.reuse)
     tables = {}
@@ -268,6 +273,21 @@ def _reproduce(args) -> int:
     if missed:
         print(f"makebreak: {missed} rows miss their target", file=sys.stderr)
     return 1 if missed else 0
+
+
+def _gap(args) -> int:
+    from makebreak.scripts.gap_command import effects_table, run_and_report
+
+    scene = Path(_scene(args.scene, "SCENE"))
+    recordings = [Path(text) for text in args.recordings]
+    for path in recordings:
+        if not path.is_file():
+            raise ValueError(f'RECORDING: got "{path}", expected a file')
+    out = Path(args.out) if args.out else _default_out("gap")
+    result, files = run_and_report(scene, recordings, out, _jobs(args.jobs))
+    print(effects_table(result).to_text())
+    print(f"Files in {out}: " + " ".join(path.name for path in files), flush=True)
+    return 0
 
 
 def _export_tests(args) -> int:
@@ -335,6 +355,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--out", metavar="DIR", help="default: runs/reproduce-<time>")
     p.set_defaults(function=_reproduce)
+
+    p = commands.add_parser(
+        "gap", help="where a model and recordings disagree, and what it lacks"
+    )
+    p.add_argument("scene", metavar="SCENE", help="the model: a file, or a listed name")
+    p.add_argument("recordings", nargs="+", metavar="RECORDING", help=".csv, .npz, ...")
+    p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
+    p.add_argument("--out", metavar="DIR", help="default: runs/gap-<time>")
+    p.set_defaults(function=_gap)
 
     p = commands.add_parser(
         "export-tests", help="a test of each system alone, from what it did in a run"

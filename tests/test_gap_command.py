@@ -1,0 +1,118 @@
+"""`makebreak gap` as a command: what it refuses, shows, writes, and how it ends."""
+
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from test_gap_report import made_by_hand, small_case
+
+from makebreak.scripts import cli
+from makebreak.scripts.gap_command import StageBar, effects_table
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("case")
+    paths = small_case(folder)
+    return (*paths, made_by_hand(*paths))
+
+
+@pytest.fixture
+def workflow(monkeypatch, case, tmp_path):
+    """A workflow that finds what was made by hand, and notes what it was given."""
+    monkeypatch.chdir(tmp_path)
+    asked = []
+
+    def run_gap(scene_path, recording_paths, out_dir, jobs, progress):
+        asked.append((scene_path, recording_paths, out_dir, jobs))
+        for stage in ("read", "fit"):
+            for share in (0.0, 0.5, 1.0):
+                progress(stage, share)
+        return case[2]
+
+    module = ModuleType("makebreak.gap.workflow")
+    module.run_gap = run_gap  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "makebreak.gap.workflow", module)
+    return asked
+
+
+def test_a_run_shows_its_stages_and_ends_with_a_table_and_files(workflow, case, capsys):
+    scene, recording, result = case
+    words = ["gap", str(scene), str(recording), "--out", "out", "--jobs", "1"]
+    assert cli.main(words) == 0
+    assert workflow == [(scene.resolve(), [recording], Path("out"), 1)]
+    shown = capsys.readouterr()
+    for stage in ("read", "fit", "report"):
+        assert f"{stage:12}: 100%" in shown.err
+    assert result.says in shown.out and "joint_coulomb_friction" in shown.out
+    written = {path.name for path in Path("out").iterdir()}
+    names = "result.json scene.yaml report.html compare.html"
+    assert set(names.split()) < written
+    for name in names.split():
+        assert name in shown.out
+    assert json.loads(Path("out/result.json").read_text())["verdict"] == "gap_named"
+
+
+@pytest.mark.parametrize("verdict", ["no_gap", "ambiguous", "gap_unnamed"])
+def test_every_verdict_is_a_run_that_is_done(workflow, case, verdict, monkeypatch):
+    object.__setattr__(case[2], "verdict", verdict)
+    monkeypatch.setattr(
+        "makebreak.scripts.gap_command.comparison_html", lambda *_: None
+    )
+    try:
+        assert cli.main(["gap", str(case[0]), str(case[1]), "--out", "out"]) == 0
+    finally:
+        object.__setattr__(case[2], "verdict", "gap_named")
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ([], "SCENE"),
+        (["scene.yaml"], "RECORDING"),
+        (["no_such", "run.csv"], 'SCENE: got "no_such", expected a scene file'),
+        (["scene.yaml", "none.csv"], 'RECORDING: got "none.csv", expected a file'),
+        (["scene.yaml", "."], 'RECORDING: got ".", expected a file'),
+        (["scene.yaml", "run.csv", "--jobs", "0"], "--jobs: got"),
+        (["scene.yaml", "run.csv", "--out", "run.csv/x"], '--out: got "run.csv/x"'),
+        (["scene.yaml", "run.csv", "--no-such"], "--no-such"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(workflow, case, words, says, capsys):
+    for path in case[:2]:
+        Path(path.name).write_text(path.read_text())
+    assert cli.main(["gap", *words]) == 2
+    shown = capsys.readouterr()
+    assert says in shown.err and shown.err.count("\n") == 1, shown.err
+    assert not workflow
+
+
+def test_ctrl_c_ends_it_in_one_line(workflow, case, monkeypatch, capsys):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys.modules["makebreak.gap.workflow"], "run_gap", interrupted)
+    assert cli.main(["gap", str(case[0]), str(case[1]), "--out", "out"]) == 130
+    shown = capsys.readouterr()
+    assert shown.err.strip() == "makebreak: interrupted"
+
+
+def test_a_stage_that_was_not_ended_is_not_shown_as_done(capsys):
+    with pytest.raises(ValueError), StageBar() as bar:
+        bar("read", 1.0)
+        bar("fit", 0.25)
+        raise ValueError
+    shown = capsys.readouterr().err
+    assert "read        : 100%" in shown
+    assert "fit         : 100%" not in shown and " 25%" in shown
+
+
+def test_the_table_has_the_held_out_errors(case):
+    text = effects_table(case[2]).to_text()
+    assert text.startswith("Gap named: joint p.j1 has Coulomb friction")
+    e = case[2].effects[0].evidence
+    [row] = [r for r in text.splitlines() if r.startswith("joint_coulomb")]
+    assert f"{e.held_out_before:.4g}" in row and f"{e.held_out_after:.4g}" in row
+    assert "coulomb 0.35 +- 0.01 N m" in row
