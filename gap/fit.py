@@ -1,0 +1,129 @@
+"""Effects fitted together, exactly and not by their columns."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from makebreak.gap.inverse import InverseModel
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect, check_parameters
+from makebreak.systems.numerics.selection import LinearFit, Screen
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """Effects with their best parameters. std: of each effect's parameters. r (m,):
+    what they leave, before nuisances. left (m,): after them."""
+
+    effects: tuple[Effect, ...]
+    std: tuple[dict[str, float], ...]
+    r: np.ndarray
+    left: np.ndarray
+    b: np.ndarray
+    fit: LinearFit
+
+    @property
+    def score(self) -> float:
+        return self.fit.score
+
+
+def fit_effects(
+    model: InverseModel,
+    screen: Screen,
+    start: Sequence[Effect],
+    fixed: Sequence[Sequence[str]] | None = None,
+    evaluations: int = 8,
+) -> Fitted:
+    """Least squares over the training rows, the nuisances fitted along.
+
+    Args: start: effects with parameters to start from; fixed: of each the parameters
+        that stay as they are. evaluations: Gauss-Newton steps at most.
+    """
+    fixed = fixed or [()] * len(start)
+    free = [
+        (i, name)
+        for i, effect in enumerate(start)
+        for name in effect.parameters
+        if name not in fixed[i]
+    ]
+    x0 = np.array([start[i].parameters[name] for i, name in free])
+    scale = np.array(
+        [_scale(start[i], name) for i, name in free]
+    )
+    low = np.array([_lowest(start[i].kind, name) for i, name in free])
+    x0 = np.maximum(x0, low + 1e-9 * scale)
+    cache: dict[bytes, np.ndarray] = {}
+
+    def effects_of(z) -> list[Effect]:
+        parameters = [dict(effect.parameters) for effect in start]
+        for (i, name), value in zip(free, z * scale, strict=True):
+            parameters[i][name] = float(value)
+        return [
+            Effect(e.kind, list(e.at), p)
+            for e, p in zip(start, parameters, strict=True)
+        ]
+
+    def residual(z) -> np.ndarray:
+        key = np.asarray(z).tobytes()
+        if key not in cache:
+            cache[key] = model.residual(effects_of(z))
+        return cache[key]
+
+    def cost(z):
+        try:
+            rows = screen.cost_rows(residual(z))
+        except (ValueError, RuntimeError):  # Drake refuses such parameters.
+            rows = np.full(_n_rows(screen), 1e6)
+        return np.where(np.isfinite(rows), rows, 1e6)
+
+    solved = least_squares(
+        cost, x0 / scale, bounds=(low / scale, np.full(len(low), np.inf)),
+        diff_step=1e-4, x_scale=1.0, ftol=1e-4, xtol=1e-6, max_nfev=evaluations,
+    ) if len(x0) else None  # fmt: skip
+    z = x0 / scale if solved is None else solved.x
+    effects = effects_of(z)
+    r = residual(z)
+    std: list[dict[str, float]] = [{} for _ in start]
+    if solved is not None:
+        u, w, vt = np.linalg.svd(solved.jac, full_matrices=False)
+        inverse = 1.0 / np.maximum(w, 1e-12 * max(w[0], 1e-300))
+        spread = np.sqrt(np.sum((vt.T * inverse) ** 2, axis=1))
+        # What is left, in units of what was allowed for, widens the interval.
+        spread *= max(np.sqrt(2.0 * solved.cost / len(solved.fun)), 1.0)
+        for (i, name), each in zip(free, spread * scale, strict=True):
+            std[i][name] = float(each)
+    b, left = screen.settle(r)
+    return Fitted(
+        tuple(_tidy(e) for e in effects), tuple(std), r, left, b, screen.judge(r)
+    )
+
+
+def _n_rows(screen: Screen) -> int:
+    return len(screen.cost_rows(screen.r))
+
+
+def _scale(effect: Effect, name: str) -> float:
+    value = abs(effect.parameters[name])
+    unit = KINDS[effect.kind].parameter(name).unit
+    typical = {"rad": 0.1, "s": 0.01, "m": 0.05, "s/s": 1e-3, "kg": 0.1}.get(unit, 0.0)
+    group = [abs(effect.parameters[p.name]) for p in KINDS[effect.kind].parameters
+             if p.unit == unit and p.name in effect.parameters]  # fmt: skip
+    return max(value, typical, 0.3 * max(group), 1e-3)
+
+
+def _lowest(kind: str, name: str) -> float:
+    valid = KINDS[kind].parameter(name).valid
+    return {">= 0": 0.0, "> 0": 1e-9}.get(valid, -np.inf)
+
+
+def _tidy(effect: Effect) -> Effect:
+    """Phases within one turn."""
+    p = dict(effect.parameters)
+    for each in KINDS[effect.kind].parameters:
+        if each.name == "phase" and "phase" in p:
+            p["phase"] = float(np.arctan2(np.sin(p["phase"]), np.cos(p["phase"])))
+    tidy = Effect(effect.kind, list(effect.at), p)
+    check_parameters(tidy, KINDS[effect.kind])
+    return tidy

@@ -1,0 +1,517 @@
+"""Measured motion of a mechanism, and what any effects leave of its equations unmet.
+
+For each episode the joints' positions are smoothed; the residual effort - ID(q, v, vd)
+of the scene with given effects is tested with bumps and divided by the noise that the
+positions have. What the other channels show of the same motion is tested beside it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from makebreak.gap.recording import Episode, Recording
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
+from makebreak.models.effects.measured_channels import acts_on
+from makebreak.models.effects.signature import Motion
+from makebreak.models.scene import Scene
+from makebreak.systems.numerics.smoother import smooth
+from makebreak.systems.numerics.weak_form import Bumps, make_bumps
+
+SENSED = ("joint_offset", "sensor_delay", "clock_skew", "sensor_bias")
+PATH = (
+    "input_delay",
+    "actuator_gain",
+    "actuator_bias",
+    "actuator_saturation",
+    "actuator_lag",
+)
+# A joint that stands still may be held by any friction: what its equation says then is
+# given this share of its rms effort as uncertainty, by the share of time at rest.
+REST_SPEED, REST_SHARE, REST_EFFORT = 0.005, 0.04, 0.3
+MODEL_ERROR = 2e-4  # Of a joint's rms effort: what smoothing and sampling leave.
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """One episode as measured. Rows: the table's; middles: of the intervals between.
+
+    q, v, vd: smoothed positions on `grid` (rows and middles), (n_grid, n_v).
+    """
+
+    recording: str
+    episode: int
+    time: np.ndarray  # (n,) [s]
+    middle: np.ndarray  # (n_mid,) Where the equations are evaluated [s].
+    step: np.ndarray  # (n_mid,) How long each of these stands for [s].
+    row: np.ndarray  # (n_mid,) Whose command holds there.
+    grid: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    vd: np.ndarray
+    commands: dict[str, np.ndarray]  # Held, (n,).
+    samples: dict[str, np.ndarray]  # Measured, (n,), NaN where missing.
+    bumps: Bumps  # On the middles.
+    row_bumps: Bumps  # On the rows.
+    block: np.ndarray  # (n_bumps,) Number of the block of time.
+    train: np.ndarray  # (n_bumps,)
+
+
+@dataclass(frozen=True)
+class RowName:
+    """What an entry of the residual is."""
+
+    what: str  # "effort", "velocity" or "effort_measured"
+    joint: str
+
+
+class _Dynamics(SceneDynamics):
+    """Remembers how bodies moved: a dozen kinds ask for it."""
+
+    def __init__(self, scene: Scene):
+        super().__init__(scene)
+        self._moved: dict = {}
+
+    def body_motion(self, body, q, v, vd):
+        key = (int(body.index()), id(q), id(v), id(vd))
+        if key not in self._moved:
+            # The arrays are kept as well, so that no other gets their id.
+            self._moved[key] = (super().body_motion(body, q, v, vd), q, v, vd)
+        return self._moved[key][0]
+
+
+class InverseModel:
+    """Residuals of a mechanism all of whose joints have measured positions.
+
+    Args: bump_sec: width of the test functions. block_sec: every third block of time
+        of this length is held out.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        recordings: Sequence[Recording],
+        bump_sec: float = 0.2,
+        block_sec: float = 1.2,
+        most_sec: float = 60.0,
+    ):
+        self.scene = scene
+        self.dynamics = _Dynamics(scene)
+        plant = self.dynamics.plant
+        self.joints = [
+            full_name(plant, j)
+            for j in sorted(one_dof_joints(plant), key=lambda j: j.velocity_start())
+        ]
+        self.recordings = list(recordings)
+        self.noise = self._noise("position")
+        self.velocity_noise = self._noise("velocity")
+        self.effort_noise = self._noise("effort_measured")
+        self.has = {
+            what: [all(f"{j}.{what}" in r for r in recordings) for j in self.joints]
+            for what in (
+                "velocity", "effort_measured", "effort_command", "position_command",
+                "velocity_command",
+            )
+        }  # fmt: skip
+        # Of a joint without a command the measured effort stands in for it.
+        self.by_measured = [
+            m and not (c or p)
+            for m, c, p in zip(
+                self.has["effort_measured"],
+                self.has["effort_command"],
+                self.has["position_command"],
+                strict=True,
+            )
+        ]
+        self.tracks: list[Track] = []
+        seconds = 0.0
+        for recording in recordings:
+            for episode in recording.episodes:
+                if seconds > most_sec:
+                    break
+                track = self._track(recording, episode, bump_sec, block_sec)
+                if track is not None:
+                    self.tracks.append(track)
+                    seconds += track.time[-1] - track.time[0]
+        if not self.tracks:
+            raise ValueError(
+                f"no episode of the recordings is long enough for windows of "
+                f"{bump_sec} s"
+            )
+        self.period = float(
+            np.median(np.concatenate([np.diff(t.time) for t in self.tracks]))
+        )
+        self._whiteners = self._noise_of_rows()
+        self._base: np.ndarray | None = None
+        self._motions: list[Motion] | None = None
+        self._needed: dict[int, np.ndarray] = {}  # Effort of each track's own motion.
+
+    def base(self) -> np.ndarray:
+        """The residual of the scene as it came."""
+        if self._base is None:
+            self._base = self.residual()
+        return self._base
+
+    # ----- What was measured
+
+    def _noise(self, what: str) -> np.ndarray:
+        out = np.zeros(len(self.joints))
+        for i, joint in enumerate(self.joints):
+            found = [
+                r.channels[f"{joint}.{what}"].noise
+                for r in self.recordings
+                if f"{joint}.{what}" in r
+            ]
+            out[i] = max(found, default=0.0)
+        return out
+
+    def _track(
+        self, recording: Recording, episode: Episode, bump_sec, block_sec
+    ) -> Track | None:
+        time = recording.time[episode.rows]
+        if time[-1] - time[0] < 2.0 * bump_sec:
+            return None
+        period = float(np.median(np.diff(time)))
+        step = np.append(np.diff(time), period)
+        middle = time + 0.5 * step
+        grid = np.concatenate([time, middle])
+        order = np.argsort(grid)
+        grid = grid[order]
+        n = len(self.joints)
+        q, v, vd = (np.empty((len(grid), n)) for _ in range(3))
+        for i, joint in enumerate(self.joints):
+            y = recording[f"{joint}.position"][episode.rows]
+            if np.isfinite(y).sum() < 6:
+                return None
+            samples = np.concatenate([y, np.full(len(time), np.nan)])[order]
+            x = smooth(grid, samples, self.noise[i]).x
+            q[:, i], v[:, i], vd[:, i] = x.T
+        held = {}
+        for channel in recording.commands():
+            held[channel.name] = recording.held(channel.name)[episode.rows]
+        samples = {c.name: c.values[episode.rows] for c in recording.measured()}
+        # Nothing is known before the first command, and little at the ends.
+        known = np.ones(len(time), bool)
+        for value in held.values():
+            known &= np.isfinite(value)
+        holes = [(time[k], time[k] + step[k]) for k in np.flatnonzero(~known)]
+        long = np.flatnonzero(step > max(4.0 * period, 0.1 * bump_sec))
+        holes += [(time[k], time[k] + step[k]) for k in long]
+        holes.append((time[0] - 1.0, time[0] + 0.05))
+        holes.append((time[-1] - 0.05, time[-1] + 1.0))
+        fine = _around_reversals(time, step, grid, v)
+        row = np.searchsorted(time, fine[:-1] + 1e-12, "right") - 1
+        middle, step = 0.5 * (fine[1:] + fine[:-1]), np.diff(fine)
+        bumps = make_bumps(middle, step, bump_sec, 0.5 * bump_sec, holes)
+        about = np.append(np.diff(time, prepend=time[0])[1:], period)
+        row_bumps = make_bumps(time, about, bump_sec, 0.5 * bump_sec, holes)
+        m = min(len(bumps.centre), len(row_bumps.centre))
+        if m < 2:
+            return None
+        bumps, row_bumps = _first(bumps, m), _first(row_bumps, m)
+        block = ((bumps.centre - time[0]) / block_sec).astype(int)
+        return Track(
+            recording.name, episode.number, time, middle, step, row, grid, q, v, vd,
+            held, samples, bumps, row_bumps, block, block % 3 != 1,
+        )  # fmt: skip
+
+    # ----- Residuals
+
+    def motions(self) -> list[Motion]:
+        """Of each track, as measured."""
+        if self._motions is None:
+            self._motions = [self.motion(track) for track in self.tracks]
+        return self._motions
+
+    def motion(self, track: Track, effects: Sequence[Effect] = ()) -> Motion:
+        """The true motion at the middles, if the effects on measurement are these."""
+        t = track.middle
+        n = len(self.joints)
+        q, v, vd = (np.empty((len(t), n)) for _ in range(3))
+        for i, joint in enumerate(self.joints):
+            scale, late, bias = _sensing(effects, f"{joint}.position")
+            at = t * scale + late
+            q[:, i], v[:, i], vd[:, i] = self._at(track, i, at)
+            q[:, i] -= bias
+            v[:, i] *= scale
+            vd[:, i] *= scale**2
+        effort = self._effort(track, effects, q, v)
+        jerk = np.gradient(vd, t, axis=0)
+        return Motion(t, q, v, vd, effort, jerk)
+
+    def _at(self, track: Track, i: int, t: np.ndarray):
+        """Smoothed state of a joint at any times, as cubics between the grid's."""
+        grid = track.grid
+        k = np.clip(np.searchsorted(grid, t, "right") - 1, 0, len(grid) - 2)
+        h = grid[k + 1] - grid[k]
+        s = np.clip((t - grid[k]) / h, 0.0, 1.0)
+        a, b = track.vd[k, i], track.vd[k + 1, i]
+        d = s * h
+        vd = a + (b - a) * s
+        v = track.v[k, i] + a * d + 0.5 * (b - a) / h * d**2
+        q = track.q[k, i] + track.v[k, i] * d + 0.5 * a * d**2 + (b - a) / h * d**3 / 6
+        return q, v, vd
+
+    def _effort(self, track: Track, effects, q, v) -> np.ndarray:
+        """(n, n_v) mean effort over each interval, after the path."""
+        out = np.zeros_like(q)
+        act = self.scene.actuation
+        for i, joint in enumerate(self.joints):
+            delay, gain, bias, limit, lag = _path(effects, joint)
+            if self.has["position_command"][i] and act.type == "pd":
+                k = act.joints.index(joint)
+                wanted = _mean_held(
+                    track, track.commands[f"{joint}.position_command"], delay
+                )
+                seen = q[:, i] + _sensing(effects, f"{joint}.position")[2]
+                u = act.kp[k] * (wanted - seen)
+                if f"{joint}.velocity_command" in track.commands:
+                    rate = track.commands[f"{joint}.velocity_command"]
+                    u = u + act.kd[k] * (_mean_held(track, rate, delay) - v[:, i])
+                else:
+                    u = u - act.kd[k] * v[:, i]
+            elif self.has["effort_command"][i]:
+                u = _mean_held(track, track.commands[f"{joint}.effort_command"], delay)
+            elif self.by_measured[i]:
+                y = track.samples[f"{joint}.effort_measured"]
+                good = np.isfinite(y)
+                t = track.middle - delay
+                u = np.interp(t, track.time[good], y[good])
+            else:
+                continue
+            u = np.clip(gain * u + bias, -limit, limit)
+            if lag > 0.0:
+                u = _mean_lagged(track.step, u, lag)
+            out[:, i] = u
+        return out
+
+    def _noise_of_rows(self) -> list[dict[str, np.ndarray]]:
+        """For each track: inverse square roots of the covariance of each bump's
+        residual efforts, and standard deviations of the other channels'."""
+        size = np.concatenate([self._effort(t, (), *self._qv(t)) for t in self.tracks])
+        rms = np.sqrt(np.mean(size**2, axis=0))
+        rms = np.maximum(rms, 0.1 * rms.max())
+        kp, kd = np.zeros(len(self.joints)), np.zeros(len(self.joints))
+        if self.scene.actuation.type == "pd":
+            for k, joint in enumerate(self.scene.actuation.joints):
+                i = self.joints.index(joint)
+                kp[i], kd[i] = self.scene.actuation.kp[k], self.scene.actuation.kd[k]
+        out = []
+        for track in self.tracks:
+            q, v = self._qv(track)
+            rest = track.bumps.mean((np.abs(v) < REST_SPEED).astype(float))
+            held = np.where(rest > REST_SHARE, rest, 0.0) * REST_EFFORT * rms
+            centre = np.clip(
+                np.searchsorted(track.middle, track.bumps.centre), 0, len(q) - 1
+            )
+            period = float(np.median(np.diff(track.time)))
+            g2 = track.bumps.position_noise_gain(period)
+            g0 = track.bumps.noise_gain(period)
+            eye = np.eye(len(self.joints))
+            L = np.empty((len(centre), *eye.shape))
+            direct = (kp * self.noise * g0) ** 2 + (MODEL_ERROR * rms) ** 2
+            direct += np.array(self.by_measured) * (self.effort_noise * g0) ** 2
+            for b, k in enumerate(centre):
+                M = self._mass_matrix(q[k])
+                C = (M * (g2 * self.noise) ** 2) @ M.T + np.diag(direct + held[b] ** 2)
+                L[b] = np.linalg.inv(np.linalg.cholesky(C))
+            # The smoothed velocity's own error, as over one bump.
+            own = self.noise * np.sqrt(period * 12.0 / track.bumps.width**3)
+            v_std = np.hypot(self.velocity_noise * g0, own)
+            out.append(
+                {
+                    "effort": L,
+                    "velocity": np.maximum(v_std, 1e-12),
+                    "effort_measured": np.maximum(
+                        np.hypot(self.effort_noise * g0, MODEL_ERROR * rms), 1e-12
+                    ),
+                }
+            )
+        return out
+
+    def _qv(self, track):
+        both = [self._at(track, i, track.middle)[:2] for i in range(len(self.joints))]
+        return tuple(np.stack(x, axis=1) for x in zip(*both, strict=True))
+
+    def _mass_matrix(self, q) -> np.ndarray:
+        plant, context = self.dynamics.plant, self.dynamics._context
+        plant.SetPositions(context, q)
+        return plant.CalcMassMatrix(context)
+
+    def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
+        """(m,) residual over its noise, of the scene with these effects added."""
+        ours = [e for e in effects if e.kind not in SENSED + PATH]
+        dynamics = self.dynamics
+        if ours:
+            dynamics = SceneDynamics(
+                replace(self.scene, effects=[*self.scene.effects, *ours])
+            )
+        moved = any(
+            e.kind in SENSED
+            and any(acts_on(e, KINDS[e.kind].channel, f"{j}.position")
+                    for j in self.joints)
+            for e in effects
+        )  # fmt: skip
+        parts = []
+        for k, (track, white) in enumerate(
+            zip(self.tracks, self._whiteners, strict=True)
+        ):
+            motion = self.motion(track, effects)
+            if ours or moved:
+                needed = motion.effort - dynamics.residual(motion)
+            else:  # Same motion, same model.
+                if k not in self._needed:
+                    self._needed[k] = motion.effort - dynamics.residual(motion)
+                needed = self._needed[k]
+            r = track.bumps.mean(motion.effort - needed)
+            parts.append(
+                self._stacked(track, white, r, self._other_rows(track, effects, motion))
+            )
+        return np.concatenate(parts)
+
+    def columns_of(self, efforts: Sequence[np.ndarray]) -> np.ndarray:
+        """(m, k) from columns of the residual effort at the middles of each track,
+        (n, n_v, k)."""
+        parts = []
+        for track, white, columns in zip(
+            self.tracks, self._whiteners, efforts, strict=True
+        ):
+            mean = track.bumps.mean(columns)
+            parts.append(self._stacked(track, white, mean, None))
+        return np.concatenate(parts)
+
+    def _other_rows(self, track, effects, motion) -> dict[str, np.ndarray]:
+        out = {}
+        for i, joint in enumerate(self.joints):
+            if self.has["velocity"][i]:
+                name = f"{joint}.velocity"
+                scale, late, bias = _sensing(effects, name)
+                p_scale, p_late, _ = _sensing(effects, f"{joint}.position")
+                true = (track.time - late) / scale
+                at = true * p_scale + p_late
+                seen = p_scale * self._at(track, i, at)[1] + bias
+                out[name] = _masked(track, track.samples[name] - seen)
+            if self.has["effort_measured"][i] and not self.by_measured[i]:
+                name = f"{joint}.effort_measured"
+                u = np.interp(track.time, track.middle, motion.effort[:, i])
+                out[name] = _masked(track, track.samples[name] - u)
+        return out
+
+    def _stacked(self, track, white, efforts, others) -> np.ndarray:
+        """Rows of one track: bump by bump, efforts of all joints, then the others."""
+        shape = efforts.shape[2:]
+        e = np.einsum("bij,bj...->bi...", white["effort"], efforts)
+        parts = [e]
+        for what in ("velocity", "effort_measured"):
+            for i, joint in enumerate(self.joints):
+                if (what, joint) not in self._other_names():
+                    continue
+                if others is None:
+                    parts.append(np.zeros((len(e), 1, *shape)))
+                else:
+                    y = others[f"{joint}.{what}"] / white[what][i]
+                    parts.append(y[:, None])
+        return np.concatenate(parts, axis=1).reshape(-1, *shape)
+
+    def _other_names(self) -> list[tuple[str, str]]:
+        v = [("velocity", j) for i, j in enumerate(self.joints)
+             if self.has["velocity"][i]]  # fmt: skip
+        u = [
+            ("effort_measured", j)
+            for i, j in enumerate(self.joints)
+            if self.has["effort_measured"][i] and not self.by_measured[i]
+        ]
+        return v + u
+
+    # ----- Rows
+
+    def names(self) -> list[tuple[str, str]]:
+        """(what, joint) of the entries of one bump."""
+        return [("effort", joint) for joint in self.joints] + self._other_names()
+
+    def train(self) -> np.ndarray:
+        """(m,) booleans."""
+        k = len(self.names())
+        return np.concatenate([np.repeat(t.train, k) for t in self.tracks])
+
+
+def _first(bumps: Bumps, m: int) -> Bumps:
+    return Bumps(bumps.w[:m], bumps.dw[:m], bumps.centre[:m], bumps.width)
+
+
+def _masked(track: Track, difference: np.ndarray) -> np.ndarray:
+    """Means over bumps of what is there; 0 where next to nothing is."""
+    good = np.isfinite(difference)
+    weight = track.row_bumps.mean(good.astype(float))
+    total = track.row_bumps.mean(np.where(good, difference, 0.0))
+    return np.where(weight > 0.3, total / np.maximum(weight, 0.3), 0.0)
+
+
+def _sensing(effects: Sequence[Effect], channel: str) -> tuple[float, float, float]:
+    """(1 + skew, delay, bias) of a channel."""
+    scale, late, bias = 1.0, 0.0, 0.0
+    for effect in effects:
+        if effect.kind not in SENSED or not acts_on(
+            effect, KINDS[effect.kind].channel, channel
+        ):
+            continue
+        p = effect.parameters
+        late += p.get("delay", 0.0)
+        scale += p.get("skew", 0.0)
+        bias += p.get("bias", 0.0) + p.get("offset", 0.0)
+    return scale, late, bias
+
+
+def _path(effects: Sequence[Effect], joint: str):
+    delay, gain, bias, limit, lag = 0.0, 1.0, 0.0, np.inf, 0.0
+    for effect in effects:
+        if effect.kind not in PATH:
+            continue
+        if joint not in effect.at and joint.split(".")[0] not in effect.at:
+            continue
+        p = effect.parameters
+        delay += p.get("delay", 0.0)
+        gain *= p.get("gain", 1.0)
+        bias += p.get("bias", 0.0)
+        limit = min(limit, p.get("limit", np.inf))
+        lag += p.get("time_constant", 0.0)
+    return delay, gain, bias, limit, lag
+
+
+def _mean_held(track: Track, command: np.ndarray, delay: float) -> np.ndarray:
+    """(n_mid,) mean over each interval of a command that arrives late."""
+    u = np.where(np.isfinite(command), command, 0.0)[track.row]
+    if delay == 0.0:
+        return u
+    edges = np.append(track.time[0], track.time[0] + np.cumsum(track.step))
+    total = np.concatenate([[0.0], np.cumsum(u * track.step)])
+    # Before the first command: that command.
+    at = edges - delay
+    value = np.interp(at, edges, total) + np.minimum(at - edges[0], 0.0) * u[0]
+    return np.diff(value) / track.step
+
+
+def _around_reversals(time, step, grid, v) -> np.ndarray:
+    """Edges of intervals: the rows' own, in eight parts where a joint reverses, so that
+    the instant at which friction turns round is known well."""
+    edges = np.append(time, time[-1] + step[-1])
+    speed = np.stack([np.interp(edges, grid, each) for each in v.T], axis=1)
+    turns = (np.sign(speed[1:]) != np.sign(speed[:-1])).any(axis=1)
+    turns |= np.append(turns[1:], False) | np.append(False, turns[:-1])
+    parts = [
+        edges[k] + (edges[k + 1] - edges[k]) * np.arange(8) / 8.0
+        for k in np.flatnonzero(turns)
+    ]
+    return np.unique(np.concatenate([edges, *parts]))
+
+
+def _mean_lagged(step: np.ndarray, u: np.ndarray, lag: float) -> np.ndarray:
+    """(n,) means of y' = (u - y)/lag over the intervals, u held in each."""
+    keep = np.exp(-step / lag)
+    y = np.empty(len(u) + 1)
+    y[0] = u[0]
+    for k in range(len(u)):
+        y[k + 1] = keep[k] * y[k] + (1.0 - keep[k]) * u[k]
+    return u - lag * np.diff(y) / step

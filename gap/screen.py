@@ -1,0 +1,264 @@
+"""Every effect of the catalogue that could act in a scene, ranked by what it explains."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from makebreak.gap.inverse import SENSED, InverseModel
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect, check_parameters
+from makebreak.systems.numerics.selection import Columns, LinearFit, Screen
+
+# How well links are known where the scene does not say [-], [m].
+LINK_MASS, LINK_COM = 0.03, 0.002
+# Kinds that are other kinds with more parameters: accepted only for a clear gain.
+NESTED = {
+    "joint_stribeck_friction": ("joint_coulomb_friction", "joint_viscous_damping"),
+    "joint_spring": ("actuator_bias",),
+    "sinusoidal_force": ("constant_force",),
+}
+_DELAYS = (0.004, 0.01, 0.02, 0.04)
+_HIDDEN = ("object_mass", "object_com", "object_inertia")  # Links': background.
+_SPEEDS = (0.03, 0.06, 0.1, 0.2)
+_RIPPLES = tuple(float(n) for n in range(2, 25)) + (30.0, 36.0, 48.0, 60.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A kind at a place: alternatives of linear columns, and how they are read."""
+
+    kind: str
+    at: tuple[str, ...]
+    size: int  # Parameters that a fit chooses.
+    columns: tuple[Columns, ...]  # (m, k) each, over the noise.
+    to_parameters: tuple[Callable, ...]
+    fixed: tuple[str, ...] = ()  # Parameters that a fit leaves at neutral.
+
+    @property
+    def name(self) -> str:
+        return f"{self.kind} at {', '.join(self.at)}"
+
+
+@dataclass(frozen=True, eq=False)
+class Ranked:
+    """A candidate with its best alternative's fit."""
+
+    candidate: Candidate
+    fit: LinearFit
+    effect: Effect
+    valid: bool
+
+
+def candidates(model: InverseModel, nuisance: np.ndarray) -> list[Candidate]:
+    """All that can be seen in the equations of motion.
+
+    Args: nuisance (m, n_b), their columns.
+    """
+    train = model.train()
+
+    def of(x: np.ndarray) -> Columns:
+        return Columns(x, nuisance, train)
+
+    dynamics, motions = model.dynamics, model.motions()
+    found: list[Candidate] = []
+    for kind, entry in KINDS.items():
+        if kind in _HIDDEN or entry.at in ("free body", "length", "pair", "ground"):
+            continue
+        if kind in SENSED:
+            found += _of_sensors(model, kind, of)
+            continue
+        if kind in ("input_delay", "actuator_lag"):
+            found += _of_delays(model, kind, of)
+            continue
+        if entry.signature is None:
+            continue
+        for at in dynamics.places(kind):
+            if entry.at == "base" and at == "world":
+                continue
+            if kind == "actuator_saturation" and not _driven(model, at):
+                continue
+            if kind == "sinusoidal_force" and at not in _links(model)[-3:]:
+                continue  # Nearer the base it moves less: the outer links tell.
+            grid = _grid(model, kind, at, motions)
+            groups = [dynamics.signatures(kind, [at], m, grid) for m in motions]
+            columns, readers = [], []
+            for same in zip(*groups, strict=True):
+                columns.append(model.columns_of([s.columns for s in same]))
+                readers.append(same[0].to_parameters)
+            if not columns:
+                continue
+            if not any(np.abs(x).max(initial=0.0) > 0.0 for x in columns):
+                continue
+            size = len(entry.parameters)
+            if kind == "body_drag":  # Of its two, most bodies show one.
+                for k, other in ((0, "angular"), (1, "linear")):
+                    found.append(
+                        Candidate(
+                            kind, (at,), 1, (of(columns[0][:, [k]]),),
+                            (_one_of(readers[0], k),), (other,),
+                        )
+                    )  # fmt: skip
+            found.append(
+                Candidate(kind, (at,), size, tuple(map(of, columns)), tuple(readers))
+            )
+    return found
+
+
+def nuisances(model: InverseModel) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Columns (m, n_b) of the links' masses and centres of mass, prior standard
+    deviations in units of the coefficients, and names."""
+    said = model.scene.tolerance
+    share = float(said.get("link_mass", LINK_MASS))
+    reach = float(said.get("link_com_m", LINK_COM))
+    dynamics, motions = model.dynamics, model.motions()
+    columns, prior, names = [], [], []
+    for kind, size in (("object_mass", share), ("object_com", reach)):
+        for at in _links(model):
+            groups = [dynamics.signatures(kind, [at], m) for m in motions]
+            for same in zip(*groups, strict=True):
+                x = model.columns_of([s.columns for s in same])
+                now = dynamics.now(kind, [at])
+                for k, unknown in enumerate(same[0].unknowns):
+                    if not np.abs(x[:, k]).max(initial=0.0) > 0.0:
+                        continue
+                    columns.append(x[:, k])
+                    prior.append(
+                        size * now["mass"] if kind == "object_mass" else size
+                    )
+                    names.append(f"{kind} of {at}, {unknown}")
+    # A mass is known to its share, whatever unit its signature has.
+    if not columns:
+        return np.zeros((len(model.train()), 0)), np.zeros(0), []
+    return np.stack(columns, axis=1), np.array(prior), names
+
+
+def rank(screen: Screen, found: Sequence[Candidate]) -> list[Ranked]:
+    """Candidates, the least held-out error first. Of alternatives that which fits the
+    training rows best is judged."""
+    ranked = []
+    for candidate in found:
+        best = None
+        for columns, reader in zip(
+            candidate.columns, candidate.to_parameters, strict=True
+        ):
+            fit = screen.fit(columns)
+            if best is None or fit.train < best[0].train:
+                best = (fit, reader)
+        assert best is not None
+        effect = Effect(candidate.kind, list(candidate.at), best[1](best[0].c))
+        ranked.append(Ranked(candidate, best[0], effect, is_sane(effect)))
+    return sorted(ranked, key=lambda r: r.fit.score)
+
+
+def is_sane(effect: Effect) -> bool:
+    """Whether the parameters are allowed, and of a size that robots have."""
+    entry = KINDS[effect.kind]
+    try:
+        check_parameters(effect, entry)
+    except ValueError:
+        return False
+    for each in entry.parameters:
+        value = effect.parameters.get(each.name)
+        if value is None or each.name == "phase":
+            continue
+        width = each.high - each.low
+        if not each.low - 0.01 * width <= value <= each.high + 0.01 * width:
+            return False
+    return not (
+        effect.kind == "joint_stribeck_friction"
+        and effect.parameters["static"] < effect.parameters["coulomb"]
+    )
+
+
+def _links(model: InverseModel) -> list[str]:
+    return [
+        at
+        for at in model.dynamics.places("body_drag")
+        if _mass(model, at) > 0.0
+    ]
+
+
+def _mass(model: InverseModel, at: str) -> float:
+    try:
+        return model.dynamics.now("object_mass", [at])["mass"]
+    except ValueError:
+        return 0.0
+
+
+def _driven(model: InverseModel, joint: str) -> bool:
+    i = model.joints.index(joint)
+    return model.has["effort_command"][i] or model.has["position_command"][i]
+
+
+def _one_of(reader: Callable, k: int) -> Callable:
+    def read(c):
+        both = np.zeros(2)
+        both[k] = c[0]
+        return reader(both)
+
+    return read
+
+
+def _grid(model: InverseModel, kind: str, at: str, motions):
+    if kind == "joint_stribeck_friction":
+        return {"stribeck_velocity": _SPEEDS}
+    if kind == "torque_ripple":
+        return {"periods_per_rev": _RIPPLES}
+    if kind == "actuator_saturation":
+        i = model.joints.index(at)
+        u = np.concatenate([np.abs(m.effort[:, i]) for m in motions])
+        return {"limit": list(np.linspace(0.4, 0.97, 20) * u.max())}
+    if kind == "sinusoidal_force":
+        return {"frequency": list(np.arange(0.5, 5.01, 0.05))}
+    return None
+
+
+def _of_delays(model: InverseModel, kind: str, of) -> list[Candidate]:
+    """Of commands: by the difference that a delay makes, for a few delays."""
+    name = "delay" if kind == "input_delay" else "time_constant"
+    models = dict.fromkeys(j.split(".")[0] for j in model.joints)
+    driven = [j for j in model.joints if _driven(model, j)]
+    places = [(m,) for m in models if any(j.startswith(f"{m}.") for j in driven)]
+    if len(driven) > 1:
+        places += [(j,) for j in driven]
+    return [c for at in places if (c := _secant(model, kind, at, name, of)) is not None]
+
+
+def _of_sensors(model: InverseModel, kind: str, of) -> list[Candidate]:
+    joints = model.joints
+    models = tuple(dict.fromkeys(j.split(".")[0] for j in joints))
+    name = {"joint_offset": "offset", "sensor_bias": "bias", "clock_skew": "skew"}
+    velocities = tuple(
+        f"{j}.velocity" for i, j in enumerate(joints) if model.has["velocity"][i]
+    )
+    positions = tuple(f"{j}.position" for j in joints)
+    if kind == "joint_offset":
+        places = [(j,) for j in joints]
+    elif kind == "sensor_bias":
+        places = [(c,) for c in velocities]
+    elif kind == "clock_skew":
+        places = [models]
+    else:
+        places = [positions, velocities, *((c,) for c in velocities), models]
+    unique = [p for p in dict.fromkeys(places) if p]
+    found = [_secant(model, kind, at, name.get(kind, "delay"), of) for at in unique]
+    return [c for c in found if c is not None]
+
+
+def _secant(model: InverseModel, kind: str, at, name: str, of) -> Candidate | None:
+    steps = {"offset": (1e-3,), "bias": (1e-3,), "skew": (1e-4,)}.get(name, _DELAYS)
+    if kind == "sensor_delay" and all(c.endswith(".velocity") for c in at):
+        steps = (0.01,)
+    base, columns = model.base(), []
+    for step in steps:
+        moved = model.residual([Effect(kind, list(at), {name: step})])
+        columns.append(((base - moved) / step)[:, None])
+
+    def read(c):
+        return {name: float(c[0])}
+
+    if not any(np.abs(x).max(initial=0.0) > 0.0 for x in columns):
+        return None
+    readers = (read,) * len(columns)
+    return Candidate(kind, tuple(at), 1, tuple(map(of, columns)), readers)

@@ -1,0 +1,198 @@
+"""Which effects a scene lacks: forward by held-out error, then backward."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from makebreak.gap.fit import Fitted, fit_effects
+from makebreak.gap.inverse import InverseModel
+from makebreak.gap.screen import NESTED, Candidate, Ranked, is_sane, rank
+from makebreak.models.effects.kind import Effect
+from makebreak.systems.numerics.selection import (
+    NESTED_GAIN,
+    SAME,
+    Screen,
+    simplest,
+)
+
+MOST_EFFECTS = 4
+FLOOR = 1.15  # Rms over noise that noise alone may leave (its estimate is that good).
+# Laws are approximations (how dry friction turns round, how commands are held): errors
+# that differ by less than this share of the whole gap do not tell two models apart.
+PRECISION = 0.015
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """One effect as chosen. before, after: held-out error without and with it."""
+
+    effect: Effect
+    std: dict[str, float]
+    before: float
+    after: float
+    runner_up: str
+    margin: float
+    ties: tuple[Effect, ...]
+    fixed: tuple[str, ...]
+    size: int
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """The chosen effects, in the order added. start: with no effect; end: with all."""
+
+    choices: tuple[Choice, ...]
+    start: Fitted
+    end: Fitted
+    table: tuple[dict, ...] = field(default=())
+
+
+def select(
+    model: InverseModel,
+    nuisance: np.ndarray,
+    prior: np.ndarray,
+    found: Sequence[Candidate],
+    say: Callable[[str], None] = lambda text: None,
+) -> Selection:
+    """Greedy forward selection with a refit of all after each addition; then whatever
+    is not needed any more is dropped."""
+    train = model.train()
+    plain = Screen(model.base(), nuisance, prior, train)
+    start = current = fit_effects(model, plain, ())
+    chosen: list[dict] = []
+    table: list[dict] = []
+    while len(chosen) < MOST_EFFECTS and current.fit.held_out > FLOOR:
+        step = _forward(model, nuisance, prior, found, chosen, current, start, say)
+        if not chosen:
+            table = step["table"]
+        if step.get("fitted") is None:
+            break
+        chosen.append(step)
+        current = step["fitted"]
+    chosen, current = _backward(model, nuisance, prior, chosen, current, start)
+    choices = tuple(
+        Choice(
+            effect, std, c["before"], c["after"], c["runner_up"], c["margin"],
+            c["ties"], c["fixed"], c["size"],
+        )
+        for c, effect, std in zip(chosen, current.effects, current.std, strict=True)
+    )  # fmt: skip
+    return Selection(choices, start, current, tuple(table))
+
+
+def _forward(model, nuisance, prior, found, chosen, current, start, say) -> dict:
+    train = model.train()
+    taken = {(c["effect"].kind, tuple(c["effect"].at)) for c in chosen}
+    open_ = [c for c in found if (c.kind, c.at) not in taken]
+    screen = Screen(current.r, nuisance, prior, train)
+    ranked = _sane(rank(screen, open_))
+    if not ranked:
+        return {"table": []}
+    # What even the best leaves is no noise: nuisances are weighed against it.
+    for _ in range(2):
+        screen = Screen(current.r, nuisance, prior, train, ranked[0].fit.train)
+        ranked = _sane(rank(screen, open_))
+    base = screen.judge(current.r)
+    table = [
+        {"kind": r.candidate.kind, "at": list(r.candidate.at),
+         "score": r.fit.score / max(base.score, 1e-12),
+         "parameters": dict(r.effect.parameters)}
+        for r in ranked[:15]
+    ]  # fmt: skip
+    short = _shortlist(ranked, base.score)
+    if not short:
+        return {"table": table}
+    fitted = []
+    for each in short:
+        trial = [*[c["effect"] for c in chosen], each.effect]
+        fixed = [*[c["fixed"] for c in chosen], each.candidate.fixed]
+        try:
+            fitted.append(fit_effects(model, screen, trial, fixed))
+        except ValueError:
+            fitted.append(None)
+        say(f"  {each.candidate.name}: {fitted[-1] and fitted[-1].score:.3g}")
+    sound = [
+        (f, r) for f, r in zip(fitted, short, strict=True)
+        if f is not None and is_sane(f.effects[-1]) and np.isfinite(f.score)
+    ]  # fmt: skip
+    if not sound:
+        return {"table": table}
+    blur = PRECISION * start.score
+
+    def error(score: float) -> float:
+        return float(np.hypot(score, blur))
+
+    errors = [error(f.score) for f, _ in sound]
+    sizes = [r.candidate.size for _, r in sound]
+    pick = simplest(errors, sizes, SAME)
+    fit, best = sound[pick]
+    # A model inside a bigger one stays unless the bigger gains clearly.
+    for k, (inner, r) in enumerate(sound):
+        inside = r.candidate.kind in NESTED.get(best.candidate.kind, ())
+        near = error(inner.score) <= (1.0 + NESTED_GAIN) * error(fit.score)
+        if inside and near and r.candidate.at == best.candidate.at:
+            pick, fit, best = k, inner, r
+            break
+    if not error(fit.score) < (1.0 - NESTED_GAIN) * error(base.score):
+        return {"table": table}
+    others = [(f, r) for k, (f, r) in enumerate(sound) if k != pick]
+    ties = tuple(
+        f.effects[-1]
+        for f, r in others
+        if error(f.score) <= (1.0 + SAME) * error(fit.score)
+        and best.candidate.kind not in NESTED.get(r.candidate.kind, ())
+        and not (r.candidate.kind == best.candidate.kind)
+    )
+    runner = min(others, key=lambda o: o[0].score, default=None)
+    return {
+        "table": table,
+        "fitted": fit,
+        "effect": fit.effects[-1],
+        "fixed": tuple(best.candidate.fixed),
+        "size": best.candidate.size,
+        "before": base.score,
+        "after": fit.score,
+        "ties": ties,
+        "runner_up": runner[1].candidate.name if runner else "",
+        "margin": runner[0].score / fit.score - 1.0 if runner else np.inf,
+    }
+
+
+def _sane(ranked: list[Ranked]) -> list[Ranked]:
+    return [r for r in ranked if r.valid]
+
+
+def _shortlist(ranked: list[Ranked], base: float) -> list[Ranked]:
+    """Those worth an exact fit: near the best, at most two of a kind."""
+    best = ranked[0].fit.score
+    if best > 0.95 * base:
+        return []
+    short: list[Ranked] = []
+    for each in ranked:
+        of_kind = sum(r.candidate.kind == each.candidate.kind for r in short)
+        near = each.fit.score < max(1.6 * best, best + 0.15 * (base - best))
+        if near and of_kind < 2 and len(short) < 7:
+            short.append(each)
+    return short
+
+
+def _backward(model, nuisance, prior, chosen, current, start):
+    """Drops effects without which the error hardly grows, the least needed first."""
+    while len(chosen) > 1:
+        screen = Screen(
+            current.r, nuisance, prior, model.train(), current.fit.train
+        )
+        now = screen.judge(current.r).score
+        without = []
+        for k in range(len(chosen)):
+            rest = [e for i, e in enumerate(current.effects) if i != k]
+            fixed = [c["fixed"] for i, c in enumerate(chosen) if i != k]
+            without.append(fit_effects(model, screen, rest, fixed, 5))
+        k = int(np.argmin([w.score for w in without]))
+        blur = PRECISION * start.score
+        if np.hypot(now, blur) < (1.0 - NESTED_GAIN) * np.hypot(without[k].score, blur):
+            break
+        chosen = [c for i, c in enumerate(chosen) if i != k]
+        current = without[k]
+    return chosen, current
