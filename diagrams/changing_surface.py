@@ -20,10 +20,11 @@ from makebreak.diagrams.changing_contact import (
 from makebreak.diagrams.tabletop import (
     THREE_SURFACES,
     TOOL,
-    set_friction,
+    set_friction_by_place,
     set_tool,
     tool_half_width,
 )
+from makebreak.models.friction_zones import FrictionZone
 from makebreak.models.scene import Scene, read_scene
 from makebreak.systems.numerics.contact_task import ContactBelief, ExpectedContact
 from makebreak.systems.numerics.motion_pattern import (
@@ -32,8 +33,12 @@ from makebreak.systems.numerics.motion_pattern import (
     segment_time,
 )
 
-SURFACES = ("surface_1", "surface_2", "surface_3")
-SEAM_X, SEAM_Y = 0.5, 0.0  # Where they meet [m].
+SEAM_X, SEAM_Y = 0.5, 0.0  # Where the surfaces meet [m].
+AREAS = [
+    FrictionZone(x=[0.0, SEAM_X], y=[-1.0, SEAM_Y]),
+    FrictionZone(x=[0.0, SEAM_X], y=[SEAM_Y, 1.0]),
+    FrictionZone(x=[SEAM_X, 1.0], y=[-1.0, 1.0]),
+]
 START = (0.42, -0.16, 0.195)  # Of the tip in the scene [m].
 DOWN = np.array([0.0, 0.0, -1.0])
 # The path on the surfaces [m]; three points: an arc.
@@ -107,7 +112,7 @@ def make_task(config: ChangingSurfaceConfig) -> SurfaceTask:
     for scene in (model, world):
         set_tool(scene, config.tool)
     friction = draw_friction(rng)
-    set_friction(world, dict(zip(SURFACES, friction.tolist(), strict=True)))
+    set_friction_by_place(world, "surfaces", friction.tolist(), AREAS)
     forces = config.normal_force * rng.uniform(*FORCE, size=len(PATH))
     contact = ExpectedContact(
         np.array([START[0], START[1], half]), 1e-6 * np.eye(3), DOWN, segment=0

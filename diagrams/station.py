@@ -249,5 +249,11 @@ def make_control_plant(
         and not (effect.kind in KINDS and KINDS[effect.kind].hidden_state)
         and effect.kind != "joint_viscous_damping"
     ]
-    part = replace(scene, directives=directives, initial=initial, effects=effects)
+    part = replace(
+        scene,
+        directives=directives,
+        initial=initial,
+        effects=effects,
+        friction_zones=[],
+    )
     return load_scene(part, DiagramBuilder()).plant

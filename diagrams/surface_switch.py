@@ -23,9 +23,11 @@ from makebreak.diagrams.tabletop import (
     TOOL,
     position,
     set_friction,
+    set_friction_by_place,
     set_tool,
     tool_half_width,
 )
+from makebreak.models.friction_zones import FrictionZone
 from makebreak.models.scene import Scene, read_scene
 from makebreak.systems.numerics.contact_task import (
     IMPACTLESS,
@@ -109,9 +111,9 @@ def make_task(config: SurfaceSwitchConfig) -> SwitchTask:
     for scene in (model, world):
         set_tool(scene, config.tool)
     friction = np.array([rng.uniform(*span) for span in (LOW, HIGH, WALL)])
-    names = ("surface_1", "surface_2", "red_block", "stop")
-    values = friction[[0, 1, 2, 2]].tolist()
-    set_friction(world, dict(zip(names, values, strict=True)))
+    areas = [FrictionZone(y=[-1.0, SEAM_Y]), FrictionZone(y=[SEAM_Y, 1.0])]
+    set_friction_by_place(world, "surfaces", friction[:2].tolist(), areas)
+    set_friction(world, {name: float(friction[2]) for name in ("red_block", "stop")})
     pattern = make_pattern(config, half)
     # Where the tool really meets table, wall and stop: the pattern goes beyond.
     touch = [

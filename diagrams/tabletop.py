@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from makebreak.models.effects.kind import Effect
+from makebreak.models.friction_zones import FrictionZone
 from makebreak.models.scene import Scene, nearest
 
 MODELS = Path(__file__).resolve().parent.parent / "models"
@@ -113,3 +114,25 @@ def set_friction(scene: Scene, friction: dict[str, float]) -> None:
         scene.effects.append(
             Effect("contact_friction", [f"{name}~{TOOL}"], {"friction": float(value)})
         )
+
+
+def set_friction_by_place(
+    scene: Scene, name: str, friction: list[float], areas: list[FrictionZone]
+) -> None:
+    """Gives one flat object a friction with the tool that depends on the place.
+
+    Args: friction: of each area; areas: FrictionZones of which x and y count, and
+        which cover the object. The smallest friction becomes the object's own.
+    Raises: ValueError as set_friction.
+    """
+    least = float(min(friction))
+    set_friction(scene, {name: least})
+    for value, area in zip(friction, areas, strict=True):
+        if not value <= FRICTION_MAX:
+            raise ValueError(
+                f"friction of {name} is {value}, expected 0 to {FRICTION_MAX}"
+            )
+        if value > least:
+            scene.friction_zones.append(
+                FrictionZone(f"{name}~{TOOL}", float(value), area.x, area.y)
+            )

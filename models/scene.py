@@ -49,6 +49,7 @@ from makebreak.models.effects.kind import (
     check_parameters,
     find_bodies,
     find_joints,
+    find_pair,
     full_name,
     model_names,
     one_dof_joints,
@@ -65,6 +66,11 @@ from makebreak.models.effects.transmission import (
     coupling_name,
     coupling_numbers,
     motor_joint,
+)
+from makebreak.models.friction_zones import (
+    FrictionZone,
+    add_friction_zones,
+    check_zones,
 )
 
 ACTUATIONS = ("effort", "pd", "none")
@@ -115,6 +121,7 @@ class Scene:
     initial_of: dict[str, dict[str, InitialSection]] = field(default_factory=dict)
     tolerance: dict[str, float] = field(default_factory=dict)
     channels: dict[str, str] = field(default_factory=dict)
+    friction_zones: list[FrictionZone] = field(default_factory=list)
     effects: list[Effect] = field(default_factory=list)
 
 
@@ -372,6 +379,18 @@ def load_scene(
     if joint_forces is not None:
         forces.append(joint_forces.get_output_port())
     body_forces = _add_body_forces(effects, plant, builder)
+    if scene.friction_zones:
+        pair = Effect("contact_friction", [scene.friction_zones[0].at], {})
+        now = KINDS[pair.kind].now
+        assert now is not None
+        add_friction_zones(
+            scene.friction_zones,
+            find_pair(pair, plant),
+            now(pair, plant, scene_graph)["friction"],
+            plant,
+            builder,
+            None if body_forces is None else body_forces.get_output_port(),
+        )
     couplings = []
     for effect in effects:
         after = KINDS[effect.kind].after_finalize
@@ -713,6 +732,7 @@ def _check(scene: Scene) -> None:
         )
     for effect in scene.effects:
         _as_kind(effect)
+    check_zones(scene.friction_zones)
 
 
 def _parse(scene: Scene, effects: Sequence[Effect], plant: MultibodyPlant) -> None:

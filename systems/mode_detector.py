@@ -51,7 +51,8 @@ class ModeDetector(LeafSystem):
         transition (6,) of numerics/contact_task.py: changes from one surface to
             another; the time of the first departing sample, and of the decision.
             Making and losing contact is not one.
-        collecting (1,) 1 while a batch is collected: the arm should be stiff.
+        collecting (1,) 1 while a batch is collected, and from a hint until it is
+            confirmed or undone: the arm should be stiff.
         status (1,) 0: there is a feature; 1: the wrench is NaN or at its limit: all is
             held; 2: no feature, for the tool is free or does not slide.
 

@@ -299,7 +299,9 @@ def test_a_right_hint_is_taken_at_once_and_the_change_still_dated(place):
     k = next(i for i, (_, s, _) in enumerate(rows) if s > place)
     assert rows[k - 1][2].mode == 1
     for _, _, memory in rows[k:]:
-        assert memory.mode == 2 and not memory.collecting
+        # Stiff until the whole tool is across and the mode is confirmed.
+        assert memory.mode == 2
+        assert memory.collecting == (memory.transition[COUNT] == 0)
     transition = rows[-1][2].transition
     assert transition[COUNT] == 1
     assert (transition[FROM_MODE], transition[TO_MODE]) == (1.0, 2.0)
@@ -312,7 +314,9 @@ def test_a_hint_of_a_change_that_does_not_come_is_undone():
     rows = [row for row in rows if row[0] < 4.5]  # Only the way out.
     inside = [m for _, s, m in rows if 0.151 < s < 0.19]
     assert all(m.mode == 2 and m.stage == HINTED for m in inside)
+    assert all(m.collecting for m in inside)
     after = [m for _, s, m in rows if 0.2 < s < 0.3]
+    assert not any(m.collecting for m in after)
     assert all(m.mode == 1 and m.transition[COUNT] == 0 for m in after)
     # And the change that comes later is found as ever.
     assert rows[-1][2].mode == 2 and rows[-1][2].transition[COUNT] == 1

@@ -141,24 +141,24 @@ def test_nothing_touches_at_the_start_and_the_places_are_as_the_scene_says():
         np.testing.assert_allclose([d for _, _, d in touching], 1e-4, atol=1e-8)
 
 
-def test_plates_are_flush_and_meet():
+def test_surfaces_are_one_flat_body_where_they_meet():
     for scene, seam in ((THREE_SURFACES, (0.5, 0.0)), (SURFACE_SWITCH, (0.6, 0.0))):
         plant = make_control_plant(scene, TOOL)
         chain = serial_chain_of(plant, "tip")
         q = plant.GetPositions(plant.CreateDefaultContext())
         _, contacts = loaded(read_scene(scene))
-        # On the seam: all plates at once, and every corner as deep as it was pushed.
-        touching = contacts(reach(chain, q, np.array([*seam, BLOCK - 1e-4])))
-        assert {a if b == TOOL else b for a, b, _ in touching} == {
-            name for name in objects(read_scene(scene)) if name.startswith("surface")
-        }
-        np.testing.assert_allclose([d for *_, d in touching], 1e-4, atol=1e-8)
+        # A foot over a seam of two boxes would touch both of them.
+        for foot in (0.0, 0.012):
+            p = np.array([seam[0] - foot, seam[1] - foot, BLOCK - 1e-4])
+            touching = contacts(reach(chain, q, p))
+            assert [{a, b} for a, b, _ in touching] == [{TOOL, "surfaces"}] * 4
+            np.testing.assert_allclose([d for *_, d in touching], 1e-4, atol=1e-8)
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.1, 0.6, 1.0])
 def test_friction_with_the_tool_is_what_was_asked_for(friction):
-    scene = read_scene(THREE_SURFACES)
-    set_friction(scene, {"surface_1": friction, "surface_3": 0.25})
+    scene = read_scene(TABLETOP_WALLS)
+    set_friction(scene, {"table": friction, "blue_wall": 0.25})
     inside, _ = loaded(scene)
     inspector = inside.scene_graph.model_inspector()
 
@@ -169,10 +169,10 @@ def test_friction_with_the_tool_is_what_was_asked_for(friction):
         properties = inspector.GetProperties(geometry, Role.kProximity)
         return properties.GetProperty("material", "coulomb_friction").dynamic_friction()
 
-    for name, expected in (("surface_1", friction), ("surface_3", 0.25)):
+    for name, expected in (("table", friction), ("blue_wall", 0.25)):
         combined = 2 * mu(TOOL) * mu(name) / (mu(TOOL) + mu(name))
         np.testing.assert_allclose(combined, expected, atol=1e-12)
-    combined = 2 * mu(TOOL) * mu("surface_2") / (mu(TOOL) + mu("surface_2"))
+    combined = 2 * mu(TOOL) * mu("red_block") / (mu(TOOL) + mu("red_block"))
     np.testing.assert_allclose(combined, 0.3, atol=1e-12)
 
 

@@ -12,7 +12,7 @@ feature.
     TOUCHED   in contact anew: the mode is found out, after a run-in
     TRACKING  the feature stays at its reference
     COLLECTING  it has departed: a batch is collected, under high stiffness
-    HINTED    the mode was told beforehand and is being verified
+    HINTED    the mode was told beforehand and is being verified, as stiff
 
 A *departure* is a difference to the reference of TRIGGER force_noise / R in SUSTAINED
 samples in a row, or of half of it in the mean over about 50 ms. The time of the change
@@ -226,7 +226,7 @@ def detect(
             strays=0,
             features=memory.features[:0],
             forces=memory.forces[:0],
-            collecting=memory.collecting and memory.stage == COLLECTING,
+            collecting=memory.collecting and memory.stage in (COLLECTING, HINTED),
             status=NO_FEATURE,
         )
     feature, R = f[: tuning.n_features].copy(), float(f[2])
@@ -265,7 +265,7 @@ def _hinted(memory: ModeMemory, hint: float) -> ModeMemory:
             slid=0,
             features=memory.features[:0],
             forces=memory.forces[:0],
-            collecting=False,
+            collecting=True,
             is_new=False,
         )
     if memory.stage == COLLECTING:
@@ -275,7 +275,7 @@ def _hinted(memory: ModeMemory, hint: float) -> ModeMemory:
             hint_from=memory.mode,
             mode=told,
             departed=True,
-            collecting=False,
+            collecting=True,
             is_new=False,
         )
     return memory
@@ -392,7 +392,14 @@ def _verified(memory: ModeMemory, tuning: ModeTuning, time, feature, R) -> ModeM
     nearest, _ = memory.table.nearest(feature)
     if nearest == memory.mode:
         return replace(memory, departed=True, change_time=time)
-    return replace(memory, stage=TRACKING, mode=memory.hint_from, over=0, slow=0.0)
+    return replace(
+        memory,
+        stage=TRACKING,
+        mode=memory.hint_from,
+        over=0,
+        slow=0.0,
+        collecting=False,
+    )
 
 
 def _collected(memory: ModeMemory, tuning: ModeTuning, time, feature, R) -> ModeMemory:
@@ -410,11 +417,9 @@ def _collected(memory: ModeMemory, tuning: ModeTuning, time, feature, R) -> Mode
             memory,
             features=features[:0],
             forces=forces[:0],
-            collecting=memory.stage != HINTED,
+            collecting=True,
         )
-    memory = replace(
-        memory, features=features, forces=forces, collecting=memory.stage != HINTED
-    )
+    memory = replace(memory, features=features, forces=forces, collecting=True)
     noise = TOLERANCE * tuning.force_noise / R
     if len(features) >= EARLY:
         last = features[-EARLY:]
