@@ -65,10 +65,10 @@ class Anticipation:
 
 
 def _control() -> ChangingContactConfig:
-    """The defaults, with a lead for what a hint takes to reach the arm: up to 20 ms
+    """The defaults, with a lead for what a hint takes to reach the arm: 10 to 20 ms
     through the estimators, and the 20 ms of the feed-forward's filter."""
     config = ChangingContactConfig()
-    return replace(config, anticipator=replace(config.anticipator, hint_lead_sec=0.03))
+    return replace(config, anticipator=replace(config.anticipator, hint_lead_sec=0.035))
 
 
 @dataclass

@@ -23,7 +23,7 @@ and the time in the transition controller are smaller than in trial 2.
 See docs/modes.md.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -98,7 +98,10 @@ def run(config: SurfaceSwitchConfig, session: Session) -> dict:
             label=f"trial_{k + 1}",
         )
         knowledge = learned(diagram, log.context)
-        trials.append(scored(telemetry(diagram, log.context), task.feet))
+        trial = scored(telemetry(diagram, log.context), task.feet)
+        # The telemetry's last row is from before the events of its instant.
+        done = log["phase"][-1, PHASE_STAGE] == DONE
+        trials.append(replace(trial, done=bool(done)))
     session.save_plot(plot_trials(trials, task), "trials")
     knowledge.contacts.save(session.out_dir / "contacts.json")
     last = trials[-1].log
