@@ -1,9 +1,11 @@
 """`makebreak gap`: reads, runs the workflow with a progress bar, writes the report."""
 
+import json
 import sys
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
+from time import perf_counter
 
 from tqdm import tqdm
 
@@ -71,6 +73,7 @@ def run_and_report(
         raise ValueError(
             f'--out: got "{out_dir}", expected a folder to write in ({error.strerror})'
         ) from error
+    start = perf_counter()
     with StageBar() as progress:
         result = run_gap(scene_path, recording_paths, out_dir, jobs, progress)
         progress("report", 0.0)
@@ -79,7 +82,9 @@ def run_and_report(
         moving = comparison_html(result, scene, recordings)
         progress("report", 0.7)
         files = write_report(result, scene, out_dir, recordings, scene_path, moving)
-    return result, files
+    times = {"wall_s": perf_counter() - start, "stages_s": dict(result.seconds)}
+    (out_dir / "timing.json").write_text(json.dumps(times, indent=2) + "\n")
+    return result, [out_dir / "timing.json", *files]
 
 
 def effects_table(result: GapResult) -> Table:

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from hashlib import sha256
 from pathlib import Path
 
@@ -104,8 +104,50 @@ def run_many(
     for i, folder in enumerate(folders):
         if folder in folders[:i]:
             raise ValueError(f"runs: {folder.name} is there twice, expected once")
-    results: list[dict | None] = [None] * len(runs)
-    waiting = list(range(len(runs)))
+    texts = [setting_texts(settings) for settings, _ in runs]
+    commands = []
+    for folder, text, (_, seed) in zip(folders, texts, runs, strict=True):
+        args = [*(command or _COMMAND), "run", experiment, "--no-meshcat"]
+        args += ["--seed", str(seed), "--out", str(folder)]
+        args += [a for one in text for a in ("--set", one)]
+        if duration is not None:
+            args += ["--duration", repr(float(duration))]
+        commands.append(args)
+
+    def is_done(i: int) -> bool:
+        seed = runs[i][1]
+        return reuse and _is_done(folders[i], experiment, texts[i], seed, duration)
+
+    results = run_commands(experiment, commands, folders, jobs, is_done)
+    return [
+        {**result, "seed": seed, "out_dir": str(folder)}
+        for result, (_, seed), folder in zip(results, runs, folders, strict=True)
+    ]
+
+
+def makebreak_command(*words: str) -> list[str]:
+    """What starts `makebreak WORDS` in this interpreter."""
+    return [*_COMMAND, *words]
+
+
+def run_commands(
+    label: str,
+    commands: Sequence[Sequence[str]],
+    folders: Sequence[Path],
+    jobs: int,
+    is_done: Callable[[int], bool] = lambda i: False,
+) -> list[dict]:
+    """Runs commands that each write result.json into a folder, `jobs` at a time, with
+    one thread each and their output in the folder's log.txt. Ctrl-C, or SIGTERM, ends
+    all of them; one that fails is reported and does not stop the others.
+
+    Args: label, of the progress bar; is_done(i): whether the folder has the result
+        already.
+    Returns: per command its result.json; of a failed one `success` False and `error`,
+        the last line that it printed.
+    """
+    results: list[dict] = [{} for _ in commands]
+    waiting = list(range(len(commands)))
     running: dict[int, subprocess.Popen] = {}
     env = _environment()
 
@@ -117,29 +159,20 @@ def run_many(
     except ValueError:  # Not in the main thread: nobody sends it there.
         old = None
     try:
-        with tqdm(total=len(runs), desc=experiment, unit="run", file=sys.stderr) as bar:
+        with tqdm(total=len(commands), desc=label, unit="run", file=sys.stderr) as bar:
             while waiting or running:
                 while waiting and len(running) < jobs:
                     i = waiting.pop(0)
-                    settings, seed = runs[i]
-                    texts = setting_texts(settings)
-                    if reuse and _is_done(
-                        folders[i], experiment, texts, seed, duration
-                    ):
+                    if is_done(i):
                         results[i] = _read(folders[i], 0)
                         bar.update()
                         continue
-                    args = [*(command or _COMMAND), "run", experiment, "--no-meshcat"]
-                    args += ["--seed", str(seed), "--out", str(folders[i])]
-                    args += [a for text in texts for a in ("--set", text)]
-                    if duration is not None:
-                        args += ["--duration", repr(float(duration))]
                     folders[i].mkdir(parents=True, exist_ok=True)
                     # Else a run that fails early would show an older run's result.
                     (folders[i] / "result.json").unlink(missing_ok=True)
                     with (folders[i] / "log.txt").open("wb") as log:
                         running[i] = subprocess.Popen(
-                            args,
+                            commands[i],
                             stdin=subprocess.DEVNULL,
                             stdout=log,
                             stderr=subprocess.STDOUT,
@@ -164,10 +197,7 @@ def run_many(
             process.wait()
         if old is not None:
             signal.signal(signal.SIGTERM, old)
-    return [
-        {**(result or {}), "seed": seed, "out_dir": str(folder)}
-        for result, (_, seed), folder in zip(results, runs, folders, strict=True)
-    ]
+    return results
 
 
 def duration_line(duration: float | None) -> str:

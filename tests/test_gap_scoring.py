@@ -1,0 +1,220 @@
+"""The benchmark's score says what it claims; the benchmark itself is not run here."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from makebreak.scripts import cli, gap_benchmark
+from makebreak.scripts.gap_benchmark import (
+    Score,
+    parameter_errors,
+    same_place,
+    score,
+    table_of,
+)
+
+
+def truth(verdict="gap_named", effects=(), ties=()):
+    return {
+        "name": "00_case",
+        "verdict": verdict,
+        "effects": list(effects),
+        "ties": list(ties),
+    }
+
+
+def effect(kind, at, tied=(), **parameters):
+    """As result.json has it."""
+    values = {k: {"value": v, "std": 0.1, "unit": ""} for k, v in parameters.items()}
+    return {
+        "kind": kind,
+        "at": at,
+        "parameters": values,
+        "indistinguishable_from": list(tied),
+    }
+
+
+def hidden(kind, at, **parameters):
+    return {"kind": kind, "at": at, "parameters": parameters}
+
+
+COULOMB = hidden("joint_coulomb_friction", "p.j1", coulomb=2.0)
+
+
+def test_the_right_effect_is_right_and_its_error_relative():
+    found = effect("joint_coulomb_friction", "p.j1", coulomb=1.9)
+    result = {"verdict": "gap_named", "effects": [found], "gap": {"reduction": 0.97}}
+    got = score(truth(effects=[COULOMB]), result)
+    assert (got.first, got.first_or_tied, got.extra, got.closed) == (
+        True,
+        True,
+        0,
+        0.97,
+    )
+    np.testing.assert_allclose(got.errors, [0.05])
+
+
+@pytest.mark.parametrize(
+    ("kind", "at"),
+    [("joint_coulomb_friction", "p.j2"), ("joint_viscous_damping", "p.j1")],
+)
+def test_the_wrong_joint_or_kind_is_wrong_unless_said_to_be_tied(kind, at):
+    wrong = effect(kind, at, coulomb=2.0)
+    got = score(truth(effects=[COULOMB]), {"verdict": "gap_named", "effects": [wrong]})
+    assert (got.first, got.first_or_tied, got.extra, got.errors) == (
+        False,
+        False,
+        1,
+        (),
+    )
+    wrong["indistinguishable_from"] = [{"kind": COULOMB["kind"], "at": ["p.j1"]}]
+    got = score(truth(effects=[COULOMB]), {"verdict": "ambiguous", "effects": [wrong]})
+    assert (got.first, got.first_or_tied) == (False, True)
+
+
+def test_any_of_a_declared_tie_is_right():
+    delay = hidden("input_delay", "p", delay=0.02)
+    case = truth("ambiguous", [delay], [["input_delay", "sensor_delay"]])
+    found = effect("sensor_delay", "p", delay=0.02)
+    got = score(case, {"verdict": "ambiguous", "effects": [found]})
+    assert got.first and got.extra == 0
+
+
+def test_what_is_named_where_nothing_is_hidden_is_invented():
+    found = effect("joint_coulomb_friction", "p.j1", coulomb=2.0)
+    for verdict in ("no_gap", "gap_unnamed"):
+        # The effect outside the catalogue stands in the truth, but has no name.
+        case = truth(verdict, [hidden("bouc_wen", "p.j1")] * (verdict != "no_gap"))
+        got = score(case, {"verdict": "gap_named", "effects": [found]})
+        assert (got.first, got.extra, got.closed) == (None, 1, None)
+
+
+def test_a_run_that_failed_is_wrong_in_everything():
+    got = score(truth(effects=[COULOMB]), {"success": False, "error": "exit status 3"})
+    assert (got.found, got.first, got.closed) == ("failed", False, 0.0)
+    assert got.says == "exit status 3"
+
+
+@pytest.mark.parametrize(
+    ("one", "two", "kind", "same"),
+    [
+        ("p.j1", ["p.j1"], "rotor_inertia", True),
+        ("ball~table.top", "table.top~ball.ball", "contact_friction", True),
+        ("ball", "ball.ball", "object_mass", True),
+        ("p", "p.j1", "joint_viscous_damping", False),
+        ("p", ["p.j1", "p.j2"], "clock_skew", True),
+        ("p", ["p.j1"], "input_delay", True),  # The only one that is driven.
+        ("p", ["p.j1.velocity", "p.j2.velocity"], "sensor_delay", False),
+        (["p.b.velocity", "p.a.velocity"], ["p.a.velocity", "p.b.velocity"],
+         "sensor_delay", True),
+        ("p", "q", "gravity_tilt", False),
+    ],
+)  # fmt: skip
+def test_places(one, two, kind, same):
+    assert same_place(one, two, kind, ["p.j1"]) is same
+    assert same_place(two, one, kind, ["p.j1"]) is same
+
+
+def test_errors_of_vectors_phases_and_changes():
+    def errors(found, there):
+        return parameter_errors({k: {"value": v} for k, v in found.items()}, there)
+
+    # (3, 4, 0) for (0, 5, 0): off by sqrt(10) of 5.
+    got = errors(dict(fx=3.0, fy=4.0, fz=0.0), dict(fx=0.0, fy=5.0, fz=0.0))
+    np.testing.assert_allclose(got, [np.sqrt(10.0) / 5.0])
+    got = errors(dict(phase=0.1), dict(phase=2.0 * np.pi - 0.1))
+    np.testing.assert_allclose(got, [0.2 / np.pi])
+    np.testing.assert_allclose(errors(dict(gain=1.12), dict(gain=1.1)), [0.2])
+    got = errors(dict(scale=1.1, radius=0.033), dict(scale=1.1, radius=0.033))
+    assert got == [0.0]
+    got = errors(dict(x_min=0.11, x_max=0.3), dict(x_min=0.1, x_max=0.3))
+    np.testing.assert_allclose(sorted(got), [0.0, 0.05], atol=1e-12)
+    assert errors(dict(angular=0.1, linear=3.0), dict(angular=0.0, linear=3.0)) == [0.0]
+
+
+def a_score(verdict, found, first=None, extra=0, closed=None, errors=()):
+    return Score("c", verdict, found, first, first, errors, closed, extra, 2.0, "x")
+
+
+def test_the_table_counts_and_names_what_went_wrong():
+    scores = [a_score("gap_named", "gap_named", True, 0, 0.9, (0.02,))] * 9
+    scores += [a_score("gap_named", "ambiguous", False, 1, 0.5, (0.3,))]
+    scores += [a_score("no_gap", "no_gap")] * 10
+    table = table_of(scores)
+    rows = {
+        row[0]: (row[2], met) for row, met in zip(table.rows, table.met, strict=True)
+    }
+    assert rows["right verdict"] == ("19 of 20 (95%)", True)
+    assert rows["right effect first"] == ("9 of 10 (90%)", True)
+    assert rows["parameter error, median"] == ("2.0% of 10", True)
+    name = "share of the reducible gap closed, mean (median)"
+    assert rows[name] == ("86% (90%)", True)
+    assert rows["effects invented where nothing is hidden"] == ("0 in 10 cases", True)
+    assert rows["effects named in vain elsewhere"] == ("1 in 10 cases", None)
+    assert rows["said of gap_named (10)"] == ("gap_named 9, ambiguous 1", None)
+    assert table.notes == ["c: gap_named -> ambiguous: x"]
+    assert table.missed == 0
+    invented = table_of([*scores, a_score("no_gap", "gap_named", extra=2)])
+    assert invented.missed == 1
+
+
+def test_where_the_benchmark_is_absent_one_line_says_so(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(gap_benchmark, "MAKER", tmp_path / "tests/cases.py")
+    assert cli.main(["reproduce", "gap"]) == 2
+    shown = capsys.readouterr().err
+    assert "is in a checkout of makebreak" in shown and shown.count("\n") == 1
+
+
+MAKER = """import argparse, json
+from pathlib import Path
+p = argparse.ArgumentParser()
+for name in ("set", "only"):
+    p.add_argument("--" + name)
+for name in ("out", "truth"):
+    p.add_argument("--" + name, type=Path)
+a = p.parse_args()
+for k in (1, 2):
+    folder = a.out / f"case_{k}"
+    folder.mkdir(parents=True)
+    (folder / "scene.yaml").write_text("actuation: {joints: [p.j1]}")
+    (folder / "recording.csv").write_text("time")
+    print(folder)
+hidden = {"kind": "rotor_inertia", "at": "p.j1", "parameters": {"inertia": 0.1}}
+none = {"name": "1_none", "verdict": "no_gap", "effects": [], "ties": []}
+one = {"name": "2_one", "verdict": "gap_named", "effects": [hidden], "ties": []}
+a.truth.write_text(json.dumps({"case_1": none, "case_2": one}))
+"""
+GAP = """import json, sys
+from pathlib import Path
+out = Path(sys.argv[sys.argv.index("--out") + 1])
+assert not list(out.parent.parent.glob("cases/*/truth*"))
+(out / "result.json").write_text(json.dumps({"verdict": "no_gap", "effects": []}))
+(out / "timing.json").write_text('{"wall_s": 3.0}')
+"""
+
+
+def test_the_whole_way_from_the_cases_to_the_table(monkeypatch, tmp_path):
+    """With a maker and a workflow that know one answer: no gap."""
+    (tmp_path / "cases.py").write_text(MAKER)
+    (tmp_path / "gap.py").write_text(GAP)
+    monkeypatch.setattr(gap_benchmark, "MAKER", tmp_path / "cases.py")
+    monkeypatch.setattr(
+        gap_benchmark,
+        "makebreak_command",
+        lambda *words: [sys.executable, str(tmp_path / "gap.py"), *words],
+    )
+    folder = tmp_path / "out"
+    folder.mkdir()
+    for reuse in (False, True, False):
+        table = gap_benchmark.run_benchmark(folder, 2, reuse=reuse)
+        rows = {row[0]: row[2] for row in table.rows}
+        assert rows["right verdict"] == "1 of 2 (50%)"
+        assert rows["right effect first"] == "0 of 1 (0%)"
+        assert rows["seconds a case, median (most)"] == "3 (3)"
+        assert table.notes == ["2_one: gap_named -> no_gap: nothing"]
+    assert len(json.loads((folder / "scores.json").read_text())) == 2
+    assert Path(folder / "results" / "case_1" / "log.txt").is_file()
