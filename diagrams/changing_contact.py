@@ -231,6 +231,7 @@ def make_changing_contact(
     connect(modes, "collecting", variable)
     connect(forward, "wrench_predicted", variable)
     connect(forward, "prediction_error", variable)
+    connect(forward, "handing_over", variable)
     connect(anticipator, "contacts", shaper)
     connect(anticipator, "mode_hint", modes)
     for port in ("stiffness", "damping", "damping_stiffness", "wrench_feedforward"):

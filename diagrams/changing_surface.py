@@ -60,7 +60,7 @@ FORCE = (0.75, 1.5)  # Of a segment, in shares of the config's.
 SPEED_DOWN = 0.1  # [m/s]
 # The corners on which the block stands, from its centre; along its sides [m].
 FEET = {"block": 0.012, "sphere": 0.0}
-# A sphere of 20 mm that sinks in by 0.4 mm touches over 8 mm.
+# A sphere crosses at one point; what is averaged over takes some way.
 SPHERE_CROSSING = 0.01  # [m]
 
 

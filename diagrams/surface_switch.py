@@ -52,7 +52,7 @@ LOW, HIGH, WALL = (0.1, 0.3), (0.4, 0.6), (0.1, 0.6)
 DOWN, Y = np.array([0.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0])
 CROSSINGS = (1, 3)  # Segments in which the surface changes.
 FEET = {"block": 0.012, "sphere": 0.0}  # From the tip to where it stands [m].
-# A sphere of 20 mm that sinks in by 0.4 mm touches over 8 mm.
+# A sphere crosses at one point; what is averaged over takes some way.
 SPHERE_CROSSING = 0.01  # [m]
 
 
@@ -66,9 +66,9 @@ class Anticipation:
 
 def _control() -> ChangingContactConfig:
     """The defaults, with a lead for what a hint takes to reach the arm: 10 to 20 ms
-    through the estimators, and the 20 ms of the feed-forward's filter."""
+    through the estimators, and the 5 ms of the feed-forward's filter."""
     config = ChangingContactConfig()
-    return replace(config, anticipator=replace(config.anticipator, hint_lead_sec=0.035))
+    return replace(config, anticipator=replace(config.anticipator, hint_lead_sec=0.025))
 
 
 @dataclass

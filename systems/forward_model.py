@@ -54,6 +54,7 @@ class ForwardModelBank(LeafSystem):
     Outputs, all of them state:
         wrench_predicted (6,) on the tool, against the motion [N], [N m]; zero in
             FREE_MODE and UNKNOWN_MODE, and without a usable wrench.
+        handing_over (1,) 1 while a model that was announced takes over.
         prediction_error (1,) |error of the last predictions of |F_t||, low-passed [N].
         status (1,) 0: a model predicts; 1: the wrench is NaN or at its limit; 2: the
             mode is one without a model.
@@ -126,6 +127,7 @@ class ForwardModelBank(LeafSystem):
         for name, size, calc in (
             ("wrench_predicted", 6, self._calc_wrench),
             ("prediction_error", 1, self._calc_error),
+            ("handing_over", 1, self._calc_handing_over),
             ("status", 1, self._calc_status),
         ):
             self.DeclareVectorOutputPort(name, size, calc, ticket)
@@ -165,6 +167,9 @@ class ForwardModelBank(LeafSystem):
 
     def _calc_error(self, context: Context, output: BasicVector):
         output.SetFromVector([self._memory_of(context).error])
+
+    def _calc_handing_over(self, context: Context, output: BasicVector):
+        output.SetFromVector([float(self._memory_of(context).left > 0)])
 
     def _calc_status(self, context: Context, output: BasicVector):
         output.SetFromVector([float(self._memory_of(context).status)])

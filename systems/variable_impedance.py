@@ -14,6 +14,10 @@ from makebreak.systems.numerics.variable_impedance import (
     warm_up,
 )
 
+# Of the feed-forward, while a model is handed over [s]: what it says is no measured
+# force with its noise, and the filter keeps no more than the torque's rate bounded.
+HANDOVER_FILTER_SEC = 0.005
+
 
 @dataclass
 class StiffnessConfig:
@@ -49,7 +53,9 @@ class VariableImpedance(LeafSystem):
     phase controllers, and of the blend of both.
 
     Inputs:  prediction_error (1,) [N], wrench_predicted (6,) on the tool [N], [N m];
-             collecting (1,), 1 while the mode detector collects a batch; phase (6,).
+             collecting (1,), 1 while the mode detector collects a batch; phase (6,);
+             optional handing_over (1,), 1 while a model that was announced takes over:
+             its prediction is fed forward with a filter of 5 ms.
     Outputs, all of them state: stiffness (6,) [N/m] x 3, [N m/rad] x 3;
              damping_stiffness (6,), the one that the damping belongs to (in an impact
              the tip is damped as by K_max), or, with paper_damping, in its place
@@ -96,6 +102,7 @@ class VariableImpedance(LeafSystem):
             blend_ticks=max(1.0, config.blend_sec / config.period_sec),
             feedforward=bool(config.feedforward),
             transition=bool(config.transition),
+            decay_handover=float(np.exp(-config.period_sec / HANDOVER_FILTER_SEC)),
         )
         warm_up(self._law)
         self._paper = stiffness.paper_damping
@@ -103,6 +110,7 @@ class VariableImpedance(LeafSystem):
         self._predicted = self.DeclareVectorInputPort("wrench_predicted", 6)
         self._collecting = self.DeclareVectorInputPort("collecting", 1)
         self._phase = self.DeclareVectorInputPort("phase", N_PHASE)
+        self._handing_over = self.DeclareVectorInputPort("handing_over", 1)
         # Before the first update: stiff, nothing fed forward.
         first = np.repeat([stiffness.maximum, stiffness.rotational], 3)
         self._memory = self.DeclareDiscreteState(N_MEMORY)
@@ -126,6 +134,9 @@ class VariableImpedance(LeafSystem):
 
     @timed
     def _update(self, context: Context, discrete_state):
+        handing_over = 0.0
+        if self._handing_over.HasValue(context):
+            handing_over = self._handing_over.Eval(context)[0]
         memory, output = tick(
             self._law,
             context.get_discrete_state(self._memory).value(),
@@ -133,6 +144,7 @@ class VariableImpedance(LeafSystem):
             self._predicted.Eval(context),
             self._collecting.Eval(context)[0],
             self._phase.Eval(context),
+            handing_over,
         )
         discrete_state.set_value(self._memory, memory)
         discrete_state.set_value(self._stiffness, output[:6])

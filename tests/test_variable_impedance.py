@@ -75,6 +75,20 @@ def test_while_a_batch_is_collected_the_stiffness_is_the_highest():
     np.testing.assert_allclose(out[:3], MAX)
 
 
+def test_what_is_handed_over_is_fed_forward_with_a_filter_of_5_ms():
+    law = law_of(trust=TrustConfig(filter_sec=0.02))
+    zero = np.zeros(6)
+    for handing_over, tau in ((0.0, 0.02), (1.0, 0.005), (np.nan, 0.02)):
+        rest = [(0.0, zero, 0.0, phase(), 0.0)]
+        out = run(law, rest + [(0.0, W, 0.0, phase(), handing_over)] * 10)[1:]
+        t = 1e-3 * np.arange(1, 11)[:, None]
+        expected = -out[0, 18] * W * (1.0 - np.exp(-t / tau))
+        np.testing.assert_allclose(out[:, 12:18], expected, rtol=1e-9, atol=1e-12)
+    # A filter that is faster still stays as it is.
+    out = run(law_of(), [(0.0, zero, 0.0, phase(), 0.0), (0.0, W, 0.0, phase(), 1.0)])
+    np.testing.assert_allclose(out[1, 12:18], -out[1, 18] * W, rtol=1e-12)
+
+
 @pytest.mark.parametrize("kind, K_2", [(IMPACT, LOW), (IMPACTLESS, MAX)])
 def test_the_blend_is_linear_over_T_both_ways(kind, K_2):
     law = law_of()

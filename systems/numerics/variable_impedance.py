@@ -58,6 +58,7 @@ class StiffnessLaw(NamedTuple):
     blend_ticks: float  # T in ticks.
     feedforward: bool
     transition: bool  # False: the base controller throughout.
+    decay_handover: float = 0.0  # Of f_ff, while a model is handed over.
 
 
 @numba.njit(cache=True)
@@ -73,7 +74,7 @@ def trust(error, steepness, midpoint):
 
 
 @numba.njit(cache=True)
-def tick(law, memory, error, predicted, collecting, phase):
+def tick(law, memory, error, predicted, collecting, phase, handing_over=0.0):
     """One tick.
 
     Args:
@@ -81,6 +82,8 @@ def tick(law, memory, error, predicted, collecting, phase):
         error: eps [N]. predicted: W (6,), the wrench on the tool that is expected [N],
             [N m]. collecting: 1 while a batch is collected, else 0. phase (N_PHASE,).
             Anything may be NaN: then K_max, or no feed-forward, or the base controller.
+        handing_over: 1 while W is a mean that was learned before, for a place that is
+        reached now, and no last sample with its noise: it is hardly filtered.
     Returns: memory, and output (N_OUTPUT,).
     """
     memory = memory.copy()
@@ -114,11 +117,14 @@ def tick(law, memory, error, predicted, collecting, phase):
         and phase[PHASE_STAGE] == REGION
         and phase[PHASE_KIND] == IMPACT
     )
+    keep_force = keep
+    if handing_over > 0.5:
+        keep_force = min(keep, law.decay_handover)
     if not waiting:
         for i in range(6):
             wanted = -weight * predicted[i] if law.feedforward and usable else 0.0
             at = FEEDFORWARD.start + i
-            memory[at] = wanted + keep * (memory[at] - wanted)
+            memory[at] = wanted + keep_force * (memory[at] - wanted)
 
     kind = NO_CONTACT
     if (
@@ -156,4 +162,4 @@ def warm_up(law: StiffnessLaw) -> None:
     memory.setflags(write=False)
     phase = np.zeros(N_PHASE)
     phase[PHASE_KIND] = IMPACTLESS
-    tick(law, memory, 0.0, np.zeros(6), 0.0, phase)
+    tick(law, memory, 0.0, np.zeros(6), 0.0, phase, 0.0)
