@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from pydrake.multibody.tree import ModelInstanceIndex
+from pydrake.geometry import Sphere
+from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus
 from pydrake.systems.primitives import Demultiplexer, LogVectorOutput
@@ -202,6 +203,60 @@ class SceneSimulation:
         scene's sensor effects add is taken off, with a line between samples."""
         found = self.channel_map(channel)
         return float(found.true_value(np.interp(found.stamp(time), stamps, measured)))
+
+    def put_down(self, initial: InitialSection, body: str) -> InitialSection:
+        """The state with a free body at such a height that it just touches what is
+        fixed below it; a sphere rolls as it moves, about an upright axis it does not
+        turn. For a body of which only x and y are measured, whose height and spin
+        follow from its size.
+
+        Args: body, `<model>.<body>`, with a pose in `initial`, near the ground.
+        Raises: ValueError if it has no pose there, or nothing fixed is below it.
+        """
+        if body not in initial.poses:
+            raise ValueError(f"put_down: no initial pose of {body!r}")
+        self._set_state(initial, True)
+        plant, own = self._plant, self._plant_context
+        thing = self._bodies[body]
+        at = thing.floating_positions_start() + 6
+        mine = plant.GetCollisionGeometriesForBody(thing)
+        fixed = [
+            geometry
+            for i in range(plant.num_bodies())
+            if plant.IsAnchored(plant.get_body(BodyIndex(i)))
+            for geometry in plant.GetCollisionGeometriesForBody(
+                plant.get_body(BodyIndex(i))
+            )
+        ]
+        scene_graph = self._loaded.scene_graph
+        for _ in range(4):  # One is enough for a flat ground.
+            query = scene_graph.get_query_output_port().Eval(
+                scene_graph.GetMyContextFromRoot(self._context)
+            )
+            down = np.inf
+            for a in mine:
+                for b in fixed:
+                    pair = query.ComputeSignedDistancePairClosestPoints(a, b)
+                    up = pair.nhat_BA_W[2] * (1.0 if pair.id_A == a else -1.0)
+                    if up > 0.5:
+                        down = min(down, pair.distance / up)
+            if not np.isfinite(down):
+                raise ValueError(f"put_down: nothing fixed is below {body!r}")
+            q = plant.GetPositions(own)
+            q[at] -= down
+            plant.SetPositions(own, q)
+        pose = [*initial.poses[body][:6], float(q[at])]
+        twist = list(initial.body_velocities.get(body, [0.0] * 6))
+        inspector = scene_graph.model_inspector()
+        shapes = [inspector.GetShape(geometry) for geometry in mine]
+        if len(shapes) == 1 and isinstance(shapes[0], Sphere):
+            radius = shapes[0].radius()
+            twist[:3] = [-twist[4] / radius, twist[3] / radius, 0.0]
+        return replace(
+            initial,
+            poses=initial.poses | {body: pose},
+            body_velocities=initial.body_velocities | {body: twist},
+        )
 
     def run(
         self,

@@ -2,8 +2,8 @@
 
 import json
 import sys
+import traceback
 from collections.abc import Sequence
-from importlib import import_module
 from pathlib import Path
 from time import perf_counter
 
@@ -16,46 +16,46 @@ from makebreak.gap.result import GapResult
 from makebreak.models.scene import read_scene
 from makebreak.scripts.table import Table
 
+# Of an earlier run in the same folder: removed at the start.
+_OWN_FILES = (
+    "result.json scene.yaml report.html compare.html timing.json error.txt "
+    "channels.png where.png series.png"
+).split()
+
 
 class StageBar:
-    """A progress bar a stage: called with the stage's name and how much of it is done,
-    0 to 1; another name ends the bar before. To be used in a `with`."""
+    """A progress bar that is told, in a line of text, what is being done. Each line is
+    taken to be a tenth of what is left, an indented one a fiftieth, unless `share` says
+    how much is done, 0 to 1: nobody knows how many effects there are to be found. To be
+    used in a `with`."""
 
     def __init__(self, shown: bool = True):
-        self._shown = shown
-        self._bar: tqdm | None = None
-        self._stage = ""
+        tty = sys.stderr.isatty()
+        self._bar = tqdm(
+            total=1.0,
+            bar_format="{percentage:3.0f}%|{bar:24}| {elapsed} {desc}",
+            mininterval=0.2 if tty else 10.0,
+            dynamic_ncols=tty,
+            ncols=None if tty else 100,
+            disable=not shown,
+            file=sys.stderr,
+        )
 
-    def __call__(self, stage: str, share: float) -> None:
-        if stage != self._stage:
-            self._end()
-            tty = sys.stderr.isatty()
-            self._stage = stage
-            self._bar = tqdm(
-                total=1.0,
-                desc=f"{stage:12}",
-                bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}",
-                mininterval=0.2 if tty else 10.0,
-                dynamic_ncols=tty,
-                ncols=None if tty else 80,
-                disable=not self._shown,
-                file=sys.stderr,
-            )
-        if self._bar is not None:
-            self._bar.update(min(max(share, 0.0), 1.0) - self._bar.n)
-
-    def _end(self, done: bool = True) -> None:
-        if self._bar is not None:
-            if done:
-                self._bar.update(1.0 - self._bar.n)
-            self._bar.close()
-            self._bar = None
+    def __call__(self, text: str, share: float | None = None) -> None:
+        if share is None:
+            step = 0.02 if text.startswith(" ") else 0.1
+            share = self._bar.n + step * (1.0 - self._bar.n)
+        self._bar.set_description_str(text.strip(), refresh=False)
+        self._bar.update(min(max(share, self._bar.n), 1.0) - self._bar.n)
+        self._bar.refresh()
 
     def __enter__(self) -> "StageBar":
         return self
 
     def __exit__(self, kind, *_) -> None:
-        self._end(done=kind is None)
+        if kind is None:
+            self("done", 1.0)
+        self._bar.close()
 
 
 def run_and_report(
@@ -65,8 +65,8 @@ def run_and_report(
 
     Raises: ValueError for a scene, a recording or a folder that cannot be used.
     """
-    # Loaded when asked for: the bad input that is found before it is told at once.
-    run_gap = import_module("makebreak.gap.workflow").run_gap
+    from makebreak.gap.workflow import run_gap  # Late: it is long to load.
+
     try:
         out_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -74,14 +74,19 @@ def run_and_report(
             f'--out: got "{out_dir}", expected a folder to write in ({error.strerror})'
         ) from error
     start = perf_counter()
-    with StageBar() as progress:
-        result = run_gap(scene_path, recording_paths, out_dir, jobs, progress)
-        progress("report", 0.0)
-        scene = read_scene(scene_path)
-        recordings = read_recordings(recording_paths)
-        moving = comparison_html(result, scene, recordings)
-        progress("report", 0.7)
-        files = write_report(result, scene, out_dir, recordings, scene_path, moving)
+    for name in _OWN_FILES:
+        (out_dir / name).unlink(missing_ok=True)
+    try:
+        with StageBar() as progress:
+            result = run_gap(scene_path, recording_paths, out_dir, jobs, progress)
+            progress("writing the report", 0.95)
+            scene = read_scene(scene_path)
+            recordings = read_recordings(recording_paths)
+            moving = comparison_html(result, scene, recordings)
+            files = write_report(result, scene, out_dir, recordings, scene_path, moving)
+    except Exception:
+        (out_dir / "error.txt").write_text(traceback.format_exc())
+        raise
     times = {"wall_s": perf_counter() - start, "stages_s": dict(result.seconds)}
     (out_dir / "timing.json").write_text(json.dumps(times, indent=2) + "\n")
     return result, [out_dir / "timing.json", *files]

@@ -229,20 +229,40 @@ def score(config, log, track, contact):
 
 
 def write_recording(session, log, plant):
-    """What a real robot could have recorded, and the ball as the camera saw it."""
+    """What a real robot could have recorded, and the ball as the camera saw it.
+
+    An effort command is the mean of what was commanded until the next row: 80 Hz are
+    too slow for a torque that changes at 1 kHz, its mean does the same to the arm.
+    The ball's height is no measurement: the tracker takes the model's radius for it.
+    """
     columns = {"time": log.time}
+    torque = log.diagram.GetSubsystemByName("torque_log").FindLog(log.context)
+    held = mean_until_next(log.time, torque.sample_times(), torque.data().T)
     for i in range(7):
         joint = f"{ARM}.panda_joint{i + 1}"
         columns[f"{joint}.position"] = log["q"][:, i]
         columns[f"{joint}.velocity"] = log["v"][:, i]
-        columns[f"{joint}.effort_command"] = log["tau"][:, i]
+        columns[f"{joint}.effort_command"] = held[:, i]
         columns[f"{joint}.effort_measured"] = log["torque"][:, i]
-    for i, axis in enumerate("xyz"):
+    for i, axis in enumerate("xy"):
         ball = log["x"][:, P_BALL.start + i]
         columns[f"ball.ball.{axis}"] = np.where(log["seen"][:, 0] > 0.5, ball, np.nan)
     for i, name in enumerate(("fx", "fy", "fz", "tx", "ty", "tz")):
         columns[f"{TOOL}.{TIP_FRAME}.{name}"] = log["wrench"][:, i]
     session.write_recording(columns)
+
+
+def mean_until_next(time, fine_time, fine):
+    """Mean (n, k) of what held from each of the times (n,) until the next.
+
+    Args: fine_time (m,), fine (m, k): values that hold from their time on. After the
+        last of the times: the value that holds there.
+    """
+    row = np.searchsorted(fine_time, time - 1e-9)
+    total = np.vstack([np.zeros(fine.shape[1]), np.cumsum(fine, axis=0)])
+    last = np.minimum(np.append(row[1:], row[-1] + 1), len(fine))
+    first = np.minimum(row, last - 1)
+    return (total[last] - total[first]) / (last - first)[:, None]
 
 
 def plot_path(session, config, track):

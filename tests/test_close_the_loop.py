@@ -1,0 +1,94 @@
+"""What the loop from a run over its recording to a repaired model rests on."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from effect_scenes import on_ground
+from pydrake.systems.framework import DiagramBuilder
+
+from makebreak.diagrams.ball_rolling import BallRollingConfig, believed
+from makebreak.diagrams.scene_facts import sphere_radius
+from makebreak.diagrams.scene_simulation import SceneSimulation
+from makebreak.diagrams.station import BALL_ROLLING
+from makebreak.models.effects.kind import Effect
+from makebreak.models.scene import InitialSection, load_scene, read_scene
+from makebreak.models.scene_file import write_scene
+from makebreak.scripts.close_the_loop import write_wrong_scene
+from makebreak.scripts.experiments.ball_rolling import mean_until_next
+
+
+@pytest.mark.parametrize("radius", [0.0265, 0.0365])
+def test_a_ball_is_put_down_on_its_radius_and_rolls(tmp_path, radius):
+    size = Effect("object_size", ["b"], {"radius": radius})
+    scene = replace(on_ground(tmp_path, "ball"), effects=[size])
+    simulation = SceneSimulation(scene)
+    start = InitialSection(
+        poses={"b.ball": [1, 0, 0, 0, 0.1, -0.2, 0.0315]},
+        body_velocities={"b.ball": [0, 0, 9.0, 0.06, -0.08, 0.0]},
+    )
+    put = simulation.put_down(start, "b.ball")
+    np.testing.assert_allclose(
+        put.poses["b.ball"], [1, 0, 0, 0, 0.1, -0.2, radius], atol=1e-9
+    )
+    # No slip where it touches: v + w x (0, 0, -r) = 0.
+    w, v = np.split(np.array(put.body_velocities["b.ball"]), 2)
+    np.testing.assert_allclose(v + np.cross(w, [0, 0, -radius]), 0.0, atol=1e-12)
+    assert start.poses["b.ball"][6] == 0.0315  # The caller's is as it was.
+
+
+def test_a_ball_with_nothing_below_it_and_one_without_a_pose_are_refused(tmp_path):
+    simulation = SceneSimulation(on_ground(tmp_path, "ball"))
+    below = InitialSection(poses={"b.ball": [1, 0, 0, 0, 0.1, -0.2, -0.5]})
+    with pytest.raises(ValueError, match="nothing fixed is below 'b.ball'"):
+        simulation.put_down(below, "b.ball")
+    with pytest.raises(ValueError, match="no initial pose of 'b.ball'"):
+        simulation.put_down(InitialSection(), "b.ball")
+
+
+def test_a_command_of_a_slow_row_is_the_mean_of_the_fast_ones_until_the_next():
+    """At 1 kHz 0, 1, 2, ..., and rows at 0, 2.5 and 5 ms: what holds from a row on is
+    counted from the first step at or after it."""
+    fine_time = np.arange(10) * 1e-3
+    fine = np.column_stack([np.arange(10.0), -np.arange(10.0)])
+    got = mean_until_next(np.array([0.0, 2.5e-3, 5e-3]), fine_time, fine)
+    np.testing.assert_allclose(got, [[1.0, -1.0], [3.5, -3.5], [5.0, -5.0]])
+
+
+@pytest.mark.parametrize("error", [-0.005, 0.008])
+def test_the_wrong_scene_is_wrong_in_the_radius_alone(tmp_path, error):
+    right, wrong = write_wrong_scene(tmp_path / "model.yaml", error)
+    assert (right, wrong) == (0.0315, pytest.approx(0.0315 + error))
+    loaded = load_scene(tmp_path / "model.yaml", DiagramBuilder())
+    assert sphere_radius(loaded.plant, loaded.scene_graph, "ball") == pytest.approx(
+        wrong
+    )
+    as_shipped = load_scene(BALL_ROLLING, DiagramBuilder())
+    for one, other in ((loaded.scene, as_shipped.scene),):
+        assert one.plant == other.plant and one.actuation == other.actuation
+        assert one.initial.positions == other.initial.positions
+    # What a controller believes of it, with no further error.
+    config = BallRollingConfig(model=str(tmp_path / "model.yaml"), radius_error_m=0.0)
+    assert believed(config)[0].ball_radius == pytest.approx(wrong)
+
+
+def test_a_repair_added_to_the_wrong_scene_is_what_controllers_believe(tmp_path):
+    """As the workflow writes it. All of the ball is then right again."""
+    write_wrong_scene(tmp_path / "model.yaml", 0.005)
+    scene = read_scene(tmp_path / "model.yaml")
+    fixed = Effect("object_size", ["ball.ball"], {"radius": 0.0315})
+    scene.effects.append(fixed)
+    write_scene(scene, tmp_path / "fixed.yaml")
+    config = BallRollingConfig(model=str(tmp_path / "fixed.yaml"), radius_error_m=0.0)
+    assert believed(config)[0].ball_radius == pytest.approx(0.0315)
+    bodies = [
+        load_scene(s, DiagramBuilder()).plant.GetBodyByName("ball")
+        for s in (tmp_path / "fixed.yaml", BALL_ROLLING)
+    ]
+    one, other = (b.default_spatial_inertia().CopyToFullMatrix6() for b in bodies)
+    np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-15)
+
+
+def test_a_radius_below_zero_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="--radius-error is -0.04, expected > -0.0315"):
+        write_wrong_scene(tmp_path / "model.yaml", -0.04)
