@@ -2,14 +2,22 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from makebreak.gap.inverse import InverseModel
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, check_parameters
 from makebreak.systems.numerics.selection import LinearFit, Screen
+
+
+class Model(Protocol):
+    """What gives residuals over their noise: InverseModel or WindowModel."""
+
+    def base(self) -> np.ndarray: ...
+    def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray: ...
+    def train(self) -> np.ndarray: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +38,7 @@ class Fitted:
 
 
 def fit_effects(
-    model: InverseModel,
+    model: Model,
     screen: Screen,
     start: Sequence[Effect],
     fixed: Sequence[Sequence[str]] | None = None,
@@ -49,9 +57,7 @@ def fit_effects(
         if name not in fixed[i]
     ]
     x0 = np.array([start[i].parameters[name] for i, name in free])
-    scale = np.array(
-        [_scale(start[i], name) for i, name in free]
-    )
+    scale = np.array([_scale(start[i], name) for i, name in free])
     low = np.array([_lowest(start[i].kind, name) for i, name in free])
     x0 = np.maximum(x0, low + 1e-9 * scale)
     cache: dict[bytes, np.ndarray] = {}
@@ -88,7 +94,7 @@ def fit_effects(
     std: list[dict[str, float]] = [{} for _ in start]
     if solved is not None:
         u, w, vt = np.linalg.svd(solved.jac, full_matrices=False)
-        inverse = 1.0 / np.maximum(w, 1e-12 * max(w[0], 1e-300))
+        inverse = 1.0 / np.maximum(w, 1e-12 * max(w[0], 1e-200))
         spread = np.sqrt(np.sum((vt.T * inverse) ** 2, axis=1))
         # What is left, in units of what was allowed for, widens the interval.
         spread *= max(np.sqrt(2.0 * solved.cost / len(solved.fun)), 1.0)

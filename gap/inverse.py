@@ -31,6 +31,9 @@ PATH = (
 # A joint that stands still may be held by any friction: what its equation says then is
 # given this share of its rms effort as uncertainty, by the share of time at rest.
 REST_SPEED, REST_SHARE, REST_EFFORT = 0.005, 0.04, 0.3
+# Sampled at the very instants at which a stiff drive gets new commands, a velocity is
+# off by a share of itself.
+DRIVE_VELOCITY = 0.01
 MODEL_ERROR = 2e-4  # Of a joint's rms effort: what smoothing and sampling leave.
 
 
@@ -320,6 +323,8 @@ class InverseModel:
             # The smoothed velocity's own error, as over one bump.
             own = self.noise * np.sqrt(period * 12.0 / track.bumps.width**3)
             v_std = np.hypot(self.velocity_noise * g0, own)
+            v_rms = np.sqrt(np.mean(v**2, axis=0))
+            v_std = np.hypot(v_std, np.where(kd > 0.0, DRIVE_VELOCITY * v_rms, 0.0))
             out.append(
                 {
                     "effort": L,

@@ -1,4 +1,4 @@
-"""Every effect of the catalogue that could act in a scene, ranked by what it explains."""
+"""Every effect of the catalogue that could act in a scene, by what it explains."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -78,14 +78,15 @@ def candidates(model: InverseModel, nuisance: np.ndarray) -> list[Candidate]:
                 continue
             if kind == "actuator_saturation" and not _driven(model, at):
                 continue
-            if kind == "sinusoidal_force" and at not in _links(model)[-3:]:
-                continue  # Nearer the base it moves less: the outer links tell.
-            grid = _grid(model, kind, at, motions)
-            groups = [dynamics.signatures(kind, [at], m, grid) for m in motions]
+            if kind == "sinusoidal_force" and at not in _links(model)[-1:]:
+                continue  # Of the last link alone: each frequency is a fit of its own.
             columns, readers = [], []
-            for same in zip(*groups, strict=True):
-                columns.append(model.columns_of([s.columns for s in same]))
-                readers.append(same[0].to_parameters)
+            # One value of a grid after the other: all at once would be gigabytes.
+            for grid in _grids(model, kind, at, motions):
+                groups = [dynamics.signatures(kind, [at], m, grid) for m in motions]
+                for same in zip(*groups, strict=True):
+                    columns.append(model.columns_of([s.columns for s in same]))
+                    readers.append(same[0].to_parameters)
             if not columns:
                 continue
             if not any(np.abs(x).max(initial=0.0) > 0.0 for x in columns):
@@ -123,9 +124,7 @@ def nuisances(model: InverseModel) -> tuple[np.ndarray, np.ndarray, list[str]]:
                     if not np.abs(x[:, k]).max(initial=0.0) > 0.0:
                         continue
                     columns.append(x[:, k])
-                    prior.append(
-                        size * now["mass"] if kind == "object_mass" else size
-                    )
+                    prior.append(size * now["mass"] if kind == "object_mass" else size)
                     names.append(f"{kind} of {at}, {unknown}")
     # A mass is known to its share, whatever unit its signature has.
     if not columns:
@@ -165,6 +164,8 @@ def is_sane(effect: Effect) -> bool:
         width = each.high - each.low
         if not each.low - 0.01 * width <= value <= each.high + 0.01 * width:
             return False
+    if effect.kind == "payload" and effect.parameters["mass"] <= 0.0:
+        return False
     return not (
         effect.kind == "joint_stribeck_friction"
         and effect.parameters["static"] < effect.parameters["coulomb"]
@@ -172,11 +173,7 @@ def is_sane(effect: Effect) -> bool:
 
 
 def _links(model: InverseModel) -> list[str]:
-    return [
-        at
-        for at in model.dynamics.places("body_drag")
-        if _mass(model, at) > 0.0
-    ]
+    return [at for at in model.dynamics.places("body_drag") if _mass(model, at) > 0.0]
 
 
 def _mass(model: InverseModel, at: str) -> float:
@@ -200,6 +197,14 @@ def _one_of(reader: Callable, k: int) -> Callable:
     return read
 
 
+def _grids(model: InverseModel, kind: str, at: str, motions) -> list:
+    grid = _grid(model, kind, at, motions)
+    if grid is None:
+        return [None]
+    ((name, values),) = grid.items()
+    return [{name: [value]} for value in values]
+
+
 def _grid(model: InverseModel, kind: str, at: str, motions):
     if kind == "joint_stribeck_friction":
         return {"stribeck_velocity": _SPEEDS}
@@ -210,7 +215,7 @@ def _grid(model: InverseModel, kind: str, at: str, motions):
         u = np.concatenate([np.abs(m.effort[:, i]) for m in motions])
         return {"limit": list(np.linspace(0.4, 0.97, 20) * u.max())}
     if kind == "sinusoidal_force":
-        return {"frequency": list(np.arange(0.5, 5.01, 0.05))}
+        return {"frequency": list(np.arange(0.4, 5.01, 0.03))}
     return None
 
 
@@ -233,6 +238,7 @@ def _of_sensors(model: InverseModel, kind: str, of) -> list[Candidate]:
         f"{j}.velocity" for i, j in enumerate(joints) if model.has["velocity"][i]
     )
     positions = tuple(f"{j}.position" for j in joints)
+    places: list[tuple[str, ...]]
     if kind == "joint_offset":
         places = [(j,) for j in joints]
     elif kind == "sensor_bias":

@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from makebreak.gap.fit import Fitted, fit_effects
-from makebreak.gap.inverse import InverseModel
+from makebreak.gap.fit import Fitted, Model, fit_effects
 from makebreak.gap.screen import NESTED, Candidate, Ranked, is_sane, rank
 from makebreak.models.effects.kind import Effect
 from makebreak.systems.numerics.selection import (
@@ -49,7 +48,7 @@ class Selection:
 
 
 def select(
-    model: InverseModel,
+    model: Model,
     nuisance: np.ndarray,
     prior: np.ndarray,
     found: Sequence[Candidate],
@@ -62,7 +61,7 @@ def select(
     start = current = fit_effects(model, plain, ())
     chosen: list[dict] = []
     table: list[dict] = []
-    while len(chosen) < MOST_EFFECTS and current.fit.held_out > FLOOR:
+    while found and len(chosen) < MOST_EFFECTS and current.fit.held_out > FLOOR:
         step = _forward(model, nuisance, prior, found, chosen, current, start, say)
         if not chosen:
             table = step["table"]
@@ -103,7 +102,7 @@ def _forward(model, nuisance, prior, found, chosen, current, start, say) -> dict
     short = _shortlist(ranked, base.score)
     if not short:
         return {"table": table}
-    fitted = []
+    fitted: list[Fitted | None] = []
     for each in short:
         trial = [*[c["effect"] for c in chosen], each.effect]
         fixed = [*[c["fixed"] for c in chosen], each.candidate.fixed]
@@ -111,7 +110,9 @@ def _forward(model, nuisance, prior, found, chosen, current, start, say) -> dict
             fitted.append(fit_effects(model, screen, trial, fixed))
         except ValueError:
             fitted.append(None)
-        say(f"  {each.candidate.name}: {fitted[-1] and fitted[-1].score:.3g}")
+        say(
+            f"  {each.candidate.name}: {fitted[-1].score if fitted[-1] else np.nan:.3g}"
+        )
     sound = [
         (f, r) for f, r in zip(fitted, short, strict=True)
         if f is not None and is_sane(f.effects[-1]) and np.isfinite(f.score)
@@ -127,6 +128,14 @@ def _forward(model, nuisance, prior, found, chosen, current, start, say) -> dict
     sizes = [r.candidate.size for _, r in sound]
     pick = simplest(errors, sizes, SAME)
     fit, best = sound[pick]
+    # Bodies whose origins coincide: the outermost, as loads and forces mostly are.
+    for k, (other, r) in enumerate(sound):
+        same = (r.candidate.kind, r.candidate.size) == (
+            best.candidate.kind, best.candidate.size,
+        )  # fmt: skip
+        if same and error(other.score) <= 1.002 * error(fit.score):
+            if found.index(r.candidate) > found.index(best.candidate):
+                pick, fit, best = k, other, r
     # A model inside a bigger one stays unless the bigger gains clearly.
     for k, (inner, r) in enumerate(sound):
         inside = r.candidate.kind in NESTED.get(best.candidate.kind, ())
@@ -180,9 +189,7 @@ def _shortlist(ranked: list[Ranked], base: float) -> list[Ranked]:
 def _backward(model, nuisance, prior, chosen, current, start):
     """Drops effects without which the error hardly grows, the least needed first."""
     while len(chosen) > 1:
-        screen = Screen(
-            current.r, nuisance, prior, model.train(), current.fit.train
-        )
+        screen = Screen(current.r, nuisance, prior, model.train(), current.fit.train)
         now = screen.judge(current.r).score
         without = []
         for k in range(len(chosen)):

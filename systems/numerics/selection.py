@@ -80,8 +80,10 @@ class Screen:
             g = g - columns.TN @ cho_solve(self._L, self._Nr)
         c = c_std = np.zeros(len(g))
         if len(g):
-            size = np.sqrt(np.maximum(np.diag(columns.TT), 1e-300))
-            w, u = np.linalg.eigh(G / np.outer(size, size))
+            size = np.sqrt(np.diag(columns.TT))
+            # What hardly shows, beside the other columns, is round-off.
+            size[size <= 1e-9 * size.max()] = np.inf
+            w, u = np.linalg.eigh(G / size[:, None] / size)
             good = w > 1e-11 * max(w[-1], 1e-300)
             inverse = np.where(good, 1.0 / np.where(good, w, 1.0), 0.0)
             c = u @ (inverse * (u.T @ (g / size))) / size

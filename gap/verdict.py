@@ -1,0 +1,76 @@
+"""The verdict on a gap, in numbers and in words."""
+
+from collections.abc import Sequence
+
+from makebreak.gap.result import Estimate, Evidence, NamedEffect
+from makebreak.gap.select import FLOOR, Choice
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import sentence
+
+# Left after all that could be named: more than so many times the noise, and more than
+# this share of the gap, is a gap without a name.
+UNNAMED, UNNAMED_SHARE = 2.0, 0.2
+NO_GAP = 1.5  # Times the noise, after the background within its tolerance.
+
+
+def verdict_of(choices: Sequence[Choice], start: float, end: float) -> str:
+    """Args: start, end: held-out error without and with all effects, the background
+    within its tolerance."""
+    if not choices:
+        return "no_gap" if start <= max(NO_GAP, FLOOR) else "gap_unnamed"
+    if end > max(UNNAMED, UNNAMED_SHARE * start):
+        return "gap_unnamed"
+    return "ambiguous" if any(c.ties for c in choices) else "gap_named"
+
+
+def named(choice: Choice) -> NamedEffect:
+    kind = KINDS[choice.effect.kind]
+    parameters, std = {}, {}
+    weak = False
+    for each in kind.parameters:
+        if each.name not in choice.effect.parameters:
+            continue
+        value = choice.effect.parameters[each.name]
+        spread = choice.std.get(each.name, 0.0)
+        width = each.high - each.low
+        if not spread < width:  # The data say nothing of it.
+            spread = float("inf")
+        weak |= spread > max(abs(value), 1e-3 * width)
+        parameters[each.name] = Estimate(value, spread, each.unit)
+        if 0.0 < spread < float("inf"):
+            std[each.name] = spread
+    apart = ""
+    if choice.ties or kind.tell_apart:
+        apart = kind.tell_apart[:1].upper() + kind.tell_apart[1:] + "."
+    says = sentence(choice.effect, kind, std)
+    return NamedEffect(
+        choice.effect.kind,
+        tuple(choice.effect.at),
+        parameters,
+        says[:1].upper() + says[1:] + ".",
+        Evidence(choice.before, choice.after, choice.runner_up, choice.margin),
+        choice.ties,
+        apart if choice.ties else "",
+        "weak" if weak else "identifiable",
+    )
+
+
+def says(verdict: str, effects: Sequence[NamedEffect], start: float, end: float) -> str:
+    """The first screen's sentence."""
+    if verdict == "no_gap":
+        return (
+            "The scene and the recordings agree: nothing is left beyond noise and "
+            f"tolerance (held-out error {start:.2g} times the noise)."
+        )
+    words = " ".join(each.says for each in effects)
+    if verdict == "gap_unnamed":
+        head = f"{words} Beyond that, " if words else ""
+        return head + (
+            f"{'a' if head else 'A'} gap is left that no effect of the catalogue "
+            f"explains: held-out error {end:.3g} times the noise."
+        )
+    tail = ""
+    if verdict == "ambiguous":
+        others = sorted({t.kind for e in effects for t in e.indistinguishable_from})
+        tail = f" These data cannot tell it apart from {', '.join(others)}."
+    return f"{words}{tail} Held-out error falls from {start:.3g} to {end:.3g}."

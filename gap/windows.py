@@ -1,0 +1,339 @@
+"""Episodes cut into windows that start from measured states, and simulated anew.
+
+A window's first state is smoothed from the positions around it; how uncertain that is
+grows with time in the window and counts as noise. Which windows are held out is fixed
+by their block of time before anything is fitted.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from makebreak.diagrams.scene_simulation import Commands, SceneSimulation
+from makebreak.gap.inverse import _sensing
+from makebreak.gap.recording import Episode, Recording
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
+from makebreak.models.scene import InitialSection, Scene
+from makebreak.systems.numerics.smoother import smooth
+
+_POSITIONS = ("x", "y", "z")
+_TURNS = ("qw", "qx", "qy", "qz")
+_G = 9.81
+LARGEST = 200.0  # An error beyond so many standard deviations counts as this: after a
+# bounce the other way, how much farther it goes says nothing.
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """rows: of the recording. state: {signal: (value, rate, accel.)} at the start."""
+
+    recording: int
+    episode: int
+    start: float  # [s]
+    rows: slice
+    state: dict[str, np.ndarray]
+    std: np.ndarray  # (n, n_channels) Of a measured sample about the simulated one.
+    train: bool
+
+
+class WindowModel:
+    """Residuals of simulated windows: the same questions as InverseModel answers, for
+    scenes with free bodies and contact, and for judging any scene.
+
+    Args: window_sec, hop_sec: length, and from one start to the next. most: windows at
+        most; a larger number is thinned evenly.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        recordings: Sequence[Recording],
+        window_sec: float = 0.3,
+        hop_sec: float | None = None,
+        block_sec: float = 1.2,
+        most: int = 400,
+        by_episode: bool = False,
+    ):
+        self.scene, self.recordings = scene, list(recordings)
+        self.window_sec = window_sec
+        self.simulation = SceneSimulation(scene)
+        self.dynamics = SceneDynamics(scene)
+        plant = self.dynamics.plant
+        self.joints = [
+            full_name(plant, j)
+            for j in one_dof_joints(plant)
+            if j.num_velocities()
+            and all(f"{full_name(plant, j)}.position" in r for r in recordings)
+        ]
+        self.bodies = [
+            full_name(plant, plant.get_body(i))
+            for i in sorted(plant.GetFloatingBaseBodies())
+            if all(f"{full_name(plant, plant.get_body(i))}.x" in r for r in recordings)
+        ]
+        known = set(self.simulation.channels())
+        self.channels = [
+            name
+            for name in recordings[0].channels
+            if name in known
+            and all(name in r for r in recordings)
+            and not recordings[0].channels[name].is_command
+            and not name.endswith(".effort_measured")
+            and name.rsplit(".", 1)[0] in (*self.joints, *self.bodies)
+        ]
+        if not self.channels:
+            raise ValueError(
+                "no measured channel of the recordings can be simulated: expected "
+                "positions of joints or poses of free bodies"
+            )
+        self.noise = np.array(
+            [max(r.channels[c].noise for r in recordings) for c in self.channels]
+        )
+        self.noise = np.maximum(self.noise, 1e-9)
+        self.windows: list[Window] = []
+        self._paths: dict[tuple[int, int], dict[str, np.ndarray]] = {}
+        number = 0
+        for i, recording in enumerate(recordings):
+            for episode in recording.episodes:
+                self._cut(
+                    i, recording, episode, hop_sec or window_sec, block_sec,
+                    number if by_episode else None,
+                )  # fmt: skip
+                number += 1
+        if len(self.windows) > most:
+            keep = np.unique(np.linspace(0, len(self.windows) - 1, most).astype(int))
+            self.windows = [self.windows[k] for k in keep]
+        if not self.windows:
+            raise ValueError(
+                f"no episode of the recordings holds a window of {window_sec} s"
+            )
+        self._commands = self._all_commands()
+        self._base: np.ndarray | None = None
+        self.runs = 0
+
+    # ----- Cutting
+
+    def _signals(self) -> list[str]:
+        names = [f"{joint}.position" for joint in self.joints]
+        for body in self.bodies:
+            names += [f"{body}.{axis}" for axis in _POSITIONS]
+            names += [
+                f"{body}.{q}" for q in _TURNS
+                if all(f"{body}.{q}" in r for r in self.recordings)
+            ]  # fmt: skip
+        return names
+
+    def _cut(self, i, recording: Recording, episode: Episode, hop, block, number):
+        time = recording.time[episode.rows]
+        if len(time) < 12 or time[-1] - time[0] < 0.6 * self.window_sec:
+            return
+        states, spreads = {}, {}
+        rough = np.zeros(len(time), bool)
+        for name in self._signals():
+            y = recording[name][episode.rows]
+            if np.isfinite(y).sum() < 8:
+                return
+            s = smooth(time, y, recording.channels[name].noise)
+            states[name] = s.x
+            spreads[name] = s.P
+            if name.rsplit(".", 1)[0] in self.bodies and name[-2:] in (
+                ".x",
+                ".y",
+                ".z",
+            ):
+                rough |= np.abs(s.x[:, 2]) > 2.0 * _G
+        self._paths[i, episode.first] = {"time": time, **states}
+        if rough.any():  # No start amid an impact, where the smoothed state is a mean.
+            at = np.flatnonzero(rough)
+            for k in at:
+                rough[max(k - 4, 0) : k + 5] = True
+        commands = [recording.held(c.name)[episode.rows] for c in recording.commands()]
+        start_row = 0
+        while start_row < len(time) - 3:
+            t0 = time[start_row]
+            last = int(np.searchsorted(time, t0 + self.window_sec, "right"))
+            if time[-1] - t0 < 0.6 * self.window_sec:
+                break
+            ok = not rough[start_row] and all(
+                np.isfinite(u[start_row]) for u in commands
+            )
+            if ok:
+                after = time[start_row:last] - t0
+                std = np.empty((last - start_row, len(self.channels)))
+                for c, name in enumerate(self.channels):
+                    std[:, c] = self._std(name, c, spreads, start_row, after)
+                block_number = number
+                if number is None:
+                    block_number = int((t0 - time[0]) / block)
+                self.windows.append(
+                    Window(
+                        i, episode.number, float(t0),
+                        slice(episode.first + start_row, episode.first + last),
+                        {n: x[start_row] for n, x in states.items()}, std,
+                        block_number % 3 != 1,
+                    )
+                )  # fmt: skip
+            start_row = max(int(np.searchsorted(time, t0 + hop)), start_row + 1)
+
+    def _std(self, name, c, spreads, k, after) -> np.ndarray:
+        """Noise of a sample, and of where a window's start is, carried along."""
+        at, quantity = name.rsplit(".", 1)
+        extra = np.zeros(len(after))
+        if quantity in ("position", "x", "y", "z", *_TURNS) and name in spreads:
+            P = spreads[name][k]
+            extra = P[0, 0] + 2.0 * after * P[0, 1] + after**2 * P[1, 1]
+        elif quantity == "velocity":
+            extra += spreads[f"{at}.position"][k][1, 1]
+        elif quantity in ("vx", "vy", "vz"):
+            extra += spreads[f"{at}.{quantity[1]}"][k][1, 1]
+        elif quantity in ("wx", "wy", "wz") and f"{at}.qw" in spreads:
+            extra += 4.0 * np.mean([spreads[f"{at}.{q}"][k][1, 1] for q in _TURNS])
+        return np.sqrt(self.noise[c] ** 2 + np.maximum(extra, 0.0))
+
+    def _all_commands(self) -> list[dict[int, Commands]]:
+        out = []
+        for recording in self.recordings:
+            names = [
+                c.name for c in recording.commands()
+                if c.name.rsplit(".", 1)[0] in self._driven(c.quantity)
+            ]  # fmt: skip
+            of: dict[int, Commands] = {}
+            for episode in recording.episodes:
+                time = recording.time[episode.rows]
+                columns = {n: recording.held(n)[episode.rows] for n in names}
+                if not names:  # What the motors gave stands in for it.
+                    for joint in self._driven("effort_command"):
+                        key = f"{joint}.effort_measured"
+                        if key in recording:
+                            columns[f"{joint}.effort_command"] = recording[key][
+                                episode.rows
+                            ]
+                of[episode.first] = Commands(time, columns)
+            out.append(of)
+        return out
+
+    def _driven(self, quantity: str) -> list[str]:
+        act = self.scene.actuation
+        wanted = {"effort": ("effort_command",),
+                  "pd": ("position_command", "velocity_command")}  # fmt: skip
+        return act.joints if quantity in wanted.get(act.type, ()) else []
+
+    # ----- Simulating
+
+    def simulate(self, effects: Sequence[Effect], chosen=None) -> list[np.ndarray]:
+        """(n, n_channels) of each window, in the scene with these effects added."""
+        self.simulation.set_effects([*self.scene.effects, *effects])
+        self.runs += 1
+        out = []
+        for k, w in enumerate(self.windows):
+            if chosen is not None and not chosen[k]:
+                out.append(np.zeros((0, len(self.channels))))
+                continue
+            recording = self.recordings[w.recording]
+            episode = next(
+                e for e in recording.episodes if e.first <= w.rows.start < e.last
+            )
+            out.append(
+                self.simulation.run(
+                    self._initial(w, episode, effects),
+                    recording.time[w.rows],
+                    self.channels,
+                    self._commands[w.recording][episode.first],
+                    start_sec=w.start,
+                    initial_is_true=True,
+                )
+            )
+        return out
+
+    def _initial(self, w: Window, episode: Episode, effects) -> InitialSection:
+        """The true state at the start, if the effects on measurement are these."""
+        initial = InitialSection()
+        path = self._paths[w.recording, episode.first]
+        measured = [e for e in effects if e.kind in _MEASUREMENT]
+
+        def state(name: str) -> np.ndarray:
+            scale, late, bias = _sensing(measured, name)
+            if scale == 1.0 and late == 0.0:
+                x = w.state[name]
+            else:
+                at = w.start * scale + late
+                x = np.array([np.interp(at, path["time"], y) for y in path[name].T])
+                x = x * np.array([1.0, scale, scale**2])
+            return x - np.array([bias, 0.0, 0.0])
+
+        for joint in self.joints:
+            x = state(f"{joint}.position")
+            initial.positions[joint] = float(x[0])
+            initial.velocities[joint] = float(x[1])
+        for body in self.bodies:
+            length = _length_scale(measured, body)
+            place = np.array([state(f"{body}.{a}") for a in _POSITIONS]) / length
+            q, dq = np.array([1.0, 0, 0, 0]), np.zeros(4)
+            if f"{body}.qw" in w.state:
+                turn = np.array([state(f"{body}.{a}") for a in _TURNS])
+                size = np.linalg.norm(turn[:, 0])
+                q, dq = turn[:, 0] / size, turn[:, 1] / size
+            spin = 2.0 * _product(dq, q * np.array([1, -1, -1, -1]))[1:]
+            initial.poses[body] = [*map(float, q), *map(float, place[:, 0])]
+            initial.body_velocities[body] = [
+                *map(float, spin),
+                *map(float, place[:, 1]),
+            ]
+        return initial
+
+    def errors(self, simulated: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """(measured - simulated)/std of each window; 0 where nothing was measured."""
+        out = []
+        for w, y in zip(self.windows, simulated, strict=True):
+            if not len(y):
+                out.append(y)
+                continue
+            recording = self.recordings[w.recording]
+            seen = np.stack([recording[c][w.rows] for c in self.channels], axis=1)
+            e = (seen - y) / w.std
+            e = np.where(np.isfinite(seen), np.where(np.isfinite(y), e, np.inf), 0.0)
+            out.append(np.clip(e, -LARGEST, LARGEST))
+        return out
+
+    # ----- As InverseModel
+
+    def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
+        return np.concatenate([e.ravel() for e in self.errors(self.simulate(effects))])
+
+    def base(self) -> np.ndarray:
+        if self._base is None:
+            self._base = self.residual()
+        return self._base
+
+    def train(self) -> np.ndarray:
+        k = len(self.channels)
+        return np.concatenate(
+            [np.full((w.rows.stop - w.rows.start) * k, w.train) for w in self.windows]
+        )
+
+
+_MEASUREMENT = ("joint_offset", "sensor_delay", "clock_skew", "sensor_bias",
+                "length_scale")  # fmt: skip
+
+
+def with_step(scene: Scene, time_step: float) -> Scene:
+    """The scene with another time step [s]; 0 is continuous."""
+    return replace(scene, plant=replace(scene.plant, time_step=time_step))
+
+
+def _length_scale(effects, body: str) -> float:
+    scale = 1.0
+    for effect in effects:
+        if effect.kind == "length_scale" and any(
+            at in ("world", body, body.split(".")[0]) for at in effect.at
+        ):
+            scale *= effect.parameters["scale"]
+    return scale
+
+
+def _product(a, b) -> np.ndarray:
+    w, x = a[0], a[1:]
+    return np.array(
+        [w * b[0] - x @ b[1:], *(w * b[1:] + b[0] * x + np.cross(x, b[1:]))]
+    )
