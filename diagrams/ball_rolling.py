@@ -35,6 +35,7 @@ from makebreak.systems.arm_reference import ArmReference, ArmReferenceConfig
 from makebreak.systems.ball_tracker import BallTracker, BallTrackerConfig
 from makebreak.systems.c3_mpc import C3Config, C3Mpc
 from makebreak.systems.impedance_controller import (
+    HybridConfig,
     ImpedanceConfig,
     ImpedanceController,
     serial_chain_of,
@@ -238,6 +239,27 @@ def make_ball_rolling(
     diagram. For scoring, `state_log`, `contact_log` and `torque_log` log the truth at
     1 kHz: the plant's state, the contact's torque on the arm, the commanded torque.
     """
+    builder = DiagramBuilder()
+    add_ball_rolling(builder, config, meshcat)
+    connect_reference(builder)
+    diagram = builder.Build()
+    diagram.set_name("ball_rolling")
+    return diagram
+
+
+def add_ball_rolling(
+    builder: DiagramBuilder,
+    config: BallRollingConfig,
+    meshcat: Meshcat | None = None,
+    sampled: bool = False,
+    hybrid: HybridConfig | None = None,
+) -> None:
+    """Adds and connects all but what leads from the task to the arm: that is
+    connect_reference's, or another diagram's.
+
+    Args: sampled: of the station's sensors, StationConfig; hybrid: of the arm's force
+        control, which nothing here asks for.
+    """
     for name, own in (
         ("tracker", ("ball_radius", "period_sec", "offset_sec")),
         ("task", ("period_sec", "offset_sec")),
@@ -253,7 +275,6 @@ def make_ball_rolling(
                     "diagram sets it"
                 )
     model, model_scene = believed(config)
-    builder = DiagramBuilder()
     if config.camera.position_noise_m != 0.0:
         raise ValueError(
             f"camera.position_noise_m is {config.camera.position_noise_m}, expected 0: "
@@ -270,6 +291,7 @@ def make_ball_rolling(
                 camera=camera,
                 contact=[TOOL, "ball"],
                 seed=config.seed,
+                sampled=sampled,
             ),
             meshcat,
             world_scene(config),
@@ -283,20 +305,19 @@ def make_ball_rolling(
         ContactPair("tip::tip", "ball::ball", config.planner.friction),
         ContactPair("ball::ball", "table::table", config.planner.friction),
     ]
-    lcs = {}
+    lcs, lcs_of = {}, {}
     for name, dt, period in (
         ("plan", PLAN_DT, CONTROL),
         ("command", CONTROL, CONTROL),
         ("learn", LEARN, LEARN),
     ):
-        lcs[name] = builder.AddNamedSystem(
-            f"lcs_{name}",
-            AnitescuLcsBuilder(
-                make_tip_and_ball(model)[0],
-                LcsBuilderConfig(pairs, dt, None, period, OFFSET["lcs"]),
-            ),
+        own = AnitescuLcsBuilder(
+            make_tip_and_ball(model)[0],
+            LcsBuilderConfig(pairs, dt, None, period, OFFSET["lcs"]),
         )
-    n_lam = lcs["plan"].model.n_lam
+        lcs_of[name] = own.model
+        lcs[name] = builder.AddNamedSystem(f"lcs_{name}", own)
+    n_lam = lcs_of["plan"].n_lam
 
     tracker = builder.AddNamedSystem(
         "ball_tracker",
@@ -351,8 +372,8 @@ def make_ball_rolling(
             ),
             n_lam,
             p_tip,
-            lcs["command"].model.build(
-                lcs["command"].model.x_default, np.zeros(lcs["command"].model.n_u)
+            lcs_of["command"].build(
+                lcs_of["command"].x_default, np.zeros(lcs_of["command"].n_u)
             ),
         ),
     )
@@ -364,6 +385,7 @@ def make_ball_rolling(
             ),
             arm,
             TIP_FRAME,
+            hybrid=hybrid,
         ),
     )
     no_force = builder.AddNamedSystem("no_force", ConstantVectorSource(np.zeros(3)))
@@ -386,8 +408,8 @@ def make_ball_rolling(
             "residual_learner",
             ResidualLearner(
                 learner_config(config.learner),
-                lcs["learn"].model.build(
-                    lcs["learn"].model.x_default, np.zeros(lcs["learn"].model.n_u)
+                lcs_of["learn"].build(
+                    lcs_of["learn"].x_default, np.zeros(lcs_of["learn"].n_u)
                 ),
                 LEARN,
                 OFFSET["learner"],
@@ -412,15 +434,12 @@ def make_ball_rolling(
     connect(lcs["command"], "lcs", c3, "lcs_command")
     builder.Connect(r_comp, c3.GetInputPort("r_comp"))
     connect(task, "phase", reference, "phase")
-    connect(task, "reference", reference, "reference")
     connect(c3, "x_next", reference, "x_next")
     connect(c3, "lam", reference, "lam")
     connect(c3, "status", reference, "status")
     connect(lcs["command"], "lcs", reference, "lcs")
     connect(station, f"{ARM}.position_measured", impedance, "q")
     connect(station, f"{ARM}.velocity_measured", impedance, "v")
-    connect(reference, "x_desired", impedance, "x_desired")
-    connect(reference, "wrench", impedance, "wrench_feedforward")
     connect(impedance, "tau", station, f"{ARM}.torque_commanded")
 
     # For scoring and for the eye alone.
@@ -455,6 +474,16 @@ def make_ball_rolling(
         builder.Connect(p_ball.get_output_port(), view.GetInputPort("p_ball"))
         connect(estimator, "x", view, "x")
         builder.Connect(gap_of_r.get_output_port(), view.GetInputPort("gap"))
-    diagram = builder.Build()
-    diagram.set_name("ball_rolling")
-    return diagram
+
+
+def connect_reference(builder: DiagramBuilder) -> None:
+    """The task's own reposition, and the reference straight to the arm."""
+    system = builder.GetSubsystemByName
+    for source, output, target, port in (
+        ("rolling_task", "reference", "arm_reference", "reference"),
+        ("arm_reference", "x_desired", "impedance_controller", "x_desired"),
+        ("arm_reference", "wrench", "impedance_controller", "wrench_feedforward"),
+    ):
+        builder.Connect(
+            system(source).GetOutputPort(output), system(target).GetInputPort(port)
+        )

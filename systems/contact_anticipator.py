@@ -104,6 +104,7 @@ class AnticipatorMemory:
     last_time: float = -np.inf  # When one was made or broken [s].
     segment_time: float = 0.0  # When this segment began [s].
     status: int = 0
+    trial: float = 0.0  # Of the port.
 
     def __copy__(self):
         return self
@@ -135,7 +136,10 @@ class KalmanContactAnticipator(LeafSystem):
     speed, or by eq. 9, at most `growth` times faster than before.
 
     Inputs:  ee_pose (7,) of the tip; contact (14,), transition (6,), phase (6,) of
-             numerics/contact_task.py.
+             numerics/contact_task.py; optional trial (1,): a motion that is repeated
+             within one simulation counts its repetitions there. When the number
+             changes a new trial begins: contacts drift by std_drift, and each can be
+             felt once more.
     Outputs: contacts (abstract, ContactBelief);
              approach_speed (1,) of the next impact of this segment, 0 if none is
              expected [m/s];
@@ -179,25 +183,13 @@ class KalmanContactAnticipator(LeafSystem):
             )
         self._lead = float(config.hint_lead_sec)
         self._mass = effective_mass
-        given = ContactBelief() if knowledge is None else knowledge
-        drift = self._filter.std_drift**2 * np.eye(3)
-        contacts = []
-        for contact in given.contacts:
-            if contact.seen > 0:
-                # Within a trial none is dropped: others know it by its index.
-                if spread_along(contact.covariance, contact.direction) > FORGET_STD:
-                    continue
-                mean, covariance = predict(contact.mean, contact.covariance, drift)
-                contact = replace(contact, mean=mean, covariance=covariance)
-            if len(contact.impacts) == 0:
-                speed = min(self._speed.first, self._speed.most)
-                contact = replace(contact, approach_speed=speed)
-            contacts.append(contact)
-        memory = AnticipatorMemory(ContactBelief(tuple(contacts)), np.zeros((0, 5)))
+        belief = self._next_trial(ContactBelief() if knowledge is None else knowledge)
+        memory = AnticipatorMemory(belief, np.zeros((0, 5)))
         self._pose = self.DeclareVectorInputPort("ee_pose", 7)
         self._contact = self.DeclareVectorInputPort("contact", N_CONTACT)
         self._transition = self.DeclareVectorInputPort("transition", N_TRANSITION)
         self._phase = self.DeclareVectorInputPort("phase", N_PHASE)
+        self._trial = self.DeclareVectorInputPort("trial", 1)
         self._memory = self.DeclareAbstractState(Value(memory))
         ticket = {self.abstract_state_ticket(self._memory)}
         self.DeclareAbstractOutputPort(
@@ -250,10 +242,39 @@ class KalmanContactAnticipator(LeafSystem):
                 best, least = float(contact.to_mode), past
         return best
 
+    def _next_trial(self, belief: ContactBelief) -> ContactBelief:
+        """What is expected at the beginning of a trial, after the one before."""
+        drift = self._filter.std_drift**2 * np.eye(3)
+        contacts = []
+        for contact in belief.contacts:
+            if contact.seen > 0:
+                # Within a trial none is dropped: others know it by its index.
+                if spread_along(contact.covariance, contact.direction) > FORGET_STD:
+                    continue
+                mean, covariance = predict(contact.mean, contact.covariance, drift)
+                contact = replace(contact, mean=mean, covariance=covariance)
+            if len(contact.impacts) == 0:
+                speed = min(self._speed.first, self._speed.most)
+                contact = replace(contact, approach_speed=speed)
+            contacts.append(contact)
+        return ContactBelief(tuple(contacts))
+
+    def _begun(self, memory, context) -> AnticipatorMemory:
+        """The memory, of a new trial if the port `trial` says so."""
+        if not self._trial.HasValue(context):
+            return memory
+        trial = float(self._trial.Eval(context)[0])
+        if trial == memory.trial or not np.isfinite(trial):
+            return memory
+        belief = self._next_trial(memory.belief)
+        return replace(
+            memory, belief=belief, trial=trial, updated=(), passed=(), last=-1
+        )
+
     @timed
     def _update(self, context: Context, state):
         memory = self._after(
-            self._memory_of(context),
+            self._begun(self._memory_of(context), context),
             context.get_time(),
             *[
                 port.Eval(context)

@@ -32,7 +32,8 @@ class RollingTask(LeafSystem):
     """Phases of rolling a ball along a circle, the target of C3 and the reposition.
 
     Inputs:  x (19,); valid (1,); r_comp (n_lam,) [m/s] of the learner, whose first
-             n_tip entries belong to tip and ball.
+             n_tip entries belong to tip and ball; optional landed (1,): where another
+             system carries the reposition out, it ends when this is 1, not in time.
     Outputs: x_desired ((N+1) 19,) for C3; reference (9,) = p, v, a of the tip at the
              next tick, used unless rolling; phase (1,): 0 roll, 1 reposition, 2 wait.
 
@@ -60,6 +61,7 @@ class RollingTask(LeafSystem):
         self._x = self.DeclareVectorInputPort("x", N_X)
         self._valid = self.DeclareVectorInputPort("valid", 1)
         self._r_comp = self.DeclareVectorInputPort("r_comp", n_lam)
+        self._landed = self.DeclareVectorInputPort("landed", 1)
         start = TaskState(WAIT, 0.0, p_tip, np.zeros(3), np.zeros(3), p_tip[2])
         self._task = self.DeclareAbstractState(AbstractValue.Make(start))
         x_desired = np.tile(np.eye(N_X)[3], n_knots)
@@ -80,9 +82,12 @@ class RollingTask(LeafSystem):
         task = context.get_abstract_state(int(self._task)).get_value()
         gap = self._r_comp.Eval(context)[: self._n_tip].mean() * self._residual_dt_sec
         valid = self._valid.Eval(context)[0] > 0.5
+        landed = None
+        if self._landed.HasValue(context):
+            landed = bool(self._landed.Eval(context)[0] > 0.5)
         task = next_state(
             c.rolling, self._path, task, t, c.period_sec, x, gap, valid,
-            self._radius_ball, self._radius_tip,
+            self._radius_ball, self._radius_tip, landed,
         )  # fmt: skip
         z_tip = 2.0 * self._radius_ball + self._radius_tip - c.press
         goal = target_over_horizon(

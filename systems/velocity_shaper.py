@@ -16,6 +16,7 @@ from makebreak.systems.numerics.velocity_shaper import (
     N_MEMORY,
     N_REGIONS,
     ShaperLaw,
+    begin_anew,
     blended,
     expected,
     plan,
@@ -94,7 +95,9 @@ class VelocityShaper(LeafSystem):
              phase (6,), see numerics/contact_task.py.
 
     Args: pattern, begun at its first segment's time (the clock's, not the shaper's
-        start); plan_sec, period in which `contacts` and `motion` are read.
+        start); plan_sec, period in which `contacts` and `motion` are read; restarts: a
+        pattern that comes on `motion` begins at its start, at rest and at once, without
+        a blend, for motions that are handed over elsewhere.
     Raises: ValueError for a number that is not positive.
     Source: CC section 3.5.2, equation 11.
     """
@@ -104,12 +107,14 @@ class VelocityShaper(LeafSystem):
         config: VelocityShaperConfig,
         pattern: MotionPattern,
         plan_sec: float = 0.01,
+        restarts: bool = False,
     ):
         super().__init__()
         self._law = law = _law(config)
         if not 0.0 < plan_sec < np.inf:
             raise ValueError(f"plan_sec is {plan_sec}, expected > 0")
         self._pattern, self._anticipate = pattern, config.region.anticipate
+        self._restarts = bool(restarts)
         self._no_regions, self._no_contact = np.zeros(N_REGIONS), np.zeros(N_CONTACT)
         warm_up(pattern, law)
         self._contacts = self.DeclareAbstractInputPort(
@@ -167,11 +172,15 @@ class VelocityShaper(LeafSystem):
                 )
                 discrete.set_value(int(self._memory_old), memory)
                 contact = self._contact.Eval(context)
-                memory, T = take_over(
-                    now.table, self._law, contact, t, patterns.now.table, memory
-                )
+                if self._restarts:
+                    memory = begin_anew(now.table, contact, t)
+                    patterns = _Patterns(now, given)
+                else:
+                    memory, T = take_over(
+                        now.table, self._law, contact, t, patterns.now.table, memory
+                    )
+                    patterns = _Patterns(now, given, patterns.now, t, T)
                 discrete.set_value(int(self._memory), memory)
-                patterns = _Patterns(now, given, patterns.now, t, T)
                 state.get_mutable_abstract_state(int(self._patterns)).set_value(
                     patterns
                 )

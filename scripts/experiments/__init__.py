@@ -21,6 +21,7 @@ EXPERIMENTS: dict[str, str] = {
     "cartpole_walls": "makebreak.scripts.experiments.cartpole_walls",
     "changing_surface": "makebreak.scripts.experiments.changing_surface",
     "contact_learning": "makebreak.scripts.experiments.contact_learning",
+    "gentle_rolling": "makebreak.scripts.experiments.gentle_rolling",
     "multi_spring": "makebreak.scripts.experiments.multi_spring",
     "multiple_collisions": "makebreak.scripts.experiments.multiple_collisions",
     "porridge": "makebreak.scripts.experiments.porridge",

@@ -183,13 +183,17 @@ def target_over_horizon(path, x, lead, speed, z_tip, radius_ball, dt, n_knots):
     return goal
 
 
-def next_state(config, path, state, t, dt, x, gap, valid, radius_ball, radius_tip):
+def next_state(
+    config, path, state, t, dt, x, gap, valid, radius_ball, radius_tip, landed=None
+):
     """One tick of the task.
 
     Args:
         t, dt: time now and period of the ticks [s].
         x: (19,) estimated state. gap: mean residual of tip and ball as a length [m].
         valid: whether x can be trusted (the ball is seen).
+        landed: whether a reposition that others carry out is over; None: it is when
+            its time is.
     Returns: TaskState: the phase, and in REPOSITION and WAIT the reference at t + dt.
     """
 
@@ -220,7 +224,8 @@ def next_state(config, path, state, t, dt, x, gap, valid, radius_ball, radius_ti
         if t - state.since_sec < config.roll_sec and ahead < config.roll_ahead:
             return state
         state = lift_from(REPOSITION)
-    if t - state.since_sec >= config.reposition_sec - 0.5 * dt:
+    over = t - state.since_sec >= config.reposition_sec - 0.5 * dt
+    if state.since_sec < t and (over if landed is None else landed):
         return TaskState(ROLL, t, state.p, state.v, state.a)
     p, v, a = reposition_step(
         config, path, state, t, dt, x, gap, radius_ball, radius_tip

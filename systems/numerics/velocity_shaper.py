@@ -380,6 +380,13 @@ def start(table, contact, t, speed):
     return m
 
 
+def begin_anew(table, contact, t):
+    """Memory (N_MEMORY,) of a pattern that begins now, at rest, whatever its times."""
+    memory = start(table, contact, t, 0.0)
+    memory[_INIT] = 2.0  # It does not wait for its first time.
+    return memory
+
+
 @numba.njit(cache=True)
 def _brake(m, law, t, s_limit, v_limit):
     """When to begin the step down to v_limit that ends at s_limit; inf: not in this

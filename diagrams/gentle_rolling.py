@@ -1,0 +1,414 @@
+"""All seven systems in one diagram: a ball is rolled, and touched gently.
+
+    as in ball_rolling: camera, tracker, estimator, three LCS builders, residual
+    learner, C3, task --> arm_reference
+    rolling_task (a push is over) --> push_motion --motion--> velocity_shaper
+    push_motion --frame, under the ball--> moving_frame, reference_blend
+    moving_frame --ee_pose--> contact_detector, contact_anticipator, velocity_shaper
+    contact_detector --contact--> contact_anticipator --contacts--> velocity_shaper
+    mode_detector --mode--> forward_model_bank --> variable_impedance
+    arm_reference (roll), velocity_shaper (between pushes) --> reference_blend
+    reference_blend, variable_impedance --> impedance_controller --tau--> station
+
+The shaper, the detector and the anticipator live in a frame that moves with the ball:
+there the ball lies still, and what is learned of a contact holds for the next push.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import LogVectorOutput, Multiplexer
+
+from makebreak.diagrams.ball_rolling import (
+    ARM_TICK,
+    CONTROL,
+    BallRollingConfig,
+    add_ball_rolling,
+    believed,
+    connect_reference,
+)
+from makebreak.diagrams.camera import CameraConfig
+from makebreak.diagrams.station import ARM, TIP_FRAME, make_control_plant
+from makebreak.systems.contact_anticipator import (
+    ApproachSpeedConfig,
+    ContactAnticipatorConfig,
+    ContactFilterConfig,
+    KalmanContactAnticipator,
+)
+from makebreak.systems.contact_detector import ContactDetector, ContactDetectorConfig
+from makebreak.systems.forward_model import ForwardModelBank, ForwardModelConfig
+from makebreak.systems.frozen import Frozen
+from makebreak.systems.impedance_controller import HybridConfig, serial_chain_of
+from makebreak.systems.mode_detector import ModeDetector, ModeDetectorConfig
+from makebreak.systems.moving_frame import MovingFrame
+from makebreak.systems.numerics.contact_task import ContactBelief, ExpectedContact
+from makebreak.systems.numerics.push_motion import BALL_SEGMENT, DOWN, TABLE_SEGMENT
+from makebreak.systems.numerics.rolling_task import (
+    CirclePath,
+    RollingConfig,
+    surface_height,
+)
+from makebreak.systems.push_motion import PushMotion, PushMotionConfig
+from makebreak.systems.reference_blend import ReferenceBlend, ReferenceBlendConfig
+from makebreak.systems.rolling_task import RollingTaskConfig
+from makebreak.systems.tip_state import TipState
+from makebreak.systems.variable_impedance import (
+    StiffnessConfig,
+    VariableImpedance,
+    VariableImpedanceConfig,
+)
+from makebreak.systems.velocity_shaper import (
+    RegionConfig,
+    SearchConfig,
+    VelocityShaper,
+    VelocityShaperConfig,
+)
+
+BRISK_SEC = 0.4  # A reposition, if nothing slows it.
+# Periods and offsets of what ball_rolling has not [s]. All that runs each millisecond
+# runs at one instant; the motion is chosen after the task, and before arm_reference.
+ESTIMATE, ANTICIPATE, PLAN = 0.005, 0.01, 0.005
+OFFSET, MOTION_OFFSET, BLEND_OFFSET = 1e-4, 3.2e-4, 3.4e-4
+# How well the model is thought to know the ball's radius and the table's height.
+RADIUS_STD = 0.003  # [m]
+TABLE_STD, TABLE_FORCE_PER_SPEED = 0.002, 700.0  # [m], [N s/m]
+FINGER_MASS = 0.12  # [kg] Between the wrench sensor and the tip.
+# A direction that is let go is to be moved along at once.
+HYBRID = HybridConfig(release_sec=0.03, normal_damping=50.0, closing_speed=0.012)
+# The seven, and what each is in the diagram.
+SEVEN = {
+    "lcs_builder": ("lcs_plan", "lcs_command", "lcs_learn"),
+    "c3_mpc": ("c3_mpc",),
+    "residual_learner": ("residual_learner",),
+    "mode_detector": ("mode_detector",),
+    "contact_anticipator": ("contact_anticipator",),
+    "velocity_shaper": ("velocity_shaper",),
+    "impedance_controller": ("impedance_controller",),
+}
+
+
+@dataclass
+class TouchConfig:
+    """The second paper's systems, for contacts of 1 to 3 N.
+
+    The wrench has 0.1 N of noise at 1 kHz, 0.05 N behind the detector's filter: 1 N is
+    20 of these, and more than what the finger's own inertia leaves."""
+
+    detector: ContactDetectorConfig = field(
+        default_factory=lambda: ContactDetectorConfig(
+            impact_force=1.0, loss_force=0.3, tool_mass=FINGER_MASS
+        )
+    )
+    modes: ModeDetectorConfig = field(
+        default_factory=lambda: ModeDetectorConfig(
+            threshold=0.08, crossing=0.0, normal_force_min=0.5, tool_mass=FINGER_MASS
+        )
+    )
+    forward_model: ForwardModelConfig = field(
+        default_factory=lambda: ForwardModelConfig(with_torque=False)
+    )
+    anticipator: ContactAnticipatorConfig = field(
+        default_factory=lambda: ContactAnticipatorConfig(
+            # The ball's place is known to 1 mm or so: on its slope, 0.4 mm of height.
+            filter=ContactFilterConfig(std_along=0.0005, std_drift=0.00025),
+            speed=ApproachSpeedConfig(force_desired=7.5, first=0.015, most=0.03),
+        )
+    )
+    shaper: VelocityShaperConfig = field(
+        default_factory=lambda: VelocityShaperConfig(
+            acceleration_max=5.0,
+            region=RegionConfig(
+                sigmas=2.0, margin=0.0008, settle_sec=0.05, blend_sec=0.05
+            ),
+            search=SearchConfig(speed=0.022, distance=0.02, go_on_unexpected=True),
+        )
+    )
+    variable_impedance: VariableImpedanceConfig = field(
+        default_factory=lambda: VariableImpedanceConfig(
+            stiffness=StiffnessConfig(free=800.0, maximum=1000.0, impact=300.0),
+            blend_sec=0.05,
+        )
+    )
+    blend: ReferenceBlendConfig = field(default_factory=ReferenceBlendConfig)
+
+
+def _brisk_ball() -> BallRollingConfig:
+    rolling = RollingConfig(reposition_sec=BRISK_SEC)
+    return BallRollingConfig(
+        camera=CameraConfig(renderer="drawn"), task=RollingTaskConfig(rolling=rolling)
+    )
+
+
+@dataclass
+class GentleRollingConfig:
+    gentle: bool = True  # False: without the second paper's systems.
+    adapt: bool = True  # False: without the residual learner.
+    frozen: list[str] = field(default_factory=list)  # Of SEVEN: held at their default.
+    ball: BallRollingConfig = field(default_factory=_brisk_ball)
+    touch: TouchConfig = field(default_factory=TouchConfig)
+    push: PushMotionConfig = field(default_factory=PushMotionConfig)
+    seed: int = 0
+
+
+# What `telemetry_log` holds: name -> (system, port, size).
+SIGNALS = {
+    "task_phase": ("rolling_task", "phase", 1),
+    "kind": ("push_motion", "kind", 1),
+    "trial": ("push_motion", "trial", 1),
+    "active": ("push_motion", "active", 1),
+    "ee_pose": ("tip_state", "ee_pose", 7),
+    "in_frame": ("moving_frame", "ee_pose", 7),
+    "wrench": ("station", f"{ARM}.external_wrench", 6),
+    "x_desired": ("reference_blend", "x_desired", 19),
+    "shaped": ("velocity_shaper", "x_desired", 19),
+    "phase": ("velocity_shaper", "phase", 6),
+    "contact": ("contact_detector", "contact", 14),
+    "mode": ("mode_detector", "mode", 1),
+    "confidence": ("mode_detector", "confidence", 2),
+    "wrench_predicted": ("forward_model_bank", "wrench_predicted", 6),
+    "prediction_error": ("forward_model_bank", "prediction_error", 1),
+    "approach_speed": ("contact_anticipator", "approach_speed", 1),
+    "stiffness": ("variable_impedance", "stiffness", 6),
+}
+
+
+def ball_config(config: GentleRollingConfig) -> BallRollingConfig:
+    """Of the part that ball_rolling has too.
+
+    Raises: ValueError for settings that gentle_rolling's own replace.
+    """
+    for name in ("seed", "adapt"):
+        default = getattr(BallRollingConfig(), name)
+        if getattr(config.ball, name) != default:
+            raise ValueError(
+                f"ball.{name} is {getattr(config.ball, name)}, expected {default}: "
+                f"{name} sets it"
+            )
+    return replace(config.ball, seed=config.seed, adapt=config.adapt)
+
+
+def prior(config: GentleRollingConfig) -> ContactBelief:
+    """Where the model says that the finger will touch, in the frame under the ball."""
+    model, _ = believed(ball_config(config))
+    shape = config.push.shape
+    z = surface_height(shape.land_behind, model.ball_radius, model.tip_radius)
+    # Twice the radius' error is the height's. The table is known better, but it is
+    # hard: 700 N s/m are the arm's 5 kg on the model's 1e5 N/m.
+    slow = config.touch.anticipator.speed.force_desired / TABLE_FORCE_PER_SPEED
+    return ContactBelief((
+        ExpectedContact(
+            np.array([0.0, 0.0, z]),
+            (2.0 * RADIUS_STD) ** 2 * np.eye(3),
+            DOWN,
+            segment=BALL_SEGMENT,
+        ),
+        ExpectedContact(
+            np.array([0.0, 0.0, model.tip_radius]),
+            TABLE_STD**2 * np.eye(3),
+            DOWN,
+            segment=TABLE_SEGMENT,
+            approach_speed=slow,
+            impacts=np.array([[slow, slow * TABLE_FORCE_PER_SPEED]]),
+        ),
+    ))  # fmt: skip
+
+
+def make_gentle_rolling(
+    config: GentleRollingConfig, meshcat: Meshcat | None = None
+) -> Diagram:
+    """The whole experiment, each system by name in the diagram.
+
+    Raises: ValueError for a name in `frozen` that is none of SEVEN or is not in this
+        diagram, and for periods and offsets that the diagram sets.
+    """
+    ball = ball_config(config)
+    freeze = _to_freeze(config)
+    builder = _Freezer(freeze)
+    hybrid = HYBRID if config.gentle else None
+    add_ball_rolling(builder, ball, meshcat, sampled=True, hybrid=hybrid)
+    if config.gentle:
+        _add_touch(builder, config, ball)
+    else:
+        connect_reference(builder)
+    diagram = builder.Build()
+    diagram.set_name("gentle_rolling")
+    return diagram
+
+
+class _Freezer(DiagramBuilder):
+    """A builder in which some systems stay at their default outputs."""
+
+    def __init__(self, names):
+        super().__init__()
+        self._names = set(names)
+
+    def AddNamedSystem(self, name, system):
+        if name in self._names:
+            system.set_name(name)
+            system = Frozen(system)
+        return super().AddNamedSystem(name, system)
+
+
+def _to_freeze(config: GentleRollingConfig) -> list[str]:
+    out: list[str] = []
+    there = set(SEVEN)
+    if not config.adapt:
+        there -= {"residual_learner"}
+    if not config.gentle:
+        there -= {"mode_detector", "contact_anticipator", "velocity_shaper"}
+    for name in config.frozen:
+        if name not in there:
+            raise ValueError(
+                f"frozen has {name!r}, expected some of: {', '.join(sorted(there))}"
+            )
+        out += SEVEN[name]
+    return out
+
+
+def _timed(part, period, offset=OFFSET):
+    for key, value in (("period_sec", period), ("offset_sec", offset)):
+        default = getattr(type(part)(), key)
+        if getattr(part, key) != default:
+            raise ValueError(
+                f"{type(part).__name__}.{key} is {getattr(part, key)}, expected "
+                f"{default}: the diagram sets it"
+            )
+        part = replace(part, **{key: value})
+    return part
+
+
+def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) -> None:
+    """The second paper's systems, and what leads from both planners to the arm."""
+    touch = config.touch
+    model, scene = believed(ball)
+    chain = serial_chain_of(make_control_plant(scene), TIP_FRAME)
+    path = CirclePath(np.array(ball.task.center), ball.task.radius)
+
+    def add(name: str, system: LeafSystem):
+        return builder.AddNamedSystem(name, system)
+
+    motion = PushMotion(
+        config.push,
+        path,
+        model.ball_radius,
+        model.tip_radius,
+        touch.shaper.acceleration_max,
+        CONTROL,
+        MOTION_OFFSET,
+    )
+    first = motion.first_pattern()
+    add("push_motion", motion)
+    add("tip_state", TipState(chain))
+    add("moving_frame", MovingFrame())
+    add("contact_detector", ContactDetector(_timed(touch.detector, ARM_TICK)))
+    add("mode_detector", ModeDetector(touch.modes, None, ESTIMATE, OFFSET))
+    add(
+        "forward_model_bank",
+        ForwardModelBank(touch.forward_model, None, ESTIMATE, OFFSET),
+    )
+    add(
+        "contact_anticipator",
+        KalmanContactAnticipator(_timed(touch.anticipator, ANTICIPATE), prior(config)),
+    )
+    add(
+        "velocity_shaper",
+        VelocityShaper(_timed(touch.shaper, ARM_TICK), first, PLAN, restarts=True),
+    )
+    add(
+        "variable_impedance",
+        VariableImpedance(_timed(touch.variable_impedance, ARM_TICK)),
+    )
+    blend = replace(touch.blend, period_sec=CONTROL, offset_sec=BLEND_OFFSET)
+    add("reference_blend", ReferenceBlend(blend))
+
+    def connect(source, output, *targets):
+        """Each target is a system, or (system, port) where the names differ."""
+        port = builder.GetSubsystemByName(source).GetOutputPort(output)
+        for target in targets:
+            name, own = (target, output) if isinstance(target, str) else target
+            builder.Connect(port, builder.GetSubsystemByName(name).GetInputPort(own))
+
+    impedance = "impedance_controller"
+    connect("state_estimator", "x", "push_motion", "reference_blend")
+    connect("rolling_task", "phase", ("push_motion", "task_phase"))
+    connect("rolling_task", "reference", ("reference_blend", "task_reference"))
+    connect("push_motion", "landed", "rolling_task")
+    connect("push_motion", "motion", "velocity_shaper")
+    connect("push_motion", "frame", "moving_frame", "reference_blend")
+    connect("push_motion", "active", "reference_blend")
+    connect("push_motion", "trial", "contact_anticipator")
+    connect("station", f"{ARM}.position_measured", ("tip_state", "q"))
+    connect("station", f"{ARM}.velocity_measured", ("tip_state", "v"))
+    connect("tip_state", "ee_pose", "moving_frame")
+    connect(
+        "tip_state", "ee_velocity", "moving_frame", "mode_detector",
+        "forward_model_bank",
+    )  # fmt: skip
+    connect(
+        "moving_frame", "ee_pose", "contact_detector", "contact_anticipator",
+        "velocity_shaper",
+    )  # fmt: skip
+    connect("moving_frame", "ee_velocity", "contact_detector")
+    connect(
+        "station", f"{ARM}.external_wrench", ("contact_detector", "wrench"),
+        ("mode_detector", "wrench"), ("forward_model_bank", "wrench"),
+        (impedance, "wrench_measured"),
+    )  # fmt: skip
+    connect("velocity_shaper", "direction", "contact_detector")
+    connect("velocity_shaper", "force_directions", "contact_detector",
+            "reference_blend")  # fmt: skip
+    connect("velocity_shaper", "force_targets", "reference_blend")
+    connect("velocity_shaper", "phase", "contact_detector", "contact_anticipator",
+            "variable_impedance", "push_motion", "reference_blend")  # fmt: skip
+    connect("velocity_shaper", "x_desired", ("reference_blend", "shaped"),
+            ("push_motion", "shaped"))  # fmt: skip
+    connect("contact_detector", "contact", "contact_anticipator", "velocity_shaper")
+    connect("contact_anticipator", "contacts", "velocity_shaper")
+    connect("contact_anticipator", "mode_hint", "mode_detector")
+    connect("mode_detector", "transition", "contact_anticipator", "forward_model_bank")
+    connect("mode_detector", "mode", "forward_model_bank")
+    connect("mode_detector", "collecting", "variable_impedance")
+    connect("forward_model_bank", "wrench_predicted", "variable_impedance")
+    connect("forward_model_bank", "prediction_error", "variable_impedance")
+    connect("variable_impedance", "wrench_feedforward", "reference_blend")
+    connect("variable_impedance", "stiffness", impedance)
+    connect("arm_reference", "x_desired", ("reference_blend", "planned"),
+            ("push_motion", "arm"))  # fmt: skip
+    connect("arm_reference", "wrench", ("reference_blend", "planned_wrench"))
+    connect("reference_blend", "reference", "arm_reference")
+    connect("reference_blend", "direction", "mode_detector", "forward_model_bank")
+    connect("reference_blend", "contact_directions",
+            ("mode_detector", "force_directions"),
+            ("forward_model_bank", "force_directions"))  # fmt: skip
+    connect("reference_blend", "x_desired", impedance)
+    connect("reference_blend", "wrench", (impedance, "wrench_feedforward"))
+    connect("reference_blend", "damping", impedance)
+    connect("reference_blend", "force_directions", impedance)
+    connect("reference_blend", "force_targets", impedance)
+
+    # For scoring and for the eye alone.
+    bundle = add("telemetry", Multiplexer([size for _, _, size in SIGNALS.values()]))
+    for i, (system, port, _) in enumerate(SIGNALS.values()):
+        builder.Connect(
+            builder.GetSubsystemByName(system).GetOutputPort(port),
+            bundle.get_input_port(i),
+        )
+    log = LogVectorOutput(bundle.get_output_port(), builder, ARM_TICK)
+    log.set_name("telemetry_log")
+
+
+def telemetry(diagram: Diagram, context) -> dict[str, np.ndarray]:
+    """What was logged in a simulation that ended in `context`: time (n,), and each of
+    SIGNALS (n, k), a row per millisecond, taken before the events of that instant.
+    Empty without the second paper's systems."""
+    if not diagram.HasSubsystemNamed("telemetry_log"):
+        return {}
+    log = diagram.GetSubsystemByName("telemetry_log").FindLog(context)
+    out = {"time": np.array(log.sample_times())}
+    data, start = log.data(), 0
+    for name, (_, _, size) in SIGNALS.items():
+        out[name] = np.array(data[start : start + size].T)
+        start += size
+    return out

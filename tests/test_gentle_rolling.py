@@ -1,0 +1,453 @@
+"""All seven systems in one diagram: their motions, rates, subsets, exported tests."""
+
+import copy
+import dataclasses
+import json
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from makebreak.diagrams.gentle_rolling import (
+    SEVEN,
+    GentleRollingConfig,
+    make_gentle_rolling,
+    prior,
+    telemetry,
+)
+from makebreak.scripts.cli import main
+from makebreak.scripts.experiments import gentle_rolling as experiment
+from makebreak.scripts.export_tests import export_tests
+from makebreak.systems import (
+    c3_mpc,
+    contact_anticipator,
+    impedance_controller,
+    lcs_builder,
+    mode_detector,
+    residual_learner,
+    velocity_shaper,
+)
+from makebreak.systems.frozen import Frozen
+from makebreak.systems.moving_frame import MovingFrame
+from makebreak.systems.numerics.contact_task import MADE, ContactBelief
+from makebreak.systems.numerics.push_motion import (
+    BALL_SEGMENT,
+    TABLE_SEGMENT,
+    PushConfig,
+    ball_pattern,
+    frame_at,
+    frame_under,
+    moved_frame,
+    table_pattern,
+)
+from makebreak.systems.numerics.reference_blend import blended_reference, weight
+from makebreak.systems.push_motion import PushConfig as SameConfig
+from makebreak.systems.push_motion import PushMotion, PushMotionConfig
+
+DOCS = Path(__file__).parent.parent / "docs"
+R_BALL, R_TIP = 0.0365, 0.0195  # As the model has them [m].
+HEADING = np.array([0.6, 0.8])
+IN_FRONT = np.append(0.027 * HEADING, 0.0755)
+
+
+def config(**changes) -> GentleRollingConfig:
+    out = GentleRollingConfig(**changes)
+    out.ball.start_angle_rad = 0.5
+    return out
+
+
+# --- The motions.
+
+
+def clearance(pattern, radius):
+    """Least distance of the tip's surface to a ball under the frame, but for what lies
+    within 25 mm of the ends, where it starts on the ball or lands on it [m]."""
+    length = pattern.length(0)
+    p = np.array([
+        pattern.geometry(0, s)[0] for s in np.linspace(0.025, length - 0.045, 200)
+    ])  # fmt: skip
+    return np.linalg.norm(p - [0.0, 0.0, radius], axis=1).min() - radius - R_TIP
+
+
+@pytest.mark.parametrize("start", [IN_FRONT, np.append(0.075 * HEADING, 0.0195)])
+def test_the_way_behind_the_ball_clears_it_and_ends_straight_down(start):
+    pattern = ball_pattern(PushConfig(), start, HEADING, R_BALL, R_TIP, 5.0)
+    assert pattern.ends_in_contact(BALL_SEGMENT)
+    assert clearance(pattern, R_BALL) > 0.0
+    np.testing.assert_allclose(pattern.geometry(0, 0.0)[0], start, atol=1e-12)
+    end, tangent = pattern.geometry(0, pattern.length(0))[:2]
+    np.testing.assert_allclose(end[:2], -0.018 * HEADING, atol=1e-12)
+    # It comes down within 15 degrees: a contact along it is one from above.
+    assert tangent[2] < -np.cos(np.deg2rad(15.0))
+    # It is planned to below the ball's surface, were it of half the radius.
+    assert end[2] < R_BALL + np.sqrt((R_BALL + R_TIP) ** 2 - 0.018**2) - 0.015
+
+
+def test_a_way_from_the_ball_takes_the_brisk_time():
+    pattern = ball_pattern(PushConfig(), IN_FRONT, HEADING, R_BALL, R_TIP, 5.0)
+    assert np.ptp(pattern.segments[0].times) == pytest.approx(0.4)
+
+
+def test_the_way_to_the_table_ends_ahead_of_the_ball_and_slides_away_from_it():
+    pattern = table_pattern(PushConfig(), IN_FRONT, HEADING, R_BALL, R_TIP, 5.0)
+    assert [pattern.ends_in_contact(k) for k in range(3)] == [False, True, False]
+    down = pattern.segments[TABLE_SEGMENT]
+    np.testing.assert_allclose(
+        down.positions[:, :2], np.outer([1, 1], 0.075 * HEADING), atol=1e-12
+    )
+    assert down.positions[1][2] < R_TIP  # Into the table.
+    slide = np.diff(pattern.segments[2].positions, axis=0)[0]
+    assert abs(slide[:2] @ HEADING) < 1e-12 and slide[2] == 0.0
+    np.testing.assert_array_equal(pattern.segments[2].force_directions, [[0, 0, -1]])
+
+
+def test_the_frame_is_continuous_and_comes_under_a_ball_that_turns():
+    angle = 0.0
+    p = np.array([0.6, 0.0, R_BALL])
+    frame = frame_under(p, np.array([0.0, 0.045, 0.0]), 0.0)
+    for k in range(1, 81):  # One second, 45 mm/s on a circle of 0.1 m.
+        t = 0.0125 * k
+        angle = 0.45 * t
+        p = np.array([0.5 + 0.1 * np.cos(angle), 0.1 * np.sin(angle), R_BALL])
+        v = 0.045 * np.array([-np.sin(angle), np.cos(angle), 0.0])
+        before = frame_at(frame, t)
+        frame = moved_frame(frame, t, p, v, 0.15)
+        np.testing.assert_allclose(frame_at(frame, t), before, atol=1e-15)
+    # A velocity that turns by v w = 0.02 m/s2 is followed with about v w T^2 of error.
+    assert np.linalg.norm(frame_at(frame, t)[:2] - p[:2]) < 2 * 0.02025 * 0.15**2
+    assert frame[2] == frame[5] == 0.0
+
+
+def test_moving_frame_takes_the_frames_motion_off():
+    system = MovingFrame()
+    context = system.CreateDefaultContext()
+    context.SetTime(2.0)
+    system.GetInputPort("frame").FixValue(context, [1, 2, 0, 0.1, -0.2, 0, 1.5])
+    system.GetInputPort("ee_pose").FixValue(context, [3, 3, 0.1, 1, 0, 0, 0])
+    system.GetInputPort("ee_velocity").FixValue(context, [0.1, 0, 0.3, 0, 0, 1])
+    pose = system.GetOutputPort("ee_pose").Eval(context)
+    np.testing.assert_allclose(pose, [1.95, 1.1, 0.1, 1, 0, 0, 0], atol=1e-15)
+    velocity = system.GetOutputPort("ee_velocity").Eval(context)
+    np.testing.assert_allclose(velocity, [0, 0.2, 0.3, 0, 0, 1], atol=1e-15)
+
+
+def test_a_blend_of_two_references_is_one_motion():
+    """Velocity and acceleration are the derivatives of the position, by differences."""
+
+    def reference(t, k):
+        out = np.zeros(19)
+        out[:3], out[3] = k * np.array([t, t**2, 0.1]), 1.0
+        out[7:10], out[13:16] = k * np.array([1, 2 * t, 0]), k * np.array([0, 2, 0])
+        return out
+
+    def at(t):
+        w = weight(np.array([0.2, 1.0, 0.3]), t, 0.05)
+        return blended_reference(reference(t, 1.0), reference(t, -0.5), *w)
+
+    h = 1e-6
+    for t in (0.305, 0.32, 0.34):
+        slope = (at(t + h)[:3] - at(t - h)[:3]) / (2 * h)
+        np.testing.assert_allclose(at(t)[7:10], slope, atol=1e-5)
+        bend = (at(t + h)[7:10] - at(t - h)[7:10]) / (2 * h)
+        np.testing.assert_allclose(at(t)[13:16], bend, rtol=1e-5, atol=1e-3)
+    np.testing.assert_allclose(at(0.36), reference(0.36, -0.5), atol=1e-15)
+
+
+def test_bad_motions_are_refused_by_name():
+    with pytest.raises(ValueError, match="push.shape.lift is -1.0, expected > 0"):
+        PushMotion(PushMotionConfig(SameConfig(lift=-1.0)), None, R_BALL, R_TIP, 5.0)
+    with pytest.raises(ValueError, match="table_first, table_every are 0, 1"):
+        PushMotion(PushMotionConfig(table_first=0, table_every=1), None, 1, 1, 5.0)
+
+
+# --- The diagram.
+
+
+def updates(diagram):
+    return {
+        s.get_name(): len(s.compute_sec)
+        for s in diagram.GetSystems()
+        if hasattr(s, "compute_sec")
+    }
+
+
+@pytest.fixture(scope="module")
+def running():
+    """The first landing, and half a second of counts before."""
+    diagram = make_gentle_rolling(config())
+    simulator = Simulator(diagram)
+    for system in diagram.GetSystems():
+        if hasattr(system, "compute_sec"):
+            system.compute_sec.clear()
+    simulator.AdvanceTo(0.5)
+    count = updates(diagram)
+    simulator.AdvanceTo(2.4)
+    return SimpleNamespace(
+        diagram=diagram,
+        context=simulator.get_context(),
+        count=count,
+        said=telemetry(diagram, simulator.get_context()),
+    )
+
+
+def test_all_seven_run_at_their_rates(running):
+    rates = dict(
+        lcs_plan=80, lcs_command=80, lcs_learn=20, c3_mpc=80, residual_learner=20,
+        mode_detector=200, contact_anticipator=100, velocity_shaper=1000,
+        impedance_controller=1000,
+    )  # fmt: skip
+    assert set(rates) == {name for names in SEVEN.values() for name in names}
+    assert {name: running.count[name] for name in rates} == {
+        name: rate // 2 for name, rate in rates.items()
+    }
+
+
+def test_the_first_landing_is_felt_where_the_ball_is_and_learned(running):
+    said, made = running.said, running.said["contact"][:, MADE]
+    assert made[-1] >= 1
+    first = int(np.argmax(made >= 1))
+    # The ball's radius is 31.5 mm: there the tip's centre is at
+    # 31.5 + sqrt(51^2 - 18^2) = 79.2 mm, on a slope of 0.38 and within 3 mm of its
+    # place; the model had 89.5.
+    assert said["ee_pose"][first, 2] == pytest.approx(0.0792, abs=0.0015)
+    anticipator = running.diagram.GetSubsystemByName("contact_anticipator")
+    belief = anticipator.knowledge(anticipator.GetMyContextFromRoot(running.context))
+    ball = belief.contacts[0]
+    assert ball.seen >= 1 and ball.mean[2] == pytest.approx(0.0792, abs=0.0015)
+    assert prior(config()).contacts[0].mean[2] == pytest.approx(0.0895, abs=1e-4)
+
+
+def test_the_reference_never_steps(running):
+    x = running.said["x_desired"]
+    v = np.diff(x[:, :3], axis=0) / 1e-3
+    # The fastest motion is some 0.4 m/s; a step of 1 mm would be 1 m/s.
+    assert np.abs(v).max() < 0.6
+
+
+def test_nothing_but_what_a_robot_measures_reaches_a_controller(running):
+    wires = [
+        (source.get_name(), source.get_output_port(port).get_name(), to.get_name())
+        for (to, _), (source, port) in running.diagram.connection_map().items()
+    ]
+    observers = {"state_log", "contact_log", "torque_log", "telemetry", "telemetry_log"}
+    measured = {port for name, port, to in wires if name == "station"
+                and to not in observers}  # fmt: skip
+    assert measured == {
+        "panda.position_measured", "panda.velocity_measured", "panda.torque_measured",
+        "panda.external_wrench", "overhead.rgb_image",
+    }  # fmt: skip
+    assert not [w for w in wires if w[0] in observers and w[2] not in observers]
+    # The anticipator is told of contacts, not what the learner has learned.
+    assert not [w for w in wires if w[0] == "residual_learner"
+                and w[2] in ("contact_anticipator", "push_motion")]  # fmt: skip
+
+
+def test_any_half_can_be_left_out():
+    for gentle in (True, False):
+        for adapt in (True, False):
+            diagram = make_gentle_rolling(config(gentle=gentle, adapt=adapt))
+            names = {s.get_name() for s in diagram.GetSystems()}
+            assert ("velocity_shaper" in names) == gentle
+            assert ("residual_learner" in names) == adapt
+            Simulator(diagram).AdvanceTo(0.002)
+
+
+@pytest.mark.parametrize("name", SEVEN)
+def test_each_of_the_seven_can_be_frozen(name):
+    diagram = make_gentle_rolling(config(frozen=[name]))
+    for own in SEVEN[name]:
+        assert isinstance(diagram.GetSubsystemByName(own), Frozen)
+    Simulator(diagram).AdvanceTo(0.015)
+
+
+def test_what_cannot_be_frozen_is_refused_by_name():
+    with pytest.raises(ValueError, match="frozen has 'shaper', expected some of"):
+        make_gentle_rolling(config(frozen=["shaper"]))
+    with pytest.raises(ValueError, match="frozen has 'velocity_shaper'"):
+        make_gentle_rolling(config(gentle=False, frozen=["velocity_shaper"]))
+
+
+def test_bad_settings_are_one_line(tmp_path, capfd):
+    for setting, message in (
+        ("ball.seed=3", "ball.seed is 3, expected 0: seed sets it"),
+        ("touch.shaper.period_sec=0.1", "VelocityShaperConfig.period_sec is 0.1"),
+        ("push.settle_sec=0", "push.settle_sec is 0.0, expected > 0"),
+    ):
+        arguments = ["run", "gentle_rolling", "--no-meshcat", "--out", str(tmp_path)]
+        assert main([*arguments, "--duration", "0.01", "--set", setting]) == 2
+        lines = capfd.readouterr().err.splitlines()
+        assert len(lines) == 1 and message in lines[0]
+
+
+# --- The score.
+
+
+def test_purity_counts_each_mode_for_the_surface_that_it_is_mostly_on():
+    mode = np.array([0, 1, 1, 1, 2, 2, 2, 2, -1])
+    table = np.array([1, 1, 1, 0, 0, 0, 0, 1, 1], dtype=bool)
+    share, known = experiment.purity(mode, table, ~table)
+    assert (share, known) == (pytest.approx(5 / 7), 2)
+
+
+def test_radius_by_touch_is_the_balls():
+    r, behind = 0.0315, PushConfig().land_behind
+    height = r + np.sqrt((r + R_TIP) ** 2 - behind**2)
+    contacts = []
+    for one, z in zip(prior(config()).contacts, (height, R_TIP), strict=True):
+        one = copy.copy(one)
+        # An arm whose zero is 7 mm off: both heights are.
+        object.__setattr__(one, "mean", np.array([0.0, 0.0, z + 0.007]))
+        object.__setattr__(one, "seen", 1)
+        contacts.append(one)
+    belief = ContactBelief(tuple(contacts))
+    got = experiment.radius_by_touch(belief, config(), config().ball)
+    assert got == pytest.approx(r, abs=1e-9)
+    assert np.isnan(
+        experiment.radius_by_touch(prior(config()), config(), config().ball)
+    )
+
+
+def test_the_table_says_what_a_subset_buys():
+    def result(peak, seconds, success=True, **more):
+        return {
+            "success": success, "contact_force_peak_N": peak, "seed": 0,
+            "time_to_circles_s": seconds, "circles_completed": 4.0, **more,
+        }  # fmt: skip
+
+    groups = {
+        "all seven": [result(9.0, 110.0)],
+        "without the second paper's": [result(20.0, 100.0)],
+        "without the learner": [result(9.0, None, False)],
+        "without both": [result(20.0, None, False)],
+    }
+    frozen = {name: [result(50.0, None, False)] for name in SEVEN}
+    table = experiment.table_of(groups, frozen)
+    assert table.missed == 0
+    text = table.to_text()
+    assert "0.45 (goal 0.60)" in text and "1.10 (goal 1.25)" in text
+    groups["all seven"] = [result(19.0, 140.0)]
+    assert experiment.table_of(groups, frozen).missed == 2
+
+
+# --- Exported tests of the seven.
+
+NAMES = [name for names in SEVEN.values() for name in names]
+EXPORTED_SEC = 2.2  # The first landing, and what follows, is in it.
+
+
+def failing(out):
+    failed = set()
+    for path in sorted(out.glob("test_*.py")):
+        module = runpy.run_path(str(path))
+        [test] = [f for name, f in module.items() if name.startswith("test_")]
+        try:
+            test()
+        except AssertionError:
+            failed.add(path.stem.removeprefix("test_"))
+    return failed
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    out = tmp_path_factory.mktemp("exported") / "tests"
+    _, left_out = export_tests(
+        "gentle_rolling", experiment, config(), out, NAMES, EXPORTED_SEC
+    )
+    assert not left_out
+    return out
+
+
+@pytest.mark.slow
+def test_exported_tests_of_the_seven_replay(exported):
+    assert {p.stem.removeprefix("test_") for p in exported.glob("test_*.py")} == set(
+        NAMES
+    )
+    assert failing(exported) == set()
+
+
+def _c3(plain):
+    def changed(*args):
+        plan, warm = plain(*args)
+        return dataclasses.replace(plan, u=1.001 * plan.u), warm
+
+    return changed
+
+
+# The system -> the module, what is altered there, and how: a gain, or a sign.
+ALTERED = {
+    "c3_mpc": (c3_mpc, "solve_c3", _c3),
+    "residual_learner": (
+        residual_learner, "spread", lambda plain: lambda *a: -plain(*a),
+    ),
+    "mode_detector": (mode_detector, "detect", lambda plain: lambda m, tuning, *a: (
+        plain(m, tuning._replace(normal_force_min=0.2), *a))),
+    "contact_anticipator": (
+        contact_anticipator, "update",
+        lambda plain: lambda mean, C, p, R: plain(mean, C, p + 1e-5, R),
+    ),
+    "velocity_shaper": (
+        velocity_shaper, "tick", lambda plain: lambda table, law, *a: (
+            plain(table, law._replace(acceleration_max=5.005), *a)),
+    ),
+    "impedance_controller": (
+        impedance_controller, "packed_tick", lambda plain: lambda *a: (
+            plain(*a[:7], 1.001 * a[7], *a[8:])),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ALTERED)
+def test_exactly_the_system_that_was_altered_fails(exported, monkeypatch, name):
+    module, what, change = ALTERED[name]
+    monkeypatch.setattr(module, what, change(getattr(module, what)))
+    assert failing(exported) == {name}
+
+
+@pytest.mark.slow
+def test_exactly_the_lcs_builders_fail_when_theirs_is_altered(exported, monkeypatch):
+    plain = lcs_builder.AnitescuLcs.build
+
+    def slipperier(self, x, u):
+        lcs = plain(self, x, u)
+        return dataclasses.replace(lcs, D=1.001 * lcs.D)
+
+    monkeypatch.setattr(lcs_builder.AnitescuLcs, "build", slipperier)
+    assert failing(exported) == set(SEVEN["lcs_builder"])
+
+
+# --- Pages, and a whole run.
+
+
+def test_the_page_on_own_diagrams_runs(tmp_path):
+    page = (DOCS / "own_diagram.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert len(code.splitlines()) <= 60
+    (tmp_path / "own.py").write_text(code)
+    done = subprocess.run(
+        [sys.executable, "own.py"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    height, speed = (float(word) for word in re.findall(r"[-\d.]+", done.stdout)[:2])
+    assert height == pytest.approx(0.0195, abs=0.001)  # The tip's radius: the table.
+    assert 0.0 < speed < 0.05
+
+
+@pytest.mark.slow
+def test_a_landing_is_softer_with_the_second_papers_systems(tmp_path):
+    peaks = {}
+    for gentle in ("true", "false"):
+        out = tmp_path / gentle
+        arguments = ["run", "gentle_rolling", "--no-meshcat", "--seed", "42"]
+        arguments += ["--duration", "20", "--out", str(out)]
+        assert main([*arguments, "--set", f"gentle={gentle}"]) == 1  # No four circles.
+        result = json.loads((out / "result.json").read_text())
+        assert result["initiated"]
+        peaks[gentle] = result["contact_force_peak_N"]
+    assert peaks["true"] < 0.8 * peaks["false"]
