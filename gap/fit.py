@@ -89,6 +89,13 @@ def fit_effects(
         diff_step=1e-4, x_scale=1.0, ftol=1e-4, xtol=1e-6, max_nfev=evaluations,
     ) if len(x0) else None  # fmt: skip
     z = x0 / scale if solved is None else solved.x
+    if solved is not None:  # What does not show is not told: it stays neutral.
+        shows = np.linalg.norm(solved.jac, axis=0)
+        for k, (i, name) in enumerate(free):
+            neutral = KINDS[start[i].kind].parameter(name).neutral
+            if shows[k] <= 1e-6 * shows.max() and neutral is not None:
+                z = np.array(z)
+                z[k] = neutral / scale[k]
     effects = effects_of(z)
     r = residual(z)
     std: list[dict[str, float]] = [{} for _ in start]

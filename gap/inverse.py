@@ -188,8 +188,8 @@ class InverseModel:
             y = recording[f"{joint}.position"][episode.rows]
             if np.isfinite(y).sum() < 6:
                 return None
-            samples = np.concatenate([y, np.full(len(time), np.nan)])[order]
-            x = smooth(grid, samples, self.noise[i]).x
+            seen = np.concatenate([y, np.full(len(time), np.nan)])[order]
+            x = smooth(grid, seen, self.noise[i]).x
             q[:, i], v[:, i], vd[:, i] = x.T
         held = {}
         for channel in recording.commands():
@@ -241,7 +241,7 @@ class InverseModel:
             v[:, i] *= scale
             vd[:, i] *= scale**2
         effort = self._effort(track, effects, q, v)
-        jerk = np.gradient(vd, t, axis=0)
+        jerk = np.asarray(np.gradient(vd, t, axis=0))
         return Motion(t, q, v, vd, effort, jerk)
 
     def _at(self, track: Track, i: int, t: np.ndarray):
@@ -348,7 +348,7 @@ class InverseModel:
     def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
         """(m,) residual over its noise, of the scene with these effects added."""
         ours = [e for e in effects if e.kind not in SENSED + PATH]
-        dynamics = self.dynamics
+        dynamics: SceneDynamics = self.dynamics
         if ours:
             dynamics = SceneDynamics(
                 replace(self.scene, effects=[*self.scene.effects, *ours])

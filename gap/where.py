@@ -78,7 +78,11 @@ def unexplained(model: InverseModel, left: np.ndarray, least: float = 2.0):
     names = model.names()
     R = left.reshape(-1, len(names))
     features: dict[str, np.ndarray] = {}
-    q, v, a, u, t = [], [], [], [], []
+    q: list[np.ndarray] = []
+    v: list[np.ndarray] = []
+    a: list[np.ndarray] = []
+    u: list[np.ndarray] = []
+    t: list[np.ndarray] = []
     for track in model.tracks:
         m = model.motion(track)
         mean = track.bumps.mean
@@ -140,13 +144,13 @@ def _merged(found: list[Where], stands_out: np.ndarray) -> list[Where]:
             key = (each.recording, each.episode, each.channel)
             groups.setdefault(key, []).append(each)
     out: list[Where] = []
-    for each in groups.values():
+    for group in groups.values():
         run: list[Where] = []
-        for w in sorted(each, key=lambda w: w.from_s):
-            if run and w.from_s > run[-1].to_s + 0.01:
+        for window in sorted(group, key=lambda w: w.from_s):
+            if run and window.from_s > run[-1].to_s + 0.01:
                 out.append(_one(run))
                 run = []
-            run.append(w)
+            run.append(window)
         if run:
             out.append(_one(run))
     return sorted(out, key=lambda w: -w.score)[:MOST]

@@ -151,7 +151,6 @@ def benjamini_hochberg(p, rate: float = 0.05) -> np.ndarray:
 def simplest(errors: Sequence[float], sizes: Sequence[int], same: float = SAME) -> int:
     """Index of the model with the fewest parameters whose error is within `same` of
     the least; of equally many the one with the least error."""
-    errors = np.asarray(errors, float)
     least = np.nanmin(errors)
     near = [i for i in range(len(errors)) if errors[i] <= (1.0 + same) * least]
     return min(near, key=lambda i: (sizes[i], errors[i]))

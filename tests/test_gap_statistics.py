@@ -1,0 +1,107 @@
+"""The statistics of the gap workflow: each against a value from elsewhere."""
+
+import numpy as np
+import pytest
+
+from makebreak.systems.numerics.selection import (
+    Columns,
+    Screen,
+    benjamini_hochberg,
+    simplest,
+)
+from makebreak.systems.numerics.smoother import smooth
+from makebreak.systems.numerics.weak_form import make_bumps
+
+
+def test_false_discovery_rate_is_that_of_the_published_example():
+    # Benjamini and Hochberg 1995, section 3.2: 15 p-values of a trial; at 5 % the
+    # first four are rejected, of which Bonferroni keeps three.
+    p = [0.0001, 0.0004, 0.0019, 0.0095, 0.0201, 0.0278, 0.0298, 0.0344, 0.0459,
+         0.3240, 0.4262, 0.5719, 0.6528, 0.7590, 1.0000]  # fmt: skip
+    order = np.random.default_rng(0).permutation(15)
+    rejected = benjamini_hochberg(np.array(p)[order], 0.05)
+    np.testing.assert_array_equal(np.sort(order[rejected]), [0, 1, 2, 3])
+
+
+def test_the_simplest_of_equals_is_taken_but_not_a_worse_one():
+    assert simplest([1.0, 1.04, 1.2], [3, 1, 1]) == 1
+    assert simplest([1.0, 1.06, 1.2], [3, 1, 1]) == 0
+
+
+def test_a_screen_fits_as_ridge_regression_does():
+    rng = np.random.default_rng(0)
+    m, prior, s = 200, np.array([0.3, 2.0]), 1.7
+    X, N, r = rng.normal(size=(m, 2)), rng.normal(size=(m, 2)), rng.normal(size=m)
+    train = np.arange(m) % 3 != 1
+    fit = Screen(r, N, prior, train, s).fit(Columns(X, N, train))
+    rows = np.vstack([np.hstack([X, N])[train] / s, np.zeros((2, 4))])
+    rows[-2:, 2:] = np.diag(1.0 / prior)
+    want = np.linalg.lstsq(rows, np.append(r[train] / s, [0, 0]), rcond=None)[0]
+    # Normal equations of a well-conditioned problem: eps times its condition squared.
+    np.testing.assert_allclose(np.append(fit.c, fit.b), want, atol=1e-12)
+    left = r - X @ want[:2] - N @ want[2:]
+    np.testing.assert_allclose(fit.held_out, np.sqrt(np.mean(left[~train] ** 2)))
+    covariance = np.linalg.inv(rows.T @ rows)
+    np.testing.assert_allclose(fit.c_std, np.sqrt(np.diag(covariance)[:2]))
+
+
+def test_a_column_of_zeros_gets_no_coefficient():
+    rng = np.random.default_rng(0)
+    X = np.stack([rng.normal(size=50), 1e-20 * rng.normal(size=50)], axis=1)
+    train = np.arange(50) < 30
+    none = np.zeros((50, 0))
+    fit = Screen(X[:, 0], none, np.zeros(0), train).fit(Columns(X, none, train))
+    np.testing.assert_allclose(fit.c, [1.0, 0.0])
+
+
+def test_weak_and_strong_form_agree_without_noise():
+    t = np.arange(0.0, 2.0, 0.001)
+    p, rate, rest = np.sin(3 * t), 3 * np.cos(3 * t), t**2
+    bumps = make_bumps(t, np.full(len(t), 0.001), 0.2, 0.1)
+    # Trapezoids on a function with three zero derivatives at its ends: error h^4.
+    np.testing.assert_allclose(bumps.weak(p, rest), bumps.mean(rate + rest), atol=1e-7)
+    np.testing.assert_allclose(bumps.mean(np.ones_like(t)), 1.0, atol=1e-8)
+
+
+def test_noise_of_a_tested_acceleration_is_as_predicted():
+    rng = np.random.default_rng(0)
+    h, width = 0.005, 0.2
+    t = np.arange(0.0, 400.0, h)
+    bumps = make_bumps(t, np.full(len(t), h), width, width)
+    noise = rng.normal(size=len(t))
+    # Twice by parts: integral(w'' y) of the noise, by differences of w' rows.
+    second = [
+        8 / 3 / width**3 * np.pi**2
+        * (12 * np.sin(a) ** 2 * np.cos(a) ** 2 - 4 * np.sin(a) ** 4)
+        for a in [np.pi * (np.arange(int(width / h)) + 0.5) * h / width]
+    ][0]  # fmt: skip
+    n = len(second)
+    values = [h * second @ noise[k : k + n] for k in range(0, len(t) - n, n)]
+    # 2000 values: their standard deviation is known to 1.6 %.
+    assert np.std(values) == pytest.approx(bumps.position_noise_gain(h), rel=0.05)
+
+
+def test_no_bump_reaches_into_a_hole():
+    t = np.arange(0.0, 2.0, 0.01)
+    bumps = make_bumps(t, np.full(len(t), 0.01), 0.2, 0.1, [(0.9, 1.1)])
+    assert np.all((bumps.centre <= 0.8 + 1e-9) | (bumps.centre >= 1.2 - 1e-9))
+
+
+def test_smoother_finds_velocity_and_its_own_error():
+    rng = np.random.default_rng(0)
+    t = np.sort(rng.uniform(0, 10, 2000))
+    y = np.sin(2 * t) + 1e-3 * rng.normal(size=len(t))
+    y[rng.uniform(size=len(t)) < 0.1] = np.nan
+    s = smooth(t, y, 1e-3)
+    inner = slice(50, -50)
+    error = s.x[inner, 1] - 2 * np.cos(2 * t[inner])
+    # Its own standard deviation, within what 20 independent stretches tell.
+    ratio = np.sqrt(np.mean(error**2 / s.P[inner, 1, 1]))
+    assert 0.5 < ratio < 1.6
+    assert np.std(error) < 0.02
+    assert 0.8 < s.innovation < 1.2
+
+
+def test_smoother_refuses_too_few_samples():
+    with pytest.raises(ValueError, match="at least 6"):
+        smooth(np.arange(9.0), [1, 2, 3, 4, 5] + [np.nan] * 4, 0.1)

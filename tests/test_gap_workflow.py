@@ -1,0 +1,71 @@
+"""A few cases of the development benchmark, from files to verdict."""
+
+import ast
+import json
+from pathlib import Path
+
+import pytest
+from gap_benchmark.cases import cases, make, write
+
+from makebreak.gap.workflow import run_gap
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def _run(name: str, folder: Path):
+    (case,) = [c for c in cases("development") if c.name == name]
+    truth = write(case, folder, make(case))
+    result = run_gap(folder / "scene.yaml", [folder / "recording.csv"])
+    json.dumps(result.to_json(), allow_nan=False)
+    return truth, result
+
+
+def test_background_within_tolerance_is_no_gap(tmp_path):
+    _, result = _run("02_pendulum_none", tmp_path)
+    assert result.verdict == "no_gap"
+    assert result.effects == []
+    # The links are off by up to 3.5 %: without the background it would be 80.
+    assert result.gap.before < 2.0
+
+
+@pytest.mark.parametrize(
+    ("name", "parameter", "tolerance"),
+    [
+        ("28_pendulum_actuator_gain", "gain", 0.002),
+        pytest.param(
+            "17_pendulum_joint_quadratic_drag",
+            "coefficient",
+            0.01,
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_a_hidden_effect_is_named_and_measured(tmp_path, name, parameter, tolerance):
+    truth, result = _run(name, tmp_path)
+    (hidden,) = truth["effects"]
+    assert result.verdict == "gap_named"
+    (found,) = result.effects
+    assert (found.kind, list(found.at)) == (hidden["kind"], [hidden["at"]])
+    assert found.parameters[parameter].value == pytest.approx(
+        hidden["parameters"][parameter], rel=tolerance
+    )
+    assert result.gap.after < 0.1 * result.gap.before
+    assert result.where
+
+
+@pytest.mark.slow
+def test_what_is_outside_the_catalogue_gets_no_verdict_of_named(tmp_path):
+    _, result = _run("84_pendulum_bouc_wen", tmp_path)
+    assert result.verdict == "gap_unnamed"
+    assert result.unexplained
+
+
+def test_the_workflow_imports_nothing_of_the_benchmark():
+    for file in (ROOT / "gap").glob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            names = []
+            if isinstance(node, ast.Import):
+                names = [a.name for a in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                names = [node.module or ""]
+            assert not any("benchmark" in n or "tests" in n for n in names), file
