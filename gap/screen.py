@@ -213,7 +213,10 @@ def _grid(model: InverseModel, kind: str, at: str, motions):
     if kind == "actuator_saturation":
         i = model.joints.index(at)
         u = np.concatenate([np.abs(m.effort[:, i]) for m in motions])
-        return {"limit": list(np.linspace(0.4, 0.97, 20) * u.max())}
+        # A controller that loses its joint asks for far more than the limit: so by how
+        # often it is exceeded as well.
+        often = np.quantile(u, np.linspace(0.3, 0.98, 14))
+        return {"limit": [*(np.linspace(0.4, 0.97, 15) * u.max()), *often]}
     if kind == "sinusoidal_force":
         return {"frequency": list(np.arange(0.4, 5.01, 0.03))}
     return None

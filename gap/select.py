@@ -53,6 +53,7 @@ def select(
     prior: np.ndarray,
     found: Sequence[Candidate],
     say: Callable[[str], None] = lambda text: None,
+    most: int = MOST_EFFECTS,
 ) -> Selection:
     """Greedy forward selection with a refit of all after each addition; then whatever
     is not needed any more is dropped."""
@@ -61,7 +62,7 @@ def select(
     start = current = fit_effects(model, plain, ())
     chosen: list[dict] = []
     table: list[dict] = []
-    while found and len(chosen) < MOST_EFFECTS and current.fit.held_out > FLOOR:
+    while found and len(chosen) < most and current.fit.held_out > FLOOR:
         step = _forward(model, nuisance, prior, found, chosen, current, start, say)
         if not chosen:
             table = step["table"]
