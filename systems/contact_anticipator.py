@@ -462,6 +462,10 @@ class KalmanContactAnticipator(LeafSystem):
             past = (p - contact.mean) @ contact.direction
             if past < self._filter.gate * sigma + margin:
                 continue
+            # A way that begins beyond it has not passed it.
+            here = memory.history[memory.history[:, 0] >= memory.segment_time]
+            if not np.any((here[:, 1:4] - contact.mean) @ contact.direction < 0.0):
+                continue
             memory = replace(memory, passed=(*memory.passed, k))
             belief = memory.belief.changed(k, covariance=4.0 * contact.covariance)
             memory = replace(memory, belief=belief)
