@@ -4,8 +4,9 @@
     learner, C3, task --> arm_reference
     rolling_task (a push is over) --> push_motion --motion--> velocity_shaper
     push_motion --frame, under the ball--> moving_frame, reference_blend
-    moving_frame --ee_pose--> contact_detector, contact_anticipator, velocity_shaper
-    contact_detector --contact--> contact_anticipator --contacts--> velocity_shaper
+    moving_frame --ee_pose--> contact_detector, velocity_shaper
+    contact_detector --contact--> velocity_shaper, moving_frame
+    moving_frame --heights--> contact_anticipator --contacts--> velocity_shaper
     mode_detector --mode--> forward_model_bank --> variable_impedance
     arm_reference (roll), velocity_shaper (between pushes) --> reference_blend
     reference_blend, variable_impedance --> impedance_controller --tau--> station
@@ -347,9 +348,10 @@ def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) ->
         "forward_model_bank",
     )  # fmt: skip
     connect(
-        "moving_frame", "ee_pose", "contact_detector", "contact_anticipator",
-        "velocity_shaper",
+        "moving_frame", "ee_pose", "contact_detector", "velocity_shaper",
     )  # fmt: skip
+    connect("moving_frame", "ee_height", ("contact_anticipator", "ee_pose"))
+    connect("moving_frame", "contact_height", ("contact_anticipator", "contact"))
     connect("moving_frame", "ee_velocity", "contact_detector")
     connect(
         "station", f"{ARM}.external_wrench", ("contact_detector", "wrench"),
@@ -364,7 +366,7 @@ def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) ->
             "variable_impedance", "push_motion", "reference_blend")  # fmt: skip
     connect("velocity_shaper", "x_desired", ("reference_blend", "shaped"),
             ("push_motion", "shaped"))  # fmt: skip
-    connect("contact_detector", "contact", "contact_anticipator", "velocity_shaper")
+    connect("contact_detector", "contact", "moving_frame", "velocity_shaper")
     connect("contact_anticipator", "contacts", "velocity_shaper")
     connect("contact_anticipator", "mode_hint", "mode_detector")
     connect("mode_detector", "transition", "contact_anticipator", "forward_model_bank")

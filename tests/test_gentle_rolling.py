@@ -137,6 +137,26 @@ def test_moving_frame_takes_the_frames_motion_off():
     np.testing.assert_allclose(velocity, [0, 0.2, 0.3, 0, 0, 1], atol=1e-15)
 
 
+def test_heights_are_all_that_is_left_of_a_contact():
+    system = MovingFrame()
+    context = system.CreateDefaultContext()
+    contact = np.arange(14.0)
+    contact[7:10] = np.array([0.1, 0.0, -1.0]) / np.sqrt(1.01)
+    system.GetInputPort("contact").FixValue(context, contact)
+    got = system.GetOutputPort("contact_height").Eval(context)
+    wanted = contact.copy()
+    wanted[4:6], wanted[7:10] = 0.0, [0.0, 0.0, -1.0]
+    np.testing.assert_array_equal(got, wanted)
+    # One from the side keeps its direction.
+    contact[7:10] = 1.0, 0.0, 0.0
+    system.GetInputPort("contact").FixValue(context, contact)
+    got = system.GetOutputPort("contact_height").Eval(context)
+    np.testing.assert_array_equal(got[7:10], contact[7:10])
+    system.GetInputPort("ee_pose").FixValue(context, [3, 3, 0.1, 1, 0, 0, 0])
+    height = system.GetOutputPort("ee_height").Eval(context)
+    np.testing.assert_array_equal(height, [0, 0, 0.1, 1, 0, 0, 0])
+
+
 def test_a_blend_of_two_references_is_one_motion():
     """Velocity and acceleration are the derivatives of the position, by differences."""
 
