@@ -161,18 +161,20 @@ def _residual(model: WindowModel, effect: Effect) -> np.ndarray | None:
         return None
 
 
-def hidden_candidates(model: WindowModel, nuisance: np.ndarray) -> list[Candidate]:
-    """Elasticity and backlash of each joint, at a few values each."""
+def hidden_candidates(
+    model: WindowModel, nuisance: np.ndarray, joints: Sequence[str]
+) -> list[Candidate]:
+    """Elasticity and backlash of these joints, where driven, at a few values each."""
     found = []
     driven = set(model.scene.actuation.joints)
-    for joint in (j for j in model.joints if j in driven):
+    for joint in (j for j in joints if j in driven):
         inertia = _inertia(model, joint)
         trials = []
-        for hz in (2.5, 4.0, 7.0, 12.0):
+        for hz in (3.0, 5.0, 8.0):
             k = inertia * (2.0 * np.pi * hz) ** 2
             p = {"stiffness": k, "damping": 2.0 * 0.05 * np.sqrt(k * inertia)}
             trials.append(("joint_elasticity", p))
-        trials += [("joint_backlash", {"gap": g}) for g in (0.01, 0.02, 0.04)]
+        trials += [("joint_backlash", {"gap": g}) for g in (0.015, 0.03)]
         for kind in ("joint_elasticity", "joint_backlash"):
             columns, readers = [], []
             for p in (p for k, p in trials if k == kind):
