@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,6 @@ from makebreak.gap.checks import Finding, check_recordings
 from makebreak.gap.contact import (
     contact_candidates,
     contact_model,
-    hidden_candidates,
 )
 from makebreak.gap.inverse import InverseModel
 from makebreak.gap.recording import (
@@ -23,7 +21,7 @@ from makebreak.gap.result import GapMeasure, GapResult, Series
 from makebreak.gap.scene_facts import scene_facts, scene_names
 from makebreak.gap.screen import candidates, nuisances
 from makebreak.gap.select import FLOOR, Selection, select
-from makebreak.gap.verdict import UNNAMED_SHARE, named, says, verdict_of
+from makebreak.gap.verdict import named, says, verdict_of
 from makebreak.gap.where import unexplained, where_in_motion, where_in_windows
 from makebreak.gap.windows import WindowModel, with_step
 from makebreak.models.dynamics import SceneDynamics
@@ -141,15 +139,6 @@ def _of_mechanism(scene, recordings, checks, seconds, clock, say) -> GapResult:
     choices = selection.choices
     start, end = selection.start.score, selection.end.score
     verdict = verdict_of(choices, start, end)
-    if verdict == "gap_unnamed":
-        say("trying elasticity and backlash by simulation")
-        hidden = _hidden(scene, recordings, model, names, selection, say)
-        # Of two measures: what share of its own gap each leaves.
-        if hidden is not None and hidden[1] < 0.6 * end / start:
-            choices, share = hidden
-            end = share * start
-            verdict = "gap_named" if share < UNNAMED_SHARE else "gap_unnamed"
-        seconds["hidden"] = clock.lap()
     say("simulating held-out windows")
     effects = [c.effect for c in choices]
     background = _background(names, prior, selection)
@@ -165,37 +154,6 @@ def _of_mechanism(scene, recordings, checks, seconds, clock, say) -> GapResult:
         verdict, says(verdict, effects_named, start, end), where, effects_named,
         measure, rest, background, checks, series, selection.table,
     )  # fmt: skip
-
-
-def _hidden(scene, recordings, model, names, selection, say):
-    """Effects with coordinates that nothing measures, through the simulator.
-
-    Returns: choices, and the share of the simulated gap that they leave; None if there
-    are none.
-    """
-    moved = _background_effects(model, names, selection.start.b)
-    try:
-        windows = WindowModel(
-            replace(scene, effects=[*scene.effects, *moved]),
-            recordings,
-            WINDOW_SEC,
-            most=16,
-        )
-        windows.base()
-    except ValueError:
-        return None
-    empty = np.zeros((len(windows.train()), 0))
-    # Such a joint's own equation is the first not to be met. Simulating a stiff gear is
-    # slow, so the worst two joints are tried.
-    R = selection.start.left.reshape(-1, len(model.names()))[:, : len(model.joints)]
-    worst = np.argsort(-np.mean(R**2, axis=0))[:2]
-    found = hidden_candidates(windows, empty, [model.joints[i] for i in worst])
-    if not found:
-        return None
-    simulated = select(windows, empty, np.zeros(0), found, say, most=1)
-    if not simulated.choices:
-        return None
-    return simulated.choices, simulated.end.score / simulated.start.score
 
 
 def _of_objects(scene, recordings, checks, seconds, clock, say) -> GapResult:
