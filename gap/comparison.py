@@ -111,6 +111,9 @@ def measured_state(
     for index in plant.GetFloatingBaseBodies():
         name = full_name(plant, plant.get_body(index))
         xyz = [_value_and_rate(recording, episode, f"{name}.{a}", time) for a in "xyz"]
+        if f"{name}.z" not in recording:  # A camera from above sees no height.
+            at = plant.get_body(index).floating_positions_start() + 6
+            xyz[2] = (float(plant.GetPositions(plant.CreateDefaultContext())[at]), 0.0)
         if any(each is None for each in xyz):
             continue
         p = [each[0] for each in xyz if each is not None]
@@ -183,6 +186,9 @@ def _simulated(scene, recording, episode, initial, times, names) -> Motion:
     columns = {c.name: c.values[rows] for c in recording.commands()}
     commands = Commands(recording.time[rows], columns)
     simulation = SceneSimulation(scene)
+    for body in initial.poses:
+        if f"{body}.z" not in recording:
+            initial = simulation.put_down(initial, body)
     values = simulation.run(initial, times, names, commands)
     for column in values.T:  # Before a delayed channel shows anything; after a failure.
         good = np.isfinite(column)
@@ -288,7 +294,7 @@ def _draw(
     if seen:
         low, high = np.min(seen, axis=0), np.max(seen, axis=0)
         target = 0.5 * (low + high)
-        away = 1.2 * max(float(np.linalg.norm(high - low)), 0.4)
+        away = 0.9 * max(float(np.linalg.norm(high - low)), 0.4)
         meshcat.SetCameraPose(target + away * np.array([0.9, -1.1, 0.6]), target)
 
 
@@ -303,7 +309,7 @@ def _put(meshcat: Meshcat, path: str, shape, colour: Rgba, pose: RigidTransform)
 def _shapes(loaded: LoadedScene) -> tuple[list, list]:
     """(path, body, pose in it, shape) of what moves, and of what stands still (with
     the body's pose in world in place of the body). A body without a shape to be seen
-    shows those it touches with; a mechanism without any is drawn as sticks."""
+    shows those it touches with; a mechanism of balls, or of nothing, has rods."""
     plant = loaded.plant
     inspector = loaded.scene_graph.model_inspector()
     context = plant.CreateDefaultContext()
@@ -328,8 +334,10 @@ def _shapes(loaded: LoadedScene) -> tuple[list, list]:
                 still.append((f"{name}_{k}", X_WB, pose, shape))
             else:
                 moving.append((path, body, pose, shape))
-    if not moving:
-        moving = _sticks(plant, context)
+    # Balls alone hang in the air: a mechanism is seen by what joins them.
+    if all(isinstance(shape, Sphere) for *_, shape in moving):
+        sticks = _sticks(plant, context)
+        moving += [s for s in sticks if not (s[1].is_floating_base_body() and moving)]
     return moving, still
 
 

@@ -174,7 +174,7 @@ def picture_of_series(series: Sequence[Series], most: int = 3) -> Figure | None:
             fontsize=9, loc="left",
         )  # fmt: skip
         right.set_title("(measured - simulated) / noise; grey: 2 sigma", fontsize=9)
-        right.set_yscale("symlog", linthresh=5.0)
+        right.set_yscale("symlog", linthresh=10.0)
         _plain_numbers(right.yaxis)
         for axes in (left, right):
             _plain(axes)

@@ -173,7 +173,8 @@ def _effect(each: NamedEffect, result: GapResult, i: int) -> str:
     if e.runner_up:
         sure += f" Next best: {escape(e.runner_up)}"
         if np.isfinite(e.margin):
-            sure += f", error {100.0 * e.margin:.0f} % larger"
+            size = "larger" if e.margin >= 0.0 else "smaller"
+            sure += f", error {100.0 * abs(e.margin):.0f} % {size}"
         sure += "."
     if each.identifiable == "weak":
         sure += " These data determine it only weakly."

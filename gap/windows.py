@@ -117,7 +117,11 @@ class WindowModel:
     def _signals(self) -> list[str]:
         names = [f"{joint}.position" for joint in self.joints]
         for body in self.bodies:
-            names += [f"{body}.{axis}" for axis in _POSITIONS]
+            # x there is; a camera from above, say, sees no height.
+            names += [
+                f"{body}.{axis}" for axis in _POSITIONS
+                if all(f"{body}.{axis}" in r for r in self.recordings)
+            ]  # fmt: skip
             names += [
                 f"{body}.{q}" for q in _TURNS
                 if all(f"{body}.{q}" in r for r in self.recordings)
@@ -268,7 +272,12 @@ class WindowModel:
             initial.velocities[joint] = float(x[1])
         for body in self.bodies:
             length = _length_scale(measured, body)
-            place = np.array([state(f"{body}.{a}") for a in _POSITIONS]) / length
+            place = np.zeros((3, 3))
+            for i, axis in enumerate(_POSITIONS):
+                if f"{body}.{axis}" in w.state:
+                    place[i] = state(f"{body}.{axis}") / length
+                elif body in self.scene.initial.poses:
+                    place[i, 0] = self.scene.initial.poses[body][4 + i]
             q, dq = np.array([1.0, 0, 0, 0]), np.zeros(4)
             if f"{body}.qw" in w.state:
                 turn = np.array([state(f"{body}.{a}") for a in _TURNS])
@@ -280,6 +289,8 @@ class WindowModel:
                 *map(float, spin),
                 *map(float, place[:, 1]),
             ]
+            if f"{body}.z" not in w.state:  # It lies, and rolls, on what is below it.
+                initial = self.simulation.put_down(initial, body)
         return initial
 
     def errors(self, simulated: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -11,6 +11,9 @@ from makebreak.diagrams.ball_rolling import BallRollingConfig, believed
 from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.scene_simulation import SceneSimulation
 from makebreak.diagrams.station import BALL_ROLLING
+from makebreak.gap.recording import read_recordings
+from makebreak.gap.table import write_recording
+from makebreak.gap.windows import WindowModel
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import InitialSection, load_scene, read_scene
 from makebreak.models.scene_file import write_scene
@@ -35,6 +38,29 @@ def test_a_ball_is_put_down_on_its_radius_and_rolls(tmp_path, radius):
     w, v = np.split(np.array(put.body_velocities["b.ball"]), 2)
     np.testing.assert_allclose(v + np.cross(w, [0, 0, -radius]), 0.0, atol=1e-12)
     assert start.poses["b.ball"][6] == 0.0315  # The caller's is as it was.
+
+
+def test_windows_of_a_ball_without_a_height_tell_its_radius(tmp_path):
+    """Put down and rolling, it spins as fast as its radius says."""
+    scene = on_ground(tmp_path, "ball")
+    size = Effect("object_size", ["b.ball"], {"radius": 0.0365})
+    time = np.arange(200) * 0.01
+    start = InitialSection(
+        poses={"b.ball": [1, 0, 0, 0, 0.0, 0.0, 0.0365]},
+        body_velocities={"b.ball": [0, 0.2 / 0.0365, 0, 0.2, 0, 0]},
+    )
+    world = SceneSimulation(replace(scene, effects=[size]))
+    x, wy = world.run(start, time, ["b.ball.x", "b.ball.wy"]).T
+    rng = np.random.default_rng(0)
+    columns = {"time": time, "b.ball.x": x + 1e-4 * rng.normal(size=200)}
+    columns["b.ball.y"] = 1e-4 * rng.normal(size=200)
+    columns["b.ball.wy"] = wy + 1e-2 * rng.normal(size=200)
+    write_recording(tmp_path / "run.csv", columns)
+    model = WindowModel(scene, read_recordings([tmp_path / "run.csv"]), 0.3)
+    right = np.sqrt(np.mean(model.residual([size]) ** 2))
+    wrong = np.sqrt(np.mean(model.residual() ** 2))
+    # Its spin is v/r: 0.86 rad/s less than the smaller ball's, 86 times the noise.
+    assert right < 1.5 and wrong > 30.0
 
 
 def test_a_ball_with_nothing_below_it_and_one_without_a_pose_are_refused(tmp_path):

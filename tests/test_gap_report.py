@@ -216,6 +216,14 @@ def test_a_tie_is_said_with_what_tells_it_apart(case, tmp_path):
     assert "    to tell: move the joint at two speeds" in summary_lines(result)
 
 
+def test_a_runner_up_that_is_ahead_is_said_to_be(case, tmp_path):
+    """A bigger model that is not enough better to be taken."""
+    evidence = replace(case[2].effects[0].evidence, margin=-0.08)
+    effect = replace(case[2].effects[0], evidence=evidence)
+    text = text_of(written(case, tmp_path, replace(case[2], effects=[effect])))
+    assert "error 8 % smaller." in text
+
+
 def test_no_gap_and_no_name_are_said_and_nothing_is_added(case, tmp_path):
     nothing = replace(
         case[2], verdict="no_gap", says="Nothing is missing.", effects=[], where=[],
