@@ -272,8 +272,8 @@ WORSE = {
     "lcs_builder": ("circles_completed", -1),
     "c3_mpc": ("circles_completed", -1),
     "residual_learner": ("circles_completed", -1),
-    "mode_detector": ("slide_stiffness_mean", 1),
-    "contact_anticipator": ("contact_force_peak_N", 1),
+    "mode_detector": ("slide_prediction_error_mean_N", 1),
+    "contact_anticipator": ("reposition_mean_s", 1),
     "velocity_shaper": ("circles_completed", -1),
     "impedance_controller": ("circles_completed", -1),
 }
