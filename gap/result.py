@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from makebreak.gap.checks import Finding
+from makebreak.gap.findings import Finding
 from makebreak.models.effects.kind import Effect
 
 VERDICTS = ("no_gap", "gap_named", "ambiguous", "gap_unnamed")

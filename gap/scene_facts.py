@@ -4,7 +4,7 @@ import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
-from makebreak.gap.checks import JointFacts, SceneFacts
+from makebreak.gap.findings import JointFacts, SceneFacts
 
 
 def scene_facts(plant: MultibodyPlant) -> SceneFacts:

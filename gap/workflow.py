@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from makebreak.gap.checks import Finding, check_recordings
+from makebreak.gap.checks import check_recordings
 from makebreak.gap.contact import (
     contact_candidates,
     contact_model,
 )
+from makebreak.gap.findings import Finding
 from makebreak.gap.inverse import InverseModel
 from makebreak.gap.recording import (
     Recording,

@@ -7,13 +7,9 @@ import pytest
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.diagrams.station import BALL_ROLLING
-from makebreak.gap.checks import (
-    JointFacts,
-    SceneFacts,
-    check_recordings,
-    excitation,
-    free_flight_gravity,
-)
+from makebreak.gap.check_motion import excitation, free_flight_gravity
+from makebreak.gap.checks import check_recordings
+from makebreak.gap.findings import JointFacts, SceneFacts
 from makebreak.gap.recording import check_against_scene, read_recording
 from makebreak.gap.scene_facts import scene_facts, scene_names
 from makebreak.gap.table import write_recording

@@ -12,8 +12,8 @@ from pydrake.math import RotationMatrix
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.diagrams.scene_simulation import Commands, SceneSimulation
-from makebreak.gap.checks import Finding
 from makebreak.gap.comparison import comparison_html, measured_state
+from makebreak.gap.findings import Finding
 from makebreak.gap.pictures import picture_of_where
 from makebreak.gap.recording import read_recordings
 from makebreak.gap.report import extents_of, summary_lines, write_report
