@@ -22,6 +22,7 @@ BENCHES: dict[str, str] = {
     "impedance": "makebreak.scripts.bench_impedance",
     "camera": "makebreak.scripts.bench_camera",
     "diagrams": "makebreak.scripts.bench_diagrams",
+    "gap": "makebreak.scripts.bench_gap",
 }
 
 

@@ -67,7 +67,7 @@ def convert(data: Path, out: Path) -> list[Path]:
         table = table[np.concatenate([[True], np.diff(table[:, 0]) > 0])]
         keep = [k for k, name in enumerate(_NAMES) if name]
         header = ",".join(_NAMES[k] for k in keep)
-        file = out / f"run_{key.strip('_')}.csv"
+        file = out / f"run_{key.rsplit('_', 1)[-1]}.csv"
         np.savetxt(file, table[:, keep], delimiter=",", header=header, comments="")
         files.append(file)
     return files

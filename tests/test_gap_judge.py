@@ -1,0 +1,89 @@
+"""What a scene's windows are off by, in the channels' own units."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+from effect_scenes import pendulum, with_effects
+from pydrake.systems.framework import DiagramBuilder
+
+from makebreak.gap.judge import judge
+from makebreak.gap.recording import read_recordings
+from makebreak.gap.table import write_recording
+from makebreak.models.scene import load_scene
+from makebreak.models.scene_file import write_scene
+from makebreak.scripts import judge as command
+
+PUSH = 1.2  # [rad/s2] of the measured joint, that the scene lacks.
+WINDOW = 0.5
+
+
+@pytest.fixture
+def case(tmp_path):
+    """A joint that nothing acts on in its scene, and that in truth is pushed."""
+    scene = pendulum(tmp_path, gravity=0.0)
+    write_scene(scene, tmp_path / "scene.yaml")
+    rng = np.random.default_rng(0)
+    time = np.arange(1001) * 0.01
+    position = 0.5 * PUSH * time**2 + 1e-4 * rng.normal(size=len(time))
+    columns = {"time": time, "p.j1.position": position}
+    write_recording(tmp_path / "run.csv", columns)
+    return scene, tmp_path / "scene.yaml", tmp_path / "run.csv"
+
+
+def test_a_push_that_the_scene_lacks_is_half_its_square_of_time(case):
+    scene, _, recording = case
+    [found] = judge(scene, read_recordings([recording]), WINDOW)
+    # The scene goes straight on: off by a t^2/2, of which the rms over a window is
+    # a T^2/2/sqrt(5). A start is known to some 1e-3 rad/s, and so to 1e-3 of that.
+    expected = 0.5 * PUSH * WINDOW**2 / np.sqrt(5.0)
+    assert found.channel == "p.j1.position" and found.unit == "rad"
+    np.testing.assert_allclose(found.rms, expected, rtol=0.03)
+    assert found.n_windows == 20 and found.failed == 0.0
+
+
+def test_a_scene_with_the_push_is_off_by_the_noise(case):
+    scene, _, recording = case
+    inertia = _inertia(scene)
+    push = with_effects(
+        scene, ("actuator_bias", "p.j1", {"bias": float(PUSH * inertia)})
+    )
+    [found] = judge(push, read_recordings([recording]), WINDOW)
+    # The noise is 1e-4, and a start's speed is off by some 1e-3 rad/s; without the push
+    # it is 0.067 rad.
+    assert found.rms < 5e-4
+
+
+def _inertia(scene) -> float:
+    plant = load_scene(scene, DiagramBuilder()).plant
+    return plant.CalcMassMatrix(plant.CreateDefaultContext())[0, 0]
+
+
+def test_the_command_prints_a_column_for_each_scene(case, monkeypatch, capsys):
+    _, scene, recording = case
+    out = scene.parent / "judged.json"
+    words = ["judge", str(scene), str(scene), "--on", str(recording)]
+    monkeypatch.setattr(sys, "argv", [*words, "--window", "0.5", "--json", str(out)])
+    assert command.main() == 0
+    shown = capsys.readouterr().out
+    [row] = [line for line in shown.splitlines() if line.startswith("p.j1.position")]
+    assert row.split().count(f"{json.loads(out.read_text())[0][str(scene)]:.4g}") == 2
+    assert "20 windows of 0.5 s of 1 recording;" in shown
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["no.yaml", "--on", "run.csv"], "no.yaml"),
+        (["scene.yaml", "--on", "none.csv"], "none.csv"),
+        (["scene.yaml", "--on", "run.csv", "--window", "-1"], "-1.0 s, expected > 0"),
+        (["scene.yaml", "--on", "run.csv", "--window", "99"], "no episode"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(case, words, says, monkeypatch, capsys):
+    monkeypatch.chdir(case[1].parent)
+    monkeypatch.setattr(sys, "argv", ["judge", *words])
+    assert command.main() == 2
+    shown = capsys.readouterr().err
+    assert says in shown and shown.count("\n") == 1, shown
