@@ -218,34 +218,13 @@ class SceneSimulation:
         self._set_state(initial, True)
         plant, own = self._plant, self._plant_context
         thing = self._bodies[body]
-        at = thing.floating_positions_start() + 6
-        mine = plant.GetCollisionGeometriesForBody(thing)
-        fixed = [
-            geometry
-            for i in range(plant.num_bodies())
-            if plant.IsAnchored(plant.get_body(BodyIndex(i)))
-            for geometry in plant.GetCollisionGeometriesForBody(
-                plant.get_body(BodyIndex(i))
-            )
-        ]
         scene_graph = self._loaded.scene_graph
-        for _ in range(4):  # One is enough for a flat ground.
-            query = scene_graph.get_query_output_port().Eval(
-                scene_graph.GetMyContextFromRoot(self._context)
-            )
-            down = np.inf
-            for a in mine:
-                for b in fixed:
-                    pair = query.ComputeSignedDistancePairClosestPoints(a, b)
-                    up = pair.nhat_BA_W[2] * (1.0 if pair.id_A == a else -1.0)
-                    if up > 0.5:
-                        down = min(down, pair.distance / up)
-            if not np.isfinite(down):
-                raise ValueError(f"put_down: nothing fixed is below {body!r}")
-            q = plant.GetPositions(own)
-            q[at] -= down
-            plant.SetPositions(own, q)
-        pose = [*initial.poses[body][:6], float(q[at])]
+        z = stand_on_ground(
+            plant, own, scene_graph, scene_graph.GetMyContextFromRoot(self._context),
+            thing,
+        )  # fmt: skip
+        mine = plant.GetCollisionGeometriesForBody(thing)
+        pose = [*initial.poses[body][:6], z]
         twist = list(initial.body_velocities.get(body, [0.0] * 6))
         inspector = scene_graph.model_inspector()
         shapes = [inspector.GetShape(geometry) for geometry in mine]
@@ -709,6 +688,42 @@ class SceneSimulation:
             out[k, 4:7] = X_WB.translation()
             out[k, 7:] = V_WB.get_coeffs()
         return out
+
+
+def stand_on_ground(plant, context, scene_graph, graph_context, thing) -> float:
+    """Moves a free body up or down until it just touches what is fixed below it.
+
+    Args: context, graph_context: of the plant and of the scene graph, in one diagram.
+    Returns: the height of its origin [m]. Raises: ValueError if nothing is below it.
+    """
+    at = thing.floating_positions_start() + 6
+    fixed = [
+        geometry
+        for i in range(plant.num_bodies())
+        if plant.IsAnchored(plant.get_body(BodyIndex(i)))
+        for geometry in plant.GetCollisionGeometriesForBody(
+            plant.get_body(BodyIndex(i))
+        )
+    ]
+    mine = plant.GetCollisionGeometriesForBody(thing)
+    q = plant.GetPositions(context)
+    for _ in range(4):  # One is enough for a flat ground.
+        query = scene_graph.get_query_output_port().Eval(graph_context)
+        down = np.inf
+        for a in mine:
+            for b in fixed:
+                pair = query.ComputeSignedDistancePairClosestPoints(a, b)
+                up = pair.nhat_BA_W[2] * (1.0 if pair.id_A == a else -1.0)
+                if up > 0.5:
+                    down = min(down, pair.distance / up)
+        if not np.isfinite(down):
+            name = full_name(plant, thing)
+            raise ValueError(f"put_down: nothing fixed is below {name!r}")
+        q[at] -= down
+        plant.SetPositions(context, q)
+        if abs(down) < 1e-9:
+            break
+    return float(q[at])
 
 
 def _padded(efforts: dict[str, list], n: int) -> dict[str, np.ndarray]:

@@ -22,6 +22,7 @@ from makebreak.gap.result import GapMeasure, GapResult, Series
 from makebreak.gap.scene_facts import scene_facts, scene_names
 from makebreak.gap.screen import candidates, nuisances
 from makebreak.gap.select import FLOOR, Selection, select
+from makebreak.gap.touch import TouchModel, touch_candidates
 from makebreak.gap.verdict import named, says, verdict_of
 from makebreak.gap.where import unexplained, where_in_motion, where_in_windows
 from makebreak.gap.windows import WindowModel, with_step
@@ -62,6 +63,10 @@ def run_gap(
     say("checking the recordings")
     checks = check_recordings(recordings, scene_facts(dynamics.plant))
     seconds["checks"] = clock.lap()
+    touch = _touch_model(scene, recordings, dynamics)
+    if touch is not None:
+        result = _of_touch(touch, checks, seconds, clock, say)
+        return result.with_seconds(seconds)
     scene, finding = _settle_step(scene, recordings, dynamics)
     checks += finding
     if _is_mechanism(dynamics, recordings):
@@ -88,6 +93,16 @@ def _is_mechanism(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> b
     return len(joints) == plant.num_velocities() and all(
         f"{full_name(plant, j)}.position" in r for j in joints for r in recordings
     )
+
+
+def _touch_model(scene, recordings, dynamics) -> TouchModel | None:
+    """Where a measured mechanism touches measured objects, and a wrench tells when."""
+    if _is_mechanism(dynamics, recordings) or not one_dof_joints(dynamics.plant):
+        return None
+    try:
+        return TouchModel(scene, recordings)
+    except ValueError:
+        return None
 
 
 def _settle_step(scene: Scene, recordings, dynamics) -> tuple[Scene, list[Finding]]:
@@ -154,6 +169,26 @@ def _of_mechanism(scene, recordings, checks, seconds, clock, say) -> GapResult:
     return GapResult(
         verdict, says(verdict, effects_named, start, end), where, effects_named,
         measure, rest, background, checks, series, selection.table,
+    )  # fmt: skip
+
+
+def _of_touch(model: TouchModel, checks, seconds, clock, say) -> GapResult:
+    say("measuring how tool and object touch")
+    nuisance, prior, names = model.nuisances()
+    clear = Screen(model.base(), nuisance, prior, model.train()).fit()
+    found = touch_candidates(model, nuisance) if clear.score > FLOOR else []
+    seconds["screen"] = clock.lap()
+    selection = select(model, nuisance, prior, found, say)
+    seconds["select"] = clock.lap()
+    start, end = selection.start.score, selection.end.score
+    verdict = verdict_of(selection.choices, start, end)
+    before, after = selection.start.left, selection.end.left
+    effects_named = [named(c) for c in selection.choices]
+    return GapResult(
+        verdict, says(verdict, effects_named, start, end),
+        model.where(before) if verdict != "no_gap" else [], effects_named,
+        model.measure(before, after), [], _background(names, prior, selection), checks,
+        model.series(before, after), selection.table,
     )  # fmt: skip
 
 
