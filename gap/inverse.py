@@ -15,7 +15,7 @@ from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.effects.measured_channels import acts_on
-from makebreak.models.effects.signature import Motion
+from makebreak.models.effects.signature import Motion, added_effort
 from makebreak.models.scene import Scene
 from makebreak.systems.numerics.smoother import smooth
 from makebreak.systems.numerics.weak_form import Bumps, make_bumps
@@ -34,6 +34,8 @@ REST_SPEED, REST_SHARE, REST_EFFORT = 0.005, 0.04, 0.3
 # Sampled at the very instants at which a stiff drive gets new commands, a velocity is
 # off by a share of itself.
 DRIVE_VELOCITY = 0.01
+HEAVY = ("payload", "gravity_tilt", "object_mass", "object_com", "object_inertia")
+MOST_MOTIONS = 40  # That are kept in memory.
 MODEL_ERROR = 2e-4  # Of a joint's rms effort: what smoothing and sampling leave.
 
 
@@ -83,6 +85,16 @@ class _Dynamics(SceneDynamics):
             # The arrays are kept as well, so that no other gets their id.
             self._moved[key] = (super().body_motion(body, q, v, vd), q, v, vd)
         return self._moved[key][0]
+
+    def mass_times_com_jacobian(self, q):
+        key = (-1, id(q))
+        if key not in self._moved:
+            self._moved[key] = (super().mass_times_com_jacobian(q), q)
+        return self._moved[key][0]
+
+    def forget(self) -> None:
+        """Of all motions."""
+        self._moved.clear()
 
 
 class InverseModel:
@@ -149,7 +161,8 @@ class InverseModel:
         self._whiteners = self._noise_of_rows()
         self._base: np.ndarray | None = None
         self._motions: list[Motion] | None = None
-        self._needed: dict[int, np.ndarray] = {}  # Effort of each track's own motion.
+        # Of a track and what moves it: the motion, and the effort that it needs.
+        self._needed: dict[tuple, tuple[Motion, np.ndarray]] = {}
 
     def base(self) -> np.ndarray:
         """The residual of the scene as it came."""
@@ -348,33 +361,54 @@ class InverseModel:
     def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
         """(m,) residual over its noise, of the scene with these effects added."""
         ours = [e for e in effects if e.kind not in SENSED + PATH]
-        dynamics: SceneDynamics = self.dynamics
-        if ours:
-            dynamics = SceneDynamics(
-                replace(self.scene, effects=[*self.scene.effects, *ours])
-            )
-        moved = any(
-            e.kind in SENSED
+        moving = [
+            e for e in effects
+            if e.kind in SENSED
             and any(acts_on(e, KINDS[e.kind].channel, f"{j}.position")
                     for j in self.joints)
-            for e in effects
-        )  # fmt: skip
+        ]  # fmt: skip
+        # Weights and gravity change each other; else effects add up.
+        together = sum(e.kind in HEAVY for e in ours) < 2
+        dynamics: SceneDynamics | None = None
         parts = []
         for k, (track, white) in enumerate(
             zip(self.tracks, self._whiteners, strict=True)
         ):
-            motion = self.motion(track, effects)
-            if ours or moved:
+            motion, needed = self._moved_by(k, moving)
+            for effect in ours if together else ():
+                add = added_effort(effect, KINDS[effect.kind], self.dynamics, motion)
+                if add is None:
+                    together = False
+                    break
+                needed = needed + add
+            if ours and not together:
+                if dynamics is None:
+                    dynamics = SceneDynamics(
+                        replace(self.scene, effects=[*self.scene.effects, *ours])
+                    )
                 needed = motion.effort - dynamics.residual(motion)
-            else:  # Same motion, same model.
-                if k not in self._needed:
-                    self._needed[k] = motion.effort - dynamics.residual(motion)
-                needed = self._needed[k]
+            motion = replace(
+                motion, effort=self._effort(track, effects, motion.q, motion.v)
+            )
             r = track.bumps.mean(motion.effort - needed)
             parts.append(
                 self._stacked(track, white, r, self._other_rows(track, effects, motion))
             )
         return np.concatenate(parts)
+
+    def _moved_by(self, k: int, moving: Sequence[Effect]) -> tuple[Motion, np.ndarray]:
+        """A track's motion, and the effort that the scene as it came needs for it."""
+        key = (k, *((e.kind, *e.at, *e.parameters.values()) for e in moving))
+        if key not in self._needed:
+            motion = (
+                self.motion(self.tracks[k], moving) if moving else self.motions()[k]
+            )
+            if len(self._needed) > MOST_MOTIONS + len(self.tracks):
+                self._needed = {i: x for i, x in self._needed.items() if len(i) == 1}
+                self.dynamics.forget()
+            needed = motion.effort - self.dynamics.residual(motion)
+            self._needed[key] = (motion, needed)
+        return self._needed[key]
 
     def columns_of(self, efforts: Sequence[np.ndarray]) -> np.ndarray:
         """(m, k) from columns of the residual effort at the middles of each track,

@@ -19,7 +19,7 @@ from effect_scenes import (
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sentence
-from makebreak.models.effects.signature import Motion
+from makebreak.models.effects.signature import Motion, added_effort
 
 # Effects on the double pendulum whose columns are exact, with parameters to find.
 EXACT = {
@@ -70,6 +70,18 @@ def explained(signature, residual, coefficients=None):
         coefficients = np.linalg.lstsq(A, b, rcond=None)[0]
     left = np.linalg.norm(b - A @ coefficients) / np.linalg.norm(b)
     return coefficients, left
+
+
+@pytest.mark.parametrize("kind", [k for k in EXACT | SMALL if "object" not in k])
+def test_what_an_effect_adds_is_what_a_model_with_it_needs_more(tmp_path, kind):
+    at, parameters = (EXACT | SMALL)[kind]
+    scene = double(tmp_path)
+    without = SceneDynamics(scene)
+    motion = motion_of(without)
+    true = SceneDynamics(with_effects(scene, (kind, at, parameters)))
+    more = -true.residual(motion)
+    added = added_effort(Effect(kind, [at], parameters), KINDS[kind], without, motion)
+    np.testing.assert_allclose(added, more, atol=1e-9 * np.abs(more).max())
 
 
 def test_inverse_dynamics_of_the_pendulum_is_the_closed_form(tmp_path):

@@ -90,6 +90,17 @@ def _sinusoidal_signature(effect, model, motion, grid=None) -> list[Signature]:
     return found
 
 
+def _sinusoidal_added(effect, model, motion) -> np.ndarray:
+    p = effect.parameters
+    (one,) = _sinusoidal_signature(
+        effect, model, motion, {"frequency": [p["frequency"]]}
+    )
+    force = np.array([p[axis] for axis in AXES])
+    return one.columns @ np.concatenate(
+        [np.cos(p["phase"]) * force, np.sin(p["phase"]) * force]
+    )
+
+
 def _drag_signature(effect, model, motion, grid=None) -> list[Signature]:
     columns = np.zeros((*motion.v.shape, 2))
     for J, V in _jacobians(effect, model, motion):
@@ -126,6 +137,7 @@ KINDS = {
         body_law=sinusoidal_law,
         body_numbers=_numbers(*AXES, "frequency", "phase"),
         signature=_sinusoidal_signature,
+        added=_sinusoidal_added,
     ),
     "body_drag": EffectKind(
         at="body",

@@ -175,8 +175,7 @@ def _rotor_signature(effect, model, motion, grid=None) -> list[Signature]:
             effect,
             ("inertia",),
             columns,
-            momentum,
-            np.zeros_like(columns),
+            lambda: (momentum, np.zeros_like(columns)),
             lambda c: {"inertia": float(c[0])},
         )
     ]
@@ -229,6 +228,20 @@ def _spring_signature(effect, model, motion, grid=None) -> list[Signature]:
             to_parameters=to_parameters,
         )
     ]
+
+
+def _ripple_added(effect, model, motion) -> np.ndarray:
+    p = effect.parameters
+    grid = {"periods_per_rev": [p["periods_per_rev"]]}
+    (one,) = _ripple_signature(effect, model, motion, grid)
+    phase = np.array([np.cos(p["phase"]), np.sin(p["phase"])])
+    return one.columns @ (p["amplitude"] * phase)
+
+
+def _spring_added(effect, model, motion) -> np.ndarray:
+    p = effect.parameters
+    (one,) = _spring_signature(effect, model, motion)
+    return one.columns @ (p["stiffness"] * np.array([1.0, p["rest"]]))
 
 
 KINDS = {
@@ -315,6 +328,7 @@ KINDS = {
         joint_law=ripple_law,
         joint_numbers=_numbers("amplitude", "periods_per_rev", "phase"),
         signature=_ripple_signature,
+        added=_ripple_added,
     ),
     "joint_spring": EffectKind(
         at="joint",
@@ -330,5 +344,6 @@ KINDS = {
         joint_law=spring_law,
         joint_numbers=_numbers("stiffness", "rest"),
         signature=_spring_signature,
+        added=_spring_added,
     ),
 }

@@ -84,6 +84,8 @@ class EffectKind:
     now(effect, plant, scene_graph): the parameters at which `effect` (whose own do not
         matter) would leave the model as it is; None: the neutral values.
     signature: see models/effects/signature.py; None: it is seen in simulation alone.
+    added(effect, model, motion) -> (n, n_v): what the effect adds to the inverse
+        dynamics, where the signature's unknowns are not the parameters.
     """
 
     at: str
@@ -114,6 +116,7 @@ class EffectKind:
         None
     )
     signature: Callable[..., list[Any]] | None = None
+    added: Callable[..., Any] | None = None
 
     def parameter(self, name: str) -> Parameter:
         for each in self.parameters:

@@ -103,18 +103,20 @@ def inertial_signature(
     def at(q, vd):
         return inertial_columns(model, replace(motion, q=q, vd=vd), body)
 
-    step = 1e-5  # [s]: central differences, so an error of step^2 = 1e-10 relative.
-    zero = np.zeros_like(motion.vd)
-    still, _ = at(motion.q, zero)
-    _, after = at(model.shifted(motion.q, motion.v, step), zero)
-    _, before = at(model.shifted(motion.q, motion.v, -step), zero)
-    rest = still - (after - before) / (2.0 * step)
+    def weak():
+        step = 1e-5  # [s]: central differences, so an error of step^2 = 1e-10 relative.
+        zero = np.zeros_like(motion.vd)
+        still, _ = at(motion.q, zero)
+        _, after = at(model.shifted(motion.q, motion.v, step), zero)
+        _, before = at(model.shifted(motion.q, motion.v, -step), zero)
+        rest = still - (after - before) / (2.0 * step)
+        return momentum @ mix, rest @ mix
+
     return Signature(
         effect,
         tuple(unknowns),
         columns @ mix,
-        momentum @ mix,
-        rest @ mix,
+        weak,
         to_parameters,
         exact=exact,
     )
@@ -140,6 +142,15 @@ def _payload_signature(effect, model, motion, grid=None) -> list[Signature]:
             effect, model, motion, body, unknowns, np.eye(10, 4), to_parameters, False
         )
     ]
+
+
+def _payload_added(effect, model, motion) -> np.ndarray:
+    p = effect.parameters
+    mass, com = p["mass"], np.array([p[f"com_{axis}"] for axis in "xyz"])
+    inertia = mass * (com @ com * np.eye(3) - np.outer(com, com))
+    ten = [mass, *(mass * com), *inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]]
+    bodies = find_bodies(effect, model.plant)
+    return sum(inertial_columns(model, motion, b)[0] @ np.array(ten) for b in bodies)
 
 
 # ----- gravity_tilt
@@ -196,17 +207,29 @@ def _tilt(effect: Effect, plant: MultibodyPlant, scene_graph) -> None:
 def _tilt_signature(effect, model, motion, grid=None) -> list[Signature]:
     """Gravity's generalized force is linear in gravity; R^T g = g - axis x g, nearly.
     Free bodies feel a base's tilt only at `world`."""
+    tilted = _weight(effect, model, motion)
+    columns = np.stack(
+        [tilted(np.cross(axis, model.gravity)) for axis in np.eye(3)[:2]], axis=2
+    )
+    return [without_momentum(effect, ["roll", "pitch"], columns, exact=False)]
+
+
+def _tilt_added(effect, model, motion) -> np.ndarray:
+    R = rotation(effect).matrix()
+    return _weight(effect, model, motion)(model.gravity - R.T @ model.gravity)
+
+
+def _weight(effect, model, motion):
+    """A function: less gravity (3,) -> effort (n, n_v) of the joints that feel it."""
     plant = model.plant
     mJ = model.mass_times_com_jacobian(motion.q)  # (n, 3, n_v)
-    e = np.eye(3)
-    columns = np.stack([np.cross(e[k], model.gravity) @ mJ for k in range(2)], axis=2)
+    stay = np.zeros(plant.num_velocities(), dtype=bool)
     if effect.at != ["world"]:
-        stay = np.ones(plant.num_velocities(), dtype=bool)
+        stay[:] = True
         for joint in one_dof_joints(plant):
             if _stands_on(plant, joint.child_body(), effect.at):
                 stay[joint.velocity_start()] = False
-        columns[:, stay] = 0.0
-    return [without_momentum(effect, ["roll", "pitch"], columns, exact=False)]
+    return lambda less: np.where(stay, 0.0, less @ mJ)
 
 
 def _stands_on(plant: MultibodyPlant, body: RigidBody, models: list[str]) -> bool:
@@ -238,6 +261,7 @@ KINDS = {
         before_finalize=_add_payload,
         set_in_context=_change_payload,
         signature=_payload_signature,
+        added=_payload_added,
     ),
     "gravity_tilt": EffectKind(
         at="base",
@@ -252,5 +276,6 @@ KINDS = {
         "round with it",
         before_finalize=_tilt,
         signature=_tilt_signature,
+        added=_tilt_added,
     ),
 }

@@ -6,7 +6,7 @@ An offset is in a joint's encoder: the drive of a position-controlled joint sees
 well. All others are in the recorded channel alone.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -59,7 +59,7 @@ def _signature(step: str, unknown: str, to_parameters):
                 error.vd[:, i] = _derivative(
                     step, motion.time, motion.vd[:, i], jerk[:, i]
                 )
-        columns, momentum = _through_dynamics(model, motion, error)
+        columns = _through_dynamics(model, motion, error)
         found = without_momentum(
             effect,
             [unknown],
@@ -69,21 +69,17 @@ def _signature(step: str, unknown: str, to_parameters):
             channels=channels,
         )
         if not error.v.any() and not error.vd.any() and step in ("offset", "bias"):
-            rest = error.effort[:, :, None] - _difference(
-                model, motion, error, model.rest
-            )
-            return [
-                Signature(
-                    effect,
-                    found.unknowns,
-                    columns,
-                    momentum,
-                    rest,
-                    found.to_parameters,
-                    exact=False,
-                    channels=channels,
+
+            def weak():
+                momentum = -_difference(
+                    model, motion, error, lambda q, v, t: model.momentum(q, v)
                 )
-            ]
+                rest = error.effort[:, :, None] - _difference(
+                    model, motion, error, model.rest
+                )
+                return momentum, rest
+
+            return [replace(found, weak=weak)]
         return [found]
 
     return signature
@@ -105,7 +101,7 @@ def _step(*errors) -> float:
     return 1e-4 / max(greatest, 1e-3)
 
 
-def _through_dynamics(model, motion, error) -> tuple[np.ndarray, np.ndarray]:
+def _through_dynamics(model, motion, error) -> np.ndarray:
     h = _step(error.q, error.v, error.vd)
 
     def ID(s):
@@ -114,8 +110,7 @@ def _through_dynamics(model, motion, error) -> tuple[np.ndarray, np.ndarray]:
         return model.inverse_dynamics(q, v, vd, motion.time)
 
     columns = error.effort - (ID(h) - ID(-h)) / (2.0 * h)
-    momentum = -_difference(model, motion, error, lambda q, v, t: model.momentum(q, v))
-    return columns[:, :, None], momentum
+    return columns[:, :, None]
 
 
 def _difference(model, motion, error, function) -> np.ndarray:

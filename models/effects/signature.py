@@ -13,13 +13,14 @@ momentum); and ID = d/dt (M v) + Dynamics.rest in the same way.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 
-from makebreak.models.effects.kind import Effect
+from makebreak.models.effects.kind import Effect, EffectKind
 
 Grid = Mapping[str, Sequence[float]]
 
@@ -59,7 +60,8 @@ class Motion:
 class Signature:
     """Columns of one effect at one place; the nonlinear parameters are held.
 
-    columns, momentum, rest: (n, n_v, k). columns = d/dt momentum + rest.
+    columns (n, n_v, k). weak(): momentum and rest of the same shape, columns = d/dt
+    momentum + rest; computed when they are asked for.
     unknowns: names of the k coefficients, for tables.
     to_parameters(coefficients (k,)): the effect's parameters, the held ones too.
     exact: the residual is linear in the coefficients, else linearised at no effect.
@@ -70,12 +72,23 @@ class Signature:
     effect: Effect  # kind and at.
     unknowns: tuple[str, ...]
     columns: np.ndarray
-    momentum: np.ndarray
-    rest: np.ndarray
+    weak: Callable[[], tuple[np.ndarray, np.ndarray]]
     to_parameters: Callable[[np.ndarray], dict[str, float]]
     held: Mapping[str, float] = field(default_factory=dict)
     exact: bool = True
     channels: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    @cached_property
+    def _weak(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.weak()
+
+    @property
+    def momentum(self) -> np.ndarray:
+        return self._weak[0]
+
+    @property
+    def rest(self) -> np.ndarray:
+        return self._weak[1]
 
 
 class Dynamics(Protocol):
@@ -92,6 +105,22 @@ class Dynamics(Protocol):
     def shifted(self, q, dq, step: float) -> np.ndarray: ...
     def coordinates(self, channel: str) -> tuple[str, int]: ...
     def channels(self) -> list[str]: ...
+
+
+def added_effort(
+    effect: Effect, kind: EffectKind, model: Dynamics, motion: Motion
+) -> np.ndarray | None:
+    """(n, n_v) what an effect adds to the inverse dynamics of a model without it, by
+    its signature; None where only a model with the effect tells."""
+    if kind.added is not None:
+        return kind.added(effect, model, motion)
+    if kind.signature is None:
+        return None
+    grid = {name: [value] for name, value in effect.parameters.items()}
+    one, *more = kind.signature(effect, model, motion, grid)
+    if more or not one.exact or any(n not in effect.parameters for n in one.unknowns):
+        return None
+    return one.columns @ np.array([effect.parameters[n] for n in one.unknowns])
 
 
 def at_joints(
@@ -138,8 +167,7 @@ def without_momentum(
         effect,
         names,
         columns,
-        np.zeros_like(columns),
-        columns,
+        lambda: (np.zeros_like(columns), columns),
         to_parameters or named,
         held,
         exact,
