@@ -1,162 +1,203 @@
-"""Effects that only a simulation shows: contact, shapes, elasticity, backlash.
+"""Effects of free bodies and their contacts, by trying values.
 
-Each is tried at a few values; what a value changes in all windows, over the noise, is
-its column.
+Each kind is tried at a few values; what a value changes in all windows, over the noise,
+is its column.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
+from makebreak.gap.free_windows import FreeBodyModel
 from makebreak.gap.screen import Candidate
 from makebreak.gap.windows import WindowModel
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.systems.numerics.selection import Columns
 
-BOUNCE_SEC, ROLL_SEC = 0.12, 0.3  # Windows: beyond the second impact all is chaos.
 # What a value is multiplied by, or what is added to it.
 _TIMES = {
-    "contact_friction": (0.5, 0.75, 1.4, 1.9),
-    "contact_stiffness": (0.3, 0.6, 1.8, 3.5),
-    "contact_dissipation": (0.3, 0.6, 1.8, 3.0),
-    "object_mass": (0.6, 0.8, 1.25, 1.6),
-    "object_inertia": (1.05,),
+    "contact_friction": (0.4, 0.7, 1.1, 1.5, 2.2),
+    "contact_stiffness": (0.15, 0.3, 0.6, 0.9, 1.8, 3.5),
+    "contact_dissipation": (0.05, 0.3, 0.6, 1.1, 1.8, 3.0),
+    "object_mass": (0.6, 0.8, 0.97, 1.25, 1.6),
 }
 _PLUS: dict[str, dict[str, tuple[float, ...]]] = {
-    "rolling_resistance": {"coefficient": (0.01,)},
-    "plane_height": {"height": (-0.006, -0.003, 0.003, 0.006)},
-    "plane_tilt": {"roll": (0.01,), "pitch": (0.01,)},
-    "corner_radius": {"radius": (0.003, 0.006, 0.009)},
-    "object_com": {"x": (0.002,), "y": (0.002,), "z": (0.002,)},
-    "body_drag": {"linear": (0.1,)},
-    "constant_force": {"fx": (0.02,), "fy": (0.02,), "fz": (0.02,)},
+    "rolling_resistance": {"coefficient": (0.005, 0.02)},
+    "plane_height": {"height": (-0.006, -0.003, -0.0005, 0.0005, 0.003, 0.006)},
+    "plane_tilt": {"roll": (0.003,), "pitch": (0.003,)},
+    "corner_radius": {"radius": (0.001, 0.003, 0.006, 0.009)},
+    "object_com": {"x": (0.001,), "y": (0.001,), "z": (0.001,)},
+    "constant_force": {"fx": (0.01,), "fy": (0.01,), "fz": (0.01,)},
 }
-_SIZES = (0.92, 0.96, 1.04, 1.08)
+_POSITIVE = dict.fromkeys(
+    ("friction", "stiffness", "dissipation", "mass", "radius", "scale", "ixx", "iyy",
+     "izz"), True,
+)  # fmt: skip
+_SIZES = (0.92, 0.96, 0.99, 1.01, 1.04, 1.08)
+_INERTIAS = (0.7, 0.97, 1.3)
+# Kinds that an unmeasured force on a mechanism would show as; those of free bodies.
+_OF_BODIES = ("constant_force", "body_drag", "object_mass", "object_com",
+              "object_inertia", "length_scale")  # fmt: skip
 
 
-def contact_model(scene, recordings) -> WindowModel:
-    """Windows short enough for what the recordings hold: bounces or rolling."""
-    whole = WindowModel(scene, recordings, ROLL_SEC, by_episode=_many(recordings))
-    if not _bounces(whole):
-        return whole
-    return WindowModel(scene, recordings, BOUNCE_SEC, by_episode=_many(recordings))
-
-
-def _many(recordings) -> bool:
-    return sum(len(r.episodes) for r in recordings) >= 6
-
-
-def _bounces(model: WindowModel) -> bool:
-    """Whether bodies hit hard: accelerations of more than five times gravity."""
-    return any(
-        np.abs(path[name][:, 2]).max() > 50.0
-        for path in model._paths.values()
-        for name in path
-        if name.endswith(".z")
-    )
+def contact_nuisances(model) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Contact stiffness and dissipation within the scene's tolerance (relative):
+    columns (m, n_b), prior standard deviations and names."""
+    columns, prior, names = [], [], []
+    for kind in ("contact_stiffness", "contact_dissipation"):
+        share = float(model.scene.tolerance.get(kind, 0.0))
+        if share <= 0.0:
+            continue
+        for at in model.dynamics.places(kind):
+            ((name, now),) = model.dynamics.now(kind, [at]).items()
+            step = min(0.3 * share, 0.2)
+            r = _residual(model, Effect(kind, [at], {name: now * (1.0 + step)}))
+            if r is None or not np.abs(model.base() - r).max() > 1e-6:
+                continue
+            columns.append((model.base() - r) / step)
+            prior.append(share)
+            names.append(f"{kind} of {at}")
+    if not columns:
+        return np.zeros((len(model.train()), 0)), np.zeros(0), []
+    return np.stack(columns, axis=1), np.array(prior), names
 
 
 def contact_candidates(
-    model: WindowModel, nuisance: np.ndarray, say: Callable[[str], None]
+    model: FreeBodyModel | WindowModel,
+    nuisance: np.ndarray,
+    there: Sequence[Effect],
+    r: np.ndarray,
 ) -> list[Candidate]:
-    """All kinds that free bodies and their contacts may show."""
+    """All kinds that free bodies and their contacts may show.
+
+    Args: there, effects that are in the model already, and what they leave, r (m,).
+    """
     found: list[Candidate] = []
-    dynamics = model.dynamics
-    for kind, entry in KINDS.items():
-        known = kind in _TIMES or kind in _PLUS
-        if not known and kind not in ("object_size", "length_scale"):
-            continue
-        for at in dynamics.places(kind):
+    for kind in KINDS:
+        for at in model.dynamics.places(kind):
             if kind == "length_scale" and at == "world":
                 continue
-            if kind in ("constant_force", "body_drag", "object_mass", "object_com",
-                        "object_inertia") and at not in model.bodies:  # fmt: skip
+            if kind in _OF_BODIES and at not in model.bodies:
                 continue
-            each = _of(model, nuisance, kind, at, entry)
-            if each is not None:
-                found.append(each)
-                say(f"  {kind} at {at}")
+            if any(e.kind == kind and at in e.at for e in there):
+                continue
+            for trials, names, fixed in _trials(model, kind, at):
+                each = _of(model, nuisance, kind, at, trials, names, fixed, there, r)
+                if each is not None:
+                    found.append(each)
     return found
 
 
-def _of(model: WindowModel, nuisance, kind: str, at: str, entry) -> Candidate | None:
+def _trials(model, kind: str, at: str):
+    """Of each candidate of a kind at a place: alternatives, each a list of (step,
+    parameters), one for each unknown; the unknowns; and what stays as it is."""
     try:
         now = dict(model.dynamics.now(kind, [at]))
     except ValueError:
-        return None
-    names: tuple[str, ...]
-    trials: list[list[tuple[str, float, dict]]] = []  # Alternatives of columns.
+        return
     if kind == "object_size":
-        trials = [[("scale", s - 1.0, _sized(now, s))] for s in _SIZES]
-        names = ("scale",)
+        name = "radius" if "radius" in now else "scale"
+        values = [now[name] * s for s in _SIZES]
+        yield [[(v - now[name], {name: v})] for v in values], (name,), ()
     elif kind == "length_scale":
-        trials, names = [[("scale", 0.01, {"scale": 1.01})]], ("scale",)
+        yield [[(s, {"scale": 1.0 + s})] for s in (-0.02, 0.02)], ("scale",), ()
     elif kind == "object_inertia":
         names = ("ixx", "iyy", "izz")
-        trials = [[(n, 0.05 * now[n], {**now, n: 1.05 * now[n]}) for n in names]]
+        yield (
+            [[((f - 1.0) * now[n], _moments(now, n, f)) for n in names]
+             for f in _INERTIAS],
+            names, (),
+        )  # fmt: skip
+    elif kind == "body_drag":
+        zero = {"linear": 0.0, "angular": 0.0}
+        mass = model.dynamics.now("object_mass", [at])["mass"]
+        for name, step, other in (
+            ("linear", 0.3 * mass, "angular"),
+            ("angular", 0.3 * mass * 1e-3, "linear"),
+        ):
+            yield [[(step, {**zero, name: step})]], (name,), (other,)
     elif kind in _TIMES:
-        (name,) = [p.name for p in entry.parameters]
-        names = (name,)
-        trials = [
-            [(name, (f - 1.0) * now[name], {name: f * now[name]})] for f in _TIMES[kind]
-        ]
-    else:
+        ((name, value),) = now.items()
+        yield (
+            [[((f - 1.0) * value, {name: f * value})] for f in _TIMES[kind]],
+            (name,), (),
+        )  # fmt: skip
+    elif kind in _PLUS:
         steps = _PLUS[kind]
-        names = tuple(steps)
-        base = {p.name: now.get(p.name, 0.0) for p in entry.parameters}
-        if len(names) == 1:
-            (name,) = names
-            trials = [[(name, d, {**base, name: base[name] + d})] for d in steps[name]]
+        base = {p.name: now.get(p.name, 0.0) for p in KINDS[kind].parameters}
+        if len(steps) == 1:
+            ((name, values),) = steps.items()
+            yield ([[(d, {**base, name: base[name] + d})] for d in values], (name,), ())
         else:
-            trials = [[(n, d, {**base, n: base[n] + d}) for n, (d,) in steps.items()]]
-    columns, readers = [], []
-    for trial in trials:
-        made = []
-        for _, step, parameters in trial:
-            r = _residual(model, Effect(kind, [at], parameters))
-            if r is None:
-                break
-            made.append((model.base() - r) / step)
-        if len(made) < len(trial) or not any(np.abs(x).max() > 0.0 for x in made):
-            continue
-        columns.append(Columns(np.stack(made, axis=1), nuisance, model.train()))
-        readers.append(_reader(kind, now, names, entry))
-    if not columns:
-        return None
-    fixed: tuple[str, ...] = ("angular",) if kind == "body_drag" else ()
-    size = len(names)
-    return Candidate(kind, (at,), size, tuple(columns), tuple(readers), fixed)
+            yield (
+                [[(d, {**base, n: base[n] + d}) for n, (d,) in steps.items()]],
+                tuple(steps), (),
+            )  # fmt: skip
 
 
-def _sized(now: dict, scale: float) -> dict[str, float]:
-    out = {"scale": scale}
-    if "radius" in now:
-        out["radius"] = now["radius"] * scale
-        if KINDS["object_size"].parameter("scale").optional:
-            out.pop("scale")
+def _moments(now: dict, name: str, factor: float) -> dict[str, float]:
+    """One moment of inertia changed, so that a body can still have the three."""
+    out = {n: now[n] for n in ("ixx", "iyy", "izz")}
+    out[name] *= factor
     return out
 
 
-def _reader(kind: str, now: dict, names: Sequence[str], entry):
+def _of(model, nuisance, kind, at, trials, names, fixed, there, r) -> Candidate | None:
+    now = {p.name: p.neutral or 0.0 for p in KINDS[kind].parameters}
+    now |= model.dynamics.now(kind, [at])
+    columns, readers = [], []
+    reach = _reach(trials, names, now)
+    for trial in trials:
+        made = []
+        for step, parameters in trial:
+            moved = _residual(model, *there, Effect(kind, [at], parameters))
+            if moved is None:
+                break
+            made.append((r - moved) / step)
+        if len(made) < len(trial) or not any(np.abs(x).max() > 1e-3 for x in made):
+            continue
+        columns.append(Columns(np.stack(made, axis=1), nuisance, model.train()))
+        readers.append(_reader(kind, now, trial[0][1], names, reach))
+    if not columns:
+        return None
+    return Candidate(kind, (at,), len(names), tuple(columns), tuple(readers), fixed)
+
+
+def _reach(trials, names, now) -> dict[str, tuple[float, float]]:
+    """How far a line through a trial is trusted: three times as far as it was tried,
+    and no farther than a fifth of a value that cannot be negative."""
+    reach = {}
+    for k, name in enumerate(names):
+        steps = [trial[k][0] for trial in trials]
+        far = 3.0 * max(max(steps), -min(steps))
+        low = now[name] - far
+        if _POSITIVE.get(name):
+            low = max(low, 0.2 * min(t[k][1][name] for t in trials))
+        reach[name] = (low, now[name] + far)
+    return reach
+
+
+def _reader(kind: str, now: dict, like: dict, names: Sequence[str], reach):
+    bounded = len(names) == 1 or kind == "object_inertia"
+
     def read(c) -> dict[str, float]:
-        if kind == "object_size":
-            return _sized(now, float(np.clip(1.0 + c[0], 0.5, 2.0)))
-        out = {p.name: now.get(p.name, 0.0) for p in entry.parameters}
+        out = {name: now[name] for name in like}
         for name, value in zip(names, c, strict=True):
-            out[name] = now.get(name, 0.0) + float(value)
-        for p in entry.parameters:
+            out[name] = now[name] + float(value)
+            if bounded:
+                out[name] = float(np.clip(out[name], *reach[name]))
+        for p in KINDS[kind].parameters:
             if p.valid != "any" and p.name in out:
-                # A line laid through a bend may end beyond zero: then start near it.
-                out[p.name] = max(out[p.name], 0.1 * abs(now.get(p.name, 0.0)))
+                out[p.name] = max(out[p.name], 0.0)
         return out
 
     return read
 
 
-def _residual(model: WindowModel, effect: Effect) -> np.ndarray | None:
+def _residual(model, *effects: Effect) -> np.ndarray | None:
     try:
-        return model.residual([effect])
+        return model.residual(list(effects))
     except (ValueError, RuntimeError):
         return None
 

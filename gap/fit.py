@@ -86,7 +86,8 @@ def fit_effects(
 
     solved = least_squares(
         cost, x0 / scale, bounds=(low / scale, np.full(len(low), np.inf)),
-        diff_step=1e-4, x_scale=1.0, ftol=1e-4, xtol=1e-6, max_nfev=evaluations,
+        diff_step=getattr(model, "diff_step", 1e-4), x_scale=1.0, ftol=1e-4, xtol=1e-6,
+        max_nfev=evaluations,
     ) if len(x0) else None  # fmt: skip
     z = x0 / scale if solved is None else solved.x
     if solved is not None:  # What does not show is not told: it stays neutral.

@@ -51,12 +51,16 @@ def select(
     model: Model,
     nuisance: np.ndarray,
     prior: np.ndarray,
-    found: Sequence[Candidate],
+    found: Sequence[Candidate] | Callable[[Fitted], Sequence[Candidate]],
     say: Callable[[str], None] = lambda text: None,
     most: int = MOST_EFFECTS,
 ) -> Selection:
     """Greedy forward selection with a refit of all after each addition; then whatever
-    is not needed any more is dropped."""
+    is not needed any more is dropped.
+
+    Args: found: the candidates; or what gives them anew for what is there already,
+        where columns are no longer the same once an effect is added.
+    """
     train = model.train()
     plain = Screen(model.base(), nuisance, prior, train)
     start = current = fit_effects(model, plain, ())
@@ -83,6 +87,8 @@ def select(
 
 def _forward(model, nuisance, prior, found, chosen, current, start, say) -> dict:
     train = model.train()
+    if callable(found):
+        found = found(current)
     taken = {(c["effect"].kind, tuple(c["effect"].at)) for c in chosen}
     open_ = [c for c in found if (c.kind, c.at) not in taken]
     screen = Screen(current.r, nuisance, prior, train)

@@ -1,0 +1,282 @@
+"""Windows of one free body that flies, bounces, slides or rolls on what is fixed.
+
+A window starts from a state smoothed on one side of an impact, never across it, at the
+row from which the next impact is told best. It ends 0.1 s after that impact: beyond the
+second one all is chaos. How an uncertain start grows through the contact is simulated
+and counts as noise.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from makebreak.diagrams.free_body import free_body_of
+from makebreak.gap.recording import Episode, Recording
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.kind import Effect
+from makebreak.models.scene import Scene
+from makebreak.systems.numerics.free_body import FreeBody, lowest_gap, simulate
+from makebreak.systems.numerics.smoother import smooth
+
+AFTER_SEC = 0.1  # Of a window after its impact.
+LONG_SEC, LEAST_SEC = 1.0, 0.25  # Windows in which nothing hits.
+HIT = 20.0  # A faster change of velocity [m/s2] is an impact; gravity's is half of it.
+BESIDE = 3  # Rows beside an impact that a smoothed state would mix with it.
+DRAWS = 12  # Of uncertain starts.
+FEWEST_ROWS = 8
+_PLACE, _TURN = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
+_STATE = (*_TURN, *_PLACE, "wx", "wy", "wz", "vx", "vy", "vz")
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """state (7, 3): orientation and place with two derivatives; spread (7, 2, 2): the
+    covariances of the first two. std (n, n_channels) of measured minus simulated."""
+
+    recording: int
+    episode: int
+    start: float  # [s]
+    rows: slice
+    state: np.ndarray
+    spread: np.ndarray
+    std: np.ndarray
+    train: bool
+    hits: bool
+
+
+class FreeBodyModel:
+    """Residuals of windows of one free body, as InverseModel gives those of mechanisms.
+
+    Raises: ValueError where scene or recordings hold anything else (free_body_of); the
+        body's x, y and z must be measured.
+    """
+
+    diff_step = 2e-3  # Of fits: smaller ones drown in the error of the steps.
+
+    def __init__(
+        self,
+        scene: Scene,
+        recordings: Sequence[Recording],
+        after_sec: float = AFTER_SEC,
+        most: int = 150,
+    ):
+        self.scene, self.recordings = scene, list(recordings)
+        self.name, self._body = free_body_of(scene)
+        self.bodies, self.joints = [self.name], list[str]()
+        self.dynamics = SceneDynamics(scene)
+        if not all(f"{self.name}.{a}" in r for a in _PLACE for r in recordings):
+            raise ValueError(f"expected x, y and z of {self.name} in all recordings")
+        self._turns = all(f"{self.name}.{a}" in r for a in _TURN for r in recordings)
+        if not self._turns and (len(self._body.spheres) > 1 or self._body.com.any()):
+            raise ValueError(f"expected the orientation of {self.name}")
+        self.channels = [
+            c for a in _STATE if all((c := f"{self.name}.{a}") in r for r in recordings)
+        ]
+        self.noise = np.array(
+            [max(r.channels[c].noise for r in recordings) for c in self.channels]
+        )
+        self.noise = np.maximum(self.noise, 1e-9)
+        reach = np.linalg.norm(self._body.spheres[:, :3], axis=1)
+        size = float((reach + self._body.spheres[:, 3]).max())
+        # Errors beyond the body's size, or a radian, say no more than these.
+        self._cap = np.array([self._most(c, size) for c in self.channels])
+        self._after = after_sec
+        self.windows: list[Window] = []
+        number = 0
+        total = sum(len(r.episodes) for r in recordings)
+        for i, recording in enumerate(recordings):
+            for episode in recording.episodes:
+                self._cut(i, recording, episode, number if total >= 6 else None)
+                number += 1
+        if len(self.windows) > most:
+            keep = np.unique(np.linspace(0, len(self.windows) - 1, most).astype(int))
+            self.windows = [self.windows[k] for k in keep]
+        if not self.windows:
+            raise ValueError(
+                f"no episode holds {FEWEST_ROWS} samples of {self.name} between impacts"
+            )
+        self._seen = [self._measured(w) for w in self.windows]
+        self._add_spread()
+        self.window_sec = float(
+            np.median([recordings[w.recording].time[w.rows][-1] - w.start
+                       for w in self.windows])
+        )  # fmt: skip
+        self._base: np.ndarray | None = None
+        self.runs = 0
+
+    def _most(self, channel: str, size: float) -> float:
+        what = channel.rsplit(".", 1)[-1]
+        if what in _PLACE:
+            return size
+        return 0.5 if what in _TURN else (20.0 * size if what[0] == "v" else 20.0)
+
+    # ----- Cutting
+
+    def _signals(self) -> list[str]:
+        turns = _TURN if self._turns else ()
+        return [f"{self.name}.{a}" for a in (*turns, *_PLACE)]
+
+    def _cut(self, i: int, recording: Recording, episode: Episode, number) -> None:
+        time = recording.time[episode.rows]
+        values = {n: recording[n][episode.rows] for n in self._signals()}
+        if any(np.isfinite(y).sum() < FEWEST_ROWS for y in values.values()):
+            return
+        rough = np.zeros(len(time), bool)
+        for a in _PLACE:
+            c = f"{self.name}.{a}"
+            s = smooth(time, values[c], recording.channels[c].noise)
+            rough |= np.abs(s.x[:, 2]) > HIT
+        hit = np.flatnonzero(rough)
+        near = np.zeros(len(time), bool)
+        for k in hit:
+            near[max(k - BESIDE, 0) : k + BESIDE + 1] = True
+        edges = np.flatnonzero(np.diff(np.concatenate([[1], near, [1]]).astype(int)))
+        for a, b in zip(edges[::2], edges[1::2], strict=True):
+            self._cut_segment(i, recording, episode, time, values, a, b, rough, number)
+
+    def _cut_segment(self, i, recording, episode, time, values, a, b, rough, number):
+        if any(np.isfinite(y[a:b]).sum() < FEWEST_ROWS for y in values.values()):
+            return
+        n = b - a
+        states = np.zeros((n, 7, 3))
+        spreads = np.zeros((n, 7, 2, 2))
+        states[:, 0, 0] = 1.0
+        for k, name in enumerate((*_TURN, *_PLACE)):
+            c = f"{self.name}.{name}"
+            if c in values:
+                s = smooth(time[a:b], values[c][a:b], recording.channels[c].noise)
+                states[:, k], spreads[:, k] = s.x, s.P[:, :2, :2]
+        before_hit = b < len(time) and rough[b : b + BESIDE + 1].any()
+        spans = []
+        if before_hit:
+            first = b + int(np.argmax(rough[b:]))
+            end = int(np.searchsorted(time, time[first] + self._after, "right"))
+            spans.append((a, b, time[first], min(end, len(time)), True))
+        if time[b - 1] - time[a] >= LEAST_SEC:
+            starts = np.arange(time[a], time[b - 1] - LEAST_SEC, 0.5 * LONG_SEC)
+            for t in starts:
+                k = int(np.searchsorted(time, t))
+                end = min(int(np.searchsorted(time, t + LONG_SEC, "right")), b)
+                late = min(int(np.searchsorted(time, t + 0.15)), end)
+                spans.append((k, max(late, k + 1), time[end - 1], end, False))
+        for k0, k1, aim, end, hits in spans:
+            tau = aim - time[k0:k1]
+            P = spreads[k0 - a : k1 - a, 4:]
+            wide = np.sum(
+                P[:, :, 0, 0]
+                + 2 * tau[:, None] * P[:, :, 0, 1]
+                + tau[:, None] ** 2 * P[:, :, 1, 1],
+                axis=1,
+            )
+            k = k0 + int(np.argmin(wide))
+            if end - k < 4:
+                continue
+            block = len(self.windows) if number is None else number
+            self.windows.append(
+                Window(
+                    i, episode.number, float(time[k]),
+                    slice(episode.first + k, episode.first + end), states[k - a],
+                    spreads[k - a], np.zeros(0), block % 3 != 1, hits,
+                )
+            )  # fmt: skip
+
+    def _measured(self, w: Window) -> np.ndarray:
+        recording = self.recordings[w.recording]
+        return np.stack([recording[c][w.rows] for c in self.channels], axis=1)
+
+    def _add_spread(self) -> None:
+        """Noise, and what uncertain starts do in the scene as it is."""
+        rng = np.random.default_rng(0)
+        done = []
+        for w in self.windows:
+            plain = self._simulate(self._body, w, w.state, 1.0)
+            wide = np.zeros_like(plain)
+            roots = [_root(P) for P in w.spread]
+            for _ in range(DRAWS):
+                state = np.array(w.state)
+                for k, L in enumerate(roots):
+                    state[k, :2] += L @ rng.normal(size=2)
+                moved = self._simulate(self._body, w, state, 1.0)
+                off = moved - plain
+                off[~np.isfinite(off)] = 1e3
+                wide += np.minimum(off**2, self._cap**2) / DRAWS
+            std = np.sqrt(self.noise**2 + wide)
+            done.append(
+                Window(w.recording, w.episode, w.start, w.rows, w.state, w.spread, std,
+                       w.train, w.hits)
+            )  # fmt: skip
+        self.windows = done
+
+    # ----- Simulating
+
+    def _simulate(self, body: FreeBody, w: Window, state, length: float) -> np.ndarray:
+        """(n, n_channels) of a window."""
+        q = state[:4, 0] / np.linalg.norm(state[:4, 0])
+        dq = state[:4, 1] - q * (q @ state[:4, 1])
+        place, velocity = state[4:, 0] / length, state[4:, 1] / length
+        spin = 2.0 * _product(dq, q * np.array([1.0, -1, -1, -1]))
+        if not self._turns:
+            radius = body.spheres[0, 3]
+            if lowest_gap(body, np.concatenate([q, place])) < 0.03 * radius:
+                spin = np.array([-velocity[1], velocity[0], 0.0]) / radius
+        times = self.recordings[w.recording].time[w.rows]
+        x = simulate(body, np.concatenate([q, place, spin, velocity]), times)
+        x[:, 4:7] *= length
+        x[:, 10:] *= length
+        columns = [_STATE.index(c.rsplit(".", 1)[-1]) for c in self.channels]
+        return x[:, columns]
+
+    def simulate(self, effects: Sequence[Effect] = ()) -> list[np.ndarray]:
+        """(n, n_channels) of each window, in the scene with these effects added."""
+        body = free_body_of(self.scene, effects)[1] if effects else self._body
+        length = 1.0
+        for e in (*self.scene.effects, *effects):
+            if e.kind == "length_scale" and {
+                "world", self.name, self.name.split(".")[0],
+            } & set(e.at):  # fmt: skip
+                length *= e.parameters["scale"]
+        self.runs += 1
+        return [self._simulate(body, w, w.state, length) for w in self.windows]
+
+    def errors(self, simulated: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """(measured - simulated)/std of each window, no more than the cap; 0 where
+        nothing was measured."""
+        out = []
+        turn = [k for k, c in enumerate(self.channels) if c.rsplit(".", 1)[1] in _TURN]
+        for w, y, seen in zip(self.windows, simulated, self._seen, strict=True):
+            if turn:  # q and -q are one orientation.
+                same = np.sign(np.nansum(y[:, turn] * seen[:, turn], axis=1))
+                y = np.array(y)
+                y[:, turn] *= np.where(same < 0, -1.0, 1.0)[:, None]
+            e = np.where(np.isfinite(y), seen - y, 1e3)
+            e = e / np.sqrt(1.0 + (e / self._cap) ** 2)
+            out.append(np.where(np.isfinite(seen), e / w.std, 0.0))
+        return out
+
+    # ----- As InverseModel
+
+    def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
+        return np.concatenate([e.ravel() for e in self.errors(self.simulate(effects))])
+
+    def base(self) -> np.ndarray:
+        if self._base is None:
+            self._base = self.residual()
+        return self._base
+
+    def train(self) -> np.ndarray:
+        k = len(self.channels)
+        return np.concatenate(
+            [np.full((w.rows.stop - w.rows.start) * k, w.train) for w in self.windows]
+        )
+
+
+def _root(P: np.ndarray) -> np.ndarray:
+    """L with L L' = P (2, 2), also where P is singular."""
+    w, u = np.linalg.eigh(P)
+    return u * np.sqrt(np.maximum(w, 0.0))
+
+
+def _product(a, b) -> np.ndarray:
+    """Vector part of the quaternion product."""
+    return a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])

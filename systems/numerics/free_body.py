@@ -1,0 +1,297 @@
+"""A free rigid body with spheres that touches fixed boxes and half-spaces.
+
+The law is that of Drake's continuous point contact, so that what is fitted here holds
+there; it is stepped a hundred times as fast, for searches over thousands of windows:
+
+    f_n = k depth (1 + d depth_rate)+,    f_t = -mu(|v_t|) f_n v_t/|v_t|
+
+with mu(v) rising smoothly to the static value at the speed v_s and falling to the
+dynamic one at 3 v_s. Source: Hunt, Crossley, J. Appl. Mech. 42(2), 1975; Drake's
+documentation of MultibodyPlant, "Modeling of compliant contact" and
+"Continuous approximation of Coulomb friction". Steps: Bogacki, Shampine, Appl. Math.
+Lett. 2(4), 1989.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+MOST_STEPS = 200_000  # Of one run: beyond it the parameters are given up.
+
+
+@dataclass(frozen=True, eq=False)
+class FreeBody:
+    """The body, what it touches, and what acts on it.
+
+    spheres (n, 4): centre in the body's frame and radius [m]. fixed (m, 15): rotation
+    (9, by rows) and centre (3) in world, half sizes (3) [m]; a half-space has its
+    origin on its surface and a first half size of -1. pairs (n, m, 5): stiffness [N/m],
+    dissipation [s/m], static and dynamic friction, and the share of the contact point
+    that lies on the sphere's surface. levers (n, m): of rolling resistance [m].
+    forces (p, 6): fx, fy, fz [N, world, on the body's origin], frequency [Hz] (0:
+    constant), phase, 0.
+    """
+
+    mass: float
+    com: np.ndarray  # (3,) in the body's frame [m]
+    inertia: np.ndarray  # (3, 3) about the centre of mass, body's axes [kg m2]
+    gravity: np.ndarray  # (3,)
+    spheres: np.ndarray
+    fixed: np.ndarray
+    pairs: np.ndarray
+    levers: np.ndarray
+    forces: np.ndarray
+    drag: np.ndarray  # (2,) linear [N s/m], angular [N m s/rad]
+    slip: float = 1e-3  # v_s [m/s]
+    fade: float = 0.05  # Below this rate rolling resistance fades [rad/s].
+
+
+def simulate(
+    body: FreeBody, start, times, max_step: float = 0.004, tol: float = 1e-6
+) -> np.ndarray:
+    """(n, 13) at the times (n,), the first of which is that of `start`.
+
+    Args: start (13,): quaternion wxyz, position of the body's origin, its angular
+        velocity and velocity, all in world, as a Drake state. tol: error of a step, of
+        velocities [m/s], and a tenth of it of positions [m].
+    Returns: NaN from where the steps became too short.
+    """
+    return _run(
+        np.asarray(start, float), np.asarray(times, float), body.mass, body.com,
+        np.ascontiguousarray(body.inertia), np.linalg.inv(body.inertia), body.gravity,
+        body.spheres, body.fixed, body.pairs, body.levers, body.forces, body.drag,
+        body.slip, body.fade, max_step, tol,
+    )  # fmt: skip
+
+
+def lowest_gap(body: FreeBody, pose) -> float:
+    """Least distance of a sphere to what is fixed [m]; pose (7,) as in `start`."""
+    R, p = _matrix(np.asarray(pose[:4], float)), np.asarray(pose[4:7], float)
+    gap = np.inf
+    for sphere in body.spheres:
+        c = p + R @ sphere[:3]
+        for each in body.fixed:
+            gap = min(gap, _gap(c, sphere[3], each)[0])
+    return float(gap)
+
+
+@njit(cache=True)
+def _matrix(q):
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    s = 2.0 / (w * w + x * x + y * y + z * z)
+    R = np.empty((3, 3))
+    R[0, 0], R[0, 1] = 1 - s * (y * y + z * z), s * (x * y - w * z)
+    R[0, 2], R[1, 0] = s * (x * z + w * y), s * (x * y + w * z)
+    R[1, 1], R[1, 2] = 1 - s * (x * x + z * z), s * (y * z - w * x)
+    R[2, 0], R[2, 1] = s * (x * z - w * y), s * (y * z + w * x)
+    R[2, 2] = 1 - s * (x * x + y * y)
+    return R
+
+
+@njit(cache=True)
+def _gap(c, radius, fixed):
+    """Distance of a sphere at c to a fixed shape, and the normal out of the shape."""
+    d0, d1, d2 = c[0] - fixed[9], c[1] - fixed[10], c[2] - fixed[11]
+    n = np.empty(3)
+    # In the shape's axes.
+    a0 = fixed[0] * d0 + fixed[3] * d1 + fixed[6] * d2
+    a1 = fixed[1] * d0 + fixed[4] * d1 + fixed[7] * d2
+    a2 = fixed[2] * d0 + fixed[5] * d1 + fixed[8] * d2
+    if fixed[12] < 0.0:
+        n[0], n[1], n[2] = fixed[2], fixed[5], fixed[8]
+        return a2 - radius, n
+    h0, h1, h2 = fixed[12], fixed[13], fixed[14]
+    o0 = a0 - min(max(a0, -h0), h0)
+    o1 = a1 - min(max(a1, -h1), h1)
+    o2 = a2 - min(max(a2, -h2), h2)
+    out = np.sqrt(o0 * o0 + o1 * o1 + o2 * o2)
+    if out > 1e-12:
+        l0, l1, l2, gap = o0 / out, o1 / out, o2 / out, out
+    else:  # The centre is inside: the nearest face.
+        e0, e1, e2 = h0 - abs(a0), h1 - abs(a1), h2 - abs(a2)
+        l0 = l1 = l2 = 0.0
+        if e2 <= e0 and e2 <= e1:
+            l2, gap = (1.0 if a2 >= 0 else -1.0), -e2
+        elif e1 <= e0:
+            l1, gap = (1.0 if a1 >= 0 else -1.0), -e1
+        else:
+            l0, gap = (1.0 if a0 >= 0 else -1.0), -e0
+    for i in range(3):
+        n[i] = fixed[3 * i] * l0 + fixed[3 * i + 1] * l1 + fixed[3 * i + 2] * l2
+    return gap - radius, n
+
+
+@njit(cache=True)
+def _friction(speed, slip, mu_s, mu_d):
+    x = speed / slip
+    if x >= 3.0:
+        return mu_d
+    if x >= 1.0:
+        y = 0.5 * (x - 1.0)
+        return mu_s - (mu_s - mu_d) * y**3 * (10.0 + y * (6.0 * y - 15.0))
+    return mu_s * x**3 * (10.0 + x * (6.0 * x - 15.0))
+
+
+@njit(cache=True)
+def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, fixed, pairs, levers,
+          forces, drag, slip, fade, dx):  # fmt: skip
+    """State s: quaternion (4), centre of mass (3), w in world (3), its velocity (3)."""
+    R = _matrix(s[:4])
+    w0, w1, w2 = s[7], s[8], s[9]
+    F = np.empty(3)
+    T = np.zeros(3)
+    o = np.empty(3)  # The origin from the centre of mass.
+    for i in range(3):
+        F[i] = mass * gravity[i]
+        o[i] = -(R[i, 0] * com[0] + R[i, 1] * com[1] + R[i, 2] * com[2])
+    f = np.zeros(3)
+    f[0] = -drag[0] * (s[10] + w1 * o[2] - w2 * o[1])
+    f[1] = -drag[0] * (s[11] + w2 * o[0] - w0 * o[2])
+    f[2] = -drag[0] * (s[12] + w0 * o[1] - w1 * o[0])
+    for j in range(len(forces)):
+        size = 1.0
+        if forces[j, 3] > 0.0:
+            size = np.sin(2.0 * np.pi * forces[j, 3] * t + forces[j, 4])
+        for i in range(3):
+            f[i] += size * forces[j, i]
+    T[0] = o[1] * f[2] - o[2] * f[1] - drag[1] * w0
+    T[1] = o[2] * f[0] - o[0] * f[2] - drag[1] * w1
+    T[2] = o[0] * f[1] - o[1] * f[0] - drag[1] * w2
+    for i in range(3):
+        F[i] += f[i]
+    c = np.empty(3)
+    for j in range(len(spheres)):
+        b0, b1, b2 = (
+            spheres[j, 0] - com[0],
+            spheres[j, 1] - com[1],
+            spheres[j, 2] - com[2],
+        )
+        for i in range(3):
+            c[i] = s[4 + i] + R[i, 0] * b0 + R[i, 1] * b1 + R[i, 2] * b2
+        radius = spheres[j, 3]
+        for m in range(len(fixed)):
+            gap, n = _gap(c, radius, fixed[m])
+            if gap >= 0.0:
+                continue
+            depth = -gap
+            reach = radius - (1.0 - pairs[j, m, 4]) * depth
+            a0 = c[0] - s[4] - reach * n[0]
+            a1 = c[1] - s[5] - reach * n[1]
+            a2 = c[2] - s[6] - reach * n[2]
+            u0 = s[10] + w1 * a2 - w2 * a1
+            u1 = s[11] + w2 * a0 - w0 * a2
+            u2 = s[12] + w0 * a1 - w1 * a0
+            un = u0 * n[0] + u1 * n[1] + u2 * n[2]
+            fn = pairs[j, m, 0] * depth * (1.0 - pairs[j, m, 1] * un)
+            if fn <= 0.0:
+                continue
+            u0 -= un * n[0]
+            u1 -= un * n[1]
+            u2 -= un * n[2]
+            speed = np.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
+            share = 0.0
+            if speed > 1e-14:
+                mu = _friction(speed, slip, pairs[j, m, 2], pairs[j, m, 3])
+                share = mu * fn / speed
+            f0 = fn * n[0] - share * u0
+            f1 = fn * n[1] - share * u1
+            f2 = fn * n[2] - share * u2
+            F[0] += f0
+            F[1] += f1
+            F[2] += f2
+            T[0] += a1 * f2 - a2 * f1
+            T[1] += a2 * f0 - a0 * f2
+            T[2] += a0 * f1 - a1 * f0
+            if levers[j, m] > 0.0:
+                wn = w0 * n[0] + w1 * n[1] + w2 * n[2]
+                t0, t1, t2 = w0 - wn * n[0], w1 - wn * n[1], w2 - wn * n[2]
+                turn = max(np.sqrt(t0 * t0 + t1 * t1 + t2 * t2), fade)
+                T[0] -= levers[j, m] * fn / turn * t0
+                T[1] -= levers[j, m] * fn / turn * t1
+                T[2] -= levers[j, m] * fn / turn * t2
+    dx[0] = 0.5 * (-s[1] * w0 - s[2] * w1 - s[3] * w2)
+    dx[1] = 0.5 * (s[0] * w0 + w1 * s[3] - w2 * s[2])
+    dx[2] = 0.5 * (s[0] * w1 + w2 * s[1] - w0 * s[3])
+    dx[3] = 0.5 * (s[0] * w2 + w0 * s[2] - w1 * s[1])
+    for i in range(3):
+        dx[4 + i] = s[10 + i]
+        dx[10 + i] = F[i] / mass
+    # Euler's equation in the body's axes.
+    wb, tb, h = np.empty(3), np.empty(3), np.empty(3)
+    for i in range(3):
+        wb[i] = R[0, i] * w0 + R[1, i] * w1 + R[2, i] * w2
+        tb[i] = R[0, i] * T[0] + R[1, i] * T[1] + R[2, i] * T[2]
+    for i in range(3):
+        h[i] = inertia[i, 0] * wb[0] + inertia[i, 1] * wb[1] + inertia[i, 2] * wb[2]
+    tb[0] -= wb[1] * h[2] - wb[2] * h[1]
+    tb[1] -= wb[2] * h[0] - wb[0] * h[2]
+    tb[2] -= wb[0] * h[1] - wb[1] * h[0]
+    for i in range(3):
+        h[i] = inverse[i, 0] * tb[0] + inverse[i, 1] * tb[1] + inverse[i, 2] * tb[2]
+    for i in range(3):
+        dx[7 + i] = R[i, 0] * h[0] + R[i, 1] * h[1] + R[i, 2] * h[2]
+
+
+@njit(cache=True)
+def _run(start, times, mass, com, inertia, inverse, gravity, spheres, fixed, pairs,
+         levers, forces, drag, slip, fade, max_step, tol):  # fmt: skip
+    n = len(times)
+    out = np.full((n, 13), np.nan)
+    s = start.copy()
+    s[:4] /= np.sqrt(np.sum(s[:4] ** 2))
+    a = _matrix(s[:4]) @ com
+    s[4:7] += a
+    s[10] += s[8] * a[2] - s[9] * a[1]
+    s[11] += s[9] * a[0] - s[7] * a[2]
+    s[12] += s[7] * a[1] - s[8] * a[0]
+    scale = np.empty(13)
+    scale[:4], scale[4:7], scale[7:10], scale[10:] = tol, 0.1 * tol, 20 * tol, tol
+    k1, k2, k3, k4 = np.empty(13), np.empty(13), np.empty(13), np.empty(13)
+    t, h, steps = times[0], 1e-4, 0
+    _rate(t, s, mass, com, inertia, inverse, gravity, spheres, fixed, pairs, levers,
+          forces, drag, slip, fade, k1)  # fmt: skip
+    for i in range(n):
+        while t < times[i] - 1e-12:
+            steps += 1
+            if steps > MOST_STEPS:
+                return out
+            h = min(h, max_step)
+            step = min(h, times[i] - t)
+            _rate(t + 0.5 * step, s + 0.5 * step * k1, mass, com, inertia, inverse,
+                  gravity, spheres, fixed, pairs, levers, forces, drag, slip, fade,
+                  k2)  # fmt: skip
+            _rate(t + 0.75 * step, s + 0.75 * step * k2, mass, com, inertia, inverse,
+                  gravity, spheres, fixed, pairs, levers, forces, drag, slip, fade,
+                  k3)  # fmt: skip
+            new = s + step * (2.0 / 9.0 * k1 + 1.0 / 3.0 * k2 + 4.0 / 9.0 * k3)
+            _rate(t + step, new, mass, com, inertia, inverse, gravity, spheres, fixed,
+                  pairs, levers, forces, drag, slip, fade, k4)  # fmt: skip
+            worst = 0.0
+            for j in range(13):
+                e = step * abs(
+                    -5.0 / 72.0 * k1[j] + 1.0 / 12.0 * k2[j] + 1.0 / 9.0 * k3[j]
+                    - 0.125 * k4[j]
+                ) / scale[j]  # fmt: skip
+                worst = max(worst, e)
+            if not np.isfinite(worst):
+                return out
+            if worst <= 1.0 or step < 1e-7:
+                t += step
+                s = new
+                k1[:] = k4
+                if step == h or worst > 1.0:
+                    h = step
+                if step >= 0.99 * h:
+                    h = step * min(3.0, 0.9 / max(worst, 1e-6) ** (1.0 / 3.0))
+            else:
+                h = step * max(0.2, 0.9 / worst ** (1.0 / 3.0))
+        s[:4] /= np.sqrt(np.sum(s[:4] ** 2))
+        a = _matrix(s[:4]) @ com
+        out[i, :4] = s[:4]
+        out[i, 4:7] = s[4:7] - a
+        out[i, 7:10] = s[7:10]
+        out[i, 10] = s[10] - (s[8] * a[2] - s[9] * a[1])
+        out[i, 11] = s[11] - (s[9] * a[0] - s[7] * a[2])
+        out[i, 12] = s[12] - (s[7] * a[1] - s[8] * a[0])
+    return out
