@@ -1,8 +1,8 @@
 """A recording in memory: channels with names, episodes, rates and noise."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -501,3 +501,76 @@ def windows(episode: Episode, time: np.ndarray, length_sec: float) -> Iterator[s
             return
         yield slice(episode.first + first, episode.first + last)
         first = max(last - 1, first + 1)
+
+
+# Of a long episode: ten blocks of time, of which every third is held out.
+PIECE_SEC, PIECE_ROWS = 12.0, 20_000
+
+
+def excerpt(
+    recordings: Sequence[Recording], most_sec: float, most_rows: int
+) -> list[Recording]:
+    """Recordings of no more than so much time [s] and so many rows together: evenly
+    spread pieces of 12 s or 20 000 rows, or whole episodes where they are shorter.
+
+    Noise and notes are those of the whole.
+    """
+    seconds = sum(r.duration_sec() for r in recordings)
+    share = min(
+        most_sec / max(seconds, 1e-9), most_rows / sum(len(r.time) for r in recordings)
+    )
+    if share >= 1.0:
+        return list(recordings)
+    pieces = [
+        (i, piece)
+        for i, recording in enumerate(recordings)
+        for episode in recording.episodes
+        for piece in _pieces(recording, episode)
+    ]
+    n = max(int(share * len(pieces)), 1)
+    kept = [pieces[int((k + 0.5) * len(pieces) / n)] for k in range(n)]
+    out = []
+    for i, recording in enumerate(recordings):
+        mine = [piece for j, piece in kept if j == i]
+        if mine:
+            out.append(_of_pieces(recording, mine))
+    return out
+
+
+def _pieces(recording: Recording, episode: Episode) -> list[Episode]:
+    t = recording.time[episode.rows]
+    n = max(round((t[-1] - t[0]) / PIECE_SEC), len(t) // PIECE_ROWS, 1)
+    edges = np.searchsorted(t, t[0] + (t[-1] - t[0]) * np.arange(1, n) / n)
+    edges = np.unique([0, *edges, len(t)])
+    return [
+        Episode(
+            episode.number, episode.first + a, episode.first + b, episode.stretch + k
+        )
+        for k, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True))
+        if b - a >= FEWEST_ROWS
+    ]
+
+
+def _of_pieces(recording: Recording, pieces: Sequence[Episode]) -> Recording:
+    rows = np.concatenate([np.arange(p.first, p.last) for p in pieces])
+    ends = np.cumsum([p.last - p.first for p in pieces])
+    episodes = tuple(
+        Episode(p.number, int(end) - (p.last - p.first), int(end), p.stretch)
+        for p, end in zip(pieces, ends, strict=True)
+    )
+
+    def of(values: np.ndarray) -> np.ndarray:
+        some = values[rows]
+        some.setflags(write=False)
+        return some
+
+    return replace(
+        recording,
+        time=of(recording.time),
+        row=of(recording.row),
+        episodes=episodes,
+        channels={
+            name: replace(c, values=of(c.values))
+            for name, c in recording.channels.items()
+        },
+    )

@@ -82,6 +82,8 @@ class NamedEffect:
 class GapMeasure:
     """Rms over held-out windows of (measured - simulated) over the noise.
 
+    noise_floor: what a perfect model would leave. The noise that an error is divided
+        by has in it how unsure its window's start is, so that this is 1.
     per_channel: {channel: {"before": , "after": }}, the same for each channel.
     """
 
@@ -93,9 +95,11 @@ class GapMeasure:
 
     @property
     def reduction(self) -> float:
-        """(before - after)/(before - floor); 0 where nothing was above the floor."""
+        """(before - after)/(before - floor); 0 where nothing was above the floor, and
+        below the floor nothing counts."""
         above = self.before - self.noise_floor
-        return (self.before - self.after) / above if above > 1e-9 else 0.0
+        closed = self.before - max(self.after, self.noise_floor)
+        return closed / above if above > 1e-9 else 0.0
 
 
 @dataclass(frozen=True)
@@ -168,7 +172,8 @@ class GapResult:
                 "after": _number(self.gap.after),
                 "noise_floor": _number(self.gap.noise_floor),
                 "reduction": _number(self.gap.reduction),
-                "metric": "rms over held-out windows of (measured - simulated)/noise",
+                "metric": "rms over held-out windows of (measured - simulated)/noise; "
+                "the noise of a sample and of its window's start",
                 "window_s": _number(self.gap.window_s),
                 "held_out": True,
                 "per_channel": {
