@@ -107,7 +107,8 @@ class ModeMemory:
     quiet_time: float = 0.0  # Of the last sample that did not depart at all [s].
     change_time: float = 0.0  # Of the first one that did.
     way: float = 0.0  # Gone since then, or since the touch [m],
-    slid: int = 0  # and samples of sliding.
+    slid: int = 0  # and samples of sliding,
+    across: int = 0  # and those of them after the crossing.
     features: np.ndarray = _zeros((0, 2))  # (n, d) The batch, newest last,
     forces: np.ndarray = _zeros(0)  # (n,) and R of each.
     hint: int = UNKNOWN_MODE  # The last one given.
@@ -411,7 +412,9 @@ def _collected(memory: ModeMemory, tuning: ModeTuning, time, feature, R) -> Mode
     needed, delay = tuning.crossing, WINDOW
     if memory.stage == TOUCHED:
         needed, delay = RUN_IN_WAY, max(WINDOW, round(RUN_IN_SEC / tuning.period))
-    if memory.way < needed or memory.slid <= delay:
+    across = memory.across + 1 if memory.way >= needed else 0
+    memory = replace(memory, across=across)
+    if memory.slid <= delay or across <= WINDOW:
         # Still on both sides, or in the average of both: none of it counts.
         return replace(
             memory,
