@@ -28,6 +28,7 @@ from makebreak.systems.numerics.pinhole import (
     extents,
     visible,
 )
+from makebreak.systems.numerics.timing import timed
 
 SKY = (204, 229, 255, 255)  # Drake's own clear colour for rendering.
 
@@ -147,6 +148,7 @@ class PinholeCamera(LeafSystem):
             np.array([s.extent for s in shapes]).reshape(n, 3),
         )
 
+    @timed
     def _draw(self, context, output):
         poses: Any = self._poses.Eval(context)
         pixels = output.get_mutable_value().mutable_data
