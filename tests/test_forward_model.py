@@ -395,3 +395,22 @@ def test_a_model_that_has_seen_little_is_not_handed_over():
     memory = feed(BankMemory(memory.bank), t, Slide(2), 0.2, 1, 3)[-1]
     memory = observe(memory, t, *Slide(4).sample(0.2), DOWN, 2, 0.0)
     assert memory.before is None
+
+
+@pytest.mark.parametrize("announced", [True, False])
+def test_the_port_says_while_a_model_is_handed_over(announced):
+    config = ForwardModelConfig(handover=HandoverConfig(duration_sec=0.05))
+    knowledge = known_bank(tuning())
+    simulator, bank = small_diagram(config, knowledge)
+    context = bank.GetMyContextFromRoot(simulator.get_mutable_context())
+    transition = bank.GetInputPort("transition")
+    said = []
+    for k in range(1, 61):
+        time = 0.4 + 0.005 * k
+        count = 0.0 if announced or time < 0.502 else 1.0
+        transition.FixValue(context, [count, 0.0, 0.0, 0.0, 0.0, 0.0])
+        simulator.AdvanceTo(time - 0.002)
+        said.append(bank.GetOutputPort("handing_over").Eval(context)[0])
+    begins = 20 if announced else None
+    assert (said.index(1.0) if 1.0 in said else None) == begins
+    assert sum(said) == (10 if announced else 0)
