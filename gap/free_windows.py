@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from makebreak.diagrams.free_body import free_body_of
+from makebreak.diagrams.free_body import FreeBodyScene
 from makebreak.gap.recording import Episode, Recording
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
@@ -48,7 +48,7 @@ class Window:
 class FreeBodyModel:
     """Residuals of windows of one free body, as InverseModel gives those of mechanisms.
 
-    Raises: ValueError where scene or recordings hold anything else (free_body_of); the
+    Raises: ValueError where scene or recordings hold anything else (FreeBodyScene); the
         body's x, y and z must be measured.
     """
 
@@ -59,10 +59,11 @@ class FreeBodyModel:
         scene: Scene,
         recordings: Sequence[Recording],
         after_sec: float = AFTER_SEC,
-        most: int = 150,
+        most: int = 60,
     ):
         self.scene, self.recordings = scene, list(recordings)
-        self.name, self._body = free_body_of(scene)
+        self._numbers = FreeBodyScene(scene)
+        self.name, self._body = self._numbers.name, self._numbers.body()
         self.bodies, self.joints = [self.name], list[str]()
         self.dynamics = SceneDynamics(scene)
         if not all(f"{self.name}.{a}" in r for a in _PLACE for r in recordings):
@@ -229,7 +230,7 @@ class FreeBodyModel:
 
     def simulate(self, effects: Sequence[Effect] = ()) -> list[np.ndarray]:
         """(n, n_channels) of each window, in the scene with these effects added."""
-        body = free_body_of(self.scene, effects)[1] if effects else self._body
+        body = self._numbers.body(effects) if effects else self._body
         length = 1.0
         for e in (*self.scene.effects, *effects):
             if e.kind == "length_scale" and {

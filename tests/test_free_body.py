@@ -1,0 +1,83 @@
+"""The fast steps of a free body against Drake's, and effects on its numbers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gap_benchmark.cases import cases, make, write
+
+from makebreak.diagrams.free_body import FreeBodyScene
+from makebreak.diagrams.scene_simulation import SceneSimulation, SimulationConfig
+from makebreak.models.effects.kind import Effect
+from makebreak.models.scene import InitialSection, read_scene
+from makebreak.systems.numerics.free_body import simulate
+
+PAIR = "cube.cube~ground.ground"
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A cube of eight spheres above a box."""
+    folder = tmp_path_factory.mktemp("cube")
+    (case,) = [c for c in cases("development") if c.name == "07_cube_none"]
+    write(case, folder, make(case))
+    scene = read_scene(folder / "scene.yaml")
+    return replace(scene, plant=replace(scene.plant, time_step=0.0))
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        Effect("contact_friction", [PAIR], {"friction": 0.15}),
+        Effect("contact_friction", [PAIR], {"friction": 1.2}),
+        Effect("contact_stiffness", [PAIR], {"stiffness": 3e3}),
+        Effect("contact_stiffness", [PAIR], {"stiffness": 2e5}),
+        Effect("contact_dissipation", [PAIR], {"dissipation": 0.1}),
+        Effect("contact_dissipation", [PAIR], {"dissipation": 4.0}),
+        Effect("object_mass", ["cube.cube"], {"mass": 0.5}),
+        Effect("object_com", ["cube"], {"x": 0.003, "z": -0.002}),
+        Effect("object_inertia", ["cube.cube"], {"ixx": 9e-4, "iyy": 8e-4, "izz": 7e-4}),
+        Effect("object_size", ["cube.cube"], {"scale": 1.05}),
+        Effect("corner_radius", ["cube.cube"], {"radius": 0.006}),
+        Effect("plane_height", ["ground.ground"], {"height": 0.004}),
+        Effect("plane_tilt", ["ground"], {"roll": 0.02, "pitch": -0.03}),
+        Effect("body_drag", ["cube.cube"], {"linear": 0.4, "angular": 1e-4}),
+        Effect("constant_force", ["cube.cube"], {"fx": 0.1, "fy": -0.2, "fz": 0.3}),
+    ],
+    ids=lambda e: e.kind,
+)  # fmt: skip
+def test_an_effect_changes_the_numbers_as_it_changes_the_plant(scene, effect):
+    fast = FreeBodyScene(scene).body([effect])
+    built = FreeBodyScene(replace(scene, effects=[effect])).body()
+    for name, value in vars(built).items():
+        a, b = getattr(fast, name), value
+        if name == "spheres":  # In whatever order.
+            a, b = (x[np.lexsort(np.round(x, 9).T)] for x in (a, b))
+        # Sums of a few terms, in other orders; SDF is written with 17 digits.
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12, err_msg=name)
+
+
+def test_the_steps_follow_drakes_continuous_plant_through_an_impact(scene):
+    numbers = FreeBodyScene(scene)
+    start = np.array([*scene.initial.poses[numbers.name], 1, 2, -3, 0.3, -0.2, -0.5])
+    times = np.linspace(0.0, 0.25, 26)  # It touches at 0.17 s.
+    names = "qw qx qy qz x y z wx wy wz vx vy vz".split()
+    initial = InitialSection(
+        poses={numbers.name: list(start[:7])},
+        body_velocities={numbers.name: list(start[7:])},
+    )
+    # Drake's own error at its default accuracy is 1e-4 m after an impact.
+    drake = SceneSimulation(scene, SimulationConfig(accuracy=1e-8))
+    want = drake.run(initial, times, [f"{numbers.name}.{n}" for n in names])
+    got = simulate(numbers.body(), start, times, tol=1e-8)
+    assert np.abs(np.diff(want[:, 12])).max() > 0.2  # It has hit [m/s].
+    np.testing.assert_allclose(got[:, 4:7], want[:, 4:7], atol=3e-5)
+    np.testing.assert_allclose(got[:, :4], want[:, :4], atol=3e-4)
+
+
+def test_a_scene_with_more_than_one_free_body_is_refused(scene):
+    two = replace(scene, directives=[*scene.directives])
+    added = replace(scene.directives[-1].add_model, name="second")
+    two.directives.append(type(scene.directives[-1])(add_model=added))
+    with pytest.raises(ValueError, match="one free body"):
+        FreeBodyScene(two)
