@@ -11,6 +11,8 @@ from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, check_parameters
 from makebreak.systems.numerics.selection import LinearFit, Screen
 
+EVALUATIONS = 8
+
 
 class Model(Protocol):
     """What gives residuals over their noise: InverseModel or WindowModel."""
@@ -42,14 +44,16 @@ def fit_effects(
     screen: Screen,
     start: Sequence[Effect],
     fixed: Sequence[Sequence[str]] | None = None,
-    evaluations: int = 8,
+    evaluations: int | None = None,
 ) -> Fitted:
     """Least squares over the training rows, the nuisances fitted along.
 
     Args: start: effects with parameters to start from; fixed: of each the parameters
-        that stay as they are. evaluations: Gauss-Newton steps at most.
+        that stay as they are. evaluations: Gauss-Newton steps at most; else the
+        model's own number, which goes with how long its residual takes.
     """
     fixed = fixed or [()] * len(start)
+    steps = evaluations or int(getattr(model, "evaluations", EVALUATIONS))
     free = [
         (i, name)
         for i, effect in enumerate(start)
@@ -86,8 +90,8 @@ def fit_effects(
 
     solved = least_squares(
         cost, x0 / scale, bounds=(low / scale, np.full(len(low), np.inf)),
-        diff_step=getattr(model, "diff_step", 1e-4), x_scale=1.0, ftol=1e-4, xtol=1e-6,
-        max_nfev=evaluations,
+        diff_step=getattr(model, "diff_step", 1e-4), x_scale=1.0, xtol=1e-6,
+        ftol=1e-6 if steps > EVALUATIONS else 1e-4, max_nfev=steps,
     ) if len(x0) else None  # fmt: skip
     z = x0 / scale if solved is None else solved.x
     if solved is not None:  # What does not show is not told: it stays neutral.

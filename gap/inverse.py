@@ -104,6 +104,8 @@ class InverseModel:
         of this length is held out.
     """
 
+    evaluations = 25  # Of a fit.
+
     def __init__(
         self,
         scene: Scene,
@@ -307,7 +309,7 @@ class InverseModel:
         """For each track: inverse square roots of the covariance of each bump's
         residual efforts, and standard deviations of the other channels'."""
         size = np.concatenate([self._effort(t, (), *self._qv(t)) for t in self.tracks])
-        rms = np.sqrt(np.mean(size**2, axis=0))
+        rms = _rms(size)
         rms = np.maximum(rms, 0.1 * rms.max())
         kp, kd = np.zeros(len(self.joints)), np.zeros(len(self.joints))
         if self.scene.actuation.type == "pd":
@@ -327,6 +329,11 @@ class InverseModel:
             g0 = track.bumps.noise_gain(period)
             eye = np.eye(len(self.joints))
             L = np.empty((len(centre), *eye.shape))
+            # When within a period an effort was sampled is not known.
+            effort = self._effort(track, (), q, v)
+            mean = track.bumps.mean(effort)
+            rate = np.gradient(mean, track.bumps.centre, axis=0)
+            e_std = np.hypot(MODEL_ERROR * rms, 0.5 * period * _rms(rate))
             direct = (kp * self.noise * g0) ** 2 + (MODEL_ERROR * rms) ** 2
             direct += np.array(self.by_measured) * (self.effort_noise * g0) ** 2
             for b, k in enumerate(centre):
@@ -336,14 +343,13 @@ class InverseModel:
             # The smoothed velocity's own error, as over one bump.
             own = self.noise * np.sqrt(period * 12.0 / track.bumps.width**3)
             v_std = np.hypot(self.velocity_noise * g0, own)
-            v_rms = np.sqrt(np.mean(v**2, axis=0))
-            v_std = np.hypot(v_std, np.where(kd > 0.0, DRIVE_VELOCITY * v_rms, 0.0))
+            v_std = np.hypot(v_std, np.where(kd > 0.0, DRIVE_VELOCITY * _rms(v), 0.0))
             out.append(
                 {
                     "effort": L,
                     "velocity": np.maximum(v_std, 1e-12),
                     "effort_measured": np.maximum(
-                        np.hypot(self.effort_noise * g0, MODEL_ERROR * rms), 1e-12
+                        np.hypot(self.effort_noise * g0, e_std), 1e-12
                     ),
                 }
             )
@@ -368,25 +374,25 @@ class InverseModel:
                     for j in self.joints)
         ]  # fmt: skip
         # Weights and gravity change each other; else effects add up.
-        together = sum(e.kind in HEAVY for e in ours) < 2
-        dynamics: SceneDynamics | None = None
+        dynamics: SceneDynamics = self.dynamics
+        heavy = [e for e in ours if e.kind in HEAVY]
+        if len(heavy) > 1 or any(e.kind.startswith("object_") for e in heavy):
+            dynamics = SceneDynamics(
+                replace(self.scene, effects=[*self.scene.effects, *heavy])
+            )
+            ours = [e for e in ours if e not in heavy]
         parts = []
         for k, (track, white) in enumerate(
             zip(self.tracks, self._whiteners, strict=True)
         ):
             motion, needed = self._moved_by(k, moving)
-            for effect in ours if together else ():
-                add = added_effort(effect, KINDS[effect.kind], self.dynamics, motion)
-                if add is None:
-                    together = False
-                    break
-                needed = needed + add
-            if ours and not together:
-                if dynamics is None:
-                    dynamics = SceneDynamics(
-                        replace(self.scene, effects=[*self.scene.effects, *ours])
-                    )
+            if dynamics is not self.dynamics:
                 needed = motion.effort - dynamics.residual(motion)
+            for effect in ours:
+                add = added_effort(effect, KINDS[effect.kind], dynamics, motion)
+                if add is None:
+                    raise ValueError(f"{effect.kind} is seen in simulation alone")
+                needed = needed + add
             motion = replace(
                 motion, effort=self._effort(track, effects, motion.q, motion.v)
             )
@@ -474,6 +480,10 @@ class InverseModel:
         """(m,) booleans."""
         k = len(self.names())
         return np.concatenate([np.repeat(t.train, k) for t in self.tracks])
+
+
+def _rms(x: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.mean(x**2, axis=0))
 
 
 def _first(bumps: Bumps, m: int) -> Bumps:

@@ -19,6 +19,7 @@ NESTED = {
     "sinusoidal_force": ("constant_force",),
 }
 _DELAYS = (0.004, 0.01, 0.02, 0.04)
+_DRIVEN = ("actuator_saturation", "joint_elasticity", "joint_backlash")
 _HIDDEN = ("object_mass", "object_com", "object_inertia")  # Links': background.
 _SPEEDS = (0.03, 0.06, 0.1, 0.2)
 _RIPPLES = tuple(float(n) for n in range(2, 25)) + (30.0, 36.0, 48.0, 60.0)
@@ -76,7 +77,7 @@ def candidates(model: InverseModel, nuisance: np.ndarray) -> list[Candidate]:
         for at in dynamics.places(kind):
             if entry.at == "base" and at == "world":
                 continue
-            if kind == "actuator_saturation" and not _driven(model, at):
+            if kind in _DRIVEN and not _driven(model, at):
                 continue
             if kind == "sinusoidal_force" and at not in _links(model)[-1:]:
                 continue  # Of the last link alone: each frequency is a fit of its own.
@@ -92,14 +93,13 @@ def candidates(model: InverseModel, nuisance: np.ndarray) -> list[Candidate]:
             if not any(np.abs(x).max(initial=0.0) > 0.0 for x in columns):
                 continue
             size = len(entry.parameters)
-            if kind == "body_drag":  # Of its two, most bodies show one.
-                for k, other in ((0, "angular"), (1, "linear")):
-                    found.append(
-                        Candidate(
-                            kind, (at,), 1, (of(columns[0][:, [k]]),),
-                            (_one_of(readers[0], k),), (other,),
-                        )
-                    )  # fmt: skip
+            if kind == "body_drag":  # Few bodies show that they are slowed in turning.
+                found.append(
+                    Candidate(
+                        kind, (at,), 1, (of(columns[0][:, [0]]),),
+                        (_one_of(readers[0], 0),), ("angular",),
+                    )
+                )  # fmt: skip
             found.append(
                 Candidate(kind, (at,), size, tuple(map(of, columns)), tuple(readers))
             )

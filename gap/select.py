@@ -7,11 +7,14 @@ import numpy as np
 
 from makebreak.gap.fit import Fitted, Model, fit_effects
 from makebreak.gap.screen import NESTED, Candidate, Ranked, is_sane, rank
+from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.systems.numerics.selection import (
     NESTED_GAIN,
     SAME,
     Screen,
+    is_plausible,
+    paired,
     simplest,
 )
 
@@ -20,6 +23,11 @@ FLOOR = 1.15  # Rms over noise that noise alone may leave (its estimate is that 
 # Laws are approximations (how dry friction turns round, how commands are held): errors
 # that differ by less than this share of the whole gap do not tell two models apart.
 PRECISION = 0.015
+# A rival that needs more parameters than these beyond the chosen effect's, to say the
+# same, is a coincidence: it contains the effect as a special case.
+MORE = 1
+# Two models that differ block by block by more than chance: less than this p-value.
+CHANCE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +74,7 @@ def select(
     start = current = fit_effects(model, plain, ())
     chosen: list[dict] = []
     table: list[dict] = []
-    while found and len(chosen) < most and current.fit.held_out > FLOOR:
+    while found and len(chosen) < most and needs_more(current, prior):
         step = _forward(model, nuisance, prior, found, chosen, current, start, say)
         if not chosen:
             table = step["table"]
@@ -83,6 +91,12 @@ def select(
         for c, effect, std in zip(chosen, current.effects, current.std, strict=True)
     )  # fmt: skip
     return Selection(choices, start, current, tuple(table))
+
+
+def needs_more(fit: Fitted, prior: np.ndarray) -> bool:
+    """Whether held-out rows are worse than noise, or the background is beyond what its
+    tolerance allows."""
+    return fit.fit.held_out > FLOOR or not is_plausible(fit.b, prior)
 
 
 def _forward(model, nuisance, prior, found, chosen, current, start, say) -> dict:
@@ -159,6 +173,9 @@ def _forward(model, nuisance, prior, found, chosen, current, start, say) -> dict
         if error(f.score) <= (1.0 + SAME) * error(fit.score)
         and best.candidate.kind not in NESTED.get(r.candidate.kind, ())
         and not (r.candidate.kind == best.candidate.kind)
+        and r.candidate.size <= best.candidate.size + MORE
+        and paired(f.left, fit.left, train) > CHANCE
+        and _is_used(f)
     )
     runner = min(others, key=lambda o: o[0].score, default=None)
     return {
@@ -173,6 +190,18 @@ def _forward(model, nuisance, prior, found, chosen, current, start, say) -> dict
         "runner_up": runner[1].candidate.name if runner else "",
         "margin": runner[0].score / fit.score - 1.0 if runner else np.inf,
     }
+
+
+def _is_used(fit: Fitted) -> bool:
+    """Whether each parameter of the last effect tells: else it is another, smaller
+    effect under its name."""
+    last, std = fit.effects[-1], fit.std[-1]
+    for each in KINDS[last.kind].parameters:
+        if each.neutral is not None and each.name in std:
+            off = abs(last.parameters[each.name] - each.neutral)
+            if not off > 2.0 * std[each.name]:
+                return False
+    return True
 
 
 def _sane(ranked: list[Ranked]) -> list[Ranked]:

@@ -13,11 +13,14 @@ UNNAMED, UNNAMED_SHARE = 2.0, 0.2
 NO_GAP = 1.5  # Times the noise, after the background within its tolerance.
 
 
-def verdict_of(choices: Sequence[Choice], start: float, end: float) -> str:
+def verdict_of(
+    choices: Sequence[Choice], start: float, end: float, far: bool = False
+) -> str:
     """Args: start, end: held-out error without and with all effects, the background
-    within its tolerance."""
+    within its tolerance; far: it had to be moved far beyond."""
     if not choices:
-        return "no_gap" if start <= max(NO_GAP, FLOOR) else "gap_unnamed"
+        calm = start <= max(NO_GAP, FLOOR) and not far
+        return "no_gap" if calm else "gap_unnamed"
     if end > max(UNNAMED, UNNAMED_SHARE * start):
         return "gap_unnamed"
     return "ambiguous" if any(c.ties for c in choices) else "gap_named"

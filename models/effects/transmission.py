@@ -8,6 +8,10 @@ mechanism's share of the state stays what it is. The motor's torque goes to it
 channels say `link`.
 """
 
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
+
+import numba
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
@@ -31,6 +35,8 @@ from makebreak.models.effects.kind import (
     find_joints,
     full_name,
 )
+from makebreak.models.effects.signature import Signature, without_momentum
+from makebreak.systems.numerics.smoother import smooth
 
 # A rotor where the model has none, as a share of the joint's inertia [-].
 ROTOR_SHARE = 0.01
@@ -207,6 +213,154 @@ def _add_coupling(
     return system.GetOutputPort("generalized_force")
 
 
+# ----- How they show
+#
+# The motor moves as measured, theta; the joint is behind it by the twist z. With J the
+# rotor's inertia, and ID of the model, which has the rotor on the joint,
+#
+#     u = ID(theta - z) + J z'',
+#
+# to first order in z. Torque through the element: tau = u - J theta''. A spring twists
+# by z = tau/k - d tau'/k^2. In a gap, with the side that touches given by the sign of
+# the torque that the joint needs at theta, T = ID(theta) - J theta'': while it touches
+# z = +- gap/2, and once T turns round the joint is on its own, M z'' = T, until it
+# touches again.
+
+GAPS = tuple(0.002 * 1.15**k for k in range(29))  # [rad] or [m]
+_linearised: WeakKeyDictionary = WeakKeyDictionary()  # Of motions.
+
+
+@dataclass(frozen=True, eq=False)
+class _Linear:
+    """What a twist of a joint, its rate and its acceleration add to the effort,
+    (n, n_v, 3); needs (n,): torque T; M (n,): the joint's own inertia, others held."""
+
+    adds: np.ndarray
+    needs: np.ndarray
+    M: np.ndarray
+
+    def effort(self, twist) -> np.ndarray:
+        return np.einsum("nik,kn->ni", self.adds, twist)
+
+
+def _elasticity_signature(effect, model, motion, grid=None) -> list[Signature]:
+    columns = np.zeros((*motion.v.shape, 2))
+    for joint in find_joints(effect, model.plant):
+        linear = _linear(model, motion, joint)
+        i = joint.velocity_start()
+        tau = motion.effort[:, i] - _rotor(model, joint) * motion.vd[:, i]
+        twist = _smooth(motion.time, tau)
+        late = np.stack([twist[1], twist[2], np.gradient(twist[2], motion.time)])
+        columns[:, :, 0] += linear.effort(twist)
+        columns[:, :, 1] -= linear.effort(late)
+
+    def to_parameters(c):
+        k = 1.0 / max(c[0], 1e-9)  # None, or the wrong way round: rigid.
+        return {"stiffness": float(k), "damping": float(max(c[1], 0.0) * k**2)}
+
+    unknowns = ("compliance", "damping_times_compliance2")
+    return [
+        without_momentum(
+            effect, unknowns, columns, to_parameters=to_parameters, exact=False
+        )
+    ]
+
+
+def _elasticity_added(effect, model, motion) -> np.ndarray:
+    k, d = effect.parameters["stiffness"], effect.parameters["damping"]
+    (one,) = _elasticity_signature(effect, model, motion)
+    return one.columns @ np.array([1.0 / k, d / k**2])
+
+
+def _backlash_signature(effect, model, motion, grid=None) -> list[Signature]:
+    """For each gap what it adds, over the gap: the coefficient is the gap."""
+    found = []
+    for gap in (grid or {}).get("gap", GAPS):
+        parameters = {"gap": float(gap)}
+        added = _backlash_added(
+            Effect(effect.kind, effect.at, parameters), model, motion
+        )
+        columns = added[:, :, None] / gap
+        found.append(without_momentum(effect, ["gap"], columns, exact=False))
+    return found
+
+
+def _backlash_added(effect, model, motion) -> np.ndarray:
+    out = np.zeros_like(motion.v)
+    for joint in find_joints(effect, model.plant):
+        linear = _linear(model, motion, joint)
+        twist = through_gap(
+            motion.time, linear.needs, linear.M, effect.parameters["gap"]
+        )
+        out += linear.effort(twist)
+    return out
+
+
+@numba.njit(cache=True)
+def through_gap(time, needs, M, gap):
+    """(3, n) twist, its rate and its acceleration (mean until the next sample).
+
+    Args: needs (n,) torque that holds the joint on its motor's path; M (n,) its
+        inertia. No bounce.
+    """
+    n = len(time)
+    out = np.zeros((3, n))
+    z = 0.5 * gap * np.sign(needs[0])
+    w = 0.0
+    for k in range(n):
+        out[0, k], out[1, k] = z, w
+        h = time[k + 1] - time[k] if k + 1 < n else 0.0
+        if h <= 0.0:
+            continue
+        before = w
+        w += h * needs[k] / M[k]
+        z += h * w
+        if abs(z) >= 0.5 * gap:
+            z, w = 0.5 * gap * np.sign(z), 0.0
+        out[2, k] = (w - before) / h
+    return out
+
+
+def _rotor(model, joint: Joint) -> float:
+    old = actuator_of(model.plant, joint)
+    return 0.0 if old is None else old.default_reflected_inertia()
+
+
+def _smooth(time, y) -> np.ndarray:
+    """(3, n) of a signal with noise of its own: value, first and second derivative."""
+    period = float(np.quantile(np.diff(time), 0.9))
+    grid = np.arange(time[0], time[-1] + 0.5 * period, period)
+    even = np.interp(grid, time, y)
+    noise = float(np.sqrt(np.mean(np.diff(even, 3) ** 2) / 20.0))
+    x = smooth(grid, even, max(noise, 1e-9 * (np.std(y) + 1e-12))).x
+    return np.stack([np.interp(time, grid, column) for column in x.T])
+
+
+def _linear(model, motion, joint: Joint) -> _Linear:
+    """Kept as long as the motion is."""
+    known = _linearised.setdefault(motion, {})
+    i_q, i_v = joint.position_start(), joint.velocity_start()
+    key = (id(model), i_v)
+    if key in known:
+        return known[key]
+    rotor, h = _rotor(model, joint), 1e-4
+
+    def needed(dq=0.0, dv=0.0, dvd=0.0):
+        q, v, vd = (np.array(x) for x in (motion.q, motion.v, motion.vd))
+        q[:, i_q] += dq
+        v[:, i_v] += dv
+        vd[:, i_v] += dvd
+        return model.inverse_dynamics(q, v, vd, motion.time)
+
+    now = needed()
+    M = needed(dvd=1.0) - now  # Linear in the acceleration.
+    M[:, i_v] -= rotor
+    adds = np.stack([-(needed(dq=h) - now) / h, -(needed(dv=h) - now) / h, -M], axis=2)
+    needs = now[:, i_v] - rotor * motion.vd[:, i_v]
+    known[key] = _Linear(adds, needs, np.maximum(M[:, i_v], 1e-9))
+    return known[key]
+
+
 KINDS = {
     "joint_elasticity": EffectKind(
         at="joint",
@@ -222,6 +376,8 @@ KINDS = {
         hidden_state=True,
         before_finalize=_add_motor,
         after_finalize=_add_coupling,
+        signature=_elasticity_signature,
+        added=_elasticity_added,
         now=lambda effect, plant, scene_graph: {"stiffness": 1e6, "damping": 0.0},
     ),
     "joint_backlash": EffectKind(
@@ -235,5 +391,7 @@ KINDS = {
         hidden_state=True,
         before_finalize=_add_motor,
         after_finalize=_add_coupling,
+        signature=_backlash_signature,
+        added=_backlash_added,
     ),
 }

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
+from scipy.stats import chi2, wilcoxon
 
 SAME = 0.05  # Within this share of the best error, data cannot tell two models apart.
 NESTED_GAIN = 0.10  # What a bigger model must take off the error of one inside it.
@@ -133,6 +134,13 @@ class Screen:
         )  # fmt: skip
 
 
+def is_plausible(b, prior, rate: float = 1e-4) -> bool:
+    """Whether nuisances b (n_b,), normal with standard deviations prior (n_b,), are
+    not farther from zero than all but `rate` of all draws."""
+    squares = float(np.sum((np.asarray(b) / np.asarray(prior)) ** 2))
+    return not len(b) or bool(chi2.sf(squares, len(b)) >= rate)
+
+
 def benjamini_hochberg(p, rate: float = 0.05) -> np.ndarray:
     """Which of the hypotheses with p-values (n,) are rejected, so that of those
     rejected wrongly the expected share is at most `rate`.
@@ -146,6 +154,22 @@ def benjamini_hochberg(p, rate: float = 0.05) -> np.ndarray:
     if below.any():
         rejected[order[: np.flatnonzero(below)[-1] + 1]] = True
     return rejected
+
+
+def paired(one, two, train) -> float:
+    """p-value of two models being equally good: Wilcoxon's signed ranks of how their
+    squared residuals (m,) differ over blocks of time, which are the stretches of rows
+    that `train` (m,) has in one piece. 1 if there are fewer than 6.
+
+    Source: Wilcoxon, Biometrics 1(6), 1945; the pairing as in Vuong, Econometrica
+    57(2), 1989.
+    """
+    train = np.asarray(train, bool)
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(train.astype(int))) + 1])
+    difference = np.add.reduceat(np.asarray(one) ** 2 - np.asarray(two) ** 2, starts)
+    if len(starts) < 6 or not np.abs(difference).max() > 0.0:
+        return 1.0
+    return float(wilcoxon(difference).pvalue)
 
 
 def simplest(errors: Sequence[float], sizes: Sequence[int], same: float = SAME) -> int:
