@@ -2,36 +2,38 @@
 
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from makebreak.gap.checks import check_recordings
-from makebreak.gap.contact import (
-    contact_candidates,
-    contact_model,
-)
 from makebreak.gap.findings import Finding
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.inverse import InverseModel
+from makebreak.gap.measure import WINDOW_SEC, measure
+from makebreak.gap.objects import of_objects
+from makebreak.gap.parallel import side_by_side
 from makebreak.gap.recording import (
     Recording,
     check_against_scene,
+    excerpt,
     read_recordings,
 )
-from makebreak.gap.result import GapMeasure, GapResult, Series
+from makebreak.gap.result import GapResult
 from makebreak.gap.scene_facts import scene_facts, scene_names
 from makebreak.gap.screen import candidates, nuisances
-from makebreak.gap.select import FLOOR, Selection, select
-from makebreak.gap.touch import TouchModel, touch_candidates
+from makebreak.gap.select import Selection, needs_more, select
 from makebreak.gap.verdict import named, says, verdict_of
-from makebreak.gap.where import unexplained, where_in_motion, where_in_windows
+from makebreak.gap.where import unexplained, where_in_motion
 from makebreak.gap.windows import WindowModel, with_step
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import Scene, read_scene
-from makebreak.systems.numerics.selection import Screen
+from makebreak.systems.numerics.selection import Screen, is_plausible
 
-WINDOW_SEC = 0.3
+# Of longer recordings of a mechanism, and of more rows of anything, pieces are used.
+MOST_SEC, MOST_ROWS = 60.0, 120_000
 
 
 def run_gap(
@@ -43,9 +45,8 @@ def run_gap(
 ) -> GapResult:
     """Finds where a scene and recordings disagree, and names what the scene lacks.
 
-    Args: out_dir: made if missing; who writes reports fills it. jobs: kept for
-        simulations side by side; one process so far. progress: called with a line of
-        text now and then.
+    Args: out_dir: made if missing; who writes reports fills it. jobs: processes at
+        once. progress: called with a line of text now and then.
     Raises: ValueError, one line, for a scene or recording that cannot be read or do
         not fit together.
     """
@@ -62,17 +63,18 @@ def run_gap(
         Path(out_dir).mkdir(parents=True, exist_ok=True)
     say("checking the recordings")
     checks = check_recordings(recordings, scene_facts(dynamics.plant))
+    recordings, cut = _shortened(recordings, dynamics)
+    checks += cut
     seconds["checks"] = clock.lap()
-    touch = _touch_model(scene, recordings, dynamics)
-    if touch is not None:
-        result = _of_touch(touch, checks, seconds, clock, say)
+    if not _is_mechanism(dynamics, recordings):
+        result = of_objects(
+            scene, recordings, checks, seconds, clock.lap, say,
+            lambda s: _settle_step(s, recordings, dynamics, jobs),
+        )  # fmt: skip
         return result.with_seconds(seconds)
-    scene, finding = _settle_step(scene, recordings, dynamics)
+    scene, finding = _settle_step(scene, recordings, dynamics, jobs)
     checks += finding
-    if _is_mechanism(dynamics, recordings):
-        result = _of_mechanism(scene, recordings, checks, seconds, clock, say)
-    else:
-        result = _of_objects(scene, recordings, checks, seconds, clock, say)
+    result = _of_mechanism(scene, recordings, checks, seconds, clock, say, jobs)
     return result.with_seconds(seconds)
 
 
@@ -95,17 +97,27 @@ def _is_mechanism(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> b
     )
 
 
-def _touch_model(scene, recordings, dynamics) -> TouchModel | None:
-    """Where a measured mechanism touches measured objects, and a wrench tells when."""
-    if _is_mechanism(dynamics, recordings) or not one_dof_joints(dynamics.plant):
-        return None
-    try:
-        return TouchModel(scene, recordings)
-    except ValueError:
-        return None
+def _shortened(recordings: Sequence[Recording], dynamics: SceneDynamics):
+    """What of the recordings is used, and what is to be said of it."""
+    seconds = MOST_SEC if _is_mechanism(dynamics, recordings) else np.inf
+    used = excerpt(recordings, seconds, MOST_ROWS)
+    if len(used) == len(recordings) and all(
+        len(a.time) == len(b.time) for a, b in zip(used, recordings, strict=True)
+    ):
+        return used, []
+    whole = sum(r.duration_sec() for r in recordings)
+    some = sum(r.duration_sec() for r in used)
+    says = (
+        f"The recordings hold {whole:.4g} s; fits and simulations use {some:.4g} s of "
+        f"them, in evenly spread pieces."
+    )
+    name = recordings[0].name
+    return used, [Finding("excerpt", name, "time", some, "s", "info", says)]
 
 
-def _settle_step(scene: Scene, recordings, dynamics) -> tuple[Scene, list[Finding]]:
+def _settle_step(
+    scene: Scene, recordings, dynamics, jobs
+) -> tuple[Scene, list[Finding]]:
     """The scene with a step so small that its error is below the noise, and what was
     found. Without contact a continuous plant is as fast, and exact."""
     step = scene.plant.time_step
@@ -117,7 +129,8 @@ def _settle_step(scene: Scene, recordings, dynamics) -> tuple[Scene, list[Findin
         fine_model = WindowModel(fine, recordings, WINDOW_SEC, most=24)
     except ValueError:
         return scene, []
-    a, b = coarse_model.simulate(()), fine_model.simulate(())
+    both = [partial(m.simulate, ()) for m in (coarse_model, fine_model)]
+    a, b = side_by_side(both, jobs)
     off = [
         (x - y) / w.std
         for x, y, w in zip(a, b, coarse_model.windows, strict=True)
@@ -142,24 +155,26 @@ def _settle_step(scene: Scene, recordings, dynamics) -> tuple[Scene, list[Findin
     ]
 
 
-def _of_mechanism(scene, recordings, checks, seconds, clock, say) -> GapResult:
+def _of_mechanism(scene, recordings, checks, seconds, clock, say, jobs) -> GapResult:
     say("smoothing the motion")
     model = InverseModel(scene, recordings)
     nuisance, prior, names = nuisances(model)
     say("screening the catalogue")
-    clear = Screen(model.base(), nuisance, prior, model.train()).fit()
-    found = candidates(model, nuisance) if clear.score > FLOOR else []
+    plain = Screen(model.base(), nuisance, prior, model.train())
+    needed = needs_more(fit_effects(model, plain, ()), prior)
+    found = candidates(model, nuisance) if needed else []
     seconds["screen"] = clock.lap()
     selection = select(model, nuisance, prior, found, say)
     seconds["select"] = clock.lap()
     choices = selection.choices
     start, end = selection.start.score, selection.end.score
-    verdict = verdict_of(choices, start, end)
+    far = not is_plausible(selection.end.b, prior)
+    verdict = verdict_of(choices, start, end, far)
     say("simulating held-out windows")
     effects = [c.effect for c in choices]
     background = _background(names, prior, selection)
     moved = _background_effects(model, names, selection.end.b)
-    measure, series = _measure(scene, recordings, effects, moved)
+    gap, series = measure(scene, recordings, effects, moved, jobs)
     seconds["simulate"] = clock.lap()
     where = where_in_motion(model, selection.start.left)
     if verdict == "no_gap":
@@ -168,53 +183,7 @@ def _of_mechanism(scene, recordings, checks, seconds, clock, say) -> GapResult:
     rest = unexplained(model, selection.end.left) if verdict == "gap_unnamed" else []
     return GapResult(
         verdict, says(verdict, effects_named, start, end), where, effects_named,
-        measure, rest, background, checks, series, selection.table,
-    )  # fmt: skip
-
-
-def _of_touch(model: TouchModel, checks, seconds, clock, say) -> GapResult:
-    say("measuring how tool and object touch")
-    nuisance, prior, names = model.nuisances()
-    clear = Screen(model.base(), nuisance, prior, model.train()).fit()
-    found = touch_candidates(model, nuisance) if clear.score > FLOOR else []
-    seconds["screen"] = clock.lap()
-    selection = select(model, nuisance, prior, found, say)
-    seconds["select"] = clock.lap()
-    start, end = selection.start.score, selection.end.score
-    verdict = verdict_of(selection.choices, start, end)
-    before, after = selection.start.left, selection.end.left
-    effects_named = [named(c) for c in selection.choices]
-    return GapResult(
-        verdict, says(verdict, effects_named, start, end),
-        model.where(before) if verdict != "no_gap" else [], effects_named,
-        model.measure(before, after), [], _background(names, prior, selection), checks,
-        model.series(before, after), selection.table,
-    )  # fmt: skip
-
-
-def _of_objects(scene, recordings, checks, seconds, clock, say) -> GapResult:
-    say("cutting windows")
-    model = contact_model(scene, recordings)
-    model.base()
-    empty = np.zeros((len(model.train()), 0))
-    say("screening the catalogue by simulation")
-    train = model.train()
-    clear = Screen(model.base(), empty, np.zeros(0), train).fit()
-    found = contact_candidates(model, empty, say) if clear.score > FLOOR else []
-    seconds["screen"] = clock.lap()
-    selection = select(model, empty, np.zeros(0), found, say)
-    seconds["select"] = clock.lap()
-    effects = [c.effect for c in selection.choices]
-    before, after = model.simulate(()), model.simulate(effects)
-    measure = _gap_measure(model, before, after)
-    start, end = selection.start.score, selection.end.score
-    verdict = verdict_of(selection.choices, start, end)
-    where = where_in_windows(model, model.errors(before)) if verdict != "no_gap" else []
-    effects_named = [named(c) for c in selection.choices]
-    seconds["simulate"] = clock.lap()
-    return GapResult(
-        verdict, says(verdict, effects_named, start, end), where, effects_named,
-        measure, [], {}, checks, _series(model, before, after), selection.table,
+        gap, rest, background, checks, series, selection.table,
     )  # fmt: skip
 
 
@@ -242,66 +211,4 @@ def _background_effects(model: InverseModel, names, values) -> list[Effect]:
         com = model.dynamics.now("object_com", [at])
         moved = {k: com[k] + float(d) for k, d in zip("xyz", shift, strict=True)}
         out.append(Effect("object_com", [at], moved))
-    return out
-
-
-def _measure(scene, recordings, effects, moved):
-    """Before and after over held-out windows, the background moved within tolerance in
-    both, as neither the gap nor its cure."""
-    model = WindowModel(scene, recordings, WINDOW_SEC, most=240)
-    taken = {(e.kind, tuple(e.at)) for e in effects}
-    moved = [e for e in moved if (e.kind, tuple(e.at)) not in taken]
-    try:
-        before = model.simulate(moved)
-        after = model.simulate([*moved, *effects]) if effects else before
-    except ValueError:  # A link that its background would make impossible.
-        before, after = model.simulate(()), model.simulate(effects)
-    return _gap_measure(model, before, after), _series(model, before, after)
-
-
-def _gap_measure(model: WindowModel, before, after) -> GapMeasure:
-    held = [not w.train for w in model.windows]
-    if not any(held):
-        held = [True] * len(held)
-    a = np.concatenate([e for e, h in zip(model.errors(before), held) if h])  # noqa: B905
-    b = np.concatenate([e for e, h in zip(model.errors(after), held) if h])  # noqa: B905
-    per_channel = {
-        name: {
-            "before": float(np.sqrt(np.mean(a[:, c] ** 2))),
-            "after": float(np.sqrt(np.mean(b[:, c] ** 2))),
-        }
-        for c, name in enumerate(model.channels)
-    }
-    return GapMeasure(
-        float(np.sqrt(np.mean(a**2))), float(np.sqrt(np.mean(b**2))), 1.0,
-        model.window_sec, per_channel,
-    )  # fmt: skip
-
-
-def _series(model: WindowModel, before, after, most: int = 12) -> list[Series]:
-    """The channels over the first block of held-out windows."""
-    rows = [k for k, w in enumerate(model.windows) if not w.train]
-    if not rows:
-        return []
-    first = model.windows[rows[0]]
-    same = [
-        k for k in rows
-        if (model.windows[k].recording, model.windows[k].episode)
-        == (first.recording, first.episode)
-    ][:most]  # fmt: skip
-    recording = model.recordings[first.recording]
-    time = np.concatenate([recording.time[model.windows[k].rows] for k in same])
-    lengths = [len(before[k]) for k in same]
-    starts = np.cumsum([0, *lengths[:-1]])
-    out = []
-    for c, channel in enumerate(model.channels):
-        seen = [recording[channel][model.windows[k].rows] for k in same]
-        out.append(
-            Series(
-                channel, recording.name, first.episode, time, np.concatenate(seen),
-                np.concatenate([before[k][:, c] for k in same]),
-                np.concatenate([after[k][:, c] for k in same]),
-                starts, float(model.noise[c]),
-            )
-        )  # fmt: skip
     return out
