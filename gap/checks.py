@@ -10,8 +10,9 @@ import numpy as np
 
 from makebreak.gap.check_motion import check_excitation, check_gravity
 from makebreak.gap.check_relations import check_relations
-from makebreak.gap.findings import Finding, JointFacts, SceneFacts
+from makebreak.gap.findings import Finding, JointFacts, SceneFacts, longest_sec
 from makebreak.gap.recording import Channel, Recording, unit_of
+from makebreak.gap.table import COMMANDS
 
 
 def check_recordings(
@@ -29,6 +30,7 @@ def check_recordings(
         found += check_units(recording, facts)
         found += check_relations(recording)
         found += check_values(recording, facts)
+        found += check_commands(recording, facts)
         found += check_gravity(recording, facts)
         found += check_excitation(recording, facts)
     order = ("error", "warning", "info")
@@ -89,19 +91,7 @@ def check_clock(recording: Recording) -> list[Finding]:
                 lost += float(np.sum(np.rint(jumps / usual) - 1.0))
                 t = recording.time[episode.rows][rows]
                 longest = max(longest, float(np.diff(t).max()))
-        if not there:
-            found.append(
-                Finding(
-                    "channel_empty",
-                    recording.name,
-                    channel.name,
-                    0.0,
-                    "",
-                    "warning",
-                    f"{channel.name} has no sample at all.",
-                )
-            )
-        elif lost > 0:
+        if lost > 0:
             share = lost / (there + lost)
             found.append(
                 Finding(
@@ -205,10 +195,35 @@ def check_values(recording: Recording, facts: SceneFacts) -> list[Finding]:
         if channel.step > 0.0 and channel.step / np.sqrt(12.0) > 0.5 * channel.noise:
             says = f"{channel.name} comes in steps of {channel.step:.4g} {unit}."
             add("resolution", channel.name, channel.step, unit, "info", says)
+        if not np.ptp(y) > 0.0:
+            says = f"{channel.name} is {y[0]:.4g} in all rows: it measures nothing."
+            add("stuck", channel.name, longest_sec(recording), "s", "warning", says)
+            continue
         stuck = _longest_stuck(recording, channel)
         if stuck > 0.0:
             says = f"{channel.name} stands still for {stuck:.3g} s amid its own noise."
             add("stuck", channel.name, stuck, "s", "warning", says)
+    return found
+
+
+def check_commands(recording: Recording, facts: SceneFacts) -> list[Finding]:
+    """Whether it is known what drove each joint that has an actuator."""
+    found = []
+    for at, joint in facts.joints.items():
+        if not joint.driven or f"{at}.position" not in recording:
+            continue
+        if any(f"{at}.{command}" in recording for command in COMMANDS):
+            continue
+        if f"{at}.effort_measured" in recording:
+            kind, severity = "command_measured", "info"
+            says = f"No command of {at} was recorded; its measured effort stands in."
+        else:
+            kind, severity = "no_command", "warning"
+            says = (
+                f"No command of {at} was recorded, though the scene has an actuator "
+                "there: it is taken to have done nothing."
+            )
+        found.append(Finding(kind, recording.name, at, 0.0, "", severity, says))
     return found
 
 

@@ -34,6 +34,7 @@ class JointFacts:
     lower: float = -np.inf  # [rad] or [m]
     upper: float = np.inf
     effort_limit: float = np.inf  # [N m] or [N]
+    driven: bool = False  # It has an actuator.
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,9 @@ from makebreak.gap.table import (
 from makebreak.systems.numerics.signal_noise import estimate_noise
 
 FEWEST_ROWS = 10  # In an episode: fewer hold no window and no noise.
+# A longer hole in time [s] is a break, as is one of so many periods.
+LONGEST_HOLE_SEC, LONGEST_HOLE_ROWS = 1.0, 50
+MOST_VALUE = 1e12  # In SI units nothing that a robot measures is larger.
 _SIDECAR = ("noise", "filters", "columns", "provenance")
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _UNITS = {q: "N" for q in ("fx", "fy", "fz")} | {q: "N m" for q in ("tx", "ty", "tz")}
@@ -218,8 +221,9 @@ def read_recording(
     if not columns:
         raise ValueError(f"recording {path} has no channel beside time")
     episodes = _episodes(path, number, part, time, table.row)
+    episodes, notes = _broken_at_holes(path, episodes, time)
+    notes += _left_out(path, columns, table.row)
     flips, norm_errors = _mend_quaternions(path, columns, episodes, table.row)
-    notes = []
     if len(time) < table.n_rows:
         notes.append(
             (
@@ -423,6 +427,67 @@ def _episodes(
     return tuple(episodes)
 
 
+def _broken_at_holes(
+    path: Path, episodes: Sequence[Episode], time: np.ndarray
+) -> tuple[tuple[Episode, ...], list[tuple[str, str]]]:
+    """Episodes without long holes in time, and what is to be said of it.
+
+    What lies between two holes and has too few rows is left out.
+    """
+    found, notes = [], []
+    for episode in episodes:
+        steps = np.diff(time[episode.rows])
+        most = max(LONGEST_HOLE_SEC, LONGEST_HOLE_ROWS * float(np.median(steps)))
+        breaks = np.flatnonzero(steps > most) + 1
+        if not breaks.size:
+            found.append(episode)
+            continue
+        edges = episode.first + np.array([0, *breaks, episode.last - episode.first])
+        parts = [
+            Episode(episode.number, int(a), int(b), episode.stretch + k)
+            for k, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True))
+        ]
+        short = sum(p.last - p.first for p in parts if p.last - p.first < FEWEST_ROWS)
+        says = (
+            f"{path.name}, episode {episode.number}, has {len(breaks)} holes in time, "
+            f"the longest of {steps.max():.4g} s; no window reaches across them"
+        )
+        if short:
+            says += f", and {short} rows that stand alone are not used"
+        notes.append(("hole", says))
+        found += [p for p in parts if p.last - p.first >= FEWEST_ROWS]
+    if not found:
+        raise ValueError(
+            f"recording {path}: no {FEWEST_ROWS} rows follow one another without a "
+            "hole in time"
+        )
+    return tuple(found), notes
+
+
+def _left_out(path: Path, columns: dict, row: np.ndarray) -> list[tuple[str, str]]:
+    """Takes columns without any sample out of the table, and says so.
+
+    Raises: ValueError for a number that nothing measures.
+    """
+    empty = [name for name, value in columns.items() if np.isnan(value).all()]
+    for name in empty:
+        del columns[name]
+    if not columns:
+        raise ValueError(f"recording {path}: no column beside time has any number")
+    for name, value in columns.items():
+        bad = np.flatnonzero(np.abs(value) > MOST_VALUE)
+        if bad.size:
+            raise ValueError(
+                f"recording {path}: column {name}, row {row[bad[0]]}: got "
+                f"{value[bad[0]]:.4g}, expected a number in SI units, of less than "
+                f"{MOST_VALUE:g}"
+            )
+    return [
+        ("channel_empty", f"{path.name}: {name} has no sample at all and is left out")
+        for name in empty
+    ]
+
+
 def _mend_quaternions(
     path: Path, columns: dict, episodes: Iterable[Episode], row: np.ndarray
 ) -> tuple[dict[str, int], dict[str, float]]:
@@ -504,7 +569,7 @@ def windows(episode: Episode, time: np.ndarray, length_sec: float) -> Iterator[s
 
 
 # Of a long episode: ten blocks of time, of which every third is held out.
-PIECE_SEC, PIECE_ROWS = 12.0, 20_000
+PIECE_SEC, PIECE_ROWS, PIECE_FEWEST = 12.0, 20_000, 100
 
 
 def excerpt(
@@ -539,7 +604,8 @@ def excerpt(
 
 def _pieces(recording: Recording, episode: Episode) -> list[Episode]:
     t = recording.time[episode.rows]
-    n = max(round((t[-1] - t[0]) / PIECE_SEC), len(t) // PIECE_ROWS, 1)
+    n = min(round((t[-1] - t[0]) / PIECE_SEC), len(t) // PIECE_FEWEST)
+    n = max(n, len(t) // PIECE_ROWS, 1)
     edges = np.searchsorted(t, t[0] + (t[-1] - t[0]) * np.arange(1, n) / n)
     edges = np.unique([0, *edges, len(t)])
     return [
@@ -547,7 +613,7 @@ def _pieces(recording: Recording, episode: Episode) -> list[Episode]:
             episode.number, episode.first + a, episode.first + b, episode.stretch + k
         )
         for k, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True))
-        if b - a >= FEWEST_ROWS
+        if b - a >= FEWEST_ROWS or n == 1
     ]
 
 

@@ -12,6 +12,7 @@ from shlex import quote
 import numpy as np
 from matplotlib.figure import Figure
 
+from makebreak.gap.findings import Finding
 from makebreak.gap.pictures import (
     picture_of_channels,
     picture_of_series,
@@ -102,6 +103,7 @@ def extents_of(
 def summary_lines(result: GapResult) -> list[str]:
     """The end of the command line's run: the verdict, and a line for each effect."""
     lines = [f"{_HEADINGS[result.verdict][0]}: {result.says}"]
+    lines += [f"  Doubtful data: {each}" for each, _ in doubts(result)]
     for each in result.effects:
         if each.says not in result.says:
             lines.append(f"  {each.says}")
@@ -110,6 +112,26 @@ def summary_lines(result: GapResult) -> list[str]:
         if each.tell_apart:
             lines.append(f"    to tell: {each.tell_apart}")
     return lines
+
+
+def doubts(result: GapResult) -> list[tuple[str, list[str]]]:
+    """What the checks found that no fit can be trusted with, and where."""
+    return together([c for c in result.checks if c.severity == "error"])
+
+
+def together(findings: Sequence[Finding]) -> list[tuple[str, list[str]]]:
+    """A sentence for each kind and channel, and the recordings that it is true of;
+    that of the largest of them, where sizes differ."""
+    groups: dict[tuple[str, str], list[Finding]] = {}
+    for each in findings:
+        groups.setdefault((each.kind, each.channel), []).append(each)
+    return [
+        (
+            max(found, key=lambda f: abs(f.size)).says,
+            list(dict.fromkeys(f.recording for f in found)),
+        )
+        for found in groups.values()
+    ]
 
 
 def report_html(
@@ -125,6 +147,7 @@ def report_html(
     first = [
         f'<p class="badge" style="background:{colour}">{escape(heading)}</p>',
         f"<h1>{_text(result.says)}</h1>",
+        _doubts(result),
         '<div class="two"><div>',
         *[_effect(each, result, i) for i, each in enumerate(result.effects)],
         _no_effect(result) if not result.effects else "",
@@ -157,6 +180,17 @@ def report_html(
 
 
 # ----- The first screen
+
+
+def _doubts(result: GapResult) -> str:
+    found = doubts(result)
+    if not found:
+        return ""
+    items = "".join(f"<li>{_text(says)}</li>" for says, _ in found[:4])
+    return (
+        '<div class="doubt"><b>Put the data right first:</b> what is said above rests '
+        f"on it.<ul>{items}</ul></div>"
+    )
 
 
 def _effect(each: NamedEffect, result: GapResult, i: int) -> str:
@@ -305,15 +339,17 @@ def _checks(result: GapResult) -> str:
         return _section(
             "Checks before any fit", "<p>Nothing was found to be wrong.</p>"
         )
-    grave = [c for c in result.checks if c.severity != "info"]
-    grave.sort(key=lambda c: _SEVERITIES.index(c.severity))
-    light = [c for c in result.checks if c.severity == "info"]
+    grave: list[tuple[str, tuple[str, list[str]]]] = []
+    light: list[tuple[str, tuple[str, list[str]]]] = []
+    for severity in _SEVERITIES:
+        found = together([c for c in result.checks if c.severity == severity])
+        (light if severity == "info" else grave).extend((severity, f) for f in found)
 
     def items(found):
         return "".join(
-            f'<li class="{c.severity}">{escape(c.says)}'
-            f' <span class="small">{escape(c.recording)}</span></li>'
-            for c in found
+            f'<li class="{severity}">{escape(says)} <span class="small">'
+            f"{escape(', '.join(where[:6]))}{', ...' if where[6:] else ''}</span></li>"
+            for severity, (says, where) in found
         )
 
     body = f"<ul>{items(grave[:10])}</ul>" if grave else "<p>No warnings.</p>"
@@ -478,6 +514,8 @@ h3{font-size:16px;margin:0 0 4px}
  color:#4a5568}
 .tie{background:#fffbeb;border:1px solid #f6e05e;border-radius:4px;padding:8px 12px}
 .tie ul{margin:4px 0;padding-left:20px}.tie p{margin:4px 0}
+.doubt{background:#fff5f5;border:1px solid #fc8181;border-radius:4px;
+ padding:8px 12px;margin:0 0 14px}.doubt ul{margin:4px 0;padding-left:20px}
 .numbers{display:flex;gap:30px;margin:0 0 4px}
 .numbers b{display:block;font-size:25px;line-height:1.2}
 .numbers span,.small{color:#718096;font-size:13px}

@@ -24,6 +24,7 @@ def scene_facts(plant: MultibodyPlant) -> SceneFacts:
             lower=float(joint.position_lower_limits()[0]),
             upper=float(joint.position_upper_limits()[0]),
             effort_limit=float(limits.get(name, np.inf)),
+            driven=name in limits,
         )
         start[name] = (joint.position_start(), joint.velocity_start())
     free = frozenset(

@@ -70,13 +70,17 @@ def test_every_format_reads_back_the_very_same_numbers(tmp_path, suffix):
 
 def test_empty_cells_anywhere_windows_line_ends_and_a_byte_order_mark(tmp_path):
     path = tmp_path / "a.csv"
-    body = "".join(f"{i},{'' if i % 2 else i},,\r\n" for i in range(12))
+    body = "".join(f"{i},{'' if i % 2 else i},{i or ''},\r\n" for i in range(12))
     header = "time,a.b.x,a.b.y,a.b.z\r\n"
     path.write_bytes(b"\xef\xbb\xbf" + (header + body + "\r\n").encode())
     recording = read_recording(path)
     np.testing.assert_array_equal(recording["a.b.x"][::2], np.arange(0, 12, 2))
     assert np.isnan(recording["a.b.x"][1::2]).all()
-    assert np.isnan(recording["a.b.z"]).all()
+    np.testing.assert_array_equal(recording["a.b.y"], [np.nan, *range(1, 12)])
+    assert "a.b.z" not in recording
+    assert recording.notes == (
+        ("channel_empty", "a.csv: a.b.z has no sample at all and is left out"),
+    )
 
 
 def test_a_command_holds_until_the_next_one_within_its_episode(tmp_path):
