@@ -20,7 +20,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import LogVectorOutput, Multiplexer
+from pydrake.systems.primitives import (
+    ConstantVectorSource,
+    LogVectorOutput,
+    Multiplexer,
+)
 
 from makebreak.diagrams.ball_rolling import (
     ARM_TICK,
@@ -44,7 +48,11 @@ from makebreak.systems.frozen import Frozen
 from makebreak.systems.impedance_controller import HybridConfig, serial_chain_of
 from makebreak.systems.mode_detector import ModeDetector, ModeDetectorConfig
 from makebreak.systems.moving_frame import MovingFrame
-from makebreak.systems.numerics.contact_task import ContactBelief, ExpectedContact
+from makebreak.systems.numerics.contact_task import (
+    N_TRANSITION,
+    ContactBelief,
+    ExpectedContact,
+)
 from makebreak.systems.numerics.push_motion import BALL_SEGMENT, DOWN, TABLE_SEGMENT
 from makebreak.systems.numerics.rolling_task import (
     CirclePath,
@@ -94,12 +102,12 @@ SEVEN = {
 class TouchConfig:
     """The second paper's systems, for contacts of 1 to 3 N.
 
-    The wrench has 0.1 N of noise at 1 kHz, 0.05 N behind the detector's filter: 1 N is
-    20 of these, and more than what the finger's own inertia leaves."""
+    The wrench has 0.1 N of noise at 1 kHz, 0.05 N behind the detector's filter: 1.2 N
+    is 24 of these, and more than what the finger's own inertia leaves."""
 
     detector: ContactDetectorConfig = field(
         default_factory=lambda: ContactDetectorConfig(
-            impact_force=1.0, loss_force=0.3, tool_mass=FINGER_MASS
+            impact_force=1.2, loss_force=0.3, tool_mass=FINGER_MASS
         )
     )
     modes: ModeDetectorConfig = field(
@@ -280,11 +288,21 @@ def _timed(part, period, offset=OFFSET):
     return part
 
 
+def _from_wrist(arm) -> np.ndarray:
+    """(2,) from the wrist to the tip, seen from above [m]: the tool's orientation is
+    held, so that it stays what it is in the arm's initial posture."""
+    context = arm.CreateDefaultContext()
+    wrist = arm.GetJointByName(f"{ARM}_joint7").child_body().EvalPoseInWorld(context)
+    tip = arm.GetFrameByName(TIP_FRAME).CalcPoseInWorld(context)
+    return (tip.translation() - wrist.translation())[:2]
+
+
 def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) -> None:
     """The second paper's systems, and what leads from both planners to the arm."""
     touch = config.touch
     model, scene = believed(ball)
-    chain = serial_chain_of(make_control_plant(scene), TIP_FRAME)
+    arm = make_control_plant(scene)
+    chain = serial_chain_of(arm, TIP_FRAME)
     path = CirclePath(np.array(ball.task.center), ball.task.radius)
 
     def add(name: str, system: LeafSystem):
@@ -296,6 +314,7 @@ def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) ->
         model.ball_radius,
         model.tip_radius,
         touch.shaper.acceleration_max,
+        _from_wrist(arm),
         CONTROL,
         MOTION_OFFSET,
     )
@@ -368,8 +387,11 @@ def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) ->
             ("push_motion", "shaped"))  # fmt: skip
     connect("contact_detector", "contact", "moving_frame", "velocity_shaper")
     connect("contact_anticipator", "contacts", "velocity_shaper")
-    connect("contact_anticipator", "mode_hint", "mode_detector")
-    connect("mode_detector", "transition", "contact_anticipator", "forward_model_bank")
+    # Modes change as the ball is rolled; in these motions nothing changes but by a
+    # contact.
+    add("no_transition", ConstantVectorSource(np.zeros(N_TRANSITION)))
+    connect("no_transition", "y0", ("contact_anticipator", "transition"))
+    connect("mode_detector", "transition", "forward_model_bank")
     connect("mode_detector", "mode", "forward_model_bank")
     connect("mode_detector", "collecting", "variable_impedance")
     connect("forward_model_bank", "wrench_predicted", "variable_impedance")

@@ -4,6 +4,7 @@ Columns follow the data from the station on; what goes back to an earlier column
 below. Graphviz would need a program that pip cannot install.
 """
 
+import math
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -12,6 +13,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Diagram, System
 
 WIDTH, HEIGHT, GAP_X, GAP_Y = 2.2, 0.62, 1.5, 0.6  # Of a box, and between boxes.
+LETTER, LINE = 0.085, 0.18  # Of a label.
 FORMATS = (".svg", ".png", ".pdf")
 COLORS = ("#4c72b0", "#dd8452", "#55a868", "#c44e52", "#8172b3", "#937860", "#da8bc3")
 
@@ -35,7 +37,7 @@ def shown_edges(diagram: Diagram) -> dict[tuple[str, str], list[str]]:
     What passes through a system that is not shown (a gain, an adder) counts as passed
     on by the one before it.
     """
-    shown = {system.get_name() for system in shown_systems(diagram)}
+    shown = [system.get_name() for system in shown_systems(diagram)]
     into: dict[str, list[tuple[str, str]]] = {}
     for (system, _), (source, output) in _wires(diagram):
         into.setdefault(system, []).append((source, output))
@@ -118,24 +120,22 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
     figure, ax = plt.subplots(
         figsize=(0.75 * wide, 0.75 * tall + 0.4), layout="constrained"
     )
-    for k, (pair, chain) in enumerate(sorted(chains.items())):
+    taken = [(x[name], y[name], WIDTH, HEIGHT) for name in names]
+    for pair, chain in sorted(chains.items()):
         color = COLORS[names.index(pair[0]) % len(COLORS)]
         points = [(x[chain[0]] + WIDTH / 2, y[chain[0]] + _spread(chain, chains, y, 0))]
         for one in chain[1:-1]:  # Straight across the column, so that no box is cut.
             points += [(x[one] - WIDTH / 2, y[one]), (x[one] + WIDTH / 2, y[one])]
         end = (x[chain[-1]] - WIDTH / 2, y[chain[-1]] + _spread(chain, chains, y, 1))
         _arrow(ax, [*points, end], color)
-        first, second = points[0], [*points, end][1]
-        share = 0.3 + 0.4 * ((k * 0.381966) % 1.0)  # Labels side by side do not meet.
-        at = [first[i] + share * (second[i] - first[i]) for i in (0, 1)]
-        _label(ax, at, edges[pair], color)
+        _label(ax, [*points, end], edges[pair], color, taken)
     for k, pair in enumerate(back):
         color = COLORS[names.index(pair[0]) % len(COLORS)]
         low = bottom - 0.35 * k
         start = (x[pair[0]] + 0.3 * WIDTH, y[pair[0]] - HEIGHT / 2)
         end = (x[pair[1]] - 0.3 * WIDTH, y[pair[1]] - HEIGHT / 2)
         _arrow(ax, [start, (start[0], low), (end[0], low), end], color)
-        _label(ax, ((start[0] + end[0]) / 2, low), edges[pair], color)
+        _label(ax, [(start[0], low), (end[0], low)], edges[pair], color, taken)
     for name in names:
         whole = isinstance(diagram.GetSubsystemByName(name), Diagram)
         ax.add_patch(
@@ -227,14 +227,39 @@ def _arrow(ax, points, color) -> None:
     xs, ys = zip(*points, strict=True)
     ax.plot(xs, ys, color=color, lw=1.0, zorder=1)
     ax.annotate(
-        "", points[-1], points[-2],
+        "", points[-1], points[-2], zorder=1,
         arrowprops=dict(arrowstyle="-|>", color=color, lw=1.0, shrinkA=0, shrinkB=0),
     )  # fmt: skip
 
 
-def _label(ax, at, ports, color) -> None:
+def _label(ax, route, ports, color, taken) -> None:
+    """Names the ports where the route has most room, rather early than late.
+
+    `taken` are the rectangles (x, y, width, height) that have something in them; this
+    one is added."""
+    lines = [port.removeprefix("panda.") for port in ports]
+    w, h = LETTER * max(map(len, lines)) + 0.1, LINE * len(lines)
+    spots = _along(route, 0.1)
+
+    def covered(at) -> float:
+        across = ((abs(at[0] - X), abs(at[1] - Y), W, H) for X, Y, W, H in taken)
+        return sum(
+            max((w + W) / 2 - dx, 0.0) * max((h + H) / 2 - dy, 0.0)
+            for dx, dy, W, H in across
+        )
+
+    x, y = min(spots, key=lambda at: round(covered(at), 3))  # The first of equals.
+    taken.append((x, y, w, h))
     ax.text(
-        *at, "\n".join(port.removeprefix("panda.") for port in ports), fontsize=8,
-        ha="center", va="center", color=color, zorder=2,
-        bbox=dict(fc="w", ec="none", pad=0.5),
+        x, y, "\n".join(lines), fontsize=8, ha="center", va="center", color=color,
+        zorder=2, bbox=dict(fc="w", ec="none", pad=0.5),
     )  # fmt: skip
+
+
+def _along(route, step) -> list[tuple[float, float]]:
+    """Points on a polyline, `step` apart on each of its pieces."""
+    out = []
+    for (x0, y0), (x1, y1) in zip(route, route[1:], strict=False):
+        n = max(round(math.hypot(x1 - x0, y1 - y0) / step), 1)
+        out += [(x0 + k / n * (x1 - x0), y0 + k / n * (y1 - y0)) for k in range(n + 1)]
+    return out

@@ -1,5 +1,6 @@
 """The motions between two pushes: see numerics/push_motion.py for their shape."""
 
+import sys
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,6 +22,7 @@ from makebreak.systems.numerics.push_motion import (
     TABLE,
     PushConfig,
     ball_pattern,
+    frame_at,
     frame_under,
     moved_frame,
     table_pattern,
@@ -28,15 +30,17 @@ from makebreak.systems.numerics.push_motion import (
 from makebreak.systems.numerics.rolling_task import REPOSITION, CirclePath
 from makebreak.systems.numerics.timing import timed
 
+NEAR = 0.005  # Farther apart tip and ball, as modelled, do not touch [m].
+
 
 @dataclass
 class PushMotionConfig:
     shape: PushConfig = field(default_factory=PushConfig)
-    table_first: int = 3  # Which reposition touches the table first, ...
-    table_every: int = 25  # ... and how many later again; 0: none does.
+    table_first: int = 3  # From which reposition on the table is touched, ...
+    table_every: int = 25  # ... and how many later again; 0: it is not.
     settle_sec: float = 0.02  # Pressed so long, the push begins.
     follow_sec: float = 0.15  # In which the frame follows a ball that turns.
-    give_up_sec: float = 4.0  # A reposition that has not landed by then is over.
+    give_up_sec: float = 4.0  # A motion that has not met anything by then is over.
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +53,9 @@ class _Push:
     kind: int = BALL
     trial: int = 0
     repositions: int = 0
-    since: float = 0.0  # Of the motion [s],
-    met: float = np.inf  # when its last segment began,
-    started: float = 0.0  # and of the reposition.
+    due: int = 0  # The reposition from which on the table is to be touched.
+    since: float = 0.0  # When the motion began [s],
+    met: float = np.inf  # and its last segment.
     running: bool = False
     active: bool = False
     landed: bool = False
@@ -78,7 +82,11 @@ class PushMotion(LeafSystem):
              reposition is over; trial (1,) counts the motions; kind (1,) 0: to the
              ball, 1: to the table.
 
-    Args: path; radii as modelled [m]; acceleration_max [m/s2] of the patterns.
+    The table is touched ahead of the ball, and only where that leads the tip towards
+    the wrist's side: else the arm comes between the ball and the camera above.
+
+    Args: path; radii as modelled [m]; acceleration_max [m/s2] of the patterns;
+        from_wrist (2,), from the wrist to the tip, seen from above.
     Raises: ValueError for numbers that make no motion.
     """
 
@@ -89,6 +97,7 @@ class PushMotion(LeafSystem):
         radius_ball: float,
         radius_tip: float,
         acceleration_max: float,
+        from_wrist: np.ndarray,
         period_sec: float = 0.0125,
         offset_sec: float = 0.0,
     ):
@@ -96,14 +105,15 @@ class PushMotion(LeafSystem):
         _check(config)
         self._config, self._path, self._period = replace(config), path, period_sec
         self._radii = radius_ball, radius_tip
-        self._a_max = acceleration_max
+        self._a_max, self._from_wrist = acceleration_max, np.array(from_wrist)
         inputs = (("x", N_X), ("task_phase", 1), ("phase", N_PHASE), ("arm", 19))
         self._x, self._task, self._phase, self._arm = [
             self.DeclareVectorInputPort(name, size) for name, size in inputs
         ]
         self._shaped = self.DeclareVectorInputPort("shaped", 19)
         pattern = self.first_pattern()
-        none = _Push(pattern, np.zeros(N_FRAME))
+        due = config.table_first if config.table_every > 0 else sys.maxsize
+        none = _Push(pattern, np.zeros(N_FRAME), due=due)
         self._push = self.DeclareAbstractState(AbstractValue.Make(none))
         ticket = {self.abstract_state_ticket(self._push)}
         self.DeclareAbstractOutputPort(
@@ -163,11 +173,16 @@ class PushMotion(LeafSystem):
             )
         if not push.running:
             n = push.repositions + 1
-            later = n - c.table_first
-            table = c.table_every > 0 and later >= 0 and later % c.table_every == 0
+            table = n >= push.due and self._path.heading(p) @ self._from_wrist <= 0.0
             frame = frame_under(p, v, t)
             start = self._arm.Eval(context)[:3] - frame[:3]
-            push = replace(push, frame=frame, repositions=n, started=t, running=True)
+            push = replace(
+                push,
+                frame=frame,
+                repositions=n,
+                due=n + c.table_every if table else push.due,
+                running=True,
+            )
             return self._begun(push, TABLE if table else BALL, start, t, x)
         # Where the ball is to go changes with where it is: so does what is behind it.
         turned = push.heading - self._path.heading(p)
@@ -181,20 +196,29 @@ class PushMotion(LeafSystem):
         last = phase[PHASE_SEGMENT] == len(push.pattern) - 1
         if last and push.met == np.inf:
             push = replace(push, met=t)
-        missed = phase[PHASE_STAGE] == HOLD or t - push.started > c.give_up_sec
+        missed = phase[PHASE_STAGE] == HOLD or t - push.since > c.give_up_sec
         if push.kind == TABLE and (missed or last and phase[PHASE_STAGE] == DONE):
             start = np.array(self._shaped.Eval(context)[:3])
             start[2] = x[P_TIP][2]  # Pressed down, it is where the table has it.
             return self._begun(push, BALL, start, t, x)
         if push.kind == BALL and (missed or t - push.met >= c.settle_sec):
-            return replace(push, landed=True)
+            apart = np.linalg.norm(x[P_TIP] - x[P_BALL]) - sum(self._radii)
+            if apart <= NEAR:
+                return replace(push, landed=True)
+            # What was felt was not the ball: once more, from where the tip is.
+            start = x[P_TIP] - frame_at(push.frame, t)
+            return self._begun(push, BALL, start, t, x)
         return push
 
     def _begun(self, push, kind, start, t, x):
         heading = self._path.heading(x[P_BALL])
+        try:
+            pattern = self._pattern(kind, start, heading)
+        except ValueError:  # No way from here: the task's own, and again next tick.
+            return replace(push, running=False, active=False)
         return replace(
             push,
-            pattern=self._pattern(kind, start, heading),
+            pattern=pattern,
             kind=kind,
             trial=push.trial + 1,
             heading=heading,

@@ -193,6 +193,21 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capsys, monkeypatch)
             "failed while it was recorded: RuntimeError: the arm fell off" in refused()
         )
 
+    calls = []
+    plain = c3_mpc.solve_c3
+
+    def breaking(*args):
+        calls.append(1)
+        if len(calls) > 3:
+            raise ZeroDivisionError("after three updates")
+        return plain(*args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(c3_mpc, "solve_c3", breaking)
+        line = refused("--systems", "c3", "--seconds", "0.1")
+        assert "failed while it was recorded" in line and "after three" in line
+        assert len(calls) == 4
+
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 

@@ -35,7 +35,8 @@ from makebreak.systems import (
 )
 from makebreak.systems.frozen import Frozen
 from makebreak.systems.moving_frame import MovingFrame
-from makebreak.systems.numerics.contact_task import MADE, ContactBelief
+from makebreak.systems.numerics.ball_state import pack
+from makebreak.systems.numerics.contact_task import DONE, MADE, ContactBelief
 from makebreak.systems.numerics.push_motion import (
     BALL_SEGMENT,
     TABLE_SEGMENT,
@@ -47,7 +48,7 @@ from makebreak.systems.numerics.push_motion import (
     table_pattern,
 )
 from makebreak.systems.numerics.reference_blend import blended_reference, weight
-from makebreak.systems.push_motion import PushConfig as SameConfig
+from makebreak.systems.numerics.rolling_task import REPOSITION, ROLL, CirclePath
 from makebreak.systems.push_motion import PushMotion, PushMotionConfig
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -105,6 +106,84 @@ def test_the_way_to_the_table_ends_ahead_of_the_ball_and_slides_away_from_it():
     slide = np.diff(pattern.segments[2].positions, axis=0)[0]
     assert abs(slide[:2] @ HEADING) < 1e-12 and slide[2] == 0.0
     np.testing.assert_array_equal(pattern.segments[2].force_directions, [[0, 0, -1]])
+
+
+def motion_system(from_wrist=(0.0, -1.0)):
+    path = CirclePath(np.array([0.5, 0.0]), 0.1)
+    system = PushMotion(PushMotionConfig(), path, R_BALL, R_TIP, 5.0, from_wrist)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+
+    def tick(t, task, p_tip, segment=0.0, stage=0.0, ball=(0.6, 0.0, R_BALL)):
+        """Returns the outputs after an update at time t."""
+        x = pack(p_tip, np.zeros(3), ball, np.zeros(3), R_BALL)
+        arm = np.zeros(19)
+        arm[:3] = p_tip
+        phase = np.array([segment, stage, 0, 0, 0, 0.0])
+        for name, value in (("x", x), ("task_phase", [task]), ("phase", phase),
+                            ("arm", arm), ("shaped", arm)):  # fmt: skip
+            system.GetInputPort(name).FixValue(context, value)
+        simulator.AdvanceTo(t)
+        return {
+            name: system.GetOutputPort(name).Eval(context)[0]
+            for name in ("active", "landed", "trial", "kind")
+        }
+
+    return tick
+
+
+def test_a_push_begins_where_the_ball_was_met_and_nowhere_else():
+    tick = motion_system()
+    on_ball = np.array([0.6, -0.018, 0.0895])
+    in_the_air = on_ball + [0.0, 0.0, 0.02]
+    k = 0
+
+    def ticks(n, *args):
+        nonlocal k
+        k += n
+        return tick(0.0125 * k + 1e-6, *args)
+
+    assert ticks(1, ROLL, in_the_air)["trial"] == 0
+    got = ticks(1, REPOSITION, in_the_air)
+    assert (got["trial"], got["active"]) == (1, 0)  # The shaper has yet to read it.
+    assert ticks(1, REPOSITION, in_the_air)["active"] == 1
+    # Felt, 20 mm above the ball: it was not the ball, and the motion begins anew.
+    got = ticks(6, REPOSITION, in_the_air, 1.0)
+    assert got["trial"] >= 2 and got["landed"] == 0
+    ticks(2, REPOSITION, on_ball, 0.0)
+    got = ticks(4, REPOSITION, on_ball, 1.0)
+    assert got["landed"] == 1
+    got = ticks(1, ROLL, on_ball, 1.0)
+    assert (got["landed"], got["active"]) == (0, 0)
+
+
+def test_the_third_reposition_goes_to_the_table_and_then_to_the_ball():
+    tick, kinds, t = motion_system(), [], 0.0
+    front = np.array([0.6, 0.027, 0.0755])
+    for _ in range(4):
+        tick(t + 0.02, ROLL, front)
+        kinds.append(tick(t + 0.04, REPOSITION, front)["kind"])
+        t += 0.06
+        if kinds[-1] == 1:
+            got = tick(t + 0.1, REPOSITION, front, 2.0, float(DONE))
+            assert got["kind"] == 0 and got["landed"] == 0
+            t += 0.1
+    assert kinds == [0, 0, 1, 0]
+
+
+def test_the_table_waits_until_the_arm_would_not_hide_the_ball():
+    tick, t = motion_system(from_wrist=(0.0, 1.0)), 0.0
+    # At the right of the circle the way ahead leads along +y, at the left along -y.
+    for ball, kind in (((0.6, 0.0, R_BALL), 0), ((0.4, 0.0, R_BALL), 1)):
+        front = np.array(ball) + [0.0, 0.027, 0.039]
+        for _ in range(4):
+            tick(t + 0.02, ROLL, front, ball=ball)
+            got = tick(t + 0.04, REPOSITION, front, ball=ball)["kind"]
+            t += 0.06
+            if kind:
+                break
+            assert got == 0
+    assert got == 1
 
 
 def test_the_frame_is_continuous_and_comes_under_a_ball_that_turns():
@@ -181,9 +260,13 @@ def test_a_blend_of_two_references_is_one_motion():
 
 def test_bad_motions_are_refused_by_name():
     with pytest.raises(ValueError, match="push.shape.lift is -1.0, expected > 0"):
-        PushMotion(PushMotionConfig(SameConfig(lift=-1.0)), None, R_BALL, R_TIP, 5.0)
+        PushMotion(
+            PushMotionConfig(PushConfig(lift=-1.0)), None, R_BALL, R_TIP, 5.0, [1, 0]
+        )
     with pytest.raises(ValueError, match="table_first, table_every are 0, 1"):
-        PushMotion(PushMotionConfig(table_first=0, table_every=1), None, 1, 1, 5.0)
+        PushMotion(
+            PushMotionConfig(table_first=0, table_every=1), None, 1, 1, 5.0, [1, 0]
+        )
 
 
 # --- The diagram.
@@ -349,12 +432,19 @@ def test_the_table_says_what_a_subset_buys():
         "without both": [result(20.0, None, False)],
     }
     frozen = {name: [result(50.0, None, False)] for name in SEVEN}
+    frozen[""] = [result(9.0, None)]
     table = experiment.table_of(groups, frozen)
     assert table.missed == 0
     text = table.to_text()
-    assert "0.45 (goal 0.60)" in text and "1.10 (goal 1.25)" in text
+    assert "at most 60%" in text and "45%" in text
+    assert "at most 125%" in text and "110%" in text
+    # A peak of 19 N, a time of 140 s, and a system without which nothing changes.
     groups["all seven"] = [result(19.0, 140.0)]
-    assert experiment.table_of(groups, frozen).missed == 2
+    frozen["mode_detector"] = frozen[""]
+    assert experiment.table_of(groups, frozen).missed == 3
+    frozen["c3_mpc"] = [{"success": False, "error": "exit status 3", "seed": 0}]
+    table = experiment.table_of(groups, frozen)
+    assert table.missed == 3 and "the run breaks off" in table.to_text()
 
 
 # --- Exported tests of the seven.

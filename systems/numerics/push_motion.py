@@ -41,7 +41,7 @@ class PushConfig:
 
 
 SLIDE_SPEED = 0.08  # [m/s]
-REFERENCE_WAY = 0.13  # [m] A way that is longer takes longer.
+REFERENCE_WAY = 0.11  # [m] A way that is longer takes longer.
 BEYOND = 0.02  # [m] A motion into a contact is planned so far behind the model's.
 PRESS_WAY, PRESS_SEC = 0.002, 0.2  # Along the contact, where force decides.
 HOP_SPEED = 0.3  # From the ball to over the table, and down on it [m/s].
