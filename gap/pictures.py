@@ -134,11 +134,14 @@ def _time_ticks(axes, spans, starts, bins) -> None:
         # One label for each part is too much: some.
         every = max(1, len(keys) // 12)
         some = keys[::every]
+        # Each recording one episode: its name; else the episode's number.
+        by_name = len({name for name, _ in keys}) == len(keys)
         axes.set_xticks(
             [starts[k] + 0.5 * bins[k] for k in some],
-            [str(k[1]) for k in some], fontsize=8,
+            [k[0] if by_name else str(k[1]) for k in some], fontsize=8,
         )  # fmt: skip
-        axes.set_xlabel("episode, from its start to its end", fontsize=9)
+        what = "recording" if by_name else "episode"
+        axes.set_xlabel(f"{what}, from its start to its end", fontsize=9)
     if 1 < len(keys) <= 4:
         for recording, episode in keys:
             axes.annotate(

@@ -151,6 +151,7 @@ def report_html(
         '<div class="two"><div>',
         *[_effect(each, result, i) for i, each in enumerate(result.effects)],
         _no_effect(result) if not result.effects else "",
+        _which_errors(result),
         "</div><div>",
         _numbers(result),
         _image(
@@ -226,6 +227,17 @@ def _effect(each: NamedEffect, result: GapResult, i: int) -> str:
     )
 
 
+def _which_errors(result: GapResult) -> str:
+    """Where the figures of effects are not of the windows whose error is beside."""
+    e = [each.evidence for each in result.effects]
+    if not e or np.isclose(e[-1].held_out_after, result.gap.after, rtol=0.02):
+        return ""
+    return (
+        '<p class="small">The errors of each effect are of the equations that it was '
+        "fitted to, on data held out; those beside are of simulations.</p>"
+    )
+
+
 def _ties(each: NamedEffect) -> str:
     if not each.indistinguishable_from:
         return ""
@@ -269,7 +281,7 @@ def _numbers(result: GapResult) -> str:
     )
     return (
         f'<div class="numbers">{shown}</div><p class="small">Error over noise, rms '
-        f"over windows of {_n(g.window_s)} s that nothing was fitted to.</p>"
+        f"over simulated windows of {_n(g.window_s)} s that nothing was fitted to.</p>"
     )
 
 
@@ -281,7 +293,7 @@ def _where(result: GapResult, pictures) -> str:
         return ""
     groups: dict[tuple[str, str], list[Where]] = {}
     for w in sorted(result.where, key=lambda w: -w.score):
-        groups.setdefault((w.channel, w.region), []).append(w)
+        groups.setdefault((w.channel, w.region.split(",")[0]), []).append(w)
     rows = [
         [
             channel,
@@ -289,7 +301,7 @@ def _where(result: GapResult, pictures) -> str:
             f"{sum(w.to_s - w.from_s for w in found):.3g} s",
             f"{found[0].score:.3g}",
             f"{found[0].from_s:.2f} - {found[0].to_s:.2f} s of {found[0].recording}, "
-            f"episode {found[0].episode}",
+            f"episode {found[0].episode}, {found[0].region}",
         ]
         for (channel, region), found in groups.items()
     ]
@@ -428,7 +440,10 @@ def _says(effect: Effect) -> str:
 
 def _text(sentence: str) -> str:
     """A sentence as HTML: it begins with a capital and has a sign for +-."""
-    return escape(sentence[:1].upper() + sentence[1:]).replace("+-", "&plusmn;")
+    text = escape(sentence[:1].upper() + sentence[1:]).replace("+-", "&plusmn;")
+    for unit in ("N m", "kg m2", "rad/s", "N s/m"):  # A number keeps its unit.
+        text = text.replace(f" {unit}", "&nbsp;" + unit.replace(" ", "&nbsp;"))
+    return text
 
 
 def _share(before: float, after: float, floor: float) -> str:

@@ -6,13 +6,16 @@ import numpy as np
 from scipy.stats import chi2
 
 from makebreak.gap.inverse import REST_SPEED, InverseModel
+from makebreak.gap.recording import unit_of
 from makebreak.gap.result import Unexplained, Where
 from makebreak.gap.windows import WindowModel
+from makebreak.models.effects.kind import full_name, one_dof_joints
 from makebreak.systems.numerics.selection import benjamini_hochberg
 
 FALSE_RATE = 0.01  # Share of the windows told that may stand out by chance.
 ALLOWED = 1.3  # What estimates of noise may be off by.
-MOST = 40
+MOST = 300
+ALIKE = 2.0  # Neighbours are told as one if what happened, and how much, is alike.
 
 
 def where_in_motion(model: InverseModel, left: np.ndarray) -> list[Where]:
@@ -23,6 +26,12 @@ def where_in_motion(model: InverseModel, left: np.ndarray) -> list[Where]:
     """
     names = model.names()
     R = left.reshape(-1, len(names))
+    units = {
+        full_name(model.dynamics.plant, joint): (
+            "m/s" if joint.type_name() == "prismatic" else "rad/s"
+        )
+        for joint in one_dof_joints(model.dynamics.plant)
+    }
     found, p = [], []
     first = 0
     for track in model.tracks:
@@ -42,7 +51,7 @@ def where_in_motion(model: InverseModel, left: np.ndarray) -> list[Where]:
                 # Neighbouring bumps share half of their samples.
                 df = max(0.7 * len(mine), 1.0)
                 p.append(float(chi2.sf(np.sum(e**2) * df / len(mine), df)))
-                region = _moving(v[here, model.joints.index(joint)])
+                region = _moving(v[here, model.joints.index(joint)], units[joint])
                 channel = f"{joint}.{'effort' if what == 'effort' else what}"
                 score = float(np.sqrt(np.mean(rows[mine, k] ** 2)))
                 found.append(
@@ -63,7 +72,7 @@ def where_in_windows(model: WindowModel, errors: Sequence[np.ndarray]) -> list[W
             score = float(np.sqrt(np.mean(e[:, c] ** 2)))
             # The samples of a window err together: they count as three.
             p.append(float(chi2.sf(3.0 * (score / ALLOWED) ** 2, 3.0)))
-            region = _moving(np.gradient(recording[channel][w.rows], time))
+            region = _moving(*_rate(channel, recording[channel][w.rows], time))
             found.append(
                 Where(
                     channel, float(time[0]), float(time[-1]), w.episode,
@@ -126,14 +135,23 @@ def _explained_share(x, y, bins: int = 12) -> float:
     return float(1.0 - within / (n - bins) / np.var(y, ddof=1)) if n > bins else 0.0
 
 
-def _moving(v: np.ndarray) -> str:
+def _rate(channel: str, y: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, str]:
+    """How fast what a channel measures changes, and the unit."""
+    quantity = channel.rsplit(".", 1)[1]
+    unit = unit_of(quantity)
+    if unit.endswith("/s"):
+        return y, unit
+    return np.gradient(y, time), "1/s" if unit == "1" else f"{unit}/s"
+
+
+def _moving(v: np.ndarray, unit: str) -> str:
     v = v[np.isfinite(v)]
     if not len(v) or np.mean(np.abs(v) < REST_SPEED) > 0.5:
         return "at rest"
     fastest = np.abs(v).max()
     turning = v.min() < -0.02 * fastest and v.max() > 0.02 * fastest
     how = "reversing" if turning else "moving"
-    return f"{how}, up to {fastest:.2g} a second"
+    return f"{how}, up to {fastest:.2g} {unit}"
 
 
 def _merged(found: list[Where], stands_out: np.ndarray) -> list[Where]:
@@ -147,13 +165,20 @@ def _merged(found: list[Where], stands_out: np.ndarray) -> list[Where]:
     for group in groups.values():
         run: list[Where] = []
         for window in sorted(group, key=lambda w: w.from_s):
-            if run and window.from_s > run[-1].to_s + 0.01:
+            if run and not _alike(run[-1], window):
                 out.append(_one(run))
                 run = []
             run.append(window)
         if run:
             out.append(_one(run))
     return sorted(out, key=lambda w: -w.score)[:MOST]
+
+
+def _alike(a: Where, b: Where) -> bool:
+    """Whether b, which starts later, goes on where a ends."""
+    same = a.region.split(",")[0] == b.region.split(",")[0]
+    near = b.from_s <= a.to_s + 0.01
+    return near and same and 1.0 / ALIKE < a.score / max(b.score, 1e-12) < ALIKE
 
 
 def _one(run: list[Where]) -> Where:

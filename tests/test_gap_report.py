@@ -154,7 +154,12 @@ def text_of(page: str) -> str:
     """What a reader sees."""
     page = re.sub(r"<style>.*?</style>", "", page, flags=re.S)
     page = re.sub(r"<[^>]*>", " ", page)
-    page = page.replace("&plusmn;", "+-").replace("&#x27;", "'").replace("&gt;", ">")
+    page = (
+        page.replace("&plusmn;", "+-")
+        .replace("&nbsp;", " ")
+        .replace("&#x27;", "'")
+        .replace("&gt;", ">")
+    )
     return " ".join(page.split())
 
 
