@@ -17,16 +17,16 @@ from makebreak.systems.numerics.selection import Columns
 
 # What a value is multiplied by, or what is added to it.
 _TIMES = {
-    "contact_friction": (0.4, 0.7, 1.1, 1.5, 2.2),
-    "contact_stiffness": (0.15, 0.3, 0.6, 0.9, 1.8, 3.5),
-    "contact_dissipation": (0.05, 0.3, 0.6, 1.1, 1.8, 3.0),
-    "object_mass": (0.6, 0.8, 0.97, 1.25, 1.6),
+    "contact_friction": (0.5, 0.9, 1.7),
+    "contact_stiffness": (0.1, 0.4, 0.9, 2.5),
+    "contact_dissipation": (0.05, 0.4, 1.1, 2.5),
+    "object_mass": (0.7, 0.97, 1.4),
 }
 _PLUS: dict[str, dict[str, tuple[float, ...]]] = {
-    "rolling_resistance": {"coefficient": (0.005, 0.02)},
-    "plane_height": {"height": (-0.006, -0.003, -0.0005, 0.0005, 0.003, 0.006)},
+    "rolling_resistance": {"coefficient": (0.005,)},
+    "plane_height": {"height": (-0.004, -0.0005, 0.004)},
     "plane_tilt": {"roll": (0.003,), "pitch": (0.003,)},
-    "corner_radius": {"radius": (0.001, 0.003, 0.006, 0.009)},
+    "corner_radius": {"radius": (0.002, 0.005)},
     "object_com": {"x": (0.001,), "y": (0.001,), "z": (0.001,)},
     "constant_force": {"fx": (0.01,), "fy": (0.01,), "fz": (0.01,)},
 }
@@ -34,8 +34,8 @@ _POSITIVE = dict.fromkeys(
     ("friction", "stiffness", "dissipation", "mass", "radius", "scale", "ixx", "iyy",
      "izz"), True,
 )  # fmt: skip
-_SIZES = (0.92, 0.96, 0.99, 1.01, 1.04, 1.08)
-_INERTIAS = (0.7, 0.97, 1.3)
+_SIZES = (0.95, 0.99, 1.05)
+_INERTIAS = (0.97, 1.2)
 # Kinds that an unmeasured force on a mechanism would show as; those of free bodies.
 _OF_BODIES = ("constant_force", "body_drag", "object_mass", "object_com",
               "object_inertia", "length_scale")  # fmt: skip

@@ -7,7 +7,7 @@ and counts as noise.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,9 +20,11 @@ from makebreak.systems.numerics.free_body import FreeBody, lowest_gap, simulate
 from makebreak.systems.numerics.smoother import smooth
 
 AFTER_SEC = 0.1  # Of a window after its impact.
-LONG_SEC, LEAST_SEC = 1.0, 0.25  # Windows in which nothing hits.
+LONG_SEC, LEAST_SEC = 2.0, 0.25  # Windows in which nothing hits: a tilt of 0.01
+# degree moves a ball by 2 mm in 2 s, and by a twentieth of a millimetre in 0.3 s.
 HIT = 20.0  # A faster change of velocity [m/s2] is an impact; gravity's is half of it.
 BESIDE = 3  # Rows beside an impact that a smoothed state would mix with it.
+BLUR = 0.02  # Laws of contact are approximations, which noise alone does not tell.
 DRAWS = 12  # Of uncertain starts.
 FEWEST_ROWS = 8
 _PLACE, _TURN = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
@@ -42,7 +44,7 @@ class Window:
     spread: np.ndarray
     std: np.ndarray
     train: bool
-    hits: bool
+    after_hits: int  # Impacts of the episode before it.
 
 
 class FreeBodyModel:
@@ -59,7 +61,7 @@ class FreeBodyModel:
         scene: Scene,
         recordings: Sequence[Recording],
         after_sec: float = AFTER_SEC,
-        most: int = 60,
+        most: int = 48,
     ):
         self.scene, self.recordings = scene, list(recordings)
         self._numbers = FreeBodyScene(scene)
@@ -90,9 +92,9 @@ class FreeBodyModel:
             for episode in recording.episodes:
                 self._cut(i, recording, episode, number if total >= 6 else None)
                 number += 1
-        if len(self.windows) > most:
-            keep = np.unique(np.linspace(0, len(self.windows) - 1, most).astype(int))
-            self.windows = [self.windows[k] for k in keep]
+        if len(self.windows) > most:  # Those before and at early impacts say most.
+            order = np.argsort([w.after_hits for w in self.windows], kind="stable")
+            self.windows = [self.windows[k] for k in sorted(order[:most])]
         if not self.windows:
             raise ValueError(
                 f"no episode holds {FEWEST_ROWS} samples of {self.name} between impacts"
@@ -134,9 +136,14 @@ class FreeBodyModel:
             near[max(k - BESIDE, 0) : k + BESIDE + 1] = True
         edges = np.flatnonzero(np.diff(np.concatenate([[1], near, [1]]).astype(int)))
         for a, b in zip(edges[::2], edges[1::2], strict=True):
-            self._cut_segment(i, recording, episode, time, values, a, b, rough, number)
+            before = int(np.sum(np.diff(rough[:a].astype(int), prepend=0) == 1))
+            self._cut_segment(
+                i, recording, episode, time, values, a, b, rough, number, before
+            )
 
-    def _cut_segment(self, i, recording, episode, time, values, a, b, rough, number):
+    def _cut_segment(
+        self, i, recording, episode, time, values, a, b, rough, number, before
+    ):
         if any(np.isfinite(y[a:b]).sum() < FEWEST_ROWS for y in values.values()):
             return
         n = b - a
@@ -148,20 +155,28 @@ class FreeBodyModel:
             if c in values:
                 s = smooth(time[a:b], values[c][a:b], recording.channels[c].noise)
                 states[:, k], spreads[:, k] = s.x, s.P[:, :2, :2]
+                # Where the acceleration jumps (it comes to rest, say) a smoothed state
+                # is wrong by more than it knows.
+                row, beside = np.arange(n), 4
+                late = s.x[np.minimum(row + beside, n - 1), 2]
+                jump = np.abs(late - s.x[np.maximum(row - beside, 0), 2])
+                reach = beside * float(np.median(np.diff(time[a:b])))
+                spreads[:, k, 1, 1] += (0.25 * jump * reach) ** 2
+                spreads[:, k, 0, 0] += (0.06 * jump * reach**2) ** 2
         before_hit = b < len(time) and rough[b : b + BESIDE + 1].any()
         spans = []
         if before_hit:
             first = b + int(np.argmax(rough[b:]))
             end = int(np.searchsorted(time, time[first] + self._after, "right"))
-            spans.append((a, b, time[first], min(end, len(time)), True))
+            spans.append((a, b, time[first], min(end, len(time))))
         if time[b - 1] - time[a] >= LEAST_SEC:
-            starts = np.arange(time[a], time[b - 1] - LEAST_SEC, 0.5 * LONG_SEC)
+            starts = np.arange(time[a], time[b - 1] - LEAST_SEC, LONG_SEC)
             for t in starts:
                 k = int(np.searchsorted(time, t))
                 end = min(int(np.searchsorted(time, t + LONG_SEC, "right")), b)
                 late = min(int(np.searchsorted(time, t + 0.15)), end)
-                spans.append((k, max(late, k + 1), time[end - 1], end, False))
-        for k0, k1, aim, end, hits in spans:
+                spans.append((k, max(late, k + 1), time[end - 1], end))
+        for k0, k1, aim, end in spans:
             tau = aim - time[k0:k1]
             P = spreads[k0 - a : k1 - a, 4:]
             wide = np.sum(
@@ -170,6 +185,11 @@ class FreeBodyModel:
                 + tau[:, None] ** 2 * P[:, :, 1, 1],
                 axis=1,
             )
+            # A vague start's round-off may leave a covariance that is none.
+            sound = (P[..., 0, 0] > 0.0) & (
+                P[..., 0, 0] * P[..., 1, 1] > P[..., 0, 1] ** 2
+            )
+            wide = np.where(sound.all(axis=1), wide, np.inf)
             k = k0 + int(np.argmin(wide))
             if end - k < 4:
                 continue
@@ -178,7 +198,7 @@ class FreeBodyModel:
                 Window(
                     i, episode.number, float(time[k]),
                     slice(episode.first + k, episode.first + end), states[k - a],
-                    spreads[k - a], np.zeros(0), block % 3 != 1, hits,
+                    spreads[k - a], np.zeros(0), block % 3 != 1, before,
                 )
             )  # fmt: skip
 
@@ -189,25 +209,29 @@ class FreeBodyModel:
     def _add_spread(self) -> None:
         """Noise, and what uncertain starts do in the scene as it is."""
         rng = np.random.default_rng(0)
-        done = []
-        for w in self.windows:
-            plain = self._simulate(self._body, w, w.state, 1.0)
-            wide = np.zeros_like(plain)
+        plain = [self._simulate(self._body, w, w.state, 1.0) for w in self.windows]
+        stds = []
+        for w, y in zip(self.windows, plain, strict=True):
+            wide = np.zeros_like(y)
             roots = [_root(P) for P in w.spread]
             for _ in range(DRAWS):
                 state = np.array(w.state)
                 for k, L in enumerate(roots):
                     state[k, :2] += L @ rng.normal(size=2)
-                moved = self._simulate(self._body, w, state, 1.0)
-                off = moved - plain
+                off = self._simulate(self._body, w, state, 1.0) - y
                 off[~np.isfinite(off)] = 1e3
                 wide += np.minimum(off**2, self._cap**2) / DRAWS
-            std = np.sqrt(self.noise**2 + wide)
-            done.append(
-                Window(w.recording, w.episode, w.start, w.rows, w.state, w.spread, std,
-                       w.train, w.hits)
-            )  # fmt: skip
-        self.windows = done
+            stds.append(np.sqrt(self.noise**2 + wide))
+        ones = [np.ones_like(std) for std in stds]
+        off = np.concatenate(self._errors(plain, ones))
+        # A gap is not measured to better than a share of itself.
+        place = [k for k, c in enumerate(self.channels) if c[-2:] in (".x", ".y", ".z")]
+        least = BLUR * float(np.sqrt(np.mean(np.sum(off[:, place] ** 2, axis=1))))
+        floor = least * self._cap / self._cap[place[0]]
+        self.windows = [
+            replace(w, std=np.sqrt(std**2 + floor**2))
+            for w, std in zip(self.windows, stds, strict=True)
+        ]
 
     # ----- Simulating
 
@@ -243,16 +267,19 @@ class FreeBodyModel:
     def errors(self, simulated: Sequence[np.ndarray]) -> list[np.ndarray]:
         """(measured - simulated)/std of each window, no more than the cap; 0 where
         nothing was measured."""
+        return self._errors(simulated, [w.std for w in self.windows])
+
+    def _errors(self, simulated, stds) -> list[np.ndarray]:
         out = []
         turn = [k for k, c in enumerate(self.channels) if c.rsplit(".", 1)[1] in _TURN]
-        for w, y, seen in zip(self.windows, simulated, self._seen, strict=True):
+        for std, y, seen in zip(stds, simulated, self._seen, strict=True):
             if turn:  # q and -q are one orientation.
                 same = np.sign(np.nansum(y[:, turn] * seen[:, turn], axis=1))
                 y = np.array(y)
                 y[:, turn] *= np.where(same < 0, -1.0, 1.0)[:, None]
             e = np.where(np.isfinite(y), seen - y, 1e3)
             e = e / np.sqrt(1.0 + (e / self._cap) ** 2)
-            out.append(np.where(np.isfinite(seen), e / w.std, 0.0))
+            out.append(np.where(np.isfinite(seen), e / std, 0.0))
         return out
 
     # ----- As InverseModel

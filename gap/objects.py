@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from makebreak.gap.contact import (
     contact_candidates,
     contact_nuisances,
@@ -11,7 +13,7 @@ from makebreak.gap.fit import Fitted
 from makebreak.gap.free_windows import FreeBodyModel
 from makebreak.gap.measure import gap_measure, series_of
 from makebreak.gap.recording import Recording
-from makebreak.gap.result import GapResult
+from makebreak.gap.result import GapResult, Unexplained
 from makebreak.gap.screen import Candidate
 from makebreak.gap.select import FLOOR, Selection, select
 from makebreak.gap.touch import TouchModel, touch_candidates
@@ -104,10 +106,68 @@ def _of_windows(model, checks, seconds, lap, say) -> GapResult:
     start, end = selection.start.score, selection.end.score
     verdict = verdict_of(selection.choices, start, end)
     where = where_in_windows(model, model.errors(before)) if verdict != "no_gap" else []
+    rest = unexplained_in_windows(model, after) if verdict == "gap_unnamed" else []
     effects_named = [named(c) for c in selection.choices]
     seconds["simulate"] = lap()
     return GapResult(
         verdict, says(verdict, effects_named, start, end), where, effects_named,
-        gap, [], moved(names, prior, selection), checks,
+        gap, rest, moved(names, prior, selection), checks,
         series_of(model, before, after), selection.table,
     )  # fmt: skip
+
+
+def unexplained_in_windows(
+    model: FreeBodyModel | WindowModel, simulated: Sequence[np.ndarray]
+) -> list[Unexplained]:
+    """Of each channel what is left, while what, and what its size goes with."""
+    errors = model.errors(simulated)
+    used = [k for k, e in enumerate(errors) if len(e)]
+    names = model.channels
+    features: dict[str, list[np.ndarray]] = {}
+    for k in used:
+        w = model.windows[k]
+        recording = model.recordings[w.recording]
+        time = recording.time[w.rows]
+        features.setdefault("time since the window's start", []).append(time - w.start)
+        for c in names:
+            if c.rsplit(".", 1)[-1] in ("x", "y", "z", "position"):
+                y = recording[c][w.rows]
+                good = np.isfinite(y)
+                if good.sum() < 2:
+                    y, good = np.zeros(len(time)), np.ones(len(time), bool)
+                y = np.interp(time, time[good], y[good])
+                features.setdefault(f"the value of {c}", []).append(y)
+                rate = np.gradient(y, time)
+                features.setdefault(f"the rate of {c}", []).append(rate)
+    E = np.concatenate([errors[k] for k in used])
+    out = []
+    for c, name in enumerate(names):
+        size = float(np.sqrt(np.mean(E[:, c] ** 2)))
+        if size < 2.0:
+            continue
+        shares = {
+            what: share_explained(np.concatenate(x), E[:, c])
+            for what, x in features.items()
+        }
+        best = max(shares, key=lambda what: shares[what])
+        goes = "nothing that is measured"
+        if shares[best] > 0.2:
+            goes = f"{best} (it tells {shares[best]:.0%} of its variance)"
+        worst = max(used, key=lambda k: float(np.mean(errors[k][:, c] ** 2)))
+        w = model.windows[worst]
+        region = f"most in episode {w.episode}, from {w.start:.3g} s"
+        out.append(Unexplained(name, region, size, goes))
+    return sorted(out, key=lambda each: -each.size)
+
+
+def share_explained(x: np.ndarray, y: np.ndarray, bins: int = 12) -> float:
+    """Share of the variance of y (n,) that its mean in bins of x (n,) tells, less what
+    chance gives."""
+    if np.std(x) == 0.0 or np.std(y) == 0.0 or len(y) <= bins:
+        return 0.0
+    edges = np.quantile(x, np.linspace(0, 1, bins + 1)[1:-1])
+    group = np.searchsorted(edges, x)
+    count = np.bincount(group, minlength=bins)
+    mean = np.bincount(group, y, minlength=bins) / np.maximum(count, 1)
+    within = float(np.sum((y - mean[group]) ** 2))
+    return 1.0 - within / (len(y) - bins) / float(np.var(y, ddof=1))

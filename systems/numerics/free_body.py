@@ -48,7 +48,7 @@ class FreeBody:
 
 
 def simulate(
-    body: FreeBody, start, times, max_step: float = 0.004, tol: float = 1e-6
+    body: FreeBody, start, times, max_step: float = 0.01, tol: float = 1e-5
 ) -> np.ndarray:
     """(n, 13) at the times (n,), the first of which is that of `start`.
 
