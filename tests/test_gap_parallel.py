@@ -1,0 +1,41 @@
+"""Computations side by side: as one after the other, but for what they leave behind."""
+
+import os
+from functools import partial
+
+import pytest
+
+from makebreak.gap.parallel import side_by_side
+
+
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_results_come_in_the_order_of_the_calls(jobs):
+    # What cannot be sent, a local function, may be called all the same.
+    kept = {"offset": 10}
+    calls = [partial(lambda k: k + kept["offset"], k) for k in range(7)]
+    assert list(side_by_side(calls, jobs)) == list(range(10, 17))
+    assert list(side_by_side([], jobs)) == []
+
+
+def test_calls_run_in_other_processes_and_leave_nothing_behind():
+    seen: list[int] = []
+
+    def call() -> int:
+        seen.append(1)
+        return os.getpid()
+
+    pids = list(side_by_side([call] * 4, 2))
+    assert os.getpid() not in pids and not seen
+    assert list(side_by_side([call] * 2, 1)) == [os.getpid()] * 2 and len(seen) == 2
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_the_first_failure_is_raised_after_the_results_before_it(jobs):
+    def fail():
+        raise ValueError("no such body")
+
+    found = []
+    with pytest.raises(ValueError, match="no such body"):
+        for result in side_by_side([lambda: 1, fail, lambda: 3], jobs):
+            found.append(result)
+    assert found == [1]
