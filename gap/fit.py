@@ -12,6 +12,7 @@ from makebreak.models.effects.kind import Effect, check_parameters
 from makebreak.systems.numerics.selection import LinearFit, Screen
 
 EVALUATIONS = 8
+ROUGH = np.linspace(0.85, 1.15, 16)  # Of a start, tried.
 
 
 class Model(Protocol):
@@ -52,7 +53,9 @@ def fit_effects(
         that stay as they are. evaluations: Gauss-Newton steps at most; else the
         model's own number, which goes with how long its residual takes.
     """
-    fixed = fixed or [()] * len(start)
+    fixed = [tuple(names) for names in fixed or [()] * len(start)]
+    start, rough = _try_rough(model, screen, list(start), fixed)
+    fixed = [(*a, *b) for a, b in zip(fixed, rough, strict=True)]
     steps = evaluations or int(getattr(model, "evaluations", EVALUATIONS))
     free = [
         (i, name)
@@ -112,10 +115,30 @@ def fit_effects(
         spread *= max(np.sqrt(2.0 * solved.cost / len(solved.fun)), 1.0)
         for (i, name), each in zip(free, spread * scale, strict=True):
             std[i][name] = float(each)
+    for each, steps in zip(std, rough, strict=True):
+        each.update(steps)
     b, left = screen.settle(r)
     return Fitted(
         tuple(_tidy(e) for e in effects), tuple(std), r, left, b, screen.judge(r)
     )
+
+
+def _try_rough(model, screen, start: list[Effect], fixed):
+    """Effects with those parameters tried that a gradient is no guide for, each about
+    its start; and of each effect the steps in which that was done, by name."""
+    steps: list[dict[str, float]] = [{} for _ in start]
+    for i, effect in enumerate(start):
+        for name, value in list(effect.parameters.items()):
+            if name in fixed[i] or not KINDS[effect.kind].parameter(name).rough:
+                continue
+            tried = []
+            for v in value * ROUGH:
+                other = Effect(effect.kind, effect.at, {**effect.parameters, name: v})
+                r = model.residual([*start[:i], other, *start[i + 1 :]])
+                tried.append((screen.judge(r).train, other))
+            start[i] = min(tried, key=lambda each: each[0])[1]
+            steps[i][name] = float(value * (ROUGH[1] - ROUGH[0]))
+    return start, steps
 
 
 def _n_rows(screen: Screen) -> int:

@@ -404,7 +404,8 @@ class InverseModel:
 
     def _moved_by(self, k: int, moving: Sequence[Effect]) -> tuple[Motion, np.ndarray]:
         """A track's motion, and the effort that the scene as it came needs for it."""
-        key = (k, *((e.kind, *e.at, *e.parameters.values()) for e in moving))
+        sensed = tuple(_sensing(moving, f"{j}.position") for j in self.joints)
+        key = (k, *sensed) if moving else (k,)
         if key not in self._needed:
             motion = (
                 self.motion(self.tracks[k], moving) if moving else self.motions()[k]

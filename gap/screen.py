@@ -19,7 +19,8 @@ NESTED = {
     "sinusoidal_force": ("constant_force",),
 }
 _DELAYS = (0.004, 0.01, 0.02, 0.04)
-_DRIVEN = ("actuator_saturation", "joint_elasticity", "joint_backlash")
+_ELASTIC = ("joint_elasticity", "joint_backlash")
+_DRIVEN = ("actuator_saturation", *_ELASTIC)
 _HIDDEN = ("object_mass", "object_com", "object_inertia")  # Links': background.
 _SPEEDS = (0.03, 0.06, 0.1, 0.2)
 _RIPPLES = tuple(float(n) for n in range(2, 25)) + (30.0, 36.0, 48.0, 60.0)
@@ -51,10 +52,12 @@ class Ranked:
     valid: bool
 
 
-def candidates(model: InverseModel, nuisance: np.ndarray) -> list[Candidate]:
+def candidates(
+    model: InverseModel, nuisance: np.ndarray, prior: np.ndarray
+) -> list[Candidate]:
     """All that can be seen in the equations of motion.
 
-    Args: nuisance (m, n_b), their columns.
+    Args: nuisance (m, n_b), their columns; prior (n_b,) their standard deviations.
     """
     train = model.train()
 
@@ -62,6 +65,7 @@ def candidates(model: InverseModel, nuisance: np.ndarray) -> list[Candidate]:
         return Columns(x, nuisance, train)
 
     dynamics, motions = model.dynamics, model.motions()
+    worst = _worst_joints(model, nuisance, prior)
     found: list[Candidate] = []
     for kind, entry in KINDS.items():
         if kind in _HIDDEN or entry.at in ("free body", "length", "pair", "ground"):
@@ -78,6 +82,8 @@ def candidates(model: InverseModel, nuisance: np.ndarray) -> list[Candidate]:
             if entry.at == "base" and at == "world":
                 continue
             if kind in _DRIVEN and not _driven(model, at):
+                continue
+            if kind in _ELASTIC and at not in worst:
                 continue
             if kind == "sinusoidal_force" and at not in _links(model)[-1:]:
                 continue  # Of the last link alone: each frequency is a fit of its own.
@@ -186,6 +192,19 @@ def _mass(model: InverseModel, at: str) -> float:
 def _driven(model: InverseModel, joint: str) -> bool:
     i = model.joints.index(joint)
     return model.has["effort_command"][i] or model.has["position_command"][i]
+
+
+def _worst_joints(model: InverseModel, nuisance, prior, most: int = 3) -> list[str]:
+    """Those whose equations are met least, after the background."""
+    train = model.train()
+    _, left = Screen(model.base(), nuisance, prior, train).settle(model.base())
+    names = model.names()
+    size = {
+        joint: float(np.mean(left[k :: len(names)] ** 2))
+        for k, (what, joint) in enumerate(names)
+        if what == "effort" and _driven(model, joint)
+    }
+    return sorted(size, key=lambda joint: -size[joint])[:most]
 
 
 def _one_of(reader: Callable, k: int) -> Callable:

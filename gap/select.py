@@ -83,6 +83,12 @@ def select(
         chosen.append(step)
         current = step["fitted"]
     chosen, current = _backward(model, nuisance, prior, chosen, current, start)
+    if chosen:  # At last, against what all of them leave.
+        screen = Screen(current.r, nuisance, prior, train, current.fit.train)
+        fixed = [c["fixed"] for c in chosen]
+        current = fit_effects(model, screen, current.effects, fixed)
+        for k, choice in enumerate(chosen):
+            choice["ties"] = _still_tied(model, screen, chosen, current, k, start)
     choices = tuple(
         Choice(
             effect, std, c["before"], c["after"], c["runner_up"], c["margin"],
@@ -110,8 +116,12 @@ def _forward(model, nuisance, prior, found, chosen, current, start, say) -> dict
     if not ranked:
         return {"table": []}
     # What even the best leaves is no noise: nuisances are weighed against it.
+    scale = 1.0
     for _ in range(2):
-        screen = Screen(current.r, nuisance, prior, train, ranked[0].fit.train)
+        if ranked[0].fit.train < 1.2 * scale and scale < 1.2 * ranked[0].fit.train:
+            break
+        scale = max(ranked[0].fit.train, 1.0)
+        screen = Screen(current.r, nuisance, prior, train, scale)
         ranked = _sane(rank(screen, open_))
     base = screen.judge(current.r)
     table = [
@@ -123,21 +133,16 @@ def _forward(model, nuisance, prior, found, chosen, current, start, say) -> dict
     short = _shortlist(ranked, base.score)
     if not short:
         return {"table": table}
-    fitted: list[Fitted | None] = []
-    for each in short:
-        trial = [*[c["effect"] for c in chosen], each.effect]
-        fixed = [*[c["fixed"] for c in chosen], each.candidate.fixed]
-        try:
-            fitted.append(fit_effects(model, screen, trial, fixed))
-        except ValueError:
-            fitted.append(None)
-        say(
-            f"  {each.candidate.name}: {fitted[-1].score if fitted[-1] else np.nan:.3g}"
-        )
-    sound = [
-        (f, r) for f, r in zip(fitted, short, strict=True)
-        if f is not None and is_sane(f.effects[-1]) and np.isfinite(f.score)
-    ]  # fmt: skip
+    sound = _fit_each(model, screen, chosen, short, say)
+    for _ in range(2 if len(prior) else 0):
+        least = min((f.fit.train for f, _ in sound), default=scale)
+        if not max(least, 1.0) < 0.8 * scale:
+            break
+        # Exactly fitted less is left: nuisances are weighed against that.
+        scale = max(least, 1.0)
+        screen = Screen(current.r, nuisance, prior, train, scale)
+        base = screen.judge(current.r)
+        sound = _fit_each(model, screen, chosen, [r for _, r in sound], say)
     if not sound:
         return {"table": table}
     blur = PRECISION * start.score
@@ -164,7 +169,7 @@ def _forward(model, nuisance, prior, found, chosen, current, start, say) -> dict
         if inside and near and r.candidate.at == best.candidate.at:
             pick, fit, best = k, inner, r
             break
-    if not error(fit.score) < (1.0 - NESTED_GAIN) * error(base.score):
+    if not error(fit.score) < (1.0 - _least_gain(model)) * error(base.score):
         return {"table": table}
     others = [(f, r) for k, (f, r) in enumerate(sound) if k != pick]
     ties = tuple(
@@ -192,6 +197,37 @@ def _forward(model, nuisance, prior, found, chosen, current, start, say) -> dict
     }
 
 
+def _fit_each(model, screen, chosen, short, say) -> list[tuple[Fitted, Ranked]]:
+    """Each of the short list with what is chosen already; those that make sense."""
+    sound = []
+    for each in short:
+        trial = [*[c["effect"] for c in chosen], each.effect]
+        fixed = [*[c["fixed"] for c in chosen], each.candidate.fixed]
+        try:
+            fit = fit_effects(model, screen, trial, fixed)
+        except ValueError:
+            continue
+        say(f"  {each.candidate.name}: {fit.score:.3g}")
+        if is_sane(fit.effects[-1]) and np.isfinite(fit.score):
+            sound.append((fit, each))
+    return sound
+
+
+def _still_tied(model, screen, chosen, current, k: int, start) -> tuple[Effect, ...]:
+    """Rivals of an effect that do as well as it among all the others."""
+    train, blur = model.train(), PRECISION * start.score
+    fixed = [c["fixed"] for c in chosen]
+    tied = []
+    for rival in chosen[k]["ties"] if len(chosen) > 1 else ():
+        trial = [*current.effects[:k], rival, *current.effects[k + 1 :]]
+        held = [*fixed[:k], (), *fixed[k + 1 :]]
+        fit = fit_effects(model, screen, trial, held)
+        near = np.hypot(fit.score, blur) <= (1.0 + SAME) * np.hypot(current.score, blur)
+        if near and paired(fit.left, current.left, train) > CHANCE:
+            tied.append(fit.effects[k])
+    return tuple(tied) if len(chosen) > 1 else chosen[k]["ties"]
+
+
 def _is_used(fit: Fitted) -> bool:
     """Whether each parameter of the last effect tells: else it is another, smaller
     effect under its name."""
@@ -202,6 +238,11 @@ def _is_used(fit: Fitted) -> bool:
             if not off > 2.0 * std[each.name]:
                 return False
     return True
+
+
+def _least_gain(model: Model) -> float:
+    """What an effect must take off the error, as a share of it."""
+    return getattr(model, "least_gain", NESTED_GAIN)
 
 
 def _sane(ranked: list[Ranked]) -> list[Ranked]:
@@ -234,7 +275,8 @@ def _backward(model, nuisance, prior, chosen, current, start):
             without.append(fit_effects(model, screen, rest, fixed, 5))
         k = int(np.argmin([w.score for w in without]))
         blur = PRECISION * start.score
-        if np.hypot(now, blur) < (1.0 - NESTED_GAIN) * np.hypot(without[k].score, blur):
+        least = (1.0 - _least_gain(model)) * np.hypot(without[k].score, blur)
+        if np.hypot(now, blur) < least:
             break
         chosen = [c for i, c in enumerate(chosen) if i != k]
         current = without[k]

@@ -162,14 +162,18 @@ def _of_mechanism(scene, recordings, checks, seconds, clock, say, jobs) -> GapRe
     say("screening the catalogue")
     plain = Screen(model.base(), nuisance, prior, model.train())
     needed = needs_more(fit_effects(model, plain, ()), prior)
-    found = candidates(model, nuisance) if needed else []
+    found = candidates(model, nuisance, prior) if needed else []
     seconds["screen"] = clock.lap()
     selection = select(model, nuisance, prior, found, say)
     seconds["select"] = clock.lap()
     choices = selection.choices
     start, end = selection.start.score, selection.end.score
     far = not is_plausible(selection.end.b, prior)
-    verdict = verdict_of(choices, start, end, far)
+    # Which blocks are held out is by the clock: some hold next to nothing of the gap.
+    whole = [
+        float(np.sqrt(np.mean(x.left**2))) for x in (selection.start, selection.end)
+    ]
+    verdict = verdict_of(choices, max(start, whole[0]), max(end, whole[1]), far)
     say("simulating held-out windows")
     effects = [c.effect for c in choices]
     background = _background(names, prior, selection)

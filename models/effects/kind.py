@@ -42,6 +42,7 @@ class Parameter:
     neutral: the value that changes nothing; None where that is the model's own value
         (EffectKind.now) or where another parameter must be neutral instead.
     valid: what is refused: "any" number, ">= 0" or "> 0".
+    rough: what it does jumps with it, so that it is found by trying values.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Parameter:
     neutral: float | None = 0.0
     valid: str = "any"
     optional: bool = False
+    rough: bool = False
 
 
 @dataclass(frozen=True)

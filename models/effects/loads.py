@@ -1,6 +1,7 @@
 """Effects on what a mechanism carries and on what it stands: payload, tilt."""
 
 from dataclasses import replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
@@ -123,8 +124,8 @@ def inertial_signature(
 
 
 def _payload_signature(effect, model, motion, grid=None) -> list[Signature]:
-    """Mass and mass times place. What is left out, the payload's own moment of inertia
-    m com^2, is small where |com| is small beside the distance to the joints."""
+    """Mass, mass times place, and the moments of inertia about the origin, which follow
+    from these but are coefficients of their own: so all is linear, and one solution."""
     (body,) = find_bodies(effect, model.plant)[:1]
 
     def to_parameters(c):
@@ -136,12 +137,16 @@ def _payload_signature(effect, model, motion, grid=None) -> list[Signature]:
             "com_z": float(com[2]),
         }
 
-    unknowns = ("mass", "mass_com_x", "mass_com_y", "mass_com_z")
+    moments = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+    unknowns = ("mass", "mass_com_x", "mass_com_y", "mass_com_z", *moments)
     return [
         inertial_signature(
-            effect, model, motion, body, unknowns, np.eye(10, 4), to_parameters, False
+            effect, model, motion, body, unknowns, np.eye(10), to_parameters, False
         )
     ]
+
+
+_columns: WeakKeyDictionary = WeakKeyDictionary()  # Of motions, as long as they are.
 
 
 def _payload_added(effect, model, motion) -> np.ndarray:
@@ -149,8 +154,14 @@ def _payload_added(effect, model, motion) -> np.ndarray:
     mass, com = p["mass"], np.array([p[f"com_{axis}"] for axis in "xyz"])
     inertia = mass * (com @ com * np.eye(3) - np.outer(com, com))
     ten = [mass, *(mass * com), *inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]]
-    bodies = find_bodies(effect, model.plant)
-    return sum(inertial_columns(model, motion, b)[0] @ np.array(ten) for b in bodies)
+    known = _columns.setdefault(motion, {})
+    added = np.zeros_like(motion.v)
+    for body in find_bodies(effect, model.plant):
+        key = (id(model), int(body.index()))
+        if key not in known:
+            known[key] = inertial_columns(model, motion, body)[0]
+        added += known[key] @ np.array(ten)
+    return added
 
 
 # ----- gravity_tilt

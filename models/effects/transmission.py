@@ -247,12 +247,9 @@ def _elasticity_signature(effect, model, motion, grid=None) -> list[Signature]:
     columns = np.zeros((*motion.v.shape, 2))
     for joint in find_joints(effect, model.plant):
         linear = _linear(model, motion, joint)
-        i = joint.velocity_start()
-        tau = motion.effort[:, i] - _rotor(model, joint) * motion.vd[:, i]
-        twist = _smooth(motion.time, tau)
-        late = np.stack([twist[1], twist[2], np.gradient(twist[2], motion.time)])
-        columns[:, :, 0] += linear.effort(twist)
-        columns[:, :, 1] -= linear.effort(late)
+        twist = _carried(model, motion, joint)
+        columns[:, :, 0] += linear.effort(twist[:3])
+        columns[:, :, 1] -= linear.effort(twist[1:])
 
     def to_parameters(c):
         k = 1.0 / max(c[0], 1e-9)  # None, or the wrong way round: rigid.
@@ -267,9 +264,37 @@ def _elasticity_signature(effect, model, motion, grid=None) -> list[Signature]:
 
 
 def _elasticity_added(effect, model, motion) -> np.ndarray:
+    """Of the whole twist, not to first order."""
     k, d = effect.parameters["stiffness"], effect.parameters["damping"]
-    (one,) = _elasticity_signature(effect, model, motion)
-    return one.columns @ np.array([1.0 / k, d / k**2])
+    known = _kept(model, motion)
+    key = (tuple(effect.at), k, d)
+    if key in known:
+        return known[key]
+    q, v, vd = (np.array(x) for x in (motion.q, motion.v, motion.vd))
+    own = np.zeros_like(v)
+    for joint in find_joints(effect, model.plant):
+        i_q, i_v = joint.position_start(), joint.velocity_start()
+        tau = _carried(model, motion, joint)
+        z = tau[:3] / k - d / k**2 * tau[1:]
+        q[:, i_q] -= z[0]
+        v[:, i_v] -= z[1]
+        vd[:, i_v] -= z[2]
+        own[:, i_v] = _rotor(model, joint) * z[2]
+    if "now" not in known:
+        known["now"] = model.inverse_dynamics(
+            motion.q, motion.v, motion.vd, motion.time
+        )
+    now = known["now"]
+    known[key] = model.inverse_dynamics(q, v, vd, motion.time) + own - now
+    return known[key]
+
+
+def _kept(model, motion) -> dict:
+    """What is known of a motion, as long as it is there."""
+    known = _linearised.setdefault(motion, {}).setdefault(id(model), {})
+    if len(known) > 200:
+        known.clear()
+    return known
 
 
 def _backlash_signature(effect, model, motion, grid=None) -> list[Signature]:
@@ -303,27 +328,39 @@ def through_gap(time, needs, M, gap):
     Args: needs (n,) torque that holds the joint on its motor's path; M (n,) its
         inertia. No bounce.
     """
-    n = len(time)
+    n, parts = len(time), 8
     out = np.zeros((3, n))
     z = 0.5 * gap * np.sign(needs[0])
     w = 0.0
     for k in range(n):
         out[0, k], out[1, k] = z, w
-        h = time[k + 1] - time[k] if k + 1 < n else 0.0
-        if h <= 0.0:
+        if k + 1 == n or time[k + 1] <= time[k]:
             continue
+        h = (time[k + 1] - time[k]) / parts
         before = w
-        w += h * needs[k] / M[k]
-        z += h * w
-        if abs(z) >= 0.5 * gap:
-            z, w = 0.5 * gap * np.sign(z), 0.0
-        out[2, k] = (w - before) / h
+        for part in range(parts):
+            T = needs[k] + (needs[k + 1] - needs[k]) * part / parts
+            w += h * T / M[k]
+            z += h * w
+            if abs(z) >= 0.5 * gap:
+                z, w = 0.5 * gap * np.sign(z), 0.0
+        out[2, k] = (w - before) / (h * parts)
     return out
 
 
 def _rotor(model, joint: Joint) -> float:
     old = actuator_of(model.plant, joint)
     return 0.0 if old is None else old.default_reflected_inertia()
+
+
+def _carried(model, motion, joint: Joint) -> np.ndarray:
+    """(4, n) torque through the transmission, smoothed, and three derivatives."""
+    known, i = _kept(model, motion), joint.velocity_start()
+    if (key := ("carried", i)) not in known:
+        tau = motion.effort[:, i] - _rotor(model, joint) * motion.vd[:, i]
+        x = _smooth(motion.time, tau)
+        known[key] = np.concatenate([x, [np.gradient(x[2], motion.time)]])
+    return known[key]
 
 
 def _smooth(time, y) -> np.ndarray:
@@ -337,10 +374,9 @@ def _smooth(time, y) -> np.ndarray:
 
 
 def _linear(model, motion, joint: Joint) -> _Linear:
-    """Kept as long as the motion is."""
-    known = _linearised.setdefault(motion, {})
+    known = _kept(model, motion)
     i_q, i_v = joint.position_start(), joint.velocity_start()
-    key = (id(model), i_v)
+    key = ("linear", i_v)
     if key in known:
         return known[key]
     rotor, h = _rotor(model, joint), 1e-4
@@ -352,7 +388,9 @@ def _linear(model, motion, joint: Joint) -> _Linear:
         vd[:, i_v] += dvd
         return model.inverse_dynamics(q, v, vd, motion.time)
 
-    now = needed()
+    if "now" not in known:
+        known["now"] = needed()
+    now = known["now"]
     M = needed(dvd=1.0) - now  # Linear in the acceleration.
     M[:, i_v] -= rotor
     adds = np.stack([-(needed(dq=h) - now) / h, -(needed(dv=h) - now) / h, -M], axis=2)
@@ -382,7 +420,7 @@ KINDS = {
     ),
     "joint_backlash": EffectKind(
         at="joint",
-        parameters=(Parameter("gap", "rad", 0.0, 0.1, valid=">= 0"),),
+        parameters=(Parameter("gap", "rad", 0.0, 0.1, valid=">= 0", rough=True),),
         says="motor and link of {at} have {gap} of backlash that the model lacks",
         confused_with=("joint_coulomb_friction", "joint_elasticity"),
         tell_apart="reverse with small motions, once without load and once with "
