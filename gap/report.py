@@ -281,8 +281,14 @@ def _numbers(result: GapResult) -> str:
     )
     return (
         f'<div class="numbers">{shown}</div><p class="small">Error over noise, rms '
-        f"over simulated windows of {_n(g.window_s)} s that nothing was fitted to.</p>"
+        f"over {windows_of(result)} that nothing was fitted to.</p>"
     )
+
+
+def windows_of(result: GapResult) -> str:
+    """What the gap was measured over; a length of 0: nothing had to be simulated."""
+    seconds = result.gap.window_s
+    return f"simulated windows of {_n(seconds)} s" if seconds > 0.0 else "samples"
 
 
 # ----- Below it
@@ -318,8 +324,10 @@ def _where(result: GapResult, pictures) -> str:
 def _series(result: GapResult, pictures) -> str:
     if "series" not in pictures:
         return ""
-    note = '<p class="small">Windows that nothing was fitted to; each starts anew from '
-    note += "a measured state.</p>"
+    note = '<p class="small">What nothing was fitted to.'
+    if result.gap.window_s > 0.0:
+        note += " Each window starts anew from a measured state."
+    note += "</p>"
     image = _image(pictures, "series", "Measured and simulated, before and after")
     return _section("Measured, before, after", image + note)
 

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from makebreak.gap.comparison import comparison_html
 from makebreak.gap.recording import read_recordings
-from makebreak.gap.report import summary_lines, write_report
+from makebreak.gap.report import summary_lines, windows_of, write_report
 from makebreak.gap.result import GapResult
 from makebreak.models.scene import read_scene
 from makebreak.scripts.table import Table
@@ -109,7 +109,7 @@ def effects_table(result: GapResult) -> Table:
     g = result.gap
     rows.append(("the whole model", "", "", g.before, g.after, ""))
     note = (
-        f"error: rms over held-out windows of {g.window_s:.3g} s, in units of noise; "
+        f"error: rms over held-out {windows_of(result)}, in units of noise, which is "
     )
-    note += f"noise floor {g.noise_floor:.3g}"
+    note += "what a perfect model would leave"
     return Table("\n".join(summary_lines(result)), columns, rows, notes=[note])
