@@ -97,11 +97,8 @@ def close_the_loop(
     repaired = load_scene(out / "2_gap" / "scene.yaml", DiagramBuilder())
     radius = sphere_radius(repaired.plant, repaired.scene_graph, "ball")
     named = [each["kind"] for each in found["effects"]]
-    contact, gap = (
-        (run[key] for run in (first, second))
-        for key in ("time_to_first_contact_s", "r_gap_error_m")
-    )
-    (contact_1, contact_2), (gap_1, gap_2) = contact, gap
+    contact_1, contact_2 = (r["time_to_first_contact_s"] for r in (first, second))
+    gap_1, gap_2 = (r["r_gap_error_m"] for r in (first, second))
     rows: list[tuple] = [
         ("effects named", "", ", ".join(named) or "none", "object_size"),
         ("radius in the model [mm]", 1e3 * wrong, 1e3 * radius,
