@@ -26,6 +26,7 @@ HIT = 20.0  # A faster change of velocity [m/s2] is an impact; gravity's is half
 BESIDE = 3  # Rows beside an impact that a smoothed state would mix with it.
 BLUR = 0.02  # Laws of contact are approximations, which noise alone does not tell.
 DRAWS = 12  # Of uncertain starts.
+ENOUGH = 30  # Windows up to the first impact: then later ones are not needed.
 FEWEST_ROWS = 8
 _PLACE, _TURN = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 _STATE = (*_TURN, *_PLACE, "wx", "wy", "wz", "vx", "vy", "vz")
@@ -55,6 +56,9 @@ class FreeBodyModel:
     """
 
     diff_step = 2e-3  # Of fits: smaller ones drown in the error of the steps.
+    # What an effect must take off the error. Laws of contact leave so much that none
+    # but the first takes off a tenth.
+    least_gain = 0.05
 
     def __init__(
         self,
@@ -92,6 +96,9 @@ class FreeBodyModel:
             for episode in recording.episodes:
                 self._cut(i, recording, episode, number if total >= 6 else None)
                 number += 1
+        first = [w for w in self.windows if w.after_hits == 0]
+        if len(first) >= ENOUGH and len(first) < len(self.windows):
+            self.windows = first  # Later ones start from states that are less sure.
         if len(self.windows) > most:  # Those before and at early impacts say most.
             order = np.argsort([w.after_hits for w in self.windows], kind="stable")
             self.windows = [self.windows[k] for k in sorted(order[:most])]

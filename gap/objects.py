@@ -57,7 +57,7 @@ def of_objects(
         scene, finding = settle(scene)
         checks = [*checks, *finding]
         many = sum(len(r.episodes) for r in recordings) >= 6
-        model = WindowModel(scene, recordings, DRAKE_SEC, by_episode=many, most=60)
+        model = WindowModel(scene, recordings, DRAKE_SEC, by_episode=many, most=24)
     return _of_windows(model, checks, seconds, lap, say)
 
 
