@@ -497,8 +497,10 @@ ALTERED = {
     "residual_learner": (
         residual_learner, "spread", lambda plain: lambda *a: -plain(*a),
     ),
-    "mode_detector": (mode_detector, "detect", lambda plain: lambda m, tuning, *a: (
-        plain(m, tuning._replace(normal_force_min=0.2), *a))),
+    "mode_detector": (
+        mode_detector, "detect", lambda plain: lambda m, tuning, t, wrench, *a: plain(
+            m, tuning, t, -wrench, *a),
+    ),
     "contact_anticipator": (
         contact_anticipator, "update",
         lambda plain: lambda mean, C, p, R: plain(mean, C, p + 1e-5, R),

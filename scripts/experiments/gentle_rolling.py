@@ -286,14 +286,14 @@ WORSE = {
     "velocity_shaper": ("circles_completed", -1),
     "impedance_controller": ("circles_completed", -1),
 }
-# That is enough for a circle and a touch of the table [s].
-FROZEN_SEEDS, FROZEN_SEC = 3, 30.0
+# Long enough for a touch of the table [s].
+FROZEN_SEEDS, FROZEN_SEC = 3, 20.0
 PEAK_SHARE_MAX, TIME_SHARE_MAX, SUCCESS_MIN = 0.6, 1.25, 0.9
 
 
 def reproduce(session, seeds: int, jobs: int) -> Table:
     """What each half of the systems buys, over seeds 0 .. seeds - 1, and what gets
-    worse within 30 s with each of the seven frozen, over at most three of them."""
+    worse within 20 s with each of the seven frozen, over at most three of them."""
     # Seed by seed: what is there after an interruption can be compared.
     results = run_many(
         "gentle_rolling",
