@@ -7,6 +7,8 @@ from makebreak.systems.numerics.selection import (
     Columns,
     Screen,
     benjamini_hochberg,
+    is_plausible,
+    paired,
     simplest,
 )
 from makebreak.systems.numerics.smoother import smooth
@@ -26,6 +28,36 @@ def test_false_discovery_rate_is_that_of_the_published_example():
 def test_the_simplest_of_equals_is_taken_but_not_a_worse_one():
     assert simplest([1.0, 1.04, 1.2], [3, 1, 1]) == 1
     assert simplest([1.0, 1.06, 1.2], [3, 1, 1]) == 0
+
+
+def test_two_models_that_differ_by_chance_alone_are_told_apart_no_oftener():
+    rng = np.random.default_rng(7)
+    train = np.arange(2000) // 50 % 3 != 1
+    noise, other = rng.normal(size=(2, 400, 2000))
+    p = [
+        paired(a + 0.1 * b, a - 0.1 * b, train)
+        for a, b in zip(noise, other, strict=True)
+    ]
+    assert np.mean(np.array(p) < 0.05) == pytest.approx(0.05, abs=0.035)
+    # A little worse everywhere, and not to be seen in the rms (1 %).
+    lines = np.sin(np.arange(2000) * 0.3)
+    assert paired(noise[0] + 0.2 * lines, noise[0], train) > 1e-3
+    steady = 1.5 * lines
+    assert paired(steady + 0.1 * lines, steady, train) < 1e-4
+    assert paired(noise[0], noise[0], train) == 1.0
+    assert paired(noise[0], noise[1], np.ones(2000, bool)) == 1.0  # One block.
+
+
+def test_nuisances_are_plausible_within_their_prior():
+    rng = np.random.default_rng(3)
+    prior = np.array([0.1, 2.0, 3.0, 0.5])
+    draws = rng.normal(size=(2000, 4)) * prior
+    assert all(is_plausible(b, prior) for b in draws)
+    assert np.mean([is_plausible(b, prior, 0.1) for b in draws]) == pytest.approx(
+        0.9, abs=0.02
+    )
+    assert not is_plausible(np.array([0.6, 0.0, 0.0, 0.0]), prior)  # Six sigma.
+    assert is_plausible([], [])
 
 
 def test_a_screen_fits_as_ridge_regression_does():
