@@ -65,10 +65,11 @@ class Anticipation:
 
 
 def _control() -> ChangingContactConfig:
-    """The defaults, with a lead for what a hint takes to reach the arm: 10 to 20 ms
-    through the estimators, and the 5 ms of the feed-forward's filter."""
+    """The defaults, with a lead for what a hint takes to reach the arm: 5 to 10 ms
+    through the estimators, 1 ms to the arm's law, and the 5 ms of the feed-forward's
+    filter."""
     config = ChangingContactConfig()
-    return replace(config, anticipator=replace(config.anticipator, hint_lead_sec=0.025))
+    return replace(config, anticipator=replace(config.anticipator, hint_lead_sec=0.014))
 
 
 @dataclass

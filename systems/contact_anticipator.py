@@ -182,6 +182,7 @@ class KalmanContactAnticipator(LeafSystem):
                 f"hint_lead_sec is {config.hint_lead_sec}, expected 0 or more"
             )
         self._lead = float(config.hint_lead_sec)
+        self._period = float(config.period_sec)
         self._mass = effective_mass
         belief = self._next_trial(ContactBelief() if knowledge is None else knowledge)
         memory = AnticipatorMemory(belief, np.zeros((0, 5)))
@@ -200,10 +201,13 @@ class KalmanContactAnticipator(LeafSystem):
         )
         for name, calc in (
             ("approach_speed", self._approach_speed),
-            ("mode_hint", self._mode_hint),
             ("status", lambda memory: float(memory.status)),
         ):
             self.DeclareVectorOutputPort(name, 1, partial(self._put, calc), ticket)
+        # Whoever asks between two updates gets the hint of that time.
+        self.DeclareVectorOutputPort(
+            "mode_hint", 1, self._put_hint, ticket | {self.time_ticket()}
+        )
         self.DeclarePeriodicUnrestrictedUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
@@ -225,14 +229,19 @@ class KalmanContactAnticipator(LeafSystem):
         k = next_impact(memory.belief.contacts, IMPACT, segment, p)
         return 0.0 if k is None else memory.belief.contacts[k].approach_speed
 
-    def _mode_hint(self, memory) -> float:
+    def _put_hint(self, context, output):
+        memory = self._memory_of(context)
+        output.SetFromVector([self._mode_hint(memory, context.get_time())])
+
+    def _mode_hint(self, memory, time) -> float:
         if len(memory.history) == 0:
             return -1.0
         p, segment = memory.history[-1, 1:4], int(memory.history[-1, 4])
         best, least = -1.0, np.inf
-        if self._lead > 0.0 and len(memory.history) > 5:
+        if len(memory.history) > 5:
             before, now = memory.history[-6], memory.history[-1]
-            p = p + self._lead * (now[1:4] - before[1:4]) / (now[0] - before[0])
+            ahead = self._lead + min(time - now[0], self._period)
+            p = p + ahead * (now[1:4] - before[1:4]) / (now[0] - before[0])
         for contact in memory.belief.contacts:
             if contact.kind != IMPACTLESS or contact.segment != segment:
                 continue
