@@ -25,6 +25,8 @@ from makebreak.models.effects.kind import one_dof_joints
 from makebreak.models.scene import Scene
 from makebreak.systems.numerics.selection import Screen
 
+# A real object differs from its model in more ways than a mechanism.
+MOST_EFFECTS = 6
 DRAKE_SEC = 0.3  # Windows of scenes that Drake has to simulate.
 
 
@@ -97,7 +99,7 @@ def _of_windows(model, checks, seconds, lap, say) -> GapResult:
     clear = Screen(model.base(), nuisance, prior, model.train()).fit()
     seconds["screen"] = lap()
     selection = select(
-        model, nuisance, prior, found if clear.score > FLOOR else [], say
+        model, nuisance, prior, found if clear.score > FLOOR else [], say, MOST_EFFECTS
     )
     seconds["select"] = lap()
     effects = [c.effect for c in selection.choices]

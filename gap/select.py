@@ -147,8 +147,10 @@ def _forward(model, nuisance, prior, found, chosen, current, start, say) -> dict
         return {"table": table}
     blur = PRECISION * start.score
 
+    floor = getattr(model, "least_error", 0.0)
+
     def error(score: float) -> float:
-        return float(np.hypot(score, blur))
+        return float(np.hypot(max(score, floor), blur))
 
     errors = [error(f.score) for f, _ in sound]
     sizes = [r.candidate.size for _, r in sound]
@@ -179,7 +181,9 @@ def _forward(model, nuisance, prior, found, chosen, current, start, say) -> dict
         and best.candidate.kind not in NESTED.get(r.candidate.kind, ())
         and not (r.candidate.kind == best.candidate.kind)
         and r.candidate.size <= best.candidate.size + MORE
-        and paired(f.left, fit.left, train) > CHANCE
+        and (
+            paired(f.left, fit.left, train) > CHANCE or max(f.score, fit.score) < floor
+        )
         and _is_used(f)
     )
     runner = min(others, key=lambda o: o[0].score, default=None)

@@ -36,7 +36,7 @@ def scene(tmp_path_factory):
         Effect("contact_dissipation", [PAIR], {"dissipation": 4.0}),
         Effect("object_mass", ["cube.cube"], {"mass": 0.5}),
         Effect("object_com", ["cube"], {"x": 0.003, "z": -0.002}),
-        Effect("object_inertia", ["cube.cube"], {"ixx": 9e-4, "iyy": 8e-4, "izz": 7e-4}),
+        Effect("object_inertia", ["cube"], {"ixx": 9e-4, "iyy": 8e-4, "izz": 7e-4}),
         Effect("object_size", ["cube.cube"], {"scale": 1.05}),
         Effect("corner_radius", ["cube.cube"], {"radius": 0.006}),
         Effect("plane_height", ["ground.ground"], {"height": 0.004}),

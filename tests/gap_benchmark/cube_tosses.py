@@ -5,10 +5,10 @@
     python tests/gap_benchmark/cube_tosses.py DATA.npz OUT --judge OUT/gap/scene.yaml
 
 The first writes scene.yaml with the published values and no effects, and fit.csv of 40
-tosses: time and poses alone, as the velocities of the data are filtered differences. The
-last simulates 200 others in Drake, from states fitted to their free flight, and prints
-the rms over the 8 corners and the first 100 ms after touch, each error capped at 60 mm,
-of the scene as it came and of the one given.
+tosses: time and poses alone, as the velocities of the data are filtered differences.
+The last simulates 200 others in Drake, from states fitted to their free flight, and
+prints the rms over the 8 corners and the first 100 ms after touch, each error capped at
+60 mm, of the scene as it came and of the one given.
 """
 
 import argparse
@@ -102,8 +102,8 @@ def convert(data: Path, out: Path) -> None:
     (out / "board.sdf").write_text(
         _model(
             "board",
-            '<collision name="top"><pose>0 0 -0.25 0 0 0</pose><geometry><box><size>4 4 '
-            f"0.5</size></box></geometry>{_surface()}</collision>",
+            '<collision name="top"><pose>0 0 -0.25 0 0 0</pose><geometry><box>'
+            f"<size>4 4 0.5</size></box></geometry>{_surface()}</collision>",
         )
     )
     (out / "scene.yaml").write_text(
@@ -123,8 +123,8 @@ def convert(data: Path, out: Path) -> None:
             rows.append(np.column_stack([t, episode, q, p]))
     header = ",".join(["time", "episode", *POSE])
     np.savetxt(
-        out / "fit.csv", np.concatenate(rows), delimiter=",", header=header, comments="",
-        fmt="%.9g",
+        out / "fit.csv", np.concatenate(rows), delimiter=",", header=header,
+        comments="", fmt="%.9g",
     )  # fmt: skip
 
 
