@@ -575,10 +575,11 @@ PIECE_SEC, PIECE_ROWS, PIECE_FEWEST = 12.0, 20_000, 100
 def excerpt(
     recordings: Sequence[Recording], most_sec: float, most_rows: int
 ) -> list[Recording]:
-    """Recordings of no more than so much time [s] and so many rows together: evenly
-    spread pieces of 12 s or 20 000 rows, or whole episodes where they are shorter.
+    """Recordings of no more than so much time [s] and so many rows together, to within
+    half a piece.
 
-    Noise and notes are those of the whole.
+    Pieces are of 12 s or 20 000 rows, or whole episodes where these are shorter, evenly
+    spread. Noise and notes are those of the whole.
     """
     seconds = sum(r.duration_sec() for r in recordings)
     share = min(
@@ -592,7 +593,9 @@ def excerpt(
         for episode in recording.episodes
         for piece in _pieces(recording, episode)
     ]
-    n = max(int(share * len(pieces)), 1)
+    n = max(round(share * len(pieces)), 1)
+    if n == len(pieces):  # A little too long: nothing is gained by cutting it.
+        return list(recordings)
     kept = [pieces[int((k + 0.5) * len(pieces) / n)] for k in range(n)]
     out = []
     for i, recording in enumerate(recordings):
