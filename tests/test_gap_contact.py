@@ -118,3 +118,73 @@ def test_a_flying_and_bouncing_cube_without_a_gap_gets_no_effect(tmp_path):
     result = run_gap(tmp_path / "scene.yaml", [tmp_path / "recording.csv"])
     assert result.verdict == "no_gap"
     assert result.effects == []
+
+
+def _gantry(folder: Path, modelled: float) -> Path:
+    """A tip of 20 mm on two slides, x and z, over a ball of the modelled radius."""
+    scene = _ball_scene(folder)
+    ball = folder / "ball.sdf"
+    ball.write_text(
+        ball.read_text().replace(f"<radius>{RADIUS}", f"<radius>{modelled}")
+    )
+    surface = ball.read_text().split("</geometry>")[1].split("</collision>")[0]
+    link = (
+        "<link name='{}'><inertial><mass>1</mass><inertia><ixx>1e-3</ixx>"
+        "<iyy>1e-3</iyy><izz>1e-3</izz></inertia></inertial>{}</link>"
+    )
+    tip = (
+        "<collision name='c'><geometry><sphere><radius>0.02</radius></sphere>"
+        f"</geometry>{surface}</collision>"
+    )
+    joint = (
+        "<joint name='{0}' type='prismatic'><parent>{1}</parent><child>{2}</child>"
+        "<axis><xyz>{3}</xyz></axis></joint>"
+    )
+    (folder / "gantry.sdf").write_text(
+        '<sdf version="1.9"><model name="gantry"><link name="base"/>'
+        + link.format("cart", "") + link.format("tip", tip)
+        + joint.format("x", "base", "cart", "1 0 0")
+        + joint.format("z", "cart", "tip", "0 0 1") + "</model></sdf>"
+    )  # fmt: skip
+    more = (
+        "  - add_model: {name: gantry, file: gantry.sdf}\n"
+        "  - add_weld: {parent: world, child: gantry::base}\n"
+    )
+    scene.write_text(scene.read_text().replace("plant:", more + "plant:"))
+    return scene
+
+
+def test_a_ball_that_is_touched_is_measured_by_it(tmp_path):
+    true, modelled, tip, k = 0.04, 0.043, 0.02, 1e5  # Two surfaces of 2e5 in a row.
+    scene = _gantry(tmp_path, modelled)
+    rng = np.random.default_rng(0)
+    t = np.arange(0.0, 20.0, 0.02)
+    touching = (t % 2.0) > 0.8
+    force = np.where(touching, rng.uniform(2.0, 8.0, len(t)), 0.0)
+    # The tip comes from all angles up to 60 degrees from above.
+    angle = np.deg2rad(60.0) * np.sin(0.9 * t)
+    x = 0.05 * np.sin(0.3 * t)
+    reach = true + tip - force / k + np.where(touching, 0.0, 0.02)
+    table = {
+        "time": t,
+        "gantry.x.position": x + reach * np.sin(angle) + 2e-5 * rng.normal(size=len(t)),
+        "gantry.z.position": true + reach * np.cos(angle)
+        + 2e-5 * rng.normal(size=len(t)),
+        "ball.ball.x": x + 1e-4 * rng.normal(size=len(t)),
+        "ball.ball.y": 1e-4 * rng.normal(size=len(t)),
+        "gantry.tip.fx": force * np.sin(angle) + 0.03 * rng.normal(size=len(t)),
+        "gantry.tip.fy": 0.03 * rng.normal(size=len(t)),
+        "gantry.tip.fz": force * np.cos(angle) + 0.03 * rng.normal(size=len(t)),
+    }  # fmt: skip
+    file = tmp_path / "touched.csv"
+    np.savetxt(
+        file, np.column_stack(list(table.values())), delimiter=",", comments="",
+        fmt="%.9g", header=",".join(table),
+    )  # fmt: skip
+    result = run_gap(scene, [file])
+    (effect,) = result.effects
+    assert (effect.kind, effect.at) == ("object_size", ("ball.ball",))
+    # Positions of 0.1 mm, hundreds of them, from angles that tell size from height.
+    assert effect.parameters["radius"].value == pytest.approx(true, abs=5e-5)
+    assert result.gap.after < 0.2 * result.gap.before
+    assert result.where
