@@ -271,14 +271,17 @@ class _RecordingSession(Session):
         initial = kwargs["context"].Clone()
         recorder = _Recorder(diagram, self._wanted, self._seconds, initial)
         self.recorders.append(recorder)
-        if self._wanted:  # Else the whole run: a later simulation may have more.
+        # One without a label is the only one of its run; of several, a later one may
+        # have systems that no earlier one has, and may need the earlier one's end.
+        only = not kwargs.get("label")
+        if self._wanted or only:
             duration_sec = min(duration_sec, self._seconds)
         with observed(recorder):
             log = super().simulate(diagram, duration_sec, record, *args, **kwargs)
         if log.interrupted:
             raise KeyboardInterrupt
         there = {n for r in self.recorders for n in r.tracks}
-        if self._wanted and there >= set(self._wanted):
+        if only or (self._wanted and there >= set(self._wanted)):
             raise _Done
         return log
 
@@ -297,7 +300,8 @@ def export_tests(
         name, module, config: of the experiment.
         out: folder to be made; it must not exist, or be empty.
         wanted: names of systems in the experiment's diagram, which is then run no
-            longer than needed; empty: all that update, and the whole experiment is run.
+            longer than needed; empty: all that update, and an experiment of several
+            simulations is run to its end.
         seconds: how long is recorded [s].
     Returns: {system: number of updates}, and {system: why it was left out}.
     Raises: ValueError for a folder that is in use, an unknown system, a system that
