@@ -127,8 +127,8 @@ def _trials(model, kind: str, at: str):
         steps = _PLUS[kind]
         base = {p.name: now.get(p.name, 0.0) for p in KINDS[kind].parameters}
         if len(steps) == 1:
-            ((name, values),) = steps.items()
-            yield ([[(d, {**base, name: base[name] + d})] for d in values], (name,), ())
+            ((name, tried),) = steps.items()
+            yield ([[(d, {**base, name: base[name] + d})] for d in tried], (name,), ())
         else:
             yield (
                 [[(d, {**base, n: base[n] + d}) for n, (d,) in steps.items()]],

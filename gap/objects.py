@@ -143,19 +143,19 @@ def unexplained_in_windows(
                 features.setdefault(f"the rate of {c}", []).append(rate)
     E = np.concatenate([errors[k] for k in used])
     out = []
-    for c, name in enumerate(names):
-        size = float(np.sqrt(np.mean(E[:, c] ** 2)))
+    for i, name in enumerate(names):
+        size = float(np.sqrt(np.mean(E[:, i] ** 2)))
         if size < 2.0:
             continue
         shares = {
-            what: share_explained(np.concatenate(x), E[:, c])
+            what: share_explained(np.concatenate(x), E[:, i])
             for what, x in features.items()
         }
         best = max(shares, key=lambda what: shares[what])
         goes = "nothing that is measured"
         if shares[best] > 0.2:
             goes = f"{best} (it tells {shares[best]:.0%} of its variance)"
-        worst = max(used, key=lambda k: float(np.mean(errors[k][:, c] ** 2)))
+        worst = max(used, key=lambda k: float(np.mean(errors[k][:, i] ** 2)))
         w = model.windows[worst]
         region = f"most in episode {w.episode}, from {w.start:.3g} s"
         out.append(Unexplained(name, region, size, goes))
