@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gap_benchmark.double_pendulum import convert
+from measured.double_pendulum import convert
 
 from makebreak.gap.judge import judge
 from makebreak.gap.recording import read_recordings

@@ -1,6 +1,6 @@
 """Scene and recordings of the DFKI double pendulum, from its npz, for the workflow.
 
-    python tests/gap_benchmark/double_pendulum.py DATA.npz OUT
+    python tests/measured/double_pendulum.py DATA.npz OUT
 
 writes OUT/scene.yaml with the published inertias and no friction, and run_<nn>.csv of
 each run: time, positions, velocities and the motors' measured effort.

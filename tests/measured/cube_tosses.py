@@ -1,8 +1,8 @@
 """Scene and recording of measured tosses of a cube, from their npz, and the judge.
 
-    python tests/gap_benchmark/cube_tosses.py DATA.npz OUT
+    python tests/measured/cube_tosses.py DATA.npz OUT
     makebreak gap OUT/scene.yaml OUT/fit.csv --out OUT/gap
-    python tests/gap_benchmark/cube_tosses.py DATA.npz OUT --judge OUT/gap/scene.yaml
+    python tests/measured/cube_tosses.py DATA.npz OUT --judge OUT/gap/scene.yaml
 
 The first writes scene.yaml with the published values and no effects, and fit.csv of 40
 tosses: time and poses alone, as the velocities of the data are filtered differences.
