@@ -13,6 +13,7 @@ import numpy as np
 
 from makebreak.diagrams.free_body import FreeBodyScene
 from makebreak.gap.recording import Episode, Recording
+from makebreak.gap.windows import WindowedResidual
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
@@ -48,7 +49,7 @@ class Window:
     after_hits: int  # Impacts of the episode before it.
 
 
-class FreeBodyModel:
+class FreeBodyModel(WindowedResidual):
     """Residuals of windows of one free body, as InverseModel gives those of mechanisms.
 
     Raises: ValueError where scene or recordings hold anything else (FreeBodyScene); the
@@ -112,7 +113,6 @@ class FreeBodyModel:
             np.median([recordings[w.recording].time[w.rows][-1] - w.start
                        for w in self.windows])
         )  # fmt: skip
-        self._base: np.ndarray | None = None
         self.runs = 0
 
     def _most(self, channel: str, size: float) -> float:
@@ -288,22 +288,6 @@ class FreeBodyModel:
             e = e / np.sqrt(1.0 + (e / self._cap) ** 2)
             out.append(np.where(np.isfinite(seen), e / std, 0.0))
         return out
-
-    # ----- As InverseModel
-
-    def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
-        return np.concatenate([e.ravel() for e in self.errors(self.simulate(effects))])
-
-    def base(self) -> np.ndarray:
-        if self._base is None:
-            self._base = self.residual()
-        return self._base
-
-    def train(self) -> np.ndarray:
-        k = len(self.channels)
-        return np.concatenate(
-            [np.full((w.rows.stop - w.rows.start) * k, w.train) for w in self.windows]
-        )
 
 
 def _root(P: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ by their block of time before anything is fitted.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -38,7 +39,40 @@ class Window:
     train: bool
 
 
-class WindowModel:
+class WindowedResidual:
+    """The residual of a model compared window by window, and which of it is
+    fitted: what a fit asks of a model (gap/fit.py).
+
+    A model has `channels`, `windows` (each with `rows` and `train`),
+    `simulate(effects)` and `errors(simulated)`, a list of (n, channels) per window.
+    """
+
+    channels: list[str]
+    windows: Sequence[Any]
+    _base: np.ndarray | None = None
+
+    def simulate(self, effects: Sequence[Effect]) -> Sequence[np.ndarray]:
+        raise NotImplementedError
+
+    def errors(self, simulated: Sequence[np.ndarray]) -> list[np.ndarray]:
+        raise NotImplementedError
+
+    def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
+        return np.concatenate([e.ravel() for e in self.errors(self.simulate(effects))])
+
+    def base(self) -> np.ndarray:
+        if self._base is None:
+            self._base = self.residual()
+        return self._base
+
+    def train(self) -> np.ndarray:
+        k = len(self.channels)
+        return np.concatenate(
+            [np.full((w.rows.stop - w.rows.start) * k, w.train) for w in self.windows]
+        )
+
+
+class WindowModel(WindowedResidual):
     """Residuals of simulated windows: the same questions as InverseModel answers, for
     scenes with free bodies and contact, and for judging any scene.
 
@@ -109,7 +143,6 @@ class WindowModel:
                 f"no episode of the recordings holds a window of {window_sec} s"
             )
         self._commands = self._all_commands()
-        self._base: np.ndarray | None = None
         self.runs = 0
 
     # ----- Cutting
@@ -306,22 +339,6 @@ class WindowModel:
             e = np.where(np.isfinite(seen), np.where(np.isfinite(y), e, np.inf), 0.0)
             out.append(np.clip(e, -LARGEST, LARGEST))
         return out
-
-    # ----- As InverseModel
-
-    def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
-        return np.concatenate([e.ravel() for e in self.errors(self.simulate(effects))])
-
-    def base(self) -> np.ndarray:
-        if self._base is None:
-            self._base = self.residual()
-        return self._base
-
-    def train(self) -> np.ndarray:
-        k = len(self.channels)
-        return np.concatenate(
-            [np.full((w.rows.stop - w.rows.start) * k, w.train) for w in self.windows]
-        )
 
 
 _MEASUREMENT = ("joint_offset", "sensor_delay", "clock_skew", "sensor_bias",
