@@ -251,7 +251,6 @@ def _together(parts: list[Relation]) -> Relation | None:
     bias, bias_std = mean("bias")
     lag, lag_std = mean("lag")
     skew, skew_std = mean("skew")
-    rms = [np.sqrt(np.mean([getattr(p, k) ** 2 for p in parts])) for k in ("residual",)]
     return Relation(
         scale=scale,
         scale_std=scale_std,
@@ -261,7 +260,7 @@ def _together(parts: list[Relation]) -> Relation | None:
         lag_std=lag_std,
         skew=skew,
         skew_std=skew_std,
-        residual=float(rms[0]),
+        residual=float(np.sqrt(np.mean([p.residual**2 for p in parts]))),
         signal=float(np.sqrt(np.mean([p.signal**2 for p in parts]))),
         period=parts[0].period,
     )

@@ -13,7 +13,7 @@ import numpy as np
 
 from makebreak.diagrams.free_body import FreeBodyScene
 from makebreak.gap.recording import Episode, Recording
-from makebreak.gap.windows import WindowedResidual
+from makebreak.gap.windows import TURN, WindowedResidual, spin_of
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
@@ -29,8 +29,8 @@ BLUR = 0.02  # Laws of contact are approximations, which noise alone does not te
 DRAWS = 12  # Of uncertain starts.
 ENOUGH = 30  # Windows up to the first impact: then later ones are not needed.
 FEWEST_ROWS = 8
-_PLACE, _TURN = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
-_STATE = (*_TURN, *_PLACE, "wx", "wy", "wz", "vx", "vy", "vz")
+_PLACE = ("x", "y", "z")
+_STATE = (*TURN, *_PLACE, "wx", "wy", "wz", "vx", "vy", "vz")
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class FreeBodyModel(WindowedResidual):
         self.dynamics = SceneDynamics(scene)
         if not all(f"{self.name}.{a}" in r for a in _PLACE for r in recordings):
             raise ValueError(f"expected x, y and z of {self.name} in all recordings")
-        self._turns = all(f"{self.name}.{a}" in r for a in _TURN for r in recordings)
+        self._turns = all(f"{self.name}.{a}" in r for a in TURN for r in recordings)
         if not self._turns and (len(self._body.spheres) > 1 or self._body.com.any()):
             raise ValueError(f"expected the orientation of {self.name}")
         self.channels = [
@@ -119,12 +119,12 @@ class FreeBodyModel(WindowedResidual):
         what = channel.rsplit(".", 1)[-1]
         if what in _PLACE:
             return size
-        return 0.5 if what in _TURN else (20.0 * size if what[0] == "v" else 20.0)
+        return 0.5 if what in TURN else (20.0 * size if what[0] == "v" else 20.0)
 
     # ----- Cutting
 
     def _signals(self) -> list[str]:
-        turns = _TURN if self._turns else ()
+        turns = TURN if self._turns else ()
         return [f"{self.name}.{a}" for a in (*turns, *_PLACE)]
 
     def _cut(self, i: int, recording: Recording, episode: Episode, number) -> None:
@@ -157,7 +157,7 @@ class FreeBodyModel(WindowedResidual):
         states = np.zeros((n, 7, 3))
         spreads = np.zeros((n, 7, 2, 2))
         states[:, 0, 0] = 1.0
-        for k, name in enumerate((*_TURN, *_PLACE)):
+        for k, name in enumerate((*TURN, *_PLACE)):
             c = f"{self.name}.{name}"
             if c in values:
                 s = smooth(time[a:b], values[c][a:b], recording.channels[c].noise)
@@ -247,7 +247,7 @@ class FreeBodyModel(WindowedResidual):
         q = state[:4, 0] / np.linalg.norm(state[:4, 0])
         dq = state[:4, 1] - q * (q @ state[:4, 1])
         place, velocity = state[4:, 0] / length, state[4:, 1] / length
-        spin = 2.0 * _product(dq, q * np.array([1.0, -1, -1, -1]))
+        spin = spin_of(q, dq)
         if not self._turns:
             radius = body.spheres[0, 3]
             if lowest_gap(body, np.concatenate([q, place])) < 0.03 * radius:
@@ -278,7 +278,7 @@ class FreeBodyModel(WindowedResidual):
 
     def _errors(self, simulated, stds) -> list[np.ndarray]:
         out = []
-        turn = [k for k, c in enumerate(self.channels) if c.rsplit(".", 1)[1] in _TURN]
+        turn = [k for k, c in enumerate(self.channels) if c.rsplit(".", 1)[1] in TURN]
         for std, y, seen in zip(stds, simulated, self._seen, strict=True):
             if turn:  # q and -q are one orientation.
                 same = np.sign(np.nansum(y[:, turn] * seen[:, turn], axis=1))
@@ -294,8 +294,3 @@ def _root(P: np.ndarray) -> np.ndarray:
     """L with L L' = P (2, 2), also where P is singular."""
     w, u = np.linalg.eigh(P)
     return u * np.sqrt(np.maximum(w, 0.0))
-
-
-def _product(a, b) -> np.ndarray:
-    """Vector part of the quaternion product."""
-    return a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])

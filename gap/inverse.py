@@ -64,14 +64,6 @@ class Track:
     train: np.ndarray  # (n_bumps,)
 
 
-@dataclass(frozen=True)
-class RowName:
-    """What an entry of the residual is."""
-
-    what: str  # "effort", "velocity" or "effort_measured"
-    joint: str
-
-
 class _Dynamics(SceneDynamics):
     """Remembers how bodies moved: a dozen kinds ask for it."""
 

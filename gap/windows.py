@@ -20,7 +20,7 @@ from makebreak.models.scene import InitialSection, Scene
 from makebreak.systems.numerics.smoother import smooth
 
 _POSITIONS = ("x", "y", "z")
-_TURNS = ("qw", "qx", "qy", "qz")
+TURN = ("qw", "qx", "qy", "qz")
 _G = 9.81
 LARGEST = 200.0  # An error beyond so many standard deviations counts as this: after a
 # bounce the other way, how much farther it goes says nothing.
@@ -156,7 +156,7 @@ class WindowModel(WindowedResidual):
                 if all(f"{body}.{axis}" in r for r in self.recordings)
             ]  # fmt: skip
             names += [
-                f"{body}.{q}" for q in _TURNS
+                f"{body}.{q}" for q in TURN
                 if all(f"{body}.{q}" in r for r in self.recordings)
             ]  # fmt: skip
         return names
@@ -217,7 +217,7 @@ class WindowModel(WindowedResidual):
         """Noise of a sample, and of where a window's start is, carried along."""
         at, quantity = name.rsplit(".", 1)
         extra = np.zeros(len(after))
-        if quantity in ("position", "x", "y", "z", *_TURNS) and name in spreads:
+        if quantity in ("position", "x", "y", "z", *TURN) and name in spreads:
             P = spreads[name][k]
             extra = P[0, 0] + 2.0 * after * P[0, 1] + after**2 * P[1, 1]
         elif quantity == "velocity":
@@ -225,7 +225,7 @@ class WindowModel(WindowedResidual):
         elif quantity in ("vx", "vy", "vz"):
             extra += spreads[f"{at}.{quantity[1]}"][k][1, 1]
         elif quantity in ("wx", "wy", "wz") and f"{at}.qw" in spreads:
-            extra += 4.0 * np.mean([spreads[f"{at}.{q}"][k][1, 1] for q in _TURNS])
+            extra += 4.0 * np.mean([spreads[f"{at}.{q}"][k][1, 1] for q in TURN])
         return np.sqrt(self.noise[c] ** 2 + np.maximum(extra, 0.0))
 
     def _all_commands(self) -> list[dict[int, Commands]]:
@@ -313,10 +313,10 @@ class WindowModel(WindowedResidual):
                     place[i, 0] = self.scene.initial.poses[body][4 + i]
             q, dq = np.array([1.0, 0, 0, 0]), np.zeros(4)
             if f"{body}.qw" in w.state:
-                turn = np.array([state(f"{body}.{a}") for a in _TURNS])
+                turn = np.array([state(f"{body}.{a}") for a in TURN])
                 size = np.linalg.norm(turn[:, 0])
                 q, dq = turn[:, 0] / size, turn[:, 1] / size
-            spin = 2.0 * _product(dq, q * np.array([1, -1, -1, -1]))[1:]
+            spin = spin_of(q, dq)
             initial.poses[body] = [*map(float, q), *map(float, place[:, 0])]
             initial.body_velocities[body] = [
                 *map(float, spin),
@@ -360,8 +360,7 @@ def _length_scale(effects, body: str) -> float:
     return scale
 
 
-def _product(a, b) -> np.ndarray:
-    w, x = a[0], a[1:]
-    return np.array(
-        [w * b[0] - x @ b[1:], *(w * b[1:] + b[0] * x + np.cross(x, b[1:]))]
-    )
+def spin_of(q, dq) -> np.ndarray:
+    """(3,) rate of turn in the world [rad/s], of a unit quaternion (4,) wxyz and its
+    rate: the vector part of 2 dq q*. What of dq lies along q does not count."""
+    return 2.0 * (q[0] * dq[1:] - dq[0] * q[1:] - np.cross(dq[1:], q[1:]))
