@@ -245,6 +245,7 @@ class SceneSimulation:
         commands: Commands = NO_COMMANDS,
         start_sec: float | None = None,
         initial_is_true: bool = False,
+        twists: Mapping[str, tuple[float, float]] | None = None,
     ) -> np.ndarray:
         """What the channels would measure, (n, n_channels) [SI].
 
@@ -257,6 +258,8 @@ class SceneSimulation:
             channels: of `channels()`.
             start_sec: the first of `times` if None.
             initial_is_true: whether `initial` has no offsets, biases and scales.
+            twists: {joint: (twist, its rate)} at the start, of joints behind an
+                elastic element or a gap; those not named start as at rest.
         Returns: NaN from where Drake could not go on (`failure` then says why), and
             where the time that a sample shows is before the window.
         Raises: ValueError for an unknown channel, joint, body or command.
@@ -274,7 +277,9 @@ class SceneSimulation:
         needed = needed[needed >= start - 1e-9]
         self._set_commands(commands)
         efforts = any(self._channels[channel][0] == "effort" for channel in channels)
-        x, effort = self._simulate(initial, start, needed, initial_is_true, efforts)
+        x, effort = self._simulate(
+            initial, start, needed, initial_is_true, efforts, twists or {}
+        )
         if not self.failure and not np.isfinite(x).all():
             self.failure = "the state grew beyond all numbers"
         x[~np.isfinite(x).all(axis=1)] = np.nan
@@ -510,9 +515,9 @@ class SceneSimulation:
                 x[n_q + b.velocity_start()] = x[n_q + a.velocity_start()]
         plant.SetPositionsAndVelocities(self._plant_context, x)
 
-    def _untwist(self, initial: InitialSection) -> None:
-        """A motor leads its link as it would at rest under its effort: by effort over
-        stiffness, or by half the gap."""
+    def _untwist(self, initial: InitialSection, twists) -> None:
+        """A motor leads its link by the given twist; else as it would at rest under its
+        effort: by effort over stiffness, or by half the gap."""
         plant = self._plant
         for effect in self._current:
             if not KINDS[effect.kind].hidden_state:
@@ -525,26 +530,34 @@ class SceneSimulation:
                 assert motor is not None and path.effort is not None
                 if full_name(plant, motor) in initial.positions:
                     continue
-                own = path.path.GetMyContextFromRoot(self._context)
-                names = [
-                    full_name(plant, a.joint())
-                    for a in actuators_of_model(plant, model)
-                ]
-                effort = path.effort.Eval(own)[names.index(name)]
-                if effect.kind == "joint_elasticity":
-                    twist = effort / effect.parameters["stiffness"]
+                if name in twists:
+                    twist, rate = twists[name]
                 else:
-                    twist = np.sign(effort) * effect.parameters["gap"] / 2.0
-                q = plant.GetPositions(self._plant_context)
+                    twist, rate = self._rest_twist(effect, name, path), 0.0
+                x = plant.GetPositionsAndVelocities(self._plant_context)
+                side, sign = joint, -1.0
                 if self._channels[f"{name}.position"][1] == joint.position_start():
-                    q[motor.position_start()] += twist
-                else:
-                    q[joint.position_start()] -= twist
-                plant.SetPositions(self._plant_context, q)
+                    side, sign = motor, 1.0
+                x[side.position_start()] += sign * twist
+                x[plant.num_positions() + side.velocity_start()] += sign * rate
+                plant.SetPositionsAndVelocities(self._plant_context, x)
+
+    def _rest_twist(self, effect: Effect, name: str, path) -> float:
+        own = path.path.GetMyContextFromRoot(self._context)
+        model = name.split(".")[0]
+        names = [
+            full_name(self._plant, a.joint())
+            for a in actuators_of_model(self._plant, model)
+        ]
+        effort = path.effort.Eval(own)[names.index(name)]
+        if effect.kind == "joint_elasticity":
+            return effort / effect.parameters["stiffness"]
+        return np.sign(effort) * effect.parameters["gap"] / 2.0
 
     def _simulate(
-        self, initial, start: float, needed: np.ndarray, is_true: bool, efforts: bool
-    ):
+        self, initial, start: float, needed: np.ndarray, is_true: bool,
+        efforts: bool, twists,
+    ):  # fmt: skip
         """States (n, n_x) at the needed times, and efforts {model: (n, n_u)} if they
         are asked for. What changes at such a time has changed in them."""
         self.failure = ""
@@ -558,7 +571,7 @@ class SceneSimulation:
         self._set_state(initial, is_true)
         self._write_commands(start)
         self._start_lags(start)
-        self._untwist(initial)
+        self._untwist(initial, twists)
         if self._log is not None:
             self._log.Clear()
         else:

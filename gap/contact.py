@@ -4,6 +4,7 @@ Each kind is tried at a few values; what a value changes in all windows, over th
 is its column.
 """
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -25,10 +26,10 @@ _TIMES = {
 _PLUS: dict[str, dict[str, tuple[float, ...]]] = {
     "rolling_resistance": {"coefficient": (0.005,)},
     "plane_height": {"height": (-0.004, -0.0005, 0.004)},
-    "plane_tilt": {"roll": (0.003,), "pitch": (0.003,)},
+    "plane_tilt": dict.fromkeys(("roll", "pitch"), (0.003, 0.02)),
     "corner_radius": {"radius": (0.002, 0.005)},
-    "object_com": {"x": (0.001,), "y": (0.001,), "z": (0.001,)},
-    "constant_force": {"fx": (0.01,), "fy": (0.01,), "fz": (0.01,)},
+    "object_com": dict.fromkeys("xyz", (0.001, 0.006)),
+    "constant_force": dict.fromkeys(("fx", "fy", "fz"), (0.01, 0.3)),
 }
 _POSITIVE = dict.fromkeys(
     ("friction", "stiffness", "dissipation", "mass", "radius", "scale", "ixx", "iyy",
@@ -129,9 +130,17 @@ def _trials(model, kind: str, at: str):
         if len(steps) == 1:
             ((name, tried),) = steps.items()
             yield ([[(d, {**base, name: base[name] + d})] for d in tried], (name,), ())
-        else:
+        else:  # The small steps; and large ones in all directions, each on its own.
+            each = [tuple(d for d, _ in steps.values())]
+            for signs in itertools.product((1.0, -1.0), repeat=len(steps)):
+                each.append(
+                    tuple(
+                        s * d for s, (_, d) in zip(signs, steps.values(), strict=True)
+                    )
+                )
             yield (
-                [[(d, {**base, n: base[n] + d}) for n, (d,) in steps.items()]],
+                [[(d, {**base, n: base[n] + d}) for n, d in zip(steps, e, strict=True)]
+                 for e in each],
                 tuple(steps), (),
             )  # fmt: skip
 
@@ -148,10 +157,14 @@ def _of(model, nuisance, kind, at, trials, names, fixed, there, r) -> Candidate 
     now |= model.dynamics.now(kind, [at])
     columns, readers = [], []
     reach = _reach(trials, names, now)
+    known: dict[tuple, np.ndarray | None] = {}
     for trial in trials:
         made = []
         for step, parameters in trial:
-            moved = _residual(model, *there, Effect(kind, [at], parameters))
+            key = tuple(parameters.items())
+            if key not in known:
+                known[key] = _residual(model, *there, Effect(kind, [at], parameters))
+            moved = known[key]
             if moved is None:
                 break
             made.append((r - moved) / step)

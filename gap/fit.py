@@ -5,13 +5,14 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize
 
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, check_parameters
 from makebreak.systems.numerics.selection import LinearFit, Screen
 
 EVALUATIONS = 8
+WANDER = 0.2  # Of a parameter's size: the first steps of a search without slopes.
 ROUGH = np.linspace(0.85, 1.15, 16)  # Of a start, tried.
 
 
@@ -57,31 +58,14 @@ def fit_effects(
     start, rough = _try_rough(model, screen, list(start), fixed)
     fixed = [(*a, *b) for a, b in zip(fixed, rough, strict=True)]
     steps = evaluations or int(getattr(model, "evaluations", EVALUATIONS))
-    free = [
-        (i, name)
-        for i, effect in enumerate(start)
-        for name in effect.parameters
-        if name not in fixed[i]
-    ]
-    x0 = np.array([start[i].parameters[name] for i, name in free])
-    scale = np.array([_scale(start[i], name) for i, name in free])
-    low = np.array([_lowest(start[i].kind, name) for i, name in free])
-    x0 = np.maximum(x0, low + 1e-9 * scale)
+    free = _Free(start, fixed)
+    x0, scale, low = free.x0, free.scale, free.low
     cache: dict[bytes, np.ndarray] = {}
-
-    def effects_of(z) -> list[Effect]:
-        parameters = [dict(effect.parameters) for effect in start]
-        for (i, name), value in zip(free, z * scale, strict=True):
-            parameters[i][name] = float(value)
-        return [
-            Effect(e.kind, list(e.at), p)
-            for e, p in zip(start, parameters, strict=True)
-        ]
 
     def residual(z) -> np.ndarray:
         key = np.asarray(z).tobytes()
         if key not in cache:
-            cache[key] = model.residual(effects_of(z))
+            cache[key] = model.residual(free.effects(z))
         return cache[key]
 
     def cost(z):
@@ -99,12 +83,12 @@ def fit_effects(
     z = x0 / scale if solved is None else solved.x
     if solved is not None:  # What does not show is not told: it stays neutral.
         shows = np.linalg.norm(solved.jac, axis=0)
-        for k, (i, name) in enumerate(free):
+        for k, (i, name) in enumerate(free.names):
             neutral = KINDS[start[i].kind].parameter(name).neutral
             if shows[k] <= 1e-6 * shows.max() and neutral is not None:
                 z = np.array(z)
                 z[k] = neutral / scale[k]
-    effects = effects_of(z)
+    effects = free.effects(z)
     r = residual(z)
     std: list[dict[str, float]] = [{} for _ in start]
     if solved is not None:
@@ -113,7 +97,7 @@ def fit_effects(
         spread = np.sqrt(np.sum((vt.T * inverse) ** 2, axis=1))
         # What is left, in units of what was allowed for, widens the interval.
         spread *= max(np.sqrt(2.0 * solved.cost / len(solved.fun)), 1.0)
-        for (i, name), each in zip(free, spread * scale, strict=True):
+        for (i, name), each in zip(free.names, spread * scale, strict=True):
             std[i][name] = float(each)
     for each, steps in zip(std, rough, strict=True):
         each.update(steps)
@@ -121,6 +105,66 @@ def fit_effects(
     return Fitted(
         tuple(_tidy(e) for e in effects), tuple(std), r, left, b, screen.judge(r)
     )
+
+
+def wander(
+    model: Model,
+    screen: Screen,
+    start: Sequence[Effect],
+    fixed: Sequence[Sequence[str]],
+) -> tuple[Effect, ...]:
+    """Effects from which a fit may go on where its gradient misled it: when which foot
+    lands first changes, the error jumps, and slopes tell little. Nelder and Mead."""
+    free = _Free(start, [tuple(names) for names in fixed])
+
+    def cost(z) -> float:
+        if np.any(z * free.scale < free.low):
+            return 1e6
+        try:
+            error = screen.judge(model.residual(free.effects(z))).train
+        except (ValueError, RuntimeError):  # Such parameters are refused.
+            return 1e6
+        return float(error) if np.isfinite(error) else 1e6
+
+    z0 = free.x0 / free.scale
+    corners = np.vstack([z0, z0 + WANDER * np.eye(len(z0))])
+    found = minimize(
+        cost, z0, method="Nelder-Mead",
+        options={"initial_simplex": corners, "maxfev": 40 * len(z0), "xatol": 1e-3,
+                 "fatol": 1e-2},
+    )  # fmt: skip
+    return tuple(_tidy(e) for e in free.effects(found.x))
+
+
+class _Free:
+    """The parameters of effects that a fit may move, as one vector.
+
+    names: (index of effect, name) of each; x0, scale, low (n,): where they start, a
+    typical size and a least value.
+    """
+
+    def __init__(self, start: Sequence[Effect], fixed: Sequence[Sequence[str]]):
+        self._start = start
+        self.names = [
+            (i, name)
+            for i, effect in enumerate(start)
+            for name in effect.parameters
+            if name not in fixed[i]
+        ]
+        self.scale = np.array([_scale(start[i], name) for i, name in self.names])
+        self.low = np.array([_lowest(start[i].kind, name) for i, name in self.names])
+        x0 = np.array([start[i].parameters[name] for i, name in self.names])
+        self.x0 = np.maximum(x0, self.low + 1e-9 * self.scale)
+
+    def effects(self, z: np.ndarray) -> list[Effect]:
+        """Effects of parameters z (n,), in units of `scale`."""
+        parameters = [dict(effect.parameters) for effect in self._start]
+        for (i, name), value in zip(self.names, z * self.scale, strict=True):
+            parameters[i][name] = float(value)
+        return [
+            Effect(e.kind, list(e.at), p)
+            for e, p in zip(self._start, parameters, strict=True)
+        ]
 
 
 def _try_rough(model, screen, start: list[Effect], fixed):

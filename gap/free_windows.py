@@ -56,6 +56,7 @@ class FreeBodyModel(WindowedResidual):
         body's x, y and z must be measured.
     """
 
+    jumps = True  # Errors, where an object's spheres land in another order.
     diff_step = 2e-3  # Of fits: smaller ones drown in the error of the steps.
     # What an effect must take off the error. Laws of contact leave so much that none
     # but the first takes off a tenth.

@@ -6,11 +6,14 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from makebreak.gap.inverse import InverseModel
 from makebreak.gap.parallel import side_by_side
 from makebreak.gap.recording import Recording
 from makebreak.gap.result import GapMeasure, Series
 from makebreak.gap.windows import WindowModel
+from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
+from makebreak.models.effects.transmission import twists
 from makebreak.models.scene import Scene
 
 WINDOW_SEC = 0.3
@@ -36,25 +39,50 @@ def measure(
     recordings: Sequence[Recording],
     effects: Sequence[Effect],
     moved: Sequence[Effect],
+    motion: InverseModel,
     jobs: int = 1,
 ) -> tuple[GapMeasure, list[Series]]:
     """Before and after over held-out windows.
 
     Args: effects: to be added. moved: the background as far as its tolerance lets it,
-        in both, as it is neither the gap nor its cure.
+        in both, as it is neither the gap nor its cure. motion: what tells how far a
+        joint lags its motor where a window starts.
     """
     model = WindowModel(scene, recordings, WINDOW_SEC, most=240)
     taken = {(e.kind, tuple(e.at)) for e in effects}
     moved = [e for e in moved if (e.kind, tuple(e.at)) not in taken]
     trials = [moved, [*moved, *effects]] if effects else [moved]
     held = held_out(model)
-    calls = [partial(model.simulate, trial, held) for trial in trials]
+    lag = _twists(motion, effects)
+    calls = [partial(model.simulate, trial, held, lag) for trial in trials]
     try:
         found = list(side_by_side(calls, jobs))
     except ValueError:  # A link that its background would make impossible.
-        found = [model.simulate((), held), model.simulate(effects, held)]
+        found = [model.simulate((), held), model.simulate(effects, held, lag)]
     before, after = found[0], found[-1]
     return gap_measure(model, before, after), series_of(model, before, after)
+
+
+def _twists(motion: InverseModel, effects: Sequence[Effect]):
+    """Function of a window: {joint: (twist, its rate)} at its start. None if nothing
+    twists."""
+    hidden = [e for e in effects if KINDS[e.kind].hidden_state]
+    if not hidden:
+        return None
+    known: dict[tuple[str, int], tuple[np.ndarray, dict]] = {}
+    for track, each in zip(motion.tracks, motion.motions(), strict=True):
+        of: dict[str, np.ndarray] = {}
+        for effect in hidden:
+            of |= twists(effect, motion.dynamics, each)
+        known[track.recording, track.episode] = (each.time, of)
+
+    def at(window) -> dict[str, tuple[float, float]]:
+        name = motion.recordings[window.recording].name
+        time, of = known[name, window.episode]
+        k = min(int(np.searchsorted(time, window.start)), len(time) - 1)
+        return {joint: (float(z[0, k]), float(z[1, k])) for joint, z in of.items()}
+
+    return at
 
 
 def held_out(model: Windows) -> list[bool]:

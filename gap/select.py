@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from makebreak.gap.fit import Fitted, Model, fit_effects
+from makebreak.gap.fit import EVALUATIONS, Fitted, Model, fit_effects, wander
 from makebreak.gap.screen import NESTED, Candidate, Ranked, is_sane, rank
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
@@ -81,7 +81,7 @@ def select(
         if step.get("fitted") is None:
             break
         chosen.append(step)
-        current = step["fitted"]
+        current = _settled(model, nuisance, prior, chosen, step["fitted"])
     chosen, current = _backward(model, nuisance, prior, chosen, current, start)
     if chosen:  # At last, against what all of them leave.
         screen = Screen(current.r, nuisance, prior, train, current.fit.train)
@@ -97,6 +97,23 @@ def select(
         for c, effect, std in zip(chosen, current.effects, current.std, strict=True)
     )  # fmt: skip
     return Selection(choices, start, current, tuple(table))
+
+
+def _settled(model, nuisance, prior, chosen, current: Fitted) -> Fitted:
+    """A fit that was stopped short, as all of a short list are, carried on: what it
+    has not reached yet would be looked for in other effects."""
+    if not needs_more(current, prior):
+        return current
+    screen = Screen(current.r, nuisance, prior, model.train(), current.fit.train)
+    fixed = [c["fixed"] for c in chosen]
+    effects = current.effects
+    if getattr(model, "jumps", False):
+        effects = wander(model, screen, effects, fixed)
+    more = fit_effects(model, screen, effects, fixed, 3 * EVALUATIONS)
+    if not more.fit.train < current.fit.train:
+        return current
+    chosen[-1]["after"] = min(more.score, chosen[-1]["after"])
+    return more
 
 
 def needs_more(fit: Fitted, prior: np.ndarray) -> bool:

@@ -258,8 +258,14 @@ class WindowModel(WindowedResidual):
 
     # ----- Simulating
 
-    def simulate(self, effects: Sequence[Effect], chosen=None) -> list[np.ndarray]:
-        """(n, n_channels) of each window, in the scene with these effects added."""
+    def simulate(
+        self, effects: Sequence[Effect], chosen=None, twists=None
+    ) -> list[np.ndarray]:
+        """(n, n_channels) of each window, in the scene with these effects added.
+
+        Args: chosen: which windows, else all. twists: gives {joint: (twist, rate)} of a
+            window's start, for joints behind an elastic element or a gap.
+        """
         self.simulation.set_effects([*self.scene.effects, *effects])
         self.runs += 1
         out = []
@@ -279,6 +285,7 @@ class WindowModel(WindowedResidual):
                     self._commands[w.recording][episode.first],
                     start_sec=w.start,
                     initial_is_true=True,
+                    twists=twists(w) if twists else None,
                 )
             )
         return out

@@ -178,7 +178,7 @@ def _of_mechanism(scene, recordings, checks, seconds, clock, say, jobs) -> GapRe
     effects = [c.effect for c in choices]
     background = _background(names, prior, selection)
     moved = _background_effects(model, names, selection.end.b)
-    gap, series = measure(scene, recordings, effects, moved, jobs)
+    gap, series = measure(scene, recordings, effects, moved, model, jobs)
     seconds["simulate"] = clock.lap()
     where = where_in_motion(model, selection.start.left)
     if verdict == "no_gap":

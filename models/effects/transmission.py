@@ -274,8 +274,7 @@ def _elasticity_added(effect, model, motion) -> np.ndarray:
     own = np.zeros_like(v)
     for joint in find_joints(effect, model.plant):
         i_q, i_v = joint.position_start(), joint.velocity_start()
-        tau = _carried(model, motion, joint)
-        z = tau[:3] / k - d / k**2 * tau[1:]
+        z = _twist(effect, model, motion, joint)
         q[:, i_q] -= z[0]
         v[:, i_v] -= z[1]
         vd[:, i_v] -= z[2]
@@ -313,12 +312,26 @@ def _backlash_signature(effect, model, motion, grid=None) -> list[Signature]:
 def _backlash_added(effect, model, motion) -> np.ndarray:
     out = np.zeros_like(motion.v)
     for joint in find_joints(effect, model.plant):
-        linear = _linear(model, motion, joint)
-        twist = through_gap(
-            motion.time, linear.needs, linear.M, effect.parameters["gap"]
-        )
-        out += linear.effort(twist)
+        twist = _twist(effect, model, motion, joint)
+        out += _linear(model, motion, joint).effort(twist)
     return out
+
+
+def twists(effect: Effect, model, motion) -> dict[str, np.ndarray]:
+    """{joint: (3, n)} twist, its rate and acceleration at the times of a motion."""
+    return {
+        full_name(model.plant, joint): _twist(effect, model, motion, joint)
+        for joint in find_joints(effect, model.plant)
+    }
+
+
+def _twist(effect: Effect, model, motion, joint: Joint) -> np.ndarray:
+    p = effect.parameters
+    if effect.kind == "joint_elasticity":
+        tau, k = _carried(model, motion, joint), p["stiffness"]
+        return tau[:3] / k - p["damping"] / k**2 * tau[1:]
+    linear = _linear(model, motion, joint)
+    return through_gap(motion.time, linear.needs, linear.M, p["gap"])
 
 
 @numba.njit(cache=True)
