@@ -69,6 +69,24 @@ def test_motor_and_link_swing_on_the_spring(tmp_path, time_step, atol):
     assert abs(expected[:, 1] - expected[:, 3]).max() > 0.3
 
 
+@pytest.mark.parametrize("side", ["motor", "link"])
+def test_a_window_starts_with_the_twist_it_is_told(tmp_path, side):
+    scene = elastic(tmp_path)
+    scene.channels = {"position": side, "velocity": side}
+    twist, rate = 0.02, -0.5
+    rows = SceneSimulation(scene).run(
+        at_rest_but({"p.j1": 0.1}, {"p.j1": 0.3}), TIMES, CHANNELS, COMMANDS,
+        twists={"p.j1": (twist, rate)},
+    )  # fmt: skip
+    start = [0.1, 0.3, 0.1 - twist, 0.3 - rate]
+    if side == "link":
+        start = [0.1 + twist, 0.3 + rate, 0.1, 0.3]
+    expected = two_masses(lambda s, r: K * s + D * r, start)
+    seen = expected[:, :2] if side == "motor" else expected[:, 2:]
+    np.testing.assert_allclose(rows[:, 0], seen[:, 0], atol=2e-4)
+    np.testing.assert_allclose(rows[:, 1], seen[:, 1], atol=8e-3)
+
+
 def test_channels_say_on_which_side_it_is_measured(tmp_path):
     scene = elastic(tmp_path)
     scene.channels = {"p.j1.position": "link side", "velocity": "link"}
