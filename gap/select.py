@@ -82,6 +82,8 @@ def select(
             break
         chosen.append(step)
         current = _settled(model, nuisance, prior, chosen, step["fitted"])
+        for choice, effect in zip(chosen, current.effects, strict=True):
+            choice["effect"] = effect  # The next are fitted from here.
     chosen, current = _backward(model, nuisance, prior, chosen, current, start)
     if chosen:  # At last, against what all of them leave.
         screen = Screen(current.r, nuisance, prior, train, current.fit.train)
@@ -159,7 +161,7 @@ def _forward(model, nuisance, prior, found, chosen, current, start, say) -> dict
         scale = max(least, 1.0)
         screen = Screen(current.r, nuisance, prior, train, scale)
         base = screen.judge(current.r)
-        sound = _fit_each(model, screen, chosen, [r for _, r in sound], say)
+        sound = _fit_each(model, screen, chosen, [r for _, r in sound], say, sound)
     if not sound:
         return {"table": table}
     blur = PRECISION * start.score
@@ -218,11 +220,18 @@ def _forward(model, nuisance, prior, found, chosen, current, start, say) -> dict
     }
 
 
-def _fit_each(model, screen, chosen, short, say) -> list[tuple[Fitted, Ranked]]:
-    """Each of the short list with what is chosen already; those that make sense."""
+def _fit_each(
+    model, screen, chosen, short, say, known=()
+) -> list[tuple[Fitted, Ranked]]:
+    """Each of the short list with what is chosen already; those that make sense.
+
+    Args: known: fits of the same, from where to go on.
+    """
     sound = []
-    for each in short:
+    for k, each in enumerate(short):
         trial = [*[c["effect"] for c in chosen], each.effect]
+        if known:
+            trial = list(known[k][0].effects)
         fixed = [*[c["fixed"] for c in chosen], each.candidate.fixed]
         try:
             fit = fit_effects(model, screen, trial, fixed)

@@ -1,12 +1,11 @@
 from typing import Any
 
-import cv2
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import LeafSystem
 from pydrake.systems.sensors import ImageRgba8U
 
-from makebreak.systems.numerics.pinhole import frame_shift
+from makebreak.systems.numerics.pinhole import frame_shift, shifted
 
 
 class CameraShake(LeafSystem):
@@ -29,6 +28,8 @@ class CameraShake(LeafSystem):
         self._shift_std_px, self._seed = shift_std_px, seed
         self._period_sec = period_sec
         blank = ImageRgba8U(width, height)
+        # Compiles it; no stall in the first picture.
+        shifted(blank.data, 0.5, 0.5, np.empty_like(blank.data))
         self._image = self.DeclareAbstractInputPort("image", Value(blank))
         self.DeclareAbstractOutputPort(
             "rgb_image",
@@ -44,12 +45,4 @@ class CameraShake(LeafSystem):
         frame = int(context.get_time() / self._period_sec + 1e-6)
         u, v = self._shift_std_px * frame_shift(self._seed, frame)
         image: Any = self._image.Eval(context)
-        source = image.data
-        shifted = output.get_mutable_value().mutable_data
-        cv2.warpAffine(
-            source,
-            np.array([[1.0, 0.0, u], [0.0, 1.0, v]]),
-            source.shape[1::-1],
-            dst=shifted,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
+        shifted(image.data, u, v, output.get_mutable_value().mutable_data)

@@ -237,20 +237,22 @@ def _inset(hull, by):
     fixed = np.empty((n, 2), np.int32)
     limit = 2.0**30
     for i in range(n):
-        before = hull[i] - hull[i - 1]
-        after = hull[(i + 1) % n] - hull[i]
-        inner_u, inner_v = hull[i]
-        a = np.sqrt(before[0] ** 2 + before[1] ** 2)
-        b = np.sqrt(after[0] ** 2 + after[1] ** 2)
+        last, then = (i if i > 0 else n) - 1, (i + 1) % n
+        before_u, before_v = hull[i, 0] - hull[last, 0], hull[i, 1] - hull[last, 1]
+        after_u, after_v = hull[then, 0] - hull[i, 0], hull[then, 1] - hull[i, 1]
+        inner_u, inner_v = hull[i, 0], hull[i, 1]
+        a = np.sqrt(before_u**2 + before_v**2)
+        b = np.sqrt(after_u**2 + after_v**2)
         if a > 0.0 and b > 0.0:
-            before, after = before / a, after / b
+            before_u, before_v = before_u / a, before_v / a
+            after_u, after_v = after_u / b, after_v / b
             # v = hull[i] + step (normal before + normal after), both normals unit.
-            turn = before[0] * after[1] - before[1] * after[0]  # Sign: the way round.
+            turn = before_u * after_v - before_v * after_u  # Sign: the way round.
             side = 1.0 if turn > 0.0 else -1.0
-            cosine = before[0] * after[0] + before[1] * after[1]
+            cosine = before_u * after_u + before_v * after_v
             step = side * by / max(1.0 + cosine, 0.3)
-            inner_u -= step * (before[1] + after[1])
-            inner_v += step * (before[0] + after[0])
+            inner_u -= step * (before_v + after_v)
+            inner_v += step * (before_u + after_u)
         fixed[i, 0] = min(max(np.rint(inner_u * 2**FIXED_POINT_BITS), -limit), limit)
         fixed[i, 1] = min(max(np.rint(inner_v * 2**FIXED_POINT_BITS), -limit), limit)
     return fixed
@@ -299,3 +301,82 @@ def frame_shift(seed, frame):
     """(2,) standard normal numbers that belong to frame >= 0 of a seed >= 0."""
     bits = np.random.Philox(key=seed, counter=[0, 0, 0, frame])
     return np.random.Generator(bits).standard_normal(2)
+
+
+@njit(cache=True, fastmath={"contract"})
+def shifted(picture, u, v, out):
+    """Fills out with the picture moved by u, v [px], linear between its pixels.
+
+    What lies beyond the picture's edges is as they are. In single precision, with fused
+    multiply-adds where the processor has them: the same as cv2.warpAffine in less time,
+    since all pixels are mixed alike.
+
+    Args: picture, out: (height, width, n) uint8, different ones, contiguous.
+    """
+    height, width, n = picture.shape
+    row = width * n
+    source, result = picture.reshape(height, row), out.reshape(height, row)
+    left, weight = np.empty(width, np.int64), np.empty(row, np.float32)
+    for j in range(width):
+        left[j], part = _split(j, u)
+        for k in range(n):
+            weight[j * n + k] = part
+    # Columns from `first` to before `end` have both neighbours in the picture, `left`
+    # by a fixed number of columns.
+    start = left[width // 2] - width // 2
+    first, end = max(0, -start), min(width, width - 1 - start)
+    while first < end and left[first] != first + start:
+        first += 1
+    while end > first and left[end - 1] != end - 1 + start:
+        end -= 1
+    mixed = np.empty((2, row), np.float32)  # Two rows of the picture, mixed sideways.
+    held = np.full(2, -1)
+    for i in range(height):
+        at, part = _split(i, v)
+        for k in range(2):
+            line = min(max(at + k, 0), height - 1)
+            if held[line % 2] != line:
+                held[line % 2] = line
+                _mix_row(source[line], mixed[line % 2], left, weight, first, end, n)
+        low = mixed[min(max(at, 0), height - 1) % 2]
+        high = mixed[min(max(at + 1, 0), height - 1) % 2]
+        _mix_rows(low, high, part, result[i])
+
+
+@njit(cache=True)
+def _split(i, shift):
+    """The pixel before i - shift, and how far that lies behind it."""
+    place = np.float32(np.float32(i) - np.float32(shift))
+    before = np.floor(place)
+    return int(before), np.float32(place - before)
+
+
+@njit(cache=True, fastmath={"contract"})
+def _mix_row(source, mixed, left, weight, first, end, n):
+    width = left.size
+    a, b = first * n, end * n
+    if b > a:
+        at = left[first] * n
+        _mix_run(source[at:], source[at + n :], weight[a:b], mixed[a:b])
+    for j in range(width):
+        if first <= j < end:
+            continue
+        p_at = min(max(left[j], 0), width - 1) * n
+        q_at = min(max(left[j] + 1, 0), width - 1) * n
+        for k in range(n):
+            value = np.float32(source[p_at + k])
+            other = np.float32(source[q_at + k])
+            mixed[j * n + k] = value + weight[j * n + k] * (other - value)
+
+
+@njit(cache=True, fastmath={"contract"})
+def _mix_run(low, high, part, out):
+    for i in range(out.size):
+        value = np.float32(low[i])
+        out[i] = value + part[i] * (np.float32(high[i]) - value)
+
+
+@njit(cache=True, fastmath={"contract"})
+def _mix_rows(low, high, part, out):
+    for i in range(out.size):
+        out[i] = np.uint8(np.rint(low[i] + part * (high[i] - low[i])))
