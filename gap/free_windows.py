@@ -270,7 +270,8 @@ class FreeBodyModel(WindowedResidual):
             } & set(e.at):  # fmt: skip
                 length *= e.parameters["scale"]
         self.runs += 1
-        return [self._simulate(body, w, w.state, length) for w in self.windows]
+        each = [self._simulate(body, w, w.state, length) for w in self.windows]
+        return [np.where(np.isnan(y), np.inf, y) for y in each]
 
     def errors(self, simulated: Sequence[np.ndarray]) -> list[np.ndarray]:
         """(measured - simulated)/std of each window, no more than the cap; 0 where

@@ -92,24 +92,28 @@ def held_out(model: Windows) -> list[bool]:
 
 
 def gap_measure(model: Windows, before, after) -> GapMeasure:
-    """Args: before, after: what held-out windows simulate without and with effects."""
+    """Args: before, after: what held-out windows simulate without and with effects.
+    Samples that one of them does not tell count in neither."""
     held = held_out(model)
 
-    def errors(simulated) -> np.ndarray:
-        each = zip(model.errors(simulated), held, strict=True)
-        return np.concatenate([e for e, h in each if h])
+    def of_held(each) -> np.ndarray:
+        return np.concatenate([e for e, h in zip(each, held, strict=True) if h])
 
-    a, b = errors(before), errors(after)
+    both = ~(np.isnan(of_held(before)) | np.isnan(of_held(after)))
+    a, b = of_held(model.errors(before)), of_held(model.errors(after))
+
+    def rms(e: np.ndarray, c) -> float:
+        told = e[:, c][both[:, c]]
+        return float(np.sqrt(np.mean(told**2))) if len(told) else 0.0
+
     per_channel = {
-        name: {
-            "before": float(np.sqrt(np.mean(a[:, c] ** 2))),
-            "after": float(np.sqrt(np.mean(b[:, c] ** 2))),
-        }
+        name: {"before": rms(a, c), "after": rms(b, c)}
         for c, name in enumerate(model.channels)
     }
+    everything = slice(None)
     return GapMeasure(
-        float(np.sqrt(np.mean(a**2))), float(np.sqrt(np.mean(b**2))), NOISE_FLOOR,
-        model.window_sec, per_channel,
+        rms(a, everything), rms(b, everything), NOISE_FLOOR, model.window_sec,
+        per_channel,
     )  # fmt: skip
 
 

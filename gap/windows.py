@@ -261,7 +261,9 @@ class WindowModel(WindowedResidual):
     def simulate(
         self, effects: Sequence[Effect], chosen=None, twists=None
     ) -> list[np.ndarray]:
-        """(n, n_channels) of each window, in the scene with these effects added.
+        """(n, n_channels) of each window, in the scene with these effects added; NaN
+        where a delayed sample shows what was before the window, infinite where Drake
+        could not go on.
 
         Args: chosen: which windows, else all. twists: gives {joint: (twist, rate)} of a
             window's start, for joints behind an elastic element or a gap.
@@ -277,17 +279,18 @@ class WindowModel(WindowedResidual):
             episode = next(
                 e for e in recording.episodes if e.first <= w.rows.start < e.last
             )
-            out.append(
-                self.simulation.run(
-                    self._initial(w, episode, effects),
-                    recording.time[w.rows],
-                    self.channels,
-                    self._commands[w.recording][episode.first],
-                    start_sec=w.start,
-                    initial_is_true=True,
-                    twists=twists(w) if twists else None,
-                )
+            y = self.simulation.run(
+                self._initial(w, episode, effects),
+                recording.time[w.rows],
+                self.channels,
+                self._commands[w.recording][episode.first],
+                start_sec=w.start,
+                initial_is_true=True,
+                twists=twists(w) if twists else None,
             )
+            if self.simulation.failure:
+                y[np.isnan(y)] = np.inf
+            out.append(y)
         return out
 
     def _initial(self, w: Window, episode: Episode, effects) -> InitialSection:
@@ -334,7 +337,8 @@ class WindowModel(WindowedResidual):
         return initial
 
     def errors(self, simulated: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """(measured - simulated)/std of each window; 0 where nothing was measured."""
+        """(measured - simulated)/std of each window; 0 where nothing was measured or
+        simulated."""
         out = []
         for w, y in zip(self.windows, simulated, strict=True):
             if not len(y):
@@ -343,8 +347,7 @@ class WindowModel(WindowedResidual):
             recording = self.recordings[w.recording]
             seen = np.stack([recording[c][w.rows] for c in self.channels], axis=1)
             e = (seen - y) / w.std
-            e = np.where(np.isfinite(seen), np.where(np.isfinite(y), e, np.inf), 0.0)
-            out.append(np.clip(e, -LARGEST, LARGEST))
+            out.append(np.clip(np.where(np.isnan(e), 0.0, e), -LARGEST, LARGEST))
         return out
 
 
