@@ -274,6 +274,25 @@ def _of_sensors(model: InverseModel, kind: str, of) -> list[Candidate]:
     return [c for c in found if c is not None]
 
 
+def inseparable(effect: Effect, model: InverseModel) -> Effect | None:
+    """What no recording of commands and joints can tell from an effect: commands that
+    act late, and all channels that show late."""
+    models = sorted({joint.split(".")[0] for joint in model.joints})
+    sensed = {
+        f"{joint}.{what}"
+        for k, joint in enumerate(model.joints)
+        for what in ("position", "velocity", "effort_measured")
+        if what == "position" or model.has[what][k]
+    }
+    driven = {joint for joint in model.joints if _driven(model, joint)}
+    at = set(effect.at)
+    if effect.kind == "input_delay" and (at == set(models) or at >= driven):
+        return Effect("sensor_delay", models, dict(effect.parameters))
+    if effect.kind == "sensor_delay" and (at == set(models) or at >= sensed):
+        return Effect("input_delay", models, dict(effect.parameters))
+    return None
+
+
 def _secant(model: InverseModel, kind: str, at, name: str, of) -> Candidate | None:
     steps = {"offset": (1e-3,), "bias": (1e-3,), "skew": (1e-4,)}.get(name, _DELAYS)
     if kind == "sensor_delay" and all(c.endswith(".velocity") for c in at):

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -22,8 +23,8 @@ from makebreak.gap.recording import (
 )
 from makebreak.gap.result import GapResult
 from makebreak.gap.scene_facts import scene_facts, scene_names
-from makebreak.gap.screen import candidates, nuisances
-from makebreak.gap.select import Selection, needs_more, select
+from makebreak.gap.screen import candidates, inseparable, nuisances
+from makebreak.gap.select import Choice, Selection, needs_more, select
 from makebreak.gap.verdict import named, says, verdict_of
 from makebreak.gap.where import unexplained, where_in_motion
 from makebreak.gap.windows import WindowModel, with_step
@@ -166,7 +167,7 @@ def _of_mechanism(scene, recordings, checks, seconds, clock, say, jobs) -> GapRe
     seconds["screen"] = clock.lap()
     selection = select(model, nuisance, prior, found, say)
     seconds["select"] = clock.lap()
-    choices = selection.choices
+    choices = [_with_inseparable(c, model) for c in selection.choices]
     start, end = selection.start.score, selection.end.score
     far = not is_plausible(selection.end.b, prior)
     # Which blocks are held out is by the clock: some hold next to nothing of the gap.
@@ -189,6 +190,13 @@ def _of_mechanism(scene, recordings, checks, seconds, clock, say, jobs) -> GapRe
         verdict, says(verdict, effects_named, start, end), where, effects_named,
         gap, rest, background, checks, series, selection.table,
     )  # fmt: skip
+
+
+def _with_inseparable(choice: Choice, model: InverseModel) -> Choice:
+    other = inseparable(choice.effect, model)
+    if other is None or any(tie.kind == other.kind for tie in choice.ties):
+        return choice
+    return replace(choice, ties=(*choice.ties, other))
 
 
 def _background(names, prior, selection: Selection) -> dict[str, float]:

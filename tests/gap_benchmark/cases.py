@@ -63,6 +63,7 @@ class Written:
 
 
 OUTSIDE = ("bouc_wen", "magnetic_pull")
+# Late commands and late sensors are one thing wherever commands are not fed back.
 _TIE_DELAY = (("input_delay", "sensor_delay"),)
 _TIE_LOAD = (("payload", "constant_force"),)
 _TIE_REST = (("object_size", "plane_height"),)
@@ -89,7 +90,8 @@ TABLE: list[tuple] = [
     ("arm", "actuator_gain", True), ("pendulum", "actuator_gain", False),
     ("arm", "actuator_bias", True), ("pendulum", "actuator_bias", False),
     ("arm", "actuator_saturation", True), ("pendulum", "actuator_saturation", False),
-    ("arm", "input_delay", True), ("cartpole", "input_delay", False),
+    ("arm", "input_delay", True, _TIE_DELAY),
+    ("cartpole", "input_delay", False, _TIE_DELAY),
     ("arm", "actuator_lag", True), ("pendulum", "actuator_lag", False),
     ("arm", "sensor_delay", True), ("pendulum", "sensor_delay", False),
     ("arm", "clock_skew", True), ("pendulum", "sensor_bias", True),
@@ -112,7 +114,7 @@ TABLE: list[tuple] = [
     ("cube", "object_com", False), ("cube", "object_inertia", False),
     ("bounce", "body_drag", False),
     ("arm", "joint_coulomb_friction payload", True),
-    ("arm", "joint_viscous_damping input_delay", False),
+    ("arm", "joint_viscous_damping input_delay", False, _TIE_DELAY),
     ("scara", "joint_coulomb_friction torque_ripple", True),
     ("pendulum", "joint_coulomb_friction actuator_gain", False),
     ("cube", "contact_friction contact_dissipation", False),
