@@ -241,6 +241,16 @@ def parameter_errors(found: Mapping, hidden: Mapping) -> list[float]:
     Args: found {name: {value, ...}} as in result.json; hidden {name: value}.
     """
     value = {name: float(found[name]["value"]) for name in found if name in hidden}
+    if "phase" not in value:
+        return _errors(value, hidden)
+    # F sin(wt + phase) and -F sin(wt + phase + half a turn) are the same.
+    sizes = ("fx", "fy", "fz", "amplitude")
+    other = {k: -v if k in sizes else v for k, v in value.items()}
+    other["phase"] += np.pi
+    return min(_errors(value, hidden), _errors(other, hidden), key=sum)
+
+
+def _errors(value: dict[str, float], hidden: Mapping) -> list[float]:
     if "radius" in value and "scale" in value:
         del value["radius"]  # The same thing, said twice.
     errors: list[float] = []

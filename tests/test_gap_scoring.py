@@ -127,6 +127,10 @@ def test_errors_of_vectors_phases_and_changes():
     np.testing.assert_allclose(got, [np.sqrt(10.0) / 5.0])
     got = errors(dict(phase=0.1), dict(phase=2.0 * np.pi - 0.1))
     np.testing.assert_allclose(got, [0.2 / np.pi])
+    # -F half a turn later is F.
+    got = errors(dict(fx=-2.0, fy=1.0, fz=0.0, phase=0.1 - np.pi),
+                 dict(fx=2.0, fy=-1.0, fz=0.0, phase=0.2))  # fmt: skip
+    np.testing.assert_allclose(got, [0.0, 0.1 / np.pi], atol=1e-12)
     np.testing.assert_allclose(errors(dict(gain=1.12), dict(gain=1.1)), [0.2])
     got = errors(dict(scale=1.1, radius=0.033), dict(scale=1.1, radius=0.033))
     assert got == [0.0]
