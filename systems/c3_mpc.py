@@ -26,7 +26,7 @@ from makebreak.systems.numerics.c3_projections import (
     PlusProjection,
     QpProjection,
 )
-from makebreak.systems.numerics.lcs import LCS
+from makebreak.systems.numerics.lcs import LCS, is_finite
 from makebreak.systems.numerics.timing import timed
 
 
@@ -152,7 +152,8 @@ class C3Mpc(LeafSystem):
                 *(self._get(context, s) for s in (self._plan_u, self._delta, self._w))
             )
             try:
-                warm = warm.shifted(min(self._period / lcs.dt, 1.0))
+                if self._problem.options.warm_start:
+                    warm = warm.shifted(min(self._period / lcs.dt, 1.0))
                 plan, warm = solve_c3(lcs, x, x_desired, self._problem, warm)
             except C3Failure:
                 status = C3Status.SOLVE_FAILED
@@ -210,8 +211,7 @@ class C3Mpc(LeafSystem):
             return False
         if (lcs.n_x, lcs.n_u, lcs.n_lam) != (p.n_x, p.n_u, p.n_lam):
             return False
-        values = (lcs.A, lcs.B, lcs.D, lcs.d, lcs.E, lcs.F, lcs.H, lcs.c)
-        return all(np.isfinite(value).all() for value in values)
+        return is_finite(lcs)
 
     def _get(self, context, state):
         index, shape = state

@@ -8,7 +8,7 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import LeafSystem
 
-from makebreak.systems.numerics.lcs import LCS
+from makebreak.systems.numerics.lcs import LCS, is_finite
 from makebreak.systems.numerics.residual_learner import (
     Buffer,
     Residual,
@@ -150,7 +150,7 @@ class ResidualLearner(LeafSystem):
             return _held(memory, None, LearnerStatus.DISABLED)
         if not self._fits(lcs):
             return _held(memory, None, LearnerStatus.BAD_LCS)
-        if not (np.isfinite(x).all() and _is_finite(lcs)):
+        if not (np.isfinite(x).all() and is_finite(lcs)):
             return _held(memory, None, LearnerStatus.NOT_FINITE)
         x.setflags(write=False)
         sample = (x, lcs)
@@ -206,10 +206,6 @@ class ResidualLearner(LeafSystem):
 
 def _held(memory: LearnerMemory, sample, status: LearnerStatus) -> LearnerMemory:
     return LearnerMemory(sample, memory.buffer, memory.residual, memory.loss, status)
-
-
-def _is_finite(lcs: LCS) -> bool:
-    return all(np.isfinite(getattr(lcs, name)).all() for name in "ABDdEFHc")
 
 
 def _checked(config: ResidualLearnerConfig, lcs: LCS, period_sec: float):

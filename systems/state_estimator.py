@@ -4,8 +4,9 @@ import numpy as np
 from pydrake.systems.framework import LeafSystem
 
 from makebreak.systems.numerics.ball_state import pack
+from makebreak.systems.numerics.packed import packed
 from makebreak.systems.numerics.serial_chain import SerialChain
-from makebreak.systems.numerics.state_estimator import tip_motion
+from makebreak.systems.numerics.state_estimator import estimate, tip_motion
 from makebreak.systems.numerics.timing import timed
 
 
@@ -43,7 +44,8 @@ class StateEstimator(LeafSystem):
                 "ball_radius and tip_mass must be positive, got "
                 f"{config.ball_radius}, {config.tip_mass}"
             )
-        self._config, self._chain = config, chain
+        self._ball_radius, self._tip_mass = config.ball_radius, config.tip_mass
+        self._chain = packed(chain)
         n = len(chain.mass)
         q_default = np.array(q_default, dtype=float)
         p_tip, _, _ = tip_motion(chain, q_default, np.zeros(n), np.zeros(n), 1.0)
@@ -56,7 +58,11 @@ class StateEstimator(LeafSystem):
         self._seen = self.DeclareVectorInputPort("seen", 1)
         x0 = pack(p_tip, np.zeros(3), [0, 0, config.ball_radius], np.zeros(3), 1.0)
         self._x = self.DeclareDiscreteState(x0)
-        self._window = self.DeclareDiscreteState(3 * n_window)
+        # The forces, and how many readings in a row were valid; a learner that starts
+        # is told that all were.
+        self._window = self.DeclareDiscreteState(
+            np.append(np.zeros(3 * n_window), n_window)
+        )
         self._valid = self.DeclareDiscreteState(1)
         self.DeclareStateOutputPort("x", self._x)
         self.DeclareVectorOutputPort(
@@ -65,47 +71,51 @@ class StateEstimator(LeafSystem):
             self._mean_force,
             prerequisites_of_calc={self.discrete_state_ticket(self._window)},
         )
-        # How many readings in a row were valid; a learner that starts is told so.
         self._n_window = n_window
-        self._n_valid = self.DeclareDiscreteState([float(n_window)])
         self.DeclareStateOutputPort("valid", self._valid)
         self.DeclareVectorOutputPort(
             "window_valid",
             1,
             self._all_valid,
-            prerequisites_of_calc={self.discrete_state_ticket(self._n_valid)},
+            prerequisites_of_calc={self.discrete_state_ticket(self._window)},
         )
         self.DeclarePeriodicDiscreteUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
+        zero, before = np.zeros(n), np.zeros(3 * n_window + 1)
+        before.setflags(write=False)  # As a Context's state is.
+        at = np.zeros(3)  # Compiled now, not at the first tick.
+        estimate(
+            self._chain, q_default, zero, zero, at, at, np.zeros(1), self._tip_mass,
+            self._ball_radius, before,
+        )  # fmt: skip
 
     def _mean_force(self, context, output):
         window = context.get_discrete_state(self._window).value()
-        output.SetFromVector(window.reshape(-1, 3).mean(axis=0))
+        output.SetFromVector(window[:-1].reshape(-1, 3).mean(axis=0))
 
     def _all_valid(self, context, output):
-        n_valid = context.get_discrete_state(self._n_valid).value()[0]
+        n_valid = context.get_discrete_state(self._window).value()[-1]
         output.SetFromVector([1.0 if n_valid >= self._n_window else 0.0])
 
     @timed
     def _update(self, context, discrete_state):
-        q, v = self._q.Eval(context), self._v.Eval(context)
-        torque = self._torque.Eval(context)
-        p_ball, v_ball = self._p_ball.Eval(context), self._v_ball.Eval(context)
-        seen = self._seen.Eval(context)[0]
-        total = q.sum() + v.sum() + torque.sum() + p_ball.sum() + v_ball.sum()
-        if not np.isfinite(total):
-            discrete_state.set_value(self._valid, [0.0])
-            discrete_state.set_value(self._n_valid, [0.0])
-            return
-        p_tip, v_tip, u = tip_motion(self._chain, q, v, torque, self._config.tip_mass)
-        x = pack(p_tip, v_tip, p_ball, v_ball, self._config.ball_radius)
         window = context.get_discrete_state(self._window).value()
-        discrete_state.set_value(self._x, x)
-        discrete_state.set_value(self._window, np.append(window[3:], u))
-        valid = 1.0 if seen > 0.5 else 0.0
-        n_valid = context.get_discrete_state(self._n_valid).value()[0]
-        discrete_state.set_value(self._valid, [valid])
-        discrete_state.set_value(
-            self._n_valid, [min(valid * (n_valid + 1.0), self._n_window)]
+        finite, x, after, valid = estimate(
+            self._chain,
+            self._q.Eval(context),
+            self._v.Eval(context),
+            self._torque.Eval(context),
+            self._p_ball.Eval(context),
+            self._v_ball.Eval(context),
+            self._seen.Eval(context),
+            self._tip_mass,
+            self._ball_radius,
+            window,
         )
+        discrete_state.set_value(self._valid, [valid])
+        if finite:
+            discrete_state.set_value(self._x, x)
+            discrete_state.set_value(self._window, after)
+        else:
+            discrete_state.set_value(self._window, np.append(window[:-1], 0.0))

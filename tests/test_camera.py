@@ -22,6 +22,7 @@ from makebreak.systems.numerics.pinhole import (
     frame_shift,
     look_down,
     paint_exactly,
+    shifted,
     sphere_circle,
 )
 
@@ -219,6 +220,25 @@ def test_frame_shifts_are_standard_normal_and_independent():
     next_to = (shifts[1:] * shifts[:-1]).mean(axis=0)
     np.testing.assert_allclose(next_to, 0.0, atol=4 / n)
     np.testing.assert_allclose((shifts[:, 0] * shifts[:, 1]).mean(), 0.0, atol=4 / n)
+
+
+@pytest.mark.parametrize("shape", [(24, 31, 4), (3, 2, 4), (2, 1, 3)])
+def test_a_shifted_picture_is_linear_between_pixels_and_ends_as_its_edges(shape):
+    rng = np.random.default_rng(0)
+    picture = rng.integers(0, 256, shape).astype(np.uint8)
+    height, width, _ = shape
+    for u, v in [(0.0, 0.0), (2.0, -1.0), (-40.0, 0.5), *rng.normal(0.0, 2.0, (20, 2))]:
+        # One axis after the other; np.interp holds the ends.
+        across = [np.interp(np.arange(width) - u, np.arange(width), line)
+                  for line in picture.transpose(0, 2, 1).reshape(-1, width)]  # fmt: skip
+        across = np.reshape(across, (height, -1, width)).transpose(2, 1, 0)
+        both = [np.interp(np.arange(height) - v, np.arange(height), line)
+                for line in across.reshape(-1, height)]  # fmt: skip
+        expected = np.reshape(both, (width, -1, height)).transpose(2, 0, 1)
+        moved = np.empty_like(picture)
+        shifted(picture, u, v, moved)
+        # Half a count of rounding, and 255 times single precision at 40 px: 1e-3.
+        np.testing.assert_allclose(moved, expected, atol=0.5 + 1e-3)
 
 
 def test_shaken_pictures_move_by_the_frame_shift():

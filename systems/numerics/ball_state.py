@@ -7,6 +7,7 @@ on it: q_ball is always the identity in an estimate.
 """
 
 import numpy as np
+from numba import njit
 
 N_X = 19
 P_TIP, Q_BALL, P_BALL = slice(0, 3), slice(3, 7), slice(7, 10)
@@ -23,9 +24,18 @@ def rolling_velocity(v_ball, radius):
 
 def pack(p_tip, v_tip, p_ball, v_ball, radius):
     """The state x (19,) of a tip and a rolling ball, each (3,) [m], [m/s]."""
+    p_tip, v_tip = np.asarray(p_tip, dtype=float), np.asarray(v_tip, dtype=float)
+    p_ball, v_ball = np.asarray(p_ball, dtype=float), np.asarray(v_ball, dtype=float)
+    return compiled_pack(p_tip, v_tip, p_ball, v_ball, float(radius))
+
+
+@njit(cache=True)
+def compiled_pack(p_tip, v_tip, p_ball, v_ball, radius):
+    """pack for compiled callers: arrays alone."""
     x = np.zeros(N_X)
     x[P_TIP], x[V_TIP] = p_tip, v_tip
-    x[Q_BALL] = 1.0, 0.0, 0.0, 0.0
+    x[Q_BALL.start] = 1.0
     x[P_BALL], x[V_BALL] = p_ball, v_ball
-    x[W_BALL] = rolling_velocity(v_ball, radius)
+    # rolling_velocity.
+    x[W_BALL.start], x[W_BALL.start + 1] = -v_ball[1] / radius, v_ball[0] / radius
     return x

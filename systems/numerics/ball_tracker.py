@@ -79,23 +79,17 @@ def find_ball(image, camera: Pinhole, hue_weights, radius, table_z, guess_p=None
     region = image[low[1] : high[1], low[0] : high[0]]
     strength = cv2.transform(region, hue_weights)
     strength = cv2.GaussianBlur(strength, (3, 3), 0.0)
-    m, n_kept = np.zeros(3), 0
-    for start in find_circles(strength, radius_px):
-        # The circle may be the finger's tip, whose edge is round, too: rays from there
-        # find a part of the ball, and those from that fit's centre all there is to see.
-        for _ in range(2):
-            points = outline_points(
-                strength, region, start[0], start[1], LARGEST * radius_px, _ANGLES
-            )
-            m, n_kept = fit_cone(camera.rays(points + low), AGREE / camera.focal)
-            if n_kept < 6 or not m[2] > 0.0:
-                break
-            start = camera.project(m[None])[0] - low
-            if not ((start > 0.0) & (start < high - low - 1)).all():
-                break
-        if n_kept >= MIN_SEEN * N_RAYS:
-            break
-    else:
+    m, n_kept = _fit_ball(
+        strength,
+        region,
+        find_circles(strength, radius_px),
+        LARGEST * radius_px,
+        _ANGLES,
+        low,
+        camera.focal,
+        camera.center,
+    )
+    if n_kept < MIN_SEEN * N_RAYS:
         return None
     norm = float(np.linalg.norm(m))
     p_WB = camera.meet_plane(m / norm, table_z + radius)
@@ -112,10 +106,12 @@ def _window(camera, p_C, half_px):
     """Corners low and high (2,) [px] of the square about a point (3,) in C, cut to the
     picture: rows low[1] to high[1] - 1 and so on.
     """
-    size = np.array([camera.width, camera.height])
-    center = camera.project(p_C[None])[0]
-    low, high = center - half_px, center + half_px + 2.0
-    return [np.clip(corner, 0, size).astype(int) for corner in (low, high)]
+    corners = np.empty((2, 2), int)
+    for i, size in enumerate((camera.width, camera.height)):
+        center = camera.focal * p_C[i] / p_C[2] + camera.center[i]
+        corners[0, i] = min(max(center - half_px, 0.0), size)
+        corners[1, i] = min(max(center + half_px + 2.0, 0.0), size)
+    return corners
 
 
 def find_circles(strength, radius_px, n=3):
@@ -134,6 +130,47 @@ def find_circles(strength, radius_px, n=3):
         maxRadius=int(np.ceil(LARGEST * radius_px)),
     )
     return np.empty((0, 3)) if circles is None else circles[0, :n].astype(float)
+
+
+@njit(cache=True)
+def _fit_ball(strength, region, circles, reach, angles, low, focal, center):
+    """The first of the circles (k, 3) in a part of the picture that is a ball.
+
+    Args: strength, region, reach, angles as of outline_points; low (2,), where the part
+        begins in the picture [px]; focal [px] and center (2,) [px] of the camera.
+    Returns: as fit_cone; too few rays agree if none is a ball.
+    """
+    m, n_kept = np.zeros(3), 0
+    height, width = strength.shape
+    for i in range(len(circles)):
+        u, v = circles[i, 0], circles[i, 1]
+        # The circle may be the finger's tip, whose edge is round, too: rays from there
+        # find a part of the ball, and those from that fit's centre all there is to see.
+        for _ in range(2):
+            points = outline_points(strength, region, u, v, reach, angles)
+            rays = _rays(points, low, focal, center)
+            m, n_kept = fit_cone(rays, AGREE / focal)
+            if n_kept < 6 or not m[2] > 0.0:
+                break
+            u = focal * m[0] / m[2] + center[0] - low[0]
+            v = focal * m[1] / m[2] + center[1] - low[1]
+            if not (0.0 < u < width - 1 and 0.0 < v < height - 1):
+                break
+        if n_kept >= MIN_SEEN * N_RAYS:
+            return m, n_kept
+    return m, 0
+
+
+@njit(cache=True)
+def _rays(points, low, focal, center):
+    """Pinhole.rays (k, 3) of points (k, 2) [px] in a part that begins at low (2,)."""
+    rays = np.empty((len(points), 3))
+    for i in range(len(points)):
+        x = (points[i, 0] + low[0] - center[0]) / focal
+        y = (points[i, 1] + low[1] - center[1]) / focal
+        length = np.sqrt(x * x + y * y + 1.0)
+        rays[i, 0], rays[i, 1], rays[i, 2] = x / length, y / length, 1.0 / length
+    return rays
 
 
 @njit(cache=True)
@@ -252,11 +289,8 @@ def fit_cone(rays, tolerance):
         m, ok = _solve3(rays[i], rays[i + third], rays[i + 2 * third])
         if not ok:
             continue
-        count = 0
         scale = tolerance * _norm_times_sine(m)
-        for j in range(k):
-            if abs(rays[j] @ m - 1.0) < scale:
-                count += 1
+        count = _n_agree(rays, m, scale)
         if count > best_count:
             best, best_count = m, count
     for _ in range(2):
@@ -265,7 +299,7 @@ def fit_cone(rays, tolerance):
         N, b = np.zeros((3, 3)), np.zeros(3)
         scale = tolerance * _norm_times_sine(best)
         for j in range(k):
-            if abs(rays[j] @ best - 1.0) < scale:
+            if _agrees(rays[j], best, scale):
                 b += rays[j]
                 for a in range(3):
                     N[a] += rays[j, a] * rays[j]
@@ -274,11 +308,22 @@ def fit_cone(rays, tolerance):
             return best, 0
         best = m
         scale = tolerance * _norm_times_sine(best)
-        best_count = 0
-        for j in range(k):
-            if abs(rays[j] @ best - 1.0) < scale:
-                best_count += 1
+        best_count = _n_agree(rays, best, scale)
     return best, best_count
+
+
+@njit(cache=True)
+def _agrees(ray, m, scale):
+    return abs(ray[0] * m[0] + ray[1] * m[1] + ray[2] * m[2] - 1.0) < scale
+
+
+@njit(cache=True)
+def _n_agree(rays, m, scale):
+    count = 0
+    for j in range(len(rays)):
+        if _agrees(rays[j], m, scale):
+            count += 1
+    return count
 
 
 @njit(cache=True)

@@ -28,6 +28,7 @@ from makebreak.systems.numerics.c3_projections import (
     Projection,
     QpProjection,
     project,
+    project_plus,
     projection_matrices,
 )
 from makebreak.systems.numerics.c3_qp import (
@@ -38,7 +39,7 @@ from makebreak.systems.numerics.c3_qp import (
     within,
 )
 from makebreak.systems.numerics.lcp import SOLVED, solve_lcp_kernel
-from makebreak.systems.numerics.lcs import LCS, simulate
+from makebreak.systems.numerics.lcs import LCS, is_finite, simulate
 
 
 class C3Failure(RuntimeError):
@@ -330,31 +331,75 @@ def solve_c3(
     elif o.start_at_x0:
         delta[:, : p.n_x] = x0
 
+    model = AB, np.array(lcs.d), np.hstack([F, H, E]), c
+    weights, bounds = (p.Q, p.R, p.Q_N, p.G), (p.lower, p.upper)
+    given = h, x0, lam0
+    if p.is_plus:
+        status, x, v, delta, w = _admm_plus(
+            *model, *weights, *bounds, p.U, *given, delta, w, o.rounds, o.rho
+        )
+        if status != SOLVED:
+            raise C3Failure(_FAILURES[status])
+    else:
+        lcp = p.projection, p.U, (E, F, H, c), matrices
+        x, v, delta, w = _admm(model, weights, bounds, given, delta, w, o, lcp)
+    plan = Plan(x, np.ascontiguousarray(v[:, p.n_lam :]), v[:, : p.n_lam] * scale)
+    return plan, WarmStart(plan.u, delta * unit, w * unit)
+
+
+def _admm(model, weights, bounds, given, delta, w, options, lcp):
+    """The rounds of C3, and the last QP: x, v, delta, w.
+
+    Args: model, weights, bounds as of _qp_step; given: h, x0, lam0 of it; lcp: what
+        `project` needs beside z and delta.
+    Raises: C3Failure.
+    """
+    (Q, R, Q_N, G), (h, x0, lam0) = weights, given
+    (N, n_z), n_lam = delta.shape, model[2].shape[0]
+
     def qp_step(G, target):
-        x, v = np.empty((o.N + 1, p.n_x)), np.empty((o.N, p.n_lam + p.n_u))
-        z = np.empty((o.N, p.n_z))
+        x, v = np.empty((N + 1, len(Q))), np.empty((N, n_lam + len(R)))
+        z = np.empty((N, n_z))
         status = _qp_step(
-            (AB, np.array(lcs.d), np.hstack([F, H, E]), c),
-            (p.Q, p.R, p.Q_N, G),
-            (p.lower, p.upper),
-            (h, target, x0, lam0),
-            (z, x, v),
+            model, (Q, R, Q_N, G), bounds, (h, target, x0, lam0), (z, x, v)
         )
         if status != SOLVED:
             raise C3Failure(_FAILURES[status])
         return z, x, v
 
-    G = p.G.copy()
-    for _ in range(o.rounds):
+    projection, U, arrays, matrices = lcp
+    for _ in range(options.rounds):
         z, _, _ = qp_step(G, delta - w)
-        delta = np.empty((o.N, p.n_z))
-        if not project(p.projection, z + w, p.U, (E, F, H, c), matrices, delta):
+        delta = np.empty((N, n_z))
+        if not project(projection, z + w, U, arrays, matrices, delta):
             raise C3Failure("the projection's LCP was not solved")
-        w = (w + z - delta) / o.rho
-        G = o.rho * G
-    _, x, v = qp_step(G, delta if p.is_plus else delta - w)
-    plan = Plan(x, np.ascontiguousarray(v[:, p.n_lam :]), v[:, : p.n_lam] * scale)
-    return plan, WarmStart(plan.u, delta * unit, w * unit)
+        w = (w + z - delta) / options.rho
+        G = options.rho * G
+    _, x, v = qp_step(G, delta - w)
+    return x, v, delta, w
+
+
+@njit(cache=True)
+def _admm_plus(
+    AB, d, C, c, Q, R, Q_N, G, lower, upper, U, h, x0, lam0, delta, w, rounds, rho
+):
+    """The same for C3+, compiled as a whole; the first result is _qp_step's status."""
+    (N, n_z), n_lam = delta.shape, C.shape[0]
+    model, bounds = (AB, d, C, c), (lower, upper)
+    x, v = np.empty((N + 1, len(Q))), np.empty((N, n_lam + len(R)))
+    z = np.empty((N, n_z))
+    for _ in range(rounds):
+        status = _qp_step(
+            model, (Q, R, Q_N, G), bounds, (h, delta - w, x0, lam0), (z, x, v)
+        )
+        if status != SOLVED:
+            return status, x, v, delta, w
+        delta = np.empty((N, n_z))
+        project_plus(z + w, U, len(Q), n_lam, delta)
+        w = (w + z - delta) / rho
+        G = rho * G
+    status = _qp_step(model, (Q, R, Q_N, G), bounds, (h, delta, x0, lam0), (z, x, v))
+    return status, x, v, delta, w
 
 
 @njit(cache=True)
@@ -476,3 +521,4 @@ def warm_up(problem: C3Problem):
     except C3Failure:
         pass  # Bounds may exclude this made-up problem; it is compiled all the same.
     simulate(lcs, x0, np.zeros(p.n_u))
+    is_finite(lcs)

@@ -8,9 +8,10 @@ Source: Huang, Aydinoglu, Jin, Posa, "Adaptive contact-implicit model predictive
 control with online residual learning" (ACI-MPC), definition 2.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from makebreak.systems.numerics.lcp import solve_lcp
 
@@ -40,12 +41,9 @@ class LCS:
         shapes |= dict(E=(n_lam, n_x), F=(n_lam, n_lam), H=(n_lam, n_u), c=(n_lam,))
         if self.phi is not None:
             shapes["phi"] = (n_lam,)
+        fields = vars(self)
         for name, shape in shapes.items():
-            value = np.array(getattr(self, name), dtype=float)  # Our own copy.
-            if value.shape != shape:
-                raise ValueError(f"LCS.{name} is {value.shape}, expected {shape}")
-            value.setflags(write=False)
-            object.__setattr__(self, name, value)
+            fields[name] = _own(name, fields[name], shape)
 
     def __deepcopy__(self, memo) -> "LCS":
         """Itself: nothing in it can change. Drake copies all state at each update."""
@@ -65,7 +63,32 @@ class LCS:
 
     def with_residual(self, r_comp) -> "LCS":
         """This LCS with the offset c + r_comp, r_comp (n_lam,) [m/s] (eq. 12)."""
-        return replace(self, c=self.c + r_comp)
+        lcs = object.__new__(LCS)  # The other fields have been checked.
+        vars(lcs).update(vars(self), c=_own("c", self.c + r_comp, (self.n_lam,)))
+        return lcs
+
+
+def _own(name, value, shape):
+    """A read-only copy of an array of floats. Raises: ValueError for another shape."""
+    value = np.array(value, dtype=float)
+    if value.shape != shape:
+        raise ValueError(f"LCS.{name} is {value.shape}, expected {shape}")
+    value.setflags(write=False)
+    return value
+
+
+def is_finite(lcs: LCS) -> bool:
+    """Whether every number of the model itself is (phi only informs)."""
+    return _all_finite(lcs.A, lcs.B, lcs.D, lcs.d, lcs.E, lcs.F, lcs.H, lcs.c)
+
+
+@njit(cache=True)
+def _all_finite(A, B, D, d, E, F, H, c):
+    for matrix in (A, B, D, E, F, H):
+        for number in matrix.flat:
+            if not np.isfinite(number):
+                return False
+    return np.isfinite(d).all() and np.isfinite(c).all()
 
 
 def simulate(lcs: LCS, x, u):

@@ -24,6 +24,7 @@ from makebreak.systems.numerics.lcs import LCS
 
 # Shapes that the fast path knows.
 SPHERE, BOX, HALF_SPACE = 0, 1, 2
+_NOT_FINITE = "the linearised contact model has an entry that is not finite"
 
 
 def friction_rows(n_f):
@@ -110,18 +111,16 @@ def assemble_anitescu(
         dt,
         eps_c,
     )
-    return _finite(LCS(A, B, D, d, E, F, H, c, dt, phi[contact]))
+    if not _is_finite(c, d, F):
+        raise ValueError(_NOT_FINITE)
+    return LCS(A, B, D, d, E, F, H, c, dt, phi[contact])
 
 
-def _finite(lcs):
-    # c, d and F together contain every ingredient.
-    if not (
-        np.isfinite(lcs.c).all()
-        and np.isfinite(lcs.d).all()
-        and np.isfinite(lcs.F).all()
-    ):
-        raise ValueError("the linearised contact model has an entry that is not finite")
-    return lcs
+@njit(cache=True)
+def _is_finite(c, d, F):
+    """Whether the model is: these together contain every ingredient."""
+    finite = np.isfinite(c).all() and np.isfinite(d).all()
+    return finite and np.isfinite(F).all()
 
 
 @njit(cache=True)
@@ -200,13 +199,15 @@ class ConstantMassModel:
 
         Raises: ValueError as assemble_anitescu.
         """
-        A, B, D, d, E, F, H, c, phi = _build_constant_mass(
+        A, B, D, d, E, F, H, c, phi, finite = _build_constant_mass(
             x, u, self.M_inv, self.f_0, self.J_v, self.J_u, self.plain, self.floating,
             self.shape, self.size, self.quaternion, self.omega, self.R, self.p_0,
             self.P, self.J_p, self.pairs, self.mu, self.reference, self.contact,
             self.edge, dt, eps_c,
         )  # fmt: skip
-        return _finite(LCS(A, B, D, d, E, F, H, c, dt, phi))
+        if not finite:
+            raise ValueError(_NOT_FINITE)
+        return LCS(A, B, D, d, E, F, H, c, dt, phi)
 
 
 @njit(cache=True)
@@ -261,7 +262,7 @@ def _build_constant_mass(
         x, f, np.zeros((n_v, n_q)), J_v, J_u, u, M_inv @ J_c.T, N, N_plus, phi, J_n,
         J_c, contact, dt, eps_c,
     )  # fmt: skip
-    return A, B, D, d, E, F, H, c, phi_lam
+    return A, B, D, d, E, F, H, c, phi_lam, _is_finite(c, d, F)
 
 
 @njit(cache=True)

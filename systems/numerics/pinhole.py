@@ -358,15 +358,22 @@ def _mix_row(source, mixed, left, weight, first, end, n):
     if b > a:
         at = left[first] * n
         _mix_run(source[at:], source[at + n :], weight[a:b], mixed[a:b])
-    for j in range(width):
-        if first <= j < end:
-            continue
-        p_at = min(max(left[j], 0), width - 1) * n
-        q_at = min(max(left[j] + 1, 0), width - 1) * n
-        for k in range(n):
-            value = np.float32(source[p_at + k])
-            other = np.float32(source[q_at + k])
-            mixed[j * n + k] = value + weight[j * n + k] * (other - value)
+    for j in range(first):
+        _mix_edge(source, mixed, left[j], weight, j, n)
+    for j in range(max(first, end), width):
+        _mix_edge(source, mixed, left[j], weight, j, n)
+
+
+@njit(cache=True, fastmath={"contract"})
+def _mix_edge(source, mixed, left, weight, j, n):
+    """Column j, whose neighbours may lie beyond the picture."""
+    last = mixed.size // n - 1
+    p = min(max(left, 0), last) * n
+    q = min(max(left + 1, 0), last) * n
+    for k in range(n):
+        value = np.float32(source[p + k])
+        other = np.float32(source[q + k])
+        mixed[j * n + k] = value + weight[j * n + k] * (other - value)
 
 
 @njit(cache=True, fastmath={"contract"})

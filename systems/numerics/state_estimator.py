@@ -3,6 +3,7 @@
 import numba
 import numpy as np
 
+from makebreak.systems.numerics.ball_state import compiled_pack
 from makebreak.systems.numerics.serial_chain import chain_state
 
 
@@ -28,3 +29,30 @@ def tip_motion(chain, q, v, torque, tip_mass):
     J = state.J[:3]
     a = J @ np.linalg.solve(state.M, torque - state.bias) + state.bias_a[:3]
     return state.p_WE, J @ v, tip_mass * a
+
+
+@numba.njit(cache=True)
+def estimate(chain, q, v, torque, p_ball, v_ball, seen, tip_mass, radius, window):
+    """One reading: the state of the LCS, and the window of forces with it.
+
+    Args:
+        chain: packed SerialChain (numerics/packed.py). q, v, torque as in tip_motion.
+        p_ball, v_ball: (3,) [m], [m/s]. seen: (1,) above 0.5 if the ball is seen.
+        radius: of the ball as the model has it [m].
+        window: (3 n + 1,) the last n forces, oldest first [N], and how many readings
+            in a row were valid, at most n.
+    Returns: whether every reading is finite (if not, the rest is not to be used);
+        x (19,); window; valid, 1.0 or 0.0.
+    """
+    after = np.empty(window.size)
+    total = q.sum() + v.sum() + torque.sum() + p_ball.sum() + v_ball.sum()
+    if not np.isfinite(total):
+        return False, after, after, 0.0
+    p_tip, v_tip, u = tip_motion(chain[0], q, v, torque, tip_mass)
+    n = window.size // 3
+    after[: 3 * n - 3] = window[3 : 3 * n]
+    after[3 * n - 3 : 3 * n] = u
+    valid = 1.0 if seen[0] > 0.5 else 0.0
+    after[3 * n] = min(valid * (window[3 * n] + 1.0), n)
+    x = compiled_pack(p_tip, v_tip, p_ball, v_ball, radius)
+    return True, x, after, valid
