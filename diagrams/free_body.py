@@ -73,7 +73,7 @@ class FreeBodyScene:
             float(now.mass), now.com, now.inertia, self._gravity, now.spheres,
             now.fixed, _pairs(now, self._guess) * self._touch[:, :, None],
             now.rolling[None, :] * now.spheres[:, 3:], now.forces, now.drag,
-            fade=FADE_RATE,
+            fade=FADE_RATE, patches=now.patches,
         )  # fmt: skip
 
     def _read(self, loaded: LoadedScene, body: RigidBody) -> None:
@@ -127,7 +127,7 @@ class FreeBodyScene:
             np.array(fixed).reshape(-1, 15), np.array(origins).reshape(-1, 3),
             np.array([_surface(inspector, g) for g in mine]),
             np.array([_surface(inspector, g) for g in others]).reshape(-1, 4),
-            np.zeros(len(others)), np.zeros((0, 6)), np.zeros(2),
+            np.zeros(len(others)), np.zeros((0, 6)), np.zeros(2), np.zeros((0, 6)),
         )  # fmt: skip
         for effect in loaded.effects:
             if effect.kind in _FORCES:
@@ -154,6 +154,7 @@ class _Numbers:
     rolling: np.ndarray
     forces: np.ndarray
     drag: np.ndarray
+    patches: np.ndarray
 
 
 def _surface(inspector, geometry) -> list[float]:
@@ -269,7 +270,16 @@ def _drag(now: _Numbers, p, on) -> None:
     now.drag += [p["linear"], p["angular"]]
 
 
+def _patch(now: _Numbers, p, on) -> None:
+    if not (p["x_min"] < p["x_max"] and p["y_min"] < p["y_max"]):
+        raise ValueError(f"friction_patch: the patch is empty: {p}")
+    sides = [p[k] for k in ("x_min", "x_max", "y_min", "y_max")]
+    more = [[m, p["friction"], *sides] for m in np.flatnonzero(on)]
+    now.patches = np.vstack([now.patches, *more])
+
+
 _CHANGES = {
+    "friction_patch": _patch,
     "object_size": _size, "corner_radius": _corners, "object_mass": _mass,
     "object_com": _com, "object_inertia": _moments, "contact_friction": _friction,
     "contact_stiffness": _stiffness, "contact_dissipation": _dissipation,

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from makebreak.gap.free_windows import FreeBodyModel
+from makebreak.gap.free_windows import FreeBodyModel, touched
 from makebreak.gap.screen import Candidate
 from makebreak.gap.windows import WindowModel
 from makebreak.models.effects import KINDS
@@ -37,6 +37,9 @@ _POSITIVE = dict.fromkeys(
 )  # fmt: skip
 _SIZES = (0.95, 0.99, 1.05)
 _INERTIAS = (0.97, 1.2)
+# Cells a side of the ground that was touched, in search of a patch; their least size.
+CELLS, LEAST_CELL = 6, 0.01  # [m]
+PATCH_ROUNDS = 12
 # Kinds that an unmeasured force on a mechanism would show as; those of free bodies.
 _OF_BODIES = ("constant_force", "body_drag", "object_mass", "object_com",
               "object_inertia", "length_scale")  # fmt: skip
@@ -82,6 +85,9 @@ def contact_candidates(
             if kind in _OF_BODIES and at not in model.bodies:
                 continue
             if any(e.kind == kind and at in e.at for e in there):
+                continue
+            if kind == "friction_patch":
+                found += _patches(model, nuisance, at, there, r)
                 continue
             for trials, names, fixed in _trials(model, kind, at):
                 each = _of(model, nuisance, kind, at, trials, names, fixed, there, r)
@@ -143,6 +149,97 @@ def _trials(model, kind: str, at: str):
                  for e in each],
                 tuple(steps), (),
             )  # fmt: skip
+
+
+def _patches(model, nuisance, at: str, there, r) -> list[Candidate]:
+    """A rectangle of other friction: cells of the ground that was touched are tried one
+    by one, and a rectangle is the sum of its cells."""
+    if not isinstance(model, FreeBodyModel):
+        return []
+    try:
+        mu = model.dynamics.now("contact_friction", [at])["friction"]
+        model.dynamics.now("friction_patch", [at])  # Whether there can be one.
+    except ValueError:
+        return []
+    for effect in there:
+        if effect.kind == "contact_friction":
+            mu = effect.parameters["friction"]
+    places = touched(model)
+    if mu <= 0.0 or len(places) < 2 * CELLS:
+        return []
+    grid = [np.linspace(c.min() - 1e-3, c.max() + 1e-3, CELLS + 1) for c in places.T]
+    if min(x[1] - x[0] for x in grid) < LEAST_CELL:
+        return []
+    train, step = model.train(), -0.3 * mu
+
+    def moved(friction: float, sides) -> np.ndarray | None:
+        names = ("x_min", "x_max", "y_min", "y_max")
+        p = {"friction": friction} | dict(zip(names, map(float, sides), strict=True))
+        return _residual(model, *there, Effect("friction_patch", [at], p))
+
+    # Cell by cell; of a rectangle, to first order, the sum of its cells.
+    sums = np.zeros((CELLS + 1, CELLS + 1, len(r)))
+    for i, j in itertools.product(range(CELLS), repeat=2):
+        new = moved(mu + step, (*grid[0][i : i + 2], *grid[1][j : j + 2]))
+        if new is not None:
+            sums[i + 1, j + 1] = (r - new) / step
+    sums = sums.cumsum(axis=0).cumsum(axis=1)
+    least, start = float(np.sum(r[train] ** 2)), None
+    pairs = list(itertools.combinations(range(CELLS + 1), 2))
+    for (i0, i1), (j0, j1) in itertools.product(pairs, repeat=2):
+        x = (sums[i1, j1] - sums[i0, j1] - sums[i1, j0] + sums[i0, j0])[train]
+        size = float(x @ x)
+        c = float(x @ r[train]) / size if size > 0.0 else 0.0
+        c = max(c, -0.9 * mu)
+        error = float(np.sum((r[train] - c * x) ** 2))
+        if error < least:
+            least, start = error, (mu + c, np.array([i0, i1, j0, j1]))
+    if start is None:
+        return []
+    friction, sides = _patch_search(moved, train, grid, *start)
+    new = moved(friction, sides)
+    if new is None or friction == mu:
+        return []
+    column = Columns(((r - new) / (friction - mu))[:, None], nuisance, train)
+
+    def read(c) -> dict[str, float]:
+        names = ("x_min", "x_max", "y_min", "y_max")
+        size = float(np.clip(mu + c[0], 0.1 * mu, max(1.5, 2.0 * mu)))
+        return {"friction": size} | dict(zip(names, sides, strict=True))
+
+    return [Candidate("friction_patch", (at,), 5, (column,), (read,))]
+
+
+def _patch_search(moved, train, grid, friction: float, corner: np.ndarray):
+    """The patch from which no move of a side by a cell or a half, with another friction
+    or the same, takes off more: simulated, not to first order.
+
+    Args: moved(friction, sides): residual or None; grid: of x and of y; corner (4,):
+        numbers in it of the sides. Returns: friction, sides.
+    """
+    cells = np.arange(CELLS + 1)
+
+    def sides(at) -> list[float]:
+        return [float(np.interp(k, cells, grid[i // 2])) for i, k in enumerate(at)]
+
+    def error(mu: float, at) -> float:
+        if not (at[0] < at[1] and at[2] < at[3]) or min(at) < 0 or max(at) > CELLS:
+            return np.inf
+        r = moved(mu, sides(at))
+        return np.inf if r is None else float(np.sum(r[train] ** 2))
+
+    at = np.array(corner, float)
+    now = error(friction, at)
+    for reach in (1.0, 0.5):
+        for _ in range(PATCH_ROUNDS):
+            moves = [at, *(at + d * e for e in np.eye(4) for d in (-reach, reach))]
+            trials = [(friction * s, x) for s in (0.83, 1.0, 1.2) for x in moves]
+            errors = [error(*each) for each in trials]
+            best = int(np.argmin(errors))
+            if not errors[best] < 0.99 * now:
+                break
+            now, (friction, at) = errors[best], trials[best]
+    return friction, sides(at)
 
 
 def _moments(now: dict, name: str, factor: float) -> dict[str, float]:

@@ -5,14 +5,16 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.optimize import least_squares, minimize
+from scipy.optimize import differential_evolution, least_squares, minimize
 
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, check_parameters
 from makebreak.systems.numerics.selection import LinearFit, Screen
 
 EVALUATIONS = 8
-WANDER = 0.2  # Of a parameter's size: the first steps of a search without slopes.
+# Of a parameter's size: first steps of a search without slopes, and how far around one
+# looks where that ended.
+WANDER, AROUND = 0.2, 0.5
 ROUGH = np.linspace(0.85, 1.15, 16)  # Of a start, tried.
 
 
@@ -112,9 +114,13 @@ def wander(
     screen: Screen,
     start: Sequence[Effect],
     fixed: Sequence[Sequence[str]],
+    far: bool = False,
 ) -> tuple[Effect, ...]:
     """Effects from which a fit may go on where its gradient misled it: when which foot
-    lands first changes, the error jumps, and slopes tell little. Nelder and Mead."""
+    lands first changes, the error jumps, and slopes tell little.
+
+    Nelder and Mead's search; `far`, differential evolution, which leaves valleys.
+    """
     free = _Free(start, [tuple(names) for names in fixed])
 
     def cost(z) -> float:
@@ -127,12 +133,18 @@ def wander(
         return float(error) if np.isfinite(error) else 1e6
 
     z0 = free.x0 / free.scale
-    corners = np.vstack([z0, z0 + WANDER * np.eye(len(z0))])
-    found = minimize(
-        cost, z0, method="Nelder-Mead",
-        options={"initial_simplex": corners, "maxfev": 40 * len(z0), "xatol": 1e-3,
-                 "fatol": 1e-2},
-    )  # fmt: skip
+    if far:
+        found = differential_evolution(
+            cost, [(z - AROUND, z + AROUND) for z in z0], x0=z0, init="sobol",
+            maxiter=15, popsize=6, polish=False, rng=0,
+        )  # fmt: skip
+    else:
+        corners = np.vstack([z0, z0 + WANDER * np.eye(len(z0))])
+        found = minimize(
+            cost, z0, method="Nelder-Mead",
+            options={"initial_simplex": corners, "maxfev": 40 * len(z0),
+                     "xatol": 1e-3, "fatol": 1e-2},
+        )  # fmt: skip
     return tuple(_tidy(e) for e in free.effects(found.x))
 
 

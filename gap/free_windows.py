@@ -17,7 +17,7 @@ from makebreak.gap.windows import TURN, WindowedResidual, spin_of
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
-from makebreak.systems.numerics.free_body import FreeBody, lowest_gap, simulate
+from makebreak.systems.numerics.free_body import FreeBody, lowest_gap, placed, simulate
 from makebreak.systems.numerics.smoother import smooth
 
 AFTER_SEC = 0.1  # Of a window after its impact.
@@ -29,6 +29,7 @@ BLUR = 0.02  # Laws of contact are approximations, which noise alone does not te
 DRAWS = 12  # Of uncertain starts.
 ENOUGH = 30  # Windows up to the first impact: then later ones are not needed.
 FEWEST_ROWS = 8
+NEAR = 2e-3  # [m] So near it is taken to touch.
 _PLACE = ("x", "y", "z")
 _STATE = (*TURN, *_PLACE, "wx", "wy", "wz", "vx", "vy", "vz")
 
@@ -121,6 +122,11 @@ class FreeBodyModel(WindowedResidual):
         if what in _PLACE:
             return size
         return 0.5 if what in TURN else (20.0 * size if what[0] == "v" else 20.0)
+
+    @property
+    def body(self) -> FreeBody:
+        """The scene's, without further effects."""
+        return self._body
 
     # ----- Cutting
 
@@ -290,6 +296,25 @@ class FreeBodyModel(WindowedResidual):
             e = e / np.sqrt(1.0 + (e / self._cap) ** 2)
             out.append(np.where(np.isfinite(seen), e / std, 0.0))
         return out
+
+
+def touched(model: FreeBodyModel) -> np.ndarray:
+    """(n, 2) where in x and y the body's spheres touched what is fixed, as measured."""
+    body, found = model.body, [np.zeros((0, 2))]
+    for w in model.windows:
+        recording = model.recordings[w.recording]
+        pose = np.zeros((w.rows.stop - w.rows.start, 7))
+        pose[:, 0] = 1.0
+        for i, a in enumerate((*TURN, *_PLACE)):
+            if f"{model.name}.{a}" in recording:
+                pose[:, i] = recording[f"{model.name}.{a}"][w.rows]
+        pose = pose[np.isfinite(pose).all(axis=1)]
+        for row in pose[:: max(len(pose) // 20, 1)]:
+            if lowest_gap(body, row) < NEAR:
+                feet = placed(row, body.spheres[:, :3])
+                low = feet[:, 2] - body.spheres[:, 3]
+                found.append(feet[low < low.min() + NEAR, :2])
+    return np.concatenate(found)
 
 
 def _root(P: np.ndarray) -> np.ndarray:

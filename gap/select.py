@@ -104,18 +104,20 @@ def select(
 def _settled(model, nuisance, prior, chosen, current: Fitted) -> Fitted:
     """A fit that was stopped short, as all of a short list are, carried on: what it
     has not reached yet would be looked for in other effects."""
-    if not needs_more(current, prior):
-        return current
-    screen = Screen(current.r, nuisance, prior, model.train(), current.fit.train)
     fixed = [c["fixed"] for c in chosen]
-    effects = current.effects
-    if getattr(model, "jumps", False):
-        effects = wander(model, screen, effects, fixed)
-    more = fit_effects(model, screen, effects, fixed, 3 * EVALUATIONS)
-    if not more.fit.train < current.fit.train:
-        return current
-    chosen[-1]["after"] = min(more.score, chosen[-1]["after"])
-    return more
+    jumps = getattr(model, "jumps", False)
+    for far in (False, True) if jumps else (False,):
+        if not needs_more(current, prior):
+            break
+        screen = Screen(current.r, nuisance, prior, model.train(), current.fit.train)
+        effects = current.effects
+        if jumps:
+            effects = wander(model, screen, effects, fixed, far)
+        more = fit_effects(model, screen, effects, fixed, 3 * EVALUATIONS)
+        if more.fit.train < current.fit.train:
+            current = more
+            chosen[-1]["after"] = min(more.score, chosen[-1]["after"])
+    return current
 
 
 def needs_more(fit: Fitted, prior: np.ndarray) -> bool:

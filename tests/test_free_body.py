@@ -82,3 +82,28 @@ def test_a_scene_with_more_than_one_free_body_is_refused(scene):
     two = replace(scene, directives=[*scene.directives, second])
     with pytest.raises(ValueError, match="one free body"):
         FreeBodyScene(two)
+
+
+def test_a_patch_of_ground_has_its_own_friction(scene):
+    # One sphere slides along x: mu g slows it, as much as the patch it is on has.
+    numbers = FreeBodyScene(scene).body()
+    ball = replace(
+        numbers, spheres=np.array([[0.0, 0.0, 0.0, 0.02]]), com=np.zeros(3),
+        inertia=1e9 * np.eye(3), pairs=numbers.pairs[:1], levers=numbers.levers[:1],
+    )  # fmt: skip
+    mu = ball.pairs[0, 0, 3]
+    top = ball.fixed[0, 11] + ball.fixed[0, 14]
+    g = -ball.gravity[2]
+    sink = ball.mass * g / ball.pairs[0, 0, 0]
+    start = np.array([1, 0, 0, 0, 0, 0, top + 0.02 - sink, 0, 0, 0, 1.0, 0, 0], float)
+    times = np.linspace(0.0, 0.1, 11)
+    for friction, sides in ((0.05, (0.03, 1, -1, 1)), (0.05, (0.03, 1, 0.1, 1))):
+        patch = np.array([[0, friction, *sides]])
+        x = simulate(replace(ball, patches=patch), start, times, tol=1e-7)
+        inside = sides[2] < 0.0
+        # 0.03 m on the ground, the rest on the patch.
+        v2 = 1.0 - 2.0 * mu * g * 0.03
+        rest = x[-1, 4] - 0.03
+        v2 -= 2.0 * (friction if inside else mu) * g * rest
+        np.testing.assert_allclose(x[-1, 10] ** 2, v2, atol=1e-4)
+        assert rest > 0.03

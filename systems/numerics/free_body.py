@@ -12,7 +12,7 @@ documentation of MultibodyPlant, "Modeling of compliant contact" and
 Lett. 2(4), 1989.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
@@ -30,7 +30,8 @@ class FreeBody:
     dissipation [s/m], static and dynamic friction, and the share of the contact point
     that lies on the sphere's surface. levers (n, m): of rolling resistance [m].
     forces (p, 6): fx, fy, fz [N, world, on the body's origin], frequency [Hz] (0:
-    constant), phase, 0.
+    constant), phase, 0. patches (k, 6): number of a fixed shape, and the friction there
+    where x and y of the world are within x_min, x_max, y_min, y_max.
     """
 
     mass: float
@@ -45,6 +46,7 @@ class FreeBody:
     drag: np.ndarray  # (2,) linear [N s/m], angular [N m s/rad]
     slip: float = 1e-3  # v_s [m/s]
     fade: float = 0.05  # Below this rate rolling resistance fades [rad/s].
+    patches: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
 
 
 def simulate(
@@ -61,8 +63,13 @@ def simulate(
         np.asarray(start, float), np.asarray(times, float), body.mass, body.com,
         np.ascontiguousarray(body.inertia), np.linalg.inv(body.inertia), body.gravity,
         body.spheres, body.fixed, body.pairs, body.levers, body.forces, body.drag,
-        body.slip, body.fade, max_step, tol,
+        body.slip, body.fade, body.patches, max_step, tol,
     )  # fmt: skip
+
+
+def placed(pose, points) -> np.ndarray:
+    """(n, 3) points of the body's frame (n, 3) in world; pose (7,) as in `start`."""
+    return np.asarray(pose[4:7]) + points @ _matrix(np.asarray(pose[:4], float)).T
 
 
 def lowest_gap(body: FreeBody, pose) -> float:
@@ -135,7 +142,7 @@ def _friction(speed, slip, mu_s, mu_d):
 
 @njit(cache=True)
 def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, fixed, pairs, levers,
-          forces, drag, slip, fade, dx):  # fmt: skip
+          forces, drag, slip, fade, patches, dx):  # fmt: skip
     """State s: quaternion (4), centre of mass (3), w in world (3), its velocity (3)."""
     R = _matrix(s[:4])
     w0, w1, w2 = s[7], s[8], s[9]
@@ -192,7 +199,15 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, fixed, pairs, lev
             speed = np.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
             share = 0.0
             if speed > 1e-14:
-                mu = _friction(speed, slip, pairs[j, m, 2], pairs[j, m, 3])
+                mu_s, mu_d = pairs[j, m, 2], pairs[j, m, 3]
+                for k in range(len(patches)):
+                    if (
+                        patches[k, 0] == m
+                        and patches[k, 2] < c[0] < patches[k, 3]
+                        and patches[k, 4] < c[1] < patches[k, 5]
+                    ):
+                        mu_s = mu_d = patches[k, 1]
+                mu = _friction(speed, slip, mu_s, mu_d)
                 share = mu * fn / speed
             f0 = fn * n[0] - share * u0
             f1 = fn * n[1] - share * u1
@@ -235,7 +250,7 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, fixed, pairs, lev
 
 @njit(cache=True)
 def _run(start, times, mass, com, inertia, inverse, gravity, spheres, fixed, pairs,
-         levers, forces, drag, slip, fade, max_step, tol):  # fmt: skip
+         levers, forces, drag, slip, fade, patches, max_step, tol):  # fmt: skip
     n = len(times)
     out = np.full((n, 13), np.nan)
     s = start.copy()
@@ -250,7 +265,7 @@ def _run(start, times, mass, com, inertia, inverse, gravity, spheres, fixed, pai
     k1, k2, k3, k4 = np.empty(13), np.empty(13), np.empty(13), np.empty(13)
     t, h, steps = times[0], 1e-4, 0
     _rate(t, s, mass, com, inertia, inverse, gravity, spheres, fixed, pairs, levers,
-          forces, drag, slip, fade, k1)  # fmt: skip
+          forces, drag, slip, fade, patches, k1)  # fmt: skip
     for i in range(n):
         while t < times[i] - 1e-12:
             steps += 1
@@ -260,13 +275,13 @@ def _run(start, times, mass, com, inertia, inverse, gravity, spheres, fixed, pai
             step = min(h, times[i] - t)
             _rate(t + 0.5 * step, s + 0.5 * step * k1, mass, com, inertia, inverse,
                   gravity, spheres, fixed, pairs, levers, forces, drag, slip, fade,
-                  k2)  # fmt: skip
+                  patches, k2)  # fmt: skip
             _rate(t + 0.75 * step, s + 0.75 * step * k2, mass, com, inertia, inverse,
                   gravity, spheres, fixed, pairs, levers, forces, drag, slip, fade,
-                  k3)  # fmt: skip
+                  patches, k3)  # fmt: skip
             new = s + step * (2.0 / 9.0 * k1 + 1.0 / 3.0 * k2 + 4.0 / 9.0 * k3)
             _rate(t + step, new, mass, com, inertia, inverse, gravity, spheres, fixed,
-                  pairs, levers, forces, drag, slip, fade, k4)  # fmt: skip
+                  pairs, levers, forces, drag, slip, fade, patches, k4)  # fmt: skip
             worst = 0.0
             for j in range(13):
                 e = step * abs(
