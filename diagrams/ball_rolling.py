@@ -15,7 +15,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram, DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, MatrixGain
+from pydrake.systems.primitives import (
+    ConstantVectorSource,
+    Demultiplexer,
+    LogVectorOutput,
+    MatrixGain,
+)
 
 from makebreak.diagrams.camera import CameraConfig, camera_model
 from makebreak.diagrams.scene_facts import sphere_radius
@@ -478,12 +483,16 @@ def add_ball_rolling(
 
 def connect_reference(builder: DiagramBuilder) -> None:
     """The task's own reposition, and the reference straight to the arm."""
-    system = builder.GetSubsystemByName
-    for source, output, target, port in (
-        ("rolling_task", "reference", "arm_reference", "reference"),
-        ("arm_reference", "x_desired", "impedance_controller", "x_desired"),
-        ("arm_reference", "wrench", "impedance_controller", "wrench_feedforward"),
-    ):
-        builder.Connect(
-            system(source).GetOutputPort(output), system(target).GetInputPort(port)
-        )
+    task, reference, arm = (
+        builder.GetSubsystemByName(name)
+        for name in ("rolling_task", "arm_reference", "impedance_controller")
+    )
+    builder.Connect(
+        task.GetOutputPort("reference"), reference.GetInputPort("reference")
+    )
+    sizes = [reference.GetOutputPort(name).size() for name in ("x_desired", "wrench")]
+    # Both at once: a port of a Python system costs more than what it works out.
+    split = builder.AddNamedSystem("arm_command_split", Demultiplexer(sizes))
+    builder.Connect(reference.GetOutputPort("command"), split.get_input_port())
+    for i, name in enumerate(("x_desired", "wrench_feedforward")):
+        builder.Connect(split.get_output_port(i), arm.GetInputPort(name))

@@ -39,7 +39,8 @@ class ArmReference(LeafSystem):
     Inputs:  phase (1,), reference (9,) of RollingTask; x_next (19,), lam (n_lam,),
              status (1,) of C3; lcs (abstract), the one-step LCS that made them.
     Outputs: x_desired (19,) = [p, quaternion, v, w, a, alpha], position and its
-             derivatives only (the quaternion is the identity); wrench (6,) force first.
+             derivatives only (the quaternion is the identity); wrench (6,) force first;
+             command (25,), one after the other: for who asks for both each millisecond.
     """
 
     def __init__(self, config: ArmReferenceConfig, n_lam: int, p_tip, lcs: LCS):
@@ -59,6 +60,7 @@ class ArmReference(LeafSystem):
         ticket = {self.discrete_state_ticket(self._line), self.time_ticket()}
         self.DeclareVectorOutputPort("x_desired", 19, self._pose, ticket)
         self.DeclareVectorOutputPort("wrench", 6, self._wrench, ticket)
+        self.DeclareVectorOutputPort("command", 25, self._command, ticket)
         self.DeclarePeriodicDiscreteUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
@@ -87,9 +89,14 @@ class ArmReference(LeafSystem):
         discrete_state.set_value(self._line, np.concatenate((start, end, [t])))
 
     def _pose(self, context, output):
-        line = context.get_discrete_state(self._line).value()
-        output.SetFromVector(pose_and_wrench(line, context.get_time(), self._period)[0])
+        output.SetFromVector(self._now(context)[:19])
 
     def _wrench(self, context, output):
+        output.SetFromVector(self._now(context)[19:])
+
+    def _command(self, context, output):
+        output.SetFromVector(self._now(context))
+
+    def _now(self, context):
         line = context.get_discrete_state(self._line).value()
-        output.SetFromVector(pose_and_wrench(line, context.get_time(), self._period)[1])
+        return pose_and_wrench(line, context.get_time(), self._period)

@@ -187,6 +187,12 @@ class ImpedanceController(LeafSystem):
             damping = self._or(self._damped, context, stiffness)
         else:
             damping = self._law.damping
+        directions, targets = self._none, self._no_targets
+        measured = self._none
+        if self._directions.HasValue(context):  # Else there is no force to control.
+            directions = self._directions.Eval(context)
+            targets = self._or(self._targets, context, self._no_targets)
+            measured = self._or(self._measured, context, self._none)
         tau, status, memory = packed_tick(
             *self._packed,
             context.get_discrete_state(self._tau).value(),
@@ -198,9 +204,9 @@ class ImpedanceController(LeafSystem):
             damping,
             ratio,
             self._or(self._wrench, context, self._none),
-            self._or(self._directions, context, self._none),
-            self._or(self._targets, context, self._no_targets),
-            self._or(self._measured, context, self._none),
+            directions,
+            targets,
+            measured,
         )
         discrete_state.set_value(self._tau, tau)
         discrete_state.set_value(self._status, [status])

@@ -229,12 +229,9 @@ def test_a_shifted_picture_is_linear_between_pixels_and_ends_as_its_edges(shape)
     height, width, _ = shape
     for u, v in [(0.0, 0.0), (2.0, -1.0), (-40.0, 0.5), *rng.normal(0.0, 2.0, (20, 2))]:
         # One axis after the other; np.interp holds the ends.
-        across = [np.interp(np.arange(width) - u, np.arange(width), line)
-                  for line in picture.transpose(0, 2, 1).reshape(-1, width)]  # fmt: skip
-        across = np.reshape(across, (height, -1, width)).transpose(2, 1, 0)
-        both = [np.interp(np.arange(height) - v, np.arange(height), line)
-                for line in across.reshape(-1, height)]  # fmt: skip
-        expected = np.reshape(both, (width, -1, height)).transpose(2, 0, 1)
+        i, j = np.arange(height), np.arange(width)
+        expected = np.apply_along_axis(lambda a: np.interp(j - u, j, a), 1, picture)
+        expected = np.apply_along_axis(lambda a: np.interp(i - v, i, a), 0, expected)
         moved = np.empty_like(picture)
         shifted(picture, u, v, moved)
         # Half a count of rounding, and 255 times single precision at 40 px: 1e-3.

@@ -377,38 +377,43 @@ class RollingResistance(LeafSystem):
             plant.time_step() or 0.001, 0.0, self._update
         )
         # Compiles it, for arrays of the kind that Drake gives.
-        zero, up = np.zeros(self._n_v), np.ones(3)
+        self._none = np.zeros(self._n_v)
+        x, up = np.zeros(self._n_q + self._n_v), np.ones(3)
         up.setflags(write=False)
-        add_rolling_torque(zero, zero, np.ones(3), up, 0.0, self._at, FADE_RATE)
+        rolling_torque(
+            self._none, x, np.ones(3), up, 0.0, self._at, self._n_q, FADE_RATE
+        )
 
     def _update(self, context, discrete_state):
-        generalized = np.zeros(self._n_v)
+        generalized = self._none
         results = self._results.Eval(context)
         ball, other = self._pair
         for i in range(results.num_point_pair_contacts()):
             contact = results.point_pair_contact_info(i)
             a, b = int(contact.bodyA_index()), int(contact.bodyB_index())
             if (a == ball and b == other) or (a == other and b == ball):
-                add_rolling_torque(
+                generalized = rolling_torque(
                     generalized,
-                    self._x.Eval(context)[self._n_q :],
+                    self._x.Eval(context),
                     contact.contact_force(),
                     contact.point_pair().nhat_BA_W,
                     self._lever,
                     self._at,
+                    self._n_q,
                     FADE_RATE,
                 )
         discrete_state.set_value(self._force, generalized)
 
 
 @numba.njit(cache=True)
-def add_rolling_torque(generalized, v, force, normal, lever, at, fade_rate):
-    """Adds the torque of rolling resistance to generalized (n_v,), in place.
+def rolling_torque(generalized, x, force, normal, lever, at, n_q, fade_rate):
+    """generalized (n_v,) with the torque of rolling resistance added, a new array.
 
-    Args: v (n_v,); force (3,) of the contact [N] and its unit normal (3,), either sign;
-        lever [m]; at (2,): where ball and other body turn in v, or -1; fade_rate
-        [rad/s].
+    Args: x (n_q + n_v,) state; force (3,) of the contact [N] and its unit normal (3,),
+        either sign; lever [m]; at (2,): where ball and other body turn in v, or -1;
+        fade_rate [rad/s].
     """
+    generalized, v = generalized.copy(), x[n_q:]
     f_n = np.abs(np.sum(force * normal))
     omega = np.zeros(3)
     for body in range(2):
@@ -420,6 +425,7 @@ def add_rolling_torque(generalized, v, force, normal, lever, at, fade_rate):
     for body in range(2):
         if at[body] >= 0:
             generalized[at[body] : at[body] + 3] += (1 - 2 * body) * torque
+    return generalized
 
 
 def _ball(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph):

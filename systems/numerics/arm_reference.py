@@ -24,13 +24,13 @@ def on_the_line(line, t, period_sec):
 @numba.njit(cache=True)
 def pose_and_wrench(line, t, period_sec):
     """The same as x_desired (19,) = [p, quaternion, v, w, a, alpha], unturned, and as
-    wrench (6,), force first."""
+    wrench (6,), force first: (25,)."""
     now = on_the_line(line, t, period_sec)
-    pose, wrench = np.zeros(19), np.zeros(6)
-    pose[0:3], pose[3] = now[0:3], 1.0
-    pose[7:10], pose[13:16] = now[3:6], now[6:9]
-    wrench[0:3] = now[9:12]
-    return pose, wrench
+    both = np.zeros(25)
+    both[0:3], both[3] = now[0:3], 1.0
+    both[7:10], both[13:16] = now[3:6], now[6:9]
+    both[19:22] = now[9:12]
+    return both
 
 
 def next_end(start, target, dv_max):
