@@ -282,7 +282,8 @@ def _sane(ranked: list[Ranked]) -> list[Ranked]:
 
 
 def _shortlist(ranked: list[Ranked], base: float) -> list[Ranked]:
-    """Those worth an exact fit: near the best, at most two of a kind."""
+    """Those worth an exact fit: near the best, at most two of a kind; and of each kind
+    with which the catalogue says that the best is confused, the best place."""
     best = ranked[0].fit.score
     if best > 0.95 * base:
         return []
@@ -292,6 +293,12 @@ def _shortlist(ranked: list[Ranked], base: float) -> list[Ranked]:
         near = each.fit.score < max(1.6 * best, best + 0.15 * (base - best))
         if near and of_kind < 2 and len(short) < 7:
             short.append(each)
+    there = {r.candidate.kind for r in short}
+    for each in ranked:
+        kind = each.candidate.kind
+        if kind in KINDS[ranked[0].candidate.kind].confused_with and kind not in there:
+            short.append(each)
+            there.add(kind)
     return short
 
 
