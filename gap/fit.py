@@ -95,7 +95,7 @@ def fit_effects(
     std: list[dict[str, float]] = [{} for _ in start]
     if solved is not None:
         u, w, vt = np.linalg.svd(solved.jac, full_matrices=False)
-        inverse = 1.0 / np.maximum(w, 1e-12 * max(w[0], 1e-200))
+        inverse = 1.0 / np.maximum(w, max(1e-12 * w[0], 1e-100))
         spread = np.sqrt(np.sum((vt.T * inverse) ** 2, axis=1))
         # What is left, in units of what was allowed for, widens the interval.
         spread *= max(np.sqrt(2.0 * solved.cost / len(solved.fun)), 1.0)

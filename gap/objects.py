@@ -17,7 +17,7 @@ from makebreak.gap.result import GapResult, Unexplained
 from makebreak.gap.screen import Candidate
 from makebreak.gap.select import FLOOR, Selection, select
 from makebreak.gap.touch import TouchModel, touch_candidates
-from makebreak.gap.verdict import named, says, verdict_of
+from makebreak.gap.verdict import named, says, told, verdict_of
 from makebreak.gap.where import where_in_windows
 from makebreak.gap.windows import WindowModel
 from makebreak.models.dynamics import SceneDynamics
@@ -79,10 +79,12 @@ def _of_touch(model: TouchModel, checks, seconds, lap, say) -> GapResult:
     seconds["select"] = lap()
     start, end = selection.start.score, selection.end.score
     verdict = verdict_of(selection.choices, start, end)
+    selection, near = told(selection, verdict)
+    end = selection.end.score
     before, after = selection.start.left, selection.end.left
     effects_named = [named(c) for c in selection.choices]
     return GapResult(
-        verdict, says(verdict, effects_named, start, end),
+        verdict, says(verdict, effects_named, start, end, near),
         model.where(before) if verdict != "no_gap" else [], effects_named,
         model.measure(before, after), [], moved(names, prior, selection), checks,
         model.series(before, after), selection.table,
@@ -102,17 +104,19 @@ def _of_windows(model, checks, seconds, lap, say) -> GapResult:
         model, nuisance, prior, found if clear.score > FLOOR else [], say, MOST_EFFECTS
     )
     seconds["select"] = lap()
+    start, end = selection.start.score, selection.end.score
+    verdict = verdict_of(selection.choices, start, end)
+    selection, near = told(selection, verdict)
+    end = selection.end.score
     effects = [c.effect for c in selection.choices]
     before, after = model.simulate(()), model.simulate(effects)
     gap = gap_measure(model, before, after)
-    start, end = selection.start.score, selection.end.score
-    verdict = verdict_of(selection.choices, start, end)
     where = where_in_windows(model, model.errors(before)) if verdict != "no_gap" else []
     rest = unexplained_in_windows(model, after) if verdict == "gap_unnamed" else []
     effects_named = [named(c) for c in selection.choices]
     seconds["simulate"] = lap()
     return GapResult(
-        verdict, says(verdict, effects_named, start, end), where, effects_named,
+        verdict, says(verdict, effects_named, start, end, near), where, effects_named,
         gap, rest, moved(names, prior, selection), checks,
         series_of(model, before, after), selection.table,
     )  # fmt: skip

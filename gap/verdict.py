@@ -1,15 +1,19 @@
 """The verdict on a gap, in numbers and in words."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from makebreak.gap.result import Estimate, Evidence, NamedEffect
-from makebreak.gap.select import FLOOR, Choice
+from makebreak.gap.select import FLOOR, Choice, Selection
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import sentence
 
 # Left after all that could be named: more than so many times the noise, and more than
 # this share of the gap, is a gap without a name.
 UNNAMED, UNNAMED_SHARE = 2.0, 0.2
+# Effects that leave a gap without a name are told only if they take off this share:
+# less is what any model with a free parameter may fit to another law.
+TOLD = 0.5
 NO_GAP = 1.5  # Times the noise, after the background within its tolerance.
 
 
@@ -24,6 +28,20 @@ def verdict_of(
     if end > max(UNNAMED, UNNAMED_SHARE * start):
         return "gap_unnamed"
     return "ambiguous" if any(c.ties for c in choices) else "gap_named"
+
+
+def told(selection: Selection, verdict: str) -> tuple[Selection, str]:
+    """The selection, without effects where they are no name for the gap, and then what
+    they are worth, in words."""
+    start, end = selection.start.score, selection.end.score
+    if verdict != "gap_unnamed" or not selection.choices or end <= TOLD * start:
+        return selection, ""
+    names = [f"{c.effect.kind} at {', '.join(c.effect.at)}" for c in selection.choices]
+    near = (
+        f" The nearest that it has ({'; '.join(names)}) takes off "
+        f"{1.0 - end / start:.0%}, too little to be named."
+    )
+    return replace(selection, choices=(), end=selection.start), near
 
 
 def named(choice: Choice) -> NamedEffect:
@@ -58,8 +76,14 @@ def named(choice: Choice) -> NamedEffect:
     )
 
 
-def says(verdict: str, effects: Sequence[NamedEffect], start: float, end: float) -> str:
-    """The first screen's sentence."""
+def says(
+    verdict: str,
+    effects: Sequence[NamedEffect],
+    start: float,
+    end: float,
+    near: str = "",
+) -> str:
+    """The first screen's sentence. near: what `told` left out, in words."""
     if verdict == "no_gap":
         return (
             "The scene and the recordings agree: nothing is left beyond noise and "
@@ -70,7 +94,7 @@ def says(verdict: str, effects: Sequence[NamedEffect], start: float, end: float)
         head = f"{words} Beyond that, " if words else ""
         return head + (
             f"{'a' if head else 'A'} gap is left that no effect of the catalogue "
-            f"explains: held-out error {end:.3g} times the noise."
+            f"explains: held-out error {end:.3g} times the noise.{near}"
         )
     tail = ""
     if verdict == "ambiguous":

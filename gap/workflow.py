@@ -25,7 +25,7 @@ from makebreak.gap.result import GapResult
 from makebreak.gap.scene_facts import scene_facts, scene_names
 from makebreak.gap.screen import candidates, inseparable, nuisances
 from makebreak.gap.select import Choice, Selection, needs_more, select
-from makebreak.gap.verdict import named, says, verdict_of
+from makebreak.gap.verdict import named, says, told, verdict_of
 from makebreak.gap.where import unexplained, where_in_motion
 from makebreak.gap.windows import WindowModel, with_step
 from makebreak.models.dynamics import SceneDynamics
@@ -175,6 +175,8 @@ def _of_mechanism(scene, recordings, checks, seconds, clock, say, jobs) -> GapRe
         float(np.sqrt(np.mean(x.left**2))) for x in (selection.start, selection.end)
     ]
     verdict = verdict_of(choices, max(start, whole[0]), max(end, whole[1]), far)
+    selection, near = told(selection, verdict)
+    choices, end = choices[: len(selection.choices)], selection.end.score
     say("simulating held-out windows")
     effects = [c.effect for c in choices]
     background = _background(names, prior, selection)
@@ -187,7 +189,7 @@ def _of_mechanism(scene, recordings, checks, seconds, clock, say, jobs) -> GapRe
     effects_named = [named(c) for c in choices]
     rest = unexplained(model, selection.end.left) if verdict == "gap_unnamed" else []
     return GapResult(
-        verdict, says(verdict, effects_named, start, end), where, effects_named,
+        verdict, says(verdict, effects_named, start, end, near), where, effects_named,
         gap, rest, background, checks, series, selection.table,
     )  # fmt: skip
 
