@@ -228,9 +228,11 @@ def _friction(now: _Numbers, p, on) -> None:
 
 
 def _stiffness(now: _Numbers, p, on) -> None:
-    k, own = p["stiffness"], now.own[0, 0]
-    if np.isfinite(own) and own > 1.01 * k:
-        now.other[on, 0] = k * own / (own - k)
+    k, k1, k2 = p["stiffness"], now.other[on, 0][0], now.own[0, 0]
+    if np.isfinite([k1, k2]).all():
+        scale = k * (k1 + k2) / (k1 * k2)
+        now.own[:, 0] *= scale
+        now.other[on, 0] *= scale
     else:
         now.own[:, 0] = now.other[on, 0] = 2.0 * k
 

@@ -84,6 +84,8 @@ def contact_candidates(
                 continue
             if kind in _OF_BODIES and at not in model.bodies:
                 continue
+            if kind == "object_mass" and isinstance(model, FreeBodyModel):
+                continue  # No force is measured: it only shows as stiffness over mass.
             if any(e.kind == kind and at in e.at for e in there):
                 continue
             if kind == "friction_patch":

@@ -117,17 +117,19 @@ def _dissipation(properties: ProximityProperties) -> float:
 def _set_stiffness(
     effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph
 ) -> None:
-    """Drake combines two surfaces as springs in a row, k = k1 k2/(k1 + k2). As with
-    friction one surface is changed if that will do, else both become 2 k."""
+    """Drake combines two surfaces as springs in a row, k = k1 k2/(k1 + k2). Both are
+    scaled alike, so that the point of contact stays where it is between them."""
     k = parameter(effect, "stiffness")
     changed, other = _changed_and_other(effect, plant)
-    k_other = _only(effect, plant, scene_graph, other, _stiffness, "stiffness")
-    if np.isfinite(k_other) and k_other > 1.01 * k:
-        k_changed = k * k_other / (k_other - k)
+    k1 = _only(effect, plant, scene_graph, changed, _stiffness, "stiffness")
+    k2 = _only(effect, plant, scene_graph, other, _stiffness, "stiffness")
+    if np.isfinite([k1, k2]).all():
+        scale = k * (k1 + k2) / (k1 * k2)
+        k1, k2 = scale * k1, scale * k2
     else:
-        k_changed = 2.0 * k
-        _set_surface(plant, scene_graph, other, "point_contact_stiffness", 2.0 * k)
-    _set_surface(plant, scene_graph, changed, "point_contact_stiffness", k_changed)
+        k1 = k2 = 2.0 * k
+    _set_surface(plant, scene_graph, changed, "point_contact_stiffness", k1)
+    _set_surface(plant, scene_graph, other, "point_contact_stiffness", k2)
 
 
 def _set_dissipation(
