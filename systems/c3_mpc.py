@@ -26,7 +26,7 @@ from makebreak.systems.numerics.c3_projections import (
     PlusProjection,
     QpProjection,
 )
-from makebreak.systems.numerics.lcs import LCS, is_finite
+from makebreak.systems.numerics.lcs import LCS, is_finite, is_finite_model
 from makebreak.systems.numerics.timing import timed
 
 
@@ -194,7 +194,7 @@ class C3Mpc(LeafSystem):
             (C3Status.BAD_X_DESIRED, x_desired),
             (C3Status.BAD_R_COMP, r_comp),
         ):
-            if not np.isfinite(values).all():
+            if not is_finite(values):
                 return status, None
         if not (self._is_good(lcs) and self._is_good(lcs_command)):
             return C3Status.BAD_LCS, None
@@ -211,7 +211,7 @@ class C3Mpc(LeafSystem):
             return False
         if (lcs.n_x, lcs.n_u, lcs.n_lam) != (p.n_x, p.n_u, p.n_lam):
             return False
-        return is_finite(lcs)
+        return is_finite_model(lcs)
 
     def _get(self, context, state):
         index, shape = state

@@ -29,7 +29,7 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Diagram, LeafSystem
 
-from makebreak.systems.numerics.lcs import LCS
+from makebreak.systems.numerics.lcs import LCS, is_finite
 from makebreak.systems.numerics.lcs_builder import (
     BOX,
     HALF_SPACE,
@@ -129,7 +129,7 @@ class AnitescuLcs:
                 f"x is {x.shape} and u is {u.shape}, "
                 f"expected ({self.n_x},) and ({self.n_u},)"
             )
-        if not (np.isfinite(x).all() and np.isfinite(u).all()):
+        if not (is_finite(x) and is_finite(u)):
             raise ValueError("x or u holds an entry that is not finite")
         for start, _ in self._floating:
             norm = np.linalg.norm(x[start : start + 4])

@@ -8,7 +8,7 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import LeafSystem
 
-from makebreak.systems.numerics.lcs import LCS, is_finite
+from makebreak.systems.numerics.lcs import LCS, is_finite_model
 from makebreak.systems.numerics.residual_learner import (
     Buffer,
     Residual,
@@ -150,7 +150,7 @@ class ResidualLearner(LeafSystem):
             return _held(memory, None, LearnerStatus.DISABLED)
         if not self._fits(lcs):
             return _held(memory, None, LearnerStatus.BAD_LCS)
-        if not (np.isfinite(x).all() and is_finite(lcs)):
+        if not (np.isfinite(x).all() and is_finite_model(lcs)):
             return _held(memory, None, LearnerStatus.NOT_FINITE)
         x.setflags(write=False)
         sample = (x, lcs)

@@ -65,6 +65,10 @@ class RollingTask(LeafSystem):
         start = TaskState(WAIT, 0.0, p_tip, np.zeros(3), np.zeros(3), p_tip[2])
         self._task = self.DeclareAbstractState(AbstractValue.Make(start))
         x_desired = np.tile(np.eye(N_X)[3], n_knots)
+        # Compiled now, not at the first tick.
+        target_over_horizon(
+            self._path, np.zeros(N_X), 0.0, 0.0, 0.0, radius_ball, knot_sec, n_knots
+        )
         self._x_desired = self.DeclareDiscreteState(x_desired)
         self._reference = self.DeclareDiscreteState([*p_tip, *np.zeros(6)])
         self._phase = self.DeclareDiscreteState([float(WAIT)])

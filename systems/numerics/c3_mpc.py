@@ -39,7 +39,7 @@ from makebreak.systems.numerics.c3_qp import (
     within,
 )
 from makebreak.systems.numerics.lcp import SOLVED, solve_lcp_kernel
-from makebreak.systems.numerics.lcs import LCS, is_finite, simulate
+from makebreak.systems.numerics.lcs import LCS, is_finite_model, simulate
 
 
 class C3Failure(RuntimeError):
@@ -304,19 +304,20 @@ def solve_c3(
     i_u = p.n_x + p.n_lam
     unit = np.ones(p.n_z)
     unit[p.n_x : i_u] = unit[i_u + p.n_u :] = scale
-    AB = np.ascontiguousarray(np.hstack([lcs.D * scale, lcs.B, lcs.A]))
-    # Fresh arrays, so that there is one compiled version whatever order came in.
-    E, F, H, c = (
-        np.array(a, order="C")
-        for a in (lcs.E / scale, lcs.F, lcs.H / scale, lcs.c / scale)
+    # Of one order, so that there is one compiled version whatever order came in.
+    A, B, D, d, E, F, H, c = (
+        np.ascontiguousarray(a)
+        for a in (lcs.A, lcs.B, lcs.D, lcs.d, lcs.E, lcs.F, lcs.H, lcs.c)
     )
+    model, E, F, H, pushes = _model(A, B, D, d, E, F, H, c, scale)
+    AB, _, _, c = model
     matrices: tuple = ()
     if not p.is_plus:
         for i in np.flatnonzero((p.U[i_u:] == 0.0) & H.any(axis=0)):
             raise C3Failure(f"U is 0 for u[{i}], expected > 0 where H is not zero")
         matrices = projection_matrices(p.U, E, F, H)
     lam0 = np.empty(0)
-    if not H.any():
+    if not pushes:
         lam0, status = solve_lcp_kernel(F, E @ x0 + c)
         if status != SOLVED:
             raise C3Failure("lam_0: the LCP at x_0 has no solution")
@@ -331,7 +332,6 @@ def solve_c3(
     elif o.start_at_x0:
         delta[:, : p.n_x] = x0
 
-    model = AB, np.array(lcs.d), np.hstack([F, H, E]), c
     weights, bounds = (p.Q, p.R, p.Q_N, p.G), (p.lower, p.upper)
     given = h, x0, lam0
     if p.is_plus:
@@ -377,6 +377,21 @@ def _admm(model, weights, bounds, given, delta, w, options, lcp):
         G = options.rho * G
     _, x, v = qp_step(G, delta - w)
     return x, v, delta, w
+
+
+@njit(cache=True)
+def _model(A, B, D, d, E, F, H, c, scale):
+    """The LCS in lam / scale: the model of _qp_step; E, F, H; whether H is not zero."""
+    n_x, n_lam = D.shape
+    n_v = n_lam + B.shape[1]
+    AB, C = np.empty((n_x, n_v + n_x)), np.empty((n_lam, n_v + n_x))
+    AB[:, :n_lam], AB[:, n_lam:n_v], AB[:, n_v:] = D * scale, B, A
+    E, F, H = E / scale, F.copy(), H / scale
+    C[:, :n_lam], C[:, n_lam:n_v], C[:, n_v:] = F, H, E
+    pushes = False
+    for number in H.flat:
+        pushes |= number != 0.0
+    return (AB, d.copy(), C, c / scale), E, F, H, pushes
 
 
 @njit(cache=True)
@@ -521,4 +536,4 @@ def warm_up(problem: C3Problem):
     except C3Failure:
         pass  # Bounds may exclude this made-up problem; it is compiled all the same.
     simulate(lcs, x0, np.zeros(p.n_u))
-    is_finite(lcs)
+    is_finite_model(lcs)

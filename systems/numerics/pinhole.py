@@ -161,15 +161,22 @@ def visible(p, extent, camera):
 
     Args: p (n, 3) their centres in C [m]; extent (n, 3) as `extents` [m].
     """
-    # Of a box's corner, or more; a capsule's end is at half its length and a radius.
-    radius = np.hypot(extent[:, 0], extent[:, 1]) + extent[:, 2]
-    seen = p[:, 2] + radius > NEAR
-    for i, n in enumerate((camera.width, camera.height)):
-        # The planes through the camera and a pixel beyond the picture's edges.
-        for edge, sign in ((-1.0, 1.0), (float(n), -1.0)):
-            slope = (edge - camera.center[i]) / camera.focal
-            away = sign * (slope * p[:, 2] - p[:, i]) / np.sqrt(1.0 + slope**2)
-            seen &= away < radius
+    return _visible(p, extent, camera.focal, camera.center, camera.width, camera.height)
+
+
+@njit(cache=True)
+def _visible(p, extent, focal, center, width, height):
+    seen = np.empty(len(p), np.bool_)
+    for j in range(len(p)):
+        # Of a box's corner, or more; a capsule's end: half its length and a radius.
+        radius = np.hypot(extent[j, 0], extent[j, 1]) + extent[j, 2]
+        seen[j] = p[j, 2] + radius > NEAR
+        for i, n in enumerate((width, height)):
+            # The planes through the camera and a pixel beyond the picture's edges.
+            for edge, sign in ((-1.0, 1.0), (float(n), -1.0)):
+                slope = (edge - center[i]) / focal
+                away = sign * (slope * p[j, 2] - p[j, i]) / np.sqrt(1.0 + slope**2)
+                seen[j] &= away < radius
     return seen
 
 

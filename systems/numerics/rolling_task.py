@@ -15,16 +15,15 @@ times and distances are ours (docs/ball_rolling.md).
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from makebreak.systems.numerics.ball_state import (
     N_X,
     P_BALL,
     P_TIP,
-    Q_BALL,
     V_BALL,
     V_TIP,
-    W_BALL,
-    rolling_velocity,
+    compiled_pack,
 )
 
 ROLL, REPOSITION, WAIT = 0, 1, 2
@@ -165,21 +164,29 @@ def target_over_horizon(path, x, lead, speed, z_tip, radius_ball, dt, n_knots):
     The tip: above the ball, at the height z_tip [m], and twice as
     fast, as a tip on a rolling ball is. Targets that stand still brake at every knot.
     """
-    angle = path.angle(x[P_BALL]) + lead + speed / path.radius * dt * np.arange(n_knots)
-    cos, sin = np.cos(angle), np.sin(angle)
-    v = speed * np.stack([-sin, cos], axis=1)
+    return _target(
+        path.center, path.radius, x, lead, speed, z_tip, radius_ball, dt, n_knots
+    )
+
+
+@njit(cache=True)
+def _target(center, radius, x, lead, speed, z_tip, radius_ball, dt, n_knots):
+    ball = x[P_BALL]
+    first = np.arctan2(ball[1] - center[1], ball[0] - center[0]) + lead
     goal = np.zeros((n_knots, N_X))
-    points = path.center + path.radius * np.stack([cos, sin], axis=1)
-    way = points[0] - x[P_BALL][:2]
-    too_far = max(0.0, 1.0 - REACH / max(np.sqrt(way @ way), 1e-9))
-    goal[:, P_BALL][:, :2] = points - too_far * way
-    goal[:, P_BALL][:, 2] = radius_ball
-    goal[:, P_TIP] = goal[:, P_BALL]
-    goal[:, P_TIP][:, 2] = z_tip
-    goal[:, V_BALL][:, :2] = v
-    goal[:, V_TIP][:, :2] = 2.0 * v
-    goal[:, Q_BALL][:, 0] = 1.0
-    goal[:, W_BALL] = rolling_velocity(v.T, radius_ball).T
+    too_far, way = 0.0, np.zeros(2)
+    for k in range(n_knots):
+        angle = first + speed / radius * dt * k
+        cos, sin = np.cos(angle), np.sin(angle)
+        point = center + radius * np.array([cos, sin])
+        if k == 0:
+            way = point - ball[:2]
+            too_far = max(0.0, 1.0 - REACH / max(np.sqrt(way @ way), 1e-9))
+        p = np.array([0.0, 0.0, radius_ball])
+        p[:2] = point - too_far * way
+        v = np.array([-speed * sin, speed * cos, 0.0])
+        goal[k] = compiled_pack(p, 2.0 * v, p, v, radius_ball)
+        goal[k, P_TIP.start + 2] = z_tip
     return goal
 
 

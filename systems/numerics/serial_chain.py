@@ -47,6 +47,16 @@ def _cross(out, a, b):
     out[2] = a[0] * b[1] - a[1] * b[0]
 
 
+# Loops of our own: for so few numbers a call of BLAS, or a new array for a sum, costs
+# more than the arithmetic.
+@numba.njit(cache=True)
+def _dot(a, b):
+    total = 0.0
+    for k in range(a.shape[0]):
+        total += a[k] * b[k]
+    return total
+
+
 @numba.njit(cache=True)
 def _matmul3(out, A, B):
     for i in range(3):
@@ -102,11 +112,13 @@ def _tip(chain, R, p, z, R_WE, p_WE, J):
         p_WE[k] = p[n - 1, k]
         for j in range(3):
             p_WE[k] += R[n - 1, k, j] * chain.p_LE[j]
-    column = np.empty(3)
+    column, arm = np.empty(3), np.empty(3)
     for i in range(n):
-        _cross(column, z[i], p_WE - p[i])
-        J[:3, i] = column
-        J[3:, i] = z[i]
+        for k in range(3):
+            arm[k] = p_WE[k] - p[i, k]
+        _cross(column, z[i], arm)
+        for k in range(3):
+            J[k, i], J[3 + k, i] = column[k], z[i, k]
 
 
 @numba.njit(cache=True)
@@ -142,14 +154,18 @@ def chain_state(chain, q, v):
     a, b = np.empty(3), np.empty(3)
     for i in range(n):
         _cross(a, p[i], z[i])
-        S[i, :3], S[i, 3:] = z[i], a
+        for k in range(3):
+            S[i, k], S[i, 3 + k] = z[i, k], a[k]
         w, u = V[i, :3], V[i, 3:]
         _cross(a, w, z[i])
-        A[i + 1, :3] = A[i, :3] + a * v[i]
+        for k in range(3):
+            A[i + 1, k] = A[i, k] + a[k] * v[i]
         _cross(a, w, S[i, 3:])
         _cross(b, u, z[i])
-        A[i + 1, 3:] = A[i, 3:] + (a + b) * v[i]
-        V[i + 1] = V[i] + S[i] * v[i]
+        for k in range(3):
+            A[i + 1, 3 + k] = A[i, 3 + k] + (a[k] + b[k]) * v[i]
+        for k in range(6):
+            V[i + 1, k] = V[i, k] + S[i, k] * v[i]
 
     # Inward: forces for the bias, composite inertias for the mass matrix.
     M, bias = np.empty((n, n)), np.empty(n)
@@ -157,24 +173,30 @@ def chain_state(chain, q, v):
     m_c, h_c, I_c = 0.0, np.zeros(3), np.zeros((3, 3))
     lifted = np.empty(6)
     for i in range(n - 1, -1, -1):
-        lifted[:3] = A[i + 1, :3]
-        lifted[3:] = A[i + 1, 3:] - chain.gravity
+        for k in range(3):
+            lifted[k] = A[i + 1, k]
+            lifted[3 + k] = A[i + 1, 3 + k] - chain.gravity[k]
         _momentum(total, chain.mass[i], h[i], inertia[i], lifted)
         _momentum(momentum, chain.mass[i], h[i], inertia[i], V[i + 1])
         w, u = V[i + 1, :3], V[i + 1, 3:]
         _cross(a, w, momentum[:3])
         _cross(b, u, momentum[3:])
-        total[:3] += a + b
+        for k in range(3):
+            total[k] += a[k] + b[k]
         _cross(a, w, momentum[3:])
-        total[3:] += a
-        f += total
-        bias[i] = np.dot(S[i], f)
+        for k in range(3):
+            total[3 + k] += a[k]
+        for k in range(6):
+            f[k] += total[k]
+        bias[i] = _dot(S[i], f)
         m_c += chain.mass[i]
-        h_c += h[i]
-        I_c += inertia[i]
+        for k in range(3):
+            h_c[k] += h[i, k]
+            for j in range(3):
+                I_c[k, j] += inertia[i, k, j]
         _momentum(momentum, m_c, h_c, I_c, S[i])
         for j in range(i + 1):
-            M[i, j] = M[j, i] = np.dot(S[j], momentum)
+            M[i, j] = M[j, i] = _dot(S[j], momentum)
         M[i, i] += chain.rotor[i]
 
     # Acceleration of the tip's point, from the twist's at the origin.
