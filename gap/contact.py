@@ -138,14 +138,13 @@ def _trials(model, kind: str, at: str):
         if len(steps) == 1:
             ((name, tried),) = steps.items()
             yield ([[(d, {**base, name: base[name] + d})] for d in tried], (name,), ())
-        else:  # The small steps; and large ones in all directions, each on its own.
+        else:
             each = [tuple(d for d, _ in steps.values())]
-            for signs in itertools.product((1.0, -1.0), repeat=len(steps)):
-                each.append(
-                    tuple(
-                        s * d for s, (_, d) in zip(signs, steps.values(), strict=True)
-                    )
-                )
+            if isinstance(model, FreeBodyModel):
+                # Large ones too, in all directions: its errors are far from linear.
+                large = [d for _, d in steps.values()]
+                for signs in itertools.product((1.0, -1.0), repeat=len(steps)):
+                    each.append(tuple(s * d for s, d in zip(signs, large, strict=True)))
             yield (
                 [[(d, {**base, n: base[n] + d}) for n, d in zip(steps, e, strict=True)]
                  for e in each],

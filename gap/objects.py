@@ -27,7 +27,8 @@ from makebreak.systems.numerics.selection import Screen
 
 # A real object differs from its model in more ways than a mechanism.
 MOST_EFFECTS = 6
-DRAKE_SEC = 0.3  # Windows of scenes that Drake has to simulate.
+# Windows of scenes that Drake has to simulate: length, and how many at most.
+DRAKE_SEC, DRAKE_MOST = 0.3, 16
 
 
 def of_objects(
@@ -59,7 +60,9 @@ def of_objects(
         scene, finding = settle(scene)
         checks = [*checks, *finding]
         many = sum(len(r.episodes) for r in recordings) >= 6
-        model = WindowModel(scene, recordings, DRAKE_SEC, by_episode=many, most=24)
+        model = WindowModel(
+            scene, recordings, DRAKE_SEC, by_episode=many, most=DRAKE_MOST
+        )
     return _of_windows(model, checks, seconds, lap, say)
 
 

@@ -80,6 +80,8 @@ class WindowModel(WindowedResidual):
         most; a larger number is thinned evenly.
     """
 
+    evaluations = 5  # Of a fit: each takes seconds.
+
     def __init__(
         self,
         scene: Scene,
