@@ -151,6 +151,10 @@ def check_units(recording: Recording, facts: SceneFacts) -> list[Finding]:
     return found
 
 
+# Noise alone is as large as all that a channel varies; to and fro it looks larger.
+HUNTING = 1.3
+
+
 def check_values(recording: Recording, facts: SceneFacts) -> list[Finding]:
     """Quaternions, ceilings of commands, resolution, stuck channels."""
     found: list[Finding] = []
@@ -199,6 +203,14 @@ def check_values(recording: Recording, facts: SceneFacts) -> list[Finding]:
             says = f"{channel.name} is {y[0]:.4g} in all rows: it measures nothing."
             add("stuck", channel.name, longest_sec(recording), "s", "warning", says)
             continue
+        spread = float(np.std(y))
+        if channel.noise_from == "estimated" and channel.noise > HUNTING * spread:
+            says = (
+                f"{channel.name} goes to and fro from sample to sample, by "
+                f"{spread:.3g} {unit}: something swings faster than it is recorded, as "
+                "a controller that hunts; taken for noise, that hides any gap."
+            )
+            add("hunting", channel.name, spread, unit, "warning", says)
         stuck = _longest_stuck(recording, channel)
         if stuck > 0.0:
             says = f"{channel.name} stands still for {stuck:.3g} s amid its own noise."

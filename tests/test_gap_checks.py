@@ -240,6 +240,16 @@ def test_resolution_and_a_stuck_channel_are_found(tmp_path):
     assert one(findings(tmp_path, columns), "stuck").size == pytest.approx(19 / RATE)
 
 
+def test_a_channel_that_swings_from_sample_to_sample_is_no_noise(tmp_path):
+    columns = arm(12)
+    columns["arm.j0.velocity"][N // 3 :: 2] += 20.0
+    assert one(findings(tmp_path, columns), "hunting").channel == "arm.j0.velocity"
+    # A joint that stands still measures noise, and no more than that.
+    columns = arm(12)
+    columns["arm.j0.velocity"] = 5e-3 * np.random.default_rng(1).normal(size=N)
+    assert not [f for f in findings(tmp_path, columns) if f.kind == "hunting"]
+
+
 def test_a_twist_in_body_axes_is_called_so_and_flips_are_counted(tmp_path):
     found = findings(tmp_path, falling(1, body_axes=True, flip=True))
     assert one(found, "body_axes").severity == "error"
