@@ -309,8 +309,7 @@ def solve_c3(
         np.ascontiguousarray(a)
         for a in (lcs.A, lcs.B, lcs.D, lcs.d, lcs.E, lcs.F, lcs.H, lcs.c)
     )
-    model, E, F, H, pushes = _model(A, B, D, d, E, F, H, c, scale)
-    AB, _, _, c = model
+    (AB, d, C, c), E, F, H, pushes = _model(A, B, D, d, E, F, H, c, scale)
     matrices: tuple = ()
     if not p.is_plus:
         for i in np.flatnonzero((p.U[i_u:] == 0.0) & H.any(axis=0)):
@@ -332,6 +331,7 @@ def solve_c3(
     elif o.start_at_x0:
         delta[:, : p.n_x] = x0
 
+    model = AB, d, C, c
     weights, bounds = (p.Q, p.R, p.Q_N, p.G), (p.lower, p.upper)
     given = h, x0, lam0
     if p.is_plus:
