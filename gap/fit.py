@@ -9,7 +9,7 @@ from scipy.optimize import differential_evolution, least_squares, minimize
 
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, check_parameters
-from makebreak.systems.numerics.selection import LinearFit, Screen
+from makebreak.systems.numerics.selection import LinearFit, Screen, spread_by_blocks
 
 EVALUATIONS = 8
 # Of a parameter's size: first steps of a search without slopes, and how far around one
@@ -24,6 +24,7 @@ class Model(Protocol):
     def base(self) -> np.ndarray: ...
     def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray: ...
     def train(self) -> np.ndarray: ...
+    def blocks(self) -> np.ndarray: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +100,11 @@ def fit_effects(
         spread = np.sqrt(np.sum((vt.T * inverse) ** 2, axis=1))
         # What is left, in units of what was allowed for, widens the interval.
         spread *= max(np.sqrt(2.0 * solved.cost / len(solved.fun)), 1.0)
+        # So do errors that go together for a while: blocks of time, drawn anew.
+        block = np.full(len(solved.fun), -1)
+        train = model.train()
+        block[: train.sum()] = model.blocks()[train]
+        spread = np.maximum(spread, spread_by_blocks(solved.jac, solved.fun, block))
         for (i, name), each in zip(free.names, spread * scale, strict=True):
             std[i][name] = float(each)
     for each, steps in zip(std, rough, strict=True):

@@ -474,6 +474,14 @@ class InverseModel:
         k = len(self.names())
         return np.concatenate([np.repeat(t.train, k) for t in self.tracks])
 
+    def blocks(self) -> np.ndarray:
+        """(m,) number of the block of time of each row."""
+        k, first, numbers = len(self.names()), 0, []
+        for track in self.tracks:
+            numbers.append(np.repeat(first + track.block, k))
+            first += int(track.block.max(initial=-1)) + 1
+        return np.concatenate(numbers)
+
 
 def _rms(x: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(x**2, axis=0))

@@ -275,6 +275,16 @@ class TouchModel:
             kept.append((time / BLOCK_SEC).astype(int) % 3 != 1)
         return np.concatenate(kept)
 
+    def blocks(self) -> np.ndarray:
+        """(m,) number of the touch and its block of time of each row."""
+        numbers, first = [], 0
+        for touch in self.touches:
+            time = self.recordings[touch.recording].time[touch.rows]
+            number = (time / BLOCK_SEC).astype(int)
+            numbers.append(first + number - number.min(initial=0))
+            first = int(numbers[-1].max(initial=first)) + 1
+        return np.concatenate(numbers)
+
     # ----- Told
 
     def _parts(self, *arrays: np.ndarray):

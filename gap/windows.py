@@ -71,6 +71,14 @@ class WindowedResidual:
             [np.full((w.rows.stop - w.rows.start) * k, w.train) for w in self.windows]
         )
 
+    def blocks(self) -> np.ndarray:
+        """(m,) number of the window of each row."""
+        k = len(self.channels)
+        return np.concatenate(
+            [np.full((w.rows.stop - w.rows.start) * k, i)
+             for i, w in enumerate(self.windows)]
+        )  # fmt: skip
+
 
 class WindowModel(WindowedResidual):
     """Residuals of simulated windows: the same questions as InverseModel answers, for

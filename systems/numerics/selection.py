@@ -178,3 +178,35 @@ def simplest(errors: Sequence[float], sizes: Sequence[int], same: float = SAME) 
     least = np.nanmin(errors)
     near = [i for i in range(len(errors)) if errors[i] <= (1.0 + same) * least]
     return min(near, key=lambda i: (sizes[i], errors[i]))
+
+
+def spread_by_blocks(J, r, block, draws: int = 200) -> np.ndarray:
+    """(k,) standard deviations of least squares whose errors go together within a block
+    (of time, an episode): the blocks are drawn anew with replacement, each time with
+    one Gauss-Newton step. Zeros for fewer than six blocks.
+
+    Args: J (m, k), r (m,): rows and their derivatives at the solution; block (m,): a
+        number of each; negative: rows that are always there, once (a prior's).
+    Source: Efron, Tibshirani, An Introduction to the Bootstrap, 1993, ch. 8-9.
+    """
+    J, r, block = np.asarray(J, float), np.asarray(r, float), np.asarray(block)
+    names, group = np.unique(block, return_inverse=True)
+    k, free = J.shape[1], names >= 0
+    if free.sum() < 6 or k == 0:
+        return np.zeros(k)
+    size = np.linalg.norm(J, axis=0)
+    size[size == 0.0] = 1.0
+    J = J / size
+    H, s = np.zeros((len(names), k, k)), np.zeros((len(names), k))
+    for g in range(len(names)):
+        mine = J[group == g]
+        H[g], s[g] = mine.T @ mine, mine.T @ r[group == g]
+    n = int(free.sum())
+    weights = np.ones((draws, len(names)))
+    weights[:, free] = np.random.default_rng(0).multinomial(n, np.full(n, 1 / n), draws)
+    steps = [
+        np.linalg.lstsq(np.tensordot(w, H, 1), -(w @ s), rcond=1e-10)[0]
+        for w in weights
+    ]
+    # Of n blocks a sum's variance comes out (n - 1)/n of what it is.
+    return np.std(steps, axis=0) * np.sqrt(n / (n - 1)) / size
