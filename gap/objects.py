@@ -85,7 +85,7 @@ def _of_touch(model: TouchModel, checks, seconds, lap, say) -> GapResult:
     selection, near = told(selection, verdict)
     end = selection.end.score
     before, after = selection.start.left, selection.end.left
-    effects_named = [named(c) for c in selection.choices]
+    effects_named = [named(c, model.dynamics.plant) for c in selection.choices]
     return GapResult(
         verdict, says(verdict, effects_named, start, end, near),
         model.where(before) if verdict != "no_gap" else [], effects_named,
@@ -116,7 +116,7 @@ def _of_windows(model, checks, seconds, lap, say) -> GapResult:
     gap = gap_measure(model, before, after)
     where = where_in_windows(model, model.errors(before)) if verdict != "no_gap" else []
     rest = unexplained_in_windows(model, after) if verdict == "gap_unnamed" else []
-    effects_named = [named(c) for c in selection.choices]
+    effects_named = [named(c, model.dynamics.plant) for c in selection.choices]
     seconds["simulate"] = lap()
     return GapResult(
         verdict, says(verdict, effects_named, start, end, near), where, effects_named,

@@ -3,10 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+from pydrake.multibody.plant import MultibodyPlant
+
 from makebreak.gap.result import Estimate, Evidence, NamedEffect
 from makebreak.gap.select import FLOOR, Choice, Selection
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.kind import sentence
+from makebreak.models.effects.kind import of_slides, sentence, unit_at
 
 # Left after all that could be named: more than so many times the noise, and more than
 # this share of the gap, is a gap without a name.
@@ -44,8 +46,10 @@ def told(selection: Selection, verdict: str) -> tuple[Selection, str]:
     return replace(selection, choices=(), end=selection.start), near
 
 
-def named(choice: Choice) -> NamedEffect:
+def named(choice: Choice, plant: MultibodyPlant) -> NamedEffect:
+    """The choice in the report's words; plant: the scene's, without it."""
     kind = KINDS[choice.effect.kind]
+    slides = kind.at in ("joint", "actuator") and of_slides(choice.effect, plant)
     parameters, std = {}, {}
     weak = False
     for each in kind.parameters:
@@ -57,13 +61,13 @@ def named(choice: Choice) -> NamedEffect:
         if not spread < width:  # The data say nothing of it.
             spread = float("inf")
         weak |= spread > max(abs(value), 1e-3 * width)
-        parameters[each.name] = Estimate(value, spread, each.unit)
+        parameters[each.name] = Estimate(value, spread, unit_at(each.unit, slides))
         if 0.0 < spread < float("inf"):
             std[each.name] = spread
     apart = ""
     if choice.ties or kind.tell_apart:
         apart = kind.tell_apart[:1].upper() + kind.tell_apart[1:] + "."
-    says = sentence(choice.effect, kind, std)
+    says = sentence(choice.effect, kind, std, slides)
     return NamedEffect(
         choice.effect.kind,
         tuple(choice.effect.at),

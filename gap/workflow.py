@@ -186,7 +186,7 @@ def _of_mechanism(scene, recordings, checks, seconds, clock, say, jobs) -> GapRe
     where = where_in_motion(model, selection.start.left)
     if verdict == "no_gap":
         where = []
-    effects_named = [named(c) for c in choices]
+    effects_named = [named(c, model.dynamics.plant) for c in choices]
     rest = unexplained(model, selection.end.left) if verdict == "gap_unnamed" else []
     return GapResult(
         verdict, says(verdict, effects_named, start, end, near), where, effects_named,

@@ -498,3 +498,10 @@ def test_a_sentence_reads_as_in_the_report():
     kind = KINDS["joint_coulomb_friction"]
     effect = Effect("joint_coulomb_friction", ["a.b"], {"coulomb": 1.8})
     assert "1.8 +- 0.1 N m" in sentence(effect, kind, {"coulomb": 0.1})
+
+
+def test_a_joint_that_slides_has_its_own_units(tmp_path):
+    spring = Effect("joint_spring", ["p.j1"], {"stiffness": 3.0, "rest": 0.1})
+    says = sentence(spring, KINDS["joint_spring"], slides=True)
+    assert "3 N/m" in says and "0.1 m" in says and "rad" not in says
+    assert "N m/rad" in sentence(spring, KINDS["joint_spring"])

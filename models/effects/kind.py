@@ -159,12 +159,34 @@ def check_parameters(effect: Effect, kind: EffectKind) -> None:
         kind.check(effect)
 
 
+# What a joint's units are where it slides.
+_ALONG = {
+    "rad": "m", "rad/s": "m/s", "N m": "N", "N m/rad": "N/m", "N m s/rad": "N s/m",
+    "N m s2/rad2": "N s2/m2", "kg m2": "kg",
+}  # fmt: skip
+
+
+def unit_at(unit: str, slides: bool) -> str:
+    """A parameter's unit, which for a joint is written as of one that turns."""
+    return _ALONG.get(unit, unit) if slides else unit
+
+
+def of_slides(effect: Effect, plant: MultibodyPlant) -> bool:
+    """Whether it is of joints that slide, all of them."""
+    joints = find_joints(effect, plant)
+    return bool(joints) and all(isinstance(j, PrismaticJoint) for j in joints)
+
+
 def sentence(
-    effect: Effect, kind: EffectKind, std: Mapping[str, float] | None = None
+    effect: Effect,
+    kind: EffectKind,
+    std: Mapping[str, float] | None = None,
+    slides: bool = False,
 ) -> str:
     """The report's sentence on an effect, numbers to three digits.
 
-    Args: std, of the parameters where they are known: told as "+- ...".
+    Args: std, of the parameters where they are known: told as "+- ..."; slides, whether
+        it is of joints that slide.
     """
     words: dict[str, str] = {"at": "nothing" if not effect.at else _place(effect, kind)}
     for each in kind.parameters:
@@ -175,7 +197,7 @@ def sentence(
         text = f"{value:.3g}"
         if std is not None and each.name in std:
             text += f" +- {std[each.name]:.1g}"
-        words[each.name] = f"{text} {each.unit}".rstrip()
+        words[each.name] = f"{text} {unit_at(each.unit, slides)}".rstrip()
     # An optional parameter that is not there takes its [bracket] with it.
     says = re.sub(
         r"\[([^\]]*)\]", lambda m: "" if "(unset)" in _fill(m[1], words) else m[1],
