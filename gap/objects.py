@@ -82,14 +82,18 @@ def _of_touch(model: TouchModel, checks, seconds, lap, say) -> GapResult:
     seconds["select"] = lap()
     start, end = selection.start.score, selection.end.score
     verdict = verdict_of(selection.choices, start, end)
-    selection, near = told(selection, verdict)
-    end = selection.end.score
     before, after = selection.start.left, selection.end.left
+    gap = model.measure(before, after)
+    every = selection
+    selection, near = told(every, verdict, gap.reduction)
+    if selection is not every:
+        after, end = before, start
+        gap = model.measure(before, after)
     effects_named = [named(c, model.dynamics.plant) for c in selection.choices]
     return GapResult(
         verdict, says(verdict, effects_named, start, end, near),
         model.where(before) if verdict != "no_gap" else [], effects_named,
-        model.measure(before, after), [], moved(names, prior, selection), checks,
+        gap, [], moved(names, prior, selection), checks,
         model.series(before, after), selection.table,
     )  # fmt: skip
 
@@ -109,11 +113,14 @@ def _of_windows(model, checks, seconds, lap, say) -> GapResult:
     seconds["select"] = lap()
     start, end = selection.start.score, selection.end.score
     verdict = verdict_of(selection.choices, start, end)
-    selection, near = told(selection, verdict)
-    end = selection.end.score
-    effects = [c.effect for c in selection.choices]
-    before, after = model.simulate(()), model.simulate(effects)
+    before = model.simulate(())
+    after = model.simulate([c.effect for c in selection.choices])
     gap = gap_measure(model, before, after)
+    every = selection
+    selection, near = told(every, verdict, gap.reduction)
+    if selection is not every:
+        after, end = before, start
+        gap = gap_measure(model, before, after)
     where = where_in_windows(model, model.errors(before)) if verdict != "no_gap" else []
     rest = unexplained_in_windows(model, after) if verdict == "gap_unnamed" else []
     effects_named = [named(c, model.dynamics.plant) for c in selection.choices]

@@ -13,8 +13,8 @@ from makebreak.models.effects.kind import of_slides, sentence, unit_at
 # Left after all that could be named: more than so many times the noise, and more than
 # this share of the gap, is a gap without a name.
 UNNAMED, UNNAMED_SHARE = 2.0, 0.2
-# Effects that leave a gap without a name are told only if they take off this share:
-# less is what any model with a free parameter may fit to another law.
+# Effects that leave a gap without a name are told only if they close this share of it,
+# simulated: less is what any model with a free parameter may fit to another law.
 TOLD = 0.5
 NO_GAP = 1.5  # Times the noise, after the background within its tolerance.
 
@@ -32,16 +32,15 @@ def verdict_of(
     return "ambiguous" if any(c.ties for c in choices) else "gap_named"
 
 
-def told(selection: Selection, verdict: str) -> tuple[Selection, str]:
+def told(selection: Selection, verdict: str, closed: float) -> tuple[Selection, str]:
     """The selection, without effects where they are no name for the gap, and then what
-    they are worth, in words."""
-    start, end = selection.start.score, selection.end.score
-    if verdict != "gap_unnamed" or not selection.choices or end <= TOLD * start:
+    they are worth, in words. closed: share of the gap that they close, simulated."""
+    if verdict != "gap_unnamed" or not selection.choices or closed >= TOLD:
         return selection, ""
     names = [f"{c.effect.kind} at {', '.join(c.effect.at)}" for c in selection.choices]
     near = (
-        f" The nearest that it has ({'; '.join(names)}) takes off "
-        f"{1.0 - end / start:.0%}, too little to be named."
+        f" The nearest that it has ({'; '.join(names)}) closes {max(closed, 0.0):.0%} "
+        "of it, too little to be named."
     )
     return replace(selection, choices=(), end=selection.start), near
 

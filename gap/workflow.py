@@ -175,13 +175,20 @@ def _of_mechanism(scene, recordings, checks, seconds, clock, say, jobs) -> GapRe
         float(np.sqrt(np.mean(x.left**2))) for x in (selection.start, selection.end)
     ]
     verdict = verdict_of(choices, max(start, whole[0]), max(end, whole[1]), far)
-    selection, near = told(selection, verdict)
-    choices, end = choices[: len(selection.choices)], selection.end.score
     say("simulating held-out windows")
-    effects = [c.effect for c in choices]
+
+    def measured(of: Selection):
+        moved = _background_effects(model, names, of.end.b)
+        effects = [c.effect for c in of.choices]
+        return measure(scene, recordings, effects, moved, model, jobs)
+
+    gap, series = measured(selection)
+    every = selection
+    selection, near = told(every, verdict, gap.reduction)
+    if selection is not every:
+        gap, series = measured(selection)
+        choices, end = [], selection.end.score
     background = _background(names, prior, selection)
-    moved = _background_effects(model, names, selection.end.b)
-    gap, series = measure(scene, recordings, effects, moved, model, jobs)
     seconds["simulate"] = clock.lap()
     where = where_in_motion(model, selection.start.left)
     if verdict == "no_gap":
