@@ -15,6 +15,7 @@ EVALUATIONS = 8
 # Of a parameter's size: first steps of a search without slopes, and how far around one
 # looks where that ended.
 WANDER, AROUND = 0.2, 0.5
+MOST_NEAR, MOST_FAR = 200, 450  # Simulations, about.
 ROUGH = np.linspace(0.85, 1.15, 16)  # Of a start, tried.
 
 
@@ -142,13 +143,13 @@ def wander(
     if far:
         found = differential_evolution(
             cost, [(z - AROUND, z + AROUND) for z in z0], x0=z0, init="sobol",
-            maxiter=15, popsize=6, polish=False, rng=0,
+            maxiter=min(15, MOST_FAR // (6 * len(z0))), popsize=6, polish=False, rng=0,
         )  # fmt: skip
     else:
         corners = np.vstack([z0, z0 + WANDER * np.eye(len(z0))])
         found = minimize(
             cost, z0, method="Nelder-Mead",
-            options={"initial_simplex": corners, "maxfev": 40 * len(z0),
+            options={"initial_simplex": corners, "maxfev": min(40 * len(z0), MOST_NEAR),
                      "xatol": 1e-3, "fatol": 1e-2},
         )  # fmt: skip
     return tuple(_tidy(e) for e in free.effects(found.x))
