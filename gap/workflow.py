@@ -72,11 +72,32 @@ def run_gap(
             scene, recordings, checks, seconds, clock.lap, say,
             lambda s: _settle_step(s, recordings, dynamics, jobs),
         )  # fmt: skip
-        return result.with_seconds(seconds)
+        return _unless_doubtful(result).with_seconds(seconds)
     scene, finding = _settle_step(scene, recordings, dynamics, jobs)
     checks += finding
     result = _of_mechanism(scene, recordings, checks, seconds, clock, say, jobs)
-    return result.with_seconds(seconds)
+    return _unless_doubtful(result).with_seconds(seconds)
+
+
+def _unless_doubtful(result: GapResult) -> GapResult:
+    """Without effects where units, signs or axes are wrong: they would explain that."""
+    if not result.effects or all(c.severity != "error" for c in result.checks):
+        return result
+    per_channel = {
+        name: {"before": each["before"], "after": each["before"]}
+        for name, each in result.gap.per_channel.items()
+    }
+    gap = replace(result.gap, after=result.gap.before, per_channel=per_channel)
+    return replace(
+        result,
+        verdict="gap_unnamed",
+        says="The scene and the recordings disagree, but units, signs or axes of what "
+        "was measured are wrong (see the checks): put that right first, for until then "
+        "nothing can be named.",
+        effects=[],
+        gap=gap,
+        series=[replace(each, after=each.before) for each in result.series],
+    )
 
 
 class _Clock:

@@ -83,7 +83,9 @@ def test_degrees_for_radians_are_said_first_and_the_run_goes_on(
     (tmp_path / "run.csv").write_text("\n".join([head, *lines]) + "\n")
     assert cli.main(["gap", str(scene), "run.csv", "--out", "out", "--jobs", "1"]) == 0
     assert "Doubtful data" in capsys.readouterr().out
-    checks = json.loads((tmp_path / "out/result.json").read_text())["checks"]
+    result = json.loads((tmp_path / "out/result.json").read_text())
+    assert result["effects"] == [] and result["verdict"] != "gap_named"
+    checks = result["checks"]
     assert [c["channel"] for c in checks if c["kind"] == "units"] == [V]
     page = (tmp_path / "out/report.html").read_text()
     first = page[page.index('<section class="first">') : page.index("</section>")]
