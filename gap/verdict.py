@@ -61,7 +61,7 @@ def named(choice: Choice, plant: MultibodyPlant) -> NamedEffect:
             spread = float("inf")
         weak |= spread > max(abs(value), 1e-3 * width)
         parameters[each.name] = Estimate(value, spread, unit_at(each.unit, slides))
-        if 0.0 < spread < float("inf"):
+        if spread > 0.0:
             std[each.name] = spread
     apart = ""
     if choice.ties or kind.tell_apart:

@@ -505,3 +505,5 @@ def test_a_joint_that_slides_has_its_own_units(tmp_path):
     says = sentence(spring, KINDS["joint_spring"], slides=True)
     assert "3 N/m" in says and "0.1 m" in says and "rad" not in says
     assert "N m/rad" in sentence(spring, KINDS["joint_spring"])
+    vague = sentence(spring, KINDS["joint_spring"], {"rest": float("inf")})
+    assert "0.1 rad (which the data do not tell)" in vague

@@ -8,6 +8,7 @@ from difflib import get_close_matches
 from typing import Any
 from xml.dom.minidom import Element
 
+import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
@@ -185,8 +186,8 @@ def sentence(
 ) -> str:
     """The report's sentence on an effect, numbers to three digits.
 
-    Args: std, of the parameters where they are known: told as "+- ..."; slides, whether
-        it is of joints that slide.
+    Args: std, of the parameters where they are known: told as "+- ...", an infinite one
+        in words; slides, whether it is of joints that slide.
     """
     words: dict[str, str] = {"at": "nothing" if not effect.at else _place(effect, kind)}
     for each in kind.parameters:
@@ -194,10 +195,12 @@ def sentence(
         if value is None:
             words[each.name] = "(unset)"
             continue
-        text = f"{value:.3g}"
-        if std is not None and each.name in std:
-            text += f" +- {std[each.name]:.1g}"
+        text, spread = f"{value:.3g}", (std or {}).get(each.name)
+        if spread is not None and np.isfinite(spread):
+            text += f" +- {spread:.1g}"
         words[each.name] = f"{text} {unit_at(each.unit, slides)}".rstrip()
+        if spread is not None and not np.isfinite(spread):
+            words[each.name] += " (which the data do not tell)"
     # An optional parameter that is not there takes its [bracket] with it.
     says = re.sub(
         r"\[([^\]]*)\]", lambda m: "" if "(unset)" in _fill(m[1], words) else m[1],
