@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from makebreak.gap.fit import fit_effects, wander
+from makebreak.models.effects.kind import Effect
 from makebreak.systems.numerics.selection import (
     Columns,
     Screen,
@@ -163,3 +165,33 @@ def test_blocks_drawn_anew_tell_how_a_slope_scatters_from_one_recording_to_the_n
     r, there = np.append(noise(1.0), 0.0), np.append(block, -1)
     assert spread_by_blocks(stiff, r, there)[0] < 1e-6
     assert spread_by_blocks(x[:125, None], noise(1.0)[:125], block[:125])[0] == 0.0
+
+
+class Steps:
+    """r = |x - 0.3| in steps of 0.02, and what slopes say of it: nothing."""
+
+    jumps = True
+
+    def residual(self, effects=()):
+        x = effects[0].parameters["damping"] if effects else 0.0
+        return np.full(8, 10.0 * np.round(abs(x - 0.3) / 0.02) * 0.02)
+
+    def base(self):
+        return self.residual()
+
+    def train(self):
+        return np.arange(8) < 6
+
+    def blocks(self):
+        return np.arange(8)
+
+
+def test_a_search_without_slopes_crosses_the_steps_that_stop_a_fit():
+    model = Steps()
+    screen = Screen(model.base(), np.zeros((8, 0)), np.zeros(0), model.train())
+    start = [Effect("joint_viscous_damping", ["p.j1"], {"damping": 0.205})]
+    stuck = fit_effects(model, screen, start)  # What does not show stays neutral.
+    assert stuck.effects[0].parameters["damping"] == 0.0
+    for far in (False, True):
+        (found,) = wander(model, screen, start, [()], far)
+        assert found.parameters["damping"] == pytest.approx(0.3, abs=0.011)

@@ -53,10 +53,32 @@ def test_a_hidden_effect_is_named_and_measured(tmp_path, name, parameter, tolera
     assert result.where
 
 
+def test_late_commands_and_late_sensors_are_told_as_one(tmp_path):
+    truth, result = _run("34_cartpole_input_delay", tmp_path)
+    (hidden,) = truth["effects"]
+    assert result.verdict == "ambiguous"
+    (found,) = result.effects
+    (other,) = found.indistinguishable_from
+    assert (found.kind, other.kind) == ("input_delay", "sensor_delay")
+    delay = hidden["parameters"]["delay"]
+    assert found.parameters["delay"].value == pytest.approx(delay, rel=0.02)
+    # Samples that show what was before a window do not count as errors.
+    assert result.gap.after < 1.3
+
+
+@pytest.mark.slow
+def test_windows_start_with_the_twist_of_an_elastic_joint(tmp_path):
+    _, result = _run("42_arm_joint_elasticity", tmp_path)
+    assert [e.kind for e in result.effects] == ["joint_elasticity"]
+    assert result.gap.after < 1.5 < 10.0 < result.gap.before
+
+
 @pytest.mark.slow
 def test_what_is_outside_the_catalogue_gets_no_verdict_of_named(tmp_path):
     _, result = _run("84_pendulum_bouc_wen", tmp_path)
     assert result.verdict == "gap_unnamed"
+    assert result.effects == []
+    assert "too little to be named" in result.says
     assert result.unexplained
 
 
