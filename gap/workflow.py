@@ -80,7 +80,15 @@ def run_gap(
 
 
 def _unless_doubtful(result: GapResult) -> GapResult:
-    """Without effects where units, signs or axes are wrong: they would explain that."""
+    """Without effects where units, signs or axes are wrong, as they would explain that;
+    and without agreement where a channel's motion was taken for noise."""
+    hunting = [c.says for c in result.checks if c.kind == "hunting"]
+    if result.verdict == "no_gap" and hunting:
+        return replace(
+            result,
+            verdict="gap_unnamed",
+            says=f"Nothing can be told of these recordings: {hunting[0]}",
+        )
     if not result.effects or all(c.severity != "error" for c in result.checks):
         return result
     per_channel = {
