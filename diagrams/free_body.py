@@ -36,7 +36,7 @@ class FreeBodyScene:
     def __init__(self, scene: Scene):
         self.scene = scene
         for effect in scene.effects:
-            if effect.kind not in (*_FORCES, *_SENSORS, *_PLANT):
+            if effect.kind not in (*_FORCES, "length_scale", *_PLANT):
                 raise ValueError(f"effect {effect.kind} is not one of a free body")
         if scene.friction_zones or scene.plant.contact_model != "point":
             raise ValueError(

@@ -88,6 +88,8 @@ def contact_candidates(
                 continue  # No force is measured: it only shows as stiffness over mass.
             if any(e.kind == kind and at in e.at for e in there):
                 continue
+            if kind == "plane_tilt" and any(e.kind == "friction_patch" for e in there):
+                continue
             if kind == "friction_patch":
                 found += _patches(model, nuisance, at, there, r)
                 continue
@@ -163,7 +165,9 @@ def _patches(model, nuisance, at: str, there, r) -> list[Candidate]:
     except ValueError:
         return []
     for effect in there:
-        if effect.kind == "contact_friction":
+        if effect.kind == "plane_tilt":
+            return []  # Only level ground is cut into a patch.
+        if effect.kind == "contact_friction" and at in effect.at:
             mu = effect.parameters["friction"]
     places = touched(model)
     if mu <= 0.0 or len(places) < 2 * CELLS:

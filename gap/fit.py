@@ -92,8 +92,12 @@ def fit_effects(
             if shows[k] <= 1e-6 * shows.max() and neutral is not None:
                 z = np.array(z)
                 z[k] = neutral / scale[k]
+    try:
+        r = residual(z)
+    except (ValueError, RuntimeError):  # Back to where it came from, which may raise.
+        z = x0 / scale
+        r = residual(z)
     effects = free.effects(z)
-    r = residual(z)
     std: list[dict[str, float]] = [{} for _ in start]
     if solved is not None:
         u, w, vt = np.linalg.svd(solved.jac, full_matrices=False)

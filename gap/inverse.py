@@ -114,6 +114,11 @@ class InverseModel:
             for j in sorted(one_dof_joints(plant), key=lambda j: j.velocity_start())
         ]
         self.recordings = list(recordings)
+        # Effects that the scene has already and its dynamics do not know.
+        self._own = [
+            e for e in scene.effects
+            if e.kind in SENSED + PATH or KINDS[e.kind].hidden_state
+        ]  # fmt: skip
         self.noise = self._noise("position")
         self.velocity_noise = self._noise("velocity")
         self.effort_noise = self._noise("effort_measured")
@@ -236,8 +241,10 @@ class InverseModel:
         return self._motions
 
     def motion(self, track: Track, effects: Sequence[Effect] = ()) -> Motion:
-        """The true motion at the middles, if the effects on measurement are these."""
+        """The true motion at the middles, if the effects on measurement are these
+        beside the scene's own."""
         t = track.middle
+        effects = [*self._own, *effects]
         n = len(self.joints)
         q, v, vd = (np.empty((len(t), n)) for _ in range(3))
         for i, joint in enumerate(self.joints):
@@ -247,7 +254,7 @@ class InverseModel:
             q[:, i] -= bias
             v[:, i] *= scale
             vd[:, i] *= scale**2
-        effort = self._effort(track, effects, q, v)
+        effort = self._effort(track, effects[len(self._own) :], q, v)
         jerk = np.asarray(np.gradient(vd, t, axis=0))
         return Motion(t, q, v, vd, effort, jerk)
 
@@ -266,6 +273,7 @@ class InverseModel:
 
     def _effort(self, track: Track, effects, q, v) -> np.ndarray:
         """(n, n_v) mean effort over each interval, after the path."""
+        effects = [*self._own, *effects]
         out = np.zeros_like(q)
         act = self.scene.actuation
         for i, joint in enumerate(self.joints):
@@ -358,7 +366,8 @@ class InverseModel:
 
     def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
         """(m,) residual over its noise, of the scene with these effects added."""
-        ours = [e for e in effects if e.kind not in SENSED + PATH]
+        hidden = [e for e in self._own if KINDS[e.kind].hidden_state]
+        ours = [*hidden, *(e for e in effects if e.kind not in SENSED + PATH)]
         moving = [
             e for e in effects
             if e.kind in SENSED
@@ -422,6 +431,7 @@ class InverseModel:
 
     def _other_rows(self, track, effects, motion) -> dict[str, np.ndarray]:
         out = {}
+        effects = [*self._own, *effects]
         for i, joint in enumerate(self.joints):
             if self.has["velocity"][i]:
                 name = f"{joint}.velocity"

@@ -7,7 +7,7 @@ import numpy as np
 
 from makebreak.gap.recording import Recording, check_against_scene, unit_of
 from makebreak.gap.scene_facts import scene_names
-from makebreak.gap.windows import WindowModel
+from makebreak.gap.windows import WindowModel, seen_in
 from makebreak.models.effects.kind import full_name, one_dof_joints
 from makebreak.models.scene import Scene
 
@@ -49,10 +49,8 @@ def judge(
     simulated = model.simulate(())
     off, done = [], []
     for window, y in zip(model.windows, simulated, strict=True):
-        recording = recordings[window.recording]
-        seen = np.stack([recording[c][window.rows] for c in model.channels], axis=1)
-        done.append(bool(np.isfinite(y).all()))
-        off.append(seen - y)
+        done.append(not np.isinf(y).any())
+        off.append(seen_in(model, window) - y)
     errors = np.concatenate(off)  # NaN where nothing was measured, or simulated.
     found = []
     for k, channel in enumerate(model.channels):

@@ -10,7 +10,7 @@ from makebreak.gap.inverse import InverseModel
 from makebreak.gap.parallel import side_by_side
 from makebreak.gap.recording import Recording
 from makebreak.gap.result import GapMeasure, Series
-from makebreak.gap.windows import WindowModel
+from makebreak.gap.windows import WindowModel, seen_in
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.models.effects.transmission import twists
@@ -64,23 +64,27 @@ def measure(
 
 
 def _twists(motion: InverseModel, effects: Sequence[Effect]):
-    """Function of a window: {joint: (twist, its rate)} at its start. None if nothing
-    twists."""
-    hidden = [e for e in effects if KINDS[e.kind].hidden_state]
+    """Function of a window: {joint: (twist, its rate)} at its start, of the motion as
+    measured in the scene as it came. None if nothing twists."""
+    every = (*motion.scene.effects, *effects)
+    hidden = [e for e in every if KINDS[e.kind].hidden_state]
     if not hidden:
         return None
-    known: dict[tuple[str, int], tuple[np.ndarray, dict]] = {}
+    known: dict[tuple[str, int], list[tuple[np.ndarray, dict]]] = {}
     for track, each in zip(motion.tracks, motion.motions(), strict=True):
         of: dict[str, np.ndarray] = {}
         for effect in hidden:
             of |= twists(effect, motion.dynamics, each)
-        known[track.recording, track.episode] = (each.time, of)
+        stretches = known.setdefault((track.recording, track.episode), [])
+        stretches.append((each.time, of))
 
     def at(window) -> dict[str, tuple[float, float]]:
         name = motion.recordings[window.recording].name
-        time, of = known[name, window.episode]
-        k = min(int(np.searchsorted(time, window.start)), len(time) - 1)
-        return {joint: (float(z[0, k]), float(z[1, k])) for joint, z in of.items()}
+        for time, of in known.get((name, window.episode), []):
+            if time[0] - 0.05 <= window.start <= time[-1]:
+                k = int(np.searchsorted(time, window.start))
+                return {j: (float(z[0, k]), float(z[1, k])) for j, z in of.items()}
+        return {}  # Too short a stretch to tell.
 
     return at
 
@@ -93,13 +97,15 @@ def held_out(model: Windows) -> list[bool]:
 
 def gap_measure(model: Windows, before, after) -> GapMeasure:
     """Args: before, after: what held-out windows simulate without and with effects.
-    Samples that one of them does not tell count in neither."""
+    Samples that were not measured, or that one of them does not tell, count in
+    neither."""
     held = held_out(model)
 
     def of_held(each) -> np.ndarray:
         return np.concatenate([e for e, h in zip(each, held, strict=True) if h])
 
     both = ~(np.isnan(of_held(before)) | np.isnan(of_held(after)))
+    both &= np.isfinite(of_held([seen_in(model, w) for w in model.windows]))
     a, b = of_held(model.errors(before)), of_held(model.errors(after))
 
     def rms(e: np.ndarray, c) -> float:

@@ -7,7 +7,12 @@ import numpy as np
 
 from makebreak.gap.inverse import SENSED, InverseModel
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.kind import Effect, check_parameters
+from makebreak.models.effects.kind import (
+    Effect,
+    check_parameters,
+    find_joints,
+    full_name,
+)
 from makebreak.systems.numerics.selection import Columns, LinearFit, Screen
 
 # How well links are known where the scene does not say [-], [m].
@@ -66,6 +71,12 @@ def candidates(
 
     dynamics, motions = model.dynamics, model.motions()
     worst = _worst_joints(model, nuisance, prior)
+    # A joint that has such an element in the scene can have no second one.
+    elastic = {
+        full_name(dynamics.plant, joint)
+        for e in model.scene.effects if e.kind in _ELASTIC
+        for joint in find_joints(e, dynamics.plant)
+    }  # fmt: skip
     found: list[Candidate] = []
     for kind, entry in KINDS.items():
         if kind in _HIDDEN or entry.at in ("free body", "length", "pair", "ground"):
@@ -83,7 +94,7 @@ def candidates(
                 continue
             if kind in _DRIVEN and not _driven(model, at):
                 continue
-            if kind in _ELASTIC and at not in worst:
+            if kind in _ELASTIC and (at not in worst or at in elastic):
                 continue
             if kind == "sinusoidal_force" and at not in _links(model)[-1:]:
                 continue  # Of the last link alone: each frequency is a fit of its own.
@@ -276,15 +287,17 @@ def _of_sensors(model: InverseModel, kind: str, of) -> list[Candidate]:
 
 def inseparable(effect: Effect, model: InverseModel) -> Effect | None:
     """What no recording of commands and joints can tell from an effect: commands that
-    act late, and all channels that show late."""
+    act late, and all channels that show late. (A measured effort would tell.)"""
     models = sorted({joint.split(".")[0] for joint in model.joints})
     sensed = {
         f"{joint}.{what}"
         for k, joint in enumerate(model.joints)
-        for what in ("position", "velocity", "effort_measured")
+        for what in ("position", "velocity")
         if what == "position" or model.has[what][k]
     }
     driven = {joint for joint in model.joints if _driven(model, joint)}
+    if not driven or any(model.has["effort_measured"]):
+        return None
     at = set(effect.at)
     if effect.kind == "input_delay" and (at == set(models) or at >= driven):
         return Effect("sensor_delay", models, dict(effect.parameters))

@@ -106,6 +106,7 @@ def _settled(model, nuisance, prior, chosen, current: Fitted) -> Fitted:
     has not reached yet would be looked for in other effects."""
     fixed = [c["fixed"] for c in chosen]
     jumps = getattr(model, "jumps", False)
+    steps = 2 * int(getattr(model, "evaluations", EVALUATIONS))
     for far in (False, True) if jumps else (False,):
         if not needs_more(current, prior):
             break
@@ -113,10 +114,10 @@ def _settled(model, nuisance, prior, chosen, current: Fitted) -> Fitted:
         effects = current.effects
         if jumps:
             effects = wander(model, screen, effects, fixed, far)
-        more = fit_effects(model, screen, effects, fixed, 3 * EVALUATIONS)
+        more = fit_effects(model, screen, effects, fixed, steps)
         if more.fit.train < current.fit.train:
             current = more
-            chosen[-1]["after"] = min(more.score, chosen[-1]["after"])
+            chosen[-1]["after"] = more.score
     return current
 
 
@@ -253,7 +254,10 @@ def _still_tied(model, screen, chosen, current, k: int, start) -> tuple[Effect, 
     for rival in chosen[k]["ties"] if len(chosen) > 1 else ():
         trial = [*current.effects[:k], rival, *current.effects[k + 1 :]]
         held = [*fixed[:k], (), *fixed[k + 1 :]]
-        fit = fit_effects(model, screen, trial, held)
+        try:
+            fit = fit_effects(model, screen, trial, held)
+        except ValueError:
+            continue
         near = np.hypot(fit.score, blur) <= (1.0 + SAME) * np.hypot(current.score, blur)
         if near and paired(fit.left, current.left, train) > CHANCE:
             tied.append(fit.effects[k])
@@ -307,16 +311,22 @@ def _backward(model, nuisance, prior, chosen, current, start):
     while len(chosen) > 1:
         screen = Screen(current.r, nuisance, prior, model.train(), current.fit.train)
         now = screen.judge(current.r).score
-        without = []
+        without: list[Fitted | None] = []
         for k in range(len(chosen)):
             rest = [e for i, e in enumerate(current.effects) if i != k]
             fixed = [c["fixed"] for i, c in enumerate(chosen) if i != k]
-            without.append(fit_effects(model, screen, rest, fixed, 5))
-        k = int(np.argmin([w.score for w in without]))
+            try:
+                without.append(fit_effects(model, screen, rest, fixed, 5))
+            except ValueError:  # What is left would be no scene.
+                without.append(None)
+        k = int(np.argmin([w.score if w else np.inf for w in without]))
+        smaller = without[k]
+        if smaller is None:
+            break
         blur = PRECISION * start.score
-        least = (1.0 - _least_gain(model)) * np.hypot(without[k].score, blur)
+        least = (1.0 - _least_gain(model)) * np.hypot(smaller.score, blur)
         if np.hypot(now, blur) < least:
             break
         chosen = [c for i, c in enumerate(chosen) if i != k]
-        current = without[k]
+        current = smaller
     return chosen, current

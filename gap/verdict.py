@@ -4,11 +4,19 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import PrismaticJoint
 
+from makebreak.gap.recording import unit_of
 from makebreak.gap.result import Estimate, Evidence, NamedEffect
 from makebreak.gap.select import FLOOR, Choice, Selection
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.kind import of_slides, sentence, unit_at
+from makebreak.models.effects.kind import (
+    full_name,
+    of_slides,
+    one_dof_joints,
+    sentence,
+    unit_at,
+)
 
 # Left after all that could be named: more than so many times the noise, and more than
 # this share of the gap, is a gap without a name.
@@ -16,6 +24,7 @@ UNNAMED, UNNAMED_SHARE = 2.0, 0.2
 # Effects that leave a gap without a name are told only if they close this share of it,
 # simulated: less is what any model with a free parameter may fit to another law.
 TOLD = 0.5
+OF_CHANNEL = "(unit of the channel)"
 NO_GAP = 1.5  # Times the noise, after the background within its tolerance.
 
 
@@ -49,6 +58,10 @@ def named(choice: Choice, plant: MultibodyPlant) -> NamedEffect:
     """The choice in the report's words; plant: the scene's, without it."""
     kind = KINDS[choice.effect.kind]
     slides = kind.at in ("joint", "actuator") and of_slides(choice.effect, plant)
+    own_unit = OF_CHANNEL
+    if kind.at == "channel" and (place := choice.effect.at[0]).count(".") == 2:
+        joint, quantity = place.rsplit(".", 1)
+        own_unit = unit_of(quantity, _is_slide(joint, plant))
     parameters, std = {}, {}
     weak = False
     for each in kind.parameters:
@@ -60,13 +73,14 @@ def named(choice: Choice, plant: MultibodyPlant) -> NamedEffect:
         if not spread < width:  # The data say nothing of it.
             spread = float("inf")
         weak |= spread > max(abs(value), 1e-3 * width)
-        parameters[each.name] = Estimate(value, spread, unit_at(each.unit, slides))
+        unit = own_unit if each.unit == OF_CHANNEL else unit_at(each.unit, slides)
+        parameters[each.name] = Estimate(value, spread, unit)
         if spread > 0.0:
             std[each.name] = spread
     apart = ""
     if choice.ties or kind.tell_apart:
         apart = kind.tell_apart[:1].upper() + kind.tell_apart[1:] + "."
-    says = sentence(choice.effect, kind, std, slides)
+    says = sentence(choice.effect, kind, std, slides).replace(OF_CHANNEL, own_unit)
     return NamedEffect(
         choice.effect.kind,
         tuple(choice.effect.at),
@@ -77,6 +91,15 @@ def named(choice: Choice, plant: MultibodyPlant) -> NamedEffect:
         apart if choice.ties else "",
         "weak" if weak else "identifiable",
     )
+
+
+def _is_slide(joint: str, plant: MultibodyPlant) -> bool:
+    sliding = {
+        full_name(plant, each)
+        for each in one_dof_joints(plant)
+        if isinstance(each, PrismaticJoint)
+    }
+    return joint in sliding
 
 
 def says(

@@ -47,9 +47,11 @@ class WindowedResidual:
     `simulate(effects)` and `errors(simulated)`, a list of (n, channels) per window.
     """
 
+    recordings: list[Recording]
     channels: list[str]
     windows: Sequence[Any]
     _base: np.ndarray | None = None
+    _kept: np.ndarray | None = None
 
     def simulate(self, effects: Sequence[Effect]) -> Sequence[np.ndarray]:
         raise NotImplementedError
@@ -58,7 +60,25 @@ class WindowedResidual:
         raise NotImplementedError
 
     def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
-        return np.concatenate([e.ravel() for e in self.errors(self.simulate(effects))])
+        e = self.errors(self.simulate(effects))
+        return np.concatenate([x.ravel() for x in e])[self.measured()]
+
+    def measured(self) -> np.ndarray:
+        """(n,) which entries of all windows were measured: rows are of these."""
+        if self._kept is None:
+            self._kept = np.concatenate(
+                [np.isfinite(seen_in(self, w)).ravel() for w in self.windows]
+            )
+        return self._kept
+
+    def _by_row(self, of_window: Sequence) -> np.ndarray:
+        """A window's value for each of its rows, (m,)."""
+        k = len(self.channels)
+        each = [
+            np.full((w.rows.stop - w.rows.start) * k, x)
+            for w, x in zip(self.windows, of_window, strict=True)
+        ]
+        return np.concatenate(each)[self.measured()]
 
     def base(self) -> np.ndarray:
         if self._base is None:
@@ -66,18 +86,17 @@ class WindowedResidual:
         return self._base
 
     def train(self) -> np.ndarray:
-        k = len(self.channels)
-        return np.concatenate(
-            [np.full((w.rows.stop - w.rows.start) * k, w.train) for w in self.windows]
-        )
+        return self._by_row([w.train for w in self.windows])
 
     def blocks(self) -> np.ndarray:
         """(m,) number of the window of each row."""
-        k = len(self.channels)
-        return np.concatenate(
-            [np.full((w.rows.stop - w.rows.start) * k, i)
-             for i, w in enumerate(self.windows)]
-        )  # fmt: skip
+        return self._by_row(range(len(self.windows)))
+
+
+def seen_in(model, window) -> np.ndarray:
+    """(n, n_channels) what was measured in a window; NaN where nothing was."""
+    recording = model.recordings[window.recording]
+    return np.stack([recording[c][window.rows] for c in model.channels], axis=1)
 
 
 class WindowModel(WindowedResidual):
@@ -304,10 +323,13 @@ class WindowModel(WindowedResidual):
         return out
 
     def _initial(self, w: Window, episode: Episode, effects) -> InitialSection:
-        """The true state at the start, if the effects on measurement are these."""
+        """The true state at the start, if the effects on measurement are these beside
+        the scene's own."""
         initial = InitialSection()
         path = self._paths[w.recording, episode.first]
-        measured = [e for e in effects if e.kind in _MEASUREMENT]
+        measured = [
+            e for e in (*self.scene.effects, *effects) if e.kind in _MEASUREMENT
+        ]
 
         def state(name: str) -> np.ndarray:
             scale, late, bias = _sensing(measured, name)
@@ -354,9 +376,7 @@ class WindowModel(WindowedResidual):
             if not len(y):
                 out.append(y)
                 continue
-            recording = self.recordings[w.recording]
-            seen = np.stack([recording[c][w.rows] for c in self.channels], axis=1)
-            e = (seen - y) / w.std
+            e = (seen_in(self, w) - y) / w.std
             out.append(np.clip(np.where(np.isnan(e), 0.0, e), -LARGEST, LARGEST))
         return out
 

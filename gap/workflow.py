@@ -25,7 +25,7 @@ from makebreak.gap.result import GapResult
 from makebreak.gap.scene_facts import scene_facts, scene_names
 from makebreak.gap.screen import candidates, inseparable, nuisances
 from makebreak.gap.select import Choice, Selection, needs_more, select
-from makebreak.gap.verdict import named, says, told, verdict_of
+from makebreak.gap.verdict import UNNAMED, named, says, told, verdict_of
 from makebreak.gap.where import unexplained, where_in_motion
 from makebreak.gap.windows import WindowModel, with_step
 from makebreak.models.dynamics import SceneDynamics
@@ -212,6 +212,8 @@ def _of_mechanism(scene, recordings, checks, seconds, clock, say, jobs) -> GapRe
         return measure(scene, recordings, effects, moved, model, jobs)
 
     gap, series = measured(selection)
+    if choices and gap.after > max(gap.before, UNNAMED):
+        verdict = "gap_unnamed"  # Equations that simulation does not bear out.
     every = selection
     selection, near = told(every, verdict, gap.reduction)
     if selection is not every:

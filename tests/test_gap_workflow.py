@@ -2,12 +2,15 @@
 
 import ast
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from gap_benchmark.cases import cases, make, write
 
 from makebreak.gap.workflow import run_gap
+from makebreak.models.scene import read_scene
+from makebreak.models.scene_file import write_scene
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -51,6 +54,20 @@ def test_a_hidden_effect_is_named_and_measured(tmp_path, name, parameter, tolera
     )
     assert result.gap.after < 0.1 * result.gap.before
     assert result.where
+
+
+@pytest.mark.parametrize(
+    "name", ["28_pendulum_actuator_gain", "38_pendulum_sensor_delay"]
+)
+def test_nothing_is_missing_from_a_repaired_scene(tmp_path, name):
+    # Drives and sensors, which rigid-body dynamics do not know of.
+    _, result = _run(name, tmp_path)
+    scene = read_scene(tmp_path / "scene.yaml")
+    repaired = replace(scene, effects=result.scene_effects())
+    write_scene(repaired, tmp_path / "repaired.yaml", "With what was named.")
+    again = run_gap(tmp_path / "repaired.yaml", [tmp_path / "recording.csv"])
+    assert again.verdict == "no_gap"
+    assert again.gap.before == pytest.approx(result.gap.after, rel=0.1)
 
 
 def test_late_commands_and_late_sensors_are_told_as_one(tmp_path):

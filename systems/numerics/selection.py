@@ -127,6 +127,8 @@ class Screen:
     def _fit(self, c, c_std, b, held, seen) -> LinearFit:
         n, m = int((~self._train).sum()), int(self._train.sum())
         held, seen = max(held, 0.0) / max(n, 1), max(seen, 0.0) / max(m, 1)
+        if n == 0:
+            held = seen  # Too little data to hold any out.
         cost = self._s2 * float(np.sum((b / self._prior) ** 2)) / (n + m)
         return LinearFit(
             c, c_std, b, float(np.sqrt(held + cost)), float(np.sqrt(held)),
