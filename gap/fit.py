@@ -15,7 +15,7 @@ EVALUATIONS = 8
 # Of a parameter's size: first steps of a search without slopes, and how far around one
 # looks where that ended.
 WANDER, AROUND = 0.2, 0.5
-MOST_NEAR, MOST_FAR = 200, 450  # Simulations, about.
+MOST_FAR = 450  # Simulations, about.
 ROUGH = np.linspace(0.85, 1.15, 16)  # Of a start, tried.
 
 
@@ -126,11 +126,13 @@ def wander(
     start: Sequence[Effect],
     fixed: Sequence[Sequence[str]],
     far: bool = False,
+    most: int = 200,
 ) -> tuple[Effect, ...]:
     """Effects from which a fit may go on where its gradient misled it: when which foot
     lands first changes, the error jumps, and slopes tell little.
 
-    Nelder and Mead's search; `far`, differential evolution, which leaves valleys.
+    Nelder and Mead's search, of `most` simulations; `far`, differential evolution,
+    which leaves valleys.
     """
     free = _Free(start, [tuple(names) for names in fixed])
 
@@ -153,7 +155,7 @@ def wander(
         corners = np.vstack([z0, z0 + WANDER * np.eye(len(z0))])
         found = minimize(
             cost, z0, method="Nelder-Mead",
-            options={"initial_simplex": corners, "maxfev": min(40 * len(z0), MOST_NEAR),
+            options={"initial_simplex": corners, "maxfev": min(40 * len(z0), most),
                      "xatol": 1e-3, "fatol": 1e-2},
         )  # fmt: skip
     return tuple(_tidy(e) for e in free.effects(found.x))

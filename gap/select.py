@@ -19,6 +19,7 @@ from makebreak.systems.numerics.selection import (
 )
 
 MOST_EFFECTS = 4
+FINALISTS, FINALIST_RUNS = 4, 80  # Searched without slopes before one is chosen.
 FLOOR = 1.15  # Rms over noise that noise alone may leave (its estimate is that good).
 # Laws are approximations (how dry friction turns round, how commands are held): errors
 # that differ by less than this share of the whole gap do not tell two models apart.
@@ -243,6 +244,21 @@ def _fit_each(
         say(f"  {each.candidate.name}: {fit.score:.3g}")
         if is_sane(fit.effects[-1]) and np.isfinite(fit.score):
             sound.append((fit, each))
+    if known or not getattr(model, "jumps", False):
+        return sound
+    # The best few once more, without slopes: else the one whose fit got stuck loses.
+    best = sorted(range(len(sound)), key=lambda k: sound[k][0].score)[:FINALISTS]
+    for k in best if sound and sound[best[0]][0].score > FLOOR else []:
+        fit, each = sound[k]
+        fixed = [*[c["fixed"] for c in chosen], each.candidate.fixed]
+        try:
+            effects = wander(model, screen, fit.effects, fixed, most=FINALIST_RUNS)
+            better = fit_effects(model, screen, effects, fixed)
+        except ValueError:
+            continue
+        if better.fit.train < fit.fit.train and is_sane(better.effects[-1]):
+            sound[k] = better, each
+            say(f"  {each.candidate.name}: {better.score:.3g}")
     return sound
 
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numba import njit
 
-MOST_STEPS = 200_000  # Of one run: beyond it the parameters are given up.
+MOST_STEPS = 40_000  # Of one run: beyond it the parameters are given up.
 
 
 @dataclass(frozen=True, eq=False)
