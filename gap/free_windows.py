@@ -58,6 +58,9 @@ class FreeBodyModel(WindowedResidual):
     """
 
     jumps = True  # Errors, where an object's spheres land in another order.
+    # Errors below the noise, which is mostly how unsure a start is, tell no two models
+    # apart.
+    least_error = 1.0
     diff_step = 2e-3  # Of fits: smaller ones drown in the error of the steps.
     # What an effect must take off the error. Laws of contact leave so much that none
     # but the first takes off a tenth.

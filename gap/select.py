@@ -314,9 +314,11 @@ def _shortlist(ranked: list[Ranked], base: float) -> list[Ranked]:
         if near and of_kind < 2 and len(short) < 7:
             short.append(each)
     there = {r.candidate.kind for r in short}
+    first = ranked[0].candidate.kind
     for each in ranked:
         kind = each.candidate.kind
-        if kind in KINDS[ranked[0].candidate.kind].confused_with and kind not in there:
+        alike = kind in KINDS[first].confused_with or first in KINDS[kind].confused_with
+        if alike and kind not in there:
             short.append(each)
             there.add(kind)
     return short

@@ -218,6 +218,18 @@ class SceneDynamics:
             body.AddInForceInWorld(self._context, SpatialForce(F), self._forces)
 
 
+def _depth(plant: MultibodyPlant, body: RigidBody) -> int:
+    """Joints and welds between a body and the world."""
+    inner = {
+        joint.child_body().index(): joint.parent_body().index()
+        for joint in (plant.get_joint(i) for i in plant.GetJointIndices())
+    }
+    depth, at = 0, body.index()
+    while at in inner:
+        depth, at = depth + 1, inner[at]
+    return depth
+
+
 def places(loaded: LoadedScene, at: str, channels: Sequence[str]) -> list[str]:
     """The places of a scene at which an effect on `at` (EffectKind.at) can be."""
     plant = loaded.plant
@@ -234,6 +246,7 @@ def places(loaded: LoadedScene, at: str, channels: Sequence[str]) -> list[str]:
         if plant.get_body(i).index() != plant.world_body().index()
         and not model.startswith(("payload_on_", "motor_of_"))
     ]
+    bodies.sort(key=lambda body: _depth(plant, body))  # From the base outwards.
     moving = [body for body in bodies if not plant.IsAnchored(body)]
     free = [body for body in bodies if body.is_floating_base_body()]
     shaped = [body for body in bodies if plant.GetCollisionGeometriesForBody(body)]
