@@ -302,14 +302,18 @@ def _sane(ranked: list[Ranked]) -> list[Ranked]:
 
 
 def _shortlist(ranked: list[Ranked], base: float) -> list[Ranked]:
-    """Those worth an exact fit: near the best, at most two of a kind; and of each kind
+    """Those worth an exact fit: near the best, at most two of a kind and size; and of each kind
     with which the catalogue says that the best is confused, the best place."""
     best = ranked[0].fit.score
     if best > 0.95 * base:
         return []
     short: list[Ranked] = []
     for each in ranked:
-        of_kind = sum(r.candidate.kind == each.candidate.kind for r in short)
+        of_kind = sum(
+            (r.candidate.kind, r.candidate.size)
+            == (each.candidate.kind, each.candidate.size)
+            for r in short
+        )
         near = each.fit.score < max(1.6 * best, best + 0.15 * (base - best))
         if near and of_kind < 2 and len(short) < 7:
             short.append(each)
