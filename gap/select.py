@@ -302,8 +302,8 @@ def _sane(ranked: list[Ranked]) -> list[Ranked]:
 
 
 def _shortlist(ranked: list[Ranked], base: float) -> list[Ranked]:
-    """Those worth an exact fit: near the best, at most two of a kind and size; and of each kind
-    with which the catalogue says that the best is confused, the best place."""
+    """Those worth an exact fit: near the best, at most two of a kind and size; and of
+    each kind that the catalogue says to be confused with the best, the best place."""
     best = ranked[0].fit.score
     if best > 0.95 * base:
         return []
