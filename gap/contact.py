@@ -24,7 +24,7 @@ _TIMES = {
     "object_mass": (0.7, 0.97, 1.4),
 }
 _PLUS: dict[str, dict[str, tuple[float, ...]]] = {
-    "rolling_resistance": {"coefficient": (0.005,)},
+    "rolling_resistance": {"coefficient": (0.002, 0.006, 0.015)},
     "plane_height": {"height": (-0.004, -0.0005, 0.004)},
     "plane_tilt": dict.fromkeys(("roll", "pitch"), (0.003, 0.02)),
     "corner_radius": {"radius": (0.002, 0.005)},

@@ -29,6 +29,7 @@ BLUR = 0.02  # Laws of contact are approximations, which noise alone does not te
 DRAWS = 12  # Of uncertain starts.
 ENOUGH = 30  # Windows up to the first impact: then later ones are not needed.
 FEWEST_ROWS = 8
+UNEVEN = 0.5  # Of the error of all windows: what is held out must have as much of it.
 NEAR = 2e-3  # [m] So near it is taken to touch.
 _PLACE = ("x", "y", "z")
 _STATE = (*TURN, *_PLACE, "wx", "wy", "wz", "vx", "vy", "vz")
@@ -46,7 +47,8 @@ class Window:
     state: np.ndarray
     spread: np.ndarray
     std: np.ndarray
-    train: bool
+    block: int
+    train: bool  # Every third block is held out.
     after_hits: int  # Impacts of the episode before it.
 
 
@@ -114,11 +116,12 @@ class FreeBodyModel(WindowedResidual):
             )
         self._seen = [self._measured(w) for w in self.windows]
         self._add_spread()
+        self.runs = 0
+        self._share_out()
         self.window_sec = float(
             np.median([recordings[w.recording].time[w.rows][-1] - w.start
                        for w in self.windows])
         )  # fmt: skip
-        self.runs = 0
 
     def _most(self, channel: str, size: float) -> float:
         what = channel.rsplit(".", 1)[-1]
@@ -215,7 +218,7 @@ class FreeBodyModel(WindowedResidual):
                 Window(
                     i, episode.number, float(time[k]),
                     slice(episode.first + k, episode.first + end), states[k - a],
-                    spreads[k - a], np.zeros(0), block % 3 != 1, before,
+                    spreads[k - a], np.zeros(0), block, block % 3 != 1, before,
                 )
             )  # fmt: skip
 
@@ -249,6 +252,25 @@ class FreeBodyModel(WindowedResidual):
             replace(w, std=np.sqrt(std**2 + floor**2))
             for w, std in zip(self.windows, stds, strict=True)
         ]
+
+    def _share_out(self) -> None:
+        """Other blocks are held out if those that are hold next to nothing of the gap:
+        then they could not tell any two models apart."""
+        off = self.errors(self.simulate())
+        size = np.array([np.mean(e**2) for e in off])
+        third = np.array([w.block % 3 for w in self.windows])
+
+        def held(k: int) -> float:
+            return (
+                float(np.sqrt(size[third == k].mean())) if (third == k).any() else 0.0
+            )
+
+        whole = float(np.sqrt(size.mean()))
+        if held(1) >= UNEVEN * whole or not (third == 1).any():
+            return
+        best = min(range(3), key=lambda k: abs(np.log((held(k) + 1e-9) / whole)))
+        if (third != best).any():
+            self.windows = [replace(w, train=w.block % 3 != best) for w in self.windows]
 
     # ----- Simulating
 
