@@ -177,10 +177,14 @@ def _patches(model, nuisance, at: str, there, r) -> list[Candidate]:
         return []
     train, step = model.train(), -0.3 * mu
 
-    def moved(friction: float, sides) -> np.ndarray | None:
+    def patch(friction: float, sides) -> dict[str, float]:
         names = ("x_min", "x_max", "y_min", "y_max")
-        p = {"friction": friction} | dict(zip(names, map(float, sides), strict=True))
-        return _residual(model, *there, Effect("friction_patch", [at], p))
+        sides = dict(zip(names, map(float, sides), strict=True))
+        return {"friction": friction} | sides
+
+    def moved(friction: float, sides) -> np.ndarray | None:
+        effect = Effect("friction_patch", [at], patch(friction, sides))
+        return _residual(model, *there, effect)
 
     # Cell by cell; of a rectangle, to first order, the sum of its cells.
     sums = np.zeros((CELLS + 1, CELLS + 1, len(r)))
@@ -208,9 +212,7 @@ def _patches(model, nuisance, at: str, there, r) -> list[Candidate]:
     column = Columns(((r - new) / (friction - mu))[:, None], nuisance, train)
 
     def read(c) -> dict[str, float]:
-        names = ("x_min", "x_max", "y_min", "y_max")
-        size = float(np.clip(mu + c[0], 0.1 * mu, max(1.5, 2.0 * mu)))
-        return {"friction": size} | dict(zip(names, sides, strict=True))
+        return patch(float(np.clip(mu + c[0], 0.1 * mu, max(1.5, 2.0 * mu))), sides)
 
     return [Candidate("friction_patch", (at,), 5, (column,), (read,))]
 
@@ -239,6 +241,7 @@ def _patch_search(moved, train, grid, friction: float, corner: np.ndarray):
         for _ in range(PATCH_ROUNDS):
             moves = [at, *(at + d * e for e in np.eye(4) for d in (-reach, reach))]
             trials = [(friction * s, x) for s in (0.83, 1.0, 1.2) for x in moves]
+            del trials[len(moves)]  # Where it is: known.
             errors = [error(*each) for each in trials]
             best = int(np.argmin(errors))
             if not errors[best] < 0.99 * now:

@@ -8,7 +8,7 @@ import numpy as np
 from makebreak.gap.recording import Recording, check_against_scene, unit_of
 from makebreak.gap.scene_facts import scene_names
 from makebreak.gap.windows import WindowModel, seen_in
-from makebreak.models.effects.kind import full_name, one_dof_joints
+from makebreak.models.effects.kind import sliding_joints
 from makebreak.models.scene import Scene
 
 
@@ -41,11 +41,7 @@ def judge(
     joints, bodies = scene_names(plant)
     for recording in recordings:
         check_against_scene(recording, joints, bodies)
-    sliding = {
-        full_name(plant, joint)
-        for joint in one_dof_joints(plant)
-        if joint.type_name() == "prismatic"
-    }
+    sliding = sliding_joints(plant)
     simulated = model.simulate(())
     off, done = [], []
     for window, y in zip(model.windows, simulated, strict=True):

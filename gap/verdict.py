@@ -4,17 +4,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import PrismaticJoint
 
 from makebreak.gap.recording import unit_of
 from makebreak.gap.result import Estimate, Evidence, NamedEffect
 from makebreak.gap.select import FLOOR, Choice, Selection
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import (
-    full_name,
     of_slides,
-    one_dof_joints,
     sentence,
+    sliding_joints,
     unit_at,
 )
 
@@ -61,7 +59,7 @@ def named(choice: Choice, plant: MultibodyPlant) -> NamedEffect:
     own_unit = OF_CHANNEL
     if kind.at == "channel" and (place := choice.effect.at[0]).count(".") == 2:
         joint, quantity = place.rsplit(".", 1)
-        own_unit = unit_of(quantity, _is_slide(joint, plant))
+        own_unit = unit_of(quantity, joint in sliding_joints(plant))
     parameters, std = {}, {}
     weak = False
     for each in kind.parameters:
@@ -91,15 +89,6 @@ def named(choice: Choice, plant: MultibodyPlant) -> NamedEffect:
         apart if choice.ties else "",
         "weak" if weak else "identifiable",
     )
-
-
-def _is_slide(joint: str, plant: MultibodyPlant) -> bool:
-    sliding = {
-        full_name(plant, each)
-        for each in one_dof_joints(plant)
-        if isinstance(each, PrismaticJoint)
-    }
-    return joint in sliding
 
 
 def says(

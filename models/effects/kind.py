@@ -172,6 +172,12 @@ def unit_at(unit: str, slides: bool) -> str:
     return _ALONG.get(unit, unit) if slides else unit
 
 
+def sliding_joints(plant: MultibodyPlant) -> set[str]:
+    """Full names of the joints that slide."""
+    joints = one_dof_joints(plant)
+    return {full_name(plant, j) for j in joints if isinstance(j, PrismaticJoint)}
+
+
 def of_slides(effect: Effect, plant: MultibodyPlant) -> bool:
     """Whether it is of joints that slide, all of them."""
     joints = find_joints(effect, plant)
