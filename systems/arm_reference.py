@@ -21,6 +21,10 @@ class ArmReferenceConfig:
     tip_mass: float = 1.0  # [kg] of the tip in the LCS.
     force_max: float = 3.0  # Feed-forward is clipped to it [N].
     acceleration_max: float = 1.5  # Of the velocity reference while rolling [m/s2].
+    # No command moves the reference faster than that, however far away it is. The task
+    # itself stays below 0.35 m/s and 4 m/s2.
+    speed_max: float = 0.7  # [m/s]
+    acceleration_fed_forward_max: float = 10.0  # While repositioning [m/s2].
     period_sec: float = 0.0125  # Of C3 and of the task.
     offset_sec: float = 0.0  # A little after theirs.
 
@@ -34,7 +38,8 @@ class ArmReference(LeafSystem):
     step reaches the arm; a step in torque would meet its rate limit.
 
     While C3 holds an old command (its status is not 0), a rolling reference stays where
-    it is and pushes nothing.
+    it is and pushes nothing; so does any while its command is not finite. A command far
+    away is gone to at speed_max, not within one period.
 
     Inputs:  phase (1,), reference (9,) of RollingTask; x_next (19,), lam (n_lam,),
              status (1,) of C3; lcs (abstract), the one-step LCS that made them.
@@ -85,7 +90,10 @@ class ArmReference(LeafSystem):
             dv_max = c.acceleration_max * c.period_sec
         else:
             target = np.concatenate((self._reference.Eval(context), self._zero))
-        end = next_end(start, target, dv_max)
+        end = next_end(
+            start, target, c.speed_max * c.period_sec, c.speed_max, dv_max,
+            c.acceleration_fed_forward_max,
+        )  # fmt: skip
         discrete_state.set_value(self._line, np.concatenate((start, end, [t])))
 
     def _pose(self, context, output):

@@ -70,9 +70,11 @@ class ImpedanceController(LeafSystem):
     tau is the motors' torque: the mass matrix contains the rotors' inertia.
 
     tau never leaves the effort limits of the control plant and never changes by more
-    than torque_rate_max x period. If q or v is NaN, tau goes, at that rate, to what
-    carries the arm at its last good position; if the reference is NaN (or a stiffness
-    or damping is negative), the last good pose is held at rest. `status` says so.
+    than torque_rate_max x period. If an entry of q or v is NaN, tau goes, at that rate,
+    to what carries the arm and slows it down, qdd = -20/s qd: joints that are still
+    measured by what is measured, the others by their last good q and v, predicted on.
+    If the reference is NaN (or a stiffness or damping is negative), the last good pose
+    is held at rest. `status` says so.
 
     Inputs:  q (n,) [rad], v (n,) [rad/s]; x_desired (19,) = [p_WE 3, quaternion wxyz 4,
              v 3, w 3, a 3, alpha 3] of E in the world; optional stiffness (6,),

@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 from pydrake.common.value import AbstractValue
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
@@ -23,11 +24,24 @@ def test_line_is_straight_and_stays_at_its_end():
 def test_norms_and_the_change_of_velocity_are_bounded():
     np.testing.assert_allclose(clip_norm(np.array([0.0, 6.0, 8.0]), 5.0), [0, 3, 4])
     np.testing.assert_allclose(clip_norm(np.array([0.0, 0.3]), 5.0), [0.0, 0.3])
-    target = np.arange(12.0)
-    target[3:6] = [3.0, 4.0, 0.0]
-    end = next_end(np.zeros(12), target, 0.5)
+    target = np.array([0, 0, 0.2, 3, 4, 0, 0, 0.1, 0, 1, 2, 3], dtype=float)
+    end = next_end(np.zeros(12), target, 1.0, 9.0, 0.5, 1.0)
     np.testing.assert_allclose(end[3:6], [0.3, 0.4, 0.0], atol=1e-15)
     np.testing.assert_allclose(np.delete(end, [3, 4, 5]), np.delete(target, [3, 4, 5]))
+
+
+@pytest.mark.parametrize("size", [1.0, 1e3, 1e200, 1e308])
+def test_position_velocity_and_acceleration_of_a_line_are_bounded(size):
+    start = np.array([0.4, 0.1, 0.2, 0.03, 0, 0, 0, 0, 0, 0, 0, 0])
+    direction = np.array([2.0, -1.0, 2.0]) / 3.0
+    target = np.concatenate([size * direction] * 3 + [np.zeros(3)])
+    end = next_end(start, target, 0.01, 0.5, np.inf, 0.7)
+    way = target[:3] - start[:3]
+    way /= abs(way).max()  # At once, its square would overflow.
+    expected = start[:3] + 0.01 * way / np.linalg.norm(way)
+    np.testing.assert_allclose(end[:3], expected, atol=1e-15)
+    np.testing.assert_allclose(end[3:6], 0.5 * direction, atol=1e-15)
+    np.testing.assert_allclose(end[6:9], 0.7 * direction, atol=1e-15)
 
 
 def one_force_lcs(tip_mass):
@@ -41,12 +55,15 @@ def one_force_lcs(tip_mass):
     )  # fmt: skip
 
 
-def run(phase, x_next, lam, t_end=0.0126, status=0.0):
+# Slow enough for no bound of the reference to be met.
+REFERENCE = np.array([1, 2, 3, 40, 50, 60, 700, 800, 900]) * 1e-3
+
+
+def run(phase, x_next, lam, t_end=0.0126, status=0.0, reference=REFERENCE):
     builder = DiagramBuilder()
     lcs = one_force_lcs(2.0)
     config = ArmReferenceConfig(tip_mass=2.0)
     arm = builder.AddNamedSystem("arm", ArmReference(config, 1, np.zeros(3), lcs))
-    reference = np.arange(9.0)
     for name, value in dict(
         phase=[phase], reference=reference, x_next=x_next, lam=lam, status=[status]
     ).items():
@@ -95,8 +112,30 @@ def test_an_old_command_of_c3_is_not_followed():
 
 def test_reposition_follows_the_task_and_pushes_nothing():
     pose, wrench = run(REPOSITION, np.ones(19), [1.5])
-    np.testing.assert_allclose(pose[[0, 1, 2, 7, 8, 9, 13, 14, 15]], range(9))
+    np.testing.assert_allclose(pose[[0, 1, 2, 7, 8, 9, 13, 14, 15]], REFERENCE)
     np.testing.assert_allclose(wrench, 0.0)
+
+
+@pytest.mark.parametrize("phase", [ROLL, REPOSITION])
+@pytest.mark.parametrize("size", [1.0, 1e6, 1e300])
+def test_an_absurd_command_moves_the_reference_no_faster_than_speed_max(phase, size):
+    x_next, reference = np.full(19, size), np.full(9, size)
+    c = ArmReferenceConfig()
+    for t_end in (0.0126, 0.1251):
+        pose, _ = run(phase, x_next, [0.0], t_end, reference=reference)
+        # A period is 12.5 ms; the line that starts at t_end has gone 0.1 ms.
+        assert np.linalg.norm(pose[:3]) <= c.speed_max * t_end * (1.0 + 1e-9)
+        assert np.linalg.norm(pose[7:10]) <= c.speed_max * (1.0 + 1e-9)
+        fed_forward = np.linalg.norm(pose[13:16])
+        assert fed_forward <= c.acceleration_fed_forward_max * (1.0 + 1e-9)
+    assert np.linalg.norm(pose[:3]) > 0.9 * c.speed_max * 0.125  # Not frozen either.
+
+
+def test_a_command_that_becomes_nan_ends_motion_and_push():
+    """A velocity that were kept would be a force on the arm, damping times it."""
+    moving = np.array([0.1, 0, 0, 0.2, 0, 0, 1.0, 0, 0, 0, 0, -2.0])
+    end = next_end(moving, np.full(12, np.nan), 1.0, 1.0, 1.0, 1.0)
+    np.testing.assert_array_equal(end, [0.1, *np.zeros(11)])
 
 
 def test_nan_from_the_planner_leaves_the_reference_where_it_was():

@@ -340,6 +340,63 @@ def test_nan_sensors_from_the_start_carry_the_nominal_arm(law, chain):
     np.testing.assert_allclose(rows[-1][0], carrying, atol=1e-12)
 
 
+def coast(law, chain, which, joints, t_nan=0.1, t_end=0.4):
+    """A moving arm of which sensors give NaN from t_nan on, by its own equations.
+
+    Returns: per ms, speed norm in the mass matrix (n,) [sqrt(J)], tau (n, 7), status.
+    """
+    dt = 1e-3
+    q = law.q_nominal.copy()
+    v = np.linalg.pinv(chain_state(chain, q, np.zeros(7)).J)[:, 1] * 0.4  # [m/s] in y.
+    tau, memory = chain_state(chain, q, v).bias, np.zeros(memory_size(7))
+    v_d = np.array([0.0, 0.4, 0.0])
+    speeds, taus = [], []
+    for k in range(round(t_end / dt)):
+        q_read, v_read = q.copy(), v.copy()
+        if k * dt >= t_nan:
+            if "q" in which:
+                q_read[joints] = np.nan
+            if "v" in which:
+                v_read[joints] = np.nan
+        x_d = reference(P_TIP + k * dt * v_d, v_d)
+        tau, status, memory = packed_tick(
+            packed(chain), packed(law), tau, memory, q_read, v_read, x_d,
+            law.stiffness, law.damping, 0.0, np.zeros(6), *NO_FORCE,
+        )  # fmt: skip
+        s = chain_state(chain, q, v)
+        speeds.append(np.sqrt(v @ s.M @ v))
+        taus.append(tau)
+        v = v + dt * np.linalg.solve(s.M, tau - s.bias)
+        q = q + dt * v
+    return np.array(speeds), np.array(taus), status
+
+
+@pytest.mark.parametrize("joints", [[3], [0, 5], list(range(7))])
+@pytest.mark.parametrize("which", ["q", "v", "qv"])
+def test_an_arm_whose_encoders_fail_while_it_moves_is_braked(law, chain, which, joints):
+    speed, tau, status = coast(law, chain, which, joints)
+    assert status & SENSORS_HELD and np.isfinite(tau).all()
+    assert abs(np.diff(tau, axis=0)).max() <= 1.0 + 1e-12  # 1000 N m/s x 1 ms.
+    # v' = -20/s v: 300 ms leave exp(-6) = 0.2 %. An arm that is only carried keeps its
+    # speed. Joints without any sensor are braked by a prediction, which does not know
+    # that the torque took some 20 ms, at its limited rate, to become the brake's:
+    # 20/s x 20 ms / 2 of their speed is left over.
+    left = 0.2 if which == "qv" else 0.01
+    assert speed[-1] < left * speed[99]
+    assert np.isfinite(speed).all() and speed[100:].max() < 1.3 * speed[99]
+
+
+def test_a_joint_that_stands_still_is_not_pushed_by_an_old_velocity(law, chain):
+    """The last good velocity may be large; held for ever it would drive the arm."""
+    nan, fast = np.full(7, np.nan), np.array([0, 0, 0, 1e6, 0, 0, 0])
+    first = (law.q_nominal, fast, reference())
+    rows = run_ticks(chain, law, [first] + [(nan, nan, reference())] * 1500)
+    assert np.isfinite([tau for tau, _ in rows]).all()
+    # At rest it carries the arm near where it was: 10 rad/s over 20/s is 0.5 rad.
+    settled = np.diff([tau for tau, _ in rows[-100:]], axis=0)
+    assert abs(settled).max() < 1e-6
+
+
 @pytest.mark.parametrize("index", [0, 4, 8, 14])
 def test_nan_reference_holds_the_last_good_pose_at_rest(law, chain, index):
     moving = reference([0.5, 0.0, 0.102], v=[0.02, 0, 0])

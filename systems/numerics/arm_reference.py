@@ -6,6 +6,9 @@ import numpy as np
 
 def clip_norm(vector, limit):
     """vector (n,), shortened to the norm limit if it is longer."""
+    largest = np.abs(vector).max()
+    if largest > limit:  # So that no square overflows.
+        vector = vector / largest * limit
     size = np.sqrt(vector @ vector)
     return vector if size <= limit else vector * (limit / size)
 
@@ -33,15 +36,20 @@ def pose_and_wrench(line, t, period_sec):
     return both
 
 
-def next_end(start, target, dv_max):
+def next_end(start, target, dp_max, v_max, dv_max, a_max):
     """Where the line from `start` towards `target` ends.
 
-    Args: start, target: (12,) = [p, v, a, feed-forward force], each (3,); dv_max: bound
-        on how far v goes [m/s].
-    Returns: (12,); start itself if target is not finite.
+    Args: start, target: (12,) = [p, v, a, feed-forward force], each (3,); dp_max: bound
+        on how far p goes [m]; v_max, a_max: bounds on v and a at the end [m/s],
+        [m/s2]; dv_max: on how far v goes [m/s].
+    Returns: (12,), p, v, a within these bounds; start at rest, without force, if target
+        is not finite.
     """
     if not np.isfinite(target).all():
-        return start.copy()
+        return np.concatenate((start[:3], np.zeros(9)))
     end = target.copy()
-    end[3:6] = start[3:6] + clip_norm(target[3:6] - start[3:6], dv_max)
+    end[:3] = start[:3] + clip_norm(target[:3] - start[:3], dp_max)
+    v = clip_norm(target[3:6], v_max)
+    end[3:6] = start[3:6] + clip_norm(v - start[3:6], dv_max)
+    end[6:9] = clip_norm(target[6:9], a_max)
     return end

@@ -33,6 +33,11 @@ IK_DAMPING = 0.02  # [m] and [rad]: of the posture's inverse kinematics.
 IK_STEP_MAX = 0.05  # [rad] a joint of the posture moves in one step.
 LIMIT_MARGIN = 0.03  # [rad] that the posture keeps from the joint limits.
 
+# While an encoder gives NaN. The rate is what 1 ms and an encoder's noise allow.
+HOLD_DAMPING = 20.0  # [1/s] at which the arm is slowed down.
+HOLD_SPEED_MAX = 10.0  # [rad/s] A joint was not faster than that, whatever was read.
+HOLD_GAIN = 0.1  # Share of a good encoder's surprise that corrects its joint's speed.
+
 CONTACT_FORCE_MIN = 0.5  # [N] Below it the integral of the force waits.
 SAME_DIRECTION = 0.98  # Cosine above which a direction goes on as the one before.
 ENGAGE_SEC = 0.02  # In which stiffness along a new direction fades.
@@ -78,8 +83,10 @@ class Law(NamedTuple):
 
 def memory_size(n: int) -> int:
     """[q_n, last good q, last good pose (7), ticks, has a good pose, has a good q,
-    last good force directions (6) and targets (2), slots (N_SLOTS x SLOT)]."""
-    return 2 * n + 18 + N_SLOTS * SLOT
+    last good force directions (6) and targets (2), slots (N_SLOTS x SLOT), last v].
+
+    While a sensor is held, the last good q and v are predicted on (held_motion)."""
+    return 3 * n + 18 + N_SLOTS * SLOT
 
 
 @numba.njit(cache=True)
@@ -347,6 +354,32 @@ def impedance_torque(
 
 
 @numba.njit(cache=True)
+def held_motion(q, v, q_last, v_last, period):
+    """Where the joints are while some encoders give NaN: predicted with the damping of
+    HOLD_DAMPING that the arm is under, corrected by what is still measured.
+
+    Args: q, v (n,) measured, NaN where nothing is; q_last, v_last (n,) of the tick
+        before, [rad], [rad/s]; period [s].
+    Returns: q (n,), v (n,), finite.
+    """
+    n = q.shape[0]
+    q_now, v_now = np.empty(n), np.empty(n)
+    for i in range(n):
+        speed = v_last[i] * np.exp(-HOLD_DAMPING * period)
+        if np.isfinite(v[i]):
+            speed = v[i]
+        speed = min(max(speed, -HOLD_SPEED_MAX), HOLD_SPEED_MAX)
+        q_now[i] = q_last[i] + period * speed
+        if np.isfinite(q[i]):
+            if not np.isfinite(v[i]):
+                speed += HOLD_GAIN * (q[i] - q_now[i]) / period
+                speed = min(max(speed, -HOLD_SPEED_MAX), HOLD_SPEED_MAX)
+            q_now[i] = q[i]
+        v_now[i] = speed
+    return q_now, v_now
+
+
+@numba.njit(cache=True)
 def tick(
     chain,
     law,
@@ -379,11 +412,17 @@ def tick(
         if not has_q:
             memory[:n] = q
         memory[n : 2 * n] = q
+        memory[-n:] = v
         memory[2 * n + 9] = 1.0
-        q_now = q
+        q_now, v_now = q, v
     else:
         status |= SENSORS_HELD
-        q_now = memory[n : 2 * n].copy() if has_q else law.q_nominal.copy()
+        if has_q:
+            q_now, v_now = held_motion(q, v, memory[n : 2 * n], memory[-n:], law.period)
+            memory[n : 2 * n] = q_now
+            memory[-n:] = v_now
+        else:
+            q_now, v_now = law.q_nominal.copy(), np.zeros(n)
 
     x_d, R_d, held = _reference(chain, memory, q_now, x_d, has_pose, n)
     if held:
@@ -407,7 +446,7 @@ def tick(
     if not np.all(np.isfinite(measured)):
         measured = np.zeros(6)  # Below CONTACT_FORCE_MIN: the integral waits.
         status |= FORCE_SENSOR_HELD
-    slots = memory[2 * n + 18 :].reshape(N_SLOTS, SLOT)
+    slots = memory[2 * n + 18 : -n].reshape(N_SLOTS, SLOT)
 
     if sensed:
         force_control(law, slots, kept[:6], kept[6:], measured)
@@ -427,8 +466,9 @@ def tick(
         )
         if count % law.posture_every == 0:
             memory[:n] = posture_step(chain, law, memory[:n].copy(), p_tip)
-    else:  # Carry the arm where it was last seen.
-        asked = chain_state(chain, q_now, np.zeros(n)).bias
+    else:  # Carry the arm, and slow it down: qdd = -HOLD_DAMPING v.
+        now = chain_state(chain, q_now, v_now)
+        asked = now.bias - HOLD_DAMPING * (now.M @ v_now)
     if not np.all(np.isfinite(asked)):  # Numbers too large to calculate with.
         asked = chain_state(chain, q_now, np.zeros(n)).bias
         status |= REFERENCE_HELD
