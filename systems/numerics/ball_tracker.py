@@ -144,6 +144,8 @@ def _fit_ball(strength, region, circles, reach, angles, low, focal, center):
     height, width = strength.shape
     for i in range(len(circles)):
         u, v = circles[i, 0], circles[i, 1]
+        if not (0.0 < u < width - 1 and 0.0 < v < height - 1):
+            continue  # Hough's centres may lie beside the picture.
         # The circle may be the finger's tip, whose edge is round, too: rays from there
         # find a part of the ball, and those from that fit's centre all there is to see.
         for _ in range(2):

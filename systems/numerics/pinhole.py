@@ -331,7 +331,9 @@ def shifted(picture, u, v, out):
     # Columns from `first` to before `end` have both neighbours in the picture, `left`
     # by a fixed number of columns.
     start = left[width // 2] - width // 2
-    first, end = max(0, -start), min(width, width - 1 - start)
+    # (A picture that is shifted by more than its width has none.)
+    first = min(max(0, -start), width)
+    end = max(min(width, width - 1 - start), 0)
     while first < end and left[first] != first + start:
         first += 1
     while end > first and left[end - 1] != end - 1 + start:
