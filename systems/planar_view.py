@@ -79,8 +79,9 @@ class PlanarView(LeafSystem):
         c = first + (last - first) * min(t / self._ramp, 1.0)
         length, bar = 0.001 + 0.5 * c / 200.0, f"{_ROOT}/viscosity"
         place = RigidTransform([0.4, -0.25 + 0.5 * length, _HEIGHT])
-        self._meshcat.SetProperty(bar, "scale", [1.0, length, 1.0], t)
         self._meshcat.SetTransform(bar, place, t)
+        # On the object below: a transform sets its own path's scale back to 1.
+        self._meshcat.SetProperty(f"{bar}/<object>", "scale", [1.0, length, 1.0], t)
 
     def _publish(self, context):
         t = context.get_time()

@@ -59,8 +59,11 @@ class RollingView(LeafSystem):
     def _show_gap(self, gap, t):
         x, y = self._config.center[0], self._config.center[1] + 0.22
         height = max(self._config.gap_scale * gap, 0.001) if np.isfinite(gap) else 0.001
-        self._meshcat.SetProperty(self.BAR, "scale", [1.0, 1.0, height], t)
         self._meshcat.SetTransform(self.BAR, RigidTransform([x, y, height / 2]), t)
+        # On the object below: a transform sets its own path's scale back to 1.
+        self._meshcat.SetProperty(
+            f"{self.BAR}/<object>", "scale", [1.0, 1.0, height], t
+        )
 
     def _remember(self, context, state):
         track = context.get_abstract_state(int(self._track)).get_value()
