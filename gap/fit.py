@@ -62,7 +62,7 @@ def fit_effects(
     start, rough = _try_rough(model, screen, list(start), fixed)
     fixed = [(*a, *b) for a, b in zip(fixed, rough, strict=True)]
     steps = evaluations or int(getattr(model, "evaluations", EVALUATIONS))
-    free = _Free(start, fixed)
+    free = _Free(model, start, fixed)
     x0, scale, low = free.x0, free.scale, free.low
     cache: dict[bytes, np.ndarray] = {}
 
@@ -134,7 +134,7 @@ def wander(
     Nelder and Mead's search, of `most` simulations; `far`, differential evolution,
     which leaves valleys.
     """
-    free = _Free(start, [tuple(names) for names in fixed])
+    free = _Free(model, start, [tuple(names) for names in fixed])
 
     def cost(z) -> float:
         if np.any(z * free.scale < free.low):
@@ -168,7 +168,9 @@ class _Free:
     typical size and a least value.
     """
 
-    def __init__(self, start: Sequence[Effect], fixed: Sequence[Sequence[str]]):
+    def __init__(
+        self, model: Model, start: Sequence[Effect], fixed: Sequence[Sequence[str]]
+    ):
         self._start = start
         self.names = [
             (i, name)
@@ -177,7 +179,16 @@ class _Free:
             if name not in fixed[i]
         ]
         self.scale = np.array([_scale(start[i], name) for i, name in self.names])
-        self.low = np.array([_lowest(start[i].kind, name) for i, name in self.names])
+        least = [
+            model.dynamics.least(e.kind, e.at) if hasattr(model, "dynamics") else {}
+            for e in start
+        ]
+        self.low = np.array(
+            [
+                max(_lowest(start[i].kind, name), least[i].get(name, -np.inf))
+                for i, name in self.names
+            ]
+        )
         x0 = np.array([start[i].parameters[name] for i, name in self.names])
         self.x0 = np.maximum(x0, self.low + 1e-9 * self.scale)
 

@@ -34,7 +34,6 @@ REST_SPEED, REST_SHARE, REST_EFFORT = 0.005, 0.04, 0.3
 # Sampled at the very instants at which a stiff drive gets new commands, a velocity is
 # off by a share of itself.
 DRIVE_VELOCITY = 0.01
-HEAVY = ("payload", "gravity_tilt", "object_mass", "object_com", "object_inertia")
 MOST_MOTIONS = 40  # That are kept in memory.
 MODEL_ERROR = 2e-4  # Of a joint's rms effort: what smoothing and sampling leave.
 
@@ -376,8 +375,8 @@ class InverseModel:
         ]  # fmt: skip
         # Weights and gravity change each other; else effects add up.
         dynamics: SceneDynamics = self.dynamics
-        heavy = [e for e in ours if e.kind in HEAVY]
-        if len(heavy) > 1 or any(e.kind.startswith("object_") for e in heavy):
+        heavy = [e for e in ours if KINDS[e.kind].weighs]
+        if len(heavy) > 1 or any(KINDS[e.kind].added is None for e in heavy):
             dynamics = SceneDynamics(
                 replace(self.scene, effects=[*self.scene.effects, *heavy])
             )

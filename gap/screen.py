@@ -1,7 +1,7 @@
 """Every effect of the catalogue that could act in a scene, by what it explains."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -23,10 +23,12 @@ NESTED = {
     "joint_spring": ("actuator_bias",),
     "sinusoidal_force": ("constant_force",),
 }
+BEYOND = 1.5  # Times what a model can lose at most is taken for all of it.
 _DELAYS = (0.004, 0.01, 0.02, 0.04)
 _ELASTIC = ("joint_elasticity", "joint_backlash")
 _DRIVEN = ("actuator_saturation", *_ELASTIC)
-_HIDDEN = ("object_mass", "object_com", "object_inertia")  # Links': background.
+# Links: background.
+_HIDDEN = ("object_mass", "object_com", "object_inertia", "link_mass", "link_com")
 _SPEEDS = (0.03, 0.06, 0.1, 0.2)
 _RIPPLES = tuple(float(n) for n in range(2, 25)) + (30.0, 36.0, 48.0, 60.0)
 
@@ -41,6 +43,7 @@ class Candidate:
     columns: tuple[Columns, ...]  # (m, k) each, over the noise.
     to_parameters: tuple[Callable, ...]
     fixed: tuple[str, ...] = ()  # Parameters that a fit leaves at neutral.
+    least: Mapping[str, float] = field(default_factory=dict)  # What the model allows.
 
     @property
     def name(self) -> str:
@@ -118,8 +121,11 @@ def candidates(
                     )
                 )  # fmt: skip
             found.append(
-                Candidate(kind, (at,), size, tuple(map(of, columns)), tuple(readers))
-            )
+                Candidate(
+                    kind, (at,), size, tuple(map(of, columns)), tuple(readers),
+                    least=dynamics.least(kind, [at]),
+                )
+            )  # fmt: skip
     return found
 
 
@@ -162,13 +168,22 @@ def rank(screen: Screen, found: Sequence[Candidate]) -> list[Ranked]:
             if best is None or fit.train < best[0].train:
                 best = (fit, reader)
         assert best is not None
-        effect = Effect(candidate.kind, list(candidate.at), best[1](best[0].c))
-        ranked.append(Ranked(candidate, best[0], effect, is_sane(effect)))
+        parameters = best[1](best[0].c)
+        for name, least in candidate.least.items():
+            # Columns take what the model has for a little more than it is.
+            if BEYOND * least <= parameters[name] < least:
+                parameters[name] = least
+        effect = Effect(candidate.kind, list(candidate.at), parameters)
+        valid = is_sane(effect, candidate.least)
+        ranked.append(Ranked(candidate, best[0], effect, valid))
     return sorted(ranked, key=lambda r: r.fit.score)
 
 
-def is_sane(effect: Effect) -> bool:
-    """Whether the parameters are allowed, and of a size that robots have."""
+def is_sane(effect: Effect, least: Mapping[str, float] | None = None) -> bool:
+    """Whether the parameters are allowed, and of a size that robots have.
+
+    Args: least, what the model allows (SceneDynamics.least).
+    """
     entry = KINDS[effect.kind]
     try:
         check_parameters(effect, entry)
@@ -178,11 +193,11 @@ def is_sane(effect: Effect) -> bool:
         value = effect.parameters.get(each.name)
         if value is None or each.name == "phase":
             continue
+        if value < (least or {}).get(each.name, -np.inf):
+            return False
         width = each.high - each.low
         if not each.low - 0.01 * width <= value <= each.high + 0.01 * width:
             return False
-    if effect.kind == "payload" and effect.parameters["mass"] <= 0.0:
-        return False
     return not (
         effect.kind == "joint_stribeck_friction"
         and effect.parameters["static"] < effect.parameters["coulomb"]

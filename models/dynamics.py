@@ -209,6 +209,15 @@ class SceneDynamics:
             if each.neutral is not None
         }
 
+    def least(self, kind: str, at: Sequence[str]) -> dict[str, float]:
+        """The least values that parameters can have, where the model sets a bound: it
+        can lose no more damping, friction, rotor or mass than it has."""
+        entry = KINDS[kind]
+        if entry.least is None:
+            return {}
+        effect = Effect(kind, list(at), {})
+        return dict(entry.least(effect, self.plant, self.loaded.effects))
+
     def _add_body_forces(self, time: float) -> None:
         assert self.loaded.body_forces is not None
         for law, body, p in self._body_laws:

@@ -214,6 +214,8 @@ class LoadedScene:
                 or kind.path
             ):
                 return False
+        if changed and _changes_new_values(new):
+            return False
         if any(kind.path == "delay" for kind in changed) and any(
             path.systems[0] is not path.path for path in self.paths.values()
         ):
@@ -243,6 +245,19 @@ class LoadedScene:
             own = path.path.GetMyMutableContextFromRoot(root_context)
             path.path.set_numbers(own, numbers[model])
         return True
+
+
+def _changes_new_values(effects: Sequence[Effect]) -> bool:
+    """Whether one body has a new inertia and a change of it: in a Context one does not
+    know of the other."""
+    new: set[str] = set()
+    changed: set[str] = set()
+    for effect in effects:
+        kind = KINDS[effect.kind]
+        if kind.edit_text is not None:
+            is_change = all(each.neutral == 0.0 for each in kind.parameters)
+            (changed if is_change else new).update(effect.at)
+    return bool(new & changed)
 
 
 def load_scene(
@@ -285,6 +300,9 @@ def load_scene(
             before(effect, plant, scene_graph)
     plant.Finalize()
     for effect in effects:
+        possible = KINDS[effect.kind].possible
+        if possible is not None:
+            possible(effect, plant, effects)
         if KINDS[effect.kind].channel:
             check_channels(effect, KINDS[effect.kind].channel, plant)
     _set_initial(scene.initial, effects, plant)

@@ -45,6 +45,7 @@ EXACT = {
     "body_drag": ("d.lower", dict(linear=0.8, angular=0.05)),
     "object_mass": ("d.lower", dict(mass=1.1)),
     "object_inertia": ("d.lower", dict(ixx=0.03, iyy=0.035, izz=0.02)),
+    "link_mass": ("d.lower", dict(mass=-0.3)),
 }
 GRID = {
     "stribeck_velocity": [0.1, 0.2],
@@ -56,6 +57,7 @@ SMALL = {
     "payload": ("d.lower", dict(mass=0.2, com_x=0.05, com_y=-0.04, com_z=-0.1)),
     "gravity_tilt": ("d", dict(roll=0.02, pitch=-0.015)),
     "object_com": ("d.lower", dict(x=0.004, y=0.036, z=-0.205)),
+    "link_com": ("d.lower", dict(x=0.004, y=-0.006, z=0.005)),
 }
 
 
@@ -85,6 +87,24 @@ def test_what_an_effect_adds_is_what_a_model_with_it_needs_more(tmp_path, kind):
     more = -true.residual(motion)
     added = added_effort(Effect(kind, [at], parameters), KINDS[kind], without, motion)
     np.testing.assert_allclose(added, more, atol=1e-9 * np.abs(more).max())
+
+
+def test_what_is_missing_is_what_a_model_with_it_needs_more(tmp_path):
+    # 0.2 kg less at the lower link's own centre of mass.
+    scene, kind = double(tmp_path), "payload"
+    parameters = dict(mass=-0.2, com_x=0.0, com_y=0.03, com_z=-0.2)
+    without = SceneDynamics(scene)
+    motion = motion_of(without)
+    more = -SceneDynamics(with_effects(scene, (kind, "d.lower", parameters))).residual(
+        motion
+    )
+    effect = Effect(kind, ["d.lower"], parameters)
+    added = added_effort(effect, KINDS[kind], without, motion)
+    np.testing.assert_allclose(added, more, atol=1e-9 * np.abs(more).max())
+    assert without.least(kind, ["d.lower"]) == {"mass": -0.8}
+    much = Effect(kind, ["d.lower"], {**parameters, "mass": -0.9})
+    with pytest.raises(ValueError, match="no body is left"):
+        added_effort(much, KINDS[kind], without, motion)
 
 
 def test_inverse_dynamics_of_the_pendulum_is_the_closed_form(tmp_path):
@@ -495,7 +515,26 @@ def test_a_sentence_reads_as_in_the_report():
     assert says("object_com", ["box"], x=0.01) == (
         "the centre of mass of body box is at x = 0.01 m in its frame"
     )
+    assert says("link_mass", ["panda.hand"], mass=-0.73) == (
+        "body panda.hand is 0.73 kg lighter than in the model"
+    )
+    assert says("link_mass", ["panda.hand"], mass=0.2) == (
+        "body panda.hand is 0.2 kg heavier than in the model"
+    )
+    assert says(
+        "payload", ["panda.link8"], mass=-0.73, com_x=0, com_y=0, com_z=-0.1
+    ) == (
+        "body panda.link8 carries 0.73 kg less than the model says, missing at (0 m, "
+        "0 m, -0.1 m) in its frame"
+    )
+    assert says("rotor_inertia", ["a.b"], inertia=-0.05).startswith(
+        "the rotor of joint a.b has 0.05 kg m2 less"
+    )
     kind = KINDS["joint_coulomb_friction"]
+    less = Effect("joint_coulomb_friction", ["a.b"], {"coulomb": -0.4})
+    assert sentence(less, kind, {"coulomb": 0.1}) == (
+        "joint a.b has 0.4 +- 0.1 N m less of Coulomb friction than the model says"
+    )
     effect = Effect("joint_coulomb_friction", ["a.b"], {"coulomb": 1.8})
     assert "1.8 +- 0.1 N m" in sentence(effect, kind, {"coulomb": 0.1})
 

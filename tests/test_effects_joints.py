@@ -1,5 +1,7 @@
 """Damping, dry friction, drag, rotor, ripple, spring in a joint."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from effect_scenes import LENGTH, MASS, G, J, at_rest_but, pendulum, with_effects
@@ -7,6 +9,8 @@ from pydrake.systems.framework import DiagramBuilder
 from scipy.integrate import solve_ivp
 
 from makebreak.diagrams.scene_simulation import Commands, SceneSimulation
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import load_scene
 
 TIMES = np.linspace(0.0, 1.0, 21)
@@ -190,6 +194,45 @@ def test_parameters_can_be_changed_without_building_anew(tmp_path, kind):
     np.testing.assert_array_equal(third, again)
 
 
+LESS = {
+    "joint_viscous_damping": (dict(damping=0.3), "damping"),
+    "joint_coulomb_friction": (dict(coulomb=0.4), "coulomb"),
+    "joint_quadratic_drag": (dict(coefficient=0.2), "coefficient"),
+    "rotor_inertia": (dict(inertia=0.2), "inertia"),
+}
+
+
+@pytest.mark.parametrize("kind", LESS)
+def test_a_model_loses_what_it_has_too_much_of_and_no_more(tmp_path, kind):
+    parameters, name = LESS[kind]
+    has = parameters[name]
+    base = with_effects(pendulum(tmp_path), (kind, "p.j1", parameters))
+    less = Effect(kind, ["p.j1"], {name: -0.6 * has})
+    scene = replace(base, effects=[*base.effects, less])
+    left = with_effects(pendulum(tmp_path), (kind, "p.j1", {name: 0.4 * has}))
+    # The same forces in two parts: rounding, at the integrator's accuracy.
+    np.testing.assert_allclose(simulated(scene), simulated(left), atol=1e-6)
+    assert abs(simulated(scene) - simulated(base)).max() > 1e-2
+    # In a Context that was built with another part of it.
+    simulation = SceneSimulation(
+        replace(base, effects=[*base.effects, Effect(kind, ["p.j1"], {name: 0.1})])
+    )
+    simulation.set_effects(scene.effects)
+    commands = Commands(TIMES, {"p.j1.effort_command": command(TIMES)})
+    initial = at_rest_but({"p.j1": Q0}, {"p.j1": V0})
+    rows = simulation.run(initial, TIMES, CHANNELS, commands)
+    assert simulation.builds == 1
+    np.testing.assert_allclose(rows, simulated(left), atol=1e-6)
+    model = SceneDynamics(base)
+    assert model.least(kind, ["p.j1"]) == {name: pytest.approx(-has)}
+    assert SceneDynamics(scene).least(kind, ["p.j1"])[name] == pytest.approx(-0.4 * has)
+    # Without the effect there is nothing to lose.
+    assert SceneDynamics(pendulum(tmp_path)).least(kind, ["p.j1"]) == {name: 0.0}
+    much = Effect(kind, ["p.j1"], {name: -1.1 * has})
+    with pytest.raises(ValueError, match=f"leaves .*{-0.1 * has:g}"):
+        load_scene(replace(base, effects=[*base.effects, much]), DiagramBuilder())
+
+
 @pytest.mark.parametrize(
     "kind, at, parameters, words",
     [
@@ -197,7 +240,7 @@ def test_parameters_can_be_changed_without_building_anew(tmp_path, kind):
             "joint_viscous_damping",
             "p.j1",
             {"damping": -1},
-            "damping is -1, expected >=",
+            "damping -1 leaves -1, expected 0 or more with the 0 that",
         ),
         ("joint_viscous_damping", "p.j9", {"damping": 1}, "expected a joint of 'p'"),
         ("joint_viscous_damping", "x.j1", {"damping": 1}, "no model 'x'"),
@@ -211,7 +254,9 @@ def test_parameters_can_be_changed_without_building_anew(tmp_path, kind):
             {"coulomb": 1, "static": 2, "stribeck_velocity": 0},
             "stribeck_velocity is 0, expected > 0",
         ),
-        ("rotor_inertia", "p.j1", {"inertia": -0.1}, "inertia is -0.1, expected >= 0"),
+        ("rotor_inertia", "p.j1", {"inertia": -0.1}, "inertia -0.1 leaves -0.1"),
+        ("joint_coulomb_friction", "p", {"coulomb": -0.1}, "coulomb -0.1 leaves -0.1"),
+        ("joint_quadratic_drag", "p.j1", {"coefficient": -1}, "leaves -1, expected 0"),
         ("torque_ripple", "p.j1", {"amplitude": 1, "phase": 0}, "`periods_per_rev`"),
         ("joint_spring", "p.base", {"stiffness": 1, "rest": 0}, "that turns or slides"),
     ],

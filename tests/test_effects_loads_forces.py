@@ -1,4 +1,6 @@
-"""Payload, tilt, and forces on a body."""
+"""Payload, links, tilt, and forces on a body."""
+
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +19,8 @@ from effect_scenes import (
 from pydrake.systems.framework import DiagramBuilder
 from scipy.integrate import solve_ivp
 
-from makebreak.diagrams.scene_simulation import SceneSimulation
+from makebreak.diagrams.scene_simulation import Commands, SceneSimulation
+from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.scene import load_scene
 
 TIMES = np.linspace(0.0, 1.0, 11)
@@ -83,6 +86,110 @@ def test_payload_is_changed_in_the_context_and_adds_no_state(tmp_path):
     assert (
         loaded.plant.num_multibody_states(loaded.plant.GetModelInstanceByName("p")) == 2
     )
+
+
+@pytest.mark.parametrize("time_step, atol", [(0.0, 1e-4), (0.0005, 0.01)])
+def test_a_load_that_is_not_there_is_a_negative_point_mass(tmp_path, time_step, atol):
+    # Of the rod's kilogram 0.3 kg are missing just beside its centre of mass.
+    m, com = -0.3, (0.01, 0.02, -0.52)
+    parameters = dict(mass=m, com_x=com[0], com_y=com[1], com_z=com[2])
+    scene = with_effects(
+        pendulum(tmp_path, time_step), ("payload", "p.rod", parameters)
+    )
+    np.testing.assert_allclose(simulated(scene), ode(free_fall(m, com)), atol=atol)
+    # It swings about as before: a pendulum's mass hardly matters. Its weight does.
+    loaded = load_scene(scene, DiagramBuilder())
+    assert loaded.plant.CalcTotalMass(loaded.plant.CreateDefaultContext()) == 0.7
+    assert SceneDynamics(scene).least("payload", ["p.rod"]) == {"mass": -0.7}
+
+
+def heavier(mass):
+    """Mass and moments of inertia times 1 + mass, as the rod has 1 kg: by a constant
+    torque the acceleration differs."""
+    return lambda t, q, v: (
+        (2.0 - (1.0 + mass) * MASS * G * LENGTH * np.sin(q)) / ((1.0 + mass) * J)
+    )
+
+
+def shifted(x, z):
+    """The rod's centre of mass at (x, z - 0.5), its central inertia as before."""
+
+    def acceleration(t, q, v):
+        c = np.array([x, z - LENGTH])
+        weight = MASS * G * (c[1] * np.sin(q) + c[0] * np.cos(q))
+        return (2.0 + weight) / (CENTRAL + MASS * c @ c)
+
+    return acceleration
+
+
+LINKS = [
+    ("link_mass", dict(mass=0.4), heavier(0.4)),
+    ("link_mass", dict(mass=-0.4), heavier(-0.4)),
+    ("link_com", dict(x=0.1, y=0.05, z=-0.06), shifted(0.1, -0.06)),
+    ("link_com", dict(x=-0.1, y=0.05, z=0.06), shifted(-0.1, 0.06)),
+]
+
+
+@pytest.mark.parametrize("kind, parameters, acceleration", LINKS)
+@pytest.mark.parametrize("built_with", [1.0, 0.3])
+def test_a_link_of_another_mass_or_centre_swings_as_the_ode_says(
+    tmp_path, kind, parameters, acceleration, built_with
+):
+    scene = with_effects(pendulum(tmp_path), (kind, "p.rod", parameters))
+    first = {name: built_with * value for name, value in parameters.items()}
+    simulation = SceneSimulation(with_effects(scene, (kind, "p.rod", first)))
+    simulation.set_effects(scene.effects)
+    assert simulation.builds == 1
+    commands = Commands(np.array([0.0]), {"p.j1.effort_command": np.array([2.0])})
+    initial = at_rest_but({"p.j1": Q0}, {"p.j1": V0})
+    rows = simulation.run(initial, TIMES, CHANNELS, commands)
+    np.testing.assert_allclose(rows, ode(acceleration), atol=1e-4)
+    assert abs(ode(acceleration) - ode(heavier(0.0))).max() > 0.1
+
+
+def test_a_change_of_a_link_goes_on_top_of_a_new_value(tmp_path):
+    scene = with_effects(
+        pendulum(tmp_path),
+        ("link_mass", "p.rod", dict(mass=-0.5)),
+        ("object_mass", "p.rod", dict(mass=2.0)),
+        ("link_com", "p.rod", dict(x=0.0, y=0.0, z=0.1)),
+        ("link_mass", "p.rod", dict(mass=0.1)),
+    )
+    simulation = SceneSimulation(scene)
+    plant = load_scene(scene, DiagramBuilder()).plant
+    M = plant.GetBodyByName("rod").default_spatial_inertia()
+    assert M.get_mass() == pytest.approx(1.6)
+    np.testing.assert_allclose(M.get_com(), [0.0, 0.0, -0.4])
+    # Central moments go with the mass, once.
+    about = M.CalcRotationalInertia().CopyToFullMatrix3()
+    assert about[1, 1] == pytest.approx(1.6 * (CENTRAL + 0.4**2))
+    # Other values of both kinds: built anew, as in a Context neither knows the other.
+    other = with_effects(
+        scene,
+        ("link_mass", "p.rod", dict(mass=0.2)),
+        ("object_mass", "p.rod", dict(mass=2.5)),
+        ("link_com", "p.rod", dict(x=0.0, y=0.0, z=0.1)),
+        ("link_mass", "p.rod", dict(mass=0.1)),
+    )
+    simulation.set_effects(other.effects)
+    initial = at_rest_but({"p.j1": Q0}, {"p.j1": V0})
+    np.testing.assert_array_equal(
+        simulation.run(initial, TIMES, CHANNELS), simulated(other)
+    )
+    assert simulation.builds == 2
+
+
+def test_a_link_can_lose_all_that_it_has_where_others_carry_on(tmp_path):
+    # A tool welded to the rod, and not mounted in truth.
+    scene = with_effects(pendulum(tmp_path), ("link_mass", "p.rod", dict(mass=-1.0)))
+    file = Path(scene.directives[0].add_model.file.removeprefix("file://"))
+    tool = """<link name="tool"><inertial><mass value="0.5"/><origin xyz="0 0 -0.7"/>
+    <inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial>
+    </link><joint name="w" type="fixed"><parent link="rod"/><child link="tool"/></joint>
+    </robot>"""
+    file.write_text(file.read_text().replace("</robot>", tool))
+    expected = ode(lambda t, q, v: -0.5 * G * 0.7 * np.sin(q) / (0.001 + 0.5 * 0.7**2))
+    np.testing.assert_allclose(simulated(scene), expected, atol=1e-4)
 
 
 @pytest.mark.parametrize("at", ["p", "world"])
@@ -198,7 +305,17 @@ def test_a_sinusoidal_force_goes_with_the_recordings_clock(tmp_path):
 @pytest.mark.parametrize(
     "kind, at, parameters, words",
     [
-        ("payload", "p.rod", dict(mass=-1, com_x=0, com_y=0, com_z=0), "expected >= 0"),
+        ("payload", "p.rod", dict(mass=-1.1, com_x=0, com_y=0, com_z=-0.5), "no body"),
+        # 0.5 kg are not that far from where all of the rod's kilogram is.
+        (
+            "payload",
+            "p.rod",
+            dict(mass=-0.5, com_x=0.3, com_y=0, com_z=0),
+            "no body",
+        ),
+        ("link_mass", "p.rod", dict(mass=-1.1), "1.1 kg less, and the link has 1 kg"),
+        ("link_mass", "p.base", dict(mass=0.1), "no mass and inertia to change"),
+        ("link_com", "p.rod", dict(x=0.1), "needs `y`"),
         ("payload", "p.rod", dict(mass=1, com_x=0, com_y=0), "needs `com_z`"),
         ("payload", "p.arm", dict(mass=1, com_x=0, com_y=0, com_z=0), "a body of 'p'"),
         ("gravity_tilt", "q", dict(roll=0, pitch=0), "expected `world` or a model: "),

@@ -13,6 +13,7 @@ from makebreak.models.effects.kind import (
     Parameter,
     actuator_of,
     find_joints,
+    full_name,
     velocity_unit,
 )
 from makebreak.models.effects.signature import Signature, at_joints
@@ -21,19 +22,35 @@ from makebreak.models.effects.transmission import motor_joint
 # ----- What they do
 
 
+def _left(effect: Effect, has: float, change: float) -> float:
+    """What a joint has with a change. Raises: ValueError if that is less than none."""
+    # Not below 0 by rounding: Drake would throw.
+    if not has + change >= -1e-6 * abs(has):
+        ((name, value),) = effect.parameters.items()
+        raise ValueError(
+            f"effect {effect.kind} at {effect.at}: {name} {value:g} leaves "
+            f"{has + change:g}, expected 0 or more with the {has:g} that the model has"
+        )
+    return max(has + change, 0.0)
+
+
 def _add_damping(effect: Effect, plant: MultibodyPlant, scene_graph) -> None:
     for joint in find_joints(effect, plant):
-        joint.set_default_damping_vector(
-            joint.default_damping_vector() + effect.parameters["damping"]
-        )
+        (has,) = joint.default_damping_vector()
+        left = _left(effect, has, effect.parameters["damping"])
+        joint.set_default_damping_vector([left])
+
+
+def _least_damping(effect: Effect, plant: MultibodyPlant, effects) -> dict[str, float]:
+    has = [joint.default_damping_vector()[0] for joint in find_joints(effect, plant)]
+    return {"damping": -min(has)}
 
 
 def _change_damping(old: Effect, new: Effect, plant: MultibodyPlant, context) -> None:
     change = new.parameters["damping"] - old.parameters["damping"]
     for joint in find_joints(new, plant):
-        # Not below 0 by rounding: Drake would throw.
-        damping = np.maximum(joint.GetDampingVector(context) + change, 0.0)
-        joint.SetDampingVector(context, damping)
+        (has,) = joint.GetDampingVector(context)
+        joint.SetDampingVector(context, [_left(new, has, change)])
 
 
 def _add_rotor(effect: Effect, plant: MultibodyPlant, scene_graph) -> None:
@@ -48,17 +65,57 @@ def _add_rotor(effect: Effect, plant: MultibodyPlant, scene_graph) -> None:
                 f"effect rotor_inertia at {effect.at}: the gear ratio of "
                 f"{actuator.name()} is 0"
             )
-        added = effect.parameters["inertia"] / actuator.default_gear_ratio() ** 2
-        actuator.set_default_rotor_inertia(actuator.default_rotor_inertia() + added)
+        has = actuator.default_reflected_inertia()
+        left = _left(effect, has, effect.parameters["inertia"])
+        actuator.set_default_rotor_inertia(left / actuator.default_gear_ratio() ** 2)
+
+
+def _least_rotor(effect: Effect, plant: MultibodyPlant, effects) -> dict[str, float]:
+    has = []
+    for joint in find_joints(effect, plant):
+        actuator = actuator_of(plant, motor_joint(plant, joint) or joint)
+        has.append(0.0 if actuator is None else actuator.default_reflected_inertia())
+    return {"inertia": -min(has)}
 
 
 def _change_rotor(old: Effect, new: Effect, plant: MultibodyPlant, context) -> None:
     change = new.parameters["inertia"] - old.parameters["inertia"]
     for joint in find_joints(new, plant):
         actuator = actuator_of(plant, motor_joint(plant, joint) or joint)
-        inertia = actuator.rotor_inertia(context)
-        inertia += change / actuator.gear_ratio(context) ** 2
-        actuator.SetRotorInertia(context, max(inertia, 0.0))
+        share = actuator.gear_ratio(context) ** 2
+        left = _left(new, actuator.rotor_inertia(context) * share, change)
+        actuator.SetRotorInertia(context, left / share)
+
+
+# Kinds whose forces add up over a scene's effects, by their one parameter.
+
+
+def _totals(effect: Effect, effects, plant: MultibodyPlant) -> dict[str, float]:
+    """Of each joint, the parameter's sum over the effects of this kind."""
+    totals: dict[str, float] = {}
+    for each in effects:
+        if each.kind == effect.kind:
+            (value,) = each.parameters.values()
+            for joint in find_joints(each, plant):
+                at = full_name(plant, joint)
+                totals[at] = totals.get(at, 0.0) + value
+    return totals
+
+
+def _least_total(name: str):
+    def least(effect: Effect, plant: MultibodyPlant, effects) -> dict[str, float]:
+        totals = _totals(effect, effects, plant)
+        has = [totals.get(full_name(plant, j), 0.0) for j in find_joints(effect, plant)]
+        return {name: -max(min(has), 0.0)}
+
+    return least
+
+
+def _check_total(effect: Effect, plant: MultibodyPlant, effects) -> None:
+    (value,) = effect.parameters.values()
+    totals = _totals(effect, effects, plant)
+    for joint in find_joints(effect, plant):
+        _left(effect, totals[full_name(plant, joint)] - value, value)
 
 
 def fade_velocity(plant: MultibodyPlant, joint: Joint, friction: float) -> float:
@@ -247,8 +304,9 @@ def _spring_added(effect, model, motion) -> np.ndarray:
 KINDS = {
     "joint_viscous_damping": EffectKind(
         at="joint",
-        parameters=(Parameter("damping", "N m s/rad", 0.0, 50.0, valid=">= 0"),),
+        parameters=(Parameter("damping", "N m s/rad", -50.0, 50.0),),
         says="{at} has {damping} of viscous damping that the model lacks",
+        says_less="{at} has {damping} less of viscous damping than the model says",
         confused_with=(
             "joint_coulomb_friction",
             "joint_quadratic_drag",
@@ -257,13 +315,15 @@ KINDS = {
         ),
         tell_apart="move the joint at speeds a decade apart, with reversals",
         before_finalize=_add_damping,
+        least=_least_damping,
         set_in_context=_change_damping,
         signature=_damping_signature,
     ),
     "joint_coulomb_friction": EffectKind(
         at="joint",
-        parameters=(Parameter("coulomb", "N m", 0.0, 50.0, valid=">= 0"),),
+        parameters=(Parameter("coulomb", "N m", -50.0, 50.0),),
         says="{at} has Coulomb friction of {coulomb} that the model lacks",
+        says_less="{at} has {coulomb} less of Coulomb friction than the model says",
         confused_with=(
             "joint_viscous_damping",
             "joint_stribeck_friction",
@@ -271,6 +331,8 @@ KINDS = {
             "joint_backlash",
         ),
         tell_apart="move the joint both ways through the same positions, at two speeds",
+        possible=_check_total,
+        least=_least_total("coulomb"),
         joint_law=coulomb_law,
         joint_numbers=_coulomb_numbers,
         signature=_coulomb_signature,
@@ -292,24 +354,31 @@ KINDS = {
     ),
     "joint_quadratic_drag": EffectKind(
         at="joint",
-        parameters=(Parameter("coefficient", "N m s2/rad2", 0.0, 20.0, valid=">= 0"),),
+        parameters=(Parameter("coefficient", "N m s2/rad2", -20.0, 20.0),),
         says="{at} has drag that grows with the square of its speed, {coefficient}, "
         "that the model lacks",
+        says_less="{at} has {coefficient} less of the drag that grows with the square "
+        "of its speed than the model says",
         confused_with=("joint_viscous_damping", "body_drag"),
         tell_apart="move the joint at speeds that differ by a factor of three or more",
+        possible=_check_total,
+        least=_least_total("coefficient"),
         joint_law=drag_law,
         joint_numbers=_numbers("coefficient"),
         signature=_drag_signature,
     ),
     "rotor_inertia": EffectKind(
         at="joint",
-        parameters=(Parameter("inertia", "kg m2", 0.0, 2.0, valid=">= 0"),),
+        parameters=(Parameter("inertia", "kg m2", -2.0, 2.0),),
         says="{at} turns a rotor with {inertia} (reflected at the joint) that the "
         "model lacks",
+        says_less="the rotor of {at} has {inertia} less (reflected at the joint) than "
+        "the model says",
         confused_with=("object_inertia", "payload", "actuator_gain"),
         tell_apart="move the other joints fast while this one rests, and know on which "
         "side of the gear the torque is measured",
         before_finalize=_add_rotor,
+        least=_least_rotor,
         set_in_context=_change_rotor,
         signature=_rotor_signature,
     ),

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Any
@@ -66,14 +66,19 @@ class EffectKind:
         "pair" (of bodies that touch), "channel", "length" (channels that are lengths),
         "base" (a model that stands on the world, or the world).
     says: the report's sentence; {at} and the parameters' names are filled in.
+    says_less: the same where the first parameter is negative, which is then told
+        without its sign.
     confused_with, tell_apart: kinds that look alike, and what tells them apart.
     time: "both", or "discrete"/"continuous" where it makes sense in one only.
     rank: effects of lower rank are applied first, else in the scene's order.
     hidden_state: it adds coordinates that no channel measures.
+    weighs: it changes weights or gravity: what two such add is not what both add.
 
     What it does; a kind has those steps that it needs:
     edit_text(effect, link): the link's element in the model's URDF or SDF text.
     before_finalize(effect, plant, scene_graph): bodies, shapes and their properties.
+    possible(effect, plant, effects): raises ValueError if the finalized plant, with
+        these effects in it, is none that could be.
     after_finalize(effect, plant, scene_graph, builder): adds systems; the port that it
         returns gives generalized forces (n_v,) on the plant.
     joint_law: compiled (q, v, t, p) -> force of the effect on the joint [N m] or [N];
@@ -84,6 +89,8 @@ class EffectKind:
     channel: what it does to a measured channel, of a name in measurement.STEPS.
     set_in_context(old, new, plant, plant_context): other parameters without a new
         plant; old: the effect whose parameters the context has.
+    least(effect, plant, effects): least values of parameters that a plant without the
+        effect allows, where there are such; `effects`: those that it has.
     now(effect, plant, scene_graph): the parameters at which `effect` (whose own do not
         matter) would leave the model as it is; None: the neutral values.
     signature: see models/effects/signature.py; None: it is seen in simulation alone.
@@ -94,17 +101,23 @@ class EffectKind:
     at: str
     parameters: tuple[Parameter, ...]
     says: str
+    says_less: str = ""
     confused_with: tuple[str, ...] = ()
     tell_apart: str = ""
     time: str = "both"
     rank: int = 0
     hidden_state: bool = False
+    weighs: bool = False
     check: Callable[[Effect], None] | None = None
     edit_text: Callable[[Effect, Element], None] | None = None
     before_finalize: Callable[[Effect, MultibodyPlant, SceneGraph], None] | None = None
     after_finalize: (
         Callable[[Effect, MultibodyPlant, SceneGraph, DiagramBuilder], OutputPort]
         | None
+    ) = None
+    possible: Callable[[Effect, MultibodyPlant, Sequence[Effect]], None] | None = None
+    least: (
+        Callable[[Effect, MultibodyPlant, Sequence[Effect]], Mapping[str, float]] | None
     ) = None
     joint_law: Callable | None = None
     joint_numbers: Callable[[Effect, MultibodyPlant, Joint], list[float]] | None = None
@@ -195,9 +208,13 @@ def sentence(
     Args: std, of the parameters where they are known: told as "+- ...", an infinite one
         in words; slides, whether it is of joints that slide.
     """
+    first = effect.parameters.get(kind.parameters[0].name, 0.0)
+    is_less = bool(kind.says_less) and first < 0.0
     words: dict[str, str] = {"at": "nothing" if not effect.at else _place(effect, kind)}
-    for each in kind.parameters:
+    for i, each in enumerate(kind.parameters):
         value = effect.parameters.get(each.name)
+        if is_less and i == 0:
+            value = -first
         if value is None:
             words[each.name] = "(unset)"
             continue
@@ -210,7 +227,7 @@ def sentence(
     # An optional parameter that is not there takes its [bracket] with it.
     says = re.sub(
         r"\[([^\]]*)\]", lambda m: "" if "(unset)" in _fill(m[1], words) else m[1],
-        kind.says,
+        kind.says_less if is_less else kind.says,
     )  # fmt: skip
     return _fill(says, words)
 

@@ -1,18 +1,20 @@
 """Effects on what a mechanism carries and on what it stands: payload, tilt."""
 
-from dataclasses import replace
-from weakref import WeakKeyDictionary
-
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     RigidBody,
-    RotationalInertia,
     SpatialInertia,
+    UnitInertia,
     WeldJoint,
 )
 
+from makebreak.models.effects.inertia import (
+    added_inertia,
+    inertial_signature,
+    ten_parameters,
+)
 from makebreak.models.effects.kind import (
     Effect,
     EffectKind,
@@ -33,11 +35,59 @@ def _payload_name(plant: MultibodyPlant, body: RigidBody) -> str:
 
 
 def _payload_inertia(effect: Effect) -> SpatialInertia:
-    p = effect.parameters
-    com = [p["com_x"], p["com_y"], p["com_z"]]
-    return SpatialInertia.MakeFromCentralInertia(
-        p["mass"], com, RotationalInertia(0.0, 0.0, 0.0)
-    )
+    """Of a mass that may be negative: then it is no body's, which Drake takes as long
+    as nobody asks."""
+    com = _payload_place(effect)
+    unit = UnitInertia.PointMass(com)
+    return SpatialInertia(effect.parameters["mass"], com, unit, True)
+
+
+def _payload_place(effect: Effect) -> np.ndarray:
+    return np.array([effect.parameters[f"com_{axis}"] for axis in "xyz"])
+
+
+def _check_left(
+    effect: Effect, plant: MultibodyPlant, body: RigidBody, more: SpatialInertia | None
+) -> None:
+    """Raises: ValueError if less than nothing is left of the body and what is welded
+    to it, with `more` (at the body's origin) if it is not in the plant yet."""
+    if effect.parameters["mass"] >= 0.0:
+        return
+    fixed = [each.index() for each in plant.GetBodiesWeldedTo(body)]
+    context = plant.CreateDefaultContext()
+    M = plant.CalcSpatialInertia(context, body.body_frame(), fixed)
+    mass, com = M.get_mass(), M.CalcComMoment()
+    about = M.CalcRotationalInertia().CopyToFullMatrix3()
+    if more is not None:
+        mass, com = mass + more.get_mass(), com + more.CalcComMoment()
+        about = about + more.CalcRotationalInertia().CopyToFullMatrix3()
+    possible = mass >= 0.0
+    if mass > 0.0:
+        place = com / mass
+        central = about - mass * (place @ place * np.eye(3) - np.outer(place, place))
+        least, middle, greatest = np.linalg.eigvalsh(central)
+        slack = 1e-9 * max(greatest, 1e-9)
+        possible = least >= -slack and least + middle >= greatest - slack
+    if not possible:
+        raise ValueError(
+            f"effect payload at {effect.at}: without {-effect.parameters['mass']:g} kg "
+            f"at {_payload_place(effect)} m no body is left of {body.scoped_name()} "
+            f"and what is fixed to it ({mass:g} kg)"
+        )
+
+
+def _check_payload(effect: Effect, plant: MultibodyPlant, effects) -> None:
+    for body in find_bodies(effect, plant):
+        _check_left(effect, plant, body, None)
+
+
+def _least_payload(effect: Effect, plant: MultibodyPlant, effects) -> dict[str, float]:
+    context = plant.CreateDefaultContext()
+    masses = [
+        sum(each.get_mass(context) for each in plant.GetBodiesWeldedTo(body))
+        for body in find_bodies(effect, plant)
+    ]
+    return {"mass": -min(masses)}
 
 
 def _add_payload(effect: Effect, plant: MultibodyPlant, scene_graph) -> None:
@@ -60,67 +110,6 @@ def _change_payload(old: Effect, new: Effect, plant: MultibodyPlant, context) ->
         plant.GetBodyByName("payload", instance).SetSpatialInertiaInBodyFrame(
             context, _payload_inertia(new)
         )
-
-
-def inertial_columns(model, motion, body: RigidBody) -> tuple[np.ndarray, np.ndarray]:
-    """How a body's inertial parameters enter the inverse dynamics.
-
-    Unknowns: mass m, h = m com (3), and the inertia about the body's origin ixx, iyy,
-    izz, ixy, ixz, iyz, in the body's axes.
-    Returns: columns and momentum (n, n_v, 10).
-    """
-
-    J, V, A, R = model.body_motion(body, motion.q, motion.v, motion.vd)
-    w, alpha, a = V[:, :3], A[:, :3], A[:, 3:] - model.gravity
-    n = len(w)
-    wrench = np.zeros((n, 6, 10))
-    momentum = np.zeros((n, 6, 10))
-    wrench[:, 3:, 0] = a
-    momentum[:, 3:, 0] = V[:, 3:]
-    for i in range(3):
-        h = R[:, :, i]
-        wrench[:, 3:, 1 + i] = np.cross(alpha, h) + np.cross(w, np.cross(w, h))
-        wrench[:, :3, 1 + i] = np.cross(h, a)
-        momentum[:, 3:, 1 + i] = np.cross(w, h)
-        momentum[:, :3, 1 + i] = np.cross(h, V[:, 3:])
-    for i, (row, column) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]):
-        E = np.zeros((3, 3))
-        E[row, column] = E[column, row] = 1.0
-        E_W = R @ E @ R.swapaxes(1, 2)
-        L = np.einsum("nij,nj->ni", E_W, w)
-        wrench[:, :3, 4 + i] = np.einsum("nij,nj->ni", E_W, alpha) + np.cross(w, L)
-        momentum[:, :3, 4 + i] = L
-    JT = J.swapaxes(1, 2)
-    return JT @ wrench, JT @ momentum
-
-
-def inertial_signature(
-    effect, model, motion, body, unknowns, mix, to_parameters, exact
-) -> Signature:
-    """A signature whose columns are inertial_columns @ mix (10, k). The rest is what is
-    there without acceleration, less the momentum's own rate along v."""
-    columns, momentum = inertial_columns(model, motion, body)
-
-    def at(q, vd):
-        return inertial_columns(model, replace(motion, q=q, vd=vd), body)
-
-    def weak():
-        step = 1e-5  # [s]: central differences, so an error of step^2 = 1e-10 relative.
-        zero = np.zeros_like(motion.vd)
-        still, _ = at(motion.q, zero)
-        _, after = at(model.shifted(motion.q, motion.v, step), zero)
-        _, before = at(model.shifted(motion.q, motion.v, -step), zero)
-        rest = still - (after - before) / (2.0 * step)
-        return momentum @ mix, rest @ mix
-
-    return Signature(
-        effect,
-        tuple(unknowns),
-        columns @ mix,
-        weak,
-        to_parameters,
-        exact=exact,
-    )
 
 
 def _payload_signature(effect, model, motion, grid=None) -> list[Signature]:
@@ -146,22 +135,11 @@ def _payload_signature(effect, model, motion, grid=None) -> list[Signature]:
     ]
 
 
-_columns: WeakKeyDictionary = WeakKeyDictionary()  # Of motions, as long as they are.
-
-
 def _payload_added(effect, model, motion) -> np.ndarray:
-    p = effect.parameters
-    mass, com = p["mass"], np.array([p[f"com_{axis}"] for axis in "xyz"])
-    inertia = mass * (com @ com * np.eye(3) - np.outer(com, com))
-    ten = [mass, *(mass * com), *inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]]
-    known = _columns.setdefault(motion, {})
-    added = np.zeros_like(motion.v)
     for body in find_bodies(effect, model.plant):
-        key = (id(model), int(body.index()))
-        if key not in known:
-            known[key] = inertial_columns(model, motion, body)[0]
-        added += known[key] @ np.array(ten)
-    return added
+        _check_left(effect, model.plant, body, _payload_inertia(effect))
+    mass, com = effect.parameters["mass"], _payload_place(effect)
+    return added_inertia(effect, model, motion, lambda M: ten_parameters(mass, com))
 
 
 # ----- gravity_tilt
@@ -262,14 +240,19 @@ KINDS = {
     "payload": EffectKind(
         at="body",
         parameters=(
-            Parameter("mass", "kg", 0.0, 20.0, valid=">= 0"),
+            Parameter("mass", "kg", -20.0, 20.0),
             *(Parameter(f"com_{a}", "m", -0.5, 0.5, None) for a in "xyz"),
         ),
         says="{at} carries {mass} that the model lacks, at ({com_x}, {com_y}, {com_z}) "
         "in its frame",
-        confused_with=("object_mass", "actuator_gain", "constant_force"),
+        says_less="{at} carries {mass} less than the model says, missing at ({com_x}, "
+        "{com_y}, {com_z}) in its frame",
+        confused_with=("object_mass", "link_mass", "actuator_gain", "constant_force"),
         tell_apart="hold three or more orientations of the wrist, and move it fast",
+        weighs=True,
         before_finalize=_add_payload,
+        possible=_check_payload,
+        least=_least_payload,
         set_in_context=_change_payload,
         signature=_payload_signature,
         added=_payload_added,
@@ -285,6 +268,7 @@ KINDS = {
         confused_with=("joint_offset", "object_com", "constant_force", "actuator_bias"),
         tell_apart="turn the first joint through its range: the torque of a tilt goes "
         "round with it",
+        weighs=True,
         before_finalize=_tilt,
         signature=_tilt_signature,
         added=_tilt_added,

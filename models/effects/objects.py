@@ -16,8 +16,15 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import RigidBody, RotationalInertia, SpatialInertia
+from pydrake.multibody.tree import RigidBody
 
+from makebreak.models.effects.inertia import (
+    central_inertia,
+    change_inertia,
+    com_mix,
+    inertial_signature,
+    mass_mix,
+)
 from makebreak.models.effects.kind import (
     Effect,
     EffectKind,
@@ -25,7 +32,6 @@ from makebreak.models.effects.kind import (
     find_bodies,
     find_body,
 )
-from makebreak.models.effects.loads import inertial_signature
 from makebreak.models.effects.model_text import (
     MOMENTS,
     children,
@@ -220,45 +226,13 @@ def _new_central(effect: Effect, central) -> np.ndarray:
     return new
 
 
-def _central(M: SpatialInertia) -> np.ndarray:
-    mass, p = M.get_mass(), M.get_com()
-    about = M.CalcRotationalInertia().CopyToFullMatrix3()
-    return about - mass * (p @ p * np.eye(3) - np.outer(p, p))
-
-
-def _spatial(mass: float, com, central) -> SpatialInertia:
-    products = [central[0, 1], central[0, 2], central[1, 2]]
-    return SpatialInertia.MakeFromCentralInertia(
-        mass, com, RotationalInertia(*np.diag(central), *products)
-    )
-
-
-def _change(new_values):
-    """set_in_context by new_values(effect, mass, com, central) -> the same three."""
-
-    def set_in_context(old: Effect, new: Effect, plant: MultibodyPlant, context):
-        for body in find_bodies(new, plant):
-            M = body.CalcSpatialInertiaInBodyFrame(context)
-            values = new_values(new, M.get_mass(), M.get_com(), _central(M))
-            try:
-                changed = _spatial(*values)
-            except RuntimeError:
-                raise ValueError(
-                    f"effect {new.kind} at {new.at}: no body has the inertia of "
-                    f"{new.parameters}"
-                ) from None
-            body.SetSpatialInertiaInBodyFrame(context, changed)
-
-    return set_in_context
-
-
 def _inertial_now(effect: Effect, plant: MultibodyPlant, scene_graph):
     M = find_bodies(effect, plant)[0].default_spatial_inertia()
     if effect.kind == "object_mass":
         return {"mass": M.get_mass()}
     if effect.kind == "object_com":
         return dict(zip("xyz", (float(x) for x in M.get_com()), strict=True))
-    central = _central(M)
+    central = central_inertia(M)
     return {f"i{key}": float(central[at]) for key, at in MOMENTS.items()}
 
 
@@ -267,22 +241,14 @@ def _inertial_signature(effect: Effect, model, motion, grid=None) -> list[Signat
     body's origin goes with its square; linear in the moments of inertia."""
     body = find_bodies(effect, model.plant)[0]
     M = body.default_spatial_inertia()
-    mass, com = M.get_mass(), M.get_com()
-    about = M.get_unit_inertia().CopyToFullMatrix3()  # Per kg, about the origin.
-    six = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
     now = _inertial_now(effect, model.plant, None)
     names = list(now)
-    mix = np.zeros((10, len(names)))
     if effect.kind == "object_mass":
-        mix[:, 0] = [1.0, *com, *(about[at] for at in six)]
+        mix = mass_mix(M)
     elif effect.kind == "object_com":
-        for i, e in enumerate(np.eye(3)):
-            mix[1:4, i] = mass * e
-            change = mass * (
-                2.0 * com[i] * np.eye(3) - np.outer(com, e) - np.outer(e, com)
-            )
-            mix[4:, i] = [change[at] for at in six]
+        mix = com_mix(M)
     else:
+        mix = np.zeros((10, 3))
         mix[4:7] = np.eye(3)
 
     def to_parameters(c):
@@ -339,12 +305,13 @@ KINDS = {
         says="{at} weighs {mass}",
         confused_with=("contact_friction", "object_inertia", "payload"),
         tell_apart="lift it or knock it: a slow push shows friction times weight only",
+        weighs=True,
         edit_text=_mass_in_text,
-        set_in_context=_change(
-            lambda effect, mass, com, central: (
-                effect.parameters["mass"],
+        set_in_context=change_inertia(
+            lambda old, new, mass, com, central: (
+                new.parameters["mass"],
                 com,
-                central * (effect.parameters["mass"] / mass),
+                central * (new.parameters["mass"] / mass),
             )
         ),
         now=_inertial_now,
@@ -361,9 +328,10 @@ KINDS = {
         tell_apart="let it fly and spin: the centre of mass alone moves on a parabola",
         rank=1,
         check=_some_are_given,
+        weighs=True,
         edit_text=_com_in_text,
-        set_in_context=_change(
-            lambda effect, mass, com, central: (mass, _new_com(effect, com), central)
+        set_in_context=change_inertia(
+            lambda old, new, mass, com, central: (mass, _new_com(new, com), central)
         ),
         now=_inertial_now,
         signature=_inertial_signature,
@@ -380,12 +348,13 @@ KINDS = {
         tell_apart="spin it about several axes, or let it hit in many attitudes",
         rank=1,
         check=_some_are_given,
+        weighs=True,
         edit_text=_inertia_in_text,
-        set_in_context=_change(
-            lambda effect, mass, com, central: (
+        set_in_context=change_inertia(
+            lambda old, new, mass, com, central: (
                 mass,
                 com,
-                _new_central(effect, central),
+                _new_central(new, central),
             )
         ),
         now=_inertial_now,
