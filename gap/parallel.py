@@ -1,6 +1,9 @@
 """Several computations at once, each in a copy of this process."""
 
+import ctypes
 import multiprocessing
+import os
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -8,6 +11,7 @@ from concurrent.futures import ProcessPoolExecutor
 from typing import TypeVar
 
 T = TypeVar("T")
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _calls: Sequence[Callable] = ()  # Of the pool that is being made: its copies have them.
 
 
@@ -28,7 +32,9 @@ def side_by_side(calls: Sequence[Callable[[], T]], jobs: int) -> Iterator[T]:
             yield call()
         return
     _calls = calls
-    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("fork"))
+    pool = ProcessPoolExecutor(
+        jobs, multiprocessing.get_context("fork"), _of_parent, (os.getpid(),)
+    )
     try:
         with warnings.catch_warnings():
             # The copies neither use nor wait for a progress bar's thread.
@@ -36,9 +42,23 @@ def side_by_side(calls: Sequence[Callable[[], T]], jobs: int) -> Iterator[T]:
             futures = [pool.submit(_call, k) for k in range(len(calls))]
         for future in futures:
             yield future.result()
+    except BaseException:  # Ctrl-C, or the caller has enough: nobody waits for these.
+        for process in list((pool._processes or {}).values()):
+            process.kill()
+        raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
         _calls = ()
+
+
+def _of_parent(parent: int) -> None:
+    """In a copy: signals, which may be sent to the whole group, are for the parent, and
+    it ends the copies. Where it is killed, they end with it."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # It was faster.
+        os._exit(1)
 
 
 def _call(k: int):

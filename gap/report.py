@@ -42,6 +42,7 @@ def write_report(
     recordings: Sequence[Recording] = (),
     scene_path: str | Path = "SCENE.yaml",
     comparison: str | None = None,
+    place: str | Path | None = None,
 ) -> list[Path]:
     """Writes the run's files into `out_dir`, which is made if it is missing.
 
@@ -50,10 +51,11 @@ def write_report(
         recordings: what was looked at: for the heat map's axis, and commands to go on.
         scene_path: as the user gave it, for these commands.
         comparison: the text of compare.html, if there is one.
+        place: the folder where the files will be in the end; None: out_dir.
     Returns: the files, report.html last.
     Raises: ValueError where they cannot be written.
     """
-    out = Path(out_dir)
+    out, place = Path(out_dir), Path(out_dir if place is None else place)
     pictures = {
         "channels": picture_of_channels(result) if result.gap.per_channel else None,
         "where": picture_of_where(result, extents_of(recordings)),
@@ -64,26 +66,35 @@ def write_report(
         out.mkdir(parents=True, exist_ok=True)
         files = [out / "result.json", out / "scene.yaml"]
         text = json.dumps(result.to_json(), indent=2, allow_nan=False) + "\n"
-        files[0].write_text(text)
+        _write(files[0], text)
         fixed = replace(scene, effects=[*scene.effects, *result.scene_effects()])
-        write_scene(fixed, files[1], _scene_heading(result, scene_path))
+        write_scene(fixed, files[1], _scene_heading(result, scene_path), place)
+        # Least to be missed last, should the disk be full.
         for name, png in drawn.items():
             files.append(out / f"{name}.png")
-            files[-1].write_bytes(png)
+            _write(files[-1], png)
         if comparison is not None:
             files.append(out / "compare.html")
-            files[-1].write_text(comparison)
-        files.append(out / "report.html")
-        files[-1].write_text(
-            report_html(
-                result, drawn, out, scene_path, recordings, comparison is not None
-            )
+            _write(files[-1], comparison)
+        page = report_html(
+            result, drawn, place, scene_path, recordings, comparison is not None
         )
+        files.append(out / "report.html")
+        _write(files[-1], page)
     except OSError as error:
         raise ValueError(
-            f'--out: got "{out}", expected a folder to write in ({error.strerror})'
+            f'--out: got "{place}", expected a folder to write in ({error.strerror})'
         ) from error
     return files
+
+
+def _write(path: Path, content: str | bytes) -> None:
+    """Writes the file; none is left of it where the disk is full."""
+    try:
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+    except OSError:
+        path.unlink(missing_ok=True)
+        raise
 
 
 def extents_of(

@@ -40,14 +40,12 @@ MOST_SEC, MOST_ROWS = 60.0, 120_000
 def run_gap(
     scene_path: str | Path,
     recording_paths: Sequence[str | Path],
-    out_dir: str | Path | None = None,
     jobs: int = 1,
     progress: Callable[[str], None] | None = None,
 ) -> GapResult:
     """Finds where a scene and recordings disagree, and names what the scene lacks.
 
-    Args: out_dir: made if missing; who writes reports fills it. jobs: processes at
-        once. progress: called with a line of text now and then.
+    Args: jobs: processes at once. progress: called with a line of text now and then.
     Raises: ValueError, one line, for a scene or recording that cannot be read or do
         not fit together.
     """
@@ -60,8 +58,6 @@ def run_gap(
     joints, bodies = scene_names(dynamics.plant)
     for recording in recordings:
         check_against_scene(recording, joints, bodies)
-    if out_dir is not None:
-        Path(out_dir).mkdir(parents=True, exist_ok=True)
     say("checking the recordings")
     checks = check_recordings(recordings, scene_facts(dynamics.plant))
     recordings, cut = _shortened(recordings, dynamics)

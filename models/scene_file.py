@@ -15,20 +15,24 @@ _WIDTH = 88
 _TAG = "_tag"  # Where Drake's reader keeps a YAML tag, such as !Rpy.
 
 
-def write_scene(scene: Scene, path: str | Path, heading: str = "") -> None:
+def write_scene(
+    scene: Scene, path: str | Path, heading: str = "", place: str | Path | None = None
+) -> None:
     """Writes the scene as YAML, so that read_scene(path) gives the same scene.
 
     Model files are named relative to the file's folder, where there is such a path;
     `package://` stays. What has its default is left out.
 
-    Args: heading: comment lines at the top; `makebreak list` shows the first.
+    Args: heading: comment lines at the top; `makebreak list` shows the first. place:
+        the folder that the file will be moved to; None: it stays.
     Raises: ValueError as scene_text, and where the file cannot be written.
     """
     path = Path(path)
     text = "".join(f"# {line}".rstrip() + "\n" for line in heading.splitlines())
     try:
-        path.write_text(text + scene_text(scene, path.parent))
+        path.write_text(text + scene_text(scene, place or path.parent))
     except OSError as error:
+        path.unlink(missing_ok=True)
         raise ValueError(
             f"scene file {path} cannot be written: {error.strerror}"
         ) from error

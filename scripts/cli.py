@@ -1,4 +1,4 @@
-"""The command line: `makebreak list | run | reproduce | gap | export-tests | bench`.
+"""The command line, `makebreak COMMAND`.
 
 Exit status: 0 done; 1 it ran and did not meet its criterion; 2 bad input, one line on
 stderr; 3 a fault of makebreak itself, with a traceback; 130 ended by Ctrl-C.
@@ -10,6 +10,7 @@ import logging
 import os
 import sys
 import traceback
+from collections.abc import Sequence
 from datetime import datetime
 from importlib import import_module
 from pathlib import Path
@@ -18,6 +19,7 @@ import yaml
 
 import makebreak.systems.numerics
 from makebreak.scripts.experiments import EXPERIMENTS, load_experiment
+from makebreak.scripts.interrupts import interrupts
 from makebreak.scripts.settings import (
     apply_settings,
     dump_config,
@@ -31,7 +33,11 @@ _MODELS = Path(__file__).resolve().parent.parent / "models"
 
 
 class _Parser(argparse.ArgumentParser):
-    """argparse, but with one line on stderr where the input is wrong."""
+    """argparse, but with one line on stderr where the input is wrong, and no shortened
+    options: --seed of `run` is not --seeds of `reproduce`."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs, allow_abbrev=False)
 
     def error(self, message):
         raise ValueError(f"{message} (see {self.prog} --help)")
@@ -115,6 +121,12 @@ def _config(module, args: argparse.Namespace):
     return config
 
 
+def _inputs(args, config) -> list[str]:
+    """The files that a run reads."""
+    scenes = [getattr(config, name, None) for name in ("world", "model")]
+    return [str(path) for path in (args.config, *scenes) if path]
+
+
 def _default_out(name: str) -> Path:
     """runs/<name>-<time>, or with -2, -3 ... where that is taken."""
     stem = f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
@@ -166,8 +178,6 @@ def _open_meshcat():
 def _run(args) -> int:
     from makebreak.scripts.diagram_picture import FORMATS
     from makebreak.scripts.session import Session
-    from makebreak.scripts.table import Table
-    from makebreak.scripts.trials import duration_line
 
     module = _experiment(args.experiment)
     duration = None
@@ -182,9 +192,25 @@ def _run(args) -> int:
         raise ValueError(
             f'--diagram: got "{args.diagram}", expected a file {", ".join(FORMATS)}'
         )
-    session = Session(out, None, duration, realtime)
+    with Session(
+        out,
+        None,
+        duration,
+        realtime,
+        command=f"run {args.experiment}",
+        inputs=_inputs(args, config),
+    ) as session:
+        return _run_in(session, args, module, config, duration)
+
+
+def _run_in(session, args, module, config, duration) -> int:
+    """Runs the experiment in the session. Returns: the exit status."""
+    from makebreak.scripts.table import Table
+    from makebreak.scripts.trials import duration_line
+
     session.picture = Path(args.diagram) if args.diagram is not None else None
     session.write_text("config.yaml", duration_line(duration) + dump_config(config))
+    _writable(session)
     if not args.no_meshcat:
         session.meshcat = _open_meshcat()
 
@@ -197,7 +223,6 @@ def _run(args) -> int:
     except KeyboardInterrupt:
         session.interrupted = True
     except Exception as error:
-        session.write_text("error.txt", traceback.format_exc())
         if session.interrupted:  # Too short a recording to be scored.
             pass
         elif not session.started and isinstance(
@@ -207,21 +232,28 @@ def _run(args) -> int:
             # raises RuntimeError.)
             raise ValueError(str(error)) from error
         else:
-            traceback.print_exc()
             session.keep_partial()
-            session.finish()
+            if isinstance(error, OSError):
+                session.unwritten = error
+                session.finish(complete=False)
+                _writable(session)
+            traceback.print_exc()
+            session.write_text("error.txt", traceback.format_exc())
+            session.finish(complete=False)
             return 3
     if result is None:
         session.keep_partial()
     else:
         result["interrupted"] = session.interrupted
         session.write_result(result)
-    files = session.finish()
+    whole = not session.interrupted and session.unwritten is None
+    files = session.finish(whole)
     if result is not None:
         print(
             Table(args.experiment, ("result", "value"), list(result.items())).to_text()
         )
-    print(f"Files in {session.out_dir}: " + " ".join(p.name for p in files), flush=True)
+    _say_files(files)
+    _writable(session)
     if session.interrupted:
         print("makebreak: interrupted; what was recorded is kept", file=sys.stderr)
         return 130
@@ -233,8 +265,26 @@ def _run(args) -> int:
     return 0 if result is not None and result["success"] else 1
 
 
+def _writable(session) -> None:
+    """Raises: ValueError if a file could not be written."""
+    if session.unwritten is not None:
+        error = session.unwritten
+        raise ValueError(
+            f"--out: not all files could be written in {session.out_dir} "
+            f"({error.strerror or error}); what could be written is kept"
+        )
+
+
+def _say_files(files: Sequence[Path]) -> None:
+    """The line that tells what was written, and where: the folder of the first file, as
+    an interrupted run may have a subfolder."""
+    if files:
+        folder = Path(os.path.commonpath([path.parent for path in files]))
+        names = " ".join(path.relative_to(folder).as_posix() for path in files)
+        print(f"Files in {folder}: {names}", flush=True)
+
+
 def _reproduce(args) -> int:
-    from makebreak.scripts.hypotheses import verdicts
     from makebreak.scripts.session import Session
 
     names = args.experiments or list(EXPERIMENTS)
@@ -253,7 +303,21 @@ def _reproduce(args) -> int:
     seeds = int(_number(args.seeds, "--seeds", 1, whole=True))
     jobs = _jobs(args.jobs)
     out = Path(args.out) if args.out else _default_out("reproduce")
-    session = Session(out, reuse=args.reuse)
+    with Session(out, reuse=args.reuse, command="reproduce") as session:
+        try:
+            status = _reproduce_in(session, modules, seeds, jobs)
+        except KeyboardInterrupt:
+            _say_files(session.finish(complete=False))
+            raise
+        _say_files(session.finish(complete=status != 3))
+        _writable(session)
+    return status
+
+
+def _reproduce_in(session, modules, seeds: int, jobs: int) -> int:
+    """The tables of all modules. Returns: the exit status."""
+    from makebreak.scripts.hypotheses import verdicts
+
     tables = {}
 
     def show(name, table):
@@ -269,16 +333,17 @@ def _reproduce(args) -> int:
 
     for name, module in modules.items():
         if hasattr(module, "reproduce"):
-            try:
-                table = module.reproduce(session.child(name), seeds, jobs)
-            except Exception:  # Not the user's doing: all input is checked above.
-                traceback.print_exc()
-                return 3
+            with session.child(name) as child:
+                try:
+                    table = module.reproduce(child, seeds, jobs)
+                except Exception:  # Not the user's doing: all input is checked above.
+                    traceback.print_exc()
+                    return 3
+                child.finish()
             show(name, table)
     verdict = verdicts(tables)
     if verdict is not None:
         show("hypotheses", verdict)
-    print(f"Files in {out}: reproduce.json reproduce.md")
     missed = sum(t.missed for name, t in tables.items() if name != "hypotheses")
     if missed:
         print(f"makebreak: {missed} rows miss their target", file=sys.stderr)
@@ -296,8 +361,41 @@ def _gap(args) -> int:
     out = Path(args.out) if args.out else _default_out("gap")
     result, files = run_and_report(scene, recordings, out, _jobs(args.jobs))
     print(effects_table(result).to_text())
-    print(f"Files in {out}: " + " ".join(path.name for path in files), flush=True)
+    _say_files(files)
     return 0
+
+
+def _close_the_loop(args) -> int:
+    from makebreak.scripts.close_the_loop import close_the_loop
+
+    if args.experiment != "ball_rolling":
+        _experiment(args.experiment)
+        raise ValueError(
+            f"close-the-loop: {args.experiment} cannot yet be given a wrong model; "
+            "expected one of: ball_rolling"
+        )
+    try:
+        error = float(args.radius_error)
+    except ValueError:
+        error = float("nan")
+    if not abs(error) < float("inf"):
+        raise ValueError(
+            f'--radius-error: got "{args.radius_error}", expected a number [m]'
+        )
+    seed = int(_number(args.seed, "--seed", 0, whole=True))
+    duration = None
+    if args.duration is not None:
+        duration = _number(args.duration, "--duration", 0.0)
+    apply_settings(_experiment(args.experiment).Config(), args.set)  # Or refuses.
+    out = Path(args.out) if args.out else _default_out("close-the-loop")
+    try:
+        table = close_the_loop(out, error, seed, duration, args.set, _jobs(args.jobs))
+    except RuntimeError as failed:
+        print(f"makebreak: {failed}", file=sys.stderr)
+        return 3
+    print(table.to_text())
+    print(f"Files in {out}: loop.json; open {out / '2_gap' / 'report.html'}")
+    return 1 if table.missed else 0
 
 
 def _export_tests(args) -> int:
@@ -308,7 +406,9 @@ def _export_tests(args) -> int:
     seconds = _number(args.seconds, "--seconds", 0.0)
     wanted = [name for name in (args.systems or "").split(",") if name]
     out = Path(args.out)
-    done, left_out = export_tests(args.experiment, module, config, out, wanted, seconds)
+    done, left_out = export_tests(
+        args.experiment, module, config, out, wanted, seconds, _inputs(args, config)
+    )
     for name, updates in done.items():
         print(f"test_{name}.py  {updates} updates")
     for name, reason in left_out.items():
@@ -333,7 +433,9 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="makebreak",
         description="Adaptive control for robots that make and break contact.",
-        allow_abbrev=False,
+    )
+    parser.add_argument(
+        "--version", action="version", version=f"makebreak {makebreak.__version__}"
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
@@ -376,6 +478,21 @@ def _parser() -> argparse.ArgumentParser:
     p.set_defaults(function=_gap)
 
     p = commands.add_parser(
+        "close-the-loop",
+        help="a run with a wrong model, gap on its recording, a run with the repaired",
+    )
+    p.add_argument("experiment", nargs="?", default="ball_rolling")
+    p.add_argument(
+        "--radius-error", default="0.005", metavar="M", help="of the ball (0.005 m)"
+    )
+    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", nargs="+")
+    p.add_argument("--seed", default="0", metavar="N", help="of both runs (0)")
+    p.add_argument("--duration", metavar="S", help="simulated seconds of each run")
+    p.add_argument("--jobs", metavar="N", help="processes of gap at once")
+    p.add_argument("--out", metavar="DIR", help="default: runs/close-the-loop-<time>")
+    p.set_defaults(function=_close_the_loop)
+
+    p = commands.add_parser(
         "export-tests", help="a test of each system alone, from what it did in a run"
     )
     p.add_argument("experiment", metavar="EXPERIMENT")
@@ -392,7 +509,23 @@ def _parser() -> argparse.ArgumentParser:
     p = commands.add_parser("bench", help="how long the parts take, as table and JSON")
     p.add_argument("names", nargs="*", metavar="NAME")
     p.set_defaults(function=_bench)
+    for each in commands.choices.values():
+        each.set_defaults(options=list(each._option_string_actions))
     return parser
+
+
+def _parse(argv: list[str]) -> argparse.Namespace:
+    """The words as a command. Raises: ValueError in one line."""
+    parser = _parser()
+    args, rest = parser.parse_known_args(argv)
+    if rest:
+        option = next((word for word in rest if word.startswith("-")), "")
+        name = option.partition("=")[0]
+        if not name:
+            raise ValueError(f"unexpected {rest[0]} (see makebreak --help)")
+        valid = [o for o in args.options if o.startswith("--")]
+        raise ValueError(f"unknown option {name}; {nearest(name, valid)}")
+    return args
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -402,16 +535,29 @@ def main(argv: list[str] | None = None) -> int:
         argv: the words after `makebreak`; None: those of the process.
     Returns: the exit status.
     """
+    with interrupts():
+        return _main(sys.argv[1:] if argv is None else argv)
+
+
+def _main(argv: list[str]) -> int:
     try:
-        args = _parser().parse_args(argv)
+        args = _parse(argv)
         if hasattr(args, "set"):
             args.set = [setting for group in args.set for setting in group]
             for setting in args.set:
                 if setting in EXPERIMENTS:
                     raise ValueError(f"EXPERIMENT comes before --set, got {setting}")
-        return args.function(args)
+        status = args.function(args)
+        sys.stdout.flush()
+        return status
     except ValueError as error:
         print(f"makebreak: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except BrokenPipeError:  # As in `makebreak list | head`: nobody reads on.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:  # Of the machine, as a full disk; not of the program.
+        print(f"makebreak: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("makebreak: interrupted", file=sys.stderr)

@@ -1,17 +1,17 @@
 """Adapt now, understand later: a run with a wrong model, `gap` on its recording, and a
 run with the repaired model.
 
-    python -m makebreak.scripts.close_the_loop --radius-error 0.005 --seed 0
+    makebreak close-the-loop ball_rolling --radius-error 0.005 --seed 0
 
 The robot is given a scene file in which the ball's radius is wrong. It adapts; what it
 recorded goes through the gap workflow; the scene that comes out is what the next run
 believes. Nothing else passes from one step to the next.
 """
 
-import argparse
 import json
 import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from pydrake.systems.framework import DiagramBuilder
@@ -20,9 +20,11 @@ from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.station import BALL_ROLLING
 from makebreak.models.scene import load_scene, read_scene
 from makebreak.models.scene_file import write_scene
+from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.table import Table
 from makebreak.scripts.trials import makebreak_command, run_commands
 
+COMMAND = "close-the-loop ball_rolling"
 # Goals of the project. With the right model the first push makes contact at 0.7 s; a
 # push that ends short of the ball takes another second.
 RADIUS_M, GAP_M, FIRST_PUSH_SEC = 1e-3, 1.5e-3, 1.2
@@ -68,33 +70,65 @@ def _scaled(text: str, tag: str, factor: float) -> str:
 
 
 def close_the_loop(
-    out: Path, error: float, seed: int, duration: float | None, renderer: str
+    out: Path,
+    error: float,
+    seed: int,
+    duration: float | None = None,
+    settings: Sequence[str] = (),
+    jobs: int = 1,
 ) -> Table:
-    """All three steps. Raises: RuntimeError where one of them gives no result."""
-    out.mkdir(parents=True, exist_ok=True)
-    model = out / "model.yaml"
-    right, wrong = write_wrong_scene(model, error)
+    """All three steps, each in a subfolder of `out`, and loop.json.
 
-    def step(folder: str, *words: str) -> dict:
+    Args:
+        error: of the radius [m].
+        seed, duration: of both runs; None: the experiment's own [s].
+        settings: key=value, of both runs.
+        jobs: processes of `gap` at once.
+    Raises: ValueError for a folder or a radius that cannot be used, and where a step
+        refuses its input; RuntimeError where one gives no result.
+    """
+    with OutputFolder(out, COMMAND) as outputs:
+        table, results = _steps(out, error, seed, duration, settings, jobs)
+        outputs.file("loop.json").write_text(json.dumps(results, indent=2) + "\n")
+        outputs.commit()
+    return table
+
+
+def _steps(out: Path, error, seed, duration, settings, jobs) -> tuple[Table, dict]:
+    with OutputFolder(out / "0_model", f"{COMMAND} model") as outputs:
+        right, wrong = write_wrong_scene(outputs.file("model.yaml"), error)
+        outputs.commit()
+    model = out / "0_model" / "model.yaml"
+
+    def step(folder: str, says: str, *words: str) -> dict:
+        print(says, file=sys.stderr, flush=True)
         command = makebreak_command(*words, "--out", str(out / folder))
         [result] = run_commands(folder, [command], [out / folder], 1)
         if "error" in result:
-            raise RuntimeError(f"{folder}: {result['error']}")
+            status, _, line = result["error"].partition(": ")
+            if status == "exit status 2":
+                raise ValueError(f"{folder}: {line.removeprefix('makebreak: ')}")
+            raise RuntimeError(
+                f"{folder}: {result['error']} (all of it: {out / folder / 'log.txt'})"
+            )
         return result
 
-    def run(folder: str, scene: Path) -> dict:
+    def run(folder: str, says: str, scene: Path) -> dict:
         words = ["run", "ball_rolling", "--no-meshcat", "--seed", str(seed)]
-        words += ["--model", str(scene)]
-        words += ["--set", "radius_error_m=0", f"camera.renderer={renderer}"]
+        words += ["--model", str(scene), "--set", "radius_error_m=0", *settings]
         if duration is not None:
             words += ["--duration", repr(duration)]
-        return step(folder, *words)
+        return step(folder, says, *words)
 
-    first = run("1_wrong_model", model)
+    first = run("1_wrong_model", f"A run with a ball {1e3 * error:+.3g} mm off", model)
     recording = out / "1_wrong_model" / "recording.csv"
-    found = step("2_gap", "gap", str(model), str(recording))
-    second = run("3_repaired_model", out / "2_gap" / "scene.yaml")
-    repaired = load_scene(out / "2_gap" / "scene.yaml", DiagramBuilder())
+    found = step(
+        "2_gap", "gap, on what the robot recorded",
+        "gap", str(model), str(recording), "--jobs", str(jobs),
+    )  # fmt: skip
+    repaired_scene = out / "2_gap" / "scene.yaml"
+    second = run("3_repaired_model", "A run with the repaired model", repaired_scene)
+    repaired = load_scene(repaired_scene, DiagramBuilder())
     radius = sphere_radius(repaired.plant, repaired.scene_graph, "ball")
     named = [each["kind"] for each in found["effects"]]
     contact_1, contact_2 = (r["time_to_first_contact_s"] for r in (first, second))
@@ -117,36 +151,7 @@ def close_the_loop(
     notes = [f"The ball's radius is {1e3 * right:.1f} mm. {found['says']}"]
     if gap_2 is None:
         notes.append("r_gap_error_m needs a whole circle: a longer --duration.")
-    (out / "loop.json").write_text(
-        json.dumps({"first": first, "gap": found, "second": second}, indent=2) + "\n"
-    )
     columns = ("result", "wrong model", "repaired model", "wanted")
     title = f"The loop closed: radius {1e3 * error:+.1f} mm, seed {seed}"
-    return Table(title, columns, rows, met, notes)
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description="A wrong model, its gap, its repair.")
-    parser.add_argument("--radius-error", type=float, default=0.005, metavar="M")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--duration", type=float, metavar="S", help="of each run")
-    parser.add_argument("--renderer", default="drawn", help="drawn, or vtk")
-    parser.add_argument("--out", type=Path, default=Path("runs/close_the_loop"))
-    args = parser.parse_args()
-    try:
-        table = close_the_loop(
-            args.out, args.radius_error, args.seed, args.duration, args.renderer
-        )
-    except ValueError as error:
-        print(f"close_the_loop: {error}", file=sys.stderr)
-        return 2
-    except RuntimeError as error:
-        print(f"close_the_loop: {error}", file=sys.stderr)
-        return 1
-    print(table.to_text())
-    print(f"Files in {args.out}; open {args.out / '2_gap' / 'report.html'}")
-    return 1 if table.missed else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    results = {"first": first, "gap": found, "second": second}
+    return Table(title, columns, rows, met, notes), results

@@ -11,10 +11,11 @@ import pkgutil
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from copy import deepcopy
 from functools import wraps
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import ModuleType
 from typing import Any
 
@@ -26,6 +27,8 @@ from makebreak.diagrams.station import make_control_plant
 from makebreak.models.scene import Scene, read_scene
 from makebreak.models.scene_file import scene_text
 from makebreak.models.tip_and_ball import make_tip_and_ball
+from makebreak.scripts.interrupts import undisturbed
+from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.replay import Track, Unsupported
 from makebreak.scripts.session import Log, Session, leaf_systems
 from makebreak.scripts.settings import nearest
@@ -112,10 +115,10 @@ def _modules(package: ModuleType) -> list[ModuleType]:
 class _Source:
     """Python source of values: the code, its imports, the arrays beside it."""
 
-    def __init__(self, made: dict[int, Call], folder: Path):
+    def __init__(self, made: dict[int, Call], folder: Path, place: Path):
         self.imports: set[tuple[str, str]] = set()
         self.arrays: dict[str, np.ndarray] = {}
-        self._made, self._folder = made, folder
+        self._made, self._folder, self._place = made, folder, place
 
     def of_call(self, call: Call) -> str:
         parts = [self.of(value) for value in call.args]
@@ -182,8 +185,9 @@ class _Source:
                 source = Path(directive.add_model.file.removeprefix("file://"))
                 if source.is_file():
                     shutil.copyfile(source, models / source.name)
-                    directive.add_model.file = f"file://{models / source.name}"
-        text = scene_text(scene, models)
+                    there = (self._place / "models" / source.name).resolve()
+                    directive.add_model.file = f"file://{there}"
+        text = scene_text(scene, self._place / "models")
         for i in range(1000):
             path = models / f"scene_{i}.yaml"
             if not path.exists() or path.read_text() == text:
@@ -293,64 +297,63 @@ def export_tests(
     out: Path,
     wanted: Sequence[str] = (),
     seconds: float = 5.0,
+    inputs: Sequence[str | Path] = (),
 ) -> tuple[dict[str, int], dict[str, str]]:
     """Runs the experiment's first seconds and writes a test of each system.
 
     Args:
         name, module, config: of the experiment.
-        out: folder to be made; it must not exist, or be empty.
+        out: folder to be made; if it exists, it is empty or of an earlier export.
         wanted: names of systems in the experiment's diagram, which is then run no
             longer than needed; empty: all that update, and an experiment of several
             simulations is run to its end.
         seconds: how long is recorded [s].
+        inputs: files that `out` must not hold.
     Returns: {system: number of updates}, and {system: why it was left out}.
     Raises: ValueError for a folder that is in use, an unknown system, a system that
         cannot be exported and was asked for, an experiment that fails, and where the
-        files cannot be written. Then nothing is left of the folder.
+        files cannot be written. Then the folder is as it was.
     """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ValueError(f'--out: got "{out}", expected a new or an empty folder')
-    part = out.with_name(out.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
-    try:
-        part.mkdir(parents=True)
-        with calls_kept() as made:
-            session = _RecordingSession(part / "run", wanted, seconds)
-            try:
-                module.run(config, session)
-            except _Done:
-                pass
-            except KeyboardInterrupt:
-                raise
-            except OSError:
-                raise
-            except Exception as error:
-                raise ValueError(
-                    f"{name} failed while it was recorded: {type(error).__name__}: "
-                    f"{' '.join(str(error).split())}"
-                ) from error
-            unknown = [w for w in wanted if w not in session.seen]
-            if unknown:
-                raise ValueError(
-                    f"--systems: {name} has no system {unknown[0]}; "
-                    f"{nearest(unknown[0], sorted(session.seen))}"
-                )
-            shutil.rmtree(part / "run")
-            done, left_out = _write(name, session.recorders, made, part, wanted)
-        if out.exists():
-            out.rmdir()
-        part.rename(out)
-    except OSError as error:
-        raise ValueError(
-            f'--out: "{out}" cannot be written: {error.strerror or error}'
-        ) from error
-    finally:
-        with suppress(OSError):
-            shutil.rmtree(part, ignore_errors=True)
+    with OutputFolder(out, f"export-tests {name}", inputs, only_new=True) as outputs:
+        folder = outputs.stage
+        try:
+            done, left_out = _export(name, module, config, folder, out, wanted, seconds)
+        except OSError as error:
+            raise ValueError(
+                f'--out: "{out}" cannot be written: {error.strerror or error}'
+            ) from error
+        with undisturbed():
+            outputs.commit()
     return done, left_out
 
 
-def _write(experiment, recorders, made, folder, wanted):
+def _export(name, module, config, folder: Path, place: Path, wanted, seconds):
+    """Records a run and writes the tests into the folder, from where they are moved to
+    their place."""
+    with calls_kept() as made, TemporaryDirectory() as elsewhere:
+        session = _RecordingSession(Path(elsewhere) / "run", wanted, seconds)
+        try:
+            module.run(config, session)
+        except _Done:
+            pass
+        except OSError:
+            raise
+        except Exception as error:
+            raise ValueError(
+                f"{name} failed while it was recorded: {type(error).__name__}: "
+                f"{' '.join(str(error).split())}"
+            ) from error
+        unknown = [w for w in wanted if w not in session.seen]
+        if unknown:
+            raise ValueError(
+                f"--systems: {name} has no system {unknown[0]}; "
+                f"{nearest(unknown[0], sorted(session.seen))}"
+            )
+        session.outputs.close()
+        return _write(name, session.recorders, made, folder, place, wanted)
+
+
+def _write(experiment, recorders, made, folder, place, wanted):
     done: dict[str, int] = {}
     left_out: dict[str, str] = {}
     for recorder in recorders:
@@ -359,7 +362,7 @@ def _write(experiment, recorders, made, folder, wanted):
         for system, tracks in recorder.tracks.items():
             if system in done or system in recorder.refused:
                 continue
-            source = _Source(made, folder)
+            source = _Source(made, folder, place)
             try:
                 code = source.of_call(made[id(recorder.systems[system])])
             except Unsupported as error:

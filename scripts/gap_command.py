@@ -4,6 +4,7 @@ import json
 import sys
 import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from time import perf_counter
 
@@ -14,13 +15,9 @@ from makebreak.gap.recording import read_recordings
 from makebreak.gap.report import summary_lines, windows_of, write_report
 from makebreak.gap.result import GapResult
 from makebreak.models.scene import read_scene
+from makebreak.scripts.interrupts import undisturbed
+from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.table import Table
-
-# Of an earlier run in the same folder: removed at the start.
-_OWN_FILES = (
-    "result.json scene.yaml report.html compare.html timing.json error.txt "
-    "channels.png where.png series.png"
-).split()
 
 
 class StageBar:
@@ -30,6 +27,7 @@ class StageBar:
     used in a `with`."""
 
     def __init__(self, shown: bool = True):
+        self.told = False  # Whether anything was.
         tty = sys.stderr.isatty()
         self._bar = tqdm(
             total=1.0,
@@ -42,6 +40,7 @@ class StageBar:
         )
 
     def __call__(self, text: str, share: float | None = None) -> None:
+        self.told = True
         if share is None:
             step = 0.02 if text.startswith(" ") else 0.1
             share = self._bar.n + step * (1.0 - self._bar.n)
@@ -67,29 +66,30 @@ def run_and_report(
     """
     from makebreak.gap.workflow import run_gap  # Late: it is long to load.
 
-    try:
-        out_dir.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(
-            f'--out: got "{out_dir}", expected a folder to write in ({error.strerror})'
-        ) from error
     start = perf_counter()
-    for name in _OWN_FILES:
-        (out_dir / name).unlink(missing_ok=True)
-    try:
-        with StageBar() as progress:
-            result = run_gap(scene_path, recording_paths, out_dir, jobs, progress)
-            progress("writing the report", 0.95)
-            scene = read_scene(scene_path)
-            recordings = read_recordings(recording_paths)
-            moving = comparison_html(result, scene, recordings)
-            files = write_report(result, scene, out_dir, recordings, scene_path, moving)
-    except Exception:
-        (out_dir / "error.txt").write_text(traceback.format_exc())
-        raise
-    times = {"wall_s": perf_counter() - start, "stages_s": dict(result.seconds)}
-    (out_dir / "timing.json").write_text(json.dumps(times, indent=2) + "\n")
-    return result, [out_dir / "timing.json", *files]
+    inputs = [scene_path, *recording_paths]
+    with OutputFolder(out_dir, "gap", inputs) as out:
+        try:
+            with StageBar() as progress:
+                result = run_gap(scene_path, recording_paths, jobs, progress)
+                progress("writing the report", 0.95)
+                scene = read_scene(scene_path)
+                recordings = read_recordings(recording_paths)
+                moving = comparison_html(result, scene, recordings)
+                folder = out.stage
+                write_report(
+                    result, scene, folder, recordings, scene_path, moving, out_dir
+                )
+        except Exception:
+            if progress.told:  # Not merely an input that was refused.
+                with suppress(OSError):
+                    out.file("error.txt").write_text(traceback.format_exc())
+                out.commit(complete=False)
+            raise
+        times = {"wall_s": perf_counter() - start, "stages_s": dict(result.seconds)}
+        out.file("timing.json").write_text(json.dumps(times, indent=2) + "\n")
+        with undisturbed():
+            return result, out.commit()
 
 
 def effects_table(result: GapResult) -> Table:

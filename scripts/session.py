@@ -3,12 +3,12 @@
 import json
 import signal
 import sys
-import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import perf_counter, process_time
-from typing import cast
+from typing import Any, cast
 
 import matplotlib
 
@@ -29,16 +29,12 @@ from tqdm import tqdm
 
 from makebreak.gap.table import write_recording
 from makebreak.scripts.diagram_picture import draw_diagram, shown_systems
+from makebreak.scripts.interrupts import handled, leave_terminal, undisturbed
+from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.table import json_value
 from makebreak.scripts.trials import run_many
 
 __all__ = ["Log", "Session", "run_many"]
-
-# Files of an earlier run in the same folder, which would tell of the wrong one.
-_OWN_FILES = (
-    "result.json timing.json config.yaml recording.csv noise.json meshcat.html "
-    "partial.npz error.txt"
-).split()
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,25 +58,26 @@ class Log(Mapping):
 
 
 class _CatchInterrupt:
-    """While entered, Ctrl-C sets `hit`; the second one raises KeyboardInterrupt."""
+    """While entered, Ctrl-C sets `hit`, as SIGTERM and SIGHUP do; the second Ctrl-C
+    raises KeyboardInterrupt."""
 
     def __init__(self):
         self.hit = False
+        self._handled = handled(self._handle)
 
-    def _handle(self, *_):
-        if self.hit:
+    def _handle(self, number, _):
+        leave_terminal(number)
+        # The others may come twice by themselves, as when a terminal is closed.
+        if self.hit and number == signal.SIGINT:
             raise KeyboardInterrupt
         self.hit = True
 
     def __enter__(self):
-        self._old = None
-        if threading.current_thread() is threading.main_thread():
-            self._old = signal.signal(signal.SIGINT, self._handle)
+        self._handled.__enter__()
         return self
 
     def __exit__(self, *_):
-        if self._old is not None:
-            signal.signal(signal.SIGINT, self._old)
+        self._handled.__exit__(None, None, None)
 
 
 def leaf_systems(system: System):
@@ -95,6 +92,9 @@ def leaf_systems(system: System):
 class Session:
     """What an experiment is given to run with.
 
+    Files are written into a hidden folder; `finish` moves them to out_dir. To be used
+    in a `with`, whose end drops what was not moved (outputs.OutputFolder).
+
     Args:
         out_dir: the folder of the run's files; made if it is missing.
         meshcat: where the run is seen; None: nowhere, and no meshcat.html.
@@ -104,7 +104,10 @@ class Session:
         progress: whether a progress bar is shown.
         reuse: whether trials that have ended in an earlier session with the same
             settings are taken as they are; run_many is to be told.
-    Raises: ValueError for an out_dir that cannot be made or written to.
+        command: what writes in the folder, such as "run ball_rolling".
+        inputs: files that it reads.
+    Raises: ValueError for an out_dir that cannot be made or written to, or holds
+        anything that this command did not write.
     """
 
     def __init__(
@@ -115,13 +118,17 @@ class Session:
         realtime: float = 0.0,
         progress: bool = True,
         reuse: bool = False,
+        command: str = "run",
+        inputs: Iterable[str | Path] = (),
     ):
         self.out_dir = Path(out_dir)
+        self.outputs = OutputFolder(out_dir, command, inputs)
         self.meshcat = meshcat
         self.duration_sec = duration_sec
         self.realtime = realtime
         self.reuse = reuse
-        self.files: list[Path] = []  # All that was written.
+        self.unwritten: OSError | None = None  # Why a file could not be written.
+        self._figures: list[tuple[Any, str]] = []  # Drawn when the rest is written.
         self.started = False  # Whether anything has been simulated yet.
         self.interrupted = False
         self._progress = progress
@@ -129,18 +136,6 @@ class Session:
         self._drawn = 0  # Systems in the diagram that was.
         self._partial: dict[str, dict[str, np.ndarray]] = {}
         self._timing: dict[str, dict] = {}
-        try:
-            self.out_dir.mkdir(parents=True, exist_ok=True)
-            for name in _OWN_FILES:
-                (self.out_dir / name).unlink(missing_ok=True)
-            probe = self.out_dir / ".writable"
-            probe.touch()
-            probe.unlink()
-        except OSError as error:
-            raise ValueError(
-                f'--out: got "{out_dir}", expected a folder to write in '
-                f"({error.strerror})"
-            ) from error
 
     def child(self, name: str) -> "Session":
         """A session of its own for one of several trials, in the subfolder `name`."""
@@ -149,6 +144,7 @@ class Session:
             duration_sec=self.duration_sec,
             progress=self._progress,
             reuse=self.reuse,
+            command=f"{self.outputs.command} {name}",
         )
 
     def simulate(
@@ -302,24 +298,25 @@ class Session:
                 }
         self._timing[label] = entry
 
-    def save_plot(self, fig, name: str) -> Path:
-        """Writes the matplotlib figure as <name>.png and closes it."""
-        path = self.out_dir / f"{name.removesuffix('.png')}.png"
-        fig.savefig(path, dpi=120, metadata={"Software": None})
-        plt.close(fig)
-        return self._wrote(path)
+    def save_plot(self, fig, name: str) -> None:
+        """Keeps the matplotlib figure; `finish` writes it as <name>.png, after what
+        matters more if the disk is full, and closes it."""
+        self._figures.append((fig, f"{name.removesuffix('.png')}.png"))
+
+    def path(self, name: str) -> Path:
+        """Where a file of another kind is to be written, before `finish`."""
+        return self.outputs.file(name)
 
     def write_recording(
         self, columns: Mapping[str, np.ndarray], noise: Mapping | None = None
-    ) -> Path:
+    ) -> None:
         """Writes recording.csv, and noise.json where the noise is known.
 
         See gap/table.py for the columns' names.
         """
-        written = write_recording(self.out_dir / "recording.csv", columns, noise)
-        return [self._wrote(path) for path in written][0]
+        self._write("recording.csv", lambda path: write_recording(path, columns, noise))
 
-    def write_result(self, result: Mapping) -> Path:
+    def write_result(self, result: Mapping) -> None:
         """Writes result.json: flat, keys in the order given, NaN and infinity as null.
 
         A value is a number, a text, a truth value or None, or a list of such (one per
@@ -340,24 +337,30 @@ class Session:
             raise ValueError(
                 f"result success: got {plain.get('success')}, expected True or False"
             )
-        return self.write_json("result.json", plain)
+        self.write_json("result.json", plain)
 
-    def write_json(self, name: str, value) -> Path:
+    def write_json(self, name: str, value) -> None:
         """Writes `value` as the JSON file `name`."""
-        return self.write_text(
-            name, json.dumps(value, indent=2, allow_nan=False) + "\n"
-        )
+        self.write_text(name, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
-    def write_text(self, name: str, text: str) -> Path:
+    def write_text(self, name: str, text: str) -> None:
         """Writes the text file `name`."""
-        path = self.out_dir / name
-        path.write_text(text)
-        return self._wrote(path)
+        self._write(name, lambda path: path.write_text(text))
 
-    def keep_partial(self) -> Path | None:
+    def _write(self, name: str, write: Callable[[Path], object]) -> None:
+        """A file that cannot be written, as on a full disk, is noted in `unwritten` and
+        left out: there may be room for others, and the run goes on."""
+        path = self.outputs.file(name)
+        try:
+            write(path)
+        except OSError as error:
+            path.unlink(missing_ok=True)
+            self.unwritten = error
+
+    def keep_partial(self) -> bool:
         """Writes partial.npz: all that was sampled, of a run that could not be scored.
 
-        Returns: its path, or None if nothing was sampled.
+        Returns: whether anything was.
         """
         arrays = {
             f"{label}.{name}" if label else name: value
@@ -365,22 +368,39 @@ class Session:
             for name, value in columns.items()
         }
         if not any(value.size for value in arrays.values()):
-            return None
-        path = self.out_dir / "partial.npz"
-        with path.open("wb") as file:
-            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
-        return self._wrote(path)
+            return False
 
-    def finish(self) -> list[Path]:
-        """Writes timing.json and, where there is a Meshcat, meshcat.html.
+        def write(path: Path) -> None:
+            with path.open("wb") as file:
+                np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
+        self._write("partial.npz", write)
+        return True
+
+    def finish(self, complete: bool = True) -> list[Path]:
+        """Writes timing.json, the plots and, where there is a Meshcat, meshcat.html,
+        and moves all files to the session's folder.
+
+        Args: complete: False keeps an older, complete result that is in the folder.
         Returns: all files of the run.
         """
-        if self._timing:
-            self.write_json("timing.json", self._timing_summary())
-        if self.meshcat is not None:
-            self.write_text("meshcat.html", self.meshcat.StaticHtml())
-        return self.files
+        with undisturbed():
+            if self._timing:
+                self.write_json("timing.json", self._timing_summary())
+            try:
+                for fig, name in self._figures:
+                    self._write(name, partial(_save_figure, fig))
+                if self.meshcat is not None:
+                    self.write_text("meshcat.html", self.meshcat.StaticHtml())
+            finally:  # A plot that fails does not lose the result.
+                files = self.outputs.commit(complete)
+            return files
+
+    def __enter__(self) -> "Session":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.outputs.close()
 
     def _timing_summary(self) -> dict:
         """The whole run's sums, and each simulation's own figures where several ran."""
@@ -396,7 +416,7 @@ class Session:
             return summary | {"systems": entries[0]["systems"]}
         return summary | {"simulations": self._timing}
 
-    def _wrote(self, path: Path) -> Path:
-        if path not in self.files:
-            self.files.append(path)
-        return path
+
+def _save_figure(fig, path: Path) -> None:
+    fig.savefig(path, dpi=120, metadata={"Software": None})
+    plt.close(fig)

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
 import time
@@ -15,9 +14,11 @@ from tqdm import tqdm
 
 import makebreak
 from makebreak.scripts.experiments import load_experiment
+from makebreak.scripts.interrupts import interrupts
 from makebreak.scripts.settings import apply_settings, dump_config
 
 _COMMAND = (sys.executable, "-m", "makebreak")
+_PATIENCE_SEC = 3.0  # For runs that are to end; then they are killed.
 
 
 def setting_texts(settings: Mapping) -> list[str]:
@@ -82,8 +83,8 @@ def run_many(
 ) -> list[dict]:
     """Runs `makebreak run experiment` once per (settings, seed), `jobs` at a time.
 
-    A run that fails is reported and does not stop the others. Ctrl-C, or SIGTERM, ends
-    all of them.
+    A run that fails is reported and does not stop the others. Ctrl-C, SIGTERM or SIGHUP
+    ends all of them.
 
     Args:
         experiment: its name.
@@ -138,8 +139,8 @@ def run_commands(
     is_done: Callable[[int], bool] = lambda i: False,
 ) -> list[dict]:
     """Runs commands that each write result.json into a folder, `jobs` at a time, with
-    one thread each and their output in the folder's log.txt. Ctrl-C, or SIGTERM, ends
-    all of them; one that fails is reported and does not stop the others.
+    one thread each and their output in the folder's log.txt. Ctrl-C, SIGTERM or SIGHUP
+    ends all of them; one that fails is reported and does not stop the others.
 
     Args: label, of the progress bar; is_done(i): whether the folder has the result
         already.
@@ -151,15 +152,12 @@ def run_commands(
     running: dict[int, subprocess.Popen] = {}
     env = _environment()
 
-    def terminate(*_):
-        raise SystemExit(143)
-
+    before: dict[int, int] = {}  # When the folder's earlier result was written.
     try:
-        old = signal.signal(signal.SIGTERM, terminate)
-    except ValueError:  # Not in the main thread: nobody sends it there.
-        old = None
-    try:
-        with tqdm(total=len(commands), desc=label, unit="run", file=sys.stderr) as bar:
+        with (
+            interrupts(),
+            tqdm(total=len(commands), desc=label, unit="run", file=sys.stderr) as bar,
+        ):
             while waiting or running:
                 while waiting and len(running) < jobs:
                     i = waiting.pop(0)
@@ -168,8 +166,7 @@ def run_commands(
                         bar.update()
                         continue
                     folders[i].mkdir(parents=True, exist_ok=True)
-                    # Else a run that fails early would show an older run's result.
-                    (folders[i] / "result.json").unlink(missing_ok=True)
+                    before[i] = _written(folders[i])
                     with (folders[i] / "log.txt").open("wb") as log:
                         running[i] = subprocess.Popen(
                             commands[i],
@@ -180,10 +177,12 @@ def run_commands(
                             start_new_session=True,  # Ctrl-C reaches us alone.
                         )
                 for i, process in list(running.items()):
-                    status = process.poll()
+                    status: int | None = process.poll()
                     if status is None:
                         continue
                     del running[i]
+                    if status in (0, 1) and _written(folders[i]) == before[i]:
+                        status = None  # The result is another run's.
                     results[i] = result = _read(folders[i], status)
                     if "error" in result:
                         bar.write(f"{folders[i].name}: {result['error']}", sys.stderr)
@@ -192,12 +191,23 @@ def run_commands(
                     time.sleep(0.05)
     finally:
         for process in running.values():
-            process.kill()
+            process.terminate()
+        end = time.monotonic() + _PATIENCE_SEC
         for process in running.values():
-            process.wait()
-        if old is not None:
-            signal.signal(signal.SIGTERM, old)
+            try:
+                process.wait(max(end - time.monotonic(), 0.0))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
     return results
+
+
+def _written(folder: Path) -> int:
+    """When result.json was written; 0 without one."""
+    try:
+        return (folder / "result.json").stat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 def duration_line(duration: float | None) -> str:

@@ -1,12 +1,15 @@
 """The command line: what it refuses, what it writes, how it ends."""
 
+import fcntl
 import io
 import json
 import os
+import pty
 import re
 import signal
 import subprocess
 import sys
+import termios
 import time
 from pathlib import Path
 
@@ -37,7 +40,7 @@ def test_a_run_writes_its_files_and_a_table(capsys):
     assert run("--seed", "3", "--duration", "10") == 0
     written = {path.name for path in Path("out").iterdir()} - {"running"}
     names = "config.yaml result.json timing.json recording.csv noise.json position.png"
-    assert written == set(names.split())
+    assert written == {*names.split(), ".makebreak.json"}
     shown = capsys.readouterr()
     for name in names.split():
         assert name in shown.out
@@ -86,18 +89,18 @@ def test_without_out_each_run_has_a_folder_of_its_own():
     assert len(list(Path("runs").glob("spring_mass-*/result.json"))) == 2
 
 
-def test_an_old_result_does_not_outlive_a_run_that_is_refused():
-    assert run() == 0
-    assert run("--set", "spring.stiffness=-1") == 2
-    assert not Path("out/result.json").exists()
-
-
 BAD = [
     (["run", "spring_mas"], "unknown experiment spring_mas; did you mean spring_mass?"),
     (["run", "x", "--no-meshcat"], "unknown experiment x; expected one of: spring_"),
     (["runn"], "invalid choice: 'runn'"),
     ([], "COMMAND"),
-    (["run", "spring_mass", "--sed", "1"], "--sed"),
+    (["run", "spring_mass", "--sed", "1"], "option --sed; did you mean --seed?"),
+    (["run", "spring_mass", "--durat=1"], "option --durat; did you mean --duration?"),
+    (["run", "spring_mass", "--no-mesh"], "option --no-mesh; did you mean --no-mes"),
+    (["reproduce", "--seed", "1"], "unknown option --seed; did you mean --seeds?"),
+    (["gap", "a.yaml", "b.csv", "--job", "1"], "option --job; did you mean --jobs?"),
+    (["bench", "--jobs", "1"], "unknown option --jobs; expected one of: --help"),
+    (["list", "scenes"], "unexpected scenes"),
     (["run", "--set", "noise=1", "spring_mass"], "EXPERIMENT comes before --set"),
     (["reproduce", "spring"], "unknown experiment spring; did you mean spring_mass?"),
     (["reproduce", "--seeds", "0"], '--seeds: got "0", expected a whole number, 1'),
@@ -226,13 +229,23 @@ def wait_for(paths):
         time.sleep(0.02)
 
 
-@pytest.mark.parametrize("whole_only", [False, True])
-def test_ctrl_c_ends_a_run_cleanly_and_keeps_what_was_recorded(whole_only, start):
+@pytest.mark.parametrize(
+    ("number", "whole_only"),
+    [
+        (signal.SIGINT, False),
+        (signal.SIGINT, True),
+        (signal.SIGTERM, False),
+        (signal.SIGHUP, False),
+    ],
+)
+def test_ctrl_c_ends_a_run_cleanly_and_keeps_what_was_recorded(
+    number, whole_only, start
+):
     settings = ["steps=100000000", f"whole_only={str(whole_only).lower()}"]
     process = start("run", "spring_mass", "--no-meshcat", "--out", "out", "--set",
                     *settings)  # fmt: skip
     wait_for([Path("out/running")])
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, error = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "Traceback" not in error
@@ -248,18 +261,61 @@ def test_ctrl_c_ends_a_run_cleanly_and_keeps_what_was_recorded(whole_only, start
         assert table["time"][-1] > 1.0
 
 
-def test_ctrl_c_ends_reproduce_and_all_its_runs(start):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_ctrl_c_ends_reproduce_and_all_its_runs(number, start):
     process = start("reproduce", "--seeds", "2", "--jobs", "2", "--out", "out",
                     SPRING_MASS_SECONDS="1e6")  # fmt: skip
     folder = Path("out/spring_mass")
     marks = [folder / f"damped=true_seed={s}" / "running" for s in (0, 1)]
     wait_for(marks)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, error = process.communicate(timeout=60)
     assert process.returncode == 130 and "Traceback" not in error
     for mark in marks:
         with pytest.raises(ProcessLookupError):
             os.kill(int(mark.read_text()), 0)
+
+
+def test_a_closed_terminal_does_not_lose_the_run():
+    """What is printed after SIGHUP has nowhere to go."""
+    master, terminal = pty.openpty()
+    words = ["run", "spring_mass", "--no-meshcat", "--out", "out"]
+    process = subprocess.Popen(
+        [*spring_mass.COMMAND, *words, "--set", "steps=100000000"],
+        stdin=terminal,
+        stdout=terminal,
+        stderr=terminal,
+        env=trials._environment(),
+        start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+    )
+    os.close(terminal)
+    try:
+        wait_for([Path("out/running")])
+        os.close(master)  # The kernel sends SIGHUP.
+        assert process.wait(timeout=60) == 130
+    finally:
+        process.kill()
+    assert read("result.json")["interrupted"] is True
+
+
+def test_nohup_is_respected():
+    words = ["run", "spring_mass", "--no-meshcat", "--out", "out"]
+    process = subprocess.Popen(
+        [*spring_mass.COMMAND, *words, "--set", "steps=100000000"],
+        stderr=subprocess.DEVNULL,
+        env=trials._environment(),
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN),
+    )
+    try:
+        wait_for([Path("out/running")])
+        process.send_signal(signal.SIGHUP)
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(timeout=1)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=60) == 130
+    finally:
+        process.kill()
 
 
 def test_reproduce_prints_and_writes_its_table_and_fails_on_a_missed_row(capsys):

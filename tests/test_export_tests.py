@@ -168,12 +168,13 @@ def run_main(*words):
 
 def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
+    (tmp_path / "out.part").mkdir()  # The user's own.
 
     def refused(*words):
         assert run_main("cartpole_walls", "--out", str(out), *words) == 2
         line = capsys.readouterr().err.strip().splitlines()[-1]
         assert line.startswith("makebreak: ")
-        assert not out.exists() and not list(tmp_path.glob("*.part"))
+        assert [path.name for path in tmp_path.iterdir()] == ["out.part"]
         return line
 
     assert "has no system lerner; did you mean learner" in refused(
@@ -219,5 +220,5 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capsys, monkeypatch)
     out.mkdir()
     (out / "mine.txt").write_text("keep")
     assert run_main("cartpole_walls", "--out", str(out)) == 2
-    assert "expected a new or an empty folder" in capsys.readouterr().err
+    assert "holds mine.txt, which makebreak did not write" in capsys.readouterr().err
     assert (out / "mine.txt").read_text() == "keep"

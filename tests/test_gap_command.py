@@ -26,8 +26,8 @@ def workflow(monkeypatch, case, tmp_path):
     monkeypatch.chdir(tmp_path)
     asked = []
 
-    def run_gap(scene_path, recording_paths, out_dir, jobs, progress):
-        asked.append((scene_path, recording_paths, out_dir, jobs))
+    def run_gap(scene_path, recording_paths, jobs, progress):
+        asked.append((scene_path, recording_paths, jobs))
         for text in ("checking the recordings", "screening the catalogue"):
             progress(text)
         return case[2]
@@ -42,7 +42,7 @@ def test_a_run_shows_its_stages_and_ends_with_a_table_and_files(workflow, case, 
     scene, recording, result = case
     words = ["gap", str(scene), str(recording), "--out", "out", "--jobs", "1"]
     assert cli.main(words) == 0
-    assert workflow == [(scene.resolve(), [recording], Path("out"), 1)]
+    assert workflow == [(scene.resolve(), [recording], 1)]
     shown = capsys.readouterr()
     for text in ("checking", "screening", "writing the report", "done"):
         assert text in shown.err

@@ -104,8 +104,8 @@ def run(config: ChangingSurfaceConfig, session: Session) -> dict:
         if label == "adaptive":
             known = learned(diagram, log.context)
             if known.modes is not None and known.models is not None:
-                known.modes.save(session.out_dir / "modes.json")
-                known.models.save(session.out_dir / "models.json")
+                known.modes.save(session.path("modes.json"))
+                known.models.save(session.path("models.json"))
     main = logs["adaptive"]
     changes, surplus = changes_of(main, task.feet)
     session.save_plot(plot_modes(main, changes, task), "modes")

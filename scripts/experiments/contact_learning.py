@@ -117,7 +117,7 @@ def run(config: ContactLearningConfig, session: Session) -> dict:
         trials.append(scored(telemetry(diagram, log.context), task, knowledge.contacts))
     session.save_plot(plot_trials(trials, task), "trials")
     session.save_plot(plot_learning(trials, task), "learning")
-    knowledge.contacts.save(session.out_dir / "contacts.json")
+    knowledge.contacts.save(session.path("contacts.json"))
     last = trials[-1].log
     columns = {"time": last["time"]}
     for i, axis in enumerate("xyz"):

@@ -103,7 +103,7 @@ def run(config: MultipleCollisionsConfig, session: Session) -> dict:
     session.save_plot(plot_trials(trials), "profiles")
     session.save_plot(plot_path(trials, task), "path")
     if knowledge is not None:
-        knowledge.contacts.save(session.out_dir / "contacts.json")
+        knowledge.contacts.save(session.path("contacts.json"))
     log = list(trials.values())[-1].log
     columns = {"time": log["time"]}
     for i, axis in enumerate("xyz"):

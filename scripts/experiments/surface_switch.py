@@ -103,7 +103,7 @@ def run(config: SurfaceSwitchConfig, session: Session) -> dict:
         done = log["phase"][-1, PHASE_STAGE] == DONE
         trials.append(replace(trial, done=bool(done)))
     session.save_plot(plot_trials(trials, task), "trials")
-    knowledge.contacts.save(session.out_dir / "contacts.json")
+    knowledge.contacts.save(session.path("contacts.json"))
     last = trials[-1].log
     columns = {"time": last["time"]}
     for i, axis in enumerate("xyz"):

@@ -1,0 +1,250 @@
+"""The folder that one command writes into, and how nothing in it is ever lost."""
+
+import errno
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Iterable
+from hashlib import sha256
+from pathlib import Path
+
+MARK = ".makebreak.json"  # Which command wrote the folder, and which files.
+STAGE = ".unfinished"  # In it, files are written before they are moved.
+KEPT = "unfinished"  # Where an interrupted run goes beside an older, complete one.
+_LOCK = "lock"
+# What commands write: in a folder that none of them made, such a file is the user's.
+_SUFFIXES = ".csv .html .json .npz .parquet .png .py .sdf .yaml".split()
+_NAMES = ("reproduce.md", "error.txt")
+
+
+class OutputFolder:
+    """A folder for the files of one command, locked until it is closed.
+
+    A file is written under the path that `file` gives, in a hidden folder, and moved to
+    its place by `commit`. Until then an earlier result of the same command stays as it
+    is; with it, that result's files are replaced, or removed where the new one has no
+    file of that name. Nothing else in the folder is touched. To be used in a `with`,
+    whose end drops what was not moved.
+
+    Args:
+        path: the folder; made where it is missing.
+        command: what writes there, such as "run ball_rolling".
+        inputs: files that the command reads.
+        only_new: whether a folder that the command did not make must be empty.
+    Raises: ValueError, in one line, for a folder that cannot be made or written to,
+        that holds inputs, files of another command or of the user, and one that another
+        process is writing to. Then nothing has been changed.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        command: str,
+        inputs: Iterable[str | Path] = (),
+        only_new: bool = False,
+    ):
+        self.path = Path(path)
+        self.command = command
+        self.stage = self.path / STAGE
+        self._lock: int | None = None
+        self._made: list[Path] = []  # Folders that were not there.
+        here = self.path.resolve()
+        for each in inputs:
+            if Path(each).resolve().parent == here:
+                self._refuse(f"holds {Path(each).name}, which this command reads")
+        try:
+            self._enter()
+            self._old = self._check(only_new)
+        except OSError as error:
+            self.close()
+            raise ValueError(
+                f'--out: got "{path}", expected a folder to write in ({error.strerror})'
+            ) from error
+        except BaseException:
+            self.close()
+            raise
+
+    def _refuse(self, why: str):
+        word = self.command.split()[0]
+        other, n = self.path / word, 1
+        while os.path.lexists(other):
+            n += 1
+            other = self.path / f"{word}-{n}"
+        raise ValueError(
+            f'--out: "{self.path}" {why}; type another folder, for example '
+            f"--out {other}"
+        )
+
+    def _enter(self) -> None:
+        """Makes the hidden folder, empty, and locks it."""
+        for folder in (self.path, *self.path.parents):
+            if folder.exists():
+                break
+            self._made.append(folder)
+        while self._lock is None:
+            self.stage.mkdir(parents=True, exist_ok=True)
+            try:
+                lock = os.open(self.stage / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+            except FileNotFoundError:  # Another process has just ended there.
+                continue
+            try:
+                # Not flock: a lock of that kind is inherited by worker processes, which
+                # may outlive a run that is killed.
+                fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                if error.errno in (errno.EACCES, errno.EAGAIN):
+                    who = os.read(lock, 20).decode(errors="replace")
+                    os.close(lock)
+                    self._refuse(f"is being written by another run (process {who})")
+                # A file system without locks: then there is none.
+            try:
+                same = os.fstat(lock).st_ino == (self.stage / _LOCK).stat().st_ino
+            except FileNotFoundError:
+                same = False
+            if same:
+                self._lock = lock
+            else:
+                os.close(lock)
+        os.ftruncate(self._lock, 0)
+        os.pwrite(self._lock, str(os.getpid()).encode(), 0)
+        for old in self.stage.iterdir():  # Of a run that was killed.
+            if old.is_dir() and not old.is_symlink():
+                shutil.rmtree(old)
+            elif old.name != _LOCK:
+                old.unlink()
+
+    def _check(self, only_new: bool) -> dict:
+        """The mark of an earlier result of this command; empty without one."""
+        mark = _read_mark(self.path)
+        strangers = sorted(
+            each.name
+            for each in self.path.iterdir()
+            if not each.name.startswith(".") and each.name != "log.txt"
+        )
+        if not mark:
+            if not only_new:
+                strangers = [
+                    name
+                    for name in strangers
+                    if name in _NAMES or Path(name).suffix in _SUFFIXES
+                ]
+            if strangers:
+                self._refuse(f"holds {strangers[0]}, which makebreak did not write")
+            return {}
+        if mark["command"] != self.command:
+            self._refuse(f"holds the files of makebreak {mark['command']}")
+        for name, digest in mark["files"].items():
+            path = self.path / name
+            if path.is_dir():
+                self._refuse(f"holds a folder {name}, expected a file")
+            if path.is_file() and _digest(path) != digest:
+                self._refuse(f"holds {name}, which was changed by hand")
+        return mark
+
+    def file(self, name: str) -> Path:
+        """Where the file `name` is to be written; its folder is there."""
+        path = self.stage / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def commit(self, complete: bool = True) -> list[Path]:
+        """Moves all files to their places, and closes the folder.
+
+        Args: complete: False keeps an older, complete result, and moves the files into
+            the subfolder `unfinished` beside it.
+        Returns: the files, where they are now.
+        """
+        target = self.path
+        old: dict[str, str] = self._old.get("files", {})
+        if not complete and self._old.get("complete"):
+            target = self.path / KEPT
+            old = _read_mark(target).get("files", {})
+            target.mkdir(exist_ok=True)
+        new = {
+            path.relative_to(self.stage).as_posix(): path
+            for path in sorted(self.stage.rglob("*"))
+            if path.is_file() and path != self.stage / _LOCK
+        }
+        digests = {name: _digest(path) for name, path in new.items()}
+        # Should it end between the two marks, all files are known as its own.
+        self._mark(target, old | digests, complete=False)
+        try:
+            for name, path in new.items():
+                place = target / name
+                place.parent.mkdir(parents=True, exist_ok=True)
+                if os.path.lexists(place) and (name not in old or place.is_dir()):
+                    os.replace(place, _free(place))  # The user's.
+                os.replace(path, place)
+        except OSError as error:
+            self.close(keep_stage=True)
+            raise ValueError(
+                f"--out: {self.path} cannot be written ({error.strerror}); the files "
+                f"are in {self.stage}"
+            ) from error
+        for name in old.keys() - new.keys():
+            (target / name).unlink(missing_ok=True)
+        self._mark(target, digests, complete)
+        self._made.clear()
+        self.close()
+        return [target / name for name in new]
+
+    def _mark(self, target: Path, files: dict[str, str], complete: bool) -> None:
+        mark = {"command": self.command, "complete": complete, "files": files}
+        new = self.stage / MARK
+        try:
+            new.write_text(json.dumps(mark, indent=1) + "\n")
+            os.replace(new, target / MARK)
+        except OSError:  # A full disk. The files matter more than the list of them.
+            new.unlink(missing_ok=True)
+
+    def close(self, keep_stage: bool = False) -> None:
+        """Drops what was not moved, and gives the folder free. May be called again."""
+        if self._lock is not None:
+            if not keep_stage:
+                shutil.rmtree(self.stage, ignore_errors=True)
+            os.close(self._lock)
+            self._lock = None
+        for folder in self._made:  # Unless something has come into them.
+            try:
+                folder.rmdir()
+            except OSError:
+                break
+        self._made.clear()
+
+    def __enter__(self) -> "OutputFolder":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()
+
+
+def _read_mark(folder: Path) -> dict:
+    try:
+        mark = json.loads((folder / MARK).read_text())
+        if isinstance(mark["command"], str) and isinstance(mark["files"], dict):
+            # A mark is no reason to go anywhere else.
+            inside = {
+                name: digest
+                for name, digest in mark["files"].items()
+                if not Path(name).is_absolute() and ".." not in Path(name).parts
+            }
+            return {**mark, "files": inside}
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    return {}
+
+
+def _digest(path: Path) -> str:
+    """What tells whether a file was changed by hand; "" of one that nobody changes."""
+    if path.suffix != ".yaml":
+        return ""
+    return sha256(path.read_bytes()).hexdigest()[:16]
+
+
+def _free(path: Path) -> Path:
+    """A name beside `path` that is not taken."""
+    n = 1
+    while os.path.lexists(path.with_name(f"{path.name}.{n}")):
+        n += 1
+    return path.with_name(f"{path.name}.{n}")
