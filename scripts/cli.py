@@ -36,8 +36,9 @@ class _Parser(argparse.ArgumentParser):
     """argparse, but with one line on stderr where the input is wrong, and no shortened
     options: --seed of `run` is not --seeds of `reproduce`."""
 
-    def __init__(self, *args, **kwargs):
-        super().__init__(*args, **kwargs, allow_abbrev=False)
+    def __init__(self, **kwargs):
+        kwargs["allow_abbrev"] = False
+        super().__init__(**kwargs)
 
     def error(self, message):
         raise ValueError(f"{message} (see {self.prog} --help)")
