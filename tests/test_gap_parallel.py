@@ -52,7 +52,7 @@ import os, sys, time
 from makebreak.gap.parallel import side_by_side
 
 def call():
-    print(os.getpid(), flush=True)
+    os.write(1, f"{os.getpid()}\n".encode())  # In one piece.
     time.sleep(100)
 
 list(side_by_side([call] * 2, 2))
