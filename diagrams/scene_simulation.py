@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventSta
 from pydrake.systems.primitives import Demultiplexer, LogVectorOutput
 
 from makebreak.models.effects import KINDS
+from makebreak.models.effects.actuation_path import TIME_CONSTANT
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.effects.measured_channels import ChannelMap, channel_maps
 from makebreak.models.effects.transmission import motor_joint
@@ -37,9 +38,9 @@ def make_scene_diagram(
     """The scene's plant, effects, actuation and sensors, for each model <m> that has
     actuators or joints.
 
-    Inputs:  <m>.effort_command (n_u,) [N m]; or where the scene's actuation is of type
-             pd, <m>.position_command and <m>.velocity_command (n_u,). What is not
-             connected is zero.
+    Inputs:  <m>.effort_command (n_u,) [N m]; or where the scene's drives have a loop of
+             their own, <m>.position_command, <m>.velocity_command (n_u,), as they take
+             them. What is not connected is zero.
     Outputs: <m>.position_measured, <m>.velocity_measured (joints with one degree of
              freedom, in the order of LoadedScene.plant's), without noise; <m>.effort,
              the motors' (n_u,), where something lies between command and joint;
@@ -67,7 +68,8 @@ def make_scene_diagram(
                 )
             else:
                 for name in ("position_command", "velocity_command"):
-                    builder.ExportInput(getattr(path, name), f"{model}.{name}")
+                    if (port := getattr(path, name)) is not None:
+                        builder.ExportInput(port, f"{model}.{name}")
         if path is not None:
             builder.ExportOutput(path.effort, f"{model}.effort")
         joints = one_dof_joints(plant, model)
@@ -454,7 +456,7 @@ class SceneSimulation:
             if path.command is None:
                 path.path.set_lagged(own, path.path.unlagged(own))
                 continue
-            T = path_numbers(self._plant, model, self._current)[0][3]
+            T = path_numbers(self._plant, model, self._current)[0][TIME_CONSTANT]
             since = start - 12.0 * T.max()  # exp(-12) = 6e-6 of what was before.
             events = self._events[(self._events > since) & (self._events < start)]
             instants = np.concatenate([[since], events, [start]])

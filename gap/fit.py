@@ -236,7 +236,7 @@ def _scale(effect: Effect, name: str) -> float:
 
 def _lowest(kind: str, name: str) -> float:
     valid = KINDS[kind].parameter(name).valid
-    return {">= 0": 0.0, "> 0": 1e-9}.get(valid, -np.inf)
+    return {">= 0": 0.0, "> 0": 1e-9, "share": 0.0}.get(valid, -np.inf)
 
 
 def _tidy(effect: Effect) -> Effect:

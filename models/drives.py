@@ -8,13 +8,17 @@ from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.actuation_path import (
-    BIAS,
     GAIN,
+    KP,
     LIMIT,
     NO_LIMIT,
-    TIME_CONSTANT,
+    OWN,
+    ROWS,
+    SHARE,
     ActuationPath,
     Drive,
+    DriveLaw,
+    Gear,
     PathPorts,
 )
 from makebreak.models.effects.actuation_path import STEPS as PATH_STEPS
@@ -26,11 +30,13 @@ from makebreak.models.effects.kind import (
     full_name,
     model_names,
     one_dof_joints,
+    velocity_unit,
 )
 from makebreak.models.effects.measured_channels import ChannelMap, channel_maps
 from makebreak.models.effects.transmission import motor_joint
-from makebreak.models.scene_schema import ActuationSection, nearest
+from makebreak.models.scene_schema import COMMANDS_OF, ActuationSection, nearest
 
+DRIVEN_BY = ("position_command", "velocity_command")  # A drive with a loop of its own.
 CHANNEL_STEPS = {name: kind.channel for name, kind in KINDS.items() if kind.channel}
 
 
@@ -65,21 +71,22 @@ def actuators_of_model(plant: MultibodyPlant, model: str) -> list:
 def path_numbers(
     plant: MultibodyPlant, model: str, effects: Iterable[Effect]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What lies between a model's commands and its joints: the numbers (4, n_u) of its
-    ActuationPath, and the delays (n_u,) [s] before it. Gains multiply, biases, lags and
-    delays add up, of several limits the least holds.
+    """What lies between a model's commands and its joints: the numbers (ROWS, n_u) of
+    its ActuationPath, and the delays (n_u,) [s] before it. Gains multiply, biases,
+    lags, delays and shares add up; the least limit holds, and the last kp.
 
     Raises: ValueError for a joint that nothing drives.
     """
     actuators = actuators_of_model(plant, model)
     at = {actuator.joint().index(): i for i, actuator in enumerate(actuators)}
-    numbers = np.tile([[1.0], [0.0], [NO_LIMIT], [0.0]], (1, len(actuators)))
+    numbers = np.zeros((ROWS, len(actuators)))
+    numbers[GAIN], numbers[LIMIT], numbers[KP] = 1.0, NO_LIMIT, OWN
     delays = np.zeros(len(actuators))
     for effect in effects:
         step = KINDS[effect.kind].path
         if not step:
             continue
-        name, _ = PATH_STEPS[step]
+        name, row = PATH_STEPS[step]
         value = effect.parameters[name]
         for joint in find_joints(effect, plant):
             if actuator_of(plant, joint) is None:
@@ -94,15 +101,81 @@ def path_numbers(
                 continue
             if step == "gain":
                 numbers[GAIN, i] *= value
-            elif step == "bias":
-                numbers[BIAS, i] += value
             elif step == "saturation":
                 numbers[LIMIT, i] = min(numbers[LIMIT, i], value)
-            elif step == "lag":
-                numbers[TIME_CONSTANT, i] += value
+            elif step == "kp":
+                numbers[KP, i] = value
+            elif row is not None:
+                numbers[row, i] += value
             else:
                 delays[i] += value
     return numbers, delays
+
+
+def drive_law(actuation: ActuationSection) -> DriveLaw:
+    """The law of the scene's drives, an entry for each of actuation.joints.
+
+    Raises: ValueError for numbers that are too few, too many or out of range.
+    """
+    n = len(actuation.joints)
+
+    def numbers(key: str, values, default: float | None, least: str = ">= 0"):
+        if not len(values) and default is not None:
+            values = [default]
+        good = all(v > 0.0 or (v == 0.0 and least == ">= 0") for v in values)
+        if len(values) not in (1, n) or not good or not np.isfinite(values).all():
+            what = "of 0 or more" if least == ">= 0" else "above 0"
+            raise ValueError(
+                f"actuation.{key} is {list(values)}, expected one number {what}, or "
+                f"one for each of the {n} joints"
+            )
+        return np.broadcast_to(np.array(values, dtype=float), n).copy()
+
+    is_position = "position_command" in COMMANDS_OF[actuation.type]
+    is_velocity = "velocity_command" in COMMANDS_OF[actuation.type]
+    kp = numbers("kp", actuation.kp, None if is_position else 0.0)
+    kd = numbers("kd", actuation.kd, None if is_velocity else 0.0)
+    if not is_position and kp.any():
+        raise ValueError(
+            f"actuation.kp is {actuation.kp}, which a drive of type {actuation.type} "
+            "does not have"
+        )
+    limit = np.full(n, np.inf)
+    if len(actuation.limit):
+        limit = numbers("limit", actuation.limit, None, "> 0")
+    emf, supply = np.zeros(n), actuation.supply
+    if len(supply.voltage) or len(supply.kt) or len(supply.resistance):
+        U, kt, R = (
+            numbers(f"supply.{key}", getattr(supply, key), None, "> 0")
+            for key in ("voltage", "kt", "resistance")
+        )
+        limit, emf = np.minimum(limit, U * kt / R), kt**2 / R
+    return DriveLaw(
+        kp, kd, limit, emf,
+        numbers("dead_band", actuation.dead_band, 0.0),
+        numbers("resolution", actuation.resolution, 0.0),
+    )  # fmt: skip
+
+
+def law_of(actuation: ActuationSection, joint: str) -> DriveLaw | None:
+    """The law of one joint's drive; None if a drive has no loop of its own there."""
+    if joint not in actuation.joints:
+        return None
+    if not set(COMMANDS_OF[actuation.type]) & set(DRIVEN_BY):
+        return None
+    return drive_law(actuation)[actuation.joints.index(joint)]
+
+
+def _gear(plant: MultibodyPlant, model: str) -> Gear:
+    """Of all actuators of a model."""
+    actuators = actuators_of_model(plant, model)
+    n_q, dt = plant.num_positions(), plant.time_step()
+    context = plant.CreateDefaultContext()
+    mobility = np.diag(np.linalg.inv(plant.CalcMassMatrix(context)))
+    joints = [motor_joint(plant, a.joint()) or a.joint() for a in actuators]
+    at = np.array([joint.velocity_start() for joint in joints], dtype=int)
+    slow = np.array([velocity_unit(joint) for joint in joints])
+    return Gear(n_q + at, slow, 2.0 * dt * mobility[at])
 
 
 def _drive(
@@ -112,32 +185,19 @@ def _drive(
     actuators = actuators_of_model(plant, model)
     names = [full_name(plant, actuator.joint()) for actuator in actuators]
     driven = np.array([name in actuation.joints for name in names], dtype=bool)
-    if actuation.type != "pd" or not driven.any():
+    takes = COMMANDS_OF[actuation.type]
+    if not driven.any() or not set(takes) & set(DRIVEN_BY):
         return None
-    gains: list[np.ndarray] = []
-    for key, values in (("kp", actuation.kp), ("kd", actuation.kd)):
-        if len(values) not in (1, len(actuation.joints)) or not all(
-            value >= 0.0 for value in values
-        ):
-            raise ValueError(
-                f"actuation.{key} is {values}, expected one gain of 0 or more, or one "
-                f"for each of the {len(actuation.joints)} joints"
-            )
-        each = dict(
-            zip(
-                actuation.joints,
-                list(values) * (len(actuation.joints) // len(values)),
-                strict=True,
-            )
-        )
-        gains.append(np.array([each.get(name, 0.0) for name in names]))
+    whole = drive_law(actuation)
+    of = {name: i for i, name in enumerate(actuation.joints)}
+    law = whole[np.array([of.get(name, 0) for name in names])]
     joints = [motor_joint(plant, a.joint()) or a.joint() for a in actuators]
     n_q = plant.num_positions()
     offsets = [effect for effect in effects if KINDS[effect.kind].channel == "offset"]
     maps = channel_maps(offsets, CHANNEL_STEPS, [f"{name}.position" for name in names])
     return Drive(
-        gains[0],
-        gains[1],
+        law,
+        takes,
         driven,
         np.array([joint.position_start() for joint in joints]),
         np.array([n_q + joint.velocity_start() for joint in joints]),
@@ -176,12 +236,14 @@ def add_paths(
         if drive is None and not any(joint.index() in changed for joint in joints):
             continue
         motors = [motor_joint(plant, joint) for joint in joints]
+        gear = _gear(plant, model) if numbers[SHARE].any() else None
         system = ActuationPath(
             numbers,
             plant.time_step(),
             drive,
             plant.num_multibody_states(),
             [motor is not None for motor in motors],
+            gear,
         )
         builder.AddNamedSystem(f"{model}_actuation_path", system)
         ports = PathPorts(system, systems=[system])
@@ -199,8 +261,9 @@ def add_paths(
         if drive is None:
             ports.command = delayed("command")
         else:
-            ports.position_command = delayed("position_command")
-            ports.velocity_command = delayed("velocity_command")
+            for name in drive.takes:
+                setattr(ports, name, delayed(name))
+        if drive is not None or gear is not None:
             builder.Connect(plant.get_state_output_port(), system.GetInputPort("state"))
         ports.effort = system.GetOutputPort("effort")
         ports.nominal = system.GetOutputPort("nominal")

@@ -22,6 +22,7 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import DiagramBuilder
 
+from makebreak.models.drives import law_of
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.body_forces import MAX_NUMBERS as BODY_NUMBERS
 from makebreak.models.effects.kind import (
@@ -33,6 +34,7 @@ from makebreak.models.effects.kind import (
 )
 from makebreak.models.effects.signature import Grid, Motion, Signature
 from makebreak.models.scene import LoadedScene, Scene, load_scene, read_scene
+from makebreak.models.scene_schema import COMMANDS_OF
 
 
 class SceneDynamics:
@@ -200,6 +202,17 @@ class SceneDynamics:
         """The parameters at which the effect would change nothing: where a search
         starts. Parameters that then have no meaning are left out."""
         entry = KINDS[kind]
+        if entry.drive:
+            law = law_of(self.loaded.scene.actuation, at[0])
+            if law is None:
+                raise ValueError(f"no drive at {at[0]}")
+            # As the scene's own effects have set it, the last one holds.
+            (name,) = (each.name for each in entry.parameters)
+            value = float(getattr(law, entry.drive))
+            for effect in self.loaded.effects:
+                if effect.kind == kind and set(effect.at) & set(at):
+                    value = effect.parameters[name]
+            return {name: value}
         if entry.now is not None:
             effect = Effect(kind, list(at), {})
             return dict(entry.now(effect, self.plant, self.loaded.scene_graph))
@@ -271,6 +284,10 @@ def places(loaded: LoadedScene, at: str, channels: Sequence[str]) -> list[str]:
             for i in plant.GetJointActuatorIndices()
         }
         return named(joint for joint in joints if joint.index() in driven)
+    if at == "drive":
+        act = loaded.scene.actuation
+        looped = "position_command" in COMMANDS_OF[act.type]
+        return [name for name in named(joints) if looped and name in act.joints]
     if at == "body":
         return named(moving)
     if at == "ground":

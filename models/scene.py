@@ -38,7 +38,7 @@ from makebreak.models.drives import (
     step_or_default,
 )
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.actuation_path import TIME_CONSTANT, PathPorts
+from makebreak.models.effects.actuation_path import SHARE, TIME_CONSTANT, PathPorts
 from makebreak.models.effects.body_forces import BodyForces
 from makebreak.models.effects.delay_line import DelayLine
 from makebreak.models.effects.joint_forces import JointForces
@@ -122,7 +122,8 @@ class LoadedScene:
             )
         if path.command is None:
             raise ValueError(
-                f"{model} takes position commands (the scene's actuation is of type pd)"
+                f"{model} takes other commands than efforts (the scene's actuation is "
+                f"of type {self.scene.actuation.type})"
             )
         return path.command
 
@@ -224,6 +225,8 @@ class LoadedScene:
         numbers = {model: path_numbers(plant, model, new)[0] for model in self.paths}
         for model, path in self.paths.items():
             if not path.path.has_lags and numbers[model][TIME_CONSTANT].any():
+                return False
+            if not path.path.has_gear and numbers[model][SHARE].any():
                 return False
         plant_context = plant.GetMyMutableContextFromRoot(root_context)
         if any(kind.set_in_context for kind in changed):

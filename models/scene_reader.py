@@ -23,6 +23,7 @@ def read_scene(path: str | Path) -> Scene:
         for effect in raw.get("effects") or []:
             if isinstance(effect.get("at"), str):
                 effect["at"] = [effect["at"]]  # The typed reader knows lists only.
+        _as_lists(raw.get("actuation") or {})
         initial = raw.get("initial") or {}
         sections = {f.name for f in fields(InitialSection)}
         # A misspelt section has numbers below it, a file has episodes.
@@ -46,6 +47,15 @@ def read_scene(path: str | Path) -> Scene:
                 part.file = f"file://{(path.parent / part.file).resolve()}"
     check_scene(scene)
     return scene
+
+
+def _as_lists(section: dict) -> None:
+    """One number for all joints becomes a list of one: the typed reader's."""
+    for key, value in section.items():
+        if key == "supply" and isinstance(value, dict):
+            _as_lists(value)
+        elif key not in ("rate_hz", "type", "hold") and not isinstance(value, list):
+            section[key] = [value]
 
 
 def initial_for(scene: Scene, recording: str, episode: int | None) -> InitialSection:

@@ -10,7 +10,14 @@ from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, check_parameters
 from makebreak.models.friction_zones import FrictionZone, check_zones
 
-ACTUATIONS = ("effort", "pd", "none")
+# What an actuation of each type takes as commands.
+COMMANDS_OF: dict[str, tuple[str, ...]] = {
+    "none": (),
+    "effort": ("effort_command",),
+    "pd": ("position_command", "velocity_command"),
+    "servo": ("position_command",),
+    "velocity": ("velocity_command",),
+}
 
 
 @dataclass
@@ -22,14 +29,35 @@ class PlantSection:
 
 
 @dataclass
-class ActuationSection:
-    """Who drives the joints. The effort of type pd is
-    kp (position_command - position) + kd (velocity_command - velocity)."""
+class SupplySection:
+    """A motor at a supply: each one number, or one for each joint."""
 
-    type: str = "none"  # effort, pd or none.
+    voltage: list[float] = field(default_factory=list)  # [V]
+    kt: list[float] = field(default_factory=list)  # [N m/A], at the joint.
+    resistance: list[float] = field(default_factory=list)  # [Ohm]
+
+
+@dataclass
+class ActuationSection:
+    """Who drives the joints. The effort of the types pd, servo and velocity is
+
+        clip(kp (position_command - position) + kd (velocity_command - velocity),
+             +-limit) - kt^2/R velocity
+
+    pd has all of the commands, servo the position (with kd against its velocity),
+    velocity the velocity. The limit is at most voltage kt/R, if there is a supply. An
+    error of position counts from the dead band's edge on; a position command is
+    received in whole steps of `resolution`. Each is one number, or one for each joint.
+    """
+
+    type: str = "none"  # A key of COMMANDS_OF.
     joints: list[str] = field(default_factory=list)
     kp: list[float] = field(default_factory=list)  # [N m/rad] or [N/m]
     kd: list[float] = field(default_factory=list)  # [N m s/rad] or [N s/m]
+    limit: list[float] = field(default_factory=list)  # [N m] or [N]
+    supply: SupplySection = field(default_factory=SupplySection)
+    dead_band: list[float] = field(default_factory=list)  # [rad] or [m], to each side.
+    resolution: list[float] = field(default_factory=list)  # [rad] or [m]
     hold: str = "zero_order"
     rate_hz: float = 1000.0
 
@@ -77,9 +105,9 @@ def check_scene(scene: Scene) -> None:
     if len(scene.plant.gravity) != 3:
         raise ValueError(f"plant.gravity is {scene.plant.gravity}, expected [x, y, z]")
     kind = scene.actuation.type
-    if kind not in ACTUATIONS:
+    if kind not in COMMANDS_OF:
         raise ValueError(
-            f"actuation.type is {kind!r}, expected one of {', '.join(ACTUATIONS)}"
+            f"actuation.type is {kind!r}, expected one of {', '.join(COMMANDS_OF)}"
         )
     if scene.actuation.hold != "zero_order":
         raise ValueError(

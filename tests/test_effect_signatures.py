@@ -21,6 +21,7 @@ from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sentence
 from makebreak.models.effects.signature import Motion, added_effort
+from makebreak.models.scene import ActuationSection
 from makebreak.systems.numerics.smoother import smooth
 from makebreak.systems.numerics.weak_form import make_bumps
 
@@ -28,6 +29,7 @@ from makebreak.systems.numerics.weak_form import make_bumps
 EXACT = {
     "joint_viscous_damping": ("d.j2", dict(damping=0.4)),
     "joint_coulomb_friction": ("d.j1", dict(coulomb=0.7)),
+    "joint_direction_friction": ("d.j1", dict(coulomb_plus=0.3, coulomb_minus=0.8)),
     "joint_stribeck_friction": (
         "d.j2",
         dict(coulomb=0.5, static=0.9, stribeck_velocity=0.2),
@@ -343,12 +345,21 @@ def test_a_free_bodys_rows_are_the_wrench_that_is_unknown(tmp_path):
 def test_every_kind_tells_its_columns_or_that_it_has_none(tmp_path):
     scenes = {
         "arm": SceneDynamics(double(tmp_path)),
+        "servo": SceneDynamics(
+            replace(
+                double(tmp_path),
+                actuation=ActuationSection(
+                    type="servo", joints=["d.j1", "d.j2"], kp=[20.0]
+                ),
+            )
+        ),
         "block": SceneDynamics(on_ground(tmp_path, "cube", 0.0)),
         "ball": SceneDynamics(on_ground(tmp_path, "ball", 0.0)),
     }
     simulated_only = set()
     for name, kind in KINDS.items():
         on = "block" if kind.at in ("pair", "ground", "length", "free body") else "arm"
+        on = "servo" if kind.at == "drive" else on
         model = scenes["ball" if name == "rolling_resistance" else on]
         places = model.places(name)
         assert places, name
@@ -411,6 +422,34 @@ def driven_pendulum(tmp_path, rotor=0.05):
     return SceneDynamics(
         with_effects(scene, ("rotor_inertia", "p.j1", dict(inertia=rotor)))
     )
+
+
+def test_friction_that_goes_with_the_load_is_a_share_of_what_all_else_needs(tmp_path):
+    # By the definition: a motor gives tau + share |tau| where the joint gets tau.
+    base = with_effects(
+        double(tmp_path), ("joint_coulomb_friction", "d.j2", dict(coulomb=0.3))
+    )
+    model = SceneDynamics(base)
+    motion = motion_of(model)
+    tau, direction = motion.effort[:, 1], np.tanh(motion.v[:, 1] / 0.005)
+    more = 0.2 * np.abs(tau) * direction
+    effort = motion.effort + np.outer(more, [0.0, 1.0])
+    measured = replace(motion, effort=effort)
+    (signature,) = model.signatures("joint_load_friction", ["d.j2"], measured)
+    assert signature.exact
+    coefficients, left = explained(signature, model.residual(measured))
+    assert coefficients[0] == pytest.approx(0.2, rel=1e-9) and left < 1e-9
+    # A joint that carries a payload besides loses a share of what that needs, too.
+    heavy = ("payload", "d.lower", dict(mass=0.5, com_x=0.1, com_y=0, com_z=-0.3))
+    loaded = SceneDynamics(with_effects(base, *[
+        (e.kind, e.at, e.parameters) for e in base.effects], heavy))  # fmt: skip
+    needed = -loaded.residual(replace(motion, effort=0.0 * effort))
+    effect = Effect("joint_load_friction", ["d.j2"], {"share": 0.2})
+    on_top = KINDS[effect.kind].on_top(effect, model, motion, needed)
+    np.testing.assert_allclose(
+        on_top[:, 1], 0.2 * np.abs(needed[:, 1]) * direction, atol=1e-12
+    )
+    assert not on_top[:, 0].any()
 
 
 def test_a_spring_between_motor_and_link_is_found_from_the_motor_alone(tmp_path):

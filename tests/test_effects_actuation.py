@@ -1,5 +1,7 @@
 """What lies between command and joint: gain, bias, limit, delay, lag, drives."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from effect_scenes import (
@@ -15,13 +17,18 @@ from effect_scenes import (
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 from makebreak.diagrams.scene_simulation import (
     Commands,
     SceneSimulation,
     make_scene_diagram,
 )
-from makebreak.models.scene import load_scene
+from makebreak.models.drives import law_of
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.scene import load_scene, read_scene
+from makebreak.models.scene_file import write_scene
+from makebreak.models.scene_schema import ActuationSection, SupplySection
 
 CHANNELS = ["p.j1.position", "p.j1.velocity", "p.j1.effort_measured"]
 TIMES = np.linspace(0.0, 1.0, 101)
@@ -183,6 +190,188 @@ def test_a_drive_sees_the_encoders_offset(tmp_path):
     rows = simulation.run(at_rest_but(), np.array([0.0, 6.0]), channels, commands)
     # exp(-5 s / 0.2 s) of the way is left.
     np.testing.assert_allclose(rows[1], [0.5, np.sin(0.4 / 2)], atol=1e-4)
+
+
+SERVO = dict(kp=[30.0], limit=[9.0], dead_band=[0.02], resolution=[0.05])
+SUPPLY = dict(voltage=[12.0], kt=[1.2], resistance=[2.0])  # 7.2 N m, 0.72 N m s/rad.
+
+
+def servo_effort(command, q, v):
+    """By the data sheet: duty = kp/(V kt/R) error, at most 1; torque = kt (duty V -
+    kt v)/R. The error counts from 0.02 rad on, the command in steps of 0.05 rad."""
+    V, kt, R = 12.0, 1.2, 2.0
+    error = 0.05 * np.round(command / 0.05) - q
+    error = np.sign(error) * max(abs(error) - 0.02, 0.0)
+    duty = np.clip(30.0 / (V * kt / R) * error, -1.0, 1.0)
+    return kt * (duty * V - kt * v) / R
+
+
+@pytest.mark.parametrize("time_step", [0.0, 0.0005])
+def test_a_servo_pulls_as_its_data_sheet_says(tmp_path, time_step):
+    drive = dict(type="servo", joints=["p.j1"], **SERVO, supply=SupplySection(**SUPPLY))
+    scene = pendulum(tmp_path, time_step, **drive)
+    times = np.linspace(0.0, 1.2, 25)
+    target = 1.1 * np.sin(6.0 * times)
+    commands = Commands(times, {"p.j1.position_command": target})
+    rows = SceneSimulation(scene).run(at_rest_but(), times, CHANNELS, commands)
+    x, expected = np.zeros(2), [np.zeros(2)]
+    for k in range(24):
+
+        def rate(t, x, k=k):
+            u = servo_effort(target[k], *x)
+            return [x[1], (u - MASS * G * LENGTH * np.sin(x[0])) / J]
+
+        x = solve_ivp(
+            rate, times[k : k + 2], x, rtol=1e-9, atol=1e-11, max_step=1e-3
+        ).y[:, -1]
+        expected.append(x)
+    # Corners of the law fall within steps of the integrator.
+    atol = 2e-4 if time_step == 0.0 else 0.02
+    np.testing.assert_allclose(rows[:, :2], expected, atol=atol)
+    u = [servo_effort(c, *x) for c, x in zip(target, rows[:, :2], strict=True)]
+    np.testing.assert_allclose(rows[:, 2], u, atol=1e-9)
+    duty = np.abs((np.array(u) + 0.72 * rows[:, 1]) / 7.2)
+    assert duty.max() > 0.999 and duty.min() < 0.5  # Both were seen.
+
+
+def test_a_servo_at_its_supply_comes_up_to_its_no_load_speed(tmp_path):
+    # Without a load, far from its command: v = V/kt (1 - exp(-(kt^2/R) t/J)).
+    supply = SupplySection(voltage=[12.0], kt=[1.2], resistance=[2.0])
+    drive = dict(type="servo", joints=["p.j1"], kp=[30.0], supply=supply)
+    scene = pendulum(tmp_path, gravity=0.0, **drive)
+    commands = Commands(np.array([0.0]), {"p.j1.position_command": np.array([100.0])})
+    times = np.linspace(0.0, 2.0, 9)
+    rows = SceneSimulation(scene).run(at_rest_but(), times, CHANNELS, commands)
+    speed = 10.0 * (1.0 - np.exp(-0.72 * times / J))
+    np.testing.assert_allclose(rows[:, 1], speed, atol=1e-4)
+    np.testing.assert_allclose(rows[:, 2], 7.2 - 0.72 * speed, atol=1e-4)
+
+
+@pytest.mark.parametrize("time_step", [0.0, 0.0005])
+def test_a_velocity_drive_follows_its_velocity(tmp_path, time_step):
+    drive = dict(type="velocity", joints=["p.j1"], kd=[12.0], limit=[6.0])
+    scene = pendulum(tmp_path, time_step, **drive)
+    times = np.linspace(0.0, 1.2, 25)
+    target = 1.5 * np.sign(np.sin(5.0 * times + 0.1))
+    commands = Commands(times, {"p.j1.velocity_command": target})
+    rows = SceneSimulation(scene).run(at_rest_but(), times, CHANNELS, commands)
+    x, expected = np.zeros(2), [np.zeros(2)]
+    for k in range(24):
+
+        def rate(t, x, k=k):
+            u = np.clip(12.0 * (target[k] - x[1]), -6.0, 6.0)
+            return [x[1], (u - MASS * G * LENGTH * np.sin(x[0])) / J]
+
+        x = solve_ivp(
+            rate, times[k : k + 2], x, rtol=1e-9, atol=1e-11, max_step=1e-3
+        ).y[:, -1]
+        expected.append(x)
+    atol = 2e-4 if time_step == 0.0 else 0.02
+    np.testing.assert_allclose(rows[:, :2], expected, atol=atol)
+    u = np.clip(12.0 * (target - rows[:, 1]), -6.0, 6.0)
+    np.testing.assert_allclose(rows[:, 2], u, atol=1e-9)
+    assert abs(u).max() == 6.0
+
+
+def test_a_servos_gain_is_changed_in_the_context(tmp_path):
+    drive = dict(type="servo", joints=["p.j1"], kp=[30.0], limit=[9.0])
+    scene = pendulum(tmp_path, **drive)
+    soft = pendulum(tmp_path, **{**drive, "kp": [12.0]})
+    commands = Commands(TIMES, {"p.j1.position_command": 0.4 * np.sin(5.0 * TIMES)})
+    changed = with_effects(scene, ("servo_gain", "p.j1", dict(kp=12.0)))
+    simulation = SceneSimulation(
+        with_effects(scene, ("servo_gain", "p.j1", dict(kp=20.0)))
+    )
+    first = simulation.run(at_rest_but(), TIMES, CHANNELS, commands)
+    simulation.set_effects(changed.effects)
+    rows = simulation.run(at_rest_but(), TIMES, CHANNELS, commands)
+    assert simulation.builds == 1 and abs(rows - first).max() > 0.01
+    expected = SceneSimulation(soft).run(at_rest_but(), TIMES, CHANNELS, commands)
+    np.testing.assert_allclose(rows, expected, atol=1e-9)
+    assert SceneDynamics(scene).now("servo_gain", ["p.j1"]) == {"kp": 30.0}
+    assert SceneDynamics(changed).now("servo_gain", ["p.j1"]) == {"kp": 12.0}
+    assert SceneDynamics(pendulum(tmp_path)).places("servo_gain") == []
+
+
+@pytest.mark.parametrize("time_step", [0.0, 0.0005])
+def test_a_gear_keeps_a_share_of_what_it_transmits(tmp_path, time_step):
+    # u = tau + share |tau| direction, solved for tau by bisection.
+    share = 0.3
+    scene = with_effects(
+        pendulum(tmp_path, time_step),
+        ("joint_load_friction", "p.j1", dict(share=share)),
+    )
+    commands = Commands(TIMES, {"p.j1.effort_command": 2.0 * COMMAND})
+    simulation = SceneSimulation(scene)
+    rows = simulation.run(at_rest_but({"p.j1": 0.4}), TIMES, CHANNELS, commands)
+    x, expected = np.array([0.4, 0.0]), [[0.4, 0.0]]
+    for k in range(100):
+
+        def rate(t, x, k=k):
+            u, s = 2.0 * COMMAND[k], np.tanh(x[1] / 0.005)
+            tau = brentq(lambda tau: tau + share * abs(tau) * s - u, -50.0, 50.0)
+            return [x[1], (tau - MASS * G * LENGTH * np.sin(x[0])) / J]
+
+        x = solve_ivp(rate, TIMES[k : k + 2], x, "Radau", rtol=1e-8, atol=1e-9).y[:, -1]
+        expected.append(x)
+    atol = 2e-4 if time_step == 0.0 else 0.02
+    np.testing.assert_allclose(rows[:, :2], expected, atol=atol)
+    # Measured is what the motor gives.
+    np.testing.assert_allclose(rows[:, 2], 2.0 * COMMAND, atol=1e-9)
+    lossless = SceneSimulation(pendulum(tmp_path, time_step))
+    free = lossless.run(at_rest_but({"p.j1": 0.4}), TIMES, CHANNELS, commands)
+    assert abs(free - rows).max() > 0.1
+    # Another share needs no other plant; none at all is the plant without the effect.
+    simulation.set_effects(
+        with_effects(scene, ("joint_load_friction", "p.j1", dict(share=0.0))).effects
+    )
+    again = simulation.run(at_rest_but({"p.j1": 0.4}), TIMES, CHANNELS, commands)
+    assert simulation.builds == 1
+    np.testing.assert_allclose(again, free, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (dict(kp=[]), r"actuation.kp is \[\], expected one number of 0 or more"),
+        (dict(kp=[1.0, 2.0]), "or one for each of the 1 joints"),
+        (dict(limit=[0.0]), "actuation.limit is .*above 0"),
+        (dict(dead_band=[-0.1]), "actuation.dead_band is"),
+        (dict(supply=SupplySection(voltage=[12.0])), r"actuation.supply.kt is \[\]"),
+        (
+            dict(type="velocity", kd=[3.0]),
+            "which a drive of type velocity does not have",
+        ),
+        (
+            dict(type="servos"),
+            "actuation.type is 'servos', expected one of none, effort",
+        ),
+    ],
+)
+def test_a_drive_that_is_none_is_refused(tmp_path, change, words):
+    drive = dict(type="servo", joints=["p.j1"], kp=[30.0]) | change
+    with pytest.raises(ValueError, match=words):
+        load_scene(pendulum(tmp_path, **drive), DiagramBuilder())
+
+
+def test_a_servo_in_a_file_may_give_one_number_for_all(tmp_path):
+    scene = pendulum(tmp_path)
+    path = tmp_path / "servo.scene.yaml"
+    write_scene(replace(scene, actuation=ActuationSection()), path)
+    path.write_text(
+        path.read_text()
+        + """
+actuation:
+  {type: servo, joints: [p.j1], kp: 7.8, limit: 2.9, dead_band: 0.001,
+   supply: {voltage: 12, kt: 1.2, resistance: 4.2}}
+"""
+    )
+    read = read_scene(path)
+    law = law_of(read.actuation, "p.j1")
+    assert (law.kp, law.limit, law.dead_band) == (7.8, 2.9, 0.001)
+    assert law.emf == pytest.approx(1.44 / 4.2)
+    write_scene(read, path)
+    assert read_scene(path).actuation == read.actuation
 
 
 def test_each_joint_has_its_own_delay_and_gain(tmp_path):

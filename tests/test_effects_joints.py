@@ -24,6 +24,10 @@ CASES = {
         dict(coulomb=0.4),
         lambda q, v: -0.4 * np.tanh(v / FADE),
     ),
+    "joint_direction_friction": (
+        dict(coulomb_plus=0.2, coulomb_minus=0.5),
+        lambda q, v: -(0.2 if v > 0 else 0.5) * np.tanh(v / FADE),
+    ),
     "joint_stribeck_friction": (
         dict(coulomb=0.3, static=0.6, stribeck_velocity=0.5),
         lambda q, v: -(0.3 + 0.3 * np.exp(-((v / 0.5) ** 2))) * np.tanh(v / FADE),

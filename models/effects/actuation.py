@@ -90,6 +90,24 @@ def _lag_signature(effect, model, motion, grid=None) -> list[Signature]:
     )
 
 
+def _kp_signature(effect, model, motion, grid=None) -> list[Signature]:
+    """Of a drive that neither reaches its limit nor turns fast: then its effort goes
+    with its gain. (gap asks the drive itself, by its law.)"""
+    joints = find_joints(effect, model.plant)
+    kp = model.now(effect.kind, effect.at)["kp"]
+    return [
+        at_joints(
+            effect,
+            ["kp_change"],
+            motion,
+            joints,
+            [lambda q, v, u: -u / kp],
+            to_parameters=lambda c: {"kp": kp + float(c[0])},
+            exact=False,
+        )
+    ]
+
+
 KINDS = {
     "actuator_gain": EffectKind(
         at="actuator",
@@ -137,5 +155,16 @@ KINDS = {
         "only shifts",
         path="lag",
         signature=_lag_signature,
+    ),
+    "servo_gain": EffectKind(
+        at="drive",
+        parameters=(Parameter("kp", "N m/rad", 0.1, 5000.0, None, valid="> 0"),),
+        says="the drive of {at} pulls towards its command with {kp}",
+        confused_with=("actuator_gain", "payload", "joint_elasticity", "joint_spring"),
+        tell_apart="hold known loads: the error of position goes with load over gain, "
+        "and measure the torque",
+        path="kp",
+        drive="kp",
+        signature=_kp_signature,
     ),
 }

@@ -16,7 +16,11 @@ from makebreak.models.effects.kind import (
     full_name,
     velocity_unit,
 )
-from makebreak.models.effects.signature import Signature, at_joints
+from makebreak.models.effects.signature import (
+    Signature,
+    at_joints,
+    without_momentum,
+)
 from makebreak.models.effects.transmission import motor_joint
 
 # ----- What they do
@@ -141,6 +145,11 @@ def _coulomb_numbers(effect, plant, joint):
     return [c, fade_velocity(plant, joint, c)]
 
 
+def _direction_numbers(effect, plant, joint):
+    c = [effect.parameters[name] for name in ("coulomb_plus", "coulomb_minus")]
+    return [*c, fade_velocity(plant, joint, max(c))]
+
+
 def _stribeck_numbers(effect, plant, joint):
     p = effect.parameters
     fade = fade_velocity(plant, joint, max(p["coulomb"], p["static"]))
@@ -154,6 +163,11 @@ def _numbers(*names):
 @numba.njit(cache=True)
 def coulomb_law(q, v, t, p):
     return -p[0] * math.tanh(v / p[1])
+
+
+@numba.njit(cache=True)
+def direction_law(q, v, t, p):
+    return -(p[0] if v > 0.0 else p[1]) * math.tanh(v / p[2])
 
 
 @numba.njit(cache=True)
@@ -198,6 +212,17 @@ def _coulomb_signature(effect, model, motion, grid=None) -> list[Signature]:
     ]
 
 
+def _direction_signature(effect, model, motion, grid=None) -> list[Signature]:
+    joints = find_joints(effect, model.plant)
+    slow = velocity_unit(joints[0])
+    entries = [
+        lambda q, v, u: np.tanh(np.maximum(v, 0.0) / slow),
+        lambda q, v, u: np.tanh(np.minimum(v, 0.0) / slow),
+    ]
+    names = ["coulomb_plus", "coulomb_minus"]
+    return [at_joints(effect, names, motion, joints, entries)]
+
+
 def _stribeck_signature(effect, model, motion, grid=None) -> list[Signature]:
     joints = find_joints(effect, model.plant)
     slow = velocity_unit(joints[0])
@@ -213,6 +238,31 @@ def _stribeck_signature(effect, model, motion, grid=None) -> list[Signature]:
         names = ["coulomb", "static"]
         found.append(at_joints(effect, names, motion, joints, entries, held))
     return found
+
+
+def _load_signature(effect, model, motion, grid=None) -> list[Signature]:
+    """Linear in the share of the torque that all else needs."""
+    needed = model.inverse_dynamics(motion.q, motion.v, motion.vd, motion.time)
+    columns = _load_column(effect, model, motion, needed)[:, :, None]
+    return [without_momentum(effect, ["share"], columns)]
+
+
+def _load_column(effect, model, motion, needed) -> np.ndarray:
+    column = np.zeros_like(motion.v)
+    for joint in find_joints(effect, model.plant):
+        i = joint.velocity_start()
+        direction = np.tanh(motion.v[:, i] / velocity_unit(joint))
+        column[:, i] = np.abs(needed[:, i]) * direction
+    return column
+
+
+def _load_on_top(effect, model, motion, needed) -> np.ndarray:
+    return effect.parameters["share"] * _load_column(effect, model, motion, needed)
+
+
+def _load_added(effect, model, motion) -> np.ndarray:
+    needed = model.inverse_dynamics(motion.q, motion.v, motion.vd, motion.time)
+    return _load_on_top(effect, model, motion, needed)
 
 
 def _drag_signature(effect, model, motion, grid=None) -> list[Signature]:
@@ -336,6 +386,42 @@ KINDS = {
         joint_law=coulomb_law,
         joint_numbers=_coulomb_numbers,
         signature=_coulomb_signature,
+    ),
+    "joint_direction_friction": EffectKind(
+        at="joint",
+        parameters=(
+            Parameter("coulomb_plus", "N m", 0.0, 50.0, valid=">= 0"),
+            Parameter("coulomb_minus", "N m", 0.0, 50.0, valid=">= 0"),
+        ),
+        says="{at} has Coulomb friction that the model lacks: {coulomb_plus} where its "
+        "position grows, {coulomb_minus} where it falls",
+        confused_with=(
+            "joint_coulomb_friction",
+            "actuator_bias",
+            "joint_load_friction",
+            "gravity_tilt",
+        ),
+        tell_apart="let the joint rest: a bias goes on pulling, friction does not; and "
+        "move it both ways with and without load",
+        joint_law=direction_law,
+        joint_numbers=_direction_numbers,
+        signature=_direction_signature,
+    ),
+    "joint_load_friction": EffectKind(
+        at="actuator",
+        parameters=(Parameter("share", "", 0.0, 0.9, valid="share"),),
+        says="{at} loses {share} of the torque that it transmits to friction",
+        confused_with=(
+            "joint_coulomb_friction",
+            "joint_direction_friction",
+            "actuator_gain",
+            "servo_gain",
+        ),
+        tell_apart="move the joint both ways, at one speed, with and without a load",
+        path="load friction",
+        signature=_load_signature,
+        added=_load_added,
+        on_top=_load_on_top,
     ),
     "joint_stribeck_friction": EffectKind(
         at="joint",

@@ -42,7 +42,7 @@ class Parameter:
     low, high: where to search for it in robots that people build; not limits.
     neutral: the value that changes nothing; None where that is the model's own value
         (EffectKind.now) or where another parameter must be neutral instead.
-    valid: what is refused: "any" number, ">= 0" or "> 0".
+    valid: what is refused: "any" number, ">= 0", "> 0" or "share" (of 0 to below 1).
     rough: what it does jumps with it, so that it is found by trying values.
     """
 
@@ -61,7 +61,8 @@ class EffectKind:
     """A kind of effect: what it is called, what it does, how it shows.
 
     at: what it acts on: "joint" (with one degree of freedom), "actuator" (a joint that
-        scene.actuation drives or that has an actuator), "body", "free body" (where to
+        scene.actuation drives or that has an actuator), "drive" (a joint whose drive
+        has a loop of position), "body", "free body" (where to
         look for it; it may be on another), "ground" (an anchored body with shapes),
         "pair" (of bodies that touch), "channel", "length" (channels that are lengths),
         "base" (a model that stands on the world, or the world).
@@ -85,6 +86,7 @@ class EffectKind:
         joint_numbers(effect, plant, joint) -> its numbers p, up to four.
     body_law: compiled (V_WB (6,), t, p, F (6,)): adds to F the spatial force, torque
         first, on the body at its origin; body_numbers(effect) -> its numbers p.
+    drive: the number of the drive's law (DriveLaw) that its parameter replaces.
     path: what it does between command and plant, of a name in actuation_path.STEPS.
     channel: what it does to a measured channel, of a name in measurement.STEPS.
     set_in_context(old, new, plant, plant_context): other parameters without a new
@@ -94,6 +96,8 @@ class EffectKind:
     now(effect, plant, scene_graph): the parameters at which `effect` (whose own do not
         matter) would leave the model as it is; None: the neutral values.
     signature: see models/effects/signature.py; None: it is seen in simulation alone.
+    on_top(effect, model, motion, needed) -> (n, n_v): what it adds where the effort
+        that all else needs is `needed` (n, n_v); `added` is then of the model alone.
     added(effect, model, motion) -> (n, n_v): what the effect adds to the inverse
         dynamics, where the signature's unknowns are not the parameters.
     """
@@ -124,6 +128,7 @@ class EffectKind:
     body_law: Callable | None = None
     body_numbers: Callable[[Effect], list[float]] | None = None
     path: str = ""
+    drive: str = ""
     channel: str = ""
     set_in_context: Callable[[Effect, Effect, MultibodyPlant, Context], None] | None = (
         None
@@ -133,6 +138,7 @@ class EffectKind:
     )
     signature: Callable[..., list[Any]] | None = None
     added: Callable[..., Any] | None = None
+    on_top: Callable[..., Any] | None = None
 
     def parameter(self, name: str) -> Parameter:
         for each in self.parameters:
@@ -163,11 +169,16 @@ def check_parameters(effect: Effect, kind: EffectKind) -> None:
                 )
             continue
         value = effect.parameters[each.name]
-        if (each.valid == ">= 0" and not value >= 0.0) or (
-            each.valid == "> 0" and not value > 0.0
-        ):
+        good = {
+            "any": True,
+            ">= 0": value >= 0.0,
+            "> 0": value > 0.0,
+            "share": 0.0 <= value < 1.0,
+        }[each.valid]
+        if not good:
+            wanted = "0 or more and below 1" if each.valid == "share" else each.valid
             raise ValueError(
-                f"effect {effect.kind}: {each.name} is {value}, expected {each.valid}"
+                f"effect {effect.kind}: {each.name} is {value}, expected {wanted}"
             )
     if kind.check is not None:
         kind.check(effect)
@@ -240,6 +251,7 @@ def _place(effect: Effect, kind: EffectKind) -> str:
     what = {
         "joint": "joint",
         "actuator": "the actuator of",
+        "drive": "joint",
         "body": "body",
         "free body": "body",
         "ground": "body",
