@@ -26,7 +26,14 @@ from makebreak.models.scene import (
     path_numbers,
     read_scene,
 )
+from makebreak.systems.numerics.filters import (
+    Stage,
+    filtered,
+    subdivided,
+    with_lag,
+)
 
+FILTERED_SEC = 0.0026  # A signal's samples before a filter are no further apart.
 COMMANDS = ("effort_command", "position_command", "velocity_command")
 POSE = "qw qx qy qz x y z".split()
 TWIST = "wx wy wz vx vy vz".split()
@@ -248,6 +255,8 @@ class SceneSimulation:
         start_sec: float | None = None,
         initial_is_true: bool = False,
         twists: Mapping[str, tuple[float, float]] | None = None,
+        filters: Mapping[str, Sequence[Stage]] | None = None,
+        before: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None,
     ) -> np.ndarray:
         """What the channels would measure, (n, n_channels) [SI].
 
@@ -262,6 +271,11 @@ class SceneSimulation:
             initial_is_true: whether `initial` has no offsets, biases and scales.
             twists: {joint: (twist, its rate)} at the start, of joints behind an
                 elastic element or a gap; those not named start as at rest.
+            filters: {channel: stages} between true and measured values, beside the
+                scene's own sensor_lag.
+            before: {channel: (times (k,), true values (k,))} up to start_sec, for
+                filters to remember; without, a channel is taken to have gone on as it
+                starts.
         Returns: NaN from where Drake could not go on (`failure` then says why), and
             where the time that a sample shows is before the window.
         Raises: ValueError for an unknown channel, joint, body or command.
@@ -275,7 +289,18 @@ class SceneSimulation:
         shown = {
             channel: (times - m.delay) / (1.0 + m.skew) for channel, m in maps.items()
         }
-        needed = np.unique(np.concatenate([times, *shown.values()]))
+        stages = {}
+        for channel in channels:
+            own = tuple((filters or {}).get(channel, ()))
+            for lag in maps.get(channel, ChannelMap()).lags:
+                own = with_lag(own, lag)
+            if own:
+                stages[channel] = own
+        between = np.zeros(0)
+        if stages:
+            edges = np.concatenate([[start], times[times > start]])
+            between = subdivided(edges, FILTERED_SEC)
+        needed = np.unique(np.concatenate([times, *shown.values(), between]))
         needed = needed[needed >= start - 1e-9]
         self._set_commands(commands)
         efforts = any(self._channels[channel][0] == "effort" for channel in channels)
@@ -290,6 +315,10 @@ class SceneSimulation:
         for i, channel in enumerate(channels):
             at = shown.get(channel, times)
             value = self._true_channel(channel, x, effort, poses)
+            if channel in stages:
+                value = _behind(stages[channel], needed, value, (before or {}).get(
+                    channel
+                ))  # fmt: skip
             here = np.searchsorted(needed, at - 1e-9)
             column = np.full(len(times), np.nan)
             good = (here < len(needed)) & (at >= start - 1e-9)
@@ -739,6 +768,16 @@ def stand_on_ground(plant, context, scene_graph, graph_context, thing) -> float:
         if abs(down) < 1e-9:
             break
     return float(q[at])
+
+
+def _behind(stages, times, values, before) -> np.ndarray:
+    """(n,) values behind filters that remember what was before."""
+    if before is None or not len(before[0]) or len(times) + len(before[0]) < 2:
+        return filtered(stages, times, values) if len(times) > 1 else values
+    since = before[0] < times[0] - 1e-9 if len(times) else np.ones(len(before[0]), bool)
+    t = np.concatenate([before[0][since], times])
+    x = np.concatenate([before[1][since], values])
+    return filtered(stages, t, x)[int(since.sum()) :]
 
 
 def _padded(efforts: dict[str, list], n: int) -> dict[str, np.ndarray]:

@@ -11,6 +11,7 @@ from makebreak.gap.findings import (
 )
 from makebreak.gap.recording import Recording, unit_of
 from makebreak.gap.table import TWIST
+from makebreak.systems.numerics.filters import filtered
 from makebreak.systems.numerics.signal_relation import (
     Relation,
     angular_velocity,
@@ -55,6 +56,7 @@ def _velocity_findings(
     if relation is None or relation.residual > 0.3 * relation.signal:
         return []
     found, r = [], relation
+    filters = recording.channels[name].stages
     # Noise of the position makes the scale too small, by at most its share of power.
     faded = 2.0 * (r.residual / r.signal) ** 2
     unit = unit_of(name.rsplit(".", 1)[1])
@@ -93,6 +95,8 @@ def _velocity_findings(
             "position"
         )
         half = abs(r.lag / r.period - 0.5) < 0.1
+        if filters:
+            says += ", beyond its declared filter"
         says += ", as a backward difference of it would." if half else "."
         add("velocity_lag", r.lag, "s", "warning", says)
     return found
@@ -119,7 +123,9 @@ def _spin_findings(recording: Recording, at: str) -> list[Finding]:
                 # By the samples themselves; a lag is small beside another frame.
                 wrong = np.interp(t_w, middle, rate[:, j]) - w
                 left[frame] += float(np.sum(wrong**2))
-            relation = relate(t_w, w, middle, world[:, j], width=_width(len(t)))
+            stages = recording.channels[name].stages or ()
+            behind = filtered(stages, middle, world[:, j])
+            relation = relate(t_w, w, middle, behind, width=_width(len(t)))
             if relation is not None:
                 parts.append(relation)
         found += _velocity_findings(recording, name, _together(parts))
@@ -217,6 +223,12 @@ def _related(
         if min(len(t_y), len(t_x)) < 20:
             continue
         width = _width(min(len(t_y), len(t_x)))
+        if not held:
+            # Each behind the other's declared filters: they then have the same ones.
+            values_y, values_x = (
+                filtered(recording.channels[b].stages or (), t, values)
+                for t, values, b in ((t_y, values_y, x), (t_x, values_x, y))
+            )
         relation = relate(t_y, values_y, t_x, values_x, order, held, width=width)
         if relation is not None:
             parts.append(relation)

@@ -10,9 +10,11 @@ import numpy as np
 
 from makebreak.gap.check_motion import check_excitation, check_gravity
 from makebreak.gap.check_relations import check_relations
+from makebreak.gap.data.filters import EXAMPLES
 from makebreak.gap.findings import Finding, JointFacts, SceneFacts, longest_sec
 from makebreak.gap.recording import Channel, Recording, unit_of
 from makebreak.gap.table import COMMANDS
+from makebreak.systems.numerics.filters import mean_delay
 
 
 def check_recordings(
@@ -26,6 +28,7 @@ def check_recordings(
     found: list[Finding] = []
     for recording in recordings:
         found += _notes(recording)
+        found += check_filters(recording)
         found += check_clock(recording)
         found += check_units(recording, facts)
         found += check_relations(recording)
@@ -105,6 +108,33 @@ def check_clock(recording: Recording) -> list[Finding]:
                     f"longest hole is {longest * 1e3:.3g} ms.",
                 )
             )
+    return found
+
+
+def check_filters(recording: Recording) -> list[Finding]:
+    """What is made of the filters that the sidecar declares: one finding a text."""
+    by_text: dict[str, list[Channel]] = {}
+    for channel in recording.channels.values():
+        if channel.filter:
+            by_text.setdefault(channel.filter, []).append(channel)
+    found = []
+    for text, channels in by_text.items():
+        name = channels[0].name
+        others = f" and {len(channels) - 1} more" if len(channels) > 1 else ""
+        stages = channels[0].stages
+        if stages is None:
+            kind, late, severity = "filter_unknown", 0.0, "warning"
+            says = (
+                f'The filter of {name}{others}, "{text}", is none that can be '
+                f"simulated, and is left out: expected one as {EXAMPLES}."
+            )
+        else:
+            kind, late, severity = "filter_declared", mean_delay(stages), "info"
+            says = (
+                f'{name}{others} is compared behind its declared filter, "{text}": '
+                f"{late * 1e3:.3g} ms late."
+            )
+        found.append(Finding(kind, recording.name, name, late, "s", severity, says))
     return found
 
 

@@ -26,7 +26,7 @@ from makebreak.gap.recording import Episode, Recording
 from makebreak.gap.result import GapResult, Series
 from makebreak.models.effects.kind import full_name, one_dof_joints
 from makebreak.models.scene import InitialSection, LoadedScene, Scene, load_scene
-from makebreak.systems.numerics.smoother import smooth
+from makebreak.systems.numerics.smoother import smooth_filtered
 
 _LEAST_SEC = 1.5  # Of motion; a window alone is too short for the eye.
 _WHOLE_SEC = 3.0  # An episode that is no longer is shown from its start.
@@ -213,7 +213,8 @@ def _value_and_rate(
     at = np.unique(np.append(t, time))
     samples = np.full(len(at), np.nan)
     samples[np.searchsorted(at, t)] = value
-    found = smooth(at, samples, max(recording.channels[channel].noise, 1e-12))
+    own = recording.channels[channel]
+    found = smooth_filtered(at, samples, max(own.noise, 1e-12), own.stages or ())
     k = int(np.searchsorted(at, time))
     return float(found.x[k, 0]), float(found.x[k, 1])
 

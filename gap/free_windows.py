@@ -17,8 +17,9 @@ from makebreak.gap.windows import TURN, WindowedResidual, spin_of
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
+from makebreak.systems.numerics.filters import Stage, filtered, mean_delay
 from makebreak.systems.numerics.free_body import FreeBody, lowest_gap, placed, simulate
-from makebreak.systems.numerics.smoother import smooth
+from makebreak.systems.numerics.smoother import smooth_filtered
 
 AFTER_SEC = 0.1  # Of a window after its impact.
 LONG_SEC, LEAST_SEC = 2.0, 0.25  # Windows in which nothing hits: a tilt of 0.01
@@ -31,6 +32,7 @@ ENOUGH = 30  # Windows up to the first impact: then later ones are not needed.
 FEWEST_ROWS = 8
 UNEVEN = 0.5  # Of the error of all windows: what is held out must have as much of it.
 NEAR = 2e-3  # [m] So near it is taken to touch.
+DENSE = 4  # Parts of a row's period at which a signal before a filter is simulated.
 _PLACE = ("x", "y", "z")
 _STATE = (*TURN, *_PLACE, "wx", "wy", "wz", "vx", "vy", "vz")
 
@@ -96,6 +98,11 @@ class FreeBodyModel(WindowedResidual):
         size = float((reach + self._body.spheres[:, 3]).max())
         # Errors beyond the body's size, or a radian, say no more than these.
         self._cap = np.array([self._most(c, size) for c in self.channels])
+        # What recordings say of their sensors.
+        self._filters: list[dict[str, tuple[Stage, ...]]] = [
+            {c: stages for c in self.channels if (stages := r.channels[c].stages)}
+            for r in recordings
+        ]
         self._after = after_sec
         self.windows: list[Window] = []
         number = 0
@@ -148,12 +155,15 @@ class FreeBodyModel(WindowedResidual):
         rough = np.zeros(len(time), bool)
         for a in _PLACE:
             c = f"{self.name}.{a}"
-            s = smooth(time, values[c], recording.channels[c].noise)
+            stages = recording.channels[c].stages or ()
+            s = smooth_filtered(time, values[c], recording.channels[c].noise, stages)
             rough |= np.abs(s.x[:, 2]) > HIT
         hit = np.flatnonzero(rough)
         near = np.zeros(len(time), bool)
-        for k in hit:
-            near[max(k - BESIDE, 0) : k + BESIDE + 1] = True
+        late = max(mean_delay(recording.channels[c].stages or ()) for c in values)
+        for k in hit:  # What a filter remembers of it is gone after a while.
+            gone = int(np.searchsorted(time, time[k] + 4.0 * late))
+            near[max(k - BESIDE, 0) : gone + BESIDE + 1] = True
         edges = np.flatnonzero(np.diff(np.concatenate([[1], near, [1]]).astype(int)))
         for a, b in zip(edges[::2], edges[1::2], strict=True):
             before = int(np.sum(np.diff(rough[:a].astype(int), prepend=0) == 1))
@@ -173,7 +183,9 @@ class FreeBodyModel(WindowedResidual):
         for k, name in enumerate((*TURN, *_PLACE)):
             c = f"{self.name}.{name}"
             if c in values:
-                s = smooth(time[a:b], values[c][a:b], recording.channels[c].noise)
+                stages = recording.channels[c].stages or ()
+                noise = recording.channels[c].noise
+                s = smooth_filtered(time[a:b], values[c][a:b], noise, stages)
                 states[:, k], spreads[:, k] = s.x, s.P[:, :2, :2]
                 # Where the acceleration jumps (it comes to rest, say) a smoothed state
                 # is wrong by more than it knows.
@@ -285,11 +297,19 @@ class FreeBodyModel(WindowedResidual):
             if lowest_gap(body, np.concatenate([q, place])) < 0.03 * radius:
                 spin = np.array([-velocity[1], velocity[0], 0.0]) / radius
         times = self.recordings[w.recording].time[w.rows]
-        x = simulate(body, np.concatenate([q, place, spin, velocity]), times)
+        filters = self._filters[w.recording]
+        n = DENSE if filters and len(times) > 1 else 1
+        rows = np.arange(len(times))
+        dense = np.interp(np.arange(n * (len(times) - 1) + 1) / n, rows, times)
+        x = simulate(body, np.concatenate([q, place, spin, velocity]), dense)
         x[:, 4:7] *= length
         x[:, 10:] *= length
         columns = [_STATE.index(c.rsplit(".", 1)[-1]) for c in self.channels]
-        return x[:, columns]
+        y = x[:, columns]
+        for k, channel in enumerate(self.channels):
+            if channel in filters and n > 1:
+                y[:, k] = filtered(filters[channel], dense, y[:, k])
+        return y[::n]
 
     def simulate(self, effects: Sequence[Effect] = ()) -> list[np.ndarray]:
         """(n, n_channels) of each window, in the scene with these effects added."""

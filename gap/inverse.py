@@ -17,10 +17,18 @@ from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.effects.measured_channels import acts_on
 from makebreak.models.effects.signature import Motion, added_effort
 from makebreak.models.scene import Scene
-from makebreak.systems.numerics.smoother import smooth
+from makebreak.systems.numerics.filters import (
+    LowPass,
+    Stage,
+    filtered,
+    mean_delay,
+    subdivided,
+    with_lag,
+)
+from makebreak.systems.numerics.smoother import smooth_filtered
 from makebreak.systems.numerics.weak_form import Bumps, make_bumps
 
-SENSED = ("joint_offset", "sensor_delay", "clock_skew", "sensor_bias")
+SENSED = ("joint_offset", "sensor_delay", "sensor_lag", "clock_skew", "sensor_bias")
 PATH = (
     "input_delay",
     "actuator_gain",
@@ -35,6 +43,7 @@ REST_SPEED, REST_SHARE, REST_EFFORT = 0.005, 0.04, 0.3
 # off by a share of itself.
 DRIVE_VELOCITY = 0.01
 MOST_MOTIONS = 40  # That are kept in memory.
+FILTERED_SEC = 0.0026  # A signal's samples before a filter are no further apart.
 MODEL_ERROR = 2e-4  # Of a joint's rms effort: what smoothing and sampling leave.
 
 
@@ -52,11 +61,13 @@ class Track:
     step: np.ndarray  # (n_mid,) How long each of these stands for [s].
     row: np.ndarray  # (n_mid,) Whose command holds there.
     grid: np.ndarray
+    dense: np.ndarray  # (n_dense,) [s] The grid, for signals before a filter.
     q: np.ndarray
     v: np.ndarray
     vd: np.ndarray
     commands: dict[str, np.ndarray]  # Held, (n,).
     samples: dict[str, np.ndarray]  # Measured, (n,), NaN where missing.
+    stages: dict[str, tuple[Stage, ...]]  # Declared filters of measured channels.
     bumps: Bumps  # On the middles.
     row_bumps: Bumps  # On the rows.
     block: np.ndarray  # (n_bumps,) Number of the block of time.
@@ -200,12 +211,15 @@ class InverseModel:
             if np.isfinite(y).sum() < 6:
                 return None
             seen = np.concatenate([y, np.full(len(time), np.nan)])[order]
-            x = smooth(grid, seen, self.noise[i]).x
+            stages = recording.channels[f"{joint}.position"].stages or ()
+            x = smooth_filtered(grid, seen, self.noise[i], stages).x
             q[:, i], v[:, i], vd[:, i] = x.T
         held = {}
         for channel in recording.commands():
             held[channel.name] = recording.held(channel.name)[episode.rows]
         samples = {c.name: c.values[episode.rows] for c in recording.measured()}
+        stages_of = {c.name: c.stages or () for c in recording.measured()}
+        late = max(mean_delay(stages_of[f"{j}.position"]) for j in self.joints)
         # Nothing is known before the first command, and little at the ends.
         known = np.ones(len(time), bool)
         for value in held.values():
@@ -214,7 +228,7 @@ class InverseModel:
         long = np.flatnonzero(step > max(4.0 * period, 0.1 * bump_sec))
         holes += [(time[k], time[k] + step[k]) for k in long]
         holes.append((time[0] - 1.0, time[0] + 0.05))
-        holes.append((time[-1] - 0.05, time[-1] + 1.0))
+        holes.append((time[-1] - 0.05 - late, time[-1] + 1.0))
         fine = _around_reversals(time, step, grid, v)
         row = np.searchsorted(time, fine[:-1] + 1e-12, "right") - 1
         middle, step = 0.5 * (fine[1:] + fine[:-1]), np.diff(fine)
@@ -227,8 +241,9 @@ class InverseModel:
         bumps, row_bumps = _first(bumps, m), _first(row_bumps, m)
         block = ((bumps.centre - time[0]) / block_sec).astype(int)
         return Track(
-            recording.name, episode.number, time, middle, step, row, grid, q, v, vd,
-            held, samples, bumps, row_bumps, block, block % 3 != 1,
+            recording.name, episode.number, time, middle, step, row, grid,
+            subdivided(grid, FILTERED_SEC), q, v, vd, held, samples, stages_of,
+            bumps, row_bumps, block, block % 3 != 1,
         )  # fmt: skip
 
     # ----- Residuals
@@ -251,6 +266,15 @@ class InverseModel:
             at = t * scale + late
             q[:, i], v[:, i], vd[:, i] = self._at(track, i, at)
             q[:, i] -= bias
+            lag = _lag(effects, f"{joint}.position")
+            if lag:  # What a low-pass took: true = measured + T d/dt measured.
+                with_lag(track.stages[f"{joint}.position"], lag)  # Or it is refused.
+                jerk = np.gradient(vd[:, i], t)
+                q[:, i], v[:, i], vd[:, i] = (
+                    q[:, i] + lag * v[:, i],
+                    v[:, i] + lag * vd[:, i],
+                    vd[:, i] + lag * jerk,
+                )
             v[:, i] *= scale
             vd[:, i] *= scale**2
         effort = self._effort(track, effects[len(self._own) :], q, v)
@@ -294,7 +318,8 @@ class InverseModel:
             elif self.by_measured[i]:
                 y = track.samples[f"{joint}.effort_measured"]
                 good = np.isfinite(y)
-                t = track.middle - delay
+                late = mean_delay(track.stages[f"{joint}.effort_measured"])
+                t = track.middle - delay + late
                 u = np.interp(t, track.time[good], y[good])
             else:
                 continue
@@ -437,14 +462,67 @@ class InverseModel:
                 scale, late, bias = _sensing(effects, name)
                 p_scale, p_late, _ = _sensing(effects, f"{joint}.position")
                 true = (track.time - late) / scale
-                at = true * p_scale + p_late
-                seen = p_scale * self._at(track, i, at)[1] + bias
-                out[name] = _masked(track, track.samples[name] - seen)
+                stages = with_lag(track.stages[name], _lag(effects, name))
+
+                p_lag = _lag(effects, f"{joint}.position")
+
+                def rate(
+                    t, i=i, p_scale=p_scale, p_late=p_late,
+                    p_lag=p_lag,
+                ):  # fmt: skip
+                    _, v, vd = self._at(track, i, t * p_scale + p_late)
+                    return p_scale * (v + p_lag * vd)
+
+                if stages:
+                    seen = filtered(stages, track.dense, rate(track.dense), true)
+                else:
+                    seen = rate(true)
+                out[name] = _masked(track, track.samples[name] - seen - bias)
             if self.has["effort_measured"][i] and not self.by_measured[i]:
                 name = f"{joint}.effort_measured"
-                u = np.interp(track.time, track.middle, motion.effort[:, i])
-                out[name] = _masked(track, track.samples[name] - u)
+                scale, late, bias = _sensing(effects, name)
+                stages = with_lag(track.stages[name], _lag(effects, name))
+                u = motion.effort[:, i]
+                at = (track.time - late) / scale
+                u = filtered(stages, track.middle, u, np.minimum(at, track.middle[-1]))
+                out[name] = _masked(track, track.samples[name] - u - bias)
         return out
+
+    def declared_lag(self, channel: str) -> float:
+        """Time constant [s] of the slowest first-order filter that is declared; 0 where
+        there is none."""
+        slow = [
+            1.0 / s.cutoff
+            for s in self.tracks[0].stages[channel]
+            if isinstance(s, LowPass) and s.order == 1
+        ]
+        return max(slow, default=0.0)
+
+    def filter_timing(self) -> tuple[list[np.ndarray], list[float], list[str]]:
+        """Columns (m,) of the residual, standard deviations [s] and names of what is
+        not known of declared filters of velocities: at which instant of a row's period
+        they were computed. Three tolerances are half a period."""
+        columns, prior, names = [], [], []
+        for i, joint in enumerate(self.joints):
+            name = f"{joint}.velocity"
+            if not self.has["velocity"][i] or not any(
+                track.stages[name] for track in self.tracks
+            ):
+                continue
+            parts = []
+            for track, white in zip(self.tracks, self._whiteners, strict=True):
+                none = np.zeros((len(track.bumps.centre), len(self.joints)))
+                others = {f"{j}.{what}": none[:, 0] for what, j in self._other_names()}
+                _, _, vd = self._at(track, i, track.dense)
+                stages = track.stages[name]
+                rate = filtered(stages, track.dense, vd, track.time)
+                there = np.where(np.isfinite(track.samples[name]), rate, np.nan)
+                others[name] = _masked(track, -there)
+                parts.append(self._stacked(track, white, none, others))
+            columns.append(np.concatenate(parts))
+            prior.append(self.period / 6.0)
+            names.append(f"sensor_delay of {name}, delay")
+        return columns, prior, names
 
     def _stacked(self, track, white, efforts, others) -> np.ndarray:
         """Rows of one track: bump by bump, efforts of all joints, then the others."""
@@ -521,6 +599,15 @@ def _sensing(effects: Sequence[Effect], channel: str) -> tuple[float, float, flo
         scale += p.get("skew", 0.0)
         bias += p.get("bias", 0.0) + p.get("offset", 0.0)
     return scale, late, bias
+
+
+def _lag(effects: Sequence[Effect], channel: str) -> float:
+    """Time constants [s] of a channel's low-passes, added up."""
+    return sum(
+        effect.parameters["time_constant"]
+        for effect in effects
+        if effect.kind == "sensor_lag" and acts_on(effect, "lag", channel)
+    )
 
 
 def _path(effects: Sequence[Effect], joint: str):

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from makebreak.gap.data.filters import read_filter
 from makebreak.gap.table import (
     COMMANDS,
     JOINT_QUANTITIES,
@@ -19,6 +20,7 @@ from makebreak.gap.table import (
     is_channel,
     read_table,
 )
+from makebreak.systems.numerics.filters import Stage
 from makebreak.systems.numerics.signal_noise import estimate_noise
 
 FEWEST_ROWS = 10  # In an episode: fewer hold no window and no noise.
@@ -52,6 +54,7 @@ class Channel:
     noise_pole: 0 for white noise; else the estimated pole of its filter, a sample.
     step: the channel's resolution if it is quantised, else 0.
     rate_hz: samples that are there per second. filter: what the sidecar says.
+    stages: what of that is simulated; None if the text says no filter we know.
     """
 
     name: str
@@ -62,6 +65,7 @@ class Channel:
     step: float = 0.0
     rate_hz: float = 0.0
     filter: str = ""
+    stages: tuple[Stage, ...] | None = ()
 
     @property
     def model(self) -> str:
@@ -245,7 +249,7 @@ def read_recording(
     for value in (time, *columns.values()):
         value.setflags(write=False)
     channels = {
-        key: _channel(key, value, time, episodes, noise, filters)
+        key: _channel(path, key, value, time, episodes, noise, filters)
         for key, value in columns.items()
     }
     return Recording(
@@ -535,26 +539,42 @@ def _mend_quaternions(
     return flips, errors
 
 
-def _channel(name, values, time, episodes, noise, filters) -> Channel:
+def _channel(path, name, values, time, episodes, noise, filters) -> Channel:
     there, breaks, duration = [], [], 0.0
+    steps = []
     n = 0
     for episode in episodes:
         i = np.flatnonzero(~np.isnan(values[episode.rows])) + episode.first
         if len(i) > 1:
-            duration += time[i[-1]] - time[i[0]] + np.median(np.diff(time[i]))
+            steps.append(np.diff(time[i]))
+            duration += time[i[-1]] - time[i[0]] + np.median(steps[-1])
         there.append(i)
         n += len(i)
         breaks.append(n)
     rate = n / duration if duration > 0.0 else 0.0
-    text = str(filters.get(name, ""))
-    if name.rsplit(".", 1)[1] in COMMANDS:  # Known, not measured.
-        return Channel(name, values, rate_hz=rate, filter=text)
+    said = filters.get(name, "")
+    quantity = name.rsplit(".", 1)[1]
+    stages: tuple[Stage, ...] | None = ()
+    if name in filters:
+        if quantity in COMMANDS:
+            raise ValueError(
+                f"sidecar of {path}: filters of {name}: a command is known, not "
+                "measured: expected a measured channel"
+            )
+        period = float(np.median(np.concatenate(steps))) if steps else np.inf
+        try:
+            stages = read_filter(name, said, quantity, period)
+        except ValueError as error:
+            raise ValueError(f"sidecar of {path}: {error}") from None
+    text = said if isinstance(said, str) else json.dumps(said)
+    if quantity in COMMANDS:  # Known, not measured.
+        return Channel(name, values, rate_hz=rate)
     rows = np.concatenate(there)
     own = estimate_noise(values[rows], breaks[:-1], time[rows])
+    std, source = own.std, "estimated"
     if noise.get(name, 0.0) > 0.0:  # A given zero says nothing that one can weigh by.
-        std = max(noise[name], own.step / np.sqrt(12.0))
-        return Channel(name, values, std, "given", own.pole, own.step, rate, text)
-    return Channel(name, values, own.std, "estimated", own.pole, own.step, rate, text)
+        std, source = max(noise[name], own.step / np.sqrt(12.0)), "given"
+    return Channel(name, values, std, source, own.pole, own.step, rate, text, stages)
 
 
 def windows(episode: Episode, time: np.ndarray, length_sec: float) -> Iterator[slice]:

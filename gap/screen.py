@@ -149,6 +149,8 @@ def nuisances(model: InverseModel) -> tuple[np.ndarray, np.ndarray, list[str]]:
                     columns.append(x[:, k])
                     prior.append(size * now["mass"] if kind == "object_mass" else size)
                     names.append(f"{kind} of {at}, {unknown}")
+    late, period, of_what = model.filter_timing()
+    columns, prior, names = columns + late, prior + period, names + of_what
     # A mass is known to its share, whatever unit its signature has.
     if not columns:
         return np.zeros((len(model.train()), 0)), np.zeros(0), []
@@ -281,20 +283,29 @@ def _of_delays(model: InverseModel, kind: str, of) -> list[Candidate]:
 def _of_sensors(model: InverseModel, kind: str, of) -> list[Candidate]:
     joints = model.joints
     models = tuple(dict.fromkeys(j.split(".")[0] for j in joints))
-    name = {"joint_offset": "offset", "sensor_bias": "bias", "clock_skew": "skew"}
+    name = {"joint_offset": "offset", "sensor_bias": "bias", "clock_skew": "skew",
+            "sensor_lag": "time_constant"}  # fmt: skip
     velocities = tuple(
         f"{j}.velocity" for i, j in enumerate(joints) if model.has["velocity"][i]
+    )
+    efforts = tuple(
+        f"{j}.effort_measured"
+        for i, j in enumerate(joints)
+        if model.has["effort_measured"][i] and not model.by_measured[i]
     )
     positions = tuple(f"{j}.position" for j in joints)
     places: list[tuple[str, ...]]
     if kind == "joint_offset":
         places = [(j,) for j in joints]
     elif kind == "sensor_bias":
-        places = [(c,) for c in velocities]
+        places = [(c,) for c in (*velocities, *efforts)]
     elif kind == "clock_skew":
         places = [models]
     else:
-        places = [positions, velocities, *((c,) for c in velocities), models]
+        places = [positions, velocities, *((c,) for c in velocities)]
+        places += [efforts, *((c,) for c in efforts)]
+        if kind == "sensor_delay":
+            places.append(models)
     unique = [p for p in dict.fromkeys(places) if p]
     found = [_secant(model, kind, at, name.get(kind, "delay"), of) for at in unique]
     return [c for c in found if c is not None]
@@ -326,12 +337,15 @@ def _secant(model: InverseModel, kind: str, at, name: str, of) -> Candidate | No
     if kind == "sensor_delay" and all(c.endswith(".velocity") for c in at):
         steps = (0.01,)
     base, columns = model.base(), []
+    least = -np.inf
+    if kind == "sensor_lag":  # It can take from a declared filter what that has.
+        least = -0.9 * min(model.declared_lag(c) for c in at)
     for step in steps:
         moved = model.residual([Effect(kind, list(at), {name: step})])
         columns.append(((base - moved) / step)[:, None])
 
     def read(c):
-        return {name: float(c[0])}
+        return {name: max(float(c[0]), least)}
 
     if not any(np.abs(x).max(initial=0.0) > 0.0 for x in columns):
         return None

@@ -22,6 +22,7 @@ from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import Scene, load_scene
+from makebreak.systems.numerics.filters import mean_delay
 from makebreak.systems.numerics.selection import Columns, benjamini_hochberg
 
 SHAPES = 2e-4  # How well shapes are known where the scene does not say [m].
@@ -211,6 +212,10 @@ class TouchModel:
 
         def value(channel: str) -> np.ndarray:
             y = np.array(recording[channel][touch.rows])
+            # A touch is slow: behind a filter it shows late, and no more.
+            late = mean_delay(recording.channels[channel].stages or ())
+            if late:
+                y += late * _rate(recording, channel)[touch.rows]
             body = channel.rsplit(".", 1)[0]
             y += (moved or {}).get(channel, 0.0)
             for e in effects:

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 
 from makebreak.diagrams.scene_simulation import Commands, SceneSimulation
-from makebreak.gap.inverse import _sensing
+from makebreak.gap.inverse import _lag, _sensing
 from makebreak.gap.recording import Episode, Recording
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import InitialSection, Scene
-from makebreak.systems.numerics.smoother import smooth
+from makebreak.systems.numerics.filters import Stage, memory, with_lag
+from makebreak.systems.numerics.smoother import smooth_filtered
 
 _POSITIONS = ("x", "y", "z")
 TURN = ("qw", "qx", "qy", "qz")
@@ -154,6 +155,11 @@ class WindowModel(WindowedResidual):
             [max(r.channels[c].noise for r in recordings) for c in self.channels]
         )
         self.noise = np.maximum(self.noise, 1e-9)
+        # What recordings say of their sensors.
+        self._filters: list[dict[str, tuple[Stage, ...]]] = [
+            {c: stages for c in self.channels if (stages := r.channels[c].stages)}
+            for r in recordings
+        ]
         self.windows: list[Window] = []
         self._paths: dict[tuple[int, int], dict[str, np.ndarray]] = {}
         number = 0
@@ -200,7 +206,8 @@ class WindowModel(WindowedResidual):
             y = recording[name][episode.rows]
             if np.isfinite(y).sum() < 8:
                 return
-            s = smooth(time, y, recording.channels[name].noise)
+            stages = recording.channels[name].stages or ()
+            s = smooth_filtered(time, y, recording.channels[name].noise, stages)
             states[name] = s.x
             spreads[name] = s.P
             if name.rsplit(".", 1)[0] in self.bodies and name[-2:] in (
@@ -316,11 +323,48 @@ class WindowModel(WindowedResidual):
                 start_sec=w.start,
                 initial_is_true=True,
                 twists=twists(w) if twists else None,
+                filters=self._filters[w.recording],
+                before=self._before(w, episode, [*self.scene.effects, *effects]),
             )
             if self.simulation.failure:
                 y[np.isnan(y)] = np.inf
             out.append(y)
         return out
+
+    def _before(self, w: Window, episode: Episode, effects):
+        """{channel: (times, true values)} of what filters remember."""
+        filters = {}
+        for channel in self.channels:
+            own = self._filters[w.recording].get(channel, ())
+            if stages := with_lag(own, _lag(effects, channel)):
+                filters[channel] = stages
+        if not filters:
+            return None
+        path = self._paths[w.recording, episode.first]
+        time, end = path["time"], w.rows.start - episode.first + 1
+        found = {}
+        for channel, stages in filters.items():
+            since = int(np.searchsorted(time, w.start - memory(stages))) - 1
+            rows = slice(max(since, 0), end)
+            value = self._true_path(channel, path, rows)
+            if value is not None:
+                found[channel] = (time[rows], value)
+        return found
+
+    def _true_path(self, channel: str, path, rows: slice) -> np.ndarray | None:
+        at, what = channel.rsplit(".", 1)
+        if channel in path:
+            return path[channel][rows, 0]
+        if what == "velocity":
+            return path[f"{at}.position"][rows, 1]
+        if what in ("vx", "vy", "vz") and f"{at}.{what[1]}" in path:
+            return path[f"{at}.{what[1]}"][rows, 1]
+        if what in ("wx", "wy", "wz") and f"{at}.qw" in path:
+            q, dq = (
+                np.stack([path[f"{at}.{a}"][rows, k] for a in TURN]) for k in (0, 1)
+            )
+            return spin_of(q.T, dq.T)[:, "xyz".index(what[1])]
+        return None
 
     def _initial(self, w: Window, episode: Episode, effects) -> InitialSection:
         """The true state at the start, if the effects on measurement are these beside
@@ -339,6 +383,9 @@ class WindowModel(WindowedResidual):
                 at = w.start * scale + late
                 x = np.array([np.interp(at, path["time"], y) for y in path[name].T])
                 x = x * np.array([1.0, scale, scale**2])
+            lag = _lag(measured, name)
+            if lag:  # What a low-pass took: true = measured + T d/dt measured.
+                x = x + lag * np.array([x[1], x[2], 0.0])
             return x - np.array([bias, 0.0, 0.0])
 
         for joint in self.joints:
@@ -381,8 +428,8 @@ class WindowModel(WindowedResidual):
         return out
 
 
-_MEASUREMENT = ("joint_offset", "sensor_delay", "clock_skew", "sensor_bias",
-                "length_scale")  # fmt: skip
+_MEASUREMENT = ("joint_offset", "sensor_delay", "sensor_lag", "clock_skew",
+                "sensor_bias", "length_scale")  # fmt: skip
 
 
 def with_step(scene: Scene, time_step: float) -> Scene:
@@ -401,6 +448,7 @@ def _length_scale(effects, body: str) -> float:
 
 
 def spin_of(q, dq) -> np.ndarray:
-    """(3,) rate of turn in the world [rad/s], of a unit quaternion (4,) wxyz and its
-    rate: the vector part of 2 dq q*. What of dq lies along q does not count."""
-    return 2.0 * (q[0] * dq[1:] - dq[0] * q[1:] - np.cross(dq[1:], q[1:]))
+    """(..., 3) rate of turn in the world [rad/s], of a unit quaternion (..., 4) wxyz
+    and its rate: the vector part of 2 dq q*. What of dq lies along q does not count."""
+    v, dv = q[..., 1:], dq[..., 1:]
+    return 2.0 * (q[..., :1] * dv - dq[..., :1] * v - np.cross(dv, v))

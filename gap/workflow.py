@@ -246,6 +246,8 @@ def _background_effects(model: InverseModel, names, values) -> list[Effect]:
     shifts: dict[str, np.ndarray] = {}
     for name, b in zip(names, values, strict=True):
         kind, rest = name.split(" of ", 1)
+        if kind == "sensor_delay":  # No part of the scene.
+            continue
         at, unknown = rest.rsplit(", ", 1)
         if kind == "object_mass":
             masses[at] = float(b)

@@ -7,6 +7,7 @@ the joints in drives.py; here is how a plant is made of it.
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,7 @@ from makebreak.models.drives import (
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.actuation_path import SHARE, TIME_CONSTANT, PathPorts
 from makebreak.models.effects.body_forces import BodyForces
-from makebreak.models.effects.delay_line import DelayLine
+from makebreak.models.effects.delay_line import DelayLine, LagLine
 from makebreak.models.effects.joint_forces import JointForces
 from makebreak.models.effects.kind import (
     Effect,
@@ -154,6 +155,12 @@ class LoadedScene:
                 self.plant.get_state_output_port(), measured.GetInputPort("state")
             )
         port = measured.GetOutputPort("y")
+        for lags in zip_longest(*(channel.lags for channel in each), fillvalue=0.0):
+            # Below 0: less than a recording's declared filter, which is not in here.
+            slow = np.maximum(lags, 0.0)
+            line = builder.AddSystem(LagLine(slow, step_or_default(self.plant)))
+            builder.Connect(port, line.get_input_port())
+            port = line.get_output_port()
         delays = [channel.delay for channel in each]
         if any(delays):
             line = builder.AddSystem(DelayLine(delays, step_or_default(self.plant)))

@@ -1,4 +1,4 @@
-"""A delay, one for each entry of a vector."""
+"""A delay, or a low-pass, one for each entry of a vector."""
 
 import numpy as np
 from pydrake.systems.framework import LeafSystem
@@ -63,3 +63,47 @@ class DelayLine(LeafSystem):
             older = samples[min(k + 1, self._length - 1), i]
             y[i] = (1.0 - share) * samples[k, i] + share * older
         output.SetFromVector(y)
+
+
+class LagLine(LeafSystem):
+    """T_i dy_i/dt = u_i - y_i, exact for lines between samples of u every period; T_i
+    of 0 lets u_i through. It starts as if u had always been what it is at the start.
+
+    Inputs:  u (n,); zero if it is not connected.
+    Outputs: y (n,), as of the last sample.
+
+    Args: time_constants: (n,) [s], each 0 or more; period_sec: of the samples.
+    """
+
+    def __init__(self, time_constants, period_sec: float):
+        super().__init__()
+        T = np.array(time_constants, dtype=float)
+        if not (T >= 0.0).all():
+            raise ValueError(f"time constants are {T}, expected 0 or more [s]")
+        self._n, self._through = T.size, T <= 1e-3 * period_sec
+        safe = np.where(self._through, 1.0, T)
+        self._keep = np.exp(-period_sec / safe)
+        # Of a line's end: what of its rise over the period has arrived.
+        self._rise = 1.0 - (1.0 - self._keep) * safe / period_sec
+        self._u = self.DeclareVectorInputPort("u", self._n)
+        self._last = self.DeclareDiscreteState(2 * self._n)  # u, then y.
+        self.DeclareVectorOutputPort("y", self._n, self._calc)
+        self.DeclareInitializationDiscreteUpdateEvent(self._start)
+        self.DeclarePeriodicDiscreteUpdateEvent(period_sec, 0.0, self._shift)
+
+    def _now(self, context):
+        return self._u.Eval(context) if self._u.HasValue(context) else np.zeros(self._n)
+
+    def _start(self, context, discrete_state):
+        now = self._now(context)
+        discrete_state.set_value(self._last, [*now, *now])
+
+    def _shift(self, context, discrete_state):
+        u, y = context.get_discrete_state(self._last).value().reshape(2, -1)
+        now = self._now(context)
+        y = u + self._keep * (y - u) + self._rise * (now - u)
+        discrete_state.set_value(self._last, [*now, *y])
+
+    def _calc(self, context, output):
+        y = context.get_discrete_state(self._last).value()[self._n :]
+        output.SetFromVector(np.where(self._through, self._now(context), y))

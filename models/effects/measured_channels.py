@@ -15,17 +15,19 @@ BODY = "x y z qw qx qy qz vx vy vz wx wy wz".split()
 WRENCH = "fx fy fz tx ty tz".split()
 LENGTHS = ("x", "y", "z", "vx", "vy", "vz")
 # What a kind of effect may name as its step.
-STEPS = ("offset", "delay", "skew", "bias", "scale")
+STEPS = ("offset", "delay", "skew", "bias", "scale", "lag")
 
 
 @dataclass(frozen=True)
 class ChannelMap:
-    """measured(t) = scale true((t - delay) / (1 + skew)) + bias."""
+    """measured(t) = scale true((t - delay) / (1 + skew)) + bias, the true value behind
+    first-order low-passes, each with its time constant in `lags`."""
 
     scale: float = 1.0
     bias: float = 0.0  # [unit of the channel]
     delay: float = 0.0  # [s]
     skew: float = 0.0  # [s/s]
+    lags: tuple[float, ...] = ()  # [s]
 
     def true_value(self, measured):
         """The value that is measured so, without the shift in time."""
@@ -72,6 +74,8 @@ def channel_maps(
                 total = replace(total, delay=total.delay + value)
             elif step == "skew":
                 total = replace(total, skew=total.skew + value)
+            elif step == "lag":
+                total = replace(total, lags=(*total.lags, value))
             else:
                 total = replace(total, scale=total.scale * value)
         if total != ChannelMap():

@@ -2,8 +2,9 @@
 
     measured(t) = scale true((t - delay) / (1 + skew)) + bias
 
-An offset is in a joint's encoder: the drive of a position-controlled joint sees it as
-well. All others are in the recorded channel alone.
+A sensor_lag is a first-order low-pass before that: T dy/dt = true - y. An offset is in
+a joint's encoder: the drive of a position-controlled joint sees it as well. All others
+are in the recorded channel alone.
 """
 
 from dataclasses import dataclass, replace
@@ -55,7 +56,7 @@ def _signature(step: str, unknown: str, to_parameters):
             add = _derivative(step, motion.time, value, rate)
             channels[channel] = add[:, None]
             getattr(error, what)[:, i] = add
-            if what == "v" and step in ("delay", "skew", "scale"):
+            if what == "v" and step in ("delay", "skew", "scale", "lag"):
                 error.vd[:, i] = _derivative(
                     step, motion.time, motion.vd[:, i], jerk[:, i]
                 )
@@ -88,7 +89,7 @@ def _signature(step: str, unknown: str, to_parameters):
 def _derivative(step, time, value, rate):
     if step in ("offset", "bias"):
         return np.ones_like(value)
-    if step == "delay":
+    if step in ("delay", "lag"):  # To first order they are the same.
         return -rate
     if step == "skew":
         return -time * rate
@@ -136,11 +137,25 @@ KINDS = {
         at="channel",
         parameters=(Parameter("delay", "s", 0.0, 0.1, valid=">= 0"),),
         says="{at} is measured {delay} late",
-        confused_with=("input_delay", "actuator_lag", "clock_skew"),
+        confused_with=("input_delay", "actuator_lag", "clock_skew", "sensor_lag"),
         tell_apart="record when commands are received, or a second channel of the same "
         "motion",
         channel="delay",
         signature=_signature("delay", "delay", lambda c: {"delay": float(c[0])}),
+    ),
+    "sensor_lag": EffectKind(
+        at="channel",
+        # Below 0: less than what the recording's sidecar declares.
+        parameters=(Parameter("time_constant", "s", -0.05, 0.2),),
+        says="{at} is low-passed, first order, with a time constant of {time_constant} "
+        "beyond what is declared",
+        confused_with=("sensor_delay",),
+        tell_apart="move faster: near 1/(2 pi time constant) a low-pass makes swings "
+        "smaller, a delay does not",
+        channel="lag",
+        signature=_signature(
+            "lag", "time_constant", lambda c: {"time_constant": float(c[0])}
+        ),
     ),
     "clock_skew": EffectKind(
         at="channel",

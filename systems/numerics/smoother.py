@@ -6,10 +6,21 @@ uneven and missing samples. Source: Rauch, Tung, Striebel, AIAA J. 3(8), 1965; a
 spline: Wahba, Spline Models for Observational Data, 1990, section 1.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from scipy.interpolate import CubicHermiteSpline
+
+from makebreak.systems.numerics.filters import (
+    Stage,
+    filtered,
+    mean_delay,
+    subdivided,
+)
+
+_REFINED = 4  # Times at most that what a filter took is put back.
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +63,42 @@ def smooth(times, samples, noise: float, density: float | None = None) -> Smooth
     x = x * spread
     x[:, 0] += shift
     return Smoothed(x, P * spread**2, density * spread**2, innovation)
+
+
+def smooth_filtered(
+    times, samples, noise: float, stages: Sequence[Stage] = ()
+) -> Smoothed:
+    """The states of a true signal of which the samples are what filters let through.
+
+    First the filters count as their mean delay alone; then what the true signal found
+    so far would look like behind them is compared with the samples, and the difference
+    put back, as smooth as the signal (van Cittert's iteration). That converges as the
+    powers of 1 - H(s) exp(s mean delay), 3 % for a first-order filter of 4 ms at 10 Hz.
+
+    Args, Raises: as smooth.
+    """
+    t, y = np.asarray(times, float), np.asarray(samples, float)
+    if not stages:
+        return smooth(t, y, noise)
+    late = mean_delay(stages)
+    there = np.isfinite(y)
+    # A sample shows about what was `late` before it.
+    grid, where = np.unique(np.concatenate([t, t[there] - late]), return_inverse=True)
+    rows, stamps = where[: len(t)], where[len(t) :]
+    seen = np.full(len(grid), np.nan)
+    seen[stamps] = y[there]
+    first = smooth(grid, seen, noise)
+    x = first.x
+    # Between samples a signal is taken as a line: a few of these an interval.
+    dense = subdivided(grid, 0.1 * float(np.median(np.diff(t))))
+    for _ in range(_REFINED):
+        guess = CubicHermiteSpline(grid, x[:, 0], x[:, 1])(dense)
+        seen[stamps] = y[there] - filtered(stages, dense, guess, t[there])
+        more = smooth(grid, seen, noise, first.density).x
+        if np.sqrt(np.mean(more[:, 0] ** 2)) < 0.5 * noise:
+            break  # What is put back now is noise.
+        x = x + more
+    return Smoothed(x[rows], first.P[rows], first.density, first.innovation)
 
 
 @njit(cache=True)
