@@ -300,13 +300,13 @@ def _reproduce(args) -> int:
             if not hasattr(module, "reproduce"):
                 raise ValueError(f"{name} has nothing to reproduce")
             if hasattr(module, "check"):
-                module.check()
+                module.check(args.which)
     seeds = int(_number(args.seeds, "--seeds", 1, whole=True))
     jobs = _jobs(args.jobs)
     out = Path(args.out) if args.out else _default_out("reproduce")
     with Session(out, reuse=args.reuse, command="reproduce") as session:
         try:
-            status = _reproduce_in(session, modules, seeds, jobs)
+            status = _reproduce_in(session, modules, seeds, jobs, args)
         except KeyboardInterrupt:
             _say_files(session.finish(complete=False))
             raise
@@ -315,7 +315,7 @@ def _reproduce(args) -> int:
     return status
 
 
-def _reproduce_in(session, modules, seeds: int, jobs: int) -> int:
+def _reproduce_in(session, modules, seeds: int, jobs: int, args) -> int:
     """The tables of all modules. Returns: the exit status."""
     from makebreak.scripts.hypotheses import verdicts
 
@@ -334,9 +334,10 @@ def _reproduce_in(session, modules, seeds: int, jobs: int) -> int:
 
     for name, module in modules.items():
         if hasattr(module, "reproduce"):
+            extra = (args.which, args.only) if name in _BENCHMARKS else ()
             with session.child(name) as child:
                 try:
-                    table = module.reproduce(child, seeds, jobs)
+                    table = module.reproduce(child, seeds, jobs, *extra)
                 except Exception:  # Not the user's doing: all input is checked above.
                     traceback.print_exc()
                     return 3
@@ -463,6 +464,13 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("experiments", nargs="*", metavar="EXPERIMENT", help="or: gap")
     p.add_argument("--seeds", default="10", metavar="N", help="trials per case (10)")
     p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
+    p.add_argument(
+        "--set", dest="which", default="standard", metavar="SET",
+        help="of gap: standard, development, logs-development, logs-final",
+    )  # fmt: skip
+    p.add_argument(
+        "--only", default="", metavar="TEXT", help="of gap: cases with this in the name"
+    )
     p.add_argument(
         "--reuse", action="store_true", help="keep trials of an earlier time"
     )

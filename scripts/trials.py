@@ -1,6 +1,7 @@
 """Runs one experiment many times, each in a process of its own, several at once."""
 
 import json
+import math
 import os
 import re
 import subprocess
@@ -137,19 +138,23 @@ def run_commands(
     folders: Sequence[Path],
     jobs: int,
     is_done: Callable[[int], bool] = lambda i: False,
+    ended: Callable[[int, dict], None] = lambda i, result: None,
+    limit_sec: float = math.inf,
 ) -> list[dict]:
     """Runs commands that each write result.json into a folder, `jobs` at a time, with
     one thread each and their output in the folder's log.txt. Ctrl-C, SIGTERM or SIGHUP
     ends all of them; one that fails is reported and does not stop the others.
 
     Args: label, of the progress bar; is_done(i): whether the folder has the result
-        already.
+        already; ended(i, result): called as each has ended; limit_sec: after so long
+        [s] a command is stopped, and has failed.
     Returns: per command its result.json; of a failed one `success` False and `error`,
         the last line that it printed.
     """
     results: list[dict] = [{} for _ in commands]
     waiting = list(range(len(commands)))
     running: dict[int, subprocess.Popen] = {}
+    started: dict[int, float] = {}
     env = _environment()
 
     before: dict[int, int] = {}  # When the folder's earlier result was written.
@@ -163,6 +168,7 @@ def run_commands(
                     i = waiting.pop(0)
                     if is_done(i):
                         results[i] = _read(folders[i], 0)
+                        ended(i, results[i])
                         bar.update()
                         continue
                     folders[i].mkdir(parents=True, exist_ok=True)
@@ -176,14 +182,24 @@ def run_commands(
                             env=env,
                             start_new_session=True,  # Ctrl-C reaches us alone.
                         )
+                    started[i] = time.monotonic()
                 for i, process in list(running.items()):
                     status: int | None = process.poll()
-                    if status is None:
+                    late = time.monotonic() - started[i] > limit_sec
+                    if status is None and not late:
                         continue
+                    if status is None:
+                        process.kill()
+                        process.wait()
+                        error = f"stopped after {limit_sec:.0f} s"
+                        result = {"success": False, "error": error}
+                    else:
+                        result = _read(folders[i], status)
                     del running[i]
                     if status in (0, 1) and _written(folders[i]) == before[i]:
-                        status = None  # The result is another run's.
-                    results[i] = result = _read(folders[i], status)
+                        result = _read(folders[i], None)  # It is another run's.
+                    results[i] = result
+                    ended(i, result)
                     if "error" in result:
                         bar.write(f"{folders[i].name}: {result['error']}", sys.stderr)
                     bar.update()

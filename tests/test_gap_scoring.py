@@ -2,13 +2,14 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from makebreak.scripts import cli, gap_benchmark
-from makebreak.scripts.gap_benchmark import (
+from makebreak.scripts.gap_scoring import (
     Score,
     parameter_errors,
     same_place,
@@ -165,9 +166,14 @@ def test_the_table_counts_and_names_what_went_wrong():
     assert invented.missed == 1
 
 
+def made_by(maker, monkeypatch):
+    every = {k: replace(v, maker=maker) for k, v in gap_benchmark.SETS.items()}
+    monkeypatch.setattr(gap_benchmark, "SETS", every)
+
+
 def test_where_the_benchmark_is_absent_one_line_says_so(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(gap_benchmark, "MAKER", tmp_path / "tests/cases.py")
+    made_by(tmp_path / "tests/cases.py", monkeypatch)
     assert cli.main(["reproduce", "gap"]) == 2
     shown = capsys.readouterr().err
     assert "is in a checkout of makebreak" in shown and shown.count("\n") == 1
@@ -205,7 +211,7 @@ def test_the_whole_way_from_the_cases_to_the_table(monkeypatch, tmp_path):
     """With a maker and a workflow that know one answer: no gap."""
     (tmp_path / "cases.py").write_text(MAKER)
     (tmp_path / "gap.py").write_text(GAP)
-    monkeypatch.setattr(gap_benchmark, "MAKER", tmp_path / "cases.py")
+    made_by(tmp_path / "cases.py", monkeypatch)
     monkeypatch.setattr(
         gap_benchmark,
         "makebreak_command",

@@ -1,0 +1,338 @@
+"""Scores a result of `makebreak gap` against what was hidden."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from makebreak.scripts.table import Table
+
+VERDICTS = ("no_gap", "gap_named", "ambiguous", "gap_unnamed")
+
+
+@dataclass(frozen=True)
+class Goals:
+    """Of the project; shares, and the median relative error of a parameter."""
+
+    verdict: float = 0.9
+    first: float = 0.85
+    error: float = 0.1
+    closed: float = 0.85
+    covered: float | None = None
+
+
+STANDARD = Goals()
+LOGS = Goals(verdict=0.92, first=0.9, error=0.05, covered=0.85)
+
+_DRIVES = ("actuator_", "input_delay")
+_ONE_CHANNEL = ("sensor_bias", "sensor_delay", "sensor_lag")
+_INTERVAL = 2.0  # Standard deviations, either way.
+
+
+@dataclass(frozen=True)
+class Score:
+    """How one case went. None: not asked of this case.
+
+    verdict: what is right, several where the data leave it open.
+    first: whether the first effect is a hidden one, or one that by the benchmark's own
+        computation cannot be told from it; first_or_tied: or says that it cannot be
+        told from one.
+    errors: relative errors of the parameters of the hidden effects that were named;
+        inside: for each parameter, whether it lies in its interval.
+    named, needed: how many of the hidden effects that show were named, of how many.
+    """
+
+    name: str
+    verdict: str
+    found: str  # What was said; "failed" if nothing was.
+    first: bool | None
+    first_or_tied: bool | None
+    errors: tuple[float, ...]
+    closed: float | None  # Share of the reducible gap, on held-out data.
+    extra: int  # Effects that are not hidden.
+    seconds: float
+    says: str
+    inside: tuple[bool, ...] = ()
+    named: int = 0
+    needed: int = 0
+
+    @property
+    def right(self) -> bool:
+        return self.found in self.verdict.split(" or ")
+
+
+def score(
+    truth: Mapping,
+    result: Mapping,
+    driven: Sequence[str] = (),
+    seconds: float = float("nan"),
+) -> Score:
+    """How well a result tells what was hidden.
+
+    Args: truth, of the benchmark: effects, each perhaps with `equivalents` (what the
+        recording cannot tell from it, with their own parameters) and `needed` (whether
+        it shows), `verdict` or `verdicts`, `ties` of kinds; result, a result.json, or
+        one with `error` in it; driven, the joints that the scene drives.
+    """
+    verdicts = truth.get("verdicts") or [truth["verdict"]]
+    hidden = [] if verdicts == ["gap_unnamed"] else truth["effects"]
+    found = _members(result.get("effects") or [], driven)
+    asked = any(h.get("needed", True) for h in hidden)
+    first = tied = None
+    if asked:
+        first = bool(found) and (
+            any(_match(found[0], h, driven) is not None for h in hidden)
+            or _in_tie(found[0]["kind"], truth)
+        )
+        others = found[0].get("indistinguishable_from", []) if found else []
+        tied = first or any(
+            _match(o, h, driven) is not None for o in others for h in hidden
+        )
+    errors: list[float] = []
+    inside: list[bool] = []
+    extra = 0
+    left = list(range(len(hidden)))
+    for each in found:
+        match = [(i, _match(each, h, driven)) for i, h in enumerate(hidden)]
+        match = [(i, p) for i, p in match if p is not None]
+        if match:
+            # Of two it may be, one that nothing else was taken for.
+            i, parameters = min(match, key=lambda m: m[0] not in left)
+            left = [k for k in left if k != i]
+            errors += parameter_errors(each["parameters"], parameters)
+            inside += parameters_inside(each["parameters"], parameters)
+        elif not _in_tie(each["kind"], truth):
+            extra += 1
+    closed = None
+    if asked:
+        closed = (result.get("gap") or {}).get("reduction") or 0.0
+    needed = [i for i, h in enumerate(hidden) if h.get("needed", True)]
+    says = result.get("error") or ", ".join(
+        f"{e['kind']} at {e['at']}" for e in result.get("effects") or []
+    )
+    return Score(
+        truth["name"],
+        " or ".join(verdicts),
+        result.get("verdict", "failed"),
+        first,
+        tied,
+        tuple(errors),
+        closed,
+        extra,
+        seconds,
+        says or "nothing",
+        tuple(inside),
+        sum(i not in left for i in needed),
+        len(needed),
+    )
+
+
+# Kinds of which one value for several joints says the same of each.
+_EACH = ("joint_", "rotor_inertia", "actuator_gain", "actuator_bias")
+
+
+def _members(effects: Sequence[Mapping], driven: Sequence[str]) -> list[Mapping]:
+    """An effect on several joints as one on each."""
+    out: list[Mapping] = []
+    for each in effects:
+        at = [each["at"]] if isinstance(each["at"], str) else list(each["at"])
+        if each["kind"].startswith(_EACH) and len(at) > 1:
+            out += [{**each, "at": [one]} for one in at]
+        else:
+            out.append(each)
+    return out
+
+
+def _match(found: Mapping, hidden: Mapping, driven: Sequence[str]) -> Mapping | None:
+    """The parameters that `found` should have if it is what is hidden, or cannot be
+    told from it."""
+    for each in (hidden, *hidden.get("equivalents", ())):
+        if same_effect(found, each, driven):
+            return each["parameters"]
+    return None
+
+
+def same_effect(one: Mapping, two: Mapping, driven: Sequence[str] = ()) -> bool:
+    """Whether two effects are of one kind at one place."""
+    return one["kind"] == two["kind"] and same_place(
+        one["at"], two["at"], one["kind"], driven
+    )
+
+
+def same_place(one, two, kind: str, driven: Sequence[str] = ()) -> bool:
+    """Whether two `at` mean the same: a model is all of its joints or its one body, a
+    pair has no order."""
+    a, b = _places(one, kind, driven), _places(two, kind, driven)
+    if a == b:
+        return True
+    for whole, parts in ((a, b), (b, a)):
+        if len(whole) == 1 and "." not in (model := next(iter(whole))):
+            if kind in _ONE_CHANNEL:
+                return False
+            if all(part.startswith(f"{model}.") for part in parts):
+                return len(parts) > 1 or parts == {f"{model}.{model}"}
+    return False
+
+
+def _places(at, kind: str, driven: Sequence[str]) -> set[str]:
+    places = set()
+    for each in [at] if isinstance(at, str) else at:
+        if "~" in each:
+            sides = sorted(_body(side.strip()) for side in each.split("~"))
+            places.add("~".join(sides))
+        elif "." not in each and kind.startswith(_DRIVES):
+            of_model = [name for name in driven if name.startswith(f"{each}.")]
+            places |= set(of_model or [each])
+        else:
+            places.add(each)
+    return places
+
+
+def _body(name: str) -> str:
+    """A model that is one body, by the body's name."""
+    return name if "." in name or name == "world" else f"{name}.{name}"
+
+
+def _in_tie(kind: str, truth: Mapping) -> bool:
+    return any(kind in tie for tie in truth["ties"])
+
+
+def parameter_errors(found: Mapping, hidden: Mapping) -> list[float]:
+    """Relative errors; parts of one vector are taken together, a phase relative to
+    half a turn, an angle at which a spring rests to one radian, a patch's sides to the
+    patch. What is truly zero and alone is left out.
+
+    Args: found {name: {value, ...}} as in result.json; hidden {name: value}.
+    """
+    value = {name: float(found[name]["value"]) for name in found if name in hidden}
+    if "phase" not in value:
+        return _errors(value, hidden)
+    # F sin(wt + phase) and -F sin(wt + phase + half a turn) are the same.
+    sizes = ("fx", "fy", "fz", "amplitude")
+    other = {k: -v if k in sizes else v for k, v in value.items()}
+    other["phase"] += np.pi
+    return min(_errors(value, hidden), _errors(other, hidden), key=sum)
+
+
+def _errors(value: dict[str, float], hidden: Mapping) -> list[float]:
+    if "radius" in value and "scale" in value:
+        del value["radius"]  # The same thing, said twice.
+    errors: list[float] = []
+    vectors = (
+        ("com_x", "com_y", "com_z"), ("x", "y", "z"), ("fx", "fy", "fz"),
+        ("roll", "pitch"), ("ixx", "iyy", "izz"),
+    )  # fmt: skip
+    for names in vectors:
+        if all(name in value for name in names):
+            there = np.array([hidden[name] for name in names])
+            off = np.array([value.pop(name) for name in names]) - there
+            if np.linalg.norm(there) > 0.0:
+                errors.append(float(np.linalg.norm(off) / np.linalg.norm(there)))
+    for name, each in value.items():
+        off, size = each - hidden[name], abs(hidden[name])
+        if name == "phase":
+            off, size = (off + np.pi) % (2.0 * np.pi) - np.pi, np.pi
+        elif name == "rest":
+            size = 1.0
+        elif name[:2] in ("x_", "y_"):
+            size = abs(hidden[f"{name[:2]}max"] - hidden[f"{name[:2]}min"])
+        elif name in ("gain", "scale"):
+            size = abs(hidden[name] - 1.0)  # Of what is changed.
+        if size > 0.0:
+            errors.append(float(abs(off) / size))
+    return errors
+
+
+def parameters_inside(found: Mapping, hidden: Mapping) -> list[bool]:
+    """Whether each hidden value lies in the interval that was named, two standard
+    deviations either way; False for an interval that is not finite."""
+    options = [hidden]
+    if "phase" in hidden:  # The same force, half a turn later.
+        sizes = ("fx", "fy", "fz", "amplitude")
+        other = {k: -v if k in sizes else v for k, v in hidden.items()}
+        options.append(other | {"phase": hidden["phase"] + np.pi})
+    answers: list[list[bool]] = []
+    for option in options:
+        now = []
+        for name in found:
+            if name not in option:
+                continue
+            off = float(found[name]["value"]) - option[name]
+            if name == "phase":
+                off = (off + np.pi) % (2.0 * np.pi) - np.pi
+            std = found[name].get("std")
+            std = np.nan if std is None else float(std)
+            now.append(bool(np.isfinite(std) and abs(off) <= _INTERVAL * std))
+        answers.append(now)
+    return max(answers, key=sum)
+
+
+def table_of(
+    scores: Sequence[Score], which: str = "standard", goals: Goals = STANDARD
+) -> Table:
+    """The benchmark's table; what went wrong stands under it, a line a case."""
+    command = "makebreak reproduce gap"
+    if which != "standard":
+        command += f" --set {which}"
+    rows: list[tuple] = []
+    met: list[bool | None] = []
+
+    def add(what, goal, ours, good=None):
+        rows.append((what, goal, ours, command))
+        met.append(good)
+
+    def share(values) -> tuple[float, str]:
+        n, k = len(values), sum(map(bool, values))
+        return (k / n if n else 0.0), f"{k} of {n}" + (f" ({k / n:.0%})" if n else "")
+
+    value, text = share([s.right for s in scores])
+    add("right verdict", f"{goals.verdict:.0%}", text, value >= goals.verdict)
+    value, text = share([s.first for s in scores if s.first is not None])
+    add("right effect first", f"{goals.first:.0%}", text, value >= goals.first)
+    _, text = share([s.first_or_tied for s in scores if s.first_or_tied is not None])
+    add("right effect first, or said to be tied with it", "-", text)
+    errors = [error for s in scores for error in s.errors]
+    middle = float(np.median(errors)) if errors else float("nan")
+    add(
+        "parameter error, median", f"{goals.error:.0%}",
+        f"{middle:.1%} of {len(errors)}" if errors else "-", middle <= goals.error,
+    )  # fmt: skip
+    closed = [s.closed for s in scores if s.closed is not None]
+    mean = float(np.mean(closed)) if closed else float("nan")
+    text = f"{mean:.0%} ({np.median(closed):.0%})" if closed else "-"
+    what = "share of the reducible gap closed, mean (median)"
+    add(what, f"{goals.closed:.0%}", text, mean >= goals.closed)
+    within = [good for s in scores for good in s.inside]
+    value, text = share(within)
+    goal = "-" if goals.covered is None else f"{goals.covered:.0%}"
+    met_covered = None if goals.covered is None else value >= goals.covered
+    add("named intervals that hold the truth", goal, text, met_covered)
+    needed = sum(s.needed for s in scores)
+    named = sum(s.named for s in scores)
+    add("hidden effects that were named", "-", f"{named} of {needed}")
+    calm = [s for s in scores if not s.needed and "no_gap" in s.verdict]
+    invented = sum(s.extra for s in calm)
+    add(
+        "effects invented where nothing is hidden", "0",
+        f"{invented} in {len(calm)} cases", invented == 0 if calm else None,
+    )  # fmt: skip
+    extra = sum(s.extra for s in scores) - invented
+    others = len(scores) - len(calm)
+    add("effects named in vain elsewhere", "-", f"{extra} in {others} cases")
+    for verdict in dict.fromkeys([*VERDICTS, *(s.verdict for s in scores)]):
+        of_it = [s.found for s in scores if s.verdict == verdict]
+        if of_it:
+            counts = {v: of_it.count(v) for v in (*VERDICTS, "failed")}
+            said = ", ".join(f"{v} {n}" for v, n in counts.items() if n)
+            add(f"said of {verdict} ({len(of_it)})", "-", said)
+    times = [s.seconds for s in scores if np.isfinite(s.seconds)]
+    if times:
+        add("seconds a case, median (most)", "-", f"{np.median(times):.0f} "
+            f"({max(times):.0f})")  # fmt: skip
+    notes = [
+        f"{s.name}: {s.verdict} -> {s.found}: {s.says}"
+        for s in scores
+        if not s.right or s.first is False or s.extra
+    ]
+    title = f"Hidden effects, {which} set: {len(scores)} cases"
+    return Table(title, ("what", "goal", "ours", "command"), rows, met, notes)
