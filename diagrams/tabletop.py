@@ -10,7 +10,8 @@ import numpy as np
 
 from makebreak.models.effects.kind import Effect
 from makebreak.models.friction_zones import FrictionZone
-from makebreak.models.scene import Scene, nearest
+from makebreak.models.scene import Scene
+from makebreak.models.typed_yaml import nearest
 
 MODELS = Path(__file__).resolve().parent.parent / "models"
 TABLETOP_WALLS = str(MODELS / "tabletop_walls.scene.yaml")

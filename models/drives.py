@@ -34,7 +34,8 @@ from makebreak.models.effects.kind import (
 )
 from makebreak.models.effects.measured_channels import ChannelMap, channel_maps
 from makebreak.models.effects.transmission import motor_joint
-from makebreak.models.scene_schema import COMMANDS_OF, ActuationSection, nearest
+from makebreak.models.scene_schema import COMMANDS_OF, ActuationSection
+from makebreak.models.typed_yaml import nearest
 
 DRIVEN_BY = ("position_command", "velocity_command")  # A drive with a loop of its own.
 CHANNEL_STEPS = {name: kind.channel for name, kind in KINDS.items() if kind.channel}

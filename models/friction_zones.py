@@ -31,6 +31,7 @@ from pydrake.systems.framework import LeafSystem
 # It acts explicitly: 0.5 times 12 N over 5 mm/s is 1200 N s/m, which takes a mass of
 # 4 kg 30 % of its speed in a step of 1 ms.
 FADE_SPEED = 0.005  # [m/s]
+MOST_FRICTION = 1e3
 N_POINTS = 16  # Of contact that are remembered; a block's face has 4.
 _POINT = 7  # Of each: p_WC, the normal, (mu(p) - mu_0) f_n.
 
@@ -53,11 +54,14 @@ def check_zones(zones: Sequence[FrictionZone]) -> None:
     """Raises: ValueError for a zone that is none, and for zones of several pairs."""
     for zone in zones:
         where = f"friction zone at {zone.at!r}"
-        if not 0.0 <= zone.friction < np.inf:
-            raise ValueError(f"{where}: friction is {zone.friction}, expected >= 0")
+        if not 0.0 <= zone.friction <= MOST_FRICTION:
+            raise ValueError(
+                f"{where}: friction is {zone.friction}, expected >= 0 and at most "
+                f"{MOST_FRICTION:g}"
+            )
         for name in "xy":
             span = getattr(zone, name)
-            if len(span) != 2 or not span[0] < span[1]:
+            if len(span) != 2 or not -1e6 <= span[0] < span[1] <= 1e6:
                 raise ValueError(f"{where}: {name} is {span}, expected [from, to]")
         if zone.at != zones[0].at:
             raise ValueError(

@@ -4,7 +4,6 @@ The file's sections are in scene_schema.py, its reading in scene_reader.py, what
 the joints in drives.py; here is how a plant is made of it.
 """
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -15,12 +14,6 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialVelocity
-from pydrake.multibody.parsing import (
-    FlattenModelDirectives,
-    ModelDirectives,
-    Parser,
-    ProcessModelDirectives,
-)
 from pydrake.multibody.plant import (
     AddMultibodyPlant,
     MultibodyPlant,
@@ -57,7 +50,6 @@ from makebreak.models.effects.measured_channels import (
     channel_maps,
     check_channels,
 )
-from makebreak.models.effects.model_text import edited_model_file
 from makebreak.models.effects.transmission import (
     Coupling,
     coupling_name,
@@ -65,6 +57,12 @@ from makebreak.models.effects.transmission import (
     motor_joint,
 )
 from makebreak.models.friction_zones import add_friction_zones
+from makebreak.models.model_files import (
+    DRAKE_ERRORS,
+    add_models,
+    check_can_move,
+    with_actuated_joints,
+)
 from makebreak.models.scene_reader import initial_for, read_scene
 from makebreak.models.scene_schema import (
     ActuationSection,
@@ -73,8 +71,8 @@ from makebreak.models.scene_schema import (
     Scene,
     as_kind,
     check_scene,
-    nearest,
 )
+from makebreak.models.typed_yaml import nearest, one_line
 
 __all__ = [
     "CHANNEL_STEPS",
@@ -86,7 +84,6 @@ __all__ = [
     "actuators_of_model",
     "initial_for",
     "load_scene",
-    "nearest",
     "path_numbers",
     "read_scene",
     "set_initial_velocities",
@@ -287,6 +284,7 @@ def load_scene(
     if not isinstance(scene, Scene):
         scene = read_scene(scene)
     check_scene(scene)
+    scene = with_actuated_joints(scene)
     section = scene.plant
     plant, scene_graph = AddMultibodyPlant(
         MultibodyPlantConfig(
@@ -302,13 +300,17 @@ def load_scene(
         (as_kind(effect) for effect in scene.effects),
         key=lambda effect: KINDS[effect.kind].rank,
     )
-    _parse(scene, effects, plant)
+    add_models(scene, effects, plant)
     add_actuators(scene.actuation, plant)
     for effect in effects:
         before = KINDS[effect.kind].before_finalize
         if before is not None:
             before(effect, plant, scene_graph)
-    plant.Finalize()
+    try:
+        plant.Finalize()
+    except DRAKE_ERRORS as error:  # Welds in a loop, and the like.
+        raise ValueError(f"scene's directives: {one_line(error)}") from None
+    check_can_move(plant)
     for effect in effects:
         possible = KINDS[effect.kind].possible
         if possible is not None:
@@ -425,7 +427,7 @@ def set_initial_velocities(loaded: LoadedScene, plant_context: Context) -> None:
     """Sets the scene's initial velocities: Drake has no default for them."""
     plant, initial = loaded.plant, loaded.scene.initial
     for name, value in initial.velocities.items():
-        joint = _find(plant, name, "joint")
+        joint = _one_dof(plant, name, "velocities")
         v = plant.GetVelocities(plant_context)
         v[joint.velocity_start()] = value
         motor = motor_joint(plant, joint)
@@ -435,44 +437,9 @@ def set_initial_velocities(loaded: LoadedScene, plant_context: Context) -> None:
     for name, twist in initial.body_velocities.items():
         plant.SetFreeBodySpatialVelocity(
             context=plant_context,
-            body=_find(plant, name, "body"),
+            body=_free_body(plant, name, "body_velocities"),
             V_JpJc=SpatialVelocity(twist[:3], twist[3:]),
         )
-
-
-def _parse(scene: Scene, effects: Sequence[Effect], plant: MultibodyPlant) -> None:
-    """Adds the directives' models; inertia effects edit a copy of the model's text,
-    as a body's default inertia can be given to Drake in no other way."""
-    parser = Parser(plant)
-    flat = FlattenModelDirectives(
-        ModelDirectives(directives=scene.directives), parser.package_map()
-    )
-    with tempfile.TemporaryDirectory() as folder:
-        for i, effect in enumerate(effects):
-            edit = KINDS[effect.kind].edit_text
-            if edit is None:
-                continue
-            for at in effect.at:
-                model, _, body = at.partition(".")
-                for directive in flat.directives:
-                    add = directive.add_model
-                    if add is not None and add.name == model:
-                        # A copy: the scene must stay as it was.
-                        copy = Path(folder) / f"{i}_{model}"
-                        add.file = edited_model_file(
-                            add.file, parser.package_map(), body, effect, edit, copy
-                        )
-                        break
-                else:
-                    raise ValueError(
-                        f"effect {effect.kind} at {at!r}: no model {model!r} is added"
-                    )
-        try:
-            ProcessModelDirectives(flat, parser)
-        except RuntimeError as error:
-            raise ValueError(
-                f"scene's directives: {' '.join(str(error).split())}"
-            ) from None
 
 
 def _set_initial(
@@ -487,23 +454,45 @@ def _set_initial(
         return maps[channel].true_value(value) if channel in maps else value
 
     for name, value in initial.positions.items():
-        joint = _find(plant, name, "joint")
+        joint = _one_dof(plant, name, "positions")
         value = true(f"{name}.position", value)
         joint.set_default_positions([value])
         motor = motor_joint(plant, joint)
         if motor is not None:
             motor.set_default_positions([value])
+    for name in initial.velocities:
+        _one_dof(plant, name, "velocities")
     for name, pose in initial.poses.items():
-        if len(pose) != 7 or not abs(np.linalg.norm(pose[:4]) - 1.0) < 1e-3:
-            raise ValueError(
-                f"initial.poses of {name!r} is {pose}, expected 7 numbers "
-                "[qw qx qy qz x y z] with a unit quaternion"
-            )
+        body = _free_body(plant, name, "poses")
         unit = np.array(pose[:4]) / np.linalg.norm(pose[:4])
         p_WB = [true(f"{name}.{a}", x) for a, x in zip("xyz", pose[4:], strict=True)]
         plant.SetDefaultFloatingBaseBodyPose(
-            _find(plant, name, "body"), RigidTransform(Quaternion(unit), p_WB)
+            body, RigidTransform(Quaternion(unit), p_WB)
         )
+    for name in initial.body_velocities:
+        _free_body(plant, name, "body_velocities")
+
+
+def _one_dof(plant: MultibodyPlant, name: str, section: str):
+    joint = _find(plant, name, "joint")
+    if joint.num_positions() != 1:
+        raise ValueError(
+            f"initial.{section}: joint {name!r} has {joint.num_positions()} positions, "
+            "expected a joint that turns or slides"
+        )
+    return joint
+
+
+def _free_body(plant: MultibodyPlant, name: str, section: str):
+    body = _find(plant, name, "body")
+    if not body.is_floating_base_body():
+        free = [full_name(plant, plant.get_body(i)) for i in
+                sorted(plant.GetFloatingBaseBodies(), key=int)]  # fmt: skip
+        raise ValueError(
+            f"initial.{section}: body {name!r} is not free to move; "
+            f"free are: {', '.join(free) or 'none'}"
+        )
+    return body
 
 
 def _find(plant: MultibodyPlant, name: str, what: str):

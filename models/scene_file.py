@@ -1,6 +1,7 @@
 """A scene as a file, for people to read and for read_scene to read again."""
 
 import os
+from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,8 +44,15 @@ def scene_text(scene: Scene, folder: str | Path) -> str:
 
     Raises: ValueError for an effect of an unknown kind.
     """
-    plain = yaml_load(data=yaml_dump_typed(scene))
-    assert isinstance(plain, dict)
+    plain: dict[str, Any] = {
+        f.name: _plain(getattr(scene, f.name)) for f in fields(scene)
+    }
+    plain["packages"] = {
+        name: _relative(where, Path(folder)) for name, where in scene.packages.items()
+    }
+    plain["directives"] = [
+        yaml_load(data=yaml_dump_typed(each)) for each in scene.directives
+    ]
     for directive in plain["directives"]:
         for what in ("add_model", "add_directives"):
             if what in directive:
@@ -80,6 +88,15 @@ def _relative(file: str, folder: Path) -> str:
         return Path(os.path.relpath(Path(name).resolve(), folder.resolve())).as_posix()
     except ValueError:  # On another drive.
         return name
+
+
+def _plain(value):
+    """Dataclasses, also those in lists and maps, as maps."""
+    if isinstance(value, dict):
+        return {key: _plain(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_plain(each) for each in value]
+    return asdict(value) if is_dataclass(value) else value  # type: ignore[arg-type]
 
 
 def _effect(effect: Effect) -> list[str]:

@@ -1,16 +1,25 @@
 """What a scene file may say, as dataclasses, and the checks of their values."""
 
-from collections.abc import Iterable
+import math
 from dataclasses import dataclass, field
-from difflib import get_close_matches
+from typing import Annotated, Literal
 
 from pydrake.multibody.parsing import ModelDirective
 
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, check_parameters
 from makebreak.models.friction_zones import FrictionZone, check_zones
+from makebreak.models.typed_yaml import Between, check, convert, hints_of, nearest
 
-# What an actuation of each type takes as commands.
+# Bounds are far outside of what robots do: they catch wrong units and slips of the
+# keyboard, and keep Drake from what it cannot compute.
+Coordinate = Annotated[float, Between(-1e4, 1e4, "rad or m")]
+Rate = Annotated[float, Between(-1e4, 1e4, "rad/s or m/s")]
+Gain = Annotated[float, Between(0.0, 1e9)]
+Positive = Annotated[float, Between(1e-9, 1e9)]
+LEAST_STEP = 1e-6  # [s]
+
+# What the commands of a recording may be, by the type of a scene's actuation.
 COMMANDS_OF: dict[str, tuple[str, ...]] = {
     "none": (),
     "effort": ("effort_command",),
@@ -18,23 +27,39 @@ COMMANDS_OF: dict[str, tuple[str, ...]] = {
     "servo": ("position_command",),
     "velocity": ("velocity_command",),
 }
+# What a scene's `tolerance` may speak of, and the largest that makes sense.
+TOLERANCES = {
+    "link_mass": Between(0.0, 10.0, "of the mass"),
+    "link_com_m": Between(0.0, 1.0, "m"),
+    "contact_stiffness": Between(0.0, 100.0, "of the stiffness"),
+    "contact_dissipation": Between(0.0, 100.0, "of the dissipation"),
+    "shape_m": Between(0.0, 0.1, "m"),
+}
+SIDES = ("motor", "motor side", "link", "link side")
+SIDED = ("position", "velocity", "effort_measured")  # Channels that have a side.
 
 
 @dataclass
 class PlantSection:
-    time_step: float = 0.001  # [s]; 0 is continuous.
-    contact_model: str = "point"
-    discrete_contact_approximation: str = "lagged"
-    gravity: list[float] = field(default_factory=lambda: [0.0, 0.0, -9.81])  # [m/s2]
+    time_step: Annotated[float, Between(0.0, 0.1, "s")] = 0.001  # 0 is continuous.
+    contact_model: Literal["point", "hydroelastic", "hydroelastic_with_fallback"] = (
+        "point"
+    )
+    discrete_contact_approximation: Literal["tamsi", "sap", "similar", "lagged"] = (
+        "lagged"
+    )
+    gravity: list[Annotated[float, Between(-1e3, 1e3, "m/s2")]] = field(
+        default_factory=lambda: [0.0, 0.0, -9.81]
+    )
 
 
 @dataclass
 class SupplySection:
     """A motor at a supply: each one number, or one for each joint."""
 
-    voltage: list[float] = field(default_factory=list)  # [V]
-    kt: list[float] = field(default_factory=list)  # [N m/A], at the joint.
-    resistance: list[float] = field(default_factory=list)  # [Ohm]
+    voltage: list[Positive] = field(default_factory=list)  # [V]
+    kt: list[Positive] = field(default_factory=list)  # [N m/A], at the joint.
+    resistance: list[Positive] = field(default_factory=list)  # [Ohm]
 
 
 @dataclass
@@ -48,34 +73,35 @@ class ActuationSection:
     velocity the velocity. The limit is at most voltage kt/R, if there is a supply. An
     error of position counts from the dead band's edge on; a position command is
     received in whole steps of `resolution`. Each is one number, or one for each joint.
+
+    joints: `<model>.<joint>`; none: those that the models' own files have actuators of.
     """
 
     type: str = "none"  # A key of COMMANDS_OF.
     joints: list[str] = field(default_factory=list)
-    kp: list[float] = field(default_factory=list)  # [N m/rad] or [N/m]
-    kd: list[float] = field(default_factory=list)  # [N m s/rad] or [N s/m]
-    limit: list[float] = field(default_factory=list)  # [N m] or [N]
+    kp: list[Gain] = field(default_factory=list)  # [N m/rad] or [N/m]
+    kd: list[Gain] = field(default_factory=list)  # [N m s/rad] or [N s/m]
+    limit: list[Positive] = field(default_factory=list)  # [N m] or [N]
     supply: SupplySection = field(default_factory=SupplySection)
-    dead_band: list[float] = field(default_factory=list)  # [rad] or [m], to each side.
-    resolution: list[float] = field(default_factory=list)  # [rad] or [m]
-    hold: str = "zero_order"
-    rate_hz: float = 1000.0
+    dead_band: list[Gain] = field(default_factory=list)  # [rad] or [m], to each side.
+    resolution: list[Gain] = field(default_factory=list)  # [rad] or [m]
+    hold: Literal["zero_order"] = "zero_order"
+    rate_hz: Annotated[float, Between(1.0, 1e5, "Hz")] = 1000.0
 
 
 @dataclass
 class InitialSection:
     """Named `<model>.<joint>` and `<model>.<body>`; bodies in the world's axes."""
 
-    positions: dict[str, float] = field(default_factory=dict)  # [rad] or [m]
-    velocities: dict[str, float] = field(default_factory=dict)  # [rad/s] or [m/s]
-    poses: dict[str, list[float]] = field(default_factory=dict)  # [qw qx qy qz x y z]
-    body_velocities: dict[str, list[float]] = field(
-        default_factory=dict
-    )  # [wx wy wz vx vy vz]
+    positions: dict[str, Coordinate] = field(default_factory=dict)
+    velocities: dict[str, Rate] = field(default_factory=dict)
+    poses: dict[str, list[Coordinate]] = field(default_factory=dict)  # qw qx qy qz x..z
+    body_velocities: dict[str, list[Rate]] = field(default_factory=dict)  # wx.. vx..
 
 
 @dataclass
 class Scene:
+    packages: dict[str, str] = field(default_factory=dict)  # Name -> its folder.
     directives: list[ModelDirective] = field(default_factory=list)
     plant: PlantSection = field(default_factory=PlantSection)
     actuation: ActuationSection = field(default_factory=ActuationSection)
@@ -89,37 +115,76 @@ class Scene:
     effects: list[Effect] = field(default_factory=list)
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """What may have been meant by a wrong name, as the end of an error message."""
-    known = sorted(known)
-    close = get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
-
-
 def check_scene(scene: Scene) -> None:
-    """Raises: ValueError, naming what in the scene is wrong."""
-    if not scene.plant.time_step >= 0.0:
+    """Checks all that can be without the models.
+
+    Raises: ValueError, naming what in the scene is wrong.
+    """
+    for name, hint in hints_of(Scene).items():
+        if name not in ("directives", "effects"):
+            convert(name, getattr(scene, name), hint)
+    step = scene.plant.time_step
+    if 0.0 < step < LEAST_STEP:
         raise ValueError(
-            f"plant.time_step is {scene.plant.time_step}, expected 0 or more [s]"
+            f"plant.time_step: got {step:g}, expected 0 (continuous) or at least "
+            f"{LEAST_STEP:g} [s]"
         )
     if len(scene.plant.gravity) != 3:
         raise ValueError(f"plant.gravity is {scene.plant.gravity}, expected [x, y, z]")
-    kind = scene.actuation.type
-    if kind not in COMMANDS_OF:
-        raise ValueError(
-            f"actuation.type is {kind!r}, expected one of {', '.join(COMMANDS_OF)}"
-        )
-    if scene.actuation.hold != "zero_order":
-        raise ValueError(
-            f"actuation.hold is {scene.actuation.hold!r}, expected zero_order"
-        )
-    if not scene.actuation.rate_hz > 0.0:
-        raise ValueError(
-            f"actuation.rate_hz is {scene.actuation.rate_hz}, expected > 0"
-        )
+    _check_actuation(scene.actuation)
+    check_initial("initial", scene.initial)
+    for file, episodes in scene.initial_of.items():
+        for episode, state in episodes.items():
+            check_initial(f"initial of {file}, episode {episode}", state)
+    for key, value in scene.tolerance.items():
+        if key not in TOLERANCES:
+            raise ValueError(
+                f"tolerance: unknown key {key}; {nearest(key, TOLERANCES)}"
+            )
+        if not TOLERANCES[key].holds(value):
+            raise ValueError(
+                f"tolerance.{key}: got {value:g}, expected {TOLERANCES[key]}"
+            )
+    for key, side in scene.channels.items():
+        if key.rsplit(".", 1)[-1] not in SIDED:
+            raise ValueError(
+                f"channels: got {key}, expected <model>.<joint>.<quantity> or a "
+                f"quantity: {', '.join(SIDED)}"
+            )
+        if side.strip().lower() not in SIDES:
+            raise ValueError(
+                f'channels.{key}: got "{side}", expected one of: {", ".join(SIDES)}'
+            )
     for effect in scene.effects:
         as_kind(effect)
     check_zones(scene.friction_zones)
+
+
+def _check_actuation(actuation: ActuationSection) -> None:
+    if actuation.type not in COMMANDS_OF:
+        raise ValueError(
+            f"actuation.type is {actuation.type!r}, expected one of {', '.join(COMMANDS_OF)}"
+        )
+    for joint in actuation.joints:
+        if actuation.joints.count(joint) > 1:
+            raise ValueError(f"actuation.joints names {joint} more than once")
+
+
+def check_initial(where: str, initial: InitialSection) -> None:
+    """Raises: ValueError for a number out of bounds; for a pose that is none."""
+    check(initial, f"{where}.")
+    for name, pose in initial.poses.items():
+        if len(pose) != 7 or not abs(math.hypot(*pose[:4]) - 1.0) < 1e-3:
+            raise ValueError(
+                f"{where}.poses of {name!r} is {pose}, expected 7 numbers "
+                "[qw qx qy qz x y z] with a unit quaternion"
+            )
+    for name, twist in initial.body_velocities.items():
+        if len(twist) != 6:
+            raise ValueError(
+                f"{where}.body_velocities of {name!r} is {twist}, expected 6 numbers "
+                "[wx wy wz vx vy vz]"
+            )
 
 
 def as_kind(effect: Effect) -> Effect:

@@ -11,7 +11,7 @@ from time import process_time
 
 import numpy as np
 
-from makebreak.scripts.settings import nearest
+from makebreak.models.typed_yaml import nearest
 from makebreak.scripts.table import Table
 
 # The name on the command line -> the module, imported when it is asked for.

@@ -1,6 +1,7 @@
 """Time of a tick of the impedance controller, and of the station under it."""
 
 from time import process_time
+from typing import Literal, get_args
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
@@ -31,7 +32,10 @@ def _x_desired() -> np.ndarray:
     return x_d
 
 
-def _loop_us(approximation: str) -> float:
+Approximation = Literal["lagged", "similar"]
+
+
+def _loop_us(approximation: Approximation) -> float:
     """CPU time of one simulated millisecond of station and controller [us]."""
     scene = read_scene(BALL_ROLLING)
     scene.plant.discrete_contact_approximation = approximation
@@ -56,7 +60,7 @@ def _loop_us(approximation: str) -> float:
     return 1e3 * (process_time() - start) / SIMULATED_SEC
 
 
-def _station_us(approximation: str) -> float:
+def _station_us(approximation: Approximation) -> float:
     """The same for the station alone, under a fixed torque."""
     scene = read_scene(BALL_ROLLING)
     scene.plant.discrete_contact_approximation = approximation
@@ -103,7 +107,7 @@ def rows() -> list[dict]:
                 "unit": "us",
             }
         )
-    for approximation in ("lagged", "similar"):
+    for approximation in get_args(Approximation):
         for label, measure in (
             ("station alone", _station_us),
             ("station and impedance", _loop_us),

@@ -27,11 +27,11 @@ from makebreak.diagrams.station import make_control_plant
 from makebreak.models.scene import Scene, read_scene
 from makebreak.models.scene_file import scene_text
 from makebreak.models.tip_and_ball import make_tip_and_ball
+from makebreak.models.typed_yaml import nearest
 from makebreak.scripts.interrupts import undisturbed
 from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.replay import Track, Unsupported
 from makebreak.scripts.session import Log, Session, leaf_systems
-from makebreak.scripts.settings import nearest
 from makebreak.systems.impedance_controller import serial_chain_of
 from makebreak.systems.numerics.timing import observed
 

@@ -127,7 +127,10 @@ BAD_RUN = [
     (["--set", "spring.stiffness=-1"], "spring.stiffness: got -1.0, expected > 0"),
     (["--config", "no.yaml"], '--config: got "no.yaml", expected a YAML file'),
     (["--config", "broken.yaml"], "--config broken.yaml: not YAML"),
-    (["--config", "list.yaml"], "--config list.yaml: got [1, 2], expected key: value"),
+    (
+        ["--config", "list.yaml"],
+        '--config list.yaml: got "[1, 2]", expected key: value',
+    ),
     (["--config", "key.yaml"], "--config key.yaml: unknown key spring.stifness; did"),
     (["--config", "type.yaml"], 'type.yaml: noise: got "abc", expected a number'),
     (["--seed", "-1"], '--seed: got "-1", expected a whole number, 0 or more'),

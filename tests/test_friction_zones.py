@@ -176,7 +176,7 @@ def test_a_file_keeps_the_zones(tmp_path):
 @pytest.mark.parametrize(
     "zones, message",
     [
-        ([FrictionZone(PAIR, np.nan)], "friction is nan"),
+        ([FrictionZone(PAIR, np.nan)], r"friction: got \"\.nan\""),
         ([FrictionZone(PAIR, -0.1)], "friction is -0.1"),
         ([FrictionZone(PAIR, 0.1)], "less than the pair's own friction, 0.2"),
         ([FrictionZone(PAIR, 0.5, x=[1.0, 0.0])], r"x is \[1.0, 0.0\]"),

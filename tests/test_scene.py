@@ -12,10 +12,10 @@ from makebreak.models.scene import (
     InitialSection,
     initial_for,
     load_scene,
-    nearest,
     read_scene,
     set_initial_velocities,
 )
+from makebreak.models.typed_yaml import nearest
 
 G = 9.81
 RADIUS, MASS = 0.0315, 0.07
@@ -218,8 +218,8 @@ def test_two_resistances_add_up(ball_scene):
 @pytest.mark.parametrize(
     "kind, at, parameters, words",
     [
-        ("rolling_resistence", "ball~table", {}, "did you mean 'rolling_resistance'"),
-        ("contact_friction", "ball~table", {"fricton": 1}, "did you mean 'friction'"),
+        ("rolling_resistence", "ball~table", {}, "did you mean rolling_resistance"),
+        ("contact_friction", "ball~table", {"fricton": 1}, "did you mean friction"),
         (
             "contact_friction",
             "ball~table",
@@ -251,7 +251,10 @@ def test_bad_effects_are_refused_by_name(ball_scene, kind, at, parameters, words
     "text, words",
     [
         ("directives: []\neffect: []", "effect"),
-        ("plant: {time_step: -1}", "plant.time_step is -1"),
+        (
+            "plant: {time_step: -1}",
+            "plant.time_step: got .-1., expected a number",
+        ),
         ("plant: {gravity: [0, 0]}", "expected \\[x, y, z\\]"),
         ("actuation: {type: motor}", "actuation.type is 'motor'"),
         ("effects: [{kind: object_size}]", "needs `at`"),
@@ -294,8 +297,8 @@ def test_missing_scene_file_is_named(tmp_path):
 
 
 def test_nearest_name_or_all_names():
-    assert nearest("object_sise", KINDS) == "did you mean 'object_size'?"
-    assert nearest("zzz", ["b", "a"]) == "known: a, b"
+    assert nearest("object_sise", KINDS) == ("did you mean object_size or object_mass?")
+    assert nearest("zzz", ["b", "a"]) == "expected one of: b, a"
 
 
 def test_model_files_are_found_in_a_folder_with_an_odd_name(tmp_path):

@@ -4,7 +4,6 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from typing import Any
 from xml.dom.minidom import Element
 
@@ -19,6 +18,11 @@ from pydrake.multibody.tree import (
     RigidBody,
 )
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
+
+from makebreak.models.typed_yaml import nearest
+
+_MOST_TIMES = 1e4  # Of the range that is searched.
+_MOST_SEC = 10.0  # A delay keeps that many samples.
 
 
 @dataclass
@@ -54,6 +58,13 @@ class Parameter:
     valid: str = "any"
     optional: bool = False
     rough: bool = False
+
+    @property
+    def most(self) -> float:
+        """No robot has more: a wrong unit, or what a computer cannot hold."""
+        if self.unit == "s":
+            return _MOST_SEC
+        return _MOST_TIMES * max(abs(self.low), abs(self.high))
 
 
 @dataclass(frozen=True)
@@ -152,13 +163,10 @@ def check_parameters(effect: Effect, kind: EffectKind) -> None:
     known = [each.name for each in kind.parameters]
     for name, value in effect.parameters.items():
         if name not in known:
-            close = get_close_matches(name, known, n=1, cutoff=0.5)
-            hint = (
-                f"did you mean {close[0]!r}?"
-                if close
-                else f"known: {', '.join(sorted(known))}"
+            raise ValueError(
+                f"effect {effect.kind} has no parameter {name!r}: "
+                f"{nearest(name, sorted(known))}"
             )
-            raise ValueError(f"effect {effect.kind} has no parameter {name!r}: {hint}")
         if not math.isfinite(value):
             raise ValueError(f"effect {effect.kind}: {name} is {value}")
     for each in kind.parameters:
@@ -179,6 +187,11 @@ def check_parameters(effect: Effect, kind: EffectKind) -> None:
             wanted = "0 or more and below 1" if each.valid == "share" else each.valid
             raise ValueError(
                 f"effect {effect.kind}: {each.name} is {value}, expected {wanted}"
+            )
+        if abs(value) > each.most:
+            raise ValueError(
+                f"effect {effect.kind}: {each.name} is {value:g}, expected at most "
+                f"{each.most:g} {each.unit}".rstrip()
             )
     if kind.check is not None:
         kind.check(effect)

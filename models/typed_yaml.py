@@ -1,0 +1,298 @@
+"""YAML text into dataclasses, checked as it is read: names, types, bounds of numbers.
+
+Not Drake's yaml_load_typed: its messages do not name the field's path, and it knows no
+nearest names, no tuples and no bounds. Imports no pydrake, so that it loads at once.
+"""
+
+import dataclasses
+import difflib
+import math
+import types
+import typing
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import yaml
+
+MOST_DEEP = 40  # Brackets in brackets; a scene needs about six.
+MOST_BYTES = 4_000_000
+MOST_ALIASES = 1000  # `*name`: nine lines of ten each would be a billion.
+_EXPECTED = {int: "an integer", float: "a number", bool: "true or false", str: "a text"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Between:
+    """Bounds of a field: `period_sec: Annotated[float, Between(1e-4, 10.0, "s")]`.
+
+    None: without a bound on that side; then infinity is a value.
+    """
+
+    low: float | None
+    high: float | None
+    unit: str = ""
+
+    def holds(self, value: float) -> bool:
+        return (self.low is None or value >= self.low) and (
+            self.high is None or value <= self.high
+        )
+
+    def __str__(self) -> str:
+        unit = f" [{self.unit}]" if self.unit else ""
+        if self.low is None or self.high is None:
+            side = f"<= {self.high:g}" if self.low is None else f">= {self.low:g}"
+            return f"a number {side}{unit}"
+        return f"a number from {self.low:g} to {self.high:g}{unit}"
+
+
+_Fastest: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class _Loader(_Fastest):
+    """Safe, but no key twice, and with a tag such as !Rpy kept under `_tag`."""
+
+    def construct_mapping(self, node, deep=False):
+        seen = set()
+        for key, _ in node.value:
+            name = key.value if isinstance(key, yaml.ScalarNode) else None
+            if name is not None and name in seen and name != "<<":
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {name!r} is there twice", key.start_mark
+                )
+            seen.add(name)
+        return super().construct_mapping(node, deep)
+
+    def with_tag(self, suffix, node):
+        if not isinstance(node, yaml.MappingNode):
+            raise yaml.constructor.ConstructorError(
+                None, None, f"the tag !{suffix} is unknown here", node.start_mark
+            )
+        return {"_tag": f"!{suffix}", **self.construct_mapping(node, deep=True)}
+
+
+_Loader.add_multi_constructor("!", _Loader.with_tag)
+
+
+def load_yaml(text: str) -> Any:
+    """What a YAML (or JSON) text says, as dicts, lists and scalars.
+
+    Raises: ValueError in one line: not YAML, a key twice, brackets too deep.
+    """
+    try:
+        depth = aliases = 0
+        for event in yaml.parse(text, Loader=_Loader):
+            if isinstance(event, yaml.CollectionStartEvent):
+                depth += 1
+            elif isinstance(event, yaml.CollectionEndEvent):
+                depth -= 1
+            aliases += isinstance(event, yaml.AliasEvent)
+            if depth > MOST_DEEP or aliases > MOST_ALIASES:
+                what = f"{MOST_DEEP} levels of brackets or indents"
+                if depth <= MOST_DEEP:
+                    what = f"{MOST_ALIASES} aliases"
+                line = event.start_mark.line + 1
+                raise ValueError(f"line {line}: expected at most {what}")
+        return yaml.load(text, Loader=_Loader)
+    except (yaml.YAMLError, RecursionError) as error:
+        raise ValueError(f"not YAML: {one_line(error)}") from None
+    except ValueError as error:
+        if "integer string conversion" in str(error):
+            raise ValueError("a number has more than 4000 digits") from None
+        raise
+    except (TypeError, OverflowError) as error:  # A list as a key, a date of year 0.
+        raise ValueError(f"not usable as YAML: {one_line(error)}") from None
+
+
+def read_yaml(path: Path) -> Any:
+    """As load_yaml, of a file. Raises: ValueError, without the file's name."""
+    try:
+        size = path.stat().st_size
+        if size > MOST_BYTES:
+            raise ValueError(f"{size} bytes, expected at most {MOST_BYTES}")
+        return load_yaml(path.read_text(encoding="utf-8-sig"))
+    except UnicodeDecodeError as error:
+        raise ValueError(f"not YAML: {one_line(error)}") from None
+    except OSError as error:
+        raise ValueError(f"cannot be read: {error.strerror}") from None
+
+
+def one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+def nearest(name: str, valid: Iterable[str]) -> str:
+    """The end of a refusal: the valid names nearest to `name`, or all of them."""
+    valid = list(valid)
+
+    def likeness(other: str) -> tuple[float, float]:
+        """Of the last parts, as often only that is given; then of the whole names."""
+        pairs = [(name.rpartition(".")[2], other.rpartition(".")[2]), (name, other)]
+        last, whole = (difflib.SequenceMatcher(None, *p).ratio() for p in pairs)
+        return last, whole
+
+    if not valid:
+        return "there is none"
+    ranked = sorted(valid, key=likeness, reverse=True)
+    least = max([0.6, *(likeness(v)[0] - 0.1 for v in ranked[:1])])
+    close = [v for v in ranked[:3] if likeness(v)[0] >= least]
+    if close:
+        return f"did you mean {' or '.join(close)}?"
+    return f"expected one of: {', '.join(valid)}"
+
+
+def shown(value) -> str:
+    """A value for a message: as in YAML, one line, not endless."""
+    text = value
+    if not isinstance(value, str):
+        try:
+            text = yaml.safe_dump(value, width=1000, default_flow_style=True)
+        except (yaml.YAMLError, ValueError):  # Not of YAML; an int of 5000 digits.
+            text = type(value).__name__
+    text = " ".join(text.replace("\n...", "").split())
+    return text if len(text) <= 120 else f"{text[:100]}... ({len(text)} characters)"
+
+
+def _refuse(name: str, value, expected: str):
+    raise ValueError(f'{name}: got "{shown(value)}", expected {expected}')
+
+
+def convert(name: str, value, hint, raw: str | None = None):
+    """`value`, as YAML reads it, as the declared type `hint`.
+
+    Args:
+        name: the field, for the message.
+        value: what YAML made of the text.
+        hint: the field's declared type, with its Between if it has one.
+        raw: the text itself: a field that is a str takes it as it stands.
+    Raises: ValueError naming the field, the value and what was expected.
+    """
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Annotated:
+        converted = convert(name, value, args[0], raw)
+        for limit in args[1:]:
+            if isinstance(limit, Between) and not limit.holds(converted):
+                _refuse(name, value, str(limit))
+        return converted
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in args:
+            return None
+        options = [a for a in args if a is not type(None)]
+        for option in options[:-1]:
+            try:
+                return convert(name, value, option, raw)
+            except ValueError:
+                continue
+        return convert(name, value, options[-1], raw)
+    if origin is typing.Literal:
+        if not isinstance(value, bool | list | dict) and value in args:
+            return value
+        _refuse(name, value, "one of: " + ", ".join(map(str, args)))
+    if hint in (str, Path):
+        text = raw if raw is not None else value
+        if not isinstance(text, str):
+            _refuse(name, value, _EXPECTED[str])
+        if "\0" in text:
+            _refuse(name, value, "a text without NUL")
+        return hint(text)
+    if hint is bool:
+        if not isinstance(value, bool):
+            _refuse(name, value, _EXPECTED[bool])
+        return value
+    if hint in (int, float):
+        return _number(name, value, hint)
+    if hint is np.ndarray:
+        try:
+            return np.asarray(value, dtype=float)
+        except (TypeError, ValueError, OverflowError):
+            _refuse(name, value, "numbers")
+    if origin in (list, tuple):
+        if not isinstance(value, list | tuple):
+            _refuse(name, value, "a list, as [1, 2, 3]")
+        inner = args or (Any,)
+        if origin is tuple and Ellipsis not in inner:
+            if len(value) != len(inner):
+                _refuse(name, value, f"a list of {len(inner)}")
+        else:
+            inner = (inner[0],) * len(value)
+        return origin(
+            convert(f"{name}[{i}]", v, h)
+            for i, (v, h) in enumerate(zip(value, inner, strict=True))
+        )
+    if dataclasses.is_dataclass(hint):
+        if isinstance(value, typing.cast(type, hint)):
+            check(value, name + ".")
+            return value
+        if not isinstance(value, dict):
+            keys = ", ".join(f.name for f in dataclasses.fields(hint))
+            setting = f"{name}.FIELD=value, or " if raw else ""
+            _refuse(name, value, f"{setting}a mapping, with any of: {keys}")
+        return merge(typing.cast(type, hint), value, None, name + ".")
+    if origin is dict:
+        if not isinstance(value, dict):
+            _refuse(name, value, "a mapping, as {a: 1}")
+        return {
+            convert(f"a key of {name}", k, args[0]): convert(f"{name}.{k}", v, args[1])
+            for k, v in value.items()
+        }
+    return value
+
+
+def _number(name: str, value, hint: type):
+    number = value
+    if isinstance(value, str):  # YAML 1.1 takes 1e-3, without a dot, for a text.
+        try:
+            number = float(value)
+        except ValueError:
+            _refuse(name, value, _EXPECTED[hint])
+    elif isinstance(value, np.generic):
+        number = value.item()
+    if not isinstance(number, int | float) or isinstance(number, bool):
+        _refuse(name, value, _EXPECTED[hint])
+    try:
+        if math.isnan(number) or (hint is int and number != number // 1):
+            _refuse(name, value, _EXPECTED[hint])
+        return hint(number)
+    except OverflowError:  # 400 digits are no float, infinity is no integer.
+        _refuse(name, value, _EXPECTED[hint])
+
+
+def hints_of(schema: type) -> dict[str, Any]:
+    """{field: declared type}, with what is annotated."""
+    return typing.get_type_hints(schema, include_extras=True)
+
+
+def merge(schema: type, mapping: dict, config=None, prefix: str = ""):
+    """`config` with the fields that `mapping` names replaced, nested ones merged; a new
+    `schema` if `config` is None.
+
+    Raises: ValueError: an unknown key, with the nearest names; as convert.
+    """
+    hints = hints_of(schema)
+    fields = {prefix + f.name: f for f in dataclasses.fields(schema)}
+    changes = {}
+    for key, value in mapping.items():
+        name = f"{prefix}{key}"
+        if name not in fields:
+            raise ValueError(f"unknown key {shown(name)}; {nearest(name, fields)}")
+        old = getattr(config, key, None)
+        if dataclasses.is_dataclass(old) and isinstance(value, dict):
+            changes[key] = merge(type(old), value, old, name + ".")
+        else:
+            changes[key] = convert(name, value, hints[key])
+    if config is not None:
+        return dataclasses.replace(config, **changes)
+    for name, f in fields.items():
+        required = f.default is f.default_factory is dataclasses.MISSING
+        if required and f.name not in changes:
+            raise ValueError(f"{name}: missing, expected a value")
+    return schema(**changes)
+
+
+def check(instance, prefix: str = "") -> None:
+    """Checks a dataclass that was not read from a file: as convert, field by field.
+
+    Raises: ValueError.
+    """
+    for name, hint in hints_of(type(instance)).items():
+        convert(f"{prefix}{name}", getattr(instance, name), hint)
