@@ -10,7 +10,7 @@ from pydrake.common.yaml import yaml_dump_typed, yaml_load
 
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sentence
-from makebreak.models.scene import Scene
+from makebreak.models.scene import ActuationSection, Scene
 
 _WIDTH = 88
 _TAG = "_tag"  # Where Drake's reader keeps a YAML tag, such as !Rpy.
@@ -62,6 +62,8 @@ def scene_text(scene: Scene, folder: str | Path) -> str:
                 directive[what] = name | {"file": file} | part
     effects = scene.effects
     del plain["effects"]
+    if scene.actuation == ActuationSection():
+        del plain["actuation"]
     of_files = plain.pop("initial_of")
     plain = _pruned(plain)
     if of_files:

@@ -163,7 +163,8 @@ def check_scene(scene: Scene) -> None:
 def _check_actuation(actuation: ActuationSection) -> None:
     if actuation.type not in COMMANDS_OF:
         raise ValueError(
-            f"actuation.type is {actuation.type!r}, expected one of {', '.join(COMMANDS_OF)}"
+            f"actuation.type is {actuation.type!r}, expected one of "
+            f"{', '.join(COMMANDS_OF)}"
         )
     for joint in actuation.joints:
         if actuation.joints.count(joint) > 1:

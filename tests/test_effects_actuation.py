@@ -335,8 +335,8 @@ def test_a_gear_keeps_a_share_of_what_it_transmits(tmp_path, time_step):
     [
         (dict(kp=[]), r"actuation.kp is \[\], expected one number of 0 or more"),
         (dict(kp=[1.0, 2.0]), "or one for each of the 1 joints"),
-        (dict(limit=[0.0]), "actuation.limit is .*above 0"),
-        (dict(dead_band=[-0.1]), "actuation.dead_band is"),
+        (dict(limit=[0.0]), r"actuation.limit\[0\]: got"),
+        (dict(dead_band=[-0.1]), r"actuation.dead_band\[0\]: got"),
         (dict(supply=SupplySection(voltage=[12.0])), r"actuation.supply.kt is \[\]"),
         (
             dict(type="velocity", kd=[3.0]),
