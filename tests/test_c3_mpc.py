@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 from pydrake.common.value import AbstractValue
 from pydrake.common.yaml import yaml_load_typed
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.solvers import ClarabelSolver, MathematicalProgram, SolverOptions
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
+from scipy.optimize import linprog
 
 from makebreak.scripts.bench_c3 import (
     OsqpC3,
@@ -21,6 +24,7 @@ from makebreak.scripts.bench_c3 import (
     quiet,
 )
 from makebreak.systems.c3_mpc import C3Config, C3Mpc, C3Status
+from makebreak.systems.lcs_builder import AnitescuLcs, ContactPair
 from makebreak.systems.lcs_plant import LcsPlant
 from makebreak.systems.numerics.c3_mpc import (
     C3Bounds,
@@ -45,17 +49,22 @@ from makebreak.systems.numerics.c3_projections import (
     projection_matrices,
 )
 from makebreak.systems.numerics.c3_qp import (
+    MET,
     factor,
     new_factor,
     solve,
+    solve_active,
     solve_bounded,
+    solve_interior,
     within,
 )
+from makebreak.systems.numerics.lcp import solve_lcp
 from makebreak.systems.numerics.lcs import LCS, simulate
 
 REFERENCE = Path(__file__).parent / "reference"
 CARTPOLE = np.load(REFERENCE / "c3_cartpole.npz")
 PROJECTIONS = np.load(REFERENCE / "projections.npz")
+BALL = np.load(REFERENCE / "ball_mpc_problem.npz")
 NO_BARRIER = np.zeros((0, 0))
 PLUS, C3_QP, EXACT = PlusProjection(), QpProjection(), ExactProjection()
 
@@ -75,6 +84,20 @@ def cartpole_problem(projection=PLUS, bounds=None, **options):
     )
     options = C3Options(**({"N": 5, "rounds": 10, "rho": 2.0} | options))
     return C3Problem(weights, projection, options, bounds)
+
+
+def ball_lcs(n_f=4, eps_c=None, x=None):
+    """The ball between finger and table, 2 n_f forces per contact; eps_c None: 5e-4."""
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, 0.0)
+    Parser(plant).AddModels(str(REFERENCE / "ball_on_table.sdf"))
+    plant.Finalize()
+    pairs = [
+        ContactPair("finger_link", "ball_link", 0.5, n_f),
+        ContactPair("ball_link", "table_link", 0.5, n_f),
+    ]
+    model = AnitescuLcs(builder.Build(), pairs, 0.05, eps_c)
+    return model.build(BALL["x0"] if x is None else x, np.zeros(3))
 
 
 # The QP step.
@@ -98,6 +121,8 @@ def random_qp(rng, bounded=False):
             lower[i] = -size * 10.0 ** rng.uniform(-1, 1)
         if rng.random() < 0.7 / size:
             upper[i] = size * 10.0 ** rng.uniform(-1, 1)
+        if i < n_v and rng.random() < 0.1:
+            lower[i] = upper[i] = 0.3  # A fixed value.
     x0 = rng.normal(size=n_x)
     return A, B, d, T, L_N @ L_N.T, h, x0, v0, lower, upper
 
@@ -105,9 +130,9 @@ def random_qp(rng, bounded=False):
 def riccati(qp):
     A, B, d, T, T_N, h, x0, v0, lower, upper = qp
     N, n_x = len(h) - 1, len(d)
-    fac = new_factor(np.hstack([B, A]), d, N)
+    fac = new_factor(np.hstack([B, A])[None], d[None], N)
     x, v = np.empty((N + 1, n_x)), np.empty((N, B.shape[1]))
-    assert factor(fac, T, T_N, NO_BARRIER, v0.size)
+    assert factor(fac, T[None], T_N, NO_BARRIER, v0.size)
     solve(fac, h, x0, v0, x, v)
     return fac, x, v
 
@@ -180,7 +205,8 @@ def test_bounded_qp_step_agrees_with_clarabel_and_sees_infeasibility():
         fac, x, v = riccati(qp)
         if within(x, v, lower, upper):
             continue
-        solved = solve_bounded(fac, T, T_N, h, x0, v0, lower, upper, x, v)
+        sides = np.zeros(h.shape, np.int64)
+        solved = solve_bounded(fac, T[None], T_N, h, x0, v0, lower, upper, sides, x, v)
         expected = clarabel(qp)
         assert solved == (expected is not None)
         if not solved:
@@ -199,8 +225,8 @@ def test_bounded_qp_step_agrees_with_clarabel_and_sees_infeasibility():
 
 
 def test_a_qp_that_is_not_convex_is_refused():
-    fac = new_factor(np.ones((1, 2)), np.zeros(1), 3)
-    T = np.diag([-1.0, 0.0])
+    fac = new_factor(np.ones((1, 1, 2)), np.zeros((1, 1)), 3)
+    T = np.diag([-1.0, 0.0])[None]
     assert not factor(fac, T, np.zeros((1, 1)), NO_BARRIER, 0)
 
 
@@ -299,6 +325,56 @@ def brute_force_projection(z, U, E, F, H, c):
     return best
 
 
+def test_exact_projection_of_sixteen_forces_is_that_of_its_four_parts():
+    """Four times four forces that share nothing: all 2^4 modes of each part are tried.
+    eps_c as the builder's: the edges of a contact are nearly parallel rows."""
+    rng = np.random.default_rng(0)
+    for eps_c in (0.0, 5e-4):
+        n, parts, best = 4, 4, 0.0
+        E, F = np.zeros((16, 16)), np.zeros((16, 16))
+        c, z, U = np.zeros(16), np.zeros(32), np.ones(32)
+        for k in range(parts):
+            at = slice(k * n, (k + 1) * n)
+            J = rng.normal(size=(n, 2))
+            E[at, at], F[at, at] = J @ rng.normal(size=(2, n)), J @ J.T
+            F[at, at] += eps_c * np.eye(n)
+            c[at] = 0.3 * abs(rng.normal(size=n))
+            lam = slice(16 + k * n, 16 + (k + 1) * n)
+            z[at], z[lam] = rng.normal(size=n), rng.normal(size=n)
+            U[at], U[lam] = 10.0 ** rng.uniform(-1, 2, (2, n))
+            best += brute_force_projection(
+                np.r_[z[at], z[lam]], np.r_[U[at], U[lam]], E[at, at], F[at, at],
+                np.zeros((n, 0)), c[at],
+            )  # fmt: skip
+        delta = np.empty(32)
+        assert project_exact(z[None], U, E, F, np.zeros((16, 0)), c, delta[None])
+        # Clarabel: a relative gap of 1e-8.
+        np.testing.assert_allclose(U @ (delta - z) ** 2, best, rtol=1e-6)
+
+
+@pytest.mark.parametrize("n_f", [1, 2, 4, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("eps_c", [0.0, 5e-4])
+def test_exact_projection_of_the_ball_never_fails(n_f, eps_c):
+    """4, 8, 16 and 32 forces on the ball between finger and table, at 60 random points
+    (4 of the 32 forces), of which the rows are singular or nearly so."""
+    problem = ball(False, 5)[3]
+    lcs = ball_lcs(n_f, eps_c)
+    E, F, H, c = (np.array(a, order="C") for a in (lcs.E, lcs.F, lcs.H, lcs.c))
+    n, rng = lcs.n_lam, np.random.default_rng(0)
+    U = np.r_[problem.U[:19], np.full(n, problem.U[19]), problem.U[-3:]]
+    for _ in range(60 if n < 32 else 4):
+        z = np.r_[BALL["x0"] + 0.05 * rng.normal(size=19), rng.normal(size=n + 3)]
+        z[19 : 19 + n] *= 5.0
+        delta = np.empty(22 + n)
+        assert project_exact(z[None], U, E, F, H, c, delta[None])
+        lam = delta[19 : 19 + n]
+        gap = E @ delta[:19] + F @ lam + H @ delta[-3:] + c
+        # Rounding of the sums that make the gap.
+        size = (np.abs(E) @ np.abs(delta[:19]) + np.abs(F) @ lam).max()
+        assert lam.min() >= 0.0 and gap.min() >= -1e-9 * size
+        assert np.minimum(lam, gap / size).max() < 1e-9
+
+
 @pytest.mark.parametrize(("n_lam", "trials"), [(2, 12), (4, 4), (8, 1)])
 def test_exact_projection_agrees_with_brute_force_over_all_modes(n_lam, trials):
     rng = np.random.default_rng(0)
@@ -310,8 +386,7 @@ def test_exact_projection_agrees_with_brute_force_over_all_modes(n_lam, trials):
         c = 0.3 * abs(rng.normal(size=n_lam))  # x = lam = u = 0 is feasible.
         U, z = 10.0 ** rng.uniform(-1, 2, n_lam + 6), rng.normal(size=n_lam + 6)
         delta = np.empty(n_lam + 6)
-        V, K = projection_matrices(U, E, F, H)
-        assert project_exact(z[None], U, E, F, H, c, V, K, delta[None])
+        assert project_exact(z[None], U, E, F, H, c, delta[None])
         lam, gap = delta[4 : 4 + n_lam], np.hstack([E, F, H]) @ delta + c
         # The LCPs hold to 1e-9 of their own scale.
         assert lam.min() >= 0.0 and gap.min() >= -1e-8 and abs(lam * gap).max() < 1e-8
@@ -402,6 +477,140 @@ def test_bounds_hold_and_far_ones_change_nothing(projection):
     assert -2.0 <= plan.u.min() and plan.u.max() <= u_max
     step = plan.x[:-1] @ lcs.A.T + plan.u @ lcs.B.T + plan.lam @ lcs.D.T + lcs.d
     np.testing.assert_allclose(plan.x[1:], step, atol=1e-9)  # Still the dynamics.
+
+
+def plan_exists(lcs, x0, problem):
+    """Whether some lam and u keep the bounds, by a linear program."""
+    N, n_x, n_lam, n_u = problem.options.N, lcs.n_x, lcs.n_lam, lcs.n_u
+    n_v, n = n_lam + n_u, n_lam + n_u + n_x
+    A_eq, b_eq = np.zeros((N * n_x, N * n)), np.tile(-lcs.d, N)
+    for k in range(N):  # Unknowns per knot: lam_k, u_k, x_(k+1).
+        row, at = slice(k * n_x, (k + 1) * n_x), k * n
+        A_eq[row, at : at + n_v] = np.hstack([lcs.D, lcs.B])
+        A_eq[row, at + n_v : at + n] = -np.eye(n_x)
+        if k == 0:
+            b_eq[row] -= lcs.A @ x0
+        else:
+            A_eq[row, at - n_x : at] = lcs.A
+    bounds = [*zip(problem.lower, problem.upper, strict=True)] * N
+    if not lcs.H.any():
+        lam0 = solve_lcp(lcs.F, lcs.E @ x0 + lcs.c)
+        bounds[:n_lam] = [(value, value) for value in lam0]
+    return linprog(np.zeros(N * n), A_eq=A_eq, b_eq=b_eq, bounds=bounds).status == 0
+
+
+@pytest.mark.parametrize("bounded", ["", "x", "u", "xu"])
+@pytest.mark.parametrize("projection", [PLUS, C3_QP, EXACT])
+@pytest.mark.parametrize("states", [8, pytest.param(300, marks=pytest.mark.slow)])
+def test_every_state_of_the_ball_with_a_plan_gets_one(projection, bounded, states):
+    """eps_c at its default; one velocity of the finger within 0.08 m/s, and inputs
+    within what about half of the free plans ask for."""
+    plus = isinstance(projection, PlusProjection)
+    lcs, x0, x_desired, plain = ball(plus, 5)
+    lcs = replace(lcs, F=lcs.F + 5e-4 * np.eye(16))
+    weights = C3Weights(plain.Q, plain.R, plain.G, plain.U)
+    bounds = C3Bounds()
+    if "x" in bounded:
+        limit = np.full(19, np.inf)
+        limit[10] = 0.08
+        bounds.x_lower, bounds.x_upper = -limit, limit
+    if "u" in bounded:
+        bounds.u_lower, bounds.u_upper = [-1.5] * 3, [1.5] * 3
+    problem = C3Problem(weights, projection, plain.options, bounds)
+    rng, met = np.random.default_rng(0), 0
+    for _ in range(states):
+        x = x0 + 0.02 * rng.normal(size=19)
+        x[10:] = x0[10:] + 0.1 * rng.normal(size=9)
+        x[3:7] = x0[3:7] + 0.3 * rng.normal(size=4)
+        x[3:7] /= np.linalg.norm(x[3:7])
+        try:
+            plan, _ = solve_c3(lcs, x, x_desired, problem)
+        except C3Failure:
+            assert not plan_exists(lcs, x, problem)
+            continue
+        met += 1
+        n_lam, n_v = 16, 19
+        lower, upper = problem.lower, problem.upper
+        assert (plan.u >= lower[n_lam:n_v]).all() and (plan.u <= upper[n_lam:n_v]).all()
+        assert (plan.x[1:] >= lower[n_v:] - 1e-6).all()
+        assert (plan.x[1:] <= upper[n_v:] + 1e-6).all()
+        step = plan.x[:-1] @ lcs.A.T + plan.u @ lcs.B.T + plan.lam @ lcs.D.T + lcs.d
+        np.testing.assert_allclose(plan.x[1:], step, atol=1e-8 * abs(plan.x).max())
+    assert met > 0.5 * states
+
+
+def test_many_active_bounds_agree_with_the_interior_point_method():
+    """Both ways to the same minimiser, with most of 60 inputs at a bound."""
+    rng = np.random.default_rng(1)
+    N, n_x, n_v = 30, 4, 3
+    A, B, d = 0.9 * np.eye(n_x), rng.normal(size=(n_x, n_v)), rng.normal(size=n_x)
+    T, T_N = np.eye(n_x + n_v)[None], np.eye(n_x)
+    h, x0 = 10.0 * rng.normal(size=(N + 1, n_x + n_v)), rng.normal(size=n_x)
+    fac = new_factor(np.hstack([B, A])[None], d[None], N)
+    assert factor(fac, T, T_N, NO_BARRIER, 0)
+    x, v = np.empty((N + 1, n_x)), np.empty((N, n_v))
+    solve(fac, h, x0, np.empty(0), x, v)
+    bound = np.r_[np.inf, 0.3, 0.3, np.full(n_x, np.inf)]
+    found = []
+    for method in (solve_active, solve_interior):
+        ours = x.copy(), v.copy()
+        if method is solve_active:
+            sides = np.zeros(h.shape, np.int64)
+            status = solve_active(fac, h, x0, np.empty(0), -bound, bound, sides, *ours)
+            assert status == MET and np.count_nonzero(sides) > 40
+        else:
+            assert solve_interior(fac, T, T_N, h, x0, np.empty(0), -bound, bound, *ours)
+        found.append(ours[1])
+    # The interior point's complementarity: 1e-9 of where it started, at the worst.
+    np.testing.assert_allclose(found[0], found[1], atol=1e-6)
+
+
+def test_an_input_with_equal_bounds_has_that_value():
+    bounds = C3Bounds(u_lower=[1.5], u_upper=[1.5])
+    for projection in (PLUS, C3_QP, EXACT):
+        problem = cartpole_problem(projection, bounds)
+        plan, _ = solve_c3(cartpole_lcs(), CARTPOLE["x0"], np.zeros((6, 4)), problem)
+        np.testing.assert_array_equal(plan.u, 1.5)
+
+
+@pytest.mark.parametrize("projection", [PLUS, C3_QP, EXACT])
+def test_an_lcs_per_knot_is_obeyed_knot_by_knot(projection):
+    lcs, x0, x_desired = cartpole_lcs(), CARTPOLE["x0"], np.zeros((6, 4))
+    problem = cartpole_problem(projection)
+    one, _ = solve_c3(lcs, x0, x_desired, problem)
+    same, _ = solve_c3([lcs] * 5, x0, x_desired, problem)
+    np.testing.assert_array_equal(same.u, one.u)
+    rng = np.random.default_rng(0)
+    models = [
+        replace(lcs, A=lcs.A + 0.01 * rng.normal(size=(4, 4)), d=lcs.d + 0.01 * k)
+        for k in range(5)
+    ]
+    plan, _ = solve_c3(models, x0, x_desired, problem)
+    for k, m in enumerate(models):
+        step = m.A @ plan.x[k] + m.B @ plan.u[k] + m.D @ plan.lam[k] + m.d
+        np.testing.assert_allclose(plan.x[k + 1], step, atol=1e-12)
+    x, cost = x0, 0.0
+    for k, m in enumerate(models):
+        cost += x @ problem.Q @ x + plan.u[k] @ problem.R @ plan.u[k]
+        x, _ = simulate(m, x, plan.u[k])
+    cost += x @ problem.Q_N @ x
+    ours = plan_cost(models, x0, plan.u, x_desired, problem)
+    assert ours == pytest.approx(cost, rel=1e-12)
+
+
+def test_what_cannot_be_solved_is_told_in_one_line():
+    lcs, x0, x_desired = cartpole_lcs(), CARTPOLE["x0"], np.zeros((6, 4))
+    problem = cartpole_problem()
+    with pytest.raises(C3Failure, match=r"x0\[2\] is nan, expected finite numbers"):
+        solve_c3(lcs, [0.0, 0.0, np.nan, 0.0], x_desired, problem)
+    with pytest.raises(C3Failure, match=r"x_desired\[0, 0\] is inf"):
+        solve_c3(lcs, x0, np.full((6, 4), np.inf), problem)
+    with pytest.raises(ValueError, match="4 LCS came, expected one, or 5"):
+        solve_c3([lcs] * 4, x0, x_desired, problem)
+    with pytest.raises(ValueError, match="lcs is a str, expected an LCS or a list"):
+        solve_c3("ball", x0, x_desired, problem)
+    with pytest.raises(ValueError, match=r"projection is 'c3\+', expected PlusProj"):
+        cartpole_problem("c3+")
 
 
 def test_bounds_that_cannot_be_met_are_a_failure():
@@ -521,7 +730,9 @@ def test_bad_weights_are_refused_by_name(change, message):
         (dict(rounds=-1), None, "rounds = -1"),
         (dict(rho=0.5), None, "rho is 0.5"),
         (dict(rho=np.nan), None, "rho is nan"),
-        ({}, C3Bounds(u_lower=[1.0], u_upper=[1.0]), "1.0 to 1.0 for entry 0"),
+        ({}, C3Bounds(u_lower=[1.1], u_upper=[1.0]), "1.1 to 1.0 for entry 0"),
+        (dict(rounds=2.5), None, "C3Options.rounds is 2.5, expected an integer"),
+        (dict(N=5.0), None, "C3Options.N is 5.0, expected an integer"),
         ({}, C3Bounds(u_lower=[1.0, 2.0]), "u is bounded by .* expected 1 numbers"),
         ({}, C3Bounds(x_upper=[np.nan] * 4), "x is bounded by"),
     ],
@@ -652,7 +863,7 @@ def not_finite(a):
         ("lcs", replace(cartpole_lcs(), c=[0.0, np.inf]), C3Status.BAD_LCS),
         ("lcs", object(), C3Status.BAD_LCS),
         ("lcs", ball(True, 5)[0], C3Status.BAD_LCS),
-        ("x", np.full(4, 1e200), C3Status.SOLVE_FAILED),
+        ("x", np.full(4, 1e308), C3Status.SOLVE_FAILED),
     ],
 )
 def test_a_bad_input_holds_the_last_plan_as_time_goes_on(name, value, status):

@@ -2,6 +2,9 @@ from itertools import product
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydrake.solvers import MathematicalProgram, MobyLcpSolver
 from scipy.optimize import linprog
 
 from makebreak.systems.numerics.lcp import SOLVED, solve_lcp, solve_lcp_kernel
@@ -74,6 +77,119 @@ def test_it_raises_exactly_where_no_w_is_feasible():
             with pytest.raises(ValueError, match="no solution"):
                 solve_lcp(F, q)
     assert 10 < raised < 50  # Both cases occurred.
+
+
+def test_a_solvable_lcp_on_which_lemke_ends_in_a_ray_is_solved():
+    F = np.array([[0.0, 1.0], [1.0, 0.0]])  # Copositive, not semi-definite.
+    np.testing.assert_allclose(solve_lcp(F, -np.ones(2)), [1.0, 1.0], rtol=1e-12)
+
+
+def any_lcp(rng, n):
+    """F of no particular kind, rows and columns of mixed scales; q at random."""
+    F = rng.normal(size=(n, n)) * (rng.random((n, n)) < rng.uniform(0.3, 1.0))
+    F *= 10.0 ** rng.uniform(-2, 2, n)[:, None]
+    return F, rng.normal(size=n)
+
+
+def test_any_F_is_solved_where_enumeration_finds_a_solution():
+    rng = np.random.default_rng(0)
+    refused = 0
+    for _ in range(300):
+        F, q = any_lcp(rng, rng.integers(1, 7))
+        try:
+            lam = solve_lcp(F, q)
+        except ValueError:
+            refused += 1
+            assert brute_force_lcp(F, q) is None
+            continue
+        assert_solves(F, q, lam)
+    assert 20 < refused < 250  # Both cases occurred.
+
+
+def cube_on_a_plane(rng, corners=8, edges=4):
+    """The LCP of Stewart and Trinkle, unknowns [normal, friction, sliding speed], of a
+    cube of random size, mass, friction, orientation, height and velocity."""
+    dt, m, a = 10.0 ** rng.uniform([-3, -2, -2], [-1, 1, 0])
+    mu, R = rng.uniform(0.0, 1.0), np.eye(3)
+    if rng.random() < 0.5:
+        R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    p = 0.5 * a * np.array(list(product([-1, 1], repeat=3))) @ R.T
+    p = p[np.argsort(p[:, 2])[:corners]]
+    M_inv = np.diag([6.0 / (m * a**2)] * 3 + [1.0 / m] * 3)
+    height = rng.choice([0.0, 1e-3 * rng.normal(), 0.05 * rng.random()])
+    J_n, J_t = [], []
+    for x, y, z in p:
+        J = np.array([[0, z, -y, 1, 0, 0], [-z, 0, x, 0, 1, 0], [y, -x, 0, 0, 0, 1.0]])
+        J_n.append(J[2])
+        for k in range(edges // 2):
+            angle = 2.0 * np.pi * k / edges
+            t = np.cos(angle) * J[0] + np.sin(angle) * J[1]
+            J_t += [t, -t]
+    J, n = np.array(J_n + J_t), corners
+    E_t, v = np.kron(np.eye(n), np.ones((edges, 1))), rng.normal(size=6)
+    v = v * rng.choice([0.0, 0.1, 1.0]) - dt * 9.81 * np.eye(6)[5]
+    F, q = np.zeros((n * (edges + 2), n * (edges + 2))), np.zeros(n * (edges + 2))
+    F[: len(J), : len(J)] = dt * J @ M_inv @ J.T
+    F[n : len(J), len(J) :] = E_t
+    F[len(J) :, :n], F[len(J) :, n : len(J)] = mu * np.eye(n), -E_t.T
+    q[: len(J)] = J @ v
+    q[:n] += (height + p[:, 2] - p[:, 2].min()) / dt
+    return F, q
+
+
+@pytest.mark.parametrize("trials", [60, pytest.param(600, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("corners", [4, 8])
+def test_a_cube_on_a_plane_with_coulomb_friction_is_solved(corners, trials):
+    rng = np.random.default_rng(0)
+    for _ in range(trials):
+        F, q = cube_on_a_plane(rng, corners)
+        assert_solves(F, q, solve_lcp(F, q))
+
+
+def test_the_smallest_cube_problems_agree_with_drakes_moby_solver_in_motion():
+    """Where Moby's answer obeys the definition (it does not check itself): for a
+    frictionless cube F is semi-definite, and then F lam is unique."""
+    rng, compared = np.random.default_rng(0), 0
+    for _ in range(30):
+        F, q = cube_on_a_plane(rng, 4)
+        F, q = F[:4, :4], q[:4]
+        prog = MathematicalProgram()
+        z = prog.NewContinuousVariables(4)
+        prog.AddLinearComplementarityConstraint(F, q, z)
+        result = MobyLcpSolver().Solve(prog)
+        ok, lam = result.is_success(), result.GetSolution(z)
+        w = F @ lam + q
+        size = np.abs(q).max()
+        if not ok or w.min() < -1e-9 * size or lam.min() < 0.0 or abs(w @ lam) > 1e-9:
+            continue
+        compared += 1
+        ours = F @ solve_lcp(F, q)
+        np.testing.assert_allclose(ours, F @ lam, atol=1e-7 * size)
+    assert compared > 15
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.floats(-6.0, 6.0),
+    st.floats(-6.0, 6.0),
+    st.floats(0.0, 6.0),
+)
+def test_contact_lcps_of_any_scale_are_solved(seed, of_F, of_q, spread):
+    """F = J J' + eps_c, singular or nearly, in units 1e-6 to 1e6, rows of mixed ones;
+    q is such that there is a solution."""
+    rng = np.random.default_rng(seed)
+    n = rng.integers(1, 17)
+    J = rng.normal(size=(n, rng.integers(1, n + 1)))
+    F = J @ J.T + rng.choice([0.0, 1e-12, 1e-9, 1e-6]) * np.eye(n)
+    lam, w = (np.maximum(rng.normal(size=n), 0.0) for _ in range(2))
+    q = np.where(lam > 0.0, 0.0, w) - F @ lam
+    s = 10.0 ** (spread * rng.uniform(-0.5, 0.5, n))
+    F, q = 10.0**of_F * s[:, None] * F * s, 10.0**of_q * s * q
+    ours = solve_lcp(F, q)
+    # In units in which the rows are of one size, as solve_lcp promises.
+    unit = 1.0 / np.sqrt(np.diag(F))
+    assert_solves(unit[:, None] * F * unit, unit * q, ours / unit)
 
 
 @pytest.mark.parametrize("n", [4, 16])

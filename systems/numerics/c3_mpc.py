@@ -17,7 +17,9 @@ Source: Aydinoglu, Wei, Huang, Posa, arXiv:2304.11259, algorithm 1; ACI-MPC sect
 docs/c3.md lists every choice in which implementations differ.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -39,7 +41,12 @@ from makebreak.systems.numerics.c3_qp import (
     within,
 )
 from makebreak.systems.numerics.lcp import SOLVED, solve_lcp_kernel
-from makebreak.systems.numerics.lcs import LCS, is_finite_model, simulate
+from makebreak.systems.numerics.lcs import (
+    LCS,
+    is_finite,
+    is_finite_model,
+    simulate,
+)
 
 
 class C3Failure(RuntimeError):
@@ -149,10 +156,10 @@ class C3Problem:
         bounds = C3Bounds() if bounds is None else bounds
         self.lower = self._bound(-np.inf, u=bounds.u_lower, x=bounds.x_lower)
         self.upper = self._bound(np.inf, u=bounds.u_upper, x=bounds.x_upper)
-        for i in np.flatnonzero(~(self.lower < self.upper)):
+        for i in np.flatnonzero(~(self.lower <= self.upper)):
             raise ValueError(
                 f"C3Bounds: {self.lower[i]} to {self.upper[i]} for entry "
-                f"{i - self.n_lam} of [u, x], expected lower < upper"
+                f"{i - self.n_lam} of [u, x], expected lower <= upper"
             )
 
     def _check_consensus_weights(self, n_contact):
@@ -200,6 +207,15 @@ class C3Problem:
 
 
 def _check_options(o: C3Options, projection: Projection):
+    if not isinstance(projection, Projection):
+        raise ValueError(
+            f"C3: projection is {projection!r}, expected PlusProjection(), "
+            "QpProjection(alpha) or ExactProjection()"
+        )
+    for name in ("N", "rounds"):
+        number = getattr(o, name)
+        if isinstance(number, bool) or not isinstance(number, Integral):
+            raise ValueError(f"C3Options.{name} is {number!r}, expected an integer")
     if o.N < 1 or o.rounds < 0:
         raise ValueError(
             f"C3Options: N = {o.N} knots and rounds = {o.rounds}, expected N >= 1 and "
@@ -260,12 +276,16 @@ _FAILURES = {
 
 
 def solve_c3(
-    lcs: LCS, x0, x_desired, problem: C3Problem, warm: WarmStart | None = None
+    lcs: LCS | Sequence[LCS],
+    x0,
+    x_desired,
+    problem: C3Problem,
+    warm: WarmStart | None = None,
 ):
     """One solve of C3, from the state x0.
 
     Args:
-        lcs: the model, one for the whole horizon.
+        lcs: the model, one for the whole horizon, or a list of N, one per knot.
         x0: (n_x,) [SI].
         x_desired: (N + 1, n_x), row k the target at knot k.
         problem: weights, projection, options, bounds.
@@ -276,18 +296,20 @@ def solve_c3(
     Raises: ValueError on wrong shapes; C3Failure where there is no result.
     """
     p, o = problem, problem.options
+    models = _one_per_knot(lcs, p)
     x0 = np.array(x0, float, order="C")
     x_desired = np.array(x_desired, float, order="C")
-    if (lcs.n_x, lcs.n_u, lcs.n_lam) != (p.n_x, p.n_u, p.n_lam):
-        raise ValueError(
-            f"solve_c3: the LCS has (n_x, n_u, n_lam) = {lcs.n_x, lcs.n_u, lcs.n_lam}, "
-            f"expected {p.n_x, p.n_u, p.n_lam} as the weights"
-        )
     if x0.shape != (p.n_x,) or x_desired.shape != (o.N + 1, p.n_x):
         raise ValueError(
             f"solve_c3: x0 is {x0.shape} and x_desired {x_desired.shape}, expected "
             f"{(p.n_x,)} and {(o.N + 1, p.n_x)}"
         )
+    for name, values in (("x0", x0), ("x_desired", x_desired)):
+        if not is_finite(values):
+            at = np.argwhere(~np.isfinite(values))[0]
+            raise C3Failure(
+                f"{name}{at.tolist()} is {values[tuple(at)]}, expected finite numbers"
+            )
     warm = problem.cold_start() if warm is None else warm
     if warm.u.shape != (o.N, p.n_u) or warm.delta.shape != (o.N, p.n_z):
         raise ValueError(
@@ -296,7 +318,7 @@ def solve_c3(
         )
     scale = 1.0
     if o.scale_lam:
-        A_norm, D_norm = np.linalg.norm(lcs.A), np.linalg.norm(lcs.D)
+        A_norm, D_norm = np.linalg.norm(models[0].A), np.linalg.norm(models[0].D)
         if not 0.0 < D_norm < np.inf:
             raise C3Failure("D is zero or not finite: there is no scale for lam")
         scale = float(A_norm / D_norm)
@@ -304,23 +326,21 @@ def solve_c3(
     i_u = p.n_x + p.n_lam
     unit = np.ones(p.n_z)
     unit[p.n_x : i_u] = unit[i_u + p.n_u :] = scale
-    # Of one order, so that there is one compiled version whatever order came in.
-    A, B, D, d, E, F, H, c = (
-        np.ascontiguousarray(a)
-        for a in (lcs.A, lcs.B, lcs.D, lcs.d, lcs.E, lcs.F, lcs.H, lcs.c)
-    )
+    A, B, D, d, E, F, H, c = (_stacked(models, name) for name in "ABDdEFHc")
     (AB, d, C, c), E, F, H, pushes = _model(A, B, D, d, E, F, H, c, scale)
-    matrices: tuple = ()
+    matrices: list = []
     if not p.is_plus:
-        for i in np.flatnonzero((p.U[i_u:] == 0.0) & H.any(axis=0)):
+        for i in np.flatnonzero((p.U[i_u:] == 0.0) & H.any(axis=(0, 1))):
             raise C3Failure(f"U is 0 for u[{i}], expected > 0 where H is not zero")
-        matrices = projection_matrices(p.U, E, F, H)
+        matrices = [
+            projection_matrices(p.U, *arrays) for arrays in zip(E, F, H, strict=True)
+        ]
     lam0 = np.empty(0)
     if not pushes:
-        lam0, status = solve_lcp_kernel(F, E @ x0 + c)
+        lam0, status = solve_lcp_kernel(F[0], E[0] @ x0 + c[0])
         if status != SOLVED:
             raise C3Failure("lam_0: the LCP at x_0 has no solution")
-    h = np.zeros((o.N + 1, AB.shape[1]))  # What stays of the QP's linear term.
+    h = np.zeros((o.N + 1, AB.shape[2]))  # What stays of the QP's linear term.
     h[:, p.n_lam + p.n_u :] = x_desired @ p.Q
     h[o.N, p.n_lam + p.n_u :] = p.Q_N @ x_desired[o.N]
     if o.penalise_input_change:
@@ -347,6 +367,34 @@ def solve_c3(
     return plan, WarmStart(plan.u, delta * unit, w * unit)
 
 
+def _one_per_knot(lcs, p: C3Problem) -> list[LCS]:
+    """[lcs], or the N of a list, checked. Raises: ValueError."""
+    models = [lcs] if isinstance(lcs, LCS) else lcs
+    if not isinstance(models, Sequence) or not all(isinstance(m, LCS) for m in models):
+        raise ValueError(
+            f"solve_c3: lcs is a {type(lcs).__name__}, expected an LCS or a list of "
+            f"{p.options.N}"
+        )
+    if not isinstance(lcs, LCS) and len(models) != p.options.N:
+        raise ValueError(
+            f"solve_c3: {len(models)} LCS came, expected one, or {p.options.N} as knots"
+        )
+    for m in models:
+        if (m.n_x, m.n_u, m.n_lam) != (p.n_x, p.n_u, p.n_lam):
+            raise ValueError(
+                f"solve_c3: the LCS has (n_x, n_u, n_lam) = {m.n_x, m.n_u, m.n_lam}, "
+                f"expected {p.n_x, p.n_u, p.n_lam} as the weights"
+            )
+    return list(models)
+
+
+def _stacked(models, name):
+    """That array of all models (K, ...), of C order: one compiled version serves."""
+    if len(models) == 1:
+        return np.ascontiguousarray(getattr(models[0], name))[None]
+    return np.array([getattr(m, name) for m in models])
+
+
 def _admm(model, weights, bounds, given, delta, w, options, lcp):
     """The rounds of C3, and the last QP: x, v, delta, w.
 
@@ -355,24 +403,30 @@ def _admm(model, weights, bounds, given, delta, w, options, lcp):
     Raises: C3Failure.
     """
     (Q, R, Q_N, G), (h, x0, lam0) = weights, given
-    (N, n_z), n_lam = delta.shape, model[2].shape[0]
+    (N, n_z), n_lam = delta.shape, model[2].shape[1]
+    sides = np.zeros((N + 1, n_lam + len(R) + len(Q)), np.int64)
 
     def qp_step(G, target):
         x, v = np.empty((N + 1, len(Q))), np.empty((N, n_lam + len(R)))
         z = np.empty((N, n_z))
         status = _qp_step(
-            model, (Q, R, Q_N, G), bounds, (h, target, x0, lam0), (z, x, v)
+            model, (Q, R, Q_N, G), bounds, (h, target, x0, lam0), (z, x, v, sides)
         )
         if status != SOLVED:
             raise C3Failure(_FAILURES[status])
         return z, x, v
 
     projection, U, arrays, matrices = lcp
+    K = len(matrices)
     for _ in range(options.rounds):
         z, _, _ = qp_step(G, delta - w)
         delta = np.empty((N, n_z))
-        if not project(projection, z + w, U, arrays, matrices, delta):
-            raise C3Failure("the projection's LCP was not solved")
+        for k in range(K):
+            knots = slice(None) if K == 1 else slice(k, k + 1)
+            arrays_k = tuple(a[k] for a in arrays)
+            goal = (z + w)[knots]
+            if not project(projection, goal, U, arrays_k, matrices[k], delta[knots]):
+                raise C3Failure("the projection has no solution")
         w = (w + z - delta) / options.rho
         G = options.rho * G
     _, x, v = qp_step(G, delta - w)
@@ -381,15 +435,18 @@ def _admm(model, weights, bounds, given, delta, w, options, lcp):
 
 @njit(cache=True)
 def _model(A, B, D, d, E, F, H, c, scale):
-    """The LCS in lam / scale: the model of _qp_step; E, F, H; whether H is not zero."""
-    n_x, n_lam = D.shape
-    n_v = n_lam + B.shape[1]
-    AB, C = np.empty((n_x, n_v + n_x)), np.empty((n_lam, n_v + n_x))
-    AB[:, :n_lam], AB[:, n_lam:n_v], AB[:, n_v:] = D * scale, B, A
+    """The LCS in lam / scale: the model of _qp_step; E, F, H; whether H is not zero.
+
+    All arrays have the knots first: one for all, or N.
+    """
+    K, n_x, n_lam = D.shape
+    n_v = n_lam + B.shape[2]
+    AB, C = np.empty((K, n_x, n_v + n_x)), np.empty((K, n_lam, n_v + n_x))
     E, F, H = E / scale, F.copy(), H / scale
-    C[:, :n_lam], C[:, n_lam:n_v], C[:, n_v:] = F, H, E
+    AB[:, :, :n_lam], AB[:, :, n_lam:n_v], AB[:, :, n_v:] = D * scale, B, A
+    C[:, :, :n_lam], C[:, :, n_lam:n_v], C[:, :, n_v:] = F, H, E
     pushes = False
-    for number in H.flat:
+    for number in H[0].flat:
         pushes |= number != 0.0
     return (AB, d.copy(), C, c / scale), E, F, H, pushes
 
@@ -399,13 +456,13 @@ def _admm_plus(
     AB, d, C, c, Q, R, Q_N, G, lower, upper, U, h, x0, lam0, delta, w, rounds, rho
 ):
     """The same for C3+, compiled as a whole; the first result is _qp_step's status."""
-    (N, n_z), n_lam = delta.shape, C.shape[0]
+    (N, n_z), n_lam = delta.shape, C.shape[1]
     model, bounds = (AB, d, C, c), (lower, upper)
     x, v = np.empty((N + 1, len(Q))), np.empty((N, n_lam + len(R)))
-    z = np.empty((N, n_z))
+    z, sides = np.empty((N, n_z)), np.zeros((N + 1, AB.shape[2]), np.int64)
     for _ in range(rounds):
         status = _qp_step(
-            model, (Q, R, Q_N, G), bounds, (h, delta - w, x0, lam0), (z, x, v)
+            model, (Q, R, Q_N, G), bounds, (h, delta - w, x0, lam0), (z, x, v, sides)
         )
         if status != SOLVED:
             return status, x, v, delta, w
@@ -413,7 +470,9 @@ def _admm_plus(
         project_plus(z + w, U, len(Q), n_lam, delta)
         w = (w + z - delta) / rho
         G = rho * G
-    status = _qp_step(model, (Q, R, Q_N, G), bounds, (h, delta, x0, lam0), (z, x, v))
+    status = _qp_step(
+        model, (Q, R, Q_N, G), bounds, (h, delta, x0, lam0), (z, x, v, sides)
+    )
     return status, x, v, delta, w
 
 
@@ -422,67 +481,70 @@ def _qp_step(model, weights, bounds, given, found):
     """One QP of C3; fills found and returns SOLVED, NOT_CONVEX or INFEASIBLE.
 
     Args:
-        model: AB = [D B A], d, C = [F H E], c.
+        model: AB = [D B A], d, C = [F H E], c, each (K, ...) with K = 1 or N.
         weights: Q, R, Q_N and the diagonal G.
         bounds: lower, upper over [lam, u, x].
         given: h (N + 1, n) the linear term of the planning cost over [lam, u, x],
             target (N, n_z) of the consensus, x0, lam0 (empty: free).
-        found: z (N, n_z), x (N + 1, n_x), v = [lam, u] (N, n_v), overwritten.
+        found: z (N, n_z), x (N + 1, n_x), v = [lam, u] (N, n_v), overwritten; sides,
+            the active bounds, from the last round to the next (solve_bounded).
     """
     AB, d, C, c = model
     Q, R, Q_N, G = weights
     lower, upper = bounds
     h_plan, target, x0, lam0 = given
-    z, x, v = found
-    n_x, n = AB.shape
-    n_lam, n_v, n_z, N = C.shape[0], n - n_x, G.size, v.shape[0]
+    z, x, v, sides = found
+    K, n_x, n = AB.shape
+    n_lam, n_v, n_z, N = C.shape[1], n - n_x, G.size, v.shape[0]
     i_eta, plus = n, n_z > n
     # Stage cost and linear term: the planning cost, and |z - target|^2_G with
     # eta = C [v, x] + c put in.
-    T, h = np.zeros((n, n)), h_plan.copy()
-    T[n_lam:n_v, n_lam:n_v] = R
-    T[n_v:, n_v:] = Q
+    T, h = np.zeros((K, n, n)), h_plan.copy()
+    T[:, n_lam:n_v, n_lam:n_v] = R
+    T[:, n_v:, n_v:] = Q
     for i in range(n):
         at = n_x + i if i < n_v else i - n_v  # Of [v, x] in z = [x, v, eta].
-        T[i, i] += G[at]
+        for k in range(K):
+            T[k, i, i] += G[at]
         for k in range(N):
             h[k, i] += G[at] * target[k, at]
     if plus:
-        for m in range(n_lam):
-            for i in range(n):
-                a = C[m, i] * G[i_eta + m]
-                if a != 0.0:
-                    for j in range(n):
-                        T[i, j] += a * C[m, j]
+        for k in range(K):
+            for m in range(n_lam):
+                for i in range(n):
+                    a = C[k, m, i] * G[i_eta + m]
+                    if a != 0.0:
+                        for j in range(n):
+                            T[k, i, j] += a * C[k, m, j]
         for k in range(N):
             for m in range(n_lam):
-                a = G[i_eta + m] * (target[k, i_eta + m] - c[m])
+                a = G[i_eta + m] * (target[k, i_eta + m] - c[k % K, m])
                 for i in range(n):
-                    h[k, i] += a * C[m, i]
+                    h[k, i] += a * C[k % K, m, i]
     fac = new_factor(AB, d, N)
     if not factor(fac, T, Q_N, np.zeros((0, 0)), lam0.size):
         return NOT_CONVEX
     solve(fac, h, x0, lam0, x, v)
     if not within(x, v, lower, upper):
-        if not solve_bounded(fac, T, Q_N, h, x0, lam0, lower, upper, x, v):
+        if not solve_bounded(fac, T, Q_N, h, x0, lam0, lower, upper, sides, x, v):
             return INFEASIBLE
     for k in range(N):
         z[k, :n_x] = x[k]
         z[k, n_x:i_eta] = v[k]
         if plus:
             for m in range(n_lam):
-                total = c[m]
+                total = c[k % K, m]
                 for i in range(n_v):
-                    total += C[m, i] * v[k, i]
+                    total += C[k % K, m, i] * v[k, i]
                 for i in range(n_x):
-                    total += C[m, n_v + i] * x[k, i]
+                    total += C[k % K, m, n_v + i] * x[k, i]
                 z[k, i_eta + m] = total
     if not (np.isfinite(x).all() and np.isfinite(v).all()):
         return NOT_CONVEX
     return SOLVED
 
 
-def plan_cost(lcs: LCS, x0, u, x_desired, problem: C3Problem) -> float:
+def plan_cost(lcs: LCS | Sequence[LCS], x0, u, x_desired, problem: C3Problem) -> float:
     """What the inputs u (N, n_u) really cost: rolled out with exact contact forces.
 
     Returns: sum (x - x_desired)'Q(x - x_desired) + u'R u, Q_N at the last state. The
@@ -490,10 +552,11 @@ def plan_cost(lcs: LCS, x0, u, x_desired, problem: C3Problem) -> float:
     Raises: ValueError if an LCP of the rollout has no solution.
     """
     x, cost = np.asarray(x0, float), 0.0
+    models = _one_per_knot(lcs, problem)
     for k in range(len(u)):
         e = x - x_desired[k]
         cost += e @ problem.Q @ e + u[k] @ problem.R @ u[k]
-        x, _ = simulate(lcs, x, u[k])
+        x, _ = simulate(models[k % len(models)], x, u[k])
     e = x - x_desired[len(u)]
     return float(cost + e @ problem.Q_N @ e)
 

@@ -18,6 +18,10 @@ import numpy as np
 from numba import njit
 
 from makebreak.systems.numerics.lcp import SOLVED, solve_lcp_kernel
+from makebreak.systems.numerics.nearest_point import nearest_mode
+
+# Nodes of one knot's branch and bound; it takes tens of them, as a rule.
+NODES_MAX = 100_000
 
 
 @dataclass
@@ -52,10 +56,10 @@ def project(projection: Projection, z, U, lcs, matrices, delta) -> bool:
     if isinstance(projection, PlusProjection):
         project_plus(z, U, E.shape[1], E.shape[0], delta)
         return True
-    V, K = matrices
     if isinstance(projection, QpProjection):
+        V, K = matrices
         return project_qp(z, projection.alpha, E, F, H, c, V, K, delta)
-    return project_exact(z, U, E, F, H, c, V, K, delta)
+    return project_exact(z, U, E, F, H, c, delta)
 
 
 @njit(cache=True)
@@ -149,141 +153,64 @@ def project_qp(z, alpha, E, F, H, c, V, K, delta):
 
 
 @njit(cache=True)
-def project_exact(z, U, E, F, H, c, V, K, delta):
+def project_exact(z, U, E, F, H, c, delta):
     """delta (N, n_z): the nearest point to each knot in the weight U that obeys the
     complementarity 0 <= lam perp s >= 0.
 
     Branch and bound: a node has decided lam_i = 0 or s_i = 0 for some i and asks only
     lam_i >= 0, s_i >= 0 of the others, a convex QP whose optimum bounds what lies
-    below it. Each such QP is solved exactly, as the LCP of its multipliers.
+    below it.
 
-    Returns: whether it succeeded (False: an LCP was not solved).
+    Returns: whether it succeeded (False: no point obeys it, or rounding was too much).
     """
     n_lam, n_x = E.shape
     n_u = H.shape[1]
-    U_lam = U[n_x : n_x + n_lam]
-    for knot in range(len(z)):
-        z_lam, gap = z[knot, n_x : n_x + n_lam], _gap(z[knot], E, H, c)
-        scale = np.empty(n_lam)  # s / scale is a distance in the weight U.
-        for i in range(n_lam):
-            total = K[i, i]
-            for j in range(n_lam):
-                total += F[i, j] ** 2 / U_lam[j]
-            scale[i] = np.sqrt(total) if total > 0.0 else 1.0
-        size = 1.0
-        for i in range(n_lam):
-            size = max(size, abs(gap[i]) / scale[i], np.sqrt(U_lam[i]) * abs(z_lam[i]))
-        # Modes: 0 undecided, 1 lam_i = 0, 2 s_i = 0. Depth first: two per level.
-        stack = np.zeros((n_lam + 2, n_lam), np.int64)
-        depth, best = 1, np.inf
-        lam, slack = np.empty(n_lam), np.empty(n_lam)
-        multiplier = np.empty(n_lam)
-        while depth > 0:
-            depth -= 1
-            mode = stack[depth].copy()
-            cost = _solve_node(
-                mode, z_lam, U_lam, gap, F, K, lam, slack, multiplier, best
-            )
-            if cost == -1.0:
-                return False
-            if not cost < best - 1e-12 * size * size:
-                continue
-            branch, worst = -1, 1e-9 * size
+    n_y = n_x + n_u
+    # In root = sqrt(weight) times the move v from z, nearness is the plain length.
+    # Columns: y = [x, u], then lam. Rows: s_i, then lam_i, each of length one.
+    root, A = np.zeros(n_y + n_lam), np.zeros((2 * n_lam, n_y + n_lam))
+    unit = np.ones(2 * n_lam)
+    for j in range(n_y + n_lam):
+        weight = U[j] if j < n_x else (U[j + n_lam] if j < n_y else U[j - n_u])
+        root[j] = np.sqrt(weight)
+        if weight > 0.0:
             for i in range(n_lam):
-                if mode[i] == 0:
-                    both = min(np.sqrt(U_lam[i]) * lam[i], slack[i] / scale[i])
-                    if both > worst:
-                        branch, worst = i, both
-            if branch < 0:
-                best = cost
-                delta[knot] = z[knot]
-                for j in range(n_x + n_u):
-                    at = j if j < n_x else j + n_lam
-                    for i in range(n_lam):
-                        delta[knot, at] += V[j, i] * multiplier[i]
-                for i in range(n_lam):
-                    open_gap = slack[i] / scale[i] > np.sqrt(U_lam[i]) * lam[i]
-                    delta[knot, n_x + i] = 0.0 if open_gap else lam[i]
-                continue
-            first = (
-                2
-                if np.sqrt(U_lam[branch]) * lam[branch]
-                > (slack[branch] / scale[branch])
-                else 1
-            )
-            stack[depth] = mode
-            stack[depth, branch] = 3 - first  # The less likely one waits below.
-            stack[depth + 1] = mode
-            stack[depth + 1, branch] = first
-            depth += 2
-        if best == np.inf:
+                if j < n_x:
+                    A[i, j] = E[i, j] / root[j]
+                elif j < n_y:
+                    A[i, j] = H[i, j - n_x] / root[j]
+                else:
+                    A[i, j] = F[i, j - n_y] / root[j]
+    for i in range(n_lam):
+        A[n_lam + i, n_y + i] = 1.0
+        length = 0.0
+        for j in range(n_y + n_lam):
+            length += A[i, j] ** 2
+        if length > 0.0:
+            unit[i] = np.sqrt(length)
+            A[i] /= unit[i]
+        unit[n_lam + i] = 1.0 / root[n_y + i]
+    b, v = np.empty(2 * n_lam), np.empty(n_y + n_lam)
+    for knot in range(len(z)):
+        gap = _gap(z[knot], E, H, c)
+        size = 0.0
+        for i in range(n_lam):
+            for j in range(n_lam):
+                gap[i] += F[i, j] * z[knot, n_x + j]
+            b[i] = gap[i] / unit[i]
+            b[n_lam + i] = z[knot, n_x + i] / unit[n_lam + i]
+            size = max(size, abs(b[i]), abs(b[n_lam + i]))
+        best = nearest_mode(A, b, size, -1.0, v, NODES_MAX)
+        if not best < np.inf:
             return False
+        for j in range(n_y + n_lam):
+            at = j if j < n_x else (j + n_lam if j < n_y else j - n_u)
+            move = v[j] / root[j] if root[j] > 0.0 else 0.0
+            delta[knot, at] = z[knot, at] + move
+        for i in range(n_lam):
+            s, lam = b[i], b[n_lam + i] + v[n_y + i]
+            for j in range(n_y + n_lam):
+                s += A[i, j] * v[j]
+            if s > lam or delta[knot, n_x + i] < 0.0:
+                delta[knot, n_x + i] = 0.0
     return True
-
-
-@njit(cache=True)
-def _solve_node(mode, z_lam, U_lam, gap, F, K, lam, slack, multiplier, best):
-    """One node's QP: fills lam, slack, multiplier (of s); returns its optimum.
-
-    inf where the node holds no point, -1 where the LCP was not solved.
-
-    Rows: s_i >= 0 for all i; lam_i >= 0 unless lam_i = 0 was decided (then it is no
-    variable); -s_i >= 0 where s_i = 0 was decided. The multipliers of these rows solve
-    an LCP with the Gram matrix of the rows in the inverse weight.
-    """
-    n = z_lam.size
-    free, closed = np.flatnonzero(mode != 1), np.flatnonzero(mode == 2)
-    n_f, n_c = free.size, closed.size
-    size = n + n_f + n_c
-    M, q = np.empty((size, size)), np.empty(size)
-    for i in range(n):
-        q[i] = gap[i]
-        for a in range(n_f):
-            j = free[a]
-            q[i] += F[i, j] * z_lam[j]
-            M[i, n + a] = M[n + a, i] = F[i, j] / U_lam[j]
-        for k in range(n):
-            M[i, k] = K[i, k]
-            for a in range(n_f):
-                j = free[a]
-                M[i, k] += F[i, j] * F[k, j] / U_lam[j]
-    for a in range(n_f):
-        q[n + a] = z_lam[free[a]]
-        for b in range(n_f):
-            M[n + a, n + b] = 0.0
-        M[n + a, n + a] = 1.0 / U_lam[free[a]]
-    for a in range(n_c):
-        row = n + n_f + a
-        q[row] = -q[closed[a]]
-        for j in range(n + n_f):
-            M[row, j] = M[j, row] = -M[closed[a], j]
-    for a in range(n_c):
-        for b in range(n_c):
-            M[n + n_f + a, n + n_f + b] = M[closed[a], closed[b]]
-    mu, status = solve_lcp_kernel(M, q)
-    if status == 1:
-        return np.inf
-    if status != SOLVED:
-        return -1.0
-    cost = 0.0
-    for i in range(n):
-        multiplier[i] = mu[i]
-        lam[i] = 0.0
-        if mode[i] == 1:
-            cost += U_lam[i] * z_lam[i] ** 2
-    for a in range(n_c):
-        multiplier[closed[a]] -= mu[n + n_f + a]
-    for a in range(n_f):
-        j = free[a]
-        step = mu[n + a]
-        for i in range(n):
-            step += F[i, j] * multiplier[i]
-        step /= U_lam[j]
-        lam[j] = max(z_lam[j] + step, 0.0)
-        cost += U_lam[j] * step**2
-    for i in range(n):
-        slack[i] = gap[i]
-        for j in range(n):
-            slack[i] += K[i, j] * multiplier[j] + F[i, j] * lam[j]
-            cost += multiplier[i] * K[i, j] * multiplier[j]
-    return cost

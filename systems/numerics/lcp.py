@@ -15,6 +15,10 @@ Source: Cottle, Pang, Stone, "The Linear Complementarity Problem", section 4.4
 import numpy as np
 from numba import njit
 
+from makebreak.systems.numerics.nearest_point import nearest_mode
+
+# Modes that the search behind Lemke's method looks at.
+NODES_MAX = 2000
 # Status of solve_lcp_kernel.
 SOLVED, NO_SOLUTION, NOT_PRECISE = 0, 1, 2
 
@@ -99,11 +103,40 @@ def solve_lcp_kernel(F, q):
     z, regular = _lemke(M, b, 1e-13)
     for i in range(n):
         M[i, i] -= 1e-12
-    if regular == SOLVED and _violation(M, b, z) * max(1.0, z.max()) < 1e-9:
-        for i in range(n):
-            lam[i] = scale[i] * largest * z[i]
-        return lam, SOLVED
-    return lam, status
+    if not (regular == SOLVED and _violation(M, b, z) * max(1.0, z.max()) < 1e-9):
+        # Lemke's path may end in a ray although there is a solution, where M is not
+        # positive semi-definite, and rounding may break it where it nearly is not.
+        if not _search(M, b, z):
+            return lam, status
+    for i in range(n):
+        lam[i] = scale[i] * largest * z[i]
+    return lam, SOLVED
+
+
+@njit(cache=True)
+def _search(M, b, z):
+    """Looks for a solution mode by mode; fills z (n,), returns whether there is one."""
+    n = b.size
+    A, distance, size = np.zeros((2 * n, n)), np.zeros(2 * n), 0.0
+    for i in range(n):
+        length = 0.0
+        for j in range(n):
+            length += M[i, j] ** 2
+        length = np.sqrt(length) if length > 0.0 else 1.0
+        for j in range(n):
+            A[i, j] = M[i, j] / length
+        distance[i] = b[i] / length
+        size = max(size, abs(distance[i]))
+        A[n + i, i] = 1.0
+    if not nearest_mode(A, distance, size, np.inf, z, NODES_MAX) < np.inf:
+        return False
+    for i in range(n):
+        w = distance[i]
+        for j in range(n):
+            w += A[i, j] * z[j]
+        if w > z[i] or z[i] < 0.0:
+            z[i] = 0.0
+    return _violation(M, b, z) < 1e-9
 
 
 @njit(cache=True)
