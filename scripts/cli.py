@@ -20,6 +20,7 @@ import yaml
 import makebreak.systems.numerics
 from makebreak.scripts.experiments import EXPERIMENTS, load_experiment
 from makebreak.scripts.interrupts import interrupts
+from makebreak.scripts.parent import end_with_parent
 from makebreak.scripts.settings import (
     apply_settings,
     dump_config,
@@ -352,6 +353,31 @@ def _reproduce_in(session, modules, seeds: int, jobs: int, args) -> int:
     return 1 if missed else 0
 
 
+def _sweep(args) -> int:
+    from makebreak.scripts.sweep import Sweep, run_sweep
+
+    module = _experiment(args.experiment)
+    config = _config(module, args)  # Refuses what is wrong before anything is run.
+    duration = None
+    if args.duration is not None:
+        duration = _number(args.duration, "--duration", 0.0)
+    sweep = Sweep(
+        args.experiment,
+        config,
+        [text for group in args.vary for text in group],
+        trials=int(_number(args.trials, "--trials", 1, whole=True)),
+        first_seed=config.seed,
+        duration_sec=duration,
+    )
+    out = Path(args.out) if args.out else _default_out(f"sweep-{args.experiment}")
+    if args.cluster is not None and args.jobs is not None:
+        raise ValueError("--jobs: got it with --cluster, expected one of the two")
+    table, files = run_sweep(sweep, out, _jobs(args.jobs), args.cluster)
+    print(table.to_text())
+    print(f"Files in {out}: " + " ".join(path.name for path in files), flush=True)
+    return 1 if table.notes else 0  # A note: a trial failed.
+
+
 def _gap(args) -> int:
     from makebreak.scripts.gap_command import effects_table, run_and_report
 
@@ -478,6 +504,30 @@ def _parser() -> argparse.ArgumentParser:
     p.set_defaults(function=_reproduce)
 
     p = commands.add_parser(
+        "sweep", help="one experiment over seeds and ranges of its settings"
+    )
+    p.add_argument("experiment", metavar="EXPERIMENT")
+    p.add_argument("--trials", required=True, metavar="N", help="seeds per case")
+    p.add_argument(
+        "--vary", action="append", default=[], metavar="KEY=LO:HI", nargs="+",
+        help="LO:HI is drawn from for each trial; A,B,C: each is a case",
+    )  # fmt: skip
+    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", nargs="+")
+    p.add_argument("--config", metavar="FILE", help="a YAML file of settings")
+    p.add_argument("--world", metavar="SCENE", help="the scene that is simulated")
+    p.add_argument("--model", metavar="SCENE", help="the scene that control believes")
+    p.add_argument("--seed", metavar="N", help="of the first trial (0)")
+    p.add_argument("--duration", metavar="S", help="simulated seconds")
+    p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
+    p.add_argument(
+        "--cluster", metavar="ADDRESS", help="Dask: tcp://HOST:PORT; Ray: ray:HOST:PORT"
+    )
+    p.add_argument(
+        "--out", metavar="DIR", help="one of an earlier sweep: it goes on there"
+    )
+    p.set_defaults(function=_sweep)
+
+    p = commands.add_parser(
         "gap", help="where a model and recordings disagree, and what it lacks"
     )
     p.add_argument("scene", metavar="SCENE", help="the model: a file, or a listed name")
@@ -544,6 +594,7 @@ def main(argv: list[str] | None = None) -> int:
         argv: the words after `makebreak`; None: those of the process.
     Returns: the exit status.
     """
+    end_with_parent()
     with interrupts():
         return _main(sys.argv[1:] if argv is None else argv)
 

@@ -1,25 +1,37 @@
-"""Runs one experiment many times, each in a process of its own, several at once."""
+"""Runs one experiment many times, each in a process of its own, several at once:
+on this machine's cores, or on a Dask or Ray cluster, with joblib."""
 
 import json
 import math
 import os
 import re
+import signal
+import socket
 import subprocess
 import sys
+import tempfile
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 
+import joblib
 from tqdm import tqdm
 
 import makebreak
 from makebreak.scripts.experiments import load_experiment
 from makebreak.scripts.interrupts import interrupts
+from makebreak.scripts.parent import PARENT
 from makebreak.scripts.settings import apply_settings, dump_config
 
 _COMMAND = (sys.executable, "-m", "makebreak")
+_LATE = "late"  # In place of an exit status: the run took too long.
 _PATIENCE_SEC = 3.0  # For runs that are to end; then they are killed.
+# What a cluster's worker sends back of a run: the recording and the plots stay there.
+_SENT_BACK = ("result.json", "config.yaml", "timing.json", "log.txt", "error.txt")
 
 
 def setting_texts(settings: Mapping) -> list[str]:
@@ -54,6 +66,7 @@ def _environment() -> dict[str, str]:
         env[f"{name}_NUM_THREADS"] = "1"
     root = str(Path(makebreak.__file__).resolve().parent.parent)
     env["PYTHONPATH"] = os.pathsep.join(filter(None, [root, env.get("PYTHONPATH")]))
+    env[PARENT] = str(os.getpid())
     return env
 
 
@@ -70,7 +83,11 @@ def _read(folder: Path, status: int | None) -> dict:
         log = ""
     lines = [line.strip() for line in re.split(r"[\r\n]+", log) if line.strip()]
     error = lines[-1] if lines else "no output"
-    return {"success": False, "error": f"exit status {status}: {error}"}
+    if status is not None and status < 0:
+        ended = f"killed by {signal.Signals(-status).name}"
+    else:
+        ended = f"exit status {status}"
+    return {"success": False, "error": f"{ended}: {error}"}
 
 
 def run_many(
@@ -81,6 +98,7 @@ def run_many(
     duration: float | None = None,
     reuse: bool = False,
     command: Sequence[str] = (),
+    cluster: str | None = None,
 ) -> list[dict]:
     """Runs `makebreak run experiment` once per (settings, seed), `jobs` at a time.
 
@@ -96,6 +114,7 @@ def run_many(
         reuse: whether a run that has already ended there, with the same settings and
             duration, is read instead of repeated.
         command: what starts makebreak; empty: this interpreter with -m makebreak.
+        cluster: as in run_commands.
     Returns: per run its result.json with `seed` and `out_dir` added; of a failed one
         `success` False and `error`, the last line that it printed.
     Raises: ValueError if jobs is below 1 or two runs are the same.
@@ -120,7 +139,9 @@ def run_many(
         seed = runs[i][1]
         return reuse and _is_done(folders[i], experiment, texts[i], seed, duration)
 
-    results = run_commands(experiment, commands, folders, jobs, is_done)
+    results = run_commands(
+        experiment, commands, folders, jobs, is_done, cluster=cluster
+    )
     return [
         {**result, "seed": seed, "out_dir": str(folder)}
         for result, (_, seed), folder in zip(results, runs, folders, strict=True)
@@ -140,81 +161,61 @@ def run_commands(
     is_done: Callable[[int], bool] = lambda i: False,
     ended: Callable[[int, dict], None] = lambda i, result: None,
     limit_sec: float = math.inf,
+    cluster: str | None = None,
 ) -> list[dict]:
     """Runs commands that each write result.json into a folder, `jobs` at a time, with
-    one thread each and their output in the folder's log.txt. Ctrl-C, SIGTERM or SIGHUP
-    ends all of them; one that fails is reported and does not stop the others.
+    one thread each and their output in the folder's log.txt. The files of a run are in
+    its folder as soon as it ends. Ctrl-C, SIGTERM, SIGHUP or the end of this process by
+    whatever means ends all of them; one that fails is reported and does not stop the
+    others.
 
     Args: label, of the progress bar; is_done(i): whether the folder has the result
         already; ended(i, result): called as each has ended; limit_sec: after so long
-        [s] a command is stopped, and has failed.
+        [s] a command is stopped, and has failed; cluster: address of a Dask scheduler
+        (tcp://HOST:PORT) or, on a machine of it, of a Ray cluster (ray:HOST:PORT),
+        whose workers run the commands, as many at a time as it has threads.
     Returns: per command its result.json; of a failed one `success` False and `error`,
-        the last line that it printed.
+        how it ended and the last line that it printed.
+    Raises: ValueError for a cluster that cannot be reached.
     """
     results: list[dict] = [{} for _ in commands]
-    waiting = list(range(len(commands)))
-    running: dict[int, subprocess.Popen] = {}
-    started: dict[int, float] = {}
-    env = _environment()
+    running = _Running()
 
-    before: dict[int, int] = {}  # When the folder's earlier result was written.
     try:
         with (
             interrupts(),
             tqdm(total=len(commands), desc=label, unit="run", file=sys.stderr) as bar,
+            _workers(cluster, jobs) as parallel,
         ):
-            while waiting or running:
-                while waiting and len(running) < jobs:
-                    i = waiting.pop(0)
-                    if is_done(i):
-                        results[i] = _read(folders[i], 0)
-                        ended(i, results[i])
-                        bar.update()
-                        continue
-                    folders[i].mkdir(parents=True, exist_ok=True)
-                    before[i] = _written(folders[i])
-                    with (folders[i] / "log.txt").open("wb") as log:
-                        running[i] = subprocess.Popen(
-                            commands[i],
-                            stdin=subprocess.DEVNULL,
-                            stdout=log,
-                            stderr=subprocess.STDOUT,
-                            env=env,
-                            start_new_session=True,  # Ctrl-C reaches us alone.
-                        )
-                    started[i] = time.monotonic()
-                for i, process in list(running.items()):
-                    status: int | None = process.poll()
-                    late = time.monotonic() - started[i] > limit_sec
-                    if status is None and not late:
-                        continue
-                    if status is None:
-                        process.kill()
-                        process.wait()
-                        error = f"stopped after {limit_sec:.0f} s"
-                        result = {"success": False, "error": error}
-                    else:
-                        result = _read(folders[i], status)
-                    del running[i]
-                    if status in (0, 1) and _written(folders[i]) == before[i]:
-                        result = _read(folders[i], None)  # It is another run's.
-                    results[i] = result
-                    ended(i, result)
-                    if "error" in result:
-                        bar.write(f"{folders[i].name}: {result['error']}", sys.stderr)
+            waiting = []
+            for i, (command, folder) in enumerate(zip(commands, folders, strict=True)):
+                if is_done(i):
+                    results[i] = _read(folder, 0)
+                    ended(i, results[i])
                     bar.update()
-                if running:
-                    time.sleep(0.05)
+                    continue
+                folder.mkdir(parents=True, exist_ok=True)
+                if cluster is None:
+                    task = partial(running.run, i, command, folder, limit_sec)
+                else:
+                    far = _portable(command, folder)
+                    task = partial(_run_far, i, far, limit_sec)
+                waiting.append(joblib.delayed(task)())
+            for i, status, files in parallel(waiting):
+                for name, content in files.items():
+                    (folders[i] / name).write_bytes(content)
+                if status == _LATE:
+                    error = f"stopped after {limit_sec:.0f} s"
+                    result = {"success": False, "error": error}
+                else:
+                    result = _read(folders[i], status)
+                results[i] = result
+                ended(i, result)
+                if "error" in result:
+                    bar.write(f"{folders[i].name}: {result['error']}", sys.stderr)
+                bar.update()
     finally:
-        for process in running.values():
-            process.terminate()
-        end = time.monotonic() + _PATIENCE_SEC
-        for process in running.values():
-            try:
-                process.wait(max(end - time.monotonic(), 0.0))
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+        running.end()
     return results
 
 
@@ -224,6 +225,138 @@ def _written(folder: Path) -> int:
         return (folder / "result.json").stat().st_mtime_ns
     except OSError:
         return 0
+
+
+class _Running:
+    """The processes that run here, each watched by a thread."""
+
+    def __init__(self):
+        self._processes: set[subprocess.Popen] = set()
+        self._lock, self._ended = threading.Lock(), False
+
+    def run(self, i: int, command: Sequence[str], folder: Path, limit_sec: float):
+        """i, the exit status, and no files: they are in the folder."""
+        before = _written(folder)
+        with (folder / "log.txt").open("wb") as log:
+            with self._lock:
+                if self._ended:
+                    return i, None, {}
+                process = subprocess.Popen(
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                    env=_environment(),
+                    start_new_session=True,  # Ctrl-C reaches us alone.
+                )
+                self._processes.add(process)
+            status: int | str | None
+            try:
+                status = process.wait(None if limit_sec == math.inf else limit_sec)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+                status = _LATE
+            with self._lock:
+                self._processes.discard(process)
+        if status in (0, 1) and _written(folder) == before:
+            status = None  # The result is another run's.
+        return i, status, {}
+
+    def end(self):
+        """Ends what still runs; nothing starts afterwards."""
+        with self._lock:
+            self._ended = True
+            left = list(self._processes)
+        for process in left:
+            process.terminate()
+        end = time.monotonic() + _PATIENCE_SEC
+        for process in left:
+            try:
+                process.wait(max(end - time.monotonic(), 0.0))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+_OUT, _PYTHON = "<out>", "<python>"
+
+
+def _portable(command: Sequence[str], folder: Path) -> list[str]:
+    """A command in which this machine's folder and interpreter have no part."""
+    own = {str(folder): _OUT, sys.executable: _PYTHON}
+    return [own.get(word, word) for word in command]
+
+
+def _run_far(i: int, command: Sequence[str], limit_sec: float):
+    """On a cluster's worker: i, the exit status, and {name: content} of the files."""
+    with tempfile.TemporaryDirectory() as folder:
+        own = {_OUT: folder, _PYTHON: sys.executable}
+        there = [own.get(word, word) for word in command]
+        _, status, _ = _Running().run(i, there, Path(folder), limit_sec)
+        paths = [Path(folder) / name for name in _SENT_BACK]
+        return i, status, {p.name: p.read_bytes() for p in paths if p.exists()}
+
+
+@contextmanager
+def _workers(cluster: str | None, jobs: int):
+    """joblib's Parallel, which gives each result as it comes.
+
+    Raises: ValueError if the cluster's library or the cluster is not there.
+    """
+    now = dict(return_as="generator_unordered", batch_size=1)
+    if cluster is None:
+        # Threads that wait: the work is in processes, which may crash alone.
+        yield joblib.Parallel(n_jobs=jobs, backend="threading", **now)
+        return
+    kind, close = _connect(cluster)
+    try:
+        with joblib.parallel_config(backend=kind):
+            yield joblib.Parallel(n_jobs=-1, **now)
+    finally:
+        close()
+
+
+def _connect(cluster: str) -> tuple[str, Callable[[], object]]:
+    """The name of joblib's backend for a cluster, and what ends the connection."""
+    if cluster.startswith(("tcp://", "tls://")):
+        extra, address = "dask", cluster
+    elif cluster.startswith("ray:") and not cluster.startswith("ray:/"):
+        extra, address = "ray", cluster[len("ray:") :]
+    else:
+        raise ValueError(
+            f'--cluster: got "{cluster}", expected tcp://HOST:PORT (Dask) or '
+            "ray:HOST:PORT (Ray, on a machine of the cluster)"
+        )
+    host, _, port = address.rpartition(":")
+    try:
+        # Before any library: Ray would try for minutes, and then end the process.
+        socket.create_connection((host.split("//")[-1], int(port)), 10.0).close()
+    except (OSError, ValueError) as error:
+        raise ValueError(f"--cluster: {cluster} not reached: {error}") from error
+    try:
+        if extra == "dask":
+            from distributed import Client
+
+            client = Client(address, timeout="10s")
+            return "dask", client.close
+        import ray
+        from ray.util.joblib import register_ray
+        from ray.util.joblib.ray_backend import RayBackend
+
+        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+        register_ray()
+        # joblib holds results of pools of processes back until all are there; Ray's
+        # pool calls back for each, so that they can be had one by one.
+        RayBackend.supports_return_generator = True
+        return "ray", ray.shutdown
+    except ImportError as error:
+        raise ValueError(
+            f"--cluster: {cluster} needs {error.name}: pip install makebreak[{extra}]"
+        ) from error
+    except (OSError, TimeoutError, RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"--cluster: {cluster} not reached: {reason}") from error
 
 
 def duration_line(duration: float | None) -> str:

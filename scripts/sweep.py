@@ -1,0 +1,318 @@
+"""One experiment over seeds and over ranges of its settings."""
+
+import csv
+import dataclasses
+import itertools
+import json
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import yaml
+from matplotlib.figure import Figure
+from scipy.stats import binomtest
+
+from makebreak.scripts.settings import (
+    apply_settings,
+    convert,
+    dump_config,
+    field_types,
+    nearest,
+    to_plain,
+)
+from makebreak.scripts.table import Table, json_value
+from makebreak.scripts.trials import run_many, setting_texts
+
+CONFIDENCE = 0.95
+
+
+def wilson(successes: int, trials: int) -> tuple[float, float]:
+    """Wilson's interval of a success rate, at 95 %. (0, 1) without trials."""
+    if trials == 0:
+        return 0.0, 1.0
+    interval = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def rate_text(successes: int, trials: int) -> str:
+    """`18 of 20, 70-97 %`: with Wilson's interval."""
+    low, high = wilson(successes, trials)
+    return f"{successes} of {trials}, {100 * low:.0f}-{100 * high:.0f} %"
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What is swept.
+
+    Args:
+        experiment: its name.
+        config: the settings that all trials have.
+        vary: texts `key=lo:hi`, drawn from uniformly for each trial, whole numbers for
+            a key that is one, and `key=a,b,c`, of which each value is a case.
+        trials: how many per case, with the seeds first_seed, first_seed + 1, ...
+        duration_sec: overrides the experiment's own.
+    Raises: ValueError for a key, a value or a range that does not fit the config.
+    """
+
+    experiment: str
+    config: object
+    vary: Sequence[str]
+    trials: int
+    first_seed: int = 0
+    duration_sec: float | None = None
+
+    def __post_init__(self):
+        types_of = field_types(type(self.config))
+        object.__setattr__(self, "ranges", {})
+        object.__setattr__(self, "cases_of", {})
+        for text in self.vary:
+            key, equals, raw = text.partition("=")
+            if not equals or not key or not raw:
+                raise ValueError(
+                    f'--vary: got "{text}", expected key=lo:hi or key=a,b,c'
+                )
+            if key not in types_of:
+                raise ValueError(f"--vary: unknown key {key}; {nearest(key, types_of)}")
+            if key in self.ranges or key in self.cases_of:
+                raise ValueError(f"--vary: got {key} twice, expected once")
+            if key == "seed":
+                raise ValueError("--vary: got seed, expected another key: --seed N")
+            if ":" in raw:
+                self.ranges[key] = _range(key, raw, types_of[key])
+            else:
+                values = [_value(key, part, types_of[key]) for part in raw.split(",")]
+                self.cases_of[key] = values
+
+    ranges: dict[str, tuple] = dataclasses.field(init=False)
+    cases_of: dict[str, list] = dataclasses.field(init=False)
+
+    @cached_property
+    def cases(self) -> list[dict]:
+        """{key: value} of each case."""
+        keys, values = list(self.cases_of), self.cases_of.values()
+        return [
+            dict(zip(keys, each, strict=True)) for each in itertools.product(*values)
+        ]
+
+    def drawn(self, seed: int) -> dict:
+        """The values that a trial draws: the same for a seed whatever else varies, so
+        that cases are compared on the same draws, and more trials keep the first."""
+        values: dict[str, float] = {}
+        for key, (low, high) in self.ranges.items():
+            rng = np.random.default_rng([seed, zlib.crc32(key.encode())])
+            if isinstance(low, int):
+                values[key] = int(rng.integers(low, high, endpoint=True))
+            else:
+                values[key] = float(f"{rng.uniform(low, high):.6g}")
+        return values
+
+    def runs(self) -> list[tuple[dict, int]]:
+        """(settings that differ from the experiment's own, seed) of each trial."""
+        own = _differing(self.config)
+        seeds = range(self.first_seed, self.first_seed + self.trials)
+        return [(own | case | self.drawn(s), s) for case in self.cases for s in seeds]
+
+
+def _differing(config) -> dict:
+    """{dotted key: value} of what differs from the defaults, but for the seed."""
+    default = to_plain(type(config)())
+
+    def walk(now, was, prefix):
+        for key, value in now.items():
+            if isinstance(value, dict) and isinstance(was.get(key), dict):
+                yield from walk(value, was[key], f"{prefix}{key}.")
+            elif value != was.get(key):
+                yield f"{prefix}{key}", value
+
+    found = dict(walk(to_plain(config), default, ""))
+    found.pop("seed", None)
+    return found
+
+
+def _value(key, text, hint):
+    try:
+        return convert(key, yaml.safe_load(text), hint, text)
+    except (ValueError, yaml.YAMLError) as error:
+        raise ValueError(f"--vary {' '.join(str(error).split())}") from error
+
+
+def _range(key, text, hint) -> tuple:
+    low, high = (_value(key, part, hint) for part in text.split(":", 1))
+    for value in (low, high):
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ValueError(f'--vary: got "{key}={text}", expected two numbers')
+    if not low < high:
+        raise ValueError(f'--vary: got "{key}={text}", expected lo below hi')
+    return low, high
+
+
+def run_sweep(
+    sweep: Sweep,
+    out_dir: Path,
+    jobs: int,
+    cluster: str | None = None,
+    command: Sequence[str] = (),
+) -> tuple[Table, list[Path]]:
+    """Runs what is not there yet, and writes sweep.md, .json, .csv and plots.
+
+    Args: out_dir: trials of an earlier sweep there that have the same settings and have
+        ended are read instead of repeated; jobs, cluster, command as in run_many.
+    Returns: the table, a row per case; the files.
+    Raises: ValueError for an out_dir that cannot be written to.
+    """
+    try:
+        out_dir.mkdir(parents=True, exist_ok=True)
+        (out_dir / "sweep.yaml").write_text(dump_config(sweep.config))
+    except OSError as error:
+        raise ValueError(
+            f'--out: got "{out_dir}", expected a folder to write in ({error.strerror})'
+        ) from error
+    runs = sweep.runs()
+    for settings, seed in runs[: len(sweep.cases) * sweep.trials : sweep.trials]:
+        apply_settings(type(sweep.config)(), [*setting_texts(settings), f"seed={seed}"])
+    results = run_many(
+        sweep.experiment, runs, jobs, out_dir / "trials", sweep.duration_sec,
+        reuse=True, command=command, cluster=cluster,
+    )  # fmt: skip
+    groups = [
+        results[i * sweep.trials : (i + 1) * sweep.trials]
+        for i in range(len(sweep.cases))
+    ]
+    fields = {key for key in field_types(type(sweep.config))} | {"interrupted"}
+    measured = {
+        key: kind
+        for result in results
+        if "error" not in result
+        for key, value in result.items()
+        if key not in fields and (kind := _kind(key, value))
+    }
+    table = _table(sweep, groups, measured)
+    files = [out_dir / f"sweep.{end}" for end in ("md", "json", "csv")]
+    files[0].write_text(table.to_markdown())
+    files[1].write_text(json.dumps(_summary(sweep, groups, measured), indent=2) + "\n")
+    _write_csv(files[2], runs, results, [*sweep.cases_of, *sweep.ranges])
+    for key in [*sweep.ranges, *(k for k in sweep.cases_of if _numeric(sweep, k))]:
+        path = out_dir / f"{key.replace('.', '_')}.png"
+        _plot(sweep, key, runs, results, measured).savefig(path, dpi=120)
+        files.append(path)
+    return table, files
+
+
+def _numeric(sweep, key) -> bool:
+    return all(
+        isinstance(v, int | float) and not isinstance(v, bool)
+        for v in sweep.cases_of[key]
+    )
+
+
+def _kind(key: str, value) -> str | None:
+    """A key of result.json as a "rate" (yes or no), a "mean", or neither."""
+    if isinstance(value, bool):
+        return "rate"
+    if isinstance(value, int | float):
+        return "mean"
+    return None
+
+
+def _values(group, key) -> list[float]:
+    return [float(r[key]) for r in group if r.get(key) is not None]
+
+
+def _is_error(key: str) -> bool:
+    """Whether a plot and the table show it: errors, and the peak of a force."""
+    return "error" in key or "peak_N" in key
+
+
+def _table(sweep, groups, measured) -> Table:
+    rates = [key for key, kind in measured.items() if kind == "rate"] or ["success"]
+    means = [k for k, kind in measured.items() if kind == "mean" and _is_error(k)]
+    rows, notes = [], []
+    for case, group in zip(sweep.cases, groups, strict=True):
+        row: list = [" ".join(setting_texts(case)) or "all"]
+        for key in rates:  # A trial that failed is one without success.
+            row.append(rate_text(sum(bool(r.get(key)) for r in group), len(group)))
+        for key in means:
+            values = _values(group, key)
+            row.append(
+                f"{np.mean(values):.4g} ({min(values):.4g} .. {max(values):.4g})"
+                if values
+                else None
+            )
+        rows.append(row)
+        notes += [
+            f"{row[0]}, seed {r['seed']} failed: {r['error']}"
+            for r in group
+            if "error" in r
+        ]
+    title = f"{sweep.experiment}, {sweep.trials} trials per case"
+    if sweep.ranges:
+        drawn = ", ".join(f"{k} {lo:g}..{hi:g}" for k, (lo, hi) in sweep.ranges.items())
+        title += f", drawn from {drawn}"
+    return Table(title, ("case", *rates, *means), rows, notes=notes)
+
+
+def _summary(sweep, groups, measured) -> dict:
+    """The same for programs."""
+    cases = []
+    for case, group in zip(sweep.cases, groups, strict=True):
+        entry: dict = {"case": case, "failed": sum("error" in r for r in group)}
+        for key, kind in measured.items():
+            if kind == "rate":
+                n = sum(bool(r.get(key)) for r in group)
+                low, high = wilson(n, len(group))
+                entry[key] = {"n": n, "of": len(group), "low": low, "high": high}
+                continue
+            values = _values(group, key)
+            if values:
+                entry[key] = {
+                    "n": len(values), "mean": float(np.mean(values)),
+                    "min": min(values), "max": max(values),
+                }  # fmt: skip
+        cases.append(entry)
+    return {
+        "experiment": sweep.experiment,
+        "settings": _differing(sweep.config),
+        "vary": {k: list(v) for k, v in {**sweep.cases_of, **sweep.ranges}.items()},
+        "trials": sweep.trials,
+        "first_seed": sweep.first_seed,
+        "duration_s": sweep.duration_sec,
+        "cases": json.loads(json.dumps(cases, default=json_value)),
+    }
+
+
+def _write_csv(path, runs, results, varied):
+    keys = list(dict.fromkeys(k for r in results for k in r if k != "out_dir"))
+    columns = list(dict.fromkeys(["seed", *varied, *keys]))
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, columns)
+        writer.writeheader()
+        for (settings, _), result in zip(runs, results, strict=True):
+            row = {k: settings[k] for k in varied if k in settings}
+            writer.writerow(row | {k: v for k, v in result.items() if k in columns})
+
+
+def _plot(sweep, key, runs, results, measured) -> Figure:
+    """Errors, and the success, against a setting that was varied."""
+    shown = [k for k, kind in measured.items() if kind == "mean" and _is_error(k)]
+    figure = Figure(figsize=(7, 2.0 + 1.6 * len(shown)), layout="constrained")
+    axes = np.atleast_1d(figure.subplots(len(shown) + 1, sharex=True))
+    x = np.array([float(settings[key]) for settings, _ in runs])
+    good = np.array([bool(r.get("success")) for r in results])
+    for ax, name in zip(axes, ["success", *shown], strict=False):
+        y = np.array(
+            [np.nan if (v := r.get(name)) is None else float(v) for r in results]
+        )
+        for mask, color, mark in ((good, "tab:blue", "o"), (~good, "tab:red", "x")):
+            label = "success" if mark == "o" else "no success"
+            ax.plot(x[mask], y[mask], mark, color=color, label=label, alpha=0.7)
+        ax.set_ylabel(name.replace("_", " "), fontsize=8)
+        ax.grid(alpha=0.3)
+    axes[0].set(yticks=[0, 1], yticklabels=["no", "yes"], ylim=(-0.3, 1.3))
+    if shown:
+        axes[1].legend(fontsize=8)
+    axes[-1].set_xlabel(key)
+    figure.suptitle(f"{sweep.experiment}: {sweep.trials} trials per case")
+    return figure
