@@ -47,7 +47,7 @@ def test_the_first_failure_is_raised_after_the_results_before_it(jobs):
     assert found == [1]
 
 
-_SLOW = """
+_SLOW = r"""
 import os, sys, time
 from makebreak.gap.parallel import side_by_side
 
