@@ -79,13 +79,15 @@ def _velocity_findings(
         )
         add("velocity_scale", r.scale, "1", "warning", says)
     if abs(r.bias) > max(SURE * r.bias_std, 0.005 * r.signal):
-        says = f"{name} reads {r.bias:.3g} {unit} too high, by its integral."
+        way = "high" if r.bias > 0.0 else "low"
+        says = f"{name} reads {abs(r.bias):.3g} {unit} too {way}, by its integral."
         add("velocity_bias", r.bias, unit, "warning", says)
     longest = longest_sec(recording)
     if abs(r.skew) > max(SURE * r.skew_std, 2e-5, 0.15 * r.period / longest):
+        late = "later" if r.skew > 0.0 else "earlier"
         says = (
-            f"{name} comes later by {r.skew * 1e3:.3g} ms each second than position: "
-            "their clocks run apart."
+            f"{name} comes {late} by {abs(r.skew) * 1e3:.3g} ms each second than "
+            "position: their clocks run apart."
         )
         add("clock_skew", r.skew, "s/s", "warning", says)
     elif abs(r.lag) > max(SURE * r.lag_std, 0.15 * r.period):

@@ -207,6 +207,7 @@ def _run(args) -> int:
 
 def _run_in(session, args, module, config, duration) -> int:
     """Runs the experiment in the session. Returns: the exit status."""
+    from makebreak.scripts.criteria import told
     from makebreak.scripts.table import Table
     from makebreak.scripts.trials import duration_line
 
@@ -246,14 +247,14 @@ def _run_in(session, args, module, config, duration) -> int:
     if result is None:
         session.keep_partial()
     else:
-        result["interrupted"] = session.interrupted
+        result |= {"interrupted": session.interrupted, "ended": session.endings}
         session.write_result(result)
     whole = not session.interrupted and session.unwritten is None
     files = session.finish(whole)
     if result is not None:
-        print(
-            Table(args.experiment, ("result", "value"), list(result.items())).to_text()
-        )
+        rows = [(k, v) for k, v in result.items() if k not in ("criteria", "ended")]
+        print(Table(args.experiment, ("result", "value"), rows).to_text())
+        print("\n".join([*session.endings, told(result)]), flush=True)
     _say_files(files)
     _writable(session)
     if session.interrupted:

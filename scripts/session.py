@@ -131,6 +131,7 @@ class Session:
         self._figures: list[tuple[Any, str]] = []  # Drawn when the rest is written.
         self.started = False  # Whether anything has been simulated yet.
         self.interrupted = False
+        self.endings: list[str] = []  # Of each simulation that ended early: why.
         self._progress = progress
         self.picture: Path | None = None  # Where the diagram is to be drawn.
         self._drawn = 0  # Systems in the diagram that was.
@@ -153,7 +154,7 @@ class Session:
         duration_sec: float,
         record: Mapping[str, OutputPort],
         period_sec: float = 0.0125,
-        until: Callable[[float, dict[str, np.ndarray]], bool] | None = None,
+        until: Callable[[float, dict[str, np.ndarray]], bool | str] | None = None,
         label: str = "",
         context: Context | None = None,
     ) -> Log:
@@ -168,7 +169,8 @@ class Session:
             duration_sec: for how long, unless the session's own duration is set [s].
             record: {column: vector output port of the diagram or a system in it}.
             period_sec: time between samples [s].
-            until: called with the time and {column: (k,)} at each sample; True ends.
+            until: called with the time and {column: (k,)} at each sample; a text, why
+                it is over, or True ends it.
             label: tells apart several simulations of one run, in timing.json and on
                 the progress bar.
             context: where to start from; None: the diagram's default context.
@@ -212,12 +214,12 @@ class Session:
         time: list[float] = []
         samples: dict[str, list[np.ndarray]] = {name: [] for name in record}
 
-        def sample(t: float) -> bool:
+        def sample(t: float) -> bool | str:
             values = {name: np.array(port.Eval(own)) for name, port, own in ports}
             time.append(t)
             for name, value in values.items():
                 samples[name].append(value)
-            return until is not None and bool(until(t, values))
+            return until(t, values) if until is not None else False
 
         # The last chunk may be shorter; 1e-9 forgives duration/period's rounding.
         n_chunks = int(np.ceil(duration / period_sec - 1e-9))
@@ -232,12 +234,15 @@ class Session:
                 simulator.Initialize()
                 done = sample(root.get_time())
                 for k in range(1, n_chunks + 1):
-                    if done or interrupt.hit:
+                    if (done or interrupt.hit) and time[-1] < duration:
                         break
                     t = min(k * period_sec, duration)
                     simulator.AdvanceTo(t)
                     done = sample(t)
                     bar.update(t - bar.n)
+                if (done or interrupt.hit) and time[-1] < duration:
+                    why = "interrupted" if interrupt.hit else done
+                    self.endings.append(_ending(label, time[-1], duration, why))
             finally:
                 self.interrupted = interrupt.hit
                 wall, cpu = perf_counter() - wall_start, process_time() - cpu_start
@@ -415,6 +420,12 @@ class Session:
         if len(entries) == 1:
             return summary | {"systems": entries[0]["systems"]}
         return summary | {"simulations": self._timing}
+
+
+def _ending(label: str, time: float, duration: float, why: bool | str) -> str:
+    """Why a simulation ended before its time, for the reader."""
+    after = f"{f'{label} ' * bool(label)}ended at {time:.4g} s of {duration:.4g} s"
+    return f"{after}: {why}" if isinstance(why, str) else after
 
 
 def _save_figure(fig, path: Path) -> None:

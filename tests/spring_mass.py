@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
+from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.table import Table
 from makebreak.scripts.trials import run_many
 from makebreak.systems.numerics.timing import timed
@@ -49,6 +50,7 @@ class Config:
     world: str = ""
     whole_only: bool = False  # Whether scoring needs the whole recording.
     fail_at_sec: float = -1.0  # A fault of the program at this time.
+    flown: float = 10.0  # So far away it is lost [m].
     seed: int = 0
 
 
@@ -85,19 +87,21 @@ def run(config, session):
     def until(t, sample):
         if t > 1.0 and not running.exists():
             running.write_text(str(os.getpid()))
-        return False
+        return "it flew away" if abs(sample["x"][0]) > config.flown else ""
 
     record = {"x": mass.GetOutputPort("x")}
     log = session.simulate(builder.Build(), 0.01 * config.steps, record, until=until)
     if config.whole_only and log.interrupted:
         raise IndexError("not enough to score")
     q = log["x"][:, 0]
+    criteria = Criteria()
+    criteria.at_most("rest", "distance from rest at the end", abs(q[-1]), 0.2, "m")
     figure = Figure()
     figure.subplots().plot(log.time, q)
     session.save_plot(figure, "position")
     session.write_recording({"time": log.time, "mass.slider.position": q}, {})
     return {
-        "success": bool(abs(q[-1]) < 0.2),
+        **criteria.result(),
         "position_end_m": q[-1],
         "settled_s": float("inf"),
         "spring_stiffness": config.spring.stiffness,

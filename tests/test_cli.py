@@ -1,6 +1,7 @@
 """The command line: what it refuses, what it writes, how it ends."""
 
 import fcntl
+import inspect
 import io
 import json
 import os
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import termios
 import time
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,9 @@ import pytest
 import spring_mass
 
 from makebreak.scripts import bench, cli, experiments, trials
+from makebreak.scripts.criteria import Criteria
+
+ALL = dict(experiments.EXPERIMENTS)
 
 
 @pytest.fixture(autouse=True)
@@ -56,6 +61,49 @@ def test_a_run_writes_its_files_and_a_table(capsys):
 def test_a_run_that_misses_its_criterion_exits_with_1():
     assert run("--set", "damped=false", "noise=0", "spring.stiffness=1e-6") == 1
     assert read("result.json")["success"] is False
+
+
+def test_a_run_says_which_criterion_was_missed_and_why_it_ended(capsys):
+    assert run("--set", "damped=false", "noise=0", "spring.stiffness=1e-6") == 1
+    shown = capsys.readouterr().out
+    assert (
+        "success: no: 1 of 1 criteria missed\n  MISSED  distance from rest at" in shown
+    )
+    assert " m, wanted at most 0.2 m" in shown and "ended" not in shown
+    result = read("result.json")
+    assert result["met_rest"] is False and result["ended"] == []
+    assert run("--duration", "20") == 0
+    shown = capsys.readouterr().out
+    assert "success: yes\n  met     distance from rest at the end: " in shown
+    assert run("--set", "flown=0.5") == 1
+    why = "ended at 0 s of 10 s: it flew away"
+    assert why in capsys.readouterr().out and read("result.json")["ended"] == [why]
+
+
+def test_every_experiment_names_its_criteria():
+    """Whatever makes `success` has a name, a value and a bound."""
+    for name, module in ALL.items():
+        source = inspect.getsource(import_module(module))
+        assert '"success": bool' not in source and '["success"] =' not in source, name
+        assert "criteria.result()" in source or name == "gentle_rolling", name
+
+
+@pytest.mark.parametrize(
+    ("value", "met"), [(0.3, True), (0.4, True), (0.5, False), (np.nan, False)]
+)
+def test_a_number_meets_its_bound_or_not_and_nan_never_does(value, met):
+    criteria = Criteria()
+    criteria.at_most("a", "distance", value, 0.4, "m")
+    criteria.at_least("b", "distance", -value, -0.4, "m")
+    criteria.at_most("c", "number", 0, 0)
+    result = criteria.result()
+    assert (result["met_a"], result["met_b"], result["met_c"]) == (met, met, True)
+    assert result["success"] is met
+    word = "met   " if met else "MISSED"
+    assert result["criteria"][0] == (
+        f"{word}  distance: {value:.4g} m, wanted at most 0.4 m"
+    )
+    assert Criteria().result()["success"] is False
 
 
 def test_the_same_seed_gives_the_same_result_bit_for_bit():

@@ -531,6 +531,33 @@ def test_every_kind_is_complete(name):
     assert set(kind.confused_with) <= set(KINDS)
 
 
+@pytest.mark.parametrize(
+    ("name", "more", "less"),
+    [
+        ("plane_height", "lies 0.01 m higher than", "lies 0.01 m lower than"),
+        ("joint_offset", "is 0.01 rad more than the", "is 0.01 rad less than the"),
+        ("clock_skew", "runs fast by 0.01 s/s", "runs slow by 0.01 s/s"),
+        ("actuator_bias", "adds a constant 0.01 N m", "takes a constant 0.01 N m away"),
+        ("sensor_bias", "0.01 (unit of the channel) too high", "channel) too low"),
+    ],
+)
+def test_a_sentence_has_a_word_for_either_sign(name, more, less):
+    kind = KINDS[name]
+    [parameter] = kind.parameters
+    for sign, words in ((0.01, more), (-0.01, less)):
+        says = sentence(Effect(name, ["a.b"], {parameter.name: sign}), kind)
+        assert words in says and "-" not in says
+
+
+def test_no_sentence_has_a_minus_before_what_it_calls_more():
+    """A kind of one number that may be below zero needs a sentence for it."""
+    for name, kind in KINDS.items():
+        first = kind.parameters[0]
+        if len(kind.parameters) == 1 and first.low < 0.0:
+            value = {first.name: 0.1 * first.low}
+            assert "-" not in sentence(Effect(name, ["a.b"], value), kind), name
+
+
 def test_a_sentence_reads_as_in_the_report():
     def says(kind, at, **parameters):
         return sentence(Effect(kind, at, parameters), KINDS[kind])

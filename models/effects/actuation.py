@@ -122,6 +122,8 @@ KINDS = {
         at="actuator",
         parameters=(Parameter("bias", "N m", -20.0, 20.0),),
         says="{at} adds a constant {bias} to the torque that it is commanded",
+        says_less="{at} takes a constant {bias} away from the torque that it is "
+        "commanded",
         confused_with=("joint_coulomb_friction", "gravity_tilt", "constant_force"),
         tell_apart="move the joint both ways, and in several poses",
         path="bias",

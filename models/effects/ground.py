@@ -56,7 +56,8 @@ KINDS = {
     "plane_height": EffectKind(
         at="ground",
         parameters=(Parameter("height", "m", -0.05, 0.05),),
-        says="the surface of {at} lies higher than modelled by {height}",
+        says="the surface of {at} lies {height} higher than modelled",
+        says_less="the surface of {at} lies {height} lower than modelled",
         confused_with=("object_size", "contact_stiffness", "length_scale"),
         tell_apart="rest on several faces, or use a second object of another size",
         before_finalize=_lift,

@@ -22,6 +22,7 @@ from makebreak.diagrams.station import (
     make_control_plant,
 )
 from makebreak.models.scene import load_scene
+from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.table import Table
 from makebreak.scripts.trials import run_many
 from makebreak.systems.impedance_controller import serial_chain_of
@@ -104,11 +105,7 @@ def run(config, session):
             run_through[0] += (turn + np.pi) % (2.0 * np.pi) - np.pi
         run_through[1] = angle
         stuck = t >= GIVE_UP_SEC and run_through[0] < np.pi / 2
-        return (
-            run_through[0] >= 2.0 * np.pi * CIRCLES
-            or stuck
-            or bool(np.hypot(*p) > config.task.radius + LOST)
-        )
+        return ending(run_through[0], stuck, np.hypot(*p) > config.task.radius + LOST)
 
     log = session.simulate(diagram, DURATION_SEC, record, SAMPLE, until=done)
     track = ground_truth(config, log, plant)
@@ -122,6 +119,15 @@ def run(config, session):
     plot_path(session, config, track)
     plot_residual(session, log, track)
     return result
+
+
+def ending(angle: float, stuck: bool, lost: bool) -> str:
+    """Why the run is over; empty while it is not. Args: angle, gone around [rad]."""
+    if angle >= 2.0 * np.pi * CIRCLES:
+        return f"{CIRCLES} circles are done"
+    if lost:
+        return f"the ball is out of reach, {LOST} m or more outside the circle"
+    return "the ball has not been rolled on for too long" if stuck else ""
 
 
 def ground_truth(config, log, plant) -> Track:
@@ -197,12 +203,12 @@ def score(config, log, track, contact):
     filtered = lfilter([1.0 - pole], [1.0, -pole], force)
     # A tenth of a minute at either end: a single sample says little.
     span = round(6.0 / SAMPLE)
-    return {
-        "success": bool(
-            circles >= CIRCLES
-            and mean <= ERROR_MAX
-            and track.time[-1] <= DURATION_SEC + SAMPLE
-        ),
+    criteria = Criteria()
+    criteria.at_least("circles", "circles completed", float(circles), CIRCLES)
+    criteria.at_most("error", "tracking error, mean", mean, ERROR_MAX, "m")
+    limit = DURATION_SEC + SAMPLE
+    criteria.at_most("time", "simulated time", float(track.time[-1]), limit, "s")
+    return criteria.result() | {
         "initiated": initiated,
         "circles_completed": float(circles),
         "time_to_first_contact_s": first_time(time, force > 0.05),

@@ -31,6 +31,7 @@ from makebreak.diagrams.cartpole_walls import (
     start,
     true_lcs,
 )
+from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Log, Session, run_many
 from makebreak.scripts.table import Table
 from makebreak.systems.numerics.lcp import solve_lcp
@@ -73,7 +74,9 @@ def run(config: CartpoleWallsConfig, session: Session) -> dict:
             DURATION,
             columns,
             period_sec=DT,
-            until=lambda t, values: abs(values["x"][1]) > FALLEN,
+            until=lambda t, values: (
+                "the pole has fallen" if abs(values["x"][1]) > FALLEN else ""
+            ),
             label=name,
             context=start(diagram, x),
         )
@@ -95,11 +98,17 @@ def run(config: CartpoleWallsConfig, session: Session) -> dict:
             result[f"{prefix}settled_without_adaptation"] = has_settled(
                 logs[f"{name}_plain"]
             )
-    result["success"] = bool(
-        result["settled"]
-        and result["residual_error_max"] <= RESIDUAL_BOUND
-        and result["multibody_settled"]
+    criteria = Criteria()
+    still = f"all states below {SETTLED_BOUND} in the last {SETTLED_FOR} s"
+    criteria.holds("settled", f"LCS as the plant: {still}", result["settled"])
+    criteria.at_most(
+        "residual", "LCS as the plant: error of the residual",
+        result["residual_error_max"], RESIDUAL_BOUND, "m",
+    )  # fmt: skip
+    criteria.holds(
+        "multibody_settled", f"MultibodyPlant: {still}", result["multibody_settled"]
     )
+    result |= criteria.result()
     figure, shares = gradient_map(config)
     session.save_plot(figure, "gradient_map")
     session.save_plot(plot_runs(logs, truth), "stabilisation")

@@ -33,6 +33,7 @@ from makebreak.diagrams.changing_surface import (
     make_task,
     surface_at,
 )
+from makebreak.scripts.criteria import Criteria, motion_ended
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
 from makebreak.systems.numerics.contact_task import (
@@ -40,7 +41,6 @@ from makebreak.systems.numerics.contact_task import (
     COUNT,
     DECIDED_TIME,
     DONE,
-    HOLD,
     IS_NEW,
     PHASE_SEGMENT,
     PHASE_STAGE,
@@ -96,7 +96,7 @@ def run(config: ChangingSurfaceConfig, session: Session) -> dict:
             DURATION_SEC,
             {"phase": shaper.GetOutputPort("phase")},
             period_sec=0.01,
-            until=lambda t, values: values["phase"][PHASE_STAGE] in (DONE, HOLD),
+            until=lambda t, values: motion_ended(values["phase"][PHASE_STAGE]),
             label=label,
         )
         done[label] = log["phase"][-1, PHASE_STAGE] == DONE
@@ -234,26 +234,31 @@ def summary(logs, done, changes, surplus, task: SurfaceTask, k_max: float) -> di
         result[f"done_{label}"] = bool(done[label])
     share = result["stiffness_mean_Npm_adaptive"] / k_max
     result["stiffness_share"] = float(share)
-    result["met_done"] = all(done.values())
-    result["met_right"] = (
-        result["changes_right"] == len(changes)
-        and surplus == 0
-        and result["modes"] == len({c.after for c in changes} | {changes[0].before})
-    )
-    result["met_delay"] = (
-        result["delay_known_max_s"] <= KNOWN_SEC
-        and result["delay_new_max_s"] <= NEW_SEC
-    )
+    surfaces = len({c.after for c in changes} | {changes[0].before})
+    right, modes = result["changes_right"], result["modes"]
+    criteria = Criteria()
+    criteria.holds("done", "every motion is carried out", all(done.values()))
+    criteria.holds(
+        "right", "changes recognised, and surplus ones; modes",
+        right == len(changes) and surplus == 0 and modes == surfaces,
+        f"{right}, {surplus}; {modes}", f"{len(changes)}, 0; {surfaces}",
+    )  # fmt: skip
+    known_sec, new_sec = result["delay_known_max_s"], result["delay_new_max_s"]
+    criteria.holds(
+        "delay", "longest delay of a decision, known and new surfaces",
+        known_sec <= KNOWN_SEC and new_sec <= NEW_SEC,
+        f"{known_sec:.3g} s, {new_sec:.3g} s", f"at most {KNOWN_SEC} s, {NEW_SEC} s",
+    )  # fmt: skip
     if "k_max" in logs:
-        result["met_tracking"] = (
-            result["tracking_error_rms_m_adaptive"]
-            <= result["tracking_error_rms_m_k_max"]
-        )
-    result["met_stiffness"] = bool(share <= STIFFNESS_SHARE)
-    result["success"] = all(
-        bool(value) for key, value in result.items() if key.startswith("met_")
+        criteria.at_most(
+            "tracking", "tracking error, rms; beside that with K_max",
+            result["tracking_error_rms_m_adaptive"],
+            result["tracking_error_rms_m_k_max"], "m",
+        )  # fmt: skip
+    criteria.at_most(
+        "stiffness", "mean stiffness over K_max", float(share), STIFFNESS_SHARE
     )
-    return result
+    return result | criteria.result()
 
 
 COLORS = {1: "#86a57f", 2: "#9a9a9a", 3: "#b98b5e"}

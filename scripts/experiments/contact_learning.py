@@ -32,6 +32,7 @@ from makebreak.diagrams.contact_learning import (
     make_contact_learning,
     make_task,
 )
+from makebreak.scripts.criteria import Criteria, motion_ended
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
 from makebreak.systems.numerics.contact_anticipator import spread_along
@@ -39,7 +40,6 @@ from makebreak.systems.numerics.contact_task import (
     DIRECTION,
     DONE,
     ENTER,
-    HOLD,
     IMPACT,
     MADE,
     PEAK_FORCE,
@@ -98,12 +98,12 @@ def run(config: ContactLearningConfig, session: Session) -> dict:
     for k in range(config.trials):
         diagram = make_contact_learning(config, task, knowledge, k, session.meshcat)
         shaper = diagram.GetSubsystemByName("velocity_shaper")
-        ended: list[float] = []
+        ended: list[tuple[float, str]] = []
 
         def over(t, values, ended=ended):
-            if values["phase"][PHASE_STAGE] in (DONE, HOLD):
-                ended.append(t)
-            return bool(ended) and t >= ended[0] + PEAK_WAIT
+            if why := motion_ended(values["phase"][PHASE_STAGE]):
+                ended.append((t, why))
+            return ended[0][1] if ended and t >= ended[0][0] + PEAK_WAIT else ""
 
         log = session.simulate(
             diagram,
@@ -224,34 +224,31 @@ def summary(trials: list[Trial], task: ContactTask) -> dict:
         for i in range(N):
             values = [getattr(t, name)[i] for t in trials]
             result[f"{key}_contact_{i + 1}"] = numbers(values)
-    result |= checks(trials)
-    result["success"] = all(
-        bool(value) for key, value in result.items() if key.startswith("met_")
-    )
-    return result
+    return result | checks(trials)
 
 
 def checks(trials: list[Trial]) -> dict:
-    """Whether each part of the criterion is met; None: too few trials to tell."""
-
-    def at_most(k, bound):
-        return bool(np.all(abs(trials[k - 1].error) <= bound))
-
+    """The parts of the criterion for which there are trials enough."""
     forces = np.array([t.force for t in trials[FORCE_FROM - 1 :]]).reshape(-1, N)
-    met = {
-        "met_done": all(t.done for t in trials),
-        "met_no_false_or_missed": not any(t.false + t.missed for t in trials),
-    }
+    criteria = Criteria()
+    criteria.holds("done", "every trial is carried out", all(t.done for t in trials))
+    wrong = sum(t.false + t.missed for t in trials)
+    criteria.at_most("no_false_or_missed", "false and missed contacts", wrong, 0)
     for k, bound in ERROR_MAX.items():
         if len(trials) >= k:
-            met[f"met_error_after_{k}"] = at_most(k, bound)
+            error = float(np.max(abs(trials[k - 1].error)))
+            what = f"error of a contact's place after trial {k}, greatest"
+            criteria.at_most(f"error_after_{k}", what, error, bound, "m")
     if len(forces):
-        off = abs(forces - FORCE_DESIRED)
-        met[f"met_force_from_trial_{FORCE_FROM}"] = bool(np.all(off <= FORCE_TOL))
+        off = float(np.max(abs(forces - FORCE_DESIRED)))
+        what = f"impact force from trial {FORCE_FROM} on: greatest distance from "
+        what += f"{FORCE_DESIRED:g} N"
+        criteria.at_most(f"force_from_trial_{FORCE_FROM}", what, off, FORCE_TOL, "N")
     if len(trials) >= 5:
-        times = trials[-1].completion, trials[0].completion
-        met["met_shorter"] = bool(times[0] <= (1.0 - SHORTER) * times[1])
-    return met
+        bound = (1.0 - SHORTER) * trials[0].completion
+        what = "time of the last trial"
+        criteria.at_most("shorter", what, trials[-1].completion, bound, "s")
+    return criteria.result()
 
 
 def plot_trials(trials: list[Trial], task: ContactTask):

@@ -119,7 +119,7 @@ class _Ending:
             self._rolled = t, self._turned
         stuck = t - self._rolled[0] >= STUCK_SEC
         lost = bool(np.hypot(*p) > self._radius + rolling.LOST)
-        return self._turned >= 2.0 * np.pi * rolling.CIRCLES or stuck or lost
+        return rolling.ending(self._turned, stuck, lost)
 
 
 def contact_truth(ball, diagram, log, plant):

@@ -35,6 +35,7 @@ from makebreak.diagrams.multi_spring import (
     mrac,
 )
 from makebreak.diagrams.planar import knowledge_of
+from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.planar_runs import (
     error_rms,
     errors,
@@ -166,12 +167,20 @@ def scored(config, ours, logs, learning, bad, swept) -> dict:
         ]
     result["biomimetic_bad_error_rms_m"] = [error_rms(log) for log in bad]
     result["biomimetic_bad_error_max_m"] = max(float(errors(log).max()) for log in bad)
-    result["success"] = bool(
-        min(result[f"ratio_{name}"] for name in BASELINES) >= RATIO_BOUND
-        and result["ratio_biomimetic_last"] > 1.0
-        and share <= STIFFNESS_BOUND
+    criteria = Criteria()
+    for name in BASELINES:
+        what = f"tracking error, rms: {name} over adaptive"
+        ratio = result[f"ratio_{name}"]
+        criteria.at_least(f"ratio_{name}", what, ratio, RATIO_BOUND)
+    ratio = result["ratio_biomimetic_last"]
+    criteria.holds(
+        "ratio_biomimetic_last", "tracking error, rms: biomimetic_last over adaptive",
+        ratio > 1.0, ratio, "above 1",
+    )  # fmt: skip
+    criteria.at_most(
+        "stiffness", "mean stiffness over the greatest", share, STIFFNESS_BOUND
     )
-    return result
+    return result | criteria.result()
 
 
 def plots(session, ours, logs, learning, bad, swept):

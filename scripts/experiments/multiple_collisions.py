@@ -31,6 +31,7 @@ from makebreak.diagrams.multiple_collisions import (
     make_multiple_collisions,
     make_task,
 )
+from makebreak.scripts.criteria import Criteria, motion_ended
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
 from makebreak.systems.contact_view import ContactViewConfig
@@ -38,7 +39,6 @@ from makebreak.systems.numerics.contact_task import (
     BROKEN,
     DIRECTION,
     DONE,
-    HOLD,
     MADE,
     PHASE_SEGMENT,
     PHASE_STAGE,
@@ -126,8 +126,8 @@ def _trial(config, task, knowledge, k, session, name, peaks):
         {"phase": shaper.GetOutputPort("phase")},
         period_sec=0.01,
         until=lambda t, values: (
-            t > 2.0 and values["phase"][PHASE_STAGE] in (DONE, HOLD)
-            and values["phase"][3] == 0.0
+            motion_ended(values["phase"][PHASE_STAGE])
+            if t > 2.0 and values["phase"][3] == 0.0 else ""
         ),
         label=name,
     )  # fmt: skip
@@ -223,19 +223,30 @@ def summary(trials: dict[str, Trial], task: CollisionTask) -> dict:
         )
     )
     result["friction"] = numbers(task.friction.values())
+    criteria = Criteria()
     if names and baseline is not None:
         first, known = trials[names[0]], trials[names[-1]]
         result["force_reduction"] = float(
             1.0 - np.nanmax(first.force) / np.nanmax(baseline.force)
         )
-        result["success"] = bool(
-            all(trials[name].whole for name in names)
-            and np.all(first.force <= FIRST_MAX)
-            and np.all(known.force <= KNOWN_MAX)
-            and max(first.a10, known.a10) <= A10_MAX
-            and result["extra_time_s"] <= EXTRA_MAX
-        )
-    return result
+        whole = sum(trials[name].whole for name in names)
+        what = "trials with all contacts made and lost, none missed or false"
+        criteria.at_least("whole", what, whole, len(names))
+        for key, which, trial, bound in (
+            ("first", "first", first, FIRST_MAX),
+            ("known", "last", known, KNOWN_MAX),
+        ):
+            what = f"impact force in the {which} trial, greatest"
+            force = float(np.max(trial.force))  # NaN where a contact was not reached.
+            criteria.at_most(f"force_{key}", what, force, bound, "N")
+        a10 = float(np.max([first.a10, known.a10]))
+        criteria.at_most("a10", "acceleration below 10 Hz", a10, A10_MAX, "m/s2")
+        what = "time longer than without handling"
+        criteria.at_most("extra_time", what, result["extra_time_s"], EXTRA_MAX, "s")
+    else:
+        what = "judged (only with handling: true, beside a trial without)"
+        criteria.holds("compared", what, False)
+    return result | criteria.result()
 
 
 def plot_trials(trials: dict[str, Trial]):

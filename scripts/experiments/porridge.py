@@ -30,6 +30,7 @@ import numpy as np
 from makebreak.diagrams.multi_spring import impedance, mrac
 from makebreak.diagrams.planar import knowledge_of
 from makebreak.diagrams.porridge import PorridgeConfig, draw, make_porridge
+from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.planar_runs import (
     along_motion,
     error_rms,
@@ -131,7 +132,12 @@ def run(config: PorridgeConfig, session: Session) -> dict:
         result[f"{name}_error_rms_m"] = error_rms(log)
         if name != "mrac":
             result[f"{name}_stiffness_mean_Npm"] = float(log["stiffness"].mean())
-    result["success"] = bool(result["fixed_over_incremental"] >= RATIO_BOUND)
+    criteria = Criteria()
+    criteria.at_least(
+        "ratio", "prediction error outside the training forces: fixed over incremental",
+        result["fixed_over_incremental"], RATIO_BOUND,
+    )  # fmt: skip
+    result |= criteria.result()
     plots(session, predicting, driving, bound)
     session.write_recording(recording(driving["incremental"]))
     return result

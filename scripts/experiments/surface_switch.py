@@ -37,6 +37,7 @@ from makebreak.diagrams.surface_switch import (
     make_surface_switch,
     make_task,
 )
+from makebreak.scripts.criteria import Criteria, motion_ended
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
 from makebreak.systems.numerics.contact_task import (
@@ -44,7 +45,6 @@ from makebreak.systems.numerics.contact_task import (
     COUNT,
     DONE,
     ENTER,
-    HOLD,
     IMPACTLESS,
     PHASE_KIND,
     PHASE_SEGMENT,
@@ -94,7 +94,7 @@ def run(config: SurfaceSwitchConfig, session: Session) -> dict:
             DURATION_SEC,
             {"phase": shaper.GetOutputPort("phase")},
             period_sec=0.01,
-            until=lambda t, values: values["phase"][PHASE_STAGE] in (DONE, HOLD),
+            until=lambda t, values: motion_ended(values["phase"][PHASE_STAGE]),
             label=f"trial_{k + 1}",
         )
         knowledge = learned(diagram, log.context)
@@ -174,24 +174,27 @@ def summary(trials: list[Trial], task: SwitchTask) -> dict:
     ):
         for i in range(N):
             result[f"{key}_seam_{i + 1}"] = [float(getattr(t, name)[i]) for t in trials]
-    result["met_done"] = all(t.done for t in trials)
-    result["met_recognised"] = all(
-        bool(np.all(np.isfinite(t.place_error))) for t in trials
-    )
+    criteria = Criteria()
+    criteria.holds("done", "every trial is carried out", all(t.done for t in trials))
+    seen = sum(int(np.isfinite(t.place_error).sum()) for t in trials)
+    criteria.at_least("recognised", "changes recognised once", seen, N * len(trials))
     if len(trials) >= 2:
         one, two = trials[:2]
         for name in ("spike", "error"):
             share = getattr(two, name).max() / getattr(one, name).max()
             result[f"{name}_share_of_trial_1"] = float(share)
-            result[f"met_{name}"] = bool(share <= SHARE)
+            what = "velocity spike" if name == "spike" else "tracking error"
+            what += ", greatest: trial 2 over trial 1"
+            criteria.at_most(name, what, float(share), SHARE)
     if len(trials) >= 3:
         for name in ("region", "handling"):
             before, after = (getattr(t, name).sum() for t in trials[1:3])
-            result[f"met_smaller_{name}"] = bool(after < before)
-    result["success"] = all(
-        bool(value) for key, value in result.items() if key.startswith("met_")
-    )
-    return result
+            what = "length of the region" if name == "region" else "time of handling"
+            what += " in trial 3"
+            criteria.holds(
+                f"smaller_{name}", what, after < before, after, f"below {before:.4g}"
+            )
+    return result | criteria.result()
 
 
 def plot_trials(trials: list[Trial], task: SwitchTask):

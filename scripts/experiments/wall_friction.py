@@ -42,6 +42,7 @@ from makebreak.diagrams.wall_friction import (
     telemetry,
     tip_states,
 )
+from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
 from makebreak.systems.numerics.baselines.long_term_predictor import (
@@ -93,7 +94,16 @@ def run(config: WallFrictionConfig, session: Session) -> dict:
     ours = [result["ours_rmse_N"], result["ours_from_scratch_rmse_N"]]
     best = min(result[f"{name}_rmse_N"] for name in (*ONE_STEP, "task_long"))
     result["ours_to_best_baseline"] = ours[0] / best
-    result["success"] = bool(max(ours) < best)
+    criteria = Criteria()
+    for key, what, value in (
+        ("ours", "our models", ours[0]),
+        ("from_scratch", "our models, beginning with nothing", ours[1]),
+    ):
+        criteria.holds(
+            key, f"prediction error of {what}, rms [N]", value < best, value,
+            f"below {best:.4g}, the best baseline's",
+        )  # fmt: skip
+    result |= criteria.result()
     session.write_json(TIMES_FILE, seconds)
     session.save_plot(plot_joints(joints), "joint_prediction")
     session.save_plot(plot_forces(data, scratch, force), "force_prediction")
