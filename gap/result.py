@@ -161,7 +161,7 @@ class GapResult:
         return [each.effect() for each in self.effects]
 
     def to_json(self) -> dict[str, Any]:
-        """What result.json holds (DESIGN.md, section 6)."""
+        """What result.json holds (docs/gap.md)."""
         return {
             "verdict": self.verdict,
             "says": self.says,
