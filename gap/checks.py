@@ -10,6 +10,7 @@ import numpy as np
 
 from makebreak.gap.check_motion import check_excitation, check_gravity
 from makebreak.gap.check_relations import check_relations
+from makebreak.gap.data.clock import clock_period
 from makebreak.gap.data.filters import EXAMPLES
 from makebreak.gap.findings import Finding, JointFacts, SceneFacts, longest_sec
 from makebreak.gap.recording import Channel, Recording, unit_of
@@ -67,6 +68,11 @@ def check_clock(recording: Recording) -> list[Finding]:
     # period is skipped.
     missing = np.rint(steps / period) - 1.0
     lost = float(missing[steps > 1.5 * period].sum())
+    if jitter > 0.1 * period:  # Then a long step is often followed by a short one.
+        lost = 0.0
+        for episode in recording.episodes:
+            t = recording.time[episode.rows]
+            lost += max(np.rint((t[-1] - t[0]) / clock_period(t)) - len(t) + 1.0, 0.0)
     if lost > 0:
         share = lost / (len(steps) + lost)
         found.append(

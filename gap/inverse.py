@@ -348,32 +348,41 @@ class InverseModel:
             centre = np.clip(
                 np.searchsorted(track.middle, track.bumps.centre), 0, len(q) - 1
             )
-            period = float(np.median(np.diff(track.time)))
+            period = _spacing(track, [f"{j}.position" for j in self.joints])
             g2 = track.bumps.position_noise_gain(period)
             g0 = track.bumps.noise_gain(period)
+            g_v, g_e = (
+                np.array([
+                    track.bumps.noise_gain(_spacing(track, [f"{j}.{what}"]))
+                    if has else g0
+                    for j, has in zip(self.joints, self.has[what], strict=True)
+                ])
+                for what in ("velocity", "effort_measured")
+            )  # fmt: skip
             eye = np.eye(len(self.joints))
             L = np.empty((len(centre), *eye.shape))
             # When within a period an effort was sampled is not known.
             effort = self._effort(track, (), q, v)
             mean = track.bumps.mean(effort)
             rate = np.gradient(mean, track.bumps.centre, axis=0)
-            e_std = np.hypot(MODEL_ERROR * rms, 0.5 * period * _rms(rate))
+            raw = min(r.period_sec() for r in self.recordings)
+            e_std = np.hypot(MODEL_ERROR * rms, 0.5 * raw * _rms(rate))
             direct = (kp * self.noise * g0) ** 2 + (MODEL_ERROR * rms) ** 2
-            direct += np.array(self.by_measured) * (self.effort_noise * g0) ** 2
+            direct += np.array(self.by_measured) * (self.effort_noise * g_e) ** 2
             for b, k in enumerate(centre):
                 M = self._mass_matrix(q[k])
                 C = (M * (g2 * self.noise) ** 2) @ M.T + np.diag(direct + held[b] ** 2)
                 L[b] = np.linalg.inv(np.linalg.cholesky(C))
             # The smoothed velocity's own error, as over one bump.
             own = self.noise * np.sqrt(period * 12.0 / track.bumps.width**3)
-            v_std = np.hypot(self.velocity_noise * g0, own)
+            v_std = np.hypot(self.velocity_noise * g_v, own)
             v_std = np.hypot(v_std, np.where(kd > 0.0, DRIVE_VELOCITY * _rms(v), 0.0))
             out.append(
                 {
                     "effort": L,
                     "velocity": np.maximum(v_std, 1e-12),
                     "effort_measured": np.maximum(
-                        np.hypot(self.effort_noise * g0, e_std), 1e-12
+                        np.hypot(self.effort_noise * g_e, e_std), 1e-12
                     ),
                 }
             )
@@ -520,7 +529,7 @@ class InverseModel:
                 others[name] = _masked(track, -there)
                 parts.append(self._stacked(track, white, none, others))
             columns.append(np.concatenate(parts))
-            prior.append(self.period / 6.0)
+            prior.append(min(r.period_sec() for r in self.recordings) / 6.0)
             names.append(f"sensor_delay of {name}, delay")
         return columns, prior, names
 
@@ -579,11 +588,23 @@ def _first(bumps: Bumps, m: int) -> Bumps:
 
 
 def _masked(track: Track, difference: np.ndarray) -> np.ndarray:
-    """Means over bumps of what is there; 0 where next to nothing is."""
+    """Means over bumps of what is there; 0 where next to nothing is, beside what that
+    channel usually has: it may be slower than the table."""
     good = np.isfinite(difference)
     weight = track.row_bumps.mean(good.astype(float))
     total = track.row_bumps.mean(np.where(good, difference, 0.0))
-    return np.where(weight > 0.3, total / np.maximum(weight, 0.3), 0.0)
+    least = 0.3 * max(float(np.median(weight)), 1e-9)
+    return np.where(weight > least, total / np.maximum(weight, least), 0.0)
+
+
+def _spacing(track: Track, channels: Sequence[str]) -> float:
+    """Usual time between samples [s] of the slowest of the channels."""
+    steps = [
+        np.median(np.diff(track.time[np.isfinite(track.samples[c])]))
+        for c in channels
+        if np.isfinite(track.samples[c]).sum() > 1
+    ]
+    return float(max(steps, default=np.median(np.diff(track.time))))
 
 
 def _sensing(effects: Sequence[Effect], channel: str) -> tuple[float, float, float]:

@@ -50,7 +50,8 @@ class Channel:
     """One column. `<model>.<element>.<quantity>`: an element is a joint, body or frame.
 
     noise: standard deviation, in the channel's unit; for a command 0.
-    noise_from: "given", "estimated", or "none" for a command.
+    noise_from: "given", "estimated", or "none" for a command. noise_given: of a single
+    sample as the sidecar says it, else 0. averaged: samples in each value, as a mean.
     noise_pole: 0 for white noise; else the estimated pole of its filter, a sample.
     step: the channel's resolution if it is quantised, else 0.
     rate_hz: samples that are there per second. filter: what the sidecar says.
@@ -61,6 +62,8 @@ class Channel:
     values: np.ndarray  # (n,), NaN where a sample is missing; read-only.
     noise: float = 0.0
     noise_from: str = "none"
+    noise_given: float = 0.0
+    averaged: float = 1.0
     noise_pole: float = 0.0
     step: float = 0.0
     rate_hz: float = 0.0
@@ -131,6 +134,7 @@ class Recording:
     notes: tuple[tuple[str, str], ...] = ()
     quaternion_flips: Mapping[str, int] = field(default_factory=dict)
     quaternion_norm_error: Mapping[str, float] = field(default_factory=dict)
+    raw_period_sec: float = 0.0  # Of the rows that were averaged; 0 if none were.
 
     def __contains__(self, name: str) -> bool:
         return name in self.channels
@@ -173,6 +177,13 @@ class Recording:
             last = np.maximum.accumulate(index[episode.rows])
             out[episode.rows] = np.where(last >= 0, y[last], np.nan)
         return out
+
+    def period_sec(self) -> float:
+        """Between rows, as they were written."""
+        if self.raw_period_sec:
+            return self.raw_period_sec
+        steps = [np.diff(self.time[e.rows]) for e in self.episodes]
+        return float(np.median(np.concatenate(steps)))
 
     def duration_sec(self) -> float:
         """Of all episodes together."""
@@ -540,18 +551,9 @@ def _mend_quaternions(
 
 
 def _channel(path, name, values, time, episodes, noise, filters) -> Channel:
-    there, breaks, duration = [], [], 0.0
-    steps = []
-    n = 0
-    for episode in episodes:
-        i = np.flatnonzero(~np.isnan(values[episode.rows])) + episode.first
-        if len(i) > 1:
-            steps.append(np.diff(time[i]))
-            duration += time[i[-1]] - time[i[0]] + np.median(steps[-1])
-        there.append(i)
-        n += len(i)
-        breaks.append(n)
-    rate = n / duration if duration > 0.0 else 0.0
+    steps = [
+        np.diff(time[e.rows][~np.isnan(values[e.rows])]) for e in episodes
+    ]  # fmt: skip
     said = filters.get(name, "")
     quantity = name.rsplit(".", 1)[1]
     stages: tuple[Stage, ...] | None = ()
@@ -561,20 +563,61 @@ def _channel(path, name, values, time, episodes, noise, filters) -> Channel:
                 f"sidecar of {path}: filters of {name}: a command is known, not "
                 "measured: expected a measured channel"
             )
-        period = float(np.median(np.concatenate(steps))) if steps else np.inf
+        every = np.concatenate(steps)
+        period = float(np.median(every)) if len(every) else np.inf
         try:
             stages = read_filter(name, said, quantity, period)
         except ValueError as error:
             raise ValueError(f"sidecar of {path}: {error}") from None
     text = said if isinstance(said, str) else json.dumps(said)
     if quantity in COMMANDS:  # Known, not measured.
+        n, duration = int((~np.isnan(values)).sum()), sum(map(np.sum, steps))
+        rate = n / duration if duration > 0.0 else 0.0
         return Channel(name, values, rate_hz=rate)
-    rows = np.concatenate(there)
-    own = estimate_noise(values[rows], breaks[:-1], time[rows])
-    std, source = own.std, "estimated"
-    if noise.get(name, 0.0) > 0.0:  # A given zero says nothing that one can weigh by.
-        std, source = max(noise[name], own.step / np.sqrt(12.0)), "given"
-    return Channel(name, values, std, source, own.pole, own.step, rate, text, stages)
+    # A given zero says nothing that one can weigh by.
+    given = max(noise.get(name, 0.0), 0.0)
+    channel = Channel(name, values, noise_given=given, filter=text, stages=stages)
+    return _with_noise(channel, time, episodes)
+
+
+def with_noise(recording: Recording) -> Recording:
+    """The recording with noise, resolution and rates that its own rows tell."""
+    channels = {
+        name: c if c.is_command else _with_noise(c, recording.time, recording.episodes)
+        for name, c in recording.channels.items()
+    }
+    return replace(recording, channels=channels)
+
+
+def part_of(recording: Recording, pieces: Sequence[Episode]) -> Recording:
+    """Pieces of its episodes as a recording of their own, which knows nothing of the
+    others: noise and rates are estimated from these rows."""
+    return with_noise(_of_pieces(recording, pieces))
+
+
+def _with_noise(channel: Channel, time, episodes) -> Channel:
+    rows, duration = [], 0.0
+    for episode in episodes:
+        i = np.flatnonzero(~np.isnan(channel.values[episode.rows])) + episode.first
+        if len(i) > 1:
+            duration += time[i[-1]] - time[i[0]] + np.median(np.diff(time[i]))
+        rows.append(i)
+    every = np.concatenate(rows)
+    rate = len(every) / duration if duration > 0.0 else 0.0
+    if not len(every):
+        return replace(channel, rate_hz=rate)
+    breaks = np.cumsum([len(i) for i in rows])[:-1]
+    own = estimate_noise(channel.values[every], breaks, time[every])
+    std, source, given = own.std, "estimated", channel.noise_given
+    if channel.averaged > 1.0:
+        # A mean of many may hold noise that goes together over them.
+        std = max(own.std, given / np.sqrt(channel.averaged))
+    elif given > 0.0:
+        std, source = max(given, own.step / np.sqrt(12.0)), "given"
+    return replace(
+        channel, noise=std, noise_from=source, noise_pole=own.pole, step=own.step,
+        rate_hz=rate,
+    )  # fmt: skip
 
 
 def windows(episode: Episode, time: np.ndarray, length_sec: float) -> Iterator[slice]:

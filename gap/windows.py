@@ -279,9 +279,12 @@ class WindowModel(WindowedResidual):
                     for joint in self._driven("effort_command"):
                         key = f"{joint}.effort_measured"
                         if key in recording:
-                            columns[f"{joint}.effort_command"] = recording[key][
-                                episode.rows
-                            ]
+                            y = recording[key][episode.rows]
+                            if recording.raw_period_sec:  # A mean, of block middles.
+                                good = np.isfinite(y)
+                                middle = time + 0.5 * np.diff(time, append=time[-1])
+                                y = np.interp(middle, time[good], y[good])
+                            columns[f"{joint}.effort_command"] = y
                 of[episode.first] = Commands(time, columns)
             out.append(of)
         return out

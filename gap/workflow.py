@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from makebreak.gap.checks import check_recordings
+from makebreak.gap.data.conditioning import condition
 from makebreak.gap.findings import Finding
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.inverse import InverseModel
@@ -60,6 +61,8 @@ def run_gap(
         check_against_scene(recording, joints, bodies)
     say("checking the recordings")
     checks = check_recordings(recordings, scene_facts(dynamics.plant))
+    recordings, done = condition(recordings, _is_mechanism(dynamics, recordings))
+    checks += done
     recordings, cut = _shortened(recordings, dynamics)
     checks += cut
     seconds["checks"] = clock.lap()

@@ -4,7 +4,7 @@ All are linear, of unit gain at rest, and of continuous time, so that they can b
 applied to a signal whose samples are uneven:
 
     low-pass        dz_i/dt = p_i z_i + x,  y = sum_i r_i z_i   (order 1, Butterworth)
-    moving average  y(t) = 1/T integral(x, t - T .. t)
+    moving average  y(t) = 1/T integral(x, t - T .. t), or centred about t
     delay           y(t) = x(t - d)
 
 A velocity by backward differences is the moving average of the true one over a period.
@@ -69,9 +69,10 @@ class LowPass:
 
 @dataclass(frozen=True)
 class MovingAverage:
-    """The mean over the last `width` [s]."""
+    """The mean over the last `width` [s]; centred, over half of it on either side."""
 
     width: float
+    centred: bool = False
 
     def __post_init__(self):
         if not (np.isfinite(self.width) and self.width > 0.0):
@@ -79,10 +80,11 @@ class MovingAverage:
 
     def gain(self, w) -> np.ndarray:
         half = 0.5 * self.width * np.asarray(w, float)
-        return np.exp(-1j * half) * np.sinc(half / np.pi)
+        late = 0.0 if self.centred else half
+        return np.exp(-1j * late) * np.sinc(half / np.pi)
 
     def mean_delay(self) -> float:
-        return 0.5 * self.width
+        return 0.0 if self.centred else 0.5 * self.width
 
     def memory(self) -> float:
         return self.width
@@ -102,7 +104,8 @@ class MovingAverage:
                 area[k] + x[k] * d + 0.5 * rise * d**2,
             )
 
-        return (integral(t) - integral(t - self.width)) / self.width
+        end = t + (0.5 * self.width if self.centred else 0.0)
+        return (integral(end) - integral(end - self.width)) / self.width
 
 
 @dataclass(frozen=True)

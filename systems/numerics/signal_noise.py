@@ -66,6 +66,54 @@ def estimate_noise(values, breaks=None, times=None) -> Noise:
     return Noise(max(std, float(step / np.sqrt(12.0))), step, pole)
 
 
+def noise_and_jitter(values, breaks, times, noise: float) -> tuple[float, float]:
+    """What stamps seem to be off by [s], and the rms noise that this makes of a
+    signal's own.
+
+    High differences of a signal with noise s0 and stamps off by s_t have the variance
+    s0^2 + (rate s_t)^2: its growth with the rate tells s_t. 0 and `noise` where it does
+    not grow clearly.
+
+    Args: values, breaks, times: as estimate_noise; noise: the signal's own.
+    """
+    y, t = np.asarray(values, float), np.asarray(times, float)
+    cuts = np.asarray([] if breaks is None else breaks, dtype=int)
+    pieces = [
+        (piece, stamp)
+        for piece, stamp in zip(
+            _some_of(np.split(y, cuts)), _some_of(np.split(t, cuts)), strict=True
+        )
+        if len(piece) >= 24
+    ]
+    if sum(len(piece) for piece, _ in pieces) < 150:
+        return 0.0, noise
+    # What both orders see is noise: of the motion, the higher one sees less.
+    return min(
+        (_jitter_of(pieces, order, noise) for order in (3, 5)), key=lambda x: x[1]
+    )
+
+
+def _jitter_of(pieces, order: int, noise: float) -> tuple[float, float]:
+    squares, rates = [], []
+    for piece, stamp in pieces:
+        d = _differences(piece, stamp, order)
+        # The slope over a few samples on either side of each difference's middle.
+        wide = (piece[11:] - piece[:-11]) / (stamp[11:] - stamp[:-11])
+        skip = (11 - order) // 2
+        n = min(len(d) - skip, len(wide))
+        squares.append(d[skip : skip + n] ** 2)
+        rates.append(np.abs(wide[:n]))
+    square, rate = np.concatenate(squares), np.concatenate(rates)
+    slow, fast = rate <= np.quantile(rate, 0.3), rate >= np.quantile(rate, 0.7)
+    low, high = (_NORMAL**2 * np.median(square[k]) for k in (slow, fast))
+    low_rate, high_rate = (np.mean(rate[k] ** 2) for k in (slow, fast))
+    if not (high > 1.5 * low and high_rate > 2.0 * low_rate):
+        return 0.0, noise
+    jitter = float(np.sqrt((high - low) / (high_rate - low_rate)))
+    total = np.hypot(min(noise, np.sqrt(high)), jitter * np.sqrt(np.mean(rate**2)))
+    return jitter, float(total)
+
+
 def _differences(y: np.ndarray, t: np.ndarray, order: int) -> np.ndarray:
     """Differences that remove every polynomial of a degree below `order` at the very
     times of the samples, scaled so that white noise keeps its standard deviation."""
