@@ -70,9 +70,10 @@ def score(
     """How well a result tells what was hidden.
 
     Args: truth, of the benchmark: effects, each perhaps with `equivalents` (what the
-        recording cannot tell from it, with their own parameters) and `needed` (whether
-        it shows), `verdict` or `verdicts`, `ties` of kinds; result, a result.json, or
-        one with `error` in it; driven, the joints that the scene drives.
+        recording cannot tell from it, with their own parameters), `needed` (whether it
+        shows) and `loose` (parameters that the recording does not tell), `verdict` or
+        `verdicts`, `ties` of kinds; result, a result.json, or one with `error` in it;
+        driven, the joints that the scene drives.
     """
     verdicts = truth.get("verdicts") or [truth["verdict"]]
     hidden = [] if verdicts == ["gap_unnamed"] else truth["effects"]
@@ -92,6 +93,7 @@ def score(
     inside: list[bool] = []
     extra = 0
     left = list(range(len(hidden)))
+    loose = [h.get("loose", ()) for h in hidden]
     for each in found:
         match = [(i, _match(each, h, driven)) for i, h in enumerate(hidden)]
         match = [(i, p) for i, p in match if p is not None]
@@ -99,7 +101,9 @@ def score(
             # Of two it may be, one that nothing else was taken for.
             i, parameters = min(match, key=lambda m: m[0] not in left)
             left = [k for k in left if k != i]
-            errors += parameter_errors(each["parameters"], parameters)
+            # What the recording does not tell cannot be wrong; its interval can.
+            told = {k: v for k, v in parameters.items() if k not in loose[i]}
+            errors += parameter_errors(each["parameters"], told)
             inside += parameters_inside(each["parameters"], parameters)
         elif not _in_tie(each["kind"], truth):
             extra += 1
@@ -223,7 +227,8 @@ def _errors(value: dict[str, float], hidden: Mapping) -> list[float]:
         ("roll", "pitch"), ("ixx", "iyy", "izz"),
     )  # fmt: skip
     for names in vectors:
-        if all(name in value for name in names):
+        names = tuple(name for name in names if name in value)
+        if len(names) > 1:
             there = np.array([hidden[name] for name in names])
             off = np.array([value.pop(name) for name in names]) - there
             if np.linalg.norm(there) > 0.0:

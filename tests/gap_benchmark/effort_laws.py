@@ -2,8 +2,6 @@
 tell by computation which effects a recording can tell apart, and to test the worlds.
 """
 
-from dataclasses import replace
-
 import mujoco
 import numpy as np
 
@@ -52,8 +50,7 @@ def added_effort(robot: Robot, effect: dict, track: Track) -> np.ndarray:
     elif kind == "joint_direction_friction":
         out[:, i] = np.where(w > 0, p["coulomb_plus"], -p["coulomb_minus"])
     elif kind == "joint_load_friction":
-        bodies = tuple(replace(body, rotor=0.0) for body in robot.bodies)
-        load = Inverse(replace(robot, bodies=bodies))(q, v, a)
+        load = Inverse(robot)(q, v, a)
         out[:, i] = p["share"] * np.abs(load[:, i]) * np.sign(w)
     elif kind == "joint_stribeck_friction":
         peak = (p["static"] - p["coulomb"]) * np.exp(

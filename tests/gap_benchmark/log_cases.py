@@ -39,12 +39,15 @@ from gap_benchmark.ties import (
     JOINT_KINDS,
     SAME,
     Comparison,
+    Rival,
     places_of,
     velocity_rivals,
     without_rotors,
 )
+from gap_benchmark.two_link import TwoLinkWorld
 
 SEEDS = {"logs-development": 210_000, "logs-final": 370_000}
+_QUANTUM = 2 * np.pi / 4096  # [rad], of such servos.
 LINK_MASS, LINK_COM = 0.03, 0.002  # The scene's tolerance, one sigma [-], [m].
 
 # Of each joint: Coulomb friction [N m, or N], and viscous [N m s/rad] as its share of
@@ -98,6 +101,7 @@ class Drawn:
     replaced: Callable[[Robot], Robot] | None = None  # Instead of simulating effects.
     declared: Filter | None = None  # In the sidecar.
     push: Push | None = None
+    ode: bool = False  # The world of two_link.py.
 
 
 @dataclass(frozen=True)
@@ -169,6 +173,36 @@ RECIPES = [
     Recipe("direction_friction", "six panda", hide="direction_friction"),
     Recipe("ripple_one_joint", "panda scara", hide="ripple"),
     Recipe("spring_one_joint", "planar panda", hide="spring"),
+    # ----- Servos.
+    Recipe("servo_gain", "servo", hide="servo_gain", options=("coarse",)),
+    Recipe("servo_backlash", "servo", hide="backlash", options=("coarse",)),
+    Recipe("servo_load_friction", "servo", hide="load_friction", options=("coarse",)),
+    Recipe("servo_payload", "servo", hide="payload", options=("coarse",)),
+    Recipe("servo_gain_friction", "servo", "multisine pick", "servo_gain friction",
+           ("coarse",)),
+    # ----- Commanded speeds.
+    Recipe("none_velocity_drive", "scara six", options=("velocity drive",)),
+    Recipe("friction_velocity_drive", "scara six", hide="friction",
+           options=("velocity drive",)),
+    # ----- Gears.
+    Recipe("load_friction", "six panda", hide="load_friction"),
+    Recipe("elasticity", "scara panda", "multisine pick", "elasticity"),
+    Recipe("backlash", "scara planar", "multisine pick", "backlash"),
+    # ----- Commands beside what was measured.
+    Recipe("effort_sensor_bias", "panda scara", hide="effort_bias",
+           options=("commands",)),
+    Recipe("saturation", "planar scara", "multisine pick", "saturation",
+           ("commands", "unmeasured")),
+    Recipe("clocks_apart", "planar panda", "multisine pick", "skew",
+           ("commands", "unmeasured")),
+    Recipe("late_states", "scara panda", "multisine pick", "late",
+           ("commands", "unmeasured")),
+    # ----- Lagrange's equations instead of MuJoCo.
+    Recipe("ode_none", "planar", options=("ode",)),
+    Recipe("ode_friction", "planar", hide="friction", options=("ode",)),
+    Recipe("ode_quadratic_drag", "planar", "multisine pick", "quadratic_drag",
+           ("ode",)),
+    Recipe("ode_load", "planar", hide="payload", options=("ode",)),
 ]  # fmt: skip
 
 
@@ -184,16 +218,15 @@ def cases(which: str) -> list[LogCase]:
 
 
 @dataclass(frozen=True)
-class Motion1:
-    """What the nominal robot needs and does on the motion: rms of effort, velocity and
-    acceleration (n,)."""
+class Demand:
+    """Of the nominal robot on its motion (n,): rms and peak of effort, rms of v."""
 
     effort: np.ndarray
+    most: np.ndarray
     v: np.ndarray
-    a: np.ndarray
 
 
-def _hidden(name: str, d: Drawn, s: Motion1) -> list[dict]:
+def _hidden(name: str, d: Drawn, s: Demand) -> list[dict]:
     """Effects of a name of a recipe, with sizes that such robots have."""
     rng, robot = d.rng, d.nominal
     joints, n = robot.joints, len(robot.joints)
@@ -247,7 +280,11 @@ def _hidden(name: str, d: Drawn, s: Motion1) -> list[dict]:
         return [one(name, any_body(), x=way[0], y=way[1], z=way[2])]
     if name == "payload":
         place = rng.uniform(-0.06, 0.06, 3)
-        scale = {"panda": 1.2, "six": 3.0, "scara": 0.5, "planar": 0.3}[d.sort]
+        if d.sort == "planar":
+            place[1] = 0.0
+        scale = {"panda": 1.2, "six": 3.0, "scara": 0.5, "planar": 0.3, "servo": 0.15}[
+            d.sort
+        ]
         return [one(name, any_body(), mass=scale * rng.uniform(0.6, 1.4),
                     com_x=place[0], com_y=place[1], com_z=place[2])]  # fmt: skip
     if name == "body_drag":
@@ -281,6 +318,40 @@ def _hidden(name: str, d: Drawn, s: Motion1) -> list[dict]:
     if name == "spring":
         return [one("joint_spring", joints[i], stiffness=1.5 * f / robot.reach[i],
                     rest=robot.middle[i] + rng.uniform(-0.3, 0.3))]  # fmt: skip
+    if name == "quadratic_drag":
+        return [one("joint_quadratic_drag", joints[i],
+                    coefficient=0.25 * s.effort[i] / s.v[i] ** 2)]  # fmt: skip
+    if name == "load_friction":
+        i = int(np.argsort(-s.effort)[rng.integers(2)])
+        return [one("joint_load_friction", joints[i], share=rng.uniform(0.12, 0.3))]
+    if name == "servo_gain":
+        f = rng.choice([rng.uniform(0.7, 0.85), rng.uniform(1.2, 1.4)])
+        return [one(name, joints[i], kp=f * d.drive.kp[i])]
+    if name == "saturation":
+        i = int(rng.integers(2))
+        peak = rng.uniform(0.6, 0.8) * s.most[i]
+        return [one("actuator_saturation", joints[i], limit=peak)]
+    if name == "effort_bias":
+        d.how = replace(d.how, effort_bias=sign * f * np.eye(n)[i])
+        at = f"{joints[i]}.effort_measured"
+        return [one("sensor_bias", at, bias=sign * f)]
+    if name == "skew":
+        skew = sign * rng.uniform(1e-3, 3e-3)
+        d.how = replace(d.how, skew=skew)
+        return [one("clock_skew", robot.model, skew=skew)]
+    if name == "late":
+        d.how = replace(d.how, delay=float(rng.uniform(0.012, 0.03)))
+        return [one("sensor_delay", robot.model, delay=d.how.delay)]
+    if name == "backlash":
+        i = int(rng.integers(2)) if d.sort != "servo" else int(rng.integers(1, 3))
+        gap = rng.uniform(0.03, 0.06) if d.sort == "servo" else rng.uniform(0.015, 0.04)
+        return [one("joint_backlash", joints[i], gap=gap)]
+    if name == "elasticity":
+        i = int(rng.integers(2))
+        beyond = Inverse(without_rotors(robot)).mass_diagonal(robot.middle)[i]
+        w = 2 * np.pi * rng.uniform(4.0, 8.0)
+        return [one("joint_elasticity", joints[i], stiffness=beyond * w**2,
+                    damping=0.1 * beyond * w)]  # fmt: skip
     raise ValueError(f"no size for {name}")
 
 
@@ -316,7 +387,7 @@ def _logging(d: Drawn, options: tuple[str, ...]) -> None:
             memory=float(rng.uniform(0.1, 0.5)),
         )  # fmt: skip
     if "coarse" in options:
-        d.how = replace(d.how, quantum=2 * np.pi / 4096 if d.sort == "servo" else 3e-4)
+        d.how = replace(d.how, quantum=_QUANTUM if d.sort == "servo" else 3e-4)
     if "link side" in options:
         d.how = replace(d.how, side="link")
     kinds = ("first order", "Butterworth", "moving average", "backward difference")
@@ -353,13 +424,29 @@ def _draw(case: LogCase) -> tuple[Drawn, object]:
     n = len(nominal.joints)
     drive = Drive()
     if sort == "servo":
-        # Kicks of a proportional servo: 8 N m/rad, and a motor's back-EMF.
-        drive = Drive("pd", 0.02, np.full(n, float(rng.uniform(7.0, 12.0))),
-                      np.full(n, float(rng.uniform(0.35, 0.6))))  # fmt: skip
+        # A hobby servo at 12 V: back-EMF brakes it, its ceiling falls with speed.
+        kt, resistance = float(rng.uniform(1.0, 1.4)), float(rng.uniform(3.5, 5.0))
+        drive = Drive(
+            "servo", 0.02, np.full(n, float(rng.uniform(7.0, 12.0))), np.zeros(n),
+            float(rng.uniform(2.0, 2.9)), 12.0, kt, resistance,
+            float(rng.choice([0.0, 0.003])), _QUANTUM,
+        )  # fmt: skip
+    elif "velocity drive" in recipe.options:
+        M = Inverse(nominal).mass_diagonal(nominal.middle)
+        limit = 2.0 * max(body.effort for body in nominal.moving)
+        drive = Drive("velocity", 0.01, np.zeros(n), 60.0 * M, limit)
     d = Drawn(rng, sort, nominal, true, drive, Logging())
     _logging(d, recipe.options)
     if sort == "servo":
         d.how = replace(d.how, side="", with_command=True)
+    elif drive.type == "velocity":
+        d.how = replace(d.how, side="", with_command=True, rate_hz=100.0)
+    elif "commands" in recipe.options:
+        rate = float(rng.choice([200.0, 250.0]))
+        side = "" if "unmeasured" in recipe.options else "motor"
+        d.how = replace(d.how, side=side, with_command=True, rate_hz=rate, jitter=0.0)
+        drive = d.drive = replace(drive, period=1.0 / rate)
+    d.ode = "ode" in recipe.options
     motion = MOTIONS[str(rng.choice(recipe.motions.split()))](
         nominal, SECONDS[sort], 0.001, rng
     )
@@ -369,7 +456,7 @@ def _draw(case: LogCase) -> tuple[Drawn, object]:
     def rms(x):
         return np.sqrt(np.mean(x**2, axis=0))
 
-    stats = Motion1(rms(effort), rms(motion.v), rms(motion.a))
+    stats = Demand(rms(effort), np.abs(effort).max(axis=0), rms(motion.v))
     for name in recipe.hide.split():
         d.effects += _hidden(name, d, stats)
     if "push" in recipe.options:
@@ -392,30 +479,79 @@ def _simulated(d: Drawn, motion) -> Track:
     if d.replaced is not None:
         true = d.replaced(true)
         effects = [e for e in effects if e["kind"] not in ("payload", "link_mass")]
+    if d.ode:
+        return TwoLinkWorld(d.nominal, true, effects).run(motion)
     return RobotWorld(d.nominal, true, effects, d.drive, d.push).run(motion)
 
 
 def _difference(d: Drawn, effect: dict, track: Track) -> np.ndarray:
     """(k, n) what a hidden effect adds to the effort."""
+    if effect["kind"] == "servo_gain":  # Beside what the drive's law says.
+        i = d.nominal.joint(effect["at"])
+        brake = d.drive.kt**2 / d.drive.resistance * track.v[:, i]
+        out = np.zeros_like(track.q)
+        has = effect["parameters"]["kp"]
+        out[:, i] = (d.drive.kp[i] / has - 1.0) * (track.motor[:, i] + brake)
+        return out
     if d.replaced is not None and effect["kind"] in ("payload", "link_mass"):
         q, v, a = track.q, track.v, track.a
         return Inverse(d.replaced(d.nominal))(q, v, a) - Inverse(d.nominal)(q, v, a)
     return added_effort(d.nominal, effect, track)
 
 
+# Not laws of effort along the motion that was measured.
+_BEYOND = ("joint_elasticity", "joint_backlash", "actuator_saturation", "sensor_bias",
+           "sensor_delay", "clock_skew")  # fmt: skip
+
+
+def _known_rivals(effect: dict, d: Drawn) -> list[dict]:
+    """What says the same by definition."""
+    if effect["kind"] == "sensor_delay":  # Nobody but the robot's own loop sees them.
+        return [{"kind": "input_delay", "at": effect["at"],
+                 "parameters": effect["parameters"], "d2": 0.0}]  # fmt: skip
+    return []
+
+
+def _as_payload(robot: Robot, hidden: dict) -> list[Rival]:
+    """A hand that is not there, as a negative payload on it or on what it is welded to:
+    one rigid body. (That its mass is no point is told by a tenth of a sigma or by ten,
+    and a payload has no inertia of its own to say it with.)"""
+    hand = robot.bodies[-1]
+    R = rotation(quaternion(hand.rpy))
+    before = robot.bodies[-2].name
+    places = {hidden["at"]: np.array(hand.com),
+              f"{robot.model}.{before}": np.array(hand.xyz) + R @ np.array(hand.com)}  # fmt: skip
+    return [
+        Rival(
+            "payload", at,
+            {"mass": -hand.mass} | dict(
+                zip(("com_x", "com_y", "com_z"), map(float, place), strict=True)
+            ), 0.0,
+        )
+        for at, place in places.items()
+    ]  # fmt: skip
+
+
 def _judged(d: Drawn, track: Track) -> dict:
     """What is hidden with what cannot be told from it, and the right verdicts."""
     how = d.how
-    if d.drive.type in ("pd", "servo"):
-        # Known: the drive's law. Its noise is that of the encoders.
+    if not how.side:
+        # The drive's law tells the effort, with the noise of what it is told by.
         step = max(how.position_noise, how.quantum / np.sqrt(12.0))
-        how = replace(how, side="motor", effort_noise=d.drive.kp * step)
+        noise = d.drive.kp * step + d.drive.kd * how.velocity_noise
+        how = replace(how, side="motor", effort_noise=noise if noise.size else 1e-3)
     judge = Comparison(d.nominal, track, how, LINK_MASS, LINK_COM)
     few = judge.track
-    effects, tied = [], False
-    maybe = False
+    effects: list[dict] = []
+    tied, maybe = 0, False
+    of_effort = [e for e in d.effects if e["kind"] not in _BEYOND]
     for effect in d.effects:
-        others = [e for e in d.effects if e is not effect]
+        if effect not in of_effort:
+            effects.append(
+                effect | {"needed": True, "equivalents": _known_rivals(effect, d)}
+            )
+            continue
+        others = [e for e in of_effort if e is not effect and e["kind"] != "servo_gain"]
         effort = _difference(d, effect, few)
         size = judge.size(effort, others)
         if effect["kind"] == "sinusoidal_force":
@@ -432,16 +568,30 @@ def _judged(d: Drawn, track: Track) -> dict:
         places = [p for p in places if p not in hidden]
         rivals = judge.rivals(effort, places, others)
         mine = len(effect["parameters"])
-        for rival in rivals:
-            # One with more parameters contains it, and is no rival but a detour.
-            if len(rival.parameters) <= mine:
-                tied |= rival.distance < SAME
-                maybe = True
+        # One with more parameters contains it, and is no rival but a detour.
+        close = [r for r in rivals if len(r.parameters) <= mine and r.distance < CLEAR]
+        tied += any(r.distance < SAME for r in close)
+        maybe |= bool(close)
+        if d.replaced is not None and effect["kind"] == "link_mass":
+            known = {(r.kind, r.at) for r in rivals}
+            same = _as_payload(d.nominal, effect)
+            rivals += [r for r in same if (r.kind, r.at) not in known]
+        if effect["kind"] == "joint_direction_friction":
+            # The mean of both with a bias of half their difference is the same.
+            plus, minus = effect["parameters"].values()
+            half = {"bias": -0.5 * (plus - minus)}
+            rivals += [
+                Rival("joint_coulomb_friction", effect["at"],
+                      {"coulomb": 0.5 * (plus + minus)}, 0.0),
+                Rival("actuator_bias", effect["at"], half, 0.0),
+            ]  # fmt: skip
+            maybe = True
         effects.append(
             effect
             | {
                 "d2": size,
                 "needed": size > CLEAR,
+                "loose": judge.loose(effect, others),
                 "equivalents": [
                     {"kind": r.kind, "at": r.at, "parameters": r.parameters,
                      "d2": r.distance}
@@ -450,14 +600,16 @@ def _judged(d: Drawn, track: Track) -> dict:
             }
         )  # fmt: skip
     verdicts = {"no_gap"}
-    if any(e["needed"] for e in effects):
-        verdicts = {"ambiguous"} if tied else {"gap_named"}
+    needed = sum(e["needed"] for e in effects)
+    if needed:
+        # All that is hidden has a rival, or some of it, or nothing.
+        verdicts = {"ambiguous"} if tied == needed else {"gap_named"}
         if maybe:
             verdicts |= {"ambiguous"}
-            if not tied:
-                verdicts |= {"gap_named"}
     elif effects:  # Hidden, and hardly to be seen.
         verdicts |= {"gap_named", "ambiguous"}
+    if any(e["kind"] == "sensor_delay" for e in d.effects):
+        verdicts = {"ambiguous"}
     optional: list[dict] = []
     if d.push is not None:
         verdicts |= {"gap_unnamed"}
@@ -479,6 +631,18 @@ def _judged(d: Drawn, track: Track) -> dict:
     return {"effects": effects, "verdicts": sorted(verdicts), "optional": optional}
 
 
+def _crossed(d: Drawn, track: Track) -> bool:
+    """Whether each gap is crossed, both ways."""
+    for effect in d.effects:
+        if effect["kind"] == "joint_backlash":
+            i = d.nominal.joint(effect["at"])
+            side = (track.link_q - track.q)[:, i] / (0.5 * effect["parameters"]["gap"])
+            sides = np.sign(side[np.abs(side) > 0.8])
+            if np.count_nonzero(np.diff(sides)) < 4:
+                return False
+    return True
+
+
 def make(case: LogCase) -> WrittenLog:
     """Draws, simulates, judges and records a case. A place where the recording would
     not show what is hidden is drawn again."""
@@ -486,7 +650,7 @@ def make(case: LogCase) -> WrittenLog:
         d, motion = _draw(replace(case, seed=case.seed + 1_000_000 * attempt))
         track = _simulated(d, motion)
         judged = _judged(d, track)
-        if not d.effects or judged["effects"][0]["needed"]:
+        if not d.effects or (judged["effects"][0]["needed"] and _crossed(d, track)):
             break
     else:
         raise RuntimeError(f"{case.name}: nothing to be seen in 30 draws")
@@ -509,7 +673,7 @@ def make(case: LogCase) -> WrittenLog:
         "optional": judged["optional"],
         "ties": [],
         "robot": d.sort,
-        "world": "mujoco",
+        "world": "ode" if d.ode else "mujoco",
         "kinds": sorted({e["kind"] for e in d.effects}),
         "rate_hz": d.how.rate_hz,
         "seconds": float(columns[next(iter(columns))][-1]),
@@ -522,7 +686,8 @@ def _foreign(columns: dict, d: Drawn) -> tuple[dict, dict]:
     """In degrees, with the names of somebody's driver, and the map that tells."""
     named, map_ = {}, {}
     short = {"position": "q", "velocity": "dq", "effort_measured": "tau",
-             "position_command": "q_des", "effort_command": "tau_des"}  # fmt: skip
+             "position_command": "q_des", "velocity_command": "dq_des",
+             "effort_command": "tau_des"}  # fmt: skip
     joints = d.nominal.joints
     for key, values in columns.items():
         if key == "time":
@@ -541,11 +706,17 @@ def _foreign(columns: dict, d: Drawn) -> tuple[dict, dict]:
 def _scene(d: Drawn, track: Track) -> str:
     robot = d.nominal
     joints = ", ".join(robot.joints)
-    if d.drive.type == "pd":
-        actuation = f"  type: pd\n  joints: [{joints}]\n  kp: {d.drive.kp.tolist()}\n"
-        actuation += f"  kd: {d.drive.kd.tolist()}\n"
-    else:
-        actuation = f"  type: effort\n  joints: [{joints}]\n"
+    drive = d.drive
+    actuation = f"  type: {drive.type}\n  joints: [{joints}]\n"
+    if drive.type == "servo":
+        actuation += (
+            f"  kp: {drive.kp.tolist()}\n  limit: [{drive.limit}]\n"
+            f"  supply: {{voltage: {drive.voltage}, kt: {drive.kt}, "
+            f"resistance: {drive.resistance}}}\n"
+            f"  dead_band: {drive.dead_band}\n  resolution: {drive.resolution!r}\n"
+        )
+    elif drive.type == "velocity":
+        actuation += f"  kd: {drive.kd.tolist()}\n  limit: [{drive.limit}]\n"
     start = "".join(
         f"    {j}: {float(q):.6f}\n"
         for j, q in zip(robot.joints, track.q[0], strict=True)

@@ -23,9 +23,9 @@ class Drive:
     """How the robot is driven.
 
     type: effort (computed torque about the motion, by the robot that its maker knows,
-        each `period` [s]); pd (kp [N m/rad] and kd [N m s/rad] on the motion, analog);
-        servo (kp on the commanded place, a ceiling, what the supply's voltage leaves,
-        a dead band; back-EMF brakes it); velocity (an inner loop follows a speed).
+        each `period` [s]); servo (kp [N m/rad] on the commanded place, a ceiling, what
+        the supply's voltage leaves, a dead band; back-EMF brakes it); velocity
+        (kd [N m s/rad] on the commanded speed, a ceiling).
     """
 
     type: str = "effort"
@@ -37,6 +37,7 @@ class Drive:
     kt: float = 0.0  # [N m/A], at the joint.
     resistance: float = 1.0  # [ohm]
     dead_band: float = 0.0  # [rad]
+    resolution: float = 0.0  # [rad] of the commands that it receives.
 
 
 @dataclass(frozen=True)
@@ -187,8 +188,6 @@ class RobotWorld:
         M = self.inverse.mass_diagonal(motion.q[0])
         kp, kd = 100.0 * M, 14.0 * M
         limits = np.array([body.effort for body in self.nominal.moving])
-        if drive.type == "velocity":
-            summed = feed[0].copy()
         rows: list[list[np.ndarray]] = [[], [], [], []]
         commands: list[np.ndarray] = []
         queue: list[tuple[float, np.ndarray]] = []
@@ -199,8 +198,7 @@ class RobotWorld:
             or self.push or drive.type != "effort" or self.delay
         )  # fmt: skip
         if self.share.any():
-            bare = self.true
-            self.load = Inverse(bare)
+            self.load = Inverse(self.true)
         small = 1 if stepwise else per_ms
         k = 0
         while k < n_steps:
@@ -218,7 +216,6 @@ class RobotWorld:
                     command = motion.q[i]
                 commands.append(command)
                 queue.append((d.time, command))
-                held = motion.v[i]
             now = command
             if self.delay:
                 while len(queue) > 1 and queue[1][0] + self.delay <= d.time + 1e-9:
@@ -227,14 +224,11 @@ class RobotWorld:
             q, v = d.qpos[self.dof] + self.offset, d.qvel[self.dof]
             if drive.type == "effort":
                 wanted = now
-            elif drive.type == "pd":
-                wanted = self.kp * (now - q) + drive.kd * (held - v)
             elif drive.type == "servo":
                 wanted = self._servo(now, q, v)
             else:
                 error = now - v
-                summed = summed + drive.kp * error * STEP * small
-                wanted = summed + drive.kd * error
+                wanted = np.clip(drive.kd * error, -drive.limit, drive.limit)
             wanted = np.clip(self.gain * wanted + self.bias, -self.limit, self.limit)
             if self.lag.any():
                 lag = np.maximum(self.lag, 1e-9)
@@ -275,6 +269,8 @@ class RobotWorld:
 
     def _servo(self, command, q, v):
         d = self.drive
+        if d.resolution:
+            command = d.resolution * np.round(command / d.resolution)
         error = command - q
         error = np.sign(error) * np.maximum(np.abs(error) - d.dead_band, 0.0)
         brake = d.kt**2 / d.resistance * v

@@ -131,6 +131,13 @@ def _values(kind: str, p) -> dict[str, float]:
     return dict(zip(LINEAR[kind], map(float, p), strict=True))
 
 
+def _vector(name: str) -> str:
+    """What belongs together: com_x with com_y, x with y, fx with fy."""
+    if name in ("x", "y", "z", "roll", "pitch"):
+        return "vector"
+    return name[:-1] if name in ("com_x", "com_y", "com_z", "fx", "fy", "fz") else name
+
+
 class Comparison:
     """A robot along a motion, its noise, and what is hidden in it."""
 
@@ -183,6 +190,32 @@ class Comparison:
         project = self._projector(self.of_others(others))
         return float((project(self._flat(effort[None])) ** 2).sum())
 
+    def loose(self, effect: dict, others=()) -> list[str]:
+        """The parameters that the recording does not tell to 30 %, of the vector that
+        they belong to: a centre of mass along an axis that is always vertical."""
+        p = effect["parameters"]
+        if len(p) == 1:  # As well known as the effect is seen.
+            return []
+        columns = []
+        for name, value in p.items():
+            step = 1e-3 * max(abs(value), 0.01)
+            up, down = (effect | {"parameters": p | {name: value + side * step}}
+                        for side in (1.0, -1.0))  # fmt: skip
+            columns.append(
+                added_effort(self.robot, up, self.track)
+                - added_effort(self.robot, down, self.track)
+            )
+            columns[-1] = columns[-1] / (2.0 * step)
+        J = self._projector(self.of_others(others))(self._flat(np.array(columns)))
+        u, size, v = np.linalg.svd(J, full_matrices=False)
+        size = np.maximum(size, 1e-9 * size.max())
+        std = np.sqrt((v**2 / size[:, None] ** 2).sum(axis=0))
+        whole = {}
+        for name in p:
+            vector = [abs(p[k]) for k in p if _vector(k) == _vector(name)]
+            whole[name] = float(np.linalg.norm(vector)) or 1.0
+        return [k for k, s in zip(p, std, strict=True) if s > 0.3 * whole[k]]
+
     def rivals(self, effort, places, others=(), near=CLEAR) -> list[Rival]:
         """Effects of `places` [(kind, at)] whose d^2 from `effort` (k, n) is below
         `near`, the nearest first, with the parameters that come nearest."""
@@ -196,11 +229,34 @@ class Comparison:
                 p, *_ = np.linalg.lstsq(A, target[:, 0], rcond=None)
                 distance = float(((A @ p - target[:, 0]) ** 2).sum())
                 values = _values(kind, p)
+            elif kind == "payload" and self._least(at, project, target) > near:
+                continue
             else:
                 values, distance = self._curved(kind, at, project, target)
             if distance < near:
                 found.append(Rival(kind, at, values, distance))
         return sorted(found, key=lambda r: r.distance)
+
+    def _least(self, at, project, target) -> float:
+        """The least d^2 that a payload could have if its inertia were as free as its
+        mass: ten points span what a body can be."""
+        key = ("ten points", at)
+        if key not in self._known:
+            places = 0.1 * np.vstack(
+                [np.zeros(3), np.eye(3), -np.eye(3), 1 - np.eye(3)]
+            )
+            self._known[key] = np.array([
+                added_effort(
+                    self.robot,
+                    {"kind": "payload", "at": at,
+                     "parameters": {"mass": 0.1, "com_x": x, "com_y": y, "com_z": z}},
+                    self.track,
+                )
+                for x, y, z in places
+            ])  # fmt: skip
+        A = project(self._flat(self._known[key]))
+        p, *_ = np.linalg.lstsq(A, target[:, 0], rcond=None)
+        return float(((A @ p - target[:, 0]) ** 2).sum())
 
     def _curved(self, kind, at, project, target):
         robot, track = self.robot, self.track
@@ -258,6 +314,8 @@ class Comparison:
 def places_of(robot: Robot, kind: str) -> list[tuple[str, str]]:
     """Where and what a rival of an effect of this kind may be."""
     joints = robot.joints
+    if kind == "servo_gain":
+        kind = "actuator_gain"
     bodies = [f"{robot.model}.{body.name}" for body in robot.bodies]
     if kind in JOINT_KINDS:
         return [(k, at) for k in JOINT_KINDS for at in joints]
