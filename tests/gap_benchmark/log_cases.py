@@ -519,8 +519,8 @@ def _as_payload(robot: Robot, hidden: dict) -> list[Rival]:
     hand = robot.bodies[-1]
     R = rotation(quaternion(hand.rpy))
     before = robot.bodies[-2].name
-    places = {hidden["at"]: np.array(hand.com),
-              f"{robot.model}.{before}": np.array(hand.xyz) + R @ np.array(hand.com)}  # fmt: skip
+    flange = np.array(hand.xyz) + R @ np.array(hand.com)
+    places = {hidden["at"]: np.array(hand.com), f"{robot.model}.{before}": flange}
     return [
         Rival(
             "payload", at,
