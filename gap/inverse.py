@@ -11,8 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from makebreak.gap.recording import Episode, Recording
+from makebreak.models.drives import law_of
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
+from makebreak.models.effects.actuation_path import OWN
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.effects.measured_channels import acts_on
 from makebreak.models.effects.signature import Motion, added_effort
@@ -28,14 +30,9 @@ from makebreak.systems.numerics.filters import (
 from makebreak.systems.numerics.smoother import smooth_filtered
 from makebreak.systems.numerics.weak_form import Bumps, make_bumps
 
-SENSED = ("joint_offset", "sensor_delay", "sensor_lag", "clock_skew", "sensor_bias")
-PATH = (
-    "input_delay",
-    "actuator_gain",
-    "actuator_bias",
-    "actuator_saturation",
-    "actuator_lag",
-)
+SENSED = tuple(name for name, kind in KINDS.items() if kind.channel)
+# Between command and motor; a gear's loss is in the equations.
+PATH = tuple(n for n, kind in KINDS.items() if kind.path and kind.on_top is None)
 # A joint that stands still may be held by any friction: what its equation says then is
 # given this share of its rms effort as uncertainty, by the share of time at rest.
 REST_SPEED, REST_SHARE, REST_EFFORT = 0.005, 0.04, 0.3
@@ -127,7 +124,9 @@ class InverseModel:
         # Effects that the scene has already and its dynamics do not know.
         self._own = [
             e for e in scene.effects
-            if e.kind in SENSED + PATH or KINDS[e.kind].hidden_state
+            if e.kind in SENSED + PATH
+            or KINDS[e.kind].hidden_state
+            or KINDS[e.kind].on_top is not None
         ]  # fmt: skip
         self.noise = self._noise("position")
         self.velocity_noise = self._noise("velocity")
@@ -139,14 +138,19 @@ class InverseModel:
                 "velocity_command",
             )
         }  # fmt: skip
+        # Drives with a loop of their own, and which joints are commanded.
+        self.laws = [law_of(scene.actuation, joint) for joint in self.joints]
+        self.commanded = [
+            self.has["effort_command"][i]
+            or self.has["position_command"][i]
+            or (self.laws[i] is not None and self.has["velocity_command"][i])
+            for i in range(len(self.joints))
+        ]
         # Of a joint without a command the measured effort stands in for it.
         self.by_measured = [
-            m and not (c or p)
-            for m, c, p in zip(
-                self.has["effort_measured"],
-                self.has["effort_command"],
-                self.has["position_command"],
-                strict=True,
+            measured and not commanded
+            for measured, commanded in zip(
+                self.has["effort_measured"], self.commanded, strict=True
             )
         ]
         self.tracks: list[Track] = []
@@ -298,21 +302,20 @@ class InverseModel:
         """(n, n_v) mean effort over each interval, after the path."""
         effects = [*self._own, *effects]
         out = np.zeros_like(q)
-        act = self.scene.actuation
         for i, joint in enumerate(self.joints):
-            delay, gain, bias, limit, lag = _path(effects, joint)
-            if self.has["position_command"][i] and act.type == "pd":
-                k = act.joints.index(joint)
-                wanted = _mean_held(
-                    track, track.commands[f"{joint}.position_command"], delay
-                )
-                seen = q[:, i] + _sensing(effects, f"{joint}.position")[2]
-                u = act.kp[k] * (wanted - seen)
+            delay, gain, bias, limit, lag, kp = _path(effects, joint)
+            law = self.laws[i]
+            if law is not None and self.commanded[i]:
+                law = law.with_kp(kp)
+                error, rate = 0.0, 0.0
+                if f"{joint}.position_command" in track.commands:
+                    wanted = law.received(track.commands[f"{joint}.position_command"])
+                    seen = q[:, i] + _sensing(effects, f"{joint}.position")[2]
+                    error = _mean_held(track, wanted, delay) - seen
                 if f"{joint}.velocity_command" in track.commands:
                     rate = track.commands[f"{joint}.velocity_command"]
-                    u = u + act.kd[k] * (_mean_held(track, rate, delay) - v[:, i])
-                else:
-                    u = u - act.kd[k] * v[:, i]
+                    rate = _mean_held(track, rate, delay)
+                u = law.effort(error, rate, v[:, i])
             elif self.has["effort_command"][i]:
                 u = _mean_held(track, track.commands[f"{joint}.effort_command"], delay)
             elif self.by_measured[i]:
@@ -336,10 +339,9 @@ class InverseModel:
         rms = _rms(size)
         rms = np.maximum(rms, 0.1 * rms.max())
         kp, kd = np.zeros(len(self.joints)), np.zeros(len(self.joints))
-        if self.scene.actuation.type == "pd":
-            for k, joint in enumerate(self.scene.actuation.joints):
-                i = self.joints.index(joint)
-                kp[i], kd[i] = self.scene.actuation.kp[k], self.scene.actuation.kd[k]
+        for i, law in enumerate(self.laws):
+            if law is not None:
+                kp[i], kd[i] = law.kp, law.kd + law.emf
         out = []
         for track in self.tracks:
             q, v = self._qv(track)
@@ -399,7 +401,10 @@ class InverseModel:
 
     def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
         """(m,) residual over its noise, of the scene with these effects added."""
-        hidden = [e for e in self._own if KINDS[e.kind].hidden_state]
+        hidden = [
+            e for e in self._own
+            if KINDS[e.kind].hidden_state or KINDS[e.kind].on_top is not None
+        ]  # fmt: skip
         ours = [*hidden, *(e for e in effects if e.kind not in SENSED + PATH)]
         moving = [
             e for e in effects
@@ -422,7 +427,12 @@ class InverseModel:
             motion, needed = self._moved_by(k, moving)
             if dynamics is not self.dynamics:
                 needed = motion.effort - dynamics.residual(motion)
-            for effect in ours:
+            # A gear's loss goes with what all the others need.
+            for effect in sorted(ours, key=lambda e: KINDS[e.kind].on_top is not None):
+                on_top = KINDS[effect.kind].on_top
+                if on_top is not None:
+                    needed = needed + on_top(effect, dynamics, motion, needed)
+                    continue
                 add = added_effort(effect, KINDS[effect.kind], dynamics, motion)
                 if add is None:
                     raise ValueError(f"{effect.kind} is seen in simulation alone")
@@ -632,7 +642,7 @@ def _lag(effects: Sequence[Effect], channel: str) -> float:
 
 
 def _path(effects: Sequence[Effect], joint: str):
-    delay, gain, bias, limit, lag = 0.0, 1.0, 0.0, np.inf, 0.0
+    delay, gain, bias, limit, lag, kp = 0.0, 1.0, 0.0, np.inf, 0.0, OWN
     for effect in effects:
         if effect.kind not in PATH:
             continue
@@ -644,7 +654,8 @@ def _path(effects: Sequence[Effect], joint: str):
         bias += p.get("bias", 0.0)
         limit = min(limit, p.get("limit", np.inf))
         lag += p.get("time_constant", 0.0)
-    return delay, gain, bias, limit, lag
+        kp = p.get("kp", kp)
+    return delay, gain, bias, limit, lag, kp
 
 
 def _mean_held(track: Track, command: np.ndarray, delay: float) -> np.ndarray:

@@ -90,6 +90,9 @@ def candidates(
         if kind in ("input_delay", "actuator_lag"):
             found += _of_delays(model, kind, of)
             continue
+        if entry.drive:
+            found += _of_drives(model, kind, of)
+            continue
         if entry.signature is None:
             continue
         for at in dynamics.places(kind):
@@ -218,8 +221,7 @@ def _mass(model: InverseModel, at: str) -> float:
 
 
 def _driven(model: InverseModel, joint: str) -> bool:
-    i = model.joints.index(joint)
-    return model.has["effort_command"][i] or model.has["position_command"][i]
+    return model.commanded[model.joints.index(joint)]
 
 
 def _worst_joints(model: InverseModel, nuisance, prior, most: int = 3) -> list[str]:
@@ -278,6 +280,26 @@ def _of_delays(model: InverseModel, kind: str, of) -> list[Candidate]:
     if len(driven) > 1:
         places += [(j,) for j in driven]
     return [c for at in places if (c := _secant(model, kind, at, name, of)) is not None]
+
+
+def _of_drives(model: InverseModel, kind: str, of) -> list[Candidate]:
+    """Of drives' own numbers: by the difference that one more or less makes."""
+    found = []
+    for at in model.dynamics.places(kind):
+        if not _driven(model, at):
+            continue
+        ((name, now),) = model.dynamics.now(kind, [at]).items()
+        base, columns = model.base(), []
+        for share in (-0.3, 0.3):
+            moved = model.residual([Effect(kind, [at], {name: (1.0 + share) * now})])
+            columns.append(((base - moved) / (share * now))[:, None])
+
+        def read(c, name=name, now=now):
+            return {name: now + float(c[0])}
+
+        readers = (read,) * len(columns)
+        found.append(Candidate(kind, (at,), 1, tuple(map(of, columns)), readers))
+    return found
 
 
 def _of_sensors(model: InverseModel, kind: str, of) -> list[Candidate]:

@@ -17,6 +17,7 @@ from makebreak.gap.recording import Episode, Recording
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import InitialSection, Scene
+from makebreak.models.scene_schema import COMMANDS_OF
 from makebreak.systems.numerics.filters import Stage, memory, with_lag
 from makebreak.systems.numerics.smoother import smooth_filtered
 
@@ -291,9 +292,7 @@ class WindowModel(WindowedResidual):
 
     def _driven(self, quantity: str) -> list[str]:
         act = self.scene.actuation
-        wanted = {"effort": ("effort_command",),
-                  "pd": ("position_command", "velocity_command")}  # fmt: skip
-        return act.joints if quantity in wanted.get(act.type, ()) else []
+        return act.joints if quantity in COMMANDS_OF[act.type] else []
 
     # ----- Simulating
 

@@ -38,6 +38,8 @@ from makebreak.models.scene_schema import COMMANDS_OF, ActuationSection
 from makebreak.models.typed_yaml import nearest
 
 DRIVEN_BY = ("position_command", "velocity_command")  # A drive with a loop of its own.
+STIFF_TYPES = ("servo", "velocity")
+FASTEST = 2000.0  # [1/s] at which a drive may stop a joint in a continuous plant.
 CHANNEL_STEPS = {name: kind.channel for name, kind in KINDS.items() if kind.channel}
 
 
@@ -179,6 +181,24 @@ def _gear(plant: MultibodyPlant, model: str) -> Gear:
     return Gear(n_q + at, slow, 2.0 * dt * mobility[at])
 
 
+def _check_stiffness(plant: MultibodyPlant, drive, joints, names) -> None:
+    """Raises: ValueError where a drive stops a joint faster than can be simulated. So
+    it is where the model leaves out what turns in the motor."""
+    damping, driven = drive
+    context, dt = plant.CreateDefaultContext(), plant.time_step()
+    mobility = np.diag(np.linalg.inv(plant.CalcMassMatrix(context)))
+    for joint, name, d, is_driven in zip(joints, names, damping, driven, strict=True):
+        inertia = 1.0 / mobility[joint.velocity_start()]
+        least = d * dt if dt else d / FASTEST
+        if is_driven and inertia < least:
+            raise ValueError(
+                f"actuation: the drive of {name} damps with {d:.3g} N m s/rad, and the "
+                f"joint has {inertia:.2g} kg m2, too little for that to be simulated "
+                f"(expected {least:.2g} or more): give it its rotor (an effect "
+                "rotor_inertia, its inertia times the gear ratio squared)"
+            )
+
+
 def _drive(
     actuation: ActuationSection, effects, plant: MultibodyPlant, model: str
 ) -> Drive | None:
@@ -193,6 +213,8 @@ def _drive(
     of = {name: i for i, name in enumerate(actuation.joints)}
     law = whole[np.array([of.get(name, 0) for name in names])]
     joints = [motor_joint(plant, a.joint()) or a.joint() for a in actuators]
+    if actuation.type in STIFF_TYPES:
+        _check_stiffness(plant, [law.kd + law.emf, driven], joints, names)
     n_q = plant.num_positions()
     offsets = [effect for effect in effects if KINDS[effect.kind].channel == "offset"]
     maps = channel_maps(offsets, CHANNEL_STEPS, [f"{name}.position" for name in names])

@@ -482,3 +482,18 @@ def test_bad_commands_and_channels_are_refused_by_name(tmp_path):
         Commands(np.array([0.0, 0.0]), {})
     with pytest.raises(ValueError, match="Commands column a is"):
         Commands(np.arange(3.0), {"a": np.zeros(2)})
+
+
+def test_a_drive_without_its_rotor_is_refused_where_it_would_never_end(tmp_path):
+    supply = SupplySection(
+        voltage=[12.0], kt=[30.0], resistance=[1.0]
+    )  # 900 N m s/rad.
+    drive = dict(type="servo", joints=["p.j1"], kp=[30.0], supply=supply)
+    with pytest.raises(ValueError, match="damps with 900 .* give it its rotor"):
+        load_scene(pendulum(tmp_path, **drive), DiagramBuilder())
+    with_rotor = with_effects(
+        pendulum(tmp_path, **drive), ("rotor_inertia", "p.j1", dict(inertia=1.0))
+    )
+    load_scene(with_rotor, DiagramBuilder())
+    with pytest.raises(ValueError, match="expected 1.8 or more"):
+        load_scene(pendulum(tmp_path, 0.002, **drive), DiagramBuilder())
