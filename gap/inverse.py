@@ -307,14 +307,14 @@ class InverseModel:
             law = self.laws[i]
             if law is not None and self.commanded[i]:
                 law = law.with_kp(kp)
-                error, rate = 0.0, 0.0
+                error, rate = np.zeros_like(v[:, i]), np.zeros_like(v[:, i])
                 if f"{joint}.position_command" in track.commands:
                     wanted = law.received(track.commands[f"{joint}.position_command"])
                     seen = q[:, i] + _sensing(effects, f"{joint}.position")[2]
                     error = _mean_held(track, wanted, delay) - seen
                 if f"{joint}.velocity_command" in track.commands:
-                    rate = track.commands[f"{joint}.velocity_command"]
-                    rate = _mean_held(track, rate, delay)
+                    told = track.commands[f"{joint}.velocity_command"]
+                    rate = _mean_held(track, told, delay)
                 u = law.effort(error, rate, v[:, i])
             elif self.has["effort_command"][i]:
                 u = _mean_held(track, track.commands[f"{joint}.effort_command"], delay)
