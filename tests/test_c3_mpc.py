@@ -13,7 +13,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.solvers import ClarabelSolver, MathematicalProgram, SolverOptions
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
-from scipy.optimize import linprog
+from scipy.optimize import linprog, minimize
 
 from makebreak.scripts.bench_c3 import (
     OsqpC3,
@@ -38,6 +38,12 @@ from makebreak.systems.numerics.c3_mpc import (
     solve_c3,
     warm_up,
     with_gap_residual,
+)
+from makebreak.systems.numerics.c3_polish import (
+    backward,
+    roll_out,
+    rollout_cost,
+    state_breach,
 )
 from makebreak.systems.numerics.c3_projections import (
     ExactProjection,
@@ -757,6 +763,172 @@ def test_numbers_that_are_not_finite_are_a_failure_and_not_a_plan():
         for x0 in (np.full(4, np.nan), np.full(4, 1e308)):
             with pytest.raises(C3Failure):
                 solve_c3(cartpole_lcs(), x0, np.zeros((6, 4)), problem)
+
+
+# The polish.
+
+
+def polish_problem(seed=0, eps_c=5e-4, N=5):
+    """The ball a little beside its reference state: model, x0, weights and inputs."""
+    rng = np.random.default_rng(seed)
+    lcs, x0, x_desired, p = ball(True, N)
+    lcs = replace(lcs, F=lcs.F + eps_c * np.eye(16))
+    x0 = x0 + 0.01 * rng.normal(size=19)
+    model = tuple(np.array(getattr(lcs, name), order="C")[None] for name in "ABDdEFHc")
+    return lcs, model, x0, x_desired, p, rng.normal(size=(N, 3))
+
+
+def unbounded(n):
+    return np.full(n, -np.inf), np.full(n, np.inf)
+
+
+def rolled_out(model, x0, u):
+    N, (n_x, n_lam) = len(u), model[2].shape[1:]
+    x, found_u = np.zeros((N + 1, n_x)), np.zeros_like(u)
+    lam, pushing = np.zeros((N, n_lam)), np.zeros((N, n_lam), np.bool_)
+    step = 0.0, np.zeros_like(u), np.zeros((*u.shape, n_x))
+    found = x, found_u, lam, pushing
+    assert roll_out(model, x0, (x.copy(), u), step, unbounded(u.shape[1]), found)
+    return x, lam, pushing
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("eps_c", [0.0, 5e-4])
+def test_the_polishs_rollout_is_that_of_simulate(seed, eps_c):
+    lcs, model, x0, *_, u = polish_problem(seed, eps_c)
+    x, lam, pushing = rolled_out(model, x0, u)
+    for k in range(5):
+        x_next, lam_k = simulate(lcs, x[k], u[k])
+        # lam is unique with eps_c alone; the motion always is.
+        np.testing.assert_allclose(x[k + 1], x_next, rtol=1e-9, atol=1e-10)
+        if eps_c > 0.0:
+            np.testing.assert_allclose(lam[k], lam_k, atol=1e-8 * lam_k.max())
+        np.testing.assert_array_equal(pushing[k], lam[k] > 0.0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_adjoint_gradient_is_that_of_finite_differences(seed):
+    _, model, x0, x_desired, p, u = polish_problem(seed)
+    centre = np.full((5, 3), 0.1)
+    x_lower, x_upper = unbounded(19)
+    # A bound that is breached at two of five knots: its penalty has a gradient too.
+    x_upper[10] = np.median(rolled_out(model, x0, u)[0][1:, 10])
+    penalty = 7.0
+
+    def cost(u):
+        x, _, pushing = rolled_out(model, x0, u)
+        _, extra = state_breach(x, x_lower, x_upper, penalty)
+        total = rollout_cost(x, u, x_desired, centre, p.Q, p.R, p.Q_N)
+        return total + extra, x, pushing
+
+    _, x, pushing = cost(u)
+    assert pushing.any() and (x[1:, 10] > x_upper[10]).sum() == 2
+    gradient = np.zeros((5, 3))
+    found = gradient, np.zeros((5, 3)), np.zeros((5, 3, 19))
+    bounds = *unbounded(3), x_lower, x_upper
+    weights = p.Q, p.R, p.Q_N, penalty
+    backward(model, x, u, pushing, x_desired, centre, weights, bounds, found)
+    numeric, h = np.zeros((5, 3)), 1e-6
+    for i in np.ndindex(5, 3):
+        step = np.zeros((5, 3))
+        step[i] = h
+        up, down = cost(u + step), cost(u - step)
+        # Central differences mean something only where no contact changes.
+        assert (up[2] == pushing).all() and (down[2] == pushing).all()
+        numeric[i] = (up[0] - down[0]) / (2.0 * h)
+    # The cost is quadratic there, so what is left is rounding of the cost over h.
+    np.testing.assert_allclose(gradient, numeric, atol=1e-5 * abs(numeric).max())
+
+
+def test_one_newton_step_is_the_optimum_where_the_modes_do_not_change():
+    """Without contact the rollout is affine, and the optimum a least-squares answer."""
+    lcs = replace(cartpole_lcs(), D=np.zeros((4, 2)), E=np.zeros((2, 4)))
+    x0, x_desired = CARTPOLE["x0"], np.random.default_rng(0).normal(size=(6, 4))
+    problem = cartpole_problem(PLUS, rounds=1, polish=1)
+    exact, _ = solve_c3(lcs, x0, x_desired, cartpole_problem(PLUS, rounds=0))
+    # Far from it at the start: the input's weight in G pulls it to zero.
+    heavy = C3Weights(problem.Q, problem.R, problem.G + 1e4, problem.U, problem.Q_N)
+    polished = C3Problem(heavy, PLUS, problem.options)
+    start, _ = solve_c3(
+        lcs, x0, x_desired, C3Problem(heavy, PLUS, replace(problem.options, polish=0))
+    )
+    plan, _ = solve_c3(lcs, x0, x_desired, polished)
+    assert abs(start.u - exact.u).max() > 1e-2
+    # G of `exact` adds 1e-9 at most to its weights (G_plus has no u part).
+    np.testing.assert_allclose(plan.u, exact.u, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("bounded", [False, True])
+@pytest.mark.parametrize("projection", [PLUS, C3_QP, EXACT])
+def test_polish_is_never_worse_and_more_of_it_is_no_worse(projection, bounded):
+    for make in (ball, cartpole):
+        plus = isinstance(projection, PlusProjection)
+        lcs, x0, x_desired, p = make(plus, 5)
+        limit = np.full(p.n_u, 2.0)
+        bounds = C3Bounds(-limit, limit) if bounded else None
+        weights = C3Weights(p.Q, p.R, p.G, p.U, p.Q_N)
+        costs = []
+        for polish in (0, 1, 3, 10):
+            options = replace(p.options, polish=polish)
+            problem = C3Problem(weights, projection, options, bounds)
+            plan, _ = solve_c3(lcs, x0, x_desired, problem)
+            costs.append(plan_cost(lcs, x0, plan.u, x_desired, problem))
+            assert not bounded or abs(plan.u).max() <= 2.0
+            if polish:  # The plan is what the model does.
+                for k in range(5):
+                    x_next, _ = simulate(lcs, plan.x[k], plan.u[k])
+                    size = abs(x_next).max()
+                    np.testing.assert_allclose(plan.x[k + 1], x_next, atol=1e-9 * size)
+        assert (np.diff(costs) <= 1e-9 * costs[0]).all()
+        if make is ball:
+            assert costs[-1] < 0.75 * costs[0]
+
+
+def test_polish_agrees_with_a_derivative_free_search_that_starts_beside_it():
+    """Powell's method knows the rollout alone. It finds nothing better near by."""
+    lcs, x0, x_desired, p = cartpole(True, 5)
+    problem = C3Problem(
+        C3Weights(p.Q, p.R, p.G, p.U, p.Q_N), PLUS, replace(p.options, polish=6)
+    )
+    plan, _ = solve_c3(lcs, x0, x_desired, problem)
+    ours = plan_cost(lcs, x0, plan.u, x_desired, problem)
+    rng = np.random.default_rng(0)
+    start = plan.u.ravel() + rng.normal(size=5)
+    found = minimize(
+        lambda u: plan_cost(lcs, x0, u.reshape(5, 1), x_desired, problem),
+        start, method="Powell", options=dict(xtol=1e-6, ftol=1e-10),
+    )  # fmt: skip
+    assert ours == pytest.approx(found.fun, rel=1e-5)
+
+
+def test_polish_does_not_breach_state_bounds_more_than_its_starts():
+    lcs, x0, x_desired = cartpole_lcs(), CARTPOLE["x0"], np.zeros((6, 4))
+    upper = np.full(4, np.inf)
+    upper[2] = 0.7  # Of the cart's speed, which starts at .5 and would rise to 1.
+    breach = []
+    for polish in (0, 1, 5):
+        bounds = C3Bounds(x_upper=upper)
+        problem = cartpole_problem(PLUS, bounds, polish=polish)
+        plan, _ = solve_c3(lcs, x0, x_desired, problem)
+        x, worst = x0, 0.0
+        for u in plan.u:
+            x, _ = simulate(lcs, x, u)
+            worst = max(worst, x[2] - 0.7)
+        breach.append(worst)
+    # 1e-6 is what Plan promises, of 1 + the bound.
+    assert max(breach[1:]) <= max(breach[0], 1.7e-6)
+    free, _ = solve_c3(lcs, x0, x_desired, cartpole_problem(PLUS, polish=5))
+    assert free.x[1:, 2].max() > 0.72  # The bound matters.
+
+
+def test_polish_takes_an_lcs_per_knot_and_no_fewer_than_zero_rollouts():
+    lcs, x0, x_desired = cartpole_lcs(), CARTPOLE["x0"], np.zeros((6, 4))
+    problem = cartpole_problem(PLUS, polish=3)
+    one, _ = solve_c3(lcs, x0, x_desired, problem)
+    same, _ = solve_c3([lcs] * 5, x0, x_desired, problem)
+    np.testing.assert_array_equal(one.u, same.u)
+    with pytest.raises(ValueError, match="polish is -1, expected at least 0"):
+        cartpole_problem(PLUS, polish=-1)
 
 
 # The residual and the command.

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from makebreak.systems.numerics.c3_polish import polish
 from makebreak.systems.numerics.c3_projections import (
     PlusProjection,
     Projection,
@@ -81,6 +82,9 @@ class C3Options:
     scale_lam: bool = False  # Solve in lam / s, s = |A|_F / |D|_F.
     start_at_x0: bool = False  # delta starts with x_0 in its x part instead of zero.
     warm_start: bool = False  # delta and w start where the last solve ended.
+    polish: int = (
+        0  # Rollouts on the LCS that improve the plan (c3_polish.py); 0: none.
+    )
 
 
 @dataclass
@@ -95,7 +99,11 @@ class C3Bounds:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What C3 intends; u obeys its bounds exactly, x to 1e-6 of their size."""
+    """What C3 intends; u obeys its bounds exactly, x to 1e-6 of their size.
+
+    A polished plan is the LCS's own rollout of u, of which C3 knew an approximation:
+    lam is exact, and x breaches its bounds where that approximation hid it.
+    """
 
     x: np.ndarray  # (N + 1, n_x) [SI]
     u: np.ndarray  # (N, n_u) [N]
@@ -212,7 +220,7 @@ def _check_options(o: C3Options, projection: Projection):
             f"C3: projection is {projection!r}, expected PlusProjection(), "
             "QpProjection(alpha) or ExactProjection()"
         )
-    for name in ("N", "rounds"):
+    for name in ("N", "rounds", "polish"):
         number = getattr(o, name)
         if isinstance(number, bool) or not isinstance(number, Integral):
             raise ValueError(f"C3Options.{name} is {number!r}, expected an integer")
@@ -221,6 +229,8 @@ def _check_options(o: C3Options, projection: Projection):
             f"C3Options: N = {o.N} knots and rounds = {o.rounds}, expected N >= 1 and "
             "rounds >= 0"
         )
+    if o.polish < 0:
+        raise ValueError(f"C3Options.polish is {o.polish}, expected at least 0")
     if not 1.0 <= o.rho < np.inf:
         raise ValueError(f"C3Options.rho is {o.rho}, expected a number >= 1")
     if isinstance(projection, QpProjection) and not 0.0 < projection.alpha <= 1.0:
@@ -355,15 +365,36 @@ def solve_c3(
     weights, bounds = (p.Q, p.R, p.Q_N, p.G), (p.lower, p.upper)
     given = h, x0, lam0
     if p.is_plus:
-        status, x, v, delta, w = _admm_plus(
+        status, x, v, delta, w, inputs = _admm_plus(
             *model, *weights, *bounds, p.U, *given, delta, w, o.rounds, o.rho
         )
         if status != SOLVED:
             raise C3Failure(_FAILURES[status])
     else:
         lcp = p.projection, p.U, (E, F, H, c), matrices
-        x, v, delta, w = _admm(model, weights, bounds, given, delta, w, o, lcp)
-    plan = Plan(x, np.ascontiguousarray(v[:, p.n_lam :]), v[:, : p.n_lam] * scale)
+        x, v, delta, w, inputs = _admm(model, weights, bounds, given, delta, w, o, lcp)
+    u, lam = np.ascontiguousarray(v[:, p.n_lam :]), v[:, : p.n_lam] * scale
+    if o.polish > 0:
+        ahead = np.vstack([warm.u[1:], warm.u[-1:]])
+        starts = np.concatenate([inputs, warm.u[None], ahead[None]])
+        u_centre = warm.u if o.penalise_input_change else np.zeros_like(u)
+        bounds = (
+            *np.split(p.lower[p.n_lam :], [p.n_u]),
+            *np.split(p.upper[p.n_lam :], [p.n_u]),
+        )
+        found = polish(
+            tuple(_stacked(models, name) for name in "ABDdEFHc"),
+            x0,
+            starts,
+            x_desired,
+            u_centre,
+            (p.Q, p.R, p.Q_N),
+            (bounds[0], bounds[2], bounds[1], bounds[3]),
+            o.polish,
+        )
+        if found[3] < np.inf:  # Else no start can be rolled out: C3's plan remains.
+            x, u, lam, _ = found
+    plan = Plan(x, u, lam)
     return plan, WarmStart(plan.u, delta * unit, w * unit)
 
 
@@ -396,7 +427,7 @@ def _stacked(models, name):
 
 
 def _admm(model, weights, bounds, given, delta, w, options, lcp):
-    """The rounds of C3, and the last QP: x, v, delta, w.
+    """The rounds of C3, and the last QP: x, v, delta, w, and every QP's u.
 
     Args: model, weights, bounds as of _qp_step; given: h, x0, lam0 of it; lcp: what
         `project` needs beside z and delta.
@@ -417,9 +448,10 @@ def _admm(model, weights, bounds, given, delta, w, options, lcp):
         return z, x, v
 
     projection, U, arrays, matrices = lcp
-    K = len(matrices)
-    for _ in range(options.rounds):
-        z, _, _ = qp_step(G, delta - w)
+    K, inputs = len(matrices), np.empty((options.rounds + 1, N, len(R)))
+    for r in range(options.rounds):
+        z, _, v = qp_step(G, delta - w)
+        inputs[r] = v[:, n_lam:]
         delta = np.empty((N, n_z))
         for k in range(K):
             knots = slice(None) if K == 1 else slice(k, k + 1)
@@ -430,7 +462,8 @@ def _admm(model, weights, bounds, given, delta, w, options, lcp):
         w = (w + z - delta) / options.rho
         G = options.rho * G
     _, x, v = qp_step(G, delta - w)
-    return x, v, delta, w
+    inputs[-1] = v[:, n_lam:]
+    return x, v, delta, w, inputs
 
 
 @njit(cache=True)
@@ -460,12 +493,14 @@ def _admm_plus(
     model, bounds = (AB, d, C, c), (lower, upper)
     x, v = np.empty((N + 1, len(Q))), np.empty((N, n_lam + len(R)))
     z, sides = np.empty((N, n_z)), np.zeros((N + 1, AB.shape[2]), np.int64)
-    for _ in range(rounds):
+    inputs = np.zeros((rounds + 1, N, len(R)))
+    for r in range(rounds):
         status = _qp_step(
             model, (Q, R, Q_N, G), bounds, (h, delta - w, x0, lam0), (z, x, v, sides)
         )
         if status != SOLVED:
-            return status, x, v, delta, w
+            return status, x, v, delta, w, inputs
+        inputs[r] = v[:, n_lam:]
         delta = np.empty((N, n_z))
         project_plus(z + w, U, len(Q), n_lam, delta)
         w = (w + z - delta) / rho
@@ -473,7 +508,8 @@ def _admm_plus(
     status = _qp_step(
         model, (Q, R, Q_N, G), bounds, (h, delta, x0, lam0), (z, x, v, sides)
     )
-    return status, x, v, delta, w
+    inputs[rounds] = v[:, n_lam:]
+    return status, x, v, delta, w, inputs
 
 
 @njit(cache=True)
