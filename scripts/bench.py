@@ -12,6 +12,7 @@ from time import process_time
 import numpy as np
 
 from makebreak.models.typed_yaml import nearest
+from makebreak.scripts.bench_rows import failed
 from makebreak.scripts.table import Table
 
 # The name on the command line -> the module, imported when it is asked for.
@@ -45,7 +46,7 @@ def median_cpu_ms(call: Callable[[], object], n: int = 200) -> float:
 def bench(names: Sequence[str] = ()) -> Table:
     """Runs the benches of these names, or all.
 
-    A bench that fails is a note under the table; the others still run.
+    A bench that fails is a row that says why; the others still run.
 
     Returns: the table; its first column is the bench.
     Raises: ValueError for an unknown name, with the nearest valid ones.
@@ -55,13 +56,11 @@ def bench(names: Sequence[str] = ()) -> Table:
         if name not in here:
             raise ValueError(f"unknown bench {name}; {nearest(name, here)}")
     found: list[dict] = []
-    notes = []
     for name in names or here:
         try:
             rows = import_module(BENCHES[name]).rows()
         except Exception as error:  # Whatever it is, the other figures are wanted.
-            notes.append(f"{name} failed: {type(error).__name__}: {error}")
-            continue
+            rows = [failed(name, error)]
         found += [{"bench": name, **row} for row in rows]
     # A row's target, where it has one, is whether it was met.
     columns = list(dict.fromkeys(c for row in found for c in row if c != "met"))
@@ -70,5 +69,4 @@ def bench(names: Sequence[str] = ()) -> Table:
         columns,
         [[row.get(c) for c in columns] for row in found],
         met=[row.get("met") for row in found],
-        notes=notes,
     )

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from makebreak.scripts.bench_rows import failed
 from makebreak.scripts.experiments import EXPERIMENTS, load_experiment
 from makebreak.scripts.trials import run_many
 
@@ -18,22 +19,27 @@ def rows() -> list[dict]:
         try:
             settings = getattr(load_experiment(name), "BENCH", {"as it is": {}})
         except ImportError as error:
-            found.append({"what": f"{name}: {error}", "value": None})
+            found.append(failed(name, error))
             continue
         for label, values in settings.items():
-            with TemporaryDirectory() as folder:
-                runs = [(values, 0)]
-                [result] = run_many(name, runs, 1, Path(folder), DURATION_SEC)
-                timing = Path(result["out_dir"]) / "timing.json"
-                row: dict = {"what": f"{name}, {label}", "unit": "x real time"}
-                if "error" in result:
-                    row |= {"value": None, "note": result["error"]}
-                else:
-                    figures = json.loads(timing.read_text())
-                    row["value"] = figures["real_time_factor_cpu"]
-                    found += _without_pictures(figures, row["what"])
-                found.append(row)
+            what = f"{name}, {label}"
+            try:
+                found += _measured(name, values, what)
+            except Exception as error:  # The others are wanted all the same.
+                found.append(failed(what, error))
     return found
+
+
+def _measured(name: str, values: dict, what: str) -> list[dict]:
+    with TemporaryDirectory() as folder:
+        [result] = run_many(name, [(values, 0)], 1, Path(folder), DURATION_SEC)
+        if "error" in result:
+            raise RuntimeError(result["error"])
+        timing = Path(result["out_dir"]) / "timing.json"
+        figures = json.loads(timing.read_text())
+    value = figures["real_time_factor_cpu"]
+    row = {"what": what, "unit": "x real time", "value": value}
+    return [*_without_pictures(figures, what), row]
 
 
 def _without_pictures(figures: dict, what: str) -> list[dict]:

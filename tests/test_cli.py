@@ -19,10 +19,13 @@ import numpy as np
 import pytest
 import spring_mass
 
+import makebreak
 from makebreak.scripts import bench, cli, experiments, trials
 from makebreak.scripts.criteria import Criteria
+from makebreak.scripts.settings import apply_settings
 
 ALL = dict(experiments.EXPERIMENTS)
+PYPROJECT = Path(__file__).resolve().parent.parent / "pyproject.toml"
 
 
 @pytest.fixture(autouse=True)
@@ -466,7 +469,9 @@ def test_bench_prints_table_and_json_and_outlives_a_failing_bench(
     ]
     assert cli.main(["bench"]) == 1
     text = capsys.readouterr().out
-    assert "bad failed: ValueError: no" in text and "1.5" in text
+    assert "failed: ValueError: no" in text and "1.5" in text
+    [bad] = [r for r in json.loads(text[text.index("{") :])["rows"] if not r["value"]]
+    assert bad["bench"] == "bad" and bad["note"] == "failed: ValueError: no"
 
 
 def test_bench_diagrams_gives_the_real_time_factor_of_each_setting(monkeypatch):
@@ -476,6 +481,44 @@ def test_bench_diagrams_gives_the_real_time_factor_of_each_setting(monkeypatch):
     monkeypatch.setattr(bench_diagrams, "EXPERIMENTS", experiments.EXPERIMENTS)
     [row] = bench_diagrams.rows()
     assert row["what"] == "spring_mass, soft" and row["value"] > 0
+    monkeypatch.setattr(spring_mass, "BENCH", {"hard": {"spring.stiffness": -1.0}})
+    [row] = bench_diagrams.rows()
+    assert row["what"] == "spring_mass, hard" and row["value"] is None
+    assert "exit status 2: makebreak: spring.stiffness: got -1.0" in row["note"]
+    assert row["met"] is False
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_the_settings_of_every_bench_are_accepted(name):
+    """By the config; and by what wall_friction asks of its training."""
+    module = import_module(ALL[name])
+    for values in getattr(module, "BENCH", {"": {}}).values():
+        config = apply_settings(module.Config(), trials.setting_texts(values))
+        if name == "wall_friction":
+            assert config.training.trials >= len(module.VARIED)
+
+
+@pytest.mark.parametrize("words", [["list"], ["--help"], ["run", "--help"]])
+def test_list_and_help_import_nothing_that_is_long_to_load(words):
+    code = "import sys; from makebreak.scripts.cli import main\n"
+    code += f"try: main({words!r})\nexcept SystemExit: pass\n"
+    code += "print([m for m in sys.modules if m in {'pydrake', 'numba', 'scipy', "
+    code += "'matplotlib', 'cv2', 'sklearn', 'tqdm'}])"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env=trials._environment(),
+    )
+    assert done.returncode == 0 and done.stdout.splitlines()[-1] == "[]", done.stderr
+
+
+def test_version_is_that_of_the_package(capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f"makebreak {makebreak.__version__}\n"
+    assert f'version = "{makebreak.__version__}"' in PYPROJECT.read_text()
 
 
 def test_python_m_makebreak_is_the_command():

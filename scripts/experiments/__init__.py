@@ -12,7 +12,10 @@ Each is a module with
                 `makebreak bench diagrams` takes its real-time factor
 """
 
+import ast
 from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 from types import ModuleType
 
 # The name on the command line -> the module, imported when it is asked for.
@@ -36,3 +39,20 @@ def load_experiment(name: str) -> ModuleType:
     Raises: KeyError if there is no experiment of that name.
     """
     return import_module(EXPERIMENTS[name])
+
+
+def summary_of(name: str) -> str:
+    """The SUMMARY of the experiment `name`, read without importing its module, which
+    would take seconds.
+
+    Raises: KeyError if there is no experiment of that name; ImportError if there is no
+        such file, or no SUMMARY in it.
+    """
+    found = find_spec(EXPERIMENTS[name])
+    if found is None or found.origin is None:
+        raise ImportError(f"no module {EXPERIMENTS[name]}")
+    for node in ast.parse(Path(found.origin).read_text(), found.origin).body:
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant):
+            if any(getattr(target, "id", "") == "SUMMARY" for target in node.targets):
+                return str(node.value.value)
+    raise ImportError(f"{EXPERIMENTS[name]} has no SUMMARY")

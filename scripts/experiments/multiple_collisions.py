@@ -281,7 +281,6 @@ def plot_trials(trials: dict[str, Trial]):
     axes[0, 0].set_ylabel("tip velocity [m/s]")
     axes[1, 0].set_ylabel("acceleration, 10 Hz [m/s2]")
     axes[2, 0].set_ylabel("force on the tool, 100 Hz [N]")
-    axes[2, 0].set_yscale("symlog", linthresh=10.0)
     axes[0, 0].legend(loc="upper right", ncols=3)
     return figure
 
