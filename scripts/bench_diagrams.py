@@ -17,22 +17,23 @@ def rows() -> list[dict]:
     found: list[dict] = []
     for name in EXPERIMENTS:
         try:
-            settings = getattr(load_experiment(name), "BENCH", {"as it is": {}})
+            module = load_experiment(name)
         except ImportError as error:
             found.append(failed(name, error))
             continue
-        for label, values in settings.items():
+        seconds = getattr(module, "BENCH_SEC", DURATION_SEC)
+        for label, values in getattr(module, "BENCH", {"as it is": {}}).items():
             what = f"{name}, {label}"
             try:
-                found += _measured(name, values, what)
+                found += _measured(name, values, what, seconds)
             except Exception as error:  # The others are wanted all the same.
                 found.append(failed(what, error))
     return found
 
 
-def _measured(name: str, values: dict, what: str) -> list[dict]:
+def _measured(name: str, values: dict, what: str, seconds: float) -> list[dict]:
     with TemporaryDirectory() as folder:
-        [result] = run_many(name, [(values, 0)], 1, Path(folder), DURATION_SEC)
+        [result] = run_many(name, [(values, 0)], 1, Path(folder), seconds)
         if "error" in result:
             raise RuntimeError(result["error"])
         timing = Path(result["out_dir"]) / "timing.json"

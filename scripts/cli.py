@@ -30,6 +30,8 @@ from makebreak.scripts.settings import (
 
 # What `reproduce` knows beside the experiments; only by its name.
 _BENCHMARKS = {"gap": "makebreak.scripts.gap_benchmark"}
+_COMPILED = ("ball_rolling", "cartpole_walls")  # By `compile`, without names.
+_REFUSED = "exit status 2"
 _MODELS = Path(__file__).resolve().parent.parent / "models"
 
 
@@ -217,9 +219,6 @@ def _run_in(session, args, module, config, duration) -> int:
     if not args.no_meshcat:
         session.meshcat = _open_meshcat()
 
-    compiled = Path(makebreak.systems.numerics.__path__[0]) / "__pycache__"
-    if not list(compiled.glob("*.nbi")):
-        print("Compiling, the first time only: a minute or two", flush=True)
     result = None
     try:
         result = dict(module.run(config, session))
@@ -447,6 +446,29 @@ def _export_tests(args) -> int:
     return 0
 
 
+def _compile(args) -> int:
+    from tempfile import TemporaryDirectory
+
+    from makebreak.scripts.trials import makebreak_command, run_commands
+
+    names = args.experiments or list(_COMPILED)
+    modules = {name: _experiment(name) for name in names}
+    jobs = _jobs(args.jobs)
+    with TemporaryDirectory() as folder:
+        commands, folders = [], [Path(folder) / name for name in names]
+        for (name, module), out in zip(modules.items(), folders, strict=True):
+            words = ["run", name, "--no-meshcat", "--out", str(out)]
+            if not hasattr(module, "BENCH_SEC"):  # Any duration will do.
+                words += ["--duration", "1"]
+            commands.append(makebreak_command(*words))
+        results = run_commands("compile", commands, folders, jobs)
+    # Whether a second of it can be scored does not matter.
+    broken = [r["error"] for r in results if r.get("error", "").startswith(_REFUSED)]
+    if broken:
+        raise ValueError(broken[0])
+    return 0
+
+
 def _bench(args) -> int:
     import json
 
@@ -565,6 +587,13 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--model", metavar="SCENE", help="the scene that control believes")
     p.add_argument("--seed", metavar="N", help="all randomness comes from it")
     p.set_defaults(function=_export_tests)
+
+    p = commands.add_parser(
+        "compile", help="compiles beforehand what the first run would wait for"
+    )
+    p.add_argument("experiments", nargs="*", metavar="EXPERIMENT")
+    p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
+    p.set_defaults(function=_compile)
 
     p = commands.add_parser("bench", help="how long the parts take, as table and JSON")
     p.add_argument("names", nargs="*", metavar="NAME")

@@ -16,7 +16,7 @@ matplotlib.use("Agg")  # Pictures go to files; no display is needed.
 
 import matplotlib.pyplot as plt
 import numpy as np
-from pydrake.geometry import Meshcat
+from pydrake.geometry import Meshcat, MeshcatVisualizer
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import (
     Context,
@@ -28,6 +28,7 @@ from pydrake.systems.framework import (
 from tqdm import tqdm
 
 from makebreak.gap.table import write_recording
+from makebreak.scripts.compiling import CompilingShown
 from makebreak.scripts.diagram_picture import draw_diagram, shown_systems
 from makebreak.scripts.interrupts import handled, leave_terminal, undisturbed
 from makebreak.scripts.outputs import OutputFolder
@@ -221,6 +222,8 @@ class Session:
                 samples[name].append(value)
             return until(t, values) if until is not None else False
 
+        if self.meshcat is not None:  # Something to see while functions are compiled.
+            _show_scene(diagram, root)
         # The last chunk may be shorter; 1e-9 forgives duration/period's rounding.
         n_chunks = int(np.ceil(duration / period_sec - 1e-9))
         if self.meshcat is not None:
@@ -229,7 +232,11 @@ class Session:
             self.meshcat.DeleteRecording()  # Of an earlier simulation.
             self.meshcat.StartRecording(frames_per_second=fps)
         wall_start, cpu_start = perf_counter(), process_time()
-        with _CatchInterrupt() as interrupt, self._bar(duration, label) as bar:
+        with (
+            _CatchInterrupt() as interrupt,
+            self._bar(duration, label) as bar,
+            CompilingShown(partial(_tell, bar)),
+        ):
             try:
                 simulator.Initialize()
                 done = sample(root.get_time())
@@ -262,7 +269,7 @@ class Session:
             desc=label or "simulating",
             # The rate in simulated seconds per second is the real-time factor.
             bar_format="{desc}: {percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s "
-            "[{elapsed}<{remaining}, {rate_noinv_fmt}]",
+            "[{elapsed}<{remaining}, {rate_noinv_fmt}{postfix}]",
             unit=" x real time",
             mininterval=0.2 if tty else 10.0,
             dynamic_ncols=tty,
@@ -420,6 +427,22 @@ class Session:
         if len(entries) == 1:
             return summary | {"systems": entries[0]["systems"]}
         return summary | {"simulations": self._timing}
+
+
+def _show_scene(diagram: Diagram, root: Context) -> None:
+    """Sends the scene as it stands to Meshcat, before anything is simulated."""
+    for system in leaf_systems(diagram):
+        if isinstance(system, MeshcatVisualizer):
+            system.ForcedPublish(system.GetMyContextFromRoot(root))
+
+
+def _tell(bar: tqdm, text: str) -> None:
+    """Shows on the progress bar what is being compiled, "" for nothing."""
+    bar.set_postfix_str(text, refresh=False)
+    if sys.stderr.isatty():
+        bar.refresh()
+    else:
+        bar.update(0)  # At most every 10 s.
 
 
 def _ending(label: str, time: float, duration: float, why: bool | str) -> str:

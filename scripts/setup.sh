@@ -4,8 +4,18 @@
 # Does nothing when .venv is complete and fits pyproject.toml and requirements.lock.
 # Missing system packages are installed where that needs no password; otherwise the one
 # command to type is printed. Exit status: 0 ready, 4 not ready (one line says why).
-# MAKEBREAK_PYTHON names another Python than python3.
+# MAKEBREAK_PYTHON names another Python than python3. With --compile, what the first run
+# would compile, for a minute or two, is compiled as well.
 set -euo pipefail
+
+case "${1:-}" in
+    "" | --compile) ;;
+    *)
+        echo "makebreak: setup.sh: got $1, expected --compile or nothing" >&2
+        exit 2
+        ;;
+esac
+compile="${1:-}"
 
 root="$(dirname "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")")"
 venv="$root/.venv"
@@ -152,7 +162,14 @@ pip_install() {
     fail "pip failed: $(grep '^ERROR' "$log" | tail -n 1) (log: $log)"
 }
 
-is_ready && exit 0
+compile_if_asked() {
+    [[ -n "$compile" ]] || return 0
+    say "compiling (once; a minute or two)"
+    OMP_NUM_THREADS=1 "$venv/bin/makebreak" compile ||
+        fail "could not compile; the first run will"
+}
+
+is_ready && compile_if_asked && exit 0
 
 python="${MAKEBREAK_PYTHON:-python3}"
 command -v "$python" >/dev/null ||
@@ -172,7 +189,7 @@ esac
 if command -v flock >/dev/null; then
     { exec 9>"$root/.venv.lock"; } 2>/dev/null || fail "cannot write in $root"
     flock -n 9 || { say "waiting for another set-up to end" && flock 9; }
-    is_ready && exit 0
+    is_ready && compile_if_asked && exit 0
 fi
 
 log="$(mktemp "${TMPDIR:-/tmp}/makebreak-setup.XXXXXX")"
@@ -197,3 +214,4 @@ pip_install --no-deps --no-build-isolation -e "$root"
 fingerprint >"$ready"
 rm -f "$unfinished" "$log"
 say "ready"
+compile_if_asked

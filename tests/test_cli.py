@@ -10,6 +10,7 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 import termios
 import time
 from importlib import import_module
@@ -450,6 +451,15 @@ def test_run_many_refuses_no_jobs_and_the_same_run_twice():
         trials.run_many("spring_mass", [({}, 0)], 0, Path("out"))
     with pytest.raises(ValueError, match="seed=0 is there twice"):
         trials.run_many("spring_mass", [({}, 0), ({}, 0)], 1, Path("out"))
+
+
+def test_compile_runs_for_a_second_and_leaves_no_files(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(trials, "_COMMAND", spring_mass.COMMAND)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    assert cli.main(["compile", "spring_mass", "--jobs", "1"]) == 0
+    assert list(tmp_path.iterdir()) == []
+    assert cli.main(["compile", "spring_mas"]) == 2
+    assert "did you mean spring_mass?" in capsys.readouterr().err
 
 
 def test_bench_prints_table_and_json_and_outlives_a_failing_bench(

@@ -8,6 +8,7 @@ import signal
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -19,6 +20,7 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource, Integrator
 
 from makebreak.gap.table import check_columns, write_recording
+from makebreak.scripts.compiling import FIRST, CompilingShown
 from makebreak.scripts.session import Session
 from makebreak.scripts.settings import (
     apply_settings,
@@ -238,6 +240,52 @@ def test_meshcat_html_holds_the_whole_animation(tmp_path):
     [animation] = [b for b in blobs if b"set_animation" in b and b"keys" in b]
     # A key is a time and a position; at 32 pictures per second there are 17 in 0.5 s.
     assert b"falling_box" in animation and animation.count(b"time") >= 17
+
+
+def test_the_scene_is_in_meshcat_before_anything_is_computed(tmp_path):
+    """Also what is compiled, which takes a minute at the first time."""
+    meshcat = Meshcat()
+    there = []
+
+    class First(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareInitializationPublishEvent(
+                lambda _: there.append(meshcat.HasPath("/drake/visualizer/ball"))
+            )
+
+    builder = DiagramBuilder()
+    builder.AddSystem(First())  # Its events come before the viewer's.
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.001)
+    body = plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    box = Box(0.1, 0.1, 0.1)
+    plant.RegisterVisualGeometry(body, RigidTransform(), box, "box", [1, 0, 0, 1])
+    plant.Finalize()
+    MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
+    session(tmp_path, meshcat=meshcat).simulate(builder.Build(), 0.1, {})
+    assert there == [True]
+
+
+def test_what_is_compiled_is_told_and_what_was_compiled_is_not(capsys):
+    @numba.njit
+    def inner(x):
+        return x + 1.0
+
+    @numba.njit
+    def outer(x):
+        return inner(2.0 * x)
+
+    for function in (inner, outer):
+        function.py_func.__module__ = "makebreak.systems.numerics.made_up"
+    seen: list[str] = []
+    with CompilingShown(seen.append):
+        assert outer(1.0) == 3.0
+        assert seen == ["compiling made_up.outer", ""]
+        assert outer(2.0) == 5.0 and inner(2.0) == 3.0
+        assert seen == ["compiling made_up.outer", ""]
+    assert capsys.readouterr().err.splitlines() == [FIRST]
+    outer(1)  # Of other types; nobody listens any more.
+    assert len(seen) == 2
 
 
 def test_result_json_is_flat_in_the_given_order_and_without_nan(tmp_path):

@@ -229,6 +229,9 @@ def test_without_rights_one_command_is_named(checkout):
         (["cartpole_walls", "--seed", "3"], ["run", "cartpole_walls", "--seed", "3"]),
         (["list"], ["list"]),
         (["bench", "c3"], ["bench", "c3"]),
+        (["close-the-loop"], ["close-the-loop"]),
+        (["compile"], ["compile"]),
+        (["--version"], ["--version"]),
         (["run", "ball_rolling"], ["run", "ball_rolling"]),
     ],
 )
@@ -236,6 +239,15 @@ def test_run_passes_its_arguments_and_keeps_the_folder(checkout, given, passed):
     done = checkout("run.sh", *given)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == [*passed, str(checkout.tools)]
+
+
+def test_set_up_compiles_when_asked_and_only_then(checkout):
+    for _ in range(2):  # At the first set-up, and when it is done already.
+        done = checkout("setup.sh", "--compile")
+        assert (done.returncode, done.stdout.splitlines()[:1]) == (0, ["compile"])
+    assert checkout("setup.sh").stdout == ""
+    done = checkout("setup.sh", "--compil")
+    assert done.returncode == 2 and "got --compil, expected --compile" in done.stderr
 
 
 def test_test_script_runs_pytest_in_the_checkout(checkout):

@@ -10,6 +10,7 @@ Each is a module with
                 optional: the paper's figure or table beside ours
     BENCH       optional: {label: {field: value}}, the settings with which
                 `makebreak bench diagrams` takes its real-time factor
+    BENCH_SEC   optional: the duration, of an experiment that has only this one
 """
 
 import ast

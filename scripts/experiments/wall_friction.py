@@ -65,6 +65,8 @@ BENCH = {
     }
 }
 
+BENCH_SEC = DURATION  # The plan's, of which all predictions are.
+
 VARIED = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]
 # name -> frictions of the wall, stiff controller, figure.
 SETS = {
@@ -91,6 +93,11 @@ def run(config: WallFrictionConfig, session: Session) -> dict:
     if config.training.every < 1:
         raise ValueError(
             f"training.every is {config.training.every}, expected 1 or more"
+        )
+    if session.duration_sec not in (None, DURATION):
+        raise ValueError(
+            f"--duration: got {session.duration_sec:g}, but a trial takes {DURATION:g} "
+            "s, for which everything is predicted"
         )
     seconds: dict[str, float] = {}  # Not of the result: they differ from run to run.
     trials, knowledge = collect(config, seconds)

@@ -1,0 +1,58 @@
+"""Tells what Numba compiles; its first time takes a minute or two."""
+
+import sys
+from collections.abc import Callable
+
+from numba.core import event
+
+FIRST = "Compiling, the first time only: a minute or two of one core"
+
+
+class CompilingShown:
+    """While entered, each function of makebreak that is compiled is told, the first one
+    with a line before it. What is read from an earlier run's files is not compiled.
+
+    Args:
+        show: called with "compiling lcp.solve" and the like, and with "" when that is
+            done.
+    """
+
+    def __init__(self, show: Callable[[str], None]):
+        self._show = show
+        self._depth = 0
+        self._first = True
+
+    def _start(self, of: event.Event) -> None:
+        self._depth += 1
+        function = of.data["dispatcher"].py_func
+        if self._depth > 1 or not function.__module__.startswith("makebreak."):
+            return
+        if self._first:
+            print(FIRST, file=sys.stderr, flush=True)
+            self._first = False
+        module = function.__module__.rpartition(".")[2]
+        self._show(f"compiling {module}.{function.__name__}")
+
+    def _end(self, _: event.Event) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            self._show("")
+
+    def __enter__(self) -> "CompilingShown":
+        self._listener = _Listener(self._start, self._end)
+        event.register("numba:compile", self._listener)
+        return self
+
+    def __exit__(self, *_) -> None:
+        event.unregister("numba:compile", self._listener)
+
+
+class _Listener(event.Listener):
+    def __init__(self, start, end):
+        self._start, self._end = start, end
+
+    def on_start(self, event):
+        self._start(event)
+
+    def on_end(self, event):
+        self._end(event)
