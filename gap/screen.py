@@ -115,7 +115,7 @@ def candidates(
                 continue
             if not any(np.abs(x).max(initial=0.0) > 0.0 for x in columns):
                 continue
-            size = len(entry.parameters)
+            size = sum(not p.optional for p in entry.parameters)
             if kind == "body_drag":  # Few bodies show that they are slowed in turning.
                 found.append(
                     Candidate(

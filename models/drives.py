@@ -8,6 +8,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.actuation_path import (
+    FASTEST,
     GAIN,
     KP,
     LIMIT,
@@ -39,7 +40,6 @@ from makebreak.models.typed_yaml import nearest
 
 DRIVEN_BY = ("position_command", "velocity_command")  # A drive with a loop of its own.
 STIFF_TYPES = ("servo", "velocity")
-FASTEST = 2000.0  # [1/s] at which a drive may stop a joint in a continuous plant.
 CHANNEL_STEPS = {name: kind.channel for name, kind in KINDS.items() if kind.channel}
 
 
@@ -189,7 +189,7 @@ def _check_stiffness(plant: MultibodyPlant, drive, joints, names) -> None:
     mobility = np.diag(np.linalg.inv(plant.CalcMassMatrix(context)))
     for joint, name, d, is_driven in zip(joints, names, damping, driven, strict=True):
         inertia = 1.0 / mobility[joint.velocity_start()]
-        least = d * dt if dt else d / FASTEST
+        least = d * dt if dt else 0.5 * d / FASTEST
         if is_driven and inertia < least:
             raise ValueError(
                 f"actuation: the drive of {name} damps with {d:.3g} N m s/rad, and the "

@@ -229,7 +229,12 @@ class SceneDynamics:
         if entry.least is None:
             return {}
         effect = Effect(kind, list(at), {})
-        return dict(entry.least(effect, self.plant, self.loaded.effects))
+        damped = {}
+        for joint in self.loaded.scene.actuation.joints:
+            law = law_of(self.loaded.scene.actuation, joint)
+            if law is not None:
+                damped[joint] = float(law.kd + law.emf)
+        return dict(entry.least(effect, self.plant, self.loaded.effects, damped))
 
     def _add_body_forces(self, time: float) -> None:
         assert self.loaded.body_forces is not None

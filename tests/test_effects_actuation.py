@@ -485,15 +485,16 @@ def test_bad_commands_and_channels_are_refused_by_name(tmp_path):
 
 
 def test_a_drive_without_its_rotor_is_refused_where_it_would_never_end(tmp_path):
-    supply = SupplySection(
-        voltage=[12.0], kt=[30.0], resistance=[1.0]
-    )  # 900 N m s/rad.
+    supply = SupplySection(voltage=[12.0], kt=[40.0], resistance=[1.0])
     drive = dict(type="servo", joints=["p.j1"], kp=[30.0], supply=supply)
-    with pytest.raises(ValueError, match="damps with 900 .* give it its rotor"):
+    with pytest.raises(ValueError, match="damps with 1.6e\\+03 .* give it its rotor"):
         load_scene(pendulum(tmp_path, **drive), DiagramBuilder())
     with_rotor = with_effects(
         pendulum(tmp_path, **drive), ("rotor_inertia", "p.j1", dict(inertia=1.0))
     )
     load_scene(with_rotor, DiagramBuilder())
-    with pytest.raises(ValueError, match="expected 1.8 or more"):
+    # No search takes so much of the rotor away that it would be refused.
+    least = SceneDynamics(with_rotor).least("rotor_inertia", ["p.j1"])["inertia"]
+    assert J + 1.0 + least == pytest.approx(1600.0 / 2000.0)
+    with pytest.raises(ValueError, match="expected 3.2 or more"):
         load_scene(pendulum(tmp_path, 0.002, **drive), DiagramBuilder())

@@ -8,6 +8,9 @@ from pydrake.systems.framework import BasicVector, InputPort, LeafSystem, Output
 GAIN, BIAS, LIMIT, TIME_CONSTANT, KP, SHARE = range(6)
 ROWS = 6
 NO_LIMIT = 1e30  # [N m]
+# A drive should stop a joint no faster than so [1/s]: a continuous plant's integrator
+# follows it. Twice as fast is refused.
+FASTEST = 2000.0
 OWN = -1.0  # As a KP: the drive's own.
 # What a kind of effect may name as its step: (parameter, its row in the numbers).
 STEPS = {

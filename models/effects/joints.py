@@ -7,6 +7,7 @@ import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Joint
 
+from makebreak.models.effects.actuation_path import FASTEST
 from makebreak.models.effects.kind import (
     Effect,
     EffectKind,
@@ -45,7 +46,7 @@ def _add_damping(effect: Effect, plant: MultibodyPlant, scene_graph) -> None:
         joint.set_default_damping_vector([left])
 
 
-def _least_damping(effect: Effect, plant: MultibodyPlant, effects) -> dict[str, float]:
+def _least_damping(effect, plant: MultibodyPlant, effects, damped) -> dict[str, float]:
     has = [joint.default_damping_vector()[0] for joint in find_joints(effect, plant)]
     return {"damping": -min(has)}
 
@@ -74,12 +75,18 @@ def _add_rotor(effect: Effect, plant: MultibodyPlant, scene_graph) -> None:
         actuator.set_default_rotor_inertia(left / actuator.default_gear_ratio() ** 2)
 
 
-def _least_rotor(effect: Effect, plant: MultibodyPlant, effects) -> dict[str, float]:
-    has = []
+def _least_rotor(effect, plant: MultibodyPlant, effects, damped) -> dict[str, float]:
+    """Of a joint that its drive damps, enough is left for that to be simulated."""
+    context = plant.CreateDefaultContext()
+    mobility = np.linalg.inv(plant.CalcMassMatrix(context))
+    low = []
     for joint in find_joints(effect, plant):
         actuator = actuator_of(plant, motor_joint(plant, joint) or joint)
-        has.append(0.0 if actuator is None else actuator.default_reflected_inertia())
-    return {"inertia": -min(has)}
+        has = 0.0 if actuator is None else actuator.default_reflected_inertia()
+        i = joint.velocity_start()
+        needed = damped.get(full_name(plant, joint), 0.0) / FASTEST
+        low.append(max(-has, min(needed - 1.0 / mobility[i, i], 0.0)))
+    return {"inertia": max(low)}
 
 
 def _change_rotor(old: Effect, new: Effect, plant: MultibodyPlant, context) -> None:
@@ -107,7 +114,7 @@ def _totals(effect: Effect, effects, plant: MultibodyPlant) -> dict[str, float]:
 
 
 def _least_total(name: str):
-    def least(effect: Effect, plant: MultibodyPlant, effects) -> dict[str, float]:
+    def least(effect, plant: MultibodyPlant, effects, damped) -> dict[str, float]:
         totals = _totals(effect, effects, plant)
         has = [totals.get(full_name(plant, j), 0.0) for j in find_joints(effect, plant)]
         return {name: -max(min(has), 0.0)}

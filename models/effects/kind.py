@@ -102,8 +102,9 @@ class EffectKind:
     channel: what it does to a measured channel, of a name in measurement.STEPS.
     set_in_context(old, new, plant, plant_context): other parameters without a new
         plant; old: the effect whose parameters the context has.
-    least(effect, plant, effects): least values of parameters that a plant without the
-        effect allows, where there are such; `effects`: those that it has.
+    least(effect, plant, effects, damped): least values of parameters that a plant
+        without the effect allows, where there are such; `effects`: those that it has,
+        `damped`: {joint: what its drive damps it with [N m s/rad]}.
     now(effect, plant, scene_graph): the parameters at which `effect` (whose own do not
         matter) would leave the model as it is; None: the neutral values.
     signature: see models/effects/signature.py; None: it is seen in simulation alone.
@@ -132,7 +133,11 @@ class EffectKind:
     ) = None
     possible: Callable[[Effect, MultibodyPlant, Sequence[Effect]], None] | None = None
     least: (
-        Callable[[Effect, MultibodyPlant, Sequence[Effect]], Mapping[str, float]] | None
+        Callable[
+            [Effect, MultibodyPlant, Sequence[Effect], Mapping[str, float]],
+            Mapping[str, float],
+        ]
+        | None
     ) = None
     joint_law: Callable | None = None
     joint_numbers: Callable[[Effect, MultibodyPlant, Joint], list[float]] | None = None

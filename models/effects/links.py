@@ -70,7 +70,7 @@ def _nothing(effect: Effect, plant: MultibodyPlant, scene_graph):
     return dict.fromkeys(names, 0.0)
 
 
-def _least_mass(effect: Effect, plant: MultibodyPlant, effects) -> dict[str, float]:
+def _least_mass(effect, plant: MultibodyPlant, effects, damped) -> dict[str, float]:
     masses = [
         b.default_spatial_inertia().get_mass() for b in find_bodies(effect, plant)
     ]

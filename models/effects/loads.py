@@ -81,7 +81,7 @@ def _check_payload(effect: Effect, plant: MultibodyPlant, effects) -> None:
         _check_left(effect, plant, body, None)
 
 
-def _least_payload(effect: Effect, plant: MultibodyPlant, effects) -> dict[str, float]:
+def _least_payload(effect, plant: MultibodyPlant, effects, damped) -> dict[str, float]:
     context = plant.CreateDefaultContext()
     masses = [
         sum(each.get_mass(context) for each in plant.GetBodiesWeldedTo(body))

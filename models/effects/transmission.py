@@ -26,6 +26,7 @@ from pydrake.systems.framework import (
     LeafSystem,
     OutputPort,
 )
+from scipy.optimize import brentq
 
 from makebreak.models.effects.kind import (
     Effect,
@@ -43,7 +44,7 @@ ROTOR_SHARE = 0.01
 # Backlash: once the gap is closed, motor and joint swing at this many radians a time
 # step of a discrete plant, and at this rate [rad/s] in a continuous one.
 CONTACT_RATE, CONTACT_RATE_MAX = 0.3, 2000.0
-CONTACT_DAMPING = 0.3  # Damping ratio of that swing.
+CONTACT_DAMPING = 0.3  # Damping ratio of that swing, where no restitution is said.
 
 
 def motor_model(plant: MultibodyPlant, joint: Joint) -> str:
@@ -176,6 +177,27 @@ class Coupling(LeafSystem):
         output.SetFromVector(out)
 
 
+def restitution_of(damping: float) -> float:
+    """Of an impact on a spring with this damping ratio that never pulls: speed after
+    over speed before (Schwager and Poeschel, Phys. Rev. E 78, 051304, 2008)."""
+    b, w = damping, np.sqrt(max(1.0 - damping**2, 1e-12))
+    turn = np.arctan2(2.0 * b * w, w**2 - b**2)
+    return float(np.exp(-b / w * (np.pi - turn)))
+
+
+def damping_of(restitution: float) -> float:
+    """Its inverse; at most 0.999, which leaves less than a sixth of the speed."""
+    if restitution <= restitution_of(0.999):
+        return 0.999
+    return float(brentq(lambda d: restitution_of(d) - restitution, 0.0, 0.999))
+
+
+def _bounces(effect: Effect) -> float:
+    """The share of its speed that a joint keeps at the other side of its gap."""
+    least = restitution_of(CONTACT_DAMPING)
+    return effect.parameters.get("restitution", least)
+
+
 def coupling_numbers(effect: Effect, plant: MultibodyPlant) -> list[list[float]]:
     """k, d, gap of each joint that `at` names."""
     p, numbers = effect.parameters, []
@@ -193,7 +215,8 @@ def coupling_numbers(effect: Effect, plant: MultibodyPlant) -> list[list[float]]
         i, j = joint.velocity_start(), motor.velocity_start()
         both = 1.0 / (np.linalg.inv(M)[i, i] + 1.0 / M[j, j])
         k = both * rate**2
-        numbers.append([k, 2.0 * CONTACT_DAMPING * np.sqrt(k * both), p["gap"]])
+        damping = damping_of(_bounces(effect))
+        numbers.append([k, 2.0 * damping * np.sqrt(k * both), p["gap"]])
     return numbers
 
 
@@ -224,8 +247,9 @@ def _add_coupling(
 # by z = tau/k - d tau'/k^2. In a gap, with the side that touches given by the sign of
 # the torque that the joint needs at theta, T = ID(theta) - J theta'': while it touches
 # z = +- gap/2, and once T turns round the joint is on its own, M z'' = T, until it
-# touches again.
+# touches again: it bounces, keeping a share of its speed, unless that is nothing.
 
+BOUNCES = (None, 0.1, 0.75)  # None: as CONTACT_DAMPING has it.
 GAPS = tuple(0.002 * 1.15**k for k in range(29))  # [rad] or [m]
 _linearised: WeakKeyDictionary = WeakKeyDictionary()  # Of motions.
 
@@ -299,13 +323,13 @@ def _kept(model, motion) -> dict:
 def _backlash_signature(effect, model, motion, grid=None) -> list[Signature]:
     """For each gap what it adds, over the gap: the coefficient is the gap."""
     found = []
-    for gap in (grid or {}).get("gap", GAPS):
-        parameters = {"gap": float(gap)}
-        added = _backlash_added(
-            Effect(effect.kind, effect.at, parameters), model, motion
-        )
-        columns = added[:, :, None] / gap
-        found.append(without_momentum(effect, ["gap"], columns, exact=False))
+    grid = grid or {}
+    for bounce in grid.get("restitution", () if "gap" in grid else BOUNCES) or (None,):
+        held = {} if bounce is None else {"restitution": float(bounce)}
+        for gap in grid.get("gap", GAPS):
+            one = Effect(effect.kind, effect.at, {"gap": float(gap), **held})
+            columns = _backlash_added(one, model, motion)[:, :, None] / gap
+            found.append(without_momentum(effect, ["gap"], columns, held, exact=False))
     return found
 
 
@@ -331,15 +355,15 @@ def _twist(effect: Effect, model, motion, joint: Joint) -> np.ndarray:
         tau, k = _carried(model, motion, joint), p["stiffness"]
         return tau[:3] / k - p["damping"] / k**2 * tau[1:]
     linear = _linear(model, motion, joint)
-    return through_gap(motion.time, linear.needs, linear.M, p["gap"])
+    return through_gap(motion.time, linear.needs, linear.M, p["gap"], _bounces(effect))
 
 
 @numba.njit(cache=True)
-def through_gap(time, needs, M, gap):
+def through_gap(time, needs, M, gap, restitution):
     """(3, n) twist, its rate and its acceleration (mean until the next sample).
 
     Args: needs (n,) torque that holds the joint on its motor's path; M (n,) its
-        inertia. No bounce.
+        inertia; restitution, the share of its speed that it keeps at the other side.
     """
     n, parts = len(time), 8
     out = np.zeros((3, n))
@@ -356,7 +380,11 @@ def through_gap(time, needs, M, gap):
             w += h * T / M[k]
             z += h * w
             if abs(z) >= 0.5 * gap:
-                z, w = 0.5 * gap * np.sign(z), 0.0
+                z = 0.5 * gap * np.sign(z)
+                # A bounce that is over within a step is none.
+                back = -restitution * w
+                rests = T * z >= 0.0 and abs(back) < 2.0 * h * abs(T) / M[k]
+                w = 0.0 if rests or w * z < 0.0 else back
         out[2, k] = (w - before) / (h * parts)
     return out
 
@@ -433,8 +461,12 @@ KINDS = {
     ),
     "joint_backlash": EffectKind(
         at="joint",
-        parameters=(Parameter("gap", "rad", 0.0, 0.1, valid=">= 0", rough=True),),
-        says="motor and link of {at} have {gap} of backlash that the model lacks",
+        parameters=(
+            Parameter("gap", "rad", 0.0, 0.1, valid=">= 0", rough=True),
+            Parameter("restitution", "", 0.0, 0.95, None, valid="share", optional=True),
+        ),
+        says="motor and link of {at} have {gap} of backlash that the model lacks[, and "
+        "bounce back from its sides with {restitution} of their speed]",
         confused_with=("joint_coulomb_friction", "joint_elasticity"),
         tell_apart="reverse with small motions, once without load and once with "
         "gravity pressing one way",
