@@ -378,9 +378,8 @@ def solve_c3(
         ahead = np.vstack([warm.u[1:], warm.u[-1:]])
         starts = np.concatenate([inputs, warm.u[None], ahead[None]])
         u_centre = warm.u if o.penalise_input_change else np.zeros_like(u)
-        bounds = (
-            *np.split(p.lower[p.n_lam :], [p.n_u]),
-            *np.split(p.upper[p.n_lam :], [p.n_u]),
+        (u_lower, x_lower), (u_upper, x_upper) = (
+            np.split(bound[p.n_lam :], [p.n_u]) for bound in (p.lower, p.upper)
         )
         found = polish(
             tuple(_stacked(models, name) for name in "ABDdEFHc"),
@@ -389,7 +388,7 @@ def solve_c3(
             x_desired,
             u_centre,
             (p.Q, p.R, p.Q_N),
-            (bounds[0], bounds[2], bounds[1], bounds[3]),
+            (u_lower, u_upper, x_lower, x_upper),
             o.polish,
         )
         if found[3] < np.inf:  # Else no start can be rolled out: C3's plan remains.
