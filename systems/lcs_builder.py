@@ -19,7 +19,15 @@ from typing import Any
 import numpy as np
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, InitializeAutoDiff
 from pydrake.common.value import Value
-from pydrake.geometry import Box, GeometryId, HalfSpace, SceneGraph, Sphere
+from pydrake.geometry import (
+    Box,
+    Convex,
+    GeometryId,
+    HalfSpace,
+    Mesh,
+    SceneGraph,
+    Sphere,
+)
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     BodyIndex,
@@ -29,6 +37,7 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Diagram, LeafSystem
 
+from makebreak.systems.numerics.convex_hull import point_on_hull
 from makebreak.systems.numerics.lcs import LCS, is_finite
 from makebreak.systems.numerics.lcs_builder import (
     BOX,
@@ -59,6 +68,9 @@ class ContactPair:
     # World direction that the first friction edge follows (its projection); empty: the
     # basis of Drake's MakeFromOneVector, which jumps as the normal turns.
     tangent: list[float] = field(default_factory=list)
+    # Of a plant that moves in a plane: the plane's normal, in the world. The edges then
+    # start in the plane; with friction_directions = 1 they are its two.
+    plane_normal: list[float] = field(default_factory=list)
 
 
 class AnitescuLcs:
@@ -190,14 +202,10 @@ class AnitescuLcs:
         n_c = len(self._geometries)
         phi, J = np.empty(n_c), np.empty((n_c, 3, self.n_v))
         for i, (id_A, id_B) in enumerate(self._geometries):
-            pair = query.ComputeSignedDistancePairClosestPoints(id_A, id_B)
-            n: Any = pair.nhat_BA_W  # (3,); the stubs say float.
-            p_A, p_B = pair.p_ACa, pair.p_BCb
-            if pair.id_A != id_A:
-                n, p_A, p_B = -n, p_B, p_A
+            phi[i], n, p_A, p_B = self._distance(query, id_A, id_B)
             if not abs(n @ n - 1.0) < 1e-6:
                 raise ValueError(f"{self._pair_names[i]}: no unique normal at {n}")
-            phi[i] = pair.distance
+            self._check_plane(i, n)
             (frame_A, X_A), (frame_B, X_B) = self._frames[id_A], self._frames[id_B]
             J_w = plant.CalcJacobianTranslationalVelocity(
                 context, wrt, frame_A, X_A @ p_A, world, world
@@ -209,6 +217,31 @@ class AnitescuLcs:
         on = self._contact_index
         J_t = (self._edge[:, :, None] * J[on, 1:]).sum(axis=1)
         return phi, J[:, 0], J[on, 0] + self._mu[on, None] * J_t
+
+    def _check_plane(self, i, n):
+        if self._planar[i] and abs(n @ self._reference[i]) > 0.1:
+            raise ValueError(
+                f"{self._pair_names[i]}: the contact normal {n} leaves the plane of "
+                f"plane_normal {self._reference[i]}"
+            )
+
+    def _distance(self, query, id_A, id_B):
+        """Gap, normal from B to A in the world, and witness points in each geometry."""
+        for sphere, other, sign in ((id_A, id_B, 1.0), (id_B, id_A, -1.0)):
+            if sphere in self._radius and other in self._hull:
+                # Drake's iteration does not end where the centre is near a vertex.
+                X_WS, X_WH = query.GetPoseInWorld(sphere), query.GetPoseInWorld(other)
+                centre = X_WH.inverse() @ X_WS.translation()
+                distance, n_H, p_H = point_on_hull(*self._hull[other], centre)
+                n, r = X_WH.rotation() @ n_H, self._radius[sphere]
+                p_S = X_WS.rotation().inverse() @ (-r * n)
+                points = (p_S, p_H) if sign > 0.0 else (p_H, p_S)
+                return distance - r, sign * n, *points
+        pair = query.ComputeSignedDistancePairClosestPoints(id_A, id_B)
+        n_BA: Any = pair.nhat_BA_W  # (3,); the stubs say float.
+        if pair.id_A != id_A:
+            return pair.distance, -n_BA, pair.p_BCb, pair.p_ACa
+        return pair.distance, n_BA, pair.p_ACa, pair.p_BCb
 
     def _velocity_maps(self, q):
         if self._maps_known:
@@ -250,7 +283,9 @@ class AnitescuLcs:
         self._geometries: list[tuple[GeometryId, GeometryId]] = []
         self._pair_names: list[str] = []
         self._frames = {}
-        mu, n_f, reference = [], [], []
+        self._radius: dict[GeometryId, float] = {}
+        self._hull: dict[GeometryId, tuple[np.ndarray, np.ndarray]] = {}
+        mu, n_f, reference, planar = [], [], [], []
         for pair in pairs:
             a = _geometries_named(pair.a, bodies, ambiguous, collision)
             b = _geometries_named(pair.b, bodies, ambiguous, collision)
@@ -266,9 +301,19 @@ class AnitescuLcs:
                     f"{name}: friction_directions is {pair.friction_directions}, "
                     "expected an integer of at least 1"
                 )
-            tangent = np.array(pair.tangent or [0.0, 0.0, 0.0], dtype=float)
-            if tangent.shape != (3,) or not np.isfinite(tangent).all():
-                raise ValueError(f"{name}: tangent is {pair.tangent}, expected (3,)")
+            tangent = _direction(f"{name}: tangent", pair.tangent)
+            plane_normal = _direction(f"{name}: plane_normal", pair.plane_normal)
+            in_plane = plane_normal.any()
+            if in_plane and tangent.any():
+                raise ValueError(
+                    f"{name}: tangent and plane_normal came, expected one of them"
+                )
+            one_direction = pair.friction_directions == 1 and pair.friction > 0.0
+            if one_direction and not (in_plane or tangent.any()):
+                raise ValueError(
+                    f"{name}: friction_directions is 1 without a direction, expected "
+                    "a plane_normal (of a plant in a plane) or a tangent"
+                )
             for one in a:
                 for other in b:
                     # As in c3_reference: A is the geometry that was registered first.
@@ -281,15 +326,29 @@ class AnitescuLcs:
                     )
                     mu.append(float(pair.friction))
                     n_f.append(int(pair.friction_directions))
-                    length = np.linalg.norm(tangent)
-                    reference.append(tangent / length if length > 0.0 else tangent)
+                    reference.append(plane_normal if in_plane else tangent)
+                    planar.append(in_plane)
         for id in {id for ids in self._geometries for id in ids}:
             body = plant.GetBodyFromFrameId(inspector.GetFrameId(id))
             self._frames[id] = (body.body_frame(), inspector.GetPoseInFrame(id))
+            shape = inspector.GetShape(id)
+            if isinstance(shape, Sphere):
+                self._radius[id] = shape.radius()
+            elif isinstance(shape, (Mesh, Convex)):
+                hull = inspector.GetConvexHull(id)
+                faces = range(hull.num_faces())
+                normals = np.array([hull.face_normal(f) for f in faces])
+                on_face = [hull.vertex(hull.element(f).vertex(0)) for f in faces]
+                offsets = np.einsum("fi,fi->f", normals, np.array(on_face))
+                self._hull[id] = normals, offsets
         if not self._geometries:
             raise ValueError("no contact pairs came, expected at least one")
         self._mu, self._reference = np.array(mu), np.array(reference).reshape(-1, 3)
         self._contact_index, self._edge = friction_rows(n_f)
+        # t1 follows the plane's normal there, so the edges start at t2.
+        turned = np.array(planar)[self._contact_index]
+        self._edge[turned] = self._edge[turned][:, ::-1] * [-1.0, 1.0]
+        self._planar = np.array(planar)
         self.n_lam = len(self._contact_index)
         first = np.searchsorted(self._contact_index, self._contact_index)
         self.lam_names = [
@@ -301,18 +360,19 @@ class AnitescuLcs:
 
     def _check_distances(self):
         query = self._query_port.Eval(self._plant_context)
-        for name, (id_A, id_B) in zip(self._pair_names, self._geometries, strict=True):
+        for i, (id_A, id_B) in enumerate(self._geometries):
             try:
-                query.ComputeSignedDistancePairClosestPoints(id_A, id_B)
+                _, n, _, _ = self._distance(query, id_A, id_B)
             except RuntimeError as error:
                 shapes = [
                     type(query.inspector().GetShape(g)).__name__ for g in (id_A, id_B)
                 ]
                 raise ValueError(
-                    f"{name}: Drake has no signed distance of {shapes[0]} and "
-                    f"{shapes[1]}, expected convex shapes (a half-space only with a "
-                    "sphere)"
+                    f"{self._pair_names[i]}: Drake has no signed distance of "
+                    f"{shapes[0]} and {shapes[1]}, expected convex shapes (a "
+                    "half-space only with a sphere)"
                 ) from error
+            self._check_plane(i, n)
 
     def _velocity_layout(self):
         """Where qdot = v, where quaternions are, and whether that is all there is."""
@@ -465,6 +525,15 @@ class AnitescuLcsBuilder(LeafSystem):
             return
         state.get_mutable_abstract_state(int(self._lcs)).set_value(lcs)
         state.get_mutable_discrete_state(self._status).set_value([1.0])
+
+
+def _direction(name, value) -> np.ndarray:
+    """A unit vector (3,), or zero where none came. Raises: ValueError."""
+    direction = np.array(value or [0.0, 0.0, 0.0], dtype=float)
+    if direction.shape != (3,) or not np.isfinite(direction).all():
+        raise ValueError(f"{name} is {value}, expected (3,)")
+    length = np.linalg.norm(direction)
+    return direction / length if length > 0.0 else direction
 
 
 def _plant_and_scene_graph(diagram):

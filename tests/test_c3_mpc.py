@@ -99,8 +99,8 @@ def ball_lcs(n_f=4, eps_c=None, x=None):
     Parser(plant).AddModels(str(REFERENCE / "ball_on_table.sdf"))
     plant.Finalize()
     pairs = [
-        ContactPair("finger_link", "ball_link", 0.5, n_f),
-        ContactPair("ball_link", "table_link", 0.5, n_f),
+        ContactPair("finger_link", "ball_link", 0.5, n_f, [0.0, 0.0, 1.0]),
+        ContactPair("ball_link", "table_link", 0.5, n_f, [1.0, 0.0, 0.0]),
     ]
     model = AnitescuLcs(builder.Build(), pairs, 0.05, eps_c)
     return model.build(BALL["x0"] if x is None else x, np.zeros(3))

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.geometry import HalfSpace
+from pydrake.geometry import Convex, HalfSpace, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.parsing import Parser
@@ -21,6 +21,7 @@ from pydrake.multibody.tree import (
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
+from scipy.optimize import nnls
 
 from makebreak.systems.lcs_builder import (
     AnitescuLcs,
@@ -701,3 +702,153 @@ def test_three_builders_in_one_diagram_do_not_disturb_each_other(
         assert lcs.dt == dt
         np.testing.assert_array_equal(lcs.E, alone.E)
         np.testing.assert_array_equal(lcs.F, alone.F)
+
+
+# A plant in a plane, and spheres against meshes.
+
+IN_PLANE = """
+<sdf version='1.7'><model name='slider'>
+  <link name='base'/>
+  <joint name='weld' type='fixed'><parent>world</parent><child>base</child></joint>
+  <link name='mid'><inertial><mass>0.001</mass></inertial></link>
+  <link name='ball'><inertial><mass>1</mass></inertial>
+    <collision name='c'><geometry><sphere><radius>0.1</radius></sphere></geometry>
+    </collision></link>
+  <joint name='x' type='prismatic'><parent>base</parent><child>mid</child>
+    <axis><xyz>1 0 0</xyz></axis></joint>
+  <joint name='z' type='prismatic'><parent>mid</parent><child>ball</child>
+    <axis><xyz>0 0 1</xyz></axis></joint>
+</model></sdf>"""
+
+
+def add_ground(plant):
+    plant.RegisterCollisionGeometry(
+        plant.world_body(), RigidTransform(), HalfSpace(), "ground", CoulombFriction()
+    )
+
+
+@pytest.mark.parametrize("analytic", [True, False])
+def test_friction_of_a_planar_plant_lies_in_its_plane(analytic):
+    """A ball on the ground in the x-z plane that slides along x: friction is mu N
+    against the motion, as on paper."""
+    pair = ContactPair("ball", "world", 0.4, 1, plane_normal=[0.0, 2.0, 0.0])
+    diagram = diagram_of(IN_PLANE, add_ground)
+    model = AnitescuLcs(diagram, [pair], 0.01, 0.0, analytic)
+    assert model.is_analytic == analytic
+    x = np.array([0.0, 0.1, 0.3, 0.0])
+    lcs = model.build(x, np.zeros(model.n_u))
+    x_next, lam = simulate(lcs, x, np.zeros(model.n_u))
+    # Anitescu's contact separates by dt mu |v_t|; N then carries that velocity too:
+    # v_z = mu v_x and m v_z = dt (N - m g), m v_x = m .3 - dt mu N.
+    m, mu, dt = 1.001, 0.4, 0.01
+    # The ball alone moves along z; along x the middle link's gram moves with it.
+    m_z = 1.0
+    A = np.array([[m, dt * mu], [-mu * m_z, dt]])
+    v_x, N = np.linalg.solve(A, [m * 0.3, dt * m_z * G])
+    np.testing.assert_allclose(lam.sum(), N, rtol=1e-9)
+    np.testing.assert_allclose(x_next[2:], [v_x, mu * v_x], rtol=1e-9)
+
+
+def test_one_friction_direction_without_a_direction_is_refused():
+    diagram = diagram_of(IN_PLANE, add_ground)
+    with pytest.raises(
+        ValueError, match="friction_directions is 1 without a direction"
+    ):
+        AnitescuLcs(diagram, [ContactPair("ball", "world", 0.4, 1)])
+    AnitescuLcs(diagram, [ContactPair("ball", "world", 0.0, 1)])  # No friction at all.
+    pair = ContactPair("ball", "world", 0.4, 1, plane_normal=[0.0, 0.0, 1.0])
+    with pytest.raises(ValueError, match="leaves the plane of plane_normal"):
+        AnitescuLcs(diagram, [pair])
+    pair = ContactPair("ball", "world", 0.4, 1, [1, 0, 0], [0, 1, 0])
+    with pytest.raises(ValueError, match="tangent and plane_normal came"):
+        AnitescuLcs(diagram, [pair])
+
+
+VERTICES = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
+TETRAHEDRON = """v 0 0 0
+v .1 0 0
+v 0 .1 0
+v 0 0 .1
+f 1 3 2
+f 1 2 4
+f 1 4 3
+f 2 3 4
+"""
+
+
+def sphere_and_tetrahedron(tmp_path, sphere_first=True):
+    """A free sphere of radius .05 and a tetrahedron in the world, as Convex."""
+    path = tmp_path / "tetrahedron.obj"
+    path.write_text(TETRAHEDRON)
+
+    def extend(plant):
+        def hull():
+            plant.RegisterCollisionGeometry(
+                plant.world_body(), RigidTransform([0.0, 0.0, 0.2]),
+                Convex(str(path), 1.0), "hull", CoulombFriction(),
+            )  # fmt: skip
+
+        if not sphere_first:
+            hull()
+        inertia = SpatialInertia.SolidSphereWithMass(1.0, 0.05)
+        body = plant.AddRigidBody("sphere", inertia)
+        plant.RegisterCollisionGeometry(
+            body, RigidTransform(), Sphere(0.05), "s", CoulombFriction()
+        )
+        if sphere_first:
+            hull()
+
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, 0.0)
+    extend(plant)
+    plant.Finalize()
+    return builder.Build()
+
+
+@pytest.mark.parametrize("sphere_first", [True, False])
+def test_a_sphere_whose_centre_is_on_a_vertex_has_a_distance(tmp_path, sphere_first):
+    diagram = sphere_and_tetrahedron(tmp_path, sphere_first)
+    model = AnitescuLcs(diagram, [ContactPair("sphere", "hull")])
+    x = np.zeros(13)
+    x[0] = 1.0
+    rng = np.random.default_rng(0)
+    for vertex in VERTICES:
+        for size in (0.0, 1e-12, 1e-7, 1e-5):
+            x[4:7] = vertex + [0.0, 0.0, 0.2] + size * rng.normal(size=3)
+            phi = model.build(x, np.zeros(0)).phi
+            # Within `size` of the surface; a distance changes no faster than the point.
+            np.testing.assert_allclose(phi, -0.05, atol=4.0 * size + 1e-12)
+
+
+@pytest.mark.parametrize("sphere_first", [True, False])
+def test_a_sphere_beside_a_hull_agrees_with_drake(tmp_path, sphere_first):
+    """Where Drake's iteration ends: outside, and well away from vertices."""
+    diagram = sphere_and_tetrahedron(tmp_path, sphere_first)
+    model = AnitescuLcs(diagram, [ContactPair("sphere", "hull")], eps_c=0.0)
+    context = diagram.CreateDefaultContext()
+    plant = model._plant
+    plant_context = plant.GetMyContextFromRoot(context)
+    query = plant.get_geometry_query_input_port().Eval(plant_context)
+    rng, x = np.random.default_rng(1), np.zeros(13)
+    x[0] = 1.0
+    for _ in range(40):
+        x[4:7] = [0.03, 0.03, 0.23] + 0.15 * rng.normal(size=3)
+        plant.SetPositionsAndVelocities(plant_context, x)
+        id_A, id_B = model._geometries[0]
+        drakes = query.ComputeSignedDistancePairClosestPoints(id_A, id_B)
+        if drakes.distance < 0.001:
+            continue
+        gap, n, p_A, p_B = model._distance(query, id_A, id_B)
+        # The hull's nearest point by non-negative least squares: weights of the
+        # vertices, their sum held at one by a heavy row (1e-8 of its weight squared).
+        p = x[4:7] - [0.0, 0.0, 0.2]
+        weights, _ = nnls(np.vstack([VERTICES.T, [1e4] * 4]), [*p, 1e4])
+        assert gap == pytest.approx(
+            np.linalg.norm(p - weights @ VERTICES) - 0.05, abs=1e-8
+        )
+        # Drake's iteration ends up to 2e-5 m too far away; in direction that is
+        # sqrt(2 2e-5 / .05) = .03 at .05 m from the centre, along the surface 1.4 mm.
+        assert drakes.distance - 3e-5 < gap < drakes.distance + 1e-6
+        np.testing.assert_allclose(n, drakes.nhat_BA_W, atol=0.03)
+        np.testing.assert_allclose(p_A, drakes.p_ACa, atol=2e-3)
+        np.testing.assert_allclose(p_B, drakes.p_BCb, atol=2e-3)
