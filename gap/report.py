@@ -69,23 +69,22 @@ def write_report(
         _write(files[0], text)
         fixed = replace(scene, effects=[*scene.effects, *result.scene_effects()])
         write_scene(fixed, files[1], _scene_heading(result, scene_path), place)
-        # Least to be missed last, should the disk be full.
+        page = report_html(
+            result, drawn, place, scene_path, recordings, comparison is not None
+        )
+        _write(out / "report.html", page)
+        # What would be missed least comes last, should the disk be full.
         for name, png in drawn.items():
             files.append(out / f"{name}.png")
             _write(files[-1], png)
         if comparison is not None:
             files.append(out / "compare.html")
             _write(files[-1], comparison)
-        page = report_html(
-            result, drawn, place, scene_path, recordings, comparison is not None
-        )
-        files.append(out / "report.html")
-        _write(files[-1], page)
     except OSError as error:
         raise ValueError(
             f'--out: got "{place}", expected a folder to write in ({error.strerror})'
         ) from error
-    return files
+    return [*files, out / "report.html"]
 
 
 def _write(path: Path, content: str | bytes) -> None:

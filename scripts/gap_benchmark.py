@@ -10,6 +10,7 @@ disk as the cases end, and `--reuse` goes on where a run was stopped.
 
 import argparse
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -129,9 +130,7 @@ def _make_cases(
 ) -> None:
     for parent in (cases, truth_file.parent / "results"):
         for old in (*parent.glob("case_*"), *parent.glob("log_*")):
-            for path in old.iterdir():
-                path.unlink()
-            old.rmdir()
+            shutil.rmtree(old)  # A run that was killed leaves a folder in it.
     truth_file.unlink(missing_ok=True)
     maker = SETS[which].maker
     words = [sys.executable, str(maker), "--set", which, "--only", only]

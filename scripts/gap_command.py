@@ -80,7 +80,10 @@ def run_and_report(
                 write_report(
                     result, scene, folder, recordings, scene_path, moving, out_dir
                 )
-        except Exception:
+        except Exception as error:
+            if isinstance(error.__cause__ or error, OSError) and any(out.written()):
+                kept = ", ".join(path.name for path in out.commit(complete=False))
+                raise ValueError(f"{error}; kept: {kept}") from error
             if progress.told:  # Not merely an input that was refused.
                 with suppress(OSError):
                     out.file("error.txt").write_text(traceback.format_exc())

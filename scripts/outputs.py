@@ -148,6 +148,14 @@ class OutputFolder:
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
+    def written(self) -> list[Path]:
+        """The files that wait to be moved, where they are."""
+        return [
+            path
+            for path in sorted(self.stage.rglob("*"))
+            if path.is_file() and path != self.stage / _LOCK
+        ]
+
     def commit(self, complete: bool = True) -> list[Path]:
         """Moves all files to their places, and closes the folder.
 
@@ -161,11 +169,7 @@ class OutputFolder:
             target = self.path / KEPT
             old = _read_mark(target).get("files", {})
             target.mkdir(exist_ok=True)
-        new = {
-            path.relative_to(self.stage).as_posix(): path
-            for path in sorted(self.stage.rglob("*"))
-            if path.is_file() and path != self.stage / _LOCK
-        }
+        new = {path.relative_to(self.stage).as_posix(): path for path in self.written()}
         digests = {name: _digest(path) for name, path in new.items()}
         # Should it end between the two marks, all files are known as its own.
         self._mark(target, old | digests, complete=False)

@@ -281,13 +281,8 @@ def test_two_runs_at_once_are_refused_and_a_killed_one_blocks_nothing(capsys):
 
 def test_on_a_full_disk_the_result_comes_first_and_the_loss_is_one_line():
     """No file may be longer than 20,000 bytes: the table and the plot are."""
-    import resource
-
-    def limit():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
-
     words = ["run", "spring_mass", "--no-meshcat", "--out", "out"]
-    process = start(*words, preexec_fn=limit)
+    process = start(*words, preexec_fn=_limit)
     _, error = process.communicate(timeout=120)
     assert process.returncode == 2 and "Traceback" not in error
     last = error.splitlines()[-1]
@@ -296,3 +291,44 @@ def test_on_a_full_disk_the_result_comes_first_and_the_loss_is_one_line():
     assert json.loads(Path("out/timing.json").read_text())["simulated_s"] > 1.0
     assert not Path("out/recording.csv").exists()  # Rather none than half of one.
     assert cli.main([*words]) == 0 and Path("out/recording.csv").exists()
+
+
+def _limit():
+    import resource
+
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+
+
+@pytest.fixture
+def real_gap(case):
+    """Files in the folder of the test; the workflow itself is to be run on them."""
+    for path in case[0].parent.iterdir():
+        Path(path.name).write_bytes(path.read_bytes())
+    return ["gap", case[0].name, case[1].name, "--jobs", "2"]
+
+
+def test_gap_on_a_full_disk_keeps_the_result_and_the_scene(real_gap):
+    process = start(*real_gap, "--out", "g1", preexec_fn=_limit)
+    _, error = process.communicate(timeout=300)
+    assert process.returncode == 2 and "Traceback" not in error
+    last = error.splitlines()[-1]
+    assert last.startswith("makebreak: --out: ")
+    assert last.endswith("kept: result.json, scene.yaml")
+    assert {p.name for p in Path("g1").iterdir()} == {"result.json", "scene.yaml", MARK}
+    assert json.loads(Path("g1/result.json").read_text())["effects"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_gap_ends_at_once_when_it_is_told_to(real_gap, number):
+    before = hashes()
+    process = start(*real_gap, "--out", "g1")
+    assert process.stderr is not None
+    seen = ""
+    while "screening" not in seen:  # It is at work.
+        seen += process.stderr.read(1)
+        assert process.poll() is None, seen
+    process.send_signal(number)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130 and "Traceback" not in error
+    assert error.splitlines()[-1] == "makebreak: interrupted"
+    assert hashes() == before and not Path("g1").exists()
