@@ -10,11 +10,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from makebreak.gap.free_windows import FreeBodyModel, touched
-from makebreak.gap.screen import Candidate
+from makebreak.gap.problem import Candidate, Nuisances
 from makebreak.gap.windows import WindowModel
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
-from makebreak.systems.numerics.selection import Columns
 
 # What a value is multiplied by, or what is added to it.
 _TIMES = {
@@ -45,9 +44,8 @@ _OF_BODIES = ("constant_force", "body_drag", "object_mass", "object_com",
               "object_inertia", "length_scale")  # fmt: skip
 
 
-def contact_nuisances(model) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Contact stiffness and dissipation within the scene's tolerance (relative):
-    columns (m, n_b), prior standard deviations and names."""
+def contact_nuisances(model: FreeBodyModel | WindowModel) -> Nuisances:
+    """Contact stiffness and dissipation within the scene's tolerance (relative)."""
     columns, prior, names = [], [], []
     for kind in ("contact_stiffness", "contact_dissipation"):
         share = float(model.scene.tolerance.get(kind, 0.0))
@@ -63,13 +61,12 @@ def contact_nuisances(model) -> tuple[np.ndarray, np.ndarray, list[str]]:
             prior.append(share)
             names.append(f"{kind} of {at}")
     if not columns:
-        return np.zeros((len(model.train()), 0)), np.zeros(0), []
-    return np.stack(columns, axis=1), np.array(prior), names
+        return Nuisances.none(len(model.train()))
+    return Nuisances(np.stack(columns, axis=1), np.array(prior), tuple(names))
 
 
 def contact_candidates(
     model: FreeBodyModel | WindowModel,
-    nuisance: np.ndarray,
     there: Sequence[Effect],
     r: np.ndarray,
 ) -> list[Candidate]:
@@ -91,10 +88,10 @@ def contact_candidates(
             if kind == "plane_tilt" and any(e.kind == "friction_patch" for e in there):
                 continue
             if kind == "friction_patch":
-                found += _patches(model, nuisance, at, there, r)
+                found += _patches(model, at, there, r)
                 continue
             for trials, names, fixed in _trials(model, kind, at):
-                each = _of(model, nuisance, kind, at, trials, names, fixed, there, r)
+                each = _of(model, kind, at, trials, names, fixed, there, r)
                 if each is not None:
                     found.append(each)
     return found
@@ -154,7 +151,7 @@ def _trials(model, kind: str, at: str):
             )  # fmt: skip
 
 
-def _patches(model, nuisance, at: str, there, r) -> list[Candidate]:
+def _patches(model, at: str, there, r) -> list[Candidate]:
     """A rectangle of other friction: cells of the ground that was touched are tried one
     by one, and a rectangle is the sum of its cells."""
     if not isinstance(model, FreeBodyModel):
@@ -209,7 +206,7 @@ def _patches(model, nuisance, at: str, there, r) -> list[Candidate]:
     new = moved(friction, sides)
     if new is None or friction == mu:
         return []
-    column = Columns(((r - new) / (friction - mu))[:, None], nuisance, train)
+    column = ((r - new) / (friction - mu))[:, None]
 
     def read(c) -> dict[str, float]:
         return patch(float(np.clip(mu + c[0], 0.1 * mu, max(1.5, 2.0 * mu))), sides)
@@ -257,7 +254,7 @@ def _moments(now: dict, name: str, factor: float) -> dict[str, float]:
     return out
 
 
-def _of(model, nuisance, kind, at, trials, names, fixed, there, r) -> Candidate | None:
+def _of(model, kind, at, trials, names, fixed, there, r) -> Candidate | None:
     now = {p.name: p.neutral or 0.0 for p in KINDS[kind].parameters}
     now |= model.dynamics.now(kind, [at])
     columns, readers = [], []
@@ -275,7 +272,7 @@ def _of(model, nuisance, kind, at, trials, names, fixed, there, r) -> Candidate 
             made.append((r - moved) / step)
         if len(made) < len(trial) or not any(np.abs(x).max() > 1e-3 for x in made):
             continue
-        columns.append(Columns(np.stack(made, axis=1), nuisance, model.train()))
+        columns.append(np.stack(made, axis=1))
         readers.append(_reader(kind, now, trial[0][1], names, reach))
     if not columns:
         return None

@@ -1,17 +1,16 @@
 """Effects fitted together, exactly and not by their columns."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy.optimize import differential_evolution, least_squares, minimize
 
+from makebreak.gap.problem import Fitted, GapProblem
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, check_parameters
-from makebreak.systems.numerics.selection import LinearFit, Screen, spread_by_blocks
+from makebreak.systems.numerics.selection import Screen, spread_by_blocks
 
-EVALUATIONS = 8
+SHORT = 8  # Evaluations: a fit of no more is not asked to converge.
 # Of a parameter's size: first steps of a search without slopes, and how far around one
 # looks where that ended.
 WANDER, AROUND = 0.2, 0.5
@@ -19,34 +18,8 @@ MOST_FAR = 450  # Simulations, about.
 ROUGH = np.linspace(0.85, 1.15, 16)  # Of a start, tried.
 
 
-class Model(Protocol):
-    """What gives residuals over their noise: InverseModel or WindowModel."""
-
-    def base(self) -> np.ndarray: ...
-    def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray: ...
-    def train(self) -> np.ndarray: ...
-    def blocks(self) -> np.ndarray: ...
-
-
-@dataclass(frozen=True, eq=False)
-class Fitted:
-    """Effects with their best parameters. std: of each effect's parameters. r (m,):
-    what they leave, before nuisances. left (m,): after them."""
-
-    effects: tuple[Effect, ...]
-    std: tuple[dict[str, float], ...]
-    r: np.ndarray
-    left: np.ndarray
-    b: np.ndarray
-    fit: LinearFit
-
-    @property
-    def score(self) -> float:
-        return self.fit.score
-
-
 def fit_effects(
-    model: Model,
+    problem: GapProblem,
     screen: Screen,
     start: Sequence[Effect],
     fixed: Sequence[Sequence[str]] | None = None,
@@ -56,20 +29,20 @@ def fit_effects(
 
     Args: start: effects with parameters to start from; fixed: of each the parameters
         that stay as they are. evaluations: Gauss-Newton steps at most; else the
-        model's own number, which goes with how long its residual takes.
+        problem's own number, which goes with how long its residual takes.
     """
     fixed = [tuple(names) for names in fixed or [()] * len(start)]
-    start, rough = _try_rough(model, screen, list(start), fixed)
+    start, rough = _try_rough(problem, screen, list(start), fixed)
     fixed = [(*a, *b) for a, b in zip(fixed, rough, strict=True)]
-    steps = evaluations or int(getattr(model, "evaluations", EVALUATIONS))
-    free = _Free(model, start, fixed)
+    steps = evaluations or problem.plan.evaluations
+    free = _Free(problem, start, fixed)
     x0, scale, low = free.x0, free.scale, free.low
     cache: dict[bytes, np.ndarray] = {}
 
     def residual(z) -> np.ndarray:
         key = np.asarray(z).tobytes()
         if key not in cache:
-            cache[key] = model.residual(free.effects(z))
+            cache[key] = problem.residual(free.effects(z))
         return cache[key]
 
     def cost(z):
@@ -81,8 +54,8 @@ def fit_effects(
 
     solved = least_squares(
         cost, x0 / scale, bounds=(low / scale, np.full(len(low), np.inf)),
-        diff_step=getattr(model, "diff_step", 1e-4), x_scale=1.0, xtol=1e-6,
-        ftol=1e-6 if steps > EVALUATIONS else 1e-4, max_nfev=steps,
+        diff_step=problem.plan.diff_step, x_scale=1.0, xtol=1e-6,
+        ftol=1e-6 if steps > SHORT else 1e-4, max_nfev=steps,
     ) if len(x0) else None  # fmt: skip
     z = x0 / scale if solved is None else solved.x
     if solved is not None:  # What does not show is not told: it stays neutral.
@@ -99,7 +72,9 @@ def fit_effects(
         r = residual(z)
     effects = free.effects(z)
     std: list[dict[str, float]] = [{} for _ in start]
+    J = np.zeros((0, len(x0)))
     if solved is not None:
+        J = solved.jac / scale
         u, w, vt = np.linalg.svd(solved.jac, full_matrices=False)
         inverse = 1.0 / np.maximum(w, max(1e-12 * w[0], 1e-100))
         spread = np.sqrt(np.sum((vt.T * inverse) ** 2, axis=1))
@@ -107,21 +82,23 @@ def fit_effects(
         spread *= max(np.sqrt(2.0 * solved.cost / len(solved.fun)), 1.0)
         # So do errors that go together for a while: blocks of time, drawn anew.
         block = np.full(len(solved.fun), -1)
-        train = model.train()
-        block[: train.sum()] = model.blocks()[train]
+        train = problem.train()
+        block[: train.sum()] = problem.blocks()[train]
         spread = np.maximum(spread, spread_by_blocks(solved.jac, solved.fun, block))
         for (i, name), each in zip(free.names, spread * scale, strict=True):
             std[i][name] = float(each)
-    for each, steps in zip(std, rough, strict=True):
-        each.update(steps)
+    for each, tried in zip(std, rough, strict=True):
+        each.update(tried)
     b, left = screen.settle(r)
     return Fitted(
-        tuple(_tidy(e) for e in effects), tuple(std), r, left, b, screen.judge(r)
-    )
+        tuple(_tidy(e) for e in effects), tuple(std), r, left, b, screen.judge(r),
+        J, np.array(solved.fun) if solved is not None else np.zeros(0),
+        tuple(free.names),
+    )  # fmt: skip
 
 
-def wander(
-    model: Model,
+def derivative_free_search(
+    problem: GapProblem,
     screen: Screen,
     start: Sequence[Effect],
     fixed: Sequence[Sequence[str]],
@@ -134,13 +111,13 @@ def wander(
     Nelder and Mead's search, of `most` simulations; `far`, differential evolution,
     which leaves valleys.
     """
-    free = _Free(model, start, [tuple(names) for names in fixed])
+    free = _Free(problem, start, [tuple(names) for names in fixed])
 
     def cost(z) -> float:
         if np.any(z * free.scale < free.low):
             return 1e6
         try:
-            error = screen.judge(model.residual(free.effects(z))).train
+            error = screen.judge(problem.residual(free.effects(z))).train
         except (ValueError, RuntimeError):  # Such parameters are refused.
             return 1e6
         return float(error) if np.isfinite(error) else 1e6
@@ -169,7 +146,10 @@ class _Free:
     """
 
     def __init__(
-        self, model: Model, start: Sequence[Effect], fixed: Sequence[Sequence[str]]
+        self,
+        problem: GapProblem,
+        start: Sequence[Effect],
+        fixed: Sequence[Sequence[str]],
     ):
         self._start = start
         self.names = [
@@ -179,10 +159,7 @@ class _Free:
             if name not in fixed[i]
         ]
         self.scale = np.array([_scale(start[i], name) for i, name in self.names])
-        least = [
-            model.dynamics.least(e.kind, e.at) if hasattr(model, "dynamics") else {}
-            for e in start
-        ]
+        least = [problem.dynamics.least(e.kind, e.at) for e in start]
         self.low = np.array(
             [
                 max(_lowest(start[i].kind, name), least[i].get(name, -np.inf))
@@ -203,7 +180,7 @@ class _Free:
         ]
 
 
-def _try_rough(model, screen, start: list[Effect], fixed):
+def _try_rough(problem, screen, start: list[Effect], fixed):
     """Effects with those parameters tried that a gradient is no guide for, each about
     its start; and of each effect the steps in which that was done, by name."""
     steps: list[dict[str, float]] = [{} for _ in start]
@@ -214,7 +191,7 @@ def _try_rough(model, screen, start: list[Effect], fixed):
             tried = []
             for v in value * ROUGH:
                 other = Effect(effect.kind, effect.at, {**effect.parameters, name: v})
-                r = model.residual([*start[:i], other, *start[i + 1 :]])
+                r = problem.residual([*start[:i], other, *start[i + 1 :]])
                 tried.append((screen.judge(r).train, other))
             start[i] = min(tried, key=lambda each: each[0])[1]
             steps[i][name] = float(value * (ROUGH[1] - ROUGH[0]))

@@ -61,15 +61,6 @@ class FreeBodyModel(WindowedResidual):
         body's x, y and z must be measured.
     """
 
-    jumps = True  # Errors, where an object's spheres land in another order.
-    # Errors below the noise, which is mostly how unsure a start is, tell no two models
-    # apart.
-    least_error = 1.0
-    diff_step = 2e-3  # Of fits: smaller ones drown in the error of the steps.
-    # What an effect must take off the error. Laws of contact leave so much that none
-    # but the first takes off a tenth.
-    least_gain = 0.05
-
     def __init__(
         self,
         scene: Scene,
@@ -255,7 +246,7 @@ class FreeBodyModel(WindowedResidual):
                 wide += np.minimum(off**2, self._cap**2) / DRAWS
             stds.append(np.sqrt(self.noise**2 + wide))
         ones = [np.ones_like(std) for std in stds]
-        off = np.concatenate(self._errors(plain, ones))
+        off = np.concatenate(self.errors_over(plain, ones))
         # A gap is not measured to better than a share of itself.
         place = [k for k, c in enumerate(self.channels) if c[-2:] in (".x", ".y", ".z")]
         least = BLUR * float(np.sqrt(np.mean(np.sum(off[:, place] ** 2, axis=1))))
@@ -327,9 +318,12 @@ class FreeBodyModel(WindowedResidual):
     def errors(self, simulated: Sequence[np.ndarray]) -> list[np.ndarray]:
         """(measured - simulated)/std of each window, no more than the cap; 0 where
         nothing was measured."""
-        return self._errors(simulated, [w.std for w in self.windows])
+        return self.errors_over(simulated, [w.std for w in self.windows])
 
-    def _errors(self, simulated, stds) -> list[np.ndarray]:
+    def errors_over(
+        self, simulated: Sequence[np.ndarray], stds: Sequence[np.ndarray]
+    ) -> list[np.ndarray]:
+        """The same over given deviations."""
         out = []
         turn = [k for k, c in enumerate(self.channels) if c.rsplit(".", 1)[1] in TURN]
         for std, y, seen in zip(stds, simulated, self._seen, strict=True):

@@ -5,7 +5,7 @@ of the scene with given effects is tested with bumps and divided by the noise th
 positions have. What the other channels show of the same motion is tested beside it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -103,8 +103,6 @@ class InverseModel:
         of this length is held out.
     """
 
-    evaluations = 25  # Of a fit.
-
     def __init__(
         self,
         scene: Scene,
@@ -114,7 +112,8 @@ class InverseModel:
         most_sec: float = 60.0,
     ):
         self.scene = scene
-        self.dynamics = _Dynamics(scene)
+        self._remembering = _Dynamics(scene)
+        self.dynamics: SceneDynamics = self._remembering
         plant = self.dynamics.plant
         self.joints = [
             full_name(plant, j)
@@ -171,7 +170,14 @@ class InverseModel:
         self.period = float(
             np.median(np.concatenate([np.diff(t.time) for t in self.tracks]))
         )
-        self._whiteners = self._noise_of_rows()
+        self._noises = self._noise_of_rows()
+        # What models are off by, beside noise [N m, rad/s].
+        self.model_error = {
+            what: np.zeros(len(self.joints))
+            for what in ("effort", "velocity", "effort_measured")
+        }
+        self._plain = self._whitened_by(self.model_error)
+        self._whiteners = self._plain
         self._base: np.ndarray | None = None
         self._motions: list[Motion] | None = None
         # Of a track and what moves it: the motion, and the effort that it needs.
@@ -333,8 +339,8 @@ class InverseModel:
         return out
 
     def _noise_of_rows(self) -> list[dict[str, np.ndarray]]:
-        """For each track: inverse square roots of the covariance of each bump's
-        residual efforts, and standard deviations of the other channels'."""
+        """For each track: the covariance of each bump's residual efforts, and standard
+        deviations of the other channels', as the sensors' noise gives them."""
         size = np.concatenate([self._effort(t, (), *self._qv(t)) for t in self.tracks])
         rms = _rms(size)
         rms = np.maximum(rms, 0.1 * rms.max())
@@ -362,7 +368,7 @@ class InverseModel:
                 for what in ("velocity", "effort_measured")
             )  # fmt: skip
             eye = np.eye(len(self.joints))
-            L = np.empty((len(centre), *eye.shape))
+            C = np.empty((len(centre), *eye.shape))
             # When within a period an effort was sampled is not known.
             effort = self._effort(track, (), q, v)
             mean = track.bumps.mean(effort)
@@ -373,15 +379,15 @@ class InverseModel:
             direct += np.array(self.by_measured) * (self.effort_noise * g_e) ** 2
             for b, k in enumerate(centre):
                 M = self._mass_matrix(q[k])
-                C = (M * (g2 * self.noise) ** 2) @ M.T + np.diag(direct + held[b] ** 2)
-                L[b] = np.linalg.inv(np.linalg.cholesky(C))
+                C[b] = (M * (g2 * self.noise) ** 2) @ M.T
+                C[b] += np.diag(direct + held[b] ** 2)
             # The smoothed velocity's own error, as over one bump.
             own = self.noise * np.sqrt(period * 12.0 / track.bumps.width**3)
             v_std = np.hypot(self.velocity_noise * g_v, own)
             v_std = np.hypot(v_std, np.where(kd > 0.0, DRIVE_VELOCITY * _rms(v), 0.0))
             out.append(
                 {
-                    "effort": L,
+                    "effort": C,
                     "velocity": np.maximum(v_std, 1e-12),
                     "effort_measured": np.maximum(
                         np.hypot(self.effort_noise * g_e, e_std), 1e-12
@@ -389,6 +395,75 @@ class InverseModel:
                 }
             )
         return out
+
+    def _whitened_by(self, error) -> list[dict[str, np.ndarray]]:
+        """For each track: inverse square roots of the efforts' covariance with what
+        models are off by, and standard deviations of the other channels'."""
+        out = []
+        for noise in self._noises:
+            C = noise["effort"] + np.diag(error["effort"] ** 2)
+            each = {"effort": np.linalg.inv(np.linalg.cholesky(C))}
+            for what in ("velocity", "effort_measured"):
+                each[what] = np.hypot(noise[what], error[what])
+            out.append(each)
+        return out
+
+    def allow(self, error: dict[str, np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
+        """Takes models to be off by so much, {what: (n_joints,)} [N m, rad/s], beside
+        noise. Returns: what gives rows (m, ...) of before in the new units."""
+        old = self._whiteners
+        self.model_error = error
+        self._whiteners = self._whitened_by(error)
+        self._base = None
+        new = self._whiteners
+        return lambda rows: self._rewhitened(rows, old, new)
+
+    def in_noise(self, left: np.ndarray) -> np.ndarray:
+        """Rows (m,) over the sensors' noise alone."""
+        return self._rewhitened(left, self._whiteners, self._plain)
+
+    def in_units(self, left: np.ndarray) -> np.ndarray:
+        """(n_bumps, n_names) of rows (m,): [N m] or [N], and units of channels."""
+        return self._rewhitened(left, self._whiteners, None).reshape(
+            -1, len(self.names())
+        )
+
+    def noise_in_units(self) -> np.ndarray:
+        """(n_bumps, n_names) standard deviations that the sensors' noise gives."""
+        others = self._other_names()
+        found = []
+        for noise in self._noises:
+            C = noise["effort"]
+            std = np.sqrt(np.einsum("bii->bi", C))
+            row = [noise[what][self.joints.index(joint)] for what, joint in others]
+            found.append(np.hstack([std, np.tile(row, (len(C), 1))]))
+        return np.concatenate(found)
+
+    def _rewhitened(self, rows: np.ndarray, old, new) -> np.ndarray:
+        """Rows (m, ...) in the units of other whiteners; None: in the channels' own."""
+        k, n = len(self.names()), len(self.joints)
+        others = self._other_names()
+        parts, first = [], 0
+        for i, track in enumerate(self.tracks):
+            size = len(track.bumps.centre)
+            mine = np.array(rows[first : first + size * k])
+            first += size * k
+            mine = mine.reshape(size, k, *rows.shape[1:])
+            T = np.linalg.inv(old[i]["effort"])
+            if new is not None:
+                T = new[i]["effort"] @ T
+            mine[:, :n] = np.einsum("bij,bj...->bi...", T, mine[:, :n])
+            for c, (what, joint) in enumerate(others):
+                j = self.joints.index(joint)
+                by = 1.0 if new is None else new[i][what][j]
+                mine[:, n + c] *= old[i][what][j] / by
+            parts.append(mine.reshape(size * k, *rows.shape[1:]))
+        return np.concatenate(parts)
+
+    def channel_of_rows(self) -> np.ndarray:
+        """(m,) index in names() of each row."""
+        n = sum(len(t.bumps.centre) for t in self.tracks)
+        return np.tile(np.arange(len(self.names())), n)
 
     def _qv(self, track):
         both = [self._at(track, i, track.middle)[:2] for i in range(len(self.joints))]
@@ -456,7 +531,7 @@ class InverseModel:
             )
             if len(self._needed) > MOST_MOTIONS + len(self.tracks):
                 self._needed = {i: x for i, x in self._needed.items() if len(i) == 1}
-                self.dynamics.forget()
+                self._remembering.forget()
             needed = motion.effort - self.dynamics.residual(motion)
             self._needed[key] = (motion, needed)
         return self._needed[key]

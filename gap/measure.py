@@ -1,6 +1,7 @@
 """The gap before and after, over held-out windows simulated from measured states."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, Protocol
 
@@ -8,11 +9,12 @@ import numpy as np
 
 from makebreak.gap.inverse import InverseModel
 from makebreak.gap.parallel import side_by_side
-from makebreak.gap.recording import Recording
-from makebreak.gap.result import GapMeasure, Series
+from makebreak.gap.recording import Recording, unit_of
+from makebreak.gap.result import GapMeasure, InUnits, Series
 from makebreak.gap.windows import WindowModel, seen_in
+from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.kind import Effect
+from makebreak.models.effects.kind import Effect, sliding_joints
 from makebreak.models.effects.transmission import twists
 from makebreak.models.scene import Scene
 
@@ -30,37 +32,71 @@ class Windows(Protocol):
     channels: list[str]
     noise: np.ndarray
     window_sec: float
+    dynamics: SceneDynamics
 
-    def errors(self, simulated: Sequence[np.ndarray]) -> list[np.ndarray]: ...
+    def errors_over(
+        self, simulated: Sequence[np.ndarray], std: Sequence[np.ndarray]
+    ) -> list[np.ndarray]: ...
 
 
 def measure(
     scene: Scene,
-    recordings: Sequence[Recording],
     effects: Sequence[Effect],
     moved: Sequence[Effect],
     motion: InverseModel,
+    every: bool,
     jobs: int = 1,
 ) -> tuple[GapMeasure, list[Series]]:
-    """Before and after over held-out windows.
+    """Before and after over windows of the recordings that `motion` has.
 
     Args: effects: to be added. moved: the background as far as its tolerance lets it,
         in both, as it is neither the gap nor its cure. motion: what tells how far a
-        joint lags its motor where a window starts.
+        joint lags its motor where a window starts. every: all windows, of recordings
+        that are only reported on; else those that were not fitted.
     """
-    model = WindowModel(scene, recordings, WINDOW_SEC, most=240)
+    model = WindowModel(scene, motion.recordings, WINDOW_SEC, most=240)
     taken = {(e.kind, tuple(e.at)) for e in effects}
     moved = [e for e in moved if (e.kind, tuple(e.at)) not in taken]
     trials = [moved, [*moved, *effects]] if effects else [moved]
-    held = held_out(model)
+    held = [every or not w.train for w in model.windows]
     lag = _twists(motion, effects)
     calls = [partial(model.simulate, trial, held, lag) for trial in trials]
     try:
         found = list(side_by_side(calls, jobs))
     except ValueError:  # A link that its background would make impossible.
-        found = [model.simulate((), held), model.simulate(effects, held, lag)]
+        trials = [[], list(effects)]
+        found = [model.simulate(each, held, lag) for each in trials]
     before, after = found[0], found[-1]
-    return gap_measure(model, before, after), series_of(model, before, after)
+    gap = gap_measure(model, before, after, held)
+    gap = replace(
+        gap,
+        equations=_equations(motion, trials[0], trials[-1], every),
+    )
+    return gap, series_of(model, before, after, held)
+
+
+def _equations(motion: InverseModel, before, after, every: bool) -> dict[str, InUnits]:
+    """What the model leaves of each joint's effort, in its unit."""
+    rows = np.ones(len(motion.train()), bool) if every else ~motion.train()
+    rows = rows.reshape(-1, len(motion.names()))[:, 0]
+    try:
+        left = [motion.in_units(motion.residual(each)) for each in (before, after)]
+    except ValueError:
+        return {}
+    noise = motion.noise_in_units()
+    slides = sliding_joints(motion.dynamics.plant)
+    return {
+        f"{joint}.effort": InUnits(
+            "N" if joint in slides else "N m", _rms(left[0][rows, k]),
+            _rms(left[1][rows, k]), _rms(noise[rows, k]),
+        )
+        for k, (what, joint) in enumerate(motion.names())
+        if what == "effort"
+    }  # fmt: skip
+
+
+def _rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(x**2))) if len(x) else 0.0
 
 
 def _twists(motion: InverseModel, effects: Sequence[Effect]):
@@ -89,43 +125,59 @@ def _twists(motion: InverseModel, effects: Sequence[Effect]):
     return at
 
 
-def held_out(model: Windows) -> list[bool]:
-    """Which windows count: all, where none is held out."""
-    held = [not w.train for w in model.windows]
-    return held if any(held) else [True] * len(held)
+def gap_measure(model: Windows, before, after, held: Sequence[bool]) -> GapMeasure:
+    """Args: before, after: what windows simulate without and with effects; held: which
+    windows count. Samples that were not measured, or that one of them does not tell,
+    and windows that one of them does not finish, count in neither."""
+    picked = [k for k, h in enumerate(held) if h]
+    failed = [
+        [bool(np.isinf(each[k]).any()) for k in picked] for each in (before, after)
+    ]
+    whole = [k for k, *f in zip(picked, *failed, strict=True) if not any(f)] or picked
 
+    def of_whole(each) -> np.ndarray:
+        return np.concatenate([each[k] for k in whole])
 
-def gap_measure(model: Windows, before, after) -> GapMeasure:
-    """Args: before, after: what held-out windows simulate without and with effects.
-    Samples that were not measured, or that one of them does not tell, count in
-    neither."""
-    held = held_out(model)
-
-    def of_held(each) -> np.ndarray:
-        return np.concatenate([e for e, h in zip(each, held, strict=True) if h])
-
-    both = ~(np.isnan(of_held(before)) | np.isnan(of_held(after)))
-    both &= np.isfinite(of_held([seen_in(model, w) for w in model.windows]))
-    a, b = of_held(model.errors(before)), of_held(model.errors(after))
+    both = ~(np.isnan(of_whole(before)) | np.isnan(of_whole(after)))
+    both &= np.isfinite(of_whole([seen_in(model, w) for w in model.windows]))
+    stds = [w.std for w in model.windows]
+    ones = [np.ones_like(std) for std in stds]
+    over = [of_whole(model.errors_over(each, stds)) for each in (before, after)]
+    plain = [of_whole(model.errors_over(each, ones)) for each in (before, after)]
 
     def rms(e: np.ndarray, c) -> float:
-        told = e[:, c][both[:, c]]
-        return float(np.sqrt(np.mean(told**2))) if len(told) else 0.0
+        return _rms(e[:, c][both[:, c]])
 
-    per_channel = {
-        name: {"before": rms(a, c), "after": rms(b, c)}
-        for c, name in enumerate(model.channels)
-    }
     everything = slice(None)
+    sliding = sliding_joints(model.dynamics.plant)
+    recordings = model.recordings
     return GapMeasure(
-        rms(a, everything), rms(b, everything), NOISE_FLOOR, model.window_sec,
-        per_channel,
+        rms(over[0], everything), rms(over[1], everything), NOISE_FLOOR,
+        model.window_sec,
+        {
+            name: {"before": rms(over[0], c), "after": rms(over[1], c)}
+            for c, name in enumerate(model.channels)
+        },
+        {
+            name: InUnits(
+                unit_of(name.rsplit(".", 1)[1], name.rsplit(".", 1)[0] in sliding),
+                rms(plain[0], c), rms(plain[1], c), float(model.noise[c]),
+            )
+            for c, name in enumerate(model.channels)
+        },
+        {}, len(picked), (sum(failed[0]), sum(failed[1])),
+        seconds=float(sum(
+            np.ptp(recordings[w.recording].time[w.rows])
+            for w in (model.windows[k] for k in picked)
+        )),
     )  # fmt: skip
 
 
-def series_of(model: Windows, before, after, most: int = 12) -> list[Series]:
-    """The channels over the first block of held-out windows."""
-    rows = np.flatnonzero(held_out(model))
+def series_of(
+    model: Windows, before, after, held: Sequence[bool], most: int = 12
+) -> list[Series]:
+    """The channels over the first windows that count."""
+    rows = np.flatnonzero(held)
     first = model.windows[rows[0]]
     same = [
         k for k in rows

@@ -1,29 +1,26 @@
-"""Scenes with free bodies: what their contacts and flights say a scene lacks."""
+"""Scenes with free bodies, as problems for the search: touches, flights, rollouts."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from makebreak.gap.contact import (
-    contact_candidates,
-    contact_nuisances,
-)
-from makebreak.gap.findings import Finding
-from makebreak.gap.fit import Fitted
+from makebreak.gap.contact import contact_candidates, contact_nuisances
 from makebreak.gap.free_windows import FreeBodyModel
 from makebreak.gap.measure import gap_measure, series_of
+from makebreak.gap.problem import (
+    Candidate,
+    Fitted,
+    GapProblem,
+    Nuisances,
+    Outcome,
+    SearchPlan,
+)
 from makebreak.gap.recording import Recording
-from makebreak.gap.result import GapResult, Unexplained
-from makebreak.gap.screen import Candidate
-from makebreak.gap.select import FLOOR, Selection, select
+from makebreak.gap.result import Unexplained, Where
 from makebreak.gap.touch import TouchModel, touch_candidates
-from makebreak.gap.verdict import named, says, told, verdict_of
 from makebreak.gap.where import where_in_windows
 from makebreak.gap.windows import WindowModel
-from makebreak.models.dynamics import SceneDynamics
-from makebreak.models.effects.kind import one_dof_joints
 from makebreak.models.scene import Scene
-from makebreak.systems.numerics.selection import Screen
 
 # A real object differs from its model in more ways than a mechanism.
 MOST_EFFECTS = 6
@@ -31,105 +28,130 @@ MOST_EFFECTS = 6
 DRAKE_SEC, DRAKE_MOST = 0.3, 16
 
 
-def of_objects(
-    scene: Scene,
-    recordings: Sequence[Recording],
-    checks: Sequence[Finding],
-    seconds: dict[str, float],
-    lap: Callable[[], float],
-    say: Callable[[str], None],
-    settle: Callable[[Scene], tuple[Scene, list[Finding]]],
-) -> GapResult:
-    """The result for a scene in which something is free to move.
+class TouchProblem(TouchModel, GapProblem):
+    """A measured mechanism, and a wrench that tells when it touches an object."""
 
-    Args: seconds, lap: into which the time of each step is written, and its clock.
-        settle: gives a scene a step that is fine enough, where Drake simulates.
-    """
-    dynamics = SceneDynamics(scene)
-    if any(joint.num_velocities() for joint in one_dof_joints(dynamics.plant)):
-        try:  # A measured mechanism, and a wrench that tells when it touches.
-            touch = TouchModel(scene, recordings)
-        except ValueError:
-            touch = None
-        if touch is not None:
-            return _of_touch(touch, checks, seconds, lap, say)
-    say("cutting windows")
-    try:
-        model: FreeBodyModel | WindowModel = FreeBodyModel(scene, recordings)
-    except ValueError:  # More than one free body, or other shapes: by Drake's steps.
-        scene, finding = settle(scene)
-        checks = [*checks, *finding]
-        many = sum(len(r.episodes) for r in recordings) >= 6
-        model = WindowModel(
-            scene, recordings, DRAKE_SEC, by_episode=many, most=DRAKE_MOST
+    # Two explanations that both leave less than the allowance for shapes are a tie.
+    plan = SearchPlan(least_error=1.0)
+
+    def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
+        return touch_candidates(self)
+
+    def judged(self) -> dict[str, str]:
+        things = {touch.thing for touch in self.touches}
+        tools = {touch.tool for touch in self.touches}
+        return {
+            c.name: "touches"
+            for r in self.recordings
+            for c in r.measured()
+            if c.at in things or c.at in tools or c.at in self.joints
+        }
+
+    def outcome(
+        self, effects, start: Fitted, end: Fitted, nuisances: Nuisances,
+        recordings=None, jobs: int = 1,
+    ) -> Outcome | None:  # fmt: skip
+        if recordings is None:
+            held = ~self.train()
+            if not held.any():
+                return None
+            gap = self.measure(start.left, end.left, held)
+            return Outcome(gap, self.series(start.left, end.left))
+        try:
+            other = TouchModel(self.scene, recordings)
+        except ValueError:  # Nothing is touched in them.
+            return None
+        there = other.nuisances()
+        left = []
+        for of, fitted in (((), start), (effects, end)):
+            known = dict(zip(nuisances.names, fitted.b, strict=True))
+            b = np.array([known.get(name, 0.0) for name in there.names])
+            left.append(other.residual(of) - there.columns @ b)
+        before, after = left
+        gap = other.measure(before, after, np.ones(len(before), bool))
+        return Outcome(gap, other.series(before, after))
+
+
+class _Windowed(GapProblem):
+    """What problems of simulated windows share."""
+
+    def nuisances(self) -> Nuisances:
+        return contact_nuisances(self._model())
+
+    def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
+        return contact_candidates(self._model(), current.effects, current.r)
+
+    def judged(self) -> dict[str, str]:
+        return dict.fromkeys(self._model().channels, "simulation")
+
+    def where(self, left: np.ndarray) -> list[Where]:
+        model = self._model()
+        return where_in_windows(model, model.errors(model.simulate(())))
+
+    def outcome(
+        self, effects, start: Fitted, end: Fitted, nuisances: Nuisances,
+        recordings=None, jobs: int = 1,
+    ) -> Outcome | None:  # fmt: skip
+        model = self._model()
+        held = [not w.train for w in model.windows]
+        if recordings is not None:
+            try:
+                model = self._again(recordings)
+            except ValueError:  # No window fits in.
+                return None
+            held = [True] * len(model.windows)
+        if not any(held):
+            return None
+        before, after = model.simulate(()), model.simulate(effects)
+        return Outcome(
+            gap_measure(model, before, after, held),
+            series_of(model, before, after, held),
+            unexplained_in_windows(model, after),
         )
-    return _of_windows(model, checks, seconds, lap, say)
+
+    def _model(self) -> FreeBodyModel | WindowModel:
+        raise NotImplementedError
+
+    def _again(self, recordings: Sequence[Recording]) -> FreeBodyModel | WindowModel:
+        raise NotImplementedError
 
 
-def moved(names, prior, selection: Selection) -> dict[str, float]:
-    """What each nuisance is moved by, in units of its tolerance."""
-    b = selection.end.b
-    return {n: float(x / p) for n, x, p in zip(names, b, prior, strict=True)}
+class FlightProblem(FreeBodyModel, _Windowed):
+    """One body of spheres that flies, bounces, slides or rolls on what is fixed."""
 
-
-def _of_touch(model: TouchModel, checks, seconds, lap, say) -> GapResult:
-    say("measuring how tool and object touch")
-    nuisance, prior, names = model.nuisances()
-    clear = Screen(model.base(), nuisance, prior, model.train()).fit()
-    found = touch_candidates(model, nuisance) if clear.score > FLOOR else []
-    seconds["screen"] = lap()
-    selection = select(model, nuisance, prior, found, say)
-    seconds["select"] = lap()
-    start, end = selection.start.score, selection.end.score
-    verdict = verdict_of(selection.choices, start, end)
-    before, after = selection.start.left, selection.end.left
-    gap = model.measure(before, after)
-    every = selection
-    selection, near = told(every, verdict, gap.reduction)
-    if selection is not every:
-        after, end = before, start
-        gap = model.measure(before, after)
-    effects_named = [named(c, model.dynamics.plant) for c in selection.choices]
-    return GapResult(
-        verdict, says(verdict, effects_named, start, end, near),
-        model.where(before) if verdict != "no_gap" else [], effects_named,
-        gap, [], moved(names, prior, selection), checks,
-        model.series(before, after), selection.table,
-    )  # fmt: skip
-
-
-def _of_windows(model, checks, seconds, lap, say) -> GapResult:
-    nuisance, prior, names = contact_nuisances(model)
-    say("screening the catalogue by simulation")
-
-    def found(current: Fitted) -> list[Candidate]:
-        return contact_candidates(model, nuisance, current.effects, current.r)
-
-    clear = Screen(model.base(), nuisance, prior, model.train()).fit()
-    seconds["screen"] = lap()
-    selection = select(
-        model, nuisance, prior, found if clear.score > FLOOR else [], say, MOST_EFFECTS
+    plan = SearchPlan(
+        jumps=True,  # Where an object's spheres land in another order.
+        # Errors below the noise, which is mostly how unsure a start is, tell no two
+        # models apart.
+        least_error=1.0,
+        diff_step=2e-3,  # Smaller ones drown in the error of the steps.
+        # Laws of contact leave so much that no effect but the first takes off a tenth.
+        least_gain=0.05,
+        most_effects=MOST_EFFECTS,
     )
-    seconds["select"] = lap()
-    start, end = selection.start.score, selection.end.score
-    verdict = verdict_of(selection.choices, start, end)
-    before = model.simulate(())
-    after = model.simulate([c.effect for c in selection.choices])
-    gap = gap_measure(model, before, after)
-    every = selection
-    selection, near = told(every, verdict, gap.reduction)
-    if selection is not every:
-        after, end = before, start
-        gap = gap_measure(model, before, after)
-    where = where_in_windows(model, model.errors(before)) if verdict != "no_gap" else []
-    rest = unexplained_in_windows(model, after) if verdict == "gap_unnamed" else []
-    effects_named = [named(c, model.dynamics.plant) for c in selection.choices]
-    seconds["simulate"] = lap()
-    return GapResult(
-        verdict, says(verdict, effects_named, start, end, near), where, effects_named,
-        gap, rest, moved(names, prior, selection), checks,
-        series_of(model, before, after), selection.table,
-    )  # fmt: skip
+
+    def _model(self) -> FreeBodyModel:
+        return self
+
+    def _again(self, recordings: Sequence[Recording]) -> FreeBodyModel:
+        return FreeBodyModel(self.scene, recordings)
+
+
+class RolloutProblem(WindowModel, _Windowed):
+    """Anything else: windows simulated by Drake."""
+
+    # Each residual takes seconds.
+    plan = SearchPlan(evaluations=5, most_effects=MOST_EFFECTS)
+
+    def __init__(self, scene: Scene, recordings: Sequence[Recording]):
+        many = sum(len(r.episodes) for r in recordings) >= 6
+        super().__init__(scene, recordings, DRAKE_SEC, by_episode=many, most=DRAKE_MOST)
+
+    def _model(self) -> WindowModel:
+        return self
+
+    def _again(self, recordings: Sequence[Recording]) -> WindowModel:
+        return WindowModel(self.scene, recordings, DRAKE_SEC, most=DRAKE_MOST)
 
 
 def unexplained_in_windows(

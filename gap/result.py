@@ -79,12 +79,58 @@ class NamedEffect:
 
 
 @dataclass(frozen=True)
+class InUnits:
+    """Rms error of a channel, or of a joint's equation, before and after, in its own
+    unit. noise: standard deviation of a sample, as used."""
+
+    unit: str
+    before: float
+    after: float
+    noise: float
+
+
+@dataclass(frozen=True)
+class Trust:
+    """A parameter on parts of the data: by recording, over stretches of time, and
+    fitted from other starts. NaN where a part does not show it. ridge_with: another
+    parameter of which only a sum with this one shows; "" if there is none."""
+
+    kind: str
+    at: tuple[str, ...]
+    parameter: str
+    unit: str
+    value: float
+    std: float
+    recordings: Mapping[str, float]
+    stretches: Sequence[float]
+    starts: Sequence[float]
+    ridge_with: str = ""
+
+
+@dataclass(frozen=True)
+class JudgedChannel:
+    """How a measured channel was judged: "equations", "simulation", both, or "not".
+    noise: as used; noise_from: "given" or "estimated"."""
+
+    channel: str
+    unit: str
+    noise: float
+    noise_from: str
+    judged: str
+
+
+@dataclass(frozen=True)
 class GapMeasure:
     """Rms over held-out windows of (measured - simulated) over the noise.
 
     noise_floor: what a perfect model would leave. The noise that an error is divided
         by has in it how unsure its window's start is, so that this is 1.
     per_channel: {channel: {"before": , "after": }}, the same for each channel.
+    in_units: the same in the channels' own units. equations: of each joint's equation
+        of motion, where there are any: what the model leaves of its effort.
+    n_windows: that were compared, failed: of them those that could not be simulated to
+        their end, before and after. data: "reported" if neither a fit nor a choice saw
+        them, "chosen on" else.
     """
 
     before: float
@@ -92,6 +138,12 @@ class GapMeasure:
     noise_floor: float
     window_s: float
     per_channel: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    in_units: Mapping[str, InUnits] = field(default_factory=dict)
+    equations: Mapping[str, InUnits] = field(default_factory=dict)
+    n_windows: int = 0
+    failed: tuple[int, int] = (0, 0)
+    data: str = "reported"
+    seconds: float = 0.0  # Of recording that were compared.
 
     @property
     def reduction(self) -> float:
@@ -151,6 +203,9 @@ class GapResult:
     series: Sequence[Series] = ()
     candidates: Sequence[Mapping[str, Any]] = ()  # The screen's table, best first.
     seconds: Mapping[str, float] = field(default_factory=dict)
+    trust: Sequence[Trust] = ()
+    channels: Sequence[JudgedChannel] = ()
+    nuisance_scene: Sequence[Effect] = ()  # The links as the nuisances have them.
 
     def __post_init__(self):
         if self.verdict not in VERDICTS:
@@ -175,7 +230,13 @@ class GapResult:
                 "metric": "rms over held-out windows of (measured - simulated)/noise; "
                 "the noise of a sample and of its window's start",
                 "window_s": _number(self.gap.window_s),
-                "held_out": True,
+                "held_out": self.gap.data == "reported" and self.gap.seconds > 0.0,
+                "data": self.gap.data,
+                "seconds": _number(self.gap.seconds),
+                "windows": self.gap.n_windows,
+                "windows_failed": list(self.gap.failed),
+                "in_units": {k: _plain(v) for k, v in self.gap.in_units.items()},
+                "equations": {k: _plain(v) for k, v in self.gap.equations.items()},
                 "per_channel": {
                     name: {k: _number(v) for k, v in each.items()}
                     for name, each in self.gap.per_channel.items()
@@ -183,6 +244,8 @@ class GapResult:
             },
             "unexplained": [dict(vars(each)) for each in self.unexplained],
             "background": {k: _number(v) for k, v in self.background.items()},
+            "trust": [_plain(each) for each in self.trust],
+            "channels": [_plain(each) for each in self.channels],
             "checks": [dict(vars(each)) for each in self.checks],
         }
 
@@ -217,6 +280,19 @@ def _effect_json(each: NamedEffect) -> dict[str, Any]:
         ],
         "tell_apart": each.tell_apart,
     }
+
+
+def _plain(each) -> dict[str, Any]:
+    """A dataclass of numbers and words, as JSON may hold it."""
+
+    def of(value):
+        if isinstance(value, float):
+            return _number(value)
+        if isinstance(value, Mapping):
+            return {k: of(v) for k, v in value.items()}
+        return [of(v) for v in value] if isinstance(value, (tuple, list)) else value
+
+    return {k: of(v) for k, v in vars(each).items()}
 
 
 def _number(value: float) -> float | None:

@@ -1,112 +1,105 @@
 """Every effect of the catalogue that could act in a scene, by what it explains."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from makebreak.gap.inverse import SENSED, InverseModel
+from makebreak.gap.problem import Candidate, Nuisances
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import (
     Effect,
-    check_parameters,
     find_joints,
     full_name,
 )
-from makebreak.systems.numerics.selection import Columns, LinearFit, Screen
+from makebreak.systems.numerics.selection import LinearFit, Screen
 
 # How well links are known where the scene does not say [-], [m].
 LINK_MASS, LINK_COM = 0.03, 0.002
+REACH = 3.0  # Tolerances: beyond them a link is not known too little but wrong.
 # Kinds that are other kinds with more parameters: accepted only for a clear gain.
 NESTED = {
     "joint_stribeck_friction": ("joint_coulomb_friction", "joint_viscous_damping"),
+    "joint_direction_friction": ("joint_coulomb_friction", "actuator_bias"),
+    "joint_load_friction": ("joint_coulomb_friction",),
     "joint_spring": ("actuator_bias",),
     "sinusoidal_force": ("constant_force",),
 }
-BEYOND = 1.5  # Times what a model can lose at most is taken for all of it.
 _DELAYS = (0.004, 0.01, 0.02, 0.04)
 _ELASTIC = ("joint_elasticity", "joint_backlash")
 _DRIVEN = ("actuator_saturation", *_ELASTIC)
-# Links: background.
-_HIDDEN = ("object_mass", "object_com", "object_inertia", "link_mass", "link_com")
+# Of links: link_mass and link_com say it as a difference.
+_HIDDEN = ("object_mass", "object_com", "object_inertia")
 _SPEEDS = (0.03, 0.06, 0.1, 0.2)
+WAVES = 12  # Frequencies of a force that are tried on every link.
 _RIPPLES = tuple(float(n) for n in range(2, 25)) + (30.0, 36.0, 48.0, 60.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
-    """A kind at a place: alternatives of linear columns, and how they are read."""
-
-    kind: str
-    at: tuple[str, ...]
-    size: int  # Parameters that a fit chooses.
-    columns: tuple[Columns, ...]  # (m, k) each, over the noise.
-    to_parameters: tuple[Callable, ...]
-    fixed: tuple[str, ...] = ()  # Parameters that a fit leaves at neutral.
-    least: Mapping[str, float] = field(default_factory=dict)  # What the model allows.
-
-    @property
-    def name(self) -> str:
-        return f"{self.kind} at {', '.join(self.at)}"
-
-
-@dataclass(frozen=True, eq=False)
 class Ranked:
-    """A candidate with its best alternative's fit."""
+    """A candidate with the fit of its best alternative, and what that says."""
 
     candidate: Candidate
     fit: LinearFit
-    effect: Effect
+    effects: tuple[Effect, ...]
     valid: bool
+    alternative: int
+
+    @property
+    def columns(self) -> np.ndarray:
+        return self.candidate.columns[self.alternative]
+
+    def fixed(self) -> tuple[tuple[str, ...], ...]:
+        return self.candidate.fixed_of_each()
 
 
 def candidates(
-    model: InverseModel, nuisance: np.ndarray, prior: np.ndarray
+    model: InverseModel, nuisances: Nuisances, left: np.ndarray
 ) -> list[Candidate]:
     """All that can be seen in the equations of motion.
 
-    Args: nuisance (m, n_b), their columns; prior (n_b,) their standard deviations.
+    Args: left (m,): what the nuisances leave of the scene as it came.
     """
-    train = model.train()
-
-    def of(x: np.ndarray) -> Columns:
-        return Columns(x, nuisance, train)
-
     dynamics, motions = model.dynamics, model.motions()
-    worst = _worst_joints(model, nuisance, prior)
+    worst = _worst_joints(model, left)
     # A joint that has such an element in the scene can have no second one.
     elastic = {
         full_name(dynamics.plant, joint)
         for e in model.scene.effects if e.kind in _ELASTIC
         for joint in find_joints(e, dynamics.plant)
     }  # fmt: skip
+    screen = Screen(left, nuisances.columns, nuisances.prior, model.train())
     found: list[Candidate] = []
     for kind, entry in KINDS.items():
         if kind in _HIDDEN or entry.at in ("free body", "length", "pair", "ground"):
             continue
         if kind in SENSED:
-            found += _of_sensors(model, kind, of)
+            found += _of_sensors(model, kind)
             continue
         if kind in ("input_delay", "actuator_lag"):
-            found += _of_delays(model, kind, of)
+            found += _of_delays(model, kind)
             continue
         if entry.drive:
-            found += _of_drives(model, kind, of)
+            found += _of_drives(model, kind)
             continue
         if entry.signature is None:
             continue
-        for at in dynamics.places(kind):
+        waves: list | None = None
+        places = dynamics.places(kind)
+        for at in reversed(places) if kind == "sinusoidal_force" else places:
             if entry.at == "base" and at == "world":
                 continue
             if kind in _DRIVEN and not _driven(model, at):
                 continue
             if kind in _ELASTIC and (at not in worst or at in elastic):
                 continue
-            if kind == "sinusoidal_force" and at not in _links(model)[-1:]:
-                continue  # Of the last link alone: each frequency is a fit of its own.
             columns, readers = [], []
+            grids = _grids(model, kind, at, motions)
+            if kind == "sinusoidal_force":
+                grids = waves if waves is not None else grids
             # One value of a grid after the other: all at once would be gigabytes.
-            for grid in _grids(model, kind, at, motions):
+            for grid in grids:
                 groups = [dynamics.signatures(kind, [at], m, grid) for m in motions]
                 for same in zip(*groups, strict=True):
                     columns.append(model.columns_of([s.columns for s in same]))
@@ -115,26 +108,45 @@ def candidates(
                 continue
             if not any(np.abs(x).max(initial=0.0) > 0.0 for x in columns):
                 continue
+            if kind == "sinusoidal_force" and waves is None:
+                # All frequencies at the last link, and the best of them elsewhere.
+                fits = [screen.fit(x).train for x in columns]
+                best = np.argsort(fits)[:WAVES]
+                waves = [grids[k] for k in best]
+                columns = [columns[k] for k in best]
+                readers = [readers[k] for k in best]
             size = sum(not p.optional for p in entry.parameters)
             if kind == "body_drag":  # Few bodies show that they are slowed in turning.
                 found.append(
                     Candidate(
-                        kind, (at,), 1, (of(columns[0][:, [0]]),),
+                        kind, (at,), 1, (columns[0][:, [0]],),
                         (_one_of(readers[0], 0),), ("angular",),
                     )
                 )  # fmt: skip
             found.append(
                 Candidate(
-                    kind, (at,), size, tuple(map(of, columns)), tuple(readers),
+                    kind, (at,), size, tuple(columns), tuple(readers),
                     least=dynamics.least(kind, [at]),
                 )
             )  # fmt: skip
     return found
 
 
-def nuisances(model: InverseModel) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Columns (m, n_b) of the links' masses and centres of mass, prior standard
-    deviations in units of the coefficients, and names."""
+def rich_columns(model: InverseModel, found: Sequence[Candidate]) -> np.ndarray:
+    """(m, k) of all kinds with one parameter at all of their places, and a load at the
+    last link: what a model that lacks nothing ordinary would have."""
+    last = _links(model)[-1:]
+    columns = []
+    for c in found:
+        if c.columns[0].shape[1] == 1 and KINDS[c.kind].at != "base":
+            columns.append(c.columns[0])
+        elif KINDS[c.kind].at == "body" and list(c.at) == last and len(c.columns) == 1:
+            columns.append(c.columns[0])
+    return np.hstack(columns) if columns else np.zeros((len(model.train()), 0))
+
+
+def nuisances(model: InverseModel) -> Nuisances:
+    """The links' masses and centres of mass."""
     said = model.scene.tolerance
     share = float(said.get("link_mass", LINK_MASS))
     reach = float(said.get("link_com_m", LINK_COM))
@@ -156,57 +168,21 @@ def nuisances(model: InverseModel) -> tuple[np.ndarray, np.ndarray, list[str]]:
     columns, prior, names = columns + late, prior + period, names + of_what
     # A mass is known to its share, whatever unit its signature has.
     if not columns:
-        return np.zeros((len(model.train()), 0)), np.zeros(0), []
-    return np.stack(columns, axis=1), np.array(prior), names
+        return Nuisances.none(len(model.train()))
+    return Nuisances(np.stack(columns, axis=1), np.array(prior), tuple(names), REACH)
 
 
 def rank(screen: Screen, found: Sequence[Candidate]) -> list[Ranked]:
     """Candidates, the least held-out error first. Of alternatives that which fits the
-    training rows best is judged."""
+    training rows best is judged. Of a group any member may be none (it is pruned)."""
     ranked = []
     for candidate in found:
-        best = None
-        for columns, reader in zip(
-            candidate.columns, candidate.to_parameters, strict=True
-        ):
-            fit = screen.fit(columns)
-            if best is None or fit.train < best[0].train:
-                best = (fit, reader)
-        assert best is not None
-        parameters = best[1](best[0].c)
-        for name, least in candidate.least.items():
-            # Columns take what the model has for a little more than it is.
-            if BEYOND * least <= parameters[name] < least:
-                parameters[name] = least
-        effect = Effect(candidate.kind, list(candidate.at), parameters)
-        valid = is_sane(effect, candidate.least)
-        ranked.append(Ranked(candidate, best[0], effect, valid))
+        fits = [screen.fit(columns) for columns in candidate.columns]
+        k = min(range(len(fits)), key=lambda i: fits[i].train)
+        effects = candidate.effects(k, fits[k].c)
+        valid = bool(candidate.members) or candidate.is_sane(effects)
+        ranked.append(Ranked(candidate, fits[k], effects, valid, k))
     return sorted(ranked, key=lambda r: r.fit.score)
-
-
-def is_sane(effect: Effect, least: Mapping[str, float] | None = None) -> bool:
-    """Whether the parameters are allowed, and of a size that robots have.
-
-    Args: least, what the model allows (SceneDynamics.least).
-    """
-    entry = KINDS[effect.kind]
-    try:
-        check_parameters(effect, entry)
-    except ValueError:
-        return False
-    for each in entry.parameters:
-        value = effect.parameters.get(each.name)
-        if value is None or each.name == "phase":
-            continue
-        if value < (least or {}).get(each.name, -np.inf):
-            return False
-        width = each.high - each.low
-        if not each.low - 0.01 * width <= value <= each.high + 0.01 * width:
-            return False
-    return not (
-        effect.kind == "joint_stribeck_friction"
-        and effect.parameters["static"] < effect.parameters["coulomb"]
-    )
 
 
 def _links(model: InverseModel) -> list[str]:
@@ -224,10 +200,8 @@ def _driven(model: InverseModel, joint: str) -> bool:
     return model.commanded[model.joints.index(joint)]
 
 
-def _worst_joints(model: InverseModel, nuisance, prior, most: int = 3) -> list[str]:
+def _worst_joints(model: InverseModel, left: np.ndarray, most: int = 3) -> list[str]:
     """Those whose equations are met least, after the background."""
-    train = model.train()
-    _, left = Screen(model.base(), nuisance, prior, train).settle(model.base())
     names = model.names()
     size = {
         joint: float(np.mean(left[k :: len(names)] ** 2))
@@ -271,7 +245,7 @@ def _grid(model: InverseModel, kind: str, at: str, motions):
     return None
 
 
-def _of_delays(model: InverseModel, kind: str, of) -> list[Candidate]:
+def _of_delays(model: InverseModel, kind: str) -> list[Candidate]:
     """Of commands: by the difference that a delay makes, for a few delays."""
     name = "delay" if kind == "input_delay" else "time_constant"
     models = dict.fromkeys(j.split(".")[0] for j in model.joints)
@@ -279,10 +253,10 @@ def _of_delays(model: InverseModel, kind: str, of) -> list[Candidate]:
     places = [(m,) for m in models if any(j.startswith(f"{m}.") for j in driven)]
     if len(driven) > 1:
         places += [(j,) for j in driven]
-    return [c for at in places if (c := _secant(model, kind, at, name, of)) is not None]
+    return [c for at in places if (c := _secant(model, kind, at, name)) is not None]
 
 
-def _of_drives(model: InverseModel, kind: str, of) -> list[Candidate]:
+def _of_drives(model: InverseModel, kind: str) -> list[Candidate]:
     """Of drives' own numbers: by the difference that one more or less makes."""
     found = []
     for at in model.dynamics.places(kind):
@@ -298,11 +272,11 @@ def _of_drives(model: InverseModel, kind: str, of) -> list[Candidate]:
             return {name: now + float(c[0])}
 
         readers = (read,) * len(columns)
-        found.append(Candidate(kind, (at,), 1, tuple(map(of, columns)), readers))
+        found.append(Candidate(kind, (at,), 1, tuple(columns), readers))
     return found
 
 
-def _of_sensors(model: InverseModel, kind: str, of) -> list[Candidate]:
+def _of_sensors(model: InverseModel, kind: str) -> list[Candidate]:
     joints = model.joints
     models = tuple(dict.fromkeys(j.split(".")[0] for j in joints))
     name = {"joint_offset": "offset", "sensor_bias": "bias", "clock_skew": "skew",
@@ -329,7 +303,7 @@ def _of_sensors(model: InverseModel, kind: str, of) -> list[Candidate]:
         if kind == "sensor_delay":
             places.append(models)
     unique = [p for p in dict.fromkeys(places) if p]
-    found = [_secant(model, kind, at, name.get(kind, "delay"), of) for at in unique]
+    found = [_secant(model, kind, at, name.get(kind, "delay")) for at in unique]
     return [c for c in found if c is not None]
 
 
@@ -354,7 +328,7 @@ def inseparable(effect: Effect, model: InverseModel) -> Effect | None:
     return None
 
 
-def _secant(model: InverseModel, kind: str, at, name: str, of) -> Candidate | None:
+def _secant(model: InverseModel, kind: str, at, name: str) -> Candidate | None:
     steps = {"offset": (1e-3,), "bias": (1e-3,), "skew": (1e-4,)}.get(name, _DELAYS)
     if kind == "sensor_delay" and all(c.endswith(".velocity") for c in at):
         steps = (0.01,)
@@ -372,4 +346,4 @@ def _secant(model: InverseModel, kind: str, at, name: str, of) -> Candidate | No
     if not any(np.abs(x).max(initial=0.0) > 0.0 for x in columns):
         return None
     readers = (read,) * len(columns)
-    return Candidate(kind, tuple(at), 1, tuple(map(of, columns)), readers)
+    return Candidate(kind, tuple(at), 1, tuple(columns), readers)

@@ -1,12 +1,17 @@
-"""Which effects a scene lacks: forward by held-out error, then backward."""
+"""Which effects a scene lacks: forward by held-out error, then backward.
 
+Models are fitted to the rows that a problem's `train` names and chosen by the others.
+"""
+
+import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from makebreak.gap.fit import EVALUATIONS, Fitted, Model, fit_effects, wander
-from makebreak.gap.screen import NESTED, Candidate, Ranked, is_sane, rank
+from makebreak.gap.fit import derivative_free_search, fit_effects
+from makebreak.gap.problem import Candidate, Fitted, GapProblem, Nuisances
+from makebreak.gap.screen import NESTED, Ranked, rank
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.systems.numerics.selection import (
@@ -15,10 +20,10 @@ from makebreak.systems.numerics.selection import (
     Screen,
     is_plausible,
     paired,
+    paired_t,
     simplest,
 )
 
-MOST_EFFECTS = 4
 FINALISTS, FINALIST_RUNS = 4, 80  # Searched without slopes before one is chosen.
 FLOOR = 1.15  # Rms over noise that noise alone may leave (its estimate is that good).
 # Laws are approximations (how dry friction turns round, how commands are held): errors
@@ -29,6 +34,15 @@ PRECISION = 0.015
 MORE = 1
 # Two models that differ block by block by more than chance: less than this p-value.
 CHANCE = 0.01
+# An effect that does not take off `least_gain` of the whole may do it of one channel,
+# if blocks of time say so together (t) and the channel is above the noise.
+CHANNEL_GAIN, LEAST_T, ABOVE = 0.10, 2.0, 1.3
+# A member of a group stays if it is so many deviations from neutral, and its channel
+# is worse by this share without it; or worse by CHANNEL_GAIN.
+MEMBER_Z, MEMBER_GAIN = 3.0, 0.02
+FEWEST_MEMBERS = 3  # Of a group: two places are two effects.
+BEYOND = 1.0  # Tolerances over a nuisance's limit that are no chance among dozens.
+PAIRED = 10  # Candidates of which all pairs are tried against a single one.
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,240 +58,573 @@ class Choice:
     ties: tuple[Effect, ...]
     fixed: tuple[str, ...]
     size: int
+    in_group: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The chosen effects, in the order added. start: with no effect; end: with all."""
+    """The chosen effects, in the order added. start: with no effect; end: with all.
+    nuisances: as weighed at the end. beyond: those that would go beyond their limit,
+    and how far, in tolerances; far: whether all together are implausible."""
 
     choices: tuple[Choice, ...]
     start: Fitted
     end: Fitted
-    table: tuple[dict, ...] = field(default=())
+    nuisances: Nuisances
+    table: tuple[dict, ...] = ()
+    beyond: tuple[tuple[str, float], ...] = ()
+    far: bool = False
+
+    def screen(self, problem: GapProblem) -> Screen:
+        """As the end was fitted with."""
+        n, scale = self.nuisances, max(self.end.fit.train, 1.0) * problem.correlation
+        return Screen(self.end.r, n.columns, n.prior, problem.train(), scale, n.reach)
+
+    def effects(self) -> list[Effect]:
+        return [c.effect for c in self.choices]
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """Candidates that were added at once, with their exact fit."""
+
+    fitted: Fitted
+    chosen: tuple[Choice, ...]
 
 
 def select(
-    model: Model,
-    nuisance: np.ndarray,
-    prior: np.ndarray,
-    found: Sequence[Candidate] | Callable[[Fitted], Sequence[Candidate]],
-    say: Callable[[str], None] = lambda text: None,
-    most: int = MOST_EFFECTS,
+    problem: GapProblem, say: Callable[[str], None] = lambda text: None
 ) -> Selection:
     """Greedy forward selection with a refit of all after each addition; then whatever
-    is not needed any more is dropped.
-
-    Args: found: the candidates; or what gives them anew for what is there already,
-        where columns are no longer the same once an effect is added.
-    """
-    train = model.train()
-    plain = Screen(model.base(), nuisance, prior, train)
-    start = current = fit_effects(model, plain, ())
-    chosen: list[dict] = []
-    table: list[dict] = []
-    while found and len(chosen) < most and needs_more(current, prior):
-        step = _forward(model, nuisance, prior, found, chosen, current, start, say)
-        if not chosen:
-            table = step["table"]
-        if step.get("fitted") is None:
-            break
-        chosen.append(step)
-        current = _settled(model, nuisance, prior, chosen, step["fitted"])
-        for choice, effect in zip(chosen, current.effects, strict=True):
-            choice["effect"] = effect  # The next are fitted from here.
-    chosen, current = _backward(model, nuisance, prior, chosen, current, start)
-    if chosen:  # At last, against what all of them leave.
-        screen = Screen(current.r, nuisance, prior, train, current.fit.train)
-        fixed = [c["fixed"] for c in chosen]
-        current = fit_effects(model, screen, current.effects, fixed)
-        for k, choice in enumerate(chosen):
-            choice["ties"] = _still_tied(model, screen, chosen, current, k, start)
-    choices = tuple(
-        Choice(
-            effect, std, c["before"], c["after"], c["runner_up"], c["margin"],
-            c["ties"], c["fixed"], c["size"],
-        )
-        for c, effect, std in zip(chosen, current.effects, current.std, strict=True)
-    )  # fmt: skip
-    return Selection(choices, start, current, tuple(table))
+    is not needed any more is dropped."""
+    return _Search(problem, say).run()
 
 
-def _settled(model, nuisance, prior, chosen, current: Fitted) -> Fitted:
-    """A fit that was stopped short, as all of a short list are, carried on: what it
-    has not reached yet would be looked for in other effects."""
-    fixed = [c["fixed"] for c in chosen]
-    jumps = getattr(model, "jumps", False)
-    steps = 2 * int(getattr(model, "evaluations", EVALUATIONS))
-    for far in (False, True) if jumps else (False,):
-        if not needs_more(current, prior):
-            break
-        screen = Screen(current.r, nuisance, prior, model.train(), current.fit.train)
-        effects = current.effects
-        if jumps:
-            effects = wander(model, screen, effects, fixed, far)
-        more = fit_effects(model, screen, effects, fixed, steps)
-        if more.fit.train < current.fit.train:
-            current = more
-            chosen[-1]["after"] = more.score
-    return current
+class _Search:
+    def __init__(self, problem: GapProblem, say: Callable[[str], None]):
+        self.problem, self.say, self.plan = problem, say, problem.plan
+        self.train = problem.train()
+        self.nuisances = problem.nuisances()
+        self.start = fit_effects(problem, self._screen(problem.base()), ())
+        self.channel = problem.channel_of_rows()
 
-
-def needs_more(fit: Fitted, prior: np.ndarray) -> bool:
-    """Whether held-out rows are worse than noise, or the background is beyond what its
-    tolerance allows."""
-    return fit.fit.held_out > FLOOR or not is_plausible(fit.b, prior)
-
-
-def _forward(model, nuisance, prior, found, chosen, current, start, say) -> dict:
-    train = model.train()
-    if callable(found):
-        found = found(current)
-    taken = {(c["effect"].kind, tuple(c["effect"].at)) for c in chosen}
-    open_ = [c for c in found if (c.kind, c.at) not in taken]
-    screen = Screen(current.r, nuisance, prior, train)
-    ranked = _sane(rank(screen, open_))
-    if not ranked:
-        return {"table": []}
-    # What even the best leaves is no noise: nuisances are weighed against it.
-    scale = 1.0
-    for _ in range(2):
-        if ranked[0].fit.train < 1.2 * scale and scale < 1.2 * ranked[0].fit.train:
-            break
-        scale = max(ranked[0].fit.train, 1.0)
-        screen = Screen(current.r, nuisance, prior, train, scale)
-        ranked = _sane(rank(screen, open_))
-    base = screen.judge(current.r)
-    table = [
-        {"kind": r.candidate.kind, "at": list(r.candidate.at),
-         "score": r.fit.score / max(base.score, 1e-12),
-         "parameters": dict(r.effect.parameters)}
-        for r in ranked[:15]
-    ]  # fmt: skip
-    short = _shortlist(ranked, base.score)
-    if not short:
-        return {"table": table}
-    sound = _fit_each(model, screen, chosen, short, say)
-    for _ in range(2 if len(prior) else 0):
-        least = min((f.fit.train for f, _ in sound), default=scale)
-        if not max(least, 1.0) < 0.8 * scale:
-            break
-        # Exactly fitted less is left: nuisances are weighed against that.
-        scale = max(least, 1.0)
-        screen = Screen(current.r, nuisance, prior, train, scale)
-        base = screen.judge(current.r)
-        sound = _fit_each(model, screen, chosen, [r for _, r in sound], say, sound)
-    if not sound:
-        return {"table": table}
-    blur = PRECISION * start.score
-
-    floor = getattr(model, "least_error", 0.0)
-
-    def error(score: float) -> float:
-        return float(np.hypot(max(score, floor), blur))
-
-    errors = [error(f.score) for f, _ in sound]
-    sizes = [r.candidate.size for _, r in sound]
-    pick = simplest(errors, sizes, SAME)
-    fit, best = sound[pick]
-    # Bodies whose origins coincide: the outermost, as loads and forces mostly are.
-    for k, (other, r) in enumerate(sound):
-        same = (r.candidate.kind, r.candidate.size) == (
-            best.candidate.kind, best.candidate.size,
+    def run(self) -> Selection:
+        problem = self.problem
+        current, chosen = self.start, list[Choice]()
+        table: list[dict] = []
+        for _ in range(self.plan.most_effects):  # A group counts as one.
+            if not self._needs_more(current):
+                break
+            found = problem.candidates(self.nuisances, current)
+            step, rows = self._forward(found, chosen, current)
+            table = table or rows
+            if step is None:
+                break
+            chosen += step.chosen
+            current = self._settled(chosen, step.fitted)
+            chosen = _refreshed(chosen, current)  # The next are fitted from here.
+            if problem.reweigh(current.left):
+                # Less is left than was taken for the least: all is weighed by that.
+                self.nuisances = problem.nuisances()
+                self.start = fit_effects(problem, self._screen(problem.base()), ())
+                current = self._refitted(chosen, current)
+                chosen = _refreshed(chosen, current)
+        chosen, current = self._backward(chosen, current)
+        while chosen:  # At last, against what all of them leave.
+            current = self._refitted(chosen, current)
+            chosen = _refreshed(chosen, current)
+            sure = [c for c in chosen if is_significant(c)]
+            if len(sure) == len(chosen):
+                break
+            chosen = sure
+        else:
+            current = self.start
+        if chosen:
+            chosen = [
+                replace(c, ties=self._still_tied(chosen, current, k))
+                for k, c in enumerate(chosen)
+            ]
+        beyond = self._beyond(current)
+        far = bool(beyond) or not is_plausible(current.b, self.nuisances.prior)
+        return Selection(
+            tuple(chosen), self.start, current, self.nuisances, tuple(table),
+            beyond, far,
         )  # fmt: skip
-        if same and error(other.score) <= 1.002 * error(fit.score):
-            if found.index(r.candidate) > found.index(best.candidate):
-                pick, fit, best = k, other, r
-    # A model inside a bigger one stays unless the bigger gains clearly.
-    for k, (inner, r) in enumerate(sound):
-        inside = r.candidate.kind in NESTED.get(best.candidate.kind, ())
-        near = error(inner.score) <= (1.0 + NESTED_GAIN) * error(fit.score)
-        if inside and near and r.candidate.at == best.candidate.at:
-            pick, fit, best = k, inner, r
-            break
-    if not error(fit.score) < (1.0 - _least_gain(model)) * error(base.score):
-        return {"table": table}
-    others = [(f, r) for k, (f, r) in enumerate(sound) if k != pick]
-    ties = tuple(
-        f.effects[-1]
-        for f, r in others
-        if error(f.score) <= (1.0 + SAME) * error(fit.score)
-        and best.candidate.kind not in NESTED.get(r.candidate.kind, ())
-        and not (r.candidate.kind == best.candidate.kind)
-        and r.candidate.size <= best.candidate.size + MORE
-        and (
-            paired(f.left, fit.left, train) > CHANCE or max(f.score, fit.score) < floor
+
+    # ----- What is asked again and again
+
+    def _screen(self, r: np.ndarray, scale: float = 1.0) -> Screen:
+        """Nuisances are weighed against what is left, and by how many rows of it are
+        independent."""
+        n = self.nuisances
+        scale = max(scale, 1.0) * self.problem.correlation
+        return Screen(r, n.columns, n.prior, self.train, scale, n.reach)
+
+    def _needs_more(self, fitted: Fitted) -> bool:
+        """Whether held-out rows are worse than noise, or the background is beyond what
+        its tolerance allows."""
+        far = not is_plausible(fitted.b, self.nuisances.prior)
+        loud = self.problem.noise_error(fitted.left) > FLOOR
+        return loud or far or bool(self._beyond(fitted))
+
+    def _beyond(self, fitted: Fitted) -> tuple[tuple[str, float], ...]:
+        """Nuisances that would go clearly beyond their limit if they could, and how
+        far, in tolerances."""
+        n = self.nuisances
+        off = self._screen(fitted.r, fitted.fit.train).wanted(fitted.r)
+        return tuple(
+            (name, float(x))
+            for name, x in zip(n.names, off, strict=True)
+            if abs(x) > n.reach + BEYOND
         )
-        and _is_used(f)
-    )
-    runner = min(others, key=lambda o: o[0].score, default=None)
-    return {
-        "table": table,
-        "fitted": fit,
-        "effect": fit.effects[-1],
-        "fixed": tuple(best.candidate.fixed),
-        "size": best.candidate.size,
-        "before": base.score,
-        "after": fit.score,
-        "ties": ties,
-        "runner_up": runner[1].candidate.name if runner else "",
-        "margin": runner[0].score / fit.score - 1.0 if runner else np.inf,
-    }
 
+    def _error(self, score: float) -> float:
+        """A held-out error as far as it tells models apart."""
+        blur = PRECISION * self.start.score
+        return float(np.hypot(max(score, self.plan.least_error), blur))
 
-def _fit_each(
-    model, screen, chosen, short, say, known=()
-) -> list[tuple[Fitted, Ranked]]:
-    """Each of the short list with what is chosen already; those that make sense.
+    def _refitted(self, chosen: Sequence[Choice], current: Fitted) -> Fitted:
+        screen = self._screen(current.r, current.fit.train)
+        effects = [c.effect for c in chosen]
+        return fit_effects(self.problem, screen, effects, [c.fixed for c in chosen])
 
-    Args: known: fits of the same, from where to go on.
-    """
-    sound = []
-    for k, each in enumerate(short):
-        trial = [*[c["effect"] for c in chosen], each.effect]
-        if known:
-            trial = list(known[k][0].effects)
-        fixed = [*[c["fixed"] for c in chosen], each.candidate.fixed]
-        try:
-            fit = fit_effects(model, screen, trial, fixed)
-        except ValueError:
-            continue
-        say(f"  {each.candidate.name}: {fit.score:.3g}")
-        if is_sane(fit.effects[-1]) and np.isfinite(fit.score):
-            sound.append((fit, each))
-    if known or not getattr(model, "jumps", False):
+    def _earns(self, without: np.ndarray, with_: np.ndarray, pooled: bool) -> bool:
+        """Whether what an effect takes off residuals (m,) is worth it: of the whole, or
+        of one channel while no chance does it."""
+        if pooled:
+            return True
+        if not self.plan.by_channel:
+            return False
+        gain = self._channel_gains(without, with_)
+        t = paired_t(without, with_, self.train, self.channel)
+        return bool(len(gain)) and max(gain.values()) >= CHANNEL_GAIN and t > LEAST_T
+
+    def _channel_gains(self, without, with_) -> dict[int, float]:
+        """Of each channel above the noise, the share that is taken off its held-out
+        error, as far as laws are told apart."""
+        held = ~self.train
+        noisy = self.problem.in_noise(without)
+        found = {}
+        for k in np.unique(self.channel):
+            mine = held & (self.channel == k)
+            if not mine.any() or _rms(noisy[mine]) < ABOVE:
+                continue
+            blur = PRECISION * _rms(self.start.left[mine])
+            a, b = (
+                np.hypot(_rms(without[mine]), blur),
+                np.hypot(_rms(with_[mine]), blur),
+            )
+            found[int(k)] = 1.0 - b / a
+        return found
+
+    # ----- Forward
+
+    def _forward(
+        self, found: Sequence[Candidate], chosen: Sequence[Choice], current: Fitted
+    ) -> tuple[_Step | None, list[dict]]:
+        taken = {(c.effect.kind, tuple(c.effect.at)) for c in chosen}
+        open_ = [c for c in found if (c.kind, c.at) not in taken]
+        open_ += _groups(open_)
+        screen = self._screen(current.r)
+        ranked = [r for r in rank(screen, open_) if r.valid]
+        if not ranked:
+            return None, []
+        # What even the best leaves is no noise: nuisances are weighed against it.
+        scale = 1.0
+        for _ in range(2):
+            best = max(ranked[0].fit.train, 1.0)
+            if best < 1.2 * scale and scale < 1.2 * best:
+                break
+            scale = best
+            screen = self._screen(current.r, scale)
+            ranked = [r for r in rank(screen, open_) if r.valid]
+        base = screen.judge(current.r)
+        ranked = self._pruned(screen, ranked)
+        table = [
+            {"kind": r.candidate.kind, "at": list(r.candidate.at),
+             "score": r.fit.score / max(base.score, 1e-12),
+             "parameters": dict(r.effects[0].parameters)}
+            for r in ranked[:15]
+        ]  # fmt: skip
+        short = _shortlist(ranked, base.score)
+        if not self.plan.by_channel and ranked[0].fit.score > 0.95 * base.score:
+            short = []
+        if not short:
+            return None, table
+        sound = self._fit_each(screen, chosen, short)
+        for _ in range(2 if len(self.nuisances.prior) else 0):
+            least = min((f.fit.train for f, _ in sound), default=scale)
+            if not max(least, 1.0) < 0.8 * scale:
+                break
+            # Exactly fitted less is left: nuisances are weighed against that.
+            scale = max(least, 1.0)
+            screen = self._screen(current.r, scale)
+            base = screen.judge(current.r)
+            sound = self._fit_each(screen, chosen, [r for _, r in sound], sound)
+        if not sound:
+            return None, table
+        pick = self._picked(sound, found)
+        pair = self._pair(screen, chosen, ranked, sound[pick][0])
+        if pair is not None:
+            sound.append(pair)
+            pick = len(sound) - 1
+        fit, best_one = sound[pick]
+        left = screen.settle(current.r)[1]
+        gained = self._error(fit.score) < (1.0 - self.plan.least_gain) * self._error(
+            base.score
+        )
+        if not self._earns(left, fit.left, gained):
+            return None, table
+        return self._step(sound, pick, chosen, base.score), table
+
+    def _picked(self, sound, found: Sequence[Candidate]) -> int:
+        """The simplest of those that do as well as the best."""
+        errors = [self._error(f.score) for f, _ in sound]
+        pick = simplest(errors, [r.candidate.size for _, r in sound], SAME)
+        fit, best = sound[pick]
+        order = {id(c): k for k, c in enumerate(found)}
+        # Bodies whose origins coincide: the outermost, as loads and forces mostly are.
+        # The others are told as ties.
+        for k, (other, r) in enumerate(sound):
+            one, two = r.candidate, best.candidate
+            same = (one.kind, one.size) == (two.kind, two.size) and not one.members
+            if same and self._error(other.score) <= 1.002 * self._error(fit.score):
+                if order.get(id(one), -1) > order.get(id(two), -1):
+                    pick, fit, best = k, other, r
+        # A model inside a bigger one stays unless the bigger gains clearly.
+        for k, (inner, r) in enumerate(sound):
+            inside = r.candidate.kind in NESTED.get(best.candidate.kind, ())
+            near = self._error(inner.score) <= (1.0 + NESTED_GAIN) * self._error(
+                fit.score
+            )
+            if inside and near and r.candidate.at == best.candidate.at:
+                return k
+        return pick
+
+    def _pair(self, screen, chosen, ranked: Sequence[Ranked], single: Fitted):
+        """Two effects at once where they leave clearly less than the best single one:
+        what two do together another kind may imitate better than either of them."""
+        if self.plan.jumps or self.problem.noise_error(single.left) < FLOOR:
+            return None
+        best: dict[str, Ranked] = {}
+        for r in ranked:
+            if not r.candidate.members:
+                best.setdefault(r.candidate.kind, r)
+        tried = list(best.values())[:PAIRED]
+        trials = []
+        for a, b in itertools.combinations(tried, 2):
+            X = np.hstack([a.columns, b.columns])
+            fit = screen.fit(X)
+            k = a.columns.shape[1]
+            effects = (
+                *a.candidate.effects(a.alternative, fit.c[:k]),
+                *b.candidate.effects(b.alternative, fit.c[k:]),
+            )
+            if a.candidate.is_sane(effects[:1]) and b.candidate.is_sane(effects[1:]):
+                trials.append((fit.score, a, b, effects))
+        trials.sort(key=lambda t: t[0])
+        for score, a, b, effects in trials[:2]:
+            if not self._error(score) < (1.0 - NESTED_GAIN) * self._error(single.score):
+                break
+            both = Candidate(
+                f"{a.candidate.kind} and {b.candidate.kind}",
+                (*a.candidate.at, *b.candidate.at),
+                a.candidate.size + b.candidate.size,
+                (np.hstack([a.columns, b.columns]),), (),
+                members=(a.candidate, b.candidate),
+            )  # fmt: skip
+            found = self._fit_each(
+                screen, chosen,
+                [Ranked(both, screen.fit(both.columns[0]), effects, True, 0)],
+            )  # fmt: skip
+            for fitted, r in found:
+                less = (1.0 - NESTED_GAIN) * self._error(single.score)
+                if self._error(fitted.score) < less:
+                    return fitted, r
+        return None
+
+    def _step(self, sound, pick: int, chosen, base: float) -> _Step:
+        fit, best = sound[pick]
+        others = [(f, r) for k, (f, r) in enumerate(sound) if k != pick]
+        runner = min(others, key=lambda o: o[0].score, default=None)
+        ties = () if best.candidate.members else self._ties(fit, best, others)
+        new = fit.effects[len(chosen) :]
+        sizes = [len(fit.std[len(chosen) + k]) for k in range(len(new))]
+        if len(new) == 1:
+            sizes = [best.candidate.size]
+        fixed = best.fixed()
+        return _Step(
+            fit,
+            tuple(
+                Choice(
+                    effect, {}, base, fit.score,
+                    runner[1].candidate.name if runner else "",
+                    runner[0].score / fit.score - 1.0 if runner else np.inf,
+                    ties, fixed[k], sizes[k], len(new) > 2,
+                )
+                for k, effect in enumerate(new)
+            ),
+        )  # fmt: skip
+
+    def _ties(self, fit: Fitted, best: Ranked, others) -> tuple[Effect, ...]:
+        """Of another kind, or of the same at another place."""
+        error, floor = self._error, self.plan.least_error
+        ties = []
+        for f, r in others:
+            if r.candidate.members:
+                continue
+            if best.candidate.kind in NESTED.get(r.candidate.kind, ()):
+                continue
+            if r.candidate.size > best.candidate.size + MORE or not _is_used(f):
+                continue
+            if r.candidate.kind == best.candidate.kind and self.problem.is_one_place(
+                r.candidate.at, best.candidate.at
+            ):
+                continue
+            alike = (
+                paired(f.left, fit.left, self.train) > CHANCE
+                or max(f.score, fit.score) < floor
+            )
+            if error(f.score) <= (1.0 + SAME) * error(fit.score) and alike:
+                ties.append(f.effects[-1])
+        return tuple(ties)
+
+    def _fit_each(
+        self, screen: Screen, chosen, short: Sequence[Ranked], known=()
+    ) -> list[tuple[Fitted, Ranked]]:
+        """Each of the short list with what is chosen already; those that make sense.
+
+        Args: known: fits of the same, from where to go on.
+        """
+        sound = []
+        for k, each in enumerate(short):
+            trial = [*[c.effect for c in chosen], *each.effects]
+            if known:
+                trial = list(known[k][0].effects)
+            fixed = [*[c.fixed for c in chosen], *each.fixed()]
+            try:
+                fit = fit_effects(self.problem, screen, trial, fixed)
+            except ValueError:
+                continue
+            self.say(f"  {each.candidate.name}: {fit.score:.3g}")
+            if _is_fit(fit, each, len(chosen)):
+                sound.append((fit, each))
+        if known or not self.plan.jumps:
+            return sound
+        # The best few once more, without slopes: else one whose fit got stuck loses.
+        best = sorted(range(len(sound)), key=lambda k: sound[k][0].score)[:FINALISTS]
+        for k in best if sound and sound[best[0]][0].score > FLOOR else []:
+            fit, each = sound[k]
+            fixed = [*[c.fixed for c in chosen], *each.fixed()]
+            try:
+                effects = derivative_free_search(
+                    self.problem, screen, fit.effects, fixed, most=FINALIST_RUNS
+                )
+                better = fit_effects(self.problem, screen, effects, fixed)
+            except ValueError:
+                continue
+            if better.fit.train < fit.fit.train and _is_fit(better, each, len(chosen)):
+                sound[k] = better, each
+                self.say(f"  {each.candidate.name}: {better.score:.3g}")
         return sound
-    # The best few once more, without slopes: else the one whose fit got stuck loses.
-    best = sorted(range(len(sound)), key=lambda k: sound[k][0].score)[:FINALISTS]
-    for k in best if sound and sound[best[0]][0].score > FLOOR else []:
-        fit, each = sound[k]
-        fixed = [*[c["fixed"] for c in chosen], each.candidate.fixed]
-        try:
-            effects = wander(model, screen, fit.effects, fixed, most=FINALIST_RUNS)
-            better = fit_effects(model, screen, effects, fixed)
-        except ValueError:
-            continue
-        if better.fit.train < fit.fit.train and is_sane(better.effects[-1]):
-            sound[k] = better, each
-            say(f"  {each.candidate.name}: {better.score:.3g}")
-    return sound
+
+    def _pruned(self, screen: Screen, ranked: list[Ranked]) -> list[Ranked]:
+        """Groups without the members that do not earn their place; those that are then
+        smaller than a group are none."""
+        out = []
+        for each in ranked:
+            if each.candidate.members:
+                smaller = self._prune(screen, each)
+                if smaller is not None:
+                    out.append(smaller)
+            else:
+                out.append(each)
+        return sorted(out, key=lambda r: r.fit.score)
+
+    def _prune(self, screen: Screen, group: Ranked) -> Ranked | None:
+        members = list(group.candidate.members)
+        held = ~self.train
+
+        def fit_of(some):
+            X = np.hstack([m.columns[0] for m in some])
+            fit = screen.fit(X)
+            return X, fit, screen.r - X @ fit.c
+
+        while len(members) >= 2:
+            X, fit, r = fit_of(members)
+            left = screen.settle(r)[1]
+            z = np.abs(fit.c) / np.maximum(fit.c_std, 1e-300)
+            effects = [m.effects(0, fit.c[[k]])[0] for k, m in enumerate(members)]
+            bad = [k for k, m in enumerate(members) if not m.is_sane([effects[k]])]
+            order = bad or np.argsort(z).tolist()
+            for k in order:
+                rest = members[:k] + members[k + 1 :]
+                if k in bad:
+                    members = rest
+                    break
+                without = screen.settle(fit_of(rest)[2])[1]
+                gains = [
+                    1.0 - _rms(left[mine]) / max(_rms(without[mine]), 1e-12)
+                    for c in np.unique(self.channel)
+                    if (mine := held & (self.channel == c)).any()
+                ]
+                least = MEMBER_GAIN if z[k] >= MEMBER_Z else CHANNEL_GAIN
+                if max(gains) < least:
+                    members = rest
+                    break
+            else:
+                break
+        if len(members) < 2:
+            return None
+        X, fit, _ = fit_of(members)
+        candidate = replace(
+            group.candidate,
+            at=tuple(at for m in members for at in m.at),
+            size=len(members),
+            columns=(X,),
+            members=tuple(members),
+        )
+        found = candidate.effects(0, fit.c)
+        sane = candidate.is_sane(found)
+        return Ranked(candidate, fit, found, sane, 0) if sane else None
+
+    # ----- After a step
+
+    def _settled(self, chosen: Sequence[Choice], current: Fitted) -> Fitted:
+        """A fit that was stopped short, as all of a short list are, carried on: what it
+        has not reached yet would be looked for in other effects."""
+        fixed = [c.fixed for c in chosen]
+        steps = 2 * self.plan.evaluations
+        for far in (False, True) if self.plan.jumps else (False,):
+            if not self._needs_more(current):
+                break
+            screen = self._screen(current.r, current.fit.train)
+            effects = current.effects
+            if self.plan.jumps:
+                effects = derivative_free_search(
+                    self.problem, screen, effects, fixed, far
+                )
+            more = fit_effects(self.problem, screen, effects, fixed, steps)
+            if more.fit.train < current.fit.train:
+                current = more
+        return current
+
+    def _still_tied(self, chosen, current: Fitted, k: int) -> tuple[Effect, ...]:
+        """Rivals of an effect that do as well as it among all the others."""
+        if len(chosen) < 2:
+            return chosen[k].ties
+        screen = self._screen(current.r, current.fit.train)
+        fixed = [c.fixed for c in chosen]
+        tied = []
+        for rival in chosen[k].ties:
+            trial = [*current.effects[:k], rival, *current.effects[k + 1 :]]
+            held = [*fixed[:k], (), *fixed[k + 1 :]]
+            try:
+                fit = fit_effects(self.problem, screen, trial, held)
+            except ValueError:
+                continue
+            near = self._error(fit.score) <= (1.0 + SAME) * self._error(current.score)
+            if near and paired(fit.left, current.left, self.train) > CHANCE:
+                tied.append(fit.effects[k])
+        return tuple(tied)
+
+    def _backward(self, chosen: list[Choice], current: Fitted):
+        """Drops effects without which the error hardly grows, the least needed
+        first."""
+        while len(chosen) > 1:
+            screen = self._screen(current.r, current.fit.train)
+            now = screen.judge(current.r)
+            left = screen.settle(current.r)[1]
+            needless: list[tuple[float, int, Fitted]] = []
+            for k in range(len(chosen)):
+                rest = [e for i, e in enumerate(current.effects) if i != k]
+                fixed = [c.fixed for i, c in enumerate(chosen) if i != k]
+                try:
+                    smaller = fit_effects(self.problem, screen, rest, fixed, 5)
+                except ValueError:  # What is left would be no scene.
+                    continue
+                least = (1.0 - self.plan.least_gain) * self._error(smaller.score)
+                pooled = self._error(now.score) < least
+                if not self._stays(chosen[k], smaller.left, left, pooled):
+                    needless.append((smaller.score, k, smaller))
+            if not needless:
+                break
+            _, k, current = min(needless, key=lambda each: each[0])
+            chosen = [c for i, c in enumerate(chosen) if i != k]
+        return chosen, current
+
+    def _stays(self, choice: Choice, without, with_, pooled: bool) -> bool:
+        if self._earns(without, with_, pooled):
+            return True
+        if not self.plan.by_channel or not choice.in_group:
+            return False
+        # One of a group, of which the others were seen.
+        gains = self._channel_gains(without, with_)
+        return max(gains.values(), default=0.0) >= MEMBER_GAIN and _is_sure(choice)
 
 
-def _still_tied(model, screen, chosen, current, k: int, start) -> tuple[Effect, ...]:
-    """Rivals of an effect that do as well as it among all the others."""
-    train, blur = model.train(), PRECISION * start.score
-    fixed = [c["fixed"] for c in chosen]
-    tied = []
-    for rival in chosen[k]["ties"] if len(chosen) > 1 else ():
-        trial = [*current.effects[:k], rival, *current.effects[k + 1 :]]
-        held = [*fixed[:k], (), *fixed[k + 1 :]]
-        try:
-            fit = fit_effects(model, screen, trial, held)
-        except ValueError:
+def _refreshed(chosen: Sequence[Choice], fitted: Fitted) -> list[Choice]:
+    """The choices with the parameters of a fit of all of them."""
+    return [
+        replace(c, effect=effect, std=std, after=fitted.score if k == len(chosen) - 1
+                else c.after)
+        for k, (c, effect, std) in enumerate(
+            zip(chosen, fitted.effects, fitted.std, strict=True)
+        )
+    ]  # fmt: skip
+
+
+def _groups(found: Sequence[Candidate]) -> list[Candidate]:
+    """Each kind with one parameter at all of its joints or channels at once."""
+    by_kind: dict[str, list[Candidate]] = {}
+    for c in found:
+        place = KINDS[c.kind].at
+        single = len(c.columns) == 1 and c.columns[0].shape[1] == 1 and len(c.at) == 1
+        if place in ("joint", "actuator", "channel") and single and not c.fixed:
+            by_kind.setdefault(c.kind, []).append(c)
+    return [
+        Candidate(
+            kind, tuple(m.at[0] for m in members), len(members),
+            (np.hstack([m.columns[0] for m in members]),), (), members=tuple(members),
+        )
+        for kind, members in by_kind.items()
+        if len(members) >= FEWEST_MEMBERS
+    ]  # fmt: skip
+
+
+def _is_fit(fit: Fitted, of: Ranked, first: int) -> bool:
+    """Whether a fit of a candidate came to something that can be."""
+    sane = of.candidate.is_sane(fit.effects[first:])
+    return bool(np.isfinite(fit.score)) and sane
+
+
+def is_significant(choice: Choice) -> bool:
+    """Whether an effect is told from none: the parameters that make it one are off
+    neutral by more than their deviation, within what the kind can be, and no interval
+    of them is infinite; and so are half of all."""
+    kind = KINDS[choice.effect.kind]
+    clear, some, wide, n = 0, 0, 0, 0
+    for each in kind.parameters:
+        value = choice.effect.parameters.get(each.name)
+        spread = choice.std.get(each.name)
+        if value is None or spread is None or each.name in choice.fixed:
             continue
-        near = np.hypot(fit.score, blur) <= (1.0 + SAME) * np.hypot(current.score, blur)
-        if near and paired(fit.left, current.left, train) > CHANCE:
-            tied.append(fit.effects[k])
-    return tuple(tied) if len(chosen) > 1 else chosen[k]["ties"]
+        n += 1
+        infinite = not spread < each.high - each.low
+        wide += infinite
+        if each.neutral is not None:
+            some += 1
+            clear += abs(value - each.neutral) > spread and not infinite
+    return 2 * wide < max(n, 1) and (clear > 0 or some == 0)
+
+
+def _is_sure(choice: Choice) -> bool:
+    """Whether a parameter is clearly off its neutral value."""
+    return any(
+        abs(choice.effect.parameters[p.name] - p.neutral) > MEMBER_Z * spread
+        for p in KINDS[choice.effect.kind].parameters
+        if p.neutral is not None and (spread := choice.std.get(p.name, np.inf)) < np.inf
+    )
 
 
 def _is_used(fit: Fitted) -> bool:
@@ -292,30 +639,27 @@ def _is_used(fit: Fitted) -> bool:
     return True
 
 
-def _least_gain(model: Model) -> float:
-    """What an effect must take off the error, as a share of it."""
-    return getattr(model, "least_gain", NESTED_GAIN)
-
-
-def _sane(ranked: list[Ranked]) -> list[Ranked]:
-    return [r for r in ranked if r.valid]
+def _rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(x**2))) if len(x) else 0.0
 
 
 def _shortlist(ranked: list[Ranked], base: float) -> list[Ranked]:
-    """Those worth an exact fit: near the best, at most two of a kind and size; and of
-    each kind that the catalogue says to be confused with the best, the best place."""
-    best = ranked[0].fit.score
-    if best > 0.95 * base:
+    """Those worth an exact fit: near the best, at most two of a kind and size, or all
+    places that do alike; and of each kind that the catalogue says to be confused with
+    the best, the best place."""
+    if not ranked:
         return []
+    best = ranked[0].fit.score
     short: list[Ranked] = []
     for each in ranked:
-        of_kind = sum(
-            (r.candidate.kind, r.candidate.size)
-            == (each.candidate.kind, each.candidate.size)
-            for r in short
-        )
+        like = [
+            r for r in short
+            if (r.candidate.kind, r.candidate.size, bool(r.candidate.members))
+            == (each.candidate.kind, each.candidate.size, bool(each.candidate.members))
+        ]  # fmt: skip
         near = each.fit.score < max(1.6 * best, best + 0.15 * (base - best))
-        if near and of_kind < 2 and len(short) < 7:
+        alike = like and each.fit.score <= 1.02 * like[0].fit.score
+        if near and len(like) < (4 if alike else 2) and len(short) < 8:
             short.append(each)
     there = {r.candidate.kind for r in short}
     first = ranked[0].candidate.kind
@@ -326,29 +670,3 @@ def _shortlist(ranked: list[Ranked], base: float) -> list[Ranked]:
             short.append(each)
             there.add(kind)
     return short
-
-
-def _backward(model, nuisance, prior, chosen, current, start):
-    """Drops effects without which the error hardly grows, the least needed first."""
-    while len(chosen) > 1:
-        screen = Screen(current.r, nuisance, prior, model.train(), current.fit.train)
-        now = screen.judge(current.r).score
-        without: list[Fitted | None] = []
-        for k in range(len(chosen)):
-            rest = [e for i, e in enumerate(current.effects) if i != k]
-            fixed = [c["fixed"] for i, c in enumerate(chosen) if i != k]
-            try:
-                without.append(fit_effects(model, screen, rest, fixed, 5))
-            except ValueError:  # What is left would be no scene.
-                without.append(None)
-        k = int(np.argmin([w.score if w else np.inf for w in without]))
-        smaller = without[k]
-        if smaller is None:
-            break
-        blur = PRECISION * start.score
-        least = (1.0 - _least_gain(model)) * np.hypot(smaller.score, blur)
-        if np.hypot(now, blur) < least:
-            break
-        chosen = [c for i, c in enumerate(chosen) if i != k]
-        current = smaller
-    return chosen, current

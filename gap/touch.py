@@ -14,16 +14,16 @@ from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.diagrams.scene_simulation import stand_on_ground
+from makebreak.gap.problem import Candidate, Nuisances
 from makebreak.gap.recording import Recording
-from makebreak.gap.result import GapMeasure, Series, Where
-from makebreak.gap.screen import Candidate
+from makebreak.gap.result import GapMeasure, InUnits, Series, Where
 from makebreak.gap.windows import LARGEST
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import Scene, load_scene
 from makebreak.systems.numerics.filters import mean_delay
-from makebreak.systems.numerics.selection import Columns, benjamini_hochberg
+from makebreak.systems.numerics.selection import benjamini_hochberg
 
 SHAPES = 2e-4  # How well shapes are known where the scene does not say [m].
 # And a camera: its place [m], its scale; its clock to a sample.
@@ -60,9 +60,6 @@ class TouchModel:
     Raises: ValueError if the recordings hold no such touch: they need the joints'
         positions, a force at a body of the mechanism, and x and y of a free body.
     """
-
-    # Two explanations that both leave less than the allowance for shapes are a tie.
-    least_error = 1.0
 
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
         self.scene, self.recordings = scene, list(recordings)
@@ -148,9 +145,8 @@ class TouchModel:
             variance += (slope * recording.channels[name].noise) ** 2
         return np.sqrt(variance)
 
-    def nuisances(self) -> tuple[np.ndarray, np.ndarray, list[str]]:
-        """Of each object that is seen: where the camera is, its scale and its clock.
-        Columns (n, n_b), prior standard deviations and names."""
+    def nuisances(self) -> Nuisances:
+        """Of each object that is seen: where the camera is, its scale and its clock."""
         things = dict.fromkeys(touch.thing for touch in self.touches)
         columns, prior, names = [], [], []
         for thing in things:
@@ -180,7 +176,7 @@ class TouchModel:
                 columns.append(np.concatenate(each))
                 prior.append(sizes[name.split(" ")[0]])
                 names.append(name)
-        return np.stack(columns, axis=1), np.array(prior), names
+        return Nuisances(np.stack(columns, axis=1), np.array(prior), tuple(names))
 
     # ----- Distances
 
@@ -299,22 +295,36 @@ class TouchModel:
             yield touch, *(x[first:last] for x in arrays)
             first = last
 
-    def measure(self, before: np.ndarray, after: np.ndarray) -> GapMeasure:
-        """Args: residuals (n,)."""
-        held = ~self.train()
-        if not held.any():
-            held[:] = True
+    def channel_of_rows(self) -> np.ndarray:
+        """(m,) number of the touch of each row."""
+        sizes = [len(touch.rows) for touch in self.touches]
+        return np.repeat(np.arange(len(sizes)), sizes)
+
+    def measure(
+        self, before: np.ndarray, after: np.ndarray, held: np.ndarray
+    ) -> GapMeasure:
+        """Args: residuals (n,), and which of them count (n,)."""
         names: dict[str, list] = {}
-        for touch, h, a, b in self._parts(held, before, after):
-            names.setdefault(touch.name, []).append((a[h], b[h]))
-        per_channel = {
-            name: {
-                key: _rms(np.concatenate([pair[k] for pair in pairs]))
-                for k, key in enumerate(("before", "after"))
-            }
-            for name, pairs in names.items()
-        }
-        return GapMeasure(_rms(before[held]), _rms(after[held]), 1.0, 0.0, per_channel)
+        for touch, h, a, b, std in self._parts(held, before, after, self.std):
+            names.setdefault(touch.name, []).append((a[h], b[h], std[h]))
+        per_channel, in_units = {}, {}
+        for name, pairs in names.items():
+            a, b, std = (np.concatenate(each) for each in zip(*pairs, strict=True))
+            per_channel[name] = {"before": _rms(a), "after": _rms(b)}
+            in_units[name] = InUnits("m", _rms(a * std), _rms(b * std), _rms(std))
+        return GapMeasure(
+            _rms(before[held]), _rms(after[held]), 1.0, 0.0, per_channel, in_units,
+            n_windows=int(held.sum()), seconds=self._seconds(held),
+        )  # fmt: skip
+
+    def _seconds(self, held: np.ndarray) -> float:
+        """How long of a recording the rows (n,) stand for."""
+        total = 0.0
+        for touch, h in self._parts(held):
+            time = self.recordings[touch.recording].time[touch.rows][h]
+            steps = np.diff(time)
+            total += float(steps[steps < BLOCK_SEC].sum())
+        return total
 
     def series(self, before: np.ndarray, after: np.ndarray) -> list[Series]:
         out = []
@@ -355,7 +365,7 @@ class TouchModel:
         return sorted(kept, key=lambda w: -w.score)[:40]
 
 
-def touch_candidates(model: TouchModel, nuisance: np.ndarray) -> list[Candidate]:
+def touch_candidates(model: TouchModel) -> list[Candidate]:
     """Sizes, heights, offsets and biases that distances show."""
     found = []
     things = {touch.thing for touch in model.touches}
@@ -383,11 +393,10 @@ def touch_candidates(model: TouchModel, nuisance: np.ndarray) -> list[Candidate]
             def read(c, name=name, start=now[name]):
                 return {name: start + float(c[0])}
 
-            columns = Columns(column, nuisance, model.train())
             # What stands elsewhere stands there for all that it carries: of a tie an
             # object's own size is the simpler.
             size = 1 if KINDS[kind].at == "free body" else 2
-            found.append(Candidate(kind, (at,), size, (columns,), (read,)))
+            found.append(Candidate(kind, (at,), size, (column,), (read,)))
     return found
 
 

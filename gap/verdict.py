@@ -6,7 +6,7 @@ from dataclasses import replace
 from pydrake.multibody.plant import MultibodyPlant
 
 from makebreak.gap.recording import unit_of
-from makebreak.gap.result import Estimate, Evidence, NamedEffect
+from makebreak.gap.result import Estimate, Evidence, GapMeasure, NamedEffect
 from makebreak.gap.select import FLOOR, Choice, Selection
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import (
@@ -30,16 +30,18 @@ def verdict_of(
     choices: Sequence[Choice], start: float, end: float, far: bool = False
 ) -> str:
     """Args: start, end: held-out error without and with all effects, the background
-    within its tolerance; far: it had to be moved far beyond."""
+    within its tolerance; far: it had to be moved beyond."""
     if not choices:
         calm = start <= max(NO_GAP, FLOOR) and not far
         return "no_gap" if calm else "gap_unnamed"
-    if end > max(UNNAMED, UNNAMED_SHARE * start):
+    if far or end > max(UNNAMED, UNNAMED_SHARE * start):
         return "gap_unnamed"
     return "ambiguous" if any(c.ties for c in choices) else "gap_named"
 
 
-def told(selection: Selection, verdict: str, closed: float) -> tuple[Selection, str]:
+def withdrawn_if_weak(
+    selection: Selection, verdict: str, closed: float
+) -> tuple[Selection, str]:
     """The selection, without effects where they are no name for the gap, and then what
     they are worth, in words. closed: share of the gap that they close, simulated."""
     if verdict != "gap_unnamed" or not selection.choices or closed >= TOLD:
@@ -50,6 +52,25 @@ def told(selection: Selection, verdict: str, closed: float) -> tuple[Selection, 
         "of it, too little to be named."
     )
     return replace(selection, choices=(), end=selection.start), near
+
+
+def two_figures(start: float, end: float, gap: GapMeasure) -> str:
+    """A sentence where equations, whose error goes from start to end, and simulated
+    windows disagree on what is left by more than a factor of two; else nothing."""
+    if not start > NO_GAP or not gap.window_s > 0.0 or not gap.before > NO_GAP:
+        return ""
+
+    def left(before: float, after: float) -> float:
+        return max((after - 1.0) / (before - 1.0), 0.1)
+
+    equations, simulated = left(start, end), left(gap.before, gap.after)
+    if 0.5 <= equations / simulated <= 2.0:
+        return ""
+    return (
+        f" The equations of motion say that {min(equations, 1.0):.0%} of the gap is "
+        f"left, simulation {simulated:.0%}: simulation is believed, for it is what the "
+        "repaired model is used for, and its errors add up as they do there."
+    )
 
 
 def named(choice: Choice, plant: MultibodyPlant) -> NamedEffect:
@@ -94,25 +115,41 @@ def named(choice: Choice, plant: MultibodyPlant) -> NamedEffect:
 def says(
     verdict: str,
     effects: Sequence[NamedEffect],
-    start: float,
-    end: float,
-    near: str = "",
+    gap: GapMeasure,
+    more: str = "",
 ) -> str:
-    """The first screen's sentence. near: what `told` left out, in words."""
+    """The first screen's sentence. more: what is to be added to it."""
+    before, after = f"{gap.before:.3g}", f"{gap.after:.3g}"
     if verdict == "no_gap":
         return (
             "The scene and the recordings agree: nothing is left beyond noise and "
-            f"tolerance (held-out error {start:.2g} times the noise)."
+            f"tolerance (held-out error {gap.before:.2g} times the noise).{more}"
         )
     words = " ".join(each.says for each in effects)
     if verdict == "gap_unnamed":
         head = f"{words} Beyond that, " if words else ""
         return head + (
             f"{'a' if head else 'A'} gap is left that no effect of the catalogue "
-            f"explains: held-out error {end:.3g} times the noise.{near}"
+            f"explains: held-out error {after} times the noise.{more}"
         )
     tail = ""
     if verdict == "ambiguous":
-        others = sorted({t.kind for e in effects for t in e.indistinguishable_from})
-        tail = f" These data cannot tell it apart from {', '.join(others)}."
-    return f"{words}{tail} Held-out error falls from {start:.3g} to {end:.3g}."
+        tail = _apart_from(effects)
+    return f"{words}{tail} Held-out error falls from {before} to {after}.{more}"
+
+
+def _apart_from(effects: Sequence[NamedEffect]) -> str:
+    """What the data do not tell the effects from, in words."""
+    kinds = sorted(
+        {t.kind for e in effects for t in e.indistinguishable_from if t.kind != e.kind}
+    )
+    places = sorted(
+        {", ".join(t.at) for e in effects for t in e.indistinguishable_from
+         if t.kind == e.kind}
+    )  # fmt: skip
+    text = ""
+    if kinds:
+        text += f" These data cannot tell it apart from {', '.join(kinds)}."
+    if places:
+        text += f" It may as well be at {' or '.join(places)}."
+    return text

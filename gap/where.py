@@ -1,6 +1,7 @@
 """Where a scene and its recordings disagree: channel, time, and what went on there."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -8,7 +9,6 @@ from scipy.stats import chi2
 from makebreak.gap.inverse import REST_SPEED, InverseModel
 from makebreak.gap.recording import unit_of
 from makebreak.gap.result import Unexplained, Where
-from makebreak.gap.windows import WindowModel
 from makebreak.models.effects.kind import full_name, one_dof_joints
 from makebreak.systems.numerics.selection import benjamini_hochberg
 
@@ -60,7 +60,7 @@ def where_in_motion(model: InverseModel, left: np.ndarray) -> list[Where]:
     return _merged(found, benjamini_hochberg(p, FALSE_RATE))
 
 
-def where_in_windows(model: WindowModel, errors: Sequence[np.ndarray]) -> list[Where]:
+def where_in_windows(model: Any, errors: Sequence[np.ndarray]) -> list[Where]:
     """Windows whose end is not where the scene would have it."""
     found, p = [], []
     for w, e in zip(model.windows, errors, strict=True):

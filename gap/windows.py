@@ -24,6 +24,7 @@ from makebreak.systems.numerics.smoother import smooth_filtered
 _POSITIONS = ("x", "y", "z")
 TURN = ("qw", "qx", "qy", "qz")
 _G = 9.81
+MARGIN_SEC = 0.1  # Before the first window of an episode.
 LARGEST = 200.0  # An error beyond so many standard deviations counts as this: after a
 # bounce the other way, how much farther it goes says nothing.
 
@@ -94,6 +95,12 @@ class WindowedResidual:
         """(m,) number of the window of each row."""
         return self._by_row(range(len(self.windows)))
 
+    def channel_of_rows(self) -> np.ndarray:
+        """(m,) index of the channel of each row."""
+        k = len(self.channels)
+        n = sum(w.rows.stop - w.rows.start for w in self.windows)
+        return np.tile(np.arange(k), n)[self.measured()]
+
 
 def seen_in(model, window) -> np.ndarray:
     """(n, n_channels) what was measured in a window; NaN where nothing was."""
@@ -108,8 +115,6 @@ class WindowModel(WindowedResidual):
     Args: window_sec, hop_sec: length, and from one start to the next. most: windows at
         most; a larger number is thinned evenly.
     """
-
-    evaluations = 5  # Of a fit: each takes seconds.
 
     def __init__(
         self,
@@ -223,7 +228,10 @@ class WindowModel(WindowedResidual):
             for k in at:
                 rough[max(k - 4, 0) : k + 5] = True
         commands = [recording.held(c.name)[episode.rows] for c in recording.commands()]
-        start_row = 0
+        # At an end a smoothed state is less sure than it knows, and what was commanded
+        # before is not known.
+        margin = min(MARGIN_SEC, 0.1 * (time[-1] - time[0]))
+        start_row = int(np.searchsorted(time, time[0] + margin))
         while start_row < len(time) - 3:
             t0 = time[start_row]
             last = int(np.searchsorted(time, t0 + self.window_sec, "right"))
@@ -418,15 +426,19 @@ class WindowModel(WindowedResidual):
         return initial
 
     def errors(self, simulated: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """(measured - simulated)/std of each window; 0 where nothing was measured or
-        simulated."""
+        """(measured - simulated)/std of each window, clipped as fits need it; 0 where
+        nothing was measured or simulated."""
+        each = self.errors_over(simulated, [w.std for w in self.windows])
+        return [np.clip(e, -LARGEST, LARGEST) for e in each]
+
+    def errors_over(
+        self, simulated: Sequence[np.ndarray], std: Sequence[np.ndarray]
+    ) -> list[np.ndarray]:
+        """(measured - simulated)/std of each window, as it is."""
         out = []
-        for w, y in zip(self.windows, simulated, strict=True):
-            if not len(y):
-                out.append(y)
-                continue
-            e = (seen_in(self, w) - y) / w.std
-            out.append(np.clip(np.where(np.isnan(e), 0.0, e), -LARGEST, LARGEST))
+        for w, y, size in zip(self.windows, simulated, std, strict=True):
+            e = (seen_in(self, w) - y) / size if len(y) else y
+            out.append(np.where(np.isnan(e), 0.0, e))
         return out
 
 

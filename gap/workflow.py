@@ -11,31 +11,42 @@ import numpy as np
 from makebreak.gap.checks import check_recordings
 from makebreak.gap.data.conditioning import condition
 from makebreak.gap.findings import Finding
-from makebreak.gap.fit import fit_effects
-from makebreak.gap.inverse import InverseModel
-from makebreak.gap.measure import WINDOW_SEC, measure
-from makebreak.gap.objects import of_objects
+from makebreak.gap.measure import WINDOW_SEC
+from makebreak.gap.mechanism import MechanismProblem
+from makebreak.gap.objects import FlightProblem, RolloutProblem, TouchProblem
 from makebreak.gap.parallel import side_by_side
+from makebreak.gap.problem import GapProblem, Outcome
 from makebreak.gap.recording import (
     Recording,
     check_against_scene,
     excerpt,
     read_recordings,
+    unit_of,
 )
-from makebreak.gap.result import GapResult
+from makebreak.gap.result import GapMeasure, GapResult, JudgedChannel
 from makebreak.gap.scene_facts import scene_facts, scene_names
-from makebreak.gap.screen import candidates, inseparable, nuisances
-from makebreak.gap.select import Choice, Selection, needs_more, select
-from makebreak.gap.verdict import UNNAMED, named, says, told, verdict_of
-from makebreak.gap.where import unexplained, where_in_motion
+from makebreak.gap.select import Choice, Selection, select
+from makebreak.gap.split import split, with_noise_of
+from makebreak.gap.trust import trust_in
+from makebreak.gap.verdict import (
+    NO_GAP,
+    TOLD,
+    UNNAMED,
+    named,
+    says,
+    two_figures,
+    verdict_of,
+    withdrawn_if_weak,
+)
 from makebreak.gap.windows import WindowModel, with_step
 from makebreak.models.dynamics import SceneDynamics
-from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
+from makebreak.models.effects.kind import full_name, one_dof_joints, sliding_joints
 from makebreak.models.scene import Scene, read_scene
-from makebreak.systems.numerics.selection import Screen, is_plausible
 
 # Of longer recordings of a mechanism, and of more rows of anything, pieces are used.
 MOST_SEC, MOST_ROWS = 60.0, 120_000
+# Of what is only reported on.
+REPORTED_SEC, REPORTED_ROWS = 20.0, 40_000
 
 
 def run_gap(
@@ -59,23 +70,173 @@ def run_gap(
     joints, bodies = scene_names(dynamics.plant)
     for recording in recordings:
         check_against_scene(recording, joints, bodies)
+    # What is reported on is cut off before anything is looked at.
+    parts = split(recordings)
     say("checking the recordings")
-    checks = check_recordings(recordings, scene_facts(dynamics.plant))
-    recordings, done = condition(recordings, _is_mechanism(dynamics, recordings))
+    checks = check_recordings(parts.decided, scene_facts(dynamics.plant))
+    is_mechanism = _is_mechanism(dynamics, recordings)
+    decided, done = condition(parts.decided, is_mechanism)
     checks += done
-    recordings, cut = _shortened(recordings, dynamics)
+    reported, _ = condition(parts.reported, is_mechanism)
+    reported = with_noise_of(reported, decided)
+    decided, cut = _shortened(decided, dynamics)
     checks += cut
     seconds["checks"] = clock.lap()
-    if not _is_mechanism(dynamics, recordings):
-        result = of_objects(
-            scene, recordings, checks, seconds, clock.lap, say,
-            lambda s: _settle_step(s, recordings, dynamics, jobs),
-        )  # fmt: skip
-        return _unless_doubtful(result).with_seconds(seconds)
-    scene, finding = _settle_step(scene, recordings, dynamics, jobs)
-    checks += finding
-    result = _of_mechanism(scene, recordings, checks, seconds, clock, say, jobs)
+    say("preparing motions and windows")
+    problem, found = problem_for(scene, decided, dynamics, jobs)
+    checks += found
+    seconds["screen"] = clock.lap()
+    say("searching the catalogue")
+    selection = select(problem, say)
+    seconds["select"] = clock.lap()
+    say("simulating held-out windows")
+    reported = excerpt(reported, REPORTED_SEC, REPORTED_ROWS) if reported else []
+    result = conclude(problem, selection, reported, checks, jobs)
+    seconds["simulate"] = clock.lap()
     return _unless_doubtful(result).with_seconds(seconds)
+
+
+def problem_for(
+    scene: Scene,
+    recordings: Sequence[Recording],
+    dynamics: SceneDynamics,
+    jobs: int = 1,
+) -> tuple[GapProblem, list[Finding]]:
+    """The problem that a scene and recordings are, and what was found on the way.
+
+    Args: dynamics: of the scene.
+    """
+    if _is_mechanism(dynamics, recordings):
+        scene, finding = _settle_step(scene, recordings, dynamics, jobs)
+        return MechanismProblem(scene, recordings), finding
+    if any(joint.num_velocities() for joint in one_dof_joints(dynamics.plant)):
+        try:
+            return TouchProblem(scene, recordings), []
+        except ValueError:  # Nothing tells when it touches.
+            pass
+    try:
+        return FlightProblem(scene, recordings), []
+    except ValueError:  # More than one free body, or other shapes: by Drake's steps.
+        scene, finding = _settle_step(scene, recordings, dynamics, jobs)
+        return RolloutProblem(scene, recordings), finding
+
+
+def conclude(
+    problem: GapProblem,
+    selection: Selection,
+    reported: Sequence[Recording],
+    checks: Sequence[Finding] = (),
+    jobs: int = 1,
+) -> GapResult:
+    """The verdict and what it rests on.
+
+    All is decided on the rows that were fitted and chosen on; then, once, the decided
+    effects are compared with recordings that neither saw. These may take a verdict
+    back; they change no effect and no parameter.
+    """
+    nuisances = selection.nuisances
+    choices = [_with_inseparable(c, problem) for c in selection.choices]
+    selection = replace(selection, choices=tuple(choices))
+    start, end = problem.error(selection.start), problem.error(selection.end)
+    verdict = verdict_of(choices, start, end, selection.far)
+    chosen_on = problem.outcome(
+        selection.effects(), selection.start, selection.end, nuisances, jobs=jobs
+    )
+    near = ""
+    if chosen_on is not None:
+        worse = chosen_on.gap.after > max(chosen_on.gap.before, UNNAMED)
+        if choices and worse:  # Equations that simulation does not bear out.
+            verdict = "gap_unnamed"
+        every = selection
+        selection, near = withdrawn_if_weak(every, verdict, chosen_on.gap.reduction)
+        if selection is not every:
+            chosen_on = problem.outcome(
+                [], selection.start, selection.end, nuisances, jobs=jobs
+            )
+    elif choices:
+        selection = replace(selection, choices=(), end=selection.start)
+        verdict = "gap_unnamed"
+        near = " The recordings are too short to choose on what was not fitted."
+    outcome = problem.outcome(
+        selection.effects(), selection.start, selection.end, nuisances, reported, jobs
+    ) if reported else None  # fmt: skip
+    if outcome is None and selection.choices:
+        selection = replace(selection, choices=(), end=selection.start)
+        verdict = "gap_unnamed"
+        near = (
+            " The recordings are too short to keep a part of them for the report, and "
+            "without it nothing is named."
+        )
+    if outcome is not None:
+        final, data = outcome, "reported"
+    elif chosen_on is not None:
+        final, data = chosen_on, "chosen on"
+    else:
+        final, data = Outcome(_nothing(start, end)), "fitted"
+    final = replace(final, gap=replace(final.gap, data=data))
+    if verdict in ("gap_named", "ambiguous") and not _borne_out(final.gap):
+        verdict = "gap_unnamed"
+        near += (
+            f" In what is only reported on, what is named takes the error from "
+            f"{final.gap.before:.3g} to {final.gap.after:.3g}: simulation does not "
+            "bear it out."
+        )
+    if selection.beyond:
+        near += _beyond_limits(selection)
+    channels = judged_channels(problem)
+    unjudged = [c.channel for c in channels if c.judged == "not"]
+    if verdict == "no_gap" and unjudged:
+        near += f" Not judged: {', '.join(unjudged)}."
+    near += two_figures(start, problem.error(selection.end), final.gap)
+    effects = [named(c, problem.dynamics.plant) for c in selection.choices]
+    fixed = [c.fixed for c in selection.choices]
+    prior = nuisances.prior
+    return GapResult(
+        verdict, says(verdict, effects, final.gap, near),
+        problem.where(selection.start.left) if verdict != "no_gap" else [], effects,
+        final.gap, final.unexplained if verdict == "gap_unnamed" else [],
+        {n: float(b / p) for n, b, p in
+         zip(nuisances.names, selection.end.b, prior, strict=True)},
+        checks, final.series, selection.table,
+        trust=trust_in(problem, selection.screen(problem), selection.end, fixed)
+        if selection.choices else (),
+        channels=channels,
+        nuisance_scene=problem.nuisance_effects(nuisances, selection.end.b),
+    )  # fmt: skip
+
+
+def _borne_out(gap: GapMeasure) -> bool:
+    """Whether simulated windows do better with what is named, or show no gap."""
+    return gap.before <= NO_GAP or gap.reduction >= TOLD
+
+
+def _nothing(start: float, end: float) -> GapMeasure:
+    """Where nothing was held out."""
+    return GapMeasure(start, end, 1.0, 0.0)
+
+
+def _beyond_limits(selection: Selection) -> str:
+    each = [f"{name} ({value:.2g})" for name, value in selection.beyond]
+    return (
+        " The model's own parameters would have to be off by more than they may, in "
+        f"tolerances: {', '.join(each)}."
+    )
+
+
+def judged_channels(problem: GapProblem) -> list[JudgedChannel]:
+    """Every measured channel, and by what it was judged."""
+    how = problem.judged()
+    sliding = sliding_joints(problem.dynamics.plant)
+    found: dict[str, JudgedChannel] = {}
+    for recording in problem.recordings:
+        for c in recording.measured():
+            unit = unit_of(c.quantity, c.at in sliding)
+            old = found.get(c.name)
+            noise = max(c.noise, old.noise) if old else c.noise
+            found[c.name] = JudgedChannel(
+                c.name, unit, noise, c.noise_from, how.get(c.name, "not")
+            )
+    return list(found.values())
 
 
 def _unless_doubtful(result: GapResult) -> GapResult:
@@ -184,84 +345,8 @@ def _settle_step(
     ]
 
 
-def _of_mechanism(scene, recordings, checks, seconds, clock, say, jobs) -> GapResult:
-    say("smoothing the motion")
-    model = InverseModel(scene, recordings)
-    nuisance, prior, names = nuisances(model)
-    say("screening the catalogue")
-    plain = Screen(model.base(), nuisance, prior, model.train())
-    needed = needs_more(fit_effects(model, plain, ()), prior)
-    found = candidates(model, nuisance, prior) if needed else []
-    seconds["screen"] = clock.lap()
-    selection = select(model, nuisance, prior, found, say)
-    seconds["select"] = clock.lap()
-    choices = [_with_inseparable(c, model) for c in selection.choices]
-    start, end = selection.start.score, selection.end.score
-    far = not is_plausible(selection.end.b, prior)
-    # Which blocks are held out is by the clock: some hold next to nothing of the gap.
-    whole = [
-        float(np.sqrt(np.mean(x.left**2))) for x in (selection.start, selection.end)
-    ]
-    verdict = verdict_of(choices, max(start, whole[0]), max(end, whole[1]), far)
-    say("simulating held-out windows")
-
-    def measured(of: Selection):
-        moved = _background_effects(model, names, of.end.b)
-        effects = [c.effect for c in of.choices]
-        return measure(scene, recordings, effects, moved, model, jobs)
-
-    gap, series = measured(selection)
-    if choices and gap.after > max(gap.before, UNNAMED):
-        verdict = "gap_unnamed"  # Equations that simulation does not bear out.
-    every = selection
-    selection, near = told(every, verdict, gap.reduction)
-    if selection is not every:
-        gap, series = measured(selection)
-        choices, end = [], selection.end.score
-    background = _background(names, prior, selection)
-    seconds["simulate"] = clock.lap()
-    where = where_in_motion(model, selection.start.left)
-    if verdict == "no_gap":
-        where = []
-    effects_named = [named(c, model.dynamics.plant) for c in choices]
-    rest = unexplained(model, selection.end.left) if verdict == "gap_unnamed" else []
-    return GapResult(
-        verdict, says(verdict, effects_named, start, end, near), where, effects_named,
-        gap, rest, background, checks, series, selection.table,
-    )  # fmt: skip
-
-
-def _with_inseparable(choice: Choice, model: InverseModel) -> Choice:
-    other = inseparable(choice.effect, model)
+def _with_inseparable(choice: Choice, problem: GapProblem) -> Choice:
+    other = problem.inseparable(choice.effect)
     if other is None or any(tie.kind == other.kind for tie in choice.ties):
         return choice
     return replace(choice, ties=(*choice.ties, other))
-
-
-def _background(names, prior, selection: Selection) -> dict[str, float]:
-    b = selection.end.b
-    return {n: float(x / p) for n, x, p in zip(names, b, prior, strict=True)}
-
-
-def _background_effects(model: InverseModel, names, values) -> list[Effect]:
-    """The links as the nuisances have them, as effects of a scene."""
-    masses: dict[str, float] = {}
-    shifts: dict[str, np.ndarray] = {}
-    for name, b in zip(names, values, strict=True):
-        kind, rest = name.split(" of ", 1)
-        if kind == "sensor_delay":  # No part of the scene.
-            continue
-        at, unknown = rest.rsplit(", ", 1)
-        if kind == "object_mass":
-            masses[at] = float(b)
-        else:
-            shifts.setdefault(at, np.zeros(3))["xyz".index(unknown[0])] = b
-    out = []
-    for at, change in masses.items():
-        now = model.dynamics.now("object_mass", [at])["mass"]
-        out.append(Effect("object_mass", [at], {"mass": max(now + change, 0.1 * now)}))
-    for at, shift in shifts.items():
-        com = model.dynamics.now("object_com", [at])
-        moved = {k: com[k] + float(d) for k, d in zip("xyz", shift, strict=True)}
-        out.append(Effect("object_com", [at], moved))
-    return out

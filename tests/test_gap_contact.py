@@ -11,7 +11,7 @@ from makebreak.gap.workflow import run_gap
 G, RADIUS, NOISE = 9.81, 0.04, 5e-5
 
 
-def _ball_scene(folder: Path) -> Path:
+def ball_scene(folder: Path) -> Path:
     """A ball on a level box."""
     surface = (
         '<drake:proximity_properties xmlns:drake="drake.mit.edu">'
@@ -46,7 +46,7 @@ def _ball_scene(folder: Path) -> Path:
     return scene
 
 
-def _rolled(folder: Path, tilt: float) -> Path:
+def rolled(folder: Path, tilt: float) -> Path:
     """Eight balls roll 2 s: on a plane tilted by `tilt` about y they gain
     (5/7) g sin(tilt) along x."""
     rng = np.random.default_rng(0)
@@ -70,7 +70,7 @@ def _rolled(folder: Path, tilt: float) -> Path:
 
 def test_a_table_tilted_by_a_hundredth_of_a_degree_shows_over_whole_episodes(tmp_path):
     tilt = np.deg2rad(0.01)
-    scene, recording = _ball_scene(tmp_path), _rolled(tmp_path, tilt)
+    scene, recording = ball_scene(tmp_path), rolled(tmp_path, tilt)
     result = run_gap(scene, [recording])
     # On one ball a force along the slope is the same, a tie that no data break.
     (effect,) = result.effects
@@ -83,7 +83,7 @@ def test_a_table_tilted_by_a_hundredth_of_a_degree_shows_over_whole_episodes(tmp
 
 
 def test_a_level_table_is_no_gap(tmp_path):
-    scene, recording = _ball_scene(tmp_path), _rolled(tmp_path, 0.0)
+    scene, recording = ball_scene(tmp_path), rolled(tmp_path, 0.0)
     result = run_gap(scene, [recording])
     assert result.verdict == "no_gap"
     assert result.effects == []
@@ -123,9 +123,9 @@ def test_a_flying_and_bouncing_cube_without_a_gap_gets_no_effect(tmp_path):
     assert result.effects == []
 
 
-def _gantry(folder: Path, modelled: float) -> Path:
+def gantry(folder: Path, modelled: float) -> Path:
     """A tip of 20 mm on two slides, x and z, over a ball of the modelled radius."""
-    scene = _ball_scene(folder)
+    scene = ball_scene(folder)
     ball = folder / "ball.sdf"
     ball.write_text(
         ball.read_text().replace(f"<radius>{RADIUS}", f"<radius>{modelled}")
@@ -157,9 +157,10 @@ def _gantry(folder: Path, modelled: float) -> Path:
     return scene
 
 
-def test_a_ball_that_is_touched_is_measured_by_it(tmp_path):
-    true, modelled, tip, k = 0.04, 0.043, 0.02, 1e5  # Two surfaces of 2e5 in a row.
-    scene = _gantry(tmp_path, modelled)
+def touched(folder: Path, true: float, modelled: float) -> tuple[Path, Path]:
+    """The scene, and a tip that touches a ball of the true radius from all sides."""
+    tip, k = 0.02, 1e5  # Two surfaces of 2e5 in a row.
+    scene = gantry(folder, modelled)
     rng = np.random.default_rng(0)
     t = np.arange(0.0, 20.0, 0.02)
     touching = (t % 2.0) > 0.8
@@ -179,11 +180,17 @@ def test_a_ball_that_is_touched_is_measured_by_it(tmp_path):
         "gantry.tip.fy": 0.03 * rng.normal(size=len(t)),
         "gantry.tip.fz": force * np.cos(angle) + 0.03 * rng.normal(size=len(t)),
     }  # fmt: skip
-    file = tmp_path / "touched.csv"
+    file = folder / "touched.csv"
     np.savetxt(
         file, np.column_stack(list(table.values())), delimiter=",", comments="",
         fmt="%.9g", header=",".join(table),
     )  # fmt: skip
+    return scene, file
+
+
+def test_a_ball_that_is_touched_is_measured_by_it(tmp_path):
+    true = 0.04
+    scene, file = touched(tmp_path, true, 0.043)
     result = run_gap(scene, [file])
     (effect,) = result.effects
     assert (effect.kind, effect.at) == ("object_size", ("ball.ball",))

@@ -1,12 +1,14 @@
 """The statistics of the gap workflow: each against a value from elsewhere."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from makebreak.gap.fit import fit_effects, wander
+from makebreak.gap.fit import derivative_free_search, fit_effects
+from makebreak.gap.problem import SearchPlan
 from makebreak.models.effects.kind import Effect
 from makebreak.systems.numerics.selection import (
-    Columns,
     Screen,
     benjamini_hochberg,
     is_plausible,
@@ -68,7 +70,7 @@ def test_a_screen_fits_as_ridge_regression_does():
     m, prior, s = 200, np.array([0.3, 2.0]), 1.7
     X, N, r = rng.normal(size=(m, 2)), rng.normal(size=(m, 2)), rng.normal(size=m)
     train = np.arange(m) % 3 != 1
-    fit = Screen(r, N, prior, train, s).fit(Columns(X, N, train))
+    fit = Screen(r, N, prior, train, s).fit(X)
     rows = np.vstack([np.hstack([X, N])[train] / s, np.zeros((2, 4))])
     rows[-2:, 2:] = np.diag(1.0 / prior)
     want = np.linalg.lstsq(rows, np.append(r[train] / s, [0, 0]), rcond=None)[0]
@@ -85,7 +87,7 @@ def test_a_column_of_zeros_gets_no_coefficient():
     X = np.stack([rng.normal(size=50), 1e-20 * rng.normal(size=50)], axis=1)
     train = np.arange(50) < 30
     none = np.zeros((50, 0))
-    fit = Screen(X[:, 0], none, np.zeros(0), train).fit(Columns(X, none, train))
+    fit = Screen(X[:, 0], none, np.zeros(0), train).fit(X)
     np.testing.assert_allclose(fit.c, [1.0, 0.0])
 
 
@@ -170,7 +172,8 @@ def test_blocks_drawn_anew_tell_how_a_slope_scatters_from_one_recording_to_the_n
 class Steps:
     """r = |x - 0.3| in steps of 0.02, and what slopes say of it: nothing."""
 
-    jumps = True
+    plan = SearchPlan(jumps=True)
+    dynamics = SimpleNamespace(least=lambda kind, at: {})
 
     def residual(self, effects=()):
         x = effects[0].parameters["damping"] if effects else 0.0
@@ -193,5 +196,5 @@ def test_a_search_without_slopes_crosses_the_steps_that_stop_a_fit():
     stuck = fit_effects(model, screen, start)  # What does not show stays neutral.
     assert stuck.effects[0].parameters["damping"] == 0.0
     for far in (False, True):
-        (found,) = wander(model, screen, start, [()], far)
+        (found,) = derivative_free_search(model, screen, start, [()], far)
         assert found.parameters["damping"] == pytest.approx(0.3, abs=0.011)

@@ -32,91 +32,87 @@ class LinearFit:
     train: float
 
 
-class Columns:
-    """Columns of one candidate, with the products that fits need.
-
-    Args: X (m, k); nuisance (m, n_b); train (m,).
-    """
-
-    def __init__(self, X, nuisance, train):
-        self.X = np.asarray(X, float)
-        T, H = self.X[train], self.X[~train]
-        self.TT, self.HH = T.T @ T, H.T @ H
-        self.TN, self.HN = T.T @ nuisance[train], H.T @ nuisance[~train]
-
-
 class Screen:
     """Fits one candidate after another to one residual.
 
     Args: r (m,) residual over its noise; nuisance (m, n_b) in the same units; prior
         (n_b,) standard deviations of b; train (m,) booleans, the others are held out;
-        scale: what is left unexplained, in units of noise: with it a nuisance is
-        weighed against its prior.
+        scale: what is left unexplained, in units of noise, times the root of how many
+        neighbouring rows say the same: with it a nuisance is weighed against its
+        prior; reach: |b| <= reach prior.
     """
 
-    def __init__(self, r, nuisance, prior, train, scale: float = 1.0):
+    def __init__(self, r, nuisance, prior, train, scale: float = 1.0, reach=np.inf):
         self.r, self._N = np.asarray(r, float), np.asarray(nuisance, float)
         self._prior, self._train = np.asarray(prior, float), np.asarray(train, bool)
         self._s2 = max(float(scale), 1.0) ** 2
-        T, H = self._N[self._train], self._N[~self._train]
-        self._NN = T.T @ T + self._s2 * np.diag(self._prior**-2)
-        self._L = cho_factor(self._NN) if len(self._prior) else None
-        self._HH = H.T @ H
-        self._set(self.r)
+        self._limit = float(reach) * self._prior
+        self._T, self._H = self._N[self._train], self._N[~self._train]
+        self._NN = self._T.T @ self._T + self._s2 * np.diag(self._prior**-2)
 
-    def _set(self, r) -> None:
-        T, H = r[self._train], r[~self._train]
-        self._rr, self._hh = T @ T, H @ H
-        self._Nr, self._Hr = self._N[self._train].T @ T, self._N[~self._train].T @ H
-
-    def fit(self, columns: "Columns | None" = None) -> LinearFit:
-        """With a candidate's columns, or with the nuisances alone."""
-        if columns is None:
-            columns = Columns(np.zeros((len(self.r), 0)), self._N, self._train)
+    def fit(self, columns=None) -> LinearFit:
+        """With a candidate's columns (m, k), or with the nuisances alone."""
+        if columns is None or columns.shape[1] == 0:
+            return self.judge(self.r)
         t = self._train
-        Xr, Xh = columns.X[t].T @ self.r[t], columns.X[~t].T @ self.r[~t]
-        G, g = columns.TT, Xr
-        if self._L is not None:
-            G = G - columns.TN @ cho_solve(self._L, columns.TN.T)
-            g = g - columns.TN @ cho_solve(self._L, self._Nr)
-        c = c_std = np.zeros(len(g))
-        if len(g):
-            size = np.sqrt(np.diag(columns.TT))
-            # What hardly shows, beside the other columns, is round-off.
-            size[size <= 1e-9 * size.max()] = np.inf
-            w, u = np.linalg.eigh(G / size[:, None] / size)
-            good = w > 1e-11 * max(w[-1], 1e-300)
-            inverse = np.where(good, 1.0 / np.where(good, w, 1.0), 0.0)
-            c = u @ (inverse * (u.T @ (g / size))) / size
-            c_std = np.sqrt(self._s2 * np.sum(u**2 * inverse, axis=1)) / size
-        b = np.zeros(0)
-        if self._L is not None:
-            b = cho_solve(self._L, self._Nr - columns.TN.T @ c)
-        held = (
-            self._hh - 2 * c @ Xh - 2 * b @ self._Hr + c @ columns.HH @ c
-            + 2 * c @ columns.HN @ b + b @ self._HH @ b
-        )  # fmt: skip
-        NN = self._NN - self._s2 * np.diag(self._prior**-2)
-        seen = (
-            self._rr - 2 * c @ Xr - 2 * b @ self._Nr + c @ columns.TT @ c
-            + 2 * c @ columns.TN @ b + b @ NN @ b
-        )  # fmt: skip
-        return self._fit(c, c_std, b, held, seen)
+        X = columns[t]
+        size = np.linalg.norm(X, axis=0)
+        # What hardly shows, beside the other columns, is round-off.
+        size[size <= 1e-9 * size.max()] = np.inf
+        X = X / size
+        XX, XN, Xr = X.T @ X, X.T @ self._T, X.T @ self.r[t]
+        Nr = self._T.T @ self.r[t]
+        inverse, c = np.zeros_like(XX), np.zeros(len(size))
+
+        def solve(free, b):
+            """Nuisances that are free, and the pull on those that are held at b."""
+            nonlocal inverse, c
+            g, G = Xr - XN[:, ~free] @ b[~free], XX
+            if free.any():
+                L = cho_factor(self._NN[np.ix_(free, free)])
+                some = XN[:, free]
+                rest = Nr[free] - self._NN[np.ix_(free, ~free)] @ b[~free]
+                G = XX - some @ cho_solve(L, some.T)
+                g = g - some @ cho_solve(L, rest)
+            inverse = _pseudo_inverse(G)
+            c = inverse @ g
+            if free.any():
+                b[free] = cho_solve(L, rest - some.T @ c)
+            return b, Nr - XN.T @ c - self._NN @ b
+
+        b = np.zeros(len(self._prior))
+        if len(b):
+            b = _within(solve, self._limit, np.diag(self._NN))
+        else:
+            solve(np.zeros(0, bool), b)
+        spread = np.sqrt(self._s2 * np.maximum(np.diag(inverse), 0.0))
+        left = self.r - columns @ (c / size) - self._N @ b
+        return self._fit(c / size, spread / size, b, left)
 
     def judge(self, r, c=(), c_std=()) -> LinearFit:
         """For another residual (m,): with the nuisances that its training rows want."""
         b, left = self.settle(r)
-        t = self._train
-        return self._fit(
-            np.array(c), np.array(c_std), b, left[~t] @ left[~t], left[t] @ left[t]
-        )
+        return self._fit(np.array(c), np.array(c_std), b, left)
 
     def settle(self, r) -> tuple[np.ndarray, np.ndarray]:
         """The nuisances' coefficients for a residual (m,), and what they leave."""
-        if self._L is None:
+        if not len(self._prior):
             return np.zeros(0), r
-        b = cho_solve(self._L, self._N[self._train].T @ r[self._train])
+        b = boxed_minimum(self._NN, self._T.T @ r[self._train], self._limit)
         return b, r - self._N @ b
+
+    def wanted(self, r) -> np.ndarray:
+        """(n_b,) each nuisance in units of its prior; one that is at its limit as far
+        as it would go alone beyond it."""
+        b, _ = self.settle(r)
+        out = b / self._prior
+        held = np.abs(b) >= self._limit * (1.0 - 1e-9)
+        for i in np.flatnonzero(held):
+            limit = np.array(self._limit)
+            limit[i] = np.inf
+            g = self._T.T @ r[self._train]
+            out[i] = boxed_minimum(self._NN, g, limit)[i] / self._prior[i]
+        return out
 
     def cost_rows(self, r) -> np.ndarray:
         """Training rows of what the nuisances leave of r (m,), over the scale, and
@@ -124,9 +120,11 @@ class Screen:
         b, left = self.settle(r)
         return np.concatenate([left[self._train] / np.sqrt(self._s2), b / self._prior])
 
-    def _fit(self, c, c_std, b, held, seen) -> LinearFit:
-        n, m = int((~self._train).sum()), int(self._train.sum())
-        held, seen = max(held, 0.0) / max(n, 1), max(seen, 0.0) / max(m, 1)
+    def _fit(self, c, c_std, b, left) -> LinearFit:
+        t = self._train
+        n, m = int((~t).sum()), int(t.sum())
+        seen = float(left[t] @ left[t]) / max(m, 1)
+        held = float(left[~t] @ left[~t]) / max(n, 1)
         if n == 0:
             held = seen  # Too little data to hold any out.
         cost = self._s2 * float(np.sum((b / self._prior) ** 2)) / (n + m)
@@ -134,6 +132,73 @@ class Screen:
             c, c_std, b, float(np.sqrt(held + cost)), float(np.sqrt(held)),
             float(np.sqrt(seen)),
         )  # fmt: skip
+
+
+def _pseudo_inverse(A: np.ndarray) -> np.ndarray:
+    """Of a symmetric matrix (k, k) with a diagonal of one or less, without directions
+    that are round-off."""
+    w, u = np.linalg.eigh(A)
+    good = w > 1e-11 * max(w[-1], 1e-300)
+    return (u * np.where(good, 1.0 / np.where(good, w, 1.0), 0.0)) @ u.T
+
+
+def boxed_minimum(H, g, limit) -> np.ndarray:
+    """b (n,) with |b| <= limit (n,) at which b'Hb/2 - g'b is least; H (n, n) positive
+    definite.
+
+    Source: the primal-dual active set of Hintermueller, Ito, Kunisch, SIAM J. Optim.
+    13(3), 2002.
+    """
+    H, g = np.asarray(H, float), np.asarray(g, float)
+    limit = np.broadcast_to(np.asarray(limit, float), g.shape)
+
+    def solve(free, b):
+        if free.any():
+            rest = g[free] - H[np.ix_(free, ~free)] @ b[~free]
+            b[free] = cho_solve(cho_factor(H[np.ix_(free, free)]), rest)
+        return b, g - H @ b
+
+    return _within(solve, limit, np.diag(H))
+
+
+def _within(solve, limit: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
+    """The solution b (n,) of a least-squares problem with |b| <= limit (n,).
+
+    Args: solve(free (n,) booleans, b): b with those that are free put to their best,
+        and how hard all of them are pulled. stiffness (n,): of each, a typical pull
+        over a typical step.
+    """
+    side, b = np.zeros(len(limit), int), np.zeros(len(limit))
+    for _ in range(40):
+        free = side == 0
+        b, pull = solve(free, np.where(free, 0.0, side * np.where(free, 0.0, limit)))
+        at = np.where(free, b, b + pull / stiffness)
+        new = np.where(at > limit, 1, np.where(at < -limit, -1, 0))
+        if (new == side).all():
+            return b
+        side = new
+    # It goes in circles. From a point within, one limit after another is met or left:
+    # slower, and it ends (the least always falls).
+    side, b = np.zeros(len(limit), int), np.zeros(len(limit))
+    for _ in range(20 * len(limit) + 20):
+        free = side == 0
+        to, pull = solve(free, np.where(free, 0.0, side * np.where(free, 0.0, limit)))
+        step = to - b
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reach = np.where(free & (step != 0.0), (np.sign(step) * limit - b) / step,
+                             np.inf)  # fmt: skip
+        k = int(np.argmin(reach))
+        if reach[k] < 1.0:
+            b = b + max(reach[k], 0.0) * step
+            side[k] = int(np.sign(step[k]))
+            continue
+        b = to
+        inward = np.where(free, 0.0, -side * pull / np.sqrt(stiffness))
+        k = int(np.argmax(inward))
+        if inward[k] <= 1e-9 * np.abs(pull / np.sqrt(stiffness)).max(initial=1e-300):
+            break
+        side[k] = 0
+    return b
 
 
 def is_plausible(b, prior, rate: float = 1e-4) -> bool:
@@ -172,6 +237,29 @@ def paired(one, two, train) -> float:
     if len(starts) < 6 or not np.abs(difference).max() > 0.0:
         return 1.0
     return float(wilcoxon(difference).pvalue)
+
+
+def paired_t(one, two, train, channel) -> float:
+    """Student's t of how much less two (m,) leaves than one (m,), over held-out blocks
+    of time (the stretches of rows that are not `train`): of each block the mean over
+    channels of the log of the ratio of their rms. 0 for fewer than four blocks."""
+    train, channel = np.asarray(train, bool), np.asarray(channel)
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(train.astype(int))) + 1])
+    ends, gains = [*starts[1:], len(train)], []
+    for a, b in zip(starts, ends, strict=True):
+        if train[a]:
+            continue
+        each = []
+        for k in np.unique(channel[a:b]):
+            mine = channel[a:b] == k
+            x, y = np.sum(one[a:b][mine] ** 2), np.sum(two[a:b][mine] ** 2)
+            if x > 0.0 and y > 0.0:
+                each.append(0.5 * np.log(x / y))
+        if each:
+            gains.append(float(np.mean(each)))
+    if len(gains) < 4:
+        return 0.0
+    return float(np.mean(gains) / max(np.std(gains, ddof=1), 1e-12) * len(gains) ** 0.5)
 
 
 def simplest(errors: Sequence[float], sizes: Sequence[int], same: float = SAME) -> int:

@@ -1,0 +1,231 @@
+"""A mechanism whose joints are measured, as a problem for the search."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from makebreak.gap.inverse import InverseModel
+from makebreak.gap.measure import measure
+from makebreak.gap.problem import (
+    Candidate,
+    Fitted,
+    GapProblem,
+    Nuisances,
+    Outcome,
+    SearchPlan,
+)
+from makebreak.gap.recording import Recording
+from makebreak.gap.result import Where
+from makebreak.gap.screen import candidates, inseparable, nuisances, rich_columns
+from makebreak.gap.where import unexplained, where_in_motion
+from makebreak.models.effects.kind import Effect, find_body
+from makebreak.models.scene import Scene
+from makebreak.systems.numerics.selection import Screen
+
+ROBUST = 1.4826  # Standard deviation over median absolute deviation, if normal.
+# Below this over the sensors' noise a rich model leaves what noise may: models are
+# right. A weight is changed where it would become less by this share.
+MISFIT, LESS = 1.3, 0.8
+RICH_PRIOR = 10.0  # Times a nuisance's tolerance, in a rich model.
+LAGS = 9  # Test functions over which errors may go together (0.9 s).
+OVERLAP = 1.3  # What neighbouring test functions share of white noise.
+
+
+class MechanismProblem(InverseModel, GapProblem):
+    """Equations of motion of all joints, and other channels beside them."""
+
+    def __init__(self, scene: Scene, recordings: Sequence[Recording]):
+        super().__init__(scene, recordings)
+        self.plan = SearchPlan(evaluations=25, most_effects=6, by_channel=True)
+        self._found: list[Candidate] | None = None
+        self._nuisances: Nuisances | None = None
+        self._learn_misfit()
+
+    # ----- What models are off by
+
+    def _learn_misfit(self) -> None:
+        """What a model with friction, rotors, gains, biases, loads and delays of all
+        joints leaves is what models are off by: no fit is believed beyond that."""
+        held = ~self.train()
+        if not held.any() or held.all():
+            return
+        n = self.nuisances()
+        plain = Screen(self.base(), n.columns, n.prior, self.train(), reach=n.reach)
+        left = plain.settle(self.base())[1]
+        if self.noise_error(left) < MISFIT:
+            return
+        self._found = candidates(self, n, left)
+        for _ in range(3):
+            n = self.nuisances()
+            rich = rich_columns(self, self._found)
+            prior = RICH_PRIOR * n.prior
+            screen = Screen(self.base(), n.columns, prior, self.train())
+            fit = screen.fit(rich)
+            left = self.base() - rich @ fit.c - n.columns @ fit.b
+            error = self._misfit(left)
+            old = self.model_error
+            if all(np.allclose(error[w], old[w], rtol=0.1, atol=1e-12) for w in error):
+                break
+            self._set(error)
+        self.correlation = self._correlation(left)
+
+    def _misfit(self, left: np.ndarray) -> dict[str, np.ndarray]:
+        """What held-out rows (m,) are off by beside noise: robust, of each channel."""
+        held = (~self.train()).reshape(-1, len(self.names()))[:, 0]
+        size = ROBUST * np.median(np.abs(self.in_units(left)[held]), axis=0)
+        noise = self.noise_in_units()[held]
+        ratio = ROBUST * np.median(np.abs(self.in_units(left)[held] / noise), axis=0)
+        error = {w: np.zeros(len(self.joints)) for w in self.model_error}
+        for k, (what, joint) in enumerate(self.names()):
+            if ratio[k] > MISFIT:
+                beside = size[k] * np.sqrt(1.0 - 1.0 / ratio[k] ** 2)
+                error[what][self.joints.index(joint)] = beside
+        return error
+
+    def _correlation(self, left: np.ndarray) -> float:
+        """Root of how many neighbouring rows err together, where models are off."""
+        k = len(self.names())
+        off = np.array([self.model_error[w][self.joints.index(j)] for w, j in
+                        self.names()]) > 0.0  # fmt: skip
+        if not off.any():
+            return 1.0
+        r = left.reshape(-1, k)[:, off]
+        block = self.blocks().reshape(-1, k)[:, 0]
+        held = (~self.train()).reshape(-1, k)[:, 0]
+        sums, counts = np.zeros(LAGS + 1), np.zeros(LAGS + 1)
+        for number in np.unique(block[held]):
+            x = r[block == number]
+            x = x / np.maximum(np.sqrt(np.mean(r[held] ** 2, axis=0)), 1e-12)
+            for lag in range(min(LAGS + 1, len(x))):
+                sums[lag] += np.sum(x[lag:] * x[: len(x) - lag])
+                counts[lag] += x[lag:].size
+        rho = sums / np.maximum(counts, 1) / max(sums[0] / max(counts[0], 1), 1e-12)
+        ends = np.flatnonzero(rho <= 0.0)
+        last = int(ends[0]) if len(ends) else LAGS + 1
+        return float(np.sqrt(max((1.0 + 2.0 * rho[1:last].sum()) / OVERLAP, 1.0)))
+
+    def _set(self, error: dict[str, np.ndarray]) -> None:
+        to_new = self.allow(error)
+        if self._found is not None:
+            self._found = [_moved(c, to_new) for c in self._found]
+        if self._nuisances is not None:
+            n = self._nuisances
+            self._nuisances = replace(n, columns=to_new(n.columns))
+
+    def reweigh(self, left: np.ndarray) -> bool:
+        error = self._misfit(left)
+        old = self.model_error
+        less = {w: np.minimum(error[w], old[w]) for w in old}
+        if all((less[w] >= LESS * old[w]).all() for w in old):
+            return False
+        self._set(less)
+        return True
+
+    # ----- The search
+
+    def nuisances(self) -> Nuisances:
+        if self._nuisances is None:
+            self._nuisances = nuisances(self)
+        return self._nuisances
+
+    def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
+        if self._found is None:
+            self._found = candidates(self, nuisances, current.left)
+        return self._found
+
+    def error(self, fitted: Fitted) -> float:
+        # Which blocks are held out is by the clock: some hold next to nothing of it.
+        whole = float(np.sqrt(np.mean(self.in_noise(fitted.left) ** 2)))
+        return max(self.noise_error(fitted.left), whole)
+
+    def judged(self) -> dict[str, str]:
+        how = {}
+        for i, joint in enumerate(self.joints):
+            how[f"{joint}.position"] = "equations and simulation"
+            if self.has["velocity"][i]:
+                how[f"{joint}.velocity"] = "equations and simulation"
+            if self.has["effort_measured"][i]:
+                how[f"{joint}.effort_measured"] = "equations"
+        return how
+
+    def nuisance_effects(self, nuisances: Nuisances, b: np.ndarray) -> list[Effect]:
+        return moved_links(self, nuisances, b)
+
+    def parts(self) -> np.ndarray:
+        k = len(self.names())
+        names = [r.name for r in self.recordings]
+        return np.concatenate(
+            [np.full(len(t.bumps.centre) * k, names.index(t.recording))
+             for t in self.tracks]
+        )  # fmt: skip
+
+    def inseparable(self, effect: Effect) -> Effect | None:
+        return inseparable(effect, self)
+
+    def is_one_place(self, one: Sequence[str], other: Sequence[str]) -> bool:
+        plant = self.dynamics.plant
+        try:
+            a, b = (
+                find_body(Effect("", list(at), {}), plant, at[0]) for at in (one, other)
+            )
+        except ValueError:
+            return False
+        return b.index() in {body.index() for body in plant.GetBodiesWeldedTo(a)}
+
+    # ----- What it comes to
+
+    def where(self, left: np.ndarray) -> list[Where]:
+        return where_in_motion(self, self.in_noise(left))
+
+    def outcome(
+        self, effects, start: Fitted, end: Fitted, nuisances: Nuisances,
+        recordings=None, jobs: int = 1,
+    ) -> Outcome | None:  # fmt: skip
+        if recordings is not None:
+            try:
+                model = InverseModel(self.scene, recordings)
+            except ValueError:  # No episode is long enough.
+                return None
+        elif self.train().all():
+            return None
+        else:
+            model = self
+        moved = moved_links(self, nuisances, end.b)
+        gap, series = measure(
+            self.scene, effects, moved, model, model is not self, jobs
+        )
+        rest = unexplained(self, self.in_noise(end.left))
+        return Outcome(gap, series, rest)
+
+
+def _moved(candidate: Candidate, to_new) -> Candidate:
+    return replace(
+        candidate,
+        columns=tuple(to_new(x) for x in candidate.columns),
+        members=tuple(_moved(m, to_new) for m in candidate.members),
+    )
+
+
+def moved_links(model: InverseModel, nuisances: Nuisances, values) -> list[Effect]:
+    """The links as the nuisances (n_b,) have them, as effects of a scene."""
+    masses: dict[str, float] = {}
+    shifts: dict[str, np.ndarray] = {}
+    for name, b in zip(nuisances.names, values, strict=True):
+        kind, rest = name.split(" of ", 1)
+        if kind not in ("object_mass", "object_com"):  # No part of the scene.
+            continue
+        at, unknown = rest.rsplit(", ", 1)
+        if kind == "object_mass":
+            masses[at] = float(b)
+        else:
+            shifts.setdefault(at, np.zeros(3))["xyz".index(unknown[0])] = b
+    out = []
+    for at, change in masses.items():
+        now = model.dynamics.now("object_mass", [at])["mass"]
+        out.append(Effect("object_mass", [at], {"mass": max(now + change, 0.1 * now)}))
+    for at, shift in shifts.items():
+        com = model.dynamics.now("object_com", [at])
+        there = {k: com[k] + float(d) for k, d in zip("xyz", shift, strict=True)}
+        out.append(Effect("object_com", [at], there))
+    return out

@@ -1,0 +1,272 @@
+"""The contract between a kind of data and the search: what is asked of a problem.
+
+A mechanism whose joints are measured (gap/mechanism.py), a tool that touches an object
+(gap/touch.py) and windows of free bodies (gap/objects.py) are three such problems;
+gap/select.py searches any of them, gap/workflow.py concludes from what it finds.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from makebreak.gap.recording import Recording
+from makebreak.gap.result import GapMeasure, Series, Unexplained, Where
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect, check_parameters
+from makebreak.models.scene import Scene
+from makebreak.systems.numerics.selection import NESTED_GAIN, LinearFit
+
+BEYOND = 1.5  # Times what a model can lose at most is taken for all of it.
+
+
+@dataclass(frozen=True)
+class SearchPlan:
+    """How a problem is searched.
+
+    evaluations: Gauss-Newton steps of a fit. diff_step: relative, of differences.
+    jumps: whether errors jump with the parameters, so that searches without slopes are
+    needed. least_gain: what an effect must take off the error, as a share of it.
+    least_error: below it nothing tells two models apart. most_effects: that are named.
+    """
+
+    evaluations: int = 8
+    diff_step: float = 1e-4
+    jumps: bool = False
+    least_gain: float = NESTED_GAIN
+    least_error: float = 0.0
+    most_effects: int = 4
+    by_channel: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Nuisances:
+    """What may be slightly wrong in any model. columns (m, n_b), over the noise; prior
+    (n_b,) standard deviations; reach: a coefficient is at most so many of them."""
+
+    columns: np.ndarray
+    prior: np.ndarray
+    names: tuple[str, ...]
+    reach: float = np.inf
+
+    @staticmethod
+    def none(m: int) -> "Nuisances":
+        return Nuisances(np.zeros((m, 0)), np.zeros(0), ())
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A kind at a place: alternatives of linear columns, and how they are read.
+
+    columns: (m, k) each, over the noise. size: parameters that a fit chooses. fixed:
+    parameters that a fit leaves at neutral. least: what the model allows.
+    members: of a group, which is fitted as one; its columns are theirs side by side.
+    """
+
+    kind: str
+    at: tuple[str, ...]
+    size: int
+    columns: tuple[np.ndarray, ...]
+    to_parameters: tuple[Callable, ...]
+    fixed: tuple[str, ...] = ()
+    least: Mapping[str, float] = field(default_factory=dict)
+    members: tuple["Candidate", ...] = ()
+
+    @property
+    def name(self) -> str:
+        if self.members:
+            return f"{self.kind} at {len(self.members)} places"
+        return f"{self.kind} at {', '.join(self.at)}"
+
+    def effects(self, alternative: int, c: np.ndarray) -> tuple[Effect, ...]:
+        """What coefficients (k,) of an alternative say."""
+        if not self.members:
+            parameters = dict(self.to_parameters[alternative](c))
+            for name, least in self.least.items():
+                # Columns take what the model has for a little more than it is.
+                if BEYOND * least <= parameters[name] < least:
+                    parameters[name] = least
+            return (Effect(self.kind, list(self.at), parameters),)
+        found: list[Effect] = []
+        first = 0
+        for each in self.members:
+            k = each.columns[0].shape[1]
+            found += each.effects(0, c[first : first + k])
+            first += k
+        return tuple(found)
+
+    def is_sane(self, effects: Sequence[Effect]) -> bool:
+        """Whether effects of it are allowed, and of a size that robots have."""
+        each = self.members or (self,)
+        return all(is_sane(e, c.least) for e, c in zip(effects, each, strict=True))
+
+    def fixed_of_each(self) -> tuple[tuple[str, ...], ...]:
+        """Of each effect, the parameters that a fit leaves as they are."""
+        return tuple(m.fixed for m in self.members) if self.members else (self.fixed,)
+
+
+def is_sane(effect: Effect, least: Mapping[str, float] | None = None) -> bool:
+    """Whether the parameters are allowed, and of a size that robots have.
+
+    Args: least, what the model allows (SceneDynamics.least).
+    """
+    entry = KINDS[effect.kind]
+    try:
+        check_parameters(effect, entry)
+    except ValueError:
+        return False
+    for each in entry.parameters:
+        value = effect.parameters.get(each.name)
+        if value is None or each.name == "phase":
+            continue
+        if value < (least or {}).get(each.name, -np.inf):
+            return False
+        width = each.high - each.low
+        if not each.low - 0.01 * width <= value <= each.high + 0.01 * width:
+            return False
+    return not (
+        effect.kind == "joint_stribeck_friction"
+        and effect.parameters["static"] < effect.parameters["coulomb"]
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """Effects with their best parameters. std: of each effect's parameters. r (m,):
+    what they leave, before nuisances. left (m,): after them, of which b (n_b,) are the
+    coefficients. rows (n,), J (n, k): training rows over the scale and the nuisances'
+    own cost, and how they change with each parameter; names (k)."""
+
+    effects: tuple[Effect, ...]
+    std: tuple[dict[str, float], ...]
+    r: np.ndarray
+    left: np.ndarray
+    b: np.ndarray
+    fit: LinearFit
+    J: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    rows: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    names: tuple[tuple[int, str], ...] = ()
+
+    @property
+    def score(self) -> float:
+        return self.fit.score
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What the decided effects are worth on some data, by simulation where there is
+    one, and what is left."""
+
+    gap: GapMeasure
+    series: Sequence[Series] = ()
+    unexplained: Sequence[Unexplained] = ()
+
+
+class GapProblem(ABC):
+    """Residuals of recordings under effects that a scene may lack.
+
+    Rows are of the part of the recordings on which is decided: `train` of them are
+    fitted, the others choose between models. The part that is reported on comes to
+    `outcome` alone.
+    """
+
+    scene: Scene
+    recordings: list[Recording]
+    dynamics: SceneDynamics
+    plan: SearchPlan
+    # Root of how many neighbouring rows say the same: their errors go together.
+    correlation: float = 1.0
+
+    @abstractmethod
+    def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
+        """(m,) over its noise, of the scene with these effects added.
+
+        Raises: ValueError, RuntimeError for effects that the scene cannot have.
+        """
+
+    @abstractmethod
+    def base(self) -> np.ndarray:
+        """residual() of the scene as it came, kept."""
+
+    @abstractmethod
+    def train(self) -> np.ndarray:
+        """(m,) which rows are fitted."""
+
+    @abstractmethod
+    def blocks(self) -> np.ndarray:
+        """(m,) number of the block of time, window or touch of each row."""
+
+    @abstractmethod
+    def channel_of_rows(self) -> np.ndarray:
+        """(m,) number of the channel, or of the joint's equation, of each row."""
+
+    @abstractmethod
+    def nuisances(self) -> Nuisances: ...
+
+    @abstractmethod
+    def candidates(self, nuisances: Nuisances, current: Fitted) -> Sequence[Candidate]:
+        """Every effect that could be added to what is there."""
+
+    @abstractmethod
+    def where(self, left: np.ndarray) -> list[Where]:
+        """Where residuals (m,) stand out."""
+
+    @abstractmethod
+    def outcome(
+        self,
+        effects: Sequence[Effect],
+        start: Fitted,
+        end: Fitted,
+        nuisances: Nuisances,
+        recordings: Sequence[Recording] | None = None,
+        jobs: int = 1,
+    ) -> Outcome | None:
+        """What effects are worth.
+
+        Args: start, end: the fits without and with them. recordings: the part that is
+            reported on; None: the rows that were chosen on.
+        Returns: None where these recordings hold nothing to compare.
+        """
+
+    def in_noise(self, left: np.ndarray) -> np.ndarray:
+        """Rows (m,) over the sensors' noise alone, without what models are off by."""
+        return left
+
+    def noise_error(self, left: np.ndarray) -> float:
+        """Rms of the rows (m,) that choose, over the sensors' noise alone."""
+        held = self.in_noise(left)[~self.train()]
+        held = held if len(held) else self.in_noise(left)
+        return float(np.sqrt(np.mean(held**2)))
+
+    def reweigh(self, left: np.ndarray) -> bool:
+        """Weighs rows by what is left now (m,), where that is clearly less than what
+        models were taken to be off by. Returns: whether anything changed; then
+        residuals, columns and nuisances are others."""
+        return False
+
+    def is_one_place(self, one: Sequence[str], other: Sequence[str]) -> bool:
+        """Whether two places are one rigid body."""
+        return False
+
+    def inseparable(self, effect: Effect) -> Effect | None:
+        """Another effect that no recording of these channels could tell from it."""
+        return None
+
+    def error(self, fitted: Fitted) -> float:
+        """What the verdict goes by: held-out error in units of the noise."""
+        return fitted.score
+
+    def judged(self) -> dict[str, str]:
+        """{channel: by what it is judged}, of all that are."""
+        return {}
+
+    def nuisance_effects(self, nuisances: Nuisances, b: np.ndarray) -> list[Effect]:
+        """The nuisances at b (n_b,), as effects of a scene file, as far as they can be
+        said there."""
+        return []
+
+    def parts(self) -> np.ndarray:
+        """(m,) number of the recording of each row."""
+        return np.zeros(len(self.train()), int)
