@@ -613,6 +613,7 @@ def _parse(argv: list[str]) -> argparse.Namespace:
         if not name:
             raise ValueError(f"unexpected {rest[0]} (see makebreak --help)")
         valid = [o for o in args.options if o.startswith("--")]
+        valid = [o for o in valid if o.startswith(name)] or valid  # A shortened one.
         raise ValueError(f"unknown option {name}; {nearest(name, valid)}")
     return args
 

@@ -1,6 +1,8 @@
 """What the loop from a run over its recording to a repaired model rests on."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +19,8 @@ from makebreak.gap.windows import WindowModel
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import InitialSection, load_scene, read_scene
 from makebreak.models.scene_file import write_scene
+from makebreak.scripts import close_the_loop as loop
+from makebreak.scripts.cli import main
 from makebreak.scripts.close_the_loop import write_wrong_scene
 from makebreak.scripts.experiments.ball_rolling import mean_until_next
 
@@ -118,3 +122,75 @@ def test_a_repair_added_to_the_wrong_scene_is_what_controllers_believe(tmp_path)
 def test_a_radius_below_zero_is_refused(tmp_path):
     with pytest.raises(ValueError, match="--radius-error is -0.04, expected > -0.0315"):
         write_wrong_scene(tmp_path / "model.yaml", -0.04)
+
+
+@pytest.fixture
+def steps(monkeypatch, tmp_path):
+    """Steps that write what the real ones would, and the words that each was given."""
+    monkeypatch.chdir(tmp_path)
+    asked: list[list[str]] = []
+
+    def run_commands(label, commands, folders, jobs):
+        [words], [folder] = commands, folders
+        asked.append(words)
+        folder.mkdir(parents=True)
+        if "gap" in words:
+            scene = read_scene(words[words.index("gap") + 1])
+            fixed = Effect("object_size", ["ball.ball"], {"radius": 0.0316})
+            scene.effects.append(fixed)
+            write_scene(scene, folder / "scene.yaml")
+            return [{"effects": [{"kind": "object_size"}], "says": "It is smaller."}]
+        contact = 3.0 if label.startswith("1") else 0.7
+        gap = 0.0102 if label.startswith("1") else steps_gap[0]
+        result = dict.fromkeys(loop._SHOWN, 1.0)
+        return [result | {"time_to_first_contact_s": contact, "r_gap_error_m": gap}]
+
+    steps_gap = [1e-4]
+    monkeypatch.setattr(loop, "run_commands", run_commands)
+    return asked, steps_gap
+
+
+def test_the_loop_passes_nothing_on_but_recording_and_scenes(steps, capsys):
+    words = ["--radius-error", "0.005", "--seed", "3", "--set", "friction=0.2"]
+    assert main(["close-the-loop", "ball_rolling", *words, "--out", "out"]) == 0
+    first, gap, second = ([w for w in words if w[0] != "/"] for words in steps[0])
+    wrong, found = "out/0_model/model.yaml", "out/2_gap/scene.yaml"
+    assert [gap[k] for k in range(gap.index("gap") + 1, gap.index("--jobs"))] == [
+        wrong,
+        "out/1_wrong_model/recording.csv",
+    ]
+    for run, model in ((first, wrong), (second, found)):
+        assert run[run.index("--model") + 1] == model
+        assert run[run.index("--seed") + 1] == "3"
+        assert run[run.index("--set") + 1 :][:2] == ["radius_error_m=0", "friction=0.2"]
+    shown = capsys.readouterr().out
+    assert "radius in the model [mm]  36.5         31.6" in shown
+    assert json.loads(Path("out/loop.json").read_text())["gap"]["says"]
+
+
+def test_a_repair_that_misses_what_is_wanted_is_status_1(steps, capsys):
+    steps[1][0] = -2e-3
+    assert main(["close-the-loop", "--out", "out"]) == 1
+    assert "MISSED" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--out", "a_file"], '--out: got "a_file", expected a folder'),
+        (["--radius-error", "nan"], '--radius-error: got "nan", expected a number'),
+        (["--radius-error=-1"], "--radius-error is -1.0, expected > -0.0315"),
+        (["cartpole_walls"], "cartpole_walls cannot yet be given a wrong model"),
+        (["ball_rollin"], "unknown experiment ball_rollin; did you mean ball_rolling?"),
+        (["--set", "nois=1"], "--set: unknown key nois"),
+        (["--duration", "0"], '--duration: got "0", expected a number above 0'),
+        (["--dur", "1"], "unknown option --dur; did you mean --duration?"),
+    ],
+)
+def test_bad_input_of_the_loop_is_one_line(steps, words, message, capsys):
+    Path("a_file").touch()
+    before = set(Path(".").rglob("*"))
+    assert main(["close-the-loop", *words]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert set(Path(".").rglob("*")) == before and not steps[0]
