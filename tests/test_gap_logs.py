@@ -344,6 +344,21 @@ def test_a_backward_difference_is_the_mean_velocity_of_the_last_row():
     )
 
 
+@pytest.mark.parametrize(
+    "which", [Filter(), Filter("first order", 20.0), Filter("backward difference")],
+    ids=lambda f: f.kind,
+)  # fmt: skip
+def test_the_noise_that_a_sidecar_gives_is_what_is_in_the_channel(which):
+    zero = np.zeros((20_000, 2))
+    rest = replace_track(still_track(20_000), q=zero, v=zero, motor=zero)
+    how = replace(CLEAN, rate_hz=500.0, position_noise=1e-4, velocity_noise=2e-2,
+                  filter=which, effort_noise=0.1, wander=0.2, memory=0.01)  # fmt: skip
+    rng = np.random.default_rng(0)
+    log, noise = write_log(rest, ["a.x", "a.y"], how, np.zeros(2), rng)
+    for name, std in noise.items():
+        assert np.std(log[name]) == pytest.approx(std, rel=0.08), name
+
+
 # ----- Ties, by computation
 
 

@@ -11,6 +11,7 @@ rates, filters and motions are drawn, from seeds that they do not share.
 import argparse
 import json
 import sys
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -749,6 +750,34 @@ def write(case: LogCase, folder: Path, made: WrittenLog | None = None) -> dict:
     return made.truth
 
 
+def check(folder: Path) -> None:
+    """Raises: ValueError for a case's folder that is not whole. It opens the files that
+    the workflow gets, and nothing else."""
+    scene = yaml.safe_load((folder / "scene.yaml").read_text())
+    sidecar = yaml.safe_load((folder / "recording.yaml").read_text())
+    [model] = [d["add_model"] for d in scene["directives"] if "add_model" in d]
+    root = ElementTree.parse(folder / model["file"]).getroot()
+    moving = [j.get("name") for j in root.iter("joint") if j.get("type") != "fixed"]
+    joints = {f"{model['name']}.{name}" for name in moving if name}
+    with (folder / "recording.csv").open() as file:
+        names = file.readline().strip().split(",")
+        table = np.loadtxt(file, delimiter=",")
+    named = sidecar.get("columns", {})
+    channels = [named[name]["channel"] if named else name for name in names]
+    for bad, what in (
+        (table.shape[1] != len(names) or len(table) < 500, "rows or columns are lost"),
+        (not np.isfinite(table).all(), "a number is missing"),
+        (channels[0] != "time" or (np.diff(table[:, 0]) <= 0).any(), "time goes back"),
+        ({c.rsplit(".", 1)[0] for c in channels[1:]} != joints, "joints differ"),
+        (set(scene["actuation"]["joints"]) != joints, "drives differ"),
+        ((table.std(axis=0) == 0).any(), "a channel never changes"),
+        (np.abs(table).max() > 1e8, "a number is absurd"),
+        (not set(sidecar) <= {"provenance", "noise", "filters", "columns"}, "sidecar"),
+    ):
+        if bad:
+            raise ValueError(f"{folder.name}: {what}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="Writes logs with hidden effects.")
     parser.add_argument("--set", choices=sorted(SEEDS), required=True)
@@ -765,6 +794,7 @@ def main() -> None:
     with ProcessPoolExecutor(args.jobs) as pool:
         written = pool.map(write, wanted, [args.out / case.folder for case in wanted])
         for case, truth in zip(wanted, written, strict=True):
+            check(args.out / case.folder)
             truths[case.folder] = truth
             args.truth.write_text(json.dumps(truths, indent=1) + "\n")
             print(case.folder, case.name, flush=True)

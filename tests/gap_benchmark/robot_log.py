@@ -121,11 +121,16 @@ def write_log(
         if how.filter.kind == "backward difference":
             v = np.diff(q, axis=0, prepend=q[:1]) * how.rate_hz
             v[0] = v[1]
+            noise["velocity"] = np.sqrt(2.0) * noise["position"] * how.rate_hz
         else:
             raw = track.v + how.velocity_noise * rng.normal(size=track.v.shape)
             v = at_rows(how.filter(raw))
+            # What a filter leaves of white noise: the energy of its impulse's response.
+            impulse = np.zeros((4000, 1))
+            impulse[500] = 1.0
+            left = float(np.linalg.norm(how.filter(impulse)))
+            noise["velocity"] = how.velocity_noise * left
         measured["velocity"] = v
-        noise["velocity"] = how.velocity_noise
     if how.side:
         u = at_rows(track.motor if how.side == "motor" else track.link)
         u = u + np.asarray(how.effort_bias) + how.effort_noise * rng.normal(size=shape)

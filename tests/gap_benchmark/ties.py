@@ -24,7 +24,7 @@ from gap_benchmark.robots import Robot
 
 SAME = 9.0  # d^2: three standard deviations, which nobody takes for a difference.
 CLEAR = 36.0  # Six: who does not see it has missed it. Between, either may be said.
-_SPACING = 0.04  # [s] of the instants at which effects are compared.
+_SPACING = 0.06  # [s] of the instants at which effects are compared.
 
 LINEAR = {
     "joint_viscous_damping": ("damping",),
