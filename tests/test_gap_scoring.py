@@ -10,6 +10,7 @@ import pytest
 
 from makebreak.scripts import cli, gap_benchmark
 from makebreak.scripts.gap_scoring import (
+    LOGS,
     Score,
     parameter_errors,
     same_place,
@@ -140,6 +141,98 @@ def test_errors_of_vectors_phases_and_changes():
     assert errors(dict(angular=0.1, linear=3.0), dict(angular=0.0, linear=3.0)) == [0.0]
 
 
+def log_truth(effects, verdicts=("gap_named",)):
+    return {"name": "l", "verdicts": list(verdicts), "effects": effects, "ties": []}
+
+
+def test_what_cannot_be_told_from_it_is_right_with_its_own_numbers():
+    rival = hidden("link_mass", "p.hand", mass=-0.7)
+    load = hidden("payload", "p.flange", mass=-0.7, com_x=0.0, com_y=0.0, com_z=0.1)
+    case = log_truth([rival | {"needed": True, "equivalents": [load]}])
+    found = effect("payload", "p.flange", mass=-0.63, com_x=0.0, com_y=0.0, com_z=0.11)
+    got = score(case, {"verdict": "gap_named", "effects": [found]})
+    assert (got.first, got.extra, got.named, got.needed) == (True, 0, 1, 1)
+    np.testing.assert_allclose(got.errors, [0.1, 0.1])
+    elsewhere = effect("payload", "p.fore", mass=-0.7)
+    got = score(case, {"verdict": "gap_named", "effects": [elsewhere]})
+    assert (got.first, got.extra, got.named) == (False, 1, 0)
+
+
+def test_a_group_is_scored_as_its_members_and_those_that_are_missed_count():
+    case = log_truth([hidden("rotor_inertia", f"p.j{i}", inertia=0.1 * i)
+                      for i in (1, 2, 3)])  # fmt: skip
+    found = effect("rotor_inertia", ["p.j1", "p.j2", "p.j4"], inertia=0.1)
+    got = score(case, {"verdict": "gap_named", "effects": [found]})
+    assert (got.first, got.extra, got.named, got.needed) == (True, 1, 2, 3)
+    np.testing.assert_allclose(sorted(got.errors), [0.0, 0.5])
+    # One effect named twice is one.
+    twice = [effect("rotor_inertia", "p.j1", inertia=0.1)] * 2
+    got = score(case, {"verdict": "gap_named", "effects": twice})
+    assert (got.named, got.extra) == (1, 0)
+
+
+def test_an_interval_holds_the_truth_or_not():
+    case = log_truth([COULOMB])
+    for value, std, inside in (
+        (2.19, 0.1, True), (2.21, 0.1, False), (1.81, 0.1, True), (1.79, 0.1, False),
+        (2.0, float("inf"), False), (2.0, None, False),
+    ):  # fmt: skip
+        found = effect("joint_coulomb_friction", "p.j1", coulomb=value)
+        found["parameters"]["coulomb"]["std"] = std
+        got = score(case, {"verdict": "gap_named", "effects": [found]})
+        assert got.inside == (inside,), value
+    wave = hidden("torque_ripple", "p.j1", amplitude=1.0, phase=0.1)
+    found = effect("torque_ripple", "p.j1", amplitude=-1.05, phase=0.1 + 3 * np.pi)
+    got = score(log_truth([wave]), {"verdict": "gap_named", "effects": [found]})
+    assert got.inside == (True, True)
+    found = effect("torque_ripple", "p.j1", amplitude=1.05, phase=0.1 + np.pi)
+    got = score(log_truth([wave]), {"verdict": "gap_named", "effects": [found]})
+    assert sum(got.inside) == 1
+
+
+def test_what_a_log_does_not_tell_is_no_error_but_must_be_in_its_interval():
+    load = hidden("payload", "p.b", mass=1.0, com_x=0.3, com_y=0.4, com_z=0.0)
+    load["loose"] = ["com_z"]
+    found = effect("payload", "p.b", mass=1.0, com_x=0.3, com_y=0.5, com_z=7.0)
+    got = score(log_truth([load]), {"verdict": "gap_named", "effects": [found]})
+    np.testing.assert_allclose(sorted(got.errors), [0.0, 0.2])
+    assert got.inside == (True, True, True, False)
+
+
+def test_what_hardly_shows_is_not_asked_for_and_no_invention():
+    faint = COULOMB | {"needed": False}
+    case = log_truth([faint], ("ambiguous", "gap_named", "no_gap"))
+    got = score(case, {"verdict": "no_gap", "effects": []})
+    assert got.right and (got.first, got.needed, got.closed) == (None, 0, None)
+    found = effect("joint_coulomb_friction", "p.j1", coulomb=2.0)
+    got = score(case, {"verdict": "gap_named", "effects": [found]})
+    assert got.right and got.extra == 0
+    assert not score(case, {"verdict": "gap_unnamed", "effects": []}).right
+
+
+def test_the_table_has_the_goals_of_its_set():
+    good = Score(
+        "c", "gap_named or ambiguous", "ambiguous", True, True, (0.06,), 0.9, 0, 2.0,
+        "x", (True, False), 3, 4,
+    )  # fmt: skip
+    table = table_of([good], "logs-final", LOGS)
+    rows = {r[0]: (r[1], r[2], m) for r, m in zip(table.rows, table.met, strict=True)}
+    assert rows["right verdict"] == ("92%", "1 of 1 (100%)", True)
+    assert rows["parameter error, median"] == ("5%", "6.0% of 1", False)
+    name = "named intervals that hold the truth"
+    assert rows[name] == ("85%", "1 of 2 (50%)", False)
+    assert rows["hidden effects that were named"] == ("-", "3 of 4", None)
+    assert rows["said of gap_named or ambiguous (1)"][1] == "ambiguous 1"
+    assert "--set logs-final" in table.rows[0][3]
+    # A push with nothing else is a case without an effect.
+    push = Score("p", "gap_unnamed or no_gap", "gap_named", None, None, (), None, 2,
+                 2.0, "x")  # fmt: skip
+    table = table_of([good, push], "logs-final", LOGS)
+    rows = {r[0]: (r[2], m) for r, m in zip(table.rows, table.met, strict=True)}
+    name = "effects invented where nothing is hidden"
+    assert rows[name] == ("2 in 1 cases", False)
+
+
 def a_score(verdict, found, first=None, extra=0, closed=None, errors=()):
     return Score("c", verdict, found, first, first, errors, closed, extra, 2.0, "x")
 
@@ -205,6 +298,35 @@ assert not list(out.parent.parent.glob("cases/*/truth*"))
 (out / "result.json").write_text(json.dumps({"verdict": "no_gap", "effects": []}))
 (out / "timing.json").write_text('{"wall_s": 3.0}')
 """
+
+
+def test_a_case_that_never_ends_is_stopped_and_the_others_are_scored(
+    monkeypatch, tmp_path
+):
+    (tmp_path / "cases.py").write_text(MAKER)
+    slow = GAP.replace("out =", "import time\nif 'case_1' in sys.argv[-1]: "
+                       "time.sleep(60)\nout =")  # fmt: skip
+    (tmp_path / "gap.py").write_text(slow)
+    made_by(tmp_path / "cases.py", monkeypatch)
+    monkeypatch.setattr(gap_benchmark, "CASE_LIMIT_SEC", 3.0)
+    monkeypatch.setattr(
+        gap_benchmark,
+        "makebreak_command",
+        lambda *words: [sys.executable, str(tmp_path / "gap.py"), *words],
+    )
+    table = gap_benchmark.run_benchmark(tmp_path, 2)
+    rows = {row[0]: row[2] for row in table.rows}
+    assert rows["said of no_gap (1)"] == "failed 1"
+    assert rows["said of gap_named (1)"] == "no_gap 1"
+    scores = json.loads((tmp_path / "scores.json").read_text())
+    assert scores[0]["says"] == "stopped after 3 s"
+
+
+def test_an_unknown_set_is_refused_by_name(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["reproduce", "gap", "--set", "logs"]) == 2
+    shown = capsys.readouterr().err
+    assert 'got "logs"' in shown and "logs-final" in shown and shown.count("\n") == 1
 
 
 def test_the_whole_way_from_the_cases_to_the_table(monkeypatch, tmp_path):
