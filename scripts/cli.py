@@ -387,7 +387,8 @@ def _gap(args) -> int:
         if not path.is_file():
             raise ValueError(f'RECORDING: got "{path}", expected a file')
     out = Path(args.out) if args.out else _default_out("gap")
-    result, files = run_and_report(scene, recordings, out, _jobs(args.jobs))
+    export = [word for word in (args.export or "").split(",") if word]
+    result, files = run_and_report(scene, recordings, out, _jobs(args.jobs), export)
     print(effects_table(result).to_text())
     _say_files(files)
     return 0
@@ -557,6 +558,9 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("recordings", nargs="+", metavar="RECORDING", help=".csv, .npz, ...")
     p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
     p.add_argument("--out", metavar="DIR", help="default: runs/gap-<time>")
+    p.add_argument(
+        "--export", metavar="FORMATS", help="the repaired model also as: urdf,mjcf"
+    )
     p.set_defaults(function=_gap)
 
     p = commands.add_parser(

@@ -5,6 +5,7 @@ import sys
 import traceback
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
@@ -14,10 +15,12 @@ from makebreak.gap.comparison import comparison_html
 from makebreak.gap.recording import read_recordings
 from makebreak.gap.report import summary_lines, windows_of, write_report
 from makebreak.gap.result import GapResult
-from makebreak.models.scene import read_scene
+from makebreak.models.scene import Scene, read_scene
 from makebreak.scripts.interrupts import undisturbed
 from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.table import Table
+
+EXPORTS = ("urdf", "mjcf")
 
 
 class StageBar:
@@ -58,15 +61,22 @@ class StageBar:
 
 
 def run_and_report(
-    scene_path: Path, recording_paths: Sequence[Path], out_dir: Path, jobs: int
+    scene_path: Path,
+    recording_paths: Sequence[Path],
+    out_dir: Path,
+    jobs: int,
+    export: Sequence[str] = (),
 ) -> tuple[GapResult, list[Path]]:
     """The workflow's result, and the files that tell of it.
 
+    Args: export: of EXPORTS; the repaired model is written so as well.
     Raises: ValueError for a scene, a recording or a folder that cannot be used.
     """
     from makebreak.gap.workflow import run_gap  # Late: it is long to load.
 
     start = perf_counter()
+    if export:  # Refused before anything is computed.
+        exported(read_scene(scene_path), export)
     inputs = [scene_path, *recording_paths]
     with OutputFolder(out_dir, "gap", inputs) as out:
         try:
@@ -80,6 +90,10 @@ def run_and_report(
                 write_report(
                     result, scene, folder, recordings, scene_path, moving, out_dir
                 )
+                effects = [*scene.effects, *result.scene_effects()]
+                repaired = replace(scene, effects=effects)
+                for name, text in exported(repaired, export).items():
+                    out.file(name).write_text(text)
         except Exception as error:
             if isinstance(error.__cause__ or error, OSError) and any(out.written()):
                 kept = ", ".join(path.name for path in out.commit(complete=False))
@@ -93,6 +107,35 @@ def run_and_report(
         out.file("timing.json").write_text(json.dumps(times, indent=2) + "\n")
         with undisturbed():
             return result, out.commit()
+
+
+def exported(scene: Scene, formats: Sequence[str]) -> dict[str, str]:
+    """{file name: text} of a scene's model in other formats: `repaired.xml` (MJCF), and
+    `<model>.urdf` of each model that comes from a URDF. What a format cannot say is in
+    a comment at its end.
+
+    Raises: ValueError for an unknown format, and for a scene that it cannot say.
+    """
+    from makebreak.models.model_export import to_mjcf, to_urdf, urdf_models
+
+    found = {}
+    for each in formats:
+        if each not in EXPORTS:
+            raise ValueError(
+                f"--export: got {each!r}, expected some of {', '.join(EXPORTS)}"
+            )
+        if each == "mjcf":
+            found["repaired.xml"] = to_mjcf(scene)
+            continue
+        models = urdf_models(scene)
+        if not models:
+            raise ValueError("--export urdf: no model of the scene comes from a URDF")
+        found |= {f"{model}.urdf": to_urdf(scene, model) for model in models}
+    texts = {}
+    for name, one in found.items():
+        lost = "".join(f"<!-- Not in this file: {said} -->\n" for said in one.unsaid)
+        texts[name] = one.text + lost
+    return texts
 
 
 def effects_table(result: GapResult) -> Table:

@@ -163,6 +163,7 @@ KINDS = {
         parameters=(Parameter("kp", "N m/rad", 0.1, 5000.0, None, valid="> 0"),),
         says="the drive of {at} pulls towards its command with {kp}",
         confused_with=("actuator_gain", "payload", "joint_elasticity", "joint_spring"),
+        exported="kp",
         tell_apart="hold known loads: the error of position goes with load over gain, "
         "and measure the torque",
         path="kp",

@@ -370,6 +370,7 @@ KINDS = {
             "input_delay",
             "body_drag",
         ),
+        exported="inertia",
         tell_apart="move the joint at speeds a decade apart, with reversals",
         before_finalize=_add_damping,
         least=_least_damping,
@@ -387,6 +388,7 @@ KINDS = {
             "actuator_bias",
             "joint_backlash",
         ),
+        exported="friction",
         tell_apart="move the joint both ways through the same positions, at two speeds",
         possible=_check_total,
         least=_least_total("coulomb"),
@@ -468,6 +470,7 @@ KINDS = {
         says_less="the rotor of {at} has {inertia} less (reflected at the joint) than "
         "the model says",
         confused_with=("object_inertia", "payload", "actuator_gain"),
+        exported="inertia",
         tell_apart="move the other joints fast while this one rests, and know on which "
         "side of the gear the torque is measured",
         before_finalize=_add_rotor,

@@ -97,6 +97,8 @@ class EffectKind:
         joint_numbers(effect, plant, joint) -> its numbers p, up to four.
     body_law: compiled (V_WB (6,), t, p, F (6,)): adds to F the spatial force, torque
         first, on the body at its origin; body_numbers(effect) -> its numbers p.
+    exported: how URDF and MJCF say it: "inertia" (damping and rotors too: the plant has
+        it), "friction" or "kp" (its one parameter); "": they cannot.
     drive: the number of the drive's law (DriveLaw) that its parameter replaces.
     path: what it does between command and plant, of a name in actuation_path.STEPS.
     channel: what it does to a measured channel, of a name in measurement.STEPS.
@@ -145,6 +147,7 @@ class EffectKind:
     body_numbers: Callable[[Effect], list[float]] | None = None
     path: str = ""
     drive: str = ""
+    exported: str = ""
     channel: str = ""
     set_in_context: Callable[[Effect, Effect, MultibodyPlant, Context], None] | None = (
         None

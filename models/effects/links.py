@@ -115,6 +115,7 @@ KINDS = {
         says="{at} is {mass} heavier than in the model",
         says_less="{at} is {mass} lighter than in the model",
         confused_with=("payload", "link_com", "actuator_gain", "constant_force"),
+        exported="inertia",
         tell_apart="weigh the part, or look whether it is mounted; else hold poses in "
         "which its weight acts on other joints than a payload's",
         rank=2,
@@ -133,6 +134,7 @@ KINDS = {
         says="the centre of mass of {at} lies ({x}, {y}, {z}) away from where the "
         "model has it, in its axes",
         confused_with=("payload", "link_mass", "gravity_tilt", "joint_offset"),
+        exported="inertia",
         tell_apart="hold the link in several attitudes: a shift turns with it, and the "
         "weight stays",
         rank=2,

@@ -248,6 +248,7 @@ KINDS = {
         says_less="{at} carries {mass} less than the model says, missing at ({com_x}, "
         "{com_y}, {com_z}) in its frame",
         confused_with=("object_mass", "link_mass", "actuator_gain", "constant_force"),
+        exported="inertia",
         tell_apart="hold three or more orientations of the wrist, and move it fast",
         weighs=True,
         before_finalize=_add_payload,
@@ -266,6 +267,7 @@ KINDS = {
         says="the base of {at} is tilted by {roll} of roll and {pitch} of pitch, "
         "relative to the model",
         confused_with=("joint_offset", "object_com", "constant_force", "actuator_bias"),
+        exported="inertia",
         tell_apart="turn the first joint through its range: the torque of a tilt goes "
         "round with it",
         weighs=True,

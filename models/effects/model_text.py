@@ -27,12 +27,7 @@ def edited_model_file(
     Returns: the copy's URI.
     Raises: ValueError if the file is neither URDF nor SDF, or has no such link.
     """
-    # As Drake reads it: no %20, and "#" is part of the name.
-    scheme, _, rest = uri.partition("://")
-    path = Path(rest)
-    if scheme == "package":
-        package, *inside = path.parts
-        path = Path(package_map.GetPath(package)).joinpath(*inside)
+    path = model_path(uri, package_map)
     where = f"effect {effect.kind} at {effect.at}"
     if path.suffix not in (".urdf", ".sdf"):
         raise ValueError(f"{where}: {path.name} is neither URDF nor SDF")
@@ -47,18 +42,32 @@ def edited_model_file(
         names = ", ".join(link.getAttribute("name") for link in links)
         raise ValueError(f"{where}: expected one link of {path.name}: {names}")
     edit(effect, chosen[0])
-    # Meshes stay where they are, the copy does not.
-    for element in document.getElementsByTagName("uri"):
-        uri = text(element)
-        if "://" not in uri:
-            set_text(element, f"file://{(path.parent / uri).resolve()}")
-    for element in document.getElementsByTagName("mesh"):
-        uri = element.getAttribute("filename")
-        if uri and "://" not in uri:
-            element.setAttribute("filename", f"file://{(path.parent / uri).resolve()}")
+    with_meshes_of(document, path.parent)
     target = copy.with_suffix(path.suffix)
     target.write_text(document.toxml())
     return f"file://{target}"
+
+
+def model_path(uri: str, package_map: PackageMap) -> Path:
+    """As Drake reads it: no %20, and "#" is part of the name."""
+    scheme, _, rest = uri.partition("://")
+    path = Path(rest)
+    if scheme == "package":
+        package, *inside = path.parts
+        path = Path(package_map.GetPath(package)).joinpath(*inside)
+    return path
+
+
+def with_meshes_of(document: minidom.Document, folder: Path) -> None:
+    """Meshes stay where they are, in the folder of the original; the copy does not."""
+    for element in document.getElementsByTagName("uri"):
+        uri = text(element)
+        if "://" not in uri:
+            set_text(element, f"file://{(folder / uri).resolve()}")
+    for element in document.getElementsByTagName("mesh"):
+        uri = element.getAttribute("filename")
+        if uri and "://" not in uri:
+            element.setAttribute("filename", f"file://{(folder / uri).resolve()}")
 
 
 def text(element: minidom.Element) -> str:

@@ -304,6 +304,7 @@ KINDS = {
         parameters=(Parameter("mass", "kg", 0.001, 50.0, None, valid="> 0"),),
         says="{at} weighs {mass}",
         confused_with=("contact_friction", "object_inertia", "payload"),
+        exported="inertia",
         tell_apart="lift it or knock it: a slow push shows friction times weight only",
         weighs=True,
         edit_text=_mass_in_text,
@@ -325,6 +326,7 @@ KINDS = {
         says="the centre of mass of {at} is at[ x = {x}][ y = {y}][ z = {z}] in its "
         "frame",
         confused_with=("object_inertia", "gravity_tilt", "joint_offset"),
+        exported="inertia",
         tell_apart="let it fly and spin: the centre of mass alone moves on a parabola",
         rank=1,
         check=_some_are_given,
@@ -345,6 +347,7 @@ KINDS = {
         says="{at} has moments of inertia[ ixx = {ixx}][ iyy = {iyy}][ izz = {izz}] "
         "about its centre of mass",
         confused_with=("object_com", "corner_radius", "rotor_inertia"),
+        exported="inertia",
         tell_apart="spin it about several axes, or let it hit in many attitudes",
         rank=1,
         check=_some_are_given,

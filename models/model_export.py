@@ -1,0 +1,326 @@
+"""A scene's mechanism with its effects, as URDF or MJCF, as far as these can say it.
+
+Both say inertias, damping, dry friction (which Drake's own parser leaves out) and what
+turns in the motors. What they cannot say is told: `unsaid`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.dom import minidom
+from xml.etree import ElementTree as ET
+
+import numpy as np
+from pydrake.multibody.parsing import FlattenModelDirectives, ModelDirectives, Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    Joint,
+    PrismaticJoint,
+    RevoluteJoint,
+    RigidBody,
+    WeldJoint,
+)
+from pydrake.systems.framework import DiagramBuilder
+
+from makebreak.models.drives import law_of
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.inertia import central_inertia
+from makebreak.models.effects.kind import (
+    Effect,
+    actuator_of,
+    find_joints,
+    full_name,
+    model_of,
+    sentence,
+)
+from makebreak.models.effects.model_text import (
+    Inertial,
+    children,
+    model_path,
+    with_meshes_of,
+    write_inertial,
+)
+from makebreak.models.scene import LoadedScene, Scene, load_scene
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A model file as text, and the effects (sentences) that it cannot say."""
+
+    text: str
+    unsaid: tuple[str, ...]
+
+
+def to_mjcf(scene: Scene) -> Exported:
+    """The joints and inertias of a scene whose bodies are all held by joints that turn,
+    slide or do not move, with motors or position servos; no shapes, so no contact.
+
+    Raises: ValueError for another scene.
+    """
+    loaded = _load(scene)
+    plant = loaded.plant
+    root = ET.Element("mujoco", model="makebreak")
+    ET.SubElement(root, "compiler", angle="radian", autolimits="true")
+    gravity = plant.gravity_field().gravity_vector()
+    # Implicit in damping; the step of a robot's controller.
+    ET.SubElement(
+        root, "option", timestep="0.001", integrator="implicitfast",
+        gravity=_numbers(gravity),
+    )  # fmt: skip
+    world = ET.SubElement(root, "worldbody")
+    elements = {plant.world_body().index(): world}
+    payloads = _payloads(plant)
+    motors = ET.Element("actuator")
+    joints = [plant.get_joint(i) for i in plant.GetJointIndices()]
+    todo = [j for j in joints if not _is_added(model_of(plant, j.child_body()))]
+    while todo:
+        ready = [j for j in todo if j.parent_body().index() in elements]
+        if not ready:
+            raise ValueError("the scene's joints form a loop, which MJCF cannot say so")
+        for joint in ready:
+            body = joint.child_body()
+            said = {"name": full_name(plant, body), **_pose(joint)}
+            at = ET.SubElement(elements[joint.parent_body().index()], "body", said)
+            elements[body.index()] = at
+            inertial = _inertial(body, payloads)
+            if inertial.mass > 0.0:
+                six = inertial.central[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+                ET.SubElement(
+                    at, "inertial", pos=_numbers(inertial.com),
+                    mass=repr(inertial.mass), fullinertia=_numbers(six),
+                )  # fmt: skip
+            if not isinstance(joint, WeldJoint):
+                _mjcf_joint(loaded, joint, at, motors)
+        todo = [j for j in todo if j.child_body().index() not in elements]
+    if len(motors):
+        root.append(motors)
+    ET.indent(root)
+    return Exported(ET.tostring(root, encoding="unicode") + "\n", _unsaid(scene))
+
+
+def to_urdf(scene: Scene, model: str) -> Exported:
+    """The model's own URDF with its inertias, damping, friction and rotors.
+
+    Raises: ValueError if the model comes from no URDF.
+    """
+    files = urdf_models(scene)
+    if model not in files:
+        raise ValueError(f"{model!r} comes from no URDF, so none can be written of it")
+    loaded = _load(scene)
+    plant = loaded.plant
+    document = minidom.parse(str(files[model]))
+    instance = plant.GetModelInstanceByName(model)
+    payloads = _payloads(plant)
+    for link in document.getElementsByTagName("link"):
+        if not link.hasAttribute("name"):
+            continue
+        body = plant.GetBodyByName(link.getAttribute("name"), instance)
+        inertial = _inertial(body, payloads)
+        if not children(link, "inertial"):
+            if inertial.mass == 0.0:
+                continue
+            own = link.appendChild(document.createElement("inertial"))
+            own.appendChild(document.createElement("mass")).setAttribute("value", "0")
+            own.appendChild(document.createElement("inertia"))
+        write_inertial(link, inertial)
+    unsaid = list(_unsaid(scene))
+    for index in plant.GetJointIndices(instance):
+        joint = plant.get_joint(index)
+        if isinstance(joint, (RevoluteJoint, PrismaticJoint)):
+            unsaid += _urdf_joint(loaded, joint, document)
+    with_meshes_of(document, files[model].parent)
+    return Exported(document.toxml() + "\n", tuple(unsaid))
+
+
+def urdf_models(scene: Scene) -> dict[str, Path]:
+    """{model: its file} of those that come from URDFs."""
+    parser = Parser(MultibodyPlant(0.0))
+    flat = FlattenModelDirectives(
+        ModelDirectives(directives=scene.directives), parser.package_map()
+    )
+    files = {
+        d.add_model.name: model_path(d.add_model.file, parser.package_map())
+        for d in flat.directives
+        if d.add_model is not None
+    }
+    return {name: file for name, file in files.items() if file.suffix == ".urdf"}
+
+
+def _load(scene: Scene) -> LoadedScene:
+    loaded = load_scene(scene, DiagramBuilder())
+    plant = loaded.plant
+    free = [
+        full_name(plant, plant.get_body(i))
+        for i in sorted(plant.GetFloatingBaseBodies())
+    ]
+    others = [
+        full_name(plant, joint)
+        for joint in (plant.get_joint(i) for i in plant.GetJointIndices())
+        if not isinstance(joint, (RevoluteJoint, PrismaticJoint, WeldJoint))
+        and full_name(plant, joint.child_body()) not in free
+    ]
+    if free or others:
+        raise ValueError(
+            f"{', '.join([*free, *others])}: only mechanisms of joints that turn or "
+            "slide are written as URDF and MJCF"
+        )
+    return loaded
+
+
+def _is_added(model: str) -> bool:
+    return model.startswith(("payload_on_", "motor_of_"))
+
+
+def _payloads(plant: MultibodyPlant) -> dict[int, list[RigidBody]]:
+    """{index of the carrier: the payloads that are welded to it}."""
+    found: dict[int, list[RigidBody]] = {}
+    for joint in (plant.get_joint(i) for i in plant.GetJointIndices()):
+        body = joint.child_body()
+        if model_of(plant, body).startswith("payload_on_"):
+            found.setdefault(int(joint.parent_body().index()), []).append(body)
+    return found
+
+
+def _inertial(body: RigidBody, payloads) -> Inertial:
+    """Of a body and the payloads on it, whose axes are the body's."""
+    M = body.default_spatial_inertia()
+    mass, moment = M.get_mass(), M.get_mass() * M.get_com()
+    about = M.CalcRotationalInertia().CopyToFullMatrix3()
+    for each in payloads.get(int(body.index()), []):
+        more = each.default_spatial_inertia()
+        mass += more.get_mass()
+        moment = moment + more.get_mass() * more.get_com()
+        about = about + more.CalcRotationalInertia().CopyToFullMatrix3()
+    if not mass > 0.0:
+        return Inertial(0.0, np.zeros(3), np.zeros((3, 3)))
+    if not payloads.get(int(body.index())):
+        return Inertial(mass, M.get_com(), central_inertia(M))
+    com = moment / mass
+    return Inertial(
+        mass, com, about - mass * (com @ com * np.eye(3) - np.outer(com, com))
+    )
+
+
+def _numbers(values: Sequence[float] | np.ndarray) -> str:
+    return " ".join(repr(float(x)) for x in values)
+
+
+def _pose(joint: Joint) -> dict[str, str]:
+    """Of the child in its parent, at the joint's zero."""
+    X_PF = joint.frame_on_parent().GetFixedPoseInBodyFrame()
+    X_BM = joint.frame_on_child().GetFixedPoseInBodyFrame()
+    X_PM = X_PF @ joint.X_FM() if isinstance(joint, WeldJoint) else X_PF
+    X_PB = X_PM @ X_BM.inverse()
+    return {
+        "pos": _numbers(X_PB.translation()),
+        "quat": _numbers(X_PB.rotation().ToQuaternion().wxyz()),
+    }
+
+
+def _mjcf_joint(loaded: LoadedScene, joint: Joint, body, motors) -> None:
+    plant, name = loaded.plant, full_name(loaded.plant, joint)
+    turns = isinstance(joint, RevoluteJoint)
+    axis = joint.revolute_axis() if turns else joint.translation_axis()
+    X_BM = joint.frame_on_child().GetFixedPoseInBodyFrame()
+    law = law_of(loaded.scene.actuation, name)
+    damping = float(joint.default_damping_vector()[0])
+    if law is not None:  # What turning costs a motor at its supply is damping.
+        damping += float(law.emf)
+    said = {
+        "name": name,
+        "type": "hinge" if turns else "slide",
+        "pos": _numbers(X_BM.translation()),
+        "axis": _numbers(X_BM.rotation() @ axis),
+        "damping": repr(damping),
+        "frictionloss": repr(_dry_friction(loaded, joint)),
+        "armature": repr(_rotor(plant, joint)),
+    }
+    low, high = joint.position_lower_limit(), joint.position_upper_limit()
+    if np.isfinite([low, high]).all():
+        said["range"] = _numbers([low, high])
+    ET.SubElement(body, "joint", said)
+    actuator = actuator_of(plant, joint)
+    if actuator is None or name not in loaded.scene.actuation.joints:
+        return
+    limit = actuator.effort_limit()
+    if law is None:
+        said = {"name": name, "joint": name}
+        if np.isfinite(limit):
+            said["ctrlrange"] = _numbers([-limit, limit])
+        ET.SubElement(motors, "motor", said)
+        return
+    kp, limit = _kp(loaded, name, float(law.kp)), min(limit, float(law.limit))
+    gains = {"kp": repr(kp), "kv": repr(float(law.kd))}
+    if kp == 0.0:
+        gains = {"kv": repr(float(law.kd))}
+    said = {"name": name, "joint": name, **gains}
+    if np.isfinite(limit):
+        said["forcerange"] = _numbers([-limit, limit])
+    ET.SubElement(motors, "position" if kp else "velocity", said)
+
+
+def _urdf_joint(loaded: LoadedScene, joint: Joint, document) -> list[str]:
+    """Returns: what could not be said."""
+    plant = loaded.plant
+    (element,) = [
+        e for e in document.getElementsByTagName("joint")
+        if e.getAttribute("name") == joint.name() and e.hasAttribute("type")
+    ]  # fmt: skip
+    found = children(element, "dynamics")
+    if not found:
+        found = [element.appendChild(document.createElement("dynamics"))]
+    found[0].setAttribute("damping", repr(float(joint.default_damping_vector()[0])))
+    found[0].setAttribute("friction", repr(_dry_friction(loaded, joint)))
+    rotor = _rotor(plant, joint)
+    if rotor == 0.0:
+        return []
+    for transmission in document.getElementsByTagName("transmission"):
+        names = [j.getAttribute("name") for j in children(transmission, "joint")]
+        for actuator in children(transmission, "actuator"):
+            if joint.name() not in names:
+                continue
+            root = document.documentElement
+            root.setAttribute("xmlns:drake", "http://drake.mit.edu")
+            for tag, value in (("rotor_inertia", rotor), ("gear_ratio", 1.0)):
+                for old in children(actuator, f"drake:{tag}"):
+                    actuator.removeChild(old)
+                new = document.createElement(f"drake:{tag}")
+                new.setAttribute("value", repr(value))
+                actuator.appendChild(new)
+            return []
+    return [f"{full_name(plant, joint)} turns a rotor with {rotor:.3g}, and has no "
+            "transmission to write it to"]  # fmt: skip
+
+
+def _rotor(plant: MultibodyPlant, joint: Joint) -> float:
+    actuator = actuator_of(plant, joint)
+    return 0.0 if actuator is None else float(actuator.default_reflected_inertia())
+
+
+def _of_kind(loaded: LoadedScene, said: str) -> list[Effect]:
+    return [e for e in loaded.effects if KINDS[e.kind].exported == said]
+
+
+def _dry_friction(loaded: LoadedScene, joint: Joint) -> float:
+    total = 0.0
+    for effect in _of_kind(loaded, "friction"):
+        (value,) = effect.parameters.values()
+        if any(j.index() == joint.index() for j in find_joints(effect, loaded.plant)):
+            total += value
+    return total
+
+
+def _kp(loaded: LoadedScene, joint: str, kp: float) -> float:
+    for effect in _of_kind(loaded, "kp"):
+        names = [full_name(loaded.plant, j) for j in find_joints(effect, loaded.plant)]
+        if joint in names:
+            (kp,) = effect.parameters.values()
+    return kp
+
+
+def _unsaid(scene: Scene) -> tuple[str, ...]:
+    return tuple(
+        sentence(effect, KINDS[effect.kind])
+        for effect in scene.effects
+        if not KINDS[effect.kind].exported
+    )
