@@ -263,16 +263,14 @@ def _of_drives(model: InverseModel, kind: str) -> list[Candidate]:
         if not _driven(model, at):
             continue
         ((name, now),) = model.dynamics.now(kind, [at]).items()
-        base, columns = model.base(), []
-        for share in (-0.3, 0.3):
-            moved = model.residual([Effect(kind, [at], {name: (1.0 + share) * now})])
-            columns.append(((base - moved) / (share * now))[:, None])
+        step = 0.2 * now
+        moved = model.residual([Effect(kind, [at], {name: now - step})])
+        columns = ((moved - model.base()) / step)[:, None]
 
         def read(c, name=name, now=now):
             return {name: now + float(c[0])}
 
-        readers = (read,) * len(columns)
-        found.append(Candidate(kind, (at,), 1, tuple(columns), readers))
+        found.append(Candidate(kind, (at,), 1, (columns,), (read,)))
     return found
 
 

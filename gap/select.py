@@ -580,7 +580,11 @@ def _groups(found: Sequence[Candidate]) -> list[Candidate]:
     for c in found:
         place = KINDS[c.kind].at
         single = len(c.columns) == 1 and c.columns[0].shape[1] == 1 and len(c.at) == 1
-        if place in ("joint", "actuator", "channel") and single and not c.fixed:
+        if (
+            place in ("joint", "actuator", "channel", "drive")
+            and single
+            and not c.fixed
+        ):
             by_kind.setdefault(c.kind, []).append(c)
     return [
         Candidate(
