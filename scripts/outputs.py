@@ -49,9 +49,8 @@ class OutputFolder:
         self.stage = self.path / STAGE
         self._lock: int | None = None
         self._made: list[Path] = []  # Folders that were not there.
-        here = self.path.resolve()
         for each in inputs:
-            if Path(each).resolve().parent == here:
+            if self._may_write(Path(each)):
                 self._refuse(f"holds {Path(each).name}, which this command reads")
         try:
             self._enter()
@@ -64,6 +63,14 @@ class OutputFolder:
         except BaseException:
             self.close()
             raise
+
+    def _may_write(self, file: Path) -> bool:
+        """Whether the file, or what it is a link to, is where this command writes."""
+        here = self.path.resolve()
+        old = {(here / name).resolve() for name in _read_mark(here).get("files", {})}
+        folders = (here, here / KEPT)
+        places = (file.parent.resolve() / file.name, file.resolve())
+        return any(place in old or place.parent in folders for place in places)
 
     def _refuse(self, why: str):
         word = self.command.split()[0]

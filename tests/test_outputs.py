@@ -215,6 +215,28 @@ def test_gap_into_the_folder_of_its_inputs_is_refused(gap, capsys):
     refusal(capsys, "gap", scene, f"logs/{recording}", "--out", "link")
 
 
+def test_an_input_is_found_wherever_the_command_may_write(gap, capsys):
+    """Behind a link either way, in `unfinished`, and among its own files below."""
+    scene, recording = gap
+    Path("out").mkdir()
+    os.symlink(f"../{recording}", "out/linked.csv")
+    refusal(capsys, "gap", scene, "out/linked.csv", "--out", "out")
+    os.unlink("out/linked.csv")
+    os.rename(recording, "out/real.csv")
+    os.symlink("out/real.csv", recording)
+    refusal(capsys, "gap", scene, recording, "--out", "out")
+    with OutputFolder("mine", "gap") as out:
+        out.file("a.yaml").write_text("")
+        out.file("models/b.yaml").write_text("")
+        out.commit()
+    with OutputFolder("mine", "gap") as out:
+        out.file("a.yaml").write_text("part")
+        out.commit(complete=False)
+    for name in ("mine/models/b.yaml", "mine/unfinished/a.yaml"):
+        error = refusal(capsys, "gap", name, "out/real.csv", "--out", "mine")
+        assert "which this command reads" in error
+
+
 def test_gap_into_the_folder_of_a_run_is_refused(gap, capsys):
     words = ["--duration", "5", "--no-meshcat", "--out", "X"]
     assert cli.main(["run", "spring_mass", *words]) < 2
