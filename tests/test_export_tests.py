@@ -222,3 +222,13 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capsys, monkeypatch)
     assert run_main("cartpole_walls", "--out", str(out)) == 2
     assert "holds mine.txt, which makebreak did not write" in capsys.readouterr().err
     assert (out / "mine.txt").read_text() == "keep"
+
+
+def test_an_export_may_be_repeated_into_its_folder(tmp_path):
+    out = str(tmp_path / "out")
+    words = ["cartpole_walls", "--out", out, "--seconds", "0.1", "--systems"]
+    assert run_main(*words, "c3,learner") == 0
+    assert run_main(*words, "c3") == 0
+    names = {path.name for path in (tmp_path / "out").iterdir()} - {"models"}
+    assert names == {"test_c3.py", "c3.npz", ".makebreak.json"}
+    assert failing(tmp_path / "out") == set()
