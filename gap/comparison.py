@@ -25,7 +25,13 @@ from makebreak.diagrams.scene_simulation import Commands, SceneSimulation
 from makebreak.gap.recording import Episode, Recording
 from makebreak.gap.result import GapResult, Series
 from makebreak.models.effects.kind import full_name, one_dof_joints
-from makebreak.models.scene import InitialSection, LoadedScene, Scene, load_scene
+from makebreak.models.scene import (
+    InitialSection,
+    LoadedScene,
+    Scene,
+    initial_for,
+    load_scene,
+)
 from makebreak.systems.numerics.smoother import smooth_filtered
 
 _LEAST_SEC = 1.5  # Of motion; a window alone is too short for the eye.
@@ -67,6 +73,8 @@ def comparison_html(
     if found is None:
         return None
     recording, episode, start, end = found
+    said = initial_for(scene, str(recording.path), episode.number)
+    scene = replace(scene, initial=said, initial_of={})
     repaired = replace(scene, effects=[*scene.effects, *result.scene_effects()])
     scenes = {"before": scene} | ({"after": repaired} if result.effects else {})
     times = np.linspace(start, end, _FRAMES)

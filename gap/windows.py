@@ -16,7 +16,7 @@ from makebreak.gap.inverse import _lag, _sensing
 from makebreak.gap.recording import Episode, Recording
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
-from makebreak.models.scene import InitialSection, Scene
+from makebreak.models.scene import InitialSection, Scene, initial_for
 from makebreak.models.scene_schema import COMMANDS_OF
 from makebreak.systems.numerics.filters import Stage, memory, with_lag
 from makebreak.systems.numerics.smoother import smooth_filtered
@@ -379,7 +379,11 @@ class WindowModel(WindowedResidual):
     def _initial(self, w: Window, episode: Episode, effects) -> InitialSection:
         """The true state at the start, if the effects on measurement are these beside
         the scene's own."""
-        initial = InitialSection()
+        said = self._said(w, episode)
+        initial = InitialSection(
+            dict(said.positions), dict(said.velocities),
+            dict(said.poses), dict(said.body_velocities),
+        )  # fmt: skip
         path = self._paths[w.recording, episode.first]
         measured = [
             e for e in (*self.scene.effects, *effects) if e.kind in _MEASUREMENT
@@ -408,14 +412,20 @@ class WindowModel(WindowedResidual):
             for i, axis in enumerate(_POSITIONS):
                 if f"{body}.{axis}" in w.state:
                     place[i] = state(f"{body}.{axis}") / length
-                elif body in self.scene.initial.poses:
-                    place[i, 0] = self.scene.initial.poses[body][4 + i]
+                elif body in said.poses:
+                    place[i, 0] = said.poses[body][4 + i]
+                    place[i, 1] = said.body_velocities.get(body, [0.0] * 6)[3 + i]
             q, dq = np.array([1.0, 0, 0, 0]), np.zeros(4)
+            if body in said.poses:
+                q = np.array(said.poses[body][:4])
+                q = q / np.linalg.norm(q)
             if f"{body}.qw" in w.state:
                 turn = np.array([state(f"{body}.{a}") for a in TURN])
                 size = np.linalg.norm(turn[:, 0])
                 q, dq = turn[:, 0] / size, turn[:, 1] / size
             spin = spin_of(q, dq)
+            if f"{body}.qw" not in w.state:
+                spin = np.array(said.body_velocities.get(body, [0.0] * 6)[:3])
             initial.poses[body] = [*map(float, q), *map(float, place[:, 0])]
             initial.body_velocities[body] = [
                 *map(float, spin),
@@ -424,6 +434,15 @@ class WindowModel(WindowedResidual):
             if f"{body}.z" not in w.state:  # It lies, and rolls, on what is below it.
                 initial = self.simulation.put_down(initial, body)
         return initial
+
+    def _said(self, w: Window, episode: Episode) -> InitialSection:
+        """What the scene says of an episode's start: it holds for what is not measured;
+        velocities only in the window that is the start."""
+        path = str(self.recordings[w.recording].path)
+        said = initial_for(self.scene, path, episode.number)
+        if w.rows.start == episode.first and episode.is_start:
+            return said
+        return replace(said, velocities={}, body_velocities={})
 
     def errors(self, simulated: Sequence[np.ndarray]) -> list[np.ndarray]:
         """(measured - simulated)/std of each window, clipped as fits need it; 0 where

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from makebreak.gap.check_drives import check_drives, check_initial_names
 from makebreak.gap.checks import check_recordings
 from makebreak.gap.data.conditioning import condition
 from makebreak.gap.findings import Finding
@@ -70,6 +71,8 @@ def run_gap(
     joints, bodies = scene_names(dynamics.plant)
     for recording in recordings:
         check_against_scene(recording, joints, bodies)
+        check_drives(recording, scene)
+    check_initial_names(scene, recordings)
     # What is reported on is cut off before anything is looked at.
     parts = split(recordings)
     say("checking the recordings")

@@ -20,7 +20,14 @@ from pydrake.multibody.plant import (
     MultibodyPlantConfig,
 )
 from pydrake.multibody.tree import ModelInstanceIndex
-from pydrake.systems.framework import Context, DiagramBuilder, InputPort, OutputPort
+from pydrake.systems.framework import (
+    Context,
+    Diagram,
+    DiagramBuilder,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+)
 from pydrake.systems.primitives import Adder
 
 from makebreak.models.drives import (
@@ -82,6 +89,7 @@ __all__ = [
     "PlantSection",
     "Scene",
     "actuators_of_model",
+    "apply_initial_velocities",
     "initial_for",
     "load_scene",
     "path_numbers",
@@ -317,7 +325,15 @@ def load_scene(
             possible(effect, plant, effects)
         if KINDS[effect.kind].channel:
             check_channels(effect, KINDS[effect.kind].channel, plant)
+    for episodes in scene.initial_of.values():
+        for state in episodes.values():
+            _check_names(state, plant)
+    _check_names(scene.initial, plant)
     _set_initial(scene.initial, effects, plant)
+    if scene.initial.velocities or scene.initial.body_velocities:
+        builder.AddNamedSystem(
+            InitialVelocities.NAME, InitialVelocities(plant, scene.initial)
+        )
     forces: list[OutputPort] = []
     joint_forces = _add_joint_forces(effects, plant, builder)
     if joint_forces is not None:
@@ -423,9 +439,43 @@ def _add_body_forces(effects, plant: MultibodyPlant, builder: DiagramBuilder):
     return system
 
 
+class InitialVelocities(LeafSystem):
+    """Keeps the scene's initial velocities in the diagram, for whoever simulates it:
+    Drake has no default for them, and no system may write another's state."""
+
+    NAME = "initial_velocities"
+
+    def __init__(self, plant: MultibodyPlant, initial: InitialSection):
+        super().__init__()
+        self._plant, self._initial = plant, initial
+
+    def apply(self, root_context: Context) -> None:
+        """Gives the plant its velocities, in a Context of the whole diagram."""
+        own = self._plant.GetMyMutableContextFromRoot(root_context)
+        _set_velocities(self._initial, self._plant, own)
+
+
+def apply_initial_velocities(diagram: Diagram, root_context: Context) -> None:
+    """Gives each scene of a diagram its initial velocities; they are not part of the
+    default Context.
+
+    Args: root_context, of the diagram, which is the whole one.
+    """
+    for system in diagram.GetSystems():
+        if isinstance(system, InitialVelocities):
+            system.apply(root_context)
+        elif isinstance(system, Diagram):
+            apply_initial_velocities(system, root_context)
+
+
 def set_initial_velocities(loaded: LoadedScene, plant_context: Context) -> None:
-    """Sets the scene's initial velocities: Drake has no default for them."""
-    plant, initial = loaded.plant, loaded.scene.initial
+    """Sets the scene's initial velocities in the plant's own Context."""
+    _set_velocities(loaded.scene.initial, loaded.plant, plant_context)
+
+
+def _set_velocities(
+    initial: InitialSection, plant: MultibodyPlant, plant_context: Context
+) -> None:
     for name, value in initial.velocities.items():
         joint = _one_dof(plant, name, "velocities")
         v = plant.GetVelocities(plant_context)
@@ -460,8 +510,6 @@ def _set_initial(
         motor = motor_joint(plant, joint)
         if motor is not None:
             motor.set_default_positions([value])
-    for name in initial.velocities:
-        _one_dof(plant, name, "velocities")
     for name, pose in initial.poses.items():
         body = _free_body(plant, name, "poses")
         unit = np.array(pose[:4]) / np.linalg.norm(pose[:4])
@@ -469,8 +517,16 @@ def _set_initial(
         plant.SetDefaultFloatingBaseBodyPose(
             body, RigidTransform(Quaternion(unit), p_WB)
         )
-    for name in initial.body_velocities:
-        _free_body(plant, name, "body_velocities")
+
+
+def _check_names(initial: InitialSection, plant: MultibodyPlant) -> None:
+    """Raises: ValueError for a joint or body that the scene has not, or not so."""
+    for section in ("positions", "velocities"):
+        for name in getattr(initial, section):
+            _one_dof(plant, name, section)
+    for section in ("poses", "body_velocities"):
+        for name in getattr(initial, section):
+            _free_body(plant, name, section)
 
 
 def _one_dof(plant: MultibodyPlant, name: str, section: str):

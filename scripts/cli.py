@@ -1,7 +1,8 @@
 """The command line, `makebreak COMMAND`.
 
 Exit status: 0 done; 1 it ran and did not meet its criterion; 2 bad input, one line on
-stderr; 3 a fault of makebreak itself, with a traceback; 130 ended by Ctrl-C.
+stderr; 3 a fault of makebreak itself, one line that names the file with the traceback;
+130 ended by Ctrl-C.
 """
 
 import argparse
@@ -10,7 +11,8 @@ import logging
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from datetime import datetime
 from importlib import import_module
 from pathlib import Path
@@ -18,15 +20,12 @@ from pathlib import Path
 import yaml
 
 import makebreak
+from makebreak.models.typed_yaml import nearest
 from makebreak.scripts.experiments import EXPERIMENTS, load_experiment, summary_of
+from makebreak.scripts.faults import fault, is_drakes, on_purpose, refused
 from makebreak.scripts.interrupts import interrupts
 from makebreak.scripts.parent import end_with_parent
-from makebreak.scripts.settings import (
-    apply_settings,
-    dump_config,
-    load_config,
-    nearest,
-)
+from makebreak.scripts.settings import apply_settings, dump_config, load_config
 
 # What `reproduce` knows beside the experiments; only by its name.
 _BENCHMARKS = {"gap": "makebreak.scripts.gap_benchmark"}
@@ -224,25 +223,21 @@ def _run_in(session, args, module, config, duration) -> int:
         result = dict(module.run(config, session))
     except KeyboardInterrupt:
         session.interrupted = True
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         if session.interrupted:  # Too short a recording to be scored.
             pass
-        elif not session.started and isinstance(
-            error, ValueError | OSError | RuntimeError
-        ):
-            # Before anything was simulated: the input does not fit. (Drake's parser
-            # raises RuntimeError.)
-            raise ValueError(str(error)) from error
+        elif not session.started:  # The input does not fit.
+            return refused(error)
         else:
             session.keep_partial()
             if isinstance(error, OSError):
                 session.unwritten = error
                 session.finish(complete=False)
                 _writable(session)
-            traceback.print_exc()
             session.write_text("error.txt", traceback.format_exc())
-            session.finish(complete=False)
-            return 3
+            files = session.finish(complete=False)
+            kept = [path for path in files if path.name == "error.txt"]
+            return fault(error, kept[0] if kept else None)
     if result is None:
         session.keep_partial()
     else:
@@ -339,9 +334,8 @@ def _reproduce_in(session, modules, seeds: int, jobs: int, args) -> int:
             with session.child(name) as child:
                 try:
                     table = module.reproduce(child, seeds, jobs, *extra)
-                except Exception:  # Not the user's doing: all input is checked above.
-                    traceback.print_exc()
-                    return 3
+                except (Exception, SystemExit) as error:
+                    return fault(error)  # All input is checked above.
                 child.finish()
             show(name, table)
     verdict = verdicts(tables)
@@ -388,7 +382,15 @@ def _gap(args) -> int:
             raise ValueError(f'RECORDING: got "{path}", expected a file')
     out = Path(args.out) if args.out else _default_out("gap")
     export = [word for word in (args.export or "").split(",") if word]
-    result, files = run_and_report(scene, recordings, out, _jobs(args.jobs), export)
+    try:
+        result, files = run_and_report(
+            scene, recordings, out, _jobs(args.jobs), export
+        )
+    except (Exception, SystemExit) as error:
+        if on_purpose(error) or isinstance(error, OSError):
+            raise
+        kept = out / "error.txt"
+        return fault(error, kept) if kept.exists() else refused(error)
     print(effects_table(result).to_text())
     _say_files(files)
     return 0
@@ -602,6 +604,11 @@ def _parser() -> argparse.ArgumentParser:
     p = commands.add_parser("bench", help="how long the parts take, as table and JSON")
     p.add_argument("names", nargs="*", metavar="NAME")
     p.set_defaults(function=_bench)
+    for name in ("run", "gap", "export-tests"):
+        commands.choices[name].add_argument(
+            "--package", action="append", default=[], metavar="NAME=PATH",
+            help="where package://NAME is, for the scenes' models",
+        )  # fmt: skip
     for each in commands.choices.values():
         each.set_defaults(options=list(each._option_string_actions))
     return parser
@@ -634,6 +641,24 @@ def main(argv: list[str] | None = None) -> int:
         return _main(sys.argv[1:] if argv is None else argv)
 
 
+@contextmanager
+def _given_packages(settings: list[str]) -> Iterator[None]:
+    """While entered, scenes know the packages of `--package NAME=PATH`."""
+    if not settings:
+        yield
+        return
+    from makebreak.models.scene_reader import PACKAGES_VARIABLE, give_packages
+
+    before = os.environ.get(PACKAGES_VARIABLE)
+    give_packages(settings)
+    try:
+        yield
+    finally:
+        del os.environ[PACKAGES_VARIABLE]
+        if before is not None:
+            os.environ[PACKAGES_VARIABLE] = before
+
+
 def _main(argv: list[str]) -> int:
     try:
         args = _parse(argv)
@@ -642,12 +667,12 @@ def _main(argv: list[str]) -> int:
             for setting in args.set:
                 if setting in EXPERIMENTS:
                     raise ValueError(f"EXPERIMENT comes before --set, got {setting}")
-        status = args.function(args)
+        with _given_packages(getattr(args, "package", [])):
+            status = args.function(args)
         sys.stdout.flush()
         return status
     except ValueError as error:
-        print(f"makebreak: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+        return refused(error) if on_purpose(error) else fault(error)
     except BrokenPipeError:  # As in `makebreak list | head`: nobody reads on.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
@@ -657,6 +682,9 @@ def _main(argv: list[str]) -> int:
     except KeyboardInterrupt:
         print("makebreak: interrupted", file=sys.stderr)
         return 130
-    except Exception:
-        traceback.print_exc()
-        return 3
+    except Exception as error:
+        return fault(error)
+    except SystemExit as error:
+        if not is_drakes(error):
+            raise
+        return fault(error)

@@ -94,7 +94,7 @@ def run_and_report(
                 repaired = replace(scene, effects=effects)
                 for name, text in exported(repaired, export).items():
                     out.file(name).write_text(text)
-        except Exception as error:
+        except (Exception, SystemExit) as error:  # Of Drake.
             if isinstance(error.__cause__ or error, OSError) and any(out.written()):
                 kept = ", ".join(path.name for path in out.commit(complete=False))
                 raise ValueError(f"{error}; kept: {kept}") from error

@@ -28,6 +28,7 @@ from pydrake.systems.framework import (
 from tqdm import tqdm
 
 from makebreak.gap.table import write_recording
+from makebreak.models.scene import apply_initial_velocities
 from makebreak.scripts.compiling import CompilingShown
 from makebreak.scripts.diagram_picture import draw_diagram, shown_systems
 from makebreak.scripts.interrupts import handled, leave_terminal, undisturbed
@@ -192,7 +193,10 @@ class Session:
                 draw_diagram(diagram, self.picture)
                 self._drawn = systems
         self.started = True
-        simulator = Simulator(diagram, context or diagram.CreateDefaultContext())
+        if context is None:
+            context = diagram.CreateDefaultContext()
+            apply_initial_velocities(diagram, context)
+        simulator = Simulator(diagram, context)
         root = simulator.get_mutable_context()
         simulator.set_target_realtime_rate(self.realtime)
         ports = []

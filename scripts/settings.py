@@ -1,6 +1,7 @@
 """Reads settings into an experiment's config dataclass, and refuses what is wrong."""
 
 import dataclasses
+import typing
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import numpy as np
 import yaml
 
 from makebreak.models.typed_yaml import (
+    Between,
     convert,
     hints_of,
     load_yaml,
@@ -44,7 +46,9 @@ def load_config(schema: type, path: Path):
         mapping = read_yaml(path)
         if not isinstance(mapping, dict | None):
             raise ValueError(f'got "{shown(mapping)}", expected key: value lines')
-        return merge(schema, mapping or {}, schema())
+        config = merge(schema, mapping or {}, schema())
+        check_sizes(config, schema())
+        return config
     except ValueError as error:
         raise ValueError(f"--config {path}: {one_line(error)}") from error
 
@@ -73,7 +77,60 @@ def apply_settings(config, settings: Iterable[str]):
             config = _replace(config, key.split("."), value, raw, types_of[key], key)
         except ValueError as error:
             raise ValueError(f"--set {one_line(error)}") from error
+    try:
+        check_sizes(config, type(config)())
+    except ValueError as error:
+        raise ValueError(f"--set {one_line(error)}") from error
     return config
+
+
+# Bounds of numbers, by the last word of their names; a field's own Between wins.
+_BOUNDS = {
+    "period_sec": Between(1e-4, 10.0, "s"),
+    "offset_sec": Between(0.0, 10.0, "s"),
+    "seed": Between(None, 2.0**63 - 1.0),
+    "friction": Between(0.0, 100.0),
+}
+# Of others: how many times the default, or as many times 1 or 10, they may be.
+_MOST_TIMES, _MOST_COUNT = 1e4, 1000
+
+
+def check_sizes(config, default, prefix: str = "") -> None:
+    """Refuses numbers that no experiment can mean: infinite ones, where the default is
+    finite, and those that are thousands of times the default.
+
+    Raises: ValueError.
+    """
+    hints = hints_of(type(config))
+    for f in dataclasses.fields(config):
+        value, usual = getattr(config, f.name), getattr(default, f.name)
+        name = f"{prefix}{f.name}"
+        if dataclasses.is_dataclass(value):
+            check_sizes(value, usual, name + ".")
+        elif typing.get_origin(hints[f.name]) is not typing.Annotated:
+            _check_size(name, value, usual)
+
+
+def _check_size(name: str, value, usual) -> None:
+    if isinstance(value, list | tuple):
+        for i, each in enumerate(value):
+            _check_size(f"{name}[{i}]", each, usual)
+        return
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return
+    usual = [usual] if not isinstance(usual, list | tuple) else usual
+    sizes = [abs(x) for x in usual if isinstance(x, int | float)]
+    last = name.rpartition(".")[2].partition("[")[0]
+    bounds = _BOUNDS.get(last)
+    if bounds is None:
+        if isinstance(value, int):
+            most = _MOST_COUNT * max([10, *sizes])
+        else:
+            most = _MOST_TIMES * max([1.0, *sizes])
+        bounds = Between(-most, most)
+    if value in usual or bounds.holds(value):
+        return
+    raise ValueError(f'{name}: got "{shown(value)}", expected {bounds}')
 
 
 def _replace(config, path: list[str], value, raw: str, hint, name: str):

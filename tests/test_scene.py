@@ -16,6 +16,7 @@ from makebreak.models.scene import (
     set_initial_velocities,
 )
 from makebreak.models.typed_yaml import nearest
+from makebreak.scripts.session import Session
 
 G = 9.81
 RADIUS, MASS = 0.0315, 0.07
@@ -314,3 +315,21 @@ def test_model_files_are_found_in_a_folder_with_an_odd_name(tmp_path):
         rows, _ = simulate(each, [0.1])
         # The contact gives way by m g / stiffness = 7 um.
         np.testing.assert_allclose(rows[0, :3], [0.1, 0, RADIUS], atol=2e-5)
+
+
+def test_initial_velocities_act_in_a_session(ball_scene, tmp_path):
+    # 1.5 m/s along x, no spin, 0.3 m above the table: free flight for 0.2 s.
+    initial = replace(
+        ball_scene.initial,
+        poses={"ball.ball": [1, 0, 0, 0, 0, 0, 0.3]},
+        body_velocities={"ball.ball": [0, 0, 0, 1.5, 0, 0]},
+    )
+    builder = DiagramBuilder()
+    loaded = load_scene(replace(ball_scene, initial=initial), builder)
+    builder.ExportOutput(loaded.plant.get_state_output_port(), "state")
+    diagram = builder.Build()
+    with Session(tmp_path / "out", None) as session:
+        log = session.simulate(diagram, 0.2, {"state": diagram.GetOutputPort("state")})
+        session.finish()
+    np.testing.assert_allclose(log["state"][:, -3], 1.5, rtol=1e-12)
+    np.testing.assert_allclose(log["state"][-1, 4], 1.5 * 0.2, rtol=1e-9)
