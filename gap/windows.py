@@ -437,10 +437,15 @@ class WindowModel(WindowedResidual):
 
     def _said(self, w: Window, episode: Episode) -> InitialSection:
         """What the scene says of an episode's start: it holds for what is not measured;
-        velocities only in the window that is the start."""
+        velocities only in the episode's first window."""
         path = str(self.recordings[w.recording].path)
         said = initial_for(self.scene, path, episode.number)
-        if w.rows.start == episode.first and episode.is_start:
+        if not (said.velocities or said.body_velocities):
+            return said
+        before = (x for x in self.windows if x.recording == w.recording)
+        if episode.is_start and not any(
+            episode.first <= x.rows.start < w.rows.start for x in before
+        ):
             return said
         return replace(said, velocities={}, body_velocities={})
 
