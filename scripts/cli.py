@@ -383,9 +383,7 @@ def _gap(args) -> int:
     out = Path(args.out) if args.out else _default_out("gap")
     export = [word for word in (args.export or "").split(",") if word]
     try:
-        result, files = run_and_report(
-            scene, recordings, out, _jobs(args.jobs), export
-        )
+        result, files = run_and_report(scene, recordings, out, _jobs(args.jobs), export)
     except (Exception, SystemExit) as error:
         if on_purpose(error) or isinstance(error, OSError):
             raise
