@@ -1,0 +1,85 @@
+"""A controller that plans through contact, for any plant: the LCS builder and C3."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from makebreak.systems.c3_mpc import C3Config, C3Mpc
+from makebreak.systems.lcs_builder import (
+    AnitescuLcsBuilder,
+    ContactPair,
+    LcsBuilderConfig,
+)
+from makebreak.systems.numerics.c3_mpc import C3Bounds, C3Options, C3Weights
+
+
+@dataclass
+class ContactMpcConfig:
+    contacts: list[ContactPair] = field(default_factory=list)
+    # Weights of the state [1/SI^2], (n_x,), and of the input [1/N^2], (n_u,).
+    Q: list[float] = field(default_factory=list)
+    R: list[float] = field(default_factory=list)
+    x_desired: list[float] = field(default_factory=list)  # (n_x,) [SI]
+    dt_sec: float = 0.05  # Of the plan's knots [s].
+    period_sec: float = 0.0125  # Between two plans [s].
+    options: C3Options = field(
+        default_factory=lambda: C3Options(N=10, rounds=5, polish=3)
+    )
+    bounds: C3Bounds = field(default_factory=C3Bounds)
+
+
+def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
+    """C3+ on the LCS about the present state, its plan polished.
+
+    Inputs:  x (n_x,), the state [q, v] of the model's plant.
+    Outputs: u (n_u,) [N, N m]; status (1,), a C3Status; plan, a Plan (abstract).
+
+    Args: model: holds the controller's own plant and its scene graph; see AnitescuLcs.
+    Raises: ValueError naming what does not fit.
+    """
+    c, builder = config, DiagramBuilder()
+    lcs = builder.AddNamedSystem(
+        "lcs",
+        AnitescuLcsBuilder(
+            model, LcsBuilderConfig(c.contacts, c.dt_sec, period_sec=c.period_sec)
+        ),
+    )
+    n_x, n_u, n_lam = lcs.model.n_x, lcs.model.n_u, lcs.model.n_lam
+    for name, values, n in (("Q", c.Q, n_x), ("R", c.R, n_u)):
+        if len(values) != n:
+            raise ValueError(
+                f"ContactMpcConfig.{name} has {len(values)} entries, expected {n}"
+            )
+    if len(c.x_desired) != n_x:
+        raise ValueError(
+            f"ContactMpcConfig.x_desired has {len(c.x_desired)} entries, expected "
+            f"{n_x}: {lcs.model.x_names}"
+        )
+    # Consensus of [x, lam, u, eta]: forces and gaps agree, x and u hardly have to.
+    G = np.repeat([0.01, 1.0, 0.01, 1.0], [n_x, n_lam, n_u, n_lam])
+    U = np.repeat([1.0, 1.0, 1.0, 10.0], [n_x, n_lam, n_u, n_lam])
+    weights = C3Weights(np.array(c.Q), np.array(c.R), G, U)
+    c3 = builder.AddNamedSystem(
+        "c3",
+        C3Mpc(
+            C3Config(weights, options=c.options, bounds=c.bounds),
+            c.period_sec,
+            offset_sec=1e-4,  # After the builder: the LCS is that of this state.
+        ),
+    )
+    goal = builder.AddSystem(
+        ConstantVectorSource(np.tile(c.x_desired, c.options.N + 1))
+    )
+    no_force = builder.AddSystem(ConstantVectorSource(np.zeros(n_u)))
+    builder.Connect(no_force.get_output_port(), lcs.GetInputPort("u"))
+    builder.Connect(goal.get_output_port(), c3.GetInputPort("x_desired"))
+    builder.Connect(lcs.GetOutputPort("lcs"), c3.GetInputPort("lcs"))
+    builder.ExportInput(lcs.GetInputPort("x"), "x")
+    builder.ConnectInput("x", c3.GetInputPort("x"))
+    for name in ("u", "status", "plan"):
+        builder.ExportOutput(c3.GetOutputPort(name), name)
+    diagram = builder.Build()
+    diagram.set_name("contact_mpc")
+    return diagram

@@ -1,0 +1,26 @@
+"""A finger pushes a puck to 0.5 m: any plant and its contacts, planned by C3+."""
+
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+
+from makebreak import ContactMpcConfig, ContactPair, make_contact_mpc, model_path
+
+builders = []
+for time_step in (0.0, 0.001):  # The controller's model, and the world.
+    builders.append(builder := DiagramBuilder())
+    plant, _ = AddMultibodyPlantSceneGraph(builder, time_step)
+    Parser(plant).AddModels(model_path("puck.sdf"))
+    plant.Finalize()
+
+pairs = [ContactPair("finger", "puck", friction=0.3)]
+Q, x_desired = [0, 200, 1, 20], [0.4, 0.5, 0, 0]  # [finger, puck, their velocities]
+config = ContactMpcConfig(pairs, Q, R=[0.01], x_desired=x_desired)
+mpc = builder.AddSystem(make_contact_mpc(builders[0].Build(), config))
+builder.Connect(plant.get_state_output_port(), mpc.GetInputPort("x"))
+builder.Connect(mpc.GetOutputPort("u"), plant.get_actuation_input_port())
+simulator = Simulator(builder.Build())
+simulator.AdvanceTo(4.0)
+q = plant.GetPositions(plant.GetMyContextFromRoot(simulator.get_context()))
+print(f"puck at {q[1]:.3f} m")

@@ -1,0 +1,61 @@
+"""Each file of examples/ runs, does what it says, and is short."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+def numbers(name):
+    """The numbers that an example prints."""
+    done = subprocess.run(
+        [sys.executable, str(EXAMPLES / name)], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return [float(n) for n in re.findall(r"-?\d+\.?\d*", done.stdout)]
+
+
+def test_every_example_is_short_and_tested():
+    here = Path(__file__).read_text()
+    for path in EXAMPLES.glob("*.py"):
+        assert len(path.read_text().splitlines()) <= 40, path.name
+        assert f'"{path.name}"' in here
+
+
+def test_the_puck_reaches_its_goal():
+    # 0.5 m; the finger cannot pull it back once it is too far.
+    assert numbers("push_a_puck.py") == [pytest.approx(0.5, abs=0.01)]
+
+
+def test_the_learner_finds_the_puck_that_is_too_small():
+    # 8 mm; the plant's contact is compliant and the learner's rigid, by under 1 mm.
+    assert numbers("learn_a_wrong_radius.py") == [pytest.approx(8.0, abs=1.0)]
+
+
+def test_the_modes_are_told_apart_and_known_again():
+    mode, found, rough, changed, again, back = numbers("detect_modes.py")
+    assert [mode, rough, again] == [1, 2, 1]
+    # The surface changes at 2 and 4 s; to decide takes the tool's length (.3 s at
+    # .1 m/s) and a batch of samples.
+    assert 0.0 < found < 1.0 and 2.0 < changed < 2.6 and 4.0 < back < 4.6
+
+
+def test_importing_makebreak_loads_nothing_heavy():
+    code = "import sys, makebreak; print(int('pydrake' in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == "0", done.stderr
+
+
+def test_every_exported_name_is_there_and_an_unknown_one_is_not():
+    import makebreak
+
+    for name in makebreak.__all__:
+        assert getattr(makebreak, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'C4Mpc'"):
+        makebreak.C4Mpc  # noqa: B018
+    with pytest.raises(ValueError, match="no model file is named 'pukc.sdf'"):
+        makebreak.model_path("pukc.sdf")
