@@ -15,6 +15,7 @@ from pydrake.multibody.tree import MultibodyForces
 
 import makebreak
 from makebreak.gap.table import write_recording
+from makebreak.scripts import bench_sysid
 from makebreak.scripts.trials import makebreak_command
 
 DURATION_SEC, RATE_HZ = 60.0, 200.0
@@ -139,11 +140,12 @@ def rows() -> list[dict]:
     what = f"gap, {DURATION_SEC:.0f} s of 7 joints at {RATE_HZ:.0f} Hz"
     note = f"{result['verdict']}: {found or 'nothing'}"
     met = wall <= TARGET_SEC
-    return [
+    rows = [
         {"what": f"{what}, by the clock", "value": wall, "unit": "s", "note": note,
          "target": f"<= {TARGET_SEC:.0f}", "met": met},
         {"what": f"{what}, CPU time", "value": cpu, "unit": "s"},
     ]  # fmt: skip
+    return rows + bench_sysid.rows()
 
 
 def _cpu_of_children() -> float:

@@ -95,8 +95,8 @@ def score(
     left = list(range(len(hidden)))
     loose = [h.get("loose", ()) for h in hidden]
     for each in found:
-        match = [(i, _match(each, h, driven)) for i, h in enumerate(hidden)]
-        match = [(i, p) for i, p in match if p is not None]
+        every = ((i, _match(each, h, driven)) for i, h in enumerate(hidden))
+        match = [(i, p) for i, p in every if p is not None]
         if match:
             # Of two it may be, one that nothing else was taken for.
             i, parameters = min(match, key=lambda m: m[0] not in left)
@@ -222,7 +222,7 @@ def _errors(value: dict[str, float], hidden: Mapping) -> list[float]:
     if "radius" in value and "scale" in value:
         del value["radius"]  # The same thing, said twice.
     errors: list[float] = []
-    vectors = (
+    vectors: tuple[tuple[str, ...], ...] = (
         ("com_x", "com_y", "com_z"), ("x", "y", "z"), ("fx", "fy", "fz"),
         ("roll", "pitch"), ("ixx", "iyy", "izz"),
     )  # fmt: skip
