@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from makebreak.gap.data.csv_table import BadRows
 from makebreak.gap.data.filters import read_filter
 from makebreak.gap.table import (
     COMMANDS,
@@ -19,6 +20,7 @@ from makebreak.gap.table import (
     check_columns,
     is_channel,
     read_table,
+    stem_of,
 )
 from makebreak.systems.numerics.filters import Stage
 from makebreak.systems.numerics.signal_noise import estimate_noise
@@ -27,7 +29,8 @@ FEWEST_ROWS = 10  # In an episode: fewer hold no window and no noise.
 # A longer hole in time [s] is a break, as is one of so many periods.
 LONGEST_HOLE_SEC, LONGEST_HOLE_ROWS = 1.0, 50
 MOST_VALUE = 1e12  # In SI units nothing that a robot measures is larger.
-_SIDECAR = ("noise", "filters", "columns", "provenance")
+_SIDECAR = ("noise", "filters", "columns", "ignore", "provenance")
+_TIME_UNITS = ((1e-3, "ms"), (1e-6, "us"), (1e-9, "ns"), (0.0, "no unit of time"))
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _UNITS = {q: "N" for q in ("fx", "fy", "fz")} | {q: "N m" for q in ("tx", "ty", "tz")}
 _UNITS |= {q: "m" for q in "xyz"} | {q: "1" for q in _QUATERNION}
@@ -192,9 +195,12 @@ class Recording:
         )
 
 
-def read_recordings(paths: Iterable[str | Path]) -> list[Recording]:
+def read_recordings(
+    paths: Iterable[str | Path], skip_bad_rows: bool = False
+) -> list[Recording]:
     """Several recordings, with names that tell them apart.
 
+    Args: skip_bad_rows: as of read_recording.
     Raises: ValueError as read_recording; if a file is given twice; for no file.
     """
     files = [Path(path) for path in paths]
@@ -205,41 +211,58 @@ def read_recordings(paths: Iterable[str | Path]) -> list[Recording]:
         if path.resolve() in seen:
             raise ValueError(f"recording {path} is given twice")
         seen[path.resolve()] = path
-    stems = [path.stem for path in files]
+    stems = [stem_of(path) for path in files]
     if len(set(stems)) < len(stems):  # runs/a/recording.csv, runs/b/recording.csv
-        stems = [f"{path.resolve().parent.name}/{path.stem}" for path in files]
+        stems = [f"{path.resolve().parent.name}/{stem_of(path)}" for path in files]
     if len(set(stems)) < len(stems):
         stems = [str(path) for path in files]
-    return [read_recording(path, name) for path, name in zip(files, stems, strict=True)]
+    return [
+        read_recording(path, name, skip_bad_rows=skip_bad_rows)
+        for path, name in zip(files, stems, strict=True)
+    ]
 
 
 def read_recording(
-    path: str | Path, name: str | None = None, most_cells: int = MOST_CELLS
+    path: str | Path,
+    name: str | None = None,
+    most_cells: int = MOST_CELLS,
+    skip_bad_rows: bool = False,
 ) -> Recording:
     """Reads a .csv, .npz or .parquet table, and what its sidecars say of it.
 
     Quaternions are given unit length and one sign without jumps; what was done is in
     the recording's fields and notes.
 
+    Args: skip_bad_rows: rows that cannot be read, that hold numbers beyond 1e12, or
+        whose time does not increase, are left out and counted in a note.
     Raises: ValueError: one line with file, column, row, what came, what was expected.
     """
     path = Path(path)
-    table = read_table(path, most_cells)
     sidecar = _read_sidecars(path)
-    columns = _renamed(path, table.columns, sidecar.get("columns") or {})
+    names = sidecar.get("columns") or {}
+    unused = frozenset(str(name) for name, to in names.items() if to is None)
+    bad = BadRows(path, skip_bad_rows)
+    table = read_table(path, most_cells, bad, unused)
+    columns = _renamed(path, table.columns, names, unused)
+    check_time(path, columns)
+    columns, row = _without_bad(columns, table.row, bad)
+    excerpt = len(row) + bad.count < table.n_rows
     number = columns.get("episode")
     try:
-        columns = check_columns(columns | {"episode": _parts(path, columns, table.row)})
+        columns = check_columns(
+            columns | {"episode": _parts(path, columns, row, excerpt)}
+        )
     except ValueError as error:
-        raise ValueError(_with_rows(path, error, table.row)) from None
+        raise ValueError(_with_rows(path, error, row)) from None
     time, part = columns.pop("time"), columns.pop("episode")
     if not columns:
         raise ValueError(f"recording {path} has no channel beside time")
-    episodes = _episodes(path, number, part, time, table.row)
+    episodes = _episodes(path, number, part, time, row)
     episodes, notes = _broken_at_holes(path, episodes, time)
-    notes += _left_out(path, columns, table.row)
-    flips, norm_errors = _mend_quaternions(path, columns, episodes, table.row)
-    if len(time) < table.n_rows:
+    episodes, more = _without_ignored(path, episodes, number, time, sidecar)
+    notes += more + _left_out(path, columns, row)
+    flips, norm_errors = _mend_quaternions(path, columns, episodes, row)
+    if excerpt:
         notes.append(
             (
                 "rows_left_out",
@@ -250,24 +273,32 @@ def read_recording(
     noise, filters = sidecar.get("noise") or {}, sidecar.get("filters") or {}
     for section, known in (("noise", noise), ("filters", filters)):
         for key in known:
-            if key not in columns:
-                if is_channel(key):  # noise.json may speak of several recordings.
-                    continue
-                raise ValueError(
-                    f'sidecar of {path}: {section} of "{key}", expected the name of a '
-                    "channel"
+            if key in columns:
+                continue
+            if is_channel(key) and key not in sidecar.get("own", ()):
+                continue  # noise.json may speak of several recordings.
+            close = get_close_matches(key, columns, n=1, cutoff=0.5)
+            hint = f'; did you mean "{close[0]}"?' if close else ""
+            raise ValueError(
+                f'sidecar of {path}: {section} of "{key}", '
+                + (
+                    f"which the recording does not have{hint}"
+                    if is_channel(key)
+                    else f"expected the name of a channel{hint}"
                 )
+            )
     for value in (time, *columns.values()):
         value.setflags(write=False)
+    notes += bad.note()
     channels = {
         key: _channel(path, key, value, time, episodes, noise, filters)
         for key, value in columns.items()
     }
     return Recording(
-        name=name or path.stem,
+        name=name or stem_of(path),
         path=path,
         time=time,
-        row=table.row,
+        row=row,
         episodes=episodes,
         channels=channels,
         n_rows_in_file=table.n_rows,
@@ -303,21 +334,33 @@ def check_against_scene(
         f"recording {recording.path}: column {first.name}{others}: no {what} "
         f'"{first.at}" in the scene: {hint}; to leave a column out, map it to null '
         "under `columns` "
-        f"in {recording.path.with_suffix('.yaml').name}"
+        f"in {sidecar_of(recording.path).name}"
     )
 
 
+def sidecar_of(path: Path) -> Path:
+    """Where a recording's sidecar is expected: monday.csv has monday.yaml."""
+    return path.with_name(f"{stem_of(path)}.yaml")
+
+
 def _read_sidecars(path: Path) -> dict:
-    """noise.json in the folder, and `<recording>.yaml`, which wins."""
+    """noise.json in the folder, and `<recording>.yaml`, or .csv.yaml, which wins."""
     merged: dict = {}
-    for file in (path.with_name("noise.json"), path.with_suffix(".yaml")):
+    own = [sidecar_of(path), path.with_name(f"{path.name}.yaml")]
+    own += [file.with_suffix(".yml") for file in own]
+    own = [file for file in dict.fromkeys(own) if file.is_file()]
+    if len(own) > 1:
+        raise ValueError(
+            f"recording {path} has two sidecars: {own[0].name} and {own[1].name}"
+        )
+    for file in (path.with_name("noise.json"), *own):
         if not file.is_file():
             continue
         try:
             # Not YAML for both: YAML reads 1e-5 as a text.
             text = file.read_text()
             data = json.loads(text) if file.suffix == ".json" else yaml.safe_load(text)
-        except (ValueError, yaml.YAMLError) as error:
+        except (ValueError, yaml.YAMLError, RecursionError) as error:
             raise ValueError(f"{file}: {' '.join(str(error).split())}") from None
         if data is None:
             continue
@@ -330,18 +373,75 @@ def _read_sidecars(path: Path) -> dict:
                 raise ValueError(
                     f'{file}: "{key}", expected one of {", ".join(_SIDECAR)}'
                 )
-            if (
-                key != "provenance"
-                and value is not None
-                and not isinstance(value, dict)
-            ):
-                raise ValueError(f"{file}: {key} must be names with values")
-            if isinstance(value, dict) and key != "provenance":
-                value = (merged.get(key) or {}) | value
+            if key == "ignore":
+                value = _spans(file, value)
+            elif key != "provenance" and value is not None:
+                if not isinstance(value, dict):
+                    raise ValueError(f"{file}: {key} must be names with values")
+                value = (merged.get(key) or {}) | {str(k): v for k, v in value.items()}
             merged[key] = value
         for key, value in (data.get("noise") or {}).items():
-            merged["noise"][key] = _number(f"{file}: noise of {key}", value, least=0.0)
+            number = _number(f"{file}: noise of {key}", value, least=0.0)
+            merged["noise"][str(key)] = number
+        if file in own:  # It speaks of this recording alone.
+            merged["own"] = {str(key) for key in data.get("noise") or {}} | {
+                str(key) for key in data.get("filters") or {}
+            }
     return merged
+
+
+def _spans(file: Path, said) -> list[tuple[float, float, int | None]]:
+    """From, to [s] and the episode, None for all, of spans that are to be left out."""
+    spans = []
+    for each in said if isinstance(said, list) else [said]:
+        if not isinstance(each, dict) or set(each) - {"from", "to", "episode"}:
+            raise ValueError(
+                f"{file}: ignore has {each!r}, expected a list of {{from: 16, to: 18}} "
+                "in seconds of the recording's time, and episode where it has several"
+            )
+        first, last = (
+            _number(f"{file}: ignore, {key}", each.get(key)) for key in ("from", "to")
+        )
+        if not first < last:
+            raise ValueError(f"{file}: ignore is from {first} to {last} s")
+        episode = each.get("episode")
+        if episode is not None and not isinstance(episode, int):
+            raise ValueError(f"{file}: ignore, episode is {episode!r}")
+        spans.append((first, last, episode))
+    return spans
+
+
+def _without_ignored(path: Path, episodes, number, time, sidecar):
+    """Episodes without the spans that the sidecar leaves out, and what is said."""
+    spans = sidecar.get("ignore") or []
+    if not spans:
+        return episodes, []
+    found, gone = [], 0
+    for e in episodes:
+        t = time[e.rows]
+        kept = np.ones(len(t), bool)
+        for first, last, of in spans:
+            if of is None or of == e.number:
+                kept &= (t < first) | (t > last)
+        gone += int((~kept).sum())
+        starts = np.flatnonzero(np.diff(kept.astype(int), prepend=0) == 1)
+        ends = np.flatnonzero(np.diff(kept.astype(int), append=0) == -1) + 1
+        for k, (a, b) in enumerate(zip(starts, ends, strict=True)):
+            if b - a >= FEWEST_ROWS:
+                stretch = e.stretch + k + (1 if a and not k else 0)
+                found.append(
+                    Episode(e.number, e.first + int(a), e.first + int(b), stretch)
+                )
+    says = ", ".join(f"{a:g} to {b:g} s" for a, b, _ in spans)
+    if not gone:
+        raise ValueError(
+            f"sidecar of {path}: ignore {says}: no row is there, time goes from "
+            f"{time[0]:g} to {time[-1]:g} s"
+        )
+    if not found:
+        raise ValueError(f"sidecar of {path}: ignore leaves no {FEWEST_ROWS} rows")
+    note = f"{path.name}: {gone} rows are left out as its sidecar says, {says}"
+    return tuple(found), [("ignored", note)]
 
 
 def _number(what: str, value, least: float = -np.inf) -> float:
@@ -355,15 +455,17 @@ def _number(what: str, value, least: float = -np.inf) -> float:
     return number
 
 
-def _renamed(path: Path, columns: Mapping, names: Mapping) -> dict[str, np.ndarray]:
+def _renamed(
+    path: Path, columns: Mapping, names: Mapping, unused: frozenset[str]
+) -> dict[str, np.ndarray]:
     """The columns under our names.
 
     names: {foreign: ours}, {foreign: null} to leave one out, or {foreign: {channel:
     ours, scale: factor, offset: added after it}}.
     """
-    file, result = path.with_suffix(".yaml"), {}
+    file, result = sidecar_of(path), {}
     for foreign in names:
-        if foreign not in columns:
+        if foreign not in columns and foreign not in unused:
             raise ValueError(
                 f'{file}: columns names "{foreign}", {path.name} has '
                 f"{', '.join(columns)}"
@@ -381,6 +483,8 @@ def _renamed(path: Path, columns: Mapping, names: Mapping) -> dict[str, np.ndarr
                 )
             what = f'{file}: columns, "{name}":'
             scale = _number(f"{what} scale", target.get("scale", 1.0))
+            if scale == 0.0:
+                raise ValueError(f"{what} scale is 0, which leaves nothing")
             offset = _number(f"{what} offset", target.get("offset", 0.0))
             value, target = scale * value + offset, target["channel"]
         if target in result:
@@ -389,9 +493,10 @@ def _renamed(path: Path, columns: Mapping, names: Mapping) -> dict[str, np.ndarr
     return result
 
 
-def _parts(path: Path, columns: Mapping, row: np.ndarray) -> np.ndarray:
-    """(n,) counts from 0 the parts of the table in which time must increase."""
-    new = np.concatenate([[0], np.diff(row) > 1])
+def _parts(path: Path, columns: Mapping, row: np.ndarray, excerpt: bool) -> np.ndarray:
+    """(n,) counts from 0 the parts of the table in which time must increase; rows of an
+    excerpt jump where some were left out."""
+    new = np.concatenate([[0], (np.diff(row) > 1) & excerpt])
     episode = columns.get("episode")
     if episode is not None:
         bad = np.flatnonzero(~(np.mod(episode, 1.0) == 0.0))
@@ -402,6 +507,51 @@ def _parts(path: Path, columns: Mapping, row: np.ndarray) -> np.ndarray:
             )
         new = new | np.concatenate([[0], np.diff(episode) != 0])
     return np.cumsum(new).astype(float)
+
+
+def _without_bad(columns: dict, row: np.ndarray, bad: BadRows):
+    """Columns and row numbers without rows that hold what nothing measures, or come
+    before the row above them, where such are left out."""
+    if not bad.skip:
+        return columns, row
+    good = np.ones(len(row), bool)
+    for name, value in columns.items():
+        for k in np.flatnonzero(good & (np.abs(value) > MOST_VALUE)):
+            bad.add(f"column {name}, row {row[k]}: got {value[k]:.4g}")
+            good[k] = False
+    time, episode = columns["time"], columns.get("episode", np.zeros(len(row)))
+    for k in np.flatnonzero(good & ~np.isfinite(time)):
+        bad.add(f"column time, row {row[k]}: got {time[k]}")
+        good[k] = False
+    rows = np.flatnonzero(good)
+    for number in np.unique(episode[rows]):
+        mine = rows[episode[rows] == number]
+        latest = np.maximum.accumulate(time[mine])
+        for k in mine[1:][time[mine[1:]] <= latest[:-1]]:
+            bad.add(f"column time, row {row[k]}: {time[k]} does not increase")
+            good[k] = False
+    return {name: value[good] for name, value in columns.items()}, row[good]
+
+
+def check_time(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Raises: ValueError where there is no time, or it is not in seconds."""
+    sidecar = sidecar_of(path).name
+    if "time" not in columns:
+        shown = ", ".join(list(columns)[:8]) + (", ..." if len(columns) > 8 else "")
+        raise ValueError(
+            f"recording {path} needs the column time, got {shown}; a column of another "
+            f"name is mapped in {sidecar}: columns: {{t: time}}"
+        )
+    steps = np.abs(np.diff(columns["time"][:100_000]))
+    step = float(np.median(steps[np.isfinite(steps)])) if len(steps) else 0.0
+    # A row a second for a quarter of an hour is 1 kHz in milliseconds.
+    if step > 1.5 or (step > 0.9 and len(steps) > 1000):
+        scale, unit = next((s, u) for s, u in _TIME_UNITS if step * s < 0.9)
+        mapping = f"{{time: {{channel: time, scale: {scale:g}}}}}"
+        raise ValueError(
+            f"recording {path}: rows are {step:.6g} s apart, as if time were in {unit}:"
+            f" expected seconds; map it in {sidecar}: columns: {mapping}"
+        )
 
 
 def _with_rows(path: Path, error: ValueError, row: np.ndarray) -> str:

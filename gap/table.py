@@ -11,17 +11,27 @@ SI units; an empty cell (NaN) is a missing sample. docs/recordings.md says the r
 Rows are counted from 1 in all messages; a csv's first row is the one under its header.
 """
 
+import gzip
 import json
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib import import_module
-from io import BytesIO
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+
+from makebreak.gap.data.csv_table import (
+    BadRows,
+    blocks_of,
+    dialect_of,
+    open_csv,
+    parse,
+    size_of,
+)
 
 JOINT_QUANTITIES = (
     "position velocity effort_command effort_measured position_command velocity_command"
@@ -31,13 +41,13 @@ POSE = "x y z qw qx qy qz".split()
 TWIST = "vx vy vz wx wy wz".split()
 WRENCH = "fx fy fz tx ty tz".split()
 QUANTITIES = frozenset([*JOINT_QUANTITIES, *POSE, *TWIST, *WRENCH])
-FORMATS = (".csv", ".npz", ".parquet")
+FORMATS = (".csv", ".csv.gz", ".npz", ".parquet")
 
 # More numbers than this are not kept in memory (320 MB): 3.6 h of 14 channels at
 # 200 Hz. Of a longer table, evenly spread stretches of rows are.
 MOST_CELLS = 40_000_000
 STRETCHES = 20
-_BLOCK = 1 << 23  # [bytes] of text that are parsed at a time.
+MOST_BYTES = 1 << 32  # Of an npz file's columns together, as they are in memory.
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +76,9 @@ def check_columns(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         column of another length, and a time that does not increase in an episode.
     """
     if "time" not in columns:
-        raise ValueError(f"a recording needs the column time, got {sorted(columns)}")
+        raise ValueError(
+            f"a recording needs the column time, got {sorted(columns)[:8]}"
+        )
     names = ["time", *(["episode"] if "episode" in columns else [])]
     names += [name for name in columns if name not in names]
     table = {name: np.asarray(columns[name], dtype=float) for name in names}
@@ -144,11 +156,30 @@ def write_recording(
     return written
 
 
-def read_table(path: Path, most_cells: int = MOST_CELLS) -> Table:
+def suffix_of(path: Path) -> str:
+    """In small letters; of a packed file both: .csv.gz."""
+    name = path.name.lower()
+    if name.endswith(".gz"):
+        return Path(name[:-3]).suffix + ".gz"
+    return path.suffix.lower()
+
+
+def stem_of(path: Path) -> str:
+    """The name without what suffix_of gives."""
+    return path.name[: len(path.name) - len(suffix_of(path))]
+
+
+def read_table(
+    path: Path,
+    most_cells: int = MOST_CELLS,
+    bad: BadRows | None = None,
+    unused: frozenset[str] = frozenset(),
+) -> Table:
     """Reads a csv, npz or parquet file; nothing but its numbers is looked at.
 
     Args:
-        path: the file.
+        path: the file. bad: what to do with rows of a csv that cannot be read; else
+            they are refused. unused: columns that may hold anything.
         most_cells: how many numbers are kept. Of a larger table, 20 stretches of rows
             are, evenly spread, the rest is skipped: read, never held.
     Raises: ValueError, one line with the file and where possible column and row.
@@ -156,12 +187,16 @@ def read_table(path: Path, most_cells: int = MOST_CELLS) -> Table:
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"recording {path} does not exist")
-    if path.suffix not in FORMATS:
+    suffix = suffix_of(path)
+    if suffix not in FORMATS:
         raise ValueError(f"recording {path}: expected a name in {', '.join(FORMATS)}")
     if not path.stat().st_size:
         raise ValueError(f"recording {path} is empty")
-    read = {".csv": _read_csv, ".npz": _read_npz, ".parquet": _read_parquet}
-    table = read[path.suffix](path, most_cells)
+    if suffix in (".csv", ".csv.gz"):
+        table = _read_csv(path, most_cells, bad or BadRows(path, False), unused)
+    else:
+        read = {".npz": _read_npz, ".parquet": _read_parquet}
+        table = read[suffix](path, most_cells, unused)
     if not table.row.size:
         raise ValueError(f"recording {path} has a header and no rows")
     return table
@@ -183,95 +218,40 @@ def _kept_rows(n_rows: int, n_columns: int, most_cells: int) -> list[tuple[int, 
     return [(start, start + length) for start in starts]
 
 
-def _read_csv(path: Path, most_cells: int) -> Table:
-    with path.open("rb") as file:
-        names = _csv_header(path, file.readline())
-        body_start = file.tell()
-        sample = file.read(1 << 20)
-        rows_per_byte = max(sample.count(b"\n"), 1) / max(len(sample), 1)
-        body_bytes = path.stat().st_size - body_start
-        # An estimate is enough to choose from; 5 % more costs nothing.
-        guess = int(rows_per_byte * body_bytes)
-        if guess * len(names) <= 1.05 * most_cells:
-            kept = [(0, 1 << 62)]
-        else:
-            kept = _kept_rows(guess, len(names), most_cells)
-        file.seek(body_start)
-        parts, rows, done, rest = [], [], 0, b""
-        while True:
-            block = file.read(_BLOCK)
-            text = rest + block
-            if block:
-                cut = text.rfind(b"\n") + 1
-                text, rest = text[:cut], text[cut:]
-            text = text.replace(b"\r\n", b"\n")
-            while b"\n\n" in text or text[:1] == b"\n":
-                text = text.replace(b"\n\n", b"\n").removeprefix(b"\n")
-            if text and not text.endswith(b"\n"):
-                text += b"\n"
-            n = text.count(b"\n")
-            wanted = [(max(a - done, 0), min(b - done, n)) for a, b in kept]
-            wanted = [(a, b) for a, b in wanted if a < b]
-            if wanted:
-                values = _csv_block(path, names, text, done)
-                for a, b in wanted:
-                    parts.append(values[a:b])
-                    rows.append(np.arange(done + a, done + b) + 1)
-            done += n
-            if not block:
-                break
+def _read_csv(path: Path, most_cells: int, bad: BadRows, unused) -> Table:
+    try:
+        with open_csv(path) as file:
+            header = file.readline()
+            body_start = file.tell()
+            sample = file.read(1 << 20)
+            dialect = dialect_of(path, header, sample, unused)
+            names = dialect.columns()
+            rows_per_byte = max(sample.count(b"\n"), 1) / max(len(sample), 1)
+            # An estimate is enough to choose from; 5 % more costs nothing.
+            guess = int(rows_per_byte * (size_of(path) - body_start))
+            if guess * len(names) <= 1.05 * most_cells:
+                kept = [(0, 1 << 62)]
+            else:
+                kept = _kept_rows(guess, len(names), most_cells)
+            file.seek(body_start)
+            parts, rows, done = [], [], 0
+            for text in blocks_of(file, dialect.quoted):
+                n = text.count(b"\n")
+                if any(a < done + n and b > done for a, b in kept):
+                    values, number = parse(dialect, text, done, bad)
+                    for a, b in kept:
+                        mine = (number > a) & (number <= b)
+                        if mine.any():
+                            parts.append(values[mine])
+                            rows.append(number[mine])
+                done += n
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise ValueError(f"recording {path} is no whole gzip file: {error}") from None
     if not parts:
         return Table({name: np.empty(0) for name in names}, np.empty(0, int), done)
     table = np.concatenate(parts)
     columns = {name: np.ascontiguousarray(table[:, i]) for i, name in enumerate(names)}
     return Table(columns, np.concatenate(rows), done)
-
-
-def _csv_header(path: Path, line: bytes) -> list[str]:
-    try:
-        text = line.decode("utf-8-sig").strip()
-    except UnicodeDecodeError:
-        raise ValueError(f"recording {path} is no text: expected a csv table") from None
-    names = [name.strip().strip('"') for name in text.split(",")]
-    if len(names) == 1 and (";" in text or "\t" in text):
-        raise ValueError(f"recording {path}: columns must be separated by commas")
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f'recording {path}: column "{name}" is there twice')
-    return names
-
-
-def _csv_block(path: Path, names: list[str], text: bytes, done: int) -> np.ndarray:
-    """(rows, columns) of whole lines; `done` rows came before them."""
-    filled = text.replace(b",,", b",nan,").replace(b",,", b",nan,")
-    filled = filled.replace(b",\n", b",nan\n").replace(b"\n,", b"\nnan,")
-    if filled.startswith(b","):
-        filled = b"nan" + filled
-    try:
-        values = np.loadtxt(BytesIO(filled), delimiter=",", ndmin=2, comments=None)
-        if values.shape[1] == len(names) and not np.isinf(values).any():
-            return values
-    except (ValueError, UnicodeDecodeError):
-        pass
-    # Something is wrong with this block: found at leisure.
-    for i, line in enumerate(filled.decode(errors="replace").splitlines()):
-        cells, row = line.split(","), done + i + 1
-        if len(cells) != len(names):
-            raise ValueError(
-                f"recording {path}: row {row} has {len(cells)} cells, expected "
-                f"{len(names)} as the header"
-            )
-        for name, cell in zip(names, cells, strict=True):
-            try:
-                good = abs(float(cell)) != np.inf
-            except ValueError:
-                good = False
-            if not good:
-                raise ValueError(
-                    f'recording {path}: column {name}, row {row}: got "{cell.strip()}",'
-                    " expected a finite number, or an empty cell where there is none"
-                )
-    raise ValueError(f"recording {path} cannot be read near row {done + 1}")
 
 
 def _columns_of(path: Path, columns: dict[str, np.ndarray], row, n_rows) -> Table:
@@ -285,16 +265,25 @@ def _columns_of(path: Path, columns: dict[str, np.ndarray], row, n_rows) -> Tabl
     return Table(columns, row, n_rows)
 
 
-def _read_npz(path: Path, most_cells: int) -> Table:
+def _read_npz(path: Path, most_cells: int, unused) -> Table:
     try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(info.file_size for info in archive.infolist())
+        if size > MOST_BYTES:
+            raise ValueError(
+                f"recording {path} holds {size} bytes, expected at most {MOST_BYTES}: "
+                "cut it into several"
+            )
         with np.load(path, allow_pickle=False) as file:
-            names = list(file)
+            names = [name for name in file if name not in unused]
             if not names:
                 raise ValueError(f"recording {path} has no columns")
             columns, n, row = {}, -1, np.empty(0, int)
             for name in names:
                 value = file[name]
-                if value.ndim != 1 or value.dtype.kind not in "iufb":
+                if not isinstance(value, np.ndarray):
+                    raise ValueError(f"recording {path}: {name} is no array")
+                if value.ndim not in (1, 2) or value.dtype.kind not in "iufb":
                     raise ValueError(
                         f"recording {path}: column {name} is {value.shape} of "
                         f"{value.dtype}, expected one number a row"
@@ -308,9 +297,13 @@ def _read_npz(path: Path, most_cells: int) -> Table:
                         f"recording {path}: column {name} has {len(value)} rows, "
                         f"{names[0]} has {n}"
                     )
-                columns[name] = value[row - 1].astype(float)
-    except (OSError, zipfile.BadZipFile, EOFError) as error:
+                value = value[row - 1].astype(float)
+                columns |= {name: value} if value.ndim == 1 else _spread(name, value)
+    except (OSError, zipfile.BadZipFile, EOFError, zlib.error) as error:
         raise ValueError(f"recording {path} is no npz file: {error}") from None
+    except (MemoryError, NotImplementedError, RuntimeError, SyntaxError) as error:
+        why = " ".join(str(error).split())[:100]  # A header that lies, a cipher.
+        raise ValueError(f"recording {path} cannot be read: {why}") from None
     except ValueError as error:
         if str(path) in str(error):
             raise
@@ -318,7 +311,7 @@ def _read_npz(path: Path, most_cells: int) -> Table:
     return _columns_of(path, columns, row, n)
 
 
-def _read_parquet(path: Path, most_cells: int) -> Table:
+def _read_parquet(path: Path, most_cells: int, unused) -> Table:
     arrow = _pyarrow(path)
     parquet = import_module("pyarrow.parquet")
     try:
@@ -326,33 +319,63 @@ def _read_parquet(path: Path, most_cells: int) -> Table:
     except (arrow.ArrowException, OSError) as error:
         first = str(error).splitlines()[0]
         raise ValueError(f"recording {path} is no parquet file: {first}") from None
+    kind, names = arrow.types, []
     for field in file.schema_arrow:
-        kind = arrow.types
+        if field.name in unused:
+            continue
+        inner = field.type
+        while kind.is_list(inner) or kind.is_fixed_size_list(inner):
+            inner = inner.value_type
         if not (
-            kind.is_integer(field.type)
-            or kind.is_floating(field.type)
-            or kind.is_null(field.type)
-        ):
+            kind.is_integer(inner) or kind.is_floating(inner) or kind.is_null(inner)
+            or kind.is_boolean(inner)
+        ):  # fmt: skip
             raise ValueError(
                 f"recording {path}: column {field.name} is of type {field.type}, "
-                "expected numbers"
+                "expected numbers (to leave it out, map it to null in the sidecar)"
             )
-    names, n = file.schema_arrow.names, file.metadata.num_rows
+        names.append(field.name)
+    n = file.metadata.num_rows
     kept = _kept_rows(n, len(names), most_cells)
     parts: dict[str, list[np.ndarray]] = {name: [] for name in names}
     done = 0
-    for batch in file.iter_batches(batch_size=1 << 16):
+    for batch in file.iter_batches(batch_size=1 << 16, columns=names):
         for a, b in kept:
             a, b = max(a - done, 0), min(b - done, batch.num_rows)
             if a < b:
                 for name, value in zip(names, batch.columns, strict=True):
-                    piece = value.slice(a, b - a).cast(arrow.float64())
-                    parts[name].append(piece.to_numpy(zero_copy_only=False))
+                    parts[name].append(
+                        _numbers(path, arrow, name, value.slice(a, b - a))
+                    )
         done += batch.num_rows
     empty = [np.empty(0)]
-    columns = {name: np.concatenate(part or empty) for name, part in parts.items()}
+    columns = {}
+    for name, part in parts.items():
+        value = np.concatenate(part or empty)
+        columns |= {name: value} if value.ndim == 1 else _spread(name, value)
     row = np.concatenate([np.arange(a, b) for a, b in kept]) + 1
     return _columns_of(path, columns, row, n)
+
+
+def _numbers(path: Path, arrow, name: str, value) -> np.ndarray:
+    """(n,) of a column, or (n, k) of one of lists."""
+    if arrow.types.is_list(value.type) or arrow.types.is_fixed_size_list(value.type):
+        rows = value.to_pylist()
+        k = max((len(row) for row in rows if row is not None), default=0)
+        if any(row is not None and len(row) != k for row in rows):
+            raise ValueError(
+                f"recording {path}: column {name} has lists of different lengths"
+            )
+        full = [[np.nan] * k if row is None else row for row in rows]
+        return np.array(full, float).reshape(len(rows), -1)
+    return value.cast(arrow.float64()).to_numpy(zero_copy_only=False)
+
+
+def _spread(name: str, value: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns name[0], name[1], ... of (n, k) numbers."""
+    return {
+        f"{name}[{i}]": np.ascontiguousarray(value[:, i]) for i in range(value.shape[1])
+    }
 
 
 def _pyarrow(path: Path) -> ModuleType:

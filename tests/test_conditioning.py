@@ -22,7 +22,7 @@ from makebreak.systems.numerics.signal_noise import estimate_noise, noise_and_ji
 def written(folder, table, sidecar=None, name="log"):
     path = folder / f"{name}.csv"
     rows = np.stack(list(table.values()), axis=1)
-    np.savetxt(path, rows, "%.9g", ",", header=",".join(table), comments="")
+    np.savetxt(path, rows, "%.12g", ",", header=",".join(table), comments="")
     path.write_text(path.read_text().replace("nan", ""))
     if sidecar:
         path.with_suffix(".yaml").write_text(json.dumps(sidecar))
@@ -219,7 +219,7 @@ def pendulum_log(folder: Path, is_dirty: bool):
             for k in repeated:
                 table[name][k] = table[name][k - 1]
         late = t + np.clip(3e-4 * rng.normal(size=n), -1.2e-3, 1.2e-3)
-        table["time"] = np.maximum.accumulate(late) + 1e-9 * np.arange(n)
+        table["time"] = np.maximum.accumulate(late) + 1e-7 * np.arange(n)
     folder.mkdir()
     case = Case("log", 7, "pendulum", (), True, ())
     columns = {**table, "episode": np.zeros(n)}

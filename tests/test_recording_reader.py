@@ -271,7 +271,7 @@ def test_a_bad_csv_is_refused_in_one_line(tmp_path, columns, message):
     [
         ("a.csv", b"", "is empty"),
         ("a.csv", b"\xff\xfe\x00\x01", "is no text"),
-        ("a.csv", b"time;a.b.x\n0;1\n", "separated by commas"),
+        ("a.csv", b"time a.b.x\n0 1\n", "needs the column time, got time a.b.x"),
         ("a.csv", b"time,a.b.x,a.b.x\n0,1,2\n", '"a.b.x" is there twice'),
         ("a.npz", b"no zip", "is no npz"),
         ("a.npz", b"PK\x03\x04 but not really", "is no npz"),
@@ -360,7 +360,7 @@ def test_too_long_a_table_is_thinned_to_whole_stretches_and_says_so(tmp_path, su
 
 
 def test_a_bad_cell_far_down_is_named_by_its_row_in_the_file(tmp_path, monkeypatch):
-    monkeypatch.setattr("makebreak.gap.table._BLOCK", 1000)
+    monkeypatch.setattr("makebreak.gap.data.csv_table._BLOCK", 1000)
     columns = replaced({k: v * 50 for k, v in GOOD.items()}, "time", 777, "x")
     with pytest.raises(ValueError, match="column time, row 777"):
         read_table(text(columns, tmp_path))

@@ -1,0 +1,259 @@
+"""csv tables as they come: other separators, decimal commas, quotes, lists in cells,
+packed with gzip; read in blocks, so that no long file is ever held whole."""
+
+import csv
+import gzip
+import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+
+_BLOCK = 1 << 23  # [bytes] of text that are parsed at a time.
+_SHOWN = 3  # Bad rows that are named one by one.
+_QUOTED = re.compile(rb'"([^"\n]*)"')
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """How a csv file is written. names: of its columns; lists: {column: how many
+    numbers its cells hold}, of cells as [1, 2, 3]; unused: columns that may hold
+    anything."""
+
+    separator: str
+    decimal_comma: bool
+    quoted: bool
+    names: tuple[str, ...]
+    lists: dict[str, int] = field(default_factory=dict)
+    unused: frozenset[str] = frozenset()
+
+    def columns(self) -> list[str]:
+        """Names of the columns of numbers: a list's are name[0], name[1], ..."""
+        out = []
+        for name in self.names:
+            if name in self.unused:
+                continue
+            n = self.lists.get(name)
+            out += [name] if n is None else [f"{name}[{i}]" for i in range(n)]
+        return out
+
+
+class BadRows:
+    """Rows that cannot be used: refused, or left out and counted.
+
+    Args: skip: whether they are left out.
+    """
+
+    def __init__(self, path: Path, skip: bool):
+        self._path, self.skip = path, skip
+        self.count, self.why = 0, list[str]()
+
+    def add(self, why: str) -> None:
+        """Raises: ValueError with the reason, unless such rows are left out."""
+        if not self.skip:
+            raise ValueError(
+                f"recording {self._path}: {why} (--skip-bad-rows leaves such rows out)"
+            )
+        self.count += 1
+        if len(self.why) < _SHOWN:
+            self.why.append(why)
+
+    def note(self) -> list[tuple[str, str]]:
+        if not self.count:
+            return []
+        more = self.count - len(self.why)
+        says = f"{self._path.name}: {self.count} bad rows are left out: "
+        says += "; ".join(self.why) + (f"; and {more} more" if more else "")
+        return [("rows_bad", says)]
+
+
+def open_csv(path: Path):
+    """A binary file to read from."""
+    return gzip.open(path, "rb") if path.suffix.lower() == ".gz" else path.open("rb")
+
+
+def size_of(path: Path) -> int:
+    """Bytes of text; of a gzip file what it says of itself, which may be less."""
+    if path.suffix.lower() != ".gz":
+        return path.stat().st_size
+    with path.open("rb") as file:
+        file.seek(-4, 2)
+        return max(int.from_bytes(file.read(4), "little"), path.stat().st_size)
+
+
+def dialect_of(
+    path: Path, header: bytes, sample: bytes, unused: frozenset[str] = frozenset()
+) -> Dialect:
+    """From the header's line and some lines below it.
+
+    Args: unused: columns that nobody needs, whatever they hold.
+    Raises: ValueError for what is no text, or has a column twice.
+    """
+    try:
+        text = header.decode("utf-8-sig").strip()
+    except UnicodeDecodeError:
+        raise ValueError(f"recording {path} is no text: expected a csv table") from None
+    plain = re.sub(r'"[^"]*"', "", text)
+    separator = max(",;\t", key=plain.count)
+    if not plain.count(separator):
+        separator = ","
+    names = [n.strip() for n in next(csv.reader([text], delimiter=separator), [])]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f'recording {path}: column "{name}" is there twice')
+    lines = sample.decode(errors="replace").splitlines()[:50]
+    lists: dict[str, int] = {}
+    if "[" in "".join(lines):
+        for cells in csv.reader(lines[:-1] or lines, delimiter=separator):
+            if len(cells) != len(names):
+                continue
+            for name, cell in zip(names, cells, strict=True):
+                values = _list(cell)
+                if values is not None:
+                    lists.setdefault(name, len(values))
+    body = "".join(lines)
+    comma = separator != "," and re.search(r"\d,\d", body) is not None
+    # Numbers in quotes with a comma in them, between commas.
+    comma |= separator == "," and re.search(r'"-?\d+,\d+"', body) is not None
+    unused = unused & set(names)
+    return Dialect(separator, comma, '"' in body, tuple(names), lists, unused)
+
+
+def _list(cell: str) -> list[float] | None:
+    cell = cell.strip()
+    if not (cell.startswith("[") and cell.endswith("]")):
+        return None
+    try:
+        return [float("nan") if v is None else float(v) for v in json.loads(cell)]
+    except (ValueError, TypeError):
+        parts = cell.strip("[]").replace(",", " ").split()  # As numpy prints it.
+        try:
+            return [float(p) for p in parts]
+        except ValueError:
+            return None
+
+
+def blocks_of(file, quoted: bool):
+    """Whole lines, 8 MB or so at a time, without empty ones."""
+    rest = b""
+    while True:
+        block = file.read(_BLOCK)
+        text = rest + block
+        if block:
+            cut = text.rfind(b"\n") + 1
+            text, rest = text[:cut], text[cut:]
+        text = text.replace(b"\r\n", b"\n")
+        while b"\n\n" in text or text[:1] == b"\n":
+            text = text.replace(b"\n\n", b"\n").removeprefix(b"\n")
+        if text and not text.endswith(b"\n"):
+            text += b"\n"
+        if text:
+            yield text
+        if not block:
+            return
+
+
+def parse(
+    dialect: Dialect, text: bytes, done: int, bad: BadRows
+) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (rows, columns) of whole lines, and the number of each row from 1; `done`
+    rows came before them."""
+    names = dialect.columns()
+    if dialect.lists:
+        return _by_line(dialect, names, text.decode(errors="replace"), done, bad, True)
+    plain = text
+    if dialect.quoted:
+        plain = _QUOTED.sub(lambda m: _unquoted(m.group(1), dialect), plain)
+    if dialect.separator != ",":
+        if dialect.decimal_comma:
+            plain = plain.replace(b",", b".")
+        plain = plain.replace(dialect.separator.encode(), b",")
+    filled = plain.replace(b",,", b",nan,").replace(b",,", b",nan,")
+    filled = filled.replace(b",\n", b",nan\n").replace(b"\n,", b"\nnan,")
+    if filled.startswith(b","):
+        filled = b"nan" + filled
+    try:
+        use = [i for i, name in enumerate(dialect.names) if name not in dialect.unused]
+        if len(use) < len(dialect.names):  # It looks at no other cell of a row.
+            n = filled.count(b",", 0, filled.find(b"\n"))
+            if n + 1 != len(dialect.names):
+                raise ValueError
+        values = np.loadtxt(
+            BytesIO(filled), delimiter=",", ndmin=2, comments=None,
+            usecols=use if len(use) < len(dialect.names) else None,
+        )  # fmt: skip
+        if values.shape[1] == len(names) and not np.isinf(values).any():
+            return values, done + 1 + np.arange(len(values))
+    except (ValueError, UnicodeDecodeError):
+        pass
+    # Something is wrong with this block: found at leisure.
+    return _by_line(dialect, names, filled.decode(errors="replace"), done, bad, False)
+
+
+def _unquoted(cell: bytes, dialect: Dialect) -> bytes:
+    return cell.replace(b",", b".") if dialect.decimal_comma else cell
+
+
+def _by_line(
+    dialect: Dialect, names: Sequence[str], text: str, done: int, bad: BadRows,
+    as_written: bool,
+):  # fmt: skip
+    """Args: as_written: with the file's own separators and quotes; else made plain."""
+    split: Callable[[str], list[str]]
+    n = len(dialect.names)
+    if as_written:
+
+        def split(line: str) -> list[str]:
+            return next(csv.reader([line], delimiter=dialect.separator), [])
+    else:
+
+        def split(line: str) -> list[str]:
+            return line.split(",")
+
+    rows, numbers = [], []
+    for i, line in enumerate(text.splitlines()):
+        cells, row = split(line), done + i + 1
+        if len(cells) != n:
+            bad.add(f"row {row} has {len(cells)} cells, expected {n} as the header")
+            continue
+        values: list[float] = []
+        for name, cell in zip(dialect.names, cells, strict=True):
+            if name in dialect.unused:
+                continue
+            found, why = _numbers(dialect, name, cell)
+            if why:
+                bad.add(f"column {name}, row {row}: {why}")
+                values = []
+                break
+            values += found
+        if values:
+            rows.append(values)
+            numbers.append(row)
+    return np.array(rows, float).reshape(-1, len(names)), np.array(numbers, int)
+
+
+def _numbers(dialect: Dialect, name: str, cell: str) -> tuple[list[float], str]:
+    """Of one cell; else what is wrong with it."""
+    cell, n = cell.strip(), dialect.lists.get(name)
+    if n is not None:
+        if not cell:
+            return [np.nan] * n, ""
+        found = _list(cell)
+        if found is None or len(found) != n or np.isinf(found).any():
+            return [], f'got "{cell[:40]}", expected a list of {n} finite numbers'
+        return found, ""
+    if dialect.decimal_comma:
+        cell = cell.replace(",", ".")
+    try:
+        value = float(cell) if cell else np.nan
+        if abs(value) != np.inf:
+            return [value], ""
+    except ValueError:
+        pass
+    why = (
+        f'got "{cell[:40]}", expected a finite number, or an empty cell where there is'
+    )
+    return [], why + " none"
