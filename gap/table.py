@@ -24,6 +24,7 @@ from types import ModuleType
 
 import numpy as np
 
+from makebreak.gap.data.bags import is_bag, is_dataset, read_bag, read_dataset
 from makebreak.gap.data.csv_table import (
     BadRows,
     blocks_of,
@@ -185,21 +186,40 @@ def read_table(
     Raises: ValueError, one line with the file and where possible column and row.
     """
     path = Path(path)
-    if not path.is_file():
+    if not path.exists():
         raise ValueError(f"recording {path} does not exist")
-    suffix = suffix_of(path)
-    if suffix not in FORMATS:
-        raise ValueError(f"recording {path}: expected a name in {', '.join(FORMATS)}")
-    if not path.stat().st_size:
-        raise ValueError(f"recording {path} is empty")
-    if suffix in (".csv", ".csv.gz"):
-        table = _read_csv(path, most_cells, bad or BadRows(path, False), unused)
+    if is_bag(path) or is_dataset(path):
+        columns = (
+            read_bag(path, unused) if is_bag(path)
+            else read_dataset(path, _parquet_columns, unused)
+        )  # fmt: skip
+        n = len(next(iter(columns.values())))
+        table = Table(columns, np.arange(n) + 1, n)
     else:
-        read = {".npz": _read_npz, ".parquet": _read_parquet}
-        table = read[suffix](path, most_cells, unused)
+        table = _read_file(path, most_cells, bad, unused)
     if not table.row.size:
         raise ValueError(f"recording {path} has a header and no rows")
     return table
+
+
+def _read_file(path: Path, most_cells: int, bad: BadRows | None, unused) -> Table:
+    suffix = suffix_of(path)
+    if path.is_dir() or suffix not in FORMATS:
+        raise ValueError(
+            f"recording {path}: expected a name in {', '.join(FORMATS)}, a bag (.bag, "
+            ".mcap, .db3, a folder with metadata.yaml) or a LeRobot dataset (a folder "
+            "with meta/info.json)"
+        )
+    if not path.stat().st_size:
+        raise ValueError(f"recording {path} is empty")
+    if suffix in (".csv", ".csv.gz"):
+        return _read_csv(path, most_cells, bad or BadRows(path, False), unused)
+    read = {".npz": _read_npz, ".parquet": _read_parquet}
+    return read[suffix](path, most_cells, unused)
+
+
+def _parquet_columns(path: Path, unused: frozenset[str]) -> dict[str, np.ndarray]:
+    return _read_parquet(path, MOST_CELLS, unused).columns
 
 
 def _nearest(name: str) -> str:

@@ -1,0 +1,181 @@
+"""ROS bags (1, 2, MCAP) and LeRobot v3 datasets as tables of numbers.
+
+A bag's numbers get the names <topic>/<joint>/position, /velocity, /effort of a
+sensor_msgs/JointState, and <topic>/<field> of anything else, arrays as <field>[0], ...;
+time is the header's stamp, where a message has one, else when it was recorded. Each
+message is a row, so that topics keep their own rates. A dataset's columns get the names
+of its features, <feature>.<name>.
+"""
+
+import json
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+
+BAGS = (".bag", ".mcap", ".db3")
+LONGEST_ARRAY = 64  # Longer ones are pictures, maps, clouds.
+_JOINT_STATE = "sensor_msgs/msg/JointState"
+_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+
+
+def is_bag(path: Path) -> bool:
+    return path.suffix.lower() in BAGS or (path / "metadata.yaml").is_file()
+
+
+def is_dataset(path: Path) -> bool:
+    return (path / "meta" / "info.json").is_file()
+
+
+def read_bag(path: Path, unused: frozenset[str] = frozenset()) -> dict[str, np.ndarray]:
+    """Columns (n,), `time` [s] from the first stamp on and what the topics hold.
+
+    Raises: ValueError, one line.
+    """
+    try:
+        highlevel = import_module("rosbags.highlevel")
+        typesys = import_module("rosbags.typesys")
+    except ImportError:
+        raise ValueError(
+            f"recording {path}: bags need rosbags: pip install 'makebreak[ros]'"
+        ) from None
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    stamps: list[int] = []
+    rows: list[dict[str, float]] = []
+    unread: set[str] = set()
+    try:
+        with highlevel.AnyReader([path], default_typestore=store) as reader:
+            for connection, received, raw in reader.messages():
+                if connection.topic in unused or connection.topic in unread:
+                    continue
+                try:
+                    message = reader.deserialize(raw, connection.msgtype)
+                except Exception:  # A type that nobody defined, a broken message.
+                    unread.add(connection.topic)
+                    continue
+                values = dict(_numbers(connection.topic, connection.msgtype, message))
+                if values:
+                    stamps.append(_stamp(message) or received)
+                    rows.append(values)
+    except Exception as error:  # The library raises what its formats' readers raise.
+        why = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ValueError(
+            f"recording {path} is no bag that can be read: {why}"
+        ) from None
+    if not rows:
+        topics = f"; not read: {', '.join(sorted(unread))}" if unread else ""
+        raise ValueError(f"recording {path} holds no message with numbers{topics}")
+    return _table(np.array(stamps), rows)
+
+
+def _stamp(message) -> int:
+    """[ns] of its header; 0 where it has none, or none was set."""
+    header = getattr(message, "header", None)
+    if header is None:
+        return 0
+    return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+
+
+def _numbers(topic: str, kind: str, message) -> Iterator[tuple[str, float]]:
+    if kind == _JOINT_STATE:
+        for what in ("position", "velocity", "effort"):
+            values = getattr(message, what)
+            if len(values) == len(message.name):
+                for name, value in zip(message.name, values, strict=True):
+                    yield f"{topic}/{name}/{what}", float(value)
+        return
+    if kind == _TRAJECTORY:  # What is to be reached first.
+        if message.points:
+            point = message.points[0]
+            for what in ("positions", "velocities", "effort"):
+                values = getattr(point, what)
+                if len(values) == len(message.joint_names):
+                    for name, value in zip(message.joint_names, values, strict=True):
+                        yield f"{topic}/{name}/{what}", float(value)
+        return
+    yield from _fields(topic, message, 0)
+
+
+def _fields(name: str, value, depth: int) -> Iterator[tuple[str, float]]:
+    """All numbers below a value."""
+    if isinstance(value, bool | int | float | np.number):
+        yield name, float(value)
+    elif isinstance(value, np.ndarray | list | tuple):
+        if len(value) <= LONGEST_ARRAY:
+            for i, each in enumerate(value):
+                yield from _fields(f"{name}[{i}]", each, depth + 1)
+    elif depth < 4 and hasattr(value, "__dataclass_fields__"):
+        for key in value.__dataclass_fields__:
+            if key not in ("header", "layout") and not key.startswith("__"):
+                yield from _fields(f"{name}/{key}", getattr(value, key), depth + 1)
+
+
+def _table(stamps: np.ndarray, rows: list[dict[str, float]]) -> dict[str, np.ndarray]:
+    """One row a stamp; what came at the very same stamp is in one."""
+    instants, row_of = np.unique(stamps, return_inverse=True)
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    index = {name: i for i, name in enumerate(names)}
+    table = np.full((len(instants), len(names)), np.nan)
+    for k, row in zip(row_of, rows, strict=True):
+        for name, value in row.items():
+            table[k, index[name]] = value
+    # Nanoseconds since 1970 are too many digits for a float.
+    time = 1e-9 * (instants - instants[0]).astype(float)
+    return {"time": time} | {name: table[:, i].copy() for name, i in index.items()}
+
+
+# ----- LeRobot
+
+
+def read_dataset(
+    path: Path, read_parquet, unused: frozenset[str] = frozenset()
+) -> dict[str, np.ndarray]:
+    """Columns (n,): time, episode, and the features that are numbers.
+
+    Args: read_parquet(file, unused) -> columns, lists as name[0], name[1], ...
+    Raises: ValueError, one line.
+    """
+    info_file = path / "meta" / "info.json"
+    try:
+        info = json.loads(info_file.read_text())
+        features = dict(info["features"])
+    except (ValueError, KeyError, TypeError, OSError) as error:
+        raise ValueError(
+            f"{info_file}: no info of a LeRobot dataset: {error}"
+        ) from None
+    files = sorted((path / "data").glob("chunk-*/*.parquet"))
+    if not files:
+        raise ValueError(f"recording {path}: no data/chunk-*/*.parquet below it")
+    numbers = {
+        name
+        for name, feature in features.items()
+        if str(feature.get("dtype", "")).startswith(("float", "int", "bool"))
+    }
+    others = frozenset(features) - numbers | unused
+    parts = [read_parquet(file, others) for file in files]
+    names = list(parts[0])
+    if any(set(part) != set(names) for part in parts):
+        raise ValueError(f"recording {path}: its parquet files have different columns")
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in names}
+    for needed in ("timestamp", "episode_index"):
+        if needed not in columns:
+            raise ValueError(f"recording {path}: no column {needed}, as LeRobot's have")
+    out = {"time": columns.pop("timestamp"), "episode": columns.pop("episode_index")}
+    for key in ("frame_index", "index", "task_index"):
+        columns.pop(key, None)
+    for name in numbers:
+        for i, label in enumerate(_labels(features[name])):
+            if f"{name}[{i}]" in columns:
+                columns[f"{name}.{label}"] = columns.pop(f"{name}[{i}]")
+    return out | {name: columns[name] for name in columns if name not in unused}
+
+
+def _labels(feature) -> list[str]:
+    """Names of a feature's entries; none where they are only counted."""
+    names = feature.get("names")
+    if isinstance(names, dict):  # {"motors": [...]}, of older writers.
+        names = next(iter(names.values()), None)
+    if isinstance(names, list) and all(isinstance(name, str) for name in names):
+        return names
+    return []
