@@ -196,11 +196,14 @@ class Recording:
 
 
 def read_recordings(
-    paths: Iterable[str | Path], skip_bad_rows: bool = False
+    paths: Iterable[str | Path],
+    skip_bad_rows: bool = False,
+    sidecars: Mapping[Path, Path] | None = None,
 ) -> list[Recording]:
     """Several recordings, with names that tell them apart.
 
-    Args: skip_bad_rows: as of read_recording.
+    Args: skip_bad_rows: as of read_recording. sidecars: {recording: sidecar}, where it
+        is not beside it.
     Raises: ValueError as read_recording; if a file is given twice; for no file.
     """
     files = [Path(path) for path in paths]
@@ -217,7 +220,9 @@ def read_recordings(
     if len(set(stems)) < len(stems):
         stems = [str(path) for path in files]
     return [
-        read_recording(path, name, skip_bad_rows=skip_bad_rows)
+        read_recording(
+            path, name, MOST_CELLS, skip_bad_rows, (sidecars or {}).get(path)
+        )
         for path, name in zip(files, stems, strict=True)
     ]
 
@@ -227,6 +232,7 @@ def read_recording(
     name: str | None = None,
     most_cells: int = MOST_CELLS,
     skip_bad_rows: bool = False,
+    sidecar_path: Path | None = None,
 ) -> Recording:
     """Reads a .csv, .npz or .parquet table, and what its sidecars say of it.
 
@@ -234,11 +240,12 @@ def read_recording(
     the recording's fields and notes.
 
     Args: skip_bad_rows: rows that cannot be read, that hold numbers beyond 1e12, or
-        whose time does not increase, are left out and counted in a note.
+        whose time does not increase, are left out and counted in a note. sidecar_path:
+        in place of the one beside it.
     Raises: ValueError: one line with file, column, row, what came, what was expected.
     """
     path = Path(path)
-    sidecar = _read_sidecars(path)
+    sidecar = _read_sidecars(path, sidecar_path)
     names = sidecar.get("columns") or {}
     unused = frozenset(str(name) for name, to in names.items() if to is None)
     bad = BadRows(path, skip_bad_rows)
@@ -343,12 +350,20 @@ def sidecar_of(path: Path) -> Path:
     return path.with_name(f"{stem_of(path)}.yaml")
 
 
-def _read_sidecars(path: Path) -> dict:
-    """noise.json in the folder, and `<recording>.yaml`, or .csv.yaml, which wins."""
-    merged: dict = {}
+def has_sidecar(path: Path) -> bool:
+    return bool(_own_sidecars(path))
+
+
+def _own_sidecars(path: Path) -> list[Path]:
     own = [sidecar_of(path), path.with_name(f"{path.name}.yaml")]
     own += [file.with_suffix(".yml") for file in own]
-    own = [file for file in dict.fromkeys(own) if file.is_file()]
+    return [file for file in dict.fromkeys(own) if file.is_file()]
+
+
+def _read_sidecars(path: Path, given: Path | None) -> dict:
+    """noise.json in the folder, and `<recording>.yaml`, or .csv.yaml, which wins."""
+    merged: dict = {}
+    own = _own_sidecars(path) if given is None else [given]
     if len(own) > 1:
         raise ValueError(
             f"recording {path} has two sidecars: {own[0].name} and {own[1].name}"

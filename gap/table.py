@@ -298,7 +298,8 @@ def _read_npz(path: Path, most_cells: int, unused) -> Table:
             names = [name for name in file if name not in unused]
             if not names:
                 raise ValueError(f"recording {path} has no columns")
-            columns, n, row = {}, -1, np.empty(0, int)
+            columns: dict[str, np.ndarray] = {}
+            n, row = -1, np.empty(0, int)
             for name in names:
                 value = file[name]
                 if not isinstance(value, np.ndarray):
@@ -369,7 +370,7 @@ def _read_parquet(path: Path, most_cells: int, unused) -> Table:
                     )
         done += batch.num_rows
     empty = [np.empty(0)]
-    columns = {}
+    columns: dict[str, np.ndarray] = {}
     for name, part in parts.items():
         value = np.concatenate(part or empty)
         columns |= {name: value} if value.ndim == 1 else _spread(name, value)

@@ -1,7 +1,7 @@
 """From a scene and recordings of the real thing to what the scene lacks."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -55,10 +55,13 @@ def run_gap(
     recording_paths: Sequence[str | Path],
     jobs: int = 1,
     progress: Callable[[str], None] | None = None,
+    skip_bad_rows: bool = False,
+    sidecars: Mapping[Path, Path] | None = None,
 ) -> GapResult:
     """Finds where a scene and recordings disagree, and names what the scene lacks.
 
     Args: jobs: processes at once. progress: called with a line of text now and then.
+        skip_bad_rows, sidecars: as of read_recordings.
     Raises: ValueError, one line, for a scene or recording that cannot be read or do
         not fit together.
     """
@@ -66,7 +69,7 @@ def run_gap(
     clock = _Clock()
     seconds: dict[str, float] = {}
     scene = read_scene(scene_path)
-    recordings = read_recordings(recording_paths)
+    recordings = read_recordings(recording_paths, skip_bad_rows, sidecars)
     dynamics = SceneDynamics(scene)
     joints, bodies = scene_names(dynamics.plant)
     for recording in recordings:

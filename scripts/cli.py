@@ -373,24 +373,47 @@ def _sweep(args) -> int:
 
 
 def _gap(args) -> int:
+    from makebreak.gap.data.bags import is_bag, is_dataset
     from makebreak.scripts.gap_command import effects_table, run_and_report
 
-    scene = Path(_scene(args.scene, "SCENE"))
     recordings = [Path(text) for text in args.recordings]
     for path in recordings:
-        if not path.is_file():
-            raise ValueError(f'RECORDING: got "{path}", expected a file')
+        if not (path.is_file() or is_bag(path) or is_dataset(path)):
+            raise ValueError(f'RECORDING: got "{path}", expected a file, or a bag')
+    robot = Path(args.scene)
+    is_robot = robot.suffix.lower() in (".urdf", ".sdf", ".xml")
+    scene = robot if is_robot else Path(_scene(args.scene, "SCENE"))
     out = Path(args.out) if args.out else _default_out("gap")
     export = [word for word in (args.export or "").split(",") if word]
     try:
-        result, files = run_and_report(scene, recordings, out, _jobs(args.jobs), export)
+        result, files, notes = run_and_report(
+            scene, recordings, out, _jobs(args.jobs), export, is_robot,
+            args.skip_bad_rows,
+        )  # fmt: skip
     except (Exception, SystemExit) as error:
         if on_purpose(error) or isinstance(error, OSError):
             raise
         kept = out / "error.txt"
         return fault(error, kept) if kept.exists() else refused(error)
     print(effects_table(result).to_text())
+    for note in notes:
+        print(note)
     _say_files(files)
+    return 0
+
+
+def _inspect(args) -> int:
+    from makebreak.scripts.inspect_command import run_inspect
+
+    robot = Path(args.robot) if args.robot else None
+    out = Path(args.out) if args.out else None
+    table, sidecar, files = run_inspect(Path(args.log), robot, out)
+    print(table.to_text())
+    if out is None:
+        print("\nA sidecar for it, to be corrected (--out DIR writes it):\n")
+        print(sidecar, end="")
+    else:
+        _say_files(files)
     return 0
 
 
@@ -554,14 +577,37 @@ def _parser() -> argparse.ArgumentParser:
     p = commands.add_parser(
         "gap", help="where a model and recordings disagree, and what it lacks"
     )
-    p.add_argument("scene", metavar="SCENE", help="the model: a file, or a listed name")
-    p.add_argument("recordings", nargs="+", metavar="RECORDING", help=".csv, .npz, ...")
+    p.add_argument(
+        "scene",
+        metavar="SCENE",
+        help="the model: a file, or a listed name; or a robot's .urdf or .sdf alone, "
+        "for which a scene is proposed",
+    )
+    p.add_argument(
+        "recordings",
+        nargs="+",
+        metavar="RECORDING",
+        help=".csv, .npz, .parquet, a ROS bag, a LeRobot dataset",
+    )
+    p.add_argument(
+        "--skip-bad-rows",
+        action="store_true",
+        help="leave out rows that cannot be read, and say how many",
+    )
     p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
     p.add_argument("--out", metavar="DIR", help="default: runs/gap-<time>")
     p.add_argument(
         "--export", metavar="FORMATS", help="the repaired model also as: urdf,mjcf"
     )
     p.set_defaults(function=_gap)
+
+    p = commands.add_parser(
+        "inspect", help="what a log holds: columns or topics, rates, holes, units"
+    )
+    p.add_argument("log", metavar="LOG", help=".csv, .npz, .parquet, a bag, a dataset")
+    p.add_argument("--robot", metavar="FILE", help=".urdf or .sdf, to match columns to")
+    p.add_argument("--out", metavar="DIR", help="write the drafted sidecar there")
+    p.set_defaults(function=_inspect)
 
     p = commands.add_parser(
         "close-the-loop",

@@ -12,7 +12,7 @@ from time import perf_counter
 from tqdm import tqdm
 
 from makebreak.gap.comparison import comparison_html
-from makebreak.gap.recording import read_recordings
+from makebreak.gap.recording import has_sidecar, read_recordings, sidecar_of
 from makebreak.gap.report import summary_lines, windows_of, write_report
 from makebreak.gap.result import GapResult
 from makebreak.models.scene import Scene, read_scene
@@ -66,25 +66,37 @@ def run_and_report(
     out_dir: Path,
     jobs: int,
     export: Sequence[str] = (),
-) -> tuple[GapResult, list[Path]]:
-    """The workflow's result, and the files that tell of it.
+    is_robot: bool = False,
+    skip_bad_rows: bool = False,
+) -> tuple[GapResult, list[Path], list[str]]:
+    """The workflow's result, the files that tell of it, and what is to be said beside.
 
-    Args: export: of EXPORTS; the repaired model is written so as well.
+    Args: export: of EXPORTS; the repaired model is written so as well. is_robot:
+        scene_path is a robot's own file; a scene is proposed for it, and a sidecar for
+        each recording that has none, and both are among the files.
     Raises: ValueError for a scene, a recording or a folder that cannot be used.
     """
     from makebreak.gap.workflow import run_gap  # Late: it is long to load.
 
     start = perf_counter()
-    if export:  # Refused before anything is computed.
-        exported(read_scene(scene_path), export)
     inputs = [scene_path, *recording_paths]
+    notes: list[str] = []
+    sidecars: dict[Path, Path] = {}
     with OutputFolder(out_dir, "gap", inputs) as out:
+        if is_robot:
+            scene_path, sidecars, notes = _proposed(
+                scene_path, recording_paths, out, out_dir
+            )
+        if export:  # Refused before anything is computed.
+            exported(read_scene(scene_path), export)
         try:
             with StageBar() as progress:
-                result = run_gap(scene_path, recording_paths, jobs, progress)
+                result = run_gap(
+                    scene_path, recording_paths, jobs, progress, skip_bad_rows, sidecars
+                )
                 progress("writing the report", 0.95)
                 scene = read_scene(scene_path)
-                recordings = read_recordings(recording_paths)
+                recordings = read_recordings(recording_paths, skip_bad_rows, sidecars)
                 moving = comparison_html(result, scene, recordings)
                 folder = out.stage
                 write_report(
@@ -106,7 +118,33 @@ def run_and_report(
         times = {"wall_s": perf_counter() - start, "stages_s": dict(result.seconds)}
         out.file("timing.json").write_text(json.dumps(times, indent=2) + "\n")
         with undisturbed():
-            return result, out.commit()
+            return result, out.commit(), notes
+
+
+def _proposed(
+    robot_path: Path, recording_paths: Sequence[Path], out: OutputFolder, out_dir: Path
+) -> tuple[Path, dict[Path, Path], list[str]]:
+    """A scene and sidecars for a robot and its logs, written to be corrected."""
+    from makebreak.gap.data.robot import propose_scene, read_log, read_robot
+
+    robot = read_robot(robot_path)
+    proposal = propose_scene(robot, [read_log(path) for path in recording_paths])
+    scene = out.file("proposed_scene.yaml")
+    scene.write_text(proposal.scene)
+    sidecars = {}
+    for path, text in proposal.sidecars.items():
+        if not has_sidecar(path):
+            sidecars[path] = out.file(sidecar_of(path).name)
+            sidecars[path].write_text(text)
+    notes = ["Proposed, to be corrected: " + "; ".join(proposal.notes) + "."]
+    names = [f"{sidecar_of(path).name} beside {path.name}" for path in sidecars]
+    where = f"Correct {out_dir / scene.name}"
+    where += f", put {', '.join(names)}" if names else ""
+    again = " ".join(str(path) for path in recording_paths)
+    notes.append(
+        f"{where}, and run again: makebreak gap {out_dir / scene.name} {again}"
+    )
+    return scene, sidecars, notes
 
 
 def exported(scene: Scene, formats: Sequence[str]) -> dict[str, str]:

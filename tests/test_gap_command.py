@@ -26,7 +26,7 @@ def workflow(monkeypatch, case, tmp_path):
     monkeypatch.chdir(tmp_path)
     asked = []
 
-    def run_gap(scene_path, recording_paths, jobs, progress):
+    def run_gap(scene_path, recording_paths, jobs, progress, *_):
         asked.append((scene_path, recording_paths, jobs))
         for text in ("checking the recordings", "screening the catalogue"):
             progress(text)

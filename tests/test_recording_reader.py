@@ -271,7 +271,7 @@ def test_a_bad_csv_is_refused_in_one_line(tmp_path, columns, message):
     [
         ("a.csv", b"", "is empty"),
         ("a.csv", b"\xff\xfe\x00\x01", "is no text"),
-        ("a.csv", b"time a.b.x\n0 1\n", "needs the column time, got time a.b.x"),
+        ("a.csv", b"time a.b.x\n0\n", "needs the column time, got time a.b.x"),
         ("a.csv", b"time,a.b.x,a.b.x\n0,1,2\n", '"a.b.x" is there twice'),
         ("a.npz", b"no zip", "is no npz"),
         ("a.npz", b"PK\x03\x04 but not really", "is no npz"),

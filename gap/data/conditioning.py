@@ -347,7 +347,8 @@ def _with_jitter(recording: Recording) -> tuple[Recording, list[Finding]]:
     channels, found = dict(recording.channels), []
     for channel in recording.measured():
         values, stamps, breaks = _samples(recording, channel, recording.time)
-        if len(values) < 200:
+        # A coarse grid shows its steps where a channel moves, and none at rest.
+        if len(values) < 200 or channel.step / np.sqrt(12.0) > 0.5 * channel.noise:
             continue
         jitter, total = noise_and_jitter(values, breaks, stamps, channel.noise)
         if total > 1.2 * channel.noise:

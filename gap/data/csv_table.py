@@ -257,3 +257,20 @@ def _numbers(dialect: Dialect, name: str, cell: str) -> tuple[list[float], str]:
         f'got "{cell[:40]}", expected a finite number, or an empty cell where there is'
     )
     return [], why + " none"
+
+
+def text_columns(path: Path) -> tuple[str, ...]:
+    """Columns whose first cells are neither numbers nor lists of them."""
+    with open_csv(path) as file:
+        header = file.readline()
+        sample = file.read(1 << 16)
+    dialect = dialect_of(path, header, sample)
+    lines = sample.decode(errors="replace").splitlines()[:20]
+    found: dict[str, int] = {}
+    for cells in csv.reader(lines, delimiter=dialect.separator):
+        if len(cells) == len(dialect.names):
+            for name, cell in zip(dialect.names, cells, strict=True):
+                found[name] = found.get(name, 0) + bool(
+                    _numbers(dialect, name, cell)[1]
+                )
+    return tuple(name for name, n in found.items() if 2 * n > len(lines))

@@ -1,0 +1,377 @@
+"""From foreign columns to channels: what each may be, in which unit, of which joint.
+
+A proposal to be corrected, not a decision: names are matched by words and numbers,
+units by the joints' limits and by how a velocity relates to its position's derivative.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from makebreak.gap.table import COMMANDS, is_channel
+
+DEG = np.pi / 180.0
+_COMMAND = set(
+    "cmd command commands commanded target desired des ref reference goal goals "
+    "setpoint action sp control".split()
+)
+_WORDS = {
+    "acceleration": set("acc acceleration accelerations ddq qdd accel".split()),
+    "current": set("current currents amp amps ampere".split()),
+    "effort": set("effort efforts torque torques tau trq moment moments u".split()),
+    "velocity": set(
+        "velocity velocities vel vels dq qd qdot speed speeds omega velo v".split()
+    ),
+    "position": set(
+        "position positions pos q qpos angle angles theta phi deg rad state states "
+        "joint joints encoder action".split()
+    ),
+}
+_NEVER = set("temperature temp voltage volt status error mode flag id seq".split())
+_TIME = set("time t timestamp timestamps stamp ts sec secs seconds clock".split())
+_EPISODE = set("episode trial run".split())
+_TIME_UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
+# Of a velocity to the derivative of its position: unit, factor to rad/s or m/s.
+_RATES = (
+    ("", 1.0), ("deg/s", DEG), ("rpm", 2.0 * np.pi / 60.0), ("mm/s", 1e-3),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class JointName:
+    """A joint of the robot. name: `<model>.<joint>`; limits in rad or m."""
+
+    name: str
+    prismatic: bool = False
+    lower: float = -np.inf
+    upper: float = np.inf
+
+
+@dataclass(frozen=True)
+class Match:
+    """What a column is taken for. channel: of a recording, `time`, `episode`, or None:
+    it is left out. why: a few words."""
+
+    column: str
+    channel: str | None
+    scale: float = 1.0
+    offset: float = 0.0
+    why: str = ""
+
+
+def words_of(name: str) -> list[str]:
+    """Lower-case words and numbers of a name, also of jointOne, q_1 and q[1]."""
+    name = re.sub(r"([a-z])([A-Z])", r"\1 \2", name)
+    return re.findall(r"[a-z]+|\d+", name.lower())
+
+
+def propose(
+    columns: Mapping[str, np.ndarray],
+    joints: Sequence[JointName],
+    text: Sequence[str] = (),
+) -> list[Match]:
+    """One for each column, in their order.
+
+    Args: columns {name: (n,)}, NaN where nothing is; joints in the robot's order; text:
+        columns that hold no numbers.
+    """
+    time = _find_time(columns)
+    found: dict[str, Match] = {name: Match(name, None, why="text") for name in text}
+    if time is not None:
+        found[time.column] = time
+    quantities = {}
+    for name in columns:
+        if name in found:
+            continue
+        if is_channel(name):
+            found[name] = Match(name, name, why="has a channel's name already")
+            continue
+        if set(words_of(name)) & _EPISODE and _counts(columns[name]):
+            found[name] = Match(name, "episode", why="counts episodes")
+            continue
+        quantity = _quantity(name)
+        if quantity is None:
+            found[name] = Match(name, None, why="no quantity that is compared")
+        else:
+            quantities[name] = quantity
+    for name, joint in _joints_of(quantities, joints).items():
+        quantity = quantities[name]
+        if joint is None:
+            found[name] = Match(
+                name, None, why=f"{quantity}, of which joint is not told"
+            )
+        else:
+            found[name] = Match(name, f"{joint.name}.{quantity}", why="by its name")
+    found = _once(found)
+    found = _in_si(_by_motion(found, columns), columns, joints)
+    return [found[name] for name in [*columns, *text]]
+
+
+def of_one_drive(matches: Sequence[Match]) -> list[Match]:
+    """With one kind of command alone: efforts before positions, and before velocities;
+    measured efforts stand in for commands of effort."""
+    kinds = {
+        m.channel.rsplit(".", 1)[1] for m in matches if m.channel and "." in m.channel
+    }
+    keep = next((k for k in ("effort_command", "effort_measured", "position_command",
+                             "velocity_command") if k in kinds), None)  # fmt: skip
+    out = []
+    for match in matches:
+        what = (match.channel or "").rsplit(".", 1)[-1]
+        pd = keep == "position_command" and what == "velocity_command"
+        if what in COMMANDS and what != keep or pd:
+            why = f"{what}: {keep} is taken for what drives the joints"
+            match = Match(match.column, None, why=why)
+        out.append(match)
+    return out
+
+
+def sidecar_text(matches: Sequence[Match]) -> str:
+    """A sidecar with the columns, to be corrected."""
+    lines = ["# What each column is: a proposal, to be corrected. docs/recordings.md",
+             "columns:"]  # fmt: skip
+    for match in matches:
+        key = _quoted(match.column)
+        if match.channel is None:
+            target = "null"
+        elif match.scale == 1.0 and match.offset == 0.0:
+            target = match.channel
+        else:
+            target = f"{{channel: {match.channel}, scale: {match.scale!r}"
+            target += f", offset: {match.offset!r}}}" if match.offset else "}"
+        if match.channel == match.column:
+            continue
+        lines.append(f"  {key}: {target}  # {match.why}")
+    if len(lines) == 2:
+        lines[1] = "columns: {}"
+    return "\n".join(lines) + "\n"
+
+
+def _quoted(name: str) -> str:
+    plain = re.fullmatch(r"[A-Za-z_][\w./-]*", name) is not None
+    reserved = name.lower() in (
+        "y",
+        "n",
+        "yes",
+        "no",
+        "on",
+        "off",
+        "true",
+        "false",
+        "null",
+    )
+    return name if plain and not reserved else "'" + name.replace("'", "''") + "'"
+
+
+# ----- Quantities
+
+
+def _quantity(name: str) -> str | None:
+    words = words_of(name)
+    if set(words) & _NEVER:
+        return None
+    command = bool(set(words) & _COMMAND)
+    kind = next((kind for kind, own in _WORDS.items() if own & set(words)), None)
+    if re.search(r"(^|[^a-z])[qv]_d_?\d*$", name.lower()):  # q_d, as in papers.
+        command = True
+    if kind is None and command:  # The joint's name says the rest.
+        kind = "position"
+    if kind is None or kind == "acceleration":
+        return None
+    if kind == "current":  # Without its gain it is no effort.
+        return None
+    if kind == "effort":
+        return "effort_command" if command or "u" in words else "effort_measured"
+    return f"{kind}_command" if command else kind
+
+
+def _joints_of(
+    quantities: Mapping[str, str], joints: Sequence[JointName]
+) -> dict[str, JointName | None]:
+    """By the joint's own name in the column's; else by the number in it."""
+    found: dict[str, JointName | None] = {}
+    plain = {
+        re.sub(r"[^a-z0-9]", "", j.name.split(".", 1)[1].lower()): j for j in joints
+    }
+    rest: dict[str, list[tuple[int, str]]] = {}
+    for name in quantities:
+        own = re.sub(r"[^a-z0-9]", "", name.lower())
+        inside = [key for key in plain if key and key in own]
+        # joint1 is in joint10: the longest that is there.
+        if inside:
+            found[name] = plain[max(inside, key=len)]
+            continue
+        numbers = list(re.finditer(r"\d+", name))
+        if not numbers:
+            found[name] = joints[0] if len(joints) == 1 else None
+            continue
+        last = numbers[-1]
+        template = f"{name[: last.start()]}#{name[last.end() :]}"
+        rest.setdefault(template, []).append((int(last.group()), name))
+    # All groups count alike: from 0 if any does, else from 1.
+    counted = [number for group in rest.values() for number, _ in group]
+    base = 0 if 0 in counted else 1
+    for group in rest.values():
+        for number, name in group:
+            k = number - base
+            found[name] = joints[k] if 0 <= k < len(joints) else None
+    return found
+
+
+def _once(found: dict[str, Match]) -> dict[str, Match]:
+    """Each channel of one column: the first that has it."""
+    taken: set[str | None] = {
+        m.channel for m in found.values() if m.channel == m.column
+    }
+    out = {}
+    for name, match in found.items():
+        if match.channel is not None and match.channel != match.column:
+            if match.channel in taken:
+                match = Match(name, None, why=f"{match.channel} is another column")
+            else:
+                taken.add(match.channel)
+        out[name] = match
+    return out
+
+
+# ----- Units
+
+
+def _find_time(columns: Mapping[str, np.ndarray]) -> Match | None:
+    for name, value in columns.items():
+        words = words_of(name)
+        if not set(words) & _TIME and not (words and words[0] in _TIME_UNITS):
+            continue
+        step = np.diff(value[np.isfinite(value)])
+        if len(step) < 5 or not np.mean(step >= 0.0) > 0.9:
+            continue
+        typical = float(np.median(step[step > 0.0])) if (step > 0.0).any() else 0.0
+        if not typical > 0.0:
+            continue
+        said = [u for u in words if u in _TIME_UNITS and u != "s"]
+        units = [*said, "s", "ms", "us", "ns"]
+        unit = next(
+            (u for u in units if 2e-5 < typical * _TIME_UNITS[u] < 0.9), "s"
+        )  # fmt: skip
+        scale = _TIME_UNITS[unit]
+        # Seconds since 1970 keep their digits, nanoseconds do not.
+        why = f"increases, {typical * scale * 1e3:.3g} ms a row, taken as {unit}"
+        return Match(name, "time", scale, why=why)
+    return None
+
+
+def _counts(value: np.ndarray) -> bool:
+    there = value[np.isfinite(value)]
+    return bool(len(there)) and bool((there == np.rint(there)).all())
+
+
+def _in_si(found, columns, joints: Sequence[JointName]) -> dict[str, Match]:
+    """Scales of positions and of what goes with them."""
+    of = {joint.name: joint for joint in joints}
+    out = dict(found)
+    time = next((m for m in found.values() if m.channel == "time"), None)
+    degrees: dict[str, bool] = {}  # By the way a column is named.
+    for name, match in found.items():
+        if match.channel is None or not match.channel.endswith(
+            (".position", ".position_command")
+        ):
+            continue
+        joint = of.get(match.channel.rsplit(".", 1)[0])
+        if joint is None or joint.prismatic:
+            continue
+        degrees.setdefault(_template(name), False)
+        degrees[_template(name)] |= _in_degrees(name, columns[name], joint)
+    for name, match in found.items():
+        if match.channel is None or name not in columns:
+            continue
+        what = match.channel.rsplit(".", 1)[-1]
+        if what in ("position", "position_command") and degrees.get(_template(name)):
+            why = "in degrees, by its name or its size"
+            out[name] = Match(name, match.channel, DEG, why=f"{match.why}; {why}")
+    for name, match in found.items():
+        channel = match.channel or ""
+        if not channel.endswith(".velocity") or time is None:
+            continue
+        position = next(
+            (m for m in out.values() if m.channel == f"{channel[:-9]}.position"), None
+        )
+        scale, why = _rate_scale(columns, time, position, name)
+        if scale != 1.0:
+            out[name] = Match(name, channel, scale, why=f"{match.why}; {why}")
+    return out
+
+
+def _by_motion(found: dict[str, Match], columns) -> dict[str, Match]:
+    """qd may be a speed or a command of position: what it goes with tells."""
+    out = dict(found)
+    for name, match in found.items():
+        channel = match.channel or ""
+        if "qd" not in words_of(name) or not channel.endswith(".velocity"):
+            continue
+        at = channel.removesuffix(".velocity")
+        position = next(
+            (m for m in found.values() if m.channel == f"{at}.position"), None
+        )
+        taken = any(m.channel == f"{at}.position_command" for m in found.values())
+        if position is None or taken:
+            continue
+        q, y = columns[position.column], columns[name]
+        good = np.isfinite(q) & np.isfinite(y)
+        if good.sum() < 50 or not (np.ptp(q[good]) > 0.0 and np.ptp(y[good]) > 0.0):
+            continue
+        if np.corrcoef(q[good], y[good])[0, 1] > 0.9:
+            why = "it follows the position"
+            out[name] = Match(name, f"{at}.position_command", why=why)
+    return out
+
+
+def _template(name: str) -> str:
+    return re.sub(r"\d+", "#", name)
+
+
+def _in_degrees(name: str, value: np.ndarray, joint: JointName) -> bool:
+    words = words_of(name)
+    if "deg" in words or "degree" in words or "degrees" in words:
+        return True
+    if "rad" in words or not np.isfinite(value).any():
+        return False
+    most = float(np.nanmax(np.abs(value)))
+    limit = max(abs(joint.lower), abs(joint.upper))
+    if np.isfinite(limit):
+        return most > 2.0 * limit and DEG * most < 1.3 * limit
+    return most > 20.0
+
+
+def _rate_scale(columns, time: Match, position: Match | None, name: str):
+    """What a velocity must be multiplied with, and why."""
+    words = words_of(name)
+    if "rpm" in words:
+        return 2.0 * np.pi / 60.0, "in rpm, by its name"
+    if "deg" in words or "degps" in words or "dps" in words:
+        return DEG, "in degrees per second, by its name"
+    if position is None:
+        return 1.0, ""
+    t = time.scale * columns[time.column]
+    q, v = position.scale * columns[position.column], columns[name]
+    good = np.isfinite(t) & np.isfinite(q) & np.isfinite(v)
+    good[1:] &= np.diff(t) > 0.0
+    if good.sum() < 50:
+        return 1.0, ""
+    t, q, v = t[good], q[good], v[good]
+    # Means over a few rows: differences of single ones are mostly noise.
+    n = max(len(t) // 2000, 5)
+    mean = np.cumsum(v)[n:] - np.cumsum(v)[:-n]
+    rate, mean = (q[n:] - q[:-n]) / (t[n:] - t[:-n]), mean / n
+    if not rate.std() > 0.0 or not mean.std() > 0.0:
+        return 1.0, ""
+    if abs(np.corrcoef(rate, mean)[0, 1]) < 0.7:
+        return 1.0, ""
+    ratio = float(np.sign(np.sum(rate * mean)) * rate.std() / mean.std())
+    for unit, factor in _RATES:
+        if abs(abs(ratio) / factor - 1.0) < 0.1:
+            if ratio < 0.0:
+                return -factor, "of the other sign than the position's derivative"
+            return factor, f"in {unit}, against the position's derivative"
+    return 1.0, ""

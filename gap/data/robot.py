@@ -1,0 +1,254 @@
+"""A robot's own file, and the scene and sidecars that a log of it would need."""
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex
+
+from makebreak.gap.data.csv_table import text_columns
+from makebreak.gap.data.proposal import (
+    JointName,
+    Match,
+    of_one_drive,
+    propose,
+    sidecar_text,
+)
+from makebreak.gap.table import Table, read_table, stem_of, suffix_of
+from makebreak.models.effects.kind import actuator_of, one_dof_joints
+
+ROBOTS = (".urdf", ".sdf", ".xml")
+GUESSED_KP = 10.0  # [N m/rad], where the log does not tell.
+SERVO_DAMPING_SEC = 0.07  # Of kd to kp, of a small geared servo's back-EMF.
+LEAST_LOAD = 0.05  # Of a joint's rms gravity torque [N m], to tell its servo by.
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """joints: in the order of the robot's coordinates. bases: bodies that nothing
+    holds. plant: finalized, with the bases welded to the world."""
+
+    path: Path
+    model: str
+    joints: tuple[JointName, ...]
+    bases: tuple[str, ...]
+    effort_limits: dict[str, float]
+    plant: MultibodyPlant
+
+
+def is_robot(path: Path) -> bool:
+    return path.suffix.lower() in ROBOTS
+
+
+def read_robot(path: Path) -> Robot:
+    """Raises: ValueError, one line, for a file that holds no one robot."""
+    floating = _load(path)
+    bases = tuple(floating.get_body(i).name() for i in floating.GetFloatingBaseBodies())
+    plant = _load(path, bases)
+    model = re.sub(r"\W", "_", plant.GetModelInstanceName(_instance(plant)))
+    joints, limits = [], {}
+    for joint in sorted(one_dof_joints(plant), key=lambda j: j.position_start()):
+        name = f"{model}.{joint.name()}"
+        joints.append(
+            JointName(
+                name,
+                joint.type_name() == "prismatic",
+                float(joint.position_lower_limits()[0]),
+                float(joint.position_upper_limits()[0]),
+            )
+        )
+        actuator = actuator_of(plant, joint)
+        limits[name] = np.inf if actuator is None else actuator.effort_limit()
+    if not joints:
+        raise ValueError(f"robot {path} has no joint that turns or slides")
+    return Robot(path, model, tuple(joints), bases, limits, plant)
+
+
+def _load(path: Path, welded: Sequence[str] = ()) -> MultibodyPlant:
+    if not path.is_file():
+        raise ValueError(f"robot {path} does not exist")
+    plant = MultibodyPlant(0.0)
+    try:
+        # Without a scene graph no mesh is looked for.
+        models = Parser(plant).AddModels(str(path.resolve()))
+        if len(models) != 1:
+            raise ValueError(f"it holds {len(models)} models, expected one")
+        for base in welded:
+            plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(base))
+        plant.Finalize()
+    except (RuntimeError, ValueError) as error:
+        why = " ".join(str(error).split())[:300]
+        raise ValueError(f"robot {path} cannot be read: {why}") from None
+    return plant
+
+
+def _instance(plant: MultibodyPlant):
+    return ModelInstanceIndex(plant.num_model_instances() - 1)  # World, default, it.
+
+
+# ----- A log, and what is proposed for it
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """A log as it is: the table of its numbers, and columns of text."""
+
+    path: Path
+    table: Table
+    text: tuple[str, ...]
+
+
+def read_log(path: Path) -> Log:
+    """Raises: ValueError, one line, for a file that cannot be read."""
+    text: tuple[str, ...] = ()
+    if suffix_of(path) in (".csv", ".csv.gz") and path.is_file():
+        text = text_columns(path)
+    return Log(path, read_table(path, unused=frozenset(text)), text)
+
+
+def matches_of(log: Log, robot: Robot | None) -> list[Match]:
+    joints = robot.joints if robot is not None else ()
+    return propose(log.table.columns, joints, log.text)
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A scene and a sidecar for each log, as texts. notes: what was guessed."""
+
+    scene: str
+    sidecars: dict[Path, str]
+    notes: tuple[str, ...]
+
+
+def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
+    """Base welded, columns matched by name, actuation by the commands there are.
+
+    Raises: ValueError where no joint's position or no time is found.
+    """
+    every = {log.path: of_one_drive(matches_of(log, robot)) for log in logs}
+    kinds: dict[str, list[str]] = {}
+    for path, matches in every.items():
+        channels = {m.channel for m in matches if m.channel}
+        if "time" not in channels:
+            raise ValueError(
+                f"recording {path}: no column looks like a time; name it in "
+                f"{stem_of(path)}.yaml: columns: {{NAME: time}}"
+            )
+        if not any(c.endswith(".position") for c in channels):
+            shown = ", ".join(m.column for m in matches[:8])
+            names = ", ".join(j.name.split(".", 1)[1] for j in robot.joints)
+            raise ValueError(
+                f"recording {path}: no column looks like the position of a joint of "
+                f"{robot.path.name} ({names}), it has {shown}; write it in a sidecar"
+            )
+        for channel in sorted(channels):
+            at, _, what = channel.rpartition(".")
+            if at and at not in kinds.setdefault(what, []):
+                kinds[what].append(at)
+    notes: list[str] = []
+    lines = [
+        "# A proposal, to be corrected. docs/station.md, docs/recordings.md",
+        "directives:",
+        f"- add_model: {{name: {robot.model}, file: {json.dumps(_file(robot))}}}",
+    ]
+    for base in robot.bases:
+        lines.append(
+            f"- add_weld: {{parent: world, child: {robot.model}::{base}}}"
+            "  # It stands upright on the world's origin."
+        )
+        notes.append(f"{base} is welded to the world, upright")
+    lines += [
+        "plant: {time_step: 0.001}",
+        *_actuation(robot, kinds, every, logs, notes),
+    ]
+    sidecars = {path: sidecar_text(matches) for path, matches in every.items()}
+    return Proposal("\n".join(lines) + "\n", sidecars, tuple(notes))
+
+
+def _file(robot: Robot) -> str:
+    return f"file://{robot.path.resolve()}"
+
+
+def _actuation(robot: Robot, kinds, every, logs, notes: list[str]) -> list[str]:
+    def named(what: str) -> list[str]:
+        return [j.name for j in robot.joints if j.name in kinds.get(what, ())]
+
+    for what in ("effort_command", "effort_measured"):
+        if joints := named(what):
+            notes.append(f"joints are driven by what {what} says")
+            return [f"actuation: {{type: effort, joints: [{', '.join(joints)}]}}"]
+    if joints := named("position_command"):
+        stiff = _stiffness(robot, every, logs)
+        known = [k for k in stiff.values() if k > 0.0]
+        guess = float(np.median(known)) if known else GUESSED_KP
+        kp = [float(f"{stiff.get(j, 0.0) or guess:.3g}") for j in joints]
+        told = "from how far joints sag below their commands" if known else "a guess"
+        notes.append(f"drives are position servos of kp {kp} N m/rad ({told})")
+        lines = [
+            "actuation:",
+            "  type: servo  # Gains are guessed: correct them.",
+            f"  joints: [{', '.join(joints)}]",
+            f"  kp: {kp}  # [N m/rad], {told}.",
+            f"  kd: {[float(f'{SERVO_DAMPING_SEC * k:.3g}') for k in kp]}"
+            "  # [N m s/rad], a guess.",
+        ]
+        limits = [robot.effort_limits.get(j, np.inf) for j in joints]
+        if all(0.0 < limit < 1e6 for limit in limits):
+            lines.append(f"  limit: {[float(x) for x in limits]}  # [N m]")
+        return lines
+    if joints := named("velocity_command"):
+        notes.append("drives follow velocities, with a gain that is a guess")
+        return [
+            "actuation:",
+            "  type: velocity  # The gain is guessed: correct it.",
+            f"  joints: [{', '.join(joints)}]",
+            f"  kd: {[GUESSED_KP] * len(joints)}  # [N m s/rad]",
+        ]
+    notes.append("no command was found: nothing drives the joints")
+    return ["actuation: {type: none}"]
+
+
+def _stiffness(robot: Robot, every, logs) -> dict[str, float]:
+    """Of a position servo [N m/rad]: gravity's torque over how far a joint is from its
+    command, by least squares; 0 where gravity hardly loads it."""
+    plant = robot.plant
+    context = plant.CreateDefaultContext()
+    up: dict[str, list] = {}
+    for log in logs:
+        scaled = {
+            m.channel: m.scale * log.table.columns[m.column] + m.offset
+            for m in every[log.path]
+            if m.channel
+        }
+        names = [f"{j.name}.position" for j in robot.joints]
+        if not all(name in scaled for name in names):
+            continue
+        q = np.stack([scaled[name] for name in names], axis=1)
+        good = np.flatnonzero(np.isfinite(q).all(axis=1))
+        good = good[:: max(len(good) // 400, 1)]
+        torque = np.empty((len(good), len(names)))
+        for k, row in enumerate(good):
+            plant.SetPositions(context, q[row])
+            torque[k] = -plant.CalcGravityGeneralizedForces(context)
+        for i, joint in enumerate(robot.joints):
+            command = scaled.get(f"{joint.name}.position_command")
+            if command is not None:
+                # A command may be on rows of its own.
+                there = np.isfinite(command)
+                if there.any():
+                    held = np.interp(good, np.flatnonzero(there), command[there])
+                    up.setdefault(joint.name, []).append(
+                        (torque[:, i], held - q[good, i])
+                    )
+    out = {}
+    for name, parts in up.items():
+        load, off = (np.concatenate(x) for x in zip(*parts, strict=True))
+        kp = float(load @ off / (off @ off)) if off.any() else 0.0
+        loaded = float(np.sqrt(np.mean(load**2))) > LEAST_LOAD
+        out[name] = kp if kp > 0.0 and loaded else 0.0
+    return out

@@ -1,0 +1,80 @@
+"""`makebreak inspect`: what a log holds, and what its columns may be."""
+
+from pathlib import Path
+
+import numpy as np
+
+from makebreak.gap.data.proposal import Match, sidecar_text
+from makebreak.gap.data.robot import Log, Robot, matches_of, read_log, read_robot
+from makebreak.gap.table import stem_of
+from makebreak.scripts.outputs import OutputFolder
+from makebreak.scripts.table import Table
+
+
+def inspect_table(log: Log, robot: Robot | None) -> tuple[Table, list[Match]]:
+    """One row a column: samples, rate, holes, range, and what it may be."""
+    matches = matches_of(log, robot)
+    columns, found = log.table.columns, {m.column: m for m in matches}
+    time = next((m for m in matches if m.channel == "time"), None)
+    t = None if time is None else time.scale * columns[time.column] + time.offset
+    rows: list[tuple] = []
+    for name in (*columns, *log.text):
+        match = found[name]
+        target = match.channel or "-"
+        if match.scale != 1.0:
+            target += f" x {match.scale:.6g}"
+        if name in log.text:
+            rows.append((name, "text", "", "", "", "", "", target, match.why))
+            continue
+        y = columns[name]
+        there = np.isfinite(y)
+        rate = hole = repeats = np.nan
+        if there.sum() > 1:
+            repeats = float(np.mean(np.diff(y[there]) == 0.0))
+            if t is not None:
+                steps = np.diff(t[there])
+                steps = steps[np.isfinite(steps) & (steps > 0.0)]
+                if len(steps):
+                    rate, hole = 1.0 / float(np.median(steps)), float(steps.max())
+        low, high = (
+            (float(np.nanmin(y)), float(np.nanmax(y))) if there.any() else (np.nan,) * 2
+        )
+        rows.append(
+            (name, int(there.sum()), _short(rate), _short(hole), _short(low),
+             _short(high), "" if np.isnan(repeats) else f"{repeats:.0%}", target,
+             match.why)
+        )  # fmt: skip
+    heads = ("column", "samples", "rate [Hz]", "longest hole [s]", "least", "most",
+             "repeats", "may be", "because")  # fmt: skip
+    title = f"{log.path}: {log.table.n_rows} rows"
+    notes = []
+    if t is not None and np.isfinite(t).any():
+        title += f", {np.nanmax(t) - np.nanmin(t):.4g} s"
+    else:
+        notes.append("no column looks like a time")
+    if robot is None:
+        notes.append("with --robot ROBOT.urdf columns are matched to its joints")
+    return Table(title, heads, rows, notes=notes), matches
+
+
+def _short(value: float) -> str:
+    return "" if np.isnan(value) else f"{value:.4g}"
+
+
+def run_inspect(
+    path: Path, robot_path: Path | None, out: Path | None
+) -> tuple[Table, str, list[Path]]:
+    """The table, the drafted sidecar and the files written, if any were asked for.
+
+    Raises: ValueError, one line, for a log or a robot that cannot be read.
+    """
+    robot = None if robot_path is None else read_robot(robot_path)
+    log = read_log(path)
+    table, matches = inspect_table(log, robot)
+    text = sidecar_text(matches)
+    if out is None:
+        return table, text, []
+    inputs = [path] + ([] if robot_path is None else [robot_path])
+    with OutputFolder(out, "inspect", inputs) as folder:
+        folder.file(f"{stem_of(path)}.yaml").write_text(text)
+        return table, text, folder.commit()

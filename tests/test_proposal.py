@@ -1,0 +1,191 @@
+"""A robot's file and a log with foreign names: what is proposed, and that it runs."""
+
+import json
+
+import numpy as np
+import pytest
+from gap_benchmark.cases import cases, make
+
+from makebreak.gap.data.proposal import JointName, of_one_drive, propose
+from makebreak.gap.data.robot import propose_scene, read_log, read_robot
+from makebreak.gap.recording import read_recording
+from makebreak.scripts.cli import main
+
+T = np.arange(400) * 0.01
+PANDA = [JointName(f"panda.panda_joint{k}", lower=-2.9, upper=2.9) for k in range(1, 8)]
+NAMED = [JointName(f"so.{n}", lower=-2.0, upper=2.0)
+         for n in ("shoulder_pan", "elbow_flex", "wrist_roll")]  # fmt: skip
+
+
+def sines(names, size=1.0):
+    return {n: size * np.sin(3.0 * T + k) for k, n in enumerate(names)}
+
+
+def channels(columns, joints, text=()):
+    return {m.column: m.channel for m in propose(columns, joints, text)}
+
+
+@pytest.mark.parametrize(
+    "names, expected",
+    [
+        (["q1", "dq1", "tau1", "q_d_1"],
+         ["1.position", "1.velocity", "1.effort_measured", "1.position_command"]),
+        (["actual_q_0", "actual_qd_0", "target_moment_0", "actual_current_0"],
+         ["1.position", "1.velocity", "1.effort_command", None]),
+        (["O_F_1", "panda_joint1_temperature", "ddq1", "error_1"], [None] * 4),
+        (["/joint_states/panda_joint1/position", "/joint_states/panda_joint1/effort",
+          "/arm_controller/commands/data[0]"],
+         ["1.position", "1.effort_measured", "1.position_command"]),
+        (["observation.state.panda_joint7.pos", "action.panda_joint7.pos"],
+         ["7.position", "7.position_command"]),
+        (["jointAngle[0]", "jointVelocity[6]", "commandedTorque[3]"],
+         ["1.position", "7.velocity", "4.effort_command"]),
+    ],
+    ids=["papers", "industrial", "others", "ros", "lerobot", "camel"],
+)  # fmt: skip
+def test_columns_are_matched_by_their_names(names, expected):
+    columns = {"time": T} | sines(names)
+    found = channels(columns, PANDA)
+    assert found["time"] == "time"
+    for name, channel in zip(names, expected, strict=True):
+        assert found[name] == (channel and f"panda.panda_joint{channel}"), name
+
+
+def test_numbers_count_from_zero_where_any_group_does():
+    found = channels(sines([f"q{k}" for k in range(7)]), PANDA)
+    assert found["q0"].startswith("panda.panda_joint1.")
+    assert found["q6"].startswith("panda.panda_joint7.")
+
+
+def test_joints_are_found_by_name_and_commands_without_a_quantity():
+    columns = {"t": T} | sines(
+        ["shoulder_pan_goal", "shoulderPan_pos", "wrist_roll_vel", "gripper_pos"]
+    )
+    found = channels(columns, NAMED)
+    assert found["shoulder_pan_goal"] == "so.shoulder_pan.position_command"
+    assert found["shoulderPan_pos"] == "so.shoulder_pan.position"
+    assert found["wrist_roll_vel"] == "so.wrist_roll.velocity"
+    assert found["gripper_pos"] is None
+
+
+def test_qd_is_a_speed_or_a_command_by_what_it_goes_with():
+    q = np.sin(3.0 * T)
+    joint = [JointName("a.j")]
+    columns = {"t": T, "q1": q, "qd1": 3.0 * np.cos(3.0 * T)}
+    assert channels(columns, joint)["qd1"] == "a.j.velocity"
+    columns["qd1"] = q + 0.01 * np.sin(20.0 * T)
+    assert channels(columns, joint)["qd1"] == "a.j.position_command"
+
+
+@pytest.mark.parametrize("time_scale, unit", [(1.0, "s"), (1e3, "ms"), (1e9, "ns")])
+def test_units_are_told_by_size_and_by_the_derivative(time_scale, unit):
+    q = 1.5 * np.sin(3.0 * T)
+    v = 4.5 * np.cos(3.0 * T)
+    columns = {
+        "timestamp": time_scale * T,
+        "q1": np.degrees(q),
+        "dq1": np.degrees(v),
+        "q2": q,
+        "dq2": v * 30.0 / np.pi,  # rpm
+        "q3": q,
+        "dq3": -v,
+    }
+    matches = {m.column: m for m in propose(columns, PANDA)}
+    assert matches["timestamp"].scale == pytest.approx(1.0 / time_scale)
+    # All of one name are in one unit: q2 and q3 would be 1.5 degrees.
+    assert matches["q1"].scale == pytest.approx(np.pi / 180.0)
+    assert matches["dq1"].scale == pytest.approx(np.pi / 180.0)
+    columns = {k: columns[k] for k in ("timestamp", "q2", "dq2", "q3", "dq3")}
+    matches = {m.column: m for m in propose(columns, PANDA)}
+    assert matches["q2"].scale == 1.0
+    assert matches["dq2"].scale == pytest.approx(np.pi / 30.0)
+    assert matches["dq3"].scale == -1.0 and "other sign" in matches["dq3"].why
+
+
+def test_there_is_one_drive():
+    columns = {"t": T} | sines(["q1", "tau1", "tau_cmd1", "q1_cmd", "dq1_cmd"])
+    kept = {m.column: m.channel for m in of_one_drive(propose(columns, PANDA))}
+    assert kept["tau_cmd1"].endswith("effort_command")
+    assert kept["q1_cmd"] is None and kept["dq1_cmd"] is None
+    assert kept["tau1"].endswith("effort_measured")
+
+
+@pytest.fixture(scope="module")
+def robot_and_log(tmp_path_factory):
+    """The benchmark's pendulum with a gain error, as a stranger would log it."""
+    folder = tmp_path_factory.mktemp("stranger")
+    (case,) = [c for c in cases("development") if c.name == "28_pendulum_actuator_gain"]
+    made = make(case)
+    ((file, text),) = made.models.items()
+    (folder / file).write_text(text)
+    joints = list(
+        dict.fromkeys(c.rsplit(".", 1)[0] for c in made.columns if ".position" in c)
+    )
+    table = made.columns
+    rows = {"Time [ms]": 1e3 * table["time"], "Episode": table["episode"]}
+    for k, joint in enumerate(joints):
+        rows[f"Angle {k + 1} [deg]"] = np.degrees(table[f"{joint}.position"])
+        command = f"{joint}.effort_command"
+        if command in table:
+            rows[f"Torque command {k + 1} [Nm]"] = table[command]
+    lines = [";".join(rows)]
+    for cells in zip(*rows.values(), strict=True):
+        words = ("" if np.isnan(c) else f"{c:.10g}".replace(".", ",") for c in cells)
+        lines.append(";".join(words))
+    (folder / "log.csv").write_text("\n".join(lines))
+    return folder, folder / file, folder / "log.csv", table, joints
+
+
+def test_what_is_proposed_for_a_stranger_is_read_as_it_was(robot_and_log, tmp_path):
+    _, robot, log, table, joints = robot_and_log
+    proposal = propose_scene(read_robot(robot), [read_log(log)])
+    (sidecar,) = proposal.sidecars.values()
+    (tmp_path / "log.yaml").write_text(sidecar)
+    recording = read_recording(log, sidecar_path=tmp_path / "log.yaml")
+    for joint in joints:
+        np.testing.assert_allclose(
+            recording[f"{joint}.position"], table[f"{joint}.position"], atol=1e-9
+        )
+    assert {e.number for e in recording.episodes} == set(table["episode"])
+    assert "type: effort" in proposal.scene
+
+
+def test_inspect_prints_and_writes_only_where_asked(robot_and_log, tmp_path, capsys):
+    folder, robot, log, _, _ = robot_and_log
+    before = sorted(folder.iterdir())
+    assert main(["inspect", str(log), "--robot", str(robot)]) == 0
+    out = capsys.readouterr().out
+    assert "Angle 1 [deg]" in out and "scale: 0.01745" in out
+    assert sorted(folder.iterdir()) == before
+    assert main(["inspect", str(log), "--out", str(tmp_path / "o")]) == 0
+    assert "columns:" in (tmp_path / "o" / "log.yaml").read_text()
+
+
+@pytest.mark.slow
+def test_gap_runs_on_a_robot_and_a_strangers_log(robot_and_log, tmp_path):
+    folder, robot, log, _, _ = robot_and_log
+    before = sorted(folder.iterdir())
+    out = tmp_path / "out"
+    assert main(["gap", str(robot), str(log), "--out", str(out), "--jobs", "1"]) == 0
+    result = json.loads((out / "result.json").read_text())
+    assert [e["kind"] for e in result["effects"]] == ["actuator_gain"]
+    assert (out / "proposed_scene.yaml").is_file() and (out / "log.yaml").is_file()
+    assert sorted(folder.iterdir()) == before
+
+
+def test_a_log_or_a_robot_that_tells_nothing_is_refused(
+    robot_and_log, tmp_path, capsys
+):
+    _, robot, _, _, _ = robot_and_log
+    log = tmp_path / "a.csv"
+    rows = "\n".join(f"{k * 0.01},{k}" for k in range(50))
+    for header, message in (
+        ("x,y", "no column looks like a time"),
+        ("t,y", "no column looks like the position of a joint"),
+    ):
+        log.write_text(f"{header}\n{rows}\n")
+        assert main(["gap", str(robot), str(log), "--out", str(tmp_path / "o")]) == 2
+        assert message in capsys.readouterr().err
+    (tmp_path / "bad.urdf").write_text("<robot")
+    assert main(["inspect", str(log), "--robot", str(tmp_path / "bad.urdf")]) == 2
+    assert "cannot be read" in capsys.readouterr().err
