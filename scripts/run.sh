@@ -8,7 +8,8 @@ here="$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")"
 "$here/setup.sh"
 
 case "${1:-}" in
-    list | run | reproduce | gap | close-the-loop | export-tests | compile | bench) ;;
+    list | run | reproduce | sweep | gap | close-the-loop | export-tests | compile | \
+        bench) ;;
     --version | --help | -h) ;;
     *) set -- run "$@" ;;
 esac

@@ -346,7 +346,7 @@ def test_gap_ends_at_once_when_it_is_told_to(real_gap, number):
     process = start(*real_gap, "--out", "g1")
     assert process.stderr is not None
     seen = ""
-    while "screening" not in seen:  # It is at work.
+    while "the catalogue" not in seen:  # It is at work.
         seen += process.stderr.read(1)
         assert process.poll() is None, seen
     process.send_signal(number)

@@ -231,6 +231,7 @@ def test_without_rights_one_command_is_named(checkout):
         (["bench", "c3"], ["bench", "c3"]),
         (["close-the-loop"], ["close-the-loop"]),
         (["compile"], ["compile"]),
+        (["sweep", "x"], ["sweep", "x"]),
         (["--version"], ["--version"]),
         (["run", "ball_rolling"], ["run", "ball_rolling"]),
     ],
