@@ -128,9 +128,25 @@ class BallRollingConfig:
     impedance: ImpedanceConfig = field(default_factory=ImpedanceConfig)
 
 
+def check_parts(scene: Scene, what: str) -> None:
+    """Raises: ValueError for a scene without the arm, its finger, a table or a ball."""
+    there = [d.add_model.name for d in scene.directives if d.add_model is not None]
+    lacks = [name for name in (ARM, TOOL, "table", "ball") if name not in there]
+    if not lacks and "ball.ball" in scene.initial.poses:
+        return
+    missing = (
+        f"no model {', '.join(lacks)}" if lacks else "no initial pose of ball.ball"
+    )
+    raise ValueError(
+        f"{what}: the scene has {missing} (it has {', '.join(there) or 'no models'}); "
+        f"expected one with {ARM}, {TOOL}, table and ball, as ball_rolling.scene.yaml"
+    )
+
+
 def world_scene(config: BallRollingConfig) -> Scene:
     """The scene that is simulated: friction, resistance, where the ball lies."""
     scene = read_scene(config.world)
+    check_parts(scene, "world")
     angle = config.start_angle_rad
     if angle is None:
         angle = np.random.default_rng(config.seed).uniform(-np.pi, np.pi)
@@ -165,6 +181,7 @@ def world_scene(config: BallRollingConfig) -> Scene:
 def believed(config: BallRollingConfig) -> tuple[TipAndBall, Scene]:
     """What the controllers believe: tip and ball, and the model's scene."""
     scene = read_scene(config.model)
+    check_parts(scene, "model")
     if config.radius_error_m != 0.0:
         loaded = load_scene(scene, DiagramBuilder())
         right = sphere_radius(loaded.plant, loaded.scene_graph, "ball")

@@ -20,6 +20,7 @@ from makebreak.diagrams.ball_rolling import (
 )
 from makebreak.diagrams.camera import CameraConfig
 from makebreak.diagrams.scene_facts import sphere_radius
+from makebreak.diagrams.station import MODELS
 from makebreak.models.scene import load_scene
 from makebreak.scripts.cli import main
 from makebreak.scripts.experiments import ball_rolling as experiment
@@ -640,3 +641,11 @@ def test_adaptation_finds_the_ball_and_rolls_it_and_without_it_nothing_rolls(tmp
     assert adapted["circles_completed"] > 0.5
     assert abs(adapted["r_gap_error_m"] or 0.0) <= 0.003
     assert not frozen["initiated"]
+
+
+@pytest.mark.parametrize("read", [world_scene, believed])
+def test_a_scene_without_arm_or_ball_is_refused_by_what_it_lacks(read):
+    other = str(MODELS / "cartpole_walls.scene.yaml")
+    wrong = BallRollingConfig(world=other, model=other)
+    with pytest.raises(ValueError, match="no model panda, finger, table, ball"):
+        read(wrong)
