@@ -581,9 +581,9 @@ class SceneSimulation:
             for a in actuators_of_model(self._plant, model)
         ]
         effort = path.effort.Eval(own)[names.index(name)]
-        if effect.kind == "joint_elasticity":
-            return effort / effect.parameters["stiffness"]
-        return np.sign(effort) * effect.parameters["gap"] / 2.0
+        rest_twist = KINDS[effect.kind].rest_twist
+        assert rest_twist is not None
+        return rest_twist(effect, float(effort))
 
     def _simulate(
         self, initial, start: float, needed: np.ndarray, is_true: bool,

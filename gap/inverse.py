@@ -712,7 +712,7 @@ def _lag(effects: Sequence[Effect], channel: str) -> float:
     return sum(
         effect.parameters["time_constant"]
         for effect in effects
-        if effect.kind == "sensor_lag" and acts_on(effect, "lag", channel)
+        if KINDS[effect.kind].channel == "lag" and acts_on(effect, "lag", channel)
     )
 
 

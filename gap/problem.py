@@ -126,10 +126,7 @@ def is_sane(effect: Effect, least: Mapping[str, float] | None = None) -> bool:
         width = each.high - each.low
         if not each.low - 0.01 * width <= value <= each.high + 0.01 * width:
             return False
-    return not (
-        effect.kind == "joint_stribeck_friction"
-        and effect.parameters["static"] < effect.parameters["coulomb"]
-    )
+    return entry.plausible is None or entry.plausible(effect)
 
 
 @dataclass(frozen=True, eq=False)

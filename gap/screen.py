@@ -18,22 +18,12 @@ from makebreak.systems.numerics.selection import LinearFit, Screen
 # How well links are known where the scene does not say [-], [m].
 LINK_MASS, LINK_COM = 0.03, 0.002
 REACH = 3.0  # Tolerances: beyond them a link is not known too little but wrong.
-# Kinds that are other kinds with more parameters: accepted only for a clear gain.
-NESTED = {
-    "joint_stribeck_friction": ("joint_coulomb_friction", "joint_viscous_damping"),
-    "joint_direction_friction": ("joint_coulomb_friction", "actuator_bias"),
-    "joint_load_friction": ("joint_coulomb_friction",),
-    "joint_spring": ("actuator_bias",),
-    "sinusoidal_force": ("constant_force",),
-}
 _DELAYS = (0.004, 0.01, 0.02, 0.04)
 _ELASTIC = ("joint_elasticity", "joint_backlash")
 _DRIVEN = ("actuator_saturation", *_ELASTIC)
 # Of links: link_mass and link_com say it as a difference.
 _HIDDEN = ("object_mass", "object_com", "object_inertia")
-_SPEEDS = (0.03, 0.06, 0.1, 0.2)
 WAVES = 12  # Frequencies of a force that are tried on every link.
-_RIPPLES = tuple(float(n) for n in range(2, 25)) + (30.0, 36.0, 48.0, 60.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,28 +211,12 @@ def _one_of(reader: Callable, k: int) -> Callable:
 
 
 def _grids(model: InverseModel, kind: str, at: str, motions) -> list:
-    grid = _grid(model, kind, at, motions)
-    if grid is None:
+    tries = KINDS[kind].tries
+    if tries is None:
         return [None]
+    grid = tries(Effect(kind, [at], {}), model.dynamics.plant, motions)
     ((name, values),) = grid.items()
     return [{name: [value]} for value in values]
-
-
-def _grid(model: InverseModel, kind: str, at: str, motions):
-    if kind == "joint_stribeck_friction":
-        return {"stribeck_velocity": _SPEEDS}
-    if kind == "torque_ripple":
-        return {"periods_per_rev": _RIPPLES}
-    if kind == "actuator_saturation":
-        i = model.joints.index(at)
-        u = np.concatenate([np.abs(m.effort[:, i]) for m in motions])
-        # A controller that loses its joint asks for far more than the limit: so by how
-        # often it is exceeded as well.
-        often = np.quantile(u, np.linspace(0.3, 0.98, 14))
-        return {"limit": [*(np.linspace(0.4, 0.97, 15) * u.max()), *often]}
-    if kind == "sinusoidal_force":
-        return {"frequency": list(np.arange(0.4, 5.01, 0.03))}
-    return None
 
 
 def _of_delays(model: InverseModel, kind: str) -> list[Candidate]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from makebreak.gap.fit import derivative_free_search, fit_effects
 from makebreak.gap.problem import Candidate, Fitted, GapProblem, Nuisances
-from makebreak.gap.screen import NESTED, Ranked, rank
+from makebreak.gap.screen import Ranked, rank
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.systems.numerics.selection import (
@@ -293,7 +293,7 @@ class _Search:
                     pick, fit, best = k, other, r
         # A model inside a bigger one stays unless the bigger gains clearly.
         for k, (inner, r) in enumerate(sound):
-            inside = r.candidate.kind in NESTED.get(best.candidate.kind, ())
+            inside = r.candidate.kind in KINDS[best.candidate.kind].contains
             near = self._error(inner.score) <= (1.0 + NESTED_GAIN) * self._error(
                 fit.score
             )
@@ -373,7 +373,7 @@ class _Search:
         for f, r in others:
             if r.candidate.members:
                 continue
-            if best.candidate.kind in NESTED.get(r.candidate.kind, ()):
+            if best.candidate.kind in KINDS[r.candidate.kind].contains:
                 continue
             if r.candidate.size > best.candidate.size + MORE or not _is_used(f):
                 continue

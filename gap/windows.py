@@ -15,6 +15,7 @@ from makebreak.diagrams.scene_simulation import Commands, SceneSimulation
 from makebreak.gap.inverse import _lag, _sensing
 from makebreak.gap.recording import Episode, Recording
 from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import InitialSection, Scene, initial_for
 from makebreak.models.scene_schema import COMMANDS_OF
@@ -385,9 +386,7 @@ class WindowModel(WindowedResidual):
             dict(said.poses), dict(said.body_velocities),
         )  # fmt: skip
         path = self._paths[w.recording, episode.first]
-        measured = [
-            e for e in (*self.scene.effects, *effects) if e.kind in _MEASUREMENT
-        ]
+        measured = [e for e in (*self.scene.effects, *effects) if KINDS[e.kind].channel]
 
         def state(name: str) -> np.ndarray:
             scale, late, bias = _sensing(measured, name)
@@ -464,10 +463,6 @@ class WindowModel(WindowedResidual):
             e = (seen_in(self, w) - y) / size if len(y) else y
             out.append(np.where(np.isnan(e), 0.0, e))
         return out
-
-
-_MEASUREMENT = ("joint_offset", "sensor_delay", "sensor_lag", "clock_skew",
-                "sensor_bias", "length_scale")  # fmt: skip
 
 
 def with_step(scene: Scene, time_step: float) -> Scene:

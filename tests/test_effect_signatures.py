@@ -528,6 +528,8 @@ def test_every_kind_is_complete(name):
             assert p.low >= 0.0, p.name
     assert kind.confused_with and kind.tell_apart
     assert set(kind.confused_with) <= set(KINDS)
+    assert set(kind.contains) <= set(KINDS)
+    assert (kind.rest_twist is not None) == kind.hidden_state
 
 
 @pytest.mark.parametrize(

@@ -59,6 +59,15 @@ def _saturation_signature(effect, model, motion, grid=None) -> list[Signature]:
     ]
 
 
+def _limits_to_try(effect, plant, motions) -> dict[str, list[float]]:
+    """Shares of the greatest effort; and as a controller that loses its joint asks for
+    far more than the limit, by how often it is exceeded as well."""
+    i = find_joints(effect, plant)[0].velocity_start()
+    u = np.concatenate([np.abs(m.effort[:, i]) for m in motions])
+    often = np.quantile(u, np.linspace(0.3, 0.98, 14))
+    return {"limit": [*(np.linspace(0.4, 0.97, 15) * u.max()), *often]}
+
+
 def _shifted(effect, model, motion, name, values, late) -> list[Signature]:
     """For each value: (u - late(u, value)) / value, the coefficient is the value."""
     found = []
@@ -134,6 +143,7 @@ KINDS = {
         parameters=(Parameter("limit", "N m", 0.05, 200.0, None, valid="> 0"),),
         says="{at} gives no more than {limit}",
         confused_with=("actuator_gain", "input_delay"),
+        tries=_limits_to_try,
         tell_apart="command less than the limit, and slowly more",
         path="saturation",
         now=lambda effect, plant, scene_graph: {"limit": 1e30},

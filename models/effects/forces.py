@@ -109,6 +109,8 @@ def _drag_signature(effect, model, motion, grid=None) -> list[Signature]:
     return [without_momentum(effect, ["linear", "angular"], columns)]
 
 
+TRIED_FREQUENCIES = list(np.arange(0.4, 5.01, 0.03))  # [Hz]
+
 KINDS = {
     "constant_force": EffectKind(
         at="body",
@@ -132,6 +134,8 @@ KINDS = {
         says="a force of amplitude ({fx}, {fy}, {fz}) shakes {at} at {frequency} "
         "(phase {phase} at time 0), which the model lacks",
         confused_with=("torque_ripple",),
+        contains=("constant_force",),
+        tries=lambda effect, plant, motions: {"frequency": TRIED_FREQUENCIES},
         tell_apart="start the same motion at another time: the force stays with the "
         "clock, a ripple with the position",
         body_law=sinusoidal_law,

@@ -201,6 +201,8 @@ def spring_law(q, v, t, p):
 # ----- How they show: the residual is minus the effect's force.
 
 STRIBECK_VELOCITIES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)  # [rad/s]
+TRIED_SPEEDS = (0.03, 0.06, 0.1, 0.2)
+TRIED_PERIODS = tuple(float(n) for n in range(2, 25)) + (30.0, 36.0, 48.0, 60.0)
 PERIODS = (*range(1, 31), 36, 40, 48, 50, 60, 72, 80, 90, 100)
 
 
@@ -410,6 +412,7 @@ KINDS = {
             "joint_load_friction",
             "gravity_tilt",
         ),
+        contains=("joint_coulomb_friction", "actuator_bias"),
         tell_apart="let the joint rest: a bias goes on pulling, friction does not; and "
         "move it both ways with and without load",
         joint_law=direction_law,
@@ -426,6 +429,7 @@ KINDS = {
             "actuator_gain",
             "servo_gain",
         ),
+        contains=("joint_coulomb_friction",),
         tell_apart="move the joint both ways, at one speed, with and without a load",
         path="load friction",
         signature=_load_signature,
@@ -442,6 +446,9 @@ KINDS = {
         says="{at} has dry friction that the model lacks: {static} when it starts, "
         "{coulomb} well above {stribeck_velocity}",
         confused_with=("joint_coulomb_friction", "joint_viscous_damping"),
+        contains=("joint_coulomb_friction", "joint_viscous_damping"),
+        plausible=lambda e: e.parameters["static"] >= e.parameters["coulomb"],
+        tries=lambda effect, plant, motions: {"stribeck_velocity": TRIED_SPEEDS},
         tell_apart="reverse the joint slowly, below 0.1 rad/s, and fast as well",
         joint_law=stribeck_law,
         joint_numbers=_stribeck_numbers,
@@ -488,6 +495,7 @@ KINDS = {
         says="{at} has a torque ripple of {amplitude} with {periods_per_rev} (phase "
         "{phase}) that the model lacks",
         confused_with=("sinusoidal_force", "joint_spring"),
+        tries=lambda effect, plant, motions: {"periods_per_rev": TRIED_PERIODS},
         tell_apart="move through the same positions at two speeds: the frequency of a "
         "ripple goes with the speed",
         joint_law=ripple_law,
@@ -504,6 +512,7 @@ KINDS = {
         says="a spring or a cable of {stiffness} pulls {at} to {rest}, which the model "
         "lacks",
         confused_with=("torque_ripple", "gravity_tilt", "payload"),
+        contains=("actuator_bias",),
         tell_apart="move through the joint's whole range, in several poses of the "
         "other joints",
         joint_law=spring_law,

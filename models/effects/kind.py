@@ -107,6 +107,11 @@ class EffectKind:
     least(effect, plant, effects, damped): least values of parameters that a plant
         without the effect allows, where there are such; `effects`: those that it has,
         `damped`: {joint: what its drive damps it with [N m s/rad]}.
+    contains: kinds that are this one with fewer parameters: it is named only where it
+        gains clearly over them.
+    plausible(effect): whether its parameters go together in robots that people build.
+    tries(effect, plant, motions): {a nonlinear parameter: values that a search tries}.
+    rest_twist(effect, effort): how far a motor leads its joint at rest.
     now(effect, plant, scene_graph): the parameters at which `effect` (whose own do not
         matter) would leave the model as it is; None: the neutral values.
     signature: see models/effects/signature.py; None: it is seen in simulation alone.
@@ -141,6 +146,10 @@ class EffectKind:
         ]
         | None
     ) = None
+    contains: tuple[str, ...] = ()
+    plausible: Callable[[Effect], bool] | None = None
+    tries: Callable[..., Mapping[str, Sequence[float]]] | None = None
+    rest_twist: Callable[[Effect, float], float] | None = None
     joint_law: Callable | None = None
     joint_numbers: Callable[[Effect, MultibodyPlant, Joint], list[float]] | None = None
     body_law: Callable | None = None

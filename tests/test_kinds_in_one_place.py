@@ -1,0 +1,64 @@
+"""What an effect is stands in models/effects/, and nowhere else."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from makebreak.models.effects import KINDS
+
+ROOT = Path(__file__).resolve().parent.parent
+# Files of diagrams/ and gap/ that still know kinds by name, and which: what bodies in
+# contact are fitted with, the catalogue's screening, and scenes that experiments make.
+# The list may only get shorter.
+CONTACT = {
+    "body_drag", "constant_force", "contact_dissipation", "contact_friction",
+    "contact_stiffness", "corner_radius", "friction_patch", "length_scale",
+    "object_com", "object_inertia", "object_mass", "object_size", "plane_height",
+    "plane_tilt", "rolling_resistance",
+}  # fmt: skip
+SENSORS = {"clock_skew", "joint_offset", "sensor_bias", "sensor_delay", "sensor_lag"}
+KNOWN = {
+    "diagrams/ball_rolling.py": {
+        "contact_friction", "object_size", "rolling_resistance"
+    },
+    "diagrams/station.py": {"joint_viscous_damping"},
+    "diagrams/tabletop.py": {"contact_friction"},
+    "diagrams/free_body.py": CONTACT
+    | {"clock_skew", "gravity_tilt", "sensor_bias", "sensor_delay", "sinusoidal_force"},
+    "gap/check_relations.py": {"clock_skew"},
+    "gap/contact.py": CONTACT,
+    "gap/free_windows.py": {"length_scale"},
+    "gap/windows.py": {"length_scale"},
+    "gap/mechanism.py": {"object_com", "object_mass", "link_com", "link_mass"},
+    "gap/screen.py": SENSORS
+    | {
+        "actuator_lag", "actuator_saturation", "body_drag", "input_delay",
+        "joint_backlash", "joint_elasticity", "link_mass", "link_com", "object_com",
+        "object_inertia", "object_mass", "sinusoidal_force",
+    },
+    "gap/touch.py": {
+        "contact_stiffness", "joint_offset", "length_scale", "object_size",
+        "plane_height", "sensor_bias",
+    },
+}  # fmt: skip
+FILES = sorted(
+    str(path.relative_to(ROOT))
+    for room in ("diagrams", "gap")
+    for path in (ROOT / room).rglob("*.py")
+)
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_no_file_outside_the_catalogue_learns_a_kinds_name(file):
+    tree = ast.parse((ROOT / file).read_text())
+    names = {
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and str(node.value) in KINDS
+    }
+    assert names <= KNOWN.get(file, set())
+
+
+def test_the_list_of_those_that_do_names_files_that_are_there():
+    assert set(KNOWN) <= set(FILES)
