@@ -150,6 +150,8 @@ KINDS = {
         parameters=(Parameter("time_constant", "s", -0.05, 0.2),),
         says="{at} is low-passed, first order, with a time constant of {time_constant} "
         "beyond what is declared",
+        says_less="the filter of {at} has a time constant {time_constant} shorter than "
+        "is declared",
         confused_with=("sensor_delay",),
         tell_apart="move faster: near 1/(2 pi time constant) a low-pass makes swings "
         "smaller, a delay does not",
