@@ -44,6 +44,11 @@ def test_the_modes_are_told_apart_and_known_again():
     assert 0.0 < found < 1.0 and 2.0 < changed < 2.6 and 4.0 < back < 4.6
 
 
+def test_the_arm_moves_its_tip_as_told():
+    # Gravity is compensated, so a spring at rest is where it is told to be.
+    assert numbers("move_an_arm.py") == pytest.approx([50.0, 0.0, 0.0], abs=0.5)
+
+
 def test_importing_makebreak_loads_nothing_heavy():
     code = "import sys, makebreak; print(int('pydrake' in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
