@@ -9,14 +9,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
 
 from makebreak.gap.recording import Episode, Recording
 from makebreak.models.drives import law_of
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.actuation_path import OWN
-from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
-from makebreak.models.effects.measured_channels import acts_on
+from makebreak.models.effects.kind import (
+    Effect,
+    actuator_of,
+    full_name,
+    one_dof_joints,
+)
+from makebreak.models.effects.measured_channels import acts_on, is_link_side
 from makebreak.models.effects.signature import Motion, added_effort
 from makebreak.models.scene import Scene
 from makebreak.systems.numerics.filters import (
@@ -152,6 +158,11 @@ class InverseModel:
                 self.has["effort_measured"], self.commanded, strict=True
             )
         ]
+        # What turns the rotor is in no torque that is measured at the link.
+        self._link_rotor = np.array(
+            [rotor_before(scene, plant, joint) for joint in self.joints]
+        )
+        self._unseen_rotor = self._link_rotor * np.array(self.by_measured)
         self.tracks: list[Track] = []
         seconds = 0.0
         for recording in recordings:
@@ -288,6 +299,7 @@ class InverseModel:
             v[:, i] *= scale
             vd[:, i] *= scale**2
         effort = self._effort(track, effects[len(self._own) :], q, v)
+        effort += self._unseen_rotor * vd
         jerk = np.asarray(np.gradient(vd, t, axis=0))
         return Motion(t, q, v, vd, effort, jerk)
 
@@ -513,7 +525,9 @@ class InverseModel:
                     raise ValueError(f"{effect.kind} is seen in simulation alone")
                 needed = needed + add
             motion = replace(
-                motion, effort=self._effort(track, effects, motion.q, motion.v)
+                motion,
+                effort=self._effort(track, effects, motion.q, motion.v)
+                + self._unseen_rotor * motion.vd,
             )
             r = track.bumps.mean(motion.effort - needed)
             parts.append(
@@ -576,7 +590,7 @@ class InverseModel:
                 name = f"{joint}.effort_measured"
                 scale, late, bias = _sensing(effects, name)
                 stages = with_lag(track.stages[name], _lag(effects, name))
-                u = motion.effort[:, i]
+                u = motion.effort[:, i] - self._link_rotor[i] * motion.vd[:, i]
                 at = (track.time - late) / scale
                 u = filtered(stages, track.middle, u, np.minimum(at, track.middle[-1]))
                 out[name] = _masked(track, track.samples[name] - u - bias)
@@ -705,6 +719,16 @@ def _sensing(effects: Sequence[Effect], channel: str) -> tuple[float, float, flo
         scale += p.get("skew", 0.0)
         bias += p.get("bias", 0.0) + p.get("offset", 0.0)
     return scale, late, bias
+
+
+def rotor_before(scene: Scene, plant: MultibodyPlant, joint: str) -> float:
+    """Inertia [kg m2], at the joint, of a rotor before the sensor of effort, where the
+    scene's `channels` say that it measures on the link's side; else 0."""
+    if not is_link_side(scene.channels, f"{joint}.effort_measured"):
+        return 0.0
+    (own,) = [j for j in one_dof_joints(plant) if full_name(plant, j) == joint]
+    actuator = actuator_of(plant, own)
+    return 0.0 if actuator is None else float(actuator.default_reflected_inertia())
 
 
 def _lag(effects: Sequence[Effect], channel: str) -> float:

@@ -22,6 +22,7 @@ from makebreak.gap.table import (
     read_table,
     stem_of,
 )
+from makebreak.models.effects.measured_channels import torque_constant
 from makebreak.systems.numerics.filters import Stage
 from makebreak.systems.numerics.signal_noise import estimate_noise
 
@@ -752,6 +753,28 @@ def with_noise(recording: Recording) -> Recording:
         for name, c in recording.channels.items()
     }
     return replace(recording, channels=channels)
+
+
+def in_newton_metres(
+    recordings: Iterable[Recording], words: Mapping[str, str]
+) -> list[Recording]:
+    """Measured efforts that a scene's `channels` say to be currents, as torques."""
+    out = []
+    for recording in recordings:
+        channels = dict(recording.channels)
+        for name, channel in recording.channels.items():
+            factor = 1.0
+            if channel.quantity == "effort_measured":
+                factor = torque_constant(words, name)
+            if factor != 1.0:
+                values = factor * channel.values
+                values.setflags(write=False)
+                given = abs(factor) * channel.noise_given
+                channels[name] = replace(channel, values=values, noise_given=given)
+        changed = any(channels[n] is not c for n, c in recording.channels.items())
+        other = replace(recording, channels=channels)
+        out.append(with_noise(other) if changed else recording)
+    return out
 
 
 def part_of(recording: Recording, pieces: Sequence[Episode]) -> Recording:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from makebreak.diagrams.scene_simulation import Commands, SceneSimulation
-from makebreak.gap.inverse import _lag, _sensing
+from makebreak.gap.inverse import _lag, _sensing, rotor_before
 from makebreak.gap.recording import Episode, Recording
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
@@ -276,7 +276,7 @@ class WindowModel(WindowedResidual):
 
     def _all_commands(self) -> list[dict[int, Commands]]:
         out = []
-        for recording in self.recordings:
+        for i, recording in enumerate(self.recordings):
             names = [
                 c.name for c in recording.commands()
                 if c.name.rsplit(".", 1)[0] in self._driven(c.quantity)
@@ -294,6 +294,11 @@ class WindowModel(WindowedResidual):
                                 good = np.isfinite(y)
                                 middle = time + 0.5 * np.diff(time, append=time[-1])
                                 y = np.interp(middle, time[good], y[good])
+                            rotor = rotor_before(self.scene, self.dynamics.plant, joint)
+                            path = self._paths.get((i, episode.first), {})
+                            if rotor and f"{joint}.position" in path:
+                                # What turned the rotor was not measured.
+                                y = y + rotor * path[f"{joint}.position"][:, 2]
                             columns[f"{joint}.effort_command"] = y
                 of[episode.first] = Commands(time, columns)
             out.append(of)

@@ -21,6 +21,7 @@ from makebreak.gap.recording import (
     Recording,
     check_against_scene,
     excerpt,
+    in_newton_metres,
     read_recordings,
     unit_of,
 )
@@ -70,6 +71,7 @@ def run_gap(
     seconds: dict[str, float] = {}
     scene = read_scene(scene_path)
     recordings = read_recordings(recording_paths, skip_bad_rows, sidecars)
+    recordings = in_newton_metres(recordings, scene.channels)
     dynamics = SceneDynamics(scene)
     joints, bodies = scene_names(dynamics.plant)
     for recording in recordings:

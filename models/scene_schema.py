@@ -8,6 +8,7 @@ from pydrake.multibody.parsing import ModelDirective
 
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, check_parameters
+from makebreak.models.effects.measured_channels import torque_constant
 from makebreak.models.friction_zones import FrictionZone, check_zones
 from makebreak.models.typed_yaml import Between, check, convert, hints_of, nearest
 
@@ -151,7 +152,9 @@ def check_scene(scene: Scene) -> None:
                 f"channels: got {key}, expected <model>.<joint>.<quantity> or a "
                 f"quantity: {', '.join(SIDED)}"
             )
-        if side.strip().lower() not in SIDES:
+        if key.endswith("effort_measured") and side.lower().startswith("current"):
+            torque_constant(scene.channels, key)
+        elif side.strip().lower() not in SIDES:
             raise ValueError(
                 f'channels.{key}: got "{side}", expected one of: {", ".join(SIDES)}'
             )

@@ -1,5 +1,6 @@
 """What lies between a true value and its measured channel, when it is not nothing."""
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -14,6 +15,7 @@ JOINT = ("position", "velocity", "effort_measured")
 BODY = "x y z qw qx qy qz vx vy vz wx wy wz".split()
 WRENCH = "fx fy fz tx ty tz".split()
 LENGTHS = ("x", "y", "z", "vx", "vy", "vz")
+_CURRENT = re.compile(r"current[, :x*]*(-?\d*\.?\d+(?:e[+-]?\d+)?)\s*n\s?m\s?/\s?a")
 # What a kind of effect may name as its step.
 STEPS = ("offset", "delay", "skew", "bias", "scale", "lag")
 
@@ -50,6 +52,30 @@ def acts_on(effect: Effect, step: str, channel: str) -> bool:
         at == "world" or channel == at or channel.startswith(f"{at}.")
         for at in effect.at
     )
+
+
+def is_link_side(words: Mapping[str, str], channel: str) -> bool:
+    """Whether a scene's `channels` say so: an entry for the channel, or for its last
+    part, that begins with `link`."""
+    said = words.get(channel, words.get(channel.rsplit(".", 1)[-1], ""))
+    return said.strip().lower().startswith("link")
+
+
+def torque_constant(words: Mapping[str, str], channel: str) -> float:
+    """[N m/A] by which a measured effort that is a current becomes one, as "current,
+    0.11 N m/A"; 1 where it is no current. Raises: ValueError where none is given."""
+    said = words.get(channel, words.get(channel.rsplit(".", 1)[-1], ""))
+    said = said.strip().lower()
+    if not said.startswith("current"):
+        return 1.0
+    found = _CURRENT.fullmatch(said)
+    value = float(found.group(1)) if found else 0.0
+    if value == 0.0 or abs(value) > 1e6:
+        raise ValueError(
+            f'channels.{channel}: got "{said}", expected a torque constant, as in '
+            '"current, 0.11 N m/A"'
+        )
+    return value
 
 
 def channel_maps(
