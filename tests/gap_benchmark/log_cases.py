@@ -796,8 +796,9 @@ def main() -> None:
         for case, truth in zip(wanted, written, strict=True):
             check(args.out / case.folder)
             truths[case.folder] = truth
-            args.truth.write_text(json.dumps(truths, indent=1) + "\n")
             print(case.folder, case.name, flush=True)
+    # At the end: a set that was cut short is none, for --reuse.
+    args.truth.write_text(json.dumps(truths, indent=1) + "\n")
 
 
 if __name__ == "__main__":
