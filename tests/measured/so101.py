@@ -4,8 +4,9 @@
 
 writes OUT/<motion>.csv with positions and position commands, OUT/<motion>.yaml beside
 it, OUT/scene.yaml with the servo of the data sheet and OUT/published.yaml with the one
-of a published MuJoCo model, OUT/by_hand.yaml with one that was fitted by hand. In alphabetical order every other motion, from the first,
-is for fitting (FITTED), the rest for judging (JUDGED).
+of a published MuJoCo model, OUT/by_hand.yaml with one that was fitted
+by hand. In alphabetical order every other motion, from the first, is for fitting
+(FITTED), the rest for judging (JUDGED).
 """
 
 import argparse
