@@ -11,6 +11,7 @@ Nothing passes from the world to the controllers but encoders, torques and pictu
 """
 
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 from pydrake.geometry import Meshcat
@@ -34,10 +35,16 @@ from makebreak.diagrams.station import (
     make_station,
 )
 from makebreak.models.effects.kind import Effect
+from makebreak.models.fruit import FRUITS, fruit_file, make_fruit
 from makebreak.models.scene import Scene, load_scene, read_scene
 from makebreak.models.tip_and_ball import TipAndBall, make_tip_and_ball
 from makebreak.systems.arm_reference import ArmReference, ArmReferenceConfig
 from makebreak.systems.ball_tracker import BallTracker, BallTrackerConfig
+from makebreak.systems.baselines.dynamics_residual import DynamicsResidual
+from makebreak.systems.baselines.dynamics_residual_learner import (
+    DynamicsResidualLearner,
+    DynamicsResidualLearnerConfig,
+)
 from makebreak.systems.c3_mpc import C3Config, C3Mpc
 from makebreak.systems.impedance_controller import (
     HybridConfig,
@@ -59,7 +66,16 @@ from makebreak.systems.numerics.ball_state import (
     W_BALL,
 )
 from makebreak.systems.numerics.c3_mpc import C3Options, C3Weights
-from makebreak.systems.residual_learner import ResidualLearner, ResidualLearnerConfig
+from makebreak.systems.numerics.c3_projections import (
+    ExactProjection,
+    PlusProjection,
+    QpProjection,
+)
+from makebreak.systems.residual_learner import (
+    PosteriorConfig,
+    ResidualLearner,
+    ResidualLearnerConfig,
+)
 from makebreak.systems.rolling_task import RollingTask, RollingTaskConfig
 from makebreak.systems.rolling_view import RollingView, RollingViewConfig
 from makebreak.systems.state_estimator import StateEstimator, StateEstimatorConfig
@@ -93,13 +109,18 @@ class PlannerConfig:
 
 @dataclass
 class LearnerConfig:
-    learning_rate: float = 8e-3  # [m/s] per update, 0.4 mm of gap.
-    n_b: int = 10
-    weight_ball: float = 2e4  # Q_d of the ball's v_x, v_y, seen by the camera, ...
-    weight_tip: float = 1e5  # ... and of the tip's v_z, felt by the joints: less noise.
-    eps: float = 2e-6  # 1e-7 / 0.05 s: the paper's, for forces in newtons.
-    gamma: float = 5e-4  # 1e-2 * 0.05 s, likewise.
-    r_max: float = 1.0  # [m/s]: 50 mm.
+    """Of the residual on the contact of tip and ball, one number for its four forces.
+
+    The weights are inverse variances of what a step of 50 ms is predicted wrongly by:
+    7 mm/s for the ball, seen by the camera; 3 mm/s for the tip, felt by the joints.
+    """
+
+    weight_ball: float = 2e4  # Q_d of the ball's v_x, v_y.
+    weight_tip: float = 1e5  # And of the tip's v_z.
+    eps: float = 1e-3  # 3 N of contact over a gap of 0.05 mm are as unlikely as 2 std.
+    gamma: float = 5e-4  # 1e-2 * 0.05 s: the paper's, for forces in newtons.
+    r_max: float = 0.7  # [m/s]: 35 mm.
+    posterior: PosteriorConfig = field(default_factory=PosteriorConfig)
 
 
 @dataclass
@@ -107,8 +128,17 @@ class BallRollingConfig:
     """World and model start from the same scene; errors change the model, conditions
     the world."""
 
-    adapt: bool = True
-    radius_error_m: float = 0.005  # Model minus world.
+    adapt: bool = True  # false: learner=none.
+    # What is learned: a residual on the contact equation (r_comp), on the dynamics
+    # (r_dyn, eq. 10), both or none.
+    learner: Literal["none", "r_comp", "r_dyn", "both"] = "r_comp"
+    # paper: the learner and the projection of the paper, with its constants.
+    controller: Literal["ours", "paper"] = "ours"
+    # Of C3; auto: plus, of the paper's controller qp.
+    projection: Literal["auto", "qp", "exact", "plus"] = "auto"
+    object: Literal["ball", "orange", "lime"] = "ball"  # What is rolled.
+    # Radius of the model minus the world's; of a fruit, minus its mean radius.
+    radius_error_m: float = 0.005
     friction: float = 0.5  # Of the ball with tip and table.
     rolling_resistance: float = 0.005  # Lever arm over radius.
     ball_noise_m: float = 0.001  # Shift of each picture, each way.
@@ -124,8 +154,10 @@ class BallRollingConfig:
     )
     task: RollingTaskConfig = field(default_factory=RollingTaskConfig)
     planner: PlannerConfig = field(default_factory=PlannerConfig)
-    learner: LearnerConfig = field(default_factory=LearnerConfig)
-    impedance: ImpedanceConfig = field(default_factory=ImpedanceConfig)
+    learning: LearnerConfig = field(default_factory=LearnerConfig)
+    impedance: ImpedanceConfig = field(
+        default_factory=lambda: ImpedanceConfig(force_max=20.0)
+    )
 
 
 def check_parts(scene: Scene, what: str) -> None:
@@ -147,21 +179,21 @@ def world_scene(config: BallRollingConfig) -> Scene:
     """The scene that is simulated: friction, resistance, where the ball lies."""
     scene = read_scene(config.world)
     check_parts(scene, "world")
+    if config.object != "ball":
+        _replace_ball(scene, config)
     angle = config.start_angle_rad
     if angle is None:
         angle = np.random.default_rng(config.seed).uniform(-np.pi, np.pi)
     center, radius = np.array(config.task.center), config.task.radius
     xy = center + radius * np.array([np.cos(angle), np.sin(angle)])
     z = scene.initial.poses["ball.ball"][6]
-    scene.initial.poses["ball.ball"] = [
-        1.0,
-        0.0,
-        0.0,
-        0.0,
-        float(xy[0]),
-        float(xy[1]),
-        z,
-    ]
+    turned = [1.0, 0.0, 0.0, 0.0]
+    if config.object != "ball":
+        kind = FRUITS[config.object]
+        z = kind.radius * (1.0 + kind.bump)
+        about_z = np.random.default_rng([config.seed, 3]).uniform(0.0, 2.0 * np.pi)
+        turned = [float(np.cos(about_z / 2)), 0.0, 0.0, float(np.sin(about_z / 2))]
+    scene.initial.poses["ball.ball"] = [*turned, float(xy[0]), float(xy[1]), z]
     if not config.friction > 0.0:
         raise ValueError(f"friction is {config.friction}, expected > 0")
     if not config.rolling_resistance >= 0.0:
@@ -178,13 +210,28 @@ def world_scene(config: BallRollingConfig) -> Scene:
     return scene
 
 
+def _replace_ball(scene: Scene, config: BallRollingConfig) -> None:
+    """The fruit of the config's seed in place of the scene's ball."""
+    for directive in scene.directives:
+        model = directive.add_model
+        if model is not None and model.name == "ball":
+            model.file = f"file://{fruit_file(config.object, config.seed)}"
+            return
+    raise ValueError(f"the scene {config.world} has no model ball, which object needs")
+
+
 def believed(config: BallRollingConfig) -> tuple[TipAndBall, Scene]:
     """What the controllers believe: tip and ball, and the model's scene."""
     scene = read_scene(config.model)
     check_parts(scene, "model")
-    if config.radius_error_m != 0.0:
+    fruit = None
+    if config.object != "ball":
+        fruit = make_fruit(config.object, config.seed)
+    if config.radius_error_m != 0.0 or fruit is not None:
         loaded = load_scene(scene, DiagramBuilder())
         right = sphere_radius(loaded.plant, loaded.scene_graph, "ball")
+        if fruit is not None:
+            right = fruit.mean_radius
         wrong = right + config.radius_error_m
         if not wrong > 0.0:
             raise ValueError(
@@ -196,12 +243,17 @@ def believed(config: BallRollingConfig) -> tuple[TipAndBall, Scene]:
     return TipAndBall(
         tip_mass=TIP_MASS,
         tip_radius=sphere_radius(loaded.plant, loaded.scene_graph, TOOL),
-        ball_mass=ball.default_mass(),
+        # A fruit is weighed; of its shape only a radius is known.
+        ball_mass=ball.default_mass() if fruit is None else fruit.mass,
         ball_radius=sphere_radius(loaded.plant, loaded.scene_graph, "ball"),
     ), scene
 
 
-def c3_config(planner: PlannerConfig, n_lam: int) -> C3Config:
+PROJECTIONS = {"qp": QpProjection, "exact": ExactProjection, "plus": PlusProjection}
+
+
+def c3_config(planner: PlannerConfig, n_lam: int, projection: str = "plus") -> C3Config:
+    """Args: projection, of PROJECTIONS: `plus` has weights of eta, the others none."""
     for name in ("tip", "ball", "ball_velocity"):
         if not getattr(planner, name) >= 0.0:
             raise ValueError(
@@ -223,8 +275,11 @@ def c3_config(planner: PlannerConfig, n_lam: int) -> C3Config:
         np.full(3, 1e-9),
         0.1 * planner.force * contact,
     ])  # fmt: skip
+    if projection != "plus":
+        G = G[: N_X + n_lam + 3]
     return C3Config(
         weights=C3Weights(Q, np.full(3, 0.01), G, G),
+        projection=PROJECTIONS[projection](),
         options=C3Options(N=planner.N, rounds=planner.rounds, rho=planner.rho),
         residual_dt_sec=LEARN,
     )
@@ -234,7 +289,7 @@ def learner_config(learner: LearnerConfig) -> ResidualLearnerConfig:
     for name in ("weight_ball", "weight_tip"):
         if not getattr(learner, name) >= 0.0:
             raise ValueError(
-                f"learner.{name} is {getattr(learner, name)}, expected >= 0"
+                f"learning.{name} is {getattr(learner, name)}, expected >= 0"
             )
     Q_d = np.zeros(N_X)
     # A tip pressed on a surface that is not there is also explained by two friction
@@ -245,12 +300,26 @@ def learner_config(learner: LearnerConfig) -> ResidualLearnerConfig:
         Q_d=Q_d.tolist(),
         eps=learner.eps,
         gamma=learner.gamma,
-        n_b=learner.n_b,
-        learning_rate=learner.learning_rate,
         # The gap is one number: the tip's four forces share one residual. The table's
         # contact does not adapt.
         groups=[list(range(N_TIP))],
         r_max=learner.r_max,
+        posterior=learner.posterior,
+    )
+
+
+def paper_learner_config(n_lam: int) -> ResidualLearnerConfig:
+    """The paper's: every entry for itself, following the gradient of the loss; Q_d 1e5
+    on the ball's velocity alone, eps 1e-7 and gamma 1e-2 for an impulse, xi 1e-3."""
+    Q_d = np.zeros(N_X)
+    Q_d[V_BALL] = 1e5
+    return ResidualLearnerConfig(
+        Q_d=Q_d.tolist(),
+        eps=1e-7 / LEARN,
+        gamma=1e-2 * LEARN,
+        n_b=10,
+        learning_rate=1e-3,
+        groups=[[i] for i in range(n_lam)],
     )
 
 
@@ -305,6 +374,11 @@ def add_ball_rolling(
     if not config.ball_noise_m >= 0.0:
         raise ValueError(f"ball_noise_m is {config.ball_noise_m}, expected >= 0")
     camera = replace(config.camera, position_noise_m=config.ball_noise_m)
+    learner_kind = config.learner if config.adapt else "none"
+    paper = config.controller == "paper"
+    projection = config.projection
+    if projection == "auto":
+        projection = "qp" if paper else "plus"
     station = builder.AddNamedSystem(
         "station",
         make_station(
@@ -347,6 +421,9 @@ def add_ball_rolling(
             replace(
                 config.tracker,
                 ball_radius=model.ball_radius,
+                hue=config.tracker.hue
+                if config.object == "ball"
+                else FRUITS[config.object].hue,
                 period_sec=TRACK,
                 offset_sec=OFFSET["tracker"],
             ),
@@ -368,7 +445,8 @@ def add_ball_rolling(
         ),
     )
     c3 = builder.AddNamedSystem(
-        "c3_mpc", C3Mpc(c3_config(config.planner, n_lam), CONTROL, OFFSET["c3"])
+        "c3_mpc",
+        C3Mpc(c3_config(config.planner, n_lam, projection), CONTROL, OFFSET["c3"]),
     )
     task = builder.AddNamedSystem(
         "rolling_task",
@@ -425,14 +503,37 @@ def add_ball_rolling(
     for one in lcs.values():
         connect(estimator, "x", one, "x")
         builder.Connect(no_force.get_output_port(), one.GetInputPort("u"))
-    if config.adapt:
+    learn_lcs = lcs_of["learn"].build(
+        lcs_of["learn"].x_default, np.zeros(lcs_of["learn"].n_u)
+    )
+    # Where C3 and the arm's reference have their models from.
+    lcs_port = {name: one.GetOutputPort("lcs") for name, one in lcs.items()}
+    if learner_kind in ("r_dyn", "both"):
+        r_dyn = builder.AddNamedSystem(
+            "dynamics_residual_learner",
+            DynamicsResidualLearner(
+                DynamicsResidualLearnerConfig(), learn_lcs, LEARN, OFFSET["learner"]
+            ),
+        )
+        connect(estimator, "x", r_dyn, "x")
+        connect(estimator, "u_measured", r_dyn, "u_measured")
+        connect(lcs["learn"], "lcs", r_dyn, "lcs")
+        for name in ("plan", "command"):
+            one = lcs_of[name].build(lcs_of[name].x_default, np.zeros(3))
+            added = builder.AddNamedSystem(
+                f"dynamics_residual_{name}", DynamicsResidual(one, LEARN)
+            )
+            connect(lcs[name], "lcs", added, "lcs")
+            connect(r_dyn, "r_dyn", added, "r_dyn")
+            lcs_port[name] = added.get_output_port()
+    if learner_kind in ("r_comp", "both"):
         learner = builder.AddNamedSystem(
             "residual_learner",
             ResidualLearner(
-                learner_config(config.learner),
-                lcs_of["learn"].build(
-                    lcs_of["learn"].x_default, np.zeros(lcs_of["learn"].n_u)
-                ),
+                paper_learner_config(n_lam)
+                if paper
+                else learner_config(config.learning),
+                learn_lcs,
                 LEARN,
                 OFFSET["learner"],
             ),
@@ -442,6 +543,7 @@ def add_ball_rolling(
         connect(estimator, "window_valid", learner, "enable")
         connect(lcs["learn"], "lcs", learner, "lcs")
         r_comp = learner.GetOutputPort("r_comp")
+        connect(learner, "r_std", task, "r_std")
     else:
         zero = builder.AddNamedSystem(
             "no_residual", ConstantVectorSource(np.zeros(n_lam))
@@ -449,11 +551,12 @@ def add_ball_rolling(
         r_comp = zero.get_output_port()
     connect(estimator, "x", task, "x")
     connect(estimator, "valid", task, "valid")
+    connect(estimator, "tip_force", task, "tip_force")
     builder.Connect(r_comp, task.GetInputPort("r_comp"))
     connect(estimator, "x", c3, "x")
     connect(task, "x_desired", c3, "x_desired")
-    connect(lcs["plan"], "lcs", c3, "lcs")
-    connect(lcs["command"], "lcs", c3, "lcs_command")
+    builder.Connect(lcs_port["plan"], c3.GetInputPort("lcs"))
+    builder.Connect(lcs_port["command"], c3.GetInputPort("lcs_command"))
     builder.Connect(r_comp, c3.GetInputPort("r_comp"))
     connect(task, "phase", reference, "phase")
     connect(c3, "x_next", reference, "x_next")

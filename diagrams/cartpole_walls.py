@@ -9,6 +9,7 @@ the pole then swings nonlinearly and the walls are Drake's compliant point conta
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from pydrake.common.value import Value
@@ -24,7 +25,11 @@ from makebreak.systems.baselines.dynamics_residual_learner import (
 from makebreak.systems.c3_mpc import C3Config, C3Mpc
 from makebreak.systems.lcs_plant import LcsPlant, LcsPlantConfig
 from makebreak.systems.numerics.c3_mpc import C3Options, C3Weights
-from makebreak.systems.numerics.c3_projections import QpProjection
+from makebreak.systems.numerics.c3_projections import (
+    ExactProjection,
+    PlusProjection,
+    QpProjection,
+)
 from makebreak.systems.numerics.cartpole import CartPole, cartpole_lcs, cost_to_go
 from makebreak.systems.numerics.lcs import LCS
 from makebreak.systems.residual_learner import ResidualLearner, ResidualLearnerConfig
@@ -52,13 +57,15 @@ class CartpoleWallsConfig:
     x_initial: list[float] = field(default_factory=lambda: [0.0, -0.4, 0.0, 0.0])
     # Half width of the uniform draw in each entry [SI].
     x_spread: list[float] = field(default_factory=lambda: [0.02, 0.02, 0.02, 0.02])
-    adapt: bool = True
-    # Adapt the dynamics (eq. 10) instead of the contact: the baseline.
-    dynamics_residual: bool = False
+    adapt: bool = True  # false: learner=none.
+    # What is learned: a residual on the contact equation (r_comp), the baseline on the
+    # dynamics (r_dyn, eq. 10), both or none.
+    learner: Literal["none", "r_comp", "r_dyn", "both"] = "r_comp"
+    projection: Literal["qp", "exact", "plus"] = "qp"  # Of C3.
     # True distance of each wall minus the distance that the model starts with [m].
     gap_error: list[float] = field(default_factory=lambda: [-0.15, 0.15])
     world: str = SCENE  # Scene file of the MultibodyPlant.
-    learner: ResidualLearnerConfig = field(default_factory=_learner)
+    learning: ResidualLearnerConfig = field(default_factory=_learner)
 
 
 def true_lcs() -> LCS:
@@ -74,23 +81,29 @@ def model_lcs(config: CartpoleWallsConfig) -> LCS:
     return truth.with_residual(-error)
 
 
-def c3_config(N: int = 10) -> C3Config:
-    """C3 with the convex projection, 10 rounds, rho 2, and the public weights.
+PROJECTIONS = {"qp": QpProjection, "exact": ExactProjection, "plus": PlusProjection}
+
+
+def c3_config(N: int = 10, projection: str = "qp") -> C3Config:
+    """C3 with a projection of PROJECTIONS, 10 rounds, rho 2, and the public weights.
+
+    The plus projection has weights of eta, too: 1 m of gap weighs as 100 N of force,
+    the wall's stiffness.
 
     The penetration of a soft wall is its force, so no gap is clamped.
     """
     lcs, n_x = true_lcs(), 4
     Q, R = np.diag([10.0, 2.0, 1.0, 1.0]), np.eye(1)
+    G = n_x * [0.1] + 2 * [0.1] + [0.0]
+    U = n_x * [1000.0] + 2 * [1.0] + [0.0]
+    if projection == "plus":
+        G, U = G + 2 * [0.1 * 1e4], U + 2 * [1e4]
     weights = C3Weights(
-        Q=Q,
-        R=R,
-        G=np.array(n_x * [0.1] + 2 * [0.1] + [0.0]),
-        U=np.array(n_x * [1000.0] + 2 * [1.0] + [0.0]),
-        Q_N=cost_to_go(lcs, Q, R),
+        Q=Q, R=R, G=np.array(G), U=np.array(U), Q_N=cost_to_go(lcs, Q, R)
     )
     return C3Config(
         weights,
-        projection=QpProjection(),
+        projection=PROJECTIONS[projection](),
         options=C3Options(N=N, rounds=10, rho=2.0),
         residual_dt_sec=DT,
         clamp_command_gap=False,
@@ -151,7 +164,9 @@ def make_cartpole_walls(
         x, u_of_plant = lcs_plant.GetOutputPort("x"), lcs_plant.GetInputPort("u")
 
     lcs = builder.AddNamedSystem("lcs", ConstantValueSource(Value(model)))
-    c3 = builder.AddNamedSystem("c3", C3Mpc(c3_config(), DT, C3_OFFSET))
+    c3 = builder.AddNamedSystem(
+        "c3", C3Mpc(c3_config(projection=config.projection), DT, C3_OFFSET)
+    )
     N = c3_config().options.N
     goal = builder.AddNamedSystem(
         "x_desired", ConstantVectorSource(np.zeros((N + 1) * model.n_x))
@@ -161,9 +176,10 @@ def make_cartpole_walls(
     builder.Connect(goal.get_output_port(), c3.GetInputPort("x_desired"))
     builder.Connect(u, u_of_plant)
     lcs_of_c3 = lcs.get_output_port()
-    if config.adapt and not config.dynamics_residual:
+    learned = config.learner if config.adapt else "none"
+    if learned in ("r_comp", "both"):
         learner = builder.AddNamedSystem(
-            "learner", ResidualLearner(config.learner, model, DT, LEARNER_OFFSET)
+            "learner", ResidualLearner(config.learning, model, DT, LEARNER_OFFSET)
         )
         builder.Connect(x, learner.GetInputPort("x"))
         # Until C3's next update this is what acted since its last one.
@@ -177,11 +193,11 @@ def make_cartpole_walls(
             "no_residual", ConstantVectorSource(np.zeros(model.n_lam))
         )
         r_comp = zero.get_output_port()
-    if config.adapt and config.dynamics_residual:
+    if learned in ("r_dyn", "both"):
         baseline = builder.AddNamedSystem(
-            "learner",
+            "dynamics_learner",
             DynamicsResidualLearner(
-                DynamicsResidualLearnerConfig(config.learner.n_b),
+                DynamicsResidualLearnerConfig(config.learning.n_b),
                 model,
                 DT,
                 LEARNER_OFFSET,

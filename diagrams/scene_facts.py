@@ -1,5 +1,6 @@
 """What can be read off a loaded scene."""
 
+import numpy as np
 from pydrake.geometry import SceneGraph, Sphere
 from pydrake.multibody.plant import MultibodyPlant
 
@@ -20,3 +21,23 @@ def sphere_radius(plant: MultibodyPlant, scene_graph: SceneGraph, model: str) ->
     if len(radii) != 1:
         raise ValueError(f"{model} has {len(radii)} collision spheres, expected one")
     return radii[0]
+
+
+def spheres_of(plant: MultibodyPlant, scene_graph: SceneGraph, model: str):
+    """The collision spheres of the model's only body: centres (n, 3) in its frame and
+    radii (n,) [m].
+
+    Raises: ValueError if it has another shape, or several bodies.
+    """
+    inspector = scene_graph.model_inspector()
+    bodies = plant.GetBodyIndices(plant.GetModelInstanceByName(model))
+    if len(bodies) != 1:
+        raise ValueError(f"{model} has {len(bodies)} bodies, expected one")
+    centers, radii = [], []
+    for geometry in plant.GetCollisionGeometriesForBody(plant.get_body(bodies[0])):
+        shape = inspector.GetShape(geometry)
+        if not isinstance(shape, Sphere):
+            raise ValueError(f"{model} has a shape that is no sphere")
+        centers.append(inspector.GetPoseInFrame(geometry).translation())
+        radii.append(shape.radius())
+    return np.array(centers), np.array(radii)

@@ -21,6 +21,7 @@ class ArmReferenceConfig:
     tip_mass: float = 1.0  # [kg] of the tip in the LCS.
     force_max: float = 3.0  # Feed-forward is clipped to it [N].
     acceleration_max: float = 1.5  # Of the velocity reference while rolling [m/s2].
+    down_max: float = 0.04  # Downwards while rolling, where contact may be early [m/s].
     # No command moves the reference faster than that, however far away it is. The task
     # itself stays below 0.35 m/s and 4 m/s2.
     speed_max: float = 0.7  # [m/s]
@@ -86,7 +87,9 @@ class ArmReference(LeafSystem):
             lcs = self._lcs.Eval(context)
             on_tip = c.tip_mass / lcs.dt * (lcs.D[V_TIP] @ self._lam.Eval(context))
             force = clip_norm(-on_tip, c.force_max)
-            target = np.concatenate((x_next[P_TIP], x_next[V_TIP], self._zero, force))
+            v = np.array(x_next[V_TIP])
+            v[2] = max(v[2], -c.down_max)
+            target = np.concatenate((x_next[P_TIP], v, self._zero, force))
             dv_max = c.acceleration_max * c.period_sec
         else:
             target = np.concatenate((self._reference.Eval(context), self._zero))

@@ -1,5 +1,6 @@
 """The arm's 1 kHz controller: a Cartesian spring and damper at the tool's tip."""
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -29,6 +30,8 @@ class ImpedanceConfig:
         default_factory=lambda: [400.0] * 3 + [15.0] * 3
     )
     control_orientation: bool = False  # False: position only, kept upright by posture.
+    # Spring and damper together push the tip no harder, whatever is in its way [N].
+    force_max: float = math.inf
     posture_stiffness: float = 100.0  # [1/s2]
     posture_damping: float = 20.0  # [1/s]
     period_sec: float = 0.001
@@ -58,7 +61,8 @@ class ImpedanceController(LeafSystem):
         S = I - sum n n',  f_fc = sum n (F_c + k_i integral (F_c - F) dt - D_n n'v)
         tau = J' F + bias + posture in the dynamically consistent null space of J
 
-    Two directions that are not orthogonal are made so, the first one kept. F_c rises in
+    K (x_d - x) + D (v_d - v) is shortened to force_max. Two directions that are not
+    orthogonal are made so, the first one kept. F_c rises in
     ramp_sec; D_n >= F_c/closing_speed bounds the speed of a lost contact's return. The
     integral waits while less than 0.5 N is felt, and goes on where the next segment has
     (nearly) the same n. A dropped n fades over release_sec, and stiffness along it
@@ -118,6 +122,7 @@ class ImpedanceController(LeafSystem):
             if not getattr(config, name) >= 0.0:
                 raise ValueError(f"{name} is {getattr(config, name)}, expected >= 0")
         for name, number in (
+            ("force_max", config.force_max),
             ("period_sec", config.period_sec),
             ("torque_rate_max", torque_rate_max),
         ):
@@ -139,6 +144,7 @@ class ImpedanceController(LeafSystem):
             ),
             stiffness=np.array(config.stiffness, dtype=float),
             damping=np.array(config.damping, dtype=float),
+            force_max=float(config.force_max),
             posture_stiffness=float(config.posture_stiffness),
             posture_damping=float(config.posture_damping),
             posture_every=max(1, round(0.012 / config.period_sec)),

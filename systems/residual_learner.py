@@ -1,6 +1,6 @@
 """The residual learner: see numerics/residual_learner.py for what it learns and how."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Any
 
@@ -20,6 +20,13 @@ from makebreak.systems.numerics.residual_learner import (
     spread,
     zero_residual,
 )
+from makebreak.systems.numerics.residual_posterior import (
+    ResidualGrid,
+    losses_on_grid,
+    mean_and_std,
+    residual_grid,
+    updated,
+)
 from makebreak.systems.numerics.timing import timed
 
 
@@ -34,6 +41,19 @@ class LearnerStatus(IntEnum):
     GAMMA_REFUSED = 5  # gamma is beyond the bound of this pair's F: it was dropped.
     NOT_SOLVED = 6  # A QP of the buffer was not solved.
     BAD_LCS = 7  # lcs is of other sizes or another dt: the pair was dropped.
+
+
+@dataclass
+class PosteriorConfig:
+    """The residual as a probability on a grid (numerics/residual_posterior.py)."""
+
+    prior_std: float = 0.16  # About zero [m/s]: 8 mm at dt = .05 s.
+    drift: float = (
+        0.02  # How it may change in a second, as a deviation [m/s / sqrt(s)].
+    )
+    spacing: float = 0.01  # Of the grid [m/s].
+    trust: float = 0.1  # Share of a step's loss that counts.
+    loss_max: float = 6.0  # What one step can say at most.
 
 
 @dataclass
@@ -54,6 +74,9 @@ class ResidualLearnerConfig:
     # Empty: all adapt, each for itself.
     groups: list[list[int]] = field(default_factory=list)
     r_max: float = 1.0  # Bound on each entry of r_comp [m/s].
+    # Given: r_comp is the mean of a probability instead of Adam's, for one group; Q_d
+    # then has inverse variances, and n_b, learning_rate and n_steps have no effect.
+    posterior: PosteriorConfig | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +88,8 @@ class LearnerMemory:
     residual: Residual
     loss: float
     status: LearnerStatus
+    belief: np.ndarray | None = None  # (n,) on the grid of the posterior.
+    std: float = 0.0  # Of the residual [m/s]; 0 without a posterior.
 
     def __deepcopy__(self, memo):
         return self  # Every part is immutable, so a Context may share it.
@@ -82,6 +107,7 @@ class ResidualLearner(LeafSystem):
 
     Outputs:
         r_comp (n_lam,) [m/s] for the contact equation at dt = period_sec.
+        r_std (1,) its standard deviation [m/s]; 0 without a posterior.
         loss (1,) mean loss per buffered pair before the last update.
         status (1,) a LearnerStatus.
 
@@ -112,6 +138,7 @@ class ResidualLearner(LeafSystem):
         self._u = self.DeclareVectorInputPort("u_measured", lcs.n_u)
         self._lcs = self.DeclareAbstractInputPort("lcs", Value(lcs))
         self._enable = self.DeclareVectorInputPort("enable", 1)
+        self._grid: ResidualGrid | None = None
         memory = LearnerMemory(
             sample=None,
             buffer=empty_buffer(lcs.n_lam),
@@ -119,9 +146,17 @@ class ResidualLearner(LeafSystem):
             loss=0.0,
             status=LearnerStatus.WAITING,
         )
+        c = self._config.posterior
+        if c is not None:
+            self._grid = residual_grid(
+                config.r_max, c.spacing, c.prior_std, c.drift * np.sqrt(period_sec)
+            )
+            _, std = mean_and_std(self._grid, self._grid.prior)
+            memory = replace(memory, belief=self._grid.prior, std=std)
         self._memory = self.DeclareAbstractState(Value(memory))
         ticket = {self.abstract_state_ticket(self._memory)}
         self.DeclareVectorOutputPort("r_comp", lcs.n_lam, self._calc_r_comp, ticket)
+        self.DeclareVectorOutputPort("r_std", 1, self._calc_r_std, ticket)
         self.DeclareVectorOutputPort("loss", 1, self._calc_loss, ticket)
         self.DeclareVectorOutputPort("status", 1, self._calc_status, ticket)
         self.DeclarePeriodicUnrestrictedUpdateEvent(
@@ -129,7 +164,11 @@ class ResidualLearner(LeafSystem):
         )
         x, u = np.zeros(lcs.n_x), np.zeros(lcs.n_u)
         # Compiled now, not at the first tick.
-        self._learned(memory, measured_step(lcs, x, u, x, self._Q_d, config.eps))
+        first = measured_step(lcs, x, u, x, self._Q_d, config.eps)
+        if self._grid is None:
+            self._learned(memory, first)
+        else:
+            self._with_posterior(memory, (x, lcs), first)
 
     @timed
     def _update(self, context, state):
@@ -162,9 +201,34 @@ class ResidualLearner(LeafSystem):
         if not self._config.gamma < gamma_bound(lcs_before.F):
             return _held(memory, sample, LearnerStatus.GAMMA_REFUSED)
         step = measured_step(lcs_before, x_before, u, x, self._Q_d, self._config.eps)
+        if self._grid is not None:
+            return self._with_posterior(memory, sample, step)
         buffer = memory.buffer.append(step, self._config.n_b)
         residual, loss, status = self._learned(memory, buffer)
         return LearnerMemory(sample, buffer, residual, loss, status)
+
+    def _with_posterior(self, memory, sample, step) -> LearnerMemory:
+        """The memory after one more measured step."""
+        c, grid = self._config, self._grid
+        assert grid is not None and c.posterior is not None
+        shared = self._group == 0
+        loss = losses_on_grid(step, shared, grid.values, c.eps, c.gamma)
+        solved = bool(np.isfinite(loss).all())
+        belief = updated(
+            grid, memory.belief, loss, c.posterior.trust, c.posterior.loss_max
+        )
+        belief.setflags(write=False)
+        mean, std = mean_and_std(grid, belief)
+        before = float(memory.residual.value[0])
+        residual = replace(memory.residual, value=np.array([mean]))
+        status = LearnerStatus.LEARNED if solved else LearnerStatus.NOT_SOLVED
+        if (
+            mean > c.r_max - c.posterior.spacing
+            or -mean > c.r_max - c.posterior.spacing
+        ):
+            status = LearnerStatus.AT_BOUND
+        told = float(np.interp(before, grid.values, loss)) if solved else memory.loss
+        return LearnerMemory(sample, memory.buffer, residual, told, status, belief, std)
 
     def _learned(self, memory, buffer):
         c = self._config
@@ -197,6 +261,9 @@ class ResidualLearner(LeafSystem):
     def _calc_r_comp(self, context, output):
         output.SetFromVector(spread(self._memory_of(context).residual, self._group))
 
+    def _calc_r_std(self, context, output):
+        output.SetFromVector([self._memory_of(context).std])
+
     def _calc_loss(self, context, output):
         output.SetFromVector([self._memory_of(context).loss])
 
@@ -205,7 +272,7 @@ class ResidualLearner(LeafSystem):
 
 
 def _held(memory: LearnerMemory, sample, status: LearnerStatus) -> LearnerMemory:
-    return LearnerMemory(sample, memory.buffer, memory.residual, memory.loss, status)
+    return replace(memory, sample=sample, status=status)
 
 
 def _checked(config: ResidualLearnerConfig, lcs: LCS, period_sec: float):
@@ -231,7 +298,17 @@ def _checked(config: ResidualLearnerConfig, lcs: LCS, period_sec: float):
             f"gamma is {c.gamma}, expected 0 < gamma < {bound:.6g}, the smallest "
             "eigenvalue of F + F' (eps_c in the LCS makes it positive)"
         )
-    group_of_entry(c.groups, lcs.n_lam)
+    group = group_of_entry(c.groups, lcs.n_lam)
+    if c.posterior is not None:
+        if group.max() > 0:
+            raise ValueError(
+                f"groups is {c.groups}, expected one group with a posterior"
+            )
+        for name, value in vars(c.posterior).items():
+            if not (np.isfinite(value) and value > 0.0):
+                raise ValueError(
+                    f"posterior.{name} is {value}, expected a positive number"
+                )
     return ResidualLearnerConfig(
         **{**vars(c), "Q_d": list(c.Q_d), "groups": [list(g) for g in c.groups]}
     )

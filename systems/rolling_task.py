@@ -32,10 +32,14 @@ class RollingTask(LeafSystem):
     """Phases of rolling a ball along a circle, the target of C3 and the reposition.
 
     Inputs:  x (19,); valid (1,); r_comp (n_lam,) [m/s] of the learner, whose first
-             n_tip entries belong to tip and ball; optional landed (1,): where another
-             system carries the reposition out, it ends when this is 1, not in time.
+             n_tip entries belong to tip and ball; optional r_std (1,), how sure of it
+             the learner is [m/s], and tip_force (3,) on the tip as the arm feels it
+             [N], with which a surface of uncertain height is approached slowly;
+             optional landed (1,): where another system carries the reposition out, it
+             ends when this is 1, not in time.
     Outputs: x_desired ((N+1) 19,) for C3; reference (9,) = p, v, a of the tip at the
-             next tick, used unless rolling; phase (1,): 0 roll, 1 reposition, 2 wait.
+             next tick, used unless rolling; phase (1,): 0 roll, 1 reposition, 2 wait,
+             3 approach.
 
     Before the first update the phase is WAIT at the height of the tip that was given.
     """
@@ -61,6 +65,8 @@ class RollingTask(LeafSystem):
         self._x = self.DeclareVectorInputPort("x", N_X)
         self._valid = self.DeclareVectorInputPort("valid", 1)
         self._r_comp = self.DeclareVectorInputPort("r_comp", n_lam)
+        self._r_std = self.DeclareVectorInputPort("r_std", 1)
+        self._tip_force = self.DeclareVectorInputPort("tip_force", 3)
         self._landed = self.DeclareVectorInputPort("landed", 1)
         start = TaskState(WAIT, 0.0, p_tip, np.zeros(3), np.zeros(3), p_tip[2])
         self._task = self.DeclareAbstractState(AbstractValue.Make(start))
@@ -89,9 +95,14 @@ class RollingTask(LeafSystem):
         landed = None
         if self._landed.HasValue(context):
             landed = bool(self._landed.Eval(context)[0] > 0.5)
+        gap_std, force_z = 0.0, 0.0
+        if self._r_std.HasValue(context):
+            gap_std = float(self._r_std.Eval(context)[0]) * self._residual_dt_sec
+        if self._tip_force.HasValue(context):
+            force_z = float(self._tip_force.Eval(context)[2])
         task = next_state(
             c.rolling, self._path, task, t, c.period_sec, x, gap, valid,
-            self._radius_ball, self._radius_tip, landed,
+            self._radius_ball, self._radius_tip, landed, gap_std, force_z,
         )  # fmt: skip
         z_tip = 2.0 * self._radius_ball + self._radius_tip - c.press
         goal = target_over_horizon(
@@ -117,10 +128,15 @@ def _check(config: RollingTaskConfig):
     for name in ("speed", "lead_deg", "press"):
         if not np.isfinite(getattr(config, name)):
             raise ValueError(f"task.{name} is {getattr(config, name)}, expected finite")
-    for name in ("roll_sec", "reposition_sec"):
+    for name in ("roll_sec", "reposition_sec", "approach_speed", "touch_force"):
         if not 0.0 < getattr(rolling, name) < np.inf:
             raise ValueError(
                 f"task.rolling.{name} is {getattr(rolling, name)}, expected > 0"
+            )
+    for name in ("n_std", "approach_max"):
+        if not 0.0 <= getattr(rolling, name) < np.inf:
+            raise ValueError(
+                f"task.rolling.{name} is {getattr(rolling, name)}, expected >= 0"
             )
     if not 0.0 < rolling.ease <= 0.5:
         raise ValueError(

@@ -3,10 +3,15 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.systems.framework import LeafSystem
 
-from makebreak.systems.numerics.ball_state import pack
+from makebreak.systems.numerics.ball_state import V_TIP, pack
 from makebreak.systems.numerics.packed import packed
 from makebreak.systems.numerics.serial_chain import SerialChain
-from makebreak.systems.numerics.state_estimator import estimate, tip_motion
+from makebreak.systems.numerics.state_estimator import (
+    estimate,
+    observe_force,
+    tip_mobility,
+    tip_motion,
+)
 from makebreak.systems.numerics.timing import timed
 
 
@@ -16,6 +21,7 @@ class StateEstimatorConfig:
     tip_mass: float = 1.0  # [kg] of the tip in the LCS.
     window_sec: float = 0.05  # Of the mean force: the learner's period.
     period_sec: float = 0.0125 / 3.0  # Divides the periods of C3 and of the learner.
+    force_bandwidth: float = 60.0  # Of the tip force's observer [1/s].
     offset_sec: float = 0.0
 
 
@@ -30,9 +36,10 @@ class StateEstimator(LeafSystem):
              v_ball (3,) [m, m/s]; seen (1,).
     Outputs: x (19,), the layout of numerics/ball_state.py; u_measured (3,) [N];
              valid (1,): 1 if every reading was finite and the ball is seen;
-             window_valid (1,): 1 if that was so all over the window.
+             window_valid (1,): 1 if that was so all over the window; tip_force (3,) [N]
+             that the surroundings put on the tip, from joint torques and velocities.
 
-    A reading that is not finite leaves x and u_measured as they were.
+    A reading that is not finite leaves x, u_measured and tip_force as they were.
     """
 
     def __init__(self, config: StateEstimatorConfig, chain: SerialChain, q_default):
@@ -64,6 +71,8 @@ class StateEstimator(LeafSystem):
             np.append(np.zeros(3 * n_window), n_window)
         )
         self._valid = self.DeclareDiscreteState(1)
+        self._observer = self.DeclareDiscreteState(7)
+        self._gain, self._dt = config.force_bandwidth, config.period_sec
         self.DeclareStateOutputPort("x", self._x)
         self.DeclareVectorOutputPort(
             "u_measured",
@@ -72,6 +81,12 @@ class StateEstimator(LeafSystem):
             prerequisites_of_calc={self.discrete_state_ticket(self._window)},
         )
         self._n_window = n_window
+        self.DeclareVectorOutputPort(
+            "tip_force",
+            3,
+            self._tip_force,
+            prerequisites_of_calc={self.discrete_state_ticket(self._observer)},
+        )
         self.DeclareStateOutputPort("valid", self._valid)
         self.DeclareVectorOutputPort(
             "window_valid",
@@ -89,10 +104,17 @@ class StateEstimator(LeafSystem):
             self._chain, q_default, zero, zero, at, at, np.zeros(1), self._tip_mass,
             self._ball_radius, before,
         )  # fmt: skip
+        observer = np.zeros(7)
+        observer.setflags(write=False)
+        mobility = tip_mobility(self._chain[0], q_default)
+        observe_force(observer, at, at, mobility, self._gain, self._dt)
 
     def _mean_force(self, context, output):
         window = context.get_discrete_state(self._window).value()
         output.SetFromVector(window[:-1].reshape(-1, 3).mean(axis=0))
+
+    def _tip_force(self, context, output):
+        output.SetFromVector(context.get_discrete_state(self._observer).value()[3:6])
 
     def _all_valid(self, context, output):
         n_valid = context.get_discrete_state(self._window).value()[-1]
@@ -117,5 +139,15 @@ class StateEstimator(LeafSystem):
         if finite:
             discrete_state.set_value(self._x, x)
             discrete_state.set_value(self._window, after)
+            u = after[-4:-1]
+            observer = observe_force(
+                context.get_discrete_state(self._observer).value(),
+                x[V_TIP],
+                u / self._tip_mass,
+                tip_mobility(self._chain[0], np.asarray(self._q.Eval(context))),
+                self._gain,
+                self._dt,
+            )
+            discrete_state.set_value(self._observer, observer)
         else:
             discrete_state.set_value(self._window, np.append(window[:-1], 0.0))

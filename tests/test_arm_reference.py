@@ -142,3 +142,11 @@ def test_nan_from_the_planner_leaves_the_reference_where_it_was():
     pose, wrench = run(ROLL, np.full(19, np.nan), [1.0])
     np.testing.assert_allclose(pose, np.eye(19)[3])
     np.testing.assert_allclose(wrench, 0.0)
+
+
+def test_while_rolling_the_reference_goes_down_slowly_and_up_as_it_is_told():
+    x_next = np.zeros(19)
+    for v_z, expected in ((-0.3, -ArmReferenceConfig().down_max), (0.06, 0.06)):
+        x_next[12] = v_z
+        pose, _ = run(ROLL, x_next, [0.0], t_end=0.2)
+        np.testing.assert_allclose(pose[9], expected, atol=1e-12)

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from pydrake.common.value import AbstractValue
 from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import DiagramBuilder
@@ -24,9 +25,15 @@ from makebreak.diagrams.station import MODELS
 from makebreak.models.scene import load_scene
 from makebreak.scripts.cli import main
 from makebreak.scripts.experiments import ball_rolling as experiment
+from makebreak.systems.baselines.dynamics_residual import DynamicsResidual
 from makebreak.systems.camera_shake import CameraShake
 from makebreak.systems.noisy_sensor import NoisySensor
 from makebreak.systems.numerics.ball_state import P_BALL, P_TIP, pack
+from makebreak.systems.numerics.c3_projections import (
+    ExactProjection,
+    PlusProjection,
+    QpProjection,
+)
 from makebreak.systems.numerics.rolling_task import ROLL, WAIT
 
 EFFORT = np.repeat([87.0, 12.0], [4, 3])  # [N m] of the Panda's joints.
@@ -480,7 +487,10 @@ def test_progress_counts_full_turns_both_ways(turns):
     np.testing.assert_allclose(progress[[0, -1]], [0.0, 2.0 * np.pi * turns], atol=1e-9)
 
 
-def scored(turns=4.0, error=0.0, gap=0.0, gap_true=0.0, force=0.0, adapt=True, t=100.0):
+def scored(
+    turns=4.0, error=0.0, gap=0.0, gap_true=0.0, force=0.0, adapt=True, t=100.0,
+    gap_std=0.0, rolling=None,
+):  # fmt: skip
     """The score of a made-up run over t seconds."""
     p = circle(turns, radius=0.1)
     n = len(p)
@@ -494,6 +504,8 @@ def scored(turns=4.0, error=0.0, gap=0.0, gap_true=0.0, force=0.0, adapt=True, t
         error=np.broadcast_to(error, n),
         gap=np.broadcast_to(gap, n),
         gap_true=np.broadcast_to(gap_true, n),
+        gap_std=np.broadcast_to(gap_std, n),
+        rolling=np.zeros(n, bool) if rolling is None else rolling,
     )
     log = dict(seen=one, c3_status=0 * one, arm_status=0 * one, loss=2.0 * one)
     force = np.broadcast_to(force, 5000)
@@ -550,6 +562,25 @@ def test_gap_error_is_learned_less_true_over_the_last_circle():
     assert np.isnan(scored(turns=0.9)["r_gap_error_m"])
 
 
+def test_pushes_are_counted_until_a_quarter_circle_is_done():
+    # A push of 1 s each 2 s; a quarter of four circles in 100 s takes 6.25 s.
+    rolling = np.linspace(0.0, 100.0, 2001) % 2.0 >= 1.0
+    assert scored(rolling=rolling)["pushes_to_quarter_circle"] == 3
+    assert scored(turns=0.0, rolling=rolling)["pushes_to_quarter_circle"] is None
+
+
+def test_coverage_is_the_share_of_time_in_which_the_gap_is_within_1_645_std():
+    off = np.where(np.arange(2001) < 1000, 0.001, 0.004)
+    result = scored(gap=0.005 + off, gap_true=0.005, gap_std=0.002)
+    # From 10 s to 50 s of 100 s it is off by 1 mm, then by 4 mm; 3.3 mm are covered.
+    assert result["r_gap_covered_share"] == pytest.approx(40.0 / 90.0, abs=0.001)
+    expected = np.sqrt((40.0 * 1.0 + 50.0 * 16.0) / 90.0) * 1e-3
+    assert result["r_gap_error_rms_m"] == pytest.approx(expected, rel=0.001)
+    assert result["r_gap_std_m"] == pytest.approx(0.002)
+    untold = scored(gap=0.0, gap_true=1.0)["r_gap_covered_share"]
+    assert np.isnan(untold)
+
+
 def test_peak_of_the_contact_force_is_low_passed_at_100_hz():
     steady = scored(force=3.0)["contact_force_peak_N"]
     assert steady == pytest.approx(3.0, rel=1e-12)
@@ -595,10 +626,15 @@ def test_true_gap_is_the_radius_error_where_the_estimate_is_right(diagram):
         ("planner.ball=-1", "planner.ball is -1.0, expected >= 0"),
         ("planner.tip=-1", "planner.tip is -1.0, expected >= 0"),
         ("planner.force=0", "planner.force is 0.0, expected > 0"),
-        ("learner.gamma=1", "gamma is 1.0, expected 0 < gamma < 0.001"),
-        ("learner.weight_ball=-1", "learner.weight_ball is -1.0, expected >= 0"),
-        ("learner.weight_tip=-1", "learner.weight_tip is -1.0, expected >= 0"),
-        ("learner.n_b=0", "n_b is 0, expected 1 or more"),
+        ("learning.gamma=1", "gamma is 1.0, expected 0 < gamma < 0.001"),
+        ("learning.weight_ball=-1", "learning.weight_ball is -1.0, expected >= 0"),
+        ("learning.weight_tip=-1", "learning.weight_tip is -1.0, expected >= 0"),
+        ("learning.posterior.trust=0", "posterior.trust is 0.0"),
+        ("learner=r_com", "learner: got"),
+        ("object=apple", "object: got"),
+        ("impedance.force_max=0", "force_max is 0.0, expected > 0"),
+        ("task.rolling.approach_speed=0", "task.rolling.approach_speed is 0.0"),
+        ("task.rolling.n_std=-1", "task.rolling.n_std is -1.0"),
         ("tracker.ball_radius=0.03", "tracker.ball_radius is 0.03, expected 0.0315"),
         ("task.period_sec=0.1", "task.period_sec is 0.1, expected 0.0125"),
         (
@@ -623,6 +659,73 @@ def test_bad_settings_are_one_line_and_no_traceback(tmp_path, capfd, setting, me
     lines = capfd.readouterr().err.splitlines()
     assert len(lines) == 1 and lines[0].startswith("makebreak: ")
     assert message in lines[0]
+
+
+@pytest.mark.parametrize("learner", ["none", "r_dyn", "both"])
+def test_each_learner_reaches_c3_by_its_own_way(learner):
+    diagram = make_ball_rolling(config(learner=learner, seed=1))
+    names = {system.get_name() for system in diagram.GetSystems()}
+    assert ("residual_learner" in names) == (learner == "both")
+    assert ("dynamics_residual_learner" in names) == (learner != "none")
+    assert ("dynamics_residual_plan" in names) == (learner != "none")
+
+
+def test_a_residual_of_the_dynamics_grows_with_the_time_step():
+    lcs = builder_of("plan").build(builder_of("plan").x_default, np.zeros(3))
+    system = DynamicsResidual(lcs, residual_dt_sec=0.05)
+    context = system.CreateDefaultContext()
+    r_dyn = np.linspace(-1.0, 1.0, lcs.n_x)
+    system.GetInputPort("lcs").FixValue(context, AbstractValue.Make(lcs))
+    system.GetInputPort("r_dyn").FixValue(context, r_dyn)
+    out = system.get_output_port().Eval(context)
+    # An error of r_dyn in 50 ms is twice that in the plan's 100 ms.
+    np.testing.assert_allclose(out.d - lcs.d, 2.0 * r_dyn, atol=1e-12)
+    np.testing.assert_array_equal(out.F, lcs.F)
+
+
+def builder_of(name):
+    diagram = make_ball_rolling(config())
+    return diagram.GetSubsystemByName(f"lcs_{name}").model
+
+
+@pytest.mark.parametrize(
+    "changes, kind",
+    [
+        (dict(), PlusProjection),
+        (dict(projection="exact"), ExactProjection),
+        (dict(controller="paper"), QpProjection),
+        (dict(controller="paper", projection="plus"), PlusProjection),
+    ],
+)
+def test_projection_is_the_one_that_is_asked_for(changes, kind):
+    c3 = make_ball_rolling(config(**changes)).GetSubsystemByName("c3_mpc")
+    assert isinstance(c3._problem.projection, kind)
+
+
+def short(tmp_path, seconds, *settings):
+    """result.json of a short run, and the largest normal force in it."""
+    out = tmp_path / "-".join(settings)
+    arguments = ["run", "ball_rolling", "--no-meshcat", "--seed", "42", "--out"]
+    arguments += [str(out), "--duration", str(seconds), "--set"]
+    assert main([*arguments, "camera.renderer=drawn", *settings]) == 1  # Too short.
+    return json.loads((out / "result.json").read_text())
+
+
+def test_a_ball_larger_than_modelled_is_felt_gently_and_its_gap_is_learned(tmp_path):
+    """The first pushes: 98 N, where the height of a landing is taken for certain."""
+    result = short(tmp_path, 6.0, "radius_error_m=-0.008")
+    assert 2.0 < result["contact_force_peak_N"] <= 40.0
+    assert result["r_gap_m"] == pytest.approx(-0.016, abs=0.003)
+    assert result["circles_completed"] > 0.1
+
+
+def test_a_ball_smaller_than_modelled_is_found_and_only_with_adaptation(tmp_path):
+    result = short(tmp_path, 7.0, "radius_error_m=0.005")
+    assert result["time_to_first_contact_s"] < 6.0
+    assert result["r_gap_m"] == pytest.approx(0.010, abs=0.003)
+    assert result["contact_force_peak_N"] <= 40.0
+    frozen = short(tmp_path, 5.0, "radius_error_m=0.005", "learner=none")
+    assert frozen["time_to_first_contact_s"] is None
 
 
 @pytest.mark.slow

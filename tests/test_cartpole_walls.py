@@ -171,7 +171,7 @@ def test_a_missed_contact_teaches_from_a_force_on_that_the_theory_gives():
     config = CartpoleWallsConfig()
     lcs = true_lcs()
     gap = 0.05  # Modelled; the contact is missed by as much.
-    lam = gap / (config.learner.eps * lcs.D[:, 0] @ lcs.D[:, 0])
+    lam = gap / (config.learning.eps * lcs.D[:, 0] @ lcs.D[:, 0])
     for factor, expected in ((0.99, False), (1.01, True)):
         penetration = factor * lam * lcs.F[0, 0]
         x = np.array([[0.35 + penetration, 0.0, 0.0, 0.0]])
@@ -204,9 +204,25 @@ def test_wrong_settings_are_refused_by_name(changes, message):
         initial_state(config)
 
 
+@pytest.mark.parametrize("learner", ["none", "r_comp", "r_dyn", "both"])
+def test_each_learner_is_wired_to_what_it_corrects(learner):
+    diagram = make_cartpole_walls(CartpoleWallsConfig(learner=learner))
+    names = {system.get_name() for system in diagram.GetSystems()}
+    assert ("learner" in names) == (learner in ("r_comp", "both"))
+    assert ("dynamics_learner" in names) == (learner in ("r_dyn", "both"))
+
+
+@pytest.mark.parametrize("projection", ["exact", "plus"])
+def test_the_walls_are_learned_with_the_other_projections(projection):
+    config = CartpoleWallsConfig(projection=projection)
+    _, _, r = simulated(config, duration=4.0)
+    # Both walls are touched within 4 s, and then known to a centimetre.
+    np.testing.assert_allclose(r[-1], TRUTH, atol=0.01)
+
+
 def test_gamma_beyond_its_bound_is_refused_by_the_command_line(tmp_path, capsys):
     arguments = ["run", "cartpole_walls", "--no-meshcat", "--out", str(tmp_path)]
-    assert main([*arguments, "--set", "learner.gamma=0.03"]) == 2
+    assert main([*arguments, "--set", "learning.gamma=0.03"]) == 2
     error = capsys.readouterr().err.strip()
     assert "gamma is 0.03, expected 0 < gamma < 0.02" in error.splitlines()[-1]
 

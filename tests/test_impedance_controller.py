@@ -506,6 +506,22 @@ def test_finger_stays_upright_while_the_tip_circles():
     assert worst < 3.0
 
 
+def test_spring_and_damper_push_no_harder_than_force_max(law, chain):
+    """At rest, far from the reference: the torque is that of force_max towards it."""
+    q, still = law.q_nominal, np.zeros(7)
+    s = chain_state(chain, q, still)
+    away = np.array([0.3, -0.2, 0.6])
+    limited = law._replace(force_max=15.0)
+    args = (q, still, q, reference(s.p_WE + away), s.R_WE, law.stiffness, law.damping)
+    tau, _ = impedance_torque(chain, limited, *args, 0.0, np.zeros(6), NO_SLOTS)
+    free, _ = impedance_torque(
+        chain, limited, q, still, q, reference(s.p_WE), s.R_WE, law.stiffness,
+        law.damping, 0.0, np.zeros(6), NO_SLOTS,
+    )  # fmt: skip
+    expected = s.J[:3].T @ (15.0 * away / np.linalg.norm(away))
+    np.testing.assert_allclose(tau - free, expected, atol=1e-9)
+
+
 def test_full_pose_is_reached_when_orientation_is_controlled():
     # The slowest part takes 15/50 s, so 3 s leave e^-10 of 0.36 rad.
     loop = Loop(

@@ -12,6 +12,7 @@ from makebreak.systems.numerics.ball_state import (
     pack,
 )
 from makebreak.systems.numerics.rolling_task import (
+    APPROACH,
     REPOSITION,
     ROLL,
     WAIT,
@@ -174,3 +175,63 @@ def test_push_is_over_when_the_tip_is_in_front_of_the_ball():
             RollingConfig(), PATH, state, 0.1, DT, x, 0.0, True, R_BALL, R_TIP
         )  # fmt: skip
         assert state.phase == phase
+
+
+def approach(surface, gap_std, T=3.0, speed_below=0.0):
+    """A task that lands on a surface at a height [m] over the modelled landing point,
+    felt as 8 N once the reference is 0.2 mm inside it; 3 N are felt in the air."""
+    config = RollingConfig()
+    ball = np.array([0.6, 0.0])
+    x = pack([0.6, 0.0, 0.1], np.zeros(3), [*ball, R_BALL], np.zeros(3), R_BALL)
+    state = TaskState(ROLL, -10.0, [0.6, 0.0, 0.1], np.zeros(3), np.zeros(3))
+    z_land = surface_height(config.land_behind, R_BALL, R_TIP) + config.land_above
+    rows = []
+    for k in range(round(T / DT)):
+        inside = z_land + surface - state.p[2]
+        force = 3.0 + (8.0 if inside > 2e-4 else 0.0)
+        state = next_state(config, PATH, state, k * DT, DT, x, 0.0, True, R_BALL, R_TIP,
+                           None, gap_std, force)  # fmt: skip
+        rows.append((k * DT, state))
+        if state.phase == ROLL and k > 5:
+            break
+    return config, z_land, rows
+
+
+def test_of_an_uncertain_height_the_last_part_is_slow_and_ends_where_it_touches():
+    config, z_land, rows = approach(surface=0.012, gap_std=0.008)
+    states = [s for _, s in rows if s.phase == APPROACH]
+    # 2.5 deviations of 8 mm above the surface, on which the landing point is 3 mm high.
+    np.testing.assert_allclose(states[0].p[2], z_land + 0.017, atol=1e-9)
+    # The reposition's plan ends at rest; from there the descent is slow.
+    assert max(-s.v[2] for s in states) <= config.approach_speed + 1e-12
+    assert rows[-1][1].phase == ROLL
+    # Over within one tick of what is felt: at most 0.2 mm and a tick's descent inside.
+    end = rows[-1][1].p[2] - (z_land + 0.012)
+    assert -2e-4 - 2 * config.approach_speed * DT <= end <= 0.0
+
+
+def test_a_touch_that_does_not_come_ends_the_approach_at_the_landing_point():
+    config, z_land, rows = approach(surface=-0.01, gap_std=0.002)
+    assert rows[-1][1].phase == ROLL
+    np.testing.assert_allclose(
+        rows[-1][1].p[2], z_land, atol=2 * config.approach_speed * DT
+    )
+
+
+def test_what_is_felt_in_the_air_is_no_touch():
+    _, _, rows = approach(surface=-1.0, gap_std=0.008)  # 3 N all the way.
+    # 17 mm at 35 mm/s.
+    assert sum(s.phase == APPROACH for _, s in rows) > 0.48 / DT
+
+
+@pytest.mark.parametrize("gap_std", [0.0, 0.0011])
+def test_without_much_uncertainty_there_is_no_approach(gap_std):
+    _, _, rows = approach(surface=-1.0, gap_std=gap_std)
+    assert all(s.phase != APPROACH for _, s in rows)
+
+
+def test_an_approach_ends_at_rest_as_a_landing_without_one_does():
+    """A tip that comes down on the ball with some speed kicks it off the path."""
+    _, _, rows = approach(surface=-0.01, gap_std=0.008)
+    # 0.3 m/s2 from 35 mm/s; over within 0.3 mm, and a tick of 12.5 ms before it.
+    assert abs(rows[-1][1].v[2]) <= 0.02

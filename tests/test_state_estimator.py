@@ -15,7 +15,11 @@ from makebreak.systems.numerics.ball_state import (
     V_TIP,
     W_BALL,
 )
-from makebreak.systems.numerics.state_estimator import tip_motion
+from makebreak.systems.numerics.state_estimator import (
+    observe_force,
+    tip_mobility,
+    tip_motion,
+)
 from makebreak.systems.state_estimator import StateEstimator, StateEstimatorConfig
 
 MASS, R_BALL = 1.3, 0.03
@@ -183,3 +187,32 @@ def test_wrong_settings_are_refused_by_name(arm, chain, name):
     config = StateEstimatorConfig(**{name: -1.0})
     with pytest.raises(ValueError, match=rf"{name}.*-1\.0"):
         StateEstimator(config, chain, np.zeros(7))
+
+
+def test_a_steady_force_on_the_tip_is_felt_with_a_first_order_lag():
+    mass, force, gain, dt = (
+        np.diag([3.0, 4.0, 6.0]),
+        np.array([1.0, -2.0, 9.0]),
+        60,
+        1e-4,
+    )
+    a_motors = np.array([0.3, 0.1, -0.5])
+    observer, v = np.zeros(7), np.array([0.02, 0.0, -0.03])
+    for _ in range(500):
+        observer = observe_force(observer, v, a_motors, np.linalg.inv(mass), gain, dt)
+        v = v + dt * (a_motors + np.linalg.solve(mass, force))
+    # Euler at gain dt = 0.006: the lag's exponential is right to half of that.
+    expected = force * (1.0 - np.exp(-gain * 499 * dt))
+    np.testing.assert_allclose(observer[3:6], expected, rtol=0.01)
+
+
+def test_mobility_of_the_tip_is_drakes(chain, arm):
+    context = arm.CreateDefaultContext()
+    frame = arm.GetFrameByName("tip")
+    J = arm.CalcJacobianTranslationalVelocity(
+        context, JacobianWrtVariable.kV, frame, np.zeros(3), arm.world_frame(),
+        arm.world_frame(),
+    )  # fmt: skip
+    M = arm.CalcMassMatrixViaInverseDynamics(context)  # Rotors included.
+    ours = tip_mobility(chain, arm.GetPositions(context))
+    np.testing.assert_allclose(ours, J @ np.linalg.solve(M, J.T), rtol=1e-9, atol=1e-12)

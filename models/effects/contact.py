@@ -448,12 +448,20 @@ def _ball(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph):
         )
     inspector = scene_graph.model_inspector()
     shapes = [inspector.GetShape(g) for g in plant.GetCollisionGeometriesForBody(ball)]
-    if len(shapes) != 1 or not isinstance(shapes[0], Sphere):
+    if not shapes or not all(isinstance(shape, Sphere) for shape in shapes):
         raise ValueError(
             f"effect rolling_resistance at {at!r}: expected {ball.scoped_name()} to "
-            "have one collision geometry, a sphere"
+            "have spheres as collision geometry"
         )
-    return ball, other, shapes[0].radius()
+    # Several make a bumpy object, about as large as they reach on average.
+    reach = [
+        float(np.linalg.norm(inspector.GetPoseInFrame(g).translation()))
+        + shape.radius()
+        for g, shape in zip(
+            plant.GetCollisionGeometriesForBody(ball), shapes, strict=True
+        )
+    ]
+    return ball, other, float(np.mean(reach))
 
 
 def _rolling_now(effect: Effect, plant: MultibodyPlant, scene_graph) -> dict:

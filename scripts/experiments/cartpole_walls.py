@@ -150,7 +150,7 @@ def contact_and_gradient(config: CartpoleWallsConfig, gap_error, x):
     """
     truth, u = true_lcs(), np.zeros(1)
     error = np.broadcast_to(gap_error, (len(x), 2))
-    c = config.learner
+    c = config.learning
     Q_d = np.array(c.Q_d or np.ones(truth.n_x))
     happened, predicted, force = (np.zeros((len(x), 2)) for _ in range(3))
     for k, x_k in enumerate(x):
@@ -262,7 +262,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         return f"{sum(bool(r.get(key)) for r in results)} of {len(results)}"
 
     near, wide, right = many({}), many(WIDE), many({**WIDE, **RIGHT})
-    dynamics = many({**WIDE, "dynamics_residual": True})
+    dynamics = many({**WIDE, "learner": "r_dyn"})
 
     def residual_errors(key):
         values = [r.get(key) for r in near]
@@ -303,7 +303,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     ours = count(wide, "settled_without_adaptation")
     row("start anywhere, without adaptation", "-", ours, wide_command)
     ours = count(dynamics, "settled")
-    dynamics_command = wide_command + " dynamics_residual=true"
+    dynamics_command = wide_command + " learner=r_dyn"
     row("start anywhere, residual on the dynamics", "-", ours, dynamics_command)
     ours = count(right, "settled")
     right_command = wide_command + " gap_error=[0,0] adapt=false"

@@ -73,6 +73,7 @@ class Law(NamedTuple):
     R_upright: np.ndarray  # (3, 3) orientation of the tip frame that counts as upright.
     stiffness: np.ndarray  # (6,) [N/m] x 3, [N m/rad] x 3
     damping: np.ndarray  # (6,) [N s/m] x 3, [N m s/rad] x 3
+    force_max: float  # Of spring and damper together [N].
     posture_stiffness: float  # k_q [1/s2]
     posture_damping: float  # k_v [1/s]
     posture_every: int  # Ticks between two steps of the posture.
@@ -320,6 +321,9 @@ def impedance_torque(
     twist = J @ v
     F = np.empty(m)
     F[:3] = stiffness[:3] * (x_d[:3] - s.p_WE) + damping[:3] * (x_d[7:10] - twist[:3])
+    pushing = np.sqrt(np.sum(F[:3] ** 2))
+    if pushing > law.force_max:
+        F[:3] *= law.force_max / pushing
     a_ref = np.empty(m)
     a_ref[:3] = x_d[13:16]
     if m == 6:

@@ -4,15 +4,18 @@ A tip on top of a rolling ball moves twice as fast as the ball and so leaves it 
 front. The task therefore alternates between
 
     ROLL        the tip follows C3, which pushes the ball along the path,
-    REPOSITION  the tip lifts, passes over the ball and lands behind it, on
-                quintics in time that end where the ball is expected to be, and
+    REPOSITION  the tip lifts, passes over the ball and comes down behind it, on
+                quintics in time that end where the ball is expected to be,
+    APPROACH    from where the ball's surface may be, as far as the uncertainty of its
+                height goes, down to where it is believed to be: slowly, and over as
+                soon as something is felt, and
     WAIT        the ball is not seen: the tip lifts and stays, and nothing is pushed.
 
 Source: ACI-MPC VII-B describes the behaviour (a push, then a new push from behind);
 times and distances are ours (docs/ball_rolling.md).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -26,8 +29,12 @@ from makebreak.systems.numerics.ball_state import (
     compiled_pack,
 )
 
-ROLL, REPOSITION, WAIT = 0, 1, 2
+ROLL, REPOSITION, WAIT, APPROACH = 0, 1, 2, 3
 LOOK_AHEAD = 0.35  # A push is directed at the point so far along the circle [rad].
+APPROACH_PLAN = (
+    0.1  # The approach is planned at least so far ahead, seen from above [s].
+)
+APPROACH_SLOPE, APPROACH_STOP = 1.5, 0.3  # To its speed, and at its end [m/s2].
 REACH = 0.015  # The ball's target is at most so far away; a tip that were to go further
 # at once would slip over the ball and leave it behind [m].
 
@@ -84,6 +91,7 @@ class TaskState:
     a: np.ndarray  # (3,) [m/s2]
     z_start: float = 0.0  # Height and climb where the phase began [m], [m/s].
     vz_start: float = 0.0
+    tare: float = 0.0  # Vertical force on the tip where the approach began [N].
 
     def __post_init__(self):
         for name in ("p", "v", "a"):
@@ -103,6 +111,10 @@ class RollingConfig:
     lift: float = 0.015  # Clearance over the ball while passing it [m].
     land_behind: float = 0.018  # [m]
     land_above: float = 0.003  # Above the surface as it is believed to be [m].
+    n_std: float = 2.5  # Standard deviations of the gap that the approach begins above.
+    approach_speed: float = 0.035  # [m/s]
+    approach_max: float = 0.025  # The longest approach [m].
+    touch_force: float = 4.0  # More on the tip than before is a touch [N].
     ease: float = 0.42  # Share of the reposition for going up, and for coming down.
 
 
@@ -127,12 +139,24 @@ def landing(config, path, x, gap, time_left, radius_ball, radius_tip):
     return p, np.append(x[V_BALL][:2], 0.0)
 
 
-def reposition_step(config, path, state, t, dt, x, gap, radius_ball, radius_tip):
+def approach_height(config, gap_std):
+    """How far above the landing point the slow approach begins [m]; gap_std [m]. The
+    landing point is itself above the surface."""
+    above = config.n_std * gap_std - config.land_above
+    return min(max(above, 0.0), config.approach_max)
+
+
+def reposition_step(
+    config, path, state, t, dt, x, gap, radius_ball, radius_tip, above=0.0
+):
     """The reference (p, v, a), each (3,), a tick dt [s] after the last one.
 
     Seen from above: a quintic from the last reference to the landing point, which is
     planned anew each tick, so that a rolling ball is met where it will be. Height: up
     to the clearance in the first `ease` of the time, down in the last, both quintics.
+
+    Args: above: how far above the landing point it ends [m]; the ball may also be so
+        much larger than believed, and is passed over accordingly.
     """
     T, T_ease = config.reposition_sec, config.ease * config.reposition_sec
     elapsed = min(t + dt - state.since_sec, T)
@@ -143,7 +167,7 @@ def reposition_step(config, path, state, t, dt, x, gap, radius_ball, radius_tip)
     p, v, a = (np.zeros(3) for _ in range(3))
     p[:2], v[:2], a[:2] = quintic(min(dt, left), left, start, end)
     top = 2.0 * radius_ball + radius_tip
-    z_clear = max(top - min(gap, 0.0) + config.lift, state.z_start)
+    z_clear = max(top - min(gap, 0.0) + config.lift + above, state.z_start)
     if elapsed < T_ease:
         begin = state.z_start, state.vz_start, 0.0
         p[2], v[2], a[2] = quintic(elapsed, T_ease, begin, (z_clear, 0.0, 0.0))
@@ -152,8 +176,28 @@ def reposition_step(config, path, state, t, dt, x, gap, radius_ball, radius_tip)
     else:
         down = elapsed - (T - T_ease)
         begin = z_clear, 0.0, 0.0
-        p[2], v[2], a[2] = quintic(down, T_ease, begin, (p_land[2], 0.0, 0.0))
+        end_z = p_land[2] + above, 0.0, 0.0
+        p[2], v[2], a[2] = quintic(down, T_ease, begin, end_z)
     return p, v, a
+
+
+def approach_step(config, path, state, dt, x, gap, radius_ball, radius_tip):
+    """The reference (p, v, a), each (3,), a tick dt [s] after the last one, on the way
+    down to the landing point; and whether it is there."""
+    p_land, v_land = landing(
+        config, path, x, gap, APPROACH_PLAN, radius_ball, radius_tip
+    )
+    left = APPROACH_PLAN
+    start = state.p[:2], state.v[:2], state.a[:2]
+    p, v, a = (np.zeros(3) for _ in range(3))
+    p[:2], v[:2], a[:2] = quintic(
+        dt, left, start, (p_land[:2], v_land[:2], np.zeros(2))
+    )
+    # At rest at the landing point, as a reposition without an approach ends.
+    stop = np.sqrt(2.0 * APPROACH_STOP * max(state.p[2] - p_land[2] - 2e-4, 0.0))
+    v[2] = max(state.v[2] - APPROACH_SLOPE * dt, -min(config.approach_speed, stop))
+    p[2] = state.p[2] + 0.5 * (state.v[2] + v[2]) * dt
+    return p, v, a, bool(p[2] <= p_land[2] + 3e-4)
 
 
 def target_over_horizon(path, x, lead, speed, z_tip, radius_ball, dt, n_knots):
@@ -191,8 +235,9 @@ def _target(center, radius, x, lead, speed, z_tip, radius_ball, dt, n_knots):
 
 
 def next_state(
-    config, path, state, t, dt, x, gap, valid, radius_ball, radius_tip, landed=None
-):
+    config, path, state, t, dt, x, gap, valid, radius_ball, radius_tip, landed=None,
+    gap_std=0.0, force_z=0.0,
+):  # fmt: skip
     """One tick of the task.
 
     Args:
@@ -201,7 +246,9 @@ def next_state(
         valid: whether x can be trusted (the ball is seen).
         landed: whether a reposition that others carry out is over; None: it is when
             its time is.
-    Returns: TaskState: the phase, and in REPOSITION and WAIT the reference at t + dt.
+        gap_std: standard deviation of gap [m]. force_z: vertical force on the tip, as
+            the arm feels it [N].
+    Returns: TaskState: the phase, and unless rolling the reference at t + dt.
     """
 
     def lift_from(phase):
@@ -231,11 +278,21 @@ def next_state(
         if t - state.since_sec < config.roll_sec and ahead < config.roll_ahead:
             return state
         state = lift_from(REPOSITION)
+    if state.phase == APPROACH:
+        p, v, a, low = approach_step(
+            config, path, state, dt, x, gap, radius_ball, radius_tip
+        )
+        if low or force_z - state.tare > config.touch_force:
+            return TaskState(ROLL, t, state.p, state.v, state.a)
+        return replace(state, p=p, v=v, a=a)
+    above = 0.0 if landed is not None else approach_height(config, gap_std)
     over = t - state.since_sec >= config.reposition_sec - 0.5 * dt
     if state.since_sec < t and (over if landed is None else landed):
+        if above > 0.0:
+            return replace(state, phase=APPROACH, since_sec=t, tare=force_z)
         return TaskState(ROLL, t, state.p, state.v, state.a)
     p, v, a = reposition_step(
-        config, path, state, t, dt, x, gap, radius_ball, radius_tip
+        config, path, state, t, dt, x, gap, radius_ball, radius_tip, above
     )
     return TaskState(
         REPOSITION, state.since_sec, p, v, a, state.z_start, state.vz_start

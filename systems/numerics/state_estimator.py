@@ -32,6 +32,35 @@ def tip_motion(chain, q, v, torque, tip_mass):
 
 
 @numba.njit(cache=True)
+def tip_mobility(chain, q):
+    """J M^-1 J' (3, 3) of the tip's translation [1/kg] at q (n,)."""
+    state = chain_state(chain, q, np.zeros(q.shape[0]))
+    J = np.ascontiguousarray(state.J[:3])
+    return J @ np.linalg.solve(state.M, np.ascontiguousarray(J.T))
+
+
+@numba.njit(cache=True)
+def observe_force(observer, v_tip, a_free, mobility, gain, dt):
+    """A momentum observer: what else accelerates the tip than the motors.
+
+    Args: observer (7,) = [expected v_tip (3), force (3), started]; v_tip (3,) [m/s];
+        a_free (3,) that the motors alone give the tip [m/s2]; mobility (3, 3) [1/kg];
+        gain: of the observer, a first-order lag of 1/gain [1/s]; dt [s].
+    Returns: observer (7,); its force is what the surroundings do to the tip [N].
+    Source: De Luca, Haddadin et al., "Robot collisions: a survey on detection,
+        isolation, and identification" (2017), III-D, here for the tip alone.
+    """
+    after = observer.copy()
+    if observer[6] == 0.0:
+        after[:3], after[3:6], after[6] = v_tip, 0.0, 1.0
+        return after
+    pushed = gain * (v_tip - observer[:3])
+    after[:3] += dt * (a_free + pushed)
+    after[3:6] = np.linalg.solve(mobility, pushed)
+    return after
+
+
+@numba.njit(cache=True)
 def estimate(chain, q, v, torque, p_ball, v_ball, seen, tip_mass, radius, window):
     """One reading: the state of the LCS, and the window of forces with it.
 

@@ -1,0 +1,90 @@
+"""The residual of one contact as a probability, given what was measured.
+
+The violation-based loss l_k(r) of a measured step (residual_learner.py), with weights
+that are inverse variances, is a negative log-likelihood. Over a grid of values of r
+
+    p(r) <- p(r) convolved with N(0, drift^2 dt)        the residual may change,
+    p(r) <- p(r) exp(-trust min(l_k(r) - min l_k, l_max))
+
+and the mean is r_comp. The gradient of the loss tells less: it is zero wherever a
+contact was missed (the loss is flat there, however high), so that a gap that is too
+large is hardly ever made smaller; and Adam's steps are of one size, whether the data
+say much or nothing. docs/residual_learning.md has both side by side.
+
+l_max bounds what a single step can say, for an impact within it or a wrong reading;
+trust < 1 because the errors of successive steps are correlated.
+
+Source: the loss, ACI-MPC section VI; the filter is Bayes' rule on a grid (a histogram
+filter: Thrun, Burgard, Fox, "Probabilistic robotics", 4.1).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from makebreak.systems.numerics.residual_learner import Buffer, _solve_step
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualGrid:
+    """The values that the residual may have, and how it is believed to change."""
+
+    values: np.ndarray  # (n,) [m/s], evenly spaced, increasing.
+    transition: np.ndarray  # (n, n) column j: where r may be a step after values[j].
+    prior: np.ndarray  # (n,) sums to 1.
+
+
+def residual_grid(r_max, spacing, prior_std, drift_std) -> ResidualGrid:
+    """Args: r_max: the grid's ends; spacing; prior_std about 0; drift_std in one time
+    step of the learner, all [m/s]."""
+    n = 2 * int(np.ceil(r_max / spacing)) + 1
+    values = np.linspace(-r_max, r_max, n)
+    distance = values[:, None] - values[None, :]
+    transition = np.exp(-0.5 * (distance / max(drift_std, 0.05 * spacing)) ** 2)
+    transition /= transition.sum(axis=0)
+    prior = np.exp(-0.5 * (values / prior_std) ** 2)
+    prior /= prior.sum()
+    for array in (values, transition, prior):
+        array.setflags(write=False)
+    return ResidualGrid(values, transition, prior)
+
+
+def losses_on_grid(step: Buffer, shared, values, eps, gamma):
+    """The loss of one measured step for each value of its residual.
+
+    Args: step: a buffer of one; shared (n_lam,): which entries of the contact equation
+        have the residual; values (n,) [m/s]; eps, gamma as in residual_learner.py.
+    Returns: loss (n,); nan where a QP was not solved.
+    """
+    data = (step.P[0], step.p[0], step.F[0], step.q[0])
+    return step.constant[0] + _costs(*data, shared, values, gamma) / eps
+
+
+@njit(cache=True)
+def _costs(P, p, F, q, shared, values, gamma):
+    costs = np.empty(values.size)
+    b = np.empty(q.size)
+    for j in range(values.size):
+        for i in range(q.size):
+            b[i] = q[i] + (values[j] if shared[i] else 0.0)
+        solved, cost, _, _, _ = _solve_step(P, p, F, b, gamma)
+        costs[j] = cost if solved else np.nan
+    return costs
+
+
+def updated(grid: ResidualGrid, belief, loss, trust, loss_max):
+    """The belief (n,) after a step with these losses (n,); as it was, had the residual
+    had time to change, where the losses are not finite."""
+    belief = grid.transition @ belief
+    if np.isfinite(loss).all():
+        belief = belief * np.exp(-trust * np.minimum(loss - loss.min(), loss_max))
+    return belief / belief.sum()
+
+
+def mean_and_std(grid: ResidualGrid, belief) -> tuple[float, float]:
+    """Of the residual [m/s]. The grid's spacing is part of the deviation."""
+    mean = float(grid.values @ belief)
+    spacing = grid.values[1] - grid.values[0]
+    variance = float((grid.values - mean) ** 2 @ belief) + spacing**2 / 12.0
+    return mean, float(np.sqrt(variance))

@@ -1,0 +1,209 @@
+"""The residual as a probability: its maths, and what the ball's learner makes of it."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from test_residual_learner import PUSH, Script, point_mass
+
+from makebreak.diagrams.ball_rolling import (
+    LEARN,
+    LearnerConfig,
+    learner_config,
+    paper_learner_config,
+)
+from makebreak.models.tip_and_ball import TipAndBall, make_tip_and_ball
+from makebreak.systems.lcs_builder import (
+    AnitescuLcsBuilder,
+    ContactPair,
+    LcsBuilderConfig,
+)
+from makebreak.systems.numerics.ball_state import V_TIP, pack
+from makebreak.systems.numerics.lcs import simulate
+from makebreak.systems.numerics.residual_learner import measured_step, violation_loss
+from makebreak.systems.numerics.residual_posterior import (
+    losses_on_grid,
+    mean_and_std,
+    residual_grid,
+    updated,
+)
+from makebreak.systems.residual_learner import (
+    LearnerStatus,
+    PosteriorConfig,
+    ResidualLearner,
+    ResidualLearnerConfig,
+)
+
+GRID = residual_grid(r_max=0.7, spacing=0.01, prior_std=0.16, drift_std=0.01)
+
+
+def test_the_prior_is_a_gaussian_about_zero():
+    mean, std = mean_and_std(GRID, GRID.prior)
+    # The grid ends at 4.4 deviations and is 16 times finer than one.
+    assert mean == pytest.approx(0.0, abs=1e-12) and std == pytest.approx(0.16, 1e-3)
+
+
+def test_losses_are_the_violation_loss_under_each_residual():
+    lcs = point_mass(5e-3)
+    step = measured_step(lcs, [0.0, 0.0], [PUSH], [0.0, 0.0], np.ones(2), 1.0)
+    values = np.linspace(-0.3, 0.3, 7)
+    loss = losses_on_grid(step, np.array([True]), values, 1.0, 5e-4)
+    expected = [violation_loss(step, np.array([r]), 1.0, 5e-4)[0][0] for r in values]
+    np.testing.assert_allclose(loss, expected, rtol=1e-12)
+
+
+def test_gaussian_measurements_and_drift_give_the_kalman_filter():
+    truth_std, drift = 0.05, 0.01
+    mean, variance = 0.0, 0.16**2
+    belief = GRID.prior
+    for y in (0.2, 0.15, 0.22, 0.18):
+        variance += drift**2
+        gain = variance / (variance + truth_std**2)
+        mean, variance = mean + gain * (y - mean), (1.0 - gain) * variance
+        loss = 0.5 * ((GRID.values - y) / truth_std) ** 2
+        belief = updated(GRID, belief, loss, trust=1.0, loss_max=np.inf)
+    ours = mean_and_std(GRID, belief)
+    # Drift is as wide as the grid is fine: sampled, its variance is right to 1e-3; the
+    # grid's own spacing is added, 0.01^2/12.
+    assert ours[0] == pytest.approx(mean, abs=1e-3)
+    assert ours[1] == pytest.approx(np.sqrt(variance + 0.01**2 / 12), rel=0.01)
+
+
+def test_one_reading_changes_odds_by_no_more_than_it_may():
+    loss = np.where(GRID.values == GRID.values[90], 0.0, 1e6)
+    still = residual_grid(0.7, 0.01, 0.16, 1e-9)
+    after = updated(still, still.prior, loss, trust=0.1, loss_max=6.0)
+    odds = (after[90] / after[60]) / (still.prior[90] / still.prior[60])
+    assert odds == pytest.approx(np.exp(0.6))
+
+
+def test_losses_that_are_not_finite_leave_the_belief_to_drift():
+    loss = np.full(GRID.values.size, np.nan)
+    after = updated(GRID, GRID.prior, loss, 0.1, 6.0)
+    expected = GRID.transition @ GRID.prior
+    np.testing.assert_allclose(after, expected / expected.sum())
+    assert mean_and_std(GRID, after)[1] > 0.16
+
+
+# The learner of ball_rolling, on what a tip of 1 kg does above a ball that lies still.
+
+MODEL = TipAndBall()
+REACH = MODEL.tip_radius + MODEL.ball_radius
+
+
+@pytest.fixture(scope="module")
+def builder():
+    pairs = [ContactPair("tip::tip", "ball::ball", 1.0)]
+    pairs.append(ContactPair("ball::ball", "table::table", 1.0))
+    return AnitescuLcsBuilder(
+        make_tip_and_ball(MODEL)[0], LcsBuilderConfig(pairs, LEARN, None, LEARN, 0.0)
+    ).model
+
+
+def press(builder, gap, n=40, noise=0.0, z_end=-0.02):
+    """A tip comes down on the ball's top, whose surface is `gap` lower than modelled
+    [m], at 4 cm/s, and rests there or at z_end below the modelled one; the ball lies.
+
+    Returns: x (n, 19), u (n, 3) that would have moved it without contact, LCS (n).
+    """
+    rng = np.random.default_rng(0)
+    top = MODEL.ball_radius + REACH
+    below = np.maximum(0.01 - 0.04 * LEARN * np.arange(n + 1), z_end)
+    z = np.maximum(top + below, top - gap)
+    v = np.diff(z, prepend=z[0] + 0.04 * LEARN) / LEARN
+    x, u, all_lcs = [], [], []
+    for k in range(n):
+        row = pack([0.0, 0.0, z[k]], [0.0, 0.0, v[k]], [0, 0, MODEL.ball_radius],
+                   np.zeros(3), MODEL.ball_radius)  # fmt: skip
+        row[V_TIP] += noise * rng.normal(size=3)
+        x.append(row)
+        # The arm's own push: 2 N where something is in the way, else what moves it.
+        blocked = z[k + 1] <= top - gap + 1e-9 and below[k + 1] > z_end - 1e-9
+        pushed = -2.0 if blocked and k > 3 else 0.0
+        u.append([0.0, 0.0, (v[k + 1] - v[k]) / LEARN * MODEL.tip_mass + pushed])
+        all_lcs.append(builder.build(row, np.zeros(3)))
+    return np.array(x), np.array(u), all_lcs
+
+
+def learned(config, x, u, all_lcs):
+    """r_comp as a gap, r_std as one, and the status at the end."""
+    diagram = DiagramBuilder()
+    enable = np.ones((len(x), 1))
+    # u of the script is that of the step that ends.
+    script = diagram.AddSystem(
+        Script(x, np.vstack([u[:1], u[:-1]]), all_lcs, enable, LEARN)
+    )
+    learner = diagram.AddSystem(ResidualLearner(config, all_lcs[0], LEARN, 1e-3))
+    for port, name in (("x", "x"), ("u", "u_measured"), ("lcs", "lcs")):
+        diagram.Connect(script.GetOutputPort(port), learner.GetInputPort(name))
+    diagram.Connect(script.GetOutputPort("enable"), learner.GetInputPort("enable"))
+    simulator = Simulator(diagram.Build())
+    simulator.AdvanceTo(LEARN * (len(x) - 1) + 2e-3)
+    context = learner.GetMyContextFromRoot(simulator.get_context())
+    r, std, status = (
+        learner.GetOutputPort(name).Eval(context)
+        for name in ("r_comp", "r_std", "status")
+    )
+    assert r[:4].min() == r[:4].max() and not r[4:].any()
+    return LEARN * r[0], LEARN * std[0], status[0]
+
+
+@pytest.mark.parametrize("gap", [-0.008, 0.0, 0.010])
+def test_a_tip_that_is_stopped_tells_where_the_surface_is(builder, gap):
+    config = learner_config(LearnerConfig())
+    r, std, status = learned(config, *press(builder, gap, noise=2e-3, z_end=-0.04))
+    # Forty steps of which some twenty touch; the grid is 0.5 mm.
+    assert abs(r - gap) < 0.002 and abs(r - gap) < 3.0 * std
+    assert status == LearnerStatus.LEARNED and std < 0.004
+
+
+def test_air_where_the_model_has_the_ball_is_learned_from_v_z_of_the_tip_alone(builder):
+    """The tip rests 6 mm below the modelled surface, and nothing stopped it. Without
+    the weight on its v_z, a still ball is explained by friction forces that cancel."""
+    data = press(builder, gap=0.05, z_end=-0.006)
+    r, _, _ = learned(learner_config(LearnerConfig()), *data)
+    assert r > 0.005
+    blind, std, _ = learned(learner_config(LearnerConfig(weight_tip=0.0)), *data)
+    assert blind < 0.003 and std > 0.006  # About what it believed before.
+
+
+def test_without_a_posterior_r_std_is_zero_and_r_comp_adapts_entry_by_entry(builder):
+    x, u, all_lcs = press(builder, gap=0.05, z_end=-0.006)
+    config = paper_learner_config(all_lcs[0].n_lam)
+    assert config.posterior is None and config.groups == [[i] for i in range(8)]
+    config = ResidualLearnerConfig(Q_d=learner_config(LearnerConfig()).Q_d,
+                                   groups=[[0, 1, 2, 3]])  # fmt: skip
+    _, std, _ = learned(config, x, u, all_lcs)
+    assert std == 0.0
+
+
+def test_a_gap_that_is_too_large_has_no_gradient_but_a_likelihood():
+    """A mass rests on a wall; a model whose wall is 20 mm further explains nothing of
+    it, and its loss is flat: the gradient is zero, the posterior is not misled."""
+    lcs = point_mass(5e-3)
+    Q, eps = np.array([0.0, 1e4]), 1e-4
+    x_next, _ = simulate(point_mass(), np.zeros(2), [PUSH])
+    step = measured_step(lcs, [0.0, 0.0], [PUSH], x_next, Q, eps)
+    far = np.array([0.3])
+    _, gradient, _, _ = violation_loss(step, far, eps, 5e-4)
+    assert abs(gradient[0, 0]) * eps < 1e-9
+    loss = losses_on_grid(step, np.array([True]), GRID.values, eps, 5e-4)
+    belief = GRID.prior
+    for _ in range(60):
+        belief = updated(GRID, belief, loss, 0.1, 6.0)
+    assert mean_and_std(GRID, belief)[0] == pytest.approx(-0.1, abs=0.01)  # 5 mm/dt.
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        (dict(groups=[]), "expected one group with a posterior"),
+        (dict(posterior=PosteriorConfig(trust=0.0)), "posterior.trust is 0.0"),
+        (dict(posterior=PosteriorConfig(drift=np.nan)), "posterior.drift is nan"),
+    ],
+)
+def test_wrong_settings_are_refused_by_name(builder, changes, message):
+    lcs = builder.build(builder.x_default, np.zeros(3))
+    settings = dict(groups=[[0, 1, 2, 3]], posterior=PosteriorConfig()) | changes
+    with pytest.raises(ValueError, match=message):
+        ResidualLearner(ResidualLearnerConfig(**settings), lcs, LEARN)
