@@ -265,9 +265,9 @@ def still_track(n=4000, joints=2):
 CLEAN = Logging(1000.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def log_of(how, track=None, seed=0):
-    rng = np.random.default_rng(seed)
-    return write_log(track or still_track(), ["a.x", "a.y"], how, np.zeros(2), rng)[0]
+def log_of(how, track=None, seed=0, names=("a.x", "a.y")):
+    rng, zero = np.random.default_rng(seed), np.zeros(len(names))
+    return write_log(track or still_track(), list(names), how, zero, rng)[0]
 
 
 def test_a_clean_log_is_the_track():
@@ -280,6 +280,44 @@ def test_a_clean_log_is_the_track():
         log["a.x.effort_measured"], 10 * np.sin(3 * t), atol=1e-12
     )
     np.testing.assert_allclose(log["a.x.effort_command"], 2 * np.sin(3 * t), atol=1e-12)
+
+
+@pytest.mark.parametrize("side", ["motor", "link"])
+@pytest.mark.parametrize("name", ["planar", "scara"])
+def test_a_log_hides_nothing_that_its_truth_does_not_name(name, side):
+    """Without noise and effects, what is left of the logged effort follows nothing that
+    an effect would make: no delay, friction, inertia or bias."""
+    robot, motion = robot_and_motion(name, seconds=6.0)
+    track = RobotWorld(robot, robot, [], Drive()).run(motion)
+    log = log_of(replace(CLEAN, rate_hz=500.0, side=side), track, names=robot.joints)
+    known = robot
+    if side == "link":
+        known = replace(
+            robot, bodies=tuple(replace(b, rotor=0.0) for b in robot.bodies)
+        )
+    rows = slice(200, -200)  # The start's swing dies away.
+
+    def of(quantity):
+        return np.column_stack([log[f"{j}.{quantity}"] for j in robot.joints])
+
+    q, v, u = of("position"), of("velocity"), of("effort_measured")
+    a = np.gradient(v, 0.002, axis=0)
+    left = (u - Inverse(known)(q, v, a))[rows]
+    rate = np.gradient(u, 0.002, axis=0)
+    for i in range(len(robot.joints)):
+        columns = np.column_stack(
+            [
+                rate[rows, i],
+                v[rows, i],
+                np.sign(v[rows, i]),
+                a[rows, i],
+                left[:, i] * 0 + 1,
+            ]
+        )
+        found = np.linalg.lstsq(columns, left[:, i], rcond=None)[0]
+        size = np.abs(columns * found).max(axis=0)
+        assert abs(found[0]) < 2e-5, "a delay [s]"
+        assert size.max() < 1e-3 * np.abs(u[:, i]).max(), (i, found)
 
 
 def test_rows_are_held_stamps_jitter_and_encoders_are_coarse():

@@ -132,7 +132,12 @@ def write_log(
             noise["velocity"] = how.velocity_noise * left
         measured["velocity"] = v
     if how.side:
-        u = at_rows(track.motor if how.side == "motor" else track.link)
+        u = track.motor if how.side == "motor" else track.link
+        if how.side == "motor" and not how.with_command:
+            # The drive renews its effort each millisecond: what it gives about an
+            # instant is the mean of both, else every log would be half of one late.
+            u = np.vstack([u[:1], 0.5 * (u[1:] + u[:-1])])
+        u = at_rows(u)
         u = u + np.asarray(how.effort_bias) + how.effort_noise * rng.normal(size=shape)
         u = u + how.wander * wandering(
             len(rows), spacing * _GRID, how.memory, (n,), rng
