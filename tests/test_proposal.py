@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from gap_benchmark.cases import cases, make
 
+from makebreak.diagrams.scene_simulation import SceneSimulation
 from makebreak.gap.data.proposal import JointName, of_one_drive, propose
 from makebreak.gap.data.robot import propose_scene, read_log, read_robot
 from makebreak.gap.recording import read_recording
+from makebreak.models.scene import read_scene
 from makebreak.scripts.cli import main
 
 T = np.arange(400) * 0.01
@@ -189,3 +191,27 @@ def test_a_log_or_a_robot_that_tells_nothing_is_refused(
     (tmp_path / "bad.urdf").write_text("<robot")
     assert main(["inspect", str(log), "--robot", str(tmp_path / "bad.urdf")]) == 2
     assert "cannot be read" in capsys.readouterr().err
+
+
+SERVO_ARM = """<robot name="s"><link name="base"/><link name="arm"><inertial>
+<origin xyz="0.1 0 0"/><mass value="0.2"/><inertia ixx="1e-5" iyy="1e-5" izz="1e-5"
+ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="lift" type="revolute">
+<parent link="base"/><child link="arm"/><axis xyz="0 -1 0"/>
+<limit lower="-2" upper="2" effort="3" velocity="5"/></joint></robot>"""
+
+
+def test_a_servo_is_proposed_with_the_stiffness_that_its_sag_tells(tmp_path):
+    (tmp_path / "s.urdf").write_text(SERVO_ARM)
+    q = 0.5 * np.sin(0.3 * T)
+    # It holds 0.2 kg at 0.1 m with 6 N m/rad; about -y, upwards is positive.
+    goal = q + 0.2 * 9.81 * 0.1 * np.cos(q) / 6.0
+    rows = np.stack([T, np.degrees(q), np.degrees(goal)], axis=1)
+    head = "t,lift_pos [deg],lift_goal [deg]"
+    np.savetxt(tmp_path / "log.csv", rows, "%.9g", ",", header=head, comments="")
+    robot = read_robot(tmp_path / "s.urdf")
+    proposal = propose_scene(robot, [read_log(tmp_path / "log.csv")])
+    (tmp_path / "scene.yaml").write_text(proposal.scene)
+    scene = read_scene(tmp_path / "scene.yaml")
+    assert scene.actuation.type == "servo"
+    np.testing.assert_allclose(scene.actuation.kp, 6.0, rtol=0.01)
+    SceneSimulation(scene)  # It can be simulated.

@@ -25,6 +25,7 @@ from makebreak.models.effects.kind import actuator_of, one_dof_joints
 ROBOTS = (".urdf", ".sdf", ".xml")
 GUESSED_KP = 10.0  # [N m/rad], where the log does not tell.
 SERVO_DAMPING_SEC = 0.07  # Of kd to kp, of a small geared servo's back-EMF.
+ROTOR_SEC = 0.05  # Of its inertia at the joint to kd.
 LEAST_LOAD = 0.05  # Of a joint's rms gravity torque [N m], to tell its servo by.
 
 
@@ -200,6 +201,14 @@ def _actuation(robot: Robot, kinds, every, logs, notes: list[str]) -> list[str]:
         limits = [robot.effort_limits.get(j, np.inf) for j in joints]
         if all(0.0 < limit < 1e6 for limit in limits):
             lines.append(f"  limit: {[float(x) for x in limits]}  # [N m]")
+        # A geared motor's own inertia is what its back-EMF and its spring work on.
+        lines.append("effects:  # Rotors of the servos' motors, a guess.")
+        for joint, k in zip(joints, kp, strict=True):
+            inertia = float(f"{ROTOR_SEC * SERVO_DAMPING_SEC * k:.2g}")
+            lines.append(
+                f"- {{kind: rotor_inertia, at: {joint}, "
+                f"parameters: {{inertia: {inertia}}}}}  # [kg m2]"
+            )
         return lines
     if joints := named("velocity_command"):
         notes.append("drives follow velocities, with a gain that is a guess")
