@@ -14,6 +14,7 @@ from makebreak.gap.result import GapResult, Series
 BEFORE, AFTER, MEASURED = "#d98032", "#2b6cb0", "#222222"
 _MOST_CHANNELS = 14  # In one picture: more cannot be read.
 _MOST_BINS = 600
+MOST_PARAMETERS = 24  # In one picture of strips.
 _MOST_WINDOWS = 8
 
 
@@ -205,6 +206,57 @@ def _stretch(each: Series) -> Series:
     return replace(
         each, time=time, measured=measured, before=before, after=after, starts=starts
     )
+
+
+def picture_of_trust(result: GapResult) -> Figure | None:
+    """A strip for each parameter: its value on parts of the data and from other starts,
+    in the deviations that such a part should have from what all data say.
+
+    Returns: None if there is none.
+    """
+    shown = result.trust[:MOST_PARAMETERS]
+    if not shown:
+        return None
+    figure = Figure(
+        figsize=(8.0, 1.2 + 0.34 * max(len(shown), 2)), layout="constrained"
+    )
+    axes = figure.add_subplot()
+    axes.axvspan(-2.0, 2.0, color="0.92", lw=0)
+    marks = (
+        ("stretches", "o", "stretches of time", "#d98032"),
+        ("recordings", "D", "recordings", "#2b6cb0"),
+        ("starts", "|", "other starts", "#222222"),
+    )
+    widest = 3.0
+    for row, each in enumerate(shown):
+        for name, mark, _, colour in marks:
+            values = getattr(each, name)
+            values = list(values.values()) if isinstance(values, Mapping) else values
+            size = max(each.std, 1e-9 * abs(each.value), 1e-300)
+            if name != "starts":  # A part of the data knows less than all.
+                size *= max(len(values), 1) ** 0.5
+            off = [(v - each.value) / size for v in values if np.isfinite(v)]
+            widest = max([widest, *map(abs, off)])
+            axes.plot(off, [row] * len(off), mark, color=colour, ms=6, mfc="none")
+    for _, mark, label, colour in marks:
+        axes.plot([], [], mark, color=colour, mfc="none", label=label)
+    names = [f"{t.parameter} of {t.kind} at {', '.join(t.at)}" for t in shown]
+    axes.set_yticks(range(len(shown)), names, fontsize=8)
+    axes.set_ylim(len(shown) - 0.5, -0.5)
+    axes.set_xscale("symlog", linthresh=3.0)
+    axes.set_xlim(-1.3 * widest, 1.3 * widest)
+    ticks = [-1000, -100, -30, -10, -3, -2, 0, 2, 3, 10, 30, 100, 1000]
+    axes.set_xticks([x for x in ticks if abs(x) <= 1.3 * widest])
+    _plain_numbers(axes.xaxis)
+    axes.set_xlabel(
+        "off the value, in deviations that such a part should have (grey: within two)",
+        fontsize=9,
+    )
+    axes.legend(
+        fontsize=8, frameon=False, ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0)
+    )
+    _plain(axes)
+    return figure
 
 
 def _plain_numbers(axis) -> None:

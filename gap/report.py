@@ -16,6 +16,7 @@ from makebreak.gap.findings import Finding
 from makebreak.gap.pictures import (
     picture_of_channels,
     picture_of_series,
+    picture_of_trust,
     picture_of_where,
 )
 from makebreak.gap.recording import Recording
@@ -60,6 +61,7 @@ def write_report(
         "channels": picture_of_channels(result) if result.gap.per_channel else None,
         "where": picture_of_where(result, extents_of(recordings)),
         "series": picture_of_series(result.series),
+        "trust": picture_of_trust(result),
     }
     drawn = {name: _png(each) for name, each in pictures.items() if each is not None}
     try:
@@ -69,6 +71,15 @@ def write_report(
         _write(files[0], text)
         fixed = replace(scene, effects=[*scene.effects, *result.scene_effects()])
         write_scene(fixed, files[1], _scene_heading(result, scene_path), place)
+        if result.effects and result.nuisance_scene:
+            # The links as they were moved, too: for who trusts these data more than
+            # the model. Effects come last: they change what is there.
+            moved = [*scene.effects, *result.nuisance_scene, *result.scene_effects()]
+            files.append(out / "scene_moved.yaml")
+            write_scene(
+                replace(scene, effects=moved), files[-1],
+                _scene_heading(result, scene_path), place,
+            )  # fmt: skip
         page = report_html(
             result, drawn, place, scene_path, recordings, comparison is not None
         )
@@ -172,10 +183,13 @@ def report_html(
     sections = [
         _where(result, pictures),
         _series(result, pictures),
+        _in_units(result),
+        _trust(result, pictures),
         _considered(result),
         _unexplained(result),
         _checks(result),
         _background(result),
+        _channels(result),
         _go_on(result, out, scene_path, recordings, has_comparison),
         _seconds(result),
     ]
@@ -289,9 +303,18 @@ def _numbers(result: GapResult) -> str:
     shown = "".join(
         f"<div><b>{value}</b><span>{name}</span></div>" for name, value in cells
     )
+    seen = {
+        "reported": " that were neither fitted nor chosen on",
+        "chosen on": " that chose between models: nothing was kept back for the report",
+    }.get(g.data, ": nothing could be held out")
+    if g.n_windows and any(g.failed):
+        seen += (
+            f"; {g.failed[0]} before and {g.failed[1]} after of {g.n_windows} could "
+            "not be simulated to their end and count in neither"
+        )
     return (
         f'<div class="numbers">{shown}</div><p class="small">Error over noise, rms '
-        f"over {windows_of(result)} that nothing was fitted to.</p>"
+        f"over {windows_of(result)}{seen}.</p>"
     )
 
 
@@ -407,6 +430,66 @@ def _background(result: GapResult) -> str:
     return _section(
         "Background", f"<p>{says}</p>" + _table(["term", "tolerances"], rows, most=5)
     )
+
+
+def _in_units(result: GapResult) -> str:
+    """Held-out errors as they are: not over noise, not clipped."""
+    rows = [
+        [name, e.unit, _n(e.before), _n(e.after), _n(e.noise)]
+        for name, e in result.gap.in_units.items()
+    ]
+    heads = ["channel", "unit", "before", "after", "noise"]
+    if not rows:
+        return ""
+    body = f"<p>Rms over {windows_of(result)}.</p>" + _table(heads, rows, most=14)
+    rows = [
+        [name, e.unit, _n(e.before), _n(e.after), _n(e.noise)]
+        for name, e in result.gap.equations.items()
+    ]
+    if rows:
+        body += (
+            "<p>What is left of each joint's equation of motion on the same data, with "
+            "the nuisance parameters moved in both.</p>"
+        )
+        body += _table(heads, rows, most=14)
+    return _section("Errors in their units", body)
+
+
+def _trust(result: GapResult, pictures) -> str:
+    if not result.trust:
+        return ""
+    rows = []
+    for t in result.trust:
+        parts = [v for v in t.stretches if np.isfinite(v)]
+        spread = f"{_n(min(parts))} to {_n(max(parts))}" if parts else "-"
+        starts = [v for v in t.starts if np.isfinite(v)]
+        rows.append(
+            [f"{t.parameter} of {t.kind} at {', '.join(t.at)}", _n(t.value),
+             _n(t.std, 2), spread,
+             f"{_n(min(starts))} to {_n(max(starts))}" if starts else "-",
+             f"only a sum with {t.ridge_with} shows" if t.ridge_with else ""]
+        )  # fmt: skip
+    heads = ["parameter", "value", "deviation", "over stretches of time",
+             "from other starts", ""]  # fmt: skip
+    note = (
+        '<p class="small">Each parameter fitted on one stretch of time, or one '
+        "recording, alone (all others as they are), and from other starts.</p>"
+    )
+    picture = _image(pictures, "trust", "Each parameter on parts of the data")
+    return _section(
+        "What can be trusted", picture + note + _table(heads, rows, most=12)
+    )
+
+
+def _channels(result: GapResult) -> str:
+    if not result.channels:
+        return ""
+    rows = [
+        [c.channel, c.judged, f"{_n(c.noise)} {c.unit}", c.noise_from]
+        for c in result.channels
+    ]
+    heads = ["channel", "judged by", "noise, as used", "which is"]
+    return _section("Channels", _table(heads, rows, most=8))
 
 
 def _go_on(result, out, scene_path, recordings, has_comparison) -> str:

@@ -264,7 +264,7 @@ class _Search:
         if not sound:
             return None, table
         pick = self._picked(sound, found)
-        pair = self._pair(screen, chosen, ranked, sound[pick][0])
+        pair = self._pair(screen, chosen, ranked, *sound[pick])
         if pair is not None:
             sound.append(pair)
             pick = len(sound) - 1
@@ -301,14 +301,17 @@ class _Search:
                 return k
         return pick
 
-    def _pair(self, screen, chosen, ranked: Sequence[Ranked], single: Fitted):
-        """Two effects at once where they leave clearly less than the best single one:
-        what two do together another kind may imitate better than either of them."""
+    def _pair(
+        self, screen, chosen, ranked: Sequence[Ranked], single: Fitted, of: Ranked
+    ):
+        """Two other effects at once where they leave clearly less than the best single
+        one: what two do together another kind may imitate better than either of them.
+        (Two of which it is one are found step by step.)"""
         if self.plan.jumps or self.problem.noise_error(single.left) < FLOOR:
             return None
         best: dict[str, Ranked] = {}
         for r in ranked:
-            if not r.candidate.members:
+            if not r.candidate.members and r.candidate.kind != of.candidate.kind:
                 best.setdefault(r.candidate.kind, r)
         tried = list(best.values())[:PAIRED]
         trials = []
