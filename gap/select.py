@@ -310,8 +310,11 @@ class _Search:
         if self.plan.jumps or self.problem.noise_error(single.left) < FLOOR:
             return None
         best: dict[str, Ranked] = {}
+        own = of.candidate.kind
         for r in ranked:
-            if not r.candidate.members and r.candidate.kind != of.candidate.kind:
+            kind = r.candidate.kind
+            same = kind == own or own in NESTED.get(kind, ())
+            if not r.candidate.members and not same:
                 best.setdefault(r.candidate.kind, r)
         tried = list(best.values())[:PAIRED]
         trials = []
