@@ -306,15 +306,13 @@ class _Search:
     ):
         """Two other effects at once where they leave clearly less than the best single
         one: what two do together another kind may imitate better than either of them.
-        (Two of which it is one are found step by step.)"""
+        Two of which it is one, if they leave least, are found step by step."""
         if self.plan.jumps or self.problem.noise_error(single.left) < FLOOR:
             return None
         best: dict[str, Ranked] = {}
         own = of.candidate.kind
         for r in ranked:
-            kind = r.candidate.kind
-            same = kind == own or own in NESTED.get(kind, ())
-            if not r.candidate.members and not same:
+            if not r.candidate.members:
                 best.setdefault(r.candidate.kind, r)
         tried = list(best.values())[:PAIRED]
         trials = []
@@ -330,6 +328,9 @@ class _Search:
                 trials.append((fit.score, a, b, effects))
         trials.sort(key=lambda t: t[0])
         for score, a, b, effects in trials[:2]:
+            if any(k == own or own in NESTED.get(k, ()) for k in
+                   (a.candidate.kind, b.candidate.kind)):  # fmt: skip
+                break  # The single one with another is as good or better.
             if not self._error(score) < (1.0 - NESTED_GAIN) * self._error(single.score):
                 break
             both = Candidate(

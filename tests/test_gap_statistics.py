@@ -4,15 +4,19 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
 from makebreak.gap.fit import derivative_free_search, fit_effects
 from makebreak.gap.problem import SearchPlan
+from makebreak.gap.trust import gauss_newton, ridges
 from makebreak.models.effects.kind import Effect
 from makebreak.systems.numerics.selection import (
     Screen,
     benjamini_hochberg,
+    boxed_minimum,
     is_plausible,
     paired,
+    paired_t,
     simplest,
     spread_by_blocks,
 )
@@ -198,3 +202,77 @@ def test_a_search_without_slopes_crosses_the_steps_that_stop_a_fit():
     for far in (False, True):
         (found,) = derivative_free_search(model, screen, start, [()], far)
         assert found.parameters["damping"] == pytest.approx(0.3, abs=0.011)
+
+
+def test_bounded_nuisances_are_those_of_bounded_least_squares():
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        n = int(rng.integers(2, 30))
+        A = rng.normal(size=(40, n)) * 10.0 ** rng.uniform(-2, 2, n)
+        A[:, 0] += 0.9 * A[:, -1]
+        H, g = A.T @ A + 1e-6 * np.eye(n), A.T @ rng.normal(size=40)
+        limit = np.abs(np.linalg.solve(H, g)) * rng.uniform(0.3, 2.0, n)
+        b = boxed_minimum(H, g, limit)
+        assert (np.abs(b) <= limit * (1.0 + 1e-9)).all()
+        # The other solver's own tolerance is 1e-10 of the objective.
+        L = np.linalg.cholesky(H)
+        y = np.linalg.solve(L, g)
+        least = lsq_linear(L.T, y, (-limit, limit), method="bvls", tol=1e-14).x
+        value, want = (0.5 * x @ H @ x - g @ x for x in (b, least))
+        assert value <= want + 1e-8 * abs(want)
+
+
+def test_a_nuisance_at_its_limit_leaves_what_it_may_not_take():
+    rng = np.random.default_rng(1)
+    m, train = 400, np.arange(400) % 3 != 1
+    N, x = rng.normal(size=(m, 2)), rng.normal(size=(m, 1))
+    r = 10.0 * N[:, 0] + 2.0 * x[:, 0] + 0.1 * rng.normal(size=m)
+    screen = Screen(r, N, np.array([1.0, 1.0]), train, reach=3.0)
+    fit = screen.fit(x)
+    assert fit.b[0] == pytest.approx(3.0) and abs(fit.b[1]) < 1.5
+    # 7 of the first column are left; without a bound the noise of 0.1 would be.
+    assert fit.held_out == pytest.approx(7.0, rel=0.15)
+    assert screen.wanted(r - 2.0 * x[:, 0])[0] == pytest.approx(10.0, rel=0.01)
+    free = Screen(r, N, np.array([1.0, 1.0]), train).fit(x)
+    assert free.held_out < 0.3 and free.c[0] == pytest.approx(2.0, abs=0.05)
+
+
+def test_two_parameters_of_which_only_a_sum_shows_are_flagged():
+    rng = np.random.default_rng(2)
+    x, y = rng.normal(size=(300, 2)).T
+    J = np.stack([x, 0.3 * x + 1e-3 * rng.normal(size=300), y], axis=1)
+    assert ridges(J).tolist() == [1, 0, -1]
+    assert ridges(np.stack([x, x, y], axis=1)).tolist() == [1, 0, -1]  # Exactly.
+    assert ridges(np.stack([x, x + y], axis=1)).tolist() == [-1, -1]  # 0.7.
+    assert ridges(x[:, None]).tolist() == [-1]
+
+
+def test_a_parameter_on_a_part_of_the_rows_is_that_of_a_fit_of_these():
+    rng = np.random.default_rng(3)
+    J, true = rng.normal(size=(200, 2)), np.array([1.0, -2.0])
+    part = np.arange(200) < 80
+    y = J @ true + 0.1 * rng.normal(size=200) + np.where(part, 0.5 * J[:, 0], 0.0)
+    best = np.linalg.lstsq(J, y, rcond=None)[0]
+    want = np.linalg.lstsq(J[part], y[part], rcond=None)[0]
+    # Residual model minus data, whose slope is J.
+    found = best + gauss_newton(J, J @ best - y, part)
+    np.testing.assert_allclose(found, want, atol=1e-9)
+    hidden = np.where(part[:, None] & (np.arange(2) == 1), 0.0, J)
+    assert np.isnan(gauss_newton(hidden, J @ best - y, part)[1])
+
+
+def test_blocks_tell_a_gain_of_one_channel_from_chance():
+    rng = np.random.default_rng(4)
+    n, k = 600, 4
+    channel = np.tile(np.arange(k), n)
+    train = np.repeat((np.arange(n) // 12) % 3 != 1, k)
+    one = rng.normal(size=n * k)
+    better = np.where(channel == 2, 0.5, 1.0) * one
+    assert paired_t(one, better, train, channel) > 100.0  # The same share everywhere.
+    by_chance = [
+        paired_t(rng.normal(size=n * k), rng.normal(size=n * k), train, channel)
+        for _ in range(100)
+    ]
+    # Student's t with 16 degrees of freedom: beyond 2 on one side 3 of 100.
+    assert np.sum(np.array(by_chance) > 2.0) <= 9
+    assert paired_t(one, better, np.ones(n * k, bool), channel) == 0.0
