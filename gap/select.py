@@ -328,7 +328,7 @@ class _Search:
                 trials.append((fit.score, a, b, effects))
         trials.sort(key=lambda t: t[0])
         for score, a, b, effects in trials[:2]:
-            if any(k == own or own in NESTED.get(k, ()) for k in
+            if any(k == own or own in KINDS[k].contains for k in
                    (a.candidate.kind, b.candidate.kind)):  # fmt: skip
                 break  # The single one with another is as good or better.
             if not self._error(score) < (1.0 - NESTED_GAIN) * self._error(single.score):
