@@ -120,12 +120,3 @@ def test_what_a_servo_hides_is_named(tmp_path, hidden, name, tolerance):
     assert found.parameters[name].value == pytest.approx(
         parameters[name], rel=tolerance
     )
-
-
-@pytest.mark.slow
-def test_a_biased_effort_sensor_is_named(tmp_path):
-    _, file = recorded(tmp_path, "servo", [], effort=True, bias=0.4)
-    result = run_gap(tmp_path / "scene.yaml", [file])
-    (found,) = result.effects
-    assert (found.kind, list(found.at)) == ("sensor_bias", ["d.j2.effort_measured"])
-    assert found.parameters["bias"].value == pytest.approx(0.4, abs=0.02)
