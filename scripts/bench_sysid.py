@@ -28,6 +28,7 @@ from time import perf_counter, process_time
 
 import numpy as np
 import yaml
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.signal import savgol_filter
 
 from makebreak.scripts.gap_benchmark import SETS, check
@@ -266,14 +267,14 @@ def _sequences(problem: Problem, spec):
             at = time[first] + fine
             # A command holds until the next one.
             held = np.clip(np.searchsorted(time, at + 1e-9, "right") - 1, 0, None)
-            seen = np.column_stack(
-                [np.interp(at, time, column) for column in np.hstack([q, v]).T]
-            )
+            there = (time > at[0] + STEP_SEC) & (time < at[-1])
+            seen = np.hstack([q, v])[there]
             starts.append(
                 sysid.create_initial_state(model, smooth_q[first], smooth_v[first])
             )
             controls.append(sysid.TimeSeries(fine, rows["effort"][held]))
-            sensors.append(sysid.TimeSeries.from_names(fine, seen, model))
+            since = time[there] - time[first]
+            sensors.append(sysid.TimeSeries.from_names(since, seen, model))
             first = int(np.searchsorted(time, time[first] + WINDOW_SEC))
     names = [f"window_{i}" for i in range(len(starts))]
     return sysid.ModelSequences("case", spec, names, starts, controls, sensors)
@@ -300,13 +301,13 @@ def fit(problem: Problem, jobs: int = 1) -> Fit:
         return np.column_stack([q] * n + [v] * n)
 
     def in_noise(params, predicted, measured, model, return_all, state=None, **_):
-        # The states after each step; the toolbox's sensors are from before it.
-        seen = np.column_stack(
-            [np.interp(state[:, 0], measured.times, y) for y in measured.data.T]
-        )
-        got = state[:, 1 : 1 + 2 * n]
-        series = [sysid.TimeSeries(state[:, 0], x) for x in (got, seen)]
-        return (got - seen) / std_of(state[:, 0]), *series
+        # The states after each step (the toolbox's sensors are from before it), at the
+        # times at which something was measured.
+        t, q, v = state[:, 0], state[:, 1 : 1 + n], state[:, 1 + n : 1 + 2 * n]
+        at = measured.times
+        got = np.hstack([CubicHermiteSpline(t, q, v)(at), CubicSpline(t, v)(at)])
+        series = [sysid.TimeSeries(at, x) for x in (got, measured.data)]
+        return (got - measured.data) / std_of(at), *series
 
     residual = sysid.build_residual_fn(
         models_sequences=[sequences],
@@ -315,7 +316,7 @@ def fit(problem: Problem, jobs: int = 1) -> Fit:
         resample_true=False,
     )
     best, result = sysid.optimize(
-        free, residual, optimizer="mujoco", verbose=False, x_scale="jac", max_iters=40
+        free, residual, optimizer="mujoco", verbose=False, x_scale="jac", max_iters=20
     )
     final, _, _ = residual(best.as_vector(), best)
     _, intervals = sysid.calculate_intervals([np.ravel(r) for r in final], result.jac)
