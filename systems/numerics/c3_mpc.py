@@ -362,11 +362,13 @@ def solve_c3(
         delta[:, : p.n_x] = x0
 
     model = AB, d, C, c
-    weights, bounds = (p.Q, p.R, p.Q_N, p.G), (p.lower, p.upper)
+    weights = p.Q, p.R, p.Q_N, p.G
+    unbounded = np.isinf(p.lower).all() and np.isinf(p.upper).all()
+    bounds = None if unbounded else (p.lower, p.upper)
     given = h, x0, lam0
     if p.is_plus:
         status, x, v, delta, w, inputs = _admm_plus(
-            *model, *weights, *bounds, p.U, *given, delta, w, o.rounds, o.rho
+            *model, *weights, bounds, p.U, *given, delta, w, o.rounds, o.rho
         )
         if status != SOLVED:
             raise C3Failure(_FAILURES[status])
@@ -485,11 +487,11 @@ def _model(A, B, D, d, E, F, H, c, scale):
 
 @njit(cache=True)
 def _admm_plus(
-    AB, d, C, c, Q, R, Q_N, G, lower, upper, U, h, x0, lam0, delta, w, rounds, rho
+    AB, d, C, c, Q, R, Q_N, G, bounds, U, h, x0, lam0, delta, w, rounds, rho
 ):
     """The same for C3+, compiled as a whole; the first result is _qp_step's status."""
     (N, n_z), n_lam = delta.shape, C.shape[1]
-    model, bounds = (AB, d, C, c), (lower, upper)
+    model = AB, d, C, c
     x, v = np.empty((N + 1, len(Q))), np.empty((N, n_lam + len(R)))
     z, sides = np.empty((N, n_z)), np.zeros((N + 1, AB.shape[2]), np.int64)
     inputs = np.zeros((rounds + 1, N, len(R)))
@@ -518,7 +520,8 @@ def _qp_step(model, weights, bounds, given, found):
     Args:
         model: AB = [D B A], d, C = [F H E], c, each (K, ...) with K = 1 or N.
         weights: Q, R, Q_N and the diagonal G.
-        bounds: lower, upper over [lam, u, x].
+        bounds: lower, upper over [lam, u, x]; None where there are none. (That is
+            another type, for which the methods with bounds are not compiled.)
         given: h (N + 1, n) the linear term of the planning cost over [lam, u, x],
             target (N, n_z) of the consensus, x0, lam0 (empty: free).
         found: z (N, n_z), x (N + 1, n_x), v = [lam, u] (N, n_v), overwritten; sides,
@@ -526,7 +529,6 @@ def _qp_step(model, weights, bounds, given, found):
     """
     AB, d, C, c = model
     Q, R, Q_N, G = weights
-    lower, upper = bounds
     h_plan, target, x0, lam0 = given
     z, x, v, sides = found
     K, n_x, n = AB.shape
@@ -560,9 +562,11 @@ def _qp_step(model, weights, bounds, given, found):
     if not factor(fac, T, Q_N, np.zeros((0, 0)), lam0.size):
         return NOT_CONVEX
     solve(fac, h, x0, lam0, x, v)
-    if not within(x, v, lower, upper):
-        if not solve_bounded(fac, T, Q_N, h, x0, lam0, lower, upper, sides, x, v):
-            return INFEASIBLE
+    if bounds is not None:
+        lower, upper = bounds
+        if not within(x, v, lower, upper):
+            if not solve_bounded(fac, T, Q_N, h, x0, lam0, lower, upper, sides, x, v):
+                return INFEASIBLE
     for k in range(N):
         z[k, :n_x] = x[k]
         z[k, n_x:i_eta] = v[k]
