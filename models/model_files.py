@@ -44,8 +44,9 @@ from makebreak.models.effects.model_text import (
 from makebreak.models.scene_schema import COMMANDS_OF, Scene
 from makebreak.models.typed_yaml import one_line, read_yaml
 
-# pydrake makes SystemExit of an assertion that fails in Drake.
-DRAKE_ERRORS = (RuntimeError, SystemExit)
+# pydrake makes SystemExit of an assertion that fails in Drake, and ValueError of some
+# of what its parser says.
+DRAKE_ERRORS = (RuntimeError, SystemExit, ValueError)
 _LOG = logging.getLogger("makebreak")
 _MOST_INCLUDES = 20  # Directives in directives in ...
 

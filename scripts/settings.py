@@ -93,6 +93,7 @@ _BOUNDS = {
 }
 # Of others: how many times the default, or as many times 1 or 10, they may be.
 _MOST_TIMES, _MOST_COUNT = 1e4, 1000
+_LEAST = 1e-30  # One over a smaller number may be no number.
 
 
 def check_sizes(config, default, prefix: str = "") -> None:
@@ -128,8 +129,13 @@ def _check_size(name: str, value, usual) -> None:
         else:
             most = _MOST_TIMES * max([1.0, *sizes])
         bounds = Between(-most, most)
-    if value in usual or bounds.holds(value):
+    tiny = 0.0 < abs(value) < _LEAST
+    if value in usual or (bounds.holds(value) and not tiny):
         return
+    if tiny:
+        raise ValueError(
+            f'{name}: got "{shown(value)}", expected 0 or at least {_LEAST}'
+        )
     raise ValueError(f'{name}: got "{shown(value)}", expected {bounds}')
 
 

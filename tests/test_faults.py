@@ -67,6 +67,17 @@ def test_a_slip_of_numpy_is_told_with_its_traceback(slip, monkeypatch, capsys):
     assert "in <lambda>" in the_file(capsys.readouterr().err).read_text()
 
 
+@pytest.mark.parametrize(
+    "setting",
+    ["noise=.inf", "noise=1e308", "spring.stiffness=1e-320", "steps=100000000000"],
+)
+def test_a_number_that_no_experiment_can_mean_is_refused(setting, capsys):
+    assert run("--set", setting) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"makebreak: --set {setting.split('=')[0]}: got")
+    assert "the traceback" not in said
+
+
 def test_a_refusal_has_no_traceback_and_no_file(capsys):
     assert run("--set", "spring.stiffness=-1") == 2
     assert capsys.readouterr().err == (

@@ -141,6 +141,11 @@ def test_an_inertia_that_no_body_has_is_refused_by_its_link(
     assert not caplog.records  # Drake's own words would come by the dozen.
 
 
+def test_a_wrong_attribute_of_the_model_is_drakes_line(tmp_path):
+    robot(tmp_path, SOLID.replace("0 0 -0.3", "0 inf0 -0.3"))
+    assert "scene's directives: Expected 3 values" in refused(tmp_path, SCENE)
+
+
 def test_a_link_of_no_inertia_between_two_joints_is_refused(tmp_path):
     # M is not singular on its diagonal, but the two joints turn one body alike.
     text = ROBOT.format(link="", more="").replace(
