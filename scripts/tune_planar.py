@@ -85,6 +85,14 @@ _MRAC = {
     "velocity_now": (0.01, 1e4),
     "velocity_summed": (0.01, 1e4),
 }
+# The best of _MRAC lies at the edge of its integral gains: without that edge.
+_WIDE = {
+    "integral_rate": (0.1, 1e4),
+    "position_now": (0.01, 1e6),
+    "position_summed": (0.01, 1e9),
+    "velocity_now": (0.01, 1e6),
+    "velocity_summed": (0.01, 1e9),
+}
 _ACTIVE_INFERENCE = {
     "variance_velocity": (0.1, 100.0),
     "variance_belief": (1e-4, 100.0),
@@ -107,8 +115,10 @@ SPACES = {
     "adaptive": _MIXTURE,
     "porridge_adaptive": _MIXTURE,
     "mrac": _MRAC,
+    "mrac_wide": _MRAC | _WIDE,
     "mrac_free": _MRAC | {"stiffness": (5.0, 1e5)},
     "porridge_mrac": _MRAC,
+    "porridge_mrac_wide": _MRAC | _WIDE,
     "active_inference": _ACTIVE_INFERENCE,
     "active_inference_free": _ACTIVE_INFERENCE | {"stiffness": (5.0, 1e5)},
     "biomimetic": _BIOMIMETIC,
