@@ -153,12 +153,15 @@ class _Search:
 
     # ----- What is asked again and again
 
-    def _screen(self, r: np.ndarray, scale: float = 1.0) -> Screen:
+    def _screen(
+        self, r: np.ndarray, scale: float = 1.0, reach: float | None = None
+    ) -> Screen:
         """Nuisances are weighed against what is left, and by how many rows of it are
-        independent."""
+        independent. reach: another limit than theirs."""
         n = self.nuisances
         scale = max(scale, 1.0) * self.problem.correlation
-        return Screen(r, n.columns, n.prior, self.train, scale, n.reach)
+        limit = n.reach if reach is None else reach
+        return Screen(r, n.columns, n.prior, self.train, scale, limit)
 
     def _needs_more(self, fitted: Fitted) -> bool:
         """Whether held-out rows are worse than noise, or the background is beyond what
@@ -169,14 +172,22 @@ class _Search:
 
     def _beyond(self, fitted: Fitted) -> tuple[tuple[str, float], ...]:
         """Nuisances that would go clearly beyond their limit if they could, and how
-        far, in tolerances."""
+        far, in tolerances; none where that would not gain what an effect must gain."""
         n = self.nuisances
-        off = self._screen(fitted.r, fitted.fit.train).wanted(fitted.r)
-        return tuple(
+        screen = self._screen(fitted.r, fitted.fit.train)
+        off = screen.wanted(fitted.r)
+        beyond = tuple(
             (name, float(x))
             for name, x in zip(n.names, off, strict=True)
             if abs(x) > n.reach + BEYOND
         )
+        if not beyond:
+            return ()
+        free = self._screen(fitted.r, fitted.fit.train, np.inf)
+        left, freed = (each.settle(fitted.r)[1] for each in (screen, free))
+        a, b = (self._error(each.judge(fitted.r).score) for each in (screen, free))
+        gained = b < (1.0 - self.plan.least_gain) * a
+        return beyond if self._earns(left, freed, gained) else ()
 
     def _error(self, score: float) -> float:
         """A held-out error as far as it tells models apart."""

@@ -7,7 +7,8 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from makebreak.gap.fit import derivative_free_search, fit_effects
-from makebreak.gap.problem import SearchPlan
+from makebreak.gap.problem import GapProblem, Nuisances, SearchPlan
+from makebreak.gap.select import select
 from makebreak.gap.trust import gauss_newton, ridges
 from makebreak.models.effects.kind import Effect
 from makebreak.systems.numerics.selection import (
@@ -276,3 +277,65 @@ def test_blocks_tell_a_gain_of_one_channel_from_chance():
     # Student's t with 16 degrees of freedom: beyond 2 on one side 3 of 100.
     assert np.sum(np.array(by_chance) > 2.0) <= 9
     assert paired_t(one, better, np.ones(n * k, bool), channel) == 0.0
+
+
+class OneNuisance(GapProblem):
+    """Residuals with one nuisance, whose column changes sign from row to row."""
+
+    plan = SearchPlan()
+
+    def __init__(self, wanted_fitted: float, wanted_held_out: float):
+        self._train = np.arange(600) % 3 != 0
+        self._column = np.where(np.arange(600) % 2 == 0, 1.0, -1.0)
+        noise = np.random.default_rng(0).normal(size=600)
+        wanted = np.where(self._train, wanted_fitted, wanted_held_out)
+        self._base = noise + wanted * self._column
+
+    def residual(self, effects=()):
+        return self._base
+
+    def base(self):
+        return self._base
+
+    def train(self):
+        return self._train
+
+    def blocks(self):
+        return np.arange(600) // 60
+
+    def channel_of_rows(self):
+        return np.zeros(600, int)
+
+    def nuisances(self):
+        return Nuisances(self._column[:, None], np.ones(1), ("mass",), 3.0)
+
+    def candidates(self, nuisances, current):
+        return []
+
+    def where(self, left):
+        return []
+
+    def outcome(self, *_args, **_kwargs):
+        return None
+
+
+@pytest.mark.parametrize(
+    "fitted, held_out, beyond",
+    [
+        (10.0, 10.0, True),  # Ten tolerances, on all data: a finding.
+        (2.0, 2.0, False),  # Within its limit.
+        (10.0, 3.0, False),  # What only the fitted rows want is none.
+        (10.0, -3.0, False),
+    ],
+)
+def test_a_nuisance_beyond_its_limit_is_a_finding_if_held_out_data_gain_by_it(
+    fitted, held_out, beyond
+):
+    selection = select(OneNuisance(fitted, held_out))
+    assert bool(selection.beyond) == beyond
+    if beyond:
+        ((name, tolerances),) = selection.beyond
+        # At the limit 10 - 3 is left, and noise of 1: the prior weighs 1 + 7^2 against
+        # 400 rows. The noise of 400 rows moves it by 0.05.
+        expected = 10.0 * 400.0 / (400.0 + 50.0)
+        assert name == "mass" and tolerances == pytest.approx(expected, abs=0.2)
