@@ -47,7 +47,7 @@ from gap_benchmark.ties import (
 )
 from gap_benchmark.two_link import TwoLinkWorld
 
-SEEDS = {"logs-development": 210_000, "logs-final": 370_000}
+SEEDS = {"logs-development": 210_000, "logs-final": 530_000}
 _QUANTUM = 2 * np.pi / 4096  # [rad], of such servos.
 LINK_MASS, LINK_COM = 0.03, 0.002  # The scene's tolerance, one sigma [-], [m].
 
