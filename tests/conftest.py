@@ -10,6 +10,8 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 # A shell starts background jobs with SIGINT ignored, and a program inherits that: the
 # tests that press Ctrl-C would press it in vain.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+# And `nohup` one with SIGHUP ignored, which makebreak would then ignore as well.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 from hypothesis import settings  # noqa: E402  (numpy's threads must be set first)
 

@@ -305,7 +305,12 @@ def test_a_sinusoidal_force_goes_with_the_recordings_clock(tmp_path):
 @pytest.mark.parametrize(
     "kind, at, parameters, words",
     [
-        ("payload", "p.rod", dict(mass=-1.1, com_x=0, com_y=0, com_z=-0.5), "no body"),
+        (
+            "payload",
+            "p.rod",
+            dict(mass=-1.1, com_x=0, com_y=0, com_z=-0.5),
+            "moves nothing that has inertia",
+        ),
         # 0.5 kg are not that far from where all of the rod's kilogram is.
         (
             "payload",
