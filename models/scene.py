@@ -318,13 +318,15 @@ def load_scene(
         plant.Finalize()
     except DRAKE_ERRORS as error:  # Welds in a loop, and the like.
         raise ValueError(f"scene's directives: {one_line(error)}") from None
-    check_can_move(plant)
     for effect in effects:
         possible = KINDS[effect.kind].possible
         if possible is not None:
             possible(effect, plant, effects)
         if KINDS[effect.kind].channel:
             check_channels(effect, KINDS[effect.kind].channel, plant)
+    check_can_move(
+        plant
+    )  # After the effects, which say best what they make impossible.
     for episodes in scene.initial_of.values():
         for state in episodes.values():
             _check_names(state, plant)

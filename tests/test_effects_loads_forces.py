@@ -309,7 +309,7 @@ def test_a_sinusoidal_force_goes_with_the_recordings_clock(tmp_path):
             "payload",
             "p.rod",
             dict(mass=-1.1, com_x=0, com_y=0, com_z=-0.5),
-            "moves nothing that has inertia",
+            "no body",
         ),
         # 0.5 kg are not that far from where all of the rod's kilogram is.
         (
