@@ -28,6 +28,9 @@ class ContactMpcConfig:
         default_factory=lambda: C3Options(N=10, rounds=5, polish=3)
     )
     bounds: C3Bounds = field(default_factory=C3Bounds)
+    closest: int | None = None  # So many contacts, the nearest of all; None: all.
+    # Each knot has its own LCS, along the last plan; else all have that of the state.
+    lcs_along_plan: bool = False
 
 
 def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
@@ -43,7 +46,14 @@ def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
     lcs = builder.AddNamedSystem(
         "lcs",
         AnitescuLcsBuilder(
-            model, LcsBuilderConfig(c.contacts, c.dt_sec, period_sec=c.period_sec)
+            model,
+            LcsBuilderConfig(
+                c.contacts,
+                c.dt_sec,
+                period_sec=c.period_sec,
+                closest=c.closest,
+                knots=c.options.N if c.lcs_along_plan else 0,
+            ),
         ),
     )
     n_x, n_u, n_lam = lcs.model.n_x, lcs.model.n_u, lcs.model.n_lam
@@ -76,6 +86,8 @@ def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
     builder.Connect(no_force.get_output_port(), lcs.GetInputPort("u"))
     builder.Connect(goal.get_output_port(), c3.GetInputPort("x_desired"))
     builder.Connect(lcs.GetOutputPort("lcs"), c3.GetInputPort("lcs"))
+    if c.lcs_along_plan:
+        builder.Connect(c3.GetOutputPort("plan"), lcs.GetInputPort("plan"))
     builder.ExportInput(lcs.GetInputPort("x"), "x")
     builder.ConnectInput("x", c3.GetInputPort("x"))
     for name in ("u", "status", "plan"):

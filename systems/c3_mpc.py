@@ -1,5 +1,6 @@
 """C3 as a system: plans through contact, and commands one step of the model."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
@@ -62,8 +63,9 @@ class C3Mpc(LeafSystem):
 
     Inputs:  x (n_x,) [SI];
              x_desired ((N + 1) n_x,), the target (N + 1, n_x) flattened row by row;
-             lcs: LCS of the horizon (abstract);
-             lcs_command: LCS of the command's step (abstract), optional, else lcs;
+             lcs (abstract): LCS of the horizon, or a sequence of N, one per knot;
+             lcs_command: LCS of the command's step (abstract), optional, else lcs (of
+             the first knot);
              r_comp (n_lam,) [m/s at residual_dt_sec], optional, else zero.
     Outputs: u (n_u,) [N], always within its bounds;
              x_next (n_x,), lam (n_lam,) [N]: one step of the command's LCS under u;
@@ -115,6 +117,7 @@ class C3Mpc(LeafSystem):
         self._status = state(1, value=float(C3Status.NO_PLAN_YET))
         # How old the plan is, and how long its knots are [s].
         self._age, self._plan_dt = state(1), state(1, value=1.0)
+        self._plan_time = state(1, value=np.nan)  # Of its first knot [s].
         self._plan_x = state(N + 1, p.n_x)
         self._plan_u = state(N, p.n_u, value=self._u_idle)
         self._plan_lam = state(N, p.n_lam)
@@ -148,12 +151,13 @@ class C3Mpc(LeafSystem):
         status, inputs = self._read_inputs(context)
         if inputs is not None:
             x, x_desired, lcs, lcs_command = inputs
+            dt = (lcs if isinstance(lcs, LCS) else lcs[0]).dt
             warm = WarmStart(
                 *(self._get(context, s) for s in (self._plan_u, self._delta, self._w))
             )
             try:
                 if self._problem.options.warm_start:
-                    warm = warm.shifted(min(self._period / lcs.dt, 1.0))
+                    warm = warm.shifted(min(self._period / dt, 1.0))
                 plan, warm = solve_c3(lcs, x, x_desired, self._problem, warm)
             except C3Failure:
                 status = C3Status.SOLVE_FAILED
@@ -162,7 +166,8 @@ class C3Mpc(LeafSystem):
             self._hold(context, write)
             return
         write(self._age, 0.0)
-        write(self._plan_dt, lcs.dt)
+        write(self._plan_dt, dt)
+        write(self._plan_time, context.get_time())
         write(self._u, plan.u[0])
         write(self._plan_x, plan.x)
         write(self._plan_u, plan.u)
@@ -186,7 +191,7 @@ class C3Mpc(LeafSystem):
         if self._r_comp.HasValue(context):
             r_comp = np.asarray(self._r_comp.Eval(context))
         lcs: Any = self._lcs.Eval(context)
-        lcs_command = lcs
+        lcs_command = lcs[0] if isinstance(lcs, Sequence) and len(lcs) else lcs
         if self._lcs_command.HasValue(context):
             lcs_command = self._lcs_command.Eval(context)
         for status, values in (
@@ -196,22 +201,32 @@ class C3Mpc(LeafSystem):
         ):
             if not is_finite(values):
                 return status, None
-        if not (self._is_good(lcs) and self._is_good(lcs_command)):
+        of_knots = [lcs] if isinstance(lcs, LCS) else lcs
+        if not (self._are_good(of_knots) and self._are_good([lcs_command])):
             return C3Status.BAD_LCS, None
+        of_knots = [
+            with_gap_residual(m, r_comp, self._residual_dt, clamp=False)
+            for m in of_knots
+        ]
         return C3Status.SOLVED, (
             x,
             x_desired.reshape(-1, p.n_x),
-            with_gap_residual(lcs, r_comp, self._residual_dt, clamp=False),
+            of_knots if isinstance(lcs, Sequence) else of_knots[0],
             with_gap_residual(lcs_command, r_comp, self._residual_dt, self._clamp),
         )
 
-    def _is_good(self, lcs):
+    def _are_good(self, models):
+        """Whether these are one LCS, or N of one time step, of the weights' sizes."""
         p = self._problem
-        if not isinstance(lcs, LCS):
+        if not isinstance(models, Sequence) or len(models) not in (1, p.options.N):
             return False
-        if (lcs.n_x, lcs.n_u, lcs.n_lam) != (p.n_x, p.n_u, p.n_lam):
-            return False
-        return is_finite_model(lcs)
+        return all(
+            isinstance(m, LCS)
+            and (m.n_x, m.n_u, m.n_lam) == (p.n_x, p.n_u, p.n_lam)
+            and m.dt == models[0].dt
+            and is_finite_model(m)
+            for m in models
+        )
 
     def _get(self, context, state):
         index, shape = state
@@ -227,8 +242,11 @@ class C3Mpc(LeafSystem):
         write(self._u, plan_u[knot] if knot < len(plan_u) else self._u_idle)
 
     def _calc_plan(self, context, output):
-        x, u, lam, status = (
-            self._get(context, s).copy()
-            for s in (self._plan_x, self._plan_u, self._plan_lam, self._status)
+        states = self._plan_x, self._plan_u, self._plan_lam
+        x, u, lam = (self._get(context, s).copy() for s in states)
+        status, time, dt = (
+            float(self._get(context, s)[0])
+            for s in (self._status, self._plan_time, self._plan_dt)
         )
-        output.set_value(Plan(x, u, lam, int(status[0])))
+        known = None if np.isnan(time) else time
+        output.set_value(Plan(x, u, lam, int(status), known, dt))

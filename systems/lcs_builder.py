@@ -14,11 +14,12 @@ See docs/lcs.md for the state's layout, quaternions, units and limits.
 
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, InitializeAutoDiff
-from pydrake.common.value import Value
+from pydrake.common.value import AbstractValue, Value
 from pydrake.geometry import (
     Box,
     Convex,
@@ -37,6 +38,7 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Diagram, LeafSystem
 
+from makebreak.systems.numerics.c3_mpc import Plan
 from makebreak.systems.numerics.convex_hull import point_on_hull
 from makebreak.systems.numerics.lcs import LCS, is_finite
 from makebreak.systems.numerics.lcs_builder import (
@@ -44,12 +46,27 @@ from makebreak.systems.numerics.lcs_builder import (
     HALF_SPACE,
     SPHERE,
     ConstantMassModel,
-    assemble_anitescu,
-    friction_rows,
+    assemble_lcs,
+    contact_rows,
+    friction_edges,
+    nearest_contacts,
     tangent_basis,
     velocity_maps,
 )
 from makebreak.systems.numerics.timing import timed
+
+
+@dataclass
+class Anitescu:
+    """Convex contact: 2 n_f forces. A contact that slides opens by dt mu |v_t|."""
+
+
+@dataclass
+class StewartTrinkle:
+    """Coulomb's cone as a polyhedron: 2 n_f + 2 entries of lam (1 without friction).
+
+    They are the normal force, 2 n_f friction forces, and the sliding speed.
+    """
 
 
 @dataclass
@@ -58,7 +75,8 @@ class ContactPair:
 
     A body is named "model::body", or "body" where that is unique; a geometry by its
     name in the scene graph ("ball::ball_collision"). A body stands for all of its
-    collision geometries: every combination is a contact of its own.
+    collision geometries: every combination is a contact of its own, or the `closest`
+    of them are.
     """
 
     a: str = ""
@@ -71,6 +89,12 @@ class ContactPair:
     # Of a plant that moves in a plane: the plane's normal, in the world. The edges then
     # start in the plane; with friction_directions = 1 they are its two.
     plane_normal: list[float] = field(default_factory=list)
+    # In YAML `contact_model: !StewartTrinkle {}`.
+    contact_model: Anitescu | StewartTrinkle = field(default_factory=Anitescu)
+    # Normal force over penetration [N/m], without damping; None: rigid, but for eps_c.
+    stiffness: float | None = None
+    # How many of the pair's combinations are contacts, the nearest; None: all.
+    closest: int | None = None
 
 
 class AnitescuLcs:
@@ -81,20 +105,26 @@ class AnitescuLcs:
         pairs: the contacts; their order is the order of the forces.
         dt_sec: time step [s].
         eps_c: added to F's diagonal, for lam in newtons [m/s per N]; None: 0.01 dt_sec,
-            the paper's 0.01 for lam as an impulse.
+            the paper's 0.01 for lam as an impulse. It softens no normal force of a
+            pair that has a stiffness.
+        closest: how many of all combinations of all pairs are contacts, the nearest at
+            each state; None: all. The pairs must have the same kind of contact.
         analytic: use the fast path where the model allows it; False: never.
 
     Attributes:
         n_q, n_v, n_x, n_u, n_lam: sizes; x = [q, v] in the plant's order.
         x_default: (n_x,) the plant's default state.
-        x_names, lam_names: of each state, and of each force, "geometry~geometry edge".
+        x_names, lam_names: of each state, and of each entry of lam, "geometry~geometry
+            edge" (where the nearest are taken: "nearest k of geometry~... edge").
         is_analytic: which of the two paths `build` takes.
 
     Raises: ValueError naming a pair that does not exist, a body without collision
         geometry, shapes without a distance, or a parameter out of range.
     """
 
-    def __init__(self, diagram, pairs, dt_sec=0.1, eps_c=None, analytic=True):
+    def __init__(
+        self, diagram, pairs, dt_sec=0.1, eps_c=None, analytic=True, closest=None
+    ):
         self._plant, scene_graph = _plant_and_scene_graph(diagram)
         plant, pairs = self._plant, list(pairs)
         if not (np.isfinite(dt_sec) and dt_sec > 0.0):
@@ -107,7 +137,7 @@ class AnitescuLcs:
         self.n_x, self.n_u = self.n_q + self.n_v, plant.num_actuated_dofs()
         self.x_names = list(plant.GetStateNames())
         self._check_model()
-        self._resolve(scene_graph.model_inspector(), pairs)
+        self._resolve(scene_graph.model_inspector(), pairs, closest)
 
         # Scratch: overwritten before each read.
         self._context = diagram.CreateDefaultContext()
@@ -152,18 +182,29 @@ class AnitescuLcs:
                 )
             x[start : start + 4] /= norm
         if self._model is not None:
-            return self._model.build(x, u, self.dt_sec, self.eps_c)
+            chosen, rows = None, (self._weight, self._F_0)
+            if self._groups is not None:
+                gaps = self._model.gaps(x[: self.n_q])
+                chosen = nearest_contacts(gaps, self._groups)
+                rows = self._rows_of(chosen)
+            return self._model.build(x, u, self.dt_sec, self._rows, *rows, chosen)
         return self._build_general(x, u)
+
+    def _rows_of(self, chosen):
+        """The rows' weight and F_0 for the friction and stiffness of these pairs."""
+        mu, compliance = self._mu[chosen], self._compliance[chosen]
+        F_0 = self._rows.F_0(mu, compliance, self.dt_sec, self.eps_c)
+        return self._rows.weight(mu), F_0
 
     # The general path: AutoDiff for the smooth dynamics, witness points for contact.
 
     def _build_general(self, x, u):
         f, J_q, J_v, J_u, M = self._smooth(x, u)
-        phi, J_n, J_c = self._contact()
+        phi, J_n, J_c, F_0 = self._contact()
         N, N_plus = self._velocity_maps(x[: self.n_q])
-        return assemble_anitescu(
-            x, f, J_q, J_v, J_u, u, M, N, N_plus, phi, J_n, J_c, self._contact_index,
-            self.dt_sec, self.eps_c,
+        return assemble_lcs(
+            x, f, J_q, J_v, J_u, u, M, N, N_plus, phi, J_n, J_c, self._rows.contact,
+            self._rows.normal, F_0, self.dt_sec,
         )  # fmt: skip
 
     def _smooth(self, x, u):
@@ -195,14 +236,19 @@ class AnitescuLcs:
         return f, J_q, J_v, J_u, M
 
     def _contact(self):
-        """phi, J_n and J_c at the state that the plant's context is at."""
-        plant, context = self._plant, self._plant_context
+        """phi, J_n, J_c and F_0 at the state that the plant's context is at."""
+        plant, context, rows = self._plant, self._plant_context, self._rows
         world, wrt = plant.world_frame(), JacobianWrtVariable.kV
         query = self._query_port.Eval(context)
-        n_c = len(self._geometries)
-        phi, J = np.empty(n_c), np.empty((n_c, 3, self.n_v))
-        for i, (id_A, id_B) in enumerate(self._geometries):
-            phi[i], n, p_A, p_B = self._distance(query, id_A, id_B)
+        found = [self._distance(query, *ids) for ids in self._geometries]
+        chosen, weight, F_0 = np.arange(len(found)), self._weight, self._F_0
+        if self._groups is not None:
+            gaps = np.array([gap for gap, *_ in found])
+            chosen = nearest_contacts(gaps, self._groups)
+            weight, F_0 = self._rows_of(chosen)
+        phi, J = np.empty(len(chosen)), np.empty((len(chosen), 3, self.n_v))
+        for k, i in enumerate(chosen):
+            (id_A, id_B), (phi[k], n, p_A, p_B) = self._geometries[i], found[i]
             if not abs(n @ n - 1.0) < 1e-6:
                 raise ValueError(f"{self._pair_names[i]}: no unique normal at {n}")
             self._check_plane(i, n)
@@ -213,10 +259,11 @@ class AnitescuLcs:
                 context, wrt, frame_B, X_B @ p_B, world, world
             )
             t1, t2 = tangent_basis(n, self._reference[i])
-            J[i] = np.stack([n, t1, t2]) @ J_w
-        on = self._contact_index
-        J_t = (self._edge[:, :, None] * J[on, 1:]).sum(axis=1)
-        return phi, J[:, 0], J[on, 0] + self._mu[on, None] * J_t
+            J[k] = np.stack([n, t1, t2]) @ J_w
+        on = rows.contact
+        J_t = (rows.edge[:, :, None] * J[on, 1:]).sum(axis=1)
+        J_c = rows.normal[:, None] * J[on, 0] + weight[:, None] * J_t
+        return phi, J[:, 0], J_c, F_0
 
     def _check_plane(self, i, n):
         if self._planar[i] and abs(n @ self._reference[i]) > 0.1:
@@ -266,7 +313,7 @@ class AnitescuLcs:
                     "(the LCS's u is effort)"
                 )
 
-    def _resolve(self, inspector, pairs):
+    def _resolve(self, inspector, pairs, closest):
         """Names to geometries: fills what `_contact` reads."""
         plant = self._plant
         bodies, ambiguous = {}, set()
@@ -285,7 +332,8 @@ class AnitescuLcs:
         self._frames = {}
         self._radius: dict[GeometryId, float] = {}
         self._hull: dict[GeometryId, tuple[np.ndarray, np.ndarray]] = {}
-        mu, n_f, reference, planar = [], [], [], []
+        mu, compliance, kinds, reference, planar = [], [], [], [], []
+        groups: list[tuple[np.ndarray, int]] = []
         for pair in pairs:
             a = _geometries_named(pair.a, bodies, ambiguous, collision)
             b = _geometries_named(pair.b, bodies, ambiguous, collision)
@@ -314,6 +362,20 @@ class AnitescuLcs:
                     f"{name}: friction_directions is 1 without a direction, expected "
                     "a plane_normal (of a plant in a plane) or a tangent"
                 )
+            if not isinstance(pair.contact_model, (Anitescu, StewartTrinkle)):
+                raise ValueError(
+                    f"{name}: contact_model is {pair.contact_model!r}, expected "
+                    "Anitescu() or StewartTrinkle()"
+                )
+            if pair.stiffness is not None and not 0.0 < pair.stiffness < np.inf:
+                raise ValueError(
+                    f"{name}: stiffness is {pair.stiffness}, expected a positive "
+                    "number [N/m], or None for a rigid contact"
+                )
+            edges = friction_edges(int(pair.friction_directions))
+            if in_plane:  # t1 follows the plane's normal, so the edges start at t2.
+                edges = edges[:, ::-1] * [-1.0, 1.0]
+            first = len(self._geometries)
             for one in a:
                 for other in b:
                     # As in c3_reference: A is the geometry that was registered first.
@@ -325,9 +387,20 @@ class AnitescuLcs:
                         f"{inspector.GetName(id_A)}~{inspector.GetName(id_B)}"
                     )
                     mu.append(float(pair.friction))
-                    n_f.append(int(pair.friction_directions))
+                    compliance.append(
+                        0.0 if pair.stiffness is None else 1.0 / pair.stiffness
+                    )
+                    anitescu = isinstance(pair.contact_model, Anitescu)
+                    kinds.append(
+                        (anitescu, edges, pair.friction > 0.0, compliance[-1] > 0.0)
+                    )
                     reference.append(plane_normal if in_plane else tangent)
                     planar.append(in_plane)
+            combinations = np.arange(first, len(self._geometries))
+            count = combinations.size
+            if pair.closest is not None:
+                count = _how_many(f"{name}: closest", pair.closest, count)
+            groups.append((combinations, count))
         for id in {id for ids in self._geometries for id in ids}:
             body = plant.GetBodyFromFrameId(inspector.GetFrameId(id))
             self._frames[id] = (body.body_frame(), inspector.GetPoseInFrame(id))
@@ -343,20 +416,49 @@ class AnitescuLcs:
                 self._hull[id] = normals, offsets
         if not self._geometries:
             raise ValueError("no contact pairs came, expected at least one")
+        if closest is not None:
+            n = len(self._geometries)
+            groups = [(np.arange(n), _how_many("closest", closest, n))]
+            if any(pair.closest is not None for pair in pairs):
+                raise ValueError(
+                    "closest came for all pairs and for one of them, expected one of "
+                    "the two"
+                )
+            self._check_alike(kinds)
+        # None: every combination is a contact at every state.
+        fixed = all(count == len(of_group) for of_group, count in groups)
+        self._groups = None if fixed else groups
         self._mu, self._reference = np.array(mu), np.array(reference).reshape(-1, 3)
-        self._contact_index, self._edge = friction_rows(n_f)
-        # t1 follows the plane's normal there, so the edges start at t2.
-        turned = np.array(planar)[self._contact_index]
-        self._edge[turned] = self._edge[turned][:, ::-1] * [-1.0, 1.0]
-        self._planar = np.array(planar)
-        self.n_lam = len(self._contact_index)
-        first = np.searchsorted(self._contact_index, self._contact_index)
+        self._compliance, self._planar = np.array(compliance), np.array(planar)
+        slots = np.concatenate([of_group[:count] for of_group, count in groups])
+        self._rows = contact_rows([kinds[i] for i in slots])
+        self._weight, self._F_0 = self._rows_of(slots)
+        self.n_lam = len(self._rows.contact)
+        names = [self._pair_names[i] for i in slots]
+        if not fixed:
+            names = [
+                self._pair_names[of_group[k]]
+                if count == len(of_group)
+                else f"nearest {k} of {self._pair_names[of_group[0]]}..."
+                for of_group, count in groups
+                for k in range(count)
+            ]
         self.lam_names = [
-            f"{self._pair_names[i]} {k}"
-            for i, k in zip(
-                self._contact_index, np.arange(self.n_lam) - first, strict=True
-            )
+            f"{names[i]} {of_contact}"
+            for i, of_contact in zip(self._rows.contact, self._rows.names, strict=True)
         ]
+
+    def _check_alike(self, kinds):
+        """Raises: ValueError unless one contact can take the other's rows."""
+        first = kinds[0]
+        for name, kind in zip(self._pair_names, kinds, strict=True):
+            same_edges = np.array_equal(kind[1], first[1])
+            if not (same_edges and kind[0] == first[0] and kind[2:] == first[2:]):
+                raise ValueError(
+                    f"closest: {name} and {self._pair_names[0]} differ in contact "
+                    "model, friction directions or in having friction or stiffness, "
+                    "expected one kind"
+                )
 
     def _check_distances(self):
         query = self._query_port.Eval(self._plant_context)
@@ -473,8 +575,8 @@ class AnitescuLcs:
             shape=array(rows["shape"], np.int64), size=array(rows["size"]),
             quaternion=array(rows["quaternion"], np.int64),
             omega=array(rows["omega"], np.int64), R=array(R), p_0=array(p_0),
-            P=array(P), J_p=array(J_p), pairs=array(ab, np.int64), mu=self._mu,
-            reference=self._reference, contact=self._contact_index, edge=self._edge,
+            P=array(P), J_p=array(J_p), pairs=array(ab, np.int64),
+            reference=self._reference,
         )  # fmt: skip
 
 
@@ -485,14 +587,29 @@ class LcsBuilderConfig:
     eps_c: float | None = None  # [m/s per N]; None: 0.01 dt_sec.
     period_sec: float = 0.0125  # Between two linearisations [s].
     offset_sec: float = 0.0  # Of the first one [s].
+    closest: int | None = None  # So many contacts, the nearest of all; None: all.
+    # 0: one LCS, about x. N: a tuple of N, one per knot along the plan at `plan`.
+    knots: int = 0
+
+
+class LcsBuilderStatus(IntEnum):
+    """The `status` port of AnitescuLcsBuilder."""
+
+    HELD = 0  # The last LCS: x or u was not usable.
+    BUILT = 1
+    # Some state of the plan was not usable; the LCS about x stands in for its knot.
+    BUILT_IN_PART = 2
 
 
 class AnitescuLcsBuilder(LeafSystem):
     """The LCS about the present state, held between updates.
 
-    Inputs:  x (n_x,) state [q, v] of the model plant; u (n_u,) its actuation.
-    Outputs: lcs (abstract, LCS) with dt and phi; status (1,): 1.0, or 0.0 while the
-             last LCS is held because x or u was not usable.
+    Inputs:  x (n_x,) state [q, v] of the model plant; u (n_u,) its actuation;
+             plan (abstract, Plan), with config.knots > 0 only: the last plan, along
+             which the LCS of all knots but the first are taken. Where there is none
+             yet, all are about x.
+    Outputs: lcs (abstract, LCS with dt and phi; with config.knots > 0 a tuple of
+             them); status (1,): an LcsBuilderStatus.
 
     Before the first update: the LCS about the plant's default state with u = 0.
 
@@ -502,12 +619,26 @@ class AnitescuLcsBuilder(LeafSystem):
     def __init__(self, diagram, config: LcsBuilderConfig):
         super().__init__()
         c = config
-        self.model = AnitescuLcs(diagram, c.contacts, c.dt_sec, c.eps_c)
+        if c.knots != int(c.knots) or c.knots < 0:
+            raise ValueError(
+                f"LcsBuilderConfig.knots is {c.knots}, expected an integer of at least "
+                "0"
+            )
+        self.model = AnitescuLcs(
+            diagram, c.contacts, c.dt_sec, c.eps_c, closest=c.closest
+        )
         initial = self.model.build(self.model.x_default, np.zeros(self.model.n_u))
+        self._knots = int(c.knots)
         self._x = self.DeclareVectorInputPort("x", self.model.n_x)
         self._u = self.DeclareVectorInputPort("u", self.model.n_u)
-        self._lcs = self.DeclareAbstractState(Value(initial))
-        status: Any = [1.0]  # The stubs know no list.
+        if self._knots:
+            self._plan = self.DeclareAbstractInputPort(
+                "plan", AbstractValue.Make(object())
+            )
+        self._lcs = self.DeclareAbstractState(
+            Value[object]((initial,) * self._knots if self._knots else initial)
+        )
+        status: Any = [float(LcsBuilderStatus.BUILT)]  # The stubs know no list.
         self._status = self.DeclareDiscreteState(status)
         self.DeclareStateOutputPort("lcs", self._lcs)
         self.DeclareStateOutputPort("status", self._status)
@@ -518,13 +649,42 @@ class AnitescuLcsBuilder(LeafSystem):
     @timed
     def _update(self, context, state):
         x, u = self._x.Eval(context), self._u.Eval(context)
+        status = LcsBuilderStatus.BUILT
         try:
             lcs = self.model.build(x, u)
         except (ValueError, RuntimeError):
-            state.get_mutable_discrete_state(self._status).set_value([0.0])
-            return
-        state.get_mutable_abstract_state(int(self._lcs)).set_value(lcs)
-        state.get_mutable_discrete_state(self._status).set_value([1.0])
+            status, lcs = LcsBuilderStatus.HELD, None
+        if lcs is not None and self._knots:
+            lcs, status = self._along_plan(context, lcs)
+        if lcs is not None:
+            state.get_mutable_abstract_state(int(self._lcs)).set_value(lcs)
+        state.get_mutable_discrete_state(self._status).set_value([float(status)])
+
+    def _along_plan(self, context, first):
+        """The LCS of all knots, the first given; and a status."""
+        models, status = [first] * self._knots, LcsBuilderStatus.BUILT
+        plan: Any = self._plan.Eval(context) if self._plan.HasValue(context) else None
+        if not isinstance(plan, Plan) or plan.time is None:
+            return tuple(models), status
+        x, u = plan.at(
+            context.get_time() + self.model.dt_sec * np.arange(1, self._knots)
+        )
+        for k in range(1, self._knots):
+            try:
+                models[k] = self.model.build(x[k - 1], u[k - 1])
+            except (ValueError, RuntimeError):
+                status = LcsBuilderStatus.BUILT_IN_PART
+        return tuple(models), status
+
+
+def _how_many(name, value, most) -> int:
+    """An integer from 1 to most. Raises: ValueError."""
+    if value != int(value) or not 1 <= value <= most:
+        raise ValueError(
+            f"{name} is {value}, expected an integer from 1 to {most}, the "
+            "combinations of geometries"
+        )
+    return int(value)
 
 
 def _direction(name, value) -> np.ndarray:

@@ -32,6 +32,7 @@ from makebreak.systems.numerics.c3_mpc import (
     C3Options,
     C3Problem,
     C3Weights,
+    Plan,
     WarmStart,
     _qp_step,
     plan_cost,
@@ -1061,6 +1062,30 @@ def test_a_bad_input_holds_the_last_plan_as_time_goes_on(name, value, status):
     simulator.AdvanceTo(0.075)
     assert read(simulator, "status") == C3Status.SOLVED
     assert read(simulator, "u") == u[0]
+
+
+def test_an_lcs_per_knot_is_planned_with_and_the_first_one_commands():
+    models = [replace(cartpole_lcs(), d=[0.0, 0.0, 0.01 * k, 0.0]) for k in range(5)]
+    simulator = fixed(C3Mpc(config(), 0.01), lcs=tuple(models))
+    simulator.AdvanceTo(0.005)
+    plan, _ = solve_c3(models, CARTPOLE["x0"], np.zeros((6, 4)), cartpole_problem())
+    np.testing.assert_array_equal(read(simulator, "u"), plan.u[0])
+    x_next, _ = simulate(models[0], CARTPOLE["x0"], plan.u[0])
+    np.testing.assert_array_equal(read(simulator, "x_next"), x_next)
+    for bad in (models[:4], [*models[:4], replace(models[4], dt=0.5)], []):
+        fix(simulator, "lcs", AbstractValue.Make(tuple(bad)))
+        simulator.AdvanceTo(simulator.get_context().get_time() + 0.01)
+        assert read(simulator, "status") == C3Status.BAD_LCS
+
+
+def test_a_plan_is_read_at_any_time():
+    x, u = np.arange(8.0).reshape(4, 2), np.array([[1.0], [2.0], [3.0]])
+    plan = Plan(x, u, np.zeros((3, 1)), 0, 2.0, 0.1)
+    at, inputs = plan.at([1.0, 2.0, 2.05, 2.1, 2.325, 9.0])
+    np.testing.assert_allclose(at[:, 0], [0, 0, 1, 2, 6, 6], atol=1e-4)
+    np.testing.assert_array_equal(inputs[:, 0], [1, 1, 1, 2, 3, 3])
+    with pytest.raises(ValueError, match="time is None"):
+        replace(plan, time=None).at([0.0])
 
 
 def test_a_stream_that_never_was_good_gives_the_smallest_input():

@@ -2,13 +2,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.geometry import Convex, HalfSpace, Sphere
+from pydrake.common.value import AbstractValue
+from pydrake.common.yaml import yaml_load_typed
+from pydrake.geometry import (
+    AddContactMaterial,
+    Convex,
+    HalfSpace,
+    ProximityProperties,
+    Sphere,
+)
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import (
     AddMultibodyPlantSceneGraph,
+    ContactModel,
     CoulombFriction,
+    DiscreteContactApproximation,
     ExternallyAppliedSpatialForce,
     MultibodyPlant,
 )
@@ -23,14 +33,23 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 from scipy.optimize import nnls
 
+from makebreak.diagrams.contact_mpc import ContactMpcConfig, make_contact_mpc
 from makebreak.systems.lcs_builder import (
+    Anitescu,
     AnitescuLcs,
     AnitescuLcsBuilder,
     ContactPair,
     LcsBuilderConfig,
+    LcsBuilderStatus,
+    StewartTrinkle,
 )
+from makebreak.systems.numerics.c3_mpc import C3Options, Plan
 from makebreak.systems.numerics.lcs import simulate
-from makebreak.systems.numerics.lcs_builder import friction_rows, tangent_basis
+from makebreak.systems.numerics.lcs_builder import (
+    contact_rows,
+    friction_edges,
+    tangent_basis,
+)
 
 REFERENCE = Path(__file__).parent / "reference"
 SDF = (REFERENCE / "ball_on_table.sdf").read_text()
@@ -147,8 +166,10 @@ def test_a_reference_direction_keeps_the_tangent_from_jumping():
 
 
 def test_friction_edges_are_opposite_pairs_at_equal_angles():
-    contact, edge = friction_rows([1, 3])
-    np.testing.assert_array_equal(contact, [0, 0, 1, 1, 1, 1, 1, 1])
+    kinds = [(True, friction_edges(n), True, False) for n in (1, 3)]
+    rows = contact_rows(kinds)
+    np.testing.assert_array_equal(rows.contact, [0, 0, 1, 1, 1, 1, 1, 1])
+    edge = rows.edge
     np.testing.assert_array_equal(edge[::2], -edge[1::2])
     angles = np.sort(np.arctan2(edge[2:, 1], edge[2:, 0]))
     np.testing.assert_allclose(np.diff(angles), np.pi / 3, atol=1e-12)
@@ -815,7 +836,7 @@ def test_a_sphere_whose_centre_is_on_a_vertex_has_a_distance(tmp_path, sphere_fi
     for vertex in VERTICES:
         for size in (0.0, 1e-12, 1e-7, 1e-5):
             x[4:7] = vertex + [0.0, 0.0, 0.2] + size * rng.normal(size=3)
-            phi = model.build(x, np.zeros(0)).phi
+            phi = model.build(x, np.zeros(model.n_u)).phi
             # Within `size` of the surface; a distance changes no faster than the point.
             np.testing.assert_allclose(phi, -0.05, atol=4.0 * size + 1e-12)
 
@@ -852,3 +873,398 @@ def test_a_sphere_beside_a_hull_agrees_with_drake(tmp_path, sphere_first):
         np.testing.assert_allclose(n, drakes.nhat_BA_W, atol=0.03)
         np.testing.assert_allclose(p_A, drakes.p_ACa, atol=2e-3)
         np.testing.assert_allclose(p_B, drakes.p_BCb, atol=2e-3)
+
+
+# Other contact models: Stewart's and Trinkle's, a given stiffness, and mixtures.
+
+
+def slider(dt, eps_c=0.0, analytic=True, **pair):
+    """A ball of 1 kg in the x-z plane above the ground; 1 g more moves along x."""
+    pair = {"plane_normal": [0.0, 1.0, 0.0], **pair}
+    pairs = [ContactPair("ball", "world", 0.4, 1, **pair)]
+    return AnitescuLcs(diagram_of(IN_PLANE, add_ground), pairs, dt, eps_c, analytic)
+
+
+@pytest.mark.parametrize("analytic", [True, False])
+@pytest.mark.parametrize("v_x", [0.3, -0.3, 0.02])
+def test_a_sliding_ball_is_slowed_by_mu_N_and_does_not_open(v_x, analytic):
+    m, m_z, mu, dt = 1.001, 1.0, 0.4, 0.01
+    model = slider(dt, analytic=analytic, contact_model=StewartTrinkle())
+    assert model.is_analytic == analytic
+    assert [name.split(" ", 1)[1] for name in model.lam_names] == [
+        "normal",
+        "edge 0",
+        "edge 1",
+        "sliding speed",
+    ]
+    x = np.array([0.0, 0.1, v_x, 0.0])
+    x_next, lam = simulate(model.build(x, np.zeros(model.n_u)), x, np.zeros(model.n_u))
+    # On paper: N = m g, v_x loses dt mu N / m, and stops where that is more than it.
+    N = m_z * G
+    left = max(abs(v_x) - dt * mu * N / m, 0.0) * np.sign(v_x)
+    assert (left == 0.0) == (abs(v_x) == 0.02)
+    np.testing.assert_allclose(x_next, [dt * left, 0.1, left, 0.0], atol=1e-12)
+    friction = m * (abs(v_x) - abs(left)) / dt
+    np.testing.assert_allclose([lam[0], abs(lam[1] - lam[2])], [N, friction], rtol=1e-9)
+    assert lam[3] == pytest.approx(abs(left), abs=1e-12)
+
+
+def forces_of(lam, names):
+    """Normal force, friction forces and sliding speed of a Stewart-Trinkle contact."""
+    edges = [k for k, name in enumerate(names) if " edge " in name]
+    return lam[0], lam[edges], lam[-1]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_step_obeys_coulombs_law_with_the_plants_own_jacobians(ball_diagram, seed):
+    """The conditions of Coulomb friction, with normal and tangents from Drake."""
+    mu, dt, rng = 0.5, 0.05, np.random.default_rng(seed)
+    pair = ContactPair("ball_link", "table_link", mu, 2, contact_model=StewartTrinkle())
+    model = AnitescuLcs(ball_diagram, [pair], dt, 0.0)
+    x = random_state(rng, model.x_default)
+    x[:3] = [-2.0, 0.0, 1.0]
+    x[BALL_Z] = 0.05 + rng.uniform(0.0, 0.02)
+    x[13:] = rng.normal(size=6) * [5, 5, 5, 0.3, 0.3, 0.5]
+    lcs = model.build(x, np.zeros(3))
+    x_next, lam = simulate(lcs, x, np.zeros(3))
+    f_n, f_t, gamma = forces_of(lam, model.lam_names)
+    gap = x_next[BALL_Z] - 0.05
+    v, omega = x_next[16:], x_next[13:16]
+    slip = v + np.cross(omega, [0.0, 0.0, -0.05])  # Of the point that touches.
+    # The force on the ball from Newton's law.
+    force = 0.2 * ((v - x[16:]) / dt + [0.0, 0.0, G])
+    np.testing.assert_allclose(f_n, force[2], atol=1e-9)
+    assert gap > -1e-9 and f_n > -1e-9 and abs(gap * f_n) < 1e-9
+    # The edges are along x and y: a square in the cone, so the slip is measured by its
+    # largest component and the friction by the sum of its components.
+    np.testing.assert_allclose(abs(force[:2]).sum(), f_t.sum(), atol=1e-9)
+    assert f_t.sum() <= mu * f_n + 1e-9
+    if f_n > 1e-6:
+        np.testing.assert_allclose(gamma, abs(slip[:2]).max(), atol=1e-9)
+        # Most dissipation that mu f_n allows; without slip anything within the cone.
+        np.testing.assert_allclose(
+            force[:2] @ slip[:2], -mu * f_n * abs(slip[:2]).max(), atol=1e-8
+        )
+
+
+def enumerated(lcs, q):
+    """All solutions of the LCP, by trying every mode with least squares."""
+    F, n, found = lcs.F, len(q), []
+    for mode in range(2**n):
+        on = [i for i in range(n) if mode >> i & 1]
+        lam = np.zeros(n)
+        if on:
+            lam[on] = np.linalg.lstsq(F[np.ix_(on, on)], -q[on], rcond=None)[0]
+        w = F @ lam + q
+        if min(lam.min(), w.min()) > -1e-9 and abs(w[on]).max(initial=0.0) < 1e-9:
+            found.append(lam)
+    return found
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_mixed_models_in_one_lcs_step_as_enumeration_says(ball_diagram, seed):
+    rng = np.random.default_rng(seed)
+    pairs = [
+        ContactPair("finger_link", "ball_link", 0.5, 2),
+        ContactPair(
+            "ball_link", "table_link", 0.6, 2,
+            contact_model=StewartTrinkle(), stiffness=3e3,
+        ),
+    ]  # fmt: skip
+    model = AnitescuLcs(ball_diagram, pairs, 0.05, 1e-3)
+    assert model.n_lam == 4 + 6
+    x = random_state(rng, np.zeros(19))
+    x[:3], x[7:10] = [-0.11 + 0.01 * rng.normal(), 0.0, 0.05], [0.0, 0.0, 0.049]
+    u = np.array([2.0, 0.5, 1.0]) + rng.normal(size=3)
+    lcs = model.build(x, u)
+    x_next, _ = simulate(lcs, x, u)
+    motions = [
+        lcs.A @ x + lcs.B @ u + lcs.D @ lam + lcs.d
+        for lam in enumerated(lcs, lcs.E @ x + lcs.H @ u + lcs.c)
+    ]
+    assert motions
+    # Coulomb's contact may have several solutions: ours must be one of them.
+    assert min(abs(x_next - motion).max() for motion in motions) < 1e-9
+
+
+@pytest.mark.parametrize("law", [Anitescu, StewartTrinkle])
+@pytest.mark.parametrize("analytic", [True, False])
+def test_a_contact_with_a_stiffness_is_a_spring(law, analytic):
+    """At rest: penetration m g / k, whatever eps_c; and one free step onto it."""
+    k, dt = 2e4, 0.01
+    model = slider(dt, 5e-4, analytic, contact_model=law(), stiffness=k)
+    x = np.array([0.0, 0.1 - G / k, 0.0, 0.0])
+    lcs = model.build(x, np.zeros(model.n_u))
+    x_next, lam = simulate(lcs, x, np.zeros(model.n_u))
+    np.testing.assert_allclose(x_next, x, atol=1e-12)
+    normal = lam.sum() if law is Anitescu else lam[0]
+    assert normal == pytest.approx(G, rel=1e-9)
+    # Falling: v' = v - g dt + dt k (-gap - dt v')/m where that is positive.
+    x = np.array([0.0, 0.1, 0.0, -0.2])
+    v_next = (-0.2 - dt * G) / (1.0 + dt**2 * k)
+    x_next, _ = simulate(model.build(x, np.zeros(model.n_u)), x, np.zeros(model.n_u))
+    assert x_next[3] == pytest.approx(v_next, rel=1e-9)
+
+
+DROPPED = """<sdf version="1.7" xmlns:drake="http://drake.mit.edu">
+<model name="ball"><link name="ball"><inertial><mass>0.2</mass>
+<inertia><ixx>2e-4</ixx><iyy>2e-4</iyy><izz>2e-4</izz></inertia></inertial>
+<collision name="c"><geometry><sphere><radius>.05</radius></sphere></geometry>
+<drake:proximity_properties>
+<drake:point_contact_stiffness>4e3</drake:point_contact_stiffness>
+<drake:hunt_crossley_dissipation>0</drake:hunt_crossley_dissipation>
+<drake:mu_dynamic>.4</drake:mu_dynamic><drake:mu_static>.4</drake:mu_static>
+</drake:proximity_properties></collision></link></model></sdf>"""
+
+
+def on_soft_ground(plant):
+    properties = ProximityProperties()
+    AddContactMaterial(0.0, 4e3, CoulombFriction(0.4, 0.4), properties)
+    plant.RegisterCollisionGeometry(
+        plant.world_body(), RigidTransform(), HalfSpace(), "ground", properties
+    )
+
+
+@pytest.mark.parametrize("law", [Anitescu, StewartTrinkle])
+def test_a_compliant_contact_steps_as_drakes_point_contact(law):
+    """One step of Drake's plant, two springs of 4e3 in a row, and of ours. With slip
+    for Stewart's and Trinkle's alone: Anitescu's opens as it slips."""
+    dt, rng = 1e-3, np.random.default_rng(0)
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, dt)
+    Parser(plant).AddModelsFromString(DROPPED, "sdf")
+    on_soft_ground(plant)
+    # TAMSI: Drake's only one of which the contact does not open as it slips.
+    plant.set_discrete_contact_approximation(DiscreteContactApproximation.kTamsi)
+    plant.set_contact_model(ContactModel.kPoint)
+    plant.Finalize()
+    diagram = builder.Build()
+    pair = ContactPair("ball", "world", 0.4, 2, contact_model=law(), stiffness=2e3)
+    model = AnitescuLcs(diagram, [pair], dt)
+    for slip in [0.0] * 5 + [0.5] * 5 * (law is StewartTrinkle):
+        x, none = np.zeros(13), np.zeros(model.n_u)
+        x[0], x[6] = 1.0, 0.05 - rng.uniform(1e-4, 1e-3)  # At most 2 % of the radius.
+        x[10:13] = slip, 0.0, rng.uniform(-0.2, 0.1)
+        simulator = Simulator(diagram)
+        context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+        plant.SetPositionsAndVelocities(context, x)
+        simulator.AdvanceTo(dt)
+        drakes = plant.GetVelocities(context)
+        ours = simulate(model.build(x, none), x, none)[0][7:13]
+        change = abs(drakes - x[7:13]).max()
+        assert change > 5e-4
+        # Drake's solver ends at 1e-4 of its stiction tolerance of 1e-4 m/s. Its force
+        # acts in the middle of the overlap, ours on the surface: half of at most 2 %.
+        np.testing.assert_allclose(ours[3:], drakes[3:], atol=1e-6)
+        np.testing.assert_allclose(ours[:3], drakes[:3], rtol=0.01, atol=1e-9)
+
+
+# The nearest of many.
+
+MANY = 12
+
+
+def rough_ball():
+    """The ball of ball_on_table with a dozen small spheres on it, and a finger."""
+    spheres = "".join(
+        f'<collision name="bump{k}"><pose>{0.05 * np.cos(a)} {0.05 * np.sin(a)} 0 0 0 0'
+        "</pose><geometry><sphere><radius>.004</radius></sphere></geometry></collision>"
+        for k, a in enumerate(2.0 * np.pi * np.arange(MANY) / MANY)
+    )
+    body = f'<link name="ball_link">{spheres}'
+    assert '<link name="ball_link">' in SDF
+    return diagram_of(SDF.replace('<link name="ball_link">', body))
+
+
+@pytest.mark.parametrize("analytic", [True, False])
+def test_the_nearest_combinations_are_the_contacts_and_sizes_stay(analytic):
+    diagram = rough_ball()
+    pairs = [
+        ContactPair("finger_link", "ball_link", 0.5, closest=2),
+        ContactPair("ball_link", "table_link", 0.3, closest=3),
+    ]
+    model = AnitescuLcs(diagram, pairs, 0.05, analytic=analytic)
+    everything = [ContactPair(p.a, p.b, p.friction) for p in pairs]
+    all_of_them = AnitescuLcs(diagram, everything, 0.05, analytic=analytic)
+    assert model.is_analytic == analytic
+    assert (model.n_lam, all_of_them.n_lam) == (4 * 5, 4 * 2 * (MANY + 1))
+    rng, seen = np.random.default_rng(0), set()
+    for _ in range(10):
+        x = random_state(rng, np.array([0.3, 0.0, 0.1, 1, 0, 0, 0, *np.zeros(12)]))
+        x[BALL_Z] = 0.06
+        lcs, whole = model.build(x, np.zeros(3)), all_of_them.build(x, np.zeros(3))
+        phi = whole.phi[::4]
+        nearest = [sorted(np.argsort(phi[: MANY + 1])[:2])]
+        nearest += [sorted(MANY + 1 + np.argsort(phi[MANY + 1 :])[:3])]
+        rows = [4 * i + k for of in nearest for i in of for k in range(4)]
+        seen.add(tuple(rows))
+        for name in ("E", "H", "c", "phi"):
+            np.testing.assert_allclose(
+                getattr(lcs, name), getattr(whole, name)[rows], atol=1e-12
+            )
+        np.testing.assert_allclose(lcs.D, whole.D[:, rows], atol=1e-12)
+        np.testing.assert_allclose(lcs.F, whole.F[np.ix_(rows, rows)], atol=1e-12)
+    assert len(seen) > 3
+
+
+def test_the_nearest_of_all_pairs_keep_their_own_friction_and_stiffness():
+    law = dict(contact_model=StewartTrinkle())
+    pairs = [
+        ContactPair("finger_link", "ball_link", 0.5, stiffness=2e3, **law),
+        ContactPair("ball_link", "table_link", 0.3, stiffness=5e3, **law),
+    ]
+    model = AnitescuLcs(diagram_of(SDF), pairs, 0.05, closest=1)
+    assert model.n_lam == 6
+    x = model.x_default.copy()
+    for z, i in ((0.06, 1), (0.5, 0)):  # Near the table, and far from it.
+        x[:3], x[7:10] = [0.0, 0.0, z + 0.2], [0.0, 0.0, z]
+        alone = AnitescuLcs(diagram_of(SDF), [pairs[i]], 0.05).build(x, np.zeros(3))
+        lcs = model.build(x, np.zeros(3))
+        for name in MATRICES:
+            np.testing.assert_allclose(
+                getattr(lcs, name), getattr(alone, name), atol=1e-12
+            )
+
+
+def test_bad_kinds_of_contact_are_refused_in_one_line(ball_diagram):
+    def refused(message, closest=None, **change):
+        pairs = ball_pairs()
+        for name, value in change.items():
+            setattr(pairs[0], name, value)
+        with pytest.raises(ValueError, match=message):
+            AnitescuLcs(ball_diagram, pairs, closest=closest)
+
+    refused("finger_link~ball_link: contact_model is 'st', exp", contact_model="st")
+    refused("stiffness is 0.0, expected a positive number", stiffness=0.0)
+    refused("stiffness is inf, expected a positive", stiffness=np.inf)
+    refused("closest is 3, expected an integer from 1 to 2", 3)
+    refused("closest is 0, expected an integer from 1 to 2", 0)
+    refused("expected one kind", 1, friction_directions=3)
+    refused("expected one kind", 1, stiffness=1e3)
+    pairs = ball_pairs()
+    pairs[0].closest = 2
+    with pytest.raises(ValueError, match="ball_link: closest is 2, expected .* 1 to 1"):
+        AnitescuLcs(ball_diagram, pairs)
+    pairs[0].closest = 1
+    with pytest.raises(ValueError, match="closest came for all pairs and for one"):
+        AnitescuLcs(ball_diagram, pairs, closest=1)
+
+
+def test_contact_models_are_read_from_yaml():
+    text = "contacts: [{a: p, b: q, contact_model: !StewartTrinkle {}, stiffness: 1e4}]"
+    config = yaml_load_typed(schema=LcsBuilderConfig, data=text)
+    assert isinstance(config.contacts[0].contact_model, StewartTrinkle)
+    assert config.contacts[0].stiffness == 1e4
+
+
+# An LCS per knot, along the last plan.
+
+PENDULUM = """<sdf version="1.7"><model name="pendulum"><link name="rod">
+<inertial><pose>.5 0 0 0 0 0</pose><mass>1</mass></inertial><collision name="tip">
+<pose>.5 0 0 0 0 0</pose><geometry><sphere><radius>.02</radius></sphere></geometry>
+</collision></link><joint name="j" type="revolute"><parent>world</parent>
+<child>rod</child><axis><xyz>0 1 0</xyz><limit><effort>1e4</effort></limit></axis>
+</joint></model></sdf>"""
+
+
+def add_floor(plant):
+    X = RigidTransform([0.0, 0.0, -3.0])
+    plant.RegisterCollisionGeometry(
+        plant.world_body(), X, HalfSpace(), "floor", CoulombFriction()
+    )
+
+
+def swung(lcs_along_plan):
+    """A pendulum is told to go from hanging to half a turn up, in its own plant."""
+    c = ContactMpcConfig(
+        [ContactPair("rod", "world", 0.5)],
+        Q=[50.0, 1.0],
+        R=[0.1],
+        x_desired=[-0.5 * np.pi, 0.0],
+        dt_sec=0.04,
+        period_sec=0.02,
+        options=C3Options(N=8, rounds=3, polish=3),
+        lcs_along_plan=lcs_along_plan,
+    )
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, 1e-3)
+    Parser(plant).AddModelsFromString(PENDULUM, "sdf")
+    add_floor(plant)
+    plant.Finalize()
+    mpc = builder.AddSystem(make_contact_mpc(diagram_of(PENDULUM, add_floor), c))
+    builder.Connect(plant.get_state_output_port(), mpc.GetInputPort("x"))
+    builder.Connect(mpc.GetOutputPort("u"), plant.get_actuation_input_port())
+    simulator = Simulator(builder.Build())
+    start = [0.5 * np.pi, 0.0]
+    plant.SetPositionsAndVelocities(
+        plant.GetMyMutableContextFromRoot(simulator.get_mutable_context()), start
+    )
+    return simulator, plant, mpc
+
+
+def test_the_lcs_of_each_knot_is_the_one_about_the_last_plan():
+    simulator, plant, mpc = swung(True)
+    lcs = mpc.GetSubsystemByName("lcs")
+    model = AnitescuLcs(
+        diagram_of(PENDULUM, add_floor), [ContactPair("rod", "world", 0.5)], 0.04
+    )
+    context = lcs.GetMyContextFromRoot(simulator.get_context())
+    simulator.AdvanceTo(1e-5)  # The builder has run, C3 has not.
+    x = [0.5 * np.pi, 0.0]
+    first = model.build(x, [0.0])
+    for built in lcs.GetOutputPort("lcs").Eval(context):
+        np.testing.assert_array_equal(built.A, first.A)
+    simulator.AdvanceTo(0.019)
+    plan = mpc.GetOutputPort("plan").Eval(
+        mpc.GetMyContextFromRoot(simulator.get_context())
+    )
+    assert (plan.time, plan.dt) == (1e-4, 0.04)
+    simulator.AdvanceTo(0.02 + 1e-5)
+    # The plan is .0199 s old, knots are .04 s apart.
+    share, x_plan = 0.0199 / 0.04, plan.x
+    built = lcs.GetOutputPort("lcs").Eval(context)
+    assert lcs.GetOutputPort("status").Eval(context) == LcsBuilderStatus.BUILT
+    for k in range(1, 8):
+        between = (1.0 - share) * x_plan[k] + share * x_plan[k + 1]
+        expected = model.build(between, plan.u[k])
+        np.testing.assert_allclose(built[k].A, expected.A, atol=1e-5)
+        np.testing.assert_allclose(built[k].d, expected.d, atol=1e-5)
+    # And not those about x: gravity's lever turns along the plan.
+    assert abs(built[7].A - built[0].A).max() > 1e-2
+
+
+def test_plans_along_the_last_one_foresee_better_what_happens():
+    errors = {}
+    for along in (True, False):
+        simulator, plant, mpc = swung(along)
+        whole, errors[along] = mpc.GetMyContextFromRoot(simulator.get_context()), []
+        for tick in range(1, 15):
+            simulator.AdvanceTo(0.02 * tick + 0.01)
+            plan = mpc.GetOutputPort("plan").Eval(whole)
+            assert plan.status == 0
+            x = plan.x[0].copy()  # Euler steps of the pendulum's own equation.
+            for u in plan.u[:, 0]:
+                x[1] += 0.04 * (u + G * 0.5 * np.cos(x[0])) / 1.25
+                x[0] += 0.04 * x[1]
+            errors[along].append(abs(plan.x[-1, 0] - x[0]))
+    assert np.mean(errors[True]) < 0.01 * np.mean(errors[False])
+
+
+def test_a_planned_state_that_is_none_is_told_and_the_present_one_stands_in(
+    ball_diagram,
+):
+    config = LcsBuilderConfig(ball_pairs(), 0.05, period_sec=0.01, knots=3)
+    system = AnitescuLcsBuilder(ball_diagram, config)
+    x = random_state(np.random.default_rng(0), np.zeros(19))
+    plan_x = np.tile(x, (4, 1))
+    plan_x[2, 3:7] = 0.0  # No quaternion.
+    plan = Plan(plan_x, np.zeros((3, 3)), np.zeros((3, 8)), 0, 0.0, 0.05)
+    simulator = run_with([system], x, np.zeros(3))
+    port, context = system.GetInputPort("plan"), simulator.get_mutable_context()
+    port.FixValue(system.GetMyMutableContextFromRoot(context), AbstractValue.Make(plan))
+    simulator.AdvanceTo(0.005)
+    models, status = outputs(simulator, system)
+    assert status == LcsBuilderStatus.BUILT_IN_PART and len(models) == 3
+    np.testing.assert_array_equal(models[2].A, models[0].A)
+    with pytest.raises(ValueError, match="knots is 1.5"):
+        AnitescuLcsBuilder(ball_diagram, LcsBuilderConfig(ball_pairs(), knots=1.5))

@@ -109,10 +109,30 @@ class Plan:
     u: np.ndarray  # (N, n_u) [N]
     lam: np.ndarray  # (N, n_lam) [N]; complementary only as far as ADMM got.
     status: int = 0  # 0: of this tick. Else the reason why it is an older one.
+    time: float | None = None  # Of x[0] [s]; None: unknown, or no plan has been made.
+    dt: float = 0.0  # Between knots [s].
 
     def __post_init__(self):
         for name in ("x", "u", "lam"):
             getattr(self, name).setflags(write=False)
+
+    def at(self, times):
+        """x (n, n_x) and u (n, n_u) at times (n,) [s]: x linear between the knots and
+        still beyond the last, u held from each knot to the next and beyond the last.
+
+        Raises: ValueError where the plan has no time.
+        """
+        if self.time is None or not self.dt > 0.0:
+            raise ValueError(
+                f"Plan: time is {self.time} and dt {self.dt}, expected a plan in time"
+            )
+        N = len(self.u)
+        # Times are sums of periods: their rounding must not delay a knot by one.
+        knots = (np.asarray(times, float) - self.time) / self.dt + 1e-6
+        before = np.clip(np.floor(knots).astype(int), 0, N - 1)
+        share = np.clip(knots - before, 0.0, 1.0)[:, None]
+        x = (1.0 - share) * self.x[before] + share * self.x[before + 1]
+        return x, self.u[before]
 
 
 @dataclass(frozen=True, eq=False)

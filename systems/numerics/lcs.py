@@ -30,7 +30,8 @@ class LCS:
     c: np.ndarray  # (n_lam,)
     dt: float  # Time step [s].
     # Gap of the contact that each force acts at, where the system was linearised [m];
-    # None where the LCS does not come from geometry. It informs, w does not use it.
+    # infinite where w holds no gap (a friction force of its own). None where the LCS
+    # does not come from geometry. It informs, w does not use it.
     phi: np.ndarray | None = None  # (n_lam,)
 
     def __post_init__(self):

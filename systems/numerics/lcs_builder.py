@@ -1,17 +1,31 @@
-"""Anitescu's contact, linearised about one state: arrays of a multibody model -> LCS.
+"""Contact linearised about one state: arrays of a multibody model -> LCS.
 
     v_next = v + dt f(q, v, u) + dt M^-1 J_c' lam,   q_next = q + dt N v_next
-    0 <= lam  perp  E_t' (phi + J_n N+ (q - q*)) / dt + J_c v_next + eps_c lam >= 0
+    0 <= lam  perp  w = S (phi + J_n N+ (q - q*)) / dt + J_c v_next + F_0 lam >= 0
 
 f is the acceleration without contact; N maps v to qdot and N+ back, both frozen at the
-nominal q*. Each contact has 2 n_f friction edges; row i of J_c is the normal Jacobian
-of its contact plus mu times the tangent Jacobian of its edge. lam is in newtons.
+nominal q*. Row i of J_c is what the i-th entry of lam pushes along, S picks the gap of
+its contact, and F_0 holds what does not come from the dynamics. With n_f friction
+directions (2 n_f edges) a contact has these rows:
+
+    Anitescu          per edge:    J_n + mu J_t, with the gap
+    Stewart-Trinkle   normal:      J_n, with the gap
+                      per edge:    J_t + gamma, without the gap
+                      cone:        w = mu lam_n - sum lam_t, lam = gamma, the speed at
+                                   which the contact slides
+
+Anitescu's contact is convex, and opens while it slides, by dt mu |v_t|.
+Stewart-Trinkle's does not; its F is not symmetric. A contact with a stiffness k is a
+spring: lam_n = k max(0, -gap after the step), which adds 1 / (k dt) to F between its
+normal forces. eps_c keeps the other forces apart. lam is in newtons (gamma in m/s, and
+its w in newtons).
 
 The gap that the forces see moves with q through E, so it changes along a horizon: a
 gap frozen at q* would let a plan push through what it has not touched yet.
 
 Source: ACI-MPC section V, eq. 5-8 (there lam is an impulse: lam_impulse = dt lam, and
-so eps_c here is dt times theirs); Anitescu, Math. Programming 105 (2006).
+so eps_c here is dt times theirs); Anitescu, Math. Programming 105 (2006); Stewart,
+Trinkle, Int. J. Numerical Methods in Engineering 39 (1996).
 """
 
 from dataclasses import dataclass
@@ -27,21 +41,92 @@ SPHERE, BOX, HALF_SPACE = 0, 1, 2
 _NOT_FINITE = "the linearised contact model has an entry that is not finite"
 
 
-def friction_rows(n_f):
-    """Which contact, and which direction in its tangent plane, each force acts along.
+def friction_edges(n_f):
+    """The 2 n_f friction edges (2 n_f, 2) of a contact, unit vectors (cos, sin) in the
+    tangent basis: theta = 0, pi, pi/n_f, pi/n_f + pi, ... as in c3_reference."""
+    edges = []
+    for k in range(n_f):
+        direction = np.array([cos(pi * k / n_f), sin(pi * k / n_f)])
+        edges += [direction, -direction]
+    return np.array(edges).reshape(-1, 2)
 
-    Args: n_f (n_contacts,) integers, friction directions of each contact.
 
-    Returns: contact (n_lam,) index, and edge (n_lam, 2), the unit vector (cos, sin) in
-        the tangent basis: theta = 0, pi, pi/n_f, pi/n_f + pi, ... as in c3_reference.
+@dataclass(frozen=True, eq=False)
+class ContactRows:
+    """What each entry of lam is: row i of J_c is normal J_n + weight (edge' J_t)."""
+
+    contact: np.ndarray  # (n_lam,) index of its contact
+    normal: np.ndarray  # (n_lam,) 1.0, or 0.0: a row without normal and gap
+    edge: np.ndarray  # (n_lam, 2) in the tangent basis; 0: none
+    along_mu: np.ndarray  # (n_lam,) whether the edge counts mu times (Anitescu)
+    cone: np.ndarray  # (n_lam, n_lam) constant part of F
+    cone_mu: np.ndarray  # (n_lam, n_lam) of F, times mu
+    regular: np.ndarray  # (n_lam, n_lam) of F, times eps_c
+    compressed: np.ndarray  # (n_lam, n_lam) of F, times 1 / (stiffness dt)
+    names: list[str]  # Of each row within its contact.
+
+    def weight(self, mu):
+        """(n_lam,) of the rows' edges, for the contacts' friction mu (n_contacts,)."""
+        return np.where(self.along_mu, mu[self.contact], 1.0)
+
+    def F_0(self, mu, compliance, dt, eps_c):
+        """(n_lam, n_lam), for mu (n_contacts,) and compliance (n_contacts,) [m/N]."""
+        of_row, soft = mu[self.contact][:, None], compliance[self.contact][:, None]
+        F_0 = self.cone + of_row * self.cone_mu + eps_c * self.regular
+        return F_0 + soft / dt * self.compressed
+
+
+def contact_rows(kinds) -> ContactRows:
+    """The rows of contacts, one after the other.
+
+    Args: kinds: per contact (is_anitescu, edges (2 n_f, 2), has friction, is
+        compliant). Without friction a Stewart-Trinkle contact is its normal row alone.
     """
-    contact, edge = [], []
-    for i, n in enumerate(n_f):
-        for k in range(n):
-            direction = np.array([cos(pi * k / n), sin(pi * k / n)])
-            contact += [i, i]
-            edge += [direction, -direction]
-    return np.array(contact, dtype=np.int64), np.array(edge).reshape(-1, 2)
+    sizes = [
+        len(edges) if anitescu else (len(edges) + 2 if friction else 1)
+        for anitescu, edges, friction, _ in kinds
+    ]
+    n = sum(sizes)
+    normal, edge, along_mu = np.zeros(n), np.zeros((n, 2)), np.zeros(n, bool)
+    cone, cone_mu, regular, compressed = np.zeros((4, n, n))
+    names, start = [], 0
+    for (anitescu, edges, friction, compliant), size in zip(kinds, sizes, strict=True):
+        own = slice(start, start + size)
+        if anitescu:
+            normal[own], edge[own], along_mu[own] = 1.0, edges, True
+            regular[own, own] = np.eye(size)
+            names += [f"{k}" for k in range(size)]
+            if compliant:  # The sum of the forces meets the spring, and only that.
+                compressed[own, own] = 1.0
+                regular[own, own] -= 1.0 / size
+        else:
+            normal[start] = 1.0
+            (compressed if compliant else regular)[start, start] = 1.0
+            names.append("normal")
+            if friction:
+                tangent, last = slice(start + 1, start + size - 1), start + size - 1
+                edge[tangent] = edges
+                regular[tangent, tangent] = np.eye(size - 2)
+                cone[tangent, last], cone[last, tangent] = 1.0, -1.0
+                cone_mu[last, start] = 1.0
+                names += [f"edge {k}" for k in range(size - 2)] + ["sliding speed"]
+        start += size
+    contact = np.repeat(np.arange(len(sizes)), sizes)
+    return ContactRows(
+        contact, normal, edge, along_mu, cone, cone_mu, regular, compressed, names
+    )
+
+
+def nearest_contacts(phi, groups):
+    """Which contacts of each group are nearest: indices, in their order in the group.
+
+    Args: phi (n,) gaps [m]; groups: pairs of (indices (m,), how many of them to take).
+    """
+    chosen = []
+    for of_group, count in groups:
+        nearest = np.argsort(phi[of_group], kind="stable")[:count]
+        chosen.append(of_group[np.sort(nearest)])
+    return np.concatenate(chosen)
 
 
 @njit(cache=True)
@@ -73,8 +158,8 @@ def tangent_basis(n, reference):
     return t1, t2
 
 
-def assemble_anitescu(
-    x, f, J_q, J_v, J_u, u, M, N, N_plus, phi, J_n, J_c, contact, dt, eps_c
+def assemble_lcs(
+    x, f, J_q, J_v, J_u, u, M, N, N_plus, phi, J_n, J_c, contact, normal, F_0, dt
 ):
     """The LCS of one linearised time step.
 
@@ -84,11 +169,12 @@ def assemble_anitescu(
             (n_v, n_v), J_u (n_v, n_u) its derivatives.
         M: (n_v, n_v) mass matrix. N: (n_q, n_v), qdot = N v. N_plus: (n_v, n_q).
         phi: (n_contacts,) gaps [m]; J_n: (n_contacts, n_v), their rates per v.
-        J_c: (n_lam, n_v), J_n of each force's contact plus mu times its edge's J_t.
-        contact: (n_lam,) integers, the contact of each force.
-        dt: time step [s]. eps_c: added to the diagonal of F [m/s per N].
+        J_c: (n_lam, n_v), what each force pushes along.
+        contact: (n_lam,) integers, the contact of each force. normal (n_lam,): 1.0
+            where w holds the contact's gap, else 0.0. F_0 (n_lam, n_lam): see the
+            module. dt: time step [s].
 
-    Returns: LCS with dt and phi (per force).
+    Returns: LCS with dt and phi (per force; infinite where w holds no gap).
 
     Raises: ValueError if the model's arrays lead to an entry that is not finite.
 
@@ -108,12 +194,14 @@ def assemble_anitescu(
         np.ascontiguousarray(J_n, dtype=float),
         np.ascontiguousarray(J_c, dtype=float),
         contact,
+        normal,
+        F_0,
         dt,
-        eps_c,
     )
     if not _is_finite(c, d, F):
         raise ValueError(_NOT_FINITE)
-    return LCS(A, B, D, d, E, F, H, c, dt, phi[contact])
+    phi_lam = np.where(normal > 0.0, phi[contact], np.inf)
+    return LCS(A, B, D, d, E, F, H, c, dt, phi_lam)
 
 
 @njit(cache=True)
@@ -125,8 +213,9 @@ def _is_finite(c, d, F):
 
 @njit(cache=True)
 def _assemble(
-    x, f, J_q, J_v, J_u, u, M_inv_J_cT, N, N_plus, phi, J_n, J_c, contact, dt, eps_c
-):
+    x, f, J_q, J_v, J_u, u, M_inv_J_cT, N, N_plus, phi, J_n, J_c, contact, normal,
+    F_0, dt,
+):  # fmt: skip
     n_v, n_q = J_q.shape
     n_x, n_u, n_lam = n_q + n_v, J_u.shape[1], contact.size
     q, v = x[:n_q].copy(), x[n_q:].copy()
@@ -154,9 +243,11 @@ def _assemble(
     F = J_c @ V_lam
     c = J_c @ V_0
     for i in range(n_lam):
-        E[i, :n_q] += gap_rate[contact[i]]
-        c[i] += gap_0[contact[i]]
-        F[i, i] += eps_c
+        if normal[i] > 0.0:
+            E[i, :n_q] += gap_rate[contact[i]]
+            c[i] += gap_0[contact[i]]
+        for j in range(n_lam):
+            F[i, j] += F_0[i, j]
     return A, B, D, d, E, F, H, c
 
 
@@ -188,22 +279,31 @@ class ConstantMassModel:
     p_0: np.ndarray  # (n_g, 3) in the world at q = 0, or in the floating body [m]
     P: np.ndarray  # (n_g, 3, n_q)
     J_p: np.ndarray  # (n_g, 3, n_v) velocity of a body that never turns
-    pairs: np.ndarray  # (n_contacts, 2) geometry A, geometry B
-    mu: np.ndarray  # (n_contacts,)
-    reference: np.ndarray  # (n_contacts, 3) see tangent_basis
-    contact: np.ndarray  # (n_lam,)
-    edge: np.ndarray  # (n_lam, 2)
+    pairs: np.ndarray  # (n_pairs, 2) geometry A, geometry B
+    reference: np.ndarray  # (n_pairs, 3) see tangent_basis
 
-    def build(self, x, u, dt, eps_c) -> LCS:
+    def gaps(self, q):
+        """(n_pairs,) of all pairs [m]."""
+        return _gaps(
+            q, self.shape, self.size, self.quaternion, self.R, self.p_0, self.P,
+            self.pairs,
+        )  # fmt: skip
+
+    def build(self, x, u, dt, rows: ContactRows, weight, F_0, chosen=None) -> LCS:
         """The LCS at x (n_x,), with unit quaternions, and u (n_u,).
 
-        Raises: ValueError as assemble_anitescu.
+        Args: rows, with weight and F_0 of its friction; chosen: the pairs that are its
+            contacts, None: all.
+        Raises: ValueError as assemble_lcs.
         """
+        pairs, reference = self.pairs, self.reference
+        if chosen is not None:
+            pairs, reference = pairs[chosen], reference[chosen]
         A, B, D, d, E, F, H, c, phi, finite = _build_constant_mass(
             x, u, self.M_inv, self.f_0, self.J_v, self.J_u, self.plain, self.floating,
             self.shape, self.size, self.quaternion, self.omega, self.R, self.p_0,
-            self.P, self.J_p, self.pairs, self.mu, self.reference, self.contact,
-            self.edge, dt, eps_c,
+            self.P, self.J_p, pairs, reference, rows.contact, rows.normal, weight,
+            rows.edge, F_0, dt,
         )  # fmt: skip
         if not finite:
             raise ValueError(_NOT_FINITE)
@@ -211,16 +311,9 @@ class ConstantMassModel:
 
 
 @njit(cache=True)
-def _build_constant_mass(
-    x, u, M_inv, f_0, J_v, J_u, plain, floating, shape, size, quaternion, omega, R,
-    p_0, P, J_p, pairs, mu, reference, contact, edge, dt, eps_c,
-):  # fmt: skip
-    n_v = f_0.size
-    n_q = x.size - n_v
-    q, v = x[:n_q].copy(), x[n_q:].copy()
-    N, N_plus = velocity_maps(q, plain, floating, n_v)
-    # Poses of the shapes, and of the origins that their bodies turn about.
-    n_g = shape.size
+def _poses(q, quaternion, R, p_0, P):
+    """Of the shapes in the world, and the origins that their bodies turn about."""
+    n_g = quaternion.size
     R_W, p_W, origin = np.empty((n_g, 3, 3)), np.empty((n_g, 3)), np.zeros((n_g, 3))
     for g in range(n_g):
         if quaternion[g] < 0:
@@ -232,21 +325,45 @@ def _build_constant_mass(
             origin[g] = q[k + 4 : k + 7]
             R_W[g] = R_WB @ R[g]
             p_W[g] = origin[g] + R_WB @ p_0[g]
+    return R_W, p_W, origin
+
+
+@njit(cache=True)
+def _distance(a, b, shape, size, R_W, p_W):
+    """Gap of the shapes a and b, normal from b to a, nearest points on a and b."""
+    if shape[a] == SPHERE:
+        return _sphere_against(p_W[a], size[a, 0], shape[b], size[b], R_W[b], p_W[b])
+    gap, n, on_b, on_a = _sphere_against(
+        p_W[b], size[b, 0], shape[a], size[a], R_W[a], p_W[a]
+    )
+    return gap, -n, on_a, on_b
+
+
+@njit(cache=True)
+def _gaps(q, shape, size, quaternion, R, p_0, P, pairs):
+    R_W, p_W, _ = _poses(q, quaternion, R, p_0, P)
+    phi = np.empty(len(pairs))
+    for i in range(len(pairs)):
+        phi[i] = _distance(pairs[i, 0], pairs[i, 1], shape, size, R_W, p_W)[0]
+    return phi
+
+
+@njit(cache=True)
+def _build_constant_mass(
+    x, u, M_inv, f_0, J_v, J_u, plain, floating, shape, size, quaternion, omega, R,
+    p_0, P, J_p, pairs, reference, contact, normal, weight, edge, F_0, dt,
+):  # fmt: skip
+    n_v = f_0.size
+    n_q = x.size - n_v
+    q, v = x[:n_q].copy(), x[n_q:].copy()
+    N, N_plus = velocity_maps(q, plain, floating, n_v)
+    R_W, p_W, origin = _poses(q, quaternion, R, p_0, P)
     n_c, n_lam = pairs.shape[0], contact.size
     phi, J = np.empty(n_c), np.empty((n_c, 3, n_v))
     J_n = np.empty((n_c, n_v))
     for i in range(n_c):
         a, b = pairs[i]
-        if shape[a] == SPHERE:
-            gap, n, on_a, on_b = _sphere_against(
-                p_W[a], size[a, 0], shape[b], size[b], R_W[b], p_W[b]
-            )
-        else:
-            gap, n, on_b, on_a = _sphere_against(
-                p_W[b], size[b, 0], shape[a], size[a], R_W[a], p_W[a]
-            )
-            n = -n
-        phi[i] = gap
+        phi[i], n, on_a, on_b = _distance(a, b, shape, size, R_W, p_W)
         J_w = _point_jacobian(on_a - origin[a], omega[a], J_p[a])
         J_w -= _point_jacobian(on_b - origin[b], omega[b], J_p[b])
         t1, t2 = tangent_basis(n, reference[i])
@@ -255,12 +372,13 @@ def _build_constant_mass(
     J_c, phi_lam = np.empty((n_lam, n_v)), np.empty(n_lam)
     for k in range(n_lam):
         i = contact[k]
-        J_c[k] = J[i, 0] + mu[i] * (edge[k, 0] * J[i, 1] + edge[k, 1] * J[i, 2])
-        phi_lam[k] = phi[i]
+        J_t = edge[k, 0] * J[i, 1] + edge[k, 1] * J[i, 2]
+        J_c[k] = normal[k] * J[i, 0] + weight[k] * J_t
+        phi_lam[k] = phi[i] if normal[k] > 0.0 else np.inf
     f = f_0 + J_v @ v + J_u @ u
     A, B, D, d, E, F, H, c = _assemble(
         x, f, np.zeros((n_v, n_q)), J_v, J_u, u, M_inv @ J_c.T, N, N_plus, phi, J_n,
-        J_c, contact, dt, eps_c,
+        J_c, contact, normal, F_0, dt,
     )  # fmt: skip
     return A, B, D, d, E, F, H, c, phi_lam, _is_finite(c, d, F)
 
