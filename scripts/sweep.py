@@ -27,6 +27,7 @@ from makebreak.scripts.table import Table, json_value
 from makebreak.scripts.trials import run_many, setting_texts
 
 CONFIDENCE = 0.95
+UNITS = ("m", "mm", "s", "N", "Nm", "rad", "deg", "kg")  # That keys end with.
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:
@@ -194,7 +195,7 @@ def run_sweep(
     files[0].write_text(table.to_markdown())
     files[1].write_text(json.dumps(_summary(sweep, groups, measured), indent=2) + "\n")
     _write_csv(files[2], runs, results, [*sweep.cases_of, *sweep.ranges])
-    for key in [*sweep.ranges, *(k for k in sweep.cases_of if _numeric(sweep, k))]:
+    for key in [*sweep.ranges, *sweep.cases_of]:
         path = out_dir / f"{key.replace('.', '_')}.png"
         _plot(sweep, key, runs, results, measured).savefig(path, dpi=120)
         files.append(path)
@@ -295,24 +296,75 @@ def _write_csv(path, runs, results, varied):
 
 
 def _plot(sweep, key, runs, results, measured) -> Figure:
-    """Errors, and the success, against a setting that was varied."""
+    """Success, and the errors, against a setting that was varied: a colour per case of
+    the other listed settings, crosses for trials without success."""
     shown = [k for k, kind in measured.items() if kind == "mean" and _is_error(k)]
-    figure = Figure(figsize=(7, 2.0 + 1.6 * len(shown)), layout="constrained")
+    figure = Figure(figsize=(7, 2.4 + 1.6 * len(shown)), layout="constrained")
     axes = np.atleast_1d(figure.subplots(len(shown) + 1, sharex=True))
-    x = np.array([float(settings[key]) for settings, _ in runs])
-    good = np.array([bool(r.get("success")) for r in results])
-    for ax, name in zip(axes, ["success", *shown], strict=False):
-        y = np.array(
-            [np.nan if (v := r.get(name)) is None else float(v) for r in results]
-        )
-        for mask, color, mark in ((good, "tab:blue", "o"), (~good, "tab:red", "x")):
-            label = "success" if mark == "o" else "no success"
-            ax.plot(x[mask], y[mask], mark, color=color, label=label, alpha=0.7)
-        ax.set_ylabel(name.replace("_", " "), fontsize=8)
+    listed = sweep.cases_of.get(key)
+    is_number = listed is None or _numeric(sweep, key)
+    others = [k for k in sweep.cases_of if k != key]
+    groups: dict[str, list[int]] = {}
+    for i, (settings, _) in enumerate(runs):
+        name = " ".join(setting_texts({k: settings[k] for k in others}))
+        groups.setdefault(name, []).append(i)
+
+    def x_of(i):
+        value = runs[i][0][key]
+        return float(value) if is_number else float(listed.index(value))
+
+    all_x = [x_of(i) for i in range(len(runs))]
+    steps = np.diff(np.unique(all_x))
+    apart = 0.15 * (steps.min() if listed and steps.size else 0.0) / len(groups)
+    for at, (group, members) in enumerate(groups.items()):
+        color = f"C{at % 10}"
+        x = np.array([all_x[i] for i in members])
+        drawn_x = x + apart * (at - 0.5 * (len(groups) - 1))
+        good = np.array([bool(results[i].get("success")) for i in members])
+        if listed:  # The rate of each value, with its interval.
+            places = np.unique(x)
+            rates = [(good[x == place].sum(), (x == place).sum()) for place in places]
+            middle = np.array([k / n for k, n in rates])
+            ends = np.array([wilson(int(k), int(n)) for k, n in rates]).T
+            reach = [np.maximum(middle - ends[0], 0.0), np.maximum(ends[1] - middle, 0)]
+            shift = places + apart * (at - 0.5 * (len(groups) - 1))
+            axes[0].errorbar(
+                shift, middle, reach, fmt="o-" if is_number else "o", color=color,
+                capsize=3, lw=0.8, label=group or None,
+            )  # fmt: skip
+        else:
+            axes[0].plot(x, good + 0.04 * at, ".", color=color, label=group or None)
+        for ax, name in zip(axes[1:], shown, strict=True):
+            got = [results[i].get(name) for i in members]
+            y = np.array([np.nan if v is None else float(v) for v in got])
+            ax.plot(drawn_x[good], y[good], "o", color=color, alpha=0.6)
+            ax.plot(drawn_x[~good], y[~good], "x", color=color, alpha=0.6)
+    axes[0].set(ylim=(-0.08, 1.12), ylabel="success")
+    for ax, name in zip(axes[1:], shown, strict=True):
+        ax.set_ylabel(_label(name), fontsize=8)
+        ax.ticklabel_format(axis="y", scilimits=(-2, 4))
+    for ax in axes:
         ax.grid(alpha=0.3)
-    axes[0].set(yticks=[0, 1], yticklabels=["no", "yes"], ylim=(-0.3, 1.3))
-    if shown:
-        axes[1].legend(fontsize=8)
-    axes[-1].set_xlabel(key)
-    figure.suptitle(f"{sweep.experiment}: {sweep.trials} trials per case")
+    axes[-1].set_xlabel(_label(key))
+    if listed:
+        ticks = sorted(listed) if is_number else range(len(listed))
+        axes[-1].set_xticks(
+            ticks, [f"{v:g}" if is_number else _text(listed[v]) for v in ticks]
+        )
+    if any(groups):
+        figure.legend(loc="outside lower center", ncols=2, fontsize=8)
+    marks = "; o success, x none" if shown else ""
+    n = f"{sweep.trials} trial{'s' if sweep.trials > 1 else ''} per case"
+    figure.suptitle(f"{sweep.experiment}: {n}{marks}", fontsize=10)
     return figure
+
+
+def _text(value) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _label(name: str) -> str:
+    """A key with its unit, which its end names: `radius error [m]`."""
+    stem, _, unit = name.rpartition("_")
+    words = name.replace("_", " ")
+    return f"{stem.replace('_', ' ')} [{unit}]" if stem and unit in UNITS else words

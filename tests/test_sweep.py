@@ -13,7 +13,7 @@ import spring_mass
 from makebreak.scripts import cli, trials
 from makebreak.scripts.experiments import EXPERIMENTS
 from makebreak.scripts.settings import apply_settings
-from makebreak.scripts.sweep import Sweep, run_sweep, wilson
+from makebreak.scripts.sweep import Sweep, _plot, run_sweep, wilson
 
 
 @pytest.fixture(autouse=True)
@@ -99,6 +99,30 @@ def test_a_sweep_writes_table_rows_and_plots(capsys):
     summary = json.loads(Path("out/sweep.json").read_text())
     assert [case["success"]["of"] for case in summary["cases"]] == [3, 3]
     assert Path("out/noise.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_plot_tells_the_cases_of_another_setting_apart():
+    s = sweep("noise=0.1,0.3", "damped=true,false", n=2)
+    # Damped ones succeed, with an error of their noise; the others with ten times it.
+    results = [
+        {"success": settings["damped"],
+         "error_m": settings["noise"] * (1.0 if settings["damped"] else 10.0)}
+        for settings, _ in s.runs()
+    ]  # fmt: skip
+    figure = _plot(s, "noise", s.runs(), results, {"error_m": "mean"})
+    rate, error = figure.axes
+    assert [t.get_text() for t in figure.legends[0].get_texts()] == [
+        "damped=true", "damped=false"]  # fmt: skip
+    points = {}
+    for line in error.lines:
+        for x, y in zip(line.get_xdata(), line.get_ydata(), strict=True):
+            points.setdefault(line.get_color(), set()).add((round(x, 1), round(y, 6)))
+    assert points == {"C0": {(0.1, 0.1), (0.3, 0.3)}, "C1": {(0.1, 1.0), (0.3, 3.0)}}
+    middle = [line.get_ydata().tolist() for line in rate.lines if len(line.get_xdata())]
+    assert [1.0, 1.0] in middle and [0.0, 0.0] in middle
+    assert error.get_ylabel() == "error [m]"
+    named = _plot(s, "damped", s.runs(), results, {"error_m": "mean"})
+    assert [t.get_text() for t in named.axes[-1].get_xticklabels()] == ["true", "false"]
 
 
 def test_a_trial_that_crashes_is_a_failed_trial_with_its_reason():
