@@ -105,6 +105,7 @@ class PlannerConfig:
     ball_velocity: float = 300.0  # And angular velocity.
     force: float = 5.0  # G of lam of tip and ball; eta's is 1/10 of it.
     friction: float = 1.0  # Of both contacts, for planning and learning.
+    polish: int = 0  # Rollouts that improve the plan (docs/c3.md); 0: none.
 
 
 @dataclass
@@ -280,7 +281,12 @@ def c3_config(planner: PlannerConfig, n_lam: int, projection: str = "plus") -> C
     return C3Config(
         weights=C3Weights(Q, np.full(3, 0.01), G, G),
         projection=PROJECTIONS[projection](),
-        options=C3Options(N=planner.N, rounds=planner.rounds, rho=planner.rho),
+        options=C3Options(
+            N=planner.N,
+            rounds=planner.rounds,
+            rho=planner.rho,
+            polish=planner.polish,
+        ),
         residual_dt_sec=LEARN,
     )
 

@@ -22,7 +22,7 @@ class RollingTaskConfig:
     radius: float = 0.1  # Of the circle [m].
     lead_deg: float = 6.0  # The target runs so far ahead of the ball ...
     speed: float = 0.045  # ... and moves along the circle with it [m/s].
-    press: float = 0.045  # Tip target below the top of the modelled ball [m].
+    press: float = 0.045  # Tip target below the ball's top, as learned [m].
     rolling: RollingConfig = field(default_factory=RollingConfig)
     period_sec: float = 0.0125
     offset_sec: float = 0.0
@@ -104,7 +104,9 @@ class RollingTask(LeafSystem):
             c.rolling, self._path, task, t, c.period_sec, x, gap, valid,
             self._radius_ball, self._radius_tip, landed, gap_std, force_z,
         )  # fmt: skip
-        z_tip = 2.0 * self._radius_ball + self._radius_tip - c.press
+        # Below the top where it is believed to be: a ball larger than modelled would
+        # else be pressed as much harder.
+        z_tip = 2.0 * self._radius_ball + self._radius_tip - gap - c.press
         goal = target_over_horizon(
             self._path, x, np.deg2rad(c.lead_deg), c.speed, z_tip, self._radius_ball,
             self._knot_sec, self._n_knots,

@@ -142,6 +142,23 @@ def test_a_ball_that_is_not_seen_at_the_start_lifts_the_tip_from_where_it_is():
         assert system.GetOutputPort("phase").Eval(context)[0] == WAIT
 
 
+@pytest.mark.parametrize("gap", [-0.016, 0.0, 0.010])
+def test_the_tip_is_pressed_as_far_below_the_top_as_learned_whatever_the_gap(gap):
+    config = RollingTaskConfig()
+    system = RollingTask(config, 6, 0.1, R_BALL, R_TIP, 8, 4, residual_dt_sec=0.05)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    r_comp = np.array([gap / 0.05] * 4 + [0.3] * 4)  # The table's are no concern.
+    for name, value in (("x", np.eye(19)[3]), ("valid", [1.0]), ("r_comp", r_comp)):
+        system.GetInputPort(name).FixValue(context, value)
+    simulator.AdvanceTo(DT / 2)
+    x_desired = system.GetOutputPort("x_desired").Eval(context).reshape(6, 19)
+    top = 2.0 * R_BALL - gap  # Of a ball whose surface is that much lower.
+    np.testing.assert_allclose(
+        x_desired[:, P_TIP.start + 2], top + R_TIP - config.press, atol=1e-12
+    )
+
+
 def test_target_leads_the_ball_and_moves_along_the_circle():
     x = pack([0.6, 0, 0.1], np.zeros(3), [0.6, 0.0, R_BALL], np.zeros(3), R_BALL)
     speed, dt = 0.1 * np.pi / 2, 0.1  # A quarter of the circle each second.
