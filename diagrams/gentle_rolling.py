@@ -146,7 +146,8 @@ class TouchConfig:
 def _brisk_ball() -> BallRollingConfig:
     rolling = RollingConfig(reposition_sec=BRISK_SEC)
     return BallRollingConfig(
-        camera=CameraConfig(renderer="drawn"), task=RollingTaskConfig(rolling=rolling)
+        camera=CameraConfig(renderer="drawn"),
+        task=RollingTaskConfig(lead_deg=6.0, rolling=rolling),
     )
 
 

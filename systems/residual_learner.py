@@ -48,11 +48,11 @@ class PosteriorConfig:
     """The residual as a probability on a grid (numerics/residual_posterior.py)."""
 
     prior_std: float = 0.16  # About zero [m/s]: 8 mm at dt = .05 s.
-    drift: float = (
-        0.02  # How it may change in a second, as a deviation [m/s / sqrt(s)].
-    )
+    # How it may change in a second, as a deviation [m/s / sqrt(s)], ...
+    drift: float = 0.02
+    growth: float = 0.05  # ... and how much more, as a share of itself [1 / sqrt(s)].
     spacing: float = 0.01  # Of the grid [m/s].
-    trust: float = 0.1  # Share of a step's loss that counts.
+    trust: float = 0.2  # Share of a step's loss that counts.
     loss_max: float = 6.0  # What one step can say at most.
 
 
@@ -148,8 +148,9 @@ class ResidualLearner(LeafSystem):
         )
         c = self._config.posterior
         if c is not None:
+            root = np.sqrt(period_sec)
             self._grid = residual_grid(
-                config.r_max, c.spacing, c.prior_std, c.drift * np.sqrt(period_sec)
+                config.r_max, c.spacing, c.prior_std, c.drift * root, c.growth * root
             )
             _, std = mean_and_std(self._grid, self._grid.prior)
             memory = replace(memory, belief=self._grid.prior, std=std)
@@ -305,10 +306,11 @@ def _checked(config: ResidualLearnerConfig, lcs: LCS, period_sec: float):
                 f"groups is {c.groups}, expected one group with a posterior"
             )
         for name, value in vars(c.posterior).items():
-            if not (np.isfinite(value) and value > 0.0):
-                raise ValueError(
-                    f"posterior.{name} is {value}, expected a positive number"
-                )
+            least, what = np.nextafter(0.0, 1.0), "a positive number"
+            if name == "growth":
+                least, what = 0.0, "0 or more"
+            if not least <= value < np.inf:
+                raise ValueError(f"posterior.{name} is {value}, expected {what}")
     return ResidualLearnerConfig(
         **{**vars(c), "Q_d": list(c.Q_d), "groups": [list(g) for g in c.groups]}
     )

@@ -20,7 +20,7 @@ from makebreak.systems.numerics.timing import timed
 class RollingTaskConfig:
     center: list[float] = field(default_factory=lambda: [0.5, 0.0])  # [m]
     radius: float = 0.1  # Of the circle [m].
-    lead_deg: float = 6.0  # The target runs so far ahead of the ball ...
+    lead_deg: float = 12.0  # The target runs so far ahead of the ball ...
     speed: float = 0.045  # ... and moves along the circle with it [m/s].
     press: float = 0.045  # Tip target below the ball's top, as learned [m].
     rolling: RollingConfig = field(default_factory=RollingConfig)

@@ -69,6 +69,16 @@ def test_gaussian_measurements_and_drift_give_the_kalman_filter():
     assert ours[1] == pytest.approx(np.sqrt(variance + 0.01**2 / 12), rel=0.01)
 
 
+def test_a_residual_changes_the_more_the_larger_it_is():
+    grid = residual_grid(0.7, 0.002, 0.16, drift_std=0.01, growth_std=0.05)
+    for value in (-0.4, 0.0, 0.2):
+        j = int(np.argmin(abs(grid.values - value)))
+        mean, std = mean_and_std(grid, grid.transition[:, j])
+        # The grid is 5 times finer than the least of them and ends far away.
+        assert mean == pytest.approx(value, abs=1e-9)
+        assert std == pytest.approx(0.01 + 0.05 * abs(value), rel=0.01)
+
+
 def test_one_reading_changes_odds_by_no_more_than_it_may():
     loss = np.where(GRID.values == GRID.values[90], 0.0, 1e6)
     still = residual_grid(0.7, 0.01, 0.16, 1e-9)
@@ -200,6 +210,7 @@ def test_a_gap_that_is_too_large_has_no_gradient_but_a_likelihood():
         (dict(groups=[]), "expected one group with a posterior"),
         (dict(posterior=PosteriorConfig(trust=0.0)), "posterior.trust is 0.0"),
         (dict(posterior=PosteriorConfig(drift=np.nan)), "posterior.drift is nan"),
+        (dict(posterior=PosteriorConfig(growth=-1.0)), "posterior.growth is -1.0"),
     ],
 )
 def test_wrong_settings_are_refused_by_name(builder, changes, message):

@@ -3,13 +3,17 @@
 The violation-based loss l_k(r) of a measured step (residual_learner.py), with weights
 that are inverse variances, is a negative log-likelihood. Over a grid of values of r
 
-    p(r) <- p(r) convolved with N(0, drift^2 dt)        the residual may change,
+    p(r) <- p(r) spread by N(0, (drift + growth |r|)^2 dt)   the residual may change,
     p(r) <- p(r) exp(-trust min(l_k(r) - min l_k, l_max))
 
 and the mean is r_comp. The gradient of the loss tells less: it is zero wherever a
 contact was missed (the loss is flat there, however high), so that a gap that is too
 large is hardly ever made smaller; and Adam's steps are of one size, whether the data
 say much or nothing. docs/residual_learning.md has both side by side.
+
+growth: a wrong radius is not one gap. Where a ball is touched at an angle a from its
+top, the gap is (1 + cos a) times the error of the radius, so the larger the residual,
+the more it changes while the ball rolls under the tip; a right model stays right.
 
 l_max bounds what a single step can say, for an impact within it or a wrong reading;
 trust < 1 because the errors of successive steps are correlated.
@@ -35,13 +39,14 @@ class ResidualGrid:
     prior: np.ndarray  # (n,) sums to 1.
 
 
-def residual_grid(r_max, spacing, prior_std, drift_std) -> ResidualGrid:
+def residual_grid(r_max, spacing, prior_std, drift_std, growth_std=0.0) -> ResidualGrid:
     """Args: r_max: the grid's ends; spacing; prior_std about 0; drift_std in one time
-    step of the learner, all [m/s]."""
+    step of the learner, all [m/s]; growth_std: more of it per size of the residual."""
     n = 2 * int(np.ceil(r_max / spacing)) + 1
     values = np.linspace(-r_max, r_max, n)
     distance = values[:, None] - values[None, :]
-    transition = np.exp(-0.5 * (distance / max(drift_std, 0.05 * spacing)) ** 2)
+    width = np.maximum(drift_std + growth_std * abs(values), 0.05 * spacing)
+    transition = np.exp(-0.5 * (distance / width) ** 2)
     transition /= transition.sum(axis=0)
     prior = np.exp(-0.5 * (values / prior_std) ** 2)
     prior /= prior.sum()
