@@ -144,10 +144,10 @@ class TouchConfig:
 
 
 def _brisk_ball() -> BallRollingConfig:
-    rolling = RollingConfig(reposition_sec=BRISK_SEC)
+    rolling = RollingConfig(reposition_sec=BRISK_SEC, integral_sec=np.inf)
     return BallRollingConfig(
         camera=CameraConfig(renderer="drawn"),
-        task=RollingTaskConfig(lead_deg=6.0, rolling=rolling),
+        task=RollingTaskConfig(rolling=rolling),
     )
 
 

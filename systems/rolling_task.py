@@ -1,4 +1,4 @@
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -11,6 +11,7 @@ from makebreak.systems.numerics.rolling_task import (
     RollingConfig,
     TaskState,
     next_state,
+    shifted,
     target_over_horizon,
 )
 from makebreak.systems.numerics.timing import timed
@@ -20,7 +21,7 @@ from makebreak.systems.numerics.timing import timed
 class RollingTaskConfig:
     center: list[float] = field(default_factory=lambda: [0.5, 0.0])  # [m]
     radius: float = 0.1  # Of the circle [m].
-    lead_deg: float = 12.0  # The target runs so far ahead of the ball ...
+    lead_deg: float = 6.0  # The target runs so far ahead of the ball ...
     speed: float = 0.045  # ... and moves along the circle with it [m/s].
     press: float = 0.045  # Tip target below the ball's top, as learned [m].
     rolling: RollingConfig = field(default_factory=RollingConfig)
@@ -77,6 +78,7 @@ class RollingTask(LeafSystem):
         )
         self._x_desired = self.DeclareDiscreteState(x_desired)
         self._reference = self.DeclareDiscreteState([*p_tip, *np.zeros(6)])
+        self._shift = self.DeclareDiscreteState([0.0])  # Of the circle's radius [m].
         self._phase = self.DeclareDiscreteState([float(WAIT)])
         self.DeclareStateOutputPort("x_desired", self._x_desired)
         self.DeclareStateOutputPort("reference", self._reference)
@@ -100,15 +102,19 @@ class RollingTask(LeafSystem):
             gap_std = float(self._r_std.Eval(context)[0]) * self._residual_dt_sec
         if self._tip_force.HasValue(context):
             force_z = float(self._tip_force.Eval(context)[2])
+        shift = float(context.get_discrete_state(self._shift).value()[0])
+        if valid:
+            shift = shifted(c.rolling, self._path, shift, x, c.period_sec)
+        path = replace(self._path, radius=self._path.radius + shift)
         task = next_state(
-            c.rolling, self._path, task, t, c.period_sec, x, gap, valid,
+            c.rolling, path, task, t, c.period_sec, x, gap, valid,
             self._radius_ball, self._radius_tip, landed, gap_std, force_z,
         )  # fmt: skip
         # Below the top where it is believed to be: a ball larger than modelled would
         # else be pressed as much harder.
         z_tip = 2.0 * self._radius_ball + self._radius_tip - gap - c.press
         goal = target_over_horizon(
-            self._path, x, np.deg2rad(c.lead_deg), c.speed, z_tip, self._radius_ball,
+            path, x, np.deg2rad(c.lead_deg), c.speed, z_tip, self._radius_ball,
             self._knot_sec, self._n_knots,
         )  # fmt: skip
         state.get_mutable_abstract_state(int(self._task)).set_value(task)
@@ -118,6 +124,7 @@ class RollingTask(LeafSystem):
             int(self._reference), np.concatenate([task.p, task.v, task.a])
         )
         discrete.set_value(int(self._phase), [float(task.phase)])
+        discrete.set_value(int(self._shift), [shift])
 
 
 def _check(config: RollingTaskConfig):
@@ -135,6 +142,10 @@ def _check(config: RollingTaskConfig):
             raise ValueError(
                 f"task.rolling.{name} is {getattr(rolling, name)}, expected > 0"
             )
+    if not rolling.integral_sec > 0.0:  # Infinite: none.
+        raise ValueError(
+            f"task.rolling.integral_sec is {rolling.integral_sec}, expected > 0"
+        )
     for name in ("n_std", "approach_max"):
         if not 0.0 <= getattr(rolling, name) < np.inf:
             raise ValueError(

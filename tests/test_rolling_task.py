@@ -21,6 +21,7 @@ from makebreak.systems.numerics.rolling_task import (
     TaskState,
     next_state,
     quintic,
+    shifted,
     surface_height,
     target_over_horizon,
 )
@@ -140,6 +141,44 @@ def test_a_ball_that_is_not_seen_at_the_start_lifts_the_tip_from_where_it_is():
         simulator.AdvanceTo(k * DT)
         assert system.GetOutputPort("reference").Eval(context)[2] >= z_tip - 1e-12
         assert system.GetOutputPort("phase").Eval(context)[0] == WAIT
+
+
+def radii_aimed_at(distance, integral_sec, valid=1.0):
+    """How far from the center C3's first target of the ball is, tick by tick for 3 s,
+    and what it would be without integral action; the ball lies still at `distance`."""
+    config = RollingTaskConfig(rolling=RollingConfig(integral_sec=integral_sec))
+    system = RollingTask(config, 6, 0.1, R_BALL, R_TIP, 8, 4, residual_dt_sec=0.05)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    ball = [0.5 + distance, 0.0, R_BALL]
+    x = pack([0.6, 0.0, 0.2], np.zeros(3), ball, np.zeros(3), R_BALL)
+    for name, value in (("x", x), ("valid", [valid]), ("r_comp", np.zeros(8))):
+        system.GetInputPort(name).FixValue(context, value)
+    found = []
+    for k in range(round(3.0 / DT)):
+        simulator.AdvanceTo((k + 0.5) * DT)
+        goal = system.GetOutputPort("x_desired").Eval(context).reshape(6, 19)[0]
+        found.append(np.linalg.norm(goal[P_BALL][:2] - PATH.center))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("error", [0.003, -0.004])
+def test_integral_action_aims_at_the_other_side_of_the_path(error):
+    radii = radii_aimed_at(0.1 + error, integral_sec=6.0)
+    t = DT * np.arange(1, len(radii) + 1)
+    # The point 6 degrees on is within reach: it is on the circle that is aimed at.
+    np.testing.assert_allclose(radii, 0.1 - error * t / 6.0, atol=1e-12)
+    without = radii_aimed_at(0.1 + error, integral_sec=np.inf)
+    np.testing.assert_allclose(without, 0.1, atol=1e-15)
+
+
+def test_integral_action_is_bounded_and_rests_while_the_ball_is_not_seen():
+    x = pack([0.6, 0, 0.2], np.zeros(3), [0.9, 0.0, R_BALL], np.zeros(3), R_BALL)
+    shift, config = 0.0, RollingConfig(integral_sec=2.0)
+    for k in range(400):  # 0.3 m away, which counts as 8 mm.
+        assert shift == pytest.approx(-min(0.008 * k * DT / 2.0, 0.008), abs=1e-12)
+        shift = shifted(config, PATH, shift, x, DT)
+    np.testing.assert_allclose(radii_aimed_at(0.104, 1.0, valid=0.0), 0.1, atol=1e-15)
 
 
 @pytest.mark.parametrize("gap", [-0.016, 0.0, 0.010])

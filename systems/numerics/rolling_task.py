@@ -38,6 +38,8 @@ APPROACH_SLOPE, APPROACH_STOP = 1.5, 0.3  # To its speed, and at its end [m/s2].
 REACH = 0.015  # The ball's target is at most so far away; a tip that were to go further
 # at once would slip over the ball and leave it behind [m].
 
+SHIFT_MAX = 0.008  # The aimed-at circle differs from the path by at most this [m].
+
 
 @dataclass(frozen=True, eq=False)
 class CirclePath:
@@ -116,6 +118,7 @@ class RollingConfig:
     approach_max: float = 0.025  # The longest approach [m].
     touch_force: float = 4.0  # More on the tip than before is a touch [N].
     ease: float = 0.42  # Share of the reposition for going up, and for coming down.
+    integral_sec: float = 6.0  # Of the integral action on the ball's distance.
 
 
 def surface_height(offset, radius_ball, radius_tip):
@@ -137,6 +140,20 @@ def landing(config, path, x, gap, time_left, radius_ball, radius_tip):
     z = surface_height(config.land_behind, radius_ball, radius_tip)
     p = np.append(p_ball + behind, z + config.land_above - gap)
     return p, np.append(x[V_BALL][:2], 0.0)
+
+
+def shifted(config, path, shift, x, dt):
+    """Integral action: how much larger a circle than the path is aimed at [m].
+
+    A ball that coasts straight on while the tip goes back, lags, and a model that is
+    wrong in more than the gap, keep it on one side of the path.
+
+    Args: shift: a tick dt [s] ago [m]; x: (19,) state.
+    """
+    ball = x[P_BALL][:2] - path.center
+    most = min(SHIFT_MAX, 0.5 * path.radius)
+    error = min(max(np.sqrt(ball @ ball) - path.radius, -most), most)
+    return min(max(shift - dt / config.integral_sec * error, -most), most)
 
 
 def approach_height(config, gap_std):
