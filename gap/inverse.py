@@ -135,6 +135,13 @@ class InverseModel:
         ]  # fmt: skip
         self.noise = self._noise("position")
         self.velocity_noise = self._noise("velocity")
+        # Root of how many neighbouring samples of a velocity err together.
+        self._together = np.sqrt(
+            [
+                max((r.channels[c].together for r in recordings if c in r), default=1.0)
+                for c in (f"{joint}.velocity" for joint in self.joints)
+            ]
+        )
         self.effort_noise = self._noise("effort_measured")
         self.has = {
             what: [all(f"{j}.{what}" in r for r in recordings) for j in self.joints]
@@ -395,7 +402,7 @@ class InverseModel:
                 C[b] += np.diag(direct + held[b] ** 2)
             # The smoothed velocity's own error, as over one bump.
             own = self.noise * np.sqrt(period * 12.0 / track.bumps.width**3)
-            v_std = np.hypot(self.velocity_noise * g_v, own)
+            v_std = np.hypot(self.velocity_noise * g_v * self._together, own)
             v_std = np.hypot(v_std, np.where(kd > 0.0, DRIVE_VELOCITY * _rms(v), 0.0))
             out.append(
                 {
@@ -549,6 +556,11 @@ class InverseModel:
             needed = motion.effort - self.dynamics.residual(motion)
             self._needed[key] = (motion, needed)
         return self._needed[key]
+
+    def needed_motions(self) -> list[Motion]:
+        """Of each track, as measured, with the effort that the scene needs for it."""
+        both = [self._moved_by(k, ()) for k in range(len(self.tracks))]
+        return [replace(motion, effort=needed) for motion, needed in both]
 
     def columns_of(self, efforts: Sequence[np.ndarray]) -> np.ndarray:
         """(m, k) from columns of the residual effort at the middles of each track,

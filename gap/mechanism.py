@@ -21,13 +21,17 @@ from makebreak.gap.screen import candidates, inseparable, nuisances, rich_column
 from makebreak.gap.where import unexplained, where_in_motion
 from makebreak.models.effects.kind import Effect, find_body
 from makebreak.models.scene import Scene
-from makebreak.systems.numerics.selection import Screen
+from makebreak.systems.numerics.selection import Screen, is_predicted
 
 ROBUST = 1.4826  # Standard deviation over median absolute deviation, if normal.
 # Below this over the sensors' noise a rich model leaves what noise may: models are
 # right. A weight is changed where it would become less by this share.
 MISFIT, LESS = 1.3, 0.8
+AT_REST = 2.0  # Times the least uncertainty: rows with more are of joints at rest.
 RICH_PRIOR = 10.0  # Times a nuisance's tolerance, in a rich model.
+# What is left of a measured effort is noise where less than this share of it repeats,
+# and no block of time has so many times the usual power.
+REPEATS, EVENT = 0.1, 10.0
 LAGS = 9  # Test functions over which errors may go together (0.9 s).
 OVERLAP = 1.3  # What neighbouring test functions share of white noise.
 
@@ -63,23 +67,33 @@ class MechanismProblem(InverseModel, GapProblem):
             screen = Screen(self.base(), n.columns, prior, self.train())
             fit = screen.fit(rich)
             left = self.base() - rich @ fit.c - n.columns @ fit.b
-            error = self._misfit(left)
+            error, other = self._misfit(left), self._misfit(self._settled(self.base()))
+            # A rich model may do worse than none, where noise is all that is left.
+            error = {w: np.minimum(error[w], other[w]) for w in error}
             old = self.model_error
             if all(np.allclose(error[w], old[w], rtol=0.1, atol=1e-12) for w in error):
                 break
             self._set(error)
         self.correlation = self._correlation(left)
 
+    def _settled(self, r: np.ndarray) -> np.ndarray:
+        """What the nuisances leave of r (m,), free within their limits."""
+        n = self.nuisances()
+        return Screen(r, n.columns, n.prior, self.train(), reach=n.reach).settle(r)[1]
+
     def _misfit(self, left: np.ndarray) -> dict[str, np.ndarray]:
         """What held-out rows (m,) are off by beside noise: robust, of each channel."""
         held = (~self.train()).reshape(-1, len(self.names()))[:, 0]
-        size = ROBUST * np.median(np.abs(self.in_units(left)[held]), axis=0)
-        noise = self.noise_in_units()[held]
-        ratio = ROBUST * np.median(np.abs(self.in_units(left)[held] / noise), axis=0)
+        off, noise = self.in_units(left)[held], self.noise_in_units()[held]
+        # A joint at rest may be held by anything: its rows say nothing of models.
+        usual = noise <= AT_REST * np.quantile(noise, 0.1, axis=0)
         error = {w: np.zeros(len(self.joints)) for w in self.model_error}
         for k, (what, joint) in enumerate(self.names()):
-            if ratio[k] > MISFIT:
-                beside = size[k] * np.sqrt(1.0 - 1.0 / ratio[k] ** 2)
+            mine = usual[:, k]
+            size = ROBUST * np.median(np.abs(off[mine, k]))
+            ratio = ROBUST * np.median(np.abs(off[mine, k] / noise[mine, k]))
+            if ratio > MISFIT:
+                beside = size * np.sqrt(1.0 - 1.0 / ratio**2)
                 error[what][self.joints.index(joint)] = beside
         return error
 
@@ -136,8 +150,49 @@ class MechanismProblem(InverseModel, GapProblem):
 
     def error(self, fitted: Fitted) -> float:
         # Which blocks are held out is by the clock: some hold next to nothing of it.
-        whole = float(np.sqrt(np.mean(self.in_noise(fitted.left) ** 2)))
-        return max(self.noise_error(fitted.left), whole)
+        rows = self.in_noise(fitted.left)
+        wanders = self.wandering(fitted.r)
+        for k in np.flatnonzero(wanders > 0.0):
+            mine = self.channel_of_rows() == k
+            rows[mine] /= max(float(np.sqrt(np.mean(rows[mine] ** 2))), 1.0)
+        held = rows[~self.train()] if not self.train().all() else rows
+        return float(np.sqrt(max(np.mean(held**2), np.mean(rows**2))))
+
+    def wandering(self, r: np.ndarray) -> np.ndarray:
+        """(n_names,) what rows (m,) of before the nuisances leave of an effort that is
+        measured, in its unit [N m], where that is no gap but noise that goes together over a while: nothing
+        of it is told by where the joint is, how it moves and what it needs, and it is
+        there all the time. 0 for all other channels."""
+        names = self.names()
+        found = np.zeros(len(names))
+        left = self._settled(r)
+        rows = self.in_noise(left).reshape(-1, len(names))
+        off, noise = self.in_units(left), self.noise_in_units()
+        block = self.blocks().reshape(-1, len(names))[:, 0]
+        state = None
+        for k, (what, joint) in enumerate(names):
+            i = self.joints.index(joint)
+            loud = float(np.sqrt(np.mean(rows[:, k] ** 2))) > MISFIT
+            if what != "effort" or not self.by_measured[i] or not loud:
+                continue
+            mine = noise[:, k] <= AT_REST * np.quantile(noise[:, k], 0.1)
+            y = off[mine, k]
+            power = [np.mean(y[block[mine] == b] ** 2) for b in np.unique(block[mine])]
+            if max(power) > EVENT * np.median(power):
+                continue  # Something happened, once.
+            state = self._mean_motion() if state is None else state
+            X = features_of(i, *state)[mine]
+            if not is_predicted(y, X, block[mine], REPEATS):
+                found[k] = float(np.sqrt(np.mean(y**2)))
+        return found
+
+    def _mean_motion(self) -> list[np.ndarray]:
+        """q, v, vd, effort needed and sign of v, each (n_bumps, n_v), over bumps."""
+        parts = []
+        for track, motion in zip(self.tracks, self.needed_motions(), strict=True):
+            signals = (motion.q, motion.v, motion.vd, motion.effort, np.sign(motion.v))
+            parts.append([track.bumps.mean(x) for x in signals])
+        return [np.concatenate(x) for x in zip(*parts, strict=True)]
 
     def judged(self) -> dict[str, str]:
         how = {}
@@ -197,6 +252,17 @@ class MechanismProblem(InverseModel, GapProblem):
         )
         rest = unexplained(self, self.in_noise(end.left))
         return Outcome(gap, series, rest)
+
+
+def features_of(i: int, q, v, vd, effort, sign) -> np.ndarray:
+    """(m, k) of what an effect on joint i could go with: its place, speed and effort,
+    and how all joints move; all arguments (m, n_v)."""
+    own = [
+        sign[:, i], np.abs(v[:, i]), v[:, i] * np.abs(v[:, i]), effort[:, i],
+        sign[:, i] * np.abs(effort[:, i]), sign[:, i] * np.exp(-np.abs(v[:, i]) / 0.1),
+        q[:, i] ** 2, *(f(n * q[:, i]) for n in (1, 2) for f in (np.sin, np.cos)),
+    ]  # fmt: skip
+    return np.column_stack([*own, q, v, vd])
 
 
 def _moved(candidate: Candidate, to_new) -> Candidate:

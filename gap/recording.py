@@ -57,6 +57,7 @@ class Channel:
     noise_from: "given", "estimated", or "none" for a command. noise_given: of a single
     sample as the sidecar says it, else 0. averaged: samples in each value, as a mean.
     noise_pole: 0 for white noise; else the estimated pole of its filter, a sample.
+    together: how many neighbouring samples' noise goes together, 1 for white noise.
     step: the channel's resolution if it is quantised, else 0.
     rate_hz: samples that are there per second. filter: what the sidecar says.
     stages: what of that is simulated; None if the text says no filter we know.
@@ -69,6 +70,7 @@ class Channel:
     noise_given: float = 0.0
     averaged: float = 1.0
     noise_pole: float = 0.0
+    together: float = 1.0
     step: float = 0.0
     rate_hz: float = 0.0
     filter: str = ""

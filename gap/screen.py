@@ -124,11 +124,21 @@ def candidates(
 
 def rich_columns(model: InverseModel, found: Sequence[Candidate]) -> np.ndarray:
     """(m, k) of all kinds with one parameter at all of their places, and a load at the
-    last link: what a model that lacks nothing ordinary would have."""
+    last link: what a model that lacks nothing ordinary would have.
+
+    A gain multiplies what the model needs: as a factor on the measured effort it would
+    cancel all of that, and with it what anything is off by.
+    """
     last = _links(model)[-1:]
     columns = []
     for c in found:
-        if c.columns[0].shape[1] == 1 and KINDS[c.kind].at != "base":
+        if KINDS[c.kind].path == "gain":
+            each = [
+                model.dynamics.signatures(c.kind, list(c.at), m)[0].columns
+                for m in model.needed_motions()
+            ]
+            columns.append(model.columns_of(each))
+        elif c.columns[0].shape[1] == 1 and KINDS[c.kind].at != "base":
             columns.append(c.columns[0])
         elif KINDS[c.kind].at == "body" and list(c.at) == last and len(c.columns) == 1:
             columns.append(c.columns[0])

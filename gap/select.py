@@ -40,7 +40,7 @@ CHANNEL_GAIN, LEAST_T, ABOVE = 0.10, 2.0, 1.3
 # A member of a group stays if it is so many deviations from neutral, and its channel
 # is worse by this share without it; or worse by CHANNEL_GAIN.
 MEMBER_Z, MEMBER_GAIN = 3.0, 0.02
-FEWEST_MEMBERS = 3  # Of a group: two places are two effects.
+FEWEST_MEMBERS = 2  # Of a group.
 BEYOND = 1.0  # Tolerances over a nuisance's limit that are no chance among dozens.
 PAIRED = 10  # Candidates of which all pairs are tried against a single one.
 
@@ -130,6 +130,7 @@ class _Search:
                 current = self._refitted(chosen, current)
                 chosen = _refreshed(chosen, current)
         chosen, current = self._backward(chosen, current)
+        chosen, current = self._simplified(chosen, current)
         while chosen:  # At last, against what all of them leave.
             current = self._refitted(chosen, current)
             chosen = _refreshed(chosen, current)
@@ -291,7 +292,7 @@ class _Search:
     def _picked(self, sound, found: Sequence[Candidate]) -> int:
         """The simplest of those that do as well as the best."""
         errors = [self._error(f.score) for f, _ in sound]
-        pick = simplest(errors, [r.candidate.size for _, r in sound], SAME)
+        pick = simplest(errors, [_weight(r.candidate) for _, r in sound], SAME)
         fit, best = sound[pick]
         order = {id(c): k for k, c in enumerate(found)}
         # Bodies whose origins coincide: the outermost, as loads and forces mostly are.
@@ -395,6 +396,8 @@ class _Search:
                 continue
             if r.candidate.size > best.candidate.size + MORE or not _is_used(f):
                 continue
+            if r.candidate.fixed and _weight(r.candidate) > _weight(best.candidate):
+                continue  # A special case of a bigger kind, which the smaller one is.
             if r.candidate.kind == best.candidate.kind and self.problem.is_one_place(
                 r.candidate.at, best.candidate.at
             ):
@@ -571,6 +574,54 @@ class _Search:
             chosen = [c for i, c in enumerate(chosen) if i != k]
         return chosen, current
 
+    def _simplified(self, chosen: list[Choice], current: Fitted):
+        """A kind that contains others gives way to one of them that does as well among
+        all that was chosen: others may have taken what it was needed for."""
+        taken = {(c.effect.kind, tuple(c.effect.at)) for c in chosen}
+        open_: Sequence[Candidate] = ()
+        if any(KINDS[c.effect.kind].contains for c in chosen):
+            open_ = self.problem.candidates(self.nuisances, current)
+        for k, choice in enumerate(chosen):
+            inner = [
+                c for c in open_
+                if c.kind in KINDS[choice.effect.kind].contains
+                and list(c.at) == list(choice.effect.at)
+                and (c.kind, c.at) not in taken
+            ]  # fmt: skip
+            found = [x for c in inner if (x := self._instead(c, k, chosen, current))]
+            if not found:
+                continue
+            fit, ranked = min(found, key=lambda x: x[0].score)
+            least = (1.0 - NESTED_GAIN) * self._error(fit.score)
+            if self._earns(fit.left, current.left, self._error(current.score) < least):
+                continue
+            chosen = [*chosen]
+            chosen[k] = replace(
+                choice, effect=fit.effects[k], ties=(), fixed=ranked.candidate.fixed,
+                size=ranked.candidate.size,
+            )  # fmt: skip
+            current = fit
+            chosen = _refreshed(chosen, current)
+        return chosen, current
+
+    def _instead(
+        self, candidate: Candidate, k: int, chosen: Sequence[Choice], current: Fitted
+    ) -> tuple[Fitted, Ranked] | None:
+        """All that was chosen, with a candidate in place of the k-th."""
+        rest = [*current.effects[:k], *current.effects[k + 1 :]]
+        fixed = [c.fixed for c in chosen]
+        fixed[k] = candidate.fixed
+        try:
+            without = self.problem.residual(rest)
+            screen = self._screen(without, current.fit.train)
+            [ranked] = rank(screen, [candidate])
+            trial = [*current.effects[:k], *ranked.effects, *current.effects[k + 1 :]]
+            fit = fit_effects(self.problem, screen, trial, fixed)
+        except (ValueError, RuntimeError):
+            return None
+        sane = candidate.is_sane(fit.effects[k : k + 1])
+        return (fit, ranked) if sane and np.isfinite(fit.score) else None
+
     def _stays(self, choice: Choice, without, with_, pooled: bool) -> bool:
         if self._earns(without, with_, pooled):
             return True
@@ -612,6 +663,13 @@ def _groups(found: Sequence[Candidate]) -> list[Candidate]:
         for kind, members in by_kind.items()
         if len(members) >= FEWEST_MEMBERS
     ]  # fmt: skip
+
+
+def _weight(candidate: Candidate) -> int:
+    """What a candidate counts where the simplest is taken: twice its parameters. A kind
+    some of whose parameters are left at neutral counts little less than all of it."""
+    all_of_them = candidate.size + len(candidate.fixed)
+    return 2 * all_of_them - bool(candidate.fixed)
 
 
 def _is_fit(fit: Fitted, of: Ranked, first: int) -> bool:
@@ -691,4 +749,14 @@ def _shortlist(ranked: list[Ranked], base: float) -> list[Ranked]:
         if alike and kind not in there:
             short.append(each)
             there.add(kind)
+    # A bigger kind is compared with those inside it, which may rank far below others.
+    known = {id(r) for r in short}
+    for each in [*short]:
+        short += [
+            r for r in ranked
+            if r.candidate.kind in KINDS[each.candidate.kind].contains
+            and r.candidate.at == each.candidate.at
+            and id(r) not in known
+            and not known.add(id(r))
+        ]  # fmt: skip
     return short

@@ -49,7 +49,8 @@ def with_noise_of(
     known = {r.name: r for r in decided}
     return [
         replace(part, channels={
-            name: replace(c, noise=known[part.name].channels[name].noise)
+            name: replace(c, noise=(own := known[part.name].channels[name]).noise,
+                          together=own.together)
             for name, c in part.channels.items()
         })
         for part in parts

@@ -14,9 +14,20 @@ import numpy as np
 
 from makebreak.gap.data.clock import clock_period, even_clock
 from makebreak.gap.findings import Finding
-from makebreak.gap.recording import Channel, Episode, Recording, with_noise
-from makebreak.systems.numerics.filters import MovingAverage
-from makebreak.systems.numerics.signal_noise import estimate_noise, noise_and_jitter
+from makebreak.gap.recording import (
+    Channel,
+    Episode,
+    Recording,
+    unit_of,
+    with_noise,
+)
+from makebreak.systems.numerics.filters import MovingAverage, filtered, subdivided
+from makebreak.systems.numerics.signal_noise import (
+    estimate_noise,
+    noise_and_jitter,
+    noise_beside,
+)
+from makebreak.systems.numerics.smoother import smooth_filtered
 
 # Blocks are no shorter than this, hold at least so many rows, and are so many times
 # shorter than a period of the fastest motion.
@@ -24,6 +35,8 @@ BLOCK_SEC, BLOCK_ROWS, PER_PERIOD = 0.01, 4, 10.0
 BAND_SHARE = 0.99  # Of the acceleration's power, that lies below the fastest motion.
 HELD_SHARE = 2e-3  # Fewer repeated rows are chance, or rest.
 LONGEST_HOLD_SEC = 0.05  # What stays the same for longer stands still.
+ENDS_SEC = 0.2  # Of an episode, where rates are not known well.
+FILTERED_SEC = 0.0026  # A signal's samples before a filter are no further apart.
 EVEN_GAIN = 0.85  # An even clock must leave so much less noise.
 
 
@@ -36,7 +49,9 @@ def condition(
     """
     out, found = [], []
     for recording in recordings:
-        for step in (_without_held, _on_even_clock, _averaged, _with_jitter):
+        for step in (
+            _without_held, _on_even_clock, _averaged, _with_jitter, _beside_positions,
+        ):  # fmt: skip
             if step is _averaged and not average:
                 continue
             recording, findings = step(recording)
@@ -364,3 +379,63 @@ def _with_jitter(recording: Recording) -> tuple[Recording, list[Finding]]:
                         says)
             )  # fmt: skip
     return replace(recording, channels=channels), found
+
+
+# ----- Velocities beside positions
+
+
+def _beside_positions(recording: Recording) -> tuple[Recording, list[Finding]]:
+    """Noise of measured velocities as the positions tell it: how they scatter about
+    the rates of these. Of a filtered velocity neighbouring samples err together, and
+    their differences show little of it."""
+    channels, found = dict(recording.channels), []
+    for channel in recording.measured():
+        position = f"{channel.at}.position"
+        if channel.quantity != "velocity" or position not in recording:
+            continue
+        parts = [_beside(recording, channel, position, e) for e in recording.episodes]
+        parts = [p for p in parts if p is not None]
+        if sum(len(p[0]) for p in parts) < 200:
+            continue
+        std, together = noise_beside(parts)
+        noise = channel.noise
+        if channel.noise_from != "given" and std > 1.2 * noise:
+            noise = std
+            says = (
+                f"{channel.name} scatters about the rate of its position more than its "
+                f"own differences show: its noise is taken as {std:.2g} and not "
+                f"{channel.noise:.2g}."
+            )
+            name = channel.name
+            unit = unit_of("velocity", False)
+            found.append(
+                Finding("noise_of_velocity", recording.name, name, std, unit, "info",
+                        says)
+            )  # fmt: skip
+        channels[channel.name] = replace(channel, noise=noise, together=together)
+    return replace(recording, channels=channels), found
+
+
+def _beside(recording: Recording, channel: Channel, position: str, episode: Episode):
+    """Of an episode: a velocity's samples (n,) less the rate of its position, and that
+    rate with its first two derivatives (n, 3), behind the velocity's filters."""
+    time = recording.time[episode.rows]
+    q, y = recording[position][episode.rows], channel.values[episode.rows]
+    there = np.isfinite(y)
+    if np.isfinite(q).sum() < 60 or there.sum() < 60:
+        return None
+    own = recording.channels[position]
+    x = smooth_filtered(time, q, own.noise, own.stages or ()).x
+    rate = np.stack([x[:, 1], x[:, 2], np.gradient(x[:, 2], time)], axis=1)
+    if channel.stages:
+        dense = subdivided(time, FILTERED_SEC)
+        rate = np.stack(
+            [
+                filtered(channel.stages, dense, np.interp(dense, time, each), time)
+                for each in rate.T
+            ],
+            axis=1,
+        )
+    # At the ends neither filters nor the smoother know enough.
+    inner = there & (time > time[0] + ENDS_SEC) & (time < time[-1] - ENDS_SEC)
+    return y[inner] - rate[inner, 0], rate[inner]

@@ -13,6 +13,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import chi2, wilcoxon
 
 SAME = 0.05  # Within this share of the best error, data cannot tell two models apart.
+_PENALTIES = 10.0 ** np.arange(-4.0, 2.0)  # Of a ridge, times the number of rows.
 NESTED_GAIN = 0.10  # What a bigger model must take off the error of one inside it.
 
 
@@ -199,6 +200,51 @@ def _within(solve, limit: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
             break
         side[k] = 0
     return b
+
+
+def predictable_share(y, X, block, folds: int = 5) -> float:
+    """How much of y (m,) features X (m, k) predict where they were not fitted: one less
+    the ratio of the squared errors with and without them, by cross-validation over
+    blocks of time. Ridge regression, of the penalties that which predicts best; 0 where
+    none predicts better than nothing at all.
+
+    Args: block (m,): a number of each row; blocks are left out whole.
+    Source: Hoerl, Kennard, Technometrics 12(1), 1970; cross-validation as in Hastie,
+    Tibshirani, Friedman, The Elements of Statistical Learning, section 7.10.
+    """
+    y, X, block = np.asarray(y, float), np.asarray(X, float), np.asarray(block)
+    names = np.unique(block)
+    total = float(y @ y)
+    if len(names) < folds or not total > 0.0:
+        return 0.0
+    size = np.std(X, axis=0)
+    X = X[:, size > 1e-12 * max(size.max(initial=0.0), 1e-300)]
+    X = (X - X.mean(axis=0)) / np.std(X, axis=0)
+    X = np.column_stack([X, np.ones(len(y))])
+    left = np.zeros(len(_PENALTIES))
+    for some in np.array_split(names, folds):
+        out = np.isin(block, some)
+        w, u = np.linalg.eigh(X[~out].T @ X[~out])
+        g = u.T @ (X[~out].T @ y[~out])
+        for i, penalty in enumerate(_PENALTIES):
+            c = u @ (g / (np.maximum(w, 0.0) + penalty * len(y)))
+            left[i] += np.sum((y[out] - X[out] @ c) ** 2)
+    return max(1.0 - float(left.min()) / total, 0.0)
+
+
+def is_predicted(y, X, block, least: float, shifts: int = 60) -> bool:
+    """Whether features X (m, k) predict at least a share `least` of y (m,), and no
+    chance does it: more than of any y that is shifted in time against them. (What goes
+    together over a while is followed by chance by whatever else does.)
+
+    Args: y, X, block: as predictable_share, in the order of time.
+    """
+    share = predictable_share(y, X, block)
+    if share < least:
+        return False
+    n = len(y)
+    steps = np.linspace(0.1 * n, 0.9 * n, shifts).astype(int)
+    return all(share > predictable_share(np.roll(y, k), X, block) for k in steps)
 
 
 def is_plausible(b, prior, rate: float = 1e-4) -> bool:

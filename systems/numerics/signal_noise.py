@@ -12,6 +12,7 @@ import numpy as np
 
 _ORDERS = (2, 3, 4, 5, 6)
 _MOST = 200_000  # Samples that are looked at: 0.3 % precision is plenty.
+_LAGS = 40  # Over which noise may go together.
 _NORMAL = 1.4826  # Standard deviation over median absolute deviation, if normal.
 
 
@@ -91,6 +92,40 @@ def noise_and_jitter(values, breaks, times, noise: float) -> tuple[float, float]
     return min(
         (_jitter_of(pieces, order, noise) for order in (3, 5)), key=lambda x: x[1]
     )
+
+
+def noise_beside(parts) -> tuple[float, float]:
+    """Standard deviation of a signal's noise, and how many neighbouring samples of it
+    err together, from how it differs from a better known one.
+
+    What a signal is late by, or what its gain is off by, is no noise: of the difference
+    the parts along the known signal and its derivatives are taken out first. The noise
+    is robust to few outliers; `together` is the sum of the autocorrelation over all
+    lags, up to where it first is none.
+
+    Args: parts: of each stretch of time the difference (n,), and the known signal with
+        derivatives (n, k).
+    """
+    beside = np.concatenate([d for d, _ in parts])
+    known = np.concatenate([x for _, x in parts])
+    X = np.column_stack([np.ones(len(beside)), known])
+    size = np.linalg.norm(X, axis=0)
+    size[size == 0.0] = 1.0
+    c = np.linalg.lstsq(X / size, beside, rcond=1e-10)[0]
+    left = beside - (X / size) @ c
+    std = float(_NORMAL * np.median(np.abs(left)))
+    # What stands out would hide the colour of the rest.
+    left = np.clip(left, -4.0 * std, 4.0 * std)
+    pieces = np.split(left, np.cumsum([len(d) for d, _ in parts])[:-1])
+    power = np.mean(left * left)
+    together = 1.0
+    for lag in range(1, _LAGS):
+        pairs = [p[lag:] * p[:-lag] for p in pieces if len(p) > lag]
+        rho = np.mean(np.concatenate(pairs)) / power if power > 0.0 else 0.0
+        if not rho > 0.0:
+            break
+        together += 2.0 * float(rho)
+    return std, together
 
 
 def _jitter_of(pieces, order: int, noise: float) -> tuple[float, float]:
