@@ -45,7 +45,7 @@ REST_SPEED, REST_SHARE, REST_EFFORT = 0.005, 0.04, 0.3
 # Sampled at the very instants at which a stiff drive gets new commands, a velocity is
 # off by a share of itself.
 DRIVE_VELOCITY = 0.01
-MOST_MOTIONS = 40  # That are kept in memory.
+MOST_MOTIONS, MOST_MEANS, MOST_DYNAMICS = 40, 1500, 8  # That are kept in memory.
 FILTERED_SEC = 0.0026  # A signal's samples before a filter are no further apart.
 MODEL_ERROR = 2e-4  # Of a joint's rms effort: what smoothing and sampling leave.
 
@@ -200,6 +200,9 @@ class InverseModel:
         self._motions: list[Motion] | None = None
         # Of a track and what moves it: the motion, and the effort that it needs.
         self._needed: dict[tuple, tuple[Motion, np.ndarray]] = {}
+        # Means over bumps that come again and again in a fit.
+        self._means: dict = {}
+        self._heavier: dict[tuple, SceneDynamics] = {}
 
     def base(self) -> np.ndarray:
         """The residual of the scene as it came."""
@@ -510,37 +513,82 @@ class InverseModel:
         dynamics: SceneDynamics = self.dynamics
         heavy = [e for e in ours if KINDS[e.kind].weighs]
         if len(heavy) > 1 or any(KINDS[e.kind].added is None for e in heavy):
-            dynamics = SceneDynamics(
-                replace(self.scene, effects=[*self.scene.effects, *heavy])
-            )
+            dynamics = self._with(heavy)
             ours = [e for e in ours if e not in heavy]
+        on_top = [e for e in ours if KINDS[e.kind].on_top is not None]
         parts = []
         for k, (track, white) in enumerate(
             zip(self.tracks, self._whiteners, strict=True)
         ):
-            motion, needed = self._moved_by(k, moving)
+            if on_top or any(self.has["effort_measured"]) and not all(self.by_measured):
+                r, motion = self._unmet(k, dynamics, effects, ours, moving)
+            else:
+                r, motion = self._unmet_sum(k, dynamics, effects, heavy, ours, moving)
+            others = self._other_rows(k, effects, motion)
+            parts.append(self._stacked(track, white, r, others))
+        return np.concatenate(parts)
+
+    def _with(self, heavy: Sequence[Effect]) -> SceneDynamics:
+        """Of the scene with these effects too."""
+        key = tuple(map(_key, heavy))
+        if key not in self._heavier:
+            if len(self._heavier) > MOST_DYNAMICS:
+                self._heavier.clear()
+            scene = replace(self.scene, effects=[*self.scene.effects, *heavy])
+            self._heavier[key] = SceneDynamics(scene)
+        return self._heavier[key]
+
+    def _unmet(self, k: int, dynamics, effects, ours, moving):
+        """(n_bumps, n_v) means over bumps of what a track's equations leave, and its
+        motion with the effort that acts."""
+        motion, needed = self._moved_by(k, moving)
+        if dynamics is not self.dynamics:
+            needed = motion.effort - dynamics.residual(motion)
+        # A gear's loss goes with what all the others need.
+        for effect in sorted(ours, key=lambda e: KINDS[e.kind].on_top is not None):
+            on_top = KINDS[effect.kind].on_top
+            if on_top is not None:
+                needed = needed + on_top(effect, dynamics, motion, needed)
+                continue
+            needed = needed + _added(effect, dynamics, motion)
+        motion = self._driven_by(k, motion, effects)
+        return self.tracks[k].bumps.mean(motion.effort - needed), motion
+
+    def _unmet_sum(self, k: int, dynamics, effects, heavy, ours, moving):
+        """The same where effects add up: what each of them adds is kept, as a fit
+        changes one parameter at a time."""
+        bumps = self.tracks[k].bumps
+        motion, _ = self._moved_by(k, moving)
+        weights = () if dynamics is self.dynamics else tuple(map(_key, heavy))
+        where = (k, tuple(map(_key, moving)), weights)
+
+        def rest() -> np.ndarray:
+            needed = self._moved_by(k, moving)[1]
             if dynamics is not self.dynamics:
                 needed = motion.effort - dynamics.residual(motion)
-            # A gear's loss goes with what all the others need.
-            for effect in sorted(ours, key=lambda e: KINDS[e.kind].on_top is not None):
-                on_top = KINDS[effect.kind].on_top
-                if on_top is not None:
-                    needed = needed + on_top(effect, dynamics, motion, needed)
-                    continue
-                add = added_effort(effect, KINDS[effect.kind], dynamics, motion)
-                if add is None:
-                    raise ValueError(f"{effect.kind} is seen in simulation alone")
-                needed = needed + add
-            motion = replace(
-                motion,
-                effort=self._effort(track, effects, motion.q, motion.v)
-                + self._unseen_rotor * motion.vd,
+            return bumps.mean(self._driven_by(k, motion, effects).effort - needed)
+
+        path = tuple(_key(e) for e in effects if e.kind in SENSED + PATH)
+        r = self._kept((where, path), rest)
+        for effect in ours:
+            r = r - self._kept(
+                (where, _key(effect)),
+                lambda e=effect: bumps.mean(_added(e, dynamics, motion)),
             )
-            r = track.bumps.mean(motion.effort - needed)
-            parts.append(
-                self._stacked(track, white, r, self._other_rows(track, effects, motion))
-            )
-        return np.concatenate(parts)
+        return r, motion
+
+    def _driven_by(self, k: int, motion: Motion, effects) -> Motion:
+        """A motion with the effort that acts under these effects."""
+        effort = self._effort(self.tracks[k], effects, motion.q, motion.v)
+        return replace(motion, effort=effort + self._unseen_rotor * motion.vd)
+
+    def _kept(self, key, compute: Callable[[], np.ndarray]) -> np.ndarray:
+        """What was computed for a key before, or now."""
+        if key not in self._means:
+            if len(self._means) > MOST_MEANS:
+                self._means.clear()
+            self._means[key] = compute()
+        return self._means[key]
 
     def _moved_by(self, k: int, moving: Sequence[Effect]) -> tuple[Motion, np.ndarray]:
         """A track's motion, and the effort that the scene as it came needs for it."""
@@ -573,31 +621,16 @@ class InverseModel:
             parts.append(self._stacked(track, white, mean, None))
         return np.concatenate(parts)
 
-    def _other_rows(self, track, effects, motion) -> dict[str, np.ndarray]:
-        out = {}
+    def _other_rows(self, k: int, effects, motion) -> dict[str, np.ndarray]:
+        out, track = {}, self.tracks[k]
         effects = [*self._own, *effects]
+        sensing = [e for e in effects if e.kind in SENSED]
+        key = (k, "rates", *map(_key, sensing))
         for i, joint in enumerate(self.joints):
             if self.has["velocity"][i]:
-                name = f"{joint}.velocity"
-                scale, late, bias = _sensing(effects, name)
-                p_scale, p_late, _ = _sensing(effects, f"{joint}.position")
-                true = (track.time - late) / scale
-                stages = with_lag(track.stages[name], _lag(effects, name))
-
-                p_lag = _lag(effects, f"{joint}.position")
-
-                def rate(
-                    t, i=i, p_scale=p_scale, p_late=p_late,
-                    p_lag=p_lag,
-                ):  # fmt: skip
-                    _, v, vd = self._at(track, i, t * p_scale + p_late)
-                    return p_scale * (v + p_lag * vd)
-
-                if stages:
-                    seen = filtered(stages, track.dense, rate(track.dense), true)
-                else:
-                    seen = rate(true)
-                out[name] = _masked(track, track.samples[name] - seen - bias)
+                out[f"{joint}.velocity"] = self._kept(
+                    (*key, i), lambda i=i: self._velocity_row(track, sensing, i)
+                )
             if self.has["effort_measured"][i] and not self.by_measured[i]:
                 name = f"{joint}.effort_measured"
                 scale, late, bias = _sensing(effects, name)
@@ -607,6 +640,26 @@ class InverseModel:
                 u = filtered(stages, track.middle, u, np.minimum(at, track.middle[-1]))
                 out[name] = _masked(track, track.samples[name] - u - bias)
         return out
+
+    def _velocity_row(self, track: Track, effects, i: int) -> np.ndarray:
+        """(n_bumps,) what a velocity shows beside the rate of the joint's position."""
+        joint = self.joints[i]
+        name = f"{joint}.velocity"
+        scale, late, bias = _sensing(effects, name)
+        p_scale, p_late, _ = _sensing(effects, f"{joint}.position")
+        true = (track.time - late) / scale
+        stages = with_lag(track.stages[name], _lag(effects, name))
+        p_lag = _lag(effects, f"{joint}.position")
+
+        def rate(t):
+            _, v, vd = self._at(track, i, t * p_scale + p_late)
+            return p_scale * (v + p_lag * vd)
+
+        if stages:
+            seen = filtered(stages, track.dense, rate(track.dense), true)
+        else:
+            seen = rate(true)
+        return _masked(track, track.samples[name] - seen - bias)
 
     def declared_lag(self, channel: str) -> float:
         """Time constant [s] of the slowest first-order filter that is declared; 0 where
@@ -688,6 +741,18 @@ class InverseModel:
             numbers.append(np.repeat(first + track.block, k))
             first += int(track.block.max(initial=-1)) + 1
         return np.concatenate(numbers)
+
+
+def _key(effect: Effect) -> tuple:
+    """An effect, to be looked up by."""
+    return effect.kind, tuple(effect.at), tuple(sorted(effect.parameters.items()))
+
+
+def _added(effect: Effect, dynamics: SceneDynamics, motion: Motion) -> np.ndarray:
+    add = added_effort(effect, KINDS[effect.kind], dynamics, motion)
+    if add is None:
+        raise ValueError(f"{effect.kind} is seen in simulation alone")
+    return add
 
 
 def _rms(x: np.ndarray) -> np.ndarray:
