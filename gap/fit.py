@@ -97,6 +97,26 @@ def fit_effects(
     )  # fmt: skip
 
 
+def tangents(
+    problem: GapProblem, fitted: Fitted, fixed: Sequence[Sequence[str]]
+) -> np.ndarray:
+    """(m, k) how residuals change with each free parameter of what is fitted, in units
+    of its typical size."""
+    free = _Free(problem, fitted.effects, [tuple(names) for names in fixed])
+    z, columns = free.x0 / free.scale, []
+    for k in range(len(z)):
+        moved = np.array(z)
+        moved[k] += problem.plan.diff_step
+        try:
+            r = problem.residual(free.effects(moved))
+        except (ValueError, RuntimeError):
+            continue
+        columns.append((r - fitted.r) / problem.plan.diff_step)
+    if not columns:
+        return np.zeros((len(fitted.r), 0))
+    return np.stack(columns, axis=1)
+
+
 def derivative_free_search(
     problem: GapProblem,
     screen: Screen,

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from makebreak.gap.fit import derivative_free_search, fit_effects
+from makebreak.gap.fit import derivative_free_search, fit_effects, tangents
 from makebreak.gap.problem import Candidate, Fitted, GapProblem, Nuisances
 from makebreak.gap.screen import Ranked, rank
 from makebreak.models.effects import KINDS
@@ -42,6 +42,7 @@ CHANNEL_GAIN, LEAST_T, ABOVE = 0.10, 2.0, 1.3
 MEMBER_Z, MEMBER_GAIN = 3.0, 0.02
 FEWEST_MEMBERS = 2  # Of a group.
 BEYOND = 1.0  # Tolerances over a nuisance's limit that are no chance among dozens.
+FREE = 1e3  # Of its size, how far what is chosen may give way to a candidate.
 PAIRED = 10  # Candidates of which all pairs are tried against a single one.
 
 
@@ -155,14 +156,19 @@ class _Search:
     # ----- What is asked again and again
 
     def _screen(
-        self, r: np.ndarray, scale: float = 1.0, reach: float | None = None
+        self, r: np.ndarray, scale: float = 1.0, reach: float | None = None, slopes=None
     ) -> Screen:
         """Nuisances are weighed against what is left, and by how many rows of it are
-        independent. reach: another limit than theirs."""
+        independent. reach: another limit than theirs. slopes (m, k): columns that are
+        free beside them."""
         n = self.nuisances
         scale = max(scale, 1.0) * self.problem.correlation
         limit = n.reach if reach is None else reach
-        return Screen(r, n.columns, n.prior, self.train, scale, limit)
+        columns, prior = n.columns, n.prior
+        if slopes is not None and slopes.shape[1]:
+            columns = np.hstack([columns, slopes])
+            prior = np.append(prior, np.full(slopes.shape[1], FREE))
+        return Screen(r, columns, prior, self.train, scale, limit)
 
     def _needs_more(self, fitted: Fitted) -> bool:
         """Whether held-out rows are worse than noise, or the background is beyond what
@@ -237,8 +243,12 @@ class _Search:
         taken = {(c.effect.kind, tuple(c.effect.at)) for c in chosen}
         open_ = [c for c in found if (c.kind, c.at) not in taken]
         open_ += _groups(open_)
-        screen = self._screen(current.r)
-        ranked = [r for r in rank(screen, open_) if r.valid]
+        # With what is chosen free to give way, as far as slopes tell.
+        slopes = np.zeros((len(current.r), 0))
+        if chosen and not self.plan.jumps:
+            slopes = tangents(self.problem, current, [c.fixed for c in chosen])
+        wide = self._screen(current.r, slopes=slopes)
+        ranked = [r for r in rank(wide, open_) if r.valid]
         if not ranked:
             return None, []
         # What even the best leaves is no noise: nuisances are weighed against it.
@@ -248,10 +258,11 @@ class _Search:
             if best < 1.2 * scale and scale < 1.2 * best:
                 break
             scale = best
-            screen = self._screen(current.r, scale)
-            ranked = [r for r in rank(screen, open_) if r.valid]
+            wide = self._screen(current.r, scale, slopes=slopes)
+            ranked = [r for r in rank(wide, open_) if r.valid]
+        screen = self._screen(current.r, scale)
         base = screen.judge(current.r)
-        ranked = self._pruned(screen, ranked)
+        ranked = self._pruned(wide, ranked)
         table = [
             {"kind": r.candidate.kind, "at": list(r.candidate.at),
              "score": r.fit.score / max(base.score, 1e-12),
@@ -276,7 +287,7 @@ class _Search:
         if not sound:
             return None, table
         pick = self._picked(sound, found)
-        pair = self._pair(screen, chosen, ranked, *sound[pick])
+        pair = self._pair(wide, screen, chosen, ranked, *sound[pick])
         if pair is not None:
             sound.append(pair)
             pick = len(sound) - 1
@@ -314,7 +325,7 @@ class _Search:
         return pick
 
     def _pair(
-        self, screen, chosen, ranked: Sequence[Ranked], single: Fitted, of: Ranked
+        self, wide, screen, chosen, ranked: Sequence[Ranked], single: Fitted, of: Ranked
     ):
         """Two other effects at once where they leave clearly less than the best single
         one: what two do together another kind may imitate better than either of them.
@@ -330,7 +341,7 @@ class _Search:
         trials = []
         for a, b in itertools.combinations(tried, 2):
             X = np.hstack([a.columns, b.columns])
-            fit = screen.fit(X)
+            fit = wide.fit(X)
             k = a.columns.shape[1]
             effects = (
                 *a.candidate.effects(a.alternative, fit.c[:k]),
@@ -372,6 +383,7 @@ class _Search:
         if len(new) == 1:
             sizes = [best.candidate.size]
         fixed = best.fixed()
+        together = len(new) > 1 and len({e.kind for e in new}) == 1
         return _Step(
             fit,
             tuple(
@@ -379,7 +391,7 @@ class _Search:
                     effect, {}, base, fit.score,
                     runner[1].candidate.name if runner else "",
                     runner[0].score / fit.score - 1.0 if runner else np.inf,
-                    ties, fixed[k], sizes[k], len(new) > 2,
+                    ties, fixed[k], sizes[k], together,
                 )
                 for k, effect in enumerate(new)
             ),

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
+from scipy.signal import lfilter
 
 from makebreak.gap.fit import derivative_free_search, fit_effects
 from makebreak.gap.problem import GapProblem, Nuisances, SearchPlan
@@ -16,11 +17,14 @@ from makebreak.systems.numerics.selection import (
     benjamini_hochberg,
     boxed_minimum,
     is_plausible,
+    is_predicted,
     paired,
     paired_t,
+    predictable_share,
     simplest,
     spread_by_blocks,
 )
+from makebreak.systems.numerics.signal_noise import noise_beside
 from makebreak.systems.numerics.smoother import smooth
 from makebreak.systems.numerics.weak_form import make_bumps
 
@@ -277,6 +281,58 @@ def test_blocks_tell_a_gain_of_one_channel_from_chance():
     # Student's t with 16 degrees of freedom: beyond 2 on one side 3 of 100.
     assert np.sum(np.array(by_chance) > 2.0) <= 9
     assert paired_t(one, better, np.ones(n * k, bool), channel) == 0.0
+
+
+def wandering_noise(n, memory, rng):
+    """(n,) of unit variance, correlation exp(-lag / memory)."""
+    keep = np.exp(-1.0 / memory)
+    return lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.normal(size=n))
+
+
+def test_what_goes_with_the_motion_is_told_from_noise_that_wanders():
+    rng = np.random.default_rng(5)
+    n, block = 240, np.arange(240) // 12
+    # A slow motion, and noise that goes together for as long as it does.
+    hits = repeats = 0
+    for _ in range(20):
+        q = np.cumsum(wandering_noise(n, 5.0, rng))
+        v = np.gradient(q)
+        X = np.column_stack([np.sign(v), v, q, q**2, np.sin(q), np.cos(q)])
+        noise = wandering_noise(n, 4.0, rng)
+        hits += is_predicted(noise, X, block, 0.1)
+        repeats += is_predicted(np.sign(v) + noise, X, block, 0.1)
+    # By chance, less than one in 60 shifts each; friction as large as the noise is
+    # half of the power.
+    assert hits <= 2 and repeats >= 17
+
+
+def test_a_predictable_share_is_that_of_the_variance():
+    rng = np.random.default_rng(6)
+    X, block = rng.normal(size=(4000, 3)), np.arange(4000) // 40
+    y = X @ [1.0, -2.0, 0.5] + rng.normal(size=4000) * np.sqrt(5.25)
+    # Half of it; of 4000 rows the share is known to 0.02.
+    assert predictable_share(y, X, block) == pytest.approx(0.5, abs=0.04)
+    assert predictable_share(rng.normal(size=4000), X, block) < 0.01
+    assert predictable_share(y, X, np.zeros(4000, int)) == 0.0  # No block to leave out.
+
+
+def test_noise_of_a_filtered_signal_is_found_beside_a_known_one():
+    """White noise behind a first-order filter, of which differences show little, and a
+    signal that is late: that is no noise."""
+    rng = np.random.default_rng(8)
+    n, pole, h = 6000, 0.6, 0.005
+    t = h * np.arange(n)
+    v, rate = np.sin(2.0 * t), 2.0 * np.cos(2.0 * t)
+    noise = lfilter([1.0 - pole], [1.0, -pole], 0.02 * rng.normal(size=n))
+    late = -0.01 * rate
+    std, together = noise_beside([(noise + late, np.column_stack([v, rate]))])
+    # Variance (1 - p)/(1 + p) of the white noise's; autocorrelation p^k, so that
+    # (1 + p)/(1 - p) = 4 samples go together. 6000 rows tell both to some per cent.
+    assert std == pytest.approx(0.02 * np.sqrt(0.4 / 1.6), rel=0.04)
+    assert together == pytest.approx(4.0, rel=0.15)
+    white = 0.02 * rng.normal(size=n)
+    std, together = noise_beside([(white, np.column_stack([v, rate]))])
+    assert std == pytest.approx(0.02, rel=0.04) and together < 1.2
 
 
 class OneNuisance(GapProblem):

@@ -50,6 +50,14 @@ class Screen:
         self._limit = float(reach) * self._prior
         self._T, self._H = self._N[self._train], self._N[~self._train]
         self._NN = self._T.T @ self._T + self._s2 * np.diag(self._prior**-2)
+        # Candidates differ little in which nuisances are at their limits.
+        self._factors: dict[bytes, tuple] = {}
+        self._Nr = self._T.T @ self.r[self._train]
+        self._side = np.zeros(len(self._prior), int)
+        if len(self._prior):
+            b = self.settle(self.r)[0]
+            held = np.abs(b) >= self._limit * (1.0 - 1e-9)
+            self._side = np.where(held, np.sign(b), 0).astype(int)
 
     def fit(self, columns=None) -> LinearFit:
         """With a candidate's columns (m, k), or with the nuisances alone."""
@@ -62,7 +70,7 @@ class Screen:
         size[size <= 1e-9 * size.max()] = np.inf
         X = X / size
         XX, XN, Xr = X.T @ X, X.T @ self._T, X.T @ self.r[t]
-        Nr = self._T.T @ self.r[t]
+        Nr = self._Nr
         inverse, c = np.zeros_like(XX), np.zeros(len(size))
 
         def solve(free, b):
@@ -70,7 +78,7 @@ class Screen:
             nonlocal inverse, c
             g, G = Xr - XN[:, ~free] @ b[~free], XX
             if free.any():
-                L = cho_factor(self._NN[np.ix_(free, free)])
+                L = self._factor(free)
                 some = XN[:, free]
                 rest = Nr[free] - self._NN[np.ix_(free, ~free)] @ b[~free]
                 G = XX - some @ cho_solve(L, some.T)
@@ -83,12 +91,19 @@ class Screen:
 
         b = np.zeros(len(self._prior))
         if len(b):
-            b = _within(solve, self._limit, np.diag(self._NN))
+            b = _within(solve, self._limit, np.diag(self._NN), self._side)
         else:
             solve(np.zeros(0, bool), b)
         spread = np.sqrt(self._s2 * np.maximum(np.diag(inverse), 0.0))
         left = self.r - columns @ (c / size) - self._N @ b
         return self._fit(c / size, spread / size, b, left)
+
+    def _factor(self, free: np.ndarray):
+        """Cholesky's, of the nuisances that are free."""
+        key = free.tobytes()
+        if key not in self._factors:
+            self._factors[key] = cho_factor(self._NN[np.ix_(free, free)])
+        return self._factors[key]
 
     def judge(self, r, c=(), c_std=()) -> LinearFit:
         """For another residual (m,): with the nuisances that its training rows want."""
@@ -162,14 +177,17 @@ def boxed_minimum(H, g, limit) -> np.ndarray:
     return _within(solve, limit, np.diag(H))
 
 
-def _within(solve, limit: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
+def _within(
+    solve, limit: np.ndarray, stiffness: np.ndarray, guess: np.ndarray | None = None
+) -> np.ndarray:
     """The solution b (n,) of a least-squares problem with |b| <= limit (n,).
 
     Args: solve(free (n,) booleans, b): b with those that are free put to their best,
         and how hard all of them are pulled. stiffness (n,): of each, a typical pull
-        over a typical step.
+        over a typical step. guess (n,): -1, 0, 1 where a limit is expected to hold.
     """
     side, b = np.zeros(len(limit), int), np.zeros(len(limit))
+    side = side if guess is None else np.array(guess)
     for _ in range(40):
         free = side == 0
         b, pull = solve(free, np.where(free, 0.0, side * np.where(free, 0.0, limit)))
