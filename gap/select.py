@@ -217,15 +217,15 @@ class _Search:
         t = paired_t(without, with_, self.train, self.channel)
         return bool(len(gain)) and max(gain.values()) >= CHANNEL_GAIN and t > LEAST_T
 
-    def _channel_gains(self, without, with_) -> dict[int, float]:
-        """Of each channel above the noise, the share that is taken off its held-out
+    def _channel_gains(self, without, with_, above=ABOVE) -> dict[int, float]:
+        """Of each channel above so many times the noise, the share that is taken off its held-out
         error, as far as laws are told apart."""
         held = ~self.train
         noisy = self.problem.in_noise(without)
         found = {}
         for k in np.unique(self.channel):
             mine = held & (self.channel == k)
-            if not mine.any() or _rms(noisy[mine]) < ABOVE:
+            if not mine.any() or _rms(noisy[mine]) < above:
                 continue
             blur = PRECISION * _rms(self.start.left[mine])
             a, b = (
@@ -408,8 +408,6 @@ class _Search:
                 continue
             if r.candidate.size > best.candidate.size + MORE or not _is_used(f):
                 continue
-            if r.candidate.fixed and _weight(r.candidate) > _weight(best.candidate):
-                continue  # A special case of a bigger kind, which the smaller one is.
             if r.candidate.kind == best.candidate.kind and self.problem.is_one_place(
                 r.candidate.at, best.candidate.at
             ):
@@ -502,7 +500,7 @@ class _Search:
                     if (mine := held & (self.channel == c)).any()
                 ]
                 least = MEMBER_GAIN if z[k] >= MEMBER_Z else CHANNEL_GAIN
-                if max(gains) < least:
+                if max(gains, default=0.0) < least:
                     members = rest
                     break
             else:
@@ -640,7 +638,7 @@ class _Search:
         if not self.plan.by_channel or not choice.in_group:
             return False
         # One of a group, of which the others were seen.
-        gains = self._channel_gains(without, with_)
+        gains = self._channel_gains(without, with_, 0.0)
         return max(gains.values(), default=0.0) >= MEMBER_GAIN and _is_sure(choice)
 
 

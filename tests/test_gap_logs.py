@@ -189,6 +189,23 @@ def test_gain_bias_and_ceiling_of_a_drive():
     np.testing.assert_array_equal(track.motor[:, 1], sent[:, 1])
 
 
+def test_a_hidden_gain_is_between_what_is_logged_and_what_acts(tmp_path):
+    """Inverse dynamics of the true robot over the logged efforts, joint by joint."""
+    made = make(LogCase("gain", 91, Recipe("gain", "six", "multisine", hide="gain")))
+    (hidden,) = made.truth["effects"]
+    columns, track = made.columns, made.track
+    efforts = [n for n in columns if "effort" in n or n.startswith("tau")]
+    logged = np.stack([columns[n] for n in efforts], axis=1)
+    rows = np.linspace(0, len(track.time) - 1, len(logged) + 2).round()[1:-1]
+    given = track.motor[rows.astype(int)]
+    ratio = np.sum(given**2, axis=0) / np.sum(given * logged, axis=0)
+    joint = int(hidden["at"][-1]) - 1
+    expected = np.ones(6)
+    expected[joint] = hidden["parameters"]["gain"]
+    # Noise, of up to a third of small efforts, in a thousand rows and more.
+    np.testing.assert_allclose(ratio, expected, atol=0.03)
+
+
 def test_a_servo_is_a_spring_with_a_brake_and_a_ceiling():
     robot, motion = robot_and_motion("servo")
     n = 5

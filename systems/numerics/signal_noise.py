@@ -6,6 +6,7 @@ reversals and outliers are few.
 """
 
 from dataclasses import dataclass
+from functools import cache
 from math import comb
 
 import numpy as np
@@ -218,6 +219,7 @@ def _autocovariance(order: int, lag: int) -> float:
     return (-1.0) ** lag * comb(2 * order, order - lag)
 
 
+@cache
 def _gain(order: int, pole: float, lag: int = 0) -> float:
     """Autocovariance at a lag of the order-th difference of first-order noise.
 

@@ -303,9 +303,9 @@ def _hidden(name: str, d: Drawn, s: Demand) -> list[dict]:
     i = any_joint()
     if name == "gain":
         i = int(rng.choice([1, 2])) if d.sort == "six" else int(rng.choice([1, 3]))
-        return [
-            one("actuator_gain", joints[i], gain=1.0 + sign * rng.uniform(0.1, 0.2))
-        ]
+        gain = 1.0 + sign * rng.uniform(0.1, 0.2)
+        d.how = replace(d.how, effort_gain=1.0 + (gain - 1.0) * np.eye(n)[i])
+        return [one("actuator_gain", joints[i], gain=gain)]
     f = rng.uniform(1.0, 1.6) * high[i]
     if name == "coulomb":
         return [one("joint_coulomb_friction", joints[i], coulomb=f)]

@@ -81,6 +81,7 @@ class Logging:
     skew: float = 0.0  # The clock of the measurements runs fast by this.
     delay: float = 0.0  # [s] All that is measured is late.
     effort_bias: np.ndarray | float = 0.0
+    effort_gain: np.ndarray | float = 1.0  # What the motors give over what they show.
 
 
 def wandering(n: int, step: float, memory: float, shape, rng) -> np.ndarray:
@@ -137,7 +138,7 @@ def write_log(
             # The drive renews its effort each millisecond: what it gives about an
             # instant is the mean of both, else every log would be half of one late.
             u = np.vstack([u[:1], 0.5 * (u[1:] + u[:-1])])
-        u = at_rows(u)
+        u = at_rows(u) / np.asarray(how.effort_gain)
         u = u + np.asarray(how.effort_bias) + how.effort_noise * rng.normal(size=shape)
         u = u + how.wander * wandering(
             len(rows), spacing * _GRID, how.memory, (n,), rng

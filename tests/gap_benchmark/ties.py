@@ -321,8 +321,10 @@ def places_of(robot: Robot, kind: str) -> list[tuple[str, str]]:
         return [(k, at) for k in JOINT_KINDS for at in joints]
     if kind == "sinusoidal_force":
         return [(kind, at) for at in bodies]
-    if kind in BODY_KINDS:
-        return [(k, at) for k in BODY_KINDS for at in bodies]
+    if kind in BODY_KINDS:  # What acts on a link near the base may be one joint's.
+        return [(k, at) for k in BODY_KINDS for at in bodies] + [
+            (k, at) for k in JOINT_KINDS for at in joints
+        ]
     return []
 
 
