@@ -159,10 +159,10 @@ class MechanismProblem(InverseModel, GapProblem):
         return float(np.sqrt(max(np.mean(held**2), np.mean(rows**2))))
 
     def wandering(self, r: np.ndarray) -> np.ndarray:
-        """(n_names,) what rows (m,) of before the nuisances leave of an effort that is
-        measured, in its unit [N m], where that is no gap but noise that goes together over a while: nothing
-        of it is told by where the joint is, how it moves and what it needs, and it is
-        there all the time. 0 for all other channels."""
+        """(n_names,) what rows (m,), before the nuisances, leave of an effort that is
+        measured, in its unit [N m], where that is no gap but noise that goes together
+        over a while: nothing of it is told by where the joint is, how it moves and what
+        it needs, and it is there all the time. 0 for all other channels."""
         names = self.names()
         found = np.zeros(len(names))
         left = self._settled(r)

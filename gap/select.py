@@ -29,6 +29,8 @@ FLOOR = 1.15  # Rms over noise that noise alone may leave (its estimate is that 
 # Laws are approximations (how dry friction turns round, how commands are held): errors
 # that differ by less than this share of the whole gap do not tell two models apart.
 PRECISION = 0.015
+# The same of one channel: less of a large gap is how its law was written down.
+CHANNEL_PRECISION = 0.03
 # A rival that needs more parameters than these beyond the chosen effect's, to say the
 # same, is a coincidence: it contains the effect as a special case.
 MORE = 1
@@ -218,8 +220,8 @@ class _Search:
         return bool(len(gain)) and max(gain.values()) >= CHANNEL_GAIN and t > LEAST_T
 
     def _channel_gains(self, without, with_, above=ABOVE) -> dict[int, float]:
-        """Of each channel above so many times the noise, the share that is taken off its held-out
-        error, as far as laws are told apart."""
+        """Of each channel above so many times the noise, the share that is taken off
+        its held-out error, as far as laws are told apart."""
         held = ~self.train
         noisy = self.problem.in_noise(without)
         found = {}
@@ -227,7 +229,7 @@ class _Search:
             mine = held & (self.channel == k)
             if not mine.any() or _rms(noisy[mine]) < above:
                 continue
-            blur = PRECISION * _rms(self.start.left[mine])
+            blur = CHANNEL_PRECISION * _rms(self.start.left[mine])
             a, b = (
                 np.hypot(_rms(without[mine]), blur),
                 np.hypot(_rms(with_[mine]), blur),

@@ -1,5 +1,5 @@
-"""Logs as robots write them, from files to verdict: of the benchmark's sorts, with seeds
-of their own."""
+"""Logs as robots write them, from files to verdict: of the benchmark's sorts, with
+seeds of their own."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def found_in(folder, recipe, seed):
 def test_filtered_velocities_and_wandering_efforts_are_no_gap(tmp_path, options):
     """Noise that goes together over some samples, or over tenths of a second: as it is
     not known where an effort's noise is made, it must not repeat with the motion."""
-    recipe = Recipe("none", "planar", "multisine guided", options=options)
+    recipe = Recipe("none", "planar", "multisine guided", options=(option,))
     _, result = found_in(tmp_path, recipe, 77)
     assert (result.verdict, result.effects) == ("no_gap", [])
 
