@@ -17,10 +17,8 @@ def found_in(folder, recipe, seed):
     return truth, run_gap(folder / "scene.yaml", [folder / "recording.csv"])
 
 
-@pytest.mark.parametrize(
-    "options", [("first order",), ("moving average",), ("wander",)]
-)
-def test_filtered_velocities_and_wandering_efforts_are_no_gap(tmp_path, options):
+@pytest.mark.parametrize("option", ["first order", "moving average", "wander"])
+def test_filtered_velocities_and_wandering_efforts_are_no_gap(tmp_path, option):
     """Noise that goes together over some samples, or over tenths of a second: as it is
     not known where an effort's noise is made, it must not repeat with the motion."""
     recipe = Recipe("none", "planar", "multisine guided", options=(option,))
