@@ -84,6 +84,8 @@ class MechanismProblem(InverseModel, GapProblem):
     def _misfit(self, left: np.ndarray) -> dict[str, np.ndarray]:
         """What held-out rows (m,) are off by beside noise: robust, of each channel."""
         held = (~self.train()).reshape(-1, len(self.names()))[:, 0]
+        if not held.any():
+            return self.model_error
         off, noise = self.in_units(left)[held], self.noise_in_units()[held]
         # A joint at rest may be held by anything: its rows say nothing of models.
         usual = noise <= AT_REST * np.quantile(noise, 0.1, axis=0)
