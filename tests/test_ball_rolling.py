@@ -729,12 +729,22 @@ def test_a_ball_larger_than_modelled_is_felt_gently_and_its_gap_is_learned(tmp_p
 
 
 def test_a_ball_smaller_than_modelled_is_found_and_only_with_adaptation(tmp_path):
+    """The headline in short: found within a few pushes, and rolling."""
     result = short(tmp_path, 7.0, "radius_error_m=0.005")
     assert result["time_to_first_contact_s"] < 6.0
+    assert result["circles_completed"] > 0.1
     assert result["r_gap_m"] == pytest.approx(0.010, abs=0.003)
     assert result["contact_force_peak_N"] <= 40.0
     frozen = short(tmp_path, 5.0, "radius_error_m=0.005", "learner=none")
     assert frozen["time_to_first_contact_s"] is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("radius_error", [0.008, 0.012])
+def test_a_much_smaller_ball_is_found_gently_and_rolled(tmp_path, radius_error):
+    result = short(tmp_path, 14.0, f"radius_error_m={radius_error}")
+    assert result["initiated"] and result["contact_force_peak_N"] <= 40.0
+    assert result["r_gap_m"] == pytest.approx(2.0 * radius_error, abs=0.004)
 
 
 @pytest.mark.slow

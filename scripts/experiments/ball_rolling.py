@@ -326,8 +326,16 @@ def plot_residual(session, log, track):
     true = np.where(log["seen"][:, 0] > 0.5, 1e3 * track.gap_true, np.nan)
     axes[0].plot(track.time, true, lw=0.4, color="0.7", label="true")
     axes[0].plot(track.time, 1e3 * track.gap, label="learned r_comp dt")
+    if track.gap_std.any():
+        reach = Z_90 * track.gap_std
+        low, high = 1e3 * (track.gap - reach), 1e3 * (track.gap + reach)
+        axes[0].fill_between(
+            track.time, low, high, color="C0", alpha=0.2, lw=0, label="its 90 %"
+        )
     axes[0].set_ylabel("gap, true - modelled [mm]")
-    axes[0].legend(loc="lower right")
+    fig.legend(
+        *axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3
+    )
     if "loss" in log:
         loss = log["loss"][:, 0]
         axes[1].semilogy(track.time, np.where(loss > 0.0, loss, np.nan), lw=0.8)
