@@ -50,10 +50,10 @@ class PosteriorConfig:
     prior_std: float = 0.16  # About zero [m/s]: 8 mm at dt = .05 s.
     # How it may change in a second, as a deviation [m/s / sqrt(s)], ...
     drift: float = 0.02
-    growth: float = 0.05  # ... and how much more, as a share of itself [1 / sqrt(s)].
+    growth: float = 0.08  # ... and how much more, as a share of itself [1 / sqrt(s)].
     spacing: float = 0.01  # Of the grid [m/s].
     trust: float = 0.2  # Share of a step's loss that counts.
-    loss_max: float = 6.0  # What one step can say at most.
+    loss_max: float = 20.0  # What one step can say at most.
 
 
 @dataclass
