@@ -23,7 +23,7 @@ from makebreak.systems.numerics.residual_learner import (
 from makebreak.systems.numerics.residual_posterior import (
     ResidualGrid,
     losses_on_grid,
-    mean_and_std,
+    mode_and_std,
     residual_grid,
     updated,
 )
@@ -74,7 +74,7 @@ class ResidualLearnerConfig:
     # Empty: all adapt, each for itself.
     groups: list[list[int]] = field(default_factory=list)
     r_max: float = 1.0  # Bound on each entry of r_comp [m/s].
-    # Given: r_comp is the mean of a probability instead of Adam's, for one group; Q_d
+    # Given: r_comp is a probability's mode instead of Adam's, for one group; Q_d
     # then has inverse variances, and n_b, learning_rate and n_steps have no effect.
     posterior: PosteriorConfig | None = None
 
@@ -152,7 +152,7 @@ class ResidualLearner(LeafSystem):
             self._grid = residual_grid(
                 config.r_max, c.spacing, c.prior_std, c.drift * root, c.growth * root
             )
-            _, std = mean_and_std(self._grid, self._grid.prior)
+            _, std = mode_and_std(self._grid, self._grid.prior)
             memory = replace(memory, belief=self._grid.prior, std=std)
         self._memory = self.DeclareAbstractState(Value(memory))
         ticket = {self.abstract_state_ticket(self._memory)}
@@ -219,14 +219,11 @@ class ResidualLearner(LeafSystem):
             grid, memory.belief, loss, c.posterior.trust, c.posterior.loss_max
         )
         belief.setflags(write=False)
-        mean, std = mean_and_std(grid, belief)
+        mode, std = mode_and_std(grid, belief)
         before = float(memory.residual.value[0])
-        residual = replace(memory.residual, value=np.array([mean]))
+        residual = replace(memory.residual, value=np.array([mode]))
         status = LearnerStatus.LEARNED if solved else LearnerStatus.NOT_SOLVED
-        if (
-            mean > c.r_max - c.posterior.spacing
-            or -mean > c.r_max - c.posterior.spacing
-        ):
+        if abs(mode) > c.r_max - c.posterior.spacing:
             status = LearnerStatus.AT_BOUND
         told = float(np.interp(before, grid.values, loss)) if solved else memory.loss
         return LearnerMemory(sample, memory.buffer, residual, told, status, belief, std)

@@ -23,7 +23,7 @@ from makebreak.systems.numerics.lcs import simulate
 from makebreak.systems.numerics.residual_learner import measured_step, violation_loss
 from makebreak.systems.numerics.residual_posterior import (
     losses_on_grid,
-    mean_and_std,
+    mode_and_std,
     residual_grid,
     updated,
 )
@@ -38,9 +38,28 @@ GRID = residual_grid(r_max=0.7, spacing=0.01, prior_std=0.16, drift_std=0.01)
 
 
 def test_the_prior_is_a_gaussian_about_zero():
-    mean, std = mean_and_std(GRID, GRID.prior)
+    mode, std = mode_and_std(GRID, GRID.prior)
     # The grid ends at 4.4 deviations and is 16 times finer than one.
-    assert mean == pytest.approx(0.0, abs=1e-12) and std == pytest.approx(0.16, 1e-3)
+    assert mode == pytest.approx(0.0, abs=1e-12) and std == pytest.approx(0.16, 1e-3)
+
+
+@pytest.mark.parametrize("r, std", [(0.1234, 0.03), (-0.4567, 0.02)])
+def test_mode_and_deviation_of_a_gaussian_between_the_grids_values(r, std):
+    belief = np.exp(-0.5 * ((GRID.values - r) / std) ** 2)
+    mode, deviation = mode_and_std(GRID, belief / belief.sum())
+    # A parabola through logarithms is exact, and sums over two values a deviation are.
+    assert mode == pytest.approx(r, abs=1e-9)
+    assert deviation == pytest.approx(np.sqrt(std**2 + 0.01**2 / 12), rel=1e-3)
+
+
+def test_a_tail_of_values_that_nothing_rules_out_does_not_pull_the_residual_along():
+    belief = np.exp(-0.5 * (GRID.values / 0.02) ** 2)
+    belief[GRID.values > 0.0] += 0.05 * np.exp(-GRID.values[GRID.values > 0.0] / 0.3)
+    belief /= belief.sum()
+    mode, deviation = mode_and_std(GRID, belief)
+    assert abs(mode) < 0.002 < 0.04 < GRID.values @ belief
+    # About the mode: never less than about the mean.
+    assert deviation > np.sqrt((GRID.values**2) @ belief - (GRID.values @ belief) ** 2)
 
 
 def test_losses_are_the_violation_loss_under_each_residual():
@@ -62,7 +81,7 @@ def test_gaussian_measurements_and_drift_give_the_kalman_filter():
         mean, variance = mean + gain * (y - mean), (1.0 - gain) * variance
         loss = 0.5 * ((GRID.values - y) / truth_std) ** 2
         belief = updated(GRID, belief, loss, trust=1.0, loss_max=np.inf)
-    ours = mean_and_std(GRID, belief)
+    ours = mode_and_std(GRID, belief)
     # Drift is as wide as the grid is fine: sampled, its variance is right to 1e-3; the
     # grid's own spacing is added, 0.01^2/12.
     assert ours[0] == pytest.approx(mean, abs=1e-3)
@@ -73,7 +92,7 @@ def test_a_residual_changes_the_more_the_larger_it_is():
     grid = residual_grid(0.7, 0.002, 0.16, drift_std=0.01, growth_std=0.05)
     for value in (-0.4, 0.0, 0.2):
         j = int(np.argmin(abs(grid.values - value)))
-        mean, std = mean_and_std(grid, grid.transition[:, j])
+        mean, std = mode_and_std(grid, grid.transition[:, j])
         # The grid is 5 times finer than the least of them and ends far away.
         assert mean == pytest.approx(value, abs=1e-9)
         assert std == pytest.approx(0.01 + 0.05 * abs(value), rel=0.01)
@@ -92,7 +111,7 @@ def test_losses_that_are_not_finite_leave_the_belief_to_drift():
     after = updated(GRID, GRID.prior, loss, 0.1, 6.0)
     expected = GRID.transition @ GRID.prior
     np.testing.assert_allclose(after, expected / expected.sum())
-    assert mean_and_std(GRID, after)[1] > 0.16
+    assert mode_and_std(GRID, after)[1] > 0.16
 
 
 # The learner of ball_rolling, on what a tip of 1 kg does above a ball that lies still.
@@ -201,7 +220,7 @@ def test_a_gap_that_is_too_large_has_no_gradient_but_a_likelihood():
     belief = GRID.prior
     for _ in range(60):
         belief = updated(GRID, belief, loss, 0.1, 6.0)
-    assert mean_and_std(GRID, belief)[0] == pytest.approx(-0.1, abs=0.01)  # 5 mm/dt.
+    assert mode_and_std(GRID, belief)[0] == pytest.approx(-0.1, abs=0.01)  # 5 mm/dt.
 
 
 @pytest.mark.parametrize(

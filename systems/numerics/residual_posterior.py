@@ -6,10 +6,10 @@ that are inverse variances, is a negative log-likelihood. Over a grid of values 
     p(r) <- p(r) spread by N(0, (drift + growth |r|)^2 dt)   the residual may change,
     p(r) <- p(r) exp(-trust min(l_k(r) - min l_k, l_max))
 
-and the mean is r_comp. The gradient of the loss tells less: it is zero wherever a
-contact was missed (the loss is flat there, however high), so that a gap that is too
-large is hardly ever made smaller; and Adam's steps are of one size, whether the data
-say much or nothing. docs/residual_learning.md has both side by side.
+and the most probable value is r_comp. The gradient of the loss tells less: it is zero
+wherever a contact was missed (the loss is flat there, however high), so that a gap that
+is too large is hardly ever made smaller; and Adam's steps are of one size, whether the
+data say much or nothing. docs/residual_learning.md has both side by side.
 
 growth: a wrong radius is not one gap. Where a ball is touched at an angle a from its
 top, the gap is (1 + cos a) times the error of the radius, so the larger the residual,
@@ -87,9 +87,20 @@ def updated(grid: ResidualGrid, belief, loss, trust, loss_max):
     return belief / belief.sum()
 
 
-def mean_and_std(grid: ResidualGrid, belief) -> tuple[float, float]:
-    """Of the residual [m/s]. The grid's spacing is part of the deviation."""
-    mean = float(grid.values @ belief)
+def mode_and_std(grid: ResidualGrid, belief) -> tuple[float, float]:
+    """The most probable residual and the deviation about it [m/s].
+
+    Not the mean: where nothing touches, data rule out smaller residuals and say nothing
+    of larger ones, so the tail on that side pulls the mean along. Between the values of
+    the grid: the parabola through the three highest logarithms (exact for a Gaussian).
+    The grid's spacing is part of the deviation.
+    """
     spacing = grid.values[1] - grid.values[0]
-    variance = float((grid.values - mean) ** 2 @ belief) + spacing**2 / 12.0
-    return mean, float(np.sqrt(variance))
+    i = min(max(int(np.argmax(belief)), 1), belief.size - 2)
+    left, middle, right = np.log(np.maximum(belief[i - 1 : i + 2], 1e-300))
+    bend = left - 2.0 * middle + right
+    mode = float(grid.values[i])
+    if bend < 0.0:
+        mode += float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0)) * spacing
+    variance = float((grid.values - mode) ** 2 @ belief) + spacing**2 / 12.0
+    return mode, float(np.sqrt(variance))
