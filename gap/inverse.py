@@ -204,6 +204,12 @@ class InverseModel:
         self._means: dict = {}
         self._heavier: dict[tuple, SceneDynamics] = {}
 
+    def is_motor_side(self, i: int) -> bool:
+        """Whether a joint's measured effort is the motor's, before its gear."""
+        return not is_link_side(
+            self.scene.channels, f"{self.joints[i]}.effort_measured"
+        )
+
     def base(self) -> np.ndarray:
         """The residual of the scene as it came."""
         if self._base is None:

@@ -20,7 +20,7 @@ LINK_MASS, LINK_COM = 0.03, 0.002
 REACH = 3.0  # Tolerances: beyond them a link is not known too little but wrong.
 _DELAYS = (0.004, 0.01, 0.02, 0.04)
 _ELASTIC = ("joint_elasticity", "joint_backlash")
-_DRIVEN = ("actuator_saturation", *_ELASTIC)
+_DRIVEN = ("actuator_saturation",)
 # Of links: link_mass and link_com say it as a difference.
 _HIDDEN = ("object_mass", "object_com", "object_inertia")
 WAVES = 12  # Frequencies of a force that are tried on every link.
@@ -200,13 +200,20 @@ def _driven(model: InverseModel, joint: str) -> bool:
     return model.commanded[model.joints.index(joint)]
 
 
+def _motor_seen(model: InverseModel, joint: str) -> bool:
+    """Whether what the motor gives is known: it is commanded, or measured before the
+    gear."""
+    i = model.joints.index(joint)
+    return model.commanded[i] or (model.by_measured[i] and model.is_motor_side(i))
+
+
 def _worst_joints(model: InverseModel, left: np.ndarray, most: int = 3) -> list[str]:
     """Those whose equations are met least, after the background."""
     names = model.names()
     size = {
         joint: float(np.mean(left[k :: len(names)] ** 2))
         for k, (what, joint) in enumerate(names)
-        if what == "effort" and _driven(model, joint)
+        if what == "effort" and _motor_seen(model, joint)
     }
     return sorted(size, key=lambda joint: -size[joint])[:most]
 
