@@ -515,10 +515,9 @@ class InverseModel:
             and any(acts_on(e, KINDS[e.kind].channel, f"{j}.position")
                     for j in self.joints)
         ]  # fmt: skip
-        # Weights and gravity change each other; else effects add up.
         dynamics: SceneDynamics = self.dynamics
         heavy = [e for e in ours if KINDS[e.kind].weighs]
-        if len(heavy) > 1 or any(KINDS[e.kind].added is None for e in heavy):
+        if not _adds_up(heavy):
             dynamics = self._with(heavy)
             ours = [e for e in ours if e not in heavy]
         on_top = [e for e in ours if KINDS[e.kind].on_top is not None]
@@ -752,6 +751,17 @@ class InverseModel:
 def _key(effect: Effect) -> tuple:
     """An effect, to be looked up by."""
     return effect.kind, tuple(effect.at), tuple(sorted(effect.parameters.items()))
+
+
+def _adds_up(heavy: Sequence[Effect]) -> bool:
+    """Whether what weights and gravity change is the sum of what each does: gravity
+    changes all weights, a link's mass the moment of where its centre is, and masses on
+    two links add up, as inverse dynamics is linear in them."""
+    if any(KINDS[e.kind].added is None for e in heavy):
+        return False
+    places = [at for e in heavy for at in e.at]
+    tilted = any(KINDS[e.kind].at == "base" for e in heavy)
+    return len(heavy) < 2 or (not tilted and len(set(places)) == len(places))
 
 
 def _added(effect: Effect, dynamics: SceneDynamics, motion: Motion) -> np.ndarray:

@@ -368,12 +368,9 @@ def _series(result: GapResult, pictures) -> str:
 def _considered(result: GapResult) -> str:
     if not result.candidates:
         return ""
-    heads = list(dict.fromkeys(key for each in result.candidates for key in each))
-    rows = [[_cell(each.get(key)) for key in heads] for each in result.candidates]
-    return _section(
-        "What else was considered",
-        _table([str(head).replace("_", " ") for head in heads], rows, most=8),
-    )
+    heads = ("kind", "at", "score", "parameters")
+    rows = [[_cell(getattr(each, h)) for h in heads] for each in result.candidates]
+    return _section("What else was considered", _table(heads, rows, most=8))
 
 
 def _unexplained(result: GapResult) -> str:

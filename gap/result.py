@@ -90,6 +90,17 @@ class InUnits:
 
 
 @dataclass(frozen=True)
+class Considered:
+    """A kind at a place, by its columns alone, beside nothing. score: held-out error as
+    a share of that without it; parameters of the (first) effect that it comes to."""
+
+    kind: str
+    at: tuple[str, ...]
+    score: float
+    parameters: Mapping[str, float]
+
+
+@dataclass(frozen=True)
 class Trust:
     """A parameter on parts of the data: by recording, over stretches of time, and
     fitted from other starts. NaN where a part does not show it. ridge_with: another
@@ -201,7 +212,7 @@ class GapResult:
     background: Mapping[str, float]
     checks: Sequence[Finding]
     series: Sequence[Series] = ()
-    candidates: Sequence[Mapping[str, Any]] = ()  # The screen's table, best first.
+    candidates: Sequence[Considered] = ()  # Of the first round, best first.
     seconds: Mapping[str, float] = field(default_factory=dict)
     trust: Sequence[Trust] = ()
     channels: Sequence[JudgedChannel] = ()

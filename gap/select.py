@@ -11,6 +11,7 @@ import numpy as np
 
 from makebreak.gap.fit import derivative_free_search, fit_effects, tangents
 from makebreak.gap.problem import Candidate, Fitted, GapProblem, Nuisances
+from makebreak.gap.result import Considered
 from makebreak.gap.screen import Ranked, rank
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
@@ -74,7 +75,7 @@ class Selection:
     start: Fitted
     end: Fitted
     nuisances: Nuisances
-    table: tuple[dict, ...] = ()
+    table: tuple[Considered, ...] = ()
     beyond: tuple[tuple[str, float], ...] = ()
     far: bool = False
 
@@ -114,7 +115,7 @@ class _Search:
     def run(self) -> Selection:
         problem = self.problem
         current, chosen = self.start, list[Choice]()
-        table: list[dict] = []
+        table: list[Considered] = []
         for _ in range(self.plan.most_effects):  # A group counts as one.
             if not self._needs_more(current):
                 break
@@ -241,7 +242,7 @@ class _Search:
 
     def _forward(
         self, found: Sequence[Candidate], chosen: Sequence[Choice], current: Fitted
-    ) -> tuple[_Step | None, list[dict]]:
+    ) -> tuple[_Step | None, list[Considered]]:
         taken = {(c.effect.kind, tuple(c.effect.at)) for c in chosen}
         open_ = [c for c in found if (c.kind, c.at) not in taken]
         open_ += _groups(open_)
@@ -266,9 +267,10 @@ class _Search:
         base = screen.judge(current.r)
         ranked = self._pruned(wide, ranked)
         table = [
-            {"kind": r.candidate.kind, "at": list(r.candidate.at),
-             "score": r.fit.score / max(base.score, 1e-12),
-             "parameters": dict(r.effects[0].parameters)}
+            Considered(
+                r.candidate.kind, tuple(r.candidate.at),
+                r.fit.score / max(base.score, 1e-12), dict(r.effects[0].parameters),
+            )
             for r in ranked[:15]
         ]  # fmt: skip
         short = _shortlist(ranked, base.score)

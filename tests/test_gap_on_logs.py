@@ -1,6 +1,8 @@
 """Logs as robots write them, from files to verdict: of the benchmark's sorts, with
 seeds of their own."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,11 @@ pytest.importorskip("mujoco", reason="the logs are simulated in MuJoCo")
 
 from gap_benchmark.log_cases import LogCase, Recipe, write  # noqa: E402
 
+from makebreak.gap.inverse import InverseModel  # noqa: E402
+from makebreak.gap.recording import read_recording  # noqa: E402
 from makebreak.gap.workflow import run_gap  # noqa: E402
+from makebreak.models.effects.kind import Effect  # noqa: E402
+from makebreak.models.scene import read_scene  # noqa: E402
 
 
 def found_in(folder, recipe, seed):
@@ -24,6 +30,31 @@ def test_filtered_velocities_and_wandering_efforts_are_no_gap(tmp_path, option):
     recipe = Recipe("none", "planar", "multisine guided", options=(option,))
     _, result = found_in(tmp_path, recipe, 77)
     assert (result.verdict, result.effects) == ("no_gap", [])
+
+
+def test_weights_of_two_links_add_up_and_those_of_one_do_not(tmp_path):
+    """What a fit adds up from the parts that it kept, against Drake with all in it."""
+    write(LogCase("log", 79, Recipe("none", "scara", "multisine")), tmp_path)
+    scene = read_scene(tmp_path / "scene.yaml")
+    recordings = [read_recording(tmp_path / "recording.csv")]
+    model = InverseModel(scene, recordings)
+    load = Effect(
+        "payload", ["scara.flange"],
+        {"mass": 0.4, "com_x": 0.03, "com_y": -0.02, "com_z": 0.05},
+    )  # fmt: skip
+    mass = {"mass": 0.3}
+    damping = Effect("joint_viscous_damping", ["scara.elbow"], {"damping": 0.2})
+    for link, more in (("scara.fore", {}), ("scara.flange", {"x": 0.02, "y": 0.01})):
+        hidden = [load, Effect("link_mass", [link], mass)]
+        if more:
+            hidden.append(Effect("link_com", [link], {**more, "z": 0.0}))
+        direct = InverseModel(replace(scene, effects=hidden), recordings)
+        expected = direct.residual([damping])
+        found = model.residual([*hidden, damping])
+        # Both divide by the noise of a model that has other masses.
+        found, expected = model.in_units(found), direct.in_units(expected)
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+        assert np.abs(found - model.in_units(model.residual())).max() > 0.01
 
 
 def test_friction_of_both_joints_is_named_by_its_own_kinds(tmp_path):
