@@ -32,6 +32,8 @@ RICH_PRIOR = 10.0  # Times a nuisance's tolerance, in a rich model.
 # What is left of a measured effort is noise where less than this share of it repeats,
 # and no block of time has so many times the usual power.
 REPEATS, EVENT = 0.1, 10.0
+MOST_WANDER = 5.0  # Times a sample's noise: more is no sensor's.
+HALF = 0.5  # Of a channel's power: what one effect more must explain to be a law of it.
 LAGS = 9  # Test functions over which errors may go together (0.9 s).
 OVERLAP = 1.3  # What neighbouring test functions share of white noise.
 
@@ -67,9 +69,12 @@ class MechanismProblem(InverseModel, GapProblem):
             screen = Screen(self.base(), n.columns, prior, self.train())
             fit = screen.fit(rich)
             left = self.base() - rich @ fit.c - n.columns @ fit.b
-            error, other = self._misfit(left), self._misfit(self._settled(self.base()))
-            # A rich model may do worse than none, where noise is all that is left.
-            error = {w: np.minimum(error[w], other[w]) for w in error}
+            error = self._misfit(left)
+            # A rich model may do worse than none, where noise is all that is left; and
+            # what one more effect of the catalogue explains is nothing models lack.
+            others = [self._settled(self.base()), self._with_best(left, rich)]
+            for other in map(self._misfit, others):
+                error = {w: np.minimum(error[w], other[w]) for w in error}
             old = self.model_error
             if all(np.allclose(error[w], old[w], rtol=0.1, atol=1e-12) for w in error):
                 break
@@ -80,6 +85,31 @@ class MechanismProblem(InverseModel, GapProblem):
         """What the nuisances leave of r (m,), free within their limits."""
         n = self.nuisances()
         return Screen(r, n.columns, n.prior, self.train(), reach=n.reach).settle(r)[1]
+
+    def _with_best(self, left: np.ndarray, rich: np.ndarray) -> np.ndarray:
+        """What a rich model and one candidate more leave of rows (m,): of each channel
+        with the candidate that fits its training rows best, if that takes half of it.
+        rich (m, p)."""
+        t, channel = self.train(), self.channel_of_rows()
+        size = np.linalg.norm(rich[t], axis=0)
+        rich = rich[:, size > 0.0] / size[size > 0.0]
+        back = np.linalg.pinv(rich[t], rcond=1e-8)
+        out = np.array(left)
+        rows = [np.flatnonzero(channel == k) for k in range(len(self.names()))]
+        fitted = [mine[t[mine]] for mine in rows]
+        least = [HALF * float(left[some] @ left[some]) for some in fitted]
+        for X in (x for c in self._found or () for x in c.columns):
+            beside = X - rich @ (back @ X[t])
+            size = np.linalg.norm(beside[t], axis=0)
+            beside = beside[:, size > 1e-6 * np.linalg.norm(X[t], axis=0)]
+            if not beside.shape[1]:
+                continue
+            r = left - beside @ np.linalg.lstsq(beside[t], left[t], rcond=1e-8)[0]
+            for k, some in enumerate(fitted):
+                power = float(r[some] @ r[some])
+                if power < least[k]:
+                    least[k], out[rows[k]] = power, r[rows[k]]
+        return out
 
     def _misfit(self, left: np.ndarray) -> dict[str, np.ndarray]:
         """What held-out rows (m,) are off by beside noise: robust, of each channel."""
@@ -156,7 +186,7 @@ class MechanismProblem(InverseModel, GapProblem):
         wanders = self.wandering(fitted.r)
         for k in np.flatnonzero(wanders > 0.0):
             mine = self.channel_of_rows() == k
-            rows[mine] /= max(float(np.sqrt(np.mean(rows[mine] ** 2))), 1.0)
+            rows[mine] /= max(_rms(rows[mine]), 1.0)
         held = rows[~self.train()] if not self.train().all() else rows
         return float(np.sqrt(max(np.mean(held**2), np.mean(rows**2))))
 
@@ -174,19 +204,26 @@ class MechanismProblem(InverseModel, GapProblem):
         state = None
         for k, (what, joint) in enumerate(names):
             i = self.joints.index(joint)
-            loud = float(np.sqrt(np.mean(rows[:, k] ** 2))) > MISFIT
+            loud = _rms(rows[:, k]) > MISFIT
             if what != "effort" or not self.by_measured[i] or not loud:
                 continue
             mine = noise[:, k] <= AT_REST * np.quantile(noise[:, k], 0.1)
             y = off[mine, k]
+            if _rms(y) > MOST_WANDER * self._sample_noise(f"{joint}.effort_measured"):
+                continue
             power = [np.mean(y[block[mine] == b] ** 2) for b in np.unique(block[mine])]
             if max(power) > EVENT * np.median(power):
                 continue  # Something happened, once.
             state = self._mean_motion() if state is None else state
             X = features_of(i, *state)[mine]
             if not is_predicted(y, X, block[mine], REPEATS):
-                found[k] = float(np.sqrt(np.mean(y**2)))
+                found[k] = _rms(y)
         return found
+
+    def _sample_noise(self, channel: str) -> float:
+        """Of one sample, before means over many were taken."""
+        every = [r.channels[channel] for r in self.recordings]
+        return max(c.noise * np.sqrt(c.averaged) for c in every)
 
     def _mean_motion(self) -> list[np.ndarray]:
         """q, v, vd, effort needed and sign of v, each (n_bumps, n_v), over bumps."""
@@ -265,6 +302,10 @@ def features_of(i: int, q, v, vd, effort, sign) -> np.ndarray:
         q[:, i] ** 2, *(f(n * q[:, i]) for n in (1, 2) for f in (np.sin, np.cos)),
     ]  # fmt: skip
     return np.column_stack([*own, q, v, vd])
+
+
+def _rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(x**2)))
 
 
 def _moved(candidate: Candidate, to_new) -> Candidate:

@@ -57,6 +57,17 @@ def test_weights_of_two_links_add_up_and_those_of_one_do_not(tmp_path):
         assert np.abs(found - model.in_units(model.residual())).max() > 0.01
 
 
+def test_one_joint_among_quiet_ones_is_not_what_models_are_off_by(tmp_path):
+    """Ripple is in no rich model: what is left of a joint must not become its noise."""
+    recipe = Recipe("ripple", "scara", "multisine", "ripple")
+    truth, result = found_in(tmp_path, recipe, 81)
+    (hidden,), (named,) = truth["effects"], result.effects
+    assert result.verdict == "gap_named"
+    assert (named.kind, *named.at) == (hidden["kind"], hidden["at"])
+    found, expected = named.parameters["amplitude"], hidden["parameters"]["amplitude"]
+    np.testing.assert_allclose(found.value, expected, rtol=0.05)
+
+
 def test_friction_of_both_joints_is_named_by_its_own_kinds(tmp_path):
     """Not by Stribeck's law for Coulomb's, and not by drag of a link for damping."""
     recipe = Recipe("friction", "planar", "multisine", "friction", ("ode",))

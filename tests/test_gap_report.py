@@ -18,6 +18,7 @@ from makebreak.gap.pictures import picture_of_where
 from makebreak.gap.recording import read_recordings
 from makebreak.gap.report import extents_of, summary_lines, write_report
 from makebreak.gap.result import (
+    Considered,
     Estimate,
     Evidence,
     GapMeasure,
@@ -127,8 +128,8 @@ def made_by_hand(scene_path, recording_path) -> GapResult:
         ],
         series,
         [
-            {"kind": "joint_coulomb_friction", "at": "p.j1", "held_out": 1.31},
-            {"kind": "joint_viscous_damping", "at": "p.j1", "held_out": 2.12},
+            Considered("joint_coulomb_friction", ("p.j1",), 0.31, {"coulomb": 0.35}),
+            Considered("joint_viscous_damping", ("p.j1",), 0.52, {"damping": 0.2}),
         ],
         {"read": 0.1, "fit": 2.3},
     )  # fmt: skip
