@@ -14,6 +14,7 @@ import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -208,6 +209,7 @@ def _run(args) -> int:
 
 def _run_in(session, args, module, config, duration) -> int:
     """Runs the experiment in the session. Returns: the exit status."""
+    from makebreak.scripts import compile_ahead
     from makebreak.scripts.criteria import told
     from makebreak.scripts.table import Table
     from makebreak.scripts.trials import duration_line
@@ -215,6 +217,11 @@ def _run_in(session, args, module, config, duration) -> int:
     session.picture = Path(args.diagram) if args.diagram is not None else None
     session.write_text("config.yaml", duration_line(duration) + dump_config(config))
     _writable(session)
+    if not args.is_trial:  # Trials keep all cores busy as it is.
+        config_file = session.path("config.yaml")
+        session.on_first_compile = partial(
+            compile_ahead.start, args.experiment, config_file
+        )
     if not args.no_meshcat:
         session.meshcat = _open_meshcat()
 
@@ -366,9 +373,10 @@ def _sweep(args) -> int:
     out = Path(args.out) if args.out else _default_out(f"sweep-{args.experiment}")
     if args.cluster is not None and args.jobs is not None:
         raise ValueError("--jobs: got it with --cluster, expected one of the two")
-    table, files = run_sweep(sweep, out, _jobs(args.jobs), args.cluster)
+    inputs = _inputs(args, config)
+    table, files = run_sweep(sweep, out, _jobs(args.jobs), args.cluster, inputs=inputs)
     print(table.to_text())
-    print(f"Files in {out}: " + " ".join(path.name for path in files), flush=True)
+    _say_files(files)
     return 1 if table.notes else 0  # A note: a trial failed.
 
 
@@ -680,9 +688,9 @@ def main(argv: list[str] | None = None) -> int:
         argv: the words after `makebreak`; None: those of the process.
     Returns: the exit status.
     """
-    end_with_parent()
+    is_trial = end_with_parent()
     with interrupts():
-        return _main(sys.argv[1:] if argv is None else argv)
+        return _main(sys.argv[1:] if argv is None else argv, is_trial)
 
 
 @contextmanager
@@ -703,9 +711,10 @@ def _given_packages(settings: list[str]) -> Iterator[None]:
             os.environ[PACKAGES_VARIABLE] = before
 
 
-def _main(argv: list[str]) -> int:
+def _main(argv: list[str], is_trial: bool) -> int:
     try:
         args = _parse(argv)
+        args.is_trial = is_trial
         if hasattr(args, "set"):
             args.set = [setting for group in args.set for setting in group]
             for setting in args.set:

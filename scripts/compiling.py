@@ -15,10 +15,13 @@ class CompilingShown:
     Args:
         show: called with "compiling lcp.solve" and the like, and with "" when that is
             done.
+        first: called before the first one is compiled.
     """
 
-    def __init__(self, show: Callable[[str], None]):
-        self._show = show
+    def __init__(
+        self, show: Callable[[str], None], first: Callable[[], None] = lambda: None
+    ):
+        self._show, self._at_first = show, first
         self._depth = 0
         self._first = True
 
@@ -30,6 +33,7 @@ class CompilingShown:
         if self._first:
             print(FIRST, file=sys.stderr, flush=True)
             self._first = False
+            self._at_first()
         module = function.__module__.rpartition(".")[2]
         self._show(f"compiling {module}.{function.__name__}")
 

@@ -35,6 +35,7 @@ from makebreak.scripts.interrupts import handled, leave_terminal, undisturbed
 from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.table import json_value
 from makebreak.scripts.trials import run_many
+from makebreak.systems.numerics.first_calls import deferred
 
 __all__ = ["Log", "Session", "run_many"]
 
@@ -95,7 +96,8 @@ class Session:
     """What an experiment is given to run with.
 
     Files are written into a hidden folder; `finish` moves them to out_dir. To be used
-    in a `with`, whose end drops what was not moved (outputs.OutputFolder).
+    in a `with`, whose end drops what was not moved (outputs.OutputFolder). Systems that
+    are made inside it are compiled when they are simulated, with the scene in Meshcat.
 
     Args:
         out_dir: the folder of the run's files; made if it is missing.
@@ -133,7 +135,10 @@ class Session:
         self._figures: list[tuple[Any, str]] = []  # Drawn when the rest is written.
         self.started = False  # Whether anything has been simulated yet.
         self.interrupted = False
+        self.on_first_compile: Callable[[], None] = lambda: None
         self.endings: list[str] = []  # Of each simulation that ended early: why.
+        self.first_calls: list[Callable[[], object]] = []  # That wait.
+        self._deferred = deferred()
         self._progress = progress
         self.picture: Path | None = None  # Where the diagram is to be drawn.
         self._drawn = 0  # Systems in the diagram that was.
@@ -239,9 +244,11 @@ class Session:
         with (
             _CatchInterrupt() as interrupt,
             self._bar(duration, label) as bar,
-            CompilingShown(partial(_tell, bar)),
+            CompilingShown(partial(_tell, bar), self.on_first_compile),
         ):
             try:
+                while self.first_calls and not interrupt.hit:
+                    self.first_calls.pop(0)()
                 simulator.Initialize()
                 done = sample(root.get_time())
                 for k in range(1, n_chunks + 1):
@@ -413,9 +420,11 @@ class Session:
             return files
 
     def __enter__(self) -> "Session":
+        self.first_calls = self._deferred.__enter__()
         return self
 
     def __exit__(self, *_) -> None:
+        self._deferred.__exit__(None, None, None)
         self.outputs.close()
 
     def _timing_summary(self) -> dict:

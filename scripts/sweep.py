@@ -5,7 +5,7 @@ import dataclasses
 import itertools
 import json
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +15,7 @@ import yaml
 from matplotlib.figure import Figure
 from scipy.stats import binomtest
 
+from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.settings import (
     apply_settings,
     convert,
@@ -156,26 +157,27 @@ def run_sweep(
     jobs: int,
     cluster: str | None = None,
     command: Sequence[str] = (),
+    inputs: Iterable[str | Path] = (),
 ) -> tuple[Table, list[Path]]:
     """Runs what is not there yet, and writes sweep.md, .json, .csv and plots.
 
     Args: out_dir: trials of an earlier sweep there that have the same settings and have
-        ended are read instead of repeated; jobs, cluster, command as in run_many.
+        ended are read instead of repeated; jobs, cluster, command as in run_many;
+        inputs, files that the trials read.
     Returns: the table, a row per case; the files.
-    Raises: ValueError for an out_dir that cannot be written to.
+    Raises: ValueError for an out_dir that cannot be written to, or holds anything that
+        another command wrote.
     """
-    try:
-        out_dir.mkdir(parents=True, exist_ok=True)
-        (out_dir / "sweep.yaml").write_text(dump_config(sweep.config))
-    except OSError as error:
-        raise ValueError(
-            f'--out: got "{out_dir}", expected a folder to write in ({error.strerror})'
-        ) from error
+    with OutputFolder(out_dir, f"sweep {sweep.experiment}", inputs) as outputs:
+        return _run(sweep, outputs, jobs, cluster, command)
+
+
+def _run(sweep: Sweep, outputs: OutputFolder, jobs, cluster, command):
     runs = sweep.runs()
     for settings, seed in runs[: len(sweep.cases) * sweep.trials : sweep.trials]:
         apply_settings(type(sweep.config)(), [*setting_texts(settings), f"seed={seed}"])
     results = run_many(
-        sweep.experiment, runs, jobs, out_dir / "trials", sweep.duration_sec,
+        sweep.experiment, runs, jobs, outputs.path / "trials", sweep.duration_sec,
         reuse=True, command=command, cluster=cluster,
     )  # fmt: skip
     groups = [
@@ -191,15 +193,15 @@ def run_sweep(
         if key not in fields and (kind := _kind(key, value))
     }
     table = _table(sweep, groups, measured)
-    files = [out_dir / f"sweep.{end}" for end in ("md", "json", "csv")]
+    outputs.file("sweep.yaml").write_text(dump_config(sweep.config))
+    files = [outputs.file(f"sweep.{end}") for end in ("md", "json", "csv")]
     files[0].write_text(table.to_markdown())
     files[1].write_text(json.dumps(_summary(sweep, groups, measured), indent=2) + "\n")
     _write_csv(files[2], runs, results, [*sweep.cases_of, *sweep.ranges])
     for key in [*sweep.ranges, *sweep.cases_of]:
-        path = out_dir / f"{key.replace('.', '_')}.png"
+        path = outputs.file(f"{key.replace('.', '_')}.png")
         _plot(sweep, key, runs, results, measured).savefig(path, dpi=120)
-        files.append(path)
-    return table, files
+    return table, outputs.commit()
 
 
 def _numeric(sweep, key) -> bool:

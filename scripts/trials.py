@@ -59,8 +59,9 @@ def _folder(settings: Mapping, seed: int) -> str:
     return name
 
 
-def _environment() -> dict[str, str]:
-    """One thread per process, and this very package on the path."""
+def run_environment() -> dict[str, str]:
+    """Of a run in a process of its own: one thread, this very package on the path, and
+    an end with this process."""
     env = dict(os.environ)
     for name in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
         env[f"{name}_NUM_THREADS"] = "1"
@@ -246,7 +247,7 @@ class _Running:
                     stdin=subprocess.DEVNULL,
                     stdout=log,
                     stderr=subprocess.STDOUT,
-                    env=_environment(),
+                    env=run_environment(),
                     start_new_session=True,  # Ctrl-C reaches us alone.
                 )
                 self._processes.add(process)

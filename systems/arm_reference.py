@@ -11,6 +11,7 @@ from makebreak.systems.numerics.arm_reference import (
     pose_and_wrench,
 )
 from makebreak.systems.numerics.ball_state import N_X, P_TIP, V_TIP
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.lcs import LCS
 from makebreak.systems.numerics.rolling_task import ROLL
 from makebreak.systems.numerics.timing import timed
@@ -60,7 +61,7 @@ class ArmReference(LeafSystem):
         self._lcs = self.DeclareAbstractInputPort("lcs", AbstractValue.Make(lcs))
         self._zero = np.zeros(3)
         at_rest = np.concatenate([p_tip, np.zeros(9)])
-        pose_and_wrench(np.zeros(25), 0.0, 1.0)  # Compiled now, not at the first tick.
+        first_call(pose_and_wrench, np.zeros(25), 0.0, 1.0)
         # The line's start and end, and when it starts [s].
         self._line = self.DeclareDiscreteState(np.concatenate([at_rest, at_rest, [0]]))
         ticket = {self.discrete_state_ticket(self._line), self.time_ticket()}

@@ -9,6 +9,7 @@ from pydrake.systems.sensors import ImageRgba8U
 
 from makebreak.systems.numerics import constant_velocity
 from makebreak.systems.numerics.ball_tracker import find_ball, strength_weights
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.pinhole import Pinhole
 from makebreak.systems.numerics.timing import timed
 
@@ -94,11 +95,14 @@ class BallTracker(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
-        blank = np.zeros(self._shape, np.uint8)  # Compiles; no stall in the first tick.
+        first_call(self._first_call, camera, config.ball_radius)
+
+    def _first_call(self, camera: Pinhole, ball_radius: float):
+        blank = np.zeros(self._shape, np.uint8)
         cv2.circle(blank, (camera.width // 2, camera.height // 2), 20, (255,) * 4, -1)
         blank[:, :, 0] //= 2
         for hue in (0.0, np.pi):
-            find_ball(blank, camera, strength_weights(hue), config.ball_radius, 0.0)
+            find_ball(blank, camera, strength_weights(hue), ball_radius, 0.0)
 
     @timed
     def _update(self, context, discrete_state):

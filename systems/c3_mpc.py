@@ -27,6 +27,7 @@ from makebreak.systems.numerics.c3_projections import (
     PlusProjection,
     QpProjection,
 )
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.lcs import LCS, is_finite, is_finite_model
 from makebreak.systems.numerics.timing import timed
 
@@ -134,7 +135,7 @@ class C3Mpc(LeafSystem):
         self.DeclareStateOutputPort("status", self._status[0])
         self.DeclareInitializationDiscreteUpdateEvent(self._initialize)
         self.DeclarePeriodicDiscreteUpdateEvent(period_sec, offset_sec, self._update)
-        warm_up(p)
+        first_call(warm_up, p)
 
     def _initialize(self, context, discrete_state):
         x = np.asarray(self._x_in.Eval(context))

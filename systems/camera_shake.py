@@ -5,6 +5,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import LeafSystem
 from pydrake.systems.sensors import ImageRgba8U
 
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.pinhole import frame_shift, shifted
 
 
@@ -28,8 +29,7 @@ class CameraShake(LeafSystem):
         self._shift_std_px, self._seed = shift_std_px, seed
         self._period_sec = period_sec
         blank = ImageRgba8U(width, height)
-        # Compiles it; no stall in the first picture.
-        shifted(blank.data, 0.5, 0.5, np.empty_like(blank.data))
+        first_call(shifted, blank.data, 0.5, 0.5, np.empty_like(blank.data))
         self._image = self.DeclareAbstractInputPort("image", Value(blank))
         self.DeclareAbstractOutputPort(
             "rgb_image",

@@ -13,6 +13,7 @@ from makebreak.systems.numerics.contact_detector import (
     warm_up,
 )
 from makebreak.systems.numerics.contact_task import N_CONTACT, N_PHASE
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.timing import timed
 
 
@@ -71,7 +72,7 @@ class ContactDetector(LeafSystem):
             wrench_limit=float(config.wrench_limit),
             period=float(config.period_sec),
         )
-        warm_up(self._limits)
+        first_call(warm_up, self._limits)
         self._ports = [
             self.DeclareVectorInputPort(name, size)
             for name, size in (

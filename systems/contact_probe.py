@@ -7,6 +7,7 @@ from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from makebreak.systems.numerics.contact_force import tip_wrench
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.packed import packed
 from makebreak.systems.numerics.serial_chain import SerialChain
 
@@ -63,7 +64,7 @@ class ToolContactForce(LeafSystem):
         super().__init__()
         self._chain = packed(chain)
         self._n = len(chain.mass)
-        tip_wrench(self._chain, np.zeros(self._n), np.zeros(self._n))  # Compiles it.
+        first_call(tip_wrench, self._chain, np.zeros(self._n), np.zeros(self._n))
         self._state = self.DeclareVectorInputPort("state", 2 * self._n)
         self._torque = self.DeclareVectorInputPort("contact_torque", self._n)
         self.DeclareVectorOutputPort("contact_force", 3, self._calc)

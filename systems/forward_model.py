@@ -7,6 +7,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from makebreak.systems.numerics.contact_task import COUNT, N_TRANSITION, UNKNOWN_MODE
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.forward_model import (
     BankMemory,
     BankTuning,
@@ -109,7 +110,7 @@ class ForwardModelBank(LeafSystem):
                     f"over {mixture.mean.shape[1]} entries, expected {shape[0]} over "
                     f"{shape[1]}"
                 )
-        warm_up(self._tuning)
+        first_call(warm_up, self._tuning)
         self._ports = [
             self.DeclareVectorInputPort(name, size)
             for name, size in (

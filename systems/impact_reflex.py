@@ -6,6 +6,7 @@ import numpy as np
 from pydrake.systems.framework import Context, LeafSystem
 
 from makebreak.systems.numerics.contact_task import N_PHASE
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.impact_reflex import (
     N_MEMORY,
     ReflexLaw,
@@ -58,7 +59,7 @@ class ImpactReflex(LeafSystem):
             fade_sec=float(config.fade_sec),
             period=float(config.period_sec),
         )
-        warm_up(self._law)
+        first_call(warm_up, self._law)
         self._ports = [
             self.DeclareVectorInputPort(name, size)
             for name, size in (

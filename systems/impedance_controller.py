@@ -8,6 +8,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JointActuator, RevoluteJoint
 from pydrake.systems.framework import Context, LeafSystem
 
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.impedance_controller import (
     SPEED_FILTER_SEC,
     ForceLaw,
@@ -162,7 +163,7 @@ class ImpedanceController(LeafSystem):
         )
         self._ratio = float(hybrid.damping_ratio)
         self._packed = packed(self._chain), packed(self._law)
-        warm_up(*self._packed)
+        first_call(warm_up, *self._packed)
         self._q = self.DeclareVectorInputPort("q", n)
         self._v = self.DeclareVectorInputPort("v", n)
         self._x_desired = self.DeclareVectorInputPort("x_desired", 19)

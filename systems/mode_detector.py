@@ -7,6 +7,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from makebreak.systems.numerics.contact_task import N_TRANSITION, UNKNOWN_MODE
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.mode_detector import (
     ModeMemory,
     ModeTuning,
@@ -81,7 +82,7 @@ class ModeDetector(LeafSystem):
                     f"{self._tuning.threshold}"
                 )
             table = knowledge
-        warm_up(self._tuning)
+        first_call(warm_up, self._tuning)
         self._ports = [
             self.DeclareVectorInputPort(name, size)
             for name, size in (

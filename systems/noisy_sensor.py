@@ -3,6 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.sensor_noise import add_noise
 
 
@@ -36,7 +37,7 @@ class NoisySensor(LeafSystem):
         self._value = self.DeclareVectorInputPort("value", n)
         needs = {self._value.ticket()} if held else {self.all_sources_ticket()}
         self.DeclareVectorOutputPort("measured", n, self._measure, needs)
-        add_noise(np.zeros(n), self._std, self._seed, 0)  # Compiles it.
+        first_call(add_noise, np.zeros(n), self._std, self._seed, 0)
 
     def _measure(self, context: Context, output: BasicVector):
         sample = int(context.get_time() * self._rate + self._shift)

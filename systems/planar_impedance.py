@@ -7,6 +7,7 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.igmm import IgmmConfig, Mixture, igmm_tuning, warm_up
 from makebreak.systems.numerics.planar_impedance import (
     ForceModel,
@@ -110,7 +111,7 @@ class PlanarImpedance(LeafSystem):
             raise ValueError(
                 f"knowledge is over {knowledge.mean.shape[1]} entries, expected {n}"
             )
-        warm_up(self._tuning, n_in)
+        first_call(warm_up, self._tuning, n_in)
         self._config = config
         self._along_motion = model.along_motion
         self._mass, self._force_max = float(mass), float(force_max)

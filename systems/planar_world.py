@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.planar_world import (
     circle_target,
     external_force,
@@ -86,8 +87,11 @@ class PlanarWorld(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(
             c.period_sec, c.period_sec - lead_sec, self._update
         )
-        force = external_force(first, 0.0, *self._world)  # Compiles both.
-        step(first, 0.0, force, self._period, self._mass, *self._world)
+        first_call(self._first_call, first)
+
+    def _first_call(self, x):
+        force = external_force(x, 0.0, *self._world)
+        step(x, 0.0, force, self._period, self._mass, *self._world)
 
     def _update(self, context: Context, discrete_state):
         count = context.get_discrete_state(self._count).value()[0]
@@ -134,7 +138,7 @@ class CircleTarget(LeafSystem):
             float(c.phase),
             float(c.turn),
         )
-        circle_target(0.0, *self._circle)  # Compiles it.
+        first_call(circle_target, 0.0, *self._circle)
         self.DeclareVectorOutputPort("x_desired", 6, self._calc, {self.time_ticket()})
 
     def _calc(self, context: Context, output: BasicVector):

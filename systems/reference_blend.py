@@ -14,6 +14,7 @@ from makebreak.systems.numerics.contact_task import (
     REGION,
     SETTLE,
 )
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.push_motion import N_FRAME, frame_at
 from makebreak.systems.numerics.reference_blend import (
     N_BLEND,
@@ -58,7 +59,7 @@ class ReferenceBlend(LeafSystem):
             if not 0.0 < getattr(config, name) < np.inf:
                 raise ValueError(f"{name} is {getattr(config, name)}, expected > 0")
         self._config = config
-        warm_up()
+        first_call(warm_up)
         self._in = {
             name: self.DeclareVectorInputPort(name, size)
             for name, size in (

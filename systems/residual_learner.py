@@ -8,6 +8,7 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import LeafSystem
 
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.lcs import LCS, is_finite_model
 from makebreak.systems.numerics.residual_learner import (
     Buffer,
@@ -163,9 +164,11 @@ class ResidualLearner(LeafSystem):
         self.DeclarePeriodicUnrestrictedUpdateEvent(
             period_sec, offset_sec, self._update
         )
+        first_call(self._first_call, memory, lcs)
+
+    def _first_call(self, memory: LearnerMemory, lcs: LCS):
         x, u = np.zeros(lcs.n_x), np.zeros(lcs.n_u)
-        # Compiled now, not at the first tick.
-        first = measured_step(lcs, x, u, x, self._Q_d, config.eps)
+        first = measured_step(lcs, x, u, x, self._Q_d, self._config.eps)
         if self._grid is None:
             self._learned(memory, first)
         else:

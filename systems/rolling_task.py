@@ -5,6 +5,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import LeafSystem
 
 from makebreak.systems.numerics.ball_state import N_X
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.rolling_task import (
     WAIT,
     CirclePath,
@@ -72,10 +73,8 @@ class RollingTask(LeafSystem):
         start = TaskState(WAIT, 0.0, p_tip, np.zeros(3), np.zeros(3), p_tip[2])
         self._task = self.DeclareAbstractState(AbstractValue.Make(start))
         x_desired = np.tile(np.eye(N_X)[3], n_knots)
-        # Compiled now, not at the first tick.
-        target_over_horizon(
-            self._path, np.zeros(N_X), 0.0, 0.0, 0.0, radius_ball, knot_sec, n_knots
-        )
+        circle = (self._path, np.zeros(N_X), 0.0, 0.0, 0.0)
+        first_call(target_over_horizon, *circle, radius_ball, knot_sec, n_knots)
         self._x_desired = self.DeclareDiscreteState(x_desired)
         self._reference = self.DeclareDiscreteState([*p_tip, *np.zeros(6)])
         self._shift = self.DeclareDiscreteState([0.0])  # Of the circle's radius [m].

@@ -4,6 +4,7 @@ import numpy as np
 from pydrake.systems.framework import LeafSystem
 
 from makebreak.systems.numerics.ball_state import V_TIP, pack
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.packed import packed
 from makebreak.systems.numerics.serial_chain import SerialChain
 from makebreak.systems.numerics.state_estimator import (
@@ -55,7 +56,9 @@ class StateEstimator(LeafSystem):
         self._chain = packed(chain)
         n = len(chain.mass)
         q_default = np.array(q_default, dtype=float)
-        p_tip, _, _ = tip_motion(chain, q_default, np.zeros(n), np.zeros(n), 1.0)
+        p_tip, _, _ = tip_motion(
+            self._chain[0], q_default, np.zeros(n), np.zeros(n), 1.0
+        )
         n_window = max(1, round(config.window_sec / config.period_sec))
         self._q = self.DeclareVectorInputPort("q", n)
         self._v = self.DeclareVectorInputPort("v", n)
@@ -97,9 +100,12 @@ class StateEstimator(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
-        zero, before = np.zeros(n), np.zeros(3 * n_window + 1)
+        first_call(self._first_call, q_default)
+
+    def _first_call(self, q_default: np.ndarray):
+        zero, before = np.zeros(q_default.size), np.zeros(3 * self._n_window + 1)
         before.setflags(write=False)  # As a Context's state is.
-        at = np.zeros(3)  # Compiled now, not at the first tick.
+        at = np.zeros(3)
         estimate(
             self._chain, q_default, zero, zero, at, at, np.zeros(1), self._tip_mass,
             self._ball_radius, before,

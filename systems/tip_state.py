@@ -3,6 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.packed import packed
 from makebreak.systems.numerics.serial_chain import SerialChain
 from makebreak.systems.numerics.tip_state import tip_pose, tip_velocity
@@ -22,8 +23,8 @@ class TipState(LeafSystem):
         super().__init__()
         self._chain = packed(chain)
         n = len(chain.mass)
-        tip_velocity(self._chain, np.zeros(n), np.zeros(n))  # Compiles both.
-        tip_pose(self._chain, np.zeros(n))
+        first_call(tip_velocity, self._chain, np.zeros(n), np.zeros(n))
+        first_call(tip_pose, self._chain, np.zeros(n))
         self._q = self.DeclareVectorInputPort("q", n)
         self._v = self.DeclareVectorInputPort("v", n)
         self.DeclareVectorOutputPort("ee_pose", 7, self._calc_pose, {self._q.ticket()})

@@ -6,6 +6,7 @@ from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.tool_wrench import external_wrench
 
 
@@ -50,10 +51,11 @@ class ToolWrench(LeafSystem):
         self._p_CE = plant.CalcRelativeTransform(
             self._plant_context, self._mount, plant.GetFrameByName(tip)
         ).translation()
-        zero = np.zeros(3)  # Compiles it, for arrays of the kind that Drake gives.
+        zero = np.zeros(3)  # Read-only, as the arrays that Drake gives.
         zero.setflags(write=False)
         R = self._mount.CalcRotationMatrixInWorld(self._plant_context).matrix()
-        external_wrench(zero, zero, R, self._weight, self._p_CM, self._p_CE)
+        constants = self._weight, self._p_CM, self._p_CE
+        first_call(external_wrench, zero, zero, R, *constants)
         self._reactions = self.DeclareAbstractInputPort(
             "reaction_forces", AbstractValue.Make([SpatialForce.Zero()])
         )

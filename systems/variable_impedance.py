@@ -6,6 +6,7 @@ import numpy as np
 from pydrake.systems.framework import Context, LeafSystem
 
 from makebreak.systems.numerics.contact_task import N_PHASE
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.timing import timed
 from makebreak.systems.numerics.variable_impedance import (
     N_MEMORY,
@@ -104,7 +105,7 @@ class VariableImpedance(LeafSystem):
             transition=bool(config.transition),
             decay_handover=float(np.exp(-config.period_sec / HANDOVER_FILTER_SEC)),
         )
-        warm_up(self._law)
+        first_call(warm_up, self._law)
         self._paper = stiffness.paper_damping
         self._error = self.DeclareVectorInputPort("prediction_error", 1)
         self._predicted = self.DeclareVectorInputPort("wrench_predicted", 6)

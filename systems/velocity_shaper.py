@@ -10,6 +10,7 @@ from makebreak.systems.numerics.contact_task import (
     N_CONTACT,
     ContactBelief,
 )
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.motion_pattern import MotionPattern
 from makebreak.systems.numerics.timing import timed
 from makebreak.systems.numerics.velocity_shaper import (
@@ -116,7 +117,7 @@ class VelocityShaper(LeafSystem):
         self._pattern, self._anticipate = pattern, config.region.anticipate
         self._restarts = bool(restarts)
         self._no_regions, self._no_contact = np.zeros(N_REGIONS), np.zeros(N_CONTACT)
-        warm_up(pattern, law)
+        first_call(warm_up, pattern, law)
         self._contacts = self.DeclareAbstractInputPort(
             "contacts", AbstractValue.Make(ContactBelief())
         )

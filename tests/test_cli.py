@@ -268,7 +268,7 @@ def start():
                 stderr=subprocess.PIPE,
                 stdin=subprocess.DEVNULL,
                 text=True,
-                env=trials._environment() | more,
+                env=trials.run_environment() | more,
             )
         )
         return processes[-1]
@@ -343,7 +343,7 @@ def test_a_closed_terminal_does_not_lose_the_run():
         stdin=terminal,
         stdout=terminal,
         stderr=terminal,
-        env=trials._environment(),
+        env=trials.run_environment(),
         start_new_session=True,
         preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
     )
@@ -362,7 +362,7 @@ def test_nohup_is_respected():
     process = subprocess.Popen(
         [*spring_mass.COMMAND, *words, "--set", "steps=1000000"],
         stderr=subprocess.DEVNULL,
-        env=trials._environment(),
+        env=trials.run_environment(),
         preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN),
     )
     try:
@@ -521,7 +521,7 @@ def test_list_and_help_import_nothing_that_is_long_to_load(words):
         [sys.executable, "-c", code],
         capture_output=True,
         text=True,
-        env=trials._environment(),
+        env=trials.run_environment(),
     )
     assert done.returncode == 0 and done.stdout.splitlines()[-1] == "[]", done.stderr
 
@@ -539,7 +539,7 @@ def test_python_m_makebreak_is_the_command():
         [sys.executable, "-m", "makebreak", "run", "no_such_experiment"],
         capture_output=True,
         text=True,
-        env=trials._environment(),
+        env=trials.run_environment(),
     )
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.startswith("makebreak: unknown experiment no_such_experiment")

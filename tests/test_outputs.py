@@ -277,7 +277,7 @@ def start(*words, **more):
         stderr=subprocess.PIPE,
         stdin=subprocess.DEVNULL,
         text=True,
-        env=trials._environment(),
+        env=trials.run_environment(),
         **more,
     )
 

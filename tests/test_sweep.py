@@ -161,7 +161,7 @@ def start_sweep(out):
     main = main.replace(
         "sys.exit(main())", SLOW.format(command=spring_mass.COMMAND, out=str(out))
     )
-    return subprocess.Popen([sys.executable, "-c", main], env=trials._environment())
+    return subprocess.Popen([sys.executable, "-c", main], env=trials.run_environment())
 
 
 def test_a_killed_sweep_goes_on_to_the_same_table(tmp_path):
@@ -248,3 +248,19 @@ def test_a_ray_cluster_gives_the_same_results():
         sweep_on(f"ray:{address}")
     finally:
         subprocess.run([*ray, "stop"], check=True)
+
+
+def test_a_sweep_does_not_write_over_another_commands_files(capsys):
+    Path("out").mkdir()
+    for name in ("sweep.csv", "result.json"):
+        Path("out", name).write_text("of the user\n")
+        assert cli.main("sweep spring_mass --trials 1 --out out".split()) == 2
+        assert f"holds {name}, which makebreak did not write" in capsys.readouterr().err
+        assert Path("out", name).read_text() == "of the user\n"
+        Path("out", name).unlink()
+    assert sorted(Path("out").iterdir()) == []
+    assert cli.main("sweep spring_mass --trials 1 --jobs 1 --out out".split()) == 0
+    first = Path("out/sweep.csv").read_text()
+    assert cli.main("sweep spring_mass --trials 2 --jobs 1 --out out".split()) == 0
+    assert len(rows_of("out/sweep.csv")) == 2
+    assert Path("out/sweep.csv").read_text().startswith(first.rstrip("\n"))
