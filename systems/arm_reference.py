@@ -61,7 +61,9 @@ class ArmReference(LeafSystem):
         self._lcs = self.DeclareAbstractInputPort("lcs", AbstractValue.Make(lcs))
         self._zero = np.zeros(3)
         at_rest = np.concatenate([p_tip, np.zeros(9)])
-        first_call(pose_and_wrench, np.zeros(25), 0.0, 1.0)
+        reference = np.zeros(25)
+        reference.setflags(write=False)  # As a Context's state is.
+        first_call(pose_and_wrench, reference, 0.0, 1.0)
         # The line's start and end, and when it starts [s].
         self._line = self.DeclareDiscreteState(np.concatenate([at_rest, at_rest, [0]]))
         ticket = {self.discrete_state_ticket(self._line), self.time_ticket()}

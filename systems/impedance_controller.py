@@ -175,7 +175,7 @@ class ImpedanceController(LeafSystem):
         self._measured = self.DeclareVectorInputPort("wrench_measured", 6)
         self._damped = self.DeclareVectorInputPort("damping_stiffness", 6)
         # The first torque carries the arm at its nominal position.
-        carrying = chain_state(self._chain, q_nominal, np.zeros(n)).bias
+        carrying = chain_state(self._packed[0][0], q_nominal, np.zeros(n)).bias
         self._tau = self.DeclareDiscreteState(carrying)
         self._status = self.DeclareDiscreteState(1)
         self._memory = self.DeclareDiscreteState(memory_size(n))

@@ -76,7 +76,8 @@ def find_ball(image, camera: Pinhole, hue_weights, radius, table_z, guess_p=None
     if not depth > radius or (high - low < 8).any():
         return None
     radius_px = camera.focal * radius / depth
-    region = image[low[1] : high[1], low[0] : high[0]]
+    # A copy has the same layout for each part: one machine code for all.
+    region = image[low[1] : high[1], low[0] : high[0]].copy()
     strength = cv2.transform(region, hue_weights)
     strength = cv2.GaussianBlur(strength, (3, 3), 0.0)
     m, n_kept = _fit_ball(
