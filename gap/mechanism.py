@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -17,8 +18,16 @@ from makebreak.gap.problem import (
 )
 from makebreak.gap.recording import Recording
 from makebreak.gap.result import Where
-from makebreak.gap.screen import candidates, inseparable, nuisances, rich_columns
+from makebreak.gap.screen import (
+    LINK_COM,
+    LINK_MASS,
+    candidates,
+    inseparable,
+    nuisances,
+    rich_columns,
+)
 from makebreak.gap.where import unexplained, where_in_motion
+from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect, find_body
 from makebreak.models.scene import Scene
 from makebreak.systems.numerics.selection import Screen, is_predicted
@@ -316,7 +325,29 @@ def _moved(candidate: Candidate, to_new) -> Candidate:
     )
 
 
-def moved_links(model: InverseModel, nuisances: Nuisances, values) -> list[Effect]:
+def link_changes(dynamics: SceneDynamics, scene: Scene):
+    """(name, effect, size) of each nuisance of the links: the mass, or a coordinate of
+    the centre of mass, moved by `size`, which is its tolerance."""
+    said = scene.tolerance
+    share = float(said.get("link_mass", LINK_MASS))
+    reach = float(said.get("link_com_m", LINK_COM))
+    links = [
+        (at, mass)
+        for at in dynamics.places("link_mass")
+        if (mass := dynamics.now("object_mass", [at])["mass"]) > 0.0
+    ]
+    for at, mass in links:
+        size = share * mass
+        effect = Effect("object_mass", [at], {"mass": mass + size})
+        yield f"object_mass of {at}, mass", effect, size
+    for at, _ in links:
+        com = dynamics.now("object_com", [at])
+        for axis in "xyz":
+            effect = Effect("object_com", [at], {**com, axis: com[axis] + reach})
+            yield f"object_com of {at}, {axis}", effect, reach
+
+
+def moved_links(model: Any, nuisances: Nuisances, values) -> list[Effect]:
     """The links as the nuisances (n_b,) have them, as effects of a scene."""
     masses: dict[str, float] = {}
     shifts: dict[str, np.ndarray] = {}

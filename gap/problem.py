@@ -30,6 +30,7 @@ class SearchPlan:
     jumps: whether errors jump with the parameters, so that searches without slopes are
     needed. least_gain: what an effect must take off the error, as a share of it.
     least_error: below it nothing tells two models apart. most_effects: that are named.
+    own_values: whether a value that joints share may become one for each.
     """
 
     evaluations: int = 8
@@ -39,6 +40,7 @@ class SearchPlan:
     least_error: float = 0.0
     most_effects: int = 4
     by_channel: bool = False
+    own_values: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,6 +244,19 @@ class GapProblem(ABC):
         models were taken to be off by. Returns: whether anything changed; then
         residuals, columns and nuisances are others."""
         return False
+
+    def column(
+        self, effects: Sequence[Effect], k: int, name: str, r: np.ndarray
+    ) -> np.ndarray:
+        """(m,) what more of a parameter of effect k takes off the residual r (m,)."""
+        raise NotImplementedError
+
+    def own_values(
+        self, effects: Sequence[Effect], k: int, r: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """{joint: (m,) what more of its value there takes off r (m,)} of the joints
+        that share the value of effect k; none where none could have its own."""
+        return {}
 
     def is_one_place(self, one: Sequence[str], other: Sequence[str]) -> bool:
         """Whether two places are one rigid body."""

@@ -10,7 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from makebreak.gap.fit import derivative_free_search, fit_effects, tangents
-from makebreak.gap.problem import Candidate, Fitted, GapProblem, Nuisances
+from makebreak.gap.problem import (
+    Candidate,
+    Fitted,
+    GapProblem,
+    Nuisances,
+    is_sane,
+)
 from makebreak.gap.result import Considered
 from makebreak.gap.screen import Ranked, rank
 from makebreak.models.effects import KINDS
@@ -46,6 +52,8 @@ MEMBER_Z, MEMBER_GAIN = 3.0, 0.02
 FEWEST_MEMBERS = 2  # Of a group.
 BEYOND = 1.0  # Tolerances over a nuisance's limit that are no chance among dozens.
 FREE = 1e3  # Of its size, how far what is chosen may give way to a candidate.
+# Joints that get a value of their own, at most; and how many are fitted for each.
+MOST_OWN, OWN_TRIES = 8, 3
 PAIRED = 10  # Candidates of which all pairs are tried against a single one.
 
 
@@ -133,6 +141,8 @@ class _Search:
                 self.start = fit_effects(problem, self._screen(problem.base()), ())
                 current = self._refitted(chosen, current)
                 chosen = _refreshed(chosen, current)
+        if self.plan.own_values and chosen:
+            chosen, current = self._with_own_values(chosen, current)
         chosen, current = self._backward(chosen, current)
         chosen, current = self._simplified(chosen, current)
         while chosen:  # At last, against what all of them leave.
@@ -544,6 +554,52 @@ class _Search:
                 current = more
         return current
 
+    def _with_own_values(self, chosen: Sequence[Choice], current: Fitted):
+        """Values that joints share become one of its own for a joint, where that earns
+        its place as an effect does; the joint that gains most first."""
+        problem, chosen = self.problem, list(chosen)
+        for _ in range(MOST_OWN):
+            screen = self._screen(current.r, current.fit.train)
+            now, left = screen.judge(current.r), screen.settle(current.r)[1]
+            shared = np.stack(
+                [problem.column(current.effects, i, name, current.r)
+                 for i, name in current.names], axis=1,
+            )  # fmt: skip
+            tried = []
+            for k in range(len(chosen)):
+                own = problem.own_values(current.effects, k, current.r)
+                for joint, column in own.items():
+                    X = np.hstack([shared, column[:, None]])
+                    tried.append((screen.fit(X).score, k, joint, own))
+            for score, k, joint, own in sorted(tried, key=lambda t: t[0])[:OWN_TRIES]:
+                if not score < now.score:
+                    break
+                effect, choice = current.effects[k], chosen[k]
+                parts = [
+                    Effect(effect.kind, [j for j in own if j != joint],
+                           dict(effect.parameters)),
+                    Effect(effect.kind, [joint], dict(effect.parameters)),
+                ]  # fmt: skip
+                trial = [*current.effects[:k], *parts, *current.effects[k + 1 :]]
+                split = [*chosen[:k], choice, choice, *chosen[k + 1 :]]
+                fixed = [c.fixed for c in split]
+                try:
+                    fit = fit_effects(problem, screen, trial, fixed)
+                except ValueError:
+                    continue
+                self.say(f"  {effect.kind} at {joint} of its own: {fit.score:.3g}")
+                pooled = self._error(fit.score) < (1.0 - self.plan.least_gain) * (
+                    self._error(now.score)
+                )
+                if all(map(is_sane, fit.effects)) and self._earns(
+                    left, fit.left, pooled
+                ):
+                    chosen, current = _refreshed(split, fit), fit
+                    break
+            else:
+                break
+        return chosen, current
+
     def _still_tied(self, chosen, current: Fitted, k: int) -> tuple[Effect, ...]:
         """Rivals of an effect that do as well as it among all the others."""
         if len(chosen) < 2:
@@ -667,6 +723,7 @@ def _groups(found: Sequence[Candidate]) -> list[Candidate]:
             place in ("joint", "actuator", "channel", "drive")
             and single
             and not c.fixed
+            and "." in c.at[0]  # A whole model is no member.
         ):
             by_kind.setdefault(c.kind, []).append(c)
     return [

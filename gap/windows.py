@@ -6,7 +6,7 @@ by their block of time before anything is fitted.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -41,6 +41,8 @@ class Window:
     state: dict[str, np.ndarray]
     std: np.ndarray  # (n, n_channels) Of a measured sample about the simulated one.
     train: bool
+    # {signal: (2, 2)} covariance of the state's value and rate.
+    spread: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 class WindowedResidual:
@@ -114,7 +116,8 @@ class WindowModel(WindowedResidual):
     scenes with free bodies and contact, and for judging any scene.
 
     Args: window_sec, hop_sec: length, and from one start to the next. most: windows at
-        most; a larger number is thinned evenly.
+        most; a larger number is thinned evenly. simulation: of the scene, if not by
+        Drake's steps.
     """
 
     def __init__(
@@ -126,10 +129,11 @@ class WindowModel(WindowedResidual):
         block_sec: float = 1.2,
         most: int = 400,
         by_episode: bool = False,
+        simulation: SceneSimulation | None = None,
     ):
         self.scene, self.recordings = scene, list(recordings)
         self.window_sec = window_sec
-        self.simulation = SceneSimulation(scene)
+        self.simulation = simulation or SceneSimulation(scene)
         self.dynamics = SceneDynamics(scene)
         plant = self.dynamics.plant
         self.joints = [
@@ -255,6 +259,7 @@ class WindowModel(WindowedResidual):
                         slice(episode.first + start_row, episode.first + last),
                         {n: x[start_row] for n, x in states.items()}, std,
                         block_number % 3 != 1,
+                        {n: P[start_row, :2, :2] for n, P in spreads.items()},
                     )
                 )  # fmt: skip
             start_row = max(int(np.searchsorted(time, t0 + hop)), start_row + 1)

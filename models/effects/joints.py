@@ -2,7 +2,6 @@
 
 import math
 
-import numba
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Joint
@@ -23,6 +22,14 @@ from makebreak.models.effects.signature import (
     without_momentum,
 )
 from makebreak.models.effects.transmission import motor_joint
+from makebreak.systems.numerics.joint_laws import (
+    coulomb_law,
+    direction_law,
+    drag_law,
+    ripple_law,
+    spring_law,
+    stribeck_law,
+)
 
 # ----- What they do
 
@@ -165,37 +172,6 @@ def _stribeck_numbers(effect, plant, joint):
 
 def _numbers(*names):
     return lambda effect, plant, joint: [effect.parameters[name] for name in names]
-
-
-@numba.njit(cache=True)
-def coulomb_law(q, v, t, p):
-    return -p[0] * math.tanh(v / p[1])
-
-
-@numba.njit(cache=True)
-def direction_law(q, v, t, p):
-    return -(p[0] if v > 0.0 else p[1]) * math.tanh(v / p[2])
-
-
-@numba.njit(cache=True)
-def stribeck_law(q, v, t, p):
-    peak = (p[1] - p[0]) * math.exp(-((v / p[2]) ** 2))
-    return -(p[0] + peak) * math.tanh(v / p[3])
-
-
-@numba.njit(cache=True)
-def drag_law(q, v, t, p):
-    return -p[0] * v * abs(v)
-
-
-@numba.njit(cache=True)
-def ripple_law(q, v, t, p):
-    return p[0] * math.sin(p[1] * q + p[2])
-
-
-@numba.njit(cache=True)
-def spring_law(q, v, t, p):
-    return -p[0] * (q - p[1])
 
 
 # ----- How they show: the residual is minus the effect's force.

@@ -1,0 +1,64 @@
+"""Forces on one joint that depend on its own position and velocity, compiled.
+
+Each law (q, v, t, p) gives the force on the joint [N m] or [N] from its position,
+velocity, the time and its numbers p, up to four.
+"""
+
+import math
+
+import numba
+
+
+@numba.njit(cache=True)
+def coulomb_law(q, v, t, p):
+    """p: dry friction, the speed below which it fades."""
+    return -p[0] * math.tanh(v / p[1])
+
+
+@numba.njit(cache=True)
+def direction_law(q, v, t, p):
+    """p: dry friction where q grows, where it falls, the speed below which it fades."""
+    return -(p[0] if v > 0.0 else p[1]) * math.tanh(v / p[2])
+
+
+@numba.njit(cache=True)
+def stribeck_law(q, v, t, p):
+    """p: sliding friction, static friction, Stribeck's speed, where it fades."""
+    peak = (p[1] - p[0]) * math.exp(-((v / p[2]) ** 2))
+    return -(p[0] + peak) * math.tanh(v / p[3])
+
+
+@numba.njit(cache=True)
+def drag_law(q, v, t, p):
+    return -p[0] * v * abs(v)
+
+
+@numba.njit(cache=True)
+def ripple_law(q, v, t, p):
+    """p: amplitude, periods a turn, phase."""
+    return p[0] * math.sin(p[1] * q + p[2])
+
+
+@numba.njit(cache=True)
+def spring_law(q, v, t, p):
+    """p: stiffness, rest."""
+    return -p[0] * (q - p[1])
+
+
+LAWS = (coulomb_law, direction_law, stribeck_law, drag_law, ripple_law, spring_law)
+
+
+@numba.njit(cache=True)
+def law_number(number, q, v, t, p):
+    """The force of LAWS[number], for compiled code that has many laws in a list."""
+    if number == 0:
+        return coulomb_law(q, v, t, p)
+    if number == 1:
+        return direction_law(q, v, t, p)
+    if number == 2:
+        return stribeck_law(q, v, t, p)
+    if number == 3:
+        return drag_law(q, v, t, p)
+    if number == 4:
+        return ripple_law(q, v, t, p)
+    return spring_law(q, v, t, p)

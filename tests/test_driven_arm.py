@@ -1,0 +1,184 @@
+"""Compiled joints and drives against Drake's plant and its integrator."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from effect_scenes import at_rest_but, double, pendulum, with_effects
+
+from makebreak.diagrams.driven_arm import DrivenArmScene, DrivenArmSimulation, can_have
+from makebreak.diagrams.scene_simulation import (
+    Commands,
+    SceneSimulation,
+    SimulationConfig,
+)
+from makebreak.models.effects import KINDS
+from makebreak.models.scene import ActuationSection
+from makebreak.models.scene_schema import SupplySection
+from makebreak.systems.numerics.driven_arm import mass_and_bias, rollout
+from makebreak.systems.numerics.joint_laws import LAWS, law_number
+
+ROBOT = """<?xml version="1.0"?>
+<robot name="t"><link name="base"/>
+<link name="cart"><inertial><origin xyz="0.1 0 0.05"/><mass value="2"/>
+<inertia ixx="0.02" iyy="0.025" izz="0.01" ixy="0.001" ixz="0" iyz="0"/></inertial>
+</link>
+<link name="arm"><inertial><origin xyz="0 0.02 -0.2" rpy="0.3 0 0.1"/><mass value="1"/>
+<inertia ixx="0.02" iyy="0.02" izz="0.005" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="hand"><inertial><origin xyz="0.05 0 -0.1"/><mass value="0.4"/>
+<inertia ixx="0.002" iyy="0.002" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="tool"><inertial><origin xyz="0 0.03 0"/><mass value="0.2"/>
+<inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="flag"><inertial><origin xyz="0 0 0.2"/><mass value="0.3"/>
+<inertia ixx="0.004" iyy="0.004" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="rail" type="prismatic"><parent link="base"/><child link="cart"/>
+<origin xyz="0 0 0.3" rpy="0.2 0.1 0"/><axis xyz="1 0.5 0"/><limit effort="60"
+lower="-5" upper="5" velocity="9"/></joint>
+<joint name="swing" type="continuous"><parent link="cart"/><child link="arm"/>
+<origin xyz="0.2 0 0" rpy="0 0.4 0"/><axis xyz="0 1 0.2"/><dynamics damping="0.1"/>
+</joint>
+<joint name="twist" type="continuous"><parent link="arm"/><child link="hand"/>
+<origin xyz="0 0 -0.4"/><axis xyz="1 0 0"/></joint>
+<joint name="hold" type="fixed"><parent link="hand"/><child link="tool"/>
+<origin xyz="0.1 0 -0.2" rpy="0.5 0 0"/></joint>
+<joint name="wave" type="continuous"><parent link="cart"/><child link="flag"/>
+<origin xyz="-0.1 0 0.1"/><axis xyz="0 0.6 0.8"/></joint></robot>"""
+
+
+def tree(folder):
+    """A scene of four joints, one of which slides and carries two branches."""
+    scene = pendulum(folder)
+    (folder / "p.urdf").write_text(ROBOT.replace('name="t"', 'name="p"', 1))
+    joints = [f"p.{name}" for name in ("rail", "swing", "twist", "wave")]
+    actuation = ActuationSection(
+        type="servo", joints=joints, kp=[300.0, 40.0, 15.0, 20.0], kd=[20, 2, 0.5, 1],
+        limit=[50.0, 8.0, 3.0, 3.0],
+    )  # fmt: skip
+    return replace(scene, actuation=actuation), joints
+
+
+ROTORS = [("rotor_inertia", "p", dict(inertia=0.02))]
+LACKS = {
+    "nothing": [],
+    "friction": [
+        ("joint_coulomb_friction", "p.swing", dict(coulomb=0.6)),
+        ("joint_load_friction", "p", dict(share=0.4)),
+        ("joint_direction_friction", "p.wave",
+         dict(coulomb_plus=0.2, coulomb_minus=0.5)),
+        ("joint_quadratic_drag", "p.twist", dict(coefficient=0.1)),
+    ],
+    "drive": [
+        ("servo_gain", "p.swing", dict(kp=25.0)),
+        ("actuator_gain", "p.twist", dict(gain=0.7)),
+        ("actuator_bias", "p.wave", dict(bias=0.4)),
+        ("actuator_saturation", "p.rail", dict(limit=25.0)),
+        ("input_delay", "p", dict(delay=0.013)),
+        ("joint_offset", "p.swing", dict(offset=0.05)),
+    ],
+    "lag": [("actuator_lag", "p", dict(time_constant=0.02))],
+    "links": [
+        ("payload", "p.tool", dict(mass=0.3, com_x=0.05, com_y=0.0, com_z=-0.1)),
+        ("link_mass", "p.arm", dict(mass=-0.3)),
+        ("gravity_tilt", "p", dict(roll=0.1, pitch=-0.05)),
+        ("joint_viscous_damping", "p.rail", dict(damping=3.0)),
+    ],
+}  # fmt: skip
+
+
+def commands(joints, seconds=1.0, rate=50.0):
+    time = np.arange(0.0, seconds, 1.0 / rate)
+    columns = {
+        f"{joint}.position_command": 0.3 * np.sin((3.0 + k) * time + k)
+        for k, joint in enumerate(joints)
+    }
+    return time, Commands(time, columns)
+
+
+@pytest.mark.parametrize("lacks", LACKS)
+def test_a_tree_of_joints_moves_as_in_drake(tmp_path, lacks):
+    scene, joints = tree(tmp_path)
+    scene = with_effects(scene, *ROTORS, *LACKS[lacks])
+    time, told = commands(joints)
+    channels = [f"{j}.{what}" for what in ("position", "velocity") for j in joints]
+    start = at_rest_but(
+        dict(zip(joints, (0.1, -0.2, 0.3, 0.4), strict=True)),
+        dict(zip(joints, (0.2, 1.0, -2.0, 0.0), strict=True)),
+    )
+    exact = SceneSimulation(scene, SimulationConfig(accuracy=1e-8))
+    fast = DrivenArmSimulation(scene)
+    fast.tol = 1e-5
+    want = exact.run(start, time, channels, told)
+    have = fast.run(start, time, channels, told)
+    # A tolerance of 1e-5 rad/s and 1e-7 rad a step, of which there are a thousand.
+    np.testing.assert_allclose(have[:, :4], want[:, :4], atol=5e-5)
+    np.testing.assert_allclose(have[:, 4:], want[:, 4:], atol=2e-3)
+    assert np.abs(want[:, :4] - want[0, :4]).max(axis=0).min() > 0.02  # It does move.
+
+
+@pytest.mark.parametrize("effort", [True, False])
+def test_efforts_and_velocities_may_be_commanded(tmp_path, effort):
+    scene = double(tmp_path)
+    name = "effort_command"
+    if not effort:
+        name = "velocity_command"
+        actuation = ActuationSection(
+            type="velocity", joints=["d.j1", "d.j2"], kd=[5.0, 3.0], limit=[9.0],
+            supply=SupplySection(voltage=[24.0], kt=[0.5], resistance=[1.0]),
+        )  # fmt: skip
+        scene = replace(scene, actuation=actuation)
+    time = np.arange(0.0, 1.0, 0.02)
+    told = Commands(
+        time, {f"d.j{k}.{name}": 3.0 * np.sin(5.0 * time + k) for k in (1, 2)}
+    )
+    channels = ["d.j1.position", "d.j2.position"]
+    start = at_rest_but({"d.j1": 0.3, "d.j2": 0.2})
+    want = SceneSimulation(scene).run(start, time, channels, told)
+    fast = DrivenArmSimulation(scene)
+    fast.tol = 1e-4
+    have = fast.run(start, time, channels, told)
+    np.testing.assert_allclose(have, want, atol=3e-4)
+
+
+def test_mass_matrix_and_bias_are_those_of_drake(tmp_path):
+    scene, _ = tree(tmp_path)
+    scene = with_effects(scene, *ROTORS)
+    arms = DrivenArmScene(scene)
+    arm = arms.arm(())
+    plant = SceneSimulation(scene)._plant
+    context = plant.CreateDefaultContext()
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        q, v = rng.normal(size=4), rng.normal(size=4)
+        plant.SetPositions(context, q)
+        plant.SetVelocities(context, v)
+        M, bias = np.empty((4, 4)), np.empty(4)
+        mass_and_bias(arm, q, v, M, bias)
+        gravity = plant.CalcGravityGeneralizedForces(context)
+        np.testing.assert_allclose(M, plant.CalcMassMatrix(context), atol=1e-12)
+        np.testing.assert_allclose(
+            bias, plant.CalcBiasTerm(context) - gravity, atol=1e-11
+        )
+
+
+def test_every_law_of_a_joint_is_in_the_compiled_list():
+    q, v, t, p = 0.3, -0.4, 0.1, np.array([0.5, 0.7, 0.2, 0.6])
+    for number, law in enumerate(LAWS):
+        assert law_number(number, q, v, t, p) == law(q, v, t, p)
+    for kind, entry in KINDS.items():
+        assert entry.joint_law is None or entry.joint_law in LAWS, kind
+
+
+def test_what_takes_drakes_own_steps_is_refused(tmp_path):
+    scene, joints = tree(tmp_path)
+    spring = ("joint_elasticity", joints[1], dict(stiffness=100.0, damping=0.1))
+    with pytest.raises(ValueError, match="joint_elasticity takes Drake's own steps"):
+        DrivenArmSimulation(with_effects(scene, spring))
+    assert not can_have("body_drag") and can_have("joint_load_friction")
+
+
+def test_what_cannot_be_stepped_ends_in_nan(tmp_path):
+    scene, _ = tree(tmp_path)
+    arm = DrivenArmScene(with_effects(scene, *ROTORS)).arm(())
+    light = arm._replace(mass=-arm.mass)  # No motion has this.
+    y = rollout(light, np.zeros(4), np.zeros(4), [0.0, 0.1], np.zeros((1, 2, 4)))
+    assert np.isnan(y).all()
