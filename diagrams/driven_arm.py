@@ -80,6 +80,12 @@ class DrivenArmScene:
                 possible(effect, plant, every)
         return DrivenArm(**body_numbers, **self._drives(plant, every))
 
+    @property
+    def has_shapes(self) -> bool:
+        """Whether there is anything that could touch."""
+        ((plant, _), *_) = self._plants.values()
+        return plant.num_collision_geometries() > 0
+
     def received(self, told: np.ndarray) -> np.ndarray:
         """Position commands (..., n) as the drives have them, in whole steps."""
         return np.where(
@@ -129,7 +135,7 @@ class DrivenArmScene:
                 slow[i], most[i] = velocity_unit(joint), actuator.effort_limit()
                 if not looped:
                     driven[i] = EFFORT
-                elif name in of:
+                elif whole is not None and name in of:
                     driven[i] = LOOP
                     own: DriveLaw = whole[of[name]]
                     kp = own.kp if numbers[KP, k] == OWN else numbers[KP, k]
@@ -139,20 +145,23 @@ class DrivenArmScene:
                         law[i, 0] = 0.0
                     else:
                         self._step[i] = own.resolution
-        forces = [
-            (joint.velocity_start(), LAWS.index(KINDS[e.kind].joint_law), numbers)
-            for e in effects
-            if KINDS[e.kind].joint_law is not None
-            for joint in find_joints(e, plant)
-            for numbers in [KINDS[e.kind].joint_numbers(e, plant, joint)]
-        ]
-        p = np.zeros((len(forces), 4))
-        for row, (_, _, numbers) in zip(p, forces, strict=True):
-            row[: len(numbers)] = numbers
+        forces: list[tuple[int, int, list[float]]] = []
+        for effect in effects:
+            kind = KINDS[effect.kind]
+            if kind.joint_law is None or kind.joint_numbers is None:
+                continue
+            for joint in find_joints(effect, plant):
+                p = kind.joint_numbers(effect, plant, joint)
+                number = LAWS.index(kind.joint_law)
+                forces.append((joint.velocity_start(), number, p))
+        law_p = np.zeros((len(forces), 4))
+        for row, (_, _, p) in zip(law_p, forces, strict=True):
+            row[: len(p)] = p
         return dict(
             driven=driven, law=law, path=path, slow=slow, most=most,
             law_joint=np.array([i for i, _, _ in forces], dtype=np.int64),
-            law_kind=np.array([k for _, k, _ in forces], dtype=np.int64), law_p=p,
+            law_kind=np.array([k for _, k, _ in forces], dtype=np.int64),
+            law_p=law_p,
         )  # fmt: skip
 
 

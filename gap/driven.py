@@ -72,8 +72,13 @@ class DrivenWindows(WindowModel):
 class DrivenProblem(DrivenWindows, GapProblem):
     """Windows of joints that follow commands, as a problem for the search."""
 
-    plan = SearchPlan(
-        evaluations=5, diff_step=1e-2, most_effects=6, by_channel=True, own_values=True
+    plan = SearchPlan(  # fmt: skip
+        evaluations=4,
+        diff_step=1e-2,
+        most_effects=8,
+        by_channel=True,
+        own_values=True,
+        shortlist=4,
     )
 
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
@@ -115,14 +120,15 @@ class DrivenProblem(DrivenWindows, GapProblem):
         held = ~self.train()
         if not held.any() or held.all() or self.noise_error(self.base()) < MISFIT:
             return
-        start = [
-            Effect(kind, [at], {name: now + step})
-            for kind, at, name, now, step in self._shared()
-            if step is not None and not KINDS[kind].channel
-        ]
+        # Of kinds with the same unit one is enough.
+        start: dict[tuple[str, str], Effect] = {}
+        for kind, at, name, now, step in self._shared():
+            unit = KINDS[kind].parameter(name).unit
+            if step is not None and not KINDS[kind].channel:
+                start.setdefault((unit, at), Effect(kind, [at], {name: now + step}))
         n = Nuisances.none(len(held))
         screen = Screen(self.base(), n.columns, n.prior, self.train())
-        rich = fit_effects(self, screen, start, evaluations=2 * self.plan.evaluations)
+        rich = fit_effects(self, screen, list(start.values()), evaluations=6)
         self._rich = rich.effects
         self.misfit = self._misfit_of(rich.r)
         self.correlation = self._correlation_of(rich.r)
@@ -297,7 +303,7 @@ class DrivenProblem(DrivenWindows, GapProblem):
     def _typical_sizes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of each joint: rms of what its drive gives by its law [N m], rms speed
         [rad/s], inertia [kg m2]."""
-        effort, speed = [], []
+        efforts, speeds = [], []
         for joint in self.joints:
             law = law_of(self.scene.actuation, joint)
             u, v = [np.zeros(1)], [np.zeros(1)]
@@ -316,12 +322,12 @@ class DrivenProblem(DrivenWindows, GapProblem):
                         rate = held[f"{joint}.velocity_command"]
                     if law is not None:
                         u.append(law.effort(error, rate, x[:, 1]))
-            effort.append(np.sqrt(np.mean(np.concatenate(u) ** 2)))
-            speed.append(np.sqrt(np.mean(np.concatenate(v) ** 2)))
+            efforts.append(np.sqrt(np.mean(np.concatenate(u) ** 2)))
+            speeds.append(np.sqrt(np.mean(np.concatenate(v) ** 2)))
         plant = self.dynamics.plant
         context = plant.CreateDefaultContext()
         M = np.diag(plant.CalcMassMatrix(context))
-        effort, speed = np.array(effort), np.array(speed)
+        effort, speed = np.array(efforts), np.array(speeds)
         return (
             np.maximum(effort, 1e-3 * effort.max() + 1e-9),
             np.maximum(speed, 1e-3 * speed.max() + 1e-6), M,

@@ -53,7 +53,7 @@ def fit_effects(
         return np.where(np.isfinite(rows), rows, 1e6)
 
     solved = least_squares(
-        cost, x0 / scale, bounds=(low / scale, np.full(len(low), np.inf)),
+        cost, x0 / scale, bounds=(low / scale, free.high / scale),
         diff_step=problem.plan.diff_step, x_scale=1.0, xtol=1e-6,
         ftol=1e-6 if steps > SHORT else 1e-4, max_nfev=steps,
     ) if len(x0) else None  # fmt: skip
@@ -161,8 +161,8 @@ def derivative_free_search(
 class _Free:
     """The parameters of effects that a fit may move, as one vector.
 
-    names: (index of effect, name) of each; x0, scale, low (n,): where they start, a
-    typical size and a least value.
+    names: (index of effect, name) of each; x0, scale, low, high (n,): where they start,
+    a typical size, a least and a greatest value.
     """
 
     def __init__(
@@ -186,8 +186,10 @@ class _Free:
                 for i, name in self.names
             ]
         )
+        self.high = np.array([_highest(start[i].kind, name) for i, name in self.names])
         x0 = np.array([start[i].parameters[name] for i, name in self.names])
-        self.x0 = np.maximum(x0, self.low + 1e-9 * self.scale)
+        x0 = np.maximum(x0, self.low + 1e-9 * self.scale)
+        self.x0 = np.minimum(x0, self.high - 1e-9 * self.scale)
 
     def effects(self, z: np.ndarray) -> list[Effect]:
         """Effects of parameters z (n,), in units of `scale`."""
@@ -234,6 +236,12 @@ def _scale(effect: Effect, name: str) -> float:
 def _lowest(kind: str, name: str) -> float:
     valid = KINDS[kind].parameter(name).valid
     return {">= 0": 0.0, "> 0": 1e-9, "share": 0.0}.get(valid, -np.inf)
+
+
+def _highest(kind: str, name: str) -> float:
+    """A share ends where robots' do: at 1 nothing is left."""
+    parameter = KINDS[kind].parameter(name)
+    return parameter.high if parameter.valid == "share" else np.inf
 
 
 def _tidy(effect: Effect) -> Effect:

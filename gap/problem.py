@@ -31,6 +31,7 @@ class SearchPlan:
     needed. least_gain: what an effect must take off the error, as a share of it.
     least_error: below it nothing tells two models apart. most_effects: that are named.
     own_values: whether a value that joints share may become one for each.
+    shortlist: candidates that are fitted exactly before one is taken.
     """
 
     evaluations: int = 8
@@ -41,6 +42,7 @@ class SearchPlan:
     most_effects: int = 4
     by_channel: bool = False
     own_values: bool = False
+    shortlist: int = 8
 
 
 @dataclass(frozen=True, eq=False)

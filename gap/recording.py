@@ -11,6 +11,7 @@ import yaml
 
 from makebreak.gap.data.csv_table import BadRows
 from makebreak.gap.data.filters import read_filter
+from makebreak.gap.data.joined import joined, time_column
 from makebreak.gap.table import (
     COMMANDS,
     JOINT_QUANTITIES,
@@ -30,7 +31,7 @@ FEWEST_ROWS = 10  # In an episode: fewer hold no window and no noise.
 # A longer hole in time [s] is a break, as is one of so many periods.
 LONGEST_HOLE_SEC, LONGEST_HOLE_ROWS = 1.0, 50
 MOST_VALUE = 1e12  # In SI units nothing that a robot measures is larger.
-_SIDECAR = ("noise", "filters", "columns", "ignore", "provenance")
+_SIDECAR = ("noise", "filters", "columns", "ignore", "join", "provenance")
 _TIME_UNITS = ((1e-3, "ms"), (1e-6, "us"), (1e-9, "ns"), (0.0, "no unit of time"))
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _UNITS = {q: "N" for q in ("fx", "fy", "fz")} | {q: "N m" for q in ("tx", "ty", "tz")}
@@ -253,6 +254,12 @@ def read_recording(
     unused = frozenset(str(name) for name, to in names.items() if to is None)
     bad = BadRows(path, skip_bad_rows)
     table = read_table(path, most_cells, bad, unused)
+    if others := sidecar.get("join"):
+        tables = []
+        for file in others:
+            own = {name.removeprefix(f"{file.name}:") for name in unused}
+            tables.append((file, read_table(file, most_cells, bad, frozenset(own))))
+        table = joined(path, table, tables, time_column(names))
     columns = _renamed(path, table.columns, names, unused)
     check_time(path, columns)
     columns, row = _without_bad(columns, table.row, bad)
@@ -393,6 +400,8 @@ def _read_sidecars(path: Path, given: Path | None) -> dict:
                 )
             if key == "ignore":
                 value = _spans(file, value)
+            elif key == "join":
+                value = _files_of(file, value)
             elif key != "provenance" and value is not None:
                 if not isinstance(value, dict):
                     raise ValueError(f"{file}: {key} must be names with values")
@@ -406,6 +415,14 @@ def _read_sidecars(path: Path, given: Path | None) -> dict:
                 str(key) for key in data.get("filters") or {}
             }
     return merged
+
+
+def _files_of(file: Path, said) -> list[Path]:
+    """Files, named beside the sidecar, that belong to a recording."""
+    names = said if isinstance(said, list) else [said]
+    if not names or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"{file}: join: got {said}, expected a file name, or a list")
+    return [file.parent / name for name in names]
 
 
 def _spans(file: Path, said) -> list[tuple[float, float, int | None]]:

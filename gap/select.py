@@ -255,7 +255,8 @@ class _Search:
     ) -> tuple[_Step | None, list[Considered]]:
         taken = {(c.effect.kind, tuple(c.effect.at)) for c in chosen}
         open_ = [c for c in found if (c.kind, c.at) not in taken]
-        open_ += _groups(open_)
+        if not self.plan.own_values:  # There places share a value first.
+            open_ += _groups(open_)
         # With what is chosen free to give way, as far as slopes tell.
         slopes = np.zeros((len(current.r), 0))
         if chosen and not self.plan.jumps:
@@ -283,7 +284,7 @@ class _Search:
             )
             for r in ranked[:15]
         ]  # fmt: skip
-        short = _shortlist(ranked, base.score)
+        short = _shortlist(ranked, base.score, self.plan.shortlist)
         if not self.plan.by_channel and ranked[0].fit.score > 0.95 * base.score:
             short = []
         if not short:
@@ -723,7 +724,6 @@ def _groups(found: Sequence[Candidate]) -> list[Candidate]:
             place in ("joint", "actuator", "channel", "drive")
             and single
             and not c.fixed
-            and "." in c.at[0]  # A whole model is no member.
         ):
             by_kind.setdefault(c.kind, []).append(c)
     return [
@@ -794,7 +794,7 @@ def _rms(x: np.ndarray) -> float:
     return float(np.sqrt(np.mean(x**2))) if len(x) else 0.0
 
 
-def _shortlist(ranked: list[Ranked], base: float) -> list[Ranked]:
+def _shortlist(ranked: list[Ranked], base: float, most: int) -> list[Ranked]:
     """Those worth an exact fit: near the best, at most two of a kind and size, or all
     places that do alike; and of each kind that the catalogue says to be confused with
     the best, the best place."""
@@ -810,7 +810,7 @@ def _shortlist(ranked: list[Ranked], base: float) -> list[Ranked]:
         ]  # fmt: skip
         near = each.fit.score < max(1.6 * best, best + 0.15 * (base - best))
         alike = like and each.fit.score <= 1.02 * like[0].fit.score
-        if near and len(like) < (4 if alike else 2) and len(short) < 8:
+        if near and len(like) < (4 if alike else 2) and len(short) < most:
             short.append(each)
     there = {r.candidate.kind for r in short}
     first = ranked[0].candidate.kind

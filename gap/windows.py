@@ -26,6 +26,7 @@ _POSITIONS = ("x", "y", "z")
 TURN = ("qw", "qx", "qy", "qz")
 _G = 9.81
 MARGIN_SEC = 0.1  # Before the first window of an episode.
+MEASURED_SEC = 0.005  # Between rows a measured effort is given in steps of this.
 LARGEST = 200.0  # An error beyond so many standard deviations counts as this: after a
 # bounce the other way, how much farther it goes says nothing.
 
@@ -248,8 +249,14 @@ class WindowModel(WindowedResidual):
             if ok:
                 after = time[start_row:last] - t0
                 std = np.empty((last - start_row, len(self.channels)))
+                state = {n: x[start_row] for n, x in states.items()}
+                shaken = self._effort_noise(recording, state)
                 for c, name in enumerate(self.channels):
                     std[:, c] = self._std(name, c, spreads, start_row, after)
+                    joint, what = name.rsplit(".", 1)
+                    if joint in shaken:  # White noise, integrated once or twice.
+                        t = after**3 / 3.0 if what == "position" else after
+                        std[:, c] = np.sqrt(std[:, c] ** 2 + shaken[joint] * t)
                 block_number = number
                 if number is None:
                     block_number = int((t0 - time[0]) / block)
@@ -257,7 +264,7 @@ class WindowModel(WindowedResidual):
                     Window(
                         i, episode.number, float(t0),
                         slice(episode.first + start_row, episode.first + last),
-                        {n: x[start_row] for n, x in states.items()}, std,
+                        state, std,
                         block_number % 3 != 1,
                         {n: P[start_row, :2, :2] for n, P in spreads.items()},
                     )
@@ -282,32 +289,78 @@ class WindowModel(WindowedResidual):
     def _all_commands(self) -> list[dict[int, Commands]]:
         out = []
         for i, recording in enumerate(self.recordings):
-            names = [
-                c.name for c in recording.commands()
-                if c.name.rsplit(".", 1)[0] in self._driven(c.quantity)
-            ]  # fmt: skip
+            names = self._commanded(recording)
             of: dict[int, Commands] = {}
             for episode in recording.episodes:
                 time = recording.time[episode.rows]
                 columns = {n: recording.held(n)[episode.rows] for n in names}
                 if not names:  # What the motors gave stands in for it.
-                    for joint in self._driven("effort_command"):
-                        key = f"{joint}.effort_measured"
-                        if key in recording:
-                            y = recording[key][episode.rows]
-                            if recording.raw_period_sec:  # A mean, of block middles.
-                                good = np.isfinite(y)
-                                middle = time + 0.5 * np.diff(time, append=time[-1])
-                                y = np.interp(middle, time[good], y[good])
-                            rotor = rotor_before(self.scene, self.dynamics.plant, joint)
-                            path = self._paths.get((i, episode.first), {})
-                            if rotor and f"{joint}.position" in path:
-                                # What turned the rotor was not measured.
-                                y = y + rotor * path[f"{joint}.position"][:, 2]
-                            columns[f"{joint}.effort_command"] = y
+                    time, columns = self._given(recording, episode, i)
                 of[episode.first] = Commands(time, columns)
             out.append(of)
         return out
+
+    def _given(self, recording: Recording, episode: Episode, i: int):
+        """times and columns of commands that give what the motors gave: measured
+        efforts, as a line between rows, in steps of MEASURED_SEC or shorter."""
+        rows = recording.time[episode.rows]
+        period = float(np.median(np.diff(rows)))
+        parts = max(int(np.ceil(period / MEASURED_SEC - 1e-6)), 1)
+        time = np.interp(
+            np.arange(parts * (len(rows) - 1) + 1) / parts, np.arange(len(rows)), rows
+        )
+        middle = time + 0.5 * np.diff(time, append=time[-1])
+        columns = {}
+        for joint in self._driven("effort_command"):
+            key = f"{joint}.effort_measured"
+            if key not in recording:
+                continue
+            y = recording[key][episode.rows]
+            good = np.isfinite(y)
+            y = np.interp(middle, rows[good], y[good])
+            rotor = rotor_before(self.scene, self.dynamics.plant, joint)
+            path = self._paths.get((i, episode.first), {})
+            if rotor and f"{joint}.position" in path:
+                # What turned the rotor was not measured.
+                rate = np.interp(middle, rows, path[f"{joint}.position"][:, 2])
+                y = y + rotor * rate
+            columns[f"{joint}.effort_command"] = y
+        return time, columns
+
+    def _effort_noise(self, recording: Recording, state) -> dict[str, float]:
+        """{joint: (rad/s2)^2 s} white noise of acceleration that the noise of measured
+        efforts makes where these stand in for commands."""
+        driven = self._driven("effort_command")
+        keys = [f"{joint}.effort_measured" for joint in driven]
+        if self._commanded(recording) or not any(k in recording for k in keys):
+            return {}
+        plant = self.dynamics.plant
+        if plant.num_positions() != plant.num_velocities():
+            return {}
+        joints = {
+            full_name(plant, j): j.velocity_start() for j in one_dof_joints(plant)
+        }
+        context = plant.CreateDefaultContext()
+        q = np.array(plant.GetPositions(context))
+        density = np.zeros(plant.num_velocities())
+        for name, i in joints.items():
+            if f"{name}.position" in state:
+                q[i] = state[f"{name}.position"][0]
+            key = f"{name}.effort_measured"
+            if name in driven and key in recording:
+                channel = recording.channels[key]
+                density[i] = channel.noise**2 / max(channel.rate_hz, 1e-6)
+        plant.SetPositions(context, q)
+        W = np.linalg.inv(plant.CalcMassMatrix(context))
+        made = (W**2) @ density
+        return {name: float(made[i]) for name, i in joints.items()}
+
+    def _commanded(self, recording: Recording) -> list[str]:
+        """Names of the commands that the scene's drives take."""
+        return [
+            c.name for c in recording.commands()
+            if c.name.rsplit(".", 1)[0] in self._driven(c.quantity)
+        ]  # fmt: skip
 
     def _driven(self, quantity: str) -> list[str]:
         act = self.scene.actuation

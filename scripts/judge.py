@@ -28,19 +28,21 @@ def judge_scenes(scenes: list[str], recordings: list[str], window_sec: float) ->
     first = judged[0]
     rows: list[tuple] = []
     for k, each in enumerate(first):
-        errors = [of[k].rms for of in judged]
-        rows.append((each.channel, each.unit, *errors, each.noise))
+        for where, name in ((f"{window_sec:g} s ahead", "at_end"), ("all", "rms")):
+            errors = [getattr(of[k], name) for of in judged]
+            rows.append((each.channel, each.unit, where, *errors, each.noise))
     notes = [
         f"{first[0].n_windows} windows of {window_sec:g} s of {len(tables)} "
-        f"recording{'s' if len(tables) > 1 else ''}; rms of measured - simulated over "
-        "all their samples."
+        f"recording{'s' if len(tables) > 1 else ''}; rms of measured - simulated "
+        f"{window_sec:g} s ahead (the last sample of each window), and over all their "
+        "samples."
     ]
     for path, of in zip(scenes, judged, strict=True):
         if of[0].failed:
             notes.append(f"{path}: {of[0].failed:.1%} of the windows did not finish.")
     return Table(
         "Error in windows from measured states",
-        ("channel", "unit", *scenes, "noise"), rows, notes=notes,
+        ("channel", "unit", "of", *scenes, "noise"), rows, notes=notes,
     )  # fmt: skip
 
 

@@ -5,7 +5,7 @@ import sys
 
 import numpy as np
 import pytest
-from effect_scenes import pendulum, with_effects
+from effect_scenes import double, pendulum, with_effects
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.gap.judge import judge
@@ -40,6 +40,8 @@ def test_a_push_that_the_scene_lacks_is_half_its_square_of_time(case):
     expected = 0.5 * PUSH * WINDOW**2 / np.sqrt(5.0)
     assert found.channel == "p.j1.position" and found.unit == "rad"
     np.testing.assert_allclose(found.rms, expected, rtol=0.03)
+    # And at its end by a T^2/2; the last of the samples lies at T.
+    np.testing.assert_allclose(found.at_end, 0.5 * PUSH * WINDOW**2, rtol=0.03)
     assert found.n_windows == 20 and found.failed == 0.0
 
 
@@ -55,6 +57,19 @@ def test_a_scene_with_the_push_is_off_by_the_noise(case):
     assert found.rms < 5e-4
 
 
+def test_positions_of_several_joints_are_told_together(tmp_path):
+    scene = double(tmp_path)
+    time = np.arange(401) * 0.01
+    measured = {"time": time, "d.j1.position": 0.3 + 0.0 * time,
+                "d.j2.position": 0.1 + 0.0 * time}  # fmt: skip
+    write_recording(tmp_path / "run.csv", measured)
+    *each, both = judge(scene, read_recordings([tmp_path / "run.csv"]), WINDOW)
+    assert both.channel == "all positions" and len(each) == 2
+    for name in ("rms", "at_end"):
+        wanted = np.hypot(*(getattr(j, name) for j in each)) / np.sqrt(2.0)
+        np.testing.assert_allclose(getattr(both, name), wanted)
+
+
 def _inertia(scene) -> float:
     plant = load_scene(scene, DiagramBuilder()).plant
     return plant.CalcMassMatrix(plant.CreateDefaultContext())[0, 0]
@@ -67,8 +82,10 @@ def test_the_command_prints_a_column_for_each_scene(case, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [*words, "--window", "0.5", "--json", str(out)])
     assert command.main() == 0
     shown = capsys.readouterr().out
-    [row] = [line for line in shown.splitlines() if line.startswith("p.j1.position")]
-    assert row.split().count(f"{json.loads(out.read_text())[0][str(scene)]:.4g}") == 2
+    rows = [line for line in shown.splitlines() if line.startswith("p.j1.position")]
+    for row, written in zip(rows, json.loads(out.read_text()), strict=True):
+        assert row.split().count(f"{written[str(scene)]:.4g}") == 2
+    assert "0.5 s ahead" in rows[0] and " all " in rows[1]
     assert "20 windows of 0.5 s of 1 recording;" in shown
 
 
