@@ -41,6 +41,7 @@ WINDOW_SEC, MOST_WINDOWS = 0.5, 60
 REST_SPEED, REST_SEC, STICKS = 0.005, 0.2, 0.2
 # How far a parameter is moved to see what it does, in shares of a typical size.
 SMALL = 0.1
+BESIDE_SEC = 0.06  # About a start, within which a jerk spoils what is known of it.
 LESS = 0.8  # A weight is changed where it would become less by this share.
 
 
@@ -67,6 +68,18 @@ class DrivenWindows(WindowModel):
         self.windows = [
             replace(w, std=np.sqrt(of)) for w, of in zip(given, variance, strict=True)
         ]
+
+    def _best_start(self, time, states, row: int) -> int:
+        """Within half a window, the row about which accelerations jump least: a joint
+        that a command or its friction jerks there has another speed than the smoothed
+        one."""
+        last = int(np.searchsorted(time, time[row] + 0.5 * WINDOW_SEC))
+        rows = np.arange(row, max(min(last, len(time) - 4), row + 1))
+        worst = np.zeros(len(rows))
+        for x in states.values():
+            jump = _jumps(time, x)
+            worst += (jump[rows] / max(float(np.sqrt(np.mean(jump**2))), 1e-12)) ** 2
+        return int(rows[np.argmin(worst)])
 
 
 class DrivenProblem(DrivenWindows, GapProblem):
@@ -129,9 +142,13 @@ class DrivenProblem(DrivenWindows, GapProblem):
         n = Nuisances.none(len(held))
         screen = Screen(self.base(), n.columns, n.prior, self.train())
         rich = fit_effects(self, screen, list(start.values()), evaluations=6)
-        self._rich = rich.effects
-        self.misfit = self._misfit_of(rich.r)
-        self.correlation = self._correlation_of(rich.r)
+        left = rich.r
+        if rich.fit.train > screen.judge(self.base()).train:  # It went astray.
+            left = self.base()
+        else:
+            self._rich = rich.effects
+        self.misfit = np.minimum(self._misfit_of(left), self._misfit_of(self.base()))
+        self.correlation = self._correlation_of(left)
         self._base = None
 
     def _misfit_of(self, left: np.ndarray) -> np.ndarray:
@@ -412,6 +429,18 @@ def sticks(scene: Scene, recordings: Sequence[Recording]) -> bool:
         if whole and still > STICKS * whole:
             return True
     return False
+
+
+def _jumps(time: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """(n,) by how much a smoothed acceleration, of states x (n, 3), changes about each
+    row."""
+    beside = max(int(BESIDE_SEC / float(np.median(np.diff(time)))), 1)
+    row, n = np.arange(len(time)), len(time)
+    spans = [
+        np.abs(x[np.clip(row + k, 0, n - 1), 2] - x[:, 2])
+        for k in (-beside, -1, 1, beside)
+    ]
+    return np.max(spans, axis=0) + np.abs(x[:, 2])
 
 
 def _moved_start(window, k: int):

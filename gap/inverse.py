@@ -436,10 +436,23 @@ class InverseModel:
             out.append(each)
         return out
 
-    def allow(self, error: dict[str, np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
+    def allow(
+        self, error: dict[str, np.ndarray], more: np.ndarray | None = None
+    ) -> Callable[[np.ndarray], np.ndarray]:
         """Takes models to be off by so much, {what: (n_joints,)} [N m, rad/s], beside
-        noise. Returns: what gives rows (m, ...) of before in the new units."""
+        noise. Returns: what gives rows (m, ...) of before in the new units.
+
+        Args: more (n_bumps, n_joints): further noise of the joints' equations [N m].
+        """
         old = self._whiteners
+        if more is not None:
+            first = 0
+            for noise in self._noises:
+                C = noise["effort"]
+                each = more[first : first + len(C)]
+                first += len(C)
+                C += np.eye(C.shape[1]) * each[:, None] ** 2
+            self._plain = self._whitened_by({w: 0.0 * x for w, x in error.items()})
         self.model_error = error
         self._whiteners = self._whitened_by(error)
         self._base = None

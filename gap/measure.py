@@ -1,6 +1,6 @@
 """The gap before and after, over held-out windows simulated from measured states."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, Protocol
@@ -11,7 +11,7 @@ from makebreak.gap.inverse import InverseModel
 from makebreak.gap.parallel import side_by_side
 from makebreak.gap.recording import Recording, unit_of
 from makebreak.gap.result import GapMeasure, InUnits, Series
-from makebreak.gap.windows import WindowModel, seen_in
+from makebreak.gap.windows import Window, WindowModel, seen_in
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sliding_joints
@@ -46,19 +46,21 @@ def measure(
     motion: InverseModel,
     every: bool,
     jobs: int = 1,
+    skip: Callable[[Window], bool] = lambda window: False,
 ) -> tuple[GapMeasure, list[Series]]:
     """Before and after over windows of the recordings that `motion` has.
 
     Args: effects: to be added. moved: the background as far as its tolerance lets it,
         in both, as it is neither the gap nor its cure. motion: what tells how far a
         joint lags its motor where a window starts. every: all windows, of recordings
-        that are only reported on; else those that were not fitted.
+        that are only reported on; else those that were not fitted. skip: windows that
+        count in neither.
     """
     model = WindowModel(scene, motion.recordings, WINDOW_SEC, most=240)
     taken = {(e.kind, tuple(e.at)) for e in effects}
     moved = [e for e in moved if (e.kind, tuple(e.at)) not in taken]
     trials = [moved, [*moved, *effects]] if effects else [moved]
-    held = [every or not w.train for w in model.windows]
+    held = [(every or not w.train) and not skip(w) for w in model.windows]
     lag = _twists(motion, effects)
     calls = [partial(model.simulate, trial, held, lag) for trial in trials]
     try:

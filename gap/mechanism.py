@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from makebreak.gap.findings import Finding
 from makebreak.gap.inverse import InverseModel
 from makebreak.gap.measure import measure
 from makebreak.gap.problem import (
@@ -16,6 +17,7 @@ from makebreak.gap.problem import (
     Outcome,
     SearchPlan,
 )
+from makebreak.gap.pushes import Push, find_pushes
 from makebreak.gap.recording import Recording
 from makebreak.gap.result import Where
 from makebreak.gap.screen import (
@@ -27,8 +29,9 @@ from makebreak.gap.screen import (
     rich_columns,
 )
 from makebreak.gap.where import unexplained, where_in_motion
+from makebreak.gap.windows import Window
 from makebreak.models.dynamics import SceneDynamics
-from makebreak.models.effects.kind import Effect, find_body
+from makebreak.models.effects.kind import Effect, find_body, sliding_joints
 from makebreak.models.scene import Scene
 from makebreak.systems.numerics.selection import Screen, is_predicted
 
@@ -43,6 +46,10 @@ RICH_PRIOR = 10.0  # Times a nuisance's tolerance, in a rich model.
 REPEATS, EVENT = 0.1, 10.0
 MOST_WANDER = 5.0  # Times a sample's noise: more is no sensor's.
 HALF = 0.5  # Of a channel's power: what one effect more must explain to be a law of it.
+# A rich model is fitted without what it leaves more than TRIM_Z of beside the usual, at
+# most such a share of all, until that stays the same.
+TRIMS, TRIMMED, TRIM_Z = 8, 0.3, 4.0
+UNWEIGHTED = 10.0  # Times what a push left, as its rows' noise.
 LAGS = 9  # Test functions over which errors may go together (0.9 s).
 OVERLAP = 1.3  # What neighbouring test functions share of white noise.
 
@@ -55,6 +62,8 @@ class MechanismProblem(InverseModel, GapProblem):
         self.plan = SearchPlan(evaluations=25, most_effects=6, by_channel=True)
         self._found: list[Candidate] | None = None
         self._nuisances: Nuisances | None = None
+        # Stretches in which something else moved it: they have next to no weight.
+        self.pushes: list[Push] = []
         self._learn_misfit()
 
     # ----- What models are off by
@@ -71,13 +80,18 @@ class MechanismProblem(InverseModel, GapProblem):
         if self.noise_error(left) < MISFIT:
             return
         self._found = candidates(self, n, left)
-        for _ in range(3):
+        for _ in range(5):
             n = self.nuisances()
             rich = rich_columns(self, self._found)
             prior = RICH_PRIOR * n.prior
             screen = Screen(self.base(), n.columns, prior, self.train())
             fit = screen.fit(rich)
             left = self.base() - rich @ fit.c - n.columns @ fit.b
+            unbent = self._unbent(rich, n, prior)
+            pushes = self._pushes_in(unbent)
+            if len(pushes) > len(self.pushes):
+                self._set_pushes(pushes, unbent)
+                continue  # What they bent is fitted again.
             error = self._misfit(left)
             # A rich model may do worse than none, where noise is all that is left; and
             # what one more effect of the catalogue explains is nothing models lack.
@@ -120,6 +134,74 @@ class MechanismProblem(InverseModel, GapProblem):
                     least[k], out[rows[k]] = power, r[rows[k]]
         return out
 
+    def _unbent(self, rich: np.ndarray, n: Nuisances, prior) -> np.ndarray:
+        """What a rich model leaves (m,) that was fitted without the test functions that
+        it explains least: least trimmed squares, so that what acts for a short while
+        bends nothing."""
+        k, joints = len(self.names()), len(self.joints)
+        noise = np.median(self.noise_in_units()[:, :joints], axis=0)
+        whole = self.train()
+        train, left = whole, self.base()
+        for _ in range(TRIMS):
+            fit = Screen(self.base(), n.columns, prior, train).fit(rich)
+            left = self.base() - rich @ fit.c - n.columns @ fit.b
+            units = np.abs(self.in_units(left)[:, :joints])
+            z = (units / np.maximum(ROBUST * np.median(units, axis=0), noise)).max(1)
+            most = np.quantile(z, 1.0 - TRIMMED)
+            kept = np.repeat(z <= max(most, TRIM_Z), k) & whole
+            if (kept == train).all():
+                break
+            train = kept
+        return left
+
+    def _pushes_in(self, left: np.ndarray) -> list[Push]:
+        n = len(self.joints)
+        units, noise = self.in_units(left)[:, :n], self.noise_in_units()[:, :n]
+        known = [row for push in self.pushes for row in push.rows]
+        units[known], noise[known] = 0.0, np.median(noise, axis=0)
+        found = find_pushes(self.tracks, self.joints, units, noise)
+        return [*self.pushes, *found] if found else self.pushes
+
+    def _is_pushed(self, window: Window) -> bool:
+        name = self.recordings[window.recording].name
+        end = self.recordings[window.recording].time[window.rows][-1]
+        return any(
+            (push.recording, push.episode) == (name, window.episode)
+            and window.start < push.end and end > push.start
+            for push in self.pushes
+        )  # fmt: skip
+
+    def _set_pushes(self, pushes: list[Push], left: np.ndarray) -> None:
+        """What nothing explains while something else moves it counts as its noise."""
+        units = self.in_units(left)[:, : len(self.joints)]
+        more = np.zeros_like(units)
+        for push in pushes[len(self.pushes) :]:
+            rows = list(push.rows)
+            more[rows] = UNWEIGHTED * np.sqrt(np.mean(units[rows] ** 2, axis=0))
+        self.pushes = pushes
+        self._set(self.model_error, more)
+
+    def push_findings(self) -> list[Finding]:
+        sliding = sliding_joints(self.dynamics.plant)
+        found = []
+        for push in self.pushes:
+            each = [
+                f"{effort:.3g} {'N' if joint in sliding else 'N m'} at {joint}"
+                for joint, effort in push.efforts
+            ]
+            joint, effort = push.efforts[0]
+            unit = "N" if joint in sliding else "N m"
+            says = (
+                f"From {push.start:.3g} to {push.end:.3g} s something that comes back "
+                f"nowhere else moved the robot, as a person's push would (rms: "
+                f"{', '.join(each)}); these {push.end - push.start:.2g} s have next to "
+                "no weight, and no effect is named for them."
+            )
+            found.append(
+                Finding("push", push.recording, joint, effort, unit, "warning", says)
+            )
+        return found
+
     def _misfit(self, left: np.ndarray) -> dict[str, np.ndarray]:
         """What held-out rows (m,) are off by beside noise: robust, of each channel."""
         held = (~self.train()).reshape(-1, len(self.names()))[:, 0]
@@ -128,6 +210,10 @@ class MechanismProblem(InverseModel, GapProblem):
         off, noise = self.in_units(left)[held], self.noise_in_units()[held]
         # A joint at rest may be held by anything: its rows say nothing of models.
         usual = noise <= AT_REST * np.quantile(noise, 0.1, axis=0)
+        held[[row for push in self.pushes for row in push.rows]] = False
+        size = ROBUST * np.median(np.abs(self.in_units(left)[held]), axis=0)
+        noise = self.noise_in_units()[held]
+        ratio = ROBUST * np.median(np.abs(self.in_units(left)[held] / noise), axis=0)
         error = {w: np.zeros(len(self.joints)) for w in self.model_error}
         for k, (what, joint) in enumerate(self.names()):
             mine = usual[:, k]
@@ -160,8 +246,8 @@ class MechanismProblem(InverseModel, GapProblem):
         last = int(ends[0]) if len(ends) else LAGS + 1
         return float(np.sqrt(max((1.0 + 2.0 * rho[1:last].sum()) / OVERLAP, 1.0)))
 
-    def _set(self, error: dict[str, np.ndarray]) -> None:
-        to_new = self.allow(error)
+    def _set(self, error: dict[str, np.ndarray], more=None) -> None:
+        to_new = self.allow(error, more)
         if self._found is not None:
             self._found = [_moved(c, to_new) for c in self._found]
         if self._nuisances is not None:
@@ -296,8 +382,9 @@ class MechanismProblem(InverseModel, GapProblem):
             model = self
         moved = moved_links(self, nuisances, end.b)
         gap, series = measure(
-            self.scene, effects, moved, model, model is not self, jobs
-        )
+            self.scene, effects, moved, model, model is not self, jobs,
+            self._is_pushed if model is self else lambda window: False,
+        )  # fmt: skip
         rest = unexplained(self, self.in_noise(end.left))
         return Outcome(gap, series, rest)
 

@@ -239,6 +239,7 @@ class WindowModel(WindowedResidual):
         margin = min(MARGIN_SEC, 0.1 * (time[-1] - time[0]))
         start_row = int(np.searchsorted(time, time[0] + margin))
         while start_row < len(time) - 3:
+            start_row = self._best_start(time, states, start_row)
             t0 = time[start_row]
             last = int(np.searchsorted(time, t0 + self.window_sec, "right"))
             if time[-1] - t0 < 0.6 * self.window_sec:
@@ -270,6 +271,10 @@ class WindowModel(WindowedResidual):
                     )
                 )  # fmt: skip
             start_row = max(int(np.searchsorted(time, t0 + hop)), start_row + 1)
+
+    def _best_start(self, time, states, row: int) -> int:
+        """The row at or soon after one at which a window begins."""
+        return row
 
     def _std(self, name, c, spreads, k, after) -> np.ndarray:
         """Noise of a sample, and of where a window's start is, carried along."""

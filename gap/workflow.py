@@ -11,6 +11,7 @@ import numpy as np
 from makebreak.gap.check_drives import check_drives, check_initial_names
 from makebreak.gap.checks import check_recordings
 from makebreak.gap.data.conditioning import condition
+from makebreak.gap.driven import DrivenProblem, is_driven, sticks
 from makebreak.gap.findings import Finding
 from makebreak.gap.measure import WINDOW_SEC
 from makebreak.gap.mechanism import MechanismProblem
@@ -115,8 +116,14 @@ def problem_for(
     Args: dynamics: of the scene.
     """
     if _is_mechanism(dynamics, recordings):
+        if is_driven(scene, recordings) and sticks(scene, recordings):
+            try:
+                return DrivenProblem(scene, recordings), []
+            except ValueError:  # It takes Drake's steps.
+                pass
         scene, finding = _settle_step(scene, recordings, dynamics, jobs)
-        return MechanismProblem(scene, recordings), finding
+        mechanism = MechanismProblem(scene, recordings)
+        return mechanism, [*finding, *mechanism.push_findings()]
     if any(joint.num_velocities() for joint in one_dof_joints(dynamics.plant)):
         try:
             return TouchProblem(scene, recordings), []

@@ -1,0 +1,144 @@
+"""Arms of position servos whose joints stick: what they lack, by simulated windows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from effect_scenes import at_rest_but, double, with_effects
+from test_driven_arm import tree
+
+from makebreak.diagrams.driven_arm import DrivenArmSimulation
+from makebreak.diagrams.scene_simulation import Commands
+from makebreak.gap.driven import DrivenProblem, is_driven, sticks
+from makebreak.gap.recording import read_recordings
+from makebreak.gap.select import select
+from makebreak.gap.workflow import run_gap
+from makebreak.models.scene import ActuationSection
+from makebreak.models.scene_file import write_scene
+from makebreak.models.scene_schema import SupplySection
+
+STEP = 1e-3  # [rad] of the encoders.
+RATE, SECONDS = 50.0, 40.0
+
+
+def two_joints(folder):
+    joints = ["d.j1", "d.j2"]
+    actuation = ActuationSection(
+        type="servo", joints=joints, kp=[60.0], limit=[25.0, 12.0],
+        supply=SupplySection(voltage=[24.0], kt=[2.0], resistance=[1.0]),
+    )  # fmt: skip
+    scene = replace(double(folder), actuation=actuation)
+    return with_effects(
+        scene,
+        ("rotor_inertia", "d", dict(inertia=0.05)),
+        ("joint_coulomb_friction", "d", dict(coulomb=0.5)),
+    ), joints
+
+
+def four_joints(folder):
+    scene, joints = tree(folder)
+    return with_effects(
+        scene,
+        ("rotor_inertia", "p", dict(inertia=0.03)),
+        ("joint_coulomb_friction", "p", dict(coulomb=0.3)),
+    ), joints
+
+
+ARMS = {"two": two_joints, "four": four_joints}
+
+
+def goals(n, rng):
+    """Steps that are held, and slow sines, in turn: (n, m)."""
+    time = np.arange(0.0, SECONDS, 1.0 / RATE)
+    out = np.empty((n, len(time)))
+    for k in range(n):
+        level = rng.uniform(-0.4, 0.4, int(SECONDS / 0.9) + 1)
+        steps = level[(time / 0.9).astype(int)]
+        sine = 0.3 * np.sin((0.8 + 0.3 * k) * time + k)
+        out[k] = np.where(time % 16.0 < 8.0, steps, sine)
+    return time, out
+
+
+def recorded(folder, arm, hidden, seed=0):
+    """A scene, and a recording of it in which `hidden` acts as well."""
+    rng = np.random.default_rng(seed)
+    scene, joints = ARMS[arm](folder)
+    truth = with_effects(scene, *hidden)
+    truth = replace(scene, effects=[*scene.effects, *truth.effects])
+    time, told = goals(len(joints), rng)
+    names = [f"{joint}.position" for joint in joints]
+    rows = DrivenArmSimulation(truth).run(
+        at_rest_but(dict(zip(joints, told[:, 0], strict=True))), time, names,
+        Commands(
+            time, {f"{j}.position_command": u for j, u in zip(joints, told, strict=True)}
+        ),
+    )  # fmt: skip
+    rows = np.round((rows + 2e-4 * rng.normal(size=rows.shape)) / STEP) * STEP
+    header = ["time", *names, *(f"{joint}.position_command" for joint in joints)]
+    file = folder / "recording.csv"
+    np.savetxt(
+        file, np.column_stack([time, rows, *told]), delimiter=",", comments="",
+        header=",".join(header), fmt="%.9g",
+    )  # fmt: skip
+    said = "".join(f"  {name}: {STEP / np.sqrt(12.0):.3g}\n" for name in names)
+    file.with_suffix(".yaml").write_text("noise:\n" + said)
+    write_scene(scene, folder / "scene.yaml")
+    return scene, file
+
+
+def problem_of(folder, arm, hidden):
+    scene, file = recorded(folder, arm, hidden)
+    recordings = read_recordings([file])
+    assert is_driven(scene, recordings) and sticks(scene, recordings)
+    return DrivenProblem(scene, recordings)
+
+
+def test_the_truth_leaves_the_noise(tmp_path):
+    hidden = [("joint_load_friction", "d", dict(share=0.3)),
+              ("servo_gain", "d", dict(kp=45.0))]  # fmt: skip
+    problem = problem_of(tmp_path, "two", hidden)
+    truth = with_effects(problem.scene, *hidden).effects
+    # Starts of joints that stick and slip are smoothed as if they moved smoothly.
+    assert problem.noise_error(problem.residual(truth)) < 2.0
+    assert problem.noise_error(problem.base()) > 5.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arm", ARMS)
+def test_nothing_is_named_where_nothing_is_hidden(tmp_path, arm):
+    recorded(tmp_path, arm, [])
+    result = run_gap(tmp_path / "scene.yaml", [tmp_path / "recording.csv"])
+    assert result.effects == []
+    assert result.verdict == "no_gap"
+
+
+HIDDEN = {
+    "two": [("joint_load_friction", "d", dict(share=0.3)),
+            ("servo_gain", "d", dict(kp=45.0))],
+    "four": [("joint_coulomb_friction", "p", dict(coulomb=0.4))],
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arm", HIDDEN)
+def test_what_all_joints_share_is_named_with_one_value(tmp_path, arm):
+    problem = problem_of(tmp_path, arm, HIDDEN[arm])
+    chosen = select(problem)
+    found = {c.effect.kind: c.effect for c in chosen.choices}
+    assert set(found) == {kind for kind, _, _ in HIDDEN[arm]}
+    for kind, at, parameters in HIDDEN[arm]:
+        assert found[kind].at == [at]
+        for name, value in parameters.items():
+            assert found[kind].parameters[name] == pytest.approx(value, rel=0.1)
+
+
+@pytest.mark.slow
+def test_a_joint_that_differs_gets_a_value_of_its_own(tmp_path):
+    hidden = [("servo_gain", ["d.j1"], dict(kp=45.0)),
+              ("servo_gain", ["d.j2"], dict(kp=25.0))]  # fmt: skip
+    problem = problem_of(tmp_path, "two", hidden)
+    found = {tuple(c.effect.at): c.effect for c in select(problem).choices}
+    for kind, at, p in hidden:
+        effect = found[tuple(at)]
+        assert effect.kind == kind
+        assert effect.parameters["kp"] == pytest.approx(p["kp"], rel=0.05)
