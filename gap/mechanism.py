@@ -205,15 +205,12 @@ class MechanismProblem(InverseModel, GapProblem):
     def _misfit(self, left: np.ndarray) -> dict[str, np.ndarray]:
         """What held-out rows (m,) are off by beside noise: robust, of each channel."""
         held = (~self.train()).reshape(-1, len(self.names()))[:, 0]
+        held[[row for push in self.pushes for row in push.rows]] = False
         if not held.any():
             return self.model_error
         off, noise = self.in_units(left)[held], self.noise_in_units()[held]
         # A joint at rest may be held by anything: its rows say nothing of models.
         usual = noise <= AT_REST * np.quantile(noise, 0.1, axis=0)
-        held[[row for push in self.pushes for row in push.rows]] = False
-        size = ROBUST * np.median(np.abs(self.in_units(left)[held]), axis=0)
-        noise = self.noise_in_units()[held]
-        ratio = ROBUST * np.median(np.abs(self.in_units(left)[held] / noise), axis=0)
         error = {w: np.zeros(len(self.joints)) for w in self.model_error}
         for k, (what, joint) in enumerate(self.names()):
             mine = usual[:, k]

@@ -67,11 +67,10 @@ def recorded(folder, arm, hidden, seed=0):
     truth = replace(scene, effects=[*scene.effects, *truth.effects])
     time, told = goals(len(joints), rng)
     names = [f"{joint}.position" for joint in joints]
+    columns = {f"{j}.position_command": u for j, u in zip(joints, told, strict=True)}
     rows = DrivenArmSimulation(truth).run(
-        at_rest_but(dict(zip(joints, told[:, 0], strict=True))), time, names,
-        Commands(
-            time, {f"{j}.position_command": u for j, u in zip(joints, told, strict=True)}
-        ),
+        at_rest_but(dict(zip(joints, told[:, 0], strict=True))),
+        time, names, Commands(time, columns),
     )  # fmt: skip
     rows = np.round((rows + 2e-4 * rng.normal(size=rows.shape)) / STEP) * STEP
     header = ["time", *names, *(f"{joint}.position_command" for joint in joints)]
