@@ -418,12 +418,12 @@ def sticks(scene: Scene, recordings: Sequence[Recording]) -> bool:
         for recording in recordings:
             channel = recording.channels[f"{joint}.position"]
             for episode in recording.episodes:
-                y, t = channel.values[episode.rows], recording.time[episode.rows]
+                y, t = recording.samples(channel.name, episode)[::-1]
                 n = int(REST_SEC / max(float(np.median(np.diff(t))), 1e-6))
                 if len(y) <= n or n < 2:
                     continue
                 spans = np.lib.stride_tricks.sliding_window_view(y, n)
-                off = np.nanmax(spans, axis=1) - np.nanmin(spans, axis=1)
+                off = np.ptp(spans, axis=1)
                 still += np.sum(off < REST_SPEED * REST_SEC + 4.0 * channel.noise)
                 whole += len(off)
         if whole and still > STICKS * whole:

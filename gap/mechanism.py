@@ -159,7 +159,9 @@ class MechanismProblem(InverseModel, GapProblem):
         units, noise = self.in_units(left)[:, :n], self.noise_in_units()[:, :n]
         known = [row for push in self.pushes for row in push.rows]
         units[known], noise[known] = 0.0, np.median(noise, axis=0)
-        found = find_pushes(self.tracks, self.joints, units, noise)
+        efforts = np.concatenate([m.effort for m in self.needed_motions()])
+        needed = np.sqrt(np.mean(efforts**2, axis=0))
+        found = find_pushes(self.tracks, self.joints, units, noise, needed)
         return [*self.pushes, *found] if found else self.pushes
 
     def _is_pushed(self, window: Window) -> bool:
