@@ -159,10 +159,13 @@ class MechanismProblem(InverseModel, GapProblem):
         units, noise = self.in_units(left)[:, :n], self.noise_in_units()[:, :n]
         known = [row for push in self.pushes for row in push.rows]
         units[known], noise[known] = 0.0, np.median(noise, axis=0)
-        efforts = np.concatenate([m.effort for m in self.needed_motions()])
-        needed = np.sqrt(np.mean(efforts**2, axis=0))
-        found = find_pushes(self.tracks, self.joints, units, noise, needed)
+        found = find_pushes(self.tracks, self.joints, units, noise, self._needed_rms())
         return [*self.pushes, *found] if found else self.pushes
+
+    def _needed_rms(self) -> np.ndarray:
+        """(n_joints,) of the efforts that the scene as it came needs [N m]."""
+        efforts = np.concatenate([m.effort for m in self.needed_motions()])
+        return np.sqrt(np.mean(efforts**2, axis=0))
 
     def _is_pushed(self, window: Window) -> bool:
         name = self.recordings[window.recording].name
@@ -174,12 +177,14 @@ class MechanismProblem(InverseModel, GapProblem):
         )  # fmt: skip
 
     def _set_pushes(self, pushes: list[Push], left: np.ndarray) -> None:
-        """What nothing explains while something else moves it counts as its noise."""
+        """What nothing explains while something else moves it counts as its noise, at
+        all joints: where a push sets in, none moves as smoothly as it is taken to."""
         units = self.in_units(left)[:, : len(self.joints)]
         more = np.zeros_like(units)
         for push in pushes[len(self.pushes) :]:
             rows = list(push.rows)
-            more[rows] = UNWEIGHTED * np.sqrt(np.mean(units[rows] ** 2, axis=0))
+            size = np.sqrt(np.mean(units[rows] ** 2, axis=0))
+            more[rows] = UNWEIGHTED * np.maximum(size, self._needed_rms())
         self.pushes = pushes
         self._set(self.model_error, more)
 

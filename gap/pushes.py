@@ -15,7 +15,7 @@ from makebreak.gap.inverse import Track
 
 ROBUST = 1.4826  # Standard deviation over median absolute deviation, if normal.
 # Over what is left elsewhere, for so many test functions in a row (0.1 s apart).
-OUT, LEAST_ROWS = 8.0, 4
+OUT, LEAST_ROWS, BESIDE = 8.0, 4, 2
 MERGED_SEC = 0.35  # Between two of them less is one stretch.
 # At its peak, by far: less may be left of friction that is modelled a little wrongly.
 PEAK = 25.0
@@ -108,8 +108,8 @@ def _push(track: Track, joints, a: int, b: int, some, left, z, first: int) -> Pu
 
 
 def _stretches(track: Track, z: np.ndarray) -> list[tuple[int, int]]:
-    """[first, last) test functions of each stretch with enough that stand out, and one
-    more at each side: what it begins and ends in."""
+    """[first, last) test functions of each stretch with enough that stand out, and
+    those beside it: what it begins and ends in is smoothed away."""
     centre = track.bumps.centre
     out = np.flatnonzero(z > OUT)
     groups: list[list[int]] = []
@@ -119,7 +119,7 @@ def _stretches(track: Track, z: np.ndarray) -> list[tuple[int, int]]:
         else:
             groups.append([int(k)])
     return [
-        (max(g[0] - 1, 0), min(g[-1] + 2, len(z)))
+        (max(g[0] - BESIDE, 0), min(g[-1] + 1 + BESIDE, len(z)))
         for g in groups
         if len(g) >= LEAST_ROWS
     ]
