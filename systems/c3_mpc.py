@@ -28,7 +28,12 @@ from makebreak.systems.numerics.c3_projections import (
     QpProjection,
 )
 from makebreak.systems.numerics.first_calls import first_call
-from makebreak.systems.numerics.lcs import LCS, is_finite, is_finite_model
+from makebreak.systems.numerics.lcs import (
+    LCS,
+    contact_modes,
+    is_finite,
+    is_finite_model,
+)
 from makebreak.systems.numerics.timing import timed
 
 
@@ -56,6 +61,8 @@ class C3Config:
     options: C3Options = field(default_factory=C3Options)
     bounds: C3Bounds = field(default_factory=C3Bounds)
     residual_dt_sec: float = 0.05  # Time step at which r_comp is a velocity.
+    # The first knots keep the contact modes that the last plan's inputs have from x.
+    fixed_knots: int = 0
     clamp_command_gap: bool = True  # Treat penetration as touching in x_next.
 
 
@@ -96,6 +103,12 @@ class C3Mpc(LeafSystem):
             config.weights, config.projection, config.options, config.bounds
         )
         self._residual_dt = config.residual_dt_sec
+        self._fixed_knots = config.fixed_knots
+        if config.fixed_knots not in range(p.options.N + 1):
+            raise ValueError(
+                f"C3Config.fixed_knots is {config.fixed_knots}, expected an integer "
+                f"from 0 to N = {p.options.N}"
+            )
         self._clamp = config.clamp_command_gap
         self._period = period_sec
         N = p.options.N
@@ -159,7 +172,8 @@ class C3Mpc(LeafSystem):
             try:
                 if self._problem.options.warm_start:
                     warm = warm.shifted(min(self._period / dt, 1.0))
-                plan, warm = solve_c3(lcs, x, x_desired, self._problem, warm)
+                modes = self._modes(context, lcs, x, dt)
+                plan, warm = solve_c3(lcs, x, x_desired, self._problem, warm, modes)
             except C3Failure:
                 status = C3Status.SOLVE_FAILED
         write(self._status, status)
@@ -182,6 +196,17 @@ class C3Mpc(LeafSystem):
             return
         write(self._x_next, x_next)
         write(self._lam, lam)
+
+    def _modes(self, context, lcs, x, dt):
+        """Contact modes of the first knots under the last plan's inputs; or None."""
+        last = self._plan_now(context) if self._fixed_knots else None
+        if last is None or last.time is None:
+            return None
+        times = context.get_time() + dt * np.arange(self._fixed_knots)
+        try:
+            return contact_modes(lcs, x, last.at(times)[1])
+        except ValueError:  # No rollout, no modes: they stay free.
+            return None
 
     def _read_inputs(self, context):
         """SOLVED and (x, x_desired, lcs, lcs_command); or why not, and None."""
@@ -242,7 +267,7 @@ class C3Mpc(LeafSystem):
         write(self._age, age)
         write(self._u, plan_u[knot] if knot < len(plan_u) else self._u_idle)
 
-    def _calc_plan(self, context, output):
+    def _plan_now(self, context):
         states = self._plan_x, self._plan_u, self._plan_lam
         x, u, lam = (self._get(context, s).copy() for s in states)
         status, time, dt = (
@@ -250,4 +275,7 @@ class C3Mpc(LeafSystem):
             for s in (self._status, self._plan_time, self._plan_dt)
         )
         known = None if np.isnan(time) else time
-        output.set_value(Plan(x, u, lam, int(status), known, dt))
+        return Plan(x, u, lam, int(status), known, dt)
+
+    def _calc_plan(self, context, output):
+        output.set_value(self._plan_now(context))

@@ -14,6 +14,7 @@ from pydrake.solvers import ClarabelSolver, MathematicalProgram, SolverOptions
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from scipy.optimize import linprog, minimize
+from scipy.spatial.transform import Rotation
 
 from makebreak.scripts.bench_c3 import (
     OsqpC3,
@@ -32,6 +33,7 @@ from makebreak.systems.numerics.c3_mpc import (
     C3Options,
     C3Problem,
     C3Weights,
+    OrientationWeight,
     Plan,
     WarmStart,
     _qp_step,
@@ -66,7 +68,17 @@ from makebreak.systems.numerics.c3_qp import (
     within,
 )
 from makebreak.systems.numerics.lcp import solve_lcp
-from makebreak.systems.numerics.lcs import LCS, simulate
+from makebreak.systems.numerics.lcs import (
+    CLOSED,
+    FREE,
+    LCS,
+    OPEN,
+    contact_modes,
+    fix_modes,
+    fixed_forces,
+    simulate,
+)
+from makebreak.systems.numerics.orientation_cost import orientation_quadratic
 
 REFERENCE = Path(__file__).parent / "reference"
 CARTPOLE = np.load(REFERENCE / "c3_cartpole.npz")
@@ -819,7 +831,7 @@ def test_the_adjoint_gradient_is_that_of_finite_differences(seed):
     def cost(u):
         x, _, pushing = rolled_out(model, x0, u)
         _, extra = state_breach(x, x_lower, x_upper, penalty)
-        total = rollout_cost(x, u, x_desired, centre, p.Q, p.R, p.Q_N)
+        total = rollout_cost(x, u, x_desired, centre, p.Q[None], p.R, p.Q_N)
         return total + extra, x, pushing
 
     _, x, pushing = cost(u)
@@ -827,7 +839,7 @@ def test_the_adjoint_gradient_is_that_of_finite_differences(seed):
     gradient = np.zeros((5, 3))
     found = gradient, np.zeros((5, 3)), np.zeros((5, 3, 19))
     bounds = *unbounded(3), x_lower, x_upper
-    weights = p.Q, p.R, p.Q_N, penalty
+    weights = p.Q[None], p.R, p.Q_N, penalty
     backward(model, x, u, pushing, x_desired, centre, weights, bounds, found)
     numeric, h = np.zeros((5, 3)), 1e-6
     for i in np.ndindex(5, 3):
@@ -1156,3 +1168,205 @@ def test_config_reads_from_yaml_with_the_projection_as_a_tag():
     assert loaded.options == C3Options(N=7, penalise_input_change=True)
     system = C3Mpc(loaded, 0.0125)
     assert system.GetInputPort("x_desired").size() == 8 * 2
+
+
+# A cost on orientation.
+
+
+def on_sphere(q, step):
+    """The unit quaternion reached from q along a tangent step (4,)."""
+    length = np.linalg.norm(step)
+    return np.cos(length) * q + np.sinc(length / np.pi) * step
+
+
+@pytest.mark.parametrize("angle", [1e-6, 0.3, 2.0, 3.1])
+def test_the_orientation_cost_has_the_gradient_and_hessian_of_the_angle(angle):
+    rng = np.random.default_rng(0)
+    goal = Rotation.random(rng=0)
+    axis = rng.normal(size=3)
+    axis *= angle / np.linalg.norm(axis)
+    turned = Rotation.from_rotvec(axis) * goal
+    q, q_d = turned.as_quat(scalar_first=True), goal.as_quat(scalar_first=True)
+    Q, target = orientation_quadratic(q, -q_d)  # The same orientation as q_d.
+    assert (q - target) @ Q @ (q - target) == pytest.approx(angle**2, abs=1e-9)
+    assert np.linalg.eigvalsh(Q).min() > -1e-12
+
+    def cost(step):  # From scipy's rotations: nothing of ours.
+        x = on_sphere(q, step)
+        relative = Rotation.from_quat(x, scalar_first=True) * goal.inv()
+        return relative.magnitude() ** 2
+
+    tangents = np.linalg.svd(q[None])[2][1:]
+    h = 1e-4
+    for a in tangents:
+        gradient = (cost(h * a) - cost(-h * a)) / (2 * h)
+        np.testing.assert_allclose(2 * a @ Q @ (q - target), gradient, atol=1e-5)
+        for b in tangents:
+            if angle > 3.0:
+                continue  # The angle has a kink at pi, .04 rad away.
+            numeric = (
+                cost(h * (a + b)) - cost(h * (a - b))
+                - cost(h * (b - a)) + cost(-h * (a + b))
+            ) / (4 * h * h)  # fmt: skip
+            np.testing.assert_allclose(2 * a @ Q @ b, numeric, atol=1e-5)
+
+
+def test_the_weights_of_an_orientation_are_in_rad():
+    problem = C3Problem(turning_weights(3.0, 7.0))
+    x = np.zeros(14)
+    x[0], x[7:11] = 1.0, [np.cos(0.2), 0.0, np.sin(0.2), 0.0]
+    x_desired = np.tile(x, (6, 1))
+    x_desired[:, :4] = [np.cos(0.15), np.sin(0.15), 0.0, 0.0]  # .3 rad apart.
+    idle = turning_lcs()
+    cost = plan_cost(idle, x, np.zeros((5, 3)), x_desired, problem)
+    assert cost == pytest.approx((5 * 3.0 + 7.0) * 0.09, rel=1e-9)
+
+
+def turning_weights(weight, weight_N=None, start=0):
+    Q = np.zeros(14)
+    Q[4:7] = 0.01
+    G = np.repeat([0.001, 1.0, 0.001, 1.0], [14, 1, 3, 1])
+    orientation = [OrientationWeight(start, weight, weight_N)]
+    return C3Weights(Q, np.full(3, 1e-3), G, np.ones(19), None, orientation)
+
+
+def turning_lcs(q=(1.0, 0.0, 0.0, 0.0), dt=0.1):
+    """x = [quaternion, omega in the world, 7 more]: a free body turned by torques u,
+    linearised about q; its contact is far away."""
+    L = np.array(
+        [[-q[1], -q[2], -q[3]], [q[0], q[3], -q[2]],
+         [-q[3], q[0], q[1]], [q[2], -q[1], q[0]]]
+    )  # fmt: skip
+    A, B = np.eye(14), np.zeros((14, 3))
+    A[:4, 4:7] = 0.5 * dt * L
+    B[4:7] = dt * np.eye(3)
+    B[:4] = 0.5 * dt * L @ B[4:7]
+    n = np.zeros
+    return LCS(
+        A, B, n((14, 1)), n(14), n((1, 14)), np.eye(1), n((1, 3)), np.ones(1), dt
+    )
+
+
+@pytest.mark.parametrize("polish", [0, 2])
+def test_a_body_is_turned_the_short_way_to_its_desired_orientation(polish):
+    options = C3Options(N=5, rounds=2, polish=polish)
+    problem = C3Problem(turning_weights(10.0), None, options)
+    start = Rotation.from_rotvec([0.0, 0.0, 2.5])
+    goal = Rotation.from_rotvec([1.2, 0.0, 0.0]) * start
+    x, angles = np.zeros(14), []
+    x[:4] = start.as_quat(scalar_first=True)
+    x_desired = np.zeros((6, 14))
+    x_desired[:, :4] = -goal.as_quat(scalar_first=True)  # The far one of the two signs.
+    for _ in range(30):
+        now = Rotation.from_quat(x[:4], scalar_first=True)
+        angles.append((goal * now.inv()).magnitude())
+        plan, _ = solve_c3(turning_lcs(x[:4]), x, x_desired, problem)
+        x[4:7] += 0.1 * plan.u[0]
+        turn = Rotation.from_rotvec(0.1 * x[4:7])
+        x[:4] = (turn * now).as_quat(scalar_first=True)
+    assert angles[0] == pytest.approx(1.2)
+    assert max(angles) < 1.2 + 1e-9 and angles[-1] < 0.02
+
+
+def test_bad_orientation_weights_are_refused_by_name():
+    for start, weight, message in (
+        (11, 1.0, "starts at 11, expected an integer from 0 to 10"),
+        (0.5, 1.0, "starts at 0.5"),
+        (0, -1.0, "-1.0, expected a number >= 0"),
+        (4, 1.0, "Q weighs the quaternion's numbers too"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            C3Problem(turning_weights(weight, start=start))
+    problem = C3Problem(turning_weights(1.0))
+    x = np.zeros(14)
+    with pytest.raises(C3Failure, match="x0: the quaternion at 0 is"):
+        solve_c3(turning_lcs(), x, np.zeros((6, 14)), problem)
+
+
+# Contact modes that are held.
+
+
+def random_steps(seed, n_steps=4):
+    """The ball's LCS with eps_c, inputs, and the exact rollout."""
+    rng = np.random.default_rng(seed)
+    lcs, x0, _, _ = ball(True, 5)
+    lcs = replace(lcs, F=lcs.F + 5e-4 * np.eye(16))
+    x0 = x0 + 0.02 * rng.normal(size=19)
+    u = rng.normal(size=(n_steps, 3))
+    x, lam = [x0], []
+    for u_k in u:
+        step = simulate(lcs, x[-1], u_k)
+        x.append(step[0])
+        lam.append(step[1])
+    return lcs, x0, u, np.array(x), np.array(lam)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_with_the_true_modes_held_the_rollout_needs_no_lcp(seed):
+    lcs, x0, u, x, lam = random_steps(seed)
+    modes = contact_modes(lcs, x0, u)
+    assert (modes == CLOSED).any() and (modes == OPEN).any()
+    for k in range(len(u)):
+        held = fix_modes(lcs, modes[k])
+        assert (held.n_x, held.n_lam) == (lcs.n_x, lcs.n_lam)
+        free = modes[k] == FREE
+        assert not held.D[:, ~free].any()
+        x_next, lam_free = simulate(held, x[k], u[k])
+        np.testing.assert_allclose(x_next, x[k + 1], atol=1e-9)
+        forces = fixed_forces(lcs, modes[k], x[k], u[k], lam_free)
+        np.testing.assert_allclose(forces, lam[k], atol=1e-7)
+
+
+def test_some_modes_held_and_the_others_free_is_the_same_lcp():
+    lcs, x0, u, x, lam = random_steps(1)
+    modes = contact_modes(lcs, x0, u)
+    modes[:, ::3] = FREE
+    for k in range(len(u)):
+        x_next, lam_free = simulate(fix_modes(lcs, modes[k]), x[k], u[k])
+        np.testing.assert_allclose(x_next, x[k + 1], atol=1e-9)
+        forces = fixed_forces(lcs, modes[k], x[k], u[k], lam_free)
+        np.testing.assert_allclose(forces, lam[k], atol=1e-7)
+
+
+@pytest.mark.parametrize("projection", [PlusProjection(), QpProjection()])
+def test_a_plan_keeps_the_modes_that_are_held(projection):
+    plus = isinstance(projection, PlusProjection)
+    lcs, x0, x_desired, p = ball(plus, 5)
+    lcs = replace(lcs, F=lcs.F + 5e-4 * np.eye(16))
+    problem = C3Problem(C3Weights(p.Q, p.R, p.G, p.U), projection, p.options)
+    free, _ = solve_c3(lcs, x0, x_desired, problem)
+    modes = contact_modes(lcs, x0, free.u)[:3]
+    plan, warm = solve_c3(lcs, x0, x_desired, problem, modes=modes)
+    assert np.isfinite(warm.delta).all() and np.isfinite(warm.w).all()
+    for k in range(3):
+        step = lcs.A @ plan.x[k] + lcs.B @ plan.u[k] + lcs.D @ plan.lam[k] + lcs.d
+        np.testing.assert_allclose(step, plan.x[k + 1], atol=1e-6)
+        gap = lcs.E @ plan.x[k] + lcs.F @ plan.lam[k] + lcs.H @ plan.u[k] + lcs.c
+        assert not plan.lam[k, modes[k] == OPEN].any()
+        np.testing.assert_allclose(gap[modes[k] == CLOSED], 0.0, atol=1e-7)
+    # Without them the relaxed forces of these knots do break the complementarity.
+    gap = free.x[:3] @ lcs.E.T + free.lam[:3] @ lcs.F.T + free.u[:3] @ lcs.H.T + lcs.c
+    assert abs(gap * free.lam[:3]).max() > 1e-3
+    with pytest.raises(ValueError, match=r"modes is \(6, 16\), expected at most 5"):
+        solve_c3(lcs, x0, x_desired, problem, modes=np.zeros((6, 16)))
+
+
+def test_the_system_holds_the_modes_of_its_last_plan():
+    lcs, x0, x_desired, p = ball(True, 5)
+    weights = C3Weights(p.Q, p.R, p.G, p.U)
+    system = C3Mpc(C3Config(weights, options=p.options, fixed_knots=2), 0.05)
+    simulator = Simulator(system)
+    for name, value in (
+        ("x", x0), ("x_desired", x_desired.ravel()), ("lcs", AbstractValue.Make(lcs)),
+    ):  # fmt: skip
+        fix(simulator, name, value)
+    simulator.AdvanceTo(0.01)
+    first = read(simulator, "plan")
+    expected, _ = solve_c3(lcs, x0, x_desired, p)
+    np.testing.assert_array_equal(first.u, expected.u)  # No plan, no modes.
+    simulator.AdvanceTo(0.06)
+    modes = contact_modes(lcs, x0, first.u[1:3])  # A knot later.
+    expected, _ = solve_c3(lcs, x0, x_desired, p, modes=modes)
+    np.testing.assert_allclose(read(simulator, "plan").u, expected.u, atol=1e-12)
+    with pytest.raises(ValueError, match="fixed_knots is 6, expected an .* N = 5"):
+        C3Mpc(C3Config(weights, options=p.options, fixed_knots=6), 0.05)

@@ -43,10 +43,17 @@ from makebreak.systems.numerics.c3_qp import (
 )
 from makebreak.systems.numerics.lcp import SOLVED, solve_lcp_kernel
 from makebreak.systems.numerics.lcs import (
+    FREE,
     LCS,
+    fix_modes,
+    fixed_forces,
     is_finite,
     is_finite_model,
     simulate,
+)
+from makebreak.systems.numerics.orientation_cost import (
+    orientation_quadratic,
+    squared_angle,
 )
 
 
@@ -56,6 +63,15 @@ class C3Failure(RuntimeError):
 
 def _required() -> Any:
     return field(default_factory=lambda: np.zeros(0))
+
+
+@dataclass
+class OrientationWeight:
+    """The squared angle [rad^2] between a quaternion of x and that of x_desired."""
+
+    start: int = 0  # Of the quaternion [w x y z] in x.
+    weight: float = 0.0  # [1/rad^2]
+    weight_N: float | None = None  # At the last knot; None: weight.
 
 
 @dataclass
@@ -71,6 +87,8 @@ class C3Weights:
     G: np.ndarray = _required()  # (n_z,) consensus; lam and eta > 0, x and u >= 0.
     U: np.ndarray = _required()  # (n_z,) projection; lam and eta (C3: and x) > 0.
     Q_N: np.ndarray | None = None  # (n_x,) last state; None: Q.
+    # Beside Q, which must be zero at these quaternions.
+    orientation: list[OrientationWeight] = field(default_factory=list)
 
 
 @dataclass
@@ -172,6 +190,8 @@ class C3Problem:
         self.Q, self.R = _square("Q", weights.Q), _square("R", weights.R)
         self.Q_N = self.Q if weights.Q_N is None else _square("Q_N", weights.Q_N)
         self.n_x, self.n_u = len(self.Q), len(self.R)
+        self._Q = self.Q[None]
+        self.orientation = [self._checked(o, weights) for o in weights.orientation]
         if self.Q_N.shape != self.Q.shape:
             raise ValueError(
                 f"C3Weights.Q_N is {self.Q_N.shape}, expected {self.Q.shape} as Q"
@@ -189,6 +209,25 @@ class C3Problem:
                 f"C3Bounds: {self.lower[i]} to {self.upper[i]} for entry "
                 f"{i - self.n_lam} of [u, x], expected lower <= upper"
             )
+
+    def _checked(self, o, weights):
+        name = f"C3Weights.orientation: OrientationWeight({o.start}, {o.weight})"
+        if o.start != int(o.start) or not 0 <= o.start <= self.n_x - 4:
+            raise ValueError(
+                f"{name} starts at {o.start}, expected an integer from 0 to "
+                f"{self.n_x - 4}"
+            )
+        for weight in (o.weight, 0.0 if o.weight_N is None else o.weight_N):
+            if not 0.0 <= weight < np.inf:
+                raise ValueError(f"{name}: {weight}, expected a number >= 0")
+        of = slice(o.start, o.start + 4)
+        for matrix in (self.Q, self.Q_N):
+            if matrix[of].any():
+                raise ValueError(
+                    f"{name}: Q weighs the quaternion's numbers too, expected zeros "
+                    "there"
+                )
+        return o
 
     def _check_consensus_weights(self, n_contact):
         parts = "[x, lam, u, eta]" if self.is_plus else "[x, lam, u]"
@@ -227,6 +266,35 @@ class C3Problem:
                 )
             parts.append(part)
         return _read_only(np.concatenate(parts))
+
+    def state_cost(self, x0, x_desired):
+        """Q of the knots, of the last one, and targets: (x - target)' Q (x - target).
+
+        Without orientation weights Q (1, n_x, n_x) is that of the weights. With them
+        the knots' Q (N, n_x, n_x), Q_N and the targets (N + 1, n_x) are the quadratic
+        of the angles' cost about the orientation of x0.
+        """
+        if not self.orientation:
+            return self._Q, self.Q_N, x_desired
+        N = self.options.N
+        Q, goal = np.tile(self.Q, (N, 1, 1)), x_desired.copy()
+        Q_N = self.Q_N.copy()
+        for o in self.orientation:
+            of = slice(o.start, o.start + 4)
+            for k in range(N + 1):
+                whole = Q_N if k == N else Q[k]
+                for name, q in (("x0", x0[of]), (f"x_desired[{k}]", x_desired[k, of])):
+                    if not np.linalg.norm(q) > 0.5:
+                        raise C3Failure(
+                            f"{name}: the quaternion at {o.start} is {q}, expected a "
+                            "unit one"
+                        )
+                weight = o.weight if k < N or o.weight_N is None else o.weight_N
+                local, goal[k, of] = orientation_quadratic(x0[of], x_desired[k, of])
+                whole[of, of] += weight * local
+        for a in (Q, Q_N):
+            a.setflags(write=False)  # To the compiler another type, like p.Q's.
+        return Q, Q_N, goal
 
     def cold_start(self) -> WarmStart:
         N = self.options.N
@@ -311,6 +379,7 @@ def solve_c3(
     x_desired,
     problem: C3Problem,
     warm: WarmStart | None = None,
+    modes=None,
 ):
     """One solve of C3, from the state x0.
 
@@ -321,12 +390,27 @@ def solve_c3(
         problem: weights, projection, options, bounds.
         warm: what the last solve returned; None: a first solve. Its u is the u_prev of
             the input-change penalty; its delta and w are used if options.warm_start.
+        modes: (n, n_lam) contact modes that the first n knots keep, as contact_modes
+            gives them; None: all are free. The forces of contacts that are held closed
+            may come out negative.
 
     Returns: Plan, and the WarmStart for the next solve.
     Raises: ValueError on wrong shapes; C3Failure where there is no result.
     """
     p, o = problem, problem.options
-    models = _one_per_knot(lcs, p)
+    models = given_models = _one_per_knot(lcs, p)
+    if modes is not None and len(modes):
+        modes = np.asarray(modes)
+        if modes.shape[1:] != (p.n_lam,) or len(modes) > o.N:
+            raise ValueError(
+                f"solve_c3: modes is {modes.shape}, expected at most {o.N} rows of "
+                f"{p.n_lam}"
+            )
+        given_models = [models[k % len(models)] for k in range(o.N)]
+        models = [
+            fix_modes(m, modes[k]) if k < len(modes) else m
+            for k, m in enumerate(given_models)
+        ]
     x0 = np.array(x0, float, order="C")
     x_desired = np.array(x_desired, float, order="C")
     if x0.shape != (p.n_x,) or x_desired.shape != (o.N + 1, p.n_x):
@@ -348,7 +432,9 @@ def solve_c3(
         )
     scale = 1.0
     if o.scale_lam:
-        A_norm, D_norm = np.linalg.norm(models[0].A), np.linalg.norm(models[0].D)
+        A_norm, D_norm = (
+            np.linalg.norm(a) for a in (given_models[0].A, given_models[0].D)
+        )
         if not 0.0 < D_norm < np.inf:
             raise C3Failure("D is zero or not finite: there is no scale for lam")
         scale = float(A_norm / D_norm)
@@ -370,9 +456,14 @@ def solve_c3(
         lam0, status = solve_lcp_kernel(F[0], E[0] @ x0 + c[0])
         if status != SOLVED:
             raise C3Failure("lam_0: the LCP at x_0 has no solution")
+    Q, Q_N, x_goal = p.state_cost(x0, x_desired)
     h = np.zeros((o.N + 1, AB.shape[2]))  # What stays of the QP's linear term.
-    h[:, p.n_lam + p.n_u :] = x_desired @ p.Q
-    h[o.N, p.n_lam + p.n_u :] = p.Q_N @ x_desired[o.N]
+    h[:, p.n_lam + p.n_u :] = (
+        x_goal @ Q[0]
+        if len(Q) == 1
+        else np.array([*(Q[k] @ x_goal[k] for k in range(o.N)), Q_N @ x_goal[o.N]])
+    )
+    h[o.N, p.n_lam + p.n_u :] = Q_N @ x_goal[o.N]
     if o.penalise_input_change:
         h[: o.N, p.n_lam : p.n_lam + p.n_u] = warm.u @ p.R
     delta, w = np.zeros((o.N, p.n_z)), np.zeros((o.N, p.n_z))
@@ -382,7 +473,7 @@ def solve_c3(
         delta[:, : p.n_x] = x0
 
     model = AB, d, C, c
-    weights = p.Q, p.R, p.Q_N, p.G
+    weights = Q, p.R, Q_N, p.G
     unbounded = np.isinf(p.lower).all() and np.isinf(p.upper).all()
     bounds = None if unbounded else (p.lower, p.upper)
     given = h, x0, lam0
@@ -407,16 +498,28 @@ def solve_c3(
             tuple(_stacked(models, name) for name in "ABDdEFHc"),
             x0,
             starts,
-            x_desired,
+            x_goal,
             u_centre,
-            (p.Q, p.R, p.Q_N),
+            (Q, p.R, Q_N),
             (u_lower, u_upper, x_lower, x_upper),
             o.polish,
         )
         if found[3] < np.inf:  # Else no start can be rolled out: C3's plan remains.
             x, u, lam, _ = found
+    delta, w = delta * unit, w * unit
+    if modes is not None and len(modes):
+        lam = lam.copy()
+        for k, mode in enumerate(modes):
+            m = given_models[k]
+            lam[k] = fixed_forces(m, mode, x[k], u[k], lam[k])
+            fixed = np.flatnonzero(mode != FREE)  # Of their rows nothing was solved.
+            delta[k, p.n_x + fixed], w[k, p.n_x + fixed] = lam[k, fixed], 0.0
+            if p.is_plus:
+                gap = m.E @ x[k] + m.F @ lam[k] + m.H @ u[k] + m.c
+                delta[k, i_u + p.n_u + fixed] = np.maximum(gap[fixed], 0.0)
+                w[k, i_u + p.n_u + fixed] = 0.0
     plan = Plan(x, u, lam)
-    return plan, WarmStart(plan.u, delta * unit, w * unit)
+    return plan, WarmStart(plan.u, delta, w)
 
 
 def _one_per_knot(lcs, p: C3Problem) -> list[LCS]:
@@ -456,10 +559,10 @@ def _admm(model, weights, bounds, given, delta, w, options, lcp):
     """
     (Q, R, Q_N, G), (h, x0, lam0) = weights, given
     (N, n_z), n_lam = delta.shape, model[2].shape[1]
-    sides = np.zeros((N + 1, n_lam + len(R) + len(Q)), np.int64)
+    sides = np.zeros((N + 1, n_lam + len(R) + len(Q_N)), np.int64)
 
     def qp_step(G, target):
-        x, v = np.empty((N + 1, len(Q))), np.empty((N, n_lam + len(R)))
+        x, v = np.empty((N + 1, len(Q_N))), np.empty((N, n_lam + len(R)))
         z = np.empty((N, n_z))
         status = _qp_step(
             model, (Q, R, Q_N, G), bounds, (h, target, x0, lam0), (z, x, v, sides)
@@ -512,7 +615,7 @@ def _admm_plus(
     """The same for C3+, compiled as a whole; the first result is _qp_step's status."""
     (N, n_z), n_lam = delta.shape, C.shape[1]
     model = AB, d, C, c
-    x, v = np.empty((N + 1, len(Q))), np.empty((N, n_lam + len(R)))
+    x, v = np.empty((N + 1, len(Q_N))), np.empty((N, n_lam + len(R)))
     z, sides = np.empty((N, n_z)), np.zeros((N + 1, AB.shape[2]), np.int64)
     inputs = np.zeros((rounds + 1, N, len(R)))
     for r in range(rounds):
@@ -523,7 +626,7 @@ def _admm_plus(
             return status, x, v, delta, w, inputs
         inputs[r] = v[:, n_lam:]
         delta = np.empty((N, n_z))
-        project_plus(z + w, U, len(Q), n_lam, delta)
+        project_plus(z + w, U, len(Q_N), n_lam, delta)
         w = (w + z - delta) / rho
         G = rho * G
     status = _qp_step(
@@ -539,7 +642,7 @@ def _qp_step(model, weights, bounds, given, found):
 
     Args:
         model: AB = [D B A], d, C = [F H E], c, each (K, ...) with K = 1 or N.
-        weights: Q, R, Q_N and the diagonal G.
+        weights: Q (1 or N, n_x, n_x), R, Q_N and the diagonal G.
         bounds: lower, upper over [lam, u, x]; None where there are none. (That is
             another type, for which the methods with bounds are not compiled.)
         given: h (N + 1, n) the linear term of the planning cost over [lam, u, x],
@@ -556,23 +659,25 @@ def _qp_step(model, weights, bounds, given, found):
     i_eta, plus = n, n_z > n
     # Stage cost and linear term: the planning cost, and |z - target|^2_G with
     # eta = C [v, x] + c put in.
-    T, h = np.zeros((K, n, n)), h_plan.copy()
+    K_T = max(K, len(Q))
+    T, h = np.zeros((K_T, n, n)), h_plan.copy()
     T[:, n_lam:n_v, n_lam:n_v] = R
-    T[:, n_v:, n_v:] = Q
+    for k in range(K_T):
+        T[k, n_v:, n_v:] = Q[k % len(Q)]
     for i in range(n):
         at = n_x + i if i < n_v else i - n_v  # Of [v, x] in z = [x, v, eta].
-        for k in range(K):
+        for k in range(K_T):
             T[k, i, i] += G[at]
         for k in range(N):
             h[k, i] += G[at] * target[k, at]
     if plus:
-        for k in range(K):
+        for k in range(K_T):
             for m in range(n_lam):
                 for i in range(n):
-                    a = C[k, m, i] * G[i_eta + m]
+                    a = C[k % K, m, i] * G[i_eta + m]
                     if a != 0.0:
                         for j in range(n):
-                            T[k, i, j] += a * C[k, m, j]
+                            T[k, i, j] += a * C[k % K, m, j]
         for k in range(N):
             for m in range(n_lam):
                 a = G[i_eta + m] * (target[k, i_eta + m] - c[k % K, m])
@@ -606,18 +711,25 @@ def _qp_step(model, weights, bounds, given, found):
 def plan_cost(lcs: LCS | Sequence[LCS], x0, u, x_desired, problem: C3Problem) -> float:
     """What the inputs u (N, n_u) really cost: rolled out with exact contact forces.
 
-    Returns: sum (x - x_desired)'Q(x - x_desired) + u'R u, Q_N at the last state. The
-        input-change penalty, ADMM's own terms and the bounds are no part of it.
+    Returns: sum (x - x_desired)'Q(x - x_desired) + u'R u, Q_N at the last state, and
+        the squared angles by their weights. The input-change penalty, ADMM's own terms
+        and the bounds are no part of it.
     Raises: ValueError if an LCP of the rollout has no solution.
     """
-    x, cost = np.asarray(x0, float), 0.0
-    models = _one_per_knot(lcs, problem)
-    for k in range(len(u)):
+    p, x, cost = problem, np.asarray(x0, float), 0.0
+    models = _one_per_knot(lcs, p)
+    for k in range(len(u) + 1):
+        last = k == len(u)
         e = x - x_desired[k]
-        cost += e @ problem.Q @ e + u[k] @ problem.R @ u[k]
-        x, _ = simulate(models[k % len(models)], x, u[k])
-    e = x - x_desired[len(u)]
-    return float(cost + e @ problem.Q_N @ e)
+        cost += e @ (p.Q_N if last else p.Q) @ e
+        for o in p.orientation:
+            of = slice(o.start, o.start + 4)
+            weight = o.weight_N if last and o.weight_N is not None else o.weight
+            cost += weight * squared_angle(x[of], x_desired[k][of])
+        if not last:
+            cost += u[k] @ p.R @ u[k]
+            x, _ = simulate(models[k % len(models)], x, u[k])
+    return float(cost)
 
 
 def with_gap_residual(lcs: LCS, r_comp, residual_dt_sec, clamp: bool) -> LCS:

@@ -159,10 +159,11 @@ def roll_out(model, x0, plan, step, bounds, found):
 
 @njit(cache=True)
 def rollout_cost(x, u, x_desired, u_centre, Q, R, Q_N):
-    """sum |x - x_desired|^2_Q + |u - u_centre|^2_R, Q_N at the last state."""
+    """sum |x - x_desired|^2_Q + |u - u_centre|^2_R, Q_N at the last state;
+    Q (1 or N, n_x, n_x)."""
     total, N = 0.0, len(u)
     for k in range(N + 1):
-        W = Q if k < N else Q_N
+        W = Q[k % len(Q)] if k < N else Q_N
         for i in range(x.shape[1]):
             e = x[k, i] - x_desired[k, i]
             if e != 0.0:
@@ -265,10 +266,11 @@ def backward(model, x, u, pushing, x_desired, u_centre, weights, bounds, found):
                         W[a, b] += f * PJ[i, b]
         for i in range(n_x):
             for j in range(n_x):
-                e = 2.0 * Q[i, j] * (x[k, j] - x_desired[k, j])
+                weight = 2.0 * Q[k % len(Q), i, j]
+                e = weight * (x[k, j] - x_desired[k, j])
                 g[i] += e
                 a_next[i] += e
-                W[i, j] += 2.0 * Q[i, j]
+                W[i, j] += weight
             beyond = _beyond(x[k, i], x_lower[i], x_upper[i]) if k > 0 else 0.0
             if beyond != 0.0:
                 g[i] += 2.0 * penalty * beyond

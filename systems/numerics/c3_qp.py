@@ -73,7 +73,7 @@ def factor(fac, costs, T_N, diagonal, n_fixed):
 
     Args:
         fac: Factor, its AB and d already set; the rest is overwritten.
-        costs: (K, n, n) symmetric stage cost T over [v, x].
+        costs: (K, n, n) symmetric stage cost T over [v, x], K = 1 or N too.
         T_N: (n_x, n_x) symmetric cost of x_N.
         diagonal: (N + 1, n) added to the diagonals of T, knot by knot (of T_N in the
             last row, entries n_v and on); (0, 0) adds nothing.
@@ -90,7 +90,7 @@ def factor(fac, costs, T_N, diagonal, n_fixed):
         for i in range(n_x):
             P[N, i, i] += diagonal[N, n_v + i]
     for k in range(N - 1, -1, -1):
-        P_next, AB, T = P[k + 1], models[k % K], costs[k % K]
+        P_next, AB, T = P[k + 1], models[k % K], costs[k % len(costs)]
         d = offsets[k % len(offsets)]
         for i in range(n_x):
             total = 0.0

@@ -109,3 +109,77 @@ def simulate(lcs: LCS, x, u):
     """
     lam = solve_lcp(lcs.F, lcs.E @ x + lcs.H @ u + lcs.c)
     return lcs.A @ x + lcs.B @ u + lcs.D @ lam + lcs.d, lam
+
+
+# What is known of an entry of lam: nothing; it is zero; its w is zero.
+FREE, OPEN, CLOSED = 0, 1, 2
+
+
+def contact_modes(models, x0, u):
+    """The modes that inputs lead to: (N, n_lam) of FREE, OPEN and CLOSED.
+
+    Args: models: one LCS, or N of them in a list; x0 (n_x,); u (N, n_u).
+    Returns: OPEN where w > 0, CLOSED where lam > 0, FREE where neither is (to 1e-9 of
+        the largest), step by step from x0.
+    Raises: ValueError as `simulate`.
+    """
+    models = [models] if isinstance(models, LCS) else models
+    x, modes = np.asarray(x0, float), []
+    for k, u_k in enumerate(u):
+        lcs = models[k % len(models)]
+        w_free = lcs.E @ x + lcs.H @ u_k + lcs.c
+        x, lam = simulate(lcs, x, u_k)
+        w = w_free + lcs.F @ lam
+        mode = np.where(w > 1e-9 * max(1e-12, np.abs(w_free).max()), OPEN, FREE)
+        mode[lam > 1e-9 * max(1e-12, lam.max())] = CLOSED
+        modes.append(mode)
+    return np.array(modes)
+
+
+def fix_modes(lcs: LCS, modes) -> LCS:
+    """The LCS in which some contacts stay open and others stay closed, of equal sizes.
+
+    A closed one's force lam_S = -F_SS^-1 (E_S x + H_S u + F_SR lam_R + c_S) is put into
+    everything else, whatever its sign (where F_SS is singular: the smallest such
+    force). Its own row, and that of an open one, holds nothing any more: lam = 0,
+    w = lam + 1.
+
+    Args: modes (n_lam,), each FREE, OPEN or CLOSED. See `fixed_forces`.
+    """
+    modes = np.asarray(modes)
+    on, free = np.flatnonzero(modes == CLOSED), np.flatnonzero(modes == FREE)
+    if len(free) == lcs.n_lam:
+        return lcs
+    X_x, X_u, X_lam, X_1 = _closed(lcs, on, free)
+    n, D_S, F_S = lcs.n_lam, lcs.D[:, on], lcs.F[np.ix_(free, on)]
+    D, E, F = np.zeros((lcs.n_x, n)), np.zeros((n, lcs.n_x)), np.eye(n)
+    H, c = np.zeros((n, lcs.n_u)), np.ones(n)
+    D[:, free] = lcs.D[:, free] - D_S @ X_lam
+    E[free], H[free] = lcs.E[free] - F_S @ X_x, lcs.H[free] - F_S @ X_u
+    F[np.ix_(free, free)] = lcs.F[np.ix_(free, free)] - F_S @ X_lam
+    c[free] = lcs.c[free] - F_S @ X_1
+    A, B, d = lcs.A - D_S @ X_x, lcs.B - D_S @ X_u, lcs.d - D_S @ X_1
+    return LCS(A, B, D, d, E, F, H, c, lcs.dt, lcs.phi)
+
+
+def fixed_forces(lcs: LCS, modes, x, u, lam):
+    """lam (n_lam,) of the whole LCS, from that of `fix_modes` at x (n_x,), u (n_u,)."""
+    modes = np.asarray(modes)
+    on, free = np.flatnonzero(modes == CLOSED), np.flatnonzero(modes == FREE)
+    X_x, X_u, X_lam, X_1 = _closed(lcs, on, free)
+    whole = np.zeros(lcs.n_lam)
+    whole[free] = lam[free]
+    whole[on] = -(X_x @ x + X_u @ u + X_lam @ lam[free] + X_1)
+    return whole
+
+
+def _closed(lcs, on, free):
+    """F_SS^-1 times E_S, H_S, F_SR and c_S."""
+    parts = lcs.E[on], lcs.H[on], lcs.F[np.ix_(on, free)], lcs.c[on, None]
+    whole = np.hstack(parts)
+    if len(on):
+        F_S = lcs.F[np.ix_(on, on)]
+        whole = np.linalg.lstsq(F_S, whole, rcond=1e-10)[0]
+    ends = np.cumsum([part.shape[1] for part in parts])
+    *first, last = np.split(whole, ends[:-1], axis=1)
+    return *first, last[:, 0]
