@@ -37,6 +37,7 @@ from makebreak.systems.numerics.c3_mpc import (
     solve_c3,
 )
 from makebreak.systems.numerics.c3_projections import (
+    ExactProjection,
     PlusProjection,
     QpProjection,
     project_exact,
@@ -412,8 +413,9 @@ def variants(repeats: int):
         )
         ms = median_ms(partial(solve_c3, lcs, x0, x_desired, problem), repeats)
         found.append({"what": f"C3+, ball, N 5, n_lam {n}", "value": ms, "unit": "ms"})
-        if n > 16:
+        if n > 32:
             continue
+        nodes = ExactProjection().nodes_max
         E, F, H, c = (np.array(a, order="C") for a in (lcs.E, lcs.F, lcs.H, lcs.c))
         U = np.r_[U[:19], U[19 : 19 + n], U[19 + n : 22 + n]]
         rng = np.random.default_rng(0)
@@ -422,7 +424,8 @@ def variants(repeats: int):
         )
         times = [
             median_ms(
-                partial(project_exact, zk, U, E, F, H, c, np.empty((1, n + 22))), 3
+                partial(project_exact, zk, U, E, F, H, c, nodes, np.empty((1, n + 22))),
+                3,
             )
             for zk in z[:, None]
         ]

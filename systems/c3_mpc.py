@@ -132,6 +132,7 @@ class C3Mpc(LeafSystem):
         # How old the plan is, and how long its knots are [s].
         self._age, self._plan_dt = state(1), state(1, value=1.0)
         self._plan_time = state(1, value=np.nan)  # Of its first knot [s].
+        self._plan_cut = state(1)  # Its projections that were cut short.
         self._plan_x = state(N + 1, p.n_x)
         self._plan_u = state(N, p.n_u, value=self._u_idle)
         self._plan_lam = state(N, p.n_lam)
@@ -183,6 +184,7 @@ class C3Mpc(LeafSystem):
         write(self._age, 0.0)
         write(self._plan_dt, dt)
         write(self._plan_time, context.get_time())
+        write(self._plan_cut, plan.cut_projections)
         write(self._u, plan.u[0])
         write(self._plan_x, plan.x)
         write(self._plan_u, plan.u)
@@ -270,12 +272,12 @@ class C3Mpc(LeafSystem):
     def _plan_now(self, context):
         states = self._plan_x, self._plan_u, self._plan_lam
         x, u, lam = (self._get(context, s).copy() for s in states)
-        status, time, dt = (
+        status, time, dt, cut = (
             float(self._get(context, s)[0])
-            for s in (self._status, self._plan_time, self._plan_dt)
+            for s in (self._status, self._plan_time, self._plan_dt, self._plan_cut)
         )
         known = None if np.isnan(time) else time
-        return Plan(x, u, lam, int(status), known, dt)
+        return Plan(x, u, lam, int(status), known, dt, int(cut))
 
     def _calc_plan(self, context, output):
         output.set_value(self._plan_now(context))

@@ -366,7 +366,10 @@ def test_exact_projection_of_sixteen_forces_is_that_of_its_four_parts():
                 np.zeros((n, 0)), c[at],
             )  # fmt: skip
         delta = np.empty(32)
-        assert project_exact(z[None], U, E, F, np.zeros((16, 0)), c, delta[None])
+        assert (
+            project_exact(z[None], U, E, F, np.zeros((16, 0)), c, 10**6, delta[None])
+            == 0
+        )
         # Clarabel: a relative gap of 1e-8.
         np.testing.assert_allclose(U @ (delta - z) ** 2, best, rtol=1e-6)
 
@@ -385,13 +388,43 @@ def test_exact_projection_of_the_ball_never_fails(n_f, eps_c):
         z = np.r_[BALL["x0"] + 0.05 * rng.normal(size=19), rng.normal(size=n + 3)]
         z[19 : 19 + n] *= 5.0
         delta = np.empty(22 + n)
-        assert project_exact(z[None], U, E, F, H, c, delta[None])
+        assert project_exact(z[None], U, E, F, H, c, 10**6, delta[None]) == 0
         lam = delta[19 : 19 + n]
         gap = E @ delta[:19] + F @ lam + H @ delta[-3:] + c
         # Rounding of the sums that make the gap.
         size = (np.abs(E) @ np.abs(delta[:19]) + np.abs(F) @ lam).max()
         assert lam.min() >= 0.0 and gap.min() >= -1e-9 * size
         assert np.minimum(lam, gap / size).max() < 1e-9
+
+
+@pytest.mark.parametrize("nodes_max", [1, 20, 200])
+def test_an_exact_projection_that_is_cut_short_obeys_and_says_so(nodes_max):
+    problem, lcs = ball(False, 5)[3], ball_lcs(8, None)
+    E, F, H, c = (np.array(a, order="C") for a in (lcs.E, lcs.F, lcs.H, lcs.c))
+    rng = np.random.default_rng(0)
+    U = np.r_[problem.U[:19], np.full(32, problem.U[19]), problem.U[-3:]]
+    z = np.r_[BALL["x0"] + 0.05 * rng.normal(size=19), 5.0 * rng.normal(size=35)]
+    cut, whole = np.empty(54), np.empty(54)
+    assert project_exact(z[None], U, E, F, H, c, nodes_max, cut[None]) == 1
+    lam, gap = cut[19:51], E @ cut[:19] + F @ cut[19:51] + H @ cut[-3:] + c
+    size = (np.abs(E) @ np.abs(cut[:19]) + np.abs(F) @ lam).max()
+    assert lam.min() >= 0.0 and gap.min() >= -1e-9 * size
+    assert np.minimum(lam, gap / size).max() < 1e-9
+    assert project_exact(z[None], U, E, F, H, c, 10**5, whole[None]) == 0
+    # Not nearer than the nearest, and not far away: at most twice the squared distance.
+    least, found = (U @ (d - z) ** 2 for d in (whole, cut))
+    assert least * (1.0 - 1e-9) <= found <= 2.0 * least
+
+
+def test_a_plan_counts_the_projections_that_were_cut_short():
+    lcs, x0, x_desired, p = ball(False, 5)
+    weights = C3Weights(p.Q, p.R, p.G, p.U)
+    for nodes_max, cut in ((1, 15), (10**5, 0)):  # Five knots in each of three rounds.
+        problem = C3Problem(weights, ExactProjection(nodes_max), p.options)
+        plan, _ = solve_c3(lcs, x0, x_desired, problem)
+        assert plan.cut_projections == cut
+    with pytest.raises(ValueError, match="nodes_max is 0, expected an integer"):
+        C3Problem(weights, ExactProjection(0), p.options)
 
 
 @pytest.mark.parametrize(("n_lam", "trials"), [(2, 12), (4, 4), (8, 1)])
@@ -405,7 +438,7 @@ def test_exact_projection_agrees_with_brute_force_over_all_modes(n_lam, trials):
         c = 0.3 * abs(rng.normal(size=n_lam))  # x = lam = u = 0 is feasible.
         U, z = 10.0 ** rng.uniform(-1, 2, n_lam + 6), rng.normal(size=n_lam + 6)
         delta = np.empty(n_lam + 6)
-        assert project_exact(z[None], U, E, F, H, c, delta[None])
+        assert project_exact(z[None], U, E, F, H, c, 10**6, delta[None]) == 0
         lam, gap = delta[4 : 4 + n_lam], np.hstack([E, F, H]) @ delta + c
         # The LCPs hold to 1e-9 of their own scale.
         assert lam.min() >= 0.0 and gap.min() >= -1e-8 and abs(lam * gap).max() < 1e-8

@@ -1,11 +1,17 @@
 import numpy as np
 import pytest
-from pydrake.math import RotationMatrix
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import JacobianWrtVariable
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    JacobianWrtVariable,
+    RevoluteJoint,
+    SpatialInertia,
+)
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource, Demultiplexer
 from scipy.spatial.transform import Rotation
 
 from makebreak.diagrams.station import (
@@ -591,3 +597,75 @@ def test_plants_that_are_no_arm_are_refused(plant):
         ImpedanceController(ImpedanceConfig(), ball, "ball")
     with pytest.raises(ValueError, match="torque_rate_max is 0"):
         ImpedanceController(ImpedanceConfig(), plant, torque_rate_max=0.0)
+
+
+# An arm without a spare joint: six joints, the full pose as its task.
+
+
+def six_joint_arm(time_step):
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, time_step)
+    rod = SpatialInertia.SolidCylinderWithMassAboutEnd(1.0, 0.05, 0.2, [0, 0, 1])
+    X, end = RigidTransform(), plant.world_frame()
+    for i, angle in enumerate([0.3, 0.6, 0.9, 0.2, 0.7, 0.1]):
+        base = plant.AddFrame(FixedOffsetFrame(f"base{i}", end, X))
+        link = plant.AddRigidBody(f"link{i}", rod).body_frame()
+        axis = np.eye(3)[[2, 1, 1, 2, 1, 2][i]]
+        joint = plant.AddJoint(RevoluteJoint(f"joint{i}", base, link, axis))
+        joint.set_default_angle(angle)
+        plant.AddJointActuator(f"motor{i}", joint, effort_limit=80.0)
+        X, end = RigidTransform([0, 0, 0.2]), link
+    plant.AddFrame(FixedOffsetFrame("tip", end, X))
+    plant.Finalize()
+    return builder, plant
+
+
+SOFT = dict(stiffness=[200.0] * 3 + [5.0] * 3, damping=[40.0] * 3 + [1.0] * 3)
+
+
+@pytest.mark.parametrize(
+    ("gains", "move", "reachable"),
+    [
+        # The elbow is 0.9 rad bent and would be 0.34 at the first goal: one that is
+        # passed by a little stretches the arm.
+        ({}, [0.05, 0.0, 0.0], True),
+        (SOFT, [0.05, 0.0, 0.0], True),
+        (SOFT, [0.0, 0.0, 0.05], True),
+        ({}, [0.2, 0.0, 0.0], False),
+        (SOFT, [0.2, 0.0, 0.0], False),
+    ],
+)
+def test_a_six_joint_arm_holds_its_pose_through_stretched_ones(gains, move, reachable):
+    config = ImpedanceConfig(**gains, control_orientation=True)
+    builder, plant = six_joint_arm(0.001)
+    arm = builder.AddSystem(ImpedanceController(config, six_joint_arm(0.0)[1]))
+    tip = plant.GetFrameByName("tip")
+    X_0 = tip.CalcPoseInWorld(plant.CreateDefaultContext())
+    goal = reference(X_0.translation() + move, (0, 0, 0), (0, 0, 0))
+    goal[3:7] = X_0.rotation().ToQuaternion().wxyz()
+    sources = [
+        (builder.AddSystem(ConstantVectorSource(goal)).get_output_port(), "x_desired")
+    ]
+    split = builder.AddSystem(Demultiplexer([6, 6]))
+    builder.Connect(plant.get_state_output_port(), split.get_input_port())
+    sources += [(split.get_output_port(0), "q"), (split.get_output_port(1), "v")]
+    for port, name in sources:
+        builder.Connect(port, arm.GetInputPort(name))
+    builder.Connect(arm.GetOutputPort("tau"), plant.get_actuation_input_port())
+    simulator = Simulator(builder.Build())
+    context, fastest = plant.GetMyContextFromRoot(simulator.get_context()), 0.0
+    for k in range(1, 61):
+        simulator.AdvanceTo(0.05 * k)
+        fastest = max(fastest, abs(plant.GetVelocities(context)).max())
+    # Thrown about it turned at 200 rad/s and more, and ended in NaN.
+    assert fastest < 20.0
+    X = tip.CalcPoseInWorld(context)
+    reached = np.linalg.norm(X.translation() - X_0.translation() - move)
+    turned = rotation_error(X_0.rotation().matrix(), X.rotation().matrix())
+    if reachable:
+        # Damping ratios near one: e^-(K/D t) of 5 cm is left after 3 s, and friction
+        # is none.
+        assert reached < 0.003 and np.linalg.norm(turned) < 0.05
+    else:  # Stretched towards it, and nearly at rest.
+        assert 0.02 < reached < 0.1
+        assert abs(plant.GetVelocities(context)).max() < 3.0

@@ -27,6 +27,8 @@ from numba import njit
 
 from makebreak.systems.numerics.c3_polish import polish
 from makebreak.systems.numerics.c3_projections import (
+    FAILED,
+    ExactProjection,
     PlusProjection,
     Projection,
     QpProjection,
@@ -129,6 +131,8 @@ class Plan:
     status: int = 0  # 0: of this tick. Else the reason why it is an older one.
     time: float | None = None  # Of x[0] [s]; None: unknown, or no plan has been made.
     dt: float = 0.0  # Between knots [s].
+    # Of all rounds' knots, those whose exact projection ended at its nodes_max.
+    cut_projections: int = 0
 
     def __post_init__(self):
         for name in ("x", "u", "lam"):
@@ -321,6 +325,13 @@ def _check_options(o: C3Options, projection: Projection):
         raise ValueError(f"C3Options.polish is {o.polish}, expected at least 0")
     if not 1.0 <= o.rho < np.inf:
         raise ValueError(f"C3Options.rho is {o.rho}, expected a number >= 1")
+    if isinstance(projection, ExactProjection) and not (
+        isinstance(projection.nodes_max, Integral) and projection.nodes_max >= 1
+    ):
+        raise ValueError(
+            f"ExactProjection.nodes_max is {projection.nodes_max!r}, expected an integer "
+            "of at least 1"
+        )
     if isinstance(projection, QpProjection) and not 0.0 < projection.alpha <= 1.0:
         raise ValueError(
             f"QpProjection.alpha is {projection.alpha}, expected more than 0, at most 1"
@@ -476,7 +487,7 @@ def solve_c3(
     weights = Q, p.R, Q_N, p.G
     unbounded = np.isinf(p.lower).all() and np.isinf(p.upper).all()
     bounds = None if unbounded else (p.lower, p.upper)
-    given = h, x0, lam0
+    given, cut = (h, x0, lam0), 0
     if p.is_plus:
         status, x, v, delta, w, inputs = _admm_plus(
             *model, *weights, bounds, p.U, *given, delta, w, o.rounds, o.rho
@@ -485,7 +496,9 @@ def solve_c3(
             raise C3Failure(_FAILURES[status])
     else:
         lcp = p.projection, p.U, (E, F, H, c), matrices
-        x, v, delta, w, inputs = _admm(model, weights, bounds, given, delta, w, o, lcp)
+        x, v, delta, w, inputs, cut = _admm(
+            model, weights, bounds, given, delta, w, o, lcp
+        )
     u, lam = np.ascontiguousarray(v[:, p.n_lam :]), v[:, : p.n_lam] * scale
     if o.polish > 0:
         ahead = np.vstack([warm.u[1:], warm.u[-1:]])
@@ -518,7 +531,7 @@ def solve_c3(
                 gap = m.E @ x[k] + m.F @ lam[k] + m.H @ u[k] + m.c
                 delta[k, i_u + p.n_u + fixed] = np.maximum(gap[fixed], 0.0)
                 w[k, i_u + p.n_u + fixed] = 0.0
-    plan = Plan(x, u, lam)
+    plan = Plan(x, u, lam, cut_projections=cut)
     return plan, WarmStart(plan.u, delta, w)
 
 
@@ -551,7 +564,8 @@ def _stacked(models, name):
 
 
 def _admm(model, weights, bounds, given, delta, w, options, lcp):
-    """The rounds of C3, and the last QP: x, v, delta, w, and every QP's u.
+    """The rounds of C3, and the last QP: x, v, delta, w, every QP's u, and how many
+    projections were cut short.
 
     Args: model, weights, bounds as of _qp_step; given: h, x0, lam0 of it; lcp: what
         `project` needs beside z and delta.
@@ -572,7 +586,7 @@ def _admm(model, weights, bounds, given, delta, w, options, lcp):
         return z, x, v
 
     projection, U, arrays, matrices = lcp
-    K, inputs = len(matrices), np.empty((options.rounds + 1, N, len(R)))
+    K, inputs, cut = len(matrices), np.empty((options.rounds + 1, N, len(R))), 0
     for r in range(options.rounds):
         z, _, v = qp_step(G, delta - w)
         inputs[r] = v[:, n_lam:]
@@ -581,13 +595,15 @@ def _admm(model, weights, bounds, given, delta, w, options, lcp):
             knots = slice(None) if K == 1 else slice(k, k + 1)
             arrays_k = tuple(a[k] for a in arrays)
             goal = (z + w)[knots]
-            if not project(projection, goal, U, arrays_k, matrices[k], delta[knots]):
+            got = project(projection, goal, U, arrays_k, matrices[k], delta[knots])
+            if got == FAILED:
                 raise C3Failure("the projection has no solution")
+            cut += got
         w = (w + z - delta) / options.rho
         G = options.rho * G
     _, x, v = qp_step(G, delta - w)
     inputs[-1] = v[:, n_lam:]
-    return x, v, delta, w, inputs
+    return x, v, delta, w, inputs, cut
 
 
 @njit(cache=True)

@@ -20,9 +20,6 @@ from numba import njit
 from makebreak.systems.numerics.lcp import SOLVED, solve_lcp_kernel
 from makebreak.systems.numerics.nearest_point import nearest_mode
 
-# Nodes of one knot's branch and bound; it takes tens of them, as a rule.
-NODES_MAX = 100_000
-
 
 @dataclass
 class PlusProjection:
@@ -38,28 +35,37 @@ class QpProjection:
 
 @dataclass
 class ExactProjection:
-    """C3 with the exact, mixed-integer projection (no bound on lam: no big M)."""
+    """C3 with the exact, mixed-integer projection (no bound on lam: no big M).
+
+    The search is exponential in the worst case: a knot's takes tens of nodes with 16
+    forces, thousands with 32. Where nodes_max are used up, the nearest point found so
+    far is taken, which obeys the complementarity too; Plan.cut_projections counts them.
+    """
+
+    nodes_max: int = 1000
 
 
+FAILED = -1
 Projection = PlusProjection | QpProjection | ExactProjection
 
 
-def project(projection: Projection, z, U, lcs, matrices, delta) -> bool:
+def project(projection: Projection, z, U, lcs, matrices, delta) -> int:
     """Fills delta (N, n_z) with the projection of each knot of z (N, n_z).
 
     Args:
         U: (n_z,) diagonal weight. lcs: (E, F, H, c). matrices: projection_matrices of
             them, which C3+ does not need.
-    Returns: False if a knot's projection failed.
+    Returns: for how many knots the search was cut short; FAILED if a projection failed.
     """
     E, F, H, c = lcs
     if isinstance(projection, PlusProjection):
         project_plus(z, U, E.shape[1], E.shape[0], delta)
-        return True
+        return 0
     if isinstance(projection, QpProjection):
         V, K = matrices
-        return project_qp(z, projection.alpha, E, F, H, c, V, K, delta)
-    return project_exact(z, U, E, F, H, c, delta)
+        solved = project_qp(z, projection.alpha, E, F, H, c, V, K, delta)
+        return 0 if solved else FAILED
+    return project_exact(z, U, E, F, H, c, projection.nodes_max, delta)
 
 
 @njit(cache=True)
@@ -153,7 +159,7 @@ def project_qp(z, alpha, E, F, H, c, V, K, delta):
 
 
 @njit(cache=True)
-def project_exact(z, U, E, F, H, c, delta):
+def project_exact(z, U, E, F, H, c, nodes_max, delta):
     """delta (N, n_z): the nearest point to each knot in the weight U that obeys the
     complementarity 0 <= lam perp s >= 0.
 
@@ -161,7 +167,8 @@ def project_exact(z, U, E, F, H, c, delta):
     lam_i >= 0, s_i >= 0 of the others, a convex QP whose optimum bounds what lies
     below it.
 
-    Returns: whether it succeeded (False: no point obeys it, or rounding was too much).
+    Returns: for how many knots nodes_max nodes did not prove the point found to be the
+        nearest; FAILED where no point obeys it, or rounding was too much.
     """
     n_lam, n_x = E.shape
     n_u = H.shape[1]
@@ -190,7 +197,7 @@ def project_exact(z, U, E, F, H, c, delta):
             unit[i] = np.sqrt(length)
             A[i] /= unit[i]
         unit[n_lam + i] = 1.0 / root[n_y + i]
-    b, v = np.empty(2 * n_lam), np.empty(n_y + n_lam)
+    b, v, cut = np.empty(2 * n_lam), np.empty(n_y + n_lam), 0
     for knot in range(len(z)):
         gap = _gap(z[knot], E, H, c)
         size = 0.0
@@ -200,9 +207,13 @@ def project_exact(z, U, E, F, H, c, delta):
             b[i] = gap[i] / unit[i]
             b[n_lam + i] = z[knot, n_x + i] / unit[n_lam + i]
             size = max(size, abs(b[i]), abs(b[n_lam + i]))
-        best = nearest_mode(A, b, size, -1.0, v, NODES_MAX)
+        best, ended = nearest_mode(A, b, size, -1.0, v, nodes_max)
+        if not (ended or best < np.inf):  # A point that obeys it is needed in any case.
+            best, ended = nearest_mode(A, b, size, np.inf, v, 100 * nodes_max)
+            ended = False
         if not best < np.inf:
-            return False
+            return FAILED
+        cut += 0 if ended else 1
         for j in range(n_y + n_lam):
             at = j if j < n_x else (j + n_lam if j < n_y else j - n_u)
             move = v[j] / root[j] if root[j] > 0.0 else 0.0
@@ -213,4 +224,4 @@ def project_exact(z, U, E, F, H, c, delta):
                 s += A[i, j] * v[j]
             if s > lam or delta[knot, n_x + i] < 0.0:
                 delta[knot, n_x + i] = 0.0
-    return True
+    return cut

@@ -38,6 +38,13 @@ HOLD_DAMPING = 20.0  # [1/s] at which the arm is slowed down.
 HOLD_SPEED_MAX = 10.0  # [rad/s] A joint was not faster than that, whatever was read.
 HOLD_GAIN = 0.1  # Share of a good encoder's surprise that corrects its joint's speed.
 
+# Of an arm without a spare joint: part of a direction of the task that is its own,
+# below which a pose counts as singular. The tip's inertia along it is the inverse of
+# that part times what it would be alone, and what Lambda makes of Jdot qdot grows so
+# much that it throws a stretching arm about. There it fades, and the spring and the
+# damper, which need no Lambda, remain.
+SINGULAR = 0.1
+
 CONTACT_FORCE_MIN = 0.5  # [N] Below it the integral of the force waits.
 SAME_DIRECTION = 0.98  # Cosine above which a direction goes on as the one before.
 ENGAGE_SEC = 0.02  # In which stiffness along a new direction fades.
@@ -313,6 +320,10 @@ def impedance_torque(
         mobility[i, i] += 1e-9 * largest  # Near a singular pose Lambda stays finite.
     L_task = np.zeros((m, m))
     cholesky(L_task, mobility)
+    # A row's pivot over its diagonal: the part of it that is not along the rows before.
+    part = 1.0
+    for i in range(m):
+        part = min(part, L_task[i, i] ** 2 / mobility[i, i])
 
     if ratio > 0.0:
         damping = damping.copy()
@@ -352,8 +363,12 @@ def impedance_torque(
     follow[:m] = twist
     v_n = _damped_inverse(s.J, follow)
     qdd = law.posture_stiffness * (q_n - q) + law.posture_damping * (v_n - v)
+    if n <= m:  # The task leaves no choice: the posture would show in Lambda's errors.
+        qdd[:] = 0.0
     inertial = a_ref - s.bias_a[:m] - J @ qdd
     cholesky_solve(L_task, inertial)
+    if n <= m and part < SINGULAR:
+        inertial *= (part / SINGULAR) ** 2
     return J.T @ (F + inertial) + s.bias + s.M @ qdd, s.p_WE
 
 

@@ -128,7 +128,7 @@ def _search(M, b, z):
         distance[i] = b[i] / length
         size = max(size, abs(distance[i]))
         A[n + i, i] = 1.0
-    if not nearest_mode(A, distance, size, np.inf, z, NODES_MAX) < np.inf:
+    if not nearest_mode(A, distance, size, np.inf, z, NODES_MAX)[0] < np.inf:
         return False
     for i in range(n):
         w = distance[i]

@@ -144,22 +144,38 @@ def nearest_mode(A, b, size, enough, v, nodes_max):
     """The nearest v with A v + b >= 0 of which, for each i < m / 2, row i or row
     m / 2 + i is zero; the search ends at the first one found within `enough`.
 
+    Branch and bound: down from the open node with the least bound, until nothing better
+    is left below; then from the next one.
+
     Args: A (m, n) rows of length one, or zero; b (m,); size: of the distances in b;
         enough: squared length; v (n,): overwritten; nodes_max: nodes to look at.
-    Returns: v'v, or inf where there is none or the nodes ran out before one was found.
+    Returns: v'v, or inf where there is none or the nodes ran out before one was found;
+        and whether the search came to its end.
     """
     half, n = A.shape[0] // 2, A.shape[1]
-    # Modes: 0 undecided, 1 the second is zero, 2 the first is. Depth first.
-    stack = np.zeros((half + 2, half), np.int64)
-    bound = np.zeros(half + 2)
-    depth, best = 1, np.inf
+    # Modes: 0 undecided, 1 the second is zero, 2 the first is. A node adds one to the
+    # open ones: two children for itself.
+    stack = np.empty((nodes_max + 2, half), np.int8)
+    bound = np.empty(nodes_max + 2)
+    stack[0], bound[0] = 0, 0.0
+    depth, best, dived, nodes = 1, np.inf, False, 0
     trial, equal, row = np.empty(n), np.zeros(2 * half, np.bool_), np.empty(2 * half)
-    for _ in range(nodes_max):
-        if depth == 0:
-            break
+    while depth > 0 and nodes < nodes_max:
+        if not dived:  # Down from the open node with the least bound.
+            least = 0
+            for i in range(depth):
+                if bound[i] <= bound[least]:
+                    least = i
+            mode = stack[least].copy()
+            stack[least], stack[depth - 1] = stack[depth - 1], mode
+            bound[least], bound[depth - 1] = bound[depth - 1], bound[least]
         depth -= 1
+        dived = False
         if not bound[depth] < best - 1e-12 * size * size:
+            if np.isfinite(best) and depth > 0 and bound[:depth].min() >= best:
+                depth = 0
             continue
+        nodes += 1
         mode = stack[depth].copy()
         for i in range(half):
             equal[i], equal[half + i] = mode[i] == 2, mode[i] == 1
@@ -198,7 +214,8 @@ def nearest_mode(A, b, size, enough, v, nodes_max):
         stack[depth + 1, branch] = first
         bound[depth] = bound[depth + 1] = cost
         depth += 2
-    return best
+        dived = True
+    return best, depth == 0 or best <= enough
 
 
 @njit(cache=True)
