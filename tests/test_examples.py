@@ -49,6 +49,14 @@ def test_the_arm_moves_its_tip_as_told():
     assert numbers("move_an_arm.py") == pytest.approx([50.0, 0.0, 0.0], abs=0.5)
 
 
+def test_the_gantry_lands_gently_the_second_time():
+    speed, peak, slower, gentler = numbers("land_a_gantry.py")
+    # The first impact is at the motion's own speed, about .11 m in 1 s; its force is
+    # v sqrt(k m) = 200 v, less the damping's part, plus the servo's. 8 N are wanted.
+    assert 0.1 < speed < 0.2 and 0.8 < peak / (200 * speed) < 1.2
+    assert slower < 0.5 * speed and gentler == pytest.approx(8.0, abs=1.0)
+
+
 def test_importing_makebreak_loads_nothing_heavy():
     code = "import sys, makebreak; print(int('pydrake' in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

@@ -329,8 +329,8 @@ def _check_options(o: C3Options, projection: Projection):
         isinstance(projection.nodes_max, Integral) and projection.nodes_max >= 1
     ):
         raise ValueError(
-            f"ExactProjection.nodes_max is {projection.nodes_max!r}, expected an integer "
-            "of at least 1"
+            f"ExactProjection.nodes_max is {projection.nodes_max!r}, expected an "
+            "integer of at least 1"
         )
     if isinstance(projection, QpProjection) and not 0.0 < projection.alpha <= 1.0:
         raise ValueError(
