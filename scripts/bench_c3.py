@@ -27,7 +27,12 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.solvers import MathematicalProgram, OsqpSolver, SolverOptions
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.systems.lcs_builder import AnitescuLcs, ContactPair
+from makebreak.systems.lcs_builder import (
+    Anitescu,
+    AnitescuLcs,
+    ContactPair,
+    StewartTrinkle,
+)
 from makebreak.systems.numerics.c3_mpc import (
     C3Bounds,
     C3Options,
@@ -365,7 +370,48 @@ def rows(horizons: Sequence[int] = (5, 10, 20, 40, 80), repeats: int = 41):
         found += [
             measure("cart-pole 4/2/1", cartpole, plus, N, repeats // 2) for N in (5, 10)
         ]
-    return found + variants(repeats)
+    return found + combinations(repeats) + variants(repeats)
+
+
+def combinations(repeats: int):
+    """Both solvers with both contact models on the ball at N = 10, eps_c 5e-4.
+
+    The cost is that of the inputs rolled out with exact forces of Stewart's and
+    Trinkle's contact, whichever was planned with: it does not open as it slides.
+    """
+    found, real = [], ball_lcs(4, StewartTrinkle())
+    for plus in (True, False):
+        _, x0, x_desired, p = ball(plus, 10)
+        for name, law in (("Anitescu", Anitescu()), ("S.-T.", StewartTrinkle())):
+            lcs = ball_lcs(4, law)
+            # The file's weights are those of 16 forces, all alike.
+            weights = C3Weights(p.Q, p.R, _widened(p.G, lcs), _widened(p.U, lcs))
+            problem = C3Problem(weights, p.projection, p.options)
+            ms = median_ms(partial(solve_c3, lcs, x0, x_desired, problem), repeats)
+            u = solve_c3(lcs, x0, x_desired, problem)[0].u
+            as_real = C3Problem(
+                C3Weights(p.Q, p.R, _widened(p.G, real), _widened(p.U, real)),
+                p.projection,
+                p.options,
+            )
+            found.append(
+                {
+                    "what": f"{'C3+' if plus else 'C3'}, ball, N 10, {name}, "
+                    f"n_lam {lcs.n_lam}",
+                    "value": ms,
+                    "unit": "ms",
+                    "cost": plan_cost(real, x0, u, x_desired, as_real),
+                }
+            )
+    return found
+
+
+def _widened(weight, lcs: LCS):
+    """G or U of the ball problem for as many forces as lcs has."""
+    parts = [weight[:19], np.full(lcs.n_lam, weight[19]), weight[35:38]]
+    if weight.size > 38:
+        parts.append(np.full(lcs.n_lam, weight[38]))
+    return np.concatenate(parts)
 
 
 def variants(repeats: int):
@@ -438,15 +484,16 @@ def median_ms(call, n):
     return float(interleaved_ms([call], n)[0])
 
 
-def ball_lcs(n_f: int) -> LCS:
-    """The ball problem with 2 n_f forces per contact and the builder's own eps_c."""
+def ball_lcs(n_f: int, law: Anitescu | StewartTrinkle | None = None) -> LCS:
+    """The ball problem with 2 n_f friction edges and the builder's own eps_c."""
+    law = Anitescu() if law is None else law
     builder = DiagramBuilder()
     plant, _ = AddMultibodyPlantSceneGraph(builder, 0.0)
     Parser(plant).AddModels(str(REFERENCE / "ball_on_table.sdf"))
     plant.Finalize()
     pairs = [
-        ContactPair("finger_link", "ball_link", 0.5, n_f),
-        ContactPair("ball_link", "table_link", 0.5, n_f),
+        ContactPair("finger_link", "ball_link", 0.5, n_f, contact_model=law),
+        ContactPair("ball_link", "table_link", 0.5, n_f, contact_model=law),
     ]
     data = load("ball_mpc_problem.npz")
     model = AnitescuLcs(builder.Build(), pairs, float(data["dt"]))
