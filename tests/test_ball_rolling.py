@@ -117,6 +117,8 @@ def rolling(diagram):
     count = run.to(0.5) and updates(diagram)
     # One tick into the roll: the line that led to the landing is over.
     t = run.to_roll() + CONTROL
+    if round(t / CONTROL) % 2:  # Every other tick lies between two of the arm's.
+        t += CONTROL
     run.to(t)
     at_roll = run.context.Clone()
     return SimpleNamespace(
@@ -389,7 +391,7 @@ def faulty():
         def tick():
             nonlocal k
             t = round(k * CONTROL, 6)  # A hair later, and the step at t is done.
-            run.to(t)
+            run.to(max(t, run.context.get_time()))  # k CONTROL may be a hair more.
             rows.append([
                 t,
                 run.read("rolling_task", "phase")[0],
