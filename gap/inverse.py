@@ -45,6 +45,8 @@ REST_SPEED, REST_SHARE, REST_EFFORT = 0.005, 0.04, 0.3
 # Sampled at the very instants at which a stiff drive gets new commands, a velocity is
 # off by a share of itself.
 DRIVE_VELOCITY = 0.01
+# Loops of drives run at a kilohertz or more: what they hold is late by half a period.
+LOOP_SEC = 2.5e-4
 MOST_MOTIONS, MOST_MEANS, MOST_DYNAMICS = 40, 1500, 8  # That are kept in memory.
 FILTERED_SEC = 0.0026  # A signal's samples before a filter are no further apart.
 MODEL_ERROR = 2e-4  # Of a joint's rms effort: what smoothing and sampling leave.
@@ -714,6 +716,22 @@ class InverseModel:
             prior.append(min(r.period_sec() for r in self.recordings) / 6.0)
             names.append(f"sensor_delay of {name}, delay")
         return columns, prior, names
+
+    def loop_timing(self) -> tuple[list[np.ndarray], list[float], list[str]]:
+        """Columns (m,) of the residual, standard deviations [s] and names of what is
+        not known of drives' own loops: by how much what they feed back is late."""
+        columns, names = [], []
+        for i, law in enumerate(self.laws):
+            if law is None or not self.commanded[i]:
+                continue
+            efforts = []
+            for motion in self.motions():
+                late = np.zeros((*motion.v.shape, 1))
+                late[:, i, 0] = law.kp * motion.v[:, i] + law.kd * motion.vd[:, i]
+                efforts.append(late)
+            columns.append(self.columns_of(efforts)[:, 0])
+            names.append(f"input_delay of {self.joints[i]}, loop")
+        return columns, [LOOP_SEC] * len(columns), names
 
     def _stacked(self, track, white, efforts, others) -> np.ndarray:
         """Rows of one track: bump by bump, efforts of all joints, then the others."""

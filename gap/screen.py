@@ -164,8 +164,8 @@ def nuisances(model: InverseModel) -> Nuisances:
                     columns.append(x[:, k])
                     prior.append(size * now["mass"] if kind == "object_mass" else size)
                     names.append(f"{kind} of {at}, {unknown}")
-    late, period, of_what = model.filter_timing()
-    columns, prior, names = columns + late, prior + period, names + of_what
+    for late, period, of_what in (model.filter_timing(), model.loop_timing()):
+        columns, prior, names = columns + late, prior + period, names + of_what
     # A mass is known to its share, whatever unit its signature has.
     if not columns:
         return Nuisances.none(len(model.train()))
