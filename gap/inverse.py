@@ -719,15 +719,16 @@ class InverseModel:
 
     def loop_timing(self) -> tuple[list[np.ndarray], list[float], list[str]]:
         """Columns (m,) of the residual, standard deviations [s] and names of what is
-        not known of drives' own loops: by how much what they feed back is late."""
+        not known of drives' own loops: by how much the velocity that they feed back is
+        late. (A late position is damping, which is looked for.)"""
         columns, names = [], []
         for i, law in enumerate(self.laws):
-            if law is None or not self.commanded[i]:
+            if law is None or not self.commanded[i] or not law.kd > 0.0:
                 continue
             efforts = []
             for motion in self.motions():
                 late = np.zeros((*motion.v.shape, 1))
-                late[:, i, 0] = law.kp * motion.v[:, i] + law.kd * motion.vd[:, i]
+                late[:, i, 0] = law.kd * motion.vd[:, i]
                 efforts.append(late)
             columns.append(self.columns_of(efforts)[:, 0])
             names.append(f"input_delay of {self.joints[i]}, loop")

@@ -43,7 +43,8 @@ def withdrawn_if_weak(
     selection: Selection, verdict: str, closed: float
 ) -> tuple[Selection, str]:
     """The selection, without effects where they are no name for the gap, and then what
-    they are worth, in words. closed: share of the gap that they close, simulated."""
+    they are worth, in words. closed: share of the gap that they close, simulated and in
+    the equations."""
     if verdict != "gap_unnamed" or not selection.choices or closed >= TOLD:
         return selection, ""
     names = [f"{c.effect.kind} at {', '.join(c.effect.at)}" for c in selection.choices]
@@ -54,16 +55,21 @@ def withdrawn_if_weak(
     return replace(selection, choices=(), end=selection.start), near
 
 
+def share_left(before: float, after: float) -> float:
+    """Of what is beyond the noise before, the share that is there after; errors are in
+    units of the noise."""
+    return max(after - 1.0, 0.0) / max(before - 1.0, 1e-9)
+
+
 def two_figures(start: float, end: float, gap: GapMeasure) -> str:
     """A sentence where equations, whose error goes from start to end, and simulated
     windows disagree on what is left by more than a factor of two; else nothing."""
     if not start > NO_GAP or not gap.window_s > 0.0 or not gap.before > NO_GAP:
         return ""
 
-    def left(before: float, after: float) -> float:
-        return max((after - 1.0) / (before - 1.0), 0.1)
-
-    equations, simulated = left(start, end), left(gap.before, gap.after)
+    equations, simulated = (
+        max(share_left(*each), 0.1) for each in ((start, end), (gap.before, gap.after))
+    )
     if 0.5 <= equations / simulated <= 2.0:
         return ""
     return (

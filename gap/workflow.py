@@ -37,6 +37,7 @@ from makebreak.gap.verdict import (
     UNNAMED,
     named,
     says,
+    share_left,
     two_figures,
     verdict_of,
     withdrawn_if_weak,
@@ -163,7 +164,8 @@ def conclude(
         if choices and worse:  # Equations that simulation does not bear out.
             verdict = "gap_unnamed"
         every = selection
-        selection, near = withdrawn_if_weak(every, verdict, chosen_on.gap.reduction)
+        closed = min(chosen_on.gap.reduction, 1.0 - share_left(start, end))
+        selection, near = withdrawn_if_weak(every, verdict, closed)
         if selection is not every:
             chosen_on = problem.outcome(
                 [], selection.start, selection.end, nuisances, jobs=jobs

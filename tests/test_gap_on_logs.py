@@ -23,11 +23,20 @@ def found_in(folder, recipe, seed):
     return truth, run_gap(folder / "scene.yaml", [folder / "recording.csv"])
 
 
-@pytest.mark.parametrize("option", ["first order", "moving average", "wander"])
-def test_filtered_velocities_and_wandering_efforts_are_no_gap(tmp_path, option):
+@pytest.mark.parametrize(
+    "robot, option",
+    [
+        ("planar", "first order"),
+        ("planar", "moving average"),
+        ("planar", "wander"),
+        ("scara", "velocity drive"),
+    ],
+)
+def test_what_sensors_and_drives_do_is_no_gap(tmp_path, robot, option):
     """Noise that goes together over some samples, or over tenths of a second: as it is
-    not known where an effort's noise is made, it must not repeat with the motion."""
-    recipe = Recipe("none", "planar", "multisine guided", options=(option,))
+    not known where an effort's noise is made, it must not repeat with the motion. And a
+    drive's loop that holds its effort for half a millisecond."""
+    recipe = Recipe("none", robot, "multisine guided", options=(option,))
     _, result = found_in(tmp_path, recipe, 77)
     assert (result.verdict, result.effects) == ("no_gap", [])
 
