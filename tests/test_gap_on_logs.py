@@ -29,7 +29,7 @@ def found_in(folder, recipe, seed):
         ("planar", "first order"),
         ("planar", "moving average"),
         ("planar", "wander"),
-        ("scara", "velocity drive"),
+        ("six", "velocity drive"),
     ],
 )
 def test_what_sensors_and_drives_do_is_no_gap(tmp_path, robot, option):
