@@ -50,6 +50,7 @@ CHANNEL_GAIN, LEAST_T, ABOVE = 0.10, 2.0, 1.3
 # is worse by this share without it; or worse by CHANNEL_GAIN.
 MEMBER_Z, MEMBER_GAIN = 3.0, 0.02
 FEWEST_MEMBERS = 2  # Of a group.
+NEARLY = 0.9  # Of what a group takes off the error: one effect that does it goes first.
 BEYOND = 1.0  # Tolerances over a nuisance's limit that are no chance among dozens.
 FREE = 1e3  # Of its size, how far what is chosen may give way to a candidate.
 # Joints that get a value of their own, at most; and how many are fitted for each.
@@ -301,7 +302,7 @@ class _Search:
             sound = self._fit_each(screen, chosen, [r for _, r in sound], sound)
         if not sound:
             return None, table
-        pick = self._picked(sound, found)
+        pick = self._picked(sound, found, base.score)
         pair = self._pair(wide, screen, chosen, ranked, *sound[pick])
         if pair is not None:
             sound.append(pair)
@@ -315,11 +316,23 @@ class _Search:
             return None, table
         return self._step(sound, pick, chosen, base.score), table
 
-    def _picked(self, sound, found: Sequence[Candidate]) -> int:
+    def _picked(self, sound, found: Sequence[Candidate], base: float) -> int:
         """The simplest of those that do as well as the best."""
         errors = [self._error(f.score) for f, _ in sound]
         pick = simplest(errors, [_weight(r.candidate) for _, r in sound], SAME)
         fit, best = sound[pick]
+        # Before a group, one effect that does nearly all that the group does with no
+        # more parameters: what it leaves is looked for next.
+        most = base - NEARLY * (base - fit.score)
+        alone = [
+            k for k, (f, r) in enumerate(sound)
+            if not r.candidate.members
+            and r.candidate.size <= best.candidate.size
+            and f.score <= most
+        ]  # fmt: skip
+        if best.candidate.members and alone:
+            pick = min(alone, key=lambda k: errors[k])
+            fit, best = sound[pick]
         order = {id(c): k for k, c in enumerate(found)}
         # Bodies whose origins coincide: the outermost, as loads and forces mostly are.
         # The others are told as ties.
