@@ -7,6 +7,7 @@ positions have. What the other channels show of the same motion is tested beside
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
@@ -593,7 +594,7 @@ class InverseModel:
         for effect in ours:
             r = r - self._kept(
                 (where, _key(effect)),
-                lambda e=effect: bumps.mean(_added(e, dynamics, motion)),
+                partial(_added_mean, effect, dynamics, motion, bumps),
             )
         return r, motion
 
@@ -649,7 +650,7 @@ class InverseModel:
         for i, joint in enumerate(self.joints):
             if self.has["velocity"][i]:
                 out[f"{joint}.velocity"] = self._kept(
-                    (*key, i), lambda i=i: self._velocity_row(track, sensing, i)
+                    (*key, i), partial(self._velocity_row, track, sensing, i)
                 )
             if self.has["effort_measured"][i] and not self.by_measured[i]:
                 name = f"{joint}.effort_measured"
@@ -794,6 +795,10 @@ def _adds_up(heavy: Sequence[Effect]) -> bool:
     places = [at for e in heavy for at in e.at]
     tilted = any(KINDS[e.kind].at == "base" for e in heavy)
     return len(heavy) < 2 or (not tilted and len(set(places)) == len(places))
+
+
+def _added_mean(effect: Effect, dynamics, motion: Motion, bumps) -> np.ndarray:
+    return bumps.mean(_added(effect, dynamics, motion))
 
 
 def _added(effect: Effect, dynamics: SceneDynamics, motion: Motion) -> np.ndarray:

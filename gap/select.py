@@ -836,11 +836,9 @@ def _shortlist(ranked: list[Ranked], base: float, most: int) -> list[Ranked]:
     # A bigger kind is compared with those inside it, which may rank far below others.
     known = {id(r) for r in short}
     for each in [*short]:
-        short += [
-            r for r in ranked
-            if r.candidate.kind in KINDS[each.candidate.kind].contains
-            and r.candidate.at == each.candidate.at
-            and id(r) not in known
-            and not known.add(id(r))
-        ]  # fmt: skip
+        for r in ranked:
+            inside = r.candidate.kind in KINDS[each.candidate.kind].contains
+            if inside and r.candidate.at == each.candidate.at and id(r) not in known:
+                short.append(r)
+                known.add(id(r))
     return short
