@@ -522,9 +522,14 @@ def _renamed(
                 raise ValueError(f"{what} scale is 0, which leaves nothing")
             offset = _number(f"{what} offset", target.get("offset", 0.0))
             value, target = scale * value + offset, target["channel"]
+        if not isinstance(target, str):
+            raise ValueError(
+                f'{file}: columns, "{name}": got {target}, expected the name of a '
+                "channel, or null"
+            )
         if target in result:
             raise ValueError(f'{file}: two columns are mapped to "{target}"')
-        result[str(target)] = value
+        result[target] = value
     return result
 
 
