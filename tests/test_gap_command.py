@@ -26,7 +26,7 @@ def workflow(monkeypatch, case, tmp_path):
     monkeypatch.chdir(tmp_path)
     asked = []
 
-    def run_gap(scene_path, recording_paths, jobs, progress, *_):
+    def run_gap(scene_path, recording_paths, jobs=1, progress=print, *_):
         asked.append((scene_path, recording_paths, jobs))
         for text in ("checking the recordings", "screening the catalogue"):
             progress(text)
@@ -54,6 +54,20 @@ def test_a_run_shows_its_stages_and_ends_with_a_table_and_files(workflow, case, 
     for name in names.split():
         assert name in shown.out
     assert json.loads(Path("out/result.json").read_text())["verdict"] == "gap_named"
+
+
+def test_the_script_of_the_docs_writes_the_same_report(workflow, case, capsys):
+    docs = Path(__file__).parent.parent / "docs/gap.md"
+    code = re.search(r"```python\n(.*?)```", docs.read_text(), re.DOTALL)
+    assert code is not None
+    text = code[1].replace("scene.yaml", str(case[0])).replace("log.csv", str(case[1]))
+    exec(compile(text, "docs/gap.md", "exec"), {})
+    assert workflow == [(str(case[0]), [str(case[1])], 1)]
+    assert "gap_named ['joint_coulomb_friction'" in capsys.readouterr().out
+    shown = json.loads(Path("report/result.json").read_text())
+    assert shown["verdict"] == "gap_named" and Path("report/report.html").is_file()
+    with pytest.raises(ImportError):
+        from makebreak.gap import run_gaps  # noqa: F401
 
 
 @pytest.mark.parametrize("verdict", ["no_gap", "ambiguous", "gap_unnamed"])
