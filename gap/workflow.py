@@ -343,7 +343,10 @@ def _settle_step(
         for x, y, w in zip(a, b, coarse_model.windows, strict=True)
         if len(x)
     ]
-    size = float(np.sqrt(np.nanmean(np.clip(np.concatenate(off), -200, 200) ** 2)))
+    apart = np.clip(np.concatenate(off), -200, 200) if off else np.full(1, np.nan)
+    if not np.isfinite(apart).any():  # No window can be simulated with one of them.
+        return scene, []
+    size = float(np.sqrt(np.nanmean(apart**2)))
     if size < 1.0 and not _is_mechanism(dynamics, recordings):
         return scene, []  # A finer step costs four times as much.
     grave = size >= 0.3

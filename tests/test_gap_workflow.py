@@ -5,10 +5,14 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from gap_benchmark.cases import cases, make, write
+from test_gap_report import small_case
 
+from makebreak.gap import read_recordings, workflow
 from makebreak.gap.workflow import run_gap
+from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.scene import read_scene
 from makebreak.models.scene_file import write_scene
 
@@ -108,3 +112,21 @@ def test_the_workflow_imports_nothing_of_the_benchmark():
             elif isinstance(node, ast.ImportFrom):
                 names = [node.module or ""]
             assert not any("benchmark" in n or "tests" in n for n in names), file
+
+
+def test_a_step_that_cannot_be_judged_is_kept_and_not_told(tmp_path, monkeypatch):
+    """Where no window can be simulated there is no number to tell (NaN is no JSON)."""
+    scene_path, recording_path = small_case(tmp_path)
+    scene = read_scene(scene_path)
+    scene = replace(scene, plant=replace(scene.plant, time_step=0.001))
+    recordings = read_recordings([recording_path])
+    dynamics = SceneDynamics(scene)
+    fine, told = workflow._settle_step(scene, recordings, dynamics, 1)
+    assert fine.plant.time_step == 0.0 and [f.kind for f in told] == ["time_step"]
+
+    def nowhere(both, jobs):
+        return [[np.full_like(x, np.nan) for x in each()] for each in both]
+
+    monkeypatch.setattr(workflow, "side_by_side", nowhere)
+    same, told = workflow._settle_step(scene, recordings, dynamics, 1)
+    assert same is scene and told == []
