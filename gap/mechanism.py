@@ -31,6 +31,7 @@ from makebreak.gap.screen import (
 from makebreak.gap.where import unexplained, where_in_motion
 from makebreak.gap.windows import Window
 from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, find_body, sliding_joints
 from makebreak.models.scene import Scene
 from makebreak.systems.numerics.selection import Screen, is_predicted
@@ -121,7 +122,10 @@ class MechanismProblem(InverseModel, GapProblem):
         rows = [np.flatnonzero(channel == k) for k in range(len(self.names()))]
         fitted = [mine[t[mine]] for mine in rows]
         least = [HALF * float(left[some] @ left[some]) for some in fitted]
-        for X in (x for c in self._found or () for x in c.columns):
+        # A gain is in the rich model, of what the model needs. Beside that a gain of
+        # the measured effort would cancel all, also what models are off by.
+        found = [c for c in self._found or () if KINDS[c.kind].path != "gain"]
+        for X in (x for c in found for x in c.columns):
             beside = X - rich @ (back @ X[t])
             size = np.linalg.norm(beside[t], axis=0)
             beside = beside[:, size > 1e-6 * np.linalg.norm(X[t], axis=0)]

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from makebreak.gap.parallel import side_by_side
-from makebreak.scripts.trials import _environment
+from makebreak.scripts.trials import run_environment
 
 
 @pytest.mark.parametrize("jobs", [1, 3])
@@ -66,7 +66,7 @@ def test_nothing_outlives_a_parent_that_is_interrupted_or_killed(number):
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
-        env=_environment(),
+        env=run_environment(),
     )
     assert process.stdout is not None
     copies = [int(process.stdout.readline()) for _ in range(2)]

@@ -10,7 +10,8 @@ import pytest
 from gap_benchmark.cases import cases, make, write
 from test_gap_report import small_case
 
-from makebreak.gap import read_recordings, workflow
+from makebreak.gap import read_recordings, screen, workflow
+from makebreak.gap.mechanism import MechanismProblem
 from makebreak.gap.workflow import run_gap
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.scene import read_scene
@@ -130,3 +131,17 @@ def test_a_step_that_cannot_be_judged_is_kept_and_not_told(tmp_path, monkeypatch
     monkeypatch.setattr(workflow, "side_by_side", nowhere)
     same, told = workflow._settle_step(scene, recordings, dynamics, 1)
     assert same is scene and told == []
+
+
+def test_a_gain_does_not_explain_away_what_models_are_off_by(tmp_path):
+    """A gain of the model's side and one of the measured effort cancel everything."""
+    scene_path, recording_path = small_case(tmp_path)
+    scene = read_scene(scene_path)
+    problem = MechanismProblem(scene, read_recordings([recording_path]))
+    nuisances = problem.nuisances()
+    found = screen.candidates(problem, nuisances, problem.base())
+    problem._found = [c for c in found if c.kind == "actuator_gain"]
+    rich = screen.rich_columns(problem, problem._found)
+    assert rich.shape[1] == 1
+    left = problem.base()  # Friction, as something that models lack.
+    np.testing.assert_array_equal(problem._with_best(left, rich), left)
