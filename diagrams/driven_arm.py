@@ -96,9 +96,7 @@ class DrivenArmScene:
 
     def _plant(self, effects) -> tuple[MultibodyPlant, dict]:
         """A plant with these effects, and what of a DrivenArm it decides."""
-        key = tuple(
-            (e.kind, tuple(e.at), tuple(sorted(e.parameters.items()))) for e in effects
-        )
+        key = tuple(e.key for e in effects)
         if key not in self._plants:
             if len(self._plants) >= _MOST_KEPT:
                 self._plants.pop(next(iter(self._plants)))

@@ -14,7 +14,13 @@ import numpy as np
 from makebreak.diagrams.driven_arm import DrivenArmSimulation, can_have
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.measure import gap_measure, series_of
-from makebreak.gap.mechanism import MISFIT, ROBUST, link_changes, moved_links
+from makebreak.gap.mechanism import (
+    LESS,
+    MISFIT,
+    beyond_noise,
+    link_changes,
+    moved_links,
+)
 from makebreak.gap.objects import unexplained_in_windows
 from makebreak.gap.problem import (
     Candidate,
@@ -42,7 +48,6 @@ REST_SPEED, REST_SEC, STICKS = 0.005, 0.2, 0.2
 # How far a parameter is moved to see what it does, in shares of a typical size.
 SMALL = 0.1
 BESIDE_SEC = 0.06  # About a start, within which a jerk spoils what is known of it.
-LESS = 0.8  # A weight is changed where it would become less by this share.
 
 
 class DrivenWindows(WindowModel):
@@ -157,12 +162,8 @@ class DrivenProblem(DrivenWindows, GapProblem):
         found = np.zeros(len(self.channels))
         for c in range(len(found)):
             mine = held & (of == c)
-            if not mine.any():
-                continue
-            times = ROBUST * np.median(np.abs(ratio[mine]))
-            if times > MISFIT:
-                size = ROBUST * np.median(np.abs(ratio[mine] * noise[mine]))
-                found[c] = size * np.sqrt(1.0 - 1.0 / times**2)
+            if mine.any():
+                found[c] = beyond_noise(ratio[mine] * noise[mine], noise[mine])
         return found
 
     def _correlation_of(self, left: np.ndarray) -> float:

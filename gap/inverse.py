@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 
+from makebreak.gap.data.filters import FILTERED_SEC
 from makebreak.gap.recording import Episode, Recording
 from makebreak.models.drives import law_of
 from makebreak.models.dynamics import SceneDynamics
@@ -49,7 +50,6 @@ DRIVE_VELOCITY = 0.01
 # Loops of drives run at a kilohertz or more: what they hold is late by half a period.
 LOOP_SEC = 2.5e-4
 MOST_MOTIONS, MOST_MEANS, MOST_DYNAMICS = 40, 1500, 8  # That are kept in memory.
-FILTERED_SEC = 0.0026  # A signal's samples before a filter are no further apart.
 MODEL_ERROR = 2e-4  # Of a joint's rms effort: what smoothing and sampling leave.
 
 
@@ -551,7 +551,7 @@ class InverseModel:
 
     def _with(self, heavy: Sequence[Effect]) -> SceneDynamics:
         """Of the scene with these effects too."""
-        key = tuple(map(_key, heavy))
+        key = tuple(e.key for e in heavy)
         if key not in self._heavier:
             if len(self._heavier) > MOST_DYNAMICS:
                 self._heavier.clear()
@@ -580,8 +580,8 @@ class InverseModel:
         changes one parameter at a time."""
         bumps = self.tracks[k].bumps
         motion, _ = self._moved_by(k, moving)
-        weights = () if dynamics is self.dynamics else tuple(map(_key, heavy))
-        where = (k, tuple(map(_key, moving)), weights)
+        weights = () if dynamics is self.dynamics else tuple(e.key for e in heavy)
+        where = (k, tuple(e.key for e in moving), weights)
 
         def rest() -> np.ndarray:
             needed = self._moved_by(k, moving)[1]
@@ -589,11 +589,11 @@ class InverseModel:
                 needed = motion.effort - dynamics.residual(motion)
             return bumps.mean(self._driven_by(k, motion, effects).effort - needed)
 
-        path = tuple(_key(e) for e in effects if e.kind in SENSED + PATH)
+        path = tuple(e.key for e in effects if e.kind in SENSED + PATH)
         r = self._kept((where, path), rest)
         for effect in ours:
             r = r - self._kept(
-                (where, _key(effect)),
+                (where, effect.key),
                 partial(_added_mean, effect, dynamics, motion, bumps),
             )
         return r, motion
@@ -646,7 +646,7 @@ class InverseModel:
         out, track = {}, self.tracks[k]
         effects = [*self._own, *effects]
         sensing = [e for e in effects if e.kind in SENSED]
-        key = (k, "rates", *map(_key, sensing))
+        key = (k, "rates", *(e.key for e in sensing))
         for i, joint in enumerate(self.joints):
             if self.has["velocity"][i]:
                 out[f"{joint}.velocity"] = self._kept(
@@ -779,11 +779,6 @@ class InverseModel:
             numbers.append(np.repeat(first + track.block, k))
             first += int(track.block.max(initial=-1)) + 1
         return np.concatenate(numbers)
-
-
-def _key(effect: Effect) -> tuple:
-    """An effect, to be looked up by."""
-    return effect.kind, tuple(effect.at), tuple(sorted(effect.parameters.items()))
 
 
 def _adds_up(heavy: Sequence[Effect]) -> bool:

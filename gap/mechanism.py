@@ -17,7 +17,7 @@ from makebreak.gap.problem import (
     Outcome,
     SearchPlan,
 )
-from makebreak.gap.pushes import Push, find_pushes
+from makebreak.gap.pushes import ROBUST, Push, find_pushes
 from makebreak.gap.recording import Recording
 from makebreak.gap.result import Where
 from makebreak.gap.screen import (
@@ -36,7 +36,6 @@ from makebreak.models.effects.kind import Effect, find_body, sliding_joints
 from makebreak.models.scene import Scene
 from makebreak.systems.numerics.selection import Screen, is_predicted
 
-ROBUST = 1.4826  # Standard deviation over median absolute deviation, if normal.
 # Below this over the sensors' noise a rich model leaves what noise may: models are
 # right. A weight is changed where it would become less by this share.
 MISFIT, LESS = 1.3, 0.8
@@ -225,11 +224,8 @@ class MechanismProblem(InverseModel, GapProblem):
         error = {w: np.zeros(len(self.joints)) for w in self.model_error}
         for k, (what, joint) in enumerate(self.names()):
             mine = usual[:, k]
-            size = ROBUST * np.median(np.abs(off[mine, k]))
-            ratio = ROBUST * np.median(np.abs(off[mine, k] / noise[mine, k]))
-            if ratio > MISFIT:
-                beside = size * np.sqrt(1.0 - 1.0 / ratio**2)
-                error[what][self.joints.index(joint)] = beside
+            beside = beyond_noise(off[mine, k], noise[mine, k])
+            error[what][self.joints.index(joint)] = beside
         return error
 
     def _correlation(self, left: np.ndarray) -> float:
@@ -395,6 +391,13 @@ class MechanismProblem(InverseModel, GapProblem):
         )  # fmt: skip
         rest = unexplained(self, self.in_noise(end.left))
         return Outcome(gap, series, rest)
+
+
+def beyond_noise(off: np.ndarray, noise: np.ndarray) -> float:
+    """What rows (m,) are off by beside their noise (m,), robust; 0 where noise may
+    leave as much."""
+    size, times = (ROBUST * np.median(np.abs(x)) for x in (off, off / noise))
+    return float(size * np.sqrt(1.0 - 1.0 / times**2)) if times > MISFIT else 0.0
 
 
 def features_of(i: int, q, v, vd, effort, sign) -> np.ndarray:

@@ -1,5 +1,6 @@
 """When systems are compiled, and that a second process begins from the other end."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -62,6 +63,26 @@ def test_a_session_compiles_before_it_simulates_and_only_once(tmp_path):
         assert made == [1, 2]
     first_call(made.append, 3)
     assert made == [1, 2, 3]
+
+
+def test_what_is_compiled_is_no_time_of_the_simulation(tmp_path, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("makebreak.scripts.session.perf_counter", lambda: now[0])
+    monkeypatch.setattr("makebreak.scripts.session.process_time", lambda: now[0])
+
+    def compiles():
+        now[0] += 100.0
+
+    def until(t, sample):
+        now[0] += 0.5
+        return False
+
+    with Session(tmp_path / "out", progress=False) as own:
+        first_call(compiles)
+        own.simulate(nothing(), 0.1, {}, period_sec=0.05, until=until)
+        own.finish()
+    timing = json.loads((tmp_path / "out/timing.json").read_text())
+    assert timing["wall_s"] == timing["cpu_s"] == 1.5  # Three samples.
 
 
 EXPERIMENT = """

@@ -1,11 +1,14 @@
 """A person's push is found and told, and bends nothing; what comes back is no push."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from effect_scenes import at_rest_but, double, with_effects
 
 from makebreak.diagrams.scene_simulation import Commands, SceneSimulation
 from makebreak.gap.mechanism import MechanismProblem
+from makebreak.gap.pushes import find_pushes
 from makebreak.gap.recording import read_recordings
 from makebreak.gap.workflow import run_gap
 from makebreak.models.scene_file import write_scene
@@ -117,3 +120,45 @@ def test_a_push_bends_no_friction_and_no_force_is_invented_for_it(tmp_path):
         value = found[kind, at]["coulomb"].value
         assert value == pytest.approx(p["coulomb"], rel=0.05)
     assert [c.kind for c in result.checks if c.severity == "warning"].count("push") == 1
+
+
+def stretches(*spans, beyond=None, joint=0):
+    """Pushes in 24 s of two joints that swing many times: 1 N m is left over by all and
+    60 N m within the spans of test functions; `beyond`: q or v, which goes far out
+    there."""
+    rng = np.random.default_rng(3)
+    centre = 0.1 * np.arange(240)
+    left, noise = rng.normal(size=(240, 2)), np.full((240, 2), 0.1)
+    q = np.stack([np.sin(1.9 * centre), np.cos(2.7 * centre)], axis=1)
+    v = np.gradient(q, centre, axis=0)
+    for first, last in spans:
+        left[first:last, joint] += 60.0
+        if beyond is not None:
+            {"q": q, "v": v}[beyond][first:last, joint] = -1.5 if beyond == "q" else 4.0
+    track = SimpleNamespace(
+        recording="run", episode=0, grid=centre, q=q, v=v,
+        bumps=SimpleNamespace(centre=centre, width=0.2),
+    )  # fmt: skip
+    needed = np.array([50.0, 50.0])
+    return find_pushes([track], ("a", "b"), left, noise, needed)  # type: ignore[list-item]
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_a_stretch_that_comes_back_nowhere_is_a_push(joint):
+    [push] = stretches((100, 111), joint=joint)
+    assert (push.start, push.end) == (pytest.approx(9.7), pytest.approx(11.3))
+    assert [j for j, _ in push.efforts] == ["ab"[joint]]
+    assert set(range(100, 111)) <= set(push.rows)
+
+
+@pytest.mark.parametrize("beyond", ["q", "v"])
+def test_what_shows_only_at_the_end_of_the_range_is_no_push(beyond):
+    """An end stop acts where a joint is never else, drag where it is never as fast."""
+    assert stretches((100, 111), beyond=beyond) == []
+
+
+def test_what_comes_back_or_is_short_or_long_is_no_push():
+    assert len(stretches((40, 50), (160, 170))) == 2
+    assert stretches((40, 50), (100, 110), (160, 170)) == []
+    assert stretches((100, 103)) == []
+    assert stretches((100, 150)) == []

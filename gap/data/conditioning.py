@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from makebreak.gap.data.clock import clock_period, even_clock
+from makebreak.gap.data.filters import FILTERED_SEC
 from makebreak.gap.findings import Finding
 from makebreak.gap.recording import (
     Channel,
@@ -36,7 +37,6 @@ BAND_SHARE = 0.99  # Of the acceleration's power, that lies below the fastest mo
 HELD_SHARE = 2e-3  # Fewer repeated rows are chance, or rest.
 LONGEST_HOLD_SEC = 0.05  # What stays the same for longer stands still.
 ENDS_SEC = 0.2  # Of an episode, where rates are not known well.
-FILTERED_SEC = 0.0026  # A signal's samples before a filter are no further apart.
 EVEN_GAIN = 0.85  # An even clock must leave so much less noise.
 
 

@@ -18,6 +18,7 @@ from makebreak.systems.numerics.filters import (
     Stage,
 )
 
+FILTERED_SEC = 0.0026  # A signal's samples before a filter are no further apart.
 EXAMPLES = (
     '"first order, 40 Hz", "Butterworth of order 2, 30 Hz", "moving average, 10 ms", '
     '"backward difference", "delay, 5 ms" or "none"'

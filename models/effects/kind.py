@@ -38,6 +38,11 @@ class Effect:
     at: list[str] = field(default_factory=list)
     parameters: dict[str, float] = field(default_factory=dict)
 
+    @property
+    def key(self) -> tuple:
+        """All of it, to be looked up by."""
+        return self.kind, tuple(self.at), tuple(sorted(self.parameters.items()))
+
 
 @dataclass(frozen=True)
 class Parameter:

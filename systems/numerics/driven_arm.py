@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from makebreak.systems.numerics.cholesky import cholesky, cholesky_solve
 from makebreak.systems.numerics.joint_laws import law_number
 
 MOST_STEPS = 40_000  # Of one run: beyond it the parameters are given up.
@@ -287,40 +288,6 @@ def _slopes(arm, t, q, v, y, told, K, D):
 
 
 @numba.njit(cache=True)
-def _factor(A):
-    """Cholesky's factor of A (n, n), in its lower half. Returns: whether there is."""
-    n = A.shape[0]
-    for j in range(n):
-        d = A[j, j]
-        for k in range(j):
-            d -= A[j, k] * A[j, k]
-        if not d > 0.0:
-            return False
-        d = math.sqrt(d)
-        A[j, j] = d
-        for i in range(j + 1, n):
-            s = A[i, j]
-            for k in range(j):
-                s -= A[i, k] * A[j, k]
-            A[i, j] = s / d
-    return True
-
-
-@numba.njit(cache=True)
-def _solve(L, b):
-    """b (n,) becomes the solution of L L' x = b."""
-    n = b.shape[0]
-    for i in range(n):
-        for k in range(i):
-            b[i] -= L[i, k] * b[k]
-        b[i] /= L[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            b[i] -= L[k, i] * b[k]
-        b[i] /= L[i, i]
-
-
-@numba.njit(cache=True)
 def _rate(arm, t, x, told, M, L, bias, tau, out):
     """d/dt of x = [q, v, y] (3 n,), and the mass matrix M there; False if it is none.
     y: what the motors that lag give."""
@@ -331,16 +298,14 @@ def _rate(arm, t, x, told, M, L, bias, tau, out):
     for i in range(n):
         out[i] = v[i]
         tau[i] -= bias[i]
-        for k in range(n):
-            L[i, k] = M[i, k]
         T = arm.path[i, 3]
         out[2 * n + i] = 0.0
         if T > 0.0:
             u = _motor(arm, i, q[i], v[i], told[0, i], told[1, i])
             out[2 * n + i] = (u - y[i]) / T
-    if not _factor(L):
+    if not cholesky(L, M):
         return False
-    _solve(L, tau)
+    cholesky_solve(L, tau)
     for i in range(n):
         out[n + i] = tau[i]
     return True
@@ -356,7 +321,7 @@ def _implicit(arm, M, L, K, h, r, out, b):
         b[i] = -hd * K[i] * r[i]
         for k in range(n):
             b[i] += M[i, k] * r[n + k]
-    _solve(L, b)
+    cholesky_solve(L, b)
     for i in range(n):
         out[n + i] = b[i]
         out[i] = r[i] + hd * b[i]
@@ -397,7 +362,7 @@ def _run(arm, q, v, times, commands, tol, out):
                 for k in range(n):
                     W[i, k] = M[i, k]
                 W[i, i] += hd * D[i] + hd * hd * K[i]
-            if not _factor(W):
+            if not cholesky(W, W):
                 return
             _implicit(arm, M, W, K, step, f0, k1, b)
             for i in range(3 * n):

@@ -20,6 +20,11 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from makebreak.systems.numerics.cholesky import (
+    cholesky,
+    cholesky_solve,
+    forward_solve,
+)
 from makebreak.systems.numerics.serial_chain import chain_state, tip_kinematics
 
 # Status bits.
@@ -95,48 +100,6 @@ def memory_size(n: int) -> int:
 
     While a sensor is held, the last good q and v are predicted on (held_motion)."""
     return 3 * n + 18 + N_SLOTS * SLOT
-
-
-@numba.njit(cache=True)
-def cholesky(L, A):
-    """Lower factor of A (n, n); False if A is not positive definite."""
-    n = A.shape[0]
-    for j in range(n):
-        d = A[j, j]
-        for k in range(j):
-            d -= L[j, k] * L[j, k]
-        if not d > 0.0:
-            return False
-        d = np.sqrt(d)
-        L[j, j] = d
-        for i in range(j + 1, n):
-            s = A[i, j]
-            for k in range(j):
-                s -= L[i, k] * L[j, k]
-            L[i, j] = s / d
-    return True
-
-
-@numba.njit(cache=True)
-def forward_solve(L, b):
-    """In place: b becomes inv(L) b, b (n,)."""
-    for i in range(L.shape[0]):
-        s = b[i]
-        for k in range(i):
-            s -= L[i, k] * b[k]
-        b[i] = s / L[i, i]
-
-
-@numba.njit(cache=True)
-def cholesky_solve(L, b):
-    """In place: b becomes inv(L L') b."""
-    forward_solve(L, b)
-    n = L.shape[0]
-    for i in range(n - 1, -1, -1):
-        s = b[i]
-        for k in range(i + 1, n):
-            s -= L[k, i] * b[k]
-        b[i] = s / L[i, i]
 
 
 @numba.njit(cache=True)
