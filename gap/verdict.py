@@ -68,9 +68,10 @@ def two_figures(start: float, end: float, gap: GapMeasure) -> str:
         return ""
 
     equations, simulated = (
-        max(share_left(*each), 0.1) for each in ((start, end), (gap.before, gap.after))
+        share_left(*each) for each in ((start, end), (gap.before, gap.after))
     )
-    if 0.5 <= equations / simulated <= 2.0:
+    # Of next to nothing, half and twice are the same.
+    if 0.5 <= max(equations, 0.1) / max(simulated, 0.1) <= 2.0:
         return ""
     return (
         f" The equations of motion say that {min(equations, 1.0):.0%} of the gap is "

@@ -1,0 +1,38 @@
+"""The sentence that says when equations of motion and simulation disagree."""
+
+import pytest
+
+from makebreak.gap.result import GapMeasure
+from makebreak.gap.verdict import two_figures
+
+
+def measure(before: float, after: float, window_s: float = 0.3) -> GapMeasure:
+    return GapMeasure(before, after, 1.0, window_s)
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "gap"),
+    [
+        (41.0, 9.0, measure(41.0, 9.0)),  # Both: a fifth is left.
+        (41.0, 9.0, measure(41.0, 16.0)),  # Less than a factor of two apart.
+        # Next to nothing is left in both: how much less is no disagreement.
+        (101.0, 1.0, measure(11.0, 2.5)),
+        (101.0, 1.0, measure(11.0, 9.0, window_s=0.0)),  # Nothing was simulated.
+        (1.2, 1.0, measure(11.0, 9.0)),  # No gap in the equations,
+        (11.0, 2.0, measure(1.2, 1.1)),  # or none in simulation.
+    ],
+)
+def test_figures_that_agree_need_no_sentence(start, end, gap):
+    assert two_figures(start, end, gap) == ""
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "gap", "said"),
+    [
+        (41.0, 9.0, measure(41.0, 25.0), "20% of the gap is left, simulation 60%"),
+        (41.0, 25.0, measure(41.0, 9.0), "60% of the gap is left, simulation 20%"),
+        (101.0, 1.0, measure(11.0, 4.0), "0% of the gap is left, simulation 30%"),
+    ],
+)
+def test_figures_more_than_a_factor_of_two_apart_are_said(start, end, gap, said):
+    assert said in two_figures(start, end, gap)
