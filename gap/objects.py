@@ -8,6 +8,7 @@ from makebreak.gap.contact import contact_candidates, contact_nuisances
 from makebreak.gap.free_windows import FreeBodyModel
 from makebreak.gap.measure import gap_measure, series_of
 from makebreak.gap.problem import (
+    DISTANCES,
     Candidate,
     Fitted,
     GapProblem,
@@ -28,6 +29,10 @@ MOST_EFFECTS = 6
 DRAKE_SEC, DRAKE_MOST = 0.3, 16
 
 
+# What distances are computed from.
+COMPARED = ("position", "x", "y", "z", "qw", "qx", "qy", "qz", "fx", "fy", "fz")
+
+
 class TouchProblem(TouchModel, GapProblem):
     """A measured mechanism, and a wrench that tells when it touches an object."""
 
@@ -38,13 +43,15 @@ class TouchProblem(TouchModel, GapProblem):
         return touch_candidates(self)
 
     def judged(self) -> dict[str, str]:
+        """That shapes meet says nothing of how anything moves."""
         things = {touch.thing for touch in self.touches}
         tools = {touch.tool for touch in self.touches}
         return {
-            c.name: "touches"
+            c.name: DISTANCES
             for r in self.recordings
             for c in r.measured()
-            if c.at in things or c.at in tools or c.at in self.joints
+            if c.quantity in COMPARED
+            and (c.at in things or c.at in tools or c.at in self.joints)
         }
 
     def outcome(

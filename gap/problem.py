@@ -19,6 +19,7 @@ from makebreak.models.effects.kind import Effect, check_parameters
 from makebreak.models.scene import Scene
 from makebreak.systems.numerics.selection import NESTED_GAIN, LinearFit
 
+DISTANCES = "distances"  # A channel is judged by these alone: not its motion.
 BEYOND = 1.5  # Times what a model can lose at most is taken for all of it.
 
 
@@ -273,7 +274,8 @@ class GapProblem(ABC):
         return fitted.score
 
     def judged(self) -> dict[str, str]:
-        """{channel: by what it is judged}, of all that are."""
+        """{channel: by what it is judged}, of all that are (gap/result.py); of one of
+        which it is not asked how it goes on in time, DISTANCES."""
         return {}
 
     def nuisance_effects(self, nuisances: Nuisances, b: np.ndarray) -> list[Effect]:

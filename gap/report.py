@@ -28,6 +28,7 @@ from makebreak.models.scene_file import write_scene
 
 _HEADINGS = {
     "no_gap": ("No gap", "#2f855a"),
+    "not_judged": ("Not all judged", "#b7791f"),
     "gap_named": ("Gap named", "#2b6cb0"),
     "ambiguous": ("Gap named, but not alone", "#b7791f"),
     "gap_unnamed": ("Gap without a name", "#c53030"),
@@ -277,6 +278,10 @@ def _no_effect(result: GapResult) -> str:
     if result.verdict == "no_gap":
         says = "The model explains the recording to within its noise and the stated "
         says += "tolerance of the model. Nothing was added to the scene."
+    elif result.verdict == "not_judged":
+        says = "What was compared agrees, to within its noise and the stated tolerance "
+        says += "of the model; some channels were not compared (below). Nothing was "
+        says += "added to the scene."
     else:
         says = "No kind of effect in the catalogue explains what is left, so none is "
         says += "named and the scene is as it was. Where it is, and what it goes with:"

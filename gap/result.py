@@ -9,7 +9,7 @@ import numpy as np
 from makebreak.gap.findings import Finding
 from makebreak.models.effects.kind import Effect
 
-VERDICTS = ("no_gap", "gap_named", "ambiguous", "gap_unnamed")
+VERDICTS = ("no_gap", "not_judged", "gap_named", "ambiguous", "gap_unnamed")
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,8 @@ class Trust:
 
 @dataclass(frozen=True)
 class JudgedChannel:
-    """How a measured channel was judged: "equations", "simulation", both, or "not".
+    """How a measured channel was judged: "equations", "simulation", both, "not", or
+    "distances": only that shapes meet was compared, and no motion.
     noise: as used; noise_from: "given" or "estimated"."""
 
     channel: str

@@ -132,6 +132,14 @@ def says(
             "The scene and the recordings agree: nothing is left beyond noise and "
             f"tolerance (held-out error {gap.before:.2g} times the noise).{more}"
         )
+    if verdict == "not_judged":
+        return (
+            "What was compared agrees (held-out error "
+            f"{gap.before:.2g} times the noise), but not all that was measured was "
+            f"compared, so that this is no agreement of scene and recordings.{more} "
+            "A channel that does not belong here is left out with `columns: {name: "
+            "null}` beside the recording."
+        )
     words = " ".join(each.says for each in effects)
     if verdict == "gap_unnamed":
         head = f"{words} Beyond that, " if words else ""

@@ -17,7 +17,7 @@ from makebreak.gap.measure import WINDOW_SEC
 from makebreak.gap.mechanism import MechanismProblem
 from makebreak.gap.objects import FlightProblem, RolloutProblem, TouchProblem
 from makebreak.gap.parallel import side_by_side
-from makebreak.gap.problem import GapProblem, Outcome
+from makebreak.gap.problem import DISTANCES, GapProblem, Outcome
 from makebreak.gap.recording import (
     Recording,
     check_against_scene,
@@ -49,6 +49,7 @@ from makebreak.models.scene import Scene, read_scene
 
 # Of longer recordings of a mechanism, and of more rows of anything, pieces are used.
 MOST_SEC, MOST_ROWS = 60.0, 120_000
+AGREES = ("no_gap", "not_judged")  # As far as anything was compared.
 # Of what is only reported on.
 REPORTED_SEC, REPORTED_ROWS = 20.0, 40_000
 
@@ -201,16 +202,16 @@ def conclude(
     if selection.beyond:
         near += _beyond_limits(selection)
     channels = judged_channels(problem)
-    unjudged = [c.channel for c in channels if c.judged == "not"]
-    if verdict == "no_gap" and unjudged:
-        near += f" Not judged: {', '.join(unjudged)}."
+    if verdict == "no_gap" and (unjudged := unjudged_channels(channels)):
+        verdict = "not_judged"
+        near += unjudged
     near += two_figures(start, problem.error(selection.end), final.gap)
     effects = [named(c, problem.dynamics.plant) for c in selection.choices]
     fixed = [c.fixed for c in selection.choices]
     prior = nuisances.prior
     return GapResult(
         verdict, says(verdict, effects, final.gap, near),
-        problem.where(selection.start.left) if verdict != "no_gap" else [], effects,
+        problem.where(selection.start.left) if verdict not in AGREES else [], effects,
         final.gap, final.unexplained if verdict == "gap_unnamed" else [],
         {n: float(b / p) for n, b, p in
          zip(nuisances.names, selection.end.b, prior, strict=True)},
@@ -256,11 +257,25 @@ def judged_channels(problem: GapProblem) -> list[JudgedChannel]:
     return list(found.values())
 
 
+def unjudged_channels(channels: Sequence[JudgedChannel]) -> str:
+    """What was measured and not compared, as a sentence; none: nothing is left."""
+    text = ""
+    left = [c.channel for c in channels if c.judged == "not"]
+    if left:
+        text += f" Not judged: {', '.join(left)}."
+    if partly := [c.channel for c in channels if c.judged == DISTANCES]:
+        text += (
+            f" Only that shapes meet was asked of {', '.join(partly)}: their motion was"
+            " not compared."
+        )
+    return text
+
+
 def _unless_doubtful(result: GapResult) -> GapResult:
     """Without effects where units, signs or axes are wrong, as they would explain that;
     and without agreement where a channel's motion was taken for noise."""
     hunting = [c.says for c in result.checks if c.kind == "hunting"]
-    if result.verdict == "no_gap" and hunting:
+    if result.verdict in AGREES and hunting:
         return replace(
             result,
             verdict="gap_unnamed",

@@ -7,7 +7,7 @@ import numpy as np
 
 from makebreak.scripts.table import Table
 
-VERDICTS = ("no_gap", "gap_named", "ambiguous", "gap_unnamed")
+VERDICTS = ("no_gap", "not_judged", "gap_named", "ambiguous", "gap_unnamed")
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,9 @@ def test_the_script_of_the_docs_writes_the_same_report(workflow, case, capsys):
         from makebreak.gap import run_gaps  # noqa: F401
 
 
-@pytest.mark.parametrize("verdict", ["no_gap", "ambiguous", "gap_unnamed"])
+@pytest.mark.parametrize(
+    "verdict", ["no_gap", "not_judged", "ambiguous", "gap_unnamed"]
+)
 def test_every_verdict_is_a_run_that_is_done(workflow, case, verdict, monkeypatch):
     object.__setattr__(case[2], "verdict", verdict)
     monkeypatch.setattr(
