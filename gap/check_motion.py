@@ -135,20 +135,21 @@ def check_excitation(recording: Recording, facts: SceneFacts) -> list[Finding]:
 
         if e.range < 20.0 * recording.channels[name].noise:
             says = (
-                f"{at} hardly moves ({e.range:.2g} {unit}): nothing of it can be told."
+                f"{at} hardly moves ({e.range:.2g} {unit}): its effects are not "
+                "identifiable."
             )
             add("no_motion", e.range, unit, says)
             continue
         if e.reversals < 3:
             says = (
                 f"{at} reverses {e.reversals} times: dry friction and a constant bias "
-                "cannot be told apart."
+                "cannot be distinguished."
             )
             add("few_reversals", e.reversals, "1", says)
         if e.speed_decades < 0.5:
             says = (
                 f"{at} moves at nearly one speed ({e.speed_decades:.2g} decades): "
-                "viscous and dry friction cannot be told apart."
+                "viscous and dry friction cannot be distinguished."
             )
             add("one_speed", e.speed_decades, "decades", says)
     if facts.torques is not None:

@@ -250,7 +250,9 @@ def check_values(recording: Recording, facts: SceneFacts) -> list[Finding]:
             add("hunting", channel.name, spread, unit, "warning", says)
         stuck = _longest_stuck(recording, channel)
         if stuck > 0.0:
-            says = f"{channel.name} stands still for {stuck:.3g} s amid its own noise."
+            says = (
+                f"{channel.name} is constant for {stuck:.3g} s, although it is noisy."
+            )
             add("stuck", channel.name, stuck, "s", "warning", says)
     return found
 

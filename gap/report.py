@@ -28,10 +28,10 @@ from makebreak.models.scene_file import write_scene
 
 _HEADINGS = {
     "no_gap": ("No gap", "#2f855a"),
-    "not_judged": ("Not all judged", "#b7791f"),
+    "not_judged": ("Not every channel judged", "#b7791f"),
     "gap_named": ("Gap named", "#2b6cb0"),
-    "ambiguous": ("Gap named, but not alone", "#b7791f"),
-    "gap_unnamed": ("Gap without a name", "#c53030"),
+    "ambiguous": ("Gap named, with a tie", "#b7791f"),
+    "gap_unnamed": ("Gap found, not explained", "#c53030"),
 }
 _MOST_ROWS = 12  # Of a table, before the rest is folded away.
 _SEVERITIES = ("error", "warning", "info")
@@ -214,7 +214,7 @@ def _doubts(result: GapResult) -> str:
         return ""
     items = "".join(f"<li>{_text(says)}</li>" for says, _ in found[:4])
     return (
-        '<div class="doubt"><b>Put the data right first:</b> what is said above rests '
+        '<div class="doubt"><b>Correct the data first:</b> what is said above rests '
         f"on it.<ul>{items}</ul></div>"
     )
 
@@ -237,9 +237,9 @@ def _effect(each: NamedEffect, result: GapResult, i: int) -> str:
             sure += f", error {100.0 * abs(e.margin):.0f} % {size}"
         sure += "."
     if each.identifiable == "weak":
-        sure += " These data determine it only weakly."
+        sure += " It is only weakly identifiable from these data."
     elif each.identifiable == "not":
-        sure += " These data do not determine its parameters."
+        sure += " Its parameters are not identifiable from these data."
     # Of a lone effect the headline is its sentence.
     title = ""
     if len(result.effects) > 1 or each.says not in result.says:
@@ -284,7 +284,8 @@ def _no_effect(result: GapResult) -> str:
         says += "added to the scene."
     else:
         says = "No kind of effect in the catalogue explains what is left, so none is "
-        says += "named and the scene is as it was. Where it is, and what it goes with:"
+        says += "named and the scene is as it was. Where it occurs, and what it "
+        says += "correlates with:"
     items = "".join(
         f"<li>{escape(_left(each))}</li>" for each in result.unexplained[:4]
     )
@@ -294,7 +295,7 @@ def _no_effect(result: GapResult) -> str:
 def _left(each) -> str:
     text = f"{each.channel}, {each.region}: {each.size:.3g} times the noise"
     return text + (
-        f"; goes with {each.correlates_with}" if each.correlates_with else ""
+        f"; correlates with {each.correlates_with}" if each.correlates_with else ""
     )
 
 
@@ -309,8 +310,8 @@ def _numbers(result: GapResult) -> str:
         f"<div><b>{value}</b><span>{name}</span></div>" for name, value in cells
     )
     seen = {
-        "reported": " that were neither fitted nor chosen on",
-        "chosen on": " that chose between models: nothing was kept back for the report",
+        "reported": " used neither to fit nor to select",
+        "chosen on": " used to select effects: no data were left for a final test",
     }.get(g.data, ": nothing could be held out")
     if g.n_windows and any(g.failed):
         seen += (
@@ -351,9 +352,9 @@ def _where(result: GapResult, pictures) -> str:
     ]
     heads = ["channel", "while", "together", "worst error / noise", "there"]
     table = _table(heads, rows, most=6)
-    note = '<p class="small">Coloured: windows of which the error is more than noise '
-    note += (
-        "would give by chance. Grey: nothing stands out, or nothing was measured.</p>"
+    note = (
+        '<p class="small">Coloured: windows whose error is significantly larger than '
+        "the noise. Grey: no significant error, or nothing was measured.</p>"
     )
     picture = _image(pictures, "where", "Where the disagreement stands out")
     return _section("Where", picture + note + table)
@@ -362,9 +363,9 @@ def _where(result: GapResult, pictures) -> str:
 def _series(result: GapResult, pictures) -> str:
     if "series" not in pictures:
         return ""
-    note = '<p class="small">What nothing was fitted to.'
+    note = '<p class="small">Held-out data.'
     if result.gap.window_s > 0.0:
-        note += " Each window starts anew from a measured state."
+        note += " Each window starts from a measured state."
     note += "</p>"
     image = _image(pictures, "series", "Measured and simulated, before and after")
     return _section("Measured, before, after", image + note)
@@ -385,7 +386,7 @@ def _unexplained(result: GapResult) -> str:
         [u.channel, u.region, f"{u.size:.3g}", u.correlates_with]
         for u in sorted(result.unexplained, key=lambda u: -u.size)
     ]
-    heads = ["channel", "where", "error / noise", "goes with"]
+    heads = ["channel", "where", "error / noise", "correlates with"]
     return _section("What is left", _table(heads, rows, most=6))
 
 
@@ -421,7 +422,7 @@ def _background(result: GapResult) -> str:
         return ""
     moved = sorted(result.background.items(), key=lambda item: -abs(item[1]))
     most = abs(moved[0][1])
-    says = "What was allowed to be slightly wrong in the model, in units of its stated "
+    says = "What may be slightly wrong in any model, in units of its stated "
     says += "tolerance (1: as wrong as the scene says it may be). "
     says += (
         f"The most is {most:.2g}."
@@ -430,7 +431,8 @@ def _background(result: GapResult) -> str:
     )
     rows = [[name, f"{value:+.2f}"] for name, value in moved]
     return _section(
-        "Background", f"<p>{says}</p>" + _table(["term", "tolerances"], rows, most=5)
+        "Nuisance parameters",
+        f"<p>{says}</p>" + _table(["term", "tolerances"], rows, most=5),
     )
 
 
@@ -469,7 +471,7 @@ def _trust(result: GapResult, pictures) -> str:
             [f"{t.parameter} of {t.kind} at {', '.join(t.at)}", _n(t.value),
              _n(t.std, 2), spread,
              f"{_n(min(starts))} to {_n(max(starts))}" if starts else "-",
-             f"only a sum with {t.ridge_with} shows" if t.ridge_with else ""]
+             f"only its sum with {t.ridge_with} shows" if t.ridge_with else ""]
         )  # fmt: skip
     heads = ["parameter", "value", "deviation", "over stretches of time",
              "from other starts", ""]  # fmt: skip
@@ -479,7 +481,7 @@ def _trust(result: GapResult, pictures) -> str:
     )
     picture = _image(pictures, "trust", "Each parameter on parts of the data")
     return _section(
-        "What can be trusted", picture + note + _table(heads, rows, most=12)
+        "How certain the parameters are", picture + note + _table(heads, rows, most=12)
     )
 
 
@@ -508,13 +510,13 @@ def _go_on(result, out, scene_path, recordings, has_comparison) -> str:
         for says, line in lines
     )
     if has_comparison:
-        body += '<p><a href="compare.html">compare.html</a>: measured as a ghost, the '
-        body += "model before and after, moving, in a browser.</p>"
+        body += '<p><a href="compare.html">compare.html</a>: an animation of '
+        body += "what was measured (a ghost), the model before and after.</p>"
     body += (
         '<p class="small">Beside this page: result.json has all numbers, scene.yaml '
     )
     body += "the scene with the effects.</p>"
-    return _section("To go on", body)
+    return _section("Next steps", body)
 
 
 def _seconds(result: GapResult) -> str:

@@ -49,8 +49,8 @@ def withdrawn_if_weak(
         return selection, ""
     names = [f"{c.effect.kind} at {', '.join(c.effect.at)}" for c in selection.choices]
     near = (
-        f" The nearest that it has ({'; '.join(names)}) closes {max(closed, 0.0):.0%} "
-        "of it, too little to be named."
+        f" The best candidates ({'; '.join(names)}) close {max(closed, 0.0):.0%} of "
+        "it, too little to be named."
     )
     return replace(selection, choices=(), end=selection.start), near
 
@@ -75,8 +75,8 @@ def two_figures(start: float, end: float, gap: GapMeasure) -> str:
         return ""
     return (
         f" The equations of motion say that {min(equations, 1.0):.0%} of the gap is "
-        f"left, simulation {simulated:.0%}: simulation is believed, for it is what the "
-        "repaired model is used for, and its errors add up as they do there."
+        f"left, simulation {simulated:.0%}: trust the simulation, because it is how "
+        "the repaired model will be used."
     )
 
 
@@ -135,8 +135,8 @@ def says(
     if verdict == "not_judged":
         return (
             "What was compared agrees (held-out error "
-            f"{gap.before:.2g} times the noise), but not all that was measured was "
-            f"compared, so that this is no agreement of scene and recordings.{more} "
+            f"{gap.before:.2g} times the noise), but not every measured channel was "
+            f"compared, so the scene is not confirmed.{more} "
             "A channel that does not belong here is left out with `columns: {name: "
             "null}` beside the recording."
         )
@@ -144,7 +144,7 @@ def says(
     if verdict == "gap_unnamed":
         head = f"{words} Beyond that, " if words else ""
         return head + (
-            f"{'a' if head else 'A'} gap is left that no effect of the catalogue "
+            f"{'a' if head else 'A'} gap remains that no effect of the catalogue "
             f"explains: held-out error {after} times the noise.{more}"
         )
     tail = ""
@@ -166,5 +166,5 @@ def _apart_from(effects: Sequence[NamedEffect]) -> str:
     if kinds:
         text += f" These data cannot tell it apart from {', '.join(kinds)}."
     if places:
-        text += f" It may as well be at {' or '.join(places)}."
+        text += f" It could equally be at {' or '.join(places)}."
     return text

@@ -112,7 +112,7 @@ def unexplained(model: InverseModel, left: np.ndarray, least: float = 2.0):
         shares = {n: _explained_share(x, R[:, k]) for n, x in features.items()}
         best = max(shares, key=lambda n: shares[n])
         text = (
-            f"{best} (it tells {shares[best]:.0%} of its variance)"
+            f"{best} (it explains {shares[best]:.0%} of its variance)"
             if shares[best] > 0.2
             else "nothing that is measured"
         )

@@ -174,7 +174,9 @@ def conclude(
     elif choices:
         selection = replace(selection, choices=(), end=selection.start)
         verdict = "gap_unnamed"
-        near = " The recordings are too short to choose on what was not fitted."
+        near = (
+            " The recordings are too short to hold out data for the choice of effects."
+        )
     outcome = problem.outcome(
         selection.effects(), selection.start, selection.end, nuisances, reported, jobs
     ) if reported else None  # fmt: skip
@@ -182,8 +184,8 @@ def conclude(
         selection = replace(selection, choices=(), end=selection.start)
         verdict = "gap_unnamed"
         near = (
-            " The recordings are too short to keep a part of them for the report, and "
-            "without it nothing is named."
+            " The recordings are too short to hold out a part for the report; without "
+            "it nothing is named."
         )
     if outcome is not None:
         final, data = outcome, "reported"
@@ -195,9 +197,9 @@ def conclude(
     if verdict in ("gap_named", "ambiguous") and not _borne_out(final.gap):
         verdict = "gap_unnamed"
         near += (
-            f" In what is only reported on, what is named takes the error from "
-            f"{final.gap.before:.3g} to {final.gap.after:.3g}: simulation does not "
-            "bear it out."
+            " On the data held out for the report the effects take the simulated "
+            f"error from {final.gap.before:.3g} to {final.gap.after:.3g}: simulation "
+            "does not confirm them."
         )
     if selection.beyond:
         near += _beyond_limits(selection)
@@ -236,8 +238,8 @@ def _nothing(start: float, end: float) -> GapMeasure:
 def _beyond_limits(selection: Selection) -> str:
     each = [f"{name} ({value:.2g})" for name, value in selection.beyond]
     return (
-        " The model's own parameters would have to be off by more than they may, in "
-        f"tolerances: {', '.join(each)}."
+        " Nuisance parameters would have to be off by more than they may be (in "
+        f"tolerances): {', '.join(each)}."
     )
 
 
@@ -279,7 +281,7 @@ def _unless_doubtful(result: GapResult) -> GapResult:
         return replace(
             result,
             verdict="gap_unnamed",
-            says=f"Nothing can be told of these recordings: {hunting[0]}",
+            says=f"These recordings are inconclusive: {hunting[0]}",
         )
     if not result.effects or all(c.severity != "error" for c in result.checks):
         return result

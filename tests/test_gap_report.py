@@ -244,7 +244,9 @@ def test_no_gap_and_no_name_are_said_and_nothing_is_added(case, tmp_path):
     )
     text = text_of(written(case, tmp_path / "left", unnamed))
     assert "none is named" in text
-    assert "near q = 0.3: 12.3 times the noise; goes with position of p.j1" in text
+    assert (
+        "near q = 0.3: 12.3 times the noise; correlates with position of p.j1" in text
+    )
 
 
 def test_numbers_that_are_none_do_not_break_it(case, tmp_path):
