@@ -34,12 +34,16 @@ _SHOWN = (
 )  # fmt: skip
 
 
-def write_wrong_scene(path: Path, error: float) -> tuple[float, float]:
+def write_wrong_scene(
+    path: Path, error: float, place: Path | None = None
+) -> tuple[float, float]:
     """The shipped scene, but in the ball's file, beside `path`, the radius is off by
     `error` [m], and the moments of inertia are those that go with it.
 
+    Args: place: the folder that both files will be moved to; None: they stay.
     Returns: the right radius and the wrong one [m].
     """
+    place = path.parent if place is None else place
     scene = read_scene(BALL_ROLLING)
     loaded = load_scene(scene, DiagramBuilder())
     right = sphere_radius(loaded.plant, loaded.scene_graph, "ball")
@@ -54,9 +58,10 @@ def write_wrong_scene(path: Path, error: float) -> tuple[float, float]:
             for moment in ("ixx", "iyy", "izz"):
                 text = _scaled(text, moment, (wrong / right) ** 2)
             (path.parent / "ball.sdf").write_text(text)
-            add.file = f"file://{path.parent.resolve() / 'ball.sdf'}"
+            add.file = f"file://{place.resolve() / 'ball.sdf'}"
     scene.initial.poses["ball.ball"][6] = wrong  # It lies on what it is thought to be.
-    write_scene(scene, path, f"The model: a ball of {1e3 * wrong:.1f} mm radius.")
+    heading = f"The model: a ball of {1e3 * wrong:.1f} mm radius."
+    write_scene(scene, path, heading, place)
     return right, wrong
 
 
@@ -96,7 +101,9 @@ def close_the_loop(
 
 def _steps(out: Path, error, seed, duration, settings, jobs) -> tuple[Table, dict]:
     with OutputFolder(out / "0_model", f"{COMMAND} model") as outputs:
-        right, wrong = write_wrong_scene(outputs.file("model.yaml"), error)
+        right, wrong = write_wrong_scene(
+            outputs.file("model.yaml"), error, outputs.path
+        )
         outputs.commit()
     model = out / "0_model" / "model.yaml"
 

@@ -1,6 +1,7 @@
 """What the loop from a run over its recording to a repaired model rests on."""
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 from effect_scenes import on_ground
 from pydrake.systems.framework import DiagramBuilder
 
+from makebreak import model_path
 from makebreak.diagrams.ball_rolling import BallRollingConfig, believed
 from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.scene_simulation import SceneSimulation
@@ -155,6 +157,10 @@ def test_the_loop_passes_nothing_on_but_recording_and_scenes(steps, capsys):
     assert main(["close-the-loop", "ball_rolling", *words, "--out", "out"]) == 0
     first, gap, second = ([w for w in words if w[0] != "/"] for words in steps[0])
     wrong, found = "out/0_model/model.yaml", "out/2_gap/scene.yaml"
+    # Files are named as seen from where the scene lies in the end.
+    panda = os.path.relpath(model_path("panda.urdf"), Path("out/0_model").resolve())
+    scene_file = Path(wrong).read_text()
+    assert f"file: {panda}" in scene_file and "file: ball.sdf" in scene_file
     assert [gap[k] for k in range(gap.index("gap") + 1, gap.index("--jobs"))] == [
         wrong,
         "out/1_wrong_model/recording.csv",
