@@ -158,7 +158,8 @@ def test_the_loop_passes_nothing_on_but_recording_and_scenes(steps, capsys):
     first, gap, second = ([w for w in words if w[0] != "/"] for words in steps[0])
     wrong, found = "out/0_model/model.yaml", "out/2_gap/scene.yaml"
     # Files are named as seen from where the scene lies in the end.
-    panda = os.path.relpath(model_path("panda.urdf"), Path("out/0_model").resolve())
+    file = Path(model_path("panda.urdf")).resolve()
+    panda = os.path.relpath(file, Path("out/0_model").resolve())
     scene_file = Path(wrong).read_text()
     assert f"file: {panda}" in scene_file and "file: ball.sdf" in scene_file
     assert [gap[k] for k in range(gap.index("gap") + 1, gap.index("--jobs"))] == [
