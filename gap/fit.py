@@ -10,6 +10,7 @@ from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, check_parameters
 from makebreak.systems.numerics.selection import Screen, spread_by_blocks
 
+AT_BOUND = 1e-9  # A parameter that may not be negative is zero.
 SHORT = 8  # Evaluations: a fit of no more is not asked to converge.
 # Of a parameter's size: first steps of a search without slopes, and how far around one
 # looks where that ended.
@@ -245,9 +246,11 @@ def _highest(kind: str, name: str) -> float:
 
 
 def _tidy(effect: Effect) -> Effect:
-    """Phases within one turn."""
+    """Phases within one turn, and what ended at its limit of zero zero."""
     p = dict(effect.parameters)
     for each in KINDS[effect.kind].parameters:
+        if each.valid == ">= 0" and p.get(each.name, 1.0) < AT_BOUND:
+            p[each.name] = 0.0
         if each.name == "phase" and "phase" in p:
             p["phase"] = float(np.arctan2(np.sin(p["phase"]), np.cos(p["phase"])))
     tidy = Effect(effect.kind, list(effect.at), p)

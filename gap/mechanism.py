@@ -16,6 +16,7 @@ from makebreak.gap.problem import (
     Nuisances,
     Outcome,
     SearchPlan,
+    share_left,
 )
 from makebreak.gap.pushes import ROBUST, Push, find_pushes
 from makebreak.gap.recording import Recording
@@ -28,6 +29,7 @@ from makebreak.gap.screen import (
     nuisances,
     rich_columns,
 )
+from makebreak.gap.verdict import UNNAMED
 from makebreak.gap.where import unexplained, where_in_motion
 from makebreak.gap.windows import Window
 from makebreak.models.dynamics import SceneDynamics
@@ -288,6 +290,21 @@ class MechanismProblem(InverseModel, GapProblem):
             rows[mine] /= max(_rms(rows[mine]), 1.0)
         held = rows[~self.train()] if not self.train().all() else rows
         return float(np.sqrt(max(np.mean(held**2), np.mean(rows**2))))
+
+    def closed(self, start: Fitted, end: Fitted) -> float:
+        # All joints together would say little where one of them has a measured effort
+        # that nothing explains: what is closed of another does not show beside that.
+        held = ~self.train()
+        each = [super().closed(start, end)]
+        for k, (what, _) in enumerate(self.names()):
+            mine = held & (self.channel_of_rows() == k)
+            if what == "effort" and mine.any():
+                before, after = (
+                    _rms(self.in_noise(fitted.left)[mine]) for fitted in (start, end)
+                )
+                if before > UNNAMED:
+                    each.append(1.0 - share_left(before, after))
+        return max(each)
 
     def wandering(self, r: np.ndarray) -> np.ndarray:
         """(n_names,) what rows (m,), before the nuisances, leave of an effort that is

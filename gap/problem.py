@@ -134,6 +134,12 @@ def is_sane(effect: Effect, least: Mapping[str, float] | None = None) -> bool:
     return entry.plausible is None or entry.plausible(effect)
 
 
+def share_left(before: float, after: float) -> float:
+    """Of what is beyond the noise before, the share that is there after; errors are in
+    units of the noise."""
+    return max(after - 1.0, 0.0) / max(before - 1.0, 1e-9)
+
+
 @dataclass(frozen=True, eq=False)
 class Fitted:
     """Effects with their best parameters. std: of each effect's parameters. r (m,):
@@ -272,6 +278,11 @@ class GapProblem(ABC):
     def error(self, fitted: Fitted) -> float:
         """What the verdict goes by: held-out error in units of the noise."""
         return fitted.score
+
+    def closed(self, start: Fitted, end: Fitted) -> float:
+        """Share of the gap, beyond the noise, that the effects of `end` close where
+        most is closed: of all rows, or of the part of them that they act on."""
+        return 1.0 - share_left(self.error(start), self.error(end))
 
     def judged(self) -> dict[str, str]:
         """{channel: by what it is judged}, of all that are (gap/result.py); of one of

@@ -307,14 +307,19 @@ class _Search:
         if pair is not None:
             sound.append(pair)
             pick = len(sound) - 1
-        fit, best_one = sound[pick]
         left = screen.settle(current.r)[1]
-        gained = self._error(fit.score) < (1.0 - self.plan.least_gain) * self._error(
-            base.score
-        )
-        if not self._earns(left, fit.left, gained):
-            return None, table
-        return self._step(sound, pick, chosen, base.score), table
+        least = (1.0 - self.plan.least_gain) * self._error(base.score)
+        worth = [self._earns(left, f.left, self._error(f.score) < least)
+                 for f, _ in sound]  # fmt: skip
+        if not worth[pick]:
+            # The simplest of those that do as well on the whole may do it by a little
+            # everywhere, where another does it at the joint that it acts on.
+            earning = [each for each, earns in zip(sound, worth, strict=True) if earns]
+            if not earning:
+                return None, table
+            best = earning[self._picked(earning, found, base.score)]
+            pick = next(k for k, each in enumerate(sound) if each is best)
+        return self._step(sound, pick, chosen, base.score, left), table
 
     def _picked(self, sound, found: Sequence[Candidate], base: float) -> int:
         """The simplest of those that do as well as the best."""
@@ -401,11 +406,12 @@ class _Search:
                     return fitted, r
         return None
 
-    def _step(self, sound, pick: int, chosen, base: float) -> _Step:
+    def _step(self, sound, pick: int, chosen, base: float, before) -> _Step:
+        """Args: base, before (m,): error and residual without it."""
         fit, best = sound[pick]
         others = [(f, r) for k, (f, r) in enumerate(sound) if k != pick]
         runner = min(others, key=lambda o: o[0].score, default=None)
-        ties = () if best.candidate.members else self._ties(fit, best, others)
+        ties = () if best.candidate.members else self._ties(fit, best, others, before)
         new = fit.effects[len(chosen) :]
         sizes = [len(fit.std[len(chosen) + k]) for k in range(len(new))]
         if len(new) == 1:
@@ -425,10 +431,16 @@ class _Search:
             ),
         )  # fmt: skip
 
-    def _ties(self, fit: Fitted, best: Ranked, others) -> tuple[Effect, ...]:
-        """Of another kind, or of the same at another place."""
+    def _ties(self, fit: Fitted, best: Ranked, others, before) -> tuple[Effect, ...]:
+        """Of another kind, or of the same at another place.
+
+        Args: before (m,): what is left without the effect.
+        """
         error, floor = self._error, self.plan.least_error
         ties = []
+        # Where it helps most a rival must do so too, not by a little everywhere.
+        gains = self._channel_gains(before, fit.left) if self.plan.by_channel else {}
+        most = max(gains, key=lambda k: gains[k], default=None)
         for f, r in others:
             if r.candidate.members:
                 continue
@@ -444,7 +456,11 @@ class _Search:
                 paired(f.left, fit.left, self.train) > CHANCE
                 or max(f.score, fit.score) < floor
             )
-            if error(f.score) <= (1.0 + SAME) * error(fit.score) and alike:
+            near = error(f.score) <= (1.0 + SAME) * error(fit.score)
+            if most is not None:
+                there = self._channel_gains(before, f.left)[most]
+                near &= 1.0 - there <= (1.0 + SAME) * (1.0 - gains[most])
+            if near and alike:
                 ties.append(f.effects[-1])
         return tuple(ties)
 
@@ -773,6 +789,8 @@ def is_significant(choice: Choice) -> bool:
         spread = choice.std.get(each.name)
         if value is None or spread is None or each.name in choice.fixed:
             continue
+        if each.neutral is None and each.valid == ">= 0" and value == 0.0:
+            continue  # At its limit it is as good as fixed, and has no interval.
         n += 1
         infinite = not spread < each.high - each.low
         wide += infinite

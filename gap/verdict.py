@@ -5,6 +5,7 @@ from dataclasses import replace
 
 from pydrake.multibody.plant import MultibodyPlant
 
+from makebreak.gap.problem import share_left
 from makebreak.gap.recording import unit_of
 from makebreak.gap.result import Estimate, Evidence, GapMeasure, NamedEffect
 from makebreak.gap.select import FLOOR, Choice, Selection
@@ -39,6 +40,24 @@ def verdict_of(
     return "ambiguous" if any(c.ties for c in choices) else "gap_named"
 
 
+def after_simulation(
+    verdict: str, choices: Sequence[Choice], gap: GapMeasure, far: bool = False
+) -> str:
+    """The verdict by the equations, after simulated windows were asked.
+
+    Args: gap: of windows that were chosen on; far: as of verdict_of.
+    """
+    if not choices:
+        return verdict
+    if gap.after > max(gap.before, UNNAMED):
+        return "gap_unnamed"  # Simulation does not bear the equations out.
+    if verdict == "gap_unnamed" and gap.before > UNNAMED and gap.after <= NO_GAP:
+        # With the effects no gap is left. What the equations leave is how a law was
+        # written down in them (a backlash: where the link is in its gap).
+        return verdict_of(choices, 1.0, 1.0, far)
+    return verdict
+
+
 def withdrawn_if_weak(
     selection: Selection, verdict: str, closed: float
 ) -> tuple[Selection, str]:
@@ -53,12 +72,6 @@ def withdrawn_if_weak(
         "it, too little to be named."
     )
     return replace(selection, choices=(), end=selection.start), near
-
-
-def share_left(before: float, after: float) -> float:
-    """Of what is beyond the noise before, the share that is there after; errors are in
-    units of the noise."""
-    return max(after - 1.0, 0.0) / max(before - 1.0, 1e-9)
 
 
 def two_figures(start: float, end: float, gap: GapMeasure) -> str:

@@ -34,10 +34,9 @@ from makebreak.gap.trust import trust_in
 from makebreak.gap.verdict import (
     NO_GAP,
     TOLD,
-    UNNAMED,
+    after_simulation,
     named,
     says,
-    share_left,
     two_figures,
     verdict_of,
     withdrawn_if_weak,
@@ -161,11 +160,10 @@ def conclude(
     )
     near = ""
     if chosen_on is not None:
-        worse = chosen_on.gap.after > max(chosen_on.gap.before, UNNAMED)
-        if choices and worse:  # Equations that simulation does not bear out.
-            verdict = "gap_unnamed"
+        verdict = after_simulation(verdict, choices, chosen_on.gap, selection.far)
         every = selection
-        closed = min(chosen_on.gap.reduction, 1.0 - share_left(start, end))
+        equations = problem.closed(selection.start, selection.end)
+        closed = min(chosen_on.gap.reduction, equations)
         selection, near = withdrawn_if_weak(every, verdict, closed)
         if selection is not every:
             chosen_on = problem.outcome(

@@ -8,9 +8,12 @@ from scipy.optimize import lsq_linear
 from scipy.signal import lfilter
 
 from makebreak.gap.fit import derivative_free_search, fit_effects
-from makebreak.gap.problem import GapProblem, Nuisances, SearchPlan
-from makebreak.gap.select import select
+from makebreak.gap.mechanism import MechanismProblem
+from makebreak.gap.problem import Candidate, GapProblem, Nuisances, SearchPlan
+from makebreak.gap.result import GapMeasure
+from makebreak.gap.select import Choice, is_significant, select
 from makebreak.gap.trust import gauss_newton, ridges
+from makebreak.gap.verdict import after_simulation, verdict_of
 from makebreak.models.effects.kind import Effect
 from makebreak.systems.numerics.selection import (
     Screen,
@@ -395,3 +398,153 @@ def test_a_nuisance_beyond_its_limit_is_a_finding_if_held_out_data_gain_by_it(
         # 400 rows. The noise of 400 rows moves it by 0.05.
         expected = 10.0 * 400.0 / (400.0 + 50.0)
         assert name == "mass" and tolerances == pytest.approx(expected, abs=0.2)
+
+
+class TwoChannels(GapProblem):
+    """Two channels of 1.5 times the noise: damping shows in both, a bias in the
+    second alone. Both are linear; sizes are shares of the 1.5."""
+
+    plan = SearchPlan(by_channel=True, least_gain=0.1, most_effects=3)
+    dynamics = SimpleNamespace(least=lambda kind, at: {})  # type: ignore[assignment]
+
+    def __init__(self, damping: float, bias: float):
+        n = 18_000
+        self._channel, self._block = np.arange(n) % 2, np.arange(n) // 100
+        rest, damped, biased = 1.5 * np.random.default_rng(3).normal(size=(3, n))
+        biased[self._channel == 0] = 0.0
+        self._of = {"joint_viscous_damping": damped, "actuator_bias": biased}
+        self._base = rest + damping * damped + bias * biased
+
+    def residual(self, effects=()):
+        r = np.array(self._base)
+        for each in effects:
+            (value,) = each.parameters.values()
+            r -= value * self._of[each.kind]
+        return r
+
+    def base(self):
+        return self._base
+
+    def train(self):
+        return self._block % 3 != 1
+
+    def blocks(self):
+        return self._block
+
+    def channel_of_rows(self):
+        return self._channel
+
+    def nuisances(self):
+        return Nuisances.none(len(self._base))
+
+    def candidates(self, nuisances, current):
+        return [
+            Candidate(kind, (at,), 1, (self._of[kind][:, None],),
+                      (lambda c, name=name: {name: float(c[0])},))
+            for kind, at, name in (("joint_viscous_damping", "a", "damping"),
+                                   ("actuator_bias", "a.j2", "bias"))
+        ]  # fmt: skip
+
+    def where(self, left):
+        return []
+
+    def outcome(self, *_args, **_kwargs):
+        return None
+
+
+def test_what_helps_a_little_everywhere_keeps_no_effect_of_one_channel_out():
+    """The damping takes 8 % off the whole, 9 and 7 % off the channels: not worth an
+    effect. The bias takes 7 % off the whole, and 12 % off its channel, which is."""
+    problem = TwoChannels(damping=np.sqrt(0.225), bias=np.sqrt(0.36))
+    damping = Effect("joint_viscous_damping", ["a"], {"damping": np.sqrt(0.225)})
+    bias = Effect("actuator_bias", ["a.j2"], {"bias": np.sqrt(0.36)})
+    by_damping, by_bias = (np.std(problem.residual([e])) for e in (damping, bias))
+    assert by_damping < by_bias  # On the whole the damping does better.
+    (choice,) = select(problem).choices
+    assert choice.effect.kind == "actuator_bias" and choice.ties == ()
+    # 6000 fitted rows of the channel: to 1.4 %.
+    assert choice.effect.parameters["bias"] == pytest.approx(np.sqrt(0.36), abs=0.03)
+    # Both leave as much on the whole: in its channel the damping leaves 8 % more.
+    (choice,) = select(TwoChannels(damping=np.sqrt(0.2), bias=np.sqrt(0.4))).choices
+    assert choice.effect.kind == "actuator_bias" and choice.ties == ()
+    # Where no effect is worth it, none is taken.
+    assert select(TwoChannels(damping=np.sqrt(0.225), bias=0.0)).choices == ()
+
+
+@pytest.mark.parametrize(
+    "damping, std, named",
+    [(0.0, np.inf, True), (2.0, 0.5, True), (2.0, np.inf, False)],
+)
+def test_a_parameter_at_its_limit_has_no_interval_that_could_be_infinite(
+    damping, std, named
+):
+    """A spring whose damping comes out zero, which it cannot be less than."""
+    spring = Effect("joint_elasticity", ["a.j"], {"stiffness": 1e3, "damping": damping})
+    choice = Choice(
+        spring, {"stiffness": 50.0, "damping": std}, 2.0, 1.0, "", 1.0, (), (), 2
+    )
+    assert is_significant(choice) == named
+
+
+def windows_leave(before: float, after: float) -> GapMeasure:
+    return GapMeasure(before, after, 1.0, 0.3)
+
+
+def test_where_simulation_shows_no_gap_any_more_equations_find_none():
+    choice = Choice(Effect("joint_backlash", ["a.j"], {"gap": 0.02}), {"gap": 1e-3},
+                    9.0, 3.0, "", 1.0, (), (), 1)  # fmt: skip
+    verdict = verdict_of([choice], 13.5, 3.4)
+    assert verdict == "gap_unnamed"  # A quarter of it is left in the equations.
+    for before, after, far, expected in (
+        (4.3, 1.1, False, "gap_named"),
+        (4.3, 1.1, True, "gap_unnamed"),  # The model would have to be off too far.
+        (4.3, 1.8, False, "gap_unnamed"),
+        (1.2, 1.1, False, "gap_unnamed"),  # Windows that do not show the gap.
+    ):
+        gap = windows_leave(before, after)
+        assert after_simulation(verdict, [choice], gap, far) == expected
+    assert after_simulation("gap_unnamed", [], windows_leave(4.3, 1.1)) == "gap_unnamed"
+    worse = windows_leave(2.5, 2.6)
+    assert after_simulation("gap_named", [choice], worse) == "gap_unnamed"
+
+
+class TwoJoints(MechanismProblem):
+    """What is left of two joints' equations and of a velocity, in units of noise."""
+
+    def __init__(self, start, end):
+        self._left = {"start": np.tile(start, 100), "end": np.tile(end, 100)}
+
+    def train(self):
+        return np.arange(300) // 60 % 2 == 0
+
+    def names(self):
+        return [("effort", "a.j1"), ("effort", "a.j2"), ("velocity", "a.j1")]
+
+    def channel_of_rows(self):
+        return np.tile(np.arange(3), 100)
+
+    def in_noise(self, left):
+        return left
+
+    def error(self, fitted):
+        return float(np.sqrt(np.mean(fitted.left**2)))
+
+    def share(self):
+        ends = (SimpleNamespace(left=self._left[k]) for k in ("start", "end"))
+        return self.closed(*ends)
+
+
+@pytest.mark.parametrize(
+    "start, end, closed",
+    [
+        # A joint whose effort nothing explains hides nothing of what another shows.
+        ((40.0, 11.0, 1.0), (40.0, 3.0, 1.0), 0.8),
+        # Half of a gap of less than twice the noise is no half of anything.
+        ((40.0, 1.9, 1.0), (40.0, 1.0, 1.0), 0.0),
+        # A velocity's filter closes no joint's equation.
+        ((40.0, 11.0, 9.0), (40.0, 11.0, 1.0), 0.02),
+        ((11.0, 11.0, 11.0), (1.0, 1.0, 1.0), 1.0),
+    ],
+)
+def test_equations_are_closed_where_an_effect_acts(start, end, closed):
+    assert TwoJoints(start, end).share() == pytest.approx(closed, abs=0.02)
