@@ -167,6 +167,27 @@ def test_columns_of_a_payload_are_exact_with_its_moments_of_inertia(tmp_path):
     assert found == pytest.approx(parameters, rel=1e-9)
 
 
+def test_moments_tell_the_mass_of_a_load_on_a_link_about_a_fixed_axis(
+    tmp_path,
+):
+    """Its weight acts on no joint but by mass times place; the moment of inertia about
+    the axis, m (x^2 + z^2), tells the mass. Where along the axis it is not shown."""
+    scene = pendulum(tmp_path)
+    parameters = dict(mass=0.3, com_x=0.1, com_y=0.0, com_z=-0.25)
+    truth = SceneDynamics(with_effects(scene, ("payload", "p.rod", parameters)))
+    motion, model = motion_of(truth), SceneDynamics(scene)
+    (signature,) = model.signatures("payload", ["p.rod"], motion)
+    A = signature.columns.reshape(-1, 10)
+    assert np.abs(A[:, 0]).max() < 1e-9
+    coefficients = np.linalg.lstsq(A, model.residual(motion).ravel(), rcond=1e-9)[0]
+    found = signature.to_parameters(coefficients)
+    assert found == pytest.approx(parameters, rel=1e-5, abs=1e-9)
+    # A load that is missing has less of all of them.
+    assert signature.to_parameters(-coefficients)["mass"] == pytest.approx(-0.3)
+    # Without moments of inertia nothing tells its mass.
+    assert signature.to_parameters(np.array([0.0, 0.1, 0, 0]))["mass"] == 0.0
+
+
 @pytest.mark.parametrize("kind", [k for k in SMALL if k != "payload"])
 def test_linearised_columns_are_right_to_first_order(tmp_path, kind):
     at, parameters = SMALL[kind]

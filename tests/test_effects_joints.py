@@ -9,6 +9,7 @@ from pydrake.systems.framework import DiagramBuilder
 from scipy.integrate import solve_ivp
 
 from makebreak.diagrams.scene_simulation import Commands, SceneSimulation
+from makebreak.gap.problem import Candidate
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import load_scene
@@ -270,3 +271,17 @@ def test_bad_effects_are_refused_by_name(tmp_path, kind, at, parameters, words):
     with pytest.raises(ValueError, match=words) as error:
         load_scene(scene, DiagramBuilder())
     assert "\n" not in str(error.value)
+
+
+def test_a_spring_pulls(tmp_path):
+    """No spring pushes away from its rest; a model that has one may have too much."""
+    base = pendulum(tmp_path)
+    assert SceneDynamics(base).least("joint_spring", ["p.j1"]) == {"stiffness": 0.0}
+    scene = with_effects(base, ("joint_spring", "p.j1", dict(stiffness=2.0, rest=1.0)))
+    assert SceneDynamics(scene).least("joint_spring", ["p.j1"]) == {"stiffness": -2.0}
+    candidate = Candidate(
+        "joint_spring", ("p.j1",), 2, (), (), least={"stiffness": 0.0}
+    )
+    for stiffness, sane in ((0.2, True), (-0.2, False)):
+        effect = Effect("joint_spring", ["p.j1"], {"stiffness": stiffness, "rest": 0.1})
+        assert candidate.is_sane([effect]) == sane

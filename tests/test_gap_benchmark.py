@@ -19,12 +19,14 @@ from gap_benchmark.cases import (  # noqa: E402
     make,
     write,
 )
+from gap_benchmark.log_cases import COULOMB  # noqa: E402
 from gap_benchmark.mechanism import MECHANISMS, to_urdf, with_background  # noqa: E402
 from gap_benchmark.mechanism_world import (  # noqa: E402
     MechanismWorld,
     Reference,
     Sampling,
 )
+from gap_benchmark.robots import ROBOTS  # noqa: E402
 from pydrake.common.eigen_geometry import Quaternion  # noqa: E402
 from pydrake.multibody.parsing import Parser  # noqa: E402
 from pydrake.multibody.plant import (  # noqa: E402
@@ -34,8 +36,10 @@ from pydrake.multibody.plant import (  # noqa: E402
 from pydrake.systems.analysis import Simulator  # noqa: E402
 from pydrake.systems.framework import DiagramBuilder  # noqa: E402
 
+from makebreak.gap.problem import is_sane  # noqa: E402
 from makebreak.gap.recording import check_against_scene, read_recording  # noqa: E402
 from makebreak.gap.scene_facts import scene_names  # noqa: E402
+from makebreak.models.effects.kind import Effect  # noqa: E402
 from makebreak.models.scene import load_scene, read_scene  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -629,3 +633,16 @@ def test_the_hidden_effect_closes_the_gap_in_drake(case, tmp_path):
     assert before > 2.0  # In four windows; a recording has dozens.
     share = sum(SHARES.get(kind, 5e-3) for kind in case.kinds)
     assert after < 0.3 + share * before
+
+
+@pytest.mark.parametrize("sort", sorted(ROBOTS))
+def test_ranges_of_the_catalogue_hold_what_robots_have(sort):
+    """A rotor of an arm of 30 kg is 3 to 4 kg m2 at its joint."""
+    for seed in range(5):
+        for body in ROBOTS[sort](np.random.default_rng(seed), False).moving:
+            for sign in (-1.0, 1.0):
+                inertia = {"inertia": sign * body.rotor}
+                assert is_sane(Effect("rotor_inertia", ["a.j"], inertia)), body.rotor
+        for coulomb in np.ravel(COULOMB[sort]):
+            friction = {"coulomb": 1.6 * float(coulomb)}
+            assert is_sane(Effect("joint_coulomb_friction", ["a.j"], friction))

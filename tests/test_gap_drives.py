@@ -100,8 +100,9 @@ def test_equations_of_driven_joints_are_met_by_the_truth_alone(tmp_path, drive, 
     model = InverseModel(scene, read_recordings([file]))
     truth = [Effect(*each) for each in effects]
     # Noise is known to a third; a stiff drive's answer to each new command is smoothed
-    # away: half a percent of the torques that cancel in it.
-    assert rms(model.residual(truth)) < 6.0
+    # away: half a percent of the torques that cancel in it, more of them where a
+    # position is held (4.9 at most) than where a speed is (2.1).
+    assert rms(model.residual(truth)) < {"servo": 5.5, "velocity": 2.4}[drive]
     if effects:
         assert rms(model.residual()) > 2.0 * rms(model.residual(truth))
 

@@ -105,15 +105,15 @@ def _change_rotor(old: Effect, new: Effect, plant: MultibodyPlant, context) -> N
         actuator.SetRotorInertia(context, left / share)
 
 
-# Kinds whose forces add up over a scene's effects, by their one parameter.
+# Kinds whose forces add up over a scene's effects.
 
 
-def _totals(effect: Effect, effects, plant: MultibodyPlant) -> dict[str, float]:
-    """Of each joint, the parameter's sum over the effects of this kind."""
+def _totals(effect: Effect, effects, plant, name: str) -> dict[str, float]:
+    """Of each joint, a parameter's sum over the effects of this kind."""
     totals: dict[str, float] = {}
     for each in effects:
         if each.kind == effect.kind:
-            (value,) = each.parameters.values()
+            value = each.parameters[name]
             for joint in find_joints(each, plant):
                 at = full_name(plant, joint)
                 totals[at] = totals.get(at, 0.0) + value
@@ -122,7 +122,7 @@ def _totals(effect: Effect, effects, plant: MultibodyPlant) -> dict[str, float]:
 
 def _least_total(name: str):
     def least(effect, plant: MultibodyPlant, effects, damped) -> dict[str, float]:
-        totals = _totals(effect, effects, plant)
+        totals = _totals(effect, effects, plant, name)
         has = [totals.get(full_name(plant, j), 0.0) for j in find_joints(effect, plant)]
         return {name: -max(min(has), 0.0)}
 
@@ -130,8 +130,8 @@ def _least_total(name: str):
 
 
 def _check_total(effect: Effect, plant: MultibodyPlant, effects) -> None:
-    (value,) = effect.parameters.values()
-    totals = _totals(effect, effects, plant)
+    ((name, value),) = effect.parameters.items()
+    totals = _totals(effect, effects, plant, name)
     for joint in find_joints(effect, plant):
         _left(effect, totals[full_name(plant, joint)] - value, value)
 
@@ -447,7 +447,7 @@ KINDS = {
     ),
     "rotor_inertia": EffectKind(
         at="joint",
-        parameters=(Parameter("inertia", "kg m2", -2.0, 2.0),),
+        parameters=(Parameter("inertia", "kg m2", -20.0, 20.0),),
         says="{at} turns a rotor with {inertia} (reflected at the joint) that the "
         "model lacks",
         says_less="the rotor of {at} has {inertia} less (reflected at the joint) than "
@@ -491,6 +491,7 @@ KINDS = {
         contains=("actuator_bias",),
         tell_apart="move through the joint's whole range, in several poses of the "
         "other joints",
+        least=_least_total("stiffness"),
         joint_law=spring_law,
         joint_numbers=_numbers("stiffness", "rest"),
         signature=_spring_signature,

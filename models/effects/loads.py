@@ -29,6 +29,9 @@ from makebreak.models.effects.signature import Signature, without_momentum
 
 # ----- payload
 
+_PLACE = ("com_x", "com_y", "com_z")
+FARTHEST = 0.5  # [m] A load's place from its body's origin.
+
 
 def _payload_name(plant: MultibodyPlant, body: RigidBody) -> str:
     return f"payload_on_{full_name(plant, body).replace('.', '_')}"
@@ -43,7 +46,7 @@ def _payload_inertia(effect: Effect) -> SpatialInertia:
 
 
 def _payload_place(effect: Effect) -> np.ndarray:
-    return np.array([effect.parameters[f"com_{axis}"] for axis in "xyz"])
+    return np.array([effect.parameters[name] for name in _PLACE])
 
 
 def _check_left(
@@ -112,19 +115,34 @@ def _change_payload(old: Effect, new: Effect, plant: MultibodyPlant, context) ->
         )
 
 
+def point_of(c: np.ndarray) -> tuple[float, np.ndarray]:
+    """(mass [kg], place (3,) [m]) of a point mass from coefficients c of mass, mass
+    times place and perhaps the moments of inertia about the origin.
+
+    The mass of a load on a link that turns about a fixed axis shows in no weight of its
+    own. There it is what mass times place and those moments that show say:
+    ixx = ((m y)^2 + (m z)^2) / m, and so on.
+    """
+    mass, moment = float(c[0]), np.array(c[1:4])
+    if abs(mass) > 1e-12 and np.abs(moment / mass).max() <= FARTHEST:
+        return mass, moment / mass
+    about = np.array(c[4:7])
+    squares = (moment @ moment - moment**2)[: len(about)]
+    shown = about != 0.0
+    if not about[shown].sum() != 0.0 or not squares[shown].sum() > 0.0:
+        return mass, moment / mass if abs(mass) > 1e-12 else np.zeros(3)
+    mass = float(squares[shown].sum() / about[shown].sum())
+    return mass, moment / mass
+
+
 def _payload_signature(effect, model, motion, grid=None) -> list[Signature]:
     """Mass, mass times place, and the moments of inertia about the origin, which follow
     from these but are coefficients of their own: so all is linear, and one solution."""
     (body,) = find_bodies(effect, model.plant)[:1]
 
     def to_parameters(c):
-        com = np.array(c[1:]) / c[0] if abs(c[0]) > 1e-12 else np.zeros(3)
-        return {
-            "mass": float(c[0]),
-            "com_x": float(com[0]),
-            "com_y": float(com[1]),
-            "com_z": float(com[2]),
-        }
+        mass, com = point_of(np.asarray(c, float))
+        return {"mass": mass} | dict(zip(_PLACE, map(float, com), strict=True))
 
     moments = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
     unknowns = ("mass", "mass_com_x", "mass_com_y", "mass_com_z", *moments)
@@ -241,7 +259,7 @@ KINDS = {
         at="body",
         parameters=(
             Parameter("mass", "kg", -20.0, 20.0),
-            *(Parameter(f"com_{a}", "m", -0.5, 0.5, None) for a in "xyz"),
+            *(Parameter(name, "m", -FARTHEST, FARTHEST, None) for name in _PLACE),
         ),
         says="{at} carries {mass} that the model lacks, at ({com_x}, {com_y}, {com_z}) "
         "in its frame",
