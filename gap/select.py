@@ -317,8 +317,8 @@ class _Search:
             earning = [each for each, earns in zip(sound, worth, strict=True) if earns]
             if not earning:
                 return None, table
-            best = earning[self._picked(earning, found, base.score)]
-            pick = next(k for k, each in enumerate(sound) if each is best)
+            taken_one = earning[self._picked(earning, found, base.score)]
+            pick = next(k for k, each in enumerate(sound) if each is taken_one)
         return self._step(sound, pick, chosen, base.score, left), table
 
     def _picked(self, sound, found: Sequence[Candidate], base: float) -> int:
