@@ -22,7 +22,7 @@ from makebreak.gap.pictures import (
 from makebreak.gap.recording import Recording
 from makebreak.gap.result import GapResult, NamedEffect, Where
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.kind import Effect, sentence
+from makebreak.models.effects.kind import Effect, sentence, with_deviation
 from makebreak.models.scene import Scene
 from makebreak.models.scene_file import write_scene
 
@@ -173,7 +173,6 @@ def report_html(
         '<div class="two"><div>',
         *[_effect(each, result, i) for i, each in enumerate(result.effects)],
         _no_effect(result) if not result.effects else "",
-        _which_errors(result),
         "</div><div>",
         _numbers(result),
         _image(
@@ -220,16 +219,14 @@ def _doubts(result: GapResult) -> str:
 
 
 def _effect(each: NamedEffect, result: GapResult, i: int) -> str:
-    rows = "".join(
-        f"<tr><td>{escape(name)}</td><td class=n>{_n(p.value)} &plusmn; "
-        f"{_n(p.std, 2)}</td><td>{escape(p.unit)}</td></tr>"
-        for name, p in each.parameters.items()
-    )
+    rows = ""
+    for name, p in each.parameters.items():
+        value = _text(with_deviation(p.value, p.std))
+        rows += f"<tr><td>{escape(name)}</td><td class=n>{value}</td>"
+        rows += f"<td>{escape(p.unit)}</td></tr>"
     e = each.evidence
-    sure = f"Held-out error <b>{_n(e.held_out_before)}</b> without it, "
-    sure += f"<b>{_n(e.held_out_after)}</b> with it"
     share = _share(e.held_out_before, e.held_out_after, result.gap.noise_floor)
-    sure += f": {share} of what is above noise." if share else "."
+    sure = f"It closes {share} of the gap that is there without it." if share else ""
     if e.runner_up:
         sure += f" Next best: {escape(e.runner_up)}"
         if np.isfinite(e.margin):
@@ -249,17 +246,6 @@ def _effect(each: NamedEffect, result: GapResult, i: int) -> str:
         f'<div class="effect">{title}<p class="kind">{escape(each.kind)} '
         f"at {escape(', '.join(each.at))}</p>"
         f"<table>{rows}</table><p>{sure}</p>{_ties(each)}</div>"
-    )
-
-
-def _which_errors(result: GapResult) -> str:
-    """Where the figures of effects are not of the windows whose error is beside."""
-    e = [each.evidence for each in result.effects]
-    if not e or np.isclose(e[-1].held_out_after, result.gap.after, rtol=0.02):
-        return ""
-    return (
-        '<p class="small">The errors of each effect are of the equations that it was '
-        "fitted to, on data held out; those beside are of simulations.</p>"
     )
 
 

@@ -15,6 +15,7 @@ from makebreak.gap.comparison import comparison_html
 from makebreak.gap.recording import has_sidecar, read_recordings, sidecar_of
 from makebreak.gap.report import summary_lines, windows_of, write_report
 from makebreak.gap.result import GapResult
+from makebreak.models.effects.kind import with_deviation
 from makebreak.models.scene import Scene, read_scene
 from makebreak.scripts.interrupts import undisturbed
 from makebreak.scripts.outputs import OutputFolder
@@ -182,7 +183,7 @@ def effects_table(result: GapResult) -> Table:
     rows: list[tuple] = []
     for each in result.effects:
         values = ", ".join(
-            f"{name} {p.value:.3g} +- {p.std:.1g} {p.unit}".rstrip()
+            f"{name} {with_deviation(p.value, p.std)} {p.unit}".rstrip()
             for name, p in each.parameters.items()
         )
         e = each.evidence

@@ -19,7 +19,7 @@ from scipy.integrate import solve_ivp
 
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.kind import Effect, sentence
+from makebreak.models.effects.kind import Effect, sentence, with_deviation
 from makebreak.models.effects.signature import Motion, added_effort
 from makebreak.models.scene import ActuationSection
 from makebreak.systems.numerics.smoother import smooth
@@ -621,10 +621,10 @@ def test_a_sentence_reads_as_in_the_report():
     kind = KINDS["joint_coulomb_friction"]
     less = Effect("joint_coulomb_friction", ["a.b"], {"coulomb": -0.4})
     assert sentence(less, kind, {"coulomb": 0.1}) == (
-        "joint a.b has 0.4 +- 0.1 N m less of Coulomb friction than the model says"
+        "joint a.b has 0.40 +- 0.10 N m less of Coulomb friction than the model says"
     )
     effect = Effect("joint_coulomb_friction", ["a.b"], {"coulomb": 1.8})
-    assert "1.8 +- 0.1 N m" in sentence(effect, kind, {"coulomb": 0.1})
+    assert "1.80 +- 0.10 N m" in sentence(effect, kind, {"coulomb": 0.1})
 
 
 def test_a_joint_that_slides_has_its_own_units(tmp_path):
@@ -633,4 +633,21 @@ def test_a_joint_that_slides_has_its_own_units(tmp_path):
     assert "3 N/m" in says and "0.1 m" in says and "rad" not in says
     assert "N m/rad" in sentence(spring, KINDS["joint_spring"])
     vague = sentence(spring, KINDS["joint_spring"], {"rest": float("inf")})
-    assert "0.1 rad (which the data do not tell)" in vague
+    assert "0.1 rad (not identifiable from these data)" in vague
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "text"),
+    [
+        (0.031494, 1.2e-5, "0.031494 +- 0.000012"),
+        (2.5831, 0.0387, "2.58 +- 0.04"),
+        (12.34, 0.7, "12.3 +- 0.7"),
+        (-0.4, 0.1, "-0.40 +- 0.10"),
+        (0.003, 50.0, "0.003 +- 5e+01"),  # Its own digits would leave nothing.
+        (1.8, 1e-12, "1.8 +- 1e-12"),
+        (0.5, 0.0, "0.5"),
+        (0.5, np.inf, "0.5"),
+    ],
+)
+def test_a_value_has_the_digits_that_its_deviation_leaves(value, std, text):
+    assert with_deviation(value, std) == text

@@ -138,4 +138,4 @@ def test_the_table_has_the_held_out_errors(case):
     e = case[2].effects[0].evidence
     [row] = [r for r in text.splitlines() if r.startswith("joint_coulomb")]
     assert f"{e.held_out_before:.4g}" in row and f"{e.held_out_after:.4g}" in row
-    assert "coulomb 0.35 +- 0.01 N m" in row
+    assert "coulomb 0.350 +- 0.010 N m" in row

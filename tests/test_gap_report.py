@@ -178,11 +178,11 @@ def test_the_page_stands_alone_and_says_it_first(case, tmp_path):
     assert outside == []
     text = text_of(page)
     first = text[: text.index(" Where ")]
-    assert "joint p.j1 has Coulomb friction of 0.35 +- 0.01 N m" in first.replace(
+    assert "joint p.j1 has Coulomb friction of 0.350 +- 0.010 N m" in first.replace(
         "Joint", "joint"
     )
     assert f"{case[2].gap.before:.3g}" in first and f"{case[2].gap.after:.3g}" in first
-    assert "0.35 +- 0.01 N m" in first
+    assert "0.350 +- 0.010 N m" in first
     assert "Next best: joint_viscous_damping at p.j1, error 62 % larger." in first
     assert "It lags 4 ms." in text and "1 note Noise" in text
     assert f"makebreak run --model {tmp_path / 'scene.yaml'}" in text

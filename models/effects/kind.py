@@ -243,15 +243,30 @@ def of_slides(effect: Effect, plant: MultibodyPlant) -> bool:
     return bool(joints) and all(isinstance(j, PrismaticJoint) for j in joints)
 
 
+def with_deviation(value: float, std: float) -> str:
+    """value +- std, to the digits that the deviation leaves: 0.03149 +- 0.00002.
+
+    A deviation that begins with 1 has two digits. Without a finite one: three digits.
+    """
+    if not 0.0 < std < np.inf:
+        return f"{value:.3g}"
+    digits = 2 if f"{std:.0e}"[0] == "1" else 1
+    decimals = digits - 1 - int(f"{std:.{digits - 1}e}".split("e")[1])
+    size = int(f"{value:.0e}".split("e")[1]) if value else 0
+    if not 0 <= decimals <= 8 or decimals + size > 7:  # Beyond what is read easily.
+        return f"{value:.3g} +- {std:.1g}"
+    return f"{value:.{decimals}f} +- {std:.{decimals}f}"
+
+
 def sentence(
     effect: Effect,
     kind: EffectKind,
     std: Mapping[str, float] | None = None,
     slides: bool = False,
 ) -> str:
-    """The report's sentence on an effect, numbers to three digits.
+    """The report's sentence on an effect.
 
-    Args: std, of the parameters where they are known: told as "+- ...", an infinite one
+    Args: std, of the parameters where they are known: as "+- ...", an infinite one
         in words; slides, whether it is of joints that slide.
     """
     first = effect.parameters.get(kind.parameters[0].name, 0.0)
@@ -264,12 +279,11 @@ def sentence(
         if value is None:
             words[each.name] = "(unset)"
             continue
-        text, spread = f"{value:.3g}", (std or {}).get(each.name)
-        if spread is not None and np.isfinite(spread):
-            text += f" +- {spread:.1g}"
+        spread = (std or {}).get(each.name)
+        text = with_deviation(value, 0.0 if spread is None else spread)
         words[each.name] = f"{text} {unit_at(each.unit, slides)}".rstrip()
         if spread is not None and not np.isfinite(spread):
-            words[each.name] += " (which the data do not tell)"
+            words[each.name] += " (not identifiable from these data)"
     # An optional parameter that is not there takes its [bracket] with it.
     says = re.sub(
         r"\[([^\]]*)\]", lambda m: "" if "(unset)" in _fill(m[1], words) else m[1],
