@@ -113,6 +113,19 @@ def select(
     return _Search(problem, say).run()
 
 
+def without(problem: GapProblem, selection: Selection, effect: Effect) -> Selection:
+    """A selection less the effect of that kind and place, all others fitted again."""
+    rest = [
+        c for c in selection.choices
+        if (c.effect.kind, list(c.effect.at)) != (effect.kind, list(effect.at))
+    ]  # fmt: skip
+    fitted = fit_effects(
+        problem, selection.screen(problem), [c.effect for c in rest],
+        [c.fixed for c in rest],
+    )  # fmt: skip
+    return replace(selection, choices=tuple(_refreshed(rest, fitted)), end=fitted)
+
+
 class _Search:
     def __init__(self, problem: GapProblem, say: Callable[[str], None]):
         self.problem, self.say, self.plan = problem, say, problem.plan

@@ -28,7 +28,7 @@ from makebreak.gap.recording import (
 )
 from makebreak.gap.result import GapMeasure, GapResult, JudgedChannel
 from makebreak.gap.scene_facts import scene_facts, scene_names
-from makebreak.gap.select import Choice, Selection, select
+from makebreak.gap.select import Choice, Selection, select, without
 from makebreak.gap.split import split, with_noise_of
 from makebreak.gap.trust import trust_in
 from makebreak.gap.verdict import (
@@ -43,6 +43,7 @@ from makebreak.gap.verdict import (
 )
 from makebreak.gap.windows import WindowModel, with_step
 from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import full_name, one_dof_joints, sliding_joints
 from makebreak.models.scene import Scene, read_scene
 
@@ -151,13 +152,11 @@ def conclude(
     back; they change no effect and no parameter.
     """
     nuisances = selection.nuisances
+    selection, chosen_on = kept_by_simulation(problem, selection, jobs)
     choices = [_with_inseparable(c, problem) for c in selection.choices]
     selection = replace(selection, choices=tuple(choices))
     start, end = problem.error(selection.start), problem.error(selection.end)
     verdict = verdict_of(choices, start, end, selection.far)
-    chosen_on = problem.outcome(
-        selection.effects(), selection.start, selection.end, nuisances, jobs=jobs
-    )
     near = ""
     if chosen_on is not None:
         verdict = after_simulation(verdict, choices, chosen_on.gap, selection.far)
@@ -221,6 +220,32 @@ def conclude(
         channels=channels,
         nuisance_scene=problem.nuisance_effects(nuisances, selection.end.b),
     )  # fmt: skip
+
+
+def kept_by_simulation(
+    problem: GapProblem, selection: Selection, jobs: int
+) -> tuple[Selection, Outcome | None]:
+    """The selection without those of several effects with a state of their own (a
+    spring or a gap in a joint) that make simulated windows no better: equations only
+    approximate them, and they imitate what else is fast. And what it comes to, on what
+    was chosen on."""
+
+    def outcome_of(some: Selection) -> Outcome | None:
+        return problem.outcome(
+            some.effects(), some.start, some.end, some.nuisances, jobs=jobs
+        )
+
+    outcome = outcome_of(selection)
+    for choice in selection.choices:
+        if outcome is None or len(selection.choices) < 2:
+            break
+        if not KINDS[choice.effect.kind].hidden_state:
+            continue
+        fewer = without(problem, selection, choice.effect)
+        other = outcome_of(fewer)
+        if other is not None and other.gap.after <= outcome.gap.after:
+            selection, outcome = fewer, other
+    return selection, outcome
 
 
 def _borne_out(gap: GapMeasure) -> bool:

@@ -1,5 +1,6 @@
 """The statistics of the gap workflow: each against a value from elsewhere."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,11 +10,18 @@ from scipy.signal import lfilter
 
 from makebreak.gap.fit import derivative_free_search, fit_effects
 from makebreak.gap.mechanism import MechanismProblem
-from makebreak.gap.problem import Candidate, GapProblem, Nuisances, SearchPlan
+from makebreak.gap.problem import (
+    Candidate,
+    GapProblem,
+    Nuisances,
+    Outcome,
+    SearchPlan,
+)
 from makebreak.gap.result import GapMeasure
-from makebreak.gap.select import Choice, is_significant, select
+from makebreak.gap.select import Choice, Selection, is_significant, select
 from makebreak.gap.trust import gauss_newton, ridges
 from makebreak.gap.verdict import after_simulation, verdict_of
+from makebreak.gap.workflow import kept_by_simulation
 from makebreak.models.effects.kind import Effect
 from makebreak.systems.numerics.selection import (
     Screen,
@@ -548,3 +556,44 @@ class TwoJoints(MechanismProblem):
 )
 def test_equations_are_closed_where_an_effect_acts(start, end, closed):
     assert TwoJoints(start, end).share() == pytest.approx(closed, abs=0.02)
+
+
+class Simulated(TwoChannels):
+    """Windows that leave so much with two effects, with the first alone, and none."""
+
+    def __init__(self, both: float, one: float):
+        super().__init__(damping=1.0, bias=1.0)
+        self._left = {2: both, 1: one, 0: 9.0}
+        self._of["joint_backlash"] = self._of.pop("actuator_bias")
+
+    def outcome(self, effects, *_args, **_kwargs):
+        return Outcome(windows_leave(9.0, self._left[len(effects)]))
+
+
+@pytest.mark.parametrize(
+    "both, one, kept", [(2.0, 3.0, 2), (3.0, 3.0, 1), (4.0, 3.0, 1)]
+)
+def test_a_gap_in_a_gear_that_windows_do_not_show_is_dropped(both, one, kept):
+    problem = Simulated(both, one)
+    effects = [Effect("joint_viscous_damping", ["a"], {"damping": 0.9}),
+               Effect("joint_backlash", ["a.j2"], {"gap": 0.9})]  # fmt: skip
+    nuisances, fixed = problem.nuisances(), [(), ("restitution",)]
+    screen = Screen(problem.base(), nuisances.columns, nuisances.prior, problem.train())
+    start, end = (
+        fit_effects(problem, screen, e, fixed[: len(e)]) for e in ([], effects)
+    )
+    choices = tuple(
+        Choice(e, {}, 2.0, 1.0, "", 1.0, (), f, 1)
+        for e, f in zip(end.effects, fixed, strict=True)
+    )
+    selection = Selection(choices, start, end, nuisances)
+    left, outcome = kept_by_simulation(problem, selection, 1)
+    assert len(left.choices) == kept and outcome.gap.after == min(both, one)
+    assert left.choices[0].effect.kind == "joint_viscous_damping"
+    # What stays is fitted again without it: of 18,000 rows to 1 %.
+    damping = left.choices[0].effect.parameters["damping"]
+    assert damping == pytest.approx(1.0, abs=0.03)
+    assert (left.end is end) == (kept == 2)
+    # Alone it is judged as any other.
+    alone = replace(selection, choices=choices[1:])
+    assert kept_by_simulation(problem, alone, 1)[0] is alone
