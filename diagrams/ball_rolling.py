@@ -105,6 +105,7 @@ class PlannerConfig:
     ball_velocity: float = 300.0  # And angular velocity.
     force: float = 5.0  # G of lam of tip and ball; eta's is 1/10 of it.
     friction: float = 1.0  # Of both contacts, for planning and learning.
+    sliding_command: bool = True  # No contact is felt from afar in one step's model.
     polish: int = 0  # Rollouts that improve the plan (docs/c3.md); 0: none.
 
 
@@ -121,7 +122,12 @@ class LearnerConfig:
     eps: float = 1e-3  # 3 N of contact over a gap of 0.05 mm are as unlikely as 2 std.
     gamma: float = 5e-4  # 1e-2 * 0.05 s: the paper's, for forces in newtons.
     r_max: float = 0.7  # [m/s]: 35 mm.
-    posterior: PosteriorConfig = field(default_factory=PosteriorConfig)
+    slip_noise: float = 0.03  # Of a ball's speed at its top, seen by the camera [m/s].
+    posterior: PosteriorConfig = field(
+        default_factory=lambda: PosteriorConfig(
+            free_states=[V_BALL.start, V_BALL.start + 1]
+        )
+    )
 
 
 @dataclass
@@ -288,6 +294,7 @@ def c3_config(planner: PlannerConfig, n_lam: int, projection: str = "plus") -> C
             polish=planner.polish,
         ),
         residual_dt_sec=LEARN,
+        sliding_command=planner.sliding_command,
     )
 
 
@@ -310,6 +317,7 @@ def learner_config(learner: LearnerConfig) -> ResidualLearnerConfig:
         # contact does not adapt.
         groups=[list(range(N_TIP))],
         r_max=learner.r_max,
+        slip_noise=learner.slip_noise,
         posterior=learner.posterior,
     )
 

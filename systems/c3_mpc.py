@@ -64,6 +64,8 @@ class C3Config:
     # The first knots keep the contact modes that the last plan's inputs have from x.
     fixed_knots: int = 0
     clamp_command_gap: bool = True  # Treat penetration as touching in x_next.
+    # In x_next a contact that slides is not felt from a distance (opening_speed).
+    sliding_command: bool = False
 
 
 class C3Mpc(LeafSystem):
@@ -109,7 +111,10 @@ class C3Mpc(LeafSystem):
                 f"C3Config.fixed_knots is {config.fixed_knots}, expected an integer "
                 f"from 0 to N = {p.options.N}"
             )
-        self._clamp = config.clamp_command_gap
+        self._per_force = [p.n_x]  # Where the entries per force begin in z.
+        if p.is_plus:
+            self._per_force.append(p.n_x + p.n_lam + p.n_u)
+        self._clamp, self._sliding = config.clamp_command_gap, config.sliding_command
         self._period = period_sec
         N = p.options.N
         self._x_in = self.DeclareVectorInputPort("x", p.n_x)
@@ -137,6 +142,7 @@ class C3Mpc(LeafSystem):
         self._plan_u = state(N, p.n_u, value=self._u_idle)
         self._plan_lam = state(N, p.n_lam)
         self._delta, self._w = state(N, p.n_z), state(N, p.n_z)
+        self._contact = state(N, p.n_lam, value=-1.0)  # Of each force; -1: unknown.
         self.DeclareStateOutputPort("u", self._u[0])
         self.DeclareStateOutputPort("x_next", self._x_next[0])
         self.DeclareStateOutputPort("lam", self._lam[0])
@@ -170,9 +176,12 @@ class C3Mpc(LeafSystem):
             warm = WarmStart(
                 *(self._get(context, s) for s in (self._plan_u, self._delta, self._w))
             )
+            contact = self._contacts_of(lcs)
             try:
                 if self._problem.options.warm_start:
-                    warm = warm.shifted(min(self._period / dt, 1.0))
+                    before = self._get(context, self._contact)
+                    contacts = before, contact, self._per_force
+                    warm = warm.shifted(min(self._period / dt, 1.0), contacts)
                 modes = self._modes(context, lcs, x, dt)
                 plan, warm = solve_c3(lcs, x, x_desired, self._problem, warm, modes)
             except C3Failure:
@@ -191,6 +200,7 @@ class C3Mpc(LeafSystem):
         write(self._plan_lam, plan.lam)
         write(self._delta, warm.delta)
         write(self._w, warm.w)
+        write(self._contact, contact)
         try:
             x_next, lam = command_step(lcs_command, x, plan.u[0])
         except C3Failure:
@@ -198,6 +208,15 @@ class C3Mpc(LeafSystem):
             return
         write(self._x_next, x_next)
         write(self._lam, lam)
+
+    def _contacts_of(self, lcs):
+        """(N, n_lam) the contact of each knot's forces; -1 where the LCS says none."""
+        N, n_lam = self._problem.options.N, self._problem.n_lam
+        models = [lcs] * N if isinstance(lcs, LCS) else lcs
+        unknown = np.full(n_lam, -1.0)
+        return np.array([
+            unknown if m.contact is None else m.contact for m in models
+        ])  # fmt: skip
 
     def _modes(self, context, lcs, x, dt):
         """Contact modes of the first knots under the last plan's inputs; or None."""
@@ -232,6 +251,7 @@ class C3Mpc(LeafSystem):
         of_knots = [lcs] if isinstance(lcs, LCS) else lcs
         if not (self._are_good(of_knots) and self._are_good([lcs_command])):
             return C3Status.BAD_LCS, None
+        at = x if self._sliding else None
         of_knots = [
             with_gap_residual(m, r_comp, self._residual_dt, clamp=False)
             for m in of_knots
@@ -240,7 +260,7 @@ class C3Mpc(LeafSystem):
             x,
             x_desired.reshape(-1, p.n_x),
             of_knots if isinstance(lcs, Sequence) else of_knots[0],
-            with_gap_residual(lcs_command, r_comp, self._residual_dt, self._clamp),
+            with_gap_residual(lcs_command, r_comp, self._residual_dt, self._clamp, at),
         )
 
     def _are_good(self, models):

@@ -200,11 +200,11 @@ class AnitescuLcs:
 
     def _build_general(self, x, u):
         f, J_q, J_v, J_u, M = self._smooth(x, u)
-        phi, J_n, J_c, F_0 = self._contact()
+        phi, J_n, J_c, F_0, chosen = self._contact()
         N, N_plus = self._velocity_maps(x[: self.n_q])
         return assemble_lcs(
             x, f, J_q, J_v, J_u, u, M, N, N_plus, phi, J_n, J_c, self._rows.contact,
-            self._rows.normal, F_0, self.dt_sec,
+            self._rows.normal, F_0, self.dt_sec, chosen,
         )  # fmt: skip
 
     def _smooth(self, x, u):
@@ -236,7 +236,8 @@ class AnitescuLcs:
         return f, J_q, J_v, J_u, M
 
     def _contact(self):
-        """phi, J_n, J_c and F_0 at the state that the plant's context is at."""
+        """phi, J_n, J_c, F_0 and the numbers of the contacts, at the state that the
+        plant's context is at."""
         plant, context, rows = self._plant, self._plant_context, self._rows
         world, wrt = plant.world_frame(), JacobianWrtVariable.kV
         query = self._query_port.Eval(context)
@@ -263,7 +264,7 @@ class AnitescuLcs:
         on = rows.contact
         J_t = (rows.edge[:, :, None] * J[on, 1:]).sum(axis=1)
         J_c = rows.normal[:, None] * J[on, 0] + weight[:, None] * J_t
-        return phi, J[:, 0], J_c, F_0
+        return phi, J[:, 0], J_c, F_0, chosen
 
     def _check_plane(self, i, n):
         if self._planar[i] and abs(n @ self._reference[i]) > 0.1:

@@ -55,6 +55,10 @@ class PosteriorConfig:
     spacing: float = 0.01  # Of the grid [m/s].
     trust: float = 0.2  # Share of a step's loss that counts.
     loss_max: float = 20.0  # What one step can say at most.
+    # States that also change for reasons which no model has (an object that rocks): by
+    # how much is watched where nothing can touch, over this time, and they weigh less.
+    free_states: list[int] = field(default_factory=list)
+    free_sec: float = 2.0
 
 
 @dataclass
@@ -75,6 +79,9 @@ class ResidualLearnerConfig:
     # Empty: all adapt, each for itself.
     groups: list[list[int]] = field(default_factory=list)
     r_max: float = 1.0  # Bound on each entry of r_comp [m/s].
+    # More than this of mu |v_t| is taken out of what a contact that slides is felt from
+    # (opening_speed) [m/s]; infinite: nothing is, as in the paper.
+    slip_noise: float = np.inf
     # Given: r_comp is a probability's mode instead of Adam's, for one group; Q_d
     # then has inverse variances, and n_b, learning_rate and n_steps have no effect.
     posterior: PosteriorConfig | None = None
@@ -91,6 +98,8 @@ class LearnerMemory:
     status: LearnerStatus
     belief: np.ndarray | None = None  # (n,) on the grid of the posterior.
     std: float = 0.0  # Of the residual [m/s]; 0 without a posterior.
+    # Of the posterior's free states: the mean square of what is not explained [SI^2].
+    unexplained: np.ndarray | None = None
 
     def __deepcopy__(self, memo):
         return self  # Every part is immutable, so a Context may share it.
@@ -154,7 +163,12 @@ class ResidualLearner(LeafSystem):
                 config.r_max, c.spacing, c.prior_std, c.drift * root, c.growth * root
             )
             _, std = mode_and_std(self._grid, self._grid.prior)
-            memory = replace(memory, belief=self._grid.prior, std=std)
+            memory = replace(
+                memory,
+                belief=self._grid.prior,
+                std=std,
+                unexplained=np.zeros(len(c.free_states)),
+            )
         self._memory = self.DeclareAbstractState(Value(memory))
         ticket = {self.abstract_state_ticket(self._memory)}
         self.DeclareVectorOutputPort("r_comp", lcs.n_lam, self._calc_r_comp, ticket)
@@ -168,11 +182,11 @@ class ResidualLearner(LeafSystem):
 
     def _first_call(self, memory: LearnerMemory, lcs: LCS):
         x, u = np.zeros(lcs.n_x), np.zeros(lcs.n_u)
-        first = measured_step(lcs, x, u, x, self._Q_d, self._config.eps)
         if self._grid is None:
+            first = measured_step(lcs, x, u, x, self._Q_d, self._config.eps)
             self._learned(memory, first)
         else:
-            self._with_posterior(memory, (x, lcs), first)
+            self._with_posterior(memory, (x, lcs), (lcs, x, u, x))
 
     @timed
     def _update(self, context, state):
@@ -204,18 +218,26 @@ class ResidualLearner(LeafSystem):
         x_before, lcs_before = memory.sample
         if not self._config.gamma < gamma_bound(lcs_before.F):
             return _held(memory, sample, LearnerStatus.GAMMA_REFUSED)
-        step = measured_step(lcs_before, x_before, u, x, self._Q_d, self._config.eps)
+        c = self._config
+        pair = lcs_before, x_before, u, x
         if self._grid is not None:
-            return self._with_posterior(memory, sample, step)
+            return self._with_posterior(memory, sample, pair)
+        step = measured_step(*pair, self._Q_d, c.eps, c.slip_noise)
         buffer = memory.buffer.append(step, self._config.n_b)
         residual, loss, status = self._learned(memory, buffer)
         return LearnerMemory(sample, buffer, residual, loss, status)
 
-    def _with_posterior(self, memory, sample, step) -> LearnerMemory:
-        """The memory after one more measured step."""
+    def _with_posterior(self, memory, sample, pair) -> LearnerMemory:
+        """The memory after one more measured step, of the pair lcs, x, u, x_next."""
         c, grid = self._config, self._grid
         assert grid is not None and c.posterior is not None
         shared = self._group == 0
+        unexplained = self._unexplained(memory, sample[1], *pair)
+        Q_d = self._Q_d.copy()
+        for i, square in zip(c.posterior.free_states, unexplained, strict=True):
+            Q_d[i] = min(Q_d[i], 1.0 / max(square, 1e-300))
+        lcs, x, u, x_next = pair
+        step = measured_step(lcs, x, u, x_next, Q_d, c.eps, c.slip_noise)
         loss = losses_on_grid(step, shared, grid.values, c.eps, c.gamma)
         solved = bool(np.isfinite(loss).all())
         belief = updated(
@@ -229,7 +251,25 @@ class ResidualLearner(LeafSystem):
         if abs(mode) > c.r_max - c.posterior.spacing:
             status = LearnerStatus.AT_BOUND
         told = float(np.interp(before, grid.values, loss)) if solved else memory.loss
-        return LearnerMemory(sample, memory.buffer, residual, told, status, belief, std)
+        return LearnerMemory(
+            sample, memory.buffer, residual, told, status, belief, std, unexplained
+        )
+
+    def _unexplained(self, memory, lcs_next, lcs, x, u, x_next):
+        """Mean squares of how the free states change where nothing can touch."""
+        c = self._config.posterior
+        assert c is not None
+        if not len(c.free_states):
+            return memory.unexplained
+        least = float(memory.residual.value[0]) - 2.0 * memory.std
+        for phi in (lcs.phi, lcs_next.phi):
+            if phi is None or (phi[self._group == 0] + least * lcs.dt <= 0.0).any():
+                return memory.unexplained
+        change = (lcs.A @ x + lcs.B @ u + lcs.d - x_next)[c.free_states]
+        share = min(lcs.dt / c.free_sec, 1.0)
+        after = (1.0 - share) * memory.unexplained + share * change**2
+        after.setflags(write=False)
+        return after
 
     def _learned(self, memory, buffer):
         c = self._config
@@ -290,6 +330,8 @@ def _checked(config: ResidualLearnerConfig, lcs: LCS, period_sec: float):
         value = getattr(c, name)
         if not (np.isfinite(value) and value > 0.0):
             raise ValueError(f"{name} is {value}, expected a positive number")
+    if not c.slip_noise >= 0.0:
+        raise ValueError(f"slip_noise is {c.slip_noise}, expected 0 or more")
     for name in ("n_b", "n_steps"):
         if not getattr(c, name) >= 1:
             raise ValueError(f"{name} is {getattr(c, name)}, expected 1 or more")
@@ -305,7 +347,14 @@ def _checked(config: ResidualLearnerConfig, lcs: LCS, period_sec: float):
             raise ValueError(
                 f"groups is {c.groups}, expected one group with a posterior"
             )
+        for i in c.posterior.free_states:
+            if not 0 <= i < lcs.n_x:
+                raise ValueError(
+                    f"posterior.free_states names {i}, expected 0..{lcs.n_x - 1}"
+                )
         for name, value in vars(c.posterior).items():
+            if name == "free_states":
+                continue
             least, what = np.nextafter(0.0, 1.0), "a positive number"
             if name == "growth":
                 least, what = 0.0, "0 or more"

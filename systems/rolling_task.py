@@ -136,7 +136,8 @@ def _check(config: RollingTaskConfig):
     for name in ("speed", "lead_deg", "press"):
         if not np.isfinite(getattr(config, name)):
             raise ValueError(f"task.{name} is {getattr(config, name)}, expected finite")
-    for name in ("roll_sec", "reposition_sec", "approach_speed", "touch_force"):
+    for name in ("roll_sec", "reposition_sec", "approach_speed", "touch_force",
+                 "land_above", "coast_change"):  # fmt: skip
         if not 0.0 < getattr(rolling, name) < np.inf:
             raise ValueError(
                 f"task.rolling.{name} is {getattr(rolling, name)}, expected > 0"
@@ -145,7 +146,7 @@ def _check(config: RollingTaskConfig):
         raise ValueError(
             f"task.rolling.integral_sec is {rolling.integral_sec}, expected > 0"
         )
-    for name in ("n_std", "approach_max"):
+    for name in ("n_std", "n_std_below", "approach_max"):
         if not 0.0 <= getattr(rolling, name) < np.inf:
             raise ValueError(
                 f"task.rolling.{name} is {getattr(rolling, name)}, expected >= 0"

@@ -15,8 +15,13 @@ from makebreak.diagrams.ball_rolling import (
     CONTROL,
     ESTIMATE,
     BallRollingConfig,
+    LearnerConfig,
+    PlannerConfig,
     believed,
+    c3_config,
+    learner_config,
     make_ball_rolling,
+    paper_learner_config,
     world_scene,
 )
 from makebreak.diagrams.camera import CameraConfig
@@ -34,7 +39,8 @@ from makebreak.systems.numerics.c3_projections import (
     PlusProjection,
     QpProjection,
 )
-from makebreak.systems.numerics.rolling_task import ROLL, WAIT
+from makebreak.systems.numerics.rolling_task import ROLL, WAIT, RollingConfig
+from makebreak.systems.rolling_task import RollingTaskConfig
 
 EFFORT = np.repeat([87.0, 12.0], [4, 3])  # [N m] of the Panda's joints.
 RATE = 1.0  # [N m per ms]
@@ -102,7 +108,9 @@ def updates(diagram):
 
 @pytest.fixture(scope="module")
 def diagram():
-    return make_ball_rolling(config())
+    """Where the tip does not feel for a surface below the one that it believes in."""
+    rolling = RollingConfig(n_std_below=0.0)
+    return make_ball_rolling(config(task=RollingTaskConfig(rolling=rolling)))
 
 
 @pytest.fixture(scope="module")
@@ -711,6 +719,13 @@ def builder_of(name):
 def test_projection_is_the_one_that_is_asked_for(changes, kind):
     c3 = make_ball_rolling(config(**changes)).GetSubsystemByName("c3_mpc")
     assert isinstance(c3._problem.projection, kind)
+
+
+def test_what_slides_is_felt_from_no_distance_by_learner_and_command_alike():
+    assert c3_config(PlannerConfig(), 8).sliding_command
+    assert learner_config(LearnerConfig()).slip_noise == 0.03
+    # The paper's learner has its contact as it is.
+    assert paper_learner_config(8).slip_noise == np.inf
 
 
 def short(tmp_path, seconds, *settings):

@@ -58,6 +58,7 @@ from makebreak.systems.numerics.c3_projections import (
     projection_matrices,
 )
 from makebreak.systems.numerics.c3_qp import (
+    CANNOT_BE_MET,
     MET,
     factor,
     new_factor,
@@ -241,6 +242,34 @@ def test_bounded_qp_step_agrees_with_clarabel_and_sees_infeasibility():
         np.testing.assert_allclose(v, expected[1], atol=2e-5 * (1 + abs(v).max()))
         np.testing.assert_allclose(x, expected[0], atol=2e-5 * (1 + abs(x).max()))
     assert met > 20 and infeasible > 0
+
+
+def test_the_dual_active_set_alone_finds_what_clarabel_finds():
+    """Without the interior point method behind it, which would hide a fault: bounds of
+    either side, also those that only come in on the way."""
+    rng = np.random.default_rng(3)
+    n_active = {1: 0, -1: 0}
+    came_in = 0
+    for _ in range(60):
+        qp = *_, h, x0, v0, lower, upper = random_qp(rng, bounded=True)
+        fac, x, v = riccati(qp)
+        if within(x, v, lower, upper):
+            continue
+        n_v = v.shape[1]
+        free = np.hstack([np.vstack([v, np.zeros(n_v)]), x])
+        sides = np.zeros(h.shape, np.int64)
+        status = solve_active(fac, h, x0, v0, lower, upper, sides, x, v)
+        expected = clarabel(qp)
+        assert status == (CANNOT_BE_MET if expected is None else MET)
+        if expected is None:
+            continue
+        # As above: the accuracy of Clarabel.
+        np.testing.assert_allclose(v, expected[1], atol=2e-5 * (1 + abs(v).max()))
+        np.testing.assert_allclose(x, expected[0], atol=2e-5 * (1 + abs(x).max()))
+        for side, held in ((1, free >= lower), (-1, free <= upper)):
+            n_active[side] += np.count_nonzero(sides == side)
+            came_in += np.count_nonzero((sides == side) & held)
+    assert min(n_active.values()) > 20 and came_in > 10
 
 
 def test_a_qp_that_is_not_convex_is_refused():
@@ -743,6 +772,63 @@ def test_shifting_a_warm_start_moves_it_along_the_horizon():
     np.testing.assert_allclose(shifted.w[:, 0], [-0.25, -1.25, -2.0])
 
 
+def test_what_is_kept_of_a_force_goes_with_its_contact():
+    """z = [x (2), lam (4), u (1), eta (4)], two forces a contact."""
+    z = np.array([[8.0, 9.0, 1, 2, 3, 4, 7.0, 10, 20, 30, 40]] * 2)
+    warm = WarmStart(np.zeros((2, 1)), z, -z)
+    of, to = np.array([[5.0, 5, 2, 2]] * 2), np.array([[2.0, 2, 6, 6]] * 2)
+    moved = warm.shifted(0.5, (of, to, [2, 7]))
+    expected = [[8.0, 9, 3, 4, 0, 0, 7, 30, 40, 0, 0]] * 2
+    np.testing.assert_array_equal(moved.delta, expected)
+    np.testing.assert_array_equal(moved.w, -np.array(expected))
+    same = warm.shifted(0.5, (of, of, [2, 7]))
+    np.testing.assert_array_equal(same.delta, z)
+
+
+def test_where_contacts_change_along_the_horizon_each_knot_has_its_own():
+    z = np.array([[0.0, 1.0, 9.0], [0.0, 2.0, 9.0]])  # z = [x, lam, u].
+    warm = WarmStart(np.zeros((2, 1)), z, 0.0 * z)
+    of, to = np.array([[3.0], [4.0]]), np.array([[3.0], [3.0]])
+    delta = warm.shifted(0.25, (of, to, [1])).delta
+    # The second knot's force was that of contact 4, of which nothing is kept.
+    np.testing.assert_allclose(delta[:, 1], [0.75 * 1.0, 0.0])
+
+
+def two_walls(number):
+    """The soft-wall cart-pole's LCS with its walls in the order of these numbers."""
+    lcs, i = cartpole_lcs(), [0, 1] if number == (0, 1) else [1, 0]
+    return LCS(
+        lcs.A, lcs.B, lcs.D[:, i], lcs.d, lcs.E[i], lcs.F[np.ix_(i, i)], lcs.H[i],
+        lcs.c[i], 0.01, None, None, np.array(number),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("projection", [PLUS, C3_QP])
+def test_a_system_whose_contacts_change_rows_plans_as_if_they_had_not(projection):
+    """The second LCS has the walls in the other order: the warm start follows them."""
+    plans = []
+    for second in ((0, 1), (1, 0)):
+        p = cartpole_problem(projection)
+        weights = C3Weights(p.Q, p.R, p.G, p.U, p.Q_N)
+        options = C3Options(N=5, rounds=2, rho=2.0, warm_start=True)
+        system = C3Mpc(C3Config(weights, projection, options), 0.01)
+        simulator = Simulator(system)
+        context = simulator.get_mutable_context()
+        system.GetInputPort("x").FixValue(context, [0.1, 0.35, 1.5, 0.5])
+        system.GetInputPort("x_desired").FixValue(context, np.zeros(24))
+        port = system.GetInputPort("lcs")
+        port.FixValue(context, AbstractValue.Make(two_walls((0, 1))))
+        simulator.AdvanceTo(0.005)
+        first = system.GetOutputPort("plan").Eval(context)
+        assert abs(first.lam).max() > 1e-3
+        port.FixValue(context, AbstractValue.Make(two_walls(second)))
+        simulator.AdvanceTo(0.015)
+        assert system.GetOutputPort("status").Eval(context)[0] == 0
+        plans.append(system.GetOutputPort("plan").Eval(context))
+    np.testing.assert_allclose(plans[0].u, plans[1].u, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(plans[0].lam, plans[1].lam[:, ::-1], atol=1e-9)
+
+
 def test_nothing_is_compiled_after_warm_up():
     problem = cartpole_problem(warm_start=True)
     warm_up(problem)
@@ -1034,6 +1120,28 @@ def read(simulator, name):
     return port.Eval(simulator.get_context())
 
 
+def test_in_the_command_a_contact_that_slides_is_not_felt_from_a_distance():
+    """A tip that passes 4 mm over a ball at 0.2 m/s: Anitescu's contact would stop it
+    within a step of 50 ms; with the sliding speed taken out it passes."""
+    x = BALL["x0"].copy()
+    x[:3] = x[7:10] + [0.0, 0.0, x[9] + 0.06]  # Lifted off, then to 4 mm.
+    far = ball_lcs(x=x).phi[0]
+    x[2] -= far - 0.004
+    x[10:] = [0.2, 0.0, -0.02, *np.zeros(6)]
+    lcs = ball_lcs(x=x)
+    assert lcs.phi[0] == pytest.approx(0.004, abs=1e-9)
+    r, mu = np.zeros(lcs.n_lam), 0.5
+    plain = with_gap_residual(lcs, r, 0.05, True)
+    passing = with_gap_residual(lcs, r, 0.05, True, x)
+    # Eight edges: along one of them within 22.5 degrees.
+    slip = passing.c[:8] - plain.c[:8]
+    assert mu * 0.2 * np.cos(np.pi / 8) <= slip[0] <= mu * 0.2 + 1e-12
+    np.testing.assert_allclose(slip, slip[0])
+    carried = np.array([0.0, 0.0, (x - lcs.A @ x - lcs.d)[12] / lcs.B[12, 2]])
+    assert simulate(plain, x, carried)[1][:8].max() > 1e-3
+    assert simulate(passing, x, carried)[1][:8].max() < 1e-9
+
+
 def test_system_gives_the_plan_and_one_step_of_its_model():
     simulator = fixed(C3Mpc(config(), 0.01))
     assert read(simulator, "status") == C3Status.NO_PLAN_YET
@@ -1068,6 +1176,23 @@ def test_command_takes_one_step_of_its_own_model_with_the_residual():
     x_next, lam = simulate(model, CARTPOLE["x0"], plan.u[0])
     np.testing.assert_allclose(read(simulator, "x_next"), x_next, rtol=1e-12)
     np.testing.assert_allclose(read(simulator, "lam"), lam, rtol=1e-12)
+
+
+@pytest.mark.parametrize("sliding", [False, True])
+def test_the_systems_command_takes_sliding_contacts_for_open_only_if_asked_to(sliding):
+    """Both forces of one contact, opposite edges along the cart's velocity x[2]."""
+    J = np.array([[0.3, 0.0], [-0.3, 0.0]])
+    plain = cartpole_lcs()
+    command = replace(plain, c=plain.c - 0.6, J=J, contact=np.zeros(2))  # Touching.
+    problem = replace(config(), sliding_command=sliding)
+    simulator = fixed(C3Mpc(problem, 0.01), lcs_command=AbstractValue.Make(command))
+    simulator.AdvanceTo(0.005)
+    opening = 0.3 * abs(CARTPOLE["x0"][2]) * sliding
+    assert not sliding or opening > 0.01
+    model = command.with_residual(np.full(2, opening))
+    _, lam = simulate(model, CARTPOLE["x0"], read(simulator, "u"))
+    np.testing.assert_allclose(read(simulator, "lam"), lam, rtol=1e-12)
+    assert lam.max() > 1.0
 
 
 def not_finite(a):

@@ -1,5 +1,7 @@
 """The residual as a probability: its maths, and what the ball's learner makes of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
@@ -19,7 +21,7 @@ from makebreak.systems.lcs_builder import (
     LcsBuilderConfig,
 )
 from makebreak.systems.numerics.ball_state import V_TIP, pack
-from makebreak.systems.numerics.lcs import simulate
+from makebreak.systems.numerics.lcs import opening_speed, simulate
 from makebreak.systems.numerics.residual_learner import measured_step, violation_loss
 from makebreak.systems.numerics.residual_posterior import (
     losses_on_grid,
@@ -196,6 +198,69 @@ def test_air_where_the_model_has_the_ball_is_learned_from_v_z_of_the_tip_alone(b
     assert blind < 0.003 and std > 0.006  # About what it believed before.
 
 
+def passing(builder, speed=0.2, clearance=0.005, n=4):
+    """Steps of a tip that passes over a still ball and touches nothing."""
+    top = MODEL.ball_radius + REACH + clearance
+    for k in range(n):
+        p = np.array([speed * LEARN * (k - n / 2), 0.0, top])
+        now, then = (
+            pack(p + [dx, 0.0, 0.0], [speed, 0.0, 0.0], [0, 0, MODEL.ball_radius],
+                 np.zeros(3), MODEL.ball_radius)
+            for dx in (0.0, speed * LEARN)
+        )  # fmt: skip
+        yield builder.build(now, np.zeros(3)), now, then
+
+
+def test_a_contact_that_slides_opens_by_mu_times_its_speed(builder):
+    for lcs, _, then in passing(builder):
+        # The tip's speed across the line of centres, in the basis of four edges.
+        along = np.abs(lcs.J[:4] @ then[10:] - (lcs.J[:4] @ then[10:]).mean())
+        np.testing.assert_allclose(opening_speed(lcs, then)[:4], along.max())
+        assert 0.13 < along.max() <= 0.2 + 1e-9  # mu = 1; |v_t| / sqrt(2) at least.
+        np.testing.assert_allclose(opening_speed(lcs, then)[4:], 0.0, atol=1e-12)
+        assert not opening_speed(lcs, then, np.inf).any()
+        noisy = opening_speed(lcs, then, 0.12)[0]
+        np.testing.assert_allclose(noisy, np.sqrt(along.max() ** 2 - 0.12**2))
+
+
+def test_a_tip_that_passes_over_the_ball_is_not_felt_by_it(builder):
+    """5 mm over it at 0.2 m/s. Anitescu's contact, that opens by 10 mm a step, would
+    have stopped the tip: without the correction the surface is believed lower."""
+    config = learner_config(LearnerConfig())
+    losses = []
+    for noise in (np.inf, 0.03):
+        at_zero = []
+        for lcs, now, then in passing(builder):
+            step = measured_step(lcs, now, np.zeros(3), then, config.Q_d, 1e-3, noise)
+            at_zero.append(violation_loss(step, np.zeros(8), 1e-3, 5e-4)[0][0])
+        losses.append(max(at_zero))
+    assert losses[0] > 20.0 and losses[1] < 1e-6
+
+
+@pytest.mark.parametrize("watched", [True, False])
+def test_a_ball_that_rocks_by_itself_says_little_of_the_gap(builder, watched):
+    """Seen first where nothing can touch it, then under a tip 6 mm over the surface."""
+    rng = np.random.default_rng(0)
+    x, u, all_lcs = [], [], []
+    for k in range(120):
+        height = 0.2 if k < 80 else MODEL.ball_radius + REACH + 0.006
+        v = [*(0.08 * rng.normal(size=2)), 0.0]
+        row = pack([0.0, 0.0, height], np.zeros(3), [0, 0, MODEL.ball_radius], v,
+                   MODEL.ball_radius)  # fmt: skip
+        row[V_TIP] += 3e-3 * rng.normal(size=3)
+        x.append(row)
+        u.append(np.zeros(3))
+        all_lcs.append(builder.build(row, np.zeros(3)))
+    config = learner_config(LearnerConfig())
+    if not watched:
+        config.posterior = replace(config.posterior, free_states=[])
+    r, std, _ = learned(config, np.array(x), np.array(u), all_lcs)
+    if watched:
+        assert abs(r) < 0.003 and abs(r) < std
+    else:
+        assert abs(r) > 0.004
+
+
 def test_without_a_posterior_r_std_is_zero_and_r_comp_adapts_entry_by_entry(builder):
     x, u, all_lcs = press(builder, gap=0.05, z_end=-0.006)
     config = paper_learner_config(all_lcs[0].n_lam)
@@ -230,6 +295,9 @@ def test_a_gap_that_is_too_large_has_no_gradient_but_a_likelihood():
         (dict(posterior=PosteriorConfig(trust=0.0)), "posterior.trust is 0.0"),
         (dict(posterior=PosteriorConfig(drift=np.nan)), "posterior.drift is nan"),
         (dict(posterior=PosteriorConfig(growth=-1.0)), "posterior.growth is -1.0"),
+        (dict(posterior=PosteriorConfig(free_sec=0.0)), "posterior.free_sec is 0.0"),
+        (dict(posterior=PosteriorConfig(free_states=[19])), "free_states names 19"),
+        (dict(slip_noise=-0.1), "slip_noise is -0.1, expected 0 or more"),
     ],
 )
 def test_wrong_settings_are_refused_by_name(builder, changes, message):

@@ -233,16 +233,30 @@ def test_push_is_over_when_the_tip_is_in_front_of_the_ball():
         assert state.phase == phase
 
 
-def approach(surface, gap_std, T=3.0, speed_below=0.0):
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_push_is_over_when_the_ball_has_rolled_away_sideways(side):
+    ball = np.array([0.6, 0.0, R_BALL])
+    for off, phase in ((0.02, ROLL), (0.03, REPOSITION)):
+        tip = ball + [side * off, 0.0, 0.04]  # Across the path.
+        x = pack(tip, np.zeros(3), ball, np.zeros(3), R_BALL)
+        state = TaskState(ROLL, 0.0, tip, np.zeros(3), np.zeros(3))
+        state = next_state(
+            RollingConfig(), PATH, state, 0.1, DT, x, 0.0, True, R_BALL, R_TIP
+        )  # fmt: skip
+        assert state.phase == phase
+
+
+def approach(surface, gap_std, T=3.0, v_ball=lambda t: np.zeros(2)):
     """A task that lands on a surface at a height [m] over the modelled landing point,
     felt as 8 N once the reference is 0.2 mm inside it; 3 N are felt in the air."""
     config = RollingConfig()
     ball = np.array([0.6, 0.0])
-    x = pack([0.6, 0.0, 0.1], np.zeros(3), [*ball, R_BALL], np.zeros(3), R_BALL)
     state = TaskState(ROLL, -10.0, [0.6, 0.0, 0.1], np.zeros(3), np.zeros(3))
     z_land = surface_height(config.land_behind, R_BALL, R_TIP) + config.land_above
     rows = []
     for k in range(round(T / DT)):
+        v = [*v_ball(k * DT), 0.0]
+        x = pack([0.6, 0.0, 0.1], np.zeros(3), [*ball, R_BALL], v, R_BALL)
         inside = z_land + surface - state.p[2]
         force = 3.0 + (8.0 if inside > 2e-4 else 0.0)
         state = next_state(config, PATH, state, k * DT, DT, x, 0.0, True, R_BALL, R_TIP,
@@ -288,6 +302,40 @@ def test_without_much_uncertainty_there_is_no_approach(gap_std):
 
 def test_an_approach_ends_at_rest_as_a_landing_without_one_does():
     """A tip that comes down on the ball with some speed kicks it off the path."""
-    _, _, rows = approach(surface=-0.01, gap_std=0.008)
+    _, _, rows = approach(surface=-1.0, gap_std=0.008)
     # 0.3 m/s2 from 35 mm/s; over within 0.3 mm, and a tick of 12.5 ms before it.
     assert abs(rows[-1][1].v[2]) <= 0.02
+
+
+def test_a_surface_of_which_little_is_known_is_felt_for_below_where_it_is_believed():
+    """It is 8 mm lower than the landing point's 3 mm over it, one deviation."""
+    config, z_land, rows = approach(surface=-0.011, gap_std=0.008)
+    assert rows[-1][1].phase == ROLL
+    # As above: a tick or two of descent inside.
+    inside = z_land - 0.011 - rows[-1][1].p[2]
+    assert 0.0 <= inside <= 2e-4 + 2 * config.approach_speed * DT
+    # What is not there is not looked for beyond 1.5 deviations.
+    _, _, rows = approach(surface=-1.0, gap_std=0.008)
+    np.testing.assert_allclose(
+        rows[-1][1].p[2], z_land - 0.003 - 0.012, atol=2 * config.approach_speed * DT
+    )
+
+
+@pytest.mark.parametrize("change, felt", [(0.05, False), (0.08, True)])
+def test_a_ball_that_does_not_coast_is_felt_for(change, felt):
+    """It rocks while the tip is in the air, and lies still when it lands."""
+
+    def rocks(t):
+        return np.array([0.0, change if 0.2 < t < 0.3 else 0.0])
+
+    _, z_land, rows = approach(surface=-1.0, gap_std=0.001, v_ball=rocks)
+    lowest = z_land - 0.003 - 0.0015 if felt else z_land
+    assert rows[-1][1].phase == ROLL
+    assert rows[-1][1].p[2] == pytest.approx(lowest, abs=5e-4)
+
+
+def test_an_integral_without_a_time_is_refused():
+    for seconds in (0.0, -1.0, np.nan):
+        config = RollingTaskConfig(rolling=RollingConfig(integral_sec=seconds))
+        with pytest.raises(ValueError, match="integral_sec is .*, expected > 0"):
+            RollingTask(config, 6, 0.1, R_BALL, R_TIP, 8, 4, 0.05)

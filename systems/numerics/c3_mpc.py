@@ -51,6 +51,7 @@ from makebreak.systems.numerics.lcs import (
     fixed_forces,
     is_finite,
     is_finite_model,
+    opening_speed,
     simulate,
 )
 from makebreak.systems.numerics.orientation_cost import (
@@ -165,13 +166,51 @@ class WarmStart:
     delta: np.ndarray  # (N, n_z)
     w: np.ndarray  # (N, n_z)
 
-    def shifted(self, knots: float) -> "WarmStart":
-        """delta and w moved ahead in time by knots (0 .. 1), linear between knots."""
+    def shifted(self, knots: float, contacts=None) -> "WarmStart":
+        """delta and w moved ahead in time by knots (0 .. 1), linear between knots.
+
+        Args: contacts: (of, to, starts). The contacts that the forces belonged to at
+            each knot and belong to now, (N, n_lam) each, and where in z the entries per
+            force begin. What is known of a force goes with its contact; of a contact
+            that is new it is zero. None: they are the same.
+        """
 
         def ahead(a):
-            return (1.0 - knots) * a + knots * np.vstack([a[1:], a[-1:]])
+            after = np.vstack([a[1:], a[-1:]])
+            if contacts is not None:
+                of, to, starts = contacts
+                a = moved_with_contacts(a, of, to, starts)
+                of_after = np.vstack([of[1:], of[-1:]])
+                after = moved_with_contacts(after, of_after, to, starts)
+            return (1.0 - knots) * a + knots * after
 
         return WarmStart(self.u, ahead(self.delta), ahead(self.w))
+
+
+def moved_with_contacts(a, of, to, starts):
+    """a (N, n_z), whose rows' entries per force belong to the contacts of (N, n_lam),
+    for the contacts to (N, n_lam); starts: where these entries begin in a row.
+
+    The forces of a contact keep their order in it.
+    """
+    if (of == to).all():
+        return a
+    moved, n_lam = a.copy(), of.shape[1]
+    for k in np.flatnonzero((of != to).any(axis=1)):
+        old = {key: i for i, key in enumerate(_in_their_contacts(of[k]))}
+        came_from = [old.get(key, -1) for key in _in_their_contacts(to[k])]
+        for start in starts:
+            entries = np.append(a[k, start : start + n_lam], 0.0)
+            moved[k, start : start + n_lam] = entries[came_from]
+    return moved
+
+
+def _in_their_contacts(contact):
+    """(its contact, its place in it) of each force."""
+    seen: dict = {}
+    for number in contact.tolist():
+        seen[number] = seen.get(number, -1) + 1
+        yield number, seen[number]
 
 
 class C3Problem:
@@ -748,17 +787,23 @@ def plan_cost(lcs: LCS | Sequence[LCS], x0, u, x_desired, problem: C3Problem) ->
     return float(cost)
 
 
-def with_gap_residual(lcs: LCS, r_comp, residual_dt_sec, clamp: bool) -> LCS:
+def with_gap_residual(
+    lcs: LCS, r_comp, residual_dt_sec, clamp: bool, sliding_x=None
+) -> LCS:
     """lcs with the learned residual of its gaps.
 
     Args:
         r_comp: (n_lam,) residual [m/s] at the time step residual_dt_sec [s]; as a gap
             [m] it does not depend on the step, so it counts as r_comp residual_dt / dt.
         clamp: where the gap phi + r (of geometry) is negative, take it for zero.
+        sliding_x (n_x,): a state at whose sliding speed no contact is to open; None:
+            Anitescu's contacts do (opening_speed).
     """
     r = r_comp * (residual_dt_sec / lcs.dt)
     if clamp and lcs.phi is not None:
         r = r + np.maximum(0.0, -(lcs.phi + r * lcs.dt)) / lcs.dt
+    if sliding_x is not None:
+        r = r + opening_speed(lcs, sliding_x)
     return lcs.with_residual(r)
 
 

@@ -33,6 +33,10 @@ class LCS:
     # infinite where w holds no gap (a friction force of its own). None where the LCS
     # does not come from geometry. It informs, w does not use it.
     phi: np.ndarray | None = None  # (n_lam,)
+    # Likewise: what each force pushes along (w grows with J v_next, x = [q, v]), and
+    # the number of its contact, the same in the LCS of every state.
+    J: np.ndarray | None = None  # (n_lam, n_v)
+    contact: np.ndarray | None = None  # (n_lam,)
 
     def __post_init__(self):
         if not self.dt > 0.0:
@@ -42,6 +46,10 @@ class LCS:
         shapes |= dict(E=(n_lam, n_x), F=(n_lam, n_lam), H=(n_lam, n_u), c=(n_lam,))
         if self.phi is not None:
             shapes["phi"] = (n_lam,)
+        if self.J is not None:
+            shapes["J"] = (n_lam, np.shape(self.J)[-1])
+        if self.contact is not None:
+            shapes["contact"] = (n_lam,)
         fields = vars(self)
         for name, shape in shapes.items():
             fields[name] = _own(name, fields[name], shape)
@@ -71,7 +79,7 @@ class LCS:
 
 def _own(name, value, shape):
     """A read-only copy of an array of floats. Raises: ValueError for another shape."""
-    value = np.array(value, dtype=float)
+    value = np.array(value, dtype=float, order="C")  # Else compiled for each layout.
     if value.shape != shape:
         raise ValueError(f"LCS.{name} is {value.shape}, expected {shape}")
     value.setflags(write=False)
@@ -79,7 +87,7 @@ def _own(name, value, shape):
 
 
 def is_finite_model(lcs: LCS) -> bool:
-    """Whether every number of the model itself is (phi only informs)."""
+    """Whether every number of the model itself is (phi, J and contact only inform)."""
     return _all_finite(lcs.A, lcs.B, lcs.D, lcs.d, lcs.E, lcs.F, lcs.H, lcs.c)
 
 
@@ -99,6 +107,31 @@ def is_finite(numbers):
         if not np.isfinite(number):
             return False
     return True
+
+
+def opening_speed(lcs: LCS, x_next, noise=0.0):
+    """How fast Anitescu's contact opens as it slides, (n_lam,) [m/s]: mu |v_t|.
+
+    A contact that slides is felt from a distance of dt mu |v_t| in that model. With the
+    speed that was measured at the step's end added to its gap velocity it is Coulomb's:
+    its normal part then is that of the gap alone (De Saxce, Feng, Mathematical and
+    Computer Modelling 28 (1998)).
+
+    Args: x_next (n_x,) after the step; noise [m/s]: of mu |v_t|, less than which counts
+        as none; infinite: all of it.
+    Returns: zeros where the LCS does not say what its forces push along.
+    """
+    speed = np.zeros(lcs.n_lam)
+    if lcs.J is None or lcs.contact is None or np.isinf(noise):
+        return speed
+    along = lcs.J @ x_next[-lcs.J.shape[1] :]
+    with_gap = np.ones(lcs.n_lam, bool) if lcs.phi is None else np.isfinite(lcs.phi)
+    for contact in np.unique(lcs.contact):
+        of = (lcs.contact == contact) & with_gap
+        # The edges come in opposite pairs: their mean is the normal's speed.
+        slip = along[of].mean() - along[of].min()
+        speed[of] = np.sqrt(max(slip**2 - noise**2, 0.0))
+    return speed
 
 
 def simulate(lcs: LCS, x, u):

@@ -159,8 +159,9 @@ def tangent_basis(n, reference):
 
 
 def assemble_lcs(
-    x, f, J_q, J_v, J_u, u, M, N, N_plus, phi, J_n, J_c, contact, normal, F_0, dt
-):
+    x, f, J_q, J_v, J_u, u, M, N, N_plus, phi, J_n, J_c, contact, normal, F_0, dt,
+    number=None,
+):  # fmt: skip
     """The LCS of one linearised time step.
 
     Args:
@@ -172,9 +173,10 @@ def assemble_lcs(
         J_c: (n_lam, n_v), what each force pushes along.
         contact: (n_lam,) integers, the contact of each force. normal (n_lam,): 1.0
             where w holds the contact's gap, else 0.0. F_0 (n_lam, n_lam): see the
-            module. dt: time step [s].
+            module. dt: time step [s]. number: (n_contacts,) what the contacts are
+            called; None: 0, 1, ...
 
-    Returns: LCS with dt and phi (per force; infinite where w holds no gap).
+    Returns: LCS with dt, phi (per force; infinite where w holds no gap), J, contact.
 
     Raises: ValueError if the model's arrays lead to an entry that is not finite.
 
@@ -201,7 +203,9 @@ def assemble_lcs(
     if not _is_finite(c, d, F):
         raise ValueError(_NOT_FINITE)
     phi_lam = np.where(normal > 0.0, phi[contact], np.inf)
-    return LCS(A, B, D, d, E, F, H, c, dt, phi_lam)
+    if number is not None:
+        contact = number[contact]
+    return LCS(A, B, D, d, E, F, H, c, dt, phi_lam, J_c, contact)
 
 
 @njit(cache=True)
@@ -299,7 +303,7 @@ class ConstantMassModel:
         pairs, reference = self.pairs, self.reference
         if chosen is not None:
             pairs, reference = pairs[chosen], reference[chosen]
-        A, B, D, d, E, F, H, c, phi, finite = _build_constant_mass(
+        A, B, D, d, E, F, H, c, phi, J_c, finite = _build_constant_mass(
             x, u, self.M_inv, self.f_0, self.J_v, self.J_u, self.plain, self.floating,
             self.shape, self.size, self.quaternion, self.omega, self.R, self.p_0,
             self.P, self.J_p, pairs, reference, rows.contact, rows.normal, weight,
@@ -307,7 +311,8 @@ class ConstantMassModel:
         )  # fmt: skip
         if not finite:
             raise ValueError(_NOT_FINITE)
-        return LCS(A, B, D, d, E, F, H, c, dt, phi)
+        contact = rows.contact if chosen is None else np.asarray(chosen)[rows.contact]
+        return LCS(A, B, D, d, E, F, H, c, dt, phi, J_c, contact)
 
 
 @njit(cache=True)
@@ -380,7 +385,7 @@ def _build_constant_mass(
         x, f, np.zeros((n_v, n_q)), J_v, J_u, u, M_inv @ J_c.T, N, N_plus, phi, J_n,
         J_c, contact, normal, F_0, dt,
     )  # fmt: skip
-    return A, B, D, d, E, F, H, c, phi_lam, _is_finite(c, d, F)
+    return A, B, D, d, E, F, H, c, phi_lam, J_c, _is_finite(c, d, F)
 
 
 @njit(cache=True)

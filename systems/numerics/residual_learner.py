@@ -31,7 +31,7 @@ from numba import njit
 
 from makebreak.systems.numerics.lcp import SOLVED as LCP_SOLVED
 from makebreak.systems.numerics.lcp import solve_lcp_kernel
-from makebreak.systems.numerics.lcs import LCS
+from makebreak.systems.numerics.lcs import LCS, opening_speed
 
 # Gradients (times eps) below this are round-off, and Adam would follow even those [N].
 FORCE_FLOOR = 1e-9
@@ -73,13 +73,14 @@ def empty_buffer(n_lam: int) -> Buffer:
     return Buffer(*(np.zeros(shape) for shape in shapes))
 
 
-def measured_step(lcs: LCS, x, u, x_next, Q_d, eps) -> Buffer:
+def measured_step(lcs: LCS, x, u, x_next, Q_d, eps, slip_noise=np.inf) -> Buffer:
     """A buffer of one step: from x (n_x,) under u (n_u,) to x_next (n_x,).
 
-    Args: Q_d (n_x,) diagonal weights of the one-step error; eps as in the module.
+    Args: Q_d (n_x,) diagonal weights of the one-step error; eps as in the module;
+        slip_noise, of opening_speed.
     """
     z = lcs.A @ x + lcs.B @ u + lcs.d - x_next
-    q = lcs.E @ x + lcs.H @ u + lcs.c
+    q = lcs.E @ x + lcs.H @ u + lcs.c + opening_speed(lcs, x_next, slip_noise)
     weighted = lcs.D.T * (eps * np.asarray(Q_d))
     P, p = weighted @ lcs.D, weighted @ z
     constant = np.array([0.5 * z @ (Q_d * z)])

@@ -7,8 +7,9 @@ front. The task therefore alternates between
     REPOSITION  the tip lifts, passes over the ball and comes down behind it, on
                 quintics in time that end where the ball is expected to be,
     APPROACH    from where the ball's surface may be, as far as the uncertainty of its
-                height goes, down to where it is believed to be: slowly, and over as
-                soon as something is felt, and
+                height goes, down to where it is believed to be, slowly, and over as
+                soon as something is felt. Where little is known of the surface, or the
+                ball does not coast as a ball does, down to where it may be at least,
     WAIT        the ball is not seen: the tip lifts and stays, and nothing is pushed.
 
 Source: ACI-MPC VII-B describes the behaviour (a push, then a new push from behind);
@@ -94,6 +95,11 @@ class TaskState:
     z_start: float = 0.0  # Height and climb where the phase began [m], [m/s].
     vz_start: float = 0.0
     tare: float = 0.0  # Vertical force on the tip where the approach began [N].
+    feel: bool = False  # Whether the approach goes on below the believed surface.
+    # How much the ball's velocity has differed from what it was at the start of the
+    # phase, at most [m/s]; that velocity (2,), None: not known yet.
+    strayed: float = 0.0
+    v_ball: np.ndarray | None = None
 
     def __post_init__(self):
         for name in ("p", "v", "a"):
@@ -108,12 +114,18 @@ class TaskState:
 @dataclass
 class RollingConfig:
     roll_sec: float = 1.0
-    roll_ahead: float = 0.025  # Tip at most so far in front of the ball [m].
+    roll_ahead: float = 0.025  # Tip at most so far from the ball, seen from above [m].
     reposition_sec: float = 0.55
     lift: float = 0.015  # Clearance over the ball while passing it [m].
     land_behind: float = 0.018  # [m]
     land_above: float = 0.003  # Above the surface as it is believed to be [m].
-    n_std: float = 2.5  # Standard deviations of the gap that the approach begins above.
+    # Standard deviations of the gap that the approach begins above the surface as it is
+    # believed to be; and that it ends below it where it has to feel for it.
+    n_std: float = 2.5
+    n_std_below: float = 1.5
+    coast_change: float = (
+        0.06  # More change of velocity in the air is no coasting [m/s].
+    )
     approach_speed: float = 0.035  # [m/s]
     approach_max: float = 0.025  # The longest approach [m].
     touch_force: float = 4.0  # More on the tip than before is a touch [N].
@@ -198,9 +210,10 @@ def reposition_step(
     return p, v, a
 
 
-def approach_step(config, path, state, dt, x, gap, radius_ball, radius_tip):
+def approach_step(config, path, state, dt, x, gap, radius_ball, radius_tip, gap_std):
     """The reference (p, v, a), each (3,), a tick dt [s] after the last one, on the way
-    down to the landing point; and whether it is there."""
+    down to the landing point, or to the lowest place of the surface; and whether it is
+    there."""
     p_land, v_land = landing(
         config, path, x, gap, APPROACH_PLAN, radius_ball, radius_tip
     )
@@ -210,11 +223,14 @@ def approach_step(config, path, state, dt, x, gap, radius_ball, radius_tip):
     p[:2], v[:2], a[:2] = quintic(
         dt, left, start, (p_land[:2], v_land[:2], np.zeros(2))
     )
-    # At rest at the landing point, as a reposition without an approach ends.
-    stop = np.sqrt(2.0 * APPROACH_STOP * max(state.p[2] - p_land[2] - 2e-4, 0.0))
+    lowest = p_land[2]
+    if state.feel:
+        lowest -= config.land_above + config.n_std_below * gap_std
+    # At rest there, as a reposition without an approach ends.
+    stop = np.sqrt(2.0 * APPROACH_STOP * max(state.p[2] - lowest - 2e-4, 0.0))
     v[2] = max(state.v[2] - APPROACH_SLOPE * dt, -min(config.approach_speed, stop))
     p[2] = state.p[2] + 0.5 * (state.v[2] + v[2]) * dt
-    return p, v, a, bool(p[2] <= p_land[2] + 3e-4)
+    return p, v, a, bool(p[2] <= lowest + 3e-4)
 
 
 def target_over_horizon(path, x, lead, speed, z_tip, radius_ball, dt, n_knots):
@@ -289,15 +305,17 @@ def next_state(
         )  # fmt: skip
     if state.phase == WAIT:
         state = lift_from(REPOSITION)
+    v_ball = x[V_BALL][:2]
     if state.phase == ROLL:
         ball = x[P_BALL]
-        ahead = path.heading(ball) @ (x[P_TIP] - ball)[:2]
-        if t - state.since_sec < config.roll_sec and ahead < config.roll_ahead:
+        off = (x[P_TIP] - ball)[:2]
+        # In front of it, or beside a ball that has rolled away from under it.
+        if t - state.since_sec < config.roll_sec and off @ off < config.roll_ahead**2:
             return state
         state = lift_from(REPOSITION)
     if state.phase == APPROACH:
         p, v, a, low = approach_step(
-            config, path, state, dt, x, gap, radius_ball, radius_tip
+            config, path, state, dt, x, gap, radius_ball, radius_tip, gap_std
         )
         if low or force_z - state.tare > config.touch_force:
             return TaskState(ROLL, t, state.p, state.v, state.a)
@@ -305,12 +323,19 @@ def next_state(
     above = 0.0 if landed is not None else approach_height(config, gap_std)
     over = t - state.since_sec >= config.reposition_sec - 0.5 * dt
     if state.since_sec < t and (over if landed is None else landed):
-        if above > 0.0:
-            return replace(state, phase=APPROACH, since_sec=t, tare=force_z)
+        feel = landed is None and gap_std > 0.0
+        feel &= (
+            max(gap_std / config.land_above, state.strayed / config.coast_change) > 1
+        )
+        if above > 0.0 or feel:
+            return replace(state, phase=APPROACH, since_sec=t, tare=force_z, feel=feel)
         return TaskState(ROLL, t, state.p, state.v, state.a)
     p, v, a = reposition_step(
         config, path, state, t, dt, x, gap, radius_ball, radius_tip, above
     )
+    off = v_ball - (v_ball if state.v_ball is None else state.v_ball)
     return TaskState(
-        REPOSITION, state.since_sec, p, v, a, state.z_start, state.vz_start
-    )
+        REPOSITION, state.since_sec, p, v, a, state.z_start, state.vz_start,
+        strayed=max(state.strayed, float(np.sqrt(off @ off))),
+        v_ball=v_ball - off,
+    )  # fmt: skip
