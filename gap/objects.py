@@ -79,7 +79,7 @@ class TouchProblem(TouchModel, GapProblem):
         return Outcome(gap, other.series(before, after))
 
 
-class _Windowed(GapProblem):
+class WindowedProblem(GapProblem):
     """What problems of simulated windows share."""
 
     def nuisances(self) -> Nuisances:
@@ -123,7 +123,7 @@ class _Windowed(GapProblem):
         raise NotImplementedError
 
 
-class FlightProblem(FreeBodyModel, _Windowed):
+class FlightProblem(FreeBodyModel, WindowedProblem):
     """One body of spheres that flies, bounces, slides or rolls on what is fixed."""
 
     plan = SearchPlan(
@@ -144,7 +144,7 @@ class FlightProblem(FreeBodyModel, _Windowed):
         return FreeBodyModel(self.scene, recordings)
 
 
-class RolloutProblem(WindowModel, _Windowed):
+class RolloutProblem(WindowModel, WindowedProblem):
     """Anything else: windows simulated by Drake."""
 
     # Each residual takes seconds.

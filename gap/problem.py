@@ -33,6 +33,7 @@ class SearchPlan:
     least_error: below it nothing tells two models apart. most_effects: that are named.
     own_values: whether a value that joints share may become one for each.
     shortlist: candidates that are fitted exactly before one is taken.
+    simulation_agrees: whether agreement also needs simulated windows that agree.
     """
 
     evaluations: int = 8
@@ -44,6 +45,7 @@ class SearchPlan:
     by_channel: bool = False
     own_values: bool = False
     shortlist: int = 8
+    simulation_agrees: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,9 +10,11 @@ import numpy as np
 
 from makebreak.gap.check_drives import check_drives, check_initial_names
 from makebreak.gap.checks import check_recordings
+from makebreak.gap.contact_problem import ContactProblem
 from makebreak.gap.data.conditioning import condition
 from makebreak.gap.driven import DrivenProblem, is_driven, sticks
 from makebreak.gap.findings import Finding
+from makebreak.gap.impacts import ImpactProblem, runs_against
 from makebreak.gap.measure import WINDOW_SEC
 from makebreak.gap.mechanism import MechanismProblem
 from makebreak.gap.objects import FlightProblem, RolloutProblem, TouchProblem
@@ -34,6 +36,7 @@ from makebreak.gap.trust import trust_in
 from makebreak.gap.verdict import (
     NO_GAP,
     TOLD,
+    UNNAMED,
     after_simulation,
     named,
     says,
@@ -86,9 +89,11 @@ def run_gap(
     say("checking the recordings")
     checks = check_recordings(parts.decided, scene_facts(dynamics.plant))
     is_mechanism = _is_mechanism(dynamics, recordings)
-    decided, done = condition(parts.decided, is_mechanism)
+    # An impact would be smeared by means over rows.
+    meets = is_mechanism and runs_against(dynamics, parts.decided)
+    decided, done = condition(parts.decided, is_mechanism and not meets)
     checks += done
-    reported, _ = condition(parts.reported, is_mechanism)
+    reported, _ = condition(parts.reported, is_mechanism and not meets)
     reported = with_noise_of(reported, decided)
     decided, cut = _shortened(decided, dynamics)
     checks += cut
@@ -118,6 +123,11 @@ def problem_for(
     Args: dynamics: of the scene.
     """
     if _is_mechanism(dynamics, recordings):
+        if runs_against(dynamics, recordings):
+            try:
+                return ImpactProblem(scene, recordings), []
+            except ValueError:  # Too few touches to tell.
+                pass
         if is_driven(scene, recordings) and sticks(scene, recordings):
             try:
                 return DrivenProblem(scene, recordings), []
@@ -127,6 +137,10 @@ def problem_for(
         mechanism = MechanismProblem(scene, recordings)
         return mechanism, [*finding, *mechanism.push_findings()]
     if any(joint.num_velocities() for joint in one_dof_joints(dynamics.plant)):
+        try:
+            return ContactProblem(scene, recordings), []
+        except ValueError:  # Not the whole motion is measured, or nothing touches.
+            pass
         try:
             return TouchProblem(scene, recordings), []
         except ValueError:  # Nothing tells when it touches.
@@ -157,7 +171,13 @@ def conclude(
     selection = replace(selection, choices=tuple(choices))
     start, end = problem.error(selection.start), problem.error(selection.end)
     verdict = verdict_of(choices, start, end, selection.far)
-    near = ""
+    near, differs = "", ""
+    if verdict == "no_gap" and problem.plan.simulation_agrees:
+        if chosen_on is None:
+            verdict, differs = "not_judged", " No window could be simulated."
+        elif chosen_on.gap.before > UNNAMED:
+            verdict = "gap_unnamed"
+            differs = " The equations of motion agree, simulated windows do not."
     if chosen_on is not None:
         verdict = after_simulation(verdict, choices, chosen_on.gap, selection.far)
         every = selection
@@ -198,6 +218,7 @@ def conclude(
             f"error from {final.gap.before:.3g} to {final.gap.after:.3g}: simulation "
             "does not confirm them."
         )
+    near += differs
     if selection.beyond:
         near += _beyond_limits(selection)
     channels = judged_channels(problem)

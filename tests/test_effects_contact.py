@@ -3,15 +3,19 @@
 Friction and rolling resistance on the project's own models: test_scene.py.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from effect_scenes import G, at_rest_but, on_ground, surface, with_effects
+from gap_benchmark import push_world
 from pydrake.systems.framework import DiagramBuilder
 from scipy.integrate import solve_ivp
 
 from makebreak.diagrams.scene_simulation import SceneSimulation
 from makebreak.models.dynamics import SceneDynamics
-from makebreak.models.scene import load_scene
+from makebreak.models.effects.kind import Effect
+from makebreak.models.scene import load_scene, read_scene
 
 BALL_MASS, RADIUS = 0.07, 0.0315
 PAIR = "b~g"
@@ -293,3 +297,24 @@ def test_dissipation_is_refused_where_the_solver_has_none(tmp_path):
     scene.plant.discrete_contact_approximation = "sap"
     with pytest.raises(ValueError, match="`sap` has no Hunt-Crossley"):
         load_scene(scene, DiagramBuilder())
+
+
+def test_friction_of_an_object_with_rougher_feet_is_that_of_what_meets(tmp_path):
+    """Feet meet the table, the box meets the tip: each pair gets its own value, and the
+    other keeps its."""
+    rng = np.random.default_rng(0)
+    world = replace(push_world.a_world(rng), friction=0.4, tip_friction=0.15)
+    table = {"time": np.arange(3.0)}
+    scene = read_scene(push_world.write(tmp_path, world, table))
+    pairs = {"table": "block.block~table.table", "tip": "block.block~tip.tip"}
+    dynamics = SceneDynamics(scene)
+    for name, mu in (("table", 0.4), ("tip", 0.15)):
+        now = dynamics.now("contact_friction", [pairs[name]])
+        assert now["friction"] == pytest.approx(mu)
+    for name, new, other in (("table", 0.25, "tip"), ("tip", 0.9, "table")):
+        effect = Effect("contact_friction", [pairs[name]], {"friction": new})
+        changed = SceneDynamics(replace(scene, effects=[effect]))
+        now = changed.now("contact_friction", [pairs[name]])
+        assert now["friction"] == pytest.approx(new)
+        kept = dynamics.now("contact_friction", [pairs[other]])
+        assert changed.now("contact_friction", [pairs[other]]) == pytest.approx(kept)

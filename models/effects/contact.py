@@ -5,6 +5,8 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.geometry import (
     Box,
+    Capsule,
+    Cylinder,
     HalfSpace,
     ProximityProperties,
     RoleAssign,
@@ -30,6 +32,8 @@ from makebreak.models.effects.kind import (
 FADE_RATE = 0.05
 
 
+STANDS = 1e-3  # Of shapes that reach down to within this a body stands on all [m].
+
 # What Drake takes where a shape has none of its own [N/m], [s/m]: MultibodyPlant's
 # contact parameters of its defaults.
 DEFAULT_DISSIPATION = 50.0
@@ -44,16 +48,19 @@ def _set_friction(
     mu mu2/(2 mu2 - mu). It is put on the body that is not free to move, so that a
     free ball's friction with table and with finger are set apart; if both or neither
     are free, on the first one named. Its pairs with third bodies change with it.
-    A value of twice mu2 or more cannot be had so: then both surfaces become mu.
+    A value of twice mu2 or more cannot be had so: then both surfaces become mu. Of a
+    body with surfaces of several frictions those count that meet the other
+    (_shapes_that_meet).
     """
     mu = parameter(effect, "friction")
     changed, other = _changed_and_other(effect, plant)
-    mu_other = _only(effect, plant, scene_graph, other, _friction, "friction")
+    mu_other = _friction_against(effect, plant, scene_graph, other, changed)
     if 2.0 * mu_other > mu or mu == 0.0:
         mu_changed = mu * mu_other / (2.0 * mu_other - mu) if mu > 0.0 else 0.0
     else:
         mu_changed = mu
-        _set_surface(plant, scene_graph, other, "coulomb_friction", _coulomb(mu))
+        only = _shapes_that_meet(effect, plant, scene_graph, other, changed)
+        _set_surface(plant, scene_graph, other, "coulomb_friction", _coulomb(mu), only)
     _set_surface(plant, scene_graph, changed, "coulomb_friction", _coulomb(mu_changed))
 
 
@@ -77,8 +84,11 @@ def _shapes(plant, scene_graph, body):
             yield geometry, properties
 
 
-def _set_surface(plant, scene_graph, body, name: str, value) -> None:
+def _set_surface(plant, scene_graph, body, name: str, value, only=None) -> None:
+    """Of all shapes of a body, or of those in `only`."""
     for geometry, old in list(_shapes(plant, scene_graph, body)):
+        if only is not None and geometry not in only:
+            continue
         properties = ProximityProperties(old)
         properties.UpdateProperty("material", name, value)
         scene_graph.AssignRole(
@@ -99,6 +109,70 @@ def _only(effect, plant, scene_graph, body, read, what: str) -> float:
 
 def _friction(properties: ProximityProperties) -> float:
     return properties.GetProperty("material", "coulomb_friction").dynamic_friction()
+
+
+def _friction_against(effect, plant, scene_graph, body, other) -> float:
+    """The one friction that a body has where it meets another. Raises: ValueError."""
+    meets = _shapes_that_meet(effect, plant, scene_graph, body, other)
+    return {g: _friction(p) for g, p in _shapes(plant, scene_graph, body)}[meets[0]]
+
+
+def _shapes_that_meet(effect, plant, scene_graph, body, other) -> list:
+    """The shapes of a body that count for its friction with another: all, if they are
+    alike. Of a free body with several frictions those on which it stands as it was
+    modelled, along z, meet what does not move; the others meet what does.
+
+    Raises: ValueError if even these differ.
+    """
+    frictions = {g: _friction(p) for g, p in _shapes(plant, scene_graph, body)}
+    if len(set(frictions.values())) <= 1:
+        return list(frictions)
+    inspector = scene_graph.model_inspector()
+    reach = {g: _lowest(inspector, g) for g in frictions}
+    low = {g: z for g, z in reach.items() if z is not None}
+    found = list(frictions)
+    if _is_free(plant, body) and len(low) == len(frictions):
+        least = min(low.values())
+        stands = [g for g in frictions if low[g] < least + STANDS]
+        fixed = not _is_free(plant, other) and not _moves(plant, other)
+        found = stands if fixed else [g for g in frictions if g not in stands]
+    if len({frictions[g] for g in found}) != 1:
+        raise ValueError(
+            f"effect {effect.kind} at {effect.at[0]!r}: {body.scoped_name()} has "
+            f"surfaces of different friction, {sorted(set(frictions.values()))}"
+        )
+    return found
+
+
+def _lowest(inspector, geometry) -> float | None:
+    """How far down its body's z a shape reaches [m]; None if that is not known."""
+    shape, X = inspector.GetShape(geometry), inspector.GetPoseInFrame(geometry)
+    z, down = X.translation()[2], abs(X.rotation().matrix()[2])
+    if isinstance(shape, Sphere):
+        return z - shape.radius()
+    if isinstance(shape, Box):
+        return z - down @ shape.size() / 2.0
+    if isinstance(shape, (Cylinder, Capsule)):
+        side = shape.radius()
+        if isinstance(shape, Cylinder):
+            side *= np.sqrt(max(1.0 - down[2] ** 2, 0.0))
+        return z - down[2] * shape.length() / 2.0 - side
+    return None
+
+
+def _moves(plant: MultibodyPlant, body: RigidBody) -> bool:
+    """Whether a joint that can move lies between a body and the world."""
+    here = body
+    while here.index() != plant.world_body().index():
+        up = [
+            joint
+            for joint in (plant.get_joint(i) for i in plant.GetJointIndices())
+            if joint.child_body().index() == here.index()
+        ]
+        if not up or up[0].num_velocities() > 0:
+            return True
+        here = up[0].parent_body()
+    return False
 
 
 def _stiffness(properties: ProximityProperties) -> float:
@@ -167,19 +241,20 @@ def _now(effect: Effect, plant: MultibodyPlant, scene_graph) -> dict[str, float]
     def both(read, what):
         return (_only(effect, plant, scene_graph, body, read, what) for body in (a, b))
 
+    if effect.kind == "contact_friction":
+        mu1 = _friction_against(effect, plant, scene_graph, a, b)
+        mu2 = _friction_against(effect, plant, scene_graph, b, a)
+        return {"friction": _both(mu1, mu2)}
     k1, k2 = both(_stiffness, "stiffness")
     if effect.kind == "contact_stiffness":
         # What Drake guesses where none is given it does not say: a stiff value.
         finite = [k for k in (k1, k2) if np.isfinite(k)]
         stiffness = 1.0 / sum(1.0 / k for k in finite) if finite else 1e6
         return {"stiffness": stiffness}
-    if effect.kind == "contact_dissipation":
-        d1, d2 = both(_dissipation, "dissipation")
-        if not np.isfinite([k1, k2]).all():
-            return {"dissipation": (d1 + d2) / 2.0}
-        return {"dissipation": (k2 * d1 + k1 * d2) / (k1 + k2)}
-    mu1, mu2 = both(_friction, "friction")
-    return {"friction": _both(mu1, mu2)}
+    d1, d2 = both(_dissipation, "dissipation")
+    if not np.isfinite([k1, k2]).all():
+        return {"dissipation": (d1 + d2) / 2.0}
+    return {"dissipation": (k2 * d1 + k1 * d2) / (k1 + k2)}
 
 
 def _both(mu1: float, mu2: float) -> float:
@@ -257,13 +332,14 @@ def _patch(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> No
     if not (x[1] < x[2] and y[1] < y[2]):
         raise ValueError(f"{where}: the patch is off {full_name(plant, ground)}")
     mu, mu_ground = p["friction"], _friction(old)
-    mu_thing = _only(effect, plant, scene_graph, thing, _friction, "friction")
+    mu_thing = _friction_against(effect, plant, scene_graph, thing, ground)
     if not 2.0 * mu_thing > mu:
         # Only a rougher thing can have it: then the ground around becomes smoother.
         around = _both(mu_ground, mu_thing)
         mu_thing = mu
         mu_ground = around * mu_thing / (2.0 * mu_thing - around)
-        _set_surface(plant, scene_graph, thing, "coulomb_friction", _coulomb(mu))
+        only = _shapes_that_meet(effect, plant, scene_graph, thing, ground)
+        _set_surface(plant, scene_graph, thing, "coulomb_friction", _coulomb(mu), only)
     mu_patch = mu * mu_thing / (2.0 * mu_thing - mu) if mu > 0.0 else 0.0
     # Patch; strips left and right; strips before and behind it.
     pieces = [

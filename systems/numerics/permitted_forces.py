@@ -1,0 +1,277 @@
+"""Contact forces that a model permits, and how much of a motion they explain.
+
+At an instant bodies need the generalized force P (n_v,), and every contact can give
+what its cone holds: columns g of generators, each with a weight that is not negative.
+What no such weights explain,
+
+    r = P - G lam*,    lam* = argmin over lam >= 0 of |W (P - G lam)|^2,
+
+is the violation of the contact model by the motion; nothing is simulated, and no depth
+of penetration enters. A contact that slides has one generator, n - mu s with s along
+the slip; one that may stick has a pyramid of them. Support at several points is a set:
+any weights that are not negative.
+
+Means are taken with test functions w of unit integral, as momentum is then exact and
+accelerations follow from positions alone: mean(a) = integral(w'' q).
+
+Source: Lawson, Hanson, Solving Least Squares Problems, 1974, chapter 23 (weights that
+are not negative); Messenger, Bortz, Multiscale Model. Simul. 19(3), 2021 (test
+functions).
+"""
+
+import numpy as np
+from numba import njit
+from scipy.sparse import csr_matrix
+
+_POWER = 4  # w ~ (1 - u^2)^4 on |u| < 1.
+_SECOND_MOMENT = 1.0 / 11.0  # Of w, over the half width squared.
+FEWEST = 6  # Samples within a test function.
+
+
+def test_functions(times, centres, half: float) -> tuple[csr_matrix, csr_matrix]:
+    """Weights (n_centres, n) that give, from samples at times (n,), the mean of a
+    signal over a test function about each centre, and the mean of its second
+    derivative. Both are exact for cubics, however samples lie. A row is empty where
+    fewer than FEWEST samples are within, or where none is in one of its thirds.
+
+    Args: half, half the width of a test function [s].
+    """
+    t, rows, columns = np.asarray(times, float), [], []
+    means: list[np.ndarray] = []
+    seconds: list[np.ndarray] = []
+    for i, c in enumerate(np.asarray(centres, float)):
+        a, b = np.searchsorted(t, [c - half, c + half])
+        u = (t[a:b] - c) / half
+        if len(u) < FEWEST or any(
+            not ((u >= x) & (u <= x + 2.0 / 3.0)).any() for x in (-1.0, -1.0 / 3, 1 / 3)
+        ):
+            continue
+        base = np.maximum(1.0 - u * u, 0.0)
+        V = np.stack([u**k for k in range(4)])  # (4, n)
+        # The function itself, and its second derivative, made exact by the smallest
+        # change that goes with a bump.
+        w = base**_POWER
+        d2 = 8.0 * base**2 * (7.0 * u * u - 1.0)
+        bump = base**2 + 1e-3
+        for weights, moments, into in (
+            (w / w.sum(), (1.0, 0.0, _SECOND_MOMENT, 0.0), means),
+            (d2, (0.0, 0.0, 2.0, 0.0), seconds),
+        ):
+            size = float(V[2] @ weights)
+            if moments[0] == 0.0:
+                weights = weights * (2.0 / size if size > 0.0 else 0.0)
+            A = (V * bump) @ V.T
+            change = np.linalg.solve(A, np.array(moments) - V @ weights)
+            into.append(weights + bump * (change @ V))
+        rows.append(np.full(b - a, i))
+        columns.append(np.arange(a, b))
+    shape = (len(centres), len(t))
+    if not rows:
+        return csr_matrix(shape), csr_matrix(shape)
+    where = (np.concatenate(rows), np.concatenate(columns))
+    return (
+        csr_matrix((np.concatenate(means), where), shape),
+        csr_matrix((np.concatenate(seconds) / half**2, where), shape),
+    )
+
+
+@njit(cache=True)
+def _solve_some(H, g, index, n, ridge, S, x):
+    """Writes x (n,), the solution of (H + ridge) x = g among the rows index[:n], by
+    Cholesky's factors; S (k, k) is scratch."""
+    for a in range(n):
+        for c in range(a + 1):
+            value = H[index[a], index[c]]
+            if a == c:
+                value += ridge
+            for b in range(c):
+                value -= S[a, b] * S[c, b]
+            if a == c:
+                S[a, a] = np.sqrt(max(value, 0.1 * ridge))
+            else:
+                S[a, c] = value / S[c, c]
+    for a in range(n):
+        value = g[index[a]]
+        for b in range(a):
+            value -= S[a, b] * x[b]
+        x[a] = value / S[a, a]
+    for a in range(n - 1, -1, -1):
+        value = x[a]
+        for b in range(a + 1, n):
+            value -= S[b, a] * x[b]
+        x[a] = value / S[a, a]
+
+
+@njit(cache=True)
+def nonnegative(H, g, weights, most):
+    """weights (k,) >= 0 with weights'H weights/2 - g'weights least, by Lawson's and
+    Hanson's active set; of |A weights - y|^2 these are H = A'A (k, k), g = A'y (k,).
+    Writes weights; returns how many steps were taken.
+
+    Columns that say the same (four feet of a block) are no harm: one of them stays out.
+    """
+    k = len(g)
+    scale, size = 1e-300, 0.0
+    for j in range(k):
+        scale = max(scale, H[j, j])
+        size = max(size, abs(g[j]))
+    passive = np.zeros(k, np.bool_)
+    banned = np.zeros(k, np.bool_)
+    index = np.empty(k, np.int64)
+    S, x = np.empty((k, k)), np.empty(k)
+    weights[:] = 0.0
+    tol = 1e-10 * size
+    steps = 0
+    while steps < most:
+        steps += 1
+        best, j = tol, -1
+        for i in range(k):
+            if not passive[i] and not banned[i]:
+                pull = g[i]
+                for a in range(k):
+                    if weights[a] > 0.0:
+                        pull -= H[i, a] * weights[a]
+                if pull > best:
+                    best, j = pull, i
+        if j < 0:
+            break
+        passive[j] = True
+        while True:
+            n = 0
+            for i in range(k):
+                if passive[i]:
+                    index[n] = i
+                    n += 1
+            _solve_some(H, g, index, n, 1e-11 * scale, S, x)
+            least = np.inf
+            for a in range(n):
+                least = min(least, x[a])
+            if least > 0.0:
+                weights[:] = 0.0
+                for a in range(n):
+                    weights[index[a]] = x[a]
+                banned[:] = False
+                break
+            step = 1.0
+            for a in range(n):
+                if x[a] <= 0.0:
+                    w = weights[index[a]]
+                    share = w / (w - x[a]) if w > x[a] else 0.0
+                    step = min(step, share)
+            moved = False
+            for a in range(n):
+                i = index[a]
+                weights[i] += step * (x[a] - weights[i])
+                if x[a] <= 0.0 and weights[i] <= 1e-13 * (1.0 + abs(x[a])):
+                    weights[i] = 0.0
+                    passive[i] = False
+                    moved = True
+            if not passive[j] and weights[j] == 0.0:
+                banned[j] = True  # It came in and went out again: no gain there.
+            if not moved or not passive.any():
+                break
+    return steps
+
+
+@njit(cache=True)
+def explain(P, G, is_there, root, share, left, weights, rank):
+    """What permitted forces leave of P, instant by instant.
+
+    Args: P (n, m) needed; G (n, m, k) generators, of which is_there (n, k) can act;
+        root (n, m, m): what weighs rows, r = root (P - G lam); share (n, d, k): with
+        it |share lam|^2 is added to |r|^2, to choose among many lam that explain alike
+        (unshared_load); it does not count as left. Writes left (n, m),
+        weights (n, k) and rank (n,), how many weights are above zero.
+    """
+    n, m, k = G.shape
+    y, A = np.empty(m), np.empty((m, k))
+    for i in range(n):
+        count = 0
+        index = np.empty(k, np.int64)
+        for c in range(k):
+            weights[i, c] = 0.0
+            if is_there[i, c]:
+                index[count] = c
+                count += 1
+        for a in range(m):
+            value = 0.0
+            for b in range(a + 1):  # root is a lower triangle.
+                value += root[i, a, b] * P[i, b]
+            y[a] = value
+            for c in range(count):
+                value = 0.0
+                for b in range(a + 1):
+                    value += root[i, a, b] * G[i, b, index[c]]
+                A[a, c] = value
+        rank[i] = 0
+        if count:
+            H, g, x = np.empty((count, count)), np.empty(count), np.empty(count)
+            for c in range(count):
+                value = 0.0
+                for a in range(m):
+                    value += A[a, c] * y[a]
+                g[c] = value
+                for d in range(c + 1):
+                    value = 0.0
+                    for a in range(m):
+                        value += A[a, c] * A[a, d]
+                    H[c, d] = H[d, c] = value
+                for d in range(c + 1):
+                    value = 0.0
+                    for a in range(share.shape[1]):
+                        value += share[i, a, index[c]] * share[i, a, index[d]]
+                    H[c, d] += value
+                    if d < c:
+                        H[d, c] += value
+            nonnegative(H, g, x, 4 * count + 20)
+            for c in range(count):
+                weights[i, index[c]] = x[c]
+                rank[i] += x[c] > 0.0
+                for a in range(m):
+                    y[a] -= A[a, c] * x[c]
+        left[i] = y
+
+
+def unshared_load(places) -> np.ndarray:
+    """(d, n) unit rows: of loads of n points at places (n, 2) the combinations that no
+    balance of force and moments tells: springs that are alike have none of them. d is
+    n - 3, or more where the points are on a line."""
+    A = np.vstack([np.ones(len(places)), np.asarray(places, float).T])
+    A[1:] -= A[1:].mean(axis=1, keepdims=True)
+    size = max(float(np.abs(A[1:]).max(initial=0.0)), 1e-9)
+    A[1:] /= size
+    _, s, vt = np.linalg.svd(A)
+    return vt[int(np.sum(s > 1e-3)) :]
+
+
+def roots_of(covariance) -> np.ndarray:
+    """(n, m, m) lower triangles L^-1 with L L' = covariance (n, m, m): rows times these
+    have unit noise."""
+    L = np.linalg.cholesky(covariance)
+    return np.linalg.solve(L, np.broadcast_to(np.eye(L.shape[-1]), L.shape))
+
+
+def held_means(times, centres, half: float) -> csr_matrix:
+    """(n_centres, n) weights that give the means of a signal that holds each of its n
+    values from its time until the next one's; the last holds on."""
+    t = np.asarray(times, float)
+    rows, columns, values = [], [], []
+    for i, c in enumerate(np.asarray(centres, float)):
+        a = max(int(np.searchsorted(t, c - half, "right")) - 1, 0)
+        b = int(np.searchsorted(t, c + half))
+        u = np.clip((np.append(t[a:b], c + half) - c) / half, -1.0, 1.0)
+        rows.append(np.full(b - a, i))
+        columns.append(np.arange(a, b))
+        values.append(np.diff(_integral(u)))
+    shape = (len(centres), len(t))
+    if not rows:
+        return csr_matrix(shape)
+    where = (np.concatenate(rows), np.concatenate(columns))
+    return csr_matrix((np.concatenate(values), where), shape)
+
+
+def _integral(u):
+    """Of (1 - u^2)^4 from -1 to u, over the whole of it."""
+    v = u - 4 * u**3 / 3 + 6 * u**5 / 5 - 4 * u**7 / 7 + u**9 / 9
+    end = 1 - 4 / 3 + 6 / 5 - 4 / 7 + 1 / 9
+    return 0.5 * (1.0 + v / end)

@@ -1,0 +1,55 @@
+"""Signed distances of points to simple shapes, many at once, with outward normals.
+
+A shape is in its own frame, centred there: a box of half sizes (3,), a sphere of a
+radius, a cylinder along z of radius and half length, a half-space below z = 0, or a
+hull: planes N x <= d with unit N (k, 3), of which the distance outside is that to the
+planes (right but for edges and corners, beyond which it is too small).
+"""
+
+import numpy as np
+
+
+def box(p, half):
+    """p (n, 3), half (3,). Returns: distance (n,), normal (n, 3)."""
+    half = np.asarray(half, float)
+    off = p - np.clip(p, -half, half)
+    out = np.linalg.norm(off, axis=1)
+    q = np.abs(p) - half
+    axis = np.argmax(q, axis=1)
+    row = np.arange(len(p))
+    inside = out <= 1e-12
+    distance = np.where(inside, q[row, axis], out)
+    normal = off / np.where(inside, 1.0, out)[:, None]
+    face = np.zeros_like(p)
+    face[row, axis] = np.where(p[row, axis] < 0.0, -1.0, 1.0)
+    return distance, np.where(inside[:, None], face, normal)
+
+
+def sphere(p, radius: float):
+    size = np.linalg.norm(p, axis=1)
+    normal = np.where(
+        size[:, None] > 1e-12, p / np.maximum(size, 1e-12)[:, None], [0.0, 0.0, 1.0]
+    )
+    return size - radius, normal
+
+
+def half_space(p):
+    return p[:, 2].copy(), np.broadcast_to([0.0, 0.0, 1.0], p.shape).copy()
+
+
+def cylinder(p, radius: float, half_length: float):
+    """As a box in the two coordinates of distance from the axis and height."""
+    rho = np.hypot(p[:, 0], p[:, 1])
+    flat = np.column_stack([rho, np.zeros(len(p)), p[:, 2]])
+    distance, n = box(flat, [radius, 1e9, half_length])
+    away = np.where(
+        rho[:, None] > 1e-12, p[:, :2] / np.maximum(rho, 1e-12)[:, None], [1.0, 0.0]
+    )
+    return distance, np.column_stack([away * n[:, :1], n[:, 2]])
+
+
+def hull(p, N, d):
+    """N (k, 3) outward unit normals, d (k,)."""
+    each = p @ np.asarray(N, float).T - d
+    k = np.argmax(each, axis=1)
+    return each[np.arange(len(p)), k], np.asarray(N, float)[k]

@@ -1,0 +1,79 @@
+"""A cart that runs against walls: what of the touch and of the rail is missing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gap_benchmark import cart_world
+from gap_benchmark.cart_world import PAIR
+
+from makebreak.gap.impacts import ImpactProblem, runs_against
+from makebreak.gap.recording import read_recordings
+from makebreak.gap.workflow import problem_for, run_gap
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.kind import Effect
+from makebreak.models.scene import read_scene
+
+
+def ran(folder, seed, seconds=16.0, **hidden):
+    rng = np.random.default_rng(seed)
+    cart = cart_world.Cart(
+        mass=rng.uniform(0.8, 2.0), stiffness=rng.uniform(8e3, 3e4),
+        dissipation=rng.uniform(0.3, 1.2),
+    )  # fmt: skip
+    true = replace(cart, **{k: f(getattr(cart, k)) for k, f in hidden.items()})
+    table, noise = cart_world.record(true, rng, seconds)
+    scene = cart_world.write(folder, cart, table, noise)
+    return scene, folder / "recording.csv", true
+
+
+def test_impacts_are_told_by_windows_about_them(tmp_path):
+    """With the true contact the windows are at the noise, with another they are not;
+    and a rail's friction is seen between touches."""
+    scene_file, file, true = ran(
+        tmp_path, 1, 5.0, stiffness=lambda k: 0.5 * k, coulomb=lambda c: 0.4
+    )
+    scene, recordings = read_scene(scene_file), read_recordings([file])
+    dynamics = SceneDynamics(scene)
+    assert runs_against(dynamics, recordings)
+    problem, _ = problem_for(scene, recordings, dynamics)
+    assert isinstance(problem, ImpactProblem)
+    truth = [
+        Effect("contact_stiffness", [PAIR], {"stiffness": true.stiffness}),
+        Effect("joint_coulomb_friction", ["cart.rail"], {"coulomb": 0.4}),
+    ]
+    left = [np.sqrt(np.mean(problem.residual(e) ** 2)) for e in ([], truth[:1], truth)]
+    assert left[0] > 3.0 and left[1] > 1.3 and left[2] < 1.1
+    judged = problem.judged()
+    assert {"cart.rail.position", "cart.rail.velocity"} <= set(judged)
+
+
+def test_walls_that_nothing_touches_do_not_count(tmp_path):
+    scene_file, file, _ = ran(tmp_path, 1, 3.0)
+    wall = tmp_path / "wall.sdf"
+    text = wall.read_text()
+    for sign in ("-", ""):
+        text = text.replace(f"<pose>{sign}0.35 ", f"<pose>{sign}1.35 ")
+    wall.write_text(text)
+    scene = read_scene(scene_file)
+    assert not runs_against(SceneDynamics(scene), read_recordings([file]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seed", "hidden"),
+    [
+        (21, {"stiffness": lambda k: 0.5 * k, "coulomb": lambda c: 0.4}),
+        (22, {"stiffness": lambda k: 1.8 * k}),
+        (23, {"dissipation": lambda d: 2.0 * d}),
+        (24, {"dissipation": lambda d: 0.4 * d}),
+        (25, {}),
+    ],
+)
+def test_from_files_to_what_is_missing(tmp_path, seed, hidden):
+    scene, file, true = ran(tmp_path, seed, **hidden)
+    result = run_gap(scene, [file])
+    found = {name: p.value for e in result.effects for name, p in e.parameters.items()}
+    expected = {name: getattr(true, name) for name in hidden}
+    assert found == pytest.approx(expected, rel=0.03)
+    assert result.verdict == ("gap_named" if hidden else "no_gap")
