@@ -822,6 +822,13 @@ class ContactDynamics:
         covariance = np.zeros((K, n_v, n_v))
         i = np.arange(n_v)
         covariance[:, i, i] = var
+        for _, k in self.joints.values():
+            true = max(
+                float(np.mean(a[:, k] ** 2 - var[:, k])), 0.05 * var[:, k].mean()
+            )
+            share = true / (true + var[:, k])
+            a[:, k] *= share
+            covariance[:, k, k] = share * var[:, k]
         up = -self.dynamics.gravity
         up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.0 else np.eye(3)[2]
         for _, i_v in self.bodies.values():

@@ -14,12 +14,13 @@ from makebreak.gap.contact_problem import ContactProblem
 from makebreak.gap.data.conditioning import condition
 from makebreak.gap.driven import DrivenProblem, is_driven, sticks
 from makebreak.gap.findings import Finding
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.impacts import ImpactProblem, runs_against
 from makebreak.gap.measure import WINDOW_SEC
 from makebreak.gap.mechanism import MechanismProblem
 from makebreak.gap.objects import FlightProblem, RolloutProblem, TouchProblem
 from makebreak.gap.parallel import side_by_side
-from makebreak.gap.problem import DISTANCES, GapProblem, Outcome
+from makebreak.gap.problem import DISTANCES, GapProblem, Outcome, is_sane
 from makebreak.gap.recording import (
     Recording,
     check_against_scene,
@@ -47,11 +48,19 @@ from makebreak.gap.verdict import (
 from makebreak.gap.windows import WindowModel, with_step
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.kind import full_name, one_dof_joints, sliding_joints
+from makebreak.models.effects.kind import (
+    Effect,
+    full_name,
+    one_dof_joints,
+    sliding_joints,
+)
 from makebreak.models.scene import Scene, read_scene
 
 # Of longer recordings of a mechanism, and of more rows of anything, pieces are used.
 MOST_SEC, MOST_ROWS = 60.0, 120_000
+# Rivals that simulation decides between: how much worse they may be in equations, how
+# much less they must leave in simulation, and how many are tried.
+NEAR_BEST, CLEARLY, MOST_RIVALS = 1.3, 0.8, 3
 AGREES = ("no_gap", "not_judged")  # As far as anything was compared.
 # Of what is only reported on.
 REPORTED_SEC, REPORTED_ROWS = 20.0, 40_000
@@ -167,6 +176,7 @@ def conclude(
     """
     nuisances = selection.nuisances
     selection, chosen_on = kept_by_simulation(problem, selection, jobs)
+    selection, chosen_on = preferred_by_simulation(problem, selection, chosen_on, jobs)
     choices = [_with_inseparable(c, problem) for c in selection.choices]
     selection = replace(selection, choices=tuple(choices))
     start, end = problem.error(selection.start), problem.error(selection.end)
@@ -266,6 +276,47 @@ def kept_by_simulation(
         other = outcome_of(fewer)
         if other is not None and other.gap.after <= outcome.gap.after:
             selection, outcome = fewer, other
+    return selection, outcome
+
+
+def preferred_by_simulation(
+    problem: GapProblem, selection: Selection, outcome: Outcome | None, jobs: int
+) -> tuple[Selection, Outcome | None]:
+    """Of contact, where a law that is written down otherwise (how friction sets in) may
+    make equations prefer the wrong one of two effects: if with the one that they chose
+    simulated windows still show a gap, those with one parameter that they found nearly
+    as good are simulated too, and one that leaves clearly less is taken."""
+    if not problem.plan.simulation_agrees or len(selection.choices) != 1:
+        return selection, outcome
+    if outcome is None or outcome.gap.after <= NO_GAP or not selection.table:
+        return selection, outcome
+    (choice,) = selection.choices
+    known, limit = {choice.effect.kind}, NEAR_BEST * selection.table[0].score
+    screen = selection.screen(problem)
+    for each in selection.table:
+        if each.kind in known or len(each.parameters) != 1 or len(each.at) != 1:
+            continue
+        if each.score > limit or len(known) > MOST_RIVALS:
+            break
+        known.add(each.kind)
+        start = Effect(each.kind, list(each.at), dict(each.parameters))
+        try:
+            fit = fit_effects(problem, screen, [start])
+        except ValueError:
+            continue
+        if not all(map(is_sane, fit.effects)):
+            continue
+        other = problem.outcome(
+            fit.effects, selection.start, fit, selection.nuisances, jobs=jobs
+        )
+        if other is not None and other.gap.after < CLEARLY * outcome.gap.after:
+            new = replace(
+                choice, effect=fit.effects[0], std=fit.std[0], after=fit.score,
+                runner_up=f"{choice.effect.kind} at {', '.join(choice.effect.at)}",
+                margin=choice.after / fit.score - 1.0, ties=(), fixed=(), size=1,
+            )  # fmt: skip
+            selection = replace(selection, choices=(new,), end=fit)
+            outcome = other
     return selection, outcome
 
 

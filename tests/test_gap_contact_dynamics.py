@@ -1,6 +1,7 @@
 """Equations of motion with permitted contact forces, on pushes of another simulator."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,9 +9,13 @@ from gap_benchmark import push_world
 from gap_benchmark.push_world import BLOCK, TABLE
 from scipy.optimize import least_squares
 
+from makebreak.gap import workflow
 from makebreak.gap.contact_dynamics import ContactDynamics
 from makebreak.gap.contact_problem import ContactProblem, _best_rectangles
+from makebreak.gap.problem import Outcome, SearchPlan
 from makebreak.gap.recording import read_recordings
+from makebreak.gap.result import Considered, GapMeasure
+from makebreak.gap.select import Choice, Selection
 from makebreak.gap.workflow import problem_for, run_gap
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
@@ -157,6 +162,45 @@ def test_rectangles_of_cells_are_those_of_brute_force():
     assert box == (1, 3, 0, 2)
     x = cells[1:3, 0:2].sum(axis=(0, 1))
     assert c == pytest.approx(x @ r / (x @ x))
+
+
+@pytest.mark.parametrize(("mass", "friction"), [(4.0, 1.6), (4.0, 3.9), (1.2, 0.5)])
+def test_simulation_decides_between_what_equations_find_alike(
+    monkeypatch, mass, friction
+):
+    """The rival is taken where the chosen effect still leaves a gap in simulation and
+    the rival clearly less."""
+    chosen = Effect("object_mass", [BLOCK], {"mass": 1.0})
+    rival = Considered("contact_friction", (PAIR,), 0.21, {"friction": 0.2})
+    worse = Considered("actuator_gain", ("tip.x",), 0.9, {"gain": 1.1})
+    first = Considered("object_mass", (BLOCK,), 0.2, {"mass": 1.0})
+    asked = []
+
+    def outcome(effects, *_, **__):
+        asked.append(effects[0].kind)
+        return Outcome(GapMeasure(60.0, friction, 1.0, 0.6))
+
+    def fit(problem, screen, start, *_):
+        return SimpleNamespace(effects=tuple(start), std=({},), score=1.1)
+
+    monkeypatch.setattr(workflow, "fit_effects", fit)
+    problem = SimpleNamespace(
+        plan=SearchPlan(simulation_agrees=True), outcome=outcome
+    )  # fmt: skip
+    choice = Choice(chosen, {}, 5.0, 1.0, "", 0.0, (), (), 1)
+    nothing = SimpleNamespace()
+    selection = Selection(
+        (choice,), nothing, nothing, nothing, (first, rival, worse)
+    )  # fmt: skip
+    monkeypatch.setattr(Selection, "screen", lambda self, problem: None)
+    before = Outcome(GapMeasure(60.0, mass, 1.0, 0.6))
+    got, after = workflow.preferred_by_simulation(problem, selection, before, 1)
+    taken = got.choices[0].effect.kind
+    if mass > 1.5 and friction < 0.8 * mass:
+        assert (taken, after.gap.after) == ("contact_friction", friction)
+    else:
+        assert (taken, after.gap.after) == ("object_mass", mass)
+    assert asked == (["contact_friction"] if mass > 1.5 else [])
 
 
 @pytest.mark.slow
