@@ -1,6 +1,6 @@
 """A circle in the plane while three springs pull (CC 4.2, Fig. 5 to 7)."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pydrake.geometry import Meshcat
@@ -13,13 +13,19 @@ from makebreak.diagrams.planar import (
     circle_of_seed,
     make_planar,
 )
+from makebreak.diagrams.planar_tuned import (
+    setting_of,
+    tuned_active_inference,
+    tuned_biomimetic,
+    tuned_impedance,
+    tuned_mrac,
+)
 from makebreak.systems.baselines.active_inference import (
     ActiveInference,
     ActiveInferenceConfig,
 )
 from makebreak.systems.baselines.biomimetic import Biomimetic, BiomimeticConfig
 from makebreak.systems.baselines.mrac import Mrac, MracConfig
-from makebreak.systems.numerics.igmm import IgmmConfig
 from makebreak.systems.planar_impedance import (
     ForceModelConfig,
     PlanarImpedance,
@@ -27,68 +33,66 @@ from makebreak.systems.planar_impedance import (
 )
 from makebreak.systems.planar_world import CircleTargetConfig, PlanarWorldConfig
 
+REACH = 0.7  # Of springs that engage and let go [m]; the circle is .5 to 1 m away.
 # Before the seed varies them: the springs' anchors [m], stiffness [N/m], rest length
 # [m]. On the circle they pull with 7 to 40 N.
 DISTANCE, DIRECTIONS = 0.75, np.radians([90.0, 210.0, 330.0])
+SPRINGS = "springs"  # The setting of the paper: perfect sensors but for force.
 STIFFNESS, REST_LENGTH = np.array([20.0, 40.0, 60.0]), 0.3
 
 
-# All as scripts/tune_planar.py found them on seeds 100 to 113; see docs/planar.md.
-def _impedance() -> PlanarImpedanceConfig:
-    return PlanarImpedanceConfig(
-        stiffness_free=110.0, damping_ratio=2.0, steepness=11.9, error_mid=1.78
-    )
-
-
-def _model() -> ForceModelConfig:
-    sigma = 2 * [0.0132] + 4 * [2.17]
-    mixture = IgmmConfig(sigma_ini=sigma, tau_nov=0.0438, sp_max=55.7)
-    return ForceModelConfig(mixture, period_sec=0.001)
-
-
-def _mrac() -> MracConfig:
-    return MracConfig(
-        omega=1.89,
-        zeta=1.81,
-        rate_weight=0.0611,
-        force_gains=[3572.0, 357200.0],
-        position_gains=[1.45, 10000.0],
-        velocity_gains=[0.0323, 1.23],
-    )
-
-
-def _active_inference() -> ActiveInferenceConfig:
-    return ActiveInferenceConfig([1.0, 0.79, 0.235, 100.0], 8.71, 395.0)
-
-
-def _biomimetic() -> BiomimeticConfig:
-    return BiomimeticConfig(
-        kappa=12.0,
-        rates=[24.5, 21900.0, 71.4],
-        stiffness=188.0,
-        damping=9.187,
-        forget=0.00422,
-        forget_less=123.0,
-    )
-
-
+# Tuned with the same budget on seeds 100 to 113 (scripts/tune_planar.py).
 @dataclass
 class BaselinesConfig:
-    mrac: MracConfig = field(default_factory=_mrac)
-    active_inference: ActiveInferenceConfig = field(default_factory=_active_inference)
-    biomimetic: BiomimeticConfig = field(default_factory=_biomimetic)
+    mrac: MracConfig = field(default_factory=lambda: tuned_mrac(SPRINGS))
+    active_inference: ActiveInferenceConfig = field(
+        default_factory=lambda: tuned_active_inference(SPRINGS)
+    )
+    biomimetic: BiomimeticConfig = field(
+        default_factory=lambda: tuned_biomimetic(SPRINGS)
+    )
 
 
 @dataclass
 class MultiSpringConfig:
+    """What of the controllers is left at its default is as tuned for the setting."""
+
     seed: int = 0  # Draws start, direction, springs and noise.
+    # springs, springs_lab or engaging: what pulls, sensors, greatest stiffness.
+    setting: str = SPRINGS
     trials: int = 30  # Of the biomimetic controller.
     # Half width of the uniform draw of each spring's stiffness and distance.
     spread: float = 0.2
-    force_noise: float = 0.2  # Standard deviation, each axis [N].
-    impedance: PlanarImpedanceConfig = field(default_factory=_impedance)
-    model: ForceModelConfig = field(default_factory=_model)
+    impedance: PlanarImpedanceConfig = field(
+        default_factory=lambda: tuned_impedance(SPRINGS)[0]
+    )
+    model: ForceModelConfig = field(default_factory=lambda: tuned_impedance(SPRINGS)[1])
     baselines: BaselinesConfig = field(default_factory=BaselinesConfig)
+
+
+def as_tuned(config: MultiSpringConfig) -> MultiSpringConfig:
+    """The config with what is left at its default as tuned for its setting."""
+    c, default = config, MultiSpringConfig()
+    law, model = tuned_impedance(c.setting)
+
+    def tuned(mine, first, found):
+        return found if mine == first else mine
+
+    b, b0 = c.baselines, default.baselines
+    return replace(
+        c,
+        impedance=tuned(c.impedance, default.impedance, law),
+        model=tuned(c.model, default.model, model),
+        baselines=BaselinesConfig(
+            tuned(b.mrac, b0.mrac, tuned_mrac(c.setting)),
+            tuned(
+                b.active_inference,
+                b0.active_inference,
+                tuned_active_inference(c.setting),
+            ),
+            tuned(b.biomimetic, b0.biomimetic, tuned_biomimetic(c.setting)),
+        ),
+    )
 
 
 def draw(config: MultiSpringConfig) -> tuple[PlanarWorldConfig, CircleTargetConfig]:
@@ -100,32 +104,52 @@ def draw(config: MultiSpringConfig) -> tuple[PlanarWorldConfig, CircleTargetConf
         raise ValueError(f"trials is {c.trials}, expected 1 or more")
     if not 0.0 <= c.spread < 1.0:
         raise ValueError(f"spread is {c.spread}, expected 0 <= spread < 1")
-    if not 0.0 <= c.force_noise < np.inf:
-        raise ValueError(f"force_noise is {c.force_noise}, expected >= 0")
-    rng = np.random.default_rng(c.seed)
+    world = setting_of(c.setting).world
+    if world == "porridge":
+        raise ValueError(f'setting is "{c.setting}", which has no springs')
+    return draw_springs(c.seed, c.spread, world == "engaging")
+
+
+def draw_springs(
+    seed: int, spread: float = 0.2, engaging: bool = False
+) -> tuple[PlanarWorldConfig, CircleTargetConfig]:
+    """The world and the circle of a seed; spread as in MultiSpringConfig.
+
+    Args: engaging: whether springs pull within a reach of REACH alone, which the seed
+        draws too: the force jumps by up to 30 N as they engage and let go.
+    """
+    rng = np.random.default_rng(seed)
     target = circle_of_seed(rng)
-    distance = DISTANCE * (1.0 + c.spread * rng.uniform(-1.0, 1.0, 3))
-    stiffness = STIFFNESS * (1.0 + c.spread * rng.uniform(-1.0, 1.0, 3))
+    distance = DISTANCE * (1.0 + spread * rng.uniform(-1.0, 1.0, 3))
+    stiffness = STIFFNESS * (1.0 + spread * rng.uniform(-1.0, 1.0, 3))
     anchors = distance[:, None] * np.column_stack(
         [np.cos(DIRECTIONS), np.sin(DIRECTIONS)]
     )
+    reach = None
+    if engaging:
+        reach = (REACH * (1.0 + spread * rng.uniform(-1.0, 1.0, 3))).tolist()
     world = PlanarWorldConfig(
         mass=MASS,
         anchors=anchors.tolist(),
         stiffness=stiffness.tolist(),
         rest_length=3 * [REST_LENGTH],
+        reach=reach,
         period_sec=PERIOD,
     )
     return world, target
 
 
 def make_multi_spring(
-    config: MultiSpringConfig, controller: LeafSystem, meshcat: Meshcat | None = None
+    config: MultiSpringConfig,
+    controller: LeafSystem,
+    meshcat: Meshcat | None = None,
+    feedforward: bool = False,
 ) -> Diagram:
     """The closed loop of make_planar with this controller, in the seed's world."""
     world, target = draw(config)
+    sensing = setting_of(config.setting).sensing
     return make_planar(
-        controller, world, target, config.force_noise, config.seed, meshcat
+        controller, world, target, sensing, config.seed, meshcat, feedforward
     )
 
 

@@ -1,17 +1,22 @@
 """A point effector in the plane under any one controller (CC 4.1, 4.2).
 
-    target --x_desired--> controller --u--> world --state--> controller
+    target --x_desired--> controller --u--> world --state--> sensor -> controller
                              ^                |
-                             +-- force sensor-+ (noisy, where the controller listens)
+                             +-- force sensor-+ (where the controller listens)
 
 The world comes to the state of t_k just before t_k; the controller reads it at t_k, and
-its u acts from t_k to t_{k+1}: there is no period of delay.
+its u acts from t_k to t_{k+1}. Sensors add noise and a delay (PlanarSensing). With
+force feedforward the measured force is taken off u, whatever the controller.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem
 
+from makebreak.models.effects.delay_line import DelayLine
+from makebreak.systems.baselines.force_feedforward import ForceFeedforward
 from makebreak.systems.noisy_sensor import NoisySensor
 from makebreak.systems.planar_view import PlanarView, PlanarViewConfig
 from makebreak.systems.planar_world import (
@@ -27,20 +32,48 @@ MASS = 1.0  # Of the effector; known to the controllers that use a mass [kg].
 _VIEW_OFFSET = 5e-4
 
 
+@dataclass(frozen=True)
+class PlanarSensing:
+    """What the controllers see; noise as the standard deviation of each axis."""
+
+    position_noise: float = 0.0  # [m]
+    velocity_noise: float = 0.0  # [m/s]
+    force_noise: float = 0.2  # [N]
+    delay_sec: float = 0.0  # Of all that is measured, whole milliseconds.
+
+    @property
+    def delay_ticks(self) -> int:
+        return round(self.delay_sec / PERIOD)
+
+    def state_std(self) -> list[float]:
+        return 2 * [self.position_noise] + 2 * [self.velocity_noise]
+
+
+# An arm in a laboratory; by default only the force has noise, and nothing is late.
+LAB = PlanarSensing(2e-5, 2e-3, 0.2, 0.001)
+
+
+def state_noise_seed(seed: int) -> int:
+    """Of the state's sensor, where the force sensor has `seed`."""
+    return seed + 2**32
+
+
 def make_planar(
     controller: LeafSystem,
     world: PlanarWorldConfig,
     target: CircleTargetConfig,
-    force_noise: float,
+    sensing: PlanarSensing,
     seed: int,
     meshcat: Meshcat | None = None,
+    feedforward: bool = False,
 ) -> Diagram:
     """The closed loop. The effector starts at rest on the target's first position.
 
     Outputs: state (4,), x_desired (6,), force (2,) true, of the world on the effector,
-        force_measured (2,), and every output of the controller.
+        state_measured (4,), force_measured (2,), and every output of the controller.
 
-    Args: force_noise, standard deviation of each axis of the force sensor [N].
+    Args: seed, of the sensors' noise; feedforward: whether the measured force is fed
+        forward beside what the controller asks for.
     """
     builder = DiagramBuilder()
     goal = builder.AddNamedSystem("target", CircleTarget(target))
@@ -50,18 +83,38 @@ def make_planar(
     first[:2] = start
     plant = builder.AddNamedSystem("world", PlanarWorld(world, first))
     state = plant.GetOutputPort("state")
-    sensor = builder.AddNamedSystem(
-        "force_sensor", NoisySensor([force_noise, force_noise], seed, PERIOD)
-    )
-    builder.Connect(plant.GetOutputPort("external_force"), sensor.GetInputPort("value"))
+
+    def sensed(name, port, std, noise_seed):
+        """What a sensor says of the port."""
+        if np.any(std):
+            sensor = NoisySensor(std, noise_seed, PERIOD)
+            builder.AddNamedSystem(f"{name}_sensor", sensor)
+            builder.Connect(port, sensor.GetInputPort("value"))
+            port = sensor.GetOutputPort("measured")
+        if sensing.delay_ticks:
+            late = DelayLine(np.full(port.size(), sensing.delay_sec), PERIOD)
+            builder.AddNamedSystem(f"{name}_delay", late)
+            builder.Connect(port, late.GetInputPort("u"))
+            port = late.GetOutputPort("y")
+        return port
+
+    noise_seed = state_noise_seed(seed)
+    measured = sensed("state", state, sensing.state_std(), noise_seed)
+    true_force = plant.GetOutputPort("external_force")
+    force = sensed("force", true_force, 2 * [sensing.force_noise], seed)
     builder.AddNamedSystem("controller", controller)
-    builder.Connect(state, controller.GetInputPort("state"))
+    builder.Connect(measured, controller.GetInputPort("state"))
     builder.Connect(x_desired, controller.GetInputPort("x_desired"))
     if controller.HasInputPort("force"):
-        builder.Connect(
-            sensor.GetOutputPort("measured"), controller.GetInputPort("force")
-        )
-    builder.Connect(controller.GetOutputPort("u"), plant.GetInputPort("u"))
+        builder.Connect(force, controller.GetInputPort("force"))
+    u = controller.GetOutputPort("u")
+    if feedforward:
+        feed = ForceFeedforward(FORCE_MAX, PERIOD)
+        total = builder.AddNamedSystem("feedforward", feed)
+        builder.Connect(u, total.GetInputPort("u"))
+        builder.Connect(force, total.GetInputPort("force"))
+        u = total.GetOutputPort("u_total")
+    builder.Connect(u, plant.GetInputPort("u"))
     if meshcat is not None:
         view = builder.AddNamedSystem(
             "view",
@@ -81,7 +134,8 @@ def make_planar(
     builder.ExportOutput(state, "state")
     builder.ExportOutput(x_desired, "x_desired")
     builder.ExportOutput(plant.GetOutputPort("external_force"), "force")
-    builder.ExportOutput(sensor.GetOutputPort("measured"), "force_measured")
+    builder.ExportOutput(measured, "state_measured")
+    builder.ExportOutput(force, "force_measured")
     for i in range(controller.num_output_ports()):
         port = controller.get_output_port(i)
         builder.ExportOutput(port, port.get_name())

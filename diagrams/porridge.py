@@ -6,23 +6,18 @@ import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram, LeafSystem
 
-from makebreak.diagrams.planar import MASS, PERIOD, circle_of_seed, make_planar
+from makebreak.diagrams.planar import (
+    MASS,
+    PERIOD,
+    PlanarSensing,
+    circle_of_seed,
+    make_planar,
+)
+from makebreak.diagrams.planar_tuned import tuned_mrac
 from makebreak.systems.baselines.mrac import MracConfig
 from makebreak.systems.numerics.igmm import IgmmConfig
 from makebreak.systems.planar_impedance import ForceModelConfig, PlanarImpedanceConfig
 from makebreak.systems.planar_world import CircleTargetConfig, PlanarWorldConfig
-
-
-# As scripts/tune_planar.py found it on seeds 100 to 113; see docs/planar.md.
-def _mrac() -> MracConfig:
-    return MracConfig(
-        omega=17.7,
-        zeta=1.27,
-        rate_weight=0.017,
-        force_gains=[312700.0, 31270000.0],
-        position_gains=[3274.0, 0.111],
-        velocity_gains=[297.5, 203.0],
-    )
 
 
 # The law as found on springs; a few settings of the mixture were tried, see there.
@@ -46,7 +41,8 @@ class PorridgeConfig:
     force_noise: float = 0.2  # Standard deviation, each axis [N].
     impedance: PlanarImpedanceConfig = field(default_factory=_impedance)
     model: ForceModelConfig = field(default_factory=_model)
-    mrac: MracConfig = field(default_factory=_mrac)
+    # As scripts/tune_planar.py found it on seeds 100 to 113; see docs/planar.md.
+    mrac: MracConfig = field(default_factory=lambda: tuned_mrac("porridge"))
 
 
 def draw(
@@ -85,6 +81,5 @@ def make_porridge(
 ) -> Diagram:
     """The closed loop of make_planar with this controller, in the seed's porridge."""
     world, target, noise_seed = draw(config, training)
-    return make_planar(
-        controller, world, target, config.force_noise, noise_seed, meshcat
-    )
+    sensing = PlanarSensing(force_noise=config.force_noise)
+    return make_planar(controller, world, target, sensing, noise_seed, meshcat)

@@ -4,11 +4,8 @@ The recordings are made by tests/gap_benchmark, in other simulators than Drake, 
 there in a checkout only. Each case is a `makebreak gap` in a process of its own, which
 gets the scene and the recording; what was hidden stays in this process. Results are on
 disk as the cases end, and `--reuse` goes on where a run was stopped.
-
-    python -m makebreak.scripts.gap_benchmark --set logs-development --only friction
 """
 
-import argparse
 import json
 import shutil
 import subprocess
@@ -148,26 +145,3 @@ def _make_cases(
     finally:
         process.kill()
         process.wait()
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description="The gap workflow's benchmark.")
-    parser.add_argument("--set", choices=tuple(SETS), required=True)
-    parser.add_argument("--only", default="", help="cases whose name has this in it")
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--reuse", action="store_true")
-    parser.add_argument("--out", type=Path, default=Path("runs/gap_benchmark"))
-    args = parser.parse_args()
-    try:
-        check(args.set)
-    except ValueError as error:
-        print(f"gap_benchmark: {error}", file=sys.stderr)
-        return 2
-    args.out.mkdir(parents=True, exist_ok=True)
-    table = run_benchmark(args.out, args.jobs, args.set, args.only, args.reuse)
-    print(table.to_text())
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

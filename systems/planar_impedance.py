@@ -42,10 +42,12 @@ def _default_model() -> IgmmConfig:
 
 @dataclass
 class ForceModelConfig:
-    # Over [v 2, F 2, next F 2], or along the motion over [|v|, f, next f].
+    # Over [v 2, F 2, next F 2]; with the position over [p 2, v 2, F 2, next F 2]; or
+    # along the motion over [|v|, f, next f].
     mixture: IgmmConfig = field(default_factory=_default_model)
     along_motion: bool = False
     period_sec: float = 0.005
+    position: bool = False
 
 
 class PlanarImpedance(LeafSystem):
@@ -103,7 +105,9 @@ class PlanarImpedance(LeafSystem):
                 f"of {period_sec}"
             )
         self._tuning = igmm_tuning(model.mixture)
-        n_in, n_out = (2, 1) if model.along_motion else (4, 2)
+        if model.along_motion and model.position:
+            raise ValueError("a model is along_motion or has the position, not both")
+        n_in, n_out = (2, 1) if model.along_motion else (6 if model.position else 4, 2)
         n = self._tuning.sigma_ini.size
         if n != n_in + n_out:
             raise ValueError(f"sigma_ini has {n} entries, expected {n_in + n_out}")
@@ -113,7 +117,7 @@ class PlanarImpedance(LeafSystem):
             )
         first_call(warm_up, self._tuning, n_in)
         self._config = config
-        self._along_motion = model.along_motion
+        self._along_motion, self._position = model.along_motion, model.position
         self._mass, self._force_max = float(mass), float(force_max)
         self._state = self.DeclareVectorInputPort("state", 4)
         self._target = self.DeclareVectorInputPort("x_desired", 6)
@@ -159,6 +163,7 @@ class PlanarImpedance(LeafSystem):
             self._force.Eval(context),
             self._along_motion,
             self._config.learn,
+            self._position,
         )
         state.get_mutable_abstract_state(self._model).set_value(model)
 

@@ -22,7 +22,31 @@ class PlanarWorldConfig:
     anchors: list[list[float]] = field(default_factory=list)  # Of the springs [m].
     stiffness: list[float] = field(default_factory=list)  # One per anchor [N/m].
     rest_length: list[float] = field(default_factory=list)  # One per anchor [m].
+    # One per anchor: farther away than this it does not pull [m]. None: it always does.
+    reach: list[float] | None = None
     period_sec: float = 0.001
+
+
+def springs_of(config: PlanarWorldConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Anchors (n, 2) [m], and springs (n, 3) as numerics/planar_world.py has them.
+
+    Raises: ValueError that names what is wrong.
+    """
+    c = config
+    anchors = np.array(c.anchors, dtype=float).reshape(-1, 2)
+    n = len(anchors)
+    springs = np.full((n, 3), np.inf)
+    for i, name in enumerate(("stiffness", "rest_length", "reach")):
+        if getattr(c, name) is None:
+            continue
+        values = np.array(getattr(c, name), dtype=float)
+        if values.shape != (n,) or not np.all(values >= 0.0):
+            raise ValueError(
+                f"{name} is {getattr(c, name)}, expected {n} numbers >= 0, one per "
+                "anchor"
+            )
+        springs[:, i] = values
+    return anchors, springs
 
 
 class PlanarWorld(LeafSystem):
@@ -55,16 +79,7 @@ class PlanarWorld(LeafSystem):
         viscosity = np.array(c.viscosity, dtype=float)
         if viscosity.shape != (2,) or not np.all(viscosity >= 0.0):
             raise ValueError(f"viscosity is {c.viscosity}, expected 2 numbers >= 0")
-        anchors = np.array(c.anchors, dtype=float).reshape(-1, 2)
-        springs = np.empty((len(anchors), 2))
-        for i, name in enumerate(("stiffness", "rest_length")):
-            values = np.array(getattr(c, name), dtype=float)
-            if values.shape != (len(anchors),) or not np.all(values >= 0.0):
-                raise ValueError(
-                    f"{name} is {getattr(c, name)}, expected {len(anchors)} numbers "
-                    ">= 0, one per anchor"
-                )
-            springs[:, i] = values
+        anchors, springs = springs_of(c)
         first = np.array(state, dtype=float)
         if first.shape != (4,) or not np.all(np.isfinite(first)):
             raise ValueError(f"state is {state}, expected 4 numbers")

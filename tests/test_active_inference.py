@@ -27,8 +27,9 @@ def test_ticks_agree_with_the_gradient_of_the_free_energy():
     memory, state = np.zeros(MEMORY), rng.normal(size=4)
     memory[8] = 1.0
     memory[:8] = rng.normal(size=8)
-    goal = rng.normal(size=2)
-    _, after, _ = tick(memory, state, goal, P, K_MU, K_A, DT, 1e9)
+    target = rng.normal(size=6)
+    goal = target[:2]
+    _, after, _ = tick(memory, state, target, False, P, K_MU, K_A, DT, 1e9)
     z = [memory[0:2], memory[2:4], memory[4:6]]
     shifted = [z[1], z[2], np.zeros(2)]
     for j in range(3):
@@ -47,13 +48,17 @@ def test_ticks_agree_with_the_gradient_of_the_free_energy():
     np.testing.assert_allclose(after[6:8], expected, rtol=1e-12)
 
 
-def follow(goal_at, seconds, viscosity, push=0.0):
-    """A point of 1 kg under the law; returns states and forces."""
+def follow(goal_at, seconds, viscosity, push=0.0, moves=False):
+    """A point of 1 kg under the law; returns states and forces. The goal moves at a
+    steady rate."""
     memory, state = np.zeros(MEMORY), np.zeros(4)
     none = (np.zeros((0, 2)), np.zeros((0, 2)))
     states, forces = [], []
     for k in range(round(seconds / DT)):
-        u, memory, _ = tick(memory, state, goal_at(k * DT), P, K_MU, K_A, DT, 100.0)
+        goal = goal_at(k * DT)
+        rate = (goal_at((k + 1) * DT) - goal) / DT
+        target = np.concatenate([goal, rate, np.zeros(2)])
+        u, memory, _ = tick(memory, state, target, moves, P, K_MU, K_A, DT, 100.0)
         pushed = u + np.array([push, 0.0])
         c = np.array([viscosity, viscosity])
         state = step(state, k * DT, pushed, DT, 1.0, c, 1.0, *none)
@@ -89,6 +94,28 @@ def test_lags_behind_a_moving_goal_by_what_the_equations_say():
     # The last state is one period, 0.05 mm, after the last goal.
     assert goal - x[-1, 0] == pytest.approx(lag, abs=2e-4)
     assert 0.7 * s < lag < 1.3 * s  # About a second.
+
+
+def test_a_goal_that_is_known_to_move_is_followed_without_a_lag():
+    s = 0.05
+    x, _ = follow(lambda t: np.array([s * t, 0.0]), 60.0, 20.0, moves=True)
+    assert x[-1, 0] == pytest.approx(s * 60.0, abs=2e-4)
+
+
+def test_the_model_of_a_moving_goal_counts_its_velocity_and_acceleration():
+    """As if the goal were a point p + v that moves at v + a."""
+    rng = np.random.default_rng(1)
+    memory, state, target = rng.normal(size=MEMORY), rng.normal(size=4), np.zeros(6)
+    memory[8] = 1.0
+    p, v, a = rng.normal(size=(3, 2))
+    target[:2] = p + v
+    _, still, _ = tick(memory, state, target, False, P, K_MU, K_A, DT, 1e9)
+    target = np.concatenate([p, v, a])
+    _, moving, _ = tick(memory, state, target, True, P, K_MU, K_A, DT, 1e9)
+    more = DT * K_MU * P[3] * (v + a)
+    np.testing.assert_allclose(moving[:2], still[:2], rtol=1e-12)
+    np.testing.assert_allclose(moving[2:4], still[2:4] + more, rtol=1e-12)
+    np.testing.assert_allclose(moving[4:6], still[4:6] + more, rtol=1e-12)
 
 
 def test_force_stays_within_its_limit():

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from makebreak.diagrams.planar import knowledge_of, make_planar
-from makebreak.scripts.tune_planar import learning_curve, task_of
+from makebreak.diagrams.planar import PlanarSensing, knowledge_of, make_planar
+from makebreak.diagrams.planar_tuned import SETTINGS
+from makebreak.scripts.planar_loops import learning_curve
+from makebreak.scripts.tune_planar import task_of
 from makebreak.systems.baselines.biomimetic import Biomimetic, BiomimeticConfig
 from makebreak.systems.numerics.biomimetic import (
     LearnedGains,
@@ -14,6 +16,8 @@ from makebreak.systems.numerics.biomimetic import (
     no_gains,
 )
 from makebreak.systems.planar_world import CircleTargetConfig, PlanarWorldConfig
+
+PERFECT = PlanarSensing(force_noise=0.0)
 
 
 def random_gains(n, rng):
@@ -77,7 +81,7 @@ def test_learns_a_constant_force_over_trials():
     for _ in range(25):
         controller = Biomimetic(config, 2.0, known)
         target = CircleTargetConfig(duration_sec=2.0)
-        diagram = make_planar(controller, world, target, 0.0, 0)
+        diagram = make_planar(controller, world, target, PERFECT, 0)
         simulator = Simulator(diagram)
         simulator.AdvanceTo(2.0)
         context = simulator.get_context()
@@ -96,7 +100,7 @@ def test_learns_a_constant_force_over_trials():
 
 def test_a_diverging_controller_leaves_finite_numbers():
     config = BiomimeticConfig(stiffness=0.0, damping=0.0, rates=[1e3, 1e5, 1e4])
-    curve = learning_curve(config, task_of(0), 10)
+    curve = learning_curve(config, 10 * [task_of(SETTINGS["springs"], 0)])
     assert np.isfinite(curve).all() and max(curve) > 1.0
 
 

@@ -55,7 +55,12 @@ def run(config, seconds, viscosity, anchor, spring, stop=None):
     circle = (0.25, seconds, 0.0, 1.0)
     weights = error_weights(config.omega, config.zeta, config.rate_weight)
     gains = config.force_gains + config.position_gains + config.velocity_gains
-    world = (np.full(2, viscosity), 1.0, np.array([anchor]), np.array([spring]))
+    world = (
+        np.full(2, viscosity),
+        1.0,
+        np.array([anchor]),
+        np.array([[*spring, np.inf]]),
+    )
     memory, x, rows = np.zeros(MEMORY), np.array([0.25, 0.0, 0.0, 0.0]), []
     for k in range(round((stop or seconds) / DT)):
         target = circle_target(k * DT, *circle)

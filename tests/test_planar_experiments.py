@@ -1,6 +1,7 @@
 """The experiments porridge and multi_spring, run short."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,13 +10,17 @@ from pydrake.systems.analysis import Simulator
 from makebreak.diagrams import multi_spring as diagrams
 from makebreak.diagrams.multi_spring import MultiSpringConfig
 from makebreak.diagrams.planar import knowledge_of
+from makebreak.diagrams.planar_tuned import SETTINGS, TUNED_FILE, tuned_biomimetic
 from makebreak.diagrams.porridge import PorridgeConfig
+from makebreak.scripts import planar_loops as loops
 from makebreak.scripts import tune_planar
 from makebreak.scripts.cli import main
 from makebreak.scripts.experiments import multi_spring, porridge
 from makebreak.scripts.planar_runs import median_range, with_count
 from makebreak.scripts.session import Session
+from makebreak.systems.numerics.mrac import error_weights
 from makebreak.systems.numerics.planar_impedance import persistence
+from makebreak.systems.numerics.planar_world import compensated
 
 
 def run_main(name, folder, *settings):
@@ -109,9 +114,10 @@ def test_regression_error_of_no_model_is_the_difference_of_forces():
     "name, setting, message",
     [
         ("multi_spring", "trials=0", "trials is 0"),
-        ("multi_spring", "force_noise=-1", "force_noise is -1"),
+        ("multi_spring", "setting=outdoors", "outdoors"),
         ("multi_spring", "baselines.mrac.omega=0", "omega is 0"),
         ("multi_spring", "impedance.stiffness_max=1", "stiffness_max is 1"),
+        ("multi_spring", "setting=porridge", "which has no springs"),
         ("porridge", "viscosity=[80,20]", "viscosity is"),
         ("porridge", "model.mixture.tau_nov=2", "tau_nov is 2"),
     ],
@@ -154,30 +160,67 @@ def test_median_and_range_of_what_is_there():
     assert with_count([4.0, 5.0, 9.0], 5.0) == "5 (4 to 9); 2 of 3 reach 5"
 
 
-def test_every_search_space_makes_a_controller_that_stays_within_its_bounds():
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_every_search_space_makes_a_controller_that_stays_within_its_bounds(setting):
     """At random settings: the gains that the tuning may not exceed."""
-    rng = np.random.default_rng(0)
-    for name, space in tune_planar.SPACES.items():
+    rng, setting = np.random.default_rng(0), SETTINGS[setting]
+    K, D = setting.stiffness_max, setting.damping_max * (1 + 1e-9)
+    assert D == pytest.approx(4.0 * np.sqrt(K))
+    checked = set()
+    for name, space in tune_planar.spaces(setting).items():
         for _ in range(20):
             p = {
                 key: float(np.exp(rng.uniform(*np.log(pair))))
                 for key, pair in space.items()
             }
-            config = tune_planar.config_of(name, p)
-            if name in ("mrac", "porridge_mrac"):
-                p2, p3 = tune_planar.error_weights(
-                    config.omega, config.zeta, config.rate_weight
-                )
+            config = tune_planar.config_of(name, p, setting)
+            if name in ("mrac", "mrac+force"):
+                p2, p3 = error_weights(config.omega, config.zeta, config.rate_weight)
                 most = config.force_gains[0] + 2 * 0.25**2 * config.position_gains[0]
                 most += 2 * 0.49**2 * config.velocity_gains[0]
-                assert p2 * most <= 500.0 * (1 + 1e-9)
-                assert p3 * most <= 4.0 * np.sqrt(500.0) * (1 + 1e-9)
+                assert p2 * most <= K * (1 + 1e-9) and p3 * most <= D
             elif name.startswith("biomimetic"):
-                assert config.stiffness <= 500.0
-                assert config.damping <= 4.0 * np.sqrt(500.0) * (1 + 1e-9)
-            elif name.endswith("adaptive"):
+                assert config.stiffness <= K and config.damping <= D
+            elif name in ("active_inference", "active_inference+force"):
+                stiffness = config.k_action / config.variance[1]
+                assert stiffness <= K * (1 + 1e-9) and config.goal_moves
+            elif name in ("adaptive", "adaptive_position", "measured_force"):
                 law, _ = config
-                assert law.stiffness_max == 500.0 and law.damping_ratio <= 2.0
+                assert law.stiffness_free < law.stiffness_max == K
+                assert 2.0 * law.damping_ratio * np.sqrt(K) <= D
+            else:
+                continue
+            checked.add(name)
+    assert len(checked) >= (2 if setting.world == "porridge" else 8)
+
+
+# Edges that are none: bounds that all controllers share; MRAC's reference model, of which
+# only p2 and p3 count, which are two numbers of three; and where a term has gone.
+SHARED = {
+    "stiffness",
+    "stiffness_free",
+    "damping_ratio",
+    "omega",
+    "zeta",
+    "rate_weight",
+}
+NOTHING_BELOW = {"position_now", "position_summed", "velocity_now", "velocity_summed"}
+NOTHING_BELOW |= {"rate_force", "rate_stiffness", "rate_damping", "forget"}
+NOTHING_ABOVE = {"variance_velocity", "variance_belief", "variance_rate", "forget_less"}
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_no_baseline_was_tuned_to_an_edge_of_its_range(setting):
+    found = json.loads(TUNED_FILE.read_text())[setting]
+    spaces = tune_planar.spaces(SETTINGS[setting])
+    assert set(found) == set(spaces)
+    for name, one in found.items():
+        if name.endswith("_free") or name.startswith(("adaptive", "measured_force")):
+            continue
+        for key in set(one["at_bound"]) - SHARED:
+            low, high = spaces[name][key]
+            is_low = one["parameters"][key] < np.sqrt(low * high)
+            assert key in (NOTHING_BELOW if is_low else NOTHING_ABOVE), (name, key)
 
 
 def diagram_error(diagram):
@@ -197,39 +240,79 @@ def diagram_error(diagram):
     return np.sqrt(np.mean(errors)), known
 
 
-def test_the_tunings_plain_loops_are_the_diagrams():
-    """Tick for tick: only the sum of the errors is taken in another order."""
-    springs = MultiSpringConfig(seed=7)
-    task = tune_planar.task_of(7)
+@pytest.mark.parametrize("setting", ["springs", "springs_lab", "engaging"])
+def test_the_plain_loops_are_the_diagrams(setting):
+    """Tick for tick, with noise and delay: only the sum of the errors is taken in
+    another order."""
+    springs = diagrams.as_tuned(MultiSpringConfig(seed=7, setting=setting))
+    task = tune_planar.task_of(SETTINGS[setting], 7)
     c = springs.baselines
-    for controller, plain in (
-        (diagrams.mrac(c.mrac), tune_planar.mrac_error(c.mrac, task)),
-        (
-            diagrams.active_inference(c.active_inference),
-            tune_planar.active_inference_error(c.active_inference, task),
-        ),
-        (
-            diagrams.impedance(springs.impedance, springs.model),
-            tune_planar.adaptive_error(springs.impedance, springs.model, task)[0],
-        ),
-    ):
-        error, _ = diagram_error(diagrams.make_multi_spring(springs, controller))
-        assert error == pytest.approx(plain, rel=1e-12)
+
+    def error_in_diagram(controller, feedforward=False):
+        diagram = diagrams.make_multi_spring(springs, controller, None, feedforward)
+        return diagram_error(diagram)
+
+    for force in (False, True):
+        error, _ = error_in_diagram(diagrams.mrac(c.mrac), force)
+        plain = loops.mrac_error(c.mrac, task, force)
+        assert error == pytest.approx(plain, rel=1e-9)
+        controller = diagrams.active_inference(c.active_inference)
+        error, _ = error_in_diagram(controller, force)
+        plain = loops.active_inference_error(c.active_inference, task, force)
+        assert error == pytest.approx(plain, rel=1e-9)
+    controller = diagrams.impedance(springs.impedance, springs.model)
+    error, _ = error_in_diagram(controller)
+    plain = loops.adaptive_error(springs.impedance, springs.model, task)[0]
+    assert error == pytest.approx(plain, rel=1e-9)
     known, errors = None, []
     for _ in range(3):
         controller = diagrams.biomimetic(c.biomimetic, known)
-        error, known = diagram_error(diagrams.make_multi_spring(springs, controller))
+        error, known = error_in_diagram(controller)
         errors.append(error)
-    curve = tune_planar.learning_curve(c.biomimetic, task, 3)
-    np.testing.assert_allclose(errors, curve, rtol=1e-12)
+    curve = loops.learning_curve(c.biomimetic, 3 * [task])
+    np.testing.assert_allclose(errors, curve, rtol=1e-9)
+
+
+def test_the_plain_loops_of_porridge_are_the_diagrams():
     stirring = PorridgeConfig(seed=7)
     for training in (True, False):
         controller = diagrams.impedance(stirring.impedance, stirring.model)
         diagram = porridge.make_porridge(stirring, controller, training)
-        plain = tune_planar.adaptive_error(
-            stirring.impedance, stirring.model, tune_planar.task_of(7, True, training)
-        )
+        task = tune_planar.task_of(SETTINGS["porridge"], 7, training)
+        plain = loops.adaptive_error(stirring.impedance, stirring.model, task)
         assert diagram_error(diagram)[0] == pytest.approx(plain[0], rel=1e-12)
+
+
+def test_a_measured_force_that_is_fed_forward_cancels_the_springs():
+    """Without noise and delay only u's period of 1 ms is left of them."""
+    config = MultiSpringConfig(seed=1)
+    soft = diagrams.impedance(
+        replace(config.impedance, adapt=False, stiffness_max=110.0), config.model
+    )
+    without, _ = diagram_error(diagrams.make_multi_spring(config, soft))
+    soft = diagrams.impedance(
+        replace(config.impedance, adapt=False, stiffness_max=110.0), config.model
+    )
+    fed, _ = diagram_error(
+        diagrams.make_multi_spring(config, soft, None, feedforward=True)
+    )
+    assert fed < 0.02 * without
+
+
+def test_a_force_that_is_not_finite_is_not_fed_forward():
+    u, force = np.array([3.0, 4.0]), np.array([1.0, np.nan])
+    np.testing.assert_array_equal(compensated(u, force, 100.0), u)
+    np.testing.assert_allclose(compensated(u, np.array([-3, -4.0]), 5.0), [3.0, 4.0])
+
+
+def test_what_is_left_at_its_default_is_as_tuned_for_the_setting():
+    config = MultiSpringConfig(setting="engaging")
+    mine = replace(config.baselines.mrac, omega=2.5)
+    config = replace(config, baselines=replace(config.baselines, mrac=mine))
+    tuned = diagrams.as_tuned(config)
+    assert tuned.impedance.stiffness_max == 50.0
+    assert tuned.baselines.mrac == mine
+    assert tuned.baselines.biomimetic == tuned_biomimetic("engaging")
 
 
 def test_porridges_noise_and_viscosity_are_settings():

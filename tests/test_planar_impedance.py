@@ -14,7 +14,7 @@ from makebreak.diagrams.multi_spring import (
     impedance,
     make_multi_spring,
 )
-from makebreak.diagrams.planar import knowledge_of, make_planar
+from makebreak.diagrams.planar import PlanarSensing, knowledge_of, make_planar
 from makebreak.systems.numerics.fixed_gmm import fit_mixture
 from makebreak.systems.numerics.igmm import (
     IgmmConfig,
@@ -42,6 +42,8 @@ from makebreak.systems.planar_impedance import (
 from makebreak.systems.planar_world import CircleTargetConfig, PlanarWorldConfig
 
 VECTORS = igmm_tuning(IgmmConfig(sigma_ini=[0.1, 0.1, 1.0, 1.0, 1.0, 1.0]))
+
+PERFECT = PlanarSensing(force_noise=0.0)
 
 
 def test_trust_is_the_papers_logistic_function():
@@ -87,7 +89,7 @@ def test_a_constant_force_leaves_what_is_not_fed_forward(trusted):
         learn=False, adapt=trusted, steepness=4.0, error_mid=0.5
     )
     controller = PlanarImpedance(law, ForceModelConfig(), knowledge=persistence(4, 2))
-    diagram = make_planar(controller, world, CircleTargetConfig(), 0.0, 0)
+    diagram = make_planar(controller, world, CircleTargetConfig(), PERFECT, 0)
     simulator = Simulator(diagram)
     simulator.AdvanceTo(9.0)  # The target rests from 6 s on.
     context = simulator.get_context()
@@ -181,10 +183,18 @@ def test_a_sample_that_is_not_finite_ends_the_trust_and_the_pair():
     assert again.mixture is bad.mixture  # A pair takes two good samples.
 
 
+LAW = PlanarImpedanceConfig(
+    stiffness_free=110.0, damping_ratio=2.0, steepness=11.9, error_mid=1.78
+)
+
+
 def tracking(config, seed=0, knowledge=None):
     """Errors (n,) and the last context's diagram of a first trial on springs."""
     task = MultiSpringConfig(seed=seed)
-    diagram = make_multi_spring(task, impedance(config, task.model, knowledge))
+    sigma = 2 * [0.0132] + 4 * [2.17]
+    mixture = IgmmConfig(sigma_ini=sigma, tau_nov=0.0438, sp_max=55.7)
+    model = ForceModelConfig(mixture, period_sec=0.001)
+    diagram = make_multi_spring(task, impedance(config, model, knowledge))
     simulator = Simulator(diagram)
     context = simulator.get_context()
     errors = []
@@ -199,7 +209,7 @@ def tracking(config, seed=0, knowledge=None):
 
 @pytest.mark.parametrize("seed", range(2))
 def test_springs_are_countered_softly_in_the_first_trial(seed):
-    config = MultiSpringConfig().impedance
+    config = LAW
     ours, diagram, context = tracking(config, seed)
     stiff, _, _ = tracking(replace(config, adapt=False), seed)
     # Issue: three times better, at a quarter of the stiffness that the other has.

@@ -36,13 +36,14 @@ from makebreak.systems.planar_world import (
     CircleTargetConfig,
     PlanarWorld,
     PlanarWorldConfig,
+    springs_of,
 )
 
 DT = 1e-3
-NONE = (np.zeros((0, 2)), np.zeros((0, 2)))
+NONE = (np.zeros((0, 2)), np.zeros((0, 3)))
 THIN, RAMP = np.zeros(2), 6.0
 ANCHORS = np.array([[0.0, 0.75], [-0.65, -0.4], [0.65, -0.4]])
-SPRINGS = np.array([[20.0, 0.3], [40.0, 0.3], [60.0, 0.3]])
+SPRINGS = np.array([[20.0, 0.3, np.inf], [40.0, 0.3, np.inf], [60.0, 0.3, np.inf]])
 
 
 def simulated(x, seconds, u=(0.0, 0.0), mass=1.0, world=(THIN, RAMP, *NONE)):
@@ -92,11 +93,26 @@ def test_effector_comes_to_rest_where_spring_and_push_balance():
         np.array([15.0, 15.0]),
         RAMP,
         np.array([[0.0, 1.0]]),
-        np.array([[k, rest]]),
+        np.array([[k, rest, np.inf]]),
     )
     x = simulated([0.1, 0.4, 0.0, 0.0], 20.0, push, world=world)[-1]
     # The spring pulls up with k (l - rest) = 6 N: it is 0.45 m long, straight down.
     np.testing.assert_allclose(x, [0.0, 1.0 - 0.45, 0.0, 0.0], atol=1e-7)
+
+
+def test_a_spring_pulls_within_its_reach_alone():
+    anchor, spring = np.array([[0.5, 0.0]]), np.array([[40.0, 0.3, 0.4]])
+    for x, expected in [(0.101, 40.0 * 0.099), (0.099, 0.0), (0.899, -40.0 * 0.099)]:
+        F = external_force(np.array([x, 0, 0, 0]), 0.0, THIN, RAMP, anchor, spring)
+        np.testing.assert_allclose(F, [expected, 0.0], atol=1e-12)
+    # It catches an effector that comes near, and then does not let go: no friction.
+    world = (THIN, RAMP, anchor, spring)
+    x = simulated([0.0, 0.0, 0.3, 0.0], 1.0, world=world)
+    caught = np.flatnonzero(x[:, 0] > 0.1)[0]
+    np.testing.assert_allclose(x[:caught, 2], 0.3)
+    stored = 0.5 * 40.0 * (np.abs(0.5 - x[caught + 1 :, 0]) - 0.3) ** 2
+    energy = stored + 0.5 * x[caught + 1 :, 2] ** 2
+    np.testing.assert_allclose(energy[:100], 0.5 * 40 * 0.1**2 + 0.045, rtol=1e-2)
 
 
 def test_springs_alone_keep_the_energy():
@@ -118,7 +134,7 @@ def test_a_held_force_with_springs_and_porridge_agrees_with_scipy():
 
     def slope(t, s, u):
         F = -150.0 * min(t / 6.0, 1.0) * s[2:]
-        for anchor, (k, rest) in zip(ANCHORS, SPRINGS, strict=True):
+        for anchor, (k, rest, _) in zip(ANCHORS, SPRINGS, strict=True):
             d = anchor - s[:2]
             F = F + k * (1.0 - rest / np.linalg.norm(d)) * d
         return [*s[2:], *((u + F) / mass)]
@@ -141,7 +157,7 @@ def test_springs_agree_with_drakes_multibody_plant():
     world = plant.world_frame()
     plant.AddJoint(PrismaticJoint("x", world, slide.body_frame(), [1, 0, 0]))
     plant.AddJoint(PrismaticJoint("y", slide.body_frame(), tip.body_frame(), [0, 1, 0]))
-    for anchor, (k, rest) in zip(ANCHORS, SPRINGS, strict=True):
+    for anchor, (k, rest, _) in zip(ANCHORS, SPRINGS, strict=True):
         at = [*anchor, 0.0]
         plant.AddForceElement(
             LinearSpringDamper(plant.world_body(), at, tip, [0, 0, 0], rest, k, 0.0)
@@ -213,7 +229,7 @@ def test_who_reads_at_t_reads_the_state_of_t_and_u_acts_from_then_on():
 @pytest.mark.parametrize("seed", range(20))
 def test_the_drawn_springs_pull_with_moderate_forces(seed):
     world, target = draw(MultiSpringConfig(seed=seed))
-    springs = np.column_stack([world.stiffness, world.rest_length])
+    anchors, springs = springs_of(world)
     circle = (target.radius, target.duration_sec, target.phase, float(target.turn))
     forces = [
         external_force(
@@ -221,7 +237,7 @@ def test_the_drawn_springs_pull_with_moderate_forces(seed):
             t,
             THIN,
             RAMP,
-            np.array(world.anchors),
+            anchors,
             springs,
         )
         for t in np.linspace(0.0, 6.0, 100)

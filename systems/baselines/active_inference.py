@@ -17,12 +17,15 @@ class ActiveInferenceConfig:
     variance: list[float] = field(default_factory=lambda: [1.0, 1.0, 5.0, 5.0])
     k_belief: float = 20.0  # k_mu [1/s].
     k_action: float = 1200.0  # k_a [N/(m s)].
+    # Whether the model knows how the goal moves. In the source it does not.
+    goal_moves: bool = False
 
 
 class ActiveInference(LeafSystem):
     """Believes that it goes to the goal, and acts until what it senses agrees.
 
-    Inputs:  state (4,) p, v; x_desired (6,) p, v, a, of which p is the goal.
+    Inputs:  state (4,) p, v; x_desired (6,) p, v, a, of which p is the goal; v and a
+             count where the config says that it moves.
     Outputs: u (2,) [N]; status (1,), a sum: 1 not finite, u held; 2 u at its limit;
              belief (6,) mu, mu', mu''.
 
@@ -52,6 +55,7 @@ class ActiveInference(LeafSystem):
             if not 0.0 < number < np.inf:
                 raise ValueError(f"{name} is {number}, expected > 0")
         self._law = (
+            bool(c.goal_moves),
             1.0 / variance,
             float(c.k_belief),
             float(c.k_action),
@@ -67,14 +71,14 @@ class ActiveInference(LeafSystem):
         self.DeclareVectorOutputPort("belief", 6, self._calc_belief, ticket)
         self.DeclareStateOutputPort("status", self._status)
         self.DeclarePeriodicDiscreteUpdateEvent(period_sec, offset_sec, self._update)
-        tick(np.zeros(MEMORY), np.zeros(4), np.zeros(2), *self._law)  # Compiles it.
+        tick(np.zeros(MEMORY), np.zeros(4), np.zeros(6), *self._law)  # Compiles it.
 
     @timed
     def _update(self, context: Context, discrete_state):
         # A Context's arrays are read-only, another type for the compiled law.
         memory = context.get_discrete_state(self._memory).value().copy()
-        goal = np.ascontiguousarray(self._target.Eval(context)[:2])
-        _, memory, limit = tick(memory, self._state.Eval(context), goal, *self._law)
+        state, target = self._state.Eval(context), self._target.Eval(context)
+        _, memory, limit = tick(memory, state, target, *self._law)
         if np.isfinite(memory).all():
             discrete_state.set_value(self._memory, memory)
             discrete_state.set_value(self._status, [AT_LIMIT if limit else 0])

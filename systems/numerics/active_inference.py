@@ -10,7 +10,10 @@
 P are precisions, one over the variances. The generative model says that the state goes
 to the goal as mu' = x_d - mu: with a time constant of 1 s. So, with k_mu large, a
 steadily moving goal is followed about 1 s late. du/dx is taken as 1: nothing is known
-of the plant. The goal is a point, x_d; its velocity has no place in the law.
+of the plant. In the source the goal is a point, x_d, and its velocity has no place in
+the law. Where the model knows how the goal moves, it is mu' = x_d + v_d - mu, and
+e_m' = mu'' + mu' - v_d - a_d: the belief follows without a lag, the most that it can be
+given.
 
 The beliefs start at what is measured first, u at zero; u stays within the limit.
 
@@ -28,12 +31,15 @@ MEMORY = 9  # mu (2), mu' (2), mu'' (2), u (2), 1 once started.
 
 
 @njit(cache=True)
-def tick(memory, state, goal, precision, k_belief, k_action, period, force_max):
+def tick(
+    memory, state, target, moves, precision, k_belief, k_action, period, force_max
+):
     """One period, integrated by Euler's rule as in the source.
 
     Args:
         memory: (9,); zeros at first.
-        state: (4,) p, v [m], [m/s]; goal: (2,) x_d [m].
+        state: (4,) p, v [m], [m/s]; target: (6,) p, v, a [m], [m/s], [m/s2].
+        moves: whether the model knows how the goal moves; else it is the point p.
         precision: (4,) P_y, P_y', P_m, P_m'.
         k_belief: k_mu [1/s]; k_action: k_a [N/(m s)].
         period [s]; force_max [N].
@@ -47,7 +53,11 @@ def tick(memory, state, goal, precision, k_belief, k_action, period, force_max):
     for i in range(2):
         mu, first, second = m[i], m[2 + i], m[4 + i]
         y, y1 = precision[0] * (state[i] - mu), precision[1] * (state[2 + i] - first)
-        g, g1 = precision[2] * (first + mu - goal[i]), precision[3] * (second + first)
+        goal, rate = target[i], 0.0
+        if moves:
+            goal, rate = goal + target[2 + i], target[2 + i] + target[4 + i]
+        g = precision[2] * (first + mu - goal)
+        g1 = precision[3] * (second + first - rate)
         m[i] += period * (first + k_belief * (y - g))
         m[2 + i] += period * (second + k_belief * (y1 - g - g1))
         m[4 + i] -= period * k_belief * g1

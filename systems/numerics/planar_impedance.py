@@ -12,7 +12,8 @@ damping that it names; it is had by damping_ratio = 0.125.
 The model is an incremental Gaussian mixture over [S, D'] (numerics/igmm.py), S what is
 measured now and D' the force one model period later. Either S = [v, F] and D' = F', as
 vectors: the force of a spring has nothing to do with the direction of motion; or, as
-in eq. 2 and 3, S = [|v|, f] and D' = f', with f the force against the motion.
+in eq. 2 and 3, S = [|v|, f] and D' = f', with f the force against the motion. Where
+the force changes at places, S = [p, v, F] can foresee it on a path that comes again.
 
 Source: "Changing-contact manipulation" (CC) section 3.1, eq. 2 to 4, 6.
 """
@@ -104,14 +105,15 @@ def _frozen(array) -> np.ndarray:
     return array
 
 
-def features_of(state, force, along_motion: bool):
+def features_of(state, force, along_motion: bool, position: bool = False):
     """S and D of one sample.
 
-    Args: state (4,); force (2,) measured, of the world on the effector [N].
+    Args: state (4,); force (2,) measured, of the world on the effector [N]; position:
+        whether S has the position too, where it is not along the motion.
     Returns: S (n,), D (m,).
     """
     if not along_motion:
-        return np.concatenate([state[2:], force]), force
+        return np.concatenate([state if position else state[2:], force]), force
     against = np.array([-force @ direction_of(state)])
     return np.concatenate([[np.hypot(state[2], state[3])], against]), against
 
@@ -136,6 +138,7 @@ def after_sample(
     force,
     along_motion: bool,
     learn: bool,
+    position: bool = False,
 ) -> ForceModel:
     """The model after one more sample, with its prediction of the next one.
 
@@ -143,7 +146,7 @@ def after_sample(
 
     Args: as features_of; learn: whether the mixture takes the sample in.
     """
-    S, D = features_of(state, force, along_motion)
+    S, D = features_of(state, force, along_motion, position)
     mixture, error, filtered = model.mixture, np.nan, model.filtered
     if not (np.isfinite(S).all() and np.isfinite(D).all()):
         nothing = _frozen(np.zeros_like(model.predicted))

@@ -3,6 +3,9 @@
     m dv/dt = u + F,    F = -c(t) v + sum_i k_i (|d_i| - l_i) d_i / |d_i|,
     d_i = anchor_i - p,    c(t) = c_0 + (c_1 - c_0) min(t / T, 1)
 
+A spring pulls where |d_i| < r_i, its reach: it engages and lets go as the effector
+comes and leaves, and the force jumps.
+
 u is held over each period. A period is integrated by four Runge-Kutta steps of fourth
 order; tests/test_planar_world.py holds the result against closed forms, scipy and
 Drake's own springs.
@@ -33,7 +36,7 @@ def _force(x, y, vx, vy, t, viscosity, ramp, anchors, springs):
     for i in range(anchors.shape[0]):
         dx, dy = anchors[i, 0] - x, anchors[i, 1] - y
         length = np.sqrt(dx * dx + dy * dy)
-        if length > _NEAR:
+        if _NEAR < length < springs[i, 2]:
             pull = springs[i, 0] * (length - springs[i, 1]) / length
             fx += pull * dx
             fy += pull * dy
@@ -49,7 +52,7 @@ def external_force(state, t, viscosity, ramp, anchors, springs):
         t: time [s].
         viscosity: (2,) first and last [N s/m]; ramp [s].
         anchors: (n, 2) [m].
-        springs: (n, 2) stiffness [N/m] and rest length [m] of each.
+        springs: (n, 3) stiffness [N/m], rest length [m] and reach [m] of each.
     Returns: F (2,) [N].
     """
     x, y, vx, vy = state
@@ -116,3 +119,13 @@ def limited(u, force_max):
     if size > force_max:
         return u * (force_max / size)
     return u
+
+
+@njit(cache=True)
+def compensated(u, force, force_max):
+    """u - force (2,) [N], at most force_max in norm; u where force is not finite."""
+    out = np.empty(2)
+    known = np.isfinite(force[0]) and np.isfinite(force[1])
+    for i in range(2):
+        out[i] = u[i] - force[i] if known else u[i]
+    return limited(out, force_max)

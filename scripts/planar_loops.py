@@ -1,0 +1,307 @@
+"""Trials of the planar experiments as plain loops, for tuning and for comparing many.
+
+tests/test_planar_experiments.py holds them against the diagrams, tick for tick.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from makebreak.diagrams.planar import (
+    FORCE_MAX,
+    MASS,
+    PERIOD,
+    PlanarSensing,
+    state_noise_seed,
+)
+from makebreak.systems.baselines.active_inference import ActiveInferenceConfig
+from makebreak.systems.baselines.biomimetic import BiomimeticConfig
+from makebreak.systems.baselines.mrac import MracConfig
+from makebreak.systems.numerics import active_inference, mrac
+from makebreak.systems.numerics.biomimetic import after_trial, force_command, no_gains
+from makebreak.systems.numerics.igmm import Mixture, igmm_tuning
+from makebreak.systems.numerics.mrac import error_weights
+from makebreak.systems.numerics.planar_impedance import (
+    after_sample,
+    new_model,
+    predicted_force,
+    stiffness_of,
+    trust,
+)
+from makebreak.systems.numerics.planar_impedance import (
+    force_command as impedance_command,
+)
+from makebreak.systems.numerics.planar_world import (
+    circle_target,
+    compensated,
+    external_force,
+    step,
+)
+from makebreak.systems.numerics.sensor_noise import add_noise
+from makebreak.systems.planar_impedance import ForceModelConfig, PlanarImpedanceConfig
+from makebreak.systems.planar_world import (
+    CircleTargetConfig,
+    PlanarWorldConfig,
+    springs_of,
+)
+
+_EVERY = 5  # Ticks from one sample of the error to the next.
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A world, a circle and what the sensors make of them, as compiled loops take it.
+
+    n is the number of ticks.
+    """
+
+    world: tuple  # Of numerics.planar_world.step, after the mass.
+    circle: tuple  # Of circle_target, after t.
+    state_noise: np.ndarray  # (n, 4) [m], [m/s]
+    force_noise: np.ndarray  # (n, 2) [N]
+    delay: int  # Of what is measured [ticks].
+
+    @property
+    def start(self) -> np.ndarray:
+        """(4,): at rest on the circle."""
+        radius, _, phase, _ = self.circle
+        return np.array([radius * np.cos(phase), radius * np.sin(phase), 0.0, 0.0])
+
+    @property
+    def sensing(self) -> tuple:
+        return self.state_noise, self.force_noise, self.delay
+
+
+def trial_of(
+    world: PlanarWorldConfig,
+    target: CircleTargetConfig,
+    sensing: PlanarSensing,
+    seed: int,
+) -> Trial:
+    """What make_planar makes of the same arguments."""
+    n = round(target.duration_sec / PERIOD)
+    state_noise = _noise(np.array(sensing.state_std()), state_noise_seed(seed), n)
+    force_noise = _noise(np.full(2, sensing.force_noise), seed, n)
+    viscosity = np.array(world.viscosity, dtype=float)
+    return Trial(
+        (viscosity, float(world.ramp_sec), *springs_of(world)),
+        (target.radius, target.duration_sec, target.phase, float(target.turn)),
+        state_noise,
+        force_noise,
+        sensing.delay_ticks,
+    )
+
+
+@njit(cache=True)
+def _noise(std, seed, n):
+    """(n, len(std)): what a NoisySensor adds at each tick."""
+    out, zero = np.empty((n, std.shape[0])), np.zeros(std.shape[0])
+    for k in range(n):
+        out[k] = add_noise(zero, std, seed, k)
+    return out
+
+
+@njit(cache=True)
+def _squared_error(state, k, circle):
+    """At the end of tick k, every fifth; else 0 [m2]."""
+    if (k + 1) % _EVERY != 0:
+        return 0.0
+    t = (k + 1) * PERIOD
+    goal = circle_target(t, circle[0], circle[1], circle[2], circle[3])
+    return (state[0] - goal[0]) ** 2 + (state[1] - goal[1]) ** 2
+
+
+@njit(cache=True)
+def _world_step(state, k, u, w):
+    return step(state, k * PERIOD, u, PERIOD, MASS, w[0], w[1], w[2], w[3])
+
+
+@njit(cache=True)
+def _world_force(state, k, w):
+    return external_force(state, k * PERIOD, w[0], w[1], w[2], w[3])
+
+
+@njit(cache=True)
+def _total(u, forces, k, sensing, feedforward):
+    """u with the measured force taken off, if it is fed forward."""
+    if not feedforward:
+        return u
+    late = max(k - sensing[2], 0)
+    return compensated(u, forces[late] + sensing[1][late], FORCE_MAX)
+
+
+@njit(cache=True)
+def _biomimetic_trial(
+    force, stiffness, damping, fixed, circle, state, world, sensing, feedforward
+):
+    """e, de/dt at each time step, and the RMS error."""
+    n, steps = round(circle[1] / PERIOD), force.shape[0]
+    states, forces = np.empty((n, 4)), np.empty((n, 2))
+    errors, total = np.empty((steps, 4)), 0.0
+    for k in range(n):
+        states[k], forces[k] = state, _world_force(state, k, world)
+        late = max(k - sensing[2], 0)
+        seen = states[late] + sensing[0][late]
+        target = circle_target(k * PERIOD, circle[0], circle[1], circle[2], circle[3])
+        j = k * steps // n
+        if k == 0 or j != (k - 1) * steps // n:
+            errors[j] = seen - target[:4]
+        u, _ = force_command(
+            seen, target, force[j], stiffness[j], damping[j], fixed, MASS, FORCE_MAX
+        )
+        u = _total(u, forces, k, sensing, feedforward)
+        state = _world_step(state, k, u, world)
+        total += _squared_error(state, k, circle)
+    return errors, np.sqrt(total / (n // _EVERY))
+
+
+@njit(cache=True)
+def _mrac_trial(
+    omega, zeta, p2, p3, gains, lag, circle, state, world, sensing, feedforward
+):
+    n = round(circle[1] / PERIOD)
+    states, forces = np.empty((n, 4)), np.empty((n, 2))
+    memory, held, total = np.zeros(mrac.MEMORY), np.zeros(2), 0.0
+    for k in range(n):
+        states[k], forces[k] = state, _world_force(state, k, world)
+        late = max(k - sensing[2], 0)
+        u, after, _ = mrac.tick(
+            memory,
+            states[late] + sensing[0][late],
+            circle_target(k * PERIOD, circle[0], circle[1], circle[2], circle[3]),
+            omega,
+            zeta,
+            p2,
+            p3,
+            gains,
+            lag,
+            PERIOD,
+            FORCE_MAX,
+        )
+        if np.isfinite(u.sum()) and np.isfinite(after.sum()):
+            memory, held = after, u
+        u = _total(held, forces, k, sensing, feedforward)
+        state = _world_step(state, k, u, world)
+        total += _squared_error(state, k, circle)
+    return np.sqrt(total / (n // _EVERY))
+
+
+@njit(cache=True)
+def _active_inference_trial(
+    moves, precision, k_belief, k_action, circle, state, world, sensing, feedforward
+):
+    n = round(circle[1] / PERIOD)
+    states, forces = np.empty((n, 4)), np.empty((n, 2))
+    memory, total = np.zeros(active_inference.MEMORY), 0.0
+    for k in range(n):
+        states[k], forces[k] = state, _world_force(state, k, world)
+        late = max(k - sensing[2], 0)
+        _, after, _ = active_inference.tick(
+            memory,
+            states[late] + sensing[0][late],
+            circle_target(k * PERIOD, circle[0], circle[1], circle[2], circle[3]),
+            moves,
+            precision,
+            k_belief,
+            k_action,
+            PERIOD,
+            FORCE_MAX,
+        )
+        if np.isfinite(after.sum()):
+            memory = after
+        u = _total(memory[6:8], forces, k, sensing, feedforward)
+        state = _world_step(state, k, u, world)
+        total += _squared_error(state, k, circle)
+    return np.sqrt(total / (n // _EVERY))
+
+
+def mrac_error(config: MracConfig, trial: Trial, feedforward: bool = False) -> float:
+    """RMS tracking error of a trial [m]."""
+    p2, p3 = error_weights(config.omega, config.zeta, config.rate_weight)
+    gains = np.array(
+        config.force_gains + config.position_gains + config.velocity_gains, dtype=float
+    )
+    law = (config.omega, config.zeta, p2, p3, gains, bool(config.lag))
+    world = (trial.circle, trial.start, trial.world, trial.sensing)
+    return float(_mrac_trial(*law, *world, feedforward))
+
+
+def active_inference_error(
+    config: ActiveInferenceConfig, trial: Trial, feedforward: bool = False
+) -> float:
+    """RMS tracking error of a trial [m]."""
+    precision = 1.0 / np.array(config.variance)
+    law = (bool(config.goal_moves), precision, config.k_belief, config.k_action)
+    world = (trial.circle, trial.start, trial.world, trial.sensing)
+    return float(_active_inference_trial(*law, *world, feedforward))
+
+
+def learning_curve(
+    config: BiomimeticConfig, trials: Sequence[Trial], feedforward: bool = False
+) -> list[float]:
+    """RMS tracking error of each of the trials, one after the other [m].
+
+    What was learned is by time steps of the first trial; in one that takes another time
+    it stays with the place on the path.
+    """
+    gains = no_gains(round(trials[0].circle[1] / config.step_sec))
+    fixed = np.array([config.stiffness, config.damping])
+    curve = []
+    for trial in trials:
+        world = (trial.circle, trial.start, trial.world, trial.sensing)
+        learned = (gains.force, gains.stiffness, gains.damping)
+        errors, rms = _biomimetic_trial(*learned, fixed, *world, feedforward)
+        curve.append(float(rms))
+        gains = after_trial(
+            gains,
+            errors[:, :2],
+            errors[:, 2:],
+            config.kappa,
+            config.rates,
+            config.forget,
+            config.forget_less,
+        )
+    return curve
+
+
+def adaptive_error(
+    law: PlanarImpedanceConfig,
+    config: ForceModelConfig,
+    trial: Trial,
+    knowledge: Mixture | None = None,
+) -> tuple[float, Mixture]:
+    """RMS tracking error of a trial [m], and what the model knows after it."""
+    tuning, along = igmm_tuning(config.mixture), config.along_motion
+    model = new_model(tuning, knowledge, along)
+    state, total, every = trial.start, 0.0, round(config.period_sec / PERIOD)
+    n = len(trial.state_noise)
+    states, forces = np.empty((n, 4)), np.empty((n, 2))
+    state_noise, force_noise, delay = trial.sensing
+    for k in range(n):
+        states[k], forces[k] = state, _world_force(state, k, trial.world)
+        late = max(k - delay, 0)
+        seen = states[late] + state_noise[late]
+        if k % every == 0:
+            F = forces[late] + force_noise[late]
+            model = after_sample(
+                model, tuning, seen, F, along, law.learn, config.position
+            )
+            lam = 0.0
+            if law.adapt:
+                lam = trust(model.filtered, law.steepness, law.error_mid)
+            K = stiffness_of(lam, law.stiffness_free, law.stiffness_max)
+        u = impedance_command(
+            seen,
+            circle_target(k * PERIOD, *trial.circle),
+            lam,
+            K,
+            predicted_force(model, seen, along),
+            MASS,
+            law.damping_ratio,
+            FORCE_MAX,
+        )
+        state = _world_step(state, k, u, trial.world)
+        total += _squared_error(state, k, trial.circle)
+    return float(np.sqrt(total / (n // _EVERY))), model.mixture
