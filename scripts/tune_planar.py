@@ -13,8 +13,8 @@ diagrams/planar_tuned.json, from where the experiments take it.
 
 No range has an edge that matters: they are so wide that the best lies inside, or the
 bound is one that all share. Such are: proportional stiffness at most stiffness_max,
-proportional damping at most twice critical there. (Else a high gain does what
-adaptation is to do; `mrac_free` and `active_inference_free` show it.) Active inference
+proportional damping at most twice critical there, as else a high gain does what
+adaptation is to do. Active inference
 integrates its error of velocity, k_a P_y' int de/dt dt: that factor is its proportional
 stiffness.
 
@@ -112,10 +112,7 @@ def spaces(setting: Setting) -> dict[str, dict[str, tuple[float, float]]]:
     others = ("mrac", "active_inference", "biomimetic")
     found |= {f"{name}{FORCE}": found[name] for name in others}
     if setting == SETTINGS["springs"]:
-        found["biomimetic_first"] = biomimetic
         found["active_inference_fixed_goal"] = active
-        found["mrac_free"] = mrac | {"stiffness": (5.0, 1e7)}
-        found["active_inference_free"] = active | {"stiffness": (5.0, 1e7)}
     if setting.world == "porridge":
         found = {"mrac": mrac, f"mrac{FORCE}": mrac}
     return found
@@ -124,7 +121,6 @@ def spaces(setting: Setting) -> dict[str, dict[str, tuple[float, float]]]:
 def config_of(name: str, p: dict[str, float], setting: Setting):
     """The config, or the two, of a controller with the parameters p."""
     name, K_max = name.removesuffix(FORCE), setting.stiffness_max
-    bounded = not name.endswith("_free")
     if name in ("adaptive", "adaptive_position", "measured_force"):
         law = PlanarImpedanceConfig(
             stiffness_free=p["stiffness_free"],
@@ -150,10 +146,9 @@ def config_of(name: str, p: dict[str, float], setting: Setting):
         p2, p3 = error_weights(p["omega"], p["zeta"], p["rate_weight"])
         alpha = p["stiffness"] / p2
         now = np.array([alpha, p["position_now"], p["velocity_now"]])
-        if bounded:
-            # What multiplies q at once, at most: K0 x, Q0 x_m, K1 v and Q1 v_m too.
-            most = now @ [1.0, 2.0 * X_MAX**2, 2.0 * V_MAX**2]
-            now *= min(1.0, K_max / (p2 * most), setting.damping_max / (p3 * most))
+        # What multiplies q at once, at most: K0 x, Q0 x_m, K1 v and Q1 v_m too.
+        most = now @ [1.0, 2.0 * X_MAX**2, 2.0 * V_MAX**2]
+        now *= min(1.0, K_max / (p2 * most), setting.damping_max / (p3 * most))
         return MracConfig(
             p["omega"],
             p["zeta"],
