@@ -30,6 +30,7 @@ from makebreak.gap.windows import TURN, spin_of
 from makebreak.models.drives import law_of
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
+from makebreak.models.effects.contact import CONTACT_LAW
 from makebreak.models.effects.inertia import SIX, central_inertia, inertial_columns
 from makebreak.models.effects.kind import (
     Effect,
@@ -78,8 +79,8 @@ WRENCHED = 0.05  # A wrench sampled amid a drive's ripple is off by as much.
 _POSE = (*TURN, "x", "y", "z")
 _FORCE = ("fx", "fy", "fz")
 # What changes shapes, surfaces and where they are.
-SHAPED = ("contact_friction", "friction_patch", "plane_tilt", "plane_height",
-          "contact_stiffness", "contact_dissipation")  # fmt: skip
+SHAPED = ("contact_friction", "friction_patch", "plane_tilt", "plane_height")
+SHAPED += CONTACT_LAW
 
 # What changes a free body's inertial parameters.
 INERTIAL = ("object_mass", "object_com", "object_inertia")

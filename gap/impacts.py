@@ -21,6 +21,7 @@ from makebreak.gap.recording import Episode, Recording
 from makebreak.gap.windows import Window, WindowModel, with_step
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
+from makebreak.models.effects.contact import CONTACT_LAW
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import Scene
 from makebreak.systems.numerics.smoother import smooth_filtered
@@ -249,7 +250,7 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
         as the scene's `tolerance` says."""
         columns, prior, names = [], [], []
         changes = list(link_changes(self.dynamics, self.scene))
-        for kind in ("contact_stiffness", "contact_dissipation"):
+        for kind in CONTACT_LAW:
             share = float(self.scene.tolerance.get(kind, 0.0))
             for at in self._pairs() if share > 0.0 else ():
                 ((name, now),) = self.dynamics.now(kind, [at]).items()
@@ -321,7 +322,7 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
 
     def _of_contacts(self):
         for at in self._pairs():
-            for kind in ("contact_stiffness", "contact_dissipation"):
+            for kind in CONTACT_LAW:
                 try:
                     ((name, now),) = self.dynamics.now(kind, [at]).items()
                 except ValueError:

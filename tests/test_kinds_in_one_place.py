@@ -28,6 +28,15 @@ KNOWN = {
     | {"clock_skew", "gravity_tilt", "sensor_bias", "sensor_delay", "sinusoidal_force"},
     "gap/check_relations.py": {"clock_skew"},
     "gap/contact.py": CONTACT,
+    "gap/contact_dynamics.py": {
+        "actuator_bias", "actuator_gain", "contact_friction", "friction_patch",
+        "input_delay", "object_com", "object_inertia", "object_mass", "plane_height",
+        "plane_tilt",
+    },
+    "gap/contact_problem.py": {
+        "body_drag", "constant_force", "contact_friction", "friction_patch",
+        "object_com", "object_inertia", "object_mass", "plane_height", "plane_tilt",
+    },
     "gap/free_windows.py": {"length_scale"},
     "gap/windows.py": {"length_scale"},
     "gap/mechanism.py": {"object_com", "object_mass", "link_com", "link_mass"},

@@ -565,6 +565,9 @@ def _add_rolling_resistance(
     return system.GetOutputPort("generalized_force")
 
 
+# How hard two shapes are to each other, and what a touch of theirs loses.
+CONTACT_LAW = ("contact_stiffness", "contact_dissipation")
+
 KINDS = {
     "contact_friction": EffectKind(
         at="pair",
