@@ -79,8 +79,8 @@ WRENCHED = 0.05  # A wrench sampled amid a drive's ripple is off by as much.
 _POSE = (*TURN, "x", "y", "z")
 _FORCE = ("fx", "fy", "fz")
 # What changes shapes, surfaces and where they are.
-SHAPED = ("contact_friction", "friction_patch", "plane_tilt", "plane_height")
-SHAPED += CONTACT_LAW
+SURFACES = ("contact_friction", "friction_patch", "plane_tilt", "plane_height")
+SHAPED = (*SURFACES, *CONTACT_LAW)
 
 # What changes a free body's inertial parameters.
 INERTIAL = ("object_mass", "object_com", "object_inertia")
