@@ -47,6 +47,7 @@ from makebreak.systems.numerics.permitted_forces import (
     explain,
     held_means,
     roots_of,
+    tangential,
     test_functions,
     unshared_load,
 )
@@ -930,7 +931,7 @@ class ContactDynamics:
                 continue
             J = self._relative(s, poses)
             u = np.einsum("nij,nj->ni", J, self._node_v)
-            slip = u - np.sum(u * s.normal, axis=1)[:, None] * s.normal
+            slip = tangential(u, s.normal)
             speed = np.linalg.norm(slip, axis=1)
             fast = np.asarray(W @ ((speed >= SLIDES) & mine).astype(float)).ravel()
             slides = fast >= 0.999 * weight  # Slower in any part: it may stick.

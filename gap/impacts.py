@@ -32,7 +32,7 @@ FREE_SEC, MOST_FREE, MOST_TOUCHES = 0.25, 6, 9
 LOOKS = 4000  # Rows at which it is first asked whether anything comes near.
 NEAR = 0.01  # [m]
 FEWEST = 3  # Touches.
-FASTEST_SHARE = 0.5  # Of the time, that may be spent in touch: else it lies there.
+MOST_SHARE = 0.5  # Of the time, that may be spent in touch: else it lies there.
 DRAWS = 3  # Of uncertain starts.
 BLUR = 0.003  # Of how far a channel goes in a window: laws are no better.
 TRIED = (0.2, 0.4, 0.7, 0.9, 1.15, 1.7, 2.6, 4.5)  # Times what the scene has.
@@ -54,14 +54,14 @@ def runs_against(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bo
         q = positions(dynamics, recording)
         for episode in recording.episodes:
             rows = np.arange(episode.first, episode.last)
+            whole += len(rows)
             some = rows[:: max(len(rows) // LOOKS, 1)]
             if not _least(shapes, dynamics, q[some]).min(initial=np.inf) < NEAR:
-                whole += len(rows)
                 continue
             near = _least(shapes, dynamics, q[rows]) < 0.0
             touches += int(np.sum(np.diff(near.astype(int)) == 1))
-            inside, whole = inside + int(near.sum()), whole + len(rows)
-    return touches >= FEWEST and inside < FASTEST_SHARE * whole
+            inside += int(near.sum())
+    return touches >= FEWEST and inside < MOST_SHARE * whole
 
 
 def walls_of(dynamics: SceneDynamics) -> ContactShapes | None:

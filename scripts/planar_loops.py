@@ -104,12 +104,17 @@ def _noise(std, seed, n):
 
 
 @njit(cache=True)
+def _target(k, circle):
+    """(6,) of circle_target at the beginning of tick k."""
+    return circle_target(k * PERIOD, circle[0], circle[1], circle[2], circle[3])
+
+
+@njit(cache=True)
 def _squared_error(state, k, circle):
     """At the end of tick k, every fifth; else 0 [m2]."""
     if (k + 1) % _EVERY != 0:
         return 0.0
-    t = (k + 1) * PERIOD
-    goal = circle_target(t, circle[0], circle[1], circle[2], circle[3])
+    goal = _target(k + 1, circle)
     return (state[0] - goal[0]) ** 2 + (state[1] - goal[1]) ** 2
 
 
@@ -124,12 +129,18 @@ def _world_force(state, k, w):
 
 
 @njit(cache=True)
+def _seen(values, noise, delay, k):
+    """What a sensor says at tick k of values (n, m), known up to k."""
+    late = max(k - delay, 0)
+    return values[late] + noise[late]
+
+
+@njit(cache=True)
 def _total(u, forces, k, sensing, feedforward):
     """u with the measured force taken off, if it is fed forward."""
     if not feedforward:
         return u
-    late = max(k - sensing[2], 0)
-    return compensated(u, forces[late] + sensing[1][late], FORCE_MAX)
+    return compensated(u, _seen(forces, sensing[1], sensing[2], k), FORCE_MAX)
 
 
 @njit(cache=True)
@@ -142,9 +153,8 @@ def _biomimetic_trial(
     errors, total = np.empty((steps, 4)), 0.0
     for k in range(n):
         states[k], forces[k] = state, _world_force(state, k, world)
-        late = max(k - sensing[2], 0)
-        seen = states[late] + sensing[0][late]
-        target = circle_target(k * PERIOD, circle[0], circle[1], circle[2], circle[3])
+        seen = _seen(states, sensing[0], sensing[2], k)
+        target = _target(k, circle)
         j = k * steps // n
         if k == 0 or j != (k - 1) * steps // n:
             errors[j] = seen - target[:4]
@@ -166,11 +176,10 @@ def _mrac_trial(
     memory, held, total = np.zeros(mrac.MEMORY), np.zeros(2), 0.0
     for k in range(n):
         states[k], forces[k] = state, _world_force(state, k, world)
-        late = max(k - sensing[2], 0)
         u, after, _ = mrac.tick(
             memory,
-            states[late] + sensing[0][late],
-            circle_target(k * PERIOD, circle[0], circle[1], circle[2], circle[3]),
+            _seen(states, sensing[0], sensing[2], k),
+            _target(k, circle),
             omega,
             zeta,
             p2,
@@ -197,11 +206,10 @@ def _active_inference_trial(
     memory, total = np.zeros(active_inference.MEMORY), 0.0
     for k in range(n):
         states[k], forces[k] = state, _world_force(state, k, world)
-        late = max(k - sensing[2], 0)
         _, after, _ = active_inference.tick(
             memory,
-            states[late] + sensing[0][late],
-            circle_target(k * PERIOD, circle[0], circle[1], circle[2], circle[3]),
+            _seen(states, sensing[0], sensing[2], k),
+            _target(k, circle),
             moves,
             precision,
             k_belief,
@@ -281,10 +289,9 @@ def adaptive_error(
     state_noise, force_noise, delay = trial.sensing
     for k in range(n):
         states[k], forces[k] = state, _world_force(state, k, trial.world)
-        late = max(k - delay, 0)
-        seen = states[late] + state_noise[late]
+        seen = _seen(states, state_noise, delay, k)
         if k % every == 0:
-            F = forces[late] + force_noise[late]
+            F = _seen(forces, force_noise, delay, k)
             model = after_sample(
                 model, tuning, seen, F, along, law.learn, config.position
             )
@@ -294,7 +301,7 @@ def adaptive_error(
             K = stiffness_of(lam, law.stiffness_free, law.stiffness_max)
         u = impedance_command(
             seen,
-            circle_target(k * PERIOD, *trial.circle),
+            _target(k, trial.circle),
             lam,
             K,
             predicted_force(model, seen, along),

@@ -59,6 +59,24 @@ def test_walls_that_nothing_touches_do_not_count(tmp_path):
     assert not runs_against(SceneDynamics(scene), read_recordings([file]))
 
 
+@pytest.mark.parametrize(
+    ("shares", "runs"), [((0.3,), True), ((0.7,), False), ((0.7, 0.0), True)]
+)
+def test_what_lies_at_a_wall_does_not_run_against_it(tmp_path, shares, runs):
+    """Five touches a recording, for so large a share of its time; 0: none."""
+    cart, t = cart_world.Cart(), np.arange(2000) / 500.0
+    files = []
+    for i, share in enumerate(shares):
+        touching = (t / 0.8) % 1.0 < share
+        x = np.where(touching, cart.reach - cart.half + 1e-3, 0.1)
+        table = {"time": t, "cart.rail.position": x}
+        table["cart.rail.effort_command"] = 0.0 * t
+        scene = cart_world.write(tmp_path / str(i), cart, table, None)
+        files.append(tmp_path / str(i) / "recording.csv")
+    dynamics = SceneDynamics(read_scene(scene))
+    assert runs_against(dynamics, read_recordings(files)) == runs
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "hidden"),

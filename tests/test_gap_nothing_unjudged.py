@@ -32,6 +32,7 @@ def test_shapes_that_meet_are_no_agreement_of_motions(tmp_path):
     how = {c.channel: c.judged for c in result.channels}
     assert how["ball.ball.x"] == how["gantry.x.position"] == DISTANCES
     assert "their motion was not compared" in result.says
+    assert "so the scene is not confirmed" in result.says
     for channel in how:
         assert channel in result.says
 

@@ -9,10 +9,20 @@ from makebreak.systems.numerics.permitted_forces import (
     explain,
     nonnegative,
     roots_of,
+    tangential,
     unshared_load,
 )
 
 FREE = np.zeros((1, 0, 4))  # No load of a foot is more likely than another.
+
+
+def test_slip_is_what_lies_in_the_plane_of_contact():
+    rng = np.random.default_rng(0)
+    u, normal = rng.normal(size=(2, 20, 3))
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    slip = tangential(u, normal)
+    np.testing.assert_allclose(np.sum(slip * normal, axis=1), 0.0, atol=1e-12)
+    np.testing.assert_allclose(np.cross(u - slip, normal), 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(40))

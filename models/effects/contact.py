@@ -15,7 +15,7 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import ContactResults, CoulombFriction, MultibodyPlant
-from pydrake.multibody.tree import RigidBody
+from pydrake.multibody.tree import Joint, RigidBody
 from pydrake.systems.framework import DiagramBuilder, LeafSystem, OutputPort
 
 from makebreak.models.effects.kind import (
@@ -160,15 +160,17 @@ def _lowest(inspector, geometry) -> float | None:
     return None
 
 
+def _joints_above(plant: MultibodyPlant, body: RigidBody) -> list[Joint]:
+    """Those that carry the body; none: it floats, if it is not the world."""
+    joints = (plant.get_joint(i) for i in plant.GetJointIndices())
+    return [j for j in joints if j.child_body().index() == body.index()]
+
+
 def _moves(plant: MultibodyPlant, body: RigidBody) -> bool:
     """Whether a joint that can move lies between a body and the world."""
     here = body
     while here.index() != plant.world_body().index():
-        up = [
-            joint
-            for joint in (plant.get_joint(i) for i in plant.GetJointIndices())
-            if joint.child_body().index() == here.index()
-        ]
+        up = _joints_above(plant, here)
         if not up or up[0].num_velocities() > 0:
             return True
         here = up[0].parent_body()
@@ -379,11 +381,7 @@ def anchored_pose(
     X = RigidTransform()  # From the body's frame to the frame reached.
     here = body
     while here.index() != plant.world_body().index():
-        up = [
-            joint
-            for joint in (plant.get_joint(i) for i in plant.GetJointIndices())
-            if joint.child_body().index() == here.index()
-        ]
+        up = _joints_above(plant, here)
         if not up or up[0].num_velocities() > 0:
             raise ValueError(
                 f"effect {effect.kind} at {effect.at}: expected "

@@ -28,6 +28,11 @@ _SECOND_MOMENT = 1.0 / 11.0  # Of w, over the half width squared.
 FEWEST = 6  # Samples within a test function.
 
 
+def tangential(u, normal):
+    """What of u (n, 3) lies in the planes of the unit normals (n, 3)."""
+    return u - np.sum(u * normal, axis=1)[:, None] * normal
+
+
 def test_functions(times, centres, half: float) -> tuple[csr_matrix, csr_matrix]:
     """Weights (n_centres, n) that give, from samples at times (n,), the mean of a
     signal over a test function about each centre, and the mean of its second

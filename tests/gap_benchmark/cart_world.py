@@ -6,12 +6,13 @@
 stepped by RK4 at 10 us; commands of effort hold between rows.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import numba
 import numpy as np
+
+from gap_benchmark.push_world import write_table
 
 STEP = 1e-5  # [s]
 PAIR = "cart.cart~wall.wall"
@@ -95,13 +96,7 @@ def record(cart: Cart, rng, seconds=16.0, rate=500.0, encoder=1e-5):
 
 def write(folder: Path, cart: Cart, table, noise) -> Path:
     """The scene as `cart` has it, and the recording."""
-    folder.mkdir(parents=True, exist_ok=True)
-    names = list(table)
-    np.savetxt(
-        folder / "recording.csv", np.column_stack([table[n] for n in names]),
-        delimiter=",", header=",".join(names), comments="", fmt="%.10g",
-    )  # fmt: skip
-    (folder / "noise.json").write_text(json.dumps(noise))
+    write_table(folder, table, noise)
     surface = (
         "<drake:proximity_properties><drake:mu_static>0</drake:mu_static>"
         "<drake:mu_dynamic>0</drake:mu_dynamic><drake:point_contact_stiffness>"

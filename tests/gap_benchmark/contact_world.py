@@ -160,12 +160,7 @@ def _rate(t, s, spheres, radius, numbers, inertia, com, n, dx):
     (mass, mu, k, d, height, rolling, mu_patch, x0, x1, y0, y1, drag, spin_drag,
      fx, fy, fz, hz, phase, pull, px, py, pz, slip) = numbers  # fmt: skip
     qw, qx, qy, qz = s[3] , s[4], s[5], s[6]  # fmt: skip
-    R = np.empty((3, 3))
-    R[0, 0], R[1, 1] = 1 - 2 * (qy * qy + qz * qz), 1 - 2 * (qx * qx + qz * qz)
-    R[2, 2] = 1 - 2 * (qx * qx + qy * qy)
-    R[0, 1], R[1, 0] = 2 * (qx * qy - qw * qz), 2 * (qx * qy + qw * qz)
-    R[0, 2], R[2, 0] = 2 * (qx * qz + qw * qy), 2 * (qx * qz - qw * qy)
-    R[1, 2], R[2, 1] = 2 * (qy * qz - qw * qx), 2 * (qy * qz + qw * qx)
+    R = rotation(s[3:7])
     v, wb = s[7:10], s[10:13]
     w, arm = np.zeros(3), np.zeros(3)  # World; the origin from the com.
     for i in range(3):

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 
+import numba
 import numpy as np
 
 
@@ -55,8 +56,9 @@ def quaternion(rpy) -> np.ndarray:
     )
 
 
+@numba.njit(cache=True)
 def rotation(q) -> np.ndarray:
-    w, x, y, z = q
+    w, x, y, z = q[0], q[1], q[2], q[3]
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -136,12 +136,7 @@ def _rate(s, command, feet, half, inertia, com, n, p, dx, force_on_tip):
     mass, mu, foot, k, d = p[0], p[1], p[2], p[3], p[4]
     radius, tip_mass, tip_mu, height, kp, kd = p[5], p[6], p[7], p[8], p[9], p[10]
     qw, qx, qy, qz = s[3], s[4], s[5], s[6]
-    R = np.empty((3, 3))
-    R[0, 0], R[1, 1] = 1 - 2 * (qy * qy + qz * qz), 1 - 2 * (qx * qx + qz * qz)
-    R[2, 2] = 1 - 2 * (qx * qx + qy * qy)
-    R[0, 1], R[1, 0] = 2 * (qx * qy - qw * qz), 2 * (qx * qy + qw * qz)
-    R[0, 2], R[2, 0] = 2 * (qx * qz + qw * qy), 2 * (qx * qz - qw * qy)
-    R[1, 2], R[2, 1] = 2 * (qy * qz - qw * qx), 2 * (qy * qz + qw * qx)
+    R = rotation(s[3:7])
     v, wb = s[7:10], s[10:13]
     w = np.zeros(3)
     for i in range(3):
@@ -342,8 +337,8 @@ def record(truth: World, rng, episodes=10, seconds=2.6, rate=250.0, camera=125.0
     return table, noise
 
 
-def write(folder: Path, world: World, table, noise=None, step=0.0005) -> Path:
-    """The scene as `world` has it, with its models, and the recording beside it."""
+def write_table(folder: Path, table, noise=None) -> None:
+    """recording.csv and, where it is known, noise.json; the folder is made."""
     folder.mkdir(parents=True, exist_ok=True)
     names = list(table)
     np.savetxt(
@@ -352,6 +347,11 @@ def write(folder: Path, world: World, table, noise=None, step=0.0005) -> Path:
     )  # fmt: skip
     if noise is not None:
         (folder / "noise.json").write_text(json.dumps(noise))
+
+
+def write(folder: Path, world: World, table, noise=None, step=0.0005) -> Path:
+    """The scene as `world` has it, with its models, and the recording beside it."""
+    write_table(folder, table, noise)
     (folder / "block.sdf").write_text(_block(world))
     (folder / "table.sdf").write_text(_model(
         "table", '<collision name="top"><pose>0 0 -0.25 0 0 0</pose><geometry><box>'
