@@ -10,11 +10,12 @@ from itertools import combinations
 import numpy as np
 from scipy.optimize import minimize
 
-from makebreak.gap.contact_dynamics import ContactDynamics, Shift
+from makebreak.gap.contact_dynamics import ContactDynamics
 from makebreak.gap.contact_windows import PushWindows
 from makebreak.gap.measure import gap_measure, series_of
 from makebreak.gap.mechanism import link_changes
 from makebreak.gap.objects import unexplained_in_windows
+from makebreak.gap.permitted_contacts import Shift
 from makebreak.gap.problem import (
     Candidate,
     Fitted,

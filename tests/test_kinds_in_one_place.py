@@ -29,9 +29,11 @@ KNOWN = {
     "gap/check_relations.py": {"clock_skew"},
     "gap/contact.py": CONTACT,
     "gap/contact_dynamics.py": {
-        "actuator_bias", "actuator_gain", "contact_friction", "friction_patch",
-        "input_delay", "object_com", "object_inertia", "object_mass", "plane_height",
-        "plane_tilt",
+        "actuator_bias", "actuator_gain", "input_delay", "object_com",
+        "object_inertia", "object_mass",
+    },
+    "gap/permitted_contacts.py": {
+        "contact_friction", "friction_patch", "plane_height", "plane_tilt",
     },
     "gap/contact_problem.py": {
         "body_drag", "constant_force", "contact_friction", "friction_patch",
