@@ -16,6 +16,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pydrake.geometry import Meshcat
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 
@@ -93,6 +95,39 @@ class Knowledge:
     models: ModelBank | None = None  # ForwardModelBank.knowledge
 
 
+def tip_mass(arm: MultibodyPlant):
+    """The arm's effective mass at its tip: a function of p_WE (3,) and a unit vector d
+    (3,) that gives 1/(d' J M^-1 J' d) [kg], by the control plant, with the tip's
+    orientation of its default positions, in the configuration nearest to those.
+    """
+    context = arm.CreateDefaultContext()
+    q_default = arm.GetPositions(context)
+    world, tip = arm.world_frame(), arm.GetFrameByName(TIP_FRAME)
+    R_default = tip.CalcRotationMatrixInWorld(context)
+
+    def mass(p, d) -> float:
+        q = q_default.copy()
+        for _ in range(30):  # Gauss-Newton; out of its reach the arm stays near it.
+            arm.SetPositions(context, q)
+            X = tip.CalcPoseInWorld(context)
+            J = arm.CalcJacobianSpatialVelocity(
+                context, JacobianWrtVariable.kV, tip, np.zeros(3), world, world
+            )
+            turn = (R_default @ X.rotation().inverse()).ToAngleAxis()
+            away = np.r_[turn.angle() * turn.axis(), p - X.translation()]
+            inverse = J.T @ np.linalg.inv(J @ J.T + 1e-4 * np.eye(6))
+            back = q_default - q
+            step = inverse @ (away - J @ back) + back  # The null space goes back.
+            q = q + step
+            if np.linalg.norm(step) < 1e-4:
+                break
+        J = J[3:]
+        M = arm.CalcMassMatrix(context)
+        return float(1.0 / (d @ J @ np.linalg.solve(M, J.T @ d)))
+
+    return mass
+
+
 # What `telemetry` gives: name -> (system, port, size).
 SIGNALS = {
     "ee_pose": ("tip_state", "ee_pose", 7),
@@ -103,7 +138,7 @@ SIGNALS = {
     "direction": ("velocity_shaper", "direction", 3),
     "force_directions": ("velocity_shaper", "force_directions", 6),
     "phase": ("velocity_shaper", "phase", 6),
-    "contact": ("contact_detector", "contact", 14),
+    "contact": ("contact_detector", "contact", 15),
     "transition": ("mode_detector", "transition", 6),
     "mode": ("mode_detector", "mode", 1),
     "confidence": ("mode_detector", "confidence", 2),
@@ -189,7 +224,9 @@ def make_changing_contact(
     )
     anticipator = add(
         "contact_anticipator",
-        KalmanContactAnticipator(timed(config.anticipator, ANTICIPATE), known.contacts),
+        KalmanContactAnticipator(
+            timed(config.anticipator, ANTICIPATE), known.contacts, tip_mass(arm)
+        ),
     )
     shaper = add("velocity_shaper", VelocityShaper(timed(config.shaper, TICK), pattern))
     variable = add(

@@ -19,12 +19,15 @@ from makebreak.diagrams.changing_contact import (
     make_changing_contact,
 )
 from makebreak.diagrams.tabletop import (
+    STIFFNESS_RANGE,
     TABLETOP_WALLS,
     TOOL,
+    draw_stiffness,
     move,
     objects,
     position,
     set_friction,
+    set_stiffness,
     set_tool,
     tool_half_width,
 )
@@ -33,6 +36,7 @@ from makebreak.systems.contact_anticipator import (
     ApproachSpeedConfig,
     ContactAnticipatorConfig,
 )
+from makebreak.systems.contact_detector import ContactDetectorConfig
 from makebreak.systems.contact_view import ContactViewConfig
 from makebreak.systems.impact_reflex import ImpactReflexConfig
 from makebreak.systems.numerics.contact_task import ContactBelief, ExpectedContact
@@ -60,10 +64,8 @@ UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 A_MAX = 1.0  # Of the pattern [m/s2].
 
 
-# v_a where no impact has been felt yet [m/s]. The block's face is four times as stiff
-# as the sphere. From 0.03 m/s a stop comes to 1 m/s2 at 10 Hz, so that is the most.
-FIRST_SPEED = {"sphere": 0.026, "block": 0.014}
-MOST_SPEED = 0.028
+# From 0.03 m/s a stop comes to 1 m/s2 at 10 Hz, so that is the most [m/s].
+MOST_SPEED = 0.03
 
 
 @dataclass
@@ -72,18 +74,27 @@ class MultipleCollisionsConfig:
     tool: str = "sphere"  # Or "block".
     speed: float = 0.2  # Of the motion pattern [m/s].
     error_max: float = 0.03  # Of the initial estimates, along the motion [m].
+    # Of each surface, drawn log-uniformly from this range [N/m].
+    stiffness: list[float] = field(default_factory=lambda: list(STIFFNESS_RANGE))
     trials: int = 2  # Each knows what the one before has learned.
     seed: int = 0
     control: ChangingContactConfig = field(
         default_factory=lambda: ChangingContactConfig(
             anticipator=ContactAnticipatorConfig(
                 speed=ApproachSpeedConfig(
-                    force_desired=7.0, first=FIRST_SPEED["sphere"], most=MOST_SPEED
+                    force_desired=7.0,
+                    stiffness_most=STIFFNESS_RANGE[1],
+                    # Of the arm without the reflex, which makes 9.6 N of it at most.
+                    force_first=14.0,
+                    most=MOST_SPEED,
+                    growth=4.0,  # What was measured decides, from the first time on.
                 )
             ),
             shaper=VelocityShaperConfig(
-                acceleration_max=0.8, region=RegionConfig(margin=0.002, settle_sec=0.06)
+                acceleration_max=0.85,
+                region=RegionConfig(margin=0.001, settle_sec=0.05),
             ),
+            detector=ContactDetectorConfig(impact_force=1.0),
             # Less force_least makes so soft a stop that it is taken for friction.
             reflex=ImpactReflexConfig(gain=4.0, force_least=2.0),
         )
@@ -100,6 +111,7 @@ class CollisionTask:
     prior: ContactBelief
     truth: np.ndarray  # (4,) p_WE . direction at each impact [m].
     friction: dict[str, float]
+    stiffness: dict[str, float]  # Of the tool against each surface [N/m].
 
 
 def make_task(config: MultipleCollisionsConfig) -> CollisionTask:
@@ -134,10 +146,12 @@ def make_task(config: MultipleCollisionsConfig) -> CollisionTask:
         mean = pattern.segments[k].positions[0].copy()
         mean += d * (estimate - mean @ d)
         # Uniform errors up to error_max: two sigma hold them all.
-        sigma = max(0.55 * config.error_max, 0.001)
+        sigma = max(0.5 * config.error_max, 0.001)
         prior.append(ExpectedContact(mean, sigma**2 * np.eye(3), d, segment=k))
+    stiffness = draw_stiffness(rng, SURFACES, config.stiffness)
+    set_stiffness(world, config.tool, stiffness)
     return CollisionTask(
-        world, model, pattern, ContactBelief(tuple(prior)), truth, friction
+        world, model, pattern, ContactBelief(tuple(prior)), truth, friction, stiffness
     )
 
 
@@ -217,13 +231,6 @@ def make_multiple_collisions(
     control = config.control
     if knowledge is None:
         knowledge = Knowledge(task.prior if config.handling else ContactBelief())
-    speed = control.anticipator.speed
-    if speed.first == FIRST_SPEED["sphere"]:  # Not set otherwise: as the tool needs it.
-        anticipator = replace(
-            control.anticipator,
-            speed=replace(speed, first=FIRST_SPEED[config.tool]),
-        )
-        control = replace(control, anticipator=anticipator)
     if not config.handling:
         control = replace(
             control,

@@ -7,6 +7,7 @@ scene that was read and change it in place.
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import brentq
 
 from makebreak.models.effects.kind import Effect
 from makebreak.models.friction_zones import FrictionZone
@@ -22,6 +23,11 @@ TOOL = "tool"  # The model instance in each of them.
 # The file of each tool, and the distance [m] from its tip to what it touches, straight
 # down and straight to the sides.
 TOOLS = {"block": ("block.sdf", 0.015), "sphere": ("sphere_tool.sdf", 0.02)}
+# On how many points each stands, and the stiffness of every surface in the files [N/m].
+POINTS = {"block": 4, "sphere": 1}
+SURFACE_STIFFNESS = 4e4
+# Of a tool against a surface: foam rubber to steel [N/m]. Controllers know the most.
+STIFFNESS_RANGE = (5e3, 2e5)
 FRICTION_MAX = 1.8  # A surface reaches 2 with none of its own left to give.
 
 
@@ -114,6 +120,57 @@ def set_friction(scene: Scene, friction: dict[str, float]) -> None:
         # The object first: the effect changes the first one's surface.
         scene.effects.append(
             Effect("contact_friction", [f"{name}~{TOOL}"], {"friction": float(value)})
+        )
+
+
+def draw_stiffness(rng: np.random.Generator, names, span) -> dict[str, float]:
+    """Stiffness of each of the names, log-uniform in span (2,) [N/m].
+
+    Raises: ValueError for a span that is none.
+    """
+    if len(span) != 2 or not 0.0 < span[0] <= span[1] < np.inf:
+        raise ValueError(f"stiffness is {span}, expected two numbers, 0 < low <= high")
+    draw = np.exp(rng.uniform(*np.log(span), size=len(names)))
+    return dict(zip(names, draw.tolist(), strict=True))
+
+
+def set_stiffness(scene: Scene, tool: str, stiffness: dict[str, float]) -> None:
+    """Gives each named object its stiffness of contact with the tool's flat side or
+    sphere: of all its points together [N/m].
+
+    An effect scales both surfaces of a pair alike, the tool's for all objects with it.
+    So what each is asked for is such that all have their value when the last is done.
+
+    Args: tool: its name in TOOLS.
+    Raises: ValueError if there is no such object or tool, or a stiffness is not
+        positive.
+    """
+    _known_tool(tool)
+    for name, value in stiffness.items():
+        _weld(scene, name)
+        if not 0.0 < value < np.inf:
+            raise ValueError(
+                f"stiffness of {name} is {value}, expected a positive number [N/m]"
+            )
+    k = np.array(list(stiffness.values())) / POINTS[tool]
+
+    def scale(log_tool):  # Of each object's surface, if the tool's ends up with this.
+        end = np.exp(log_tool)
+        return k * end / ((end - k) * SURFACE_STIFFNESS)
+
+    def excess(log_tool):
+        return np.log(scale(log_tool)).sum() - log_tool + np.log(SURFACE_STIFFNESS)
+
+    least, most = np.log(k.max()) + 1e-9, np.log(1e3 * k.max())
+    while excess(most) > 0.0:
+        most += 1.0
+    tool_now = SURFACE_STIFFNESS
+    for name, factor in zip(stiffness, scale(brentq(excess, least, most)), strict=True):
+        tool_now = factor * tool_now
+        surface = factor * SURFACE_STIFFNESS
+        pair = tool_now * surface / (tool_now + surface)
+        scene.effects.append(
+            Effect("contact_stiffness", [f"{name}~{TOOL}"], {"stiffness": float(pair)})
         )
 
 

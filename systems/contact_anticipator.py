@@ -72,6 +72,10 @@ class ContactFilterConfig:
 class ApproachSpeedConfig:
     force_desired: float = 8.0  # F_d of an impact, along the motion [N].
     first: float = 0.05  # v_a of a contact that has not been felt [m/s].
+    # Or, if not 0, the v_a at which the stiffest contact that there may be [N/m] gives
+    # force_first [N]; the arm's mass is the constructor's `effective_mass`.
+    stiffness_most: float = 0.0
+    force_first: float = 8.0
     regression: bool = True  # F = s v from all impacts; False: eq. 9.
     beta: float = 0.002  # Of eq. 9 [m/s per N].
     growth: float = 1.4  # At most so many times faster than the trial before.
@@ -121,6 +125,15 @@ def reduced_mass_one(p, d) -> float:
     return 1.0
 
 
+def first_speed(config: ApproachSpeedConfig, p, d, effective_mass) -> float:
+    """v_a [m/s] of a contact that was never felt, at p (3,) along d (3,)."""
+    speed = config.first
+    if config.stiffness_most > 0.0:
+        mass = effective_mass(p, d)
+        speed = impact_speed(config.force_first, config.stiffness_most, mass)
+    return float(min(speed, config.most))
+
+
 class KalmanContactAnticipator(LeafSystem):
     """Expects contacts where they were felt, and approaches them at the right speed.
 
@@ -135,7 +148,7 @@ class KalmanContactAnticipator(LeafSystem):
     The peak force of an impact gives the next approach speed: by regression of force on
     speed, or by eq. 9, at most `growth` times faster than before.
 
-    Inputs:  ee_pose (7,) of the tip; contact (14,), transition (6,), phase (6,) of
+    Inputs:  ee_pose (7,) of the tip; contact (15,), transition (6,), phase (6,) of
              numerics/contact_task.py; optional trial (1,): a motion that is repeated
              within one simulation counts its repetitions there. When the number
              changes a new trial begins: contacts drift by std_drift, and each can be
@@ -162,7 +175,7 @@ class KalmanContactAnticipator(LeafSystem):
                 contact without impacts is given the config's first speed; one that was
                 felt drifts by std_drift.
             effective_mass: of the arm at a position (3,) along a direction (3,) [kg],
-                for `carry_over`.
+                for `carry_over` and `stiffness_most`.
         Raises: ValueError for numbers in config that are not positive.
         """
         super().__init__()
@@ -170,6 +183,8 @@ class KalmanContactAnticipator(LeafSystem):
         numbers = {**vars(config.filter), **vars(config.speed)}
         for name, value in numbers.items():
             if isinstance(value, bool):
+                continue
+            if name == "stiffness_most" and value == 0.0:
                 continue
             if not 0.0 < value < np.inf:
                 raise ValueError(f"{name} is {value}, expected a positive number")
@@ -263,7 +278,7 @@ class KalmanContactAnticipator(LeafSystem):
                 mean, covariance = predict(contact.mean, contact.covariance, drift)
                 contact = replace(contact, mean=mean, covariance=covariance)
             if len(contact.impacts) == 0:
-                speed = min(self._speed.first, self._speed.most)
+                speed = self._first_speed(contact.mean, contact.direction)
                 contact = replace(contact, approach_speed=speed)
             contacts.append(contact)
         return ContactBelief(tuple(contacts))
@@ -346,7 +361,7 @@ class KalmanContactAnticipator(LeafSystem):
                 direction=d,
                 kind=IMPACT,
                 segment=segment,
-                approach_speed=self._speed.first,
+                approach_speed=self._first_speed(p, d),
                 seen=1,
             )
             belief = ContactBelief((*memory.belief.contacts, added))
@@ -392,6 +407,9 @@ class KalmanContactAnticipator(LeafSystem):
             belief = self._carried_over(belief, k)
         return replace(memory, belief=belief, last=-1)
 
+    def _first_speed(self, p, d) -> float:
+        return first_speed(self._speed, p, d, self._mass)
+
     def _next_speed(self, contact, impacts) -> float:
         s = self._speed
         before = contact.approach_speed
@@ -412,7 +430,8 @@ class KalmanContactAnticipator(LeafSystem):
                 continue
             mass = self._mass(contact.mean, contact.direction)
             new = impact_speed(s.force_desired, stiffness, mass)
-            new = capped(new, s.first, s.growth, LEAST_SPEED, s.most)
+            first = self._first_speed(contact.mean, contact.direction)
+            new = capped(new, first, s.growth, LEAST_SPEED, s.most)
             belief = belief.changed(i, approach_speed=new)
         return belief
 

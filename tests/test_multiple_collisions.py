@@ -174,13 +174,13 @@ def test_success_asks_for_each_part_of_the_criterion(task):
 
     def success(**change):
         trials = {"baseline": base, "trial_1": replace(good, **change), "trial_2": good}
-        return summary(trials, task)["success"]
+        return summary(trials, task, MultipleCollisionsConfig())["success"]
 
     assert success()
-    assert not success(force=np.array([1.0, 1.0, 8.6, 1.0]))
+    assert not success(force=np.array([1.0, 1.0, 10.1, 1.0]))
     assert not success(force=np.array([1.0, np.nan, 1.0, 1.0]))
     assert not success(a10=1.01)
-    assert not success(completion=base.completion + 2.1)
+    assert not success(completion=base.completion + 3.1)
     assert not success(lost=False)
     assert not success(done=False)
     assert not success(missed=1)
@@ -189,7 +189,8 @@ def test_success_asks_for_each_part_of_the_criterion(task):
 
 def test_result_has_one_number_per_contact(task):
     good: Trial = scored(made_up_log(task), task)
-    result = summary({"baseline": good, "trial_1": good, "trial_2": good}, task)
+    trials = {"baseline": good, "trial_1": good, "trial_2": good}
+    result = summary(trials, task, MultipleCollisionsConfig())
     for key in ("impact_force_peak_N", "impact_force_peak_known_N", "estimate_error_m"):
         assert len(result[key]) == 4
     assert result["extra_time_s"] == 0.0

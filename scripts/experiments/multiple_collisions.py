@@ -4,18 +4,22 @@ The tool comes down on the table, slides to the red block, along both to the blu
 up this wall until it ends, goes free over the red block, down onto its top, and slides
 along the top to the goal. The motion goes at 0.2 m/s. Without handling it meets the
 contacts at that speed; with handling it has estimates of their places, up to 3 cm off.
-Positions (5 cm), frictions (0.1 to 0.6) and errors are drawn by the seed.
+Positions (5 cm), frictions (0.1 to 0.6), errors and the stiffness of each surface
+(5e3 to 2e5 N/m, log-uniform) are drawn by the seed. The controllers know only that no
+surface is stiffer than 2e5 N/m.
 
 A run is the motion without handling, then `trials` trials with it; each trial knows
-what the one before has learned. Contact stiffness: the sphere 2e4 N/m, a face of the
-block 8e4 N/m. Impact force: F100, along the motion, measured at the wrist, 100 Hz, less
-its value before the contact. Acceleration: a10, 10 Hz, over the whole motion, with the
-arm's rotors. The raw peaks stand beside both.
+what the one before has learned. With `stiffness` a range of one value and the
+anticipator's `stiffness_most` the same, the stiffness is told. Impact force: F100,
+along the motion, measured at the wrist, 100 Hz, less its value before the contact.
+Acceleration: a10, 10 Hz, over the whole motion, with the arm's rotors. The raw peaks
+stand beside both.
 
 Criterion, set beforehand: the whole chain in each trial, no contact missed or reported
-where none is; in the first trial every impact at most 8.5 N, in the last one at most
-8 N; a10 at most 1 m/s2 in both; the first trial takes at most 2 s longer than the
-motion without handling. The last of these cannot be had: see docs/shaping.md.
+where none is; in the first trial every impact at most 10 N (8 N if the stiffness is
+told), in the last one at most 8 N; a10 at most 1 m/s2 in both; the first trial takes at
+most 3 s longer than the motion without handling, the last one 1 s. Not all of this can
+be had: docs/shaping.md derives the bound.
 """
 
 from dataclasses import dataclass, replace
@@ -53,7 +57,8 @@ Config = MultipleCollisionsConfig
 BENCH = {"multiple_collisions": {"trials": 1}}
 
 DURATION_SEC = 60.0  # Of a trial, at most.
-FIRST_MAX, KNOWN_MAX, A10_MAX, EXTRA_MAX = 8.5, 8.0, 1.0, 2.0  # [N] [N] [m/s2] [s]
+FIRST_MAX, TOLD_MAX, KNOWN_MAX = 10.0, 8.0, 8.0  # Of impact forces [N].
+A10_MAX, EXTRA_MAX, EXTRA_KNOWN_MAX = 1.0, 3.0, 1.0  # [m/s2], [s], [s]
 REACHED, TOUCHED = 3e-4, 3e-5  # So near to a surface it counts as reached, touched [m].
 MATCH = 0.003  # A contact reported so near to a surface is that surface's [m].
 LOSS_SEGMENT = 3
@@ -111,7 +116,7 @@ def run(config: MultipleCollisionsConfig, session: Session) -> dict:
         columns[f"tool.tip.v{axis}"] = log["ee_velocity"][:, i]
         columns[f"tool.tip.f{axis}"] = log["wrench"][:, i]
     session.write_recording(columns)
-    return summary(trials, task)
+    return summary(trials, task, config)
 
 
 def _trial(config, task, knowledge, k, session, name, peaks):
@@ -178,14 +183,34 @@ def scored(log: dict[str, np.ndarray], task: CollisionTask) -> Trial:
         done=bool(ended.size),
         lost=bool(np.any(segment[broken] == LOSS_SEGMENT)),
         completion=float(time[ended[0]] - BEGINS) if ended.size else np.nan,
-        a10=float(a10[time > 0.1].max()),
+        a10=float(a10[time > 0.1].max(initial=0.0)),
         missed=missed,
         false=int((~used).sum()),
         **values,
     )
 
 
-def summary(trials: dict[str, Trial], task: CollisionTask) -> dict:
+def is_told(config: MultipleCollisionsConfig) -> bool:
+    """Whether the anticipator knows how stiff the surfaces are."""
+    most = config.control.anticipator.speed.stiffness_most
+    return all(k == most for k in config.stiffness)
+
+
+def extra_time_least(first: Trial, task: CollisionTask, config) -> float:
+    """What the trial's approach speeds cost if each region began just where the range
+    of errors does, and the arm could brake in no time [s]."""
+    way = np.array([
+        config.error_max - (c.mean @ d - where)
+        for c, (d, *_), where in zip(
+            task.prior.contacts, IMPACTS, task.truth, strict=True
+        )
+    ])  # fmt: skip
+    return float(np.sum(way * (1.0 / first.speed - 1.0 / config.speed)))
+
+
+def summary(
+    trials: dict[str, Trial], task: CollisionTask, config: MultipleCollisionsConfig
+) -> dict:
     """result.json."""
 
     def numbers(values):
@@ -223,6 +248,7 @@ def summary(trials: dict[str, Trial], task: CollisionTask) -> dict:
         )
     )
     result["friction"] = numbers(task.friction.values())
+    result["stiffness_Npm"] = numbers(task.stiffness.values())
     criteria = Criteria()
     if names and baseline is not None:
         first, known = trials[names[0]], trials[names[-1]]
@@ -232,8 +258,10 @@ def summary(trials: dict[str, Trial], task: CollisionTask) -> dict:
         whole = sum(trials[name].whole for name in names)
         what = "trials with all contacts made and lost, none missed or false"
         criteria.at_least("whole", what, whole, len(names))
+        result["extra_time_least_s"] = extra_time_least(first, task, config)
+        first_max = TOLD_MAX if is_told(config) else FIRST_MAX
         for key, which, trial, bound in (
-            ("first", "first", first, FIRST_MAX),
+            ("first", "first", first, first_max),
             ("known", "last", known, KNOWN_MAX),
         ):
             what = f"impact force in the {which} trial, greatest"
@@ -243,6 +271,8 @@ def summary(trials: dict[str, Trial], task: CollisionTask) -> dict:
         criteria.at_most("a10", "acceleration below 10 Hz", a10, A10_MAX, "m/s2")
         what = "time longer than without handling"
         criteria.at_most("extra_time", what, result["extra_time_s"], EXTRA_MAX, "s")
+        what, extra = "the same in the last trial", result["extra_time_known_s"]
+        criteria.at_most("extra_time_known", what, extra, EXTRA_KNOWN_MAX, "s")
     else:
         what = "judged (only with handling: true, beside a trial without)"
         criteria.holds("compared", what, False)
@@ -306,23 +336,39 @@ def plot_path(trials: dict[str, Trial], task: CollisionTask):
     return figure
 
 
+SPEEDS = "control.anticipator.speed"
+TOLD = "sphere, stiffness told"
+VARIANTS: dict[str, dict] = {
+    "sphere": {"tool": "sphere"},
+    "block": {"tool": "block"},
+    TOLD: {
+        "stiffness": [2e4, 2e4],
+        f"{SPEEDS}.stiffness_most": 2e4,
+        f"{SPEEDS}.force_first": 10.5,
+    },
+}
+
+
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
-    """Figure 16's numbers beside ours, over seeds, with the sphere and the block."""
+    """Figure 16's numbers beside ours, over seeds, with the sphere and the block, and
+    with the sphere where the stiffness is told."""
     runs = {
-        tool: run_many(
+        name: run_many(
             "multiple_collisions",
-            [({"tool": tool}, seed) for seed in range(seeds)],
+            [(settings, seed) for seed in range(seeds)],
             jobs,
             session.out_dir,
             reuse=session.reuse,
         )
-        for tool in ("sphere", "block")
+        for name, settings in VARIANTS.items()
     }
     rows: list[tuple] = []
     met: list[bool | None] = []
 
     for tool, results in runs.items():
-        command = f"makebreak run multiple_collisions --seed S --set tool={tool}"
+        texts = " ".join(f"{key}={value}" for key, value in VARIANTS[tool].items())
+        command = f"makebreak run multiple_collisions --seed S --set {texts}"
+        first_max = TOLD_MAX if tool == TOLD else FIRST_MAX
 
         def values(key, results=results):
             out = []
@@ -352,7 +398,10 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         x = values("acceleration_10Hz_max_baseline_mps2")
         row("no handling, acceleration, 10 Hz", "-", spread(x, "m/s2"))
         x = values("impact_force_peak_N")
-        row("first trial, impact force", "<= 8 N", spread(x, "N"), most(x, FIRST_MAX))
+        row("first trial, impact force", "<= 8 N", spread(x, "N"), most(x, first_max))
+        share = f"{np.sum(x <= first_max)} of {x.size}"
+        good = bool(np.mean(x <= first_max) >= 0.95)
+        row(f"first trial, impacts of {first_max:g} N at most", "-", share, good)
         x = values("impact_force_peak_known_N")
         row("contacts known, impact force", "-", spread(x, "N"), most(x, KNOWN_MAX))
         x = values("acceleration_10Hz_max_mps2")
@@ -366,9 +415,14 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         x = values("completion_time_baseline_s")
         row("no handling, time", "-", spread(x, "s"))
         x = values("extra_time_s")
-        row("first trial, extra time", "3.7 s", spread(x, "s"), most(x, EXTRA_MAX))
+        text = f"{spread(x, 's')}, median {np.median(x):.1f} s"
+        row("first trial, extra time", "3.7 s", text, most(x, EXTRA_MAX))
+        x = values("extra_time_least_s")
+        text = f"{spread(x, 's')}, median {np.median(x):.1f} s"
+        row("of it, creeping over the range of errors alone", "-", text)
         x = values("extra_time_known_s")
-        row("contacts known, extra time", "-", spread(x, "s"), most(x, EXTRA_MAX))
+        good = most(x, EXTRA_KNOWN_MAX)
+        row("contacts known, extra time", "-", spread(x, "s"), good)
         x = np.array([
             bool(one.get("chain_complete") and one.get("chain_complete_known"))
             for one in results
@@ -387,8 +441,9 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         rows,
         met,
         [
-            "Impact force: F100; contact stiffness 2e4 N/m (sphere), 8e4 N/m (block).",
-            "Estimates up to 3 cm off: at a speed that stops within 1 m/s2 the regions "
-            "alone take 4 to 5 s. docs/shaping.md has the sum.",
+            "Impact force: F100; the stiffness of each surface is drawn from 5e3 to "
+            "2e5 N/m and not known to the controllers, or 2e4 N/m and told.",
+            "Estimates are up to 3 cm off. docs/shaping.md derives what force and "
+            "acceleration allow.",
         ],
     )
