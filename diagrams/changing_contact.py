@@ -198,6 +198,13 @@ def make_changing_contact(
     )
     arm = make_control_plant(model, tool)
     chain = serial_chain_of(arm, TIP_FRAME)
+    # The speed of approach depends on how hard the arm brakes.
+    speed = replace(
+        config.anticipator.speed,
+        reflex_gain=config.reflex.gain,
+        reflex_force_least=config.reflex.force_least,
+    )
+    config = replace(config, anticipator=replace(config.anticipator, speed=speed))
 
     def timed(part, period, offset=OFFSET):
         for key, value in (("period_sec", period), ("offset_sec", offset)):

@@ -3,7 +3,7 @@
 A block comes down on a table, slides along it to a wall, and along both to a second
 wall. Where they are is known to 0.1 m at first; each trial begins with what the last
 one has learned. The world differs by seed: positions within 5 cm, frictions 0.1 to 0.6,
-the signs of the initial errors.
+the signs of the initial errors, the stiffness of each surface.
 """
 
 from dataclasses import dataclass, field
@@ -18,16 +18,25 @@ from makebreak.diagrams.changing_contact import (
     make_changing_contact,
 )
 from makebreak.diagrams.tabletop import (
+    STIFFNESS_RANGE,
     TABLETOP_WALLS,
     TOOL,
+    draw_stiffness,
     move,
     objects,
     position,
     set_friction,
+    set_stiffness,
     set_tool,
     tool_half_width,
 )
 from makebreak.models.scene import Scene, read_scene
+from makebreak.systems.contact_anticipator import (
+    ApproachSpeedConfig,
+    ContactAnticipatorConfig,
+)
+from makebreak.systems.contact_detector import ContactDetectorConfig
+from makebreak.systems.impact_reflex import ImpactReflexConfig
 from makebreak.systems.numerics.contact_task import ContactBelief, ExpectedContact
 from makebreak.systems.numerics.motion_pattern import (
     MotionPattern,
@@ -55,10 +64,19 @@ class ContactLearningConfig:
     trials: int = 5
     speed: float = 0.25  # Of the motion pattern [m/s].
     normal_force: float = 8.0  # On each surface that has been reached [N].
-    # Contacts are felt to 0.1 mm here, so the region's margin is less than elsewhere.
+    # Of each surface, drawn log-uniformly from this range [N/m].
+    stiffness: list[float] = field(default_factory=lambda: list(STIFFNESS_RANGE))
     control: ChangingContactConfig = field(
         default_factory=lambda: ChangingContactConfig(
-            shaper=VelocityShaperConfig(region=RegionConfig(margin=0.002))
+            anticipator=ContactAnticipatorConfig(
+                speed=ApproachSpeedConfig(
+                    stiffness_most=STIFFNESS_RANGE[1], growth=10.0
+                )
+            ),
+            # Contacts are felt to 0.1 mm here, so the margin is less than elsewhere.
+            shaper=VelocityShaperConfig(region=RegionConfig(margin=0.002)),
+            detector=ContactDetectorConfig(impact_force=1.0),
+            reflex=ImpactReflexConfig(gain=4.0, force_least=2.0),
         )
     )
 
@@ -73,6 +91,7 @@ class ContactTask:
     truth: np.ndarray  # (3, 3) p_WE at each contact, along its direction only [m].
     prior: ContactBelief
     friction: np.ndarray  # (3,)
+    stiffness: dict[str, float]  # Of the tool against each surface [N/m].
 
 
 def make_task(config: ContactLearningConfig) -> ContactTask:
@@ -110,8 +129,10 @@ def make_task(config: ContactLearningConfig) -> ContactTask:
         axis = int(np.argmax(abs(d)))
         mean[axis] = truth[i, axis] + sign * ERRORS[i]
         prior.append(ExpectedContact(mean, SIGMA**2 * np.eye(3), d, segment=i))
+    stiffness = draw_stiffness(rng, SURFACES, config.stiffness)
+    set_stiffness(world, config.tool, stiffness)
     return ContactTask(
-        world, model, pattern, truth, ContactBelief(tuple(prior)), friction
+        world, model, pattern, truth, ContactBelief(tuple(prior)), friction, stiffness
     )
 
 

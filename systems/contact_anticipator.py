@@ -20,6 +20,7 @@ from makebreak.systems.numerics.contact_anticipator import (
     speed_by_error,
     speed_by_regression,
     spread_along,
+    unbraked_force,
     update,
 )
 from makebreak.systems.numerics.contact_task import (
@@ -76,6 +77,9 @@ class ApproachSpeedConfig:
     # force_first [N]; the arm's mass is the constructor's `effective_mass`.
     stiffness_most: float = 0.0
     force_first: float = 8.0
+    # Of the arm's impact reflex, if it has one: its gain and least force [N].
+    reflex_gain: float = 0.0
+    reflex_force_least: float = 0.0
     regression: bool = True  # F = s v from all impacts; False: eq. 9.
     beta: float = 0.002  # Of eq. 9 [m/s per N].
     growth: float = 1.4  # At most so many times faster than the trial before.
@@ -118,6 +122,7 @@ class AnticipatorMemory:
 
 
 LEAST_SPEED = 0.001  # [m/s]
+MAY_BE_ZERO = ("stiffness_most", "reflex_gain", "reflex_force_least")
 
 
 def reduced_mass_one(p, d) -> float:
@@ -130,7 +135,10 @@ def first_speed(config: ApproachSpeedConfig, p, d, effective_mass) -> float:
     speed = config.first
     if config.stiffness_most > 0.0:
         mass = effective_mass(p, d)
-        speed = impact_speed(config.force_first, config.stiffness_most, mass)
+        force = unbraked_force(
+            config.force_first, config.reflex_gain, config.reflex_force_least
+        )
+        speed = impact_speed(force, config.stiffness_most, mass)
     return float(min(speed, config.most))
 
 
@@ -184,7 +192,7 @@ class KalmanContactAnticipator(LeafSystem):
         for name, value in numbers.items():
             if isinstance(value, bool):
                 continue
-            if name == "stiffness_most" and value == 0.0:
+            if value == 0.0 and name in MAY_BE_ZERO:
                 continue
             if not 0.0 < value < np.inf:
                 raise ValueError(f"{name} is {value}, expected a positive number")
@@ -414,7 +422,9 @@ class KalmanContactAnticipator(LeafSystem):
         s = self._speed
         before = contact.approach_speed
         if s.regression:
-            speed = speed_by_regression(impacts, s.force_desired)
+            speed = speed_by_regression(
+                impacts, s.force_desired, s.reflex_gain, s.reflex_force_least
+            )
         else:
             speed = speed_by_error(before, s.force_desired, impacts[-1, 1], s.beta)
         return capped(speed, before, s.growth, LEAST_SPEED, s.most)
@@ -424,12 +434,14 @@ class KalmanContactAnticipator(LeafSystem):
         s, source = self._speed, belief.contacts[k]
         speed, force = source.impacts[-1]
         mass = self._mass(source.mean, source.direction)
-        stiffness = contact_stiffness(speed, force, mass)
+        reflex = s.reflex_gain, s.reflex_force_least
+        stiffness = contact_stiffness(speed, unbraked_force(force, *reflex), mass)
+        wanted = unbraked_force(s.force_desired, *reflex)
         for i, contact in enumerate(belief.contacts):
             if contact.kind != IMPACT or len(contact.impacts):
                 continue
             mass = self._mass(contact.mean, contact.direction)
-            new = impact_speed(s.force_desired, stiffness, mass)
+            new = impact_speed(wanted, stiffness, mass)
             first = self._first_speed(contact.mean, contact.direction)
             new = capped(new, first, s.growth, LEAST_SPEED, s.most)
             belief = belief.changed(i, approach_speed=new)

@@ -2,9 +2,11 @@
 
 The tool comes down on a table, slides to a wall, and along both to a second wall. At
 first the contacts are believed 0.12, 0.09 and 0.10 m off (along the motion into each;
-table 1 calls it the most significant axis), with sigma 0.08 m; the sign, the places and
-the frictions are drawn by the seed. A trial begins with what the one before has
-learned. The desired impact force is 8 N, the first approach speed 0.05 m/s.
+table 1 calls it the most significant axis), with sigma 0.08 m; the sign, the places, the
+frictions and the stiffness of each surface (5e3 to 2e5 N/m, log-uniform) are drawn by
+the seed. A trial begins with what the one before has learned. The desired impact force
+is 8 N. The first approach is as slow as a surface of 2e5 N/m asks for: no more is known
+of a surface that was never felt.
 
 Impact force: F100, along the motion, measured at the wrist, 100 Hz, less its value
 before the contact. Acceleration: a10, 10 Hz (numerics/impact_score.py). The raw peaks
@@ -12,8 +14,9 @@ stand beside both.
 
 Criterion, set beforehand. A run is a success if every trial comes to its end; no
 contact is missed and none is reported that is not there; each error is at most 2 mm
-after one trial and 1 mm after three; from trial 3 on each impact is within 8 +- 1 N;
-and the last of five trials is at least 40 % shorter than the first.
+after one trial and 1 mm after three; no impact of the first trial is above 15 N; from
+trial 2 on each is within 8 +- 0.6 N; and the last of five trials is at least 50 %
+shorter than the first.
 
 See docs/contacts.md.
 """
@@ -58,13 +61,14 @@ from makebreak.systems.numerics.impact_score import impact, low_pass
 SUMMARY = "three contacts, their places and approach speeds learned (CC 4.5.1, fig. 18)"
 Config = ContactLearningConfig
 
-DURATION_SEC = 60.0  # Of a trial, at most.
+DURATION_SEC = 120.0  # Of a trial, at most.
 PEAK_WAIT = 0.2  # A trial goes on so long after its end [s].
 REACHED, TOUCHED = 3e-4, 3e-5  # So near to a surface it counts as reached, touched [m].
 MATCH = 0.003  # A contact reported so near to a surface is that surface's [m].
 ERROR_MAX = {1: 0.002, 3: 0.001}  # After so many trials [m].
-FORCE_DESIRED, FORCE_TOL, FORCE_FROM = 8.0, 1.0, 3  # [N], [N], trial.
-SHORTER = 0.4  # Share of the first trial's time.
+FORCE_DESIRED, FORCE_TOL, FORCE_FROM = 8.0, 0.6, 2  # [N], [N], trial.
+FIRST_MAX = 15.0  # In the first trial [N].
+SHORTER = 0.5  # Share of the first trial's time.
 N = len(DIRECTIONS)
 
 
@@ -208,6 +212,7 @@ def summary(trials: list[Trial], task: ContactTask) -> dict:
         "missed_contacts": sum(t.missed for t in trials),
         "trials_done": sum(t.done for t in trials),
         "friction": numbers(task.friction),
+        "stiffness_Npm": numbers(task.stiffness.values()),
         "contact_error_initial_m": first,
     }
     names = {
@@ -239,6 +244,9 @@ def checks(trials: list[Trial]) -> dict:
             error = float(np.max(abs(trials[k - 1].error)))
             what = f"error of a contact's place after trial {k}, greatest"
             criteria.at_most(f"error_after_{k}", what, error, bound, "m")
+    first = float(np.max(trials[0].force))
+    what = "impact force in the first trial, greatest"
+    criteria.at_most("force_first", what, first, FIRST_MAX, "N")
     if len(forces):
         off = float(np.max(abs(forces - FORCE_DESIRED)))
         what = f"impact force from trial {FORCE_FROM} on: greatest distance from "
@@ -348,12 +356,15 @@ APPROACH = "control.anticipator.speed"
 VARIANTS: dict[str, dict] = {
     "sphere": {"tool": "sphere"},
     "eq. 9 for the speed": {f"{APPROACH}.regression": False},
-    "safe start, 18 mm/s": {f"{APPROACH}.first": 0.018},
+    "50 mm/s first, whatever the stiffness": {
+        f"{APPROACH}.first": 0.05,
+        f"{APPROACH}.stiffness_most": 0.0,
+    },
 }
 
 
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
-    """Table 1 and figure 18 beside ours; other tool, other rule, slower start."""
+    """Table 1 and figure 18 beside ours; other tool, other rule, faster start."""
     name = "contact_learning"
 
     def many(settings, n):
@@ -411,7 +422,26 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         f"{missed} and {false}",
         not (missed or false) and len(ended) == len(main),
     )
+    first = force[:, 0].ravel()
+    row(
+        "impact force in trial 1, all contacts",
+        "-",
+        f"{first.min():.1f} to {first.max():.1f} N, median {np.median(first):.1f}; "
+        f"10 N at most in {np.sum(first <= 10.0)} of {first.size}",
+        bool(np.all(first <= FIRST_MAX) and np.mean(first <= 10.0) >= 0.95),
+    )
     late = force[:, FORCE_FROM - 1 :]
+    row(
+        f"within {FORCE_DESIRED:g} +- {FORCE_TOL:g} N from trial {FORCE_FROM} on",
+        "-",
+        ", ".join(
+            f"trial {FORCE_FROM + k}: {np.sum(near)} of {near.size}"
+            for k, near in enumerate(
+                (abs(late - FORCE_DESIRED) <= FORCE_TOL).swapaxes(0, 1)
+            )
+        ),
+        bool(np.all(abs(late - FORCE_DESIRED) <= FORCE_TOL)),
+    )
     for i in range(N):
         row(
             f"contact {i + 1}: impact force from trial {FORCE_FROM}",
@@ -426,7 +456,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         )
         row(
             f"contact {i + 1}: approach speed in trial 1, 5",
-            "50 mm/s / -",
+            "50 / - mm/s",
             " / ".join(f"{speed[:, k, i].mean():.1f}" for k in (0, 4)) + " mm/s",
         )
 
@@ -435,7 +465,8 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         share = 1.0 - T[:, -1] / T[:, 0]
         return (
             f"{T[:, 0].mean():.1f} -> {T[:, -1].mean():.1f} s, shorter by "
-            f"{100 * share.min():.0f} to {100 * share.max():.0f} %",
+            f"{100 * share.min():.0f} to {100 * share.max():.0f} %; by half in "
+            f"{np.sum(share >= SHORTER)} of {share.size}",
             bool(np.all(share >= SHORTER)),
         )
 
@@ -481,6 +512,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         met,
         [
             "Errors are along the motion into each contact. Force: F100. A robot and a "
-            "wooden block in the paper; 2e4 N/m per point of contact here.",
+            "wooden block in the paper; the stiffness of each surface is drawn from 5e3 "
+            "to 2e5 N/m here, and not known to the controllers.",
         ],
     )

@@ -344,7 +344,7 @@ VARIANTS: dict[str, dict] = {
     TOLD: {
         "stiffness": [2e4, 2e4],
         f"{SPEEDS}.stiffness_most": 2e4,
-        f"{SPEEDS}.force_first": 10.5,
+        f"{SPEEDS}.force_first": 6.0,
     },
 }
 

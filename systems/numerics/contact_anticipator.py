@@ -148,10 +148,30 @@ def force_per_speed(impacts, forget=0.2) -> float | None:
     return float((weight * F / v).sum() / weight.sum())
 
 
-def speed_by_regression(impacts, force_desired) -> float | None:
-    """The speed at which F = s v gives force_desired [m/s]; None without impacts."""
+def unbraked_force(force, gain=0.0, force_least=0.0):
+    """The impact force [N] that an arm without a reflex would have had at the same
+    speed, v sqrt(k m), of one that was `force` with it (numerics/impact_reflex.py).
+
+    The reflex adds gain (F - force_least) to a spring's F = k x, from force_least on.
+    What the two take up to the largest F is the energy m v^2 / 2, so v sqrt(k m) =
+    sqrt(F^2 + gain (F - force_least)^2); delays of the reflex are not in it.
+    """
+    beyond = np.maximum(np.asarray(force, dtype=float) - force_least, 0.0)
+    return np.sqrt(np.square(force) + gain * beyond**2)
+
+
+def speed_by_regression(
+    impacts, force_desired, gain=0.0, force_least=0.0
+) -> float | None:
+    """The speed at which an impact has force_desired [m/s]; None without impacts.
+
+    Args: impacts (n, 2) of [speed, peak force]; gain, force_least of the reflex.
+    """
+    impacts = np.array(impacts, dtype=float).reshape(-1, 2)
+    impacts[:, 1] = unbraked_force(impacts[:, 1], gain, force_least)
     slope = force_per_speed(impacts)
-    return None if slope is None else force_desired / slope
+    wanted = float(unbraked_force(force_desired, gain, force_least))
+    return None if slope is None else wanted / slope
 
 
 def capped(speed, before, growth, least, most) -> float:

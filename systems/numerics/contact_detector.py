@@ -15,8 +15,9 @@ innovation's slow mean is taken off instead. A contact is *made* when
 A tip that was not moving has no speed to lose: there only a force that no friction can
 make, by twice the threshold, is a contact. An innovation that ends otherwise is a
 change of friction, which is learned anew. Time, position and speed are those of the
-first sample that departs. The peak force is the largest f in the 80 ms after that, less
-its mean over 50 ms, up to 20 ms before (as in numerics/impact_score.py).
+first sample that departs. The peak force is the largest f until the tip stands, at most
+80 ms after that, less its mean over 50 ms, up to 20 ms before: of the impact, without
+the push that follows.
 
 A contact is *broken* when a normal force that was there falls below a threshold for
 8 ms.
@@ -54,6 +55,7 @@ LEARN_SEC, FAST_SEC, SLOW_SEC = 0.25, 0.03, 0.15  # Learning of friction.
 SAMPLES = 3  # In a row above the threshold.
 DECIDE_SEC, DECIDE_MOST_SEC = 0.08, 0.2  # The longer, while the force still grows.
 PEAK_SEC = 0.08
+REST_TICKS = 3.0  # For the lag of the filters.
 # After a contact, in the same direction: so long, and so far, it is the same one. The
 # longer way while its force is still there.
 SAME_SEC, SAME_WAY, SAME_WAY_PRESSED = 0.3, 0.003, 0.02
@@ -409,6 +411,9 @@ def detect(limits, memory, contact, time, wrench, pose, velocity, d, n, phase):
     if m[_PEAK_LEFT] > 0.0:
         m[_PEAK] = max(m[_PEAK], -_dot(m, _F, m[_PEAK_D : _PEAK_D + 3]))
         m[_PEAK_LEFT] -= 1.0
+        # At rest it is as deep in as the impact brings it. What comes then is the push.
+        if _dot(m, _V, m[_PEAK_D : _PEAK_D + 3]) <= 0.0:
+            m[_PEAK_LEFT] = min(m[_PEAK_LEFT], REST_TICKS)
         if m[_PEAK_LEFT] <= 0.0:
             contact[MEASURED] += 1.0
             contact[PEAK_FORCE] = max(m[_PEAK] - m[_PEAK_BEFORE], 0.0)
