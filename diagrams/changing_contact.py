@@ -138,7 +138,7 @@ SIGNALS = {
     "direction": ("velocity_shaper", "direction", 3),
     "force_directions": ("velocity_shaper", "force_directions", 6),
     "phase": ("velocity_shaper", "phase", 6),
-    "contact": ("contact_detector", "contact", 15),
+    "contact": ("contact_detector", "contact", 14),
     "transition": ("mode_detector", "transition", 6),
     "mode": ("mode_detector", "mode", 1),
     "confidence": ("mode_detector", "confidence", 2),

@@ -174,7 +174,7 @@ SIGNALS = {
     "x_desired": ("reference_blend", "x_desired", 19),
     "shaped": ("velocity_shaper", "x_desired", 19),
     "phase": ("velocity_shaper", "phase", 6),
-    "contact": ("contact_detector", "contact", 15),
+    "contact": ("contact_detector", "contact", 14),
     "mode": ("mode_detector", "mode", 1),
     "confidence": ("mode_detector", "confidence", 2),
     "wrench_predicted": ("forward_model_bank", "wrench_predicted", 6),

@@ -156,7 +156,7 @@ class KalmanContactAnticipator(LeafSystem):
     The peak force of an impact gives the next approach speed: by regression of force on
     speed, or by eq. 9, at most `growth` times faster than before.
 
-    Inputs:  ee_pose (7,) of the tip; contact (15,), transition (6,), phase (6,) of
+    Inputs:  ee_pose (7,) of the tip; contact (14,), transition (6,), phase (6,) of
              numerics/contact_task.py; optional trial (1,): a motion that is repeated
              within one simulation counts its repetitions there. When the number
              changes a new trial begins: contacts drift by std_drift, and each can be

@@ -39,7 +39,7 @@ class ContactDetector(LeafSystem):
         phase (6,) of the motion, numerics/contact_task.py.
 
     Outputs, all of them state:
-        contact (15,) of numerics/contact_task.py: counters of contacts made, broken
+        contact (14,) of numerics/contact_task.py: counters of contacts made, broken
             and peaks measured; time, p_WE, direction and speed of the last one made, at
             its first sample; its peak force; status 1 while the wrench is NaN, stuck
             (no bit changes for 50 ms of motion) or at its limit: then nothing is

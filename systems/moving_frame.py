@@ -15,10 +15,10 @@ class MovingFrame(LeafSystem):
     The frame has the world's axes; only its origin moves.
 
     Inputs:  frame (7,) = [origin 3 [m], its velocity 3 [m/s], when it was there [s]];
-             ee_pose (7,), ee_velocity (6,) in the world; contact (15,), of
+             ee_pose (7,), ee_velocity (6,) in the world; contact (14,), of
              numerics/contact_task.py, in the frame.
     Outputs: ee_pose (7,), ee_velocity (6,) in the frame;
-             ee_height (7,), contact_height (15,): pose and contact with only their
+             ee_height (7,), contact_height (14,): pose and contact with only their
              height, for who learns at which height something is met. The finger lands
              elsewhere around the ball each time: a contact that is not quite from
              above would make centimetres across into millimetres of height.

@@ -87,7 +87,7 @@ class VelocityShaper(LeafSystem):
     contact is felt. While `contact` is NaN or has a status the motion pauses (HOLD,
     BAD_INPUT).
 
-    Inputs:  contacts (ContactBelief); contact (15,); ee_pose (7,); optional motion
+    Inputs:  contacts (ContactBelief); contact (14,); ee_pose (7,); optional motion
              (MotionPattern): another one that comes there is taken over, from where the
              motion is and at its speed, blended in over blend_sec or more.
     Outputs, all of them state: x_desired (19,) = [p, quaternion wxyz, v, w, a, alpha]

@@ -4,6 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydrake.math import RotationMatrix
+from pydrake.multibody.inverse_kinematics import InverseKinematics
+from pydrake.multibody.tree import JacobianWrtVariable
+from pydrake.solvers import Solve
 from pydrake.systems.analysis import InitializeParams, Simulator
 
 from makebreak.diagrams.changing_contact import (
@@ -13,7 +17,9 @@ from makebreak.diagrams.changing_contact import (
     learned,
     make_changing_contact,
     telemetry,
+    tip_mass,
 )
+from makebreak.diagrams.station import make_control_plant
 from makebreak.diagrams.tabletop import TABLETOP_WALLS, move, set_friction, set_tool
 from makebreak.models.scene import read_scene
 from makebreak.systems.numerics.contact_task import (
@@ -31,6 +37,38 @@ START = np.array([0.42, -0.16, 0.195])  # Of the sphere's centre [m].
 RAISED = 0.095  # The table, so that the way down is short [m].
 TOUCH = RAISED + 0.02  # Height at which the sphere meets it [m].
 DOWN, LEFT = np.array([0.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0])
+
+
+def test_the_tip_s_mass_is_drake_s_where_the_arm_would_be():
+    arm = make_control_plant(read_scene(TABLETOP_WALLS), "tool")
+    context = arm.CreateDefaultContext()
+    default = arm.GetPositions(context)
+    E, W, mass = arm.GetFrameByName("tip"), arm.world_frame(), tip_mass(arm)
+
+    def expected(q, d):
+        arm.SetPositions(context, q)
+        J = arm.CalcJacobianTranslationalVelocity(
+            context, JacobianWrtVariable.kV, E, np.zeros(3), W, W
+        )
+        return 1.0 / (d @ J @ np.linalg.inv(arm.CalcMassMatrix(context)) @ J.T @ d)
+
+    for d in np.eye(3):
+        np.testing.assert_allclose(mass(START, d), expected(default, d), rtol=1e-3)
+    # Elsewhere: Drake's own inverse kinematics.
+    p = np.array([0.6, 0.1, 0.05])
+    ik = InverseKinematics(arm)
+    ik.AddPositionConstraint(E, np.zeros(3), W, p, p)
+    R = RotationMatrix()
+    ik.AddOrientationConstraint(W, R, E, R, 1e-4)
+    ik.prog().AddQuadraticErrorCost(np.eye(7), default, ik.q())
+    ik.prog().SetInitialGuess(ik.q(), default)
+    found = Solve(ik.prog())
+    assert found.is_success()
+    for d in np.eye(3):
+        right = expected(found.GetSolution(ik.q()), d)
+        np.testing.assert_allclose(mass(p, d), right, rtol=0.02)
+    assert abs(mass(START, d) / mass(p * [1, 1, 0], d) - 1.0) > 0.02  # It does change.
+    assert np.isfinite(mass(np.array([2.0, 2.0, 2.0]), DOWN))
 
 
 def pattern():

@@ -249,6 +249,48 @@ def test_the_error_rule_converges_while_beta_is_below_twice_dv_by_df():
         assert (abs(v * slope - 8.0) < 1e-6) == converges
 
 
+def test_with_a_reflex_one_small_impact_gives_the_speed_of_the_wanted_one():
+    # F of v by bisection, from the energy that spring and brake take.
+    def force(v, k, m, gain, least):
+        low, high = 0.0, 1e3
+        for _ in range(60):
+            F = 0.5 * (low + high)
+            work = F**2 / (2 * k) + gain * max(F - least, 0.0) ** 2 / (2 * k)
+            low, high = (F, high) if work < 0.5 * m * v**2 else (low, F)
+        return low
+
+    for k in (5e3, 2e5):
+        small = force(0.01, k, 6.0, 4.0, 2.0)
+        v = speed_by_regression([[0.01, small]], 8.0, 4.0, 2.0)
+        np.testing.assert_allclose(force(v, k, 6.0, 4.0, 2.0), 8.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize("gain", [0.0, 4.0])
+def test_what_was_never_felt_is_met_as_the_stiffest_surface_asks(gain):
+    def mass(p, d):
+        return 9.0 if abs(d[2]) > 0.5 else 4.0
+
+    speed = ApproachSpeedConfig(
+        stiffness_most=1e5, force_first=6.0, reflex_gain=gain, reflex_force_least=2.0
+    )
+    wall = ExpectedContact([0.5, 0.3, 0], 0.08**2 * np.eye(3), RIGHT, segment=1)
+    config = ContactAnticipatorConfig(speed=speed)
+    trial = Trial(ContactBelief((prior(0.0), wall)), config, effective_mass=mass)
+    v = [c.approach_speed for c in trial.belief().contacts]
+    unbraked = 6.0 if gain == 0.0 else 10.0  # sqrt(36 + 4 * 16)
+    np.testing.assert_allclose(v, unbraked / np.sqrt([9e5, 4e5]))
+    # One that nobody expected is met again at that speed, too.
+    trial.step([0.5, 0, 0.3], 3)
+    trial.impact([0.7, 0.1, 0.3], RIGHT, 0.0, 0.0)
+    np.testing.assert_allclose(
+        trial.belief().contacts[2].approach_speed, unbraked / np.sqrt(4e5)
+    )
+    fast = replace(speed, most=0.004)
+    slow = replace(config, speed=fast)
+    trial = Trial(ContactBelief((wall,)), slow, effective_mass=mass)
+    assert trial.belief().contacts[0].approach_speed == 0.004
+
+
 def test_regression_is_the_weighted_least_squares_slope():
     rng = np.random.default_rng(9)
     impacts = rng.uniform(0.1, 1.0, (6, 2))

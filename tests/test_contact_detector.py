@@ -286,6 +286,18 @@ def test_gentle_contacts_are_felt_with_a_lower_threshold():
         np.testing.assert_allclose(rows[-1, PEAK_FORCE], force, rtol=0.2, atol=0.15)
 
 
+def test_the_peak_is_the_impact_s_and_not_of_the_push_after_it():
+    # 0.02 m/s into 2e4 N/m is 7 N; a push to 12 N begins 45 ms after the touch.
+    rng = np.random.default_rng(5)
+    world = World(0.02, 1.6, rng, wall=0.02, stiffness=2e4)
+    touch, impact = world.touch(), world.push.max()
+    push = 12.0 * np.clip((np.arange(len(world.x)) - touch - 45) / 30.0, 0.0, 1.0)
+    world.wrench[:, :3] -= push[:, None] * world.d
+    rows = run(world)
+    assert (world.push + push)[touch : touch + 80].max() > 1.25 * impact
+    np.testing.assert_allclose(rows[-1, PEAK_FORCE], impact, rtol=0.1)
+
+
 def test_the_bias_of_the_wrench_is_taken_off():
     # World adds (0.3, -0.2, 0.4) N; along an axis with a bias of 5 N nothing is felt.
     rng = np.random.default_rng(0)

@@ -219,7 +219,7 @@ def test_moving_frame_takes_the_frames_motion_off():
 def test_heights_are_all_that_is_left_of_a_contact():
     system = MovingFrame()
     context = system.CreateDefaultContext()
-    contact = np.arange(15.0)
+    contact = np.arange(14.0)
     contact[7:10] = np.array([0.1, 0.0, -1.0]) / np.sqrt(1.01)
     system.GetInputPort("contact").FixValue(context, contact)
     got = system.GetOutputPort("contact_height").Eval(context)

@@ -17,10 +17,12 @@ from makebreak.diagrams.tabletop import (
     THREE_SURFACES,
     TOOL,
     TOOLS,
+    draw_stiffness,
     move,
     objects,
     position,
     set_friction,
+    set_stiffness,
     set_tool,
     tool_half_width,
 )
@@ -176,6 +178,45 @@ def test_friction_with_the_tool_is_what_was_asked_for(friction):
     np.testing.assert_allclose(combined, 0.3, atol=1e-12)
 
 
+@pytest.mark.parametrize("tool, points", [("sphere", 1), ("block", 4)])
+def test_each_surface_has_the_stiffness_that_was_asked_for(tool, points):
+    asked = {"table": 5e3, "red_block": 2e5, "blue_wall": 3.3e4}
+    scene = read_scene(TABLETOP_WALLS)
+    set_tool(scene, tool)
+    set_stiffness(scene, tool, asked)
+    inside, _ = loaded(scene)
+    inspector = inside.scene_graph.model_inspector()
+
+    def stiffness(model):
+        instance = inside.plant.GetModelInstanceByName(model)
+        body = inside.plant.get_body(inside.plant.GetBodyIndices(instance)[0])
+        values = {
+            inspector.GetProperties(g, Role.kProximity).GetProperty(
+                "material", "point_contact_stiffness"
+            )
+            for g in inside.plant.GetCollisionGeometriesForBody(body)
+        }
+        (value,) = values
+        return value
+
+    for name, k in asked.items():  # Springs in a row, as Drake combines them.
+        pair = 1.0 / (1.0 / stiffness(TOOL) + 1.0 / stiffness(name))
+        np.testing.assert_allclose(points * pair, k, rtol=1e-9)
+
+
+def test_stiffness_is_drawn_evenly_over_its_logarithm():
+    rng = np.random.default_rng(0)
+    k = [draw_stiffness(rng, "ab", (5e3, 2e5)) for _ in range(2000)]
+    u = np.log(np.array([list(one.values()) for one in k]) / 5e3) / np.log(40.0)
+    # Uniform in (0, 1): deciles within four standard deviations of 400 +- 19.
+    assert np.all(abs(np.histogram(u, 10, (0.0, 1.0))[0] - 400) < 76)
+    assert abs(np.corrcoef(u.T)[0, 1]) < 0.1
+    assert draw_stiffness(rng, "a", (2e4, 2e4)) == {"a": pytest.approx(2e4)}
+    for span in ((2e5, 5e3), (0.0, 1.0), (1.0,), (1.0, np.inf)):
+        with pytest.raises(ValueError, match="stiffness is .* expected two numbers"):
+            draw_stiffness(rng, "a", span)
+
+
 def test_objects_are_moved_in_memory_alone():
     scene = read_scene(TABLETOP_WALLS)
     assert objects(scene) == ["table", "red_block", "blue_wall"]
@@ -200,6 +241,9 @@ def test_objects_are_moved_in_memory_alone():
         (lambda s: set_friction(s, {"wall": 0.3}), "no object 'wall'"),
         (lambda s: set_friction(s, {"table": -0.1}), "friction of table is -0.1"),
         (lambda s: set_friction(s, {"table": np.nan}), "friction of table is nan"),
+        (lambda s: set_stiffness(s, "block", {"wall": 1e4}), "no object 'wall'"),
+        (lambda s: set_stiffness(s, "bloc", {}), "tool is 'bloc'"),
+        (lambda s: set_stiffness(s, "block", {"table": 0.0}), "table is 0.0, expected"),
         (lambda s: move(s, "panda", [0, 0, 0]), "no object 'panda'"),
     ],
 )

@@ -558,7 +558,7 @@ def diagram(pattern, belief, motion=None, **config):
     shaper = builder.AddSystem(VelocityShaper(VelocityShaperConfig(**config), pattern))
     sources = {
         "contacts": ConstantValueSource(AbstractValue.Make(belief)),
-        "contact": ConstantVectorSource(np.zeros(15)),
+        "contact": ConstantVectorSource(np.zeros(14)),
         "ee_pose": ConstantVectorSource(np.zeros(7)),
     }
     for name, source in sources.items():

@@ -2,11 +2,11 @@
 
 The tool comes down on a table, slides to a wall, and along both to a second wall. At
 first the contacts are believed 0.12, 0.09 and 0.10 m off (along the motion into each;
-table 1 calls it the most significant axis), with sigma 0.08 m; the sign, the places, the
-frictions and the stiffness of each surface (5e3 to 2e5 N/m, log-uniform) are drawn by
-the seed. A trial begins with what the one before has learned. The desired impact force
-is 8 N. The first approach is as slow as a surface of 2e5 N/m asks for: no more is known
-of a surface that was never felt.
+table 1 calls it the most significant axis), with sigma 0.08 m; the sign, the places,
+the frictions and the stiffness of each surface (5e3 to 2e5 N/m, log-uniform) are drawn
+by the seed. A trial begins with what the one before has learned. The desired impact
+force is 8 N. The first approach is as slow as a surface of 2e5 N/m asks for: no more is
+known of a surface that was never felt.
 
 Impact force: F100, along the motion, measured at the wrist, 100 Hz, less its value
 before the contact. Acceleration: a10, 10 Hz (numerics/impact_score.py). The raw peaks
@@ -512,7 +512,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         met,
         [
             "Errors are along the motion into each contact. Force: F100. A robot and a "
-            "wooden block in the paper; the stiffness of each surface is drawn from 5e3 "
-            "to 2e5 N/m here, and not known to the controllers.",
+            "wooden block in the paper; the stiffness of each surface is drawn from "
+            "5e3 to 2e5 N/m here, and not known to the controllers.",
         ],
     )

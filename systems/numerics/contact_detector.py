@@ -45,7 +45,6 @@ from makebreak.systems.numerics.contact_task import (
     POSITION,
     SPEED,
     STATUS,
-    STIFFNESS,
     TIME,
 )
 
@@ -356,7 +355,7 @@ def _is_impact(limits, m, f, total, innovation, speed, learning):
 def detect(limits, memory, contact, time, wrench, pose, velocity, d, n, phase):
     """One tick.
 
-    Args: limits: Thresholds. memory (MEMORY_SIZE,), contact (15,): of the last tick.
+    Args: limits: Thresholds. memory (MEMORY_SIZE,), contact (14,): of the last tick.
         time [s]. wrench (6,) on the tool, world axes [N], [N m]. pose (7,) and velocity
         (6,) of the tip. d (3,) unit vector of the motion, zero at rest. n (6,) two rows
         of force directions. phase (6,). Any of them may be NaN.
@@ -477,10 +476,6 @@ def _report(limits, m, contact, d):
     contact[_DIRECTION : _DIRECTION + 3] = d
     contact[SPEED] = m[_BEFORE_SPEED]
     contact[PEAK_FORCE] = 0.0
-    # Force over way, before any push that the contact lets begin.
-    contact[STIFFNESS] = 0.0
-    if m[_PENDING] > 0.0 and m[_SUMS] > 0.0:
-        contact[STIFFNESS] = max(m[_SUMS + 1] / m[_SUMS], 0.0)
     m[_PEAK] = m[_HIGHEST]
     m[_PEAK_BEFORE] = m[_BEFORE]
     m[_PEAK_D : _PEAK_D + 3] = d

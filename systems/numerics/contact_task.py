@@ -33,8 +33,8 @@ REGION_COVERS_PATH, CONTACT_MISSING, CONTACT_UNEXPECTED, SPEED_FLOOR, BAD_INPUT 
     16,
 )
 
-# --- contact (15,): what the contact detector has felt so far.
-N_CONTACT = 15
+# --- contact (14,): what the contact detector has felt so far.
+N_CONTACT = 14
 MADE, BROKEN, MEASURED = range(3)  # Counts: made, broken, peak forces measured.
 TIME = 3  # Of the last contact made, its first sample [s].
 POSITION = slice(4, 7)  # p_WE there [m].
@@ -43,7 +43,6 @@ SPEED = 10  # Along it, just before [m/s].
 PEAK_FORCE = 11  # F_m: its peak along it, friction taken off [N]; 0 until MEASURED.
 BROKEN_ROW = 12  # Which row of force_directions was lost last, 0 or 1.
 STATUS = 13  # 0, or 1: the wrench is not to be used (NaN, stuck, or at its limit).
-STIFFNESS = 14  # Of the last contact made, as it was pressed in [N/m]; 0: not known.
 
 # --- transition (6,): mode changes, from the mode detector.
 N_TRANSITION = 6

@@ -589,7 +589,7 @@ def tick(table, law, regions, memory, t, contact, pose):
     """One tick.
 
     Args: table of the pattern; law; regions (N_REGIONS,) as plan gives them; memory of
-        the last tick (memory[0] = 0: none yet); t [s]; contact (15,); pose (7,)
+        the last tick (memory[0] = 0: none yet); t [s]; contact (14,); pose (7,)
         measured: anything may be NaN.
     Returns: memory; X, dX/dt, d2X/dt2 (3, 6); tangent (3,), zero at rest; force
         directions (6,); force targets (2,); phase (6,).
