@@ -130,7 +130,8 @@ def draw_stiffness(rng: np.random.Generator, names, span) -> dict[str, float]:
     """
     if len(span) != 2 or not 0.0 < span[0] <= span[1] < np.inf:
         raise ValueError(f"stiffness is {span}, expected two numbers, 0 < low <= high")
-    draw = np.exp(rng.uniform(*np.log(span), size=len(names)))
+    low, high = np.log(span)
+    draw = np.exp(rng.uniform(low, high, size=len(names)))
     return dict(zip(names, draw.tolist(), strict=True))
 
 
