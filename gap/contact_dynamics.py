@@ -156,16 +156,10 @@ class ContactDynamics(PermittedContacts):
         m = self.means
         K, n_v = m.acceleration.shape
         n = n_v + m.wrench.shape[1]
-        C = np.zeros((K, n, n))
-        M = self._M
-        C[:, :n_v, :n_v] = M @ self._a_covariance @ M.transpose(0, 2, 1)
-        i, j = np.arange(n_v), np.arange(n_v, n)
-        C[:, i, i] += m.effort_var
-        C[:, j, j] += m.wrench_var
-        self._sensors_alone = C
+        self._sensors_alone = self._sensor_covariance(np.ones(n_v), np.ones(n_v))
         needs = self._all_needs(())
         G, there, of, _, sharing = self._generators(())
-        rough = np.array(C)
+        rough = np.array(self._sensors_alone)
         size = np.sqrt(np.mean(needs**2, axis=0))
         rough[:, np.arange(n), np.arange(n)] += (0.1 * size + 1e-6) ** 2
         weights = np.zeros(there.shape)
@@ -181,10 +175,8 @@ class ContactDynamics(PermittedContacts):
     def allow(self, allowance: np.ndarray) -> None:
         """Weighs rows anew. allowance (rows,): what models are off by, in N and N m."""
         self.allowance = np.asarray(allowance, float)
-        C = np.array(self._sensors_alone)
-        k = np.arange(C.shape[1])
-        C[:, k, k] += (self.allowance + 1e-9 + 1e-6 * self.acting) ** 2
-        self.root, self._last = roots_of(C), None
+        self._root_of: dict[tuple, np.ndarray] = {}
+        self.root, self._last = self._root(()), None
         needs = self._all_needs(())
         G, there, of, _, sharing = self._generators(())
         weights = np.zeros(there.shape)
@@ -199,6 +191,58 @@ class ContactDynamics(PermittedContacts):
             pair = self._pair_of(self.slots[number])
             f = self._pressed.setdefault(pair, np.zeros(len(needs)))
             f += weights[:, column]
+
+    def _sensor_covariance(self, inertia, gain) -> np.ndarray:
+        """(K, rows, rows) of what sensors' noise makes of the rows, with the inertia in
+        each row and the effort of each drive (n_v,) times so much."""
+        m = self.means
+        n_v = m.acceleration.shape[1]
+        n = n_v + m.wrench.shape[1]
+        C = np.zeros((len(m.time), n, n))
+        M = inertia[:, None] * self._M
+        C[:, :n_v, :n_v] = M @ self._a_covariance @ M.transpose(0, 2, 1)
+        i, j = np.arange(n_v), np.arange(n_v, n)
+        C[:, i, i] += gain**2 * m.effort_var
+        C[:, j, j] += m.wrench_var
+        return C
+
+    def _root(self, effects: Sequence[Effect]) -> np.ndarray:
+        """(K, rows, rows) what weighs the rows of a model with these effects.
+
+        Noise of an acceleration errs by the inertia of that model, of an effort by the
+        gain of its drive. With the scene's own inertia in its place, of two models that
+        differ by a common factor (a mass times 1.5; a drive that gives 1/1.5 of what
+        it should) the one with the smaller forces would err less, and win.
+        """
+        n_v = len(self.coordinates)
+        inertia, gain = np.ones(n_v), np.ones(n_v)
+        bodies: dict[str, list[Effect]] = {}
+        for e in effects:
+            if e.kind in INERTIAL:
+                for body in find_bodies(e, self.plant):
+                    bodies.setdefault(full_name(self.plant, body), []).append(e)
+            elif e.kind == "actuator_gain":
+                for joint in find_joints(e, self.plant):
+                    gain[joint.velocity_start()] = e.parameters["gain"]
+        for body, own in bodies.items():
+            if body not in self.bodies:
+                continue  # A link's mass is off by little.
+            i_v = self.bodies[body][1]
+            before, more = self._ten(body), self._more_inertia(body, own)
+            inertia[i_v + 3 : i_v + 6] = 1.0 + more[0] / before[0]
+            trace = slice(4, 7)  # Of the inertia: it has no axes.
+            inertia[i_v : i_v + 3] = 1.0 + more[trace].sum() / before[trace].sum()
+        key = (*inertia, *gain)
+        if key not in self._root_of:
+            C = self._sensor_covariance(inertia, gain)
+            scale = np.append(inertia * np.abs(gain), np.ones(C.shape[1] - n_v))
+            k = np.arange(C.shape[1])
+            off = self.allowance + 1e-9 + 1e-6 * self.acting
+            C[:, k, k] += (scale * off) ** 2
+            kept = [(1.0,) * (2 * n_v)]  # That of the scene as it came, and the last.
+            self._root_of = {k: r for k, r in self._root_of.items() if k in kept}
+            self._root_of[key] = roots_of(C)
+        return self._root_of[key]
 
     def in_newtons(self, left: np.ndarray) -> np.ndarray:
         """Rows (K, rows) of equations as left() gives them, in N and N m."""
@@ -263,6 +307,12 @@ class ContactDynamics(PermittedContacts):
             )[0]
         return self._inertial_of[body]
 
+    def _ten(self, body: str) -> np.ndarray:
+        """(10,) the body's inertial parameters."""
+        (found,) = find_bodies(Effect("", [body], {}), self.plant)
+        M = found.default_spatial_inertia()
+        return _ten(M.get_mass(), np.array(M.get_com()), central_inertia(M))
+
     def _more_inertia(self, body: str, effects: Sequence[Effect]) -> np.ndarray:
         """(10,) by which the body's inertial parameters change: kinds in the order of
         their rank, as on a plant."""
@@ -270,7 +320,6 @@ class ContactDynamics(PermittedContacts):
         M = found.default_spatial_inertia()
         mass, com = M.get_mass(), np.array(M.get_com())
         central = central_inertia(M)
-        before = _ten(mass, com, central)
         for e in sorted(effects, key=lambda e: KINDS[e.kind].rank):
             p = e.parameters
             if e.kind == "object_mass":
@@ -285,37 +334,44 @@ class ContactDynamics(PermittedContacts):
                 w = np.linalg.eigvalsh(central)
                 if not (w[0] > 0.0 and w[0] + w[1] >= w[2]):
                     raise ValueError(f"object_inertia: no body has {p}")
-        return _ten(mass, com, central) - before
+        return _ten(mass, com, central) - self._ten(body)
 
-    def left(self, effects: Sequence[Effect] = (), shift: Shift | None = None):
+    def left(
+        self,
+        effects: Sequence[Effect] = (),
+        shift: Shift | None = None,
+        weighed_as: Sequence[Effect] | None = None,
+    ):
         """What permitted forces leave over the noise, (K, n): equations and wrenches,
-        then channels that tell the same twice, then distances."""
+        then channels that tell the same twice, then distances. weighed_as: the model
+        whose noise divides the rows, if it is not that of `effects`."""
         needs = self._all_needs(effects)
         shaped = [e for e in effects if e.kind in SHAPED]
         G, there, _, slots, sharing = self._generators(shaped, shift)
-        r = self._explained(needs, G, there, sharing)
+        root = self._root(effects if weighed_as is None else weighed_as)
+        r = self._explained(needs, G, there, sharing, root)
         r = r * self.free[:, None]
         more = self.means.extra / np.sqrt(np.maximum(self.means.extra_var, 1e-300))
         return np.hstack([r, more, self._distances(slots)])
 
-    def _explained(self, needs, G, there, sharing) -> np.ndarray:
+    def _explained(self, needs, G, there, sharing, root) -> np.ndarray:
         """What permitted forces leave; only where anything is other than the last time
         is it computed."""
         new = np.ones(len(needs), bool)
         r = np.zeros_like(needs)
         if self._last is not None and self._last[1].shape == G.shape:
-            P_last, G_last, there_last, r_last = self._last
+            P_last, G_last, there_last, root_last, r_last = self._last
             new = (needs != P_last).any(axis=1) | (G != G_last).any(axis=(1, 2))
-            new |= (there != there_last).any(axis=1)
+            new |= (there != there_last).any(axis=1) | (root is not root_last)
             r[:] = r_last
         if new.any():
             some = np.zeros((int(new.sum()), needs.shape[1]))
             explain(
-                needs[new], G[new], there[new], self.root[new], sharing[new], some,
+                needs[new], G[new], there[new], root[new], sharing[new], some,
                 np.zeros((len(some), there.shape[1])), np.zeros(len(some), np.int64),
             )  # fmt: skip
             r[new] = some
-        self._last = (needs, G, there, r)
+        self._last = (needs, G, there, root, r)
         return r
 
     def _distances(self, slots: Sequence[Slot]) -> np.ndarray:

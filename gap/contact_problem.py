@@ -54,6 +54,7 @@ class ContactProblem(ContactDynamics, GapProblem):
         evaluations=8,
         diff_step=1e-3,
         least_gain=0.05,
+        least_error=1.0,
         most_effects=4,
         shortlist=10,
         simulation_agrees=True,
@@ -261,8 +262,10 @@ class ContactProblem(ContactDynamics, GapProblem):
         return found
 
     def _try(self, there: Sequence[Effect], effect: Effect) -> np.ndarray | None:
+        """With the weights of what is there: columns are then as linear as can be."""
         try:
-            return self.residual([*there, effect])
+            r = self.left([*there, effect], weighed_as=there)
+            return np.clip(self._flat(r), -200.0, 200.0)
         except (ValueError, RuntimeError):
             return None
 
