@@ -551,10 +551,15 @@ def write(case: ContactCase, folder: Path) -> dict:
                 {"contact_dissipation": 1.0} if mujoco_ else {}
             )
         write_scene(folder, s, columns, noise, 0.0005, tolerance)
+        if mujoco_ and recipe.scene in ("cart", "pendulum"):
+            # MuJoCo's damper is linear, Hunt-Crossley's is not: it may be told.
+            at = f"{s.tool_body}~wall.wall"
+            effects.append({"kind": "contact_dissipation", "at": at, "parameters": {},
+                            "needed": False})  # fmt: skip
     outside = "adhesion" in names
     verdict = (
         "gap_unnamed" if outside else "ambiguous" if recipe.ties
-        else "gap_named" if effects else "no_gap"
+        else "gap_named" if names else "no_gap"
     )  # fmt: skip
     return {
         "name": case.name, "verdict": verdict, "effects": effects,
