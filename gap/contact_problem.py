@@ -5,6 +5,7 @@ Residuals are those of gap/contact_dynamics.py; simulated windows
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -47,6 +48,9 @@ EXACT = 4  # Single effects that are fitted for what models are off by.
 CELL, MOST_CELLS = 0.015, 20  # A side of the cells in which a patch is looked for [m].
 LEAST_CELLS = 4
 PATCH_RUNS, PATCH_STARTS = 200, 4
+# Of a patch's side: how far it is moved [m], and what that may add to the sum of
+# squares (neighbouring rows err together: four times what one row would count).
+MOVED, PROFILE = (5e-4, 1e-3, 2e-3, 4e-3, 8e-3, 0.016, 0.032, 0.064), 16.0
 SMALL = 0.1  # First trial of an effect on joints, of the efforts there.
 
 
@@ -464,6 +468,37 @@ class ContactProblem(ContactDynamics, GapProblem):
         )  # fmt: skip
         x = scale * found.x
         return float(found.fun), friction + x[0], sides + x[1:]
+
+    def widened(self, end: Fitted, k: int) -> dict[str, float]:
+        """A patch's side that nothing slid across can be anywhere until something did:
+        it is moved by ever more, and its deviation is half of how far that goes without
+        a loss of PROFILE noise variances; infinite where it goes on."""
+        effect, std = end.effects[k], dict(end.std[k])
+        if effect.kind != "friction_patch":
+            return std
+        calm = self.nuisances().columns @ end.b
+        limit = PROFILE * max(end.score, 1.0) ** 2
+
+        def cost(parameters) -> float:
+            others = [*end.effects]
+            others[k] = replace(effect, parameters=parameters)
+            try:
+                return float(np.sum((self.residual(others) - calm) ** 2))
+            except ValueError:  # The patch is empty.
+                return np.inf
+
+        least = cost(effect.parameters)
+        for name in ("x_min", "x_max", "y_min", "y_max"):
+            now = effect.parameters[name]
+            for sign in (-1.0, 1.0):
+                far = np.inf
+                for d in MOVED:
+                    moved = {**effect.parameters, name: now + sign * d}
+                    if cost(moved) - least > limit:
+                        far = d
+                        break
+                std[name] = max(std.get(name, 0.0), 0.5 * far)
+        return std
 
     def _slid_over(self, pair) -> np.ndarray:
         """(n, 2) places of the ground over which a point of the pair slid."""

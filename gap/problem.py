@@ -277,6 +277,10 @@ class GapProblem(ABC):
         """Another effect that no recording of these channels could tell from it."""
         return None
 
+    def widened(self, end: Fitted, k: int) -> dict[str, float]:
+        """Deviations of effect k of a fit, wider where slopes say too little."""
+        return dict(end.std[k])
+
     def error(self, fitted: Fitted) -> float:
         """What the verdict goes by: held-out error in units of the noise."""
         return fitted.score

@@ -20,7 +20,7 @@ from makebreak.gap.measure import WINDOW_SEC
 from makebreak.gap.mechanism import MechanismProblem
 from makebreak.gap.objects import FlightProblem, RolloutProblem, TouchProblem
 from makebreak.gap.parallel import side_by_side
-from makebreak.gap.problem import DISTANCES, GapProblem, Outcome, is_sane
+from makebreak.gap.problem import DISTANCES, Fitted, GapProblem, Outcome, is_sane
 from makebreak.gap.recording import (
     Recording,
     check_against_scene,
@@ -177,7 +177,10 @@ def conclude(
     nuisances = selection.nuisances
     selection, chosen_on = kept_by_simulation(problem, selection, jobs)
     selection, chosen_on = preferred_by_simulation(problem, selection, chosen_on, jobs)
-    choices = [_with_inseparable(c, problem) for c in selection.choices]
+    choices = [
+        _with_inseparable(_widened(c, problem, selection.end), problem)
+        for c in selection.choices
+    ]
     selection = replace(selection, choices=tuple(choices))
     start, end = problem.error(selection.start), problem.error(selection.end)
     verdict = verdict_of(choices, start, end, selection.far)
@@ -475,6 +478,11 @@ def _settle_step(
             f"{fine.plant.time_step or 'a continuous plant'}.",
         )
     ]
+
+
+def _widened(choice: Choice, problem: GapProblem, end: Fitted) -> Choice:
+    k = end.effects.index(choice.effect) if choice.effect in end.effects else -1
+    return replace(choice, std=problem.widened(end, k)) if k >= 0 else choice
 
 
 def _with_inseparable(choice: Choice, problem: GapProblem) -> Choice:

@@ -547,7 +547,7 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
     p.add_argument(
         "--set", dest="which", default="standard", metavar="SET",
-        help="of gap: standard, development, logs-development, logs-final",
+        help="of gap: standard, development, logs-..., contact-development or -final",
     )  # fmt: skip
     p.add_argument(
         "--only", default="", metavar="TEXT", help="of gap: cases with this in the name"

@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 import makebreak
 from makebreak.scripts.gap_scoring import (
+    CONTACT,
     LOGS,
     STANDARD,
     Goals,
@@ -51,6 +52,12 @@ SETS = {
         _TESTS / "log_cases.py", LOGS, "as robots log, for tuning", True
     ),
     "logs-final": BenchmarkSet(_TESTS / "log_cases.py", LOGS, "as robots log", True),
+    "contact-development": BenchmarkSet(
+        _TESTS / "contact_cases.py", CONTACT, "where robots touch things, for tuning"
+    ),
+    "contact-final": BenchmarkSet(
+        _TESTS / "contact_cases.py", CONTACT, "where robots touch things"
+    ),
 }
 
 

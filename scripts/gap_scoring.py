@@ -22,6 +22,7 @@ class Goals:
 
 
 STANDARD = Goals()
+CONTACT = Goals(verdict=0.9, first=0.88, error=0.05, closed=0.9)
 LOGS = Goals(verdict=0.92, first=0.9, error=0.05, covered=0.85)
 
 _DRIVES = ("actuator_", "input_delay")

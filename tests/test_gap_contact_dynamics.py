@@ -12,6 +12,7 @@ from scipy.optimize import least_squares
 from makebreak.gap import workflow
 from makebreak.gap.contact_dynamics import ContactDynamics
 from makebreak.gap.contact_problem import ContactProblem, _best_rectangles
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.problem import Outcome, SearchPlan
 from makebreak.gap.recording import read_recordings
 from makebreak.gap.result import Considered, GapMeasure
@@ -20,6 +21,7 @@ from makebreak.gap.workflow import problem_for, run_gap
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
+from makebreak.systems.numerics.selection import Screen
 
 PAIR = f"{BLOCK}~{TABLE}"
 
@@ -180,6 +182,30 @@ def test_a_pose_without_orientation_is_refused(tmp_path):
     })  # fmt: skip
     with pytest.raises(ValueError, match="expected the whole pose of block.block"):
         ContactDynamics(scene, [blind])
+
+
+def test_a_side_of_a_patch_that_nothing_crosses_is_said_not_to_be_known(tmp_path):
+    """The patch reaches far beyond where the block is pushed on one side."""
+    rng = np.random.default_rng(18)
+    world = push_world.a_world(rng)
+    sides = {"x_min": 0.0, "x_max": 0.6, "y_min": -0.05, "y_max": 0.04}
+    mu = 1.7 * world.friction
+    truth = replace(world, patch=(mu, *sides.values()))
+    table, noise = push_world.record(truth, rng, episodes=5)
+    scene = push_world.write(tmp_path, world, table, noise)
+    problem = ContactProblem(
+        read_scene(scene), read_recordings([tmp_path / "recording.csv"])
+    )
+    n = problem.nuisances()
+    screen = Screen(problem.base(), n.columns, n.prior, problem.train(), reach=n.reach)
+    patch = Effect("friction_patch", [PAIR], {"friction": mu, **sides})
+    end = fit_effects(problem, screen, [patch], [tuple(sides)])
+    assert problem.reweigh(end.left)  # As the search does with what it has chosen.
+    std = problem.widened(end, 0)
+    assert std["x_max"] == np.inf
+    # No foot comes near this one, as these pushes go; across the others they do.
+    assert 0.004 <= std["x_min"] < np.inf
+    assert max(std["y_min"], std["y_max"]) <= 0.002
 
 
 def test_rectangles_of_cells_are_those_of_brute_force():

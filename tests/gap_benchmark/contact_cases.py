@@ -413,9 +413,12 @@ def arm_pushes(recipe: Recipe, rng):
             rate = np.gradient(q, t, axis=0)
             poses = {box.body: lying(true.thing("block"), true, middle, yaw)}
 
-            def command(at, now, v, t=t, q=q, rate=rate, sag=sag):
-                k = int(np.clip(np.searchsorted(t, at + 1e-9) - 1, 0, len(t) - 1))
-                return np.concatenate([q[k] + sag[k], rate[k]])
+            asked = np.hstack([q + sag, rate])
+
+            def command(at, now, v, asked=asked):
+                k, part = divmod(min(at * s.rate + 1e-9, len(asked) - 1.001), 1.0)
+                k = int(k)
+                return asked[k] + part * (asked[k + 1] - asked[k])
 
             found.append(Episode(seconds, q[0], poses, command))
         return found
@@ -537,7 +540,7 @@ def write(case: ContactCase, folder: Path) -> dict:
         truth, effects = hide(s, names, rng)
         # What drives the true robot is the same, whatever is measured of it.
         if truth.kp and truth.drive == "effort":
-            truth = replace(truth, drive="pd")
+            truth = replace(truth, drive="pd", smooth=True)
         columns, noise = record(
             truth, recipe.world, episodes(truth, rng), sensing(recipe), rng
         )

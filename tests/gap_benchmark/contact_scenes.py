@@ -59,10 +59,11 @@ class Thing:
 class Setting:
     """Things, and a robot whose last body has the tool.
 
-    drive: "pd" (kp, kd of each joint) or "effort". stiffness [N/m], dissipation [s/m]:
-    of each pair. The rest is of the truth alone: friction and stiffness of single
-    pairs of bodies; patch (mu, x0, x1, y0, y1) of the ground; what the joints have;
-    drag [N s/m] and force [N] on a thing; adhesion [N] of the tool.
+    drive: "pd" (kp, kd of each joint) or "effort". smooth: commands go on between rows,
+    as from a fast controller that nobody logged, else they hold. stiffness [N/m],
+    dissipation [s/m]: of each pair. The rest is of the truth alone: friction and
+    stiffness of single pairs of bodies; patch (mu, x0, x1, y0, y1) of the ground; what
+    the joints have; drag [N s/m] and force [N] on a thing; adhesion [N] of the tool.
     """
 
     things: tuple[Thing, ...]
@@ -74,6 +75,7 @@ class Setting:
     stiffness: float = 4e4
     dissipation: float = 2.0
     rate: float = 250.0
+    smooth: bool = False
     friction: Mapping[tuple[str, str], float] = field(default_factory=dict)
     springs: Mapping[tuple[str, str], float] = field(default_factory=dict)
     patch: tuple[float, ...] = ()
@@ -241,7 +243,7 @@ class MujocoWorld:
         return self.data.qpos[at : at + 7].copy()
 
     def advance(self, effort: Callable, until: float) -> None:
-        """effort (q, v) -> (n,) of the drives."""
+        """effort (t, q, v) -> (n,) of the drives."""
         s, m, d = self.s, self.model, self.data
         n = max(round((until - d.time) / STEP), 1)
         m.opt.timestep = (until - d.time) / n
@@ -249,7 +251,7 @@ class MujocoWorld:
         for _ in range(n):
             if self.joints:
                 q, v = d.qpos[self.q_at], d.qvel[self.v_at]
-                u = effort(q, v)
+                u = effort(d.time, q, v)
                 if hindered:
                     u = u - s.of_joints("coulomb") * np.tanh(v / 1e-3)
                     u = u - s.of_joints("damping") * v
@@ -386,7 +388,7 @@ class DrakeWorld:
             plant.SetFreeBodyPose(own, b, X)
             if len(x) == 13:
                 V = SpatialVelocity(x[10:13], x[7:10])
-                plant.SetFreeBodySpatialVelocity(b, V, own)
+                plant.SetFreeBodySpatialVelocity(own, b, V)
         self.port.FixValue(own, np.zeros(plant.num_velocities()))
         self.simulator.Initialize()
 
@@ -409,7 +411,7 @@ class DrakeWorld:
         for k in range(n):
             if at:
                 q, v = self.state()
-                u = effort(q, v)
+                u = effort(self.context.get_time(), q, v)
                 if hindered:
                     u = u - s.of_joints("coulomb") * np.tanh(v / 1e-3)
                     u = u - s.of_joints("damping") * v
@@ -649,12 +651,14 @@ def record(s: Setting, world: str, episodes, sense: Sensing, rng):
             if n and sense.wrench is not None:
                 kept["f"].append(simulated.wrench())
 
-            def effort(q, v, c=c):
+            def effort(at, q, v, c=c, command=e.command):
+                if s.smooth:
+                    c = command(at, q, v)
                 if s.drive == "effort":
                     return gain * c
                 return gain * (s.kp * (c[:n] - q) + s.kd * (c[n:] - v))
 
-            for key, x in (("q", q), ("v", v), ("c", c), ("u", effort(q, v))):
+            for key, x in (("q", q), ("v", v), ("c", c), ("u", effort(t[i], q, v))):
                 kept[key].append(x)
             if i + 1 < len(t):
                 simulated.advance(effort, float(t[i + 1]))

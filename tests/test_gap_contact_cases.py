@@ -1,0 +1,185 @@
+"""The contact half of the benchmark: its cases, and that its worlds obey physics."""
+
+import json
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from gap_benchmark.contact_cases import (
+    RECIPES,
+    SCENES,
+    SEEDS,
+    block,
+    contact_cases,
+    hide,
+    lying,
+    table,
+    write,
+)
+from gap_benchmark.contact_scenes import (
+    STUCK,
+    WORLDS,
+    MujocoWorld,
+    Setting,
+    Thing,
+    pair,
+    pair_friction,
+)
+
+from makebreak.gap.recording import check_against_scene, read_recordings
+from makebreak.gap.scene_facts import scene_names
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.scene import read_scene
+
+G = 9.81
+
+
+def nothing(t, q, v):
+    return np.zeros(0)
+
+
+def slid(world: str, friction: float, **changes) -> tuple[float, Thing]:
+    """How far a block slides that starts at 0.4 m/s, and the block."""
+    box = replace(block(np.random.default_rng(0)), **changes)
+    feet = tuple(replace(x, friction=friction) for x in box.shapes)
+    s = Setting((table(friction), replace(box, shapes=feet)))
+    simulated = WORLDS[world](s)
+    x = np.concatenate([lying(s.things[1], s, (0.0, 0.0), 0.0), [0.4, *np.zeros(5)]])
+    simulated.reset(np.zeros(0), {"block.block": x})
+    simulated.advance(nothing, 0.5)
+    return float(simulated.pose("block.block")[0]), s.things[1]
+
+
+def test_there_are_enough_cases_and_their_seeds_are_apart():
+    development, final = (contact_cases(which) for which in SEEDS)
+    every = development + final
+    assert len(every) == 2 * len(RECIPES) >= 80
+    assert len({c.seed for c in every}) == len({c.folder for c in every}) == len(every)
+    assert len({c.name for c in final}) == len(RECIPES)
+    scenes = {c.recipe.scene for c in final}
+    assert scenes >= set(SCENES) and len(scenes) >= 8
+    calm = {c.recipe.scene for c in final if not c.recipe.hide}
+    assert calm >= set(SCENES)  # One of each with nothing hidden.
+    assert {c.recipe.world for c in final} == {"mujoco", "ode", "drake"}
+    options = {o for c in final for o in c.recipe.options}
+    assert options >= {"camera30", "camera60", "no_wrench", "effort"}
+    assert any(c.recipe.ties for c in final)
+    assert any(len(c.recipe.hide.split()) == 2 for c in final)
+
+
+@pytest.mark.parametrize("world", sorted(WORLDS))
+def test_a_block_slides_as_far_as_friction_says(world):
+    far, _ = slid(world, 0.3)
+    assert far == pytest.approx(0.4**2 / (2.0 * 0.3 * G), rel=0.02)
+
+
+def test_a_block_that_lies_sinks_in_by_its_weight_and_stays():
+    box = block(np.random.default_rng(1))
+    s = Setting((table(0.3), box), stiffness=2e4)
+    simulated = MujocoWorld(s)
+    start = lying(box, s, (0.0, 0.0), 0.3)
+    simulated.reset(np.zeros(0), {"block.block": start})
+    simulated.advance(nothing, 0.4)
+    np.testing.assert_allclose(simulated.pose("block.block"), start, atol=2e-6)
+
+
+def test_on_a_tilted_table_a_smooth_block_slides_downhill():
+    box = block(np.random.default_rng(1))
+    box = replace(box, shapes=tuple(replace(x, friction=0.0) for x in box.shapes))
+    s = Setting((replace(table(0.0), pitch=0.03), box))
+    simulated = MujocoWorld(s)
+    start = lying(box, s, (0.0, 0.0), 0.0)
+    simulated.reset(np.zeros(0), {"block.block": start})
+    simulated.advance(nothing, 0.4)
+    moved = simulated.pose("block.block")[:3] - start[:3]
+    along = np.array([np.cos(0.03), 0.0, -np.sin(0.03)])
+    expected = 0.5 * G * np.sin(0.03) * 0.4**2 * along
+    np.testing.assert_allclose(moved, expected, atol=2e-5)
+
+
+def test_a_cart_leaves_a_wall_as_a_spring_throws_it():
+    """Half a period of the true pair's spring, not of the scene's."""
+    rng = np.random.default_rng(3)
+    s, _ = SCENES["cart"](RECIPES[2], rng)
+    s = replace(s, dissipation=0.0, springs={pair("cart.cart", "wall.wall"): 5e3})
+    simulated = MujocoWorld(s)
+    assert s.robot is not None and s.tool is not None
+    gap = s.things[0].shapes[1].place[0] - 0.1 - s.tool.size[0]
+    simulated.reset(np.array([gap]), {})
+    simulated.data.qvel[simulated.v_at] = 0.3
+    half = np.pi * np.sqrt(s.robot.bodies[0].mass / 5e3)
+    simulated.advance(lambda t, q, v: np.zeros(1), 0.5 * half)
+    q, v = simulated.state()
+    assert q[0] - gap == pytest.approx(0.3 * half / np.pi, rel=0.02)
+    assert abs(v[0]) < 0.01
+    simulated.advance(lambda t, q, v: np.zeros(1), half)
+    assert simulated.state()[1][0] == pytest.approx(-0.3, rel=0.03)
+
+
+def test_what_is_hidden_changes_the_world_by_what_is_said():
+    rng = np.random.default_rng(4)
+    s, _ = SCENES["push"](RECIPES[0], rng)
+    for name, value in {
+        "mass": lambda t: t.thing("block").mass,
+        "friction": lambda t: t.friction[pair("block.block", "table.table")],
+        "drag": lambda t: t.drag["block.block"],
+    }.items():
+        true, (effect,) = hide(s, [name], rng)
+        assert value(true) == pytest.approx(next(iter(effect["parameters"].values())))
+    box, ground = s.thing("block"), s.thing("table")
+    assert pair_friction(box.shapes[-1], ground.shapes[0]) == pytest.approx(
+        box.shapes[-1].friction
+    )
+
+
+def test_a_tool_that_adheres_holds_on_and_lets_go():
+    rng = np.random.default_rng(5)
+    s, _ = SCENES["push"](RECIPES[0], rng)
+    s = replace(s, adhesion=2.0)
+    simulated = MujocoWorld(s)
+    box = s.thing("block")
+    reach = box.shapes[0].size[0] + 0.012
+    pose = {"block.block": lying(box, s, (0.0, 0.0), 0.0)}
+    for gap, holds in ((-1e-5, True), (2 * STUCK, False)):
+        simulated.reset(np.array([reach + gap, 0.0]), pose)
+        simulated.data.qpos[simulated.q_at[0]] += 0.5 * STUCK if holds else 0.0
+        mujoco.mj_forward(simulated.model, simulated.data)
+        simulated._stuck = holds
+        simulated._forces()
+        pull = simulated.data.xfrc_applied[simulated.model.body("tip").id, 0]
+        assert bool(pull < -1.9) is holds
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """One episode of each scene."""
+    for name, make in dict(SCENES).items():
+
+        def shorter(recipe, rng, make=make):
+            s, episodes = make(recipe, rng)
+            return s, lambda true, rng: [
+                replace(e, seconds=0.3) for e in episodes(true, rng)[:1]
+            ]
+
+        monkeypatch.setitem(SCENES, name, shorter)
+
+
+@pytest.mark.parametrize("scene", sorted(SCENES))
+def test_a_case_is_a_function_of_its_seed_and_holds_no_truth(short, tmp_path, scene):
+    case = next(c for c in contact_cases("contact-development")
+                if c.recipe.scene == scene and c.recipe.world == "mujoco"
+                and c.recipe.hide)  # fmt: skip
+    truth = write(case, tmp_path / "one")
+    assert truth == write(case, tmp_path / "two")
+    texts = {p.name: p.read_text() for p in (tmp_path / "one").iterdir()}
+    assert texts == {p.name: p.read_text() for p in (tmp_path / "two").iterdir()}
+    assert json.loads(json.dumps(truth)) == truth
+    for text in texts.values():
+        for effect in truth["effects"]:
+            assert case.name not in text
+            for value in effect["parameters"].values():
+                assert repr(value)[:12] not in text
+    recording = read_recordings([tmp_path / "one/recording.csv"])[0]
+    plant = SceneDynamics(read_scene(tmp_path / "one/scene.yaml")).plant
+    check_against_scene(recording, *scene_names(plant))
