@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from makebreak.gap.contact_dynamics import ContactDynamics
-from makebreak.gap.contact_windows import PushWindows
+from makebreak.gap.contact_windows import PushWindows, led_as_measured
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.measure import gap_measure, series_of
 from makebreak.gap.mechanism import link_changes
@@ -546,7 +546,11 @@ class ContactProblem(ContactDynamics, GapProblem):
     def judged(self) -> dict[str, str]:
         """Positions and poses by the equations and in simulation; all that is measured
         twice, and wrenches, in equations."""
-        how = {f"{j}.position": "equations and simulation" for j in self.joints}
+        _, led = led_as_measured(self.scene, self.recordings)
+        how = {
+            f"{j}.position": "equations" if j in led else "equations and simulation"
+            for j in self.joints
+        }
         for body in self.bodies:
             for a in ("qw", "qx", "qy", "qz", "x", "y", "z"):
                 how[f"{body}.{a}"] = "equations and simulation"

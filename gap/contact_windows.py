@@ -13,7 +13,10 @@ import numpy as np
 
 from makebreak.gap.recording import Episode, Recording
 from makebreak.gap.windows import TURN, Window, WindowModel
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.kind import full_name, one_dof_joints
 from makebreak.models.scene import Scene
+from makebreak.models.scene_schema import COMMANDS_OF, ActuationSection
 from makebreak.systems.numerics.smoother import smooth_filtered
 
 WINDOW_SEC = 0.6  # Reaches into the sliding.
@@ -24,6 +27,8 @@ DRAWS = 3  # Of uncertain starts.
 # Laws of contact are approximations: of how far an object moves, and a driven joint.
 BLUR, BLUR_DRIVEN = 0.005, 0.0005
 MOST = 4
+# How fast joints that are led follow their measured motion [rad/s], told so often [s].
+LED_RATE, LED_SEC = 300.0, 1e-3
 
 
 class PushWindows(WindowModel):
@@ -39,8 +44,34 @@ class PushWindows(WindowModel):
         episodes: set[tuple[int, int]] | None = None,
     ):
         self._only = episodes
+        scene, led = led_as_measured(scene, recordings)
         super().__init__(scene, recordings, WINDOW_SEC, by_episode=True, most=MOST)
+        keep = [
+            k for k, c in enumerate(self.channels) if c.rsplit(".", 1)[0] not in led
+        ]
+        if not keep:
+            raise ValueError("nothing but joints that are led as they were measured")
+        self.channels = [self.channels[k] for k in keep]
+        self.noise = self.noise[keep]
+        self.windows = [replace(w, std=w.std[:, keep]) for w in self.windows]
         self._add_spread()
+
+    def _given(self, recording: Recording, episode: Episode, i: int):
+        """times and columns of commands: the smoothed motion."""
+        path = self._paths.get((i, episode.first))
+        if path is None:  # No window begins here.
+            return recording.time[episode.rows], {}
+        rows = path["time"]
+        count = int((rows[-1] - rows[0]) / LED_SEC) + 1
+        time = rows[0] + LED_SEC * np.arange(count)
+        columns = {}
+        for joint in self.scene.actuation.joints:
+            if f"{joint}.position" in path:
+                x, v, _ = path[f"{joint}.position"].T
+                now = np.interp(time + 0.5 * LED_SEC, rows, x)
+                columns[f"{joint}.position_command"] = now
+                columns[f"{joint}.velocity_command"] = np.interp(time, rows, v)
+        return time, columns
 
     def _cut(self, i, recording: Recording, episode: Episode, hop, block, number):
         if self._only is not None and (i, episode.number) not in self._only:
@@ -135,6 +166,42 @@ class PushWindows(WindowModel):
             replace(w, std=np.sqrt(w.std**2 + v + far**2))
             for w, v in zip(self.windows, wide, strict=True)
         ]
+
+
+def led_as_measured(
+    scene: Scene, recordings: Sequence[Recording]
+) -> tuple[Scene, list[str]]:
+    """The scene with joints led along their measured motion, and these joints, where
+    efforts were measured and no command: with these efforts as an input a robot drifts
+    by their noise, and by what an impact does between two rows. What the joints do is
+    then judged by the equations alone, what objects do in simulation. Else the scene as
+    it is, and none."""
+    act = scene.actuation
+    takes = COMMANDS_OF[act.type]
+    commanded = any(f"{j}.{what}" in r for r in recordings for j in act.joints
+                    for what in takes)  # fmt: skip
+    known = [
+        j for j in act.joints
+        if all(f"{j}.{what}" in r for r in recordings
+               for what in ("position", "effort_measured"))
+    ]  # fmt: skip
+    if commanded or not known or len(known) < len(act.joints):
+        return scene, []
+    plant = SceneDynamics(scene).plant
+    context = plant.CreateDefaultContext()
+    of = {full_name(plant, j): j for j in one_dof_joints(plant)}
+    q = plant.GetPositions(context)
+    for joint in known:
+        y = recordings[0][f"{joint}.position"]
+        q[of[joint].position_start()] = y[np.isfinite(y)][0]
+    plant.SetPositions(context, q)
+    ease = np.diag(np.linalg.inv(plant.CalcMassMatrix(context)))
+    inertia = [1.0 / ease[of[joint].velocity_start()] for joint in known]
+    drive = ActuationSection(
+        "pd", list(known), kp=[float(m * LED_RATE**2) for m in inertia],
+        kd=[float(2.0 * m * LED_RATE) for m in inertia], rate_hz=act.rate_hz,
+    )  # fmt: skip
+    return replace(scene, actuation=drive), known
 
 
 def _drawn(w: Window, rng) -> Window:

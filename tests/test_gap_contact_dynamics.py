@@ -5,18 +5,21 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from gap_benchmark import push_world
+from gap_benchmark import contact_cases, push_world
+from gap_benchmark.contact_scenes import Sensing, record, write_scene
 from gap_benchmark.push_world import BLOCK, TABLE
 from scipy.optimize import least_squares
 
-from makebreak.gap import workflow
+from makebreak.gap import contact_windows, workflow
 from makebreak.gap.contact_dynamics import ContactDynamics
 from makebreak.gap.contact_problem import ContactProblem, _best_rectangles
+from makebreak.gap.contact_windows import PushWindows, led_as_measured
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.problem import Outcome, SearchPlan
 from makebreak.gap.recording import read_recordings
 from makebreak.gap.result import Considered, GapMeasure
 from makebreak.gap.select import Choice, Selection
+from makebreak.gap.windows import WindowModel
 from makebreak.gap.workflow import problem_for, run_gap
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
@@ -255,6 +258,32 @@ def test_simulation_decides_between_what_equations_find_alike(
     else:
         assert (taken, after.gap.after) == ("object_mass", mass)
     assert asked == (["contact_friction"] if mass > 1.5 else [])
+
+
+def test_a_robot_without_commands_is_led_as_it_was_measured(tmp_path, monkeypatch):
+    """Its measured efforts, at 250 Hz, miss what an impact does between two rows: with
+    them as the input the robot is soon elsewhere, and the object with it."""
+    rng = np.random.default_rng(61)
+    scene, episodes = contact_cases.pushed(contact_cases.RECIPES[3], rng)
+    true = replace(scene, smooth=True)
+    look = Sensing(effort=0.05, wrench=None)
+    table, noise = record(true, "mujoco", episodes(true, rng)[:2], look, rng)
+    write_scene(tmp_path, replace(scene, drive="effort"), table, noise, 0.0005, {})
+    scene = read_scene(tmp_path / "scene.yaml")
+    recordings = read_recordings([tmp_path / "recording.csv"])
+
+    def errors() -> float:
+        windows = PushWindows(scene, recordings)
+        assert {c.rsplit(".", 1)[0] for c in windows.channels} >= {"block.block"}
+        rows = windows.errors(windows.simulate(()))
+        k = [c.startswith("block") for c in windows.channels]
+        return float(np.sqrt(np.nanmean(np.concatenate(rows)[:, k] ** 2)))
+
+    assert errors() < 1.2
+    assert led_as_measured(scene, recordings)[1] == ["pusher.x", "pusher.y"]
+    monkeypatch.setattr(contact_windows, "led_as_measured", lambda s, r: (s, []))
+    monkeypatch.setattr(PushWindows, "_given", WindowModel._given)
+    assert errors() > 2.0
 
 
 @pytest.mark.slow

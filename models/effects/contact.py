@@ -590,6 +590,7 @@ KINDS = {
         "coefficient of {at} is {friction}",
         confused_with=("contact_friction", "plane_tilt"),
         tell_apart="slide over the place in another direction, and beside it",
+        contains=("contact_friction",),  # A patch of all that was slid over.
         rank=1,
         before_finalize=_patch,
         now=_patch_now,
