@@ -22,6 +22,7 @@ from makebreak.gap.select import Choice, Selection
 from makebreak.gap.windows import WindowModel
 from makebreak.gap.workflow import problem_for, run_gap
 from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
 from makebreak.systems.numerics.selection import Screen
@@ -209,6 +210,17 @@ def test_a_side_of_a_patch_that_nothing_crosses_is_said_not_to_be_known(tmp_path
     # No foot comes near this one, as these pushes go; across the others they do.
     assert 0.004 <= std["x_min"] < np.inf
     assert max(std["y_min"], std["y_max"]) <= 0.002
+
+
+def test_a_patch_of_all_that_was_slid_over_is_friction_and_is_known_to_be(tmp_path):
+    """Else it is named in place of the friction with another effect beside it."""
+    scene, recordings, _ = pushed(tmp_path, 15, [], episodes=3)
+    model = ContactDynamics(scene, recordings)
+    wide = {"x_min": -1.0, "x_max": 1.0, "y_min": -1.0, "y_max": 1.0}
+    patch = model.left([Effect("friction_patch", [PAIR], {"friction": 0.5, **wide})])
+    plain = model.left([Effect("contact_friction", [PAIR], {"friction": 0.5})])
+    np.testing.assert_allclose(patch, plain, atol=1e-6)
+    assert "contact_friction" in KINDS["friction_patch"].contains
 
 
 def test_rectangles_of_cells_are_those_of_brute_force():
