@@ -21,6 +21,7 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 
+from makebreak.diagrams.realism import StationErrors, with_errors
 from makebreak.diagrams.station import (
     ARM,
     TIP_FRAME,
@@ -134,6 +135,7 @@ SIGNALS = {
     "ee_velocity": ("tip_state", "ee_velocity", 6),
     "wrench": ("station", f"{ARM}.external_wrench", 6),
     "contact_force": ("station", f"{TOOL}.contact_force", 3),
+    "tip_true": ("station", f"{TOOL}.tip_position", 3),
     "x_desired": ("velocity_shaper", "x_desired", 19),
     "direction": ("velocity_shaper", "direction", 3),
     "force_directions": ("velocity_shaper", "force_directions", 6),
@@ -164,6 +166,7 @@ def make_changing_contact(
     seed: int = 0,
     meshcat: Meshcat | None = None,
     view: ContactViewConfig | None = None,
+    errors: StationErrors | None = None,
 ) -> Diagram:
     """The station and the systems of both levels, each by name in the diagram.
 
@@ -178,10 +181,14 @@ def make_changing_contact(
         seed: of the sensors' noise.
         meshcat: where it is seen; None: nowhere.
         view: how it is seen there; None: as by default.
+        errors: of the station, which the model does not have; None: none. The first of
+            the world's objects is its table.
     Raises: ValueError for periods or offsets in config that are not the defaults.
     """
     known = knowledge or Knowledge()
     builder = DiagramBuilder()
+    if errors is not None:
+        world = with_errors(world, errors, ARM, tool, objects(world)[0])
     station = builder.AddNamedSystem(
         "station",
         make_station(
@@ -194,6 +201,7 @@ def make_changing_contact(
             ),
             meshcat,
             world,
+            errors,
         ),
     )
     arm = make_control_plant(model, tool)

@@ -17,6 +17,7 @@ from makebreak.diagrams.changing_contact import (
     Knowledge,
     make_changing_contact,
 )
+from makebreak.diagrams.realism import StationErrors, draw_errors
 from makebreak.diagrams.tabletop import (
     THREE_SURFACES,
     TOOL,
@@ -70,6 +71,7 @@ class ChangingSurfaceConfig:
     tool: str = "block"  # Or "sphere".
     speed: float = 0.1  # Of sliding [m/s].
     normal_force: float = 8.0  # About; each segment has its own [N].
+    realism: str = "none"  # Errors of the station: "none", "lab" or "poor".
     baselines: bool = True  # Constant K_max and constant K_free as well.
     control: ChangingContactConfig = field(default_factory=ChangingContactConfig)
 
@@ -84,6 +86,7 @@ class SurfaceTask:
     prior: ContactBelief  # Where the table is is known.
     friction: np.ndarray  # (3,)
     forces: np.ndarray  # (n_segments - 1,) [N]
+    errors: StationErrors
     feet: float  # From the tip to the corners it stands on, along x and y [m].
 
 
@@ -124,6 +127,7 @@ def make_task(config: ChangingSurfaceConfig) -> SurfaceTask:
         ContactBelief((contact,)),
         friction,
         forces,
+        draw_errors(config.realism, config.seed),
         FEET[config.tool],
     )
 
@@ -186,6 +190,7 @@ def make_changing_surface(
         tool=TOOL,
         seed=config.seed,
         meshcat=meshcat,
+        errors=task.errors,
     )
 
 

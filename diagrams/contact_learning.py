@@ -17,6 +17,7 @@ from makebreak.diagrams.changing_contact import (
     Knowledge,
     make_changing_contact,
 )
+from makebreak.diagrams.realism import StationErrors, draw_errors
 from makebreak.diagrams.tabletop import (
     STIFFNESS_RANGE,
     TABLETOP_WALLS,
@@ -64,6 +65,7 @@ class ContactLearningConfig:
     trials: int = 5
     speed: float = 0.25  # Of the motion pattern [m/s].
     normal_force: float = 8.0  # On each surface that has been reached [N].
+    realism: str = "none"  # Errors of the station: "none", "lab" or "poor".
     # Of each surface, drawn log-uniformly from this range [N/m].
     stiffness: list[float] = field(default_factory=lambda: list(STIFFNESS_RANGE))
     control: ChangingContactConfig = field(
@@ -92,6 +94,16 @@ class ContactTask:
     prior: ContactBelief
     friction: np.ndarray  # (3,)
     stiffness: dict[str, float]  # Of the tool against each surface [N/m].
+    errors: StationErrors
+    half: float  # From the tip to what it touches, straight down or to a side [m].
+
+    def table_rise(self, p) -> np.ndarray:
+        """How much higher than in the level world the tip meets the table, (n,) [m].
+
+        Args: p (n, 3) of the tip [m].
+        """
+        rise = self.errors.table_rise(p, position(self.world, "table"))
+        return rise + self.errors.corner_rise(self.half)
 
 
 def make_task(config: ContactLearningConfig) -> ContactTask:
@@ -132,8 +144,9 @@ def make_task(config: ContactLearningConfig) -> ContactTask:
     stiffness = draw_stiffness(rng, SURFACES, config.stiffness)
     set_stiffness(world, config.tool, stiffness)
     return ContactTask(
-        world, model, pattern, truth, ContactBelief(tuple(prior)), friction, stiffness
-    )
+        world, model, pattern, truth, ContactBelief(tuple(prior)), friction, stiffness,
+        draw_errors(config.realism, config.seed), half,
+    )  # fmt: skip
 
 
 def make_pattern(config: ContactLearningConfig, half: float) -> MotionPattern:
@@ -190,4 +203,5 @@ def make_contact_learning(
         tool=TOOL,
         seed=1000 * config.seed + trial,
         meshcat=meshcat,
+        errors=task.errors,
     )

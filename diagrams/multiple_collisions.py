@@ -18,6 +18,7 @@ from makebreak.diagrams.changing_contact import (
     Knowledge,
     make_changing_contact,
 )
+from makebreak.diagrams.realism import StationErrors, draw_errors
 from makebreak.diagrams.tabletop import (
     STIFFNESS_RANGE,
     TABLETOP_WALLS,
@@ -76,6 +77,7 @@ class MultipleCollisionsConfig:
     error_max: float = 0.03  # Of the initial estimates, along the motion [m].
     # Of each surface, drawn log-uniformly from this range [N/m].
     stiffness: list[float] = field(default_factory=lambda: list(STIFFNESS_RANGE))
+    realism: str = "none"  # Errors of the station: "none", "lab" or "poor".
     trials: int = 2  # Each knows what the one before has learned.
     seed: int = 0
     control: ChangingContactConfig = field(
@@ -112,6 +114,16 @@ class CollisionTask:
     truth: np.ndarray  # (4,) p_WE . direction at each impact [m].
     friction: dict[str, float]
     stiffness: dict[str, float]  # Of the tool against each surface [N/m].
+    errors: StationErrors
+    half: float  # From the tip to what it touches, straight down or to a side [m].
+
+    def table_rise(self, p) -> np.ndarray:
+        """How much higher than in the level world the tip meets the table, (n,) [m].
+
+        Args: p (n, 3) of the tip [m].
+        """
+        rise = self.errors.table_rise(p, position(self.world, "table"))
+        return rise + self.errors.corner_rise(self.half)
 
 
 def make_task(config: MultipleCollisionsConfig) -> CollisionTask:
@@ -151,8 +163,9 @@ def make_task(config: MultipleCollisionsConfig) -> CollisionTask:
     stiffness = draw_stiffness(rng, SURFACES, config.stiffness)
     set_stiffness(world, config.tool, stiffness)
     return CollisionTask(
-        world, model, pattern, ContactBelief(tuple(prior)), truth, friction, stiffness
-    )
+        world, model, pattern, ContactBelief(tuple(prior)), truth, friction, stiffness,
+        draw_errors(config.realism, config.seed), half,
+    )  # fmt: skip
 
 
 def surfaces(scene: Scene, half: float) -> np.ndarray:
@@ -245,4 +258,5 @@ def make_multiple_collisions(
     return make_changing_contact(
         control, task.world, task.model, task.pattern, knowledge, TOOL,
         seed=100 * config.seed + trial, meshcat=meshcat, view=view,
+        errors=task.errors,
     )  # fmt: skip

@@ -11,11 +11,12 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import Demultiplexer, Saturation
 
 from makebreak.diagrams.camera import CameraConfig, add_camera
+from makebreak.diagrams.realism import StationErrors
 from makebreak.models.effects import KINDS
 from makebreak.models.scene import InitialSection, Scene, load_scene, read_scene
-from makebreak.systems.contact_probe import ContactProbe, ToolContactForce
+from makebreak.systems.contact_probe import ContactProbe, ToolContactForce, TrueTip
 from makebreak.systems.impedance_controller import serial_chain_of
-from makebreak.systems.noisy_sensor import NoisySensor
+from makebreak.systems.noisy_sensor import DriftingSensor, LateSensor, NoisySensor
 from makebreak.systems.tool_wrench import ToolWrench
 
 MODELS = Path(__file__).resolve().parent.parent / "models"
@@ -50,7 +51,10 @@ class StationConfig:
 
 
 def make_station(
-    config: StationConfig, meshcat: Meshcat | None = None, scene: Scene | None = None
+    config: StationConfig,
+    meshcat: Meshcat | None = None,
+    scene: Scene | None = None,
+    errors: StationErrors | None = None,
 ) -> Diagram:
     """The plant, its sensors and actuators.
 
@@ -66,7 +70,7 @@ def make_station(
              contact_force (4,) = [normal, x, y, z] [N] of the first body of
              config.contact on the second (4 more for each further one);
              {tool}.contact_force (3,) on the tool, of all its contacts, in the world
-             [N], found when asked for;
+             [N], and {tool}.tip_position (3,) in the world [m], found when asked for;
              panda.contact_torque (7,) [N m] of all contacts on the arm's joints;
              contact_results, body_poses (abstract).
 
@@ -74,7 +78,9 @@ def make_station(
     at multiples of its time step; a torque written at such an instant acts from the
     next one on, a torque written just before it acts at once.
 
-    Args: scene, in place of the file, for a world that was changed in memory.
+    Args: scene, in place of the file, for a world that was changed in memory; errors,
+        of which the wrench's and the delays (whole periods) are added here, the others
+        are the scene's.
     """
     builder = DiagramBuilder()
     loaded = load_scene(read_scene(config.scene) if scene is None else scene, builder)
@@ -112,9 +118,18 @@ def make_station(
         channels = [f"{joint}.{each}" for each in what for joint in joints]
         return loaded.measured_output_port(builder, port, channels)
 
+    def late(name: str, port: OutputPort) -> OutputPort:
+        periods = 0 if errors is None else round(errors.delay / period)
+        if periods == 0:
+            return port
+        line = builder.AddNamedSystem(name, LateSensor(port.size(), periods, period))
+        builder.Connect(port, line.get_input_port())
+        return line.get_output_port()
+
+    q_and_v = measured(plant.get_state_output_port(arm), "position", "velocity")
     encoders = noisy(
         f"{ARM}_encoders",
-        measured(plant.get_state_output_port(arm), "position", "velocity"),
+        late(f"{ARM}_encoders_delay", q_and_v),
         np.repeat([noise.position, noise.velocity], n),
         seeds[0],
     )
@@ -159,13 +174,21 @@ def make_station(
     )
     builder.Connect(plant.get_state_output_port(), wrench.GetInputPort("state"))
     std_wrench = np.repeat([noise.force, noise.moment], 3)
+    felt = wrench.GetOutputPort("wrench")
+    if errors is not None and (np.any(errors.force_bias) or np.any(errors.force_drift)):
+        no_moment = np.zeros(3)
+        drifting = builder.AddNamedSystem(
+            f"{ARM}_wrench_bias",
+            DriftingSensor(
+                np.r_[errors.force_bias, no_moment],
+                np.r_[errors.force_drift, no_moment],
+            ),
+        )
+        builder.Connect(felt, drifting.get_input_port())
+        felt = drifting.get_output_port()
+    felt = late(f"{ARM}_wrench_delay", felt)
     builder.ExportOutput(
-        noisy(
-            f"{ARM}_external_wrench",
-            wrench.GetOutputPort("wrench"),
-            std_wrench,
-            seeds[2],
-        ),
+        noisy(f"{ARM}_external_wrench", felt, std_wrench, seeds[2]),
         f"{ARM}.external_wrench",
     )
 
@@ -187,6 +210,9 @@ def make_station(
     builder.ExportOutput(
         touch.GetOutputPort("contact_force"), f"{config.tool}.contact_force"
     )
+    tip = builder.AddNamedSystem("true_tip", TrueTip(chain))
+    builder.Connect(plant.get_state_output_port(arm), tip.get_input_port())
+    builder.ExportOutput(tip.get_output_port(), f"{config.tool}.tip_position")
     builder.ExportOutput(plant.get_state_output_port(), "state")
     builder.ExportOutput(
         plant.get_generalized_contact_forces_output_port(arm), f"{ARM}.contact_torque"

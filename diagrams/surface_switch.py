@@ -18,6 +18,7 @@ from makebreak.diagrams.changing_contact import (
     Knowledge,
     make_changing_contact,
 )
+from makebreak.diagrams.realism import StationErrors, draw_errors
 from makebreak.diagrams.tabletop import (
     SURFACE_SWITCH,
     TOOL,
@@ -79,6 +80,7 @@ class SurfaceSwitchConfig:
     trials: int = 3
     speed: float = 0.1  # Of sliding [m/s].
     normal_force: float = 8.0  # On each surface that has been reached [N].
+    realism: str = "none"  # Errors of the station: "none", "lab" or "poor".
     anticipation: Anticipation = field(default_factory=Anticipation)
     control: ChangingContactConfig = field(default_factory=_control)
 
@@ -92,6 +94,7 @@ class SwitchTask:
     pattern: MotionPattern
     prior: ContactBelief
     friction: np.ndarray  # (3,) of surface 1, of surface 2, of the walls.
+    errors: StationErrors
     feet: float  # From the tip to the corners it stands on, along y [m].
 
 
@@ -134,6 +137,7 @@ def make_task(config: SurfaceSwitchConfig) -> SwitchTask:
         pattern,
         ContactBelief(tuple(prior)),
         friction,
+        draw_errors(config.realism, config.seed),
         FEET[config.tool],
     )
 
@@ -212,4 +216,5 @@ def make_surface_switch(
         tool=TOOL,
         seed=1000 * config.seed + trial,
         meshcat=meshcat,
+        errors=task.errors,
     )

@@ -10,6 +10,7 @@ from makebreak.systems.numerics.contact_force import tip_wrench
 from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.packed import packed
 from makebreak.systems.numerics.serial_chain import SerialChain
+from makebreak.systems.numerics.tip_state import tip_pose
 
 
 class ContactProbe(LeafSystem):
@@ -45,6 +46,28 @@ class ContactProbe(LeafSystem):
             force[row, 0] += abs(f_B @ contact.point_pair().nhat_BA_W)
             force[row, 1:] += sign * f_B
         output.SetFromVector(force.ravel())
+
+
+class TrueTip(LeafSystem):
+    """Where the tip is.
+
+    Inputs:  state (2 n,) of the arm.
+    Outputs: tip_position (3,) in the world [m].
+
+    Args: chain, constants of the arm with its tool, as they are in the world.
+    """
+
+    def __init__(self, chain: SerialChain):
+        super().__init__()
+        self._chain = packed(chain)
+        self._n = len(chain.mass)
+        first_call(tip_pose, self._chain, np.zeros(self._n))
+        self._state = self.DeclareVectorInputPort("state", 2 * self._n)
+        self.DeclareVectorOutputPort("tip_position", 3, self._calc)
+
+    def _calc(self, context: Context, output: BasicVector):
+        q = self._state.Eval(context)[: self._n]
+        output.SetFromVector(tip_pose(self._chain, q)[:3])
 
 
 class ToolContactForce(LeafSystem):

@@ -44,3 +44,62 @@ class NoisySensor(LeafSystem):
         output.SetFromVector(
             add_noise(self._value.Eval(context), self._std, self._seed, sample)
         )
+
+
+class DriftingSensor(LeafSystem):
+    """value + bias + drift x time.
+
+    Inputs:  value (n,).
+    Outputs: measured (n,).
+
+    Args: bias (n,); drift (n,) [1/s].
+    """
+
+    def __init__(self, bias, drift):
+        super().__init__()
+        self._bias, self._drift = (np.array(x, dtype=float) for x in (bias, drift))
+        n = len(self._bias)
+        self._value = self.DeclareVectorInputPort("value", n)
+        self.DeclareVectorOutputPort("measured", n, self._measure)
+
+    def _measure(self, context: Context, output: BasicVector):
+        added = self._bias + self._drift * context.get_time()
+        output.SetFromVector(self._value.Eval(context) + added)
+
+
+class LateSensor(LeafSystem):
+    """What `value`, which changes at multiples of a period alone, was periods ago.
+
+    Before the start it was what it is at the start.
+
+    Inputs:  value (n,).
+    Outputs: measured (n,).
+
+    Args: size n; periods, 1 or more; period_sec.
+    """
+
+    def __init__(self, size: int, periods: int, period_sec: float):
+        super().__init__()
+        if periods < 1:
+            raise ValueError(f"periods is {periods}, expected 1 or more")
+        self._periods = periods
+        self._value = self.DeclareVectorInputPort("value", size)
+        self._past = self.DeclareDiscreteState(periods * size)  # The oldest first.
+        self.DeclareVectorOutputPort(
+            "measured", size, self._measure, {self.all_state_ticket()}
+        )
+        self.DeclareInitializationDiscreteUpdateEvent(self._fill)
+        self.DeclarePeriodicDiscreteUpdateEvent(period_sec, 0.0, self._shift)
+
+    def _measure(self, context: Context, output: BasicVector):
+        past = context.get_discrete_state(self._past).value()
+        output.SetFromVector(past[: self._value.size()])
+
+    def _fill(self, context: Context, discrete_state):
+        now = self._value.Eval(context)
+        discrete_state.set_value(self._past, np.tile(now, self._periods))
+
+    def _shift(self, context: Context, discrete_state):
+        past = context.get_discrete_state(self._past).value()
+        later = np.r_[past[self._value.size() :], self._value.Eval(context)]
+        discrete_state.set_value(self._past, later)

@@ -125,6 +125,7 @@ def made_up_log(task, force=(8.0, 9.0, 7.0), events=(0, 1, 2), offset=0.0):
         "contact": np.zeros((n, N_CONTACT)),
     }
     log["ee_pose"][:, :3] = places
+    log["tip_true"] = log["ee_pose"][:, :3]
     segment = np.repeat(np.arange(3), segments)
     log["phase"][:, PHASE_SEGMENT] = segment
     log["phase"][-100:, PHASE_STAGE] = DONE

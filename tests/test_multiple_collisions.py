@@ -148,7 +148,14 @@ def made_up_log(task, peak=6.0, late=0.0):
             p[time > 1.5 * (i + 1) + 0.6, 2] += 0.2
             p[time > 1.5 * (i + 1) + 0.6, 0] -= 0.05
     phase[time > 7.0, PHASE_STAGE] = DONE
-    log = dict(time=time, ee_pose=p, wrench=wrench, contact=contact, phase=phase)
+    log = dict(
+        time=time,
+        ee_pose=p,
+        tip_true=p[:, :3],
+        wrench=wrench,
+        contact=contact,
+        phase=phase,
+    )
     return log | dict(ee_velocity=np.zeros((n, 6)))
 
 

@@ -134,7 +134,7 @@ def run(config: ContactLearningConfig, session: Session) -> dict:
 
 def scored(log: dict[str, np.ndarray], task: ContactTask, belief) -> Trial:
     """A trial, from its log and the truth."""
-    time, p = log["time"], log["ee_pose"][:, :3]
+    time, p = log["time"], log["tip_true"]
     stage, segment = log["phase"][:, PHASE_STAGE], log["phase"][:, PHASE_SEGMENT]
     ended = np.flatnonzero(stage == DONE)
     contact = log["contact"]
@@ -144,18 +144,20 @@ def scored(log: dict[str, np.ndarray], task: ContactTask, belief) -> Trial:
         name: np.full(N, np.nan)
         for name in "touched force force_raw force_felt a10 a_raw speed".split()
     }
-    missed = 0
+    missed, where = 0, np.sum(task.truth * DIRECTIONS, axis=1)
     for i, d in enumerate(DIRECTIONS):
-        away = (task.truth[i] - p) @ d
+        rise = task.table_rise(p) if i == 0 else np.zeros(len(p))
+        away = (task.truth[i] - p) @ d - rise
         reached = np.flatnonzero((away < REACHED) & (segment >= i))
+        if reached.size == 0:
+            continue
+        where[i] = task.truth[i] @ d - rise[reached[0]]
         near = [
             k
             for k, event in enumerate(events)
             if event[DIRECTION] @ d > 0.7
-            and abs((event[POSITION] - task.truth[i]) @ d) < MATCH
+            and abs(event[POSITION] @ d - where[i]) < MATCH + task.errors.place
         ]
-        if reached.size == 0:
-            continue
         if not near:
             missed += 1
         touch = np.flatnonzero((away < TOUCHED) & (segment >= i))
@@ -175,7 +177,7 @@ def scored(log: dict[str, np.ndarray], task: ContactTask, belief) -> Trial:
         mine = [c for c in belief.contacts if c.kind == IMPACT and c.segment == i]
         if mine:  # The one that will be met first is what the next trial expects.
             c = mine[int(np.argmin([one.mean @ d for one in mine]))]
-            error[i] = (c.mean - task.truth[i]) @ d
+            error[i] = c.mean @ d - where[i]
             std[i] = spread_along(c.covariance, d)
     handling = np.isin(stage, (ENTER, REGION, SETTLE)) & (
         log["phase"][:, PHASE_KIND] == IMPACT

@@ -141,7 +141,7 @@ def _trial(config, task, knowledge, k, session, name, peaks):
 
 def scored(log: dict[str, np.ndarray], task: CollisionTask) -> Trial:
     """A trial, from its log and the truth."""
-    time, p = log["time"], log["ee_pose"][:, :3]
+    time, p = log["time"], log["tip_true"]
     segment, stage = log["phase"][:, PHASE_SEGMENT], log["phase"][:, PHASE_STAGE]
     contact = log["contact"]
     events = contact[np.flatnonzero(np.diff(contact[:, MADE]) > 0) + 1]
@@ -152,7 +152,8 @@ def scored(log: dict[str, np.ndarray], task: CollisionTask) -> Trial:
     }
     missed = 0
     for i, ((d, _, k), where) in enumerate(zip(IMPACTS, task.truth, strict=True)):
-        away = where - p @ d
+        rise = task.table_rise(p) if IMPACTS[i][1] == "table" else np.zeros(len(p))
+        away = where - rise - p @ d
         reached = np.flatnonzero((away < REACHED) & (segment >= k))
         if reached.size == 0:
             continue
@@ -160,7 +161,8 @@ def scored(log: dict[str, np.ndarray], task: CollisionTask) -> Trial:
             j
             for j, event in enumerate(events)
             if event[DIRECTION] @ d > 0.7
-            and abs(event[POSITION] @ d - where) < MATCH
+            and abs(event[POSITION] @ d - where + rise[reached[0]])
+            < MATCH + task.errors.place
             and not used[j]
         ]
         missed += not near
@@ -173,7 +175,8 @@ def scored(log: dict[str, np.ndarray], task: CollisionTask) -> Trial:
         if near:
             used[near[0]] = True
             values["speed"][i] = events[near[0]][SPEED]
-            values["error"][i] = events[near[0]][POSITION] @ d - where
+            place = events[near[0]][POSITION] @ d
+            values["error"][i] = place - where + rise[reached[0]]
     broken = np.flatnonzero(np.diff(contact[:, BROKEN]) > 0)
     a = np.gradient(log["ee_velocity"][:, :3], time[1] - time[0], axis=0)
     a10 = np.linalg.norm(low_pass(a, 10.0, time[1] - time[0]), axis=1)

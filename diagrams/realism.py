@@ -1,0 +1,120 @@
+"""Errors that a real station has and its model does not: the `realism` setting.
+
+A level says how large they are, the seed what they are. They stay the same from trial
+to trial, as those of a robot do. Controllers know nothing of them.
+"""
+
+from copy import deepcopy
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.common.schema import Transform
+
+from makebreak.models.effects.kind import Effect
+from makebreak.models.scene import Scene
+from makebreak.models.typed_yaml import nearest
+
+N_JOINTS = 7
+
+
+@dataclass(frozen=True)
+class Level:
+    """Sizes of the errors."""
+
+    encoder: float  # Standard deviation of each encoder's offset [rad].
+    tool: float  # The tool is so much longer than modelled [m].
+    tilt: float  # Of the table, in any direction [rad].
+    force: float  # Bias of each force, up to so much either way [N].
+    drift: float  # And its change, up to so much either way [N/s].
+    delay: float  # Of encoders and wrench [s].
+
+
+REALISM = {
+    "none": Level(0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    "lab": Level(5e-4, 0.002, np.radians(0.5), 0.5, 0.01, 0.001),
+    "poor": Level(1e-3, 0.004, np.radians(1.0), 1.0, 0.03, 0.003),
+}
+REACH = 0.7  # From an encoder to the tip, about [m].
+
+
+@dataclass(frozen=True, eq=False)
+class StationErrors:
+    """The errors of one station; none by default."""
+
+    encoders: np.ndarray = field(default_factory=lambda: np.zeros(N_JOINTS))  # [rad]
+    tool: float = 0.0  # [m]
+    tilt: np.ndarray = field(default_factory=lambda: np.zeros(2))  # Roll, pitch [rad].
+    force_bias: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [N]
+    force_drift: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [N/s]
+    delay: float = 0.0  # [s]
+
+    @property
+    def place(self) -> float:
+        """How far from the truth the arm may believe its tip, about [m]."""
+        return abs(self.tool) + 3.0 * REACH * float(np.std(self.encoders))
+
+    def table_rise(self, p, origin) -> np.ndarray:
+        """How much higher the table is than it would be level, (n,) [m].
+
+        Args: p (n, 3) of places in the world, origin (3,) about which it is tilted [m].
+        """
+        roll, pitch = self.tilt
+        # Of the normal Ry(pitch) Rx(roll) z.
+        normal = np.array([
+            np.sin(pitch) * np.cos(roll),
+            -np.sin(roll),
+            np.cos(pitch) * np.cos(roll),
+        ])  # fmt: skip
+        away = np.asarray(p)[:, :2] - np.asarray(origin)[:2]
+        return -away @ normal[:2] / normal[2]
+
+    def corner_rise(self, half: float) -> float:
+        """How much higher an upright block of half width `half` [m] meets it [m]."""
+        return half * float(np.abs(np.tan(self.tilt)).sum())
+
+
+def draw_errors(level: str, seed: int) -> StationErrors:
+    """The errors of the station of this seed.
+
+    Raises: ValueError for a level that there is not.
+    """
+    if level not in REALISM:
+        raise ValueError(f"realism is {level!r}: {nearest(level, REALISM)}")
+    size = REALISM[level]
+    rng = np.random.default_rng([seed, 23])
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    return StationErrors(
+        encoders=size.encoder * rng.normal(size=N_JOINTS),
+        tool=size.tool,
+        tilt=size.tilt * np.array([np.cos(angle), np.sin(angle)]),
+        force_bias=size.force * rng.uniform(-1.0, 1.0, size=3),
+        force_drift=size.drift * rng.uniform(-1.0, 1.0, size=3),
+        delay=size.delay,
+    )
+
+
+def with_errors(
+    scene: Scene, errors: StationErrors, arm: str, tool: str, table: str
+) -> Scene:
+    """The world with these errors: all but the wrench's and the delays, which the
+    station adds.
+
+    Args: arm, tool, table: names of models; the tool is welded to the arm.
+    """
+    scene = deepcopy(scene)
+    joints = [f"{arm}.panda_joint{i + 1}" for i in range(N_JOINTS)]
+    for joint, offset in zip(joints, errors.encoders.tolist(), strict=True):
+        if offset != 0.0:
+            scene.effects.append(Effect("joint_offset", [joint], {"offset": offset}))
+    if np.any(errors.tilt):
+        roll, pitch = errors.tilt.tolist()
+        tilt = {"roll": roll, "pitch": pitch}
+        scene.effects.append(Effect("plane_tilt", [table], tilt))
+    for directive in scene.directives:
+        weld = directive.add_weld
+        if weld is not None and weld.child.split("::")[0] == tool and errors.tool:
+            if weld.X_PC is None:
+                weld.X_PC = Transform()
+            x, y, z = np.array(weld.X_PC.translation, dtype=float)
+            weld.X_PC.translation = [x, y, z + errors.tool]
+    return scene

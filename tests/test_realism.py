@@ -1,0 +1,165 @@
+"""Errors of the station that its model does not have."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+
+from makebreak.diagrams.multiple_collisions import MultipleCollisionsConfig, make_task
+from makebreak.diagrams.realism import (
+    REALISM,
+    StationErrors,
+    draw_errors,
+    with_errors,
+)
+from makebreak.diagrams.station import (
+    TIP_FRAME,
+    SensorNoise,
+    StationConfig,
+    make_control_plant,
+    make_station,
+)
+from makebreak.diagrams.tabletop import TABLETOP_WALLS, TOOL, position
+from makebreak.models.scene import load_scene, read_scene
+from makebreak.scripts.experiments import contact_learning, multiple_collisions
+from makebreak.systems.impedance_controller import serial_chain_of
+from makebreak.systems.numerics.packed import packed
+from makebreak.systems.numerics.tip_state import tip_pose
+
+ARM = "panda"
+QUIET = SensorNoise(0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def errors(**changes):
+    return StationErrors(**changes)
+
+
+def station(these, sampled=True):
+    world = with_errors(read_scene(TABLETOP_WALLS), these, ARM, TOOL, "table")
+    config = StationConfig(
+        noise=QUIET, tool=TOOL, contact=[TOOL, "table"], sampled=sampled
+    )
+    return make_station(config, None, world, these)
+
+
+def test_levels_are_drawn_by_the_seed_and_none_is_nothing():
+    none = draw_errors("none", 3)
+    assert not any(np.any(value) for value in vars(none).values()) and none.place == 0.0
+    many = [draw_errors("lab", seed) for seed in range(200)]
+    lab = REALISM["lab"]
+    # 1400 Gaussian numbers: their deviation within 4 sigma/sqrt(2 n).
+    np.testing.assert_allclose(np.std([e.encoders for e in many]), 5e-4, rtol=0.08)
+    for e in many:
+        np.testing.assert_allclose(np.linalg.norm(e.tilt), np.radians(0.5))
+        assert np.all(abs(e.force_bias) <= 0.5) and np.all(
+            abs(e.force_drift) <= lab.drift
+        )
+        assert (e.tool, e.delay) == (0.002, 0.001)
+    assert np.std([e.force_bias for e in many]) > 0.25
+    np.testing.assert_array_equal(many[5].encoders, draw_errors("lab", 5).encoders)
+    assert draw_errors("poor", 0).delay == 0.003
+    with pytest.raises(ValueError, match="realism is 'labb': did you mean lab"):
+        draw_errors("labb", 0)
+
+
+def test_encoders_and_a_longer_tool_put_the_tip_elsewhere_than_the_arm_believes():
+    offsets = np.array([1.0, -2.0, 0.5, 3.0, -1.0, 0.2, 4.0]) * 1e-3
+    diagram = station(errors(encoders=offsets, tool=0.003))
+    root = diagram.CreateDefaultContext()
+    q = diagram.GetOutputPort(f"{ARM}.position_measured").Eval(root)
+    model = make_control_plant(read_scene(TABLETOP_WALLS), TOOL)
+    # A scene's initial positions are what is measured: the arm stands elsewhere.
+    started = model.GetPositions(model.CreateDefaultContext())
+    np.testing.assert_allclose(q, started, atol=1e-12)
+    chain = packed(serial_chain_of(model, TIP_FRAME))
+    believed = tip_pose(chain, q - offsets)[:3]  # By an arm without offsets.
+    true = diagram.GetOutputPort(f"{TOOL}.tip_position").Eval(root)
+    np.testing.assert_allclose(true - believed, [0.0, 0.0, -0.003], atol=1e-4)
+    assert 5e-4 < np.linalg.norm(tip_pose(chain, q)[:3] - believed) < 5e-3
+
+
+@pytest.mark.parametrize("delay", [0.001, 0.003])
+def test_what_is_measured_comes_late_with_a_bias_that_drifts(delay):
+    bias, drift = np.array([0.4, -0.3, 0.2]), np.array([1.0, 2.0, -3.0])
+    late = errors(force_bias=bias, force_drift=drift, delay=delay)
+    logs = {}
+    for name, these in (("late", late), ("true", errors())):
+        diagram = station(these)
+        root = diagram.CreateDefaultContext()
+        diagram.GetInputPort(f"{ARM}.torque_commanded").FixValue(root, np.zeros(7))
+        simulator = Simulator(diagram, root)  # It falls.
+        rows = []
+        for k in range(60):
+            simulator.AdvanceTo(1e-3 * k + 5e-4)
+            rows.append([
+                *diagram.GetOutputPort(f"{ARM}.position_measured").Eval(root),
+                *diagram.GetOutputPort(f"{ARM}.velocity_measured").Eval(root),
+                *diagram.GetOutputPort(f"{ARM}.external_wrench").Eval(root),
+            ])  # fmt: skip
+        logs[name] = np.array(rows)
+    n = round(delay / 1e-3)
+    measured, true = logs["late"][20:], logs["true"][20 - n : 60 - n]
+    assert np.ptp(true[:, 7:14], axis=0).max() > 0.1
+    np.testing.assert_allclose(measured[:, :14], true[:, :14], atol=1e-9)
+    off = measured[:, 14:17] - true[:, 14:17]
+    time = 1e-3 * np.arange(20, 60)[:, None]
+    # The drift is as late as the rest: 3 N/s by at most 3.5 ms.
+    np.testing.assert_allclose(off, bias + drift * time, atol=0.012)
+    np.testing.assert_allclose(measured[:, 17:], true[:, 17:], atol=1e-9)
+
+
+def test_the_table_is_where_drake_has_it():
+    these = errors(tilt=np.array([0.006, -0.009]))
+    scene = with_errors(read_scene(TABLETOP_WALLS), these, ARM, TOOL, "table")
+    builder = DiagramBuilder()
+    loaded = load_scene(scene, builder)
+    root = builder.Build().CreateDefaultContext()
+    graph = loaded.scene_graph
+    query = graph.get_query_output_port().Eval(graph.GetMyContextFromRoot(root))
+    origin = position(scene, "table")
+    p = np.array([[0.42, -0.16, 0.0], [0.6, 0.1, 0.0], [0.5, 0.3, 0.0]])
+    rise = these.table_rise(p, origin)
+    assert abs(rise).max() > 5e-4
+    inspector = graph.model_inspector()
+    for at, up in zip(p, rise, strict=True):
+        at = at + [0.0, 0.0, up]
+        (distance,) = [
+            one.distance
+            for one in query.ComputeSignedDistanceToPoint(at, 0.05)
+            if inspector.GetName(one.id_G).startswith("table::")
+        ]
+        assert abs(distance) < 1e-9
+    # Of an upright block's corners the first one touches.
+    corners = np.array([[a, b, 0.0] for a in (-1, 1) for b in (-1, 1)]) * 0.015
+    highest = these.table_rise(p[0] + corners, origin).max()
+    np.testing.assert_allclose(highest, rise[0] + these.corner_rise(0.015), atol=1e-8)
+
+
+def test_the_model_s_scene_is_left_as_it_is():
+    scene = read_scene(TABLETOP_WALLS)
+    with_errors(scene, draw_errors("poor", 0), ARM, TOOL, "table")
+    assert scene.effects == [] and all(
+        d.add_weld.X_PC is None for d in scene.directives
+        if d.add_weld is not None and d.add_weld.child == "tool::tool"
+    )  # fmt: skip
+
+
+def test_contacts_are_scored_by_the_truth():
+    task = make_task(MultipleCollisionsConfig(seed=100, realism="lab"))
+    p = np.array([[0.42, -0.16, 0.1]])
+    rise = task.table_rise(p)
+    assert rise.shape == (1,) and abs(rise[0]) > 1e-5
+    # At the table's true height, which is not the level one's, it is touched.
+    time = np.arange(0.0, 0.4, 1e-3)
+    z = -task.truth[0] + rise[0] + 0.1 * np.maximum(0.2 - time, 0.0)
+    n = len(time)
+    tip = np.column_stack([np.full(n, 0.42), np.full(n, -0.16), z])
+    log = dict(
+        time=time, tip_true=tip, ee_pose=np.full((n, 7), np.nan),
+        ee_velocity=np.zeros((n, 6)), wrench=np.zeros((n, 6)),
+        contact=np.zeros((n, 14)), phase=np.zeros((n, 6)),
+    )  # fmt: skip
+    trial = multiple_collisions.scored(log, task)
+    assert trial.touched[0] == pytest.approx(0.2, abs=2e-3)
+    assert np.isnan(trial.touched[1:]).all() and trial.missed == 1
+    assert contact_learning.Config(realism="poor").realism == "poor"
