@@ -24,6 +24,7 @@ from pydrake.systems.primitives import (
 )
 
 from makebreak.diagrams.camera import CameraConfig, camera_model
+from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.station import (
     ARM,
@@ -90,6 +91,7 @@ OFFSET = dict(
     tracker=1e-4, estimator=2e-4, task=3e-4, lcs=3e-4, learner=3.5e-4, c3=4e-4,
     reference=4.5e-4, impedance=7e-4,
 )  # fmt: skip
+BALL_CHANNELS = ("ball.ball.x", "ball.ball.y")  # What a camera above sees of it.
 PLAN_DT, TIP_MASS, N_TIP = 0.1, 1.0, 4  # N_TIP: forces of tip and ball, the first ones.
 
 
@@ -589,6 +591,12 @@ def add_ball_rolling(
         ("torque_log", impedance.GetOutputPort("tau")),
     ):
         LogVectorOutput(source, builder, ARM_TICK).set_name(name)
+    # The ball's height is no measurement: the tracker takes the model's radius for it.
+    of_ball = [""] * N_X
+    of_ball[P_BALL.start : P_BALL.start + 2] = BALL_CHANNELS
+    seen = {"ball": (estimator.GetOutputPort("x"), of_ball)}
+    tau = impedance.GetOutputPort("tau")
+    record_station(builder, station, tau, TOOL, CONTROL, seen)
     gap = np.zeros((1, n_lam))
     gap[0, :N_TIP] = LEARN / N_TIP
     gap_of_r = builder.AddNamedSystem("learned_gap", MatrixGain(gap))

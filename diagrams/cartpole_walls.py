@@ -17,6 +17,7 @@ from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
+from makebreak.diagrams.recorder import add_recorder
 from makebreak.models.scene import load_scene
 from makebreak.systems.baselines.dynamics_residual_learner import (
     DynamicsResidualLearner,
@@ -214,6 +215,13 @@ def make_cartpole_walls(
             "walls_view", WallsView(WallsViewConfig(gap=list(model.c)), meshcat)
         )
         builder.Connect(r_comp, view.GetInputPort("r_comp"))
+    names = ("slide.position", "pivot.position", "slide.velocity", "pivot.velocity")
+    add_recorder(
+        builder,
+        {"x": (x, [f"cartpole.{name}" for name in names])},
+        {"u": (u, ["cartpole.slide.effort_command"])},
+        DT,
+    )
     builder.ExportOutput(x, "x")
     builder.ExportOutput(u, "u")
     builder.ExportOutput(r_comp, "r_comp")

@@ -22,6 +22,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 
 from makebreak.diagrams.realism import StationErrors, with_errors
+from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.station import (
     ARM,
     TIP_FRAME,
@@ -299,6 +300,7 @@ def make_changing_contact(
             connect(source, port, impedance)
     connect(impedance, "tau", station, port=f"{ARM}.torque_commanded")
 
+    record_station(builder, station, impedance.GetOutputPort("tau"), tool)
     # For scoring and for the eye alone.
     _add_telemetry(builder, SIGNALS)
     if meshcat is not None:

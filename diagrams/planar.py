@@ -10,11 +10,13 @@ force feedforward the measured force is taken off u, whatever the controller.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem
 
+from makebreak.diagrams.recorder import add_recorder
 from makebreak.models.effects.delay_line import DelayLine
 from makebreak.systems.baselines.force_feedforward import ForceFeedforward
 from makebreak.systems.noisy_sensor import NoisySensor
@@ -26,6 +28,9 @@ from makebreak.systems.planar_world import (
     PlanarWorldConfig,
 )
 
+MODELS = Path(__file__).resolve().parent.parent / "models"
+PLANAR = str(MODELS / "planar.scene.yaml")  # The effector alone: what is believed.
+AXES = "effector"  # The model there; its joints are x and y.
 PERIOD = 0.001  # Of world and controllers [s].
 FORCE_MAX = 100.0  # |u| of every controller [N].
 MASS = 1.0  # Of the effector; known to the controllers that use a mass [kg].
@@ -139,6 +144,19 @@ def make_planar(
     for i in range(controller.num_output_ports()):
         port = controller.get_output_port(i)
         builder.ExportOutput(port, port.get_name())
+    entries = [f"{AXES}.{axis}" for axis in "xy"]
+    add_recorder(
+        builder,
+        {
+            "state": (
+                measured,
+                [f"{e}.{q}" for q in ("position", "velocity") for e in entries],
+            ),
+            "force": (force, [f"{AXES}.tip.f{axis}" for axis in "xy"]),
+        },
+        {"u": (u, [f"{e}.effort_command" for e in entries])},
+        late=True,
+    )
     diagram = builder.Build()
     diagram.set_name("planar")
     return diagram

@@ -24,6 +24,7 @@ from pydrake.systems.primitives import (
 )
 from pydrake.trajectories import PiecewisePolynomial
 
+from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.station import (
     ARM,
     TIP_FRAME,
@@ -297,6 +298,7 @@ def make_wall_friction(
     log = LogVectorOutput(sampled.get_output_port(), builder, ESTIMATE)
     log.set_name("telemetry_log")
     builder.ExportOutput(wrench, "wrench")
+    record_station(builder, station, impedance.GetOutputPort("tau"), TOOL)
     return builder.Build()
 
 

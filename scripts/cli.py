@@ -257,6 +257,8 @@ def _run_in(session, args, module, config, duration) -> int:
         print(Table(args.experiment, ("result", "value"), rows).to_text())
         print("\n".join([*session.endings, told(result)]), flush=True)
     _say_files(files)
+    if session.compared_by:
+        print(f"What the model lacks: {session.compared_by}", flush=True)
     _writable(session)
     if session.interrupted:
         print("makebreak: interrupted; what was recorded is kept", file=sys.stderr)

@@ -4,6 +4,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from pydrake.systems.framework import Diagram
 
+from makebreak.diagrams.planar import PLANAR
+from makebreak.diagrams.recorder import recorded
+from makebreak.models.scene import read_scene
 from makebreak.scripts.session import Log, Session
 
 DURATION, SAMPLE = 6.0, 0.005  # [s]
@@ -61,15 +64,9 @@ def plot_path(ax: Axes, log: Log, label: str, target: bool = True, **style):
     ax.set(xlim=(-0.55, 0.55), ylim=(-0.55, 0.55), aspect=1, xlabel="x [m]")
 
 
-def recording(log: Log) -> dict[str, np.ndarray]:
-    """The columns of recording.csv."""
-    columns = {"time": log.time}
-    for i, axis in enumerate("xy"):
-        columns[f"effector.{axis}.position"] = log["state"][:, i]
-        columns[f"effector.{axis}.velocity"] = log["state"][:, 2 + i]
-        columns[f"effector.{axis}.effort_command"] = log["u"][:, i]
-        columns[f"effector.tip.f{axis}"] = log["force_measured"][:, i]
-    return columns
+def write_recording(session: Session, log: Log) -> None:
+    """What could be measured of a trial, and the effector alone as the model."""
+    session.write_recording(recorded(log.diagram, log.context), read_scene(PLANAR))
 
 
 def median_range(values, scale: float = 1.0, unit: str = "") -> str:

@@ -28,7 +28,8 @@ from pydrake.systems.framework import (
 from tqdm import tqdm
 
 from makebreak.gap.table import write_recording
-from makebreak.models.scene import apply_initial_velocities
+from makebreak.models.scene import Scene, apply_initial_velocities
+from makebreak.models.scene_file import write_scene
 from makebreak.scripts.compiling import CompilingShown
 from makebreak.scripts.diagram_picture import draw_diagram, shown_systems
 from makebreak.scripts.interrupts import handled, leave_terminal, undisturbed
@@ -38,6 +39,8 @@ from makebreak.scripts.trials import run_many
 from makebreak.systems.numerics.first_calls import deferred
 
 __all__ = ["Log", "Session", "run_many"]
+
+MODEL = "model.yaml"
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +147,7 @@ class Session:
         self._drawn = 0  # Systems in the diagram that was.
         self._partial: dict[str, dict[str, np.ndarray]] = {}
         self._timing: dict[str, dict] = {}
+        self.compared_by = ""  # The command that compares recording and model.
 
     def child(self, name: str) -> "Session":
         """A session of its own for one of several trials, in the subfolder `name`."""
@@ -332,13 +336,23 @@ class Session:
         return self.outputs.file(name)
 
     def write_recording(
-        self, columns: Mapping[str, np.ndarray], noise: Mapping | None = None
+        self,
+        columns: Mapping[str, np.ndarray],
+        scene: Scene | None = None,
+        noise: Mapping | None = None,
     ) -> None:
-        """Writes recording.csv, and noise.json where the noise is known.
+        """Writes recording.csv, noise.json where the noise is known, and as model.yaml
+        the scene that controllers believed: what `makebreak gap` is to compare it with.
 
         See gap/table.py for the columns' names.
         """
         self._write("recording.csv", lambda path: write_recording(path, columns, noise))
+        if scene is not None:
+            says = "What the controllers believed."
+            place = self.out_dir
+            self._write(MODEL, lambda path: write_scene(scene, path, says, place=place))
+            files = (self.out_dir / name for name in (MODEL, "recording.csv"))
+            self.compared_by = " ".join(["makebreak gap", *map(str, files)])
 
     def write_result(self, result: Mapping) -> None:
         """Writes result.json: flat, keys in the order given, NaN and infinity as null.

@@ -12,6 +12,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from makebreak import model_path
 from makebreak.diagrams.ball_rolling import BallRollingConfig, believed
+from makebreak.diagrams.recorder import mean_until_next
 from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.scene_simulation import SceneSimulation
 from makebreak.diagrams.station import BALL_ROLLING
@@ -24,7 +25,6 @@ from makebreak.models.scene_file import write_scene
 from makebreak.scripts import close_the_loop as loop
 from makebreak.scripts.cli import main
 from makebreak.scripts.close_the_loop import write_wrong_scene
-from makebreak.scripts.experiments.ball_rolling import mean_until_next
 
 
 @pytest.mark.parametrize("radius", [0.0265, 0.0365])

@@ -9,6 +9,7 @@ from scipy.signal import lfilter
 from scipy.stats import t as student
 
 from makebreak.diagrams.ball_rolling import (
+    BALL_CHANNELS,
     LEARN,
     BallRollingConfig,
     believed,
@@ -16,6 +17,7 @@ from makebreak.diagrams.ball_rolling import (
     world_scene,
 )
 from makebreak.diagrams.camera import describe_camera, vtk_works
+from makebreak.diagrams.recorder import recorded
 from makebreak.diagrams.scene_facts import sphere_radius, spheres_of
 from makebreak.diagrams.station import (
     ARM,
@@ -94,12 +96,7 @@ def run(config, session):
         "gap": system("learned_gap").get_output_port(),
         "seen": system("ball_tracker").GetOutputPort("seen"),
         "c3_status": system("c3_mpc").GetOutputPort("status"),
-        "q": station.GetOutputPort(f"{ARM}.position_measured"),
-        "v": station.GetOutputPort(f"{ARM}.velocity_measured"),
-        "torque": station.GetOutputPort(f"{ARM}.torque_measured"),
-        "tau": system("impedance_controller").GetOutputPort("tau"),
         "phase": system("rolling_task").GetOutputPort("phase"),
-        "wrench": station.GetOutputPort(f"{ARM}.external_wrench"),
     }
     if diagram.HasSubsystemNamed("residual_learner"):
         learner = system("residual_learner")
@@ -127,7 +124,7 @@ def run(config, session):
     result["torque_peak_Nm"] = float(abs(torque).max())
     at_limit = abs(np.diff(torque, axis=1)) >= TORQUE_RATE_MAX * 1e-3 * (1.0 - 1e-9)
     result["torque_rate_limited_share"] = float(at_limit.any(axis=0).mean())
-    write_recording(session, log, plant)
+    write_recording(session, log, config)
     plot_path(session, config, track)
     plot_residual(session, log, track)
     return result
@@ -267,41 +264,15 @@ def score(config, log, track, contact):
     }
 
 
-def write_recording(session, log, plant):
-    """What a real robot could have recorded, and the ball as the camera saw it.
-
-    An effort command is the mean of what was commanded until the next row: 80 Hz are
-    too slow for a torque that changes at 1 kHz, its mean does the same to the arm.
-    The ball's height is no measurement: the tracker takes the model's radius for it.
-    """
-    columns = {"time": log.time}
-    torque = log.diagram.GetSubsystemByName("torque_log").FindLog(log.context)
-    held = mean_until_next(log.time, torque.sample_times(), torque.data().T)
-    for i in range(7):
-        joint = f"{ARM}.panda_joint{i + 1}"
-        columns[f"{joint}.position"] = log["q"][:, i]
-        columns[f"{joint}.velocity"] = log["v"][:, i]
-        columns[f"{joint}.effort_command"] = held[:, i]
-        columns[f"{joint}.effort_measured"] = log["torque"][:, i]
-    for i, axis in enumerate("xy"):
-        ball = log["x"][:, P_BALL.start + i]
-        columns[f"ball.ball.{axis}"] = np.where(log["seen"][:, 0] > 0.5, ball, np.nan)
-    for i, name in enumerate(("fx", "fy", "fz", "tx", "ty", "tz")):
-        columns[f"{TOOL}.{TIP_FRAME}.{name}"] = log["wrench"][:, i]
-    session.write_recording(columns)
-
-
-def mean_until_next(time, fine_time, fine):
-    """Mean (n, k) of what held from each of the times (n,) until the next.
-
-    Args: fine_time (m,), fine (m, k): values that hold from their time on. After the
-        last of the times: the value that holds there.
-    """
-    row = np.searchsorted(fine_time, time - 1e-9)
-    total = np.vstack([np.zeros(fine.shape[1]), np.cumsum(fine, axis=0)])
-    last = np.minimum(np.append(row[1:], row[-1] + 1), len(fine))
-    first = np.minimum(row, last - 1)
-    return (total[last] - total[first]) / (last - first)[:, None]
+def write_recording(session, log, config):
+    """What a real robot could have recorded, the ball only while the camera saw it, and
+    the scene that controllers believed."""
+    columns = recorded(log.diagram, log.context)
+    row = np.searchsorted(log.time, columns["time"] - 1e-9).clip(0, len(log.time) - 1)
+    seen = log["seen"][row, 0] > 0.5
+    for name in BALL_CHANNELS:
+        columns[name] = np.where(seen, columns[name], np.nan)
+    session.write_recording(columns, believed(config)[1])
 
 
 def plot_path(session, config, track):

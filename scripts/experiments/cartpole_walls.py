@@ -31,6 +31,8 @@ from makebreak.diagrams.cartpole_walls import (
     start,
     true_lcs,
 )
+from makebreak.diagrams.recorder import recorded
+from makebreak.models.scene import read_scene
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Log, Session, run_many
 from makebreak.scripts.table import Table
@@ -114,11 +116,10 @@ def run(config: CartpoleWallsConfig, session: Session) -> dict:
     session.save_plot(plot_runs(logs, truth), "stabilisation")
     result |= shares
     log = logs["multibody"]
-    names = ("slide.position", "pivot.position", "slide.velocity", "pivot.velocity")
-    columns = {"time": log.time}
-    columns |= {f"cartpole.{name}": log["x"][:, i] for i, name in enumerate(names)}
-    columns["cartpole.slide.effort_command"] = log["u"][:, 0]
-    session.write_recording(columns)
+    # The walls that the controller believes are an LCS's: no scene has them.
+    session.write_recording(
+        recorded(log.diagram, log.context), read_scene(config.world)
+    )
     return result
 
 

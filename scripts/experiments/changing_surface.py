@@ -33,6 +33,7 @@ from makebreak.diagrams.changing_surface import (
     make_task,
     surface_at,
 )
+from makebreak.diagrams.recorder import recorded
 from makebreak.scripts.criteria import Criteria, motion_ended
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
@@ -102,6 +103,7 @@ def run(config: ChangingSurfaceConfig, session: Session) -> dict:
         done[label] = log["phase"][-1, PHASE_STAGE] == DONE
         logs[label] = telemetry(diagram, log.context)
         if label == "adaptive":
+            recording = recorded(diagram, log.context)
             known = learned(diagram, log.context)
             if known.modes is not None and known.models is not None:
                 known.modes.save(session.path("modes.json"))
@@ -110,12 +112,7 @@ def run(config: ChangingSurfaceConfig, session: Session) -> dict:
     changes, surplus = changes_of(main, task.feet)
     session.save_plot(plot_modes(main, changes, task), "modes")
     session.save_plot(plot_stiffness(logs, changes), "stiffness")
-    columns = {"time": main["time"]}
-    for i, axis in enumerate("xyz"):
-        columns[f"tool.tip.{axis}"] = main["ee_pose"][:, i]
-        columns[f"tool.tip.v{axis}"] = main["ee_velocity"][:, i]
-        columns[f"tool.tip.f{axis}"] = main["wrench"][:, i]
-    session.write_recording(columns)
+    session.write_recording(recording, task.model)
     return summary(logs, done, changes, surplus, task, stiffness.maximum)
 
 

@@ -35,6 +35,7 @@ from makebreak.diagrams.contact_learning import (
     make_contact_learning,
     make_task,
 )
+from makebreak.diagrams.recorder import episodes, recorded
 from makebreak.scripts.criteria import Criteria, motion_ended
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
@@ -99,6 +100,7 @@ def run(config: ContactLearningConfig, session: Session) -> dict:
     task = make_task(config)
     knowledge = Knowledge(contacts=task.prior)
     trials: list[Trial] = []
+    recordings = []
     for k in range(config.trials):
         diagram = make_contact_learning(config, task, knowledge, k, session.meshcat)
         shaper = diagram.GetSubsystemByName("velocity_shaper")
@@ -118,17 +120,12 @@ def run(config: ContactLearningConfig, session: Session) -> dict:
             label=f"trial_{k + 1}",
         )
         knowledge = learned(diagram, log.context)
+        recordings.append(recorded(diagram, log.context))
         trials.append(scored(telemetry(diagram, log.context), task, knowledge.contacts))
     session.save_plot(plot_trials(trials, task), "trials")
     session.save_plot(plot_learning(trials, task), "learning")
     knowledge.contacts.save(session.path("contacts.json"))
-    last = trials[-1].log
-    columns = {"time": last["time"]}
-    for i, axis in enumerate("xyz"):
-        columns[f"tool.tip.{axis}"] = last["ee_pose"][:, i]
-        columns[f"tool.tip.v{axis}"] = last["ee_velocity"][:, i]
-        columns[f"tool.tip.f{axis}"] = last["wrench"][:, i]
-    session.write_recording(columns)
+    session.write_recording(episodes(recordings), task.model)
     return summary(trials, task)
 
 

@@ -66,11 +66,6 @@ def run(config: GentleRollingConfig, session) -> dict:
         "seen": system("ball_tracker").GetOutputPort("seen"),
         "c3_status": system("c3_mpc").GetOutputPort("status"),
         "phase": system("rolling_task").GetOutputPort("phase"),
-        "q": station.GetOutputPort(f"{ARM}.position_measured"),
-        "v": station.GetOutputPort(f"{ARM}.velocity_measured"),
-        "torque": station.GetOutputPort(f"{ARM}.torque_measured"),
-        "tau": system("impedance_controller").GetOutputPort("tau"),
-        "wrench": station.GetOutputPort(f"{ARM}.external_wrench"),
     }
     if config.adapt:
         record["loss"] = system("residual_learner").GetOutputPort("loss")
@@ -93,7 +88,7 @@ def run(config: GentleRollingConfig, session) -> dict:
     result["torque_peak_Nm"] = float(abs(torque).max())
     result["gentle"] = config.gentle
     result["frozen"] = ", ".join(config.frozen)
-    rolling.write_recording(session, log, plant)
+    rolling.write_recording(session, log, ball)
     rolling.plot_path(session, ball, track)
     plot_forces(session, log, time, on_ball, up)
     return result

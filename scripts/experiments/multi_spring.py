@@ -56,10 +56,10 @@ from makebreak.scripts.planar_runs import (
     limit_share,
     median_range,
     plot_path,
-    recording,
     rms,
     trial,
     with_count,
+    write_recording,
 )
 from makebreak.scripts.session import Log, Session, run_many
 from makebreak.scripts.table import Table
@@ -151,7 +151,7 @@ def run(config: MultiSpringConfig, session: Session) -> dict:
     if session.meshcat is not None:  # The last one is what its recording shows.
         one(impedance(config.impedance, config.model), "adaptive_seen", session.meshcat)
     plots(session, ours, logs, learning, bad, swept)
-    session.write_recording(recording(ours[0]))
+    write_recording(session, ours[0])
     return scored(config, ours, logs, learning, bad, swept)
 
 

@@ -35,6 +35,7 @@ from makebreak.diagrams.multiple_collisions import (
     make_multiple_collisions,
     make_task,
 )
+from makebreak.diagrams.recorder import episodes, recorded
 from makebreak.scripts.criteria import Criteria, motion_ended
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
@@ -94,33 +95,32 @@ def run(config: MultipleCollisionsConfig, session: Session) -> dict:
     """Without handling, then the trials with it; see the module for the criterion."""
     task = make_task(config)
     trials: dict[str, Trial] = {}
+    recordings = []
     if config.handling:
         plain = replace(config, handling=False)
-        trials["baseline"], _ = _trial(plain, task, None, 0, session, "baseline", [])
+        trials["baseline"], _, recording = _trial(
+            plain, task, None, 0, session, "baseline", []
+        )
+        recordings.append(recording)
     knowledge: Knowledge | None = None
     peaks = [list(one.force) for one in trials.values()]
     for k in range(config.trials if config.handling else 1):
         name = f"trial_{k + 1}" if config.handling else "baseline"
-        trials[name], knowledge = _trial(
+        trials[name], knowledge, recording = _trial(
             config, task, knowledge, k, session, name, peaks
         )
+        recordings.append(recording)
         peaks.append(list(trials[name].force))
     session.save_plot(plot_trials(trials), "profiles")
     session.save_plot(plot_path(trials, task), "path")
     if knowledge is not None:
         knowledge.contacts.save(session.path("contacts.json"))
-    log = list(trials.values())[-1].log
-    columns = {"time": log["time"]}
-    for i, axis in enumerate("xyz"):
-        columns[f"tool.tip.{axis}"] = log["ee_pose"][:, i]
-        columns[f"tool.tip.v{axis}"] = log["ee_velocity"][:, i]
-        columns[f"tool.tip.f{axis}"] = log["wrench"][:, i]
-    session.write_recording(columns)
+    session.write_recording(episodes(recordings), task.model)
     return summary(trials, task, config)
 
 
 def _trial(config, task, knowledge, k, session, name, peaks):
-    """A trial, scored, and what was learned in it."""
+    """A trial, scored, what was learned in it, and its recording."""
     diagram = make_multiple_collisions(
         config, knowledge, k, session.meshcat, task, ContactViewConfig(peaks=peaks)
     )
@@ -136,7 +136,8 @@ def _trial(config, task, knowledge, k, session, name, peaks):
         ),
         label=name,
     )  # fmt: skip
-    return scored(telemetry(diagram, log.context), task), learned(diagram, log.context)
+    trial = scored(telemetry(diagram, log.context), task)
+    return trial, learned(diagram, log.context), recorded(diagram, log.context)
 
 
 def scored(log: dict[str, np.ndarray], task: CollisionTask) -> Trial:

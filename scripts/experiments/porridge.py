@@ -37,10 +37,10 @@ from makebreak.scripts.planar_runs import (
     errors,
     median_range,
     plot_path,
-    recording,
     rms,
     trial,
     with_count,
+    write_recording,
 )
 from makebreak.scripts.session import Log, Session, run_many
 from makebreak.scripts.table import Table
@@ -139,7 +139,7 @@ def run(config: PorridgeConfig, session: Session) -> dict:
     )  # fmt: skip
     result |= criteria.result()
     plots(session, predicting, driving, bound)
-    session.write_recording(recording(driving["incremental"]))
+    write_recording(session, driving["incremental"])
     return result
 
 

@@ -29,6 +29,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from makebreak.diagrams.changing_contact import Knowledge, learned, telemetry
+from makebreak.diagrams.recorder import episodes, recorded
 from makebreak.diagrams.surface_switch import (
     CROSSINGS,
     SEAM_Y,
@@ -86,6 +87,7 @@ def run(config: SurfaceSwitchConfig, session: Session) -> dict:
     task = make_task(config)
     knowledge = Knowledge(contacts=task.prior)
     trials: list[Trial] = []
+    recordings = []
     for k in range(config.trials):
         diagram = make_surface_switch(config, task, knowledge, k, session.meshcat)
         shaper = diagram.GetSubsystemByName("velocity_shaper")
@@ -98,19 +100,14 @@ def run(config: SurfaceSwitchConfig, session: Session) -> dict:
             label=f"trial_{k + 1}",
         )
         knowledge = learned(diagram, log.context)
+        recordings.append(recorded(diagram, log.context))
         trial = scored(telemetry(diagram, log.context), task.feet)
         # The telemetry's last row is from before the events of its instant.
         done = log["phase"][-1, PHASE_STAGE] == DONE
         trials.append(replace(trial, done=bool(done)))
     session.save_plot(plot_trials(trials, task), "trials")
     knowledge.contacts.save(session.path("contacts.json"))
-    last = trials[-1].log
-    columns = {"time": last["time"]}
-    for i, axis in enumerate("xyz"):
-        columns[f"tool.tip.{axis}"] = last["ee_pose"][:, i]
-        columns[f"tool.tip.v{axis}"] = last["ee_velocity"][:, i]
-        columns[f"tool.tip.f{axis}"] = last["wrench"][:, i]
-    session.write_recording(columns)
+    session.write_recording(episodes(recordings), task.model)
     return summary(trials, task)
 
 

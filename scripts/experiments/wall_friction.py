@@ -29,8 +29,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
-from makebreak.diagrams.station import ARM, TIP_FRAME
-from makebreak.diagrams.tabletop import TOOL
+from makebreak.diagrams.recorder import recorded
+from makebreak.diagrams.tabletop import TABLETOP_WALLS
 from makebreak.diagrams.wall_friction import (
     DURATION,
     TIMES,
@@ -42,6 +42,7 @@ from makebreak.diagrams.wall_friction import (
     telemetry,
     tip_states,
 )
+from makebreak.models.scene import read_scene
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
@@ -102,7 +103,9 @@ def run(config: WallFrictionConfig, session: Session) -> dict:
     seconds: dict[str, float] = {}  # Not of the result: they differ from run to run.
     trials, knowledge = collect(config, seconds)
     result: dict = {"success": False}
-    data, scratch = one_step_ahead(config, session, trials, knowledge, seconds, result)
+    data, scratch, recording = one_step_ahead(
+        config, session, trials, knowledge, seconds, result
+    )
     force = force_from_the_start(config, trials["varied"], data, seconds, result)
     joints = joints_from_the_start(config, trials, data, seconds, result)
 
@@ -122,14 +125,15 @@ def run(config: WallFrictionConfig, session: Session) -> dict:
     session.write_json(TIMES_FILE, seconds)
     session.save_plot(plot_joints(joints), "joint_prediction")
     session.save_plot(plot_forces(data, scratch, force), "force_prediction")
-    write_recording(session, data)
+    session.write_recording(recording, read_scene(TABLETOP_WALLS))
     return result
 
 
 def one_step_ahead(config, session, trials, knowledge, seconds, result):
     """Figure 14: trains, simulates the tested trial with all that predicts, scores.
 
-    Returns: its log, and that of the same trial where our models begin with nothing.
+    Returns: its log, that of the same trial where our models begin with nothing, and
+        what is recorded.
     """
     measured = [force_trial(data) for _, data in trials["varied"]]
     predictors = {}
@@ -162,7 +166,7 @@ def one_step_ahead(config, session, trials, knowledge, seconds, result):
         result[f"{name}_rmse_N"] = rms(mean - force)
         result[f"{name}_in_band"] = share_in_band(force, mean, std)
     result["persistence_rmse_N"] = rms(np.diff(data["wrench"][:, Y])[window[1:]])
-    return logs
+    return *logs, recorded(diagram, log.context)
 
 
 def force_from_the_start(config, trials, data, seconds, result):
@@ -379,18 +383,6 @@ def plot_forces(data, scratch, ahead):
     axes[0, 0].set_ylabel("force along the wall [N]")
     axes[1, 0].set_ylabel("error along the wall [N]")
     return figure
-
-
-def write_recording(session: Session, data):
-    """What a real robot could have recorded."""
-    columns = {"time": data["time"]}
-    for i in range(data["q"].shape[1]):
-        joint = f"{ARM}.panda_joint{i + 1}"
-        columns[f"{joint}.position"] = data["q"][:, i]
-        columns[f"{joint}.velocity"] = data["v"][:, i]
-    for i, name in enumerate(("fx", "fy", "fz", "tx", "ty", "tz")):
-        columns[f"{TOOL}.{TIP_FRAME}.{name}"] = data["wrench"][:, i]
-    session.write_recording(columns)
 
 
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:

@@ -1,0 +1,169 @@
+"""What a real robot could record of a run, for `makebreak gap`: one way for all.
+
+A diagram has a Recorder beside its station or plant; after a simulation `recorded`
+gives the columns of recording.csv (gap/table.py). Sensors are sampled once a row. An
+effort command changes faster than rows come: a row has the mean of what acted from its
+instant until the next row's, which does the same to a mechanism.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from pydrake.systems.framework import (
+    Context,
+    Diagram,
+    DiagramBuilder,
+    OutputPort,
+    System,
+)
+from pydrake.systems.primitives import Multiplexer, VectorLogSink
+
+from makebreak.diagrams.station import ARM, TIP_FRAME
+
+TICK = 0.001  # Of commands [s].
+ROW_SEC = 0.005  # From row to row [s].
+WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
+Channels = Mapping[str, tuple[OutputPort, Sequence[str]]]
+
+
+class Recorder(Diagram):
+    """Logs of measured and of commanded channels.
+
+    Inputs: one for each port that is recorded, of the same name.
+
+    Args:
+        measured, commanded: {input: names of its entries}; an entry without a name is
+            not recorded.
+        row_sec: from one row to the next, a multiple of TICK [s].
+        late: whether a command that is seen at an instant acted in the TICK before it,
+            not from it on.
+    """
+
+    def __init__(
+        self,
+        measured: Mapping[str, Sequence[str]],
+        commanded: Mapping[str, Sequence[str]],
+        row_sec: float = ROW_SEC,
+        late: bool = False,
+    ):
+        super().__init__()
+        self.names = {"measured": measured, "commanded": commanded}
+        self.late = late
+        builder = DiagramBuilder()
+        for what, period in (("measured", row_sec), ("commanded", TICK)):
+            sizes = [len(names) for names in self.names[what].values()]
+            if not sizes:
+                continue
+            joined = builder.AddSystem(Multiplexer(sizes))
+            for i, name in enumerate(self.names[what]):
+                builder.ExportInput(joined.get_input_port(i), name)
+            log = builder.AddNamedSystem(what, VectorLogSink(sum(sizes), period))
+            builder.Connect(joined.get_output_port(), log.get_input_port())
+        builder.BuildInto(self)
+        self.set_name("recorder")
+
+    def log(self, what: str, context: Context) -> tuple[np.ndarray, dict]:
+        """The times and {channel: (n,)} of "measured" or "commanded", in a root
+        context; empty where there are none."""
+        if not self.HasSubsystemNamed(what):
+            return np.zeros(0), {}
+        log = self.GetSubsystemByName(what).FindLog(context)
+        names = [name for part in self.names[what].values() for name in part]
+        values = zip(names, log.data(), strict=True)
+        return np.array(log.sample_times()), {n: np.array(x) for n, x in values if n}
+
+
+def add_recorder(
+    builder: DiagramBuilder,
+    measured: Channels,
+    commanded: Channels,
+    row_sec: float = ROW_SEC,
+    late: bool = False,
+) -> None:
+    """A Recorder of output ports. Args: {input: (port, names of its entries)}; the rest
+    as of Recorder."""
+    parts = ({k: names for k, (_, names) in each.items()} for each in
+             (measured, commanded))  # fmt: skip
+    recorder = builder.AddNamedSystem("recorder", Recorder(*parts, row_sec, late))
+    for name, (port, _) in {**measured, **commanded}.items():
+        builder.Connect(port, recorder.GetInputPort(name))
+
+
+def record_station(
+    builder: DiagramBuilder,
+    station: Diagram,
+    tau: OutputPort,
+    tool: str,
+    row_sec: float = ROW_SEC,
+    seen: Channels | None = None,
+) -> None:
+    """A Recorder of a station: its arm's joints and the wrench at the tool's tip.
+
+    Args: tau (7,), what is commanded; tool, the model of TIP_FRAME; seen, of what else
+        is measured, as by a camera.
+    """
+    joints = [f"{ARM}.panda_joint{i + 1}" for i in range(tau.size())]
+
+    def of(port: str, what: str):
+        names = [f"{joint}.{what}" for joint in joints]
+        return station.GetOutputPort(f"{ARM}.{port}"), names
+
+    measured = {
+        "position": of("position_measured", "position"),
+        "velocity": of("velocity_measured", "velocity"),
+        "torque": of("torque_measured", "effort_measured"),
+        "wrench": (
+            station.GetOutputPort(f"{ARM}.external_wrench"),
+            [f"{tool}.{TIP_FRAME}.{name}" for name in WRENCH],
+        ),
+    }
+    commanded = {"tau": (tau, [f"{joint}.effort_command" for joint in joints])}
+    add_recorder(builder, measured | dict(seen or {}), commanded, row_sec)
+
+
+def recorded(diagram: Diagram, context: Context) -> dict[str, np.ndarray]:
+    """The columns of a simulation that ended in `context`: time (n,) and every channel
+    (n,), a row per row_sec of its Recorder.
+
+    Raises: ValueError for a diagram without a Recorder.
+    """
+    found = [system for system in _within(diagram) if isinstance(system, Recorder)]
+    if not found:
+        raise ValueError(f"{diagram.get_name()} has no recorder")
+    (recorder,) = found
+    time, columns = recorder.log("measured", context)
+    ticks, commands = recorder.log("commanded", context)
+    if commands:
+        fine = np.column_stack(list(commands.values()))
+        begin = ticks - TICK if recorder.late else ticks
+        held = mean_until_next(time, begin, fine)
+        columns |= dict(zip(commands, held.T, strict=True))
+    return {"time": time, **columns}
+
+
+def _within(diagram: Diagram) -> Iterator[System]:
+    for system in diagram.GetSystems():
+        yield system
+        if isinstance(system, Diagram):
+            yield from _within(system)
+
+
+def mean_until_next(time, fine_time, fine):
+    """Mean (n, k) of what held from each of the times (n,) until the next.
+
+    Args: fine_time (m,), fine (m, k): values that hold from their time on. After the
+        last of the times: the value that holds there.
+    """
+    row = np.searchsorted(fine_time, time - 1e-9)
+    row = np.minimum(row, len(fine) - 1)
+    total = np.vstack([np.zeros(fine.shape[1]), np.cumsum(fine, axis=0)])
+    last = np.minimum(np.append(row[1:], row[-1] + 1), len(fine))
+    first = np.minimum(row, last - 1)
+    return (total[last] - total[first]) / (last - first)[:, None]
+
+
+def episodes(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Several simulations as one table, each an episode; channels of all of them."""
+    number = [np.full(len(part["time"]), k) for k, part in enumerate(parts)]
+    table = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+    return {"time": table.pop("time"), "episode": np.concatenate(number), **table}
