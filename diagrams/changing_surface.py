@@ -21,6 +21,8 @@ from makebreak.diagrams.realism import StationErrors, draw_errors
 from makebreak.diagrams.tabletop import (
     THREE_SURFACES,
     TOOL,
+    frictions,
+    read_model,
     set_friction_by_place,
     set_tool,
     tool_half_width,
@@ -73,6 +75,10 @@ class ChangingSurfaceConfig:
     normal_force: float = 8.0  # About; each segment has its own [N].
     realism: str = "none"  # Errors of the station: "none", "lab" or "poor".
     baselines: bool = True  # Constant K_max and constant K_free as well.
+    friction: list[float] = field(
+        default_factory=list
+    )  # Of the three; empty: drawn by the seed.
+    model: str = ""  # Scene that the controllers believe; "": the shipped one.
     control: ChangingContactConfig = field(default_factory=ChangingContactConfig)
 
 
@@ -110,11 +116,11 @@ def make_task(config: ChangingSurfaceConfig) -> SurfaceTask:
     if config.seed < 0:
         raise ValueError(f"seed is {config.seed}, expected an integer of 0 or more")
     rng = np.random.default_rng([config.seed, 7])
-    model, world = read_scene(THREE_SURFACES), read_scene(THREE_SURFACES)
+    model = read_model(config.model, THREE_SURFACES, config.tool)
+    world = read_scene(THREE_SURFACES)
+    set_tool(world, config.tool)
     half = tool_half_width(config.tool)
-    for scene in (model, world):
-        set_tool(scene, config.tool)
-    friction = draw_friction(rng)
+    friction = frictions(config.friction, draw_friction(rng))
     set_friction_by_place(world, "surfaces", friction.tolist(), AREAS)
     forces = config.normal_force * rng.uniform(*FORCE, size=len(PATH))
     contact = ExpectedContact(

@@ -23,9 +23,11 @@ from makebreak.diagrams.tabletop import (
     TABLETOP_WALLS,
     TOOL,
     draw_stiffness,
+    frictions,
     move,
     objects,
     position,
+    read_model,
     set_friction,
     set_stiffness,
     set_tool,
@@ -68,6 +70,11 @@ class ContactLearningConfig:
     realism: str = "none"  # Errors of the station: "none", "lab" or "poor".
     # Of each surface, drawn log-uniformly from this range [N/m].
     stiffness: list[float] = field(default_factory=lambda: list(STIFFNESS_RANGE))
+    # In the world table, red block and blue wall are up to so far from where the
+    # scene has them [m], and have these frictions.
+    spread: float = SPREAD
+    friction: list[float] = field(default_factory=list)  # Empty: drawn by the seed.
+    model: str = ""  # Scene that the controllers believe; "": the shipped one.
     control: ChangingContactConfig = field(
         default_factory=lambda: ChangingContactConfig(
             anticipator=ContactAnticipatorConfig(
@@ -115,14 +122,16 @@ def make_task(config: ContactLearningConfig) -> ContactTask:
         value = getattr(config, name)
         if not 0.0 < value < np.inf:
             raise ValueError(f"{name} is {value}, expected a positive number")
+    if not 0.0 <= config.spread <= SPREAD:
+        raise ValueError(f"spread is {config.spread}, expected 0 to {SPREAD} m")
     rng = np.random.default_rng([config.seed, 3])
-    model, world = read_scene(TABLETOP_WALLS), read_scene(TABLETOP_WALLS)
+    model = read_model(config.model, TABLETOP_WALLS, config.tool)
+    world = read_scene(TABLETOP_WALLS)
+    set_tool(world, config.tool)
     half = tool_half_width(config.tool)
-    for scene in (model, world):
-        set_tool(scene, config.tool)
-    friction = rng.uniform(*FRICTION, size=3)
+    friction = frictions(config.friction, rng.uniform(*FRICTION, size=3))
     set_friction(world, dict(zip(SURFACES, friction.tolist(), strict=True)))
-    shift = rng.uniform(-SPREAD, SPREAD, size=3)
+    shift = rng.uniform(-config.spread, config.spread, size=3)
     for name in objects(world):  # All stand on the table.
         move(world, name, [0.0, 0.0, -shift[0]])
     move(world, "red_block", shift[1] * DIRECTIONS[1])

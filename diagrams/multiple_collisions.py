@@ -24,9 +24,11 @@ from makebreak.diagrams.tabletop import (
     TABLETOP_WALLS,
     TOOL,
     draw_stiffness,
+    frictions,
     move,
     objects,
     position,
+    read_model,
     set_friction,
     set_stiffness,
     set_tool,
@@ -80,6 +82,11 @@ class MultipleCollisionsConfig:
     realism: str = "none"  # Errors of the station: "none", "lab" or "poor".
     trials: int = 2  # Each knows what the one before has learned.
     seed: int = 0
+    # In the world table, red block and blue wall are up to so far from where the
+    # scene has them [m], and have these frictions.
+    spread: float = SPREAD
+    friction: list[float] = field(default_factory=list)  # Empty: drawn by the seed.
+    model: str = ""  # Scene that the controllers believe; "": the shipped one.
     control: ChangingContactConfig = field(
         default_factory=lambda: ChangingContactConfig(
             anticipator=ContactAnticipatorConfig(
@@ -138,14 +145,17 @@ def make_task(config: MultipleCollisionsConfig) -> CollisionTask:
             )
     if not 0.0 <= config.error_max <= 0.1:
         raise ValueError(f"error_max is {config.error_max}, expected 0 to 0.1 m")
+    if not 0.0 <= config.spread <= SPREAD:
+        raise ValueError(f"spread is {config.spread}, expected 0 to {SPREAD} m")
     rng = np.random.default_rng([config.seed, 5])
     half = tool_half_width(config.tool)
-    model, world = read_scene(TABLETOP_WALLS), read_scene(TABLETOP_WALLS)
-    for scene in (model, world):
-        set_tool(scene, config.tool)
-    friction = dict(zip(SURFACES, rng.uniform(*FRICTION, size=3).tolist(), strict=True))
+    model = read_model(config.model, TABLETOP_WALLS, config.tool)
+    world = read_scene(TABLETOP_WALLS)
+    set_tool(world, config.tool)
+    drawn = frictions(config.friction, rng.uniform(*FRICTION, size=3))
+    friction = dict(zip(SURFACES, drawn.tolist(), strict=True))
     set_friction(world, friction)
-    up, left, ahead = rng.uniform(-SPREAD, SPREAD, size=3)
+    up, left, ahead = rng.uniform(-config.spread, config.spread, size=3)
     for name in objects(world):  # All stand on the table.
         move(world, name, [0.0, 0.0, up])
     move(world, "red_block", left * LEFT)

@@ -21,6 +21,7 @@ from pydrake.systems.primitives import Multiplexer, VectorLogSink
 from makebreak.diagrams.station import ARM, TIP_FRAME
 
 TICK = 0.001  # Of commands [s].
+ENCODER_NOISE = {"position": 2e-5, "velocity": 2e-3}  # [m], [rad] and their rates.
 ROW_SEC = 0.005  # From row to row [s].
 WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
 Channels = Mapping[str, tuple[OutputPort, Sequence[str]]]
@@ -82,9 +83,15 @@ def add_recorder(
 ) -> None:
     """A Recorder of output ports. Args: {input: (port, names of its entries)}; the rest
     as of Recorder."""
-    parts = ({k: names for k, (_, names) in each.items()} for each in
-             (measured, commanded))  # fmt: skip
-    recorder = builder.AddNamedSystem("recorder", Recorder(*parts, row_sec, late))
+    recorder = builder.AddNamedSystem(
+        "recorder",
+        Recorder(
+            {name: entries for name, (_, entries) in measured.items()},
+            {name: entries for name, (_, entries) in commanded.items()},
+            row_sec,
+            late,
+        ),
+    )
     for name, (port, _) in {**measured, **commanded}.items():
         builder.Connect(port, recorder.GetInputPort(name))
 
@@ -160,6 +167,20 @@ def mean_until_next(time, fine_time, fine):
     last = np.minimum(np.append(row[1:], row[-1] + 1), len(fine))
     first = np.minimum(row, last - 1)
     return (total[last] - total[first]) / (last - first)[:, None]
+
+
+def with_noise(columns, seed: int) -> dict[str, np.ndarray]:
+    """The columns with the noise of encoders, of experiments whose sensors have none:
+    without any a comparison would be one of rounding errors.
+
+    Args: columns, as `recorded` gives them; seed, of the noise.
+    """
+    rng, found = np.random.default_rng([seed, 17]), dict(columns)
+    for name, y in columns.items():
+        std = ENCODER_NOISE.get(name.rsplit(".", 1)[-1], 0.0)
+        if std:
+            found[name] = y + std * rng.normal(size=len(y))
+    return found
 
 
 def episodes(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:

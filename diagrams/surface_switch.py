@@ -22,7 +22,9 @@ from makebreak.diagrams.realism import StationErrors, draw_errors
 from makebreak.diagrams.tabletop import (
     SURFACE_SWITCH,
     TOOL,
+    frictions,
     position,
+    read_model,
     set_friction,
     set_friction_by_place,
     set_tool,
@@ -81,6 +83,10 @@ class SurfaceSwitchConfig:
     speed: float = 0.1  # Of sliding [m/s].
     normal_force: float = 8.0  # On each surface that has been reached [N].
     realism: str = "none"  # Errors of the station: "none", "lab" or "poor".
+    friction: list[float] = field(
+        default_factory=list
+    )  # Of low, high, walls; empty: drawn by the seed.
+    model: str = ""  # Scene that the controllers believe; "": the shipped one.
     anticipation: Anticipation = field(default_factory=Anticipation)
     control: ChangingContactConfig = field(default_factory=_control)
 
@@ -110,11 +116,12 @@ def make_task(config: SurfaceSwitchConfig) -> SwitchTask:
     if config.seed < 0:
         raise ValueError(f"seed is {config.seed}, expected an integer of 0 or more")
     rng = np.random.default_rng([config.seed, 11])
-    model, world = read_scene(SURFACE_SWITCH), read_scene(SURFACE_SWITCH)
+    model = read_model(config.model, SURFACE_SWITCH, config.tool)
+    world = read_scene(SURFACE_SWITCH)
+    set_tool(world, config.tool)
     half = tool_half_width(config.tool)
-    for scene in (model, world):
-        set_tool(scene, config.tool)
-    friction = np.array([rng.uniform(*span) for span in (LOW, HIGH, WALL)])
+    drawn = np.array([rng.uniform(*span) for span in (LOW, HIGH, WALL)])
+    friction = frictions(config.friction, drawn)
     areas = [FrictionZone(y=[-1.0, SEAM_Y]), FrictionZone(y=[SEAM_Y, 1.0])]
     set_friction_by_place(world, "surfaces", friction[:2].tolist(), areas)
     set_friction(world, {name: float(friction[2]) for name in ("red_block", "stop")})

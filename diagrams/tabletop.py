@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 
 from makebreak.models.effects.kind import Effect
 from makebreak.models.friction_zones import FrictionZone
-from makebreak.models.scene import Scene
+from makebreak.models.scene import Scene, read_scene
 from makebreak.models.typed_yaml import nearest
 
 MODELS = Path(__file__).resolve().parent.parent / "models"
@@ -35,6 +35,19 @@ def _known_tool(tool: str) -> tuple[str, float]:
     if tool not in TOOLS:
         raise ValueError(f"tool is {tool!r}: {nearest(tool, TOOLS)}")
     return TOOLS[tool]
+
+
+def read_model(path: str, shipped: str, tool: str) -> Scene:
+    """The scene that controllers believe: the file, with the tool on the arm.
+
+    Args: path, a scene file; "": the shipped one.
+    Raises: ValueError if there is no such tool, or a part of the shipped scene lacks.
+    """
+    model = read_scene(path or shipped)
+    set_tool(model, tool)
+    for name in objects(read_scene(shipped)):
+        position(model, name)  # Raises if it is not there.
+    return model
 
 
 def tool_half_width(tool: str) -> float:
@@ -101,6 +114,16 @@ def move(scene: Scene, name: str, by) -> None:
         raise ValueError(f"{name} is to be moved by {by}, expected 3 numbers [m]")
     weld = _weld(scene, name)
     weld.X_PC.translation = list(position(scene, name) + by)
+
+
+def frictions(given: list[float], drawn: np.ndarray) -> np.ndarray:
+    """Those that are given, else those that were drawn.
+
+    Raises: ValueError for another number of them.
+    """
+    if given and len(given) != len(drawn):
+        raise ValueError(f"friction is {given}, expected {len(drawn)} numbers")
+    return np.array(given, dtype=float) if given else drawn
 
 
 def set_friction(scene: Scene, friction: dict[str, float]) -> None:

@@ -380,10 +380,8 @@ class ContactProblem(ContactDynamics, GapProblem):
         """A rectangle: cells of the ground that was slid over are tried one by one, a
         rectangle is the sum of its cells; the best is searched on exactly."""
         at = self.pair_name(pair)
-        if not self._lies(pair) or at not in self.dynamics.places("friction_patch"):
-            return []
         there = list(current.effects)
-        if any(e.kind in ("plane_tilt", "friction_patch") for e in there):
+        if not self._may_have_patch(pair, there):
             return []
         mu = self._friction_now(pair)
         for e in there:
@@ -448,6 +446,12 @@ class ContactProblem(ContactDynamics, GapProblem):
             return patch(np.clip(mu + c[0], 0.05 * mu, max(1.5, 2.0 * mu)), sides)
 
         return [Candidate("friction_patch", (at,), 5, (column,), (read,))]
+
+    def _may_have_patch(self, pair, there: Sequence[Effect]) -> bool:
+        at = self.pair_name(pair)
+        if not self._lies(pair) or at not in self.dynamics.places("friction_patch"):
+            return False
+        return not any(e.kind in ("plane_tilt", "friction_patch") for e in there)
 
     def _search_patch(self, moved: Callable, mu, friction, sides, train, most):
         """The error, friction and sides from which no small move takes off more."""

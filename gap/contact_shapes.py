@@ -164,6 +164,10 @@ class ContactShapes:
         self.points = [p for p in self.points if counts(p.body)]
         self.surfaces = [s for s in self.surfaces if counts(s.body)]
 
+    def never_touch(self, point: _Point, surface: _Surface) -> bool:
+        """Whether the scene filters their contact."""
+        return self._apart[point.geometry, surface.geometry]
+
     def bodies(self) -> list[int]:
         return sorted({p.body for p in self.points} | {s.body for s in self.surfaces})
 

@@ -43,12 +43,25 @@ REACH = 3.0
 def runs_against(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
     """Whether a link touches something fixed every now and then, as the scene has the
     shapes; what belongs to the robot's own model does not count."""
-    try:
-        shapes = walls_of(dynamics)
-    except ValueError:
-        return False
-    if shapes is None:
-        return False
+    return _met_walls(dynamics, recordings) is not None
+
+
+def _met_walls(
+    dynamics: SceneDynamics, recordings: Sequence[Recording]
+) -> ContactShapes | None:
+    """The shapes that run against each other every now and then; those of a robot's own
+    base only if no others do, as models overlap there. None: none do."""
+    for own in (False, True):
+        try:
+            shapes = walls_of(dynamics, own)
+        except ValueError:
+            return None
+        if shapes is not None and _now_and_then(dynamics, shapes, recordings):
+            return shapes
+    return None
+
+
+def _now_and_then(dynamics: SceneDynamics, shapes, recordings) -> bool:
     touches, inside, whole = 0, 0, 0
     for recording in recordings:
         q = positions(dynamics, recording)
@@ -56,17 +69,17 @@ def runs_against(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bo
             rows = np.arange(episode.first, episode.last)
             whole += len(rows)
             some = rows[:: max(len(rows) // LOOKS, 1)]
-            if not _least(shapes, dynamics, q[some]).min(initial=np.inf) < NEAR:
+            if not nearest(shapes, dynamics, q[some]).min(initial=np.inf) < NEAR:
                 continue
-            near = _least(shapes, dynamics, q[rows]) < 0.0
+            near = nearest(shapes, dynamics, q[rows]) < 0.0
             touches += int(np.sum(np.diff(near.astype(int)) == 1))
             inside += int(near.sum())
     return touches >= FEWEST and inside < MOST_SHARE * whole
 
 
-def walls_of(dynamics: SceneDynamics) -> ContactShapes | None:
-    """Shapes of links, and of what is fixed and no part of a robot; None if there are
-    not both. Raises: ValueError as ContactShapes."""
+def walls_of(dynamics: SceneDynamics, own: bool = False) -> ContactShapes | None:
+    """Shapes of links, and of what is fixed and, unless `own`, no part of a robot; None
+    if there are not both. Raises: ValueError as ContactShapes."""
     plant = dynamics.plant
     moving = {
         plant.GetModelInstanceName(j.model_instance()) for j in one_dof_joints(plant)
@@ -75,7 +88,7 @@ def walls_of(dynamics: SceneDynamics) -> ContactShapes | None:
 
     def counts(body: int) -> bool:
         model = shapes.names[body].split(".")[0]
-        return (body in shapes.anchored) == (model not in moving)
+        return own or body not in shapes.anchored or model not in moving
 
     shapes.keep(counts)
     sides = {s.body in shapes.anchored for s in shapes.surfaces}
@@ -99,7 +112,7 @@ def positions(dynamics: SceneDynamics, recording: Recording) -> np.ndarray:
     return q
 
 
-def _least(shapes: ContactShapes, dynamics: SceneDynamics, q) -> np.ndarray:
+def nearest(shapes: ContactShapes, dynamics: SceneDynamics, q) -> np.ndarray:
     """(n,) distance of the nearest pair."""
     if not len(q):
         return np.zeros(0)
@@ -118,9 +131,9 @@ class ImpactWindows(WindowModel):
 
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
         scene = with_step(scene, 0.0)
-        self.shapes = walls_of(SceneDynamics(scene))
+        self.shapes = _met_walls(SceneDynamics(scene), recordings)
         if self.shapes is None:
-            raise ValueError("nothing fixed that a link could touch")
+            raise ValueError("nothing fixed that a link touches now and then")
         self._touches = 0
         self._free: list[Window] = []
         super().__init__(scene, recordings, LONGEST_SEC, most=10**6)
@@ -147,7 +160,7 @@ class ImpactWindows(WindowModel):
         if len(time) < 3 * ROWS_BEFORE:
             return
         q = positions(self.dynamics, recording)[episode.rows]
-        near = _least(self.shapes, self.dynamics, q) < 0.0
+        near = nearest(self.shapes, self.dynamics, q) < 0.0
         edges = np.flatnonzero(np.diff(np.concatenate([[0], near, [0]]).astype(int)))
         touches = list(zip(edges[::2], edges[1::2], strict=True))
         # Free stretches, and the states in them: a smoother across a touch blurs both.

@@ -31,7 +31,9 @@ UNEVEN = 2e-5  # How flat what carries is; points share a load to k times it [m]
 PYRAMID = 12  # Sides about a friction cone.
 MOST_SHARED = 6  # Rows that share loads.
 # What changes shapes, surfaces and where they are.
-SURFACES = ("contact_friction", "friction_patch", "plane_tilt", "plane_height")
+SURFACES = (
+    "contact_friction", "friction_patch", "plane_tilt", "plane_height", "wall_position",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -255,18 +257,7 @@ class PermittedContacts(ContactMeans):
     def _generators(self, effects: Sequence[Effect], shift: Shift | None = None):
         """G (K, rows, columns), which can act (K, columns), slot of each column; the
         slots; how loads are shared."""
-        moved = shift or any(e.kind in ("plane_tilt", "plane_height") for e in effects)
-        if moved:
-            slots, poses = self._slots(effects, shift)
-            masks = dict(zip((s.key for s in self.slots), self._masks, strict=True))
-            slots = [s for s in slots if s.key in masks]
-            made = self._columns(slots, poses, masks)
-        else:
-            slots = self.slots
-            if self._known_columns is None:
-                masks = dict(zip((s.key for s in slots), self._masks, strict=True))
-                self._known_columns = self._columns(slots, self._node_poses, masks)
-            made = self._known_columns
+        slots, made = self._contacts_at(effects, shift)
         K, n = len(self.means.time), len(self.coordinates) + 3 * len(self.sensors)
         frictions = {
             number: self._friction(slots[number], effects)
@@ -289,6 +280,22 @@ class PermittedContacts(ContactMeans):
         else:
             sharing = self._known_sharing
         return G, there, [c.slot for c in made], slots, sharing
+
+    def _contacts_at(self, effects: Sequence[Effect], shift: Shift | None):
+        """The slots where effects put the shapes, and their columns."""
+        moved = shift or any(e.kind in ("plane_tilt", "plane_height") for e in effects)
+        if moved:
+            slots, poses = self._slots(effects, shift)
+            masks = dict(zip((s.key for s in self.slots), self._masks, strict=True))
+            slots = [s for s in slots if s.key in masks]
+            made = self._columns(slots, poses, masks)
+        else:
+            slots = self.slots
+            if self._known_columns is None:
+                masks = dict(zip((s.key for s in slots), self._masks, strict=True))
+                self._known_columns = self._columns(slots, self._node_poses, masks)
+            made = self._known_columns
+        return slots, made
 
     def _columns(self, slots: Sequence[Slot], poses, masks) -> list[_Column]:
         """Of each slot the force along its slip, and where it may stick those of a

@@ -268,7 +268,9 @@ class _Search:
         self, found: Sequence[Candidate], chosen: Sequence[Choice], current: Fitted
     ) -> tuple[_Step | None, list[Considered]]:
         taken = {(c.effect.kind, tuple(c.effect.at)) for c in chosen}
-        open_ = [c for c in found if (c.kind, c.at) not in taken]
+        open_ = [
+            c for c in found if (c.kind, c.at) not in taken or KINDS[c.kind].several
+        ]
         if not self.plan.own_values:  # There places share a value first.
             open_ += _groups(open_)
         # With what is chosen free to give way, as far as slopes tell.

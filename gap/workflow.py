@@ -20,6 +20,7 @@ from makebreak.gap.measure import WINDOW_SEC
 from makebreak.gap.mechanism import MechanismProblem
 from makebreak.gap.objects import FlightProblem, RolloutProblem, TouchProblem
 from makebreak.gap.parallel import side_by_side
+from makebreak.gap.pressing import PressingProblem, presses
 from makebreak.gap.problem import DISTANCES, Fitted, GapProblem, Outcome, is_sane
 from makebreak.gap.recording import (
     Recording,
@@ -99,7 +100,9 @@ def run_gap(
     checks = check_recordings(parts.decided, scene_facts(dynamics.plant))
     is_mechanism = _is_mechanism(dynamics, recordings)
     # An impact would be smeared by means over rows.
-    meets = is_mechanism and runs_against(dynamics, parts.decided)
+    meets = is_mechanism and (
+        runs_against(dynamics, parts.decided) or presses(dynamics, parts.decided)
+    )
     decided, done = condition(parts.decided, is_mechanism and not meets)
     checks += done
     reported, _ = condition(parts.reported, is_mechanism and not meets)
@@ -132,6 +135,11 @@ def problem_for(
     Args: dynamics: of the scene.
     """
     if _is_mechanism(dynamics, recordings):
+        if presses(dynamics, recordings):
+            try:
+                return PressingProblem(scene, recordings), []
+            except ValueError:  # Too little motion.
+                pass
         if runs_against(dynamics, recordings):
             try:
                 return ImpactProblem(scene, recordings), []

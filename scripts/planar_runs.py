@@ -4,8 +4,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from pydrake.systems.framework import Diagram
 
-from makebreak.diagrams.planar import PLANAR
-from makebreak.diagrams.recorder import recorded
+from makebreak.diagrams.planar import PLANAR, PlanarSensing
+from makebreak.diagrams.recorder import recorded, with_noise
 from makebreak.models.scene import read_scene
 from makebreak.scripts.session import Log, Session
 
@@ -64,9 +64,12 @@ def plot_path(ax: Axes, log: Log, label: str, target: bool = True, **style):
     ax.set(xlim=(-0.55, 0.55), ylim=(-0.55, 0.55), aspect=1, xlabel="x [m]")
 
 
-def write_recording(session: Session, log: Log) -> None:
+def write_recording(session: Session, log: Log, sensing: PlanarSensing, seed: int):
     """What could be measured of a trial, and the effector alone as the model."""
-    session.write_recording(recorded(log.diagram, log.context), read_scene(PLANAR))
+    columns = recorded(log.diagram, log.context)
+    if not any(sensing.state_std()):
+        columns = with_noise(columns, seed)
+    session.write_recording(columns, read_scene(PLANAR))
 
 
 def median_range(values, scale: float = 1.0, unit: str = "") -> str:

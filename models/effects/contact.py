@@ -270,30 +270,50 @@ FAR = 100.0  # Half width of what a half-space becomes, and a box's depth [m].
 
 
 def _level_ground(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph):
-    """The id of the ground's only shape, the shape, and its pose in the world.
+    """The ground's shapes, flush on top: their ids, shapes, and poses in the world.
 
-    Raises: ValueError if it is not a level box or half-space.
+    Raises: ValueError if they are not one level box or half-space, or level boxes that
+        are flush, such as an earlier patch leaves.
     """
     ground, _ = _changed_and_other(effect, plant)
     where = f"effect friction_patch at {effect.at[0]!r}"
     X_WB = anchored_pose(effect, plant, ground)
     inspector = scene_graph.model_inspector()
-    shapes = list(_shapes(plant, scene_graph, ground))
-    shape = inspector.GetShape(shapes[0][0]) if len(shapes) == 1 else None
-    if not isinstance(shape, (Box, HalfSpace)):
+    found = []
+    for geometry, _ in _shapes(plant, scene_graph, ground):
+        X_WG = X_WB @ inspector.GetPoseInFrame(geometry)
+        found.append((geometry, inspector.GetShape(geometry), X_WG))
+    kinds = {type(shape) for _, shape, _ in found}
+    if kinds != {Box} and not (kinds == {HalfSpace} and len(found) == 1):
         raise ValueError(
             f"{where}: expected {full_name(plant, ground)} to have one collision shape,"
             " a box or a half-space"
         )
-    X_WG = X_WB @ inspector.GetPoseInFrame(shapes[0][0])
-    R = X_WG.rotation().matrix()
-    level = abs(R[2, 2]) > 1.0 - 1e-9
-    square = np.allclose(np.sort(abs(R), axis=0)[:2], 0.0, atol=1e-6)
-    if not level or (isinstance(shape, Box) and not square):
+    tops = []
+    for _, shape, X_WG in found:
+        R = X_WG.rotation().matrix()
+        level = abs(R[2, 2]) > 1.0 - 1e-9
+        square = np.allclose(np.sort(abs(R), axis=0)[:2], 0.0, atol=1e-6)
+        if not level or (isinstance(shape, Box) and not square):
+            raise ValueError(
+                f"{where}: expected {full_name(plant, ground)} level, its sides along "
+                "x, y"
+            )
+        tops.append(_span(shape, X_WG)[1][2])
+    if np.ptp(tops) > 1e-9:
         raise ValueError(
-            f"{where}: expected {full_name(plant, ground)} level, its sides along x, y"
+            f"{where}: expected the shapes of {full_name(plant, ground)} to be flush"
         )
-    return shapes[0][0], shape, X_WG
+    return found
+
+
+def _span(shape: Box | HalfSpace, X_WG: RigidTransform):
+    """(3,) from and to, in the world; of a half-space FAR about the world's origin."""
+    centre = X_WG.translation()
+    if isinstance(shape, Box):
+        half = abs(X_WG.rotation().matrix()) @ (shape.size() / 2.0)
+        return centre - half, centre + half
+    return np.array([-FAR, -FAR, centre[2] - FAR]), np.array([FAR, FAR, centre[2]])
 
 
 def _patch_now(effect: Effect, plant: MultibodyPlant, scene_graph) -> dict[str, float]:
@@ -303,72 +323,68 @@ def _patch_now(effect: Effect, plant: MultibodyPlant, scene_graph) -> dict[str, 
 
 
 def _patch(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-    """Cuts the ground's one box or half-space into the patch and what is around it.
+    """Cuts each shape of the ground into its part of the patch and what is around it.
 
     Tops are flush. A friction that needs a rougher thing makes it so, and what is
     around the patch smoother; the thing's pairs with third bodies change with it. What
     slides over the edge touches both for a moment: a sphere of radius R that sinks in
-    by s does so for sqrt(8 R s).
+    by s does so for sqrt(8 R s). Of patches that overlap the later one counts.
     """
     p = effect.parameters
     where = f"effect friction_patch at {effect.at[0]!r}"
     if p["x_min"] >= p["x_max"] or p["y_min"] >= p["y_max"]:
         raise ValueError(f"{where}: the patch is empty: {p}")
     ground, thing = _changed_and_other(effect, plant)
-    geometry, shape, X_WG = _level_ground(effect, plant, scene_graph)
-    X_WB = anchored_pose(effect, plant, ground)
+    shapes = _level_ground(effect, plant, scene_graph)
+    X_BW = anchored_pose(effect, plant, ground).inverse()
     inspector = scene_graph.model_inspector()
-    # A copy: the original will have changed.
-    old = ProximityProperties(inspector.GetProximityProperties(geometry))
-    R = X_WG.rotation().matrix()
-    centre = X_WG.translation()
-    if isinstance(shape, Box):
-        half = abs(R) @ (shape.size() / 2.0)
-        top, depth = centre[2] + half[2], 2.0 * half[2]
-    else:
-        half, top, depth = np.full(3, FAR), centre[2], FAR
-        centre = np.zeros(3)
-    low, high = centre - half, centre + half
-    x = np.clip([low[0], p["x_min"], p["x_max"], high[0]], low[0], high[0])
-    y = np.clip([low[1], p["y_min"], p["y_max"], high[1]], low[1], high[1])
-    if not (x[1] < x[2] and y[1] < y[2]):
-        raise ValueError(f"{where}: the patch is off {full_name(plant, ground)}")
-    mu, mu_ground = p["friction"], _friction(old)
+    mu = p["friction"]
     mu_thing = _friction_against(effect, plant, scene_graph, thing, ground)
-    if not 2.0 * mu_thing > mu:
-        # Only a rougher thing can have it: then the ground around becomes smoother.
-        around = _both(mu_ground, mu_thing)
-        mu_thing = mu
-        mu_ground = around * mu_thing / (2.0 * mu_thing - around)
+    # Only a rougher thing can have more: then the ground around becomes smoother.
+    rougher = mu if not 2.0 * mu_thing > mu else mu_thing
+    mu_patch = mu * rougher / (2.0 * rougher - mu) if mu > 0.0 else 0.0
+    source, met = plant.get_source_id(), False
+    for number, (geometry, shape, X_WG) in enumerate(shapes):
+        low, high = _span(shape, X_WG)
+        # A copy: the original will have changed.
+        old = ProximityProperties(inspector.GetProximityProperties(geometry))
+        around = _both(_friction(old), mu_thing)
+        mu_ground = around * rougher / (2.0 * rougher - around)
+        x = np.clip([low[0], p["x_min"], p["x_max"], high[0]], low[0], high[0])
+        y = np.clip([low[1], p["y_min"], p["y_max"], high[1]], low[1], high[1])
+        inside = x[1] < x[2] and y[1] < y[2]
+        met |= bool(inside)
+        # Its part of the patch; strips left and right; strips before and behind it.
+        pieces = [
+            (x[1], x[2], y[1], y[2]),
+            (x[0], x[1], y[0], y[3]),
+            (x[2], x[3], y[0], y[3]),
+            (x[1], x[2], y[0], y[1]),
+            (x[1], x[2], y[2], y[3]),
+        ]
+        if not inside:
+            pieces = [(low[0], high[0], low[1], high[1])]
+        pieces = [each for each in pieces if each[0] < each[1] and each[2] < each[3]]
+        for i, (x0, x1, y0, y1) in enumerate(pieces):
+            box = Box(x1 - x0, y1 - y0, high[2] - low[2])
+            middle = [(x0 + x1) / 2.0, (y0 + y1) / 2.0, (low[2] + high[2]) / 2.0]
+            X_BG = X_BW @ RigidTransform(middle)
+            mu_piece = _coulomb(mu_patch if inside and i == 0 else mu_ground)
+            properties = ProximityProperties(old)
+            properties.UpdateProperty("material", "coulomb_friction", mu_piece)
+            if i == 0:
+                scene_graph.ChangeShape(source, geometry, box, X_BG)
+                scene_graph.AssignRole(
+                    source, geometry, properties, RoleAssign.kReplace
+                )
+            else:
+                name = f"{ground.name()}_of_{len(shapes)}_{number}_around_patch_{i}"
+                plant.RegisterCollisionGeometry(ground, X_BG, box, name, properties)
+    if not met:
+        raise ValueError(f"{where}: the patch is off {full_name(plant, ground)}")
+    if rougher != mu_thing:
         only = _shapes_that_meet(effect, plant, scene_graph, thing, ground)
         _set_surface(plant, scene_graph, thing, "coulomb_friction", _coulomb(mu), only)
-    mu_patch = mu * mu_thing / (2.0 * mu_thing - mu) if mu > 0.0 else 0.0
-    # Patch; strips left and right; strips before and behind it.
-    pieces = [
-        (x[1], x[2], y[1], y[2]),
-        (x[0], x[1], y[0], y[3]),
-        (x[2], x[3], y[0], y[3]),
-        (x[1], x[2], y[0], y[1]),
-        (x[1], x[2], y[2], y[3]),
-    ]
-    source = plant.get_source_id()
-    for i, (x0, x1, y0, y1) in enumerate(pieces):
-        if not (x0 < x1 and y0 < y1):
-            continue
-        box = Box(x1 - x0, y1 - y0, depth)
-        p_WG = [(x0 + x1) / 2.0, (y0 + y1) / 2.0, top - depth / 2.0]
-        X_BG = X_WB.inverse() @ RigidTransform(p_WG)
-        properties = ProximityProperties(old)
-        properties.UpdateProperty(
-            "material", "coulomb_friction", _coulomb(mu_patch if i == 0 else mu_ground)
-        )
-        if i == 0:
-            scene_graph.ChangeShape(source, geometry, box, X_BG)
-            scene_graph.AssignRole(source, geometry, properties, RoleAssign.kReplace)
-        else:
-            plant.RegisterCollisionGeometry(
-                ground, X_BG, box, f"{ground.name()}_around_patch_{i}", properties
-            )
 
 
 def anchored_pose(
@@ -578,6 +594,7 @@ KINDS = {
     ),
     "friction_patch": EffectKind(
         at="pair",
+        several=True,
         parameters=(
             Parameter("friction", "", 0.01, 1.5, None, valid=">= 0"),
             *(

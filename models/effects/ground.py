@@ -40,6 +40,17 @@ def _lift(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> Non
         _move(effect, plant, scene_graph, body, lambda X_WG, p_WB: up @ X_WG)
 
 
+def _displace(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+    by = RigidTransform(np.array([effect.parameters.get(a, 0.0) for a in "xyz"]))
+    for body in find_bodies(effect, plant):
+        _move(effect, plant, scene_graph, body, lambda X_WG, p_WB: by @ X_WG)
+
+
+def _some_are_given(effect: Effect) -> None:
+    if not effect.parameters:
+        raise ValueError(f"effect {effect.kind} at {effect.at} needs `x`, `y` or `z`")
+
+
 def _tilt(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
     """About the body's origin, along the world's axes."""
     R = rotation(effect)
@@ -61,6 +72,20 @@ KINDS = {
         confused_with=("object_size", "contact_stiffness", "length_scale"),
         tell_apart="rest on several faces, or use a second object of another size",
         before_finalize=_lift,
+    ),
+    "wall_position": EffectKind(
+        at="ground",
+        parameters=tuple(
+            Parameter(a, "m", -0.2, 0.2, 0.0, optional=True) for a in "xyz"
+        ),
+        says="{at} stands elsewhere than modelled[, by {x} along x][, by {y} along y]"
+        "[, by {z} along z]",
+        confused_with=("plane_height", "joint_offset", "contact_stiffness"),
+        tell_apart="touch it in several attitudes of the robot: an offset of a joint "
+        "shifts the tool by another length in each",
+        contains=("plane_height",),
+        check=_some_are_given,
+        before_finalize=_displace,
     ),
     "plane_tilt": EffectKind(
         at="ground",

@@ -88,6 +88,7 @@ class EffectKind:
     confused_with, tell_apart: kinds that look alike, and what tells them apart.
     time: "both", or "discrete"/"continuous" where it makes sense in one only.
     rank: effects of lower rank are applied first, else in the scene's order.
+    several: a place may have more than one.
     hidden_state: it adds coordinates that no channel measures.
     weighs: it changes weights or gravity: what two such add is not what both add.
 
@@ -134,6 +135,7 @@ class EffectKind:
     tell_apart: str = ""
     time: str = "both"
     rank: int = 0
+    several: bool = False
     hidden_state: bool = False
     weighs: bool = False
     check: Callable[[Effect], None] | None = None

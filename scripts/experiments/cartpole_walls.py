@@ -31,7 +31,7 @@ from makebreak.diagrams.cartpole_walls import (
     start,
     true_lcs,
 )
-from makebreak.diagrams.recorder import recorded
+from makebreak.diagrams.recorder import recorded, with_noise
 from makebreak.models.scene import read_scene
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Log, Session, run_many
@@ -117,9 +117,8 @@ def run(config: CartpoleWallsConfig, session: Session) -> dict:
     result |= shares
     log = logs["multibody"]
     # The walls that the controller believes are an LCS's: no scene has them.
-    session.write_recording(
-        recorded(log.diagram, log.context), read_scene(config.world)
-    )
+    columns = with_noise(recorded(log.diagram, log.context), config.seed)
+    session.write_recording(columns, read_scene(config.world))
     return result
 
 

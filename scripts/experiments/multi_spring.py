@@ -44,6 +44,7 @@ from makebreak.diagrams.multi_spring import (
 )
 from makebreak.diagrams.planar import knowledge_of
 from makebreak.diagrams.planar_tuned import (
+    setting_of,
     tuned_active_inference,
     tuned_impedance,
     tuned_mrac,
@@ -151,7 +152,7 @@ def run(config: MultiSpringConfig, session: Session) -> dict:
     if session.meshcat is not None:  # The last one is what its recording shows.
         one(impedance(config.impedance, config.model), "adaptive_seen", session.meshcat)
     plots(session, ours, logs, learning, bad, swept)
-    write_recording(session, ours[0])
+    write_recording(session, ours[0], setting_of(setting).sensing, config.seed)
     return scored(config, ours, logs, learning, bad, swept)
 
 

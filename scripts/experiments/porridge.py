@@ -28,7 +28,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from makebreak.diagrams.multi_spring import impedance, mrac
-from makebreak.diagrams.planar import knowledge_of
+from makebreak.diagrams.planar import PlanarSensing, knowledge_of
 from makebreak.diagrams.porridge import PorridgeConfig, draw, make_porridge
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.planar_runs import (
@@ -139,7 +139,8 @@ def run(config: PorridgeConfig, session: Session) -> dict:
     )  # fmt: skip
     result |= criteria.result()
     plots(session, predicting, driving, bound)
-    write_recording(session, driving["incremental"])
+    sensing = PlanarSensing(force_noise=config.force_noise)
+    write_recording(session, driving["incremental"], sensing, config.seed)
     return result
 
 
