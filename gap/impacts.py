@@ -14,10 +14,11 @@ import numpy as np
 
 from makebreak.gap.contact_problem import reader_of_trial
 from makebreak.gap.contact_shapes import ContactShapes, poses_of
+from makebreak.gap.findings import Finding
 from makebreak.gap.mechanism import link_changes
 from makebreak.gap.objects import WindowedProblem
 from makebreak.gap.problem import Candidate, Fitted, Nuisances, SearchPlan
-from makebreak.gap.recording import Episode, Recording
+from makebreak.gap.recording import FEWEST_ROWS, Episode, Recording, part_of
 from makebreak.gap.windows import Window, WindowModel, with_step
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
@@ -33,6 +34,7 @@ LOOKS = 4000  # Rows at which it is first asked whether anything comes near.
 NEAR = 0.01  # [m]
 FEWEST = 3  # Touches.
 MOST_SHARE = 0.5  # Of the time, that may be spent in touch: else it lies there.
+BESIDE_SEC, LEAST_SEC = 0.1, 0.5  # About a touch; a stretch without one.
 DRAWS = 3  # Of uncertain starts.
 BLUR = 0.003  # Of how far a channel goes in a window: laws are no better.
 TRIED = (0.2, 0.4, 0.7, 0.9, 1.15, 1.7, 2.6, 4.5)  # Times what the scene has.
@@ -59,6 +61,68 @@ def _met_walls(
         if shapes is not None and _now_and_then(dynamics, shapes, recordings):
             return shapes
     return None
+
+
+def without_contact(
+    dynamics: SceneDynamics, recordings: Sequence[Recording]
+) -> tuple[list[Recording], list[Finding]]:
+    """The recordings less the few times at which a link touches what is fixed, for
+    equations that know of no contact; and what was left out. All of them where nothing
+    touches, or so much that it is no touch."""
+    kept = list(recordings)
+    for own in (False, True):
+        try:
+            shapes = walls_of(dynamics, own)
+        except ValueError:
+            return kept, []
+        if shapes is None:
+            continue
+        parts = [_apart(dynamics, shapes, recording) for recording in recordings]
+        if all(part is None for part in parts) or any(
+            part is not None and not part[0] for part in parts
+        ):
+            continue
+        found = []
+        for k, part in enumerate(parts):
+            if part is None:
+                continue
+            episodes, seconds = part
+            name = recordings[k].name
+            kept[k] = part_of(recordings[k], episodes)
+            says = (
+                f"A link touches what is fixed now and then; {seconds:.2g} s about "
+                "that are left out: too few touches to judge contact by."
+            )
+            found.append(Finding("touches", name, "time", seconds, "s", "info", says))
+        return kept, found
+    return kept, []
+
+
+def _apart(dynamics: SceneDynamics, shapes, recording: Recording):
+    """Episodes without touches and how long the rest is; None: nothing touches; no
+    episodes where too much would be left out."""
+    q = positions(dynamics, recording)
+    episodes: list[Episode] = []
+    seconds, some = 0.0, False
+    for episode in recording.episodes:
+        time = recording.time[episode.rows]
+        near = nearest(shapes, dynamics, q[episode.rows]) < 0.0
+        some |= bool(near.any())
+        for k in np.flatnonzero(near):
+            near |= np.abs(time - time[k]) < BESIDE_SEC
+        edges = np.flatnonzero(np.diff(np.concatenate([[1], near, [1]]).astype(int)))
+        seconds += float(np.median(np.diff(time)) * near.sum())
+        for number, (a, b) in enumerate(zip(edges[::2], edges[1::2], strict=True)):
+            if b - a >= FEWEST_ROWS and time[b - 1] - time[a] >= LEAST_SEC:
+                first, last = episode.first + int(a), episode.first + int(b)
+                episodes.append(
+                    Episode(episode.number, first, last, episode.stretch + number)
+                )
+    if not some:
+        return None
+    return (
+        episodes if seconds < MOST_SHARE * recording.duration_sec() else []
+    ), seconds
 
 
 def _now_and_then(dynamics: SceneDynamics, shapes, recordings) -> bool:

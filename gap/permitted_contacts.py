@@ -28,6 +28,7 @@ CARRIES = 0.012  # What is fixed may carry what is measured so far above it [m],
 STEEP = 0.12  # and turned by so much against how it would rest [rad].
 EDGE = 8e-4  # Over which a patch of friction sets in [m].
 UNEVEN = 2e-5  # How flat what carries is; points share a load to k times it [m].
+ONE_WAY = 0.9  # Mean of the directions of slip within a test function, at least.
 PYRAMID = 12  # Sides about a friction cone.
 MOST_SHARED = 6  # Rows that share loads.
 # What changes shapes, surfaces and where they are.
@@ -314,6 +315,8 @@ class PermittedContacts(ContactMeans):
             fast = np.asarray(W @ ((speed >= SLIDES) & mine).astype(float)).ravel()
             slides = fast >= 0.999 * weight  # Slower in any part: it may stick.
             along = slip / np.maximum(speed, 1e-9)[:, None]
+            one_way = np.linalg.norm(W @ (along * mine[:, None]), axis=1)
+            slides &= one_way >= ONE_WAY * weight  # Turning round, it may stick.
             e1 = np.cross(s.normal, np.where(
                 np.abs(s.normal[:, :1]) > 0.7, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]]
             ))  # fmt: skip

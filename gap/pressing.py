@@ -18,12 +18,13 @@ from makebreak.gap.contact_problem import ContactProblem
 from makebreak.gap.contact_shapes import Slot
 from makebreak.gap.impacts import MOST_SHARE, nearest, positions, walls_of
 from makebreak.gap.permitted_contacts import SLACK, Shift
-from makebreak.gap.problem import Nuisances
+from makebreak.gap.problem import Candidate, Fitted, Nuisances
 from makebreak.gap.recording import Recording
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
 from makebreak.systems.numerics.permitted_forces import explain
+from makebreak.systems.numerics.selection import Screen
 
 REACH = 0.12  # What is fixed is no farther off than this [m].
 KNOCKED = 8e-3  # A knock goes no deeper than this [m].
@@ -33,6 +34,8 @@ PASSED = 4e-3  # No contact lets a tool so far in [m].
 FELT, LESS = 4.0, 0.5  # Mean square of what is left where a face is felt; with it.
 CLEAR, LEAST_FORCE, FELT_SHARE = 6.0, 0.5, 0.03  # Times noise, [N], of the rows.
 MOVES = ("wall_position", "plane_height")
+WHOLE = 0.9  # Of the squares left: what one more of a body leaves is tried first.
+SOFTER = (0.3, 0.6, 2.0)  # Times the stiffness of the scene: trials.
 MOST_FRICTION = 2.0  # Of what is taken for any.
 MOST_PATCHES, MOST_EFFECTS = 3, 10
 MOST_KEPT = 12  # Geometries.
@@ -99,7 +102,8 @@ class PressingProblem(ContactProblem):
 
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
         self._geometries: dict[tuple, _Geometry] = {}
-        self._any_friction, self._mu = False, None
+        self._any_friction = False
+        self._mu: float | None = None
         super().__init__(scene, recordings)
 
     # ----- What may touch
@@ -403,6 +407,7 @@ class PressingProblem(ContactProblem):
         return (*made, of + most[2], slots, self._sharing(of + of, slots))
 
     def left(self, effects: Sequence[Effect] = (), shift: Shift | None = None):
+        self._softened = [e for e in effects if e.kind == "contact_stiffness"]
         self._placed = [e for e in effects if e.kind in MOVES]
         if self._any_friction:
             self._placed += self._displacing(self.off)
@@ -422,7 +427,13 @@ class PressingProblem(ContactProblem):
                 columns.append(np.zeros(K))
                 continue
             nearest = np.min([s.phi for s in mine], axis=0)
-            d = self._W @ nearest + self._pressed.get(pair, 0.0) / mine[0].stiffness
+            stiffness = mine[0].stiffness
+            for e in self._softened:
+                if self._at_pair(e, pair):
+                    stiffness = e.parameters["stiffness"]
+            if not stiffness > 0.0:
+                raise ValueError("contact_stiffness: not above zero")
+            d = self._W @ nearest + self._pressed.get(pair, 0.0) / stiffness
             columns.append(np.where(on, d / shape, 0.0))
         return -np.stack(columns, axis=1) if columns else np.zeros((K, 0))
 
@@ -498,6 +509,23 @@ class PressingProblem(ContactProblem):
                 return s.friction
         return 0.0
 
+    def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
+        """Patches of friction, which explain much at some places, only where no other
+        place or friction of a whole body explains more."""
+        found = self._plain_candidates(current.r, current.effects)
+        train = self.train()
+        screen = Screen(current.r, nuisances.columns, nuisances.prior, train)
+        r = screen.settle(current.r)[1][train]
+        for c in found:
+            if c.kind in (*MOVES, "contact_friction"):
+                for X in c.columns:
+                    fit = np.linalg.lstsq(X[train], r, rcond=None)[0]
+                    if np.sum((r - X[train] @ fit) ** 2) < WHOLE * np.sum(r**2):
+                        return found
+        for pair in self._pairs_met:
+            found += self._patches(pair, current)
+        return found
+
     def _plain_candidates(self, r: np.ndarray, there: Sequence[Effect]):
         found = super()._plain_candidates(r, there)
         taken = {at for e in there if e.kind in MOVES for at in e.at}
@@ -522,6 +550,15 @@ class PressingProblem(ContactProblem):
         for each in super()._trials():
             if each[0] not in ("plane_tilt", "plane_height"):
                 yield each
+        for pair in self._met:
+            # How deep a point goes under a force that is known.
+            at = self.pair_name(pair)
+            try:
+                now = self.dynamics.now("contact_stiffness", [at])["stiffness"]
+            except ValueError:
+                continue
+            steps = [[((f - 1.0) * now, {"stiffness": f * now})] for f in SOFTER]
+            yield "contact_stiffness", at, 1, ("stiffness",), (), steps
         for body, by in self._touched_axes().items():
             at, names = self.shapes.names[body], tuple(by)
             if names == ("z",):

@@ -15,7 +15,7 @@ from makebreak.gap.data.conditioning import condition
 from makebreak.gap.driven import DrivenProblem, is_driven, sticks
 from makebreak.gap.findings import Finding
 from makebreak.gap.fit import fit_effects
-from makebreak.gap.impacts import ImpactProblem, runs_against
+from makebreak.gap.impacts import ImpactProblem, runs_against, without_contact
 from makebreak.gap.measure import WINDOW_SEC
 from makebreak.gap.mechanism import MechanismProblem
 from makebreak.gap.objects import FlightProblem, RolloutProblem, TouchProblem
@@ -150,9 +150,10 @@ def problem_for(
                 return DrivenProblem(scene, recordings), []
             except ValueError:  # It takes Drake's steps.
                 pass
+        recordings, touches = without_contact(dynamics, recordings)
         scene, finding = _settle_step(scene, recordings, dynamics, jobs)
         mechanism = MechanismProblem(scene, recordings)
-        return mechanism, [*finding, *mechanism.push_findings()]
+        return mechanism, [*touches, *finding, *mechanism.push_findings()]
     if any(joint.num_velocities() for joint in one_dof_joints(dynamics.plant)):
         try:
             return ContactProblem(scene, recordings), []

@@ -409,6 +409,7 @@ def test_every_kind_tells_its_columns_or_that_it_has_none(tmp_path):
         "contact_dissipation",
         "plane_height",
         "plane_tilt",
+        "wall_position",
         "object_size",
         "corner_radius",
     }

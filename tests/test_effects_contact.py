@@ -174,6 +174,28 @@ def test_a_patch_can_be_rougher_than_either_surface_allows(tmp_path, x, mu):
     np.testing.assert_allclose(mean, mu, rtol=5e-3)
 
 
+@pytest.mark.parametrize(
+    "x, y, mu",
+    [(0.32, 0.0, 0.1), (0.32, -0.4, 0.2), (-0.5, 0.0, 0.2), (-0.5, 0.6, 0.5)],
+)
+def test_of_two_patches_the_later_one_counts_where_they_overlap(tmp_path, x, y, mu):
+    # The second is left of and before the first, and over a strip of it.
+    second = dict(friction=0.2, x_min=-1.0, x_max=0.6, y_min=-0.6, y_max=-0.3)
+    third = dict(friction=0.2, x_min=-1.0, x_max=0.1, y_min=-0.6, y_max=0.3)
+    scene = with_effects(
+        on_ground(tmp_path, "block", 0.001),
+        *(("friction_patch", PAIR, p) for p in (PATCH, second, third)),
+    )
+    start = at_rest_but(
+        body="b.box", pose=[1, 0, 0, 0, x, y, 0.02], twist=[0, 0, 0, 0.8, 0, 0]
+    )
+    rows = SceneSimulation(scene).run(
+        start, np.array([0.03, 0.08]), ["b.box.vx", "b.box.vz"], start_sec=0.0
+    )
+    slowing, push = slowing_and_push(*rows, 0.05)
+    np.testing.assert_allclose(slowing / push, mu, rtol=5e-3)
+
+
 @pytest.mark.parametrize("x, mu", [(0.32, 0.1), (-0.5, 0.5)])
 def test_a_half_space_can_have_a_patch(tmp_path, x, mu):
     mean = slide(tmp_path, 0.001, x, 0.0, 0.8, half_space=True)
@@ -217,6 +239,24 @@ def test_a_lifted_plane_bears_things_higher(tmp_path, time_step):
     start = at_rest_but(body="b.ball", pose=[1, 0, 0, 0, 0, 0, RADIUS + 0.01 - depth])
     rows = SceneSimulation(scene).run(start, np.array([0, 0.2]), ["b.ball.z"])
     np.testing.assert_allclose(rows[1, 0], RADIUS + 0.01 - depth, atol=1e-6)
+
+
+def test_a_body_that_stands_elsewhere_is_met_there(tmp_path):
+    """A ball that rolls off the displaced ground's edge falls; on it, it lies as high
+    as the ground was lifted."""
+    scene = with_effects(
+        on_ground(tmp_path, "ball", 0.001),
+        ("wall_position", "g.plate", dict(x=-0.1, z=0.01)),
+    )
+    depth = BALL_MASS * G / 1e5
+    for x, falls in ((1.85, False), (1.95, True)):  # The ground ends at 2 m.
+        start = at_rest_but(
+            body="b.ball", pose=[1, 0, 0, 0, x, 0, RADIUS + 0.01 - depth]
+        )
+        rows = SceneSimulation(scene).run(start, np.array([0, 0.2]), ["b.ball.z"])
+        assert (rows[1, 0] < 0.0) == falls
+        if not falls:
+            np.testing.assert_allclose(rows[1, 0], RADIUS + 0.01 - depth, atol=1e-6)
 
 
 @pytest.mark.parametrize("time_step", [0.0, 0.001])

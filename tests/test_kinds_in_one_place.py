@@ -34,6 +34,11 @@ KNOWN = {
     },
     "gap/permitted_contacts.py": {
         "contact_friction", "friction_patch", "plane_height", "plane_tilt",
+        "wall_position",
+    },
+    "gap/pressing.py": {
+        "contact_friction", "contact_stiffness", "friction_patch", "plane_height",
+        "plane_tilt", "wall_position",
     },
     "gap/contact_problem.py": {
         "body_drag", "constant_force", "contact_friction", "friction_patch",

@@ -1,0 +1,205 @@
+"""A robot that presses on what is fixed: a gantry with a ball for a tool, by an ODE."""
+
+import numpy as np
+import pytest
+
+from makebreak.gap.pressing import PressingProblem, presses
+from makebreak.gap.recording import read_recordings
+from makebreak.gap.select import select
+from makebreak.gap.table import write_recording
+from makebreak.gap.workflow import problem_for
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.kind import Effect
+from makebreak.models.scene import read_scene
+
+GRAVITY = np.array([0.0, 0.0, 9.81])
+MASS, RADIUS, STIFFNESS, DAMPING, TABLE_MU, WALL_MU = 2.0, 0.02, 2e4, 200.0, 0.3, 0.2
+LINK = """<link name="{name}"><inertial><mass>{mass}</mass><inertia><ixx>1e-3</ixx>
+<iyy>1e-3</iyy><izz>1e-3</izz><ixy>0</ixy><ixz>0</ixz><iyz>0</iyz></inertia></inertial>
+{shape}</link>"""
+JOINT = """<joint name="{name}" type="prismatic"><parent>{parent}</parent>
+<child>{child}</child><axis><xyz>{axis}</xyz></axis></joint>"""
+SHAPE = """<collision name="c"><pose>{at}</pose><geometry>{what}</geometry>
+<drake:proximity_properties><drake:mu_dynamic>{mu}</drake:mu_dynamic>
+<drake:mu_static>{mu}</drake:mu_static><drake:point_contact_stiffness>4e4
+</drake:point_contact_stiffness></drake:proximity_properties></collision>"""
+MODEL = """<?xml version="1.0"?>
+<sdf version="1.9" xmlns:drake="drake.mit.edu"><model name="{name}">{body}</model></sdf>
+"""
+SCENE = """directives:
+  - add_model: {name: gantry, file: gantry.sdf}
+  - add_weld: {parent: world, child: gantry::base}
+  - add_model: {name: table, file: table.sdf}
+  - add_weld: {parent: world, child: table::table}
+  - add_model: {name: wall, file: wall.sdf}
+  - add_weld: {parent: world, child: wall::wall, X_PC: {translation: [0.3, 0, 0]}}
+plant: {time_step: 0.001}
+actuation:
+  type: effort
+  joints: [gantry.x, gantry.y, gantry.z]
+  hold: zero_order
+  rate_hz: 1000
+tolerance: {link_mass: 0.001, link_com_m: 0.0001}
+"""
+TABLE, WALL = "table.table", "wall.wall"
+
+
+def write_scene(folder):
+    light = LINK.format(name="{}", mass=1e-6, shape="")
+    ball = SHAPE.format(
+        at="0 0 0 0 0 0", what=f"<sphere><radius>{RADIUS}</radius></sphere>", mu=1.0
+    )
+    body = '<link name="base"/>' + light.replace("{}", "a") + light.replace("{}", "b")
+    body += LINK.format(name="tool", mass=MASS, shape=ball)
+    for name, parent, child, axis in (
+        ("x", "base", "a", "1 0 0"),
+        ("y", "a", "b", "0 1 0"),
+        ("z", "b", "tool", "0 0 1"),
+    ):
+        body += JOINT.format(name=name, parent=parent, child=child, axis=axis)
+    body += '<frame name="tip" attached_to="tool"/>'
+    (folder / "gantry.sdf").write_text(MODEL.format(name="gantry", body=body))
+    for name, at, size, mu in (
+        ("table", "0 0 -0.05 0 0 0", "2 2 0.1", TABLE_MU),
+        ("wall", "0.05 0 0.1 0 0 0", "0.1 1 0.2", WALL_MU),
+    ):
+        shape = SHAPE.format(
+            at=at, what=f"<box><size>{size}</size></box>", mu=mu / (2 - mu)
+        )
+        link = f'<link name="{name}">{shape}</link>'
+        (folder / f"{name}.sdf").write_text(MODEL.format(name=name, body=link))
+    (folder / "scene.yaml").write_text(SCENE)
+    return read_scene(folder / "scene.yaml")
+
+
+def contact(p, v, table, wall, mu):
+    """Force of table and wall on the tool (3,), by springs; mu (2,) their friction."""
+    total = np.zeros(3)
+    each = ((2, 1.0, table, mu[0]), (0, -1.0, wall, mu[1]))
+    for axis, sign, place, friction in each:
+        depth = RADIUS - sign * (p[axis] - place)
+        f = max(STIFFNESS * depth - DAMPING * sign * v[axis], 0.0) if depth > 0 else 0.0
+        slip = np.delete(v, axis)
+        rub = -friction * f * slip / max(np.hypot(*slip), 1e-3)
+        total[axis] += sign * f
+        total[np.arange(3) != axis] += rub
+    return total
+
+
+def record(folder, table=0.0, wall=0.3, mu=(TABLE_MU, WALL_MU), wrench=True, n=1):
+    """Down on the table, along it to the wall, along both; pressed with about 8 N."""
+    rng = np.random.default_rng(0)
+    names = ("x", "y", "z")
+    tables = []
+    for episode in range(n):
+        time, dt = np.arange(0.0, 6.0, 1e-3), 1e-3
+        state = np.array([0.1, -0.2, 0.12, 0.0, 0.0, 0.0])
+        states, efforts, forces = [], [], []
+        for t in time:
+            p, v = state[:3], state[3:]
+            target = np.array([
+                0.25 if 1.5 < t < 3.0 else 0.0,
+                0.02 if t < 3.0 else 0.2 * (1.0 if (t + episode) % 2.0 < 1.0 else -1.0),
+                -0.15 if t < 1.2 else 0.0,
+            ])  # fmt: skip
+            u = MASS * 25.0 * (target - v)
+            pressed = [8.0 * (t > 3.0), 0.0, -8.0 * (t > 1.2)]
+            u = np.clip(u, -12.0, 12.0) + pressed + np.array([0.0, 0.0, MASS * 9.81])
+            F = contact(p, v, table, wall, mu)
+            states.append(state)
+            efforts.append(u)
+            forces.append(F)
+
+            def rate(y, u=u):
+                a = u + contact(y[:3], y[3:], table, wall, mu)
+                return np.append(y[3:], a / MASS - GRAVITY)
+
+            for _ in range(2):  # The classical Runge-Kutta rule.
+                h = dt / 2
+                k1 = rate(state)
+                k2 = rate(state + h / 2 * k1)
+                k3 = rate(state + h / 2 * k2)
+                k4 = rate(state + h * k3)
+                state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        rows = slice(0, None, 5)
+        x, u, F = (np.array(each) for each in (states, efforts, forces))
+        mean = u.reshape(-1, 5, 3).mean(axis=1)
+        columns = {"time": time[rows], "episode": np.full(len(mean), episode)}
+        for i, axis in enumerate(names):
+            noise = rng.normal(size=(2, len(mean)))
+            columns[f"gantry.{axis}.position"] = x[rows, i] + 1e-5 * noise[0]
+            columns[f"gantry.{axis}.effort_command"] = mean[:, i]
+            if wrench:
+                columns[f"gantry.tip.f{axis}"] = F[rows, i] + 0.1 * noise[1]
+        tables.append(columns)
+    table_of = {k: np.concatenate([t[k] for t in tables]) for k in tables[0]}
+    write_recording(folder / "recording.csv", table_of)
+    return read_recordings([folder / "recording.csv"])
+
+
+@pytest.fixture(scope="module")
+def right(tmp_path_factory):
+    """World and model are alike."""
+    folder = tmp_path_factory.mktemp("right")
+    scene, recordings = write_scene(folder), record(folder)
+    return scene, recordings, PressingProblem(scene, recordings)
+
+
+@pytest.fixture(scope="module")
+def displaced(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("displaced")
+    scene = write_scene(folder)
+    recordings = record(folder, table=-0.012, wall=0.325, mu=(0.42, 0.35))
+    return PressingProblem(scene, recordings)
+
+
+def test_where_nothing_is_hidden_nothing_is_left_and_nothing_named(right):
+    scene, recordings, problem = right
+    dynamics = SceneDynamics(scene)
+    assert presses(dynamics, recordings)
+    found, _ = problem_for(scene, recordings, dynamics)
+    assert isinstance(found, PressingProblem)
+    assert problem.off == {}
+    assert problem.noise_error(problem.base()) < 1.5  # What `no_gap` allows.
+    assert select(problem).choices == ()
+
+
+def test_bodies_that_stand_elsewhere_are_felt_there(displaced):
+    """Nearest places, before any fit; friction and springs leave a millimetre."""
+    off = {displaced.shapes.names[k]: by for k, by in displaced.off.items()}
+    assert off[TABLE]["z"] == pytest.approx(-0.012, abs=1e-3)
+    assert off[WALL]["x"] == pytest.approx(0.025, abs=1e-3)
+
+
+def test_places_and_frictions_are_named(displaced):
+    found = {(c.effect.kind, *c.effect.at): c.effect.parameters
+             for c in select(displaced).choices}  # fmt: skip
+    assert found["plane_height", TABLE]["height"] == pytest.approx(-0.012, abs=5e-4)
+    assert found["wall_position", WALL]["x"] == pytest.approx(0.025, abs=5e-4)
+    for body, mu in ((TABLE, 0.42), (WALL, 0.35)):
+        friction = found["contact_friction", f"{body}~gantry.tool"]["friction"]
+        assert friction == pytest.approx(mu, rel=0.05)
+    assert len(found) == 4
+
+
+def test_a_wall_that_is_put_right_explains_forces_and_distance(displaced):
+    names = displaced.row_names()
+    there = [
+        Effect("wall_position", [WALL], {"x": 0.025}),
+        Effect("plane_height", [TABLE], {"height": -0.012}),
+    ]
+    k = names.index(f"{WALL}~gantry.tool.distance")
+    before, after = displaced.left(), displaced.left(there)
+    shown = displaced.counts()[:, k]
+    assert shown.sum() > 5
+    # 25 mm over 0.2 mm.
+    np.testing.assert_allclose(abs(before[shown, k]), 125.0, rtol=0.05)
+    assert np.sqrt(np.mean(after[shown, k] ** 2)) < 2.0
+
+
+def test_without_a_wrench_a_face_that_was_passed_tells(tmp_path):
+    scene = write_scene(tmp_path)
+    recordings = record(tmp_path, table=-0.012, wrench=False)
+    problem = PressingProblem(scene, recordings)
+    off = {problem.shapes.names[k]: by for k, by in problem.off.items()}
+    assert off[TABLE]["z"] == pytest.approx(-0.012, abs=1e-3)
