@@ -79,6 +79,7 @@ class ChangingSurfaceConfig:
         default_factory=list
     )  # Of the three; empty: drawn by the seed.
     model: str = ""  # Scene that the controllers believe; "": the shipped one.
+    rehearse: int = 0  # Trials in the model before the first real one.
     control: ChangingContactConfig = field(default_factory=ChangingContactConfig)
 
 

@@ -75,6 +75,7 @@ class ContactLearningConfig:
     spread: float = SPREAD
     friction: list[float] = field(default_factory=list)  # Empty: drawn by the seed.
     model: str = ""  # Scene that the controllers believe; "": the shipped one.
+    rehearse: int = 0  # Trials in the model before the first real one.
     control: ChangingContactConfig = field(
         default_factory=lambda: ChangingContactConfig(
             anticipator=ContactAnticipatorConfig(
@@ -99,6 +100,7 @@ class ContactTask:
     pattern: MotionPattern
     truth: np.ndarray  # (3, 3) p_WE at each contact, along its direction only [m].
     prior: ContactBelief
+    model_prior: ContactBelief  # Where the model has them, about.
     friction: np.ndarray  # (3,)
     stiffness: dict[str, float]  # Of the tool against each surface [N/m].
     errors: StationErrors
@@ -143,19 +145,31 @@ def make_task(config: ContactLearningConfig) -> ContactTask:
         axis = int(np.argmax(abs(d)))
         # Across, where the motion comes: surfaces met before decide it.
         truth[i:, axis] = places[i, axis] - half * d[axis]
-    prior = []
+    prior, modelled = [], []
     for i, d in enumerate(DIRECTIONS):
         mean = pattern.segments[i].positions[0].copy()
         sign = rng.choice([-1.0, 1.0])
         axis = int(np.argmax(abs(d)))
+        there = mean.copy()
+        there[axis] = position(model, SURFACES[i])[axis] - half * d[axis]
         mean[axis] = truth[i, axis] + sign * ERRORS[i]
-        prior.append(ExpectedContact(mean, SIGMA**2 * np.eye(3), d, segment=i))
+        for each, place in ((prior, mean), (modelled, there)):
+            each.append(ExpectedContact(place, SIGMA**2 * np.eye(3), d, segment=i))
     stiffness = draw_stiffness(rng, SURFACES, config.stiffness)
     set_stiffness(world, config.tool, stiffness)
     return ContactTask(
         world, model, pattern, truth, ContactBelief(tuple(prior)), friction, stiffness,
         draw_errors(config.realism, config.seed), half,
     )  # fmt: skip
+        world,
+        model,
+        pattern,
+        truth,
+        ContactBelief(tuple(prior)),
+        ContactBelief(tuple(modelled)),
+        friction,
+        stiffness,
+    )
 
 
 def make_pattern(config: ContactLearningConfig, half: float) -> MotionPattern:

@@ -87,6 +87,7 @@ class MultipleCollisionsConfig:
     spread: float = SPREAD
     friction: list[float] = field(default_factory=list)  # Empty: drawn by the seed.
     model: str = ""  # Scene that the controllers believe; "": the shipped one.
+    rehearse: int = 0  # Trials in the model before the first real one.
     control: ChangingContactConfig = field(
         default_factory=lambda: ChangingContactConfig(
             anticipator=ContactAnticipatorConfig(
@@ -118,6 +119,7 @@ class CollisionTask:
     model: Scene
     pattern: MotionPattern
     prior: ContactBelief
+    model_prior: ContactBelief  # Where the model has them, about.
     truth: np.ndarray  # (4,) p_WE . direction at each impact [m].
     friction: dict[str, float]
     stiffness: dict[str, float]  # Of the tool against each surface [N/m].
@@ -162,13 +164,17 @@ def make_task(config: MultipleCollisionsConfig) -> CollisionTask:
     move(world, "blue_wall", ahead * AHEAD)
     pattern = make_pattern(config, half)
     truth = surfaces(world, half)
-    prior = []
-    for (d, _, k), where in zip(IMPACTS, truth, strict=True):
+    prior, modelled = [], []
+    sigma = max(0.5 * config.error_max, 0.001)
+    for (d, _, k), where, there in zip(
+        IMPACTS, truth, surfaces(model, half), strict=True
+    ):
         estimate = where + rng.uniform(-config.error_max, config.error_max)
-        mean = pattern.segments[k].positions[0].copy()
-        mean += d * (estimate - mean @ d)
+        start = pattern.segments[k].positions[0]
+        believed = start + d * (there - start @ d)
+        modelled.append(ExpectedContact(believed, sigma**2 * np.eye(3), d, segment=k))
+        mean = start + d * (estimate - start @ d)
         # Uniform errors up to error_max: two sigma hold them all.
-        sigma = max(0.5 * config.error_max, 0.001)
         prior.append(ExpectedContact(mean, sigma**2 * np.eye(3), d, segment=k))
     stiffness = draw_stiffness(rng, SURFACES, config.stiffness)
     set_stiffness(world, config.tool, stiffness)
@@ -176,6 +182,15 @@ def make_task(config: MultipleCollisionsConfig) -> CollisionTask:
         world, model, pattern, ContactBelief(tuple(prior)), truth, friction, stiffness,
         draw_errors(config.realism, config.seed), half,
     )  # fmt: skip
+        world,
+        model,
+        pattern,
+        ContactBelief(tuple(prior)),
+        ContactBelief(tuple(modelled)),
+        truth,
+        friction,
+        stiffness,
+    )
 
 
 def surfaces(scene: Scene, half: float) -> np.ndarray:

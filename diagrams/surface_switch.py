@@ -87,6 +87,7 @@ class SurfaceSwitchConfig:
         default_factory=list
     )  # Of low, high, walls; empty: drawn by the seed.
     model: str = ""  # Scene that the controllers believe; "": the shipped one.
+    rehearse: int = 0  # Trials in the model before the first real one.
     anticipation: Anticipation = field(default_factory=Anticipation)
     control: ChangingContactConfig = field(default_factory=_control)
 

@@ -23,7 +23,7 @@ KNOWN = {
         "contact_friction", "object_size", "rolling_resistance"
     },
     "diagrams/station.py": {"joint_viscous_damping"},
-    "diagrams/tabletop.py": {"contact_friction"},
+    "diagrams/tabletop.py": {"contact_friction", "contact_stiffness"},
     "diagrams/free_body.py": CONTACT
     | {"clock_skew", "gravity_tilt", "sensor_bias", "sensor_delay", "sinusoidal_force"},
     "gap/check_relations.py": {"clock_skew"},

@@ -343,7 +343,7 @@ def _patch(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> No
     # Only a rougher thing can have more: then the ground around becomes smoother.
     rougher = mu if not 2.0 * mu_thing > mu else mu_thing
     mu_patch = mu * rougher / (2.0 * rougher - mu) if mu > 0.0 else 0.0
-    source, met = plant.get_source_id(), False
+    source, met, more = plant.get_source_id(), False, []
     for number, (geometry, shape, X_WG) in enumerate(shapes):
         low, high = _span(shape, X_WG)
         # A copy: the original will have changed.
@@ -379,7 +379,9 @@ def _patch(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> No
                 )
             else:
                 name = f"{ground.name()}_of_{len(shapes)}_{number}_around_patch_{i}"
-                plant.RegisterCollisionGeometry(ground, X_BG, box, name, properties)
+                more.append((X_BG, box, name, properties))
+    for piece in more:  # After the rest: Drake's ids of the shapes end with this.
+        plant.RegisterCollisionGeometry(ground, *piece)
     if not met:
         raise ValueError(f"{where}: the patch is off {full_name(plant, ground)}")
     if rougher != mu_thing:

@@ -19,7 +19,7 @@ and the mean stiffness is at most 40 % of K_max.
 See docs/modes.md.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -89,17 +89,14 @@ def run(config: ChangingSurfaceConfig, session: Session) -> dict:
             configs[label] = constant_stiffness(config, value)
     configs["adaptive"] = config  # The last one is what Meshcat's recording shows.
     logs, done = {}, {}
+    knowledge = None
+    imagined = replace(task, world=task.model)
+    for k in range(config.rehearse):
+        name = f"rehearsal_{k + 1}"
+        diagram, log = _simulated(config, imagined, knowledge, session, name)
+        knowledge = learned(diagram, log.context)
     for label, its in configs.items():
-        diagram = make_changing_surface(its, task, meshcat=session.meshcat)
-        shaper = diagram.GetSubsystemByName("velocity_shaper")
-        log = session.simulate(
-            diagram,
-            DURATION_SEC,
-            {"phase": shaper.GetOutputPort("phase")},
-            period_sec=0.01,
-            until=lambda t, values: motion_ended(values["phase"][PHASE_STAGE]),
-            label=label,
-        )
+        diagram, log = _simulated(its, task, knowledge, session, label)
         done[label] = log["phase"][-1, PHASE_STAGE] == DONE
         logs[label] = telemetry(diagram, log.context)
         if label == "adaptive":
@@ -114,6 +111,21 @@ def run(config: ChangingSurfaceConfig, session: Session) -> dict:
     session.save_plot(plot_stiffness(logs, changes), "stiffness")
     session.write_recording(recording, task.model)
     return summary(logs, done, changes, surplus, task, stiffness.maximum)
+
+
+def _simulated(config, task, knowledge, session, label):
+    """The diagram and the log of a motion."""
+    diagram = make_changing_surface(config, task, knowledge, session.meshcat)
+    shaper = diagram.GetSubsystemByName("velocity_shaper")
+    log = session.simulate(
+        diagram,
+        DURATION_SEC,
+        {"phase": shaper.GetOutputPort("phase")},
+        period_sec=0.01,
+        until=lambda t, values: motion_ended(values["phase"][PHASE_STAGE]),
+        label=label,
+    )
+    return diagram, log
 
 
 def sliding(log) -> np.ndarray:

@@ -21,7 +21,7 @@ shorter than the first.
 See docs/contacts.md.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -99,26 +99,18 @@ def run(config: ContactLearningConfig, session: Session) -> dict:
     """config.trials trials in a row, scored; see the module for the criterion."""
     task = make_task(config)
     knowledge = Knowledge(contacts=task.prior)
+    imagined = replace(task, world=task.model)
+    if config.rehearse:
+        knowledge = Knowledge(contacts=task.model_prior)
+    for k in range(config.rehearse):
+        name = f"rehearsal_{k + 1}"
+        diagram, log = _simulated(config, imagined, knowledge, k, session, name)
+        knowledge = learned(diagram, log.context)
     trials: list[Trial] = []
     recordings = []
     for k in range(config.trials):
-        diagram = make_contact_learning(config, task, knowledge, k, session.meshcat)
-        shaper = diagram.GetSubsystemByName("velocity_shaper")
-        ended: list[tuple[float, str]] = []
-
-        def over(t, values, ended=ended):
-            if why := motion_ended(values["phase"][PHASE_STAGE]):
-                ended.append((t, why))
-            return ended[0][1] if ended and t >= ended[0][0] + PEAK_WAIT else ""
-
-        log = session.simulate(
-            diagram,
-            DURATION_SEC,
-            {"phase": shaper.GetOutputPort("phase")},
-            period_sec=0.01,
-            until=over,
-            label=f"trial_{k + 1}",
-        )
+        name = f"trial_{k + 1}"
+        diagram, log = _simulated(config, task, knowledge, k, session, name)
         knowledge = learned(diagram, log.context)
         recordings.append(recorded(diagram, log.context))
         trials.append(scored(telemetry(diagram, log.context), task, knowledge.contacts))
@@ -127,6 +119,28 @@ def run(config: ContactLearningConfig, session: Session) -> dict:
     knowledge.contacts.save(session.path("contacts.json"))
     session.write_recording(episodes(recordings), task.model)
     return summary(trials, task)
+
+
+def _simulated(config, task, knowledge, k, session, label):
+    """The diagram and the log of a trial."""
+    diagram = make_contact_learning(config, task, knowledge, k, session.meshcat)
+    shaper = diagram.GetSubsystemByName("velocity_shaper")
+    ended: list[tuple[float, str]] = []
+
+    def over(t, values):
+        if why := motion_ended(values["phase"][PHASE_STAGE]):
+            ended.append((t, why))
+        return ended[0][1] if ended and t >= ended[0][0] + PEAK_WAIT else ""
+
+    log = session.simulate(
+        diagram,
+        DURATION_SEC,
+        {"phase": shaper.GetOutputPort("phase")},
+        period_sec=0.01,
+        until=over,
+        label=label,
+    )
+    return diagram, log
 
 
 def scored(log: dict[str, np.ndarray], task: ContactTask, belief) -> Trial:

@@ -103,6 +103,13 @@ def run(config: MultipleCollisionsConfig, session: Session) -> dict:
         )
         recordings.append(recording)
     knowledge: Knowledge | None = None
+    imagined = replace(task, world=task.model)
+    if config.rehearse:
+        knowledge = Knowledge(task.model_prior)
+    for k in range(config.rehearse):
+        _, knowledge, _ = _trial(
+            config, imagined, knowledge, k, session, f"rehearsal_{k + 1}", []
+        )
     peaks = [list(one.force) for one in trials.values()]
     for k in range(config.trials if config.handling else 1):
         name = f"trial_{k + 1}" if config.handling else "baseline"

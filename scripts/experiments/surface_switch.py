@@ -86,19 +86,16 @@ def run(config: SurfaceSwitchConfig, session: Session) -> dict:
     """config.trials trials in a row, scored; see the module for the criterion."""
     task = make_task(config)
     knowledge = Knowledge(contacts=task.prior)
+    imagined = replace(task, world=task.model)
+    for k in range(config.rehearse):
+        name = f"rehearsal_{k + 1}"
+        diagram, log = _simulated(config, imagined, knowledge, k, session, name)
+        knowledge = learned(diagram, log.context)
     trials: list[Trial] = []
     recordings = []
     for k in range(config.trials):
-        diagram = make_surface_switch(config, task, knowledge, k, session.meshcat)
-        shaper = diagram.GetSubsystemByName("velocity_shaper")
-        log = session.simulate(
-            diagram,
-            DURATION_SEC,
-            {"phase": shaper.GetOutputPort("phase")},
-            period_sec=0.01,
-            until=lambda t, values: motion_ended(values["phase"][PHASE_STAGE]),
-            label=f"trial_{k + 1}",
-        )
+        name = f"trial_{k + 1}"
+        diagram, log = _simulated(config, task, knowledge, k, session, name)
         knowledge = learned(diagram, log.context)
         recordings.append(recorded(diagram, log.context))
         trial = scored(telemetry(diagram, log.context), task.feet)
@@ -109,6 +106,21 @@ def run(config: SurfaceSwitchConfig, session: Session) -> dict:
     knowledge.contacts.save(session.path("contacts.json"))
     session.write_recording(episodes(recordings), task.model)
     return summary(trials, task)
+
+
+def _simulated(config, task, knowledge, k, session, label):
+    """The diagram and the log of a trial."""
+    diagram = make_surface_switch(config, task, knowledge, k, session.meshcat)
+    shaper = diagram.GetSubsystemByName("velocity_shaper")
+    log = session.simulate(
+        diagram,
+        DURATION_SEC,
+        {"phase": shaper.GetOutputPort("phase")},
+        period_sec=0.01,
+        until=lambda t, values: motion_ended(values["phase"][PHASE_STAGE]),
+        label=label,
+    )
+    return diagram, log
 
 
 def sign_of(segment: int) -> float:
