@@ -145,7 +145,8 @@ def make_task(config: ContactLearningConfig) -> ContactTask:
         axis = int(np.argmax(abs(d)))
         # Across, where the motion comes: surfaces met before decide it.
         truth[i:, axis] = places[i, axis] - half * d[axis]
-    prior, modelled = [], []
+    prior: list[ExpectedContact] = []
+    modelled: list[ExpectedContact] = []
     for i, d in enumerate(DIRECTIONS):
         mean = pattern.segments[i].positions[0].copy()
         sign = rng.choice([-1.0, 1.0])

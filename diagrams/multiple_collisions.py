@@ -164,7 +164,8 @@ def make_task(config: MultipleCollisionsConfig) -> CollisionTask:
     move(world, "blue_wall", ahead * AHEAD)
     pattern = make_pattern(config, half)
     truth = surfaces(world, half)
-    prior, modelled = [], []
+    prior: list[ExpectedContact] = []
+    modelled: list[ExpectedContact] = []
     sigma = max(0.5 * config.error_max, 0.001)
     for (d, _, k), where, there in zip(
         IMPACTS, truth, surfaces(model, half), strict=True

@@ -406,12 +406,17 @@ class PressingProblem(ContactProblem):
                 ((G, most[0]), (there, most[1]))]  # fmt: skip
         return (*made, of + most[2], slots, self._sharing(of + of, slots))
 
-    def left(self, effects: Sequence[Effect] = (), shift: Shift | None = None):
+    def left(
+        self,
+        effects: Sequence[Effect] = (),
+        shift: Shift | None = None,
+        weighed_as: Sequence[Effect] | None = None,
+    ):
         self._softened = [e for e in effects if e.kind == "contact_stiffness"]
         self._placed = [e for e in effects if e.kind in MOVES]
         if self._any_friction:
             self._placed += self._displacing(self.off)
-        return super().left(effects, shift)
+        return super().left(effects, shift, weighed_as)
 
     def _distances(self, slots: Sequence[Slot]) -> np.ndarray:
         """(K, pairs) over what shapes are known to: of each pair, when it is felt."""
