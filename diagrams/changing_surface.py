@@ -75,9 +75,8 @@ class ChangingSurfaceConfig:
     normal_force: float = 8.0  # About; each segment has its own [N].
     realism: str = "none"  # Errors of the station: "none", "lab" or "poor".
     baselines: bool = True  # Constant K_max and constant K_free as well.
-    friction: list[float] = field(
-        default_factory=list
-    )  # Of the three; empty: drawn by the seed.
+    # Of the three surfaces; empty: drawn by the seed.
+    friction: list[float] = field(default_factory=list)
     model: str = ""  # Scene that the controllers believe; "": the shipped one.
     rehearse: int = 0  # Trials in the model before the first real one.
     control: ChangingContactConfig = field(default_factory=ChangingContactConfig)

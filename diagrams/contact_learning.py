@@ -159,9 +159,6 @@ def make_task(config: ContactLearningConfig) -> ContactTask:
     stiffness = draw_stiffness(rng, SURFACES, config.stiffness)
     set_stiffness(world, config.tool, stiffness)
     return ContactTask(
-        world, model, pattern, truth, ContactBelief(tuple(prior)), friction, stiffness,
-        draw_errors(config.realism, config.seed), half,
-    )  # fmt: skip
         world,
         model,
         pattern,
@@ -170,6 +167,8 @@ def make_task(config: ContactLearningConfig) -> ContactTask:
         ContactBelief(tuple(modelled)),
         friction,
         stiffness,
+        draw_errors(config.realism, config.seed),
+        half,
     )
 
 

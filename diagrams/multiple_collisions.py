@@ -180,9 +180,6 @@ def make_task(config: MultipleCollisionsConfig) -> CollisionTask:
     stiffness = draw_stiffness(rng, SURFACES, config.stiffness)
     set_stiffness(world, config.tool, stiffness)
     return CollisionTask(
-        world, model, pattern, ContactBelief(tuple(prior)), truth, friction, stiffness,
-        draw_errors(config.realism, config.seed), half,
-    )  # fmt: skip
         world,
         model,
         pattern,
@@ -191,6 +188,8 @@ def make_task(config: MultipleCollisionsConfig) -> CollisionTask:
         truth,
         friction,
         stiffness,
+        draw_errors(config.realism, config.seed),
+        half,
     )
 
 

@@ -83,9 +83,8 @@ class SurfaceSwitchConfig:
     speed: float = 0.1  # Of sliding [m/s].
     normal_force: float = 8.0  # On each surface that has been reached [N].
     realism: str = "none"  # Errors of the station: "none", "lab" or "poor".
-    friction: list[float] = field(
-        default_factory=list
-    )  # Of low, high, walls; empty: drawn by the seed.
+    # Low, high, of the walls; empty: drawn by the seed.
+    friction: list[float] = field(default_factory=list)
     model: str = ""  # Scene that the controllers believe; "": the shipped one.
     rehearse: int = 0  # Trials in the model before the first real one.
     anticipation: Anticipation = field(default_factory=Anticipation)
