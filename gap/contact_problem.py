@@ -39,6 +39,7 @@ PLACED = 1e-3  # A camera's place [m],
 TURNED = 3e-3  # its turn [rad],
 LATE = 0.25  # and its clock, in periods of its samples.
 TIMING = 2.5e-4  # Of what drives get [s].
+FELT = 0.05  # What a force sensor shows more, sampled amid a drive's ripple too.
 BEYOND = 3.0
 MISFIT = 1.15  # Less than so many times the sensors' noise is no misfit.
 ROBUST = 1.4826
@@ -211,6 +212,18 @@ class ContactProblem(ContactDynamics, GapProblem):
                 add("timing of the drives", self.residual(), step, TIMING)
             finally:
                 self._needs = kept
+        for k, (sensor, welded) in enumerate(self.sensors):
+            own, kept = slice(3 * k, 3 * k + 3), self.means.wrench
+            for name, more, step, size in (
+                (f"gain of {sensor}", kept[:, own], 0.01, FELT),
+                (f"ripple of {sensor}", self._ripple(welded), 1e-4, self._row_sec()),
+            ):
+                self.means.wrench = np.array(kept)
+                self.means.wrench[:, own] += step * more
+                try:
+                    add(name, self.residual(), step, size)
+                finally:
+                    self.means.wrench = kept
         for name, effect, size in link_changes(self.dynamics, self.scene):
             if set(effect.at) & set(self.bodies):
                 continue
@@ -233,6 +246,21 @@ class ContactProblem(ContactDynamics, GapProblem):
             else Nuisances.none(len(base))
         )
         return self._nuisances
+
+    def _ripple(self, welded: Sequence[int]) -> np.ndarray:
+        """(K, 3) force at a sensor by a delay of all commands [N/s]: a drive's effort
+        steps up with each command and falls until the next, and a sensor that is read
+        with the commands sees the top of it, not the mean."""
+        m, shown = self.means, [k for k in welded if k in self._J]
+        if not shown:
+            return np.zeros((len(m.time), 3))
+        middle = np.searchsorted(self._rows, m.centre)
+        J = self._J[shown[0]][np.clip(middle, 0, len(self._rows) - 1), 3:]
+        inverse = np.linalg.pinv(J.transpose(0, 2, 1), rcond=1e-3)
+        return np.einsum("kij,kj->ki", inverse, m.effort_slope)
+
+    def _row_sec(self) -> float:
+        return float(np.median([np.median(np.diff(t.time)) for t in self.tracks]))
 
     def _period(self, body: str) -> float:
         steps = []

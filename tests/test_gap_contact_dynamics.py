@@ -272,6 +272,31 @@ def test_simulation_decides_between_what_equations_find_alike(
     assert asked == (["contact_friction"] if mass > 1.5 else [])
 
 
+def test_a_force_sensor_that_is_read_with_the_commands_sees_their_ripple(
+    tmp_path, monkeypatch
+):
+    """Each command is a step of the drive's effort, and the sensor is read just after
+    it. Taken for the mean, that is a lighter block."""
+    truth = contact_cases.write(contact_cases.contact_cases("contact-development")[0],
+                                tmp_path)  # fmt: skip
+    (hidden,) = truth["effects"]
+    scene = read_scene(tmp_path / "scene.yaml")
+    recordings = read_recordings([tmp_path / "recording.csv"])
+
+    def off() -> float:
+        problem = ContactProblem(scene, recordings)
+        n = problem.nuisances()
+        rows = (problem.base(), n.columns, n.prior, problem.train())
+        start = Effect(hidden["kind"], [hidden["at"]], dict(hidden["parameters"]))
+        fit = fit_effects(problem, Screen(*rows, reach=n.reach), [start])
+        return fit.effects[0].parameters["mass"] / start.parameters["mass"] - 1.0
+
+    assert abs(off()) < 0.004
+    monkeypatch.setattr(ContactProblem, "_ripple", lambda self, welded: np.zeros(
+        (len(self.means.time), 3)))  # fmt: skip
+    assert off() < -0.005
+
+
 def test_a_robot_without_commands_is_led_as_it_was_measured(tmp_path, monkeypatch):
     """Its measured efforts, at 250 Hz, miss what an impact does between two rows: with
     them as the input the robot is soon elsewhere, and the object with it."""
