@@ -14,6 +14,7 @@ import numpy as np
 from makebreak.diagrams.driven_arm import DrivenArmSimulation, can_have
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.measure import gap_measure, series_of
+from makebreak.gap.inverse import LOOP_SEC
 from makebreak.gap.mechanism import (
     LESS,
     MISFIT,
@@ -106,7 +107,7 @@ class DrivenProblem(DrivenWindows, GapProblem):
         self._sizes = self._typical_sizes()
         self._rich: tuple[Effect, ...] = ()
         self._nuisances: Nuisances | None = None
-        self._learn_misfit()
+        self._explained: bool | None = None
 
     # ----- Residuals
 
@@ -132,11 +133,24 @@ class DrivenProblem(DrivenWindows, GapProblem):
 
     # ----- What models are off by
 
-    def _learn_misfit(self) -> None:
-        """What a model with all that a drive may have at all joints leaves is what
+    def is_explained(self) -> bool:
+        """Whether the scene as it came, its background within its tolerance, explains
+        each channel's windows as well as noise lets it."""
+        if self._explained is None:
+            n = self.nuisances()
+            screen = Screen(self.base(), n.columns, n.prior, self.train(), reach=n.reach)
+            left = self.in_noise(screen.settle(self.base())[1])
+            channel = self.channel_of_rows()
+            each = [left[channel == c] for c in np.unique(channel)]
+            self._explained = all(_rms(x) < MISFIT for x in each)
+            self._nuisances = None  # They are seen beside a rich model, if need be.
+        return self._explained
+
+    def learn_misfit(self) -> None:
+        """To be called before a search. What a model with all that a drive may have at all joints leaves is what
         models are off by: no fit is believed beyond that."""
         held = ~self.train()
-        if not held.any() or held.all() or self.noise_error(self.base()) < MISFIT:
+        if not held.any() or held.all() or self.is_explained():
             return
         # Of kinds with the same unit one is enough.
         start: dict[tuple[str, str], Effect] = {}
@@ -187,20 +201,43 @@ class DrivenProblem(DrivenWindows, GapProblem):
     # ----- The search
 
     def nuisances(self) -> Nuisances:
-        """The links' masses and centres of mass, where all is as it may be (a joint
-        that friction holds hardly shows them)."""
+        """The links' masses and centres of mass, and how late drives' loops are, where
+        all is as it may be (a joint that friction holds hardly shows them)."""
         if self._nuisances is None:
             columns, prior, names = [], [], []
             there = self.residual(self._rich)
-            for name, effect, size in link_changes(self.dynamics, self.scene):
+            changes = [*link_changes(self.dynamics, self.scene), *self._late_loops()]
+            for name, effect, size in changes:
                 moved = self.residual([*self._rich, effect])
                 columns.append((there - moved) / size)
-                prior.append(size)
+                prior.append(abs(size))
                 names.append(name)
             self._nuisances = Nuisances(
                 np.stack(columns, axis=1), np.array(prior), tuple(names), REACH
             ) if columns else Nuisances.none(len(self.train()))  # fmt: skip
         return self._nuisances
+
+    def _late_loops(self):
+        """(name, effect, size) as link_changes, of drives' own loops: a velocity that
+        is fed back late adds to a joint what a smaller rotor would take away."""
+        for joint in self.joints:
+            law = law_of(self.scene.actuation, joint)
+            if law is None or not law.kd > 0.0:
+                continue
+            if self._takes("rotor_inertia", joint):
+                more = Effect("rotor_inertia", [joint], {"inertia": law.kd * LOOP_SEC})
+                yield f"input_delay of {joint}, loop", more, -LOOP_SEC
+
+    def _moved_loops(self, effects, nuisances: Nuisances, b) -> list[Effect]:
+        """Drives' loops as the nuisances (n_b,) have them."""
+        found = dict(zip(nuisances.names, b, strict=True))
+        there = {(e.kind, at) for e in effects for at in e.at}
+        return [
+            Effect(more.kind, more.at, {"inertia": more.parameters["inertia"] / size
+                                        * float(found.get(name, 0.0))})
+            for name, more, size in self._late_loops()
+            if (more.kind, more.at[0]) not in there
+        ]  # fmt: skip
 
     def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
         """Kinds at all joints of a model with one value, at each joint, and at bodies
@@ -382,7 +419,10 @@ class DrivenProblem(DrivenWindows, GapProblem):
             held = [True] * len(model.windows)
         if not any(held):
             return None
-        moved = moved_links(self, nuisances, end.b)
+        moved = [
+            *moved_links(self, nuisances, end.b),
+            *self._moved_loops(effects, nuisances, end.b),
+        ]
         try:
             before, after = model.simulate(moved), model.simulate([*moved, *effects])
         except ValueError:  # A link that its background would make impossible.
@@ -452,6 +492,10 @@ def _moved_start(window, k: int):
         state[name] = np.array(state[name])
         state[name][:2] += np.sqrt(max(w[k], 0.0)) * u[:, k]
     return state
+
+
+def _rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(x**2)))
 
 
 def _reader(name: str, now: float, share: float):

@@ -19,6 +19,7 @@ from makebreak.gap.problem import (
 )
 from makebreak.gap.result import Considered
 from makebreak.gap.screen import Ranked, rank
+from makebreak.gap.trust import steady
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.systems.numerics.selection import (
@@ -53,6 +54,9 @@ FEWEST_MEMBERS = 2  # Of a group.
 NEARLY = 0.9  # Of what a group takes off the error: one effect that does it goes first.
 BEYOND = 1.0  # Tolerances over a nuisance's limit that are no chance among dozens.
 FREE = 1e3  # Of its size, how far what is chosen may give way to a candidate.
+# Standard deviations from neutral that an effect must be where what it is differs from
+# one part of the data to the next.
+STEADY = 2.0
 # Joints that get a value of their own, at most; and how many are fitted for each.
 MOST_OWN, OWN_TRIES = 8, 3
 PAIRED = 10  # Candidates of which all pairs are tried against a single one.
@@ -164,7 +168,12 @@ class _Search:
             chosen = _refreshed(chosen, current)
             sure = [c for c in chosen if is_significant(c)]
             if len(sure) == len(chosen):
-                break
+                # Then the least steady one, if parts of the data contradict it.
+                off = steady(problem, current)
+                k = int(np.argmin(off))
+                if not off[k] < STEADY:
+                    break
+                sure = [*chosen[:k], *chosen[k + 1 :]]
             chosen = sure
         else:
             current = self.start
@@ -271,8 +280,7 @@ class _Search:
         open_ = [
             c for c in found if (c.kind, c.at) not in taken or KINDS[c.kind].several
         ]
-        if not self.plan.own_values:  # There places share a value first.
-            open_ += _groups(open_)
+        open_ += _groups(open_)
         # With what is chosen free to give way, as far as slopes tell.
         slopes = np.zeros((len(current.r), 0))
         if chosen and not self.plan.jumps:
@@ -764,6 +772,7 @@ def _groups(found: Sequence[Candidate]) -> list[Candidate]:
     for c in found:
         place = KINDS[c.kind].at
         single = len(c.columns) == 1 and c.columns[0].shape[1] == 1 and len(c.at) == 1
+        single = single and "." in c.at[0]  # Not all joints of a model, with one value.
         if (
             place in ("joint", "actuator", "channel", "drive")
             and single

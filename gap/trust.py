@@ -9,9 +9,10 @@ from makebreak.gap.problem import Fitted, GapProblem
 from makebreak.gap.result import Trust
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
-from makebreak.systems.numerics.selection import Screen
+from makebreak.systems.numerics.selection import Screen, random_effects
 
 PARTS = 5  # Stretches of time of a recording.
+FEWEST_PARTS = 4  # Of which a scatter is taken.
 STARTS = (0.5, 1.6)  # Of each parameter's distance from neutral.
 RIDGE = 0.98  # Two parameters whose errors go together like this: their sum shows.
 
@@ -25,19 +26,13 @@ def trust_in(
     """
     if not fitted.names:
         return []
-    train = problem.train()
-    n = int(train.sum())
-    J, r = fitted.J[:n], fitted.rows[:n]
-    value = np.array([fitted.effects[i].parameters[p] for i, p in fitted.names])
-    recording, block = problem.parts()[train], problem.blocks()[train]
+    J, r = _data_rows(problem, fitted)
+    value = _values(fitted)
+    recording, stretches_of = _parts(problem)
     by_recording = {
         int(k): value + gauss_newton(J, r, recording == k) for k in np.unique(recording)
     }
-    stretches = [
-        value + gauss_newton(J, r, np.isin(block, some))
-        for some in np.array_split(np.unique(block), PARTS)
-        if len(some)
-    ]
+    stretches = [value + gauss_newton(J, r, some) for some in stretches_of]
     starts = [_from_elsewhere(problem, screen, fitted, fixed, s) for s in STARTS]
     ridge = ridges(fitted.J)
     found = []
@@ -62,6 +57,66 @@ def trust_in(
             )
         )  # fmt: skip
     return found
+
+
+def steady(problem: GapProblem, fitted: Fitted) -> list[float]:
+    """Of each effect, by how many standard deviations it is off neutral if what it is
+    on parts of the data (recordings; stretches of time where there are few) differs
+    from part to part by more than noise: its surest parameter's. What imitates another
+    law is one thing here and another there. Infinite where parts say nothing."""
+    sure = [np.inf] * len(fitted.effects)
+    if not fitted.names:
+        return sure
+    J, r = _data_rows(problem, fitted)
+    recording, parts = _parts(problem)
+    several = np.unique(recording)
+    if len(several) >= FEWEST_PARTS:
+        parts = [recording == k for k in several]
+    value = _values(fitted)
+    x = np.array([value + gauss_newton(J, r, some) for some in parts])
+    variance = np.array([_variances(J, r, some) for some in parts])
+    found: dict[int, float] = {}
+    for k, (i, name) in enumerate(fitted.names):
+        neutral = KINDS[fitted.effects[i].kind].parameter(name).neutral
+        there = np.isfinite(x[:, k]) & np.isfinite(variance[:, k])
+        if neutral is None or there.sum() < FEWEST_PARTS:
+            continue
+        mean, std = random_effects(x[there, k], variance[there, k])
+        off = abs(mean - neutral) / std
+        found[i] = max(found.get(i, 0.0), off)
+    return [found.get(i, off) for i, off in enumerate(sure)]
+
+
+def _data_rows(problem: GapProblem, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
+    """J (m, k) and r (m,) of the rows that were fitted, without the nuisances'."""
+    n = int(problem.train().sum())
+    return fitted.J[:n], fitted.rows[:n]
+
+
+def _values(fitted: Fitted) -> np.ndarray:
+    return np.array([fitted.effects[i].parameters[p] for i, p in fitted.names])
+
+
+def _parts(problem: GapProblem) -> tuple[np.ndarray, list[np.ndarray]]:
+    """(m,) the recording of each fitted row, and the rows (m,) of each stretch."""
+    train = problem.train()
+    recording, block = problem.parts()[train], problem.blocks()[train]
+    stretches = np.array_split(np.unique(block), PARTS)
+    return recording, [np.isin(block, some) for some in stretches if len(some)]
+
+
+def _variances(J: np.ndarray, r: np.ndarray, some: np.ndarray) -> np.ndarray:
+    """(k,) of the step that gauss_newton takes; NaN where it takes none."""
+    out = np.full(J.shape[1], np.nan)
+    step = gauss_newton(J, r, some)
+    shown = np.isfinite(step)
+    if shown.any():
+        A = J[some][:, shown]
+        left = r[some] + A @ step[shown]
+        size = np.linalg.norm(A, axis=0)
+        C = np.linalg.pinv((A / size).T @ (A / size), rcond=1e-12, hermitian=True)
+        out[shown] = np.diag(C) / size**2 * max(float(np.mean(left**2)), 1.0)
+    return out
 
 
 def gauss_newton(J: np.ndarray, r: np.ndarray, some: np.ndarray) -> np.ndarray:

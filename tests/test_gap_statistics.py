@@ -19,7 +19,7 @@ from makebreak.gap.problem import (
 )
 from makebreak.gap.result import GapMeasure
 from makebreak.gap.select import Choice, Selection, is_significant, select
-from makebreak.gap.trust import gauss_newton, ridges
+from makebreak.gap.trust import gauss_newton, ridges, steady
 from makebreak.gap.verdict import after_simulation, verdict_of
 from makebreak.gap.workflow import kept_by_simulation
 from makebreak.models.effects.kind import Effect
@@ -33,6 +33,7 @@ from makebreak.systems.numerics.selection import (
     paired_t,
     predictable_share,
     simplest,
+    random_effects,
     spread_by_blocks,
 )
 from makebreak.systems.numerics.signal_noise import noise_beside
@@ -187,6 +188,65 @@ def test_blocks_drawn_anew_tell_how_a_slope_scatters_from_one_recording_to_the_n
     r, there = np.append(noise(1.0), 0.0), np.append(block, -1)
     assert spread_by_blocks(stiff, r, there)[0] < 1e-6
     assert spread_by_blocks(x[:125, None], noise(1.0)[:125], block[:125])[0] == 0.0
+
+
+def test_a_mean_of_what_differs_from_time_to_time():
+    # Measured alike well, and no more apart than that: the plain mean and its error.
+    mean, std = random_effects([1.0, 1.0, 1.0, 1.0], [0.04] * 4)
+    assert (mean, std) == pytest.approx((1.0, 0.1))
+    # Much further apart: the scatter itself is the error, whatever each claims.
+    x = np.array([3.0, -1.0, 2.0, -3.0, 1.5])
+    for variance in (1e-9, 1e-4):
+        mean, std = random_effects(x, np.full(5, variance))
+        assert mean == pytest.approx(x.mean(), rel=1e-3)
+        assert std == pytest.approx(np.std(x, ddof=1) / np.sqrt(5), rel=1e-3)
+    # What is hardly seen at one time hardly counts.
+    mean, std = random_effects([1.0, 1.1, 50.0], [0.01, 0.01, 1e6])
+    assert mean == pytest.approx(1.05, abs=1e-3)
+    assert std == pytest.approx(0.1 / np.sqrt(2), rel=0.01)
+    # A coverage by chance: truly different values, unequal errors.
+    rng = np.random.default_rng(5)
+    covered = 0
+    for _ in range(400):
+        variance = rng.uniform(0.1, 2.0, 12)
+        each = 0.7 + rng.normal(size=12) + np.sqrt(variance) * rng.normal(size=12)
+        mean, std = random_effects(each, variance)
+        covered += abs(mean - 0.7) < 2.0 * std
+    assert 0.90 < covered / 400 < 0.98
+
+
+@pytest.mark.parametrize("recordings", [1, 5])
+def test_an_effect_that_changes_from_part_to_part_is_not_steady(recordings):
+    """Two effects, of five stretches of one recording or of five recordings: one the
+    same in each, one of another sign from each to the next."""
+    rng = np.random.default_rng(6)
+    n, parts = 1000, 5
+    part = np.repeat(np.arange(parts), n // parts)
+    X = 10.0 * rng.normal(size=(n, 2))  # In units of noise.
+    a_of = np.full(parts, 0.3)
+    b_of = np.array([0.5, -0.6, 0.4, -0.3, 0.2])
+    y = X[:, 0] * a_of[part] + X[:, 1] * b_of[part] + rng.normal(size=n)
+    best = np.linalg.lstsq(X, y, rcond=None)[0]
+    effects = tuple(
+        Effect("joint_viscous_damping", [joint], {"damping": float(value)})
+        for joint, value in zip(("arm.j1", "arm.j2"), best, strict=True)
+    )
+    fitted = SimpleNamespace(
+        effects=effects, names=((0, "damping"), (1, "damping")),
+        J=-X, rows=y - X @ best,
+    )  # fmt: skip
+    problem = SimpleNamespace(
+        train=lambda: np.ones(n, bool),
+        parts=lambda: part if recordings > 1 else np.zeros(n, int),
+        blocks=lambda: np.arange(n) // 20,
+    )
+    first, second = steady(problem, fitted)
+    assert first > 20.0
+    assert second < 2.0
+    # A scatter takes four parts at least.
+    problem.blocks = lambda: np.arange(n) // 334
+    if recordings == 1:
+        assert steady(problem, fitted) == [np.inf, np.inf]
 
 
 class Steps:

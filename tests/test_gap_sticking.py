@@ -10,10 +10,13 @@ from test_driven_arm import tree
 from makebreak.diagrams.driven_arm import DrivenArmSimulation
 from makebreak.diagrams.scene_simulation import Commands
 from makebreak.gap.driven import DrivenProblem, is_driven, sticks
+from makebreak.gap.mechanism import MechanismProblem
+from makebreak.gap.problem import Candidate
 from makebreak.gap.recording import read_recordings
-from makebreak.gap.select import select
-from makebreak.gap.workflow import run_gap
-from makebreak.models.scene import ActuationSection
+from makebreak.gap.select import _groups, select
+from makebreak.gap.workflow import problem_for, run_gap
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.scene import ActuationSection, read_scene
 from makebreak.models.scene_file import write_scene
 from makebreak.models.scene_schema import SupplySection
 
@@ -89,7 +92,9 @@ def problem_of(folder, arm, hidden):
     scene, file = recorded(folder, arm, hidden)
     recordings = read_recordings([file])
     assert is_driven(scene, recordings)
-    return DrivenProblem(scene, recordings)
+    problem = DrivenProblem(scene, recordings)
+    problem.learn_misfit()
+    return problem
 
 
 def test_the_truth_leaves_the_noise(tmp_path):
@@ -142,3 +147,58 @@ def test_a_joint_that_differs_gets_a_value_of_its_own(tmp_path):
         effect = found[tuple(at)]
         assert effect.kind == kind
         assert effect.parameters["kp"] == pytest.approx(p["kp"], rel=0.05)
+
+
+@pytest.mark.slow
+def test_joints_that_all_differ_are_found_together(tmp_path):
+    hidden = [("joint_coulomb_friction", ["d.j1"], dict(coulomb=1.6)),
+              ("joint_coulomb_friction", ["d.j2"], dict(coulomb=0.3))]  # fmt: skip
+    problem = problem_of(tmp_path, "two", hidden)
+    found = {tuple(c.effect.at): c.effect for c in select(problem).choices}
+    assert set(found) == {("d.j1",), ("d.j2",)}
+    for kind, at, p in hidden:
+        assert found[tuple(at)].kind == kind
+        assert found[tuple(at)].parameters["coulomb"] == pytest.approx(
+            p["coulomb"], rel=0.1
+        )
+
+
+def test_groups_have_joints_and_not_the_value_that_all_share():
+    def candidate(at):
+        return Candidate("joint_coulomb_friction", (at,), 1, (np.ones((4, 1)),), ())
+
+    (group,) = _groups([candidate(at) for at in ("d", "d.j1", "d.j2")])
+    assert group.at == ("d.j1", "d.j2")
+    assert group.columns[0].shape == (4, 2)
+
+
+def velocity_log(folder, hide):
+    """A log by MuJoCo of a planar arm whose drives follow commanded speeds."""
+    pytest.importorskip("mujoco")
+    from gap_benchmark.log_cases import LogCase, Recipe, write
+
+    recipe = Recipe("velocity", "planar", hide=hide, options=("velocity drive",))
+    write(LogCase("velocity", 77, recipe), folder)
+    scene = read_scene(folder / "scene.yaml")
+    recordings = read_recordings([folder / "recording.csv"])
+    assert is_driven(scene, recordings) and not sticks(scene, recordings)
+    return scene, recordings
+
+
+def test_windows_of_a_velocity_drive_say_that_nothing_is_hidden(tmp_path):
+    # Links are off within their tolerance, and the drive's loop takes 1 ms.
+    scene, recordings = velocity_log(tmp_path, "")
+    problem, _ = problem_for(scene, recordings, SceneDynamics(scene))
+    assert isinstance(problem, DrivenProblem)
+    chosen = select(problem)
+    assert not chosen.choices and not chosen.far
+    assert problem.error(chosen.end) < 1.15
+    outcome = problem.outcome([], chosen.start, chosen.end, chosen.nuisances)
+    assert outcome is not None and outcome.gap.after < 1.3
+
+
+def test_of_a_velocity_drive_friction_is_looked_for_in_equations(tmp_path):
+    scene, recordings = velocity_log(tmp_path, "friction")
+    assert not DrivenProblem(scene, recordings).is_explained()
+    problem, _ = problem_for(scene, recordings, SceneDynamics(scene))
+    assert isinstance(problem, MechanismProblem)

@@ -44,6 +44,7 @@ KNOWN = {
         "body_drag", "constant_force", "contact_friction", "friction_patch",
         "object_com", "object_inertia", "object_mass", "plane_height", "plane_tilt",
     },
+    "gap/driven.py": {"rotor_inertia"},
     "gap/free_windows.py": {"length_scale"},
     "gap/windows.py": {"length_scale"},
     "gap/mechanism.py": {"object_com", "object_mass", "link_com", "link_mass"},

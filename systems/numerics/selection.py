@@ -364,3 +364,19 @@ def spread_by_blocks(J, r, block, draws: int = 200) -> np.ndarray:
     ]
     # Of n blocks a sum's variance comes out (n - 1)/n of what it is.
     return np.std(steps, axis=0) * np.sqrt(n / (n - 1)) / size
+
+
+def random_effects(x, variance) -> tuple[float, float]:
+    """Mean of one quantity that was measured several times, where it may truly differ
+    from time to time, and the mean's standard deviation.
+
+    Args: x (n,), variance (n,): values and their own variances, n >= 2.
+    Source: DerSimonian, Laird, Meta-analysis in clinical trials, 1986.
+    """
+    x = np.asarray(x, dtype=float)
+    variance = np.maximum(np.asarray(variance, dtype=float), 1e-300)
+    w = 1.0 / variance
+    Q = np.sum(w * (x - w @ x / w.sum()) ** 2)
+    between = max(Q - (len(x) - 1), 0.0) / (w.sum() - np.sum(w**2) / w.sum())
+    w = 1.0 / (variance + between)
+    return float(w @ x / w.sum()), float(1.0 / np.sqrt(w.sum()))
