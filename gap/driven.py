@@ -138,7 +138,9 @@ class DrivenProblem(DrivenWindows, GapProblem):
         each channel's windows as well as noise lets it."""
         if self._explained is None:
             n = self.nuisances()
-            screen = Screen(self.base(), n.columns, n.prior, self.train(), reach=n.reach)
+            screen = Screen(
+                self.base(), n.columns, n.prior, self.train(), reach=n.reach
+            )
             left = self.in_noise(screen.settle(self.base())[1])
             channel = self.channel_of_rows()
             each = [left[channel == c] for c in np.unique(channel)]

@@ -19,6 +19,7 @@ from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
 from makebreak.systems.numerics.filters import Stage, filtered, mean_delay
 from makebreak.systems.numerics.free_body import FreeBody, lowest_gap, placed, simulate
+from makebreak.systems.numerics.free_flight import fit_flight, turned_by
 from makebreak.systems.numerics.smoother import smooth_filtered
 
 AFTER_SEC = 0.1  # Of a window after its impact.
@@ -29,7 +30,8 @@ BESIDE = 3  # Rows beside an impact that a smoothed state would mix with it.
 BLUR = 0.02  # Laws of contact are approximations, which noise alone does not tell.
 DRAWS = 12  # Of uncertain starts.
 ENOUGH = 30  # Windows up to the first impact: then later ones are not needed.
-FEWEST_ROWS = 8
+FEWEST_ROWS, FEWEST_IN_FLIGHT = 8, 6
+FLIES = 1.5  # Times the noise that a fit of free flight may leave, to be one.
 UNEVEN = 0.5  # Of the error of all windows: what is held out must have as much of it.
 NEAR = 2e-3  # [m] So near it is taken to touch.
 DENSE = 4  # Parts of a row's period at which a signal before a filter is simulated.
@@ -165,7 +167,10 @@ class FreeBodyModel(WindowedResidual):
     def _cut_segment(
         self, i, recording, episode, time, values, a, b, rough, number, before
     ):
-        if any(np.isfinite(y[a:b]).sum() < FEWEST_ROWS for y in values.values()):
+        before_hit = b < len(time) and rough[b : b + BESIDE + 1].any()
+        may_fly = before_hit and not self._filters[i]
+        rows = min(np.isfinite(y[a:b]).sum() for y in values.values())
+        if rows < (FEWEST_IN_FLIGHT if may_fly else FEWEST_ROWS):
             return
         n = b - a
         states = np.zeros((n, 7, 3))
@@ -186,7 +191,9 @@ class FreeBodyModel(WindowedResidual):
                 reach = beside * float(np.median(np.diff(time[a:b])))
                 spreads[:, k, 1, 1] += (0.25 * jump * reach) ** 2
                 spreads[:, k, 0, 0] += (0.06 * jump * reach**2) ** 2
-        before_hit = b < len(time) and rough[b : b + BESIDE + 1].any()
+        flies = may_fly and self._fly(recording, time[a:b], values, a, states, spreads)
+        if rows < FEWEST_ROWS and not flies:
+            return
         spans = []
         if before_hit:
             first = b + int(np.argmax(rough[b:]))
@@ -224,6 +231,52 @@ class FreeBodyModel(WindowedResidual):
                     spreads[k - a], np.zeros(0), block, block % 3 != 1, before,
                 )
             )  # fmt: skip
+
+    def _fly(self, recording, time, values, first: int, states, spreads) -> bool:
+        """Where nothing is touched before an impact, the states (n, 7, 3) and their
+        covariances (n, 7, 2, 2) that all poses of the flight together tell. Returns:
+        whether they are of a flight."""
+        signals = [f"{self.name}.{a}" for a in (*TURN, *_PLACE)]
+        n = len(time)
+        pose, noise = np.full((n, 7), np.nan), np.ones(7)
+        for k, c in enumerate(signals):
+            if c in values:
+                pose[:, k] = values[c][first : first + n]
+                noise[k] = recording.channels[c].noise
+        if not self._turns:
+            pose[:, :4] = [1.0, 0.0, 0.0, 0.0]
+        at = [lowest_gap(self._body, x) for x in pose[np.isfinite(pose).all(axis=1)]]
+        if np.mean(np.array(at) < NEAR) > 0.5:  # It slides or rolls.
+            return False
+        q, dq = states[n // 2, :4, 0], states[n // 2, :4, 1]
+        q = q / np.linalg.norm(q)
+        guess = np.concatenate(
+            [states[0, :4, 0], states[0, 4:, 0], spin_of(q, dq - q * (q @ dq)),
+             states[n // 2, 4:, 1]]
+        )  # fmt: skip
+        guess[12] -= self._body.gravity[2] * (time[n // 2] - time[0])
+        flight = fit_flight(self._body, time, pose, noise, guess)
+        if flight is None or flight.rms > FLIES:
+            return False
+        for k, t in enumerate(time):
+            x, C = flight.later(self._body, t - time[0])
+            if not np.isfinite(x).all() or not np.isfinite(C).all():
+                return False
+            C = C * max(flight.rms, 1.0) ** 2
+            states[k, 4:] = np.stack([x[4:7], x[10:], self._body.gravity], axis=1)
+            for i in range(3):
+                of = np.ix_([3 + i, 9 + i], [3 + i, 9 + i])
+                spreads[k, 4 + i] = C[of]
+            if self._turns:
+                x[:4] *= np.sign(x[:4] @ states[k, :4, 0])
+                states[k, :4, 0], states[k, :4, 1] = x[:4], turned_by(x[:4], x[7:10])
+                G = np.stack([turned_by(x[:4], e) for e in np.eye(3)], axis=1)
+                both = np.zeros((8, 6))
+                both[:4, :3] = both[4:, 3:] = G
+                P = both @ C[np.ix_([0, 1, 2, 6, 7, 8], [0, 1, 2, 6, 7, 8])] @ both.T
+                for i in range(4):
+                    spreads[k, i] = P[np.ix_([i, 4 + i], [i, 4 + i])]
+        return True
 
     def _measured(self, w: Window) -> np.ndarray:
         recording = self.recordings[w.recording]
