@@ -13,8 +13,8 @@ import numpy as np
 
 from makebreak.diagrams.driven_arm import DrivenArmSimulation, can_have
 from makebreak.gap.fit import fit_effects
-from makebreak.gap.measure import gap_measure, series_of
 from makebreak.gap.inverse import LOOP_SEC
+from makebreak.gap.measure import gap_measure, series_of
 from makebreak.gap.mechanism import (
     LESS,
     MISFIT,

@@ -32,8 +32,8 @@ from makebreak.systems.numerics.selection import (
     paired,
     paired_t,
     predictable_share,
-    simplest,
     random_effects,
+    simplest,
     spread_by_blocks,
 )
 from makebreak.systems.numerics.signal_noise import noise_beside
