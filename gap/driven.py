@@ -149,8 +149,8 @@ class DrivenProblem(DrivenWindows, GapProblem):
         return self._explained
 
     def learn_misfit(self) -> None:
-        """To be called before a search. What a model with all that a drive may have at all joints leaves is what
-        models are off by: no fit is believed beyond that."""
+        """To be called before a search. What a model with all that a drive may have at
+        all joints leaves is what models are off by: no fit is believed beyond that."""
         held = ~self.train()
         if not held.any() or held.all() or self.is_explained():
             return
