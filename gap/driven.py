@@ -234,12 +234,13 @@ class DrivenProblem(DrivenWindows, GapProblem):
         """Drives' loops as the nuisances (n_b,) have them."""
         found = dict(zip(nuisances.names, b, strict=True))
         there = {(e.kind, at) for e in effects for at in e.at}
-        return [
-            Effect(more.kind, more.at, {"inertia": more.parameters["inertia"] / size
-                                        * float(found.get(name, 0.0))})
-            for name, more, size in self._late_loops()
-            if (more.kind, more.at[0]) not in there
-        ]  # fmt: skip
+        moved = []
+        for name, more, size in self._late_loops():
+            if (more.kind, more.at[0]) not in there:
+                times = float(found.get(name, 0.0)) / size
+                p = {k: times * x for k, x in more.parameters.items()}
+                moved.append(Effect(more.kind, more.at, p))
+        return moved
 
     def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
         """Kinds at all joints of a model with one value, at each joint, and at bodies
