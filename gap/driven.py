@@ -227,7 +227,8 @@ class DrivenProblem(DrivenWindows, GapProblem):
             if law is None or not law.kd > 0.0:
                 continue
             if self._takes("rotor_inertia", joint):
-                more = Effect("rotor_inertia", [joint], {"inertia": law.kd * LOOP_SEC})
+                inertia = float(law.kd) * LOOP_SEC
+                more = Effect("rotor_inertia", [joint], {"inertia": inertia})
                 yield f"input_delay of {joint}, loop", more, -LOOP_SEC
 
     def _moved_loops(self, effects, nuisances: Nuisances, b) -> list[Effect]:
