@@ -428,13 +428,14 @@ def _inspect(args) -> int:
 
 
 def _close_the_loop(args) -> int:
+    from makebreak.scripts.close_contact_loop import SETTINGS, close_contact_loop
     from makebreak.scripts.close_the_loop import close_the_loop
 
-    if args.experiment != "ball_rolling":
+    if args.experiment not in ("ball_rolling", *SETTINGS):
         _experiment(args.experiment)
         raise ValueError(
             f"close-the-loop: {args.experiment} cannot yet be given a wrong model; "
-            "expected one of: ball_rolling"
+            f"expected one of: ball_rolling, {', '.join(SETTINGS)}"
         )
     try:
         error = float(args.radius_error)
@@ -448,10 +449,16 @@ def _close_the_loop(args) -> int:
     duration = None
     if args.duration is not None:
         duration = _number(args.duration, "--duration", 0.0)
+        if args.experiment in SETTINGS:
+            raise ValueError(f"--duration: {args.experiment} ends by itself")
     apply_settings(_experiment(args.experiment).Config(), args.set)  # Or refuses.
     out = Path(args.out) if args.out else _default_out("close-the-loop")
     try:
-        table = close_the_loop(out, error, seed, duration, args.set, _jobs(args.jobs))
+        jobs, settings = _jobs(args.jobs), args.set
+        if args.experiment == "ball_rolling":
+            table = close_the_loop(out, error, seed, duration, settings, jobs)
+        else:
+            table = close_contact_loop(args.experiment, out, seed, settings, jobs)
     except RuntimeError as failed:
         print(f"makebreak: {failed}", file=sys.stderr)
         return 3

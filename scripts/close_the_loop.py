@@ -99,6 +99,24 @@ def close_the_loop(
     return table
 
 
+def take_step(out: Path, folder: str, says: str, *words: str) -> dict:
+    """The result of a makebreak command, in its subfolder of `out`.
+
+    Raises: ValueError where it refuses its input, RuntimeError without a result.
+    """
+    print(says, file=sys.stderr, flush=True)
+    command = makebreak_command(*words, "--out", str(out / folder))
+    [result] = run_commands(folder, [command], [out / folder], 1)
+    if "error" in result:
+        status, _, line = result["error"].partition(": ")
+        if status == "exit status 2":
+            raise ValueError(f"{folder}: {line.removeprefix('makebreak: ')}")
+        raise RuntimeError(
+            f"{folder}: {result['error']} (all of it: {out / folder / 'log.txt'})"
+        )
+    return result
+
+
 def _steps(out: Path, error, seed, duration, settings, jobs) -> tuple[Table, dict]:
     with OutputFolder(out / "0_model", f"{COMMAND} model") as outputs:
         right, wrong = write_wrong_scene(
@@ -107,30 +125,17 @@ def _steps(out: Path, error, seed, duration, settings, jobs) -> tuple[Table, dic
         outputs.commit()
     model = out / "0_model" / "model.yaml"
 
-    def step(folder: str, says: str, *words: str) -> dict:
-        print(says, file=sys.stderr, flush=True)
-        command = makebreak_command(*words, "--out", str(out / folder))
-        [result] = run_commands(folder, [command], [out / folder], 1)
-        if "error" in result:
-            status, _, line = result["error"].partition(": ")
-            if status == "exit status 2":
-                raise ValueError(f"{folder}: {line.removeprefix('makebreak: ')}")
-            raise RuntimeError(
-                f"{folder}: {result['error']} (all of it: {out / folder / 'log.txt'})"
-            )
-        return result
-
     def run(folder: str, says: str, scene: Path) -> dict:
         words = ["run", "ball_rolling", "--no-meshcat", "--seed", str(seed)]
         words += ["--model", str(scene), "--set", "radius_error_m=0", *settings]
         if duration is not None:
             words += ["--duration", repr(duration)]
-        return step(folder, says, *words)
+        return take_step(out, folder, says, *words)
 
     first = run("1_wrong_model", f"A run with a ball {1e3 * error:+.3g} mm off", model)
     recording = out / "1_wrong_model" / "recording.csv"
-    found = step(
-        "2_gap", "gap, on what the robot recorded",
+    found = take_step(
+        out, "2_gap", "gap, on what the robot recorded",
         "gap", str(model), str(recording), "--jobs", str(jobs),
     )  # fmt: skip
     repaired_scene = out / "2_gap" / "scene.yaml"

@@ -22,6 +22,7 @@ from makebreak.gap.windows import WindowModel
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import InitialSection, load_scene, read_scene
 from makebreak.models.scene_file import write_scene
+from makebreak.scripts import close_contact_loop as contact_loop
 from makebreak.scripts import close_the_loop as loop
 from makebreak.scripts.cli import main
 from makebreak.scripts.close_the_loop import write_wrong_scene
@@ -190,6 +191,7 @@ def test_a_repair_that_misses_what_is_wanted_is_status_1(steps, capsys):
         (["cartpole_walls"], "cartpole_walls cannot yet be given a wrong model"),
         (["ball_rollin"], "unknown experiment ball_rollin; did you mean ball_rolling?"),
         (["--set", "nois=1"], "--set: unknown key nois"),
+        (["contact_learning", "--duration", "9"], "contact_learning ends by itself"),
         (["--duration", "0"], '--duration: got "0", expected a number above 0'),
         (["--dur", "1"], "unknown option --dur; did you mean --duration?"),
     ],
@@ -201,3 +203,81 @@ def test_bad_input_of_the_loop_is_one_line(steps, words, message, capsys):
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
     assert set(Path(".").rglob("*")) == before and not steps[0]
+
+
+def valued(**parameters) -> dict:
+    return {name: {"value": x} for name, x in parameters.items()}
+
+
+def test_what_is_said_of_a_plates_friction_is_that_of_the_last_patch_there():
+    effects = [
+        {"kind": "friction_patch", "at": ["p~t"],
+         "parameters": valued(friction=0.2, x_min=0, x_max=1, y_min=0, y_max=1)},
+        {"kind": "contact_friction", "at": ["p~t"], "parameters": valued(friction=0.5)},
+        {"kind": "friction_patch", "at": ["p~t"],
+         "parameters": valued(friction=0.1, x_min=0.5, x_max=2, y_min=0, y_max=1)},
+    ]  # fmt: skip
+    found = [contact_loop.friction_at(effects, (x, 0.5), 0.3) for x in (-1, 0.2, 0.7)]
+    assert found == [0.5, 0.2, 0.1]
+    assert contact_loop.friction_at([], (0, 0), 0.3) == 0.3
+
+
+def test_a_displacement_is_the_sum_of_what_moves_a_model_along_an_axis():
+    effects = [
+        {"kind": "wall_position", "at": "red.red", "parameters": valued(y=0.02)},
+        {"kind": "plane_height", "at": ["table.top"], "parameters": valued(height=0.1)},
+    ]
+    for model, axis, by in (
+        ("red", "y", 0.02), ("red", "x", 0.0), ("table", "z", 0.1), ("table", "x", 0.0),
+        ("blue", "x", 0.0),
+    ):  # fmt: skip
+        assert contact_loop.displacement(effects, model, axis) == by
+
+
+def test_the_contact_loop_passes_nothing_on_but_recording_and_scenes(
+    monkeypatch, tmp_path, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    asked: list[list[str]] = []
+    config = contact_loop.apply_settings(
+        contact_loop.CONFIGS["contact_learning"](), contact_loop.WALLS
+    )
+    task = contact_loop.contact_learning.make_task(replace(config, seed=3))
+    where = {
+        name: contact_loop.position(task.world, name)
+        - contact_loop.position(task.model, name)
+        for name in ("table", "red_block", "blue_wall")
+    }
+    off = [0.0]
+
+    def run_commands(label, commands, folders, jobs):
+        [words], [folder] = commands, folders
+        asked.append(words)
+        folder.mkdir(parents=True)
+        if "gap" in words:
+            said = [("wall_position", n, a, where[n]["xyz".index(a)] + off[0])
+                    for n, a in (("red_block", "y"), ("blue_wall", "x"))]  # fmt: skip
+            said.append(("plane_height", "table", "height", where["table"][2]))
+            effects = [{"kind": k, "at": f"{n}.{n}", "parameters": valued(**{a: x})}
+                       for k, n, a, x in said]  # fmt: skip
+            return [{"effects": effects, "says": "They stand elsewhere."}]
+        first = label.startswith("1")
+        force = [31.0, 8.0] if first else [8.3]
+        result = {f"impact_force_peak_N_contact_{i}": force for i in (1, 2, 3)}
+        return [result | {"completion_time_s": [9.0, 6.0] if first else [6.1]}]
+
+    monkeypatch.setattr(loop, "run_commands", run_commands)
+    words = ["close-the-loop", "contact_learning", "--seed", "3", "--out"]
+    assert main([*words, "out"]) == 0
+    first, gap, second = asked
+    assert gap[gap.index("gap") + 1 : gap.index("--jobs")] == [
+        "out/1_wrong_model/model.yaml", "out/1_wrong_model/recording.csv",
+    ]  # fmt: skip
+    assert "--model" not in first
+    assert second[second.index("--model") + 1] == "out/2_gap/scene.yaml"
+    for run in (first, second):
+        assert run[run.index("--seed") + 1] == "3" and "spread=0.03" in run
+    assert "31.00" in capsys.readouterr().out
+    off[0] = 6e-4
+    assert main([*words, "again"]) == 1
+    assert "MISSED" in capsys.readouterr().out
