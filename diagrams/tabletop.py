@@ -26,7 +26,7 @@ TOOLS = {"block": ("block.sdf", 0.015), "sphere": ("sphere_tool.sdf", 0.02)}
 # On how many points each stands, and the stiffness of every surface in the files [N/m].
 POINTS = {"block": 4, "sphere": 1}
 SURFACE_STIFFNESS = 4e4
-# Of a tool against a surface: foam rubber to steel [N/m]. Controllers know the most.
+# Of a tool against a surface [N/m]; controllers know the most.
 STIFFNESS_RANGE = (5e3, 2e5)
 FRICTION_MAX = 1.8  # A surface reaches 2 with none of its own left to give.
 

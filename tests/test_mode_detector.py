@@ -161,6 +161,52 @@ def test_over_20_seeds_changes_are_right(speed, normal, known_sec, new_sec):
     assert all_missed <= 0.02 * n  # 98 % is what the task asks for; none was missed.
 
 
+def two_surfaces(gap, seed, normal, threshold):
+    """Of changes between two surfaces `gap` apart: how many were right, how many there
+    were, how many modes there are, and the delays from the last foot [s]."""
+    rng = np.random.default_rng([seed, round(1000 * gap)])
+    low = rng.uniform(0.1, 0.6 - gap)
+    friction = [low, low + gap] if rng.random() < 0.5 else [low + gap, low]
+    slide = Slide(
+        friction,
+        [0.2],
+        length=0.4,
+        rows=bool(seed % 2),
+        seed=seed,
+        normal=normal,
+        angle=rng.uniform(0.0, 2.0 * np.pi),
+    )
+    stays: list[tuple[int, float, list]] = []  # Surface, since when, (time, mode).
+    rows = follow(slide, ModeTuning(crossing=0.03, threshold=threshold), 20.0)
+    for time, s, memory in rows:
+        surface = slide.surface_at(s)
+        if time < slide.touch_sec or surface < 0:
+            continue
+        if not stays or stays[-1][0] != surface:
+            stays.append((surface, time, []))
+        mode = memory.mode if memory.stage == TRACKING else UNKNOWN_MODE
+        stays[-1][2].append((time, mode))
+    mode_of = {surface: told[-1][1] for surface, _, told in reversed(stays)}
+    right, delays = 0, []
+    for surface, since, told in stays[1:]:
+        mode = told[-1][1]
+        if mode == mode_of[surface] != mode_of[1 - surface]:
+            right += 1
+            delays.append(next(t for t, one in told if one == mode) - since)
+    return right, len(stays) - 1, len(rows[-1][2].table), delays
+
+
+@pytest.mark.parametrize(
+    "threshold, gap, modes", [(0.04, 0.07, 2), (0.04, 0.03, 1), (0.02, 0.05, 2)]
+)
+def test_how_near_two_surfaces_may_be_goes_with_the_threshold(threshold, gap, modes):
+    for seed in (10, 11):
+        right, n, found, delays = two_surfaces(gap, seed, 8.0, threshold)
+        assert n >= 4 and found == modes
+        assert right == (n if modes == 2 else 0)
+        assert max(delays, default=0.0) <= 0.3
+
+
 def test_a_point_knows_a_surface_again_within_80_ms():
     slide = Slide([0.15, 0.5, 0.3], [0.2, 0.4], ramp=0.0)
     rows = follow(slide, ModeTuning(crossing=0.0), 20.0)
