@@ -76,9 +76,17 @@ def withdrawn_if_weak(
 
 def two_figures(start: float, end: float, gap: GapMeasure) -> str:
     """A sentence where equations, whose error goes from start to end, and simulated
-    windows disagree on what is left by more than a factor of two; else nothing."""
-    if not start > NO_GAP or not gap.window_s > 0.0 or not gap.before > NO_GAP:
+    windows disagree on what is left by more than a factor of two, or only equations
+    show the gap (a heavier object goes where it is pushed all the same); else
+    nothing."""
+    if not start > NO_GAP or not gap.window_s > 0.0:
         return ""
+    if gap.before <= NO_GAP:
+        return (
+            " Simulated windows do not show this gap; in the equations of motion the "
+            f"error falls from {start:.3g} to {end:.3g} times the noise."
+            if end < start else ""
+        )  # fmt: skip
 
     equations, simulated = (
         share_left(*each) for each in ((start, end), (gap.before, gap.after))
@@ -163,7 +171,8 @@ def says(
     tail = ""
     if verdict == "ambiguous":
         tail = _apart_from(effects)
-    return f"{words}{tail} Held-out error falls from {before} to {after}.{more}"
+    goes = "falls" if gap.after < gap.before else "goes"
+    return f"{words}{tail} Held-out error {goes} from {before} to {after}.{more}"
 
 
 def _apart_from(effects: Sequence[NamedEffect]) -> str:

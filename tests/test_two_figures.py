@@ -18,8 +18,8 @@ def measure(before: float, after: float, window_s: float = 0.3) -> GapMeasure:
         # Next to nothing is left in both: how much less is no disagreement.
         (101.0, 1.0, measure(11.0, 2.5)),
         (101.0, 1.0, measure(11.0, 9.0, window_s=0.0)),  # Nothing was simulated.
-        (1.2, 1.0, measure(11.0, 9.0)),  # No gap in the equations,
-        (11.0, 2.0, measure(1.2, 1.1)),  # or none in simulation.
+        (1.2, 1.0, measure(11.0, 9.0)),  # No gap in the equations.
+        (11.0, 11.0, measure(1.2, 1.2)),  # Nothing was named.
     ],
 )
 def test_figures_that_agree_need_no_sentence(start, end, gap):
@@ -36,3 +36,9 @@ def test_figures_that_agree_need_no_sentence(start, end, gap):
 )
 def test_figures_more_than_a_factor_of_two_apart_are_said(start, end, gap, said):
     assert said in two_figures(start, end, gap)
+
+
+def test_a_gap_that_simulation_does_not_show_is_told_by_the_equations():
+    said = two_figures(11.0, 0.934, measure(1.41, 0.83))
+    assert "Simulated windows do not show this gap" in said
+    assert "from 11 to 0.934 times the noise" in said
