@@ -368,6 +368,7 @@ PAPER_TIME = (14.4, 9.2)  # [s]
 APPROACH = "control.anticipator.speed"
 VARIANTS: dict[str, dict] = {
     "sphere": {"tool": "sphere"},
+    "realism lab": {"realism": "lab"},
     "eq. 9 for the speed": {f"{APPROACH}.regression": False},
     "50 mm/s first, whatever the stiffness": {
         f"{APPROACH}.first": 0.05,
@@ -377,7 +378,8 @@ VARIANTS: dict[str, dict] = {
 
 
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
-    """Table 1 and figure 18 beside ours; other tool, other rule, faster start."""
+    """Table 1 and figure 18 beside ours; other tool, errors of the station, other
+    rule, faster start."""
     name = "contact_learning"
 
     def many(settings, n):
