@@ -63,15 +63,19 @@ class Recorder(Diagram):
         builder.BuildInto(self)
         self.set_name("recorder")
 
-    def log(self, what: str, context: Context) -> tuple[np.ndarray, dict]:
-        """The times and {channel: (n,)} of "measured" or "commanded", in a root
-        context; empty where there are none."""
+    def log(
+        self, what: str, context: Context, begin: float = -np.inf
+    ) -> tuple[np.ndarray, dict]:
+        """The times and {channel: (n,)} of "measured" or "commanded" from `begin` on
+        [s], in a root context; empty where there are none."""
         if not self.HasSubsystemNamed(what):
             return np.zeros(0), {}
         log = self.GetSubsystemByName(what).FindLog(context)
         names = [name for part in self.names[what].values() for name in part]
-        values = zip(names, log.data(), strict=True)
-        return np.array(log.sample_times()), {n: np.array(x) for n, x in values if n}
+        first = int(np.searchsorted(log.sample_times(), begin - 1e-9))
+        values = zip(names, log.data()[:, first:], strict=True)
+        times = np.array(log.sample_times()[first:])
+        return times, {n: np.array(x) for n, x in values if n}
 
 
 def add_recorder(
@@ -128,9 +132,16 @@ def record_station(
     add_recorder(builder, measured | dict(seen or {}), commanded, row_sec)
 
 
-def recorded(diagram: Diagram, context: Context) -> dict[str, np.ndarray]:
+def has_recorder(diagram: Diagram) -> bool:
+    """Whether `recorded` can be asked."""
+    return any(isinstance(system, Recorder) for system in _within(diagram))
+
+
+def recorded(
+    diagram: Diagram, context: Context, begin: float = -np.inf
+) -> dict[str, np.ndarray]:
     """The columns of a simulation that ended in `context`: time (n,) and every channel
-    (n,), a row per row_sec of its Recorder.
+    (n,), a row per row_sec of its Recorder, from `begin` on [s].
 
     Raises: ValueError for a diagram without a Recorder.
     """
@@ -138,13 +149,15 @@ def recorded(diagram: Diagram, context: Context) -> dict[str, np.ndarray]:
     if not found:
         raise ValueError(f"{diagram.get_name()} has no recorder")
     (recorder,) = found
-    time, columns = recorder.log("measured", context)
-    ticks, commands = recorder.log("commanded", context)
-    if commands:
+    time, columns = recorder.log("measured", context, begin)
+    ticks, commands = recorder.log("commanded", context, begin)
+    if commands and len(time):
         fine = np.column_stack(list(commands.values()))
         begin = ticks - TICK if recorder.late else ticks
         held = mean_until_next(time, begin, fine)
         columns |= dict(zip(commands, held.T, strict=True))
+    else:  # None yet.
+        columns |= commands
     return {"time": time, **columns}
 
 

@@ -126,15 +126,7 @@ def write_recording(
     path = Path(path)
     table = check_columns(columns)
     if path.suffix == ".csv":
-        # repr gives the shortest text that reads back as the very same number.
-        cells = [
-            [str(int(v)) for v in value]
-            if name == "episode"
-            else ["" if v != v else repr(v) for v in value.tolist()]
-            for name, value in table.items()
-        ]
-        rows = [",".join(row) for row in zip(*cells, strict=True)]
-        path.write_text("\n".join([",".join(table), *rows]) + "\n")
+        path.write_text("\n".join([",".join(table), *csv_rows(table)]) + "\n")
     elif path.suffix == ".npz":
         with path.open("wb") as file:
             np.savez_compressed(file, **table)  # type: ignore[arg-type]
@@ -155,6 +147,18 @@ def write_recording(
         beside.write_text(json.dumps(dict(noise), indent=2) + "\n")
         written.append(beside)
     return written
+
+
+def csv_rows(table: Mapping[str, np.ndarray]) -> list[str]:
+    """A table's rows as lines of a csv file; a missing sample is an empty cell."""
+    # repr gives the shortest text that reads back as the very same number.
+    cells = [
+        [str(int(v)) for v in value]
+        if name == "episode"
+        else ["" if v != v else repr(v) for v in value.tolist()]
+        for name, value in table.items()
+    ]
+    return [",".join(row) for row in zip(*cells, strict=True)]
 
 
 def suffix_of(path: Path) -> str:

@@ -214,6 +214,12 @@ def _run_in(session, args, module, config, duration) -> int:
     from makebreak.scripts.table import Table
     from makebreak.scripts.trials import duration_line
 
+    if session.outputs.salvaged is not None:
+        print(
+            "makebreak: an earlier run here was killed; what it had recorded is in "
+            f"{session.outputs.salvaged}",
+            file=sys.stderr,
+        )
     session.picture = Path(args.diagram) if args.diagram is not None else None
     session.write_text("config.yaml", duration_line(duration) + dump_config(config))
     _writable(session)

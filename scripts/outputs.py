@@ -11,6 +11,7 @@ from pathlib import Path
 
 MARK = ".makebreak.json"  # Which command wrote the folder, and which files.
 STAGE = ".unfinished"  # In it, files are written before they are moved.
+KILLED = "killed"  # Where what a killed run had recorded goes when the next one begins.
 KEPT = "unfinished"  # Where an interrupted run goes beside an older, complete one.
 _LOCK = "lock"
 # What commands write: in a folder that none of them made, such a file is the user's.
@@ -47,6 +48,7 @@ class OutputFolder:
         self.path = Path(path)
         self.command = command
         self.stage = self.path / STAGE
+        self.salvaged: Path | None = None  # What a run that was killed had recorded.
         self._lock: int | None = None
         self._made: list[Path] = []  # Folders that were not there.
         for each in inputs:
@@ -115,7 +117,15 @@ class OutputFolder:
                 os.close(lock)
         os.ftruncate(self._lock, 0)
         os.pwrite(self._lock, str(os.getpid()).encode(), 0)
-        for old in self.stage.iterdir():  # Of a run that was killed.
+        # Of a run that was killed.
+        recorded = sorted(self.stage.glob("recording*.csv"))
+        if recorded:
+            place = self.path / KILLED
+            self.salvaged = _free(place) if os.path.lexists(place) else place
+            self.salvaged.mkdir()
+            for each in recorded:
+                os.replace(each, self.salvaged / each.name)
+        for old in self.stage.iterdir():
             if old.is_dir() and not old.is_symlink():
                 shutil.rmtree(old)
             elif old.name != _LOCK:

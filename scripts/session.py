@@ -34,6 +34,7 @@ from makebreak.scripts.compiling import CompilingShown
 from makebreak.scripts.diagram_picture import draw_diagram, shown_systems
 from makebreak.scripts.interrupts import handled, leave_terminal, undisturbed
 from makebreak.scripts.outputs import OutputFolder
+from makebreak.scripts.recording_stream import RecordingStream
 from makebreak.scripts.table import json_value
 from makebreak.scripts.trials import run_many
 from makebreak.systems.numerics.first_calls import deferred
@@ -147,6 +148,7 @@ class Session:
         self._drawn = 0  # Systems in the diagram that was.
         self._partial: dict[str, dict[str, np.ndarray]] = {}
         self._timing: dict[str, dict] = {}
+        self._streams: list[Path] = []  # Recordings as they came.
         self.compared_by = ""  # The command that compares recording and model.
 
     def child(self, name: str) -> "Session":
@@ -225,6 +227,9 @@ class Session:
             system.compute_sec.clear()
 
         label = label or f"simulation_{len(self._timing)}" * bool(self._timing)
+        name = f"recording_{label}.csv" if label else "recording.csv"
+        stream = RecordingStream(self.outputs.file(name), diagram)
+        self._streams.append(stream.path)
         time: list[float] = []
         samples: dict[str, list[np.ndarray]] = {name: [] for name in record}
 
@@ -262,6 +267,7 @@ class Session:
                     t = min(k * period_sec, duration)
                     simulator.AdvanceTo(t)
                     done = sample(t)
+                    stream.tick(root)
                     bar.update(t - bar.n)
                 if (done or interrupt.hit) and time[-1] < duration:
                     why = "interrupted" if interrupt.hit else done
@@ -269,6 +275,7 @@ class Session:
             finally:
                 self.interrupted = interrupt.hit
                 wall, cpu = perf_counter() - wall_start, process_time() - cpu_start
+                stream.catch_up(root, ended=True)
                 log = self._finish_log(
                     label, time, samples, interrupt.hit, root, diagram
                 )
@@ -344,8 +351,10 @@ class Session:
         """Writes recording.csv, noise.json where the noise is known, and as model.yaml
         the scene that controllers believed: what `makebreak gap` is to compare it with.
 
-        See gap/table.py for the columns' names.
+        See gap/table.py for the columns' names. It takes the place of what was written
+        while it was simulated.
         """
+        self._drop_streams()
         self._write("recording.csv", lambda path: write_recording(path, columns, noise))
         if scene is not None:
             says = "What the controllers believed."
@@ -353,6 +362,10 @@ class Session:
             self._write(MODEL, lambda path: write_scene(scene, path, says, place=place))
             files = (self.out_dir / name for name in (MODEL, "recording.csv"))
             self.compared_by = " ".join(["makebreak gap", *map(str, files)])
+
+    def _drop_streams(self) -> None:
+        while self._streams:
+            self._streams.pop().unlink(missing_ok=True)
 
     def write_result(self, result: Mapping) -> None:
         """Writes result.json: flat, keys in the order given, NaN and infinity as null.
@@ -425,6 +438,8 @@ class Session:
         with undisturbed():
             if self._timing:
                 self.write_json("timing.json", self._timing_summary())
+            if complete:
+                self._drop_streams()
             try:
                 for fig, name in self._figures:
                     self._write(name, partial(_save_figure, fig))

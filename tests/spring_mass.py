@@ -99,7 +99,7 @@ def run(config, session):
     figure = Figure()
     figure.subplots().plot(log.time, q)
     session.save_plot(figure, "position")
-    session.write_recording({"time": log.time, "mass.slider.position": q}, {})
+    session.write_recording({"time": log.time, "mass.slider.position": q}, noise={})
     return {
         **criteria.result(),
         "position_end_m": q[-1],

@@ -1,0 +1,111 @@
+"""What is on disk of a run that is killed."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from makebreak.diagrams.recorder import recorded
+from makebreak.gap.recording import read_recording
+from makebreak.scripts import recording_stream
+from makebreak.scripts.session import Session
+
+# A pendulum with a recorder, simulated in real time for a minute.
+RUN = """
+import sys
+from pathlib import Path
+import numpy as np
+import pydrake.all as drake
+from makebreak.diagrams.recorder import add_recorder
+from makebreak.scripts.session import Session
+
+def pendulum():
+    builder = drake.DiagramBuilder()
+    plant, _ = drake.AddMultibodyPlantSceneGraph(builder, 0.001)
+    rod = drake.SpatialInertia.SolidCylinderWithMassAboutEnd(1.0, 0.02, 0.5, [0, 0, -1])
+    link = plant.AddRigidBody("link", rod)
+    joint = plant.AddJoint(drake.RevoluteJoint(
+        "swing", plant.world_frame(), link.body_frame(), [0, 1, 0]))
+    plant.AddJointActuator("motor", joint)
+    joint.set_default_angle(1.0)
+    plant.Finalize()
+    told = builder.AddSystem(drake.Sine(0.3, 5.0, 0.0, 1))
+    builder.Connect(told.get_output_port(0), plant.get_actuation_input_port())
+    add_recorder(
+        builder,
+        {"x": (plant.get_state_output_port(), ["p.swing.position", "p.swing.velocity"])},
+        {"u": (told.get_output_port(0), ["p.swing.effort_command"])},
+    )
+    return builder.Build()
+"""
+MAIN = (
+    RUN
+    + """
+with Session(Path(sys.argv[1]), realtime=1.0, progress=False) as session:
+    session.simulate(pendulum(), 60.0, {})
+"""
+)
+
+
+def test_a_killed_run_loses_a_second_at_most(tmp_path):
+    out = tmp_path / "out"
+    script = tmp_path / "run.py"
+    script.write_text(MAIN)
+    process = subprocess.Popen([sys.executable, str(script), str(out)])
+    file = out / ".unfinished" / "recording.csv"
+    try:
+        began = None
+        while began is None or time.monotonic() < began + 2.5:
+            assert process.poll() is None
+            if began is None and file.is_file() and file.stat().st_size:
+                began = time.monotonic()  # Of what a second and more had gathered.
+            time.sleep(0.02)
+        first = time.monotonic() - began
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    recording = read_recording(file)
+    t = recording.time
+    assert np.diff(t) == pytest.approx(np.full(len(t) - 1, 0.005), abs=1e-9)
+    # A second had passed in simulation when the file came (real time is as fast as it
+    # may go), or less on a slow machine; since then at most one was lost.
+    assert t[-1] > first - 1.5
+    # The next run of that folder keeps it.
+    with Session(out, progress=False) as session:
+        assert session.outputs.salvaged == out / "killed"
+        assert (out / "killed" / "recording.csv").is_file()
+        assert not file.exists()
+    assert read_recording(out / "killed" / "recording.csv").time[-1] == t[-1]
+
+
+def test_what_was_streamed_is_what_is_written_at_the_end(tmp_path, monkeypatch):
+    monkeypatch.setattr(recording_stream, "EVERY_SEC", 0.0)  # At each sample.
+    scope: dict = {}
+    exec(RUN, scope)
+    diagram = scope["pendulum"]()
+    with Session(tmp_path / "out", progress=False) as session:
+        log = session.simulate(diagram, 0.5, {})
+        columns = recorded(diagram, log.context)
+        streamed = session.outputs.file("recording.csv")
+        table = np.genfromtxt(streamed, delimiter=",", names=True, deletechars="")
+        assert set(table.dtype.names) == set(columns)
+        for name, y in columns.items():
+            assert table[name] == pytest.approx(y, rel=1e-12, abs=1e-12)  # Of sums.
+        session.write_recording(columns)
+        session.simulate(scope["pendulum"](), 0.1, {}, label="again")
+        session.finish()
+    # What was streamed beside it is gone with a complete run.
+    assert {p.name for p in (tmp_path / "out").glob("*.csv")} == {"recording.csv"}
+
+
+def test_an_interrupted_run_keeps_what_was_streamed(tmp_path):
+    scope: dict = {}
+    exec(RUN, scope)
+    with Session(tmp_path / "out", progress=False) as session:
+        session.simulate(scope["pendulum"](), 0.1, {})
+        session.finish(complete=False)
+    t = read_recording(tmp_path / "out" / "recording.csv").time
+    assert t[-1] == pytest.approx(0.1)
