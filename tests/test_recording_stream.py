@@ -36,8 +36,8 @@ def pendulum():
     builder.Connect(told.get_output_port(0), plant.get_actuation_input_port())
     add_recorder(
         builder,
-        {"x": (plant.get_state_output_port(), ["p.swing.position", "p.swing.velocity"])},
-        {"u": (told.get_output_port(0), ["p.swing.effort_command"])},
+        {"x": (plant.get_state_output_port(), ["p.j.position", "p.j.velocity"])},
+        {"u": (told.get_output_port(0), ["p.j.effort_command"])},
     )
     return builder.Build()
 """
