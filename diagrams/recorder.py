@@ -153,8 +153,8 @@ def recorded(
     ticks, commands = recorder.log("commanded", context, begin)
     if commands and len(time):
         fine = np.column_stack(list(commands.values()))
-        begin = ticks - TICK if recorder.late else ticks
-        held = mean_until_next(time, begin, fine)
+        acting = ticks - TICK if recorder.late else ticks
+        held = mean_until_next(time, acting, fine)
         columns |= dict(zip(commands, held.T, strict=True))
     else:  # None yet.
         columns |= commands
