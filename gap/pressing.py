@@ -370,7 +370,12 @@ class PressingProblem(ContactProblem):
     # ----- Rows
 
     def allow(self, allowance: np.ndarray) -> None:
-        super().allow(allowance)
+        # Which rows forces take up is asked of the scene as it came.
+        kept, self._any_friction = self._any_friction, False
+        try:
+            super().allow(allowance)
+        finally:
+            self._any_friction = kept
         if hasattr(self, "_met"):  # Else not all is prepared.
             self._pressed, _ = self._pressing()
 

@@ -203,3 +203,12 @@ def test_without_a_wrench_a_face_that_was_passed_tells(tmp_path):
     problem = PressingProblem(scene, recordings)
     off = {problem.shapes.names[k]: by for k, by in problem.off.items()}
     assert off[TABLE]["z"] == pytest.approx(-0.012, abs=1e-3)
+
+
+def test_bodies_that_stand_nearer_are_felt_though_the_scene_has_no_contact(tmp_path):
+    scene = write_scene(tmp_path)
+    problem = PressingProblem(scene, record(tmp_path, table=0.01, wall=0.28))
+    assert not problem.slots  # The tool never comes near what the scene has.
+    off = {problem.shapes.names[k]: by for k, by in problem.off.items()}
+    assert off[TABLE]["z"] == pytest.approx(0.01, abs=1e-3)
+    assert off[WALL]["x"] == pytest.approx(-0.02, abs=1e-3)
