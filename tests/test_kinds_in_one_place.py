@@ -22,6 +22,7 @@ KNOWN = {
     "diagrams/ball_rolling.py": {
         "contact_friction", "object_size", "rolling_resistance"
     },
+    "diagrams/realism.py": {"joint_offset", "plane_tilt"},
     "diagrams/station.py": {"joint_viscous_damping"},
     "diagrams/tabletop.py": {"contact_friction", "contact_stiffness"},
     "diagrams/free_body.py": CONTACT
