@@ -255,7 +255,9 @@ MEASURED = {
     "panda.torque_measured",
     "overhead.rgb_image",
 }
-OBSERVERS = {"state_log", "contact_log", "torque_log", "true_ball", "rolling_view"}
+OBSERVERS = {
+    "state_log", "contact_log", "torque_log", "true_ball", "rolling_view", "recorder",
+}  # fmt: skip
 
 
 def connections(diagram) -> Iterator[tuple[str, str, str]]:
