@@ -539,6 +539,29 @@ def test_what_helps_a_little_everywhere_keeps_no_effect_of_one_channel_out():
     assert select(TwoChannels(damping=np.sqrt(0.225), bias=0.0)).choices == ()
 
 
+class Wavering(TwoChannels):
+    """Five recordings, in each of which the bias is another."""
+
+    def __init__(self, biases):
+        super().__init__(damping=0.0, bias=0.0)
+        n = len(self._base)
+        self._part = np.arange(n) * 5 // n
+        self._base = (
+            self._base + np.array(biases)[self._part] * self._of["actuator_bias"]
+        )
+
+    def parts(self):
+        return self._part
+
+
+def test_an_effect_that_recordings_contradict_is_not_named():
+    (choice,) = select(Wavering([1.0, 1.3, 0.8, 1.1, 0.7])).choices
+    assert choice.effect.kind == "actuator_bias"
+    # Its mean takes a fifth off the channel, but it is of another sign from one
+    # recording to the next.
+    assert select(Wavering([9.0, -1.5, 7.0, -2.0, 5.5])).choices == ()
+
+
 @pytest.mark.parametrize(
     "damping, std, named",
     [(0.0, np.inf, True), (2.0, 0.5, True), (2.0, np.inf, False)],
