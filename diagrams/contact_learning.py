@@ -19,9 +19,11 @@ from makebreak.diagrams.changing_contact import (
 )
 from makebreak.diagrams.realism import StationErrors, draw_errors
 from makebreak.diagrams.tabletop import (
+    SPREAD,
     STIFFNESS_RANGE,
     TABLETOP_WALLS,
     TOOL,
+    check_spread,
     draw_stiffness,
     frictions,
     move,
@@ -31,6 +33,7 @@ from makebreak.diagrams.tabletop import (
     set_friction,
     set_stiffness,
     set_tool,
+    tool_corner,
     tool_half_width,
 )
 from makebreak.models.scene import Scene, read_scene
@@ -52,7 +55,6 @@ SURFACES = ("table", "red_block", "blue_wall")  # Of contacts 1, 2, 3.
 DIRECTIONS = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
 ERRORS = (0.12, 0.09, 0.10)  # Of the initial estimates, along DIRECTIONS [m].
 SIGMA = 0.08  # Of them [m].
-SPREAD = 0.05  # Of the surfaces' positions [m].
 FRICTION = (0.1, 0.6)
 START = (0.42, -0.16, 0.195)  # Of the tip in the scene [m].
 BEYOND = 0.06  # How far behind the nominal surfaces the motion pattern goes [m].
@@ -104,15 +106,7 @@ class ContactTask:
     friction: np.ndarray  # (3,)
     stiffness: dict[str, float]  # Of the tool against each surface [N/m].
     errors: StationErrors
-    half: float  # From the tip to what it touches, straight down or to a side [m].
-
-    def table_rise(self, p) -> np.ndarray:
-        """How much higher than in the level world the tip meets the table, (n,) [m].
-
-        Args: p (n, 3) of the tip [m].
-        """
-        rise = self.errors.table_rise(p, position(self.world, "table"))
-        return rise + self.errors.corner_rise(self.half)
+    corner: float  # From the tip to the tool's corners, in x and in y; 0: none [m].
 
 
 def make_task(config: ContactLearningConfig) -> ContactTask:
@@ -124,8 +118,7 @@ def make_task(config: ContactLearningConfig) -> ContactTask:
         value = getattr(config, name)
         if not 0.0 < value < np.inf:
             raise ValueError(f"{name} is {value}, expected a positive number")
-    if not 0.0 <= config.spread <= SPREAD:
-        raise ValueError(f"spread is {config.spread}, expected 0 to {SPREAD} m")
+    check_spread(config.spread)
     rng = np.random.default_rng([config.seed, 3])
     model = read_model(config.model, TABLETOP_WALLS, config.tool)
     world = read_scene(TABLETOP_WALLS)
@@ -168,7 +161,7 @@ def make_task(config: ContactLearningConfig) -> ContactTask:
         friction,
         stiffness,
         draw_errors(config.realism, config.seed),
-        half,
+        tool_corner(config.tool),
     )
 
 

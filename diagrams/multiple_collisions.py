@@ -20,9 +20,11 @@ from makebreak.diagrams.changing_contact import (
 )
 from makebreak.diagrams.realism import StationErrors, draw_errors
 from makebreak.diagrams.tabletop import (
+    SPREAD,
     STIFFNESS_RANGE,
     TABLETOP_WALLS,
     TOOL,
+    check_spread,
     draw_stiffness,
     frictions,
     move,
@@ -32,6 +34,7 @@ from makebreak.diagrams.tabletop import (
     set_friction,
     set_stiffness,
     set_tool,
+    tool_corner,
     tool_half_width,
 )
 from makebreak.models.scene import Scene, read_scene
@@ -57,7 +60,6 @@ IMPACTS = ((DOWN, "table", 0), (LEFT, "red_block", 1), (AHEAD, "blue_wall", 2),
            (DOWN, "red_top", 6))  # fmt: skip
 START = (0.42, -0.16, 0.195)  # Of the tip in the scene [m].
 RED_TOP, BLUE_TOP = 0.06, 0.09  # Above the table [m].
-SPREAD = 0.05  # Of the surfaces' positions [m].
 FRICTION = (0.1, 0.6)
 BEYOND = 0.06  # How far behind the nominal surfaces the pattern goes [m].
 CLEAR = 0.05  # Above the blue wall's top, before it turns [m].
@@ -124,15 +126,7 @@ class CollisionTask:
     friction: dict[str, float]
     stiffness: dict[str, float]  # Of the tool against each surface [N/m].
     errors: StationErrors
-    half: float  # From the tip to what it touches, straight down or to a side [m].
-
-    def table_rise(self, p) -> np.ndarray:
-        """How much higher than in the level world the tip meets the table, (n,) [m].
-
-        Args: p (n, 3) of the tip [m].
-        """
-        rise = self.errors.table_rise(p, position(self.world, "table"))
-        return rise + self.errors.corner_rise(self.half)
+    corner: float  # From the tip to the tool's corners, in x and in y; 0: none [m].
 
 
 def make_task(config: MultipleCollisionsConfig) -> CollisionTask:
@@ -147,8 +141,7 @@ def make_task(config: MultipleCollisionsConfig) -> CollisionTask:
             )
     if not 0.0 <= config.error_max <= 0.1:
         raise ValueError(f"error_max is {config.error_max}, expected 0 to 0.1 m")
-    if not 0.0 <= config.spread <= SPREAD:
-        raise ValueError(f"spread is {config.spread}, expected 0 to {SPREAD} m")
+    check_spread(config.spread)
     rng = np.random.default_rng([config.seed, 5])
     half = tool_half_width(config.tool)
     model = read_model(config.model, TABLETOP_WALLS, config.tool)
@@ -189,7 +182,7 @@ def make_task(config: MultipleCollisionsConfig) -> CollisionTask:
         friction,
         stiffness,
         draw_errors(config.realism, config.seed),
-        half,
+        tool_corner(config.tool),
     )
 
 

@@ -53,10 +53,13 @@ class StationErrors:
         """How far from the truth the arm may believe its tip, about [m]."""
         return abs(self.tool) + 3.0 * REACH * float(np.std(self.encoders))
 
-    def table_rise(self, p, origin) -> np.ndarray:
-        """How much higher the table is than it would be level, (n,) [m].
+    def table_rise(self, p, origin, corner: float = 0.0) -> np.ndarray:
+        """How much higher than a level table an upright tool meets it, (n,) [m].
 
-        Args: p (n, 3) of places in the world, origin (3,) about which it is tilted [m].
+        Args:
+            p: (n, 3) of places in the world [m].
+            origin: (3,) about which the table is tilted [m].
+            corner: from there to the corners of the tool, in x and in y [m].
         """
         roll, pitch = self.tilt
         # Of the normal Ry(pitch) Rx(roll) z.
@@ -66,11 +69,8 @@ class StationErrors:
             np.cos(pitch) * np.cos(roll),
         ])  # fmt: skip
         away = np.asarray(p)[:, :2] - np.asarray(origin)[:2]
-        return -away @ normal[:2] / normal[2]
-
-    def corner_rise(self, half: float) -> float:
-        """How much higher an upright block of half width `half` [m] meets it [m]."""
-        return half * float(np.abs(np.tan(self.tilt)).sum())
+        slope = -normal[:2] / normal[2]
+        return away @ slope + corner * float(np.abs(slope).sum())
 
 
 def draw_errors(level: str, seed: int) -> StationErrors:

@@ -28,6 +28,7 @@ POINTS = {"block": 4, "sphere": 1}
 SURFACE_STIFFNESS = 4e4
 # Of a tool against a surface [N/m]; controllers know the most.
 STIFFNESS_RANGE = (5e3, 2e5)
+SPREAD = 0.05  # Of the surfaces' positions [m].
 FRICTION_MAX = 1.8  # A surface reaches 2 with none of its own left to give.
 
 
@@ -56,6 +57,20 @@ def tool_half_width(tool: str) -> float:
     Raises: ValueError if there is no such tool.
     """
     return _known_tool(tool)[1]
+
+
+def tool_corner(tool: str) -> float:
+    """From the tip to the tool's corners, in x and in y; 0: it has none [m].
+
+    Raises: ValueError if there is no such tool.
+    """
+    return tool_half_width(tool) if POINTS[tool] > 1 else 0.0
+
+
+def check_spread(spread: float) -> None:
+    """Raises: ValueError if surfaces cannot be so far from their places [m]."""
+    if not 0.0 <= spread <= SPREAD:
+        raise ValueError(f"spread is {spread}, expected 0 to {SPREAD} m")
 
 
 def set_tool(scene: Scene, tool: str) -> None:

@@ -30,6 +30,7 @@ from makebreak.gap.problem import (
     Nuisances,
     Outcome,
     SearchPlan,
+    rms,
 )
 from makebreak.gap.recording import Recording
 from makebreak.gap.result import Where
@@ -144,7 +145,7 @@ class DrivenProblem(DrivenWindows, GapProblem):
             left = self.in_noise(screen.settle(self.base())[1])
             channel = self.channel_of_rows()
             each = [left[channel == c] for c in np.unique(channel)]
-            self._explained = all(_rms(x) < MISFIT for x in each)
+            self._explained = all(rms(x) < MISFIT for x in each)
             self._nuisances = None  # They are seen beside a rich model, if need be.
         return self._explained
 
@@ -496,10 +497,6 @@ def _moved_start(window, k: int):
         state[name] = np.array(state[name])
         state[name][:2] += np.sqrt(max(w[k], 0.0)) * u[:, k]
     return state
-
-
-def _rms(x: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(x**2)))
 
 
 def _reader(name: str, now: float, share: float):

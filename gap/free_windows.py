@@ -258,11 +258,11 @@ class FreeBodyModel(WindowedResidual):
         flight = fit_flight(self._body, time, pose, noise, guess)
         if flight is None or flight.rms > FLIES:
             return False
-        for k, t in enumerate(time):
-            x, C = flight.later(self._body, t - time[0])
-            if not np.isfinite(x).all() or not np.isfinite(C).all():
-                return False
-            C = C * max(flight.rms, 1.0) ** 2
+        path, covariance = flight.path(self._body, time - time[0])
+        if not np.isfinite(path).all() or not np.isfinite(covariance).all():
+            return False
+        covariance *= max(flight.rms, 1.0) ** 2
+        for k, (x, C) in enumerate(zip(path, covariance, strict=True)):
             states[k, 4:] = np.stack([x[4:7], x[10:], self._body.gravity], axis=1)
             for i in range(3):
                 of = np.ix_([3 + i, 9 + i], [3 + i, 9 + i])

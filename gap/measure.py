@@ -9,6 +9,7 @@ import numpy as np
 
 from makebreak.gap.inverse import InverseModel
 from makebreak.gap.parallel import side_by_side
+from makebreak.gap.problem import rms
 from makebreak.gap.recording import Recording, unit_of
 from makebreak.gap.result import GapMeasure, InUnits, Series
 from makebreak.gap.windows import Window, WindowModel, seen_in
@@ -89,16 +90,12 @@ def _equations(motion: InverseModel, before, after, every: bool) -> dict[str, In
     slides = sliding_joints(motion.dynamics.plant)
     return {
         f"{joint}.effort": InUnits(
-            "N" if joint in slides else "N m", _rms(left[0][rows, k]),
-            _rms(left[1][rows, k]), _rms(noise[rows, k]),
+            "N" if joint in slides else "N m", rms(left[0][rows, k]),
+            rms(left[1][rows, k]), rms(noise[rows, k]),
         )
         for k, (what, joint) in enumerate(motion.names())
         if what == "effort"
     }  # fmt: skip
-
-
-def _rms(x: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(x**2))) if len(x) else 0.0
 
 
 def _twists(motion: InverseModel, effects: Sequence[Effect]):
@@ -147,23 +144,23 @@ def gap_measure(model: Windows, before, after, held: Sequence[bool]) -> GapMeasu
     over = [of_whole(model.errors_over(each, stds)) for each in (before, after)]
     plain = [of_whole(model.errors_over(each, ones)) for each in (before, after)]
 
-    def rms(e: np.ndarray, c) -> float:
-        return _rms(e[:, c][both[:, c]])
+    def rms_of(e: np.ndarray, c) -> float:
+        return rms(e[:, c][both[:, c]])
 
     everything = slice(None)
     sliding = sliding_joints(model.dynamics.plant)
     recordings = model.recordings
     return GapMeasure(
-        rms(over[0], everything), rms(over[1], everything), NOISE_FLOOR,
+        rms_of(over[0], everything), rms_of(over[1], everything), NOISE_FLOOR,
         model.window_sec,
         {
-            name: {"before": rms(over[0], c), "after": rms(over[1], c)}
+            name: {"before": rms_of(over[0], c), "after": rms_of(over[1], c)}
             for c, name in enumerate(model.channels)
         },
         {
             name: InUnits(
                 unit_of(name.rsplit(".", 1)[1], name.rsplit(".", 1)[0] in sliding),
-                rms(plain[0], c), rms(plain[1], c), float(model.noise[c]),
+                rms_of(plain[0], c), rms_of(plain[1], c), float(model.noise[c]),
             )
             for c, name in enumerate(model.channels)
         },

@@ -16,6 +16,7 @@ from makebreak.gap.problem import (
     Nuisances,
     Outcome,
     SearchPlan,
+    rms,
     share_left,
 )
 from makebreak.gap.pushes import ROBUST, Push, find_pushes
@@ -287,7 +288,7 @@ class MechanismProblem(InverseModel, GapProblem):
         wanders = self.wandering(fitted.r)
         for k in np.flatnonzero(wanders > 0.0):
             mine = self.channel_of_rows() == k
-            rows[mine] /= max(_rms(rows[mine]), 1.0)
+            rows[mine] /= max(rms(rows[mine]), 1.0)
         held = rows[~self.train()] if not self.train().all() else rows
         return float(np.sqrt(max(np.mean(held**2), np.mean(rows**2))))
 
@@ -300,7 +301,7 @@ class MechanismProblem(InverseModel, GapProblem):
             mine = held & (self.channel_of_rows() == k)
             if what == "effort" and mine.any():
                 before, after = (
-                    _rms(self.in_noise(fitted.left)[mine]) for fitted in (start, end)
+                    rms(self.in_noise(fitted.left)[mine]) for fitted in (start, end)
                 )
                 if before > UNNAMED:
                     each.append(1.0 - share_left(before, after))
@@ -320,12 +321,12 @@ class MechanismProblem(InverseModel, GapProblem):
         state = None
         for k, (what, joint) in enumerate(names):
             i = self.joints.index(joint)
-            loud = _rms(rows[:, k]) > MISFIT
+            loud = rms(rows[:, k]) > MISFIT
             if what != "effort" or not self.by_measured[i] or not loud:
                 continue
             mine = noise[:, k] <= AT_REST * np.quantile(noise[:, k], 0.1)
             y = off[mine, k]
-            if _rms(y) > MOST_WANDER * self._sample_noise(f"{joint}.effort_measured"):
+            if rms(y) > MOST_WANDER * self._sample_noise(f"{joint}.effort_measured"):
                 continue
             power = [np.mean(y[block[mine] == b] ** 2) for b in np.unique(block[mine])]
             if max(power) > EVENT * np.median(power):
@@ -333,7 +334,7 @@ class MechanismProblem(InverseModel, GapProblem):
             state = self._mean_motion() if state is None else state
             X = features_of(i, *state)[mine]
             if not is_predicted(y, X, block[mine], REPEATS):
-                found[k] = _rms(y)
+                found[k] = rms(y)
         return found
 
     def _sample_noise(self, channel: str) -> float:
@@ -426,10 +427,6 @@ def features_of(i: int, q, v, vd, effort, sign) -> np.ndarray:
         q[:, i] ** 2, *(f(n * q[:, i]) for n in (1, 2) for f in (np.sin, np.cos)),
     ]  # fmt: skip
     return np.column_stack([*own, q, v, vd])
-
-
-def _rms(x: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(x**2)))
 
 
 def _moved(candidate: Candidate, to_new) -> Candidate:

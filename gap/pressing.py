@@ -39,7 +39,6 @@ SOFTER = (0.3, 0.6, 2.0)  # Times the stiffness of the scene: trials.
 MOST_FRICTION = 2.0  # Of what is taken for any.
 MOST_PATCHES, MOST_EFFECTS = 3, 10
 MOST_KEPT = 12  # Geometries.
-STEP = 0.004  # Of differences in time [s].
 SMALL_SHIFT = 1e-3  # First trial of a place [m].
 AXES = "xyz"
 
@@ -489,17 +488,11 @@ class PressingProblem(ContactProblem):
         mass = body.default_mass()
         if not mass > 0.0:
             return None
-        m, at = self.means, []
+        m = self.means
         q, v, vd = (x[m.centre] for x in (self._q, self._v, self._vd))
-        for sign in (-1.0, 0.0, 1.0):
-            moved = self.dynamics.shifted(q, v + 0.5 * sign * STEP * vd, sign * STEP)
-            places = np.empty((len(moved), 3))
-            for i, row in enumerate(moved):
-                self.plant.SetPositions(self._context, row)
-                X = self.plant.EvalBodyPoseInWorld(self._context, body)
-                places[i] = X.multiply(body.default_com())
-            at.append(places)
-        a = (at[2] - 2.0 * at[1] + at[0]) / STEP**2
+        _, V, A, R = self.dynamics.body_motion(body, q, v, vd)
+        arm, turns = R @ body.default_com(), V[:, :3]  # To the centre of mass.
+        a = A[:, 3:] + np.cross(A[:, :3], arm) + np.cross(turns, np.cross(turns, arm))
         kept = m.wrench
         m.wrench = kept.copy()
         m.wrench[:, 3 * k : 3 * k + 3] += mass * a
@@ -577,7 +570,7 @@ class PressingProblem(ContactProblem):
                     "plane_height", at, 1, ("height",), (), [[(step, {"height": step})]]
                 )  # fmt: skip
                 continue
-            zero = {a: by.get(a, 0.0) * 0.0 for a in names}
+            zero = dict.fromkeys(names, 0.0)
             trial = [
                 (step, {**zero, a: step})
                 for a, step in ((a, by[a] or SMALL_SHIFT) for a in names)

@@ -114,6 +114,11 @@ class Candidate:
         return tuple(m.fixed for m in self.members) if self.members else (self.fixed,)
 
 
+def rms(x: np.ndarray) -> float:
+    """Root mean square; 0 of nothing."""
+    return float(np.sqrt(np.mean(x**2))) if len(x) else 0.0
+
+
 def is_sane(effect: Effect, least: Mapping[str, float] | None = None) -> bool:
     """Whether the parameters are allowed, and of a size that robots have.
 

@@ -16,6 +16,7 @@ from makebreak.gap.problem import (
     GapProblem,
     Nuisances,
     is_sane,
+    rms,
 )
 from makebreak.gap.result import Considered
 from makebreak.gap.screen import Ranked, rank
@@ -261,12 +262,12 @@ class _Search:
         found = {}
         for k in np.unique(self.channel):
             mine = held & (self.channel == k)
-            if not mine.any() or _rms(noisy[mine]) < above:
+            if not mine.any() or rms(noisy[mine]) < above:
                 continue
-            blur = CHANNEL_PRECISION * _rms(self.start.left[mine])
+            blur = CHANNEL_PRECISION * rms(self.start.left[mine])
             a, b = (
-                np.hypot(_rms(without[mine]), blur),
-                np.hypot(_rms(with_[mine]), blur),
+                np.hypot(rms(without[mine]), blur),
+                np.hypot(rms(with_[mine]), blur),
             )
             found[int(k)] = 1.0 - b / a
         return found
@@ -562,7 +563,7 @@ class _Search:
                     break
                 without = screen.settle(fit_of(rest)[2])[1]
                 gains = [
-                    1.0 - _rms(left[mine]) / max(_rms(without[mine]), 1e-12)
+                    1.0 - rms(left[mine]) / max(rms(without[mine]), 1e-12)
                     for c in np.unique(self.channel)
                     if (mine := held & (self.channel == c)).any()
                 ]
@@ -843,10 +844,6 @@ def _is_used(fit: Fitted) -> bool:
             if not off > 2.0 * std[each.name]:
                 return False
     return True
-
-
-def _rms(x: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(x**2))) if len(x) else 0.0
 
 
 def _shortlist(ranked: list[Ranked], base: float, most: int) -> list[Ranked]:

@@ -14,7 +14,7 @@ from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.diagrams.scene_simulation import stand_on_ground
-from makebreak.gap.problem import Candidate, Nuisances
+from makebreak.gap.problem import Candidate, Nuisances, rms
 from makebreak.gap.recording import Recording
 from makebreak.gap.result import GapMeasure, InUnits, Series, Where
 from makebreak.gap.windows import LARGEST
@@ -310,10 +310,10 @@ class TouchModel:
         per_channel, in_units = {}, {}
         for name, pairs in names.items():
             a, b, std = (np.concatenate(each) for each in zip(*pairs, strict=True))
-            per_channel[name] = {"before": _rms(a), "after": _rms(b)}
-            in_units[name] = InUnits("m", _rms(a * std), _rms(b * std), _rms(std))
+            per_channel[name] = {"before": rms(a), "after": rms(b)}
+            in_units[name] = InUnits("m", rms(a * std), rms(b * std), rms(std))
         return GapMeasure(
-            _rms(before[held]), _rms(after[held]), 1.0, 0.0, per_channel, in_units,
+            rms(before[held]), rms(after[held]), 1.0, 0.0, per_channel, in_units,
             n_windows=int(held.sum()), seconds=self._seconds(held),
         )  # fmt: skip
 
@@ -349,7 +349,7 @@ class TouchModel:
             time = recording.time[touch.rows]
             starts = np.flatnonzero(np.diff(time, prepend=-np.inf) > 0.5)
             for a, b in zip(starts, [*starts[1:], len(time)], strict=True):
-                score = _rms(r[a:b])
+                score = rms(r[a:b])
                 row = touch.rows[a]
                 (number,) = [
                     e.number for e in recording.episodes if e.first <= row < e.last
@@ -404,10 +404,6 @@ def _rate(recording: Recording, channel: str) -> np.ndarray:
     time, y = recording.time, recording[channel]
     good = np.isfinite(y)
     return np.gradient(np.interp(time, time[good], y[good]), time)
-
-
-def _rms(x: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(x**2))) if len(x) else 0.0
 
 
 def _frames(plant: MultibodyPlant):

@@ -47,9 +47,9 @@ def test_deviations_cover_what_a_flight_is_off_by_then_and_later():
         pose[:, :4] *= rng.choice([-1.0, 1.0])  # The same orientation.
         flight = fit_flight(body, TIME, pose, NOISE, guess)
         assert flight is not None and flight.rms < 1.3
-        for seconds in (0.0, 0.1):
-            found, C = flight.later(body, seconds)
-            true = simulate(body, x, [0.0, seconds])[-1] if seconds else x
+        times = np.array([0.0, 0.1])
+        truth = simulate(body, x, times)
+        for found, C, true in zip(*flight.path(body, times), truth, strict=True):
             off = np.concatenate([turn(found[:4], true[:4]), (found - true)[4:]])
             z.append(off / np.sqrt(np.diag(C)))
     # 120 values of each: their scatter is known to a tenth.

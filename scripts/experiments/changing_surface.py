@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import matplotlib.pyplot as plt
 import numpy as np
 
-from makebreak.diagrams.changing_contact import learned, telemetry
+from makebreak.diagrams.changing_contact import Knowledge, learned, telemetry
 from makebreak.diagrams.changing_surface import (
     ChangingSurfaceConfig,
     SurfaceTask,
@@ -34,7 +34,8 @@ from makebreak.diagrams.changing_surface import (
     surface_at,
 )
 from makebreak.diagrams.recorder import recorded
-from makebreak.scripts.criteria import Criteria, motion_ended
+from makebreak.scripts.contact_runs import rehearsed, simulate_motion
+from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
 from makebreak.systems.numerics.contact_task import (
@@ -89,19 +90,24 @@ def run(config: ChangingSurfaceConfig, session: Session) -> dict:
             configs[label] = constant_stiffness(config, value)
     configs["adaptive"] = config  # The last one is what Meshcat's recording shows.
     logs, done = {}, {}
-    knowledge = None
+
+    def simulate(config, task, knowledge, label):
+        diagram = make_changing_surface(config, task, knowledge, session.meshcat)
+        return simulate_motion(session, diagram, DURATION_SEC, label)
+
     imagined = replace(task, world=task.model)
-    for k in range(config.rehearse):
-        name = f"rehearsal_{k + 1}"
-        diagram, log = _simulated(config, imagined, knowledge, session, name)
-        knowledge = learned(diagram, log.context)
+    knowledge = rehearsed(
+        config.rehearse,
+        lambda known, _, label: simulate(config, imagined, known, label),
+        Knowledge(contacts=task.prior),
+    )
     for label, its in configs.items():
-        diagram, log = _simulated(its, task, knowledge, session, label)
+        log = simulate(its, task, knowledge, label)
         done[label] = log["phase"][-1, PHASE_STAGE] == DONE
-        logs[label] = telemetry(diagram, log.context)
+        logs[label] = telemetry(log.diagram, log.context)
         if label == "adaptive":
-            recording = recorded(diagram, log.context)
-            known = learned(diagram, log.context)
+            recording = recorded(log.diagram, log.context)
+            known = learned(log.diagram, log.context)
             if known.modes is not None and known.models is not None:
                 known.modes.save(session.path("modes.json"))
                 known.models.save(session.path("models.json"))
@@ -111,21 +117,6 @@ def run(config: ChangingSurfaceConfig, session: Session) -> dict:
     session.save_plot(plot_stiffness(logs, changes), "stiffness")
     session.write_recording(recording, task.model)
     return summary(logs, done, changes, surplus, task, stiffness.maximum)
-
-
-def _simulated(config, task, knowledge, session, label):
-    """The diagram and the log of a motion."""
-    diagram = make_changing_surface(config, task, knowledge, session.meshcat)
-    shaper = diagram.GetSubsystemByName("velocity_shaper")
-    log = session.simulate(
-        diagram,
-        DURATION_SEC,
-        {"phase": shaper.GetOutputPort("phase")},
-        period_sec=0.01,
-        until=lambda t, values: motion_ended(values["phase"][PHASE_STAGE]),
-        label=label,
-    )
-    return diagram, log
 
 
 def sliding(log) -> np.ndarray:

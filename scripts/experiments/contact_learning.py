@@ -22,6 +22,7 @@ See docs/contacts.md.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -36,7 +37,9 @@ from makebreak.diagrams.contact_learning import (
     make_task,
 )
 from makebreak.diagrams.recorder import episodes, recorded
-from makebreak.scripts.criteria import Criteria, motion_ended
+from makebreak.diagrams.tabletop import position
+from makebreak.scripts.contact_runs import rehearsed, simulate_motion
+from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
 from makebreak.systems.numerics.contact_anticipator import spread_along
@@ -99,48 +102,28 @@ def run(config: ContactLearningConfig, session: Session) -> dict:
     """config.trials trials in a row, scored; see the module for the criterion."""
     task = make_task(config)
     knowledge = Knowledge(contacts=task.prior)
-    imagined = replace(task, world=task.model)
+
+    def simulate(knowledge, k, label, task=task):
+        diagram = make_contact_learning(config, task, knowledge, k, session.meshcat)
+        return simulate_motion(session, diagram, DURATION_SEC, label, PEAK_WAIT)
+
     if config.rehearse:
-        knowledge = Knowledge(contacts=task.model_prior)
-    for k in range(config.rehearse):
-        name = f"rehearsal_{k + 1}"
-        diagram, log = _simulated(config, imagined, knowledge, k, session, name)
-        knowledge = learned(diagram, log.context)
+        on_model = partial(simulate, task=replace(task, world=task.model))
+        known = Knowledge(contacts=task.model_prior)
+        knowledge = rehearsed(config.rehearse, on_model, known)
     trials: list[Trial] = []
     recordings = []
     for k in range(config.trials):
-        name = f"trial_{k + 1}"
-        diagram, log = _simulated(config, task, knowledge, k, session, name)
-        knowledge = learned(diagram, log.context)
-        recordings.append(recorded(diagram, log.context))
-        trials.append(scored(telemetry(diagram, log.context), task, knowledge.contacts))
+        log = simulate(knowledge, k, f"trial_{k + 1}")
+        knowledge = learned(log.diagram, log.context)
+        recordings.append(recorded(log.diagram, log.context))
+        motion = telemetry(log.diagram, log.context)
+        trials.append(scored(motion, task, knowledge.contacts))
     session.save_plot(plot_trials(trials, task), "trials")
     session.save_plot(plot_learning(trials, task), "learning")
     knowledge.contacts.save(session.path("contacts.json"))
     session.write_recording(episodes(recordings), task.model)
     return summary(trials, task)
-
-
-def _simulated(config, task, knowledge, k, session, label):
-    """The diagram and the log of a trial."""
-    diagram = make_contact_learning(config, task, knowledge, k, session.meshcat)
-    shaper = diagram.GetSubsystemByName("velocity_shaper")
-    ended: list[tuple[float, str]] = []
-
-    def over(t, values):
-        if why := motion_ended(values["phase"][PHASE_STAGE]):
-            ended.append((t, why))
-        return ended[0][1] if ended and t >= ended[0][0] + PEAK_WAIT else ""
-
-    log = session.simulate(
-        diagram,
-        DURATION_SEC,
-        {"phase": shaper.GetOutputPort("phase")},
-        period_sec=0.01,
-        until=over,
-        label=label,
-    )
-    return diagram, log
 
 
 def scored(log: dict[str, np.ndarray], task: ContactTask, belief) -> Trial:
@@ -156,8 +139,9 @@ def scored(log: dict[str, np.ndarray], task: ContactTask, belief) -> Trial:
         for name in "touched force force_raw force_felt a10 a_raw speed".split()
     }
     missed, where = 0, np.sum(task.truth * DIRECTIONS, axis=1)
+    table = task.errors.table_rise(p, position(task.world, "table"), task.corner)
     for i, d in enumerate(DIRECTIONS):
-        rise = task.table_rise(p) if i == 0 else np.zeros(len(p))
+        rise = table if i == 0 else np.zeros(len(p))
         away = (task.truth[i] - p) @ d - rise
         reached = np.flatnonzero((away < REACHED) & (segment >= i))
         if reached.size == 0:

@@ -23,6 +23,7 @@ be had: docs/shaping.md derives the bound.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -36,7 +37,9 @@ from makebreak.diagrams.multiple_collisions import (
     make_task,
 )
 from makebreak.diagrams.recorder import episodes, recorded
-from makebreak.scripts.criteria import Criteria, motion_ended
+from makebreak.diagrams.tabletop import position
+from makebreak.scripts.contact_runs import rehearsed, simulate_motion
+from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
 from makebreak.systems.contact_view import ContactViewConfig
@@ -96,55 +99,39 @@ def run(config: MultipleCollisionsConfig, session: Session) -> dict:
     task = make_task(config)
     trials: dict[str, Trial] = {}
     recordings = []
+    peaks: list[list[float]] = []
+
+    def simulate(knowledge, k, label, config=config, task=task):
+        view = ContactViewConfig(peaks=peaks)
+        diagram = make_multiple_collisions(
+            config, knowledge, k, session.meshcat, task, view
+        )
+        return simulate_motion(session, diagram, DURATION_SEC, label)
+
+    def keep(log, label):
+        trials[label] = scored(telemetry(log.diagram, log.context), task)
+        recordings.append(recorded(log.diagram, log.context))
+        peaks.append(list(trials[label].force))
+
     if config.handling:
         plain = replace(config, handling=False)
-        trials["baseline"], _, recording = _trial(
-            plain, task, None, 0, session, "baseline", []
-        )
-        recordings.append(recording)
+        keep(simulate(None, 0, "baseline", plain), "baseline")
     knowledge: Knowledge | None = None
-    imagined = replace(task, world=task.model)
     if config.rehearse:
-        knowledge = Knowledge(task.model_prior)
-    for k in range(config.rehearse):
-        _, knowledge, _ = _trial(
-            config, imagined, knowledge, k, session, f"rehearsal_{k + 1}", []
-        )
-    peaks = [list(one.force) for one in trials.values()]
+        on_model = partial(simulate, task=replace(task, world=task.model))
+        known = Knowledge(task.model_prior)
+        knowledge = rehearsed(config.rehearse, on_model, known)
     for k in range(config.trials if config.handling else 1):
         name = f"trial_{k + 1}" if config.handling else "baseline"
-        trials[name], knowledge, recording = _trial(
-            config, task, knowledge, k, session, name, peaks
-        )
-        recordings.append(recording)
-        peaks.append(list(trials[name].force))
+        log = simulate(knowledge, k, name)
+        knowledge = learned(log.diagram, log.context)
+        keep(log, name)
     session.save_plot(plot_trials(trials), "profiles")
     session.save_plot(plot_path(trials, task), "path")
     if knowledge is not None:
         knowledge.contacts.save(session.path("contacts.json"))
     session.write_recording(episodes(recordings), task.model)
     return summary(trials, task, config)
-
-
-def _trial(config, task, knowledge, k, session, name, peaks):
-    """A trial, scored, what was learned in it, and its recording."""
-    diagram = make_multiple_collisions(
-        config, knowledge, k, session.meshcat, task, ContactViewConfig(peaks=peaks)
-    )
-    shaper = diagram.GetSubsystemByName("velocity_shaper")
-    log = session.simulate(
-        diagram,
-        DURATION_SEC,
-        {"phase": shaper.GetOutputPort("phase")},
-        period_sec=0.01,
-        until=lambda t, values: (
-            motion_ended(values["phase"][PHASE_STAGE])
-            if t > 2.0 and values["phase"][3] == 0.0 else ""
-        ),
-        label=name,
-    )  # fmt: skip
-    trial = scored(telemetry(diagram, log.context), task)
-    return trial, learned(diagram, log.context), recorded(diagram, log.context)
 
 
 def scored(log: dict[str, np.ndarray], task: CollisionTask) -> Trial:
@@ -159,8 +146,9 @@ def scored(log: dict[str, np.ndarray], task: CollisionTask) -> Trial:
         for name in "touched force force_raw a_raw speed error".split()
     }
     missed = 0
-    for i, ((d, _, k), where) in enumerate(zip(IMPACTS, task.truth, strict=True)):
-        rise = task.table_rise(p) if IMPACTS[i][1] == "table" else np.zeros(len(p))
+    table = task.errors.table_rise(p, position(task.world, "table"), task.corner)
+    for i, ((d, name, k), where) in enumerate(zip(IMPACTS, task.truth, strict=True)):
+        rise = table if name == "table" else np.zeros(len(p))
         away = where - rise - p @ d
         reached = np.flatnonzero((away < REACHED) & (segment >= k))
         if reached.size == 0:

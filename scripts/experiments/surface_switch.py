@@ -24,6 +24,7 @@ See docs/modes.md.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -38,7 +39,8 @@ from makebreak.diagrams.surface_switch import (
     make_surface_switch,
     make_task,
 )
-from makebreak.scripts.criteria import Criteria, motion_ended
+from makebreak.scripts.contact_runs import rehearsed, simulate_motion
+from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
 from makebreak.systems.numerics.contact_task import (
@@ -86,19 +88,20 @@ def run(config: SurfaceSwitchConfig, session: Session) -> dict:
     """config.trials trials in a row, scored; see the module for the criterion."""
     task = make_task(config)
     knowledge = Knowledge(contacts=task.prior)
-    imagined = replace(task, world=task.model)
-    for k in range(config.rehearse):
-        name = f"rehearsal_{k + 1}"
-        diagram, log = _simulated(config, imagined, knowledge, k, session, name)
-        knowledge = learned(diagram, log.context)
+
+    def simulate(knowledge, k, label, task=task):
+        diagram = make_surface_switch(config, task, knowledge, k, session.meshcat)
+        return simulate_motion(session, diagram, DURATION_SEC, label)
+
+    on_model = partial(simulate, task=replace(task, world=task.model))
+    knowledge = rehearsed(config.rehearse, on_model, knowledge)
     trials: list[Trial] = []
     recordings = []
     for k in range(config.trials):
-        name = f"trial_{k + 1}"
-        diagram, log = _simulated(config, task, knowledge, k, session, name)
-        knowledge = learned(diagram, log.context)
-        recordings.append(recorded(diagram, log.context))
-        trial = scored(telemetry(diagram, log.context), task.feet)
+        log = simulate(knowledge, k, f"trial_{k + 1}")
+        knowledge = learned(log.diagram, log.context)
+        recordings.append(recorded(log.diagram, log.context))
+        trial = scored(telemetry(log.diagram, log.context), task.feet)
         # The telemetry's last row is from before the events of its instant.
         done = log["phase"][-1, PHASE_STAGE] == DONE
         trials.append(replace(trial, done=bool(done)))
@@ -106,21 +109,6 @@ def run(config: SurfaceSwitchConfig, session: Session) -> dict:
     knowledge.contacts.save(session.path("contacts.json"))
     session.write_recording(episodes(recordings), task.model)
     return summary(trials, task)
-
-
-def _simulated(config, task, knowledge, k, session, label):
-    """The diagram and the log of a trial."""
-    diagram = make_surface_switch(config, task, knowledge, k, session.meshcat)
-    shaper = diagram.GetSubsystemByName("velocity_shaper")
-    log = session.simulate(
-        diagram,
-        DURATION_SEC,
-        {"phase": shaper.GetOutputPort("phase")},
-        period_sec=0.01,
-        until=lambda t, values: motion_ended(values["phase"][PHASE_STAGE]),
-        label=label,
-    )
-    return diagram, log
 
 
 def sign_of(segment: int) -> float:

@@ -26,18 +26,17 @@ class Flight:
     covariance: np.ndarray
     rms: float
 
-    def later(self, body: FreeBody, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """x and covariance so much later, nothing being touched."""
-
-        def fly(x):
-            return _high(body, x, np.array([0.0, seconds]))[-1]
-
-        if not seconds > 0.0:
-            return self.x, self.covariance
-        x = fly(self.x)
-        parts = [_apart(fly(moved(self.x, i, SMALL)), x) / SMALL for i in range(12)]
-        A = np.stack(parts, axis=1)
-        return x, A @ self.covariance @ A.T
+    def path(self, body: FreeBody, seconds) -> tuple[np.ndarray, np.ndarray]:
+        """States (n, 13) and covariances (n, 12, 12) so much later, nothing being
+        touched. Args: seconds (n,), ascending from 0 [s]."""
+        seconds = np.asarray(seconds, float)
+        path = _high(body, self.x, seconds)
+        A = np.empty((len(seconds), 12, 12))
+        for i in range(12):
+            other = _high(body, moved(self.x, i, SMALL), seconds)
+            for k, (one, x) in enumerate(zip(other, path, strict=True)):
+                A[k, :, i] = _apart(one, x) / SMALL
+        return path, A @ self.covariance @ A.transpose(0, 2, 1)
 
 
 def fit_flight(body: FreeBody, time, pose, noise, guess) -> Flight | None:

@@ -1,0 +1,64 @@
+"""What the experiments of changing contact share: a motion simulated to its end, and
+trials that are rehearsed on the model before the first real one."""
+
+from collections.abc import Callable
+
+from pydrake.systems.framework import Diagram
+
+from makebreak.diagrams.changing_contact import Knowledge, learned
+from makebreak.scripts.criteria import motion_ended
+from makebreak.scripts.session import Log, Session
+from makebreak.systems.numerics.contact_task import PHASE_SPEED, PHASE_STAGE
+
+
+def simulate_motion(
+    session: Session,
+    diagram: Diagram,
+    duration_sec: float,
+    label: str,
+    wait_sec: float = 0.0,
+) -> Log:
+    """Simulates a diagram until the motion of its velocity shaper is over: at rest,
+    complete or held.
+
+    Args:
+        duration_sec: at most [s].
+        label: of the simulation, as in Session.simulate.
+        wait_sec: for how long it goes on after that [s].
+    """
+    shaper = diagram.GetSubsystemByName("velocity_shaper")
+    ended: list[tuple[float, str]] = []
+
+    def over(t, values):
+        phase = values["phase"]
+        why = motion_ended(phase[PHASE_STAGE]) if phase[PHASE_SPEED] == 0.0 else ""
+        if why and not ended:
+            ended.append((t, why))
+        return ended[0][1] if ended and t >= ended[0][0] + wait_sec else ""
+
+    return session.simulate(
+        diagram,
+        duration_sec,
+        {"phase": shaper.GetOutputPort("phase")},
+        period_sec=0.01,
+        until=over,
+        label=label,
+    )
+
+
+def rehearsed(
+    count: int,
+    simulate: Callable[[Knowledge, int, str], Log],
+    knowledge: Knowledge,
+) -> Knowledge:
+    """What is known after so many trials on the model, none of them scored.
+
+    Args:
+        count: of rehearsals.
+        simulate: a trial on the model, by what is known, its number and its label.
+        knowledge: before the first one.
+    """
+    for k in range(count):
+        log = simulate(knowledge, k, f"rehearsal_{k + 1}")
+        knowledge = learned(log.diagram, log.context)
+    return knowledge
