@@ -8,7 +8,6 @@ the pole then swings nonlinearly and the walls are Drake's compliant point conta
 """
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -18,6 +17,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
 from makebreak.diagrams.recorder import add_recorder
+from makebreak.models.model_files import MODELS
 from makebreak.models.scene import load_scene
 from makebreak.systems.baselines.dynamics_residual_learner import (
     DynamicsResidualLearner,
@@ -36,7 +36,6 @@ from makebreak.systems.numerics.lcs import LCS
 from makebreak.systems.residual_learner import ResidualLearner, ResidualLearnerConfig
 from makebreak.systems.walls_view import WallsView, WallsViewConfig
 
-MODELS = Path(__file__).resolve().parent.parent / "models"
 SCENE = str(MODELS / "cartpole_walls.scene.yaml")
 DT = 0.01  # Time step of the LCS, of C3 and of the learner [s].
 # Learner, C3, then the LCS as plant: no value waits for the next period. (The

@@ -10,7 +10,6 @@ force feedforward the measured force is taken off u, whatever the controller.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from pydrake.geometry import Meshcat
@@ -18,6 +17,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSyst
 
 from makebreak.diagrams.recorder import add_recorder
 from makebreak.models.effects.delay_line import DelayLine
+from makebreak.models.model_files import MODELS
 from makebreak.systems.baselines.force_feedforward import ForceFeedforward
 from makebreak.systems.noisy_sensor import NoisySensor
 from makebreak.systems.planar_view import PlanarView, PlanarViewConfig
@@ -28,7 +28,6 @@ from makebreak.systems.planar_world import (
     PlanarWorldConfig,
 )
 
-MODELS = Path(__file__).resolve().parent.parent / "models"
 PLANAR = str(MODELS / "planar.scene.yaml")  # The effector alone: what is believed.
 AXES = "effector"  # The model there; its joints are x and y.
 PERIOD = 0.001  # Of world and controllers [s].

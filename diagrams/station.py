@@ -13,13 +13,13 @@ from pydrake.systems.primitives import Demultiplexer, Saturation
 from makebreak.diagrams.camera import CameraConfig, add_camera
 from makebreak.diagrams.realism import StationErrors
 from makebreak.models.effects import KINDS
+from makebreak.models.model_files import MODELS
 from makebreak.models.scene import InitialSection, Scene, load_scene, read_scene
 from makebreak.systems.contact_probe import ContactProbe, ToolContactForce, TrueTip
 from makebreak.systems.impedance_controller import serial_chain_of
 from makebreak.systems.noisy_sensor import DriftingSensor, LateSensor, NoisySensor
 from makebreak.systems.tool_wrench import ToolWrench
 
-MODELS = Path(__file__).resolve().parent.parent / "models"
 BALL_ROLLING = str(MODELS / "ball_rolling.scene.yaml")
 ARM, TOOL, TIP_FRAME = "panda", "finger", "tip"
 TORQUE_RATE_MAX = 1000.0  # [N m/s] of the real Panda.

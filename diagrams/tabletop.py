@@ -4,17 +4,15 @@ A world is read from a scene file and then changed in memory: these functions ta
 scene that was read and change it in place.
 """
 
-from pathlib import Path
-
 import numpy as np
 from scipy.optimize import brentq
 
 from makebreak.models.effects.kind import Effect
 from makebreak.models.friction_zones import FrictionZone
+from makebreak.models.model_files import MODELS
 from makebreak.models.scene import Scene, read_scene
 from makebreak.models.typed_yaml import nearest
 
-MODELS = Path(__file__).resolve().parent.parent / "models"
 TABLETOP_WALLS = str(MODELS / "tabletop_walls.scene.yaml")
 THREE_SURFACES = str(MODELS / "three_surfaces.scene.yaml")
 SURFACE_SWITCH = str(MODELS / "surface_switch.scene.yaml")

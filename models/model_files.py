@@ -44,6 +44,7 @@ from makebreak.models.effects.model_text import (
 from makebreak.models.scene_schema import COMMANDS_OF, Scene
 from makebreak.models.typed_yaml import one_line, read_yaml
 
+MODELS = Path(__file__).resolve().parent  # What this package ships.
 # pydrake makes SystemExit of an assertion that fails in Drake, and ValueError of some
 # of what its parser says.
 DRAKE_ERRORS = (RuntimeError, SystemExit, ValueError)

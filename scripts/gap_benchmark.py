@@ -42,16 +42,15 @@ class BenchmarkSet:
     maker: Path
     goals: Goals
     says: str
-    parallel: bool = False  # Whether its maker has --jobs.
 
 
 SETS = {
     "standard": BenchmarkSet(_TESTS / "cases.py", STANDARD, "90 effects, one by one"),
     "development": BenchmarkSet(_TESTS / "cases.py", STANDARD, "the same, for tuning"),
     "logs-development": BenchmarkSet(
-        _TESTS / "log_cases.py", LOGS, "as robots log, for tuning", True
+        _TESTS / "log_cases.py", LOGS, "as robots log, for tuning"
     ),
-    "logs-final": BenchmarkSet(_TESTS / "log_cases.py", LOGS, "as robots log", True),
+    "logs-final": BenchmarkSet(_TESTS / "log_cases.py", LOGS, "as robots log"),
     "contact-development": BenchmarkSet(
         _TESTS / "contact_cases.py", CONTACT, "where robots touch things, for tuning"
     ),
@@ -138,9 +137,7 @@ def _make_cases(
     truth_file.unlink(missing_ok=True)
     maker = SETS[which].maker
     words = [sys.executable, str(maker), "--set", which, "--only", only]
-    words += ["--out", str(cases), "--truth", str(truth_file)]
-    if SETS[which].parallel:
-        words += ["--jobs", str(jobs)]
+    words += ["--out", str(cases), "--truth", str(truth_file), "--jobs", str(jobs)]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:

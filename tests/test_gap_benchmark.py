@@ -14,7 +14,6 @@ from gap_benchmark import contact_world as contact  # noqa: E402
 from gap_benchmark.cases import (  # noqa: E402
     OUTSIDE,
     TABLE,
-    anonymous_name,
     cases,
     make,
     write,
@@ -83,7 +82,7 @@ def test_there_are_enough_cases_kinds_and_seeds():
     counts = [len(case.kinds) for case in standard]
     assert counts.count(0) >= 8 and counts.count(2) >= 5 and counts.count(3) >= 2
     assert sum(case.background for case in standard) >= 25
-    assert len({anonymous_name(c) for c in standard + development}) == 2 * len(TABLE)
+    assert len({c.folder for c in standard + development}) == 2 * len(TABLE)
 
 
 QUICK = [c for c in cases() if c.name.split("_", 1)[1] in (

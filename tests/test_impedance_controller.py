@@ -15,12 +15,12 @@ from pydrake.systems.primitives import ConstantVectorSource, Demultiplexer
 from scipy.spatial.transform import Rotation
 
 from makebreak.diagrams.station import (
-    MODELS,
     SensorNoise,
     StationConfig,
     make_control_plant,
     make_station,
 )
+from makebreak.models.model_files import MODELS
 from makebreak.models.scene import read_scene
 from makebreak.systems.impedance_controller import (
     ImpedanceConfig,

@@ -5,9 +5,10 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.diagrams.station import BALL_ROLLING, MODELS
+from makebreak.diagrams.station import BALL_ROLLING
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
+from makebreak.models.model_files import MODELS
 from makebreak.models.scene import (
     InitialSection,
     initial_for,

@@ -8,7 +8,6 @@ reported is of the set `standard`; `development` has the same table with other s
 for tuning. Nothing is drawn twice: a case is a function of its seed.
 """
 
-import argparse
 import json
 import sys
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ if __name__ == "__main__":  # The package is found beside the tests.
     sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from gap_benchmark import contact_world as contact
+from gap_benchmark.maker import make_cases
 from gap_benchmark.mechanism import (
     MECHANISMS,
     quaternion,
@@ -44,6 +44,11 @@ class Case:
     kinds: tuple[str, ...]
     background: bool
     ties: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def folder(self) -> str:
+        """A name that does not tell."""
+        return f"case_{self.seed}"
 
 
 @dataclass(frozen=True)
@@ -142,11 +147,6 @@ def cases(which: str = "standard") -> list[Case]:
             )
         )  # fmt: skip
     return found
-
-
-def anonymous_name(case: Case) -> str:
-    """A name that does not tell: the folder's."""
-    return f"case_{case.seed}"
 
 
 def make(case: Case, exact: bool = False) -> Written:
@@ -747,24 +747,5 @@ def _object_scene(case, world, shape, pusher, table, rng) -> str:
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Writes the benchmark's recordings.")
-    parser.add_argument("--set", choices=sorted(SEEDS), default="standard")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the cases")
-    parser.add_argument("--truth", type=Path, required=True, help="file, elsewhere")
-    parser.add_argument("--only", default="", help="cases whose name has this in it")
-    args = parser.parse_args()
-    if args.out.resolve() in args.truth.resolve().parents:
-        parser.error("--truth must not lie in --out: the workflow could read it")
-    truths = {}
-    for case in cases(args.set):
-        if args.only in case.name:
-            folder = anonymous_name(case)
-            truths[folder] = write(case, args.out / folder)
-            print(folder, case.name, flush=True)
-    args.truth.parent.mkdir(parents=True, exist_ok=True)
-    args.truth.write_text(json.dumps(truths, indent=1) + "\n")
-
-
 if __name__ == "__main__":
-    main()
+    make_cases("the benchmark's recordings", list(SEEDS), cases, write)

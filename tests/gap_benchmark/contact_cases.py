@@ -10,8 +10,6 @@ from seeds that they do not share. Recipes stand in the order of how likely a us
 brings them, so that a run that is cut short has the likely ones.
 """
 
-import argparse
-import json
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -35,6 +33,7 @@ from gap_benchmark.contact_scenes import (
     record,
     write_scene,
 )
+from gap_benchmark.maker import make_cases
 from gap_benchmark.mechanism import quaternion, rotation
 from gap_benchmark.robots import Body, Robot, panda, rod
 
@@ -616,24 +615,5 @@ def _write_object(case: ContactCase, folder: Path) -> list[dict]:
     return cases.write(old, folder)["effects"]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Writes recordings of contact.")
-    parser.add_argument("--set", choices=sorted(SEEDS), required=True)
-    parser.add_argument("--out", type=Path, required=True, help="folder of the cases")
-    parser.add_argument("--truth", type=Path, required=True, help="file, elsewhere")
-    parser.add_argument("--only", default="", help="cases whose name has this in it")
-    args = parser.parse_args()
-    if args.out.resolve() in args.truth.resolve().parents:
-        parser.error("--truth must not lie in --out: the workflow could read it")
-    truths = {}
-    for case in contact_cases(args.set):
-        if args.only in case.name:
-            truths[case.folder] = write(case, args.out / case.folder)
-            print(case.folder, case.name, flush=True)
-    args.truth.parent.mkdir(parents=True, exist_ok=True)
-    # At the end: a set that was cut short is none, for --reuse.
-    args.truth.write_text(json.dumps(truths, indent=1) + "\n")
-
-
 if __name__ == "__main__":
-    main()
+    make_cases("recordings of contact", list(SEEDS), contact_cases, write)

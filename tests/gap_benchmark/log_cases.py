@@ -8,12 +8,9 @@ logs-development and logs-final have the same sorts of cases; robot, sizes, plac
 rates, filters and motions are drawn, from seeds that they do not share.
 """
 
-import argparse
-import json
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -24,6 +21,7 @@ if __name__ == "__main__":  # The package is found beside the tests.
     sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from gap_benchmark.effort_laws import added_effort
+from gap_benchmark.maker import make_cases
 from gap_benchmark.mechanism import quaternion, rotation
 from gap_benchmark.motions import MOTIONS
 from gap_benchmark.robot_log import Filter, Logging, write_log
@@ -747,6 +745,7 @@ def write(case: LogCase, folder: Path, made: WrittenLog | None = None) -> dict:
         np.savetxt(file, table, fmt="%.10g", delimiter=",")
     text = yaml.safe_dump(made.sidecar, sort_keys=False)
     (folder / "recording.yaml").write_text(text)
+    check(folder)
     return made.truth
 
 
@@ -778,28 +777,5 @@ def check(folder: Path) -> None:
             raise ValueError(f"{folder.name}: {what}")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Writes logs with hidden effects.")
-    parser.add_argument("--set", choices=sorted(SEEDS), required=True)
-    parser.add_argument("--out", type=Path, required=True, help="folder of the cases")
-    parser.add_argument("--truth", type=Path, required=True, help="file, elsewhere")
-    parser.add_argument("--only", default="", help="cases whose name has this in it")
-    parser.add_argument("--jobs", type=int, default=1, help="processes at once")
-    args = parser.parse_args()
-    if args.out.resolve() in args.truth.resolve().parents:
-        parser.error("--truth must not lie in --out: the workflow could read it")
-    wanted = [case for case in cases(args.set) if args.only in case.name]
-    truths = {}
-    args.truth.parent.mkdir(parents=True, exist_ok=True)
-    with ProcessPoolExecutor(args.jobs) as pool:
-        written = pool.map(write, wanted, [args.out / case.folder for case in wanted])
-        for case, truth in zip(wanted, written, strict=True):
-            check(args.out / case.folder)
-            truths[case.folder] = truth
-            print(case.folder, case.name, flush=True)
-    # At the end: a set that was cut short is none, for --reuse.
-    args.truth.write_text(json.dumps(truths, indent=1) + "\n")
-
-
 if __name__ == "__main__":
-    main()
+    make_cases("logs with hidden effects", list(SEEDS), cases, write)
