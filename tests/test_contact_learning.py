@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydrake.systems.framework import DiagramBuilder
@@ -10,6 +12,7 @@ from makebreak.diagrams.contact_learning import (
     ContactLearningConfig,
     make_task,
 )
+from makebreak.diagrams.realism import StationErrors
 from makebreak.diagrams.tabletop import tool_half_width
 from makebreak.models.scene import load_scene
 from makebreak.scripts.experiments.contact_learning import (
@@ -172,6 +175,10 @@ def test_missed_and_false_contacts_are_counted(task):
     assert (trial.missed, trial.false) == (1, 0)
     trial = scored(made_up_log(task, offset=-0.01), task, task.prior)
     assert (trial.missed, trial.false) == (3, 3)
+    # An arm that believes its tip 8 mm off reports the contact there.
+    off = replace(task, errors=StationErrors(tool=0.008))
+    trial = scored(made_up_log(task, offset=-0.01), off, task.prior)
+    assert (trial.missed, trial.false) == (0, 0)
     trial = scored(made_up_log(task, events=(0, 1, 1, 2)), task, task.prior)
     assert (trial.missed, trial.false) == (0, 1)
     log = made_up_log(task)

@@ -9,12 +9,14 @@ from gap_benchmark import contact_cases, push_world
 from gap_benchmark.contact_scenes import Sensing, record, write_scene
 from gap_benchmark.push_world import BLOCK, TABLE
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from makebreak.gap import contact_windows, workflow
 from makebreak.gap.contact_dynamics import ContactDynamics
 from makebreak.gap.contact_problem import ContactProblem, _best_rectangles
 from makebreak.gap.contact_windows import PushWindows, led_as_measured
 from makebreak.gap.fit import fit_effects
+from makebreak.gap.permitted_contacts import Shift
 from makebreak.gap.problem import Outcome, SearchPlan
 from makebreak.gap.recording import read_recordings
 from makebreak.gap.result import Considered, GapMeasure
@@ -176,6 +178,36 @@ def test_a_table_that_is_elsewhere_shows_in_the_distance_and_not_in_forces(tmp_p
     np.testing.assert_allclose(np.abs(change), 2e-3 / np.hypot(2e-4, 1.5e-4), rtol=0.05)
     forces = slice(0, len(model.coordinates))
     np.testing.assert_allclose(moved[:, forces], plain[:, forces], atol=0.05)
+
+
+def test_a_camera_s_error_moves_what_touches(tmp_path):
+    scene, recordings, _ = pushed(tmp_path, 15, [], episodes=2)
+    model = ContactDynamics(scene, recordings)
+    _, plain = model._slots(())
+    (body,) = [k for k, name in model.shapes.names.items() if name == BLOCK]
+    R, p = plain[body]
+    _, i_v, *_ = model.bodies[BLOCK]
+    place, turn, late = (2e-3, -1e-3, 3e-3), (0.0, 0.0, 0.02), 0.004
+    shift = Shift(BLOCK, place, turn, late)
+    slots, moved = model._slots((), shift)
+    v = model._node_v[:, i_v + 3 : i_v + 6]
+    assert np.abs(v).max() > 0.05
+    np.testing.assert_allclose(moved[body][1], p + place + late * v, atol=1e-12)
+    # A turn in world comes after the body's own.
+    np.testing.assert_allclose(
+        moved[body][0], Rotation.from_rotvec(turn).as_matrix() @ R, atol=1e-12
+    )
+    # Up by 3 mm: so much further from the table. The others stay.
+    before = {s.key: s.phi for s in model._slots(())[0]}
+    on_table = [s for s in slots if model.pair_name(model._pair_of(s)) == PAIR]
+    assert on_table
+    for s in on_table:
+        up = s.phi - before[s.key]
+        np.testing.assert_allclose(up, 3e-3 + late * v[:, 2], atol=1e-4)
+    for k, (turned, at) in moved.items():
+        if k != body:
+            np.testing.assert_array_equal(turned, plain[k][0])
+            np.testing.assert_array_equal(at, plain[k][1])
 
 
 def test_a_pose_without_orientation_is_refused(tmp_path):

@@ -17,6 +17,7 @@ from makebreak.diagrams.multiple_collisions import (
     make_pattern,
     make_task,
 )
+from makebreak.diagrams.realism import StationErrors
 from makebreak.diagrams.tabletop import tool_half_width
 from makebreak.scripts.experiments import multiple_collisions
 from makebreak.scripts.experiments.multiple_collisions import (
@@ -173,6 +174,10 @@ def test_a_made_up_trial_has_the_scores_it_was_made_with(task):
 def test_a_contact_reported_elsewhere_is_false_and_the_true_one_missed(task):
     trial = scored(made_up_log(task, late=-0.01), task)
     assert trial.false == 4 and trial.missed == 4 and not trial.whole
+    # An arm that believes its tip 8 mm off reports the contact there.
+    off = replace(task, errors=StationErrors(tool=0.008))
+    trial = scored(made_up_log(task, late=-0.01), off)
+    assert trial.false == 0 and trial.missed == 0
 
 
 def test_success_asks_for_each_part_of_the_criterion(task):
