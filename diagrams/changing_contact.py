@@ -3,7 +3,8 @@
     station --q, v, wrench--> tip_state --ee_pose, ee_velocity--> all
     contact_detector --contact--> contact_anticipator, velocity_shaper
     mode_detector --mode--> forward_model_bank --prediction--> variable_impedance
-    contact_anticipator --contacts--> velocity_shaper; --mode_hint--> mode_detector
+    contact_anticipator --contacts--> velocity_shaper; --hints--> mode_detector
+    mode_detector --touch_mode--> contact_anticipator
     velocity_shaper --x_desired, force directions and targets--> impedance_controller
     variable_impedance --stiffness, feed-forward--> impedance_controller
     impedance_controller --tau--> station
@@ -281,12 +282,14 @@ def make_changing_contact(
     connect(detector, "contact", anticipator, shaper, variable)
     connect(modes, "transition", anticipator, forward)
     connect(modes, "mode", forward)
+    connect(modes, "touch_mode", anticipator)
     connect(modes, "collecting", variable)
     connect(forward, "wrench_predicted", variable)
     connect(forward, "prediction_error", variable)
     connect(forward, "handing_over", variable)
     connect(anticipator, "contacts", shaper)
     connect(anticipator, "mode_hint", modes)
+    connect(anticipator, "touch_hint", modes)
     for port in ("stiffness", "damping", "damping_stiffness", "wrench_feedforward"):
         source = variable
         if port == "wrench_feedforward" and config.reflex.gain > 0.0:

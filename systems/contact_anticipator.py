@@ -29,6 +29,7 @@ from makebreak.systems.numerics.contact_task import (
     CHANGE_TIME,
     COUNT,
     DIRECTION,
+    FOUND,
     FREE_MODE,
     FROM_MODE,
     IMPACT,
@@ -37,6 +38,7 @@ from makebreak.systems.numerics.contact_task import (
     MEASURED,
     N_CONTACT,
     N_PHASE,
+    N_TOUCH_MODE,
     N_TRANSITION,
     PEAK_FORCE,
     PHASE_SEGMENT,
@@ -45,6 +47,8 @@ from makebreak.systems.numerics.contact_task import (
     STATUS,
     TIME,
     TO_MODE,
+    TOUCH_MODE,
+    UNKNOWN_MODE,
     ContactBelief,
     ExpectedContact,
 )
@@ -109,6 +113,8 @@ class AnticipatorMemory:
     updated: tuple[int, ...] = ()  # Contacts felt in this trial,
     passed: tuple[int, ...] = ()  # and those that were passed without.
     last: int = -1  # The contact that was made last; -1: none that is to learn.
+    touch: int = -1  # The one whose mode is not found out yet; -1: none.
+    found: float = 0.0  # A counter, of touches whose mode was.
     last_time: float = -np.inf  # When one was made or broken [s].
     segment_time: float = 0.0  # When this segment began [s].
     status: int = 0
@@ -151,13 +157,15 @@ class KalmanContactAnticipator(LeafSystem):
     without an impact, from `transition`, is an impact-less contact: its place is looked
     up in the recent past, at its change time, not where it was confirmed. A learned
     contact that is passed and not felt doubles its standard deviation; above FORGET_STD
-    it is given up before the next trial.
+    it is given up before the next trial. Which mode a contact brought, from
+    `touch_mode`, is told when it is felt in a later trial.
 
     The peak force of an impact gives the next approach speed: by regression of force on
     speed, or by eq. 9, at most `growth` times faster than before.
 
     Inputs:  ee_pose (7,) of the tip; contact (14,), transition (6,), phase (6,) of
-             numerics/contact_task.py; optional trial (1,): a motion that is repeated
+             numerics/contact_task.py; optional touch_mode (2,), of the same;
+             optional trial (1,): a motion that is repeated
              within one simulation counts its repetitions there. When the number
              changes a new trial begins: contacts drift by std_drift, and each can be
              felt once more.
@@ -167,6 +175,8 @@ class KalmanContactAnticipator(LeafSystem):
              mode_hint (1,) the mode that begins at the expected place of an impact-less
              change, from hint_lead_sec before the tip passes it until HINT_WAY past its
              region; -1: none;
+             touch_hint (1,) the mode that the contact brought before which was felt
+             last, until that of now is found out; -1: none;
              status (1,) 0, or BAD_INPUT: the belief is held.
 
     Source: CC 3.3, 3.4.1.
@@ -213,6 +223,7 @@ class KalmanContactAnticipator(LeafSystem):
         self._contact = self.DeclareVectorInputPort("contact", N_CONTACT)
         self._transition = self.DeclareVectorInputPort("transition", N_TRANSITION)
         self._phase = self.DeclareVectorInputPort("phase", N_PHASE)
+        self._touch_mode = self.DeclareVectorInputPort("touch_mode", N_TOUCH_MODE)
         self._trial = self.DeclareVectorInputPort("trial", 1)
         self._memory = self.DeclareAbstractState(Value(memory))
         ticket = {self.abstract_state_ticket(self._memory)}
@@ -224,6 +235,7 @@ class KalmanContactAnticipator(LeafSystem):
         )
         for name, calc in (
             ("approach_speed", self._approach_speed),
+            ("touch_hint", _touch_hint),
             ("status", lambda memory: float(memory.status)),
         ):
             self.DeclareVectorOutputPort(name, 1, partial(self._put, calc), ticket)
@@ -300,7 +312,7 @@ class KalmanContactAnticipator(LeafSystem):
             return memory
         belief = self._next_trial(memory.belief)
         return replace(
-            memory, belief=belief, trial=trial, updated=(), passed=(), last=-1
+            memory, belief=belief, trial=trial, updated=(), passed=(), last=-1, touch=-1
         )
 
     @timed
@@ -313,6 +325,8 @@ class KalmanContactAnticipator(LeafSystem):
                 for port in (self._pose, self._contact, self._transition, self._phase)
             ],
         )
+        if self._touch_mode.HasValue(context):
+            memory = _found(memory, self._touch_mode.Eval(context))
         state.get_mutable_abstract_state(self._memory).set_value(memory)
 
     def _after(self, memory, time, pose, contact, transition, phase):
@@ -353,15 +367,14 @@ class KalmanContactAnticipator(LeafSystem):
         d = d / np.linalg.norm(d)
         segment = _segment_at(memory.history, time)
         c = self._filter
-        again = memory.updated and any(
-            _is_same(memory.belief.contacts[k], p, d) for k in memory.updated
-        )
-        if again:
-            return memory  # A bounce: felt in this trial, here, before.
+        for k in memory.updated:
+            if _is_same(memory.belief.contacts[k], p, d):
+                # A bounce: felt in this trial, here, before.
+                return replace(memory, touch=k)
         R = measurement_covariance(d, c.std_along, c.std_across)
         k = self._matching(memory.belief, IMPACT, segment, p, d, c.std_along)
         if k is not None and k in memory.updated:
-            return memory  # Two detections of one contact.
+            return replace(memory, touch=k)  # Two detections of one contact.
         if k is None:
             added = ExpectedContact(
                 mean=p,
@@ -376,7 +389,8 @@ class KalmanContactAnticipator(LeafSystem):
             k = len(belief.contacts) - 1
         else:
             belief = self._corrected(memory.belief, k, p, R)
-        return replace(memory, belief=belief, last=k, updated=(*memory.updated, k))
+        updated = (*memory.updated, k)
+        return replace(memory, belief=belief, last=k, touch=k, updated=updated)
 
     def _matching(self, belief, kind, segment, p, d, std_along) -> int | None:
         """Index of the expected contact that was felt: the nearest along d."""
@@ -510,6 +524,23 @@ class KalmanContactAnticipator(LeafSystem):
             belief = memory.belief.changed(k, covariance=4.0 * contact.covariance)
             memory = replace(memory, belief=belief)
         return memory
+
+
+def _touch_hint(memory: AnticipatorMemory) -> float:
+    """The mode that the contact which was felt last brought in an earlier trial."""
+    if memory.touch < 0:
+        return float(UNKNOWN_MODE)
+    return float(memory.belief.contacts[memory.touch].to_mode)
+
+
+def _found(memory: AnticipatorMemory, touch_mode) -> AnticipatorMemory:
+    """After the mode of a touch was found out."""
+    if not touch_mode[FOUND] > memory.found:
+        return memory
+    belief = memory.belief
+    if memory.touch >= 0:
+        belief = belief.changed(memory.touch, to_mode=int(touch_mode[TOUCH_MODE]))
+    return replace(memory, belief=belief, touch=-1, found=touch_mode[FOUND])
 
 
 def _segment_at(history, time) -> int:

@@ -6,7 +6,11 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from makebreak.systems.numerics.contact_task import N_TRANSITION, UNKNOWN_MODE
+from makebreak.systems.numerics.contact_task import (
+    N_TOUCH_MODE,
+    N_TRANSITION,
+    UNKNOWN_MODE,
+)
 from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.mode_detector import (
     ModeMemory,
@@ -43,15 +47,17 @@ class ModeDetector(LeafSystem):
         force_directions (6,) two rows n, pressed along; a zero row: none.
         mode_hint (1,) optional: the mode that begins now, -1 for none. It is taken at
             once if it is known, verified, and undone if it does not come true.
+        touch_hint (1,) optional: the mode that a touch brings, -1 for none.
 
     Outputs, all of them state:
         mode (1,) 1, 2, ...; FREE_MODE without normal force; UNKNOWN_MODE after a touch,
-            until it is found out.
+            until it is found out or hinted.
         confidence (2,) shares of the last batch: in this mode, in the second best.
         is_new (1,) 1 while the mode is one that the last decision created.
         transition (6,) of numerics/contact_task.py: changes from one surface to
             another; the time of the first departing sample, and of the decision.
             Making and losing contact is not one.
+        touch_mode (2,) of how many touches the mode was found out, and the last one's.
         collecting (1,) 1 while a batch is collected, and from a hint until it is
             confirmed or undone: the arm should be stiff.
         status (1,) 0: there is a feature; 1: the wrench is NaN or at its limit: all is
@@ -93,6 +99,7 @@ class ModeDetector(LeafSystem):
             )
         ]
         self._hint = self.DeclareVectorInputPort("mode_hint", 1)
+        self._touch_hint = self.DeclareVectorInputPort("touch_hint", 1)
         self._memory = self.DeclareAbstractState(Value(ModeMemory(table)))
         ticket = {self.abstract_state_ticket(self._memory)}
         for name, size, value in (
@@ -100,6 +107,7 @@ class ModeDetector(LeafSystem):
             ("confidence", 2, lambda m: m.confidence),
             ("is_new", 1, lambda m: [m.is_new]),
             ("transition", N_TRANSITION, lambda m: m.transition),
+            ("touch_mode", N_TOUCH_MODE, lambda m: m.touch_mode),
             ("collecting", 1, lambda m: [m.collecting]),
             ("status", 1, lambda m: [m.status]),
         ):
@@ -114,9 +122,10 @@ class ModeDetector(LeafSystem):
 
     @timed
     def _update(self, context: Context, state):
-        hint = UNKNOWN_MODE
-        if self._hint.HasValue(context):
-            hint = self._hint.Eval(context)[0]
+        hints = [
+            port.Eval(context)[0] if port.HasValue(context) else UNKNOWN_MODE
+            for port in (self._hint, self._touch_hint)
+        ]
         wrench, velocity, direction, rows = [p.Eval(context) for p in self._ports]
         memory = detect(
             self._memory_of(context),
@@ -126,7 +135,7 @@ class ModeDetector(LeafSystem):
             velocity,
             direction,
             rows,
-            hint,
+            *hints,
         )
         state.get_mutable_abstract_state(self._memory).set_value(memory)
 

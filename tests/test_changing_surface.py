@@ -16,6 +16,7 @@ from makebreak.diagrams.changing_surface import (
 )
 from makebreak.scripts.experiments.changing_surface import (
     changes_of,
+    modes_of,
     sliding,
     tracking_error,
 )
@@ -112,6 +113,23 @@ def test_wrong_decisions_are_counted(decisions, right, surplus):
     assert len(changes) == 2
     assert sum(c.right for c in changes) == right
     assert too_many == surplus
+
+
+def test_of_a_rehearsal_a_surface_s_mode_is_known_when_it_is_first_met():
+    known = [(1.70, 1, 2, 0), (4.70, 2, 1, 0)]
+    assert [c.right for c in changes_of(made_up(known), 0.012)[0]] == [False, True]
+    assert [c.right for c in changes_of(made_up(known), 0.012, True)[0]] == [True, True]
+    # One mode for two surfaces is wrong all the same.
+    one = [(1.70, 1, 1, 0), (4.70, 1, 1, 0)]
+    assert not changes_of(made_up(one), 0.012, True)[0][0].right
+
+
+def test_modes_that_were_hinted_or_only_rehearsed_do_not_count():
+    log = made_up([(1.70, 2, 4, 1), (4.70, 4, 2, 0)])
+    log["mode"][:1700] = 2
+    log["collecting"] = np.zeros((6000, 1))
+    log["mode"][400:500], log["collecting"][400:500] = 3, 1
+    assert modes_of(log) == {2, 4}
 
 
 def test_the_tracking_error_is_in_the_surface_alone():

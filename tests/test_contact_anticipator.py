@@ -33,9 +33,11 @@ from makebreak.systems.numerics.contact_anticipator import (
 )
 from makebreak.systems.numerics.contact_task import (
     BAD_INPUT,
+    BROKEN,
     CHANGE_TIME,
     COUNT,
     DIRECTION,
+    FOUND,
     FROM_MODE,
     IMPACT,
     IMPACTLESS,
@@ -43,6 +45,7 @@ from makebreak.systems.numerics.contact_task import (
     MEASURED,
     N_CONTACT,
     N_PHASE,
+    N_TOUCH_MODE,
     N_TRANSITION,
     PEAK_FORCE,
     PHASE_SEGMENT,
@@ -50,6 +53,7 @@ from makebreak.systems.numerics.contact_task import (
     SPEED,
     TIME,
     TO_MODE,
+    TOUCH_MODE,
     ContactBelief,
     ExpectedContact,
 )
@@ -354,6 +358,7 @@ class Trial:
             ("ee_pose", 7),
             ("contact", N_CONTACT),
             ("transition", N_TRANSITION),
+            ("touch_mode", N_TOUCH_MODE),
             ("phase", N_PHASE),
         ):
             source = builder.AddSystem(ConstantVectorSource(np.zeros(size)))
@@ -608,6 +613,31 @@ def test_the_mode_is_hinted_from_the_expected_place_on():
     trial = Trial(known)
     trial.step([0.5, 0.072, 0.0], 2)
     assert trial.out("mode_hint") == -1.0
+
+
+def touched(trial, mode):
+    """A touch whose mode is found out a while after; hints before and after that."""
+    hints = [trial.out("touch_hint")]
+    trial.impact([0.5, 0.0, 0.0], DOWN)
+    hints.append(trial.out("touch_hint"))
+    trial.values["contact"][BROKEN] += 1  # A bounce.
+    trial.step()
+    hints.append(trial.out("touch_hint"))
+    trial.values["touch_mode"][[FOUND, TOUCH_MODE]] += [1, mode]
+    trial.step()
+    return [*hints, trial.out("touch_hint")]
+
+
+def test_the_mode_that_a_contact_brought_is_told_when_it_is_felt_again():
+    first = Trial()
+    first.step([0.5, 0.0, 0.01], 0)
+    assert touched(first, 2) == [-1.0] * 4
+    assert first.belief().contacts[0].to_mode == 2
+    again = Trial(first.belief())
+    again.step([0.5, 0.0, 0.01], 0)
+    # Until it is found out: then the mode detector knows better.
+    assert touched(again, 3) == [-1.0, 2.0, 2.0, -1.0]
+    assert again.belief().contacts[0].to_mode == 3
 
 
 def test_a_hint_may_lead_by_a_time():

@@ -38,9 +38,11 @@ def start(tuning):
     return ModeMemory(no_modes(tuning.n_features, tuning.threshold))
 
 
-def follow(slide, tuning, seconds, memory=None, normal=None, edit=None, hint=None):
+def follow(
+    slide, tuning, seconds, memory=None, normal=None, edit=None, hint=None, touch=-1
+):
     """Rows (time, place, memory). edit(time, wrench) changes the wrench in place;
-    hint(time, place, memory) gives the hint."""
+    hint(time, place, memory) gives the hint; touch is that of touches."""
     memory = memory or start(tuning)
     rows = []
     for time, wrench, velocity, direction, s in slide.samples(seconds, normal):
@@ -48,7 +50,7 @@ def follow(slide, tuning, seconds, memory=None, normal=None, edit=None, hint=Non
             edit(time, wrench)
         told = hint(time, s, memory) if hint else UNKNOWN_MODE
         memory = detect(
-            memory, tuning, time, wrench, velocity, direction, DOWN, hint=told
+            memory, tuning, time, wrench, velocity, direction, DOWN, told, touch
         )
         rows.append((time, s, memory))
     return rows
@@ -352,6 +354,35 @@ def hinted(place_hint, mode_hint, tuning, friction=(0.2, 0.5), seam=0.3):
         memory=ModeMemory(table),
         hint=lambda time, s, m: mode_hint if s > place_hint else UNKNOWN_MODE,
     )
+
+
+@pytest.mark.parametrize("friction, told", [(0.2, 1), (0.5, 2), (0.5, 1)])
+def test_the_mode_of_a_touch_may_be_told_and_is_found_out_all_the_same(friction, told):
+    tuning = ModeTuning(crossing=0.03)
+    table = known_surfaces(Slide([0.2, 0.5], [0.3], seed=4), tuning)
+    right = 1 if friction == 0.2 else 2
+    slide = Slide([friction], [], seed=6)
+    memory = ModeMemory(table)
+    memories = [m for _, _, m in follow(slide, tuning, 1.0, memory, touch=told)]
+    untold = [m for _, _, m in follow(slide, tuning, 1.0, memory)]
+    found = next(k for k, m in enumerate(memories) if m.touch_mode[0])
+    touched = next(k for k, m in enumerate(memories) if m.mode != FREE_MODE)
+    assert found - touched > 10
+    assert {m.mode for m in memories[touched:found]} == {told}
+    assert {m.mode for m in untold[touched:found]} == {UNKNOWN_MODE}
+    # Stiff until then, and found as soon as without.
+    assert all(m.collecting for m in memories[touched + 10 : found])
+    assert untold[found].touch_mode == memories[found].touch_mode == (1.0, right)
+    assert {m.mode for m in memories[found:]} == {right}
+    assert memories[-1].transition[COUNT] == 0  # No change of surface.
+
+
+def test_a_touch_s_mode_that_nobody_knows_is_not_taken():
+    tuning = ModeTuning(crossing=0.03)
+    slide = Slide([0.2], [], seed=6)
+    for told in (1, np.nan):  # Of an empty table.
+        rows = follow(slide, tuning, 0.2, touch=told)
+        assert rows[-1][2].mode == UNKNOWN_MODE
 
 
 @pytest.mark.parametrize("place", [0.29, 0.3, 0.31])

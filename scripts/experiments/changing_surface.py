@@ -112,7 +112,7 @@ def run(config: ChangingSurfaceConfig, session: Session) -> dict:
                 known.modes.save(session.path("modes.json"))
                 known.models.save(session.path("models.json"))
     main = logs["adaptive"]
-    changes, surplus = changes_of(main, task.feet)
+    changes, surplus = changes_of(main, task.feet, config.rehearse > 0)
     session.save_plot(plot_modes(main, changes, task), "modes")
     session.save_plot(plot_stiffness(logs, changes), "stiffness")
     session.write_recording(recording, task.model)
@@ -127,6 +127,12 @@ def sliding(log) -> np.ndarray:
     return on & (log["time"] >= log["time"][np.argmax(on)] + SETTLED_SEC)
 
 
+def modes_of(log) -> set[int]:
+    """The modes that were found in sliding; not all of a rehearsal need be."""
+    found = sliding(log) & (log["collecting"][:, 0] < 0.5)
+    return {int(mode) for mode in log["mode"][found, 0] if mode >= 1}
+
+
 def tracking_error(log) -> np.ndarray:
     """(n,) distance of the tip from where it should be, in the surface [m]."""
     return np.linalg.norm((log["x_desired"] - _padded(log["ee_pose"]))[:, :2], axis=1)
@@ -136,9 +142,11 @@ def _padded(pose):
     return np.pad(pose, ((0, 0), (0, 12)))
 
 
-def changes_of(log, feet: float) -> tuple[list[Change], int]:
+def changes_of(log, feet: float, rehearsed: bool = False) -> tuple[list[Change], int]:
     """Every change of surface in a log, from the truth, with what was decided.
 
+    Args: rehearsed, whether modes were known before: then the first time on a surface
+        may be one of them, if no other surface has it.
     Returns: the changes, and how many reports belong to none or came twice.
     """
     time, p = log["time"], log["ee_pose"][:, :3]
@@ -185,7 +193,7 @@ def changes_of(log, feet: float) -> tuple[list[Change], int]:
         event = transition[mine[-1]]
         mode, is_new = int(event[TO_MODE]), bool(event[IS_NEW])
         if change.new:
-            right = is_new and mode not in names.values()
+            right = (is_new or rehearsed) and mode not in names.values()
             names[change.after] = mode
         else:
             right = mode == names.get(change.after)
@@ -218,7 +226,7 @@ def summary(logs, done, changes, surplus, task: SurfaceTask, k_max: float) -> di
         "changes": len(changes),
         "changes_right": sum(c.right for c in changes),
         "changes_surplus": surplus,
-        "modes": int(main["mode"].max()),
+        "modes": len(modes_of(main)),
         "confidence_min": float(np.nanmin([c.confidence[0] for c in changes])),
         "confidence_second_max": float(np.nanmax([c.confidence[1] for c in changes])),
     }

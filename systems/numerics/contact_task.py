@@ -48,6 +48,12 @@ STATUS = 13  # 0, or 1: the wrench is not to be used (NaN, stuck, or at its limi
 N_TRANSITION = 6
 COUNT, CHANGE_TIME, FROM_MODE, TO_MODE, IS_NEW, DECIDED_TIME = range(N_TRANSITION)
 
+# --- touch_mode (2,): of touches, from the mode detector.
+N_TOUCH_MODE = 2
+FOUND, TOUCH_MODE = range(
+    N_TOUCH_MODE
+)  # Of how many it found the mode; the last one's.
+
 # --- modes. Clusters are numbered from 1.
 UNKNOWN_MODE, FREE_MODE = -1, 0
 
@@ -65,7 +71,7 @@ class ExpectedContact:
     seen: int = 0  # How often it has been felt.
     # (n, 2) [m/s, N]: speeds of approach and the peak forces that they gave.
     impacts: np.ndarray = None  # type: ignore[assignment]
-    from_mode: int = UNKNOWN_MODE
+    from_mode: int = UNKNOWN_MODE  # Of an IMPACTLESS change.
     to_mode: int = UNKNOWN_MODE
 
     def __post_init__(self):

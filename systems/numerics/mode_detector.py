@@ -14,6 +14,9 @@ feature.
     COLLECTING  it has departed: a batch is collected, under high stiffness
     HINTED    the mode was told beforehand and is being verified, as stiff
 
+The mode that a touch brings may be told as well (`touch_hint`): then it is the mode
+from the touch on, and still found out as any other, under high stiffness.
+
 A *departure* is a difference to the reference of TRIGGER force_noise / R in SUSTAINED
 samples in a row, or of half of it in the mean over about 50 ms. The time of the change
 is that of the first departing sample. Nothing is decided before the tool has gone
@@ -36,6 +39,7 @@ import numpy as np
 
 from makebreak.systems.numerics.contact_task import (
     FREE_MODE,
+    N_TOUCH_MODE,
     N_TRANSITION,
     UNKNOWN_MODE,
 )
@@ -117,6 +121,7 @@ class ModeMemory:
     confidence: tuple[float, float] = (0.0, 0.0)
     is_new: bool = False
     transition: tuple[float, ...] = (0.0,) * N_TRANSITION
+    touch_mode: tuple[float, ...] = (0.0,) * N_TOUCH_MODE
     collecting: bool = False
     status: int = NO_FEATURE
 
@@ -189,13 +194,14 @@ def detect(
     direction,
     force_directions,
     hint: float = UNKNOWN_MODE,
+    touch_hint: float = UNKNOWN_MODE,
 ) -> ModeMemory:
     """The memory after one sample.
 
     Args: time [s]; wrench (6,) on the tool, force first [N], [N m]; velocity (6,)
         [m/s], [rad/s]; direction (3,) of the target motion, zero at rest;
         force_directions (6,); hint: the number of the mode that begins here,
-        UNKNOWN_MODE: none.
+        UNKNOWN_MODE: none; touch_hint: of the mode that a touch here brings.
 
     A wrench that is not finite or at its limit changes nothing but the status, and the
     averages begin anew after it.
@@ -214,6 +220,10 @@ def detect(
         return memory
     memory = _hinted(replace(memory, ring=ring, rows=rows), hint)
     memory = _contact(memory, tuning, time, float(motion_wrench(ring[-1, :6], rows)[6]))
+    if memory.stage == TOUCHED and memory.mode == UNKNOWN_MODE:
+        told = int(touch_hint) if np.isfinite(touch_hint) else UNKNOWN_MODE
+        if 1 <= told <= len(memory.table):
+            memory = replace(memory, mode=told)
     if memory.stage == FREE or len(ring) <= WINDOW:
         return replace(memory, status=NO_FEATURE)
     f = contact_feature(ring, rows, tuning.tool_mass, tuning.torque_arm, tuning.period)
@@ -485,6 +495,9 @@ def _decided(memory, tuning, time, mode, fractions, batch) -> ModeMemory:
             float(is_new),
             time,
         )
+    touch_mode = memory.touch_mode
+    if memory.stage == TOUCHED:
+        touch_mode = (touch_mode[0] + 1.0, float(mode))
     return replace(
         memory,
         table=memory.table.learned(batch, mode),
@@ -502,6 +515,7 @@ def _decided(memory, tuning, time, mode, fractions, batch) -> ModeMemory:
         confidence=confidence,
         is_new=is_new,
         transition=transition,
+        touch_mode=touch_mode,
         collecting=False,
     )
 
