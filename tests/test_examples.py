@@ -23,7 +23,7 @@ def test_every_example_is_short_and_tested():
     here = Path(__file__).read_text()
     for path in EXAMPLES.glob("*.py"):
         # Some make a log or have a system of their own, too.
-        most = {"gap": 50, "own": 60, "sweep": 50}.get(path.name.split("_")[0], 40)
+        most = {"gap": 50, "own": 65, "sweep": 50}.get(path.name.split("_")[0], 40)
         assert len(path.read_text().splitlines()) <= most, path.name
         assert f'"{path.name}"' in here
 
@@ -38,7 +38,8 @@ def test_an_own_planner_takes_the_place_of_c3():
 
 
 def test_a_sweep_says_how_far_a_wrong_mass_matters():
-    *rows, _, reached, of, low, high = numbers("sweep_a_puck.py")  # "within 1 cm:".
+    # ... "within 1 cm: 8 of 8, 68-100 %".
+    *rows, _, reached, of, low, high = map(abs, numbers("sweep_a_puck.py"))
     shares, places = rows[::2], rows[1::2]
     assert len(shares) == of == 8 and shares == sorted(shares)
     assert min(shares) > 0.5 and max(shares) < 3.0 and len(set(shares)) == 8
