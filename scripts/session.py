@@ -35,6 +35,7 @@ from makebreak.scripts.diagram_picture import draw_diagram, shown_systems
 from makebreak.scripts.interrupts import handled, leave_terminal, undisturbed
 from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.recording_stream import RecordingStream
+from makebreak.scripts.run_buttons import RunButtons
 from makebreak.scripts.table import json_value
 from makebreak.scripts.trials import run_many
 from makebreak.systems.numerics.first_calls import deferred
@@ -174,8 +175,9 @@ class Session:
         """Simulates the diagram and samples its ports, from time 0.
 
         A sample at time t is taken before the events at t; the first is at time 0, and
-        each is at a multiple of period_sec. Ctrl-C ends the simulation at the next
-        sample; all that was recorded until then is in the log.
+        each is at a multiple of period_sec. Ctrl-C, or the button `stop` in Meshcat,
+        ends the simulation at the next sample; all that was recorded until then is in
+        the log.
 
         Args:
             diagram: what is simulated.
@@ -251,6 +253,7 @@ class Session:
             self.meshcat.StartRecording(frames_per_second=fps)
         with (
             _CatchInterrupt() as interrupt,
+            RunButtons(self.meshcat) as buttons,
             self._bar(duration, label) as bar,
             CompilingShown(partial(_tell, bar), self.on_first_compile),
         ):
@@ -269,12 +272,16 @@ class Session:
                     done = sample(t)
                     stream.tick(root)
                     bar.update(t - bar.n)
+                    interrupt.hit |= buttons.stopped(
+                        lambda: interrupt.hit, simulator.ResetStatistics
+                    )
                 if (done or interrupt.hit) and time[-1] < duration:
                     why = "interrupted" if interrupt.hit else done
                     self.endings.append(_ending(label, time[-1], duration, why))
             finally:
                 self.interrupted = interrupt.hit
-                wall, cpu = perf_counter() - wall_start, process_time() - cpu_start
+                wall = perf_counter() - wall_start - buttons.waited_sec
+                cpu = process_time() - cpu_start
                 stream.catch_up(root, ended=True)
                 log = self._finish_log(
                     label, time, samples, interrupt.hit, root, diagram
