@@ -39,6 +39,7 @@ from makebreak.models.effects.kind import Effect
 from makebreak.models.fruit import FRUITS, fruit_file, make_fruit
 from makebreak.models.scene import Scene, load_scene, read_scene
 from makebreak.models.tip_and_ball import TipAndBall, make_tip_and_ball
+from makebreak.systems.adapt_button import AdaptButton
 from makebreak.systems.arm_reference import ArmReference, ArmReferenceConfig
 from makebreak.systems.ball_tracker import BallTracker, BallTrackerConfig
 from makebreak.systems.baselines.dynamics_residual import DynamicsResidual
@@ -560,6 +561,10 @@ def add_ball_rolling(
         connect(lcs["learn"], "lcs", learner, "lcs")
         r_comp = learner.GetOutputPort("r_comp")
         connect(learner, "r_std", task, "r_std")
+        if meshcat is not None:
+            button = builder.AddNamedSystem("adapt_button", AdaptButton(n_lam, meshcat))
+            builder.Connect(r_comp, button.get_input_port())
+            r_comp = button.get_output_port()
     else:
         zero = builder.AddNamedSystem(
             "no_residual", ConstantVectorSource(np.zeros(n_lam))

@@ -451,6 +451,7 @@ class Session:
                 for fig, name in self._figures:
                     self._write(name, partial(_save_figure, fig))
                 if self.meshcat is not None:
+                    self.meshcat.DeleteAddedControls()  # Nobody listens there.
                     self.write_text("meshcat.html", self.meshcat.StaticHtml())
             finally:  # A plot that fails does not lose the result.
                 files = self.outputs.commit(complete)
