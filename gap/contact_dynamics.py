@@ -17,7 +17,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from makebreak.gap.contact_means import FORCE, MODELLED
+from makebreak.gap.contact_means import MODELLED
 from makebreak.gap.contact_shapes import Slot
 from makebreak.gap.permitted_contacts import SURFACES, PermittedContacts, Shift
 from makebreak.gap.recording import Recording
@@ -434,7 +434,7 @@ class ContactDynamics(PermittedContacts):
 
     def row_names(self) -> list[str]:
         names = [f"{c} equation" for c in self.coordinates]
-        names += [f"{place}.{a}" for place, _ in self.sensors for a in FORCE]
+        names += [name for sensor in self.sensors for name in sensor.names]
         names += [name for name, _ in self.extra]
         for pair in self._pairs_met:
             name = self.pair_name(pair)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import Frame
 from scipy.sparse import block_diag, csr_matrix
 from scipy.spatial.transform import Rotation
 
@@ -36,7 +37,38 @@ APPROACH = 0.02  # Faster along the normal is no lasting contact [m/s].
 SLIDES = 0.01  # Slower slip may be sticking [m/s].
 MODELLED = 0.02  # What models are off by, as a share of the forces in a row.
 POSE = (*TURN, "x", "y", "z")
-FORCE = ("fx", "fy", "fz")
+FORCE, MOMENT = ("fx", "fy", "fz"), ("tx", "ty", "tz")
+
+
+@dataclass(frozen=True, eq=False)
+class WrenchSensor:
+    """A force sensor at a frame: what acts on the bodies `welded` to that of the frame.
+
+    names: of its channels, forces and then, where they were measured, moments about the
+    frame's origin, all in world axes; first: of its rows among those of all sensors.
+    """
+
+    place: str
+    frame: Frame
+    welded: list[int]
+    names: tuple[str, ...]
+    first: int
+
+    @property
+    def forces(self) -> slice:
+        return slice(self.first, self.first + len(FORCE))
+
+    @property
+    def rows(self) -> slice:
+        return slice(self.first, self.first + len(self.names))
+
+    @property
+    def moments(self) -> slice:
+        return slice(self.forces.stop, self.rows.stop)
+
+    @property
+    def feels_moments(self) -> bool:
+        return len(self.names) > len(FORCE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +99,7 @@ class _Means:
     effort_slope: np.ndarray  # By a delay of all commands [N/s].
     centre: np.ndarray
     weights: csr_matrix
-    wrench: np.ndarray  # (K, 3 n_sensors)
+    wrench: np.ndarray  # (K, n_wrench), forces and moments of all sensors
     wrench_var: np.ndarray
     extra: np.ndarray  # (K, n_extra) measured rates and efforts less what they must be.
     extra_var: np.ndarray
@@ -163,23 +195,32 @@ class ContactMeans:
                 self.by[joint] = "" if joint in act.joints else "passive"
 
     def _read_sensors(self) -> None:
-        """sensors: (frame, body index) of wrenches; extra: channels that must agree
-        with what others tell, with the coordinate each is of."""
+        """sensors, with n_wrench rows in all; extra: channels that must agree with what
+        others tell, with the coordinate each is of."""
         plant = self.plant
-        self.sensors: list[tuple[str, list[int]]] = []
+        self.sensors: list[WrenchSensor] = []
+        self.n_wrench = 0
         for place in self.recordings[0].places(FORCE):
-            names = [f"{place}.{f}" for f in FORCE]
-            if not all(n in r for n in names for r in self.recordings):
+            forces, moments = (
+                tuple(f"{place}.{a}" for a in axes) for axes in (FORCE, MOMENT)
+            )
+            if not all(n in r for n in forces for r in self.recordings):
                 continue
+            names = forces
+            if all(n in r for n in moments for r in self.recordings):
+                names += moments
             model, name = place.split(".", 1)
             if not plant.HasModelInstanceNamed(model):
                 continue
             instance = plant.GetModelInstanceByName(model)
             if not plant.HasFrameNamed(name, instance):
                 continue
-            body = plant.GetFrameByName(name, instance).body()
-            welded = [int(b.index()) for b in plant.GetBodiesWeldedTo(body)]
-            self.sensors.append((place, welded))
+            frame = plant.GetFrameByName(name, instance)
+            welded = [int(b.index()) for b in plant.GetBodiesWeldedTo(frame.body())]
+            self.sensors.append(
+                WrenchSensor(place, frame, welded, names, self.n_wrench)
+            )
+            self.n_wrench += len(names)
         self.extra: list[tuple[str, int]] = []
         for joint, (_, i) in self.joints.items():
             self.extra.append((f"{joint}.velocity", i))
@@ -269,8 +310,8 @@ class ContactMeans:
                                    strict=False)
             ])  # fmt: skip
             found[pair] = (phi < MEETS) & (np.abs(rate) < APPROACH)
-        for place, welded in self.sensors:
-            size = self._force_size(place)
+        for sensor in self.sensors:
+            size, welded = self._force_size(sensor.place), sensor.welded
             for pair in found:
                 if set(pair) & set(welded) and np.isfinite(size).all():
                     partner = pair[0] if pair[1] in welded else pair[1]
@@ -490,14 +531,14 @@ class ContactMeans:
 
     def _wrench_means(self, recording: Recording, t: _Track, centres):
         columns, variances = [], []
-        for place, _ in self.sensors:
-            for a in FORCE:
-                y = recording[f"{place}.{a}"][t.episode.rows]
+        for sensor in self.sensors:
+            for name in sensor.names:
+                y = recording[name][t.episode.rows]
                 ok = np.isfinite(y)
                 w, _ = test_functions(t.time[ok], centres, self.half)
                 columns.append(w @ y[ok])
                 var = np.asarray(w.multiply(w).sum(axis=1)).ravel()
-                noise = recording.channels[f"{place}.{a}"].noise
+                noise = recording.channels[name].noise
                 # Where there are no samples, nothing is known.
                 variances.append(np.where(var > 0.0, var * noise**2, 1e12))
         K = len(centres)

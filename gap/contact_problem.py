@@ -11,7 +11,7 @@ from itertools import combinations
 import numpy as np
 from scipy.optimize import minimize
 
-from makebreak.gap.contact_dynamics import ContactDynamics
+from makebreak.gap.contact_dynamics import WRENCHED, ContactDynamics
 from makebreak.gap.contact_windows import PushWindows, led_as_measured
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.measure import gap_measure, series_of
@@ -26,6 +26,7 @@ from makebreak.gap.problem import (
     Outcome,
     SearchPlan,
     is_sane,
+    rms,
 )
 from makebreak.gap.recording import Recording
 from makebreak.gap.result import Where
@@ -52,6 +53,7 @@ PATCH_RUNS, PATCH_STARTS = 200, 4
 # Of a patch's side: how far it is moved [m], and what that may add to the sum of
 # squares (neighbouring rows err together: four times what one row would count).
 MOVED, PROFILE = (5e-4, 1e-3, 2e-3, 4e-3, 8e-3, 0.016, 0.032, 0.064), 16.0
+FEWEST_ROWS = 8  # Of a channel that is looked at by itself.
 SMALL = 0.1  # First trial of an effect on joints, of the efforts there.
 
 
@@ -95,9 +97,9 @@ class ContactProblem(ContactDynamics, GapProblem):
         return self._base
 
     def _share_out(self) -> None:
-        """Which blocks are fitted: blocks of time, for what is seen at one place alone
-        (a patch) must be in both parts; of the three ways to hold a third of them out
-        the one in which it errs most like the whole."""
+        """Which blocks are fitted. What is seen at one place alone (a patch, a wall) is
+        seen in few blocks, and must be in both parts: so of each three blocks of which
+        the scene leaves about as much, the middle one is held out."""
         m = self.means
         block = np.zeros(len(m.time), int)
         first = 0
@@ -109,13 +111,10 @@ class ContactProblem(ContactDynamics, GapProblem):
         self._block = block
         _, order = np.unique(block, return_inverse=True)
         size = np.sum(np.where(self._shown, self.left() ** 2, 0.0), axis=1)
-        whole = size.mean() + 1e-12
-
-        def off(k: int) -> float:
-            held = size[order % 3 == k]
-            return abs(np.log((held.mean() + 1e-12) / whole)) if len(held) else np.inf
-
-        self._train = order % 3 != min(range(3), key=off)
+        total = np.bincount(order, weights=size)
+        rank = np.empty(len(total), int)
+        rank[np.argsort(-total, kind="stable")] = np.arange(len(total))
+        self._train = rank[order] % 3 != 1
 
     def train(self) -> np.ndarray:
         return self._of_rows(self._train)
@@ -176,7 +175,14 @@ class ContactProblem(ContactDynamics, GapProblem):
         )
         sensors = self.sensor_std()
         beside = np.sqrt(np.maximum(size**2 - (MISFIT * sensors) ** 2, 0.0))
-        return np.maximum(beside, LEAST_MISFIT * self.acting)
+        off = np.maximum(beside, LEAST_MISFIT * self.acting)
+        for sensor in self.sensors:
+            # A moment is a force, of which other rows tell, at a point that geometry
+            # tells: one that is off by more is no law of contact.
+            rows = np.arange(len(self.coordinates) + self.n_wrench)
+            rows = rows[len(self.coordinates) :][sensor.moments]
+            off[rows] = np.minimum(off[rows], WRENCHED * self.acting[rows])
+        return off
 
     def _set(self, allowance: np.ndarray) -> None:
         self.allow(allowance)
@@ -212,11 +218,12 @@ class ContactProblem(ContactDynamics, GapProblem):
                 add("timing of the drives", self.residual(), step, TIMING)
             finally:
                 self._needs = kept
-        for k, (sensor, welded) in enumerate(self.sensors):
-            own, kept = slice(3 * k, 3 * k + 3), self.means.wrench
-            for name, more, step, size in (
-                (f"gain of {sensor}", kept[:, own], 0.01, FELT),
-                (f"ripple of {sensor}", self._ripple(welded), 1e-4, self._row_sec()),
+        for sensor in self.sensors:
+            at, kept, forces = sensor.place, self.means.wrench, sensor.forces
+            ripple = self._ripple(sensor.welded)
+            for name, own, more, step, size in (
+                (f"gain of {at}", sensor.rows, kept[:, sensor.rows], 0.01, FELT),
+                (f"ripple of {at}", forces, ripple, 1e-4, self._row_sec()),
             ):
                 self.means.wrench = np.array(kept)
                 self.means.wrench[:, own] += step * more
@@ -544,6 +551,14 @@ class ContactProblem(ContactDynamics, GapProblem):
 
     # ----- What it comes to
 
+    def loudest(self, fitted: Fitted) -> tuple[str, float]:
+        found = ("", 0.0)
+        for k, name in enumerate(self.row_names()):
+            mine = fitted.left[self.channel_of_rows() == k]
+            if len(mine) >= FEWEST_ROWS:
+                found = max(found, (name, rms(mine)), key=lambda each: each[1])
+        return found
+
     def where(self, left: np.ndarray) -> list[Where]:
         r = np.zeros(self._shown.shape)
         r[self._shown] = left
@@ -591,9 +606,9 @@ class ContactProblem(ContactDynamics, GapProblem):
         for joint, by in self.by.items():
             if by == "measured":
                 how[f"{joint}.effort_measured"] = "equations"
-        for place, _ in self.sensors:
-            for a in ("fx", "fy", "fz"):
-                how[f"{place}.{a}"] = "equations"
+        for sensor in self.sensors:
+            for name in sensor.names:
+                how[name] = "equations"
         return how
 
     def outcome(

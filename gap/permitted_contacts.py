@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable
+from pydrake.multibody.tree import BodyIndex, Frame, JacobianWrtVariable
 from scipy.optimize import linprog
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
@@ -96,12 +96,22 @@ class PermittedContacts(ContactMeans):
                     self._context, wrt, frame, np.zeros(3), W, W
                 )
         self._node_v = v
+        # Where wrenches are measured (n_nodes, 3) [m].
+        self._felt_at = [self._places_of(sensor.frame, q) for sensor in self.sensors]
         # The equations without acceleration at nodes, the mass matrix in the middle.
         self._still = self._W @ self.dynamics.inverse_dynamics(q, v, np.zeros_like(v))
         self._M = np.empty((len(m.time), n_v, n_v))
         for k, row in enumerate(m.centre):
             plant.SetPositions(self._context, self._q[row])
             self._M[k] = plant.CalcMassMatrix(self._context)
+
+    def _places_of(self, frame: Frame, q: np.ndarray) -> np.ndarray:
+        """(n, 3) a frame's origin in the world at positions q (n, n_q)."""
+        out = np.empty((len(q), 3))
+        for n, row in enumerate(q):
+            self.plant.SetPositions(self._context, row)
+            out[n] = frame.CalcPoseInWorld(self._context).translation()
+        return out
 
     def _slots(self, effects: Sequence[Effect], shift: Shift | None = None):
         """Slots at the nodes, and the poses that they are of."""
@@ -259,7 +269,7 @@ class PermittedContacts(ContactMeans):
         """G (K, rows, columns), which can act (K, columns), slot of each column; the
         slots; how loads are shared."""
         slots, made = self._contacts_at(effects, shift)
-        K, n = len(self.means.time), len(self.coordinates) + 3 * len(self.sensors)
+        K, n = len(self.means.time), len(self.coordinates) + self.n_wrench
         frictions = {
             number: self._friction(slots[number], effects)
             for number in {c.slot for c in made}
@@ -341,11 +351,14 @@ class PermittedContacts(ContactMeans):
     def _felt(self, s: Slot, J: np.ndarray, f: np.ndarray) -> np.ndarray:
         """(n_nodes, rows) a force f (n_nodes, 3) on the slot's a, and back on its b."""
         n_v = self.plant.num_velocities()
-        out = np.zeros((len(f), n_v + 3 * len(self.sensors)))
+        out = np.zeros((len(f), n_v + self.n_wrench))
         out[:, :n_v] = np.einsum("nij,ni->nj", J, f)
-        for k, (_, welded) in enumerate(self.sensors):
-            sign = float(s.a in welded) - float(s.b in welded)
-            out[:, n_v + 3 * k : n_v + 3 * k + 3] = sign * f
+        felt = out[:, n_v:]
+        for sensor, at in zip(self.sensors, self._felt_at, strict=True):
+            sign = float(s.a in sensor.welded) - float(s.b in sensor.welded)
+            felt[:, sensor.forces] = sign * f
+            if sensor.feels_moments:
+                felt[:, sensor.moments] = sign * np.cross(s.place - at, f)
         return out
 
     def _sharing(self, made: Sequence[_Column], slots: Sequence[Slot]) -> np.ndarray:

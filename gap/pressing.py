@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from makebreak.gap.contact_dynamics import THIN
-from makebreak.gap.contact_means import FORCE, MEETS
+from makebreak.gap.contact_means import FORCE, MEETS, WrenchSensor
 from makebreak.gap.contact_problem import ContactProblem
 from makebreak.gap.contact_shapes import Slot
 from makebreak.gap.impacts import MOST_SHARE, nearest, positions, walls_of
@@ -177,8 +177,8 @@ class PressingProblem(ContactProblem):
         tool came nearest to it and, with a wrench, felt it; inf: none. A hard knock
         goes deeper for a moment."""
         near = d < REACH
-        for place, _ in self.sensors:
-            near &= self._force_along(place, normal) > LEAST_FORCE
+        for sensor in self.sensors:
+            near &= self._force_along(sensor.place, normal) > LEAST_FORCE
         if near.sum() < FEWEST_ROWS:
             return np.inf
         values = np.sort(d[near & (d < d[near].min() + KNOCKED)])
@@ -363,8 +363,8 @@ class PressingProblem(ContactProblem):
 
     def _clear_force(self) -> float:
         """A pressing force of less may be nothing [N]."""
-        noise = [np.sqrt(np.median(self.means.wrench_var))] if self.sensors else []
-        return max([LEAST_FORCE, *(CLEAR * float(x) for x in noise)])
+        var = [np.median(self.means.wrench_var[:, s.forces]) for s in self.sensors]
+        return max([LEAST_FORCE, *(CLEAR * float(np.sqrt(x)) for x in var)])
 
     # ----- Rows
 
@@ -465,26 +465,22 @@ class PressingProblem(ContactProblem):
             return self._nuisances
         plain = super().nuisances()
         columns, prior, names = [plain.columns], list(plain.prior), list(plain.names)
-        for k, (place, _) in enumerate(self.sensors):
-            column = self._carried(k)
+        for sensor in self.sensors:
+            column = self._carried(sensor)
             if column is not None:
                 columns.append(column[0][:, None])
                 prior.append(column[1])
-                names.append(f"mass beyond {place}")
+                names.append(f"mass beyond {sensor.place}")
         self._nuisances = Nuisances(
             np.hstack(columns), np.array(prior), tuple(names), plain.reach
         )
         return self._nuisances
 
-    def _carried(self, k: int) -> tuple[np.ndarray, float] | None:
-        """The column of a kilogram beyond the k-th sensor, and what may be there [kg]:
-        the sensor feels what is outside less mass times acceleration."""
-        place, _ = self.sensors[k]
-        model, name = place.split(".", 1)
-        frame = self.plant.GetFrameByName(
-            name, self.plant.GetModelInstanceByName(model)
-        )
-        body = frame.body()
+    def _carried(self, sensor: WrenchSensor) -> tuple[np.ndarray, float] | None:
+        """The column of a kilogram beyond a sensor, and what may be there [kg]: the
+        sensor feels what is outside less mass times acceleration, at the body's centre
+        of mass."""
+        body = sensor.frame.body()
         mass = body.default_mass()
         if not mass > 0.0:
             return None
@@ -495,7 +491,10 @@ class PressingProblem(ContactProblem):
         a = A[:, 3:] + np.cross(A[:, :3], arm) + np.cross(turns, np.cross(turns, arm))
         kept = m.wrench
         m.wrench = kept.copy()
-        m.wrench[:, 3 * k : 3 * k + 3] += mass * a
+        m.wrench[:, sensor.forces] += mass * a
+        if sensor.feels_moments:
+            about = arm - R @ sensor.frame.GetFixedPoseInBodyFrame().translation()
+            m.wrench[:, sensor.moments] += mass * np.cross(about, a)
         try:
             column = (self.base() - self.residual()) / mass
         finally:

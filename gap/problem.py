@@ -255,6 +255,11 @@ class GapProblem(ABC):
         held = held if len(held) else self.in_noise(left)
         return float(np.sqrt(np.mean(held**2)))
 
+    def loudest(self, fitted: Fitted) -> tuple[str, float]:
+        """The channel, or equation, of which all rows together leave most of the noise,
+        and how many times that; no name where it is not asked."""
+        return "", 0.0
+
     def reweigh(self, left: np.ndarray) -> bool:
         """Weighs rows by what is left now (m,), where that is clearly less than what
         models were taken to be off by. Returns: whether anything changed; then

@@ -32,7 +32,7 @@ from makebreak.gap.recording import (
 )
 from makebreak.gap.result import GapMeasure, GapResult, JudgedChannel
 from makebreak.gap.scene_facts import scene_facts, scene_names
-from makebreak.gap.select import Choice, Selection, select, without
+from makebreak.gap.select import LOUD, Choice, Selection, select, without
 from makebreak.gap.split import split, with_noise_of
 from makebreak.gap.trust import trust_in
 from makebreak.gap.verdict import (
@@ -207,6 +207,11 @@ def conclude(
         elif chosen_on.gap.before > UNNAMED:
             verdict = "gap_unnamed"
             differs = " The equations of motion agree, simulated windows do not."
+    name, size = problem.loudest(selection.start)
+    if verdict == "no_gap" and size > LOUD:
+        # Among many others one that is off would not show.
+        verdict = "gap_unnamed"
+        differs = f" {name} is off by {size:.2g} times its noise."
     if chosen_on is not None:
         verdict = after_simulation(verdict, choices, chosen_on.gap, selection.far)
         every = selection

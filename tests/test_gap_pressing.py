@@ -5,9 +5,9 @@ import pytest
 
 from makebreak.gap.pressing import PressingProblem, presses
 from makebreak.gap.recording import read_recordings
-from makebreak.gap.select import select
+from makebreak.gap.select import LOUD, select
 from makebreak.gap.table import write_recording
-from makebreak.gap.workflow import problem_for
+from makebreak.gap.workflow import judged_channels, problem_for, unjudged_channels
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
@@ -72,21 +72,27 @@ def write_scene(folder):
     return read_scene(folder / "scene.yaml")
 
 
-def contact(p, v, table, wall, mu):
-    """Force of table and wall on the tool (3,), by springs; mu (2,) their friction."""
-    total = np.zeros(3)
+def contact(p, v, table, wall, mu, longer=0.0):
+    """Force of table and wall on the tool by springs, moment about its centre (6,);
+    mu (2,) their friction; longer: what touches is so much farther off the centre."""
+    total = np.zeros(6)
     each = ((2, 1.0, table, mu[0]), (0, -1.0, wall, mu[1]))
     for axis, sign, place, friction in each:
         depth = RADIUS - sign * (p[axis] - place)
         f = max(STIFFNESS * depth - DAMPING * sign * v[axis], 0.0) if depth > 0 else 0.0
         slip = np.delete(v, axis)
-        rub = -friction * f * slip / max(np.hypot(*slip), 1e-3)
-        total[axis] += sign * f
-        total[np.arange(3) != axis] += rub
+        force, arm = np.zeros(3), np.zeros(3)
+        force[axis] = sign * f
+        force[np.arange(3) != axis] = -friction * f * slip / max(np.hypot(*slip), 1e-3)
+        arm[axis] = -sign * (RADIUS - 0.5 * depth)
+        arm[1] += longer
+        total += np.append(force, np.cross(arm, force))
     return total
 
 
-def record(folder, table=0.0, wall=0.3, mu=(TABLE_MU, WALL_MU), wrench=True, n=1):
+def record(
+    folder, table=0.0, wall=0.3, mu=(TABLE_MU, WALL_MU), wrench=True, n=1, longer=0.0
+):
     """Down on the table, along it to the wall, along both; pressed with about 8 N."""
     rng = np.random.default_rng(0)
     names = ("x", "y", "z")
@@ -105,13 +111,13 @@ def record(folder, table=0.0, wall=0.3, mu=(TABLE_MU, WALL_MU), wrench=True, n=1
             u = MASS * 25.0 * (target - v)
             pressed = [8.0 * (t > 3.0), 0.0, -8.0 * (t > 1.2)]
             u = np.clip(u, -12.0, 12.0) + pressed + np.array([0.0, 0.0, MASS * 9.81])
-            F = contact(p, v, table, wall, mu)
+            F = contact(p, v, table, wall, mu, longer)
             states.append(state)
             efforts.append(u)
             forces.append(F)
 
             def rate(y, u=u):
-                a = u + contact(y[:3], y[3:], table, wall, mu)
+                a = u + contact(y[:3], y[3:], table, wall, mu)[:3]
                 return np.append(y[3:], a / MASS - GRAVITY)
 
             for _ in range(2):  # The classical Runge-Kutta rule.
@@ -126,11 +132,12 @@ def record(folder, table=0.0, wall=0.3, mu=(TABLE_MU, WALL_MU), wrench=True, n=1
         mean = u.reshape(-1, 5, 3).mean(axis=1)
         columns = {"time": time[rows], "episode": np.full(len(mean), episode)}
         for i, axis in enumerate(names):
-            noise = rng.normal(size=(2, len(mean)))
+            noise = rng.normal(size=(3, len(mean)))
             columns[f"gantry.{axis}.position"] = x[rows, i] + 1e-5 * noise[0]
             columns[f"gantry.{axis}.effort_command"] = mean[:, i]
             if wrench:
                 columns[f"gantry.tip.f{axis}"] = F[rows, i] + 0.1 * noise[1]
+                columns[f"gantry.tip.t{axis}"] = F[rows, 3 + i] + 0.005 * noise[2]
         tables.append(columns)
     table_of = {k: np.concatenate([t[k] for t in tables]) for k in tables[0]}
     write_recording(folder / "recording.csv", table_of)
@@ -161,7 +168,21 @@ def test_where_nothing_is_hidden_nothing_is_left_and_nothing_named(right):
     assert isinstance(found, PressingProblem)
     assert problem.off == {}
     assert problem.noise_error(problem.base()) < 1.5  # What `no_gap` allows.
-    assert select(problem).choices == ()
+    found = select(problem)
+    assert found.choices == ()
+    assert problem.loudest(found.start)[1] < LOUD
+    # Nothing that was measured is left out.
+    assert unjudged_channels(judged_channels(problem)) == ""
+
+
+def test_a_moment_is_what_the_force_has_where_shapes_touch(tmp_path):
+    """A tool whose contact is 6 mm off has the same forces, and other moments."""
+    scene = write_scene(tmp_path)
+    problem = PressingProblem(scene, record(tmp_path, longer=0.006))
+    start = select(problem).start
+    # The table's force is 8 N: 48 mN m about x, and of the wall's as much about z.
+    assert problem.loudest(start)[0] in ("gantry.tip.tx", "gantry.tip.tz")
+    assert problem.loudest(start)[1] > LOUD
 
 
 def test_bodies_that_stand_elsewhere_are_felt_there(displaced):

@@ -39,6 +39,7 @@ from gap_benchmark.robots import Body, Robot, panda, rod
 
 SEEDS = {"contact-development": 710_000, "contact-final": 940_000}
 G = 9.81
+BACK = 0.03  # A tip that adheres goes back so far [m].
 TIE_SLOW = (("object_mass", "contact_friction"),)
 TIE_SIZE = (("object_size", "plane_height"),)
 
@@ -337,6 +338,13 @@ def pushed(recipe: Recipe, rng):
             if slow:  # One constant speed, with soft ends.
                 v = 0.03 * np.clip(np.minimum(t - 0.2, seconds - 0.2 - t) / 0.3, 0, 1)
                 way, speed = np.concatenate([[0], np.cumsum(v)[:-1] / s.rate]), v
+            if true.adhesion:  # It shows where the tip pulls.
+                back = (
+                    0.5 * BACK * (1 - np.cos(np.linspace(0, np.pi, int(0.6 * s.rate))))
+                )
+                way = np.concatenate([way, way[-1] - back])
+                speed = np.gradient(way) * s.rate
+                t, seconds = np.arange(len(way)) / s.rate, seconds + 0.6
             yaw = rng.uniform(-np.pi, np.pi)
             reach, across = _sides(first, rng)
             angle = yaw + reach[1]

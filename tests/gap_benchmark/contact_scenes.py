@@ -301,9 +301,10 @@ class MujocoWorld:
                     d.xfrc_applied[body, 3:] = np.cross(at[:3] - p, self.s.adhesion * f)
 
     def wrench(self) -> np.ndarray:
-        """(3,) force of all contacts on the tool, in world."""
-        m, d, total = self.model, self.data, np.zeros(3)
+        """(3,) force on the tool of all contacts, and of what it holds on to."""
+        m, d = self.model, self.data
         tip, six = m.geom(f"{self.s.tool_body}/0").id, np.zeros(6)
+        total = d.xfrc_applied[m.geom_bodyid[tip], :3].copy()
         for k in range(d.ncon):
             c = d.contact[k]
             if tip in (c.geom1, c.geom2):
@@ -478,8 +479,8 @@ def _surface(friction: float, s: Setting, compliant=False, rigid=False) -> str:
     if hydro:
         hydro += "<drake:mesh_resolution_hint>0.004</drake:mesh_resolution_hint>"
     return (
-        f"<drake:proximity_properties>{hydro}<drake:mu_static>{friction!r}"
-        f"</drake:mu_static><drake:mu_dynamic>{friction!r}</drake:mu_dynamic>"
+        f"<drake:proximity_properties>{hydro}<drake:mu_static>{float(friction)!r}"
+        f"</drake:mu_static><drake:mu_dynamic>{float(friction)!r}</drake:mu_dynamic>"
         f"<drake:point_contact_stiffness>{2 * s.stiffness!r}"
         "</drake:point_contact_stiffness><drake:hunt_crossley_dissipation>"
         f"{s.dissipation!r}</drake:hunt_crossley_dissipation>"
