@@ -36,6 +36,9 @@ MEETS = 2.5e-3  # Two bodies touch when the nearest points are within this [m].
 APPROACH = 0.02  # Faster along the normal is no lasting contact [m/s].
 SLIDES = 0.01  # Slower slip may be sticking [m/s].
 MODELLED = 0.02  # What models are off by, as a share of the forces in a row.
+# A force is felt where the mean of so many samples is clear of noise, and at least this
+# [N]; where one may be felt, the mean over a test function is so many times its noise.
+FELT_SAMPLES, LEAST_FELT, MAYBE_FELT = 9, 0.2, 4.0
 POSE = (*TURN, "x", "y", "z")
 FORCE, MOMENT = ("fx", "fy", "fz"), ("tx", "ty", "tz")
 
@@ -303,6 +306,8 @@ class ContactMeans:
             now = least.get(pair)
             least[pair] = s.phi if now is None else np.minimum(now, s.phi)
         found = {}
+        # How far what a sensor may feel is apart (n_rows,) [m].
+        self._apart: dict[tuple[int, int], np.ndarray] = {}
         for pair, phi in least.items():
             rate = np.concatenate([
                 np.gradient(phi[a:b], t.time)
@@ -317,10 +322,12 @@ class ContactMeans:
                     partner = pair[0] if pair[1] in welded else pair[1]
                     if partner not in self.shapes.anchored:
                         found[pair] = (size > 0.0) & (least[pair] < NEAR)
+                        self._apart[pair] = least[pair]
         return found
 
     def _force_size(self, place: str) -> np.ndarray:
-        """(n_rows,) of the measured force where it is clear of noise, else 0."""
+        """(n_rows,) of the measured force where it is clear of noise, else 0; of few
+        newtons too, as of a tool that leans on something at rest."""
         out = []
         for t in self.tracks:
             recording = self.recordings[t.recording]
@@ -328,12 +335,16 @@ class ContactMeans:
                 [recording[f"{place}.{a}"][t.episode.rows] for a in FORCE], axis=1
             )
             noise = max(recording.channels[f"{place}.{a}"].noise for a in FORCE)
-            size = np.linalg.norm(f, axis=1)
-            good = np.isfinite(size)
+            good = np.isfinite(f).all(axis=1)
             if good.sum() < 2:
                 return np.full(self._offset[-1], np.nan)
-            size = np.interp(t.time, t.time[good], size[good])
-            out.append(np.where(size > max(6.0 * noise, 0.2), size, 0.0))
+            n = min(FELT_SAMPLES, int(good.sum()))
+            f = np.apply_along_axis(
+                np.convolve, 0, f[good], np.full(n, 1.0 / n), "same"
+            )
+            size = np.interp(t.time, t.time[good], np.linalg.norm(f, axis=1))
+            least = max(6.0 * noise / np.sqrt(n), LEAST_FELT)
+            out.append(np.where(size > least, size, 0.0))
         return np.concatenate(out)
 
     # ----- Means
@@ -471,6 +482,7 @@ class ContactMeans:
         centre = self._offset[number] + np.clip(
             np.searchsorted(t.time, centres), 0, len(t.time) - 1
         )
+        full &= ~self._maybe_felt(first[good], last[good], rows, wrench, wrench_var)
         part = _Means(
             np.full(K, number), centres, a, a_var, effort, effort_var, slope, centre,
             weights, wrench, wrench_var, extra, extra_var,
@@ -478,6 +490,31 @@ class ContactMeans:
         if not full.all():
             part = _Means(**{name: x[full] for name, x in vars(part).items()})
         return part if len(part.time) else None
+
+    def _maybe_felt(self, first, last, rows: slice, wrench, wrench_var) -> np.ndarray:
+        """(K,) whether a sensor near something free feels a force that is too small to
+        say from when to when: then it is not known whether they touch.
+
+        Args: first, last: rows of each test function within the episode, whose rows
+            among all are `rows`; wrench, wrench_var (K, n_wrench).
+        """
+        maybe = np.zeros(len(first), bool)
+        for sensor in self.sensors:
+            size = np.linalg.norm(wrench[:, sensor.forces], axis=1)
+            noise = np.sqrt(np.max(wrench_var[:, sensor.forces], axis=1, initial=0.0))
+            near = np.zeros(len(first), bool)
+            on = np.zeros(len(first), bool)
+            for pair, touching in self._touching.items():
+                if not set(pair) & set(sensor.welded):
+                    continue
+                distance = self._apart.get(pair)
+                for k, (a, b) in enumerate(zip(first, last, strict=True)):
+                    on[k] |= bool(touching[rows][a:b].any())
+                    near[k] |= distance is not None and bool(
+                        (distance[rows][a:b] < NEAR).any()
+                    )
+            maybe |= near & ~on & (size > MAYBE_FELT * noise)
+        return maybe
 
     def _effort(self, joint, recording, t: _Track, held, w, there, centres):
         """Mean effort of a drive, its variance, its slope by a delay of commands."""

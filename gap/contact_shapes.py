@@ -1,8 +1,10 @@
 """Where shapes of a scene may touch, at many poses at once: points against surfaces.
 
-Spheres are their centres, boxes, cylinders and hulls their corners (and a cylinder's
-rims); each is compared with the surfaces of other bodies. Edges that cross edges are
-left out. Friction and stiffness of a pair are those that Drake makes of two surfaces.
+Spheres are their centres, boxes and hulls their corners. A cylinder that stands on
+something is points on its rims; where its side touches, of each rim the point that is
+nearest to the other surface. Each is compared with the surfaces of other bodies. Edges
+that cross edges are left out. Friction and stiffness of a pair are those that Drake
+makes of two surfaces.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,6 +21,8 @@ from makebreak.models.scene import LoadedScene
 from makebreak.systems.numerics import surface_distance
 
 RIM = 12  # Points on a rim.
+SIDE = 0.9  # Cosine of normal and axis: less, and a cylinder touches with its side.
+NEARING = 3  # Steps to the nearest point of a rim.
 MOST_CORNERS = 200  # Of a hull; more are thinned.
 SAME_NORMAL = 0.64  # Cosine: a point touches one of two surfaces that face alike.
 
@@ -31,7 +35,30 @@ class _Point:
     radius: float
     friction: float
     stiffness: float
-    is_sphere: bool
+    is_sphere: bool = False
+    axis: np.ndarray | None = None  # Of the cylinder that it is on the rim of.
+    rim: float = 0.0  # Any point on a rim of this radius about p_B, if not 0 [m].
+
+    def near(
+        self, s: "_Surface", R_a, p_a, R_b, p_b
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The point's place (n, 3) in world at poses of the two bodies, its distance
+        (n,) from the surface, the normal (n, 3), and whether it may touch so (n,)."""
+        centre = p_a + R_a @ self.p_B
+        c, side = centre, np.ones(len(centre), bool)
+        for k in range(NEARING + 1 if self.rim else 1):
+            d, n = s.distance(np.einsum("nji,nj->ni", R_b, c - p_b))
+            n = np.einsum("nij,nj->ni", R_b, n)
+            if self.axis is None:
+                break
+            axis = R_a @ self.axis
+            along = np.sum(n * axis, axis=1)
+            side = abs(along) < SIDE
+            if k < NEARING and self.rim:
+                out = n - along[:, None] * axis
+                size = np.maximum(np.linalg.norm(out, axis=1), 1e-9)
+                c = centre - self.rim * out / size[:, None]
+        return c, d - self.radius, n, side if self.rim or self.axis is None else ~side
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,10 +148,20 @@ class ContactShapes:
     def _add(self, k: int, g, shape, R, p, own) -> bool:
         friction, stiffness = own
 
-        def points(local, radius=0.0, is_sphere=False):
+        def points(local, radius=0.0, is_sphere=False, axis=None, rim=0.0):
             for x in np.atleast_2d(local):
                 self.points.append(
-                    _Point(k, g, R @ x + p, radius, friction, stiffness, is_sphere)
+                    _Point(
+                        k,
+                        g,
+                        R @ x + p,
+                        radius,
+                        friction,
+                        stiffness,
+                        is_sphere,
+                        axis,
+                        rim,
+                    )
                 )
 
         def surface(kind, *size):
@@ -142,10 +179,10 @@ class ContactShapes:
         elif isinstance(shape, Cylinder):
             r, h = shape.radius(), shape.length() / 2.0
             angle = np.arange(RIM) * 2.0 * np.pi / RIM
-            rim = np.column_stack([r * np.cos(angle), r * np.sin(angle)])
-            points(
-                np.vstack([np.column_stack([rim, np.full(RIM, z)]) for z in (-h, h)])
-            )
+            x, y, axis = r * np.cos(angle), r * np.sin(angle), R[:, 2]
+            for z in (-h, h):
+                points(np.column_stack([x, y, np.full(RIM, z)]), axis=axis)
+            points([[0.0, 0.0, -h], [0.0, 0.0, h]], axis=axis, rim=r)
             surface("cylinder", r, h)
         elif isinstance(shape, (Convex, Mesh)) and self._hulls:
             mesh = shape.GetConvexHull()
@@ -180,9 +217,7 @@ class ContactShapes:
         """
         found = []
         for i, point in enumerate(self.points):
-            R_a, p_a = poses[point.body]
-            c = p_a + R_a @ point.p_B
-            each: list[tuple[int, np.ndarray, np.ndarray]] = []
+            each: list[tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
             for j, s in enumerate(self.surfaces):
                 fixed = point.body in self.anchored and s.body in self.anchored
                 if s.body == point.body or fixed:
@@ -197,15 +232,12 @@ class ContactShapes:
                 if s.kind == "sphere" and point.is_sphere and j < i:
                     if s.body > point.body:
                         continue  # Two spheres are one pair.
-                R_b, p_b = poses[s.body]
-                local = np.einsum("nji,nj->ni", R_b, c - p_b)
-                d, n = s.distance(local)
-                phi = d - point.radius
+                c, phi, n, may = point.near(s, *poses[point.body], *poses[s.body])
                 if phi.min() < near:
-                    each.append((j, phi, np.einsum("nij,nj->ni", R_b, n)))
-            for k, (j, phi, n) in enumerate(each):
-                best = np.ones(len(phi), bool)
-                for m, (_, other, n_other) in enumerate(each):
+                    each.append((j, phi, n, c, may))
+            for k, (j, phi, n, c, may) in enumerate(each):
+                best = may.copy()
+                for m, (_, other, n_other, _, _) in enumerate(each):
                     if (
                         m == k
                         or self.surfaces[each[m][0]].body != self.surfaces[j].body

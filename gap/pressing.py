@@ -140,7 +140,8 @@ class PressingProblem(ContactProblem):
     def _possible_faces(self, poses) -> list[_Face]:
         """Faces of fixed boxes over which the tool came, with how near it kept to them:
         so far they may be off, if it pressed on them there."""
-        moving = [p for p in self.shapes.points if p.body not in self.shapes.anchored]
+        moving = [p for p in self.shapes.points
+                  if p.body not in self.shapes.anchored and not p.rim]  # fmt: skip
         found = []
         for s in self.shapes.surfaces:
             if s.body not in self.shapes.anchored or s.kind != "box":

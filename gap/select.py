@@ -34,7 +34,7 @@ from makebreak.systems.numerics.selection import (
 )
 
 FINALISTS, FINALIST_RUNS = 4, 80  # Searched without slopes before one is chosen.
-LOUD = 2.0  # Rms over noise of one channel that is a gap, whatever the others leave.
+LOUD = 3.0  # Rms over noise of one channel that is a gap, whatever the others leave.
 FLOOR = 1.15  # Rms over noise that noise alone may leave (its estimate is that good).
 # Laws are approximations (how dry friction turns round, how commands are held): errors
 # that differ by less than this share of the whole gap do not tell two models apart.
