@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from makebreak.gap import contact_windows, workflow
 from makebreak.gap.contact_dynamics import ContactDynamics
 from makebreak.gap.contact_problem import ContactProblem, _best_rectangles
+from makebreak.gap.contact_shapes import _Point, _Surface
 from makebreak.gap.contact_windows import PushWindows, led_as_measured
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.permitted_contacts import Shift
@@ -376,3 +377,97 @@ def test_from_files_to_no_gap(tmp_path):
     pushed(tmp_path, 33, [], episodes=10)
     result = run_gap(tmp_path / "scene.yaml", [tmp_path / "recording.csv"])
     assert (result.verdict, result.effects) == ("no_gap", [])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_side_of_a_cylinder_is_met_where_it_is_nearest(seed):
+    """Upright beside a box, both turned anyhow about the vertical: in the plane a
+    circle and a rectangle."""
+    rng = np.random.default_rng(seed)
+    r, h, half = rng.uniform(0.03, 0.08), 0.03, np.array([0.06, 0.05, 0.04])
+    up, zero = np.array([0.0, 0.0, 1.0]), np.zeros(3)
+    rim = _Point(1, "disc", h * up, 0.0, 0.3, 1e4, axis=up, rim=r)
+    fixed = _Point(1, "disc", h * up + [r, 0.0, 0.0], 0.0, 0.3, 1e4, axis=up)
+    box = _Surface(2, "box", "box", np.eye(3), zero, (half,), 0.3, 1e4)
+    yaw, turn = rng.uniform(-np.pi, np.pi, (2, 6))
+    angle = rng.uniform(-np.pi, np.pi, 6)
+    p = 0.15 * np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle])
+    of_box, of_disc = (
+        Rotation.from_euler("z", each[:, None]).as_matrix() for each in (yaw, turn)
+    )
+    place, phi, normal, may = rim.near(box, of_disc, p, of_box, np.zeros((6, 3)))
+    local = np.einsum("nji,nj->ni", of_box, p)[:, :2]
+    nearest = np.clip(local, -half[:2], half[:2])
+    gap = np.linalg.norm(local - nearest, axis=1)
+    # Three steps of a fixed point that halves the error at the least.
+    np.testing.assert_allclose(phi, gap - r, atol=1e-3)
+    flat = np.abs(local - nearest).min(axis=1) == 0.0  # A side, not an edge.
+    np.testing.assert_allclose(phi[flat], (gap - r)[flat], atol=1e-12)
+    out = np.einsum("nij,nj->ni", of_box[:, :2, :2], (local - nearest) / gap[:, None])
+    np.testing.assert_allclose(place[flat, :2], (p[:, :2] - r * out)[flat], atol=1e-12)
+    np.testing.assert_allclose(normal[flat, :2], out[flat], atol=1e-12)
+    assert may.all() and not fixed.near(box, of_disc, p, of_box, 0 * p)[3].any()
+    # Standing on it, the fixed points of its rim carry it.
+    on = np.tile([0.0, 0.0, 0.1], (6, 1))
+    assert not rim.near(box, of_disc, on, of_box, 0 * on)[3].any()
+    assert fixed.near(box, of_disc, on, of_box, 0 * on)[3].all()
+
+
+class _Logged(dict):
+    """Channels by name, as a Recording gives them."""
+
+    channels = {f"tip.tip.{a}": SimpleNamespace(noise=0.07) for a in ("fx", "fy", "fz")}
+
+
+def test_a_tool_that_leans_on_something_with_little_is_felt():
+    """0.4 N is less than six times a sample's noise."""
+    rng = np.random.default_rng(0)
+    time = np.arange(400) / 250.0
+    log = _Logged(
+        {f"tip.tip.{a}": 0.07 * rng.normal(size=400) for a in ("fx", "fy", "fz")}
+    )
+    log["tip.tip.fx"][200:] += 0.4
+    log["tip.tip.fy"][::7] = np.nan
+    track = SimpleNamespace(
+        recording=0, time=time, episode=SimpleNamespace(rows=slice(0, 400))
+    )
+    model = SimpleNamespace(tracks=[track], recordings=[log], _offset=[0, 400])
+    size = ContactDynamics._force_size(model, "tip.tip")
+    assert size[:190].max() == 0.0
+    np.testing.assert_allclose(size[210:390], 0.4, atol=0.15)  # Five deviations.
+
+
+def test_where_a_force_may_be_felt_it_is_not_known_whether_they_touch():
+    off = np.zeros(40, bool)
+    touching = off.copy()
+    touching[30:] = True
+    sensor = SimpleNamespace(forces=slice(0, 3), welded=[1])
+    distance = np.full(40, 1e-3)
+    distance[10:20] = 0.1
+    model = SimpleNamespace(
+        sensors=[sensor], _touching={(0, 1): touching, (0, 2): off},
+        _apart={(0, 1): distance},
+    )  # fmt: skip
+    # Near and felt; far; near and not felt; touching.
+    first, last = np.array([0, 10, 20, 30]), np.array([10, 20, 30, 40])
+    wrench = np.array([[0.1, 0, 0], [0.1, 0, 0], [0.02, 0, 0], [0.1, 0, 0]])
+    var = np.full((4, 3), 1e-4)
+    got = ContactDynamics._maybe_felt(model, first, last, slice(0, 40), wrench, var)
+    assert got.tolist() == [True, False, False, False]
+
+
+def test_what_is_seen_in_two_blocks_is_fitted_and_held_out():
+    time = np.arange(0.0, 18.0, 0.05)
+    r = np.ones((len(time), 2))
+    loud = ((time > 3.0) & (time < 3.6)) | ((time > 4.8) & (time < 5.4))
+    r[loud, 1] = 9.0
+    model = SimpleNamespace(
+        means=SimpleNamespace(time=time, episode=np.zeros(len(time), int)),
+        _shown=np.ones(r.shape, bool), left=lambda: r,
+    )  # fmt: skip
+    ContactProblem._share_out(model)
+    train = model._train
+    assert train.mean() == pytest.approx(2 / 3, abs=0.05)
+    assert train[loud].mean() == pytest.approx(0.5, abs=0.1)
+    for block in np.unique(model._block):  # Neighbours err together.
+        assert len(set(train[model._block == block])) == 1

@@ -233,8 +233,26 @@ def test_the_table_has_the_goals_of_its_set():
     assert rows[name] == ("2 in 1 cases", False)
 
 
-def a_score(verdict, found, first=None, extra=0, closed=None, errors=()):
-    return Score("c", verdict, found, first, first, errors, closed, extra, 2.0, "x")
+def a_score(verdict, found, first=None, extra=0, closed=None, errors=(), **more):
+    return Score(
+        "c", verdict, found, first, first, errors, closed, extra, 2.0, "x", **more
+    )
+
+
+def test_what_windows_do_not_show_is_not_asked_to_be_closed_there():
+    case = {"name": "c", "verdict": "gap_named", "ties": []}
+    case["effects"] = [{"kind": "object_mass", "at": "b.b", "parameters": {"mass": 2}}]
+    result = {"verdict": "gap_named", "effects": []}
+    shows = score(case, {**result, "gap": {"before": 5.0, "reduction": 0.8}})
+    assert (shows.before, shows.closed) == (5.0, 0.8)
+    hides = score(case, {**result, "gap": {"before": 0.9, "reduction": 0.0}})
+    failed = score(case, {"error": "stopped"})
+    table = table_of([shows, hides, failed])
+    rows = {r[0]: r[2] for r in table.rows}
+    assert rows["share of the reducible gap closed, mean (median)"] == "27% (0%)"
+    name = "the same where windows show more than 1.5 times the noise"
+    assert rows[name] == "80% (80%) of 1 cases"
+    assert {r[0]: r[2] for r in table_of([hides]).rows}[name] == "- of 0 cases"
 
 
 def test_the_table_counts_and_names_what_went_wrong():
