@@ -22,7 +22,6 @@ from makebreak.systems.numerics import surface_distance
 
 RIM = 12  # Points on a rim.
 SIDE = 0.9  # Cosine of normal and axis: less, and a cylinder touches with its side.
-NEARING = 3  # Steps to the nearest point of a rim.
 MOST_CORNERS = 200  # Of a hull; more are thinned.
 SAME_NORMAL = 0.64  # Cosine: a point touches one of two surfaces that face alike.
 
@@ -44,21 +43,23 @@ class _Point:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """The point's place (n, 3) in world at poses of the two bodies, its distance
         (n,) from the surface, the normal (n, 3), and whether it may touch so (n,)."""
-        centre = p_a + R_a @ self.p_B
-        c, side = centre, np.ones(len(centre), bool)
-        for k in range(NEARING + 1 if self.rim else 1):
-            d, n = s.distance(np.einsum("nji,nj->ni", R_b, c - p_b))
-            n = np.einsum("nij,nj->ni", R_b, n)
-            if self.axis is None:
-                break
-            axis = R_a @ self.axis
-            along = np.sum(n * axis, axis=1)
-            side = abs(along) < SIDE
-            if k < NEARING and self.rim:
-                out = n - along[:, None] * axis
-                size = np.maximum(np.linalg.norm(out, axis=1), 1e-9)
-                c = centre - self.rim * out / size[:, None]
-        return c, d - self.radius, n, side if self.rim or self.axis is None else ~side
+        c = p_a + R_a @ self.p_B
+        d, n = s.distance(np.einsum("nji,nj->ni", R_b, c - p_b))
+        n = np.einsum("nij,nj->ni", R_b, n)
+        if self.axis is None:
+            return c, d - self.radius, n, np.ones(len(c), bool)
+        axis = R_a @ self.axis
+        along = np.sum(n * axis, axis=1)
+        side = abs(along) < SIDE
+        if not self.rim:
+            return c, d - self.radius, n, ~side
+        # Towards the surface from the middle, which is outside: exact for planes, and
+        # for upright shapes.
+        out = n - along[:, None] * axis
+        size = np.maximum(np.linalg.norm(out, axis=1), 1e-9)
+        c = c - self.rim * out / size[:, None]
+        d, _ = s.distance(np.einsum("nji,nj->ni", R_b, c - p_b))
+        return c, d - self.radius, n, side
 
 
 @dataclass(frozen=True, eq=False)

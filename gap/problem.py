@@ -131,7 +131,7 @@ def is_sane(effect: Effect, least: Mapping[str, float] | None = None) -> bool:
         return False
     for each in entry.parameters:
         value = effect.parameters.get(each.name)
-        if value is None or each.name == "phase":
+        if value is None or each.name == "phase" or each.endless:
             continue
         if value < (least or {}).get(each.name, -np.inf):
             return False

@@ -600,7 +600,7 @@ KINDS = {
         parameters=(
             Parameter("friction", "", 0.01, 1.5, None, valid=">= 0"),
             *(
-                Parameter(f"{a}_{end}", "m", -2.0, 2.0, None)
+                Parameter(f"{a}_{end}", "m", -2.0, 2.0, None, endless=True)
                 for a in "xy"
                 for end in ("min", "max")
             ),

@@ -53,6 +53,7 @@ class Parameter:
         (EffectKind.now) or where another parameter must be neutral instead.
     valid: what is refused: "any" number, ">= 0", "> 0" or "share" (of 0 to below 1).
     rough: what it does jumps with it, so that it is found by trying values.
+    endless: beyond low and high it says the same as there, and is allowed.
     """
 
     name: str
@@ -63,6 +64,7 @@ class Parameter:
     valid: str = "any"
     optional: bool = False
     rough: bool = False
+    endless: bool = False
 
     @property
     def most(self) -> float:
