@@ -1,4 +1,4 @@
-"""A finger pushes a puck to 0.5 m: any plant and its contacts, planned by C3+."""
+"""A finger pushes a puck to 0.5 m: any plant and its contacts, planned by C3Mpc."""
 
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph

@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 from makebreak.models.effects import KINDS
@@ -26,3 +27,15 @@ def test_the_number_of_kinds_is_told_as_it_is():
     for page in ("README.md", "docs/effects.md"):
         told = re.findall(r"(\d+) kinds", (ROOT / page).read_text())
         assert told == [str(len(KINDS))], page
+
+
+def test_the_seven_systems_are_where_the_table_says():
+    rows = re.findall(r"^\| `(\w+)` \| `(\w+)` \|(.*)$", README.read_text(), re.M)
+    assert len(rows) == 7
+    for name, cls, rest in rows:
+        assert hasattr(import_module(f"makebreak.systems.{name}"), cls)
+        (ROOT / "systems" / "numerics" / f"{name}.py").stat()
+        (ROOT / "tests" / f"test_{name}.py").stat()
+        example, page = re.findall(r"\]\((.*?)\)", rest)
+        assert cls in (ROOT / example).read_text()
+        (ROOT / page).stat()
