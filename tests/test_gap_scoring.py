@@ -293,7 +293,7 @@ def test_where_the_benchmark_is_absent_one_line_says_so(monkeypatch, capsys, tmp
 MAKER = """import argparse, json
 from pathlib import Path
 p = argparse.ArgumentParser()
-for name in ("set", "only"):
+for name in ("set", "only", "jobs"):
     p.add_argument("--" + name)
 for name in ("out", "truth"):
     p.add_argument("--" + name, type=Path)
