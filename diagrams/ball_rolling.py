@@ -24,14 +24,18 @@ from pydrake.systems.primitives import (
 )
 
 from makebreak.diagrams.camera import CameraConfig, camera_model
+from makebreak.diagrams.fault_kinds import read_faults
+from makebreak.diagrams.faults import faulty_lcs
 from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.station import (
     ARM,
     BALL_ROLLING,
+    DELAY,
     TIP_FRAME,
     TOOL,
     StationConfig,
+    StationFaults,
     make_control_plant,
     make_station,
 )
@@ -93,6 +97,7 @@ OFFSET = dict(
     reference=4.5e-4, impedance=7e-4,
 )  # fmt: skip
 BALL_CHANNELS = ("ball.ball.x", "ball.ball.y")  # What a camera above sees of it.
+BOX_AHEAD = np.pi / 2  # From where the ball lies at first to a stray box [rad].
 PLAN_DT, TIP_MASS, N_TIP = 0.1, 1.0, 4  # N_TIP: forces of tip and ball, the first ones.
 
 
@@ -168,6 +173,7 @@ class BallRollingConfig:
     impedance: ImpedanceConfig = field(
         default_factory=lambda: ImpedanceConfig(force_max=20.0)
     )
+    faults: list[str] = field(default_factory=list)  # What goes wrong, by --fault.
 
 
 def check_parts(scene: Scene, what: str) -> None:
@@ -185,15 +191,32 @@ def check_parts(scene: Scene, what: str) -> None:
     )
 
 
+def start_angle(config: BallRollingConfig) -> float:
+    """Where on the circle the ball lies at first [rad]."""
+    if config.start_angle_rad is not None:
+        return config.start_angle_rad
+    return float(np.random.default_rng(config.seed).uniform(-np.pi, np.pi))
+
+
+def what_goes_wrong(config: BallRollingConfig) -> StationFaults | None:
+    """The faults of the config. A stray box stands on the ball's circle."""
+    if not config.faults:
+        return None
+    faults = read_faults(config.faults, ("camera", "ball", "planner", "scene"))
+    angle, task = start_angle(config) + BOX_AHEAD, config.task
+    x, y = np.array(task.center) + task.radius * np.array(
+        [np.cos(angle), np.sin(angle)]
+    )
+    return StationFaults(faults, (float(x), float(y), 0.03), center=task.center)
+
+
 def world_scene(config: BallRollingConfig) -> Scene:
     """The scene that is simulated: friction, resistance, where the ball lies."""
     scene = read_scene(config.world)
     check_parts(scene, "world")
     if config.object != "ball":
         _replace_ball(scene, config)
-    angle = config.start_angle_rad
-    if angle is None:
-        angle = np.random.default_rng(config.seed).uniform(-np.pi, np.pi)
+    angle = start_angle(config)
     center, radius = np.array(config.task.center), config.task.radius
     xy = center + radius * np.array([np.cos(angle), np.sin(angle)])
     z = scene.initial.poses["ball.ball"][6]
@@ -340,15 +363,45 @@ def paper_learner_config(n_lam: int) -> ResidualLearnerConfig:
     )
 
 
+def make_world(
+    config: BallRollingConfig, meshcat: Meshcat | None = None, sampled: bool = False
+) -> Diagram:
+    """The station: what is simulated of the experiment, without any controller."""
+    if config.camera.position_noise_m != 0.0:
+        raise ValueError(
+            f"camera.position_noise_m is {config.camera.position_noise_m}, expected 0: "
+            "ball_noise_m sets it"
+        )
+    if not config.ball_noise_m >= 0.0:
+        raise ValueError(f"ball_noise_m is {config.ball_noise_m}, expected >= 0")
+    return make_station(
+        StationConfig(
+            scene=config.world,
+            camera=replace(config.camera, position_noise_m=config.ball_noise_m),
+            contact=[TOOL, "ball"],
+            seed=config.seed,
+            sampled=sampled,
+        ),
+        meshcat,
+        world_scene(config),
+        wrong=what_goes_wrong(config),
+    )
+
+
 def make_ball_rolling(
-    config: BallRollingConfig, meshcat: Meshcat | None = None
+    config: BallRollingConfig,
+    meshcat: Meshcat | None = None,
+    station: Diagram | None = None,
 ) -> Diagram:
     """The whole experiment: the station and its controllers, each by name in the
     diagram. For scoring, `state_log`, `contact_log` and `torque_log` log the truth at
     1 kHz: the plant's state, the contact's torque on the arm, the commanded torque.
+
+    Args: station, what the controllers are wired to in place of the simulated world;
+        its inputs that nobody gives are the diagram's own.
     """
     builder = DiagramBuilder()
-    add_ball_rolling(builder, config, meshcat)
+    add_ball_rolling(builder, config, meshcat, station=station)
     connect_reference(builder)
     diagram = builder.Build()
     diagram.set_name("ball_rolling")
@@ -361,12 +414,15 @@ def add_ball_rolling(
     meshcat: Meshcat | None = None,
     sampled: bool = False,
     hybrid: HybridConfig | None = None,
+    station: Diagram | None = None,
 ) -> None:
     """Adds and connects all but what leads from the task to the arm: that is
     connect_reference's, or another diagram's.
 
     Args: sampled: of the station's sensors, StationConfig; hybrid: of the arm's force
-        control, which nothing here asks for.
+        control, which nothing here asks for; station, in place of the simulated world:
+        it has the sensors' ports, but may lack the truth and the wrench, and have ball
+        positions (`ball.p_WB`, `ball.v_WB`, `ball.seen`) in place of pictures.
     """
     for name, own in (
         ("tracker", ("ball_radius", "period_sec", "offset_sec")),
@@ -383,33 +439,17 @@ def add_ball_rolling(
                     "diagram sets it"
                 )
     model, model_scene = believed(config)
-    if config.camera.position_noise_m != 0.0:
-        raise ValueError(
-            f"camera.position_noise_m is {config.camera.position_noise_m}, expected 0: "
-            "ball_noise_m sets it"
-        )
-    if not config.ball_noise_m >= 0.0:
-        raise ValueError(f"ball_noise_m is {config.ball_noise_m}, expected >= 0")
     camera = replace(config.camera, position_noise_m=config.ball_noise_m)
     learner_kind = config.learner if config.adapt else "none"
     paper = config.controller == "paper"
     projection = config.projection
     if projection == "auto":
         projection = "qp" if paper else "plus"
-    station = builder.AddNamedSystem(
-        "station",
-        make_station(
-            StationConfig(
-                scene=config.world,
-                camera=camera,
-                contact=[TOOL, "ball"],
-                seed=config.seed,
-                sampled=sampled,
-            ),
-            meshcat,
-            world_scene(config),
-        ),
-    )
+    wrong = what_goes_wrong(config)
+    if station is None:
+        station = make_world(config, meshcat, sampled)
+    station = builder.AddNamedSystem("station", station)
+    simulated = station.HasSubsystemNamed("plant")  # Whether there is a truth.
     arm = make_control_plant(model_scene)
     tip = arm.GetFrameByName(TIP_FRAME)
     p_tip = tip.CalcPoseInWorld(arm.CreateDefaultContext()).translation()
@@ -432,21 +472,23 @@ def add_ball_rolling(
         lcs[name] = builder.AddNamedSystem(f"lcs_{name}", own)
     n_lam = lcs_of["plan"].n_lam
 
-    tracker = builder.AddNamedSystem(
-        "ball_tracker",
-        BallTracker(
-            replace(
-                config.tracker,
-                ball_radius=model.ball_radius,
-                hue=config.tracker.hue
-                if config.object == "ball"
-                else FRUITS[config.object].hue,
-                period_sec=TRACK,
-                offset_sec=OFFSET["tracker"],
+    sees = station.HasOutputPort("overhead.rgb_image")
+    if sees:
+        tracker = builder.AddNamedSystem(
+            "ball_tracker",
+            BallTracker(
+                replace(
+                    config.tracker,
+                    ball_radius=model.ball_radius,
+                    hue=config.tracker.hue
+                    if config.object == "ball"
+                    else FRUITS[config.object].hue,
+                    period_sec=TRACK,
+                    offset_sec=OFFSET["tracker"],
+                ),
+                camera_model(camera),
             ),
-            camera_model(camera),
-        ),
-    )
+        )
     estimator = builder.AddNamedSystem(
         "state_estimator",
         StateEstimator(
@@ -510,13 +552,14 @@ def add_ball_rolling(
     def connect(source, output, target, port):
         builder.Connect(source.GetOutputPort(output), target.GetInputPort(port))
 
-    connect(station, "overhead.rgb_image", tracker, "image")
+    if sees:
+        connect(station, "overhead.rgb_image", tracker, "image")
     connect(station, f"{ARM}.position_measured", estimator, "q")
     connect(station, f"{ARM}.velocity_measured", estimator, "v")
     connect(station, f"{ARM}.torque_measured", estimator, "torque")
-    connect(tracker, "p_WB", estimator, "p_ball")
-    connect(tracker, "v_WB", estimator, "v_ball")
-    connect(tracker, "seen", estimator, "seen")
+    for name, port in (("p_WB", "p_ball"), ("v_WB", "v_ball"), ("seen", "seen")):
+        source, of = (tracker, name) if sees else (station, f"ball.{name}")
+        connect(source, of, estimator, port)
     for one in lcs.values():
         connect(estimator, "x", one, "x")
         builder.Connect(no_force.get_output_port(), one.GetInputPort("u"))
@@ -576,6 +619,9 @@ def add_ball_rolling(
     builder.Connect(r_comp, task.GetInputPort("r_comp"))
     connect(estimator, "x", c3, "x")
     connect(task, "x_desired", c3, "x_desired")
+    if wrong is not None:
+        example = lcs_of["plan"].build(lcs_of["plan"].x_default, np.zeros(3))
+        lcs_port["plan"] = faulty_lcs(builder, lcs_port["plan"], example, wrong.faults)
     builder.Connect(lcs_port["plan"], c3.GetInputPort("lcs"))
     builder.Connect(lcs_port["command"], c3.GetInputPort("lcs_command"))
     builder.Connect(r_comp, c3.GetInputPort("r_comp"))
@@ -586,15 +632,21 @@ def add_ball_rolling(
     connect(lcs["command"], "lcs", reference, "lcs")
     connect(station, f"{ARM}.position_measured", impedance, "q")
     connect(station, f"{ARM}.velocity_measured", impedance, "v")
+    if station.HasOutputPort(DELAY):
+        connect(station, DELAY, impedance, "delay")
     connect(impedance, "tau", station, f"{ARM}.torque_commanded")
 
+    for i in range(station.num_input_ports()):
+        port = station.get_input_port(i)
+        if port.get_name() != f"{ARM}.torque_commanded":
+            builder.ExportInput(port, port.get_name())
+
     # For scoring and for the eye alone.
-    plant = station.GetSubsystemByName("plant")
-    for name, source in (
-        ("state_log", station.GetOutputPort("state")),
-        ("contact_log", station.GetOutputPort(f"{ARM}.contact_torque")),
-        ("torque_log", impedance.GetOutputPort("tau")),
-    ):
+    logged = {"torque_log": impedance.GetOutputPort("tau")}
+    if simulated:
+        logged["state_log"] = station.GetOutputPort("state")
+        logged["contact_log"] = station.GetOutputPort(f"{ARM}.contact_torque")
+    for name, source in logged.items():
         LogVectorOutput(source, builder, ARM_TICK).set_name(name)
     # The ball's height is no measurement: the tracker takes the model's radius for it.
     of_ball = [""] * N_X
@@ -618,11 +670,16 @@ def add_ball_rolling(
                 meshcat,
             ),
         )
-        select = np.zeros((3, plant.num_multibody_states()))
-        at = plant.GetBodyByName("ball").floating_positions_start() + 4
+        if simulated:
+            plant = station.GetSubsystemByName("plant")
+            state, size = station.GetOutputPort("state"), plant.num_multibody_states()
+            at = plant.GetBodyByName("ball").floating_positions_start() + 4
+        else:  # As it is believed.
+            state, size, at = estimator.GetOutputPort("x"), N_X, P_BALL.start
+        select = np.zeros((3, size))
         select[:, at : at + 3] = np.eye(3)
         p_ball = builder.AddNamedSystem("true_ball", MatrixGain(select))
-        builder.Connect(station.GetOutputPort("state"), p_ball.get_input_port())
+        builder.Connect(state, p_ball.get_input_port())
         builder.Connect(p_ball.get_output_port(), view.GetInputPort("p_ball"))
         connect(estimator, "x", view, "x")
         builder.Connect(gap_of_r.get_output_port(), view.GetInputPort("gap"))

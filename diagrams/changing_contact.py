@@ -22,6 +22,7 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 
+from makebreak.diagrams.fault_kinds import read_faults
 from makebreak.diagrams.realism import StationErrors, with_errors
 from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.station import (
@@ -29,6 +30,7 @@ from makebreak.diagrams.station import (
     TIP_FRAME,
     SensorNoise,
     StationConfig,
+    StationFaults,
     make_control_plant,
     make_station,
 )
@@ -87,6 +89,7 @@ class ChangingContactConfig:
         default_factory=lambda: HybridConfig(damping_ratio=0.9)
     )
     reflex: ImpactReflexConfig = field(default_factory=ImpactReflexConfig)  # Off.
+    faults: list[str] = field(default_factory=list)  # What goes wrong, by --fault.
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,6 +194,11 @@ def make_changing_contact(
     builder = DiagramBuilder()
     if errors is not None:
         world = with_errors(world, errors, ARM, tool, objects(world)[0])
+    wrong = None
+    if config.faults:  # A stray box is half way along the first segment.
+        way = pattern.segments[0].positions[:, :3]
+        faults = read_faults(config.faults, ("scene",))
+        wrong = StationFaults(faults, tuple(way.mean(axis=0).tolist()))
     station = builder.AddNamedSystem(
         "station",
         make_station(
@@ -204,6 +212,7 @@ def make_changing_contact(
             meshcat,
             world,
             errors,
+            wrong,
         ),
     )
     arm = make_control_plant(model, tool)

@@ -108,7 +108,8 @@ def record_station(
     row_sec: float = ROW_SEC,
     seen: Channels | None = None,
 ) -> None:
-    """A Recorder of a station: its arm's joints and the wrench at the tool's tip.
+    """A Recorder of a station: its arm's joints, and the wrench at the tool's tip where
+    it has one.
 
     Args: tau (7,), what is commanded; tool, the model of TIP_FRAME; seen, of what else
         is measured, as by a camera.
@@ -123,11 +124,12 @@ def record_station(
         "position": of("position_measured", "position"),
         "velocity": of("velocity_measured", "velocity"),
         "torque": of("torque_measured", "effort_measured"),
-        "wrench": (
+    }
+    if station.HasOutputPort(f"{ARM}.external_wrench"):
+        measured["wrench"] = (
             station.GetOutputPort(f"{ARM}.external_wrench"),
             [f"{tool}.{TIP_FRAME}.{name}" for name in WRENCH],
-        ),
-    }
+        )
     commanded = {"tau": (tau, [f"{joint}.effort_command" for joint in joints])}
     add_recorder(builder, measured | dict(seen or {}), commanded, row_sec)
 

@@ -1,5 +1,6 @@
 """The station: a Panda with a tool, its sensors, and a camera above it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -11,18 +12,29 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import Demultiplexer, Saturation
 
 from makebreak.diagrams.camera import CameraConfig, add_camera
+from makebreak.diagrams.fault_kinds import Injected
+from makebreak.diagrams.faults import (
+    add_forces,
+    faulty_command,
+    faulty_image,
+    faulty_sensor,
+    with_box,
+)
 from makebreak.diagrams.realism import StationErrors
 from makebreak.models.effects import KINDS
 from makebreak.models.model_files import MODELS
 from makebreak.models.scene import InitialSection, Scene, load_scene, read_scene
 from makebreak.systems.contact_probe import ContactProbe, ToolContactForce, TrueTip
+from makebreak.systems.fault_signals import LateSignal
 from makebreak.systems.impedance_controller import serial_chain_of
 from makebreak.systems.noisy_sensor import DriftingSensor, LateSensor, NoisySensor
+from makebreak.systems.safety_monitor import ArmLimits, SafetyMonitor
 from makebreak.systems.tool_wrench import ToolWrench
 
 BALL_ROLLING = str(MODELS / "ball_rolling.scene.yaml")
 ARM, TOOL, TIP_FRAME = "panda", "finger", "tip"
 TORQUE_RATE_MAX = 1000.0  # [N m/s] of the real Panda.
+MONITOR, DELAY = f"{ARM}.monitor", f"{ARM}.delay"  # Ports that may be there.
 
 
 @dataclass
@@ -50,11 +62,22 @@ class StationConfig:
     sampled: bool = False
 
 
+@dataclass(frozen=True)
+class StationFaults:
+    """What goes wrong in a station (diagrams/faults.py)."""
+
+    faults: Sequence[Injected]
+    box_at: Sequence[float] = (0.0, 0.0, 0.0)  # (3,) of a stray box [m].
+    ball: str = "ball"  # The model that a camera looks for.
+    center: Sequence[float] = (0.5, 0.0)  # (2,) about which it is put elsewhere [m].
+
+
 def make_station(
     config: StationConfig,
     meshcat: Meshcat | None = None,
     scene: Scene | None = None,
     errors: StationErrors | None = None,
+    wrong: StationFaults | None = None,
 ) -> Diagram:
     """The plant, its sensors and actuators.
 
@@ -72,7 +95,10 @@ def make_station(
              {tool}.contact_force (3,) on the tool, of all its contacts, in the world
              [N], and {tool}.tip_position (3,) in the world [m], found when asked for;
              panda.contact_torque (7,) [N m] of all contacts on the arm's joints;
-             contact_results, body_poses (abstract).
+             contact_results, body_poses (abstract);
+             with a fault that delays torques, panda.delay (1,) [s], as time stamps
+             tell it; with faults, panda.monitor (6,), `worst` of a SafetyMonitor that
+             watches what is commanded and the true joints.
 
     The subsystems `plant` and `scene_graph` can be asked for by name. The plant steps
     at multiples of its time step; a torque written at such an instant acts from the
@@ -80,16 +106,42 @@ def make_station(
 
     Args: scene, in place of the file, for a world that was changed in memory; errors,
         of which the wrench's and the delays (whole periods) are added here, the others
-        are the scene's.
+        are the scene's; wrong, what is to go wrong.
     """
     builder = DiagramBuilder()
-    loaded = load_scene(read_scene(config.scene) if scene is None else scene, builder)
+    scene = read_scene(config.scene) if scene is None else scene
+    faults = [] if wrong is None else list(wrong.faults)
+    if wrong is not None:
+        scene = with_box(scene, faults, wrong.box_at, MODELS)
+    loaded = load_scene(scene, builder)
     plant, scene_graph = loaded.plant, loaded.scene_graph
     arm = plant.GetModelInstanceByName(ARM)
     tool_body = _only_body(plant, config.tool, "tool")
     tool = tool_body.model_instance()
     n = plant.num_velocities(arm)
-    builder.ExportInput(loaded.command_input_port(ARM), f"{ARM}.torque_commanded")
+    # What the motors give within the effort limits that Drake keeps, too. Drake's own
+    # port for it would solve the contact once more.
+    limit = np.array([
+        plant.get_joint_actuator(index).effort_limit()
+        for index in plant.GetJointActuatorIndices(arm)
+    ])  # fmt: skip
+    # Where commands come in, and what they are behind the faults on their way.
+    on_the_way = faulty_command(builder, limit, faults)
+    if on_the_way:
+        builder.Connect(
+            on_the_way[-1].GetOutputPort("value"), loaded.command_input_port(ARM)
+        )
+        builder.ExportInput(
+            on_the_way[0].GetInputPort("value"), f"{ARM}.torque_commanded"
+        )
+    else:
+        builder.ExportInput(loaded.command_input_port(ARM), f"{ARM}.torque_commanded")
+    for system in on_the_way:
+        if isinstance(system, LateSignal):
+            builder.ExportOutput(system.GetOutputPort("age"), DELAY)
+            break
+    if wrong is not None:
+        add_forces(builder, loaded, ARM, config.tool, wrong.ball, wrong.center, faults)
     noise = config.noise
     if len(config.contact) < 2:
         raise ValueError(
@@ -133,32 +185,28 @@ def make_station(
         np.repeat([noise.position, noise.velocity], n),
         seeds[0],
     )
+    encoders = faulty_sensor(builder, encoders, "position_velocity", faults)
     split = builder.AddNamedSystem(f"{ARM}_encoders_split", Demultiplexer([n, n]))
     builder.Connect(encoders, split.get_input_port())
     for i, name in enumerate(("position", "velocity")):
         builder.ExportOutput(split.get_output_port(i), f"{ARM}.{name}_measured")
 
-    # What the motors give within the effort limits that Drake keeps, too. Drake's own
-    # port for it would solve the contact once more.
-    limit = np.array([
-        plant.get_joint_actuator(index).effort_limit()
-        for index in plant.GetJointActuatorIndices(arm)
-    ])  # fmt: skip
     motors = builder.AddNamedSystem(f"{ARM}_motors", Saturation(-limit, limit))
     effort = loaded.effort_output_port(ARM)
+    if effort is None and on_the_way:
+        effort = on_the_way[-1].GetOutputPort("value")
     if effort is None:
         builder.ConnectInput(f"{ARM}.torque_commanded", motors.get_input_port())
     else:
         builder.Connect(effort, motors.get_input_port())
-    builder.ExportOutput(
-        noisy(
-            f"{ARM}_torque",
-            measured(motors.get_output_port(), "effort_measured"),
-            np.full(n, noise.torque),
-            seeds[1],
-        ),
-        f"{ARM}.torque_measured",
+    torque = noisy(
+        f"{ARM}_torque",
+        measured(motors.get_output_port(), "effort_measured"),
+        np.full(n, noise.torque),
+        seeds[1],
     )
+    torque = faulty_sensor(builder, torque, "torque", faults)
+    builder.ExportOutput(torque, f"{ARM}.torque_measured")
 
     mount = next(
         joint
@@ -187,10 +235,9 @@ def make_station(
         builder.Connect(felt, drifting.get_input_port())
         felt = drifting.get_output_port()
     felt = late(f"{ARM}_wrench_delay", felt)
-    builder.ExportOutput(
-        noisy(f"{ARM}_external_wrench", felt, std_wrench, seeds[2]),
-        f"{ARM}.external_wrench",
-    )
+    felt = noisy(f"{ARM}_external_wrench", felt, std_wrench, seeds[2])
+    felt = faulty_sensor(builder, felt, "wrench", faults)
+    builder.ExportOutput(felt, f"{ARM}.external_wrench")
 
     probe = builder.AddNamedSystem(
         "contact_probe",
@@ -222,13 +269,43 @@ def make_station(
 
     if config.camera is not None:
         image = add_camera(builder, scene_graph, plant, config.camera, int(seeds[3]))
+        if wrong is not None:
+            image = faulty_image(
+                builder, image, config.camera, loaded, wrong.ball, config.seed, faults
+            )
         builder.ExportOutput(image, "overhead.rgb_image")
+    if faults:
+        _add_monitor(builder, plant, limit)
     if meshcat is not None:
         parameters = MeshcatVisualizerParams(publish_period=config.meshcat_period_sec)
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, parameters)
     diagram = builder.Build()
     diagram.set_name("station")
     return diagram
+
+
+def _add_monitor(builder: DiagramBuilder, plant: MultibodyPlant, effort_max) -> None:
+    """A SafetyMonitor of the arm, just after its controller has spoken."""
+    arm = plant.GetModelInstanceByName(ARM)
+    joints = [
+        plant.get_joint_actuator(index).joint()
+        for index in plant.GetJointActuatorIndices(arm)
+    ]
+    limits = ArmLimits(
+        torque=effort_max,
+        torque_rate=TORQUE_RATE_MAX,
+        speed=np.array([joint.velocity_upper_limits()[0] for joint in joints]),
+        lower=np.array([joint.position_lower_limits()[0] for joint in joints]),
+        upper=np.array([joint.position_upper_limits()[0] for joint in joints]),
+    )
+    monitor = builder.AddNamedSystem("monitor", SafetyMonitor(limits, 0.001, 9e-4))
+    n = len(joints)
+    truth = builder.AddNamedSystem("monitor_split", Demultiplexer([n, n]))
+    builder.Connect(plant.get_state_output_port(arm), truth.get_input_port())
+    for i, name in enumerate("qv"):
+        builder.Connect(truth.get_output_port(i), monitor.GetInputPort(name))
+    builder.ConnectInput(f"{ARM}.torque_commanded", monitor.GetInputPort("tau"))
+    builder.ExportOutput(monitor.GetOutputPort("worst"), MONITOR)
 
 
 def _only_body(plant: MultibodyPlant, model: str, where: str) -> RigidBody:

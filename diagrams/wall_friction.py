@@ -24,11 +24,13 @@ from pydrake.systems.primitives import (
 )
 from pydrake.trajectories import PiecewisePolynomial
 
+from makebreak.diagrams.fault_kinds import read_faults
 from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.station import (
     ARM,
     TIP_FRAME,
     StationConfig,
+    StationFaults,
     make_control_plant,
     make_station,
 )
@@ -91,6 +93,7 @@ class WallFrictionConfig:
     start_spread: float = 0.003  # [m], standard deviation of the path's corners.
     training: WallTraining = field(default_factory=WallTraining)
     seed: int = 0
+    faults: list[str] = field(default_factory=list)  # What goes wrong, by --fault.
 
 
 def motion(config: WallFrictionConfig, p_start) -> dict[str, np.ndarray]:
@@ -190,6 +193,9 @@ def make_wall_friction(
     def add(name, system):
         return builder.AddNamedSystem(name, system)
 
+    wrong = None
+    if config.faults:
+        wrong = StationFaults(read_faults(config.faults, ()))
     station = add(
         "station",
         make_station(
@@ -201,6 +207,7 @@ def make_wall_friction(
             ),
             meshcat,
             scene,
+            wrong=wrong,
         ),
     )
     chain = serial_chain_of(control_plant, TIP_FRAME)

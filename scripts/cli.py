@@ -26,10 +26,18 @@ from makebreak.scripts.experiments import EXPERIMENTS, load_experiment, summary_
 from makebreak.scripts.faults import fault, is_drakes, on_purpose, refused
 from makebreak.scripts.interrupts import interrupts
 from makebreak.scripts.parent import end_with_parent
-from makebreak.scripts.settings import apply_settings, dump_config, load_config
+from makebreak.scripts.settings import (
+    apply_settings,
+    dump_config,
+    field_types,
+    load_config,
+)
 
 # What `reproduce` knows beside the experiments; only by its name.
-_BENCHMARKS = {"gap": "makebreak.scripts.gap_benchmark"}
+_BENCHMARKS = {
+    "gap": "makebreak.scripts.gap_benchmark",
+    "faults": "makebreak.scripts.fault_trials",
+}
 _COMPILED = ("ball_rolling", "cartpole_walls")  # By `compile`, without names.
 _REFUSED = "exit status 2"
 _MODELS = Path(__file__).resolve().parent.parent / "models"
@@ -117,12 +125,31 @@ def _config(module, args: argparse.Namespace):
         path = _scene(text, f"--{option}")
         config = dataclasses.replace(config, **{option: path})
     config = apply_settings(config, args.set)
+    config = _with_faults(config, getattr(args, "fault", []), args.experiment)
     if args.seed is not None:
         seed = int(_number(args.seed, "--seed", 0, whole=True))
         config = apply_settings(config, [f"seed={seed}"])
     if getattr(config, "seed", 0) < 0:
         raise ValueError(f"seed: got {config.seed}, expected 0 or more")
     return config
+
+
+def _with_faults(config, texts: Sequence[str], experiment: str):
+    """The config with the faults of --fault.
+
+    Raises: ValueError for a fault that there is not, or an experiment without an arm.
+    """
+    if not texts:
+        return config
+    from makebreak.diagrams.fault_kinds import read_fault
+
+    keys = [k for k in field_types(type(config)) if k.rpartition(".")[2] == "faults"]
+    for text in texts:
+        read_fault(text)
+    if not keys:
+        raise ValueError(f"--fault: {experiment} has no arm that faults could meet")
+    given = ", ".join(f"'{text}'" for text in texts)
+    return apply_settings(config, [f"{keys[0]}=[{given}]"])
 
 
 def _inputs(args, config) -> list[str]:
@@ -141,6 +168,17 @@ def _default_out(name: str) -> Path:
     return path
 
 
+def fault_lines() -> dict[str, str]:
+    """{name: what it is, with its settings} of the faults of `run --fault`."""
+    from makebreak.diagrams.fault_kinds import FAULTS
+
+    lines = {}
+    for name, kind in FAULTS.items():
+        own = ", ".join(f"{key}={value:g}" for key, value in kind.numbers.items())
+        lines[name] = f"{kind.says} ({own})" if own else kind.says
+    return lines
+
+
 def _list(args) -> int:
     names: dict[str, dict[str, str]] = {"experiments": {}, "scenes": {}}
     for name in EXPERIMENTS:
@@ -151,6 +189,7 @@ def _list(args) -> int:
     for name, path in scenes().items():
         first = path.read_text().splitlines()[0]
         names["scenes"][name] = first.lstrip("# ") if first.startswith("#") else ""
+    names["faults"] = fault_lines()
     width = max((len(n) for group in names.values() for n in group), default=0)
     for group, lines in names.items():
         print(f"{group}:")
@@ -191,6 +230,7 @@ def _run(args) -> int:
     if args.realtime is not None:
         realtime = _number(args.realtime, "--realtime", 0.0)
     config = _config(module, args)
+    run = _runner(module, args)
     out = Path(args.out) if args.out else _default_out(args.experiment)
     if args.diagram is not None and Path(args.diagram).suffix not in FORMATS:
         raise ValueError(
@@ -204,10 +244,37 @@ def _run(args) -> int:
         command=f"run {args.experiment}",
         inputs=_inputs(args, config),
     ) as session:
-        return _run_in(session, args, module, config, duration)
+        return _run_in(session, args, run, config, duration)
 
 
-def _run_in(session, args, module, config, duration) -> int:
+def _runner(module, args):
+    """What runs the experiment, (config, session) -> result, on the robot of --robot.
+
+    Raises: ValueError for a robot that there is not, or that the experiment cannot use.
+    """
+    kind, *rest = args.robot
+    if kind == "sim" and not rest:
+        return module.run
+    if kind == "lcm" and len(rest) <= 1:
+        if not hasattr(module, "run_on_lcm"):
+            raise ValueError(f"--robot lcm: {args.experiment} cannot be run on it yet")
+        from makebreak.diagrams.lcm_station import URL
+
+        args.no_meshcat = True  # Its pictures would cost the loop's time.
+        return partial(module.run_on_lcm, url=rest[0] if rest else URL)
+    if kind == "replay" and len(rest) == 1:
+        if not hasattr(module, "run_on_recording"):
+            raise ValueError(
+                f"--robot replay: {args.experiment} cannot be replayed yet"
+            )
+        return partial(module.run_on_recording, recording=Path(rest[0]))
+    raise ValueError(
+        f"--robot: got {' '.join(args.robot)}, expected sim, lcm [URL] or replay "
+        "RECORDING"
+    )
+
+
+def _run_in(session, args, run, config, duration) -> int:
     """Runs the experiment in the session. Returns: the exit status."""
     from makebreak.scripts import compile_ahead
     from makebreak.scripts.criteria import told
@@ -233,7 +300,7 @@ def _run_in(session, args, module, config, duration) -> int:
 
     result = None
     try:
-        result = dict(module.run(config, session))
+        result = dict(run(config, session))
     except KeyboardInterrupt:
         session.interrupted = True
     except (Exception, SystemExit) as error:
@@ -254,6 +321,7 @@ def _run_in(session, args, module, config, duration) -> int:
     if result is None:
         session.keep_partial()
     else:
+        result |= session.limits_kept()
         result |= {"interrupted": session.interrupted, "ended": session.endings}
         session.write_result(result)
     whole = not session.interrupted and session.unwritten is None
@@ -294,6 +362,37 @@ def _say_files(files: Sequence[Path]) -> None:
         folder = Path(os.path.commonpath([path.parent for path in files]))
         names = " ".join(path.relative_to(folder).as_posix() for path in files)
         print(f"Files in {folder}: {names}", flush=True)
+
+
+def _station(args) -> int:
+    import json
+
+    from makebreak.diagrams.lcm_station import URL
+    from makebreak.scripts.session import CatchInterrupt
+    from makebreak.scripts.stand_in import StandIn, StandInConfig
+    from makebreak.scripts.table import Table
+
+    module = _experiment(args.experiment)
+    if not hasattr(module, "run_on_lcm"):
+        raise ValueError(f"station: {args.experiment} has no station behind LCM yet")
+    rate = _number(args.rate, "--rate", 0.0)
+    if rate > 1.0:
+        raise ValueError(f"--rate: got {rate:g}, expected at most 1, real time")
+    drop = _number(args.drop, "--drop", -1e-300)
+    if not drop < 1.0:
+        raise ValueError(f"--drop: got {drop:g}, expected a share from 0 to below 1")
+    delay = _number(args.delay, "--delay", -1e-300)
+    duration = _number(args.duration, "--duration", 0.0)
+    config = _config(module, args)
+    told = StandInConfig(rate, max(drop, 0.0), max(delay, 0.0), args.url or URL)
+    stand_in = StandIn(config, told, config.seed)
+    print(f"The station sends on {told.url}; Ctrl-C ends it", flush=True)
+    with CatchInterrupt() as interrupt:
+        stand_in.run(duration, lambda: interrupt.hit)
+    result = stand_in.report.result()
+    print(Table("station", ("result", "value"), list(result.items())).to_text())
+    print(json.dumps(result), flush=True)
+    return 0
 
 
 def _reproduce(args) -> int:
@@ -548,6 +647,14 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--model", metavar="SCENE", help="the scene that control believes")
     p.add_argument("--seed", metavar="N", help="all randomness comes from it")
     p.add_argument("--duration", metavar="S", help="simulated seconds")
+    p.add_argument(
+        "--fault", action="append", default=[], metavar="NAME[:from=S,for=S]",
+        help="what is to go wrong; `list` has the names",
+    )  # fmt: skip
+    p.add_argument(
+        "--robot", nargs="+", default=["sim"], metavar=("sim", "RECORDING"),
+        help="sim; lcm [URL], one behind LCM; replay RECORDING",
+    )  # fmt: skip
     p.add_argument("--no-meshcat", action="store_true", help="no viewer, no html")
     p.add_argument("--realtime", metavar="RATE", help="at most so fast; 1: real time")
     p.add_argument(
@@ -556,8 +663,30 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--out", metavar="DIR", help="default: runs/<experiment>-<time>")
     p.set_defaults(function=_run)
 
+    p = commands.add_parser(
+        "station", help="a robot behind LCM to try `run --robot lcm` with"
+    )
+    p.add_argument("experiment", nargs="?", default="ball_rolling")
+    p.add_argument("--rate", default="1", metavar="R", help="simulated s per s (1)")
+    p.add_argument("--drop", default="0", metavar="SHARE", help="of messages, lost")
+    p.add_argument("--delay", default="0", metavar="S", help="sent so much later")
+    p.add_argument("--url", metavar="URL", help="of LCM; default: this machine alone")
+    p.add_argument("--duration", default="86400", metavar="S", help="of its own time")
+    p.add_argument(
+        "--fault", action="append", default=[], metavar="NAME[:from=S,for=S]",
+        help="what is to go wrong; `list` has the names",
+    )  # fmt: skip
+    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", nargs="+")
+    p.add_argument("--config", metavar="FILE", help="a YAML file of settings")
+    p.add_argument("--world", metavar="SCENE", help="the scene that is simulated")
+    p.add_argument("--model", metavar="SCENE", help="not used by a station")
+    p.add_argument("--seed", metavar="N", help="all randomness comes from it")
+    p.set_defaults(function=_station)
+
     p = commands.add_parser("reproduce", help="the paper's figure or table beside ours")
-    p.add_argument("experiments", nargs="*", metavar="EXPERIMENT", help="or: gap")
+    p.add_argument(
+        "experiments", nargs="*", metavar="EXPERIMENT", help="or: gap, faults"
+    )
     p.add_argument("--seeds", default="10", metavar="N", help="trials per case (10)")
     p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
     p.add_argument(
@@ -565,7 +694,10 @@ def _parser() -> argparse.ArgumentParser:
         help="of gap: standard, development, logs-..., contact-development or -final",
     )  # fmt: skip
     p.add_argument(
-        "--only", default="", metavar="TEXT", help="of gap: cases with this in the name"
+        "--only",
+        default="",
+        metavar="TEXT",
+        help="of gap and faults: cases with this in the name",
     )
     p.add_argument(
         "--reuse", action="store_true", help="keep trials of an earlier time"

@@ -27,6 +27,7 @@ from pydrake.systems.framework import (
 )
 from tqdm import tqdm
 
+from makebreak.diagrams.station import MONITOR
 from makebreak.gap.table import write_recording
 from makebreak.models.scene import Scene, apply_initial_velocities
 from makebreak.models.scene_file import write_scene
@@ -39,6 +40,7 @@ from makebreak.scripts.run_buttons import RunButtons
 from makebreak.scripts.table import json_value
 from makebreak.scripts.trials import run_many
 from makebreak.systems.numerics.first_calls import deferred
+from makebreak.systems.safety_monitor import verdict
 
 __all__ = ["Log", "Session", "run_many"]
 
@@ -65,7 +67,7 @@ class Log(Mapping):
         return len(self.columns)
 
 
-class _CatchInterrupt:
+class CatchInterrupt:
     """While entered, Ctrl-C sets `hit`, as SIGTERM and SIGHUP do; the second Ctrl-C
     raises KeyboardInterrupt."""
 
@@ -150,6 +152,7 @@ class Session:
         self._partial: dict[str, dict[str, np.ndarray]] = {}
         self._timing: dict[str, dict] = {}
         self._streams: list[Path] = []  # Recordings as they came.
+        self._watched: list[np.ndarray] = []  # What monitors saw, of each simulation.
         self.compared_by = ""  # The command that compares recording and model.
 
     def child(self, name: str) -> "Session":
@@ -252,7 +255,7 @@ class Session:
             self.meshcat.DeleteRecording()  # Of an earlier simulation.
             self.meshcat.StartRecording(frames_per_second=fps)
         with (
-            _CatchInterrupt() as interrupt,
+            CatchInterrupt() as interrupt,
             RunButtons(self.meshcat) as buttons,
             self._bar(duration, label) as bar,
             CompilingShown(partial(_tell, bar), self.on_first_compile),
@@ -287,6 +290,7 @@ class Session:
                     label, time, samples, interrupt.hit, root, diagram
                 )
                 self._time(label, log, wall, cpu, leaf_systems(diagram))
+                self._note_limits(diagram, root)
                 if self.meshcat is not None:
                     self.meshcat.StopRecording()
                     self.meshcat.PublishRecording()
@@ -339,6 +343,32 @@ class Session:
                     "max_ms": float(ms.max()),
                 }
         self._timing[label] = entry
+
+    def _note_limits(self, diagram: Diagram, root: Context) -> None:
+        if not diagram.HasSubsystemNamed("station"):
+            return
+        station = diagram.GetSubsystemByName("station")
+        if station.HasOutputPort(MONITOR):
+            seen = station.GetOutputPort(MONITOR).Eval(
+                station.GetMyContextFromRoot(root)
+            )
+            self._watched.append(np.array(seen))
+
+    def limits_kept(self) -> dict:
+        """What the monitors of the arm have seen, the worst of all simulations, as part
+        of a result; empty where there was none."""
+        if not self._watched:
+            return {}
+        seen = [verdict(worst) for worst in self._watched]
+        return {
+            "limits_kept": all(each.kept for each in seen),
+            "torque_share_max": max(each.torque_share for each in seen),
+            "torque_rate_share_max": max(each.torque_rate_share for each in seen),
+            "joint_speed_share_max": max(each.speed_share for each in seen),
+            "joint_range_excess_rad": max(each.position_excess for each in seen),
+            "ticks_not_finite": sum(each.not_finite for each in seen),
+            "first_violation_s": [each.first_violation_s for each in seen],
+        }
 
     def save_plot(self, fig, name: str) -> None:
         """Keeps the matplotlib figure; `finish` writes it as <name>.png, after what

@@ -7,8 +7,10 @@ Modelling                lcs_builder, forward_model
 Adaptation               residual_learner
 Planning                 rolling_task, c3_mpc
 Shaping                  velocity_shaper, variable_impedance
-Control                  arm_reference, impedance_controller, impact_reflex
+Control                  arm_reference, impedance_controller, impact_reflex,
+                         gravity_left_out
 For scoring and the eye  contact_probe, rolling_view, walls_view, contact_view
+Faults, and who watches  fault_signals, fault_pictures, fault_forces, safety_monitor
 As a world               lcs_plant
 In the plane             planar_world, planar_impedance, planar_view
 Compared with            baselines/: dynamics_residual_learner, mrac, active_inference,

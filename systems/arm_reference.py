@@ -74,6 +74,12 @@ class ArmReference(LeafSystem):
             config.period_sec, config.offset_sec, self._update
         )
 
+    def start_at(self, context, p_tip) -> None:
+        """The reference rests at p_tip (3,) [m], in a Context of this system."""
+        at_rest = np.concatenate([p_tip, np.zeros(9)])
+        line = np.concatenate([at_rest, at_rest, [context.get_time()]])
+        context.SetDiscreteState(self._line, line)
+
     @timed
     def _update(self, context, discrete_state):
         c = self._config

@@ -21,6 +21,10 @@ from makebreak.systems.numerics.packed import packed
 from makebreak.systems.numerics.serial_chain import SerialChain, chain_state
 from makebreak.systems.numerics.timing import timed
 
+# Of the tip's mass over the delay, that damping may be: a third of where it begins to
+# swing by itself, which leaves the spring a margin.
+DELAY_SHARE = 0.5
+
 
 @dataclass
 class ImpedanceConfig:
@@ -89,7 +93,10 @@ class ImpedanceController(LeafSystem):
              zero for none, force_targets (2,) F_c [N], wrench_measured (6,) on the tool
              [N], [N m]: without it, or while it is NaN, F_c is fed forward alone;
              optional damping_stiffness (6,): with a damping ratio, the stiffness that
-             the damping belongs to, where that is not the stiffness itself.
+             the damping belongs to, where that is not the stiffness itself; optional
+             delay (1,) [s] from a reading to when its torque acts: damping d of a mass
+             m that is told so late is stable while d delay < pi/2 m, so the tip's is
+             bounded to DELAY_SHARE m / delay.
     Outputs: tau (n,) [N m]; status (1,), a sum: 1 reference held, 2 sensors held,
              4 effort limit reached, 8 torque rate limit reached, 16 wrench not used.
 
@@ -130,6 +137,7 @@ class ImpedanceController(LeafSystem):
             if not number > 0.0:
                 raise ValueError(f"{name} is {number}, expected > 0")
         self._chain = serial_chain_of(plant, tip_frame)
+        self._tau_size = plant.num_positions()
         context = plant.CreateDefaultContext()
         n = plant.num_positions()
         q_nominal = plant.GetPositions(context)
@@ -174,6 +182,10 @@ class ImpedanceController(LeafSystem):
         self._targets = self.DeclareVectorInputPort("force_targets", 2)
         self._measured = self.DeclareVectorInputPort("wrench_measured", 6)
         self._damped = self.DeclareVectorInputPort("damping_stiffness", 6)
+        self._delay = self.DeclareVectorInputPort("delay", 1)
+        at_rest = chain_state(self._packed[0][0], q_nominal, np.zeros(n))
+        mobility = at_rest.J[:3] @ np.linalg.solve(at_rest.M, at_rest.J[:3].T)
+        self._mass = 1.0 / np.diag(mobility)  # Of the tip along each axis [kg].
         # The first torque carries the arm at its nominal position.
         carrying = chain_state(self._packed[0][0], q_nominal, np.zeros(n)).bias
         self._tau = self.DeclareDiscreteState(carrying)
@@ -186,6 +198,14 @@ class ImpedanceController(LeafSystem):
             config.period_sec, config.offset_sec, self._update
         )
 
+    def start_at(self, context: Context, q) -> None:
+        """The torque carries the arm at q (n,) [rad], and nothing is remembered."""
+        n = self._tau_size
+        q = np.array(q, dtype=float)
+        carrying = chain_state(self._packed[0][0], q, np.zeros(n)).bias
+        context.SetDiscreteState(self._tau, carrying)
+        context.SetDiscreteState(self._memory, np.zeros(memory_size(n)))
+
     @timed
     def _update(self, context: Context, discrete_state):
         stiffness = self._or(self._stiffness, context, self._law.stiffness)
@@ -196,6 +216,12 @@ class ImpedanceController(LeafSystem):
             damping = self._or(self._damped, context, stiffness)
         else:
             damping = self._law.damping
+        if ratio == 0.0 and self._delay.HasValue(context):
+            delay = float(self._delay.Eval(context)[0])
+            if delay > self._law.period:  # Less is what every tick has.
+                damping = np.array(damping)
+                most = DELAY_SHARE * self._mass / delay
+                damping[:3] = np.minimum(damping[:3], most)
         directions, targets = self._none, self._no_targets
         measured = self._none
         if self._directions.HasValue(context):  # Else there is no force to control.

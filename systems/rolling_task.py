@@ -86,6 +86,15 @@ class RollingTask(LeafSystem):
             config.period_sec, config.offset_sec, self._update
         )
 
+    def start_at(self, context, p_tip) -> None:
+        """The task waits with the tip at p_tip (3,) [m], in a Context of this system:
+        then it begins as from there."""
+        t, still = context.get_time(), np.zeros(3)
+        start = TaskState(WAIT, t, p_tip, still, still, float(p_tip[2]))
+        context.SetAbstractState(int(self._task), start)
+        context.SetDiscreteState(self._reference, [*p_tip, *np.zeros(6)])
+        context.SetDiscreteState(self._phase, [float(WAIT)])
+
     @timed
     def _update(self, context, state):
         c = self._config

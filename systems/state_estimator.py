@@ -55,7 +55,7 @@ class StateEstimator(LeafSystem):
         self._ball_radius, self._tip_mass = config.ball_radius, config.tip_mass
         self._chain = packed(chain)
         n = len(chain.mass)
-        q_default = np.array(q_default, dtype=float)
+        self.q_default = q_default = np.array(q_default, dtype=float)
         p_tip, _, _ = tip_motion(
             self._chain[0], q_default, np.zeros(n), np.zeros(n), 1.0
         )
@@ -125,6 +125,13 @@ class StateEstimator(LeafSystem):
     def _all_valid(self, context, output):
         n_valid = context.get_discrete_state(self._window).value()[-1]
         output.SetFromVector([1.0 if n_valid >= self._n_window else 0.0])
+
+    def start_at(self, context) -> None:
+        """Begins anew in a Context of this system: no window is whole until another
+        window_sec has passed."""
+        window = np.zeros(3 * self._n_window + 1)
+        context.SetDiscreteState(self._window, window)
+        context.SetDiscreteState(self._observer, np.zeros(7))
 
     @timed
     def _update(self, context, discrete_state):

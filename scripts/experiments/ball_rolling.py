@@ -1,6 +1,7 @@
 """Adaptive rolling of a ball that is modelled wrongly (ACI-MPC VII-B, Fig. 5, 6)."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -17,7 +18,10 @@ from makebreak.diagrams.ball_rolling import (
     world_scene,
 )
 from makebreak.diagrams.camera import describe_camera, vtk_works
+from makebreak.diagrams.fault_kinds import read_fault
+from makebreak.diagrams.lcm_station import make_lcm_station
 from makebreak.diagrams.recorder import recorded
+from makebreak.diagrams.replay_station import joint_columns, make_replay_station
 from makebreak.diagrams.scene_facts import sphere_radius, spheres_of
 from makebreak.diagrams.station import (
     ARM,
@@ -26,8 +30,10 @@ from makebreak.diagrams.station import (
     TORQUE_RATE_MAX,
     make_control_plant,
 )
+from makebreak.gap.table import read_table
 from makebreak.models.scene import load_scene
 from makebreak.scripts.criteria import Criteria
+from makebreak.scripts.lcm_loop import drive
 from makebreak.scripts.sweep import rate_text
 from makebreak.scripts.table import Table
 from makebreak.scripts.trials import run_many
@@ -43,6 +49,8 @@ Config = BallRollingConfig
 DURATION_SEC = 240.0
 CIRCLES = 4
 GIVE_UP_SEC = 60.0  # A run in which nothing rolls by then ends.
+START_WITHIN = 0.2  # The tip of a real arm, of where the scene has it at first [m].
+ALIKE = 3.0  # Commands of a replay that differ by less are alike [N m].
 LOST = 0.1  # So far outside the circle the ball is out of reach [m].
 ERROR_MAX = 0.004  # Success: mean distance to the path of at most this [m].
 SAMPLE = 0.0125  # [s]
@@ -105,6 +113,7 @@ def run(config, session):
     at = plant.GetBodyByName("ball").floating_positions_start() + 4
     center = np.array(config.task.center)
     run_through: list = [0.0, None]  # Progress and the last angle.
+    taken = any(read_fault(text).kind.on == "ball" for text in config.faults)
 
     def done(t, sample):
         p = sample["state"][at : at + 2] - center
@@ -114,7 +123,9 @@ def run(config, session):
             run_through[0] += (turn + np.pi) % (2.0 * np.pi) - np.pi
         run_through[1] = angle
         stuck = t >= GIVE_UP_SEC and run_through[0] < np.pi / 2
-        return ending(run_through[0], stuck, np.hypot(*p) > config.task.radius + LOST)
+        # Out of reach for good, that is: not in a hand.
+        lost = np.hypot(*p) > config.task.radius + LOST and not taken
+        return ending(run_through[0], stuck, lost)
 
     log = session.simulate(diagram, DURATION_SEC, record, SAMPLE, until=done)
     track = ground_truth(config, log, plant)
@@ -124,10 +135,172 @@ def run(config, session):
     result["torque_peak_Nm"] = float(abs(torque).max())
     at_limit = abs(np.diff(torque, axis=1)) >= TORQUE_RATE_MAX * 1e-3 * (1.0 - 1e-9)
     result["torque_rate_limited_share"] = float(at_limit.any(axis=0).mean())
+    if config.faults:  # For `reproduce faults`: how far it had come, each second.
+        second = np.searchsorted(track.time, np.arange(0.0, track.time[-1]) - 1e-9)
+        result["angle_by_second_rad"] = track.progress[second].round(4).tolist()
     write_recording(session, log, config)
     plot_path(session, config, track)
     plot_residual(session, log, track)
     return result
+
+
+def run_on_lcm(config, session, url: str) -> dict:
+    """Rolls with a robot behind LCM, until four circles are done, as the camera sees
+    them, or the time is over. There is no ground truth: errors are those of the
+    estimated ball.
+
+    Raises: ValueError for faults, which the robot's side has, and if no robot answers.
+    """
+    if config.faults:
+        raise ValueError("--fault: the robot's side has the faults: makebreak station")
+    arm = make_control_plant(believed(config)[1])
+    diagram = make_ball_rolling(config, station=make_lcm_station(arm))
+    system = diagram.GetSubsystemByName
+    ports = {
+        "x": system("state_estimator").GetOutputPort("x"),
+        "gap": system("learned_gap").get_output_port(),
+        "seen": system("ball_tracker").GetOutputPort("seen"),
+    }
+    if diagram.HasSubsystemNamed("residual_learner"):
+        ports["r_std"] = system("residual_learner").GetOutputPort("r_std")
+    center, radius = np.array(config.task.center), config.task.radius
+    rolled: list = [0.0, None]
+
+    def done(t, sample) -> str:
+        if sample["seen"][0] < 0.5:
+            return ""
+        p = sample["x"][P_BALL][:2] - center
+        angle = float(np.arctan2(p[1], p[0]))
+        if rolled[1] is not None:
+            rolled[0] += (angle - rolled[1] + np.pi) % (2.0 * np.pi) - np.pi
+        rolled[1] = angle
+        return ending(rolled[0], False, np.hypot(*p) > radius + LOST)
+
+    def begin(_, context, q):
+        start_where_it_is(diagram, context, q, arm)
+
+    log, report = drive(session, diagram, ports, begin, url, DURATION_SEC, SAMPLE, done)
+    seen = log["seen"][:, 0] > 0.5
+    if not seen.any():
+        raise ValueError("--robot lcm: the ball was never seen")
+    p_ball = log["x"][seen][:, P_BALL]
+    progress = progress_of(p_ball, center)
+    off = abs(np.linalg.norm(p_ball[:, :2] - center, axis=1) - radius)
+    after = off[int(np.argmax(progress >= np.pi / 2)) :]
+    circles = float(progress.max() / (2.0 * np.pi))
+    mean = float(after.mean()) if circles > 0.25 else float("nan")
+    criteria = Criteria()
+    criteria.at_least("circles", "circles completed, as seen", circles, CIRCLES)
+    criteria.at_most("error", "tracking error as seen, mean", mean, ERROR_MAX, "m")
+    columns = recorded(diagram, log.context)
+    row = np.searchsorted(log.time, columns["time"] - 1e-9).clip(0, len(log.time) - 1)
+    for name in BALL_CHANNELS:
+        columns[name] = np.where(seen[row], columns[name], np.nan)
+    session.write_recording(columns, believed(config)[1])
+    torque = system("torque_log").FindLog(log.context).data()
+    return criteria.result() | {
+        "circles_completed_seen": circles,
+        "tracking_error_mean_seen_m": mean,
+        "r_gap_m": float(log["gap"][-1, 0]),
+        "r_gap_std_m": LEARN * float(log["r_std"][-1, 0]) if "r_std" in log else 0.0,
+        "seen_share": float(seen.mean()),
+        "torque_peak_Nm": float(abs(torque).max()),
+        "controlled_s": float(log.time[-1]),
+        **report.result(),
+        "seed": config.seed,
+        "adapt": config.adapt,
+        "radius_error_m": config.radius_error_m,
+    }
+
+
+def run_on_recording(config, session, recording: Path) -> dict:
+    """The controllers with the sensors of a recording in place of the world, open loop:
+    what they command beside what was commanded.
+
+    `success`: every command is finite. How far they may differ depends on what was
+    changed since.
+    """
+    columns = read_table(recording).columns
+    model, scene = believed(config)
+    station = make_replay_station(columns, BALL_CHANNELS, model.ball_radius)
+    diagram = make_ball_rolling(config, session.meshcat, station)
+    system = diagram.GetSubsystemByName
+    record = {
+        "gap": system("learned_gap").get_output_port(),
+        "phase": system("rolling_task").GetOutputPort("phase"),
+    }
+    time = columns["time"]
+    log = session.simulate(diagram, float(time[-1]), record, SAMPLE)
+    again = recorded(diagram, log.context)
+    names = joint_columns("effort_command")
+    # Rows begin with the same instant; those of the recording may be closer together.
+    row = np.searchsorted(time, again["time"] - 1e-6).clip(0, len(time) - 1)
+    there = np.column_stack([columns[name] for name in names])[row]
+    here = np.column_stack([again[name] for name in names])
+    off = here - there
+    spread = there - there.mean(axis=0)
+    worst = int(np.argmax(abs(off).max(axis=1)))
+    apart = abs(off).max(axis=1) > ALIKE
+    session.write_recording(again, scene)
+    fig, axes = plt.subplots(len(names), sharex=True, figsize=(7, 9))
+    for k, ax in enumerate(axes):
+        ax.plot(again["time"], there[:, k], lw=0.8, label="recorded")
+        ax.plot(again["time"], here[:, k], lw=0.8, label="now")
+        ax.set_ylabel(f"joint {k + 1} [N m]")
+    axes[0].legend(loc="upper right")
+    axes[-1].set_xlabel("time [s]")
+    session.save_plot(fig, "commands")
+    criteria = Criteria()
+    lost = float((~np.isfinite(here)).sum())
+    criteria.at_most("finite", "commands that are not finite", lost, 0.0)
+    rms = np.sqrt((off**2).mean(axis=0))
+    return criteria.result() | {
+        "replayed_s": float(again["time"][-1]),
+        "command_difference_rms_Nm": rms.tolist(),
+        "command_spread_rms_Nm": np.sqrt((spread**2).mean(axis=0)).tolist(),
+        "commands_alike_until_s": first_time(again["time"], apart),
+        "command_difference_max_Nm": float(abs(off).max()),
+        "command_difference_max_at_s": float(again["time"][worst]),
+        "r_gap_m": float(log["gap"][-1, 0]),
+        "seed": config.seed,
+        "adapt": config.adapt,
+        "radius_error_m": config.radius_error_m,
+    }
+
+
+def start_where_it_is(diagram, context, q, arm) -> None:
+    """The controllers begin with the arm at q (7,) [rad], in the diagram's root context
+    `context`; what was learned stays. Args: arm: the control plant.
+
+    Raises: ValueError if the tip is too far away for the task.
+    """
+    plant_context = arm.CreateDefaultContext()
+    tip = arm.GetFrameByName(TIP_FRAME)
+    home = tip.CalcPoseInWorld(plant_context).translation()
+    arm.SetPositions(plant_context, q)
+    p_tip = tip.CalcPoseInWorld(plant_context).translation()
+    if not np.linalg.norm(p_tip - home) <= START_WITHIN:
+        raise ValueError(
+            f"--robot lcm: the tip is at {p_tip.round(3).tolist()}, expected within "
+            f"{START_WITHIN} m of {home.round(3).tolist()}"
+        )
+
+    def own(name):
+        system = diagram.GetSubsystemByName(name)
+        return system, system.GetMyMutableContextFromRoot(context)
+
+    for name in ("ball_tracker", "c3_mpc", "state_estimator", "rolling_task"):
+        system, at = own(name)
+        at.SetStateAndParametersFrom(system.CreateDefaultContext())
+    for name, place in (
+        ("rolling_task", p_tip),
+        ("arm_reference", p_tip),
+        ("impedance_controller", q),
+    ):
+        system, at = own(name)
+        system.start_at(at, place)
+    system, at = own("state_estimator")
+    system.start_at(at)
 
 
 def ending(angle: float, stuck: bool, lost: bool) -> str:

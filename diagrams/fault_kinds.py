@@ -1,0 +1,190 @@
+"""What can go wrong in a station, by name, and how `--fault` is read.
+
+A fault is a text, NAME[:from=S,for=S,...=...]. `from` is when it begins and `for` how
+long it lasts [s]. What it does is in faults.py.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from makebreak.models.typed_yaml import nearest
+
+ALWAYS = math.inf
+TICK = 0.001  # Of the station [s].
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A kind of fault.
+
+    on: what it acts on: camera, ball, arm, command, position_velocity,
+        torque or wrench (a sensor), planner or scene.
+    recoverable: whether the task should go on during it or after it; else the arm is
+        to be held safely. Said before anything was run.
+    numbers: {name: value}, its own settings with their defaults.
+    """
+
+    says: str
+    on: str
+    recoverable: bool
+    lasts: float  # Unless `for` says otherwise [s].
+    numbers: dict[str, float] = field(default_factory=dict)
+
+
+FAULTS: dict[str, Fault] = {
+    "none": Fault(
+        "nothing goes wrong, but the arm is watched as with the others",
+        "nothing", True, ALWAYS,
+    ),
+    "frames_dropped": Fault(
+        "a share of the camera's frames does not come; the one before stays",
+        "camera", True, ALWAYS, {"share": 0.5},
+    ),
+    "frames_frozen": Fault(
+        "no new frame comes; the last one stays", "camera", True, 0.5
+    ),
+    "frames_delayed": Fault(
+        "each frame comes some frames late", "camera", True, ALWAYS, {"frames": 3}
+    ),
+    "second_ball": Fault(
+        "a ball of the same colour is seen at a distance from the real one",
+        "camera", True, 3.0, {"x": 0.0, "y": 0.12},
+    ),
+    "glare": Fault(
+        "a white spot hides most of the ball", "camera", True, 0.5
+    ),
+    "position_nan": Fault(
+        "all encoders give NaN for positions", "position_velocity", True, 0.05
+    ),
+    "velocity_nan": Fault(
+        "all encoders give NaN for velocities", "position_velocity", True, 0.05
+    ),
+    "torque_nan": Fault("the torque sensors give NaN", "torque", True, 0.5),
+    "wrench_nan": Fault("the force sensor gives NaN", "wrench", True, 0.5),
+    "position_stuck": Fault(
+        "one encoder's position does not change any more",
+        "position_velocity", False, 0.2, {"joint": 4},
+    ),
+    "position_bias": Fault(
+        "one encoder's position is off [rad]",
+        "position_velocity", True, ALWAYS, {"joint": 2, "by": 0.003},
+    ),
+    "velocity_bias": Fault(
+        "all velocities are off [rad/s]",
+        "position_velocity", False, ALWAYS, {"by": 0.1},
+    ),
+    "torque_bias": Fault(
+        "one torque sensor is off [N m]",
+        "torque", True, ALWAYS, {"joint": 2, "by": 2.0},
+    ),
+    "wrench_bias": Fault(
+        "the force sensor is off along z [N]", "wrench", True, ALWAYS, {"by": 1.0}
+    ),
+    "position_delay": Fault(
+        "positions come late [s], velocities do not",
+        "position_velocity", True, ALWAYS, {"sec": 0.05},
+    ),
+    "compute_delay": Fault(
+        "torques reach the arm late [s], as from a slow computer",
+        "command", True, ALWAYS, {"sec": 0.005},
+    ),
+    "solver_fails": Fault(
+        "the planner's solver fails at each of its ticks", "planner", True, 0.5
+    ),
+    "ball_taken": Fault(
+        "a hand takes the ball away and puts it back elsewhere on its circle",
+        "ball", True, 4.0, {"turn": 1.57},
+    ),
+    "push": Fault(
+        "the arm's last link is pushed [N]",
+        "arm", True, 0.3, {"x": 0.0, "y": 20.0, "z": 0.0},
+    ),
+    "weak_joint": Fault(
+        "one joint gives a share of its torque at most",
+        "command", False, ALWAYS, {"joint": 2, "share": 0.333},
+    ),
+    "joint_friction": Fault(
+        "dry friction in the first joints [N m]",
+        "arm", False, ALWAYS, {"joints": 4, "coulomb": 2.0},
+    ),
+    "box": Fault(
+        "a fixed box stands on the path, from the beginning on", "scene", False, ALWAYS
+    ),
+}  # fmt: skip
+FROM = 6.0  # When a fault begins, unless `from` says otherwise [s].
+
+
+@dataclass(frozen=True)
+class Injected:
+    """A fault that is asked for: FAULTS[name] from `start` to `end` [s]."""
+
+    name: str
+    start: float
+    end: float
+    numbers: dict[str, float]
+
+    @property
+    def kind(self) -> Fault:
+        return FAULTS[self.name]
+
+
+def read_fault(text: str) -> Injected:
+    """NAME[:from=S,for=S,...=...] as a fault.
+
+    Raises: ValueError in one line for an unknown name or setting, or a value that is
+        no number.
+    """
+    name, _, rest = text.partition(":")
+    if name not in FAULTS:
+        raise ValueError(f"unknown fault {name}; {nearest(name, FAULTS)}")
+    kind = FAULTS[name]
+    start = 0.0 if kind.on == "scene" else FROM
+    numbers = {"from": start, "for": kind.lasts} | dict(kind.numbers)
+    if kind.on == "scene":  # It does not come and go.
+        numbers = dict(kind.numbers)
+    for setting in filter(None, rest.split(",")):
+        key, _, value = setting.partition("=")
+        if key not in numbers:
+            raise ValueError(f"fault {name}: unknown setting {key}; {_known(numbers)}")
+        try:
+            numbers[key] = float(value)
+        except ValueError:
+            numbers[key] = math.nan
+        if math.isnan(numbers[key]):
+            raise ValueError(f'fault {name}: {key}: got "{value}", expected a number')
+    start, lasts = numbers.pop("from", 0.0), numbers.pop("for", ALWAYS)
+    if not 0.0 <= start < math.inf or not lasts > 0.0:
+        raise ValueError(
+            f"fault {name}: from is {start}, for {lasts}, expected >= 0 and > 0"
+        )
+    if "sec" in numbers and not TICK <= numbers["sec"] <= 1.0:
+        raise ValueError(
+            f"fault {name}: sec is {numbers['sec']}, expected 0.001 to 1 s"
+        )
+    for key in ("joint", "joints"):
+        if key in numbers and numbers[key] not in range(1, 8):
+            raise ValueError(
+                f"fault {name}: {key} is {numbers[key]:g}, expected 1 to 7"
+            )
+    return Injected(name, start, start + lasts, numbers)
+
+
+def _known(numbers) -> str:
+    return f"it has {', '.join(numbers)}" if numbers else "it has none"
+
+
+def read_faults(texts: Sequence[str], has: Sequence[str]) -> list[Injected]:
+    """The faults of an experiment.
+
+    Args: has: what there is beside the arm and its sensors: camera, ball, planner,
+        scene (a place for a box).
+    Raises: ValueError as read_fault, and for a fault of what is not there.
+    """
+    faults = [read_fault(text) for text in texts]
+    for fault in faults:
+        on = fault.kind.on
+        if on in ("camera", "ball", "planner", "scene") and on not in has:
+            what = {"scene": "known place for a box"}.get(on, on)
+            raise ValueError(f"fault {fault.name}: there is no {what} here")
+    return faults

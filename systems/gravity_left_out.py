@@ -1,0 +1,35 @@
+"""Torques for a robot that carries its own weight."""
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from makebreak.systems.numerics.packed import packed
+from makebreak.systems.numerics.serial_chain import SerialChain, chain_state
+
+
+def gravity_torque(chain, q) -> np.ndarray:
+    """(n,) [N m] that carry the arm at rest at q (n,) [rad]. Args: chain, packed."""
+    return chain_state(chain[0], q, np.zeros(len(q))).bias
+
+
+class GravityLeftOut(LeafSystem):
+    """tau - g(q): what is sent to a robot whose driver adds g(q) itself.
+
+    Inputs:  tau (n,) [N m]; q (n,) measured [rad].
+    Outputs: torque (n,) [N m]; zero while q is not finite.
+    """
+
+    def __init__(self, chain: SerialChain):
+        super().__init__()
+        n = len(chain.mass)
+        self._chain = packed(chain)
+        self._tau = self.DeclareVectorInputPort("tau", n)
+        self._q = self.DeclareVectorInputPort("q", n)
+        self.DeclareVectorOutputPort("torque", n, self._calc)
+
+    def _calc(self, context: Context, output: BasicVector):
+        q = np.array(self._q.Eval(context))
+        torque = np.zeros(len(q))
+        if np.isfinite(q).all():
+            torque = self._tau.Eval(context) - gravity_torque(self._chain, q)
+        output.SetFromVector(torque)
