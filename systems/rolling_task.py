@@ -4,7 +4,7 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import LeafSystem
 
-from makebreak.systems.numerics.ball_state import N_X
+from makebreak.systems.numerics.ball_state import N_X, P_BALL
 from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.rolling_task import (
     WAIT,
@@ -16,6 +16,8 @@ from makebreak.systems.numerics.rolling_task import (
     target_over_horizon,
 )
 from makebreak.systems.numerics.timing import timed
+
+OUT_OF_REACH = 0.12  # A ball that is so far outside the circle is waited for [m].
 
 
 @dataclass
@@ -42,6 +44,8 @@ class RollingTask(LeafSystem):
     Outputs: x_desired ((N+1) 19,) for C3; reference (9,) = p, v, a of the tip at the
              next tick, used unless rolling; phase (1,): 0 roll, 1 reposition, 2 wait,
              3 approach.
+
+    A ball that is OUT_OF_REACH is as one that is not seen.
 
     Before the first update the phase is WAIT at the height of the tip that was given.
     """
@@ -101,7 +105,10 @@ class RollingTask(LeafSystem):
         x, t = self._x.Eval(context), context.get_time()
         task = context.get_abstract_state(int(self._task)).get_value()
         gap = self._r_comp.Eval(context)[: self._n_tip].mean() * self._residual_dt_sec
-        valid = self._valid.Eval(context)[0] > 0.5
+        away = x[P_BALL][:2] - self._path.center
+        reach = self._path.radius + OUT_OF_REACH
+        # Who runs after a ball that is out of reach, stretches the arm for nothing.
+        valid = self._valid.Eval(context)[0] > 0.5 and away @ away < reach**2
         landed = None
         if self._landed.HasValue(context):
             landed = bool(self._landed.Eval(context)[0] > 0.5)

@@ -143,6 +143,21 @@ def test_a_ball_that_is_not_seen_at_the_start_lifts_the_tip_from_where_it_is():
         assert system.GetOutputPort("phase").Eval(context)[0] == WAIT
 
 
+@pytest.mark.parametrize(("outside", "waits"), [(0.11, False), (0.13, True)])
+def test_a_ball_out_of_reach_is_waited_for(outside, waits):
+    system = RollingTask(RollingTaskConfig(), 6, 0.1, R_BALL, R_TIP, 8, 4, 0.05)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    ball = [0.5, 0.1 + outside, R_BALL]
+    x = pack([0.5, 0.0, 0.15], np.zeros(3), ball, np.zeros(3), R_BALL)
+    for name, value in (("x", x), ("valid", [1.0]), ("r_comp", np.zeros(8))):
+        system.GetInputPort(name).FixValue(context, value)
+    simulator.AdvanceTo(0.3)
+    assert (system.GetOutputPort("phase").Eval(context)[0] == WAIT) == waits
+    reference = system.GetOutputPort("reference").Eval(context)
+    assert (abs(reference[1]) < 1e-9) == waits  # It stays, or goes to the ball.
+
+
 def radii_aimed_at(distance, integral_sec, valid=1.0):
     """How far from the center C3's first target of the ball is, tick by tick for 3 s,
     and what it would be without integral action; the ball lies still at `distance`."""
