@@ -98,6 +98,7 @@ OFFSET = dict(
 )  # fmt: skip
 BALL_CHANNELS = ("ball.ball.x", "ball.ball.y")  # What a camera above sees of it.
 BOX_AHEAD = np.pi / 2  # From where the ball lies at first to a stray box [rad].
+BALL_RESISTANCE = 0.005  # Lever arm over radius.
 PLAN_DT, TIP_MASS, N_TIP = 0.1, 1.0, 4  # N_TIP: forces of tip and ball, the first ones.
 
 
@@ -155,7 +156,8 @@ class BallRollingConfig:
     # Radius of the model minus the world's; of a fruit, minus its mean radius.
     radius_error_m: float = 0.005
     friction: float = 0.5  # Of the ball with tip and table.
-    rolling_resistance: float = 0.005  # Lever arm over radius.
+    # Lever arm over radius; None: 0.005 of a ball, of a fruit its own.
+    rolling_resistance: float | None = None
     ball_noise_m: float = 0.001  # Shift of each picture, each way.
     start_angle_rad: float | None = None  # Of the ball on the circle; None: by seed.
     world: str = BALL_ROLLING
@@ -164,7 +166,11 @@ class BallRollingConfig:
     camera: CameraConfig = field(default_factory=CameraConfig)
     tracker: BallTrackerConfig = field(
         default_factory=lambda: BallTrackerConfig(
-            position_std=1.5e-3, acceleration_density=4e-3
+            position_std=1.5e-3,
+            acceleration_density=4e-3,
+            driven_density=0.3,
+            free_sec=2.0,
+            driven_sec=0.2,
         )
     )
     task: RollingTaskConfig = field(default_factory=RollingTaskConfig)
@@ -229,17 +235,19 @@ def world_scene(config: BallRollingConfig) -> Scene:
     scene.initial.poses["ball.ball"] = [*turned, float(xy[0]), float(xy[1]), z]
     if not config.friction > 0.0:
         raise ValueError(f"friction is {config.friction}, expected > 0")
-    if not config.rolling_resistance >= 0.0:
-        raise ValueError(
-            f"rolling_resistance is {config.rolling_resistance}, expected >= 0"
-        )
+    resistance = config.rolling_resistance
+    if resistance is None:
+        fruit = FRUITS.get(config.object)
+        resistance = BALL_RESISTANCE if fruit is None else fruit.rolling_resistance
+    if not resistance >= 0.0:
+        raise ValueError(f"rolling_resistance is {resistance}, expected >= 0")
     for pair in (f"{TOOL}~ball", "ball~table"):
         scene.effects.append(
             Effect("contact_friction", [pair], {"friction": config.friction})
         )
-    if config.rolling_resistance > 0.0:
-        resistance = {"coefficient": config.rolling_resistance}
-        scene.effects.append(Effect("rolling_resistance", ["ball~table"], resistance))
+    if resistance > 0.0:
+        lever = {"coefficient": resistance}
+        scene.effects.append(Effect("rolling_resistance", ["ball~table"], lever))
     return scene
 
 
@@ -630,6 +638,7 @@ def add_ball_rolling(
     connect(c3, "lam", reference, "lam")
     connect(c3, "status", reference, "status")
     connect(lcs["command"], "lcs", reference, "lcs")
+    connect(estimator, "tip_force", reference, "tip_force")
     connect(station, f"{ARM}.position_measured", impedance, "q")
     connect(station, f"{ARM}.velocity_measured", impedance, "v")
     if station.HasOutputPort(DELAY):

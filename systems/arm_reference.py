@@ -6,11 +6,12 @@ from pydrake.systems.framework import LeafSystem
 
 from makebreak.systems.numerics.arm_reference import (
     clip_norm,
+    lost_contact,
     next_end,
     on_the_line,
     pose_and_wrench,
 )
-from makebreak.systems.numerics.ball_state import N_X, P_TIP, V_TIP
+from makebreak.systems.numerics.ball_state import N_X, P_TIP, V_BALL, V_TIP
 from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.lcs import LCS
 from makebreak.systems.numerics.rolling_task import ROLL
@@ -23,6 +24,10 @@ class ArmReferenceConfig:
     force_max: float = 3.0  # Feed-forward is clipped to it [N].
     acceleration_max: float = 1.5  # Of the velocity reference while rolling [m/s2].
     down_max: float = 0.04  # Downwards while rolling, where contact may be early [m/s].
+    # Where the plan presses and less than follow_force is felt, the tip goes down by so
+    # much, and with the ball.
+    follow_speed: float = 0.03  # [m/s]
+    follow_force: float = 1.0  # [N]
     # No command moves the reference faster than that, however far away it is. The task
     # itself stays below 0.35 m/s and 4 m/s2.
     speed_max: float = 0.7  # [m/s]
@@ -43,8 +48,14 @@ class ArmReference(LeafSystem):
     it is and pushes nothing; so does any while its command is not finite. A command far
     away is gone to at speed_max, not within one period.
 
+    The fed-forward force alone moves a well damped tip by some mm/s: too slow for the
+    dents of an object that rolls by under it, and off such an object the tip would run
+    ahead alone. So where it should press and feels nothing it goes down, and along with
+    the ball.
+
     Inputs:  phase (1,), reference (9,) of RollingTask; x_next (19,), lam (n_lam,),
-             status (1,) of C3; lcs (abstract), the one-step LCS that made them.
+             status (1,) of C3; lcs (abstract), the one-step LCS that made them;
+             optional tip_force (3,) on the tip, as the arm feels it [N].
     Outputs: x_desired (19,) = [p, quaternion, v, w, a, alpha], position and its
              derivatives only (the quaternion is the identity); wrench (6,) force first;
              command (25,), one after the other: for who asks for both each millisecond.
@@ -52,6 +63,11 @@ class ArmReference(LeafSystem):
 
     def __init__(self, config: ArmReferenceConfig, n_lam: int, p_tip, lcs: LCS):
         super().__init__()
+        if not config.follow_force > 0.0 or not config.follow_speed >= 0.0:
+            raise ValueError(
+                "follow_force must be positive and follow_speed 0 or more, got "
+                f"{config.follow_force}, {config.follow_speed}"
+            )
         self._config, self._period = config, config.period_sec
         self._phase = self.DeclareVectorInputPort("phase", 1)
         self._reference = self.DeclareVectorInputPort("reference", 9)
@@ -59,6 +75,7 @@ class ArmReference(LeafSystem):
         self._lam = self.DeclareVectorInputPort("lam", n_lam)
         self._status = self.DeclareVectorInputPort("status", 1)
         self._lcs = self.DeclareAbstractInputPort("lcs", AbstractValue.Make(lcs))
+        self._tip_force = self.DeclareVectorInputPort("tip_force", 3)
         self._zero = np.zeros(3)
         at_rest = np.concatenate([p_tip, np.zeros(9)])
         reference = np.zeros(25)
@@ -97,8 +114,16 @@ class ArmReference(LeafSystem):
             on_tip = c.tip_mass / lcs.dt * (lcs.D[V_TIP] @ self._lam.Eval(context))
             force = clip_norm(-on_tip, c.force_max)
             v = np.array(x_next[V_TIP])
+            p = np.array(x_next[P_TIP])
+            if self._tip_force.HasValue(context):
+                felt = self._tip_force.Eval(context)[2]
+                lost = lost_contact(-force[2], felt, c.follow_force)
+                change = lost * (x_next[V_BALL][:2] - v[:2])
+                p[:2] += change * c.period_sec
+                v[:2] += change
+                v[2] -= lost * c.follow_speed
             v[2] = max(v[2], -c.down_max)
-            target = np.concatenate((x_next[P_TIP], v, self._zero, force))
+            target = np.concatenate((p, v, self._zero, force))
             dv_max = c.acceleration_max * c.period_sec
         else:
             target = np.concatenate((self._reference.Eval(context), self._zero))

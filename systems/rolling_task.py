@@ -27,6 +27,9 @@ class RollingTaskConfig:
     lead_deg: float = 6.0  # The target runs so far ahead of the ball ...
     speed: float = 0.045  # ... and moves along the circle with it [m/s].
     press: float = 0.045  # Tip target below the ball's top, as learned [m].
+    # Where the tip hides nothing of the circle from the camera [m]: between the circle
+    # and the arm's base.
+    withdrawn: list[float] = field(default_factory=lambda: [0.3, 0.0])
     rolling: RollingConfig = field(default_factory=RollingConfig)
     period_sec: float = 0.0125
     offset_sec: float = 0.0
@@ -124,6 +127,7 @@ class RollingTask(LeafSystem):
         task = next_state(
             c.rolling, path, task, t, c.period_sec, x, gap, valid,
             self._radius_ball, self._radius_tip, landed, gap_std, force_z,
+            np.array(c.withdrawn),
         )  # fmt: skip
         # Below the top where it is believed to be: a ball larger than modelled would
         # else be pressed as much harder.
@@ -145,15 +149,18 @@ class RollingTask(LeafSystem):
 def _check(config: RollingTaskConfig):
     """Raises: ValueError for a config that makes no task, by name."""
     rolling = config.rolling
-    if np.shape(config.center) != (2,) or not np.isfinite(config.center).all():
-        raise ValueError(f"task.center is {config.center}, expected 2 numbers")
+    for name in ("center", "withdrawn"):
+        place = getattr(config, name)
+        if np.shape(place) != (2,) or not np.isfinite(place).all():
+            raise ValueError(f"task.{name} is {place}, expected 2 numbers")
     if not 0.0 < config.radius < np.inf:
         raise ValueError(f"task.radius is {config.radius}, expected > 0")
     for name in ("speed", "lead_deg", "press"):
         if not np.isfinite(getattr(config, name)):
             raise ValueError(f"task.{name} is {getattr(config, name)}, expected finite")
     for name in ("roll_sec", "reposition_sec", "approach_speed", "touch_force",
-                 "land_above", "coast_change"):  # fmt: skip
+                 "land_above", "coast_change", "withdraw_speed",
+                 "reposition_far", "unseen_drift"):  # fmt: skip
         if not 0.0 < getattr(rolling, name) < np.inf:
             raise ValueError(
                 f"task.rolling.{name} is {getattr(rolling, name)}, expected > 0"
@@ -162,7 +169,7 @@ def _check(config: RollingTaskConfig):
         raise ValueError(
             f"task.rolling.integral_sec is {rolling.integral_sec}, expected > 0"
         )
-    for name in ("n_std", "n_std_below", "approach_max"):
+    for name in ("n_std", "n_std_below", "approach_max", "unseen_speed"):
         if not 0.0 <= getattr(rolling, name) < np.inf:
             raise ValueError(
                 f"task.rolling.{name} is {getattr(rolling, name)}, expected >= 0"

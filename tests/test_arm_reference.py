@@ -6,7 +6,12 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
 from makebreak.systems.arm_reference import ArmReference, ArmReferenceConfig
-from makebreak.systems.numerics.arm_reference import clip_norm, next_end, on_the_line
+from makebreak.systems.numerics.arm_reference import (
+    clip_norm,
+    lost_contact,
+    next_end,
+    on_the_line,
+)
 from makebreak.systems.numerics.lcs import LCS
 from makebreak.systems.numerics.rolling_task import REPOSITION, ROLL
 
@@ -59,7 +64,9 @@ def one_force_lcs(tip_mass):
 REFERENCE = np.array([1, 2, 3, 40, 50, 60, 700, 800, 900]) * 1e-3
 
 
-def run(phase, x_next, lam, t_end=0.0126, status=0.0, reference=REFERENCE):
+def run(
+    phase, x_next, lam, t_end=0.0126, status=0.0, reference=REFERENCE, tip_force=None
+):
     builder = DiagramBuilder()
     lcs = one_force_lcs(2.0)
     config = ArmReferenceConfig(tip_mass=2.0)
@@ -69,6 +76,9 @@ def run(phase, x_next, lam, t_end=0.0126, status=0.0, reference=REFERENCE):
     ).items():
         source = builder.AddSystem(ConstantVectorSource(value))
         builder.Connect(source.get_output_port(), arm.GetInputPort(name))
+    if tip_force is not None:
+        source = builder.AddSystem(ConstantVectorSource([0.0, 0.0, tip_force]))
+        builder.Connect(source.get_output_port(), arm.GetInputPort("tip_force"))
     source = builder.AddSystem(ConstantValueSource(AbstractValue.Make(lcs)))
     builder.Connect(source.get_output_port(), arm.GetInputPort("lcs"))
     diagram = builder.Build()
@@ -150,3 +160,43 @@ def test_while_rolling_the_reference_goes_down_slowly_and_up_as_it_is_told():
         x_next[12] = v_z
         pose, _ = run(ROLL, x_next, [0.0], t_end=0.2)
         np.testing.assert_allclose(pose[9], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "pressed, felt, expected",
+    [
+        (2.0, 0.0, 1.0),  # Pressed, and nothing there.
+        (2.0, -3.0, 1.0),
+        (2.0, 0.5, 0.5),
+        (2.0, 1.0, 0.0),  # In contact.
+        (2.0, 5.0, 0.0),
+        (0.0, 0.0, 0.0),  # Nothing is to be pressed.
+        (-1.0, 0.0, 0.0),
+        (0.4, 0.0, 0.4),
+    ],
+)
+def test_a_contact_is_lost_where_it_should_press_and_feels_nothing(
+    pressed, felt, expected
+):
+    np.testing.assert_allclose(lost_contact(pressed, felt, 1.0), expected)
+
+
+def test_a_tip_that_has_lost_its_contact_goes_down_and_with_the_ball():
+    x_next = np.zeros(19)
+    x_next[0], x_next[10], x_next[16] = 1e-4, 0.012, 0.004  # p, v of tip; v of ball.
+    found = {}
+    for lam, felt in ((0.5, 0.0), (2.0, 3.0), (0.0, 0.0), (2.0, None)):
+        x_desired, _ = run(ROLL, x_next, [lam], tip_force=felt)
+        found[lam, felt] = x_desired[[0, 7, 9]]
+    dt, change = 0.0125, 0.5 * (0.004 - 0.012)
+    lost = [1e-4 + change * dt, 0.012 + change, -0.5 * 0.03]
+    np.testing.assert_allclose(found.pop((0.5, 0.0)), lost, atol=1e-12)
+    for kept in found.values():  # In contact, not pressed, or without a feeling.
+        np.testing.assert_allclose(kept, [1e-4, 0.012, 0.0], atol=1e-12)
+
+
+def test_what_cannot_be_followed_is_refused_by_name():
+    with pytest.raises(ValueError, match="follow_force must be positive"):
+        ArmReference(
+            ArmReferenceConfig(follow_force=0.0), 1, np.zeros(3), one_force_lcs(1.0)
+        )

@@ -496,8 +496,16 @@ def circle(turns, n=2001, radius=0.1):
 
 @pytest.mark.parametrize("turns", [4.0, -3.0, 0.25])
 def test_progress_counts_full_turns_both_ways(turns):
-    progress = experiment.progress_of(circle(turns), (0.5, 0.0))
+    progress = experiment.progress_of(circle(turns), (0.5, 0.0), 0.1)
     np.testing.assert_allclose(progress[[0, -1]], [0.0, 2.0 * np.pi * turns], atol=1e-9)
+
+
+def test_angles_near_the_centre_are_no_progress():
+    """A ball that goes around the centre of the circle has followed no path."""
+    for radius, counted in ((0.04, 0.0), (0.06, 2.0), (0.14, 2.0), (0.16, 0.0)):
+        p = circle(2.0, radius=radius)
+        progress = experiment.progress_of(p, (0.5, 0.0), 0.1)
+        np.testing.assert_allclose(progress[-1], 2.0 * np.pi * counted, atol=1e-9)
 
 
 def scored(
@@ -513,7 +521,7 @@ def scored(
         time=time,
         p_ball=p,
         p_tip=p,
-        progress=experiment.progress_of(p, (0.5, 0.0)),
+        progress=experiment.progress_of(p, (0.5, 0.0), 0.1),
         error=np.broadcast_to(error, n),
         gap=np.broadcast_to(gap, n),
         gap_true=np.broadcast_to(gap_true, n),

@@ -440,6 +440,8 @@ def test_a_saved_context_replays_bit_for_bit():
         (dict(ball_radius=np.nan), "ball_radius must be positive, got nan"),
         (dict(position_std=-1e-3), "position_std must be positive, got -0.001"),
         (dict(acceleration_density=0.0), "acceleration_density must be positive"),
+        (dict(driven_density=-1.0), "driven_density is -1.0, expected 0 or more"),
+        (dict(driven_sec=0.0), "driven_sec must be positive, got 0.0"),
         (dict(table_z=0.9), "the camera at height 0.8 must be above the ball"),
         (dict(hue=np.inf), "hue must be finite, got inf"),
         (dict(period_sec=0.0), "period_sec must be positive, got 0.0"),

@@ -19,6 +19,7 @@ from makebreak.systems.numerics.rolling_task import (
     CirclePath,
     RollingConfig,
     TaskState,
+    landing,
     next_state,
     quintic,
     shifted,
@@ -117,13 +118,125 @@ def test_learned_gap_lowers_the_landing_by_as_much():
 def test_a_ball_that_is_not_seen_stops_the_push_and_lifts_the_tip():
     ball = np.array([0.6, 0.0])
     start = TaskState(ROLL, 0.0, [0.6, 0.0, 0.08], np.zeros(3), np.zeros(3))
-    _, history = run_task(
-        start, 2.5, ball, np.zeros(2), valid=lambda t: not 0.2 < t < 1.5
-    )
+    v = np.array([0.0, 0.06])  # 15 mm in 0.25 s.
+    ball = ball - [0.0, 0.02]
+    _, history = run_task(start, 2.5, ball, v, valid=lambda t: not 0.2 < t < 1.5)
     phases = {round(t, 4): state.phase for t, state, _ in history}
-    assert phases[0.2] == ROLL and phases[0.5] == WAIT and phases[1.6] == REPOSITION
+    assert phases[0.4375] == ROLL and phases[0.4875] == WAIT
+    assert phases[1.6] == REPOSITION
     z = [state.p[2] for t, state, _ in history if t > 1.3 and state.phase == WAIT]
     np.testing.assert_allclose(z, 2 * R_BALL + R_TIP + 0.03, atol=1e-12)
+
+
+def phases_after_a_sight(v_ball, seen_sec, t_end=2.0):
+    """How long a push goes on whose ball, seen at velocity v_ball, is then hidden."""
+    start = TaskState(ROLL, 0.0, [0.6, 0.0, 0.08], np.zeros(3), np.zeros(3))
+    state, config = start, RollingConfig(roll_sec=9.0)
+    for k in range(round(t_end / DT)):
+        x = pack([0.6, 0, 0.08], np.zeros(3), [0.6, 0, R_BALL], [*v_ball, 0], R_BALL)
+        state = next_state(config, PATH, state, k * DT, DT, x, 0.0,
+                           k * DT < seen_sec, R_BALL, R_TIP)  # fmt: skip
+        if state.phase == WAIT:
+            return k * DT - seen_sec
+    return np.inf
+
+
+@pytest.mark.parametrize(
+    "speed, patience", [(0.0, 1.5), (0.01, 1.5), (0.05, 0.3), (0.3, 0.05)]
+)
+def test_a_hidden_ball_is_waited_for_once_it_may_have_gone_15_mm(speed, patience):
+    found = phases_after_a_sight([speed, 0.0], seen_sec=0.3)
+    assert abs(found - patience) <= 2 * DT  # The tick of either end.
+
+
+def test_a_glimpse_tells_no_speed():
+    """A tracker that has just found a ball has a velocity of noise: 0.3 m/s here."""
+    assert phases_after_a_sight([0.3, 0.0], seen_sec=0.08) > 1.4
+
+
+def test_a_tip_that_hides_the_ball_withdraws_until_it_is_seen():
+    """The arm hides all that is less than 30 mm from the tip, seen from above."""
+    ball, goal = np.array([0.6, 0.0, R_BALL]), np.array([0.3, 0.0])
+    config = RollingConfig()
+    state = TaskState(WAIT, 0.0, [0.605, 0.0, 0.083], np.zeros(3), np.zeros(3), 0.083)
+    seen_at, p, v = None, [state.p], [state.v]
+    for k in range(200):
+        t = k * DT
+        valid = bool(np.hypot(*(state.p - ball)[:2]) > 0.03)
+        x = pack(state.p, state.v, ball, np.zeros(3), R_BALL)
+        state = next_state(config, PATH, state, t, DT, x, 0.0, valid, R_BALL, R_TIP,
+                           withdrawn=goal)  # fmt: skip
+        p.append(state.p)
+        v.append(state.v)
+        if valid:
+            seen_at = t
+            break
+    assert seen_at is not None and state.phase == REPOSITION
+    p, v = np.array(p), np.array(v)
+    # Not before it is above the ball, and no faster than it may.
+    moved = abs(p[:, 0] - p[0, 0]) > 1e-9
+    assert p[moved][0, 2] > 2 * R_BALL + R_TIP
+    assert np.hypot(v[:, 0], v[:, 1]).max() <= config.withdraw_speed + 1e-12
+    assert abs(np.diff(v[:, :2], axis=0)).max() <= 1.0 * DT + 1e-12
+    # Without a place to go to it would stay, and wait for ever.
+    stays = TaskState(WAIT, 0.0, [0.605, 0.0, 0.12], np.zeros(3), np.zeros(3), 0.12)
+    for k in range(200):
+        stays = next_state(config, PATH, stays, k * DT, DT, x, 0.0, False, R_BALL,
+                           R_TIP)  # fmt: skip
+    np.testing.assert_array_equal(stays.p[:2], [0.605, 0.0])
+
+
+def test_a_withdrawn_tip_comes_to_rest_at_its_place():
+    goal = np.array([0.3, 0.0])
+    state = TaskState(WAIT, 0.0, [0.6, 0.1, 0.2], np.zeros(3), np.zeros(3), 0.2)
+    x = pack(state.p, state.v, [0.6, 0, R_BALL], np.zeros(3), R_BALL)
+    for k in range(320):
+        state = next_state(RollingConfig(), PATH, state, k * DT, DT, x, 0.0, False,
+                           R_BALL, R_TIP, withdrawn=goal)  # fmt: skip
+    # Braking at half of what it may, in ticks of 12.5 ms.
+    np.testing.assert_allclose(state.p[:2], goal, atol=1e-3)
+    assert np.hypot(*state.v[:2]) < 0.02
+
+
+def test_a_long_reposition_takes_longer_and_is_no_faster():
+    config, fastest = RollingConfig(), []
+    for far in (1.0, 2.0):
+        ball = np.array([0.6, 0.0])
+        tip = [0.6, config.reposition_far * far - config.land_behind, 0.2]
+        start = TaskState(ROLL, -10.0, tip, np.zeros(3), np.zeros(3))
+        T = config.reposition_sec * far
+        _, history = run_task(start, T + 2 * DT, ball, np.zeros(2))
+        repositions = [s for _, s, _ in history if s.phase == REPOSITION]
+        # The heading, and so the place to land, turns by 1 % of the way.
+        assert abs(len(repositions) * DT - T) < 0.02 * T + 2 * DT
+        fastest.append(max(np.hypot(*s.v[:2]) for s in repositions))
+    assert abs(fastest[1] / fastest[0] - 1.0) < 0.05
+
+
+@pytest.mark.parametrize(
+    "strayed, offset", [(0.0, 0.018), (0.06, 0.009), (0.12, 0.0036)]
+)
+def test_the_less_a_ball_coasts_the_nearer_to_its_top_the_tip_lands(strayed, offset):
+    x = pack([0.6, 0, 0.1], np.zeros(3), [0.6, 0, R_BALL], np.zeros(3), R_BALL)
+    config = RollingConfig()
+    p, _ = landing(config, PATH, x, 0.0, 0.1, R_BALL, R_TIP, strayed)
+    np.testing.assert_allclose(np.hypot(*(p[:2] - [0.6, 0.0])), offset, rtol=1e-12)
+    reach = np.linalg.norm(p - [0.6, 0.0, R_BALL + config.land_above])
+    np.testing.assert_allclose(reach, R_BALL + R_TIP, rtol=1e-12)
+
+
+def test_where_a_ball_that_changes_its_mind_is_landed_on_is_near_its_top():
+    """The reposition itself uses what it saw of the ball."""
+    for v_late, offset in ((0.0, 0.018), (0.12, 0.0036)):
+
+        def v_ball(t, late=v_late):
+            return np.array([0.0, late if t > 0.2 else 0.0])
+
+        _, _, rows = approach(surface=-1.0, gap_std=0.0, v_ball=v_ball)
+        last = [s for _, s in rows if s.phase == REPOSITION][-1]
+        # The ball is shown at [.6, 0] although it has a velocity, by which it is led.
+        behind = [0.6, v_late * DT] - last.p[:2]
+        assert abs(np.hypot(*behind) - offset) < 2.5e-3
 
 
 def test_a_ball_that_is_not_seen_at_the_start_lifts_the_tip_from_where_it_is():
@@ -343,7 +456,10 @@ def test_a_ball_that_does_not_coast_is_felt_for(change, felt):
     def rocks(t):
         return np.array([0.0, change if 0.2 < t < 0.3 else 0.0])
 
-    _, z_land, rows = approach(surface=-1.0, gap_std=0.001, v_ball=rocks)
+    config, _, rows = approach(surface=-1.0, gap_std=0.001, v_ball=rocks)
+    # It is landed on nearer to its top.
+    offset = config.land_behind / (1.0 + (change / config.coast_change) ** 2)
+    z_land = surface_height(offset, R_BALL, R_TIP) + config.land_above
     lowest = z_land - 0.003 - 0.0015 if felt else z_land
     assert rows[-1][1].phase == ROLL
     assert rows[-1][1].p[2] == pytest.approx(lowest, abs=5e-4)

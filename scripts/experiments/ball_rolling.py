@@ -78,10 +78,21 @@ class Track:
     rolling: np.ndarray  # (n,) whether the task pushes.
 
 
-def progress_of(p, center):
-    """Angle (n,) [rad] that the points p (n, 3) have run through about center."""
-    angle = np.unwrap(np.arctan2(p[:, 1] - center[1], p[:, 0] - center[0]))
-    return angle - angle[0]
+def turned(before, after, radius):
+    """Angle(s) [rad] about zero from the points before, (2,) or (n, 2), to after. Only
+    within half a radius of the circle does it count: near the centre it costs nothing.
+    """
+    before, after = np.asarray(before), np.asarray(after)
+    angle = np.arctan2(after[..., 1], after[..., 0])
+    angle = angle - np.arctan2(before[..., 1], before[..., 0])
+    off = abs(np.hypot(after[..., 0], after[..., 1]) - radius)
+    return np.where(off <= 0.5 * radius, (angle + np.pi) % (2.0 * np.pi) - np.pi, 0.0)
+
+
+def progress_of(p, center, radius):
+    """Angle (n,) [rad] that the points p (n, 3) have run through along the circle."""
+    off = p[:, :2] - center
+    return np.append(0.0, np.cumsum(turned(off[:-1], off[1:], radius)))
 
 
 def first_time(time, condition):
@@ -112,16 +123,14 @@ def run(config, session):
         record["r_std"] = learner.GetOutputPort("r_std")
     at = plant.GetBodyByName("ball").floating_positions_start() + 4
     center = np.array(config.task.center)
-    run_through: list = [0.0, None]  # Progress and the last angle.
+    run_through: list = [0.0, None]  # Progress and the last place.
     taken = any(read_fault(text).kind.on == "ball" for text in config.faults)
 
     def done(t, sample):
         p = sample["state"][at : at + 2] - center
-        angle = np.arctan2(p[1], p[0])
         if run_through[1] is not None:
-            turn = angle - run_through[1]
-            run_through[0] += (turn + np.pi) % (2.0 * np.pi) - np.pi
-        run_through[1] = angle
+            run_through[0] += float(turned(run_through[1], p, config.task.radius))
+        run_through[1] = p
         stuck = t >= GIVE_UP_SEC and run_through[0] < np.pi / 2
         # Out of reach for good, that is: not in a hand.
         lost = np.hypot(*p) > config.task.radius + LOST and not taken
@@ -339,7 +348,7 @@ def ground_truth(config, log, plant) -> Track:
         time=log.time,
         p_ball=p_ball,
         p_tip=p_tip,
-        progress=progress_of(p_ball, center),
+        progress=progress_of(p_ball, center, config.task.radius),
         error=abs(np.linalg.norm(p_ball[:, :2] - center, axis=1) - config.task.radius),
         gap=log["gap"][:, 0],
         gap_true=distance - modelled,

@@ -10,7 +10,8 @@ front. The task therefore alternates between
                 height goes, down to where it is believed to be, slowly, and over as
                 soon as something is felt. Where little is known of the surface, or the
                 ball does not coast as a ball does, down to where it may be at least,
-    WAIT        the ball is not seen: the tip lifts and stays, and nothing is pushed.
+    WAIT        the ball is not seen: the tip lifts, and nothing is pushed. The arm
+                may hide the ball itself, so the tip then withdraws until it is seen.
 
 Source: ACI-MPC VII-B describes the behaviour (a push, then a new push from behind);
 times and distances are ours (docs/ball_rolling.md).
@@ -38,6 +39,9 @@ APPROACH_PLAN = (
 APPROACH_SLOPE, APPROACH_STOP = 1.5, 0.3  # To its speed, and at its end [m/s2].
 REACH = 0.015  # The ball's target is at most so far away; a tip that were to go further
 # at once would slip over the ball and leave it behind [m].
+
+WITHDRAW_ACCELERATION = 1.0  # [m/s2]
+GLIMPSE_SEC = 0.1  # A ball seen for a shorter time has no velocity yet.
 
 SHIFT_MAX = 0.008  # The aimed-at circle differs from the path by at most this [m].
 
@@ -96,6 +100,12 @@ class TaskState:
     vz_start: float = 0.0
     tare: float = 0.0  # Vertical force on the tip where the approach began [N].
     feel: bool = False  # Whether the approach goes on below the believed surface.
+    stretch: float = 1.0  # How much longer this reposition takes than the usual one.
+    # For how long the ball has been seen, or has not been seen; how fast it was when it
+    # was last seen for longer than GLIMPSE_SEC [m/s].
+    seen_sec: float = 0.0
+    unseen_sec: float = 0.0
+    speed_seen: float = 0.0
     # How much the ball's velocity has differed from what it was at the start of the
     # phase, at most [m/s]; that velocity (2,), None: not known yet.
     strayed: float = 0.0
@@ -129,6 +139,13 @@ class RollingConfig:
     approach_speed: float = 0.035  # [m/s]
     approach_max: float = 0.025  # The longest approach [m].
     touch_force: float = 4.0  # More on the tip than before is a touch [N].
+    # A ball that the arm hides is where it was, until it may have gone so far [m] at
+    # the speed that it had, or at least the other [m/s]. Then the task waits, and the
+    # tip goes at withdraw_speed to where it hides nothing of the circle.
+    unseen_drift: float = 0.015
+    unseen_speed: float = 0.01
+    withdraw_speed: float = 0.2  # [m/s]
+    reposition_far: float = 0.12  # Repositions that are longer take longer [m].
     ease: float = 0.42  # Share of the reposition for going up, and for coming down.
     integral_sec: float = 6.0  # Of the integral action on the ball's distance.
 
@@ -140,16 +157,19 @@ def surface_height(offset, radius_ball, radius_tip):
     return radius_ball + np.sqrt(max(reach**2 - offset**2, 0.0))
 
 
-def landing(config, path, x, gap, time_left, radius_ball, radius_tip):
-    """Where and how fast the tip should land: p (3,) [m], v (3,) [m/s].
+def landing(config, path, x, gap, time_left, radius_ball, radius_tip, strayed=0.0):
+    """Where and how fast the tip should land: p (3,) [m], v (3,) [m/s]. The less the
+    ball coasts, the nearer to its top, where missing it by a little costs least.
 
     Args:
         x: (19,) state; the ball is expected to keep its velocity for time_left [s].
         gap: how much lower the surface is believed to be than modelled [m].
+        strayed: how much its velocity has changed while nothing touched it [m/s].
     """
     p_ball = x[P_BALL][:2] + x[V_BALL][:2] * time_left
-    behind = -path.heading(p_ball) * config.land_behind
-    z = surface_height(config.land_behind, radius_ball, radius_tip)
+    offset = config.land_behind / (1.0 + (strayed / config.coast_change) ** 2)
+    behind = -path.heading(p_ball) * offset
+    z = surface_height(offset, radius_ball, radius_tip)
     p = np.append(p_ball + behind, z + config.land_above - gap)
     return p, np.append(x[V_BALL][:2], 0.0)
 
@@ -187,10 +207,13 @@ def reposition_step(
     Args: above: how far above the landing point it ends [m]; the ball may also be so
         much larger than believed, and is passed over accordingly.
     """
-    T, T_ease = config.reposition_sec, config.ease * config.reposition_sec
+    T = config.reposition_sec * state.stretch
+    T_ease = config.ease * T
     elapsed = min(t + dt - state.since_sec, T)
     left = max(T - (elapsed - dt), dt)
-    p_land, v_land = landing(config, path, x, gap, left, radius_ball, radius_tip)
+    p_land, v_land = landing(
+        config, path, x, gap, left, radius_ball, radius_tip, state.strayed
+    )
     start = state.p[:2], state.v[:2], state.a[:2]
     end = p_land[:2], v_land[:2], np.zeros(2)
     p, v, a = (np.zeros(3) for _ in range(3))
@@ -210,12 +233,27 @@ def reposition_step(
     return p, v, a
 
 
+def withdraw_step(config, state, dt, goal):
+    """Place and velocity seen from above, each (2,), a tick dt [s] after the last one,
+    on the way to goal (2,), where the tip stops."""
+    way = goal - state.p[:2]
+    distance = np.sqrt(way @ way)
+    fastest = min(
+        config.withdraw_speed, np.sqrt(2.0 * 0.5 * WITHDRAW_ACCELERATION * distance)
+    )
+    change = fastest * way / max(distance, 1e-9) - state.v[:2]
+    most = WITHDRAW_ACCELERATION * dt
+    change *= min(1.0, most / max(np.sqrt(change @ change), 1e-12))
+    v = state.v[:2] + change
+    return state.p[:2] + 0.5 * (state.v[:2] + v) * dt, v
+
+
 def approach_step(config, path, state, dt, x, gap, radius_ball, radius_tip, gap_std):
     """The reference (p, v, a), each (3,), a tick dt [s] after the last one, on the way
     down to the landing point, or to the lowest place of the surface; and whether it is
     there."""
     p_land, v_land = landing(
-        config, path, x, gap, APPROACH_PLAN, radius_ball, radius_tip
+        config, path, x, gap, APPROACH_PLAN, radius_ball, radius_tip, state.strayed
     )
     left = APPROACH_PLAN
     start = state.p[:2], state.v[:2], state.a[:2]
@@ -269,7 +307,7 @@ def _target(center, radius, x, lead, speed, z_tip, radius_ball, dt, n_knots):
 
 def next_state(
     config, path, state, t, dt, x, gap, valid, radius_ball, radius_tip, landed=None,
-    gap_std=0.0, force_z=0.0,
+    gap_std=0.0, force_z=0.0, withdrawn=None,
 ):  # fmt: skip
     """One tick of the task.
 
@@ -281,14 +319,31 @@ def next_state(
             its time is.
         gap_std: standard deviation of gap [m]. force_z: vertical force on the tip, as
             the arm feels it [N].
+        withdrawn: (2,) where the tip hides nothing from the camera [m]; None: where the
+            ball is lost sight of, it stays.
     Returns: TaskState: the phase, and unless rolling the reference at t + dt.
     """
 
     def lift_from(phase):
         p, v = x[P_TIP], x[V_TIP]
-        return TaskState(phase, t, p, v, np.zeros(3), p[2], v[2])
+        left = config.reposition_sec
+        goal, _ = landing(config, path, x, gap, left, radius_ball, radius_tip)
+        far = float(np.hypot(*(goal - p)[:2])) / config.reposition_far
+        return TaskState(
+            phase, t, p, v, np.zeros(3), p[2], v[2], stretch=max(1.0, far), **sight
+        )
 
-    if not valid:
+    v_ball = x[V_BALL][:2]
+    sight = dict(seen_sec=0.0, unseen_sec=0.0, speed_seen=state.speed_seen)
+    if valid:
+        sight["seen_sec"] = state.seen_sec + dt
+        if sight["seen_sec"] > GLIMPSE_SEC:
+            sight["speed_seen"] = float(np.sqrt(v_ball @ v_ball))
+    else:
+        sight["unseen_sec"] = state.unseen_sec + dt
+    state = replace(state, **sight)
+    drift = state.unseen_sec * max(state.speed_seen, config.unseen_speed)
+    if not valid and (state.phase == WAIT or drift > config.unseen_drift):
         if state.phase != WAIT:
             state = lift_from(WAIT)
         T = config.reposition_sec
@@ -298,14 +353,16 @@ def next_state(
         z, vz, az = quintic(elapsed, T, begin, (z_end, 0.0, 0.0))
         slow = max(0.0, 1.0 - 5.0 * dt / T)
         v_xy = state.v[:2] * slow
-        p = np.array([*(state.p[:2] + v_xy * dt), z])
-        return TaskState(
-            WAIT, state.since_sec, p, np.array([*v_xy, vz]), np.array([0, 0, az]),
-            state.z_start, state.vz_start,
+        p_xy = state.p[:2] + v_xy * dt
+        clear = 2 * radius_ball + radius_tip - min(gap, 0.0)
+        if withdrawn is not None and state.p[2] >= clear:
+            p_xy, v_xy = withdraw_step(config, state, dt, withdrawn)
+        return replace(
+            state, p=np.array([*p_xy, z]), v=np.array([*v_xy, vz]),
+            a=np.array([0, 0, az]),
         )  # fmt: skip
     if state.phase == WAIT:
         state = lift_from(REPOSITION)
-    v_ball = x[V_BALL][:2]
     if state.phase == ROLL:
         ball = x[P_BALL]
         off = (x[P_TIP] - ball)[:2]
@@ -318,10 +375,10 @@ def next_state(
             config, path, state, dt, x, gap, radius_ball, radius_tip, gap_std
         )
         if low or force_z - state.tare > config.touch_force:
-            return TaskState(ROLL, t, state.p, state.v, state.a)
+            return TaskState(ROLL, t, state.p, state.v, state.a, **sight)
         return replace(state, p=p, v=v, a=a)
     above = 0.0 if landed is not None else approach_height(config, gap_std)
-    over = t - state.since_sec >= config.reposition_sec - 0.5 * dt
+    over = t - state.since_sec >= config.reposition_sec * state.stretch - 0.5 * dt
     if state.since_sec < t and (over if landed is None else landed):
         feel = landed is None and gap_std > 0.0
         feel &= (
@@ -329,13 +386,12 @@ def next_state(
         )
         if above > 0.0 or feel:
             return replace(state, phase=APPROACH, since_sec=t, tare=force_z, feel=feel)
-        return TaskState(ROLL, t, state.p, state.v, state.a)
+        return TaskState(ROLL, t, state.p, state.v, state.a, **sight)
     p, v, a = reposition_step(
         config, path, state, t, dt, x, gap, radius_ball, radius_tip, above
     )
     off = v_ball - (v_ball if state.v_ball is None else state.v_ball)
-    return TaskState(
-        REPOSITION, state.since_sec, p, v, a, state.z_start, state.vz_start,
+    return replace(
+        state, p=p, v=v, a=a, v_ball=v_ball - off,
         strayed=max(state.strayed, float(np.sqrt(off @ off))),
-        v_ball=v_ball - off,
     )  # fmt: skip
