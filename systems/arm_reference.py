@@ -6,7 +6,6 @@ from pydrake.systems.framework import LeafSystem
 
 from makebreak.systems.numerics.arm_reference import (
     clip_norm,
-    lost_contact,
     next_end,
     on_the_line,
     pose_and_wrench,
@@ -24,9 +23,9 @@ class ArmReferenceConfig:
     force_max: float = 3.0  # Feed-forward is clipped to it [N].
     acceleration_max: float = 1.5  # Of the velocity reference while rolling [m/s2].
     down_max: float = 0.04  # Downwards while rolling, where contact may be early [m/s].
-    # Where the plan presses and less than follow_force is felt, the tip goes down by so
-    # much, and with the ball.
-    follow_speed: float = 0.03  # [m/s]
+    # Where a push feels less than follow_force the tip goes down so much faster, and
+    # with the ball.
+    follow_speed: float = 0.015  # [m/s]
     follow_force: float = 1.0  # [N]
     # No command moves the reference faster than that, however far away it is. The task
     # itself stays below 0.35 m/s and 4 m/s2.
@@ -49,9 +48,9 @@ class ArmReference(LeafSystem):
     away is gone to at speed_max, not within one period.
 
     The fed-forward force alone moves a well damped tip by some mm/s: too slow for the
-    dents of an object that rolls by under it, and off such an object the tip would run
-    ahead alone. So where it should press and feels nothing it goes down, and along with
-    the ball.
+    dents of an object that rolls by under it, and without contact C3's tip runs ahead
+    of the ball alone. So a rolling tip that feels nothing goes down, and along with the
+    ball, until it does.
 
     Inputs:  phase (1,), reference (9,) of RollingTask; x_next (19,), lam (n_lam,),
              status (1,) of C3; lcs (abstract), the one-step LCS that made them;
@@ -117,7 +116,7 @@ class ArmReference(LeafSystem):
             p = np.array(x_next[P_TIP])
             if self._tip_force.HasValue(context):
                 felt = self._tip_force.Eval(context)[2]
-                lost = lost_contact(-force[2], felt, c.follow_force)
+                lost = 1.0 - min(max(felt / c.follow_force, 0.0), 1.0)
                 change = lost * (x_next[V_BALL][:2] - v[:2])
                 p[:2] += change * c.period_sec
                 v[:2] += change

@@ -8,7 +8,6 @@ from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 from makebreak.systems.arm_reference import ArmReference, ArmReferenceConfig
 from makebreak.systems.numerics.arm_reference import (
     clip_norm,
-    lost_contact,
     next_end,
     on_the_line,
 )
@@ -162,37 +161,23 @@ def test_while_rolling_the_reference_goes_down_slowly_and_up_as_it_is_told():
         np.testing.assert_allclose(pose[9], expected, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "pressed, felt, expected",
-    [
-        (2.0, 0.0, 1.0),  # Pressed, and nothing there.
-        (2.0, -3.0, 1.0),
-        (2.0, 0.5, 0.5),
-        (2.0, 1.0, 0.0),  # In contact.
-        (2.0, 5.0, 0.0),
-        (0.0, 0.0, 0.0),  # Nothing is to be pressed.
-        (-1.0, 0.0, 0.0),
-        (0.4, 0.0, 0.4),
-    ],
-)
-def test_a_contact_is_lost_where_it_should_press_and_feels_nothing(
-    pressed, felt, expected
-):
-    np.testing.assert_allclose(lost_contact(pressed, felt, 1.0), expected)
-
-
 def test_a_tip_that_has_lost_its_contact_goes_down_and_with_the_ball():
     x_next = np.zeros(19)
     x_next[0], x_next[10], x_next[16] = 1e-4, 0.012, 0.004  # p, v of tip; v of ball.
     found = {}
-    for lam, felt in ((0.5, 0.0), (2.0, 3.0), (0.0, 0.0), (2.0, None)):
-        x_desired, _ = run(ROLL, x_next, [lam], tip_force=felt)
-        found[lam, felt] = x_desired[[0, 7, 9]]
-    dt, change = 0.0125, 0.5 * (0.004 - 0.012)
-    lost = [1e-4 + change * dt, 0.012 + change, -0.5 * 0.03]
-    np.testing.assert_allclose(found.pop((0.5, 0.0)), lost, atol=1e-12)
-    for kept in found.values():  # In contact, not pressed, or without a feeling.
-        np.testing.assert_allclose(kept, [1e-4, 0.012, 0.0], atol=1e-12)
+    for felt in (-1.0, 0.0, 0.5, 1.0, 3.0, None):
+        x_desired, _ = run(ROLL, x_next, [2.0], 0.012499, tip_force=felt)
+        found[felt] = x_desired[[0, 7, 9]]
+    dt = 0.0125
+    for felt, lost in ((-1.0, 1.0), (0.0, 1.0), (0.5, 0.5)):
+        change = lost * (0.004 - 0.012)
+        # The reference starts at rest, and changes by 1.5 m/s2 at most.
+        v = clip_norm(np.array([0.012 + change, -lost * 0.015]), 1.5 * dt)
+        expected = [1e-4 + change * dt, *v]
+        # 1e-4 before the end of a line of at most 0.02 m/s.
+        np.testing.assert_allclose(found[felt], expected, atol=2e-6)
+    for felt in (1.0, 3.0, None):  # In contact, or without a feeling.
+        np.testing.assert_allclose(found[felt], [1e-4, 0.012, 0.0], atol=2e-6)
 
 
 def test_what_cannot_be_followed_is_refused_by_name():

@@ -214,7 +214,7 @@ def test_a_long_reposition_takes_longer_and_is_no_faster():
 
 
 @pytest.mark.parametrize(
-    "strayed, offset", [(0.0, 0.018), (0.06, 0.009), (0.12, 0.0036)]
+    "strayed, offset", [(0.0, 0.018), (0.12, 0.009), (0.24, 0.0036)]
 )
 def test_the_less_a_ball_coasts_the_nearer_to_its_top_the_tip_lands(strayed, offset):
     x = pack([0.6, 0, 0.1], np.zeros(3), [0.6, 0, R_BALL], np.zeros(3), R_BALL)
@@ -227,7 +227,7 @@ def test_the_less_a_ball_coasts_the_nearer_to_its_top_the_tip_lands(strayed, off
 
 def test_where_a_ball_that_changes_its_mind_is_landed_on_is_near_its_top():
     """The reposition itself uses what it saw of the ball."""
-    for v_late, offset in ((0.0, 0.018), (0.12, 0.0036)):
+    for v_late, offset in ((0.0, 0.018), (0.24, 0.0036)):
 
         def v_ball(t, late=v_late):
             return np.array([0.0, late if t > 0.2 else 0.0])
@@ -458,7 +458,7 @@ def test_a_ball_that_does_not_coast_is_felt_for(change, felt):
 
     config, _, rows = approach(surface=-1.0, gap_std=0.001, v_ball=rocks)
     # It is landed on nearer to its top.
-    offset = config.land_behind / (1.0 + (change / config.coast_change) ** 2)
+    offset = config.land_behind / (1.0 + (change / 0.12) ** 2)
     z_land = surface_height(offset, R_BALL, R_TIP) + config.land_above
     lowest = z_land - 0.003 - 0.0015 if felt else z_land
     assert rows[-1][1].phase == ROLL

@@ -36,17 +36,6 @@ def pose_and_wrench(line, t, period_sec):
     return both
 
 
-def lost_contact(pressed, felt, enough):
-    """How much a contact that should be there is lost, 0 to 1.
-
-    Args: pressed: downward force that is planned [N]; felt: upward force on the tip;
-        enough: as much of either is contact [N].
-    """
-    if not pressed > 0.0:
-        return 0.0
-    return min(max(0.0, 1.0 - max(felt, 0.0) / enough), pressed / enough)
-
-
 def next_end(start, target, dp_max, v_max, dv_max, a_max):
     """Where the line from `start` towards `target` ends.
 

@@ -41,6 +41,7 @@ REACH = 0.015  # The ball's target is at most so far away; a tip that were to go
 # at once would slip over the ball and leave it behind [m].
 
 WITHDRAW_ACCELERATION = 1.0  # [m/s2]
+LAND_CHANGE = 0.12  # So much change of the ball's velocity halves its offset [m/s].
 GLIMPSE_SEC = 0.1  # A ball seen for a shorter time has no velocity yet.
 
 SHIFT_MAX = 0.008  # The aimed-at circle differs from the path by at most this [m].
@@ -123,7 +124,7 @@ class TaskState:
 
 @dataclass
 class RollingConfig:
-    roll_sec: float = 1.0
+    roll_sec: float = 1.5
     roll_ahead: float = 0.025  # Tip at most so far from the ball, seen from above [m].
     reposition_sec: float = 0.55
     lift: float = 0.015  # Clearance over the ball while passing it [m].
@@ -167,7 +168,7 @@ def landing(config, path, x, gap, time_left, radius_ball, radius_tip, strayed=0.
         strayed: how much its velocity has changed while nothing touched it [m/s].
     """
     p_ball = x[P_BALL][:2] + x[V_BALL][:2] * time_left
-    offset = config.land_behind / (1.0 + (strayed / config.coast_change) ** 2)
+    offset = config.land_behind / (1.0 + (strayed / LAND_CHANGE) ** 2)
     behind = -path.heading(p_ball) * offset
     z = surface_height(offset, radius_ball, radius_tip)
     p = np.append(p_ball + behind, z + config.land_above - gap)
