@@ -639,6 +639,7 @@ def add_ball_rolling(
     connect(c3, "status", reference, "status")
     connect(lcs["command"], "lcs", reference, "lcs")
     connect(estimator, "tip_force", reference, "tip_force")
+    connect(task, "feel", reference, "feel")
     connect(station, f"{ARM}.position_measured", impedance, "q")
     connect(station, f"{ARM}.velocity_measured", impedance, "v")
     if station.HasOutputPort(DELAY):

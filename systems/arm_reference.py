@@ -23,8 +23,8 @@ class ArmReferenceConfig:
     force_max: float = 3.0  # Feed-forward is clipped to it [N].
     acceleration_max: float = 1.5  # Of the velocity reference while rolling [m/s2].
     down_max: float = 0.04  # Downwards while rolling, where contact may be early [m/s].
-    # Where a push feels less than follow_force the tip goes down so much faster, and
-    # with the ball.
+    # Where a push that has to feel for the ball feels less than follow_force, the tip
+    # goes down so much faster, and with the ball.
     follow_speed: float = 0.015  # [m/s]
     follow_force: float = 1.0  # [N]
     # No command moves the reference faster than that, however far away it is. The task
@@ -49,12 +49,14 @@ class ArmReference(LeafSystem):
 
     The fed-forward force alone moves a well damped tip by some mm/s: too slow for the
     dents of an object that rolls by under it, and without contact C3's tip runs ahead
-    of the ball alone. So a rolling tip that feels nothing goes down, and along with the
-    ball, until it does.
+    of the ball alone. So a rolling tip that has to feel for the ball and feels nothing
+    goes down, and along with the ball, until it does. (On a hard and smooth ball, which
+    needs it not, it would hop.)
 
     Inputs:  phase (1,), reference (9,) of RollingTask; x_next (19,), lam (n_lam,),
              status (1,) of C3; lcs (abstract), the one-step LCS that made them;
-             optional tip_force (3,) on the tip, as the arm feels it [N].
+             optional feel (1,) of RollingTask, and then tip_force (3,) on the tip, as
+             the arm feels it [N].
     Outputs: x_desired (19,) = [p, quaternion, v, w, a, alpha], position and its
              derivatives only (the quaternion is the identity); wrench (6,) force first;
              command (25,), one after the other: for who asks for both each millisecond.
@@ -62,10 +64,9 @@ class ArmReference(LeafSystem):
 
     def __init__(self, config: ArmReferenceConfig, n_lam: int, p_tip, lcs: LCS):
         super().__init__()
-        if not config.follow_force > 0.0 or not config.follow_speed >= 0.0:
+        if not config.follow_force > 0.0:
             raise ValueError(
-                "follow_force must be positive and follow_speed 0 or more, got "
-                f"{config.follow_force}, {config.follow_speed}"
+                f"follow_force is {config.follow_force}, expected more than 0"
             )
         self._config, self._period = config, config.period_sec
         self._phase = self.DeclareVectorInputPort("phase", 1)
@@ -75,6 +76,7 @@ class ArmReference(LeafSystem):
         self._status = self.DeclareVectorInputPort("status", 1)
         self._lcs = self.DeclareAbstractInputPort("lcs", AbstractValue.Make(lcs))
         self._tip_force = self.DeclareVectorInputPort("tip_force", 3)
+        self._feel = self.DeclareVectorInputPort("feel", 1)
         self._zero = np.zeros(3)
         at_rest = np.concatenate([p_tip, np.zeros(9)])
         reference = np.zeros(25)
@@ -114,7 +116,7 @@ class ArmReference(LeafSystem):
             force = clip_norm(-on_tip, c.force_max)
             v = np.array(x_next[V_TIP])
             p = np.array(x_next[P_TIP])
-            if self._tip_force.HasValue(context):
+            if self._feel.HasValue(context) and self._feel.Eval(context)[0] > 0.5:
                 felt = self._tip_force.Eval(context)[2]
                 lost = 1.0 - min(max(felt / c.follow_force, 0.0), 1.0)
                 change = lost * (x_next[V_BALL][:2] - v[:2])

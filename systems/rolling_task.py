@@ -46,7 +46,8 @@ class RollingTask(LeafSystem):
              ends when this is 1, not in time.
     Outputs: x_desired ((N+1) 19,) for C3; reference (9,) = p, v, a of the tip at the
              next tick, used unless rolling; phase (1,): 0 roll, 1 reposition, 2 wait,
-             3 approach.
+             3 approach; feel (1,): 1 where little is known of the surface, or the ball
+             does not coast as a ball does, so that a push has to feel for it.
 
     A ball that is OUT_OF_REACH is as one that is not seen.
 
@@ -86,9 +87,11 @@ class RollingTask(LeafSystem):
         self._reference = self.DeclareDiscreteState([*p_tip, *np.zeros(6)])
         self._shift = self.DeclareDiscreteState([0.0])  # Of the circle's radius [m].
         self._phase = self.DeclareDiscreteState([float(WAIT)])
+        self._feel = self.DeclareDiscreteState([0.0])
         self.DeclareStateOutputPort("x_desired", self._x_desired)
         self.DeclareStateOutputPort("reference", self._reference)
         self.DeclareStateOutputPort("phase", self._phase)
+        self.DeclareStateOutputPort("feel", self._feel)
         self.DeclarePeriodicUnrestrictedUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
@@ -143,6 +146,7 @@ class RollingTask(LeafSystem):
             int(self._reference), np.concatenate([task.p, task.v, task.a])
         )
         discrete.set_value(int(self._phase), [float(task.phase)])
+        discrete.set_value(int(self._feel), [float(task.feel)])
         discrete.set_value(int(self._shift), [shift])
 
 
@@ -158,8 +162,8 @@ def _check(config: RollingTaskConfig):
     for name in ("speed", "lead_deg", "press"):
         if not np.isfinite(getattr(config, name)):
             raise ValueError(f"task.{name} is {getattr(config, name)}, expected finite")
-    for name in ("roll_sec", "reposition_sec", "approach_speed", "touch_force",
-                 "land_above", "coast_change", "withdraw_speed",
+    for name in ("roll_sec", "roll_feel_sec", "reposition_sec", "approach_speed",
+                 "touch_force", "land_above", "coast_change", "withdraw_speed",
                  "reposition_far", "unseen_drift"):  # fmt: skip
         if not 0.0 < getattr(rolling, name) < np.inf:
             raise ValueError(

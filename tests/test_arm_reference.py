@@ -64,7 +64,14 @@ REFERENCE = np.array([1, 2, 3, 40, 50, 60, 700, 800, 900]) * 1e-3
 
 
 def run(
-    phase, x_next, lam, t_end=0.0126, status=0.0, reference=REFERENCE, tip_force=None
+    phase,
+    x_next,
+    lam,
+    t_end=0.0126,
+    status=0.0,
+    reference=REFERENCE,
+    tip_force=None,
+    feel=1.0,
 ):
     builder = DiagramBuilder()
     lcs = one_force_lcs(2.0)
@@ -78,6 +85,8 @@ def run(
     if tip_force is not None:
         source = builder.AddSystem(ConstantVectorSource([0.0, 0.0, tip_force]))
         builder.Connect(source.get_output_port(), arm.GetInputPort("tip_force"))
+        source = builder.AddSystem(ConstantVectorSource([feel]))
+        builder.Connect(source.get_output_port(), arm.GetInputPort("feel"))
     source = builder.AddSystem(ConstantValueSource(AbstractValue.Make(lcs)))
     builder.Connect(source.get_output_port(), arm.GetInputPort("lcs"))
     diagram = builder.Build()
@@ -163,7 +172,7 @@ def test_while_rolling_the_reference_goes_down_slowly_and_up_as_it_is_told():
 
 def test_a_tip_that_has_lost_its_contact_goes_down_and_with_the_ball():
     x_next = np.zeros(19)
-    x_next[0], x_next[10], x_next[16] = 1e-4, 0.012, 0.004  # p, v of tip; v of ball.
+    x_next[0], x_next[10], x_next[16] = 3e-4, 0.012, 0.004  # p, v of tip; v of ball.
     found = {}
     for felt in (-1.0, 0.0, 0.5, 1.0, 3.0, None):
         x_desired, _ = run(ROLL, x_next, [2.0], 0.012499, tip_force=felt)
@@ -173,15 +182,17 @@ def test_a_tip_that_has_lost_its_contact_goes_down_and_with_the_ball():
         change = lost * (0.004 - 0.012)
         # The reference starts at rest, and changes by 1.5 m/s2 at most.
         v = clip_norm(np.array([0.012 + change, -lost * 0.015]), 1.5 * dt)
-        expected = [1e-4 + change * dt, *v]
+        expected = [3e-4 + change * dt, *v]
         # 1e-4 before the end of a line of at most 0.02 m/s.
         np.testing.assert_allclose(found[felt], expected, atol=2e-6)
-    for felt in (1.0, 3.0, None):  # In contact, or without a feeling.
-        np.testing.assert_allclose(found[felt], [1e-4, 0.012, 0.0], atol=2e-6)
+    x_desired, _ = run(ROLL, x_next, [2.0], 0.012499, tip_force=0.0, feel=0.0)
+    found["needs it not"] = x_desired[[0, 7, 9]]
+    for felt in (1.0, 3.0, None, "needs it not"):  # In contact, or without a feeling.
+        np.testing.assert_allclose(found[felt], [3e-4, 0.012, 0.0], atol=2e-6)
 
 
 def test_what_cannot_be_followed_is_refused_by_name():
-    with pytest.raises(ValueError, match="follow_force must be positive"):
+    with pytest.raises(ValueError, match="follow_force is 0.0, expected more"):
         ArmReference(
             ArmReferenceConfig(follow_force=0.0), 1, np.zeros(3), one_force_lcs(1.0)
         )

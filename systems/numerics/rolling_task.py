@@ -42,6 +42,7 @@ REACH = 0.015  # The ball's target is at most so far away; a tip that were to go
 
 WITHDRAW_ACCELERATION = 1.0  # [m/s2]
 LAND_CHANGE = 0.12  # So much change of the ball's velocity halves its offset [m/s].
+SPEED_SEC = 0.15
 GLIMPSE_SEC = 0.1  # A ball seen for a shorter time has no velocity yet.
 
 SHIFT_MAX = 0.008  # The aimed-at circle differs from the path by at most this [m].
@@ -100,13 +101,15 @@ class TaskState:
     z_start: float = 0.0  # Height and climb where the phase began [m], [m/s].
     vz_start: float = 0.0
     tare: float = 0.0  # Vertical force on the tip where the approach began [N].
-    feel: bool = False  # Whether the approach goes on below the believed surface.
+    # Whether the tip has to feel for the ball: its approach goes on below the believed
+    # surface, and its push is longer.
+    feel: bool = False
     stretch: float = 1.0  # How much longer this reposition takes than the usual one.
     # For how long the ball has been seen, or has not been seen; how fast it was when it
-    # was last seen for longer than GLIMPSE_SEC [m/s].
+    # was last seen for longer than GLIMPSE_SEC, as a mean over SPEED_SEC [m/s].
     seen_sec: float = 0.0
     unseen_sec: float = 0.0
-    speed_seen: float = 0.0
+    v_seen: tuple[float, float] = (0.0, 0.0)
     # How much the ball's velocity has differed from what it was at the start of the
     # phase, at most [m/s]; that velocity (2,), None: not known yet.
     strayed: float = 0.0
@@ -124,7 +127,8 @@ class TaskState:
 
 @dataclass
 class RollingConfig:
-    roll_sec: float = 1.5
+    roll_sec: float = 1.0
+    roll_feel_sec: float = 1.5  # The same where the tip has to feel for the ball.
     roll_ahead: float = 0.025  # Tip at most so far from the ball, seen from above [m].
     reposition_sec: float = 0.55
     lift: float = 0.015  # Clearance over the ball while passing it [m].
@@ -143,8 +147,8 @@ class RollingConfig:
     # A ball that the arm hides is where it was, until it may have gone so far [m] at
     # the speed that it had, or at least the other [m/s]. Then the task waits, and the
     # tip goes at withdraw_speed to where it hides nothing of the circle.
-    unseen_drift: float = 0.015
-    unseen_speed: float = 0.01
+    unseen_drift: float = 0.02
+    unseen_speed: float = 0.006
     withdraw_speed: float = 0.2  # [m/s]
     reposition_far: float = 0.12  # Repositions that are longer take longer [m].
     ease: float = 0.42  # Share of the reposition for going up, and for coming down.
@@ -335,15 +339,17 @@ def next_state(
         )
 
     v_ball = x[V_BALL][:2]
-    sight = dict(seen_sec=0.0, unseen_sec=0.0, speed_seen=state.speed_seen)
+    sight: dict = dict(seen_sec=0.0, unseen_sec=0.0, v_seen=state.v_seen)
     if valid:
         sight["seen_sec"] = state.seen_sec + dt
         if sight["seen_sec"] > GLIMPSE_SEC:
-            sight["speed_seen"] = float(np.sqrt(v_ball @ v_ball))
+            was, share = np.array(state.v_seen), min(dt / SPEED_SEC, 1.0)
+            sight["v_seen"] = tuple(was + share * (v_ball - was))
     else:
         sight["unseen_sec"] = state.unseen_sec + dt
     state = replace(state, **sight)
-    drift = state.unseen_sec * max(state.speed_seen, config.unseen_speed)
+    speed = max(float(np.hypot(*state.v_seen)), config.unseen_speed)
+    drift = state.unseen_sec * speed
     if not valid and (state.phase == WAIT or drift > config.unseen_drift):
         if state.phase != WAIT:
             state = lift_from(WAIT)
@@ -368,7 +374,8 @@ def next_state(
         ball = x[P_BALL]
         off = (x[P_TIP] - ball)[:2]
         # In front of it, or beside a ball that has rolled away from under it.
-        if t - state.since_sec < config.roll_sec and off @ off < config.roll_ahead**2:
+        longest = config.roll_feel_sec if state.feel else config.roll_sec
+        if t - state.since_sec < longest and off @ off < config.roll_ahead**2:
             return state
         state = lift_from(REPOSITION)
     if state.phase == APPROACH:
@@ -376,7 +383,9 @@ def next_state(
             config, path, state, dt, x, gap, radius_ball, radius_tip, gap_std
         )
         if low or force_z - state.tare > config.touch_force:
-            return TaskState(ROLL, t, state.p, state.v, state.a, **sight)
+            return TaskState(
+                ROLL, t, state.p, state.v, state.a, feel=state.feel, **sight
+            )
         return replace(state, p=p, v=v, a=a)
     above = 0.0 if landed is not None else approach_height(config, gap_std)
     over = t - state.since_sec >= config.reposition_sec * state.stretch - 0.5 * dt
