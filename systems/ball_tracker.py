@@ -131,7 +131,7 @@ class BallTracker(LeafSystem):
         state = context.get_discrete_state(self._state).value()
         v, P = state[_V], state[_COVARIANCE]
         lost = state[_UNSEEN_SEC] > HOLD_SEC
-        estimate = self._predict(_unflat(state[_MODELS:]))
+        estimate: interacting_models.Estimate = self._predict(_unflat(state[_MODELS:]))
         p_next, _, P_next = interacting_models.combined(*estimate)
         picture: Any = self._image.Eval(context)
         image = picture.data
@@ -177,7 +177,7 @@ class BallTracker(LeafSystem):
         if np.isfinite(state).all():
             discrete_state.set_value(self._state, state)
 
-    def _predict(self, estimate):
+    def _predict(self, estimate: interacting_models.Estimate):
         return interacting_models.predict(
             *estimate, self._chances, self._config.period_sec, self._densities
         )

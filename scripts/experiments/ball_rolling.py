@@ -179,10 +179,9 @@ def run_on_lcm(config, session, url: str) -> dict:
         if sample["seen"][0] < 0.5:
             return ""
         p = sample["x"][P_BALL][:2] - center
-        angle = float(np.arctan2(p[1], p[0]))
         if rolled[1] is not None:
-            rolled[0] += (angle - rolled[1] + np.pi) % (2.0 * np.pi) - np.pi
-        rolled[1] = angle
+            rolled[0] += float(turned(rolled[1], p, radius))
+        rolled[1] = p
         return ending(rolled[0], False, np.hypot(*p) > radius + LOST)
 
     def begin(_, context, q):
@@ -193,7 +192,7 @@ def run_on_lcm(config, session, url: str) -> dict:
     if not seen.any():
         raise ValueError("--robot lcm: the ball was never seen")
     p_ball = log["x"][seen][:, P_BALL]
-    progress = progress_of(p_ball, center)
+    progress = progress_of(p_ball, center, radius)
     off = abs(np.linalg.norm(p_ball[:, :2] - center, axis=1) - radius)
     after = off[int(np.argmax(progress >= np.pi / 2)) :]
     circles = float(progress.max() / (2.0 * np.pi))

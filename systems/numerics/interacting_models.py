@@ -16,6 +16,7 @@ import numpy as np
 
 from makebreak.systems.numerics import constant_velocity
 
+Estimate = tuple[np.ndarray, np.ndarray, np.ndarray]
 LEAST = 1e-6  # No model's probability falls below this: it could not come back.
 
 
