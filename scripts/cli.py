@@ -626,6 +626,13 @@ def _bench(args) -> int:
     return 1 if table.missed else 0  # A bench that failed is a missed row.
 
 
+def _completion(args) -> int:
+    from makebreak.scripts.completion import completion
+
+    print(completion(_parser(), args.shell, EXPERIMENTS))
+    return 0
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="makebreak",
@@ -803,6 +810,10 @@ def _parser() -> argparse.ArgumentParser:
     p = commands.add_parser("bench", help="how long the parts take, as table and JSON")
     p.add_argument("names", nargs="*", metavar="NAME")
     p.set_defaults(function=_bench)
+
+    p = commands.add_parser("completion", help="what a shell completes, as its script")
+    p.add_argument("shell", metavar="SHELL", help="bash, zsh, fish or tcsh")
+    p.set_defaults(function=_completion)
     for name in ("run", "gap", "export-tests"):
         commands.choices[name].add_argument(
             "--package", action="append", default=[], metavar="NAME=PATH",
