@@ -432,7 +432,7 @@ class ContactProblem(ContactDynamics, GapProblem):
             if n < LEAST_CELLS:
                 return []
             grid.append(np.linspace(low, high, n + 1))
-        r, train, step = current.r, self.train(), -0.2 * mu
+        r, train = current.r, self.train()
 
         def patch(friction, sides) -> dict[str, float]:
             names = ("x_min", "x_max", "y_min", "y_max")
@@ -445,16 +445,17 @@ class ContactProblem(ContactDynamics, GapProblem):
 
         nx, ny = len(grid[0]) - 1, len(grid[1]) - 1
         count, _, _ = np.histogram2d(places[:, 0], places[:, 1], bins=grid)
-        cells = np.zeros((nx, ny, int(train.sum())))
-        for i in range(nx):
-            for j in range(ny):
-                if count[i, j] < 1:
-                    continue
+        rectangles = []
+        # More friction is not less of it turned round: other forces are at limits.
+        for step in (-0.2 * mu, 0.2 * mu):
+            cells = np.zeros((nx, ny, int(train.sum())))
+            for i, j in np.argwhere(count):
                 new = moved(mu + step, (*grid[0][i : i + 2], *grid[1][j : j + 2]))
                 if new is not None:
                     cells[i, j] = ((r - new) / step)[train]
+            rectangles += _best_rectangles(cells, r[train], mu)
         found = []
-        for c, (i0, i1, j0, j1) in _best_rectangles(cells, r[train], mu):
+        for c, (i0, i1, j0, j1) in rectangles:
             box = np.array([grid[0][i0], grid[0][i1], grid[1][j0], grid[1][j1]])
             for f in dict.fromkeys((mu + c, 0.5 * mu, 1.6 * mu)):
                 new = moved(f, box)

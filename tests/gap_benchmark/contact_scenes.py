@@ -448,8 +448,9 @@ def _with_ground(s: Setting) -> Setting:
             t = next((t for t in s.things if t.body == fixed and not t.mass), None)
             if t is None:
                 continue
-            with_ = [x.friction for u in s.things if u.body == other for x in u.shapes]
-            low = min(with_) if with_ else (s.tool.friction if s.tool else 0.0)
+            # What lies on the ground are a thing's last shapes, its feet.
+            feet = [u.shapes[-1].friction for u in s.things if u.body == other]
+            low = feet[0] if feet else (s.tool.friction if s.tool else 0.0)
             if mu >= 2.0 * low:
                 raise ValueError("no ground makes so much friction with it")
             own = mu * low / (2.0 * low - mu)
