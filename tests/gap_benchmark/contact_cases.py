@@ -204,7 +204,10 @@ def hide(s: Setting, names, rng) -> tuple[Setting, list[dict]]:
             p = {"linear": value, "angular": 0.0}
         elif name == "adhesion":
             assert thing is not None
-            s = replace(s, adhesion=rng.uniform(0.4, 0.7) * thing.mass * G)
+            # More than friction holds: what is pulled comes along.
+            ground = next(t for t in s.things if not t.mass)
+            mu = pair_friction(thing.shapes[-1], ground.shapes[0])
+            s = replace(s, adhesion=rng.uniform(1.4, 1.9) * mu * thing.mass * G)
             kind, at, p = "adhesion", thing.body, {"force": s.adhesion}
         else:
             raise ValueError(f"no law for {name}")
