@@ -345,8 +345,11 @@ def preferred_by_simulation(
 
 
 def _borne_out(gap: GapMeasure) -> bool:
-    """Whether simulated windows do better with what is named, or show no gap."""
-    return gap.before <= NO_GAP or gap.reduction >= TOLD
+    """Whether simulated windows do better with what is named; where they show no gap
+    without it, whether they show none with it."""
+    if gap.before <= NO_GAP:
+        return gap.after <= NO_GAP
+    return gap.reduction >= TOLD
 
 
 def _nothing(start: float, end: float) -> GapMeasure:

@@ -476,3 +476,11 @@ def test_a_patch_s_side_that_nothing_crossed_may_be_anywhere():
     sides = {"x_min": -0.1, "x_max": 2.5, "y_min": -9.0, "y_max": 0.2}
     assert is_sane(Effect("friction_patch", [PAIR], {"friction": 0.4} | sides))
     assert not is_sane(Effect("friction_patch", [PAIR], {"friction": 3.0} | sides))
+
+
+@pytest.mark.parametrize(
+    "before, after, good",
+    [(0.9, 0.8, True), (0.9, 2.1, False), (8.0, 2.0, True), (8.0, 5.0, False)],
+)
+def test_effects_that_make_a_gap_in_simulation_are_not_borne_out(before, after, good):
+    assert workflow._borne_out(GapMeasure(before, after, 1.0, 0.6)) == good
