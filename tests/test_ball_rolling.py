@@ -353,6 +353,26 @@ def test_conditions_are_the_worlds_alone():
     assert "rolling_resistance" in kinds
 
 
+def test_a_push_is_told_whether_it_feels_for_the_ball_and_what_it_feels(
+    diagram, rolling
+):
+    """Of the ports that the reference can do without: a loose one changes nothing that
+    fails at once."""
+    reference = diagram.GetSubsystemByName("arm_reference")
+    context = reference.GetMyContextFromRoot(rolling.context)
+    for port, system, output in (
+        ("feel", "rolling_task", "feel"),
+        ("tip_force", "state_estimator", "tip_force"),
+    ):
+        there = rolling.run.diagram.GetSubsystemByName(system)
+        value = there.GetOutputPort(output).Eval(
+            there.GetMyContextFromRoot(rolling.context)
+        )
+        np.testing.assert_array_equal(reference.GetInputPort(port).Eval(context), value)
+    # The first push is into what nobody knows yet.
+    assert reference.GetInputPort("feel").Eval(context)[0] == 1.0
+
+
 def test_world_and_model_start_from_one_file():
     assert BallRollingConfig().world == BallRollingConfig().model
     model, _ = believed(config(radius_error_m=0.0))

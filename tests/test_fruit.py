@@ -32,6 +32,20 @@ def test_an_orange_has_bumps_and_dents_of_three_percent(seed):
     assert 0.96 < r.min() < 0.98 and r.std() > 0.008
 
 
+def test_a_fruit_rolls_with_its_own_resistance_unless_told_otherwise():
+    def lever(**changes):
+        effects = world_scene(BallRollingConfig(**changes)).effects
+        return [
+            e.parameters["coefficient"] for e in effects
+            if e.kind == "rolling_resistance"
+        ]  # fmt: skip
+
+    assert lever() == [0.005]
+    assert lever(object="lime") == [FRUITS["lime"].rolling_resistance] == [0.01]
+    assert lever(object="lime", rolling_resistance=0.02) == [0.02]
+    assert lever(object="lime", rolling_resistance=0.0) == []
+
+
 def test_a_lime_is_longer_by_twelve_percent():
     fruit = make_fruit("lime", 5)
     u = directions(20000)

@@ -187,6 +187,23 @@ def test_a_tip_that_hides_the_ball_withdraws_until_it_is_seen():
     np.testing.assert_array_equal(stays.p[:2], [0.605, 0.0])
 
 
+def test_the_task_withdraws_to_where_its_config_says():
+    config = RollingTaskConfig(withdrawn=[0.45, 0.05])
+    system = RollingTask(config, 6, 0.1, R_BALL, R_TIP, 8, 4, 0.05, p_tip=(0.5, 0, 0.2))
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    for name, value in (
+        ("x", np.eye(19)[3]), ("valid", [0.0]), ("r_comp", np.zeros(8)),
+    ):  # fmt: skip
+        system.GetInputPort(name).FixValue(context, value)
+    simulator.AdvanceTo(2.0)
+    p = system.GetOutputPort("reference").Eval(context)[:2]
+    np.testing.assert_allclose(p, [0.45, 0.05], atol=1e-3)
+    with pytest.raises(ValueError, match="task.withdrawn is .*, expected 2 numbers"):
+        bad = RollingTaskConfig(withdrawn=[0.3])
+        RollingTask(bad, 6, 0.1, R_BALL, R_TIP, 8, 4, 0.05)
+
+
 def test_a_withdrawn_tip_comes_to_rest_at_its_place():
     goal = np.array([0.3, 0.0])
     state = TaskState(WAIT, 0.0, [0.6, 0.1, 0.2], np.zeros(3), np.zeros(3), 0.2)
