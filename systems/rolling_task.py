@@ -7,6 +7,7 @@ from pydrake.systems.framework import LeafSystem
 from makebreak.systems.numerics.ball_state import N_X, P_BALL
 from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.rolling_task import (
+    ROLL,
     WAIT,
     CirclePath,
     RollingConfig,
@@ -46,8 +47,8 @@ class RollingTask(LeafSystem):
              ends when this is 1, not in time.
     Outputs: x_desired ((N+1) 19,) for C3; reference (9,) = p, v, a of the tip at the
              next tick, used unless rolling; phase (1,): 0 roll, 1 reposition, 2 wait,
-             3 approach; feel (1,): 1 where little is known of the surface, or the ball
-             does not coast as a ball does, so that a push has to feel for it.
+             3 approach; feel (1,): 1 in a push of a ball that does not coast as a ball
+             does, so that the tip has to feel for it.
 
     A ball that is OUT_OF_REACH is as one that is not seen.
 
@@ -146,7 +147,8 @@ class RollingTask(LeafSystem):
             int(self._reference), np.concatenate([task.p, task.v, task.a])
         )
         discrete.set_value(int(self._phase), [float(task.phase)])
-        discrete.set_value(int(self._feel), [float(task.feel)])
+        pushes = task.feel and task.phase == ROLL
+        discrete.set_value(int(self._feel), [float(pushes)])
         discrete.set_value(int(self._shift), [shift])
 
 

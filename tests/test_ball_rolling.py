@@ -369,8 +369,8 @@ def test_a_push_is_told_whether_it_feels_for_the_ball_and_what_it_feels(
             there.GetMyContextFromRoot(rolling.context)
         )
         np.testing.assert_array_equal(reference.GetInputPort(port).Eval(context), value)
-    # The first push is into what nobody knows yet.
-    assert reference.GetInputPort("feel").Eval(context)[0] == 1.0
+    # A ball that lay still does not stray.
+    assert reference.GetInputPort("feel").Eval(context)[0] == 0.0
 
 
 def test_world_and_model_start_from_one_file():

@@ -41,7 +41,7 @@ REACH = 0.015  # The ball's target is at most so far away; a tip that were to go
 # at once would slip over the ball and leave it behind [m].
 
 WITHDRAW_ACCELERATION = 1.0  # [m/s2]
-LAND_CHANGE = 0.12  # So much change of the ball's velocity halves its offset [m/s].
+LAND_CHANGE = 0.06  # More change of velocity than that of coasting [m/s].
 SPEED_SEC = 0.15
 GLIMPSE_SEC = 0.1  # A ball seen for a shorter time has no velocity yet.
 
@@ -102,7 +102,7 @@ class TaskState:
     vz_start: float = 0.0
     tare: float = 0.0  # Vertical force on the tip where the approach began [N].
     # Whether the tip has to feel for the ball: its approach goes on below the believed
-    # surface, and its push is longer.
+    # surface; and after a ball that does not coast, its push is longer.
     feel: bool = False
     stretch: float = 1.0  # How much longer this reposition takes than the usual one.
     # For how long the ball has been seen, or has not been seen; how fast it was when it
@@ -172,7 +172,8 @@ def landing(config, path, x, gap, time_left, radius_ball, radius_tip, strayed=0.
         strayed: how much its velocity has changed while nothing touched it [m/s].
     """
     p_ball = x[P_BALL][:2] + x[V_BALL][:2] * time_left
-    offset = config.land_behind / (1.0 + (strayed / LAND_CHANGE) ** 2)
+    more = max(strayed - config.coast_change, 0.0) / LAND_CHANGE
+    offset = config.land_behind / (1.0 + more**2)
     behind = -path.heading(p_ball) * offset
     z = surface_height(offset, radius_ball, radius_tip)
     p = np.append(p_ball + behind, z + config.land_above - gap)
@@ -378,14 +379,13 @@ def next_state(
         if t - state.since_sec < longest and off @ off < config.roll_ahead**2:
             return state
         state = lift_from(REPOSITION)
+    strays = state.strayed > config.coast_change
     if state.phase == APPROACH:
         p, v, a, low = approach_step(
             config, path, state, dt, x, gap, radius_ball, radius_tip, gap_std
         )
         if low or force_z - state.tare > config.touch_force:
-            return TaskState(
-                ROLL, t, state.p, state.v, state.a, feel=state.feel, **sight
-            )
+            return TaskState(ROLL, t, state.p, state.v, state.a, feel=strays, **sight)
         return replace(state, p=p, v=v, a=a)
     above = 0.0 if landed is not None else approach_height(config, gap_std)
     over = t - state.since_sec >= config.reposition_sec * state.stretch - 0.5 * dt
@@ -396,12 +396,13 @@ def next_state(
         )
         if above > 0.0 or feel:
             return replace(state, phase=APPROACH, since_sec=t, tare=force_z, feel=feel)
-        return TaskState(ROLL, t, state.p, state.v, state.a, **sight)
+        return TaskState(ROLL, t, state.p, state.v, state.a, feel=strays, **sight)
     p, v, a = reposition_step(
         config, path, state, t, dt, x, gap, radius_ball, radius_tip, above
     )
+    state = replace(state, p=p, v=v, a=a)
+    if state.seen_sec <= GLIMPSE_SEC:
+        return state
     off = v_ball - (v_ball if state.v_ball is None else state.v_ball)
-    return replace(
-        state, p=p, v=v, a=a, v_ball=v_ball - off,
-        strayed=max(state.strayed, float(np.sqrt(off @ off))),
-    )  # fmt: skip
+    strayed = max(state.strayed, float(np.sqrt(off @ off)))
+    return replace(state, v_ball=v_ball - off, strayed=strayed)
