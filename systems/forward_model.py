@@ -6,7 +6,12 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from makebreak.systems.numerics.contact_task import COUNT, N_TRANSITION, UNKNOWN_MODE
+from makebreak.systems.numerics.contact_task import (
+    COUNT,
+    FREE_MODE,
+    N_TRANSITION,
+    UNKNOWN_MODE,
+)
 from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.forward_model import (
     BankMemory,
@@ -33,6 +38,8 @@ class HandoverConfig:
 class ForwardModelConfig:
     with_torque: bool = True  # False: models over |v| and |F_t| alone.
     learns: bool = True  # False: the models stay as given, the fixed GMM.
+    # False: one model, learned in all modes of contact; what modes are worth (CC 3.2).
+    per_mode: bool = True
     smoothing: float = 0.3  # Of the error, per sample; 1: none.
     tau_nov: float = 1e-3  # Of the mixtures: how unlikely a new component's sample is.
     wrench_limit: float = 200.0  # At which the sensor saturates [N], [N m].
@@ -110,6 +117,7 @@ class ForwardModelBank(LeafSystem):
                     f"over {mixture.mean.shape[1]} entries, expected {shape[0]} over "
                     f"{shape[1]}"
                 )
+        self._per_mode = bool(config.per_mode)
         first_call(warm_up, self._tuning)
         self._ports = [
             self.DeclareVectorInputPort(name, size)
@@ -145,8 +153,11 @@ class ForwardModelBank(LeafSystem):
         wrench, velocity, direction, rows, mode = [
             port.Eval(context) for port in self._ports
         ]
+        number = int(mode[0]) if np.isfinite(mode[0]) else UNKNOWN_MODE
         changes = None
-        if self._transition.HasValue(context):
+        if not self._per_mode:
+            number = number if number == FREE_MODE else 1  # Nothing has to be told.
+        elif self._transition.HasValue(context):
             changes = float(self._transition.Eval(context)[COUNT])
         memory = observe(
             self._memory_of(context),
@@ -155,7 +166,7 @@ class ForwardModelBank(LeafSystem):
             velocity,
             direction,
             rows,
-            int(mode[0]) if np.isfinite(mode[0]) else UNKNOWN_MODE,
+            number,
             changes,
         )
         state.get_mutable_abstract_state(self._memory).set_value(memory)

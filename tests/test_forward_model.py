@@ -294,6 +294,26 @@ def test_the_system_predicts_for_the_mode_it_is_told():
     assert [mode for mode, _ in bank.knowledge(context).models] == [1, 2]
 
 
+def test_one_model_for_all_modes_learns_in_each_of_them():
+    simulator, bank = small_diagram(ForwardModelConfig(per_mode=False))
+    simulator.AdvanceTo(1.0)
+    context = bank.GetMyContextFromRoot(simulator.get_context())
+    [(mode, mixture)] = bank.knowledge(context).models
+    assert mode == 1
+    # Of both surfaces, 200 samples in a second but for the first ones.
+    seen = dict(small_diagram_models())
+    assert mixture.support.sum() > 1.5 * seen[1].support.sum()
+    np.testing.assert_allclose(
+        np.linalg.norm(outputs(simulator, bank)[:3]), 4.8, atol=0.3
+    )
+
+
+def small_diagram_models():
+    simulator, bank = small_diagram()
+    simulator.AdvanceTo(1.0)
+    return bank.knowledge(bank.GetMyContextFromRoot(simulator.get_context())).models
+
+
 def test_a_restored_context_replays_and_knowledge_starts_the_next_trial():
     simulator, bank = small_diagram()
     simulator.AdvanceTo(0.4)

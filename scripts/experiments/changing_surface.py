@@ -357,6 +357,7 @@ VARIANTS: dict[str, dict] = {
     "sphere": {"tool": "sphere"},
     "0.05 m/s, 5 N": {"speed": 0.05, "normal_force": 5.0},
     "0.2 m/s, 12 N": {"speed": 0.2, "normal_force": 12.0},
+    "one model for all modes": {"control.forward_model.per_mode": False},
 }
 
 

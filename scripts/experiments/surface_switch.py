@@ -258,6 +258,7 @@ VARIANTS: dict[str, dict] = {
     "K_max alone": {"anticipation.models": False},
     "nothing anticipated": {"anticipation.places": False},
     "sphere": {"tool": "sphere"},
+    "one model for all modes": {"control.forward_model.per_mode": False},
 }
 
 
