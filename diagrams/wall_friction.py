@@ -255,7 +255,8 @@ def make_wall_friction(
         "forward_model_bank",
         ForwardModelBank(
             # A face slides: its torque says nothing of friction.
-            ForwardModelConfig(with_torque=False, tau_nov=0.01),
+            # The mixture alone is compared.
+            ForwardModelConfig(with_torque=False, tau_nov=0.01, correction=0.0),
             known_models,
             ESTIMATE,
             OFFSET,

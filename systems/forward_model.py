@@ -41,6 +41,9 @@ class ForwardModelConfig:
     # False: one model, learned in all modes of contact; what modes are worth (CC 3.2).
     per_mode: bool = True
     smoothing: float = 0.3  # Of the error, per sample; 1: none.
+    # Of what a model has been off by of late, which is added to what it predicts, per
+    # sample; 0: nothing is added.
+    correction: float = 0.05
     tau_nov: float = 1e-3  # Of the mixtures: how unlikely a new component's sample is.
     wrench_limit: float = 200.0  # At which the sensor saturates [N], [N m].
     error_unknown: float = 10.0  # Said where the wrench cannot be used [N].
@@ -89,6 +92,10 @@ class ForwardModelBank(LeafSystem):
             raise ValueError(
                 f"smoothing is {config.smoothing}, expected a number in (0, 1]"
             )
+        if not 0.0 <= config.correction < 1.0:
+            raise ValueError(
+                f"correction is {config.correction}, expected a number in [0, 1)"
+            )
         for name in ("duration_sec", "rows"):
             if not 0.0 <= getattr(config.handover, name) < np.inf:
                 raise ValueError(
@@ -102,6 +109,7 @@ class ForwardModelBank(LeafSystem):
             with_torque=bool(config.with_torque),
             learns=bool(config.learns),
             smoothing=float(config.smoothing),
+            correction=float(config.correction),
             wrench_limit=float(config.wrench_limit),
             error_unknown=float(config.error_unknown),
             handover=round(config.handover.duration_sec / period_sec),

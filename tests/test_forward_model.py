@@ -123,8 +123,10 @@ def test_a_bank_is_the_mixture_over_eq_2_and_3_and_its_regression():
 
 
 @pytest.mark.parametrize("with_torque", [True, False])
-def test_prediction_comes_as_near_as_the_noise_lets_it(with_torque):
-    t = tuning(with_torque=with_torque, mixtures=bank_tuning(with_torque))
+@pytest.mark.parametrize("correction", [0.0, 0.05])
+def test_prediction_comes_as_near_as_the_noise_lets_it(with_torque, correction):
+    mixtures = bank_tuning(with_torque)
+    t = tuning(with_torque=with_torque, mixtures=mixtures, correction=correction)
     slide = Slide()
     memories = feed(BankMemory(ModelBank()), t, slide, 0.4, 1, 2000)
     raw = [abs(m.predicted[0] - 3.2) for m in memories[500:]]
@@ -133,6 +135,32 @@ def test_prediction_comes_as_near_as_the_noise_lets_it(with_torque):
     # E|noise| = 0.1 sqrt(2/pi) = 0.080 N.
     errors = [m.error for m in memories[500:]]
     np.testing.assert_allclose(np.mean(errors), 0.080, atol=0.01)
+
+
+def test_a_small_offset_that_stays_is_corrected():
+    """0.16 N more than the mixture has learned, less than a new component needs."""
+    left = {}
+    for correction in (0.0, 0.05):
+        t, slide = tuning(correction=correction), Slide()
+        memory = feed(BankMemory(ModelBank()), t, slide, 0.4, 1, 2000)[-1]
+        memories = feed(memory, t, slide, 0.42, 1, 300)
+        left[correction] = np.mean([3.36 - m.predicted[0] for m in memories[100:]])
+    assert left[0.0] > 0.05 and abs(left[0.05]) < 0.02, left
+
+
+def test_the_offset_of_one_mode_is_not_that_of_the_next():
+    t, slide = tuning(correction=0.05), Slide()
+    memory = feed(BankMemory(ModelBank()), t, slide, 0.2, 1, 400)[-1]
+    memory = feed(memory, t, slide, 0.3, 1, 60)[-1]
+    assert memory.offset[0] != 0.0
+    (memory,) = feed(memory, t, slide, 0.5, 2, 1)
+    np.testing.assert_array_equal(memory.offset, 0.0)
+
+
+def test_an_announced_mode_s_model_begins_without_an_offset():
+    for memory in across(tuning(handover=10, correction=0.05), announced=True)[60:70]:
+        np.testing.assert_array_equal(memory.offset, 0.0)
+        np.testing.assert_allclose(memory.predicted[0], 4.0, atol=0.1)
 
 
 def test_each_mode_keeps_its_own_model_and_uses_it_again():
@@ -333,6 +361,7 @@ def test_a_restored_context_replays_and_knowledge_starts_the_next_trial():
     "changes, message",
     [
         (dict(smoothing=0.0), "smoothing is 0.0"),
+        (dict(correction=1.0), "correction is 1.0"),
         (dict(wrench_limit=np.nan), "wrench_limit is nan"),
         (dict(error_unknown=-1.0), "error_unknown is -1.0"),
         (dict(tau_nov=2.0), "tau_nov is 2.0"),

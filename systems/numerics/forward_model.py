@@ -133,9 +133,11 @@ class BankMemory:
     way: float = 0.0
     left: int = 0
     count: float = 0.0  # Of mode changes that were confirmed.
+    # (2,) what the model has been off by of late, in `predicted` already [N], [N m].
+    offset: np.ndarray = None  # type: ignore[assignment]
 
     def __post_init__(self):
-        for name, size in (("predicted", 2), ("wrench", 6)):
+        for name, size in (("predicted", 2), ("wrench", 6), ("offset", 2)):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, np.zeros(size))
             getattr(self, name).setflags(write=False)
@@ -160,6 +162,7 @@ class BankTuning:
     handover: int = 10  # Samples for which a step is handed over; 0: never.
     rows: float = 0.0  # From the first row of feet to the second; 0: one point [m].
     period: float = 0.005  # [s]
+    correction: float = 0.0  # Of the offset, per sample; 0: there is none.
 
 
 def observe(
@@ -205,6 +208,12 @@ def observe(
         mixture = empty_mixture(tuning.mixtures)
         bank = bank.put(mode, mixture)
     state = size[:4].copy() if tuning.with_torque else size[[0, 2]]
+    offset = np.zeros(2)
+    if mode == memory.mode and memory.state is not None and memory.left == 0:
+        # One step ahead a model returns towards its mean by a share of what the force
+        # is off by: a small offset that stays, where the force does.
+        off = actual - (memory.predicted - memory.offset)
+        offset = memory.offset + tuning.correction * (off - memory.offset)
     memory = _handing_over(memory, tuning, mixture, actual, size[0], mode, changes)
     if memory.left > 0:
         # What is fed forward belongs to a place that the tool is about to reach: it
@@ -220,6 +229,10 @@ def observe(
         predicted[:n] = regress(mixture, state)[0]
     elif tuning.learns:
         predicted[:] = actual  # Nothing is known but this.
+    if memory.left == 0 and mixture.count:
+        predicted = predicted + offset
+    else:
+        offset = np.zeros(2)
     if memory.before is not None and memory.left > 0:
         whole = memory.way >= tuning.rows
         predicted = _without_force(mixture, state, tuning.with_torque)
@@ -241,6 +254,7 @@ def observe(
         memory.way,
         memory.left,
         memory.count,
+        offset,
     )
 
 
