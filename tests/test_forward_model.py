@@ -148,6 +148,14 @@ def test_a_small_offset_that_stays_is_corrected():
     assert left[0.0] > 0.05 and abs(left[0.05]) < 0.02, left
 
 
+def test_an_impact_is_no_offset():
+    t, slide = tuning(correction=0.05), Slide()
+    memory = feed(BankMemory(ModelBank()), t, slide, 0.4, 1, 400)[-1]
+    before = memory.offset[0]
+    memories = feed(memory, t, slide, 1.4, 1, 4)  # 8 N more, for 20 ms.
+    assert abs(memories[-1].offset[0] - before) < 0.05
+
+
 def test_the_offset_of_one_mode_is_not_that_of_the_next():
     t, slide = tuning(correction=0.05), Slide()
     memory = feed(BankMemory(ModelBank()), t, slide, 0.2, 1, 400)[-1]

@@ -213,6 +213,7 @@ def observe(
         # One step ahead a model returns towards its mean by a share of what the force
         # is off by: a small offset that stays, where the force does.
         off = actual - (memory.predicted - memory.offset)
+        off = np.clip(off, -OFFSET_MOST, OFFSET_MOST)
         offset = memory.offset + tuning.correction * (off - memory.offset)
     memory = _handing_over(memory, tuning, mixture, actual, size[0], mode, changes)
     if memory.left > 0:
@@ -258,6 +259,9 @@ def observe(
     )
 
 
+# More than that of |F_t|, |tau| in one sample is a change or an impact, which the model
+# follows by itself, and no offset [N], [N m].
+OFFSET_MOST = np.array([0.3, 0.03])
 # A model that has seen fewer samples than this is not handed over.
 SUPPORT_MIN = 20.0
 
