@@ -40,7 +40,7 @@ WITHIN = 0.0009  # [s] After a tick: all that follows from it has been worked ou
 # Without a status for longer, the robot is taken for gone: of its own time, which may
 # pass more slowly than ours.
 HOLD_SEC = 0.05
-KNOWN_SEC = 0.2  # After so much of it, how much more slowly is known.
+KNOWN_SEC = 0.05  # After so much of it, how much more slowly is known.
 CATCH_UP = 50  # [ticks] Fewer lost ones are simulated, more are a new beginning.
 DELAY_MEMORY_SEC = 1.0  # In which a delay that was once seen is forgotten.
 PICTURE_SEC = 0.1  # A picture that is older is not shown.
@@ -119,6 +119,7 @@ class LcmLoop:
         self._robot: int | None = None  # The robot's tick that was answered last.
         self._heard = clock()  # When the last status came [s].
         self._since: tuple[float, int] | None = None  # Then, and its time stamp [us].
+        self._robot_utime = 0  # Of the last status.
         self._slowness = 1.0  # Our seconds in one of the robot's.
         self._picture_utime = 0
         self._shown = False
@@ -164,6 +165,9 @@ class LcmLoop:
             self._hold(now)  # This process itself was away.
         self._heard = now
         status = lcmt_panda_status.decode(data)
+        if status.robot_utime < self._robot_utime:
+            self._since = None  # It was started anew.
+        self._robot_utime = status.robot_utime
         self._note_pace(status.utime)
         return self.answer(status, data, start)
 
@@ -171,7 +175,8 @@ class LcmLoop:
         return now - self._heard > HOLD_SEC * self._slowness
 
     def _note_pace(self, utime: int) -> None:
-        if self._since is None or self.is_held:
+        # Both clocks go on while nothing is heard; another robot has another one.
+        if self._since is None or utime < self._since[1]:
             self._since = self._heard, utime
             return
         passed = 1e-6 * (utime - self._since[1])

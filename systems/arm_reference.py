@@ -29,7 +29,7 @@ class ArmReferenceConfig:
     follow_force: float = 1.0  # [N]
     # No command moves the reference faster than that, however far away it is. The task
     # itself stays below 0.35 m/s and 4 m/s2.
-    speed_max: float = 0.7  # [m/s]
+    speed_max: float = 0.5  # [m/s]
     acceleration_fed_forward_max: float = 10.0  # While repositioning [m/s2].
     period_sec: float = 0.0125  # Of C3 and of the task.
     offset_sec: float = 0.0  # A little after theirs.

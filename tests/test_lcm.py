@@ -227,6 +227,17 @@ def test_a_silent_robot_is_held_within_50_ms_and_begun_again(robot):
     assert robot.loop.time == pytest.approx(0.001)  # Ours goes on.
 
 
+def test_a_robot_that_is_slower_than_real_time_is_waited_for_as_long(robot):
+    """At a tenth of real time a millisecond takes 10 ms, and 50 ms half a second."""
+    for tick in range(1, 70):
+        robot.says(tick, after=0.01)
+    robot.says(after=9.0 * HOLD_SEC)
+    assert not robot.loop.is_held
+    robot.says(after=2.0 * HOLD_SEC)
+    assert robot.loop.is_held
+    assert robot.loop.report.holds_sec == [pytest.approx(1.1 * HOLD_SEC, rel=0.02)]
+
+
 def test_a_robot_in_another_mode_is_sent_nothing(robot):
     robot.says(1)
     assert robot.says(2, control_mode=1) == []
