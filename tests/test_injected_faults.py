@@ -33,6 +33,7 @@ from makebreak.diagrams.station import (
 )
 from makebreak.scripts import cli
 from makebreak.scripts.fault_trials import FAILED, HELD, RECOVERED, judge
+from makebreak.scripts.session import Session
 from makebreak.systems.c3_mpc import C3Status
 from makebreak.systems.fault_forces import Hand, Push
 from makebreak.systems.fault_pictures import LatePictures, PaintedPictures
@@ -459,3 +460,16 @@ def test_recovered_held_and_failed_are_told_apart():
     assert judge(fault, runs(slow, limits_kept=False), plain) == FAILED
     assert judge(fault, runs(slow, contact_force_peak_N=80.0), plain) == FAILED
     assert judge(fault, {"error": "exit status 3"}, plain) == FAILED
+
+
+def test_a_run_says_whether_its_limits_were_kept(tmp_path):
+    config = BallRollingConfig(camera=CameraConfig(renderer="drawn"), faults=["none"])
+    with Session(tmp_path / "out", progress=False) as session:
+        assert session.limits_kept() == {}
+        diagram = make_ball_rolling(config)
+        tau = diagram.GetSubsystemByName("impedance_controller").GetOutputPort("tau")
+        session.simulate(diagram, 0.05, {"tau": tau})
+        said = session.limits_kept()
+    assert said["limits_kept"] and said["ticks_not_finite"] == 0
+    assert 0.1 < said["torque_share_max"] < 1.0  # It carries the arm.
+    assert said["joint_range_excess_rad"] < 0.0
