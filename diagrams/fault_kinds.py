@@ -112,6 +112,15 @@ FAULTS: dict[str, Fault] = {
         "a fixed box stands on the path, from the beginning on", "scene", False, ALWAYS
     ),
 }  # fmt: skip
+# Of settings: least, most, whether it is a whole number.
+RANGES: dict[str, tuple[float, float, bool]] = {
+    "sec": (TICK, 1.0, False),
+    "joint": (1, 7, True),
+    "joints": (1, 7, True),
+    "frames": (0, 80, True),  # A second of them.
+    "share": (0.0, 1.0, False),
+    "coulomb": (0.0, 100.0, False),
+}
 FROM = 6.0  # When a fault begins, unless `from` says otherwise [s].
 
 
@@ -151,21 +160,21 @@ def read_fault(text: str) -> Injected:
             numbers[key] = float(value)
         except ValueError:
             numbers[key] = math.nan
-        if math.isnan(numbers[key]):
+        endless = key == "for" and numbers[key] == ALWAYS
+        if not math.isfinite(numbers[key]) and not endless:
             raise ValueError(f'fault {name}: {key}: got "{value}", expected a number')
     start, lasts = numbers.pop("from", 0.0), numbers.pop("for", ALWAYS)
     if not 0.0 <= start < math.inf or not lasts > 0.0:
         raise ValueError(
             f"fault {name}: from is {start}, for {lasts}, expected >= 0 and > 0"
         )
-    if "sec" in numbers and not TICK <= numbers["sec"] <= 1.0:
-        raise ValueError(
-            f"fault {name}: sec is {numbers['sec']}, expected 0.001 to 1 s"
-        )
-    for key in ("joint", "joints"):
-        if key in numbers and numbers[key] not in range(1, 8):
+    for key, (least, most, whole) in RANGES.items():
+        number = numbers.get(key, least)
+        if not least <= number <= most or whole and number != round(number):
+            what = "a whole number" if whole else "a number"
             raise ValueError(
-                f"fault {name}: {key} is {numbers[key]:g}, expected 1 to 7"
+                f"fault {name}: {key} is {number:g}, expected {what} from {least:g} to "
+                f"{most:g}"
             )
     return Injected(name, start, start + lasts, numbers)
 

@@ -2,6 +2,7 @@
 trials that are rehearsed on the model before the first real one."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from pydrake.systems.framework import Diagram
 
@@ -44,6 +45,11 @@ def simulate_motion(
         until=over,
         label=label,
     )
+
+
+def without_faults(config):
+    """An experiment's config for rehearsals: nothing goes wrong in the model."""
+    return replace(config, control=replace(config.control, faults=[]))
 
 
 def rehearsed(

@@ -9,6 +9,9 @@ of its own (systems/safety_monitor.py) watches the arm at 1 kHz.
     safely held  it does not, but all limits are kept, no number is NaN, and tip and
                  ball press no harder than FORCE_MAX
     failed       anything else
+
+A case whose run without the fault does not roll is not judged, and no case of it counts
+as met.
 """
 
 from collections.abc import Mapping, Sequence
@@ -51,26 +54,29 @@ SHARE = 0.5  # Of the way without the fault that counts as rolling on.
 FORCE_MAX = 60.0  # [N] About twice the most that was ever seen without a fault.
 RECOVERED_MIN = 0.8  # Of the recoverable ones.
 SETTINGS = {"camera.renderer": "drawn", "radius_error_m": 0.005}
+ROLLED_MIN = 0.5  # [rad] Without the fault; else nothing can be told.
 RECOVERED, HELD, FAILED = "recovered", "safely held", "failed"
+UNJUDGED = "not judged"
 
 
 def judge(fault: Injected, result: Mapping, plain: Mapping) -> str:
-    """RECOVERED, HELD or FAILED. Args: result of the run; plain, without a fault."""
+    """RECOVERED, HELD, FAILED or UNJUDGED. Args: result of the run; plain, without a
+    fault."""
     if "error" in result or not result.get("limits_kept", False):
         return FAILED
     force = result.get("contact_force_peak_N")
     if force is None or force > FORCE_MAX:
         return FAILED
-    if "error" in plain:
-        return HELD
     since = fault.end if fault.end < ALWAYS else fault.start
     # Without a beginning of its own, the fault is met on the way.
     first = round(since + AFTER_SEC) if since > 0.0 else 0
 
     def rolled(run) -> float:
-        angle = run["angle_by_second_rad"]
+        angle = run.get("angle_by_second_rad", [])
         return angle[-1] - angle[first] if first < len(angle) else 0.0
 
+    if rolled(plain) < ROLLED_MIN:
+        return UNJUDGED
     there = len(result["angle_by_second_rad"]) == len(plain["angle_by_second_rad"])
     return RECOVERED if there and rolled(result) >= SHARE * rolled(plain) else HELD
 
@@ -89,10 +95,12 @@ def reproduce(session, seeds: int, jobs: int, which: str = "", only: str = "") -
     )
     plain, rows, met = results[:seeds], [], []
     recovered = recoverable = 0
+    judged: dict[str, list[str]] = {}
     for i, text in enumerate(cases, start=1):
         fault = read_fault(text)
         own = results[i * seeds : (i + 1) * seeds]
         found = [judge(fault, r, p) for r, p in zip(own, plain, strict=True)]
+        judged[text] = found
         wanted = fault.kind.recoverable
         if wanted:
             recoverable += len(found)
@@ -105,7 +113,7 @@ def reproduce(session, seeds: int, jobs: int, which: str = "", only: str = "") -
             _worst(own, "joint_speed_share_max"),
             _worst(own, "contact_force_peak_N"),
         ))  # fmt: skip
-        met.append(found.count(FAILED) == 0)
+        met.append(found.count(FAILED) == 0 and UNJUDGED not in found)
     share = recovered / recoverable if recoverable else 1.0
     rows.append((
         "recoverable ones that were recovered", f"{100 * share:.0f} %", recovered,
@@ -118,6 +126,10 @@ def reproduce(session, seeds: int, jobs: int, which: str = "", only: str = "") -
         f"ball [N]: the largest. Wanted: none failed, {100 * RECOVERED_MIN:.0f} % of "
         "the recoverable ones recovered.",
     ]
+    notes += [
+        f"{text}: not judged, the run without it does not roll"
+        for text, found in judged.items() if UNJUDGED in found
+    ]  # fmt: skip
     notes += [f"{r['out_dir']}: {r['error']}" for r in results if "error" in r]
     return Table(
         "Faults",

@@ -115,6 +115,8 @@ class PaintedPictures(LeafSystem):
             return
         poses: Any = self._poses.Eval(context)
         p_C = self._camera.to_camera(poses[self._body].translation() + self._offset)
+        if p_C[2] <= self._radius:  # Beside the camera, or behind it.
+            return
         center = self._camera.focal * p_C[:2] / p_C[2] + self._camera.center
         u, v = (int(round(float(x))) for x in center)
         radius_px = int(round(self._camera.focal * self._radius / float(p_C[2])))

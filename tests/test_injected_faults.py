@@ -1,6 +1,7 @@
 """Faults by name: what each does, when, and to whom; and the monitor of the arm."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from makebreak.diagrams.ball_rolling import (
     make_world,
 )
 from makebreak.diagrams.camera import CameraConfig, camera_model
+from makebreak.diagrams.contact_learning import ContactLearningConfig
 from makebreak.diagrams.fault_kinds import FAULTS, FROM, read_fault, read_faults
 from makebreak.diagrams.faults import GLARE_SHARE
 from makebreak.diagrams.station import (
@@ -32,7 +34,8 @@ from makebreak.diagrams.station import (
     make_station,
 )
 from makebreak.scripts import cli
-from makebreak.scripts.fault_trials import FAILED, HELD, RECOVERED, judge
+from makebreak.scripts.contact_runs import without_faults
+from makebreak.scripts.fault_trials import FAILED, HELD, RECOVERED, UNJUDGED, judge
 from makebreak.scripts.session import Session
 from makebreak.systems.c3_mpc import C3Status
 from makebreak.systems.fault_forces import Hand, Push
@@ -65,8 +68,14 @@ def test_a_fault_is_read_with_its_own_time_and_settings():
         ("push:x=far", 'fault push: x: got "far", expected a number'),
         ("push:from=-1", "from is -1.0"),
         ("push:for=0", "for 0.0, expected"),
-        ("position_bias:joint=8", "joint is 8, expected 1 to 7"),
-        ("compute_delay:sec=0", "sec is 0.0, expected"),
+        ("position_bias:joint=8", "joint is 8, expected a whole number from 1 to 7"),
+        ("position_bias:by=1e400", 'by: got "1e400", expected a number'),
+        ("push:x=inf", 'x: got "inf", expected a number'),
+        ("compute_delay:sec=0", "sec is 0, expected a number from 0.001"),
+        ("frames_delayed:frames=2.7", "frames is 2.7, expected a whole number"),
+        ("frames_dropped:share=2", "share is 2, expected a number from 0 to 1"),
+        ("weak_joint:share=-1", "share is -1, expected"),
+        ("joint_friction:coulomb=-1", "coulomb is -1, expected"),
         ("box:from=3", "unknown setting from; it has none"),
     ],
 )
@@ -473,3 +482,34 @@ def test_a_run_says_whether_its_limits_were_kept(tmp_path):
     assert said["limits_kept"] and said["ticks_not_finite"] == 0
     assert 0.1 < said["torque_share_max"] < 1.0  # It carries the arm.
     assert said["joint_range_excess_rad"] < 0.0
+
+
+def test_beside_a_run_that_does_not_roll_nothing_is_recovered():
+    fault, still = read_fault("push:from=6,for=1"), runs([1.0] * 20)
+    assert judge(fault, still, still) == UNJUDGED
+    back = runs([-0.4 * t for t in range(20)])
+    assert judge(fault, back, back) == UNJUDGED
+    short = runs([0.4 * t for t in range(8)])
+    assert judge(fault, short, short) == UNJUDGED
+    assert judge(fault, still, {"error": "exit status 3"}) == UNJUDGED
+    assert judge(fault, runs([1.0] * 20, limits_kept=False), still) == FAILED
+
+
+def test_rehearsals_have_no_faults():
+    config = ContactLearningConfig()
+    config = replace(config, control=replace(config.control, faults=["box"]))
+    assert without_faults(config).control.faults == []
+    assert without_faults(config).trials == config.trials
+
+
+def test_a_ball_beside_the_camera_is_not_painted():
+    camera = camera_model(CameraConfig())
+    system = PaintedPictures(camera, 0, [0.0, 0.0, 0.0], 0.03, (9, 8, 7), 0.0, 1.0)
+    context = system.CreateDefaultContext()
+    blank = ImageRgba8U(camera.width, camera.height)
+    system.GetInputPort("image").FixValue(context, Value(blank))
+    for z in np.linspace(0.0, 3.0, 31):  # Lifted by a hand, through the camera.
+        poses = [RigidTransform([0.5, 0.0, z])]
+        system.GetInputPort("body_poses").FixValue(context, Value(poses))
+        painted = np.array(system.get_output_port().Eval(context).data)
+    assert not painted[:, :, :3].any()

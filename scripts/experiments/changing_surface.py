@@ -34,7 +34,11 @@ from makebreak.diagrams.changing_surface import (
     surface_at,
 )
 from makebreak.diagrams.recorder import recorded
-from makebreak.scripts.contact_runs import rehearsed, simulate_motion
+from makebreak.scripts.contact_runs import (
+    rehearsed,
+    simulate_motion,
+    without_faults,
+)
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
@@ -95,10 +99,10 @@ def run(config: ChangingSurfaceConfig, session: Session) -> dict:
         diagram = make_changing_surface(config, task, knowledge, session.meshcat)
         return simulate_motion(session, diagram, DURATION_SEC, label)
 
-    imagined = replace(task, world=task.model)
+    imagined, on_model = replace(task, world=task.model), without_faults(config)
     knowledge = rehearsed(
         config.rehearse,
-        lambda known, _, label: simulate(config, imagined, known, label),
+        lambda known, _, label: simulate(on_model, imagined, known, label),
         Knowledge(contacts=task.prior),
     )
     for label, its in configs.items():

@@ -38,7 +38,11 @@ from makebreak.diagrams.contact_learning import (
 )
 from makebreak.diagrams.recorder import episodes, recorded
 from makebreak.diagrams.tabletop import position
-from makebreak.scripts.contact_runs import rehearsed, simulate_motion
+from makebreak.scripts.contact_runs import (
+    rehearsed,
+    simulate_motion,
+    without_faults,
+)
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
@@ -103,12 +107,16 @@ def run(config: ContactLearningConfig, session: Session) -> dict:
     task = make_task(config)
     knowledge = Knowledge(contacts=task.prior)
 
-    def simulate(knowledge, k, label, task=task):
+    def simulate(knowledge, k, label, config=config, task=task):
         diagram = make_contact_learning(config, task, knowledge, k, session.meshcat)
         return simulate_motion(session, diagram, DURATION_SEC, label, PEAK_WAIT)
 
     if config.rehearse:
-        on_model = partial(simulate, task=replace(task, world=task.model))
+        on_model = partial(
+            simulate,
+            config=without_faults(config),
+            task=replace(task, world=task.model),
+        )
         known = Knowledge(contacts=task.model_prior)
         knowledge = rehearsed(config.rehearse, on_model, known)
     trials: list[Trial] = []

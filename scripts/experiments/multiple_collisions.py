@@ -38,7 +38,11 @@ from makebreak.diagrams.multiple_collisions import (
 )
 from makebreak.diagrams.recorder import episodes, recorded
 from makebreak.diagrams.tabletop import position
-from makebreak.scripts.contact_runs import rehearsed, simulate_motion
+from makebreak.scripts.contact_runs import (
+    rehearsed,
+    simulate_motion,
+    without_faults,
+)
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
@@ -118,7 +122,11 @@ def run(config: MultipleCollisionsConfig, session: Session) -> dict:
         keep(simulate(None, 0, "baseline", plain), "baseline")
     knowledge: Knowledge | None = None
     if config.rehearse:
-        on_model = partial(simulate, task=replace(task, world=task.model))
+        on_model = partial(
+            simulate,
+            config=without_faults(config),
+            task=replace(task, world=task.model),
+        )
         known = Knowledge(task.model_prior)
         knowledge = rehearsed(config.rehearse, on_model, known)
     for k in range(config.trials if config.handling else 1):

@@ -39,7 +39,11 @@ from makebreak.diagrams.surface_switch import (
     make_surface_switch,
     make_task,
 )
-from makebreak.scripts.contact_runs import rehearsed, simulate_motion
+from makebreak.scripts.contact_runs import (
+    rehearsed,
+    simulate_motion,
+    without_faults,
+)
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
@@ -89,11 +93,15 @@ def run(config: SurfaceSwitchConfig, session: Session) -> dict:
     task = make_task(config)
     knowledge = Knowledge(contacts=task.prior)
 
-    def simulate(knowledge, k, label, task=task):
+    def simulate(knowledge, k, label, config=config, task=task):
         diagram = make_surface_switch(config, task, knowledge, k, session.meshcat)
         return simulate_motion(session, diagram, DURATION_SEC, label)
 
-    on_model = partial(simulate, task=replace(task, world=task.model))
+    on_model = partial(
+        simulate,
+        config=without_faults(config),
+        task=replace(task, world=task.model),
+    )
     knowledge = rehearsed(config.rehearse, on_model, knowledge)
     trials: list[Trial] = []
     recordings = []
