@@ -22,6 +22,7 @@ from pydrake.systems.framework import Context, Diagram, OutputPort
 from makebreak.diagrams.lcm_station import (
     COMMAND,
     COMMAND_PORT,
+    N_JOINTS,
     PICTURES,
     PICTURES_PORT,
     STATUS,
@@ -39,12 +40,15 @@ TICK = 0.001  # [s] Of the robot.
 WITHIN = 0.0009  # [s] After a tick: all that follows from it has been worked out.
 # Without a status for longer, the robot is taken for gone: of its own time, which may
 # pass more slowly than ours.
-HOLD_SEC = 0.05
+HOLD_SEC = 0.04  # With SPIN_MS, 50 ms.
+SPIN_MS = 10
 KNOWN_SEC = 0.05  # After so much of it, how much more slowly is known.
 CATCH_UP = 50  # [ticks] Fewer lost ones are simulated, more are a new beginning.
 DELAY_MEMORY_SEC = 1.0  # In which a delay that was once seen is forgotten.
 PICTURE_SEC = 0.1  # A picture that is older is not shown.
 FIRST_SEC = 20.0  # To wait for the first status.
+GONE_SEC = 120.0  # Without an answer for longer, the run ends.
+KEPT = 100_000  # Of the latest times, for the report.
 MOVES = (0, 1, 2)  # Robot modes of libfranka in which it may be commanded.
 
 
@@ -56,8 +60,11 @@ class LoopReport:
     lost: int = 0  # Ticks without a status of their own.
     not_finite: int = 0  # Commands that were not sent for it.
     rate_limited: int = 0  # Commands that were shortened to the torque's rate.
-    compute_sec: list[float] = field(default_factory=list)  # From status to command.
-    delay_sec: list[float] = field(default_factory=list)  # From status to acting.
+    not_read: int = 0  # Messages that are none of a Panda's.
+    not_begun: int = 0  # Statuses from a place where the task cannot begin.
+    # The latest: from a status to its command, and until that acts [s].
+    compute_sec: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))
+    delay_sec: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))
     holds_sec: list[float] = field(default_factory=list)  # From the last status on.
     begun: int = 0  # Times that the controllers began at the robot's place.
 
@@ -75,6 +82,8 @@ class LoopReport:
             "loop_delay_p99_ms": float(np.percentile(late, 99)),
             "commands_not_finite": self.not_finite,
             "commands_rate_limited": self.rate_limited,
+            "messages_not_read": self.not_read,
+            "statuses_not_begun": self.not_begun,
             "holds": len(self.holds_sec),
             "hold_after_ms": [1e3 * each for each in self.holds_sec],
             "beginnings": self.begun,
@@ -127,6 +136,7 @@ class LcmLoop:
         # (time stamp, torques) of the last commands, to be found again in a status.
         self._on_the_way: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=100)
         self._delay = 0.0  # [s]
+        self._acting: tuple[float, ...] = ()  # By the last status.
 
     def _keeper(self, channel: str) -> Callable[[bytes], None]:
         def keep(data: bytes) -> None:
@@ -147,7 +157,7 @@ class LcmLoop:
         """Whether the robot is gone, or was never there."""
         return self._robot is None
 
-    def spin(self, timeout_ms: int = 10) -> bool:
+    def spin(self, timeout_ms: int = SPIN_MS) -> bool:
         """Waits for messages and answers the newest status. Returns: whether there was
         one, and it was answered."""
         self._lcm.HandleSubscriptions(timeout_ms)
@@ -164,12 +174,30 @@ class LcmLoop:
         if not self.is_held and self._is_silent(now):
             self._hold(now)  # This process itself was away.
         self._heard = now
-        status = lcmt_panda_status.decode(data)
+        status = self._read(data)
+        if status is None:
+            return False
         if status.robot_utime < self._robot_utime:
             self._since = None  # It was started anew.
         self._robot_utime = status.robot_utime
         self._note_pace(status.utime)
         return self.answer(status, data, start)
+
+    def _read(self, data: bytes) -> lcmt_panda_status | None:
+        """A status of an arm with as many joints as ours; None: it is none."""
+        try:
+            status = lcmt_panda_status.decode(data)
+        except ValueError:
+            status = None
+        if status is None or status.num_joints != N_JOINTS:
+            self.report.not_read += 1
+            return None
+        return status
+
+    @property
+    def silent_sec(self) -> float:
+        """Since the last status, in the robot's own time."""
+        return (self._clock() - self._heard) / self._slowness
 
     def _is_silent(self, now: float) -> bool:
         return now - self._heard > HOLD_SEC * self._slowness
@@ -203,7 +231,7 @@ class LcmLoop:
                 self._hold(self._clock())
             return False
         if self._robot is not None and not 0 < robot - self._robot <= CATCH_UP:
-            if robot - self._robot in (0, -1, -2):  # Twice, or out of order.
+            if 0 <= self._robot - robot <= CATCH_UP:  # Twice, or out of order.
                 return False
             self._robot = None  # Another robot, or one that was away.
         self._fix(self.context, STATUS_PORT, data)
@@ -212,27 +240,39 @@ class LcmLoop:
             q = np.array(status.joint_position)
             if self._tick > 0:  # To the new time, with nothing in between.
                 self._simulator.AdvanceTo(self._tick * TICK - 1e-5)
-            self._begin(self._diagram, self.context, q)
+            try:
+                self._begin(self._diagram, self.context, q)
+            except ValueError:
+                if self.report.begun == 0:
+                    raise
+                self.report.not_begun += 1  # It may be moved there.
+                self._tick -= 1
+                return False
             self._sent = np.zeros(len(q))
             self.report.begun += 1
         else:
             self._tick += robot - self._robot
             self.report.lost += robot - self._robot - 1
+        follows = self._robot is not None and robot == self._robot + 1
         self._robot = robot
-        self._note_delay(status)
+        self._note_delay(status, follows)
         self._show_picture(status.utime)
         self._simulator.AdvanceTo(self._tick * TICK + WITHIN)
         self._send(status.utime)
         self.report.compute_sec.append(perf_counter() - start)
         return True
 
-    def _note_delay(self, status: lcmt_panda_status) -> None:
+    def _note_delay(self, status: lcmt_panda_status, follows: bool) -> None:
         """How old the status was that the torque which acts now was worked out of: of
-        the last second's the largest, roughly. A driver that filters what it is sent
-        does not let it be found again; then it stays as it was."""
+        the last second's the largest, roughly. It counts when that torque is new, in a
+        status that follows the one before: a driver that hears nothing goes on with
+        what it has, and that grows older without any delay. A driver that filters what
+        it is sent does not let it be found again; then it stays as it was."""
         acting = tuple(status.joint_torque_desired)
+        is_new = follows and acting != self._acting
+        self._acting = acting
         for utime, torque in reversed(self._on_the_way):
-            if torque == acting and any(torque):
+            if is_new and torque == acting and any(torque):
                 age = 1e-6 * (status.utime - utime)
                 self._delay = max(age, self._delay * (1.0 - TICK / DELAY_MEMORY_SEC))
                 self.report.delay_sec.append(age)
@@ -320,6 +360,9 @@ def drive(
         why, was_held = "", False
         while not why and not interrupt.hit and loop.time < duration:
             answered = loop.spin()
+            if loop.is_held and loop.silent_sec > GONE_SEC:
+                why = f"the robot has not answered for {GONE_SEC:.0f} s"
+                break
             if loop.is_held != was_held:
                 was_held = loop.is_held
                 print(

@@ -11,6 +11,7 @@ the wall's: then both sides have more time for a millisecond, and nothing else c
 """
 
 import heapq
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import count
@@ -67,7 +68,8 @@ class StandInReport:
     damped: int = 0  # Ticks without a command to follow.
     received: int = 0
     refused: dict[str, int] = field(default_factory=dict)  # {why: commands}
-    age_sec: list[float] = field(default_factory=list)  # Of accepted commands.
+    # Of the latest accepted commands.
+    age_sec: deque[float] = field(default_factory=lambda: deque(maxlen=100_000))
     steps_too_large: int = 0  # Torques that had to be limited to the rate.
     slipped_sec: float = 0.0  # Time by which it fell behind its rate [s].
     joint_speed_share_max: float = 0.0
@@ -102,10 +104,14 @@ class Driver:
         self._report.received += 1
         why = self._fault_of(command, now)
         if why:
-            self._report.refused[why] = self._report.refused.get(why, 0) + 1
+            self.refuse(why)
             return
         self._report.age_sec.append(1e-6 * (now - command.utime))
         self._command = command.utime, np.array(command.joint_torque)
+
+    def refuse(self, why: str) -> None:
+        """Notes that a command was."""
+        self._report.refused[why] = self._report.refused.get(why, 0) + 1
 
     def _fault_of(self, command: lcmt_panda_command, now: int) -> str:
         if command.control_mode_expected != TORQUE_MODE:
@@ -162,6 +168,8 @@ class StandIn:
         arm = make_control_plant(world.world)
         self._chain = packed(serial_chain_of(arm, TIP_FRAME))
         self._speed_max = arm.GetVelocityUpperLimits()
+        plant = self._station.GetSubsystemByName("plant")
+        self._robot = plant.GetModelInstanceByName(ARM)
         self.report = StandInReport()
         self.driver = Driver(self.report)
         self._rng = np.random.default_rng([seed, 31])
@@ -184,7 +192,12 @@ class StandIn:
 
     def _receive(self, data: bytes) -> None:
         if self._rng.random() >= self._config.drop:
-            self.driver.receive(lcmt_panda_command.decode(data), self.now())
+            try:
+                command = lcmt_panda_command.decode(data)
+            except ValueError:
+                self.driver.refuse("not_a_command")
+            else:
+                self.driver.receive(command, self.now())
 
     def _publish(self, channel: str, data: bytes) -> None:
         if self._rng.random() < self._config.drop:
@@ -208,7 +221,10 @@ class StandIn:
     def tick(self) -> None:
         """One millisecond: the torque, the plant, the status."""
         k = self.report.ticks
-        q, v = (self._measured(f"{x}_measured") for x in ("position", "velocity"))
+        # What the driver itself does rests on what is: faults are what it tells.
+        plant = self._station.GetSubsystemByName("plant")
+        at, robot = plant.GetMyContextFromRoot(self._context), self._robot
+        q, v = plant.GetPositions(at, robot), plant.GetVelocities(at, robot)
         torque = self.driver.torque(v, self.now())
         carrying = gravity_torque(self._chain, q)
         self._in.FixValue(self._context, torque + carrying)

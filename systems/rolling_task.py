@@ -115,7 +115,8 @@ class RollingTask(LeafSystem):
         away = x[P_BALL][:2] - self._path.center
         reach = self._path.radius + OUT_OF_REACH
         # Who runs after a ball that is out of reach, stretches the arm for nothing.
-        valid = self._valid.Eval(context)[0] > 0.5 and away @ away < reach**2
+        said, near = self._valid.Eval(context)[0], away @ away < reach**2
+        valid, hidden = said > 0.5 and near, said == 0.0 and near
         landed = None
         if self._landed.HasValue(context):
             landed = bool(self._landed.Eval(context)[0] > 0.5)
@@ -131,7 +132,7 @@ class RollingTask(LeafSystem):
         task = next_state(
             c.rolling, path, task, t, c.period_sec, x, gap, valid,
             self._radius_ball, self._radius_tip, landed, gap_std, force_z,
-            np.array(c.withdrawn),
+            np.array(c.withdrawn), hidden,
         )  # fmt: skip
         # Below the top where it is believed to be: a ball larger than modelled would
         # else be pressed as much harder.

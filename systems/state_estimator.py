@@ -36,7 +36,8 @@ class StateEstimator(LeafSystem):
     Inputs:  q (7,), v (7,), torque (7,) motor side [rad, rad/s, N m]; p_ball (3,),
              v_ball (3,) [m, m/s]; seen (1,).
     Outputs: x (19,), the layout of numerics/ball_state.py; u_measured (3,) [N];
-             valid (1,): 1 if every reading was finite and the ball is seen;
+             valid (1,): 1 if every reading was finite and the ball is seen, 0 if it
+             is not seen, -1 if a reading was not finite (x is of the last good ones);
              window_valid (1,): 1 if that was so all over the window; tip_force (3,) [N]
              that the surroundings put on the tip, from joint torques and velocities.
 

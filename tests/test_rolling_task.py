@@ -289,6 +289,26 @@ def test_a_ball_out_of_reach_is_waited_for(outside, waits):
     assert (abs(reference[1]) < 1e-9) == waits  # It stays, or goes to the ball.
 
 
+@pytest.mark.parametrize(
+    ("valid", "outside", "phase"),
+    [(1.0, 0.0, ROLL), (0.0, 0.0, ROLL), (-1.0, 0.0, WAIT), (0.0, 0.13, WAIT)],
+)
+def test_only_a_ball_that_is_hidden_is_pushed_on(valid, outside, phase):
+    """Not one out of reach, and none beside encoders that fail."""
+    system = RollingTask(RollingTaskConfig(), 6, 0.1, R_BALL, R_TIP, 8, 4, 0.05)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    ball = np.array([0.5, 0.1 + outside, R_BALL])
+    tip = ball + [0.0, 0.0, R_BALL + R_TIP]
+    x = pack(tip, np.zeros(3), ball, np.zeros(3), R_BALL)
+    for name, value in (("x", x), ("valid", [valid]), ("r_comp", np.zeros(8))):
+        system.GetInputPort(name).FixValue(context, value)
+    pushes = TaskState(ROLL, 0.0, tip, np.zeros(3), np.zeros(3))
+    context.SetAbstractState(0, pushes)
+    simulator.AdvanceTo(0.1)
+    assert system.GetOutputPort("phase").Eval(context)[0] == phase
+
+
 def radii_aimed_at(distance, integral_sec, valid=1.0):
     """How far from the center C3's first target of the ball is, tick by tick for 3 s,
     and what it would be without integral action; the ball lies still at `distance`."""

@@ -152,7 +152,7 @@ def test_a_reading_that_is_not_finite_leaves_x_and_u_and_is_not_valid(bench, por
     x_after, u_after, valid = bench.tick(**readings)
     np.testing.assert_array_equal(x_after, x)
     np.testing.assert_array_equal(u_after, u)
-    assert valid == 0.0
+    assert valid == -1.0
     assert bench.tick()[2] == 1.0
 
 

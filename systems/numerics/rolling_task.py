@@ -10,8 +10,10 @@ front. The task therefore alternates between
                 height goes, down to where it is believed to be, slowly, and over as
                 soon as something is felt. Where little is known of the surface, or the
                 ball does not coast as a ball does, down to where it may be at least,
-    WAIT        the ball is not seen: the tip lifts, and nothing is pushed. The arm
-                may hide the ball itself, so the tip then withdraws until it is seen.
+    WAIT        the ball has not been seen for as long as it takes to go 20 mm
+                (unseen_drift), or what is measured cannot be used: the tip lifts, and
+                nothing is pushed. The arm may hide the ball itself, so the tip then
+                withdraws until it is seen.
 
 Source: ACI-MPC VII-B describes the behaviour (a push, then a new push from behind);
 times and distances are ours (docs/ball_rolling.md).
@@ -313,7 +315,7 @@ def _target(center, radius, x, lead, speed, z_tip, radius_ball, dt, n_knots):
 
 def next_state(
     config, path, state, t, dt, x, gap, valid, radius_ball, radius_tip, landed=None,
-    gap_std=0.0, force_z=0.0, withdrawn=None,
+    gap_std=0.0, force_z=0.0, withdrawn=None, hidden=True,
 ):  # fmt: skip
     """One tick of the task.
 
@@ -327,6 +329,9 @@ def next_state(
             the arm feels it [N].
         withdrawn: (2,) where the tip hides nothing from the camera [m]; None: where the
             ball is lost sight of, it stays.
+        hidden: where x is not valid, whether all that is wrong is that the ball is not
+            seen: then it is believed to be where it was for a while. Else the tip
+            lifts at once.
     Returns: TaskState: the phase, and unless rolling the reference at t + dt.
     """
 
@@ -351,7 +356,8 @@ def next_state(
     state = replace(state, **sight)
     speed = max(float(np.hypot(*state.v_seen)), config.unseen_speed)
     drift = state.unseen_sec * speed
-    if not valid and (state.phase == WAIT or drift > config.unseen_drift):
+    lost = not hidden or drift > config.unseen_drift
+    if not valid and (state.phase == WAIT or lost):
         if state.phase != WAIT:
             state = lift_from(WAIT)
         T = config.reposition_sec

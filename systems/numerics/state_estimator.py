@@ -71,12 +71,12 @@ def estimate(chain, q, v, torque, p_ball, v_ball, seen, tip_mass, radius, window
         window: (3 n + 1,) the last n forces, oldest first [N], and how many readings
             in a row were valid, at most n.
     Returns: whether every reading is finite (if not, the rest is not to be used);
-        x (19,); window; valid, 1.0 or 0.0.
+        x (19,); window; valid: 1.0, 0.0 where the ball is not seen, else -1.0.
     """
     after = np.empty(window.size)
     total = q.sum() + v.sum() + torque.sum() + p_ball.sum() + v_ball.sum()
     if not np.isfinite(total):
-        return False, after, after, 0.0
+        return False, after, after, -1.0
     p_tip, v_tip, u = tip_motion(chain[0], q, v, torque, tip_mass)
     n = window.size // 3
     after[: 3 * n - 3] = window[3 : 3 * n]
