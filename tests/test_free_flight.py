@@ -5,7 +5,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from makebreak.systems.numerics.free_body import FreeBody, simulate
-from makebreak.systems.numerics.free_flight import fit_flight, moved, turned_by
+from makebreak.systems.numerics.free_flight import (
+    Flight,
+    fit_flight,
+    moved,
+    turned_by,
+)
 
 NOISE = np.array([5e-4] * 4 + [3e-4] * 3)
 TIME = np.arange(12) / 120
@@ -56,6 +61,29 @@ def test_deviations_cover_what_a_flight_is_off_by_then_and_later():
     assert np.std(z, axis=0) == pytest.approx(np.ones(12), abs=0.3)
     # What a smoother would not reach: spin to 0.01 rad/s from a tenth of a second.
     assert np.sqrt(np.diag(flight.covariance))[6:9].max() < 0.012
+
+
+def test_a_path_is_as_exact_as_its_windows_need():
+    """About its centre of mass a body falls along a parabola, whatever its spin."""
+    rng, body, times = (
+        np.random.default_rng(3),
+        box(com=np.zeros(3)),
+        np.arange(60) / 120,
+    )
+    for _ in range(5):
+        x, _ = thrown(rng)
+        path, _ = Flight(x, np.eye(12), 1.0).path(body, times)
+        t = times[:, None]
+        place = x[4:7] + x[10:] * t + 0.5 * body.gravity * t**2
+        np.testing.assert_allclose(path[:, 4:7], place, atol=1e-7)
+        np.testing.assert_allclose(path[:, 10:], x[10:] + body.gravity * t, atol=1e-7)
+        # Turning freely keeps the angular momentum.
+        momentum = []
+        for pose in path:
+            R = Rotation.from_quat(np.roll(pose[:4], -1)).as_matrix()
+            momentum.append(R @ body.inertia @ R.T @ pose[7:10])
+        scale = np.linalg.norm(momentum[0])
+        np.testing.assert_allclose(momentum, [momentum[0]] * 60, atol=1e-6 * scale)
 
 
 def test_what_touches_something_is_no_flight():
