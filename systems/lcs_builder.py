@@ -23,6 +23,7 @@ from pydrake.common.value import AbstractValue, Value
 from pydrake.geometry import (
     Box,
     Convex,
+    Cylinder,
     GeometryId,
     HalfSpace,
     Mesh,
@@ -43,6 +44,7 @@ from makebreak.systems.numerics.convex_hull import point_on_hull
 from makebreak.systems.numerics.lcs import LCS, is_finite
 from makebreak.systems.numerics.lcs_builder import (
     BOX,
+    CYLINDER,
     HALF_SPACE,
     SPHERE,
     ConstantMassModel,
@@ -500,24 +502,30 @@ class AnitescuLcs:
         if plant.num_force_elements() != 1:  # Gravity is always there, and constant.
             return None
         floating_bodies = {}
+        turning: list[tuple[int, int]] = []
+        inertias: list[np.ndarray] = []
         joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
         for joint in joints:
             if joint.type_name() == "quaternion_floating":
-                body = joint.child_body()
-                I_B = body.default_spatial_inertia()
+                child = joint.child_body()
+                I_B = child.default_spatial_inertia()
                 inertia = I_B.CalcRotationalInertia().CopyToFullMatrix3()
                 at_origin = not I_B.get_com().any()
                 unlike = np.abs(inertia - inertia[0, 0] * np.eye(3)).max()
                 isotropic = unlike <= 1e-12 * inertia[0, 0]
                 frames = joint.frame_on_parent(), joint.frame_on_child()
                 if not (
-                    at_origin
-                    and isotropic
-                    and frames[0] == plant.world_frame()
-                    and frames[1] == body.body_frame()
+                    frames[0] == plant.world_frame() and frames[1] == child.body_frame()
                 ):
                     return None
-                floating_bodies[body.index()] = joint
+                floating_bodies[child.index()] = joint
+                if not (at_origin and isotropic):
+                    turning.append((joint.position_start(), joint.velocity_start()))
+                    centre, mass = I_B.get_com(), I_B.get_mass()
+                    about = I_B.Shift(centre).CalcRotationalInertia()
+                    inertias.append(
+                        np.vstack([about.CopyToFullMatrix3(), centre, np.full(3, mass)])
+                    )
             elif joint.type_name() not in ("prismatic", "weld"):
                 return None
         if any(joint.parent_body().index() in floating_bodies for joint in joints):
@@ -537,6 +545,10 @@ class AnitescuLcs:
             elif isinstance(shape, Box):
                 rows["shape"].append(BOX)
                 rows["size"].append([0.5 * length for length in np.array(shape.size())])
+            elif isinstance(shape, Cylinder):
+                rows["shape"].append(CYLINDER)
+                half = 0.5 * shape.length()
+                rows["size"].append([shape.radius(), half, half])
             elif isinstance(shape, HalfSpace):
                 rows["shape"].append(HALF_SPACE)
                 rows["size"].append([0.0] * 3)
@@ -573,6 +585,8 @@ class AnitescuLcs:
         return ConstantMassModel(
             M_inv=array(np.linalg.inv(M)), f_0=array(f_0), J_v=array(J_v),
             J_u=array(J_u), plain=self._plain, floating=self._floating,
+            turning=array(turning, np.int64).reshape(-1, 2),
+            body=array(inertias).reshape(-1, 5, 3),
             shape=array(rows["shape"], np.int64), size=array(rows["size"]),
             quaternion=array(rows["quaternion"], np.int64),
             omega=array(rows["omega"], np.int64), R=array(R), p_0=array(p_0),

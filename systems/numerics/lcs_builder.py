@@ -37,7 +37,7 @@ from numba import njit
 from makebreak.systems.numerics.lcs import LCS
 
 # Shapes that the fast path knows.
-SPHERE, BOX, HALF_SPACE = 0, 1, 2
+SPHERE, BOX, HALF_SPACE, CYLINDER = 0, 1, 2, 3
 _NOT_FINITE = "the linearised contact model has an entry that is not finite"
 
 
@@ -257,11 +257,13 @@ def _assemble(
 
 @dataclass(frozen=True, eq=False)
 class ConstantMassModel:
-    """A model whose mass matrix does not depend on its state, and its contacts.
+    """A model of bodies that move apart from one another, and its contacts.
 
-    Every body either never turns (prismatic joints and welds) or floats freely with
-    its centre of mass at its origin and equal moments of inertia. Then f = f_0 + J_v v
-    + J_u u exactly and only contact geometry depends on q. Made by systems/lcs_builder.
+    Every body either never turns (prismatic joints and welds) or floats freely. With
+    its centre of mass at its origin and equal moments of inertia, that is all: then
+    f = f_0 + J_v v + J_u u exactly, the mass matrix is constant, and only contact
+    geometry depends on q. For the other floating bodies (`turning`) rigid_body adds
+    what depends on how they are turned. Made by systems/lcs_builder.
 
     Row g of the geometry arrays is one collision shape. `quaternion` and `omega` are
     where its body's quaternion is in q and its angular velocity in v (the body's
@@ -275,8 +277,10 @@ class ConstantMassModel:
     J_u: np.ndarray  # (n_v, n_u)
     plain: np.ndarray  # (n, 2) pairs (index in q, index in v) with qdot = v
     floating: np.ndarray  # (m, 2) starts (in q, in v) of each floating body
-    shape: np.ndarray  # (n_g,) SPHERE, BOX or HALF_SPACE
-    size: np.ndarray  # (n_g, 3) radius; half extents of a box [m]
+    turning: np.ndarray  # (k, 2) the same of those with a mass matrix that turns
+    body: np.ndarray  # (k, 5, 3) inertia about the centre of mass, that centre, mass
+    shape: np.ndarray  # (n_g,) SPHERE, BOX, HALF_SPACE or CYLINDER
+    size: np.ndarray  # (n_g, 3) radius; half extents of a box; radius, half length [m]
     quaternion: np.ndarray  # (n_g,)
     omega: np.ndarray  # (n_g,)
     R: np.ndarray  # (n_g, 3, 3) in the world, or in the floating body
@@ -305,9 +309,9 @@ class ConstantMassModel:
             pairs, reference = pairs[chosen], reference[chosen]
         A, B, D, d, E, F, H, c, phi, J_c, finite = _build_constant_mass(
             x, u, self.M_inv, self.f_0, self.J_v, self.J_u, self.plain, self.floating,
-            self.shape, self.size, self.quaternion, self.omega, self.R, self.p_0,
-            self.P, self.J_p, pairs, reference, rows.contact, rows.normal, weight,
-            rows.edge, F_0, dt,
+            self.turning, self.body, self.shape, self.size, self.quaternion, self.omega,
+            self.R, self.p_0, self.P, self.J_p, pairs, reference, rows.contact,
+            rows.normal, weight, rows.edge, F_0, dt,
         )  # fmt: skip
         if not finite:
             raise ValueError(_NOT_FINITE)
@@ -355,8 +359,9 @@ def _gaps(q, shape, size, quaternion, R, p_0, P, pairs):
 
 @njit(cache=True)
 def _build_constant_mass(
-    x, u, M_inv, f_0, J_v, J_u, plain, floating, shape, size, quaternion, omega, R,
-    p_0, P, J_p, pairs, reference, contact, normal, weight, edge, F_0, dt,
+    x, u, M_inv, f_0, J_v, J_u, plain, floating, turning, body, shape, size,
+    quaternion, omega, R, p_0, P, J_p, pairs, reference, contact, normal, weight,
+    edge, F_0, dt,
 ):  # fmt: skip
     n_v = f_0.size
     n_q = x.size - n_v
@@ -381,11 +386,71 @@ def _build_constant_mass(
         J_c[k] = normal[k] * J[i, 0] + weight[k] * J_t
         phi_lam[k] = phi[i] if normal[k] > 0.0 else np.inf
     f = f_0 + J_v @ v + J_u @ u
+    J_q = np.zeros((n_v, n_q))
+    if len(turning) > 0:
+        M_inv, J_v = M_inv.copy(), J_v.copy()
+    for i in range(len(turning)):
+        a, b = turning[i]
+        of = slice(b, b + 6)
+        R_WB = _rotation(q[a], q[a + 1], q[a + 2], q[a + 3])
+        f_i, J_angle, J_w, M_inv_i = rigid_body(R_WB, v[b : b + 3], body[i])
+        f[of] += f_i
+        J_q[of, a : a + 4] = J_angle @ N_plus[b : b + 3, a : a + 4].copy()
+        J_v[of, b : b + 3] += J_w
+        M_inv[of, of] = M_inv_i
     A, B, D, d, E, F, H, c = _assemble(
-        x, f, np.zeros((n_v, n_q)), J_v, J_u, u, M_inv @ J_c.T, N, N_plus, phi, J_n,
+        x, f, J_q, J_v, J_u, u, M_inv @ J_c.T, N, N_plus, phi, J_n,
         J_c, contact, normal, F_0, dt,
     )  # fmt: skip
     return A, B, D, d, E, F, H, c, phi_lam, J_c, _is_finite(c, d, F)
+
+
+@njit(cache=True)
+def _cross(a):
+    """[a]x (3, 3): [a]x b = a x b."""
+    m = np.zeros((3, 3))
+    m[0, 1], m[0, 2], m[1, 2] = -a[2], a[1], -a[0]
+    m[1, 0], m[2, 0], m[2, 1] = a[2], -a[1], a[0]
+    return m
+
+
+@njit(cache=True)
+def rigid_body(R, omega, body):
+    """A free rigid body that turns, beside its weight.
+
+    Its origin and its turning accelerate, with I about the centre of mass at c, both in
+    the body's frame, and w = R' omega, by
+
+        R F(w),  F = [dw, -dw x c - w x (w x c)],  dw = -I^-1 (w x I w)
+
+    Args: R (3, 3) of the body in the world; omega (3,) in the world [rad/s]; body
+        (5, 3): I [kg m2], c [m], and mass [kg] in all of the last row.
+    Returns: f (6,) [turning, origin]; its derivatives (6, 3) by a turn of the body (a
+        vector in the world [rad]) and by omega; the inverse (6, 6) of its mass matrix.
+    Source: Newton and Euler; Featherstone, "Rigid Body Dynamics Algorithms", 2.
+    """
+    inertia, c, mass = body[:3].copy(), body[3].copy(), body[4, 0]
+    w, I_inv = R.T @ omega, np.linalg.inv(inertia)
+    C = _cross(c)
+    dw = -I_inv @ np.cross(w, inertia @ w)
+    F = np.empty((2, 3))
+    F[0] = dw
+    F[1] = C @ dw - np.cross(w, np.cross(w, c))
+    G_w = -I_inv @ (_cross(w) @ inertia - _cross(inertia @ w))
+    G_v = C @ G_w + _cross(np.cross(w, c)) + _cross(w) @ C
+    f, J_angle, J_w = np.empty(6), np.empty((6, 3)), np.empty((6, 3))
+    for i, G in enumerate((G_w, G_v)):
+        of = slice(3 * i, 3 * i + 3)
+        f[of] = R @ F[i]
+        J_w[of] = R @ G @ R.T
+        J_angle[of] = R @ G @ R.T @ _cross(omega) - _cross(f[of])
+    # v_origin = v_centre + C omega.
+    M_inv, I_W, C_W = np.empty((6, 6)), R @ I_inv @ R.T, R @ C @ R.T
+    M_inv[:3, :3] = I_W
+    M_inv[:3, 3:] = I_W @ C_W.T
+    M_inv[3:, :3] = C_W @ I_W
+    M_inv[3:, 3:] = np.eye(3) / mass + C_W @ I_W @ C_W.T
+    return f, J_angle, J_w, M_inv
 
 
 @njit(cache=True)
@@ -443,8 +508,8 @@ def _point_jacobian(r, omega, J_p):
 def _sphere_against(p_S, radius, shape, size, R_G, p_G):
     """Gap, unit normal towards the sphere, nearest points on the sphere and the other.
 
-    The other shape: a sphere, a box (half extents `size`), or the half-space below the
-    z axis of its frame.
+    The other shape: a sphere, a box (half extents `size`), the half-space below the z
+    axis of its frame, or a cylinder about that axis.
     """
     if shape == HALF_SPACE:
         n = R_G[:, 2].copy()
@@ -460,6 +525,10 @@ def _sphere_against(p_S, radius, shape, size, R_G, p_G):
         on_other = p_G + size[0] * n
         return distance - size[0] - radius, n, p_S - radius * n, on_other
     p = R_G.T @ (p_S - p_G)
+    if shape == CYLINDER:
+        distance, n_G, nearest = _point_on_cylinder(p, size[0], size[1])
+        n = R_G @ n_G
+        return distance - radius, n, p_S - radius * n, p_G + R_G @ nearest
     nearest = np.minimum(np.maximum(p, -size), size)
     n_G = p - nearest
     distance = sqrt(n_G @ n_G)
@@ -473,3 +542,32 @@ def _sphere_against(p_S, radius, shape, size, R_G, p_G):
         nearest[axis] = side * size[axis]
     n = R_G @ n_G
     return distance - radius, n, p_S - radius * n, p_G + R_G @ nearest
+
+
+@njit(cache=True)
+def _point_on_cylinder(p, radius, half_length):
+    """Distance (negative inside), outward unit normal and nearest point of a cylinder
+    about z to the point p (3,)."""
+    along, off = p[2], sqrt(p[0] * p[0] + p[1] * p[1])
+    out = np.zeros(3)  # Away from the axis; on it every direction is right.
+    if off > 1e-12:
+        out[0], out[1] = p[0] / off, p[1] / off
+    else:
+        out[0] = 1.0
+    side = 1.0 if along >= 0.0 else -1.0
+    beyond, outside = abs(along) - half_length, off - radius
+    nearest, n = np.empty(3), np.zeros(3)
+    if beyond <= 0.0 and outside <= 0.0:  # Out through the nearer of side and end.
+        if outside >= beyond:
+            nearest[:] = radius * out
+            nearest[2] = along
+            return outside, out, nearest
+        nearest[:] = p
+        nearest[2] = side * half_length
+        n[2] = side
+        return beyond, n, nearest
+    nearest[:] = min(off, radius) * out
+    nearest[2] = min(max(along, -half_length), half_length)
+    n[:] = p - nearest
+    distance = sqrt(n @ n)
+    return distance, n / distance, nearest
