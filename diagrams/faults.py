@@ -17,7 +17,7 @@ from pydrake.systems.primitives import Adder
 
 from makebreak.diagrams.camera import CameraConfig, camera_model
 from makebreak.diagrams.fault_kinds import TICK, Injected
-from makebreak.diagrams.scene_facts import spheres_of
+from makebreak.diagrams.scene_facts import actuators_of, spheres_of
 from makebreak.models.effects.joint_forces import JointForces
 from makebreak.models.effects.joints import fade_velocity
 from makebreak.models.scene import LoadedScene, Scene
@@ -30,6 +30,7 @@ from makebreak.systems.fault_signals import (
     SpoiledLcs,
     StuckSignal,
 )
+from makebreak.systems.numerics.time_span import lasts
 
 GLARE = (255, 255, 255)
 BALL_COLOR = (242, 102, 13)  # Of models/ball.sdf.
@@ -195,12 +196,8 @@ def add_forces(
         name = f"fault_{i}_{fault.name}"
         system: Push | Hand | JointForces
         if fault.name == "joint_friction":
-            joints = [
-                plant.get_joint_actuator(index).joint()
-                for index in plant.GetJointActuatorIndices(
-                    plant.GetModelInstanceByName(arm)
-                )
-            ][: int(p["joints"])]
+            driven = actuators_of(plant, arm)[: int(p["joints"])]
+            joints = [each.joint() for each in driven]
             c = p["coulomb"]
             numbers = [[c, fade_velocity(plant, j, c), *span] for j in joints]
             system = JointForces(
@@ -246,7 +243,7 @@ def faulty_lcs(
 
 def _timed_friction(q, v, t, p):
     """p: dry friction, the speed below which it fades, from when and until when."""
-    if p[2] - 1e-9 <= t < p[3] - 1e-9:
+    if lasts(t, p[2], p[3]):
         return -p[0] * math.tanh(v / p[1])
     return 0.0
 

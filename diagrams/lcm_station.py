@@ -23,13 +23,13 @@ from pydrake.systems.lcm import _Serializer_  # What use_cpp_serializer=True tak
 from pydrake.systems.primitives import Gain, PassThrough
 from pydrake.systems.sensors import LcmImageArrayToImages
 
+from makebreak.diagrams.scene_facts import N_JOINTS
 from makebreak.diagrams.station import ARM, DELAY, TIP_FRAME
 from makebreak.systems.gravity_left_out import GravityLeftOut
 from makebreak.systems.impedance_controller import serial_chain_of
 
 STATUS, COMMAND, PICTURES = "PANDA_STATUS", "PANDA_COMMAND", "OVERHEAD_IMAGES"
 URL = "udpm://239.255.76.67:7671?ttl=0"  # This machine alone.
-N_JOINTS = 7
 TORQUE_MODE = int(PandaControlMode.kTorque)
 STATUS_PORT, PICTURES_PORT = "lcmt_panda_status", "lcmt_image_array"
 COMMAND_PORT = "lcmt_panda_command"

@@ -10,11 +10,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydrake.common.schema import Transform
 
+from makebreak.diagrams.scene_facts import N_JOINTS, PANDA_JOINTS
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
 from makebreak.models.typed_yaml import nearest
-
-N_JOINTS = 7
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,7 @@ def with_errors(
     Args: arm, tool, table: names of models; the tool is welded to the arm.
     """
     scene = deepcopy(scene)
-    joints = [f"{arm}.panda_joint{i + 1}" for i in range(N_JOINTS)]
+    joints = [f"{arm}.{joint}" for joint in PANDA_JOINTS]
     for joint, offset in zip(joints, errors.encoders.tolist(), strict=True):
         if offset != 0.0:
             scene.effects.append(Effect("joint_offset", [joint], {"offset": offset}))

@@ -18,6 +18,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import Multiplexer, VectorLogSink
 
+from makebreak.diagrams.scene_facts import PANDA_JOINTS
 from makebreak.diagrams.station import ARM, TIP_FRAME
 
 TICK = 0.001  # Of commands [s].
@@ -114,7 +115,7 @@ def record_station(
     Args: tau (7,), what is commanded; tool, the model of TIP_FRAME; seen, of what else
         is measured, as by a camera.
     """
-    joints = [f"{ARM}.panda_joint{i + 1}" for i in range(tau.size())]
+    joints = [f"{ARM}.{joint}" for joint in PANDA_JOINTS]
 
     def of(port: str, what: str):
         names = [f"{joint}.{what}" for joint in joints]

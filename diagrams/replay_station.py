@@ -17,9 +17,9 @@ from pydrake.systems.framework import (
 )
 from scipy.signal import savgol_filter
 
+from makebreak.diagrams.scene_facts import N_JOINTS, PANDA_JOINTS
 from makebreak.diagrams.station import ARM
 
-N_JOINTS = 7
 SMOOTH_ROWS = 9  # Of a parabola through the ball's places, whose slope is its speed.
 
 
@@ -56,7 +56,7 @@ class RecordedSignals(LeafSystem):
 
 def joint_columns(what: str) -> list[str]:
     """Names of a recording's columns of the arm's joints, such as `position`."""
-    return [f"{ARM}.panda_joint{i + 1}.{what}" for i in range(N_JOINTS)]
+    return [f"{ARM}.{joint}.{what}" for joint in PANDA_JOINTS]
 
 
 def make_replay_station(

@@ -3,6 +3,16 @@
 import numpy as np
 from pydrake.geometry import SceneGraph, Sphere
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import JointActuator
+
+PANDA_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))  # Of models/panda.urdf.
+N_JOINTS = len(PANDA_JOINTS)
+
+
+def actuators_of(plant: MultibodyPlant, model: str) -> list[JointActuator]:
+    """The actuators of a model, in the order of its inputs."""
+    indices = plant.GetJointActuatorIndices(plant.GetModelInstanceByName(model))
+    return [plant.get_joint_actuator(index) for index in indices]
 
 
 def sphere_radius(plant: MultibodyPlant, scene_graph: SceneGraph, model: str) -> float:

@@ -21,6 +21,7 @@ from makebreak.diagrams.faults import (
     with_box,
 )
 from makebreak.diagrams.realism import StationErrors
+from makebreak.diagrams.scene_facts import actuators_of
 from makebreak.models.effects import KINDS
 from makebreak.models.model_files import MODELS
 from makebreak.models.scene import InitialSection, Scene, load_scene, read_scene
@@ -121,10 +122,7 @@ def make_station(
     n = plant.num_velocities(arm)
     # What the motors give within the effort limits that Drake keeps, too. Drake's own
     # port for it would solve the contact once more.
-    limit = np.array([
-        plant.get_joint_actuator(index).effort_limit()
-        for index in plant.GetJointActuatorIndices(arm)
-    ])  # fmt: skip
+    limit = np.array([each.effort_limit() for each in actuators_of(plant, ARM)])
     # Where commands come in, and what they are behind the faults on their way.
     on_the_way = faulty_command(builder, limit, faults)
     if on_the_way:
@@ -160,10 +158,7 @@ def make_station(
         builder.Connect(port, sensor.GetInputPort("value"))
         return sensor.GetOutputPort("measured")
 
-    joints = [
-        f"{ARM}.{plant.get_joint_actuator(index).joint().name()}"
-        for index in plant.GetJointActuatorIndices(arm)
-    ]
+    joints = [f"{ARM}.{each.joint().name()}" for each in actuators_of(plant, ARM)]
 
     def measured(port: OutputPort, *what: str) -> OutputPort:
         """The port as the scene's effects have it measured."""
@@ -286,11 +281,7 @@ def make_station(
 
 def _add_monitor(builder: DiagramBuilder, plant: MultibodyPlant, effort_max) -> None:
     """A SafetyMonitor of the arm, just after its controller has spoken."""
-    arm = plant.GetModelInstanceByName(ARM)
-    joints = [
-        plant.get_joint_actuator(index).joint()
-        for index in plant.GetJointActuatorIndices(arm)
-    ]
+    joints = [each.joint() for each in actuators_of(plant, ARM)]
     limits = ArmLimits(
         torque=effort_max,
         torque_rate=TORQUE_RATE_MAX,
@@ -301,7 +292,10 @@ def _add_monitor(builder: DiagramBuilder, plant: MultibodyPlant, effort_max) -> 
     monitor = builder.AddNamedSystem("monitor", SafetyMonitor(limits, 0.001, 9e-4))
     n = len(joints)
     truth = builder.AddNamedSystem("monitor_split", Demultiplexer([n, n]))
-    builder.Connect(plant.get_state_output_port(arm), truth.get_input_port())
+    builder.Connect(
+        plant.get_state_output_port(plant.GetModelInstanceByName(ARM)),
+        truth.get_input_port(),
+    )
     for i, name in enumerate("qv"):
         builder.Connect(truth.get_output_port(i), monitor.GetInputPort(name))
     builder.ConnectInput(f"{ARM}.torque_commanded", monitor.GetInputPort("tau"))

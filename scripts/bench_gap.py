@@ -14,6 +14,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyForces
 
 import makebreak
+from makebreak.diagrams.scene_facts import PANDA_JOINTS
 from makebreak.gap.table import write_recording
 from makebreak.scripts import bench_sysid
 from makebreak.scripts.trials import makebreak_command
@@ -24,7 +25,7 @@ POSITION_NOISE, VELOCITY_NOISE = 3e-5, 3e-3  # [rad], [rad/s]
 FRICTION_JOINT, FRICTION = 3, 1.8  # [N m] Coulomb, of panda_joint4.
 _STEP = 5e-4  # [s] of the integration; 1/_STEP is a multiple of the rate.
 _MODELS = Path(makebreak.__file__).parent / "models"
-_JOINTS = [f"panda.panda_joint{i}" for i in range(1, 8)]
+_JOINTS = [f"panda.{joint}" for joint in PANDA_JOINTS]
 _SCENE = """directives:
   - add_model: {{name: panda, file: {urdf}}}
   - add_weld: {{parent: world, child: panda::panda_link0}}

@@ -14,7 +14,7 @@ import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
-from functools import partial
+from functools import partial, reduce
 from importlib import import_module
 from pathlib import Path
 
@@ -135,7 +135,7 @@ def _config(module, args: argparse.Namespace):
 
 
 def _with_faults(config, texts: Sequence[str], experiment: str):
-    """The config with the faults of --fault.
+    """The config with the faults of --fault beside its own.
 
     Raises: ValueError for a fault that there is not, or an experiment without an arm.
     """
@@ -148,7 +148,8 @@ def _with_faults(config, texts: Sequence[str], experiment: str):
         read_fault(text)
     if not keys:
         raise ValueError(f"--fault: {experiment} has no arm that faults could meet")
-    given = ", ".join(f"'{text}'" for text in texts)
+    there = reduce(getattr, keys[0].split("."), config)
+    given = ", ".join(f"'{text}'" for text in (*there, *texts))
     return apply_settings(config, [f"{keys[0]}=[{given}]"])
 
 
@@ -633,6 +634,26 @@ def _completion(args) -> int:
     return 0
 
 
+def _config_options(
+    p: argparse.ArgumentParser,
+    model: str = "the scene that control believes",
+    seed: str = "all randomness comes from it",
+) -> None:
+    """What _config reads. Args: model, seed: the help of these two."""
+    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", nargs="+")
+    p.add_argument("--config", metavar="FILE", help="a YAML file of settings")
+    p.add_argument("--world", metavar="SCENE", help="the scene that is simulated")
+    p.add_argument("--model", metavar="SCENE", help=model)
+    p.add_argument("--seed", metavar="N", help=seed)
+
+
+def _fault_option(p: argparse.ArgumentParser) -> None:
+    p.add_argument(
+        "--fault", action="append", default=[], metavar="NAME[:from=S,for=S]",
+        help="what is to go wrong; `list` has the names",
+    )  # fmt: skip
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="makebreak",
@@ -648,16 +669,9 @@ def _parser() -> argparse.ArgumentParser:
 
     p = commands.add_parser("run", help="one experiment, seen in Meshcat")
     p.add_argument("experiment", nargs="?", default="ball_rolling")
-    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", nargs="+")
-    p.add_argument("--config", metavar="FILE", help="a YAML file of settings")
-    p.add_argument("--world", metavar="SCENE", help="the scene that is simulated")
-    p.add_argument("--model", metavar="SCENE", help="the scene that control believes")
-    p.add_argument("--seed", metavar="N", help="all randomness comes from it")
+    _config_options(p)
     p.add_argument("--duration", metavar="S", help="simulated seconds")
-    p.add_argument(
-        "--fault", action="append", default=[], metavar="NAME[:from=S,for=S]",
-        help="what is to go wrong; `list` has the names",
-    )  # fmt: skip
+    _fault_option(p)
     p.add_argument(
         "--robot", nargs="+", default=["sim"], metavar=("sim", "RECORDING"),
         help="sim; lcm [URL], one behind LCM; replay RECORDING",
@@ -679,15 +693,8 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--delay", default="0", metavar="S", help="sent so much later")
     p.add_argument("--url", metavar="URL", help="of LCM; default: this machine alone")
     p.add_argument("--duration", default="86400", metavar="S", help="of its own time")
-    p.add_argument(
-        "--fault", action="append", default=[], metavar="NAME[:from=S,for=S]",
-        help="what is to go wrong; `list` has the names",
-    )  # fmt: skip
-    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", nargs="+")
-    p.add_argument("--config", metavar="FILE", help="a YAML file of settings")
-    p.add_argument("--world", metavar="SCENE", help="the scene that is simulated")
-    p.add_argument("--model", metavar="SCENE", help="not used by a station")
-    p.add_argument("--seed", metavar="N", help="all randomness comes from it")
+    _fault_option(p)
+    _config_options(p, model="not used by a station")
     p.set_defaults(function=_station)
 
     p = commands.add_parser("reproduce", help="the paper's figure or table beside ours")
@@ -721,11 +728,7 @@ def _parser() -> argparse.ArgumentParser:
         "--vary", action="append", default=[], metavar="KEY=LO:HI", nargs="+",
         help="LO:HI is drawn from for each trial; A,B,C: each is a case",
     )  # fmt: skip
-    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", nargs="+")
-    p.add_argument("--config", metavar="FILE", help="a YAML file of settings")
-    p.add_argument("--world", metavar="SCENE", help="the scene that is simulated")
-    p.add_argument("--model", metavar="SCENE", help="the scene that control believes")
-    p.add_argument("--seed", metavar="N", help="of the first trial (0)")
+    _config_options(p, seed="of the first trial (0)")
     p.add_argument("--duration", metavar="S", help="simulated seconds")
     p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
     p.add_argument(
@@ -793,11 +796,7 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--systems", metavar="A,B", help="by name; default: all that update")
     p.add_argument("--out", metavar="DIR", required=True, help="a new folder")
     p.add_argument("--seconds", metavar="S", default="5", help="recorded (default 5)")
-    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", nargs="+")
-    p.add_argument("--config", metavar="FILE", help="a YAML file of settings")
-    p.add_argument("--world", metavar="SCENE", help="the scene that is simulated")
-    p.add_argument("--model", metavar="SCENE", help="the scene that control believes")
-    p.add_argument("--seed", metavar="N", help="all randomness comes from it")
+    _config_options(p)
     p.set_defaults(function=_export_tests)
 
     p = commands.add_parser(

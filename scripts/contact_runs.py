@@ -3,6 +3,7 @@ trials that are rehearsed on the model before the first real one."""
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 from pydrake.systems.framework import Diagram
 
@@ -47,24 +48,21 @@ def simulate_motion(
     )
 
 
-def without_faults(config):
-    """An experiment's config for rehearsals: nothing goes wrong in the model."""
-    return replace(config, control=replace(config.control, faults=[]))
-
-
 def rehearsed(
-    count: int,
-    simulate: Callable[[Knowledge, int, str], Log],
-    knowledge: Knowledge,
+    config: Any, task: Any, simulate: Callable[..., Log], knowledge: Knowledge
 ) -> Knowledge:
-    """What is known after so many trials on the model, none of them scored.
+    """What is known after config.rehearse trials on the model, none of them scored.
+
+    Nothing goes wrong in the model: they have no faults.
 
     Args:
-        count: of rehearsals.
-        simulate: a trial on the model, by what is known, its number and its label.
+        simulate: a trial, by what is known, its number and its label; `config` and
+            `task` by name.
         knowledge: before the first one.
     """
-    for k in range(count):
-        log = simulate(knowledge, k, f"rehearsal_{k + 1}")
+    config = replace(config, control=replace(config.control, faults=[]))
+    task = replace(task, world=task.model)
+    for k in range(config.rehearse):
+        log = simulate(knowledge, k, f"rehearsal_{k + 1}", config=config, task=task)
         knowledge = learned(log.diagram, log.context)
     return knowledge

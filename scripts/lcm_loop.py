@@ -22,7 +22,6 @@ from pydrake.systems.framework import Context, Diagram, OutputPort
 from makebreak.diagrams.lcm_station import (
     COMMAND,
     COMMAND_PORT,
-    N_JOINTS,
     PICTURES,
     PICTURES_PORT,
     STATUS,
@@ -32,6 +31,7 @@ from makebreak.diagrams.lcm_station import (
     empty_status,
     no_pictures,
 )
+from makebreak.diagrams.scene_facts import N_JOINTS
 from makebreak.diagrams.station import TORQUE_RATE_MAX
 from makebreak.scripts.recording_stream import RecordingStream
 from makebreak.scripts.session import CatchInterrupt, Log, Session

@@ -40,19 +40,13 @@ class RunButtons:
             return False
         began = perf_counter()
         waited = False
-        while not self._pressed_stop() and not ended() and self._is_paused():
+        while not self._clicks(STOP) and not ended() and self._clicks(PAUSE) % 2:
             waited = True
             sleep(LOOK_SEC)
         if waited:
             self.waited_sec += perf_counter() - began
             at_rest()
-        return self._pressed_stop()
+        return self._clicks(STOP) > 0
 
-    def _is_paused(self) -> bool:
-        return (
-            self._meshcat is not None and self._meshcat.GetButtonClicks(PAUSE) % 2 > 0
-        )
-
-    def _pressed_stop(self) -> bool:
-        shown = self._meshcat
-        return shown is not None and shown.GetButtonClicks(STOP) > 0
+    def _clicks(self, name: str) -> int:
+        return 0 if self._meshcat is None else self._meshcat.GetButtonClicks(name)

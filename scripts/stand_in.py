@@ -27,7 +27,6 @@ from pydrake.systems.sensors import ImageToLcmImageArrayT, PixelType
 from makebreak.diagrams.ball_rolling import BallRollingConfig, make_world
 from makebreak.diagrams.lcm_station import (
     COMMAND,
-    N_JOINTS,
     PICTURES,
     PICTURES_PORT,
     STATUS,
@@ -35,6 +34,7 @@ from makebreak.diagrams.lcm_station import (
     Messages,
     empty_status,
 )
+from makebreak.diagrams.scene_facts import N_JOINTS
 from makebreak.diagrams.station import (
     ARM,
     TIP_FRAME,

@@ -6,6 +6,8 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.framework import LeafSystem
 
+from makebreak.systems.numerics.time_span import lasts
+
 HAND_RATE = 60.0  # [1/s] of the hand's spring and damper.
 HAND_SPEED = 0.8  # [m/s]
 HAND_HEIGHT = 1.2  # [m] Above any camera.
@@ -34,7 +36,7 @@ class Push(LeafSystem):
 
     def _calc(self, context, output):
         force = np.zeros(self._plant.num_velocities())
-        if self._start - 1e-9 <= context.get_time() < self._end - 1e-9:
+        if lasts(context.get_time(), self._start, self._end):
             self._plant.SetPositionsAndVelocities(
                 self._scratch, self._state.Eval(context)
             )
@@ -93,7 +95,8 @@ class Hand(LeafSystem):
             )
 
     def _note(self, context, discrete_state):
-        if context.get_time() < self._start - 1e-9 or context.get_time() == 0.0:
+        t = context.get_time()
+        if t == 0.0 or not lasts(t, self._start, np.inf):
             p = self._state.Eval(context)[self._q : self._q + 3]
             discrete_state.set_value(self._taken, p)
 
@@ -126,7 +129,7 @@ class Hand(LeafSystem):
 
     def _calc(self, context, output):
         force, t = np.zeros(self._n_v), context.get_time()
-        if self._start - 1e-9 <= t < self._end - 1e-9:
+        if lasts(t, self._start, self._end):
             x = self._state.Eval(context)
             p = x[self._q : self._q + 3]
             w = x[self._n_q + self._v : self._n_q + self._v + 3]

@@ -12,6 +12,7 @@ from pydrake.systems.framework import LeafSystem
 from pydrake.systems.sensors import ImageRgba8U
 
 from makebreak.systems.numerics.pinhole import Pinhole
+from makebreak.systems.numerics.time_span import lasts
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +65,7 @@ class LatePictures(LeafSystem):
         frames = (*film.frames, now)[-(self._frames + 1) :]
         time = context.get_time()
         shown = now
-        if self._start - 1e-9 <= time < self._end - 1e-9:
+        if lasts(time, self._start, self._end):
             shown = frames[0]
             number = int(time / self._period + 0.5)
             lost = np.random.default_rng([self._seed, 29, number]).random()
@@ -111,7 +112,7 @@ class PaintedPictures(LeafSystem):
         picture: Any = self._image.Eval(context)
         pixels = output.get_mutable_value().mutable_data
         pixels[:] = picture.data
-        if not self._start - 1e-9 <= context.get_time() < self._end - 1e-9:
+        if not lasts(context.get_time(), self._start, self._end):
             return
         poses: Any = self._poses.Eval(context)
         p_C = self._camera.to_camera(poses[self._body].translation() + self._offset)

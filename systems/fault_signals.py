@@ -12,6 +12,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from makebreak.systems.numerics.lcs import LCS
+from makebreak.systems.numerics.time_span import lasts
 
 HUGE = 1e200
 
@@ -30,8 +31,7 @@ class _Timed(LeafSystem):
         self.DeclareVectorOutputPort("value", n, self._calc)
 
     def _acts(self, context: Context) -> bool:
-        # A tick's instant is a sum of periods: its rounding is no reason to wait.
-        return self._start - 1e-9 <= context.get_time() < self._end - 1e-9
+        return lasts(context.get_time(), self._start, self._end)
 
     def _calc(self, context: Context, output: BasicVector):
         value = self._value.Eval(context)
@@ -167,6 +167,6 @@ class SpoiledLcs(LeafSystem):
 
     def _calc(self, context, output):
         lcs: Any = self._lcs.Eval(context)
-        if self._start - 1e-9 <= context.get_time() < self._end - 1e-9:
+        if lasts(context.get_time(), self._start, self._end):
             lcs = replace(lcs, A=HUGE * lcs.A, D=HUGE * lcs.D)
         output.set_value(lcs)

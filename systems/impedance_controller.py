@@ -21,8 +21,8 @@ from makebreak.systems.numerics.packed import packed
 from makebreak.systems.numerics.serial_chain import SerialChain, chain_state
 from makebreak.systems.numerics.timing import timed
 
-# Of the tip's mass over the delay, that damping may be: a third of where it begins to
-# swing by itself, which leaves the spring a margin.
+# Of the tip's mass over the delay, that damping may be. It begins to swing by itself at
+# pi/2: a third of that leaves the spring a margin.
 DELAY_SHARE = 0.5
 
 

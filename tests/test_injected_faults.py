@@ -21,7 +21,8 @@ from makebreak.diagrams.ball_rolling import (
     make_world,
 )
 from makebreak.diagrams.camera import CameraConfig, camera_model
-from makebreak.diagrams.contact_learning import ContactLearningConfig
+from makebreak.diagrams.changing_contact import Knowledge
+from makebreak.diagrams.contact_learning import ContactLearningConfig, make_task
 from makebreak.diagrams.fault_kinds import FAULTS, FROM, read_fault, read_faults
 from makebreak.diagrams.faults import GLARE_SHARE
 from makebreak.diagrams.station import (
@@ -34,7 +35,7 @@ from makebreak.diagrams.station import (
     make_station,
 )
 from makebreak.scripts import cli
-from makebreak.scripts.contact_runs import without_faults
+from makebreak.scripts.contact_runs import rehearsed
 from makebreak.scripts.fault_trials import FAILED, HELD, RECOVERED, UNJUDGED, judge
 from makebreak.scripts.session import Session
 from makebreak.systems.c3_mpc import C3Status
@@ -495,11 +496,31 @@ def test_beside_a_run_that_does_not_roll_nothing_is_recovered():
     assert judge(fault, runs([1.0] * 20, limits_kept=False), still) == FAILED
 
 
+def test_faults_of_the_command_line_come_beside_those_of_the_config():
+    own = cli._with_faults(ContactLearningConfig(), ["box"], "contact_learning")
+    both = cli._with_faults(own, ["push:from=2"], "contact_learning")
+    assert both.control.faults == ["box", "push:from=2"]
+
+
 def test_rehearsals_have_no_faults():
     config = ContactLearningConfig()
     config = replace(config, control=replace(config.control, faults=["box"]))
-    assert without_faults(config).control.faults == []
-    assert without_faults(config).trials == config.trials
+    config = replace(config, rehearse=1)
+    task = make_task(config)
+
+    class Done(Exception):
+        pass
+
+    def trial(knowledge, k, label, config, task):
+        assert config.control.faults == [] and config.trials == before.trials
+        assert task.world is task.model
+        assert (knowledge, k, label) == (known, 0, "rehearsal_1")
+        raise Done
+
+    before, known = config, Knowledge(contacts=task.prior)
+    with pytest.raises(Done):
+        rehearsed(config, task, trial, known)
+    assert rehearsed(replace(config, rehearse=0), task, trial, known) is known
 
 
 def test_a_ball_beside_the_camera_is_not_painted():

@@ -13,7 +13,6 @@ from makebreak.diagrams.camera import CameraConfig
 from makebreak.diagrams.lcm_station import (
     COMMAND,
     COMMAND_PORT,
-    N_JOINTS,
     PICTURES_PORT,
     STATUS,
     STATUS_PORT,
@@ -24,9 +23,10 @@ from makebreak.diagrams.lcm_station import (
     no_pictures,
 )
 from makebreak.diagrams.replay_station import joint_columns, make_replay_station
+from makebreak.diagrams.scene_facts import N_JOINTS
 from makebreak.diagrams.station import make_control_plant
 from makebreak.scripts import cli
-from makebreak.scripts.experiments.ball_rolling import start_where_it_is
+from makebreak.scripts.experiments.ball_rolling import differences, start_where_it_is
 from makebreak.scripts.lcm_loop import HOLD_SEC, SPIN_MS, LcmLoop
 from makebreak.scripts.stand_in import (
     DAMPING,
@@ -268,6 +268,21 @@ def test_no_command_that_is_not_finite_is_sent_and_none_steps_too_far(robot):
     assert abs(np.array(answer.joint_torque) - before).max() <= 1.0 + 1e-9
 
 
+def test_a_command_that_is_not_finite_is_not_sent(robot, monkeypatch):
+    robot.says(1)
+    real = Messages.read
+
+    def broken(*args):
+        command = lcmt_panda_command.decode(real(*args))
+        command.joint_torque = [*command.joint_torque[:6], float("nan")]
+        return command.encode()
+
+    monkeypatch.setattr(Messages, "read", broken)
+    assert robot.says(2) == [] and robot.loop.report.not_finite == 1
+    monkeypatch.setattr(Messages, "read", real)
+    assert len(robot.says(3)) == 1
+
+
 def test_the_loops_delay_is_found_in_the_torques_that_come_back(robot):
     robot.says(1)
     (answer,) = robot.says(2, q=np.array(HOME) + 0.01)
@@ -400,6 +415,10 @@ def test_a_start_far_away_is_refused():
         (["run", "porridge", "--robot", "lcm"], "porridge cannot be run on it yet"),
         (["run", "--robot", "iiwa"], "got iiwa, expected sim, lcm"),
         (["run", "--robot", "replay", "none.csv"], "none.csv does not exist"),
+        (
+            ["run", "--robot", "replay", "none.csv", "--fault", "push"],
+            "--fault push: a recording has no robot that it meets",
+        ),
         (["station", "--rate", "2"], "--rate: got 2, expected at most 1"),
         (["station", "--drop", "1"], "--drop: got 1, expected a share"),
         (["station", "porridge"], "porridge has no station"),
@@ -423,6 +442,21 @@ def recording(n=40):
             columns[name] = k + time
     columns["ball.x"], columns["ball.y"] = 0.5 + 0.1 * time, -0.2 * time
     return columns
+
+
+def test_commands_of_a_replay_are_alike_until_they_are_not():
+    time, before = 0.1 * np.arange(6), np.zeros((6, 7))
+    now = before.copy()
+    now[:, 2] = [0.0, 1.0, -2.9, 0.0, 0.0, -3.1]
+    found = differences(time, before + 5.0, now + 5.0)
+    assert found["commands_alike_until_s"] == pytest.approx(0.5)
+    assert found["command_difference_max_Nm"] == pytest.approx(3.1)
+    assert found["command_difference_max_at_s"] == pytest.approx(0.5)
+    assert found["command_difference_rms_Nm"][2] > 0.0
+    assert found["command_spread_rms_Nm"] == [0.0] * 7
+    now[3, 0] = np.nan
+    assert differences(time, before, now)["commands_alike_until_s"] == time[3]
+    assert np.isnan(differences(time, before, before)["commands_alike_until_s"])
 
 
 def test_a_replay_gives_what_was_recorded():

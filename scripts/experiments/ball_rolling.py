@@ -229,7 +229,12 @@ def run_on_recording(config, session, recording: Path) -> dict:
 
     `success`: every command is finite. How far they may differ depends on what was
     changed since.
+
+    Raises: ValueError for faults of what is not there.
     """
+    for text in config.faults:
+        if read_fault(text).kind.on != "planner":
+            raise ValueError(f"--fault {text}: a recording has no robot that it meets")
     columns = read_table(recording).columns
     model, scene = believed(config)
     station = make_replay_station(columns, BALL_CHANNELS, model.ball_radius)
@@ -247,10 +252,6 @@ def run_on_recording(config, session, recording: Path) -> dict:
     row = np.searchsorted(time, again["time"] - 1e-6).clip(0, len(time) - 1)
     there = np.column_stack([columns[name] for name in names])[row]
     here = np.column_stack([again[name] for name in names])
-    off = here - there
-    spread = there - there.mean(axis=0)
-    worst = int(np.argmax(abs(off).max(axis=1)))
-    apart = abs(off).max(axis=1) > ALIKE
     session.write_recording(again, scene)
     fig, axes = plt.subplots(len(names), sharex=True, figsize=(7, 9))
     for k, ax in enumerate(axes):
@@ -263,18 +264,30 @@ def run_on_recording(config, session, recording: Path) -> dict:
     criteria = Criteria()
     lost = float((~np.isfinite(here)).sum())
     criteria.at_most("finite", "commands that are not finite", lost, 0.0)
-    rms = np.sqrt((off**2).mean(axis=0))
     return criteria.result() | {
         "replayed_s": float(again["time"][-1]),
-        "command_difference_rms_Nm": rms.tolist(),
-        "command_spread_rms_Nm": np.sqrt((spread**2).mean(axis=0)).tolist(),
-        "commands_alike_until_s": first_time(again["time"], apart),
-        "command_difference_max_Nm": float(abs(off).max()),
-        "command_difference_max_at_s": float(again["time"][worst]),
+        **differences(again["time"], there, here),
         "r_gap_m": float(log["gap"][-1, 0]),
         "seed": config.seed,
         "adapt": config.adapt,
         "radius_error_m": config.radius_error_m,
+    }
+
+
+def differences(time, recorded, now) -> dict:
+    """How far the commands of a replay are from the recorded ones.
+
+    Args: time (n,) [s]; recorded, now (n, 7) [N m]. What is not finite is not alike.
+    """
+    off = abs(now - recorded)
+    worst = off.max(axis=1)
+    spread = recorded - recorded.mean(axis=0)
+    return {
+        "command_difference_rms_Nm": np.sqrt((off**2).mean(axis=0)).tolist(),
+        "command_spread_rms_Nm": np.sqrt((spread**2).mean(axis=0)).tolist(),
+        "commands_alike_until_s": first_time(time, ~(worst <= ALIKE)),
+        "command_difference_max_Nm": float(worst.max()),
+        "command_difference_max_at_s": float(time[int(np.argmax(worst))]),
     }
 
 

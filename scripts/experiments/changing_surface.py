@@ -19,7 +19,7 @@ and the mean stiffness is at most 40 % of K_max.
 See docs/modes.md.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -37,7 +37,6 @@ from makebreak.diagrams.recorder import recorded
 from makebreak.scripts.contact_runs import (
     rehearsed,
     simulate_motion,
-    without_faults,
 )
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
@@ -95,18 +94,14 @@ def run(config: ChangingSurfaceConfig, session: Session) -> dict:
     configs["adaptive"] = config  # The last one is what Meshcat's recording shows.
     logs, done = {}, {}
 
-    def simulate(config, task, knowledge, label):
+    def simulate(knowledge, _, label, config=config, task=task):
         diagram = make_changing_surface(config, task, knowledge, session.meshcat)
         return simulate_motion(session, diagram, DURATION_SEC, label)
 
-    imagined, on_model = replace(task, world=task.model), without_faults(config)
-    knowledge = rehearsed(
-        config.rehearse,
-        lambda known, _, label: simulate(on_model, imagined, known, label),
-        Knowledge(contacts=task.prior),
-    )
+    known = Knowledge(contacts=task.prior)
+    knowledge = rehearsed(config, task, simulate, known)
     for label, its in configs.items():
-        log = simulate(its, task, knowledge, label)
+        log = simulate(knowledge, 0, label, config=its)
         done[label] = log["phase"][-1, PHASE_STAGE] == DONE
         logs[label] = telemetry(log.diagram, log.context)
         if label == "adaptive":

@@ -21,8 +21,7 @@ shorter than the first.
 See docs/contacts.md.
 """
 
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -41,7 +40,6 @@ from makebreak.diagrams.tabletop import position
 from makebreak.scripts.contact_runs import (
     rehearsed,
     simulate_motion,
-    without_faults,
 )
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
@@ -112,13 +110,8 @@ def run(config: ContactLearningConfig, session: Session) -> dict:
         return simulate_motion(session, diagram, DURATION_SEC, label, PEAK_WAIT)
 
     if config.rehearse:
-        on_model = partial(
-            simulate,
-            config=without_faults(config),
-            task=replace(task, world=task.model),
-        )
         known = Knowledge(contacts=task.model_prior)
-        knowledge = rehearsed(config.rehearse, on_model, known)
+        knowledge = rehearsed(config, task, simulate, known)
     trials: list[Trial] = []
     recordings = []
     for k in range(config.trials):

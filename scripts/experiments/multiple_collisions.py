@@ -23,7 +23,6 @@ be had: docs/shaping.md derives the bound.
 """
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -41,7 +40,6 @@ from makebreak.diagrams.tabletop import position
 from makebreak.scripts.contact_runs import (
     rehearsed,
     simulate_motion,
-    without_faults,
 )
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
@@ -122,13 +120,8 @@ def run(config: MultipleCollisionsConfig, session: Session) -> dict:
         keep(simulate(None, 0, "baseline", plain), "baseline")
     knowledge: Knowledge | None = None
     if config.rehearse:
-        on_model = partial(
-            simulate,
-            config=without_faults(config),
-            task=replace(task, world=task.model),
-        )
         known = Knowledge(task.model_prior)
-        knowledge = rehearsed(config.rehearse, on_model, known)
+        knowledge = rehearsed(config, task, simulate, known)
     for k in range(config.trials if config.handling else 1):
         name = f"trial_{k + 1}" if config.handling else "baseline"
         log = simulate(knowledge, k, name)

@@ -24,7 +24,6 @@ See docs/modes.md.
 """
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -42,7 +41,6 @@ from makebreak.diagrams.surface_switch import (
 from makebreak.scripts.contact_runs import (
     rehearsed,
     simulate_motion,
-    without_faults,
 )
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
@@ -97,12 +95,7 @@ def run(config: SurfaceSwitchConfig, session: Session) -> dict:
         diagram = make_surface_switch(config, task, knowledge, k, session.meshcat)
         return simulate_motion(session, diagram, DURATION_SEC, label)
 
-    on_model = partial(
-        simulate,
-        config=without_faults(config),
-        task=replace(task, world=task.model),
-    )
-    knowledge = rehearsed(config.rehearse, on_model, knowledge)
+    knowledge = rehearsed(config, task, simulate, knowledge)
     trials: list[Trial] = []
     recordings = []
     for k in range(config.trials):
