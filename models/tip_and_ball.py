@@ -6,15 +6,22 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.geometry import Box, Sphere
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
+from pydrake.multibody.plant import (
+    AddMultibodyPlantSceneGraph,
+    CoulombFriction,
+    MultibodyPlant,
+)
 from pydrake.multibody.tree import (
     PrismaticJoint,
+    RigidBody,
     SpatialInertia,
     UnitInertia,
 )
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.systems.numerics.ball_state import N_X, P_BALL, P_TIP, V_BALL, V_TIP
+
+UNUSED_FRICTION = CoulombFriction(1.0, 1.0)  # Contact pairs state their own.
 
 
 @dataclass
@@ -31,13 +38,38 @@ def make_tip_and_ball(config: TipAndBall):
     which has no weight (the arm carries it). The state is laid out as in
     numerics/ball_state.py.
     """
-    for name in ("tip_mass", "tip_radius", "ball_mass", "ball_radius"):
-        if not getattr(config, name) > 0.0:
-            raise ValueError(f"{name} is {getattr(config, name)}, expected > 0")
+    for name in ("ball_mass", "ball_radius"):
+        _check_positive(config, name)
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
-    friction = CoulombFriction(1.0, 1.0)  # Unused: contact pairs state their own.
-    at_origin = RigidTransform.Identity()
+    add_tip(plant, config)
+    ball = plant.AddRigidBody(
+        "ball",
+        plant.AddModelInstance("ball"),
+        SpatialInertia.SolidSphereWithMass(config.ball_mass, config.ball_radius),
+    )
+    plant.RegisterCollisionGeometry(
+        ball,
+        RigidTransform.Identity(),
+        Sphere(config.ball_radius),
+        "ball",
+        UNUSED_FRICTION,
+    )
+    add_table(plant)
+    plant.Finalize()
+    check_layout(plant, ball)
+    return builder.Build(), plant, scene_graph
+
+
+def _check_positive(config: TipAndBall, name: str) -> None:
+    if not getattr(config, name) > 0.0:
+        raise ValueError(f"{name} is {getattr(config, name)}, expected > 0")
+
+
+def add_tip(plant: MultibodyPlant, config: TipAndBall) -> None:
+    """The body `tip`, a weightless sphere of some mass that a force (3,) moves."""
+    for name in ("tip_mass", "tip_radius"):
+        _check_positive(config, name)
     arm = plant.AddModelInstance("tip")
     no_mass = SpatialInertia(
         0.0, np.zeros(3), UnitInertia(0.0, 0.0, 0.0), skip_validity_check=True
@@ -57,32 +89,35 @@ def make_tip_and_ball(config: TipAndBall):
         plant.AddJointActuator(f"tip_{name}", joint)
         parent = body
     plant.RegisterCollisionGeometry(
-        parent, at_origin, Sphere(config.tip_radius), "tip", friction
+        parent,
+        RigidTransform.Identity(),
+        Sphere(config.tip_radius),
+        "tip",
+        UNUSED_FRICTION,
     )
     plant.set_gravity_enabled(arm, False)
-    ball = plant.AddRigidBody(
-        "ball",
-        plant.AddModelInstance("ball"),
-        SpatialInertia.SolidSphereWithMass(config.ball_mass, config.ball_radius),
-    )
-    plant.RegisterCollisionGeometry(
-        ball, at_origin, Sphere(config.ball_radius), "ball", friction
-    )
+
+
+def add_table(plant: MultibodyPlant) -> None:
+    """The body `table`, a wide box with its top at z = 0."""
     table = plant.AddRigidBody("table", plant.AddModelInstance("table"))
     plant.WeldFrames(plant.world_frame(), table.body_frame())
     below = RigidTransform([0.0, 0.0, -0.5])
     plant.RegisterCollisionGeometry(
-        table, below, Box(10.0, 10.0, 1.0), "table", friction
+        table, below, Box(10.0, 10.0, 1.0), "table", UNUSED_FRICTION
     )
-    plant.Finalize()
+
+
+def check_layout(plant: MultibodyPlant, body: RigidBody) -> None:
+    """Raises: RuntimeError if the state of a tip and a free body is not laid out as in
+    numerics/ball_state.py."""
     nq = plant.num_positions()
     starts = (
         plant.GetJointByName("tip_x").position_start(),
-        ball.floating_positions_start() + 4,
+        body.floating_positions_start() + 4,
         nq + plant.GetJointByName("tip_x").velocity_start(),
-        ball.floating_velocities_start_in_v() + nq + 3,
+        body.floating_velocities_start_in_v() + nq + 3,
     )
     expected = tuple(part.start for part in (P_TIP, P_BALL, V_TIP, V_BALL))
     if starts != expected or nq + plant.num_velocities() != N_X:
         raise RuntimeError(f"state starts {starts}, expected {expected}")
-    return builder.Build(), plant, scene_graph

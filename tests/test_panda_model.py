@@ -54,7 +54,7 @@ def postures():
 def test_panda_and_finger_parse_without_a_warning(caplog):
     caplog.set_level(logging.INFO)
     plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 1e-3)
-    for name in ("panda.urdf", "finger.sdf", "table.sdf", "ball.sdf"):
+    for name in ("panda.urdf", "finger.sdf", "table.sdf", "ball.sdf", "pushed_t.sdf"):
         Parser(plant).AddModels(str(MODELS / name))
     plant.Finalize()
     assert [r.message for r in caplog.records if r.name.startswith("drake")] == []

@@ -1,0 +1,364 @@
+"""Objects to push over a table: their files, and what a planner knows of them.
+
+The frame of an object has its origin over its centroid, half-way up, and z up: on a
+table at z = 0 it lies at z = rest_height(spec). Shapes, at scale 1:
+
+    t         two bars of 160 x 40 mm and 40 x 120 mm; the cross bar is at +y
+    l         two bars of 40 x 160 mm and 80 x 40 mm; the foot is at -y, towards +x
+    box       100 x 140 mm
+    disc      an upright cylinder of radius 60 mm
+    cylinder  lying along x: 140 mm long; it rolls
+    mesh      the convex hull of the points of a file, as it stands there (z up)
+
+Drake's point contact gives two boxes one point, which jumps about as they tilt. An
+object therefore stands on small spheres, and its solid parts end SKIN above the table:
+many spheres, evenly spread, in a simulated world (their loads are then close to an even
+pressure), three in a planner's model, placed where they resist turning as much as an
+even pressure does.
+"""
+
+import hashlib
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Literal, NamedTuple
+
+import numpy as np
+from pydrake.geometry import Box, Convex, Cylinder, Shape, Sphere
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.multibody.tree import CalcSpatialInertia, SpatialInertia
+from pydrake.systems.framework import DiagramBuilder
+from scipy.spatial import ConvexHull, QhullError
+
+from makebreak.models.model_files import DRAKE_ERRORS
+from makebreak.models.tip_and_ball import (
+    UNUSED_FRICTION,
+    TipAndBall,
+    add_table,
+    add_tip,
+    check_layout,
+)
+
+UNIT = 0.04  # [m] of which T and L are made.
+SKIN = 2e-4  # [m] Solid parts end so far above the table.
+FOOT = 2e-3  # [m] Radius of the spheres that a flat object stands on.
+SPACING = 0.03  # [m] Of these in a world, about.
+LINE = 0.25  # A lying cylinder's spheres are so far from its middle, of its length.
+N_ROUND = 48  # Corners of a circle, in an outline.
+LOWER_FACE = 1e-3  # [m] Points of a mesh so near to its lowest one belong to it.
+# Of point contacts, on the object's side: as the ball's; a support's is less, for they
+# are many [N/m], [s/m].
+STIFFNESS, SUPPORT_STIFFNESS, DISSIPATION = 2e5, 2e4, 1.0
+SHAPES = ("t", "box", "l", "disc", "cylinder", "mesh")
+COLOR, HUE = (0.95, 0.4, 0.05), 0.41  # Of an object: for the eye, for a camera [rad].
+
+
+@dataclass
+class PushedObject:
+    shape: Literal["t", "box", "l", "disc", "cylinder", "mesh"] = "t"
+    scale: float = 1.0  # Of its size, all ways.
+    mass: float = 0.4  # [kg]
+    # Of the centre of mass from the frame's origin, x and y [m], whatever the scale.
+    com_offset: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    height: float = 0.04  # [m] at scale 1; a lying cylinder's diameter. Not of a mesh.
+    file: str = ""  # Of a mesh (.obj, .gltf or .vtk).
+
+
+class Part(NamedTuple):
+    """A convex part of an object."""
+
+    shape: Shape
+    X_BS: RigidTransform  # Its pose in the object's frame.
+    points: np.ndarray  # (n, 3) [m] whose convex hull it is, in the object's frame.
+
+
+def check_object(spec: PushedObject) -> None:
+    """Raises: ValueError for what makes no object."""
+    if spec.shape not in SHAPES:
+        raise ValueError(f"shape is {spec.shape}, expected one of {', '.join(SHAPES)}")
+    for name in ("scale", "mass", "height"):
+        if not 0.0 < getattr(spec, name) < np.inf:
+            raise ValueError(f"{name} is {getattr(spec, name)}, expected > 0")
+    offset = np.asarray(spec.com_offset, dtype=float)
+    if offset.shape != (2,) or not np.isfinite(offset).all():
+        raise ValueError(f"com_offset is {spec.com_offset}, expected [x, y] in metres")
+    if bool(spec.file) != (spec.shape == "mesh"):
+        raise ValueError(
+            f"file is {spec.file!r} and shape is {spec.shape}, expected a file for a "
+            "mesh, and for nothing else"
+        )
+
+
+def _box(size, center) -> Part:
+    half, center = np.asarray(size) / 2.0, np.asarray(center, dtype=float)
+    signs = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, 8).T
+    return Part(Box(*size), RigidTransform(center), center + signs * half)
+
+
+def _cylinder(radius, length, R_BS: RotationMatrix) -> Part:
+    angle = np.linspace(0.0, 2.0 * np.pi, N_ROUND, endpoint=False)
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(N_ROUND)], axis=1)
+    ends = [radius * ring + [0.0, 0.0, z] for z in (-length / 2.0, length / 2.0)]
+    points = np.concatenate(ends) @ R_BS.matrix().T
+    return Part(Cylinder(radius, length), RigidTransform(R_BS, np.zeros(3)), points)
+
+
+def _mesh(spec: PushedObject) -> Part:
+    path = Path(spec.file).resolve()
+    if not path.is_file():
+        raise ValueError(f"file is {spec.file!r}, which is not there")
+    try:
+        shape = Convex(path, spec.scale)
+        x, y, _ = CalcSpatialInertia(shape, 1.0).get_com()
+        hull = shape.GetConvexHull()
+    except DRAKE_ERRORS as error:
+        first = str(error).splitlines()[0]
+        raise ValueError(f"file {spec.file} holds no convex body: {first}") from error
+    points = np.array([hull.vertex(i) for i in range(hull.num_vertices())])
+    p_BS = -np.array([x, y, (points[:, 2].min() + points[:, 2].max()) / 2.0])
+    return Part(shape, RigidTransform(p_BS), points + p_BS)
+
+
+def parts(spec: PushedObject) -> list[Part]:
+    """The convex parts that an object is made of; they do not overlap.
+
+    Raises: ValueError for what makes no object.
+    """
+    check_object(spec)
+    h, u = spec.scale * spec.height, spec.scale * UNIT
+    match spec.shape:
+        case "t":
+            c = (4 * 3.5 + 3 * 1.5) / 7  # Height of the centroid over the stem's end.
+            bar = _box((4 * u, u, h), (0.0, (3.5 - c) * u, 0.0))
+            return [bar, _box((u, 3 * u, h), (0.0, (1.5 - c) * u, 0.0))]
+        case "l":
+            x, y = (4 * 0.5 + 2 * 2.0) / 6, (4 * 2.0 + 2 * 0.5) / 6  # From the corner.
+            long = _box((u, 4 * u, h), ((0.5 - x) * u, (2.0 - y) * u, 0.0))
+            return [long, _box((2 * u, u, h), ((2.0 - x) * u, (0.5 - y) * u, 0.0))]
+        case "box":
+            return [_box((2.5 * u, 3.5 * u, h), np.zeros(3))]
+        case "disc":
+            return [_cylinder(1.5 * u, h, RotationMatrix.Identity())]
+        case "cylinder":
+            along_x = RotationMatrix.MakeYRotation(np.pi / 2.0)
+            return [_cylinder(h / 2.0, 3.5 * u, along_x)]
+    return [_mesh(spec)]
+
+
+def rest_height(spec: PushedObject) -> float:
+    """Of the object's frame over the table that it lies on [m]."""
+    return -min(part.points[:, 2].min() for part in parts(spec))
+
+
+def object_inertia(spec: PushedObject) -> SpatialInertia:
+    """About the frame's origin: as of an even density, but that the centre of mass is
+    elsewhere (the inertia about it stays, as an effect object_com has it)."""
+    whole = parts(spec)
+    M_BBo = CalcSpatialInertia(whole[0].shape, 1.0)
+    M_BBo = _placed(M_BBo, whole[0].X_BS)
+    for part in whole[1:]:
+        M_BBo += _placed(CalcSpatialInertia(part.shape, 1.0), part.X_BS)
+    p_even = M_BBo.get_com()
+    central = M_BBo.Shift(p_even)
+    unit = central.get_unit_inertia()
+    com = p_even + np.array([*spec.com_offset, 0.0])
+    return SpatialInertia(spec.mass, np.zeros(3), unit).Shift(-com)
+
+
+def _placed(M_SSo: SpatialInertia, X_BS: RigidTransform) -> SpatialInertia:
+    """A part's spatial inertia about the object's origin, in the object's frame."""
+    return M_SSo.ReExpress(X_BS.rotation()).Shift(-X_BS.translation())
+
+
+def support_spheres(spec: PushedObject, even: bool = False) -> tuple[np.ndarray, float]:
+    """What the object stands on: centres (n, 3) [m] in its frame, and their radius [m].
+
+    Args: even: many, evenly over the lower face, as a world has them; else three that
+        carry the same each (with the centre of mass over the centroid) and give the
+        same friction torque about the vertical as an even pressure. A lying cylinder
+        stands, and rolls, on two of its own radius, even or not, for which the same
+        holds.
+    Raises: ValueError for a mesh without a flat lower face.
+    """
+    low = -rest_height(spec)
+    if spec.shape == "cylinder":
+        length = 3.5 * UNIT * spec.scale
+        return np.array([[s * LINE * length, 0.0, 0.0] for s in (-1.0, 1.0)]), -low
+    faces = [_lower_face(part, low) for part in parts(spec)]
+    if even:
+        spheres = np.concatenate([_grid(face, SPACING * spec.scale) for face in faces])
+    else:
+        fine = np.concatenate([_grid(face, SPACING * spec.scale / 8) for face in faces])
+        r = np.hypot(*fine.T).mean()
+        # Turned to where the three are furthest within the lower face.
+        turns = np.linspace(0.0, 2.0 * np.pi / 3.0, 60, endpoint=False)
+        angle = turns[:, None] + np.arange(3) * 2.0 * np.pi / 3.0 - np.pi / 2.0
+        ways = r * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        outside = np.min(
+            [_outside(face, ways.reshape(-1, 2)).reshape(-1, 3) for face in faces],
+            axis=0,
+        )
+        spheres = ways[int(np.argmin(np.round(outside.max(axis=1), 6)))]
+    z = np.full((len(spheres), 1), low + FOOT)
+    return np.hstack([spheres, z]), FOOT
+
+
+def _lower_face(part: Part, low: float) -> ConvexHull:
+    """The lower face of a part, in its plan."""
+    at = part.points[part.points[:, 2] < low + LOWER_FACE, :2]
+    try:
+        return ConvexHull(at)
+    except (QhullError, ValueError) as error:
+        raise ValueError(
+            "the object has no flat lower face to stand on, expected one (of the "
+            f"points within {1e3 * LOWER_FACE:g} mm of its lowest)"
+        ) from error
+
+
+def _outside(face: ConvexHull, p: np.ndarray) -> np.ndarray:
+    """How far points (n, 2) are outside of a face (n,) [m], negative within."""
+    return (p @ face.equations[:, :2].T + face.equations[:, 2]).max(axis=1)
+
+
+def _grid(face: ConvexHull, spacing: float) -> np.ndarray:
+    """Points (n, 2) in the middle of equal cells of a face's bounding box, those that
+    are within the face."""
+    axes = []
+    for a, b in zip(face.points.min(axis=0), face.points.max(axis=0), strict=True):
+        n = max(2, round((b - a) / spacing))
+        axes.append(a + (np.arange(n) + 0.5) * (b - a) / n)
+    points = np.array(np.meshgrid(*axes)).reshape(2, -1).T
+    return points[_outside(face, points) <= 0.0]
+
+
+def object_sdf(spec: PushedObject) -> str:
+    """The object as a model `object` with the body `object`, in SDFormat, standing on
+    evenly spread spheres."""
+    M = object_inertia(spec)
+    com = M.get_com()
+    moments = M.Shift(com).CalcRotationalInertia().CopyToFullMatrix3()
+    shapes = []
+    for i, part in enumerate(parts(spec)):
+        shapes.append(
+            f'<visual name="part_{i}">{_placed_text(part.shape, part.X_BS)}<material>'
+            f"<diffuse>{' '.join(map(str, COLOR))} 1</diffuse></material></visual>"
+        )
+        shapes.append(
+            _collision_text(f"part_{i}", *_above_table(part, spec), STIFFNESS)
+        )
+    centers, radius = support_spheres(spec, even=True)
+    for i, p in enumerate(centers):
+        sphere = Sphere(radius), RigidTransform(p)
+        shapes.append(_collision_text(f"support_{i}", *sphere, SUPPORT_STIFFNESS))
+    inertia = "".join(
+        f"<i{'xyz'[i]}{'xyz'[j]}>{moments[i, j]:.9g}</i{'xyz'[i]}{'xyz'[j]}>"
+        for i in range(3)
+        for j in range(i, 3)
+    )
+    listed = "\n      ".join(shapes)
+    return (
+        '<?xml version="1.0"?>\n<sdf version="1.9" xmlns:drake="drake.mit.edu">\n'
+        '  <model name="object">\n    <link name="object">\n      <inertial>'
+        f"<mass>{spec.mass:.9g}</mass><pose>{_numbers(com)} 0 0 0</pose>"
+        f"<inertia>{inertia}</inertia></inertial>\n      {listed}\n"
+        "    </link>\n  </model>\n</sdf>\n"
+    )
+
+
+def _above_table(part: Part, spec: PushedObject) -> tuple[Shape, RigidTransform]:
+    """A part that ends SKIN above the table, where spheres carry it."""
+    shape, X_BS = part.shape, part.X_BS
+    up = RigidTransform([0.0, 0.0, SKIN / 2.0])
+    if isinstance(shape, Box):
+        w, d, h = shape.size()
+        return Box(w, d, h - SKIN), up @ X_BS
+    if isinstance(shape, Cylinder) and spec.shape == "cylinder":
+        return Cylinder(shape.radius() - SKIN, shape.length()), X_BS
+    if isinstance(shape, Cylinder):
+        return Cylinder(shape.radius(), shape.length() - SKIN), up @ X_BS
+    return shape, up @ up @ X_BS
+
+
+def _numbers(values) -> str:
+    return " ".join(f"{x + 0.0:.9g}" for x in np.round(values, 12))
+
+
+def _placed_text(shape: Shape, X_BS: RigidTransform) -> str:
+    if isinstance(shape, Box):
+        geometry = f"<box><size>{_numbers(shape.size())}</size></box>"
+    elif isinstance(shape, Sphere):
+        geometry = f"<sphere><radius>{shape.radius():.9g}</radius></sphere>"
+    elif isinstance(shape, Cylinder):
+        geometry = (
+            f"<cylinder><radius>{shape.radius():.9g}</radius>"
+            f"<length>{shape.length():.9g}</length></cylinder>"
+        )
+    elif isinstance(shape, Convex):
+        geometry = (
+            f"<mesh><uri>file://{shape.source().path()}</uri>"
+            f"<scale>{_numbers(shape.scale3())}</scale><drake:declare_convex/></mesh>"
+        )
+    else:
+        raise TypeError(f"no text for a {type(shape).__name__}")
+    turned = _numbers(RollPitchYaw(X_BS.rotation()).vector())
+    pose = f"<pose>{_numbers(X_BS.translation())} {turned}</pose>"
+    return f"{pose}<geometry>{geometry}</geometry>"
+
+
+def _collision_text(
+    name: str, shape: Shape, X_BS: RigidTransform, stiffness: float
+) -> str:
+    return (
+        f'<collision name="{name}">{_placed_text(shape, X_BS)}'
+        "<drake:proximity_properties><drake:mu_static>1</drake:mu_static>"
+        "<drake:mu_dynamic>1</drake:mu_dynamic>"
+        f"<drake:point_contact_stiffness>{stiffness:g}</drake:point_contact_stiffness>"
+        f"<drake:hunt_crossley_dissipation>{DISSIPATION:g}"
+        "</drake:hunt_crossley_dissipation></drake:proximity_properties></collision>"
+    )
+
+
+@cache
+def _folder() -> TemporaryDirectory:
+    return TemporaryDirectory(prefix="makebreak-object-")
+
+
+def object_file(spec: PushedObject) -> str:
+    """A file of object_sdf, which is there as long as this process is."""
+    text = object_sdf(spec)
+    name = hashlib.sha256(text.encode()).hexdigest()[:16]
+    path = Path(_folder().name) / f"{spec.shape}-{name}.sdf"
+    if not path.exists():
+        path.write_text(text)
+    return str(path)
+
+
+def make_tip_and_object(spec: PushedObject, tip: TipAndBall | None = None):
+    """What the planner knows of an arm that pushes an object: a point of some mass, and
+    a free body on a table, as make_tip_and_ball has it for a ball.
+
+    Args: tip: whose tip_mass [kg] and tip_radius [m] count.
+    Returns: (diagram, plant, scene_graph): bodies `tip`, a sphere; `object`, with
+        collision geometries object::part_i, its convex parts, and object::support_i,
+        the spheres that it stands on; and `table`, a wide box with its top at z = 0.
+        u (3,) is the force on the tip [N], which has no weight (the arm carries it).
+        The state is laid out as in numerics/ball_state.py, with the object for the
+        ball.
+    """
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
+    add_tip(plant, TipAndBall() if tip is None else tip)
+    inertia = object_inertia(spec)
+    body = plant.AddRigidBody("object", plant.AddModelInstance("object"), inertia)
+    shapes = {f"part_{i}": _above_table(p, spec) for i, p in enumerate(parts(spec))}
+    centers, radius = support_spheres(spec)
+    for i, p in enumerate(centers):
+        shapes[f"support_{i}"] = Sphere(radius), RigidTransform(p)
+    for name, (shape, X_BS) in shapes.items():
+        plant.RegisterCollisionGeometry(body, X_BS, shape, name, UNUSED_FRICTION)
+    add_table(plant)
+    plant.Finalize()
+    check_layout(plant, body)
+    return builder.Build(), plant, scene_graph
