@@ -22,6 +22,7 @@ BENCHES: dict[str, str] = {
     "learner": "makebreak.scripts.bench_learner",
     "impedance": "makebreak.scripts.bench_impedance",
     "camera": "makebreak.scripts.bench_camera",
+    "latency": "makebreak.scripts.bench_latency",
     "diagrams": "makebreak.scripts.bench_diagrams",
     "gap": "makebreak.scripts.bench_gap",
 }

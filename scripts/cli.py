@@ -330,7 +330,8 @@ def _run_in(session, args, run, config, duration) -> int:
     if result is not None:
         rows = [(k, v) for k, v in result.items() if k not in ("criteria", "ended")]
         print(Table(args.experiment, ("result", "value"), rows).to_text())
-        print("\n".join([*session.endings, told(result)]), flush=True)
+        lines = [*session.endings, *session.too_slow(), told(result)]
+        print("\n".join(lines), flush=True)
     _say_files(files)
     if session.compared_by:
         print(f"What the model lacks: {session.compared_by}", flush=True)

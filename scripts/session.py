@@ -336,13 +336,30 @@ class Session:
                 name = system.get_name()  # Unique in one diagram, not in nested ones.
                 if name in entry["systems"]:
                     name = system.GetSystemPathname()
+                period_ms = 1e3 * simulated / ms.size
                 entry["systems"][name] = {
                     "updates": int(ms.size),
+                    "period_ms": period_ms,
                     "p50_ms": float(np.percentile(ms, 50)),
                     "p99_ms": float(np.percentile(ms, 99)),
                     "max_ms": float(ms.max()),
+                    "overruns": int((ms > period_ms).sum()),
                 }
         self._timing[label] = entry
+
+    def too_slow(self) -> list[str]:
+        """A line for each system of which more than one update in a hundred took longer
+        than its period: on this machine it would not keep real time."""
+        lines = {}
+        for entry in self._timing.values():
+            for name, system in entry["systems"].items():
+                if system["p99_ms"] > system["period_ms"]:
+                    lines[name] = (
+                        f"Too slow for real time: {name}, {system['overruns']} of "
+                        f"{system['updates']} updates took longer than its period of "
+                        f"{system['period_ms']:.3g} ms (99 %: {system['p99_ms']:.3g})"
+                    )
+        return list(lines.values())
 
     def _note_limits(self, diagram: Diagram, root: Context) -> None:
         if not diagram.HasSubsystemNamed("station"):

@@ -109,6 +109,34 @@ def test_simulated_time_passes_no_faster_than_the_rate_allows(tmp_path):
     assert timing["real_time_factor"] < 2.2  # A bound from above holds on any machine.
 
 
+def test_updates_that_take_longer_than_their_period_are_said(tmp_path):
+    builder = DiagramBuilder()
+    for name, late in (("fast", 101), ("rarely", 100), ("slow", 20)):
+        builder.AddNamedSystem(name, Timed(late))
+    own = session(tmp_path)
+    own.simulate(builder.Build(), 0.5, {})
+    assert own.too_slow() == [
+        "Too slow for real time: slow, 5 of 100 updates took longer than its period of "
+        "5 ms (99 %: 6)"
+    ]
+    own.finish()
+    systems = json.loads((own.out_dir / "timing.json").read_text())["systems"]
+    assert [systems[name]["overruns"] for name in systems] == [0, 1, 5]
+
+
+class Timed(LeafSystem):
+    """Says that one update in `late`, of 200 a second, took 6 ms, and the others 4."""
+
+    def __init__(self, late):
+        super().__init__()
+        self.compute_sec, self._late = [], late
+        self.DeclarePeriodicDiscreteUpdateEvent(0.005, 0.0, self._update)
+
+    def _update(self, context, discrete_state):
+        is_late = (len(self.compute_sec) + 1) % self._late == 0
+        self.compute_sec.append(0.006 if is_late else 0.004)
+
+
 class Ticker(LeafSystem):
     """Counts at 100 Hz. Outputs: n (1,); words (abstract)."""
 

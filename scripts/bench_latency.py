@@ -1,0 +1,239 @@
+"""Ages in `ball_rolling`: how long after a sensor changes each system shows it.
+
+Measured, not added up from periods: two copies of one Context go on, in one of which a
+sensor reads a little else from some instant on. What differs has seen it. In simulated
+time an update takes none: its computing time stands beside it.
+"""
+
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    Diagram,
+    DiagramBuilder,
+    LeafSystem,
+    PortDataType,
+)
+from pydrake.systems.sensors import ImageRgba8U
+
+from makebreak.diagrams.ball_rolling import (
+    CONTROL,
+    LEARN,
+    BallRollingConfig,
+    make_ball_rolling,
+    make_world,
+)
+from makebreak.diagrams.camera import CameraConfig
+from makebreak.diagrams.station import ARM
+from makebreak.scripts.bench_rows import failed
+from makebreak.scripts.trials import makebreak_command, run_commands
+from makebreak.systems.numerics.rolling_task import ROLL
+
+WARM_SEC = 6.0  # Until then the ball rolls, and the learner's buffer is full.
+ROLLS = 8  # Periods of C3 in which it was rolled without a break.
+PHASES = 32  # Instants within a period of the learner at which a sensor changes.
+LOOK_SEC = 2.5e-4  # Between two looks.
+WITHIN_SEC = 0.15  # What has not changed by then does not depend on it.
+# Each sensor, and by how much it changes: far more than rounding, too little for the
+# state machines to decide otherwise.
+ENCODERS, TORQUES = f"{ARM}.position_measured", f"{ARM}.torque_measured"
+PICTURE = "overhead.rgb_image"
+NUDGES = {ENCODERS: 1e-6, TORQUES: 1e-3, PICTURE: 1.0}
+SAYS = {ENCODERS: "encoders", TORQUES: "joint torques", PICTURE: "picture"}
+# What is looked at, in the order of the data: (system, port).
+OUTPUTS = {
+    "tracked ball": ("ball_tracker", "p_WB"),
+    "state": ("state_estimator", "x"),
+    "force on the tip": ("state_estimator", "u_measured"),
+    "learned gap": ("residual_learner", "r_comp"),
+    "plan": ("c3_mpc", "u"),
+    "arm's reference": ("arm_reference", "command"),
+    "torque": ("impedance_controller", "tau"),
+}
+SHOWN = {
+    ENCODERS: {name: port for name, port in OUTPUTS.items() if name != "tracked ball"},
+    # (The state shows them only when the arm has moved.)
+    TORQUES: {
+        name: OUTPUTS[name] for name in ("force on the tip", "learned gap", "plan")
+    },
+    PICTURE: OUTPUTS,
+}
+LCM_SEC, LCM_RATE = 4.0, 0.2  # Of the robot; simulated per real second.
+LCM_URL = "udpm://239.255.76.67:7693?ttl=0"
+
+
+class Nudge(LeafSystem):
+    """Its input, and a little more while its state is not zero; of a picture: shifted
+    by so many pixels."""
+
+    def __init__(self, port):
+        super().__init__()
+        self._more = self.DeclareDiscreteState(1)
+        if port.get_data_type() == PortDataType.kVectorValued:
+            self.DeclareVectorInputPort("value", port.size())
+            self.DeclareVectorOutputPort("value", port.size(), self._add)
+        else:
+            example = port.Allocate()
+            self.DeclareAbstractInputPort("value", example)
+            self.DeclareAbstractOutputPort("value", example.Clone, self._shift)
+
+    def start(self, context: Context, by: float) -> None:
+        context.SetDiscreteState(self._more, [by])
+
+    def _by(self, context) -> float:
+        return context.get_discrete_state(self._more).value()[0]
+
+    def _add(self, context: Context, output: BasicVector):
+        value = self.get_input_port().Eval(context)
+        output.SetFromVector(value + self._by(context))
+
+    def _shift(self, context: Context, output: Value[ImageRgba8U]):
+        pixels = self.get_input_port().Eval(context).data
+        by = int(self._by(context))
+        output.get_mutable_value().mutable_data[:] = np.roll(pixels, by, axis=1)
+
+
+def make_nudged_station(station: Diagram) -> Diagram:
+    """The station with a Nudge, by the port's name, behind each sensor of NUDGES."""
+    builder = DiagramBuilder()
+    builder.AddNamedSystem("inner", station)
+    for i in range(station.num_input_ports()):
+        port = station.get_input_port(i)
+        builder.ExportInput(port, port.get_name())
+    for i in range(station.num_output_ports()):
+        port = station.get_output_port(i)
+        name = port.get_name()
+        if name in NUDGES:
+            nudge = builder.AddNamedSystem(name, Nudge(port))
+            builder.Connect(port, nudge.get_input_port())
+            port = nudge.get_output_port()
+        builder.ExportOutput(port, name)
+    diagram = builder.Build()
+    diagram.set_name("station")
+    return diagram
+
+
+def ages(
+    diagram: Diagram,
+    context: Context,
+    sensor: str,
+    outputs: Mapping[str, tuple[str, str]],
+    phases: int,
+) -> dict[str, np.ndarray]:
+    """{output: (phases,) s} from when `sensor` changes until the output does; inf: not
+    within WITHIN_SEC.
+
+    Args: context, of the diagram, which stays as it
+        is. sensor, of NUDGES; outputs, {name: (system, port)}.
+    """
+    nudge = diagram.GetSubsystemByName("station").GetSubsystemByName(sensor)
+    ports = {
+        name: diagram.GetSubsystemByName(system).GetOutputPort(port)
+        for name, (system, port) in outputs.items()
+    }
+    found = {name: np.full(phases, np.inf) for name in ports}
+    for k in range(phases):
+        # In the middle between two ticks: what is read at a tick is never old news.
+        start = context.get_time() + (k + 0.5) * LEARN / phases
+        runs = [Simulator(diagram, context.Clone()) for _ in range(2)]
+        for run in runs:
+            run.AdvanceTo(start)
+        nudge.start(
+            nudge.GetMyMutableContextFromRoot(runs[1].get_mutable_context()),
+            NUDGES[sensor],
+        )
+        for i in range(round(WITHIN_SEC / LOOK_SEC)):
+            for run in runs:
+                run.AdvanceTo(start + i * LOOK_SEC)
+            for name, port in ports.items():
+                if found[name][k] < np.inf:
+                    continue
+                was, now = (
+                    port.Eval(port.get_system().GetMyContextFromRoot(r.get_context()))
+                    for r in runs
+                )
+                if not np.array_equal(was, now):
+                    found[name][k] = i * LOOK_SEC
+            if all(each[k] < np.inf for each in found.values()):
+                break
+    return found
+
+
+def rows() -> list[dict]:
+    """Mean and largest age [ms] of each sensor in each output that depends on it, with
+    the computing time of the output's system; then the loop over LCM."""
+    config = BallRollingConfig(camera=CameraConfig(renderer="drawn"), seed=2)
+    diagram = make_ball_rolling(config, station=make_nudged_station(make_world(config)))
+    simulator = Simulator(diagram)
+    phase = diagram.GetSubsystemByName("rolling_task").GetOutputPort("phase")
+    context = simulator.get_context()
+    own = phase.get_system().GetMyContextFromRoot(context)
+    periods, rolls = round(WARM_SEC / CONTROL), 0
+    while rolls < ROLLS:  # C3's command reaches the arm while it rolls, not else.
+        simulator.AdvanceTo(periods * CONTROL)
+        rolls = rolls + 1 if phase.Eval(own)[0] == ROLL else 0
+        periods += 1
+    found = [row for sensor in NUDGES for row in _rows(sensor, diagram, context)]
+    try:
+        return found + _lcm_rows()
+    except (RuntimeError, OSError) as error:
+        return [*found, failed("over LCM", error)]
+
+
+def _rows(sensor: str, diagram: Diagram, context: Context) -> list[dict]:
+    found = []
+    for name, sec in ages(diagram, context, sensor, SHOWN[sensor], PHASES).items():
+        if not np.isfinite(sec).all():
+            continue
+        row = {
+            "what": f"{SAYS[sensor]} -> {name}, mean age",
+            "unit": "ms",
+            "value": 1e3 * float(sec.mean()),
+            "max": 1e3 * float(sec.max()),
+        }
+        system = diagram.GetSubsystemByName(OUTPUTS[name][0])
+        computing = 1e3 * np.array(getattr(system, "compute_sec", ()))
+        if computing.size:
+            row["computing p50"] = float(np.percentile(computing, 50))
+            row["computing p99"] = float(np.percentile(computing, 99))
+        found.append(row)
+    return found
+
+
+def _lcm_rows() -> list[dict]:
+    """The controllers and a stand-in robot, in two processes that share this machine:
+    wall time of an answer, and the robot's time until it acts."""
+    common = ["--set", "camera.renderer=drawn", "--seed", "2"]
+    station = makebreak_command(
+        "station", "--url", LCM_URL, "--rate", f"{LCM_RATE}", *common
+    )
+    with TemporaryDirectory() as folder:
+        out = Path(folder) / "run"
+        run = makebreak_command(
+            "run", "--robot", "lcm", LCM_URL, "--duration", f"{LCM_SEC}", "--out",
+            str(out), *common,
+        )  # fmt: skip
+        with subprocess.Popen(station, stdout=subprocess.DEVNULL) as robot:
+            try:
+                [result] = run_commands("latency", [run], [out], 1)
+            finally:
+                robot.terminate()
+    if "error" in result:
+        raise RuntimeError(result["error"])
+    rows = []
+    for what, key in (
+        ("status -> command, computing", "status_to_command"),
+        (f"reading -> its torque acts, at {LCM_RATE} of real time", "loop_delay"),
+    ):
+        p50, p99 = (result[f"{key}_{p}_ms"] for p in ("p50", "p99"))
+        rows.append(
+            {"what": f"over LCM: {what}", "unit": "ms", "value": p50, "p99": p99}
+        )
+    return rows
