@@ -49,6 +49,7 @@ from makebreak.systems.numerics.lcs_builder import (
     SPHERE,
     ConstantMassModel,
     assemble_lcs,
+    build_many_constant_mass,
     contact_rows,
     friction_edges,
     nearest_contacts,
@@ -56,6 +57,8 @@ from makebreak.systems.numerics.lcs_builder import (
     velocity_maps,
 )
 from makebreak.systems.numerics.timing import timed
+
+_LCS_FIELDS = ("A", "B", "D", "d", "E", "F", "H", "c", "phi")
 
 
 @dataclass
@@ -191,6 +194,49 @@ class AnitescuLcs:
                 rows = self._rows_of(chosen)
             return self._model.build(x, u, self.dt_sec, self._rows, *rows, chosen)
         return self._build_general(x, u)
+
+    def build_many(self, x, u) -> tuple[np.ndarray, ...]:
+        """The LCS about each of many states x (n, n_x) and one input u (n_u,).
+
+        Returns: A, B, D, d, E, F, H, c and phi (LCS), each with the n states first;
+            not a number in those of a state that has no LCS.
+        Raises: ValueError on a wrong size.
+        """
+        x, u = np.array(x, dtype=float), np.array(u, dtype=float)
+        if x.ndim != 2 or x.shape[1] != self.n_x or u.shape != (self.n_u,):
+            raise ValueError(
+                f"x is {x.shape} and u is {u.shape}, expected (n, {self.n_x}) and "
+                f"({self.n_u},)"
+            )
+        n, n_x, n_u, n_lam = len(x), self.n_x, self.n_u, self.n_lam
+        shapes = ((n_x, n_x), (n_x, n_u), (n_x, n_lam), (n_x,), (n_lam, n_x),
+                  (n_lam, n_lam), (n_lam, n_u), (n_lam,), (n_lam,))  # fmt: skip
+        out = tuple(np.full((n, *shape), np.nan) for shape in shapes)
+        if self._model is None or self._groups_in_arrays is None:
+            for i in range(n):
+                try:
+                    lcs = self.build(x[i], u)
+                except (ValueError, RuntimeError):
+                    continue
+                for array, name in zip(out, _LCS_FIELDS, strict=True):
+                    array[i] = getattr(lcs, name)
+            return out
+        good = np.isfinite(x).all(axis=1) & np.isfinite(u).all()
+        for start, _ in self._floating:
+            norm = np.linalg.norm(x[:, start : start + 4], axis=1)
+            good &= (norm >= 0.5) & (norm <= 2.0)
+            x[good, start : start + 4] /= norm[good, None]
+        if good.any():
+            rows = self._rows
+            finite = build_many_constant_mass(
+                x[good], u, self.dt_sec, tuple(vars(self._model).values()),
+                (rows.contact, rows.normal, self._weight, rows.edge, self._F_0),
+                self._groups_in_arrays, part := tuple(a[good] for a in out),
+            )  # fmt: skip
+            for array, of_good in zip(out, part, strict=True):
+                of_good[~finite] = np.nan
+                array[good] = of_good
+        return out
 
     def _rows_of(self, chosen):
         """The rows' weight and F_0 for the friction and stiffness of these pairs."""
@@ -431,6 +477,14 @@ class AnitescuLcs:
         # None: every combination is a contact at every state.
         fixed = all(count == len(of_group) for of_group, count in groups)
         self._groups = None if fixed else groups
+        # For compiled callers; None where friction differs within a group.
+        self._groups_in_arrays = None
+        if closest is None:
+            self._groups_in_arrays = (
+                np.concatenate([of_group for of_group, _ in groups]),
+                np.cumsum([len(of_group) for of_group, _ in groups]),
+                np.array([count for _, count in groups]),
+            )
         self._mu, self._reference = np.array(mu), np.array(reference).reshape(-1, 3)
         self._compliance, self._planar = np.array(compliance), np.array(planar)
         slots = np.concatenate([of_group[:count] for of_group, count in groups])

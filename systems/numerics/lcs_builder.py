@@ -320,6 +320,63 @@ class ConstantMassModel:
 
 
 @njit(cache=True)
+def nearest_of_groups(phi, members, ends, counts):
+    """nearest_contacts for compiled callers: groups one after the other in members,
+    each up to its end (exclusive), of which so many are taken."""
+    chosen = np.empty(counts.sum(), np.int64)
+    start, n = 0, 0
+    for g in range(len(ends)):
+        of_group = members[start : ends[g]]
+        start = ends[g]
+        taken = np.zeros(of_group.size, np.bool_)
+        for _ in range(counts[g]):
+            best = -1
+            for i in range(of_group.size):
+                if not taken[i] and (
+                    best < 0 or phi[of_group[i]] < phi[of_group[best]]
+                ):
+                    best = i
+            taken[best] = True
+        for i in range(of_group.size):
+            if taken[i]:
+                chosen[n] = of_group[i]
+                n += 1
+    return chosen
+
+
+@njit(cache=True)
+def build_many_constant_mass(x, u, dt, model, rows, groups, out):
+    """The LCS about each of many states, written into out.
+
+    Args:
+        x: (n, n_x), with unit quaternions; u (n_u,).
+        model: the fields of a ConstantMassModel in their order, as a tuple.
+        rows: contact, normal, weight, edge, F_0 of the contacts.
+        groups: members, ends, counts, as of nearest_of_groups.
+        out: A, B, D, d, E, F, H, c, phi, each with the n states first.
+    Returns: whether each is finite (n,).
+    """
+    (M_inv, f_0, J_v, J_u, plain, floating, turning, body, shape, size, quaternion,
+     omega, R, p_0, P, J_p, pairs, reference) = model  # fmt: skip
+    contact, normal, weight, edge, F_0 = rows
+    members, ends, counts = groups
+    A, B, D, d, E, F, H, c, phi = out
+    finite = np.empty(len(x), np.bool_)
+    n_q = x.shape[1] - f_0.size
+    for i in range(len(x)):
+        gaps = _gaps(x[i, :n_q].copy(), shape, size, quaternion, R, p_0, P, pairs)
+        chosen = nearest_of_groups(gaps, members, ends, counts)
+        built = _build_constant_mass(
+            x[i], u, M_inv, f_0, J_v, J_u, plain, floating, turning, body, shape, size,
+            quaternion, omega, R, p_0, P, J_p, pairs[chosen], reference[chosen],
+            contact, normal, weight, edge, F_0, dt,
+        )  # fmt: skip
+        A[i], B[i], D[i], d[i], E[i], F[i], H[i], c[i] = built[:8]
+        phi[i], finite[i] = built[8], built[10]
+    return finite
+
+
+@njit(cache=True)
 def _poses(q, quaternion, R, p_0, P):
     """Of the shapes in the world, and the origins that their bodies turn about."""
     n_g = quaternion.size

@@ -1,0 +1,320 @@
+"""Where to touch: places around an object, each with the plan that begins there.
+
+A tip that pushes an object can start anywhere around it. Each place is scored by the
+cost of a C3+ plan from there, with the tip at rest, rolled out (and polished) on the
+true LCS, so that a plan that cannot be carried out does not look cheap; and by the way
+to it through the air. C3 itself decides only how to go on from where the tip is: behind
+a corner, or on the wrong side, it is stuck in a local minimum.
+
+All LCS of a round have the same object, so they and their solves are made in compiled
+batches. Each is what AnitescuLcs.build and solve_c3 give, one by one.
+
+Source: the idea is that of Venkatesh, Bianchini, Aydinoglu, Yang, Posa, "Approximating
+global contact-implicit MPC via sampling and local complementarity", arXiv:2505.13350.
+"""
+
+from time import perf_counter
+
+import numpy as np
+from numba import njit
+from scipy.spatial import ConvexHull, QhullError
+
+from makebreak.systems.numerics.c3_mpc import C3Problem, _admm_plus, _model
+from makebreak.systems.numerics.c3_polish import polish
+from makebreak.systems.numerics.lcp import SOLVED, solve_lcp_kernel
+
+# Of a place that is not wanted, or whose plan failed.
+NO_PLAN = np.inf
+
+
+def outline_of(parts, R, p):
+    """The outline of an object on the table, seen from above.
+
+    Args: parts: convex parts of the object, the points (n, 3) [m] of each in its own
+        frame; R (3, 3), p (3,) [m]: how and where that is.
+    Returns: a list of convex polygons (m, 2) [m], counter-clockwise.
+    """
+    outline = []
+    for points in parts:
+        plan = (points @ R.T + p)[:, :2]
+        try:
+            outline.append(plan[ConvexHull(plan).vertices])
+        except QhullError as error:
+            raise ValueError("a part of the object has no area from above") from error
+    return outline
+
+
+def distance_to_outline(points, outline):
+    """(n,) how far points (n, 2) are outside of an outline [m]; negative inside: how
+    deep in its deepest part."""
+    points = np.atleast_2d(points)
+    nearest = np.full(len(points), np.inf)
+    for polygon in outline:
+        edge = np.roll(polygon, -1, axis=0) - polygon
+        length = np.hypot(*edge.T)
+        along = edge / length[:, None]
+        out = np.stack([along[:, 1], -along[:, 0]], axis=1)
+        off = points[:, None] - polygon
+        height = (off * out).sum(axis=2)
+        share = np.clip((off * along).sum(axis=2), 0.0, length)
+        beside = np.linalg.norm(off - share[..., None] * along, axis=2).min(axis=1)
+        inside = height.max(axis=1)
+        nearest = np.minimum(nearest, np.where(inside > 0.0, beside, inside))
+    return nearest
+
+
+def places_around(outline, distance, n, phase=0.0):
+    """Places on the contour at some distance around an outline, evenly along it.
+
+    Args: outline: convex polygons (m, 2) [m]; distance [m] > 0; n: how many; phase: in
+        [0, 1), where the first is, as a share of the spacing.
+    Returns: (n, 2) [m]; fewer where other parts are nearer than the distance.
+    """
+    starts, ends = [], []
+    for polygon in outline:
+        nxt = np.roll(polygon, -1, axis=0)
+        edge = nxt - polygon
+        out = np.stack([edge[:, 1], -edge[:, 0]], axis=1)
+        out *= distance / np.hypot(*edge.T)[:, None]
+        starts += [polygon + out, nxt + out]  # Each side, and the bend behind it.
+        ends += [nxt + out, nxt + np.roll(out, -1, axis=0)]
+        starts[-2:] = [np.stack(starts[-2:], axis=1).reshape(-1, 2)]
+        ends[-2:] = [np.stack(ends[-2:], axis=1).reshape(-1, 2)]
+    start, end = np.concatenate(starts), np.concatenate(ends)
+    # Finely first, to know how much of the contour is free of the other parts.
+    length = np.hypot(*(end - start).T)
+    whole = length.sum()
+    fine = (np.arange(40 * n) + 0.5) / (40 * n) * whole
+    free = _pushed_out(_along(start, end, length, fine), outline, distance)
+    free = free[distance_to_outline(free, outline) >= distance - 1e-9]
+    if len(free) == 0:
+        return free
+    at = ((np.arange(n) + phase) * len(free) / n).astype(int)
+    return free[np.unique(np.minimum(at, len(free) - 1))]
+
+
+def _along(start, end, length, s):
+    upto = np.cumsum(length)
+    k = np.minimum(np.searchsorted(upto, s), len(upto) - 1)
+    share = (s - upto[k] + length[k]) / np.maximum(length[k], 1e-12)
+    return start[k] + share[:, None] * (end[k] - start[k])
+
+
+def _pushed_out(points, outline, distance):
+    """The straight ways around corners cut them: these points go out to the distance
+    from the corner."""
+    corners = np.concatenate(outline)
+    off = points[:, None] - corners
+    far = np.linalg.norm(off, axis=2)
+    k = far.argmin(axis=1)
+    near = far[np.arange(len(points)), k]
+    out = off[np.arange(len(points)), k] / np.maximum(near, 1e-12)[:, None]
+    moved = corners[k] + distance * out
+    return np.where((near < distance)[:, None], moved, points)
+
+
+def way_is_free(a, b, outline, distance):
+    """Whether the straight way from a to b (2,) keeps that distance from an outline,
+    but for what it has less at a itself, on its way out [m]."""
+    n = max(2, int(np.ceil(np.hypot(*(b - a)) / 0.002)) + 1)
+    d = distance_to_outline(a + np.linspace(0.0, 1.0, n)[:, None] * (b - a), outline)
+    near = d < distance - 1e-9
+    if not near.any():
+        return True
+    out = int(np.argmin(near)) if near[0] else 0  # The first that is far enough.
+    return bool(near[0] and not near[out:].any() and (np.diff(d[: out + 1]) > 0).all())
+
+
+def travel_length(a, b, outline, distance, height):
+    """Length of the way from a to b (3,) [m]: straight where that is free, else up to
+    the height, across, and down."""
+    if way_is_free(a[:2], b[:2], outline, distance):
+        return float(np.linalg.norm(b - a))
+    up = max(height - a[2], 0.0) + max(height - b[2], 0.0)
+    return float(up + np.hypot(*(b - a)[:2]))
+
+
+def travel_step(p, v, goal, outline, distance, height, limits, dt):
+    """One step of the reference on its way to a place, never nearer to the object.
+
+    Where the straight way at the tip's height keeps the distance, it is taken; else the
+    tip goes up to the height, across, and down. Speed falls off towards each corner of
+    the way, so that nothing is overshot.
+
+    Args: p, v (3,) [m], [m/s] of the reference; goal (3,) [m]; outline, distance as of
+        way_is_free; height [m] at which the object is cleared; limits: speed [m/s],
+        acceleration [m/s2]; dt [s].
+    Returns: p, v, a (3,) dt later, and whether it has arrived.
+    """
+    speed, acceleration = limits
+    off = goal - p
+    across = np.hypot(*off[:2])
+    low = p[2] < height - 1e-3
+    if across < 1e-3 or way_is_free(p[:2], goal[:2], outline, distance):
+        target = goal  # Down, or along the table.
+        if across >= 1e-3 and p[2] > goal[2] + 1e-3 and not low:
+            target = np.array([*goal[:2], p[2]])  # Already above: across first.
+    elif low:
+        target = np.array([*p[:2], height])
+    else:
+        target = np.array([*goal[:2], height])
+    off = target - p
+    left = np.linalg.norm(off)
+    # What it can still brake from within what is left, in steps of dt.
+    half = 0.5 * acceleration * dt
+    fast = min(speed, np.sqrt(half**2 + 2.0 * acceleration * left) - half)
+    wanted = off / max(left, 1e-12) * fast
+    change = wanted - v
+    size = np.linalg.norm(change)
+    if size > acceleration * dt:
+        change *= acceleration * dt / size
+    v_next = v + change
+    p_next = p + 0.5 * dt * (v + v_next)
+    arrived = np.linalg.norm(goal - p_next) < 1.5e-3 and np.linalg.norm(v_next) < 0.02
+    return p_next, v_next, change / dt, bool(arrived)
+
+
+@njit(cache=True)
+def _score(lcs, x, x_desired, weights, bounds, polish_bounds, U, guess, options):
+    """cost (n,), u (n, N, n_u), x (n, N + 1, n_x): solve_c3's C3+, one after the other.
+
+    Args: lcs: A, B, D, d, E, F, H, c, each of n; x (n, n_x); weights: Q, Q_N, R, G, h;
+        bounds as of _admm_plus, polish_bounds as of polish; guess (n, N, n_u); options:
+        rounds, rho, scale_lam, start_at_x0, polish.
+    """
+    A, B, D, d, E, F, H, c = lcs
+    Q, Q_N, R, G, h = weights
+    rounds, rho, scale_lam, start_at_x0, evaluations = options
+    n, n_lam, n_z = len(x), F.shape[1], G.size
+    _, N, n_u = guess.shape
+    cost, u_of = np.full(n, NO_PLAN), np.zeros((n, N, n_u))
+    x_of = np.zeros((n, N + 1, x.shape[1]))
+    for i in range(n):
+        one = slice(i, i + 1)
+        if not (np.isfinite(c[i]).all() and np.isfinite(F[i]).all()):
+            continue
+        scale = 1.0
+        if scale_lam:
+            scale = np.sqrt((A[i] ** 2).sum()) / np.sqrt((D[i] ** 2).sum())
+        model, E_s, F_s, _, pushes = _model(
+            A[one], B[one], D[one], d[one], E[one], F[one], H[one], c[one], scale
+        )
+        AB, d_s, C, c_s = model
+        lam0 = np.empty(0)
+        if not pushes:
+            lam0, status = solve_lcp_kernel(F_s[0], E_s[0] @ x[i] + c_s[0])
+            if status != SOLVED:
+                continue
+        delta, w = np.zeros((N, n_z)), np.zeros((N, n_z))
+        if start_at_x0:
+            for k in range(N):
+                delta[k, : x.shape[1]] = x[i]
+        status, x_i, v_i, _, _, inputs = _admm_plus(
+            AB, d_s, C, c_s, Q, R, Q_N, G, bounds, U, h, x[i], lam0, delta, w, rounds,
+            rho,
+        )  # fmt: skip
+        if status != SOLVED:
+            continue
+        starts = np.empty((rounds + 3, N, n_u))
+        starts[: rounds + 1] = inputs
+        starts[rounds + 1] = guess[i]
+        starts[rounds + 2, : N - 1], starts[rounds + 2, N - 1] = (
+            guess[i, 1:],
+            guess[i, -1],
+        )
+        found = polish(
+            (A[one], B[one], D[one], d[one], E[one], F[one], H[one], c[one]), x[i],
+            starts, x_desired, np.zeros((N, n_u)), (Q, R, Q_N), polish_bounds,
+            evaluations,
+        )  # fmt: skip
+        x_of[i], u_of[i], cost[i] = found[0], found[1], found[3]
+    return cost, u_of, x_of
+
+
+def score_plans(lcs, x, x_desired, problem: C3Problem, guess=None, first=0, last=None):
+    """The plan from each of many states, as solve_c3 makes it, and what it costs.
+
+    Args:
+        lcs: A, B, D, d, E, F, H, c, ... of n states (AnitescuLcs.build_many).
+        x: (n, n_x) the states, which have the same quaternions.
+        x_desired: (N + 1, n_x). problem: with C3+.
+        guess: (n, N, n_u) inputs that the polish may start from, as WarmStart.u; None:
+            zeros.
+        first, last: of which states; the others cost NO_PLAN.
+
+    Returns: cost (n,), NO_PLAN where there is no plan: of the rollout on the state's
+        own LCS, to second order in the orientation; u (n, N, n_u); x (n, N + 1, n_x).
+    """
+    p, o = problem, problem.options
+    if not p.is_plus or o.penalise_input_change or o.warm_start:
+        raise ValueError(
+            "score_plans: expected a problem with PlusProjection, without "
+            "penalise_input_change and warm_start"
+        )
+    Q, Q_N, x_goal = p.state_cost(x[0], x_desired)
+    h = np.zeros((o.N + 1, p.n_x + p.n_u + p.n_lam))
+    for k in range(o.N + 1):
+        h[k, p.n_lam + p.n_u :] = (Q_N if k == o.N else Q[k % len(Q)]) @ x_goal[k]
+    unbounded = np.isinf(p.lower).all() and np.isinf(p.upper).all()
+    (u_lower, x_lower), (u_upper, x_upper) = (
+        np.split(bound[p.n_lam :], [p.n_u]) for bound in (p.lower, p.upper)
+    )
+    guess = np.zeros((len(x), o.N, p.n_u)) if guess is None else guess
+    own = slice(first, last)
+    found = _score(
+        tuple(a[own] for a in lcs[:8]),
+        np.ascontiguousarray(x[own]),
+        np.ascontiguousarray(x_goal),
+        (Q, Q_N, p.R, p.G, h),
+        None if unbounded else (p.lower, p.upper),
+        (u_lower, u_upper, x_lower, x_upper),
+        p.U,
+        guess[own],
+        (o.rounds, o.rho, o.scale_lam, o.start_at_x0, o.polish),
+    )
+    if first == 0 and last is None:
+        return found
+    cost = np.full(len(x), NO_PLAN)
+    whole = [np.zeros((len(x), *a.shape[1:])) for a in found[1:]]
+    for a, part in zip((cost, *whole), found, strict=True):
+        a[own] = part
+    return cost, *whole
+
+
+def score_within(budget_sec, lcs, x, x_desired, problem, guess=None, at_once=4):
+    """score_plans of as many states as the budget has time for, the first ones first.
+
+    Args: budget_sec: wall-clock time [s]; infinite: all, in one go, which repeats
+        whatever the computer does. at_once: states between two looks at the clock.
+    Returns: as score_plans.
+    """
+    if np.isinf(budget_sec):
+        return score_plans(lcs, x, x_desired, problem, guess)
+    start, n = perf_counter(), len(x)
+    parts = []
+    for first in range(0, n, at_once):
+        spent = perf_counter() - start
+        # Of a part that would not be done in time as far as the last ones tell.
+        if first and spent * (1.0 + at_once / first) > budget_sec:
+            break
+        parts.append(
+            score_plans(lcs, x, x_desired, problem, guess, first, first + at_once)
+        )
+    cost = np.min([part[0] for part in parts], axis=0)
+    return cost, *(np.sum([part[i] for part in parts], axis=0) for i in (1, 2))
+
+
+def choose(cost, hysteresis):
+    """Which place to take: the first (the present one), unless another is clearly
+    better.
+
+    Args: cost (n,); hysteresis: (share, absolute): how much less than the present one
+        another has to cost, as a share of the present cost plus so much.
+    Returns: index; the present one where nothing has a finite cost.
+    """
+    cost = np.where(np.isfinite(cost), cost, np.inf)
+    best = int(np.argmin(cost))
+    share, absolute = hysteresis
+    if not np.isfinite(cost[best]) or cost[best] >= cost[0] * (1.0 - share) - absolute:
+        return 0 if np.isfinite(cost[0]) or not np.isfinite(cost[best]) else best
+    return best
