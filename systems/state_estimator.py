@@ -12,6 +12,7 @@ from makebreak.systems.numerics.state_estimator import (
     observe_force,
     tip_mobility,
     tip_motion,
+    with_pose,
 )
 from makebreak.systems.numerics.timing import timed
 
@@ -34,7 +35,9 @@ class StateEstimator(LeafSystem):
     which is what the residual learner needs.
 
     Inputs:  q (7,), v (7,), torque (7,) motor side [rad, rad/s, N m]; p_ball (3,),
-             v_ball (3,) [m, m/s]; seen (1,).
+             v_ball (3,) [m, m/s]; seen (1,); of an object whose pose is known, both of
+             q_object (4,) its quaternion [w x y z] and w_object (3,) [rad/s]: without
+             them it is a ball that rolls.
     Outputs: x (19,), the layout of numerics/ball_state.py; u_measured (3,) [N];
              valid (1,): 1 if every reading was finite and the ball is seen, 0 if it
              is not seen, -1 if a reading was not finite (x is of the last good ones);
@@ -67,6 +70,8 @@ class StateEstimator(LeafSystem):
         self._p_ball = self.DeclareVectorInputPort("p_ball", 3)
         self._v_ball = self.DeclareVectorInputPort("v_ball", 3)
         self._seen = self.DeclareVectorInputPort("seen", 1)
+        self._q_object = self.DeclareVectorInputPort("q_object", 4)
+        self._w_object = self.DeclareVectorInputPort("w_object", 3)
         x0 = pack(p_tip, np.zeros(3), [0, 0, config.ball_radius], np.zeros(3), 1.0)
         self._x = self.DeclareDiscreteState(x0)
         # The forces, and how many readings in a row were valid; a learner that starts
@@ -149,6 +154,14 @@ class StateEstimator(LeafSystem):
             self._ball_radius,
             window,
         )
+        if self._q_object.HasValue(context) and self._w_object.HasValue(context):
+            finite, x, valid = with_pose(
+                finite,
+                x,
+                valid,
+                np.asarray(self._q_object.Eval(context)),
+                np.asarray(self._w_object.Eval(context)),
+            )
         discrete_state.set_value(self._valid, [valid])
         if finite:
             discrete_state.set_value(self._x, x)

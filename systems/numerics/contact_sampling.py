@@ -13,18 +13,69 @@ Source: the idea is that of Venkatesh, Bianchini, Aydinoglu, Yang, Posa, "Approx
 global contact-implicit MPC via sampling and local complementarity", arXiv:2505.13350.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 
 import numpy as np
 from numba import njit
 from scipy.spatial import ConvexHull, QhullError
 
+from makebreak.systems.numerics.ball_state import P_BALL, P_TIP, Q_BALL, V_TIP
 from makebreak.systems.numerics.c3_mpc import C3Problem, _admm_plus, _model
 from makebreak.systems.numerics.c3_polish import polish
 from makebreak.systems.numerics.lcp import SOLVED, solve_lcp_kernel
 
 # Of a place that is not wanted, or whose plan failed.
 NO_PLAN = np.inf
+# From round to round the places move on by this share of their spacing: the golden
+# section, which leaves no part of the contour out.
+GOLDEN = 0.6180339887498949
+PROGRESS = 0.003  # Less than this towards the goal is none [m].
+
+
+@dataclass
+class SamplingConfig:
+    """What a round of ContactSampler looks at, and what it prefers."""
+
+    places: int = 14  # Sampled in a round, beside the present one and the last best.
+    clearance: float = 0.004  # Of the tip from the object at a place [m].
+    height: float = 0.024  # Of the tip's centre while pushing [m].
+    reach: list[float] = field(default_factory=lambda: [0.3, 0.78])  # From the base.
+    travel: float = 15.0  # Cost of a metre through the air [1/m].
+    # Another place has to cost so much less than the present one: a share of the
+    # latter's cost, and an absolute amount.
+    hysteresis: list[float] = field(default_factory=lambda: [0.15, 1.0])
+    push: float = 4.0  # Force of the plan that is tried first, into the object [N].
+    stuck_sec: float = 1.2  # Without progress for so long, the present one is given up.
+
+
+@dataclass(frozen=True, eq=False)
+class SamplingMemory:
+    """What a round leaves to the next; places are in the object's frame (2,) [m]."""
+
+    count: int = 0  # Rounds.
+    place: np.ndarray | None = None  # Where to go, or where it went last.
+    best: np.ndarray | None = None  # The best other place of the last round.
+    go: int = 0  # How often a place was chosen: a new number is a new command.
+    error: float = np.inf  # From the goal when there was progress last [m] ...
+    since_sec: float = 0.0  # ... and when that was.
+
+    def __deepcopy__(self, memo) -> "SamplingMemory":
+        return self  # Nothing in it is changed once it is there.
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectShape:
+    """What is known of the object and the tip for finding places."""
+
+    parts: list[np.ndarray]  # Convex parts: points (n, 3) [m] in the object's frame.
+    tip_radius: float  # [m]
+    top: float  # Height of the object's highest point on the table [m].
+
+    def clear_height(self, margin: float) -> float:
+        """At which the tip's centre is above the object by a margin [m]."""
+        return self.top + self.tip_radius + margin
 
 
 def outline_of(parts, R, p):
@@ -185,7 +236,7 @@ def _score(lcs, x, x_desired, weights, bounds, polish_bounds, U, guess, options)
     A, B, D, d, E, F, H, c = lcs
     Q, Q_N, R, G, h = weights
     rounds, rho, scale_lam, start_at_x0, evaluations = options
-    n, n_lam, n_z = len(x), F.shape[1], G.size
+    n, n_z = len(x), G.size
     _, N, n_u = guess.shape
     cost, u_of = np.full(n, NO_PLAN), np.zeros((n, N, n_u))
     x_of = np.zeros((n, N + 1, x.shape[1]))
@@ -318,3 +369,126 @@ def choose(cost, hysteresis):
     if not np.isfinite(cost[best]) or cost[best] >= cost[0] * (1.0 - share) - absolute:
         return 0 if np.isfinite(cost[0]) or not np.isfinite(cost[best]) else best
     return best
+
+
+def rotation_of(q):
+    """(3, 3) of a quaternion [w x y z] of any length but zero."""
+    w, x, y, z = q / np.linalg.norm(q)
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+
+
+def to_world(x, place):
+    """A place (2,) of the object's frame, seen from above, in the world."""
+    R = rotation_of(x[Q_BALL])
+    heading = np.array([R[:2, 0], [-R[1, 0], R[0, 0]]]).T
+    heading = heading / np.linalg.norm(heading[:, 0])
+    return heading @ place + x[P_BALL][:2]
+
+
+def to_object(x, place):
+    """The inverse of to_world."""
+    R = rotation_of(x[Q_BALL])
+    heading = np.array([R[:2, 0], [-R[1, 0], R[0, 0]]]).T
+    heading = heading / np.linalg.norm(heading[:, 0])
+    return heading.T @ (place - x[P_BALL][:2])
+
+
+def inward(places, outline):
+    """(n, 2) unit directions from places (n, 2) straight towards an outline."""
+    step, rise = 1e-5, np.empty((len(places), 2))
+    for i in range(2):
+        to = np.zeros(2)
+        to[i] = step
+        ahead = distance_to_outline(places + to, outline)
+        rise[:, i] = ahead - distance_to_outline(places - to, outline)
+    size = np.linalg.norm(rise, axis=1)
+    return -rise / np.maximum(size, 1e-12)[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """What a round found, for the eye and for scoring; n places."""
+
+    places: np.ndarray  # (n, 2) in the world [m]; the first is the present one.
+    cost: np.ndarray  # (n,) of plan and travel.
+    chosen: int
+    x: np.ndarray  # (N + 1, n_x) the plan from the chosen one.
+
+
+def sample_round(
+    config: SamplingConfig,
+    memory: SamplingMemory,
+    build_many: Callable,
+    problem: C3Problem,
+    shape: ObjectShape,
+    x,
+    x_desired,
+    error: float,
+    in_contact: bool,
+    t: float,
+    r=None,
+    budget_sec: float = np.inf,
+) -> tuple[SamplingMemory, Round]:
+    """One round of ContactSampler.
+
+    Args:
+        build_many: as AnitescuLcs.build_many, of the planner's model.
+        x (19,), x_desired (N + 1, 19) of numerics/ball_state.py.
+        error: of the object from its goal [m].
+        in_contact: whether the tip pushes; else it is on its way to memory.place.
+        t [s]; r (n_lam,): what is added to every LCS's c [m/s], None: nothing.
+        budget_sec: of wall-clock time for the scores (score_within).
+    Raises: ValueError for an object without an outline.
+    """
+    c, m = config, memory
+    outline = outline_of(shape.parts, rotation_of(x[Q_BALL]), x[P_BALL])
+    distance = shape.tip_radius + c.clearance
+    phase = (m.count * GOLDEN) % 1.0
+    around = places_around(outline, distance, c.places, phase)
+    far = np.hypot(*around.T)
+    around = around[(far >= c.reach[0]) & (far <= c.reach[1])]
+    going = m.place is not None and not in_contact
+    present = to_world(x, m.place) if going else x[P_TIP][:2]
+    last = [] if m.best is None else [to_world(x, m.best)]
+    places = np.array([present, *last, *around])
+    n, N = len(places), problem.options.N
+    starts = np.tile(x, (n, 1))
+    starts[:, :2], starts[:, 2], starts[:, V_TIP] = places, c.height, 0.0
+    if in_contact:
+        starts[0] = x
+    lcs = build_many(starts, np.zeros(problem.n_u))
+    if r is not None:
+        lcs = (*lcs[:7], lcs[7] + r, *lcs[8:])
+    guess = np.zeros((n, N, problem.n_u))
+    guess[:, :, :2] = c.push * inward(places, outline)[:, None]
+    cost, _, plans = score_within(budget_sec, lcs, starts, x_desired, problem, guess)
+    way = [
+        travel_length(
+            x[P_TIP], np.array([*place, c.height]), outline, distance,
+            shape.clear_height(0.0),
+        )
+        for place in places
+    ]  # fmt: skip
+    if in_contact:
+        way[0] = 0.0
+    elif not going:
+        cost[0] = NO_PLAN
+    cost = cost + c.travel * np.array(way)
+    progressed = not in_contact or error < m.error - PROGRESS
+    if progressed or not np.isfinite(m.error):
+        m = replace(m, error=error, since_sec=t)
+    elif t - m.since_sec > c.stuck_sec:
+        m = replace(m, error=error, since_sec=t)
+        cost[0] = NO_PLAN
+    chosen = choose(cost, c.hysteresis)
+    found = Round(places, cost, chosen, plans[chosen])
+    m = replace(m, count=m.count + 1)
+    if n > 1 and np.isfinite(cost[1:]).any():
+        m = replace(m, best=to_object(x, places[1 + int(np.argmin(cost[1:]))]))
+    if np.isfinite(cost[chosen]) and (chosen != 0):
+        m = replace(m, place=to_object(x, places[chosen]), go=m.go + 1)
+    return m, found

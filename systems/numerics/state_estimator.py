@@ -3,7 +3,7 @@
 import numba
 import numpy as np
 
-from makebreak.systems.numerics.ball_state import compiled_pack
+from makebreak.systems.numerics.ball_state import Q_BALL, W_BALL, compiled_pack
 from makebreak.systems.numerics.serial_chain import chain_state
 
 
@@ -85,3 +85,15 @@ def estimate(chain, q, v, torque, p_ball, v_ball, seen, tip_mass, radius, window
     after[3 * n] = min(valid * (window[3 * n] + 1.0), n)
     x = compiled_pack(p_tip, v_tip, p_ball, v_ball, radius)
     return True, x, after, valid
+
+
+def with_pose(finite, x, valid, q_object, w_object):
+    """What `estimate` returned (without the window), for an object whose orientation
+    q_object (4,) and turning rate w_object (3,) [rad/s] are known: it need not roll."""
+    known = np.isfinite(q_object).all() and np.isfinite(w_object).all()
+    size = np.sqrt(q_object @ q_object)
+    if not (finite and known and size > 0.5):
+        return False, x, -1.0
+    x = x.copy()
+    x[Q_BALL], x[W_BALL] = q_object / size, w_object
+    return True, x, valid

@@ -1,0 +1,490 @@
+"""A Panda pushes an object over a table to poses, choosing where to touch it.
+
+    station --body_poses--> pose_sensor --> state_estimator <-- q, v, torque -- station
+    state_estimator --x--> push_goals --goal--> push_task, contact_sampler
+    push_task --x_desired--> c3_mpc, contact_sampler
+    contact_sampler --command (where to touch)--> push_task
+    lcs_learn --> residual_learner --r_comp--> c3_mpc, contact_sampler
+    c3_mpc (contact), push_task (travel) --> arm_reference
+    arm_reference --> impedance_controller --tau--> station
+
+Nothing passes from the world to the controllers but encoders, torques and what the pose
+sensor measures of the object.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.primitives import (
+    ConstantVectorSource,
+    Demultiplexer,
+    LogVectorOutput,
+)
+
+from makebreak.diagrams.recorder import record_station
+from makebreak.diagrams.scene_facts import sphere_radius
+from makebreak.diagrams.station import (
+    ARM,
+    TIP_FRAME,
+    TOOL,
+    StationConfig,
+    make_control_plant,
+    make_station,
+)
+from makebreak.models.effects.kind import Effect
+from makebreak.models.model_files import MODELS
+from makebreak.models.pushed_object import (
+    PushedObject,
+    make_tip_and_object,
+    object_file,
+    parts,
+    rest_height,
+    support_spheres,
+)
+from makebreak.models.scene import Scene, load_scene, read_scene
+from makebreak.models.tip_and_ball import TipAndBall
+from makebreak.systems.adapt_button import AdaptButton
+from makebreak.systems.arm_reference import ArmReference, ArmReferenceConfig
+from makebreak.systems.c3_mpc import C3Config, C3Mpc
+from makebreak.systems.contact_sampler import ContactSampler, ContactSamplerConfig
+from makebreak.systems.impedance_controller import (
+    ImpedanceConfig,
+    ImpedanceController,
+    serial_chain_of,
+)
+from makebreak.systems.lcs_builder import (
+    AnitescuLcsBuilder,
+    ContactPair,
+    LcsBuilderConfig,
+)
+from makebreak.systems.numerics.ball_state import N_X, P_BALL, Q_BALL, V_BALL, V_TIP
+from makebreak.systems.numerics.c3_mpc import (
+    C3Options,
+    C3Problem,
+    C3Weights,
+    OrientationWeight,
+)
+from makebreak.systems.numerics.contact_sampling import ObjectShape
+from makebreak.systems.pose_sensor import PoseSensor, PoseSensorConfig
+from makebreak.systems.push_goals import PushGoals, PushGoalsConfig, draw_poses
+from makebreak.systems.push_task import PushTask, PushTaskConfig
+from makebreak.systems.residual_learner import (
+    PosteriorConfig,
+    ResidualLearner,
+    ResidualLearnerConfig,
+)
+from makebreak.systems.state_estimator import StateEstimator, StateEstimatorConfig
+
+PUSH_OBJECT = str(MODELS / "push_object.scene.yaml")
+OBJECT = "object"
+CONTROL = 0.0125
+ESTIMATE, LEARN, ARM_TICK = CONTROL / 3.0, 0.05, 0.001
+# As in ball_rolling: each system runs a little after the one that it listens to, within
+# the millisecond between two steps of the plant. The sampler's choice and the residual
+# are a tick old where they are used.
+OFFSET = dict(
+    sensor=1e-4, estimator=2e-4, goals=2.5e-4, task=3e-4, lcs=3e-4, learner=3.5e-4,
+    sampler=3.5e-4, c3=4e-4, reference=4.5e-4, impedance=7e-4,
+)  # fmt: skip
+PLAN_DT, TIP_MASS, N_TIP = 0.1, 1.0, 4  # N_TIP: forces of tip and object, the first.
+
+
+@dataclass
+class PushPlannerConfig:
+    """Costs of C3+; forces in newtons."""
+
+    N: int = 5  # Knots of 0.1 s.
+    rounds: int = 2
+    polish: int = 6
+    position: float = 5000.0  # Of the object, across the table [1/m2].
+    angle_radius: float = 0.12  # A turn of the object counts as so much of a way [m].
+    last: float = 5.0  # The last knot's weight over the others'.
+    tip_speed: float = 10.0  # [s2/m2]
+
+
+@dataclass
+class PushLearnerConfig:
+    """Of the residual on the contact of tip and object, as in ball_rolling."""
+
+    weight_object: float = 2e4  # Q_d of the object's v_x, v_y.
+    weight_tip: float = 1e5  # And of the tip's v_x, v_y.
+    eps: float = 1e-3
+    gamma: float = 5e-4
+    r_max: float = 0.4  # [m/s]: 20 mm.
+    posterior: PosteriorConfig = field(
+        default_factory=lambda: PosteriorConfig(
+            free_states=[V_BALL.start, V_BALL.start + 1]
+        )
+    )
+
+
+@dataclass
+class PushModelConfig:
+    """What of the model differs from the world."""
+
+    friction: float | None = (
+        None  # Of the object with tip and table; None: the world's.
+    )
+    scale: float = 1.0  # Of the object's size, times the world's.
+    mass: float = 1.0  # Of the object's mass, times the world's.
+    com_offset: list[float] = field(default_factory=lambda: [0.0, 0.0])  # Added [m].
+
+
+@dataclass
+class PushObjectConfig:
+    """World and model start from the same object; errors change the model."""
+
+    adapt: bool = True
+    object: PushedObject = field(default_factory=PushedObject)
+    friction: float = 0.5  # Of the object with tip and table, in the world.
+    model: PushModelConfig = field(default_factory=PushModelConfig)
+    scene: str = PUSH_OBJECT
+    seed: int = 0
+    n_goals: int = 1  # In a row, drawn by the seed.
+    start: list[float] = field(default_factory=list)  # x, y, yaw; empty: drawn.
+    goals: PushGoalsConfig = field(default_factory=PushGoalsConfig)
+    pose: PoseSensorConfig = field(default_factory=PoseSensorConfig)
+    sampler: ContactSamplerConfig = field(default_factory=ContactSamplerConfig)
+    task: PushTaskConfig = field(default_factory=PushTaskConfig)
+    planner: PushPlannerConfig = field(default_factory=PushPlannerConfig)
+    learning: PushLearnerConfig = field(default_factory=PushLearnerConfig)
+    reference: ArmReferenceConfig = field(
+        default_factory=lambda: ArmReferenceConfig(
+            force_max=8.0, acceleration_max=3.0, tip_mass=TIP_MASS
+        )
+    )
+    impedance: ImpedanceConfig = field(
+        default_factory=lambda: ImpedanceConfig(force_max=20.0)
+    )
+
+
+def poses_of(config: PushObjectConfig) -> np.ndarray:
+    """(1 + n_goals, 3) x, y [m], yaw [rad]: where the object is at first, the goals."""
+    if config.n_goals < 1:
+        raise ValueError(f"n_goals is {config.n_goals}, expected at least 1")
+    poses = draw_poses(config.goals, config.n_goals + 1, config.seed)
+    if config.start:
+        if len(config.start) != 3:
+            raise ValueError(f"start is {config.start}, expected [x, y, yaw]")
+        poses[0] = config.start
+    return poses
+
+
+def world_scene(config: PushObjectConfig) -> Scene:
+    """The scene that is simulated: the object, where it lies, its friction."""
+    scene = read_scene(config.scene)
+    if not config.friction > 0.0:
+        raise ValueError(f"friction is {config.friction}, expected > 0")
+    models = [d.add_model for d in scene.directives if d.add_model is not None]
+    own = [model for model in models if model.name == OBJECT]
+    if not own:
+        names = ", ".join(model.name for model in models)
+        raise ValueError(f"the scene has {names}, expected a model {OBJECT} too")
+    own[0].file = f"file://{object_file(config.object)}"
+    x, y, yaw = poses_of(config)[0]
+    q = [float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2))]
+    z = rest_height(config.object)
+    scene.initial.poses[f"{OBJECT}.{OBJECT}"] = [*q, float(x), float(y), z]
+    for pair in (f"{TOOL}~{OBJECT}", f"{OBJECT}~table"):
+        scene.effects.append(
+            Effect("contact_friction", [pair], {"friction": config.friction})
+        )
+    return scene
+
+
+def believed_object(config: PushObjectConfig) -> tuple[PushedObject, float]:
+    """The object and the friction that the controllers believe."""
+    o, m = config.object, config.model
+    offset = [a + b for a, b in zip(o.com_offset, m.com_offset, strict=True)]
+    friction = config.friction if m.friction is None else m.friction
+    if not friction > 0.0:
+        raise ValueError(f"model.friction is {friction}, expected > 0")
+    spec = replace(o, scale=o.scale * m.scale, mass=o.mass * m.mass, com_offset=offset)
+    return spec, friction
+
+
+def contact_pairs(spec: PushedObject, friction: float) -> list[ContactPair]:
+    """Tip and object, then each of the object's supports on the table."""
+    n = len(support_spheres(spec)[0])
+    # Edges along the vertical do not jump as the normal goes around the object.
+    tip = ContactPair(
+        "tip::tip", f"{OBJECT}::{OBJECT}", friction, tangent=[0.0, 0.0, 1.0], closest=1
+    )
+    return [tip] + [
+        ContactPair(f"{OBJECT}::support_{i}", "table::table", friction)
+        for i in range(n)
+    ]
+
+
+def c3_config(planner: PushPlannerConfig, n_lam: int) -> C3Config:
+    """Raises: ValueError for a weight out of range."""
+    p = planner
+    for name in ("position", "angle_radius", "last", "tip_speed"):
+        if not getattr(p, name) > 0.0:
+            raise ValueError(f"planner.{name} is {getattr(p, name)}, expected > 0")
+    Q = np.zeros(N_X)
+    Q[2], Q[V_TIP] = 500.0, p.tip_speed
+    Q[P_BALL.start : P_BALL.start + 2], Q[V_BALL] = p.position, 20.0
+    Q_N = Q.copy()
+    Q_N[P_BALL.start : P_BALL.start + 2] *= p.last
+    # As in ball_rolling: lam : eta = 10 : 1, and the table's contacts loose.
+    contact = np.full(n_lam, 0.002)
+    contact[:N_TIP] = 1.0
+    G = np.concatenate([
+        np.full(N_X, 1e-9), 5.0 * contact, np.full(3, 1e-9), 0.5 * contact,
+    ])  # fmt: skip
+    turn = p.position * p.angle_radius**2
+    return C3Config(
+        weights=C3Weights(
+            Q, np.full(3, 0.01), G, G, Q_N=Q_N,
+            orientation=[OrientationWeight(Q_BALL.start, turn, p.last * turn)],
+        ),
+        options=C3Options(N=p.N, rounds=p.rounds, rho=2.2, polish=p.polish),
+        residual_dt_sec=LEARN,
+        sliding_command=True,
+    )  # fmt: skip
+
+
+def learner_config(learner: PushLearnerConfig) -> ResidualLearnerConfig:
+    Q_d = np.zeros(N_X)
+    Q_d[[V_TIP.start, V_TIP.start + 1]] = learner.weight_tip
+    Q_d[[V_BALL.start, V_BALL.start + 1]] = learner.weight_object
+    return ResidualLearnerConfig(
+        Q_d=Q_d.tolist(),
+        eps=learner.eps,
+        gamma=learner.gamma,
+        groups=[list(range(N_TIP))],
+        r_max=learner.r_max,
+        posterior=learner.posterior,
+    )
+
+
+def make_push_object(
+    config: PushObjectConfig, meshcat: Meshcat | None = None
+) -> Diagram:
+    """The whole experiment, each system by name in the diagram.
+
+    For scoring, of the truth: `state_log` (the plant's state, at 80 Hz) and `touch_log`
+    (3,), the force on the finger of all its contacts [N], at 1 kHz; and of what is
+    commanded: `torque_log` (7,) at 1 kHz, `goal_log` (5,) of PushGoals, `phase_log`
+    (1,) of PushTask and `command_log` (3,) of ContactSampler, at 80 Hz. A diagram is
+    done when the number in goal_log is n_goals.
+    """
+    builder = DiagramBuilder()
+    spec, friction = believed_object(config)
+    station = builder.AddNamedSystem(
+        "station",
+        make_station(
+            StationConfig(scene=config.scene, contact=[TOOL, OBJECT], seed=config.seed),
+            meshcat,
+            world_scene(config),
+        ),
+    )
+    model_scene = read_scene(config.scene)
+    arm = make_control_plant(model_scene)
+    p_tip = (
+        arm.GetFrameByName(TIP_FRAME)
+        .CalcPoseInWorld(arm.CreateDefaultContext())
+        .translation()
+    )
+    loaded = load_scene(model_scene, DiagramBuilder())
+    tip = TipAndBall(
+        tip_mass=TIP_MASS,
+        tip_radius=sphere_radius(loaded.plant, loaded.scene_graph, TOOL),
+    )
+    height = rest_height(spec)
+    points = [part.points for part in parts(spec)]
+    top = height + max(float(p[:, 2].max()) for p in points)
+    shape = ObjectShape(points, tip.tip_radius, top)
+    pairs = contact_pairs(spec, friction)
+    lcs, lcs_of = {}, {}
+    for name, dt, period in (
+        ("plan", PLAN_DT, CONTROL),
+        ("command", CONTROL, CONTROL),
+        ("learn", LEARN, LEARN),
+    ):
+        own = AnitescuLcsBuilder(
+            make_tip_and_object(spec, tip)[0],
+            LcsBuilderConfig(pairs, dt, None, period, OFFSET["lcs"]),
+        )
+        lcs_of[name] = own.model
+        lcs[name] = builder.AddNamedSystem(f"lcs_{name}", own)
+    n_lam = lcs_of["plan"].n_lam
+    c3_settings = c3_config(config.planner, n_lam)
+
+    plant = station.GetSubsystemByName("plant")
+    sensor = builder.AddNamedSystem(
+        "pose_sensor",
+        PoseSensor(
+            replace(
+                config.pose,
+                height=height,
+                rolling_axis=[1.0, 0.0, 0.0] if spec.shape == "cylinder" else [],
+                offset_sec=OFFSET["sensor"],
+            ),
+            int(plant.GetBodyByName(OBJECT).index()),
+            config.seed,
+        ),
+    )
+    estimator = builder.AddNamedSystem(
+        "state_estimator",
+        StateEstimator(
+            StateEstimatorConfig(
+                ball_radius=height,
+                tip_mass=tip.tip_mass,
+                window_sec=LEARN,
+                period_sec=ESTIMATE,
+                offset_sec=OFFSET["estimator"],
+            ),
+            serial_chain_of(arm, TIP_FRAME),
+            arm.GetPositions(arm.CreateDefaultContext()),
+        ),
+    )
+    goals = builder.AddNamedSystem(
+        "push_goals",
+        PushGoals(
+            replace(config.goals, period_sec=CONTROL, offset_sec=OFFSET["goals"]),
+            poses_of(config)[1:],
+        ),
+    )
+    sampling = config.sampler.sampling
+    task = builder.AddNamedSystem(
+        "push_task",
+        PushTask(
+            replace(
+                config.task,
+                height=sampling.height,
+                clearance=sampling.clearance,
+                period_sec=CONTROL,
+                offset_sec=OFFSET["task"],
+            ),
+            config.planner.N + 1,
+            shape,
+            p_tip,
+        ),
+    )
+    sampler = builder.AddNamedSystem(
+        "contact_sampler",
+        ContactSampler(
+            replace(
+                config.sampler,
+                angle_radius=config.planner.angle_radius,
+                residual_dt_sec=LEARN,
+                offset_sec=OFFSET["sampler"],
+            ),
+            lcs_of["plan"],
+            C3Problem(c3_settings.weights, c3_settings.projection, c3_settings.options),
+            shape,
+        ),
+    )
+    c3 = builder.AddNamedSystem("c3_mpc", C3Mpc(c3_settings, CONTROL, OFFSET["c3"]))
+    at_default = {
+        name: one.build(one.x_default, np.zeros(one.n_u))
+        for name, one in lcs_of.items()
+    }
+    reference = builder.AddNamedSystem(
+        "arm_reference",
+        ArmReference(
+            replace(
+                config.reference, period_sec=CONTROL, offset_sec=OFFSET["reference"]
+            ),
+            n_lam,
+            p_tip,
+            at_default["command"],
+        ),
+    )
+    impedance = builder.AddNamedSystem(
+        "impedance_controller",
+        ImpedanceController(
+            replace(
+                config.impedance, period_sec=ARM_TICK, offset_sec=OFFSET["impedance"]
+            ),
+            arm,
+            TIP_FRAME,
+        ),
+    )
+    no_force = builder.AddNamedSystem("no_force", ConstantVectorSource(np.zeros(3)))
+
+    def connect(source, output, target, port):
+        builder.Connect(source.GetOutputPort(output), target.GetInputPort(port))
+
+    connect(station, "body_poses", sensor, "body_poses")
+    for name, port in (
+        ("p_WB", "p_ball"), ("v_WB", "v_ball"), ("seen", "seen"),
+        ("q_WB", "q_object"), ("w_WB", "w_object"),
+    ):  # fmt: skip
+        connect(sensor, name, estimator, port)
+    connect(station, f"{ARM}.position_measured", estimator, "q")
+    connect(station, f"{ARM}.velocity_measured", estimator, "v")
+    connect(station, f"{ARM}.torque_measured", estimator, "torque")
+    for one in lcs.values():
+        connect(estimator, "x", one, "x")
+        builder.Connect(no_force.get_output_port(), one.GetInputPort("u"))
+    if config.adapt:
+        learner = builder.AddNamedSystem(
+            "residual_learner",
+            ResidualLearner(
+                learner_config(config.learning),
+                at_default["learn"],
+                LEARN,
+                OFFSET["learner"],
+            ),
+        )
+        connect(estimator, "x", learner, "x")
+        connect(estimator, "u_measured", learner, "u_measured")
+        connect(estimator, "window_valid", learner, "enable")
+        connect(lcs["learn"], "lcs", learner, "lcs")
+        r_comp = learner.GetOutputPort("r_comp")
+        if meshcat is not None:
+            button = builder.AddNamedSystem("adapt_button", AdaptButton(n_lam, meshcat))
+            builder.Connect(r_comp, button.get_input_port())
+            r_comp = button.get_output_port()
+        for system in (c3, sampler):
+            builder.Connect(r_comp, system.GetInputPort("r_comp"))
+    for system in (goals, task, sampler):
+        connect(estimator, "x", system, "x")
+        connect(estimator, "valid", system, "valid")
+    for system in (task, sampler):
+        connect(goals, "goal", system, "goal")
+    connect(task, "x_desired", sampler, "x_desired")
+    connect(task, "phase", sampler, "phase")
+    connect(sampler, "command", task, "command")
+    connect(estimator, "x", c3, "x")
+    connect(task, "x_desired", c3, "x_desired")
+    connect(lcs["plan"], "lcs", c3, "lcs")
+    connect(lcs["command"], "lcs", c3, "lcs_command")
+    connect(task, "phase", reference, "phase")
+    connect(task, "reference", reference, "reference")
+    connect(c3, "x_next", reference, "x_next")
+    connect(c3, "lam", reference, "lam")
+    connect(c3, "status", reference, "status")
+    connect(lcs["command"], "lcs", reference, "lcs")
+    connect(station, f"{ARM}.position_measured", impedance, "q")
+    connect(station, f"{ARM}.velocity_measured", impedance, "v")
+    sizes = [reference.GetOutputPort(name).size() for name in ("x_desired", "wrench")]
+    split = builder.AddNamedSystem("arm_command_split", Demultiplexer(sizes))
+    builder.Connect(reference.GetOutputPort("command"), split.get_input_port())
+    for i, name in enumerate(("x_desired", "wrench_feedforward")):
+        builder.Connect(split.get_output_port(i), impedance.GetInputPort(name))
+    tau = impedance.GetOutputPort("tau")
+    builder.Connect(tau, station.GetInputPort(f"{ARM}.torque_commanded"))
+
+    for name, source, period in (
+        ("torque_log", tau, ARM_TICK),
+        ("touch_log", station.GetOutputPort(f"{TOOL}.contact_force"), ARM_TICK),
+        ("state_log", station.GetOutputPort("state"), CONTROL),
+        ("goal_log", goals.GetOutputPort("log"), CONTROL),
+        ("phase_log", task.GetOutputPort("phase"), CONTROL),
+        ("command_log", sampler.GetOutputPort("command"), CONTROL),
+    ):
+        LogVectorOutput(source, builder, period).set_name(name)
+    of_object = [""] * N_X
+    names = [f"{OBJECT}.{OBJECT}.{part}" for part in ("qw", "qx", "qy", "qz", *"xyz")]
+    of_object[Q_BALL.start : P_BALL.stop] = names
+    seen = {"object": (estimator.GetOutputPort("x"), of_object)}
+    record_station(builder, station, tau, TOOL, CONTROL, seen)
+    diagram = builder.Build()
+    diagram.set_name("push_object")
+    return diagram
