@@ -53,6 +53,7 @@ LOWER_FACE = 1e-3  # [m] Points of a mesh so near to its lowest one belong to it
 STIFFNESS, SUPPORT_STIFFNESS, DISSIPATION = 2e5, 2e4, 1.0
 SHAPES = ("t", "box", "l", "disc", "cylinder", "mesh")
 COLOR, HUE = (0.95, 0.4, 0.05), 0.41  # Of an object: for the eye, for a camera [rad].
+BODY_COLOR, PLATE = (0.25, 0.26, 0.28), 1e-3  # Of what is below it; its thickness [m].
 
 
 @dataclass
@@ -239,12 +240,8 @@ def object_sdf(spec: PushedObject) -> str:
     M = object_inertia(spec)
     com = M.get_com()
     moments = M.Shift(com).CalcRotationalInertia().CopyToFullMatrix3()
-    shapes = []
+    shapes = [_visual_text(*visual) for visual in _visuals(spec)]
     for i, part in enumerate(parts(spec)):
-        shapes.append(
-            f'<visual name="part_{i}">{_placed_text(part.shape, part.X_BS)}<material>'
-            f"<diffuse>{' '.join(map(str, COLOR))} 1</diffuse></material></visual>"
-        )
         shapes.append(
             _collision_text(f"part_{i}", *_above_table(part, spec), STIFFNESS)
         )
@@ -265,6 +262,51 @@ def object_sdf(spec: PushedObject) -> str:
         f"<inertia>{inertia}</inertia></inertial>\n      {listed}\n"
         "    </link>\n  </model>\n</sdf>\n"
     )
+
+
+def _visuals(spec: PushedObject):
+    """(name, shape, pose, colour) of what is seen: a flat object has a coloured top on
+    a dark body, others are of that colour all over."""
+    if spec.shape in ("cylinder", "mesh"):
+        for i, part in enumerate(parts(spec)):
+            yield f"part_{i}", part.shape, part.X_BS, COLOR
+        return
+    top = rest_height(spec)
+    for what, low, high, color in (
+        ("body", -top, top - PLATE, BODY_COLOR),
+        ("top", top - PLATE, top, COLOR),
+    ):
+        for i, part in enumerate(_overlapping(spec)):
+            middle = RigidTransform([0.0, 0.0, (low + high) / 2.0])
+            if isinstance(part.shape, Box):
+                w, d, _ = part.shape.size()
+                shape: Shape = Box(w, d, high - low)
+            else:
+                shape = Cylinder(part.shape.radius(), high - low)
+            yield f"{what}_{i}", shape, middle @ part.X_BS, color
+
+
+def _overlapping(spec: PushedObject) -> list[Part]:
+    """The parts of a flat object, of T and L so that no seam shows where they meet."""
+    made, u = parts(spec), spec.scale * UNIT
+    if spec.shape not in ("t", "l"):
+        return made
+    w, d, h = made[1].shape.size()
+    back = np.array([0.0, u / 2.0, 0.0] if spec.shape == "t" else [-u / 2.0, 0.0, 0.0])
+    size = np.array([w, d, h]) + 2.0 * abs(back)
+    return [made[0], _box(size, made[1].X_BS.translation() + back)]
+
+
+def seen_parts(spec: PushedObject) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """What a camera above sees of the object, in its frame: the parts that have its
+    colour, the top of a flat one, and the parts of all of it; each the points (n, 3)
+    [m] of which it is the convex hull. Parts may overlap.
+    """
+    if spec.shape in ("cylinder", "mesh"):
+        whole = [part.points for part in parts(spec)]
+        return whole, whole
+    whole = [part.points for part in _overlapping(spec)]
+    return [points[points[:, 2] > 0.0] for points in whole], whole
 
 
 def _above_table(part: Part, spec: PushedObject) -> tuple[Shape, RigidTransform]:
@@ -305,6 +347,13 @@ def _placed_text(shape: Shape, X_BS: RigidTransform) -> str:
     turned = _numbers(RollPitchYaw(X_BS.rotation()).vector())
     pose = f"<pose>{_numbers(X_BS.translation())} {turned}</pose>"
     return f"{pose}<geometry>{geometry}</geometry>"
+
+
+def _visual_text(name: str, shape: Shape, X_BS: RigidTransform, color) -> str:
+    return (
+        f'<visual name="{name}">{_placed_text(shape, X_BS)}<material><diffuse>'
+        f"{' '.join(map(str, color))} 1</diffuse></material></visual>"
+    )
 
 
 def _collision_text(
