@@ -101,6 +101,7 @@ class PushPlannerConfig:
     position: float = 5000.0  # Of the object, across the table [1/m2].
     angle_radius: float = 0.12  # A turn of the object counts as so much of a way [m].
     last: float = 5.0  # The last knot's weight over the others'.
+    tip_height: float = 1e4  # [1/m2]
     tip_speed: float = 10.0  # [s2/m2]
 
 
@@ -221,11 +222,11 @@ def contact_pairs(spec: PushedObject, friction: float) -> list[ContactPair]:
 def c3_config(planner: PushPlannerConfig, n_lam: int) -> C3Config:
     """Raises: ValueError for a weight out of range."""
     p = planner
-    for name in ("position", "angle_radius", "last", "tip_speed"):
+    for name in ("position", "angle_radius", "last", "tip_height", "tip_speed"):
         if not getattr(p, name) > 0.0:
             raise ValueError(f"planner.{name} is {getattr(p, name)}, expected > 0")
     Q = np.zeros(N_X)
-    Q[2], Q[V_TIP] = 500.0, p.tip_speed
+    Q[2], Q[V_TIP] = p.tip_height, p.tip_speed
     Q[P_BALL.start : P_BALL.start + 2], Q[V_BALL] = p.position, 20.0
     Q_N = Q.copy()
     Q_N[P_BALL.start : P_BALL.start + 2] *= p.last

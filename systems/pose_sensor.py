@@ -7,8 +7,8 @@ from pydrake.common.value import AbstractValue, Value
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import LeafSystem
 
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.pose_filter import (
-    PoseEstimate,
     corrected,
     first_pose,
     on_the_table,
@@ -59,6 +59,10 @@ class PoseSensor(LeafSystem):
                 f"{config.period_sec}, expected at least 0 and more than 0"
             )
         self._config, self._body, self._seed = config, int(body), int(seed)
+        self._axis = np.array(config.rolling_axis or [0.0, 0.0, 0.0], dtype=float)
+        zero = np.zeros(3)
+        self._unknown = zero, zero, np.array([1.0, 0.0, 0.0, 0.0]), zero
+        first_call(on_the_table, 0.0, *self._unknown, config.height, self._axis)
         self._poses = self.DeclareAbstractInputPort(
             "body_poses", AbstractValue.Make([RigidTransform()])
         )
@@ -66,10 +70,10 @@ class PoseSensor(LeafSystem):
         self._late = self.DeclareAbstractState(Value[object](()))
         self._pose = self.DeclareAbstractState(Value[object](None))
         ticket = {self.abstract_state_ticket(self._pose), self.time_ticket()}
-        for name, size, of in (
-            ("p_WB", 3, "p"), ("q_WB", 4, "q"), ("v_WB", 3, "v"), ("w_WB", 3, "w"),
-        ):  # fmt: skip
-            self.DeclareVectorOutputPort(name, size, self._calc(of), ticket)
+        for i, (name, size) in enumerate(
+            (("p_WB", 3), ("v_WB", 3), ("q_WB", 4), ("w_WB", 3))
+        ):
+            self.DeclareVectorOutputPort(name, size, self._calc(i), ticket)
         self.DeclareVectorOutputPort("seen", 1, self._calc_seen, ticket)
         self.DeclarePeriodicUnrestrictedUpdateEvent(
             config.period_sec, config.offset_sec, self._update
@@ -99,23 +103,17 @@ class PoseSensor(LeafSystem):
         state.get_mutable_abstract_state(int(self._late)).set_value(late)
         state.get_mutable_abstract_state(int(self._pose)).set_value(pose)
 
-    def _now(self, context) -> PoseEstimate | None:
-        pose = context.get_abstract_state(int(self._pose)).get_value()
-        if pose is None:
-            return None
-        c = self._config
-        now = predicted(pose, max(context.get_time(), pose.t), c.density)
-        return on_the_table(now, c.height, c.rolling_axis or None)
-
-    def _calc(self, of):
+    def _calc(self, i):
         def calc(context, output):
-            pose = self._now(context)
-            if pose is not None:
-                output.SetFromVector(getattr(pose, of))
-            elif of == "q":
-                output.SetFromVector([1.0, 0.0, 0.0, 0.0])
-            else:
-                output.SetFromVector(np.zeros(3))
+            pose = context.get_abstract_state(int(self._pose)).get_value()
+            if pose is None:
+                output.SetFromVector(self._unknown[i])
+                return
+            dt = max(context.get_time() - pose.t, 0.0)
+            now = on_the_table(
+                dt, pose.p, pose.v, pose.q, pose.w, self._config.height, self._axis
+            )
+            output.SetFromVector(now[i])
 
         return calc
 

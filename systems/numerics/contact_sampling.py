@@ -19,7 +19,6 @@ from time import perf_counter
 
 import numpy as np
 from numba import njit
-from scipy.spatial import ConvexHull, QhullError
 
 from makebreak.systems.numerics.ball_state import P_BALL, P_TIP, Q_BALL, V_TIP
 from makebreak.systems.numerics.c3_mpc import C3Problem, _admm_plus, _model
@@ -31,6 +30,7 @@ NO_PLAN = np.inf
 # From round to round the places move on by this share of their spacing: the golden
 # section, which leaves no part of the contour out.
 GOLDEN = 0.6180339887498949
+BRAKE = 0.6  # Share of the acceleration that a travelling tip is to brake with.
 PROGRESS = 0.003  # Less than this towards the goal is none [m].
 
 
@@ -84,34 +84,70 @@ def outline_of(parts, R, p):
     Args: parts: convex parts of the object, the points (n, 3) [m] of each in its own
         frame; R (3, 3), p (3,) [m]: how and where that is.
     Returns: a list of convex polygons (m, 2) [m], counter-clockwise.
+    Raises: ValueError for a part without area.
     """
-    outline = []
-    for points in parts:
-        plan = (points @ R.T + p)[:, :2]
-        try:
-            outline.append(plan[ConvexHull(plan).vertices])
-        except QhullError as error:
-            raise ValueError("a part of the object has no area from above") from error
+    outline = [_hull_from_above(points, R, p) for points in parts]
+    if any(len(polygon) < 3 for polygon in outline):
+        raise ValueError("a part of the object has no area from above")
     return outline
+
+
+@njit(cache=True)
+def _hull_from_above(points, R, p):
+    """Andrew's monotone chain; corners of less than 1e-12 m2 are left out."""
+    n = len(points)
+    plan = np.empty((n, 2))
+    for i in range(n):
+        for k in range(2):
+            plan[i, k] = p[k]
+            for j in range(3):
+                plan[i, k] += R[k, j] * points[i, j]
+    # Points of one x, but for rounding, in the order of y.
+    order = np.argsort(plan[:, 1], kind="mergesort")
+    x = np.round(plan[order, 0], 9)
+    order = order[np.argsort(x, kind="mergesort")]
+    hull, size = np.empty((2 * n + 1, 2)), 0
+    for way in range(2):
+        first = size
+        for step in range(n):
+            at = plan[order[step if way == 0 else n - 1 - step]]
+            while size > first + 1:
+                a, b = hull[size - 2], hull[size - 1]
+                area = (b[0] - a[0]) * (at[1] - a[1]) - (b[1] - a[1]) * (at[0] - a[0])
+                if area > 1e-12:
+                    break
+                size -= 1
+            hull[size] = at
+            size += 1
+        size -= 1  # The last point begins the way back.
+    return hull[:size].copy()
 
 
 def distance_to_outline(points, outline):
     """(n,) how far points (n, 2) are outside of an outline [m]; negative inside: how
     deep in its deepest part."""
-    points = np.atleast_2d(points)
+    points = np.ascontiguousarray(np.atleast_2d(points), dtype=float)
     nearest = np.full(len(points), np.inf)
     for polygon in outline:
-        edge = np.roll(polygon, -1, axis=0) - polygon
-        length = np.hypot(*edge.T)
-        along = edge / length[:, None]
-        out = np.stack([along[:, 1], -along[:, 0]], axis=1)
-        off = points[:, None] - polygon
-        height = (off * out).sum(axis=2)
-        share = np.clip((off * along).sum(axis=2), 0.0, length)
-        beside = np.linalg.norm(off - share[..., None] * along, axis=2).min(axis=1)
-        inside = height.max(axis=1)
-        nearest = np.minimum(nearest, np.where(inside > 0.0, beside, inside))
+        _lower_to_polygon(points, polygon, nearest)
     return nearest
+
+
+@njit(cache=True)
+def _lower_to_polygon(points, polygon, nearest):
+    m = len(polygon)
+    for i in range(len(points)):
+        inside, beside = -np.inf, np.inf
+        for k in range(m):
+            a, b = polygon[k], polygon[(k + 1) % m]
+            ex, ey = b[0] - a[0], b[1] - a[1]
+            x, y = points[i, 0] - a[0], points[i, 1] - a[1]
+            length = np.sqrt(ex * ex + ey * ey)
+            inside = max(inside, (x * ey - y * ex) / length)
+            share = min(max((x * ex + y * ey) / length**2, 0.0), 1.0)
+            off = np.sqrt((x - share * ex) ** 2 + (y - share * ey) ** 2)
+            beside = min(beside, off)
+        nearest[i] = min(nearest[i], beside if inside > 0.0 else inside)
 
 
 def places_around(outline, distance, n, phase=0.0):
@@ -188,7 +224,7 @@ def travel_length(a, b, outline, distance, height):
 def travel_step(p, v, goal, outline, distance, height, limits, dt):
     """One step of the reference on its way to a place, never nearer to the object.
 
-    Where the straight way at the tip's height keeps the distance, it is taken; else the
+    Where the straight way beside the object keeps the distance, it is taken; else the
     tip goes up to the height, across, and down. Speed falls off towards each corner of
     the way, so that nothing is overshot.
 
@@ -198,22 +234,22 @@ def travel_step(p, v, goal, outline, distance, height, limits, dt):
     Returns: p, v, a (3,) dt later, and whether it has arrived.
     """
     speed, acceleration = limits
-    off = goal - p
-    across = np.hypot(*off[:2])
+    across = np.hypot(*(goal - p)[:2])
+    # Above the place, and not drifting away from above it while going down.
+    above = across < 1e-3 and np.hypot(*v[:2]) < 0.02
     low = p[2] < height - 1e-3
-    if across < 1e-3 or way_is_free(p[:2], goal[:2], outline, distance):
-        target = goal  # Down, or along the table.
-        if across >= 1e-3 and p[2] > goal[2] + 1e-3 and not low:
-            target = np.array([*goal[:2], p[2]])  # Already above: across first.
+    if above or (low and way_is_free(p[:2], goal[:2], outline, distance)):
+        target = goal
     elif low:
         target = np.array([*p[:2], height])
     else:
-        target = np.array([*goal[:2], height])
+        target = np.array([*goal[:2], max(p[2], height)])
     off = target - p
     left = np.linalg.norm(off)
-    # What it can still brake from within what is left, in steps of dt.
-    half = 0.5 * acceleration * dt
-    fast = min(speed, np.sqrt(half**2 + 2.0 * acceleration * left) - half)
+    # What it can still brake from within what is left, in steps of dt, and not with all
+    # of the acceleration: some is left to keep to it.
+    brake = BRAKE * acceleration
+    fast = min(speed, np.sqrt((brake * dt) ** 2 + 2.0 * brake * left) - brake * dt)
     wanted = off / max(left, 1e-12) * fast
     change = wanted - v
     size = np.linalg.norm(change)

@@ -4,16 +4,16 @@ Position and orientation each by a Kalman filter of constant velocity
 (numerics/constant_velocity.py), the orientation's error as a turn in the world.
 """
 
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from makebreak.systems.numerics.constant_velocity import correct, predict
 
 
-@dataclass(frozen=True, eq=False)
-class PoseEstimate:
-    """Of a body at one time, in the world."""
+class PoseEstimate(NamedTuple):
+    """Of a body at one time, in the world. Nothing in it is changed."""
 
     t: float  # [s]
     p: np.ndarray  # (3,) [m]
@@ -23,30 +23,35 @@ class PoseEstimate:
     P_p: np.ndarray  # (3,) covariance of p and v, of each axis
     P_q: np.ndarray  # (3,) and of the turn and w
 
-    def __deepcopy__(self, memo) -> "PoseEstimate":
-        return self  # Nothing in it is changed once it is there.
 
-
-def multiplied(a, b):
-    """The quaternion (4,) of turning by b, then by a, both about the world's axes."""
-    w = a[0] * b[0] - a[1:] @ b[1:]
-    return np.r_[w, a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])]
-
-
+@njit(cache=True)
 def turned(q, angle):
     """q (4,), then turned by a vector (3,) in the world [rad]; of length one."""
-    size = np.linalg.norm(angle)
-    half = 0.5 * np.sinc(size / (2.0 * np.pi)) * angle
-    q = multiplied(np.r_[np.cos(size / 2.0), half], q)
-    return q / np.linalg.norm(q)
+    size = np.sqrt(angle[0] ** 2 + angle[1] ** 2 + angle[2] ** 2)
+    sine = np.sin(size / 2.0) / size if size > 1e-9 else 0.5
+    w, x, y, z = np.cos(size / 2.0), sine * angle[0], sine * angle[1], sine * angle[2]
+    a, b, c, d = q
+    turned_q = np.empty(4)
+    turned_q[0] = w * a - x * b - y * c - z * d
+    turned_q[1] = w * b + x * a + y * d - z * c
+    turned_q[2] = w * c - x * d + y * a + z * b
+    turned_q[3] = w * d + x * c - y * b + z * a
+    return turned_q / np.sqrt((turned_q**2).sum())
 
 
 def turn_between(a, b):
     """The shortest turn (3,) in the world from a to b (4,) [rad]."""
-    d = multiplied(b, a * [1.0, -1.0, -1.0, -1.0])
-    d = d if d[0] >= 0.0 else -d
-    sine = np.linalg.norm(d[1:])
-    return 2.0 * np.arctan2(sine, d[0]) * d[1:] / sine if sine > 0.0 else np.zeros(3)
+    (aw, ax, ay, az), (bw, bx, by, bz) = a, b
+    w = bw * aw + bx * ax + by * ay + bz * az
+    axis = np.array([
+        bx * aw - bw * ax - by * az + bz * ay,
+        by * aw - bw * ay - bz * ax + bx * az,
+        bz * aw - bw * az - bx * ay + by * ax,
+    ])  # fmt: skip
+    if w < 0.0:
+        w, axis = -w, -axis
+    sine = np.sqrt(axis @ axis)
+    return 2.0 * np.arctan2(sine, w) * axis / sine if sine > 0.0 else np.zeros(3)
 
 
 def first_pose(t, p, q, std, speed_std) -> PoseEstimate:
@@ -77,37 +82,36 @@ def corrected(pose: PoseEstimate, p, q, std) -> PoseEstimate:
     return PoseEstimate(pose.t, p_new, v, turned(pose.q, turn), w, P_p, P_q)
 
 
-def on_the_table(pose: PoseEstimate, height, rolling_axis=None) -> PoseEstimate:
-    """The pose of an object that lies on a level table: at its height, upright, and
-    turning about the vertical alone.
+@njit(cache=True)
+def on_the_table(dt, p, v, q, w, height, axis):
+    """The pose dt [s] later of an object that lies on a level table: at its height,
+    upright, and turning about the vertical alone.
 
-    Args: height of its origin [m]; rolling_axis (3,): of one that rolls, the axis in
-        its frame, which stays level; it turns about that axis too, and rolls freely
-        over the table.
+    Args: p, v, q, w as in PoseEstimate; height of its origin [m]; axis (3,): of an
+        object that rolls, in its frame, which stays level; it turns about that axis
+        too, and rolls freely over the table. Zero: it lies flat.
+    Returns: p, v, q, w.
     """
-    if rolling_axis is None:
-        axis, level = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])
-        axis = turned_vector(pose.q, axis)
+    rolls = (axis**2).sum() > 0.0
+    q = turned(q, dt * w)
+    held, level = np.zeros(3), np.zeros(3)
+    if rolls:
+        held[:] = axis
     else:
-        axis = turned_vector(pose.q, np.asarray(rolling_axis, dtype=float))
-        level = axis * [1.0, 1.0, 0.0]
-        level = level / max(np.linalg.norm(level), 1e-9)
-    sine = np.cross(axis, level)
-    size = np.linalg.norm(sine)
-    tilt = np.arctan2(size, axis @ level) * sine / size if size > 0.0 else np.zeros(3)
-    up = np.array([0.0, 0.0, 1.0])
-    w = up * pose.w[2]
-    if rolling_axis is not None:
-        w = w + level * (level @ pose.w)
-    return replace(
-        pose,
-        p=np.array([*pose.p[:2], height]),
-        v=pose.v * [1.0, 1.0, 0.0],
-        q=turned(pose.q, tilt),
-        w=w,
-    )
-
-
-def turned_vector(q, a):
-    """a (3,) of the body in the world."""
-    return a + 2.0 * np.cross(q[1:], np.cross(q[1:], a) + q[0] * a)
+        held[2] = level[2] = 1.0
+    cross = np.cross(q[1:], held) * 2.0  # Of the body in the world:
+    held = held + q[0] * cross + np.cross(q[1:], cross)
+    if rolls:
+        level[:2] = held[:2]
+        level /= max(np.sqrt((level**2).sum()), 1e-9)
+    sine = np.cross(held, level)
+    size = np.sqrt((sine**2).sum())
+    if size > 0.0:
+        q = turned(q, np.arctan2(size, (held * level).sum()) * sine / size)
+    p, v = p + dt * v, v.copy()
+    p[2], v[2] = height, 0.0
+    turning = np.zeros(3)
+    turning[2] = w[2]
+    if rolls:
+        turning += level * (level * w).sum()
+    return p, v, q, turning

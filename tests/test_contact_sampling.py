@@ -1,0 +1,563 @@
+"""Places around an object, their plans, and the choice between them."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from makebreak.diagrams.push_object import PushPlannerConfig, c3_config, contact_pairs
+from makebreak.models.pushed_object import (
+    PushedObject,
+    make_tip_and_object,
+    parts,
+    rest_height,
+)
+from makebreak.models.tip_and_ball import TipAndBall
+from makebreak.systems.contact_sampler import (
+    ContactSampler,
+    ContactSamplerConfig,
+    SamplerStatus,
+)
+from makebreak.systems.lcs_builder import AnitescuLcs
+from makebreak.systems.numerics.ball_state import P_BALL, P_TIP, Q_BALL, V_BALL
+from makebreak.systems.numerics.c3_mpc import (
+    C3Problem,
+    WarmStart,
+    plan_cost,
+    solve_c3,
+)
+from makebreak.systems.numerics.contact_sampling import (
+    ObjectShape,
+    SamplingConfig,
+    SamplingMemory,
+    choose,
+    distance_to_outline,
+    inward,
+    outline_of,
+    places_around,
+    rotation_of,
+    sample_round,
+    score_plans,
+    score_within,
+    to_object,
+    to_world,
+    travel_step,
+    way_is_free,
+)
+from makebreak.systems.numerics.lcs import simulate
+from makebreak.systems.numerics.push_task import (
+    CONTACT,
+    TRAVEL,
+    WAIT,
+    PushConfig,
+    PushState,
+    angle_between,
+    errors,
+    heading,
+    look_ahead,
+    next_push,
+)
+
+T = PushedObject("t")
+HEIGHT = 0.024
+TIP = TipAndBall(tip_mass=1.0, tip_radius=0.0195)
+
+
+def turned(yaw):
+    return np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+
+
+def state(tip, pose, spec=T):
+    x = np.zeros(19)
+    x[P_TIP], x[Q_BALL] = tip, turned(pose[2])
+    x[P_BALL] = [*pose[:2], rest_height(spec)]
+    return x
+
+
+def outline_at(pose, spec=T):
+    x = state(np.zeros(3), pose, spec)
+    points = [part.points for part in parts(spec)]
+    return outline_of(points, rotation_of(x[Q_BALL]), x[P_BALL])
+
+
+@pytest.fixture(scope="module")
+def planner():
+    """The model of tip and T, the problem, and the shape."""
+    model = AnitescuLcs(make_tip_and_object(T, TIP)[0], contact_pairs(T, 0.5), 0.1)
+    c3 = c3_config(PushPlannerConfig(), model.n_lam)
+    problem = C3Problem(c3.weights, c3.projection, c3.options)
+    points = [part.points for part in parts(T)]
+    return model, problem, ObjectShape(points, TIP.tip_radius, 2.0 * rest_height(T))
+
+
+# Geometry.
+
+
+@pytest.mark.parametrize("shape", ["t", "box", "disc", "cylinder"])
+def test_the_outline_is_the_convex_hull_of_each_part_from_above(shape):
+    rng = np.random.default_rng(0)
+    for part in parts(PushedObject(shape)):
+        for _ in range(10):
+            R = Rotation.random(random_state=int(rng.integers(1000))).as_matrix()
+            (polygon,) = outline_of([part.points], R, np.array([0.4, -0.2, 0.1]))
+            hull = ConvexHull(part.points @ R[:2].T + [0.4, -0.2])
+            x, y = polygon.T
+            area = 0.5 * (x @ np.roll(y, -1) - y @ np.roll(x, -1))
+            # Counter-clockwise: positive. Corners of less than 1e-12 m2 are left out.
+            assert area == pytest.approx(hull.volume, abs=1e-9)
+
+
+def test_distance_to_the_outline_agrees_with_the_nearest_of_many_points():
+    outline = outline_at([0.5, 0.1, 0.7])
+    rng = np.random.default_rng(0)
+    points = [0.5, 0.1] + rng.uniform(-0.2, 0.2, (200, 2))
+    share = np.linspace(0.0, 1.0, 400)[:, None]
+    edges = np.concatenate([
+        a + share * (b - a)
+        for polygon in outline
+        for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True)
+    ])  # fmt: skip
+    brute = np.linalg.norm(points[:, None] - edges, axis=2).min(axis=1)
+    distance = distance_to_outline(points, outline)
+    outside = distance > 0.0
+    assert 20 < outside.sum() < 200
+    # Points every 0.4 mm: the nearest is off by 0.2 mm along the edge at most.
+    np.testing.assert_allclose(distance[outside], brute[outside], atol=2e-4)
+    inside = [
+        any((ConvexHull(p).equations @ [*point, 1.0] <= 0).all() for p in outline)
+        for point in points
+    ]
+    np.testing.assert_array_equal(~outside, inside)
+
+
+@pytest.mark.parametrize("shape", ["t", "l", "box", "disc", "cylinder"])
+@pytest.mark.parametrize("phase", [0.0, 0.4, 0.99])
+def test_places_lie_at_the_clearance_all_around_the_object(shape, phase):
+    outline = outline_at([0.5, 0.1, 0.7], PushedObject(shape))
+    places = places_around(outline, 0.0235, 16, phase)
+    assert len(places) == 16
+    # None inside or nearer; on the bends a straight piece of the contour is cut short.
+    np.testing.assert_allclose(distance_to_outline(places, outline), 0.0235, atol=1e-4)
+    middle = np.concatenate(outline).mean(axis=0)
+    angles = np.sort(np.arctan2(*(places - middle).T))
+    assert np.diff(np.r_[angles, angles[0] + 2 * np.pi]).max() < 1.3  # On every side.
+
+
+def test_a_place_goes_with_the_object():
+    x = state([0, 0, 0], [0.5, 0.1, 0.7])
+    place = np.array([0.03, -0.08])
+    there = to_world(x, place)
+    expected = Rotation.from_euler("z", 0.7).as_matrix()[:2, :2] @ place + [0.5, 0.1]
+    np.testing.assert_allclose(there, expected, atol=1e-12)
+    np.testing.assert_allclose(to_object(x, there), place, atol=1e-12)
+
+
+def test_the_first_guess_pushes_into_the_object():
+    outline = outline_at([0.5, 0.1, 0.7])
+    places = places_around(outline, 0.0235, 16)
+    ahead = distance_to_outline(places + 0.01 * inward(places, outline), outline)
+    np.testing.assert_allclose(ahead, 0.0135, atol=2e-4)
+
+
+# Travel.
+
+
+def travel(p, goal, outline, v=(0.0, 0.0, 0.0), up=0.075, keep=0.0215, dt=0.0125):
+    """The references from p to the goal, and whether it arrived."""
+    p, v, way = np.array(p), np.array(v, dtype=float), []
+    for _ in range(400):
+        p, v, a, arrived = travel_step(p, v, goal, outline, keep, up, (0.35, 2.0), dt)
+        way.append((p, v, a))
+        if arrived:
+            break
+    return way, arrived
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_way_arrives_and_never_comes_nearer_than_it_may(seed):
+    rng = np.random.default_rng(seed)
+    outline = outline_at([0.5, 0.0, rng.uniform(-np.pi, np.pi)])
+    places = places_around(outline, 0.0235, 16, rng.random())
+    a, b = places[rng.choice(16, 2, replace=False)]
+    way, arrived = travel([*a, HEIGHT], np.array([*b, HEIGHT]), outline)
+    assert arrived
+    p, v, acceleration = (np.array(each) for each in zip(*way, strict=True))
+    low = p[:, 2] < 0.04 + 0.0195 + 0.01  # Else it passes above the object.
+    # Between a place's distance and what is kept there are 2 mm.
+    assert distance_to_outline(p[low, :2], outline).min() > 0.0215 - 1e-9
+    assert p[:, 2].min() > HEIGHT - 1e-3  # Nor does it go into the table.
+    assert np.linalg.norm(v, axis=1).max() < 0.35 + 1e-9
+    assert np.linalg.norm(acceleration, axis=1).max() < 2.0 + 1e-9
+
+
+def test_a_free_way_is_not_gone_through_the_air():
+    outline = outline_at([0.5, 0.0, 0.0], PushedObject("box"))
+    a, b = np.array([0.40, -0.05]), np.array([0.40, 0.05])
+    assert way_is_free(a, b, outline, 0.0215)
+    way, arrived = travel([*a, HEIGHT], np.array([*b, HEIGHT]), outline)
+    assert arrived and max(p[2] for p, _, _ in way) < HEIGHT + 1e-9
+    across = np.array([0.60, 0.05])
+    assert not way_is_free(a, across, outline, 0.0215)
+    way, arrived = travel([*a, HEIGHT], np.array([*across, HEIGHT]), outline)
+    assert arrived and max(p[2] for p, _, _ in way) > 0.074
+
+
+def test_a_tip_that_touches_may_leave_but_not_go_through():
+    outline = outline_at([0.5, 0.0, 0.0], PushedObject("box"))
+    at = np.array([0.45 - 0.0195, 0.0])  # The box is 100 mm wide.
+    assert way_is_free(at, np.array([0.40, 0.0]), outline, 0.0215)
+    assert not way_is_free(at, np.array([0.45 - 0.0195, 0.03]), outline, 0.0215)
+    assert not way_is_free(at, np.array([0.60, 0.0]), outline, 0.0215)
+
+
+# Plans.
+
+
+def places_of(planner, pose=(0.5, 0.0, 0.3), n=16):
+    model, problem, shape = planner
+    outline = outline_at(pose)
+    places = places_around(outline, shape.tip_radius + 0.004, n)
+    x = np.array([state([*place, HEIGHT], pose) for place in places])
+    guess = np.zeros((n, problem.options.N, 3))
+    guess[:, :, :2] = 4.0 * inward(places, outline)[:, None]
+    return x, guess
+
+
+def target(x, goal, n_knots):
+    return look_ahead(PushConfig(), x, np.array(goal), HEIGHT, n_knots)
+
+
+def test_a_batch_is_what_build_and_solve_c3_give_one_by_one(planner):
+    model, problem, _ = planner
+    x, guess = places_of(planner)
+    x_desired = target(x[0], [0.55, 0.02, 0.6], problem.options.N + 1)
+    cost, u, plans = score_plans(
+        model.build_many(x, np.zeros(3)), x, x_desired, problem, guess
+    )
+    z = np.zeros((problem.options.N, problem.n_z))
+    for i in range(len(x)):
+        lcs = model.build(x[i], np.zeros(3))
+        plan, _ = solve_c3(lcs, x[i], x_desired, problem, WarmStart(guess[i], z, z))
+        # The same operations: rounding alone.
+        np.testing.assert_allclose(u[i], plan.u, atol=1e-9)
+        np.testing.assert_allclose(plans[i], plan.x, atol=1e-9)
+        # The angle's cost is quadratic in the batch, the angle itself in plan_cost.
+        real = plan_cost(lcs, x[i], plan.u, x_desired, problem)
+        assert cost[i] == pytest.approx(real, rel=0.1)
+
+
+def test_many_lcs_are_those_of_one_after_the_other(planner):
+    model, _, _ = planner
+    x, _ = places_of(planner)
+    x[3, Q_BALL] *= 1.3  # Normalised.
+    x[5, 0] = np.nan
+    arrays = model.build_many(x, np.ones(3))
+    for i in range(len(x)):
+        if i == 5:
+            assert all(np.isnan(a[i]).all() for a in arrays)
+            continue
+        lcs = model.build(x[i], np.ones(3))
+        for a, name in zip(arrays, "A B D d E F H c phi".split(), strict=True):
+            np.testing.assert_allclose(a[i], getattr(lcs, name), atol=1e-12)
+    general = AnitescuLcs(
+        make_tip_and_object(T, TIP)[0], contact_pairs(T, 0.5), 0.1, analytic=False
+    )
+    assert model.is_analytic and not general.is_analytic
+    for a, b in zip(arrays, general.build_many(x, np.ones(3)), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-9)
+
+
+def test_the_best_place_is_behind_the_object(planner):
+    model, problem, _ = planner
+    pose = (0.5, 0.0, np.pi / 2)  # The cross bar is at -x, the stem towards +x.
+    x, guess = places_of(planner, pose)
+    x_desired = target(x[0], [0.44, 0.0, np.pi / 2], problem.options.N + 1)
+    cost, _, plans = score_plans(
+        model.build_many(x, np.zeros(3)), x, x_desired, problem, guess
+    )
+    best = int(np.argmin(cost))
+    assert x[best, 0] > 0.5 and abs(x[best, 1]) < 0.03
+    assert plans[best, -1, P_BALL.start] < 0.46
+    # In front of it nothing can be done: the tip stays, and so does the object.
+    in_front = int(np.argmin(x[:, 0]))
+    assert cost[in_front] > 3.0 * cost[best]
+
+
+def test_the_budget_leaves_the_last_places_out(planner):
+    model, problem, _ = planner
+    x, guess = places_of(planner)
+    lcs = model.build_many(x, np.zeros(3))
+    x_desired = target(x[0], [0.55, 0.02, 0.6], problem.options.N + 1)
+    whole = score_plans(lcs, x, x_desired, problem, guess)
+    little = score_within(1e-9, lcs, x, x_desired, problem, guess, at_once=4)
+    np.testing.assert_array_equal(little[0][:4], whole[0][:4])
+    assert np.isinf(little[0][4:]).all()
+    enough = score_within(1e3, lcs, x, x_desired, problem, guess, at_once=4)
+    for a, b in zip(enough, whole, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+# The choice.
+
+
+def test_the_present_place_is_kept_unless_another_is_clearly_better():
+    hysteresis = (0.2, 1.0)
+    assert choose(np.array([10.0, 7.1, 9.0]), hysteresis) == 0
+    assert choose(np.array([10.0, 6.9, 9.0]), hysteresis) == 1
+    assert choose(np.array([10.0, 6.9, np.nan]), hysteresis) == 1
+    assert choose(np.array([np.inf, 50.0, 49.0]), hysteresis) == 2
+    assert choose(np.array([np.inf, np.inf]), hysteresis) == 0
+
+
+def rounds(planner, x, goal, n, in_contact, memory=None, dt=0.1):
+    model, problem, shape = planner
+    memory = SamplingMemory() if memory is None else memory
+    x_desired = target(x, goal, problem.options.N + 1)
+    for k in range(n):
+        memory, found = sample_round(
+            SamplingConfig(), memory, model.build_many, problem, shape, x, x_desired,
+            sum(errors(x, np.array(goal))), in_contact, k * dt,
+        )  # fmt: skip
+    return memory, found
+
+
+def test_a_tip_on_its_way_keeps_its_place_and_a_stuck_one_leaves_it(planner):
+    x, _ = places_of(planner)
+    goal = [0.55, 0.02, 0.6]
+    memory, found = rounds(planner, x[0], goal, 1, in_contact=False)
+    assert memory.go == 1 and found.chosen > 0
+    # Nothing changes but the places that are looked at.
+    later, _ = rounds(planner, x[0], goal, 12, False, memory)
+    assert later.go <= 3
+    best = state([*to_world(x[0], later.place), HEIGHT], (0.5, 0.0, 0.3))
+    pushing, found = rounds(planner, best, goal, 11, True, later)
+    assert found.chosen == 0 and pushing.go == later.go
+    stuck, _ = rounds(planner, best, goal, 14, True, later, dt=0.2)
+    assert stuck.go == later.go + 1  # No progress for more than 1.2 s.
+
+
+def test_places_out_of_reach_are_not_looked_at(planner):
+    model, problem, shape = planner
+    x = state([0.6, 0.0, HEIGHT], (0.72, 0.0, 0.3))
+    x_desired = target(x, [0.6, 0.0, 0.0], problem.options.N + 1)
+    _, found = sample_round(
+        SamplingConfig(), SamplingMemory(), model.build_many, problem, shape, x,
+        x_desired, 0.1, False, 0.0,
+    )  # fmt: skip
+    assert len(found.places) > 4
+    assert (np.hypot(*found.places.T) <= 0.78).all()
+
+
+# The task.
+
+
+def test_the_target_is_the_goal_or_a_part_of_the_way():
+    x = state([0.4, 0.0, 0.1], (0.5, 0.0, 3.0))
+    near = look_ahead(PushConfig(), x, np.array([0.52, 0.01, -3.1]), HEIGHT, 3)
+    np.testing.assert_allclose(near[:, P_BALL], [[0.52, 0.01, x[9]]] * 3, atol=1e-12)
+    assert heading(near[0, Q_BALL]) == pytest.approx(-3.1)
+    far = look_ahead(PushConfig(), x, np.array([0.5, 0.3, -2.0]), HEIGHT, 3)
+    np.testing.assert_allclose(far[0, P_BALL], [0.5, 0.06, x[9]], atol=1e-12)
+    turn = angle_between(3.0, heading(far[0, Q_BALL]))
+    assert turn == pytest.approx(0.5)  # The shorter way round, through pi.
+    assert (far[:, 2] == HEIGHT).all() and not far[:, 10:].any()
+
+
+def test_the_task_travels_pushes_and_waits_for_what_is_not_seen(planner):
+    shape, config = planner[2], PushConfig()
+    x = state([0.35, 0.0, 0.1], (0.5, 0.0, 0.3))
+    place = places_of(planner)[0][0, :2]
+    in_object = to_object(x, place)
+    still = np.zeros(3)
+    task = PushState(WAIT, x[P_TIP].copy(), still, still)
+
+    def tick(task, seen=True, go=1):
+        task = next_push(
+            config, task, shape, 0.0125, x, seen, in_object if go else None, go,
+            HEIGHT, 0.004,
+        )  # fmt: skip
+        x[P_TIP] = task.p if task.phase != CONTACT else x[P_TIP]
+        return task
+
+    assert tick(task, go=0).phase == WAIT
+    for _ in range(400):
+        task = tick(task)
+        if task.phase == CONTACT:
+            break
+        assert task.phase == TRAVEL
+    np.testing.assert_allclose(x[P_TIP], [*place, HEIGHT], atol=2e-3)
+    for _ in range(20):
+        task = tick(task)
+        assert task.phase == CONTACT
+    x[P_TIP] += [-0.03, 0.0, 0.0]
+    assert tick(task, go=2).phase == TRAVEL  # A new command.
+    x[P_TIP] += [0.03, 0.0, 0.0]
+    for _ in range(20):
+        task = tick(task, seen=False)
+        assert task.phase == CONTACT  # For 0.25 s it may be hidden.
+    for _ in range(200):
+        task = tick(task, seen=False)
+    assert task.phase == WAIT
+    assert task.p[2] > 0.07 and np.hypot(*(task.p[:2] - config.withdrawn)) < 0.01
+
+
+# The loop, without an arm: the model is the world, of smaller steps.
+
+
+def test_a_t_is_pushed_to_a_pose_by_changing_contact(planner):
+    model, problem, shape = planner
+    pairs = contact_pairs(T, 0.5)
+    world = AnitescuLcs(make_tip_and_object(T, TIP)[0], pairs, 0.0125)
+    goal = np.array([0.53, 0.05, 0.9])
+    x = state([0.35, 0.0, 0.1], (0.5, 0.0, 0.3))
+    start = errors(x, goal)
+    still = np.zeros(3)
+    task = PushState(WAIT, x[P_TIP].copy(), still, still)
+    memory, warm = SamplingMemory(), problem.cold_start()
+    for k in range(480):
+        x_desired = target(x, goal, problem.options.N + 1)
+        if k % 8 == 0:
+            memory, _ = sample_round(
+                SamplingConfig(), memory, model.build_many, problem, shape, x,
+                x_desired, sum(errors(x, goal)), task.phase == CONTACT, k * 0.0125,
+            )  # fmt: skip
+        task = next_push(
+            PushConfig(), task, shape, 0.0125, x, True, memory.place, memory.go, HEIGHT,
+            0.004,
+        )  # fmt: skip
+        if task.phase == CONTACT:
+            plan, warm = solve_c3(
+                model.build(x, np.zeros(3)), x, x_desired, problem, warm
+            )
+            x, _ = simulate(world.build(x, np.zeros(3)), x, plan.u[0])
+        else:
+            x[P_TIP], x[10:13], x[V_BALL] = task.p, task.v, 0.0
+            x[13:16] = 0.0
+        # Sliding contacts of this model open: the object is put back on the table.
+        yaw = heading(x[Q_BALL])
+        x[Q_BALL], x[9] = turned(yaw), rest_height(T)
+        x[13:15], x[18] = 0.0, 0.0
+    length, angle = errors(x, goal)
+    assert start[0] > 0.05 and start[1] > 0.5
+    assert length < 0.02 and angle < 0.1
+    assert memory.go >= 1
+
+
+# The system.
+
+
+def system_of(planner, x, x_desired=None, goal=(0.55, 0.02, 0.6), phase=TRAVEL):
+    model, problem, shape = planner
+    builder = DiagramBuilder()
+    sampler = builder.AddSystem(
+        ContactSampler(ContactSamplerConfig(), model, problem, shape)
+    )
+    if x_desired is None:
+        x_desired = target(x, goal, problem.options.N + 1)
+    values = dict(
+        x=x, x_desired=np.ravel(x_desired), goal=np.array(goal), phase=[float(phase)],
+        valid=[1.0],
+    )  # fmt: skip
+    for name, value in values.items():
+        source = builder.AddSystem(ConstantVectorSource(np.array(value, dtype=float)))
+        source.set_name(name)
+        builder.Connect(source.get_output_port(), sampler.GetInputPort(name))
+    diagram = builder.Build()
+    return diagram, sampler
+
+
+def outputs(diagram, sampler, context):
+    own = sampler.GetMyContextFromRoot(context)
+    return (
+        sampler.GetOutputPort("command").Eval(own),
+        sampler.GetOutputPort("status").Eval(own)[0],
+    )
+
+
+def test_the_system_gives_the_place_of_the_round_and_holds_it_for_bad_input(planner):
+    x, _ = places_of(planner)
+    diagram, sampler = system_of(planner, x[0])
+    simulator = Simulator(diagram)
+    context = simulator.get_mutable_context()
+    command, status = outputs(diagram, sampler, context)
+    assert command[0] == 0.0 and status == SamplerStatus.NONE_YET
+    simulator.AdvanceTo(0.05)
+    memory, _ = rounds(planner, x[0], [0.55, 0.02, 0.6], 1, in_contact=False)
+    command, status = outputs(diagram, sampler, context)
+    assert status == SamplerStatus.CHOSEN
+    # The target's goal counts an angle by its radius there, by one metre here: both
+    # are the first round's, which progress does not matter to.
+    np.testing.assert_array_equal(command, [1.0, *memory.place])
+    bad = {"x": 7, "goal": 0, "x_desired": 3, "valid": 0}
+    for name, entry in bad.items():
+        source = diagram.GetSubsystemByName(name)
+        own = source.GetMyMutableContextFromRoot(context)
+        value = source.get_source_value(own).value().copy()
+        wrong = value.copy()
+        wrong[entry] = 0.0 if name == "valid" else np.nan
+        source.get_mutable_source_value(own).SetFromVector(wrong)
+        simulator.AdvanceTo(context.get_time() + 0.1)
+        held, status = outputs(diagram, sampler, context)
+        np.testing.assert_array_equal(held, command)
+        expected = SamplerStatus.NOT_SEEN if name == "valid" else (
+            SamplerStatus.NOT_FINITE
+        )  # fmt: skip
+        assert status == expected
+        source.get_mutable_source_value(own).SetFromVector(value)
+    simulator.AdvanceTo(context.get_time() + 0.1)
+    assert outputs(diagram, sampler, context)[1] == SamplerStatus.CHOSEN
+
+
+def test_a_model_that_fails_leaves_the_place_as_it_is(planner):
+    model, problem, shape = planner
+    x, _ = places_of(planner)
+    diagram, sampler = system_of(planner, x[0])
+    simulator = Simulator(diagram)
+    simulator.AdvanceTo(0.05)
+    context = simulator.get_mutable_context()
+    before, _ = outputs(diagram, sampler, context)
+
+    class Broken:
+        n_x, n_u, n_lam, dt_sec = model.n_x, model.n_u, model.n_lam, model.dt_sec
+
+        def build_many(self, x, u):
+            return tuple(np.full_like(a, np.nan) for a in model.build_many(x, u))
+
+    sampler._model = Broken()
+    simulator.AdvanceTo(0.15)
+    after, status = outputs(diagram, sampler, context)
+    np.testing.assert_array_equal(after, before)
+    assert status == SamplerStatus.NO_PLAN
+
+
+def test_a_context_replays_the_same_choices(planner):
+    x, _ = places_of(planner)
+    diagram, sampler = system_of(planner, x[0])
+    simulator = Simulator(diagram)
+    simulator.AdvanceTo(0.15)
+    saved = simulator.get_context().Clone()
+    simulator.AdvanceTo(0.45)
+    one = outputs(diagram, sampler, simulator.get_context())
+    again = Simulator(diagram, saved)
+    again.AdvanceTo(0.45)
+    two = outputs(diagram, sampler, again.get_context())
+    np.testing.assert_array_equal(one[0], two[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"places": 0}, "sampling.places is 0"),
+        ({"clearance": 0.0}, "sampling.clearance is 0.0"),
+        ({"travel": -1.0}, "sampling.travel is -1.0"),
+        ({"hysteresis": [1.0, 0.0]}, "sampling.hysteresis"),
+        ({"reach": [0.5, 0.4]}, "sampling.reach"),
+    ],
+)
+def test_a_setting_out_of_range_is_named(planner, change, message):
+    config = ContactSamplerConfig(SamplingConfig(**change))
+    with pytest.raises(ValueError, match=message):
+        ContactSampler(config, *planner)
