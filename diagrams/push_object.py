@@ -1,6 +1,7 @@
 """A Panda pushes an object over a table to poses, choosing where to touch it.
 
     station --body_poses--> pose_sensor --> state_estimator <-- q, v, torque -- station
+       (or --image--> pose_tracker -->)
     state_estimator --x--> push_goals --goal--> push_task, contact_sampler
     push_task --x_desired--> c3_mpc, contact_sampler
     contact_sampler --command (where to touch)--> push_task
@@ -8,21 +9,23 @@
     c3_mpc (contact), push_task (travel) --> arm_reference
     arm_reference --> impedance_controller --tau--> station
 
-Nothing passes from the world to the controllers but encoders, torques and what the pose
-sensor measures of the object.
+Nothing passes from the world to the controllers but encoders, torques and what a pose
+sensor, or a camera, measures of the object.
 """
 
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import (
     ConstantVectorSource,
     Demultiplexer,
     LogVectorOutput,
 )
 
+from makebreak.diagrams.camera import CameraConfig, camera_model
 from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.station import (
@@ -36,11 +39,13 @@ from makebreak.diagrams.station import (
 from makebreak.models.effects.kind import Effect
 from makebreak.models.model_files import MODELS
 from makebreak.models.pushed_object import (
+    HUE,
     PushedObject,
     make_tip_and_object,
     object_file,
     parts,
     rest_height,
+    seen_parts,
     support_spheres,
 )
 from makebreak.models.scene import Scene, load_scene, read_scene
@@ -67,9 +72,12 @@ from makebreak.systems.numerics.c3_mpc import (
     OrientationWeight,
 )
 from makebreak.systems.numerics.contact_sampling import ObjectShape
+from makebreak.systems.numerics.pose_tracker import make_shape
 from makebreak.systems.pose_sensor import PoseSensor, PoseSensorConfig
+from makebreak.systems.pose_tracker import PoseTracker, PoseTrackerConfig
 from makebreak.systems.push_goals import PushGoals, PushGoalsConfig, draw_poses
 from makebreak.systems.push_task import PushTask, PushTaskConfig
+from makebreak.systems.push_view import PushView, PushViewConfig
 from makebreak.systems.residual_learner import (
     PosteriorConfig,
     ResidualLearner,
@@ -146,7 +154,11 @@ class PushObjectConfig:
     n_goals: int = 1  # In a row, drawn by the seed.
     start: list[float] = field(default_factory=list)  # x, y, yaw; empty: drawn.
     goals: PushGoalsConfig = field(default_factory=PushGoalsConfig)
+    # What measures the object: a sensor of poses, as motion capture, or the camera.
+    pose_from: Literal["sensor", "camera"] = "sensor"
     pose: PoseSensorConfig = field(default_factory=PoseSensorConfig)
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    tracker: PoseTrackerConfig = field(default_factory=PoseTrackerConfig)
     sampler: ContactSamplerConfig = field(default_factory=ContactSamplerConfig)
     task: PushTaskConfig = field(default_factory=PushTaskConfig)
     planner: PushPlannerConfig = field(default_factory=PushPlannerConfig)
@@ -262,6 +274,50 @@ def learner_config(learner: PushLearnerConfig) -> ResidualLearnerConfig:
     )
 
 
+def _add_sensor(
+    builder: DiagramBuilder, config: PushObjectConfig, spec: PushedObject, station
+) -> LeafSystem:
+    """What measures the object's pose, connected to the station; spec: as believed."""
+    height, offset = rest_height(spec), OFFSET["sensor"]
+    if config.pose_from == "camera":
+        tracker = builder.AddNamedSystem(
+            "pose_tracker",
+            PoseTracker(
+                replace(
+                    config.tracker,
+                    z=height,
+                    hue=HUE,
+                    period_sec=CONTROL,
+                    offset_sec=offset,
+                ),
+                camera_model(config.camera),
+                make_shape(*seen_parts(spec)),
+            ),
+        )
+        builder.Connect(
+            station.GetOutputPort("overhead.rgb_image"), tracker.GetInputPort("image")
+        )
+        return tracker
+    plant = station.GetSubsystemByName("plant")
+    sensor = builder.AddNamedSystem(
+        "pose_sensor",
+        PoseSensor(
+            replace(
+                config.pose,
+                height=height,
+                rolling_axis=[1.0, 0.0, 0.0] if spec.shape == "cylinder" else [],
+                offset_sec=offset,
+            ),
+            int(plant.GetBodyByName(OBJECT).index()),
+            config.seed,
+        ),
+    )
+    builder.Connect(
+        station.GetOutputPort("body_poses"), sensor.GetInputPort("body_poses")
+    )
+    return sensor
+
+
 def make_push_object(
     config: PushObjectConfig, meshcat: Meshcat | None = None
 ) -> Diagram:
@@ -278,7 +334,12 @@ def make_push_object(
     station = builder.AddNamedSystem(
         "station",
         make_station(
-            StationConfig(scene=config.scene, contact=[TOOL, OBJECT], seed=config.seed),
+            StationConfig(
+                scene=config.scene,
+                camera=config.camera if config.pose_from == "camera" else None,
+                contact=[TOOL, OBJECT],
+                seed=config.seed,
+            ),
             meshcat,
             world_scene(config),
         ),
@@ -315,20 +376,7 @@ def make_push_object(
     n_lam = lcs_of["plan"].n_lam
     c3_settings = c3_config(config.planner, n_lam)
 
-    plant = station.GetSubsystemByName("plant")
-    sensor = builder.AddNamedSystem(
-        "pose_sensor",
-        PoseSensor(
-            replace(
-                config.pose,
-                height=height,
-                rolling_axis=[1.0, 0.0, 0.0] if spec.shape == "cylinder" else [],
-                offset_sec=OFFSET["sensor"],
-            ),
-            int(plant.GetBodyByName(OBJECT).index()),
-            config.seed,
-        ),
-    )
+    sensor = _add_sensor(builder, config, spec, station)
     estimator = builder.AddNamedSystem(
         "state_estimator",
         StateEstimator(
@@ -411,7 +459,6 @@ def make_push_object(
     def connect(source, output, target, port):
         builder.Connect(source.GetOutputPort(output), target.GetInputPort(port))
 
-    connect(station, "body_poses", sensor, "body_poses")
     for name, port in (
         ("p_WB", "p_ball"), ("v_WB", "v_ball"), ("seen", "seen"),
         ("q_WB", "q_object"), ("w_WB", "w_object"),
@@ -486,6 +533,17 @@ def make_push_object(
     of_object[Q_BALL.start : P_BALL.stop] = names
     seen = {"object": (estimator.GetOutputPort("x"), of_object)}
     record_station(builder, station, tau, TOOL, CONTROL, seen)
+    if meshcat is not None:
+        view = builder.AddNamedSystem(
+            "push_view",
+            PushView(
+                PushViewConfig(height=height),
+                [(part.shape, part.X_BS) for part in parts(spec)],
+                meshcat,
+            ),
+        )
+        connect(goals, "goal", view, "goal")
+        connect(estimator, "x", view, "x")
     diagram = builder.Build()
     diagram.set_name("push_object")
     return diagram
