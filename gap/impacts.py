@@ -22,7 +22,7 @@ from makebreak.gap.recording import FEWEST_ROWS, Episode, Recording, part_of
 from makebreak.gap.windows import Window, WindowModel, with_step
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.contact import CONTACT_LAW
+from makebreak.models.effects.contact import CONTACT_LAW, DAMPER, STIFFNESS
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import Scene
 from makebreak.systems.numerics.smoother import smooth_filtered
@@ -38,6 +38,7 @@ BESIDE_SEC, LEAST_SEC = 0.1, 0.5  # About a touch; a stretch without one.
 DRAWS = 3  # Of uncertain starts.
 BLUR = 0.003  # Of how far a channel goes in a window: laws are no better.
 TRIED = (0.2, 0.4, 0.7, 0.9, 1.15, 1.7, 2.6, 4.5)  # Times what the scene has.
+DAMPED = (0.02, 0.06, 0.12, 0.25, 0.5, 1.0)  # Of critical damping: a linear damper's.
 SMALL = 0.2  # First trial of an effect on joints, of the efforts there.
 REACH = 3.0
 
@@ -199,6 +200,7 @@ class ImpactWindows(WindowModel):
         if self.shapes is None:
             raise ValueError("nothing fixed that a link touches now and then")
         self._touches = 0
+        self._touch_sec: list[float] = []  # How long each lasts.
         self._free: list[Window] = []
         super().__init__(scene, recordings, LONGEST_SEC, most=10**6)
         if self._touches < FEWEST:
@@ -260,6 +262,7 @@ class ImpactWindows(WindowModel):
             )  # fmt: skip
 
         for a, b in touches:
+            self._touch_sec.append(float(time[min(b, len(time) - 1)] - time[a]))
             before = [s for s in free if s[1] == a]
             if not before or a - before[0][0] < ROWS_BEFORE:
                 continue
@@ -407,6 +410,14 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
                 trials = [((f - 1.0) * now, f * now) for f in TRIED]
                 if now > 0.0:
                     yield kind, at, name, trials
+            try:
+                stiffness = self.dynamics.now(STIFFNESS, [at])["stiffness"]
+            except ValueError:
+                continue
+            # A mass m on a spring k touches for pi sqrt(m/k).
+            critical = 2.0 * stiffness * float(np.median(self._touch_sec)) / np.pi
+            values = [share * critical for share in DAMPED]
+            yield DAMPER, at, "damping", [(c, c) for c in values]
 
     def _of_joints(self):
         """Kinds with one parameter, at each joint."""

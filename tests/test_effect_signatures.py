@@ -407,6 +407,7 @@ def test_every_kind_tells_its_columns_or_that_it_has_none(tmp_path):
         "rolling_resistance",
         "contact_stiffness",
         "contact_dissipation",
+        "contact_damping",
         "plane_height",
         "plane_tilt",
         "wall_position",

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from effect_scenes import G, at_rest_but, on_ground, surface, with_effects
 from gap_benchmark import push_world
+from pydrake.math import RigidTransform
+from pydrake.multibody.math import SpatialVelocity
 from pydrake.systems.framework import DiagramBuilder
 from scipy.integrate import solve_ivp
 
@@ -114,6 +116,71 @@ def test_a_ball_bounces_as_hunt_and_crossley_say(tmp_path, d, time_step):
     atol = 1e-5 if time_step == 0 else 5e-3
     np.testing.assert_allclose(rows[:, 0], expected[:, 0], atol=atol * 1e-2)
     np.testing.assert_allclose(rows[:, 1], expected[:, 1], atol=atol)
+
+
+@pytest.mark.parametrize("c", [0.0, 4.0, 40.0])
+@pytest.mark.parametrize("time_step", [0.0, 5e-6])
+def test_a_ball_bounces_on_a_linear_damper(tmp_path, c, time_step):
+    # m z'' = max(k x + c x', 0) - m g with x > 0 the penetration, against scipy.
+    k, v0 = 2e4, -1.0
+    scene = with_effects(
+        on_ground(tmp_path, "ball", time_step),
+        ("contact_stiffness", PAIR, dict(stiffness=k)),
+        ("contact_damping", PAIR, dict(damping=c)),
+        ("contact_dissipation", PAIR, dict(dissipation=9.0)),  # Has no say beside it.
+    )
+    times = np.array([0.0, 0.003, 0.015])
+    start = at_rest_but(
+        body="b.ball", pose=[1, 0, 0, 0, 0, 0, RADIUS], twist=[0, 0, 0, 0, 0, v0]
+    )
+    rows = SceneSimulation(scene).run(start, times, ["b.ball.z", "b.ball.vz"])
+
+    def rate(t, y):
+        x, x_rate = RADIUS - y[0], -y[1]
+        push = max(k * x + c * x_rate, 0.0) if x > 0.0 else 0.0
+        return [y[1], push / BALL_MASS - G]
+
+    expected = solve_ivp(
+        rate, (0, 0.015), [RADIUS, v0], t_eval=times, rtol=1e-10, atol=1e-13,
+        max_step=1e-5,
+    ).y.T  # fmt: skip
+    atol = 5e-4 if time_step == 0 else 1e-2  # The damper begins with a step of force.
+    np.testing.assert_allclose(rows[:, 0], expected[:, 0], atol=atol * 1e-2)
+    np.testing.assert_allclose(rows[:, 1], expected[:, 1], atol=atol)
+
+
+def test_a_damper_acts_on_its_pair_alone(tmp_path):
+    other = with_effects(
+        on_ground(tmp_path, "ball"), ("contact_damping", PAIR, dict(damping=40.0))
+    )
+    builder = DiagramBuilder()
+    plant = load_scene(other, builder).plant
+    diagram = builder.Build()
+    name = next(
+        s.get_name()
+        for s in diagram.GetSystems()
+        if s.get_name().startswith("contact_damper")
+    )
+    damper = diagram.GetSubsystemByName(name)
+    context = diagram.CreateDefaultContext()
+    own = plant.GetMyMutableContextFromRoot(context)
+    ball = plant.GetBodyByName("ball")
+
+    def force(z, vz):
+        plant.SetFreeBodyPose(own, ball, RigidTransform([0.1, 0.0, z]))
+        v = SpatialVelocity([0.0, 0.0, 0.0], [0.3, 0.0, vz])
+        plant.SetFreeBodySpatialVelocity(own, ball, v)
+        port = damper.GetOutputPort("generalized_force")
+        return port.Eval(damper.GetMyContextFromRoot(context))
+
+    np.testing.assert_allclose(force(RADIUS + 1e-6, -1.0), 0.0)
+    at = ball.floating_velocities_start_in_v()
+    expected = np.zeros(plant.num_velocities())
+    expected[at + 5] = 40.0 * 0.02
+    np.testing.assert_allclose(force(RADIUS - 1e-3, -0.02), expected, atol=1e-9)
+    _, k, _ = combined(other)
+    expected[at + 5] = -k * 1e-7  # It takes the spring's force, and does not pull.
+    np.testing.assert_allclose(force(RADIUS - 1e-7, 5.0), expected, atol=1e-9)
 
 
 def test_values_of_a_pair_are_what_was_asked_for_and_told_back(tmp_path):

@@ -14,6 +14,8 @@ from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
 
+_PARAMETER = {"damper": "damping"}  # Of the effect that is the cart's field.
+
 
 def ran(folder, seed, seconds=16.0, **hidden):
     rng = np.random.default_rng(seed)
@@ -46,6 +48,28 @@ def test_impacts_are_told_by_windows_about_them(tmp_path):
     assert left[0] > 3.0 and left[1] > 1.3 and left[2] < 1.1
     judged = problem.judged()
     assert {"cart.rail.position", "cart.rail.velocity"} <= set(judged)
+
+
+def test_a_linear_damper_is_no_dissipation(tmp_path):
+    """Walls that damp as most simulators' do, not as Hunt and Crossley say: no value of
+    the dissipation explains them, a damper's does, and it is among what is tried."""
+    scene_file, file, true = ran(tmp_path, 2, 5.0, damper=lambda _: 18.0)
+    scene, recordings = read_scene(scene_file), read_recordings([file])
+    problem, _ = problem_for(scene, recordings, SceneDynamics(scene))
+    assert isinstance(problem, ImpactProblem)
+
+    def left(*effects):
+        return np.sqrt(np.mean(problem.residual(effects) ** 2))
+
+    tried = [kind_at for kind_at in problem._of_contacts() if kind_at[1] == PAIR]
+    values = {kind: [v for _, v in trials] for kind, _, _, trials in tried}
+    assert min(values["contact_damping"]) < true.damper < max(values["contact_damping"])
+    best = min(
+        left(Effect("contact_dissipation", [PAIR], {"dissipation": d}))
+        for d in (0.1, *values["contact_dissipation"])
+    )
+    with_damper = left(Effect("contact_damping", [PAIR], {"damping": true.damper}))
+    assert best > 1.5 and with_damper < 1.1
 
 
 def test_walls_that_nothing_touches_do_not_count(tmp_path):
@@ -86,12 +110,14 @@ def test_what_lies_at_a_wall_does_not_run_against_it(tmp_path, shares, runs):
         (23, {"dissipation": lambda d: 2.0 * d}),
         (24, {"dissipation": lambda d: 0.4 * d}),
         (25, {}),
+        (26, {"damper": lambda _: 18.0}),
+        (27, {"damper": lambda _: 60.0, "stiffness": lambda k: 0.6 * k}),
     ],
 )
 def test_from_files_to_what_is_missing(tmp_path, seed, hidden):
     scene, file, true = ran(tmp_path, seed, **hidden)
     result = run_gap(scene, [file])
     found = {name: p.value for e in result.effects for name, p in e.parameters.items()}
-    expected = {name: getattr(true, name) for name in hidden}
+    expected = {_PARAMETER.get(n, n): getattr(true, n) for n in hidden}
     assert found == pytest.approx(expected, rel=0.03)
     assert result.verdict == ("gap_named" if hidden else "no_gap")

@@ -18,6 +18,7 @@ from pydrake.multibody.plant import ContactResults, CoulombFriction, MultibodyPl
 from pydrake.multibody.tree import Joint, RigidBody
 from pydrake.systems.framework import DiagramBuilder, LeafSystem, OutputPort
 
+from makebreak.models.effects.contact_damper import ContactDamper
 from makebreak.models.effects.kind import (
     Effect,
     EffectKind,
@@ -581,8 +582,33 @@ def _add_rolling_resistance(
     return system.GetOutputPort("generalized_force")
 
 
+def _undamp(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+    """Hunt and Crossley's damping of the pair makes room for the linear damper."""
+    for body in find_pair(effect, plant):
+        _set_surface(plant, scene_graph, body, "hunt_crossley_dissipation", 0.0)
+
+
+def _add_damper(
+    effect: Effect,
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    builder: DiagramBuilder,
+) -> OutputPort:
+    (stiffness,) = _now(Effect(STIFFNESS, effect.at, {}), plant, scene_graph).values()
+    damper = builder.AddNamedSystem(
+        f"contact_damper_{effect.at[0].replace('.', '_').replace('~', '_')}",
+        ContactDamper(
+            plant, find_pair(effect, plant), stiffness, parameter(effect, "damping")
+        ),
+    )
+    builder.Connect(plant.get_state_output_port(), damper.GetInputPort("state"))
+    builder.Connect(scene_graph.get_query_output_port(), damper.GetInputPort("query"))
+    return damper.GetOutputPort("generalized_force")
+
+
 # How hard two shapes are to each other, and what a touch of theirs loses.
-CONTACT_LAW = ("contact_stiffness", "contact_dissipation")
+CONTACT_LAW = (STIFFNESS, DISSIPATION) = ("contact_stiffness", "contact_dissipation")
+DAMPER = "contact_damping"  # In the place of the dissipation.
 
 KINDS = {
     "contact_friction": EffectKind(
@@ -642,5 +668,18 @@ KINDS = {
         rank=1,
         before_finalize=_set_dissipation,
         now=_now,
+    ),
+    "contact_damping": EffectKind(
+        at="pair",
+        parameters=(Parameter("damping", "N s/m", 0.0, 1e4, None, valid=">= 0"),),
+        says="the contact of {at} is damped by a linear damper of {damping}, not by "
+        "Hunt and Crossley's",
+        confused_with=("contact_dissipation", "contact_stiffness"),
+        tell_apart="let it hit at several speeds: a linear damper takes the same share "
+        "of each",
+        rank=2,  # Behind the dissipation, in whose place it is.
+        before_finalize=_undamp,
+        after_finalize=_add_damper,
+        now=lambda effect, plant, scene_graph: {},
     ),
 }

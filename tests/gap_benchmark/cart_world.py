@@ -1,7 +1,7 @@
 """A cart on a rail that runs against a wall at each end: by an ODE of our own.
 
-    m x'' = u - coulomb tanh(x'/1e-3) - c x' + f_left - f_right,
-    f = k depth (1 + d depth_rate)+,
+    m x'' = u - coulomb tanh(x'/1e-3) - b x' + f_left - f_right,
+    f = k depth (1 + d depth_rate)+; with a linear damper (k depth + c depth_rate)+,
 
 stepped by RK4 at 10 us; commands of effort hold between rows.
 """
@@ -27,10 +27,11 @@ class Cart:
     dissipation: float = 0.6  # [s/m]
     coulomb: float = 0.0  # [N]
     damping: float = 0.3  # [N s/m]
+    damper: float | None = None  # [N s/m] In the place of the dissipation.
 
 
 @numba.njit(cache=True)
-def _run(x, v, times, u, step, m, gap, k, d, coulomb, damping):
+def _run(x, v, times, u, step, m, gap, k, d, c, coulomb, damping):
     out = np.empty((len(times), 2))
     for i in range(len(times)):
         out[i, 0], out[i, 1] = x, v
@@ -45,9 +46,9 @@ def _run(x, v, times, u, step, m, gap, k, d, coulomb, damping):
                 f = u[i] - coulomb * np.tanh(v1 / 1e-3) - damping * v1
                 right, left = x1 - gap, -gap - x1
                 if right > 0.0:
-                    f -= max(k * right * (1.0 + d * v1), 0.0)
+                    f -= max(k * right * (1.0 + d * v1) + c * v1, 0.0)
                 if left > 0.0:
-                    f += max(k * left * (1.0 - d * v1), 0.0)
+                    f += max(k * left * (1.0 - d * v1) - c * v1, 0.0)
                 a = f / m
                 if stage == 0:
                     a1 = a
@@ -73,6 +74,7 @@ def record(cart: Cart, rng, seconds=16.0, rate=500.0, encoder=1e-5):
     out = np.empty((len(t), 2))
     side, push = 1.0, rng.uniform(1.5, 4.0)
     gap = cart.reach - cart.half
+    law = (cart.dissipation, 0.0) if cart.damper is None else (0.0, cart.damper)
     for i in range(len(t)):
         out[i] = x, v
         # A simple controller: push to one side until a while after the wall was met.
@@ -82,7 +84,7 @@ def record(cart: Cart, rng, seconds=16.0, rate=500.0, encoder=1e-5):
         if i + 1 < len(t):
             row = _run(
                 x, v, t[i : i + 2], u[i : i + 2], STEP, cart.mass, gap, cart.stiffness,
-                cart.dissipation, cart.coulomb, cart.damping,
+                *law, cart.coulomb, cart.damping,
             )[-1]  # fmt: skip
             x, v = float(row[0]), float(row[1])
     table = {

@@ -516,6 +516,19 @@ def against_walls(recipe: Recipe, rng):
     return s, episodes
 
 
+def dampers(true: Setting) -> float:
+    """The linear damper of MuJoCo's contacts, all alike [N s/m]."""
+    world = MujocoWorld(true)
+    m = world.model
+    found = []
+    for k in range(m.npair):
+        bodies = [m.geom_bodyid[g] for g in (m.pair_geom1[k], m.pair_geom2[k])]
+        ease = sum(float(m.body_invweight0[b, 0]) for b in bodies)
+        found.append(-float(m.pair_solref[k][1]) / ease)
+    assert np.allclose(found, found[0])
+    return found[0]
+
+
 SCENES: dict[str, Callable] = {
     "push": pushed, "disc": pushed, "roll": pushed, "two": pushed,
     "arm": arm_pushes, "cart": against_walls, "pendulum": against_walls,
@@ -565,14 +578,14 @@ def write(case: ContactCase, folder: Path) -> dict:
             )
         write_scene(folder, s, columns, noise, 0.0005, tolerance)
         if mujoco_ and recipe.scene in ("cart", "pendulum"):
-            # MuJoCo's damper is linear, Hunt-Crossley's is not: it may be told.
+            # MuJoCo's damper is linear, Hunt-Crossley's is not.
             at = f"{s.tool_body}~wall.wall"
-            effects.append({"kind": "contact_dissipation", "at": at, "parameters": {},
-                            "needed": False})  # fmt: skip
+            effects.append({"kind": "contact_damping", "at": at,
+                            "parameters": {"damping": dampers(truth)}})  # fmt: skip
     outside = "adhesion" in names
     verdict = (
         "gap_unnamed" if outside else "ambiguous" if recipe.ties
-        else "gap_named" if names else "no_gap"
+        else "gap_named" if any(e.get("needed", True) for e in effects) else "no_gap"
     )  # fmt: skip
     return {
         "name": case.name, "verdict": verdict, "effects": effects,

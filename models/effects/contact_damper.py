@@ -1,0 +1,71 @@
+"""A linear damper in the contact of two bodies, in the place of Drake's damping."""
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.geometry import QueryObject
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import JacobianWrtVariable, RigidBody
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+
+class ContactDamper(LeafSystem):
+    """The force with which the contact of two bodies is damped: damping times the rate
+    at which they sink into each other. Drake's spring is there without it; the two
+    together never pull. Friction is that of the spring alone.
+
+    Inputs:  state (n_x,) of the plant; query, of the scene graph (abstract).
+    Outputs: generalized_force (n_v,).
+
+    Args: pair: the bodies; stiffness [N/m] and damping [N s/m] of a contact of theirs.
+    """
+
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        pair: tuple[RigidBody, RigidBody],
+        stiffness: float,
+        damping: float,
+    ):
+        super().__init__()
+        self._plant, self._scratch = plant, plant.CreateDefaultContext()
+        self._stiffness, self._damping = float(stiffness), float(damping)
+        self._of = {
+            geometry: body
+            for body in pair
+            for geometry in plant.GetCollisionGeometriesForBody(body)
+        }
+        self._state = self.DeclareVectorInputPort("state", plant.num_multibody_states())
+        self._query = self.DeclareAbstractInputPort(
+            "query", AbstractValue.Make(QueryObject())
+        )
+        self.DeclareVectorOutputPort(
+            "generalized_force", plant.num_velocities(), self._calc
+        )
+
+    def _calc(self, context: Context, output: BasicVector):
+        total = np.zeros(self._plant.num_velocities())
+        is_set = False
+        for touch in self._query.Eval(context).ComputePointPairPenetration():
+            a, b = self._of.get(touch.id_A), self._of.get(touch.id_B)
+            if a is None or b is None or a.index() == b.index():
+                continue
+            x = self._state.Eval(context)
+            if not is_set:
+                self._plant.SetPositionsAndVelocities(self._scratch, x)
+                is_set = True
+            middle = (touch.p_WCa + touch.p_WCb) / 2.0
+            X_WA = self._plant.EvalBodyPoseInWorld(self._scratch, a)
+            # Of the point of A as B sees it: the velocity at which they slide and part.
+            J = self._plant.CalcJacobianTranslationalVelocity(
+                self._scratch,
+                JacobianWrtVariable.kV,
+                a.body_frame(),
+                X_WA.inverse() @ middle,
+                b.body_frame(),
+                self._plant.world_frame(),
+            )
+            along = J.T @ touch.nhat_BA_W
+            rate = -float(along @ x[self._plant.num_positions() :])
+            force = max(self._damping * rate, -self._stiffness * touch.depth)
+            total += force * along
+        output.SetFromVector(total)
