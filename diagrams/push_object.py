@@ -437,7 +437,10 @@ def make_push_object(
         "arm_reference",
         ArmReference(
             replace(
-                config.reference, period_sec=CONTROL, offset_sec=OFFSET["reference"]
+                config.reference,
+                height=sampling.height,
+                period_sec=CONTROL,
+                offset_sec=OFFSET["reference"],
             ),
             n_lam,
             p_tip,

@@ -21,6 +21,7 @@ BENCHES: dict[str, str] = {
     "lcs": "makebreak.scripts.bench_lcs",
     "learner": "makebreak.scripts.bench_learner",
     "impedance": "makebreak.scripts.bench_impedance",
+    "push": "makebreak.scripts.bench_push",
     "camera": "makebreak.scripts.bench_camera",
     "latency": "makebreak.scripts.bench_latency",
     "diagrams": "makebreak.scripts.bench_diagrams",

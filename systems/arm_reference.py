@@ -31,6 +31,9 @@ class ArmReferenceConfig:
     # itself stays below 0.35 m/s and 4 m/s2.
     speed_max: float = 0.5  # [m/s]
     acceleration_fed_forward_max: float = 10.0  # While repositioning [m/s2].
+    # Rolling, the tip stays at this height, and only what C3 wants across the table
+    # counts [m]; None: C3 moves it up and down too.
+    height: float | None = None
     period_sec: float = 0.0125  # Of C3 and of the task.
     offset_sec: float = 0.0  # A little after theirs.
 
@@ -124,6 +127,8 @@ class ArmReference(LeafSystem):
                 v[:2] += change
                 v[2] -= lost * c.follow_speed
             v[2] = max(v[2], -c.down_max)
+            if c.height is not None:
+                p[2], v[2], force[2] = c.height, 0.0, 0.0
             target = np.concatenate((p, v, self._zero, force))
             dv_max = c.acceleration_max * c.period_sec
         else:

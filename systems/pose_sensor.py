@@ -9,6 +9,7 @@ from pydrake.systems.framework import LeafSystem
 
 from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.pose_filter import (
+    PoseEstimate,
     corrected,
     first_pose,
     on_the_table,
@@ -103,9 +104,13 @@ class PoseSensor(LeafSystem):
         state.get_mutable_abstract_state(int(self._late)).set_value(late)
         state.get_mutable_abstract_state(int(self._pose)).set_value(pose)
 
+    def _pose_of(self, context) -> PoseEstimate | None:
+        """The filter's, of the last reading that is known."""
+        return context.get_abstract_state(int(self._pose)).get_value()
+
     def _calc(self, i):
         def calc(context, output):
-            pose = context.get_abstract_state(int(self._pose)).get_value()
+            pose = self._pose_of(context)
             if pose is None:
                 output.SetFromVector(self._unknown[i])
                 return
@@ -118,5 +123,5 @@ class PoseSensor(LeafSystem):
         return calc
 
     def _calc_seen(self, context, output):
-        pose = context.get_abstract_state(int(self._pose)).get_value()
+        pose = self._pose_of(context)
         output.SetFromVector([0.0 if pose is None else 1.0])

@@ -72,10 +72,11 @@ def run(
     reference=REFERENCE,
     tip_force=None,
     feel=1.0,
+    height=None,
 ):
     builder = DiagramBuilder()
     lcs = one_force_lcs(2.0)
-    config = ArmReferenceConfig(tip_mass=2.0)
+    config = ArmReferenceConfig(tip_mass=2.0, height=height)
     arm = builder.AddNamedSystem("arm", ArmReference(config, 1, np.zeros(3), lcs))
     for name, value in dict(
         phase=[phase], reference=reference, x_next=x_next, lam=lam, status=[status]
@@ -113,6 +114,15 @@ def test_feed_forward_and_the_slope_of_the_velocity_are_bounded():
     assert np.linalg.norm(wrench) <= 3.0 + 1e-12
     # At 12.5 ms a period of 1.5 m/s2 is over, and 0.1 ms of the next.
     np.testing.assert_allclose(pose[7], 1.5 * 0.0126, atol=1e-12)
+
+
+def test_a_held_height_leaves_what_is_across_the_table():
+    x_next = np.zeros(19)
+    x_next[0:3], x_next[10:13] = [0.001, 0.0, -0.005], [0.01, 0.0, -0.03]
+    pose, wrench = run(ROLL, x_next, [1.5], height=0.003)
+    np.testing.assert_allclose(pose[0:3], [0.001, 0.0, 0.003], atol=1e-15)
+    np.testing.assert_allclose(pose[7:10], [0.01, 0.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(wrench, 0.0)  # This contact pushes up alone.
 
 
 def test_half_a_period_later_the_reference_is_half_way():

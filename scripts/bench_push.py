@@ -1,0 +1,84 @@
+"""Time to score 16 places around an object: one batch, and one after another.
+
+The same plans, to rounding: 19 states, 16 forces, 5 knots. One after another is what
+the public functions take: AnitescuLcs.build and solve_c3 of each place, with the
+analytic LCS and with the general one, which was the only one for such an object before.
+"""
+
+from functools import partial
+
+import numpy as np
+
+from makebreak.diagrams.push_object import PushPlannerConfig, c3_config, contact_pairs
+from makebreak.models.pushed_object import (
+    PushedObject,
+    make_tip_and_object,
+    parts,
+    rest_height,
+)
+from makebreak.scripts.bench import median_cpu_ms
+from makebreak.systems.lcs_builder import AnitescuLcs
+from makebreak.systems.numerics.ball_state import P_BALL
+from makebreak.systems.numerics.c3_mpc import C3Problem, WarmStart, solve_c3
+from makebreak.systems.numerics.contact_sampling import (
+    inward,
+    outline_of,
+    places_around,
+    score_plans,
+)
+from makebreak.systems.numerics.push_task import PushConfig, look_ahead
+
+PLACES = 16
+RATE_MIN, GAIN_MIN = 10.0, 4.0  # [Hz], and how many times faster.
+
+
+def rows() -> list[dict]:
+    """Milliseconds of a round on one core, its rate, and the gain of the batch."""
+    spec = PushedObject("t")
+    diagram, pairs = make_tip_and_object(spec)[0], contact_pairs(spec, 0.5)
+    model = AnitescuLcs(diagram, pairs, 0.1)
+    general = AnitescuLcs(diagram, pairs, 0.1, analytic=False)
+    c3 = c3_config(PushPlannerConfig(), model.n_lam)
+    problem = C3Problem(c3.weights, c3.projection, c3.options)
+    N = problem.options.N
+    object_at = np.array([0.5, 0.0, rest_height(spec)])
+    outline = outline_of([part.points for part in parts(spec)], np.eye(3), object_at)
+    places = places_around(outline, 0.0235, PLACES)
+    x = np.tile(model.x_default, (PLACES, 1))
+    x[:, :2], x[:, 2], x[:, P_BALL] = places, 0.024, object_at
+    x_desired = look_ahead(
+        PushConfig(), x[0], np.array([0.55, 0.03, 0.3]), 0.024, N + 1
+    )
+    guess = np.zeros((PLACES, N, 3))
+    guess[:, :, :2] = 4.0 * inward(places, outline)[:, None]
+    no_force, zero = np.zeros(3), np.zeros((N, problem.n_z))
+
+    def batch():
+        lcs = model.build_many(x, no_force)
+        return score_plans(lcs, x, x_desired, problem, guess)
+
+    def one_by_one(builder):
+        for i in range(PLACES):
+            lcs = builder.build(x[i], no_force)
+            warm = WarmStart(guess[i], zero, zero)
+            solve_c3(lcs, x[i], x_desired, problem, warm)
+
+    of_batch = median_cpu_ms(batch, 30)
+    what = f"{PLACES} places scored, n_x {model.n_x}, n_lam {model.n_lam}"
+    rate = 1e3 / of_batch
+    found: list[dict] = [
+        {"what": f"{what}, one batch", "value": of_batch, "unit": "ms"},
+        {
+            "what": "rounds a second on one core", "value": rate, "unit": "Hz",
+            "target": RATE_MIN, "met": rate >= RATE_MIN,
+        },
+    ]  # fmt: skip
+    for builder, path in ((general, "general"), (model, "analytic")):
+        value = median_cpu_ms(partial(one_by_one, builder), 10)
+        what = f"one after another, {path} LCS"
+        found.append({"what": what, "value": value, "unit": "ms"})
+        gain = {"what": f"{what}, over the batch", "value": value / of_batch}
+        if path == "general":
+            gain |= {"target": GAIN_MIN, "met": value / of_batch >= GAIN_MIN}
+        found.append(gain)
+    return found

@@ -1,0 +1,265 @@
+"""The parts of push_object beside its planner, and the whole diagram for a moment."""
+
+import numpy as np
+import pytest
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
+from scipy.spatial.transform import Rotation
+
+from makebreak.diagrams.push_object import (
+    PushModelConfig,
+    PushObjectConfig,
+    believed_object,
+    make_push_object,
+    poses_of,
+    world_scene,
+)
+from makebreak.systems.numerics.ball_state import N_X, P_BALL, Q_BALL
+from makebreak.systems.numerics.pose_filter import (
+    corrected,
+    first_pose,
+    on_the_table,
+    predicted,
+    turn_between,
+    turned,
+)
+from makebreak.systems.numerics.push_task import CONTACT, TRAVEL, errors, heading
+from makebreak.systems.numerics.state_estimator import with_pose
+from makebreak.systems.pose_sensor import PoseSensor, PoseSensorConfig
+from makebreak.systems.push_goals import PushGoals, PushGoalsConfig, draw_poses
+
+
+def as_scipy(q):
+    return Rotation.from_quat(np.roll(q, -1))
+
+
+# The pose filter.
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_turns_are_those_of_scipy(seed):
+    rng = np.random.default_rng(seed)
+    q = rng.normal(size=4)
+    q /= np.linalg.norm(q)
+    angle = rng.normal(size=3)
+    after = turned(q, angle)
+    expected = Rotation.from_rotvec(angle) * as_scipy(q)
+    np.testing.assert_allclose(
+        as_scipy(after).as_matrix(), expected.as_matrix(), atol=1e-12
+    )
+    np.testing.assert_allclose(turn_between(q, after), angle, atol=1e-9)
+    np.testing.assert_allclose(turn_between(q, -after), angle, atol=1e-9)
+
+
+def test_the_filter_finds_a_steady_motion_through_noise():
+    rng = np.random.default_rng(0)
+    v, w, std, density = np.array([0.05, -0.03, 0.0]), np.array([0, 0, 0.4]), (
+        1e-3, 1e-2,
+    ), (1e-4, 1e-2)  # fmt: skip
+    pose = None
+    for k in range(90):
+        t = k / 30.0
+        p = v * t + std[0] * rng.normal(size=3)
+        q = turned(np.array([1.0, 0, 0, 0]), w * t)
+        q = turned(q, std[1] * rng.normal(size=3))
+        if pose is None:
+            pose = first_pose(t, p, q, std, (0.1, 1.0))
+        else:
+            pose = corrected(predicted(pose, t, density), p, q, std)
+    # The filter's own standard deviations, times four.
+    np.testing.assert_allclose(pose.p, v * t, atol=4 * np.sqrt(pose.P_p[0]))
+    np.testing.assert_allclose(pose.v, v, atol=4 * np.sqrt(pose.P_p[2]))
+    np.testing.assert_allclose(pose.w, w, atol=4 * np.sqrt(pose.P_q[2]))
+    assert np.sqrt(pose.P_p[0]) < 0.7e-3  # Less than one reading's.
+
+
+def test_what_lies_on_a_table_is_upright_at_its_height():
+    q = turned(
+        turned(np.array([1.0, 0, 0, 0]), np.array([0, 0, 0.8])),
+        np.array([0.05, -0.1, 0]),
+    )
+    p, v, q_flat, w = on_the_table(
+        0.1, np.array([0.5, 0.1, 0.03]), np.array([0.2, 0, 0.4]), q,
+        np.array([0.3, 0.2, 0.0]), 0.02, np.zeros(3),
+    )  # fmt: skip
+    np.testing.assert_allclose(p, [0.52, 0.1, 0.02])
+    np.testing.assert_allclose(v, [0.2, 0.0, 0.0])
+    z = as_scipy(q_flat).as_matrix()[:, 2]
+    np.testing.assert_allclose(z, [0, 0, 1], atol=1e-12)
+    assert heading(q_flat) == pytest.approx(0.8, abs=0.02)
+    np.testing.assert_allclose(w, 0.0)
+
+
+def test_a_lying_cylinder_keeps_its_roll_and_its_rolling():
+    axis, yaw, roll = np.array([1.0, 0.0, 0.0]), 0.8, 2.0
+    upright = Rotation.from_euler("z", yaw) * Rotation.from_euler("x", roll)
+    q = turned(np.roll(upright.as_quat(), 1), np.array([0.1, -0.05, 0.0]))
+    along = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    _, _, flat, w = on_the_table(
+        0.0, np.zeros(3), np.zeros(3), q, 3.0 * along + [0, 0, 0.5], 0.02, axis
+    )
+    R = as_scipy(flat).as_matrix()
+    assert R[2, 0] == pytest.approx(0.0, abs=1e-12)  # The axis is level.
+    left = (upright.inv() * as_scipy(flat)).magnitude()
+    assert left < 0.12  # Only the tilt, of 0.11, has gone.
+    np.testing.assert_allclose(w, 3.0 * along + [0, 0, 0.5], atol=0.2)
+
+
+# The sensor.
+
+
+def sensor_at(pose, **config):
+    builder = DiagramBuilder()
+    sensor = builder.AddSystem(PoseSensor(PoseSensorConfig(**config), 1, seed=3))
+    poses = builder.AddSystem(ConstantValueSource(Value([RigidTransform(), pose])))
+    builder.Connect(poses.get_output_port(), sensor.get_input_port())
+    return builder.Build(), sensor
+
+
+def test_a_pose_is_known_after_its_delay_and_laid_on_the_table():
+    pose = RigidTransform(RotationMatrix.MakeZRotation(0.7), [0.5, 0.1, 0.05])
+    diagram, sensor = sensor_at(pose, noise=[0.0, 0.0], delay_sec=0.1, height=0.02)
+    simulator = Simulator(diagram)
+    own = sensor.GetMyContextFromRoot(simulator.get_context())
+    simulator.AdvanceTo(0.09)
+    assert sensor.GetOutputPort("seen").Eval(own)[0] == 0.0
+    simulator.AdvanceTo(0.15)
+    assert sensor.GetOutputPort("seen").Eval(own)[0] == 1.0
+    np.testing.assert_allclose(
+        sensor.GetOutputPort("p_WB").Eval(own), [0.5, 0.1, 0.02], atol=1e-9
+    )
+    assert heading(sensor.GetOutputPort("q_WB").Eval(own)) == pytest.approx(0.7)
+    assert sensor.GetOutputPort("v_WB").Eval(own)[2] == 0.0
+
+
+def test_readings_have_the_noise_that_is_asked_for():
+    diagram, sensor = sensor_at(RigidTransform([0.5, 0.0, 0.02]), density=[1e6, 1e6])
+    simulator = Simulator(diagram)
+    own = sensor.GetMyContextFromRoot(simulator.get_context())
+    seen = []
+    for k in range(300):  # A filter that trusts each reading alone.
+        simulator.AdvanceTo((k + 2.01) / 30.0)
+        seen.append(sensor._pose_of(own).p[0] - 0.5)
+    # The deviation of 300 samples is known to 4 %; three of that.
+    assert np.std(seen) == pytest.approx(1e-3, rel=0.12)
+
+
+# The estimator's option, and the goals.
+
+
+def test_a_known_pose_takes_the_place_of_rolling():
+    x = np.arange(19.0)
+    q, w = np.array([2.0, 0.0, 0.0, 0.0]), np.array([0.1, 0.2, 0.3])
+    finite, after, valid = with_pose(True, x, 1.0, q, w)
+    assert finite and valid == 1.0
+    np.testing.assert_array_equal(after[Q_BALL], [1.0, 0, 0, 0])
+    np.testing.assert_array_equal(after[13:16], w)
+    for bad in (np.full(4, np.nan), np.zeros(4)):
+        assert with_pose(True, x, 1.0, bad, w)[0] is False
+    assert with_pose(True, x, 1.0, q, w * np.nan)[2] == -1.0
+
+
+def goals_at(x, goals, **config):
+    builder = DiagramBuilder()
+    system = builder.AddSystem(PushGoals(PushGoalsConfig(**config), goals))
+    state = builder.AddNamedSystem("x", ConstantVectorSource(x))
+    seen = builder.AddSystem(ConstantVectorSource([1.0]))
+    builder.Connect(state.get_output_port(), system.GetInputPort("x"))
+    builder.Connect(seen.get_output_port(), system.GetInputPort("valid"))
+    return builder.Build(), system
+
+
+def test_a_goal_is_over_when_it_is_reached_for_a_while_or_its_time_is_up():
+    x = np.zeros(N_X)
+    x[Q_BALL], x[P_BALL] = (
+        turned(np.array([1.0, 0, 0, 0]), np.array([0, 0, 3.1])),
+        [0.5, 0, 0.02],
+    )
+    near = [0.51, 0.005, -3.12]  # 11 mm, 0.06 rad the shorter way round.
+    far = [0.6, 0.0, 0.0]
+    diagram, system = goals_at(x, [near, far, near], limit_sec=2.0, dwell_sec=0.25)
+    simulator = Simulator(diagram)
+    own = system.GetMyContextFromRoot(simulator.get_context())
+
+    def now():
+        return system.GetOutputPort("log").Eval(own)
+
+    simulator.AdvanceTo(0.2)
+    np.testing.assert_array_equal(now(), [0.0, *near, 0.0])
+    simulator.AdvanceTo(0.5)
+    assert now()[0] == 1.0 and now()[4] == pytest.approx(0.25, abs=0.03)
+    np.testing.assert_array_equal(system.GetOutputPort("goal").Eval(own), far)
+    simulator.AdvanceTo(2.2)
+    assert now()[0] == 1.0
+    simulator.AdvanceTo(2.4)
+    assert now()[0] == 2.0
+    simulator.AdvanceTo(3.0)
+    assert now()[0] == 3.0  # Over; the last goal stays.
+    np.testing.assert_array_equal(system.GetOutputPort("goal").Eval(own), near)
+
+
+def test_goals_lie_all_over_the_region():
+    config = PushGoalsConfig()
+    poses = draw_poses(config, 400, 5)
+    half = 0.5 * np.array([*config.size, 2 * np.pi])
+    off = poses - [*config.center, 0.0]
+    assert (np.abs(off) <= half).all()
+    # Evenly: mean zero to 4 standard deviations of a mean of 400.
+    assert (np.abs(off.mean(axis=0)) < 4 * half / np.sqrt(3 * 400)).all()
+    assert not np.array_equal(poses, draw_poses(config, 400, 6))
+
+
+# The diagram.
+
+
+def test_errors_change_the_model_and_leave_the_world_alone():
+    wrong = PushModelConfig(friction=0.25, scale=1.1, mass=0.9, com_offset=[0.015, 0.0])
+    spec, friction = believed_object(PushObjectConfig(model=wrong))
+    right, _ = believed_object(PushObjectConfig())
+    assert friction == 0.25 and spec.scale == 1.1 and spec.com_offset == [0.015, 0.0]
+    assert spec.mass == pytest.approx(0.9 * right.mass)
+    scene = world_scene(PushObjectConfig(model=wrong))
+    frictions = [effect.parameters["friction"] for effect in scene.effects]
+    assert frictions == [0.5, 0.5]
+
+
+def test_the_object_starts_where_the_seed_says_it_does():
+    config = PushObjectConfig(seed=4, n_goals=2)
+    x, y, yaw = poses_of(config)[0]
+    pose = world_scene(config).initial.poses["object.object"]
+    assert pose[4:6] == [x, y] and heading(np.array(pose[:4])) == pytest.approx(yaw)
+    started = PushObjectConfig(start=[0.4, 0.1, 0.2])
+    np.testing.assert_array_equal(poses_of(started)[0], [0.4, 0.1, 0.2])
+
+
+def test_the_arm_goes_to_the_object_and_moves_it_towards_its_goal():
+    config = PushObjectConfig(start=[0.5, 0.0, 0.3], adapt=True)
+    config.goals.center, config.goals.size = [0.55, 0.0], [1e-6, 1e-6]
+    diagram = make_push_object(config)
+    simulator = Simulator(diagram)
+    simulator.AdvanceTo(4.0)
+    context = simulator.get_context()
+
+    def log(name):
+        return diagram.GetSubsystemByName(name).FindLog(context)
+
+    goal = log("goal_log").data()[1:4, -1]
+    plant = diagram.GetSubsystemByName("station").GetSubsystemByName("plant")
+    at = plant.GetBodyByName("object").floating_positions_start()
+    x = np.zeros((2, N_X))
+    for i, k in enumerate((0, -1)):
+        pose = log("state_log").data()[at : at + 7, k]
+        x[i, Q_BALL], x[i, P_BALL] = pose[:4], pose[4:]
+    before, after = (0.12 * angle + length for length, angle in
+                     (errors(x[0], goal), errors(x[1], goal)))  # fmt: skip
+    phases = log("phase_log").data()[0]
+    assert {TRAVEL, CONTACT} <= set(phases.tolist())
+    assert phases[12] == TRAVEL  # As soon as the pose is known and a place is chosen.
+    assert after < before - 0.03
+    force = np.linalg.norm(log("touch_log").data(), axis=0)
+    assert 0.5 < force.max() < 40.0
+    tau = log("torque_log").data()
+    assert np.isfinite(tau).all() and np.abs(np.diff(tau, axis=1)).max() < 87.0
