@@ -14,6 +14,7 @@ sensor, or a camera, measures of the object.
 """
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -178,6 +179,8 @@ def poses_of(config: PushObjectConfig) -> np.ndarray:
     if config.n_goals < 1:
         raise ValueError(f"n_goals is {config.n_goals}, expected at least 1")
     poses = draw_poses(config.goals, config.n_goals + 1, config.seed)
+    if outline_fold(config) == 0:
+        poses[:, 2] = 0.0  # Of a disc the camera knows no yaw; it is 0 at first.
     if config.start:
         if len(config.start) != 3:
             raise ValueError(f"start is {config.start}, expected [x, y, yaw]")
@@ -216,6 +219,43 @@ def believed_object(config: PushObjectConfig) -> tuple[PushedObject, float]:
         raise ValueError(f"model.friction is {friction}, expected > 0")
     spec = replace(o, scale=o.scale * m.scale, mass=o.mass * m.mass, com_offset=offset)
     return spec, friction
+
+
+def outline_fold(config: PushObjectConfig) -> int:
+    """Into how many equal turns the object may be turned without a difference to what
+    measures it (numerics/pose_tracker.py): a sensor of poses knows every turn."""
+    if config.pose_from == "sensor":
+        return 1
+    return make_shape(*seen_parts(config.object)).fold
+
+
+def model_scene(config: PushObjectConfig, file: str | Path) -> Scene:
+    """The scene that the controllers believe, with what is wrong in it as effects.
+
+    Args: file: of the world's object (models/pushed_object.py: object_sdf).
+    """
+    scene = read_scene(config.scene)
+    spec, friction = believed_object(config)
+    for d in scene.directives:
+        if d.add_model is not None and d.add_model.name == OBJECT:
+            d.add_model.file = f"file://{file}"
+    x, y, yaw = poses_of(config)[0]
+    q = [float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2))]
+    pose = [*q, float(x), float(y), rest_height(spec)]
+    scene.initial.poses[f"{OBJECT}.{OBJECT}"] = pose
+    m = config.model
+    if m.scale != 1.0:
+        scene.effects.append(Effect("object_size", [OBJECT], {"scale": m.scale}))
+    if m.mass != 1.0:
+        mass = {"mass": float(spec.mass)}
+        scene.effects.append(Effect("object_mass", [OBJECT], mass))
+    if any(m.com_offset) or (m.scale != 1.0 and any(config.object.com_offset)):
+        com = dict(zip("xy", map(float, spec.com_offset), strict=True))
+        scene.effects.append(Effect("object_com", [OBJECT], com))
+    for pair in (f"{TOOL}~{OBJECT}", f"{OBJECT}~table"):
+        value = {"friction": friction}
+        scene.effects.append(Effect("contact_friction", [pair], value))
+    return scene
 
 
 def contact_pairs(spec: PushedObject, friction: float) -> list[ContactPair]:

@@ -150,7 +150,7 @@ def parts(spec: PushedObject) -> list[Part]:
 
 def rest_height(spec: PushedObject) -> float:
     """Of the object's frame over the table that it lies on [m]."""
-    return -min(part.points[:, 2].min() for part in parts(spec))
+    return -float(min(part.points[:, 2].min() for part in parts(spec)))
 
 
 def object_inertia(spec: PushedObject) -> SpatialInertia:

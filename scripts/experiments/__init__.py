@@ -29,6 +29,7 @@ EXPERIMENTS: dict[str, str] = {
     "multi_spring": "makebreak.scripts.experiments.multi_spring",
     "multiple_collisions": "makebreak.scripts.experiments.multiple_collisions",
     "porridge": "makebreak.scripts.experiments.porridge",
+    "push_object": "makebreak.scripts.experiments.push_object",
     "surface_switch": "makebreak.scripts.experiments.surface_switch",
     "wall_friction": "makebreak.scripts.experiments.wall_friction",
 }
