@@ -12,15 +12,26 @@ ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
 
 
-def test_the_readmes_diagram_pushes_its_puck_to_the_goal(tmp_path):
-    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
-    (tmp_path / "example.py").write_text(code)
+def printed(page: Path, folder: Path) -> str:
+    """What the only Python example of a page prints."""
+    (code,) = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+    (folder / "example.py").write_text(code)
     done = subprocess.run(
-        [sys.executable, "example.py"], cwd=tmp_path, capture_output=True, text=True
+        [sys.executable, "example.py"], cwd=folder, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_readmes_diagram_pushes_its_puck_to_the_goal(tmp_path):
+    said = printed(README, tmp_path)
     # The goal is 0.5 m; the finger cannot pull the puck back once it is too far.
-    assert abs(float(done.stdout.split()[2]) - 0.5) < 0.01, done.stdout
+    assert abs(float(said.split()[2]) - 0.5) < 0.01, said
+
+
+def test_the_plan_of_the_page_on_c3_goes_to_the_goal(tmp_path):
+    said = printed(ROOT / "docs" / "c3.md", tmp_path)
+    assert abs(float(said.split()[-2]) - 0.5) < 0.1, said
 
 
 def test_the_number_of_kinds_is_told_as_it_is():
