@@ -5,7 +5,7 @@ Sensing and estimation   pinhole_camera, camera_shake, noisy_sensor, tool_wrench
                          contact_detector, mode_detector, contact_anticipator
 Modelling                lcs_builder, forward_model
 Adaptation               residual_learner
-Planning                 rolling_task, c3_mpc
+Planning                 rolling_task, pivot_target, c3_mpc
 Shaping                  velocity_shaper, variable_impedance
 Control                  arm_reference, impedance_controller, impact_reflex,
                          gravity_left_out

@@ -1,5 +1,7 @@
 """An object's mass, centre of mass, inertia and corners. Its size: test_scene.py."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from effect_scenes import (
@@ -15,6 +17,7 @@ from effect_scenes import (
     with_effects,
 )
 from pydrake.geometry import Sphere
+from pydrake.multibody.parsing import LoadModelDirectivesFromString
 from pydrake.systems.framework import DiagramBuilder
 from scipy.integrate import solve_ivp
 
@@ -264,3 +267,41 @@ def test_an_inertia_that_no_body_has_is_refused_in_the_context_too(tmp_path):
     rows = simulation.run(at_rest_but(), times, channels)
     expected = SceneSimulation(scene).run(at_rest_but(), times, channels)
     np.testing.assert_array_equal(rows, expected)
+
+
+FILTER = """
+directives:
+- add_collision_filter_group:
+    name: apart
+    members: [b::box, g::plate]
+    ignored_collision_filter_groups: [apart]
+"""
+
+
+@pytest.mark.parametrize(
+    "kind, at, parameters, more",
+    [
+        ("object_size", "b.box", {"scale": 1.2}, 0),
+        ("corner_radius", "b.box", {"radius": 0.004}, 7),
+        ("plane_height", "g.plate", {"height": 0.01}, 0),
+        (
+            "friction_patch",
+            "b.box~g.plate",
+            dict(friction=0.2, x_min=-0.1, x_max=0.1, y_min=-0.1, y_max=0.1),
+            4,
+        ),
+    ],
+)
+def test_bodies_that_a_scene_keeps_apart_stay_so(tmp_path, kind, at, parameters, more):
+    """Drake's ChangeShape forgets collision filters: a body would be touched again."""
+    scene = on_ground(tmp_path, "cube")
+    directives = LoadModelDirectivesFromString(FILTER).directives
+    scene = replace(scene, directives=[*scene.directives, *directives])
+    loaded = load_scene(with_effects(scene, (kind, at, parameters)), DiagramBuilder())
+    plant, inspector = loaded.plant, loaded.scene_graph.model_inspector()
+    box, plate = (
+        plant.GetCollisionGeometriesForBody(plant.GetBodyByName(name))
+        for name in ("box", "plate")
+    )
+    assert len(box) + len(plate) == 2 + more
+    assert all(inspector.CollisionFiltered(a, b) for a in box for b in plate)

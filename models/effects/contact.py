@@ -18,6 +18,11 @@ from pydrake.multibody.plant import ContactResults, CoulombFriction, MultibodyPl
 from pydrake.multibody.tree import Joint, RigidBody
 from pydrake.systems.framework import DiagramBuilder, LeafSystem, OutputPort
 
+from makebreak.models.effects.change_shape import (
+    change_shape,
+    keep_apart,
+    not_colliding_with,
+)
 from makebreak.models.effects.contact_damper import ContactDamper
 from makebreak.models.effects.kind import (
     Effect,
@@ -349,6 +354,7 @@ def _patch(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> No
         low, high = _span(shape, X_WG)
         # A copy: the original will have changed.
         old = ProximityProperties(inspector.GetProximityProperties(geometry))
+        apart = not_colliding_with(scene_graph, geometry)
         around = _both(_friction(old), mu_thing)
         mu_ground = around * rougher / (2.0 * rougher - around)
         x = np.clip([low[0], p["x_min"], p["x_max"], high[0]], low[0], high[0])
@@ -374,15 +380,17 @@ def _patch(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> No
             properties = ProximityProperties(old)
             properties.UpdateProperty("material", "coulomb_friction", mu_piece)
             if i == 0:
-                scene_graph.ChangeShape(source, geometry, box, X_BG)
+                change_shape(plant, scene_graph, geometry, box, X_BG)
                 scene_graph.AssignRole(
                     source, geometry, properties, RoleAssign.kReplace
                 )
             else:
                 name = f"{ground.name()}_of_{len(shapes)}_{number}_around_patch_{i}"
-                more.append((X_BG, box, name, properties))
-    for piece in more:  # After the rest: Drake's ids of the shapes end with this.
-        plant.RegisterCollisionGeometry(ground, *piece)
+                more.append((apart, X_BG, box, name, properties))
+    for apart, *piece in more:  # After the rest: Drake's ids of the shapes end here.
+        keep_apart(
+            scene_graph, [plant.RegisterCollisionGeometry(ground, *piece)], apart
+        )
     if not met:
         raise ValueError(f"{where}: the patch is off {full_name(plant, ground)}")
     if rougher != mu_thing:

@@ -6,6 +6,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 
+from makebreak.models.effects.change_shape import change_shape
 from makebreak.models.effects.contact import anchored_pose
 from makebreak.models.effects.kind import Effect, EffectKind, Parameter, find_bodies
 from makebreak.models.effects.loads import rotation
@@ -29,9 +30,8 @@ def _move(
         )
     for g in geometries:
         X_WG = moved(X_WB @ inspector.GetPoseInFrame(g), X_WB.translation())
-        scene_graph.ChangeShape(
-            plant.get_source_id(), g, inspector.GetShape(g), X_WB.inverse() @ X_WG
-        )
+        shape, X_BG = inspector.GetShape(g), X_WB.inverse() @ X_WG
+        change_shape(plant, scene_graph, g, shape, X_BG)
 
 
 def _lift(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:

@@ -18,6 +18,11 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 
+from makebreak.models.effects.change_shape import (
+    change_shape,
+    keep_apart,
+    not_colliding_with,
+)
 from makebreak.models.effects.inertia import (
     central_inertia,
     change_inertia,
@@ -99,7 +104,6 @@ def _scale_shapes(
 ) -> None:
     """All shapes of the body, seen and touched, about the body's origin."""
     inspector = scene_graph.model_inspector()
-    source = plant.get_source_id()
     for at in effect.at:
         body = find_body(effect, plant, at)
         shapes = {
@@ -111,7 +115,7 @@ def _scale_shapes(
         scale = _scale(effect, [sphere.radius() for sphere in spheres])
         for g, (shape, X_BG) in shapes.items():
             moved = RigidTransform(X_BG.rotation(), scale * X_BG.translation())
-            scene_graph.ChangeShape(source, g, _scaled_shape(shape, scale), moved)
+            change_shape(plant, scene_graph, g, _scaled_shape(shape, scale), moved)
 
 
 def _size_now(effect: Effect, plant: MultibodyPlant, scene_graph) -> dict[str, float]:
@@ -176,12 +180,16 @@ def _round_corners(
         old = _touched(body, plant, scene_graph)
         inspector = scene_graph.model_inspector()
         properties = ProximityProperties(inspector.GetProximityProperties(old[0][0]))
+        apart = not_colliding_with(scene_graph, old[0][0])
         for (g, _, _), X in zip(old, corners, strict=False):
-            scene_graph.ChangeShape(plant.get_source_id(), g, Sphere(radius), X)
-        for i, X in enumerate(corners[len(old) :]):
+            change_shape(plant, scene_graph, g, Sphere(radius), X)
+        more = [
             plant.RegisterCollisionGeometry(
                 body, X, Sphere(radius), f"{body.name()}_corner_{i}", properties
             )
+            for i, X in enumerate(corners[len(old) :])
+        ]
+        keep_apart(scene_graph, more, apart)
 
 
 def _radius_now(effect: Effect, plant: MultibodyPlant, scene_graph) -> dict[str, float]:

@@ -1,0 +1,413 @@
+"""A planar cube on a platform, tipped by 90 degrees by two fingers.
+
+    plant --x--> lcs --lcs--> c3 --u--> (+ the fingers' weight) --> plant
+            `--> target --x_desired--^
+
+The world is a scene, simulated by Drake; the planner has a plant of its own, of a scene
+in which friction, mass and size of the cube may be others.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from pydrake.geometry import Box, Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.multibody.tree import JointActuatorIndex
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.primitives import (
+    Adder,
+    ConstantVectorSource,
+    Demultiplexer,
+    Multiplexer,
+    VectorLogSink,
+)
+
+from makebreak.diagrams.recorder import add_recorder
+from makebreak.models.drives import add_actuators
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect
+from makebreak.models.model_files import MODELS, add_models
+from makebreak.models.scene import Scene, load_scene, read_scene
+from makebreak.systems.c3_mpc import C3Config, C3Mpc
+from makebreak.systems.contact_probe import ContactProbe
+from makebreak.systems.lcs_builder import (
+    AnitescuLcsBuilder,
+    ContactPair,
+    LcsBuilderConfig,
+)
+from makebreak.systems.numerics.c3_mpc import C3Bounds, C3Options, C3Weights
+from makebreak.systems.numerics.c3_projections import PlusProjection, QpProjection
+from makebreak.systems.numerics.pivot_target import (
+    LEFT,
+    N_X,
+    RIGHT,
+    THETA,
+    corners,
+)
+from makebreak.systems.pivot_target import PivotTarget, PivotTargetConfig
+
+SCENE = str(MODELS / "cube_pivoting.scene.yaml")
+FINGERS = ("left", "right")
+CUBE_BODY, CORNERS_BODY, PLATFORM = "pivot.cube", "pivot.corners", "pivot.platform"
+JOINTS = (
+    "pivot.x", "pivot.z", "pivot.angle", "left.x", "left.z", "right.x", "right.z"
+)  # fmt: skip
+# What may touch, (first body, the others): the order of logged_forces.
+TOUCHES = (
+    (CUBE_BODY, ("left.finger", "right.finger")),
+    (PLATFORM, (CORNERS_BODY, "left.finger", "right.finger")),
+    ("left.finger", ("right.finger",)),
+)
+N_FORCES = sum(len(others) for _, others in TOUCHES)
+LCS_OFFSET, C3_OFFSET = 1e-4, 2e-4  # No value waits for the next period [s].
+TICK = 0.001  # Of the log of forces [s].
+# 1 / m^2, 1 / rad^2, and the same of velocities: cube x, z, angle; each finger's x, z.
+Q = (2000.0, 2000.0, 200.0, *4 * [50.0], 2.0, 2.0, 0.5, *4 * [5.0])
+R = 0.01  # [1/N^2]
+
+
+@dataclass
+class PivotStart:
+    """Where a run starts; each of them uniformly drawn by the seed."""
+
+    place: float = 0.05  # The cube's centre, up to so far from x = -0.1 m [m].
+    tilt: float = 0.15  # Of the cube, to either side [rad].
+    # From the cube's sides to the fingers' surfaces, and the fingers' height [m].
+    distance: list[float] = field(default_factory=lambda: [0.01, 0.06])
+    height: list[float] = field(default_factory=lambda: [0.02, 0.12])
+    friction: list[float] = field(default_factory=lambda: [0.4, 1.0])  # Of all pairs.
+
+
+@dataclass
+class PivotPlanner:
+    projection: Literal["plus", "qp"] = "plus"
+    options: C3Options = field(
+        default_factory=lambda: C3Options(N=10, rounds=3, polish=3)
+    )
+    dt_sec: float = 0.05  # Between knots [s].
+    period_sec: float = 0.02  # From plan to plan [s].
+    # Each knot has its own LCS, along the last plan; else all have that of the state.
+    lcs_along_plan: bool = False
+    force_max: float = 10.0  # Of each slide of a finger, beside its weight [N].
+    rate: float = 1.0  # Of the angle that is wanted [rad/s].
+
+
+@dataclass
+class CubePivotingConfig:
+    seed: int = 0  # Draws the start and the friction.
+    start: PivotStart = field(default_factory=PivotStart)
+    mass: float = 0.4  # Of the cube [kg].
+    size: float = 1.0  # Of the cube, over the scene's.
+    # The planner's friction, mass and size over the world's.
+    friction_error: float = 1.0
+    mass_error: float = 1.0
+    size_error: float = 1.0
+    planner: PivotPlanner = field(default_factory=PivotPlanner)
+    world: str = SCENE
+
+
+@dataclass(frozen=True)
+class Cube:
+    """What may differ between world and model."""
+
+    friction: float
+    mass: float  # [kg]
+    side: float  # [m]
+
+
+def world_cube(config: CubePivotingConfig) -> Cube:
+    """The cube of the run of config.seed. Raises: ValueError."""
+    c = config
+    friction = _range("start.friction", c.start.friction, 0.0)
+    for name in ("mass", "size", "friction_error", "mass_error", "size_error"):
+        if not 0.0 < getattr(c, name) < np.inf:
+            raise ValueError(f"{name} is {getattr(c, name)}, expected > 0")
+    drawn = np.random.default_rng([c.seed, 1]).uniform(friction[0], friction[1])
+    return Cube(float(drawn), c.mass, c.size * _side(read_scene(c.world)))
+
+
+def model_cube(config: CubePivotingConfig) -> Cube:
+    """The same as the planner has it."""
+    c, cube = config, world_cube(config)
+    return Cube(
+        cube.friction * c.friction_error,
+        cube.mass * c.mass_error,
+        cube.side * c.size_error,
+    )
+
+
+def scene_with(path: str, cube: Cube) -> Scene:
+    """The scene of the file with this cube."""
+    scene = read_scene(path)
+    pairs = [f"{CORNERS_BODY}~{PLATFORM}"]
+    pairs += [f"{finger}.finger~{CUBE_BODY}" for finger in FINGERS]
+    effects = [
+        Effect("contact_friction", [pair], {"friction": cube.friction})
+        for pair in pairs
+    ]
+    effects.append(Effect("object_mass", [CUBE_BODY], {"mass": cube.mass}))
+    scale = cube.side / _side(scene)
+    if scale != 1.0:
+        bodies = [CUBE_BODY, CORNERS_BODY]
+        effects.append(Effect("object_size", bodies, {"scale": scale}))
+    return replace(scene, effects=[*scene.effects, *effects])
+
+
+def initial_state(config: CubePivotingConfig) -> np.ndarray:
+    """Where the run of config.seed starts, x (14,): at rest, nothing touching."""
+    c = config.start
+    for name in ("place", "tilt"):
+        if not 0.0 <= getattr(c, name) < np.inf:
+            raise ValueError(f"start.{name} is {getattr(c, name)}, expected >= 0")
+    distance = _range("start.distance", c.distance, 0.0)
+    height = _range("start.height", c.height, -np.inf)
+    rng, cube = np.random.default_rng([config.seed, 0]), world_cube(config)
+    x = np.zeros(N_X)
+    x[0] = -0.1 + rng.uniform(-c.place, c.place)
+    x[THETA] = rng.uniform(-c.tilt, c.tilt)
+    x[1] = 1e-3 - corners(x, cube.side)[:, 1].min()
+    ends = corners(x, cube.side)[:, 0]
+    radius = PivotTargetConfig().finger_radius
+    for finger, face, sign in ((LEFT, ends.min(), -1.0), (RIGHT, ends.max(), 1.0)):
+        x[finger] = (
+            face + sign * (radius + rng.uniform(distance[0], distance[1])),
+            rng.uniform(height[0], height[1]),
+        )
+    return x
+
+
+def _range(name: str, values, least: float) -> list[float]:
+    """[low, high]. Raises: ValueError."""
+    good = len(values) == 2 and np.isfinite(values).all()
+    if not (good and least <= values[0] <= values[1]):
+        raise ValueError(
+            f"{name} is {list(values)}, expected [low, high] with {least:g} <= low"
+            if np.isfinite(least)
+            else f"{name} is {list(values)}, expected [low, high]"
+        )
+    return list(values)
+
+
+def _side(scene: Scene) -> float:
+    """Of the cube in the scene without effects [m]."""
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
+    add_models(scene, (), plant)
+    try:
+        body = plant.GetBodyByName("cube", plant.GetModelInstanceByName("pivot"))
+    except RuntimeError:
+        raise ValueError("the scene has no body pivot.cube") from None
+    (shape,) = plant.GetCollisionGeometriesForBody(body)
+    box = scene_graph.model_inspector().GetShape(shape)
+    if not isinstance(box, Box) or box.width() != box.height():
+        raise ValueError("pivot.cube is no box with equal sides in the x-z plane")
+    return float(box.width())
+
+
+def make_model(scene: Scene) -> Diagram:
+    """The planner's plant and its scene graph: continuous, and the fingers have no
+    weight, as something carries them (make_cube_pivoting)."""
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
+    add_models(scene, scene.effects, plant)
+    add_actuators(scene.actuation, plant)
+    for effect in scene.effects:
+        before = KINDS[effect.kind].before_finalize
+        if before is not None:
+            before(effect, plant, scene_graph)
+    for finger in FINGERS:
+        plant.set_gravity_enabled(plant.GetModelInstanceByName(finger), False)
+    plant.Finalize()
+    return builder.Build()
+
+
+def contact_pairs(friction: float) -> list[ContactPair]:
+    """Fingers on the cube, its two lowest corners on the platform, and the fingers on
+    that, without friction."""
+    y = [0.0, 1.0, 0.0]
+
+    def pair(a, b, mu, closest=None):
+        return ContactPair(
+            a, b, mu, friction_directions=1, plane_normal=y, closest=closest
+        )
+
+    return [
+        *(pair(f"{f}::finger", "pivot::cube", friction) for f in FINGERS),
+        pair("pivot::corners", "pivot::platform", friction, closest=2),
+        *(pair(f"{f}::finger", "pivot::platform", 0.0) for f in FINGERS),
+    ]
+
+
+def c3_config(planner: PivotPlanner, n_lam: int) -> C3Config:
+    """C3's weights for n_lam forces, and the bounds of the fingers' forces.
+
+    A force weighs as a gap velocity: 1 N as 1 m/s. Consensus hardly asks for x and u.
+    """
+    if not 0.0 < planner.force_max < np.inf:
+        raise ValueError(
+            f"planner.force_max is {planner.force_max}, expected a positive force [N]"
+        )
+    n_u = 2 * len(FINGERS)
+    sizes = [N_X, n_lam, n_u]
+    G, U = [0.01, 1.0, 0.01], [1.0, 1.0, 1.0]
+    if planner.projection == "plus":
+        sizes, G, U = [*sizes, n_lam], [*G, 1.0], [*U, 10.0]
+    weights = C3Weights(
+        Q=np.array(Q), R=R * np.ones(n_u), G=np.repeat(G, sizes), U=np.repeat(U, sizes)
+    )
+    u_max = planner.force_max * np.ones(n_u)
+    return C3Config(
+        weights,
+        projection=PlusProjection() if planner.projection == "plus" else QpProjection(),
+        options=planner.options,
+        bounds=C3Bounds(u_lower=-u_max, u_upper=u_max),
+        residual_dt_sec=planner.dt_sec,
+    )
+
+
+def make_cube_pivoting(
+    config: CubePivotingConfig, meshcat: Meshcat | None = None
+) -> Diagram:
+    """The closed loop.
+
+    Outputs: x (14,) the plant's state, as in numerics/pivot_target.py; u (4,) what the
+        planner asks of the fingers' slides [N]; touches (24,), of each of TOUCHES what
+        ContactProbe tells, which force_log has every TICK; c3_status (1,).
+
+    Raises: ValueError for a number out of range, or a scene of other joints.
+    """
+    c, p = config, config.planner
+    initial_state(config)
+    world, believed = world_cube(config), model_cube(config)
+    builder = DiagramBuilder()
+    loaded = load_scene(scene_with(c.world, world), builder)
+    plant = loaded.plant
+    _check_joints(plant)
+    model = make_model(scene_with(c.world, believed))
+    lcs = builder.AddNamedSystem(
+        "lcs",
+        AnitescuLcsBuilder(
+            model,
+            LcsBuilderConfig(
+                contact_pairs(believed.friction),
+                p.dt_sec,
+                period_sec=p.period_sec,
+                offset_sec=LCS_OFFSET,
+                knots=p.options.N if p.lcs_along_plan else 0,
+            ),
+        ),
+    )
+    c3 = builder.AddNamedSystem(
+        "c3", C3Mpc(c3_config(p, lcs.model.n_lam), p.period_sec, C3_OFFSET)
+    )
+    target = builder.AddNamedSystem(
+        "target",
+        PivotTarget(
+            PivotTargetConfig(side=believed.side, rate=p.rate), p.dt_sec, p.options.N
+        ),
+    )
+    x, u = plant.get_state_output_port(), c3.GetOutputPort("u")
+    for system in (lcs, c3, target):
+        builder.Connect(x, system.GetInputPort("x"))
+    zero = builder.AddNamedSystem("u_of_lcs", ConstantVectorSource(np.zeros(4)))
+    builder.Connect(zero.get_output_port(), lcs.GetInputPort("u"))
+    builder.Connect(target.GetOutputPort("x_desired"), c3.GetInputPort("x_desired"))
+    builder.Connect(lcs.GetOutputPort("lcs"), c3.GetInputPort("lcs"))
+    if p.lcs_along_plan:
+        builder.Connect(c3.GetOutputPort("plan"), lcs.GetInputPort("plan"))
+    effort = builder.AddNamedSystem("effort", Adder(2, 4))
+    weight = builder.AddNamedSystem("weight", ConstantVectorSource(weights_of(plant)))
+    builder.Connect(u, effort.get_input_port(0))
+    builder.Connect(weight.get_output_port(), effort.get_input_port(1))
+    split = builder.AddNamedSystem("fingers", Demultiplexer([2, 2]))
+    builder.Connect(effort.get_output_port(), split.get_input_port())
+    for i, finger in enumerate(FINGERS):
+        builder.Connect(split.get_output_port(i), loaded.command_input_port(finger))
+    touches = _add_touches(builder, plant)
+    names = [f"{joint}.{what}" for what in ("position", "velocity") for joint in JOINTS]
+    efforts = [f"{joint}.effort_command" for joint in JOINTS[3:]]
+    add_recorder(
+        builder,
+        {"x": (x, names)},
+        {"effort": (effort.get_output_port(), efforts)},
+    )
+    if meshcat is not None:
+        meshcat.SetCameraPose([0.0, -0.7, 0.18], [0.0, 0.0, 0.07])
+        MeshcatVisualizer.AddToBuilder(
+            builder,
+            loaded.scene_graph,
+            meshcat,
+            MeshcatVisualizerParams(publish_period=1.0 / 30.0),
+        )
+    builder.ExportOutput(x, "x")
+    builder.ExportOutput(u, "u")
+    builder.ExportOutput(touches, "touches")
+    builder.ExportOutput(c3.GetOutputPort("status"), "c3_status")
+    diagram = builder.Build()
+    diagram.set_name("cube_pivoting")
+    return diagram
+
+
+def _check_joints(plant: MultibodyPlant) -> None:
+    """Raises: ValueError unless the joints are those of numerics/pivot_target.py."""
+    found = []
+    for index in plant.GetJointIndices():
+        joint = plant.get_joint(index)
+        if joint.num_positions():
+            model = plant.GetModelInstanceName(joint.model_instance())
+            found.append((joint.position_start(), f"{model}.{joint.name()}"))
+    names = tuple(name for _, name in sorted(found))
+    if names != JOINTS or plant.num_actuated_dofs() != 4:
+        raise ValueError(
+            f"the scene has the joints {', '.join(names)} and "
+            f"{plant.num_actuated_dofs()} actuators, expected {', '.join(JOINTS)} and 4"
+        )
+
+
+def weights_of(plant: MultibodyPlant) -> np.ndarray:
+    """(4,) the effort that carries each finger's slides, as modelled [N]."""
+    gravity = plant.CalcGravityGeneralizedForces(plant.CreateDefaultContext())
+    joints = [
+        plant.get_joint_actuator(JointActuatorIndex(int(i))).joint()
+        for i in plant.GetJointActuatorIndices()
+    ]
+    return np.array([-gravity[joint.velocity_start()] for joint in joints])
+
+
+def _add_touches(builder: DiagramBuilder, plant: MultibodyPlant):
+    """A port with what a ContactProbe tells of each of TOUCHES, (24,), and its log."""
+    parts = []
+    for first, others in TOUCHES:
+        bodies = [
+            plant.GetBodyByName(body, plant.GetModelInstanceByName(model))
+            for model, body in (name.split(".") for name in (first, *others))
+        ]
+        probe = builder.AddNamedSystem(f"touch_{first}", ContactProbe(*bodies))
+        builder.Connect(
+            plant.get_contact_results_output_port(),
+            probe.GetInputPort("contact_results"),
+        )
+        parts.append(probe.GetOutputPort("contact_force"))
+    joined = builder.AddNamedSystem("touches", Multiplexer([p.size() for p in parts]))
+    for i, port in enumerate(parts):
+        builder.Connect(port, joined.get_input_port(i))
+    log = builder.AddNamedSystem("force_log", VectorLogSink(4 * N_FORCES, TICK))
+    builder.Connect(joined.get_output_port(), log.get_input_port())
+    return joined.get_output_port()
+
+
+def logged_forces(diagram: Diagram, context: Context) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,) [s] and forces (n, 6) [N] between two bodies each, in the order of
+    TOUCHES, of a simulation that ended in `context`."""
+    log = diagram.GetSubsystemByName("force_log").FindLog(context)
+    vectors = log.data().T.reshape(-1, N_FORCES, 4)[:, :, 1:]
+    return np.array(log.sample_times()), np.linalg.norm(vectors, axis=2)
+
+
+def start(diagram: Diagram, x) -> Context:
+    """A context of make_cube_pivoting in which the plant's state is x (14,)."""
+    context = diagram.CreateDefaultContext()
+    plant = diagram.GetSubsystemByName("plant")
+    plant.SetPositionsAndVelocities(plant.GetMyContextFromRoot(context), x)
+    return context

@@ -1,0 +1,228 @@
+"""Two fingers tip a cube over an edge, by 90 degrees, in a plane.
+
+C3+ plans which finger pushes, presses or lets go; the target only says how fast the
+cube is to turn, and beside which faces the fingers are to be. Cube, fingers and the
+friction of all pairs start where the seed draws them.
+
+Criterion, set beforehand: over the last half second the angle is within 0.1 rad of 90
+degrees, the cube is at rest on the platform, and its place within 2 cm of where pure
+pivoting leads from where it stood at the start; and in the whole run no two bodies
+press on each other with more than 40 N. (The two corners on the platform count as one.)
+"""
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.patches import Circle, Polygon
+
+from makebreak.diagrams.cube_pivoting import (
+    TOUCHES,
+    CubePivotingConfig,
+    initial_state,
+    logged_forces,
+    make_cube_pivoting,
+    model_cube,
+    scene_with,
+    start,
+    world_cube,
+)
+from makebreak.diagrams.recorder import recorded, with_noise
+from makebreak.scripts.criteria import Criteria
+from makebreak.scripts.session import Log, Session, run_many
+from makebreak.scripts.sweep import rate_text
+from makebreak.scripts.table import Table
+from makebreak.systems.c3_mpc import C3Status
+from makebreak.systems.numerics.pivot_target import LEFT, N_X, RIGHT, THETA, corners
+from makebreak.systems.pivot_target import PivotTargetConfig
+
+SUMMARY = "two fingers tip a cube by 90 degrees, planned by C3+"
+Config = CubePivotingConfig
+
+DURATION, SAMPLE = 6.0, 0.02  # [s]
+GOAL = PivotTargetConfig().goal  # [rad]
+LAST = 0.5  # What is judged at the end [s].
+ANGLE_BOUND, PLACE_BOUND = 0.1, 0.02  # [rad], [m]
+SPEED_BOUND, TURN_BOUND = 0.02, 0.2  # Of a cube at rest [m/s], [rad/s].
+FORCE_BOUND = 40.0  # [N]
+LOST = 0.4  # The platform's end [m].
+
+
+def run(config: CubePivotingConfig, session: Session) -> dict:
+    """One start, scored; see the module for the criterion."""
+    x0 = initial_state(config)
+    diagram = make_cube_pivoting(config, session.meshcat)
+    log = session.simulate(
+        diagram,
+        DURATION,
+        {name: diagram.GetOutputPort(name) for name in ("x", "u", "c3_status")},
+        period_sec=SAMPLE,
+        until=lambda t, values: (
+            "the cube has left the platform" if abs(values["x"][0]) > LOST else ""
+        ),
+        context=start(diagram, x0),
+    )
+    time, force = logged_forces(diagram, log.context)
+    side = world_cube(config).side
+    result = score(log, time, force, side)
+    result["friction"] = world_cube(config).friction
+    session.save_plot(plot_run(log, time, force), "pivot")
+    session.save_plot(plot_motion(log, side), "motion")
+    columns = with_noise(recorded(diagram, log.context), config.seed)
+    session.write_recording(columns, scene_with(config.world, model_cube(config)))
+    return result
+
+
+def score(log: Log, time, force, side: float) -> dict:
+    """The criteria and what is told beside them.
+
+    Args: time (n,) [s], force (n, 6) [N] as of logged_forces; side of the cube [m].
+    """
+    x = log["x"]
+    last = x[log.time >= log.time[-1] - LAST]
+    error = abs(x[:, THETA] - GOAL)
+    place = last[:, 0] - (standing_place(x[0], side) + side)
+    speed = np.hypot(last[:, N_X // 2], last[:, N_X // 2 + 1])
+    rest = bool(
+        speed.max() <= SPEED_BOUND
+        and abs(last[:, N_X // 2 + THETA]).max() <= TURN_BOUND
+    )
+    peak = force.max(axis=0)
+    result = {
+        "success": False,
+        "angle_error_rad": float(error[-len(last) :].max()),
+        "place_error_m": float(abs(place).max()),
+        "time_to_goal_s": time_to_stay(log.time, error, ANGLE_BOUND),
+        "force_max_N": float(peak.max()),
+        "finger_force_max_N": float(peak[:2].max()),
+        "platform_force_max_N": float(peak[2]),
+        "plans_failed": int((log["c3_status"][1:] != C3Status.SOLVED).sum()),
+        "u_max_N": float(abs(log["u"]).max()),
+    }
+    criteria = Criteria()
+    end = f"in the last {LAST} s"
+    criteria.at_most(
+        "angle", f"distance to 90 degrees {end}", result["angle_error_rad"],
+        ANGLE_BOUND, "rad",
+    )  # fmt: skip
+    criteria.at_most(
+        "place", f"distance to where it should stand {end}", result["place_error_m"],
+        PLACE_BOUND, "m",
+    )  # fmt: skip
+    criteria.holds("rest", f"at rest {end}", rest)
+    criteria.at_most(
+        "force", "largest force between two bodies", result["force_max_N"],
+        FORCE_BOUND, "N",
+    )  # fmt: skip
+    return result | criteria.result()
+
+
+def standing_place(x, side: float) -> float:
+    """Where the centre of a tilted cube is once it has fallen back on its face [m]."""
+    lowest = corners(x, side)[:2]
+    pivot = int(np.argmin(lowest[:, 1]))  # Lower left or lower right.
+    return float(lowest[pivot, 0] + (0.5 - pivot) * side)
+
+
+def time_to_stay(time, error, bound) -> float | None:
+    """From when on error (n,) stays below bound [s]; None if it ends above."""
+    above = np.flatnonzero(error > bound)
+    if above.size == 0:
+        return float(time[0])
+    return float(time[above[-1] + 1]) if above[-1] + 1 < len(time) else None
+
+
+def plot_run(log: Log, time, force):
+    """Angle, inputs and forces over time."""
+    figure, axes = plt.subplots(3, 1, figsize=(8, 8), sharex=True, layout="constrained")
+    axes[0].plot(log.time, np.degrees(log["x"][:, THETA]))
+    axes[0].axhline(np.degrees(GOAL), color="0.5", ls=":")
+    axes[0].set(ylabel="cube [degrees]")
+    for i, name in enumerate(("left x", "left z", "right x", "right z")):
+        axes[1].step(log.time, log["u"][:, i], where="post", label=name)
+    axes[1].set(ylabel="asked of the fingers [N]")
+    names = [
+        f"{other.split('.')[1] if i else other.split('.')[0]} ~ {first.split('.')[1]}"
+        for i, (first, others) in enumerate(TOUCHES)
+        for other in others
+    ]
+    for i, name in enumerate(names):
+        if force[:, i].any():
+            axes[2].plot(time, force[:, i], label=name)
+    axes[2].axhline(FORCE_BOUND, color="0.5", ls=":")
+    axes[2].set(ylabel="force [N]", xlabel="time [s]")
+    for ax in axes[1:]:
+        ax.legend()
+    return figure
+
+
+def plot_motion(log: Log, side: float):
+    """Cube and fingers at several instants, one picture each."""
+    n = 8
+    end = time_to_stay(log.time, abs(log["x"][:, THETA] - GOAL), 0.01)
+    instants = np.linspace(0.0, log.time[-1] if end is None else end, n)
+    figure, axes = plt.subplots(
+        2, n // 2, figsize=(12, 5), sharex=True, sharey=True, layout="constrained"
+    )
+    radius = PivotTargetConfig().finger_radius
+    for ax, t in zip(axes.flat, instants, strict=True):
+        x = log["x"][np.searchsorted(log.time, t - 1e-9)]
+        outline = corners(x, side)
+        ax.add_patch(Polygon(outline, fc="#dd8452", ec="0.2"))
+        ax.plot(*outline[2:].T, color="0.1", lw=3)  # The face that was on top.
+        for finger, color in ((LEFT, "C0"), (RIGHT, "C2")):
+            ax.add_patch(Circle(tuple(x[finger]), radius, fc=color))
+        ax.axhline(0.0, color="0.3")
+        ax.set(title=f"{t:.2f} s", aspect=1, ylim=(-0.02, 2.2 * side))
+    middle = np.median(log["x"][:, 0])
+    axes[0, 0].set_xlim(middle - 2.3 * side, middle + 2.3 * side)
+    return figure
+
+
+# What is compared: settings, and whether all starts are to succeed.
+VARIANTS: dict[str, tuple[dict, bool | None]] = {
+    "as it is": ({}, True),
+    "QP projection in place of C3+": ({"planner.projection": "qp"}, None),
+    "not polished": ({"planner.options.polish": 0}, None),
+    "an LCS for each knot along the plan": ({"planner.lcs_along_plan": True}, None),
+    "6 knots": ({"planner.options.N": 6}, None),
+    "15 knots": ({"planner.options.N": 15}, None),
+    "twice as heavy": ({"mass": 0.8}, None),
+    "half as heavy": ({"mass": 0.2}, None),
+    "0.8 of the size": ({"size": 0.8}, None),
+    "friction 0.3": ({"start.friction": [0.3, 0.3]}, None),
+    "modelled with half the mass": ({"mass_error": 0.5}, None),
+    "modelled with twice the mass": ({"mass_error": 2.0}, None),
+    "modelled with half the friction": ({"friction_error": 0.5}, None),
+    "modelled with twice the friction": ({"friction_error": 2.0}, None),
+    "modelled 10 % too small": ({"size_error": 0.9}, None),
+    "modelled 10 % too large": ({"size_error": 1.1}, None),
+}
+
+
+def reproduce(session: Session, seeds: int, jobs: int) -> Table:
+    """How many starts succeed, as it is and with each thing changed."""
+    runs = [
+        (settings, seed) for settings, _ in VARIANTS.values() for seed in range(seeds)
+    ]
+    found = run_many("cube_pivoting", runs, jobs, session.out_dir, reuse=session.reuse)
+    rows, met = [], []
+    for i, (what, (settings, all_wanted)) in enumerate(VARIANTS.items()):
+        results = found[i * seeds : (i + 1) * seeds]
+        count = sum(bool(r.get("success")) for r in results)
+        times = [r["time_to_goal_s"] for r in results if r.get("success")]
+        forces = [r["force_max_N"] for r in results if "force_max_N" in r]
+        text = rate_text(count, len(results))
+        if times:
+            text += f"; {np.median(times):.1f} s"
+        if forces:
+            text += f"; at most {max(forces):.0f} N"
+        words = " ".join(f"{key}={value}" for key, value in settings.items())
+        command = "makebreak run cube_pivoting --seed S"
+        command += f" --set {words}".replace(" [", "[") if words else ""
+        rows.append((what, "-", text, command.replace(", ", ",")))
+        met.append(count == len(results) if all_wanted else None)
+    return Table(
+        "A cube tipped by 90 degrees: starts that succeed, median time, largest force",
+        ("what", "paper", "ours", "command"),
+        rows,
+        met,
+    )
