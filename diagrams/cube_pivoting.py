@@ -8,6 +8,7 @@ in which friction, mass and size of the cube may be others.
 """
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -83,7 +84,7 @@ class PivotStart:
 class PivotPlanner:
     projection: Literal["plus", "qp"] = "plus"
     options: C3Options = field(
-        default_factory=lambda: C3Options(N=10, rounds=3, polish=3)
+        default_factory=lambda: C3Options(N=10, rounds=3, polish=10)
     )
     dt_sec: float = 0.05  # Between knots [s].
     period_sec: float = 0.02  # From plan to plan [s].
@@ -124,7 +125,7 @@ def world_cube(config: CubePivotingConfig) -> Cube:
         if not 0.0 < getattr(c, name) < np.inf:
             raise ValueError(f"{name} is {getattr(c, name)}, expected > 0")
     drawn = np.random.default_rng([c.seed, 1]).uniform(friction[0], friction[1])
-    return Cube(float(drawn), c.mass, c.size * _side(read_scene(c.world)))
+    return Cube(float(drawn), c.mass, c.size * _side(c.world))
 
 
 def model_cube(config: CubePivotingConfig) -> Cube:
@@ -147,7 +148,7 @@ def scene_with(path: str, cube: Cube) -> Scene:
         for pair in pairs
     ]
     effects.append(Effect("object_mass", [CUBE_BODY], {"mass": cube.mass}))
-    scale = cube.side / _side(scene)
+    scale = cube.side / _side(path)
     if scale != 1.0:
         bodies = [CUBE_BODY, CORNERS_BODY]
         effects.append(Effect("object_size", bodies, {"scale": scale}))
@@ -189,11 +190,12 @@ def _range(name: str, values, least: float) -> list[float]:
     return list(values)
 
 
-def _side(scene: Scene) -> float:
-    """Of the cube in the scene without effects [m]."""
+@lru_cache
+def _side(path: str) -> float:
+    """Of the cube in the scene of the file, without effects [m]."""
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
-    add_models(scene, (), plant)
+    add_models(read_scene(path), (), plant)
     try:
         body = plant.GetBodyByName("cube", plant.GetModelInstanceByName("pivot"))
     except RuntimeError:

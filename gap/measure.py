@@ -48,8 +48,9 @@ def measure(
     every: bool,
     jobs: int = 1,
     skip: Callable[[Window], bool] = lambda window: False,
-) -> tuple[GapMeasure, list[Series]]:
-    """Before and after over windows of the recordings that `motion` has.
+) -> tuple[GapMeasure, list[Series]] | None:
+    """Before and after over windows of the recordings that `motion` has; None where no
+    window counts.
 
     Args: effects: to be added. moved: the background as far as its tolerance lets it,
         in both, as it is neither the gap nor its cure. motion: what tells how far a
@@ -62,6 +63,8 @@ def measure(
     moved = [e for e in moved if (e.kind, tuple(e.at)) not in taken]
     trials = [moved, [*moved, *effects]] if effects else [moved]
     held = [(every or not w.train) and not skip(w) for w in model.windows]
+    if not any(held):
+        return None
     lag = _twists(motion, effects)
     calls = [partial(model.simulate, trial, held, lag) for trial in trials]
     try:

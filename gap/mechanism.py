@@ -403,12 +403,14 @@ class MechanismProblem(InverseModel, GapProblem):
         else:
             model = self
         moved = moved_links(self, nuisances, end.b)
-        gap, series = measure(
+        measured = measure(
             self.scene, effects, moved, model, model is not self, jobs,
             self._is_pushed if model is self else lambda window: False,
         )  # fmt: skip
+        if measured is None:  # In every window something pushes.
+            return None
         rest = unexplained(self, self.in_noise(end.left))
-        return Outcome(gap, series, rest)
+        return Outcome(*measured, rest)
 
 
 def beyond_noise(off: np.ndarray, noise: np.ndarray) -> float:

@@ -1,5 +1,6 @@
 """A person's push is found and told, and bends nothing; what comes back is no push."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -87,6 +88,17 @@ def test_a_push_is_told_with_its_time_joint_and_size(tmp_path):
     # Next to no weight: no row of its joint is more than a deviation off.
     rows = problem.base().reshape(-1, 2)
     assert np.abs(rows[list(push.rows), 0]).max() < 1.0 < np.median(np.abs(rows[:, 0]))
+
+
+def test_where_all_is_pushed_no_window_is_simulated(tmp_path):
+    _, file = recorded(tmp_path, FRICTION, PUSH)
+    problem = MechanismProblem(double(tmp_path), read_recordings([file]))
+    n = problem.nuisances()
+    fitted = SimpleNamespace(b=np.zeros(len(n.prior)), left=problem.base())
+    assert problem.outcome([], fitted, fitted, n) is not None
+    (push,) = problem.pushes
+    problem.pushes = [replace(push, start=-1.0, end=SECONDS + 1.0)]
+    assert problem.outcome([], fitted, fitted, n) is None
 
 
 COMES_BACK = {

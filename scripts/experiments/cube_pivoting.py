@@ -172,6 +172,10 @@ def plot_motion(log: Log, side: float):
             ax.add_patch(Circle(tuple(x[finger]), radius, fc=color))
         ax.axhline(0.0, color="0.3")
         ax.set(title=f"{t:.2f} s", aspect=1, ylim=(-0.02, 2.2 * side))
+    for ax in axes[1]:
+        ax.set_xlabel("x [m]")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("z [m]")
     middle = np.median(log["x"][:, 0])
     axes[0, 0].set_xlim(middle - 2.3 * side, middle + 2.3 * side)
     return figure
