@@ -404,6 +404,35 @@ def test_the_task_travels_pushes_and_waits_for_what_is_not_seen(planner):
     assert task.p[2] > 0.07 and np.hypot(*(task.p[:2] - config.withdrawn)) < 0.01
 
 
+def test_a_tip_that_comes_down_on_the_object_goes_up_and_comes_down_farther_out(
+    planner,
+):
+    shape, config = planner[2], PushConfig()
+    x = state([0.35, 0.0, 0.1], (0.5, 0.0, 0.3))
+    place = places_of(planner)[0][0, :2]
+    in_object = to_object(x, place)
+    outline = outline_at((0.5, 0.0, 0.3))
+    still = np.zeros(3)
+    task = PushState(WAIT, x[P_TIP].copy(), still, still)
+    lowest = []
+    for _ in range(1200):
+        task = next_push(
+            config, task, shape, 0.0125, x, True, in_object, 1, HEIGHT, 0.004
+        )
+        # The object reaches 4 mm farther out than believed.
+        x[P_TIP] = task.p
+        if distance_to_outline(task.p[None, :2], outline)[0] < 0.0195 + 0.0075:
+            x[2] = max(task.p[2], 0.0585)
+        lowest.append(task.p[2])
+        if task.phase == CONTACT:
+            break
+    assert task.phase == CONTACT and x[2] == pytest.approx(HEIGHT, abs=2e-3)
+    assert task.extra == pytest.approx(0.006)  # 4 mm of clearance, and two steps of 3.
+    # It went up after each of the two misses, not along the table.
+    low = np.array(lowest) < 0.03
+    assert np.sum(np.diff(low.astype(int)) == 1) == 3
+
+
 # The loop, without an arm: the model is the world, of smaller steps.
 
 

@@ -20,6 +20,7 @@ from makebreak.systems.numerics.ball_state import (
 )
 from makebreak.systems.numerics.contact_sampling import (
     ObjectShape,
+    inward,
     outline_of,
     rotation_of,
     to_world,
@@ -30,6 +31,10 @@ from makebreak.systems.numerics.contact_sampling import (
 CONTACT, TRAVEL, WAIT = 0, 1, 2
 # A place moves with the object where that is more than noise [m].
 PLACE_CHANGE = 0.008
+# A tip that is so far from a place where it should have arrived has come down on the
+# object, which is larger than believed, or elsewhere: it goes up, and after that comes
+# down so much farther out; not farther than EXTRA_MAX [m].
+MISSED, EXTRA, EXTRA_MAX = 0.01, 0.003, 0.012
 
 
 @dataclass
@@ -55,6 +60,8 @@ class PushState:
     go: int = 0  # The last command of the sampler that was carried out.
     place: np.ndarray | None = None  # (2,) in the world, where it travels to [m].
     unseen_sec: float = 0.0
+    extra: float = 0.0  # Beyond the clearance of a place, for what was hit [m].
+    lifting: bool = False  # Off what was hit.
 
     def __deepcopy__(self, memo) -> "PushState":
         return self  # Nothing in it is changed once it is there.
@@ -135,7 +142,15 @@ def next_push(
             state.p, state.v, goal, outline, distance, up, limits, dt
         )
         return replace(state, p=p, v=v, a=a)
+    if state.lifting:
+        goal = np.array([*state.p[:2], up])
+        p, v, a, arrived = travel_step(
+            state.p, state.v, goal, outline, distance, up, limits, dt
+        )
+        return replace(state, p=p, v=v, a=a, lifting=not arrived)
     now = to_world(x, place)
+    if state.extra > 0.0:
+        now = now - state.extra * inward(now[None], outline)[0]
     held = state.place
     if held is None or np.hypot(*(now - held)) > PLACE_CHANGE:
         held = now
@@ -144,4 +159,10 @@ def next_push(
         state.p, state.v, goal, outline, distance, up, limits, dt
     )
     state = replace(state, p=p, v=v, a=a, place=held, go=go)
-    return replace(state, phase=CONTACT) if arrived and seen else state
+    if not (arrived and seen):
+        return state
+    if np.linalg.norm(x[P_TIP] - goal) > MISSED:
+        extra = min(state.extra + EXTRA, EXTRA_MAX)
+        at_rest = dict(p=x[P_TIP].copy(), v=np.zeros(3), a=np.zeros(3))
+        return replace(state, **at_rest, extra=extra, lifting=True, place=None)
+    return replace(state, phase=CONTACT)
