@@ -1,11 +1,12 @@
 """The systems, in the order in which data flows.
 
 Sensing and estimation   pinhole_camera, camera_shake, noisy_sensor, tool_wrench,
-                         ball_tracker, pose_tracker, state_estimator, tip_state,
-                         contact_detector, mode_detector, contact_anticipator
+                         ball_tracker, pose_tracker, pose_sensor, state_estimator,
+                         tip_state, contact_detector, mode_detector, contact_anticipator
 Modelling                lcs_builder, forward_model
 Adaptation               residual_learner
-Planning                 rolling_task, pivot_target, c3_mpc
+Planning                 rolling_task, push_goals, push_task, contact_sampler,
+                         pivot_target, c3_mpc
 Shaping                  velocity_shaper, variable_impedance
 Control                  arm_reference, impedance_controller, impact_reflex,
                          gravity_left_out
