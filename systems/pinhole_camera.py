@@ -6,6 +6,7 @@ from pydrake.common.value import Value
 from pydrake.geometry import (
     Box,
     Capsule,
+    Convex,
     Cylinder,
     Ellipsoid,
     HalfSpace,
@@ -42,11 +43,12 @@ class PaintedShape:
     kind: int  # Its place in SHAPES of numerics/pinhole.py.
     extent: np.ndarray  # (3,) [m], see `extents` there.
     color: np.ndarray  # (3,) 0..255
+    points: np.ndarray | None = None  # (n, 3) [m] of a convex hull.
 
 
 def painted_shapes(plant: MultibodyPlant, scene_graph: SceneGraph):
-    """The visible primitives of a finalized plant. Meshes are left out; a half-space
-    becomes a wide, thin box.
+    """The visible primitives and convex hulls of a finalized plant. Other meshes are
+    left out; a half-space becomes a wide, thin box.
     """
     inspector = scene_graph.model_inspector()
     shapes = []
@@ -58,6 +60,7 @@ def painted_shapes(plant: MultibodyPlant, scene_graph: SceneGraph):
             X_BG = inspector.GetPoseInFrame(geometry_id)
             shape = inspector.GetShape(geometry_id)
             size: tuple[float, ...]
+            points = None
             match shape:
                 case Sphere():
                     kind, size = "sphere", (shape.radius(),)
@@ -71,6 +74,9 @@ def painted_shapes(plant: MultibodyPlant, scene_graph: SceneGraph):
                     kind, size = "ellipsoid", (shape.a(), shape.b(), shape.c())
                 case HalfSpace():
                     kind, size = "box", (100.0, 100.0, 1e-6)
+                case Convex():
+                    points, X_BG = _centred_hull(shape, X_BG)
+                    kind, size = "box", tuple(2.0 * abs(points).max(axis=0))
                 case _:
                     continue
             properties = inspector.GetPerceptionProperties(geometry_id)
@@ -86,9 +92,19 @@ def painted_shapes(plant: MultibodyPlant, scene_graph: SceneGraph):
                         kind=SHAPES.index(kind),
                         extent=extents(kind, size),
                         color=color,
+                        points=points,
                     )
                 )
     return shapes
+
+
+def _centred_hull(shape: Convex, X_BG: RigidTransform):
+    """The corners (n, 3) of a convex hull about the middle of its extents, and the pose
+    of that in the body."""
+    hull = shape.GetConvexHull()
+    points = np.array([hull.vertex(i) for i in range(hull.num_vertices())])
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
+    return points - middle, X_BG @ RigidTransform(middle)
 
 
 def _pose_if_anchored(plant, context, shape):
@@ -98,7 +114,7 @@ def _pose_if_anchored(plant, context, shape):
 
 class PinholeCamera(LeafSystem):
     """A colour camera without a graphics library: OpenCV paints the plant's spheres,
-    capsules, cylinders, boxes and ellipsoids, far ones first.
+    capsules, cylinders, boxes, ellipsoids and convex hulls, far ones first.
 
     Inputs:  body_poses, abstract, the plant's port of that name.
     Outputs: rgb_image, abstract ImageRgba8U, drawn when it is asked for.
@@ -167,4 +183,6 @@ class PinholeCamera(LeafSystem):
         seen = np.flatnonzero(visible(p, extent, camera))
         for i in seen[np.argsort(-p[seen, 2], kind="stable")]:
             s = shapes[i]
-            draw_visible(picture, camera, s.kind, s.extent, p[i], R[i], s.color)
+            draw_visible(
+                picture, camera, s.kind, s.extent, p[i], R[i], s.color, s.points
+            )

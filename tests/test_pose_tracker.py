@@ -56,7 +56,9 @@ RENDERERS = [
         ),
     ),
 ]
-_photographers = {}
+_photographers: dict = {}
+# A house: 0.14 x 0.1 m, with a gable over +y.
+HOUSE = 0.1 * np.array([[-0.7, -0.5], [0.7, -0.5], [0.7, 0.3], [0.0, 0.8], [-0.7, 0.3]])
 
 
 def shape_of(name, **changes):
@@ -151,6 +153,26 @@ def test_lying_cylinder_is_found(renderer):
         p, yaw = error(find_pose(picture, CAMERA, WEIGHTS, shape, z), pose, 2)
         # A rendered cylinder is dark where its surface is steep.
         assert p < 3e-3 and yaw < 0.03
+
+
+@pytest.mark.parametrize("renderer", RENDERERS)
+def test_convex_mesh_is_drawn_and_found(renderer, tmp_path):
+    path = tmp_path / "house.obj"
+    prism = [(*p, z) for z in (0.0, 0.01) for p in HOUSE]
+    lines = [f"v {x} {y} {z}" for x, y, z in prism]
+    lines += ["f 5 4 3 2 1", "f 6 7 8 9 10"]
+    lines += [f"f {i + 1} {j + 1} {j + 6} {i + 6}" for i, j in zip(
+        range(5), (1, 2, 3, 4, 0), strict=True)]  # fmt: skip
+    path.write_text("\n".join(lines) + "\n")
+    mesh = dict(name="mesh", file=str(path))
+    shape, z = shape_of(**mesh), rest_height(PushedObject("mesh", file=str(path)))
+    assert shape.fold == 1
+    for pose in poses(6):
+        picture = photograph(pose, renderer=renderer, **mesh)
+        found = find_pose(picture, CAMERA, WEIGHTS, shape, z)
+        p, yaw = error(found, pose, 1)
+        # Its sides, 10 mm high, have the colour too, and are dark in VTK's light.
+        assert p < 1.5e-3 and yaw < 0.02
 
 
 @pytest.mark.parametrize("color", [ARM, DARK])

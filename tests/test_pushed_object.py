@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from pydrake.geometry import Box, Convex
 from pydrake.multibody.math import SpatialVelocity
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
@@ -218,6 +219,47 @@ def test_centre_of_mass_is_moved_and_the_inertia_about_it_stays(spec_of, shape):
     np.testing.assert_allclose(
         M.CopyToFullMatrix6(), object_inertia(wrong).CopyToFullMatrix6(), atol=1e-8
     )
+
+
+@pytest.mark.parametrize("shape", [*FLAT, "cylinder"])
+def test_effect_object_size_is_the_scale(spec_of, shape):
+    scene = read_scene(MODELS / "push_object.scene.yaml")
+    for d in scene.directives:
+        if d.add_model is not None and d.add_model.name == "object":
+            d.add_model.file = f"file://{object_file(spec_of(shape))}"
+    scene.effects.append(Effect("object_size", ["object"], {"scale": 1.1}))
+    loaded = load_scene(scene, DiagramBuilder())
+    body, inspector = (
+        loaded.plant.GetBodyByName("object"), loaded.scene_graph.model_inspector()
+    )  # fmt: skip
+    scaled = spec_of(shape, scale=1.1)
+    np.testing.assert_allclose(
+        body.default_spatial_inertia().CopyToFullMatrix6(),
+        object_inertia(scaled).CopyToFullMatrix6(),
+        atol=1e-8,
+    )
+    by_name = {
+        inspector.GetName(g).split("::")[-1]: g
+        for g in loaded.plant.GetCollisionGeometriesForBody(body)
+    }
+    for i, part in enumerate(parts(scaled)):
+        g = by_name[f"part_{i}"]
+        X_BG, shape_now = inspector.GetPoseInFrame(g), inspector.GetShape(g)
+        if isinstance(shape_now, Convex):
+            hull = shape_now.GetConvexHull()
+            now = (
+                X_BG @ np.array([hull.vertex(k) for k in range(hull.num_vertices())]).T
+            )
+            now = now.T
+        elif isinstance(shape_now, Box):
+            half = shape_now.size() / 2.0
+            now = X_BG.translation() + np.array([-half, half])
+        else:
+            continue
+        for end in (np.min, np.max):  # Less SKIN, 0.2 mm.
+            np.testing.assert_allclose(
+                end(now, axis=0), end(part.points, axis=0), atol=3e-4
+            )
 
 
 @pytest.mark.parametrize("shape", FLAT)

@@ -7,6 +7,7 @@ import numpy as np
 from pydrake.geometry import (
     Box,
     Capsule,
+    Convex,
     Cylinder,
     Ellipsoid,
     ProximityProperties,
@@ -93,9 +94,11 @@ def _scaled_shape(shape: Shape, scale: float) -> Shape:
         return type(shape)(s * shape.radius(), s * shape.length())
     if isinstance(shape, Ellipsoid):
         return Ellipsoid(s * shape.a(), s * shape.b(), s * shape.c())
+    if isinstance(shape, Convex):
+        return Convex(shape.source(), s * shape.scale3())
     raise ValueError(
         f"effect object_size cannot scale a {type(shape).__name__}; expected a sphere, "
-        "box, cylinder, capsule or ellipsoid"
+        "box, cylinder, capsule, ellipsoid or convex hull"
     )
 
 

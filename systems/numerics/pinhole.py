@@ -180,9 +180,19 @@ def _visible(p, extent, focal, center, width, height):
     return seen
 
 
-def draw_visible(picture, camera, kind, extent, p, R, color):
-    """As draw, of a shape that `visible` lets through; kind is its place in SHAPES."""
-    corners = _corners(kind, extent, p, R, camera.focal, camera.center)
+def draw_visible(picture, camera, kind, extent, p, R, color, points=None):
+    """As draw, of a shape that `visible` lets through; kind is its place in SHAPES.
+
+    Args: points: (n, 3) [m] whose convex hull the shape is, about p; kind does not
+        count then.
+    """
+    if points is None:
+        corners = _corners(kind, extent, p, R, camera.focal, camera.center)
+    else:
+        kind, corners = BOX, p + points @ R.T
+        corners = (
+            corners[:0] if corners[:, 2].min() <= NEAR else camera.project(corners)
+        )
     if len(corners) == 0:
         return
     if kind != SPHERE:
