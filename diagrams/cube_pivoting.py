@@ -1,7 +1,8 @@
 """A planar cube on a platform, tipped by 90 degrees by two fingers.
 
     plant --x--> lcs --lcs--> c3 --u--> (+ the fingers' weight) --> plant
-            `--> target --x_desired--^
+            |--> target --x_desired--^
+            `--> learner --r_comp----^   (if it adapts)
 
 The world is a scene, simulated by Drake; the planner has a plant of its own, of a scene
 in which friction, mass and size of the cube may be others.
@@ -15,7 +16,7 @@ import numpy as np
 from pydrake.geometry import Box, Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import JointActuatorIndex
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import (
     Adder,
     ConstantVectorSource,
@@ -47,6 +48,7 @@ from makebreak.systems.numerics.pivot_target import (
     corners,
 )
 from makebreak.systems.pivot_target import PivotTarget, PivotTargetConfig
+from makebreak.systems.residual_learner import ResidualLearner, ResidualLearnerConfig
 
 SCENE = str(MODELS / "cube_pivoting.scene.yaml")
 FINGERS = ("left", "right")
@@ -61,7 +63,8 @@ TOUCHES = (
     ("left.finger", ("right.finger",)),
 )
 N_FORCES = sum(len(others) for _, others in TOUCHES)
-LCS_OFFSET, C3_OFFSET = 1e-4, 2e-4  # No value waits for the next period [s].
+# Builders, learner, C3: no value waits for the next period [s].
+LCS_OFFSET, LEARNER_OFFSET, C3_OFFSET = 1e-4, 1.5e-4, 2e-4
 TICK = 0.001  # Of the log of forces [s].
 # 1 / m^2, 1 / rad^2, and the same of velocities: cube x, z, angle; each finger's x, z.
 Q = (2000.0, 2000.0, 200.0, *4 * [50.0], 2.0, 2.0, 0.5, *4 * [5.0])
@@ -94,6 +97,23 @@ class PivotPlanner:
     rate: float = 1.0  # Of the angle that is wanted [rad/s].
 
 
+def _learner() -> ResidualLearnerConfig:
+    """A value for each finger on the cube and one for the corners on the platform.
+
+    A touch that the model misses by a gap velocity g is learned from if its force is
+    above g / (eps |D|^2): with a finger of 0.3 kg, 20 ms and 5 mm (0.25 m/s) from
+    0.2 N on.
+    """
+    return ResidualLearnerConfig(
+        eps=300.0,
+        gamma=2e-4,
+        n_b=10,
+        learning_rate=0.01,
+        n_steps=5,
+        groups=[[0, 1], [2, 3], [4, 5, 6, 7]],
+    )
+
+
 @dataclass
 class CubePivotingConfig:
     seed: int = 0  # Draws the start and the friction.
@@ -105,6 +125,8 @@ class CubePivotingConfig:
     mass_error: float = 1.0
     size_error: float = 1.0
     planner: PivotPlanner = field(default_factory=PivotPlanner)
+    adapt: bool = False  # Residuals on the contacts are learned.
+    learning: ResidualLearnerConfig = field(default_factory=_learner)
     world: str = SCENE
 
 
@@ -264,7 +286,7 @@ def c3_config(planner: PivotPlanner, n_lam: int) -> C3Config:
         projection=PlusProjection() if planner.projection == "plus" else QpProjection(),
         options=planner.options,
         bounds=C3Bounds(u_lower=-u_max, u_upper=u_max),
-        residual_dt_sec=planner.dt_sec,
+        residual_dt_sec=planner.period_sec,
     )
 
 
@@ -275,7 +297,8 @@ def make_cube_pivoting(
 
     Outputs: x (14,) the plant's state, as in numerics/pivot_target.py; u (4,) what the
         planner asks of the fingers' slides [N]; touches (24,), of each of TOUCHES what
-        ContactProbe tells, which force_log has every TICK; c3_status (1,).
+        ContactProbe tells, which force_log has every TICK; c3_status (1,); r_comp (10,)
+        [m/s], zero without adaptation.
 
     Raises: ValueError for a number out of range, or a scene of other joints.
     """
@@ -316,6 +339,12 @@ def make_cube_pivoting(
     builder.Connect(zero.get_output_port(), lcs.GetInputPort("u"))
     builder.Connect(target.GetOutputPort("x_desired"), c3.GetInputPort("x_desired"))
     builder.Connect(lcs.GetOutputPort("lcs"), c3.GetInputPort("lcs"))
+    if c.adapt:
+        r_comp = _add_learner(builder, c, model, believed.friction, x, u)
+    else:
+        none = ConstantVectorSource(np.zeros(lcs.model.n_lam))
+        r_comp = builder.AddNamedSystem("no_residual", none).get_output_port()
+    builder.Connect(r_comp, c3.GetInputPort("r_comp"))
     if p.lcs_along_plan:
         builder.Connect(c3.GetOutputPort("plan"), lcs.GetInputPort("plan"))
     effort = builder.AddNamedSystem("effort", Adder(2, 4))
@@ -346,9 +375,38 @@ def make_cube_pivoting(
     builder.ExportOutput(u, "u")
     builder.ExportOutput(touches, "touches")
     builder.ExportOutput(c3.GetOutputPort("status"), "c3_status")
+    builder.ExportOutput(r_comp, "r_comp")
     diagram = builder.Build()
     diagram.set_name("cube_pivoting")
     return diagram
+
+
+def _add_learner(builder, config, model, friction, x, u) -> OutputPort:
+    """The r_comp of a learner on LCS of one period, about each measured state."""
+    period = config.planner.period_sec
+    contacts = contact_pairs(friction)
+    lcs = builder.AddNamedSystem(
+        "lcs_of_learner",
+        AnitescuLcsBuilder(
+            model,
+            LcsBuilderConfig(
+                contacts, period, period_sec=period, offset_sec=LCS_OFFSET
+            ),
+        ),
+    )
+    zero = builder.GetSubsystemByName("u_of_lcs")
+    initial = lcs.model.build(lcs.model.x_default, np.zeros(4))
+    learner = builder.AddNamedSystem(
+        "learner",
+        ResidualLearner(config.learning, initial, period, LEARNER_OFFSET),
+    )
+    builder.Connect(x, lcs.GetInputPort("x"))
+    builder.Connect(zero.get_output_port(), lcs.GetInputPort("u"))
+    builder.Connect(x, learner.GetInputPort("x"))
+    # Until C3's next update this is what acted since its last one.
+    builder.Connect(u, learner.GetInputPort("u_measured"))
+    builder.Connect(lcs.GetOutputPort("lcs"), learner.GetInputPort("lcs"))
+    return learner.GetOutputPort("r_comp")
 
 
 def _check_joints(plant: MultibodyPlant) -> None:

@@ -139,6 +139,36 @@ def test_a_cube_is_pivoted_gently():
     assert diagram.GetOutputPort("c3_status").Eval(context) == [0.0]
 
 
+@pytest.mark.parametrize("size_error", [0.9, 1.1])
+def test_the_learner_finds_how_much_too_near_or_far_the_faces_are(size_error):
+    """Each is wrong by half the error of the side, 5 mm."""
+    config = CubePivotingConfig(seed=0, size_error=size_error, adapt=True)
+    diagram, context = simulated(config, 1.0)
+    gap = config.planner.period_sec * diagram.GetOutputPort("r_comp").Eval(context)
+    _, force = logged_forces(diagram, context)
+    truth = 0.05 * (size_error - 1.0)
+    # The left finger pushes, and is felt to a millimetre: it moves 1 mm in a period.
+    assert force[-1, 0] > 0.3
+    np.testing.assert_allclose(gap[:2], truth, atol=1e-3)
+    # Corners: 5 mm as it stands, and more by and by as it turns to stand on an edge.
+    assert np.ptp(gap[4:8]) == 0.0 and 0.9 < gap[4] / truth < np.sqrt(2.0)
+    assert (gap[8:] == 0.0).all()  # No finger on the platform.
+
+
+def test_a_cube_modelled_too_small_is_tipped_sooner_with_the_learner():
+    config = CubePivotingConfig(seed=3, size_error=0.9)
+    angles = []
+    for adapt in (False, True):
+        diagram, context = simulated(replace(config, adapt=adapt), 3.0)
+        angles.append(diagram.GetOutputPort("x").Eval(context)[THETA])
+    assert angles[0] < 0.5 and abs(angles[1] - np.pi / 2) < experiment.ANGLE_BOUND
+
+
+def test_without_adaptation_there_is_no_residual():
+    diagram, context = simulated(CubePivotingConfig(size_error=0.9), 0.2)
+    assert (diagram.GetOutputPort("r_comp").Eval(context) == 0.0).all()
+
+
 def test_fingers_are_asked_for_no_more_than_force_max():
     config = CubePivotingConfig(seed=3, planner=PivotPlanner(force_max=0.2))
     diagram = make_cube_pivoting(config)
@@ -272,12 +302,13 @@ def test_meshcat_shows_cube_and_fingers():
 
 def test_command_line_writes_result_recording_and_model(tmp_path, capsys):
     out = tmp_path / "a"
-    words = ["--set", "planner.rate=1.5", "size=0.9", "mass_error=1.1"]
+    words = ["--set", "planner.rate=1.5", "size=0.9", "mass_error=1.1", "adapt=true"]
     arguments = ["run", "cube_pivoting", "--no-meshcat", "--seed", "3", *words]
     assert main([*arguments, "--out", str(out), "--duration", "3"]) == 0
     result = json.loads((out / "result.json").read_text())
     assert result["success"] and result["plans_failed"] == 0
     assert 1.0 < result["time_to_goal_s"] < 2.5
+    assert 0.0 < abs(result["residual_corners_m"]) < 1e-3
     for name in ("pivot.png", "motion.png"):
         assert (out / name).stat().st_size > 10_000
     head = (out / "recording.csv").read_text().splitlines()[0]

@@ -30,6 +30,7 @@ from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Log, Session, run_many
 from makebreak.scripts.sweep import rate_text
 from makebreak.scripts.table import Table
+from makebreak.scripts.trials import setting_texts
 from makebreak.systems.c3_mpc import C3Status
 from makebreak.systems.numerics.pivot_target import LEFT, N_X, RIGHT, THETA, corners
 from makebreak.systems.pivot_target import PivotTargetConfig
@@ -44,6 +45,8 @@ ANGLE_BOUND, PLACE_BOUND = 0.1, 0.02  # [rad], [m]
 SPEED_BOUND, TURN_BOUND = 0.02, 0.2  # Of a cube at rest [m/s], [rad/s].
 FORCE_BOUND = 40.0  # [N]
 LOST = 0.4  # The platform's end [m].
+# Of whose contact with the cube, or the platform, a residual is told.
+RESIDUALS = ("left", "right", "corners")
 
 
 def run(config: CubePivotingConfig, session: Session) -> dict:
@@ -53,7 +56,10 @@ def run(config: CubePivotingConfig, session: Session) -> dict:
     log = session.simulate(
         diagram,
         DURATION,
-        {name: diagram.GetOutputPort(name) for name in ("x", "u", "c3_status")},
+        {
+            name: diagram.GetOutputPort(name)
+            for name in ("x", "u", "c3_status", "r_comp")
+        },
         period_sec=SAMPLE,
         until=lambda t, values: (
             "the cube has left the platform" if abs(values["x"][0]) > LOST else ""
@@ -64,7 +70,12 @@ def run(config: CubePivotingConfig, session: Session) -> dict:
     side = world_cube(config).side
     result = score(log, time, force, side)
     result["friction"] = world_cube(config).friction
-    session.save_plot(plot_run(log, time, force), "pivot")
+    gap = config.planner.period_sec * log["r_comp"][:, ::2]  # [m]
+    for i, name in enumerate(RESIDUALS):
+        result[f"residual_{name}_m"] = float(gap[-1, i])
+    session.save_plot(
+        plot_run(log, time, force, gap if config.adapt else None), "pivot"
+    )
     session.save_plot(plot_motion(log, side), "motion")
     columns = with_noise(recorded(diagram, log.context), config.seed)
     session.write_recording(columns, scene_with(config.world, model_cube(config)))
@@ -130,9 +141,12 @@ def time_to_stay(time, error, bound) -> float | None:
     return float(time[above[-1] + 1]) if above[-1] + 1 < len(time) else None
 
 
-def plot_run(log: Log, time, force):
-    """Angle, inputs and forces over time."""
-    figure, axes = plt.subplots(3, 1, figsize=(8, 8), sharex=True, layout="constrained")
+def plot_run(log: Log, time, force, gap=None):
+    """Angle, inputs and forces over time, and the learned gaps (n, 3 or more) [m]."""
+    rows = 3 if gap is None else 4
+    figure, axes = plt.subplots(
+        rows, 1, figsize=(8, 2.7 * rows), sharex=True, layout="constrained"
+    )
     axes[0].plot(log.time, np.degrees(log["x"][:, THETA]))
     axes[0].axhline(np.degrees(GOAL), color="0.5", ls=":")
     axes[0].set(ylabel="cube [degrees]")
@@ -148,7 +162,12 @@ def plot_run(log: Log, time, force):
         if force[:, i].any():
             axes[2].plot(time, force[:, i], label=name)
     axes[2].axhline(FORCE_BOUND, color="0.5", ls=":")
-    axes[2].set(ylabel="force [N]", xlabel="time [s]")
+    axes[2].set(ylabel="force [N]")
+    if gap is not None:
+        for i, name in enumerate(RESIDUALS):
+            axes[3].plot(log.time, 1e3 * gap[:, i], label=name)
+        axes[3].set(ylabel="learned gap [mm]")
+    axes[-1].set(xlabel="time [s]")
     for ax in axes[1:]:
         ax.legend()
     return figure
@@ -181,35 +200,44 @@ def plot_motion(log: Log, side: float):
     return figure
 
 
-# What is compared: settings, and whether all starts are to succeed.
-VARIANTS: dict[str, tuple[dict, bool | None]] = {
-    "as it is": ({}, True),
-    "QP projection in place of C3+": ({"planner.projection": "qp"}, None),
-    "not polished": ({"planner.options.polish": 0}, None),
-    "an LCS for each knot along the plan": ({"planner.lcs_along_plan": True}, None),
-    "6 knots": ({"planner.options.N": 6}, None),
-    "15 knots": ({"planner.options.N": 15}, None),
-    "twice as heavy": ({"mass": 0.8}, None),
-    "half as heavy": ({"mass": 0.2}, None),
-    "0.8 of the size": ({"size": 0.8}, None),
-    "friction 0.3": ({"start.friction": [0.3, 0.3]}, None),
-    "modelled with half the mass": ({"mass_error": 0.5}, None),
-    "modelled with twice the mass": ({"mass_error": 2.0}, None),
-    "modelled with half the friction": ({"friction_error": 0.5}, None),
-    "modelled with twice the friction": ({"friction_error": 2.0}, None),
-    "modelled 10 % too small": ({"size_error": 0.9}, None),
-    "modelled 10 % too large": ({"size_error": 1.1}, None),
-}
+def _variants() -> dict[str, dict]:
+    """What is compared: name -> settings."""
+    found: dict[str, dict] = {
+        "as it is": {},
+        "adapting": {"adapt": True},
+        "QP projection in place of C3+": {"planner.projection": "qp"},
+        "polished with 3 rollouts, not 10": {"planner.options.polish": 3},
+        "not polished": {"planner.options.polish": 0},
+        "an LCS for each knot along the plan": {"planner.lcs_along_plan": True},
+        "6 knots": {"planner.options.N": 6},
+        "15 knots": {"planner.options.N": 15},
+        "twice as heavy": {"mass": 0.8},
+        "half as heavy": {"mass": 0.2},
+        "0.8 of the size": {"size": 0.8},
+        "friction 0.3": {"start.friction": [0.3, 0.3]},
+    }
+    for what, settings in {
+        "10 % too small": {"size_error": 0.9},
+        "10 % too large": {"size_error": 1.1},
+        "half as heavy": {"mass_error": 0.5},
+        "twice as heavy": {"mass_error": 2.0},
+        "with half the friction": {"friction_error": 0.5},
+        "with twice the friction": {"friction_error": 2.0},
+    }.items():
+        found[f"modelled {what}"] = settings
+        found[f"modelled {what}, adapting"] = {**settings, "adapt": True}
+    return found
+
+
+VARIANTS = _variants()
 
 
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     """How many starts succeed, as it is and with each thing changed."""
-    runs = [
-        (settings, seed) for settings, _ in VARIANTS.values() for seed in range(seeds)
-    ]
+    runs = [(settings, seed) for settings in VARIANTS.values() for seed in range(seeds)]
     found = run_many("cube_pivoting", runs, jobs, session.out_dir, reuse=session.reuse)
     rows, met = [], []
-    for i, (what, (settings, all_wanted)) in enumerate(VARIANTS.items()):
+    for i, (what, settings) in enumerate(VARIANTS.items()):
         results = found[i * seeds : (i + 1) * seeds]
         count = sum(bool(r.get("success")) for r in results)
         times = [r["time_to_goal_s"] for r in results if r.get("success")]
@@ -219,11 +247,11 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
             text += f"; {np.median(times):.1f} s"
         if forces:
             text += f"; at most {max(forces):.0f} N"
-        words = " ".join(f"{key}={value}" for key, value in settings.items())
+        words = " ".join(setting_texts(settings)).replace(", ", ",")
         command = "makebreak run cube_pivoting --seed S"
-        command += f" --set {words}".replace(" [", "[") if words else ""
-        rows.append((what, "-", text, command.replace(", ", ",")))
-        met.append(count == len(results) if all_wanted else None)
+        command += f" --set {words}" if words else ""
+        rows.append((what, "-", text, command))
+        met.append(None if settings else count == len(results))
     return Table(
         "A cube tipped by 90 degrees: starts that succeed, median time, largest force",
         ("what", "paper", "ours", "command"),
