@@ -20,7 +20,10 @@ from gap_benchmark.robots import Robot, to_mjcf, to_urdf
 
 G = 9.81  # [m/s2]
 STEP, DRAKE_STEP = 1e-4, 2.5e-4  # [s]
-IMPEDANCE = 0.01  # So small that MuJoCo's contact is a spring of known stiffness.
+# So small that contacts are springs of known stiffness. MuJoCo divides it by
+# 1 - i + i r, where r is how much easier the point is to move than it is taken for (at
+# the tip of a rod: 8).
+IMPEDANCE = 0.001
 MODULUS = 2e7  # [Pa] of compliant hydroelastic shapes.
 STUCK = 1e-3  # [m] over which what adheres holds on.
 
