@@ -364,7 +364,7 @@ def make_cube_pivoting(
         {"effort": (effort.get_output_port(), efforts)},
     )
     if meshcat is not None:
-        meshcat.SetCameraPose([0.0, -0.7, 0.18], [0.0, 0.0, 0.07])
+        meshcat.SetCameraPose([0.05, -0.45, 0.16], [-0.02, 0.0, 0.06])
         MeshcatVisualizer.AddToBuilder(
             builder,
             loaded.scene_graph,

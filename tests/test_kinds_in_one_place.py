@@ -23,6 +23,9 @@ KNOWN = {
         "contact_friction", "object_size", "rolling_resistance"
     },
     "diagrams/cube_pivoting.py": {"contact_friction", "object_mass", "object_size"},
+    "diagrams/push_object.py": {
+        "contact_friction", "object_com", "object_mass", "object_size"
+    },
     "diagrams/realism.py": {"joint_offset", "plane_tilt"},
     "diagrams/station.py": {"joint_viscous_damping"},
     "diagrams/tabletop.py": {"contact_friction", "contact_stiffness"},
