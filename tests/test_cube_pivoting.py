@@ -169,6 +169,28 @@ def test_without_adaptation_there_is_no_residual():
     assert (diagram.GetOutputPort("r_comp").Eval(context) == 0.0).all()
 
 
+def test_a_plan_is_made_of_the_state_and_the_lcs_of_its_own_instant():
+    diagram, context = simulated(CubePivotingConfig(seed=3), 0.3005)
+    (x, plan, lcs) = (
+        port.Eval(system.GetMyContextFromRoot(context))
+        for system, port in (
+            (system, system.GetOutputPort(name))
+            for system, name in (
+                (diagram.GetSubsystemByName("plant"), "state"),
+                (diagram.GetSubsystemByName("c3"), "plan"),
+                (diagram.GetSubsystemByName("lcs"), "lcs"),
+            )
+        )
+    )
+    assert plan.time == pytest.approx(0.3 + 2e-4) and abs(x[7:]).max() > 1e-3
+    np.testing.assert_array_equal(plan.x[0], x)
+    model = diagram.GetSubsystemByName("lcs").model
+    np.testing.assert_array_equal(lcs.phi, model.build(x, np.zeros(4)).phi)
+    # A polished plan is the rollout of its inputs, so C3 had this LCS.
+    x_next, _ = simulate(lcs, x, plan.u[0])
+    np.testing.assert_allclose(plan.x[1], x_next, atol=1e-9)
+
+
 def test_fingers_are_asked_for_no_more_than_force_max():
     config = CubePivotingConfig(seed=3, planner=PivotPlanner(force_max=0.2))
     diagram = make_cube_pivoting(config)
