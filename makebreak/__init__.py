@@ -42,6 +42,13 @@ _EXPORTS = {
     "ContactAnticipatorConfig": "systems.contact_anticipator",
     "VelocityShaper": "systems.velocity_shaper",
     "VelocityShaperConfig": "systems.velocity_shaper",
+    "ContactSampler": "systems.contact_sampler",
+    "ContactSamplerConfig": "systems.contact_sampler",
+    "PoseTracker": "systems.pose_tracker",
+    "PoseTrackerConfig": "systems.pose_tracker",
+    "Marker": "systems.pose_tracker",
+    "PushedObject": "models.pushed_object",
+    "make_tip_and_object": "models.pushed_object",
     "ImpedanceController": "systems.impedance_controller",
     "ImpedanceConfig": "systems.impedance_controller",
 }

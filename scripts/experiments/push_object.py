@@ -212,7 +212,7 @@ def score(config, diagram, log, truth, goals, force):
         "time_loose_s": [goal.loose_sec for goal in goals],
         "position_error_m": [float(goal.error[0]) for goal in goals],
         "yaw_error_rad": [float(goal.error[1]) for goal in goals],
-        "places_touched": int(touches.max()) if touches.size else 0,
+        "places_chosen": int(touches.max()) if touches.size else 0,
         "contact_force_peak_N": peak,
         **{f"{name}_share_max": value for name, value in shares.items()},
         "tilt_max_rad": float(truth.tilt.max()),
