@@ -44,6 +44,7 @@ from makebreak.systems.numerics.contact_sampling import (
     score_within,
     to_object,
     to_world,
+    travel_length,
     travel_step,
     way_is_free,
 )
@@ -349,6 +350,56 @@ def test_places_out_of_reach_are_not_looked_at(planner):
     )  # fmt: skip
     assert len(found.places) > 4
     assert (np.hypot(*found.places.T) <= 0.78).all()
+
+
+def test_the_way_through_the_air_has_its_price_but_not_for_a_tip_that_pushes(planner):
+    model, problem, shape = planner
+    x = state([0.35, 0.0, 0.024], (0.5, 0.0, 0.3))
+    x_desired = target(x, [0.55, 0.02, 0.6], problem.options.N + 1)
+
+    def cost(travel, in_contact):
+        memory, found = sample_round(
+            SamplingConfig(travel=travel), SamplingMemory(), model.build_many, problem,
+            shape, x, x_desired, 0.1, in_contact, 0.0,
+        )  # fmt: skip
+        return found
+
+    free, paid = cost(0.0, False), cost(20.0, False)
+    outline = outline_at((0.5, 0.0, 0.3))
+    up = shape.clear_height(0.0)
+    way = [
+        travel_length(x[P_TIP], np.array([*place, HEIGHT]), outline, 0.0235, up)
+        for place in paid.places[1:]
+    ]
+    np.testing.assert_allclose(paid.cost[1:] - free.cost[1:], 20.0 * np.array(way))
+    # Over the object: up 55.5 mm, across, and down; beside it the straight way.
+    behind = int(np.argmax(paid.places[1:, 0]))
+    across = np.hypot(*(paid.places[1 + behind] - x[:2]))
+    assert way[behind] == pytest.approx(across + 2 * (0.04 + 0.0195 - HEIGHT))
+    beside = int(np.argmin(way))
+    assert way[beside] == pytest.approx(
+        np.hypot(*(paid.places[1 + beside] - x[:2])), abs=1e-9
+    )
+    assert cost(20.0, True).cost[0] == cost(0.0, True).cost[0]
+
+
+def test_a_learned_gap_counts_in_every_plan(planner):
+    model, problem, shape = planner
+    x, _ = places_of(planner)
+    x_desired = target(x[0], [0.55, 0.02, 0.6], problem.options.N + 1)
+    r = np.zeros(model.n_lam)
+
+    def best(gap):
+        r[:4] = gap / model.dt_sec
+        _, found = sample_round(
+            SamplingConfig(), SamplingMemory(), model.build_many, problem, shape, x[0],
+            x_desired, 0.1, False, 0.0, r,
+        )  # fmt: skip
+        return found.cost.min()
+
+    # An object that begins 30 mm farther away than seen is reached too late to be moved
+    # as far in half a second.
+    assert best(0.03) > 1.3 * best(0.0)
 
 
 # The task.
