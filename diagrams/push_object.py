@@ -5,7 +5,8 @@
     state_estimator --x--> push_goals --goal--> push_task, contact_sampler
     push_task --x_desired--> c3_mpc, contact_sampler
     contact_sampler --command (where to touch)--> push_task
-    lcs_learn --> residual_learner --r_comp--> c3_mpc, contact_sampler
+    pose_sensor, state_estimator --> past_state --> lcs_learn, residual_learner
+    residual_learner --r_comp--> c3_mpc, contact_sampler
     c3_mpc (contact), push_task (travel) --> arm_reference
     arm_reference --> impedance_controller --tau--> station
 
@@ -74,6 +75,7 @@ from makebreak.systems.numerics.c3_mpc import (
 )
 from makebreak.systems.numerics.contact_sampling import ObjectShape
 from makebreak.systems.numerics.pose_tracker import make_shape
+from makebreak.systems.past_state import PastState, PastStateConfig
 from makebreak.systems.pose_sensor import PoseSensor, PoseSensorConfig
 from makebreak.systems.pose_tracker import PoseTracker, PoseTrackerConfig
 from makebreak.systems.push_goals import PushGoals, PushGoalsConfig, draw_poses
@@ -94,8 +96,8 @@ ESTIMATE, LEARN, ARM_TICK = CONTROL / 3.0, 0.05, 0.001
 # the millisecond between two steps of the plant. The sampler's choice and the residual
 # are a tick old where they are used.
 OFFSET = dict(
-    sensor=1e-4, estimator=2e-4, goals=2.5e-4, task=3e-4, lcs=3e-4, learner=3.5e-4,
-    sampler=3.5e-4, c3=4e-4, reference=4.5e-4, impedance=7e-4,
+    sensor=1e-4, estimator=2e-4, goals=2.5e-4, past=2.5e-4, task=3e-4, lcs=3e-4,
+    learner=3.5e-4, sampler=3.5e-4, c3=4e-4, reference=4.5e-4, impedance=7e-4,
 )  # fmt: skip
 PLAN_DT, TIP_MASS, N_TIP = 0.1, 1.0, 4  # N_TIP: forces of tip and object, the first.
 
@@ -118,16 +120,18 @@ class PushPlannerConfig:
 class PushLearnerConfig:
     """Of the residual on the contact of tip and object, as in ball_rolling.
 
-    The pose is a few hundredths of a second old when a push sets in: the tip seems to
-    be up to 5 mm within the object. Over a step of 50 ms that is 0.08 m/s, of which the
-    weights are the inverse variance: nothing is to be learned from the lag.
+    The weights Q_d are inverse variances of a speed over a step of 50 ms: of v_x, v_y
+    of the object and of the tip, which a gap that is wrong moves too. The pose of a
+    past moment (PastState) is good to 0.8 mm, which is 16 mm/s. The present one, all
+    that there is with the camera, is a few hundredths of a second old when a push sets
+    in: the tip seems to be up to 5 mm within the object, 0.08 m/s.
     """
 
-    weight_object: float = 150.0  # Q_d of the object's v_x, v_y.
-    weight_tip: float = 150.0  # And of the tip's v_x, v_y.
+    weight: float = 4e3
+    weight_late: float = 150.0
     eps: float = 1e-3
     gamma: float = 5e-4
-    r_max: float = 0.2  # [m/s]: 10 mm.
+    r_max: float = 0.3  # [m/s]: 15 mm.
     slip_noise: float = 0.03  # [m/s]
     posterior: PosteriorConfig = field(
         default_factory=lambda: PosteriorConfig(
@@ -264,6 +268,11 @@ def model_scene(config: PushObjectConfig, file: str | Path) -> Scene:
     return scene
 
 
+def rolling_axis(spec: PushedObject) -> list[float]:
+    """About which the object rolls, in its frame; empty: it lies flat."""
+    return [1.0, 0.0, 0.0] if spec.shape == "cylinder" else []
+
+
 def contact_pairs(spec: PushedObject, friction: float) -> list[ContactPair]:
     """Tip and object, then each of the object's supports on the table."""
     n = len(support_spheres(spec)[0])
@@ -306,10 +315,14 @@ def c3_config(planner: PushPlannerConfig, n_lam: int) -> C3Config:
     )  # fmt: skip
 
 
-def learner_config(learner: PushLearnerConfig) -> ResidualLearnerConfig:
+def learner_config(learner: PushLearnerConfig, late: bool) -> ResidualLearnerConfig:
+    """Args: late: whether the learner sees the present pose, not a past one."""
+    weight = learner.weight_late if late else learner.weight
+    if not weight >= 0.0:
+        name = "weight_late" if late else "weight"
+        raise ValueError(f"learning.{name} is {weight}, expected >= 0")
     Q_d = np.zeros(N_X)
-    Q_d[[V_TIP.start, V_TIP.start + 1]] = learner.weight_tip
-    Q_d[[V_BALL.start, V_BALL.start + 1]] = learner.weight_object
+    Q_d[[V_TIP.start, V_TIP.start + 1, V_BALL.start, V_BALL.start + 1]] = weight
     return ResidualLearnerConfig(
         Q_d=Q_d.tolist(),
         eps=learner.eps,
@@ -352,7 +365,7 @@ def _add_sensor(
             replace(
                 config.pose,
                 height=height,
-                rolling_axis=[1.0, 0.0, 0.0] if spec.shape == "cylinder" else [],
+                rolling_axis=rolling_axis(spec),
                 offset_sec=offset,
             ),
             int(plant.GetBodyByName(OBJECT).index()),
@@ -517,22 +530,37 @@ def make_push_object(
     connect(station, f"{ARM}.position_measured", estimator, "q")
     connect(station, f"{ARM}.velocity_measured", estimator, "v")
     connect(station, f"{ARM}.torque_measured", estimator, "torque")
-    for one in lcs.values():
-        connect(estimator, "x", one, "x")
+    past = estimator
+    if config.adapt and sensor.HasOutputPort("readings"):
+        past = builder.AddNamedSystem(
+            "past_state",
+            PastState(
+                PastStateConfig(
+                    height=height, period_sec=LEARN, offset_sec=OFFSET["past"]
+                ),
+                rolling_axis(spec) or np.zeros(3),
+            ),
+        )
+        connect(estimator, "x", past, "x")
+        connect(estimator, "u_measured", past, "u_measured")
+        connect(sensor, "readings", past, "readings")
+    for name, one in lcs.items():
+        connect(past if name == "learn" else estimator, "x", one, "x")
         builder.Connect(no_force.get_output_port(), one.GetInputPort("u"))
     if config.adapt:
         learner = builder.AddNamedSystem(
             "residual_learner",
             ResidualLearner(
-                learner_config(config.learning),
+                learner_config(config.learning, late=past is estimator),
                 at_default["learn"],
                 LEARN,
                 OFFSET["learner"],
             ),
         )
-        connect(estimator, "x", learner, "x")
-        connect(estimator, "u_measured", learner, "u_measured")
-        connect(estimator, "window_valid", learner, "enable")
+        connect(past, "x", learner, "x")
+        connect(past, "u_measured", learner, "u_measured")
+        ready = "window_valid" if past is estimator else "ready"
+        connect(past, ready, learner, "enable")
         connect(lcs["learn"], "lcs", learner, "lcs")
         r_comp = learner.GetOutputPort("r_comp")
         if meshcat is not None:

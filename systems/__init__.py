@@ -1,8 +1,9 @@
 """The systems, in the order in which data flows.
 
 Sensing and estimation   pinhole_camera, camera_shake, noisy_sensor, tool_wrench,
-                         ball_tracker, pose_tracker, pose_sensor, state_estimator,
-                         tip_state, contact_detector, mode_detector, contact_anticipator
+                         ball_tracker, pose_tracker, pose_sensor, past_state,
+                         state_estimator, tip_state, contact_detector,
+                         mode_detector, contact_anticipator
 Modelling                lcs_builder, forward_model
 Adaptation               residual_learner
 Planning                 rolling_task, push_goals, push_task, contact_sampler,

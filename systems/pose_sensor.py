@@ -18,6 +18,8 @@ from makebreak.systems.numerics.pose_filter import (
 )
 from makebreak.systems.numerics.timing import timed
 
+KEPT = 16  # Readings.
+
 
 @dataclass
 class PoseSensorConfig:
@@ -41,7 +43,8 @@ class PoseSensor(LeafSystem):
 
     Inputs:  body_poses (abstract, of a MultibodyPlant).
     Outputs: p_WB (3,) [m]; q_WB (4,) [w x y z]; v_WB (3,) [m/s]; w_WB (3,) [rad/s];
-             seen (1,): 1 when there has been a reading.
+             seen (1,): 1 when there has been a reading; readings (abstract): the last
+             KEPT that are known, as they were measured: (time [s], p (3,), q (4,)).
 
     Args: config; body, its index in body_poses; seed of the noise.
     """
@@ -76,6 +79,8 @@ class PoseSensor(LeafSystem):
         ):
             self.DeclareVectorOutputPort(name, size, self._calc(i), ticket)
         self.DeclareVectorOutputPort("seen", 1, self._calc_seen, ticket)
+        self._known = self.DeclareAbstractState(Value[object](()))
+        self.DeclareStateOutputPort("readings", self._known)
         self.DeclarePeriodicUnrestrictedUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
@@ -94,8 +99,10 @@ class PoseSensor(LeafSystem):
         )
         late = context.get_abstract_state(int(self._late)).get_value() + (reading,)
         pose = context.get_abstract_state(int(self._pose)).get_value()
+        known = context.get_abstract_state(int(self._known)).get_value()
         std = np.maximum(c.noise, 1e-6)  # A filter of no noise at all divides by it.
         while late and late[0][0] <= t - c.delay_sec + 1e-9:
+            known = (*known, late[0])[-KEPT:]
             (at, p, q), late = late[0], late[1:]
             if pose is None:
                 pose = first_pose(at, p, q, std, (0.1, 1.0))
@@ -103,6 +110,7 @@ class PoseSensor(LeafSystem):
                 pose = corrected(predicted(pose, at, c.density), p, q, std)
         state.get_mutable_abstract_state(int(self._late)).set_value(late)
         state.get_mutable_abstract_state(int(self._pose)).set_value(pose)
+        state.get_mutable_abstract_state(int(self._known)).set_value(known)
 
     def _pose_of(self, context) -> PoseEstimate | None:
         """The filter's, of the last reading that is known."""
