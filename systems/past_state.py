@@ -85,7 +85,8 @@ class PastState(LeafSystem):
         discrete.set_value(int(self._ready), [0.0 if pose is None else 1.0])
         if pose is None:
             return
-        p, v, q, w = on_the_table(0.0, *pose, c.height, self._axis)
+        p, v, q, w = pose
+        p, v, q, w = on_the_table(0.0, p, v, q, w, c.height, self._axis)
         past = np.zeros(N_X)
         past[P_TIP], past[V_TIP] = p_tip, v_tip
         past[P_BALL], past[V_BALL], past[Q_BALL], past[W_BALL] = p, v, q, w
