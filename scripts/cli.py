@@ -115,12 +115,11 @@ def _config(module, args: argparse.Namespace):
         config = module.Config()
     else:
         config = load_config(module.Config, Path(args.config))
-    fields = {f.name for f in dataclasses.fields(config)}
     for option in ("world", "model"):
         text = getattr(args, option)
         if text is None:
             continue
-        if option not in fields:
+        if not isinstance(getattr(config, option, None), str):
             raise ValueError(f"--{option}: {args.experiment} has no {option} scene")
         path = _scene(text, f"--{option}")
         config = dataclasses.replace(config, **{option: path})
@@ -156,7 +155,7 @@ def _with_faults(config, texts: Sequence[str], experiment: str):
 def _inputs(args, config) -> list[str]:
     """The files that a run reads."""
     scenes = [getattr(config, name, None) for name in ("world", "model")]
-    return [str(path) for path in (args.config, *scenes) if path]
+    return [path for path in (args.config, *scenes) if isinstance(path, str) and path]
 
 
 def _default_out(name: str) -> Path:

@@ -22,6 +22,7 @@ from makebreak.diagrams.push_object import (
 from makebreak.models.pushed_object import PushedObject, object_inertia, object_sdf
 from makebreak.models.scene import load_scene, read_scene
 from makebreak.models.scene_file import write_scene
+from makebreak.scripts.cli import main
 from makebreak.scripts.experiments import push_object as experiment
 from makebreak.scripts.experiments.push_object import (
     GOALS,
@@ -252,3 +253,9 @@ def test_only_what_is_wrong_is_an_effect_of_the_model(tmp_path):
     kinds = [e.kind for e in model_scene(config, tmp_path / "object.sdf").effects]
     assert kinds.count("object_mass") == 1
     assert diagrams.believed_object(config)[0].mass == pytest.approx(0.8)
+
+
+def test_model_is_no_scene_here_and_says_so(capsys, tmp_path):
+    words = ["run", "push_object", "--model", "scene.yaml", "--out", str(tmp_path)]
+    assert main(words) == 2
+    assert "--model: push_object has no model scene" in capsys.readouterr().err
