@@ -622,6 +622,7 @@ def make_push_object(
         )
         connect(goals, "goal", view, "goal")
         connect(estimator, "x", view, "x")
+        connect(estimator, "valid", view, "valid")
     diagram = builder.Build()
     diagram.set_name("push_object")
     return diagram

@@ -23,7 +23,7 @@ class PushView(LeafSystem):
     as it is estimated (blue), both as ghosts, and its track since the last goal.
 
     Inputs: goal (3,) = x, y [m], yaw [rad]; x (19,) of numerics/ball_state.py, the
-            estimate.
+            estimate; valid (1,): above 0.5 where it is one.
     """
 
     GOAL, MODEL, TRACK = "/makebreak/goal", "/makebreak/model", "/makebreak/track"
@@ -42,13 +42,14 @@ class PushView(LeafSystem):
         self._config, self._meshcat = config, meshcat
         self._goal = self.DeclareVectorInputPort("goal", 3)
         self._x = self.DeclareVectorInputPort("x", N_X)
+        self._valid = self.DeclareVectorInputPort("valid", 1)
         # The goal that it belongs to, and the points (n, 3).
         self._track = self.DeclareAbstractState(
             AbstractValue.Make((np.full(3, np.nan), np.zeros((0, 3))))
         )
         meshcat.SetProperty("/Grid", "visible", False)
         meshcat.SetProperty("/Axes", "visible", False)
-        meshcat.SetCameraPose([1.25, -0.55, 0.75], [0.45, 0.0, 0.0])
+        meshcat.SetCameraPose([1.0, -0.35, 0.6], [0.5, 0.0, 0.0])
         for path, color in (
             (self.GOAL, Rgba(0.1, 0.7, 0.2, 0.35)),
             (self.MODEL, Rgba(0.3, 0.5, 1.0, 0.25)),
@@ -60,6 +61,8 @@ class PushView(LeafSystem):
         self.DeclarePeriodicUnrestrictedUpdateEvent(0.1, 0.0, self._remember)
 
     def _remember(self, context, state):
+        if not self._valid.Eval(context)[0] > 0.5:
+            return
         goal, p = self._goal.Eval(context), self._x.Eval(context)[P_BALL]
         known, track = context.get_abstract_state(int(self._track)).get_value()
         point = np.array([[p[0], p[1], 0.003]])

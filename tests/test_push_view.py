@@ -19,12 +19,13 @@ PARTS = [
 ]
 
 
-def show(meshcat, goal, x_first, x_last=None, seconds=0.5):
+def show(meshcat, goal, x_first, x_last=None, seconds=0.5, valid=1.0):
     """The page after the object went from one state to another (N_X,)."""
     builder = DiagramBuilder()
     view = builder.AddSystem(PushView(PushViewConfig(), PARTS, meshcat))
-    source = builder.AddSystem(ConstantVectorSource(goal))
-    builder.Connect(source.get_output_port(), view.GetInputPort("goal"))
+    for name, value in (("goal", goal), ("valid", [valid])):
+        source = builder.AddSystem(ConstantVectorSource(value))
+        builder.Connect(source.get_output_port(), view.GetInputPort(name))
     ends = np.array([x_first, x_first if x_last is None else x_last]).T
     way = PiecewisePolynomial.FirstOrderHold([0.0, seconds], ends)
     x = builder.AddSystem(TrajectorySource(way))
@@ -52,7 +53,10 @@ def test_track_is_there_after_it_moved_and_not_before():
     meshcat = Meshcat()
     show(meshcat, [0.5, 0.0, 0.0], state(0.4, 0.1, 0.0))
     assert not meshcat.HasPath(PushView.TRACK)
-    show(meshcat, [0.5, 0.0, 0.0], state(0.4, 0.1, 0.0), state(0.5, 0.1, 0.0))
+    way = state(0.4, 0.1, 0.0), state(0.5, 0.1, 0.0)
+    show(meshcat, [0.5, 0.0, 0.0], *way, valid=0.0)
+    assert not meshcat.HasPath(PushView.TRACK)
+    show(meshcat, [0.5, 0.0, 0.0], *way)
     assert meshcat.HasPath(PushView.TRACK)
 
 
