@@ -602,11 +602,18 @@ def _add_damper(
     scene_graph: SceneGraph,
     builder: DiagramBuilder,
 ) -> OutputPort:
-    (stiffness,) = _now(Effect(STIFFNESS, effect.at, {}), plant, scene_graph).values()
+    stiffness, friction = (
+        _now(Effect(kind, effect.at, {}), plant, scene_graph)[name]
+        for kind, name in ((STIFFNESS, "stiffness"), ("contact_friction", "friction"))
+    )
     damper = builder.AddNamedSystem(
         f"contact_damper_{effect.at[0].replace('.', '_').replace('~', '_')}",
         ContactDamper(
-            plant, find_pair(effect, plant), stiffness, parameter(effect, "damping")
+            plant,
+            find_pair(effect, plant),
+            stiffness,
+            parameter(effect, "damping"),
+            friction,
         ),
     )
     builder.Connect(plant.get_state_output_port(), damper.GetInputPort("state"))

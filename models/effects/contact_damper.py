@@ -7,16 +7,19 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable, RigidBody
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+STICTION = 1e-3  # Below this speed friction fades, as Drake's does [m/s].
+
 
 class ContactDamper(LeafSystem):
     """The force with which the contact of two bodies is damped: damping times the rate
-    at which they sink into each other. Drake's spring is there without it; the two
-    together never pull. Friction is that of the spring alone.
+    at which they sink into each other. Drake's spring, with its friction, is there
+    without it; the two together never pull, and rub as one normal force.
 
     Inputs:  state (n_x,) of the plant; query, of the scene graph (abstract).
     Outputs: generalized_force (n_v,).
 
-    Args: pair: the bodies; stiffness [N/m] and damping [N s/m] of a contact of theirs.
+    Args: pair: the bodies; stiffness [N/m], damping [N s/m] and coefficient of friction
+        of a contact of theirs.
     """
 
     def __init__(
@@ -25,10 +28,12 @@ class ContactDamper(LeafSystem):
         pair: tuple[RigidBody, RigidBody],
         stiffness: float,
         damping: float,
+        friction: float,
     ):
         super().__init__()
         self._plant, self._scratch = plant, plant.CreateDefaultContext()
         self._stiffness, self._damping = float(stiffness), float(damping)
+        self._friction = float(friction)
         self._of = {
             geometry: body
             for body in pair
@@ -64,8 +69,10 @@ class ContactDamper(LeafSystem):
                 b.body_frame(),
                 self._plant.world_frame(),
             )
-            along = J.T @ touch.nhat_BA_W
-            rate = -float(along @ x[self._plant.num_positions() :])
-            force = max(self._damping * rate, -self._stiffness * touch.depth)
-            total += force * along
+            n = touch.nhat_BA_W
+            v = J @ x[self._plant.num_positions() :]
+            force = max(-self._damping * (n @ v), -self._stiffness * touch.depth)
+            slip = v - (n @ v) * n
+            speed = max(float(np.sqrt(slip @ slip)), STICTION)
+            total += J.T @ (force * (n - self._friction / speed * slip))
         output.SetFromVector(total)
