@@ -35,6 +35,9 @@ def fit_effects(
     fixed = [tuple(names) for names in fixed or [()] * len(start)]
     start, rough = _try_rough(problem, screen, list(start), fixed)
     fixed = [(*a, *b) for a, b in zip(fixed, rough, strict=True)]
+    replaced = problem.replaced(start)
+    if replaced is not None and replaced.any():
+        screen = screen.without(replaced)
     steps = evaluations or problem.plan.evaluations
     free = _Free(problem, start, fixed)
     x0, scale, low = free.x0, free.scale, free.low

@@ -22,7 +22,7 @@ from makebreak.gap.recording import FEWEST_ROWS, Episode, Recording, part_of
 from makebreak.gap.windows import Window, WindowModel, with_step
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.contact import CONTACT_LAW, DAMPER, STIFFNESS
+from makebreak.models.effects.contact import CONTACT_LAW, DAMPER, DISSIPATION, STIFFNESS
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import Scene
 from makebreak.systems.numerics.smoother import smooth_filtered
@@ -315,6 +315,8 @@ def drawn(w: Window, rng) -> Window:
 class ImpactProblem(ImpactWindows, WindowedProblem):
     """A mechanism that runs against walls, as a problem for the search."""
 
+    _names: tuple[str, ...] | None = None  # Of the nuisances.
+
     plan = SearchPlan(
         evaluations=10, diff_step=0.01, least_gain=0.05, most_effects=4, shortlist=8
     )
@@ -347,9 +349,23 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
                 columns.append(column)
                 prior.append(self._tolerance(name, effect, size))
                 names.append(name)
+        self._names = tuple(names)
         if not columns:
             return Nuisances.none(len(self.base()))
-        return Nuisances(np.stack(columns, 1), np.array(prior), tuple(names), REACH)
+        return Nuisances(np.stack(columns, 1), np.array(prior), self._names, REACH)
+
+    def replaced(self, effects: Sequence[Effect]) -> np.ndarray | None:
+        """The dissipation of a contact that a linear damper damps."""
+        names = {f"{DISSIPATION} of {at}" for e in effects for at in e.at
+                 if e.kind == DAMPER}  # fmt: skip
+        if not names:
+            return None
+        return np.array([name in names for name in self._named()])
+
+    def _named(self) -> tuple[str, ...]:
+        if self._names is None:
+            self._names = self.nuisances().names
+        return self._names
 
     def _tolerance(self, name: str, effect: Effect, size: float) -> float:
         if not effect.kind.startswith("contact_"):

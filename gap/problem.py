@@ -220,6 +220,11 @@ class GapProblem(ABC):
     @abstractmethod
     def nuisances(self) -> Nuisances: ...
 
+    def replaced(self, effects: Sequence[Effect]) -> np.ndarray | None:
+        """(n_b,) which nuisances mean nothing beside these effects, which stand in the
+        place of what they change; None: all go on."""
+        return None
+
     @abstractmethod
     def candidates(self, nuisances: Nuisances, current: Fitted) -> Sequence[Candidate]:
         """Every effect that could be added to what is there."""

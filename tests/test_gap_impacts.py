@@ -7,12 +7,14 @@ import pytest
 from gap_benchmark import cart_world
 from gap_benchmark.cart_world import PAIR
 
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.impacts import ImpactProblem, runs_against
 from makebreak.gap.recording import read_recordings
 from makebreak.gap.workflow import problem_for, run_gap
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
+from makebreak.systems.numerics.selection import Screen
 
 _PARAMETER = {"damper": "damping"}  # Of the effect that is the cart's field.
 
@@ -70,6 +72,21 @@ def test_a_linear_damper_is_no_dissipation(tmp_path):
     )
     with_damper = left(Effect("contact_damping", [PAIR], {"damping": true.damper}))
     assert best > 1.5 and with_damper < 1.1
+    # What the dissipation may be off by says nothing once a damper is in its place.
+    scene.tolerance["contact_dissipation"] = 1.0
+    problem, _ = problem_for(scene, recordings, SceneDynamics(scene))
+    assert isinstance(problem, ImpactProblem)
+    n = problem.nuisances()
+    own = [name == f"contact_dissipation of {PAIR}" for name in n.names]
+    damper = Effect("contact_damping", [PAIR], {"damping": 14.0})
+    assert sum(own) == 1 and problem.replaced([damper]).tolist() == own
+    assert problem.replaced([Effect("contact_damping", ["a.a~b.b"], {})]).sum() == 0
+    assert problem.replaced([]) is None
+    screen = Screen(problem.base(), n.columns, n.prior, problem.train())
+    fitted = fit_effects(problem, screen, [damper])
+    found = fitted.effects[0].parameters["damping"]
+    assert found == pytest.approx(true.damper, rel=0.03)
+    assert fitted.b[own.index(True)] == 0.0
 
 
 def test_walls_that_nothing_touches_do_not_count(tmp_path):

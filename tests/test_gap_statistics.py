@@ -255,6 +255,9 @@ class Steps:
     plan = SearchPlan(jumps=True)
     dynamics = SimpleNamespace(least=lambda kind, at: {})
 
+    def replaced(self, effects):
+        return None
+
     def residual(self, effects=()):
         x = effects[0].parameters["damping"] if effects else 0.0
         return np.full(8, 10.0 * np.round(abs(x - 0.3) / 0.02) * 0.02)

@@ -44,6 +44,7 @@ class Screen:
     """
 
     def __init__(self, r, nuisance, prior, train, scale: float = 1.0, reach=np.inf):
+        self._given = r, nuisance, prior, train, scale, reach
         self.r, self._N = np.asarray(r, float), np.asarray(nuisance, float)
         self._prior, self._train = np.asarray(prior, float), np.asarray(train, bool)
         self._s2 = max(float(scale), 1.0) ** 2
@@ -58,6 +59,11 @@ class Screen:
             b = self.settle(self.r)[0]
             held = np.abs(b) >= self._limit * (1.0 - 1e-9)
             self._side = np.where(held, np.sign(b), 0).astype(int)
+
+    def without(self, some) -> "Screen":
+        """The same, but nuisances of which `some` (n_b,) is true explain nothing."""
+        r, nuisance, *rest = self._given
+        return Screen(r, np.where(np.asarray(some, bool), 0.0, nuisance), *rest)
 
     def fit(self, columns=None) -> LinearFit:
         """With a candidate's columns (m, k), or with the nuisances alone."""
