@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,6 +30,8 @@ from makebreak.models.scene import load_scene
 from makebreak.scripts.cli import main
 from makebreak.scripts.experiments import cube_pivoting as experiment
 from makebreak.scripts.session import Log
+from makebreak.scripts.settings import apply_settings
+from makebreak.scripts.trials import setting_texts
 from makebreak.systems.lcs_builder import AnitescuLcs
 from makebreak.systems.numerics.lcs import simulate
 from makebreak.systems.numerics.pivot_target import LEFT, RIGHT, THETA, corners
@@ -311,6 +314,38 @@ def test_a_tilted_cube_falls_back_on_the_face_beside_its_lower_edge(theta):
         flat = standing()
         flat[0] = place
         assert corners(flat, 0.1)[edge, 0] == pytest.approx(corners(x, 0.1)[edge, 0])
+
+
+def test_reproduce_counts_each_variant_and_its_commands_are_those_that_ran(
+    monkeypatch, tmp_path
+):
+    asked = []
+
+    def run_many(name, runs, jobs, out_dir, reuse):
+        asked.extend(runs)
+        good = {"success": True, "time_to_goal_s": 2.0, "force_max_N": 30.0}
+        return [
+            good if settings != {"mass": 0.8} or seed == 0 else {"success": False}
+            for settings, seed in runs
+        ]
+
+    monkeypatch.setattr(experiment, "run_many", run_many)
+    table = experiment.reproduce(SimpleNamespace(out_dir=tmp_path, reuse=False), 3, 1)
+    rows = {row[0]: row for row in table.rows}
+    assert len(rows) == len(experiment.VARIANTS) and len(asked) == 3 * len(rows)
+    assert (
+        rows["as it is"][2].startswith("3 of 3")
+        and "at most 30 N" in (rows["as it is"][2])
+    )
+    assert rows["twice as heavy"][2].startswith("1 of 3")
+    assert table.met[0] and set(table.met[1:]) == {None}
+    for (_, _, _, command), settings in zip(
+        table.rows, experiment.VARIANTS.values(), strict=True
+    ):
+        words = command.partition("--set ")[2].split()
+        ours = apply_settings(CubePivotingConfig(), words)
+        given = apply_settings(CubePivotingConfig(), setting_texts(settings))
+        assert ours == given
 
 
 def test_meshcat_shows_cube_and_fingers():
