@@ -37,6 +37,7 @@ from makebreak.scripts.trials import makebreak_command, run_commands
 from makebreak.systems.numerics.rolling_task import ROLL
 
 WARM_SEC = 6.0  # Until then the ball rolls, and the learner's buffer is full.
+MOST_SEC = 30.0  # To wait for that.
 ROLLS = 8  # Periods of C3 in which it was rolled without a break.
 PHASES = 32  # Instants within a period of the learner at which a sensor changes.
 LOOK_SEC = 2.5e-4  # Between two looks.
@@ -180,6 +181,8 @@ def rows() -> list[dict]:
         simulator.AdvanceTo(periods * CONTROL)
         rolls = rolls + 1 if phase.Eval(own)[0] == ROLL else 0
         periods += 1
+        if context.get_time() > MOST_SEC:
+            raise RuntimeError(f"the ball is not rolled within {MOST_SEC} s")
     found = [row for sensor in NUDGES for row in _rows(sensor, diagram, context)]
     try:
         return found + _lcm_rows()
@@ -190,10 +193,14 @@ def rows() -> list[dict]:
 def _rows(sensor: str, diagram: Diagram, context: Context) -> list[dict]:
     found = []
     for name, sec in ages(diagram, context, sensor, SHOWN[sensor], PHASES).items():
-        if not np.isfinite(sec).all():
+        what = f"{SAYS[sensor]} -> {name}, mean age"
+        late = int(np.sum(~np.isfinite(sec)))
+        if late:
+            why = f"not seen within {WITHIN_SEC} s in {late} of {len(sec)}"
+            found.append(failed(what, RuntimeError(why)))
             continue
         row = {
-            "what": f"{SAYS[sensor]} -> {name}, mean age",
+            "what": what,
             "unit": "ms",
             "value": 1e3 * float(sec.mean()),
             "max": 1e3 * float(sec.max()),

@@ -146,7 +146,7 @@ def _with_faults(config, texts: Sequence[str], experiment: str):
     for text in texts:
         read_fault(text)
     if not keys:
-        raise ValueError(f"--fault: {experiment} has no arm that faults could meet")
+        raise ValueError(f"--fault: {experiment} has no arm that takes faults")
     there = reduce(getattr, keys[0].split("."), config)
     given = ", ".join(f"'{text}'" for text in (*there, *texts))
     return apply_settings(config, [f"{keys[0]}=[{given}]"])

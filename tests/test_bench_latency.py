@@ -12,6 +12,7 @@ from pydrake.systems.primitives import (
 from pydrake.systems.sensors import ImageRgba8U
 
 from makebreak.diagrams.ball_rolling import LEARN
+from makebreak.scripts import bench_latency
 from makebreak.scripts.bench_latency import (
     ENCODERS,
     NUDGES,
@@ -90,3 +91,14 @@ def test_a_nudge_shifts_a_picture_and_nothing_else():
     np.testing.assert_array_equal(
         diagram.GetOutputPort(ENCODERS).Eval(context), [0.0, 1.0]
     )
+
+
+def test_what_is_not_seen_in_time_has_a_row_that_says_so(loop, monkeypatch):
+    late = {"state": np.array([0.001, np.inf]), "torque": np.array([0.001, 0.002])}
+    monkeypatch.setattr(bench_latency, "ages", lambda *_: late)
+    outputs = {name: ("sampler", "y0") for name in late}
+    monkeypatch.setattr(bench_latency, "OUTPUTS", outputs)
+    diagram, context = loop
+    bad, good = bench_latency._rows(ENCODERS, diagram, context)
+    assert bad["value"] is None and "1 of 2" in bad["note"] and not bad["met"]
+    assert good["value"] == pytest.approx(1.5) and good["max"] == pytest.approx(2.0)

@@ -169,7 +169,22 @@ def test_a_damped_contact_rubs_with_its_whole_force(tmp_path, time_step):
     np.testing.assert_allclose(3.0 - rows[1, 0], mu * thrown, rtol=5e-3)
 
 
-def test_a_damper_acts_on_its_pair_alone(tmp_path):
+@pytest.mark.parametrize("c", [40.0, 150.0, 1000.0])
+def test_a_stiff_damper_throws_nothing_away_in_a_discrete_plant(tmp_path, c):
+    scene = with_effects(
+        on_ground(tmp_path, "ball", 0.001),
+        ("contact_stiffness", PAIR, dict(stiffness=2e4)),
+        ("contact_damping", PAIR, dict(damping=c)),
+    )
+    start = at_rest_but(
+        body="b.ball", pose=[1, 0, 0, 0, 0, 0, RADIUS], twist=[0, 0, 0, 0, 0, -1.0]
+    )
+    times = 0.001 * np.arange(60)
+    rows = SceneSimulation(scene).run(start, times, ["b.ball.vz"])
+    assert rows.max() < 0.3
+
+
+def test_a_damper_acts_while_the_two_touch_and_never_pulls(tmp_path):
     other = with_effects(
         on_ground(tmp_path, "ball"), ("contact_damping", PAIR, dict(damping=40.0))
     )

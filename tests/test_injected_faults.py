@@ -96,7 +96,7 @@ def test_a_fault_of_what_is_not_there_is_refused():
 
 def test_the_command_line_refuses_faults_where_there_is_no_arm(capsys):
     assert cli.main(["run", "porridge", "--fault", "push"]) == 2
-    assert "porridge has no arm" in capsys.readouterr().err
+    assert "porridge has no arm that takes faults" in capsys.readouterr().err
     assert cli.main(["run", "ball_rolling", "--fault", "pushh"]) == 2
     assert "did you mean push" in capsys.readouterr().err
 

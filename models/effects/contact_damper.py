@@ -13,7 +13,10 @@ STICTION = 1e-3  # Below this speed friction fades, as Drake's does [m/s].
 class ContactDamper(LeafSystem):
     """The force with which the contact of two bodies is damped: damping times the rate
     at which they sink into each other. Drake's spring, with its friction, is there
-    without it; the two together never pull, and rub as one normal force.
+    without it; the two together do not pull, and rub as one normal force.
+
+    In a discrete plant the force is that of the step's beginning, so at most what stops
+    the two within the step: a stiffer damper would throw them apart.
 
     Inputs:  state (n_x,) of the plant; query, of the scene graph (abstract).
     Outputs: generalized_force (n_v,).
@@ -33,7 +36,7 @@ class ContactDamper(LeafSystem):
         super().__init__()
         self._plant, self._scratch = plant, plant.CreateDefaultContext()
         self._stiffness, self._damping = float(stiffness), float(damping)
-        self._friction = float(friction)
+        self._friction, self._dt = float(friction), plant.time_step()
         self._of = {
             geometry: body
             for body in pair
@@ -71,7 +74,13 @@ class ContactDamper(LeafSystem):
             )
             n = touch.nhat_BA_W
             v = J @ x[self._plant.num_positions() :]
-            force = max(-self._damping * (n @ v), -self._stiffness * touch.depth)
+            damping = self._damping
+            if self._dt > 0.0:
+                along = J.T @ n
+                M = self._plant.CalcMassMatrix(self._scratch)
+                ease = float(along @ np.linalg.solve(M, along))
+                damping = min(damping, 1.0 / (self._dt * max(ease, 1e-12)))
+            force = max(-damping * (n @ v), -self._stiffness * touch.depth)
             slip = v - (n @ v) * n
             speed = max(float(np.sqrt(slip @ slip)), STICTION)
             total += J.T @ (force * (n - self._friction / speed * slip))
