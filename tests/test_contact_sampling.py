@@ -417,6 +417,39 @@ def test_the_target_is_the_goal_or_a_part_of_the_way():
     assert (far[:, 2] == HEIGHT).all() and not far[:, 10:].any()
 
 
+def test_what_the_arm_hides_on_its_way_is_gone_to_and_pushed_a_little(planner):
+    """Waited for at once, it would be seen, gone to and hidden again without end."""
+    shape, config = planner[2], PushConfig()
+    x = state([0.35, 0.0, 0.1], (0.5, 0.0, 0.3))
+    in_object = to_object(x, places_of(planner)[0][0, :2])
+    task = PushState(WAIT, x[P_TIP].copy(), np.zeros(3), np.zeros(3))
+    phases = []
+    for k in range(600):
+        task = next_push(
+            config, task, shape, 0.0125, x, k == 0, in_object, 1, HEIGHT, 0.004
+        )
+        if task.phase != CONTACT:
+            x[P_TIP] = task.p
+        phases.append(task.phase)
+        if task.phase == WAIT:
+            break
+    n = [phases.count(phase) * 0.0125 for phase in (TRAVEL, CONTACT)]
+    assert phases == sorted(phases, key=[TRAVEL, CONTACT, WAIT].index)
+    assert config.unseen_sec < n[0] < config.believed_sec
+    assert n[1] == pytest.approx(config.unseen_sec, abs=0.03)
+    # And not for ever, where the place is far away.
+    slow, x = PushConfig(speed=0.01), state([0.35, 0.0, 0.1], (0.5, 0.0, 0.3))
+    task = PushState(TRAVEL, x[P_TIP].copy(), np.zeros(3), np.zeros(3))
+    ticks = 0
+    while task.phase == TRAVEL and ticks < 400:
+        task = next_push(
+            slow, task, shape, 0.0125, x, False, in_object, 1, HEIGHT, 0.004
+        )
+        ticks += 1
+    assert task.phase == WAIT
+    assert 0.0125 * ticks == pytest.approx(slow.believed_sec, abs=0.03)
+
+
 def test_the_task_travels_pushes_and_waits_for_what_is_not_seen(planner):
     shape, config = planner[2], PushConfig()
     x = state([0.35, 0.0, 0.1], (0.5, 0.0, 0.3))

@@ -45,7 +45,9 @@ class PushConfig:
     # C3's target is at most so far from where the object is.
     look_ahead: float = 0.06  # [m]
     look_ahead_angle: float = 0.5  # [rad]
-    unseen_sec: float = 0.3  # An object not seen for longer is waited for.
+    unseen_sec: float = 0.3  # An object not seen for longer is waited for,
+    # or for longer while nothing touches it: then the arm hides it on its way.
+    believed_sec: float = 3.0
     withdrawn: list[float] = field(default_factory=lambda: [0.3, 0.0])  # [m]
 
 
@@ -120,7 +122,8 @@ def next_push(
     """
     unseen = 0.0 if seen else state.unseen_sec + dt
     state = replace(state, unseen_sec=unseen)
-    lost = unseen > config.unseen_sec
+    travels = state.phase == TRAVEL
+    lost = unseen > (config.believed_sec if travels else config.unseen_sec)
     # C3 knows no object that is not seen; nor does anybody know a place before that.
     if lost or place is None:
         if state.phase == CONTACT:
@@ -159,10 +162,11 @@ def next_push(
         state.p, state.v, goal, outline, distance, up, limits, dt
     )
     state = replace(state, p=p, v=v, a=a, place=held, go=go)
-    if not (arrived and seen):
+    if not arrived:
         return state
     if np.linalg.norm(x[P_TIP] - goal) > MISSED:
         extra = min(state.extra + EXTRA, EXTRA_MAX)
         at_rest = dict(p=x[P_TIP].copy(), v=np.zeros(3), a=np.zeros(3))
         return replace(state, **at_rest, extra=extra, lifting=True, place=None)
-    return replace(state, phase=CONTACT)
+    # Where the arm hides it from this place, it is pushed a little as it is believed.
+    return replace(state, phase=CONTACT, unseen_sec=0.0)
