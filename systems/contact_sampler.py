@@ -61,7 +61,9 @@ class ContactSampler(LeafSystem):
 
     Inputs:  x (19,) of numerics/ball_state.py; x_desired ((N + 1) 19,) of C3;
              goal (3,) = x, y [m], yaw [rad]; phase (1,) of PushTask; valid (1,): 1 if
-             the object is seen; r_comp (n_lam,) [m/s at residual_dt_sec], optional.
+             the object is seen; r_comp (n_lam,) [m/s at residual_dt_sec], optional: it
+             counts in every plan, and where the object turns out to reach farther out,
+             the places do too.
     Outputs: command (3,) = [number, x, y]: a place in the object's frame, seen from
              above [m]; each new number is a new command to go there, 0: none yet;
              status (1,): a SamplerStatus; round (abstract): the last Round, or None.
@@ -121,11 +123,10 @@ class ContactSampler(LeafSystem):
             np.asarray(port.Eval(context))
             for port in (self._x, self._x_desired, self._goal, self._phase, self._valid)
         )
-        r = np.zeros(p.n_lam)
+        gap = np.zeros(p.n_lam)  # Learned [m].
         if self._r_comp.HasValue(context):
-            r = np.asarray(self._r_comp.Eval(context)) * (
-                c.residual_dt_sec / self._model.dt_sec
-            )
+            gap = np.asarray(self._r_comp.Eval(context)) * c.residual_dt_sec
+        r = gap / self._model.dt_sec
         if not all(is_finite(a) for a in (x, x_desired, goal, phase, valid, r)):
             return SamplerStatus.NOT_FINITE
         if not valid[0] > 0.5:
@@ -137,6 +138,7 @@ class ContactSampler(LeafSystem):
                 c.sampling, memory, self._model.build_many, p, self._shape, x,
                 x_desired.reshape(-1, N_X), length + c.angle_radius * angle,
                 phase[0] == CONTACT, context.get_time(), r, c.budget_sec,
+                max(0.0, -float(gap.min())),
             )  # fmt: skip
         except ValueError:  # An object on edge has no outline.
             return SamplerStatus.NO_PLAN

@@ -44,7 +44,7 @@ class PushTask(LeafSystem):
 
     def __init__(self, config: PushTaskConfig, n_knots: int, shape: ObjectShape, p_tip):
         super().__init__()
-        for name in ("speed", "acceleration", "margin", "look_ahead",
+        for name in ("speed", "acceleration", "descent", "margin", "look_ahead",
                      "look_ahead_angle", "unseen_sec", "believed_sec"):  # fmt: skip
             if not getattr(config.push, name) > 0.0:
                 raise ValueError(

@@ -397,6 +397,13 @@ def test_a_learned_gap_counts_in_every_plan(planner):
         )  # fmt: skip
         return found.cost.min()
 
+    _, found = sample_round(
+        SamplingConfig(), SamplingMemory(), model.build_many, problem, shape, x[0],
+        x_desired, 0.1, False, 0.0, nearer=0.006,
+    )  # fmt: skip
+    outline = outline_at((0.5, 0.0, 0.3))
+    far = distance_to_outline(found.places[1:], outline)
+    np.testing.assert_allclose(far, 0.0195 + 0.004 + 0.006, atol=1e-4)
     # An object that begins 30 mm farther away than seen is reached too late to be moved
     # as far in half a second.
     assert best(0.03) > 1.3 * best(0.0)
@@ -467,11 +474,16 @@ def test_the_task_travels_pushes_and_waits_for_what_is_not_seen(planner):
         return task
 
     assert tick(task, go=0).phase == WAIT
+    falls = []
     for _ in range(400):
         task = tick(task)
+        if task.p[2] < 0.04 + 0.0195:  # Beside the object, or on it.
+            falls.append(-task.v[2])
         if task.phase == CONTACT:
             break
         assert task.phase == TRAVEL
+    # Down slowly from where it may hit something; the last step of braking is on it.
+    assert 0.08 < max(falls) < config.descent + 2.0 * 0.0125
     np.testing.assert_allclose(x[P_TIP], [*place, HEIGHT], atol=2e-3)
     for _ in range(20):
         task = tick(task)

@@ -221,7 +221,7 @@ def travel_length(a, b, outline, distance, height):
     return float(up + np.hypot(*(b - a)[:2]))
 
 
-def travel_step(p, v, goal, outline, distance, height, limits, dt):
+def travel_step(p, v, goal, outline, distance, height, limits, dt, descent=None):
     """One step of the reference on its way to a place, never nearer to the object.
 
     Where the straight way beside the object keeps the distance, it is taken; else the
@@ -230,7 +230,8 @@ def travel_step(p, v, goal, outline, distance, height, limits, dt):
 
     Args: p, v (3,) [m], [m/s] of the reference; goal (3,) [m]; outline, distance as of
         way_is_free; height [m] at which the object is cleared; limits: speed [m/s],
-        acceleration [m/s2]; dt [s].
+        acceleration [m/s2]; dt [s]; descent: (speed [m/s], height [m]): going down it
+        is at most so fast from that height on, where something may be in its way.
     Returns: p, v, a (3,) dt later, and whether it has arrived.
     """
     speed, acceleration = limits
@@ -250,6 +251,10 @@ def travel_step(p, v, goal, outline, distance, height, limits, dt):
     # of the acceleration: some is left to keep to it.
     brake = BRAKE * acceleration
     fast = min(speed, np.sqrt((brake * dt) ** 2 + 2.0 * brake * left) - brake * dt)
+    if descent is not None and off[2] < -1e-3:
+        slow, below = descent
+        ahead = max(p[2] - below, 0.0)
+        fast = min(fast, np.sqrt(slow**2 + 2.0 * brake * ahead))
     wanted = off / max(left, 1e-12) * fast
     change = wanted - v
     size = np.linalg.norm(change)
@@ -468,6 +473,7 @@ def sample_round(
     t: float,
     r=None,
     budget_sec: float = np.inf,
+    nearer: float = 0.0,
 ) -> tuple[SamplingMemory, Round]:
     """One round of ContactSampler.
 
@@ -478,11 +484,13 @@ def sample_round(
         in_contact: whether the tip pushes; else it is on its way to memory.place.
         t [s]; r (n_lam,): what is added to every LCS's c [m/s], None: nothing.
         budget_sec: of wall-clock time for the scores (score_within).
+        nearer: by how much the object reaches farther out than its shape, as learned;
+            the places lie as much farther out [m].
     Raises: ValueError for an object without an outline.
     """
     c, m = config, memory
     outline = outline_of(shape.parts, rotation_of(x[Q_BALL]), x[P_BALL])
-    distance = shape.tip_radius + c.clearance
+    distance = shape.tip_radius + c.clearance + nearer
     phase = (m.count * GOLDEN) % 1.0
     around = places_around(outline, distance, c.places, phase)
     far = np.hypot(*around.T)
