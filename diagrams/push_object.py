@@ -76,7 +76,7 @@ from makebreak.systems.numerics.c3_mpc import (
 from makebreak.systems.numerics.contact_sampling import ObjectShape
 from makebreak.systems.numerics.pose_tracker import make_shape
 from makebreak.systems.past_state import PastState, PastStateConfig
-from makebreak.systems.pose_sensor import PoseSensor, PoseSensorConfig
+from makebreak.systems.pose_sensor import KEPT_SEC, PoseSensor, PoseSensorConfig
 from makebreak.systems.pose_tracker import PoseTracker, PoseTrackerConfig
 from makebreak.systems.push_goals import PushGoals, PushGoalsConfig, draw_poses
 from makebreak.systems.push_task import PushTask, PushTaskConfig
@@ -273,6 +273,24 @@ def rolling_axis(spec: PushedObject) -> list[float]:
     return [1.0, 0.0, 0.0] if spec.shape == "cylinder" else []
 
 
+def past_config(pose: PoseSensorConfig, height: float) -> PastStateConfig:
+    """How long ago the learner looks at, by when the readings about then are known.
+
+    Raises: ValueError for readings that are too rare or too late.
+    """
+    plain = PastStateConfig(height=height, period_sec=LEARN, offset_sec=OFFSET["past"])
+    # Of a parabola's readings two are on either side, and one is lost between ticks.
+    half_width = max(plain.half_width, 2.5 * pose.period_sec)
+    wait = pose.delay_sec + pose.period_sec + half_width
+    if wait + half_width > KEPT_SEC:
+        raise ValueError(
+            f"pose: period_sec {pose.period_sec:g}, delay_sec {pose.delay_sec:g} are "
+            "too long to learn from; expected less, or adapt=false"
+        )
+    ticks = max(plain.ticks, int(np.ceil(wait / LEARN - 1e-9)))
+    return replace(plain, ticks=ticks, half_width=half_width)
+
+
 def contact_pairs(spec: PushedObject, friction: float) -> list[ContactPair]:
     """Tip and object, then each of the object's supports on the table."""
     n = len(support_spheres(spec)[0])
@@ -378,6 +396,31 @@ def _add_sensor(
     return sensor
 
 
+# Settings that the diagram makes of others.
+_OWN = {
+    "goals": ("period_sec", "offset_sec"),
+    "task": ("height", "clearance", "period_sec", "offset_sec"),
+    "sampler": ("angle_radius", "residual_dt_sec", "offset_sec"),
+    "reference": ("height", "period_sec", "offset_sec"),
+    "impedance": ("period_sec", "offset_sec"),
+    "pose": ("height", "rolling_axis", "offset_sec"),
+    "tracker": ("z", "hue", "period_sec", "offset_sec"),
+}
+
+
+def _check_own(config: PushObjectConfig) -> None:
+    """Raises: ValueError for a setting that would not act."""
+    for name, own in _OWN.items():
+        part = getattr(config, name)
+        plain = getattr(PushObjectConfig(), name)
+        for key in own:
+            value, default = getattr(part, key), getattr(plain, key)
+            if value != default:
+                raise ValueError(
+                    f"{name}.{key} is {value}, expected {default}: the diagram sets it"
+                )
+
+
 def make_push_object(
     config: PushObjectConfig, meshcat: Meshcat | None = None
 ) -> Diagram:
@@ -389,6 +432,7 @@ def make_push_object(
     (1,) of PushTask and `command_log` (3,) of ContactSampler, at 80 Hz. A diagram is
     done when the number in goal_log is n_goals.
     """
+    _check_own(config)
     builder = DiagramBuilder()
     spec, friction = believed_object(config)
     station = builder.AddNamedSystem(
@@ -459,6 +503,11 @@ def make_push_object(
         ),
     )
     sampling = config.sampler.sampling
+    if not tip.tip_radius < sampling.height < top:
+        raise ValueError(
+            f"sampler.sampling.height is {sampling.height:g}, expected above the tip's "
+            f"radius, {tip.tip_radius:g}, and below the object's top, {top:g} m"
+        )
     task = builder.AddNamedSystem(
         "push_task",
         PushTask(
@@ -535,9 +584,7 @@ def make_push_object(
         past = builder.AddNamedSystem(
             "past_state",
             PastState(
-                PastStateConfig(
-                    height=height, period_sec=LEARN, offset_sec=OFFSET["past"]
-                ),
+                past_config(config.pose, height),
                 rolling_axis(spec) or np.zeros(3),
             ),
         )

@@ -21,6 +21,8 @@ from makebreak.systems.numerics.lcs import is_finite
 from makebreak.systems.numerics.push_task import CONTACT, errors
 from makebreak.systems.numerics.timing import timed
 
+PLACES_MAX = 1000  # In a round.
+
 
 class SamplerStatus(IntEnum):
     """The `status` port: 0 is good, anything else says why the last place is held."""
@@ -139,6 +141,7 @@ class ContactSampler(LeafSystem):
                 x_desired.reshape(-1, N_X), length + c.angle_radius * angle,
                 phase[0] == CONTACT, context.get_time(), r, c.budget_sec,
                 max(0.0, -float(gap.min())),
+                tuple(goal.tolist()),
             )  # fmt: skip
         except ValueError:  # An object on edge has no outline.
             return SamplerStatus.NO_PLAN
@@ -157,16 +160,21 @@ class ContactSampler(LeafSystem):
 def _check(config: ContactSamplerConfig) -> None:
     """Raises: ValueError for a config out of range, by name."""
     c = config.sampling
-    if c.places != int(c.places) or c.places < 1:
+    if c.places != int(c.places) or not 1 <= c.places <= PLACES_MAX:
         raise ValueError(
-            f"sampling.places is {c.places}, expected an integer of at least 1"
+            f"sampling.places is {c.places}, expected an integer from 1 to {PLACES_MAX}"
         )
     for name in ("clearance", "height", "stuck_sec"):
-        if not getattr(c, name) > 0.0:
+        if not 0.0 < getattr(c, name) < np.inf:
             raise ValueError(f"sampling.{name} is {getattr(c, name)}, expected > 0")
     for name in ("travel", "push"):
-        if not getattr(c, name) >= 0.0:
+        if not 0.0 <= getattr(c, name) < np.inf:
             raise ValueError(f"sampling.{name} is {getattr(c, name)}, expected >= 0")
+    for name in ("hysteresis", "reach"):
+        if np.shape(getattr(c, name)) != (2,):
+            raise ValueError(
+                f"sampling.{name} is {getattr(c, name)}, expected two numbers"
+            )
     share, absolute = c.hysteresis
     if not (0.0 <= share < 1.0 and absolute >= 0.0):
         raise ValueError(
@@ -175,8 +183,8 @@ def _check(config: ContactSamplerConfig) -> None:
         )
     if not 0.0 <= c.reach[0] < c.reach[1]:
         raise ValueError(
-            f"sampling.reach is {c.reach}, expected [least, most] from the base in "
-            "metres"
+            f"sampling.reach is {c.reach}, expected [least, most] from the world's "
+            "origin in metres"
         )
     for name in ("budget_sec", "residual_dt_sec", "period_sec"):
         if not getattr(config, name) > 0.0:

@@ -18,7 +18,7 @@ from makebreak.systems.numerics.pose_filter import (
 )
 from makebreak.systems.numerics.timing import timed
 
-KEPT = 16  # Readings.
+KEPT_SEC = 1.0  # How old a reading is kept.
 
 
 @dataclass
@@ -43,8 +43,9 @@ class PoseSensor(LeafSystem):
 
     Inputs:  body_poses (abstract, of a MultibodyPlant).
     Outputs: p_WB (3,) [m]; q_WB (4,) [w x y z]; v_WB (3,) [m/s]; w_WB (3,) [rad/s];
-             seen (1,): 1 when there has been a reading; readings (abstract): the last
-             KEPT that are known, as they were measured: (time [s], p (3,), q (4,)).
+             seen (1,): 1 when there has been a reading; readings (abstract): those of
+             the last KEPT_SEC that are known, as they were measured: (time [s], p (3,),
+             q (4,)).
 
     Args: config; body, its index in body_poses; seed of the noise.
     """
@@ -102,12 +103,13 @@ class PoseSensor(LeafSystem):
         known = context.get_abstract_state(int(self._known)).get_value()
         std = np.maximum(c.noise, 1e-6)  # A filter of no noise at all divides by it.
         while late and late[0][0] <= t - c.delay_sec + 1e-9:
-            known = (*known, late[0])[-KEPT:]
+            known = (*known, late[0])
             (at, p, q), late = late[0], late[1:]
             if pose is None:
                 pose = first_pose(at, p, q, std, (0.1, 1.0))
             else:
                 pose = corrected(predicted(pose, at, c.density), p, q, std)
+        known = tuple(one for one in known if one[0] > t - KEPT_SEC)
         state.get_mutable_abstract_state(int(self._late)).set_value(late)
         state.get_mutable_abstract_state(int(self._pose)).set_value(pose)
         state.get_mutable_abstract_state(int(self._known)).set_value(known)

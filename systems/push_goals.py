@@ -25,7 +25,11 @@ class PushGoalsConfig:
 
 
 def draw_poses(config: PushGoalsConfig, n: int, seed: int) -> np.ndarray:
-    """(n, 3) x, y [m], yaw [rad]: evenly within the region."""
+    """(n, 3) x, y [m], yaw [rad]: evenly within the region.
+
+    Raises: ValueError for a config out of range, by name.
+    """
+    _check(config)
     rng = np.random.default_rng([seed, 1])
     half = 0.5 * np.array([*config.size, 2.0 * np.pi])
     return np.array([*config.center, 0.0]) + rng.uniform(-half, half, (n, 3))
@@ -44,6 +48,7 @@ class PushGoals(LeafSystem):
 
     def __init__(self, config: PushGoalsConfig, goals):
         super().__init__()
+        _check(config)
         self._config = config
         self._goals = np.array(goals, dtype=float)
         if self._goals.ndim != 2 or self._goals.shape[1] != 3 or not len(self._goals):
@@ -85,3 +90,25 @@ class PushGoals(LeafSystem):
         if held >= c.dwell_sec or t - since >= c.limit_sec:
             number, since, held = number + 1.0, t, 0.0
         discrete_state.set_value(self._state, [number, since, held])
+
+
+def _check(config: PushGoalsConfig) -> None:
+    """Raises: ValueError for a config out of range, by name."""
+    for name in ("center", "size", "tolerance"):
+        value = getattr(config, name)
+        if np.shape(value) != (2,) or not np.isfinite(value).all():
+            raise ValueError(f"goals.{name} is {value}, expected two numbers")
+    if min(config.size) < 0.0:
+        raise ValueError(f"goals.size is {config.size}, expected at least 0")
+    if not min(config.tolerance) > 0.0:
+        raise ValueError(f"goals.tolerance is {config.tolerance}, expected > 0")
+    if not 0.0 < config.share <= 1.0:
+        raise ValueError(
+            f"goals.share is {config.share}, expected > 0 and at most 1: a goal is "
+            "left where it was reached"
+        )
+    for name in ("limit_sec", "period_sec"):
+        if not 0.0 < getattr(config, name) < np.inf:
+            raise ValueError(f"goals.{name} is {getattr(config, name)}, expected > 0")
+    if not 0.0 <= config.dwell_sec < np.inf:
+        raise ValueError(f"goals.dwell_sec is {config.dwell_sec}, expected >= 0")

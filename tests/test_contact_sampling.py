@@ -340,6 +340,43 @@ def test_a_tip_on_its_way_keeps_its_place_and_a_stuck_one_leaves_it(planner):
     assert stuck.go == later.go + 1  # No progress for more than 1.2 s.
 
 
+def test_another_goal_is_no_lack_of_progress(planner):
+    model, problem, shape = planner
+    x, _ = places_of(planner)
+    first, second = [0.505, 0.0, 0.3], [0.7, 0.02, 0.3]
+    memory, found = rounds(planner, x[0], first, 1, in_contact=False)
+    at = state([*to_world(x[0], memory.place), HEIGHT], (0.5, 0.0, 0.3))
+
+    def again(memory, goal, t, error):
+        x_desired = target(at, goal, problem.options.N + 1)
+        return sample_round(
+            SamplingConfig(), memory, model.build_many, problem, shape, at, x_desired,
+            error, True, t, goal=tuple(goal),
+        )  # fmt: skip
+
+    memory, _ = again(memory, first, 0.1, 0.005)
+    for k in range(20):  # 3 cm/s towards the second, whose error was 0.2 m.
+        memory, found = again(memory, second, 0.2 + 0.1 * k, 0.2 - 0.003 * k)
+        assert np.isfinite(found.cost[0])
+    memory, found = again(memory, second, 5.0, 0.2)
+    assert not np.isfinite(found.cost[0])  # Of the same goal it is one.
+
+
+def test_places_that_moved_out_of_reach_with_the_object_are_dropped(planner):
+    model, problem, shape = planner
+    x = state([0.6, 0.0, HEIGHT], (0.72, 0.0, 0.3))
+    far = np.array([0.2, 0.0])  # In the object's frame.
+    memory = SamplingMemory(best=far, place=far, go=1)
+    x_desired = target(x, [0.6, 0.0, 0.3], problem.options.N + 1)
+    _, found = sample_round(
+        SamplingConfig(), memory, model.build_many, problem, shape, x, x_desired,
+        0.1, False, 0.0,
+    )  # fmt: skip
+    reach = np.hypot(*found.places.T)
+    assert reach[0] > 0.78 and not np.isfinite(found.cost[0])
+    assert (reach[1:] <= 0.78).all() and found.chosen > 0
+
+
 def test_places_out_of_reach_are_not_looked_at(planner):
     model, problem, shape = planner
     x = state([0.6, 0.0, HEIGHT], (0.72, 0.0, 0.3))

@@ -17,6 +17,7 @@ from makebreak.diagrams.push_object import (
     make_push_object,
     model_scene,
     outline_fold,
+    past_config,
     poses_of,
 )
 from makebreak.models.pushed_object import PushedObject, object_inertia, object_sdf
@@ -36,6 +37,8 @@ from makebreak.scripts.experiments.push_object import (
 )
 from makebreak.scripts.session import Session
 from makebreak.scripts.settings import apply_settings
+from makebreak.systems.numerics.past_state import pose_at
+from makebreak.systems.pose_sensor import KEPT_SEC, PoseSensorConfig
 
 GOAL = np.array([0.5, 0.1, 3.0])
 
@@ -46,7 +49,7 @@ def truth_of(poses, numbers, dt=1.0):
     zero = np.zeros(n)
     return Truth(
         dt * np.arange(n), np.array(poses, float), zero, np.zeros((n, 3)),
-        np.zeros((n, 7)), np.array(numbers, float),
+        np.zeros((n, 7)), np.zeros((n, 7)), np.array(numbers, float),
     )  # fmt: skip
 
 
@@ -93,8 +96,10 @@ def test_totals_count_goals_and_a_failed_run_reaches_none():
         "n_goals": 3, "goals_reached": 2, "goals_reached_loose": 3,
         "time_s": [5.0, None, 7.0], "contact_force_peak_N": 12.0,
     }  # fmt: skip
-    found = totals([good, {"error": "stopped"}, good])
-    assert found == {"n": 6, "reached": 4, "loose": 6, "time": 6.0, "force": 12.0}
+    found = totals([good, {"error": "stopped"}, good], 2)
+    # Of 5, 60, 7; 60, 60; 5, 60 and 7 s.
+    assert found == {"n": 8, "reached": 4, "loose": 6, "time": 33.5, "force": 12.0}
+    assert totals([{"error": "stopped"}], 3)["time"] == 60.0
     assert won_back(1.0, 0.5, 0.75) == 0.5 and np.isnan(won_back(1.0, 1.0, 1.0))
 
 
@@ -234,16 +239,79 @@ def test_camera_and_sensor_are_the_only_ways_from_the_world():
         )
         assert diagram.HasSubsystemNamed(name)
         station = diagram.GetSubsystemByName("station")
-        heard = {
-            station.get_output_port(source[1]).get_name(): target[0].get_name()
+        heard = [
+            (station.get_output_port(source[1]).get_name(), target[0].get_name())
             for target, source in diagram.connection_map().items()
             if source[0] is station
+        ]
+        measured = {
+            "panda.position_measured", "panda.velocity_measured",
+            "panda.torque_measured", "panda.external_wrench", "overhead.rgb_image",
+        }  # fmt: skip
+        others = {
+            (port, target)
+            for port, target in heard
+            if port not in measured and not target.endswith("_log")
         }
-        truth = {"state", "body_poses", "contact_results"} & set(heard)
-        listeners = {heard[port] for port in truth}
-        assert listeners <= {"pose_sensor"} | {
-            name for name in listeners if "Log" in name or name.endswith("_log")
-        }
+        sensor = {("body_poses", "pose_sensor")} if pose_from == "sensor" else set()
+        assert others == sensor
+
+
+@pytest.mark.parametrize("hz", [8.0, 10.0, 15.0, 30.0, 60.0, 100.0, 240.0])
+@pytest.mark.parametrize("delay", [0.0, 0.02, 0.15])
+def test_the_learner_finds_its_readings_at_any_rate(hz, delay):
+    """What is kept of the readings at any tick is enough for the moment that counts."""
+    period = 1.0 / hz
+    past = past_config(PoseSensorConfig(delay_sec=delay, period_sec=period), 0.02)
+    ready = []
+    for k in range(60, 100):
+        t = k * past.period_sec
+        times = [i * period for i in range(int(t / period) + 1)]
+        known = [
+            (s, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+            for s in times
+            if t - KEPT_SEC < s and s + delay <= t - period + 1e-9
+        ]
+        at = t - past.ticks * past.period_sec
+        ready.append(pose_at(at, known, past.half_width) is not None)
+    assert all(ready)
+
+
+def test_readings_that_are_too_rare_or_too_late_are_refused():
+    for wrong in (PoseSensorConfig(period_sec=0.5), PoseSensorConfig(delay_sec=0.9)):
+        with pytest.raises(ValueError, match="too long to learn from"):
+            make_push_object(PushObjectConfig(pose=wrong))
+
+
+@pytest.mark.parametrize(
+    ("setting", "says"),
+    [
+        ("goals.tolerance=[0.02]", "goals.tolerance is [0.02], expected two numbers"),
+        ("goals.tolerance=[-1,-1]", "goals.tolerance is [-1.0, -1.0], expected > 0"),
+        ("goals.share=5", "goals.share is 5.0, expected > 0 and at most 1"),
+        ("goals.limit_sec=-1", "goals.limit_sec is -1.0, expected > 0"),
+        ("goals.dwell_sec=-1", "goals.dwell_sec is -1.0, expected >= 0"),
+        ("goals.size=[0.1]", "goals.size is [0.1], expected two numbers"),
+        (
+            "sampler.sampling.height=0.3",
+            "height is 0.3, expected above the tip's",
+        ),
+        ("object.height=0.02", "and below the object's top, 0.02 m"),
+        ("sampler.sampling.reach=[0.1]", "reach is [0.1], expected two numbers"),
+        ("sampler.sampling.hysteresis=[0.1]", "hysteresis is [0.1], expected two"),
+        ("sampler.sampling.places=2000", "expected an integer from 1 to 1000"),
+        (
+            "task.height=0.03",
+            "task.height is 0.03, expected 0.024: the",
+        ),
+        ("tracker.hue=1.0", "tracker.hue is 1.0, expected"),
+    ],
+)
+def test_settings_that_cannot_act_are_refused_by_name(setting, says):
+    config = apply_settings(PushObjectConfig(), [setting])
+    with pytest.raises(ValueError) as caught:
+        make_push_object(config)
+    assert says in str(caught.value)
 
 
 def test_only_what_is_wrong_is_an_effect_of_the_model(tmp_path):

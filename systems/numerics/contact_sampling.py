@@ -41,7 +41,8 @@ class SamplingConfig:
     places: int = 14  # Sampled in a round, beside the present one and the last best.
     clearance: float = 0.004  # Of the tip from the object at a place [m].
     height: float = 0.024  # Of the tip's centre while pushing [m].
-    reach: list[float] = field(default_factory=lambda: [0.3, 0.78])  # From the base.
+    # From the world's origin, where the arm stands.
+    reach: list[float] = field(default_factory=lambda: [0.3, 0.78])
     travel: float = 15.0  # Cost of a metre through the air [1/m].
     # Another place has to cost so much less than the present one: a share of the
     # latter's cost, and an absolute amount.
@@ -58,6 +59,7 @@ class SamplingMemory:
     place: np.ndarray | None = None  # Where to go, or where it went last.
     best: np.ndarray | None = None  # The best other place of the last round.
     go: int = 0  # How often a place was chosen: a new number is a new command.
+    goal: tuple[float, ...] | None = None  # That the error is from.
     error: float = np.inf  # From the goal when there was progress last [m] ...
     since_sec: float = 0.0  # ... and when that was.
 
@@ -396,6 +398,12 @@ def score_within(budget_sec, lcs, x, x_desired, problem, guess=None, at_once=4):
     return cost, *(np.sum([part[i] for part in parts], axis=0) for i in (1, 2))
 
 
+def in_reach(places, reach):
+    """(n,) whether places (n, 2) are from reach[0] to reach[1] from the origin [m]."""
+    far = np.hypot(*np.transpose(places))
+    return (far >= reach[0]) & (far <= reach[1])
+
+
 def choose(cost, hysteresis):
     """Which place to take: the first (the present one), unless another is clearly
     better.
@@ -474,6 +482,7 @@ def sample_round(
     r=None,
     budget_sec: float = np.inf,
     nearer: float = 0.0,
+    goal: tuple[float, ...] | None = None,
 ) -> tuple[SamplingMemory, Round]:
     """One round of ContactSampler.
 
@@ -486,18 +495,21 @@ def sample_round(
         budget_sec: of wall-clock time for the scores (score_within).
         nearer: by how much the object reaches farther out than its shape, as learned;
             the places lie as much farther out [m].
+        goal: tells one goal from the next, whose error is another one.
     Raises: ValueError for an object without an outline.
     """
     c, m = config, memory
+    if goal != m.goal:
+        m = replace(m, goal=goal, error=np.inf)
     outline = outline_of(shape.parts, rotation_of(x[Q_BALL]), x[P_BALL])
     distance = shape.tip_radius + c.clearance + nearer
     phase = (m.count * GOLDEN) % 1.0
     around = places_around(outline, distance, c.places, phase)
-    far = np.hypot(*around.T)
-    around = around[(far >= c.reach[0]) & (far <= c.reach[1])]
+    around = around[in_reach(around, c.reach)]
     going = m.place is not None and not in_contact
     present = to_world(x, m.place) if going else x[P_TIP][:2]
     last = [] if m.best is None else [to_world(x, m.best)]
+    last = [place for place in last if in_reach(place[None], c.reach)[0]]
     places = np.array([present, *last, *around])
     n, N = len(places), problem.options.N
     starts = np.tile(x, (n, 1))
@@ -519,7 +531,7 @@ def sample_round(
     ]  # fmt: skip
     if in_contact:
         way[0] = 0.0
-    elif not going:
+    elif not going or not in_reach(present[None], c.reach)[0]:
         cost[0] = NO_PLAN
     cost = cost + c.travel * np.array(way)
     progressed = not in_contact or error < m.error - PROGRESS
