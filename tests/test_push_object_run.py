@@ -125,7 +125,7 @@ def test_table_tells_what_was_missed_and_a_failed_run_counts(tmp_path, monkeypat
         got = n - 1 if wrong and not settings["adapt"] else n
         return {
             "n_goals": n, "goals_reached": got, "goals_reached_loose": n,
-            "time_s": [20.0 if wrong and not settings["adapt"] else 10.0] * got,
+            "time_s": [20.0 if got < n else 10.0] * got + [None] * (n - got),
             "contact_force_peak_N": 30.0, "seed": seed,
         }  # fmt: skip
 
@@ -135,12 +135,18 @@ def test_table_tells_what_was_missed_and_a_failed_run_counts(tmp_path, monkeypat
         lambda name, trials, *_, **__: [result(*trial) for trial in trials],
     )
     with Session(tmp_path / "out", progress=False) as session:
-        table = experiment.reproduce(session, 2, 1)
-    row = {
-        line[0]: (line[2], met) for line, met in zip(table.rows, table.met, strict=True)
-    }
-    assert row["T, model right: 2 cm, 0.1 rad, 60 s"][0].startswith("20 of 20")
-    assert row["box, model right: 2 cm, 0.1 rad, 60 s"] == ("5 of 10, 24-76 %", False)
+        few, table = (experiment.reproduce(session, n, 1) for n in (2, 10))
+
+    def rows(table):
+        lines = zip(table.rows, table.met, strict=True)
+        return {line[0]: (line[2], met) for line, met in lines}
+
+    row, row_of_few = rows(table), rows(few)
+    name = "T, model right: 2 cm, 0.1 rad, 60 s"
+    assert row_of_few[name][0].startswith("20 of 20") and row_of_few[name][1] is None
+    assert row[name][0].startswith("100 of 100") and row[name][1] is True
+    box = row["box, model right: 2 cm, 0.1 rad, 60 s"]
+    assert box[0].startswith("45 of 50") and box[1] is False
     assert row["T, friction halved: the learner wins back, success"] == (
         "100 % of what was lost", True,
     )  # fmt: skip
