@@ -41,7 +41,7 @@ MISSED, EXTRA, EXTRA_MAX = 0.01, 0.003, 0.012
 class PushConfig:
     speed: float = 0.35  # Of a travelling tip [m/s].
     acceleration: float = 2.0  # [m/s2]
-    descent: float = 0.1  # Of one that comes down beside the object [m/s].
+    descent: float = 0.08  # Of one that comes down beside the object [m/s].
     margin: float = 0.012  # Between tip and object where it passes above [m].
     # C3's target is at most so far from where the object is.
     look_ahead: float = 0.06  # [m]
@@ -159,7 +159,8 @@ def next_push(
     if held is None or np.hypot(*(now - held)) > PLACE_CHANGE:
         held = now
     goal = np.array([*held, height])
-    descent = config.descent, shape.clear_height(0.0)
+    # An object that is larger than believed is higher, too.
+    descent = config.descent, shape.clear_height(0.5 * config.margin)
     p, v, a, arrived = travel_step(
         state.p, state.v, goal, outline, distance, up, limits, dt, descent
     )
