@@ -41,8 +41,9 @@ class SamplingConfig:
     places: int = 14  # Sampled in a round, beside the present one and the last best.
     clearance: float = 0.004  # Of the tip from the object at a place [m].
     height: float = 0.024  # Of the tip's centre while pushing [m].
-    # From the world's origin, where the arm stands.
-    reach: list[float] = field(default_factory=lambda: [0.3, 0.78])
+    # From the world's origin, where the arm stands [m]: nearer, the elbow of a Panda
+    # with the finger upright is at its limit.
+    reach: list[float] = field(default_factory=lambda: [0.38, 0.78])
     travel: float = 15.0  # Cost of a metre through the air [1/m].
     # Another place has to cost so much less than the present one: a share of the
     # latter's cost, and an absolute amount.
