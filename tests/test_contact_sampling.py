@@ -566,6 +566,27 @@ def test_a_tip_that_comes_down_on_the_object_goes_up_and_comes_down_farther_out(
     assert np.sum(np.diff(low.astype(int)) == 1) == 3
 
 
+@pytest.mark.parametrize("off", [[0.02, 0.0, 0.0], [0.0, 0.0, 0.02]])
+def test_a_place_that_is_not_reached_does_not_keep_the_tip_for_ever(planner, off):
+    """The arm stays 20 mm beside its place, or 20 mm above it, whatever it does."""
+    shape, config = planner[2], PushConfig()
+    x = state([0.35, 0.0, 0.1], (0.5, 0.0, 0.3))
+    in_object = to_object(x, places_of(planner)[0][0, :2])
+    task = PushState(WAIT, x[P_TIP].copy(), np.zeros(3), np.zeros(3))
+    lifts, low = 0, False
+    for _ in range(3000):
+        task = next_push(
+            config, task, shape, 0.0125, x, True, in_object, 1, HEIGHT, 0.004
+        )
+        x[P_TIP] = task.p + off
+        lifts += task.lifting and not low
+        low = task.lifting
+        if task.phase == CONTACT:
+            break
+    assert task.phase == CONTACT
+    assert lifts == (0 if off[0] else 4)  # As often as it may go 3 mm out.
+
+
 # The loop, without an arm: the model is the world, of smaller steps.
 
 

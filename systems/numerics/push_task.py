@@ -31,9 +31,9 @@ from makebreak.systems.numerics.contact_sampling import (
 CONTACT, TRAVEL, WAIT = 0, 1, 2
 # A place moves with the object where that is more than noise [m].
 PLACE_CHANGE = 0.008
-# A tip that is so far from a place where it should have arrived has come down on the
+# A tip that is so far above a place where it should have arrived has come down on the
 # object, which is larger than believed, or elsewhere: it goes up, and after that comes
-# down so much farther out; not farther than EXTRA_MAX [m].
+# down so much farther out; not farther than EXTRA_MAX, where it no longer matters [m].
 MISSED, EXTRA, EXTRA_MAX = 0.01, 0.003, 0.012
 
 
@@ -167,7 +167,8 @@ def next_push(
     state = replace(state, p=p, v=v, a=a, place=held, go=go)
     if not arrived:
         return state
-    if np.linalg.norm(x[P_TIP] - goal) > MISSED:
+    # A tip that is beside its place, where the arm does not reach, pushes from there.
+    if x[P_TIP][2] - height > MISSED and state.extra < EXTRA_MAX:
         extra = min(state.extra + EXTRA, EXTRA_MAX)
         at_rest = dict(p=x[P_TIP].copy(), v=np.zeros(3), a=np.zeros(3))
         return replace(state, **at_rest, extra=extra, lifting=True, place=None)
