@@ -11,7 +11,8 @@ Planning                 rolling_task, push_goals, push_task, contact_sampler,
 Shaping                  velocity_shaper, variable_impedance
 Control                  arm_reference, impedance_controller, impact_reflex,
                          gravity_left_out
-For scoring and the eye  contact_probe, rolling_view, walls_view, contact_view
+For scoring and the eye  contact_probe, rolling_view, walls_view, contact_view,
+                         push_view
 Faults, and who watches  fault_signals, fault_pictures, fault_forces, safety_monitor
 As a world               lcs_plant
 In the plane             planar_world, planar_impedance, planar_view
