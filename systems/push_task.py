@@ -45,7 +45,8 @@ class PushTask(LeafSystem):
     def __init__(self, config: PushTaskConfig, n_knots: int, shape: ObjectShape, p_tip):
         super().__init__()
         for name in ("speed", "acceleration", "descent", "margin", "look_ahead",
-                     "look_ahead_angle", "unseen_sec", "believed_sec"):  # fmt: skip
+                     "look_ahead_angle", "unseen_sec", "believed_sec",
+                     "farthest"):  # fmt: skip
             if not getattr(config.push, name) > 0.0:
                 raise ValueError(
                     f"task.push.{name} is {getattr(config.push, name)}, expected > 0"

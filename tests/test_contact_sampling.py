@@ -494,6 +494,19 @@ def test_what_the_arm_hides_on_its_way_is_gone_to_and_pushed_a_little(planner):
     assert 0.0125 * ticks == pytest.approx(slow.believed_sec, abs=0.03)
 
 
+def test_an_object_out_of_reach_is_not_followed(planner):
+    shape, config = planner[2], PushConfig()
+    for phase in (TRAVEL, CONTACT):
+        for y, expected in ((0.5, phase), (0.6, WAIT)):
+            x = state([0.35, 0.0, 0.1], (0.5, y, 0.3))
+            task = PushState(phase, x[P_TIP].copy(), np.zeros(3), np.zeros(3), go=1)
+            task = next_push(
+                config, task, shape, 0.0125, x, True, np.array([0.1, 0.0]), 1, HEIGHT,
+                0.004,
+            )  # fmt: skip
+            assert task.phase == expected
+
+
 def test_the_task_travels_pushes_and_waits_for_what_is_not_seen(planner):
     shape, config = planner[2], PushConfig()
     x = state([0.35, 0.0, 0.1], (0.5, 0.0, 0.3))

@@ -49,6 +49,8 @@ class PushConfig:
     unseen_sec: float = 0.3  # An object not seen for longer is waited for,
     # or for longer while nothing touches it: then the arm hides it on its way.
     believed_sec: float = 3.0
+    # One farther from the world's origin, where the arm stands, is not followed.
+    farthest: float = 0.75  # [m]
     withdrawn: list[float] = field(default_factory=lambda: [0.3, 0.0])  # [m]
 
 
@@ -125,6 +127,7 @@ def next_push(
     state = replace(state, unseen_sec=unseen)
     travels = state.phase == TRAVEL
     lost = unseen > (config.believed_sec if travels else config.unseen_sec)
+    lost = lost or float(np.hypot(*x[P_BALL][:2])) > config.farthest
     # C3 knows no object that is not seen; nor does anybody know a place before that.
     if lost or place is None:
         if state.phase == CONTACT:
