@@ -69,6 +69,7 @@ TICK = 0.001  # Of the log of forces [s].
 # 1 / m^2, 1 / rad^2, and the same of velocities: cube x, z, angle; each finger's x, z.
 Q = (2000.0, 2000.0, 200.0, *4 * [50.0], 2.0, 2.0, 0.5, *4 * [5.0])
 R = 0.01  # [1/N^2]
+APART = 1e-3  # What does not touch at first is so far apart at least [m].
 
 
 @dataclass
@@ -183,15 +184,15 @@ def initial_state(config: CubePivotingConfig) -> np.ndarray:
     for name in ("place", "tilt"):
         if not 0.0 <= getattr(c, name) < np.inf:
             raise ValueError(f"start.{name} is {getattr(c, name)}, expected >= 0")
-    distance = _range("start.distance", c.distance, 0.0)
-    height = _range("start.height", c.height, -np.inf)
+    radius = PivotTargetConfig().finger_radius
+    distance = _range("start.distance", c.distance, APART)
+    height = _range("start.height", c.height, radius + APART)
     rng, cube = np.random.default_rng([config.seed, 0]), world_cube(config)
     x = np.zeros(N_X)
     x[0] = -0.1 + rng.uniform(-c.place, c.place)
     x[THETA] = rng.uniform(-c.tilt, c.tilt)
-    x[1] = 1e-3 - corners(x, cube.side)[:, 1].min()
+    x[1] = APART - corners(x, cube.side)[:, 1].min()
     ends = corners(x, cube.side)[:, 0]
-    radius = PivotTargetConfig().finger_radius
     for finger, face, sign in ((LEFT, ends.min(), -1.0), (RIGHT, ends.max(), 1.0)):
         x[finger] = (
             face + sign * (radius + rng.uniform(distance[0], distance[1])),
@@ -206,8 +207,6 @@ def _range(name: str, values, least: float) -> list[float]:
     if not (good and least <= values[0] <= values[1]):
         raise ValueError(
             f"{name} is {list(values)}, expected [low, high] with {least:g} <= low"
-            if np.isfinite(least)
-            else f"{name} is {list(values)}, expected [low, high]"
         )
     return list(values)
 
@@ -222,9 +221,9 @@ def _side(path: str) -> float:
         body = plant.GetBodyByName("cube", plant.GetModelInstanceByName("pivot"))
     except RuntimeError:
         raise ValueError("the scene has no body pivot.cube") from None
-    (shape,) = plant.GetCollisionGeometriesForBody(body)
-    box = scene_graph.model_inspector().GetShape(shape)
-    if not isinstance(box, Box) or box.width() != box.height():
+    shapes = plant.GetCollisionGeometriesForBody(body)
+    box = scene_graph.model_inspector().GetShape(shapes[0]) if shapes else None
+    if len(shapes) != 1 or not isinstance(box, Box) or box.width() != box.height():
         raise ValueError("pivot.cube is no box with equal sides in the x-z plane")
     return float(box.width())
 

@@ -36,7 +36,8 @@ class PushTask(LeafSystem):
     Outputs: x_desired ((N + 1) 19,) for C3; reference (9,) = p, v, a of the tip at the
              next tick, used unless in CONTACT; phase (1,): 0 CONTACT, 1 TRAVEL, 2 WAIT.
 
-    Where x or goal is not finite the target stays, and the tip waits.
+    Where x or command is not finite all stays as it is; where goal is not, the target
+    stays, and the tip waits.
 
     Args: n_knots = N + 1; shape of object and tip; p_tip (3,): where the tip is at
         first [m].

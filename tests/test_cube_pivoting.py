@@ -253,6 +253,8 @@ def test_world_and_model_differ_by_the_errors_alone():
         ("start.friction=[0.5]", "start.friction is [0.5], expected [low, high]"),
         ("start.friction=[1,0.5]", "start.friction is [1.0, 0.5], expected"),
         ("start.height=[0.1,0.05]", "start.height is [0.1, 0.05], expected"),
+        ("start.height=[-0.05,-0.05]", "expected [low, high] with 0.013 <= low"),
+        ("start.distance=[0,0]", "expected [low, high] with 0.001 <= low"),
         ("start.tilt=-0.1", "start.tilt is -0.1, expected >= 0"),
         ("planner.force_max=0", "planner.force_max is 0.0, expected a positive"),
         ("planner.rate=0", "rate is 0.0, expected > 0"),
