@@ -30,6 +30,7 @@ from makebreak.systems.numerics.smoother import smooth_filtered
 ROWS_BEFORE, ROWS_AFTER = 12, 12  # Of a window about a touch, beside the touch itself.
 LONGEST_SEC = 0.3  # Of a window.
 FREE_SEC, MOST_FREE, MOST_TOUCHES = 0.25, 6, 9
+AS_LONG = 0.8  # As the longest free window, of which some are much shorter.
 LOOKS = 4000  # Rows at which it is first asked whether anything comes near.
 NEAR = 0.01  # [m]
 FEWEST = 3  # Touches.
@@ -206,8 +207,8 @@ class ImpactWindows(WindowModel):
         if self._touches < FEWEST:
             raise ValueError(f"{self._touches} touches, expected {FEWEST} or more")
         both = []
-        for mine, most in ((True, MOST_TOUCHES), (False, MOST_FREE)):
-            some = [w for w in self.windows if (w in self._free) != mine]
+        touching = [w for w in self.windows if w not in self._free]
+        for some, most in ((touching, MOST_TOUCHES), (self._longest(), MOST_FREE)):
             keep = np.unique(np.linspace(0, len(some) - 1, most).astype(int))
             # Every third is held out, of each sort.
             both += [
@@ -274,14 +275,22 @@ class ImpactWindows(WindowModel):
                 self._touches += 1
                 self.windows.append(found)
         for a, b in free:
-            start = a + 3
-            while start < b and time[b - 1] - time[start] > FREE_SEC:
+            # What bounces to and fro is free for less: the whole of each way then.
+            start, last = a + 3, b - 3
+            while last - start >= ROWS_BEFORE:
                 end = int(np.searchsorted(time, time[start] + FREE_SEC, "right"))
-                found = window(start, min(end, b - 3))
+                found = window(start, min(end, last))
                 if found is not None:
                     self.windows.append(found)
                     self._free.append(found)
                 start = end
+
+    def _longest(self) -> list[Window]:
+        """Free windows that are about as long as the longest: friction and drives show
+        in them by the square of the time."""
+        rows = [w.rows.stop - w.rows.start for w in self._free]
+        least = AS_LONG * max(rows, default=0)
+        return [w for w, n in zip(self._free, rows, strict=True) if n >= least]
 
     def _add_spread(self) -> None:
         """Noise, what uncertain starts do in the scene as it is, and BLUR."""
