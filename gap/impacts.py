@@ -30,7 +30,7 @@ from makebreak.systems.numerics.smoother import smooth_filtered
 ROWS_BEFORE, ROWS_AFTER = 12, 12  # Of a window about a touch, beside the touch itself.
 LONGEST_SEC = 0.3  # Of a window.
 FREE_SEC, MOST_FREE, MOST_TOUCHES = 0.25, 6, 9
-AS_LONG = 0.8  # As the longest free window, of which some are much shorter.
+AS_LONG = 0.8  # As the longest free windows; some are much shorter.
 LOOKS = 4000  # Rows at which it is first asked whether anything comes near.
 NEAR = 0.01  # [m]
 FEWEST = 3  # Touches.
@@ -286,10 +286,10 @@ class ImpactWindows(WindowModel):
                 start = end
 
     def _longest(self) -> list[Window]:
-        """Free windows that are about as long as the longest: friction and drives show
-        in them by the square of the time."""
+        """Free windows that are about as long as the longest few: friction and drives
+        show in them by the square of the time."""
         rows = [w.rows.stop - w.rows.start for w in self._free]
-        least = AS_LONG * max(rows, default=0)
+        least = AS_LONG * min(sorted(rows)[-MOST_FREE:], default=0)
         return [w for w, n in zip(self._free, rows, strict=True) if n >= least]
 
     def _add_spread(self) -> None:

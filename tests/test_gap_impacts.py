@@ -8,7 +8,7 @@ from gap_benchmark import cart_world
 from gap_benchmark.cart_world import PAIR
 
 from makebreak.gap.fit import fit_effects
-from makebreak.gap.impacts import ImpactProblem, runs_against
+from makebreak.gap.impacts import FREE_SEC, MOST_FREE, ImpactProblem, runs_against
 from makebreak.gap.recording import read_recordings
 from makebreak.gap.workflow import problem_for, run_gap
 from makebreak.models.dynamics import SceneDynamics
@@ -87,6 +87,32 @@ def test_a_linear_damper_is_no_dissipation(tmp_path):
     found = fitted.effects[0].parameters["damping"]
     assert found == pytest.approx(true.damper, rel=0.03)
     assert fitted.b[own.index(True)] == 0.0
+
+
+def test_free_motion_is_judged_between_walls_that_are_near(tmp_path):
+    """From wall to wall in less time than a window of free motion is given: then it is
+    as long as it can be, and tells the rail's friction as well as elsewhere."""
+    cart = cart_world.Cart(reach=0.08)
+    true = replace(cart, coulomb=0.4)
+    table, noise = cart_world.record(true, np.random.default_rng(5), 4.0)
+    scene = read_scene(cart_world.write(tmp_path, cart, table, noise))
+    recordings = read_recordings([tmp_path / "recording.csv"])
+    problem, _ = problem_for(scene, recordings, SceneDynamics(scene))
+    assert isinstance(problem, ImpactProblem)
+    wall = cart.reach - cart.half
+    free = [
+        w for w in problem.windows
+        if np.abs(recordings[0]["cart.rail.position"][w.rows]).max() < wall
+    ]  # fmt: skip
+    rows = [w.rows.stop - w.rows.start for w in free]
+    assert len(free) == MOST_FREE and sum(w.train for w in free) == 4
+    assert max(rows) < FREE_SEC * 500 and min(rows) > 0.05 * 500
+    n = problem.nuisances()
+    screen = Screen(problem.base(), n.columns, n.prior, problem.train())
+    start = Effect("joint_coulomb_friction", ["cart.rail"], {"coulomb": 0.2})
+    fitted = fit_effects(problem, screen, [start])
+    assert fitted.effects[0].parameters["coulomb"] == pytest.approx(0.4, rel=0.02)
+    assert fitted.std[0]["coulomb"] < 0.01
 
 
 def test_walls_that_nothing_touches_do_not_count(tmp_path):
