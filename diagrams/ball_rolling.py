@@ -18,7 +18,6 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import (
     ConstantVectorSource,
-    Demultiplexer,
     LogVectorOutput,
     MatrixGain,
 )
@@ -39,6 +38,7 @@ from makebreak.diagrams.station import (
     make_control_plant,
     make_station,
 )
+from makebreak.diagrams.wiring import check_own, connect_command
 from makebreak.models.effects.kind import Effect
 from makebreak.models.fruit import FRUITS, fruit_file, make_fruit
 from makebreak.models.scene import Scene, load_scene, read_scene
@@ -416,6 +416,15 @@ def make_ball_rolling(
     return diagram
 
 
+# Settings that the diagram makes of others.
+_OWN = {
+    "tracker": ("ball_radius", "period_sec", "offset_sec"),
+    "task": ("period_sec", "offset_sec"),
+    "impedance": ("period_sec", "offset_sec"),
+    "camera": ("period_sec",),
+}
+
+
 def add_ball_rolling(
     builder: DiagramBuilder,
     config: BallRollingConfig,
@@ -432,20 +441,7 @@ def add_ball_rolling(
         it has the sensors' ports, but may lack the truth and the wrench, and have ball
         positions (`ball.p_WB`, `ball.v_WB`, `ball.seen`) in place of pictures.
     """
-    for name, own in (
-        ("tracker", ("ball_radius", "period_sec", "offset_sec")),
-        ("task", ("period_sec", "offset_sec")),
-        ("impedance", ("period_sec", "offset_sec")),
-        ("camera", ("period_sec",)),
-    ):
-        part = getattr(config, name)
-        for key in own:
-            default = getattr(type(part)(), key)
-            if getattr(part, key) != default:
-                raise ValueError(
-                    f"{name}.{key} is {getattr(part, key)}, expected {default}: the "
-                    "diagram sets it"
-                )
+    check_own(config, _OWN)
     model, model_scene = believed(config)
     camera = replace(config.camera, position_noise_m=config.ball_noise_m)
     learner_kind = config.learner if config.adapt else "none"
@@ -704,9 +700,4 @@ def connect_reference(builder: DiagramBuilder) -> None:
     builder.Connect(
         task.GetOutputPort("reference"), reference.GetInputPort("reference")
     )
-    sizes = [reference.GetOutputPort(name).size() for name in ("x_desired", "wrench")]
-    # Both at once: a port of a Python system costs more than what it works out.
-    split = builder.AddNamedSystem("arm_command_split", Demultiplexer(sizes))
-    builder.Connect(reference.GetOutputPort("command"), split.get_input_port())
-    for i, name in enumerate(("x_desired", "wrench_feedforward")):
-        builder.Connect(split.get_output_port(i), arm.GetInputPort(name))
+    connect_command(builder, reference, arm)

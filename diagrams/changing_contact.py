@@ -35,6 +35,7 @@ from makebreak.diagrams.station import (
     make_station,
 )
 from makebreak.diagrams.tabletop import TOOL, objects
+from makebreak.diagrams.wiring import timed
 from makebreak.models.scene import Scene
 from makebreak.systems.contact_anticipator import (
     ContactAnticipatorConfig,
@@ -225,22 +226,13 @@ def make_changing_contact(
     )
     config = replace(config, anticipator=replace(config.anticipator, speed=speed))
 
-    def timed(part, period, offset=OFFSET):
-        for key, value in (("period_sec", period), ("offset_sec", offset)):
-            default = getattr(type(part)(), key)
-            if getattr(part, key) != default:
-                raise ValueError(
-                    f"{type(part).__name__}.{key} is {getattr(part, key)}, expected "
-                    f"{default}: the diagram sets it"
-                )
-            part = replace(part, **{key: value})
-        return part
-
     def add(name, system):
         return builder.AddNamedSystem(name, system)
 
     tip = add("tip_state", TipState(chain))
-    detector = add("contact_detector", ContactDetector(timed(config.detector, TICK)))
+    detector = add(
+        "contact_detector", ContactDetector(timed(config.detector, TICK, OFFSET))
+    )
     modes = add(
         "mode_detector", ModeDetector(config.modes, known.modes, ESTIMATE, OFFSET)
     )
@@ -251,13 +243,15 @@ def make_changing_contact(
     anticipator = add(
         "contact_anticipator",
         KalmanContactAnticipator(
-            timed(config.anticipator, ANTICIPATE), known.contacts, tip_mass(arm)
+            timed(config.anticipator, ANTICIPATE, OFFSET), known.contacts, tip_mass(arm)
         ),
     )
-    shaper = add("velocity_shaper", VelocityShaper(timed(config.shaper, TICK), pattern))
+    shaper = add(
+        "velocity_shaper", VelocityShaper(timed(config.shaper, TICK, OFFSET), pattern)
+    )
     variable = add(
         "variable_impedance",
-        VariableImpedance(timed(config.variable_impedance, TICK)),
+        VariableImpedance(timed(config.variable_impedance, TICK, OFFSET)),
     )
     impedance = add(
         "impedance_controller",
@@ -302,7 +296,9 @@ def make_changing_contact(
     for port in ("stiffness", "damping", "damping_stiffness", "wrench_feedforward"):
         source = variable
         if port == "wrench_feedforward" and config.reflex.gain > 0.0:
-            source = add("impact_reflex", ImpactReflex(timed(config.reflex, TICK)))
+            source = add(
+                "impact_reflex", ImpactReflex(timed(config.reflex, TICK, OFFSET))
+            )
             connect(variable, port, source)
             connect(station, felt, source, port="wrench")
             connect(tip, "ee_velocity", source)

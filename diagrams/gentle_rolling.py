@@ -36,6 +36,7 @@ from makebreak.diagrams.ball_rolling import (
 )
 from makebreak.diagrams.camera import CameraConfig
 from makebreak.diagrams.station import ARM, TIP_FRAME, make_control_plant
+from makebreak.diagrams.wiring import timed
 from makebreak.systems.contact_anticipator import (
     ApproachSpeedConfig,
     ContactAnticipatorConfig,
@@ -277,18 +278,6 @@ def _to_freeze(config: GentleRollingConfig) -> list[str]:
     return out
 
 
-def _timed(part, period, offset=OFFSET):
-    for key, value in (("period_sec", period), ("offset_sec", offset)):
-        default = getattr(type(part)(), key)
-        if getattr(part, key) != default:
-            raise ValueError(
-                f"{type(part).__name__}.{key} is {getattr(part, key)}, expected "
-                f"{default}: the diagram sets it"
-            )
-        part = replace(part, **{key: value})
-    return part
-
-
 def _from_wrist(arm) -> np.ndarray:
     """(2,) from the wrist to the tip, seen from above [m]: the tool's orientation is
     held, so that it stays what it is in the arm's initial posture."""
@@ -323,7 +312,7 @@ def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) ->
     add("push_motion", motion)
     add("tip_state", TipState(chain))
     add("moving_frame", MovingFrame())
-    add("contact_detector", ContactDetector(_timed(touch.detector, ARM_TICK)))
+    add("contact_detector", ContactDetector(timed(touch.detector, ARM_TICK, OFFSET)))
     add("mode_detector", ModeDetector(touch.modes, None, ESTIMATE, OFFSET))
     add(
         "forward_model_bank",
@@ -331,15 +320,19 @@ def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) ->
     )
     add(
         "contact_anticipator",
-        KalmanContactAnticipator(_timed(touch.anticipator, ANTICIPATE), prior(config)),
+        KalmanContactAnticipator(
+            timed(touch.anticipator, ANTICIPATE, OFFSET), prior(config)
+        ),
     )
     add(
         "velocity_shaper",
-        VelocityShaper(_timed(touch.shaper, ARM_TICK), first, PLAN, restarts=True),
+        VelocityShaper(
+            timed(touch.shaper, ARM_TICK, OFFSET), first, PLAN, restarts=True
+        ),
     )
     add(
         "variable_impedance",
-        VariableImpedance(_timed(touch.variable_impedance, ARM_TICK)),
+        VariableImpedance(timed(touch.variable_impedance, ARM_TICK, OFFSET)),
     )
     blend = replace(touch.blend, period_sec=CONTROL, offset_sec=BLEND_OFFSET)
     add("reference_blend", ReferenceBlend(blend))

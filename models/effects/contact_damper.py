@@ -51,33 +51,37 @@ class ContactDamper(LeafSystem):
         )
 
     def _calc(self, context: Context, output: BasicVector):
-        total = np.zeros(self._plant.num_velocities())
-        is_set = False
-        for touch in self._query.Eval(context).ComputePointPairPenetration():
-            a, b = self._of.get(touch.id_A), self._of.get(touch.id_B)
-            if a is None or b is None or a.index() == b.index():
-                continue
-            x = self._state.Eval(context)
-            if not is_set:
-                self._plant.SetPositionsAndVelocities(self._scratch, x)
-                is_set = True
+        plant, own = self._plant, self._scratch
+        total, of = np.zeros(plant.num_velocities()), self._of
+        touches = [
+            touch
+            for touch in self._query.Eval(context).ComputePointPairPenetration()
+            if touch.id_A in of
+            and touch.id_B in of
+            and of[touch.id_A].index() != of[touch.id_B].index()
+        ]
+        if not touches:
+            output.SetFromVector(total)
+            return
+        x = self._state.Eval(context)
+        plant.SetPositionsAndVelocities(own, x)
+        M = plant.CalcMassMatrix(own) if self._dt > 0.0 else None
+        for touch in touches:
+            a, b, n = of[touch.id_A], of[touch.id_B], touch.nhat_BA_W
             middle = (touch.p_WCa + touch.p_WCb) / 2.0
-            X_WA = self._plant.EvalBodyPoseInWorld(self._scratch, a)
             # Of the point of A as B sees it: the velocity at which they slide and part.
-            J = self._plant.CalcJacobianTranslationalVelocity(
-                self._scratch,
+            J = plant.CalcJacobianTranslationalVelocity(
+                own,
                 JacobianWrtVariable.kV,
                 a.body_frame(),
-                X_WA.inverse() @ middle,
+                plant.EvalBodyPoseInWorld(own, a).inverse() @ middle,
                 b.body_frame(),
-                self._plant.world_frame(),
+                plant.world_frame(),
             )
-            n = touch.nhat_BA_W
-            v = J @ x[self._plant.num_positions() :]
+            v = J @ x[plant.num_positions() :]
             damping = self._damping
-            if self._dt > 0.0:
+            if M is not None:
                 along = J.T @ n
-                M = self._plant.CalcMassMatrix(self._scratch)
                 ease = float(along @ np.linalg.solve(M, along))
                 damping = min(damping, 1.0 / (self._dt * max(ease, 1e-12)))
             force = max(-damping * (n @ v), -self._stiffness * touch.depth)

@@ -34,10 +34,7 @@ from makebreak.diagrams.changing_surface import (
     surface_at,
 )
 from makebreak.diagrams.recorder import recorded
-from makebreak.scripts.contact_runs import (
-    rehearsed,
-    simulate_motion,
-)
+from makebreak.scripts.contact_runs import rehearsed, simulate_motion
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table

@@ -37,10 +37,7 @@ from makebreak.diagrams.multiple_collisions import (
 )
 from makebreak.diagrams.recorder import episodes, recorded
 from makebreak.diagrams.tabletop import position
-from makebreak.scripts.contact_runs import (
-    rehearsed,
-    simulate_motion,
-)
+from makebreak.scripts.contact_runs import rehearsed, simulate_motion
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table

@@ -38,10 +38,7 @@ from makebreak.diagrams.surface_switch import (
     make_surface_switch,
     make_task,
 )
-from makebreak.scripts.contact_runs import (
-    rehearsed,
-    simulate_motion,
-)
+from makebreak.scripts.contact_runs import rehearsed, simulate_motion
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table

@@ -1,0 +1,46 @@
+"""What several diagrams do alike: settings that are theirs to give, and the arm's."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
+
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import Demultiplexer
+
+_Config = TypeVar("_Config")
+
+
+def refuse_changed(name: str, part: Any, keys: Sequence[str]) -> None:
+    """Raises: ValueError for a setting that the diagram sets: it would not act."""
+    plain = type(part)()
+    for key in keys:
+        value, default = getattr(part, key), getattr(plain, key)
+        if value != default:
+            raise ValueError(
+                f"{name}.{key} is {value}, expected {default}: the diagram sets it"
+            )
+
+
+def check_own(config: Any, own: Mapping[str, Sequence[str]]) -> None:
+    """refuse_changed of each part of a config, {field: keys}."""
+    for name, keys in own.items():
+        refuse_changed(name, getattr(config, name), keys)
+
+
+def timed(part: _Config, period: float, offset: float) -> _Config:
+    """A system's config with the diagram's period and offset [s]."""
+    refuse_changed(type(part).__name__, part, ("period_sec", "offset_sec"))
+    changed: Any = part
+    return replace(changed, period_sec=period, offset_sec=offset)
+
+
+def connect_command(
+    builder: DiagramBuilder, reference: LeafSystem, arm: LeafSystem
+) -> None:
+    """An ArmReference to an ImpedanceController, pose and wrench at once: a port of a
+    Python system costs more than what it works out."""
+    sizes = [reference.GetOutputPort(name).size() for name in ("x_desired", "wrench")]
+    split = builder.AddNamedSystem("arm_command_split", Demultiplexer(sizes))
+    builder.Connect(reference.GetOutputPort("command"), split.get_input_port())
+    for i, name in enumerate(("x_desired", "wrench_feedforward")):
+        builder.Connect(split.get_output_port(i), arm.GetInputPort(name))
