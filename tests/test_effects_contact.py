@@ -218,6 +218,41 @@ def test_a_damper_acts_while_the_two_touch_and_never_pulls(tmp_path):
     np.testing.assert_allclose(force(RADIUS - 1e-7, 5.0), expected, atol=1e-9)
 
 
+@pytest.mark.parametrize("spin", [0.0, 3.0])
+def test_a_damped_contact_rubs_where_the_two_touch(tmp_path, spin):
+    """The generalized force on a ball that sinks, slides and spins is f and r x f, with
+    r from its centre to the touch, halfway in the overlap."""
+    other = with_effects(
+        on_ground(tmp_path, "ball"), ("contact_damping", PAIR, dict(damping=40.0))
+    )
+    builder = DiagramBuilder()
+    plant = load_scene(other, builder).plant
+    diagram = builder.Build()
+    damper = next(
+        s for s in diagram.GetSystems() if s.get_name().startswith("contact_damper")
+    )
+    context = diagram.CreateDefaultContext()
+    own = plant.GetMyMutableContextFromRoot(context)
+    ball = plant.GetBodyByName("ball")
+    depth, down = 2e-3, 0.02
+    r = np.array([0.0, 0.0, -(RADIUS - depth / 2)])
+    v, w = np.array([0.3, -0.1, -down]), np.array([0.0, spin, 0.0])
+    plant.SetFreeBodyPose(own, ball, RigidTransform([0.1, 0.0, RADIUS - depth]))
+    plant.SetFreeBodySpatialVelocity(own, ball, SpatialVelocity(w, v))
+    port = damper.GetOutputPort("generalized_force")
+    felt = port.Eval(damper.GetMyContextFromRoot(context))
+
+    friction, _, _ = combined(other)
+    slip = v + np.cross(w, r)
+    slip[2] = 0.0
+    normal = 40.0 * down
+    f = np.array([0.0, 0.0, normal]) - friction * normal * slip / np.linalg.norm(slip)
+    expected = np.zeros(plant.num_velocities())
+    at = ball.floating_velocities_start_in_v()
+    expected[at : at + 3], expected[at + 3 : at + 6] = np.cross(r, f), f
+    np.testing.assert_allclose(felt, expected, rtol=1e-9, atol=1e-12)
+
+
 def test_values_of_a_pair_are_what_was_asked_for_and_told_back(tmp_path):
     ground = surface(0.3, 5e4, 2.0)
     scene = on_ground(tmp_path, "ball", ground=ground)
