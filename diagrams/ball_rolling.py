@@ -43,27 +43,25 @@ from makebreak.models.effects.kind import Effect
 from makebreak.models.fruit import FRUITS, fruit_file, make_fruit
 from makebreak.models.scene import Scene, load_scene, read_scene
 from makebreak.models.tip_and_ball import TipAndBall, make_tip_and_ball
-from makebreak.systems.adapt_button import AdaptButton
-from makebreak.systems.arm_reference import ArmReference, ArmReferenceConfig
-from makebreak.systems.ball_tracker import BallTracker, BallTrackerConfig
-from makebreak.systems.baselines.dynamics_residual import DynamicsResidual
-from makebreak.systems.baselines.dynamics_residual_learner import (
-    DynamicsResidualLearner,
-    DynamicsResidualLearnerConfig,
-)
-from makebreak.systems.c3_mpc import C3Config, C3Mpc
-from makebreak.systems.impedance_controller import (
+from makebreak.systems.arm.arm_reference import ArmReference, ArmReferenceConfig
+from makebreak.systems.arm.impedance_controller import (
     HybridConfig,
     ImpedanceConfig,
     ImpedanceController,
     serial_chain_of,
 )
-from makebreak.systems.lcs_builder import (
+from makebreak.systems.baselines.dynamics_residual import DynamicsResidual
+from makebreak.systems.baselines.dynamics_residual_learner import (
+    DynamicsResidualLearner,
+    DynamicsResidualLearnerConfig,
+)
+from makebreak.systems.contact_mpc.c3_mpc import C3Config, C3Mpc
+from makebreak.systems.contact_mpc.lcs_builder import (
     AnitescuLcsBuilder,
     ContactPair,
     LcsBuilderConfig,
 )
-from makebreak.systems.numerics.ball_state import (
+from makebreak.systems.contact_mpc.numerics.ball_state import (
     N_X,
     P_BALL,
     P_TIP,
@@ -71,20 +69,25 @@ from makebreak.systems.numerics.ball_state import (
     V_TIP,
     W_BALL,
 )
-from makebreak.systems.numerics.c3_mpc import C3Options, C3Weights
-from makebreak.systems.numerics.c3_projections import (
+from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Options, C3Weights
+from makebreak.systems.contact_mpc.numerics.c3_projections import (
     ExactProjection,
     PlusProjection,
     QpProjection,
 )
-from makebreak.systems.residual_learner import (
+from makebreak.systems.contact_mpc.residual_learner import (
     PosteriorConfig,
     ResidualLearner,
     ResidualLearnerConfig,
 )
-from makebreak.systems.rolling_task import RollingTask, RollingTaskConfig
-from makebreak.systems.rolling_view import RollingView, RollingViewConfig
-from makebreak.systems.state_estimator import StateEstimator, StateEstimatorConfig
+from makebreak.systems.contact_mpc.rolling_task import RollingTask, RollingTaskConfig
+from makebreak.systems.perception.ball_tracker import BallTracker, BallTrackerConfig
+from makebreak.systems.perception.state_estimator import (
+    StateEstimator,
+    StateEstimatorConfig,
+)
+from makebreak.systems.views.adapt_button import AdaptButton
+from makebreak.systems.views.rolling_view import RollingView, RollingViewConfig
 
 # Periods [s]. The estimator's divides C3's and the learner's: no reading is stale.
 TRACK = CONTROL = 0.0125

@@ -23,9 +23,9 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
-from makebreak.systems.camera_shake import CameraShake
-from makebreak.systems.numerics.pinhole import Pinhole, look_down
-from makebreak.systems.pinhole_camera import PinholeCamera
+from makebreak.systems.perception.camera_shake import CameraShake
+from makebreak.systems.perception.numerics.pinhole import Pinhole, look_down
+from makebreak.systems.perception.pinhole_camera import PinholeCamera
 
 # Drake's VTK picture lies half a pixel towards -u and -v of what its CameraInfo says
 # (tests/test_camera.py measures it); the drawn one lies where VTK's does.

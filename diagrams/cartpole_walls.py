@@ -23,18 +23,25 @@ from makebreak.systems.baselines.dynamics_residual_learner import (
     DynamicsResidualLearner,
     DynamicsResidualLearnerConfig,
 )
-from makebreak.systems.c3_mpc import C3Config, C3Mpc
-from makebreak.systems.lcs_plant import LcsPlant, LcsPlantConfig
-from makebreak.systems.numerics.c3_mpc import C3Options, C3Weights
-from makebreak.systems.numerics.c3_projections import (
+from makebreak.systems.contact_mpc.c3_mpc import C3Config, C3Mpc
+from makebreak.systems.contact_mpc.lcs_plant import LcsPlant, LcsPlantConfig
+from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Options, C3Weights
+from makebreak.systems.contact_mpc.numerics.c3_projections import (
     ExactProjection,
     PlusProjection,
     QpProjection,
 )
-from makebreak.systems.numerics.cartpole import CartPole, cartpole_lcs, cost_to_go
-from makebreak.systems.numerics.lcs import LCS
-from makebreak.systems.residual_learner import ResidualLearner, ResidualLearnerConfig
-from makebreak.systems.walls_view import WallsView, WallsViewConfig
+from makebreak.systems.contact_mpc.numerics.cartpole import (
+    CartPole,
+    cartpole_lcs,
+    cost_to_go,
+)
+from makebreak.systems.contact_mpc.numerics.lcs import LCS
+from makebreak.systems.contact_mpc.residual_learner import (
+    ResidualLearner,
+    ResidualLearnerConfig,
+)
+from makebreak.systems.views.walls_view import WallsView, WallsViewConfig
 
 SCENE = str(MODELS / "cartpole_walls.scene.yaml")
 DT = 0.01  # Time step of the LCS, of C3 and of the learner [s].

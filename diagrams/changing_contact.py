@@ -37,31 +37,46 @@ from makebreak.diagrams.station import (
 from makebreak.diagrams.tabletop import TOOL, objects
 from makebreak.diagrams.wiring import timed
 from makebreak.models.scene import Scene
-from makebreak.systems.contact_anticipator import (
-    ContactAnticipatorConfig,
-    KalmanContactAnticipator,
-)
-from makebreak.systems.contact_detector import ContactDetector, ContactDetectorConfig
-from makebreak.systems.contact_view import ContactView, ContactViewConfig
-from makebreak.systems.forward_model import ForwardModelBank, ForwardModelConfig
-from makebreak.systems.impact_reflex import ImpactReflex, ImpactReflexConfig
-from makebreak.systems.impedance_controller import (
+from makebreak.systems.arm.impedance_controller import (
     HybridConfig,
     ImpedanceConfig,
     ImpedanceController,
     serial_chain_of,
 )
-from makebreak.systems.mode_detector import ModeDetector, ModeDetectorConfig
-from makebreak.systems.numerics.contact_task import ContactBelief
-from makebreak.systems.numerics.forward_model import ModelBank
-from makebreak.systems.numerics.mode_table import ModeTable
-from makebreak.systems.numerics.motion_pattern import MotionPattern
-from makebreak.systems.tip_state import TipState
-from makebreak.systems.variable_impedance import (
+from makebreak.systems.arm.tip_state import TipState
+from makebreak.systems.arm.variable_impedance import (
     VariableImpedance,
     VariableImpedanceConfig,
 )
-from makebreak.systems.velocity_shaper import VelocityShaper, VelocityShaperConfig
+from makebreak.systems.changing_contact.contact_anticipator import (
+    ContactAnticipatorConfig,
+    KalmanContactAnticipator,
+)
+from makebreak.systems.changing_contact.contact_detector import (
+    ContactDetector,
+    ContactDetectorConfig,
+)
+from makebreak.systems.changing_contact.forward_model import (
+    ForwardModelBank,
+    ForwardModelConfig,
+)
+from makebreak.systems.changing_contact.impact_reflex import (
+    ImpactReflex,
+    ImpactReflexConfig,
+)
+from makebreak.systems.changing_contact.mode_detector import (
+    ModeDetector,
+    ModeDetectorConfig,
+)
+from makebreak.systems.changing_contact.numerics.contact_task import ContactBelief
+from makebreak.systems.changing_contact.numerics.forward_model import ModelBank
+from makebreak.systems.changing_contact.numerics.mode_table import ModeTable
+from makebreak.systems.changing_contact.numerics.motion_pattern import MotionPattern
+from makebreak.systems.changing_contact.velocity_shaper import (
+    VelocityShaper,
+    VelocityShaperConfig,
+)
+from makebreak.systems.views.contact_view import ContactView, ContactViewConfig
 
 # Periods [s].
 TICK, ESTIMATE, ANTICIPATE = 0.001, 0.005, 0.01

@@ -29,8 +29,11 @@ from makebreak.diagrams.tabletop import (
 )
 from makebreak.models.friction_zones import FrictionZone
 from makebreak.models.scene import Scene, read_scene
-from makebreak.systems.numerics.contact_task import ContactBelief, ExpectedContact
-from makebreak.systems.numerics.motion_pattern import (
+from makebreak.systems.changing_contact.numerics.contact_task import (
+    ContactBelief,
+    ExpectedContact,
+)
+from makebreak.systems.changing_contact.numerics.motion_pattern import (
     MotionPattern,
     Segment,
     segment_time,

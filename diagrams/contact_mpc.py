@@ -6,13 +6,13 @@ import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from makebreak.systems.c3_mpc import C3Config, C3Mpc
-from makebreak.systems.lcs_builder import (
+from makebreak.systems.contact_mpc.c3_mpc import C3Config, C3Mpc
+from makebreak.systems.contact_mpc.lcs_builder import (
     AnitescuLcsBuilder,
     ContactPair,
     LcsBuilderConfig,
 )
-from makebreak.systems.numerics.c3_mpc import C3Bounds, C3Options, C3Weights
+from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Bounds, C3Options, C3Weights
 
 
 @dataclass

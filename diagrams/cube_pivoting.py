@@ -31,24 +31,30 @@ from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.models.model_files import MODELS, add_models
 from makebreak.models.scene import Scene, load_scene, read_scene
-from makebreak.systems.c3_mpc import C3Config, C3Mpc
-from makebreak.systems.contact_probe import ContactProbe
-from makebreak.systems.lcs_builder import (
+from makebreak.systems.contact_mpc.c3_mpc import C3Config, C3Mpc
+from makebreak.systems.contact_mpc.lcs_builder import (
     AnitescuLcsBuilder,
     ContactPair,
     LcsBuilderConfig,
 )
-from makebreak.systems.numerics.c3_mpc import C3Bounds, C3Options, C3Weights
-from makebreak.systems.numerics.c3_projections import PlusProjection, QpProjection
-from makebreak.systems.numerics.pivot_target import (
+from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Bounds, C3Options, C3Weights
+from makebreak.systems.contact_mpc.numerics.c3_projections import (
+    PlusProjection,
+    QpProjection,
+)
+from makebreak.systems.contact_mpc.numerics.pivot_target import (
     LEFT,
     N_X,
     RIGHT,
     THETA,
     corners,
 )
-from makebreak.systems.pivot_target import PivotTarget, PivotTargetConfig
-from makebreak.systems.residual_learner import ResidualLearner, ResidualLearnerConfig
+from makebreak.systems.contact_mpc.pivot_target import PivotTarget, PivotTargetConfig
+from makebreak.systems.contact_mpc.residual_learner import (
+    ResidualLearner,
+    ResidualLearnerConfig,
+)
+from makebreak.systems.views.contact_probe import ContactProbe
 
 SCENE = str(MODELS / "cube_pivoting.scene.yaml")
 FINGERS = ("left", "right")

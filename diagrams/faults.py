@@ -21,16 +21,16 @@ from makebreak.diagrams.scene_facts import actuators_of, spheres_of
 from makebreak.models.effects.joint_forces import JointForces
 from makebreak.models.effects.joints import fade_velocity
 from makebreak.models.scene import LoadedScene, Scene
-from makebreak.systems.fault_forces import Hand, Push
-from makebreak.systems.fault_pictures import LatePictures, PaintedPictures
-from makebreak.systems.fault_signals import (
+from makebreak.systems.faults.fault_forces import Hand, Push
+from makebreak.systems.faults.fault_pictures import LatePictures, PaintedPictures
+from makebreak.systems.faults.fault_signals import (
     BiasedSignal,
     LateSignal,
     LimitedSignal,
     SpoiledLcs,
     StuckSignal,
 )
-from makebreak.systems.numerics.time_span import lasts
+from makebreak.systems.faults.numerics.time_span import lasts
 
 GLARE = (255, 255, 255)
 BALL_COLOR = (242, 102, 13)  # Of models/ball.sdf.

@@ -37,44 +37,60 @@ from makebreak.diagrams.ball_rolling import (
 from makebreak.diagrams.camera import CameraConfig
 from makebreak.diagrams.station import ARM, TIP_FRAME, make_control_plant
 from makebreak.diagrams.wiring import timed
-from makebreak.systems.contact_anticipator import (
+from makebreak.systems.arm.impedance_controller import HybridConfig, serial_chain_of
+from makebreak.systems.arm.tip_state import TipState
+from makebreak.systems.arm.variable_impedance import (
+    StiffnessConfig,
+    VariableImpedance,
+    VariableImpedanceConfig,
+)
+from makebreak.systems.baselines.frozen import Frozen
+from makebreak.systems.changing_contact.contact_anticipator import (
     ApproachSpeedConfig,
     ContactAnticipatorConfig,
     ContactFilterConfig,
     KalmanContactAnticipator,
 )
-from makebreak.systems.contact_detector import ContactDetector, ContactDetectorConfig
-from makebreak.systems.forward_model import ForwardModelBank, ForwardModelConfig
-from makebreak.systems.frozen import Frozen
-from makebreak.systems.impedance_controller import HybridConfig, serial_chain_of
-from makebreak.systems.mode_detector import ModeDetector, ModeDetectorConfig
-from makebreak.systems.moving_frame import MovingFrame
-from makebreak.systems.numerics.contact_task import (
+from makebreak.systems.changing_contact.contact_detector import (
+    ContactDetector,
+    ContactDetectorConfig,
+)
+from makebreak.systems.changing_contact.forward_model import (
+    ForwardModelBank,
+    ForwardModelConfig,
+)
+from makebreak.systems.changing_contact.mode_detector import (
+    ModeDetector,
+    ModeDetectorConfig,
+)
+from makebreak.systems.changing_contact.moving_frame import MovingFrame
+from makebreak.systems.changing_contact.numerics.contact_task import (
     N_TRANSITION,
     ContactBelief,
     ExpectedContact,
 )
-from makebreak.systems.numerics.push_motion import BALL_SEGMENT, DOWN, TABLE_SEGMENT
-from makebreak.systems.numerics.rolling_task import (
-    CirclePath,
-    RollingConfig,
-    surface_height,
+from makebreak.systems.changing_contact.numerics.push_motion import (
+    BALL_SEGMENT,
+    DOWN,
+    TABLE_SEGMENT,
 )
-from makebreak.systems.push_motion import PushMotion, PushMotionConfig
-from makebreak.systems.reference_blend import ReferenceBlend, ReferenceBlendConfig
-from makebreak.systems.rolling_task import RollingTaskConfig
-from makebreak.systems.tip_state import TipState
-from makebreak.systems.variable_impedance import (
-    StiffnessConfig,
-    VariableImpedance,
-    VariableImpedanceConfig,
+from makebreak.systems.changing_contact.push_motion import PushMotion, PushMotionConfig
+from makebreak.systems.changing_contact.reference_blend import (
+    ReferenceBlend,
+    ReferenceBlendConfig,
 )
-from makebreak.systems.velocity_shaper import (
+from makebreak.systems.changing_contact.velocity_shaper import (
     RegionConfig,
     SearchConfig,
     VelocityShaper,
     VelocityShaperConfig,
 )
+from makebreak.systems.contact_mpc.numerics.rolling_task import (
+    CirclePath,
+    RollingConfig,
+    surface_height,
+)
+from makebreak.systems.contact_mpc.rolling_task import RollingTaskConfig
 
 BRISK_SEC = 0.4  # A reposition, if nothing slows it.
 # Periods and offsets of what ball_rolling has not [s]. All that runs each millisecond

@@ -25,8 +25,8 @@ from pydrake.systems.sensors import LcmImageArrayToImages
 
 from makebreak.diagrams.scene_facts import N_JOINTS
 from makebreak.diagrams.station import ARM, DELAY, TIP_FRAME
-from makebreak.systems.gravity_left_out import GravityLeftOut
-from makebreak.systems.impedance_controller import serial_chain_of
+from makebreak.systems.arm.gravity_left_out import GravityLeftOut
+from makebreak.systems.arm.impedance_controller import serial_chain_of
 
 STATUS, COMMAND, PICTURES = "PANDA_STATUS", "PANDA_COMMAND", "OVERHEAD_IMAGES"
 URL = "udpm://239.255.76.67:7671?ttl=0"  # This machine alone.

@@ -26,12 +26,12 @@ from makebreak.systems.baselines.active_inference import (
 )
 from makebreak.systems.baselines.biomimetic import Biomimetic, BiomimeticConfig
 from makebreak.systems.baselines.mrac import Mrac, MracConfig
-from makebreak.systems.planar_impedance import (
+from makebreak.systems.planar.planar_impedance import (
     ForceModelConfig,
     PlanarImpedance,
     PlanarImpedanceConfig,
 )
-from makebreak.systems.planar_world import CircleTargetConfig, PlanarWorldConfig
+from makebreak.systems.planar.planar_world import CircleTargetConfig, PlanarWorldConfig
 
 REACH = 0.7  # Of springs that engage and let go [m]; the circle is .5 to 1 m away.
 # Before the seed varies them: the springs' anchors [m], stiffness [N/m], rest length

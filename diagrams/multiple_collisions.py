@@ -38,20 +38,26 @@ from makebreak.diagrams.tabletop import (
     tool_half_width,
 )
 from makebreak.models.scene import Scene, read_scene
-from makebreak.systems.contact_anticipator import (
+from makebreak.systems.changing_contact.contact_anticipator import (
     ApproachSpeedConfig,
     ContactAnticipatorConfig,
 )
-from makebreak.systems.contact_detector import ContactDetectorConfig
-from makebreak.systems.contact_view import ContactViewConfig
-from makebreak.systems.impact_reflex import ImpactReflexConfig
-from makebreak.systems.numerics.contact_task import ContactBelief, ExpectedContact
-from makebreak.systems.numerics.motion_pattern import (
+from makebreak.systems.changing_contact.contact_detector import ContactDetectorConfig
+from makebreak.systems.changing_contact.impact_reflex import ImpactReflexConfig
+from makebreak.systems.changing_contact.numerics.contact_task import (
+    ContactBelief,
+    ExpectedContact,
+)
+from makebreak.systems.changing_contact.numerics.motion_pattern import (
     MotionPattern,
     Segment,
     segment_time,
 )
-from makebreak.systems.velocity_shaper import RegionConfig, VelocityShaperConfig
+from makebreak.systems.changing_contact.velocity_shaper import (
+    RegionConfig,
+    VelocityShaperConfig,
+)
+from makebreak.systems.views.contact_view import ContactViewConfig
 
 SURFACES = ("table", "red_block", "blue_wall")
 DOWN, LEFT, AHEAD = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])

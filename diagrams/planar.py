@@ -19,14 +19,14 @@ from makebreak.diagrams.recorder import add_recorder
 from makebreak.models.effects.delay_line import DelayLine
 from makebreak.models.model_files import MODELS
 from makebreak.systems.baselines.force_feedforward import ForceFeedforward
-from makebreak.systems.noisy_sensor import NoisySensor
-from makebreak.systems.planar_view import PlanarView, PlanarViewConfig
-from makebreak.systems.planar_world import (
+from makebreak.systems.perception.noisy_sensor import NoisySensor
+from makebreak.systems.planar.planar_world import (
     CircleTarget,
     CircleTargetConfig,
     PlanarWorld,
     PlanarWorldConfig,
 )
+from makebreak.systems.views.planar_view import PlanarView, PlanarViewConfig
 
 PLANAR = str(MODELS / "planar.scene.yaml")  # The effector alone: what is believed.
 AXES = "effector"  # The model there; its joints are x and y.

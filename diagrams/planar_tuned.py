@@ -11,8 +11,11 @@ from makebreak.diagrams.planar import LAB, MASS, PlanarSensing
 from makebreak.systems.baselines.active_inference import ActiveInferenceConfig
 from makebreak.systems.baselines.biomimetic import BiomimeticConfig
 from makebreak.systems.baselines.mrac import MracConfig
-from makebreak.systems.numerics.igmm import IgmmConfig
-from makebreak.systems.planar_impedance import ForceModelConfig, PlanarImpedanceConfig
+from makebreak.systems.changing_contact.numerics.igmm import IgmmConfig
+from makebreak.systems.planar.planar_impedance import (
+    ForceModelConfig,
+    PlanarImpedanceConfig,
+)
 
 TUNED_FILE = Path(__file__).with_name("planar_tuned.json")
 

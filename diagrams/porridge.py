@@ -15,9 +15,12 @@ from makebreak.diagrams.planar import (
 )
 from makebreak.diagrams.planar_tuned import tuned_mrac
 from makebreak.systems.baselines.mrac import MracConfig
-from makebreak.systems.numerics.igmm import IgmmConfig
-from makebreak.systems.planar_impedance import ForceModelConfig, PlanarImpedanceConfig
-from makebreak.systems.planar_world import CircleTargetConfig, PlanarWorldConfig
+from makebreak.systems.changing_contact.numerics.igmm import IgmmConfig
+from makebreak.systems.planar.planar_impedance import (
+    ForceModelConfig,
+    PlanarImpedanceConfig,
+)
+from makebreak.systems.planar.planar_world import CircleTargetConfig, PlanarWorldConfig
 
 
 # The law as found on springs; a few settings of the mixture were tried, see there.

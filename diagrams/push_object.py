@@ -49,41 +49,61 @@ from makebreak.models.pushed_object import (
 )
 from makebreak.models.scene import Scene, load_scene, read_scene
 from makebreak.models.tip_and_ball import TipAndBall
-from makebreak.systems.adapt_button import AdaptButton
-from makebreak.systems.arm_reference import ArmReference, ArmReferenceConfig
-from makebreak.systems.c3_mpc import C3Config, C3Mpc
-from makebreak.systems.contact_sampler import ContactSampler, ContactSamplerConfig
-from makebreak.systems.impedance_controller import (
+from makebreak.systems.arm.arm_reference import ArmReference, ArmReferenceConfig
+from makebreak.systems.arm.impedance_controller import (
     ImpedanceConfig,
     ImpedanceController,
     serial_chain_of,
 )
-from makebreak.systems.lcs_builder import (
+from makebreak.systems.contact_mpc.c3_mpc import C3Config, C3Mpc
+from makebreak.systems.contact_mpc.contact_sampler import (
+    ContactSampler,
+    ContactSamplerConfig,
+)
+from makebreak.systems.contact_mpc.lcs_builder import (
     AnitescuLcsBuilder,
     ContactPair,
     LcsBuilderConfig,
 )
-from makebreak.systems.numerics.ball_state import N_X, P_BALL, Q_BALL, V_BALL, V_TIP
-from makebreak.systems.numerics.c3_mpc import (
+from makebreak.systems.contact_mpc.numerics.ball_state import (
+    N_X,
+    P_BALL,
+    Q_BALL,
+    V_BALL,
+    V_TIP,
+)
+from makebreak.systems.contact_mpc.numerics.c3_mpc import (
     C3Options,
     C3Problem,
     C3Weights,
     OrientationWeight,
 )
-from makebreak.systems.numerics.contact_sampling import ObjectShape
-from makebreak.systems.numerics.pose_tracker import make_shape
-from makebreak.systems.past_state import PastState, PastStateConfig
-from makebreak.systems.pose_sensor import KEPT_SEC, PoseSensor, PoseSensorConfig
-from makebreak.systems.pose_tracker import PoseTracker, PoseTrackerConfig
-from makebreak.systems.push_goals import PushGoals, PushGoalsConfig, draw_poses
-from makebreak.systems.push_task import PushTask, PushTaskConfig
-from makebreak.systems.push_view import PushView, PushViewConfig
-from makebreak.systems.residual_learner import (
+from makebreak.systems.contact_mpc.numerics.contact_sampling import ObjectShape
+from makebreak.systems.contact_mpc.push_goals import (
+    PushGoals,
+    PushGoalsConfig,
+    draw_poses,
+)
+from makebreak.systems.contact_mpc.push_task import PushTask, PushTaskConfig
+from makebreak.systems.contact_mpc.residual_learner import (
     PosteriorConfig,
     ResidualLearner,
     ResidualLearnerConfig,
 )
-from makebreak.systems.state_estimator import StateEstimator, StateEstimatorConfig
+from makebreak.systems.perception.numerics.pose_tracker import make_shape
+from makebreak.systems.perception.past_state import PastState, PastStateConfig
+from makebreak.systems.perception.pose_sensor import (
+    KEPT_SEC,
+    PoseSensor,
+    PoseSensorConfig,
+)
+from makebreak.systems.perception.pose_tracker import PoseTracker, PoseTrackerConfig
+from makebreak.systems.perception.state_estimator import (
+    StateEstimator,
+    StateEstimatorConfig,
+)
+from makebreak.systems.views.adapt_button import AdaptButton
+from makebreak.systems.views.push_view import PushView, PushViewConfig
 
 PUSH_OBJECT = str(MODELS / "push_object.scene.yaml")
 OBJECT = "object"

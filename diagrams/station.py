@@ -25,12 +25,20 @@ from makebreak.diagrams.scene_facts import actuators_of
 from makebreak.models.effects import KINDS
 from makebreak.models.model_files import MODELS
 from makebreak.models.scene import InitialSection, Scene, load_scene, read_scene
-from makebreak.systems.contact_probe import ContactProbe, ToolContactForce, TrueTip
-from makebreak.systems.fault_signals import LateSignal
-from makebreak.systems.impedance_controller import serial_chain_of
-from makebreak.systems.noisy_sensor import DriftingSensor, LateSensor, NoisySensor
-from makebreak.systems.safety_monitor import ArmLimits, SafetyMonitor
-from makebreak.systems.tool_wrench import ToolWrench
+from makebreak.systems.arm.impedance_controller import serial_chain_of
+from makebreak.systems.arm.tool_wrench import ToolWrench
+from makebreak.systems.faults.fault_signals import LateSignal
+from makebreak.systems.faults.safety_monitor import ArmLimits, SafetyMonitor
+from makebreak.systems.perception.noisy_sensor import (
+    DriftingSensor,
+    LateSensor,
+    NoisySensor,
+)
+from makebreak.systems.views.contact_probe import (
+    ContactProbe,
+    ToolContactForce,
+    TrueTip,
+)
 
 BALL_ROLLING = str(MODELS / "ball_rolling.scene.yaml")
 ARM, TOOL, TIP_FRAME = "panda", "finger", "tip"

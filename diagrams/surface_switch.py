@@ -32,13 +32,13 @@ from makebreak.diagrams.tabletop import (
 )
 from makebreak.models.friction_zones import FrictionZone
 from makebreak.models.scene import Scene, read_scene
-from makebreak.systems.numerics.contact_task import (
+from makebreak.systems.changing_contact.numerics.contact_task import (
     IMPACTLESS,
     UNKNOWN_MODE,
     ContactBelief,
     ExpectedContact,
 )
-from makebreak.systems.numerics.motion_pattern import (
+from makebreak.systems.changing_contact.numerics.motion_pattern import (
     MotionPattern,
     Segment,
     segment_time,

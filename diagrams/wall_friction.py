@@ -36,20 +36,26 @@ from makebreak.diagrams.station import (
 )
 from makebreak.diagrams.tabletop import TABLETOP_WALLS, TOOL, set_friction
 from makebreak.models.scene import read_scene
-from makebreak.systems.baselines.long_term_predictor import OneStepPredictor
-from makebreak.systems.forward_model import ForwardModelBank, ForwardModelConfig
-from makebreak.systems.impedance_controller import (
+from makebreak.systems.arm.impedance_controller import (
     ImpedanceConfig,
     ImpedanceController,
     serial_chain_of,
 )
-from makebreak.systems.mode_detector import ModeDetector, ModeDetectorConfig
-from makebreak.systems.numerics.baselines.long_term_predictor import (
+from makebreak.systems.arm.numerics.serial_chain import tip_kinematics
+from makebreak.systems.arm.tip_state import TipState
+from makebreak.systems.baselines.long_term_predictor import OneStepPredictor
+from makebreak.systems.baselines.numerics.long_term_predictor import (
     LongTermPredictor,
     TrainingBudget,
 )
-from makebreak.systems.numerics.serial_chain import tip_kinematics
-from makebreak.systems.tip_state import TipState
+from makebreak.systems.changing_contact.forward_model import (
+    ForwardModelBank,
+    ForwardModelConfig,
+)
+from makebreak.systems.changing_contact.mode_detector import (
+    ModeDetector,
+    ModeDetectorConfig,
+)
 
 WALL, N_ARM = "blue_wall", 7
 # Of the motion [s]: down, rest on the table, to the wall, rest, along it, rest.

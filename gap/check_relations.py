@@ -9,14 +9,14 @@ from makebreak.gap.findings import (
     longest_sec,
     some_episodes,
 )
-from makebreak.gap.recording import Recording, unit_of
-from makebreak.gap.table import TWIST
-from makebreak.systems.numerics.filters import filtered
-from makebreak.systems.numerics.signal_relation import (
+from makebreak.gap.numerics.signal_relation import (
     Relation,
     angular_velocity,
     relate,
 )
+from makebreak.gap.recording import Recording, unit_of
+from makebreak.gap.table import TWIST
+from makebreak.systems.numerics.filters import filtered
 
 # Ratios of velocity to differentiated position that a wrong unit explains.
 _RATIOS = (

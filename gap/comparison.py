@@ -21,9 +21,9 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context, DiagramBuilder
 
-from makebreak.diagrams.scene_simulation import Commands, SceneSimulation
 from makebreak.gap.recording import Episode, Recording
 from makebreak.gap.result import GapResult, Series
+from makebreak.gap.scene_simulation import Commands, SceneSimulation
 from makebreak.models.effects.kind import full_name, one_dof_joints
 from makebreak.models.scene import (
     InitialSection,

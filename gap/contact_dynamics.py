@@ -19,6 +19,7 @@ import numpy as np
 
 from makebreak.gap.contact_means import MODELLED
 from makebreak.gap.contact_shapes import Slot
+from makebreak.gap.numerics.permitted_forces import explain, roots_of
 from makebreak.gap.permitted_contacts import SURFACES, PermittedContacts, Shift
 from makebreak.gap.recording import Recording
 from makebreak.gap.windows import TURN
@@ -28,7 +29,6 @@ from makebreak.models.effects.inertia import SIX, central_inertia, inertial_colu
 from makebreak.models.effects.kind import Effect, find_bodies, find_joints, full_name
 from makebreak.models.effects.signature import Motion, added_effort
 from makebreak.models.scene import Scene
-from makebreak.systems.numerics.permitted_forces import explain, roots_of
 
 HOLDS = 0.03  # Known of the distance's acceleration where bodies stay in touch [m/s2].
 SHAPES = 2e-4  # How well shapes are known where the scene does not say [m].

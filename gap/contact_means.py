@@ -15,6 +15,7 @@ from scipy.sparse import block_diag, csr_matrix
 from scipy.spatial.transform import Rotation
 
 from makebreak.gap.contact_shapes import ContactShapes, poses_of
+from makebreak.gap.numerics.permitted_forces import held_means, test_functions
 from makebreak.gap.recording import Episode, Recording
 from makebreak.gap.windows import TURN, spin_of
 from makebreak.models.drives import law_of
@@ -22,7 +23,6 @@ from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import full_name, one_dof_joints
 from makebreak.models.scene import Scene
 from makebreak.models.scene_schema import COMMANDS_OF
-from makebreak.systems.numerics.permitted_forces import held_means, test_functions
 from makebreak.systems.numerics.smoother import smooth_filtered
 
 SAMPLES = 8  # Of the slowest pose, in half a test function.

@@ -16,6 +16,7 @@ from makebreak.gap.contact_windows import PushWindows, led_as_measured
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.measure import gap_measure, series_of
 from makebreak.gap.mechanism import link_changes
+from makebreak.gap.numerics.selection import Screen, benjamini_hochberg
 from makebreak.gap.objects import unexplained_in_windows
 from makebreak.gap.permitted_contacts import Shift
 from makebreak.gap.problem import (
@@ -33,7 +34,6 @@ from makebreak.gap.result import Where
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
-from makebreak.systems.numerics.selection import Screen, benjamini_hochberg
 
 BLOCK_SEC = 0.6  # In which a tool goes a few centimetres.
 PLACED = 1e-3  # A camera's place [m],

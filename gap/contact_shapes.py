@@ -16,9 +16,9 @@ from pydrake.geometry import Box, Convex, Cylinder, HalfSpace, Mesh, Sphere
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 
+from makebreak.gap.numerics import surface_distance
 from makebreak.models.effects.kind import full_name
 from makebreak.models.scene import LoadedScene
-from makebreak.systems.numerics import surface_distance
 
 RIM = 12  # Points on a rim.
 SIDE = 0.9  # Cosine of normal and axis: less, and a cylinder touches with its side.

@@ -2,7 +2,7 @@
 
 A joint at rest only says that friction is at most so much, and without a measured
 effort its equation says what the drive's law makes of its own error: equations of
-motion mislead. Here windows are simulated by compiled code (diagrams/driven_arm.py), a
+motion mislead. Here windows are simulated by compiled code (gap/driven_arm.py), a
 hundred times as fast as by Drake, and what effects would do is seen by differences.
 """
 
@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from makebreak.diagrams.driven_arm import DrivenArmSimulation, can_have
+from makebreak.gap.driven_arm import DrivenArmSimulation, can_have
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.inverse import LOOP_SEC
 from makebreak.gap.measure import gap_measure, series_of
@@ -22,6 +22,7 @@ from makebreak.gap.mechanism import (
     link_changes,
     moved_links,
 )
+from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.objects import unexplained_in_windows
 from makebreak.gap.problem import (
     Candidate,
@@ -42,7 +43,6 @@ from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, find_joints, full_name
 from makebreak.models.scene import Scene
 from makebreak.models.scene_schema import COMMANDS_OF
-from makebreak.systems.numerics.selection import Screen
 
 WINDOW_SEC, MOST_WINDOWS = 0.5, 60
 # A joint below this speed is at rest; one that is for this share of the time sticks.

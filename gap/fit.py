@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import differential_evolution, least_squares, minimize
 
+from makebreak.gap.numerics.selection import Screen, spread_by_blocks
 from makebreak.gap.problem import Fitted, GapProblem
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, check_parameters
-from makebreak.systems.numerics.selection import Screen, spread_by_blocks
 
 AT_BOUND = 1e-9  # A parameter that may not be negative is zero.
 SHORT = 8  # Evaluations: a fit of no more is not asked to converge.

@@ -11,15 +11,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from makebreak.diagrams.free_body import FreeBodyScene
+from makebreak.gap.free_body import FreeBodyScene
+from makebreak.gap.numerics.free_body import FreeBody, lowest_gap, placed, simulate
+from makebreak.gap.numerics.free_flight import fit_flight, turned_by
 from makebreak.gap.recording import Episode, Recording
 from makebreak.gap.windows import TURN, WindowedResidual, spin_of
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
 from makebreak.systems.numerics.filters import Stage, filtered, mean_delay
-from makebreak.systems.numerics.free_body import FreeBody, lowest_gap, placed, simulate
-from makebreak.systems.numerics.free_flight import fit_flight, turned_by
 from makebreak.systems.numerics.smoother import smooth_filtered
 
 AFTER_SEC = 0.1  # Of a window after its impact.

@@ -13,6 +13,7 @@ import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 
 from makebreak.gap.data.filters import FILTERED_SEC
+from makebreak.gap.numerics.weak_form import Bumps, make_bumps
 from makebreak.gap.recording import Episode, Recording
 from makebreak.models.drives import law_of
 from makebreak.models.dynamics import SceneDynamics
@@ -36,7 +37,6 @@ from makebreak.systems.numerics.filters import (
     with_lag,
 )
 from makebreak.systems.numerics.smoother import smooth_filtered
-from makebreak.systems.numerics.weak_form import Bumps, make_bumps
 
 SENSED = tuple(name for name, kind in KINDS.items() if kind.channel)
 # Between command and motor; a gear's loss is in the equations.

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from makebreak.diagrams.driven_arm import DrivenArmScene, DrivenArmSimulation
-from makebreak.diagrams.scene_simulation import SceneSimulation
+from makebreak.gap.driven_arm import DrivenArmScene, DrivenArmSimulation
 from makebreak.gap.recording import Recording, check_against_scene, unit_of
 from makebreak.gap.scene_facts import scene_names
+from makebreak.gap.scene_simulation import SceneSimulation
 from makebreak.gap.windows import WindowModel, seen_in
 from makebreak.models.effects.kind import sliding_joints
 from makebreak.models.scene import Scene

@@ -9,6 +9,7 @@ import numpy as np
 from makebreak.gap.findings import Finding
 from makebreak.gap.inverse import InverseModel
 from makebreak.gap.measure import measure
+from makebreak.gap.numerics.selection import Screen, is_predicted
 from makebreak.gap.problem import (
     Candidate,
     Fitted,
@@ -37,7 +38,6 @@ from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, find_body, sliding_joints
 from makebreak.models.scene import Scene
-from makebreak.systems.numerics.selection import Screen, is_predicted
 
 # Below this over the sensors' noise a rich model leaves what noise may: models are
 # right. A weight is changed where it would become less by this share.

@@ -17,11 +17,11 @@ from scipy.special import expit
 
 from makebreak.gap.contact_means import MEETS, NEAR, SLIDES, ContactMeans
 from makebreak.gap.contact_shapes import Slot
+from makebreak.gap.numerics.permitted_forces import tangential, unshared_load
 from makebreak.gap.recording import Recording
 from makebreak.models.effects.kind import Effect
 from makebreak.models.effects.loads import rotation
 from makebreak.models.scene import Scene
-from makebreak.systems.numerics.permitted_forces import tangential, unshared_load
 
 SLACK = 8e-4  # Points so little farther than the nearest of two bodies touch too [m].
 CARRIES = 0.012  # What is fixed may carry what is measured so far above it [m],

@@ -17,14 +17,14 @@ from makebreak.gap.contact_means import FORCE, MEETS, WrenchSensor
 from makebreak.gap.contact_problem import ContactProblem
 from makebreak.gap.contact_shapes import Slot
 from makebreak.gap.impacts import MOST_SHARE, nearest, positions, walls_of
+from makebreak.gap.numerics.permitted_forces import explain
+from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.permitted_contacts import SLACK, Shift
 from makebreak.gap.problem import Candidate, Fitted, Nuisances
 from makebreak.gap.recording import Recording
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
-from makebreak.systems.numerics.permitted_forces import explain
-from makebreak.systems.numerics.selection import Screen
 
 REACH = 0.12  # What is fixed is no farther off than this [m].
 KNOCKED = 8e-3  # A knock goes no deeper than this [m].

@@ -11,13 +11,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from makebreak.gap.numerics.selection import NESTED_GAIN, LinearFit
 from makebreak.gap.recording import Recording
 from makebreak.gap.result import GapMeasure, Series, Unexplained, Where
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, check_parameters
 from makebreak.models.scene import Scene
-from makebreak.systems.numerics.selection import NESTED_GAIN, LinearFit
 
 DISTANCES = "distances"  # A channel is judged by these alone: not its motion.
 BEYOND = 1.5  # Times what a model can lose at most is taken for all of it.

@@ -12,6 +12,7 @@ import yaml
 from makebreak.gap.data.csv_table import BadRows
 from makebreak.gap.data.filters import read_filter
 from makebreak.gap.data.joined import joined, time_column
+from makebreak.gap.numerics.signal_noise import estimate_noise
 from makebreak.gap.table import (
     COMMANDS,
     JOINT_QUANTITIES,
@@ -25,7 +26,6 @@ from makebreak.gap.table import (
 )
 from makebreak.models.effects.measured_channels import torque_constant
 from makebreak.systems.numerics.filters import Stage
-from makebreak.systems.numerics.signal_noise import estimate_noise
 
 FEWEST_ROWS = 10  # In an episode: fewer hold no window and no noise.
 # A longer hole in time [s] is a break, as is one of so many periods.

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from makebreak.gap.inverse import SENSED, InverseModel
+from makebreak.gap.numerics.selection import LinearFit, Screen
 from makebreak.gap.problem import Candidate, Nuisances
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import (
@@ -13,7 +14,6 @@ from makebreak.models.effects.kind import (
     find_joints,
     full_name,
 )
-from makebreak.systems.numerics.selection import LinearFit, Screen
 
 # How well links are known where the scene does not say [-], [m].
 LINK_MASS, LINK_COM = 0.03, 0.002

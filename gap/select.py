@@ -10,6 +10,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from makebreak.gap.fit import derivative_free_search, fit_effects, tangents
+from makebreak.gap.numerics.selection import (
+    NESTED_GAIN,
+    SAME,
+    Screen,
+    is_plausible,
+    paired,
+    paired_t,
+    simplest,
+)
 from makebreak.gap.problem import (
     Candidate,
     Fitted,
@@ -23,15 +32,6 @@ from makebreak.gap.screen import Ranked, rank
 from makebreak.gap.trust import steady
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
-from makebreak.systems.numerics.selection import (
-    NESTED_GAIN,
-    SAME,
-    Screen,
-    is_plausible,
-    paired,
-    paired_t,
-    simplest,
-)
 
 FINALISTS, FINALIST_RUNS = 4, 80  # Searched without slopes before one is chosen.
 LOUD = 3.0  # Rms over noise of one channel that is a gap, whatever the others leave.

@@ -13,17 +13,17 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.diagrams.scene_simulation import stand_on_ground
+from makebreak.gap.numerics.selection import benjamini_hochberg
 from makebreak.gap.problem import Candidate, Nuisances, rms
 from makebreak.gap.recording import Recording
 from makebreak.gap.result import GapMeasure, InUnits, Series, Where
+from makebreak.gap.scene_simulation import stand_on_ground
 from makebreak.gap.windows import LARGEST
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import Scene, load_scene
 from makebreak.systems.numerics.filters import mean_delay
-from makebreak.systems.numerics.selection import benjamini_hochberg
 
 SHAPES = 2e-4  # How well shapes are known where the scene does not say [m].
 # And a camera: its place [m], its scale; its clock to a sample.

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from makebreak.gap.fit import fit_effects
+from makebreak.gap.numerics.selection import Screen, random_effects
 from makebreak.gap.problem import Fitted, GapProblem
 from makebreak.gap.result import Trust
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
-from makebreak.systems.numerics.selection import Screen, random_effects
 
 PARTS = 5  # Stretches of time of a recording.
 FEWEST_PARTS = 4  # Of which a scatter is taken.

@@ -7,10 +7,10 @@ import numpy as np
 from scipy.stats import chi2
 
 from makebreak.gap.inverse import REST_SPEED, InverseModel
+from makebreak.gap.numerics.selection import benjamini_hochberg
 from makebreak.gap.recording import unit_of
 from makebreak.gap.result import Unexplained, Where
 from makebreak.models.effects.kind import full_name, one_dof_joints
-from makebreak.systems.numerics.selection import benjamini_hochberg
 
 FALSE_RATE = 0.01  # Share of the windows told that may stand out by chance.
 ALLOWED = 1.3  # What estimates of noise may be off by.

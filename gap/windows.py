@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from makebreak.diagrams.scene_simulation import Commands, SceneSimulation
 from makebreak.gap.inverse import _lag, _sensing, rotor_before
 from makebreak.gap.recording import Episode, Recording
+from makebreak.gap.scene_simulation import Commands, SceneSimulation
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints

@@ -19,7 +19,13 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.systems.numerics.ball_state import N_X, P_BALL, P_TIP, V_BALL, V_TIP
+from makebreak.systems.contact_mpc.numerics.ball_state import (
+    N_X,
+    P_BALL,
+    P_TIP,
+    V_BALL,
+    V_TIP,
+)
 
 UNUSED_FRICTION = CoulombFriction(1.0, 1.0)  # Contact pairs state their own.
 

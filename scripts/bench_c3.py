@@ -27,13 +27,13 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.solvers import MathematicalProgram, OsqpSolver, SolverOptions
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.systems.lcs_builder import (
+from makebreak.systems.contact_mpc.lcs_builder import (
     Anitescu,
     AnitescuLcs,
     ContactPair,
     StewartTrinkle,
 )
-from makebreak.systems.numerics.c3_mpc import (
+from makebreak.systems.contact_mpc.numerics.c3_mpc import (
     C3Bounds,
     C3Options,
     C3Problem,
@@ -41,14 +41,14 @@ from makebreak.systems.numerics.c3_mpc import (
     plan_cost,
     solve_c3,
 )
-from makebreak.systems.numerics.c3_projections import (
+from makebreak.systems.contact_mpc.numerics.c3_projections import (
     ExactProjection,
     PlusProjection,
     QpProjection,
     project_exact,
 )
-from makebreak.systems.numerics.lcp import solve_lcp
-from makebreak.systems.numerics.lcs import LCS
+from makebreak.systems.contact_mpc.numerics.lcp import solve_lcp
+from makebreak.systems.contact_mpc.numerics.lcs import LCS
 
 REFERENCE = Path(__file__).resolve().parents[1] / "tests" / "reference"
 # Options of the library's QP step, and of its QP projection.

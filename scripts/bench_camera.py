@@ -16,8 +16,11 @@ from makebreak.diagrams.camera import (
     vtk_works,
 )
 from makebreak.scripts.bench import median_cpu_ms
-from makebreak.systems.ball_tracker import BallTrackerConfig
-from makebreak.systems.numerics.ball_tracker import find_ball, strength_weights
+from makebreak.systems.perception.ball_tracker import BallTrackerConfig
+from makebreak.systems.perception.numerics.ball_tracker import (
+    find_ball,
+    strength_weights,
+)
 
 BALL, TIP, ROD = 0.0315, 0.0195, 0.12  # [m] radius, radius, length.
 WORKSPACE = [0.35, -0.15], [0.65, 0.15]  # [m]

@@ -15,13 +15,13 @@ from makebreak.diagrams.station import (
 )
 from makebreak.models.scene import read_scene
 from makebreak.scripts.bench import median_cpu_ms
-from makebreak.systems.impedance_controller import (
+from makebreak.systems.arm.impedance_controller import (
     HybridConfig,
     ImpedanceConfig,
     ImpedanceController,
     serial_chain_of,
 )
-from makebreak.systems.numerics.serial_chain import chain_state
+from makebreak.systems.arm.numerics.serial_chain import chain_state
 
 SIMULATED_SEC = 2.0
 

@@ -34,7 +34,7 @@ from makebreak.diagrams.camera import CameraConfig
 from makebreak.diagrams.station import ARM
 from makebreak.scripts.bench_rows import failed
 from makebreak.scripts.trials import makebreak_command, run_commands
-from makebreak.systems.numerics.rolling_task import ROLL
+from makebreak.systems.contact_mpc.numerics.rolling_task import ROLL
 
 WARM_SEC = 6.0  # Until then the ball rolls, and the learner's buffer is full.
 MOST_SEC = 30.0  # To wait for that.

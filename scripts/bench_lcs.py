@@ -6,7 +6,7 @@ import numpy as np
 
 from makebreak.models.tip_and_ball import TipAndBall, make_tip_and_ball
 from makebreak.scripts.bench import median_cpu_ms
-from makebreak.systems.lcs_builder import AnitescuLcs, ContactPair
+from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs, ContactPair
 
 
 def rows() -> list[dict]:

@@ -4,8 +4,8 @@ from time import process_time
 
 import numpy as np
 
-from makebreak.systems.numerics.lcs import LCS, simulate
-from makebreak.systems.numerics.residual_learner import (
+from makebreak.systems.contact_mpc.numerics.lcs import LCS, simulate
+from makebreak.systems.contact_mpc.numerics.residual_learner import (
     empty_buffer,
     gamma_bound,
     group_of_entry,

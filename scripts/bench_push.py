@@ -17,16 +17,16 @@ from makebreak.models.pushed_object import (
     rest_height,
 )
 from makebreak.scripts.bench import median_cpu_ms
-from makebreak.systems.lcs_builder import AnitescuLcs
-from makebreak.systems.numerics.ball_state import P_BALL
-from makebreak.systems.numerics.c3_mpc import C3Problem, WarmStart, solve_c3
-from makebreak.systems.numerics.contact_sampling import (
+from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs
+from makebreak.systems.contact_mpc.numerics.ball_state import P_BALL
+from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Problem, WarmStart, solve_c3
+from makebreak.systems.contact_mpc.numerics.contact_sampling import (
     inward,
     outline_of,
     places_around,
     score_plans,
 )
-from makebreak.systems.numerics.push_task import PushConfig, look_ahead
+from makebreak.systems.contact_mpc.numerics.push_task import PushConfig, look_ahead
 
 PLACES = 16
 RATE_MIN, GAIN_MIN = 10.0, 4.0  # [Hz], and how many times faster.

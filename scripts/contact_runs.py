@@ -10,7 +10,10 @@ from pydrake.systems.framework import Diagram
 from makebreak.diagrams.changing_contact import Knowledge, learned
 from makebreak.scripts.criteria import motion_ended
 from makebreak.scripts.session import Log, Session
-from makebreak.systems.numerics.contact_task import PHASE_SPEED, PHASE_STAGE
+from makebreak.systems.changing_contact.numerics.contact_task import (
+    PHASE_SPEED,
+    PHASE_STAGE,
+)
 
 
 def simulate_motion(

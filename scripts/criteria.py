@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from makebreak.scripts.table import format_cell
-from makebreak.systems.numerics.contact_task import DONE, HOLD
+from makebreak.systems.changing_contact.numerics.contact_task import DONE, HOLD
 
 
 class Criteria:

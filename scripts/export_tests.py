@@ -32,7 +32,7 @@ from makebreak.scripts.interrupts import undisturbed
 from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.replay import Track, Unsupported
 from makebreak.scripts.session import Log, Session, leaf_systems
-from makebreak.systems.impedance_controller import serial_chain_of
+from makebreak.systems.arm.impedance_controller import serial_chain_of
 from makebreak.systems.numerics.timing import observed
 
 # What makes a plant, or constants of one, that a system is built with: such an argument

@@ -2,7 +2,7 @@
 
 Each fault meets ball_rolling, with drawn pictures and a radius that is 5 mm wrong,
 while the ball rolls. Beside it the same run with the same seed and no fault. A monitor
-of its own (systems/safety_monitor.py) watches the arm at 1 kHz.
+of its own (systems/faults/safety_monitor.py) watches the arm at 1 kHz.
 
     recovered    from AFTER_SEC after the fault (after its beginning, if it stays) the
                  ball rolls on at least half as far as without the fault

@@ -19,29 +19,36 @@ from makebreak.diagrams.planar import (
 from makebreak.systems.baselines.active_inference import ActiveInferenceConfig
 from makebreak.systems.baselines.biomimetic import BiomimeticConfig
 from makebreak.systems.baselines.mrac import MracConfig
-from makebreak.systems.numerics import active_inference, mrac
-from makebreak.systems.numerics.biomimetic import after_trial, force_command, no_gains
-from makebreak.systems.numerics.igmm import Mixture, igmm_tuning
-from makebreak.systems.numerics.mrac import error_weights
-from makebreak.systems.numerics.planar_impedance import (
+from makebreak.systems.baselines.numerics import active_inference, mrac
+from makebreak.systems.baselines.numerics.biomimetic import (
+    after_trial,
+    force_command,
+    no_gains,
+)
+from makebreak.systems.baselines.numerics.mrac import error_weights
+from makebreak.systems.changing_contact.numerics.igmm import Mixture, igmm_tuning
+from makebreak.systems.perception.numerics.sensor_noise import add_noise
+from makebreak.systems.planar.numerics.planar_impedance import (
     after_sample,
     new_model,
     predicted_force,
     stiffness_of,
     trust,
 )
-from makebreak.systems.numerics.planar_impedance import (
+from makebreak.systems.planar.numerics.planar_impedance import (
     force_command as impedance_command,
 )
-from makebreak.systems.numerics.planar_world import (
+from makebreak.systems.planar.numerics.planar_world import (
     circle_target,
     compensated,
     external_force,
     step,
 )
-from makebreak.systems.numerics.sensor_noise import add_noise
-from makebreak.systems.planar_impedance import ForceModelConfig, PlanarImpedanceConfig
-from makebreak.systems.planar_world import (
+from makebreak.systems.planar.planar_impedance import (
+    ForceModelConfig,
+    PlanarImpedanceConfig,
+)
+from makebreak.systems.planar.planar_world import (
     CircleTargetConfig,
     PlanarWorldConfig,
     springs_of,

@@ -39,8 +39,8 @@ from makebreak.scripts.recording_stream import RecordingStream
 from makebreak.scripts.run_buttons import RunButtons
 from makebreak.scripts.table import json_value
 from makebreak.scripts.trials import run_many
+from makebreak.systems.faults.safety_monitor import verdict
 from makebreak.systems.numerics.first_calls import deferred
-from makebreak.systems.safety_monitor import verdict
 
 __all__ = ["Log", "Session", "run_many"]
 

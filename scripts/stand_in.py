@@ -41,9 +41,9 @@ from makebreak.diagrams.station import (
     TORQUE_RATE_MAX,
     make_control_plant,
 )
-from makebreak.systems.gravity_left_out import gravity_torque
-from makebreak.systems.impedance_controller import serial_chain_of
-from makebreak.systems.numerics.packed import packed
+from makebreak.systems.arm.gravity_left_out import gravity_torque
+from makebreak.systems.arm.impedance_controller import serial_chain_of
+from makebreak.systems.arm.numerics.packed import packed
 
 TICK = 0.001  # [s]
 EXPIRE_SEC = 0.1

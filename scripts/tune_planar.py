@@ -47,10 +47,13 @@ from makebreak.scripts.planar_loops import (
 from makebreak.systems.baselines.active_inference import ActiveInferenceConfig
 from makebreak.systems.baselines.biomimetic import BiomimeticConfig
 from makebreak.systems.baselines.mrac import MracConfig
-from makebreak.systems.numerics.igmm import IgmmConfig
-from makebreak.systems.numerics.mrac import error_weights
-from makebreak.systems.numerics.planar_impedance import persistence
-from makebreak.systems.planar_impedance import ForceModelConfig, PlanarImpedanceConfig
+from makebreak.systems.baselines.numerics.mrac import error_weights
+from makebreak.systems.changing_contact.numerics.igmm import IgmmConfig
+from makebreak.systems.planar.numerics.planar_impedance import persistence
+from makebreak.systems.planar.planar_impedance import (
+    ForceModelConfig,
+    PlanarImpedanceConfig,
+)
 
 SEARCH_SEEDS, FINAL_SEEDS = (100, 101, 102), tuple(range(100, 114))
 SLOW, QUICK, FINALISTS = 160, 1200, 5  # Settings tried; half of them around the best.

@@ -1,24 +1,25 @@
-"""The systems, in the order in which data flows.
+"""The systems: LeafSystems that meet at ports, in wings by subject.
 
-Sensing and estimation   pinhole_camera, camera_shake, noisy_sensor, tool_wrench,
-                         ball_tracker, pose_tracker, pose_sensor, past_state,
-                         state_estimator, tip_state, contact_detector,
-                         mode_detector, contact_anticipator
-Modelling                lcs_builder, forward_model
-Adaptation               residual_learner
-Planning                 rolling_task, push_goals, push_task, contact_sampler,
-                         pivot_target, c3_mpc
-Shaping                  velocity_shaper, variable_impedance
-Control                  arm_reference, impedance_controller, impact_reflex,
-                         gravity_left_out
-For scoring and the eye  contact_probe, rolling_view, walls_view, contact_view,
-                         push_view
-Faults, and who watches  fault_signals, fault_pictures, fault_forces, safety_monitor
-As a world               lcs_plant
-In the plane             planar_world, planar_impedance, planar_view
-Compared with            baselines/: dynamics_residual_learner, mrac, active_inference,
-                         biomimetic, long_term_predictor
+contact_mpc/       a contact model of any plant (LCS), plans through contact (C3), what
+                   the model has wrong (residual), where to touch, the tasks
+changing_contact/  contacts felt and expected, contact modes and their forward models,
+                   motions slowed down before a contact and blended after it
+arm/               from what a planner wants to torques: references, impedance, tool
+perception/        cameras and noisy sensors, trackers, the state that planners use
+planar/            a point in the plane with adaptive impedance
+baselines/         what ours is compared with
+faults/            faults injected into signals, pictures and forces, and the monitor
+views/             what is seen and pressed in Meshcat, and ground truth for scores
 
-Each file has one LeafSystem and its config; its maths is in numerics/, under the same
-name. Systems do not import each other: they meet at ports.
+Each file has one LeafSystem and its config. Its maths is in the wing's numerics/, most
+often under the same name; numerics/ here is what all share. Systems never import each
+other. Maths does, one way: contact_mpc <- changing_contact <- arm <- perception, and
+the other wings take from these.
 """
+
+import sys
+
+from makebreak.systems.moved import FormerNames
+
+if not any(isinstance(finder, FormerNames) for finder in sys.meta_path):
+    sys.meta_path.append(FormerNames())

@@ -7,8 +7,8 @@ from makebreak.systems.baselines.active_inference import (
     ActiveInference,
     ActiveInferenceConfig,
 )
-from makebreak.systems.numerics.active_inference import MEMORY, tick
-from makebreak.systems.numerics.planar_world import step
+from makebreak.systems.baselines.numerics.active_inference import MEMORY, tick
+from makebreak.systems.planar.numerics.planar_world import step
 
 DT = 1e-3
 P, K_MU, K_A = np.array([1.0, 1.0, 0.2, 0.2]), 20.0, 1200.0

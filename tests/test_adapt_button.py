@@ -7,7 +7,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 from test_run_buttons import press
 
-from makebreak.systems.adapt_button import ADAPT, AdaptButton
+from makebreak.systems.views.adapt_button import ADAPT, AdaptButton
 
 
 def test_each_press_takes_the_residual_away_or_brings_it_back():

@@ -5,14 +5,14 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
-from makebreak.systems.arm_reference import ArmReference, ArmReferenceConfig
-from makebreak.systems.numerics.arm_reference import (
+from makebreak.systems.arm.arm_reference import ArmReference, ArmReferenceConfig
+from makebreak.systems.arm.numerics.arm_reference import (
     clip_norm,
     next_end,
     on_the_line,
 )
-from makebreak.systems.numerics.lcs import LCS
-from makebreak.systems.numerics.rolling_task import REPOSITION, ROLL
+from makebreak.systems.contact_mpc.numerics.lcs import LCS
+from makebreak.systems.contact_mpc.numerics.rolling_task import REPOSITION, ROLL
 
 
 def test_line_is_straight_and_stays_at_its_end():

@@ -31,16 +31,20 @@ from makebreak.models.scene import load_scene
 from makebreak.scripts.cli import main
 from makebreak.scripts.experiments import ball_rolling as experiment
 from makebreak.systems.baselines.dynamics_residual import DynamicsResidual
-from makebreak.systems.camera_shake import CameraShake
-from makebreak.systems.noisy_sensor import NoisySensor
-from makebreak.systems.numerics.ball_state import P_BALL, P_TIP, pack
-from makebreak.systems.numerics.c3_projections import (
+from makebreak.systems.contact_mpc.numerics.ball_state import P_BALL, P_TIP, pack
+from makebreak.systems.contact_mpc.numerics.c3_projections import (
     ExactProjection,
     PlusProjection,
     QpProjection,
 )
-from makebreak.systems.numerics.rolling_task import ROLL, WAIT, RollingConfig
-from makebreak.systems.rolling_task import RollingTaskConfig
+from makebreak.systems.contact_mpc.numerics.rolling_task import (
+    ROLL,
+    WAIT,
+    RollingConfig,
+)
+from makebreak.systems.contact_mpc.rolling_task import RollingTaskConfig
+from makebreak.systems.perception.camera_shake import CameraShake
+from makebreak.systems.perception.noisy_sensor import NoisySensor
 
 EFFORT = np.repeat([87.0, 12.0], [4, 3])  # [N m] of the Panda's joints.
 RATE = 1.0  # [N m per ms]

@@ -16,7 +16,7 @@ from makebreak.diagrams.camera import (
     camera_model,
     vtk_works,
 )
-from makebreak.systems.ball_tracker import (
+from makebreak.systems.perception.ball_tracker import (
     HOLD_SEC,
     NOT_FOUND,
     PATIENCE,
@@ -25,14 +25,14 @@ from makebreak.systems.ball_tracker import (
     BallTracker,
     BallTrackerConfig,
 )
-from makebreak.systems.numerics import constant_velocity
-from makebreak.systems.numerics.ball_tracker import (
+from makebreak.systems.perception.numerics import constant_velocity
+from makebreak.systems.perception.numerics.ball_tracker import (
     find_ball,
     fit_cone,
     outline_points,
     strength_weights,
 )
-from makebreak.systems.numerics.pinhole import draw, look_down, sphere_circle
+from makebreak.systems.perception.numerics.pinhole import draw, look_down, sphere_circle
 
 RADIUS, TIP_RADIUS = 0.0315, 0.0195
 ORANGE, GREY, DARK = (242.0, 102.0, 13.0), (204.0, 204.0, 204.0), (60.0, 62.0, 66.0)

@@ -9,13 +9,13 @@ from makebreak.diagrams.planar_tuned import SETTINGS
 from makebreak.scripts.planar_loops import learning_curve
 from makebreak.scripts.tune_planar import task_of
 from makebreak.systems.baselines.biomimetic import Biomimetic, BiomimeticConfig
-from makebreak.systems.numerics.biomimetic import (
+from makebreak.systems.baselines.numerics.biomimetic import (
     LearnedGains,
     after_trial,
     force_command,
     no_gains,
 )
-from makebreak.systems.planar_world import CircleTargetConfig, PlanarWorldConfig
+from makebreak.systems.planar.planar_world import CircleTargetConfig, PlanarWorldConfig
 
 PERFECT = PlanarSensing(force_noise=0.0)
 

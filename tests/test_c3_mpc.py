@@ -24,10 +24,10 @@ from makebreak.scripts.bench_c3 import (
     osqp_options,
     quiet,
 )
-from makebreak.systems.c3_mpc import C3Config, C3Mpc, C3Status
-from makebreak.systems.lcs_builder import AnitescuLcs, ContactPair
-from makebreak.systems.lcs_plant import LcsPlant
-from makebreak.systems.numerics.c3_mpc import (
+from makebreak.systems.contact_mpc.c3_mpc import C3Config, C3Mpc, C3Status
+from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs, ContactPair
+from makebreak.systems.contact_mpc.lcs_plant import LcsPlant
+from makebreak.systems.contact_mpc.numerics.c3_mpc import (
     C3Bounds,
     C3Failure,
     C3Options,
@@ -42,13 +42,13 @@ from makebreak.systems.numerics.c3_mpc import (
     warm_up,
     with_gap_residual,
 )
-from makebreak.systems.numerics.c3_polish import (
+from makebreak.systems.contact_mpc.numerics.c3_polish import (
     backward,
     roll_out,
     rollout_cost,
     state_breach,
 )
-from makebreak.systems.numerics.c3_projections import (
+from makebreak.systems.contact_mpc.numerics.c3_projections import (
     ExactProjection,
     PlusProjection,
     QpProjection,
@@ -57,7 +57,7 @@ from makebreak.systems.numerics.c3_projections import (
     project_qp,
     projection_matrices,
 )
-from makebreak.systems.numerics.c3_qp import (
+from makebreak.systems.contact_mpc.numerics.c3_qp import (
     CANNOT_BE_MET,
     MET,
     factor,
@@ -68,8 +68,8 @@ from makebreak.systems.numerics.c3_qp import (
     solve_interior,
     within,
 )
-from makebreak.systems.numerics.lcp import solve_lcp
-from makebreak.systems.numerics.lcs import (
+from makebreak.systems.contact_mpc.numerics.lcp import solve_lcp
+from makebreak.systems.contact_mpc.numerics.lcs import (
     CLOSED,
     FREE,
     LCS,
@@ -79,7 +79,9 @@ from makebreak.systems.numerics.lcs import (
     fixed_forces,
     simulate,
 )
-from makebreak.systems.numerics.orientation_cost import orientation_quadratic
+from makebreak.systems.contact_mpc.numerics.orientation_cost import (
+    orientation_quadratic,
+)
 
 REFERENCE = Path(__file__).parent / "reference"
 CARTPOLE = np.load(REFERENCE / "c3_cartpole.npz")

@@ -18,7 +18,7 @@ from makebreak.diagrams.camera import (
     describe_camera,
     vtk_works,
 )
-from makebreak.systems.numerics.pinhole import (
+from makebreak.systems.perception.numerics.pinhole import (
     Pinhole,
     frame_shift,
     look_down,

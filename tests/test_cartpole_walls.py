@@ -24,9 +24,13 @@ from makebreak.diagrams.cartpole_walls import (
 from makebreak.models.scene import load_scene
 from makebreak.scripts.cli import main
 from makebreak.scripts.experiments import cartpole_walls as experiment
-from makebreak.systems.numerics.cartpole import CartPole, cartpole_lcs, cost_to_go
-from makebreak.systems.numerics.lcs import simulate
-from makebreak.systems.walls_view import WallsView, WallsViewConfig
+from makebreak.systems.contact_mpc.numerics.cartpole import (
+    CartPole,
+    cartpole_lcs,
+    cost_to_go,
+)
+from makebreak.systems.contact_mpc.numerics.lcs import simulate
+from makebreak.systems.views.walls_view import WallsView, WallsViewConfig
 
 REFERENCE = Path(__file__).parent / "reference"
 TRUTH = np.array([-0.15, 0.15])  # gap_error of the paper [m].

@@ -22,7 +22,7 @@ from makebreak.diagrams.changing_contact import (
 from makebreak.diagrams.station import make_control_plant
 from makebreak.diagrams.tabletop import TABLETOP_WALLS, move, set_friction, set_tool
 from makebreak.models.scene import read_scene
-from makebreak.systems.numerics.contact_task import (
+from makebreak.systems.changing_contact.numerics.contact_task import (
     DONE,
     MADE,
     PHASE_SEGMENT,
@@ -31,7 +31,10 @@ from makebreak.systems.numerics.contact_task import (
     ContactBelief,
     ExpectedContact,
 )
-from makebreak.systems.numerics.motion_pattern import MotionPattern, Segment
+from makebreak.systems.changing_contact.numerics.motion_pattern import (
+    MotionPattern,
+    Segment,
+)
 
 START = np.array([0.42, -0.16, 0.195])  # Of the sphere's centre [m].
 RAISED = 0.095  # The table, so that the way down is short [m].

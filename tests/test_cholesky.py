@@ -1,7 +1,11 @@
 import numpy as np
 import pytest
 
-from makebreak.systems.numerics.cholesky import cholesky, cholesky_solve, forward_solve
+from makebreak.systems.arm.numerics.cholesky import (
+    cholesky,
+    cholesky_solve,
+    forward_solve,
+)
 
 
 @pytest.mark.parametrize("n", [1, 2, 7])

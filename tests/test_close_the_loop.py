@@ -14,9 +14,9 @@ from makebreak import model_path
 from makebreak.diagrams.ball_rolling import BallRollingConfig, believed
 from makebreak.diagrams.recorder import mean_until_next
 from makebreak.diagrams.scene_facts import sphere_radius
-from makebreak.diagrams.scene_simulation import SceneSimulation
 from makebreak.diagrams.station import BALL_ROLLING
 from makebreak.gap.recording import read_recordings
+from makebreak.gap.scene_simulation import SceneSimulation
 from makebreak.gap.table import write_recording
 from makebreak.gap.windows import WindowModel
 from makebreak.models.effects.kind import Effect

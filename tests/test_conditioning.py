@@ -13,10 +13,10 @@ from gap_benchmark.sensing import hermite
 from makebreak.gap.checks import check_recordings
 from makebreak.gap.data.clock import clock_period, even_clock
 from makebreak.gap.data.conditioning import condition
+from makebreak.gap.numerics.signal_noise import estimate_noise, noise_and_jitter
 from makebreak.gap.recording import read_recording
 from makebreak.gap.workflow import run_gap
 from makebreak.systems.numerics.filters import filtered
-from makebreak.systems.numerics.signal_noise import estimate_noise, noise_and_jitter
 
 
 def written(folder, table, sidecar=None, name="log"):

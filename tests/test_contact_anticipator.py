@@ -7,13 +7,13 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 from scipy.stats import chi2
 
-from makebreak.systems.contact_anticipator import (
+from makebreak.systems.changing_contact.contact_anticipator import (
     ApproachSpeedConfig,
     ContactAnticipatorConfig,
     ContactFilterConfig,
     KalmanContactAnticipator,
 )
-from makebreak.systems.numerics.contact_anticipator import (
+from makebreak.systems.changing_contact.numerics.contact_anticipator import (
     capped,
     confidence_radius,
     contact_stiffness,
@@ -31,7 +31,7 @@ from makebreak.systems.numerics.contact_anticipator import (
     spread_along,
     update,
 )
-from makebreak.systems.numerics.contact_task import (
+from makebreak.systems.changing_contact.numerics.contact_task import (
     BAD_INPUT,
     BROKEN,
     CHANGE_TIME,

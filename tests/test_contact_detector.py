@@ -5,13 +5,16 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from makebreak.systems.contact_detector import ContactDetector, ContactDetectorConfig
-from makebreak.systems.numerics.contact_detector import (
+from makebreak.systems.changing_contact.contact_detector import (
+    ContactDetector,
+    ContactDetectorConfig,
+)
+from makebreak.systems.changing_contact.numerics.contact_detector import (
     Thresholds,
     detect,
     new_memory,
 )
-from makebreak.systems.numerics.contact_task import (
+from makebreak.systems.changing_contact.numerics.contact_task import (
     BROKEN,
     BROKEN_ROW,
     DIRECTION,

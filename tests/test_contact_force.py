@@ -15,12 +15,12 @@ from makebreak.diagrams.station import (
     make_station,
 )
 from makebreak.models.scene import read_scene
-from makebreak.systems.impedance_controller import (
+from makebreak.systems.arm.impedance_controller import (
     ImpedanceConfig,
     ImpedanceController,
     serial_chain_of,
 )
-from makebreak.systems.numerics.contact_force import contact_forces
+from makebreak.systems.arm.numerics.contact_force import contact_forces
 
 R_TIP = 0.0195
 

@@ -23,7 +23,7 @@ from makebreak.scripts.experiments.contact_learning import (
     summary,
 )
 from makebreak.scripts.session import Session
-from makebreak.systems.numerics.contact_task import (
+from makebreak.systems.changing_contact.numerics.contact_task import (
     DIRECTION,
     DONE,
     MADE,

@@ -16,20 +16,25 @@ from makebreak.models.pushed_object import (
     rest_height,
 )
 from makebreak.models.tip_and_ball import TipAndBall
-from makebreak.systems.contact_sampler import (
+from makebreak.systems.contact_mpc.contact_sampler import (
     ContactSampler,
     ContactSamplerConfig,
     SamplerStatus,
 )
-from makebreak.systems.lcs_builder import AnitescuLcs
-from makebreak.systems.numerics.ball_state import P_BALL, P_TIP, Q_BALL, V_BALL
-from makebreak.systems.numerics.c3_mpc import (
+from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs
+from makebreak.systems.contact_mpc.numerics.ball_state import (
+    P_BALL,
+    P_TIP,
+    Q_BALL,
+    V_BALL,
+)
+from makebreak.systems.contact_mpc.numerics.c3_mpc import (
     C3Problem,
     WarmStart,
     plan_cost,
     solve_c3,
 )
-from makebreak.systems.numerics.contact_sampling import (
+from makebreak.systems.contact_mpc.numerics.contact_sampling import (
     ObjectShape,
     SamplingConfig,
     SamplingMemory,
@@ -48,8 +53,8 @@ from makebreak.systems.numerics.contact_sampling import (
     travel_step,
     way_is_free,
 )
-from makebreak.systems.numerics.lcs import simulate
-from makebreak.systems.numerics.push_task import (
+from makebreak.systems.contact_mpc.numerics.lcs import simulate
+from makebreak.systems.contact_mpc.numerics.push_task import (
     CONTACT,
     TRAVEL,
     WAIT,

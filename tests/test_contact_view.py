@@ -8,13 +8,16 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
-from makebreak.systems.contact_view import (
+from makebreak.systems.changing_contact.numerics.contact_task import (
+    ContactBelief,
+    ExpectedContact,
+)
+from makebreak.systems.views.contact_view import (
     FORCE_SLIDER,
     SPEED_SLIDER,
     ContactView,
     ContactViewConfig,
 )
-from makebreak.systems.numerics.contact_task import ContactBelief, ExpectedContact
 
 TIP = np.array([0.4, 0.1, 0.2])
 CONTACT = ExpectedContact(TIP, np.diag([1e-4, 4e-4, 9e-4]), np.array([0.0, 0.0, -1.0]))

@@ -32,9 +32,14 @@ from makebreak.scripts.experiments import cube_pivoting as experiment
 from makebreak.scripts.session import Log
 from makebreak.scripts.settings import apply_settings
 from makebreak.scripts.trials import setting_texts
-from makebreak.systems.lcs_builder import AnitescuLcs
-from makebreak.systems.numerics.lcs import simulate
-from makebreak.systems.numerics.pivot_target import LEFT, RIGHT, THETA, corners
+from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs
+from makebreak.systems.contact_mpc.numerics.lcs import simulate
+from makebreak.systems.contact_mpc.numerics.pivot_target import (
+    LEFT,
+    RIGHT,
+    THETA,
+    corners,
+)
 
 G = 9.81
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from effect_scenes import at_rest_but, double, pendulum, with_effects
 
-from makebreak.diagrams.driven_arm import DrivenArmScene, DrivenArmSimulation, can_have
-from makebreak.diagrams.scene_simulation import (
+from makebreak.gap.driven_arm import DrivenArmScene, DrivenArmSimulation, can_have
+from makebreak.gap.numerics.driven_arm import mass_and_bias, rollout
+from makebreak.gap.scene_simulation import (
     Commands,
     SceneSimulation,
     SimulationConfig,
@@ -15,7 +16,6 @@ from makebreak.diagrams.scene_simulation import (
 from makebreak.models.effects import KINDS
 from makebreak.models.scene import ActuationSection
 from makebreak.models.scene_schema import SupplySection
-from makebreak.systems.numerics.driven_arm import mass_and_bias, rollout
 from makebreak.systems.numerics.joint_laws import LAWS, law_number
 
 ROBOT = """<?xml version="1.0"?>

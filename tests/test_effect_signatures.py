@@ -17,13 +17,13 @@ from effect_scenes import (
 )
 from scipy.integrate import solve_ivp
 
+from makebreak.gap.numerics.weak_form import make_bumps
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sentence, with_deviation
 from makebreak.models.effects.signature import Motion, added_effort
 from makebreak.models.scene import ActuationSection
 from makebreak.systems.numerics.smoother import smooth
-from makebreak.systems.numerics.weak_form import make_bumps
 
 # Effects on the double pendulum whose columns are exact, with parameters to find.
 EXACT = {

@@ -8,8 +8,8 @@ from effect_scenes import LENGTH, MASS, G, J, at_rest_but, pendulum, with_effect
 from pydrake.systems.framework import DiagramBuilder
 from scipy.integrate import solve_ivp
 
-from makebreak.diagrams.scene_simulation import Commands, SceneSimulation
 from makebreak.gap.problem import Candidate
+from makebreak.gap.scene_simulation import Commands, SceneSimulation
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import load_scene

@@ -16,16 +16,16 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from scipy.integrate import solve_ivp
 
-from makebreak.diagrams.scene_simulation import (
-    Commands,
-    SceneSimulation,
-    make_scene_diagram,
-)
 from makebreak.diagrams.station import (
     BALL_ROLLING,
     StationConfig,
     make_control_plant,
     make_station,
+)
+from makebreak.gap.scene_simulation import (
+    Commands,
+    SceneSimulation,
+    make_scene_diagram,
 )
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import load_scene, read_scene

@@ -23,9 +23,12 @@ from makebreak.scripts.replay import (
     flatten,
     rebuild,
 )
-from makebreak.systems import c3_mpc, residual_learner
-from makebreak.systems.c3_mpc import C3Status
-from makebreak.systems.numerics.contact_task import ContactBelief, ExpectedContact
+from makebreak.systems.changing_contact.numerics.contact_task import (
+    ContactBelief,
+    ExpectedContact,
+)
+from makebreak.systems.contact_mpc import c3_mpc, residual_learner
+from makebreak.systems.contact_mpc.c3_mpc import C3Status
 
 SECONDS = 0.4
 

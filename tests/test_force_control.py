@@ -11,13 +11,13 @@ from makebreak.diagrams.station import (
 )
 from makebreak.diagrams.tabletop import TABLETOP_WALLS, TOOL, set_friction, set_tool
 from makebreak.models.scene import read_scene
-from makebreak.systems.impedance_controller import (
+from makebreak.systems.arm.impedance_controller import (
     HybridConfig,
     ImpedanceConfig,
     ImpedanceController,
     serial_chain_of,
 )
-from makebreak.systems.numerics.impedance_controller import (
+from makebreak.systems.arm.numerics.impedance_controller import (
     ACTIVE,
     DAMPING,
     FORCE_SENSOR_HELD,
@@ -32,8 +32,8 @@ from makebreak.systems.numerics.impedance_controller import (
     memory_size,
     packed_tick,
 )
-from makebreak.systems.numerics.packed import packed
-from makebreak.systems.numerics.serial_chain import chain_state
+from makebreak.systems.arm.numerics.packed import packed
+from makebreak.systems.arm.numerics.serial_chain import chain_state
 
 NO_NOISE = SensorNoise(0.0, 0.0, 0.0, 0.0, 0.0)
 START = np.array([0.42, -0.16, 0.195])

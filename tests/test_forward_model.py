@@ -5,13 +5,16 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from makebreak.systems.forward_model import (
+from makebreak.systems.changing_contact.forward_model import (
     ForwardModelBank,
     ForwardModelConfig,
     HandoverConfig,
 )
-from makebreak.systems.numerics.contact_task import FREE_MODE, UNKNOWN_MODE
-from makebreak.systems.numerics.forward_model import (
+from makebreak.systems.changing_contact.numerics.contact_task import (
+    FREE_MODE,
+    UNKNOWN_MODE,
+)
+from makebreak.systems.changing_contact.numerics.forward_model import (
     BAD_WRENCH,
     NO_MODEL,
     OK,
@@ -22,8 +25,16 @@ from makebreak.systems.numerics.forward_model import (
     bank_tuning,
     observe,
 )
-from makebreak.systems.numerics.igmm import as_vector, empty_mixture, learned, regress
-from makebreak.systems.numerics.motion_feature import magnitudes, motion_wrench
+from makebreak.systems.changing_contact.numerics.igmm import (
+    as_vector,
+    empty_mixture,
+    learned,
+    regress,
+)
+from makebreak.systems.changing_contact.numerics.motion_feature import (
+    magnitudes,
+    motion_wrench,
+)
 
 DOWN = np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0])
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from makebreak.systems.numerics.free_body import FreeBody, simulate
-from makebreak.systems.numerics.free_flight import (
+from makebreak.gap.numerics.free_body import FreeBody, simulate
+from makebreak.gap.numerics.free_flight import (
     Flight,
     fit_flight,
     moved,

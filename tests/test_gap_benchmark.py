@@ -543,7 +543,7 @@ def windows_of(made, object_world):
 
 def gap_in_noise(made, scene, effects):
     """The worst channel's rms of measured - simulated, in standard deviations."""
-    from makebreak.diagrams.scene_simulation import (
+    from makebreak.gap.scene_simulation import (
         Commands,
         SceneSimulation,
         SimulationConfig,

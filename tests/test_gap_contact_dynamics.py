@@ -17,6 +17,7 @@ from makebreak.gap.contact_problem import ContactProblem, _best_rectangles
 from makebreak.gap.contact_shapes import _Point, _Surface
 from makebreak.gap.contact_windows import PushWindows, led_as_measured
 from makebreak.gap.fit import fit_effects
+from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.permitted_contacts import Shift
 from makebreak.gap.problem import Outcome, SearchPlan, is_sane
 from makebreak.gap.recording import read_recordings
@@ -28,7 +29,6 @@ from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
-from makebreak.systems.numerics.selection import Screen
 
 PAIR = f"{BLOCK}~{TABLE}"
 

@@ -9,12 +9,12 @@ from gap_benchmark.cart_world import PAIR
 
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.impacts import FREE_SEC, MOST_FREE, ImpactProblem, runs_against
+from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.recording import read_recordings
 from makebreak.gap.workflow import problem_for, run_gap
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
-from makebreak.systems.numerics.selection import Screen
 
 _PARAMETER = {"damper": "damping"}  # Of the effect that is the cart's field.
 

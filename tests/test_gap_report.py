@@ -11,7 +11,6 @@ from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RotationMatrix
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.diagrams.scene_simulation import Commands, SceneSimulation
 from makebreak.gap.comparison import comparison_html, measured_state
 from makebreak.gap.findings import Finding
 from makebreak.gap.pictures import picture_of_where
@@ -28,6 +27,7 @@ from makebreak.gap.result import (
     Unexplained,
     Where,
 )
+from makebreak.gap.scene_simulation import Commands, SceneSimulation
 from makebreak.gap.table import write_recording
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sentence

@@ -10,6 +10,21 @@ from scipy.signal import lfilter
 
 from makebreak.gap.fit import derivative_free_search, fit_effects
 from makebreak.gap.mechanism import MechanismProblem
+from makebreak.gap.numerics.selection import (
+    Screen,
+    benjamini_hochberg,
+    boxed_minimum,
+    is_plausible,
+    is_predicted,
+    paired,
+    paired_t,
+    predictable_share,
+    random_effects,
+    simplest,
+    spread_by_blocks,
+)
+from makebreak.gap.numerics.signal_noise import noise_beside
+from makebreak.gap.numerics.weak_form import make_bumps
 from makebreak.gap.problem import (
     Candidate,
     GapProblem,
@@ -23,22 +38,7 @@ from makebreak.gap.trust import gauss_newton, ridges, steady
 from makebreak.gap.verdict import after_simulation, verdict_of
 from makebreak.gap.workflow import kept_by_simulation
 from makebreak.models.effects.kind import Effect
-from makebreak.systems.numerics.selection import (
-    Screen,
-    benjamini_hochberg,
-    boxed_minimum,
-    is_plausible,
-    is_predicted,
-    paired,
-    paired_t,
-    predictable_share,
-    random_effects,
-    simplest,
-    spread_by_blocks,
-)
-from makebreak.systems.numerics.signal_noise import noise_beside
 from makebreak.systems.numerics.smoother import smooth
-from makebreak.systems.numerics.weak_form import make_bumps
 
 
 def test_false_discovery_rate_is_that_of_the_published_example():

@@ -7,12 +7,12 @@ import pytest
 from effect_scenes import at_rest_but, double, with_effects
 from test_driven_arm import tree
 
-from makebreak.diagrams.driven_arm import DrivenArmSimulation
-from makebreak.diagrams.scene_simulation import Commands
 from makebreak.gap.driven import DrivenProblem, is_driven, sticks
+from makebreak.gap.driven_arm import DrivenArmSimulation
 from makebreak.gap.mechanism import MechanismProblem
 from makebreak.gap.problem import Candidate
 from makebreak.gap.recording import read_recordings
+from makebreak.gap.scene_simulation import Commands
 from makebreak.gap.select import _groups, select
 from makebreak.gap.workflow import problem_for, run_gap
 from makebreak.models.dynamics import SceneDynamics

@@ -24,20 +24,20 @@ from makebreak.diagrams.gentle_rolling import (
 from makebreak.scripts.cli import main
 from makebreak.scripts.experiments import gentle_rolling as experiment
 from makebreak.scripts.export_tests import export_tests
-from makebreak.systems import (
-    c3_mpc,
+from makebreak.systems.arm import impedance_controller
+from makebreak.systems.baselines.frozen import Frozen
+from makebreak.systems.changing_contact import (
     contact_anticipator,
-    impedance_controller,
-    lcs_builder,
     mode_detector,
-    residual_learner,
     velocity_shaper,
 )
-from makebreak.systems.frozen import Frozen
-from makebreak.systems.moving_frame import MovingFrame
-from makebreak.systems.numerics.ball_state import pack
-from makebreak.systems.numerics.contact_task import DONE, MADE, ContactBelief
-from makebreak.systems.numerics.push_motion import (
+from makebreak.systems.changing_contact.moving_frame import MovingFrame
+from makebreak.systems.changing_contact.numerics.contact_task import (
+    DONE,
+    MADE,
+    ContactBelief,
+)
+from makebreak.systems.changing_contact.numerics.push_motion import (
     BALL_SEGMENT,
     TABLE_SEGMENT,
     PushConfig,
@@ -47,9 +47,18 @@ from makebreak.systems.numerics.push_motion import (
     moved_frame,
     table_pattern,
 )
-from makebreak.systems.numerics.reference_blend import blended_reference, weight
-from makebreak.systems.numerics.rolling_task import REPOSITION, ROLL, CirclePath
-from makebreak.systems.push_motion import PushMotion, PushMotionConfig
+from makebreak.systems.changing_contact.numerics.reference_blend import (
+    blended_reference,
+    weight,
+)
+from makebreak.systems.changing_contact.push_motion import PushMotion, PushMotionConfig
+from makebreak.systems.contact_mpc import c3_mpc, lcs_builder, residual_learner
+from makebreak.systems.contact_mpc.numerics.ball_state import pack
+from makebreak.systems.contact_mpc.numerics.rolling_task import (
+    REPOSITION,
+    ROLL,
+    CirclePath,
+)
 
 DOCS = Path(__file__).parent.parent / "docs"
 R_BALL, R_TIP = 0.0365, 0.0195  # As the model has them [m].

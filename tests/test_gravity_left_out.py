@@ -5,8 +5,8 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.diagrams.station import TIP_FRAME, make_control_plant
-from makebreak.systems.gravity_left_out import GravityLeftOut
-from makebreak.systems.impedance_controller import serial_chain_of
+from makebreak.systems.arm.gravity_left_out import GravityLeftOut
+from makebreak.systems.arm.impedance_controller import serial_chain_of
 
 Q = np.array([0.1, -0.5, 0.2, -2.0, 0.3, 1.6, 0.4])
 

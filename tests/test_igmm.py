@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 from sklearn.mixture import GaussianMixture
 
-from makebreak.systems.numerics.igmm import (
+from makebreak.systems.changing_contact.numerics.igmm import (
     CREATED,
     REFUSED,
     UPDATED,

@@ -3,10 +3,24 @@
 import numpy as np
 import pytest
 
-from makebreak.systems.impact_reflex import ImpactReflex, ImpactReflexConfig
-from makebreak.systems.numerics.contact_anticipator import unbraked_force
-from makebreak.systems.numerics.contact_task import IMPACT, IMPACTLESS, MOVE, REGION
-from makebreak.systems.numerics.impact_reflex import N_MEMORY, ReflexLaw, tick
+from makebreak.systems.changing_contact.impact_reflex import (
+    ImpactReflex,
+    ImpactReflexConfig,
+)
+from makebreak.systems.changing_contact.numerics.contact_anticipator import (
+    unbraked_force,
+)
+from makebreak.systems.changing_contact.numerics.contact_task import (
+    IMPACT,
+    IMPACTLESS,
+    MOVE,
+    REGION,
+)
+from makebreak.systems.changing_contact.numerics.impact_reflex import (
+    N_MEMORY,
+    ReflexLaw,
+    tick,
+)
 
 DOWN = np.array([0.0, 0.0, -1.0])
 LAW = ReflexLaw(gain=3.0, force_least=0.0, force_max=100.0, fade_sec=0.1, period=1e-3)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from makebreak.systems.numerics.impact_score import impact, low_pass
+from makebreak.systems.changing_contact.numerics.impact_score import impact, low_pass
 
 DT, T_HIT = 0.001, 0.5
 D = np.array([0.6, 0.0, -0.8])

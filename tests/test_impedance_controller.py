@@ -22,12 +22,12 @@ from makebreak.diagrams.station import (
 )
 from makebreak.models.model_files import MODELS
 from makebreak.models.scene import read_scene
-from makebreak.systems.impedance_controller import (
+from makebreak.systems.arm.impedance_controller import (
     ImpedanceConfig,
     ImpedanceController,
     serial_chain_of,
 )
-from makebreak.systems.numerics.impedance_controller import (
+from makebreak.systems.arm.numerics.impedance_controller import (
     EFFORT_LIMITED,
     N_SLOTS,
     RATE_LIMITED,
@@ -41,8 +41,8 @@ from makebreak.systems.numerics.impedance_controller import (
     rotation_error,
     rotation_of,
 )
-from makebreak.systems.numerics.packed import packed
-from makebreak.systems.numerics.serial_chain import chain_state, tip_kinematics
+from makebreak.systems.arm.numerics.packed import packed
+from makebreak.systems.arm.numerics.serial_chain import chain_state, tip_kinematics
 
 EFFORT = np.repeat([87.0, 12.0], [4, 3])
 NO_NOISE = SensorNoise(0.0, 0.0, 0.0, 0.0, 0.0)

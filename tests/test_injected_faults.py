@@ -38,17 +38,20 @@ from makebreak.scripts import cli
 from makebreak.scripts.contact_runs import rehearsed
 from makebreak.scripts.fault_trials import FAILED, HELD, RECOVERED, UNJUDGED, judge
 from makebreak.scripts.session import Session
-from makebreak.systems.c3_mpc import C3Status
-from makebreak.systems.fault_forces import Hand, Push
-from makebreak.systems.fault_pictures import LatePictures, PaintedPictures
-from makebreak.systems.fault_signals import (
+from makebreak.systems.arm.impedance_controller import (
+    ImpedanceConfig,
+    ImpedanceController,
+)
+from makebreak.systems.contact_mpc.c3_mpc import C3Status
+from makebreak.systems.faults.fault_forces import Hand, Push
+from makebreak.systems.faults.fault_pictures import LatePictures, PaintedPictures
+from makebreak.systems.faults.fault_signals import (
     BiasedSignal,
     LateSignal,
     LimitedSignal,
     StuckSignal,
 )
-from makebreak.systems.impedance_controller import ImpedanceConfig, ImpedanceController
-from makebreak.systems.safety_monitor import ArmLimits, SafetyMonitor, verdict
+from makebreak.systems.faults.safety_monitor import ArmLimits, SafetyMonitor, verdict
 
 NO_NOISE = SensorNoise(0.0, 0.0, 0.0, 0.0, 0.0)
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from makebreak.systems.numerics import constant_velocity, interacting_models
+from makebreak.systems.perception.numerics import constant_velocity, interacting_models
 
 DT, SIGMA, NOISE = 0.0125, 1.5e-3, 1e-3
 QUIET, DRIVEN = 4e-3, 0.3

@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-NUMERICS = ROOT / "systems" / "numerics"
+NUMERICS = [*ROOT.glob("systems/**/numerics/*.py"), *ROOT.glob("gap/numerics/*.py")]
 
 # Pictures are indexed by numbers that come from measurements. None of these may raise.
 PICTURES = """
 import numpy as np
-from makebreak.systems.numerics.ball_tracker import (
+from makebreak.systems.perception.numerics.ball_tracker import (
     _ANGLES, _fit_ball, find_ball, strength_weights)
-from makebreak.systems.numerics.pinhole import draw, look_down, shifted
+from makebreak.systems.perception.numerics.pinhole import draw, look_down, shifted
 
 rng = np.random.default_rng(0)
 FAR = [0, 0.5, -0.5, 8, 9, 31, 32, 33, 400, 1e6, 1e30, np.inf, np.nan]
@@ -76,7 +76,7 @@ def _tests_of_kernels() -> list[str]:
     """Test files of the maths that has compiled code."""
     kernels = [
         path.stem
-        for path in NUMERICS.glob("*.py")
+        for path in NUMERICS
         if re.search(r"^@(numba\.)?njit", path.read_text(), re.MULTILINE)
     ]
     files = sorted((ROOT / "tests").glob("test_*.py"))

@@ -29,7 +29,7 @@ KNOWN = {
     "diagrams/realism.py": {"joint_offset", "plane_tilt"},
     "diagrams/station.py": {"joint_viscous_damping"},
     "diagrams/tabletop.py": {"contact_friction", "contact_stiffness"},
-    "diagrams/free_body.py": CONTACT
+    "gap/free_body.py": CONTACT
     | {"clock_skew", "gravity_tilt", "sensor_bias", "sensor_delay", "sinusoidal_force"},
     "gap/check_relations.py": {"clock_skew"},
     "gap/contact.py": CONTACT,

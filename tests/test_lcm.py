@@ -36,7 +36,10 @@ from makebreak.scripts.stand_in import (
     StandInConfig,
     StandInReport,
 )
-from makebreak.systems.impedance_controller import ImpedanceConfig, ImpedanceController
+from makebreak.systems.arm.impedance_controller import (
+    ImpedanceConfig,
+    ImpedanceController,
+)
 
 NOW = 1_700_000_000_000_000  # [us]
 HOME = [-0.117125, -0.059522, -0.137316, -2.552375, -0.013487, 2.493369, -0.243449]

@@ -7,7 +7,11 @@ from hypothesis import strategies as st
 from pydrake.solvers import MathematicalProgram, MobyLcpSolver
 from scipy.optimize import linprog
 
-from makebreak.systems.numerics.lcp import SOLVED, solve_lcp, solve_lcp_kernel
+from makebreak.systems.contact_mpc.numerics.lcp import (
+    SOLVED,
+    solve_lcp,
+    solve_lcp_kernel,
+)
 
 
 def brute_force_lcp(F, q):

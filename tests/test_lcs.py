@@ -7,8 +7,8 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from makebreak.systems.lcs_plant import LcsPlant, LcsPlantConfig
-from makebreak.systems.numerics.lcs import LCS, simulate
+from makebreak.systems.contact_mpc.lcs_plant import LcsPlant, LcsPlantConfig
+from makebreak.systems.contact_mpc.numerics.lcs import LCS, simulate
 
 CARTPOLE = np.load(Path(__file__).parent / "reference" / "c3_cartpole.npz")
 

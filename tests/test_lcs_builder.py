@@ -34,7 +34,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from scipy.optimize import nnls
 
 from makebreak.diagrams.contact_mpc import ContactMpcConfig, make_contact_mpc
-from makebreak.systems.lcs_builder import (
+from makebreak.systems.contact_mpc.lcs_builder import (
     Anitescu,
     AnitescuLcs,
     AnitescuLcsBuilder,
@@ -43,9 +43,9 @@ from makebreak.systems.lcs_builder import (
     LcsBuilderStatus,
     StewartTrinkle,
 )
-from makebreak.systems.numerics.c3_mpc import C3Options, Plan
-from makebreak.systems.numerics.lcs import simulate
-from makebreak.systems.numerics.lcs_builder import (
+from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Options, Plan
+from makebreak.systems.contact_mpc.numerics.lcs import simulate
+from makebreak.systems.contact_mpc.numerics.lcs_builder import (
     contact_rows,
     friction_edges,
     tangent_basis,

@@ -7,7 +7,7 @@ import pytest
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from makebreak.systems.numerics.baselines.long_term_predictor import (
+from makebreak.systems.baselines.numerics.long_term_predictor import (
     JITTER,
     LongTermPredictor,
     TrainingBudget,

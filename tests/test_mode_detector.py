@@ -9,8 +9,11 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from sklearn.cluster import Birch
 from sliding_tool import DOWN, TOOL_MASS, Slide
 
-from makebreak.systems.mode_detector import ModeDetector, ModeDetectorConfig
-from makebreak.systems.numerics.contact_task import (
+from makebreak.systems.changing_contact.mode_detector import (
+    ModeDetector,
+    ModeDetectorConfig,
+)
+from makebreak.systems.changing_contact.numerics.contact_task import (
     CHANGE_TIME,
     COUNT,
     DECIDED_TIME,
@@ -20,7 +23,7 @@ from makebreak.systems.numerics.contact_task import (
     TO_MODE,
     UNKNOWN_MODE,
 )
-from makebreak.systems.numerics.mode_detector import (
+from makebreak.systems.changing_contact.numerics.mode_detector import (
     BAD_WRENCH,
     HINTED,
     NO_FEATURE,
@@ -31,7 +34,7 @@ from makebreak.systems.numerics.mode_detector import (
     contact_feature,
     detect,
 )
-from makebreak.systems.numerics.mode_table import ModeTable, no_modes
+from makebreak.systems.changing_contact.numerics.mode_table import ModeTable, no_modes
 
 
 def start(tuning):

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation, Slerp
 
-from makebreak.systems.numerics.motion_pattern import (
+from makebreak.systems.changing_contact.numerics.motion_pattern import (
     MotionPattern,
     Segment,
     load_pattern,
@@ -16,7 +16,7 @@ from makebreak.systems.numerics.motion_pattern import (
     save_pattern,
     segment_time,
 )
-from makebreak.systems.numerics.path_geometry import path_point
+from makebreak.systems.changing_contact.numerics.path_geometry import path_point
 
 PATTERNS = Path(__file__).resolve().parent.parent / "models" / "patterns"
 DOWN, LEFT = [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]

@@ -9,8 +9,8 @@ from scipy.linalg import solve_continuous_lyapunov
 from scipy.signal import StateSpace, lsim
 
 from makebreak.systems.baselines.mrac import Mrac, MracConfig
-from makebreak.systems.numerics.mrac import MEMORY, error_weights, tick
-from makebreak.systems.numerics.planar_world import circle_target, step
+from makebreak.systems.baselines.numerics.mrac import MEMORY, error_weights, tick
+from makebreak.systems.planar.numerics.planar_world import circle_target, step
 
 DT = 1e-3
 

@@ -26,7 +26,7 @@ from makebreak.scripts.experiments.multiple_collisions import (
     summary,
 )
 from makebreak.scripts.session import Session
-from makebreak.systems.numerics.contact_task import (
+from makebreak.systems.changing_contact.numerics.contact_task import (
     BROKEN,
     DIRECTION,
     DONE,

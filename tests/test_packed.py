@@ -3,7 +3,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from makebreak.systems.numerics.packed import packed
+from makebreak.systems.arm.numerics.packed import packed
 
 
 class Inner(NamedTuple):

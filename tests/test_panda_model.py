@@ -12,13 +12,13 @@ from pydrake.systems.framework import DiagramBuilder
 from makebreak.diagrams.camera import CameraConfig, add_camera
 from makebreak.diagrams.station import BALL_ROLLING, MODELS, make_control_plant
 from makebreak.models.scene import load_scene, read_scene
-from makebreak.systems.impedance_controller import (
+from makebreak.systems.arm.impedance_controller import (
     ImpedanceConfig,
     ImpedanceController,
     serial_chain_of,
 )
-from makebreak.systems.numerics.impedance_controller import posture_step
-from makebreak.systems.numerics.serial_chain import tip_kinematics
+from makebreak.systems.arm.numerics.impedance_controller import posture_step
+from makebreak.systems.arm.numerics.serial_chain import tip_kinematics
 
 ROTOR = np.array([0.606, 0.606, 0.462, 0.462, 0.206, 0.206, 0.206])
 CAMERA = np.array([0.5, 0.0, 0.8])

@@ -7,7 +7,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from makebreak.systems.numerics.ball_state import (
+from makebreak.systems.contact_mpc.numerics.ball_state import (
     N_X,
     P_BALL,
     P_TIP,
@@ -16,10 +16,10 @@ from makebreak.systems.numerics.ball_state import (
     V_TIP,
     W_BALL,
 )
-from makebreak.systems.numerics.past_state import pose_at
-from makebreak.systems.numerics.pose_filter import turn_between, turned
-from makebreak.systems.past_state import PastState, PastStateConfig
-from makebreak.systems.pose_sensor import PoseSensor, PoseSensorConfig
+from makebreak.systems.perception.numerics.past_state import pose_at
+from makebreak.systems.perception.numerics.pose_filter import turn_between, turned
+from makebreak.systems.perception.past_state import PastState, PastStateConfig
+from makebreak.systems.perception.pose_sensor import PoseSensor, PoseSensorConfig
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 A, ALPHA = np.array([0.4, -0.2, 0.0]), 3.0  # [m/s2], [rad/s2]

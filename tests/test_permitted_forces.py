@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from makebreak.systems.numerics import permitted_forces
-from makebreak.systems.numerics.permitted_forces import (
+from makebreak.gap.numerics import permitted_forces
+from makebreak.gap.numerics.permitted_forces import (
     explain,
     nonnegative,
     roots_of,

@@ -3,7 +3,7 @@ import pytest
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from makebreak.systems.numerics.pivot_target import (
+from makebreak.systems.contact_mpc.numerics.pivot_target import (
     LEFT,
     RIGHT,
     THETA,
@@ -12,7 +12,7 @@ from makebreak.systems.numerics.pivot_target import (
     pivot_target,
     share_of_rate,
 )
-from makebreak.systems.pivot_target import PivotTarget, PivotTargetConfig
+from makebreak.systems.contact_mpc.pivot_target import PivotTarget, PivotTargetConfig
 
 SIDE = 0.1
 POINTS = np.array([[-0.062, 0.02], [0.015, 0.062]])

@@ -18,9 +18,9 @@ from makebreak.scripts.cli import main
 from makebreak.scripts.experiments import multi_spring, porridge
 from makebreak.scripts.planar_runs import median_range, with_count
 from makebreak.scripts.session import Session
-from makebreak.systems.numerics.mrac import error_weights
-from makebreak.systems.numerics.planar_impedance import persistence
-from makebreak.systems.numerics.planar_world import compensated
+from makebreak.systems.baselines.numerics.mrac import error_weights
+from makebreak.systems.planar.numerics.planar_impedance import persistence
+from makebreak.systems.planar.numerics.planar_world import compensated
 
 
 def run_main(name, folder, *settings):

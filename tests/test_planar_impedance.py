@@ -15,8 +15,8 @@ from makebreak.diagrams.multi_spring import (
     make_multi_spring,
 )
 from makebreak.diagrams.planar import PlanarSensing, knowledge_of, make_planar
-from makebreak.systems.numerics.fixed_gmm import fit_mixture
-from makebreak.systems.numerics.igmm import (
+from makebreak.systems.baselines.numerics.fixed_gmm import fit_mixture
+from makebreak.systems.changing_contact.numerics.igmm import (
     IgmmConfig,
     Mixture,
     empty_mixture,
@@ -24,7 +24,7 @@ from makebreak.systems.numerics.igmm import (
     learned,
     log_likelihood,
 )
-from makebreak.systems.numerics.planar_impedance import (
+from makebreak.systems.planar.numerics.planar_impedance import (
     after_sample,
     features_of,
     force_command,
@@ -34,12 +34,12 @@ from makebreak.systems.numerics.planar_impedance import (
     stiffness_of,
     trust,
 )
-from makebreak.systems.planar_impedance import (
+from makebreak.systems.planar.planar_impedance import (
     ForceModelConfig,
     PlanarImpedance,
     PlanarImpedanceConfig,
 )
-from makebreak.systems.planar_world import CircleTargetConfig, PlanarWorldConfig
+from makebreak.systems.planar.planar_world import CircleTargetConfig, PlanarWorldConfig
 
 VECTORS = igmm_tuning(IgmmConfig(sigma_ini=[0.1, 0.1, 1.0, 1.0, 1.0, 1.0]))
 

@@ -7,7 +7,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from makebreak.systems.planar_view import PlanarView, PlanarViewConfig
+from makebreak.systems.views.planar_view import PlanarView, PlanarViewConfig
 
 
 @pytest.mark.parametrize("seconds, viscosity", [(0.0, 40.0), (1.5, 70.0), (3.1, 100.0)])

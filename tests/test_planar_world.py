@@ -25,13 +25,13 @@ from makebreak.diagrams.multi_spring import (
 from makebreak.diagrams.porridge import PorridgeConfig, make_porridge
 from makebreak.diagrams.porridge import draw as draw_porridge
 from makebreak.systems.baselines.active_inference import ActiveInferenceConfig
-from makebreak.systems.numerics.planar_world import (
+from makebreak.systems.planar.numerics.planar_world import (
     circle_target,
     external_force,
     limited,
     step,
 )
-from makebreak.systems.planar_world import (
+from makebreak.systems.planar.planar_world import (
     CircleTarget,
     CircleTargetConfig,
     PlanarWorld,

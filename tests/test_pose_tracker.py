@@ -24,15 +24,15 @@ from makebreak.models.pushed_object import (
     seen_parts,
 )
 from makebreak.models.scene import load_scene, read_scene
-from makebreak.systems.numerics.ball_tracker import strength_weights
-from makebreak.systems.numerics.pose_tracker import (
+from makebreak.systems.perception.numerics.ball_tracker import strength_weights
+from makebreak.systems.perception.numerics.pose_tracker import (
     MIN_SEEN,
     find_marker,
     find_pose,
     make_shape,
     nearest_yaw,
 )
-from makebreak.systems.pose_tracker import (
+from makebreak.systems.perception.pose_tracker import (
     HOLD_SEC,
     NOT_FOUND,
     OUTLIER,

@@ -17,8 +17,19 @@ from makebreak.diagrams.push_object import (
     poses_of,
     world_scene,
 )
-from makebreak.systems.numerics.ball_state import N_X, P_BALL, Q_BALL
-from makebreak.systems.numerics.pose_filter import (
+from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL, Q_BALL
+from makebreak.systems.contact_mpc.numerics.push_task import (
+    CONTACT,
+    TRAVEL,
+    errors,
+    heading,
+)
+from makebreak.systems.contact_mpc.push_goals import (
+    PushGoals,
+    PushGoalsConfig,
+    draw_poses,
+)
+from makebreak.systems.perception.numerics.pose_filter import (
     corrected,
     first_pose,
     on_the_table,
@@ -26,10 +37,8 @@ from makebreak.systems.numerics.pose_filter import (
     turn_between,
     turned,
 )
-from makebreak.systems.numerics.push_task import CONTACT, TRAVEL, errors, heading
-from makebreak.systems.numerics.state_estimator import with_pose
-from makebreak.systems.pose_sensor import PoseSensor, PoseSensorConfig
-from makebreak.systems.push_goals import PushGoals, PushGoalsConfig, draw_poses
+from makebreak.systems.perception.numerics.state_estimator import with_pose
+from makebreak.systems.perception.pose_sensor import PoseSensor, PoseSensorConfig
 
 
 def as_scipy(q):

@@ -37,8 +37,8 @@ from makebreak.scripts.experiments.push_object import (
 )
 from makebreak.scripts.session import Session
 from makebreak.scripts.settings import apply_settings
-from makebreak.systems.numerics.past_state import pose_at
-from makebreak.systems.pose_sensor import KEPT_SEC, PoseSensorConfig
+from makebreak.systems.perception.numerics.past_state import pose_at
+from makebreak.systems.perception.pose_sensor import KEPT_SEC, PoseSensorConfig
 
 GOAL = np.array([0.5, 0.1, 3.0])
 

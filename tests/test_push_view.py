@@ -10,8 +10,8 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
-from makebreak.systems.numerics.ball_state import N_X, P_BALL, Q_BALL
-from makebreak.systems.push_view import PushView, PushViewConfig
+from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL, Q_BALL
+from makebreak.systems.views.push_view import PushView, PushViewConfig
 
 PARTS = [
     (Box(0.16, 0.04, 0.04), RigidTransform([0.0, 0.03, 0.0])),

@@ -22,9 +22,9 @@ from makebreak.models.pushed_object import (
 )
 from makebreak.models.scene import load_scene, read_scene
 from makebreak.models.tip_and_ball import TipAndBall
-from makebreak.systems.lcs_builder import AnitescuLcs, ContactPair
-from makebreak.systems.numerics.ball_state import P_BALL, V_BALL, W_BALL
-from makebreak.systems.numerics.lcs import simulate
+from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs, ContactPair
+from makebreak.systems.contact_mpc.numerics.ball_state import P_BALL, V_BALL, W_BALL
+from makebreak.systems.contact_mpc.numerics.lcs import simulate
 
 FLAT = ("t", "l", "box", "disc", "mesh")
 G = 9.81

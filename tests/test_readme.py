@@ -41,11 +41,11 @@ def test_the_number_of_kinds_is_told_as_it_is():
 
 
 def test_the_seven_systems_are_where_the_table_says():
-    rows = re.findall(r"^\| `(\w+)` \| `(\w+)` \|(.*)$", README.read_text(), re.M)
+    rows = re.findall(r"^\| `(\w+)/(\w+)` \| `(\w+)` \|(.*)$", README.read_text(), re.M)
     assert len(rows) == 7
-    for name, cls, rest in rows:
-        assert hasattr(import_module(f"makebreak.systems.{name}"), cls)
-        (ROOT / "systems" / "numerics" / f"{name}.py").stat()
+    for wing, name, cls, rest in rows:
+        assert hasattr(import_module(f"makebreak.systems.{wing}.{name}"), cls)
+        (ROOT / "systems" / wing / "numerics" / f"{name}.py").stat()
         (ROOT / "tests" / f"test_{name}.py").stat()
         example, page = re.findall(r"\]\((.*?)\)", rest)
         assert cls in (ROOT / example).read_text()

@@ -22,9 +22,9 @@ from makebreak.diagrams.station import (
 from makebreak.diagrams.tabletop import TABLETOP_WALLS, TOOL, position
 from makebreak.models.scene import load_scene, read_scene
 from makebreak.scripts.experiments import contact_learning, multiple_collisions
-from makebreak.systems.impedance_controller import serial_chain_of
-from makebreak.systems.numerics.packed import packed
-from makebreak.systems.numerics.tip_state import tip_pose
+from makebreak.systems.arm.impedance_controller import serial_chain_of
+from makebreak.systems.arm.numerics.packed import packed
+from makebreak.systems.arm.numerics.tip_state import tip_pose
 
 ARM = "panda"
 QUIET = SensorNoise(0.0, 0.0, 0.0, 0.0, 0.0)

@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 
+from makebreak.gap.numerics.signal_noise import estimate_noise, resolution
 from makebreak.gap.recording import (
     check_against_scene,
     read_recording,
@@ -14,7 +15,6 @@ from makebreak.gap.recording import (
     windows,
 )
 from makebreak.gap.table import read_table, write_recording
-from makebreak.systems.numerics.signal_noise import estimate_noise, resolution
 
 FORMATS = ["csv", "npz"]
 try:

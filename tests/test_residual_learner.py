@@ -16,10 +16,10 @@ from makebreak.systems.baselines.dynamics_residual_learner import (
     DynamicsResidualLearnerConfig,
     DynamicsStatus,
 )
-from makebreak.systems.lcs_plant import LcsPlant
-from makebreak.systems.numerics import residual_learner as numerics
-from makebreak.systems.numerics.lcs import LCS, simulate
-from makebreak.systems.numerics.residual_learner import (
+from makebreak.systems.contact_mpc.lcs_plant import LcsPlant
+from makebreak.systems.contact_mpc.numerics import residual_learner as numerics
+from makebreak.systems.contact_mpc.numerics.lcs import LCS, simulate
+from makebreak.systems.contact_mpc.numerics.residual_learner import (
     empty_buffer,
     gamma_bound,
     group_of_entry,
@@ -29,7 +29,7 @@ from makebreak.systems.numerics.residual_learner import (
     violation_loss,
     zero_residual,
 )
-from makebreak.systems.residual_learner import (
+from makebreak.systems.contact_mpc.residual_learner import (
     LearnerStatus,
     ResidualLearner,
     ResidualLearnerConfig,

@@ -15,21 +15,24 @@ from makebreak.diagrams.ball_rolling import (
     paper_learner_config,
 )
 from makebreak.models.tip_and_ball import TipAndBall, make_tip_and_ball
-from makebreak.systems.lcs_builder import (
+from makebreak.systems.contact_mpc.lcs_builder import (
     AnitescuLcsBuilder,
     ContactPair,
     LcsBuilderConfig,
 )
-from makebreak.systems.numerics.ball_state import V_TIP, pack
-from makebreak.systems.numerics.lcs import opening_speed, simulate
-from makebreak.systems.numerics.residual_learner import measured_step, violation_loss
-from makebreak.systems.numerics.residual_posterior import (
+from makebreak.systems.contact_mpc.numerics.ball_state import V_TIP, pack
+from makebreak.systems.contact_mpc.numerics.lcs import opening_speed, simulate
+from makebreak.systems.contact_mpc.numerics.residual_learner import (
+    measured_step,
+    violation_loss,
+)
+from makebreak.systems.contact_mpc.numerics.residual_posterior import (
     losses_on_grid,
     mode_and_std,
     residual_grid,
     updated,
 )
-from makebreak.systems.residual_learner import (
+from makebreak.systems.contact_mpc.residual_learner import (
     LearnerStatus,
     PosteriorConfig,
     ResidualLearner,

@@ -3,7 +3,7 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from scipy.interpolate import BPoly
 
-from makebreak.systems.numerics.ball_state import (
+from makebreak.systems.contact_mpc.numerics.ball_state import (
     P_BALL,
     P_TIP,
     V_BALL,
@@ -11,7 +11,7 @@ from makebreak.systems.numerics.ball_state import (
     W_BALL,
     pack,
 )
-from makebreak.systems.numerics.rolling_task import (
+from makebreak.systems.contact_mpc.numerics.rolling_task import (
     APPROACH,
     REPOSITION,
     ROLL,
@@ -26,7 +26,7 @@ from makebreak.systems.numerics.rolling_task import (
     surface_height,
     target_over_horizon,
 )
-from makebreak.systems.rolling_task import RollingTask, RollingTaskConfig
+from makebreak.systems.contact_mpc.rolling_task import RollingTask, RollingTaskConfig
 
 PATH = CirclePath(np.array([0.5, 0.0]), 0.1)
 R_BALL, R_TIP, DT = 0.0315, 0.0195, 0.0125

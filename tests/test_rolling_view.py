@@ -8,8 +8,8 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from makebreak.systems.numerics.ball_state import pack
-from makebreak.systems.rolling_view import RollingView, RollingViewConfig
+from makebreak.systems.contact_mpc.numerics.ball_state import pack
+from makebreak.systems.views.rolling_view import RollingView, RollingViewConfig
 
 SLIDER = "r_comp as a gap [mm]"
 BALL = np.array([0.6, 0.1, 0.0315])

@@ -304,7 +304,7 @@ def test_what_is_compiled_is_told_and_what_was_compiled_is_not(capsys):
         return inner(2.0 * x)
 
     for function in (inner, outer):
-        function.py_func.__module__ = "makebreak.systems.numerics.made_up"
+        function.py_func.__module__ = "makebreak.systems.arm.numerics.made_up"
     seen: list[str] = []
     with CompilingShown(seen.append):
         assert outer(1.0) == 3.0

@@ -6,8 +6,8 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
 
 from makebreak.diagrams.station import TIP_FRAME, make_control_plant
-from makebreak.systems.impedance_controller import serial_chain_of
-from makebreak.systems.numerics.ball_state import (
+from makebreak.systems.arm.impedance_controller import serial_chain_of
+from makebreak.systems.contact_mpc.numerics.ball_state import (
     P_BALL,
     P_TIP,
     Q_BALL,
@@ -15,12 +15,15 @@ from makebreak.systems.numerics.ball_state import (
     V_TIP,
     W_BALL,
 )
-from makebreak.systems.numerics.state_estimator import (
+from makebreak.systems.perception.numerics.state_estimator import (
     observe_force,
     tip_mobility,
     tip_motion,
 )
-from makebreak.systems.state_estimator import StateEstimator, StateEstimatorConfig
+from makebreak.systems.perception.state_estimator import (
+    StateEstimator,
+    StateEstimatorConfig,
+)
 
 MASS, R_BALL = 1.3, 0.03
 CONFIG = StateEstimatorConfig(

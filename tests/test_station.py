@@ -14,10 +14,13 @@ from makebreak.diagrams.station import (
 )
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
-from makebreak.systems.impedance_controller import ImpedanceConfig, ImpedanceController
-from makebreak.systems.noisy_sensor import NoisySensor
-from makebreak.systems.numerics.sensor_noise import add_noise
-from makebreak.systems.numerics.tool_wrench import external_wrench
+from makebreak.systems.arm.impedance_controller import (
+    ImpedanceConfig,
+    ImpedanceController,
+)
+from makebreak.systems.arm.numerics.tool_wrench import external_wrench
+from makebreak.systems.perception.noisy_sensor import NoisySensor
+from makebreak.systems.perception.numerics.sensor_noise import add_noise
 
 NO_NOISE = SensorNoise(0.0, 0.0, 0.0, 0.0, 0.0)
 EFFORT = np.repeat([87.0, 12.0], [4, 3])

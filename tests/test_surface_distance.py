@@ -15,7 +15,7 @@ from pydrake.geometry import HalfSpace as DrakeHalfSpace
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.systems.numerics import surface_distance as own
+from makebreak.gap.numerics import surface_distance as own
 
 SHAPES = {
     "box": (Box(0.2, 0.3, 0.1), lambda p: own.box(p, [0.1, 0.15, 0.05])),

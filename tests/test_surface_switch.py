@@ -16,7 +16,7 @@ from makebreak.diagrams.surface_switch import (
     taken_over,
 )
 from makebreak.scripts.experiments.surface_switch import N, Trial, scored, summary
-from makebreak.systems.numerics.contact_task import (
+from makebreak.systems.changing_contact.numerics.contact_task import (
     IMPACTLESS,
     REGION,
     UNKNOWN_MODE,

@@ -27,11 +27,11 @@ from makebreak.diagrams.tabletop import (
     tool_half_width,
 )
 from makebreak.models.scene import load_scene, read_scene
-from makebreak.systems.impedance_controller import serial_chain_of
-from makebreak.systems.numerics.impedance_controller import rotation_error
-from makebreak.systems.numerics.packed import packed
-from makebreak.systems.numerics.serial_chain import chain_state, tip_kinematics
-from makebreak.systems.numerics.tip_state import tip_pose, tip_velocity
+from makebreak.systems.arm.impedance_controller import serial_chain_of
+from makebreak.systems.arm.numerics.impedance_controller import rotation_error
+from makebreak.systems.arm.numerics.packed import packed
+from makebreak.systems.arm.numerics.serial_chain import chain_state, tip_kinematics
+from makebreak.systems.arm.numerics.tip_state import tip_pose, tip_velocity
 
 SCENES = [TABLETOP_WALLS, THREE_SURFACES, SURFACE_SWITCH]
 START = np.array([0.42, -0.16, 0.195])

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from makebreak.models.tip_and_ball import TipAndBall, make_tip_and_ball
-from makebreak.systems.lcs_builder import AnitescuLcs, ContactPair
-from makebreak.systems.numerics.ball_state import (
+from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs, ContactPair
+from makebreak.systems.contact_mpc.numerics.ball_state import (
     P_BALL,
     P_TIP,
     V_BALL,
@@ -14,7 +14,7 @@ from makebreak.systems.numerics.ball_state import (
     pack,
     rolling_velocity,
 )
-from makebreak.systems.numerics.lcs import simulate
+from makebreak.systems.contact_mpc.numerics.lcs import simulate
 
 MODEL = TipAndBall(tip_mass=1.5, tip_radius=0.02, ball_mass=0.1, ball_radius=0.04)
 PAIRS = [

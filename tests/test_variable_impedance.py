@@ -2,7 +2,18 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from makebreak.systems.numerics.contact_task import (
+from makebreak.systems.arm.numerics.variable_impedance import (
+    N_MEMORY,
+    tick,
+    trust,
+)
+from makebreak.systems.arm.variable_impedance import (
+    StiffnessConfig,
+    TrustConfig,
+    VariableImpedance,
+    VariableImpedanceConfig,
+)
+from makebreak.systems.changing_contact.numerics.contact_task import (
     DONE,
     ENTER,
     HOLD,
@@ -14,13 +25,6 @@ from makebreak.systems.numerics.contact_task import (
     PHASE_STAGE,
     REGION,
     SETTLE,
-)
-from makebreak.systems.numerics.variable_impedance import N_MEMORY, tick, trust
-from makebreak.systems.variable_impedance import (
-    StiffnessConfig,
-    TrustConfig,
-    VariableImpedance,
-    VariableImpedanceConfig,
 )
 
 W = np.array([-3.0, 1.0, 0.5, 0.1, -0.2, 0.0])

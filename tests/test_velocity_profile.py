@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from makebreak.systems.numerics.velocity_profile import (
+from makebreak.systems.changing_contact.numerics.velocity_profile import (
     speed_transition,
     transition_time,
     unit_step,

@@ -10,7 +10,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 from scipy.spatial.transform import Rotation
 
-from makebreak.systems.numerics.contact_task import (
+from makebreak.systems.changing_contact.numerics.contact_task import (
     BAD_INPUT,
     BROKEN,
     BROKEN_ROW,
@@ -33,12 +33,12 @@ from makebreak.systems.numerics.contact_task import (
     ContactBelief,
     ExpectedContact,
 )
-from makebreak.systems.numerics.motion_pattern import (
+from makebreak.systems.changing_contact.numerics.motion_pattern import (
     MotionPattern,
     Segment,
     load_pattern,
 )
-from makebreak.systems.numerics.velocity_shaper import (
+from makebreak.systems.changing_contact.numerics.velocity_shaper import (
     N_MEMORY,
     REGIONS_MAX,
     expected,
@@ -46,7 +46,7 @@ from makebreak.systems.numerics.velocity_shaper import (
     pose_output,
     tick,
 )
-from makebreak.systems.velocity_shaper import (
+from makebreak.systems.changing_contact.velocity_shaper import (
     RegionConfig,
     SearchConfig,
     VelocityShaper,

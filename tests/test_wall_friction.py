@@ -32,7 +32,7 @@ from makebreak.scripts.experiments.wall_friction import (
 )
 from makebreak.scripts.session import Session
 from makebreak.systems.baselines.long_term_predictor import OneStepPredictor
-from makebreak.systems.numerics.baselines.long_term_predictor import (
+from makebreak.systems.baselines.numerics.long_term_predictor import (
     LongTermPredictor,
     TrainingBudget,
     predict_one_step,

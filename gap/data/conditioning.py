@@ -15,6 +15,11 @@ import numpy as np
 from makebreak.gap.data.clock import clock_period, even_clock
 from makebreak.gap.data.filters import FILTERED_SEC
 from makebreak.gap.findings import Finding
+from makebreak.gap.numerics.signal_noise import (
+    estimate_noise,
+    noise_and_jitter,
+    noise_beside,
+)
 from makebreak.gap.recording import (
     Channel,
     Episode,
@@ -23,11 +28,6 @@ from makebreak.gap.recording import (
     with_noise,
 )
 from makebreak.systems.numerics.filters import MovingAverage, filtered, subdivided
-from makebreak.systems.numerics.signal_noise import (
-    estimate_noise,
-    noise_and_jitter,
-    noise_beside,
-)
 from makebreak.systems.numerics.smoother import smooth_filtered
 
 # Blocks are no shorter than this, hold at least so many rows, and are so many times

@@ -37,11 +37,11 @@ from makebreak.scripts.lcm_loop import drive
 from makebreak.scripts.sweep import rate_text
 from makebreak.scripts.table import Table
 from makebreak.scripts.trials import run_many
-from makebreak.systems.impedance_controller import serial_chain_of
-from makebreak.systems.numerics.ball_state import P_BALL, P_TIP
-from makebreak.systems.numerics.contact_force import contact_forces
-from makebreak.systems.numerics.rolling_task import ROLL
-from makebreak.systems.numerics.serial_chain import tip_kinematics
+from makebreak.systems.arm.impedance_controller import serial_chain_of
+from makebreak.systems.arm.numerics.contact_force import contact_forces
+from makebreak.systems.arm.numerics.serial_chain import tip_kinematics
+from makebreak.systems.contact_mpc.numerics.ball_state import P_BALL, P_TIP
+from makebreak.systems.contact_mpc.numerics.rolling_task import ROLL
 
 SUMMARY = "a Panda rolls a ball that it models wrongly, along a circle (ACI-MPC VII-B)"
 Config = BallRollingConfig

@@ -36,9 +36,12 @@ from makebreak.models.scene import read_scene
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Log, Session, run_many
 from makebreak.scripts.table import Table
-from makebreak.systems.numerics.lcp import solve_lcp
-from makebreak.systems.numerics.lcs import simulate
-from makebreak.systems.numerics.residual_learner import measured_step, violation_loss
+from makebreak.systems.contact_mpc.numerics.lcp import solve_lcp
+from makebreak.systems.contact_mpc.numerics.lcs import simulate
+from makebreak.systems.contact_mpc.numerics.residual_learner import (
+    measured_step,
+    violation_loss,
+)
 
 SUMMARY = "a cart-pole finds soft walls that its model misplaces (ACI-MPC VII-A)"
 Config = CartpoleWallsConfig

@@ -41,8 +41,8 @@ from makebreak.scripts.contact_runs import rehearsed, simulate_motion
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
-from makebreak.systems.numerics.contact_anticipator import spread_along
-from makebreak.systems.numerics.contact_task import (
+from makebreak.systems.changing_contact.numerics.contact_anticipator import spread_along
+from makebreak.systems.changing_contact.numerics.contact_task import (
     DIRECTION,
     DONE,
     ENTER,
@@ -59,7 +59,7 @@ from makebreak.systems.numerics.contact_task import (
     TIME,
     ContactBelief,
 )
-from makebreak.systems.numerics.impact_score import impact, low_pass
+from makebreak.systems.changing_contact.numerics.impact_score import impact, low_pass
 
 SUMMARY = "three contacts, their places and approach speeds learned (CC 4.5.1, fig. 18)"
 Config = ContactLearningConfig

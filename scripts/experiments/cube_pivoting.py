@@ -31,9 +31,15 @@ from makebreak.scripts.session import Log, Session, run_many
 from makebreak.scripts.sweep import rate_text
 from makebreak.scripts.table import Table
 from makebreak.scripts.trials import setting_texts
-from makebreak.systems.c3_mpc import C3Status
-from makebreak.systems.numerics.pivot_target import LEFT, N_X, RIGHT, THETA, corners
-from makebreak.systems.pivot_target import PivotTargetConfig
+from makebreak.systems.contact_mpc.c3_mpc import C3Status
+from makebreak.systems.contact_mpc.numerics.pivot_target import (
+    LEFT,
+    N_X,
+    RIGHT,
+    THETA,
+    corners,
+)
+from makebreak.systems.contact_mpc.pivot_target import PivotTargetConfig
 
 SUMMARY = "two fingers tip a cube by 90 degrees, planned by C3+"
 Config = CubePivotingConfig

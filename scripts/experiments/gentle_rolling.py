@@ -32,16 +32,20 @@ from makebreak.models.scene import load_scene
 from makebreak.scripts.experiments import ball_rolling as rolling
 from makebreak.scripts.table import Table
 from makebreak.scripts.trials import run_many
-from makebreak.systems.impedance_controller import serial_chain_of
-from makebreak.systems.numerics.contact_force import contact_forces
-from makebreak.systems.numerics.contact_task import (
+from makebreak.systems.arm.impedance_controller import serial_chain_of
+from makebreak.systems.arm.numerics.contact_force import contact_forces
+from makebreak.systems.arm.numerics.serial_chain import tip_kinematics
+from makebreak.systems.changing_contact.numerics.contact_task import (
     IMPACT,
     MADE,
     PHASE_SEGMENT,
     POSITION,
 )
-from makebreak.systems.numerics.push_motion import BALL, TABLE, TABLE_SEGMENT
-from makebreak.systems.numerics.serial_chain import tip_kinematics
+from makebreak.systems.changing_contact.numerics.push_motion import (
+    BALL,
+    TABLE,
+    TABLE_SEGMENT,
+)
 
 SUMMARY = "all seven systems: a ball is rolled and touched gently"
 Config = GentleRollingConfig

@@ -65,7 +65,7 @@ from makebreak.scripts.planar_runs import (
 from makebreak.scripts.session import Log, Session, run_many
 from makebreak.scripts.table import Table
 from makebreak.systems.baselines.mrac import MracConfig
-from makebreak.systems.numerics.planar_impedance import persistence
+from makebreak.systems.planar.numerics.planar_impedance import persistence
 
 SUMMARY = "a circle while three springs pull; MRAC, AIC and BAC beside it (CC 4.2)"
 Config = MultiSpringConfig

@@ -41,8 +41,7 @@ from makebreak.scripts.contact_runs import rehearsed, simulate_motion
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
-from makebreak.systems.contact_view import ContactViewConfig
-from makebreak.systems.numerics.contact_task import (
+from makebreak.systems.changing_contact.numerics.contact_task import (
     BROKEN,
     DIRECTION,
     DONE,
@@ -53,7 +52,8 @@ from makebreak.systems.numerics.contact_task import (
     REGION,
     SPEED,
 )
-from makebreak.systems.numerics.impact_score import impact, low_pass
+from makebreak.systems.changing_contact.numerics.impact_score import impact, low_pass
+from makebreak.systems.views.contact_view import ContactViewConfig
 
 SUMMARY = "four impacts and a loss of contact, with and without handling (CC fig. 16)"
 Config = MultipleCollisionsConfig

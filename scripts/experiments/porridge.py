@@ -44,9 +44,9 @@ from makebreak.scripts.planar_runs import (
 )
 from makebreak.scripts.session import Log, Session, run_many
 from makebreak.scripts.table import Table
-from makebreak.systems.numerics.fixed_gmm import fit_mixture
-from makebreak.systems.numerics.igmm import regress
-from makebreak.systems.numerics.planar_impedance import features_of, persistence
+from makebreak.systems.baselines.numerics.fixed_gmm import fit_mixture
+from makebreak.systems.changing_contact.numerics.igmm import regress
+from makebreak.systems.planar.numerics.planar_impedance import features_of, persistence
 
 SUMMARY = "stirring porridge that thickens: fixed and incremental models (CC 4.1)"
 Config = PorridgeConfig

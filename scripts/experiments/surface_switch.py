@@ -42,7 +42,7 @@ from makebreak.scripts.contact_runs import rehearsed, simulate_motion
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
-from makebreak.systems.numerics.contact_task import (
+from makebreak.systems.changing_contact.numerics.contact_task import (
     CHANGE_TIME,
     COUNT,
     DONE,
@@ -54,7 +54,7 @@ from makebreak.systems.numerics.contact_task import (
     REGION,
     SETTLE,
 )
-from makebreak.systems.numerics.impact_score import low_pass
+from makebreak.systems.changing_contact.numerics.impact_score import low_pass
 
 SUMMARY = "a seam between surfaces, unknown, then anticipated (CC 4.5.2, fig. 19, 20)"
 Config = SurfaceSwitchConfig

@@ -46,7 +46,7 @@ from makebreak.models.scene import read_scene
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session, run_many
 from makebreak.scripts.table import Table
-from makebreak.systems.numerics.baselines.long_term_predictor import (
+from makebreak.systems.baselines.numerics.long_term_predictor import (
     Prediction,
     Trial,
     known,

@@ -1,1 +1,1 @@
-"""Other people's answers, to compare with."""
+"""Other people's answers, to compare with; and frozen, a system that does nothing."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from makebreak.systems.numerics.active_inference import MEMORY, tick
+from makebreak.systems.baselines.numerics.active_inference import MEMORY, tick
 from makebreak.systems.numerics.timing import timed
 
 HELD, AT_LIMIT = 1, 2  # Status, a sum.

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydrake.systems.framework import Context, LeafSystem
 
-from makebreak.systems.numerics.biomimetic import (
+from makebreak.systems.baselines.numerics.biomimetic import (
     LearnedGains,
     after_trial,
     force_command,

@@ -3,8 +3,10 @@
 from pydrake.common.value import Value
 from pydrake.systems.framework import LeafSystem
 
-from makebreak.systems.numerics.dynamics_residual import with_dynamics_residual
-from makebreak.systems.numerics.lcs import LCS
+from makebreak.systems.baselines.numerics.dynamics_residual import (
+    with_dynamics_residual,
+)
+from makebreak.systems.contact_mpc.numerics.lcs import LCS
 
 
 class DynamicsResidual(LeafSystem):

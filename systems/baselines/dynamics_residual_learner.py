@@ -8,11 +8,11 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import LeafSystem
 
-from makebreak.systems.numerics.dynamics_residual import (
+from makebreak.systems.baselines.numerics.dynamics_residual import (
     step_error,
     with_dynamics_residual,
 )
-from makebreak.systems.numerics.lcs import LCS
+from makebreak.systems.contact_mpc.numerics.lcs import LCS
 from makebreak.systems.numerics.timing import timed
 
 

@@ -5,7 +5,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from makebreak.systems.numerics.first_calls import first_call
-from makebreak.systems.numerics.planar_world import compensated
+from makebreak.systems.planar.numerics.planar_world import compensated
 
 
 class ForceFeedforward(LeafSystem):

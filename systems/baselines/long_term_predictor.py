@@ -4,7 +4,7 @@ ForwardModelBank is compared with."""
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from makebreak.systems.numerics.baselines.long_term_predictor import (
+from makebreak.systems.baselines.numerics.long_term_predictor import (
     LongTermPredictor,
     predict_one_step,
 )

@@ -1,0 +1,301 @@
+"""What a scene's one free body feels, as numbers for the fast stepping of it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydrake.geometry import Box, HalfSpace, Sphere
+from pydrake.math import RollPitchYaw
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, RigidBody
+from pydrake.systems.framework import DiagramBuilder
+
+from makebreak.gap.numerics.free_body import FreeBody
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.contact import DEFAULT_DISSIPATION, FADE_RATE
+from makebreak.models.effects.kind import Effect, check_parameters, full_name
+from makebreak.models.scene import LoadedScene, Scene, load_scene
+
+# Forces that have their own numbers here; what changes shapes, inertias and surfaces is
+# read off the plant.
+_FORCES = ("constant_force", "sinusoidal_force", "body_drag", "rolling_resistance")
+_SENSORS = ("length_scale", "sensor_delay", "sensor_bias", "clock_skew")
+_PLANT = ("object_size", "corner_radius", "object_mass", "object_com", "object_inertia",
+          "contact_friction", "contact_stiffness", "contact_dissipation",
+          "friction_patch", "plane_height", "plane_tilt", "gravity_tilt")  # fmt: skip
+
+
+class FreeBodyScene:
+    """A scene's one free body, read off its plant once; effects change its numbers
+    without another plant, which would take longer than all windows' steps.
+
+    Raises: ValueError where the scene has anything else that moves, shapes other than
+        a body of spheres on boxes and half-spaces, or effects of other kinds.
+    """
+
+    def __init__(self, scene: Scene):
+        self.scene = scene
+        for effect in scene.effects:
+            if effect.kind not in (*_FORCES, "length_scale", *_PLANT):
+                raise ValueError(f"effect {effect.kind} is not one of a free body")
+        if scene.friction_zones or scene.plant.contact_model != "point":
+            raise ValueError(
+                "friction zones and hydroelastic contact are Drake's alone"
+            )
+        loaded = load_scene(scene, DiagramBuilder())
+        plant = loaded.plant
+        bodies = [plant.get_body(i) for i in sorted(plant.GetFloatingBaseBodies())]
+        if len(bodies) != 1 or plant.num_velocities() != 6:
+            raise ValueError("expected one free body and nothing else that moves")
+        self.name = full_name(plant, bodies[0])
+        self._read(loaded, bodies[0])
+
+    def body(self, effects: Sequence[Effect] = ()) -> FreeBody:
+        """Its numbers with these effects added to the scene's own.
+
+        Raises: ValueError for effects that no body can have.
+        """
+        if not all(e.kind in _CHANGES or e.kind in _SENSORS for e in effects):
+            more = replace(self.scene, effects=[*self.scene.effects, *effects])
+            return FreeBodyScene(more).body()
+        now = _Numbers(**{k: np.array(v) for k, v in vars(self._numbers).items()})
+        for effect in sorted(effects, key=lambda e: KINDS[e.kind].rank):
+            check_parameters(effect, KINDS[effect.kind])
+            change = _CHANGES.get(effect.kind)
+            if change is None:
+                continue
+            at = [place.strip() for each in effect.at for place in each.split("~")]
+            at = [self._whole_name.get(place, place) for place in at]
+            mine = np.array([ground in at for ground in self._grounds], bool)
+            if self.name in at or mine.any():
+                change(now, effect.parameters, mine)
+        return FreeBody(
+            float(now.mass), now.com, now.inertia, self._gravity, now.spheres,
+            now.fixed, _pairs(now, self._guess) * self._touch[:, :, None],
+            now.rolling[None, :] * now.spheres[:, 3:], now.forces, now.drag,
+            fade=FADE_RATE, patches=now.patches,
+        )  # fmt: skip
+
+    def _read(self, loaded: LoadedScene, body: RigidBody) -> None:
+        plant, inspector = loaded.plant, loaded.scene_graph.model_inspector()
+        mine = plant.GetCollisionGeometriesForBody(body)
+        if not mine:
+            raise ValueError(f"{self.name} has nothing to touch with")
+        spheres = []
+        for g in mine:
+            shape = inspector.GetShape(g)
+            if not isinstance(shape, Sphere):
+                raise ValueError(f"a {type(shape).__name__} of a free body")
+            centre = inspector.GetPoseInFrame(g).translation()
+            spheres.append([*centre, shape.radius()])
+        context = plant.CreateDefaultContext()
+        fixed, others, origins = [], [], []
+        self._grounds: list[str] = []
+        self._whole_name = {self.name.split(".")[0]: self.name}
+        for i in range(plant.num_bodies()):
+            ground = plant.get_body(BodyIndex(i))
+            if not plant.IsAnchored(ground):
+                continue
+            X_WB = plant.EvalBodyPoseInWorld(context, ground)
+            for g in plant.GetCollisionGeometriesForBody(ground):
+                shape = inspector.GetShape(g)
+                X = X_WB @ inspector.GetPoseInFrame(g)
+                if isinstance(shape, Box):
+                    half = shape.size() / 2.0
+                elif isinstance(shape, HalfSpace):
+                    half = np.array([-1.0, 0.0, 0.0])
+                else:
+                    raise ValueError(f"a {type(shape).__name__} that is fixed")
+                fixed.append([*X.rotation().matrix().ravel(), *X.translation(), *half])
+                others.append(g)
+                origins.append(X_WB.translation())
+                name = full_name(plant, ground)
+                self._grounds.append(name)
+                self._whole_name[name.split(".")[0]] = name
+        M = body.default_spatial_inertia()
+        mass, com = M.get_mass(), np.array(M.get_com())
+        about = M.CalcRotationalInertia().CopyToFullMatrix3()
+        central = about - mass * (com @ com * np.eye(3) - np.outer(com, com))
+        self._gravity = np.array(plant.gravity_field().gravity_vector())
+        self._guess = default_stiffness(plant)
+        self._touch = np.array(
+            [[not inspector.CollisionFiltered(a, b) for b in others] for a in mine],
+            float,
+        ).reshape(len(mine), len(others))
+        self._numbers = _Numbers(
+            np.array(mass), com, central, np.array(spheres),
+            np.array(fixed).reshape(-1, 15), np.array(origins).reshape(-1, 3),
+            np.array([_surface(inspector, g) for g in mine]),
+            np.array([_surface(inspector, g) for g in others]).reshape(-1, 4),
+            np.zeros(len(others)), np.zeros((0, 6)), np.zeros(2), np.zeros((0, 6)),
+        )  # fmt: skip
+        for effect in loaded.effects:
+            if effect.kind in _FORCES:
+                at = [p.strip() for each in effect.at for p in each.split("~")]
+                at = [self._whole_name.get(place, place) for place in at]
+                on = np.array([ground in at for ground in self._grounds], bool)
+                if self.name in at:
+                    _CHANGES[effect.kind](self._numbers, effect.parameters, on)
+
+
+@dataclass(eq=False)
+class _Numbers:
+    """What effects change. own (n, 4), other (m, 4): stiffness (inf: Drake's guess),
+    dissipation, static and dynamic friction of each surface; rolling (m,)."""
+
+    mass: np.ndarray
+    com: np.ndarray
+    inertia: np.ndarray
+    spheres: np.ndarray
+    fixed: np.ndarray
+    origins: np.ndarray
+    own: np.ndarray
+    other: np.ndarray
+    rolling: np.ndarray
+    forces: np.ndarray
+    drag: np.ndarray
+    patches: np.ndarray
+
+
+def _surface(inspector, geometry) -> list[float]:
+    properties = inspector.GetProximityProperties(geometry)
+    k = properties.GetPropertyOrDefault("material", "point_contact_stiffness", np.inf)
+    d = properties.GetPropertyOrDefault(
+        "material", "hunt_crossley_dissipation", DEFAULT_DISSIPATION
+    )
+    mu = properties.GetProperty("material", "coulomb_friction")
+    return [k, d, mu.static_friction(), mu.dynamic_friction()]
+
+
+def _pairs(now: _Numbers, guess: float) -> np.ndarray:
+    """(n, m, 5) as Drake combines two surfaces."""
+    own, other = now.own[:, None], now.other[None, :]
+    k1 = np.where(np.isfinite(own[..., 0]), own[..., 0], guess)
+    k2 = np.where(np.isfinite(other[..., 0]), other[..., 0], guess)
+    mu = [
+        2.0 * own[..., i] * other[..., i]
+        / np.maximum(own[..., i] + other[..., i], 1e-300)
+        for i in (2, 3)
+    ]  # fmt: skip
+    d = (k2 * own[..., 1] + k1 * other[..., 1]) / (k1 + k2)
+    return np.stack([k1 * k2 / (k1 + k2), d, *mu, k1 / (k1 + k2)], axis=-1)
+
+
+# ----- Effects: the same as in models/effects, on these numbers.
+
+
+def _size(now: _Numbers, p, on) -> None:
+    scale = p["scale"] if "scale" in p else p["radius"] / now.spheres[0, 3]
+    now.spheres *= scale
+    now.com *= scale
+    now.inertia *= scale**2
+
+
+def _corners(now: _Numbers, p, on) -> None:
+    middle = now.spheres[:, :3].mean(axis=0)
+    half = abs(now.spheres[:, :3] - middle).mean(axis=0) + now.spheres[0, 3]
+    if len(now.spheres) != 8 or not 0.0 < p["radius"] <= half.min():
+        raise ValueError(f"corner_radius: radius is {p['radius']}, half size {half}")
+    sign = np.sign(now.spheres[:, :3] - middle)
+    now.spheres[:, :3] = middle + sign * (half - p["radius"])
+    now.spheres[:, 3] = p["radius"]
+
+
+def _mass(now: _Numbers, p, on) -> None:
+    now.inertia *= p["mass"] / now.mass
+    now.mass[...] = p["mass"]
+
+
+def _com(now: _Numbers, p, on) -> None:
+    for i, a in enumerate("xyz"):
+        now.com[i] = p.get(a, now.com[i])
+
+
+def _moments(now: _Numbers, p, on) -> None:
+    for i, a in enumerate(("ixx", "iyy", "izz")):
+        now.inertia[i, i] = p.get(a, now.inertia[i, i])
+    w = np.linalg.eigvalsh(now.inertia)
+    if not (w[0] > 0.0 and w[0] + w[1] >= w[2]):
+        raise ValueError(f"object_inertia: no body has {p}")
+
+
+def _friction(now: _Numbers, p, on) -> None:
+    mu, own = p["friction"], now.own[0, 3]
+    if 2.0 * own > mu or mu == 0.0:
+        now.other[on, 2:] = mu * own / (2.0 * own - mu) if mu > 0.0 else 0.0
+    else:
+        now.own[:, 2:] = now.other[on, 2:] = mu
+
+
+def _stiffness(now: _Numbers, p, on) -> None:
+    k, k1, k2 = p["stiffness"], now.other[on, 0][0], now.own[0, 0]
+    if np.isfinite([k1, k2]).all():
+        scale = k * (k1 + k2) / (k1 * k2)
+        now.own[:, 0] *= scale
+        now.other[on, 0] *= scale
+    else:
+        now.own[:, 0] = now.other[on, 0] = 2.0 * k
+
+
+def _dissipation(now: _Numbers, p, on) -> None:
+    d, (k2, d2) = p["dissipation"], now.own[0, :2]
+    k1 = now.other[on, 0][0]
+    d1 = -1.0
+    if np.isfinite([k1, k2]).all():
+        d1 = (d * (k1 + k2) - k1 * d2) / k2
+    if d1 < 0.0:
+        d1 = now.own[:, 1] = d
+    now.other[on, 1] = d1
+
+
+def _height(now: _Numbers, p, on) -> None:
+    now.fixed[on, 11] += p["height"]
+
+
+def _tilt(now: _Numbers, p, on) -> None:
+    R = RollPitchYaw(p["roll"], p["pitch"], 0.0).ToRotationMatrix().matrix()
+    for m in np.flatnonzero(on):
+        now.fixed[m, :9] = (R @ now.fixed[m, :9].reshape(3, 3)).ravel()
+        now.fixed[m, 9:12] = now.origins[m] + R @ (now.fixed[m, 9:12] - now.origins[m])
+
+
+def _rolling(now: _Numbers, p, on) -> None:
+    now.rolling[on] += p["coefficient"]
+
+
+def _force(now: _Numbers, p, on) -> None:
+    wave = [p.get("frequency", 0.0), p.get("phase", 0.0), 0.0]
+    now.forces = np.vstack([now.forces, [p["fx"], p["fy"], p["fz"], *wave]])
+
+
+def _drag(now: _Numbers, p, on) -> None:
+    now.drag += [p["linear"], p["angular"]]
+
+
+def _patch(now: _Numbers, p, on) -> None:
+    if not (p["x_min"] < p["x_max"] and p["y_min"] < p["y_max"]):
+        raise ValueError(f"friction_patch: the patch is empty: {p}")
+    sides = [p[k] for k in ("x_min", "x_max", "y_min", "y_max")]
+    more = [[m, p["friction"], *sides] for m in np.flatnonzero(on)]
+    now.patches = np.vstack([now.patches, *more])
+
+
+_CHANGES = {
+    "friction_patch": _patch,
+    "object_size": _size, "corner_radius": _corners, "object_mass": _mass,
+    "object_com": _com, "object_inertia": _moments, "contact_friction": _friction,
+    "contact_stiffness": _stiffness, "contact_dissipation": _dissipation,
+    "plane_height": _height, "plane_tilt": _tilt, "rolling_resistance": _rolling,
+    "constant_force": _force, "sinusoidal_force": _force, "body_drag": _drag,
+}  # fmt: skip
+
+
+def default_stiffness(plant: MultibodyPlant) -> float:
+    """What Drake gives shapes that have none [N/m]: at twice it in each of two, the
+    heaviest body would rest a millimetre deep."""
+    heaviest = max(
+        plant.get_body(BodyIndex(i)).default_mass()
+        for i in range(1, plant.num_bodies())
+    )
+    g = float(np.linalg.norm(plant.gravity_field().gravity_vector()))
+    return 2.0 * heaviest * g / 1e-3

@@ -1,0 +1,49 @@
+"""Torques for a robot that carries its own weight."""
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from makebreak.systems.arm.numerics.packed import packed
+from makebreak.systems.arm.numerics.serial_chain import SerialChain, chain_state
+
+
+def gravity_torque(chain, q) -> np.ndarray:
+    """(n,) [N m] that carry the arm at rest at q (n,) [rad]. Args: chain, packed."""
+    return chain_state(chain[0], q, np.zeros(len(q))).bias
+
+
+class GravityLeftOut(LeafSystem):
+    """tau - g(q): what is sent to a robot whose driver adds g(q) itself.
+
+    Inputs:  tau (n,) [N m]; q (n,) measured [rad].
+    Outputs: torque (n,) [N m]; zero before q was ever finite.
+    State: q (n,), the last finite one.
+    """
+
+    def __init__(self, chain: SerialChain):
+        super().__init__()
+        n = len(chain.mass)
+        self._chain = packed(chain)
+        self._tau = self.DeclareVectorInputPort("tau", n)
+        self._q = self.DeclareVectorInputPort("q", n)
+        self._last = self.DeclareDiscreteState(np.full(n, np.nan))
+        self.DeclarePerStepDiscreteUpdateEvent(self._keep)
+        self.DeclareVectorOutputPort("torque", n, self._calc)
+
+    def _keep(self, context: Context, discrete_state):
+        discrete_state.set_value(self._now(context))
+
+    def _now(self, context: Context) -> np.ndarray:
+        q = np.array(self._q.Eval(context))
+        return (
+            q if np.isfinite(q).all() else context.get_discrete_state_vector().value()
+        )
+
+    def _calc(self, context: Context, output: BasicVector):
+        # A sensor that fails for a moment does not take the arm's weight from the sum:
+        # the law itself goes on, and so does what is left out of it.
+        q = self._now(context)
+        torque = np.zeros(len(q))
+        if np.isfinite(q).all():
+            torque = self._tau.Eval(context) - gravity_torque(self._chain, q)
+        output.SetFromVector(torque)

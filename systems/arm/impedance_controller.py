@@ -1,0 +1,336 @@
+"""The arm's 1 kHz controller: a Cartesian spring and damper at the tool's tip."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import JointActuator, RevoluteJoint
+from pydrake.systems.framework import Context, LeafSystem
+
+from makebreak.systems.arm.numerics.impedance_controller import (
+    SPEED_FILTER_SEC,
+    ForceLaw,
+    Law,
+    memory_size,
+    packed_tick,
+    warm_up,
+)
+from makebreak.systems.arm.numerics.packed import packed
+from makebreak.systems.arm.numerics.serial_chain import SerialChain, chain_state
+from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.timing import timed
+
+# Of the tip's mass over the delay, that damping may be. It begins to swing by itself at
+# pi/2: a third of that leaves the spring a margin.
+DELAY_SHARE = 0.5
+
+
+@dataclass
+class ImpedanceConfig:
+    stiffness: list[float] = field(  # [N/m] x 3, [N m/rad] x 3
+        default_factory=lambda: [1000.0] * 3 + [50.0] * 3
+    )
+    damping: list[float] = field(  # [N s/m] x 3, [N m s/rad] x 3
+        default_factory=lambda: [400.0] * 3 + [15.0] * 3
+    )
+    control_orientation: bool = False  # False: position only, kept upright by posture.
+    # Spring and damper together push the tip no harder, whatever is in its way [N].
+    force_max: float = math.inf
+    posture_stiffness: float = 100.0  # [1/s2]
+    posture_damping: float = 20.0  # [1/s]
+    period_sec: float = 0.001
+    offset_sec: float = 0.0
+
+
+@dataclass
+class HybridConfig:
+    """Force control, and damping that goes with the stiffness."""
+
+    # 0: damping as given. Else 2 damping_ratio sqrt(K lambda_i) in place of the config
+    # one, lambda_i the tip's mass along each axis; a connected port `damping` wins.
+    damping_ratio: float = 0.0
+    integral_gain: float = 0.5  # k_i [1/s]
+    integral_max: float = 8.0  # [N]
+    normal_damping: float = 200.0  # D_n at least [N s/m].
+    closing_speed: float = 0.012  # [m/s] D_n is such that F_c alone moves no faster.
+    ramp_sec: float = 0.1  # From no force to its target.
+    release_sec: float = 0.12  # A direction that is dropped fades so long.
+
+
+class ImpedanceController(LeafSystem):
+    """Joint torques that make the tool's tip E a spring and damper, and let it press
+    along up to two directions n.
+
+        F = S (K (x_d - x) + D (v_d - v)) + f_fc + f_ff + Lambda (S a_d - Jdot qdot)
+        S = I - sum n n',  f_fc = sum n (F_c + k_i integral (F_c - F) dt - D_n n'v)
+        tau = J' F + bias + posture in the dynamically consistent null space of J
+
+    K (x_d - x) + D (v_d - v) is shortened to force_max. Two directions that are not
+    orthogonal are made so, the first one kept. F_c rises in
+    ramp_sec; D_n >= F_c/closing_speed bounds the speed of a lost contact's return. The
+    integral waits while less than 0.5 N is felt, and goes on where the next segment has
+    (nearly) the same n. A dropped n fades over release_sec, and stiffness along it
+    returns as it fades.
+
+    With `control_orientation` False the task is the tip's position; the posture keeps
+    the tool as upright, and turned, as at the control plant's default positions. With
+    True it is the full pose.
+    tau is the motors' torque: the mass matrix contains the rotors' inertia.
+
+    tau never leaves the effort limits of the control plant and never changes by more
+    than torque_rate_max x period. If an entry of q or v is NaN, tau goes, at that rate,
+    to what carries the arm and slows it down, qdd = -20/s qd: joints that are still
+    measured by what is measured, the others by their last good q and v, predicted on.
+    If the reference is NaN (or a stiffness or damping is negative), the last good pose
+    is held at rest. `status` says so.
+
+    Inputs:  q (n,) [rad], v (n,) [rad/s]; x_desired (19,) = [p_WE 3, quaternion wxyz 4,
+             v 3, w 3, a 3, alpha 3] of E in the world; optional stiffness (6,),
+             damping (6,) in place of the config's; optional wrench_feedforward (6,),
+             force first [N], [N m] (its torque acts only if orientation is controlled);
+             optional force_directions (6,), two rows n, unit vectors into the surface,
+             zero for none, force_targets (2,) F_c [N], wrench_measured (6,) on the tool
+             [N], [N m]: without it, or while it is NaN, F_c is fed forward alone;
+             optional damping_stiffness (6,): with a damping ratio, the stiffness that
+             the damping belongs to, where that is not the stiffness itself; optional
+             delay (1,) [s] from a reading to when its torque acts: damping d of a mass
+             m that is told so late is stable while d delay < pi/2 m, so the tip's is
+             bounded to DELAY_SHARE m / delay.
+    Outputs: tau (n,) [N m]; status (1,), a sum: 1 reference held, 2 sensors held,
+             4 effort limit reached, 8 torque rate limit reached, 16 wrench not used.
+
+    Args: plant, finalized, the arm with its tool alone, never the simulated one;
+        tip_frame, name of E; torque_rate_max [N m/s]; hybrid, of force and damping.
+    Raises: ValueError for a plant that is not one chain of revolute joints with a motor
+        each, and for gains that are negative.
+    """
+
+    def __init__(
+        self,
+        config: ImpedanceConfig,
+        plant: MultibodyPlant,
+        tip_frame: str = "tip",
+        torque_rate_max: float = 1000.0,
+        hybrid: HybridConfig | None = None,
+    ):
+        super().__init__()
+        hybrid = HybridConfig() if hybrid is None else hybrid
+        for name, number in vars(hybrid).items():
+            least = name in ("closing_speed", "ramp_sec", "release_sec")
+            if not (number > 0.0 if least else number >= 0.0):
+                raise ValueError(
+                    f"{name} is {number}, expected {'> 0' if least else '0 or more'}"
+                )
+        for name in ("stiffness", "damping"):
+            gains = np.asarray(getattr(config, name), dtype=float)
+            if gains.shape != (6,) or not np.all(gains >= 0.0):
+                raise ValueError(f"{name} is {gains}, expected 6 numbers of 0 or more")
+        for name in ("posture_stiffness", "posture_damping"):
+            if not getattr(config, name) >= 0.0:
+                raise ValueError(f"{name} is {getattr(config, name)}, expected >= 0")
+        for name, number in (
+            ("force_max", config.force_max),
+            ("period_sec", config.period_sec),
+            ("torque_rate_max", torque_rate_max),
+        ):
+            if not number > 0.0:
+                raise ValueError(f"{name} is {number}, expected > 0")
+        self._chain = serial_chain_of(plant, tip_frame)
+        self._tau_size = plant.num_positions()
+        context = plant.CreateDefaultContext()
+        n = plant.num_positions()
+        q_nominal = plant.GetPositions(context)
+        frame = plant.GetFrameByName(tip_frame)
+        self._law = Law(
+            effort_max=plant.GetEffortUpperLimits()[_actuator_order(plant)],
+            step_max=np.full(n, torque_rate_max * config.period_sec),
+            q_lower=plant.GetPositionLowerLimits(),
+            q_upper=plant.GetPositionUpperLimits(),
+            q_nominal=q_nominal,
+            R_upright=np.ascontiguousarray(
+                frame.CalcPoseInWorld(context).rotation().matrix()
+            ),
+            stiffness=np.array(config.stiffness, dtype=float),
+            damping=np.array(config.damping, dtype=float),
+            force_max=float(config.force_max),
+            posture_stiffness=float(config.posture_stiffness),
+            posture_damping=float(config.posture_damping),
+            posture_every=max(1, round(0.012 / config.period_sec)),
+            control_orientation=bool(config.control_orientation),
+            period=float(config.period_sec),
+            force=ForceLaw(
+                integral_gain=float(hybrid.integral_gain),
+                integral_max=float(hybrid.integral_max),
+                normal_damping=float(hybrid.normal_damping),
+                closing_speed=float(hybrid.closing_speed),
+                ramp_sec=float(hybrid.ramp_sec),
+                release_sec=float(hybrid.release_sec),
+                speed_keep=float(np.exp(-config.period_sec / SPEED_FILTER_SEC)),
+            ),
+        )
+        self._ratio = float(hybrid.damping_ratio)
+        self._packed = packed(self._chain), packed(self._law)
+        first_call(warm_up, *self._packed)
+        self._q = self.DeclareVectorInputPort("q", n)
+        self._v = self.DeclareVectorInputPort("v", n)
+        self._x_desired = self.DeclareVectorInputPort("x_desired", 19)
+        self._stiffness = self.DeclareVectorInputPort("stiffness", 6)
+        self._damping = self.DeclareVectorInputPort("damping", 6)
+        self._wrench = self.DeclareVectorInputPort("wrench_feedforward", 6)
+        self._directions = self.DeclareVectorInputPort("force_directions", 6)
+        self._targets = self.DeclareVectorInputPort("force_targets", 2)
+        self._measured = self.DeclareVectorInputPort("wrench_measured", 6)
+        self._damped = self.DeclareVectorInputPort("damping_stiffness", 6)
+        self._delay = self.DeclareVectorInputPort("delay", 1)
+        at_rest = chain_state(self._packed[0][0], q_nominal, np.zeros(n))
+        mobility = at_rest.J[:3] @ np.linalg.solve(at_rest.M, at_rest.J[:3].T)
+        self._mass = 1.0 / np.diag(mobility)  # Of the tip along each axis [kg].
+        # The first torque carries the arm at its nominal position.
+        carrying = chain_state(self._packed[0][0], q_nominal, np.zeros(n)).bias
+        self._tau = self.DeclareDiscreteState(carrying)
+        self._status = self.DeclareDiscreteState(1)
+        self._memory = self.DeclareDiscreteState(memory_size(n))
+        self._none, self._no_targets = np.zeros(6), np.zeros(2)
+        self.DeclareStateOutputPort("tau", self._tau)
+        self.DeclareStateOutputPort("status", self._status)
+        self.DeclarePeriodicDiscreteUpdateEvent(
+            config.period_sec, config.offset_sec, self._update
+        )
+
+    def start_at(self, context: Context, q) -> None:
+        """The torque carries the arm at q (n,) [rad], and nothing is remembered."""
+        n = self._tau_size
+        q = np.array(q, dtype=float)
+        carrying = chain_state(self._packed[0][0], q, np.zeros(n)).bias
+        context.SetDiscreteState(self._tau, carrying)
+        context.SetDiscreteState(self._memory, np.zeros(memory_size(n)))
+
+    @timed
+    def _update(self, context: Context, discrete_state):
+        stiffness = self._or(self._stiffness, context, self._law.stiffness)
+        ratio = self._ratio
+        if self._damping.HasValue(context):
+            damping, ratio = self._damping.Eval(context), 0.0
+        elif ratio > 0.0:
+            damping = self._or(self._damped, context, stiffness)
+        else:
+            damping = self._law.damping
+        if ratio == 0.0 and self._delay.HasValue(context):
+            delay = float(self._delay.Eval(context)[0])
+            if delay > self._law.period:  # Less is what every tick has.
+                damping = np.array(damping)
+                most = DELAY_SHARE * self._mass / delay
+                damping[:3] = np.minimum(damping[:3], most)
+        directions, targets = self._none, self._no_targets
+        measured = self._none
+        if self._directions.HasValue(context):  # Else there is no force to control.
+            directions = self._directions.Eval(context)
+            targets = self._or(self._targets, context, self._no_targets)
+            measured = self._or(self._measured, context, self._none)
+        tau, status, memory = packed_tick(
+            *self._packed,
+            context.get_discrete_state(self._tau).value(),
+            context.get_discrete_state(self._memory).value(),
+            self._q.Eval(context),
+            self._v.Eval(context),
+            self._x_desired.Eval(context),
+            stiffness,
+            damping,
+            ratio,
+            self._or(self._wrench, context, self._none),
+            directions,
+            targets,
+            measured,
+        )
+        discrete_state.set_value(self._tau, tau)
+        discrete_state.set_value(self._status, [status])
+        discrete_state.set_value(self._memory, memory)
+
+    def _or(self, port, context, otherwise):
+        return port.Eval(context) if port.HasValue(context) else otherwise
+
+
+def _actuator_order(plant: MultibodyPlant) -> list[int]:
+    """Index of each joint's actuator, in the order of the joints' positions."""
+    by_start = {
+        actuator.joint().position_start(): i
+        for i, actuator in enumerate(_motors(plant))
+    }
+    return [by_start[i] for i in range(plant.num_positions())]
+
+
+def _motors(plant: MultibodyPlant) -> list[JointActuator]:
+    return [
+        plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()
+    ]
+
+
+def serial_chain_of(plant: MultibodyPlant, tip_frame: str) -> SerialChain:
+    """The constants of a plant that is one chain of revolute joints, a motor each.
+
+    Args: plant, finalized; tip_frame, name of a frame on the last link or on what is
+        welded to it.
+    Raises: ValueError if it is anything else.
+    """
+    moving = [
+        joint
+        for joint in (plant.get_joint(i) for i in plant.GetJointIndices())
+        if joint.num_velocities() > 0
+    ]
+    moving.sort(key=lambda joint: joint.position_start())
+    motors = _motors(plant)
+    motor_of = {motor.joint().index(): motor for motor in motors}
+    welded_to = [plant.GetBodiesWeldedTo(joint.child_body()) for joint in moving]
+    before = [plant.GetBodiesWeldedTo(plant.world_body()), *welded_to[:-1]]
+    for joint, parents in zip(moving, before, strict=True):
+        name = joint.name()
+        if not isinstance(joint, RevoluteJoint):
+            raise ValueError(f"joint {name!r} is not revolute; the law needs an arm")
+        if joint.parent_body() not in parents:
+            raise ValueError(f"joint {name!r} does not continue the chain before it")
+        if joint.index() not in motor_of:
+            raise ValueError(f"joint {name!r} has no actuator")
+        if joint.default_damping() != 0.0:
+            raise ValueError(f"joint {name!r} has damping; the law does not know it")
+    if not moving:
+        raise ValueError("the control plant has no joint that moves")
+    if not plant.HasFrameNamed(tip_frame):
+        raise ValueError(f"the control plant has no frame {tip_frame!r}")
+    tip = plant.GetFrameByName(tip_frame)
+    if tip.body() not in welded_to[-1]:
+        raise ValueError(f"frame {tip_frame!r} is not on the last link")
+
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, np.zeros(plant.num_positions()))
+    X_WJ = [joint.frame_on_child().CalcPoseInWorld(context) for joint in moving]
+    R_PJ, p_PJ, mass, p_com, I_com = [], [], [], [], []
+    for i, (joint, bodies) in enumerate(zip(moving, welded_to, strict=True)):
+        X_PJ = X_WJ[0] if i == 0 else X_WJ[i - 1].inverse() @ X_WJ[i]
+        R_PJ.append(X_PJ.rotation().matrix())
+        p_PJ.append(X_PJ.translation())
+        inertia = plant.CalcSpatialInertia(
+            context, joint.frame_on_child(), [body.index() for body in bodies]
+        )
+        mass.append(inertia.get_mass())
+        p_com.append(inertia.get_com())
+        about_com = inertia.Shift(inertia.get_com()).CalcRotationalInertia()
+        I_com.append(about_com.CopyToFullMatrix3())
+    X_LE = X_WJ[-1].inverse() @ tip.CalcPoseInWorld(context)
+    rotor = [
+        motor_of[joint.index()].default_rotor_inertia()
+        * motor_of[joint.index()].default_gear_ratio() ** 2
+        for joint in moving
+    ]
+    return SerialChain(
+        R_PJ=np.array(R_PJ),
+        p_PJ=np.array(p_PJ),
+        axis=np.array([joint.revolute_axis() for joint in moving]),
+        mass=np.array(mass),
+        p_com=np.array(p_com),
+        I_com=np.array(I_com),
+        rotor=np.array(rotor),
+        gravity=np.array(plant.gravity_field().gravity_vector(), dtype=float),
+        R_LE=np.ascontiguousarray(X_LE.rotation().matrix()),
+        p_LE=np.array(X_LE.translation()),
+    )

@@ -1,0 +1,514 @@
+"""Cartesian impedance of a redundant arm: one tick, from measurement to joint torque.
+
+    F = S (K (x_d - x) + D (v_d - v)) + f_fc + f_ff + Lambda (S a_d - Jdot qdot)
+    tau = J' F + bias + N' M (k_q (q_n - q) + k_v (v_n - v))
+    N' = I - J' Lambda J inv(M)
+    S = I - sum n n',  f_fc = sum n (F_c + k_i integral (F_c - F) dt - D_n n' v)
+
+with the directions n along which force, not motion, is controlled: none, one or two.
+M is the mass matrix with the motors' rotors, so tau is a motor's torque; Lambda is the
+inverse of J inv(M) J'. Stiffness K and damping D are plain N/m and N s/m, not scaled by
+Lambda, which multiplies the reference's acceleration alone. The posture q_n follows the
+tip with the tool upright; v_n is the joint velocity that does so.
+
+Source: Khatib, "A unified approach for motion and force control of robot manipulators:
+the operational space formulation" (1987), sections III and V; CC eq. 1 and 4a.
+"""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from makebreak.systems.arm.numerics.cholesky import (
+    cholesky,
+    cholesky_solve,
+    forward_solve,
+)
+from makebreak.systems.arm.numerics.serial_chain import chain_state, tip_kinematics
+
+# Status bits.
+REFERENCE_HELD = 1
+SENSORS_HELD = 2
+EFFORT_LIMITED = 4
+RATE_LIMITED = 8
+FORCE_SENSOR_HELD = 16
+
+IK_DAMPING = 0.02  # [m] and [rad]: of the posture's inverse kinematics.
+IK_STEP_MAX = 0.05  # [rad] a joint of the posture moves in one step.
+LIMIT_MARGIN = 0.03  # [rad] that the posture keeps from the joint limits.
+
+# While an encoder gives NaN. The rate is what 1 ms and an encoder's noise allow.
+HOLD_DAMPING = 20.0  # [1/s] at which the arm is slowed down.
+HOLD_SPEED_MAX = 10.0  # [rad/s] A joint was not faster than that, whatever was read.
+HOLD_GAIN = 0.1  # Share of a good encoder's surprise that corrects its joint's speed.
+
+# Of an arm without a spare joint: part of a direction of the task that is its own,
+# below which a pose counts as singular. The tip's inertia along it is the inverse of
+# that part times what it would be alone, and what Lambda makes of Jdot qdot grows so
+# much that it throws a stretching arm about. There it fades, and the spring and the
+# damper, which need no Lambda, remain.
+SINGULAR = 0.1
+
+CONTACT_FORCE_MIN = 0.5  # [N] Below it the integral of the force waits.
+SAME_DIRECTION = 0.98  # Cosine above which a direction goes on as the one before.
+ENGAGE_SEC = 0.02  # In which stiffness along a new direction fades.
+# Directions under force control, those being released included: [n (3), force asked
+# for now, integral, weight 0 to 1, D_n, 1 while asked for, n'v filtered].
+N_SLOTS, SLOT = 4, 9
+LEVEL, INTEGRAL, WEIGHT, DAMPING, ACTIVE, SPEED = 3, 4, 5, 6, 7, 8
+# Of n'v [s]. D_n is large, and the encoders' velocity is noisy: without it the noise
+# alone reaches the torque's rate limit. A contact's own frequency is below 20 Hz.
+SPEED_FILTER_SEC = 0.003
+
+
+class ForceLaw(NamedTuple):
+    """Constants of force control."""
+
+    integral_gain: float  # k_i [1/s]
+    integral_max: float  # [N] of either sign.
+    normal_damping: float  # D_n at least [N s/m].
+    closing_speed: float  # [m/s] at which F_c alone would close a gap: F_c / D_n.
+    ramp_sec: float  # In which the force rises to its target.
+    release_sec: float  # In which a direction that is dropped fades.
+    speed_keep: float  # Of the filtered n'v, per tick.
+
+
+class Law(NamedTuple):
+    """Constants of the control law for n joints."""
+
+    effort_max: np.ndarray  # (n,) [N m]
+    step_max: np.ndarray  # (n,) change of torque in one tick [N m].
+    q_lower: np.ndarray  # (n,) [rad]
+    q_upper: np.ndarray  # (n,) [rad]
+    q_nominal: np.ndarray  # (n,) posture where the task leaves a choice [rad].
+    R_upright: np.ndarray  # (3, 3) orientation of the tip frame that counts as upright.
+    stiffness: np.ndarray  # (6,) [N/m] x 3, [N m/rad] x 3
+    damping: np.ndarray  # (6,) [N s/m] x 3, [N m s/rad] x 3
+    force_max: float  # Of spring and damper together [N].
+    posture_stiffness: float  # k_q [1/s2]
+    posture_damping: float  # k_v [1/s]
+    posture_every: int  # Ticks between two steps of the posture.
+    control_orientation: bool  # The task is the full pose, not the position alone.
+    period: float  # Of a tick [s].
+    force: ForceLaw
+
+
+def memory_size(n: int) -> int:
+    """[q_n, last good q, last good pose (7), ticks, has a good pose, has a good q,
+    last good force directions (6) and targets (2), slots (N_SLOTS x SLOT), last v].
+
+    While a sensor is held, the last good q and v are predicted on (held_motion)."""
+    return 3 * n + 18 + N_SLOTS * SLOT
+
+
+@numba.njit(cache=True)
+def rotation_of(quaternion):
+    """(3, 3) of a quaternion wxyz of any length but 0."""
+    w, x, y, z = quaternion / np.sqrt(np.sum(quaternion**2))
+    R = np.empty((3, 3))
+    R[0, 0], R[0, 1], R[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 0.0
+    R[0, 2] = 2 * (x * z + w * y)
+    R[1, 0], R[1, 1], R[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 0.0
+    R[1, 2] = 2 * (y * z - w * x)
+    R[2, 0], R[2, 1], R[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 0.0
+    R[2, 2] = 1 - 2 * (x * x + y * y)
+    return R
+
+
+@numba.njit(cache=True)
+def quaternion_of(R):
+    """wxyz of a rotation (3, 3), w >= 0."""
+    q = np.empty(4)
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    best = max(trace, R[0, 0], R[1, 1], R[2, 2])
+    if best == trace:
+        q[0] = 1.0 + trace
+        q[1], q[2], q[3] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    else:
+        i = 0 if best == R[0, 0] else (1 if best == R[1, 1] else 2)
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[0] = R[k, j] - R[j, k]
+        q[1 + i] = 1.0 + R[i, i] - R[j, j] - R[k, k]
+        q[1 + j], q[1 + k] = R[i, j] + R[j, i], R[i, k] + R[k, i]
+    q /= np.sqrt(np.sum(q**2))
+    return q if q[0] >= 0.0 else -q
+
+
+@numba.njit(cache=True)
+def rotation_error(R_d, R):
+    """Rotation vector (3,) [rad], world axes, that takes R to R_d."""
+    E = R_d @ R.T
+    q = quaternion_of(E)
+    sine = np.sqrt(q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    if sine < 1e-9:
+        return 2.0 * q[1:]
+    return (2.0 * np.arctan2(sine, q[0]) / sine) * q[1:]
+
+
+@numba.njit(cache=True)
+def posture_step(chain, law, q_n, p_tip):
+    """q_n (n,) one damped step nearer to: tip at p_tip (3,), upright, else nominal."""
+    n = q_n.shape[0]
+    p, R, J = tip_kinematics(chain, q_n)
+    pull = 0.05 * (law.q_nominal - q_n)
+    error = np.empty(6)
+    error[:3] = p_tip - p
+    error[3:] = rotation_error(law.R_upright, R)
+    step = pull + _damped_inverse(J, error - J @ pull)
+    out = np.empty(n)
+    for i in range(n):
+        change = min(max(step[i], -IK_STEP_MAX), IK_STEP_MAX)
+        lower, upper = law.q_lower[i] + LIMIT_MARGIN, law.q_upper[i] - LIMIT_MARGIN
+        out[i] = min(max(q_n[i] + change, lower), upper)
+    return out
+
+
+@numba.njit(cache=True)
+def _damped_inverse(J, y):
+    """J' inv(J J' + damping^2 I) y: joint motion (n,) for a tip motion y (6,)."""
+    A = J @ J.T
+    for i in range(6):
+        A[i, i] += IK_DAMPING**2
+    L = np.zeros((6, 6))
+    cholesky(L, A)
+    x = y.copy()
+    cholesky_solve(L, x)
+    return J.T @ x
+
+
+@numba.njit(cache=True)
+def _orthonormal(directions):
+    """Two rows (6,) as orthonormal rows (2, 3); a zero row stays zero, and a second one
+    that (nearly) repeats the first becomes zero."""
+    out = np.zeros((2, 3))
+    for k in range(2):
+        row = directions[3 * k : 3 * k + 3].copy()
+        length = np.sqrt(np.sum(row**2))
+        if length < 1e-6:
+            continue
+        row /= length
+        if k == 1:
+            row -= np.sum(row * out[0]) * out[0]
+            length = np.sqrt(np.sum(row**2))
+            if length < 0.1:
+                continue
+            row /= length
+        out[k] = row
+    return out
+
+
+@numba.njit(cache=True)
+def force_control(law, slots, directions, targets, measured):
+    """One tick of force control.
+
+    Args: slots (N_SLOTS, SLOT), changed in place. directions (6,): two rows n, zero for
+        none; targets (2,) [N]; measured (6,) wrench on the tool [N]: all finite.
+    Returns: nothing; the force that is added along a slot's n is its
+        weight (level + integral - D_n n'v), at least 0 at rest.
+    """
+    force = law.force
+    rows = _orthonormal(directions)
+    slots[:, ACTIVE] = 0.0
+    for k in range(2):
+        n = rows[k]
+        if np.sum(n**2) == 0.0:
+            continue
+        best, likeness = -1, SAME_DIRECTION
+        for j in range(N_SLOTS):
+            alike = np.sum(slots[j, :3] * n)
+            if slots[j, WEIGHT] > 0.0 and slots[j, ACTIVE] == 0.0 and alike > likeness:
+                best, likeness = j, alike
+        if best < 0:  # A direction that was not there: in the slot that is least used.
+            least = np.inf
+            for j in range(N_SLOTS):
+                if slots[j, ACTIVE] == 0.0 and slots[j, WEIGHT] < least:
+                    best, least = j, slots[j, WEIGHT]
+            slots[best] = 0.0
+        slot = slots[best]
+        slot[:3] = n
+        slot[ACTIVE] = 1.0
+        target = max(targets[k], 0.0)
+        # In proportion, so that the ramp takes the same time whatever the force.
+        step = max(target, slot[LEVEL]) * law.period / force.ramp_sec
+        slot[LEVEL] += min(max(target - slot[LEVEL], -step), step)
+        slot[DAMPING] = max(target / force.closing_speed, force.normal_damping)
+        felt = -np.sum(n * measured[:3])
+        if felt >= CONTACT_FORCE_MIN:
+            most = force.integral_max
+            grown = slot[INTEGRAL] + (
+                force.integral_gain * (slot[LEVEL] - felt) * law.period
+            )
+            slot[INTEGRAL] = min(max(grown, -most), most)
+    for j in range(N_SLOTS):
+        slot = slots[j]
+        if slot[ACTIVE] > 0.0:
+            slot[WEIGHT] = min(slot[WEIGHT] + law.period / ENGAGE_SEC, 1.0)
+        elif slot[WEIGHT] > 0.0:
+            slot[WEIGHT] = max(slot[WEIGHT] - law.period / force.release_sec, 0.0)
+
+
+@numba.njit(cache=True)
+def impedance_torque(
+    chain, law, q, v, q_n, x_d, R_d, stiffness, damping, ratio, wrench, slots
+):
+    """The law, without limits.
+
+    Args: chain, law: constants. q, v, q_n (n,) [rad], [rad/s]. x_d (19,) =
+        [p, quaternion (unused), v, w, a, alpha] of the tip in the world; R_d (3, 3)
+        its orientation. stiffness, damping (6,). ratio: 0, or the damping ratio, and
+        then `damping` is the stiffness that it belongs to: along each axis D becomes
+        2 ratio sqrt(damping lambda), lambda = 1/(J inv(M) J')_ii. wrench (6,) fed
+        forward, force first [N], [N m]. slots (N_SLOTS, SLOT) of force_control; their
+        filtered speeds are brought up to date.
+    Returns: tau (n,) [N m] and the tip's position p_WE (3,) [m].
+    """
+    n = q.shape[0]
+    s = chain_state(chain, q, v)
+    m = 6 if law.control_orientation else 3
+    J = np.ascontiguousarray(s.J[:m])
+    L = np.zeros((n, n))
+    cholesky(L, s.M)  # Positive definite by construction.
+    X = np.ascontiguousarray(J.T)
+    column = np.empty(n)
+    for j in range(m):
+        column[:] = X[:, j]
+        forward_solve(L, column)
+        X[:, j] = column
+    mobility = X.T @ X  # J inv(M) J'
+    largest = 0.0
+    for i in range(m):
+        largest = max(largest, mobility[i, i])
+    for i in range(m):
+        mobility[i, i] += 1e-9 * largest  # Near a singular pose Lambda stays finite.
+    L_task = np.zeros((m, m))
+    cholesky(L_task, mobility)
+    # A row's pivot over its diagonal: the part of it that is not along the rows before.
+    part = 1.0
+    for i in range(m):
+        part = min(part, L_task[i, i] ** 2 / mobility[i, i])
+
+    if ratio > 0.0:
+        damping = damping.copy()
+        for i in range(m):
+            damping[i] = 2.0 * ratio * np.sqrt(damping[i] / mobility[i, i])
+    twist = J @ v
+    F = np.empty(m)
+    F[:3] = stiffness[:3] * (x_d[:3] - s.p_WE) + damping[:3] * (x_d[7:10] - twist[:3])
+    pushing = np.sqrt(np.sum(F[:3] ** 2))
+    if pushing > law.force_max:
+        F[:3] *= law.force_max / pushing
+    a_ref = np.empty(m)
+    a_ref[:3] = x_d[13:16]
+    if m == 6:
+        # Explicit damping d is stable while d period < inertia; the wrist's may be
+        # small, so stiffness and damping are lessened together where it is.
+        turning = mobility[3, 3] + mobility[4, 4] + mobility[5, 5]
+        most = max(damping[3], damping[4], damping[5]) * turning * law.period
+        scale = 1.0 if most < 0.5 else 0.5 / most
+        turn = rotation_error(R_d, s.R_WE)
+        F[3:] = scale * (stiffness[3:] * turn + damping[3:] * (x_d[10:13] - twist[3:]))
+        a_ref[3:] = x_d[16:19]
+    for j in range(slots.shape[0]):
+        weight = slots[j, WEIGHT]
+        if weight > 0.0:  # Of motion, the part across n; along n, the push.
+            n_j = slots[j, :3]
+            v_n = np.sum(n_j * twist[:3])
+            slots[j, SPEED] = v_n + law.force.speed_keep * (slots[j, SPEED] - v_n)
+            push = max(slots[j, LEVEL] + slots[j, INTEGRAL], 0.0)
+            push -= slots[j, DAMPING] * slots[j, SPEED]
+            F[:3] += weight * (push - np.sum(n_j * F[:3])) * n_j
+            a_ref[:3] -= weight * np.sum(n_j * a_ref[:3]) * n_j
+    F += wrench[:m]
+
+    # Posture: the acceleration it asks for, less the part that the tip would feel.
+    follow = np.zeros(6)
+    follow[:m] = twist
+    v_n = _damped_inverse(s.J, follow)
+    qdd = law.posture_stiffness * (q_n - q) + law.posture_damping * (v_n - v)
+    if n <= m:  # The task leaves no choice: the posture would show in Lambda's errors.
+        qdd[:] = 0.0
+    inertial = a_ref - s.bias_a[:m] - J @ qdd
+    cholesky_solve(L_task, inertial)
+    if n <= m and part < SINGULAR:
+        inertial *= (part / SINGULAR) ** 2
+    return J.T @ (F + inertial) + s.bias + s.M @ qdd, s.p_WE
+
+
+@numba.njit(cache=True)
+def held_motion(q, v, q_last, v_last, period):
+    """Where the joints are while some encoders give NaN: predicted with the damping of
+    HOLD_DAMPING that the arm is under, corrected by what is still measured.
+
+    Args: q, v (n,) measured, NaN where nothing is; q_last, v_last (n,) of the tick
+        before, [rad], [rad/s]; period [s].
+    Returns: q (n,), v (n,), finite.
+    """
+    n = q.shape[0]
+    q_now, v_now = np.empty(n), np.empty(n)
+    for i in range(n):
+        speed = v_last[i] * np.exp(-HOLD_DAMPING * period)
+        if np.isfinite(v[i]):
+            speed = v[i]
+        speed = min(max(speed, -HOLD_SPEED_MAX), HOLD_SPEED_MAX)
+        q_now[i] = q_last[i] + period * speed
+        if np.isfinite(q[i]):
+            if not np.isfinite(v[i]):
+                speed += HOLD_GAIN * (q[i] - q_now[i]) / period
+                speed = min(max(speed, -HOLD_SPEED_MAX), HOLD_SPEED_MAX)
+            q_now[i] = q[i]
+        v_now[i] = speed
+    return q_now, v_now
+
+
+@numba.njit(cache=True)
+def tick(
+    chain,
+    law,
+    tau,
+    memory,
+    q,
+    v,
+    x_d,
+    stiffness,
+    damping,
+    ratio,
+    wrench,
+    directions,
+    targets,
+    measured,
+):
+    """One tick of the controller.
+
+    Args: tau (n,) of the last tick; memory as memory_size says; the rest as in
+        impedance_torque and force_control, measured or received: anything may be NaN.
+    Returns: tau (n,) within all limits, status (bits), memory.
+    """
+    n = q.shape[0]
+    memory = memory.copy()
+    status = 0
+    count = memory[2 * n + 7]
+    has_pose, has_q = memory[2 * n + 8] > 0.0, memory[2 * n + 9] > 0.0
+    sensed = np.all(np.isfinite(q)) and np.all(np.isfinite(v))
+    if sensed:
+        if not has_q:
+            memory[:n] = q
+        memory[n : 2 * n] = q
+        memory[-n:] = v
+        memory[2 * n + 9] = 1.0
+        q_now, v_now = q, v
+    else:
+        status |= SENSORS_HELD
+        if has_q:
+            q_now, v_now = held_motion(q, v, memory[n : 2 * n], memory[-n:], law.period)
+            memory[n : 2 * n] = q_now
+            memory[-n:] = v_now
+        else:
+            q_now, v_now = law.q_nominal.copy(), np.zeros(n)
+
+    x_d, R_d, held = _reference(chain, memory, q_now, x_d, has_pose, n)
+    if held:
+        status |= REFERENCE_HELD
+    if not (np.all(np.isfinite(stiffness)) and np.all(stiffness >= 0.0)):
+        stiffness = law.stiffness.copy()
+        status |= REFERENCE_HELD
+    if not (np.all(np.isfinite(damping)) and np.all(damping >= 0.0)):
+        damping = law.stiffness.copy() if ratio > 0.0 else law.damping.copy()
+        status |= REFERENCE_HELD
+    if not np.all(np.isfinite(wrench)):
+        wrench = np.zeros(6)
+        status |= REFERENCE_HELD
+
+    kept = memory[2 * n + 10 : 2 * n + 18]
+    if np.all(np.isfinite(directions)) and np.all(np.isfinite(targets)):
+        kept[:6] = directions
+        kept[6:] = targets
+    else:
+        status |= REFERENCE_HELD
+    if not np.all(np.isfinite(measured)):
+        measured = np.zeros(6)  # Below CONTACT_FORCE_MIN: the integral waits.
+        status |= FORCE_SENSOR_HELD
+    slots = memory[2 * n + 18 : -n].reshape(N_SLOTS, SLOT)
+
+    if sensed:
+        force_control(law, slots, kept[:6], kept[6:], measured)
+        asked, p_tip = impedance_torque(
+            chain,
+            law,
+            q,
+            v,
+            memory[:n],
+            x_d,
+            R_d,
+            stiffness,
+            damping,
+            ratio,
+            wrench,
+            slots,
+        )
+        if count % law.posture_every == 0:
+            memory[:n] = posture_step(chain, law, memory[:n].copy(), p_tip)
+    else:  # Carry the arm, and slow it down: qdd = -HOLD_DAMPING v.
+        now = chain_state(chain, q_now, v_now)
+        asked = now.bias - HOLD_DAMPING * (now.M @ v_now)
+    if not np.all(np.isfinite(asked)):  # Numbers too large to calculate with.
+        asked = chain_state(chain, q_now, np.zeros(n)).bias
+        status |= REFERENCE_HELD
+    memory[2 * n + 7] = (count + 1) % law.posture_every
+
+    out = np.empty(n)
+    for i in range(n):
+        allowed = min(max(asked[i], -law.effort_max[i]), law.effort_max[i])
+        if allowed != asked[i]:
+            status |= EFFORT_LIMITED
+        change = min(max(allowed - tau[i], -law.step_max[i]), law.step_max[i])
+        out[i] = tau[i] + change
+        if abs(allowed - tau[i]) > law.step_max[i]:
+            status |= RATE_LIMITED
+    return out, status, memory
+
+
+@numba.njit(cache=True)
+def _reference(chain, memory, q, x_d, has_pose, n):
+    """x_d, its rotation, and whether it had to be replaced by the last good pose."""
+    square = np.sum(x_d[3:7] ** 2)
+    if np.all(np.isfinite(x_d)) and 0.25 < square < 4.0:
+        memory[2 * n : 2 * n + 7] = x_d[:7]
+        memory[2 * n + 8] = 1.0
+        return x_d, rotation_of(x_d[3:7]), False
+    if not has_pose:  # Stay where the arm is.
+        p, R, _ = tip_kinematics(chain, q)
+        memory[2 * n : 2 * n + 3] = p
+        memory[2 * n + 3 : 2 * n + 7] = quaternion_of(R)
+        memory[2 * n + 8] = 1.0
+    held = np.zeros(19)
+    held[:7] = memory[2 * n : 2 * n + 7]
+    return held, rotation_of(held[3:7]), True
+
+
+@numba.njit(cache=True)
+def packed_tick(
+    chain, law, tau, memory, q, v, x_d, stiffness, damping, ratio, wrench,
+    directions, targets, measured,
+):  # fmt: skip
+    """The tick, with chain and law packed (numerics/packed.py)."""
+    return tick(
+        chain[0], law[0], tau, memory, q, v, x_d, stiffness, damping, ratio, wrench,
+        directions, targets, measured,
+    )  # fmt: skip
+
+
+def warm_up(chain: np.ndarray, law: np.ndarray) -> None:
+    """Compiles the law, so that no tick has to wait for it. Both are packed.
+
+    tau and memory are read-only, as a Context's state is: to the compiler those are
+    arrays of another type.
+    """
+    n = law["effort_max"].size
+    tau, memory = np.zeros(n), np.zeros(memory_size(n))
+    for state in (tau, memory):
+        state.setflags(write=False)
+    args = (np.zeros(n), np.zeros(n), np.full(19, np.nan))
+    none = np.zeros(6)
+    gains = (none, none, 0.0)
+    packed_tick(chain, law, tau, memory, *args, *gains, none, none, np.zeros(2), none)

@@ -1,0 +1,88 @@
+"""A force-torque sensor between flange and tool."""
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from makebreak.systems.arm.numerics.tool_wrench import external_wrench
+from makebreak.systems.numerics.first_calls import first_call
+
+
+class ToolWrench(LeafSystem):
+    """The wrench from outside on the tool, from the reaction in its mount.
+
+    What the mount carries, less the tool's weight. The tool's inertia stays in it
+    (m a, some 0.1 N for a light finger), as on a robot without accelerometer.
+
+    Inputs:  reaction_forces (abstract) and state (n_x,) of the plant.
+    Outputs: wrench (6,) on the tool at its tip, world axes, force first [N], [N m].
+
+    It is worked out when asked for, from the torques and the state of that instant:
+    for a discrete plant, what the mount would carry in a step that begins with them.
+    With a period it is sampled just as the plant steps, and is what the mount carries
+    in the step that is then made (and costs no solution of the contact of its own).
+
+    Args: plant, finalized; joint, name of the weld that mounts the tool, the tool its
+        child; tip, name of a frame on the tool; period_sec, the plant's time step, or
+        None.
+    """
+
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        joint: str,
+        tip: str,
+        period_sec: float | None = None,
+    ):
+        super().__init__()
+        self._plant = plant
+        mount = plant.GetJointByName(joint)
+        self._ordinal = int(mount.index())  # Equal where no joint was removed.
+        self._mount = mount.frame_on_child()
+        self._plant_context = plant.CreateDefaultContext()
+        inertia = mount.child_body().CalcSpatialInertiaInBodyFrame(self._plant_context)
+        self._weight = inertia.get_mass() * np.array(
+            plant.gravity_field().gravity_vector()
+        )
+        X_BC = self._mount.CalcPoseInBodyFrame(self._plant_context)
+        self._p_CM = X_BC.inverse() @ np.array(inertia.get_com())
+        self._p_CE = plant.CalcRelativeTransform(
+            self._plant_context, self._mount, plant.GetFrameByName(tip)
+        ).translation()
+        zero = np.zeros(3)  # Read-only, as the arrays that Drake gives.
+        zero.setflags(write=False)
+        R = self._mount.CalcRotationMatrixInWorld(self._plant_context).matrix()
+        constants = self._weight, self._p_CM, self._p_CE
+        first_call(external_wrench, zero, zero, R, *constants)
+        self._reactions = self.DeclareAbstractInputPort(
+            "reaction_forces", AbstractValue.Make([SpatialForce.Zero()])
+        )
+        self._x = self.DeclareVectorInputPort("state", plant.num_multibody_states())
+        if period_sec is None:
+            self.DeclareVectorOutputPort("wrench", 6, self._calc)
+        else:
+            self._sampled = self.DeclareDiscreteState(6)
+            self.DeclareStateOutputPort("wrench", self._sampled)
+            self.DeclarePeriodicDiscreteUpdateEvent(period_sec, 0.0, self._sample)
+
+    def _calc(self, context: Context, output: BasicVector):
+        output.SetFromVector(self._wrench(context))
+
+    def _sample(self, context: Context, discrete_state):
+        discrete_state.set_value(self._sampled, self._wrench(context))
+
+    def _wrench(self, context: Context) -> np.ndarray:
+        self._plant.SetPositionsAndVelocities(
+            self._plant_context, self._x.Eval(context)
+        )
+        reaction = self._reactions.Eval(context)[self._ordinal]
+        return external_wrench(
+            reaction.translational(),
+            reaction.rotational(),
+            self._mount.CalcRotationMatrixInWorld(self._plant_context).matrix(),
+            self._weight,
+            self._p_CM,
+            self._p_CE,
+        )

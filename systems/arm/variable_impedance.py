@@ -1,0 +1,158 @@
+"""The stiffness of the moment: see numerics/variable_impedance.py for the law."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.systems.framework import Context, LeafSystem
+
+from makebreak.systems.arm.numerics.variable_impedance import (
+    N_MEMORY,
+    StiffnessLaw,
+    tick,
+    warm_up,
+)
+from makebreak.systems.changing_contact.numerics.contact_task import N_PHASE
+from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.timing import timed
+
+# Of the feed-forward, while a model is handed over [s]: what it says is no measured
+# force with its noise, and the filter keeps no more than the torque's rate bounded.
+HANDOVER_FILTER_SEC = 0.005
+
+
+@dataclass
+class StiffnessConfig:
+    """Along each axis [N/m]; free = maximum = impact is constant stiffness."""
+
+    free: float = 200.0  # K_free, where the forward model is right.
+    maximum: float = 1000.0  # K_max, where it is wrong, and while modes are told apart.
+    impact: float = 150.0  # Where an impact is expected.
+    rotational: float = 40.0  # [N m/rad], constant.
+    paper_damping: bool = False  # D = sqrt(K)/4: see docs/impedance.md.
+
+
+@dataclass
+class TrustConfig:
+    steepness: float = 8.0  # r [1/N]
+    midpoint: float = 0.8  # eps_0 [N]
+    filter_sec: float = 0.02  # Of stiffness and feed-forward; 0: none.
+
+
+@dataclass
+class VariableImpedanceConfig:
+    stiffness: StiffnessConfig = field(default_factory=StiffnessConfig)
+    trust: TrustConfig = field(default_factory=TrustConfig)
+    blend_sec: float = 0.1  # T of eq. 10.
+    feedforward: bool = True  # Of the predicted wrench.
+    transition: bool = True  # False: the base controller at changes of contact too.
+    period_sec: float = 0.001
+    offset_sec: float = 0.0
+
+
+class VariableImpedance(LeafSystem):
+    """Stiffness, damping and feed-forward of the base controller, of the transition-
+    phase controllers, and of the blend of both.
+
+    Inputs:  prediction_error (1,) [N], wrench_predicted (6,) on the tool [N], [N m];
+             collecting (1,), 1 while the mode detector collects a batch; phase (6,);
+             optional handing_over (1,), 1 while a model that was announced takes over:
+             its prediction is fed forward with a filter of 5 ms.
+    Outputs, all of them state: stiffness (6,) [N/m] x 3, [N m/rad] x 3;
+             damping_stiffness (6,), the one that the damping belongs to (in an impact
+             the tip is damped as by K_max), or, with paper_damping, in its place
+             damping (6,) [N s/m] x 3, [N m s/rad] x 3;
+             wrench_feedforward (6,) [N], [N m]; trust (1,), lambda of eq. 4c;
+             status (1,), 1 while an input is NaN: then K_max, no feed-forward, or the
+             base controller.
+
+    Raises: ValueError for numbers out of their range.
+    Source: CC eq. 4b, 4c, 8, 10.
+    """
+
+    def __init__(self, config: VariableImpedanceConfig):
+        super().__init__()
+        stiffness = config.stiffness
+        for name in ("free", "maximum", "impact", "rotational"):
+            if not 0.0 < getattr(stiffness, name) < np.inf:
+                raise ValueError(
+                    f"stiffness.{name} is {getattr(stiffness, name)}, expected > 0"
+                )
+        if stiffness.free > stiffness.maximum:
+            raise ValueError(
+                f"stiffness.free is {stiffness.free}, expected at most the maximum, "
+                f"{stiffness.maximum}"
+            )
+        for name, number, least in (
+            ("trust.steepness", config.trust.steepness, "> 0"),
+            ("trust.midpoint", config.trust.midpoint, ">= 0"),
+            ("trust.filter_sec", config.trust.filter_sec, ">= 0"),
+            ("blend_sec", config.blend_sec, "> 0"),
+            ("period_sec", config.period_sec, "> 0"),
+        ):
+            if not (number > 0.0 or (number == 0.0 and least == ">= 0")):
+                raise ValueError(f"{name} is {number}, expected {least}")
+        filter_sec = config.trust.filter_sec
+        self._law = StiffnessLaw(
+            free=float(stiffness.free),
+            maximum=float(stiffness.maximum),
+            impact=float(stiffness.impact),
+            rotational=float(stiffness.rotational),
+            steepness=float(config.trust.steepness),
+            midpoint=float(config.trust.midpoint),
+            decay=float(np.exp(-config.period_sec / filter_sec)) if filter_sec else 0.0,
+            blend_ticks=max(1.0, config.blend_sec / config.period_sec),
+            feedforward=bool(config.feedforward),
+            transition=bool(config.transition),
+            decay_handover=float(np.exp(-config.period_sec / HANDOVER_FILTER_SEC)),
+        )
+        first_call(warm_up, self._law)
+        self._paper = stiffness.paper_damping
+        self._error = self.DeclareVectorInputPort("prediction_error", 1)
+        self._predicted = self.DeclareVectorInputPort("wrench_predicted", 6)
+        self._collecting = self.DeclareVectorInputPort("collecting", 1)
+        self._phase = self.DeclareVectorInputPort("phase", N_PHASE)
+        self._handing_over = self.DeclareVectorInputPort("handing_over", 1)
+        # Before the first update: stiff, nothing fed forward.
+        first = np.repeat([stiffness.maximum, stiffness.rotational], 3)
+        self._memory = self.DeclareDiscreteState(N_MEMORY)
+        self._stiffness = self.DeclareDiscreteState(first)
+        self._damping = self.DeclareDiscreteState(
+            np.sqrt(first) / 4.0 if self._paper else first
+        )
+        self._wrench = self.DeclareDiscreteState(6)
+        self._trust = self.DeclareDiscreteState(1)
+        self._status = self.DeclareDiscreteState(1)
+        self.DeclareStateOutputPort("stiffness", self._stiffness)
+        self.DeclareStateOutputPort(
+            "damping" if self._paper else "damping_stiffness", self._damping
+        )
+        self.DeclareStateOutputPort("wrench_feedforward", self._wrench)
+        self.DeclareStateOutputPort("trust", self._trust)
+        self.DeclareStateOutputPort("status", self._status)
+        self.DeclarePeriodicDiscreteUpdateEvent(
+            config.period_sec, config.offset_sec, self._update
+        )
+
+    @timed
+    def _update(self, context: Context, discrete_state):
+        handing_over = 0.0
+        if self._handing_over.HasValue(context):
+            handing_over = self._handing_over.Eval(context)[0]
+        memory, output = tick(
+            self._law,
+            context.get_discrete_state(self._memory).value(),
+            self._error.Eval(context)[0],
+            self._predicted.Eval(context),
+            self._collecting.Eval(context)[0],
+            self._phase.Eval(context),
+            handing_over,
+        )
+        discrete_state.set_value(self._memory, memory)
+        discrete_state.set_value(self._stiffness, output[:6])
+        damping = output[6:12]
+        discrete_state.set_value(
+            self._damping, np.sqrt(damping) / 4.0 if self._paper else damping
+        )
+        discrete_state.set_value(self._wrench, output[12:18])
+        discrete_state.set_value(self._trust, output[18:19])
+        discrete_state.set_value(self._status, output[19:20])

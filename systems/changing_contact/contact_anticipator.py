@@ -1,0 +1,558 @@
+"""The contact anticipator: see numerics/contact_anticipator.py for the model."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.framework import Context, LeafSystem
+
+from makebreak.systems.changing_contact.numerics.contact_anticipator import (
+    capped,
+    contact_stiffness,
+    impact_speed,
+    is_expected,
+    measurement_covariance,
+    next_impact,
+    place_at,
+    predict,
+    speed_by_error,
+    speed_by_regression,
+    spread_along,
+    unbraked_force,
+    update,
+)
+from makebreak.systems.changing_contact.numerics.contact_task import (
+    BAD_INPUT,
+    BROKEN,
+    CHANGE_TIME,
+    COUNT,
+    DIRECTION,
+    FOUND,
+    FREE_MODE,
+    FROM_MODE,
+    IMPACT,
+    IMPACTLESS,
+    MADE,
+    MEASURED,
+    N_CONTACT,
+    N_PHASE,
+    N_TOUCH_MODE,
+    N_TRANSITION,
+    PEAK_FORCE,
+    PHASE_SEGMENT,
+    POSITION,
+    SPEED,
+    STATUS,
+    TIME,
+    TO_MODE,
+    TOUCH_MODE,
+    UNKNOWN_MODE,
+    ContactBelief,
+    ExpectedContact,
+)
+from makebreak.systems.numerics.timing import timed
+
+HISTORY = 150  # Poses kept: 1.5 s at 100 Hz.
+# A mode change so near in time to a contact, or to the beginning of a segment, belongs
+# to it; it is no impact-less change.
+SETTLE_SEC = 0.3
+HINT_WAY = 0.02  # [m] past the place, and 3 sigma, for which the hint is given.
+FORGET_STD = 0.02  # A learned contact that is not felt is given up at this sigma [m].
+
+
+@dataclass
+class ContactFilterConfig:
+    """Standard deviations of the Kalman filter."""
+
+    std_along: float = 0.0007  # Of a felt contact, along the motion [m].
+    std_across: float = 0.005  # And across: how well the motion repeats itself [m].
+    std_change: float = 0.002  # Of an impact-less change, along the motion [m].
+    std_drift: float = 0.0003  # Of a contact from trial to trial [m].
+    gate: float = 3.0  # Standard deviations of the innovation.
+
+
+@dataclass
+class ApproachSpeedConfig:
+    force_desired: float = 8.0  # F_d of an impact, along the motion [N].
+    first: float = 0.05  # v_a of a contact that has not been felt [m/s].
+    # Or, if not 0, the v_a at which the stiffest contact that there may be [N/m] gives
+    # force_first [N]; the arm's mass is the constructor's `effective_mass`.
+    stiffness_most: float = 0.0
+    force_first: float = 8.0
+    # Of the arm's impact reflex, if it has one: its gain and least force [N].
+    reflex_gain: float = 0.0
+    reflex_force_least: float = 0.0
+    regression: bool = True  # F = s v from all impacts; False: eq. 9.
+    beta: float = 0.002  # Of eq. 9 [m/s per N].
+    growth: float = 1.4  # At most so many times faster than the trial before.
+    most: float = 0.2  # [m/s]
+    carry_over: bool = False  # The first stiffness felt is assumed of all the others.
+
+
+@dataclass
+class ContactAnticipatorConfig:
+    filter: ContactFilterConfig = field(default_factory=ContactFilterConfig)
+    speed: ApproachSpeedConfig = field(default_factory=ApproachSpeedConfig)
+    hint_lead_sec: float = 0.0  # So long before its place a mode is hinted [s].
+    period_sec: float = 0.01
+    offset_sec: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class AnticipatorMemory:
+    """All that the anticipator remembers, as a value: an update makes a new one."""
+
+    belief: ContactBelief
+    history: np.ndarray  # (n, 5): time, p_WE, segment; oldest first.
+    made: float = 0.0  # Counters that were seen last.
+    broken: float = 0.0
+    measured: float = 0.0
+    count: float = 0.0
+    updated: tuple[int, ...] = ()  # Contacts felt in this trial,
+    passed: tuple[int, ...] = ()  # and those that were passed without.
+    last: int = -1  # The contact that was made last; -1: none that is to learn.
+    touch: int = -1  # The one whose mode is not found out yet; -1: none.
+    found: float = 0.0  # A counter, of touches whose mode was.
+    last_time: float = -np.inf  # When one was made or broken [s].
+    segment_time: float = 0.0  # When this segment began [s].
+    status: int = 0
+    trial: float = 0.0  # Of the port.
+
+    def __copy__(self):
+        return self
+
+    def __deepcopy__(self, memo):
+        return self  # Every part is immutable, so a Context may share it.
+
+
+LEAST_SPEED = 0.001  # [m/s]
+MAY_BE_ZERO = ("stiffness_most", "reflex_gain", "reflex_force_least")
+
+
+def reduced_mass_one(p, d) -> float:
+    """1 kg everywhere: as long as masses are about equal, only ratios count."""
+    return 1.0
+
+
+def first_speed(config: ApproachSpeedConfig, p, d, effective_mass) -> float:
+    """v_a [m/s] of a contact that was never felt, at p (3,) along d (3,)."""
+    speed = config.first
+    if config.stiffness_most > 0.0:
+        mass = effective_mass(p, d)
+        force = unbraked_force(
+            config.force_first, config.reflex_gain, config.reflex_force_least
+        )
+        speed = impact_speed(force, config.stiffness_most, mass)
+    return float(min(speed, config.most))
+
+
+class KalmanContactAnticipator(LeafSystem):
+    """Expects contacts where they were felt, and approaches them at the right speed.
+
+    Each expected contact is a Gaussian of the tip's position at the contact. When the
+    contact detector reports one, the contact of this segment and direction whose gate
+    it passes is updated, once a trial; if there is none, it is added. A change of mode
+    without an impact, from `transition`, is an impact-less contact: its place is looked
+    up in the recent past, at its change time, not where it was confirmed. A learned
+    contact that is passed and not felt doubles its standard deviation; above FORGET_STD
+    it is given up before the next trial. Which mode a contact brought, from
+    `touch_mode`, is told when it is felt in a later trial.
+
+    The peak force of an impact gives the next approach speed: by regression of force on
+    speed, or by eq. 9, at most `growth` times faster than before.
+
+    Inputs:  ee_pose (7,) of the tip; contact (14,), transition (6,), phase (6,) of
+             numerics/contact_task.py; optional touch_mode (2,), of the same;
+             optional trial (1,): a motion that is repeated
+             within one simulation counts its repetitions there. When the number
+             changes a new trial begins: contacts drift by std_drift, and each can be
+             felt once more.
+    Outputs: contacts (abstract, ContactBelief);
+             approach_speed (1,) of the next impact of this segment, 0 if none is
+             expected [m/s];
+             mode_hint (1,) the mode that begins at the expected place of an impact-less
+             change, from hint_lead_sec before the tip passes it until HINT_WAY past its
+             region; -1: none;
+             touch_hint (1,) the mode that the contact brought before which was felt
+             last, until that of now is found out; -1: none;
+             status (1,) 0, or BAD_INPUT: the belief is held.
+
+    Source: CC 3.3, 3.4.1.
+    """
+
+    def __init__(
+        self,
+        config: ContactAnticipatorConfig,
+        knowledge: ContactBelief | None = None,
+        effective_mass: Callable[[np.ndarray, np.ndarray], float] = reduced_mass_one,
+    ):
+        """Args:
+            knowledge: what is expected: a prior, or `knowledge` of the last trial. A
+                contact without impacts is given the config's first speed; one that was
+                felt drifts by std_drift.
+            effective_mass: of the arm at a position (3,) along a direction (3,) [kg],
+                for `carry_over` and `stiffness_most`.
+        Raises: ValueError for numbers in config that are not positive.
+        """
+        super().__init__()
+        self._filter, self._speed = replace(config.filter), replace(config.speed)
+        numbers = {**vars(config.filter), **vars(config.speed)}
+        for name, value in numbers.items():
+            if isinstance(value, bool):
+                continue
+            if value == 0.0 and name in MAY_BE_ZERO:
+                continue
+            if not 0.0 < value < np.inf:
+                raise ValueError(f"{name} is {value}, expected a positive number")
+        if self._speed.growth < 1.0:
+            raise ValueError(f"growth is {self._speed.growth}, expected 1 or more")
+        if not config.period_sec > 0.0:
+            raise ValueError(f"period_sec is {config.period_sec}, expected > 0")
+        if not 0.0 <= config.hint_lead_sec < np.inf:
+            raise ValueError(
+                f"hint_lead_sec is {config.hint_lead_sec}, expected 0 or more"
+            )
+        self._lead = float(config.hint_lead_sec)
+        self._period = float(config.period_sec)
+        self._mass = effective_mass
+        belief = self._next_trial(ContactBelief() if knowledge is None else knowledge)
+        memory = AnticipatorMemory(belief, np.zeros((0, 5)))
+        self._pose = self.DeclareVectorInputPort("ee_pose", 7)
+        self._contact = self.DeclareVectorInputPort("contact", N_CONTACT)
+        self._transition = self.DeclareVectorInputPort("transition", N_TRANSITION)
+        self._phase = self.DeclareVectorInputPort("phase", N_PHASE)
+        self._touch_mode = self.DeclareVectorInputPort("touch_mode", N_TOUCH_MODE)
+        self._trial = self.DeclareVectorInputPort("trial", 1)
+        self._memory = self.DeclareAbstractState(Value(memory))
+        ticket = {self.abstract_state_ticket(self._memory)}
+        self.DeclareAbstractOutputPort(
+            "contacts",
+            lambda: Value(ContactBelief()),
+            lambda context, output: output.set_value(self.knowledge(context)),
+            ticket,
+        )
+        for name, calc in (
+            ("approach_speed", self._approach_speed),
+            ("touch_hint", _touch_hint),
+            ("status", lambda memory: float(memory.status)),
+        ):
+            self.DeclareVectorOutputPort(name, 1, partial(self._put, calc), ticket)
+        # Whoever asks between two updates gets the hint of that time.
+        self.DeclareVectorOutputPort(
+            "mode_hint", 1, self._put_hint, ticket | {self.time_ticket()}
+        )
+        self.DeclarePeriodicUnrestrictedUpdateEvent(
+            config.period_sec, config.offset_sec, self._update
+        )
+
+    def knowledge(self, context: Context) -> ContactBelief:
+        """What is believed now: for the next trial's constructor, or to be saved."""
+        return self._memory_of(context).belief
+
+    def _memory_of(self, context) -> AnticipatorMemory:
+        return context.get_abstract_state(self._memory).get_value()
+
+    def _put(self, calc, context, output):
+        output.SetFromVector([calc(self._memory_of(context))])
+
+    def _approach_speed(self, memory) -> float:
+        if len(memory.history) == 0:
+            return 0.0
+        p, segment = memory.history[-1, 1:4], int(memory.history[-1, 4])
+        k = next_impact(memory.belief.contacts, IMPACT, segment, p)
+        return 0.0 if k is None else memory.belief.contacts[k].approach_speed
+
+    def _put_hint(self, context, output):
+        memory = self._memory_of(context)
+        output.SetFromVector([self._mode_hint(memory, context.get_time())])
+
+    def _mode_hint(self, memory, time) -> float:
+        if len(memory.history) == 0:
+            return -1.0
+        p, segment = memory.history[-1, 1:4], int(memory.history[-1, 4])
+        best, least = -1.0, np.inf
+        if len(memory.history) > 5:
+            before, now = memory.history[-6], memory.history[-1]
+            ahead = self._lead + min(time - now[0], self._period)
+            p = p + ahead * (now[1:4] - before[1:4]) / (now[0] - before[0])
+        for contact in memory.belief.contacts:
+            if contact.kind != IMPACTLESS or contact.segment != segment:
+                continue
+            past = (p - contact.mean) @ contact.direction
+            sigma = spread_along(contact.covariance, contact.direction)
+            if 0.0 <= past < min(least, 3.0 * sigma + HINT_WAY):
+                best, least = float(contact.to_mode), past
+        return best
+
+    def _next_trial(self, belief: ContactBelief) -> ContactBelief:
+        """What is expected at the beginning of a trial, after the one before."""
+        drift = self._filter.std_drift**2 * np.eye(3)
+        contacts = []
+        for contact in belief.contacts:
+            if contact.seen > 0:
+                # Within a trial none is dropped: others know it by its index.
+                if spread_along(contact.covariance, contact.direction) > FORGET_STD:
+                    continue
+                mean, covariance = predict(contact.mean, contact.covariance, drift)
+                contact = replace(contact, mean=mean, covariance=covariance)
+            if len(contact.impacts) == 0:
+                speed = self._first_speed(contact.mean, contact.direction)
+                contact = replace(contact, approach_speed=speed)
+            contacts.append(contact)
+        return ContactBelief(tuple(contacts))
+
+    def _begun(self, memory, context) -> AnticipatorMemory:
+        """The memory, of a new trial if the port `trial` says so."""
+        if not self._trial.HasValue(context):
+            return memory
+        trial = float(self._trial.Eval(context)[0])
+        if trial == memory.trial or not np.isfinite(trial):
+            return memory
+        belief = self._next_trial(memory.belief)
+        return replace(
+            memory, belief=belief, trial=trial, updated=(), passed=(), last=-1, touch=-1
+        )
+
+    @timed
+    def _update(self, context: Context, state):
+        memory = self._after(
+            self._begun(self._memory_of(context), context),
+            context.get_time(),
+            *[
+                port.Eval(context)
+                for port in (self._pose, self._contact, self._transition, self._phase)
+            ],
+        )
+        if self._touch_mode.HasValue(context):
+            memory = _found(memory, self._touch_mode.Eval(context))
+        state.get_mutable_abstract_state(self._memory).set_value(memory)
+
+    def _after(self, memory, time, pose, contact, transition, phase):
+        """The memory after one tick."""
+        inputs = (pose[:3], contact, transition, phase)
+        if not all(np.all(np.isfinite(x)) for x in inputs):
+            return replace(memory, status=BAD_INPUT)
+        status = BAD_INPUT if contact[STATUS] else 0
+        segment = phase[PHASE_SEGMENT]
+        row = np.array([[time, *pose[:3], segment]])
+        history = np.vstack([memory.history[-(HISTORY - 1) :], row])
+        history.setflags(write=False)
+        began = len(memory.history) == 0 or memory.history[-1, 4] != segment
+        memory = replace(
+            memory,
+            history=history,
+            status=status,
+            segment_time=time if began else memory.segment_time,
+        )
+        if contact[BROKEN] > memory.broken:
+            memory = replace(memory, broken=contact[BROKEN], last_time=time)
+        if contact[MADE] > memory.made:
+            memory = self._felt(memory, contact)
+        if contact[MEASURED] > memory.measured:
+            memory = self._measured(memory, contact)
+        if transition[COUNT] > memory.count:
+            memory = self._changed(memory, transition)
+        return self._without_passed(memory)
+
+    # An impact.
+
+    def _felt(self, memory, contact):
+        """After a contact that was made."""
+        p, d, time = contact[POSITION], contact[DIRECTION], contact[TIME]
+        memory = replace(memory, made=contact[MADE], last=-1, last_time=time)
+        if not abs(np.linalg.norm(d) - 1.0) < 1e-3:
+            return replace(memory, status=BAD_INPUT)
+        d = d / np.linalg.norm(d)
+        segment = _segment_at(memory.history, time)
+        c = self._filter
+        for k in memory.updated:
+            if _is_same(memory.belief.contacts[k], p, d):
+                # A bounce: felt in this trial, here, before.
+                return replace(memory, touch=k)
+        R = measurement_covariance(d, c.std_along, c.std_across)
+        k = self._matching(memory.belief, IMPACT, segment, p, d, c.std_along)
+        if k is not None and k in memory.updated:
+            return replace(memory, touch=k)  # Two detections of one contact.
+        if k is None:
+            added = ExpectedContact(
+                mean=p,
+                covariance=R,
+                direction=d,
+                kind=IMPACT,
+                segment=segment,
+                approach_speed=self._first_speed(p, d),
+                seen=1,
+            )
+            belief = ContactBelief((*memory.belief.contacts, added))
+            k = len(belief.contacts) - 1
+        else:
+            belief = self._corrected(memory.belief, k, p, R)
+        updated = (*memory.updated, k)
+        return replace(memory, belief=belief, last=k, touch=k, updated=updated)
+
+    def _matching(self, belief, kind, segment, p, d, std_along) -> int | None:
+        """Index of the expected contact that was felt: the nearest along d."""
+        found, nearest = None, np.inf
+        for k, contact in enumerate(belief.contacts):
+            away = abs((contact.mean - p) @ d)
+            if (
+                contact.kind == kind
+                and contact.segment == segment
+                and away < nearest
+                and is_expected(contact, p, d, std_along, self._filter.gate)
+            ):
+                found, nearest = k, away
+        return found
+
+    def _corrected(self, belief, k, p, R, **changes):
+        contact = belief.contacts[k]
+        mean, covariance = update(contact.mean, contact.covariance, p, R)
+        return belief.changed(
+            k, mean=mean, covariance=covariance, seen=contact.seen + 1, **changes
+        )
+
+    def _measured(self, memory, contact):
+        """After the peak force of the last contact is known: its next speed."""
+        memory = replace(memory, measured=contact[MEASURED])
+        speed, force = contact[SPEED], contact[PEAK_FORCE]
+        k = memory.last
+        if k < 0 or not (speed > 0.0 and force > 0.0):
+            return memory
+        known = memory.belief.contacts[k]
+        impacts = np.vstack([known.impacts, [speed, force]])[-20:]
+        belief = memory.belief.changed(
+            k, impacts=impacts, approach_speed=self._next_speed(known, impacts)
+        )
+        if self._speed.carry_over:
+            belief = self._carried_over(belief, k)
+        return replace(memory, belief=belief, last=-1)
+
+    def _first_speed(self, p, d) -> float:
+        return first_speed(self._speed, p, d, self._mass)
+
+    def _next_speed(self, contact, impacts) -> float:
+        s = self._speed
+        before = contact.approach_speed
+        if s.regression:
+            speed = speed_by_regression(
+                impacts, s.force_desired, s.reflex_gain, s.reflex_force_least
+            )
+        else:
+            speed = speed_by_error(before, s.force_desired, impacts[-1, 1], s.beta)
+        return capped(speed, before, s.growth, LEAST_SPEED, s.most)
+
+    def _carried_over(self, belief, k):
+        """The stiffness of contact k for those that have not been felt yet."""
+        s, source = self._speed, belief.contacts[k]
+        speed, force = source.impacts[-1]
+        mass = self._mass(source.mean, source.direction)
+        reflex = s.reflex_gain, s.reflex_force_least
+        stiffness = contact_stiffness(speed, unbraked_force(force, *reflex), mass)
+        wanted = unbraked_force(s.force_desired, *reflex)
+        for i, contact in enumerate(belief.contacts):
+            if contact.kind != IMPACT or len(contact.impacts):
+                continue
+            mass = self._mass(contact.mean, contact.direction)
+            new = impact_speed(wanted, stiffness, mass)
+            first = self._first_speed(contact.mean, contact.direction)
+            new = capped(new, first, s.growth, LEAST_SPEED, s.most)
+            belief = belief.changed(i, approach_speed=new)
+        return belief
+
+    # A change without impact.
+
+    def _changed(self, memory, transition):
+        """After a change of mode."""
+        memory = replace(memory, count=transition[COUNT])
+        time = transition[CHANGE_TIME]
+        modes = int(transition[FROM_MODE]), int(transition[TO_MODE])
+        if min(modes) <= FREE_MODE or modes[0] == modes[1]:
+            return memory
+        near_contact = abs(time - memory.last_time) < SETTLE_SEC
+        if near_contact or time - memory.segment_time < SETTLE_SEC:
+            return memory
+        found = place_at(memory.history[:, 0], memory.history[:, 1:4], time)
+        if found is None:
+            return memory
+        p, d = found
+        segment = _segment_at(memory.history, time)
+        c = self._filter
+        R = measurement_covariance(d, c.std_change, c.std_across)
+        k = self._matching(memory.belief, IMPACTLESS, segment, p, d, c.std_change)
+        if k is not None and k in memory.updated:
+            return memory
+        if k is None:
+            added = ExpectedContact(
+                mean=p,
+                covariance=R,
+                direction=d,
+                kind=IMPACTLESS,
+                segment=segment,
+                seen=1,
+                from_mode=modes[0],
+                to_mode=modes[1],
+            )
+            belief = ContactBelief((*memory.belief.contacts, added))
+            k = len(belief.contacts) - 1
+        else:
+            belief = self._corrected(
+                memory.belief, k, p, R, from_mode=modes[0], to_mode=modes[1]
+            )
+        return replace(memory, belief=belief, updated=(*memory.updated, k))
+
+    def _without_passed(self, memory):
+        """Contacts that have been felt before and were passed now are less certain."""
+        p, segment = memory.history[-1, 1:4], int(memory.history[-1, 4])
+        for k, contact in enumerate(memory.belief.contacts):
+            if contact.segment != segment or contact.seen == 0:
+                continue
+            if k in memory.updated or k in memory.passed:
+                continue
+            sigma = spread_along(contact.covariance, contact.direction)
+            # An impact-less change is confirmed only a while after its place.
+            margin = 0.005 if contact.kind == IMPACT else 0.05
+            past = (p - contact.mean) @ contact.direction
+            if past < self._filter.gate * sigma + margin:
+                continue
+            # A way that begins beyond it has not passed it.
+            here = memory.history[memory.history[:, 0] >= memory.segment_time]
+            if not np.any((here[:, 1:4] - contact.mean) @ contact.direction < 0.0):
+                continue
+            memory = replace(memory, passed=(*memory.passed, k))
+            belief = memory.belief.changed(k, covariance=4.0 * contact.covariance)
+            memory = replace(memory, belief=belief)
+        return memory
+
+
+def _touch_hint(memory: AnticipatorMemory) -> float:
+    """The mode that the contact which was felt last brought in an earlier trial."""
+    if memory.touch < 0:
+        return float(UNKNOWN_MODE)
+    return float(memory.belief.contacts[memory.touch].to_mode)
+
+
+def _found(memory: AnticipatorMemory, touch_mode) -> AnticipatorMemory:
+    """After the mode of a touch was found out."""
+    if not touch_mode[FOUND] > memory.found:
+        return memory
+    belief = memory.belief
+    if memory.touch >= 0:
+        belief = belief.changed(memory.touch, to_mode=int(touch_mode[TOUCH_MODE]))
+    return replace(memory, belief=belief, touch=-1, found=touch_mode[FOUND])
+
+
+def _segment_at(history, time) -> int:
+    """In which segment the tip was just before `time`."""
+    before = history[history[:, 0] < time]
+    return int(before[-1, 4] if len(before) else history[0, 4])
+
+
+def _is_same(contact: ExpectedContact, p, d) -> bool:
+    """Whether p, on the way along d, is where this impact was just felt."""
+    return (
+        contact.kind == IMPACT
+        and bool(contact.direction @ d > 0.7)
+        and bool(np.linalg.norm(p - contact.mean) < 0.005)
+    )

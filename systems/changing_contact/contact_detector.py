@@ -1,0 +1,107 @@
+"""The contact detector: see numerics/contact_detector.py for how it decides."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.systems.framework import Context, LeafSystem
+
+from makebreak.systems.changing_contact.numerics.contact_detector import (
+    ALONG,
+    Thresholds,
+    detect,
+    new_memory,
+    warm_up,
+)
+from makebreak.systems.changing_contact.numerics.contact_task import N_CONTACT, N_PHASE
+from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.timing import timed
+
+
+@dataclass
+class ContactDetectorConfig:
+    impact_force: float = 2.0  # What is beyond friction and may be an impact [N].
+    loss_force: float = 1.0  # A normal force below it is no contact [N].
+    stiffness_min: float = 1000.0  # Of a contact made while sliding [N/m].
+    tool_mass: float = 0.3  # Between sensor and tip: its inertia is taken off [kg].
+    wrench_limit: float = 200.0  # At which the sensor saturates [N], [N m].
+    period_sec: float = 0.001
+    offset_sec: float = 0.0
+
+
+class ContactDetector(LeafSystem):
+    """Says when the tool has made or broken contact, where, and with what force.
+
+    Inputs:
+        wrench (6,) measured on the tool at its tip, world axes, force first [N], [N m].
+        ee_pose (7,), ee_velocity (6,) of the tip E: p_WE, quaternion; v, w.
+        direction (3,) unit vector of the target motion, zero at rest.
+        force_directions (6,) two rows n, pressed along; a zero row: none.
+        phase (6,) of the motion, numerics/contact_task.py.
+
+    Outputs, all of them state:
+        contact (14,) of numerics/contact_task.py: counters of contacts made, broken
+            and peaks measured; time, p_WE, direction and speed of the last one made, at
+            its first sample; its peak force; status 1 while the wrench is NaN, stuck
+            (no bit changes for 50 ms of motion) or at its limit: then nothing is
+            reported, and friction is learned anew afterwards.
+        along (2,) force against the motion and the part of it that is expected [N].
+
+    The bias of the wrench is its mean over the first 0.1 s, if the tip is at rest in
+    free space for that long.
+
+    Source: CC section 3.3.
+    """
+
+    def __init__(self, config: ContactDetectorConfig):
+        """Raises: ValueError for a number that is not positive (tool_mass, offset_sec:
+        that is negative) or a period above 2 ms."""
+        super().__init__()
+        for name, value in vars(config).items():
+            may_be_zero = name in ("tool_mass", "offset_sec")
+            if not (0.0 < value or may_be_zero and value == 0.0) or value == np.inf:
+                raise ValueError(f"{name} is {value}, expected a positive number")
+        if config.period_sec > 0.002:
+            raise ValueError(
+                f"period_sec is {config.period_sec}, expected 0.002 s or less"
+            )
+        self._limits = Thresholds(
+            impact_force=float(config.impact_force),
+            loss_force=float(config.loss_force),
+            stiffness_min=float(config.stiffness_min),
+            tool_mass=float(config.tool_mass),
+            wrench_limit=float(config.wrench_limit),
+            period=float(config.period_sec),
+        )
+        first_call(warm_up, self._limits)
+        self._ports = [
+            self.DeclareVectorInputPort(name, size)
+            for name, size in (
+                ("wrench", 6),
+                ("ee_pose", 7),
+                ("ee_velocity", 6),
+                ("direction", 3),
+                ("force_directions", 6),
+                ("phase", N_PHASE),
+            )
+        ]
+        self._contact = self.DeclareDiscreteState(N_CONTACT)
+        self._along = self.DeclareDiscreteState(2)
+        self._memory = self.DeclareDiscreteState(new_memory())
+        self.DeclareStateOutputPort("contact", self._contact)
+        self.DeclareStateOutputPort("along", self._along)
+        self.DeclarePeriodicDiscreteUpdateEvent(
+            config.period_sec, config.offset_sec, self._update
+        )
+
+    @timed
+    def _update(self, context: Context, discrete_state):
+        memory, contact = detect(
+            self._limits,
+            context.get_discrete_state(self._memory).value(),
+            context.get_discrete_state(self._contact).value(),
+            context.get_time(),
+            *[port.Eval(context) for port in self._ports],
+        )
+        discrete_state.set_value(self._memory, memory)
+        discrete_state.set_value(self._contact, contact)
+        discrete_state.set_value(self._along, memory[ALONG])

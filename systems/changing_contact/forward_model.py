@@ -1,0 +1,195 @@
+"""Forward models of the contact modes: see numerics/forward_model.py."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from makebreak.systems.changing_contact.numerics.contact_task import (
+    COUNT,
+    FREE_MODE,
+    N_TRANSITION,
+    UNKNOWN_MODE,
+)
+from makebreak.systems.changing_contact.numerics.forward_model import (
+    BankMemory,
+    BankTuning,
+    ModelBank,
+    bank_tuning,
+    observe,
+    warm_up,
+)
+from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.timing import timed
+
+
+@dataclass
+class HandoverConfig:
+    """How the model of a mode that was announced takes over."""
+
+    duration_sec: float = 0.05  # 0: by its one-step prediction, as any other.
+    # From the first row of the tool's feet to the second, along the motion; 0: it
+    # touches with one point [m].
+    rows: float = 0.0
+
+
+@dataclass
+class ForwardModelConfig:
+    with_torque: bool = True  # False: models over |v| and |F_t| alone.
+    learns: bool = True  # False: the models stay as given, the fixed GMM.
+    # False: one model, learned in all modes of contact; what modes are worth (CC 3.2).
+    per_mode: bool = True
+    smoothing: float = 0.3  # Of the error, per sample; 1: none.
+    # Of what a model has been off by of late, which is added to what it predicts, per
+    # sample; 0: nothing is added.
+    correction: float = 0.05
+    tau_nov: float = 1e-3  # Of the mixtures: how unlikely a new component's sample is.
+    wrench_limit: float = 200.0  # At which the sensor saturates [N], [N m].
+    error_unknown: float = 10.0  # Said where the wrench cannot be used [N].
+    handover: HandoverConfig = field(default_factory=HandoverConfig)
+
+
+class ForwardModelBank(LeafSystem):
+    """Predicts the wrench on the tool one sample ahead, with one model per mode.
+
+    Inputs:
+        wrench (6,) measured on the tool at its tip, world axes, force first [N], [N m].
+        ee_velocity (6,) of the tip, v [m/s], w [rad/s].
+        direction (3,) unit vector of the target motion, zero at rest.
+        force_directions (6,) two rows n, pressed along; a zero row: none.
+        mode (1,) of the mode detector; a mode seen first gets a new model.
+        transition (6,) optional, of the mode detector: a mode that changes without a
+            new count there was announced, and its model is handed over.
+
+    Outputs, all of them state:
+        wrench_predicted (6,) on the tool, against the motion [N], [N m]; zero in
+            FREE_MODE and UNKNOWN_MODE, and without a usable wrench.
+        handing_over (1,) 1 while a model that was announced takes over.
+        prediction_error (1,) |error of the last predictions of |F_t||, low-passed [N].
+        status (1,) 0: a model predicts; 1: the wrench is NaN or at its limit; 2: the
+            mode is one without a model.
+
+    Args: knowledge, of an earlier trial. Source: CC section 3.1, eq. 2, 3, 6.
+    """
+
+    def __init__(
+        self,
+        config: ForwardModelConfig,
+        knowledge: ModelBank | None = None,
+        period_sec: float = 0.005,
+        offset_sec: float = 0.0,
+    ):
+        """Raises: ValueError for a setting out of its range, and for knowledge over
+        other entries or of another number of components."""
+        super().__init__()
+        for name in ("wrench_limit", "error_unknown"):
+            if not 0.0 < getattr(config, name) < np.inf:
+                raise ValueError(
+                    f"{name} is {getattr(config, name)}, expected a positive number"
+                )
+        if not 0.0 < config.smoothing <= 1.0:
+            raise ValueError(
+                f"smoothing is {config.smoothing}, expected a number in (0, 1]"
+            )
+        if not 0.0 <= config.correction < 1.0:
+            raise ValueError(
+                f"correction is {config.correction}, expected a number in [0, 1)"
+            )
+        for name in ("duration_sec", "rows"):
+            if not 0.0 <= getattr(config.handover, name) < np.inf:
+                raise ValueError(
+                    f"handover.{name} is {getattr(config.handover, name)}, expected a "
+                    "number of 0 or more"
+                )
+        if not period_sec > 0.0:
+            raise ValueError(f"period_sec is {period_sec}, expected > 0")
+        self._tuning = BankTuning(
+            mixtures=bank_tuning(config.with_torque, tau_nov=config.tau_nov),
+            with_torque=bool(config.with_torque),
+            learns=bool(config.learns),
+            smoothing=float(config.smoothing),
+            correction=float(config.correction),
+            wrench_limit=float(config.wrench_limit),
+            error_unknown=float(config.error_unknown),
+            handover=round(config.handover.duration_sec / period_sec),
+            rows=float(config.handover.rows),
+            period=float(period_sec),
+        )
+        mixtures = self._tuning.mixtures
+        shape = (mixtures.n_max, mixtures.sigma_ini.size)
+        for mode, mixture in knowledge.models if knowledge else ():
+            if mixture.mean.shape != shape:
+                raise ValueError(
+                    f"the model of mode {mode} has {mixture.mean.shape[0]} components "
+                    f"over {mixture.mean.shape[1]} entries, expected {shape[0]} over "
+                    f"{shape[1]}"
+                )
+        self._per_mode = bool(config.per_mode)
+        first_call(warm_up, self._tuning)
+        self._ports = [
+            self.DeclareVectorInputPort(name, size)
+            for name, size in (
+                ("wrench", 6),
+                ("ee_velocity", 6),
+                ("direction", 3),
+                ("force_directions", 6),
+                ("mode", 1),
+            )
+        ]
+        self._transition = self.DeclareVectorInputPort("transition", N_TRANSITION)
+        empty = ModelBank((), self._tuning.with_torque)
+        self._memory = self.DeclareAbstractState(Value(BankMemory(knowledge or empty)))
+        ticket = {self.abstract_state_ticket(self._memory)}
+        for name, size, calc in (
+            ("wrench_predicted", 6, self._calc_wrench),
+            ("prediction_error", 1, self._calc_error),
+            ("handing_over", 1, self._calc_handing_over),
+            ("status", 1, self._calc_status),
+        ):
+            self.DeclareVectorOutputPort(name, size, calc, ticket)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(
+            period_sec, offset_sec, self._update
+        )
+
+    def knowledge(self, context: Context) -> ModelBank:
+        """What it has learned so far, for the next trial."""
+        return self._memory_of(context).bank
+
+    @timed
+    def _update(self, context: Context, state):
+        wrench, velocity, direction, rows, mode = [
+            port.Eval(context) for port in self._ports
+        ]
+        number = int(mode[0]) if np.isfinite(mode[0]) else UNKNOWN_MODE
+        changes = None
+        if not self._per_mode:
+            number = number if number == FREE_MODE else 1  # Nothing has to be told.
+        elif self._transition.HasValue(context):
+            changes = float(self._transition.Eval(context)[COUNT])
+        memory = observe(
+            self._memory_of(context),
+            self._tuning,
+            wrench,
+            velocity,
+            direction,
+            rows,
+            number,
+            changes,
+        )
+        state.get_mutable_abstract_state(self._memory).set_value(memory)
+
+    def _memory_of(self, context: Context) -> BankMemory:
+        return context.get_abstract_state(self._memory).get_value()
+
+    def _calc_wrench(self, context: Context, output: BasicVector):
+        output.SetFromVector(self._memory_of(context).wrench)
+
+    def _calc_error(self, context: Context, output: BasicVector):
+        output.SetFromVector([self._memory_of(context).error])
+
+    def _calc_handing_over(self, context: Context, output: BasicVector):
+        output.SetFromVector([float(self._memory_of(context).left > 0)])
+
+    def _calc_status(self, context: Context, output: BasicVector):
+        output.SetFromVector([float(self._memory_of(context).status)])

@@ -1,0 +1,88 @@
+"""The reflex at first touch: see numerics/impact_reflex.py for the law."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.systems.framework import Context, LeafSystem
+
+from makebreak.systems.changing_contact.numerics.contact_task import N_PHASE
+from makebreak.systems.changing_contact.numerics.impact_reflex import (
+    N_MEMORY,
+    ReflexLaw,
+    tick,
+    warm_up,
+)
+from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.timing import timed
+
+
+@dataclass
+class ImpactReflexConfig:
+    gain: float = 0.0  # Newtons of braking per newton felt; 0: no reflex.
+    force_least: float = 0.5  # Less is noise [N].
+    force_max: float = 10.0  # Of what is felt; more does not brake more [N].
+    fade_sec: float = 0.1  # After the impact.
+    period_sec: float = 0.001
+    offset_sec: float = 0.0
+
+
+class ImpactReflex(LeafSystem):
+    """Adds to the feed-forward wrench what brakes the arm at the first touch of an
+    expected impact.
+
+    Inputs:  wrench (6,) on the tool [N], [N m]; ee_velocity (6,) of the tip; direction
+             (3,) of the motion; phase (6,); wrench_feedforward (6,), of the variable
+             impedance.
+    Output:  wrench_feedforward (6,), the sum; state.
+
+    Raises: ValueError for numbers out of their range.
+    Source: ours; it belongs to the transition-phase controller of CC 3.4.1.
+    """
+
+    def __init__(self, config: ImpactReflexConfig):
+        super().__init__()
+        for name, least in (
+            ("gain", 0.0),
+            ("force_least", 0.0),
+            ("force_max", 0.0),
+            ("fade_sec", 1e-6),
+            ("period_sec", 1e-6),
+        ):
+            value = getattr(config, name)
+            if not least <= value < np.inf:
+                wanted = "0 or more" if least == 0.0 else "a positive number"
+                raise ValueError(f"{name} is {value}, expected {wanted}")
+        self._law = ReflexLaw(
+            gain=float(config.gain),
+            force_least=float(config.force_least),
+            force_max=float(config.force_max),
+            fade_sec=float(config.fade_sec),
+            period=float(config.period_sec),
+        )
+        first_call(warm_up, self._law)
+        self._ports = [
+            self.DeclareVectorInputPort(name, size)
+            for name, size in (
+                ("wrench", 6),
+                ("ee_velocity", 6),
+                ("direction", 3),
+                ("phase", N_PHASE),
+            )
+        ]
+        self._fed = self.DeclareVectorInputPort("wrench_feedforward", 6)
+        self._memory = self.DeclareDiscreteState(N_MEMORY)
+        self._wrench = self.DeclareDiscreteState(6)
+        self.DeclareStateOutputPort("wrench_feedforward", self._wrench)
+        self.DeclarePeriodicDiscreteUpdateEvent(
+            config.period_sec, config.offset_sec, self._update
+        )
+
+    @timed
+    def _update(self, context: Context, discrete_state):
+        memory = context.get_discrete_state(self._memory).value()
+        values = [port.Eval(context) for port in self._ports]
+        memory, force = tick(self._law, memory, *values)
+        wrench = self._fed.Eval(context)
+        wrench[:3] += force
+        discrete_state.set_value(self._memory, memory)
+        discrete_state.set_value(self._wrench, wrench)

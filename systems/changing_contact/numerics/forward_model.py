@@ -1,0 +1,351 @@
+"""Forward models of contact, one per mode: what wrench the next sample will bring.
+
+    S_t = [|v|, |w|, |F_t|, |tau|]   D_t = [|F_t|, |tau|]   X_t = [S_{t-1}, D_t]
+
+of which an incremental Gaussian mixture is learned (igmm.py), and f: S_t -> D_{t+1} is
+the regression from it. F_t is the force without its parts along the directions of force
+control: with the normal force in it the feed-forward would be several times too large.
+Magnitudes do not depend on the direction of motion; the wrench that is predicted acts
+against it.
+
+A model that sees the last force says, in the main, that nothing will change. So where a
+mode was announced before it begins, its model is asked without the last force, which is
+still the old surface's: E[D | |v|, |w|]. That is a *hand-over*. It lasts for a short
+time, in which nothing is learned. A tool that stands on two rows of feet crosses a seam
+in two steps: half of the difference is handed over at first, the whole when it has gone
+from one row to the other.
+
+Source: CC section 3.1, eq. 2, 3, 5, 6.
+"""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from makebreak.systems.changing_contact.numerics.contact_task import UNKNOWN_MODE
+from makebreak.systems.changing_contact.numerics.igmm import (
+    IgmmConfig,
+    IgmmTuning,
+    Mixture,
+    as_vector,
+    empty_mixture,
+    from_vector,
+    igmm_tuning,
+    learned,
+    regress,
+)
+from makebreak.systems.changing_contact.numerics.motion_feature import (
+    magnitudes,
+    motion_wrench,
+)
+
+# Status.
+OK, BAD_WRENCH, NO_MODEL = range(3)
+
+# sigma_ini and entries of [|v|, |w|, |F_t|, |tau|, |F_t|', |tau|'].
+_SIGMA = np.array([0.02, 0.05, 0.3, 0.05, 0.3, 0.05])
+_WITH_TORQUE, _FORCE_ONLY = [0, 1, 2, 3, 4, 5], [0, 2, 4]
+
+
+@dataclass(frozen=True, eq=False)
+class ModelBank:
+    """One mixture per mode, numbered from 1: what a ForwardModelBank knows."""
+
+    models: tuple[tuple[int, Mixture], ...] = ()
+    with_torque: bool = True
+
+    def __copy__(self):
+        return self
+
+    def __deepcopy__(self, _):
+        return self
+
+    def get(self, mode: int) -> Mixture | None:
+        """The model of a mode, None if it has none."""
+        for known, mixture in self.models:
+            if known == mode:
+                return mixture
+        return None
+
+    def put(self, mode: int, mixture: Mixture) -> "ModelBank":
+        """The bank with the model of one mode replaced or added."""
+        models = [(k, mixture if k == mode else m) for k, m in self.models]
+        if self.get(mode) is None:
+            models.append((mode, mixture))
+        return replace(self, models=tuple(models))
+
+    def save(self, path: str | Path) -> None:
+        """Writes it as JSON."""
+        rows = {str(mode): as_vector(mixture).tolist() for mode, mixture in self.models}
+        n_max = self.models[0][1].mean.shape[0] if self.models else 0
+        Path(path).write_text(
+            json.dumps(
+                {"with_torque": self.with_torque, "n_max": n_max, "models": rows}
+            )
+            + "\n"
+        )
+
+    @staticmethod
+    def load(path: str | Path) -> "ModelBank":
+        """What `save` wrote.
+
+        Raises: ValueError if the file is missing or is no bank.
+        """
+        try:
+            data = json.loads(Path(path).read_text())
+            with_torque = bool(data["with_torque"])
+            tuning = bank_tuning(with_torque, n_max=max(int(data["n_max"]), 1))
+            return ModelBank(
+                tuple(
+                    (int(mode), from_vector(vector, tuning))
+                    for mode, vector in data["models"].items()
+                ),
+                with_torque,
+            )
+        except (OSError, KeyError, TypeError, AttributeError, ValueError) as error:
+            raise ValueError(
+                f"forward models {path}: {' '.join(str(error).split())}"
+            ) from None
+
+
+def bank_tuning(with_torque: bool, **changes) -> IgmmTuning:
+    """Constants of the mixtures of a bank. Args: changes of IgmmConfig's defaults."""
+    entries = _WITH_TORQUE if with_torque else _FORCE_ONLY
+    settings = {"floor": 0.1, "sp_max": 2000.0} | changes
+    return igmm_tuning(IgmmConfig(sigma_ini=_SIGMA[entries].tolist(), **settings))
+
+
+@dataclass(frozen=True, eq=False)
+class BankMemory:
+    """All that a ForwardModelBank remembers, as a value."""
+
+    bank: ModelBank
+    mode: int = UNKNOWN_MODE
+    # S_t of the last good sample, None after a gap.
+    state: np.ndarray | None = None
+    # (2,) predicted |F_t|, |tau| for the next sample [N], [N m].
+    predicted: np.ndarray = None  # type: ignore[assignment]
+    error: float = 0.0  # eps_t, low-passed [N].
+    wrench: np.ndarray = None  # type: ignore[assignment]
+    status: int = NO_MODEL
+    # A hand-over: |F_t|, |tau| before it, None: there is none; the way since [m], and
+    # the samples that the step of now is still handed over for.
+    before: np.ndarray | None = None
+    way: float = 0.0
+    left: int = 0
+    count: float = 0.0  # Of mode changes that were confirmed.
+    # (2,) what the model has been off by of late, in `predicted` already [N], [N m].
+    offset: np.ndarray = None  # type: ignore[assignment]
+
+    def __post_init__(self):
+        for name, size in (("predicted", 2), ("wrench", 6), ("offset", 2)):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, np.zeros(size))
+            getattr(self, name).setflags(write=False)
+
+    def __copy__(self):
+        return self
+
+    def __deepcopy__(self, _):
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class BankTuning:
+    """Constants of a bank."""
+
+    mixtures: IgmmTuning
+    with_torque: bool
+    learns: bool  # False: the models stay as they were given.
+    smoothing: float  # Of the error, per sample: 1 is none.
+    wrench_limit: float  # At which the sensor saturates [N], [N m].
+    error_unknown: float  # What the error is said to be without a wrench [N].
+    handover: int = 10  # Samples for which a step is handed over; 0: never.
+    rows: float = 0.0  # From the first row of feet to the second; 0: one point [m].
+    period: float = 0.005  # [s]
+    correction: float = 0.0  # Of the offset, per sample; 0: there is none.
+
+
+def observe(
+    memory: BankMemory,
+    tuning: BankTuning,
+    wrench,
+    velocity,
+    direction,
+    force_directions,
+    mode: int,
+    changes: float | None = None,
+) -> BankMemory:
+    """The memory after one sample: the last prediction's error, learning, the next one.
+
+    Args: wrench (6,), velocity (6,), direction (3,) of the target motion, zero at rest,
+        force_directions (6,) as motion_wrench; mode, of contact_task.py; changes: how
+        many changes of mode were confirmed so far. A mode that changes without one was
+        announced; None: none is.
+
+    A mode without a model gets an empty one, which predicts that nothing will change
+    until it has learned (if nothing is learned: zero). In FREE_MODE and UNKNOWN_MODE
+    the prediction is zero, and the error the force that is there. A wrench that is not
+    finite or at its limit teaches nothing: the prediction is zero, and the error
+    error_unknown.
+    """
+    finite = np.all(np.isfinite(wrench)) and np.all(np.isfinite(velocity))
+    if not finite or np.max(np.abs(wrench)) >= tuning.wrench_limit:
+        error = tuning.error_unknown
+        return BankMemory(memory.bank, mode, error=error, status=BAD_WRENCH)
+    size = magnitudes(wrench, velocity, force_directions)
+    actual = size[2:4]
+    # The error of the prediction that was made for this sample.
+    error = abs(actual[0] - memory.predicted[0])
+    if memory.status == BAD_WRENCH:
+        smoothed = error
+    else:
+        smoothed = memory.error + tuning.smoothing * (error - memory.error)
+    if mode < 1:
+        return BankMemory(memory.bank, mode, error=smoothed)
+    bank = memory.bank
+    mixture = bank.get(mode)
+    if mixture is None:
+        mixture = empty_mixture(tuning.mixtures)
+        bank = bank.put(mode, mixture)
+    state = size[:4].copy() if tuning.with_torque else size[[0, 2]]
+    offset = np.zeros(2)
+    if mode == memory.mode and memory.state is not None and memory.left == 0:
+        # One step ahead a model returns towards its mean by a share of what the force
+        # is off by: a small offset that stays, where the force does.
+        off = actual - (memory.predicted - memory.offset)
+        off = np.clip(off, -OFFSET_MOST, OFFSET_MOST)
+        offset = memory.offset + tuning.correction * (off - memory.offset)
+    memory = _handing_over(memory, tuning, mixture, actual, size[0], mode, changes)
+    if memory.left > 0:
+        # What is fed forward belongs to a place that the tool is about to reach: it
+        # cannot be judged by what the sensor says meanwhile.
+        smoothed = memory.error
+    if tuning.learns and memory.state is not None and memory.left == 0:
+        x = np.concatenate([memory.state, actual if tuning.with_torque else actual[:1]])
+        mixture, _ = learned(mixture, x, tuning.mixtures)
+        bank = bank.put(mode, mixture)
+    predicted = np.zeros(2)
+    if mixture.count:
+        n = 2 if tuning.with_torque else 1
+        predicted[:n] = regress(mixture, state)[0]
+    elif tuning.learns:
+        predicted[:] = actual  # Nothing is known but this.
+    if memory.left == 0 and mixture.count:
+        predicted = predicted + offset
+    else:
+        offset = np.zeros(2)
+    if memory.before is not None and memory.left > 0:
+        whole = memory.way >= tuning.rows
+        predicted = _without_force(mixture, state, tuning.with_torque)
+        predicted = memory.before + (1.0 if whole else 0.5) * (
+            predicted - memory.before
+        )
+    # A magnitude; and an extrapolation is not to be trusted beyond what the sensor can
+    # feel.
+    predicted = np.clip(predicted, 0.0, tuning.wrench_limit)
+    return BankMemory(
+        bank,
+        mode,
+        state,
+        predicted,
+        smoothed,
+        against_motion(predicted, direction, velocity, force_directions),
+        OK if mixture.count or tuning.learns else NO_MODEL,
+        memory.before,
+        memory.way,
+        memory.left,
+        memory.count,
+        offset,
+    )
+
+
+# More than that of |F_t|, |tau| in one sample is a change or an impact, which the model
+# follows by itself, and no offset [N], [N m].
+OFFSET_MOST = np.array([0.3, 0.03])
+# A model that has seen fewer samples than this is not handed over.
+SUPPORT_MIN = 20.0
+
+
+def _handing_over(memory, tuning, mixture, actual, speed, mode, changes) -> BankMemory:
+    """The memory with the state of the hand-over: begun, gone on, or over."""
+    confirmed = changes is None or changes != memory.count
+    count = memory.count if changes is None else changes
+    if (
+        not confirmed
+        and tuning.handover > 0
+        and mode != memory.mode
+        and memory.mode >= 1
+        and mixture.support.sum() >= SUPPORT_MIN
+    ):
+        # The mean of what was said and what is: less noise than either.
+        before = 0.5 * (actual + memory.predicted)
+        return replace(
+            memory, before=before, way=0.0, left=tuning.handover, count=count
+        )
+    if memory.before is None:
+        return replace(memory, count=count)
+    way = memory.way + speed * tuning.period
+    left = max(memory.left - 1, 0)
+    before = memory.before
+    if memory.way < tuning.rows <= way:
+        left = tuning.handover
+    elif left == 0 and way >= tuning.rows or mode != memory.mode:
+        before, left = None, 0
+    return replace(memory, before=before, way=way, left=left, count=count)
+
+
+def _without_force(mixture, state, with_torque) -> np.ndarray:
+    """(2,) |F_t|, |tau| that a model has at this speed, whatever the last force was."""
+    n = 2 if with_torque else 1
+    j = int(np.argmax(mixture.support[: mixture.count]))
+    k = slice(j, j + 1)
+    best = Mixture(
+        mixture.mean[k], mixture.factor[k], mixture.support[k], mixture.age[k], 1
+    )
+    # The best supported component: a mean of all would be drawn by rare events, such as
+    # the impacts that end a motion.
+    mean = regress(best, state[:n])[0]  # Of [|F_t|, |tau|, |F_t|', |tau|'].
+    out = np.zeros(2)
+    out[:n] = mean[n:]
+    return out
+
+
+# Slower than this, a direction of turning is noise [rad/s].
+TURNING_MIN = 0.05
+
+
+def against_motion(predicted, direction, velocity, force_directions) -> np.ndarray:
+    """The wrench (6,) of magnitudes predicted (2,) against the motion.
+
+    The force is along -direction (3,), without its parts along force_directions; the
+    torque against the measured turning, zero where that is slower than TURNING_MIN.
+    """
+    wrench = np.zeros(6)
+    d = motion_part(direction, force_directions)
+    length = np.sqrt(np.sum(d * d))
+    if length > 1e-6:
+        wrench[:3] = -predicted[0] / length * d
+    w = np.asarray(velocity)[3:]
+    turning = np.sqrt(np.sum(w * w))
+    if turning > TURNING_MIN:
+        wrench[3:] = -predicted[1] / turning * w
+    return wrench
+
+
+def motion_part(direction, force_directions) -> np.ndarray:
+    """direction (3,) without its parts along the rows of force_directions (6,)."""
+    wrench = np.zeros(6)
+    wrench[:3] = direction
+    d = motion_wrench(wrench, force_directions)[:3]
+    return d if np.all(np.isfinite(d)) else np.zeros(3)
+
+
+def warm_up(tuning: BankTuning) -> None:
+    """Compiles what a sample calls, for writeable arrays as a port gives them."""
+    zero, n = np.zeros(6), np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0])
+    memory = BankMemory(ModelBank((), tuning.with_torque))
+    for _ in range(3):
+        memory = observe(memory, tuning, zero, zero, np.ones(3), n, 1)

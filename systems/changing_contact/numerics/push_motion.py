@@ -1,0 +1,134 @@
+"""The motions between two pushes of a ball, in a frame that moves with the ball.
+
+In that frame the ball lies still, so a motion needs no new plan as it rolls, and a
+contact with it is at the same place push after push. The frame has the world's axes and
+height; its origin is under the ball.
+
+    BALL   lift, pass over the ball, come down behind it; ends in a contact
+    TABLE  lift, go ahead of the ball, come down on the table, slide sideways on it
+
+Segments tell what is met: the ball in segment BALL_SEGMENT of the one, the table in
+TABLE_SEGMENT of the other.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from makebreak.systems.changing_contact.numerics.motion_pattern import (
+    MotionPattern,
+    Segment,
+    segment_time,
+)
+
+BALL, TABLE = 0, 1
+BALL_SEGMENT, TABLE_SEGMENT = 0, 1
+DOWN = np.array([0.0, 0.0, -1.0])
+N_FRAME = 7  # Origin (3) [m], its velocity (3) [m/s], when it was there [s].
+
+
+@dataclass
+class PushConfig:
+    """The shape of the motions."""
+
+    reposition_sec: float = 0.4  # Of lift, over and land, if nothing slows it.
+    lift: float = 0.015  # Clearance over the ball as modelled [m].
+    land_behind: float = 0.018  # The ball's centre, along the way [m].
+    press: float = 1.0  # On the ball that was met, until the push begins [N],
+    press_table: float = 2.5  # and on the table [N].
+    land_ahead: float = 0.075  # On the table, before the ball's centre [m].
+    slide: float = 0.04  # On the table, sideways [m].
+
+
+SLIDE_SPEED = 0.08  # [m/s]
+REFERENCE_WAY = 0.11  # [m] A way that is longer takes longer.
+BEYOND = 0.02  # [m] A motion into a contact is planned so far behind the model's.
+PRESS_WAY, PRESS_SEC = 0.002, 0.2  # Along the contact, where force decides.
+HOP_SPEED = 0.3  # From the ball to over the table, and down on it [m/s].
+
+
+def frame_at(frame, t):
+    """Origin (3,) [m] at time t [s] of a frame (N_FRAME,)."""
+    return frame[:3] + (t - frame[6]) * frame[3:6]
+
+
+def moved_frame(frame, t, p_ball, v_ball, follow_sec):
+    """The frame from time t on: it goes on from where it is, with a velocity that
+    brings it under the ball within about follow_sec.
+
+    Args: p_ball, v_ball (3,), as estimated, of which x and y count.
+    Returns: (N_FRAME,).
+    """
+    p = frame_at(frame, t)
+    v = v_ball + (p_ball - p) / follow_sec
+    v = frame[3:6] + 0.5 * (v - frame[3:6])
+    v[2] = 0.0
+    return np.concatenate([p, v, [t]])
+
+
+def frame_under(p_ball, v_ball, t):
+    """A frame (N_FRAME,) under the ball, with its velocity."""
+    return np.array([*p_ball[:2], 0.0, *v_ball[:2], 0.0, t])
+
+
+def _segment(kind, points, start, seconds, targets=(), n=DOWN):
+    return Segment(
+        kind,
+        np.array(points),
+        np.array([start, start + seconds]),
+        force_directions=np.array([n] * len(targets)).reshape(-1, 3),
+        force_targets=np.array(targets),
+    )
+
+
+def ball_pattern(config, start, heading, radius_ball, radius_tip, a_max):
+    """Over the ball and down behind it.
+
+    Args: start (3,) in the frame [m]; heading (2,) unit vector in which the ball is to
+        be pushed; the radii as modelled [m]; a_max [m/s2].
+    """
+    centre, reach = radius_ball, radius_ball + radius_tip
+    top = centre + reach + config.lift
+    surface = centre + np.sqrt(reach**2 - config.land_behind**2)
+    land = np.append(-config.land_behind * heading, surface)
+    top = max(top, start[2] + 0.005)
+    rise = start + [0.0, 0.0, 0.6 * (top - start[2])]
+    over = np.append(0.5 * (start[:2] + land[:2]), top)
+    fall = land + [0.0, 0.0, 0.5 * (top - land[2])]
+    end = land + BEYOND * DOWN
+    n = np.array([0.0, 0.0, centre]) - land
+    n /= np.linalg.norm(n)
+    points = np.array([start, rise, over, fall, end])
+    way = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
+    seconds = config.reposition_sec * max(1.0, way / REFERENCE_WAY)
+    return MotionPattern(
+        (
+            _segment("spline", points, 0.0, seconds),
+            _segment(
+                "line", [end, end + PRESS_WAY * n], seconds, PRESS_SEC,
+                [config.press], n,
+            ),
+        ),
+        a_max,
+    )  # fmt: skip
+
+
+def table_pattern(config, start, heading, radius_ball, radius_tip, a_max):
+    """Ahead of the ball and down on the table, then sideways. Args: as ball_pattern."""
+    side = np.array([heading[1], -heading[0], 0.0])  # Out of a circle run to the left.
+    ahead = np.append(config.land_ahead * heading, 2.0 * radius_ball + radius_tip)
+    down = np.append(config.land_ahead * heading, radius_tip - BEYOND)
+    hop = segment_time(float(np.linalg.norm(ahead - start)), HOP_SPEED, a_max)
+    fall = segment_time(ahead[2] - down[2], HOP_SPEED, a_max, stops=False)
+    slide = segment_time(config.slide, SLIDE_SPEED, a_max)
+    return MotionPattern(
+        (
+            _segment("line", [start, ahead], 0.0, hop),
+            _segment("line", [ahead, down], hop, fall),
+            _segment(
+                "line", [down, down + config.slide * side], hop + fall, slide,
+                [config.press_table],
+            ),
+        ),
+        a_max,
+    )  # fmt: skip

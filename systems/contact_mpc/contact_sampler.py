@@ -1,0 +1,191 @@
+"""Where to touch next, as a system: see numerics/contact_sampling.py."""
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Protocol
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.framework import LeafSystem
+
+from makebreak.systems.contact_mpc.numerics.ball_state import N_X
+from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Problem
+from makebreak.systems.contact_mpc.numerics.contact_sampling import (
+    ObjectShape,
+    SamplingConfig,
+    SamplingMemory,
+    sample_round,
+    score_plans,
+)
+from makebreak.systems.contact_mpc.numerics.lcs import is_finite
+from makebreak.systems.contact_mpc.numerics.push_task import CONTACT, errors
+from makebreak.systems.numerics.timing import timed
+
+PLACES_MAX = 1000  # In a round.
+
+
+class SamplerStatus(IntEnum):
+    """The `status` port: 0 is good, anything else says why the last place is held."""
+
+    CHOSEN = 0
+    NONE_YET = 1
+    NOT_FINITE = 2  # x, x_desired, goal or r_comp.
+    NOT_SEEN = 3
+    NO_PLAN = 4  # From no place.
+
+
+class Model(Protocol):
+    """What makes the LCS of many states: AnitescuLcs of lcs_builder.py."""
+
+    n_x: int
+    n_u: int
+    n_lam: int
+    dt_sec: float
+    x_default: np.ndarray
+
+    def build_many(self, x, u) -> tuple[np.ndarray, ...]: ...
+
+
+@dataclass
+class ContactSamplerConfig:
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    angle_radius: float = 0.12  # An angle to the goal counts as so much of a way [m].
+    residual_dt_sec: float = 0.05  # Time step at which r_comp is a velocity.
+    # Of a round, in wall-clock time; what is not scored by then is not looked at.
+    # Infinite: all of it, and runs repeat bit for bit.
+    budget_sec: float = np.inf
+    period_sec: float = 0.1
+    offset_sec: float = 0.0
+
+
+class ContactSampler(LeafSystem):
+    """Chooses the place beside an object where the tip is to touch it.
+
+    Inputs:  x (19,) of numerics/ball_state.py; x_desired ((N + 1) 19,) of C3;
+             goal (3,) = x, y [m], yaw [rad]; phase (1,) of PushTask; valid (1,): 1 if
+             the object is seen; r_comp (n_lam,) [m/s at residual_dt_sec], optional: it
+             counts in every plan, and where the object turns out to reach farther out,
+             the places do too.
+    Outputs: command (3,) = [number, x, y]: a place in the object's frame, seen from
+             above [m]; each new number is a new command to go there, 0: none yet;
+             status (1,): a SamplerStatus; round (abstract): the last Round, or None.
+
+    What is not finite, not seen, or has no plan, leaves the command as it is.
+
+    Args: config; model, the planner's; problem, what is planned with, as C3Mpc has it;
+        shape of the object and the tip.
+    """
+
+    def __init__(
+        self,
+        config: ContactSamplerConfig,
+        model: Model,
+        problem: C3Problem,
+        shape: ObjectShape,
+    ):
+        super().__init__()
+        _check(config)
+        self._config, self._model, self._shape = config, model, shape
+        self._problem = p = problem
+        if (model.n_x, model.n_u, model.n_lam) != (p.n_x, p.n_u, p.n_lam):
+            raise ValueError(
+                f"ContactSampler: the model has (n_x, n_u, n_lam) = "
+                f"{model.n_x, model.n_u, model.n_lam}, the weights are for "
+                f"{p.n_x, p.n_u, p.n_lam}"
+            )
+        self._x = self.DeclareVectorInputPort("x", N_X)
+        n_knots = p.options.N + 1
+        self._x_desired = self.DeclareVectorInputPort("x_desired", n_knots * N_X)
+        self._goal = self.DeclareVectorInputPort("goal", 3)
+        self._phase = self.DeclareVectorInputPort("phase", 1)
+        self._valid = self.DeclareVectorInputPort("valid", 1)
+        self._r_comp = self.DeclareVectorInputPort("r_comp", p.n_lam)
+        self._memory = self.DeclareAbstractState(Value[object](SamplingMemory()))
+        self._round = self.DeclareAbstractState(Value[object](None))
+        self._command = self.DeclareDiscreteState(3)
+        self._status = self.DeclareDiscreteState([float(SamplerStatus.NONE_YET)])
+        self.DeclareStateOutputPort("command", self._command)
+        self.DeclareStateOutputPort("status", self._status)
+        self.DeclareStateOutputPort("round", self._round)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(
+            config.period_sec, config.offset_sec, self._update
+        )
+        x = model.x_default[None]  # Compiles.
+        lcs = model.build_many(x, np.zeros(p.n_u))
+        score_plans(lcs, x, np.tile(x, (n_knots, 1)), p)
+
+    @timed
+    def _update(self, context, state):
+        status = self._sample(context, state)
+        state.get_mutable_discrete_state(self._status).set_value([float(status)])
+
+    def _sample(self, context, state) -> SamplerStatus:
+        c, p = self._config, self._problem
+        x, x_desired, goal, phase, valid = (
+            np.asarray(port.Eval(context))
+            for port in (self._x, self._x_desired, self._goal, self._phase, self._valid)
+        )
+        gap = np.zeros(p.n_lam)  # Learned [m].
+        if self._r_comp.HasValue(context):
+            gap = np.asarray(self._r_comp.Eval(context)) * c.residual_dt_sec
+        r = gap / self._model.dt_sec
+        if not all(is_finite(a) for a in (x, x_desired, goal, phase, valid, r)):
+            return SamplerStatus.NOT_FINITE
+        if not valid[0] > 0.5:
+            return SamplerStatus.NOT_SEEN
+        memory = context.get_abstract_state(int(self._memory)).get_value()
+        length, angle = errors(x, goal)
+        try:
+            memory, found = sample_round(
+                c.sampling, memory, self._model.build_many, p, self._shape, x,
+                x_desired.reshape(-1, N_X), length + c.angle_radius * angle,
+                phase[0] == CONTACT, context.get_time(), r, c.budget_sec,
+                max(0.0, -float(gap.min())),
+                tuple(goal.tolist()),
+            )  # fmt: skip
+        except ValueError:  # An object on edge has no outline.
+            return SamplerStatus.NO_PLAN
+        abstract = state.get_mutable_abstract_state
+        abstract(int(self._memory)).set_value(memory)
+        abstract(int(self._round)).set_value(found)
+        if memory.place is not None:
+            state.get_mutable_discrete_state(self._command).set_value(
+                [float(memory.go), *memory.place]
+            )
+        if not np.isfinite(found.cost[found.chosen]):
+            return SamplerStatus.NO_PLAN
+        return SamplerStatus.CHOSEN
+
+
+def _check(config: ContactSamplerConfig) -> None:
+    """Raises: ValueError for a config out of range, by name."""
+    c = config.sampling
+    if c.places != int(c.places) or not 1 <= c.places <= PLACES_MAX:
+        raise ValueError(
+            f"sampling.places is {c.places}, expected an integer from 1 to {PLACES_MAX}"
+        )
+    for name in ("clearance", "height", "stuck_sec"):
+        if not 0.0 < getattr(c, name) < np.inf:
+            raise ValueError(f"sampling.{name} is {getattr(c, name)}, expected > 0")
+    for name in ("travel", "push"):
+        if not 0.0 <= getattr(c, name) < np.inf:
+            raise ValueError(f"sampling.{name} is {getattr(c, name)}, expected >= 0")
+    for name in ("hysteresis", "reach"):
+        if np.shape(getattr(c, name)) != (2,):
+            raise ValueError(
+                f"sampling.{name} is {getattr(c, name)}, expected two numbers"
+            )
+    share, absolute = c.hysteresis
+    if not (0.0 <= share < 1.0 and absolute >= 0.0):
+        raise ValueError(
+            f"sampling.hysteresis is {c.hysteresis}, expected [share, cost] with "
+            "0 <= share < 1 and cost >= 0"
+        )
+    if not 0.0 <= c.reach[0] < c.reach[1]:
+        raise ValueError(
+            f"sampling.reach is {c.reach}, expected [least, most] from the world's "
+            "origin in metres"
+        )
+    for name in ("budget_sec", "residual_dt_sec", "period_sec"):
+        if not getattr(config, name) > 0.0:
+            raise ValueError(f"{name} is {getattr(config, name)}, expected > 0")

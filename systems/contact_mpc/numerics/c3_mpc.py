@@ -1,0 +1,834 @@
+"""Consensus complementarity control: model predictive control through contact.
+
+ADMM on z_k = [x_k, lam_k, u_k] (for C3+ also eta_k, the gap velocity): copies delta of
+z obey the complementarity, z obeys the dynamics, and w drives them together. A round:
+
+    1. z <- argmin  sum (x - x_desired)'Q(x - x_desired) + (u - u_prev)'R(u - u_prev)
+                        + |z - (delta - w)|^2_G  subject to dynamics, x_0, bounds
+       (c3_qp.py; the last knot's state is weighed by Q_N)
+    2. delta <- projection of z + w, knot by knot (c3_projections.py)
+    3. w <- (w + z - delta) / rho,  G <- rho G
+
+and after the last round step 1 once more gives the plan (for C3+ with the target delta
+instead of delta - w). Where u does not act on the gap (H = 0), lam_0 follows from x_0
+alone and is fixed beforehand.
+
+Source: Aydinoglu, Wei, Huang, Posa, arXiv:2304.11259, algorithm 1; ACI-MPC section IV.
+docs/c3.md lists every choice in which implementations differ.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from numbers import Integral
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from makebreak.systems.contact_mpc.numerics.c3_polish import polish
+from makebreak.systems.contact_mpc.numerics.c3_projections import (
+    FAILED,
+    ExactProjection,
+    PlusProjection,
+    Projection,
+    QpProjection,
+    project,
+    project_plus,
+    projection_matrices,
+)
+from makebreak.systems.contact_mpc.numerics.c3_qp import (
+    factor,
+    new_factor,
+    solve,
+    solve_bounded,
+    within,
+)
+from makebreak.systems.contact_mpc.numerics.lcp import SOLVED, solve_lcp_kernel
+from makebreak.systems.contact_mpc.numerics.lcs import (
+    FREE,
+    LCS,
+    fix_modes,
+    fixed_forces,
+    is_finite,
+    is_finite_model,
+    opening_speed,
+    simulate,
+)
+from makebreak.systems.contact_mpc.numerics.orientation_cost import (
+    orientation_quadratic,
+    squared_angle,
+)
+
+
+class C3Failure(RuntimeError):
+    """A solve that has no result, with the reason: bounds, an LCP, an indefinite QP."""
+
+
+def _required() -> Any:
+    return field(default_factory=lambda: np.zeros(0))
+
+
+@dataclass
+class OrientationWeight:
+    """The squared angle [rad^2] between a quaternion of x and that of x_desired."""
+
+    start: int = 0  # Of the quaternion [w x y z] in x.
+    weight: float = 0.0  # [1/rad^2]
+    weight_N: float | None = None  # At the last knot; None: weight.
+
+
+@dataclass
+class C3Weights:
+    """Diagonals, or matrices (G and U: diagonal ones), in the units of 1 / z^2.
+
+    z = [x, lam, u] for C3 and [x, lam, u, eta] for C3+. All but Q_N must be given (the
+    empty defaults, which C3Problem refuses, are what yaml_load_typed needs).
+    """
+
+    Q: np.ndarray = _required()  # (n_x,) state, >= 0.
+    R: np.ndarray = _required()  # (n_u,) input, >= 0, and with G's u part > 0.
+    G: np.ndarray = _required()  # (n_z,) consensus; lam and eta > 0, x and u >= 0.
+    U: np.ndarray = _required()  # (n_z,) projection; lam and eta (C3: and x) > 0.
+    Q_N: np.ndarray | None = None  # (n_x,) last state; None: Q.
+    # Beside Q, which must be zero at these quaternions.
+    orientation: list[OrientationWeight] = field(default_factory=list)
+
+
+@dataclass
+class C3Options:
+    N: int = 5  # Knots, each lcs.dt long.
+    rounds: int = 3  # ADMM rounds.
+    rho: float = 2.0  # Growth of G per round, >= 1.
+    penalise_input_change: bool = False  # (u - u_prev)'R(u - u_prev), else u'R u.
+    scale_lam: bool = False  # Solve in lam / s, s = |A|_F / |D|_F.
+    start_at_x0: bool = False  # delta starts with x_0 in its x part instead of zero.
+    warm_start: bool = False  # delta and w start where the last solve ended.
+    polish: int = (
+        0  # Rollouts on the LCS that improve the plan (c3_polish.py); 0: none.
+    )
+
+
+@dataclass
+class C3Bounds:
+    """Of every u_k and of x_1 .. x_N; None, or infinite entries: no bound."""
+
+    u_lower: np.ndarray | None = None  # (n_u,) [N]
+    u_upper: np.ndarray | None = None  # (n_u,) [N]
+    x_lower: np.ndarray | None = None  # (n_x,) [SI]
+    x_upper: np.ndarray | None = None  # (n_x,) [SI]
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What C3 intends; u obeys its bounds exactly, x to 1e-6 of their size.
+
+    A polished plan is the LCS's own rollout of u, of which C3 knew an approximation:
+    lam is exact, and x breaches its bounds where that approximation hid it.
+    """
+
+    x: np.ndarray  # (N + 1, n_x) [SI]
+    u: np.ndarray  # (N, n_u) [N]
+    lam: np.ndarray  # (N, n_lam) [N]; complementary only as far as ADMM got.
+    status: int = 0  # 0: of this tick. Else the reason why it is an older one.
+    time: float | None = None  # Of x[0] [s]; None: unknown, or no plan has been made.
+    dt: float = 0.0  # Between knots [s].
+    # Of all rounds' knots, those whose exact projection ended at its nodes_max.
+    cut_projections: int = 0
+
+    def __post_init__(self):
+        for name in ("x", "u", "lam"):
+            getattr(self, name).setflags(write=False)
+
+    def at(self, times):
+        """x (n, n_x) and u (n, n_u) at times (n,) [s]: x linear between the knots and
+        still beyond the last, u held from each knot to the next and beyond the last.
+
+        Raises: ValueError where the plan has no time.
+        """
+        if self.time is None or not self.dt > 0.0:
+            raise ValueError(
+                f"Plan: time is {self.time} and dt {self.dt}, expected a plan in time"
+            )
+        N = len(self.u)
+        # Times are sums of periods: their rounding must not delay a knot by one.
+        knots = (np.asarray(times, float) - self.time) / self.dt + 1e-6
+        before = np.clip(np.floor(knots).astype(int), 0, N - 1)
+        share = np.clip(knots - before, 0.0, 1.0)[:, None]
+        x = (1.0 - share) * self.x[before] + share * self.x[before + 1]
+        return x, self.u[before]
+
+
+@dataclass(frozen=True, eq=False)
+class WarmStart:
+    """A solve's memory; the lam and eta parts are in newtons and m/s, not scaled."""
+
+    u: np.ndarray  # (N, n_u) last inputs, for the input-change penalty [N]
+    delta: np.ndarray  # (N, n_z)
+    w: np.ndarray  # (N, n_z)
+
+    def shifted(self, knots: float, contacts=None) -> "WarmStart":
+        """delta and w moved ahead in time by knots (0 .. 1), linear between knots.
+
+        Args: contacts: (of, to, starts). The contacts that the forces belonged to at
+            each knot and belong to now, (N, n_lam) each, and where in z the entries per
+            force begin. What is known of a force goes with its contact; of a contact
+            that is new it is zero. None: they are the same.
+        """
+
+        def ahead(a):
+            after = np.vstack([a[1:], a[-1:]])
+            if contacts is not None:
+                of, to, starts = contacts
+                a = moved_with_contacts(a, of, to, starts)
+                of_after = np.vstack([of[1:], of[-1:]])
+                after = moved_with_contacts(after, of_after, to, starts)
+            return (1.0 - knots) * a + knots * after
+
+        return WarmStart(self.u, ahead(self.delta), ahead(self.w))
+
+
+def moved_with_contacts(a, of, to, starts):
+    """a (N, n_z), whose rows' entries per force belong to the contacts of (N, n_lam),
+    for the contacts to (N, n_lam); starts: where these entries begin in a row.
+
+    The forces of a contact keep their order in it.
+    """
+    if (of == to).all():
+        return a
+    moved, n_lam = a.copy(), of.shape[1]
+    for k in np.flatnonzero((of != to).any(axis=1)):
+        old = {key: i for i, key in enumerate(_in_their_contacts(of[k]))}
+        came_from = [old.get(key, -1) for key in _in_their_contacts(to[k])]
+        for start in starts:
+            entries = np.append(a[k, start : start + n_lam], 0.0)
+            moved[k, start : start + n_lam] = entries[came_from]
+    return moved
+
+
+def _in_their_contacts(contact):
+    """(its contact, its place in it) of each force."""
+    seen: dict = {}
+    for number in contact.tolist():
+        seen[number] = seen.get(number, -1) + 1
+        yield number, seen[number]
+
+
+class C3Problem:
+    """Weights, projection, options and bounds, checked once and ready for `solve_c3`.
+
+    Raises: ValueError, naming the entry, where one is of the wrong shape or sign.
+    """
+
+    def __init__(
+        self,
+        weights: C3Weights,
+        projection: Projection | None = None,
+        options: C3Options | None = None,
+        bounds: C3Bounds | None = None,
+    ):
+        self.projection = PlusProjection() if projection is None else projection
+        self.options = C3Options() if options is None else options
+        _check_options(self.options, self.projection)
+        self.is_plus = isinstance(self.projection, PlusProjection)
+        self.Q, self.R = _square("Q", weights.Q), _square("R", weights.R)
+        self.Q_N = self.Q if weights.Q_N is None else _square("Q_N", weights.Q_N)
+        self.n_x, self.n_u = len(self.Q), len(self.R)
+        self._Q = self.Q[None]
+        self.orientation = [self._checked(o, weights) for o in weights.orientation]
+        if self.Q_N.shape != self.Q.shape:
+            raise ValueError(
+                f"C3Weights.Q_N is {self.Q_N.shape}, expected {self.Q.shape} as Q"
+            )
+        self.G, self.U = _diagonal("G", weights.G), _diagonal("U", weights.U)
+        self.n_z = self.G.size
+        n_contact = self.n_z - self.n_x - self.n_u
+        self.n_lam = n_contact // 2 if self.is_plus else n_contact
+        self._check_consensus_weights(n_contact)
+        bounds = C3Bounds() if bounds is None else bounds
+        self.lower = self._bound(-np.inf, u=bounds.u_lower, x=bounds.x_lower)
+        self.upper = self._bound(np.inf, u=bounds.u_upper, x=bounds.x_upper)
+        for i in np.flatnonzero(~(self.lower <= self.upper)):
+            raise ValueError(
+                f"C3Bounds: {self.lower[i]} to {self.upper[i]} for entry "
+                f"{i - self.n_lam} of [u, x], expected lower <= upper"
+            )
+
+    def _checked(self, o, weights):
+        name = f"C3Weights.orientation: OrientationWeight({o.start}, {o.weight})"
+        if o.start != int(o.start) or not 0 <= o.start <= self.n_x - 4:
+            raise ValueError(
+                f"{name} starts at {o.start}, expected an integer from 0 to "
+                f"{self.n_x - 4}"
+            )
+        for weight in (o.weight, 0.0 if o.weight_N is None else o.weight_N):
+            if not 0.0 <= weight < np.inf:
+                raise ValueError(f"{name}: {weight}, expected a number >= 0")
+        of = slice(o.start, o.start + 4)
+        for matrix in (self.Q, self.Q_N):
+            if matrix[of].any():
+                raise ValueError(
+                    f"{name}: Q weighs the quaternion's numbers too, expected zeros "
+                    "there"
+                )
+        return o
+
+    def _check_consensus_weights(self, n_contact):
+        parts = "[x, lam, u, eta]" if self.is_plus else "[x, lam, u]"
+        odd = self.is_plus and n_contact % 2
+        if n_contact < 1 or odd or self.U.size != self.n_z:
+            raise ValueError(
+                f"C3Weights: G has {self.n_z} and U {self.U.size} entries, expected "
+                f"one per entry of {parts} with {self.n_x} of x and {self.n_u} of u"
+            )
+        i_u = self.n_x + self.n_lam
+        needed = np.zeros(self.n_z, bool)
+        needed[self.n_x : i_u] = needed[i_u + self.n_u :] = True
+        for name, weight in (("G", self.G), ("U", self.U)):
+            if name == "U" and not self.is_plus:
+                needed[: self.n_x] = True  # That projection moves x.
+            for i in np.flatnonzero((weight < 0.0) | (needed & (weight == 0.0))):
+                raise ValueError(
+                    f"C3Weights.{name}[{i}] is {weight[i]}, expected "
+                    f"{'> 0' if needed[i] else '>= 0'} (order {parts})"
+                )
+        G_u = self.G[i_u : i_u + self.n_u]
+        if not np.linalg.eigvalsh(self.R + np.diag(G_u))[0] > 0.0:
+            raise ValueError(
+                f"C3Weights: R = {self.R.tolist()} and G of u = {G_u} leave an input "
+                "without cost, expected R + G > 0"
+            )
+
+    def _bound(self, unbounded, u, x):
+        """A bound over [lam, u, x]; lam has none here (the projection keeps it)."""
+        parts = [np.full(self.n_lam, unbounded)]
+        for name, value, n in (("u", u, self.n_u), ("x", x, self.n_x)):
+            part = np.full(n, unbounded) if value is None else np.asarray(value, float)
+            if part.shape != (n,) or np.isnan(part).any():
+                raise ValueError(
+                    f"C3Bounds: {name} is bounded by {part}, expected {n} numbers"
+                )
+            parts.append(part)
+        return _read_only(np.concatenate(parts))
+
+    def state_cost(self, x0, x_desired):
+        """Q of the knots, of the last one, and targets: (x - target)' Q (x - target).
+
+        Without orientation weights Q (1, n_x, n_x) is that of the weights. With them
+        the knots' Q (N, n_x, n_x), Q_N and the targets (N + 1, n_x) are the quadratic
+        of the angles' cost about the orientation of x0.
+        """
+        if not self.orientation:
+            return self._Q, self.Q_N, x_desired
+        N = self.options.N
+        Q, goal = np.tile(self.Q, (N, 1, 1)), x_desired.copy()
+        Q_N = self.Q_N.copy()
+        for o in self.orientation:
+            of = slice(o.start, o.start + 4)
+            for k in range(N + 1):
+                whole = Q_N if k == N else Q[k]
+                for name, q in (("x0", x0[of]), (f"x_desired[{k}]", x_desired[k, of])):
+                    if not np.linalg.norm(q) > 0.5:
+                        raise C3Failure(
+                            f"{name}: the quaternion at {o.start} is {q}, expected a "
+                            "unit one"
+                        )
+                weight = o.weight if k < N or o.weight_N is None else o.weight_N
+                local, goal[k, of] = orientation_quadratic(x0[of], x_desired[k, of])
+                whole[of, of] += weight * local
+        for a in (Q, Q_N):
+            a.setflags(write=False)  # To the compiler another type, like p.Q's.
+        return Q, Q_N, goal
+
+    def cold_start(self) -> WarmStart:
+        N = self.options.N
+        z = np.zeros((N, self.n_z))
+        return WarmStart(np.zeros((N, self.n_u)), z, z)
+
+
+def _check_options(o: C3Options, projection: Projection):
+    if not isinstance(projection, Projection):
+        raise ValueError(
+            f"C3: projection is {projection!r}, expected PlusProjection(), "
+            "QpProjection(alpha) or ExactProjection()"
+        )
+    for name in ("N", "rounds", "polish"):
+        number = getattr(o, name)
+        if isinstance(number, bool) or not isinstance(number, Integral):
+            raise ValueError(f"C3Options.{name} is {number!r}, expected an integer")
+    if o.N < 1 or o.rounds < 0:
+        raise ValueError(
+            f"C3Options: N = {o.N} knots and rounds = {o.rounds}, expected N >= 1 and "
+            "rounds >= 0"
+        )
+    if o.polish < 0:
+        raise ValueError(f"C3Options.polish is {o.polish}, expected at least 0")
+    if not 1.0 <= o.rho < np.inf:
+        raise ValueError(f"C3Options.rho is {o.rho}, expected a number >= 1")
+    if isinstance(projection, ExactProjection) and not (
+        isinstance(projection.nodes_max, Integral) and projection.nodes_max >= 1
+    ):
+        raise ValueError(
+            f"ExactProjection.nodes_max is {projection.nodes_max!r}, expected an "
+            "integer of at least 1"
+        )
+    if isinstance(projection, QpProjection) and not 0.0 < projection.alpha <= 1.0:
+        raise ValueError(
+            f"QpProjection.alpha is {projection.alpha}, expected more than 0, at most 1"
+        )
+
+
+def _read_only(a):
+    a = np.array(a, dtype=float, order="C")
+    a.setflags(write=False)
+    return a
+
+
+def _square(name, weight):
+    """A symmetric positive semi-definite matrix, from it or from its diagonal."""
+    weight = np.atleast_1d(np.asarray(weight, dtype=float))
+    matrix = np.diag(weight) if weight.ndim == 1 else weight
+    n = matrix.shape[0]
+    if matrix.shape != (n, n) or n == 0 or not np.isfinite(matrix).all():
+        raise ValueError(
+            f"C3Weights.{name} is {weight}, expected finite numbers, a diagonal or a "
+            "square matrix"
+        )
+    size = abs(matrix).max()
+    if abs(matrix - matrix.T).max() > 1e-9 * size:
+        raise ValueError(f"C3Weights.{name} is not symmetric: {matrix.tolist()}")
+    least = np.linalg.eigvalsh(matrix)[0]
+    if least < -1e-9 * size:
+        raise ValueError(
+            f"C3Weights.{name} has the eigenvalue {least:.3g}, expected none below 0"
+        )
+    return _read_only(0.5 * (matrix + matrix.T))
+
+
+def _diagonal(name, weight):
+    weight = np.asarray(weight, dtype=float)
+    if weight.ndim == 2 and weight.shape[0] == weight.shape[1]:
+        if np.count_nonzero(weight - np.diag(np.diag(weight))):
+            raise ValueError(f"C3Weights.{name} is not diagonal, expected a diagonal")
+        weight = np.diag(weight)
+    if weight.ndim != 1 or not np.isfinite(weight).all():
+        raise ValueError(f"C3Weights.{name} is {weight}, expected finite numbers")
+    return _read_only(weight)
+
+
+# What _qp_step returns beside SOLVED.
+NOT_CONVEX, INFEASIBLE = 1, 2
+_FAILURES = {
+    NOT_CONVEX: "the QP is not strictly convex, or its numbers are not finite",
+    INFEASIBLE: "no plan meets the bounds",
+}
+
+
+def solve_c3(
+    lcs: LCS | Sequence[LCS],
+    x0,
+    x_desired,
+    problem: C3Problem,
+    warm: WarmStart | None = None,
+    modes=None,
+):
+    """One solve of C3, from the state x0.
+
+    Args:
+        lcs: the model, one for the whole horizon, or a list of N, one per knot.
+        x0: (n_x,) [SI].
+        x_desired: (N + 1, n_x), row k the target at knot k.
+        problem: weights, projection, options, bounds.
+        warm: what the last solve returned; None: a first solve. Its u is the u_prev of
+            the input-change penalty; its delta and w are used if options.warm_start.
+        modes: (n, n_lam) contact modes that the first n knots keep, as contact_modes
+            gives them; None: all are free. The forces of contacts that are held closed
+            may come out negative.
+
+    Returns: Plan, and the WarmStart for the next solve.
+    Raises: ValueError on wrong shapes; C3Failure where there is no result.
+    """
+    p, o = problem, problem.options
+    models = given_models = _one_per_knot(lcs, p)
+    if modes is not None and len(modes):
+        modes = np.asarray(modes)
+        if modes.shape[1:] != (p.n_lam,) or len(modes) > o.N:
+            raise ValueError(
+                f"solve_c3: modes is {modes.shape}, expected at most {o.N} rows of "
+                f"{p.n_lam}"
+            )
+        given_models = [models[k % len(models)] for k in range(o.N)]
+        models = [
+            fix_modes(m, modes[k]) if k < len(modes) else m
+            for k, m in enumerate(given_models)
+        ]
+    x0 = np.array(x0, float, order="C")
+    x_desired = np.array(x_desired, float, order="C")
+    if x0.shape != (p.n_x,) or x_desired.shape != (o.N + 1, p.n_x):
+        raise ValueError(
+            f"solve_c3: x0 is {x0.shape} and x_desired {x_desired.shape}, expected "
+            f"{(p.n_x,)} and {(o.N + 1, p.n_x)}"
+        )
+    for name, values in (("x0", x0), ("x_desired", x_desired)):
+        if not is_finite(values):
+            at = np.argwhere(~np.isfinite(values))[0]
+            raise C3Failure(
+                f"{name}{at.tolist()} is {values[tuple(at)]}, expected finite numbers"
+            )
+    warm = problem.cold_start() if warm is None else warm
+    if warm.u.shape != (o.N, p.n_u) or warm.delta.shape != (o.N, p.n_z):
+        raise ValueError(
+            f"solve_c3: warm.u is {warm.u.shape} and warm.delta {warm.delta.shape}, "
+            f"expected {(o.N, p.n_u)} and {(o.N, p.n_z)}"
+        )
+    scale = 1.0
+    if o.scale_lam:
+        A_norm, D_norm = (
+            np.linalg.norm(a) for a in (given_models[0].A, given_models[0].D)
+        )
+        if not 0.0 < D_norm < np.inf:
+            raise C3Failure("D is zero or not finite: there is no scale for lam")
+        scale = float(A_norm / D_norm)
+    # Contact entries of z count in units of scale.
+    i_u = p.n_x + p.n_lam
+    unit = np.ones(p.n_z)
+    unit[p.n_x : i_u] = unit[i_u + p.n_u :] = scale
+    A, B, D, d, E, F, H, c = (_stacked(models, name) for name in "ABDdEFHc")
+    (AB, d, C, c), E, F, H, pushes = _model(A, B, D, d, E, F, H, c, scale)
+    matrices: list = []
+    if not p.is_plus:
+        for i in np.flatnonzero((p.U[i_u:] == 0.0) & H.any(axis=(0, 1))):
+            raise C3Failure(f"U is 0 for u[{i}], expected > 0 where H is not zero")
+        matrices = [
+            projection_matrices(p.U, *arrays) for arrays in zip(E, F, H, strict=True)
+        ]
+    lam0 = np.empty(0)
+    if not pushes:
+        lam0, status = solve_lcp_kernel(F[0], E[0] @ x0 + c[0])
+        if status != SOLVED:
+            raise C3Failure("lam_0: the LCP at x_0 has no solution")
+    Q, Q_N, x_goal = p.state_cost(x0, x_desired)
+    h = np.zeros((o.N + 1, AB.shape[2]))  # What stays of the QP's linear term.
+    h[:, p.n_lam + p.n_u :] = (
+        x_goal @ Q[0]
+        if len(Q) == 1
+        else np.array([*(Q[k] @ x_goal[k] for k in range(o.N)), Q_N @ x_goal[o.N]])
+    )
+    h[o.N, p.n_lam + p.n_u :] = Q_N @ x_goal[o.N]
+    if o.penalise_input_change:
+        h[: o.N, p.n_lam : p.n_lam + p.n_u] = warm.u @ p.R
+    delta, w = np.zeros((o.N, p.n_z)), np.zeros((o.N, p.n_z))
+    if o.warm_start:
+        delta, w = warm.delta / unit, warm.w / unit
+    elif o.start_at_x0:
+        delta[:, : p.n_x] = x0
+
+    model = AB, d, C, c
+    weights = Q, p.R, Q_N, p.G
+    unbounded = np.isinf(p.lower).all() and np.isinf(p.upper).all()
+    bounds = None if unbounded else (p.lower, p.upper)
+    given, cut = (h, x0, lam0), 0
+    if p.is_plus:
+        status, x, v, delta, w, inputs = _admm_plus(
+            *model, *weights, bounds, p.U, *given, delta, w, o.rounds, o.rho
+        )
+        if status != SOLVED:
+            raise C3Failure(_FAILURES[status])
+    else:
+        lcp = p.projection, p.U, (E, F, H, c), matrices
+        x, v, delta, w, inputs, cut = _admm(
+            model, weights, bounds, given, delta, w, o, lcp
+        )
+    u, lam = np.ascontiguousarray(v[:, p.n_lam :]), v[:, : p.n_lam] * scale
+    if o.polish > 0:
+        ahead = np.vstack([warm.u[1:], warm.u[-1:]])
+        starts = np.concatenate([inputs, warm.u[None], ahead[None]])
+        u_centre = warm.u if o.penalise_input_change else np.zeros_like(u)
+        (u_lower, x_lower), (u_upper, x_upper) = (
+            np.split(bound[p.n_lam :], [p.n_u]) for bound in (p.lower, p.upper)
+        )
+        found = polish(
+            tuple(_stacked(models, name) for name in "ABDdEFHc"),
+            x0,
+            starts,
+            x_goal,
+            u_centre,
+            (Q, p.R, Q_N),
+            (u_lower, u_upper, x_lower, x_upper),
+            o.polish,
+        )
+        if found[3] < np.inf:  # Else no start can be rolled out: C3's plan remains.
+            x, u, lam, _ = found
+    delta, w = delta * unit, w * unit
+    if modes is not None and len(modes):
+        lam = lam.copy()
+        for k, mode in enumerate(modes):
+            m = given_models[k]
+            lam[k] = fixed_forces(m, mode, x[k], u[k], lam[k])
+            fixed = np.flatnonzero(mode != FREE)  # Of their rows nothing was solved.
+            delta[k, p.n_x + fixed], w[k, p.n_x + fixed] = lam[k, fixed], 0.0
+            if p.is_plus:
+                gap = m.E @ x[k] + m.F @ lam[k] + m.H @ u[k] + m.c
+                delta[k, i_u + p.n_u + fixed] = np.maximum(gap[fixed], 0.0)
+                w[k, i_u + p.n_u + fixed] = 0.0
+    plan = Plan(x, u, lam, cut_projections=cut)
+    return plan, WarmStart(plan.u, delta, w)
+
+
+def _one_per_knot(lcs, p: C3Problem) -> list[LCS]:
+    """[lcs], or the N of a list, checked. Raises: ValueError."""
+    models = [lcs] if isinstance(lcs, LCS) else lcs
+    if not isinstance(models, Sequence) or not all(isinstance(m, LCS) for m in models):
+        raise ValueError(
+            f"solve_c3: lcs is a {type(lcs).__name__}, expected an LCS or a list of "
+            f"{p.options.N}"
+        )
+    if not isinstance(lcs, LCS) and len(models) != p.options.N:
+        raise ValueError(
+            f"solve_c3: {len(models)} LCS came, expected one, or {p.options.N} as knots"
+        )
+    for m in models:
+        if (m.n_x, m.n_u, m.n_lam) != (p.n_x, p.n_u, p.n_lam):
+            raise ValueError(
+                f"solve_c3: the LCS has (n_x, n_u, n_lam) = {m.n_x, m.n_u, m.n_lam}, "
+                f"expected {p.n_x, p.n_u, p.n_lam} as the weights"
+            )
+    return list(models)
+
+
+def _stacked(models, name):
+    """That array of all models (K, ...), of C order: one compiled version serves."""
+    if len(models) == 1:
+        return np.ascontiguousarray(getattr(models[0], name))[None]
+    return np.array([getattr(m, name) for m in models])
+
+
+def _admm(model, weights, bounds, given, delta, w, options, lcp):
+    """The rounds of C3, and the last QP: x, v, delta, w, every QP's u, and how many
+    projections were cut short.
+
+    Args: model, weights, bounds as of _qp_step; given: h, x0, lam0 of it; lcp: what
+        `project` needs beside z and delta.
+    Raises: C3Failure.
+    """
+    (Q, R, Q_N, G), (h, x0, lam0) = weights, given
+    (N, n_z), n_lam = delta.shape, model[2].shape[1]
+    sides = np.zeros((N + 1, n_lam + len(R) + len(Q_N)), np.int64)
+
+    def qp_step(G, target):
+        x, v = np.empty((N + 1, len(Q_N))), np.empty((N, n_lam + len(R)))
+        z = np.empty((N, n_z))
+        status = _qp_step(
+            model, (Q, R, Q_N, G), bounds, (h, target, x0, lam0), (z, x, v, sides)
+        )
+        if status != SOLVED:
+            raise C3Failure(_FAILURES[status])
+        return z, x, v
+
+    projection, U, arrays, matrices = lcp
+    K, inputs, cut = len(matrices), np.empty((options.rounds + 1, N, len(R))), 0
+    for r in range(options.rounds):
+        z, _, v = qp_step(G, delta - w)
+        inputs[r] = v[:, n_lam:]
+        delta = np.empty((N, n_z))
+        for k in range(K):
+            knots = slice(None) if K == 1 else slice(k, k + 1)
+            arrays_k = tuple(a[k] for a in arrays)
+            goal = (z + w)[knots]
+            got = project(projection, goal, U, arrays_k, matrices[k], delta[knots])
+            if got == FAILED:
+                raise C3Failure("the projection has no solution")
+            cut += got
+        w = (w + z - delta) / options.rho
+        G = options.rho * G
+    _, x, v = qp_step(G, delta - w)
+    inputs[-1] = v[:, n_lam:]
+    return x, v, delta, w, inputs, cut
+
+
+@njit(cache=True)
+def _model(A, B, D, d, E, F, H, c, scale):
+    """The LCS in lam / scale: the model of _qp_step; E, F, H; whether H is not zero.
+
+    All arrays have the knots first: one for all, or N.
+    """
+    K, n_x, n_lam = D.shape
+    n_v = n_lam + B.shape[2]
+    AB, C = np.empty((K, n_x, n_v + n_x)), np.empty((K, n_lam, n_v + n_x))
+    E, F, H = E / scale, F.copy(), H / scale
+    AB[:, :, :n_lam], AB[:, :, n_lam:n_v], AB[:, :, n_v:] = D * scale, B, A
+    C[:, :, :n_lam], C[:, :, n_lam:n_v], C[:, :, n_v:] = F, H, E
+    pushes = False
+    for number in H[0].flat:
+        pushes |= number != 0.0
+    return (AB, d.copy(), C, c / scale), E, F, H, pushes
+
+
+@njit(cache=True)
+def _admm_plus(
+    AB, d, C, c, Q, R, Q_N, G, bounds, U, h, x0, lam0, delta, w, rounds, rho
+):
+    """The same for C3+, compiled as a whole; the first result is _qp_step's status."""
+    (N, n_z), n_lam = delta.shape, C.shape[1]
+    model = AB, d, C, c
+    x, v = np.empty((N + 1, len(Q_N))), np.empty((N, n_lam + len(R)))
+    z, sides = np.empty((N, n_z)), np.zeros((N + 1, AB.shape[2]), np.int64)
+    inputs = np.zeros((rounds + 1, N, len(R)))
+    for r in range(rounds):
+        status = _qp_step(
+            model, (Q, R, Q_N, G), bounds, (h, delta - w, x0, lam0), (z, x, v, sides)
+        )
+        if status != SOLVED:
+            return status, x, v, delta, w, inputs
+        inputs[r] = v[:, n_lam:]
+        delta = np.empty((N, n_z))
+        project_plus(z + w, U, len(Q_N), n_lam, delta)
+        w = (w + z - delta) / rho
+        G = rho * G
+    status = _qp_step(
+        model, (Q, R, Q_N, G), bounds, (h, delta, x0, lam0), (z, x, v, sides)
+    )
+    inputs[rounds] = v[:, n_lam:]
+    return status, x, v, delta, w, inputs
+
+
+@njit(cache=True)
+def _qp_step(model, weights, bounds, given, found):
+    """One QP of C3; fills found and returns SOLVED, NOT_CONVEX or INFEASIBLE.
+
+    Args:
+        model: AB = [D B A], d, C = [F H E], c, each (K, ...) with K = 1 or N.
+        weights: Q (1 or N, n_x, n_x), R, Q_N and the diagonal G.
+        bounds: lower, upper over [lam, u, x]; None where there are none. (That is
+            another type, for which the methods with bounds are not compiled.)
+        given: h (N + 1, n) the linear term of the planning cost over [lam, u, x],
+            target (N, n_z) of the consensus, x0, lam0 (empty: free).
+        found: z (N, n_z), x (N + 1, n_x), v = [lam, u] (N, n_v), overwritten; sides,
+            the active bounds, from the last round to the next (solve_bounded).
+    """
+    AB, d, C, c = model
+    Q, R, Q_N, G = weights
+    h_plan, target, x0, lam0 = given
+    z, x, v, sides = found
+    K, n_x, n = AB.shape
+    n_lam, n_v, n_z, N = C.shape[1], n - n_x, G.size, v.shape[0]
+    i_eta, plus = n, n_z > n
+    # Stage cost and linear term: the planning cost, and |z - target|^2_G with
+    # eta = C [v, x] + c put in.
+    K_T = max(K, len(Q))
+    T, h = np.zeros((K_T, n, n)), h_plan.copy()
+    T[:, n_lam:n_v, n_lam:n_v] = R
+    for k in range(K_T):
+        T[k, n_v:, n_v:] = Q[k % len(Q)]
+    for i in range(n):
+        at = n_x + i if i < n_v else i - n_v  # Of [v, x] in z = [x, v, eta].
+        for k in range(K_T):
+            T[k, i, i] += G[at]
+        for k in range(N):
+            h[k, i] += G[at] * target[k, at]
+    if plus:
+        for k in range(K_T):
+            for m in range(n_lam):
+                for i in range(n):
+                    a = C[k % K, m, i] * G[i_eta + m]
+                    if a != 0.0:
+                        for j in range(n):
+                            T[k, i, j] += a * C[k % K, m, j]
+        for k in range(N):
+            for m in range(n_lam):
+                a = G[i_eta + m] * (target[k, i_eta + m] - c[k % K, m])
+                for i in range(n):
+                    h[k, i] += a * C[k % K, m, i]
+    fac = new_factor(AB, d, N)
+    if not factor(fac, T, Q_N, np.zeros((0, 0)), lam0.size):
+        return NOT_CONVEX
+    solve(fac, h, x0, lam0, x, v)
+    if bounds is not None:
+        lower, upper = bounds
+        if not within(x, v, lower, upper):
+            if not solve_bounded(fac, T, Q_N, h, x0, lam0, lower, upper, sides, x, v):
+                return INFEASIBLE
+    for k in range(N):
+        z[k, :n_x] = x[k]
+        z[k, n_x:i_eta] = v[k]
+        if plus:
+            for m in range(n_lam):
+                total = c[k % K, m]
+                for i in range(n_v):
+                    total += C[k % K, m, i] * v[k, i]
+                for i in range(n_x):
+                    total += C[k % K, m, n_v + i] * x[k, i]
+                z[k, i_eta + m] = total
+    if not (np.isfinite(x).all() and np.isfinite(v).all()):
+        return NOT_CONVEX
+    return SOLVED
+
+
+def plan_cost(lcs: LCS | Sequence[LCS], x0, u, x_desired, problem: C3Problem) -> float:
+    """What the inputs u (N, n_u) really cost: rolled out with exact contact forces.
+
+    Returns: sum (x - x_desired)'Q(x - x_desired) + u'R u, Q_N at the last state, and
+        the squared angles by their weights. The input-change penalty, ADMM's own terms
+        and the bounds are no part of it.
+    Raises: ValueError if an LCP of the rollout has no solution.
+    """
+    p, x, cost = problem, np.asarray(x0, float), 0.0
+    models = _one_per_knot(lcs, p)
+    for k in range(len(u) + 1):
+        last = k == len(u)
+        e = x - x_desired[k]
+        cost += e @ (p.Q_N if last else p.Q) @ e
+        for o in p.orientation:
+            of = slice(o.start, o.start + 4)
+            weight = o.weight_N if last and o.weight_N is not None else o.weight
+            cost += weight * squared_angle(x[of], x_desired[k][of])
+        if not last:
+            cost += u[k] @ p.R @ u[k]
+            x, _ = simulate(models[k % len(models)], x, u[k])
+    return float(cost)
+
+
+def with_gap_residual(
+    lcs: LCS, r_comp, residual_dt_sec, clamp: bool, sliding_x=None
+) -> LCS:
+    """lcs with the learned residual of its gaps.
+
+    Args:
+        r_comp: (n_lam,) residual [m/s] at the time step residual_dt_sec [s]; as a gap
+            [m] it does not depend on the step, so it counts as r_comp residual_dt / dt.
+        clamp: where the gap phi + r (of geometry) is negative, take it for zero.
+        sliding_x (n_x,): a state at whose sliding speed no contact is to open; None:
+            Anitescu's contacts do (opening_speed).
+    """
+    r = r_comp * (residual_dt_sec / lcs.dt)
+    if clamp and lcs.phi is not None:
+        r = r + np.maximum(0.0, -(lcs.phi + r * lcs.dt)) / lcs.dt
+    if sliding_x is not None:
+        r = r + opening_speed(lcs, sliding_x)
+    return lcs.with_residual(r)
+
+
+def command_step(lcs: LCS, x, u):
+    """x_next (n_x,) and lam (n_lam,) after x under u; C3Failure if there are none."""
+    try:
+        x_next, lam = simulate(lcs, x, u)
+    except ValueError as error:
+        raise C3Failure(f"the command's step: {error}") from error
+    if not (np.isfinite(x_next).all() and np.isfinite(lam).all()):
+        raise C3Failure("the command's step is not finite")
+    return x_next, lam
+
+
+def warm_up(problem: C3Problem):
+    """Compiles what a solve of this problem needs, so that the first is no slower."""
+    p = problem
+    D, E = np.eye(p.n_x, p.n_lam), -np.eye(p.n_lam, p.n_x)
+    H, c = np.zeros((p.n_lam, p.n_u)), -np.ones(p.n_lam)
+    B, F = np.zeros((p.n_x, p.n_u)), np.eye(p.n_lam)
+    lcs = LCS(0.5 * np.eye(p.n_x), B, D, np.zeros(p.n_x), E, F, H, c, 1.0)
+    x0 = np.zeros(p.n_x)
+    try:
+        solve_c3(lcs, x0, np.zeros((p.options.N + 1, p.n_x)), p)
+    except C3Failure:
+        pass  # Bounds may exclude this made-up problem; it is compiled all the same.
+    simulate(lcs, x0, np.zeros(p.n_u))
+    is_finite_model(lcs)

@@ -1,0 +1,258 @@
+"""Linear complementarity problem (LCP): the contact forces of one time step.
+
+Find lam with   0 <= lam   perp   w = F lam + q >= 0.
+
+Lemke's method with lexicographic pivoting: it ends for every F, without cycling, and
+for positive semi-definite F (symmetric or not) it ends either in a solution or in the
+proof that there is none. F of rigid contact is positive semi-definite and singular
+(several friction edges share one normal), so neither a factorisation nor a projected
+iteration on F would be exact.
+
+Source: Cottle, Pang, Stone, "The Linear Complementarity Problem", section 4.4
+(Lemke's method), 4.9 (lexicographic degeneracy resolution).
+"""
+
+import numpy as np
+from numba import njit
+
+from makebreak.systems.contact_mpc.numerics.nearest_point import nearest_mode
+
+# Modes that the search behind Lemke's method looks at.
+NODES_MAX = 2000
+# Status of solve_lcp_kernel.
+SOLVED, NO_SOLUTION, NOT_PRECISE = 0, 1, 2
+
+
+def solve_lcp(F, q):
+    """A solution lam of the LCP; where F is singular it need not be the only one.
+
+    Args:
+        F: (n, n), positive semi-definite (symmetric or not) [m/s per N].
+        q: (n,) gap velocities without contact force [m/s].
+
+    Returns: lam (n,) [N], every entry >= 0. w = F lam + q holds w >= 0 and w lam = 0 to
+        1e-9 of the problem's own scale.
+
+    Raises: ValueError on wrong shapes, entries that are not finite, and when there is
+        no solution (or, for F that is not positive semi-definite, none was found).
+
+    Source: see the module; the method costs about n pivots of n x 2n numbers.
+    """
+    F, q = np.ascontiguousarray(F, dtype=float), np.ascontiguousarray(q, dtype=float)
+    if q.ndim != 1 or F.shape != (q.size, q.size):
+        raise ValueError(
+            f"solve_lcp: F is {F.shape} and q is {q.shape}, expected (n, n) and (n,)"
+        )
+    lam, status = solve_lcp_kernel(F, q)
+    if status == SOLVED:
+        return lam
+    if not np.isfinite(F).all() or not np.isfinite(q).all():
+        raise ValueError("solve_lcp: F or q holds an entry that is not finite")
+    if status == NO_SOLUTION:
+        raise ValueError("solve_lcp: the LCP has no solution (Lemke ended in a ray)")
+    raise ValueError("solve_lcp: no solution precise to 1e-9 (is F nearly singular?)")
+
+
+@njit(cache=True)
+def solve_lcp_kernel(F, q):
+    """solve_lcp for compiled callers: returns (lam, status) and raises nothing.
+
+    Args: F (n, n) and q (n,) are contiguous float64 of matching size.
+    Returns: lam (n,) [N], zero unless status is SOLVED; status, one of the above.
+    """
+    n = q.size
+    lam = np.zeros(n)
+    worst = 0.0
+    for i in range(n):
+        worst = min(worst, q[i])
+        if not np.isfinite(q[i]):
+            return lam, NOT_PRECISE
+        for j in range(n):
+            if not np.isfinite(F[i, j]):
+                return lam, NOT_PRECISE
+    if worst == 0.0:
+        return lam, SOLVED
+    # The same LCP in units in which F has a diagonal of ones and the largest |q| is 1,
+    # so that the tolerances below mean the same for grams and for tonnes.
+    scale, largest = np.ones(n), 0.0
+    for i in range(n):
+        if F[i, i] > 0.0:
+            scale[i] = 1.0 / np.sqrt(F[i, i])
+        largest = max(largest, scale[i] * abs(q[i]))
+    M, b = np.empty((n, n)), np.empty(n)
+    for i in range(n):
+        b[i] = scale[i] * q[i] / largest
+        for j in range(n):
+            M[i, j] = scale[i] * F[i, j] * scale[j]
+    status = NOT_PRECISE
+    # A pivot below the tolerance is taken for rounding. Where that was wrong the check
+    # at the end says so, and another tolerance is tried.
+    for tolerance in (1e-11, 1e-9, 1e-13):
+        z, status = _lemke(M, b, tolerance)
+        if status == SOLVED:
+            if _violation(M, b, z) < 1e-9:
+                for i in range(n):
+                    lam[i] = scale[i] * largest * z[i]
+                return lam, SOLVED
+            status = NOT_PRECISE
+    # Where feasible w leave no room (a wedge), rounding in q alone makes a ray. Then a
+    # slightly regular F tells: its w is wrong by 1e-12 z, which stays below 1e-9 if
+    # there is a solution, and does not shrink with the 1e-12 if there is none.
+    for i in range(n):
+        M[i, i] += 1e-12
+    z, regular = _lemke(M, b, 1e-13)
+    for i in range(n):
+        M[i, i] -= 1e-12
+    if not (regular == SOLVED and _violation(M, b, z) * max(1.0, z.max()) < 1e-9):
+        # Lemke's path may end in a ray although there is a solution, where M is not
+        # positive semi-definite, and rounding may break it where it nearly is not.
+        if not _search(M, b, z):
+            return lam, status
+    for i in range(n):
+        lam[i] = scale[i] * largest * z[i]
+    return lam, SOLVED
+
+
+@njit(cache=True)
+def _search(M, b, z):
+    """Looks for a solution mode by mode; fills z (n,), returns whether there is one."""
+    n = b.size
+    A, distance, size = np.zeros((2 * n, n)), np.zeros(2 * n), 0.0
+    for i in range(n):
+        length = 0.0
+        for j in range(n):
+            length += M[i, j] ** 2
+        length = np.sqrt(length) if length > 0.0 else 1.0
+        for j in range(n):
+            A[i, j] = M[i, j] / length
+        distance[i] = b[i] / length
+        size = max(size, abs(distance[i]))
+        A[n + i, i] = 1.0
+    if not nearest_mode(A, distance, size, np.inf, z, NODES_MAX)[0] < np.inf:
+        return False
+    for i in range(n):
+        w = distance[i]
+        for j in range(n):
+            w += A[i, j] * z[j]
+        if w > z[i] or z[i] < 0.0:
+            z[i] = 0.0
+    return _violation(M, b, z) < 1e-9
+
+
+@njit(cache=True)
+def _lemke(M, b, tolerance):
+    """Lemke's method on w - M z - 1 z0 = b; returns z (n,) and a status."""
+    n = b.size
+    # Columns: w (n; these hold the basis inverse), z (n), z0, right-hand side.
+    T = np.zeros((n, 2 * n + 2))
+    basic = np.arange(n)
+    z0, rhs = 2 * n, 2 * n + 1
+    for i in range(n):
+        T[i, i] = 1.0
+        T[i, n : 2 * n] = -M[i]
+        T[i, z0] = -1.0
+        T[i, rhs] = b[i]
+    # z0 enters for the most negative b; of equal ones the last, which is the
+    # lexicographically smallest row of [b, I].
+    row = 0
+    for i in range(1, n):
+        if b[i] <= b[row]:
+            row = i
+    z = np.zeros(n)
+    entering = z0
+    for _ in range(50 * (n + 1)):
+        leaving = basic[row]
+        _pivot(T, row, entering)
+        basic[row] = entering
+        if leaving == z0:
+            _read(T, M, b, basic, z)
+            return z, SOLVED
+        entering = leaving + n if leaving < n else leaving - n
+        row = _lexicographic_row(T, entering, basic, z0, rhs, tolerance)
+        if row < 0:
+            return z, NO_SOLUTION
+    return z, NOT_PRECISE
+
+
+@njit(cache=True)
+def _pivot(T, row, column):
+    """Makes column of T a unit vector with its one in row."""
+    T[row] /= T[row, column]
+    for i in range(T.shape[0]):
+        if i != row:
+            factor = T[i, column]
+            if factor != 0.0:
+                for j in range(T.shape[1]):
+                    T[i, j] -= factor * T[row, j]
+                T[i, column] = 0.0
+
+
+@njit(cache=True)
+def _lexicographic_row(T, entering, basic, z0, rhs, tolerance):
+    """The row whose [rhs, basis inverse] / pivot is smallest; -1 if nothing bounds."""
+    n = T.shape[0]
+    tied = np.zeros(n, np.bool_)
+    n_tied = 0
+    for i in range(n):
+        if T[i, entering] > tolerance:
+            tied[i] = True
+            n_tied += 1
+    if n_tied == 0:
+        return -1
+    for k in range(n + 1):
+        column = rhs if k == 0 else k - 1
+        smallest = np.inf
+        for i in range(n):
+            if tied[i]:
+                smallest = min(smallest, T[i, column] / T[i, entering])
+        for i in range(n):
+            if tied[i]:
+                gap = T[i, column] / T[i, entering] - smallest
+                if gap > 1e-12 * (1.0 + abs(smallest)):
+                    tied[i] = False
+                    n_tied -= 1
+        if k == 0:
+            for i in range(n):  # z0 may leave: that is the solution.
+                if tied[i] and basic[i] == z0:
+                    return i
+        if n_tied == 1:
+            break
+    for i in range(n):
+        if tied[i]:
+            return i
+    return -1
+
+
+@njit(cache=True)
+def _read(T, M, b, basic, z):
+    """z (n,) of the final basis, with the pivots' rounding refined away."""
+    n = b.size
+    value = T[:, 2 * n + 1].copy()
+    residual = np.empty(n)
+    for _ in range(2):
+        residual[:] = b
+        for k in range(n):
+            if basic[k] < n:
+                residual[basic[k]] -= value[k]
+            else:
+                residual += M[:, basic[k] - n] * value[k]
+        for i in range(n):
+            for j in range(n):
+                value[i] += T[i, j] * residual[j]
+    for k in range(n):
+        if basic[k] >= n:
+            z[basic[k] - n] = max(value[k], 0.0)
+
+
+@njit(cache=True)
+def _violation(M, b, z):
+    """Largest breach of w >= 0 and of w z = 0, of the scale of the terms."""
+    worst, largest = 0.0, 1.0
+    for i in range(b.size):
+        largest = max(largest, z[i])
+    for i in range(b.size):
+        w = b[i]
+        for j in range(b.size):
+            w += M[i, j] * z[j]
+        worst = max(worst, -w, min(abs(w), z[i]))
+    return worst / largest

@@ -1,0 +1,179 @@
+"""Pushing an object to a pose, a contact at a time: what the tip does between plans.
+
+CONTACT  the tip follows C3, which pushes the object towards its goal,
+TRAVEL   the tip goes to another place beside the object: along the table where
+         nothing is in the way, else up, across and down,
+WAIT     the object is not seen, or there is no place to go to: the tip goes up and
+         to where it hides nothing.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from makebreak.systems.contact_mpc.numerics.ball_state import (
+    N_X,
+    P_BALL,
+    P_TIP,
+    Q_BALL,
+    V_TIP,
+)
+from makebreak.systems.contact_mpc.numerics.contact_sampling import (
+    ObjectShape,
+    inward,
+    outline_of,
+    rotation_of,
+    to_world,
+    travel_step,
+)
+
+# CONTACT is what ArmReference follows C3 in (numerics/rolling_task.py: ROLL).
+CONTACT, TRAVEL, WAIT = 0, 1, 2
+# A place moves with the object where that is more than noise [m].
+PLACE_CHANGE = 0.008
+# A tip that is so far above a place where it should have arrived has come down on the
+# object, which is larger than believed, or elsewhere: it goes up, and after that comes
+# down so much farther out; not farther than EXTRA_MAX, where it no longer matters [m].
+MISSED, EXTRA, EXTRA_MAX = 0.01, 0.003, 0.012
+
+
+@dataclass
+class PushConfig:
+    speed: float = 0.35  # Of a travelling tip [m/s].
+    acceleration: float = 2.0  # [m/s2]
+    descent: float = 0.08  # Of one that comes down beside the object [m/s].
+    margin: float = 0.012  # Between tip and object where it passes above [m].
+    # C3's target is at most so far from where the object is.
+    look_ahead: float = 0.06  # [m]
+    look_ahead_angle: float = 0.5  # [rad]
+    unseen_sec: float = 0.3  # An object not seen for longer is waited for,
+    # or for longer while nothing touches it: then the arm hides it on its way.
+    believed_sec: float = 3.0
+    # One farther from the world's origin, where the arm stands, is not followed.
+    farthest: float = 0.75  # [m]
+    withdrawn: list[float] = field(default_factory=lambda: [0.3, 0.0])  # [m]
+
+
+@dataclass(frozen=True, eq=False)
+class PushState:
+    """Memory of the task between two ticks; p, v, a (3,) is the last reference."""
+
+    phase: int
+    p: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    go: int = 0  # The last command of the sampler that was carried out.
+    place: np.ndarray | None = None  # (2,) in the world, where it travels to [m].
+    unseen_sec: float = 0.0
+    extra: float = 0.0  # Beyond the clearance of a place, for what was hit [m].
+    lifting: bool = False  # Off what was hit.
+
+    def __deepcopy__(self, memo) -> "PushState":
+        return self  # Nothing in it is changed once it is there.
+
+
+def heading(q) -> float:
+    """Where a body's x axis points to, seen from above [rad]; q (4,) [w x y z]."""
+    R = rotation_of(q)
+    return float(np.arctan2(R[1, 0], R[0, 0]))
+
+
+def angle_between(a, b):
+    """b - a as the shorter turn, in [-pi, pi) [rad]."""
+    return (b - a + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def errors(x, goal) -> tuple[float, float]:
+    """How far the object is from a goal (x, y, yaw): [m], [rad]."""
+    off = goal[:2] - x[P_BALL][:2]
+    return float(np.hypot(*off)), float(abs(angle_between(heading(x[Q_BALL]), goal[2])))
+
+
+def look_ahead(config: PushConfig, x, goal, height: float, n_knots: int):
+    """C3's target (n_knots, 19): the goal, or the part of the way to it that a plan is
+    good for; the tip at the height of pushing, everything at rest.
+
+    Args: x (19,); goal (3,) = x, y [m], yaw [rad]; height of the tip's centre [m].
+    """
+    off = goal[:2] - x[P_BALL][:2]
+    off = off * min(1.0, config.look_ahead / max(np.hypot(*off), 1e-12))
+    turn = angle_between(heading(x[Q_BALL]), goal[2])
+    turn = np.clip(turn, -config.look_ahead_angle, config.look_ahead_angle)
+    w, z = np.cos(turn / 2.0), np.sin(turn / 2.0)
+    a, b, c, d = x[Q_BALL]
+    target = np.zeros(N_X)
+    target[P_TIP], target[2] = x[P_TIP], height
+    # The turn about the vertical, before how it is turned already.
+    target[Q_BALL] = [w * a - z * d, w * b - z * c, w * c + z * b, w * d + z * a]
+    target[P_BALL] = x[P_BALL]
+    target[P_BALL.start : P_BALL.start + 2] += off
+    return np.tile(target, (n_knots, 1))
+
+
+def next_push(
+    config: PushConfig, state: PushState, shape: ObjectShape, dt, x, seen, place, go,
+    height, clearance,
+):  # fmt: skip
+    """One tick of the task.
+
+    Args:
+        dt [s]; x (19,); seen: whether x can be trusted.
+        place: (2,) of ContactSampler, in the object's frame; None: none yet. go: the
+            number of that command. height of the tip's centre while pushing, clearance
+            from the object at a place [m].
+    Returns: PushState; unless in CONTACT its p, v, a is the reference at t + dt.
+    """
+    unseen = 0.0 if seen else state.unseen_sec + dt
+    state = replace(state, unseen_sec=unseen)
+    travels = state.phase == TRAVEL
+    lost = unseen > (config.believed_sec if travels else config.unseen_sec)
+    lost = lost or float(np.hypot(*x[P_BALL][:2])) > config.farthest
+    # C3 knows no object that is not seen; nor does anybody know a place before that.
+    if lost or place is None:
+        if state.phase == CONTACT:
+            state = replace(state, p=x[P_TIP].copy(), v=x[V_TIP].copy())
+        state = replace(state, phase=WAIT)
+    elif state.phase == WAIT or (state.phase == CONTACT and go != state.go):
+        if state.phase == CONTACT:
+            state = replace(state, p=x[P_TIP].copy(), v=x[V_TIP].copy())
+        state = replace(state, phase=TRAVEL, place=None)
+    if state.phase == CONTACT:
+        return state
+    outline = outline_of(shape.parts, rotation_of(x[Q_BALL]), x[P_BALL])
+    limits = config.speed, config.acceleration
+    up = shape.clear_height(config.margin)
+    distance = shape.tip_radius + 0.5 * clearance
+    if state.phase == WAIT:
+        goal = np.array([*config.withdrawn, up])
+        p, v, a, _ = travel_step(
+            state.p, state.v, goal, outline, distance, up, limits, dt
+        )
+        return replace(state, p=p, v=v, a=a)
+    if state.lifting:
+        goal = np.array([*state.p[:2], up])
+        p, v, a, arrived = travel_step(
+            state.p, state.v, goal, outline, distance, up, limits, dt
+        )
+        return replace(state, p=p, v=v, a=a, lifting=not arrived)
+    now = to_world(x, place)
+    if state.extra > 0.0:
+        now = now - state.extra * inward(now[None], outline)[0]
+    held = state.place
+    if held is None or np.hypot(*(now - held)) > PLACE_CHANGE:
+        held = now
+    goal = np.array([*held, height])
+    # An object that is larger than believed is higher, too.
+    descent = config.descent, shape.clear_height(0.5 * config.margin)
+    p, v, a, arrived = travel_step(
+        state.p, state.v, goal, outline, distance, up, limits, dt, descent
+    )
+    state = replace(state, p=p, v=v, a=a, place=held, go=go)
+    if not arrived:
+        return state
+    # A tip that is beside its place, where the arm does not reach, pushes from there.
+    if x[P_TIP][2] - height > MISSED and state.extra < EXTRA_MAX:
+        extra = min(state.extra + EXTRA, EXTRA_MAX)
+        at_rest = dict(p=x[P_TIP].copy(), v=np.zeros(3), a=np.zeros(3))
+        return replace(state, **at_rest, extra=extra, lifting=True, place=None)
+    # Where the arm hides it from this place, it is pushed a little as it is believed.
+    return replace(state, phase=CONTACT, unseen_sec=0.0)

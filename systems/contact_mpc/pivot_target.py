@@ -1,0 +1,74 @@
+"""The target of a planner that tips a planar cube: PivotTarget."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from makebreak.systems.contact_mpc.numerics.pivot_target import (
+    N_X,
+    fingers_away,
+    pivot_target,
+    share_of_rate,
+)
+
+
+@dataclass
+class PivotTargetConfig:
+    side: float = 0.1  # Of the cube [m].
+    finger_radius: float = 0.012  # [m]
+    goal: float = np.pi / 2  # [rad]
+    rate: float = 1.0  # [rad/s]
+    # Where the fingers touch, as shares of the side from the face's middle: the left
+    # one upwards, the right one to the right.
+    left_at: float = 0.2
+    right_at: float = 0.15
+    # The full rate with the fingers this near to their places, and none from so far on.
+    near: float = 0.03  # [m]
+    far: float = 0.06  # [m]
+
+
+class PivotTarget(LeafSystem):
+    """Where cube and fingers are to be at the knots of a plan.
+
+    Inputs:  x (14,), as in numerics/pivot_target.py.
+    Outputs: x_desired ((N + 1) 14,), row by row.
+
+    Args: config; dt_sec between the knots [s]; N, knots after the first.
+    Raises: ValueError for a number out of range.
+    """
+
+    def __init__(self, config: PivotTargetConfig, dt_sec: float, N: int):
+        super().__init__()
+        c = config
+        for name in ("side", "finger_radius", "rate"):
+            if not 0.0 < getattr(c, name) < np.inf:
+                raise ValueError(
+                    f"PivotTargetConfig.{name} is {getattr(c, name)}, expected > 0"
+                )
+        for name in ("left_at", "right_at"):
+            if not -0.5 <= getattr(c, name) <= 0.5:
+                raise ValueError(
+                    f"PivotTargetConfig.{name} is {getattr(c, name)}, expected -0.5 to "
+                    "0.5 of the side"
+                )
+        if not 0.0 <= c.near < c.far:
+            raise ValueError(
+                f"PivotTargetConfig.near is {c.near} and far {c.far}, expected "
+                "0 <= near < far"
+            )
+        if not np.isfinite(c.goal):
+            raise ValueError(f"PivotTargetConfig.goal is {c.goal}, expected an angle")
+        self._config, self._dt, self._N = c, dt_sec, N
+        out = 0.5 * c.side + c.finger_radius
+        self._points = np.array(
+            [[-out, c.left_at * c.side], [c.right_at * c.side, out]]
+        )
+        self._x = self.DeclareVectorInputPort("x", N_X)
+        self.DeclareVectorOutputPort("x_desired", (N + 1) * N_X, self._calc)
+
+    def _calc(self, context: Context, output: BasicVector):
+        c, q = self._config, self._x.Eval(context)[: N_X // 2]
+        rate = c.rate * share_of_rate(fingers_away(q, self._points), c.near, c.far)
+        rows = pivot_target(q, c.side, self._points, c.goal, rate, self._dt, self._N)
+        output.SetFromVector(rows.ravel())

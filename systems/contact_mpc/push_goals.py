@@ -1,0 +1,114 @@
+"""Goals for an object that is pushed, one after the other."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.systems.framework import LeafSystem
+
+from makebreak.systems.contact_mpc.numerics.ball_state import N_X
+from makebreak.systems.contact_mpc.numerics.push_task import errors
+from makebreak.systems.numerics.timing import timed
+
+
+@dataclass
+class PushGoalsConfig:
+    # Drawn evenly: x, y within size about center [m], yaw over the whole circle.
+    center: list[float] = field(default_factory=lambda: [0.5, 0.0])
+    size: list[float] = field(default_factory=lambda: [0.16, 0.36])
+    tolerance: list[float] = field(default_factory=lambda: [0.02, 0.1])  # [m], [rad]
+    # By the estimate it has to be nearer than that, as a share, for so long.
+    share: float = 0.8
+    dwell_sec: float = 0.25
+    limit_sec: float = 60.0  # Then the next goal comes, and this one was missed.
+    period_sec: float = 0.0125
+    offset_sec: float = 0.0
+
+
+def draw_poses(config: PushGoalsConfig, n: int, seed: int) -> np.ndarray:
+    """(n, 3) x, y [m], yaw [rad]: evenly within the region.
+
+    Raises: ValueError for a config out of range, by name.
+    """
+    _check(config)
+    rng = np.random.default_rng([seed, 1])
+    half = 0.5 * np.array([*config.size, 2.0 * np.pi])
+    return np.array([*config.center, 0.0]) + rng.uniform(-half, half, (n, 3))
+
+
+class PushGoals(LeafSystem):
+    """Gives a goal until the object is there, as far as the estimate tells, or the time
+    is up; then the next.
+
+    Inputs:  x (19,) of numerics/ball_state.py; valid (1,).
+    Outputs: goal (3,) = x, y [m], yaw [rad]; log (5,) = [number of the goal, goal 3,
+             since when s]. After the last goal the last one stays, its number one more.
+
+    Args: goals (n, 3).
+    """
+
+    def __init__(self, config: PushGoalsConfig, goals):
+        super().__init__()
+        _check(config)
+        self._config = config
+        self._goals = np.array(goals, dtype=float)
+        if self._goals.ndim != 2 or self._goals.shape[1] != 3 or not len(self._goals):
+            raise ValueError(f"goals is {self._goals.shape}, expected (n, 3)")
+        self._x = self.DeclareVectorInputPort("x", N_X)
+        self._valid = self.DeclareVectorInputPort("valid", 1)
+        # Number of the goal, since when [s], how long it has been reached [s].
+        self._state = self.DeclareDiscreteState(3)
+        ticket = {self.discrete_state_ticket(self._state)}
+        self.DeclareVectorOutputPort("goal", 3, self._calc_goal, ticket)
+        self.DeclareVectorOutputPort("log", 5, self._calc_log, ticket)
+        self.DeclarePeriodicDiscreteUpdateEvent(
+            config.period_sec, config.offset_sec, self._update
+        )
+
+    def _goal(self, context):
+        number = int(context.get_discrete_state(self._state).value()[0])
+        return self._goals[min(number, len(self._goals) - 1)]
+
+    def _calc_goal(self, context, output):
+        output.SetFromVector(self._goal(context))
+
+    def _calc_log(self, context, output):
+        number, since, _ = context.get_discrete_state(self._state).value()
+        output.SetFromVector([number, *self._goal(context), since])
+
+    @timed
+    def _update(self, context, discrete_state):
+        c, t = self._config, context.get_time()
+        number, since, held = context.get_discrete_state(self._state).value()
+        if number >= len(self._goals):
+            return
+        x = np.asarray(self._x.Eval(context))
+        there = False
+        if self._valid.Eval(context)[0] > 0.5 and np.isfinite(x).all():
+            off = errors(x, self._goal(context))
+            there = all(a < c.share * b for a, b in zip(off, c.tolerance, strict=True))
+        held = held + c.period_sec if there else 0.0
+        if held >= c.dwell_sec or t - since >= c.limit_sec:
+            number, since, held = number + 1.0, t, 0.0
+        discrete_state.set_value(self._state, [number, since, held])
+
+
+def _check(config: PushGoalsConfig) -> None:
+    """Raises: ValueError for a config out of range, by name."""
+    for name in ("center", "size", "tolerance"):
+        value = getattr(config, name)
+        if np.shape(value) != (2,) or not np.isfinite(value).all():
+            raise ValueError(f"goals.{name} is {value}, expected two numbers")
+    if min(config.size) < 0.0:
+        raise ValueError(f"goals.size is {config.size}, expected at least 0")
+    if not min(config.tolerance) > 0.0:
+        raise ValueError(f"goals.tolerance is {config.tolerance}, expected > 0")
+    if not 0.0 < config.share <= 1.0:
+        raise ValueError(
+            f"goals.share is {config.share}, expected > 0 and at most 1: a goal is "
+            "left where it was reached"
+        )
+    for name in ("limit_sec", "period_sec"):
+        if not 0.0 < getattr(config, name) < np.inf:
+            raise ValueError(f"goals.{name} is {getattr(config, name)}, expected > 0")
+    if not 0.0 <= config.dwell_sec < np.inf:
+        raise ValueError(f"goals.dwell_sec is {config.dwell_sec}, expected >= 0")

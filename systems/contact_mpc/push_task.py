@@ -1,0 +1,107 @@
+"""What the tip does between plans, as a system: see numerics/push_task.py."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.framework import LeafSystem
+
+from makebreak.systems.contact_mpc.numerics.ball_state import N_X
+from makebreak.systems.contact_mpc.numerics.contact_sampling import ObjectShape
+from makebreak.systems.contact_mpc.numerics.lcs import is_finite
+from makebreak.systems.contact_mpc.numerics.push_task import (
+    WAIT,
+    PushConfig,
+    PushState,
+    look_ahead,
+    next_push,
+)
+from makebreak.systems.numerics.timing import timed
+
+
+@dataclass
+class PushTaskConfig:
+    push: PushConfig = field(default_factory=PushConfig)
+    height: float = 0.024  # Of the tip's centre while pushing [m].
+    clearance: float = 0.004  # From the object at a place [m].
+    period_sec: float = 0.0125
+    offset_sec: float = 0.0
+
+
+class PushTask(LeafSystem):
+    """Phases of pushing an object to a pose, the target of C3 and the way between.
+
+    Inputs:  x (19,) of numerics/ball_state.py; valid (1,): above 0.5 where it can be
+             trusted; goal (3,) = x, y [m], yaw [rad]; command (3,) of ContactSampler.
+    Outputs: x_desired ((N + 1) 19,) for C3; reference (9,) = p, v, a of the tip at the
+             next tick, used unless in CONTACT; phase (1,): 0 CONTACT, 1 TRAVEL, 2 WAIT.
+
+    Where x or command is not finite all stays as it is; where goal is not, the target
+    stays, and the tip waits.
+
+    Args: n_knots = N + 1; shape of object and tip; p_tip (3,): where the tip is at
+        first [m].
+    """
+
+    def __init__(self, config: PushTaskConfig, n_knots: int, shape: ObjectShape, p_tip):
+        super().__init__()
+        for name in ("speed", "acceleration", "descent", "margin", "look_ahead",
+                     "look_ahead_angle", "unseen_sec", "believed_sec",
+                     "farthest"):  # fmt: skip
+            if not getattr(config.push, name) > 0.0:
+                raise ValueError(
+                    f"task.push.{name} is {getattr(config.push, name)}, expected > 0"
+                )
+        for name in ("height", "clearance", "period_sec"):
+            if not getattr(config, name) > 0.0:
+                raise ValueError(
+                    f"task.{name} is {getattr(config, name)}, expected > 0"
+                )
+        self._config, self._n_knots, self._shape = config, n_knots, shape
+        p_tip = np.array(p_tip, dtype=float)
+        self._x = self.DeclareVectorInputPort("x", N_X)
+        self._valid = self.DeclareVectorInputPort("valid", 1)
+        self._goal = self.DeclareVectorInputPort("goal", 3)
+        self._command = self.DeclareVectorInputPort("command", 3)
+        start = PushState(WAIT, p_tip, np.zeros(3), np.zeros(3))
+        self._task = self.DeclareAbstractState(Value[object](start))
+        at_rest = np.zeros(N_X)
+        at_rest[3] = 1.0
+        self._x_desired = self.DeclareDiscreteState(np.tile(at_rest, n_knots))
+        self._reference = self.DeclareDiscreteState([*p_tip, *np.zeros(6)])
+        self._phase = self.DeclareDiscreteState([float(WAIT)])
+        self.DeclareStateOutputPort("x_desired", self._x_desired)
+        self.DeclareStateOutputPort("reference", self._reference)
+        self.DeclareStateOutputPort("phase", self._phase)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(
+            config.period_sec, config.offset_sec, self._update
+        )
+
+    @timed
+    def _update(self, context, state):
+        c = self._config
+        x, valid, goal, command = (
+            np.asarray(port.Eval(context))
+            for port in (self._x, self._valid, self._goal, self._command)
+        )
+        task = context.get_abstract_state(int(self._task)).get_value()
+        if not (is_finite(x) and is_finite(command)):
+            return
+        discrete = state.get_mutable_discrete_state()
+        seen = valid[0] > 0.5 and is_finite(goal)
+        if is_finite(goal):
+            target = look_ahead(c.push, x, goal, c.height, self._n_knots)
+            discrete.set_value(int(self._x_desired), target.ravel())
+        place = command[1:] if command[0] > 0.0 else None
+        try:
+            task = next_push(
+                c.push, task, self._shape, c.period_sec, x, seen, place,
+                int(command[0]), c.height, c.clearance,
+            )  # fmt: skip
+        except ValueError:  # An object on edge has no outline: everything stays.
+            return
+        state.get_mutable_abstract_state(int(self._task)).set_value(task)
+        discrete.set_value(
+            int(self._reference), np.concatenate([task.p, task.v, task.a])
+        )
+        discrete.set_value(int(self._phase), [float(task.phase)])

@@ -1,0 +1,187 @@
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import LeafSystem
+
+from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL
+from makebreak.systems.contact_mpc.numerics.rolling_task import (
+    ROLL,
+    WAIT,
+    CirclePath,
+    RollingConfig,
+    TaskState,
+    next_state,
+    shifted,
+    target_over_horizon,
+)
+from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.timing import timed
+
+OUT_OF_REACH = 0.12  # A ball that is so far outside the circle is waited for [m].
+
+
+@dataclass
+class RollingTaskConfig:
+    center: list[float] = field(default_factory=lambda: [0.5, 0.0])  # [m]
+    radius: float = 0.1  # Of the circle [m].
+    lead_deg: float = 6.0  # The target runs so far ahead of the ball ...
+    speed: float = 0.045  # ... and moves along the circle with it [m/s].
+    press: float = 0.045  # Tip target below the ball's top, as learned [m].
+    # Where the tip hides nothing of the circle from the camera [m]: between the circle
+    # and the arm's base.
+    withdrawn: list[float] = field(default_factory=lambda: [0.3, 0.0])
+    rolling: RollingConfig = field(default_factory=RollingConfig)
+    period_sec: float = 0.0125
+    offset_sec: float = 0.0
+
+
+class RollingTask(LeafSystem):
+    """Phases of rolling a ball along a circle, the target of C3 and the reposition.
+
+    Inputs:  x (19,); valid (1,); r_comp (n_lam,) [m/s] of the learner, whose first
+             n_tip entries belong to tip and ball; optional r_std (1,), how sure of it
+             the learner is [m/s], and tip_force (3,) on the tip as the arm feels it
+             [N], with which a surface of uncertain height is approached slowly;
+             optional landed (1,): where another system carries the reposition out, it
+             ends when this is 1, not in time.
+    Outputs: x_desired ((N+1) 19,) for C3; reference (9,) = p, v, a of the tip at the
+             next tick, used unless rolling; phase (1,): 0 roll, 1 reposition, 2 wait,
+             3 approach; feel (1,): 1 in a push of a ball that does not coast as a ball
+             does, so that the tip has to feel for it.
+
+    A ball that is OUT_OF_REACH is as one that is not seen.
+
+    Before the first update the phase is WAIT at the height of the tip that was given.
+    """
+
+    def __init__(
+        self,
+        config: RollingTaskConfig,
+        n_knots: int,
+        knot_sec: float,
+        radius_ball: float,
+        radius_tip: float,
+        n_lam: int,
+        n_tip: int,
+        residual_dt_sec: float,
+        p_tip=(0.5, 0.0, 0.15),
+    ):
+        super().__init__()
+        _check(config)
+        self._config, self._n_knots, self._knot_sec = config, n_knots, knot_sec
+        self._radius_ball, self._radius_tip = radius_ball, radius_tip
+        self._n_tip, self._residual_dt_sec = n_tip, residual_dt_sec
+        self._path = CirclePath(np.array(config.center), config.radius)
+        self._x = self.DeclareVectorInputPort("x", N_X)
+        self._valid = self.DeclareVectorInputPort("valid", 1)
+        self._r_comp = self.DeclareVectorInputPort("r_comp", n_lam)
+        self._r_std = self.DeclareVectorInputPort("r_std", 1)
+        self._tip_force = self.DeclareVectorInputPort("tip_force", 3)
+        self._landed = self.DeclareVectorInputPort("landed", 1)
+        start = TaskState(WAIT, 0.0, p_tip, np.zeros(3), np.zeros(3), p_tip[2])
+        self._task = self.DeclareAbstractState(AbstractValue.Make(start))
+        x_desired = np.tile(np.eye(N_X)[3], n_knots)
+        circle = (self._path, np.zeros(N_X), 0.0, 0.0, 0.0)
+        first_call(target_over_horizon, *circle, radius_ball, knot_sec, n_knots)
+        self._x_desired = self.DeclareDiscreteState(x_desired)
+        self._reference = self.DeclareDiscreteState([*p_tip, *np.zeros(6)])
+        self._shift = self.DeclareDiscreteState([0.0])  # Of the circle's radius [m].
+        self._phase = self.DeclareDiscreteState([float(WAIT)])
+        self._feel = self.DeclareDiscreteState([0.0])
+        self.DeclareStateOutputPort("x_desired", self._x_desired)
+        self.DeclareStateOutputPort("reference", self._reference)
+        self.DeclareStateOutputPort("phase", self._phase)
+        self.DeclareStateOutputPort("feel", self._feel)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(
+            config.period_sec, config.offset_sec, self._update
+        )
+
+    def start_at(self, context, p_tip) -> None:
+        """The task waits with the tip at p_tip (3,) [m], in a Context of this system:
+        then it begins as from there."""
+        t, still = context.get_time(), np.zeros(3)
+        start = TaskState(WAIT, t, p_tip, still, still, float(p_tip[2]))
+        context.SetAbstractState(int(self._task), start)
+        context.SetDiscreteState(self._reference, [*p_tip, *np.zeros(6)])
+        context.SetDiscreteState(self._phase, [float(WAIT)])
+
+    @timed
+    def _update(self, context, state):
+        c = self._config
+        x, t = self._x.Eval(context), context.get_time()
+        task = context.get_abstract_state(int(self._task)).get_value()
+        gap = self._r_comp.Eval(context)[: self._n_tip].mean() * self._residual_dt_sec
+        away = x[P_BALL][:2] - self._path.center
+        reach = self._path.radius + OUT_OF_REACH
+        # Who runs after a ball that is out of reach, stretches the arm for nothing.
+        said, near = self._valid.Eval(context)[0], away @ away < reach**2
+        valid, hidden = said > 0.5 and near, said == 0.0 and near
+        landed = None
+        if self._landed.HasValue(context):
+            landed = bool(self._landed.Eval(context)[0] > 0.5)
+        gap_std, force_z = 0.0, 0.0
+        if self._r_std.HasValue(context):
+            gap_std = float(self._r_std.Eval(context)[0]) * self._residual_dt_sec
+        if self._tip_force.HasValue(context):
+            force_z = float(self._tip_force.Eval(context)[2])
+        shift = float(context.get_discrete_state(self._shift).value()[0])
+        if valid:
+            shift = shifted(c.rolling, self._path, shift, x, c.period_sec)
+        path = replace(self._path, radius=self._path.radius + shift)
+        task = next_state(
+            c.rolling, path, task, t, c.period_sec, x, gap, valid,
+            self._radius_ball, self._radius_tip, landed, gap_std, force_z,
+            np.array(c.withdrawn), hidden,
+        )  # fmt: skip
+        # Below the top where it is believed to be: a ball larger than modelled would
+        # else be pressed as much harder.
+        z_tip = 2.0 * self._radius_ball + self._radius_tip - gap - c.press
+        goal = target_over_horizon(
+            path, x, np.deg2rad(c.lead_deg), c.speed, z_tip, self._radius_ball,
+            self._knot_sec, self._n_knots,
+        )  # fmt: skip
+        state.get_mutable_abstract_state(int(self._task)).set_value(task)
+        discrete = state.get_mutable_discrete_state()
+        discrete.set_value(int(self._x_desired), goal.ravel())
+        discrete.set_value(
+            int(self._reference), np.concatenate([task.p, task.v, task.a])
+        )
+        discrete.set_value(int(self._phase), [float(task.phase)])
+        pushes = task.feel and task.phase == ROLL
+        discrete.set_value(int(self._feel), [float(pushes)])
+        discrete.set_value(int(self._shift), [shift])
+
+
+def _check(config: RollingTaskConfig):
+    """Raises: ValueError for a config that makes no task, by name."""
+    rolling = config.rolling
+    for name in ("center", "withdrawn"):
+        place = getattr(config, name)
+        if np.shape(place) != (2,) or not np.isfinite(place).all():
+            raise ValueError(f"task.{name} is {place}, expected 2 numbers")
+    if not 0.0 < config.radius < np.inf:
+        raise ValueError(f"task.radius is {config.radius}, expected > 0")
+    for name in ("speed", "lead_deg", "press"):
+        if not np.isfinite(getattr(config, name)):
+            raise ValueError(f"task.{name} is {getattr(config, name)}, expected finite")
+    for name in ("roll_sec", "roll_feel_sec", "reposition_sec", "approach_speed",
+                 "touch_force", "land_above", "coast_change", "withdraw_speed",
+                 "reposition_far", "unseen_drift"):  # fmt: skip
+        if not 0.0 < getattr(rolling, name) < np.inf:
+            raise ValueError(
+                f"task.rolling.{name} is {getattr(rolling, name)}, expected > 0"
+            )
+    if not rolling.integral_sec > 0.0:  # Infinite: none.
+        raise ValueError(
+            f"task.rolling.integral_sec is {rolling.integral_sec}, expected > 0"
+        )
+    for name in ("n_std", "n_std_below", "approach_max", "unseen_speed"):
+        if not 0.0 <= getattr(rolling, name) < np.inf:
+            raise ValueError(
+                f"task.rolling.{name} is {getattr(rolling, name)}, expected >= 0"
+            )
+    if not 0.0 < rolling.ease <= 0.5:
+        raise ValueError(
+            f"task.rolling.ease is {rolling.ease}, expected > 0 and at most 0.5"
+        )

@@ -1,1 +1,0 @@
-"""The maths of the baselines: other people's answers, to compare with."""

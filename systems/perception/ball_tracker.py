@@ -1,0 +1,223 @@
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.framework import LeafSystem
+from pydrake.systems.sensors import ImageRgba8U
+
+from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.timing import timed
+from makebreak.systems.perception.numerics import constant_velocity, interacting_models
+from makebreak.systems.perception.numerics.ball_tracker import (
+    find_ball,
+    strength_weights,
+)
+from makebreak.systems.perception.numerics.pinhole import Pinhole
+
+# Values of the status port.
+TRACKED, NOT_FOUND, OUTLIER, WRONG_IMAGE = 0.0, 1.0, 2.0, 3.0
+
+GATE = 8.0  # [standard deviations] A measurement that is further off is not believed,
+PATIENCE = 3  # unless this many in a row are: then the ball was moved, start afresh.
+HOLD_SEC = 0.1  # Unseen for longer: velocity zero, and look everywhere.
+START_SPEED = 0.3  # [m/s] Standard deviation of the velocity at a fresh start.
+
+# Layout of the state; then, per model of motion, its mean, covariance and probability.
+_P, _V, _COVARIANCE = slice(0, 2), slice(2, 4), slice(4, 7)
+_UNSEEN_SEC, _N_OUTLIERS, _STATUS, _MODELS = 7, 8, 9, 10
+_PER_MODEL = 4 + 3 + 1
+
+
+@dataclass
+class BallTrackerConfig:
+    ball_radius: float = 0.0315  # [m] as the model has it.
+    table_z: float = 0.0  # [m] height of the table.
+    hue: float = 0.41  # [rad] of the ball: 0 red, 2.09 green, 4.19 blue.
+    position_std: float = 1e-3  # [m] of one measurement.
+    acceleration_density: float = 0.03  # [m^2/s^3] how freely the ball moves.
+    # The same while something drives it (a push, a bump that it rolls off); 0: it
+    # always moves as above. How long each of the two lasts, on average [s].
+    driven_density: float = 0.0
+    free_sec: float = 1.0
+    driven_sec: float = 0.1
+    period_sec: float = 0.0125
+    offset_sec: float = 0.0
+
+
+class BallTracker(LeafSystem):
+    """Where the ball is and how fast it moves, from an overhead camera's pictures.
+
+    Each period the picture is asked for, the ball is found in it (numerics/
+    ball_tracker.py) and a constant-velocity Kalman filter is corrected (numerics/
+    constant_velocity.py), or two of them, one for a ball that something drives
+    (numerics/interacting_models.py). The ball is taken to lie on the table: p_WB z is
+    the table's height plus the model's radius, v_WB z is 0.
+
+    Inputs:  image, abstract ImageRgba8U of the camera model's size.
+    Outputs: p_WB (3,) [m]; v_WB (3,) [m/s]; seen (1,): 1 if the last picture showed the
+             ball where it can be, else 0; status (1,): TRACKED, NOT_FOUND, OUTLIER
+             or WRONG_IMAGE; position_std (1,) [m], of p_WB each way.
+
+    A ball that is not seen is not guessed: p_WB is held, v_WB is held for HOLD_SEC and
+    zero from then on, and position_std grows. Before the first sight p_WB is the point
+    below the camera.
+    """
+
+    def __init__(self, config: BallTrackerConfig, camera: Pinhole):
+        super().__init__()
+        for name in (
+            "ball_radius",
+            "position_std",
+            "acceleration_density",
+            "free_sec",
+            "driven_sec",
+            "period_sec",
+        ):
+            if not 0.0 < getattr(config, name) < np.inf:
+                raise ValueError(
+                    f"{name} must be positive, got {getattr(config, name)}"
+                )
+        if not 0.0 <= config.driven_density < np.inf:
+            raise ValueError(
+                f"driven_density is {config.driven_density}, expected 0 or more"
+            )
+        if not np.isfinite(config.hue):
+            raise ValueError(f"hue must be finite, got {config.hue}")
+        if not config.table_z + config.ball_radius < camera.p_WC[2]:
+            raise ValueError(
+                f"the camera at height {camera.p_WC[2]} must be above the ball, whose "
+                f"centre is at {config.table_z + config.ball_radius}"
+            )
+        self._config, self._camera = config, camera
+        self._weights = strength_weights(config.hue)
+        self._shape = (camera.height, camera.width, 4)
+        self._image = self.DeclareAbstractInputPort("image", Value(ImageRgba8U()))
+        densities, dwell = [config.acceleration_density], [config.free_sec]
+        if config.driven_density > 0.0:
+            densities.append(config.driven_density)
+            dwell.append(config.driven_sec)
+        self._densities = np.array(densities)
+        self._chances = interacting_models.transition(dwell, config.period_sec)
+        start: Any = np.zeros(_MODELS + _PER_MODEL * len(densities))
+        start[_P] = camera.p_WC[:2]
+        start[_COVARIANCE] = 1.0, 0.0, START_SPEED**2
+        start[_UNSEEN_SEC], start[_STATUS] = 2.0 * HOLD_SEC, NOT_FOUND
+        at, speed, P = camera.p_WC[:2], np.zeros(2), start[_COVARIANCE]
+        start[_MODELS:] = _flat(interacting_models.start(at, speed, P, len(densities)))
+        self._state = self.DeclareDiscreteState(start)
+        ticket = {self.discrete_state_ticket(self._state)}
+        for name, size, calc in (
+            ("p_WB", 3, self._position),
+            ("v_WB", 3, self._velocity),
+            ("seen", 1, self._seen),
+            ("status", 1, self._status),
+            ("position_std", 1, self._position_std),
+        ):
+            self.DeclareVectorOutputPort(name, size, calc, prerequisites_of_calc=ticket)
+        self.DeclarePeriodicDiscreteUpdateEvent(
+            config.period_sec, config.offset_sec, self._update
+        )
+        first_call(self._first_call, camera, config.ball_radius)
+
+    def _first_call(self, camera: Pinhole, ball_radius: float):
+        blank = np.zeros(self._shape, np.uint8)
+        cv2.circle(blank, (camera.width // 2, camera.height // 2), 20, (255,) * 4, -1)
+        blank[:, :, 0] //= 2
+        for hue in (0.0, np.pi):
+            find_ball(blank, camera, strength_weights(hue), ball_radius, 0.0)
+
+    @timed
+    def _update(self, context, discrete_state):
+        c = self._config
+        state = context.get_discrete_state(self._state).value()
+        v, P = state[_V], state[_COVARIANCE]
+        lost = state[_UNSEEN_SEC] > HOLD_SEC
+        estimate: interacting_models.Estimate = self._predict(_unflat(state[_MODELS:]))
+        p_next, _, P_next = interacting_models.combined(*estimate)
+        picture: Any = self._image.Eval(context)
+        image = picture.data
+        measured, status = None, WRONG_IMAGE
+        if image.shape == self._shape:
+            status = NOT_FOUND
+            z = c.table_z + c.ball_radius
+            near = state[_STATUS] == TRACKED  # Else it may be anywhere.
+            guess = np.array([*p_next, z]) if near else None
+            found = find_ball(
+                image, self._camera, self._weights, c.ball_radius, c.table_z, guess
+            )
+            if found is not None:
+                measured, status = found.p_WB[:2], TRACKED
+        n_outliers = 0
+        if measured is None:
+            n_outliers = state[_N_OUTLIERS]
+        elif lost:
+            estimate = self._afresh(measured)
+        elif (
+            constant_velocity.distance_in_sigmas(
+                p_next, P_next, measured, c.position_std
+            )
+            <= GATE
+        ):
+            estimate = interacting_models.correct(*estimate, measured, c.position_std)
+        elif state[_N_OUTLIERS] + 1 >= PATIENCE:
+            estimate = self._afresh(measured)
+        else:
+            n_outliers, status = state[_N_OUTLIERS] + 1, OUTLIER
+        if status == TRACKED:
+            unseen_sec = 0.0
+        else:
+            # Held where it was, and less and less sure.
+            unseen_sec = min(state[_UNSEEN_SEC] + c.period_sec, 2.0 * HOLD_SEC)
+            v = v if unseen_sec <= HOLD_SEC else np.zeros(2)
+            P = P_next if P_next[0] < 1.0 else P
+            estimate = interacting_models.start(state[_P], v, P, len(self._densities))
+        p, v, P = interacting_models.combined(*estimate)
+        state = np.concatenate(
+            [p, v, P, [unseen_sec, n_outliers, status], _flat(estimate)]
+        )
+        if np.isfinite(state).all():
+            discrete_state.set_value(self._state, state)
+
+    def _predict(self, estimate: interacting_models.Estimate):
+        return interacting_models.predict(
+            *estimate, self._chances, self._config.period_sec, self._densities
+        )
+
+    def _afresh(self, measured):
+        P = np.array([self._config.position_std**2, 0.0, START_SPEED**2])
+        return interacting_models.start(measured, np.zeros(2), P, len(self._densities))
+
+    def _get(self, context):
+        return context.get_discrete_state(self._state).value()
+
+    def _position(self, context, output):
+        z = self._config.table_z + self._config.ball_radius
+        output.SetFromVector([*self._get(context)[_P], z])
+
+    def _velocity(self, context, output):
+        output.SetFromVector([*self._get(context)[_V], 0.0])
+
+    def _seen(self, context, output):
+        output.SetAtIndex(0, float(self._get(context)[_STATUS] == TRACKED))
+
+    def _status(self, context, output):
+        output.SetAtIndex(0, self._get(context)[_STATUS])
+
+    def _position_std(self, context, output):
+        output.SetAtIndex(0, np.sqrt(self._get(context)[_COVARIANCE][0]))
+
+
+def _flat(estimate):
+    """An estimate of interacting_models as numbers in a row."""
+    return np.concatenate([part.ravel() for part in estimate])
+
+
+def _unflat(numbers):
+    m = len(numbers) // _PER_MODEL
+    return (
+        numbers[: 4 * m].reshape(m, 4),
+        numbers[4 * m : 7 * m].reshape(m, 3),
+        numbers[7 * m :],
+    )

@@ -1,0 +1,104 @@
+"""What the joint sensors say about the tip: where it is, and what force moves it."""
+
+import numba
+import numpy as np
+
+from makebreak.systems.arm.numerics.serial_chain import chain_state
+from makebreak.systems.contact_mpc.numerics.ball_state import (
+    Q_BALL,
+    W_BALL,
+    compiled_pack,
+)
+
+
+@numba.njit(cache=True)
+def tip_motion(chain, q, v, torque, tip_mass):
+    """The tip of an arm, and the force that explains its motion as a point's.
+
+    An LCS that takes the arm for a point of mass m needs the force that gives *this*
+    mass the acceleration that the motors give the tip where nothing touches it:
+
+        u = m (J M^-1 (tau - bias) + Jdot v)
+
+    Newtons at the real tip would not do: its apparent mass is another one, and differs
+    with the direction.
+
+    Args:
+        chain: SerialChain of the arm with its tool.
+        q, v, torque: (n,) [rad], [rad/s], [N m] of the motors.
+        tip_mass: m [kg].
+    Returns: p_tip (3,) [m], v_tip (3,) [m/s], u (3,) [N].
+    """
+    state = chain_state(chain, q, v)
+    J = state.J[:3]
+    a = J @ np.linalg.solve(state.M, torque - state.bias) + state.bias_a[:3]
+    return state.p_WE, J @ v, tip_mass * a
+
+
+@numba.njit(cache=True)
+def tip_mobility(chain, q):
+    """J M^-1 J' (3, 3) of the tip's translation [1/kg] at q (n,)."""
+    state = chain_state(chain, q, np.zeros(q.shape[0]))
+    J = np.ascontiguousarray(state.J[:3])
+    return J @ np.linalg.solve(state.M, np.ascontiguousarray(J.T))
+
+
+@numba.njit(cache=True)
+def observe_force(observer, v_tip, a_free, mobility, gain, dt):
+    """A momentum observer: what else accelerates the tip than the motors.
+
+    Args: observer (7,) = [expected v_tip (3), force (3), started]; v_tip (3,) [m/s];
+        a_free (3,) that the motors alone give the tip [m/s2]; mobility (3, 3) [1/kg];
+        gain: of the observer, a first-order lag of 1/gain [1/s]; dt [s].
+    Returns: observer (7,); its force is what the surroundings do to the tip [N].
+    Source: De Luca, Haddadin et al., "Robot collisions: a survey on detection,
+        isolation, and identification" (2017), III-D, here for the tip alone.
+    """
+    after = observer.copy()
+    if observer[6] == 0.0:
+        after[:3], after[3:6], after[6] = v_tip, 0.0, 1.0
+        return after
+    pushed = gain * (v_tip - observer[:3])
+    after[:3] += dt * (a_free + pushed)
+    after[3:6] = np.linalg.solve(mobility, pushed)
+    return after
+
+
+@numba.njit(cache=True)
+def estimate(chain, q, v, torque, p_ball, v_ball, seen, tip_mass, radius, window):
+    """One reading: the state of the LCS, and the window of forces with it.
+
+    Args:
+        chain: SerialChain, packed (arm/numerics/packed.py). q, v, torque: as in
+            tip_motion.
+        p_ball, v_ball: (3,) [m], [m/s]. seen: (1,) above 0.5 if the ball is seen.
+        radius: of the ball as the model has it [m].
+        window: (3 n + 1,) the last n forces, oldest first [N], and how many readings
+            in a row were valid, at most n.
+    Returns: whether every reading is finite (if not, the rest is not to be used);
+        x (19,); window; valid: 1.0, 0.0 where the ball is not seen, else -1.0.
+    """
+    after = np.empty(window.size)
+    total = q.sum() + v.sum() + torque.sum() + p_ball.sum() + v_ball.sum()
+    if not np.isfinite(total):
+        return False, after, after, -1.0
+    p_tip, v_tip, u = tip_motion(chain[0], q, v, torque, tip_mass)
+    n = window.size // 3
+    after[: 3 * n - 3] = window[3 : 3 * n]
+    after[3 * n - 3 : 3 * n] = u
+    valid = 1.0 if seen[0] > 0.5 else 0.0
+    after[3 * n] = min(valid * (window[3 * n] + 1.0), n)
+    x = compiled_pack(p_tip, v_tip, p_ball, v_ball, radius)
+    return True, x, after, valid
+
+
+def with_pose(finite, x, valid, q_object, w_object):
+    """What `estimate` returned (without the window), for an object whose orientation
+    q_object (4,) and turning rate w_object (3,) [rad/s] are known: it need not roll."""
+    known = np.isfinite(q_object).all() and np.isfinite(w_object).all()
+    size = np.sqrt(q_object @ q_object)
+    if not (finite and known and size > 0.5):
+        return False, x, -1.0
+    x = x.copy()
+    x[Q_BALL], x[W_BALL] = q_object / size, w_object
+    return True, x, valid

@@ -1,0 +1,137 @@
+"""The pose of an object as a motion capture system tells it: late, noisy, filtered."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.common.value import AbstractValue, Value
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import LeafSystem
+
+from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.timing import timed
+from makebreak.systems.perception.numerics.pose_filter import (
+    PoseEstimate,
+    corrected,
+    first_pose,
+    on_the_table,
+    predicted,
+    turned,
+)
+
+KEPT_SEC = 1.0  # How old a reading is kept.
+
+
+@dataclass
+class PoseSensorConfig:
+    noise: list[float] = field(default_factory=lambda: [1e-3, 1e-2])  # [m], [rad]
+    delay_sec: float = 1.0 / 30.0
+    period_sec: float = 1.0 / 30.0
+    # Of white acceleration in the filter [m2/s3], [rad2/s3].
+    density: list[float] = field(default_factory=lambda: [0.02, 2.0])
+    height: float = 0.02  # Of the object's origin as the model has it [m].
+    # Of an object that rolls, in its frame; empty: it lies flat.
+    rolling_axis: list[float] = field(default_factory=list)
+    offset_sec: float = 0.0
+
+
+class PoseSensor(LeafSystem):
+    """Measures a body's pose, and says where it is now and how it moves.
+
+    Each reading is of the period's beginning, is known delay_sec later, and has
+    Gaussian noise of the two deviations on each axis. The filter's pose is predicted to
+    the present time, and laid on the table (numerics/pose_filter.py).
+
+    Inputs:  body_poses (abstract, of a MultibodyPlant).
+    Outputs: p_WB (3,) [m]; q_WB (4,) [w x y z]; v_WB (3,) [m/s]; w_WB (3,) [rad/s];
+             seen (1,): 1 when there has been a reading; readings (abstract): those of
+             the last KEPT_SEC that are known, as they were measured: (time [s], p (3,),
+             q (4,)).
+
+    Args: config; body, its index in body_poses; seed of the noise.
+    """
+
+    def __init__(self, config: PoseSensorConfig, body: int, seed: int = 0):
+        super().__init__()
+        for name in ("noise", "density"):
+            values = getattr(config, name)
+            if len(values) != 2 or not all(v >= 0.0 for v in values):
+                raise ValueError(
+                    f"pose.{name} is {values}, expected two numbers of at least 0"
+                )
+        if not (config.delay_sec >= 0.0 and config.period_sec > 0.0):
+            raise ValueError(
+                f"pose: delay_sec is {config.delay_sec} and period_sec "
+                f"{config.period_sec}, expected at least 0 and more than 0"
+            )
+        self._config, self._body, self._seed = config, int(body), int(seed)
+        self._axis = np.array(config.rolling_axis or [0.0, 0.0, 0.0], dtype=float)
+        zero = np.zeros(3)
+        self._unknown = zero, zero, np.array([1.0, 0.0, 0.0, 0.0]), zero
+        first_call(on_the_table, 0.0, *self._unknown, config.height, self._axis)
+        self._poses = self.DeclareAbstractInputPort(
+            "body_poses", AbstractValue.Make([RigidTransform()])
+        )
+        # Readings that are not known yet, oldest first; and how many there were.
+        self._late = self.DeclareAbstractState(Value[object](()))
+        self._pose = self.DeclareAbstractState(Value[object](None))
+        ticket = {self.abstract_state_ticket(self._pose), self.time_ticket()}
+        for i, (name, size) in enumerate(
+            (("p_WB", 3), ("v_WB", 3), ("q_WB", 4), ("w_WB", 3))
+        ):
+            self.DeclareVectorOutputPort(name, size, self._calc(i), ticket)
+        self.DeclareVectorOutputPort("seen", 1, self._calc_seen, ticket)
+        self._known = self.DeclareAbstractState(Value[object](()))
+        self.DeclareStateOutputPort("readings", self._known)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(
+            config.period_sec, config.offset_sec, self._update
+        )
+
+    @timed
+    def _update(self, context, state):
+        c, t = self._config, context.get_time()
+        X_WB = self._poses.Eval(context)[self._body]
+        sample = round(t / c.period_sec)
+        noise = np.random.default_rng([self._seed, sample]).normal(size=6)
+        q = X_WB.rotation().ToQuaternion().wxyz()
+        reading = (
+            t,
+            X_WB.translation() + c.noise[0] * noise[:3],
+            turned(np.array(q), c.noise[1] * noise[3:]),
+        )
+        late = context.get_abstract_state(int(self._late)).get_value() + (reading,)
+        pose = context.get_abstract_state(int(self._pose)).get_value()
+        known = context.get_abstract_state(int(self._known)).get_value()
+        std = np.maximum(c.noise, 1e-6)  # A filter of no noise at all divides by it.
+        while late and late[0][0] <= t - c.delay_sec + 1e-9:
+            known = (*known, late[0])
+            (at, p, q), late = late[0], late[1:]
+            if pose is None:
+                pose = first_pose(at, p, q, std, (0.1, 1.0))
+            else:
+                pose = corrected(predicted(pose, at, c.density), p, q, std)
+        known = tuple(one for one in known if one[0] > t - KEPT_SEC)
+        state.get_mutable_abstract_state(int(self._late)).set_value(late)
+        state.get_mutable_abstract_state(int(self._pose)).set_value(pose)
+        state.get_mutable_abstract_state(int(self._known)).set_value(known)
+
+    def _pose_of(self, context) -> PoseEstimate | None:
+        """The filter's, of the last reading that is known."""
+        return context.get_abstract_state(int(self._pose)).get_value()
+
+    def _calc(self, i):
+        def calc(context, output):
+            pose = self._pose_of(context)
+            if pose is None:
+                output.SetFromVector(self._unknown[i])
+                return
+            dt = max(context.get_time() - pose.t, 0.0)
+            now = on_the_table(
+                dt, pose.p, pose.v, pose.q, pose.w, self._config.height, self._axis
+            )
+            output.SetFromVector(now[i])
+
+        return calc
+
+    def _calc_seen(self, context, output):
+        pose = self._pose_of(context)
+        output.SetFromVector([0.0 if pose is None else 1.0])

@@ -1,0 +1,180 @@
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.systems.framework import LeafSystem
+
+from makebreak.systems.arm.numerics.packed import packed
+from makebreak.systems.arm.numerics.serial_chain import SerialChain
+from makebreak.systems.contact_mpc.numerics.ball_state import V_TIP, pack
+from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.timing import timed
+from makebreak.systems.perception.numerics.state_estimator import (
+    estimate,
+    observe_force,
+    tip_mobility,
+    tip_motion,
+    with_pose,
+)
+
+
+@dataclass
+class StateEstimatorConfig:
+    ball_radius: float = 0.0315  # [m] as the model has it.
+    tip_mass: float = 1.0  # [kg] of the tip in the LCS.
+    window_sec: float = 0.05  # Of the mean force: the learner's period.
+    period_sec: float = 0.0125 / 3.0  # Divides the periods of C3 and of the learner.
+    force_bandwidth: float = 60.0  # Of the tip force's observer [1/s].
+    offset_sec: float = 0.0
+
+
+class StateEstimator(LeafSystem):
+    """Joint sensors and the ball tracker, as the state and input of the LCS.
+
+    The LCS knows the arm as a point of some mass; u_measured is the force on it that
+    explains the tip's motion (numerics/state_estimator.py), as a mean over the window,
+    which is what the residual learner needs.
+
+    Inputs:  q (7,), v (7,), torque (7,) motor side [rad, rad/s, N m]; p_ball (3,),
+             v_ball (3,) [m, m/s]; seen (1,); of an object whose pose is known, both of
+             q_object (4,) its quaternion [w x y z] and w_object (3,) [rad/s]: without
+             them it is a ball that rolls.
+    Outputs: x (19,), the layout of contact_mpc/numerics/ball_state.py; u_measured (3,)
+             [N]; valid (1,): 1 if every reading was finite and the ball is seen, 0 if
+             it is not seen, -1 if one was not finite (x is of the last good ones);
+             window_valid (1,): 1 if that was so all over the window; tip_force (3,) [N]
+             that the surroundings put on the tip, from joint torques and velocities.
+
+    A reading that is not finite leaves x, u_measured and tip_force as they were.
+    """
+
+    def __init__(self, config: StateEstimatorConfig, chain: SerialChain, q_default):
+        """Args: chain, the arm with its tool as the model has it; q_default (n,) [rad],
+        where x is before the first reading."""
+        super().__init__()
+        if not config.ball_radius > 0.0 or not config.tip_mass > 0.0:
+            raise ValueError(
+                "ball_radius and tip_mass must be positive, got "
+                f"{config.ball_radius}, {config.tip_mass}"
+            )
+        self._ball_radius, self._tip_mass = config.ball_radius, config.tip_mass
+        self._chain = packed(chain)
+        n = len(chain.mass)
+        self.q_default = q_default = np.array(q_default, dtype=float)
+        p_tip, _, _ = tip_motion(
+            self._chain[0], q_default, np.zeros(n), np.zeros(n), 1.0
+        )
+        n_window = max(1, round(config.window_sec / config.period_sec))
+        self._q = self.DeclareVectorInputPort("q", n)
+        self._v = self.DeclareVectorInputPort("v", n)
+        self._torque = self.DeclareVectorInputPort("torque", n)
+        self._p_ball = self.DeclareVectorInputPort("p_ball", 3)
+        self._v_ball = self.DeclareVectorInputPort("v_ball", 3)
+        self._seen = self.DeclareVectorInputPort("seen", 1)
+        self._q_object = self.DeclareVectorInputPort("q_object", 4)
+        self._w_object = self.DeclareVectorInputPort("w_object", 3)
+        x0 = pack(p_tip, np.zeros(3), [0, 0, config.ball_radius], np.zeros(3), 1.0)
+        self._x = self.DeclareDiscreteState(x0)
+        # The forces, and how many readings in a row were valid; a learner that starts
+        # is told that all were.
+        self._window = self.DeclareDiscreteState(
+            np.append(np.zeros(3 * n_window), n_window)
+        )
+        self._valid = self.DeclareDiscreteState(1)
+        self._observer = self.DeclareDiscreteState(7)
+        self._gain, self._dt = config.force_bandwidth, config.period_sec
+        self.DeclareStateOutputPort("x", self._x)
+        self.DeclareVectorOutputPort(
+            "u_measured",
+            3,
+            self._mean_force,
+            prerequisites_of_calc={self.discrete_state_ticket(self._window)},
+        )
+        self._n_window = n_window
+        self.DeclareVectorOutputPort(
+            "tip_force",
+            3,
+            self._tip_force,
+            prerequisites_of_calc={self.discrete_state_ticket(self._observer)},
+        )
+        self.DeclareStateOutputPort("valid", self._valid)
+        self.DeclareVectorOutputPort(
+            "window_valid",
+            1,
+            self._all_valid,
+            prerequisites_of_calc={self.discrete_state_ticket(self._window)},
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(
+            config.period_sec, config.offset_sec, self._update
+        )
+        first_call(self._first_call, q_default)
+
+    def _first_call(self, q_default: np.ndarray):
+        zero, before = np.zeros(q_default.size), np.zeros(3 * self._n_window + 1)
+        before.setflags(write=False)  # As a Context's state is.
+        at = np.zeros(3)
+        estimate(
+            self._chain, q_default, zero, zero, at, at, np.zeros(1), self._tip_mass,
+            self._ball_radius, before,
+        )  # fmt: skip
+        observer = np.zeros(7)
+        observer.setflags(write=False)
+        mobility = tip_mobility(self._chain[0], q_default)
+        observe_force(observer, at, at, mobility, self._gain, self._dt)
+
+    def _mean_force(self, context, output):
+        window = context.get_discrete_state(self._window).value()
+        output.SetFromVector(window[:-1].reshape(-1, 3).mean(axis=0))
+
+    def _tip_force(self, context, output):
+        output.SetFromVector(context.get_discrete_state(self._observer).value()[3:6])
+
+    def _all_valid(self, context, output):
+        n_valid = context.get_discrete_state(self._window).value()[-1]
+        output.SetFromVector([1.0 if n_valid >= self._n_window else 0.0])
+
+    def start_at(self, context) -> None:
+        """Begins anew in a Context of this system: no window is whole until another
+        window_sec has passed."""
+        window = np.zeros(3 * self._n_window + 1)
+        context.SetDiscreteState(self._window, window)
+        context.SetDiscreteState(self._observer, np.zeros(7))
+
+    @timed
+    def _update(self, context, discrete_state):
+        window = context.get_discrete_state(self._window).value()
+        finite, x, after, valid = estimate(
+            self._chain,
+            self._q.Eval(context),
+            self._v.Eval(context),
+            self._torque.Eval(context),
+            self._p_ball.Eval(context),
+            self._v_ball.Eval(context),
+            self._seen.Eval(context),
+            self._tip_mass,
+            self._ball_radius,
+            window,
+        )
+        if self._q_object.HasValue(context) and self._w_object.HasValue(context):
+            finite, x, valid = with_pose(
+                finite,
+                x,
+                valid,
+                np.asarray(self._q_object.Eval(context)),
+                np.asarray(self._w_object.Eval(context)),
+            )
+        discrete_state.set_value(self._valid, [valid])
+        if finite:
+            discrete_state.set_value(self._x, x)
+            discrete_state.set_value(self._window, after)
+            u = after[-4:-1]
+            observer = observe_force(
+                context.get_discrete_state(self._observer).value(),
+                x[V_TIP],
+                u / self._tip_mass,
+                tip_mobility(self._chain[0], np.asarray(self._q.Eval(context))),
+                self._gain,
+                self._dt,
+            )
+            discrete_state.set_value(self._observer, observer)
+        else:
+            discrete_state.set_value(self._window, np.append(window[:-1], 0.0))

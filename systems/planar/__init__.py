@@ -1,0 +1,1 @@
+"""Adaptive control of a point in the plane: planar_world, planar_impedance."""

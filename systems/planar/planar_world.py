@@ -1,0 +1,160 @@
+"""A point effector in the plane, in porridge or on springs, and its target."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.planar.numerics.planar_world import (
+    circle_target,
+    external_force,
+    step,
+)
+
+
+@dataclass
+class PlanarWorldConfig:
+    mass: float = 1.0  # [kg]
+    # First and last viscosity [N s/m]; it rises over ramp_sec, from time 0 on.
+    viscosity: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    ramp_sec: float = 6.0
+    anchors: list[list[float]] = field(default_factory=list)  # Of the springs [m].
+    stiffness: list[float] = field(default_factory=list)  # One per anchor [N/m].
+    rest_length: list[float] = field(default_factory=list)  # One per anchor [m].
+    # One per anchor: farther away than this it does not pull [m]. None: it always does.
+    reach: list[float] | None = None
+    period_sec: float = 0.001
+
+
+def springs_of(config: PlanarWorldConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Anchors (n, 2) [m], and springs (n, 3) as numerics/planar_world.py has them.
+
+    Raises: ValueError that names what is wrong.
+    """
+    c = config
+    anchors = np.array(c.anchors, dtype=float).reshape(-1, 2)
+    n = len(anchors)
+    springs = np.full((n, 3), np.inf)
+    for i, name in enumerate(("stiffness", "rest_length", "reach")):
+        if getattr(c, name) is None:
+            continue
+        values = np.array(getattr(c, name), dtype=float)
+        if values.shape != (n,) or not np.all(values >= 0.0):
+            raise ValueError(
+                f"{name} is {getattr(c, name)}, expected {n} numbers >= 0, one per "
+                "anchor"
+            )
+        springs[:, i] = values
+    return anchors, springs
+
+
+class PlanarWorld(LeafSystem):
+    """The effector and what pulls at it; see numerics/planar_world.py.
+
+    The update that ends a period comes at t_k - lead_sec and brings the state to t_k,
+    so that whoever reads at t_k reads the state of t_k, and u, held over the period, is
+    what was there at its beginning.
+
+    Inputs:  u (2,) [N], held over each period; not finite counts as zero.
+    Outputs: state (4,) p, v [m], [m/s]; external_force (2,) of the world on the
+             effector [N].
+
+    Args: state, (4,) the first one.
+    Raises: ValueError that names what is wrong in the config.
+    """
+
+    def __init__(self, config: PlanarWorldConfig, state, lead_sec: float = 1e-4):
+        super().__init__()
+        c = config
+        for name, number in (
+            ("mass", c.mass),
+            ("ramp_sec", c.ramp_sec),
+            ("period_sec", c.period_sec),
+        ):
+            if not 0.0 < number < np.inf:
+                raise ValueError(f"{name} is {number}, expected > 0")
+        if not 0.0 < lead_sec < c.period_sec:
+            raise ValueError(f"lead_sec is {lead_sec}, expected within a period")
+        viscosity = np.array(c.viscosity, dtype=float)
+        if viscosity.shape != (2,) or not np.all(viscosity >= 0.0):
+            raise ValueError(f"viscosity is {c.viscosity}, expected 2 numbers >= 0")
+        anchors, springs = springs_of(c)
+        first = np.array(state, dtype=float)
+        if first.shape != (4,) or not np.all(np.isfinite(first)):
+            raise ValueError(f"state is {state}, expected 4 numbers")
+        self._period = c.period_sec
+        self._mass = float(c.mass)
+        self._world = (viscosity, float(c.ramp_sec), anchors, springs)
+        self._u = self.DeclareVectorInputPort("u", 2)
+        self._state = self.DeclareDiscreteState(first)
+        self._count = self.DeclareDiscreteState(1)  # Periods since time 0.
+        self.DeclareStateOutputPort("state", self._state)
+        self.DeclareVectorOutputPort(
+            "external_force",
+            2,
+            self._calc_force,
+            {
+                self.discrete_state_ticket(self._state),
+                self.discrete_state_ticket(self._count),
+            },
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(
+            c.period_sec, c.period_sec - lead_sec, self._update
+        )
+        first_call(self._first_call, first)
+
+    def _first_call(self, x):
+        force = external_force(x, 0.0, *self._world)
+        step(x, 0.0, force, self._period, self._mass, *self._world)
+
+    def _update(self, context: Context, discrete_state):
+        count = context.get_discrete_state(self._count).value()[0]
+        x = context.get_discrete_state(self._state).value().copy()
+        u = self._u.Eval(context)
+        if not (np.isfinite(u[0]) and np.isfinite(u[1])):
+            u = np.zeros(2)
+        t = count * self._period
+        x = step(x, t, u, self._period, self._mass, *self._world)
+        discrete_state.set_value(self._state, x)
+        discrete_state.set_value(self._count, [count + 1.0])
+
+    def _calc_force(self, context: Context, output: BasicVector):
+        count = context.get_discrete_state(self._count).value()[0]
+        x = context.get_discrete_state(self._state).value().copy()
+        output.SetFromVector(external_force(x, count * self._period, *self._world))
+
+
+@dataclass
+class CircleTargetConfig:
+    radius: float = 0.25  # [m]
+    duration_sec: float = 6.0
+    phase: float = 0.0  # Angle at which it starts [rad].
+    turn: int = 1  # +1 counter-clockwise, -1 clockwise.
+
+
+class CircleTarget(LeafSystem):
+    """Once around a circle about the origin, from rest to rest.
+
+    Outputs: x_desired (6,) p, v, a [m], [m/s], [m/s2].
+    """
+
+    def __init__(self, config: CircleTargetConfig):
+        super().__init__()
+        c = config
+        for name in ("radius", "duration_sec"):
+            if not 0.0 < getattr(c, name) < np.inf:
+                raise ValueError(f"{name} is {getattr(c, name)}, expected > 0")
+        if c.turn not in (1, -1):
+            raise ValueError(f"turn is {c.turn}, expected 1 or -1")
+        self._circle = (
+            float(c.radius),
+            float(c.duration_sec),
+            float(c.phase),
+            float(c.turn),
+        )
+        first_call(circle_target, 0.0, *self._circle)
+        self.DeclareVectorOutputPort("x_desired", 6, self._calc, {self.time_ticket()})
+
+    def _calc(self, context: Context, output: BasicVector):
+        output.SetFromVector(circle_target(context.get_time(), *self._circle))

@@ -1,0 +1,98 @@
+"""Ground truth of contacts, for scoring."""
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.multibody.plant import ContactResults
+from pydrake.multibody.tree import RigidBody
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from makebreak.systems.arm.numerics.contact_force import tip_wrench
+from makebreak.systems.arm.numerics.packed import packed
+from makebreak.systems.arm.numerics.serial_chain import SerialChain
+from makebreak.systems.arm.numerics.tip_state import tip_pose
+from makebreak.systems.numerics.first_calls import first_call
+
+
+class ContactProbe(LeafSystem):
+    """The force between a body and others (point contact), found when it is asked for.
+
+    Inputs:  contact_results (abstract).
+    Outputs: contact_force (4 n,): for each of n others [normal force, force on it xyz
+             in the world] [N]; zeros while they do not touch.
+    """
+
+    def __init__(self, first: RigidBody, *others: RigidBody):
+        super().__init__()
+        self._first = int(first.index())
+        self._row = {int(body.index()): i for i, body in enumerate(others)}
+        self._results = self.DeclareAbstractInputPort(
+            "contact_results", AbstractValue.Make(ContactResults())
+        )
+        self.DeclareVectorOutputPort("contact_force", 4 * len(others), self._calc)
+
+    def _calc(self, context: Context, output: BasicVector):
+        force = np.zeros((len(self._row), 4))
+        results = self._results.Eval(context)
+        for i in range(results.num_point_pair_contacts()):
+            contact = results.point_pair_contact_info(i)
+            a, b = int(contact.bodyA_index()), int(contact.bodyB_index())
+            if a == self._first and b in self._row:
+                row, sign = self._row[b], 1.0  # Drake's force acts on B.
+            elif b == self._first and a in self._row:
+                row, sign = self._row[a], -1.0
+            else:
+                continue
+            f_B = contact.contact_force()
+            force[row, 0] += abs(f_B @ contact.point_pair().nhat_BA_W)
+            force[row, 1:] += sign * f_B
+        output.SetFromVector(force.ravel())
+
+
+class TrueTip(LeafSystem):
+    """Where the tip is.
+
+    Inputs:  state (2 n,) of the arm.
+    Outputs: tip_position (3,) in the world [m].
+
+    Args: chain, constants of the arm with its tool, as they are in the world.
+    """
+
+    def __init__(self, chain: SerialChain):
+        super().__init__()
+        self._chain = packed(chain)
+        self._n = len(chain.mass)
+        first_call(tip_pose, self._chain, np.zeros(self._n))
+        self._state = self.DeclareVectorInputPort("state", 2 * self._n)
+        self.DeclareVectorOutputPort("tip_position", 3, self._calc)
+
+    def _calc(self, context: Context, output: BasicVector):
+        q = self._state.Eval(context)[: self._n]
+        output.SetFromVector(tip_pose(self._chain, q)[:3])
+
+
+class ToolContactForce(LeafSystem):
+    """The force of all contacts on the tool, found when it is asked for.
+
+    It is the one that makes the joint torques of the contacts, so it takes no part of
+    Drake's contact results, whose copy costs more than a step of the plant. If a link
+    of the arm touches something, too, that is in it.
+
+    Inputs:  state (2 n,) of the arm; contact_torque (n,) of its contacts [N m].
+    Outputs: contact_force (3,) on the tool in the world [N].
+
+    Args: chain, constants of the arm with its tool.
+    """
+
+    def __init__(self, chain: SerialChain):
+        super().__init__()
+        self._chain = packed(chain)
+        self._n = len(chain.mass)
+        first_call(tip_wrench, self._chain, np.zeros(self._n), np.zeros(self._n))
+        self._state = self.DeclareVectorInputPort("state", 2 * self._n)
+        self._torque = self.DeclareVectorInputPort("contact_torque", self._n)
+        self.DeclareVectorOutputPort("contact_force", 3, self._calc)
+
+    def _calc(self, context: Context, output: BasicVector):
+        q = self._state.Eval(context)[: self._n]
+        wrench = tip_wrench(self._chain, q, self._torque.Eval(context))
+        output.SetFromVector(wrench[:3])

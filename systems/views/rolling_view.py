@@ -1,0 +1,85 @@
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.geometry import Box, Meshcat, Rgba, Sphere
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import LeafSystem
+
+from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL
+
+
+@dataclass
+class RollingViewConfig:
+    center: list[float] = field(default_factory=lambda: [0.5, 0.0])  # [m]
+    radius: float = 0.1  # Of the path [m].
+    ball_radius: float = 0.0315  # As the model has it [m].
+    gap_scale: float = 10.0  # The bar is so much longer than the gap it shows.
+    period_sec: float = 1.0 / 15.0
+
+
+class RollingView(LeafSystem):
+    """Meshcat's live view of an adaptive roll: the target path (dark), the ball's
+    track (orange), the ball as the model has it (a ghost), and a bar beside the path
+    whose height is the learned residual as a length; a slider shows the same in mm.
+
+    Inputs: p_ball (3,) true position, for the track; x (19,) the estimate, for the
+            ghost; gap (1,) the learned residual times its time step [m].
+    """
+
+    BAR = "/makebreak/r_comp"
+
+    def __init__(self, config: RollingViewConfig, meshcat: Meshcat):
+        super().__init__()
+        self._config, self._meshcat = config, meshcat
+        self._p_ball = self.DeclareVectorInputPort("p_ball", 3)
+        self._x = self.DeclareVectorInputPort("x", N_X)
+        self._gap = self.DeclareVectorInputPort("gap", 1)
+        self._track = self.DeclareAbstractState(AbstractValue.Make(np.zeros((0, 3))))
+        meshcat.SetProperty("/Grid", "visible", False)
+        meshcat.SetProperty("/Axes", "visible", False)
+        meshcat.SetCameraPose([1.12, -0.62, 0.52], [0.4, 0.0, 0.16])
+        angle = np.linspace(0.0, 2.0 * np.pi, 121)
+        c = config
+        path = [
+            c.center[0] + c.radius * np.cos(angle),
+            c.center[1] + c.radius * np.sin(angle),
+            np.full_like(angle, 0.002),
+        ]
+        meshcat.SetLine("/makebreak/path", np.array(path), 3.0, Rgba(0.1, 0.1, 0.2, 1))
+        meshcat.SetObject(
+            "/makebreak/model_ball", Sphere(c.ball_radius), Rgba(0.3, 0.5, 1, 0.25)
+        )
+        meshcat.SetObject(self.BAR, Box(0.012, 0.012, 1.0), Rgba(0.2, 0.45, 1.0, 1.0))
+        self._show_gap(0.0, 0.0)
+        meshcat.AddSlider("r_comp as a gap [mm]", -20.0, 40.0, 0.1, 0.0)
+        self.DeclarePeriodicPublishEvent(config.period_sec, 0.0, self._publish)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(0.1, 0.0, self._remember)
+
+    def _show_gap(self, gap, t):
+        x, y = self._config.center[0], self._config.center[1] + 0.22
+        height = max(self._config.gap_scale * gap, 0.001) if np.isfinite(gap) else 0.001
+        self._meshcat.SetTransform(self.BAR, RigidTransform([x, y, height / 2]), t)
+        # On the object below: a transform sets its own path's scale back to 1.
+        self._meshcat.SetProperty(
+            f"{self.BAR}/<object>", "scale", [1.0, 1.0, height], t
+        )
+
+    def _remember(self, context, state):
+        track = context.get_abstract_state(int(self._track)).get_value()
+        p = self._p_ball.Eval(context)
+        point = np.array([[p[0], p[1], 0.003]])
+        track = np.concatenate([track, point])
+        state.get_mutable_abstract_state(int(self._track)).set_value(track)
+
+    def _publish(self, context):
+        t, meshcat = context.get_time(), self._meshcat
+        gap = self._gap.Eval(context)[0]
+        ghost = RigidTransform(self._x.Eval(context)[P_BALL])
+        meshcat.SetTransform("/makebreak/model_ball", ghost, t)
+        self._show_gap(gap, t)
+        if np.isfinite(gap):
+            meshcat.SetSliderValue("r_comp as a gap [mm]", 1e3 * gap)
+        track = context.get_abstract_state(int(self._track)).get_value()
+        if len(track) > 1:
+            meshcat.SetLine("/makebreak/track", track.T, 4.0, Rgba(1, 0.5, 0, 1))
