@@ -38,7 +38,7 @@ from makebreak.diagrams.station import (
     make_control_plant,
     make_station,
 )
-from makebreak.diagrams.wiring import check_own, connect_command
+from makebreak.diagrams.wiring import add_legend, check_own, connect_command
 from makebreak.models.effects.kind import Effect
 from makebreak.models.fruit import FRUITS, fruit_file, make_fruit
 from makebreak.models.scene import Scene, load_scene, read_scene
@@ -87,6 +87,7 @@ from makebreak.systems.perception.state_estimator import (
     StateEstimatorConfig,
 )
 from makebreak.systems.views.adapt_button import AdaptButton
+from makebreak.systems.views.legend import LegendConfig
 from makebreak.systems.views.rolling_view import RollingView, RollingViewConfig
 
 # Periods [s]. The estimator's divides C3's and the learner's: no reading is stale.
@@ -419,6 +420,13 @@ def make_ball_rolling(
     return diagram
 
 
+# Of the task, as the legend says them.
+PHASES = (
+    "now: rolls the ball",
+    "now: goes on to the next place",
+    "now: waits for the ball to be seen",
+    "now: approaches the ball",
+)
 # Settings that the diagram makes of others.
 _OWN = {
     "tracker": ("ball_radius", "period_sec", "offset_sec"),
@@ -692,6 +700,8 @@ def add_ball_rolling(
         builder.Connect(p_ball.get_output_port(), view.GetInputPort("p_ball"))
         connect(estimator, "x", view, "x")
         builder.Connect(gap_of_r.get_output_port(), view.GetInputPort("gap"))
+        legend = LegendConfig(view.LEGEND, PHASES, view.CAMERA, view.LOOK_AT)
+        add_legend(builder, meshcat, legend, task.GetOutputPort("phase"))
 
 
 def connect_reference(builder: DiagramBuilder) -> None:

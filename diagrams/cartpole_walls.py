@@ -17,6 +17,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
 from makebreak.diagrams.recorder import add_recorder
+from makebreak.diagrams.wiring import add_legend
 from makebreak.models.model_files import MODELS
 from makebreak.models.scene import load_scene
 from makebreak.systems.baselines.dynamics_residual_learner import (
@@ -41,9 +42,11 @@ from makebreak.systems.contact_mpc.residual_learner import (
     ResidualLearner,
     ResidualLearnerConfig,
 )
+from makebreak.systems.views.legend import LegendConfig
 from makebreak.systems.views.walls_view import WallsView, WallsViewConfig
 
 SCENE = str(MODELS / "cartpole_walls.scene.yaml")
+CAMERA = (0.25, -1.3, 0.6), (0.0, 0.0, 0.35)  # In Meshcat, and what it looks at [m].
 DT = 0.01  # Time step of the LCS, of C3 and of the learner [s].
 # Learner, C3, then the LCS as plant: no value waits for the next period. (The
 # MultibodyPlant steps every millisecond, and holds u from C3 on.)
@@ -158,7 +161,7 @@ def make_cartpole_walls(
             loaded.command_input_port(driven),
         )
         if meshcat is not None:
-            meshcat.SetCameraPose([0.25, -1.3, 0.6], [0.0, 0.0, 0.35])
+            meshcat.SetCameraPose(*CAMERA)
             MeshcatVisualizer.AddToBuilder(
                 builder,
                 loaded.scene_graph,
@@ -221,6 +224,7 @@ def make_cartpole_walls(
             "walls_view", WallsView(WallsViewConfig(gap=list(model.c)), meshcat)
         )
         builder.Connect(r_comp, view.GetInputPort("r_comp"))
+        add_legend(builder, meshcat, LegendConfig(view.LEGEND, (), *CAMERA))
     names = ("slide.position", "pivot.position", "slide.velocity", "pivot.velocity")
     add_recorder(
         builder,

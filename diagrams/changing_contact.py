@@ -35,7 +35,7 @@ from makebreak.diagrams.station import (
     make_station,
 )
 from makebreak.diagrams.tabletop import TOOL, objects
-from makebreak.diagrams.wiring import timed
+from makebreak.diagrams.wiring import add_legend, timed
 from makebreak.models.scene import Scene
 from makebreak.systems.arm.impedance_controller import (
     HybridConfig,
@@ -77,6 +77,7 @@ from makebreak.systems.changing_contact.velocity_shaper import (
     VelocityShaperConfig,
 )
 from makebreak.systems.views.contact_view import ContactView, ContactViewConfig
+from makebreak.systems.views.legend import LegendConfig
 
 # Periods [s].
 TICK, ESTIMATE, ANTICIPATE = 0.001, 0.005, 0.01
@@ -334,6 +335,8 @@ def make_changing_contact(
         connect(modes, "mode", view)
         connect(shaper, "phase", view)
         connect(shaper, "x_desired", view)
+        legend = LegendConfig(view.LEGEND, (), view.camera, view.LOOK_AT)
+        add_legend(builder, meshcat, legend)
     diagram = builder.Build()
     diagram.set_name("changing_contact")
     return diagram

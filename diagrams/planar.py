@@ -16,6 +16,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem
 
 from makebreak.diagrams.recorder import add_recorder
+from makebreak.diagrams.wiring import add_legend
 from makebreak.models.effects.delay_line import DelayLine
 from makebreak.models.model_files import MODELS
 from makebreak.systems.baselines.force_feedforward import ForceFeedforward
@@ -26,6 +27,7 @@ from makebreak.systems.planar.planar_world import (
     PlanarWorld,
     PlanarWorldConfig,
 )
+from makebreak.systems.views.legend import LegendConfig
 from makebreak.systems.views.planar_view import PlanarView, PlanarViewConfig
 
 PLANAR = str(MODELS / "planar.scene.yaml")  # The effector alone: what is believed.
@@ -135,6 +137,8 @@ def make_planar(
         )
         builder.Connect(state, view.GetInputPort("state"))
         builder.Connect(x_desired, view.GetInputPort("x_desired"))
+        legend = LegendConfig(view.LEGEND, (), view.CAMERA, view.LOOK_AT)
+        add_legend(builder, meshcat, legend)
     builder.ExportOutput(state, "state")
     builder.ExportOutput(x_desired, "x_desired")
     builder.ExportOutput(plant.GetOutputPort("external_force"), "force")

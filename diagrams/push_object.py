@@ -34,7 +34,7 @@ from makebreak.diagrams.station import (
     make_control_plant,
     make_station,
 )
-from makebreak.diagrams.wiring import check_own, connect_command
+from makebreak.diagrams.wiring import add_legend, check_own, connect_command
 from makebreak.models.effects.kind import Effect
 from makebreak.models.model_files import MODELS
 from makebreak.models.pushed_object import (
@@ -103,6 +103,7 @@ from makebreak.systems.perception.state_estimator import (
     StateEstimatorConfig,
 )
 from makebreak.systems.views.adapt_button import AdaptButton
+from makebreak.systems.views.legend import LegendConfig
 from makebreak.systems.views.push_view import PushView, PushViewConfig
 
 PUSH_OBJECT = str(MODELS / "push_object.scene.yaml")
@@ -414,6 +415,12 @@ def _add_sensor(
 
 
 # Settings that the diagram makes of others.
+# Of the task, as the legend says them.
+PHASES = (
+    "now: pushes",
+    "now: goes to another place",
+    "now: waits for the object to be seen",
+)
 _OWN = {
     "goals": ("period_sec", "offset_sec"),
     "task": ("height", "clearance", "period_sec", "offset_sec"),
@@ -670,6 +677,8 @@ def make_push_object(
         connect(goals, "goal", view, "goal")
         connect(estimator, "x", view, "x")
         connect(estimator, "valid", view, "valid")
+        legend = LegendConfig(view.LEGEND, PHASES, view.CAMERA, view.LOOK_AT)
+        add_legend(builder, meshcat, legend, task.GetOutputPort("phase"))
     diagram = builder.Build()
     diagram.set_name("push_object")
     return diagram

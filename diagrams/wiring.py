@@ -4,8 +4,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
-from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import DiagramBuilder, LeafSystem, OutputPort
 from pydrake.systems.primitives import Demultiplexer
+
+from makebreak.systems.views.legend import Legend, LegendConfig
 
 _Config = TypeVar("_Config")
 
@@ -44,3 +47,15 @@ def connect_command(
     builder.Connect(reference.GetOutputPort("command"), split.get_input_port())
     for i, name in enumerate(("x_desired", "wrench_feedforward")):
         builder.Connect(split.get_output_port(i), arm.GetInputPort(name))
+
+
+def add_legend(
+    builder: DiagramBuilder,
+    meshcat: Meshcat,
+    config: LegendConfig,
+    phase: OutputPort | None = None,
+) -> None:
+    """A legend beside a view. Args: phase (1,): the number of one of config.phases."""
+    legend = builder.AddNamedSystem("legend", Legend(config, meshcat))
+    if phase is not None:
+        builder.Connect(phase, legend.GetInputPort("phase"))

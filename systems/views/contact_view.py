@@ -16,6 +16,7 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
     UNKNOWN_MODE,
     ContactBelief,
 )
+from makebreak.systems.views.numerics.trail import Trail
 
 _ROOT = "/makebreak/contact"
 _NOWHERE = RigidTransform([0.0, 0.0, -5.0])
@@ -23,6 +24,7 @@ _BESIDE = np.array([0.045, -0.045, 0.06])  # Of the tip, where the mode is seen 
 _REGIONS = 6  # Of each kind that can be seen at once.
 _KIND_COLORS = {IMPACT: Rgba(0.9, 0.2, 0.2, 0.3), IMPACTLESS: Rgba(0.2, 0.4, 0.95, 0.3)}
 # Unknown, free, then the modes in their order, again from the third on.
+_TARGET, _TRACK, _FORCE = Rgba(0.1, 0.1, 0.2), Rgba(1.0, 0.5, 0.0), Rgba(0.1, 0.1, 0.1)
 _MODE_COLORS = (
     Rgba(1.0, 1.0, 1.0),
     Rgba(0.6, 0.6, 0.6),
@@ -57,6 +59,18 @@ class ContactView(LeafSystem):
             mode (1,); phase (6,); optional x_desired (19,), for the target path.
     """
 
+    LOOK_AT = (0.48, 0.0, 0.05)  # [m]
+    LEGEND = (
+        ("an impact is expected here", _KIND_COLORS[IMPACT]),
+        ("a change of contact is expected here", _KIND_COLORS[IMPACTLESS]),
+        ("contact force: arrow", _FORCE),
+        ("target path", _TARGET),
+        ("track of the tool", _TRACK),
+        ("ball beside the tool: mode; unknown", _MODE_COLORS[0]),
+        ("no contact", _MODE_COLORS[1]),
+        ("first mode of contact, then other colours", _MODE_COLORS[2]),
+    )
+
     def __init__(
         self, config: ContactViewConfig, meshcat: Meshcat, offset_sec: float = 0.0
     ):
@@ -75,15 +89,17 @@ class ContactView(LeafSystem):
         meshcat.Delete(_ROOT)
         meshcat.SetProperty("/Grid", "visible", False)
         meshcat.SetProperty("/Axes", "visible", False)
-        meshcat.SetCameraPose(config.camera, [0.48, 0.0, 0.05])
+        self.camera = config.camera
+        meshcat.SetCameraPose(config.camera, self.LOOK_AT)
+        self._target = Trail(meshcat, f"{_ROOT}/target", _TARGET, 2.0)
+        self._track = Trail(meshcat, f"{_ROOT}/track", _TRACK)
         for kind, color in _KIND_COLORS.items():
             for i in range(_REGIONS):
                 self._draw(_region(kind, i), Sphere(1.0), color)
         for i, color in enumerate(_MODE_COLORS):
             self._draw(f"{_ROOT}/mode/{i}", Sphere(0.014), color)
-        dark = Rgba(0.1, 0.1, 0.1)
-        self._draw(f"{_ROOT}/force/shaft", Box(0.006, 0.006, 1.0), dark)
-        self._draw(f"{_ROOT}/force/head", MeshcatCone(0.025, 0.01, 0.01), dark)
+        self._draw(f"{_ROOT}/force/shaft", Box(0.006, 0.006, 1.0), _FORCE)
+        self._draw(f"{_ROOT}/force/head", MeshcatCone(0.025, 0.01, 0.01), _FORCE)
         self._draw_bars()
         for name, most in ((FORCE_SLIDER, 60.0), (SPEED_SLIDER, 300.0)):
             meshcat.DeleteSlider(name, strict=False)
@@ -145,10 +161,8 @@ class ContactView(LeafSystem):
         if np.isfinite(speed):
             meshcat.SetSliderValue(SPEED_SLIDER, 1e3 * float(speed))
         path = context.get_abstract_state(int(self._path)).get_value()
-        if len(path) > 1:
-            target, track = path[:, :3].T, path[:, 3:].T
-            meshcat.SetLine(f"{_ROOT}/target", target, 2.0, Rgba(0.1, 0.1, 0.2, 1))
-            meshcat.SetLine(f"{_ROOT}/track", track, 4.0, Rgba(1, 0.5, 0, 1))
+        self._target.show(path[:, :3], t)
+        self._track.show(path[:, 3:], t)
 
     def _show_regions(self, belief, t):
         for kind in _KIND_COLORS:

@@ -11,6 +11,8 @@ _HEIGHT = 0.02  # Of all that moves, above the floor [m].
 _TRACE_DOTS = 120
 _ROOT = "/makebreak/planar"
 
+_EFFECTOR, _TARGET = Rgba(0.13, 0.4, 0.9), Rgba(0.95, 0.55, 0.1)
+
 
 @dataclass
 class PlanarViewConfig:
@@ -32,6 +34,12 @@ class PlanarView(LeafSystem):
     Inputs: state (4,) p, v; x_desired (6,) p, v, a.
     """
 
+    CAMERA, LOOK_AT = (0.0, -0.3, 1.25), (0.0, 0.0, 0.0)  # [m]
+    LEGEND = (
+        ("effector, and its path", _EFFECTOR),
+        ("target, and its path", _TARGET),
+    )
+
     def __init__(
         self, config: PlanarViewConfig, meshcat: Meshcat, offset_sec: float = 0.0
     ):
@@ -44,19 +52,19 @@ class PlanarView(LeafSystem):
         self._target = self.DeclareVectorInputPort("x_desired", 6)
         meshcat.SetProperty("/Grid", "visible", False)
         meshcat.SetProperty("/Axes", "visible", False)
-        meshcat.SetCameraPose([0.0, -0.3, 1.25], [0.0, 0.0, 0.0])
+        meshcat.SetCameraPose(self.CAMERA, self.LOOK_AT)
         floor = Rgba(0.96, 0.94, 0.88)
         meshcat.SetObject(f"{_ROOT}/floor", Box(2.4, 2.4, 0.002), floor)
         if c.viscosity[0] != c.viscosity[1]:
             brown = Rgba(0.6, 0.42, 0.22)
             meshcat.SetObject(f"{_ROOT}/viscosity", Box(0.03, 1.0, 0.01), brown)
             self._show_viscosity(0.0)
-        meshcat.SetObject(f"{_ROOT}/effector", Sphere(0.02), Rgba(0.13, 0.4, 0.9))
-        meshcat.SetObject(f"{_ROOT}/target", Sphere(0.012), Rgba(0.95, 0.55, 0.1))
+        meshcat.SetObject(f"{_ROOT}/effector", Sphere(0.02), _EFFECTOR)
+        meshcat.SetObject(f"{_ROOT}/target", Sphere(0.012), _TARGET)
         for i in range(_TRACE_DOTS):
-            meshcat.SetObject(self._dot(i), Sphere(0.005), Rgba(0.13, 0.4, 0.9))
+            meshcat.SetObject(self._dot(i), Sphere(0.005), _EFFECTOR)
             meshcat.SetTransform(self._dot(i), RigidTransform([0.0, 0.0, -0.1]))
-            meshcat.SetObject(f"{_ROOT}/goal/{i}", Sphere(0.003), Rgba(0.95, 0.55, 0.1))
+            meshcat.SetObject(f"{_ROOT}/goal/{i}", Sphere(0.003), _TARGET)
             meshcat.SetTransform(f"{_ROOT}/goal/{i}", RigidTransform([0.0, 0.0, -0.1]))
         for i, (anchor, k) in enumerate(zip(self._anchors, c.stiffness, strict=True)):
             radius = 0.002 + 0.006 * k / max(c.stiffness)

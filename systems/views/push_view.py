@@ -9,6 +9,10 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import LeafSystem
 
 from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL, Q_BALL
+from makebreak.systems.views.numerics.trail import Trail
+
+_GOAL, _MODEL = Rgba(0.1, 0.7, 0.2, 0.35), Rgba(0.3, 0.5, 1.0, 0.25)
+_TRACK = Rgba(1.0, 0.5, 0.0)
 
 
 @dataclass
@@ -28,6 +32,12 @@ class PushView(LeafSystem):
     """
 
     GOAL, MODEL, TRACK = "/makebreak/goal", "/makebreak/model", "/makebreak/track"
+    CAMERA, LOOK_AT = (1.0, -0.35, 0.6), (0.5, 0.0, 0.0)  # [m]
+    LEGEND = (
+        ("goal", _GOAL),
+        ("object as it is estimated", _MODEL),
+        ("its track since the last goal", _TRACK),
+    )
 
     def __init__(
         self,
@@ -50,11 +60,9 @@ class PushView(LeafSystem):
         )
         meshcat.SetProperty("/Grid", "visible", False)
         meshcat.SetProperty("/Axes", "visible", False)
-        meshcat.SetCameraPose([1.0, -0.35, 0.6], [0.5, 0.0, 0.0])
-        for path, color in (
-            (self.GOAL, Rgba(0.1, 0.7, 0.2, 0.35)),
-            (self.MODEL, Rgba(0.3, 0.5, 1.0, 0.25)),
-        ):
+        meshcat.SetCameraPose(self.CAMERA, self.LOOK_AT)
+        self._trail = Trail(meshcat, self.TRACK, _TRACK)
+        for path, color in ((self.GOAL, _GOAL), (self.MODEL, _MODEL)):
             for i, (shape, X_BS) in enumerate(parts):
                 meshcat.SetObject(f"{path}/{i}", shape, color)
                 meshcat.SetTransform(f"{path}/{i}", X_BS)
@@ -87,5 +95,4 @@ class PushView(LeafSystem):
             X_WB = RigidTransform(q, x[P_BALL])
             meshcat.SetTransform(self.MODEL, X_WB, t)
         _, track = context.get_abstract_state(int(self._track)).get_value()
-        if len(track) > 1:
-            meshcat.SetLine(self.TRACK, track.T, 4.0, Rgba(1, 0.5, 0, 1))
+        self._trail.show(track, t)

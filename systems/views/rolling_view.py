@@ -7,6 +7,13 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import LeafSystem
 
 from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL
+from makebreak.systems.views.numerics.trail import Trail
+
+_PATH, _TRACK = Rgba(0.1, 0.1, 0.2), Rgba(1.0, 0.5, 0.0)
+_MODEL, _RESIDUAL = Rgba(0.3, 0.5, 1.0, 0.25), Rgba(0.2, 0.45, 1.0)
+
+_PATH, _TRACK = Rgba(0.1, 0.1, 0.2), Rgba(1.0, 0.5, 0.0)
+_GHOST, _BAR = Rgba(0.3, 0.5, 1.0, 0.25), Rgba(0.2, 0.45, 1.0)
 
 
 @dataclass
@@ -28,6 +35,13 @@ class RollingView(LeafSystem):
     """
 
     BAR = "/makebreak/r_comp"
+    CAMERA, LOOK_AT = (1.12, -0.62, 0.52), (0.4, 0.0, 0.16)  # [m]
+    LEGEND = (
+        ("path to follow", _PATH),
+        ("track of the ball", _TRACK),
+        ("ball as the model has it", _MODEL),
+        ("learned residual, as a gap, times 10", _RESIDUAL),
+    )
 
     def __init__(self, config: RollingViewConfig, meshcat: Meshcat):
         super().__init__()
@@ -38,7 +52,7 @@ class RollingView(LeafSystem):
         self._track = self.DeclareAbstractState(AbstractValue.Make(np.zeros((0, 3))))
         meshcat.SetProperty("/Grid", "visible", False)
         meshcat.SetProperty("/Axes", "visible", False)
-        meshcat.SetCameraPose([1.12, -0.62, 0.52], [0.4, 0.0, 0.16])
+        meshcat.SetCameraPose(self.CAMERA, self.LOOK_AT)
         angle = np.linspace(0.0, 2.0 * np.pi, 121)
         c = config
         path = [
@@ -46,11 +60,10 @@ class RollingView(LeafSystem):
             c.center[1] + c.radius * np.sin(angle),
             np.full_like(angle, 0.002),
         ]
-        meshcat.SetLine("/makebreak/path", np.array(path), 3.0, Rgba(0.1, 0.1, 0.2, 1))
-        meshcat.SetObject(
-            "/makebreak/model_ball", Sphere(c.ball_radius), Rgba(0.3, 0.5, 1, 0.25)
-        )
-        meshcat.SetObject(self.BAR, Box(0.012, 0.012, 1.0), Rgba(0.2, 0.45, 1.0, 1.0))
+        meshcat.SetLine("/makebreak/path", np.array(path), 3.0, _PATH)
+        meshcat.SetObject("/makebreak/model_ball", Sphere(c.ball_radius), _MODEL)
+        meshcat.SetObject(self.BAR, Box(0.012, 0.012, 1.0), _RESIDUAL)
+        self._trail = Trail(meshcat, "/makebreak/track", _TRACK)
         self._show_gap(0.0, 0.0)
         meshcat.AddSlider("r_comp as a gap [mm]", -20.0, 40.0, 0.1, 0.0)
         self.DeclarePeriodicPublishEvent(config.period_sec, 0.0, self._publish)
@@ -81,5 +94,4 @@ class RollingView(LeafSystem):
         if np.isfinite(gap):
             meshcat.SetSliderValue("r_comp as a gap [mm]", 1e3 * gap)
         track = context.get_abstract_state(int(self._track)).get_value()
-        if len(track) > 1:
-            meshcat.SetLine("/makebreak/track", track.T, 4.0, Rgba(1, 0.5, 0, 1))
+        self._trail.show(track, t)

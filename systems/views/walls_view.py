@@ -7,6 +7,8 @@ from pydrake.geometry import Box, Meshcat, Rgba
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import LeafSystem
 
+_WALL = Rgba(0.2, 0.45, 1.0, 0.4)
+
 
 @dataclass
 class WallsViewConfig:
@@ -23,6 +25,8 @@ class WallsView(LeafSystem):
     Inputs: r_comp (2,) learned error of the distances [m].
     """
 
+    LEGEND = (("wall as it is believed", _WALL),)
+
     def __init__(
         self, config: WallsViewConfig, meshcat: Meshcat, offset_sec: float = 0.0
     ):
@@ -32,7 +36,7 @@ class WallsView(LeafSystem):
         self._height = config.height
         self._r_comp = self.DeclareVectorInputPort("r_comp", 2)
         for path in self._paths():
-            meshcat.SetObject(path, Box(0.01, 0.34, 0.56), Rgba(0.2, 0.45, 1.0, 0.4))
+            meshcat.SetObject(path, Box(0.01, 0.34, 0.56), _WALL)
         self._show(self._gap, 0.0)
         self.DeclarePeriodicPublishEvent(config.period_sec, offset_sec, self._publish)
 

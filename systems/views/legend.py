@@ -1,0 +1,87 @@
+"""What the colours of a view mean, and what the controllers do just now."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.common import MemoryFile
+from pydrake.geometry import InMemoryMesh, Mesh, Meshcat, Rgba
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import LeafSystem
+
+from makebreak.systems.views.numerics.text_board import text_board
+
+ROOT = "/makebreak/legend"
+# Of the board's upper left corner as the camera sees it: to the right, up and away, and
+# a line's height. Meshcat sees 37 degrees up and down, and more to the sides.
+_CORNER, _LINE = np.array([-0.9, 0.62, 1.0]), 0.045
+
+
+@dataclass
+class LegendConfig:
+    lines: Sequence[tuple[str, Rgba]] = ()  # A text, and the colour of what it names.
+    phases: Sequence[str] = ()  # The text of each number of the phase.
+    camera: Sequence[float] = (1.0, -0.6, 0.5)  # From where it is seen [m] ...
+    look_at: Sequence[float] = field(default_factory=lambda: [0.4, 0.0, 0.1])  # [m]
+    period_sec: float = 1.0 / 15.0
+
+
+class Legend(LeafSystem):
+    """A board in Meshcat, at the upper left as the camera sees it first, with what each
+    colour means, and below it the phase. It is in the recording too.
+
+    Inputs: phase (1,), a whole number: which of the phases; optional.
+    """
+
+    def __init__(self, config: LegendConfig, meshcat: Meshcat):
+        super().__init__()
+        self._config, self._meshcat = config, meshcat
+        self._phase = self.DeclareVectorInputPort("phase", 1)
+        meshcat.Delete(ROOT)
+        lines = [(text, _on_white(color)) for text, color in config.lines]
+        self._draw(f"{ROOT}/lines", lines, 0.0)
+        for k, text in enumerate(config.phases):
+            path = f"{ROOT}/phase/{k}"
+            self._draw(path, [(text, None)], len(config.lines) + 0.3)
+            meshcat.SetProperty(path, "visible", False)
+        if config.phases:
+            self._shown: int | None = None  # What the page shows.
+            self.DeclarePeriodicPublishEvent(config.period_sec, 0.0, self._publish)
+
+    def _draw(self, path, lines, below: float):
+        if not lines:
+            return
+        board = text_board(lines)
+        files = {
+            "board.mtl": MemoryFile(board.mtl, ".mtl", "board.mtl"),
+            "board.png": MemoryFile(board.png, ".png", "board.png"),
+        }
+        mesh = InMemoryMesh(MemoryFile(board.obj, ".obj", "board.obj"), files)
+        self._meshcat.SetObject(path, Mesh(mesh, _LINE), Rgba(1.0, 1.0, 1.0))
+        camera = np.array(self._config.camera, dtype=float)
+        away = np.array(self._config.look_at) - camera
+        away /= np.linalg.norm(away)
+        right = np.cross(away, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        up = np.cross(right, away)
+        turn = RotationMatrix(np.column_stack([-away, right, up]))
+        offset = _CORNER - [0.0, _LINE * below, 0.0]
+        place = camera + np.column_stack([right, up, away]) @ offset
+        self._meshcat.SetTransform(path, RigidTransform(turn, place))
+
+    def _publish(self, context):
+        if not self._phase.HasValue(context):
+            return
+        phase = int(self._phase.Eval(context)[0])
+        if phase == self._shown:
+            return
+        self._shown = phase
+        for k in range(len(self._config.phases)):
+            path, t = f"{ROOT}/phase/{k}", context.get_time()
+            self._meshcat.SetProperty(path, "visible", k == phase, t)
+
+
+def _on_white(color: Rgba) -> tuple[float, float, float]:
+    alpha = color.a()
+    r, g, b = (alpha * c + 1.0 - alpha for c in (color.r(), color.g(), color.b()))
+    return r, g, b
