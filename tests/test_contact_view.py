@@ -57,8 +57,7 @@ def show(meshcat, config=None, **change):
         "phase": [0, 0, 0, 0.15, 0, 0],
     } | change
     builder = DiagramBuilder()
-    view = ContactView(config or ContactViewConfig(), Recorder())
-    view._meshcat = meshcat
+    view = ContactView(config or ContactViewConfig(), meshcat)
     builder.AddSystem(view)
     belief = ConstantValueSource(AbstractValue.Make(ContactBelief((CONTACT,))))
     builder.AddSystem(belief)
@@ -97,8 +96,7 @@ def test_a_real_meshcat_takes_it_twice_and_shows_track_and_bars():
     meshcat = Meshcat()
     config = ContactViewConfig(peaks=[[12.0, 7.9], [8.1, np.nan]])
     for _ in range(2):  # A trial after the other in one window.
-        ContactView(config, meshcat)
-    show(meshcat)
+        show(meshcat, config)
     for path in ("track", "peaks/0/1", "peaks/1/0", "region/1/0", "force/head"):
         assert meshcat.HasPath(f"/makebreak/contact/{path}"), path
     assert not meshcat.HasPath("/makebreak/contact/peaks/1/1")

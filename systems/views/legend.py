@@ -56,7 +56,9 @@ class Legend(LeafSystem):
             "board.mtl": MemoryFile(board.mtl, ".mtl", "board.mtl"),
             "board.png": MemoryFile(board.png, ".png", "board.png"),
         }
-        mesh = InMemoryMesh(MemoryFile(board.obj, ".obj", "board.obj"), files)
+        mesh = InMemoryMesh(
+            mesh_file=MemoryFile(board.obj, ".obj", "board.obj"), supporting_files=files
+        )
         self._meshcat.SetObject(path, Mesh(mesh, _LINE), Rgba(1.0, 1.0, 1.0))
         camera = np.array(self._config.camera, dtype=float)
         away = np.array(self._config.look_at) - camera
