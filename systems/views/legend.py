@@ -84,6 +84,6 @@ class Legend(LeafSystem):
 
 
 def _on_white(color: Rgba) -> tuple[float, float, float]:
-    alpha = color.a()
+    alpha = max(color.a(), 0.5)  # What is paler could not be told apart.
     r, g, b = (alpha * c + 1.0 - alpha for c in (color.r(), color.g(), color.b()))
     return r, g, b
