@@ -39,8 +39,8 @@ def text_board(
         top = LINE * i
         if color is not None:
             blue_first = [round(255 * c) for c in color[::-1]]
-            corners = (LINE // 4, top + LINE // 4), (LINE, top + 3 * LINE // 4)
-            cv2.rectangle(picture, *corners, blue_first, cv2.FILLED)
+            square = (LINE // 4, top + LINE // 4), (LINE, top + 3 * LINE // 4)
+            cv2.rectangle(picture, *square, blue_first, cv2.FILLED)
         at = (indent, top + 11 * LINE // 16)
         cv2.putText(picture, text, at, _FONT, _SCALE, (30, 30, 30), _THICK, cv2.LINE_AA)
     w, h = width / LINE, float(len(lines))
