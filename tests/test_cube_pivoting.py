@@ -27,6 +27,7 @@ from makebreak.diagrams.cube_pivoting import (
     world_cube,
 )
 from makebreak.models.scene import load_scene
+from makebreak.scripts import comparison
 from makebreak.scripts.cli import main
 from makebreak.scripts.experiments import cube_pivoting as experiment
 from makebreak.scripts.session import Log
@@ -336,7 +337,7 @@ def test_reproduce_counts_each_variant_and_its_commands_are_those_that_ran(
             for settings, seed in runs
         ]
 
-    monkeypatch.setattr(experiment, "run_many", run_many)
+    monkeypatch.setattr(comparison, "run_many", run_many)
     table = experiment.reproduce(SimpleNamespace(out_dir=tmp_path, reuse=False), 3, 1)
     rows = {row[0]: row for row in table.rows}
     assert len(rows) == len(experiment.VARIANTS) and len(asked) == 3 * len(rows)

@@ -12,8 +12,8 @@ from makebreak.diagrams.multi_spring import MultiSpringConfig
 from makebreak.diagrams.planar import knowledge_of
 from makebreak.diagrams.planar_tuned import SETTINGS, TUNED_FILE, tuned_biomimetic
 from makebreak.diagrams.porridge import PorridgeConfig
+from makebreak.scripts import comparison, tune_planar
 from makebreak.scripts import planar_loops as loops
-from makebreak.scripts import tune_planar
 from makebreak.scripts.cli import main
 from makebreak.scripts.experiments import multi_spring, porridge
 from makebreak.scripts.planar_runs import median_range, with_count
@@ -155,7 +155,7 @@ def test_reproduce_says_met_only_if_every_seed_ran_and_met(
         ([good, good], True),
         ([good, {"success": False, "error": "exit status 3"}], False),
     ):
-        monkeypatch.setattr(module, "run_many", lambda *a, r=results, **k: r)
+        monkeypatch.setattr(comparison, "run_many", lambda *a, r=results, **k: r)
         table = module.reproduce(Session(tmp_path / "r"), 2, 1)
         targets = [m for m in table.met if m is not None]
         assert targets and all(targets) == everything_met

@@ -33,8 +33,9 @@ from makebreak.diagrams.cartpole_walls import (
 )
 from makebreak.diagrams.recorder import recorded, with_noise
 from makebreak.models.scene import read_scene
+from makebreak.scripts.comparison import Comparison
 from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.session import Log, Session, run_many
+from makebreak.scripts.session import Log, Session
 from makebreak.scripts.table import Table
 from makebreak.systems.contact_mpc.numerics.lcp import solve_lcp
 from makebreak.systems.contact_mpc.numerics.lcs import simulate
@@ -255,17 +256,16 @@ RIGHT = {"gap_error": [0.0, 0.0], "adapt": False}  # A baseline that must work.
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     """Figures 3 and 4 beside ours, over seeds, and from states far apart."""
 
-    def many(settings):
-        runs = [(settings, seed) for seed in range(seeds)]
-        return run_many(
-            "cartpole_walls", runs, jobs, session.out_dir, reuse=session.reuse
-        )
+    table = Comparison("cartpole_walls", session, jobs)
+    row = table.row
 
     def count(results, key):
         return f"{sum(bool(r.get(key)) for r in results)} of {len(results)}"
 
-    near, wide, right = many({}), many(WIDE), many({**WIDE, **RIGHT})
-    dynamics = many({**WIDE, "learner": "r_dyn"})
+    near, wide, right, dynamics = (
+        table.runs(settings, seeds)
+        for settings in ({}, WIDE, {**WIDE, **RIGHT}, {**WIDE, "learner": "r_dyn"})
+    )
 
     def residual_errors(key):
         values = [r.get(key) for r in near]
@@ -273,49 +273,38 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
 
     errors = residual_errors("residual_error_max")
     body_errors = residual_errors("multibody_residual_error_max")
-    command = "makebreak run cartpole_walls --seed S"
-    wide_command = command + " --set x_initial=[0,0,0,0] x_spread=[.2,.5,.5,.5]"
-    rows: list[tuple] = []
-    met: list[bool | None] = []
-
-    def row(what, paper, ours, command, good=None):
-        rows.append((what, paper, ours, command))
-        met.append(good)
-
+    wide_command = table.command + " --set x_initial=[0,0,0,0] x_spread=[.2,.5,.5,.5]"
     all_settled = all(r.get("settled") for r in near)
     # A run that ended in an error proves nothing: its key is missing.
     none_plain = all(r.get("settled_without_adaptation") is False for r in near)
-    row("fig. 4: stabilised", "yes", count(near, "settled"), command, all_settled)
+    row("fig. 4: stabilised", "yes", count(near, "settled"), all_settled)
     worst = f"at most {1e3 * max(errors):.1f} mm"
     good = max(errors) <= RESIDUAL_BOUND
-    row("fig. 4: |r - truth| at the end", "converges", worst, command, good)
+    row("fig. 4: |r - truth| at the end", "converges", worst, good)
     ours = count(near, "settled_without_adaptation")
-    row("without adaptation: stabilised", "-", ours, command, none_plain)
+    row("without adaptation: stabilised", "-", ours, none_plain)
     ours = count(near, "multibody_settled")
-    row("MultibodyPlant: stabilised", "-", ours, command)
+    row("MultibodyPlant: stabilised", "-", ours)
     worst = f"at most {1e3 * max(body_errors):.1f} mm"
-    row("MultibodyPlant: |r - truth| at the end", "-", worst, command)
+    row("MultibodyPlant: |r - truth| at the end", "-", worst)
     ours = count(near, "multibody_settled_without_adaptation")
-    row("MultibodyPlant, without adaptation", "-", ours, command)
+    row("MultibodyPlant, without adaptation", "-", ours)
     for name in QUADRANTS.values():
         share = near[0].get(f"gradient_zero_share_{name}")
         text = "-" if share is None else f"{100 * share:.0f} %"
         paper = "100 %" if name == "agreed_free" else "0 %"
-        row(f"fig. 3: no gradient, {name.replace('_', ' ')}", paper, text, command)
-    row("start anywhere: stabilised", "-", count(wide, "settled"), wide_command)
+        row(f"fig. 3: no gradient, {name.replace('_', ' ')}", paper, text)
+    row("start anywhere: stabilised", "-", count(wide, "settled"), command=wide_command)
     ours = count(wide, "settled_without_adaptation")
-    row("start anywhere, without adaptation", "-", ours, wide_command)
+    row("start anywhere, without adaptation", "-", ours, command=wide_command)
     ours = count(dynamics, "settled")
     dynamics_command = wide_command + " learner=r_dyn"
-    row("start anywhere, residual on the dynamics", "-", ours, dynamics_command)
+    row("start anywhere, residual on the dynamics", "-", ours, command=dynamics_command)
     ours = count(right, "settled")
     right_command = wide_command + " gap_error=[0,0] adapt=false"
-    row("start anywhere, walls known", "-", ours, right_command)
-    return Table(
+    row("start anywhere, walls known", "-", ours, command=right_command)
+    return table.table(
         "Cart-pole with soft walls (ACI-MPC VII-A)",
-        ("what", "paper", "ours", "command"),
-        rows,
-        met,
         [
             "A wall that is neither met nor expected teaches nothing: from most states "
             "only one wall's r is learned.",

@@ -34,9 +34,10 @@ from makebreak.diagrams.changing_surface import (
     surface_at,
 )
 from makebreak.diagrams.recorder import recorded
+from makebreak.scripts.comparison import Comparison
 from makebreak.scripts.contact_runs import rehearsed, simulate_motion
 from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.session import Session, run_many
+from makebreak.scripts.session import Session
 from makebreak.scripts.table import Table
 from makebreak.systems.changing_contact.numerics.contact_task import (
     CHANGE_TIME,
@@ -359,20 +360,11 @@ VARIANTS: dict[str, dict] = {
 
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     """Figures 9 and 10 beside ours, over seeds; another tool, other speeds."""
-    name = "changing_surface"
-    command = f"makebreak run {name} --seed S"
-    rows: list[tuple] = []
-    met: list[bool | None] = []
-
-    def row(what, paper, ours, good=None, command=command):
-        rows.append((what, paper, ours, command))
-        met.append(good)
+    table = Comparison("changing_surface", session, jobs)
+    row = table.row
 
     def many(settings, n):
-        results = run_many(
-            name, [(settings, seed) for seed in range(n)], jobs, session.out_dir,
-            reuse=session.reuse,
-        )  # fmt: skip
+        results = table.runs(settings, n)
         return results, [r for r in results if "changes" in r]
 
     main, ended = many({}, seeds)
@@ -439,8 +431,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     for label, settings in VARIANTS.items():
         settings = {**settings, "baselines": False}
         results, runs = many(settings, max(1, seeds // 2))
-        texts = " ".join(f"{key}={value}" for key, value in settings.items())
-        its = command + " --set " + texts.replace("False", "false")
+        its = table.with_settings(settings)
         if not runs:
             row(label, "-", "no run ended", False, command=its)
             continue
@@ -454,11 +445,8 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
             command=its,
         )
         row(f"{label}: tracking error", "-", errors("adaptive", runs)[1], command=its)
-    return Table(
+    return table.table(
         "Three unknown surfaces (CC 4.3, figures 9 and 10)",
-        ("what", "paper", "ours", "command"),
-        rows,
-        met,
         [
             "Delays count from when the last foot of the block is across. The paper "
             "shows one trial on a robot and gives no numbers but confidences.",

@@ -37,9 +37,10 @@ from makebreak.diagrams.contact_learning import (
 )
 from makebreak.diagrams.recorder import episodes, recorded
 from makebreak.diagrams.tabletop import position
+from makebreak.scripts.comparison import Comparison
 from makebreak.scripts.contact_runs import rehearsed, simulate_motion
 from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.session import Session, run_many
+from makebreak.scripts.session import Session
 from makebreak.scripts.table import Table
 from makebreak.systems.changing_contact.numerics.contact_anticipator import spread_along
 from makebreak.systems.changing_contact.numerics.contact_task import (
@@ -362,23 +363,9 @@ VARIANTS: dict[str, dict] = {
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     """Table 1 and figure 18 beside ours; other tool, errors of the station, other
     rule, faster start."""
-    name = "contact_learning"
-
-    def many(settings, n):
-        return run_many(
-            name, [(settings, seed) for seed in range(n)], jobs, session.out_dir,
-            reuse=session.reuse,
-        )  # fmt: skip
-
-    command = f"makebreak run {name} --seed S"
-    rows: list[tuple] = []
-    met: list[bool | None] = []
-
-    def row(what, paper, ours, good=None, command=command):
-        rows.append((what, paper, ours, command))
-        met.append(good)
-
-    main = many({}, seeds)
+    table = Comparison("contact_learning", session, jobs)
+    row = table.row
+    main = table.runs({}, seeds)
     ended = [r for r in main if "completion_time_s" in r]
     if not ended:
         raise RuntimeError(f"no run ended: {main[0].get('error')}")
@@ -483,13 +470,14 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     )
     for label, settings in VARIANTS.items():
         runs = [
-            r for r in many(settings, max(1, seeds // 4)) if "completion_time_s" in r
+            r
+            for r in table.runs(settings, max(1, seeds // 4))
+            if "completion_time_s" in r
         ]
         if not runs:
             row(label, "-", "no run ended")
             continue
-        texts = " ".join(f"{key}={value}" for key, value in settings.items())
-        its = command + " --set " + texts.replace("False", "false")
+        its = table.with_settings(settings)
         F = of("impact_force_peak_N", runs)
         row(
             f"{label}: impact force in trial 1; from trial {FORCE_FROM}",
@@ -502,11 +490,8 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         row(f"{label}: time of trial 1 -> 5", "-", times(runs)[0], command=its)
         wrong = [r["missed_contacts"] + r["false_contacts"] for r in runs]
         row(f"{label}: contacts missed or false", "-", str(sum(wrong)), command=its)
-    return Table(
+    return table.table(
         "Three contacts, learned in five trials (CC 4.5.1, table 1, figure 18)",
-        ("what", "paper", "ours", "command"),
-        rows,
-        met,
         [
             "Errors are along the motion into each contact. Force: F100. A robot and a "
             "wooden block in the paper; the stiffness of each surface is drawn from "

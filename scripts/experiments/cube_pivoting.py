@@ -26,11 +26,11 @@ from makebreak.diagrams.cube_pivoting import (
     world_cube,
 )
 from makebreak.diagrams.recorder import recorded, with_noise
+from makebreak.scripts.comparison import Comparison
 from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.session import Log, Session, run_many
+from makebreak.scripts.session import Log, Session
 from makebreak.scripts.sweep import rate_text
 from makebreak.scripts.table import Table
-from makebreak.scripts.trials import setting_texts
 from makebreak.systems.contact_mpc.c3_mpc import C3Status
 from makebreak.systems.contact_mpc.numerics.pivot_target import (
     LEFT,
@@ -240,11 +240,9 @@ VARIANTS = _variants()
 
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     """How many starts succeed, as it is and with each thing changed."""
-    runs = [(settings, seed) for settings in VARIANTS.values() for seed in range(seeds)]
-    found = run_many("cube_pivoting", runs, jobs, session.out_dir, reuse=session.reuse)
-    rows, met = [], []
-    for i, (what, settings) in enumerate(VARIANTS.items()):
-        results = found[i * seeds : (i + 1) * seeds]
+    table = Comparison("cube_pivoting", session, jobs)
+    for what, settings in VARIANTS.items():
+        results = table.runs(settings, seeds)
         count = sum(bool(r.get("success")) for r in results)
         times = [r["time_to_goal_s"] for r in results if r.get("success")]
         forces = [r["force_max_N"] for r in results if "force_max_N" in r]
@@ -253,14 +251,8 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
             text += f"; {np.median(times):.1f} s"
         if forces:
             text += f"; at most {max(forces):.0f} N"
-        words = " ".join(setting_texts(settings)).replace(", ", ",")
-        command = "makebreak run cube_pivoting --seed S"
-        command += f" --set {words}" if words else ""
-        rows.append((what, "-", text, command))
-        met.append(None if settings else count == len(results))
-    return Table(
-        "A cube tipped by 90 degrees: starts that succeed, median time, largest force",
-        ("what", "paper", "ours", "command"),
-        rows,
-        met,
+        good = None if settings else count == len(results)
+        table.row(what, "-", text, good, table.with_settings(settings))
+    return table.table(
+        "A cube tipped by 90 degrees: starts that succeed, median time, largest force"
     )

@@ -49,6 +49,7 @@ from makebreak.diagrams.planar_tuned import (
     tuned_impedance,
     tuned_mrac,
 )
+from makebreak.scripts.comparison import Comparison
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.planar_comparison import compare
 from makebreak.scripts.planar_runs import (
@@ -62,7 +63,7 @@ from makebreak.scripts.planar_runs import (
     with_count,
     write_recording,
 )
-from makebreak.scripts.session import Log, Session, run_many
+from makebreak.scripts.session import Log, Session
 from makebreak.scripts.table import Table
 from makebreak.systems.baselines.mrac import MracConfig
 from makebreak.systems.planar.numerics.planar_impedance import persistence
@@ -307,21 +308,13 @@ def plots(session, ours, logs, learning, bad, swept):
 
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     """Figures 5 to 7 in numbers, over seeds."""
-    results = run_many(
-        "multi_spring",
-        [({}, seed) for seed in range(seeds)],
-        jobs,
-        session.out_dir,
-        reuse=session.reuse,
-    )
-    good = [r for r in results if "error" not in r]
-    rows: list[tuple] = []
-    met: list[bool | None] = []
-    command = "makebreak run multi_spring --seed S"
+    table = Comparison("multi_spring", session, jobs)
+    good = [r for r in table.runs({}, seeds) if "error" not in r]
 
     def row(what, paper, ours, target=None):
-        rows.append((what, paper, ours, command))
-        met.append(None if target is None else bool(target and len(good) == seeds))
+        if target is not None:
+            target = target and len(good) == seeds
+        table.row(what, paper, ours, target)
 
     def values(key, pick=None):
         return [r[key] if pick is None else r[key][pick] for r in good]
@@ -381,22 +374,18 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     row("constant K_free", "-", mm("constant_free_error_rms_m"))
     row("last measured force as prediction", "-", mm("measured_force_error_rms_m"))
     for setting, errors_in in compare(seeds).items():
-        rows.append((f"{SETTING_NAMES[setting]}:", "", "", ""))
-        met.append(None)
+        table.row(f"{SETTING_NAMES[setting]}:", "", "", command="")
         ours = np.array(next(iter(errors_in.values())))
         for name, found in errors_in.items():
             text = median_range(found, 1e3, "mm")
             if name != next(iter(errors_in)):
                 text += f", {median_range(np.array(found) / ours)} times"
-            rows.append((f"  {name.replace('_', ' ')}", "-", text, "reproduce alone"))
-            met.append(None)
+            label = f"  {name.replace('_', ' ')}"
+            table.row(label, "-", text, command="reproduce alone")
     notes = ["Medians over seeds (least to greatest). A target holds for every seed."]
     if len(good) < seeds:
         notes.append(f"{seeds - len(good)} of {seeds} runs failed.")
-    return Table(
+    return table.table(
         "Three springs: adaptive impedance and adaptive control (CC 4.2)",
-        ("what", "paper", "ours", "command"),
-        rows,
-        met,
         notes,
     )

@@ -37,9 +37,10 @@ from makebreak.diagrams.multiple_collisions import (
 )
 from makebreak.diagrams.recorder import episodes, recorded
 from makebreak.diagrams.tabletop import position
+from makebreak.scripts.comparison import Comparison
 from makebreak.scripts.contact_runs import rehearsed, simulate_motion
 from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.session import Session, run_many
+from makebreak.scripts.session import Session
 from makebreak.scripts.table import Table
 from makebreak.systems.changing_contact.numerics.contact_task import (
     BROKEN,
@@ -350,22 +351,11 @@ VARIANTS: dict[str, dict] = {
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     """Figure 16's numbers beside ours, over seeds, with the sphere and the block, with
     errors of the station, and where the stiffness is told."""
-    runs = {
-        name: run_many(
-            "multiple_collisions",
-            [(settings, seed) for seed in range(seeds)],
-            jobs,
-            session.out_dir,
-            reuse=session.reuse,
-        )
-        for name, settings in VARIANTS.items()
-    }
-    rows: list[tuple] = []
-    met: list[bool | None] = []
+    table = Comparison("multiple_collisions", session, jobs)
+    runs = {name: table.runs(settings, seeds) for name, settings in VARIANTS.items()}
 
     for tool, results in runs.items():
-        texts = " ".join(f"{key}={value}" for key, value in VARIANTS[tool].items())
-        command = f"makebreak run multiple_collisions --seed S --set {texts}"
+        command = table.with_settings(VARIANTS[tool])
         first_max = TOLD_MAX if tool == TOLD else FIRST_MAX
 
         def values(key, results=results):
@@ -377,8 +367,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
             return np.array(out)
 
         def row(what, paper, ours, good=None, tool=tool, command=command):
-            rows.append((f"{tool}: {what}", paper, ours, command))
-            met.append(good)
+            table.row(f"{tool}: {what}", paper, ours, good, command)
 
         def spread(x, unit, digits=1):
             if np.isnan(x).any():
@@ -433,11 +422,8 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         )
         good = most(x, 0)
         row("contacts missed or false", "-", f"{np.nansum(x):.0f}", good)
-    return Table(
+    return table.table(
         "Multiple collisions (CC 4.5.1, figure 16)",
-        ("what", "paper", "ours", "command"),
-        rows,
-        met,
         [
             "Impact force: F100; the stiffness of each surface is drawn from 5e3 to "
             "2e5 N/m and not known to the controllers, or 2e4 N/m and told.",

@@ -30,6 +30,7 @@ import numpy as np
 from makebreak.diagrams.multi_spring import impedance, mrac
 from makebreak.diagrams.planar import PlanarSensing, knowledge_of
 from makebreak.diagrams.porridge import PorridgeConfig, draw, make_porridge
+from makebreak.scripts.comparison import Comparison
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.planar_runs import (
     along_motion,
@@ -42,7 +43,7 @@ from makebreak.scripts.planar_runs import (
     with_count,
     write_recording,
 )
-from makebreak.scripts.session import Log, Session, run_many
+from makebreak.scripts.session import Log, Session
 from makebreak.scripts.table import Table
 from makebreak.systems.baselines.numerics.fixed_gmm import fit_mixture
 from makebreak.systems.changing_contact.numerics.igmm import regress
@@ -230,27 +231,16 @@ def sizes_text(results, k: int) -> str:
 
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     """Figure 4 in numbers, over seeds."""
-    results = run_many(
-        "porridge",
-        [({}, seed) for seed in range(seeds)],
-        jobs,
-        session.out_dir,
-        reuse=session.reuse,
-    )
-    good = [r for r in results if "error" not in r]
-    command = "makebreak run porridge --seed S"
-    rows: list[tuple] = []
-    met: list[bool | None] = []
+    table = Comparison("porridge", session, jobs)
+    good = [r for r in table.runs({}, seeds) if "error" not in r]
 
     def row(what, paper, key, scale, unit, bound=None):
         values = [r[key] for r in good]
-        text = median_range(values, scale, unit)
+        text, target = median_range(values, scale, unit), None
         if bound is not None:
             text = with_count(values, bound)
-        rows.append((what, paper, text, command))
-        met.append(
-            None if bound is None else len(good) == seeds and min(values) >= bound
-        )
+            target = len(good) == seeds and min(values) >= bound
+        table.row(what, paper, text, target)
 
     papers = {"fixed": "poor", "incremental": "good"}
     for name, label in MODELS.items():
@@ -263,8 +253,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         row(f"fig. 4: within training, {label}", paper, key, 1.0, "N")
     for k, n in enumerate(SIZES):
         what = f"beyond training, fixed mixture of {n}"
-        rows.append((what, "-", sizes_text(good, k), command))
-        met.append(None)
+        table.row(what, "-", sizes_text(good, k))
     what = "fixed over incremental, beyond training"
     row(what, "-", "fixed_over_incremental", 1.0, "", RATIO_BOUND)
     row("frozen over incremental", "-", "frozen_over_incremental", 1.0, "")
@@ -280,10 +269,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     notes = ["Medians over seeds (least to greatest). A target holds for every seed."]
     if len(good) < seeds:
         notes.append(f"{seeds - len(good)} of {seeds} runs failed.")
-    return Table(
+    return table.table(
         "Stirring porridge: fixed and incremental models (CC 4.1)",
-        ("what", "paper", "ours", "command"),
-        rows,
-        met,
         notes,
     )

@@ -38,9 +38,10 @@ from makebreak.diagrams.surface_switch import (
     make_surface_switch,
     make_task,
 )
+from makebreak.scripts.comparison import Comparison
 from makebreak.scripts.contact_runs import rehearsed, simulate_motion
 from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.session import Session, run_many
+from makebreak.scripts.session import Session
 from makebreak.scripts.table import Table
 from makebreak.systems.changing_contact.numerics.contact_task import (
     CHANGE_TIME,
@@ -262,20 +263,11 @@ VARIANTS: dict[str, dict] = {
 
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     """Figures 19 and 20 beside ours, over seeds; less anticipation; another tool."""
-    name = "surface_switch"
-    command = f"makebreak run {name} --seed S"
-    rows: list[tuple] = []
-    met: list[bool | None] = []
-
-    def row(what, paper, ours, good=None, command=command):
-        rows.append((what, paper, ours, command))
-        met.append(good)
+    table = Comparison("surface_switch", session, jobs)
+    row = table.row
 
     def many(settings, n):
-        results = run_many(
-            name, [(settings, seed) for seed in range(n)], jobs, session.out_dir,
-            reuse=session.reuse,
-        )  # fmt: skip
+        results = table.runs(settings, n)
         return results, [r for r in results if "met_done" in r]
 
     def of(key, runs):
@@ -334,8 +326,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         )
     for label, settings in VARIANTS.items():
         _, runs = many(settings, max(1, seeds // 2))
-        texts = " ".join(f"{key}={value}" for key, value in settings.items())
-        its = command + " --set " + texts.replace("False", "false")
+        its = table.with_settings(settings)
         if not runs:
             row(label, "-", "no run ended", False, command=its)
             continue
@@ -350,11 +341,8 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
                 means(values, scale, unit, digits),
                 command=its,
             )
-    return Table(
+    return table.table(
         "Surfaces that change, anticipated (CC 4.5.2, figures 19 and 20)",
-        ("what", "paper", "ours", "command"),
-        rows,
-        met,
         [
             "The paper shows one run on a robot, as pictures. Its trial 1 has K_free "
             "until a change is felt, as ours.",

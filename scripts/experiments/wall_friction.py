@@ -43,8 +43,9 @@ from makebreak.diagrams.wall_friction import (
     tip_states,
 )
 from makebreak.models.scene import read_scene
+from makebreak.scripts.comparison import Comparison
 from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.session import Session, run_many
+from makebreak.scripts.session import Session
 from makebreak.scripts.table import Table
 from makebreak.systems.baselines.numerics.long_term_predictor import (
     Prediction,
@@ -387,21 +388,9 @@ def plot_forces(data, scratch, ahead):
 
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     """Figures 11 to 14 beside ours; each seed has its own training."""
-    results = run_many(
-        "wall_friction",
-        [({}, seed) for seed in range(seeds)],
-        jobs,
-        session.out_dir,
-        reuse=session.reuse,
-    )
+    table = Comparison("wall_friction", session, jobs)
+    row, results = table.row, table.runs({}, seeds)
     done = [r for r in results if "error" not in r]
-    command = "makebreak run wall_friction --seed S"
-    rows: list[tuple] = []
-    met: list[bool | None] = []
-
-    def row(what, paper, ours, good=None):
-        rows.append((what, paper, ours, command))
-        met.append(good)
 
     def mean(key):
         return float(np.mean([r[key] for r in done])) if done else float("nan")
@@ -456,11 +445,8 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         ("predictor_one_step", "the baseline's prediction, a sample"),
     ):
         row(label, "-", f"{online.get(name, np.nan):.2f} ms")
-    return Table(
+    return table.table(
         "A wall of unknown friction (CC 4.4)",
-        ("what", "paper", "ours", "command"),
-        rows,
-        met,
         [
             "Errors along the wall, rms, mean (joints: median) over seeds (least to "
             "greatest); the sensor's noise alone is 0.1 N. Band: two standard "

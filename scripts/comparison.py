@@ -1,0 +1,57 @@
+"""What `reproduce` makes: a paper's figures or goals beside ours, row by row."""
+
+from collections.abc import Mapping, Sequence
+
+from makebreak.scripts.session import Session
+from makebreak.scripts.table import Table
+from makebreak.scripts.trials import run_many, setting_texts
+
+
+class Comparison:
+    """Trials of one experiment, and the rows that are made of them.
+
+    Args: experiment: its name. session: whose folder the trials go to. jobs: how many
+        run at once. command: of a row that names none; None: a run of the experiment.
+    """
+
+    def __init__(
+        self, experiment: str, session: Session, jobs: int, command: str | None = None
+    ):
+        self.experiment, self.session, self.jobs = experiment, session, jobs
+        self.command = command or f"makebreak run {experiment} --seed S"
+        self.rows: list[tuple] = []
+        self.met: list[bool | None] = []
+
+    def runs(self, settings: Mapping, seeds: int) -> list[dict]:
+        """The results of seeds 0 .. seeds - 1, as run_many gives them."""
+        return run_many(
+            self.experiment,
+            [(settings, seed) for seed in range(seeds)],
+            self.jobs,
+            self.session.out_dir,
+            reuse=self.session.reuse,
+        )
+
+    def with_settings(self, settings: Mapping) -> str:
+        """The command of a run with settings, as one types it."""
+        words = " ".join(setting_texts(settings)).replace(", ", ",")
+        return f"{self.command} --set {words}" if words else self.command
+
+    def row(
+        self,
+        what: str,
+        paper: str,
+        ours,
+        good: bool | None = None,
+        command: str | None = None,
+    ) -> None:
+        """Args: good: whether a stated target is met; None: there is none."""
+        self.rows.append(
+            (what, paper, ours, self.command if command is None else command)
+        )
+        self.met.append(None if good is None else bool(good))
+
+    def table(self, title: str, notes: Sequence[str] = (), theirs="paper") -> Table:
+        """Args: theirs: the head of what ours is compared with."""
+        columns = ("what", theirs, "ours", "command")
+        return Table(title, columns, self.rows, self.met, notes)

@@ -1,0 +1,50 @@
+"""The rows that `reproduce` makes of trials."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from makebreak.diagrams.multiple_collisions import MultipleCollisionsConfig
+from makebreak.scripts import comparison
+from makebreak.scripts.comparison import Comparison
+from makebreak.scripts.experiments.multiple_collisions import VARIANTS
+from makebreak.scripts.settings import apply_settings
+from makebreak.scripts.trials import setting_texts
+
+
+@pytest.fixture
+def table(tmp_path):
+    session = SimpleNamespace(out_dir=tmp_path, reuse=True)
+    return Comparison("multiple_collisions", session, 3)
+
+
+def test_runs_are_those_of_the_first_seeds_in_the_sessions_folder(
+    table, tmp_path, monkeypatch
+):
+    asked = []
+    monkeypatch.setattr(
+        comparison, "run_many", lambda *a, **k: asked.append((a, k)) or ["results"]
+    )
+    assert table.runs({"tool": "block"}, 2) == ["results"]
+    runs = [({"tool": "block"}, 0), ({"tool": "block"}, 1)]
+    assert asked == [(("multiple_collisions", runs, 3, tmp_path), {"reuse": True})]
+
+
+@pytest.mark.parametrize("settings", [{}, *VARIANTS.values()])
+def test_a_command_is_what_a_shell_takes_and_means_the_same_settings(table, settings):
+    words = table.with_settings(settings).partition(" --set ")[2].split()
+    given = apply_settings(MultipleCollisionsConfig(), words)
+    assert given == apply_settings(MultipleCollisionsConfig(), setting_texts(settings))
+    assert table.with_settings({}) == "makebreak run multiple_collisions --seed S"
+
+
+def test_rows_are_met_missed_or_without_a_target(table):
+    table.row("a", "1", 2, good=True)
+    table.row("b", "-", "x", command="other")
+    table.row("c", "-", "y", good=False, command="")
+    made = table.table("Title", ["a note"], theirs="wanted")
+    assert made.columns == ("what", "wanted", "ours", "command")
+    commands = [row[3] for row in made.rows]
+    assert commands == ["makebreak run multiple_collisions --seed S", "other", ""]
+    assert list(made.met) == [True, None, False] and made.missed == 1
+    assert list(made.notes) == ["a note"]
