@@ -21,7 +21,11 @@ from typing import Literal
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
+from pydrake.systems.primitives import (
+    ConstantVectorSource,
+    Demultiplexer,
+    LogVectorOutput,
+)
 
 from makebreak.diagrams.camera import CameraConfig, camera_model
 from makebreak.diagrams.recorder import record_station
@@ -34,7 +38,6 @@ from makebreak.diagrams.station import (
     make_control_plant,
     make_station,
 )
-from makebreak.diagrams.wiring import add_legend, check_own, connect_command
 from makebreak.models.effects.kind import Effect
 from makebreak.models.model_files import MODELS
 from makebreak.models.pushed_object import (
@@ -103,7 +106,7 @@ from makebreak.systems.perception.state_estimator import (
     StateEstimatorConfig,
 )
 from makebreak.systems.views.adapt_button import AdaptButton
-from makebreak.systems.views.legend import LegendConfig
+from makebreak.systems.views.contact_probe import ContactLoad
 from makebreak.systems.views.push_view import PushView, PushViewConfig
 
 PUSH_OBJECT = str(MODELS / "push_object.scene.yaml")
@@ -162,8 +165,9 @@ class PushLearnerConfig:
 class PushModelConfig:
     """What of the model differs from the world."""
 
-    # Of the object with tip and table; None: the world's.
-    friction: float | None = None
+    friction: float | None = (
+        None  # Of the object with tip and table; None: the world's.
+    )
     scale: float = 1.0  # Of the object's size, times the world's.
     mass: float = 1.0  # Of the object's mass, times the world's.
     com_offset: list[float] = field(default_factory=lambda: [0.0, 0.0])  # Added [m].
@@ -220,30 +224,21 @@ def world_scene(config: PushObjectConfig) -> Scene:
     scene = read_scene(config.scene)
     if not config.friction > 0.0:
         raise ValueError(f"friction is {config.friction}, expected > 0")
-    models = [d.add_model.name for d in scene.directives if d.add_model is not None]
-    if OBJECT not in models:
-        names = ", ".join(models)
+    models = [d.add_model for d in scene.directives if d.add_model is not None]
+    own = [model for model in models if model.name == OBJECT]
+    if not own:
+        names = ", ".join(model.name for model in models)
         raise ValueError(f"the scene has {names}, expected a model {OBJECT} too")
-    _lay(scene, object_file(config.object), config.object, poses_of(config)[0])
-    _rub(scene, config.friction)
-    return scene
-
-
-def _lay(scene: Scene, file: str | Path, spec: PushedObject, pose) -> None:
-    """The object of a file at x, y, yaw of the table, as high as `spec` lies."""
-    for d in scene.directives:
-        if d.add_model is not None and d.add_model.name == OBJECT:
-            d.add_model.file = f"file://{file}"
-    x, y, yaw = map(float, pose)
+    own[0].file = f"file://{object_file(config.object)}"
+    x, y, yaw = poses_of(config)[0]
     q = [float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2))]
-    scene.initial.poses[f"{OBJECT}.{OBJECT}"] = [*q, x, y, rest_height(spec)]
-
-
-def _rub(scene: Scene, friction: float) -> None:
-    """The object's friction with tip and table."""
+    z = rest_height(config.object)
+    scene.initial.poses[f"{OBJECT}.{OBJECT}"] = [*q, float(x), float(y), z]
     for pair in (f"{TOOL}~{OBJECT}", f"{OBJECT}~table"):
-        value = {"friction": friction}
-        scene.effects.append(Effect("contact_friction", [pair], value))
+        scene.effects.append(
+            Effect("contact_friction", [pair], {"friction": config.friction})
+        )
+    return scene
 
 
 def believed_object(config: PushObjectConfig) -> tuple[PushedObject, float]:
@@ -272,7 +267,13 @@ def model_scene(config: PushObjectConfig, file: str | Path) -> Scene:
     """
     scene = read_scene(config.scene)
     spec, friction = believed_object(config)
-    _lay(scene, file, spec, poses_of(config)[0])
+    for d in scene.directives:
+        if d.add_model is not None and d.add_model.name == OBJECT:
+            d.add_model.file = f"file://{file}"
+    x, y, yaw = poses_of(config)[0]
+    q = [float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2))]
+    pose = [*q, float(x), float(y), rest_height(spec)]
+    scene.initial.poses[f"{OBJECT}.{OBJECT}"] = pose
     m = config.model
     if m.scale != 1.0:
         scene.effects.append(Effect("object_size", [OBJECT], {"scale": m.scale}))
@@ -282,7 +283,9 @@ def model_scene(config: PushObjectConfig, file: str | Path) -> Scene:
     if any(m.com_offset) or (m.scale != 1.0 and any(config.object.com_offset)):
         com = dict(zip("xy", map(float, spec.com_offset), strict=True))
         scene.effects.append(Effect("object_com", [OBJECT], com))
-    _rub(scene, friction)
+    for pair in (f"{TOOL}~{OBJECT}", f"{OBJECT}~table"):
+        value = {"friction": friction}
+        scene.effects.append(Effect("contact_friction", [pair], value))
     return scene
 
 
@@ -415,12 +418,6 @@ def _add_sensor(
 
 
 # Settings that the diagram makes of others.
-# Of the task, as the legend says them.
-PHASES = (
-    "now: pushes",
-    "now: goes to another place",
-    "now: waits for the object to be seen",
-)
 _OWN = {
     "goals": ("period_sec", "offset_sec"),
     "task": ("height", "clearance", "period_sec", "offset_sec"),
@@ -432,18 +429,32 @@ _OWN = {
 }
 
 
+def _check_own(config: PushObjectConfig) -> None:
+    """Raises: ValueError for a setting that would not act."""
+    for name, own in _OWN.items():
+        part = getattr(config, name)
+        plain = getattr(PushObjectConfig(), name)
+        for key in own:
+            value, default = getattr(part, key), getattr(plain, key)
+            if value != default:
+                raise ValueError(
+                    f"{name}.{key} is {value}, expected {default}: the diagram sets it"
+                )
+
+
 def make_push_object(
     config: PushObjectConfig, meshcat: Meshcat | None = None
 ) -> Diagram:
     """The whole experiment, each system by name in the diagram.
 
     For scoring, of the truth: `state_log` (the plant's state, at 80 Hz) and `touch_log`
-    (3,), the force on the finger of all its contacts [N], at 1 kHz; and of what is
-    commanded: `torque_log` (7,) at 1 kHz, `goal_log` (5,) of PushGoals, `phase_log`
+    (3,), the force on the finger of all its contacts [N], and `load_log` (2,), the size
+    of all contacts' forces on the arm and its finger, from the object and from anything
+    else [N], both at 1 kHz; and of what is commanded: `torque_log` (7,) at 1 kHz, `goal_log` (5,) of PushGoals, `phase_log`
     (1,) of PushTask and `command_log` (3,) of ContactSampler, at 80 Hz. A diagram is
     done when the number in goal_log is n_goals.
     """
-    check_own(config, _OWN)
+    _check_own(config)
     builder = DiagramBuilder()
     spec, friction = believed_object(config)
     station = builder.AddNamedSystem(
@@ -647,12 +658,27 @@ def make_push_object(
     connect(lcs["command"], "lcs", reference, "lcs")
     connect(station, f"{ARM}.position_measured", impedance, "q")
     connect(station, f"{ARM}.velocity_measured", impedance, "v")
-    connect_command(builder, reference, impedance)
+    sizes = [reference.GetOutputPort(name).size() for name in ("x_desired", "wrench")]
+    split = builder.AddNamedSystem("arm_command_split", Demultiplexer(sizes))
+    builder.Connect(reference.GetOutputPort("command"), split.get_input_port())
+    for i, name in enumerate(("x_desired", "wrench_feedforward")):
+        builder.Connect(split.get_output_port(i), impedance.GetInputPort(name))
     tau = impedance.GetOutputPort("tau")
     builder.Connect(tau, station.GetInputPort(f"{ARM}.torque_commanded"))
 
+    plant = station.GetSubsystemByName("plant")
+    of_arm = [
+        plant.get_body(i)
+        for name in (ARM, TOOL)
+        for i in plant.GetBodyIndices(plant.GetModelInstanceByName(name))
+    ]
+    load = builder.AddNamedSystem(
+        "contact_load", ContactLoad(of_arm, plant.GetBodyByName(OBJECT))
+    )
+    connect(station, "contact_results", load, "contact_results")
     for name, source, period in (
         ("torque_log", tau, ARM_TICK),
+        ("load_log", load.get_output_port(), ARM_TICK),
         ("touch_log", station.GetOutputPort(f"{TOOL}.contact_force"), ARM_TICK),
         ("state_log", station.GetOutputPort("state"), CONTROL),
         ("goal_log", goals.GetOutputPort("log"), CONTROL),
@@ -677,8 +703,6 @@ def make_push_object(
         connect(goals, "goal", view, "goal")
         connect(estimator, "x", view, "x")
         connect(estimator, "valid", view, "valid")
-        legend = LegendConfig(view.LEGEND, PHASES, view.CAMERA, view.LOOK_AT)
-        add_legend(builder, meshcat, legend, task.GetOutputPort("phase"))
     diagram = builder.Build()
     diagram.set_name("push_object")
     return diagram

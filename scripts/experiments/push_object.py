@@ -35,8 +35,8 @@ SAMPLE = 0.05  # [s] Of what decides when a run is over.
 TOLERANCE = (0.02, 0.1)  # [m], [rad] A goal is reached within these ...
 LOOSE = (0.05, 0.4)  # ... and within these it counts as in arXiv:2505.13350.
 LIMIT_SEC = 60.0  # For a goal.
-FORCE_MAX = 40.0  # [N] On the finger, below FORCE_HZ.
-FORCE_HZ = 100.0
+FORCE_MAX = 40.0  # [N] Of all contacts of the arm and its finger, at 1 kHz.
+FORCE_HZ = 100.0  # Told as well: on the finger, below it.
 REACHED, REACHED_LOOSE = 0.95, 0.99  # Shares of the goals.
 # What `makebreak bench diagrams` takes the real-time factor of.
 BENCH = {
@@ -112,7 +112,8 @@ def run(config, session):
     """Pushes the object to all goals, one after the other.
 
     `success`: 95 % of the goals reached within 2 cm, 0.1 rad and 60 s, 99 % within 5 cm
-    and 0.4 rad, the force on the finger at most 40 N, and the arm's limits kept.
+    and 0.4 rad, the forces of all contacts on arm and finger together at most 40 N, and
+    the arm's limits kept.
     """
     diagram = make_push_object(config, session.meshcat)
     system = diagram.GetSubsystemByName
@@ -131,11 +132,13 @@ def run(config, session):
     truth = the_truth(diagram, log.context)
     fold = outline_fold(config)
     goals = score_goals(truth, poses_of(config)[1:], fold)
-    force_time, force = force_on_finger(diagram, log.context)
-    result = score(config, diagram, log, truth, goals, force)
+    load = diagram.GetSubsystemByName("load_log").FindLog(log.context)
+    result = score(config, diagram, log, truth, goals)
     write_recording(session, log, config)
     plot_paths(session, config, truth, goals)
-    plot_errors(session, truth, goals, fold, force_time, force, log)
+    plot_errors(
+        session, truth, goals, fold, load.sample_times(), load.data().sum(axis=0), log
+    )
     return result
 
 
@@ -165,15 +168,15 @@ def the_truth(diagram, context) -> Truth:
 
 
 def force_on_finger(diagram, context):
-    """Time (n,) [s] and the size (n,) [N] of all contacts' force on the finger, below
-    FORCE_HZ (first order), each ms."""
+    """(n,) the size of all contacts' force on the finger, below FORCE_HZ (first order),
+    each ms [N]."""
     log = diagram.GetSubsystemByName("touch_log").FindLog(context)
     pole = np.exp(-2.0 * np.pi * FORCE_HZ * 1e-3)
     filtered = lfilter([1.0 - pole], [1.0, -pole], log.data(), axis=1)
-    return log.sample_times(), np.linalg.norm(filtered, axis=0)
+    return np.linalg.norm(filtered, axis=0)
 
 
-def score(config, diagram, log, truth, goals, force):
+def score(config, diagram, log, truth, goals):
     """The flat result; NaN (null in the file) for what did not happen."""
     system = diagram.GetSubsystemByName
     n = len(goals)
@@ -197,8 +200,11 @@ def score(config, diagram, log, truth, goals, force):
         ("loose", "goals reached within 5 cm, 0.4 rad, 60 s", loose, REACHED_LOOSE),
     ):
         criteria.at_least(key, what, sum(value) / n, bound)
-    peak = float(force.max())
-    criteria.at_most("force", "force on the finger, peak", peak, FORCE_MAX, "N")
+    load = system("load_log").FindLog(log.context)
+    force = load.data().sum(axis=0)
+    worst_at = int(np.argmax(force))  # The first NaN, if there is one.
+    peak = float(force[worst_at])
+    criteria.at_most("force", "contact forces on the arm, peak", peak, FORCE_MAX, "N")
     shares = {
         "torque": float((abs(torque).max(axis=1) / effort).max()),
         "torque_rate": float(rate),
@@ -219,6 +225,11 @@ def score(config, diagram, log, truth, goals, force):
         "yaw_error_rad": [float(goal.error[1]) for goal in goals],
         "places_chosen": int(touches.max()) if touches.size else 0,
         "contact_force_peak_N": peak,
+        "contact_force_peak_time_s": float(load.sample_times()[worst_at]),
+        "contact_force_peak_off_object_N": float(load.data()[1].max()),
+        "finger_force_below_100hz_N": float(
+            force_on_finger(diagram, log.context).max()
+        ),
         **{f"{name}_share_max": value for name, value in shares.items()},
         "tilt_max_rad": float(truth.tilt.max()),
         "r_gap_m": float(r),
@@ -304,7 +315,7 @@ def plot_paths(session, config, truth, goals):
 
 
 def plot_errors(session, truth, goals, fold, force_time, force, log):
-    """Distance and turn to the goal, force on the finger, and what was learned."""
+    """Distance and turn to the goal, contact forces, and what was learned."""
     rows = 4 if "r" in log else 3
     fig, axes = plt.subplots(
         rows, 1, figsize=(7, 1.9 * rows), sharex=True, layout="constrained"
@@ -394,6 +405,9 @@ def totals(runs, n_goals: int) -> dict:
         "loose": sum(run["goals_reached_loose"] for run in good),
         "time": float(np.median(times)) if times else float("nan"),
         "force": max((run["contact_force_peak_N"] for run in good), default=np.nan),
+        "slow_force": max(
+            (run["finger_force_below_100hz_N"] for run in good), default=np.nan
+        ),
     }
 
 
@@ -410,7 +424,14 @@ def reproduce(session, seeds, jobs) -> Table:
     results = run_many(
         "push_object", trials, jobs, session.out_dir, reuse=session.reuse
     )
-    group = {n: results[i * seeds : (i + 1) * seeds] for i, n in enumerate(named)}
+    return table_of(
+        {n: results[i * seeds : (i + 1) * seeds] for i, n in enumerate(named)}
+    )
+
+
+def table_of(group: dict[str, list[dict]]) -> Table:
+    """{case: results of its runs} as the table of `reproduce`; a case may lack runs."""
+    named = cases()
     rows: list[tuple] = []
     met: list[bool | None] = []
 
@@ -435,8 +456,10 @@ def reproduce(session, seeds, jobs) -> Table:
             PAPER["time"] if demanded else "-",
             f"{t['time']:.1f} s",
         )
-        add(f"{name}: peak force", "-", f"{t['force']:.1f} N",
-            bool(t["force"] <= FORCE_MAX))  # fmt: skip
+        add(f"{name}: peak of all contact forces on the arm, 1 kHz", "-",
+            f"{t['force']:.1f} N", bool(t["force"] <= FORCE_MAX))  # fmt: skip
+        add(f"{name}: peak force on the finger, below {FORCE_HZ:.0f} Hz", "-",
+            f"{t['slow_force']:.1f} N")  # fmt: skip
     right = found["T, model right"]
     for what in WRONG:
         with_it, without = (
@@ -464,7 +487,12 @@ def reproduce(session, seeds, jobs) -> Table:
         "Nothing lost: without the learner less than 5 % of the goals, or 10 % of the "
         "time, is lost.",
     ]
-    notes += [f"seed {r['seed']} failed: {r['error']}" for r in results if "error" in r]
+    notes += [
+        f"{name}, seed {run['seed']} failed: {run['error']}"
+        for name, runs in group.items()
+        for run in runs
+        if "error" in run
+    ]
     return Table(
         "Pushing an object to poses, the planner choosing where to touch it",
         ("what", "published", "ours", "command"),

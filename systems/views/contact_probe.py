@@ -1,5 +1,7 @@
 """Ground truth of contacts, for scoring."""
 
+from collections.abc import Iterable
+
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.multibody.plant import ContactResults
@@ -46,6 +48,40 @@ class ContactProbe(LeafSystem):
             force[row, 0] += abs(f_B @ contact.point_pair().nhat_BA_W)
             force[row, 1:] += sign * f_B
         output.SetFromVector(force.ravel())
+
+
+class ContactLoad(LeafSystem):
+    """How much all contacts together push on some bodies, such as an arm and its tool:
+    the sum of the sizes of the forces, so that pushes against each other count (point
+    contact). Contacts among the bodies themselves are left out.
+
+    Inputs:  contact_results (abstract).
+    Outputs: load (2,): from one other body, and from everything else [N].
+
+    Args: bodies; other, the body whose contacts are told apart.
+    """
+
+    def __init__(self, bodies: Iterable[RigidBody], other: RigidBody):
+        super().__init__()
+        self._bodies = frozenset(int(body.index()) for body in bodies)
+        self._other = int(other.index())
+        self._results = self.DeclareAbstractInputPort(
+            "contact_results", AbstractValue.Make(ContactResults())
+        )
+        self.DeclareVectorOutputPort("load", 2, self._calc)
+
+    def _calc(self, context: Context, output: BasicVector):
+        load = np.zeros(2)
+        results = self._results.Eval(context)
+        for i in range(results.num_point_pair_contacts()):
+            contact = results.point_pair_contact_info(i)
+            a, b = int(contact.bodyA_index()), int(contact.bodyB_index())
+            if (a in self._bodies) == (b in self._bodies):
+                continue
+            outside = b if a in self._bodies else a
+            row = 0 if outside == self._other else 1
+            load[row] += np.linalg.norm(contact.contact_force())
+        output.SetFromVector(load)
 
 
 class TrueTip(LeafSystem):
