@@ -111,6 +111,8 @@ from makebreak.systems.views.push_view import PushView, PushViewConfig
 
 PUSH_OBJECT = str(MODELS / "push_object.scene.yaml")
 OBJECT = "object"
+# Of a recording: the object's quaternion and place.
+POSE_COLUMNS = [f"{OBJECT}.{OBJECT}.{p}" for p in ("qw", "qx", "qy", "qz", *"xyz")]
 CONTROL = 0.0125
 ESTIMATE, LEARN, ARM_TICK = CONTROL / 3.0, 0.05, 0.001
 # As in ball_rolling: each system runs a little after the one that it listens to, within
@@ -165,6 +167,9 @@ class PushLearnerConfig:
 class PushModelConfig:
     """What of the model differs from the world."""
 
+    # Scene file of what the controllers believe of arm and table; None: the world's,
+    # without its effects, which are what no model knows.
+    scene: str | None = None
     friction: float | None = (
         None  # Of the object with tip and table; None: the world's.
     )
@@ -181,7 +186,7 @@ class PushObjectConfig:
     object: PushedObject = field(default_factory=PushedObject)
     friction: float = 0.5  # Of the object with tip and table, in the world.
     model: PushModelConfig = field(default_factory=PushModelConfig)
-    scene: str = PUSH_OBJECT
+    scene: str = PUSH_OBJECT  # The world's.
     seed: int = 0
     n_goals: int = 1  # In a row, drawn by the seed.
     start: list[float] = field(default_factory=list)  # x, y, yaw; empty: drawn.
@@ -252,6 +257,13 @@ def believed_object(config: PushObjectConfig) -> tuple[PushedObject, float]:
     return spec, friction
 
 
+def believed_scene(config: PushObjectConfig) -> Scene:
+    """What the controllers believe of arm, finger and table."""
+    if config.model.scene is not None:
+        return read_scene(config.model.scene)
+    return replace(read_scene(config.scene), effects=[])
+
+
 def outline_fold(config: PushObjectConfig) -> int:
     """Into how many equal turns the object may be turned without a difference to what
     measures it (numerics/pose_tracker.py): a sensor of poses knows every turn."""
@@ -260,20 +272,18 @@ def outline_fold(config: PushObjectConfig) -> int:
     return make_shape(*seen_parts(config.object)).fold
 
 
-def model_scene(config: PushObjectConfig, file: str | Path) -> Scene:
+def model_scene(config: PushObjectConfig, file: str | Path, pose) -> Scene:
     """The scene that the controllers believe, with what is wrong in it as effects.
 
-    Args: file: of the world's object (models/pushed_object.py: object_sdf).
+    Args: file: of the world's object (models/pushed_object.py: object_sdf); pose (7,)
+        of the object as it was measured first, quaternion and place [m].
     """
-    scene = read_scene(config.scene)
+    scene = believed_scene(config)
     spec, friction = believed_object(config)
     for d in scene.directives:
         if d.add_model is not None and d.add_model.name == OBJECT:
             d.add_model.file = f"file://{file}"
-    x, y, yaw = poses_of(config)[0]
-    q = [float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2))]
-    pose = [*q, float(x), float(y), rest_height(spec)]
-    scene.initial.poses[f"{OBJECT}.{OBJECT}"] = pose
+    scene.initial.poses[f"{OBJECT}.{OBJECT}"] = [float(value) for value in pose]
     m = config.model
     if m.scale != 1.0:
         scene.effects.append(Effect("object_size", [OBJECT], {"scale": m.scale}))
@@ -386,6 +396,7 @@ def _add_sensor(
                     config.tracker,
                     z=height,
                     hue=HUE,
+                    rolling_axis=rolling_axis(spec),
                     period_sec=CONTROL,
                     offset_sec=offset,
                 ),
@@ -425,7 +436,7 @@ _OWN = {
     "reference": ("height", "period_sec", "offset_sec"),
     "impedance": ("period_sec", "offset_sec"),
     "pose": ("height", "rolling_axis", "offset_sec"),
-    "tracker": ("z", "hue", "period_sec", "offset_sec"),
+    "tracker": ("z", "hue", "rolling_axis", "period_sec", "offset_sec"),
 }
 
 
@@ -450,9 +461,9 @@ def make_push_object(
     For scoring, of the truth: `state_log` (the plant's state, at 80 Hz) and `touch_log`
     (3,), the force on the finger of all its contacts [N], and `load_log` (2,), the size
     of all contacts' forces on the arm and its finger, from the object and from anything
-    else [N], both at 1 kHz; and of what is commanded: `torque_log` (7,) at 1 kHz, `goal_log` (5,) of PushGoals, `phase_log`
-    (1,) of PushTask and `command_log` (3,) of ContactSampler, at 80 Hz. A diagram is
-    done when the number in goal_log is n_goals.
+    else [N], both at 1 kHz; and of what is commanded: `torque_log` (7,) at 1 kHz,
+    `goal_log` (5,) of PushGoals, `phase_log` (1,) of PushTask and `command_log` (3,) of
+    ContactSampler, at 80 Hz. A diagram is done when the number in goal_log is n_goals.
     """
     _check_own(config)
     builder = DiagramBuilder()
@@ -470,14 +481,14 @@ def make_push_object(
             world_scene(config),
         ),
     )
-    model_scene = read_scene(config.scene)
-    arm = make_control_plant(model_scene)
+    believed = believed_scene(config)
+    arm = make_control_plant(believed)
     p_tip = (
         arm.GetFrameByName(TIP_FRAME)
         .CalcPoseInWorld(arm.CreateDefaultContext())
         .translation()
     )
-    loaded = load_scene(model_scene, DiagramBuilder())
+    loaded = load_scene(believed, DiagramBuilder())
     tip = TipAndBall(
         tip_mass=TIP_MASS,
         tip_radius=sphere_radius(loaded.plant, loaded.scene_graph, TOOL),
@@ -522,6 +533,7 @@ def make_push_object(
         PushGoals(
             replace(config.goals, period_sec=CONTROL, offset_sec=OFFSET["goals"]),
             poses_of(config)[1:],
+            outline_fold(config),
         ),
     )
     sampling = config.sampler.sampling
@@ -687,8 +699,7 @@ def make_push_object(
     ):
         LogVectorOutput(source, builder, period).set_name(name)
     of_object = [""] * N_X
-    names = [f"{OBJECT}.{OBJECT}.{part}" for part in ("qw", "qx", "qy", "qz", *"xyz")]
-    of_object[Q_BALL.start : P_BALL.stop] = names
+    of_object[Q_BALL.start : P_BALL.stop] = POSE_COLUMNS
     seen = {"object": (estimator.GetOutputPort("x"), of_object)}
     record_station(builder, station, tau, TOOL, CONTROL, seen)
     if meshcat is not None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import isnan
 
 from pydrake.multibody.plant import MultibodyPlant
 
@@ -67,10 +68,11 @@ def withdrawn_if_weak(
     if verdict != "gap_unnamed" or not selection.choices or closed >= TOLD:
         return selection, ""
     names = [f"{c.effect.kind} at {', '.join(c.effect.at)}" for c in selection.choices]
-    near = (
-        f" The best candidates ({'; '.join(names)}) close {max(closed, 0.0):.0%} of "
-        "it, too little to be named."
-    )
+    near = f" The best candidates ({'; '.join(names)}) "
+    if isnan(closed):  # No window could be simulated to its end.
+        near += "could not be judged by simulation, so none is named."
+    else:
+        near += f"close {max(closed, 0.0):.0%} of it, too little to be named."
     return replace(selection, choices=(), end=selection.start), near
 
 

@@ -234,9 +234,32 @@ def _grid(face: ConvexHull, spacing: float) -> np.ndarray:
     return points[_outside(face, points) <= 0.0]
 
 
-def object_sdf(spec: PushedObject) -> str:
+def hull_obj(spec: PushedObject) -> str:
+    """The convex hull of a mesh as a Wavefront file, in the frame and unit of the file
+    that it is of: for a copy of the object that needs that file no more.
+
+    Raises: ValueError for what is no mesh.
+    """
+    (part,) = parts(spec)
+    if not isinstance(part.shape, Convex):
+        raise ValueError(f"shape is {spec.shape}, expected mesh")
+    hull = ConvexHull((part.points - part.X_BS.translation()) / spec.scale)
+    middle = hull.points.mean(axis=0)
+    lines = [f"v {_numbers(p)}" for p in hull.points]
+    for face in hull.simplices:
+        a, b, c = hull.points[face]
+        out = np.cross(b - a, c - a) @ (a - middle) > 0.0
+        lines.append("f " + " ".join(str(i + 1) for i in face[:: 1 if out else -1]))
+    return "\n".join(lines) + "\n"
+
+
+def object_sdf(spec: PushedObject, mesh: str = "") -> str:
     """The object as a model `object` with the body `object`, in SDFormat, standing on
-    evenly spread spheres."""
+    evenly spread spheres.
+
+    Args: mesh: where the file with a mesh's hull (hull_obj) is, seen from this one;
+        empty: the mesh itself, by its whole path.
+    """
     M = object_inertia(spec)
     com = M.get_com()
     moments = M.Shift(com).CalcRotationalInertia().CopyToFullMatrix3()
@@ -255,6 +278,8 @@ def object_sdf(spec: PushedObject) -> str:
         for j in range(i, 3)
     )
     listed = "\n      ".join(shapes)
+    if mesh and spec.shape == "mesh":
+        listed = listed.replace(_uri(parts(spec)[0].shape), mesh)
     return (
         '<?xml version="1.0"?>\n<sdf version="1.9" xmlns:drake="drake.mit.edu">\n'
         '  <model name="object">\n    <link name="object">\n      <inertial>'
@@ -339,7 +364,7 @@ def _placed_text(shape: Shape, X_BS: RigidTransform) -> str:
         )
     elif isinstance(shape, Convex):
         geometry = (
-            f"<mesh><uri>file://{shape.source().path()}</uri>"
+            f"<mesh><uri>{_uri(shape)}</uri>"
             f"<scale>{_numbers(shape.scale3())}</scale><drake:declare_convex/></mesh>"
         )
     else:
@@ -347,6 +372,10 @@ def _placed_text(shape: Shape, X_BS: RigidTransform) -> str:
     turned = _numbers(RollPitchYaw(X_BS.rotation()).vector())
     pose = f"<pose>{_numbers(X_BS.translation())} {turned}</pose>"
     return f"{pose}<geometry>{geometry}</geometry>"
+
+
+def _uri(shape: Convex) -> str:
+    return f"file://{shape.source().path()}"
 
 
 def _visual_text(name: str, shape: Shape, X_BS: RigidTransform, color) -> str:

@@ -1,5 +1,7 @@
 """Places around an object, their plans, and the choice between them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
@@ -582,6 +584,20 @@ def test_a_tip_that_comes_down_on_the_object_goes_up_and_comes_down_farther_out(
     # It went up after each of the two misses, not along the table.
     low = np.array(lowest) < 0.03
     assert np.sum(np.diff(low.astype(int)) == 1) == 3
+    # That is not kept for ever: each time that it goes on from a place where it came
+    # down well, it takes some of it back.
+    for go, extra in ((2, 0.005), (3, 0.004)):
+        task = replace(task, phase=CONTACT)
+        task = next_push(
+            config, task, shape, 0.0125, x, True, in_object, go, HEIGHT, 0.004
+        )
+        assert task.phase == TRAVEL and task.extra == pytest.approx(extra)
+    for k in range(20):
+        task = replace(task, phase=CONTACT)
+        task = next_push(
+            config, task, shape, 0.0125, x, True, in_object, 4 + k, HEIGHT, 0.004
+        )
+    assert task.extra == 0.0
 
 
 @pytest.mark.parametrize("off", [[0.02, 0.0, 0.0], [0.0, 0.0, 0.02]])

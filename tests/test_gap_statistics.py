@@ -35,7 +35,7 @@ from makebreak.gap.problem import (
 from makebreak.gap.result import GapMeasure
 from makebreak.gap.select import Choice, Selection, is_significant, select
 from makebreak.gap.trust import gauss_newton, ridges, steady
-from makebreak.gap.verdict import after_simulation, verdict_of
+from makebreak.gap.verdict import after_simulation, verdict_of, withdrawn_if_weak
 from makebreak.gap.workflow import kept_by_simulation
 from makebreak.models.effects.kind import Effect
 from makebreak.systems.numerics.smoother import smooth
@@ -582,6 +582,19 @@ def test_a_parameter_at_its_limit_has_no_interval_that_could_be_infinite(
 
 def windows_leave(before: float, after: float) -> GapMeasure:
     return GapMeasure(before, after, 1.0, 0.3)
+
+
+@pytest.mark.parametrize(
+    "closed, expected", [(0.12, "close 12% of it"), (float("nan"), "not be judged")]
+)
+def test_candidates_that_close_too_little_are_told_and_not_named(closed, expected):
+    choice = Choice(Effect("joint_backlash", ["a.j"], {"gap": 0.02}), {"gap": 1e-3},
+                    9.0, 3.0, "", 1.0, (), (), 1)  # fmt: skip
+    every = Selection((choice,), None, None, None)
+    left, words = withdrawn_if_weak(every, "gap_unnamed", closed)
+    assert left.choices == () and "joint_backlash at a.j" in words
+    assert expected in words and "nan" not in words
+    assert withdrawn_if_weak(every, "gap_unnamed", 0.9) == (every, "")
 
 
 def test_where_simulation_shows_no_gap_any_more_equations_find_none():

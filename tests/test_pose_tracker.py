@@ -42,6 +42,7 @@ from makebreak.systems.perception.pose_tracker import (
     Marker,
     PoseTracker,
     PoseTrackerConfig,
+    rolling_turn,
 )
 
 WEIGHTS = strength_weights(HUE)
@@ -59,6 +60,23 @@ RENDERERS = [
 _photographers: dict = {}
 # A house: 0.14 x 0.1 m, with a gable over +y.
 HOUSE = 0.1 * np.array([[-0.7, -0.5], [0.7, -0.5], [0.7, 0.3], [0.0, 0.8], [-0.7, 0.3]])
+
+
+def test_what_rolls_turns_so_that_it_does_not_slip():
+    height, yaw = 0.02, 0.7
+    rate = np.array([0.05, -0.08, 0.4])
+    axis = np.array([1.0, 0.0, 0.0])
+    w = rolling_turn(rate, yaw, axis, height)
+    level = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    # Where it touches the table it is at rest, but along its axis, where it slides.
+    foot = np.array([*rate[:2], 0.0]) + np.cross(w, [0.0, 0.0, -height])
+    np.testing.assert_allclose(foot, (foot @ level) * level, atol=1e-12)
+    assert foot @ level == pytest.approx(rate[:2] @ level[:2])
+    assert w[2] == 0.4 and np.linalg.norm(w[:2]) > 1.0
+    # What does not roll turns about the vertical alone.
+    np.testing.assert_array_equal(
+        rolling_turn(rate, yaw, np.zeros(3), height), [0.0, 0.0, 0.4]
+    )
 
 
 def shape_of(name, **changes):

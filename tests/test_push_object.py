@@ -3,20 +3,28 @@
 import numpy as np
 import pytest
 from pydrake.common.value import Value
+from pydrake.geometry import Box
 from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
+from pydrake.multibody.tree import PrismaticJoint, SpatialInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 from scipy.spatial.transform import Rotation
 
 from makebreak.diagrams.push_object import (
+    PUSH_OBJECT,
     PushModelConfig,
     PushObjectConfig,
     believed_object,
     make_push_object,
+    model_scene,
     poses_of,
     world_scene,
 )
+from makebreak.models.effects.kind import Effect
+from makebreak.models.scene import read_scene
+from makebreak.models.scene_file import write_scene
 from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL, Q_BALL
 from makebreak.systems.contact_mpc.numerics.push_task import (
     CONTACT,
@@ -28,6 +36,7 @@ from makebreak.systems.contact_mpc.push_goals import (
     PushGoals,
     PushGoalsConfig,
     draw_poses,
+    nearest_turn,
 )
 from makebreak.systems.perception.numerics.pose_filter import (
     corrected,
@@ -39,6 +48,9 @@ from makebreak.systems.perception.numerics.pose_filter import (
 )
 from makebreak.systems.perception.numerics.state_estimator import with_pose
 from makebreak.systems.perception.pose_sensor import PoseSensor, PoseSensorConfig
+from makebreak.systems.views.contact_probe import ContactLoad
+
+POSE = [1.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.02]
 
 
 def as_scipy(q):
@@ -171,9 +183,9 @@ def test_a_known_pose_takes_the_place_of_rolling():
     assert with_pose(True, x, 1.0, q, w * np.nan)[2] == -1.0
 
 
-def goals_at(x, goals, **config):
+def goals_at(x, goals, fold=1, **config):
     builder = DiagramBuilder()
-    system = builder.AddSystem(PushGoals(PushGoalsConfig(**config), goals))
+    system = builder.AddSystem(PushGoals(PushGoalsConfig(**config), goals, fold))
     state = builder.AddNamedSystem("x", ConstantVectorSource(x))
     seen = builder.AddSystem(ConstantVectorSource([1.0]))
     builder.Connect(state.get_output_port(), system.GetInputPort("x"))
@@ -210,6 +222,37 @@ def test_a_goal_is_over_when_it_is_reached_for_a_while_or_its_time_is_up():
     np.testing.assert_array_equal(system.GetOutputPort("goal").Eval(own), near)
 
 
+def test_a_turn_that_leaves_the_object_as_it_is_does_not_count():
+    for goal, yaw, fold, turn in (
+        (0.2, 3.0, 2, np.pi),
+        (0.2, 1.7, 2, 0.0),
+        (3.0, -3.0, 1, 0.0),
+        (0.0, 2.2, 4, np.pi / 2.0),
+        (1.0, 0.3, 0, -0.7),
+    ):
+        assert nearest_turn(goal, yaw, fold) == pytest.approx(turn)
+
+
+def test_a_box_is_turned_to_the_nearer_of_the_yaws_that_are_the_same():
+    x = np.zeros(N_X)
+    x[Q_BALL] = turned(np.array([1.0, 0, 0, 0]), np.array([0, 0, 2.9]))
+    x[P_BALL] = [0.5, 0, 0.02]
+    first, second = [0.5, 0.0, -0.2], [0.52, 0.0, 0.0]
+    for fold, given in ((1, [-0.2, 0.0]), (2, [np.pi - 0.2, np.pi])):
+        diagram, system = goals_at(x, [first, second], fold, limit_sec=2.0)
+        simulator = Simulator(diagram)
+        own = system.GetMyContextFromRoot(simulator.get_context())
+        simulator.AdvanceTo(0.1)
+        yaw = system.GetOutputPort("goal").Eval(own)[2]
+        assert yaw == pytest.approx(given[0])
+        simulator.AdvanceTo(2.2)
+        # As a box it was there at once; else its time was up.
+        number, since = system.GetOutputPort("log").Eval(own)[[0, 4]]
+        assert number == 1.0
+        assert since == pytest.approx(0.25 if fold == 2 else 2.0, abs=0.03)
+        assert system.GetOutputPort("goal").Eval(own)[2] == pytest.approx(given[1])
+
+
 def test_goals_lie_all_over_the_region():
     config = PushGoalsConfig()
     poses = draw_poses(config, 400, 5)
@@ -219,6 +262,53 @@ def test_goals_lie_all_over_the_region():
     # Evenly: mean zero to 4 standard deviations of a mean of 400.
     assert (np.abs(off.mean(axis=0)) < 4 * half / np.sqrt(3 * 400)).all()
     assert not np.array_equal(poses, draw_poses(config, 400, 6))
+
+
+# The forces.
+
+
+def load_on(names, other):
+    """ContactLoad on bodies of a stack of boxes of 1, 2 and 4 kg, at rest."""
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, 1e-3)
+    hard = CoulombFriction(1.0, 1.0)
+    ground, size = RigidTransform([0.0, 0.0, -0.05]), Box(1.0, 1.0, 0.1)
+    plant.RegisterCollisionGeometry(plant.world_body(), ground, size, "g", hard)
+    for i, mass in enumerate((1.0, 2.0, 4.0)):
+        inertia = SpatialInertia.SolidBoxWithMass(mass, 0.1, 0.1, 0.1)
+        body = plant.AddRigidBody(f"box{i}", inertia)
+        joint = PrismaticJoint(
+            f"slide{i}", plant.world_frame(), body.body_frame(), [0.0, 0.0, 1.0]
+        )
+        plant.AddJoint(joint)
+        plant.RegisterCollisionGeometry(
+            body, RigidTransform(), Box(0.1, 0.1, 0.1), f"box{i}", hard
+        )
+    plant.Finalize()
+    bodies = [plant.GetBodyByName(name) for name in names]
+    load = builder.AddSystem(ContactLoad(bodies, plant.GetBodyByName(other)))
+    builder.Connect(
+        plant.get_contact_results_output_port(), load.GetInputPort("contact_results")
+    )
+    simulator = Simulator(builder.Build())
+    own = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    plant.SetPositions(own, [0.05, 0.15, 0.25])
+    simulator.AdvanceTo(1.0)
+    return load.get_output_port().Eval(
+        load.GetMyContextFromRoot(simulator.get_context())
+    )
+
+
+def test_all_contacts_of_some_bodies_count_and_none_among_themselves():
+    # The lowest carries 6 kg and stands with 7: forces that cancel are both counted.
+    np.testing.assert_allclose(
+        load_on(["box0"], "box1"), [6.0 * 9.81, 7.0 * 9.81], rtol=1e-3
+    )
+    # The two lower ones together: what is between them is their own matter.
+    np.testing.assert_allclose(
+        load_on(["box0", "box1"], "box2"), [4.0 * 9.81, 7.0 * 9.81], rtol=1e-3
+    )
+    np.testing.assert_allclose(load_on(["box2"], "box0"), [0.0, 4.0 * 9.81], rtol=1e-3)
 
 
 # The diagram.
@@ -233,6 +323,24 @@ def test_errors_change_the_model_and_leave_the_world_alone():
     scene = world_scene(PushObjectConfig(model=wrong))
     frictions = [effect.parameters["friction"] for effect in scene.effects]
     assert frictions == [0.5, 0.5]
+
+
+def test_controllers_know_no_effect_of_the_world(tmp_path):
+    scene = read_scene(PUSH_OBJECT)
+    joint = "panda.panda_joint2"
+    scene.effects.append(Effect("joint_coulomb_friction", [joint], {"coulomb": 3.0}))
+    write_scene(scene, tmp_path / "world.scene.yaml")
+    config = PushObjectConfig(scene=str(tmp_path / "world.scene.yaml"))
+    of_world, believed = world_scene(config).effects, model_scene(config, "o.sdf", POSE)
+    assert [effect.kind for effect in of_world] == [
+        "joint_coulomb_friction", "contact_friction", "contact_friction",
+    ]  # fmt: skip
+    kinds = [effect.kind for effect in believed.effects]
+    assert kinds == ["contact_friction", "contact_friction"]
+    # Unless they are told.
+    config.model.scene = config.scene
+    told = model_scene(config, "o.sdf", POSE).effects
+    assert told[0].kind == "joint_coulomb_friction"
 
 
 def test_the_object_starts_where_the_seed_says_it_does():
@@ -270,5 +378,9 @@ def test_the_arm_goes_to_the_object_and_moves_it_towards_its_goal():
     assert after < before - 0.03
     force = np.linalg.norm(log("touch_log").data(), axis=0)
     assert 0.5 < force.max() < 40.0
+    # Nothing but the finger touches anything, and it the object alone.
+    load = log("load_log").data()
+    np.testing.assert_allclose(load[0], force, atol=0.3)
+    assert (load[1] == 0.0).all()
     tau = log("torque_log").data()
     assert np.isfinite(tau).all() and np.abs(np.diff(tau, axis=1)).max() < 87.0

@@ -41,6 +41,7 @@ from makebreak.systems.perception.numerics.past_state import pose_at
 from makebreak.systems.perception.pose_sensor import KEPT_SEC, PoseSensorConfig
 
 GOAL = np.array([0.5, 0.1, 3.0])
+POSE = [1.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.02]
 
 
 def truth_of(poses, numbers, dt=1.0):
@@ -95,10 +96,14 @@ def test_totals_count_goals_and_a_failed_run_reaches_none():
     good = {
         "n_goals": 3, "goals_reached": 2, "goals_reached_loose": 3,
         "time_s": [5.0, None, 7.0], "contact_force_peak_N": 12.0,
+        "finger_force_below_100hz_N": 8.0,
     }  # fmt: skip
     found = totals([good, {"error": "stopped"}, good], 2)
     # Of 5, 60, 7; 60, 60; 5, 60 and 7 s.
-    assert found == {"n": 8, "reached": 4, "loose": 6, "time": 33.5, "force": 12.0}
+    assert found == {
+        "n": 8, "reached": 4, "loose": 6, "time": 33.5, "force": 12.0,
+        "slow_force": 8.0,
+    }  # fmt: skip
     assert totals([{"error": "stopped"}], 3)["time"] == 60.0
     assert won_back(1.0, 0.5, 0.75) == 0.5 and np.isnan(won_back(1.0, 1.0, 1.0))
 
@@ -126,7 +131,8 @@ def test_table_tells_what_was_missed_and_a_failed_run_counts(tmp_path, monkeypat
         return {
             "n_goals": n, "goals_reached": got, "goals_reached_loose": n,
             "time_s": [20.0 if got < n else 10.0] * got + [None] * (n - got),
-            "contact_force_peak_N": 30.0, "seed": seed,
+            "contact_force_peak_N": 30.0, "finger_force_below_100hz_N": 20.0,
+            "seed": seed,
         }  # fmt: skip
 
     monkeypatch.setattr(
@@ -167,7 +173,7 @@ def test_model_scene_is_what_the_controllers_believe(name, tmp_path):
     )
     path = tmp_path / "object.sdf"
     path.write_text(object_sdf(config.object))
-    write_scene(model_scene(config, path), tmp_path / "model.yaml")
+    write_scene(model_scene(config, path, POSE), tmp_path / "model.yaml")
     loaded = load_scene(read_scene(tmp_path / "model.yaml"), DiagramBuilder())
     body = loaded.plant.GetBodyByName("object")
     spec, friction = believed_object(config)
@@ -233,6 +239,17 @@ def test_run_with_the_camera_is_scored_recorded_and_drawn(tmp_path):
     last = table[-1]
     yaw = 2.0 * np.arctan2(last["objectobjectqz"], last["objectobjectqw"])
     assert yaw == pytest.approx(0.4, abs=0.02)
+    # It begins with the first pose that was measured, and the model lies there.
+    assert table["time"][0] > 0.0
+    first = [
+        table[0][f"objectobject{part}"] for part in ("qw", "qx", "qy", "qz", *"xyz")
+    ]
+    model = read_scene(out / "model.yaml")
+    assert model.initial.poses["object.object"] == first
+    assert first[4:6] == pytest.approx([0.5, 0.1], abs=0.02) and first[4:6] != [
+        0.5,
+        0.1,
+    ]
     assert last["objectobjectx"] == pytest.approx(0.5, abs=5e-3)
     assert "object_size" in (out / "model.yaml").read_text()
 
@@ -259,6 +276,14 @@ def test_camera_and_sensor_are_the_only_ways_from_the_world():
             for port, target in heard
             if port not in measured and not target.endswith("_log")
         }
+        # Forces for scoring go to a log, and nowhere else.
+        hears = [
+            target[0].get_name()
+            for target, source in diagram.connection_map().items()
+            if source[0].get_name() == "contact_load"
+        ]
+        assert hears == ["load_log"]
+        others.remove(("contact_results", "contact_load"))
         sensor = {("body_poses", "pose_sensor")} if pose_from == "sensor" else set()
         assert others == sensor
 
@@ -321,10 +346,10 @@ def test_settings_that_cannot_act_are_refused_by_name(setting, says):
 
 
 def test_only_what_is_wrong_is_an_effect_of_the_model(tmp_path):
-    scene = model_scene(PushObjectConfig(), tmp_path / "object.sdf")
+    scene = model_scene(PushObjectConfig(), tmp_path / "object.sdf", POSE)
     assert {effect.kind for effect in scene.effects} == {"contact_friction"}
     config = replace(PushObjectConfig(), model=PushModelConfig(mass=2.0))
-    kinds = [e.kind for e in model_scene(config, tmp_path / "object.sdf").effects]
+    kinds = [e.kind for e in model_scene(config, tmp_path / "object.sdf", POSE).effects]
     assert kinds.count("object_mass") == 1
     assert diagrams.believed_object(config)[0].mass == pytest.approx(0.8)
 

@@ -1,9 +1,14 @@
 """Objects to push: files of a simulated world, and what a planner knows of them."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from pydrake.geometry import Box, Convex
 from pydrake.multibody.math import SpatialVelocity
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial import ConvexHull
@@ -12,6 +17,7 @@ from makebreak.models.effects.kind import Effect
 from makebreak.models.model_files import MODELS
 from makebreak.models.pushed_object import (
     PushedObject,
+    hull_obj,
     make_tip_and_object,
     object_file,
     object_inertia,
@@ -196,6 +202,33 @@ def test_mesh_has_its_origin_over_its_centroid_half_way_up(spec_of):
     np.testing.assert_allclose(part.points.max(axis=0), high, atol=1e-9)
     assert rest_height(spec) == pytest.approx(0.04)
     np.testing.assert_allclose(object_inertia(spec).get_com()[:2], 0.0, atol=1e-9)
+
+
+def test_a_copy_of_a_mesh_needs_its_file_no_more(spec_of, wedge, tmp_path):
+    own = tmp_path / "of_the_user.obj"
+    own.write_text(Path(wedge).read_text())
+    spec = replace(spec_of("mesh", scale=2.0), file=str(own))
+    (expected,) = parts(spec)
+    (tmp_path / "copy.obj").write_text(hull_obj(spec))
+    sdf = tmp_path / "object.sdf"
+    sdf.write_text(object_sdf(spec, "copy.obj"))
+    own.unlink()
+    assert str(tmp_path) not in sdf.read_text()
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1e-3)
+    Parser(plant).AddModels(str(sdf))
+    plant.Finalize()
+    inspector = scene_graph.model_inspector()
+    (g,) = plant.GetCollisionGeometriesForBody(plant.GetBodyByName("object"))[:1]
+    hull = inspector.GetShape(g).GetConvexHull()
+    got = np.array([hull.vertex(i) for i in range(hull.num_vertices())])
+    got = got + inspector.GetPoseInFrame(g).translation()
+    skin = [0.0, 0.0, 2e-4]  # It ends so far above the table.
+    np.testing.assert_allclose(
+        got[np.lexsort(got.round(6).T)],
+        (expected.points + skin)[np.lexsort((expected.points + skin).round(6).T)],
+        atol=1e-8,
+    )
 
 
 @pytest.mark.parametrize("shape", ["t", "mesh"])

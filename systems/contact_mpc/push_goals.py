@@ -5,8 +5,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydrake.systems.framework import LeafSystem
 
-from makebreak.systems.contact_mpc.numerics.ball_state import N_X
-from makebreak.systems.contact_mpc.numerics.push_task import errors
+from makebreak.systems.contact_mpc.numerics.ball_state import N_X, Q_BALL
+from makebreak.systems.contact_mpc.numerics.push_task import (
+    angle_between,
+    errors,
+    heading,
+)
 from makebreak.systems.numerics.timing import timed
 
 
@@ -35,6 +39,17 @@ def draw_poses(config: PushGoalsConfig, n: int, seed: int) -> np.ndarray:
     return np.array([*config.center, 0.0]) + rng.uniform(-half, half, (n, 3))
 
 
+def nearest_turn(goal: float, yaw: float, fold: int) -> float:
+    """Added to the goal [rad], of the yaws that are the same the one nearest to yaw.
+
+    Args: fold: as of PushGoals.
+    """
+    off = angle_between(goal, yaw)
+    if fold == 0:
+        return off
+    return 2.0 * np.pi / fold * round(off * fold / (2.0 * np.pi))
+
+
 class PushGoals(LeafSystem):
     """Gives a goal until the object is there, as far as the estimate tells, or the time
     is up; then the next.
@@ -43,10 +58,15 @@ class PushGoals(LeafSystem):
     Outputs: goal (3,) = x, y [m], yaw [rad]; log (5,) = [number of the goal, goal 3,
              since when s]. After the last goal the last one stays, its number one more.
 
-    Args: goals (n, 3).
+    A turn that leaves the object as it is does not count: of the yaws that are the same
+    then, the one nearest to the object's, as it was first seen after the goal came, is
+    given.
+
+    Args: goals (n, 3); fold: so many turns about z leave the object as it is, as far as
+        what measures it can tell; 0: any.
     """
 
-    def __init__(self, config: PushGoalsConfig, goals):
+    def __init__(self, config: PushGoalsConfig, goals, fold: int = 1):
         super().__init__()
         _check(config)
         self._config = config
@@ -55,8 +75,10 @@ class PushGoals(LeafSystem):
             raise ValueError(f"goals is {self._goals.shape}, expected (n, 3)")
         self._x = self.DeclareVectorInputPort("x", N_X)
         self._valid = self.DeclareVectorInputPort("valid", 1)
-        # Number of the goal, since when [s], how long it has been reached [s].
-        self._state = self.DeclareDiscreteState(3)
+        self._fold = fold
+        # Number of the goal, since when [s], how long it has been reached [s], and the
+        # turn that is added to its yaw [rad], NaN: not known yet.
+        self._state = self.DeclareDiscreteState([0.0, 0.0, 0.0, np.nan])
         ticket = {self.discrete_state_ticket(self._state)}
         self.DeclareVectorOutputPort("goal", 3, self._calc_goal, ticket)
         self.DeclareVectorOutputPort("log", 5, self._calc_log, ticket)
@@ -65,31 +87,39 @@ class PushGoals(LeafSystem):
         )
 
     def _goal(self, context):
-        number = int(context.get_discrete_state(self._state).value()[0])
-        return self._goals[min(number, len(self._goals) - 1)]
+        state = context.get_discrete_state(self._state).value()
+        goal = self._goals[min(int(state[0]), len(self._goals) - 1)].copy()
+        if np.isfinite(state[3]):
+            goal[2] += state[3]
+        return goal
 
     def _calc_goal(self, context, output):
         output.SetFromVector(self._goal(context))
 
     def _calc_log(self, context, output):
-        number, since, _ = context.get_discrete_state(self._state).value()
+        number, since, _, _ = context.get_discrete_state(self._state).value()
         output.SetFromVector([number, *self._goal(context), since])
 
     @timed
     def _update(self, context, discrete_state):
         c, t = self._config, context.get_time()
-        number, since, held = context.get_discrete_state(self._state).value()
+        number, since, held, turn = context.get_discrete_state(self._state).value()
         if number >= len(self._goals):
             return
         x = np.asarray(self._x.Eval(context))
         there = False
         if self._valid.Eval(context)[0] > 0.5 and np.isfinite(x).all():
-            off = errors(x, self._goal(context))
+            goal = self._goals[int(number)].copy()
+            if np.isnan(turn):
+                turn = nearest_turn(goal[2], heading(x[Q_BALL]), self._fold)
+            goal[2] += turn
+            off = errors(x, goal)
             there = all(a < c.share * b for a, b in zip(off, c.tolerance, strict=True))
         held = held + c.period_sec if there else 0.0
         if held >= c.dwell_sec or t - since >= c.limit_sec:
             number, since, held = number + 1.0, t, 0.0
-        discrete_state.set_value(self._state, [number, since, held])
+            turn = np.nan if number < len(self._goals) else turn
+        discrete_state.set_value(self._state, [number, since, held, turn])
 
 
 def _check(config: PushGoalsConfig) -> None:

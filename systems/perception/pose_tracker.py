@@ -1,4 +1,4 @@
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
@@ -42,6 +42,8 @@ class PoseTrackerConfig:
     # How freely it moves [m^2/s^3] and turns [rad^2/s^3].
     acceleration_density: float = 0.01
     turning_density: float = 2.0
+    # Of an object that rolls on the table, in its frame; empty: it slides.
+    rolling_axis: list[float] = field(default_factory=list)
     period_sec: float = 0.0125
     offset_sec: float = 0.0
 
@@ -63,6 +65,19 @@ class Marker:
         return np.hstack([xy, np.zeros((4, 1))]) + self.center
 
 
+def rolling_turn(rate, yaw, axis, height):
+    """Angular velocity (3,) of an object that rolls without slipping [rad/s].
+
+    Args: rate (3,) = v_x, v_y [m/s] and yaw's [rad/s]; axis (3,) that it rolls about,
+        level, in its frame, zero: it slides; yaw [rad]; height of its origin [m].
+    """
+    c, s = np.cos(yaw), np.sin(yaw)
+    level = np.array([c * axis[0] - s * axis[1], s * axis[0] + c * axis[1]])
+    about = (level[1] * rate[0] - level[0] * rate[1]) / height
+    # v = w x (height z): w along the level axis.
+    return np.array([*(about * level), rate[2]])
+
+
 class PoseTracker(LeafSystem):
     """Where a flat object lies on a table, how it is turned, and how fast it moves and
     turns, from an overhead camera's pictures.
@@ -70,7 +85,8 @@ class PoseTracker(LeafSystem):
     Each period the picture is asked for, the object is found in it (numerics/
     pose_tracker.py) and Kalman filters of constant velocity are corrected (numerics/
     constant_velocity.py), one for its place and one for its yaw. It is taken to lie
-    flat: z is as configured, roll and pitch are 0.
+    flat: z is as configured, roll and pitch are 0. One that rolls is taken to roll
+    without slipping: about its axis it turns as fast as its place says.
 
     Inputs:  image, abstract ImageRgba8U of the camera model's size.
     Outputs: p_WB (3,) [m]; q_WB (4,) = [w, x, y, z]; yaw (1,) [rad], without jumps;
@@ -118,7 +134,12 @@ class PoseTracker(LeafSystem):
                 f"marker has number {marker.number} and side {marker.side}, expected "
                 "0 to 49 (of the dictionary 4X4_50) and a side above 0"
             )
+        if len(config.rolling_axis) not in (0, 3):
+            raise ValueError(
+                f"rolling_axis is {config.rolling_axis}, expected 3 numbers or none"
+            )
         self._config, self._camera, self._shape = config, camera, shape
+        self._axis = np.array(config.rolling_axis or np.zeros(3), dtype=float)
         self._weights = strength_weights(config.hue)
         self._marker = marker
         self._size = (camera.height, camera.width, 4)
@@ -253,7 +274,10 @@ class PoseTracker(LeafSystem):
         output.SetFromVector([*self._get(context)[_RATE][:2], 0.0])
 
     def _angular_velocity(self, context, output):
-        output.SetFromVector([0.0, 0.0, self._get(context)[_RATE][2]])
+        state = self._get(context)
+        output.SetFromVector(
+            rolling_turn(state[_RATE], state[_POSE][2], self._axis, self._config.z)
+        )
 
     def _seen(self, context, output):
         output.SetAtIndex(0, float(self._get(context)[_STATUS] == TRACKED))

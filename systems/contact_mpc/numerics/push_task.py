@@ -35,6 +35,8 @@ PLACE_CHANGE = 0.008
 # object, which is larger than believed, or elsewhere: it goes up, and after that comes
 # down so much farther out; not farther than EXTRA_MAX, where it no longer matters [m].
 MISSED, EXTRA, EXTRA_MAX = 0.01, 0.003, 0.012
+# Each landing that does not miss takes so much of it back [m].
+TAKEN_BACK = 0.001
 
 
 @dataclass
@@ -135,7 +137,8 @@ def next_push(
         state = replace(state, phase=WAIT)
     elif state.phase == WAIT or (state.phase == CONTACT and go != state.go):
         if state.phase == CONTACT:
-            state = replace(state, p=x[P_TIP].copy(), v=x[V_TIP].copy())
+            extra = max(state.extra - TAKEN_BACK, 0.0)
+            state = replace(state, p=x[P_TIP].copy(), v=x[V_TIP].copy(), extra=extra)
         state = replace(state, phase=TRAVEL, place=None)
     if state.phase == CONTACT:
         return state
