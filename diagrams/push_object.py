@@ -21,11 +21,7 @@ from typing import Literal
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import (
-    ConstantVectorSource,
-    Demultiplexer,
-    LogVectorOutput,
-)
+from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
 from makebreak.diagrams.camera import CameraConfig, camera_model
 from makebreak.diagrams.recorder import record_station
@@ -38,6 +34,7 @@ from makebreak.diagrams.station import (
     make_control_plant,
     make_station,
 )
+from makebreak.diagrams.wiring import add_legend, check_own, connect_command
 from makebreak.models.effects.kind import Effect
 from makebreak.models.model_files import MODELS
 from makebreak.models.pushed_object import (
@@ -107,6 +104,7 @@ from makebreak.systems.perception.state_estimator import (
 )
 from makebreak.systems.views.adapt_button import AdaptButton
 from makebreak.systems.views.contact_probe import ContactLoad
+from makebreak.systems.views.legend import LegendConfig
 from makebreak.systems.views.push_view import PushView, PushViewConfig
 
 PUSH_OBJECT = str(MODELS / "push_object.scene.yaml")
@@ -170,9 +168,8 @@ class PushModelConfig:
     # Scene file of what the controllers believe of arm and table; None: the world's,
     # without its effects, which are what no model knows.
     scene: str | None = None
-    friction: float | None = (
-        None  # Of the object with tip and table; None: the world's.
-    )
+    # Of the object with tip and table; None: the world's.
+    friction: float | None = None
     scale: float = 1.0  # Of the object's size, times the world's.
     mass: float = 1.0  # Of the object's mass, times the world's.
     com_offset: list[float] = field(default_factory=lambda: [0.0, 0.0])  # Added [m].
@@ -229,21 +226,38 @@ def world_scene(config: PushObjectConfig) -> Scene:
     scene = read_scene(config.scene)
     if not config.friction > 0.0:
         raise ValueError(f"friction is {config.friction}, expected > 0")
-    models = [d.add_model for d in scene.directives if d.add_model is not None]
-    own = [model for model in models if model.name == OBJECT]
-    if not own:
-        names = ", ".join(model.name for model in models)
+    models = [d.add_model.name for d in scene.directives if d.add_model is not None]
+    if OBJECT not in models:
+        names = ", ".join(models)
         raise ValueError(f"the scene has {names}, expected a model {OBJECT} too")
-    own[0].file = f"file://{object_file(config.object)}"
     x, y, yaw = poses_of(config)[0]
-    q = [float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2))]
-    z = rest_height(config.object)
-    scene.initial.poses[f"{OBJECT}.{OBJECT}"] = [*q, float(x), float(y), z]
-    for pair in (f"{TOOL}~{OBJECT}", f"{OBJECT}~table"):
-        scene.effects.append(
-            Effect("contact_friction", [pair], {"friction": config.friction})
-        )
+    pose = [
+        np.cos(yaw / 2),
+        0.0,
+        0.0,
+        np.sin(yaw / 2),
+        x,
+        y,
+        rest_height(config.object),
+    ]
+    _lay(scene, object_file(config.object), pose)
+    _rub(scene, config.friction)
     return scene
+
+
+def _lay(scene: Scene, file: str | Path, pose) -> None:
+    """The object of a file at a pose (7,), quaternion and place [m]."""
+    for d in scene.directives:
+        if d.add_model is not None and d.add_model.name == OBJECT:
+            d.add_model.file = f"file://{file}"
+    scene.initial.poses[f"{OBJECT}.{OBJECT}"] = [float(value) for value in pose]
+
+
+def _rub(scene: Scene, friction: float) -> None:
+    """The object's friction with tip and table."""
+    for pair in (f"{TOOL}~{OBJECT}", f"{OBJECT}~table"):
+        value = {"friction": friction}
+        scene.effects.append(Effect("contact_friction", [pair], value))
 
 
 def believed_object(config: PushObjectConfig) -> tuple[PushedObject, float]:
@@ -280,10 +294,7 @@ def model_scene(config: PushObjectConfig, file: str | Path, pose) -> Scene:
     """
     scene = believed_scene(config)
     spec, friction = believed_object(config)
-    for d in scene.directives:
-        if d.add_model is not None and d.add_model.name == OBJECT:
-            d.add_model.file = f"file://{file}"
-    scene.initial.poses[f"{OBJECT}.{OBJECT}"] = [float(value) for value in pose]
+    _lay(scene, file, pose)
     m = config.model
     if m.scale != 1.0:
         scene.effects.append(Effect("object_size", [OBJECT], {"scale": m.scale}))
@@ -293,9 +304,7 @@ def model_scene(config: PushObjectConfig, file: str | Path, pose) -> Scene:
     if any(m.com_offset) or (m.scale != 1.0 and any(config.object.com_offset)):
         com = dict(zip("xy", map(float, spec.com_offset), strict=True))
         scene.effects.append(Effect("object_com", [OBJECT], com))
-    for pair in (f"{TOOL}~{OBJECT}", f"{OBJECT}~table"):
-        value = {"friction": friction}
-        scene.effects.append(Effect("contact_friction", [pair], value))
+    _rub(scene, friction)
     return scene
 
 
@@ -429,6 +438,12 @@ def _add_sensor(
 
 
 # Settings that the diagram makes of others.
+# Of the task, as the legend says them.
+PHASES = (
+    "now: pushes",
+    "now: goes to another place",
+    "now: waits for the object to be seen",
+)
 _OWN = {
     "goals": ("period_sec", "offset_sec"),
     "task": ("height", "clearance", "period_sec", "offset_sec"),
@@ -438,19 +453,6 @@ _OWN = {
     "pose": ("height", "rolling_axis", "offset_sec"),
     "tracker": ("z", "hue", "rolling_axis", "period_sec", "offset_sec"),
 }
-
-
-def _check_own(config: PushObjectConfig) -> None:
-    """Raises: ValueError for a setting that would not act."""
-    for name, own in _OWN.items():
-        part = getattr(config, name)
-        plain = getattr(PushObjectConfig(), name)
-        for key in own:
-            value, default = getattr(part, key), getattr(plain, key)
-            if value != default:
-                raise ValueError(
-                    f"{name}.{key} is {value}, expected {default}: the diagram sets it"
-                )
 
 
 def make_push_object(
@@ -465,7 +467,7 @@ def make_push_object(
     `goal_log` (5,) of PushGoals, `phase_log` (1,) of PushTask and `command_log` (3,) of
     ContactSampler, at 80 Hz. A diagram is done when the number in goal_log is n_goals.
     """
-    _check_own(config)
+    check_own(config, _OWN)
     builder = DiagramBuilder()
     spec, friction = believed_object(config)
     station = builder.AddNamedSystem(
@@ -670,11 +672,7 @@ def make_push_object(
     connect(lcs["command"], "lcs", reference, "lcs")
     connect(station, f"{ARM}.position_measured", impedance, "q")
     connect(station, f"{ARM}.velocity_measured", impedance, "v")
-    sizes = [reference.GetOutputPort(name).size() for name in ("x_desired", "wrench")]
-    split = builder.AddNamedSystem("arm_command_split", Demultiplexer(sizes))
-    builder.Connect(reference.GetOutputPort("command"), split.get_input_port())
-    for i, name in enumerate(("x_desired", "wrench_feedforward")):
-        builder.Connect(split.get_output_port(i), impedance.GetInputPort(name))
+    connect_command(builder, reference, impedance)
     tau = impedance.GetOutputPort("tau")
     builder.Connect(tau, station.GetInputPort(f"{ARM}.torque_commanded"))
 
@@ -714,6 +712,8 @@ def make_push_object(
         connect(goals, "goal", view, "goal")
         connect(estimator, "x", view, "x")
         connect(estimator, "valid", view, "valid")
+        legend = LegendConfig(view.LEGEND, PHASES, view.CAMERA, view.LOOK_AT)
+        add_legend(builder, meshcat, legend, task.GetOutputPort("phase"))
     diagram = builder.Build()
     diagram.set_name("push_object")
     return diagram
