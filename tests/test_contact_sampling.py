@@ -91,14 +91,20 @@ def outline_at(pose, spec=T):
     return outline_of(points, rotation_of(x[Q_BALL]), x[P_BALL])
 
 
-@pytest.fixture(scope="module")
-def planner():
-    """The model of tip and T, the problem, and the shape."""
-    model = AnitescuLcs(make_tip_and_object(T, TIP)[0], contact_pairs(T, 0.5), 0.1)
+def planner_of(spec):
+    """The model of tip and object, the problem, and the shape."""
+    model = AnitescuLcs(
+        make_tip_and_object(spec, TIP)[0], contact_pairs(spec, 0.5), 0.1
+    )
     c3 = c3_config(PushPlannerConfig(), model.n_lam)
     problem = C3Problem(c3.weights, c3.projection, c3.options)
-    points = [part.points for part in parts(T)]
-    return model, problem, ObjectShape(points, TIP.tip_radius, 2.0 * rest_height(T))
+    points = [part.points for part in parts(spec)]
+    return model, problem, ObjectShape(points, TIP.tip_radius, 2.0 * rest_height(spec))
+
+
+@pytest.fixture(scope="module")
+def planner():
+    return planner_of(T)
 
 
 # Geometry.
@@ -369,6 +375,30 @@ def test_another_goal_is_no_lack_of_progress(planner):
     assert not np.isfinite(found.cost[0])  # Of the same goal it is one.
 
 
+@pytest.mark.parametrize("shape", ["disc", "cylinder"])
+def test_a_place_keeps_the_plan_that_it_was_chosen_for(shape):
+    """Round by round the search finds a good plan from a place, or a bad one: where the
+    good one is not kept, the tip turns round each time that it is not found again."""
+    spec = PushedObject(shape)
+    model, problem, own = planner_of(spec)
+    goal, rng = [0.563, -0.02, -2.819], np.random.default_rng(0)
+    for pose in ((0.556, -0.005, -1.812), (0.52, -0.05, -2.5), (0.58, 0.02, -2.0)):
+        memory, costs = SamplingMemory(), []
+        for k in range(20):
+            noise = rng.normal(size=5) * [5e-4, 5e-4, 5e-3, 0.02, 0.02]
+            x = state([0.5, 0.05, 0.08], np.array(pose) + noise[:3], spec)
+            x[V_BALL.start : V_BALL.start + 2] = noise[3:]
+            x_desired = target(x, goal, problem.options.N + 1)
+            memory, found = sample_round(
+                SamplingConfig(), memory, model.build_many, problem, own, x, x_desired,
+                sum(errors(x, np.array(goal))), False, 0.1 * k,
+            )  # fmt: skip
+            costs.append(found.cost[found.chosen])
+        assert memory.go <= 3
+        # It is kept as noise turns it, and made better.
+        assert (np.array(costs[1:]) < 1.3 * np.array(costs[:-1])).all()
+
+
 def test_places_that_moved_out_of_reach_with_the_object_are_dropped(planner):
     model, problem, shape = planner
     x = state([0.6, 0.0, HEIGHT], (0.72, 0.0, 0.3))
@@ -394,6 +424,14 @@ def test_places_out_of_reach_are_not_looked_at(planner):
     )  # fmt: skip
     assert len(found.places) > 4
     assert (np.hypot(*found.places.T) <= 0.78).all()
+    # Nor those beside and behind the arm's base, however near they are.
+    x = state([0.4, 0.3, HEIGHT], (0.25, 0.4, 0.3))
+    _, found = sample_round(
+        SamplingConfig(), SamplingMemory(), model.build_many, problem, shape, x,
+        x_desired, 0.1, False, 0.0,
+    )  # fmt: skip
+    side = np.arctan2(found.places[1:, 1], found.places[1:, 0])
+    assert 2 < len(side) < 14 and (side <= 1.05).all()
 
 
 def test_the_way_through_the_air_has_its_price_but_not_for_a_tip_that_pushes(planner):
@@ -504,8 +542,15 @@ def test_what_the_arm_hides_on_its_way_is_gone_to_and_pushed_a_little(planner):
 def test_an_object_out_of_reach_is_not_followed(planner):
     shape, config = planner[2], PushConfig()
     for phase in (TRAVEL, CONTACT):
-        for y, expected in ((0.5, phase), (0.6, WAIT)):
-            x = state([0.35, 0.0, 0.1], (0.5, y, 0.3))
+        for at, expected in (
+            ((0.5, 0.5), phase),
+            ((0.5, 0.6), WAIT),  # Too far,
+            ((0.24, 0.0), WAIT),  # too near,
+            ((0.26, 0.0), phase),
+            ((0.1, 0.4), WAIT),  # beside the arm's base,
+            ((-0.5, 0.2), WAIT),  # behind it: there the tip would go through the base.
+        ):
+            x = state([0.35, 0.0, 0.1], (*at, 0.3))
             task = PushState(phase, x[P_TIP].copy(), np.zeros(3), np.zeros(3), go=1)
             task = next_push(
                 config, task, shape, 0.0125, x, True, np.array([0.1, 0.0]), 1, HEIGHT,

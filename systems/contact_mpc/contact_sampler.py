@@ -164,7 +164,7 @@ def _check(config: ContactSamplerConfig) -> None:
         raise ValueError(
             f"sampling.places is {c.places}, expected an integer from 1 to {PLACES_MAX}"
         )
-    for name in ("clearance", "height", "stuck_sec"):
+    for name in ("clearance", "height", "stuck_sec", "bearing"):
         if not 0.0 < getattr(c, name) < np.inf:
             raise ValueError(f"sampling.{name} is {getattr(c, name)}, expected > 0")
     for name in ("travel", "push"):

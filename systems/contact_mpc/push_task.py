@@ -47,7 +47,7 @@ class PushTask(LeafSystem):
         super().__init__()
         for name in ("speed", "acceleration", "descent", "margin", "look_ahead",
                      "look_ahead_angle", "unseen_sec", "believed_sec",
-                     "farthest"):  # fmt: skip
+                     "nearest", "farthest", "bearing"):  # fmt: skip
             if not getattr(config.push, name) > 0.0:
                 raise ValueError(
                     f"task.push.{name} is {getattr(config.push, name)}, expected > 0"

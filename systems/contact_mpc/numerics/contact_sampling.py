@@ -49,6 +49,9 @@ class SamplingConfig:
     # From the world's origin, where the arm stands [m]: nearer, the elbow of a Panda
     # with the finger upright is at its limit.
     reach: list[float] = field(default_factory=lambda: [0.38, 0.78])
+    # To either side of the x axis, which the arm looks along [rad]: beyond, the way to
+    # a place may lead through the arm's own base.
+    bearing: float = 1.05
     travel: float = 15.0  # Cost of a metre through the air [1/m].
     # Another place has to cost so much less than the present one: a share of the
     # latter's cost, and an absolute amount.
@@ -63,6 +66,8 @@ class SamplingMemory:
 
     count: int = 0  # Rounds.
     place: np.ndarray | None = None  # Where to go, or where it went last.
+    # The inputs (N, 3) that the place was chosen for, turned with the object [N].
+    inputs: np.ndarray | None = None
     best: np.ndarray | None = None  # The best other place of the last round.
     go: int = 0  # How often a place was chosen: a new number is a new command.
     goal: tuple[float, ...] | None = None  # That the error is from.
@@ -404,10 +409,12 @@ def score_within(budget_sec, lcs, x, x_desired, problem, guess=None, at_once=4):
     return cost, *(np.sum([part[i] for part in parts], axis=0) for i in (1, 2))
 
 
-def in_reach(places, reach):
-    """(n,) whether places (n, 2) are from reach[0] to reach[1] from the origin [m]."""
-    far = np.hypot(*np.transpose(places))
-    return (far >= reach[0]) & (far <= reach[1])
+def in_reach(places, reach, bearing):
+    """(n,) whether places (n, 2) are from reach[0] to reach[1] from the origin [m], and
+    at most bearing from the x axis [rad]."""
+    x, y = np.transpose(places)
+    far = np.hypot(x, y)
+    return (far >= reach[0]) & (far <= reach[1]) & (abs(np.arctan2(y, x)) <= bearing)
 
 
 def choose(cost, hysteresis):
@@ -436,20 +443,26 @@ def rotation_of(q):
     ])  # fmt: skip
 
 
+def heading_of(q):
+    """(2, 2) how an object of quaternion q (4,) is turned, seen from above."""
+    R = rotation_of(q)
+    heading = np.array([R[:2, 0], [-R[1, 0], R[0, 0]]]).T
+    return heading / np.linalg.norm(heading[:, 0])
+
+
 def to_world(x, place):
     """A place (2,) of the object's frame, seen from above, in the world."""
-    R = rotation_of(x[Q_BALL])
-    heading = np.array([R[:2, 0], [-R[1, 0], R[0, 0]]]).T
-    heading = heading / np.linalg.norm(heading[:, 0])
-    return heading @ place + x[P_BALL][:2]
+    return heading_of(x[Q_BALL]) @ place + x[P_BALL][:2]
 
 
 def to_object(x, place):
     """The inverse of to_world."""
-    R = rotation_of(x[Q_BALL])
-    heading = np.array([R[:2, 0], [-R[1, 0], R[0, 0]]]).T
-    heading = heading / np.linalg.norm(heading[:, 0])
-    return heading.T @ (place - x[P_BALL][:2])
+    return heading_of(x[Q_BALL]).T @ (place - x[P_BALL][:2])
+
+
+def turned_inputs(inputs, heading):
+    """Inputs (N, 3) with x and y turned by heading (2, 2)."""
+    return np.column_stack([inputs[:, :2] @ heading.T, inputs[:, 2:]])
 
 
 def inward(places, outline):
@@ -511,11 +524,11 @@ def sample_round(
     distance = shape.tip_radius + c.clearance + nearer
     phase = (m.count * GOLDEN) % 1.0
     around = places_around(outline, distance, c.places, phase)
-    around = around[in_reach(around, c.reach)]
+    around = around[in_reach(around, c.reach, c.bearing)]
     going = m.place is not None and not in_contact
     present = to_world(x, m.place) if going else x[P_TIP][:2]
     last = [] if m.best is None else [to_world(x, m.best)]
-    last = [place for place in last if in_reach(place[None], c.reach)[0]]
+    last = [place for place in last if in_reach(place[None], c.reach, c.bearing)[0]]
     places = np.array([present, *last, *around])
     n, N = len(places), problem.options.N
     starts = np.tile(x, (n, 1))
@@ -527,7 +540,13 @@ def sample_round(
         lcs = (*lcs[:7], lcs[7] + r, *lcs[8:])
     guess = np.zeros((n, N, problem.n_u))
     guess[:, :, :2] = c.push * inward(places, outline)[:, None]
-    cost, _, plans = score_within(budget_sec, lcs, starts, x_desired, problem, guess)
+    heading = heading_of(x[Q_BALL])
+    if going and m.inputs is not None:
+        # What it was chosen for counts again: whether the search finds as good a plan
+        # in every round is chance, and the tip would turn round each time that it does
+        # not.
+        guess[0] = turned_inputs(m.inputs, heading)
+    cost, u, plans = score_within(budget_sec, lcs, starts, x_desired, problem, guess)
     way = [
         travel_length(
             x[P_TIP], np.array([*place, c.height]), outline, distance,
@@ -537,7 +556,7 @@ def sample_round(
     ]  # fmt: skip
     if in_contact:
         way[0] = 0.0
-    elif not going or not in_reach(present[None], c.reach)[0]:
+    elif not going or not in_reach(present[None], c.reach, c.bearing)[0]:
         cost[0] = NO_PLAN
     cost = cost + c.travel * np.array(way)
     progressed = not in_contact or error < m.error - PROGRESS
@@ -551,6 +570,8 @@ def sample_round(
     m = replace(m, count=m.count + 1)
     if n > 1 and np.isfinite(cost[1:]).any():
         m = replace(m, best=to_object(x, places[1 + int(np.argmin(cost[1:]))]))
+    if np.isfinite(cost[chosen]) and (chosen != 0 or going):
+        m = replace(m, inputs=turned_inputs(u[chosen], heading.T))
     if np.isfinite(cost[chosen]) and (chosen != 0):
         m = replace(m, place=to_object(x, places[chosen]), go=m.go + 1)
     return m, found

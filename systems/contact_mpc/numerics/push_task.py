@@ -20,6 +20,7 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
 )
 from makebreak.systems.contact_mpc.numerics.contact_sampling import (
     ObjectShape,
+    in_reach,
     inward,
     outline_of,
     rotation_of,
@@ -51,8 +52,11 @@ class PushConfig:
     unseen_sec: float = 0.3  # An object not seen for longer is waited for,
     # or for longer while nothing touches it: then the arm hides it on its way.
     believed_sec: float = 3.0
-    # One farther from the world's origin, where the arm stands, is not followed.
+    # One nearer to the world's origin, where the arm stands, or farther from it, or
+    # more to either side of the x axis, is not followed.
+    nearest: float = 0.25  # [m]
     farthest: float = 0.75  # [m]
+    bearing: float = 1.05  # [rad]
     withdrawn: list[float] = field(default_factory=lambda: [0.3, 0.0])  # [m]
 
 
@@ -129,7 +133,8 @@ def next_push(
     state = replace(state, unseen_sec=unseen)
     travels = state.phase == TRAVEL
     lost = unseen > (config.believed_sec if travels else config.unseen_sec)
-    lost = lost or float(np.hypot(*x[P_BALL][:2])) > config.farthest
+    followed = [config.nearest, config.farthest], config.bearing
+    lost = lost or not in_reach(x[P_BALL][None, :2], *followed)[0]
     # C3 knows no object that is not seen; nor does anybody know a place before that.
     if lost or place is None:
         if state.phase == CONTACT:
