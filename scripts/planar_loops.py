@@ -58,7 +58,7 @@ _EVERY = 5  # Ticks from one sample of the error to the next.
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class PlanarTrial:
     """A world, a circle and what the sensors make of them, as compiled loops take it.
 
     n is the number of ticks.
@@ -86,13 +86,13 @@ def trial_of(
     target: CircleTargetConfig,
     sensing: PlanarSensing,
     seed: int,
-) -> Trial:
+) -> PlanarTrial:
     """What make_planar makes of the same arguments."""
     n = round(target.duration_sec / PERIOD)
     state_noise = _noise(np.array(sensing.state_std()), state_noise_seed(seed), n)
     force_noise = _noise(np.full(2, sensing.force_noise), seed, n)
     viscosity = np.array(world.viscosity, dtype=float)
-    return Trial(
+    return PlanarTrial(
         (viscosity, float(world.ramp_sec), *springs_of(world)),
         (target.radius, target.duration_sec, target.phase, float(target.turn)),
         state_noise,
@@ -232,7 +232,9 @@ def _active_inference_trial(
     return np.sqrt(total / (n // _EVERY))
 
 
-def mrac_error(config: MracConfig, trial: Trial, feedforward: bool = False) -> float:
+def mrac_error(
+    config: MracConfig, trial: PlanarTrial, feedforward: bool = False
+) -> float:
     """RMS tracking error of a trial [m]."""
     p2, p3 = error_weights(config.omega, config.zeta, config.rate_weight)
     gains = np.array(
@@ -244,7 +246,7 @@ def mrac_error(config: MracConfig, trial: Trial, feedforward: bool = False) -> f
 
 
 def active_inference_error(
-    config: ActiveInferenceConfig, trial: Trial, feedforward: bool = False
+    config: ActiveInferenceConfig, trial: PlanarTrial, feedforward: bool = False
 ) -> float:
     """RMS tracking error of a trial [m]."""
     precision = 1.0 / np.array(config.variance)
@@ -254,7 +256,7 @@ def active_inference_error(
 
 
 def learning_curve(
-    config: BiomimeticConfig, trials: Sequence[Trial], feedforward: bool = False
+    config: BiomimeticConfig, trials: Sequence[PlanarTrial], feedforward: bool = False
 ) -> list[float]:
     """RMS tracking error of each of the trials, one after the other [m].
 
@@ -284,7 +286,7 @@ def learning_curve(
 def adaptive_error(
     law: PlanarImpedanceConfig,
     config: ForceModelConfig,
-    trial: Trial,
+    trial: PlanarTrial,
     knowledge: Mixture | None = None,
 ) -> tuple[float, Mixture]:
     """RMS tracking error of a trial [m], and what the model knows after it."""

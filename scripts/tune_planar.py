@@ -37,7 +37,7 @@ from makebreak.diagrams import multi_spring, porridge
 from makebreak.diagrams.planar import MASS
 from makebreak.diagrams.planar_tuned import SETTINGS, TUNED_FILE, Setting
 from makebreak.scripts.planar_loops import (
-    Trial,
+    PlanarTrial,
     active_inference_error,
     adaptive_error,
     learning_curve,
@@ -177,7 +177,7 @@ def config_of(name: str, p: dict[str, float], setting: Setting):
 
 
 @cache
-def task_of(setting: Setting, seed: int, training: bool = False) -> Trial:
+def task_of(setting: Setting, seed: int, training: bool = False) -> PlanarTrial:
     """The seed's springs, or its porridge (in training or in the test)."""
     if setting.world == "porridge":
         # Its MRAC is what is being tuned, and may not be there yet.
@@ -191,7 +191,7 @@ def task_of(setting: Setting, seed: int, training: bool = False) -> Trial:
 
 
 @cache
-def path_again(setting: Setting, seed: int, trials: int) -> tuple[Trial, ...]:
+def path_again(setting: Setting, seed: int, trials: int) -> tuple[PlanarTrial, ...]:
     """So many trials in the seed's world, each with noise of its own; where springs
     engage, every second one is faster."""
     world, target = multi_spring.draw_springs(

@@ -16,7 +16,7 @@ from makebreak.diagrams.realism import StationErrors
 from makebreak.diagrams.tabletop import tool_half_width
 from makebreak.models.scene import load_scene
 from makebreak.scripts.experiments.contact_learning import (
-    Trial,
+    LearningTrial,
     checks,
     run,
     scored,
@@ -188,7 +188,7 @@ def test_missed_and_false_contacts_are_counted(task):
 
 def with_numbers(error, force, completion):
     three = np.full(3, np.nan)
-    return Trial(
+    return LearningTrial(
         {}, ContactBelief(), True, completion, 1.0, three, np.array(force), three,
         three, three, three, three, np.full(3, error), three, 0, 0,
     )  # fmt: skip

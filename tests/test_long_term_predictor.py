@@ -11,7 +11,7 @@ from makebreak.systems.baselines.numerics.long_term_predictor import (
     JITTER,
     LongTermPredictor,
     TrainingBudget,
-    Trial,
+    TrainingTrial,
     _OneMode,
     find_modes,
     fit_gp,
@@ -179,7 +179,7 @@ def wall_trial(rng, T=60):
     force = np.where(x > -5e-4, 100.0 * np.maximum(goal, 0.0), 0.0)
     state = np.stack([x, v + 1e-3 * rng.normal(size=T)], axis=1)
     features = np.column_stack([state, force + 0.1 * rng.normal(size=T)])
-    return Trial(state, goal[:, None], features)
+    return TrainingTrial(state, goal[:, None], features)
 
 
 BUDGET = TrainingBudget(points_per_mode=60, svm_points=400, modes_max=4, segment_min=5)

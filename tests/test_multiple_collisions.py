@@ -21,7 +21,7 @@ from makebreak.diagrams.realism import StationErrors
 from makebreak.diagrams.tabletop import tool_half_width
 from makebreak.scripts.experiments import multiple_collisions
 from makebreak.scripts.experiments.multiple_collisions import (
-    Trial,
+    CollisionTrial,
     scored,
     summary,
 )
@@ -200,7 +200,7 @@ def test_success_asks_for_each_part_of_the_criterion(task):
 
 
 def test_result_has_one_number_per_contact(task):
-    good: Trial = scored(made_up_log(task), task)
+    good: CollisionTrial = scored(made_up_log(task), task)
     trials = {"baseline": good, "trial_1": good, "trial_2": good}
     result = summary(trials, task, MultipleCollisionsConfig())
     for key in ("impact_force_peak_N", "impact_force_peak_known_N", "estimate_error_m"):

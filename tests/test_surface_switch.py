@@ -15,7 +15,7 @@ from makebreak.diagrams.surface_switch import (
     make_task,
     taken_over,
 )
-from makebreak.scripts.experiments.surface_switch import N, Trial, scored, summary
+from makebreak.scripts.experiments.surface_switch import N, SwitchTrial, scored, summary
 from makebreak.systems.changing_contact.numerics.contact_task import (
     IMPACTLESS,
     REGION,
@@ -126,7 +126,7 @@ def trials(spikes, errors, regions):
         both = {"spike": spike, "error": error, "region": region, "handling": region}
         both |= {"a10": 0.1, "place_error": 0.001, "stiff": 300.0}
         values = {name: np.full(N, value) for name, value in both.items()}
-        out.append(Trial(log={}, done=True, rows=[], **values))
+        out.append(SwitchTrial(log={}, done=True, rows=[], **values))
     return out
 
 

@@ -77,7 +77,7 @@ N = len(DIRECTIONS)
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class LearningTrial:
     """One trial's log, and what was made of it; nan where a contact did not come."""
 
     log: dict[str, np.ndarray]
@@ -110,7 +110,7 @@ def run(config: ContactLearningConfig, session: Session) -> dict:
     if config.rehearse:
         known = Knowledge(contacts=task.model_prior)
         knowledge = rehearsed(config, task, simulate, known)
-    trials: list[Trial] = []
+    trials: list[LearningTrial] = []
     recordings = []
     for k in range(config.trials):
         log = simulate(knowledge, k, f"trial_{k + 1}")
@@ -125,7 +125,7 @@ def run(config: ContactLearningConfig, session: Session) -> dict:
     return summary(trials, task)
 
 
-def scored(log: dict[str, np.ndarray], task: ContactTask, belief) -> Trial:
+def scored(log: dict[str, np.ndarray], task: ContactTask, belief) -> LearningTrial:
     """A trial, from its log and the truth."""
     time, p = log["time"], log["tip_true"]
     stage, segment = log["phase"][:, PHASE_STAGE], log["phase"][:, PHASE_SEGMENT]
@@ -176,7 +176,7 @@ def scored(log: dict[str, np.ndarray], task: ContactTask, belief) -> Trial:
     handling = np.isin(stage, (ENTER, REGION, SETTLE)) & (
         log["phase"][:, PHASE_KIND] == IMPACT
     )
-    return Trial(
+    return LearningTrial(
         log=log,
         belief=belief,
         done=bool(ended.size),
@@ -190,7 +190,7 @@ def scored(log: dict[str, np.ndarray], task: ContactTask, belief) -> Trial:
     )
 
 
-def summary(trials: list[Trial], task: ContactTask) -> dict:
+def summary(trials: list[LearningTrial], task: ContactTask) -> dict:
     """result.json."""
 
     def numbers(values):
@@ -228,7 +228,7 @@ def summary(trials: list[Trial], task: ContactTask) -> dict:
     return result | checks(trials)
 
 
-def checks(trials: list[Trial]) -> dict:
+def checks(trials: list[LearningTrial]) -> dict:
     """The parts of the criterion for which there are trials enough."""
     forces = np.array([t.force for t in trials[FORCE_FROM - 1 :]]).reshape(-1, N)
     criteria = Criteria()
@@ -255,7 +255,7 @@ def checks(trials: list[Trial]) -> dict:
     return criteria.result()
 
 
-def plot_trials(trials: list[Trial], task: ContactTask):
+def plot_trials(trials: list[LearningTrial], task: ContactTask):
     """Figure 18: velocity, acceleration, force, activation in the first and the last
     trial."""
     shown = [0, len(trials) - 1] if len(trials) > 1 else [0]
@@ -312,7 +312,7 @@ def plot_trials(trials: list[Trial], task: ContactTask):
     return figure
 
 
-def plot_learning(trials: list[Trial], task: ContactTask):
+def plot_learning(trials: list[LearningTrial], task: ContactTask):
     """What is learned from trial to trial."""
     k = np.arange(1, len(trials) + 1)
     figure, axes = plt.subplots(1, 4, figsize=(15, 3.8), layout="constrained")

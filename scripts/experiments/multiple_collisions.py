@@ -71,7 +71,7 @@ N = len(IMPACTS)
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class CollisionTrial:
     """One trial's log and its scores; nan where a contact did not come."""
 
     log: dict[str, np.ndarray]
@@ -97,7 +97,7 @@ class Trial:
 def run(config: MultipleCollisionsConfig, session: Session) -> dict:
     """Without handling, then the trials with it; see the module for the criterion."""
     task = make_task(config)
-    trials: dict[str, Trial] = {}
+    trials: dict[str, CollisionTrial] = {}
     recordings = []
     peaks: list[list[float]] = []
 
@@ -133,7 +133,7 @@ def run(config: MultipleCollisionsConfig, session: Session) -> dict:
     return summary(trials, task, config)
 
 
-def scored(log: dict[str, np.ndarray], task: CollisionTask) -> Trial:
+def scored(log: dict[str, np.ndarray], task: CollisionTask) -> CollisionTrial:
     """A trial, from its log and the truth."""
     time, p = log["time"], log["tip_true"]
     segment, stage = log["phase"][:, PHASE_SEGMENT], log["phase"][:, PHASE_STAGE]
@@ -176,7 +176,7 @@ def scored(log: dict[str, np.ndarray], task: CollisionTask) -> Trial:
     a = np.gradient(log["ee_velocity"][:, :3], time[1] - time[0], axis=0)
     a10 = np.linalg.norm(low_pass(a, 10.0, time[1] - time[0]), axis=1)
     ended = np.flatnonzero(stage == DONE)
-    return Trial(
+    return CollisionTrial(
         log=log,
         done=bool(ended.size),
         lost=bool(np.any(segment[broken] == LOSS_SEGMENT)),
@@ -194,7 +194,7 @@ def is_told(config: MultipleCollisionsConfig) -> bool:
     return all(k == most for k in config.stiffness)
 
 
-def extra_time_least(first: Trial, task: CollisionTask, config) -> float:
+def extra_time_least(first: CollisionTrial, task: CollisionTask, config) -> float:
     """What the trial's approach speeds cost if each region began just where the range
     of errors does, and the arm could brake in no time [s]."""
     way = np.array([
@@ -207,7 +207,9 @@ def extra_time_least(first: Trial, task: CollisionTask, config) -> float:
 
 
 def summary(
-    trials: dict[str, Trial], task: CollisionTask, config: MultipleCollisionsConfig
+    trials: dict[str, CollisionTrial],
+    task: CollisionTask,
+    config: MultipleCollisionsConfig,
 ) -> dict:
     """result.json."""
 
@@ -277,7 +279,7 @@ def summary(
     return result | criteria.result()
 
 
-def plot_trials(trials: dict[str, Trial]):
+def plot_trials(trials: dict[str, CollisionTrial]):
     """Figure 16: speed, acceleration and force over time, without and with handling."""
     figure, axes = plt.subplots(
         3, len(trials), figsize=(5.0 * len(trials), 8), layout="constrained",
@@ -313,7 +315,7 @@ def plot_trials(trials: dict[str, Trial]):
     return figure
 
 
-def plot_path(trials: dict[str, Trial], task: CollisionTask):
+def plot_path(trials: dict[str, CollisionTrial], task: CollisionTask):
     """Figure 15: the way of the tip, from the side and from above, and the estimates
     with two standard deviations."""
     figure, axes = plt.subplots(1, 2, figsize=(12, 5), layout="constrained")

@@ -69,7 +69,7 @@ N = len(CROSSINGS)
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class SwitchTrial:
     """One trial's log and its scores, (2,) for the two seams; nan: not reached."""
 
     log: dict[str, np.ndarray]
@@ -94,7 +94,7 @@ def run(config: SurfaceSwitchConfig, session: Session) -> dict:
         return simulate_motion(session, diagram, DURATION_SEC, label)
 
     knowledge = rehearsed(config, task, simulate, knowledge)
-    trials: list[Trial] = []
+    trials: list[SwitchTrial] = []
     recordings = []
     for k in range(config.trials):
         log = simulate(knowledge, k, f"trial_{k + 1}")
@@ -115,7 +115,7 @@ def sign_of(segment: int) -> float:
     return 1.0 if segment == CROSSINGS[0] else -1.0
 
 
-def scored(log: dict[str, np.ndarray], feet: float) -> Trial:
+def scored(log: dict[str, np.ndarray], feet: float) -> SwitchTrial:
     """A trial, from its log and the truth."""
     time, stage = log["time"], log["phase"][:, PHASE_STAGE]
     segment, kind = log["phase"][:, PHASE_SEGMENT], log["phase"][:, PHASE_KIND]
@@ -153,10 +153,12 @@ def scored(log: dict[str, np.ndarray], feet: float) -> Trial:
         if len(mine) == 1:
             at = time.searchsorted(transition[mine[0], CHANGE_TIME])
             values["place_error"][i] = sign * y[min(at, len(y) - 1)] + feet
-    return Trial(log=log, done=bool((stage == DONE).any()), rows=windows, **values)
+    return SwitchTrial(
+        log=log, done=bool((stage == DONE).any()), rows=windows, **values
+    )
 
 
-def summary(trials: list[Trial], task: SwitchTask) -> dict:
+def summary(trials: list[SwitchTrial], task: SwitchTask) -> dict:
     """result.json: one list per trial, for each seam."""
     result: dict = {"success": False, "friction": task.friction.tolist()}
     for key, name in (
@@ -193,7 +195,7 @@ def summary(trials: list[Trial], task: SwitchTask) -> dict:
     return result | criteria.result()
 
 
-def plot_trials(trials: list[Trial], task: SwitchTask):
+def plot_trials(trials: list[SwitchTrial], task: SwitchTask):
     """Figures 19 and 20: velocity, acceleration and force at both seams."""
     figure, axes = plt.subplots(
         4, N * len(trials), figsize=(4.2 * N * len(trials), 9.5), sharey="row",

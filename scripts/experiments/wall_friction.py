@@ -49,7 +49,7 @@ from makebreak.scripts.session import Session
 from makebreak.scripts.table import Table
 from makebreak.systems.baselines.numerics.long_term_predictor import (
     Prediction,
-    Trial,
+    TrainingTrial,
     known,
     predict_long_term,
     train,
@@ -178,7 +178,7 @@ def force_from_the_start(config, trials, data, seconds, result):
     every = config.training.every
 
     def thinned(data, config):
-        return Trial(*(values[::every] for values in force_trial(data, config)))
+        return TrainingTrial(*(values[::every] for values in force_trial(data, config)))
 
     planned = [thinned(data, one) for one, data in trials]
     start = perf_counter()
@@ -271,21 +271,23 @@ def features(data) -> np.ndarray:
     return np.hstack([*tip_states(data), data["wrench"][:, :3]])
 
 
-def joint_trial(data, config: WallFrictionConfig, every: int) -> Trial:
+def joint_trial(data, config: WallFrictionConfig, every: int) -> TrainingTrial:
     """x = [q, v], u of the controller."""
     x = np.hstack([data["q"], data["v"]])[::every]
     u = policy(config, every)
     u_all = np.concatenate([u(t, x[t : t + 1]) for t in range(len(x))])
-    return Trial(x, u_all, features(data)[::every])
+    return TrainingTrial(x, u_all, features(data)[::every])
 
 
-def force_trial(data, config: WallFrictionConfig | None = None) -> Trial:
+def force_trial(data, config: WallFrictionConfig | None = None) -> TrainingTrial:
     """x = the force, u = [velocity, position]: planned in config, or measured."""
     position, velocity = tip_states(data)
     if config is not None:
         plan = plan_of(config)["x_desired"][: len(position)]
         position, velocity = plan[:, :3], plan[:, 7:10]
-    return Trial(data["wrench"][:, :3], np.hstack([velocity, position]), features(data))
+    return TrainingTrial(
+        data["wrench"][:, :3], np.hstack([velocity, position]), features(data)
+    )
 
 
 def from_the_start(predictor, trials, modes, u, T, seed) -> Prediction:

@@ -60,7 +60,7 @@ class TrainingBudget:
     seed: int = 0
 
 
-class Trial(NamedTuple):
+class TrainingTrial(NamedTuple):
     """One training trial; row t is taken at time t dt."""
 
     x: np.ndarray  # (T, n_x) what is predicted.
@@ -319,7 +319,7 @@ def one_of_each_stratum(n: int, wanted: int, rng) -> np.ndarray:
 
 
 def train(
-    trials: Sequence[Trial],
+    trials: Sequence[TrainingTrial],
     budget: TrainingBudget,
     gp_inputs: Sequence[int] | None = None,
 ) -> tuple[LongTermPredictor, list[np.ndarray]]:
