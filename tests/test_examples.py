@@ -33,6 +33,10 @@ def test_the_puck_reaches_its_goal():
     assert numbers("push_a_puck.py") == [pytest.approx(0.5, abs=0.01)]
 
 
+def test_the_spinner_is_turned_by_three_radians_and_stays_there():
+    assert numbers("flick_a_spinner.py") == [pytest.approx(3.0, abs=0.05)]
+
+
 def test_an_own_planner_takes_the_place_of_c3():
     assert numbers("own_planner.py") == [pytest.approx(0.5, abs=0.01)]
 
