@@ -336,7 +336,7 @@ def make_changing_contact(
         connect(modes, "mode", seen)
         connect(shaper, "phase", seen)
         connect(shaper, "x_desired", seen)
-        legend = LegendConfig(seen.LEGEND, (), seen.camera, seen.LOOK_AT)
+        legend = LegendConfig(seen.legend, (), seen.camera, seen.LOOK_AT)
         add_legend(builder, meshcat, legend)
     diagram = builder.Build()
     diagram.set_name("changing_contact")

@@ -25,6 +25,7 @@ _REGIONS = 6  # Of each kind that can be seen at once.
 _KIND_COLORS = {IMPACT: Rgba(0.9, 0.2, 0.2, 0.3), IMPACTLESS: Rgba(0.2, 0.4, 0.95, 0.3)}
 # Unknown, free, then the modes in their order, again from the third on.
 _TARGET, _TRACK, _FORCE = Rgba(0.1, 0.1, 0.2), Rgba(1.0, 0.5, 0.0), Rgba(0.1, 0.1, 0.1)
+_GOOD, _BAD = Rgba(0.3, 0.7, 0.3), Rgba(0.85, 0.25, 0.2)  # Bars.
 _MODE_COLORS = (
     Rgba(1.0, 1.0, 1.0),
     Rgba(0.6, 0.6, 0.6),
@@ -61,14 +62,13 @@ class ContactView(LeafSystem):
 
     LOOK_AT = (0.48, 0.0, 0.05)  # [m]
     LEGEND = (
-        ("an impact is expected here", _KIND_COLORS[IMPACT]),
-        ("a change of contact is expected here", _KIND_COLORS[IMPACTLESS]),
-        ("contact force: arrow", _FORCE),
+        ("an impact is expected", _KIND_COLORS[IMPACT]),
+        ("a change of contact is expected", _KIND_COLORS[IMPACTLESS]),
+        ("contact force", _FORCE),
         ("target path", _TARGET),
         ("track of the tool", _TRACK),
-        ("ball beside the tool: mode; unknown", _MODE_COLORS[0]),
-        ("no contact", _MODE_COLORS[1]),
-        ("first mode of contact, then other colours", _MODE_COLORS[2]),
+        ("ball beside the tool: no contact", _MODE_COLORS[1]),
+        ("the same: first contact mode", _MODE_COLORS[2]),
     )
 
     def __init__(
@@ -89,7 +89,13 @@ class ContactView(LeafSystem):
         meshcat.Delete(_ROOT)
         meshcat.SetProperty("/Grid", "visible", False)
         meshcat.SetProperty("/Axes", "visible", False)
-        self.camera = config.camera
+        self.camera, self.legend = config.camera, list(self.LEGEND)
+        if config.peaks:
+            limit = f"{config.peak_limit:g} N"
+            self.legend += [
+                (f"bars: peak forces so far, up to {limit}", _GOOD),
+                (f"the same, above {limit}", _BAD),
+            ]
         meshcat.SetCameraPose(config.camera, self.LOOK_AT)
         self._target = Trail(meshcat, f"{_ROOT}/target", _TARGET, 2.0)
         self._track = Trail(meshcat, f"{_ROOT}/track", _TRACK)
@@ -123,7 +129,7 @@ class ContactView(LeafSystem):
                 height = max(0.004 * min(peak, 50.0), 0.001)  # 4 mm per newton.
                 path = f"{_ROOT}/peaks/{i}/{j}"
                 good = peak <= c.peak_limit
-                color = Rgba(0.3, 0.7, 0.3) if good else Rgba(0.85, 0.25, 0.2)
+                color = _GOOD if good else _BAD
                 self._meshcat.SetObject(path, Box(0.012, 0.012, height), color)
                 place = [x + 0.016 * j, y - 0.03 * i, height / 2]
                 self._meshcat.SetTransform(path, RigidTransform(place))

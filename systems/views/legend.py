@@ -14,7 +14,7 @@ from makebreak.systems.views.numerics.text_board import text_board
 ROOT = "/makebreak/legend"
 # Of the board's upper left corner as the camera sees it: to the right, up and away, and
 # a line's height. Meshcat sees 37 degrees up and down, and more to the sides.
-_CORNER, _LINE = np.array([-0.9, 0.62, 1.0]), 0.045
+_CORNER, _LINE = np.array([-0.9, 0.62, 1.0]), 0.04
 
 
 @dataclass
