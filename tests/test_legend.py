@@ -157,6 +157,15 @@ def test_a_legend_is_in_the_upper_left_of_what_the_camera_sees_and_faces_it():
     assert below @ up > 2 * 0.04  # Below both lines.
 
 
+def test_a_camera_that_looks_straight_down_sees_the_legend_too():
+    scene = Scene()
+    config = LegendConfig([("goal", Rgba(1, 0, 0))], (), [0.0, 0, 2], [0.0, 0, 0])
+    Legend(config, scene)
+    X = scene.poses[f"{ROOT}/lines"]
+    np.testing.assert_allclose(X.rotation().matrix()[:, 0], [0.0, 0.0, 1.0])
+    assert X.translation()[2] == 1.0  # A metre before the camera.
+
+
 def test_the_phase_alone_is_seen_and_its_changes_are_recorded():
     scene = Scene()
     _, phase, diagram = legend(scene)
@@ -176,9 +185,10 @@ def test_the_phase_alone_is_seen_and_its_changes_are_recorded():
         t, shown = scene.visible[f"{ROOT}/phase/{k}"][-1]
         assert shown and end - 1.0 <= t < end - 1.0 + 0.1
     assert len(scene.visible[f"{ROOT}/phase/0"]) == 3  # What stays is not said twice.
-    values.set_value([7.0])  # Without a text.
-    simulator.AdvanceTo(2.2)
-    assert seen() == [False, False]
+    for k, end in ((7.0, 2.2), (1.0, 2.4), (np.nan, 2.6)):  # Without a text.
+        values.set_value([k])
+        simulator.AdvanceTo(end)
+        assert seen() == [False, k == 1.0]
 
 
 def test_a_real_meshcat_takes_a_legend_and_its_page_has_the_picture():

@@ -64,6 +64,8 @@ class Legend(LeafSystem):
         away = np.array(self._config.look_at) - camera
         away /= np.linalg.norm(away)
         right = np.cross(away, [0.0, 0.0, 1.0])
+        if np.linalg.norm(right) < 1e-6:  # Straight down: any up will do.
+            right = np.cross(away, [1.0, 0.0, 0.0])
         right /= np.linalg.norm(right)
         up = np.cross(right, away)
         turn = RotationMatrix(np.column_stack([-away, right, up]))
@@ -74,7 +76,8 @@ class Legend(LeafSystem):
     def _publish(self, context):
         if not self._phase.HasValue(context):
             return
-        phase = int(self._phase.Eval(context)[0])
+        value = self._phase.Eval(context)[0]
+        phase = int(value) if np.isfinite(value) else -1
         if phase == self._shown:
             return
         self._shown = phase
