@@ -135,6 +135,9 @@ class PushPlannerConfig:
     last: float = 5.0  # The last knot's weight over the others'.
     tip_height: float = 1e4  # [1/m2]
     tip_speed: float = 10.0  # [s2/m2]
+    # An object that rolls goes on after the plan's end: its speed there counts as the
+    # way that it goes in so long a time [s].
+    coast_sec: float = 0.5
 
 
 @dataclass
@@ -199,7 +202,7 @@ class PushObjectConfig:
     learning: PushLearnerConfig = field(default_factory=PushLearnerConfig)
     reference: ArmReferenceConfig = field(
         default_factory=lambda: ArmReferenceConfig(
-            force_max=8.0, acceleration_max=3.0, tip_mass=TIP_MASS
+            force_max=8.0, acceleration_max=3.0, tip_mass=TIP_MASS, touch_speed=0.15
         )
     )
     impedance: ImpedanceConfig = field(
@@ -344,9 +347,14 @@ def contact_pairs(spec: PushedObject, friction: float) -> list[ContactPair]:
     ]
 
 
-def c3_config(planner: PushPlannerConfig, n_lam: int) -> C3Config:
-    """Raises: ValueError for a weight out of range."""
+def c3_config(planner: PushPlannerConfig, n_lam: int, rolls: bool = False) -> C3Config:
+    """Args: rolls: whether the object rolls on where nothing holds it.
+
+    Raises: ValueError for a weight out of range.
+    """
     p = planner
+    if not 0.0 <= p.coast_sec < np.inf:
+        raise ValueError(f"planner.coast_sec is {p.coast_sec}, expected >= 0")
     for name in ("position", "angle_radius", "last", "tip_height", "tip_speed"):
         if not getattr(p, name) > 0.0:
             raise ValueError(f"planner.{name} is {getattr(p, name)}, expected > 0")
@@ -355,6 +363,8 @@ def c3_config(planner: PushPlannerConfig, n_lam: int) -> C3Config:
     Q[P_BALL.start : P_BALL.start + 2], Q[V_BALL] = p.position, 20.0
     Q_N = Q.copy()
     Q_N[P_BALL.start : P_BALL.start + 2] *= p.last
+    if rolls:
+        Q_N[V_BALL] += p.last * p.position * p.coast_sec**2
     # As in ball_rolling: lam : eta = 10 : 1, and the table's contacts loose.
     contact = np.full(n_lam, 0.002)
     contact[:N_TIP] = 1.0
@@ -513,7 +523,8 @@ def make_push_object(
         lcs_of[name] = own.model
         lcs[name] = builder.AddNamedSystem(f"lcs_{name}", own)
     n_lam = lcs_of["plan"].n_lam
-    c3_settings = c3_config(config.planner, n_lam)
+    rolls = bool(rolling_axis(spec))
+    c3_settings = c3_config(config.planner, n_lam, rolls)
 
     sensor = _add_sensor(builder, config, spec, station)
     estimator = builder.AddNamedSystem(
@@ -666,6 +677,7 @@ def make_push_object(
     connect(lcs["command"], "lcs", c3, "lcs_command")
     connect(task, "phase", reference, "phase")
     connect(task, "reference", reference, "reference")
+    connect(estimator, "tip_force", reference, "tip_force")
     connect(c3, "x_next", reference, "x_next")
     connect(c3, "lam", reference, "lam")
     connect(c3, "status", reference, "status")

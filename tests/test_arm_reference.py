@@ -73,11 +73,12 @@ def run(
     tip_force=None,
     feel=1.0,
     height=None,
+    **config,
 ):
     builder = DiagramBuilder()
     lcs = one_force_lcs(2.0)
-    config = ArmReferenceConfig(tip_mass=2.0, height=height)
-    arm = builder.AddNamedSystem("arm", ArmReference(config, 1, np.zeros(3), lcs))
+    settings = ArmReferenceConfig(tip_mass=2.0, height=height, **config)
+    arm = builder.AddNamedSystem("arm", ArmReference(settings, 1, np.zeros(3), lcs))
     for name, value in dict(
         phase=[phase], reference=reference, x_next=x_next, lam=lam, status=[status]
     ).items():
@@ -201,7 +202,35 @@ def test_a_tip_that_has_lost_its_contact_goes_down_and_with_the_ball():
         np.testing.assert_allclose(found[felt], [3e-4, 0.012, 0.0], atol=2e-6)
 
 
+def test_a_tip_that_feels_nothing_yet_goes_slowly():
+    """What it is to touch may be nearer than planned: it hits it no faster."""
+    x_next = np.zeros(19)
+    x_next[0:2], x_next[10:12] = [0.004, 0.003], [0.32, 0.24]
+    found = {}
+    for felt in (0.0, 0.9, -1.1, 2.0):
+        x_desired, _ = run(
+            ROLL, x_next, [2.0], 0.0999, tip_force=felt, feel=0.0, touch_speed=0.1
+        )
+        found[felt] = x_desired[[0, 1, 7, 8]]
+    for felt in (0.0, 0.9):  # Where it is to go it is after 5 / 1.25 periods.
+        np.testing.assert_allclose(found[felt], [4e-3, 3e-3, 0.08, 0.06], atol=1e-6)
+    for felt in (-1.1, 2.0):  # 1.5 m/s2 for 8 periods.
+        np.testing.assert_allclose(found[felt], [4e-3, 3e-3, 0.12, 0.09], atol=2e-4)
+    early = {
+        felt: run(
+            ROLL, x_next, [2.0], 0.012499, tip_force=felt, feel=0.0, touch_speed=0.1
+        )[0][:2]
+        for felt in (0.0, 2.0)
+    }
+    np.testing.assert_allclose(early[0.0], [1e-3, 7.5e-4], atol=1e-6)  # 1.25 mm.
+    np.testing.assert_allclose(early[2.0], [4e-3, 3e-3], atol=1e-6)
+
+
 def test_what_cannot_be_followed_is_refused_by_name():
+    with pytest.raises(ValueError, match="touch_speed is 0.0, expected more"):
+        ArmReference(
+            ArmReferenceConfig(touch_speed=0.0), 1, np.zeros(3), one_force_lcs(1.0)
+        )
     with pytest.raises(ValueError, match="follow_force is 0.0, expected more"):
         ArmReference(
             ArmReferenceConfig(follow_force=0.0), 1, np.zeros(3), one_force_lcs(1.0)

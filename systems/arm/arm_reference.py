@@ -27,6 +27,10 @@ class ArmReferenceConfig:
     # goes down so much faster, and with the ball.
     follow_speed: float = 0.015  # [m/s]
     follow_force: float = 1.0  # [N]
+    # Rolling, until the tip feels touch_force it goes no faster than this: it may meet
+    # what it is to touch earlier than planned, and hits it the harder the faster it is.
+    touch_speed: float = np.inf  # [m/s]
+    touch_force: float = 1.0  # [N]
     # No command moves the reference faster than that, however far away it is. The task
     # itself stays below 0.35 m/s and 4 m/s2.
     speed_max: float = 0.5  # [m/s]
@@ -59,7 +63,7 @@ class ArmReference(LeafSystem):
     Inputs:  phase (1,), reference (9,) of RollingTask; x_next (19,), lam (n_lam,),
              status (1,) of C3; lcs (abstract), the one-step LCS that made them;
              optional feel (1,) of RollingTask, and then tip_force (3,) on the tip, as
-             the arm feels it [N].
+             the arm feels it [N], which a touch_speed needs, too.
     Outputs: x_desired (19,) = [p, quaternion, v, w, a, alpha], position and its
              derivatives only (the quaternion is the identity); wrench (6,) force first;
              command (25,), one after the other: for who asks for both each millisecond.
@@ -71,6 +75,11 @@ class ArmReference(LeafSystem):
             raise ValueError(
                 f"follow_force is {config.follow_force}, expected more than 0"
             )
+        for name in ("touch_speed", "touch_force"):
+            if not getattr(config, name) > 0.0:
+                raise ValueError(
+                    f"{name} is {getattr(config, name)}, expected more than 0"
+                )
         self._config, self._period = config, config.period_sec
         self._phase = self.DeclareVectorInputPort("phase", 1)
         self._reference = self.DeclareVectorInputPort("reference", 9)
@@ -129,6 +138,12 @@ class ArmReference(LeafSystem):
             v[2] = max(v[2], -c.down_max)
             if c.height is not None:
                 p[2], v[2], force[2] = c.height, 0.0, 0.0
+            if c.touch_speed < np.inf:
+                felt = np.linalg.norm(self._tip_force.Eval(context))
+                if not felt >= c.touch_force:
+                    v = clip_norm(v, c.touch_speed)
+                    far = c.touch_speed * c.period_sec
+                    p = start[:3] + clip_norm(p - start[:3], far)
             target = np.concatenate((p, v, self._zero, force))
             dv_max = c.acceleration_max * c.period_sec
         else:
