@@ -25,9 +25,6 @@ class Split:
     decided: list[Recording]
     reported: list[Recording]
 
-    def reported_sec(self) -> float:
-        return sum(r.duration_sec() for r in self.reported)
-
 
 def split(recordings: Sequence[Recording]) -> Split:
     """Cuts off the last fifth: of the episodes of a recording that has five or more,

@@ -15,11 +15,9 @@ from makebreak.systems.changing_contact.contact_anticipator import (
 )
 from makebreak.systems.changing_contact.numerics.contact_anticipator import (
     capped,
-    confidence_radius,
     contact_stiffness,
     force_per_speed,
     impact_speed,
-    interval_inside,
     is_expected,
     measurement_covariance,
     next_impact,
@@ -167,43 +165,6 @@ def test_contacts_are_told_apart_along_the_motion_alone():
 
 
 # The region.
-
-
-def test_the_interval_inside_agrees_with_sampling_the_path():
-    rng = np.random.default_rng(4)
-    s = np.linspace(-20.0, 20.0, 40001)
-    met = 0
-    for _ in range(60):
-        mean, C = rng.normal(size=3), random_covariance(rng, 0.6)
-        start, d = mean + rng.normal(size=3) * 2.0, rng.normal(size=3)
-        radius = rng.uniform(0.5, 3.0)
-        away = start + s[:, None] * d - mean
-        inside = np.einsum("ij,ji->i", away, np.linalg.solve(C, away.T)) <= radius**2
-        found = interval_inside(mean, C, radius, start, d)
-        if found is None:
-            assert not inside.any()
-            continue
-        if not inside.any():
-            assert found[1] - found[0] < 1.5e-3  # Between two samples, 1e-3 apart.
-            continue
-        met += 1
-        np.testing.assert_allclose(found, s[inside][[0, -1]], atol=1.01e-3)
-    assert met > 10
-
-
-def test_the_region_holds_what_its_confidence_says():
-    rng = np.random.default_rng(5)
-    C = random_covariance(rng)
-    draws = rng.multivariate_normal(np.zeros(3), C, size=20000)
-    for confidence in (0.5, 0.9, 0.99):
-        radius = confidence_radius(confidence)
-        square = np.einsum("ij,ji->i", draws, np.linalg.solve(C, draws.T))
-        # Four standard deviations of a share of 20000.
-        atol = 4.0 * np.sqrt(confidence * (1 - confidence) / 20000)
-        np.testing.assert_allclose((square < radius**2).mean(), confidence, atol=atol)
-    np.testing.assert_allclose(confidence_radius(0.6826894921370859, 1), 1.0)
-    with pytest.raises(ValueError, match="confidence is 1.0, expected between"):
-        confidence_radius(1.0)
 
 
 def test_the_semi_axes_are_on_the_surface():

@@ -8,6 +8,7 @@ from pydrake.geometry import Box, Meshcat, MeshcatCone, Rgba, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import LeafSystem
 
+from makebreak.systems.changing_contact.numerics.contact_anticipator import semi_axes
 from makebreak.systems.changing_contact.numerics.contact_task import (
     IMPACT,
     IMPACTLESS,
@@ -178,10 +179,9 @@ class ContactView(LeafSystem):
                 if i >= len(contacts):
                     self._meshcat.SetTransform(path, _NOWHERE, t)
                     continue
-                sizes, axes = np.linalg.eigh(contacts[i].covariance)
-                axes[:, 2] *= np.sign(np.linalg.det(axes))
+                half, axes = semi_axes(contacts[i].covariance, self._config.sigmas)
                 # At least a millimetre, so that what is well known is still seen.
-                half = np.maximum(self._config.sigmas * np.sqrt(sizes), 0.001)
+                half = np.maximum(half, 0.001)
                 X = RigidTransform(RotationMatrix(axes), contacts[i].mean)
                 self._meshcat.SetTransform(path, X, t)
                 self._meshcat.SetProperty(f"{path}/<object>", "scale", list(half), t)

@@ -13,7 +13,6 @@ Source: CC sections 3.3 and 3.4.1, eq. 9.
 """
 
 import numpy as np
-from scipy.stats import chi2
 
 from makebreak.systems.changing_contact.numerics.contact_task import ExpectedContact
 
@@ -72,39 +71,6 @@ def is_expected(contact: ExpectedContact, p, d, std_along, gate) -> bool:
 
 
 # The region of anticipated contact.
-
-
-def confidence_radius(confidence: float, dimensions: int = 3) -> float:
-    """Mahalanobis radius r of the ellipsoid that holds c with this probability.
-
-    Args: dimensions: 3 for the ellipsoid, 1 for the interval along d.
-    Raises: ValueError for a confidence that is not between 0 and 1.
-    """
-    if not 0.0 < confidence < 1.0:
-        raise ValueError(f"confidence is {confidence}, expected between 0 and 1")
-    return float(np.sqrt(chi2.ppf(confidence, dimensions)))
-
-
-def interval_inside(mean, covariance, radius, start, direction):
-    """Where the straight path start + s direction is inside the ellipsoid
-    (x - mean)' inv(covariance) (x - mean) <= radius^2.
-
-    Args: mean, start (3,) [m]; covariance (3, 3) [m2]; direction (3,), of any length.
-    Returns: (s_in, s_out), or None if the path misses it.
-    """
-    L = np.linalg.cholesky(covariance)
-    a = np.linalg.solve(L, np.asarray(start, dtype=float) - mean)
-    b = np.linalg.solve(L, np.asarray(direction, dtype=float))
-    bb = b @ b
-    if not bb > 0.0:
-        return None
-    middle = -(a @ b) / bb
-    nearest = a + middle * b
-    room = radius**2 - nearest @ nearest
-    if room < 0.0:
-        return None
-    half = np.sqrt(room / bb)
-    return float(middle - half), float(middle + half)
 
 
 def semi_axes(covariance, radius):

@@ -178,23 +178,6 @@ def regress(mixture: Mixture, x) -> tuple[np.ndarray, np.ndarray]:
     return _regress(mixture.mean, mixture.factor, mixture.support, mixture.count, x)
 
 
-def reordered(mixture: Mixture, order) -> Mixture:
-    """The same mixture over x[order]: for a regression on other entries.
-
-    Args: order (d,), a permutation of 0..d-1.
-    """
-    order = np.asarray(order)
-    if sorted(order) != list(range(mixture.mean.shape[1])):
-        raise ValueError(f"order is {order}, expected a permutation of the entries")
-    factor = np.zeros_like(mixture.factor)
-    C = mixture.covariance[:, order][:, :, order]
-    factor[: mixture.count] = np.linalg.cholesky(C)
-    mean = np.ascontiguousarray(mixture.mean[:, order])
-    return Mixture(
-        mean, factor, mixture.support.copy(), mixture.age.copy(), mixture.count
-    )
-
-
 def log_likelihood(mixture: Mixture, x) -> float:
     """log p(x) of a joint vector x (d,), eq. 5; -inf for an empty mixture."""
     terms = [
