@@ -20,6 +20,7 @@ from gap_benchmark.robots import Robot, to_mjcf, to_urdf
 
 G = 9.81  # [m/s2]
 STEP, DRAKE_STEP = 1e-4, 2.5e-4  # [s]
+FELT_STEPS = 10  # Of MuJoCo's, which a force sensor takes the mean of.
 # So small that contacts are springs of known stiffness. MuJoCo divides it by
 # 1 - i + i r, where r is how much easier the point is to move than it is taken for (at
 # the tip of a rod: 8).
@@ -235,6 +236,7 @@ class MujocoWorld:
                 self.data.qvel[v : v + 3] = x[7:10]
                 self.data.qvel[v + 3 : v + 6] = rotation(x[3:7]).T @ x[10:13]
         self._stuck = False
+        self._felt: list[np.ndarray] = []
         mujoco.mj_forward(self.model, self.data)
 
     def state(self):
@@ -251,7 +253,8 @@ class MujocoWorld:
         n = max(round((until - d.time) / STEP), 1)
         m.opt.timestep = (until - d.time) / n
         hindered = s.robot is not None and (any(s.coulomb) or any(s.damping))
-        for _ in range(n):
+        self._felt = []
+        for i in range(n):
             if self.joints:
                 q, v = d.qpos[self.q_at], d.qvel[self.v_at]
                 u = effort(d.time, q, v)
@@ -261,6 +264,8 @@ class MujocoWorld:
                 d.qfrc_applied[self.v_at] = u
             self._forces()
             mujoco.mj_step(m, d)
+            if s.tool is not None and n - i <= FELT_STEPS:
+                self._felt.append(self._wrench_now())
 
     def _forces(self) -> None:
         s, m, d = self.s, self.model, self.data
@@ -304,7 +309,12 @@ class MujocoWorld:
                     d.xfrc_applied[body, 3:] = np.cross(at[:3] - p, self.s.adhesion * f)
 
     def wrench(self) -> np.ndarray:
-        """(3,) force on the tool of all contacts, and of what it holds on to."""
+        """(3,) force on the tool of all contacts, and of what it holds on to: its mean
+        over the last FELT_STEPS, as no sensor shows what alternates from step to step
+        (friction of what sticks, by a quarter of what presses)."""
+        return np.mean(self._felt, axis=0) if self._felt else self._wrench_now()
+
+    def _wrench_now(self) -> np.ndarray:
         m, d = self.model, self.data
         tip, six = m.geom(f"{self.s.tool_body}/0").id, np.zeros(6)
         total = d.xfrc_applied[m.geom_bodyid[tip], :3].copy()
