@@ -17,7 +17,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from makebreak.gap.contact_means import MODELLED
+from makebreak.gap.contact_means import MODELLED, SLIDES
 from makebreak.gap.contact_shapes import Slot
 from makebreak.gap.numerics.permitted_forces import explain, roots_of
 from makebreak.gap.permitted_contacts import SURFACES, PermittedContacts, Shift
@@ -127,6 +127,9 @@ class ContactDynamics(PermittedContacts):
             along = v[:, i_v + 3 : i_v + 6]
             along = along - (along @ up)[:, None] * up
             size = np.linalg.norm(along, axis=1)
+            # What is at rest throughout says nothing of what moves, or begins to.
+            speed = np.linalg.norm(self._node_v[:, i_v + 3 : i_v + 6], axis=1)
+            moves = np.asarray(self._W @ (speed > SLIDES).astype(float)).ravel() > 0.0
             spare = np.cross(
                 up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0]
             )
@@ -139,9 +142,9 @@ class ContactDynamics(PermittedContacts):
                 axes = np.broadcast_to(np.eye(3), (K, 3, 3)) if turn is None else turn
                 y = np.einsum("kij,kj->ki", axes, a[:, index])
                 noise = np.einsum("kij,kj->ki", axes**2, var[:, index])
-                true = np.mean(y**2 - noise, axis=0)
-                true = np.maximum(true, 0.05 * np.mean(noise, axis=0))
-                share = true / (true + noise)
+                share = np.empty_like(y)
+                for some in (moves, ~moves):
+                    share[some] = _signal_share(y[some], noise[some])
                 a[:, index] = np.einsum("kji,kj->ki", axes, share * y)
                 covariance[:, index, index] = np.einsum(
                     "kji,kj,kjl->kil", axes, share * noise, axes
@@ -453,6 +456,16 @@ class ContactDynamics(PermittedContacts):
         out[:, known] = False
         out[:, n + len(self.extra) :] = r[:, n + len(self.extra) :] != 0.0
         return out
+
+
+def _signal_share(y: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """(n, k) of measured y (n, k) with variances noise (n, k) the part that is expected
+    to be true, if what is true is spread alike in all rows."""
+    if not len(y):
+        return np.zeros_like(y)
+    true = np.mean(y**2 - noise, axis=0)
+    true = np.maximum(true, 0.05 * np.mean(noise, axis=0))
+    return true / (true + noise)
 
 
 def _ten(mass: float, com: np.ndarray, central: np.ndarray) -> np.ndarray:

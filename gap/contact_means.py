@@ -529,8 +529,8 @@ class ContactMeans:
             y = recording[name][t.episode.rows]
             ok = np.isfinite(y)
             means, _ = test_functions(t.time[ok], centres, self.half)
-            var = np.asarray(means.multiply(means).sum(axis=1)).ravel()
-            return means @ y[ok], var * recording.channels[name].noise ** 2, np.zeros(K)
+            var = variance_of_means(means, y[ok], recording.channels[name].noise)
+            return means @ y[ok], var, np.zeros(K)
         if by == "command":
             u = np.nan_to_num(recording.held(f"{joint}.effort_command")[t.episode.rows])
             rate = np.gradient(held @ u, centres) if K > 1 else np.zeros(K)
@@ -601,3 +601,13 @@ class ContactMeans:
         if not columns:
             return np.zeros((K, 0)), np.zeros((K, 0))
         return np.stack(columns, axis=1), np.stack(variances, axis=1)
+
+
+def variance_of_means(w: csr_matrix, y: np.ndarray, noise: float) -> np.ndarray:
+    """(K,) of the means w @ y of samples y (n,): of their noise, and of what the signal
+    does between them. Where it goes by d from one sample to the next its mean there is
+    anything between the two, uniform: d^2/12. (An effort that jumps by 3 N m within a
+    tenth of a second was off by six times its noise.)"""
+    steps = np.maximum(np.diff(y) ** 2 - 2.0 * noise**2, 0.0)
+    between = 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps)) / 12.0
+    return np.asarray(w.multiply(w) @ (noise**2 + between)).ravel()

@@ -9,14 +9,17 @@ from gap_benchmark import contact_cases, push_world
 from gap_benchmark.contact_scenes import Sensing, record, write_scene
 from gap_benchmark.push_world import BLOCK, TABLE
 from scipy.optimize import least_squares
+from scipy.sparse import eye_array
 from scipy.spatial.transform import Rotation
 
 from makebreak.gap import contact_windows, workflow
 from makebreak.gap.contact_dynamics import ContactDynamics
+from makebreak.gap.contact_means import variance_of_means
 from makebreak.gap.contact_problem import ContactProblem, _best_rectangles
 from makebreak.gap.contact_shapes import _Point, _Surface
 from makebreak.gap.contact_windows import PushWindows, led_as_measured
 from makebreak.gap.fit import fit_effects
+from makebreak.gap.numerics import permitted_forces
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.permitted_contacts import Shift
 from makebreak.gap.problem import Outcome, SearchPlan, is_sane
@@ -484,3 +487,46 @@ def test_a_patch_s_side_that_nothing_crossed_may_be_anywhere():
 )
 def test_effects_that_make_a_gap_in_simulation_are_not_borne_out(before, after, good):
     assert workflow._borne_out(GapMeasure(before, after, 1.0, 0.6)) == good
+
+
+def test_a_signal_that_jumps_between_samples_is_known_less_well():
+    """Means of samples against integrals: of noise alone, and of jumps at any time."""
+    rng = np.random.default_rng(0)
+    t, fine = np.arange(60) / 250.0, np.arange(24_000) / 1e5
+    w, _ = permitted_forces.test_functions(t, [0.1], 0.064)
+    dense, _ = permitted_forces.test_functions(fine, [0.1], 0.064)
+    off, said, noise = [], [], 0.04
+    for _ in range(400):
+        at = rng.uniform(0.08, 0.12)
+        y = np.where(t < at, 0.7, -2.2) + noise * rng.normal(size=len(t))
+        off.append(float((w @ y - dense @ np.where(fine < at, 0.7, -2.2))[0]))
+        said.append(variance_of_means(w, y, noise)[0])
+    quiet = variance_of_means(w, 0.0 * t, noise)[0]
+    assert quiet == pytest.approx(noise**2 * w.power(2).sum())
+    assert np.mean(np.square(off)) > 4.0 * quiet
+    assert np.mean(np.square(off)) == pytest.approx(np.mean(said), rel=0.15)
+
+
+def test_a_body_at_rest_does_not_say_how_one_that_moves_is_accelerated():
+    """What is expected is right on average of what moves (a regression of the truth on
+    it has slope 1), and next to nothing of what rests; whatever share rests."""
+    rng = np.random.default_rng(0)
+    n, noise = 4000, 0.15
+    true, v = np.zeros((n, 6)), np.zeros((n, 6))
+    moves = np.arange(n) < n // 4
+    true[moves, 3] = 0.3 * rng.normal(size=n // 4)
+    v[moves, 3] = 0.1
+    model = SimpleNamespace(
+        means=SimpleNamespace(
+            acceleration=true + noise * rng.normal(size=(n, 6)),
+            acceleration_var=np.full((n, 6), noise**2),
+        ),
+        joints={}, bodies={"body": (0, 0)}, _W=eye_array(n, format="csr"), _node_v=v,
+        dynamics=SimpleNamespace(gravity=np.array([0.0, 0.0, -9.81])),
+    )  # fmt: skip
+    a, covariance = ContactDynamics._expected_acceleration(model, v)  # type: ignore[arg-type]
+    slope = true[moves, 3] @ a[moves, 3] / (a[moves, 3] @ a[moves, 3])
+    assert slope == pytest.approx(1.0, abs=0.05)
+    off = np.mean((a - true)[moves, 3] ** 2)
+    assert off == pytest.approx(covariance[moves, 3, 3].mean(), rel=0.1)
+    assert np.sqrt(np.mean(a[~moves, 3] ** 2)) < 0.1 * noise
