@@ -10,6 +10,7 @@ from gap_benchmark.contact_cases import (
     RECIPES,
     SCENES,
     SEEDS,
+    Recipe,
     block,
     contact_cases,
     hide,
@@ -131,6 +132,28 @@ def test_what_is_hidden_changes_the_world_by_what_is_said():
     assert pair_friction(box.shapes[-1], ground.shapes[0]) == pytest.approx(
         box.shapes[-1].friction
     )
+
+
+def test_a_force_sensor_shows_what_the_drive_holds():
+    """A tip rests against a block that sticks: no net force. From one step of MuJoCo to
+    the next friction alternates by far more, which no sensor would show."""
+    rng = np.random.default_rng(710_003)
+    s, episodes = SCENES["push"](Recipe("push", "mujoco"), rng)
+    e = episodes(s, rng)[0]
+    simulated = MujocoWorld(s)
+    simulated.reset(e.q, e.poses)
+    for t in np.arange(0.0, 1.4, 0.004):
+        command = e.command(t, None, None)
+
+        def effort(_, q, v, command=command):
+            return s.kp * (command[:2] - q) + s.kd * (command[2:] - v)
+
+        simulated.advance(effort, t + 0.004)
+    q, v = simulated.state()
+    holds = effort(0.0, q, v)
+    assert np.abs(v).max() < 1e-3 and np.linalg.norm(holds) > 2.0
+    np.testing.assert_allclose(simulated.wrench()[:2], -holds, atol=0.03)
+    assert np.abs(simulated._wrench_now()[:2] + holds).max() > 0.3
 
 
 def test_a_tool_that_adheres_holds_on_and_lets_go():
