@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.multibody.tree import PrismaticJoint, SpatialInertia
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 from scipy.spatial.transform import Rotation
 
@@ -166,6 +166,41 @@ def test_readings_have_the_noise_that_is_asked_for():
         seen.append(sensor._pose_of(own).p[0] - 0.5)
     # The deviation of 300 samples is known to 4 %; three of that.
     assert np.std(seen) == pytest.approx(1e-3, rel=0.12)
+
+
+class Moving(LeafSystem):
+    """Poses of a body that rests, and from a time on goes at a speed along x."""
+
+    def __init__(self, since, speed):
+        super().__init__()
+
+        def calc(context, output):
+            x = 0.5 + speed * max(context.get_time() - since, 0.0)
+            output.set_value([RigidTransform(), RigidTransform([x, 0.0, 0.02])])
+
+        self.DeclareAbstractOutputPort("poses", lambda: Value([RigidTransform()]), calc)
+
+
+def test_the_speed_of_what_rolls_on_is_known_well_and_a_push_is_seen_as_soon():
+    rest, late = {}, {}
+    for axis in ([], [1.0, 0.0, 0.0]):
+        builder = DiagramBuilder()
+        config = PoseSensorConfig(rolling_axis=axis)
+        sensor = builder.AddSystem(PoseSensor(config, 1, seed=3))
+        body = builder.AddSystem(Moving(6.0, 0.15))
+        builder.Connect(body.get_output_port(), sensor.get_input_port())
+        simulator = Simulator(builder.Build())
+        own = sensor.GetMyContextFromRoot(simulator.get_context())
+        speeds = []
+        for t in np.arange(1.0, 8.0, 0.05):
+            simulator.AdvanceTo(t)
+            speeds.append(sensor.GetOutputPort("v_WB").Eval(own)[0])
+        speeds = np.array(speeds)
+        rest[len(axis)] = speeds[:100].std()
+        late[len(axis)] = np.flatnonzero(speeds > 0.1)[0] * 0.05 + 1.0 - 6.0
+        assert speeds[-20:].mean() == pytest.approx(0.15, abs=0.01)
+    assert rest[0] > 0.01 and rest[3] < 0.3 * rest[0]
+    assert late[3] < late[0] + 0.06 < 0.3
 
 
 # The estimator's option, and the goals.

@@ -9,6 +9,7 @@ from pydrake.systems.framework import LeafSystem
 
 from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.timing import timed
+from makebreak.systems.perception.numerics import interacting_models
 from makebreak.systems.perception.numerics.pose_filter import (
     PoseEstimate,
     corrected,
@@ -31,6 +32,11 @@ class PoseSensorConfig:
     height: float = 0.02  # Of the object's origin as the model has it [m].
     # Of an object that rolls, in its frame; empty: it lies flat.
     rolling_axis: list[float] = field(default_factory=list)
+    # What rolls mostly goes straight on, with this density, for so long on average;
+    # else it is driven, as density says (numerics/interacting_models.py).
+    free_density: float = 1e-5  # [m2/s3]
+    free_sec: float = 2.0
+    driven_sec: float = 0.3
     offset_sec: float = 0.0
 
 
@@ -39,7 +45,8 @@ class PoseSensor(LeafSystem):
 
     Each reading is of the period's beginning, is known delay_sec later, and has
     Gaussian noise of the two deviations on each axis. The filter's pose is predicted to
-    the present time, and laid on the table (numerics/pose_filter.py).
+    the present time, and laid on the table (numerics/pose_filter.py). What rolls keeps
+    its speed where nothing drives it: then its velocity is known five times better.
 
     Inputs:  body_poses (abstract, of a MultibodyPlant).
     Outputs: p_WB (3,) [m]; q_WB (4,) [w x y z]; v_WB (3,) [m/s]; w_WB (3,) [rad/s];
@@ -64,7 +71,16 @@ class PoseSensor(LeafSystem):
                 f"{config.period_sec}, expected at least 0 and more than 0"
             )
         self._config, self._body, self._seed = config, int(body), int(seed)
+        for name in ("free_density", "free_sec", "driven_sec"):
+            if not 0.0 < getattr(config, name) < np.inf:
+                raise ValueError(
+                    f"pose.{name} is {getattr(config, name)}, expected > 0"
+                )
         self._axis = np.array(config.rolling_axis or [0.0, 0.0, 0.0], dtype=float)
+        self._densities = np.array([config.free_density, config.density[0]])
+        self._chances = interacting_models.transition(
+            [config.free_sec, config.driven_sec], config.period_sec
+        )
         zero = np.zeros(3)
         self._unknown = zero, zero, np.array([1.0, 0.0, 0.0, 0.0]), zero
         first_call(on_the_table, 0.0, *self._unknown, config.height, self._axis)
@@ -74,6 +90,8 @@ class PoseSensor(LeafSystem):
         # Readings that are not known yet, oldest first; and how many there were.
         self._late = self.DeclareAbstractState(Value[object](()))
         self._pose = self.DeclareAbstractState(Value[object](None))
+        # Of what rolls: an estimate of numerics/interacting_models.py.
+        self._rolling = self.DeclareAbstractState(Value[object](None))
         ticket = {self.abstract_state_ticket(self._pose), self.time_ticket()}
         for i, (name, size) in enumerate(
             (("p_WB", 3), ("v_WB", 3), ("q_WB", 4), ("w_WB", 3))
@@ -101,6 +119,7 @@ class PoseSensor(LeafSystem):
         late = context.get_abstract_state(int(self._late)).get_value() + (reading,)
         pose = context.get_abstract_state(int(self._pose)).get_value()
         known = context.get_abstract_state(int(self._known)).get_value()
+        rolling = context.get_abstract_state(int(self._rolling)).get_value()
         std = np.maximum(c.noise, 1e-6)  # A filter of no noise at all divides by it.
         while late and late[0][0] <= t - c.delay_sec + 1e-9:
             known = (*known, late[0])
@@ -109,10 +128,27 @@ class PoseSensor(LeafSystem):
                 pose = first_pose(at, p, q, std, (0.1, 1.0))
             else:
                 pose = corrected(predicted(pose, at, c.density), p, q, std)
+            if c.rolling_axis:
+                rolling = self._followed(rolling, p[:2], std[0])
+                (x, y), v, _ = interacting_models.combined(*rolling)
+                pose = pose._replace(
+                    p=np.array([x, y, pose.p[2]]), v=np.array([*v, 0.0])
+                )
         known = tuple(one for one in known if one[0] > t - KEPT_SEC)
         state.get_mutable_abstract_state(int(self._late)).set_value(late)
         state.get_mutable_abstract_state(int(self._pose)).set_value(pose)
+        state.get_mutable_abstract_state(int(self._rolling)).set_value(rolling)
         state.get_mutable_abstract_state(int(self._known)).set_value(known)
+
+    def _followed(self, rolling, measured, std):
+        """The estimate of what rolls, a period later, where it was measured."""
+        if rolling is None:
+            P = np.array([std**2, 0.0, 0.1**2])
+            return interacting_models.start(measured, np.zeros(2), P, 2)
+        ahead = interacting_models.predict(
+            *rolling, self._chances, self._config.period_sec, self._densities
+        )
+        return interacting_models.correct(*ahead, measured, std)
 
     def _pose_of(self, context) -> PoseEstimate | None:
         """The filter's, of the last reading that is known."""
