@@ -14,6 +14,7 @@ Nothing passes from the world to the controllers but encoders, torques and what 
 sensor, or a camera, measures of the object.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -347,8 +348,11 @@ def contact_pairs(spec: PushedObject, friction: float) -> list[ContactPair]:
     ]
 
 
-def c3_config(planner: PushPlannerConfig, n_lam: int, rolls: bool = False) -> C3Config:
-    """Args: rolls: whether the object rolls on where nothing holds it.
+def c3_config(
+    planner: PushPlannerConfig, n_lam: int, axis: Sequence[float] = ()
+) -> C3Config:
+    """Args: axis: that the object rolls about, in its frame (3,); empty: it slides. A
+    turn about it does not count, and what rolls goes on where nothing holds it.
 
     Raises: ValueError for a weight out of range.
     """
@@ -363,7 +367,7 @@ def c3_config(planner: PushPlannerConfig, n_lam: int, rolls: bool = False) -> C3
     Q[P_BALL.start : P_BALL.start + 2], Q[V_BALL] = p.position, 20.0
     Q_N = Q.copy()
     Q_N[P_BALL.start : P_BALL.start + 2] *= p.last
-    if rolls:
+    if axis:
         Q_N[V_BALL] += p.last * p.position * p.coast_sec**2
     # As in ball_rolling: lam : eta = 10 : 1, and the table's contacts loose.
     contact = np.full(n_lam, 0.002)
@@ -375,7 +379,11 @@ def c3_config(planner: PushPlannerConfig, n_lam: int, rolls: bool = False) -> C3
     return C3Config(
         weights=C3Weights(
             Q, np.full(3, 0.01), G, G, Q_N=Q_N,
-            orientation=[OrientationWeight(Q_BALL.start, turn, p.last * turn)],
+            orientation=[
+                OrientationWeight(
+                    Q_BALL.start, turn, p.last * turn, list(axis) if axis else None
+                )
+            ],
         ),
         options=C3Options(N=p.N, rounds=p.rounds, rho=2.2, polish=p.polish),
         residual_dt_sec=LEARN,
@@ -523,8 +531,7 @@ def make_push_object(
         lcs_of[name] = own.model
         lcs[name] = builder.AddNamedSystem(f"lcs_{name}", own)
     n_lam = lcs_of["plan"].n_lam
-    rolls = bool(rolling_axis(spec))
-    c3_settings = c3_config(config.planner, n_lam, rolls)
+    c3_settings = c3_config(config.planner, n_lam, rolling_axis(spec))
 
     sensor = _add_sensor(builder, config, spec, station)
     estimator = builder.AddNamedSystem(

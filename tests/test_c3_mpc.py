@@ -81,6 +81,7 @@ from makebreak.systems.contact_mpc.numerics.lcs import (
 )
 from makebreak.systems.contact_mpc.numerics.orientation_cost import (
     orientation_quadratic,
+    squared_angle,
 )
 
 REFERENCE = Path(__file__).parent / "reference"
@@ -1373,6 +1374,36 @@ def test_the_orientation_cost_has_the_gradient_and_hessian_of_the_angle(angle):
                 - cost(h * (b - a)) + cost(-h * (a + b))
             ) / (4 * h * h)  # fmt: skip
             np.testing.assert_allclose(2 * a @ Q @ b, numeric, atol=1e-5)
+
+
+@pytest.mark.parametrize("angle", [1e-6, 0.3, 1.0])
+@pytest.mark.parametrize("rolled", [0.0, 1.5, 4.0])
+def test_a_turn_about_a_free_axis_costs_nothing(angle, rolled):
+    axis = np.array([0.6, 0.0, 0.8])
+    across = np.array([0.8, 0.0, -0.6])  # The swing: square to the axis.
+    goal = Rotation.random(rng=1)
+    turned = goal * Rotation.from_rotvec(angle * across)
+    turned = turned * Rotation.from_rotvec(rolled * axis)
+    q, q_d = turned.as_quat(scalar_first=True), goal.as_quat(scalar_first=True)
+    assert squared_angle(q, q_d, 3.0 * axis) == pytest.approx(angle**2, abs=1e-9)
+
+    def cost(step):  # The angle between where the axis points and where it should.
+        x = Rotation.from_quat(on_sphere(q, step), scalar_first=True)
+        a, b = x.apply(axis), goal.apply(axis)
+        return np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b) ** 2
+
+    Q, target = orientation_quadratic(q, q_d, axis)
+    assert (q - target) @ Q @ (q - target) == pytest.approx(angle**2, abs=1e-9)
+    assert np.linalg.eigvalsh(Q).min() > -1e-12
+    h = 1e-4
+    for a in np.linalg.svd(q[None])[2][1:]:
+        gradient = (cost(h * a) - cost(-h * a)) / (2 * h)
+        np.testing.assert_allclose(2 * a @ Q @ (q - target), gradient, atol=1e-5)
+    # Rolling on costs nothing, to any order; swinging on what the angle says.
+    roll = Rotation.from_rotvec(1e-3 * axis)
+    t = ((turned * roll).as_quat(scalar_first=True) - q) / 5e-4
+    assert abs(t @ Q @ t) < 1e-5
+    np.testing.assert_allclose(2 * t @ Q @ (q - target), 0.0, atol=1e-3)
 
 
 def test_the_weights_of_an_orientation_are_in_rad():

@@ -91,12 +91,12 @@ def outline_at(pose, spec=T):
     return outline_of(points, rotation_of(x[Q_BALL]), x[P_BALL])
 
 
-def planner_of(spec):
+def planner_of(spec, axis=()):
     """The model of tip and object, the problem, and the shape."""
     model = AnitescuLcs(
         make_tip_and_object(spec, TIP)[0], contact_pairs(spec, 0.5), 0.1
     )
-    c3 = c3_config(PushPlannerConfig(), model.n_lam)
+    c3 = c3_config(PushPlannerConfig(), model.n_lam, axis)
     problem = C3Problem(c3.weights, c3.projection, c3.options)
     points = [part.points for part in parts(spec)]
     return model, problem, ObjectShape(points, TIP.tip_radius, 2.0 * rest_height(spec))
@@ -397,6 +397,27 @@ def test_a_place_keeps_the_plan_that_it_was_chosen_for(shape):
         assert memory.go <= 3
         # It is kept as noise turns it, and made better.
         assert (np.array(costs[1:]) < 1.3 * np.array(costs[:-1])).all()
+
+
+def test_what_rolls_is_pushed_on_and_is_slow_where_the_plan_ends():
+    """A lying cylinder: as it rolls its orientation is another one, but no wrong one;
+    and it rolls on when the plan is over."""
+    spec, ends = PushedObject("cylinder"), {}
+    model, _, _ = planner_of(spec)
+    x = state([0.5, -0.0435, HEIGHT], (0.5, 0.0, 0.0), spec)
+    for axis, coast in (([], 0.5), ([1.0, 0.0, 0.0], 0.0), ([1.0, 0.0, 0.0], 0.5)):
+        c3 = c3_config(PushPlannerConfig(coast_sec=coast), model.n_lam, axis)
+        problem = C3Problem(c3.weights, c3.projection, c3.options)
+        x_desired = target(x, [0.5, 0.05, 0.0], problem.options.N + 1)
+        guess = np.zeros((1, problem.options.N, 3))
+        guess[:, :, 1] = 1.0
+        lcs = model.build_many(x[None], np.zeros(3))
+        plan = score_plans(lcs, x[None], x_desired, problem, guess)[2][0]
+        ends[len(axis), coast] = plan[-1, P_BALL][1], plan[-1, V_BALL][1]
+    still, fast, slow = ends[0, 0.5], ends[3, 0.0], ends[3, 0.5]
+    assert still[0] < 0.005  # It is not to turn, and so not to roll.
+    assert slow[0] > 0.025 and fast[0] > 0.035
+    assert slow[1] < 0.8 * fast[1]
 
 
 def test_places_that_moved_out_of_reach_with_the_object_are_dropped(planner):

@@ -75,6 +75,8 @@ class OrientationWeight:
     start: int = 0  # Of the quaternion [w x y z] in x.
     weight: float = 0.0  # [1/rad^2]
     weight_N: float | None = None  # At the last knot; None: weight.
+    # (3,) of the body: a turn about it does not count, as of what rolls. None: none.
+    free_axis: list[float] | None = None
 
 
 @dataclass
@@ -263,6 +265,12 @@ class C3Problem:
         for weight in (o.weight, 0.0 if o.weight_N is None else o.weight_N):
             if not 0.0 <= weight < np.inf:
                 raise ValueError(f"{name}: {weight}, expected a number >= 0")
+        if o.free_axis is not None and not (
+            np.shape(o.free_axis) == (3,) and 0.0 < np.linalg.norm(o.free_axis) < np.inf
+        ):
+            raise ValueError(
+                f"{name}: free_axis is {o.free_axis}, expected 3 numbers, not all 0"
+            )
         of = slice(o.start, o.start + 4)
         for matrix in (self.Q, self.Q_N):
             if matrix[of].any():
@@ -333,7 +341,9 @@ class C3Problem:
                             "unit one"
                         )
                 weight = o.weight if k < N or o.weight_N is None else o.weight_N
-                local, goal[k, of] = orientation_quadratic(x0[of], x_desired[k, of])
+                local, goal[k, of] = orientation_quadratic(
+                    x0[of], x_desired[k, of], o.free_axis
+                )
                 whole[of, of] += weight * local
         for a in (Q, Q_N):
             a.setflags(write=False)  # To the compiler another type, like p.Q's.
@@ -780,7 +790,7 @@ def plan_cost(lcs: LCS | Sequence[LCS], x0, u, x_desired, problem: C3Problem) ->
         for o in p.orientation:
             of = slice(o.start, o.start + 4)
             weight = o.weight_N if last and o.weight_N is not None else o.weight
-            cost += weight * squared_angle(x[of], x_desired[k][of])
+            cost += weight * squared_angle(x[of], x_desired[k][of], o.free_axis)
         if not last:
             cost += u[k] @ p.R @ u[k]
             x, _ = simulate(models[k % len(models)], x, u[k])
