@@ -140,15 +140,17 @@ class PoseSensor(LeafSystem):
         state.get_mutable_abstract_state(int(self._rolling)).set_value(rolling)
         state.get_mutable_abstract_state(int(self._known)).set_value(known)
 
-    def _followed(self, rolling, measured, std):
+    def _followed(
+        self, rolling: interacting_models.Estimate | None, measured, std
+    ) -> interacting_models.Estimate:
         """The estimate of what rolls, a period later, where it was measured."""
         if rolling is None:
             P = np.array([std**2, 0.0, 0.1**2])
             return interacting_models.start(measured, np.zeros(2), P, 2)
-        ahead = interacting_models.predict(
+        means, covariances, chances = interacting_models.predict(
             *rolling, self._chances, self._config.period_sec, self._densities
         )
-        return interacting_models.correct(*ahead, measured, std)
+        return interacting_models.correct(means, covariances, chances, measured, std)
 
     def _pose_of(self, context) -> PoseEstimate | None:
         """The filter's, of the last reading that is known."""
