@@ -138,7 +138,7 @@ class PushPlannerConfig:
     tip_speed: float = 10.0  # [s2/m2]
     # An object that rolls goes on after the plan's end: its speed there counts as the
     # way that it goes in so long a time [s].
-    coast_sec: float = 0.5
+    coast_sec: float = 1.0
 
 
 @dataclass

@@ -32,7 +32,7 @@ from makebreak.systems.contact_mpc.numerics.contact_sampling import (
 CONTACT, TRAVEL, WAIT = 0, 1, 2
 # A place moves with the object where that is more than noise [m].
 PLACE_CHANGE = 0.008
-# A tip that is so far above a place where it should have arrived has come down on the
+# A tip that is so far above where it should be on its way down has come down on the
 # object, which is larger than believed, or elsewhere: it goes up, and after that comes
 # down so much farther out; not farther than EXTRA_MAX, where it no longer matters [m].
 MISSED, EXTRA, EXTRA_MAX = 0.01, 0.003, 0.012
@@ -176,12 +176,14 @@ def next_push(
         state.p, state.v, goal, outline, distance, up, limits, dt, descent
     )
     state = replace(state, p=p, v=v, a=a, place=held, go=go)
-    if not arrived:
-        return state
+    # What is in its way down is noticed on the way, or the tip presses on it all along.
     # A tip that is beside its place, where the arm does not reach, pushes from there.
-    if x[P_TIP][2] - height > MISSED and state.extra < EXTRA_MAX:
+    missed = p[2] < descent[1] and x[P_TIP][2] - p[2] > MISSED
+    if missed and state.extra < EXTRA_MAX:
         extra = min(state.extra + EXTRA, EXTRA_MAX)
         at_rest = dict(p=x[P_TIP].copy(), v=np.zeros(3), a=np.zeros(3))
         return replace(state, **at_rest, extra=extra, lifting=True, place=None)
+    if not arrived:
+        return state
     # Where the arm hides it from this place, it is pushed a little as it is believed.
     return replace(state, phase=CONTACT, unseen_sec=0.0)
