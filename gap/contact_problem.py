@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from makebreak.gap.contact_dynamics import WRENCHED, ContactDynamics
-from makebreak.gap.contact_windows import PushWindows, led_as_measured
+from makebreak.gap.contact_windows import PushWindows, led_as_measured, varies
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.measure import gap_measure, series_of
 from makebreak.gap.mechanism import link_changes
@@ -601,7 +601,8 @@ class ContactProblem(ContactDynamics, GapProblem):
         }
         for body in self.bodies:
             for a in ("qw", "qx", "qy", "qz", "x", "y", "z"):
-                how[f"{body}.{a}"] = "equations and simulation"
+                both = varies(self.recordings, name := f"{body}.{a}")
+                how[name] = "equations and simulation" if both else "equations"
         for name, _ in self.extra:
             how[name] = "equations"
         for joint, by in self.by.items():

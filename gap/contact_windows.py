@@ -47,8 +47,9 @@ class PushWindows(WindowModel):
         scene, led = led_as_measured(scene, recordings)
         super().__init__(scene, recordings, WINDOW_SEC, by_episode=True, most=MOST)
         keep = [
-            k for k, c in enumerate(self.channels) if c.rsplit(".", 1)[0] not in led
-        ]
+            k for k, c in enumerate(self.channels)
+            if c.rsplit(".", 1)[0] not in led and varies(recordings, c)
+        ]  # fmt: skip
         if not keep:
             raise ValueError("nothing but joints that are led as they were measured")
         self.channels = [self.channels[k] for k in keep]
@@ -166,6 +167,15 @@ class PushWindows(WindowModel):
             replace(w, std=np.sqrt(w.std**2 + v + far**2))
             for w, v in zip(self.windows, wide, strict=True)
         ]
+
+
+def varies(recordings: Sequence[Recording], channel: str) -> bool:
+    """Whether a channel is ever other than one value: height and tilt by a camera that
+    sees a plane alone are said, not measured, and no simulation agrees with them to the
+    last digit."""
+    values = np.concatenate([r[channel] for r in recordings])
+    values = values[np.isfinite(values)]
+    return bool(len(values)) and bool(np.ptp(values) > 0.0)
 
 
 def led_as_measured(

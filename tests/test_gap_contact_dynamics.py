@@ -531,3 +531,24 @@ def test_a_body_at_rest_does_not_say_how_one_that_moves_is_accelerated():
     off = np.mean((a - true)[moves, 3] ** 2)
     assert off == pytest.approx(covariance[moves, 3, 3].mean(), rel=0.1)
     assert np.sqrt(np.mean(a[~moves, 3] ** 2)) < 0.1 * noise
+
+
+def test_what_a_planar_camera_says_of_the_height_is_not_compared(tmp_path):
+    """Height and tilt that are the same number in all rows: windows judge the rest,
+    which is at the noise with the true friction."""
+    scene, recordings, truth = pushed(tmp_path, 203, ["contact_friction"], 1.0, 2)
+    (recording,) = recordings
+    said = {"z": np.nanmean(recording[f"{BLOCK}.z"]), "qx": 0.0, "qy": 0.0}
+    channels = dict(recording.channels)
+    for a, value in said.items():
+        c = channels[f"{BLOCK}.{a}"]
+        same = np.where(np.isnan(c.values), np.nan, value)
+        channels[c.name] = replace(c, values=same, noise=0.0)
+    windows = PushWindows(scene, [replace(recording, channels=channels)])
+    left = {f"{BLOCK}.{a}" for a in said} & set(windows.channels)
+    assert not left and f"{BLOCK}.x" in windows.channels
+    (hidden,) = truth.hidden
+    effect = Effect(hidden["kind"], [hidden["at"]], dict(hidden["parameters"]))
+
+    errors = np.concatenate(windows.errors(windows.simulate([effect])))
+    assert np.sqrt(np.mean(errors**2)) < 1.2
