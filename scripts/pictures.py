@@ -26,6 +26,10 @@ class Picture:
     size: tuple[int, int] = (1280, 800)
 
 
+def _figure(experiment: str, plot: str) -> Picture:
+    return Picture(f"run {experiment} --no-meshcat", f"{plot}.png")
+
+
 _LOOP = "close-the-loop --seed 2"
 PICTURES = {
     "ball_rolling.png": Picture("run ball_rolling --duration 24", "meshcat.html"),
@@ -40,6 +44,21 @@ PICTURES = {
     "gentle_rolling_diagram.svg": Picture(
         "run gentle_rolling --duration 0.1 --no-meshcat --diagram OUT/d.svg", "d.svg"
     ),
+    # The papers' figures, for docs/figures.md.
+    "mpc_figure_3.png": _figure("cartpole_walls", "gradient_map"),
+    "mpc_figure_4.png": _figure("cartpole_walls", "stabilisation"),
+    "mpc_figure_6.png": _figure("ball_rolling", "residual"),
+    "contact_figure_4.png": _figure("porridge", "prediction"),
+    "contact_figure_5.png": _figure("multi_spring", "mrac"),
+    "contact_figure_6.png": _figure("multi_spring", "active_inference"),
+    "contact_figure_7.png": _figure("multi_spring", "biomimetic"),
+    "contact_figure_9.png": _figure("changing_surface", "modes"),
+    "contact_figure_10.png": _figure("changing_surface", "stiffness"),
+    "contact_figure_12.png": _figure("wall_friction", "joint_prediction"),
+    "contact_figure_14.png": _figure("wall_friction", "force_prediction"),
+    "contact_figure_16.png": _figure("multiple_collisions", "profiles"),
+    "contact_figure_18.png": _figure("contact_learning", "trials"),
+    "contact_figure_20.png": _figure("surface_switch", "trials"),
 }
 
 
