@@ -10,8 +10,14 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from matplotlib.figure import Figure
+
 from makebreak.scripts.screenshot import screenshot
 from makebreak.scripts.trials import makebreak_command, run_commands
+from makebreak.systems.changing_contact.numerics.velocity_profile import (
+    speed_transition,
+)
 
 DOCS = Path(__file__).resolve().parent.parent / "docs" / "pictures"
 
@@ -62,13 +68,33 @@ PICTURES = {
 }
 
 
+def plot_speed_transition():
+    """Figure 3 of the second paper: from 1.2 to 0.5 m/s in 1 s, by equation 11."""
+    t = np.linspace(0.0, 1.0, 400)
+    values = np.array([speed_transition(1.2, 0.5, 1.0, x) for x in t])
+    figure = Figure(figsize=(9.0, 5.0), layout="constrained")
+    names = ("position [m]", "speed [m/s]", "acceleration [m/s2]", "jerk [m/s3]")
+    for axes, name, y in zip(figure.subplots(2, 2).flat, names, values.T, strict=True):
+        axes.plot(t, y)
+        axes.set(xlabel="t [s]", ylabel=name)
+        axes.grid(alpha=0.3)
+    return figure
+
+
+PLOTS = {"contact_figure_3.png": plot_speed_transition}  # Without a run.
+
+
 def make_pictures(names: list[str], out: Path, work: Path) -> None:
     """One run for all pictures that name the same command.
 
-    Args: names: keys of PICTURES. out: where they go. work: where the runs go.
+    Args: names: keys of PICTURES and PLOTS. out: where they go. work: where runs go.
     Raises: ValueError where there is no browser; RuntimeError where a run fails.
     """
     out.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        if name in PLOTS:
+            PLOTS[name]().savefig(out / name, dpi=120)
+    names = [name for name in names if name in PICTURES]
     for k, command in enumerate(dict.fromkeys(PICTURES[n].command for n in names)):
         folder = work / str(k)
         words = command.replace("OUT", str(folder)).split()
@@ -93,18 +119,19 @@ def make_pictures(names: list[str], out: Path, work: Path) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(
         description="The pictures of docs/pictures, from runs.",
-        epilog=f"pictures: {', '.join(PICTURES)}",
+        epilog=f"pictures: {', '.join([*PICTURES, *PLOTS])}",
     )
     parser.add_argument("pictures", nargs="*", metavar="PICTURE")
     parser.add_argument("--out", type=Path, default=DOCS)
     args = parser.parse_args()
-    unknown = [name for name in args.pictures if name not in PICTURES]
+    known = [*PICTURES, *PLOTS]
+    unknown = [name for name in args.pictures if name not in known]
     try:
         if unknown:
-            known = ", ".join(PICTURES)
-            raise ValueError(f"unknown picture {unknown[0]}, expected some of {known}")
+            listed = ", ".join(known)
+            raise ValueError(f"unknown picture {unknown[0]}, expected some of {listed}")
         with tempfile.TemporaryDirectory() as work:
-            make_pictures(args.pictures or list(PICTURES), args.out, Path(work))
+            make_pictures(args.pictures or known, args.out, Path(work))
     except (ValueError, RuntimeError) as error:
         print(f"pictures: {error}", file=sys.stderr)
         return 2
