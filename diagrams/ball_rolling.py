@@ -423,7 +423,7 @@ def make_ball_rolling(
 # Of the task, as the legend says them.
 PHASES = (
     "now: rolls the ball",
-    "now: goes on to the next place",
+    "now: moves to where it will touch next",
     "now: waits for the ball to be seen",
     "now: approaches the ball",
 )
@@ -700,7 +700,7 @@ def add_ball_rolling(
         builder.Connect(p_ball.get_output_port(), view.GetInputPort("p_ball"))
         connect(estimator, "x", view, "x")
         builder.Connect(gap_of_r.get_output_port(), view.GetInputPort("gap"))
-        legend = LegendConfig(view.LEGEND, PHASES, view.CAMERA, view.LOOK_AT)
+        legend = LegendConfig(view.legend, PHASES, view.CAMERA, view.LOOK_AT)
         add_legend(builder, meshcat, legend, task.GetOutputPort("phase"))
 
 

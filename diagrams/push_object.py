@@ -455,13 +455,13 @@ def _add_sensor(
     return sensor
 
 
-# Settings that the diagram makes of others.
 # Of the task, as the legend says them.
 PHASES = (
     "now: pushes",
-    "now: goes to another place",
+    "now: moves to where it will touch next",
     "now: waits for the object to be seen",
 )
+# Settings that the diagram makes of others.
 _OWN = {
     "goals": ("period_sec", "offset_sec"),
     "task": ("height", "clearance", "period_sec", "offset_sec"),

@@ -1,5 +1,5 @@
-"""A two-link finger turns a spinner by 3 rad: it swings, flicks it by friction, and the
-spinner's own damping stops it where it is wanted. Nobody tells C3 when to touch."""
+"""A two-link finger turns a spinner by 3 rad: it swings, flicks it by friction, brakes
+it, and pushes it back where it went too far. Nobody tells C3 when to touch."""
 
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
@@ -25,4 +25,5 @@ simulator = Simulator(builder.Build())
 own = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
 plant.SetPositions(own, [0.1, 0.1, 0.0])
 simulator.AdvanceTo(5.0)
-print(f"spinner at {plant.GetPositions(own)[2]:.3f} rad")
+angle, rate = plant.GetPositions(own)[2], plant.GetVelocities(own)[2]
+print(f"spinner at {angle:.3f} rad, turning at {rate:.3f} rad/s")

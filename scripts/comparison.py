@@ -24,13 +24,19 @@ class Comparison:
 
     def runs(self, settings: Mapping, seeds: int) -> list[dict]:
         """The results of seeds 0 .. seeds - 1, as run_many gives them."""
-        return run_many(
-            self.experiment,
-            [(settings, seed) for seed in range(seeds)],
-            self.jobs,
-            self.session.out_dir,
+        return self.runs_of({"": settings}, seeds)[""]
+
+    def runs_of(self, variants: Mapping[str, Mapping], seeds: int) -> dict:
+        """{name: runs(settings, seeds)} of {name: settings}, side by side."""
+        trials = [(s, seed) for s in variants.values() for seed in range(seeds)]
+        results = run_many(
+            self.experiment, trials, self.jobs, self.session.out_dir,
             reuse=self.session.reuse,
-        )
+        )  # fmt: skip
+        return {
+            name: results[i * seeds : (i + 1) * seeds]
+            for i, name in enumerate(variants)
+        }
 
     def with_settings(self, settings: Mapping) -> str:
         """The command of a run with settings, as one types it."""
@@ -51,7 +57,7 @@ class Comparison:
         )
         self.met.append(None if good is None else bool(good))
 
-    def table(self, title: str, notes: Sequence[str] = (), theirs="paper") -> Table:
+    def to_table(self, title: str, notes: Sequence[str] = (), theirs="paper") -> Table:
         """Args: theirs: the head of what ours is compared with."""
         columns = ("what", theirs, "ours", "command")
         return Table(title, columns, self.rows, self.met, notes)

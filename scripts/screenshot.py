@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+LIMIT_SEC = 300
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
@@ -29,9 +30,8 @@ def screenshot(page: Path, picture: Path, size=(1280, 800), wait_ms: int = 15000
     browser = next(filter(None, map(shutil.which, _BROWSERS)), None)
     if browser is None:
         raise ValueError("no browser found, expected one of: " + ", ".join(_BROWSERS))
-    picture = picture.resolve()
-    picture.unlink(missing_ok=True)
-    with TemporaryDirectory() as profile:
+    with TemporaryDirectory() as folder:
+        profile, taken = Path(folder) / "profile", Path(folder) / "page.png"
         options = [
             "--headless=new",
             "--no-sandbox",
@@ -46,15 +46,19 @@ def screenshot(page: Path, picture: Path, size=(1280, 800), wait_ms: int = 15000
             f"--user-data-dir={profile}",
             f"--window-size={size[0]},{size[1]}",
             f"--virtual-time-budget={wait_ms}",
-            f"--screenshot={picture}",
+            f"--screenshot={taken}",
             page.resolve().as_uri(),
         ]
-        done = subprocess.run(
-            [browser, *options], capture_output=True, text=True, timeout=300
-        )
-    if not picture.is_file():
-        lines = done.stderr.strip().splitlines() or ["no output"]
-        raise RuntimeError(f"{browser} wrote no picture: {lines[-1]}")
+        try:
+            done = subprocess.run(
+                [browser, *options], capture_output=True, text=True, timeout=LIMIT_SEC
+            )
+        except subprocess.TimeoutExpired as error:
+            raise RuntimeError(f"{browser} took more than {LIMIT_SEC} s") from error
+        if not taken.is_file():
+            lines = done.stderr.strip().splitlines() or ["no output"]
+            raise RuntimeError(f"{browser} wrote no picture: {lines[-1]}")
+        shutil.move(taken, picture)
 
 
 def main() -> int:

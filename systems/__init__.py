@@ -13,8 +13,7 @@ views/             what is seen and pressed in Meshcat, and ground truth for sco
 
 Each file has one LeafSystem and its config. Its maths is in the wing's numerics/, most
 often under the same name; numerics/ here is what all share. Systems never import each
-other. Maths does, one way: contact_mpc <- changing_contact <- arm <- perception, and
-the other wings take from these.
+other. Maths of a wing does, of some wings and one way: MATHS_OF in tests/test_code.py.
 """
 
 import sys
@@ -22,4 +21,4 @@ import sys
 from makebreak.systems.moved import FormerNames
 
 if not any(isinstance(finder, FormerNames) for finder in sys.meta_path):
-    sys.meta_path.append(FormerNames())
+    sys.meta_path.insert(0, FormerNames())

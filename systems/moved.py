@@ -2,6 +2,7 @@
 makebreak.systems.contact_mpc.c3_mpc, and so on. What users wrote, exported tests among
 it, imports them so."""
 
+import sys
 from collections.abc import Sequence
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
@@ -65,10 +66,17 @@ MOVED = {
     for wing, names in modules.items()
     for name in names.split()
 }
+MOVED |= {
+    f"{__package__}.numerics.baselines": f"{__package__}.baselines.numerics",
+    f"{__package__}.numerics.baselines.long_term_predictor": (
+        f"{__package__}.baselines.numerics.long_term_predictor"
+    ),
+}
 
 
 class FormerNames(MetaPathFinder, Loader):
-    """Finds what nothing else has found: it stands last in sys.meta_path."""
+    """Gives the present module itself, so that nothing is there twice. It stands first
+    in sys.meta_path: below a former package others would load a second copy."""
 
     def find_spec(
         self,
@@ -79,6 +87,4 @@ class FormerNames(MetaPathFinder, Loader):
         return spec_from_loader(fullname, self) if fullname in MOVED else None
 
     def exec_module(self, module: ModuleType) -> None:
-        for name, value in vars(import_module(MOVED[module.__name__])).items():
-            if not name.startswith("__"):
-                setattr(module, name, value)
+        sys.modules[module.__name__] = import_module(MOVED[module.__name__])

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from makebreak.scripts.experiments import EXPERIMENTS, load_experiment
+from makebreak.systems.moved import MOVED
 
 ROOT = Path(__file__).resolve().parent.parent
 ROOMS = ("models", "systems", "diagrams", "gap", "scripts")
@@ -75,6 +76,12 @@ def imported_modules(tree, package):
                 yield node.lineno, node.value
 
 
+def is_former(name):
+    """Whether makebreak.systems.c3_mpc.C3Mpc is a name from before the wings."""
+    parts = name.split(".")
+    return any(".".join(parts[:k]) in MOVED for k in range(3, len(parts) + 1))
+
+
 def may_use(parts, other):
     """Whether maths `other` is for a file of systems/."""
     own, there = wing_of(parts), wing_of(other)
@@ -97,6 +104,8 @@ def breaches(root):
                 found.append(f"{where}: expected makebreak.{name}")
             elif first == "pydrake" and here.endswith("numerics"):
                 found.append(f"{where}: numerics must not import pydrake")
+            elif is_former(name):
+                found.append(f"{where}: a former name")
             elif name == "makebreak.systems.moved.FormerNames":
                 continue  # What stands in for former names is no system.
             elif first == "makebreak" and rest and rest[0] in ROOMS:
@@ -166,6 +175,11 @@ def test_imports_go_one_way():
             "from makebreak.systems.contact_mpc.numerics.lcs import LCS",
         ),
         ("systems/arm/numerics/a.py", "from makebreak.gap.numerics.selection import S"),
+        (
+            "systems/contact_mpc/numerics/a.py",
+            "from makebreak.systems.numerics.packed import packed",
+        ),
+        ("diagrams/a.py", "from makebreak.systems.c3_mpc import C3Mpc"),
         ("systems/arm/a.py", "from makebreak.models import scene"),
         ("systems/arm/a.py", "import_module('makebreak.diagrams.station')"),
         ("models/a.py", "from makebreak import diagrams"),

@@ -23,11 +23,26 @@ def test_runs_are_those_of_the_first_seeds_in_the_sessions_folder(
 ):
     asked = []
     monkeypatch.setattr(
-        comparison, "run_many", lambda *a, **k: asked.append((a, k)) or ["results"]
+        comparison,
+        "run_many",
+        lambda *a, **k: asked.append((a, k)) or ["first", "second"],
     )
-    assert table.runs({"tool": "block"}, 2) == ["results"]
+    assert table.runs({"tool": "block"}, 2) == ["first", "second"]
     runs = [({"tool": "block"}, 0), ({"tool": "block"}, 1)]
     assert asked == [(("multiple_collisions", runs, 3, tmp_path), {"reuse": True})]
+
+
+def test_all_variants_run_side_by_side_and_are_told_apart(table, monkeypatch):
+    asked = []
+
+    def run_many(name, runs, *_, **__):
+        asked.append(runs)
+        return [f"{settings.get('tool')} {seed}" for settings, seed in runs]
+
+    monkeypatch.setattr(comparison, "run_many", run_many)
+    found = table.runs_of({"plain": {}, "block": {"tool": "block"}}, 2)
+    assert found == {"plain": ["None 0", "None 1"], "block": ["block 0", "block 1"]}
+    assert len(asked) == 1
 
 
 @pytest.mark.parametrize("settings", [{}, *VARIANTS.values()])
@@ -42,7 +57,7 @@ def test_rows_are_met_missed_or_without_a_target(table):
     table.row("a", "1", 2, good=True)
     table.row("b", "-", "x", command="other")
     table.row("c", "-", "y", good=False, command="")
-    made = table.table("Title", ["a note"], theirs="wanted")
+    made = table.to_table("Title", ["a note"], theirs="wanted")
     assert made.columns == ("what", "wanted", "ours", "command")
     commands = [row[3] for row in made.rows]
     assert commands == ["makebreak run multiple_collisions --seed S", "other", ""]

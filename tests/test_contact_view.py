@@ -105,6 +105,6 @@ def test_a_real_meshcat_takes_it_twice_and_shows_track_and_bars():
 def test_the_legend_names_the_bars_where_there_are_bars():
     config = ContactViewConfig(peaks=[[12.0, 7.9]], peak_limit=9.0)
     texts = [text for text, _ in ContactView(config, Recorder()).legend]
-    assert "the same, above 9 N" in texts
+    assert "bars: above 9 N" in texts
     plain = ContactView(ContactViewConfig(), Recorder()).legend
     assert len(plain) == len(texts) - 2

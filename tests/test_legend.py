@@ -29,19 +29,16 @@ class Page:
         assert name == "visible"
         self.visible.setdefault(path, []).append((t, value))
 
-    def Delete(self, path):
-        for known in (self.lines, self.visible):
-            for each in [k for k in known if k == path or k.startswith(path + "/")]:
-                del known[each]
+    def Delete(self, path):  # What was recorded of it stays.
+        for each in [k for k in self.lines if f"{k}/".startswith(f"{path}/")]:
+            del self.lines[each]
 
     def played(self, t):
         """The points (n, 3) that a recording shows at t."""
         seen = []
         for path, points in self.lines.items():
-            known = [v for s, v in self.visible.get(path, []) if s is not None]
-            times = [s for s, _ in self.visible.get(path, []) if s is not None]
-            at = [v for s, v in sorted(zip(times, known, strict=True)) if s <= t]
-            if not at or at[-1]:
+            frames = dict(self.visible[path])  # The last that was said of a time.
+            if frames[max(s for s in frames if s <= t)]:
                 seen.append(points)
         return np.concatenate(seen) if seen else np.zeros((0, 3))
 
@@ -60,8 +57,9 @@ def test_a_track_grows_where_it_is_played_again():
         shown = page.played(t)
         assert (shown[:, 0] <= t).all()  # Nothing of what is to come,
         last = shown[:, 0].max() if len(shown) else 0.0
-        assert t - last <= PIECE  # and a piece at most is missing.
+        assert t - last <= PIECE  # and a piece at most is missing,
         assert set(range(int(last))) <= set(shown[:, 0])
+    assert set(page.played(n)[:, 0]) == set(range(n))  # at the end nothing.
 
 
 def test_while_it_runs_all_of_a_track_is_seen_without_gaps():
@@ -80,12 +78,18 @@ def test_another_track_takes_the_one_before_away():
     page = Page()
     trail = Trail(page, "/t", None)
     trail.show(along(3 * PIECE), 5.0)
-    assert len(page.played(5.0)) and len(page.played(6.0))
-    trail.show(along(1) + 7.0, 6.0)
-    assert len(page.played(5.0)) and not len(page.played(6.0))
-    trail.show(along(2 * PIECE) + 7.0, 7.0)
-    assert page.played(7.0)[:, 0].min() == 7.0
-    trail.show(np.zeros((0, 3)), 8.0)
+    trail.show(along(3 * PIECE + 4), 5.5)
+    whole = page.played(5.5)
+    assert len(whole) and len(page.played(6.0))
+    trail.show(along(1) + 70.0, 6.0)
+    assert not len(page.played(6.0)) and len(page.played(5.0))
+    assert set(page.played(5.9)[:, 0]) == set(whole[:, 0]) == set(range(3 * PIECE + 4))
+    for k in (2, PIECE, PIECE + 4):
+        trail.show(along(k) + 70.0, 6.0 + k)
+        assert page.played(6.0 + k)[:, 0].min() == 70.0
+        assert page.played(5.9)[:, 0].max() < 70.0
+    assert page.played(90.0)[:, 0].max() == 70.0 + PIECE + 3
+    trail.show(np.zeros((0, 3)), 91.0)
 
 
 def test_a_board_has_the_words_and_the_colour_and_is_read_from_left_to_right():
@@ -149,8 +153,8 @@ def test_a_legend_is_in_the_upper_left_of_what_the_camera_sees_and_faces_it():
         np.testing.assert_allclose(X.rotation().matrix()[:, 2], up, atol=1e-12)
         seen = X.translation() - camera
         x, y = seen @ right / (seen @ away), seen @ up / (seen @ away)
-        # Within 75 degrees from top to bottom, of a page at least 4 : 3.
-        assert -np.tan(np.radians(37.5)) * 4 / 3 < x < 0.0
+        # Within 75 degrees from top to bottom, of a page as wide as it is high.
+        assert -np.tan(np.radians(37.5)) < x < 0.0
         assert 0.0 < y < np.tan(np.radians(37.5))
     below = scene.poses[f"{ROOT}/lines"].translation()
     below = below - scene.poses[f"{ROOT}/phase/0"].translation()
@@ -163,7 +167,14 @@ def test_a_camera_that_looks_straight_down_sees_the_legend_too():
     Legend(config, scene)
     X = scene.poses[f"{ROOT}/lines"]
     np.testing.assert_allclose(X.rotation().matrix()[:, 0], [0.0, 0.0, 1.0])
-    assert X.translation()[2] == 1.0  # A metre before the camera.
+    x, y, z = X.translation()
+    assert z == 1.0 and -0.767 < x < 0.0 < y < 0.767  # Meshcat has x right, y up.
+    np.testing.assert_allclose(X.rotation().matrix()[:, 1], [1.0, 0.0, 0.0])
+
+
+def test_a_camera_where_it_looks_at_is_refused():
+    with pytest.raises(ValueError, match="expected not where it looks at"):
+        Legend(LegendConfig([("a", Rgba(1, 0, 0))], (), [1, 0, 1], [1, 0, 1]), Scene())
 
 
 def test_the_phase_alone_is_seen_and_its_changes_are_recorded():
@@ -191,7 +202,16 @@ def test_the_phase_alone_is_seen_and_its_changes_are_recorded():
         assert seen() == [False, k == 1.0]
 
 
-def test_a_real_meshcat_takes_a_legend_and_its_page_has_the_picture():
+def test_a_second_simulation_says_its_phase_from_the_beginning():
+    scene = Scene()
+    _, _, diagram = legend(scene)
+    for _ in range(2):
+        scene.visible.clear()
+        Simulator(diagram).AdvanceTo(0.3)
+        assert scene.visible[f"{ROOT}/phase/1"] == [(0.0, True)]
+
+
+def test_a_real_meshcat_takes_a_legend():
     meshcat = Meshcat()
     _, _, diagram = legend(meshcat)
     Simulator(diagram).AdvanceTo(0.1)

@@ -1,6 +1,8 @@
 """The command that makes the documents' pictures."""
 
 import re
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -19,27 +21,31 @@ def test_every_picture_of_the_documents_is_there_and_made_by_the_command():
 def test_one_run_gives_all_its_pictures_and_a_failed_one_is_told(tmp_path, monkeypatch):
     ran = []
 
-    def run_commands(label, commands, folders, jobs):
-        ran.append(label)
-        if "close-the-loop" in label:
-            (folders[0] / "2_gap").mkdir(parents=True)
+    def run(command, **_):
+        ran.append(command)
+        folder = Path(command[-1])
+        if "close-the-loop" in command:
+            (folder / "2_gap").mkdir(parents=True)
             for name in ("report", "compare"):
-                (folders[0] / "2_gap" / f"{name}.html").write_text(name)
-            return [{}]
-        return [{"error": "it broke"}]
+                (folder / "2_gap" / f"{name}.html").write_text(name)
+            return SimpleNamespace(returncode=1)  # Its goals are not met.
+        status = 2 if "cube_pivoting" in command else 0
+        return SimpleNamespace(returncode=status, stderr="...\nit broke\n")
 
     def screenshot(page, picture, size, wait_ms):
         picture.write_text(page.read_text())
 
-    monkeypatch.setattr(pictures, "run_commands", run_commands)
+    monkeypatch.setattr(pictures.subprocess, "run", run)
     monkeypatch.setattr(pictures, "screenshot", screenshot)
     out = tmp_path / "out"
-    make_pictures(["gap_report.png", "gap_compare.png"], out, tmp_path / "w")
+    make_pictures(["gap_report.png", "gap_compare.png"], out, tmp_path / "a b")
     assert len(ran) == 1
     assert (out / "gap_report.png").read_text() == "report"
     assert (out / "gap_compare.png").read_text() == "compare"
     with pytest.raises(RuntimeError, match="run cube_pivoting: it broke"):
         make_pictures(["cube_pivoting.png"], out, tmp_path / "v")
+    with pytest.raises(RuntimeError, match="run porridge .*: it made no prediction"):
+        make_pictures(["contact_figure_4.png"], out, tmp_path / "w")
 
 
 def test_an_unknown_picture_is_refused(monkeypatch, capsys):

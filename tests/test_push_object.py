@@ -280,7 +280,11 @@ def test_a_box_is_turned_to_the_nearer_of_the_yaws_that_are_the_same():
         simulator.AdvanceTo(0.1)
         yaw = system.GetOutputPort("goal").Eval(own)[2]
         assert yaw == pytest.approx(given[0])
-        simulator.AdvanceTo(2.2)
+        yaws = set()
+        for t in np.arange(0.1, 2.2, 0.005):  # Finer than it decides.
+            simulator.AdvanceTo(t)
+            yaws.add(round(system.GetOutputPort("goal").Eval(own)[2], 9))
+        assert yaws == {round(yaw, 9) for yaw in given}  # At no instant another.
         # As a box it was there at once; else its time was up.
         number, since = system.GetOutputPort("log").Eval(own)[[0, 4]]
         assert number == 1.0

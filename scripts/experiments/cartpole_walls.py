@@ -256,16 +256,19 @@ RIGHT = {"gap_error": [0.0, 0.0], "adapt": False}  # A baseline that must work.
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     """Figures 3 and 4 beside ours, over seeds, and from states far apart."""
 
-    table = Comparison("cartpole_walls", session, jobs)
-    row = table.row
+    comparison = Comparison("cartpole_walls", session, jobs)
+    row = comparison.row
 
     def count(results, key):
         return f"{sum(bool(r.get(key)) for r in results)} of {len(results)}"
 
-    near, wide, right, dynamics = (
-        table.runs(settings, seeds)
-        for settings in ({}, WIDE, {**WIDE, **RIGHT}, {**WIDE, "learner": "r_dyn"})
-    )
+    variants: dict[str, dict] = {
+        "near": {},
+        "wide": WIDE,
+        "right": {**WIDE, **RIGHT},
+        "dynamics": {**WIDE, "learner": "r_dyn"},
+    }
+    near, wide, right, dynamics = comparison.runs_of(variants, seeds).values()
 
     def residual_errors(key):
         values = [r.get(key) for r in near]
@@ -273,7 +276,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
 
     errors = residual_errors("residual_error_max")
     body_errors = residual_errors("multibody_residual_error_max")
-    wide_command = table.command + " --set x_initial=[0,0,0,0] x_spread=[.2,.5,.5,.5]"
+    commands = {name: comparison.with_settings(s) for name, s in variants.items()}
     all_settled = all(r.get("settled") for r in near)
     # A run that ended in an error proves nothing: its key is missing.
     none_plain = all(r.get("settled_without_adaptation") is False for r in near)
@@ -294,16 +297,16 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         text = "-" if share is None else f"{100 * share:.0f} %"
         paper = "100 %" if name == "agreed_free" else "0 %"
         row(f"fig. 3: no gradient, {name.replace('_', ' ')}", paper, text)
-    row("start anywhere: stabilised", "-", count(wide, "settled"), command=wide_command)
+    its = commands["wide"]
+    row("start anywhere: stabilised", "-", count(wide, "settled"), command=its)
     ours = count(wide, "settled_without_adaptation")
-    row("start anywhere, without adaptation", "-", ours, command=wide_command)
+    row("start anywhere, without adaptation", "-", ours, command=its)
     ours = count(dynamics, "settled")
-    dynamics_command = wide_command + " learner=r_dyn"
-    row("start anywhere, residual on the dynamics", "-", ours, command=dynamics_command)
+    its = commands["dynamics"]
+    row("start anywhere, residual on the dynamics", "-", ours, command=its)
     ours = count(right, "settled")
-    right_command = wide_command + " gap_error=[0,0] adapt=false"
-    row("start anywhere, walls known", "-", ours, command=right_command)
-    return table.table(
+    row("start anywhere, walls known", "-", ours, command=commands["right"])
+    return comparison.to_table(
         "Cart-pole with soft walls (ACI-MPC VII-A)",
         [
             "A wall that is neither met nor expected teaches nothing: from most states "

@@ -360,11 +360,11 @@ VARIANTS: dict[str, dict] = {
 
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     """Figures 9 and 10 beside ours, over seeds; another tool, other speeds."""
-    table = Comparison("changing_surface", session, jobs)
-    row = table.row
+    comparison = Comparison("changing_surface", session, jobs)
+    row = comparison.row
 
     def many(settings, n):
-        results = table.runs(settings, n)
+        results = comparison.runs(settings, n)
         return results, [r for r in results if "changes" in r]
 
     main, ended = many({}, seeds)
@@ -431,7 +431,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     for label, settings in VARIANTS.items():
         settings = {**settings, "baselines": False}
         results, runs = many(settings, max(1, seeds // 2))
-        its = table.with_settings(settings)
+        its = comparison.with_settings(settings)
         if not runs:
             row(label, "-", "no run ended", False, command=its)
             continue
@@ -445,7 +445,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
             command=its,
         )
         row(f"{label}: tracking error", "-", errors("adaptive", runs)[1], command=its)
-    return table.table(
+    return comparison.to_table(
         "Three unknown surfaces (CC 4.3, figures 9 and 10)",
         [
             "Delays count from when the last foot of the block is across. The paper "

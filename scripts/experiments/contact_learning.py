@@ -363,9 +363,9 @@ VARIANTS: dict[str, dict] = {
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     """Table 1 and figure 18 beside ours; other tool, errors of the station, other
     rule, faster start."""
-    table = Comparison("contact_learning", session, jobs)
-    row = table.row
-    main = table.runs({}, seeds)
+    comparison = Comparison("contact_learning", session, jobs)
+    row = comparison.row
+    main = comparison.runs({}, seeds)
     ended = [r for r in main if "completion_time_s" in r]
     if not ended:
         raise RuntimeError(f"no run ended: {main[0].get('error')}")
@@ -471,13 +471,13 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     for label, settings in VARIANTS.items():
         runs = [
             r
-            for r in table.runs(settings, max(1, seeds // 4))
+            for r in comparison.runs(settings, max(1, seeds // 4))
             if "completion_time_s" in r
         ]
         if not runs:
             row(label, "-", "no run ended")
             continue
-        its = table.with_settings(settings)
+        its = comparison.with_settings(settings)
         F = of("impact_force_peak_N", runs)
         row(
             f"{label}: impact force in trial 1; from trial {FORCE_FROM}",
@@ -490,7 +490,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         row(f"{label}: time of trial 1 -> 5", "-", times(runs)[0], command=its)
         wrong = [r["missed_contacts"] + r["false_contacts"] for r in runs]
         row(f"{label}: contacts missed or false", "-", str(sum(wrong)), command=its)
-    return table.table(
+    return comparison.to_table(
         "Three contacts, learned in five trials (CC 4.5.1, table 1, figure 18)",
         [
             "Errors are along the motion into each contact. Force: F100. A robot and a "

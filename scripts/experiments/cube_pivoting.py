@@ -240,9 +240,9 @@ VARIANTS = _variants()
 
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     """How many starts succeed, as it is and with each thing changed."""
-    table = Comparison("cube_pivoting", session, jobs)
-    for what, settings in VARIANTS.items():
-        results = table.runs(settings, seeds)
+    comparison = Comparison("cube_pivoting", session, jobs)
+    for what, results in comparison.runs_of(VARIANTS, seeds).items():
+        settings = VARIANTS[what]
         count = sum(bool(r.get("success")) for r in results)
         times = [r["time_to_goal_s"] for r in results if r.get("success")]
         forces = [r["force_max_N"] for r in results if "force_max_N" in r]
@@ -252,7 +252,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         if forces:
             text += f"; at most {max(forces):.0f} N"
         good = None if settings else count == len(results)
-        table.row(what, "-", text, good, table.with_settings(settings))
-    return table.table(
+        comparison.row(what, "-", text, good, comparison.with_settings(settings))
+    return comparison.to_table(
         "A cube tipped by 90 degrees: starts that succeed, median time, largest force"
     )

@@ -308,13 +308,13 @@ def plots(session, ours, logs, learning, bad, swept):
 
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     """Figures 5 to 7 in numbers, over seeds."""
-    table = Comparison("multi_spring", session, jobs)
-    good = [r for r in table.runs({}, seeds) if "error" not in r]
+    comparison = Comparison("multi_spring", session, jobs)
+    good = [r for r in comparison.runs({}, seeds) if "error" not in r]
 
     def row(what, paper, ours, target=None):
         if target is not None:
             target = target and len(good) == seeds
-        table.row(what, paper, ours, target)
+        comparison.row(what, paper, ours, target)
 
     def values(key, pick=None):
         return [r[key] if pick is None else r[key][pick] for r in good]
@@ -374,18 +374,18 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     row("constant K_free", "-", mm("constant_free_error_rms_m"))
     row("last measured force as prediction", "-", mm("measured_force_error_rms_m"))
     for setting, errors_in in compare(seeds).items():
-        table.row(f"{SETTING_NAMES[setting]}:", "", "", command="")
+        comparison.row(f"{SETTING_NAMES[setting]}:", "", "", command="")
         ours = np.array(next(iter(errors_in.values())))
         for name, found in errors_in.items():
             text = median_range(found, 1e3, "mm")
             if name != next(iter(errors_in)):
                 text += f", {median_range(np.array(found) / ours)} times"
             label = f"  {name.replace('_', ' ')}"
-            table.row(label, "-", text, command="reproduce alone")
+            comparison.row(label, "-", text, command="reproduce alone")
     notes = ["Medians over seeds (least to greatest). A target holds for every seed."]
     if len(good) < seeds:
         notes.append(f"{seeds - len(good)} of {seeds} runs failed.")
-    return table.table(
+    return comparison.to_table(
         "Three springs: adaptive impedance and adaptive control (CC 4.2)",
         notes,
     )

@@ -353,11 +353,11 @@ VARIANTS: dict[str, dict] = {
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     """Figure 16's numbers beside ours, over seeds, with the sphere and the block, with
     errors of the station, and where the stiffness is told."""
-    table = Comparison("multiple_collisions", session, jobs)
-    runs = {name: table.runs(settings, seeds) for name, settings in VARIANTS.items()}
+    comparison = Comparison("multiple_collisions", session, jobs)
+    runs = comparison.runs_of(VARIANTS, seeds)
 
     for tool, results in runs.items():
-        command = table.with_settings(VARIANTS[tool])
+        command = comparison.with_settings(VARIANTS[tool])
         first_max = TOLD_MAX if tool == TOLD else FIRST_MAX
 
         def values(key, results=results):
@@ -369,7 +369,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
             return np.array(out)
 
         def row(what, paper, ours, good=None, tool=tool, command=command):
-            table.row(f"{tool}: {what}", paper, ours, good, command)
+            comparison.row(f"{tool}: {what}", paper, ours, good, command)
 
         def spread(x, unit, digits=1):
             if np.isnan(x).any():
@@ -424,7 +424,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         )
         good = most(x, 0)
         row("contacts missed or false", "-", f"{np.nansum(x):.0f}", good)
-    return table.table(
+    return comparison.to_table(
         "Multiple collisions (CC 4.5.1, figure 16)",
         [
             "Impact force: F100; the stiffness of each surface is drawn from 5e3 to "

@@ -231,8 +231,8 @@ def sizes_text(results, k: int) -> str:
 
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     """Figure 4 in numbers, over seeds."""
-    table = Comparison("porridge", session, jobs)
-    good = [r for r in table.runs({}, seeds) if "error" not in r]
+    comparison = Comparison("porridge", session, jobs)
+    good = [r for r in comparison.runs({}, seeds) if "error" not in r]
 
     def row(what, paper, key, scale, unit, bound=None):
         values = [r[key] for r in good]
@@ -240,7 +240,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         if bound is not None:
             text = with_count(values, bound)
             target = len(good) == seeds and min(values) >= bound
-        table.row(what, paper, text, target)
+        comparison.row(what, paper, text, target)
 
     papers = {"fixed": "poor", "incremental": "good"}
     for name, label in MODELS.items():
@@ -253,7 +253,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         row(f"fig. 4: within training, {label}", paper, key, 1.0, "N")
     for k, n in enumerate(SIZES):
         what = f"beyond training, fixed mixture of {n}"
-        table.row(what, "-", sizes_text(good, k))
+        comparison.row(what, "-", sizes_text(good, k))
     what = "fixed over incremental, beyond training"
     row(what, "-", "fixed_over_incremental", 1.0, "", RATIO_BOUND)
     row("frozen over incremental", "-", "frozen_over_incremental", 1.0, "")
@@ -269,7 +269,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     notes = ["Medians over seeds (least to greatest). A target holds for every seed."]
     if len(good) < seeds:
         notes.append(f"{seeds - len(good)} of {seeds} runs failed.")
-    return table.table(
+    return comparison.to_table(
         "Stirring porridge: fixed and incremental models (CC 4.1)",
         notes,
     )

@@ -265,11 +265,11 @@ VARIANTS: dict[str, dict] = {
 
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     """Figures 19 and 20 beside ours, over seeds; less anticipation; another tool."""
-    table = Comparison("surface_switch", session, jobs)
-    row = table.row
+    comparison = Comparison("surface_switch", session, jobs)
+    row = comparison.row
 
     def many(settings, n):
-        results = table.runs(settings, n)
+        results = comparison.runs(settings, n)
         return results, [r for r in results if "met_done" in r]
 
     def of(key, runs):
@@ -328,7 +328,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         )
     for label, settings in VARIANTS.items():
         _, runs = many(settings, max(1, seeds // 2))
-        its = table.with_settings(settings)
+        its = comparison.with_settings(settings)
         if not runs:
             row(label, "-", "no run ended", False, command=its)
             continue
@@ -343,7 +343,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
                 means(values, scale, unit, digits),
                 command=its,
             )
-    return table.table(
+    return comparison.to_table(
         "Surfaces that change, anticipated (CC 4.5.2, figures 19 and 20)",
         [
             "The paper shows one run on a robot, as pictures. Its trial 1 has K_free "

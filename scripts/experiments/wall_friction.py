@@ -390,8 +390,8 @@ def plot_forces(data, scratch, ahead):
 
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     """Figures 11 to 14 beside ours; each seed has its own training."""
-    table = Comparison("wall_friction", session, jobs)
-    row, results = table.row, table.runs({}, seeds)
+    comparison = Comparison("wall_friction", session, jobs)
+    row, results = comparison.row, comparison.runs({}, seeds)
     done = [r for r in results if "error" not in r]
 
     def mean(key):
@@ -447,7 +447,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         ("predictor_one_step", "the baseline's prediction, a sample"),
     ):
         row(label, "-", f"{online.get(name, np.nan):.2f} ms")
-    return table.table(
+    return comparison.to_table(
         "A wall of unknown friction (CC 4.4)",
         [
             "Errors along the wall, rms, mean (joints: median) over seeds (least to "

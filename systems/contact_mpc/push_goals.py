@@ -108,17 +108,23 @@ class PushGoals(LeafSystem):
             return
         x = np.asarray(self._x.Eval(context))
         there = False
-        if self._valid.Eval(context)[0] > 0.5 and np.isfinite(x).all():
+        is_seen = self._valid.Eval(context)[0] > 0.5 and np.isfinite(x).all()
+
+        def turn_of(goal):
+            return nearest_turn(goal[2], heading(x[Q_BALL]), self._fold)
+
+        if is_seen:
             goal = self._goals[int(number)].copy()
             if np.isnan(turn):
-                turn = nearest_turn(goal[2], heading(x[Q_BALL]), self._fold)
+                turn = turn_of(goal)
             goal[2] += turn
             off = errors(x, goal)
             there = all(a < c.share * b for a, b in zip(off, c.tolerance, strict=True))
         held = held + c.period_sec if there else 0.0
         if held >= c.dwell_sec or t - since >= c.limit_sec:
             number, since, held = number + 1.0, t, 0.0
-            turn = np.nan if number < len(self._goals) else turn
+            if number < len(self._goals):  # At once: others read it at this instant.
+                turn = turn_of(self._goals[int(number)]) if is_seen else np.nan
         discrete_state.set_value(self._state, [number, since, held, turn])
 
 

@@ -24,9 +24,9 @@ _NOWHERE = RigidTransform([0.0, 0.0, -5.0])
 _BESIDE = np.array([0.045, -0.045, 0.06])  # Of the tip, where the mode is seen [m].
 _REGIONS = 6  # Of each kind that can be seen at once.
 _KIND_COLORS = {IMPACT: Rgba(0.9, 0.2, 0.2, 0.3), IMPACTLESS: Rgba(0.2, 0.4, 0.95, 0.3)}
-# Unknown, free, then the modes in their order, again from the third on.
 _TARGET, _TRACK, _FORCE = Rgba(0.1, 0.1, 0.2), Rgba(1.0, 0.5, 0.0), Rgba(0.1, 0.1, 0.1)
 _GOOD, _BAD = Rgba(0.3, 0.7, 0.3), Rgba(0.85, 0.25, 0.2)  # Bars.
+# Unknown, free, then the modes in their order, again from the third on.
 _MODE_COLORS = (
     Rgba(1.0, 1.0, 1.0),
     Rgba(0.6, 0.6, 0.6),
@@ -69,7 +69,7 @@ class ContactView(LeafSystem):
         ("target path", _TARGET),
         ("track of the tool", _TRACK),
         ("ball beside the tool: no contact", _MODE_COLORS[1]),
-        ("the same: first contact mode", _MODE_COLORS[2]),
+        ("ball beside the tool: first contact mode", _MODE_COLORS[2]),
     )
 
     def __init__(
@@ -95,7 +95,7 @@ class ContactView(LeafSystem):
             limit = f"{config.peak_limit:g} N"
             self.legend += [
                 (f"bars: peak forces so far, up to {limit}", _GOOD),
-                (f"the same, above {limit}", _BAD),
+                (f"bars: above {limit}", _BAD),
             ]
         meshcat.SetCameraPose(config.camera, self.LOOK_AT)
         self._target = Trail(meshcat, f"{_ROOT}/target", _TARGET, 2.0)

@@ -13,8 +13,8 @@ from makebreak.systems.views.numerics.text_board import text_board
 
 ROOT = "/makebreak/legend"
 # Of the board's upper left corner as the camera sees it: to the right, up and away, and
-# a line's height. Meshcat sees 37 degrees up and down, and more to the sides.
-_CORNER, _LINE = np.array([-0.9, 0.62, 1.0]), 0.04
+# a line's height. Meshcat sees 37 degrees up and down, and as the page is wide.
+_CORNER, _LINE = np.array([-0.75, 0.62, 1.0]), 0.04
 
 
 @dataclass
@@ -45,7 +45,7 @@ class Legend(LeafSystem):
             self._draw(path, [(text, None)], len(config.lines) + 0.3)
             meshcat.SetProperty(path, "visible", False)
         if config.phases:
-            self._shown: int | None = None  # What the page shows.
+            self._shown, self._time = -2, np.inf  # What the page shows, since when.
             self.DeclarePeriodicPublishEvent(config.period_sec, 0.0, self._publish)
 
     def _draw(self, path, lines, below: float):
@@ -62,10 +62,12 @@ class Legend(LeafSystem):
         self._meshcat.SetObject(path, Mesh(mesh, _LINE), Rgba(1.0, 1.0, 1.0))
         camera = np.array(self._config.camera, dtype=float)
         away = np.array(self._config.look_at) - camera
+        if not np.linalg.norm(away) > 0.0:
+            raise ValueError(f"camera is at {camera}, expected not where it looks at")
         away /= np.linalg.norm(away)
         right = np.cross(away, [0.0, 0.0, 1.0])
-        if np.linalg.norm(right) < 1e-6:  # Straight down: any up will do.
-            right = np.cross(away, [1.0, 0.0, 0.0])
+        if np.linalg.norm(right) < 1e-6:  # Straight down: so Meshcat turns it.
+            right = np.array([1.0, 0.0, 0.0])
         right /= np.linalg.norm(right)
         up = np.cross(right, away)
         turn = RotationMatrix(np.column_stack([-away, right, up]))
@@ -78,12 +80,14 @@ class Legend(LeafSystem):
             return
         value = self._phase.Eval(context)[0]
         phase = int(value) if np.isfinite(value) else -1
-        if phase == self._shown:
-            return
-        self._shown = phase
-        for k in range(len(self._config.phases)):
-            path, t = f"{ROOT}/phase/{k}", context.get_time()
-            self._meshcat.SetProperty(path, "visible", k == phase, t)
+        t = context.get_time()
+        # Where time went back another simulation began, perhaps another recording.
+        is_known = phase == self._shown and t >= self._time
+        self._shown, self._time = phase, t
+        if not is_known:
+            for k in range(len(self._config.phases)):
+                path = f"{ROOT}/phase/{k}"
+                self._meshcat.SetProperty(path, "visible", k == phase, t)
 
 
 def _on_white(color: Rgba) -> tuple[float, float, float]:

@@ -12,6 +12,7 @@ _TRACE_DOTS = 120
 _ROOT = "/makebreak/planar"
 
 _EFFECTOR, _TARGET = Rgba(0.13, 0.4, 0.9), Rgba(0.95, 0.55, 0.1)
+_SPRING = Rgba(0.4, 0.4, 0.4)
 
 
 @dataclass
@@ -38,6 +39,7 @@ class PlanarView(LeafSystem):
     LEGEND = (
         ("effector, and its path", _EFFECTOR),
         ("target, and its path", _TARGET),
+        ("springs: the thicker, the stiffer", _SPRING),
     )
 
     def __init__(
@@ -69,9 +71,7 @@ class PlanarView(LeafSystem):
         for i, (anchor, k) in enumerate(zip(self._anchors, c.stiffness, strict=True)):
             radius = 0.002 + 0.006 * k / max(c.stiffness)
             name = self._spring(i)
-            meshcat.SetObject(
-                f"{name}/coil", Cylinder(radius, 1.0), Rgba(0.4, 0.4, 0.4)
-            )
+            meshcat.SetObject(f"{name}/coil", Cylinder(radius, 1.0), _SPRING)
             meshcat.SetObject(f"{name}_anchor", Sphere(0.02), Rgba(0.2, 0.2, 0.2))
             meshcat.SetTransform(f"{name}_anchor", RigidTransform([*anchor, _HEIGHT]))
         self.DeclarePeriodicPublishEvent(c.period_sec, offset_sec, self._publish)

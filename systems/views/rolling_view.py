@@ -12,9 +12,6 @@ from makebreak.systems.views.numerics.trail import Trail
 _PATH, _TRACK = Rgba(0.1, 0.1, 0.2), Rgba(1.0, 0.5, 0.0)
 _MODEL, _RESIDUAL = Rgba(0.3, 0.5, 1.0, 0.25), Rgba(0.2, 0.45, 1.0)
 
-_PATH, _TRACK = Rgba(0.1, 0.1, 0.2), Rgba(1.0, 0.5, 0.0)
-_GHOST, _BAR = Rgba(0.3, 0.5, 1.0, 0.25), Rgba(0.2, 0.45, 1.0)
-
 
 @dataclass
 class RollingViewConfig:
@@ -36,16 +33,16 @@ class RollingView(LeafSystem):
 
     BAR = "/makebreak/r_comp"
     CAMERA, LOOK_AT = (1.12, -0.62, 0.52), (0.4, 0.0, 0.16)  # [m]
-    LEGEND = (
-        ("path to follow", _PATH),
-        ("track of the ball", _TRACK),
-        ("ball as the model has it", _MODEL),
-        ("learned residual, as a gap, times 10", _RESIDUAL),
-    )
 
     def __init__(self, config: RollingViewConfig, meshcat: Meshcat):
         super().__init__()
         self._config, self._meshcat = config, meshcat
+        self.legend = [
+            ("path to follow", _PATH),
+            ("track of the ball", _TRACK),
+            ("ball in the controller's model", _MODEL),
+            (f"learned gap, {config.gap_scale:g} times as long", _RESIDUAL),
+        ]
         self._p_ball = self.DeclareVectorInputPort("p_ball", 3)
         self._x = self.DeclareVectorInputPort("x", N_X)
         self._gap = self.DeclareVectorInputPort("gap", 1)

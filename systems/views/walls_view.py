@@ -25,7 +25,7 @@ class WallsView(LeafSystem):
     Inputs: r_comp (2,) learned error of the distances [m].
     """
 
-    LEGEND = (("wall as it is believed", _WALL),)
+    LEGEND = (("wall in the controller's model", _WALL),)
 
     def __init__(
         self, config: WallsViewConfig, meshcat: Meshcat, offset_sec: float = 0.0

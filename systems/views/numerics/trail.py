@@ -6,11 +6,14 @@ it is drawn in pieces, each of which becomes visible at its time.
 
 import numpy as np
 
-PIECE = 8  # Points of a piece; with a point each 0.1 s it is seen 0.8 s late at most.
+PIECE = 8  # Points of a piece.
 
 
 class Trail:
     """Draws points that are appended to, on a Meshcat.
+
+    Where a recording is played the last few points, fewer than a piece, are seen once
+    the trail has ended.
 
     Args: path: in Meshcat's tree. color: Rgba. width [pixels].
     """
@@ -18,7 +21,8 @@ class Trail:
     def __init__(self, meshcat, path: str, color, width: float = 4.0):
         self._meshcat, self._path = meshcat, path
         self._color, self._width = color, width
-        self._run, self._pieces, self._first = 0, 0, np.full(3, np.nan)
+        self._run, self._pieces = 0, 0
+        self._points, self._seen_at = np.zeros((0, 3)), 0.0
         meshcat.Delete(path)
 
     def show(self, points: np.ndarray, t: float) -> None:
@@ -26,24 +30,37 @@ class Trail:
         are a new trail, and the one before is taken away. t [s]."""
         if not len(points):
             return
-        is_new = not np.array_equal(points[0], self._first)
-        if is_new or len(points) < self._pieces * PIECE:
-            for k in range(self._pieces):
-                self._set_visible(k, False, t)
-            self._meshcat.Delete(self._now)
-            self._run, self._pieces, self._first = self._run + 1, 0, points[0].copy()
+        known = self._points
+        if len(known) and not (
+            len(points) >= len(known) and np.array_equal(points[0], known[0])
+        ):
+            self._take_away(t)
         while len(points) > (self._pieces + 1) * PIECE:
-            start = self._pieces * PIECE
-            self._draw(self._piece(self._pieces), points[start : start + PIECE + 1])
-            self._set_visible(self._pieces, False, 0.0)
-            self._set_visible(self._pieces, True, t)
-            self._pieces += 1
+            self._add(points[self._pieces * PIECE :][: PIECE + 1], t)
         rest = points[self._pieces * PIECE :]
         if len(rest) > 1:
             self._draw(self._now, rest)
-            # Where it is played again the last piece is seen once it is whole.
-            self._meshcat.SetProperty(self._now, "visible", False, 0.0)
-            self._meshcat.SetProperty(self._now, "visible", True)
+            # The line that is there in the end is seen from its last change on.
+            for seen, at in ((False, 0.0), (False, self._seen_at), (True, t)):
+                self._meshcat.SetProperty(self._now, "visible", seen, at)
+            self._seen_at = t
+        self._points = points
+
+    def _take_away(self, t: float) -> None:
+        rest = self._points[self._pieces * PIECE :]
+        if len(rest) > 1:
+            self._add(rest, self._seen_at)
+        for k in range(self._pieces):
+            self._meshcat.SetProperty(self._piece(k), "visible", False, t)
+        self._meshcat.Delete(self._now)
+        self._run, self._pieces = self._run + 1, 0
+
+    def _add(self, points: np.ndarray, t: float) -> None:
+        path = self._piece(self._pieces)
+        self._draw(path, points)
+        for seen, at in ((False, 0.0), (True, t)):
+            self._meshcat.SetProperty(path, "visible", seen, at)
+        self._pieces += 1
 
     @property
     def _now(self) -> str:
@@ -51,9 +68,6 @@ class Trail:
 
     def _piece(self, k: int) -> str:
         return f"{self._path}/{self._run}/{k}"
-
-    def _set_visible(self, k: int, is_visible: bool, t: float) -> None:
-        self._meshcat.SetProperty(self._piece(k), "visible", is_visible, t)
 
     def _draw(self, path: str, points: np.ndarray) -> None:
         self._meshcat.SetLine(path, points.T, self._width, self._color)
