@@ -623,10 +623,36 @@ def test_the_task_travels_pushes_and_waits_for_what_is_not_seen(planner):
     assert task.p[2] > 0.07 and np.hypot(*(task.p[:2] - config.withdrawn)) < 0.01
 
 
+def test_a_tip_comes_down_farther_out_and_goes_in_along_the_table(planner):
+    """An object that reaches 10 mm farther out than believed is not landed on."""
+    shape, config = planner[2], PushConfig()
+    for k in range(0, 12, 3):
+        x = state([0.35, 0.0, 0.1], (0.5, 0.0, 0.3))
+        place = places_of(planner)[0][k, :2]
+        in_object = to_object(x, place)
+        outline = outline_at((0.5, 0.0, 0.3))
+        task = PushState(WAIT, x[P_TIP].copy(), np.zeros(3), np.zeros(3))
+        way = []
+        for _ in range(800):
+            task = next_push(
+                config, task, shape, 0.0125, x, True, in_object, 1, HEIGHT, 0.004
+            )
+            x[P_TIP] = task.p
+            way.append(task.p)
+            if task.phase == CONTACT:
+                break
+        assert task.phase == CONTACT
+        assert np.hypot(*(task.p[:2] - place)) < 2e-3
+        way = np.array(way)
+        falling = way[(way[:, 2] < 0.0595) & (way[:, 2] > HEIGHT + 0.0021)]
+        near = distance_to_outline(falling[:, :2], outline) - 0.0195
+        assert len(falling) > 10 and near.min() > 0.0075  # 4 mm, and room for 8.
+
+
 def test_a_tip_that_comes_down_on_the_object_goes_up_and_comes_down_farther_out(
     planner,
 ):
-    shape, config = planner[2], PushConfig()
+    shape, config = planner[2], PushConfig(room=0.0)
     x = state([0.35, 0.0, 0.1], (0.5, 0.0, 0.3))
     place = places_of(planner)[0][0, :2]
     in_object = to_object(x, place)

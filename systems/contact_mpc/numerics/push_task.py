@@ -20,6 +20,7 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
 )
 from makebreak.systems.contact_mpc.numerics.contact_sampling import (
     ObjectShape,
+    distance_to_outline,
     in_reach,
     inward,
     outline_of,
@@ -36,6 +37,7 @@ PLACE_CHANGE = 0.008
 # object, which is larger than believed, or elsewhere: it goes up, and after that comes
 # down so much farther out; not farther than EXTRA_MAX, where it no longer matters [m].
 MISSED, EXTRA, EXTRA_MAX = 0.01, 0.003, 0.012
+LOW = 2e-3  # So little above the table's height for pushing the tip is down [m].
 # Each landing that does not miss takes so much of it back [m].
 TAKEN_BACK = 0.001
 
@@ -45,6 +47,9 @@ class PushConfig:
     speed: float = 0.35  # Of a travelling tip [m/s].
     acceleration: float = 2.0  # [m/s2]
     descent: float = 0.08  # Of one that comes down beside the object [m/s].
+    # So much farther out than its place, where there is room, and then to it along the
+    # table: coming down on an edge, the tip is wedged between arm and object.
+    room: float = 0.008  # [m]
     margin: float = 0.012  # Between tip and object where it passes above [m].
     # C3's target is at most so far from where the object is.
     look_ahead: float = 0.06  # [m]
@@ -170,6 +175,11 @@ def next_push(
     if held is None or np.hypot(*(now - held)) > PLACE_CHANGE:
         held = now
     goal = np.array([*held, height])
+    if state.p[2] > height + LOW:
+        beside = held - config.room * inward(held[None], outline)[0]
+        near = distance_to_outline(beside[None], outline)[0]
+        if near > shape.tip_radius + clearance + 0.5 * config.room:
+            goal[:2] = beside
     # An object that is larger than believed is higher, too.
     descent = config.descent, shape.clear_height(0.5 * config.margin)
     p, v, a, arrived = travel_step(
