@@ -13,11 +13,11 @@ from pydrake.common.schema import Transform
 from pydrake.multibody.parsing import AddModel, AddWeld, ModelDirective
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder, OutputPort
-from pydrake.systems.primitives import Adder
 
 from makebreak.diagrams.camera import CameraConfig, camera_model
 from makebreak.diagrams.fault_kinds import TICK, Injected
 from makebreak.diagrams.scene_facts import actuators_of, spheres_of
+from makebreak.diagrams.wiring import add_generalized_forces
 from makebreak.models.effects.joint_forces import JointForces
 from makebreak.models.effects.joints import fade_velocity
 from makebreak.models.scene import LoadedScene, Scene
@@ -211,21 +211,7 @@ def add_forces(
         builder.AddNamedSystem(name, system)
         builder.Connect(plant.get_state_output_port(), system.GetInputPort("state"))
         forces.append(system.GetOutputPort("generalized_force"))
-    if not forces:
-        return
-    into = plant.get_applied_generalized_force_input_port()
-    # (system, port) of what the scene has there already.
-    before = builder.connection_map().get((plant, into.get_index()))
-    if before is not None:
-        source = before[0].get_output_port(before[1])
-        builder.Disconnect(source, into)
-        forces.append(source)
-    total = builder.AddNamedSystem(
-        "fault_forces", Adder(len(forces), plant.num_velocities())
-    )
-    for i, port in enumerate(forces):
-        builder.Connect(port, total.get_input_port(i))
-    builder.Connect(total.get_output_port(), into)
+    add_generalized_forces(builder, plant, forces)
 
 
 def faulty_lcs(

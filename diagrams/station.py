@@ -22,11 +22,13 @@ from makebreak.diagrams.faults import (
 )
 from makebreak.diagrams.realism import StationErrors
 from makebreak.diagrams.scene_facts import actuators_of
+from makebreak.diagrams.wiring import add_generalized_forces
 from makebreak.models.effects import KINDS
 from makebreak.models.model_files import MODELS
 from makebreak.models.scene import InitialSection, Scene, load_scene, read_scene
 from makebreak.systems.arm.impedance_controller import serial_chain_of
 from makebreak.systems.arm.tool_wrench import ToolWrench
+from makebreak.systems.faults.fault_forces import BodyForce
 from makebreak.systems.faults.fault_signals import LateSignal
 from makebreak.systems.faults.safety_monitor import ArmLimits, SafetyMonitor
 from makebreak.systems.perception.noisy_sensor import (
@@ -39,6 +41,7 @@ from makebreak.systems.views.contact_probe import (
     ToolContactForce,
     TrueTip,
 )
+from makebreak.systems.views.push_button import PushButton
 
 BALL_ROLLING = str(MODELS / "ball_rolling.scene.yaml")
 ARM, TOOL, TIP_FRAME = "panda", "finger", "tip"
@@ -280,6 +283,13 @@ def make_station(
     if faults:
         _add_monitor(builder, plant, limit)
     if meshcat is not None:
+        button = builder.AddNamedSystem("push_button", PushButton(meshcat))
+        push = builder.AddNamedSystem("push", BodyForce(plant, tool_body))
+        builder.Connect(plant.get_state_output_port(), push.GetInputPort("state"))
+        builder.Connect(button.GetOutputPort("force"), push.GetInputPort("force"))
+        add_generalized_forces(
+            builder, plant, [push.GetOutputPort("generalized_force")]
+        )
         parameters = MeshcatVisualizerParams(publish_period=config.meshcat_period_sec)
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, parameters)
     diagram = builder.Build()

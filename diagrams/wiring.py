@@ -5,8 +5,9 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 from pydrake.geometry import Meshcat
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder, LeafSystem, OutputPort
-from pydrake.systems.primitives import Demultiplexer
+from pydrake.systems.primitives import Adder, Demultiplexer
 
 from makebreak.systems.views.legend import Legend, LegendConfig
 
@@ -59,3 +60,21 @@ def add_legend(
     legend = builder.AddNamedSystem("legend", Legend(config, meshcat))
     if phase is not None:
         builder.Connect(phase, legend.GetInputPort("phase"))
+
+
+def add_generalized_forces(
+    builder: DiagramBuilder, plant: MultibodyPlant, forces: Sequence[OutputPort]
+) -> None:
+    """Ports (n_v,) to a plant, beside the forces that the scene has there already."""
+    if not forces:
+        return
+    into = plant.get_applied_generalized_force_input_port()
+    ports = list(forces)
+    before = builder.connection_map().get((plant, into.get_index()))
+    if before is not None:  # (system, port)
+        ports.append(before[0].get_output_port(before[1]))
+        builder.Disconnect(ports[-1], into)
+    total = builder.AddSystem(Adder(len(ports), plant.num_velocities()))
+    for i, port in enumerate(ports):
+        builder.Connect(port, total.get_input_port(i))
+    builder.Connect(total.get_output_port(), into)

@@ -14,43 +14,56 @@ HAND_HEIGHT = 1.2  # [m] Above any camera.
 ASIDE = 0.12  # [m] First to the side, from under whatever presses on it.
 
 
-class Push(LeafSystem):
-    """A constant force on a body's origin, from `start` on and before `end` [s].
+class BodyForce(LeafSystem):
+    """A force on a body's origin, as generalized forces.
 
-    Inputs:  state (n_x,) of the plant.
+    Inputs:  state (n_x,) of the plant; force (3,) in the world [N].
     Outputs: generalized_force (n_v,).
-
-    Args: force (3,) in the world [N].
     """
 
-    def __init__(self, plant: MultibodyPlant, body, force, start, end):
+    def __init__(self, plant: MultibodyPlant, body):
         super().__init__()
         self._plant, self._body = plant, body
-        self._force = np.array(force, dtype=float)
-        self._start, self._end = float(start), float(end)
         self._scratch = plant.CreateDefaultContext()
         self._state = self.DeclareVectorInputPort("state", plant.num_multibody_states())
+        self._force_on = self.DeclareVectorInputPort("force", 3)
         self.DeclareVectorOutputPort(
             "generalized_force", plant.num_velocities(), self._calc
         )
 
+    def _force(self, context) -> np.ndarray:
+        return self._force_on.Eval(context)
+
     def _calc(self, context, output):
-        force = np.zeros(self._plant.num_velocities())
-        if lasts(context.get_time(), self._start, self._end):
-            self._plant.SetPositionsAndVelocities(
-                self._scratch, self._state.Eval(context)
-            )
-            world = self._plant.world_frame()
-            J = self._plant.CalcJacobianTranslationalVelocity(
-                self._scratch,
-                JacobianWrtVariable.kV,
-                self._body.body_frame(),
-                np.zeros(3),
-                world,
-                world,
-            )
-            force = J.T @ self._force
-        output.SetFromVector(force)
+        plant, force = self._plant, self._force(context)
+        if not np.any(force):
+            output.SetZero()
+            return
+        plant.SetPositionsAndVelocities(self._scratch, self._state.Eval(context))
+        world = plant.world_frame()
+        J = plant.CalcJacobianTranslationalVelocity(
+            self._scratch,
+            JacobianWrtVariable.kV,
+            self._body.body_frame(),
+            np.zeros(3),
+            world,
+            world,
+        )
+        output.SetFromVector(J.T @ force)
+
+
+class Push(BodyForce):
+    """A constant force (3,) in the world [N] from `start` on and before `end` [s]; its
+    input of that name is not read."""
+
+    def __init__(self, plant: MultibodyPlant, body, force, start, end):
+        super().__init__(plant, body)
+        self._constant = np.array(force, dtype=float)
+        self._start, self._end = float(start), float(end)
+
+    def _force(self, context) -> np.ndarray:
+        acts = lasts(context.get_time(), self._start, self._end)
+        return self._constant if acts else np.zeros(3)
 
 
 class Hand(LeafSystem):
