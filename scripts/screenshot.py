@@ -14,19 +14,22 @@ LIMIT_SEC = 300
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
-def screenshot(page: Path, picture: Path, size=(1280, 800), wait_ms: int = 15000):
+def screenshot(page: Path | str, picture: Path, size=(1280, 800), wait_ms: int = 15000):
     """Draws `page` with a browser's software renderer and writes `picture`.
 
     Args:
-        page: an HTML file.
+        page: an HTML file, or the address of one, as of a Meshcat that runs.
         picture: the PNG to write.
         size: width and height [pixels].
         wait_ms: how long the page may take, on its own clock [ms].
     Raises: ValueError if there is no page or no browser; RuntimeError if the browser
         writes no picture.
     """
-    if not page.is_file():
-        raise ValueError(f'page: got "{page}", expected an HTML file')
+    address = str(page)
+    if not address.startswith("http://"):
+        if not Path(page).is_file():
+            raise ValueError(f'page: got "{page}", expected an HTML file')
+        address = Path(page).resolve().as_uri()
     browser = next(filter(None, map(shutil.which, _BROWSERS)), None)
     if browser is None:
         raise ValueError("no browser found, expected one of: " + ", ".join(_BROWSERS))
@@ -47,7 +50,7 @@ def screenshot(page: Path, picture: Path, size=(1280, 800), wait_ms: int = 15000
             f"--window-size={size[0]},{size[1]}",
             f"--virtual-time-budget={wait_ms}",
             f"--screenshot={taken}",
-            page.resolve().as_uri(),
+            address,
         ]
         try:
             done = subprocess.run(
@@ -65,7 +68,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description="A picture of a meshcat.html, taken without a screen."
     )
-    parser.add_argument("page", type=Path)
+    parser.add_argument("page", help="an HTML file, or http://...")
     parser.add_argument("picture", type=Path)
     args = parser.parse_args()
     try:

@@ -34,6 +34,7 @@ from makebreak.models.scene_file import write_scene
 from makebreak.scripts.compiling import CompilingShown
 from makebreak.scripts.diagram_picture import draw_diagram, shown_systems
 from makebreak.scripts.interrupts import handled, leave_terminal, undisturbed
+from makebreak.scripts.meshcat_page import page_of
 from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.recording_stream import RecordingStream
 from makebreak.scripts.run_buttons import RunButtons
@@ -499,7 +500,7 @@ class Session:
                     self._write(name, partial(_save_figure, fig))
                 if self.meshcat is not None:
                     self.meshcat.DeleteAddedControls()  # Nobody listens there.
-                    self.write_text("meshcat.html", self.meshcat.StaticHtml())
+                    self.write_text("meshcat.html", page_of(self.meshcat))
             finally:  # A plot that fails does not lose the result.
                 files = self.outputs.commit(complete)
             return files
