@@ -53,6 +53,7 @@ PATCH_RUNS, PATCH_STARTS = 200, 4
 # Of a patch's side: how far it is moved [m], and what that may add to the sum of
 # squares (neighbouring rows err together: four times what one row would count).
 MOVED, PROFILE = (5e-4, 1e-3, 2e-3, 4e-3, 8e-3, 0.016, 0.032, 0.064), 16.0
+LARGEST = 200.0  # An error beyond so many standard deviations counts as this.
 FEWEST_ROWS = 8  # Of a channel that is looked at by itself.
 SMALL = 0.1  # First trial of an effect on joints, of the efforts there.
 
@@ -89,7 +90,18 @@ class ContactProblem(ContactDynamics, GapProblem):
         return np.broadcast_to(value[:, None], self._shown.shape)[self._shown]
 
     def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
-        return np.clip(self._flat(self.left(effects)), -200.0, 200.0)
+        return np.clip(self._flat(self.left(effects)), -LARGEST, LARGEST)
+
+    def weighed_alike(self, one: Sequence[Effect], other: Sequence[Effect]):
+        """A heavier body makes more noise of the same accelerations: by its own weights
+        each of two models that are both below the noise seems better the heavier it is.
+        """
+
+        def row(effects, weights):
+            r = self._flat(self.left(effects, weighed_as=weights))
+            return np.clip(r, -LARGEST, LARGEST)
+
+        return [(row(one, w), row(other, w)) for w in (one, other)]
 
     def base(self) -> np.ndarray:
         if self._base is None:
@@ -320,7 +332,7 @@ class ContactProblem(ContactDynamics, GapProblem):
         """With the weights of what is there: columns are then as linear as can be."""
         try:
             r = self.left([*there, effect], weighed_as=there)
-            return np.clip(self._flat(r), -200.0, 200.0)
+            return np.clip(self._flat(r), -LARGEST, LARGEST)
         except (ValueError, RuntimeError):
             return None
 

@@ -284,6 +284,13 @@ class GapProblem(ABC):
         that share the value of effect k; none where none could have its own."""
         return {}
 
+    def weighed_alike(
+        self, one: Sequence[Effect], other: Sequence[Effect]
+    ) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Residuals (m,) of two models, both by the weights of the one and both by
+        those of the other; none where weights do not depend on the model."""
+        return []
+
     def is_one_place(self, one: Sequence[str], other: Sequence[str]) -> bool:
         """Whether two places are one rigid body."""
         return False

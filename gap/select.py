@@ -46,6 +46,8 @@ CHANNEL_PRECISION = 0.03
 MORE = 1
 # Two models that differ block by block by more than chance: less than this p-value.
 CHANCE = 0.01
+# A rival that leaves more by more than SAME, by each of two weights, is worse then.
+TOLD_APART = 0.05
 # An effect that does not take off `least_gain` of the whole may do it of one channel,
 # if blocks of time say so together (t) and the channel is above the noise.
 CHANNEL_GAIN, LEAST_T, ABOVE = 0.10, 2.0, 1.3
@@ -483,12 +485,29 @@ class _Search:
                 or max(f.score, fit.score) < floor
             )
             near = error(f.score) <= (1.0 + SAME) * error(fit.score)
+            if near and alike and self._is_worse(f, fit):
+                continue
             if most is not None:
                 there = self._channel_gains(before, f.left)[most]
                 near &= 1.0 - there <= (1.0 + SAME) * (1.0 - gains[most])
             if near and alike:
                 ties.append(f.effects[-1])
         return tuple(ties)
+
+    def _is_worse(self, rival: Fitted, fit: Fitted) -> bool:
+        """Whether a rival that seems as good is clearly worse, below the noise too, by
+        the weights of either model."""
+        screen = self._screen(fit.r, fit.fit.train)
+        pairs = self.problem.weighed_alike(rival.effects, fit.effects)
+        for worse, better in pairs:
+            a, b = (self._blurred(screen.judge(r).score) for r in (worse, better))
+            one, two = (screen.settle(r)[1] for r in (worse, better))
+            if a <= (1.0 + SAME) * b or paired(one, two, self.train) > TOLD_APART:
+                return False
+        return bool(pairs)
+
+    def _blurred(self, score: float) -> float:
+        return float(np.hypot(score, PRECISION * self.start.score))
 
     def _fit_each(
         self, screen: Screen, chosen, short: Sequence[Ranked], known=()
@@ -671,7 +690,8 @@ class _Search:
             except ValueError:
                 continue
             near = self._error(fit.score) <= (1.0 + SAME) * self._error(current.score)
-            if near and paired(fit.left, current.left, self.train) > CHANCE:
+            alike = paired(fit.left, current.left, self.train) > CHANCE
+            if near and alike and not self._is_worse(fit, current):
                 tied.append(fit.effects[k])
         return tuple(tied)
 

@@ -542,6 +542,42 @@ def test_what_helps_a_little_everywhere_keeps_no_effect_of_one_channel_out():
     assert select(TwoChannels(damping=np.sqrt(0.225), bias=0.0)).choices == ()
 
 
+class BelowTheNoise(TwoChannels):
+    """The bias is the truth; a damping that looks much like it leaves 0.7 times the
+    noise in place of 0.6. By the weights of the damping it would leave `lighter` times
+    as much as it does by the bias's."""
+
+    plan = SearchPlan(least_gain=0.1, most_effects=1, least_error=1.0)
+
+    def __init__(self, lighter: float | None):
+        super().__init__(damping=0.0, bias=0.0)
+        rest, same, other = np.random.default_rng(5).normal(size=(3, len(self._base)))
+        self._of = {"joint_viscous_damping": same + 0.12 * other, "actuator_bias": same}
+        self._base, self._lighter = 0.6 * rest + 3.0 * same, lighter
+
+    def weighed_alike(self, one, other):
+        if self._lighter is None:
+            return []
+        r = [self.residual(e) for e in (one, other)]
+        size = [self._lighter if e[0].kind == "joint_viscous_damping" else 1.0
+                for e in (one, other)]  # fmt: skip
+        return [tuple(r), (size[0] * r[0], size[1] * r[1])]
+
+
+@pytest.mark.parametrize(
+    ("lighter", "ties"),
+    [
+        (None, ["joint_viscous_damping"]),  # Below the noise nothing tells them apart,
+        (1.0, []),  # but that one leaves more by the weights of either,
+        (0.85, ["joint_viscous_damping"]),  # and not by those of one alone.
+    ],
+)
+def test_below_the_noise_a_rival_is_worse_only_by_the_weights_of_either(lighter, ties):
+    (choice,) = select(BelowTheNoise(lighter)).choices
+    assert choice.effect.kind == "actuator_bias"
+    assert [t.kind for t in choice.ties] == ties
+
+
 class Wavering(TwoChannels):
     """Five recordings, in each of which the bias is another."""
 
