@@ -24,6 +24,7 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
     P_BALL,
     P_TIP,
     Q_BALL,
+    V_BALL,
     V_TIP,
 )
 from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Problem, _admm_plus, _model
@@ -36,6 +37,8 @@ NO_PLAN = np.inf
 # section, which leaves no part of the contour out.
 GOLDEN = 0.6180339887498949
 BRAKE = 0.6  # Share of the acceleration that a travelling tip is to brake with.
+# Around an object the tip looks so far ahead [rad], and keeps so much more away [m].
+AROUND, AROUND_MARGIN = 0.35, 0.003
 PROGRESS = 0.003  # Less than this towards the goal is none [m].
 
 
@@ -58,6 +61,8 @@ class SamplingConfig:
     hysteresis: list[float] = field(default_factory=lambda: [0.15, 1.0])
     push: float = 4.0  # Force of the plan that is tried first, into the object [N].
     stuck_sec: float = 1.2  # Without progress for so long, the present one is given up.
+    # Of an object that rolls on by itself: the tip arrives with its velocity.
+    follow: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,7 +239,33 @@ def travel_length(a, b, outline, distance, height):
     return float(up + np.hypot(*(b - a)[:2]))
 
 
-def travel_step(p, v, goal, outline, distance, height, limits, dt, descent=None):
+def way_around(a, b, outline, distance):
+    """Where to go next from a to b (2,), around an outline that is one convex polygon:
+    b itself where the straight way is free, else along the contour at the distance, the
+    shorter way [m]."""
+    if way_is_free(a, b, outline, distance):
+        return b
+    (polygon,) = outline
+    middle = polygon.mean(axis=0)
+    from_a, from_b = a - middle, b - middle
+    turn = np.arctan2(from_a[0] * from_b[1] - from_a[1] * from_b[0], from_a @ from_b)
+    turn = np.clip(turn, -AROUND, AROUND)
+    cos, sin = np.cos(turn), np.sin(turn)
+    out = np.array([cos * from_a[0] - sin * from_a[1], sin * from_a[0] + cos * from_a[1]])
+    out /= np.linalg.norm(out)
+    far = np.linalg.norm(polygon - middle, axis=1).max() + distance
+    # Inwards from where nothing is near, to the distance.
+    for _ in range(30):
+        near = distance_to_outline((middle + far * out)[None], outline)[0] - distance
+        if near < 1e-5:
+            break
+        far -= near
+    return middle + (far + AROUND_MARGIN) * out
+
+
+def travel_step(
+    p, v, goal, outline, distance, height, limits, dt, descent=None, around=False
+):
     """One step of the reference on its way to a place, never nearer to the object.
 
     Where the straight way beside the object keeps the distance, it is taken; else the
@@ -249,17 +280,22 @@ def travel_step(p, v, goal, outline, distance, height, limits, dt, descent=None)
     """
     speed, acceleration = limits
     across = np.hypot(*(goal - p)[:2])
+    left = None
     # Above the place, and not drifting away from above it while going down.
     above = across < 1e-3 and np.hypot(*v[:2]) < 0.02
     low = p[2] < height - 1e-3
     if above or (low and way_is_free(p[:2], goal[:2], outline, distance)):
         target = goal
+    elif around and p[2] < goal[2] + 2e-3:
+        target = np.array([*way_around(p[:2], goal[:2], outline, distance), goal[2]])
+        left = max(across, np.linalg.norm(target - p))
     elif low:
         target = np.array([*p[:2], height])
     else:
         target = np.array([*goal[:2], max(p[2], height)])
     off = target - p
-    left = np.linalg.norm(off)
+    away = np.linalg.norm(off)
+    left = away if left is None else left
     # What it can still brake from within what is left, in steps of dt, and not with all
     # of the acceleration: some is left to keep to it.
     brake = BRAKE * acceleration
@@ -268,7 +304,7 @@ def travel_step(p, v, goal, outline, distance, height, limits, dt, descent=None)
         slow, below = descent
         ahead = max(p[2] - below, 0.0)
         fast = min(fast, np.sqrt(slow**2 + 2.0 * brake * ahead))
-    wanted = off / max(left, 1e-12) * fast
+    wanted = off / max(away, 1e-12) * fast
     change = wanted - v
     size = np.linalg.norm(change)
     if size > acceleration * dt:
@@ -533,6 +569,8 @@ def sample_round(
     n, N = len(places), problem.options.N
     starts = np.tile(x, (n, 1))
     starts[:, :2], starts[:, 2], starts[:, V_TIP] = places, c.height, 0.0
+    if c.follow:
+        starts[:, V_TIP.start : V_TIP.start + 2] = x[V_BALL][:2]
     if in_contact:
         starts[0] = x
     lcs = build_many(starts, np.zeros(problem.n_u))

@@ -16,6 +16,7 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
     P_BALL,
     P_TIP,
     Q_BALL,
+    V_BALL,
     V_TIP,
 )
 from makebreak.systems.contact_mpc.numerics.contact_sampling import (
@@ -63,6 +64,11 @@ class PushConfig:
     farthest: float = 0.75  # [m]
     bearing: float = 1.05  # [rad]
     withdrawn: list[float] = field(default_factory=lambda: [0.3, 0.0])  # [m]
+    # Of an object that rolls on by itself: the tip travels along with it, and arrives
+    # with its velocity.
+    follow: bool = False
+    # Around an object that is one convex part, not over it, where the tip is low.
+    around: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,23 +162,29 @@ def next_push(
     limits = config.speed, config.acceleration
     up = shape.clear_height(config.margin)
     distance = shape.tip_radius + 0.5 * clearance
+    along = np.zeros(3)
+    if config.follow and state.phase == TRAVEL:
+        along[:2] = x[V_BALL][:2]
+
+    def step(goal, descent=None):
+        """Beside an object that moves, the way is the one beside it at rest."""
+        p, v, a, arrived = travel_step(
+            state.p, state.v - along, goal, outline, distance, up, limits, dt, descent,
+            config.around,
+        )  # fmt: skip
+        return p + dt * along, v + along, a, arrived
+
     if state.phase == WAIT:
-        goal = np.array([*config.withdrawn, up])
-        p, v, a, _ = travel_step(
-            state.p, state.v, goal, outline, distance, up, limits, dt
-        )
+        p, v, a, _ = step(np.array([*config.withdrawn, up]))
         return replace(state, p=p, v=v, a=a)
     if state.lifting:
-        goal = np.array([*state.p[:2], up])
-        p, v, a, arrived = travel_step(
-            state.p, state.v, goal, outline, distance, up, limits, dt
-        )
+        p, v, a, arrived = step(np.array([*state.p[:2], up]))
         return replace(state, p=p, v=v, a=a, lifting=not arrived)
     now = to_world(x, place)
     if state.extra > 0.0:
         now = now - state.extra * inward(now[None], outline)[0]
     held = state.place
-    if held is None or np.hypot(*(now - held)) > PLACE_CHANGE:
+    if held is None or config.follow or np.hypot(*(now - held)) > PLACE_CHANGE:
         held = now
     goal = np.array([*held, height])
     if state.p[2] > height + LOW:
@@ -182,9 +194,7 @@ def next_push(
             goal[:2] = beside
     # An object that is larger than believed is higher, too.
     descent = config.descent, shape.clear_height(0.5 * config.margin)
-    p, v, a, arrived = travel_step(
-        state.p, state.v, goal, outline, distance, up, limits, dt, descent
-    )
+    p, v, a, arrived = step(goal, descent)
     state = replace(state, p=p, v=v, a=a, place=held, go=go)
     # What is in its way down is noticed on the way, or the tip presses on it all along.
     # A tip that is beside its place, where the arm does not reach, pushes from there.
