@@ -7,6 +7,8 @@
     c3_mpc (roll), rolling_task (reposition) --> arm_reference
     arm_reference --> impedance_controller --tau--> station
 
+With contact_sequence=sampled diagrams/sampled_contacts.py takes rolling_task's place.
+
 Nothing passes from the world to the controllers but encoders, torques and pictures.
 """
 
@@ -15,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import (
     ConstantVectorSource,
     LogVectorOutput,
@@ -26,6 +28,12 @@ from makebreak.diagrams.camera import CameraConfig, camera_model
 from makebreak.diagrams.fault_kinds import read_faults
 from makebreak.diagrams.faults import faulty_lcs
 from makebreak.diagrams.recorder import record_station
+from makebreak.diagrams.sampled_contacts import (
+    SampledContactsConfig,
+    add_sampled_contacts,
+    check_contacts,
+    sampled_c3_config,
+)
 from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.station import (
     ARM,
@@ -75,6 +83,7 @@ from makebreak.systems.contact_mpc.numerics.c3_projections import (
     PlusProjection,
     QpProjection,
 )
+from makebreak.systems.contact_mpc.path_target import PathTargetConfig
 from makebreak.systems.contact_mpc.residual_learner import (
     PosteriorConfig,
     ResidualLearner,
@@ -97,8 +106,8 @@ ESTIMATE, LEARN, ARM_TICK = CONTROL / 3.0, 0.05, 0.001
 # millisecond between two steps of the plant: no value waits for the next period. (But
 # for r_comp in the task's landing height, which may be 12.5 ms old.)
 OFFSET = dict(
-    tracker=1e-4, estimator=2e-4, task=3e-4, lcs=3e-4, learner=3.5e-4, c3=4e-4,
-    reference=4.5e-4, impedance=7e-4,
+    tracker=1e-4, estimator=2e-4, target=2.5e-4, task=3e-4, lcs=3e-4, learner=3.5e-4,
+    sampler=3.5e-4, c3=4e-4, reference=4.5e-4, impedance=7e-4,
 )  # fmt: skip
 BALL_CHANNELS = ("ball.ball.x", "ball.ball.y")  # What a camera above sees of it.
 BOX_AHEAD = np.pi / 2  # From where the ball lies at first to a stray box [rad].
@@ -154,6 +163,9 @@ class BallRollingConfig:
     learner: Literal["none", "r_comp", "r_dyn", "both"] = "r_comp"
     # paper: the learner and the projection of the paper, with its constants.
     controller: Literal["ours", "paper"] = "ours"
+    # Who decides when and where to touch: the hand-written cycle of RollingTask, or
+    # ContactSampler.
+    contact_sequence: Literal["cycle", "sampled"] = "cycle"
     # Of C3; auto: plus, of the paper's controller qp.
     projection: Literal["auto", "qp", "exact", "plus"] = "auto"
     object: Literal["ball", "orange", "lime"] = "ball"  # What is rolled.
@@ -180,6 +192,7 @@ class BallRollingConfig:
     task: RollingTaskConfig = field(default_factory=RollingTaskConfig)
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     learning: LearnerConfig = field(default_factory=LearnerConfig)
+    contacts: SampledContactsConfig = field(default_factory=SampledContactsConfig)
     impedance: ImpedanceConfig = field(
         default_factory=lambda: ImpedanceConfig(force_max=20.0)
     )
@@ -336,7 +349,11 @@ def c3_config(planner: PlannerConfig, n_lam: int, projection: str = "plus") -> C
     )
 
 
-def learner_config(learner: LearnerConfig) -> ResidualLearnerConfig:
+def learner_config(
+    learner: LearnerConfig, from_beside: float | None = None
+) -> ResidualLearnerConfig:
+    """Args: from_beside: of a tip that pushes from beside, Q_d of its v_x, v_y and the
+    ball's; None: it pushes from above."""
     for name in ("weight_ball", "weight_tip"):
         if not getattr(learner, name) >= 0.0:
             raise ValueError(
@@ -347,6 +364,10 @@ def learner_config(learner: LearnerConfig) -> ResidualLearnerConfig:
     # forces that cancel; only its missing rebound, v_z, shows that nothing touched.
     Q_d[V_TIP.start + 2] = learner.weight_tip
     Q_d[[V_BALL.start, V_BALL.start + 1]] = learner.weight_ball
+    if from_beside is not None:
+        Q_d[:] = 0.0
+        Q_d[[V_TIP.start, V_TIP.start + 1]] = from_beside
+        Q_d[[V_BALL.start, V_BALL.start + 1]] = from_beside
     return ResidualLearnerConfig(
         Q_d=Q_d.tolist(),
         eps=learner.eps,
@@ -460,6 +481,19 @@ def add_ball_rolling(
     projection = config.projection
     if projection == "auto":
         projection = "qp" if paper else "plus"
+    samples = config.contact_sequence == "sampled"
+    if samples:
+        check_contacts(config.contacts)
+        for name, value, expected in (
+            ("controller", config.controller, ("ours",)),
+            ("projection", projection, ("plus",)),
+            ("learner", learner_kind, ("none", "r_comp")),
+        ):
+            if value not in expected:
+                raise ValueError(
+                    f"{name}={value} with contact_sequence=sampled, expected "
+                    + " or ".join(expected)
+                )
     wrong = what_goes_wrong(config)
     if station is None:
         station = make_world(config, meshcat, sampled)
@@ -469,9 +503,13 @@ def add_ball_rolling(
     tip = arm.GetFrameByName(TIP_FRAME)
     p_tip = tip.CalcPoseInWorld(arm.CreateDefaultContext()).translation()
 
+    friction, tangent = config.planner.friction, None
+    if samples:
+        # Edges along the vertical do not jump as the normal goes around the ball.
+        friction, tangent = config.contacts.planner.friction, [0.0, 0.0, 1.0]
     pairs = [
-        ContactPair("tip::tip", "ball::ball", config.planner.friction),
-        ContactPair("ball::ball", "table::table", config.planner.friction),
+        ContactPair("tip::tip", "ball::ball", friction, tangent=tangent),
+        ContactPair("ball::ball", "table::table", friction),
     ]
     lcs, lcs_of = {}, {}
     for name, dt, period in (
@@ -518,28 +556,43 @@ def add_ball_rolling(
             arm.GetPositions(arm.CreateDefaultContext()),
         ),
     )
-    c3 = builder.AddNamedSystem(
-        "c3_mpc",
-        C3Mpc(c3_config(config.planner, n_lam, projection), CONTROL, OFFSET["c3"]),
-    )
-    task = builder.AddNamedSystem(
-        "rolling_task",
-        RollingTask(
-            replace(config.task, period_sec=CONTROL, offset_sec=OFFSET["task"]),
-            n_knots=config.planner.N + 1,
-            knot_sec=PLAN_DT,
-            radius_ball=model.ball_radius,
-            radius_tip=model.tip_radius,
-            n_lam=n_lam,
-            n_tip=N_TIP,
-            residual_dt_sec=LEARN,
-            p_tip=p_tip,
-        ),
-    )
+    task: LeafSystem
+    if samples:
+        c3_settings = sampled_c3_config(
+            config.contacts.planner, n_lam, N_TIP, model.ball_radius, LEARN
+        )
+        circle = PathTargetConfig(center=config.task.center, radius=config.task.radius)
+        contacts = add_sampled_contacts(
+            builder, config.contacts, circle, model, lcs_of["plan"], c3_settings, p_tip,
+            CONTROL, OFFSET, estimator,
+        )  # fmt: skip
+        task, target = contacts.task, contacts.target
+        reference_settings = replace(
+            config.contacts.reference, height=config.contacts.sampler.sampling.height
+        )
+    else:
+        c3_settings = c3_config(config.planner, n_lam, projection)
+        target = task = builder.AddNamedSystem(
+            "rolling_task",
+            RollingTask(
+                replace(config.task, period_sec=CONTROL, offset_sec=OFFSET["task"]),
+                n_knots=config.planner.N + 1,
+                knot_sec=PLAN_DT,
+                radius_ball=model.ball_radius,
+                radius_tip=model.tip_radius,
+                n_lam=n_lam,
+                n_tip=N_TIP,
+                residual_dt_sec=LEARN,
+                p_tip=p_tip,
+            ),
+        )
+        reference_settings = ArmReferenceConfig()
+    c3 = builder.AddNamedSystem("c3_mpc", C3Mpc(c3_settings, CONTROL, OFFSET["c3"]))
     reference = builder.AddNamedSystem(
         "arm_reference",
         ArmReference(
-            ArmReferenceConfig(
+            replace(
+                reference_settings,
                 tip_mass=model.tip_mass,
                 period_sec=CONTROL,
                 offset_sec=OFFSET["reference"],
@@ -607,7 +660,10 @@ def add_ball_rolling(
             ResidualLearner(
                 paper_learner_config(n_lam)
                 if paper
-                else learner_config(config.learning),
+                else learner_config(
+                    config.learning,
+                    config.contacts.learning_weight if samples else None,
+                ),
                 learn_lcs,
                 LEARN,
                 OFFSET["learner"],
@@ -618,7 +674,8 @@ def add_ball_rolling(
         connect(estimator, "window_valid", learner, "enable")
         connect(lcs["learn"], "lcs", learner, "lcs")
         r_comp = learner.GetOutputPort("r_comp")
-        connect(learner, "r_std", task, "r_std")
+        if not samples:
+            connect(learner, "r_std", task, "r_std")
         if meshcat is not None:
             button = builder.AddNamedSystem("adapt_button", AdaptButton(n_lam, meshcat))
             builder.Connect(r_comp, button.get_input_port())
@@ -628,12 +685,15 @@ def add_ball_rolling(
             "no_residual", ConstantVectorSource(np.zeros(n_lam))
         )
         r_comp = zero.get_output_port()
-    connect(estimator, "x", task, "x")
-    connect(estimator, "valid", task, "valid")
-    connect(estimator, "tip_force", task, "tip_force")
-    builder.Connect(r_comp, task.GetInputPort("r_comp"))
+    if samples:
+        builder.Connect(r_comp, contacts.sampler.GetInputPort("r_comp"))
+    else:
+        connect(estimator, "x", task, "x")
+        connect(estimator, "valid", task, "valid")
+        connect(estimator, "tip_force", task, "tip_force")
+        builder.Connect(r_comp, task.GetInputPort("r_comp"))
     connect(estimator, "x", c3, "x")
-    connect(task, "x_desired", c3, "x_desired")
+    connect(target, "x_desired", c3, "x_desired")
     if wrong is not None:
         example = lcs_of["plan"].build(lcs_of["plan"].x_default, np.zeros(3))
         lcs_port["plan"] = faulty_lcs(builder, lcs_port["plan"], example, wrong.faults)
@@ -645,8 +705,9 @@ def add_ball_rolling(
     connect(c3, "lam", reference, "lam")
     connect(c3, "status", reference, "status")
     connect(lcs["command"], "lcs", reference, "lcs")
-    connect(estimator, "tip_force", reference, "tip_force")
-    connect(task, "feel", reference, "feel")
+    if not samples:
+        connect(estimator, "tip_force", reference, "tip_force")
+        connect(task, "feel", reference, "feel")
     connect(station, f"{ARM}.position_measured", impedance, "q")
     connect(station, f"{ARM}.velocity_measured", impedance, "v")
     if station.HasOutputPort(DELAY):
@@ -704,11 +765,17 @@ def add_ball_rolling(
         add_legend(builder, meshcat, legend, task.GetOutputPort("phase"))
 
 
+def task_name(diagram: Diagram | DiagramBuilder) -> str:
+    """Of the system that says when the tip pushes: its port `phase` is 0 then."""
+    sampled = diagram.HasSubsystemNamed("push_task")
+    return "push_task" if sampled else "rolling_task"
+
+
 def connect_reference(builder: DiagramBuilder) -> None:
     """The task's own reposition, and the reference straight to the arm."""
     task, reference, arm = (
         builder.GetSubsystemByName(name)
-        for name in ("rolling_task", "arm_reference", "impedance_controller")
+        for name in (task_name(builder), "arm_reference", "impedance_controller")
     )
     builder.Connect(
         task.GetOutputPort("reference"), reference.GetInputPort("reference")

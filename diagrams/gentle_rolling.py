@@ -213,6 +213,11 @@ def ball_config(config: GentleRollingConfig) -> BallRollingConfig:
                 f"ball.{name} is {getattr(config.ball, name)}, expected {default}: "
                 f"{name} sets it"
             )
+    if config.ball.contact_sequence != "cycle":
+        raise ValueError(
+            f"ball.contact_sequence is {config.ball.contact_sequence}, expected cycle: "
+            "the gentle touch-down is that of its landing"
+        )
     return replace(config.ball, seed=config.seed, adapt=config.adapt)
 
 

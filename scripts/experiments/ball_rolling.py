@@ -15,6 +15,7 @@ from makebreak.diagrams.ball_rolling import (
     BallRollingConfig,
     believed,
     make_ball_rolling,
+    task_name,
     world_scene,
 )
 from makebreak.diagrams.camera import describe_camera, vtk_works
@@ -117,7 +118,7 @@ def run(config, session):
         "gap": system("learned_gap").get_output_port(),
         "seen": system("ball_tracker").GetOutputPort("seen"),
         "c3_status": system("c3_mpc").GetOutputPort("status"),
-        "phase": system("rolling_task").GetOutputPort("phase"),
+        "phase": system(task_name(diagram)).GetOutputPort("phase"),
     }
     if diagram.HasSubsystemNamed("residual_learner"):
         learner = system("residual_learner")
@@ -164,6 +165,11 @@ def run_on_lcm(config, session, url: str) -> dict:
     """
     if config.faults:
         raise ValueError("--fault: the robot's side has the faults: makebreak station")
+    if config.contact_sequence != "cycle":
+        raise ValueError(
+            f"--robot lcm: contact_sequence is {config.contact_sequence}, expected "
+            "cycle"
+        )
     arm = make_control_plant(believed(config)[1])
     diagram = make_ball_rolling(config, station=make_lcm_station(arm))
     system = diagram.GetSubsystemByName
@@ -242,7 +248,7 @@ def run_on_recording(config, session, recording: Path) -> dict:
     system = diagram.GetSubsystemByName
     record = {
         "gap": system("learned_gap").get_output_port(),
-        "phase": system("rolling_task").GetOutputPort("phase"),
+        "phase": system(task_name(diagram)).GetOutputPort("phase"),
     }
     time = columns["time"]
     log = session.simulate(diagram, float(time[-1]), record, SAMPLE)
@@ -456,6 +462,7 @@ def score(config, log, track, contact):
         "camera": describe_camera(config.camera),
         "seed": config.seed,
         "adapt": config.adapt,
+        "contact_sequence": config.contact_sequence,
         "radius_error_m": config.radius_error_m,
     }
 

@@ -251,7 +251,7 @@ def way_around(a, b, outline, distance):
     turn = np.arctan2(from_a[0] * from_b[1] - from_a[1] * from_b[0], from_a @ from_b)
     turn = np.clip(turn, -AROUND, AROUND)
     cos, sin = np.cos(turn), np.sin(turn)
-    out = np.array([cos * from_a[0] - sin * from_a[1], sin * from_a[0] + cos * from_a[1]])
+    out = np.array([[cos, -sin], [sin, cos]]) @ from_a
     out /= np.linalg.norm(out)
     far = np.linalg.norm(polygon - middle, axis=1).max() + distance
     # Inwards from where nothing is near, to the distance.

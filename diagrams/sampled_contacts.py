@@ -1,0 +1,244 @@
+"""ball_rolling without a hand-written cycle: ContactSampler says where to touch.
+
+    state_estimator --x--> path_target --x_desired--> c3_mpc, contact_sampler
+    path_target --goal (the next point on the circle)--> contact_sampler, push_task
+    contact_sampler --command (where to touch)--> push_task
+    c3_mpc (contact), push_task (travel) --> arm_reference
+
+The tip pushes from beside the ball, at one height. Everything else is ball_rolling's.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+
+from makebreak.diagrams.wiring import refuse_changed
+from makebreak.models.tip_and_ball import TipAndBall
+from makebreak.systems.arm.arm_reference import ArmReferenceConfig
+from makebreak.systems.contact_mpc.c3_mpc import C3Config
+from makebreak.systems.contact_mpc.contact_sampler import (
+    ContactSampler,
+    ContactSamplerConfig,
+)
+from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs
+from makebreak.systems.contact_mpc.numerics.ball_state import (
+    N_X,
+    P_BALL,
+    V_BALL,
+    V_TIP,
+    W_BALL,
+)
+from makebreak.systems.contact_mpc.numerics.c3_mpc import (
+    C3Options,
+    C3Problem,
+    C3Weights,
+)
+from makebreak.systems.contact_mpc.numerics.contact_sampling import (
+    ObjectShape,
+    SamplingConfig,
+)
+from makebreak.systems.contact_mpc.numerics.push_task import PushConfig
+from makebreak.systems.contact_mpc.path_target import PathTarget, PathTargetConfig
+from makebreak.systems.contact_mpc.push_task import PushTask, PushTaskConfig
+
+CORNERS = 24  # Of the ball's outline: it is 0.3 mm within the circle at most.
+
+
+@dataclass
+class SampledPlannerConfig:
+    """Costs of C3+; forces in newtons."""
+
+    N: int = 8  # Knots of 0.1 s.
+    rounds: int = 2
+    polish: int = 6
+    position: float = 5000.0  # Of the ball, across the table [1/m2].
+    velocity: float = 100.0  # Of the ball; its turning counts as much [s2/m2].
+    tip_height: float = 1e4  # [1/m2]
+    tip_speed: float = 1.0  # [s2/m2]
+    force: float = 5.0  # G of lam of tip and ball; eta's is 1/10 of it.
+    friction: float = 0.5  # Of both contacts, for planning and learning.
+
+
+@dataclass
+class SampledContactsConfig:
+    path: PathTargetConfig = field(default_factory=PathTargetConfig)
+    planner: SampledPlannerConfig = field(default_factory=SampledPlannerConfig)
+    sampler: ContactSamplerConfig = field(
+        default_factory=lambda: ContactSamplerConfig(
+            SamplingConfig(
+                height=0.038, travel=5.0, hysteresis=[0.15, 0.5], push=0.5, follow=True
+            )
+        )
+    )
+    push: PushConfig = field(
+        default_factory=lambda: PushConfig(
+            descent=0.2, believed_sec=0.5, follow=True, around=True
+        )
+    )
+    # Q_d of the learner on v_x, v_y of tip and ball: the inverse variance of a speed
+    # over a step of 50 ms. The ball is seen late: when a push sets in, the tip seems to
+    # be up to 5 mm within it, 0.08 m/s (docs/contact_sampling.md).
+    learning_weight: float = 150.0
+    reference: ArmReferenceConfig = field(
+        default_factory=lambda: ArmReferenceConfig(force_max=8.0, acceleration_max=3.0)
+    )
+
+
+def check_contacts(config: SampledContactsConfig) -> None:
+    """Raises: ValueError for a setting that the diagram sets, or out of range."""
+    p = config.planner
+    for name in (
+        "position",
+        "velocity",
+        "tip_height",
+        "tip_speed",
+        "force",
+        "friction",
+    ):
+        if not getattr(p, name) > 0.0:
+            raise ValueError(
+                f"contacts.planner.{name} is {getattr(p, name)}, expected > 0"
+            )
+    if not config.learning_weight >= 0.0:
+        raise ValueError(
+            f"contacts.learning_weight is {config.learning_weight}, expected >= 0"
+        )
+    refuse_changed(
+        "contacts.path", config.path,
+        ("center", "radius", "height", "period_sec", "offset_sec"),
+    )  # fmt: skip
+    refuse_changed(
+        "contacts.sampler", config.sampler,
+        ("angle_radius", "residual_dt_sec", "offset_sec"),
+    )  # fmt: skip
+    refuse_changed(
+        "contacts.reference", config.reference,
+        ("tip_mass", "height", "period_sec", "offset_sec"),
+    )  # fmt: skip
+    for name in ("push", "sampler.sampling"):
+        part = config.push if name == "push" else config.sampler.sampling
+        if not part.follow:
+            raise ValueError(f"contacts.{name}.follow is false, expected true")
+
+
+def ball_shape(model: TipAndBall, height: float) -> ObjectShape:
+    """The ball for a tip whose centre stays at a height [m]: its outline is as far from
+    the tip, seen from above, as the ball is.
+
+    Raises: ValueError for a height at which the tip does not touch the ball's side.
+    """
+    R, r = model.ball_radius, model.tip_radius
+    if not r < height < 2.0 * R:
+        raise ValueError(
+            f"contacts.sampler.sampling.height is {height:g}, expected above the tip's "
+            f"radius, {r:g}, and below the ball's top, {2.0 * R:g} m"
+        )
+    beside = np.sqrt((R + r) ** 2 - (height - R) ** 2) - r
+    angle = 2.0 * np.pi * np.arange(CORNERS) / CORNERS
+    ring = beside * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    return ObjectShape([ring], r, 2.0 * R)
+
+
+def sampled_c3_config(
+    planner: SampledPlannerConfig, n_lam: int, n_tip: int, radius: float, residual_dt
+) -> C3Config:
+    """Args: n_tip: forces of tip and ball, the first of n_lam; radius: of the ball [m];
+    residual_dt [s]."""
+    p = planner
+    Q = np.zeros(N_X)
+    Q[2], Q[V_TIP] = p.tip_height, p.tip_speed
+    Q[P_BALL], Q[V_BALL], Q[W_BALL] = p.position, p.velocity, p.velocity * radius**2
+    # As of c3_config: lam : eta = 10 : 1, and the table's contact loose.
+    contact = np.full(n_lam, 0.002)
+    contact[:n_tip] = 1.0
+    G = np.concatenate([
+        np.full(N_X, 1e-9), p.force * contact,
+        np.full(3, 1e-9), 0.1 * p.force * contact,
+    ])  # fmt: skip
+    return C3Config(
+        weights=C3Weights(Q, np.full(3, 0.01), G, G),
+        options=C3Options(N=p.N, rounds=p.rounds, rho=2.2, polish=p.polish),
+        residual_dt_sec=residual_dt,
+        sliding_command=True,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SampledContacts:
+    """The systems that take the task's place."""
+
+    target: PathTarget
+    task: PushTask
+    sampler: ContactSampler
+
+
+def add_sampled_contacts(
+    builder: DiagramBuilder,
+    config: SampledContactsConfig,
+    path: PathTargetConfig,
+    model: TipAndBall,
+    lcs: AnitescuLcs,
+    c3: C3Config,
+    p_tip,
+    period: float,
+    offset: dict[str, float],
+    estimator: LeafSystem,
+) -> SampledContacts:
+    """Adds and connects them, but for r_comp and what leads to C3 and the arm.
+
+    Args: path: where the circle is; lcs: of the plan; p_tip (3,) where the tip is at
+        first [m]; period of the task [s]; offset of `target`, `task`, `sampler` [s].
+    """
+    sampling = config.sampler.sampling
+    shape = ball_shape(model, sampling.height)
+    target = builder.AddNamedSystem(
+        "path_target",
+        PathTarget(
+            replace(
+                config.path, center=path.center, radius=path.radius,
+                height=sampling.height, period_sec=period, offset_sec=offset["target"],
+            ),
+            c3.options.N + 1,
+            lcs.dt_sec,
+            model.ball_radius,
+        ),
+    )  # fmt: skip
+    task = builder.AddNamedSystem(
+        "push_task",
+        PushTask(
+            PushTaskConfig(
+                config.push, sampling.height, sampling.clearance, period,
+                offset["task"],
+            ),
+            c3.options.N + 1,
+            shape,
+            p_tip,
+        ),
+    )  # fmt: skip
+    sampler = builder.AddNamedSystem(
+        "contact_sampler",
+        ContactSampler(
+            replace(
+                config.sampler,
+                residual_dt_sec=c3.residual_dt_sec,
+                offset_sec=offset["sampler"],
+            ),
+            lcs,
+            C3Problem(c3.weights, c3.projection, c3.options),
+            shape,
+        ),
+    )
+
+    def connect(source, output, system, port):
+        builder.Connect(source.GetOutputPort(output), system.GetInputPort(port))
+
+    for system in (target, task, sampler):
+        connect(estimator, "x", system, "x")
+        connect(estimator, "valid", system, "valid")
+    for system in (task, sampler):
+        connect(target, "goal", system, "goal")
+    connect(target, "x_desired", sampler, "x_desired")
+    connect(task, "phase", sampler, "phase")
+    connect(sampler, "command", task, "command")
+    return SampledContacts(target, task, sampler)

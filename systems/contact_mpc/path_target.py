@@ -1,0 +1,105 @@
+"""A circle as a target that moves and as goals: see numerics/path_target.py."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from pydrake.systems.framework import LeafSystem
+
+from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL
+from makebreak.systems.contact_mpc.numerics.lcs import is_finite
+from makebreak.systems.contact_mpc.numerics.path_target import (
+    moving_target,
+    next_waypoint,
+)
+from makebreak.systems.contact_mpc.numerics.rolling_task import (
+    CirclePath,
+    RollingConfig,
+    shifted,
+)
+from makebreak.systems.numerics.timing import timed
+
+
+@dataclass
+class PathTargetConfig:
+    center: list[float] = field(default_factory=lambda: [0.5, 0.0])  # [m]
+    radius: float = 0.1  # Of the circle [m].
+    lead_deg: float = 6.0  # The target runs so far ahead of the ball ...
+    speed: float = 0.05  # ... and moves along the circle with it [m/s].
+    goal_deg: float = 10.0  # From one goal to the next.
+    integral_sec: float = 6.0  # Of the integral action on the ball's distance.
+    height: float = 0.038  # Of the tip's centre while pushing [m].
+    period_sec: float = 0.0125
+    offset_sec: float = 0.0
+
+
+class PathTarget(LeafSystem):
+    """What C3 and ContactSampler are to make of a ball that rolls along a circle.
+
+    Inputs:  x (19,) of numerics/ball_state.py; valid (1,): above 0.5 where it can be
+             trusted.
+    Outputs: x_desired ((N + 1) 19,) for C3; goal (3,) = x, y [m], 0: the next point on
+             the circle.
+
+    The circle that is aimed at is larger or smaller than the path by the integral of
+    the ball's distance to it, as in RollingTask. What is not finite changes nothing.
+
+    Args: n_knots = N + 1; knot_sec between them [s]; radius_ball as modelled [m].
+    """
+
+    def __init__(
+        self,
+        config: PathTargetConfig,
+        n_knots: int,
+        knot_sec: float,
+        radius_ball: float,
+    ):
+        super().__init__()
+        c = config
+        if np.shape(c.center) != (2,) or not np.isfinite(c.center).all():
+            raise ValueError(f"path.center is {c.center}, expected 2 numbers")
+        for name in ("radius", "speed", "goal_deg", "integral_sec", "height"):
+            if not getattr(c, name) > 0.0:
+                raise ValueError(f"path.{name} is {getattr(c, name)}, expected > 0")
+        if not 0.0 <= c.lead_deg < np.inf:
+            raise ValueError(f"path.lead_deg is {c.lead_deg}, expected >= 0")
+        self._config, self._n_knots, self._knot_sec = c, n_knots, knot_sec
+        self._radius_ball = radius_ball
+        self._path = CirclePath(np.array(c.center), c.radius)
+        self._integral = RollingConfig(integral_sec=c.integral_sec)
+        self._x = self.DeclareVectorInputPort("x", N_X)
+        self._valid = self.DeclareVectorInputPort("valid", 1)
+        at_rest = np.eye(N_X)[3]
+        self._shift = self.DeclareDiscreteState([0.0])  # Of the circle's radius [m].
+        self._angle = self.DeclareDiscreteState([np.nan])  # Of the goal [rad].
+        self._x_desired = self.DeclareDiscreteState(np.tile(at_rest, n_knots))
+        self._goal = self.DeclareDiscreteState(3)
+        self.DeclareStateOutputPort("x_desired", self._x_desired)
+        self.DeclareStateOutputPort("goal", self._goal)
+        self.DeclarePeriodicDiscreteUpdateEvent(
+            config.period_sec, config.offset_sec, self._update
+        )
+
+    @timed
+    def _update(self, context, discrete_state):
+        c = self._config
+        x, valid = (np.asarray(p.Eval(context)) for p in (self._x, self._valid))
+        if not is_finite(x):
+            return
+        shift = float(context.get_discrete_state(self._shift).value()[0])
+        if valid[0] > 0.5:
+            shift = shifted(self._integral, self._path, shift, x, c.period_sec)
+        path = replace(self._path, radius=self._path.radius + shift)
+        lead = np.deg2rad(c.lead_deg)
+        target = moving_target(
+            path, x, lead, c.speed, c.height, self._radius_ball, self._knot_sec,
+            self._n_knots,
+        )  # fmt: skip
+        last = float(context.get_discrete_state(self._angle).value()[0])
+        angle = next_waypoint(
+            self._path.angle(x[P_BALL]), lead, np.deg2rad(c.goal_deg),
+            None if np.isnan(last) else last,
+        )  # fmt: skip
+        discrete_state.set_value(self._shift, [shift])
+        discrete_state.set_value(self._angle, [angle])
+        discrete_state.set_value(self._x_desired, target.ravel())
+        discrete_state.set_value(self._goal, [*self._path.point(angle), 0.0])
