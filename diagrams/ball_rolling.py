@@ -19,6 +19,7 @@ import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import (
+    Adder,
     ConstantVectorSource,
     LogVectorOutput,
     MatrixGain,
@@ -350,10 +351,9 @@ def c3_config(planner: PlannerConfig, n_lam: int, projection: str = "plus") -> C
 
 
 def learner_config(
-    learner: LearnerConfig, from_beside: float | None = None
+    learner: LearnerConfig, from_beside: SampledContactsConfig | None = None
 ) -> ResidualLearnerConfig:
-    """Args: from_beside: of a tip that pushes from beside, Q_d of its v_x, v_y and the
-    ball's; None: it pushes from above."""
+    """Args: from_beside: of a tip that pushes from beside; None: from above."""
     for name in ("weight_ball", "weight_tip"):
         if not getattr(learner, name) >= 0.0:
             raise ValueError(
@@ -366,11 +366,10 @@ def learner_config(
     Q_d[[V_BALL.start, V_BALL.start + 1]] = learner.weight_ball
     if from_beside is not None:
         Q_d[:] = 0.0
-        Q_d[[V_TIP.start, V_TIP.start + 1]] = from_beside
-        Q_d[[V_BALL.start, V_BALL.start + 1]] = from_beside
+        Q_d[[V_BALL.start, V_BALL.start + 1]] = from_beside.learning_weight
     return ResidualLearnerConfig(
         Q_d=Q_d.tolist(),
-        eps=learner.eps,
+        eps=learner.eps if from_beside is None else from_beside.learning_eps,
         gamma=learner.gamma,
         # The gap is one number: the tip's four forces share one residual. The table's
         # contact does not adapt.
@@ -503,7 +502,7 @@ def add_ball_rolling(
     tip = arm.GetFrameByName(TIP_FRAME)
     p_tip = tip.CalcPoseInWorld(arm.CreateDefaultContext()).translation()
 
-    friction, tangent = config.planner.friction, None
+    friction, tangent = config.planner.friction, ContactPair().tangent
     if samples:
         # Edges along the vertical do not jump as the normal goes around the ball.
         friction, tangent = config.contacts.planner.friction, [0.0, 0.0, 1.0]
@@ -564,7 +563,7 @@ def add_ball_rolling(
         circle = PathTargetConfig(center=config.task.center, radius=config.task.radius)
         contacts = add_sampled_contacts(
             builder, config.contacts, circle, model, lcs_of["plan"], c3_settings, p_tip,
-            CONTROL, OFFSET, estimator,
+            N_TIP, CONTROL, OFFSET, estimator,
         )  # fmt: skip
         task, target = contacts.task, contacts.target
         reference_settings = replace(
@@ -661,8 +660,7 @@ def add_ball_rolling(
                 paper_learner_config(n_lam)
                 if paper
                 else learner_config(
-                    config.learning,
-                    config.contacts.learning_weight if samples else None,
+                    config.learning, config.contacts if samples else None
                 ),
                 learn_lcs,
                 LEARN,
@@ -674,7 +672,17 @@ def add_ball_rolling(
         connect(estimator, "window_valid", learner, "enable")
         connect(lcs["learn"], "lcs", learner, "lcs")
         r_comp = learner.GetOutputPort("r_comp")
-        if not samples:
+        if samples:
+            taken = np.zeros(n_lam)
+            taken[:N_TIP] = -config.contacts.gap_allowance / LEARN
+            allowance = builder.AddNamedSystem(
+                "gap_allowance", ConstantVectorSource(taken)
+            )
+            cautious = builder.AddNamedSystem("cautious_residual", Adder(2, n_lam))
+            builder.Connect(r_comp, cautious.get_input_port(0))
+            builder.Connect(allowance.get_output_port(), cautious.get_input_port(1))
+            r_comp = cautious.get_output_port()
+        else:
             connect(learner, "r_std", task, "r_std")
         if meshcat is not None:
             button = builder.AddNamedSystem("adapt_button", AdaptButton(n_lam, meshcat))
@@ -686,7 +694,13 @@ def add_ball_rolling(
         )
         r_comp = zero.get_output_port()
     if samples:
-        builder.Connect(r_comp, contacts.sampler.GetInputPort("r_comp"))
+        for system in (contacts.sampler, contacts.target):
+            builder.Connect(r_comp, system.GetInputPort("r_comp"))
+        reach = np.zeros((1, n_lam))
+        reach[0, :N_TIP] = -LEARN / N_TIP
+        nearer = builder.AddNamedSystem("learned_reach", MatrixGain(reach))
+        builder.Connect(r_comp, nearer.get_input_port())
+        builder.Connect(nearer.get_output_port(), task.GetInputPort("nearer"))
     else:
         connect(estimator, "x", task, "x")
         connect(estimator, "valid", task, "valid")

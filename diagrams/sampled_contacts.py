@@ -49,13 +49,16 @@ CORNERS = 24  # Of the ball's outline: it is 0.3 mm within the circle at most.
 class SampledPlannerConfig:
     """Costs of C3+; forces in newtons."""
 
-    N: int = 8  # Knots of 0.1 s.
+    N: int = 5  # Knots of 0.1 s.
     rounds: int = 2
     polish: int = 6
     position: float = 5000.0  # Of the ball, across the table [1/m2].
     velocity: float = 100.0  # Of the ball; its turning counts as much [s2/m2].
+    # Of the tip beside the ball, on the side from which it is to be pushed next: where
+    # nothing touches, the plan else does not care where the tip is [1/m2].
+    tip: float = 3000.0
     tip_height: float = 1e4  # [1/m2]
-    tip_speed: float = 1.0  # [s2/m2]
+    tip_speed: float = 10.0  # [s2/m2]
     force: float = 5.0  # G of lam of tip and ball; eta's is 1/10 of it.
     friction: float = 0.5  # Of both contacts, for planning and learning.
 
@@ -67,7 +70,12 @@ class SampledContactsConfig:
     sampler: ContactSamplerConfig = field(
         default_factory=lambda: ContactSamplerConfig(
             SamplingConfig(
-                height=0.038, travel=5.0, hysteresis=[0.15, 0.5], push=0.5, follow=True
+                height=0.038,
+                travel=5.0,
+                hysteresis=[0.3, 1.0],
+                push=0.5,
+                follow=True,
+                keep_sec=0.5,
             )
         )
     )
@@ -76,10 +84,15 @@ class SampledContactsConfig:
             descent=0.2, believed_sec=0.5, follow=True, around=True
         )
     )
-    # Q_d of the learner on v_x, v_y of tip and ball: the inverse variance of a speed
-    # over a step of 50 ms. The ball is seen late: when a push sets in, the tip seems to
-    # be up to 5 mm within it, 0.08 m/s (docs/contact_sampling.md).
-    learning_weight: float = 150.0
+    # Q_d of the learner on the ball's v_x, v_y, as from above: 7 mm/s. The arm that
+    # moves the tip hardly feels a ball beside it.
+    learning_weight: float = 2e4
+    # Loss of complementarity over the learner's: a ball beside the tip is pushed with
+    # some hundredths of a newton, not with the newtons of a tip on top of it.
+    learning_eps: float = 1e-4
+    # The gap is learned too large by 1.5 to 3 mm, for the ball is seen late; a tip that
+    # believes it strikes the ball. So much is taken off what is learned [m].
+    gap_allowance: float = 0.002
     reference: ArmReferenceConfig = field(
         default_factory=lambda: ArmReferenceConfig(force_max=8.0, acceleration_max=3.0)
     )
@@ -91,6 +104,7 @@ def check_contacts(config: SampledContactsConfig) -> None:
     for name in (
         "position",
         "velocity",
+        "tip",
         "tip_height",
         "tip_speed",
         "force",
@@ -100,9 +114,14 @@ def check_contacts(config: SampledContactsConfig) -> None:
             raise ValueError(
                 f"contacts.planner.{name} is {getattr(p, name)}, expected > 0"
             )
-    if not config.learning_weight >= 0.0:
+    for name in ("learning_weight", "gap_allowance"):
+        if not 0.0 <= getattr(config, name) < np.inf:
+            raise ValueError(
+                f"contacts.{name} is {getattr(config, name)}, expected >= 0"
+            )
+    if not config.learning_eps > 0.0:
         raise ValueError(
-            f"contacts.learning_weight is {config.learning_weight}, expected >= 0"
+            f"contacts.learning_eps is {config.learning_eps}, expected > 0"
         )
     refuse_changed(
         "contacts.path", config.path,
@@ -122,6 +141,13 @@ def check_contacts(config: SampledContactsConfig) -> None:
             raise ValueError(f"contacts.{name}.follow is false, expected true")
 
 
+def beside(model: TipAndBall, height: float) -> float:
+    """How far beside the ball's centre, seen from above, a tip's surface is that
+    touches the ball with its centre at a height [m]; negative: it does not."""
+    R, r = model.ball_radius, model.tip_radius
+    return float(np.sqrt(max((R + r) ** 2 - (height - R) ** 2, 0.0)) - r)
+
+
 def ball_shape(model: TipAndBall, height: float) -> ObjectShape:
     """The ball for a tip whose centre stays at a height [m]: its outline is as far from
     the tip, seen from above, as the ball is.
@@ -129,14 +155,14 @@ def ball_shape(model: TipAndBall, height: float) -> ObjectShape:
     Raises: ValueError for a height at which the tip does not touch the ball's side.
     """
     R, r = model.ball_radius, model.tip_radius
+    far = beside(model, height)
     if not r < height < 2.0 * R:
         raise ValueError(
             f"contacts.sampler.sampling.height is {height:g}, expected above the tip's "
             f"radius, {r:g}, and below the ball's top, {2.0 * R:g} m"
         )
-    beside = np.sqrt((R + r) ** 2 - (height - R) ** 2) - r
     angle = 2.0 * np.pi * np.arange(CORNERS) / CORNERS
-    ring = beside * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    ring = far * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
     return ObjectShape([ring], r, 2.0 * R)
 
 
@@ -147,7 +173,7 @@ def sampled_c3_config(
     residual_dt [s]."""
     p = planner
     Q = np.zeros(N_X)
-    Q[2], Q[V_TIP] = p.tip_height, p.tip_speed
+    Q[0:2], Q[2], Q[V_TIP] = p.tip, p.tip_height, p.tip_speed
     Q[P_BALL], Q[V_BALL], Q[W_BALL] = p.position, p.velocity, p.velocity * radius**2
     # As of c3_config: lam : eta = 10 : 1, and the table's contact loose.
     contact = np.full(n_lam, 0.002)
@@ -181,6 +207,7 @@ def add_sampled_contacts(
     lcs: AnitescuLcs,
     c3: C3Config,
     p_tip,
+    n_tip: int,
     period: float,
     offset: dict[str, float],
     estimator: LeafSystem,
@@ -188,7 +215,8 @@ def add_sampled_contacts(
     """Adds and connects them, but for r_comp and what leads to C3 and the arm.
 
     Args: path: where the circle is; lcs: of the plan; p_tip (3,) where the tip is at
-        first [m]; period of the task [s]; offset of `target`, `task`, `sampler` [s].
+        first [m]; n_tip: forces of tip and ball; period of the task [s]; offset of
+        `target`, `task`, `sampler` [s].
     """
     sampling = config.sampler.sampling
     shape = ball_shape(model, sampling.height)
@@ -202,6 +230,10 @@ def add_sampled_contacts(
             c3.options.N + 1,
             lcs.dt_sec,
             model.ball_radius,
+            beside(model, sampling.height) + model.tip_radius,
+            lcs.n_lam,
+            n_tip,
+            c3.residual_dt_sec,
         ),
     )  # fmt: skip
     task = builder.AddNamedSystem(

@@ -14,6 +14,7 @@ from makebreak.diagrams.gentle_rolling import GentleRollingConfig, ball_config
 from makebreak.diagrams.sampled_contacts import (
     SampledContactsConfig,
     ball_shape,
+    beside,
     check_contacts,
     sampled_c3_config,
 )
@@ -42,6 +43,7 @@ from makebreak.systems.contact_mpc.numerics.lcs import simulate
 from makebreak.systems.contact_mpc.numerics.path_target import (
     moving_target,
     next_waypoint,
+    push_direction,
 )
 from makebreak.systems.contact_mpc.numerics.push_task import (
     CONTACT,
@@ -59,6 +61,7 @@ HEIGHT, R_BALL, R_TIP = 0.038, 0.0315, 0.0195
 SHAPE = ball_shape(MODEL, HEIGHT)
 PATH = CirclePath(np.array([0.5, 0.0]), 0.1)
 DT = 0.0125
+FAR = beside(MODEL, HEIGHT) + R_TIP  # Between the centres, seen from above [m].
 
 
 def ball_at(p, v=(0.0, 0.0), tip=(0.5, -0.2, 0.15), v_tip=(0.0, 0.0, 0.0)):
@@ -74,14 +77,43 @@ def outline(x):
 
 def test_the_tips_target_goes_with_the_balls():
     x = ball_at(PATH.point(0.4), (0.0, 0.03))
-    goal = moving_target(PATH, x, 0.1, 0.05, HEIGHT, R_BALL, 0.1, 6)
+    goal = moving_target(PATH, x, 0.1, 0.05, HEIGHT, 0.05, R_BALL, 0.1, 6)
     angle = 0.5 + 0.05 / 0.1 * 0.1 * np.arange(6)
     on = np.stack([0.5 + 0.1 * np.cos(angle), 0.1 * np.sin(angle)], axis=1)
     np.testing.assert_allclose(goal[:, P_BALL][:, :2], on, atol=1e-12)
     along = 0.05 * np.stack([-np.sin(angle), np.cos(angle)], axis=1)
-    np.testing.assert_allclose(goal[:, V_TIP][:, :2], along, atol=1e-12)
     np.testing.assert_allclose(goal[:, V_BALL][:, :2], along, atol=1e-12)
+    # The tip stays beside the ball as that goes on, 50 mm from it.
+    np.testing.assert_array_equal(goal[:, V_TIP], np.tile([0.0, 0.03, 0.0], (6, 1)))
+    goes = x[P_BALL][:2] + 0.1 * np.arange(6)[:, None] * x[V_BALL][:2]
+    off = goal[:, P_TIP][:, :2] - goes
+    np.testing.assert_allclose(np.linalg.norm(off, axis=1), 0.05, atol=1e-12)
+    np.testing.assert_allclose(off, np.tile(off[0], (6, 1)), atol=1e-12)
     np.testing.assert_array_equal(goal[:, 2], HEIGHT)
+
+
+@pytest.mark.parametrize("angle", [0.4, 2.0, -1.1])
+def test_the_ball_is_pushed_from_where_it_has_too_much_velocity(angle):
+    """In the circle's own directions at the ball, outwards and along it."""
+    out = np.array([np.cos(angle), np.sin(angle)])
+    along = np.array([-out[1], out[0]])
+
+    def pushed(outside, v):
+        p = PATH.point(angle) + outside * out
+        d = push_direction(PATH, ball_at(p, v), 0.05)
+        assert np.linalg.norm(d) == pytest.approx(1.0)
+        return np.array([d @ out, d @ along])
+
+    at_rest = pushed(0.0, (0.0, 0.0))
+    # To the point 20 degrees ahead: inwards by half of that.
+    np.testing.assert_allclose(at_rest, [-np.sin(0.175), np.cos(0.175)], atol=1e-3)
+    # As fast as it should be, along the circle: mostly inwards, as a curve needs.
+    rolls = pushed(0.0, 0.05 * along)
+    assert rolls[0] < -0.4 and rolls[1] > 0.5
+    # One that rolls outwards, or is outside, is pushed inwards more; and the reverse.
+    assert pushed(0.0, 0.05 * along + 0.02 * out)[0] < rolls[0] - 0.2
+    assert pushed(0.01, 0.05 * along)[0] < rolls[0] - 0.2
+    assert pushed(-0.02, 0.05 * along)[0] > 0.0
 
 
 def test_goals_lie_ahead_and_do_not_go_back_with_the_ball():
@@ -108,11 +140,12 @@ def test_goals_lie_ahead_and_do_not_go_back_with_the_ball():
 def test_the_system_gives_target_and_goal_and_holds_them_for_bad_input():
     builder = DiagramBuilder()
     target = builder.AddSystem(
-        PathTarget(PathTargetConfig(integral_sec=2.0), 6, 0.1, R_BALL)
+        PathTarget(PathTargetConfig(integral_sec=2.0), 6, 0.1, R_BALL, 0.05, 8, 4, 0.05)
     )
     x = ball_at([0.5 + 0.104, 0.0])  # 4 mm outside.
     sources = {}
-    for name, value in (("x", x), ("valid", [1.0])):
+    r = np.append(np.full(4, -0.04), np.full(4, 9.0))  # 2 mm nearer, and another's.
+    for name, value in (("x", x), ("valid", [1.0]), ("r_comp", r)):
         sources[name] = builder.AddSystem(ConstantVectorSource(np.array(value)))
         builder.Connect(sources[name].get_output_port(), target.GetInputPort(name))
     diagram = builder.Build()
@@ -133,6 +166,8 @@ def test_the_system_gives_target_and_goal_and_holds_them_for_bad_input():
     # The circle that is aimed at shrinks by 1 s / 2 s of the distance to the path.
     inward = np.linalg.norm((first - later)[-1, P_BALL][:2])
     assert inward == pytest.approx(0.004 * 1.0 / 2.0, rel=0.05)
+    away = np.linalg.norm((first[0, P_TIP] - x[P_BALL])[:2])
+    assert away == pytest.approx(0.05 + 0.001 + 0.002)
     value = x.copy()
     value[7] = np.nan
     own = sources["x"].GetMyMutableContextFromRoot(context)
@@ -152,7 +187,7 @@ def test_the_system_gives_target_and_goal_and_holds_them_for_bad_input():
 )
 def test_a_path_out_of_range_is_named(change, message):
     with pytest.raises(ValueError, match=message):
-        PathTarget(PathTargetConfig(**change), 6, 0.1, R_BALL)
+        PathTarget(PathTargetConfig(**change), 6, 0.1, R_BALL, 0.05, 8, 4, 0.05)
 
 
 # The way, and places around a ball.
@@ -257,7 +292,7 @@ def test_a_tip_elsewhere_is_taken_to_arrive_with_the_balls_velocity(planner):
     plan, problem, sampling, _ = planner
     x = ball_at(PATH.point(0.4), (-0.02, 0.04), [0.55, -0.02, HEIGHT], (0.1, 0.2, 0.0))
     target = moving_target(
-        PATH, x, 0.1, 0.05, HEIGHT, R_BALL, 0.1, problem.options.N + 1
+        PATH, x, 0.1, 0.05, HEIGHT, 0.05, R_BALL, 0.1, problem.options.N + 1
     )
     seen = []
 
@@ -294,8 +329,9 @@ def test_a_ball_is_rolled_along_the_circle_from_beside(planner):
     goal = None
     for k in range(round(7.0 / DT)):
         target = moving_target(
-            PATH, x, np.deg2rad(6.0), 0.05, HEIGHT, R_BALL, 0.1, problem.options.N + 1
-        )
+            PATH, x, np.deg2rad(6.0), 0.05, HEIGHT, FAR + 1e-3, R_BALL, 0.1,
+            problem.options.N + 1,
+        )  # fmt: skip
         goal = next_waypoint(PATH.angle(x[P_BALL]), 0.1, np.deg2rad(10.0), goal)
         if k % 8 == 0:
             off = float(np.linalg.norm(PATH.point(goal) - x[P_BALL][:2]))

@@ -65,7 +65,7 @@ class ContactSampler(LeafSystem):
              goal (3,) = x, y [m], yaw [rad]; phase (1,) of PushTask; valid (1,): 1 if
              the object is seen; r_comp (n_lam,) [m/s at residual_dt_sec], optional: it
              counts in every plan, and where the object turns out to reach farther out,
-             the places do too.
+             the places do too (with follow also where it reaches less far).
     Outputs: command (3,) = [number, x, y]: a place in the object's frame, seen from
              above [m]; each new number is a new command to go there, 0: none yet;
              status (1,): a SamplerStatus; round (abstract): the last Round, or None.
@@ -135,12 +135,15 @@ class ContactSampler(LeafSystem):
             return SamplerStatus.NOT_SEEN
         memory = context.get_abstract_state(int(self._memory)).get_value()
         length, angle = errors(x, goal)
+        # What lies still is approached from no nearer than its model says.
+        nearer = -float(gap.min())
+        nearer = nearer if c.sampling.follow else max(0.0, nearer)
         try:
             memory, found = sample_round(
                 c.sampling, memory, self._model.build_many, p, self._shape, x,
                 x_desired.reshape(-1, N_X), length + c.angle_radius * angle,
                 phase[0] == CONTACT, context.get_time(), r, c.budget_sec,
-                max(0.0, -float(gap.min())),
+                nearer,
                 tuple(goal.tolist()),
             )  # fmt: skip
         except ValueError:  # An object on edge has no outline.

@@ -18,6 +18,8 @@ from makebreak.systems.contact_mpc.numerics.rolling_task import (
 )
 from makebreak.systems.numerics.timing import timed
 
+AWAY = 0.001  # The tip's target does not touch the ball by itself [m].
+
 
 @dataclass
 class PathTargetConfig:
@@ -36,14 +38,16 @@ class PathTarget(LeafSystem):
     """What C3 and ContactSampler are to make of a ball that rolls along a circle.
 
     Inputs:  x (19,) of numerics/ball_state.py; valid (1,): above 0.5 where it can be
-             trusted.
+             trusted; r_comp (n_lam,) [m/s] of the learner, whose first n_tip entries
+             belong to tip and ball, optional: the tip is to be as much nearer.
     Outputs: x_desired ((N + 1) 19,) for C3; goal (3,) = x, y [m], 0: the next point on
              the circle.
 
     The circle that is aimed at is larger or smaller than the path by the integral of
     the ball's distance to it, as in RollingTask. What is not finite changes nothing.
 
-    Args: n_knots = N + 1; knot_sec between them [s]; radius_ball as modelled [m].
+    Args: n_knots = N + 1; knot_sec between them [s]; radius_ball as modelled [m]; away:
+        of the tip's centre from the ball's, seen from above, where they touch [m].
     """
 
     def __init__(
@@ -52,6 +56,10 @@ class PathTarget(LeafSystem):
         n_knots: int,
         knot_sec: float,
         radius_ball: float,
+        away: float,
+        n_lam: int,
+        n_tip: int,
+        residual_dt_sec: float,
     ):
         super().__init__()
         c = config
@@ -63,11 +71,13 @@ class PathTarget(LeafSystem):
         if not 0.0 <= c.lead_deg < np.inf:
             raise ValueError(f"path.lead_deg is {c.lead_deg}, expected >= 0")
         self._config, self._n_knots, self._knot_sec = c, n_knots, knot_sec
-        self._radius_ball = radius_ball
+        self._radius_ball, self._away = radius_ball, away
+        self._n_tip, self._residual_dt_sec = n_tip, residual_dt_sec
         self._path = CirclePath(np.array(c.center), c.radius)
         self._integral = RollingConfig(integral_sec=c.integral_sec)
         self._x = self.DeclareVectorInputPort("x", N_X)
         self._valid = self.DeclareVectorInputPort("valid", 1)
+        self._r_comp = self.DeclareVectorInputPort("r_comp", n_lam)
         at_rest = np.eye(N_X)[3]
         self._shift = self.DeclareDiscreteState([0.0])  # Of the circle's radius [m].
         self._angle = self.DeclareDiscreteState([np.nan])  # Of the goal [rad].
@@ -83,16 +93,21 @@ class PathTarget(LeafSystem):
     def _update(self, context, discrete_state):
         c = self._config
         x, valid = (np.asarray(p.Eval(context)) for p in (self._x, self._valid))
-        if not is_finite(x):
+        gap = 0.0
+        if self._r_comp.HasValue(context):
+            r = np.asarray(self._r_comp.Eval(context))[: self._n_tip]
+            gap = float(r.mean()) * self._residual_dt_sec
+        if not (is_finite(x) and np.isfinite(gap)):
             return
+        away = self._away + AWAY - gap
         shift = float(context.get_discrete_state(self._shift).value()[0])
         if valid[0] > 0.5:
             shift = shifted(self._integral, self._path, shift, x, c.period_sec)
         path = replace(self._path, radius=self._path.radius + shift)
         lead = np.deg2rad(c.lead_deg)
         target = moving_target(
-            path, x, lead, c.speed, c.height, self._radius_ball, self._knot_sec,
-            self._n_knots,
+            path, x, lead, c.speed, c.height, away, self._radius_ball,
+            self._knot_sec, self._n_knots,
         )  # fmt: skip
         last = float(context.get_discrete_state(self._angle).value()[0])
         angle = next_waypoint(

@@ -32,12 +32,14 @@ class PushTask(LeafSystem):
     """Phases of pushing an object to a pose, the target of C3 and the way between.
 
     Inputs:  x (19,) of numerics/ball_state.py; valid (1,): above 0.5 where it can be
-             trusted; goal (3,) = x, y [m], yaw [rad]; command (3,) of ContactSampler.
+             trusted; goal (3,) = x, y [m], yaw [rad]; command (3,) of ContactSampler;
+             nearer (1,) [m], optional: by how much the object reaches farther out than
+             its shape, as learned (negative: less far), which its ways heed.
     Outputs: x_desired ((N + 1) 19,) for C3; reference (9,) = p, v, a of the tip at the
              next tick, used unless in CONTACT; phase (1,): 0 CONTACT, 1 TRAVEL, 2 WAIT.
 
-    Where x or command is not finite all stays as it is; where goal is not, the target
-    stays, and the tip waits.
+    Where x, command or nearer is not finite all stays as it is; where goal is not, the
+    target stays, and the tip waits.
 
     Args: n_knots = N + 1; shape of object and tip; p_tip (3,): where the tip is at
         first [m].
@@ -65,6 +67,7 @@ class PushTask(LeafSystem):
         self._valid = self.DeclareVectorInputPort("valid", 1)
         self._goal = self.DeclareVectorInputPort("goal", 3)
         self._command = self.DeclareVectorInputPort("command", 3)
+        self._nearer = self.DeclareVectorInputPort("nearer", 1)
         start = PushState(WAIT, p_tip, np.zeros(3), np.zeros(3))
         self._task = self.DeclareAbstractState(Value[object](start))
         at_rest = np.zeros(N_X)
@@ -87,7 +90,10 @@ class PushTask(LeafSystem):
             for port in (self._x, self._valid, self._goal, self._command)
         )
         task = context.get_abstract_state(int(self._task)).get_value()
-        if not (is_finite(x) and is_finite(command)):
+        nearer = 0.0
+        if self._nearer.HasValue(context):
+            nearer = float(self._nearer.Eval(context)[0])
+        if not (is_finite(x) and is_finite(command) and np.isfinite(nearer)):
             return
         discrete = state.get_mutable_discrete_state()
         seen = valid[0] > 0.5 and is_finite(goal)
@@ -98,7 +104,7 @@ class PushTask(LeafSystem):
         try:
             task = next_push(
                 c.push, task, self._shape, c.period_sec, x, seen, place,
-                int(command[0]), c.height, c.clearance,
+                int(command[0]), c.height, c.clearance, nearer,
             )  # fmt: skip
         except ValueError:  # An object on edge has no outline: everything stays.
             return

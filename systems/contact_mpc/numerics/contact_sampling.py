@@ -63,6 +63,7 @@ class SamplingConfig:
     stuck_sec: float = 1.2  # Without progress for so long, the present one is given up.
     # Of an object that rolls on by itself: the tip arrives with its velocity.
     follow: bool = False
+    keep_sec: float = 0.0  # A place that is reached is kept for so long.
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +79,7 @@ class SamplingMemory:
     goal: tuple[float, ...] | None = None  # That the error is from.
     error: float = np.inf  # From the goal when there was progress last [m] ...
     since_sec: float = 0.0  # ... and when that was.
+    reached_sec: float | None = None  # Since when the tip pushes; None: it travels.
 
     def __deepcopy__(self, memo) -> "SamplingMemory":
         return self  # Nothing in it is changed once it is there.
@@ -549,7 +551,7 @@ def sample_round(
         t [s]; r (n_lam,): what is added to every LCS's c [m/s], None: nothing.
         budget_sec: of wall-clock time for the scores (score_within).
         nearer: by how much the object reaches farther out than its shape, as learned;
-            the places lie as much farther out [m].
+            the places lie as much farther out [m]; negative: as much farther in.
         goal: tells one goal from the next, whose error is another one.
     Raises: ValueError for an object without an outline.
     """
@@ -603,7 +605,10 @@ def sample_round(
     elif t - m.since_sec > c.stuck_sec:
         m = replace(m, error=error, since_sec=t)
         cost[0] = NO_PLAN
-    chosen = choose(cost, c.hysteresis)
+    reached = m.reached_sec if in_contact else None
+    m = replace(m, reached_sec=t if in_contact and reached is None else reached)
+    keep = in_contact and t - (m.reached_sec or 0.0) < c.keep_sec
+    chosen = 0 if keep and np.isfinite(cost[0]) else choose(cost, c.hysteresis)
     found = Round(places, cost, chosen, plans[chosen])
     m = replace(m, count=m.count + 1)
     if n > 1 and np.isfinite(cost[1:]).any():

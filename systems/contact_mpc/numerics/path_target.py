@@ -7,20 +7,44 @@ points along the circle.
 
 import numpy as np
 
-from makebreak.systems.contact_mpc.numerics.ball_state import V_BALL, V_TIP
+from makebreak.systems.contact_mpc.numerics.ball_state import (
+    P_BALL,
+    P_TIP,
+    V_BALL,
+    V_TIP,
+)
 from makebreak.systems.contact_mpc.numerics.rolling_task import (
     CirclePath,
     target_over_horizon,
 )
 
+# Along the path a ball is pushed as if it had to be faster by this share of its speed:
+# where nothing else is wanted of it, the tip belongs behind it.
+FORWARD = 0.5
+
+
+def push_direction(path: CirclePath, x, speed: float) -> np.ndarray:
+    """(2,) unit vector: where the ball is to be accelerated to, for the velocity with
+    which it comes to the path and along it at a speed [m/s]."""
+    wanted = speed * path.heading(x[P_BALL])
+    change = (1.0 + FORWARD) * wanted - x[V_BALL][:2]
+    return change / max(float(np.hypot(*change)), 1e-9)
+
 
 def moving_target(
-    path: CirclePath, x, lead, speed, z_tip, radius_ball, dt, n_knots
+    path: CirclePath, x, lead, speed, z_tip, away, radius_ball, dt, n_knots
 ) -> np.ndarray:
-    """The target of C3 (n_knots, 19), as target_over_horizon has it, for a tip that
-    goes with the ball: at the height z_tip [m], as fast as the ball's target."""
+    """The target of C3 (n_knots, 19): of the ball that of target_over_horizon; of the
+    tip, to go along with the ball as it is, on the side from which it is to be pushed.
+
+    Args: as of target_over_horizon; z_tip: height of the tip's centre, away: its
+        distance from the ball's, seen from above [m].
+    """
     goal = target_over_horizon(path, x, lead, speed, z_tip, radius_ball, dt, n_knots)
-    goal[:, V_TIP] = goal[:, V_BALL]
+    side = x[P_BALL][:2] - away * push_direction(path, x, speed)
+    ahead = dt * np.arange(n_knots)[:, None]
+    goal[:, P_TIP.start : P_TIP.start + 2] = side + ahead * x[V_BALL][:2]
+    goal[:, V_TIP] = x[V_BALL]
     return goal
 
 

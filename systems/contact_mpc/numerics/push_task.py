@@ -129,7 +129,7 @@ def look_ahead(config: PushConfig, x, goal, height: float, n_knots: int):
 
 def next_push(
     config: PushConfig, state: PushState, shape: ObjectShape, dt, x, seen, place, go,
-    height, clearance,
+    height, clearance, nearer=0.0,
 ):  # fmt: skip
     """One tick of the task.
 
@@ -138,6 +138,7 @@ def next_push(
         place: (2,) of ContactSampler, in the object's frame; None: none yet. go: the
             number of that command. height of the tip's centre while pushing, clearance
             from the object at a place [m].
+        nearer: by how much the object reaches farther out than its shape [m].
     Returns: PushState; unless in CONTACT its p, v, a is the reference at t + dt.
     """
     unseen = 0.0 if seen else state.unseen_sec + dt
@@ -161,7 +162,7 @@ def next_push(
     outline = outline_of(shape.parts, rotation_of(x[Q_BALL]), x[P_BALL])
     limits = config.speed, config.acceleration
     up = shape.clear_height(config.margin)
-    distance = shape.tip_radius + 0.5 * clearance
+    distance = shape.tip_radius + 0.5 * clearance + nearer
     along = np.zeros(3)
     if config.follow and state.phase == TRAVEL:
         along[:2] = x[V_BALL][:2]
