@@ -367,16 +367,21 @@ def learner_config(
     if from_beside is not None:
         Q_d[:] = 0.0
         Q_d[[V_BALL.start, V_BALL.start + 1]] = from_beside.learning_weight
+    eps, posterior = learner.eps, learner.posterior
+    if from_beside is not None:
+        eps = from_beside.learning_eps
+        drift = from_beside.learning_drift
+        posterior = replace(posterior, drift=drift, growth=0.0)
     return ResidualLearnerConfig(
         Q_d=Q_d.tolist(),
-        eps=learner.eps if from_beside is None else from_beside.learning_eps,
+        eps=eps,
         gamma=learner.gamma,
         # The gap is one number: the tip's four forces share one residual. The table's
         # contact does not adapt.
         groups=[list(range(N_TIP))],
         r_max=learner.r_max,
         slip_noise=learner.slip_noise,
-        posterior=learner.posterior,
+        posterior=posterior,
     )
 
 

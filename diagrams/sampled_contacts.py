@@ -71,6 +71,7 @@ class SampledContactsConfig:
         default_factory=lambda: ContactSamplerConfig(
             SamplingConfig(
                 height=0.038,
+                reach=[0.35, 0.78],
                 travel=5.0,
                 hysteresis=[0.3, 1.0],
                 push=0.5,
@@ -90,6 +91,9 @@ class SampledContactsConfig:
     # Loss of complementarity over the learner's: a ball beside the tip is pushed with
     # some hundredths of a newton, not with the newtons of a tip on top of it.
     learning_eps: float = 1e-4
+    # As posterior.drift of the learner [m/s / sqrt(s)]: a tip at one height touches the
+    # ball at one angle, where the gap stays what it is.
+    learning_drift: float = 0.005
     # The gap is learned too large by 1.5 to 3 mm, for the ball is seen late; a tip that
     # believes it strikes the ball. So much is taken off what is learned [m].
     gap_allowance: float = 0.002
@@ -114,7 +118,7 @@ def check_contacts(config: SampledContactsConfig) -> None:
             raise ValueError(
                 f"contacts.planner.{name} is {getattr(p, name)}, expected > 0"
             )
-    for name in ("learning_weight", "gap_allowance"):
+    for name in ("learning_weight", "learning_drift", "gap_allowance"):
         if not 0.0 <= getattr(config, name) < np.inf:
             raise ValueError(
                 f"contacts.{name} is {getattr(config, name)}, expected >= 0"
