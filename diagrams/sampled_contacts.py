@@ -81,9 +81,7 @@ class SampledContactsConfig:
         )
     )
     push: PushConfig = field(
-        default_factory=lambda: PushConfig(
-            descent=0.2, believed_sec=0.5, follow=True, around=True
-        )
+        default_factory=lambda: PushConfig(believed_sec=0.5, follow=True, around=True)
     )
     # Q_d of the learner on the ball's v_x, v_y, as from above: 7 mm/s. The arm that
     # moves the tip hardly feels a ball beside it.
@@ -96,7 +94,7 @@ class SampledContactsConfig:
     learning_drift: float = 0.005
     # The gap is learned too large by 1.5 to 3 mm, for the ball is seen late; a tip that
     # believes it strikes the ball. So much is taken off what is learned [m].
-    gap_allowance: float = 0.002
+    gap_allowance: float = 0.003
     reference: ArmReferenceConfig = field(
         default_factory=lambda: ArmReferenceConfig(force_max=8.0, acceleration_max=3.0)
     )

@@ -228,8 +228,9 @@ def test_the_way_around_arrives_and_keeps_its_distance(goal_deg):
     assert length < 0.06 * abs(angle) + 0.015  # The shorter way around.
 
 
-def travelled(v, config, seconds=1.0):
-    """References of a tip that goes to the far side of a ball that moves at v (2,)."""
+def travelled(v, config, seconds=1.0, inside=0.0, nearer=0.0):
+    """References of a tip that goes to the far side of a ball that moves at v (2,), to
+    a place by so much nearer than the model's ball lets it."""
     start, along = np.array([0.5, 0.0]), np.array(v)
     state = PushState(
         TRAVEL, np.array([0.5, -0.056, HEIGHT]), np.array([*v, 0.0]), np.zeros(3), go=1
@@ -237,18 +238,10 @@ def travelled(v, config, seconds=1.0):
     rows = []
     for k in range(round(seconds / DT)):
         x = ball_at(start + along * k * DT, v, state.p, state.v)
+        place = (1.0 - inside / 0.0555) * np.array([0.02, 0.0518])
         state = next_push(
-            config,
-            state,
-            SHAPE,
-            DT,
-            x,
-            True,
-            np.array([0.02, 0.0518]),
-            1,
-            HEIGHT,
-            0.004,
-        )
+            config, state, SHAPE, DT, x, True, place, 1, HEIGHT, 0.004, nearer
+        )  # fmt: skip
         rows.append([*(state.p[:2] - along * (k + 1) * DT), *(state.v[:2] - along)])
         if state.phase == CONTACT:
             break
@@ -267,6 +260,16 @@ def test_the_way_beside_a_ball_that_rolls_is_that_beside_one_at_rest():
     assert np.linalg.norm(lags.v[:2]) < 0.02
     _, over = travelled([0.0, 0.0], replace(config, around=False), 0.3)
     assert over.p[2] > HEIGHT + 0.01 and end.p[2] == pytest.approx(HEIGHT, abs=2e-3)
+
+
+def test_a_ball_that_is_learned_to_be_smaller_is_passed_and_reached_nearer():
+    config = PushConfig(follow=True, around=True)
+    rows, end = travelled([0.0, 0.0], config, inside=0.004, nearer=-0.005)
+    assert end.phase == CONTACT
+    far = np.hypot(*(rows[:, :2] - [0.5, 0.0]).T)
+    assert far[-1] == pytest.approx(0.0515, abs=2e-3)
+    _, kept = travelled([0.0, 0.0], config, inside=0.004)
+    assert np.hypot(*(kept.p[:2] - [0.5, 0.0])) > 0.0525 or kept.p[2] > HEIGHT + 0.01
 
 
 # Rounds and the loop.
@@ -315,6 +318,30 @@ def test_a_tip_elsewhere_is_taken_to_arrive_with_the_balls_velocity(planner):
     )
     at_rest = round_of(replace(sampling, follow=False))
     np.testing.assert_array_equal(at_rest[1:, V_TIP], 0.0)
+
+
+def test_a_place_that_is_reached_is_kept_for_a_while(planner):
+    """A tip in front of a ball that it should be behind."""
+    plan, problem, sampling, _ = planner
+    at, along = PATH.point(0.4), np.array([-np.sin(0.4), np.cos(0.4)])
+    x = ball_at(at, (0.0, 0.0), [*(at + 0.0512 * along), HEIGHT])
+    target = moving_target(
+        PATH, x, 0.1, 0.05, HEIGHT, FAR, R_BALL, 0.1, problem.options.N + 1
+    )
+
+    def chosen(keep_sec, times):
+        memory, found = SamplingMemory(), []
+        for t in times:
+            memory, one = sample_round(
+                replace(sampling, keep_sec=keep_sec), memory, plan.build_many, problem,
+                SHAPE, x, target, 0.01, True, t,
+            )  # fmt: skip
+            found.append(one.chosen)
+        return found
+
+    assert chosen(0.0, [5.0])[0] != 0
+    kept = chosen(0.5, [5.0, 5.3, 5.6])
+    assert kept[:2] == [0, 0] and kept[2] != 0
 
 
 def test_a_ball_is_rolled_along_the_circle_from_beside(planner):
