@@ -86,8 +86,8 @@ class SampledContactsConfig:
     # Q_d of the learner on the ball's v_x, v_y, as from above: 7 mm/s. The arm that
     # moves the tip hardly feels a ball beside it.
     learning_weight: float = 2e4
-    # Loss of complementarity over the learner's: a ball beside the tip is pushed with
-    # some hundredths of a newton, not with the newtons of a tip on top of it.
+    # As learning.eps: a ball beside the tip is pushed with far less than the newtons of
+    # a tip on top of it, so a force over a gap has to cost more.
     learning_eps: float = 1e-4
     # As posterior.drift of the learner [m/s / sqrt(s)]: a tip at one height touches the
     # ball at one angle, where the gap stays what it is.
