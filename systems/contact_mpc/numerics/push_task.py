@@ -38,7 +38,8 @@ PLACE_CHANGE = 0.008
 # object, which is larger than believed, or elsewhere: it goes up, and after that comes
 # down so much farther out; not farther than EXTRA_MAX, where it no longer matters [m].
 MISSED, EXTRA, EXTRA_MAX = 0.01, 0.003, 0.012
-LOW = 2e-3  # So little above the table's height for pushing the tip is down [m].
+LOW = 2e-3  # So little above its height for pushing the tip is down [m].
+EDGE = 0.9  # From so much of the object's height on its upper edge may be in the way.
 # Each landing that does not miss takes so much of it back [m].
 TAKEN_BACK = 0.001
 
@@ -188,7 +189,8 @@ def next_push(
     if held is None or config.follow or np.hypot(*(now - held)) > PLACE_CHANGE:
         held = now
     goal = np.array([*held, height])
-    if state.p[2] > height + LOW:
+    # Below the object's top it meets a side, not an edge.
+    if state.p[2] > max(height + LOW, EDGE * shape.top):
         beside = held - config.room * inward(held[None], outline)[0]
         near = distance_to_outline(beside[None], outline)[0]
         if near > shape.tip_radius + clearance + 0.5 * config.room:
