@@ -556,7 +556,11 @@ def make_push_object(
             outline_fold(config),
         ),
     )
+    # What rolls on is followed.
+    rolls = bool(rolling_axis(spec))
+    push = replace(config.task.push, follow=config.task.push.follow or rolls)
     sampling = config.sampler.sampling
+    sampling = replace(sampling, follow=sampling.follow or rolls)
     if not tip.tip_radius < sampling.height < top:
         raise ValueError(
             f"sampler.sampling.height is {sampling.height:g}, expected above the tip's "
@@ -567,6 +571,7 @@ def make_push_object(
         PushTask(
             replace(
                 config.task,
+                push=push,
                 height=sampling.height,
                 clearance=sampling.clearance,
                 period_sec=CONTROL,
@@ -582,6 +587,7 @@ def make_push_object(
         ContactSampler(
             replace(
                 config.sampler,
+                sampling=sampling,
                 angle_radius=config.planner.angle_radius,
                 residual_dt_sec=LEARN,
                 offset_sec=OFFSET["sampler"],

@@ -81,7 +81,9 @@ class SampledContactsConfig:
         )
     )
     push: PushConfig = field(
-        default_factory=lambda: PushConfig(believed_sec=0.5, follow=True, around=True)
+        default_factory=lambda: PushConfig(
+            believed_sec=0.5, follow=True, place_change=0.0, around=True
+        )
     )
     # Q_d of the learner on the ball's v_x, v_y, as from above: 7 mm/s. The arm that
     # moves the tip hardly feels a ball beside it.

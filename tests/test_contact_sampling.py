@@ -375,6 +375,32 @@ def test_another_goal_is_no_lack_of_progress(planner):
     assert not np.isfinite(found.cost[0])  # Of the same goal it is one.
 
 
+def test_a_place_goes_along_with_what_rolls_and_not_with_its_noise(planner):
+    shape = planner[2]
+    place = np.array([0.0, 0.13])
+    for follow, change in ((True, 0.008), (True, 0.0), (False, 0.008)):
+        config, rng = PushConfig(follow=follow, place_change=change), (
+            np.random.default_rng(0)
+        )  # fmt: skip
+        x = state([0.5, 0.3, 0.1], (0.5, 0.0, 0.0))
+        task = PushState(WAIT, x[P_TIP].copy(), np.zeros(3), np.zeros(3))
+        off = []
+        for k in range(60):
+            y = 0.1 * 0.0125 * k
+            x[P_BALL][:2] = [0.5, y] + 5e-4 * rng.normal(size=2)
+            x[V_BALL][:2] = [0.0, 0.1]
+            task = next_push(
+                config, task, shape, 0.0125, x, True, place, 1, HEIGHT, 0.004
+            )
+            x[P_TIP] = task.p
+            off.append(task.place - [0.5, y + 0.13])
+        steps = np.diff(np.array(off)[1:], axis=0)
+        still = bool(np.median(abs(steps[:, 0])) < 1e-9)
+        assert still is (change > 0.0)  # It does not shake with the noise.
+        lag = abs(np.array(off)[:, 1]).max()
+        assert lag < 0.003 if follow else lag > 0.006
+
+
 @pytest.mark.parametrize("shape", ["disc", "cylinder"])
 def test_a_place_keeps_the_plan_that_it_was_chosen_for(shape):
     """Round by round the search finds a good plan from a place, or a bad one: where the

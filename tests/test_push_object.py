@@ -23,6 +23,7 @@ from makebreak.diagrams.push_object import (
     world_scene,
 )
 from makebreak.models.effects.kind import Effect
+from makebreak.models.pushed_object import PushedObject
 from makebreak.models.scene import read_scene
 from makebreak.models.scene_file import write_scene
 from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL, Q_BALL
@@ -301,6 +302,17 @@ def test_goals_lie_all_over_the_region():
     # Evenly: mean zero to 4 standard deviations of a mean of 400.
     assert (np.abs(off.mean(axis=0)) < 4 * half / np.sqrt(3 * 400)).all()
     assert not np.array_equal(poses, draw_poses(config, 400, 6))
+
+
+def test_a_lying_cylinder_is_followed_and_a_t_is_not():
+    """Where it will be touched a place goes along with what rolls."""
+    for shape, follows in (("cylinder", True), ("t", False)):
+        config = PushObjectConfig(object=PushedObject(shape))
+        diagram = make_push_object(config)
+        task = diagram.GetSubsystemByName("push_task")
+        sampler = diagram.GetSubsystemByName("contact_sampler")
+        assert task._config.push.follow is follows
+        assert sampler._config.sampling.follow is follows
 
 
 # The forces.

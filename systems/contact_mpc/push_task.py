@@ -54,8 +54,11 @@ class PushTask(LeafSystem):
                 raise ValueError(
                     f"task.push.{name} is {getattr(config.push, name)}, expected > 0"
                 )
-        if not 0.0 <= config.push.room < np.inf:
-            raise ValueError(f"task.push.room is {config.push.room}, expected >= 0")
+        for name in ("room", "place_change"):
+            if not 0.0 <= getattr(config.push, name) < np.inf:
+                raise ValueError(
+                    f"task.push.{name} is {getattr(config.push, name)}, expected >= 0"
+                )
         for name in ("height", "clearance", "period_sec"):
             if not getattr(config, name) > 0.0:
                 raise ValueError(

@@ -32,8 +32,6 @@ from makebreak.systems.contact_mpc.numerics.contact_sampling import (
 
 # CONTACT is what ArmReference follows C3 in (numerics/rolling_task.py: ROLL).
 CONTACT, TRAVEL, WAIT = 0, 1, 2
-# A place moves with the object where that is more than noise [m].
-PLACE_CHANGE = 0.008
 # A tip that is so far above where it should be on its way down has come down on the
 # object, which is larger than believed, or elsewhere: it goes up, and after that comes
 # down so much farther out; not farther than EXTRA_MAX, where it no longer matters [m].
@@ -68,6 +66,9 @@ class PushConfig:
     # Of an object that rolls on by itself: the tip travels along with it, and arrives
     # with its velocity.
     follow: bool = False
+    # A place is where it was on the object (and goes along with it, with follow) as
+    # long as the object is not measured so far off from there: less is noise.
+    place_change: float = 0.008  # [m]
     # Around an object that is one convex part, not over it, where the tip is low.
     around: bool = False
 
@@ -185,8 +186,8 @@ def next_push(
     now = to_world(x, place)
     if state.extra > 0.0:
         now = now - state.extra * inward(now[None], outline)[0]
-    held = state.place
-    if held is None or config.follow or np.hypot(*(now - held)) > PLACE_CHANGE:
+    held = state.place if state.place is None else state.place + dt * along[:2]
+    if held is None or np.hypot(*(now - held)) > config.place_change:
         held = now
     goal = np.array([*held, height])
     # Below the object's top it meets a side, not an edge.
