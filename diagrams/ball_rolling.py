@@ -17,7 +17,8 @@ from typing import Literal
 
 import numpy as np
 from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort
 from pydrake.systems.primitives import (
     Adder,
     ConstantVectorSource,
@@ -66,6 +67,7 @@ from makebreak.systems.baselines.dynamics_residual_learner import (
 )
 from makebreak.systems.contact_mpc.c3_mpc import C3Config, C3Mpc
 from makebreak.systems.contact_mpc.lcs_builder import (
+    AnitescuLcs,
     AnitescuLcsBuilder,
     ContactPair,
     LcsBuilderConfig,
@@ -84,6 +86,7 @@ from makebreak.systems.contact_mpc.numerics.c3_projections import (
     PlusProjection,
     QpProjection,
 )
+from makebreak.systems.contact_mpc.numerics.lcs import LCS
 from makebreak.systems.contact_mpc.path_target import PathTargetConfig
 from makebreak.systems.contact_mpc.residual_learner import (
     PosteriorConfig,
@@ -479,87 +482,24 @@ def add_ball_rolling(
     """
     check_own(config, _OWN)
     model, model_scene = believed(config)
-    camera = replace(config.camera, position_noise_m=config.ball_noise_m)
     learner_kind = config.learner if config.adapt else "none"
-    paper = config.controller == "paper"
     projection = config.projection
     if projection == "auto":
-        projection = "qp" if paper else "plus"
+        projection = "qp" if config.controller == "paper" else "plus"
     samples = config.contact_sequence == "sampled"
     if samples:
-        check_contacts(config.contacts)
-        for name, value, expected in (
-            ("controller", config.controller, ("ours",)),
-            ("projection", projection, ("plus",)),
-            ("learner", learner_kind, ("none", "r_comp")),
-        ):
-            if value not in expected:
-                raise ValueError(
-                    f"{name}={value} with contact_sequence=sampled, expected "
-                    + " or ".join(expected)
-                )
+        _check_sampled(config, projection, learner_kind)
     wrong = what_goes_wrong(config)
     if station is None:
         station = make_world(config, meshcat, sampled)
     station = builder.AddNamedSystem("station", station)
-    simulated = station.HasSubsystemNamed("plant")  # Whether there is a truth.
     arm = make_control_plant(model_scene)
     tip = arm.GetFrameByName(TIP_FRAME)
     p_tip = tip.CalcPoseInWorld(arm.CreateDefaultContext()).translation()
 
-    friction, tangent = config.planner.friction, ContactPair().tangent
-    if samples:
-        # Edges along the vertical do not jump as the normal goes around the ball.
-        friction, tangent = config.contacts.planner.friction, [0.0, 0.0, 1.0]
-    pairs = [
-        ContactPair("tip::tip", "ball::ball", friction, tangent=tangent),
-        ContactPair("ball::ball", "table::table", friction),
-    ]
-    lcs, lcs_of = {}, {}
-    for name, dt, period in (
-        ("plan", PLAN_DT, CONTROL),
-        ("command", CONTROL, CONTROL),
-        ("learn", LEARN, LEARN),
-    ):
-        own = AnitescuLcsBuilder(
-            make_tip_and_ball(model)[0],
-            LcsBuilderConfig(pairs, dt, None, period, OFFSET["lcs"]),
-        )
-        lcs_of[name] = own.model
-        lcs[name] = builder.AddNamedSystem(f"lcs_{name}", own)
+    lcs, lcs_of = _add_models(builder, config, model)
     n_lam = lcs_of["plan"].n_lam
-
-    sees = station.HasOutputPort("overhead.rgb_image")
-    if sees:
-        tracker = builder.AddNamedSystem(
-            "ball_tracker",
-            BallTracker(
-                replace(
-                    config.tracker,
-                    ball_radius=model.ball_radius,
-                    hue=config.tracker.hue
-                    if config.object == "ball"
-                    else FRUITS[config.object].hue,
-                    period_sec=TRACK,
-                    offset_sec=OFFSET["tracker"],
-                ),
-                camera_model(camera),
-            ),
-        )
-    estimator = builder.AddNamedSystem(
-        "state_estimator",
-        StateEstimator(
-            StateEstimatorConfig(
-                ball_radius=model.ball_radius,
-                tip_mass=model.tip_mass,
-                window_sec=LEARN,
-                period_sec=ESTIMATE,
-                offset_sec=OFFSET["estimator"],
-            ),
-            serial_chain_of(arm, TIP_FRAME),
-            arm.GetPositions(arm.CreateDefaultContext()),
-        ),
-    )
+    estimator = _add_sensing(builder, config, model, station, arm)
     task: LeafSystem
     if samples:
         c3_settings = sampled_c3_config(
@@ -576,20 +516,7 @@ def add_ball_rolling(
         )
     else:
         c3_settings = c3_config(config.planner, n_lam, projection)
-        target = task = builder.AddNamedSystem(
-            "rolling_task",
-            RollingTask(
-                replace(config.task, period_sec=CONTROL, offset_sec=OFFSET["task"]),
-                n_knots=config.planner.N + 1,
-                knot_sec=PLAN_DT,
-                radius_ball=model.ball_radius,
-                radius_tip=model.tip_radius,
-                n_lam=n_lam,
-                n_tip=N_TIP,
-                residual_dt_sec=LEARN,
-                p_tip=p_tip,
-            ),
-        )
+        target = task = _add_cycle(builder, config, model, n_lam, p_tip)
         reference_settings = ArmReferenceConfig()
     c3 = builder.AddNamedSystem("c3_mpc", C3Mpc(c3_settings, CONTROL, OFFSET["c3"]))
     reference = builder.AddNamedSystem(
@@ -603,9 +530,7 @@ def add_ball_rolling(
             ),
             n_lam,
             p_tip,
-            lcs_of["command"].build(
-                lcs_of["command"].x_default, np.zeros(lcs_of["command"].n_u)
-            ),
+            _example(lcs_of["command"]),
         ),
     )
     impedance = builder.AddNamedSystem(
@@ -619,76 +544,20 @@ def add_ball_rolling(
             hybrid=hybrid,
         ),
     )
-    no_force = builder.AddNamedSystem("no_force", ConstantVectorSource(np.zeros(3)))
 
     def connect(source, output, target, port):
         builder.Connect(source.GetOutputPort(output), target.GetInputPort(port))
 
-    if sees:
-        connect(station, "overhead.rgb_image", tracker, "image")
-    connect(station, f"{ARM}.position_measured", estimator, "q")
-    connect(station, f"{ARM}.velocity_measured", estimator, "v")
-    connect(station, f"{ARM}.torque_measured", estimator, "torque")
-    for name, port in (("p_WB", "p_ball"), ("v_WB", "v_ball"), ("seen", "seen")):
-        source, of = (tracker, name) if sees else (station, f"ball.{name}")
-        connect(source, of, estimator, port)
+    no_force = builder.AddNamedSystem("no_force", ConstantVectorSource(np.zeros(3)))
     for one in lcs.values():
         connect(estimator, "x", one, "x")
         builder.Connect(no_force.get_output_port(), one.GetInputPort("u"))
-    learn_lcs = lcs_of["learn"].build(
-        lcs_of["learn"].x_default, np.zeros(lcs_of["learn"].n_u)
-    )
     # Where C3 and the arm's reference have their models from.
     lcs_port = {name: one.GetOutputPort("lcs") for name, one in lcs.items()}
     if learner_kind in ("r_dyn", "both"):
-        r_dyn = builder.AddNamedSystem(
-            "dynamics_residual_learner",
-            DynamicsResidualLearner(
-                DynamicsResidualLearnerConfig(), learn_lcs, LEARN, OFFSET["learner"]
-            ),
-        )
-        connect(estimator, "x", r_dyn, "x")
-        connect(estimator, "u_measured", r_dyn, "u_measured")
-        connect(lcs["learn"], "lcs", r_dyn, "lcs")
-        for name in ("plan", "command"):
-            one = lcs_of[name].build(lcs_of[name].x_default, np.zeros(3))
-            added = builder.AddNamedSystem(
-                f"dynamics_residual_{name}", DynamicsResidual(one, LEARN)
-            )
-            connect(lcs[name], "lcs", added, "lcs")
-            connect(r_dyn, "r_dyn", added, "r_dyn")
-            lcs_port[name] = added.get_output_port()
+        lcs_port |= _add_dynamics_residual(builder, lcs, lcs_of, estimator)
     if learner_kind in ("r_comp", "both"):
-        learner = builder.AddNamedSystem(
-            "residual_learner",
-            ResidualLearner(
-                paper_learner_config(n_lam)
-                if paper
-                else learner_config(
-                    config.learning, config.contacts if samples else None
-                ),
-                learn_lcs,
-                LEARN,
-                OFFSET["learner"],
-            ),
-        )
-        connect(estimator, "x", learner, "x")
-        connect(estimator, "u_measured", learner, "u_measured")
-        connect(estimator, "window_valid", learner, "enable")
-        connect(lcs["learn"], "lcs", learner, "lcs")
-        r_comp = learner.GetOutputPort("r_comp")
-        if samples:
-            taken = np.zeros(n_lam)
-            taken[:N_TIP] = -config.contacts.gap_allowance / LEARN
-            allowance = builder.AddNamedSystem(
-                "gap_allowance", ConstantVectorSource(taken)
-            )
-            cautious = builder.AddNamedSystem("cautious_residual", Adder(2, n_lam))
-            builder.Connect(r_comp, cautious.get_input_port(0))
-            builder.Connect(allowance.get_output_port(), cautious.get_input_port(1))
-            r_comp = cautious.get_output_port()
-        else:
-            connect(learner, "r_std", task, "r_std")
+        r_comp = _add_learner(builder, config, lcs, lcs_of, estimator, task)
         if meshcat is not None:
             button = builder.AddNamedSystem("adapt_button", AdaptButton(n_lam, meshcat))
             builder.Connect(r_comp, button.get_input_port())
@@ -701,11 +570,8 @@ def add_ball_rolling(
     if samples:
         for system in (contacts.sampler, contacts.target):
             builder.Connect(r_comp, system.GetInputPort("r_comp"))
-        reach = np.zeros((1, n_lam))
-        reach[0, :N_TIP] = -LEARN / N_TIP
-        nearer = builder.AddNamedSystem("learned_reach", MatrixGain(reach))
-        builder.Connect(r_comp, nearer.get_input_port())
-        builder.Connect(nearer.get_output_port(), task.GetInputPort("nearer"))
+        nearer = _mean_of_tip(builder, "learned_reach", r_comp, n_lam, -LEARN)
+        builder.Connect(nearer, task.GetInputPort("nearer"))
     else:
         connect(estimator, "x", task, "x")
         connect(estimator, "valid", task, "valid")
@@ -714,7 +580,7 @@ def add_ball_rolling(
     connect(estimator, "x", c3, "x")
     connect(target, "x_desired", c3, "x_desired")
     if wrong is not None:
-        example = lcs_of["plan"].build(lcs_of["plan"].x_default, np.zeros(3))
+        example = _example(lcs_of["plan"])
         lcs_port["plan"] = faulty_lcs(builder, lcs_port["plan"], example, wrong.faults)
     builder.Connect(lcs_port["plan"], c3.GetInputPort("lcs"))
     builder.Connect(lcs_port["command"], c3.GetInputPort("lcs_command"))
@@ -738,9 +604,221 @@ def add_ball_rolling(
         if port.get_name() != f"{ARM}.torque_commanded":
             builder.ExportInput(port, port.get_name())
 
-    # For scoring and for the eye alone.
-    logged = {"torque_log": impedance.GetOutputPort("tau")}
-    if simulated:
+    _add_records(builder, station, impedance, estimator)
+    gap = _mean_of_tip(builder, "learned_gap", r_comp, n_lam, LEARN)
+    if meshcat is not None:
+        _add_view(builder, config, model, meshcat, station, estimator, gap, task)
+
+
+def _check_sampled(
+    config: BallRollingConfig, projection: str, learner_kind: str
+) -> None:
+    """Raises: ValueError for what sampled contacts do not go with."""
+    check_contacts(config.contacts)
+    for name, value, expected in (
+        ("controller", config.controller, ("ours",)),
+        ("projection", projection, ("plus",)),
+        ("learner", learner_kind, ("none", "r_comp")),
+    ):
+        if value not in expected:
+            raise ValueError(
+                f"{name}={value} with contact_sequence=sampled, expected "
+                + " or ".join(expected)
+            )
+
+
+def _add_models(
+    builder: DiagramBuilder, config: BallRollingConfig, model
+) -> tuple[dict[str, LeafSystem], dict[str, AnitescuLcs]]:
+    """The three LCS: as systems, and what they build with."""
+    friction, tangent = config.planner.friction, ContactPair().tangent
+    if config.contact_sequence == "sampled":
+        # Edges along the vertical do not jump as the normal goes around the ball.
+        friction, tangent = config.contacts.planner.friction, [0.0, 0.0, 1.0]
+    pairs = [
+        ContactPair("tip::tip", "ball::ball", friction, tangent=tangent),
+        ContactPair("ball::ball", "table::table", friction),
+    ]
+    lcs, lcs_of = {}, {}
+    for name, dt, period in (
+        ("plan", PLAN_DT, CONTROL),
+        ("command", CONTROL, CONTROL),
+        ("learn", LEARN, LEARN),
+    ):
+        own = AnitescuLcsBuilder(
+            make_tip_and_ball(model)[0],
+            LcsBuilderConfig(pairs, dt, None, period, OFFSET["lcs"]),
+        )
+        lcs_of[name] = own.model
+        lcs[name] = builder.AddNamedSystem(f"lcs_{name}", own)
+    return lcs, lcs_of
+
+
+def _example(lcs: AnitescuLcs) -> LCS:
+    return lcs.build(lcs.x_default, np.zeros(lcs.n_u))
+
+
+def _mean_of_tip(
+    builder: DiagramBuilder, name: str, r_comp: OutputPort, n_lam: int, scale: float
+) -> OutputPort:
+    """(1,) scale times the mean of the entries of r_comp for tip and ball."""
+    mean = np.zeros((1, n_lam))
+    mean[0, :N_TIP] = scale / N_TIP
+    gain = builder.AddNamedSystem(name, MatrixGain(mean))
+    builder.Connect(r_comp, gain.get_input_port())
+    return gain.get_output_port()
+
+
+def _add_sensing(
+    builder: DiagramBuilder,
+    config: BallRollingConfig,
+    model,
+    station: Diagram,
+    arm: MultibodyPlant,
+) -> StateEstimator:
+    """The tracker, where there are pictures, and the estimator of arm and ball."""
+    tracker = None
+    if station.HasOutputPort("overhead.rgb_image"):
+        hue = config.tracker.hue
+        tracker = builder.AddNamedSystem(
+            "ball_tracker",
+            BallTracker(
+                replace(
+                    config.tracker,
+                    ball_radius=model.ball_radius,
+                    hue=hue if config.object == "ball" else FRUITS[config.object].hue,
+                    period_sec=TRACK,
+                    offset_sec=OFFSET["tracker"],
+                ),
+                camera_model(
+                    replace(config.camera, position_noise_m=config.ball_noise_m)
+                ),
+            ),
+        )
+        builder.Connect(
+            station.GetOutputPort("overhead.rgb_image"), tracker.GetInputPort("image")
+        )
+    estimator = builder.AddNamedSystem(
+        "state_estimator",
+        StateEstimator(
+            StateEstimatorConfig(
+                ball_radius=model.ball_radius,
+                tip_mass=model.tip_mass,
+                window_sec=LEARN,
+                period_sec=ESTIMATE,
+                offset_sec=OFFSET["estimator"],
+            ),
+            serial_chain_of(arm, TIP_FRAME),
+            arm.GetPositions(arm.CreateDefaultContext()),
+        ),
+    )
+    for name, port in (("position", "q"), ("velocity", "v"), ("torque", "torque")):
+        measured = station.GetOutputPort(f"{ARM}.{name}_measured")
+        builder.Connect(measured, estimator.GetInputPort(port))
+    for name, port in (("p_WB", "p_ball"), ("v_WB", "v_ball"), ("seen", "seen")):
+        source, of = (station, f"ball.{name}") if tracker is None else (tracker, name)
+        builder.Connect(source.GetOutputPort(of), estimator.GetInputPort(port))
+    return estimator
+
+
+def _add_cycle(
+    builder: DiagramBuilder, config: BallRollingConfig, model, n_lam: int, p_tip
+) -> RollingTask:
+    return builder.AddNamedSystem(
+        "rolling_task",
+        RollingTask(
+            replace(config.task, period_sec=CONTROL, offset_sec=OFFSET["task"]),
+            n_knots=config.planner.N + 1,
+            knot_sec=PLAN_DT,
+            radius_ball=model.ball_radius,
+            radius_tip=model.tip_radius,
+            n_lam=n_lam,
+            n_tip=N_TIP,
+            residual_dt_sec=LEARN,
+            p_tip=p_tip,
+        ),
+    )
+
+
+def _add_dynamics_residual(
+    builder: DiagramBuilder, lcs, lcs_of, estimator: StateEstimator
+) -> dict[str, OutputPort]:
+    """A learner of the dynamics' residual. Returns: the LCS that have it."""
+    r_dyn = builder.AddNamedSystem(
+        "dynamics_residual_learner",
+        DynamicsResidualLearner(
+            DynamicsResidualLearnerConfig(),
+            _example(lcs_of["learn"]),
+            LEARN,
+            OFFSET["learner"],
+        ),
+    )
+    for name in ("x", "u_measured"):
+        builder.Connect(estimator.GetOutputPort(name), r_dyn.GetInputPort(name))
+    builder.Connect(lcs["learn"].GetOutputPort("lcs"), r_dyn.GetInputPort("lcs"))
+    ports = {}
+    for name in ("plan", "command"):
+        added = builder.AddNamedSystem(
+            f"dynamics_residual_{name}", DynamicsResidual(_example(lcs_of[name]), LEARN)
+        )
+        builder.Connect(lcs[name].GetOutputPort("lcs"), added.GetInputPort("lcs"))
+        builder.Connect(r_dyn.GetOutputPort("r_dyn"), added.GetInputPort("r_dyn"))
+        ports[name] = added.get_output_port()
+    return ports
+
+
+def _add_learner(
+    builder: DiagramBuilder,
+    config: BallRollingConfig,
+    lcs,
+    lcs_of,
+    estimator: StateEstimator,
+    task: LeafSystem,
+) -> OutputPort:
+    """The learner of the contact's residual. Returns: what controllers get of it."""
+    n_lam = lcs_of["plan"].n_lam
+    samples = config.contact_sequence == "sampled"
+    if config.controller == "paper":
+        settings = paper_learner_config(n_lam)
+    else:
+        settings = learner_config(config.learning, config.contacts if samples else None)
+    learner = builder.AddNamedSystem(
+        "residual_learner",
+        ResidualLearner(settings, _example(lcs_of["learn"]), LEARN, OFFSET["learner"]),
+    )
+    for name, port in (
+        ("x", "x"), ("u_measured", "u_measured"), ("window_valid", "enable"),
+    ):  # fmt: skip
+        builder.Connect(estimator.GetOutputPort(name), learner.GetInputPort(port))
+    builder.Connect(lcs["learn"].GetOutputPort("lcs"), learner.GetInputPort("lcs"))
+    r_comp = learner.GetOutputPort("r_comp")
+    if not samples:
+        builder.Connect(learner.GetOutputPort("r_std"), task.GetInputPort("r_std"))
+        return r_comp
+    taken = np.zeros(n_lam)
+    taken[:N_TIP] = -config.contacts.gap_allowance / LEARN
+    allowance = builder.AddNamedSystem("gap_allowance", ConstantVectorSource(taken))
+    cautious = builder.AddNamedSystem("cautious_residual", Adder(2, n_lam))
+    builder.Connect(r_comp, cautious.get_input_port(0))
+    builder.Connect(allowance.get_output_port(), cautious.get_input_port(1))
+    return cautious.get_output_port()
+
+
+def _is_simulated(station: Diagram) -> bool:
+    """Whether there is a truth."""
+    return station.HasSubsystemNamed("plant")
+
+
+def _add_records(
+    builder: DiagramBuilder,
+    station: Diagram,
+    impedance: ImpedanceController,
+    estimator: StateEstimator,
+) -> None:
+    """What is scored, and what a recording has."""
+    tau = impedance.GetOutputPort("tau")
+    logged = {"torque_log": tau}
+    if _is_simulated(station):
         logged["state_log"] = station.GetOutputPort("state")
         logged["contact_log"] = station.GetOutputPort(f"{ARM}.contact_torque")
     for name, source in logged.items():
@@ -749,39 +827,46 @@ def add_ball_rolling(
     of_ball = [""] * N_X
     of_ball[P_BALL.start : P_BALL.start + 2] = BALL_CHANNELS
     seen = {"ball": (estimator.GetOutputPort("x"), of_ball)}
-    tau = impedance.GetOutputPort("tau")
     record_station(builder, station, tau, TOOL, CONTROL, seen)
-    gap = np.zeros((1, n_lam))
-    gap[0, :N_TIP] = LEARN / N_TIP
-    gap_of_r = builder.AddNamedSystem("learned_gap", MatrixGain(gap))
-    builder.Connect(r_comp, gap_of_r.get_input_port())
-    if meshcat is not None:
-        view = builder.AddNamedSystem(
-            "rolling_view",
-            RollingView(
-                RollingViewConfig(
-                    center=config.task.center,
-                    radius=config.task.radius,
-                    ball_radius=model.ball_radius,
-                ),
-                meshcat,
+
+
+def _add_view(
+    builder: DiagramBuilder,
+    config: BallRollingConfig,
+    model,
+    meshcat: Meshcat,
+    station: Diagram,
+    estimator: StateEstimator,
+    gap: OutputPort,
+    task: LeafSystem,
+) -> None:
+    view = builder.AddNamedSystem(
+        "rolling_view",
+        RollingView(
+            RollingViewConfig(
+                center=config.task.center,
+                radius=config.task.radius,
+                ball_radius=model.ball_radius,
             ),
-        )
-        if simulated:
-            plant = station.GetSubsystemByName("plant")
-            state, size = station.GetOutputPort("state"), plant.num_multibody_states()
-            at = plant.GetBodyByName("ball").floating_positions_start() + 4
-        else:  # As it is believed.
-            state, size, at = estimator.GetOutputPort("x"), N_X, P_BALL.start
-        select = np.zeros((3, size))
-        select[:, at : at + 3] = np.eye(3)
-        p_ball = builder.AddNamedSystem("true_ball", MatrixGain(select))
-        builder.Connect(state, p_ball.get_input_port())
-        builder.Connect(p_ball.get_output_port(), view.GetInputPort("p_ball"))
-        connect(estimator, "x", view, "x")
-        builder.Connect(gap_of_r.get_output_port(), view.GetInputPort("gap"))
-        legend = LegendConfig(view.legend, PHASES, view.CAMERA, view.LOOK_AT)
-        add_legend(builder, meshcat, legend, task.GetOutputPort("phase"))
+            meshcat,
+        ),
+    )
+    x = estimator.GetOutputPort("x")
+    if _is_simulated(station):
+        plant = station.GetSubsystemByName("plant")
+        state, size = station.GetOutputPort("state"), plant.num_multibody_states()
+        at = plant.GetBodyByName("ball").floating_positions_start() + 4
+    else:  # As it is believed.
+        state, size, at = x, N_X, P_BALL.start
+    select = np.zeros((3, size))
+    select[:, at : at + 3] = np.eye(3)
+    p_ball = builder.AddNamedSystem("true_ball", MatrixGain(select))
+    builder.Connect(state, p_ball.get_input_port())
+    builder.Connect(p_ball.get_output_port(), view.GetInputPort("p_ball"))
+    builder.Connect(x, view.GetInputPort("x"))
+    builder.Connect(gap, view.GetInputPort("gap"))
+    legend = LegendConfig(view.legend, PHASES, view.CAMERA, view.LOOK_AT)
+    add_legend(builder, meshcat, legend, task.GetOutputPort("phase"))
 
 
 def task_name(diagram: Diagram | DiagramBuilder) -> str:
