@@ -1,9 +1,9 @@
 """What a real robot could record of a run, for `makebreak gap`: one way for all.
 
 A diagram has a Recorder beside its station or plant; after a simulation `recorded`
-gives the columns of recording.csv (gap/table.py). Sensors are sampled once a row. An
-effort command changes faster than rows come: a row has the mean of what acted from its
-instant until the next row's, which does the same to a mechanism.
+gives the columns of recording.csv (gap/data/table.py). Sensors are sampled once a row.
+An effort command changes faster than rows come: a row has the mean of what acted from
+its instant until the next row's, which does the same to a mechanism.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

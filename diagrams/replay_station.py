@@ -68,7 +68,7 @@ def make_replay_station(
     Outputs: panda.position_measured, velocity_measured, torque_measured (7,);
              ball.p_WB, ball.v_WB (3,), ball.seen (1,).
 
-    Args: columns, of gap/table.py; ball: names of those of the ball's place in the
+    Args: columns, of gap/data/table.py; ball: names of those of the ball's place in the
         plane [m]; radius: its height, as it is believed [m].
     Raises: ValueError for a column that is not there or has holes where none may be.
     """

@@ -1,5 +1,12 @@
 """The gap workflow: where a simulation and measured data disagree, and why.
 
+data/        recordings: read, checked, conditioned, split
+simulation/  scenes simulated from measured states
+residuals/   kinds of data, each as a problem (problem.py) for the search
+search/      which effects a scene lacks
+report/      files and pictures
+workflow.py  from a scene and recordings to a result
+
 from makebreak.gap import read_scene, run_gap, write_report
 
 result = run_gap("scene.yaml", ["log.csv"])
@@ -13,13 +20,13 @@ from importlib import import_module
 # does not wait for the whole.
 _EXPORTS = {
     "GapResult": "gap.result",
-    "Recording": "gap.recording",
-    "read_recording": "gap.recording",
-    "read_recordings": "gap.recording",
+    "Recording": "gap.data.recording",
+    "read_recording": "gap.data.recording",
+    "read_recordings": "gap.data.recording",
     "read_scene": "models.scene",
     "run_gap": "gap.workflow",
-    "write_recording": "gap.table",
-    "write_report": "gap.report",
+    "write_recording": "gap.data.table",
+    "write_report": "gap.report.files",
 }
 __all__ = list(_EXPORTS)
 

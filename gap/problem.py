@@ -1,8 +1,8 @@
 """The contract between a kind of data and the search: what is asked of a problem.
 
-A mechanism whose joints are measured (gap/mechanism.py), a tool that touches an object
-(gap/touch.py) and windows of free bodies (gap/objects.py) are three such problems;
-gap/select.py searches any of them, gap/workflow.py concludes from what it finds.
+A mechanism whose joints are measured (gap/residuals/mechanism.py), a tool that touches
+an object (touch.py) and windows of free bodies (objects.py) are three such problems;
+gap/search/select.py searches any of them, gap/workflow.py concludes from what it finds.
 """
 
 from abc import ABC, abstractmethod
@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from makebreak.gap.data.recording import Recording
 from makebreak.gap.numerics.selection import NESTED_GAIN, LinearFit
-from makebreak.gap.recording import Recording
 from makebreak.gap.result import GapMeasure, Series, Unexplained, Where
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS

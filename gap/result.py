@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from makebreak.gap.findings import Finding
+from makebreak.gap.data.findings import Finding
 from makebreak.models.effects.kind import Effect
 
 VERDICTS = ("no_gap", "not_judged", "gap_named", "ambiguous", "gap_unnamed")

@@ -6,10 +6,10 @@ from math import isnan
 
 from pydrake.multibody.plant import MultibodyPlant
 
+from makebreak.gap.data.recording import unit_of
 from makebreak.gap.problem import share_left
-from makebreak.gap.recording import unit_of
 from makebreak.gap.result import Estimate, Evidence, GapMeasure, NamedEffect
-from makebreak.gap.select import FLOOR, Choice, Selection
+from makebreak.gap.search.select import FLOOR, Choice, Selection
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import (
     of_slides,

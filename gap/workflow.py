@@ -8,21 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from makebreak.gap.check_drives import check_drives, check_initial_names
-from makebreak.gap.checks import check_recordings
-from makebreak.gap.contact_problem import ContactProblem
+from makebreak.gap.data.check_drives import check_drives, check_initial_names
+from makebreak.gap.data.checks import check_recordings
 from makebreak.gap.data.conditioning import condition
-from makebreak.gap.driven import DrivenProblem, is_driven, sticks
-from makebreak.gap.findings import Finding
-from makebreak.gap.fit import fit_effects
-from makebreak.gap.impacts import ImpactProblem, runs_against, without_contact
-from makebreak.gap.measure import WINDOW_SEC
-from makebreak.gap.mechanism import MechanismProblem
-from makebreak.gap.objects import FlightProblem, RolloutProblem, TouchProblem
-from makebreak.gap.parallel import side_by_side
-from makebreak.gap.pressing import PressingProblem, presses
-from makebreak.gap.problem import DISTANCES, Fitted, GapProblem, Outcome, is_sane
-from makebreak.gap.recording import (
+from makebreak.gap.data.findings import Finding
+from makebreak.gap.data.recording import (
     Recording,
     check_against_scene,
     excerpt,
@@ -30,11 +20,22 @@ from makebreak.gap.recording import (
     read_recordings,
     unit_of,
 )
+from makebreak.gap.data.scene_facts import scene_facts, scene_names
+from makebreak.gap.data.split import split, with_noise_of
+from makebreak.gap.parallel import side_by_side
+from makebreak.gap.problem import DISTANCES, Fitted, GapProblem, Outcome, is_sane
+from makebreak.gap.residuals.contact_problem import ContactProblem
+from makebreak.gap.residuals.driven import DrivenProblem, is_driven, sticks
+from makebreak.gap.residuals.impacts import ImpactProblem, runs_against, without_contact
+from makebreak.gap.residuals.mechanism import MechanismProblem
+from makebreak.gap.residuals.objects import FlightProblem, RolloutProblem, TouchProblem
+from makebreak.gap.residuals.pressing import PressingProblem, presses
 from makebreak.gap.result import GapMeasure, GapResult, JudgedChannel
-from makebreak.gap.scene_facts import scene_facts, scene_names
-from makebreak.gap.select import LOUD, Choice, Selection, select, without
-from makebreak.gap.split import split, with_noise_of
-from makebreak.gap.trust import trust_in
+from makebreak.gap.search.fit import fit_effects
+from makebreak.gap.search.select import LOUD, Choice, Selection, select, without
+from makebreak.gap.search.trust import trust_in
+from makebreak.gap.simulation.measure import WINDOW_SEC
+from makebreak.gap.simulation.windows import WindowModel, with_step
 from makebreak.gap.verdict import (
     NO_GAP,
     TOLD,
@@ -46,7 +47,6 @@ from makebreak.gap.verdict import (
     verdict_of,
     withdrawn_if_weak,
 )
-from makebreak.gap.windows import WindowModel, with_step
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import (

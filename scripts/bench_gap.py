@@ -15,7 +15,7 @@ from pydrake.multibody.tree import MultibodyForces
 
 import makebreak
 from makebreak.diagrams.scene_facts import PANDA_JOINTS
-from makebreak.gap.table import write_recording
+from makebreak.gap.data.table import write_recording
 from makebreak.scripts import bench_sysid
 from makebreak.scripts.trials import makebreak_command
 

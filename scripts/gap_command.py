@@ -11,9 +11,9 @@ from time import perf_counter
 
 from tqdm import tqdm
 
-from makebreak.gap.comparison import comparison_html
-from makebreak.gap.recording import has_sidecar, read_recordings, sidecar_of
-from makebreak.gap.report import summary_lines, windows_of, write_report
+from makebreak.gap.data.recording import has_sidecar, read_recordings, sidecar_of
+from makebreak.gap.report.comparison import comparison_html
+from makebreak.gap.report.files import summary_lines, windows_of, write_report
 from makebreak.gap.result import GapResult
 from makebreak.models.effects.kind import with_deviation
 from makebreak.models.scene import Scene, read_scene

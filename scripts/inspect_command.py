@@ -6,7 +6,7 @@ import numpy as np
 
 from makebreak.gap.data.proposal import Match, sidecar_text
 from makebreak.gap.data.robot import Log, Robot, matches_of, read_log, read_robot
-from makebreak.gap.table import stem_of
+from makebreak.gap.data.table import stem_of
 from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.table import Table
 

@@ -7,14 +7,14 @@ import numpy as np
 from pydrake.systems.framework import Context, Diagram
 
 from makebreak.diagrams.recorder import has_recorder, recorded
-from makebreak.gap.table import csv_rows
+from makebreak.gap.data.table import csv_rows
 
 EVERY_SEC = 1.0  # By the clock: so much is lost at most.
 
 
 class RecordingStream:
     """Appends the rows that a diagram's Recorder has gathered to a csv file, as
-    write_recording writes it (gap/table.py), but as the sensors gave them: what an
+    write_recording writes it (gap/data/table.py), but as the sensors gave them: what an
     experiment leaves out at the end (a ball that the camera did not see) is there.
 
     A diagram without a Recorder has no file. A file that cannot be written, as on a

@@ -28,7 +28,7 @@ from pydrake.systems.framework import (
 from tqdm import tqdm
 
 from makebreak.diagrams.station import MONITOR
-from makebreak.gap.table import write_recording
+from makebreak.gap.data.table import write_recording
 from makebreak.models.scene import Scene, apply_initial_velocities
 from makebreak.models.scene_file import write_scene
 from makebreak.scripts.compiling import CompilingShown
@@ -406,8 +406,8 @@ class Session:
         """Writes recording.csv, noise.json where the noise is known, and as model.yaml
         the scene that controllers believed: what `makebreak gap` is to compare it with.
 
-        See gap/table.py for the columns' names. It takes the place of what was written
-        while it was simulated.
+        See gap/data/table.py for the columns' names. It takes the place of what was
+        written while it was simulated.
         """
         self._drop_streams()
         self._write("recording.csv", lambda path: write_recording(path, columns, noise))

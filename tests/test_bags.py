@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from makebreak.gap.recording import read_recording
-from makebreak.gap.table import read_table
+from makebreak.gap.data.recording import read_recording
+from makebreak.gap.data.table import read_table
 
 N, PERIOD = 200, 5_000_000  # Rows; [ns]
 START = 1_700_000_000_123_456_789  # [ns]

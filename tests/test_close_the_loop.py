@@ -15,10 +15,10 @@ from makebreak.diagrams.ball_rolling import BallRollingConfig, believed
 from makebreak.diagrams.recorder import mean_until_next
 from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.station import BALL_ROLLING
-from makebreak.gap.recording import read_recordings
-from makebreak.gap.scene_simulation import SceneSimulation
-from makebreak.gap.table import write_recording
-from makebreak.gap.windows import WindowModel
+from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.table import write_recording
+from makebreak.gap.simulation.scene_simulation import SceneSimulation
+from makebreak.gap.simulation.windows import WindowModel
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import InitialSection, load_scene, read_scene
 from makebreak.models.scene_file import write_scene

@@ -10,11 +10,11 @@ from gap_benchmark.mechanism import to_urdf, with_background
 from gap_benchmark.mechanism_world import MechanismWorld, Reference, Sampling
 from gap_benchmark.sensing import hermite
 
-from makebreak.gap.checks import check_recordings
+from makebreak.gap.data.checks import check_recordings
 from makebreak.gap.data.clock import clock_period, even_clock
 from makebreak.gap.data.conditioning import condition
+from makebreak.gap.data.recording import read_recording
 from makebreak.gap.numerics.signal_noise import estimate_noise, noise_and_jitter
-from makebreak.gap.recording import read_recording
 from makebreak.gap.workflow import run_gap
 from makebreak.systems.numerics.filters import filtered
 

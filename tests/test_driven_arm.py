@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 from effect_scenes import at_rest_but, double, pendulum, with_effects
 
-from makebreak.gap.driven_arm import DrivenArmScene, DrivenArmSimulation, can_have
 from makebreak.gap.numerics.driven_arm import mass_and_bias, rollout
-from makebreak.gap.scene_simulation import (
+from makebreak.gap.simulation.driven_arm import (
+    DrivenArmScene,
+    DrivenArmSimulation,
+    can_have,
+)
+from makebreak.gap.simulation.scene_simulation import (
     Commands,
     SceneSimulation,
     SimulationConfig,

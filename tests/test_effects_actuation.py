@@ -19,7 +19,7 @@ from pydrake.systems.framework import DiagramBuilder
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from makebreak.gap.scene_simulation import (
+from makebreak.gap.simulation.scene_simulation import (
     Commands,
     SceneSimulation,
     make_scene_diagram,

@@ -19,7 +19,7 @@ from effect_scenes import (
 from pydrake.systems.framework import DiagramBuilder
 from scipy.integrate import solve_ivp
 
-from makebreak.gap.scene_simulation import Commands, SceneSimulation
+from makebreak.gap.simulation.scene_simulation import Commands, SceneSimulation
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.scene import load_scene
 

@@ -22,7 +22,7 @@ from makebreak.diagrams.station import (
     make_control_plant,
     make_station,
 )
-from makebreak.gap.scene_simulation import (
+from makebreak.gap.simulation.scene_simulation import (
     Commands,
     SceneSimulation,
     make_scene_diagram,

@@ -21,7 +21,7 @@ from pydrake.multibody.parsing import LoadModelDirectivesFromString
 from pydrake.systems.framework import DiagramBuilder
 from scipy.integrate import solve_ivp
 
-from makebreak.gap.scene_simulation import SceneSimulation
+from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import load_scene

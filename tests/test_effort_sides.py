@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from effect_scenes import LENGTH, MASS, G, J, pendulum, with_effects
 
-from makebreak.gap.inverse import InverseModel
-from makebreak.gap.recording import in_newton_metres, read_recording
+from makebreak.gap.data.recording import in_newton_metres, read_recording
+from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.models.effects.measured_channels import torque_constant
 from makebreak.models.scene_schema import check_scene
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from gap_benchmark.cases import cases, make, write
 
-from makebreak.gap.free_body import FreeBodyScene
 from makebreak.gap.numerics.free_body import simulate
-from makebreak.gap.scene_simulation import SceneSimulation, SimulationConfig
+from makebreak.gap.simulation.free_body import FreeBodyScene
+from makebreak.gap.simulation.scene_simulation import SceneSimulation, SimulationConfig
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import InitialSection, read_scene
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from test_gap_report import small_case
 
-from makebreak.gap.checks import check_recordings
-from makebreak.gap.findings import JointFacts, SceneFacts
-from makebreak.gap.recording import excerpt, read_recording
-from makebreak.gap.table import write_recording
+from makebreak.gap.data.checks import check_recordings
+from makebreak.gap.data.findings import JointFacts, SceneFacts
+from makebreak.gap.data.recording import excerpt, read_recording
+from makebreak.gap.data.table import write_recording
 from makebreak.scripts import cli
 
 Q, U, V = "p.j1.position", "p.j1.effort_command", "p.j1.velocity"

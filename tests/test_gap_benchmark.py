@@ -35,9 +35,9 @@ from pydrake.multibody.plant import (  # noqa: E402
 from pydrake.systems.analysis import Simulator  # noqa: E402
 from pydrake.systems.framework import DiagramBuilder  # noqa: E402
 
+from makebreak.gap.data.recording import check_against_scene, read_recording  # noqa: E402
+from makebreak.gap.data.scene_facts import scene_names  # noqa: E402
 from makebreak.gap.problem import is_sane  # noqa: E402
-from makebreak.gap.recording import check_against_scene, read_recording  # noqa: E402
-from makebreak.gap.scene_facts import scene_names  # noqa: E402
 from makebreak.models.effects.kind import Effect  # noqa: E402
 from makebreak.models.scene import load_scene, read_scene  # noqa: E402
 
@@ -543,7 +543,7 @@ def windows_of(made, object_world):
 
 def gap_in_noise(made, scene, effects):
     """The worst channel's rms of measured - simulated, in standard deviations."""
-    from makebreak.gap.scene_simulation import (
+    from makebreak.gap.simulation.scene_simulation import (
         Commands,
         SceneSimulation,
         SimulationConfig,

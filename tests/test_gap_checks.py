@@ -7,13 +7,13 @@ import pytest
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.diagrams.station import BALL_ROLLING
-from makebreak.gap.check_motion import excitation, free_flight_gravity
-from makebreak.gap.checks import check_recordings
-from makebreak.gap.findings import JointFacts, SceneFacts
+from makebreak.gap.data.check_motion import excitation, free_flight_gravity
+from makebreak.gap.data.checks import check_recordings
+from makebreak.gap.data.findings import JointFacts, SceneFacts
+from makebreak.gap.data.recording import check_against_scene, read_recording
+from makebreak.gap.data.scene_facts import scene_facts, scene_names
+from makebreak.gap.data.table import write_recording
 from makebreak.gap.numerics.signal_relation import angular_velocity, relate
-from makebreak.gap.recording import check_against_scene, read_recording
-from makebreak.gap.scene_facts import scene_facts, scene_names
-from makebreak.gap.table import write_recording
 from makebreak.models.scene import load_scene
 
 RATE = 200.0  # [Hz]

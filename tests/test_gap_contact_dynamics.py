@@ -12,21 +12,22 @@ from scipy.optimize import least_squares
 from scipy.sparse import eye_array
 from scipy.spatial.transform import Rotation
 
-from makebreak.gap import contact_windows, workflow
-from makebreak.gap.contact_dynamics import ContactDynamics
-from makebreak.gap.contact_means import variance_of_means
-from makebreak.gap.contact_problem import ContactProblem, _best_rectangles
-from makebreak.gap.contact_shapes import _Point, _Surface
-from makebreak.gap.contact_windows import PushWindows, led_as_measured
-from makebreak.gap.fit import fit_effects
+from makebreak.gap import workflow
+from makebreak.gap.data.recording import read_recordings
 from makebreak.gap.numerics import permitted_forces
 from makebreak.gap.numerics.selection import Screen
-from makebreak.gap.permitted_contacts import Shift
 from makebreak.gap.problem import Outcome, SearchPlan, is_sane
-from makebreak.gap.recording import read_recordings
+from makebreak.gap.residuals.contact_dynamics import ContactDynamics
+from makebreak.gap.residuals.contact_means import variance_of_means
+from makebreak.gap.residuals.contact_problem import ContactProblem, _best_rectangles
+from makebreak.gap.residuals.contact_shapes import _Point, _Surface
+from makebreak.gap.residuals.permitted_contacts import Shift
 from makebreak.gap.result import Considered, GapMeasure
-from makebreak.gap.select import Choice, Selection
-from makebreak.gap.windows import WindowModel
+from makebreak.gap.search.fit import fit_effects
+from makebreak.gap.search.select import Choice, Selection
+from makebreak.gap.simulation import contact_windows
+from makebreak.gap.simulation.contact_windows import PushWindows, led_as_measured
+from makebreak.gap.simulation.windows import WindowModel
 from makebreak.gap.workflow import problem_for, run_gap
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS

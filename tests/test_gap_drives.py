@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from effect_scenes import at_rest_but, double, with_effects
 
-from makebreak.gap.inverse import InverseModel
-from makebreak.gap.recording import read_recordings
-from makebreak.gap.scene_simulation import Commands, SceneSimulation
+from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.residuals.inverse import InverseModel
+from makebreak.gap.simulation.scene_simulation import Commands, SceneSimulation
 from makebreak.gap.workflow import run_gap
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import ActuationSection

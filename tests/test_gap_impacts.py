@@ -7,10 +7,15 @@ import pytest
 from gap_benchmark import cart_world
 from gap_benchmark.cart_world import PAIR
 
-from makebreak.gap.fit import fit_effects
-from makebreak.gap.impacts import FREE_SEC, MOST_FREE, ImpactProblem, runs_against
+from makebreak.gap.data.recording import read_recordings
 from makebreak.gap.numerics.selection import Screen
-from makebreak.gap.recording import read_recordings
+from makebreak.gap.residuals.impacts import (
+    FREE_SEC,
+    MOST_FREE,
+    ImpactProblem,
+    runs_against,
+)
+from makebreak.gap.search.fit import fit_effects
 from makebreak.gap.workflow import problem_for, run_gap
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect

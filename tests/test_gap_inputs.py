@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from effect_scenes import on_ground, pendulum
 
-from makebreak.gap.check_drives import check_drives, check_initial_names
-from makebreak.gap.recording import read_recordings
-from makebreak.gap.windows import WindowModel
+from makebreak.gap.data.check_drives import check_drives, check_initial_names
+from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.simulation.windows import WindowModel
 from makebreak.gap.workflow import run_gap
 from makebreak.models.scene import InitialSection, read_scene
 from makebreak.models.scene_file import write_scene

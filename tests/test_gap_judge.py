@@ -8,9 +8,9 @@ import pytest
 from effect_scenes import double, pendulum, with_effects
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.gap.judge import judge
-from makebreak.gap.recording import read_recordings
-from makebreak.gap.table import write_recording
+from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.table import write_recording
+from makebreak.gap.simulation.judge import judge
 from makebreak.models.scene import load_scene
 from makebreak.models.scene_file import write_scene
 from makebreak.scripts import judge as command

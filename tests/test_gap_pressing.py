@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from makebreak.gap.pressing import PressingProblem, presses
-from makebreak.gap.recording import read_recordings
-from makebreak.gap.select import LOUD, select
-from makebreak.gap.table import write_recording
+from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.table import write_recording
+from makebreak.gap.residuals.pressing import PressingProblem, presses
+from makebreak.gap.search.select import LOUD, select
 from makebreak.gap.workflow import judged_channels, problem_for, unjudged_channels
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect

@@ -11,11 +11,12 @@ from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RotationMatrix
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.gap.comparison import comparison_html, measured_state
-from makebreak.gap.findings import Finding
-from makebreak.gap.pictures import picture_of_where
-from makebreak.gap.recording import read_recordings
-from makebreak.gap.report import extents_of, summary_lines, write_report
+from makebreak.gap.data.findings import Finding
+from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.table import write_recording
+from makebreak.gap.report.comparison import comparison_html, measured_state
+from makebreak.gap.report.files import extents_of, summary_lines, write_report
+from makebreak.gap.report.pictures import picture_of_where
 from makebreak.gap.result import (
     Considered,
     Estimate,
@@ -27,8 +28,7 @@ from makebreak.gap.result import (
     Unexplained,
     Where,
 )
-from makebreak.gap.scene_simulation import Commands, SceneSimulation
-from makebreak.gap.table import write_recording
+from makebreak.gap.simulation.scene_simulation import Commands, SceneSimulation
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sentence
 from makebreak.models.scene import InitialSection, load_scene, read_scene

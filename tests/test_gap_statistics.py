@@ -8,8 +8,6 @@ import pytest
 from scipy.optimize import lsq_linear
 from scipy.signal import lfilter
 
-from makebreak.gap.fit import derivative_free_search, fit_effects
-from makebreak.gap.mechanism import MechanismProblem
 from makebreak.gap.numerics.selection import (
     Screen,
     benjamini_hochberg,
@@ -32,9 +30,11 @@ from makebreak.gap.problem import (
     Outcome,
     SearchPlan,
 )
+from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.result import GapMeasure
-from makebreak.gap.select import Choice, Selection, is_significant, select
-from makebreak.gap.trust import gauss_newton, ridges, steady
+from makebreak.gap.search.fit import derivative_free_search, fit_effects
+from makebreak.gap.search.select import Choice, Selection, is_significant, select
+from makebreak.gap.search.trust import gauss_newton, ridges, steady
 from makebreak.gap.verdict import after_simulation, verdict_of, withdrawn_if_weak
 from makebreak.gap.workflow import kept_by_simulation
 from makebreak.models.effects.kind import Effect

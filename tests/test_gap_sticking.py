@@ -7,13 +7,13 @@ import pytest
 from effect_scenes import at_rest_but, double, with_effects
 from test_driven_arm import tree
 
-from makebreak.gap.driven import DrivenProblem, is_driven, sticks
-from makebreak.gap.driven_arm import DrivenArmSimulation
-from makebreak.gap.mechanism import MechanismProblem
+from makebreak.gap.data.recording import read_recordings
 from makebreak.gap.problem import Candidate
-from makebreak.gap.recording import read_recordings
-from makebreak.gap.scene_simulation import Commands
-from makebreak.gap.select import _groups, select
+from makebreak.gap.residuals.driven import DrivenProblem, is_driven, sticks
+from makebreak.gap.residuals.mechanism import MechanismProblem
+from makebreak.gap.search.select import _groups, select
+from makebreak.gap.simulation.driven_arm import DrivenArmSimulation
+from makebreak.gap.simulation.scene_simulation import Commands
 from makebreak.gap.workflow import problem_for, run_gap
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.scene import ActuationSection, read_scene

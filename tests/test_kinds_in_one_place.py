@@ -29,37 +29,39 @@ KNOWN = {
     "diagrams/realism.py": {"joint_offset", "plane_tilt"},
     "diagrams/station.py": {"joint_viscous_damping"},
     "diagrams/tabletop.py": {"contact_friction", "contact_stiffness"},
-    "gap/free_body.py": CONTACT
+    "gap/simulation/free_body.py": CONTACT
     | {"clock_skew", "gravity_tilt", "sensor_bias", "sensor_delay", "sinusoidal_force"},
-    "gap/check_relations.py": {"clock_skew"},
-    "gap/contact.py": CONTACT,
-    "gap/contact_dynamics.py": {
+    "gap/data/check_relations.py": {"clock_skew"},
+    "gap/residuals/contact.py": CONTACT,
+    "gap/residuals/contact_dynamics.py": {
         "actuator_bias", "actuator_gain", "input_delay", "object_com",
         "object_inertia", "object_mass",
     },
-    "gap/permitted_contacts.py": {
+    "gap/residuals/permitted_contacts.py": {
         "contact_friction", "friction_patch", "plane_height", "plane_tilt",
         "wall_position",
     },
-    "gap/pressing.py": {
+    "gap/residuals/pressing.py": {
         "contact_friction", "contact_stiffness", "friction_patch", "plane_height",
         "plane_tilt", "wall_position",
     },
-    "gap/contact_problem.py": {
+    "gap/residuals/contact_problem.py": {
         "body_drag", "constant_force", "contact_friction", "friction_patch",
         "object_com", "object_inertia", "object_mass", "plane_height", "plane_tilt",
     },
-    "gap/driven.py": {"rotor_inertia"},
-    "gap/free_windows.py": {"length_scale"},
-    "gap/windows.py": {"length_scale"},
-    "gap/mechanism.py": {"object_com", "object_mass", "link_com", "link_mass"},
-    "gap/screen.py": SENSORS
+    "gap/residuals/driven.py": {"rotor_inertia"},
+    "gap/simulation/free_windows.py": {"length_scale"},
+    "gap/simulation/windows.py": {"length_scale"},
+    "gap/residuals/mechanism.py": {
+        "object_com", "object_mass", "link_com", "link_mass",
+    },
+    "gap/search/screen.py": SENSORS
     | {
         "actuator_lag", "actuator_saturation", "body_drag", "input_delay",
         "joint_backlash", "joint_elasticity", "link_mass", "link_com", "object_com",
         "object_inertia", "object_mass", "sinusoidal_force",
     },
-    "gap/touch.py": {
+    "gap/residuals/touch.py": {
         "contact_stiffness", "joint_offset", "length_scale", "object_size",
         "plane_height", "sensor_bias",
     },

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from effect_scenes import J, pendulum
 
-from makebreak.gap.recording import read_recordings
-from makebreak.gap.table import write_recording
-from makebreak.gap.windows import WindowModel, seen_in
+from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.table import write_recording
+from makebreak.gap.simulation.windows import WindowModel, seen_in
 
 SIZE, RATE = 2.0, 8.0  # [N m], [rad/s] of a sine.
 ENCODER = 1e-5  # [rad]

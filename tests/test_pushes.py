@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from effect_scenes import at_rest_but, double, with_effects
 
-from makebreak.gap.mechanism import MechanismProblem
-from makebreak.gap.pushes import find_pushes
-from makebreak.gap.recording import read_recordings
-from makebreak.gap.scene_simulation import Commands, SceneSimulation
+from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.residuals.mechanism import MechanismProblem
+from makebreak.gap.residuals.pushes import find_pushes
+from makebreak.gap.simulation.scene_simulation import Commands, SceneSimulation
 from makebreak.gap.workflow import run_gap
 from makebreak.models.scene_file import write_scene
 

@@ -14,8 +14,8 @@ from makebreak.diagrams.multi_spring import (
 )
 from makebreak.diagrams.planar import PLANAR
 from makebreak.diagrams.recorder import add_recorder, episodes, recorded, with_noise
-from makebreak.gap.recording import check_against_scene, read_recordings
-from makebreak.gap.scene_facts import scene_names
+from makebreak.gap.data.recording import check_against_scene, read_recordings
+from makebreak.gap.data.scene_facts import scene_names
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.scene import read_scene
 from makebreak.scripts.session import MODEL, Session

@@ -6,15 +6,15 @@ import sys
 import numpy as np
 import pytest
 
-from makebreak.gap.numerics.signal_noise import estimate_noise, resolution
-from makebreak.gap.recording import (
+from makebreak.gap.data.recording import (
     check_against_scene,
     read_recording,
     read_recordings,
     unit_of,
     windows,
 )
-from makebreak.gap.table import read_table, write_recording
+from makebreak.gap.data.table import read_table, write_recording
+from makebreak.gap.numerics.signal_noise import estimate_noise, resolution
 
 FORMATS = ["csv", "npz"]
 try:

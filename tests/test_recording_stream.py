@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from makebreak.diagrams.recorder import recorded
-from makebreak.gap.recording import read_recording
+from makebreak.gap.data.recording import read_recording
 from makebreak.scripts import recording_stream
 from makebreak.scripts.session import Session
 

@@ -19,7 +19,7 @@ from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource, Integrator
 
-from makebreak.gap.table import check_columns, write_recording
+from makebreak.gap.data.table import check_columns, write_recording
 from makebreak.scripts.compiling import FIRST, CompilingShown
 from makebreak.scripts.session import Session
 from makebreak.scripts.settings import (

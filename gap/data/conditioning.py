@@ -14,18 +14,18 @@ import numpy as np
 
 from makebreak.gap.data.clock import clock_period, even_clock
 from makebreak.gap.data.filters import FILTERED_SEC
-from makebreak.gap.findings import Finding
-from makebreak.gap.numerics.signal_noise import (
-    estimate_noise,
-    noise_and_jitter,
-    noise_beside,
-)
-from makebreak.gap.recording import (
+from makebreak.gap.data.findings import Finding
+from makebreak.gap.data.recording import (
     Channel,
     Episode,
     Recording,
     unit_of,
     with_noise,
+)
+from makebreak.gap.numerics.signal_noise import (
+    estimate_noise,
+    noise_and_jitter,
+    noise_beside,
 )
 from makebreak.systems.numerics.filters import MovingAverage, filtered, subdivided
 from makebreak.systems.numerics.smoother import smooth_filtered

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from makebreak.gap.table import Table
+from makebreak.gap.data.table import RecordingTable
 
 
 def time_column(names: Mapping) -> str:
@@ -18,8 +18,11 @@ def time_column(names: Mapping) -> str:
 
 
 def joined(
-    path: Path, table: Table, others: Sequence[tuple[Path, Table]], time: str
-) -> Table:
+    path: Path,
+    table: RecordingTable,
+    others: Sequence[tuple[Path, RecordingTable]],
+    time: str,
+) -> RecordingTable:
     """One table with a row for each stamp that any of the files has; what a file does
     not have there is missing (NaN).
 
@@ -53,4 +56,4 @@ def joined(
     # A row that only another file has is told as the row before it.
     last = np.searchsorted(table.columns[time], stamps, "right") - 1
     row = table.row[np.maximum(last, 0)]
-    return Table(columns, row, max(table.n_rows, len(stamps)))
+    return RecordingTable(columns, row, max(table.n_rows, len(stamps)))

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from makebreak.gap.table import COMMANDS, is_channel
+from makebreak.gap.data.table import COMMANDS, is_channel
 
 DEG = np.pi / 180.0
 _COMMAND = set(

@@ -19,7 +19,7 @@ from makebreak.gap.data.proposal import (
     propose,
     sidecar_text,
 )
-from makebreak.gap.table import Table, read_table, stem_of, suffix_of
+from makebreak.gap.data.table import RecordingTable, read_table, stem_of, suffix_of
 from makebreak.models.effects.kind import actuator_of, one_dof_joints
 
 ROBOTS = (".urdf", ".sdf", ".xml")
@@ -100,7 +100,7 @@ class Log:
     """A log as it is: the table of its numbers, and columns of text."""
 
     path: Path
-    table: Table
+    table: RecordingTable
     text: tuple[str, ...]
 
 

@@ -31,7 +31,7 @@ from makebreak.diagrams.station import (
     TORQUE_RATE_MAX,
     make_control_plant,
 )
-from makebreak.gap.table import read_table
+from makebreak.gap.data.table import read_table
 from makebreak.models.scene import load_scene
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.lcm_loop import drive

@@ -141,7 +141,7 @@ def start_of(t, q, p):
 
 def judge(data: Path, scene_file: Path) -> float:
     """Rms [m] over all judged tosses."""
-    from makebreak.gap.scene_simulation import SceneSimulation
+    from makebreak.gap.simulation.scene_simulation import SceneSimulation
     from makebreak.models.scene import InitialSection, read_scene
 
     simulation = SceneSimulation(read_scene(scene_file))

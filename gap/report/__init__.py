@@ -1,0 +1,1 @@
+"""Files and pictures of what was found."""

@@ -1,0 +1,1 @@
+"""Kinds of data as problems for the search: what effects leave of them unexplained."""

@@ -1,0 +1,720 @@
+"""A robot that pushes, slides or presses on objects: as a problem for the search.
+
+Residuals are those of gap/residuals/contact_dynamics.py; simulated windows
+(gap/simulation/contact_windows.py) then say what effects are worth.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+from scipy.optimize import minimize
+
+from makebreak.gap.data.recording import Recording
+from makebreak.gap.numerics.selection import Screen, benjamini_hochberg
+from makebreak.gap.problem import (
+    Candidate,
+    Fitted,
+    GapProblem,
+    Nuisances,
+    Outcome,
+    SearchPlan,
+    is_sane,
+    rms,
+)
+from makebreak.gap.residuals.contact_dynamics import WRENCHED, ContactDynamics
+from makebreak.gap.residuals.mechanism import link_changes
+from makebreak.gap.residuals.objects import unexplained_in_windows
+from makebreak.gap.residuals.permitted_contacts import Shift
+from makebreak.gap.result import Where
+from makebreak.gap.search.fit import fit_effects
+from makebreak.gap.simulation.contact_windows import (
+    PushWindows,
+    led_as_measured,
+    varies,
+)
+from makebreak.gap.simulation.measure import gap_measure, series_of
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect
+from makebreak.models.scene import Scene
+
+BLOCK_SEC = 0.6  # In which a tool goes a few centimetres.
+PLACED = 1e-3  # A camera's place [m],
+TURNED = 3e-3  # its turn [rad],
+LATE = 0.25  # and its clock, in periods of its samples.
+TIMING = 2.5e-4  # Of what drives get [s].
+FELT = 0.05  # What a force sensor shows more, sampled amid a drive's ripple too.
+BEYOND = 3.0
+MISFIT = 1.15  # Less than so many times the sensors' noise is no misfit.
+ROBUST = 1.4826
+LEAST_MISFIT = 0.002  # Of the forces in a row: laws are no better than that.
+LESS = 0.85
+EXACT = 4  # Single effects that are fitted for what models are off by.
+CELL, MOST_CELLS = 0.015, 20  # A side of the cells in which a patch is looked for [m].
+LEAST_CELLS = 4
+PATCH_RUNS, PATCH_STARTS = 200, 4
+# Of a patch's side: how far it is moved [m], and what that may add to the sum of
+# squares (neighbouring rows err together: four times what one row would count).
+MOVED, PROFILE = (5e-4, 1e-3, 2e-3, 4e-3, 8e-3, 0.016, 0.032, 0.064), 16.0
+LARGEST = 200.0  # An error beyond so many standard deviations counts as this.
+FEWEST_ROWS = 8  # Of a channel that is looked at by itself.
+SMALL = 0.1  # First trial of an effect on joints, of the efforts there.
+
+
+class ContactProblem(ContactDynamics, GapProblem):
+    """Robots and free bodies that touch, by their equations of motion."""
+
+    plan = SearchPlan(
+        evaluations=8,
+        diff_step=1e-3,
+        least_gain=0.05,
+        least_error=1.0,
+        most_effects=4,
+        shortlist=10,
+        simulation_agrees=True,
+    )
+
+    def __init__(self, scene: Scene, recordings: Sequence[Recording]):
+        super().__init__(scene, recordings)
+        self._base: np.ndarray | None = None
+        self._nuisances: Nuisances | None = None
+        self._shown = self.counts()
+        self._windows: PushWindows | None = None
+        self._share_out()
+        self._learn_misfit()
+
+    # ----- Rows
+
+    def _flat(self, r: np.ndarray) -> np.ndarray:
+        return r[self._shown]
+
+    def _of_rows(self, value: np.ndarray) -> np.ndarray:
+        """A value of each test function, for each row."""
+        return np.broadcast_to(value[:, None], self._shown.shape)[self._shown]
+
+    def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
+        return np.clip(self._flat(self.left(effects)), -LARGEST, LARGEST)
+
+    def weighed_alike(self, one: Sequence[Effect], other: Sequence[Effect]):
+        """A heavier body makes more noise of the same accelerations: by its own weights
+        each of two models that are both below the noise seems better the heavier it is.
+        """
+
+        def row(effects, weights):
+            r = self._flat(self.left(effects, weighed_as=weights))
+            return np.clip(r, -LARGEST, LARGEST)
+
+        return [(row(one, w), row(other, w)) for w in (one, other)]
+
+    def base(self) -> np.ndarray:
+        if self._base is None:
+            self._base = self.residual()
+        return self._base
+
+    def _share_out(self) -> None:
+        """Which blocks are fitted. What is seen at one place alone (a patch, a wall) is
+        seen in few blocks, and must be in both parts: so of each three blocks of which
+        the scene leaves about as much, the middle one is held out."""
+        m = self.means
+        block = np.zeros(len(m.time), int)
+        first = 0
+        for number in np.unique(m.episode):
+            mine = m.episode == number
+            start = m.time[mine].min()
+            block[mine] = first + ((m.time[mine] - start) / BLOCK_SEC).astype(int)
+            first = int(block[mine].max()) + 1
+        self._block = block
+        _, order = np.unique(block, return_inverse=True)
+        size = np.sum(np.where(self._shown, self.left() ** 2, 0.0), axis=1)
+        total = np.bincount(order, weights=size)
+        rank = np.empty(len(total), int)
+        rank[np.argsort(-total, kind="stable")] = np.arange(len(total))
+        self._train = rank[order] % 3 != 1
+
+    def train(self) -> np.ndarray:
+        return self._of_rows(self._train)
+
+    def blocks(self) -> np.ndarray:
+        return self._of_rows(self._block)
+
+    def channel_of_rows(self) -> np.ndarray:
+        index = np.arange(self._shown.shape[1])
+        return np.broadcast_to(index, self._shown.shape)[self._shown]
+
+    def parts(self) -> np.ndarray:
+        number = np.array([t.recording for t in self.tracks])
+        return self._of_rows(number[self.means.episode])
+
+    # ----- What models are off by
+
+    def _learn_misfit(self) -> None:
+        """What a model with everything ordinary in it leaves of held-out rows; or, if
+        that is less, one with a single effect, fitted exactly (a mass half as large
+        again is far from where its column is straight)."""
+        base, nuisances = self.base(), self.nuisances()
+        found = self._plain_candidates(base, ())
+        n = nuisances.columns
+        screen = Screen(base, n, nuisances.prior, self.train())
+        left, least = base, screen.fit().score
+        if found:
+            X = np.hstack([c.columns[0] for c in found])
+            rich = screen.fit(X)
+            if rich.score < least:
+                left, least = base - X @ rich.c - n @ rich.b, rich.score
+        singles = [
+            (fit.score, c.effects(k, fit.c))
+            for c in found
+            for k, fit in enumerate(map(screen.fit, c.columns))
+        ]
+        singles = [s for s in singles if all(map(is_sane, s[1]))]
+        for _, effects in sorted(singles, key=lambda s: s[0])[:EXACT]:
+            try:
+                one = fit_effects(self, screen, effects)
+            except ValueError:
+                continue
+            if one.score < least:
+                left, least = one.left, one.score
+        self._set(self._misfit(left))
+
+    def _misfit(self, left: np.ndarray) -> np.ndarray:
+        """(rows,) [N, N m] what held-out equations are off by beside sensors' noise."""
+        r = np.zeros(self._shown.shape)
+        r[self._shown] = left
+        n = len(self.allowance)
+        held = ~self._train if not self._train.all() else self._train
+        off = np.abs(self.in_newtons(r[:, :n])[held])
+        size = ROBUST * np.median(off, axis=0)
+        # Where forces take up most rows, the median of what is left says little.
+        size = np.maximum(
+            size, 0.6 * np.sqrt(np.mean(np.minimum(off, 4 * size) ** 2, axis=0))
+        )
+        sensors = self.sensor_std()
+        beside = np.sqrt(np.maximum(size**2 - (MISFIT * sensors) ** 2, 0.0))
+        off = np.maximum(beside, LEAST_MISFIT * self.acting)
+        for sensor in self.sensors:
+            # A moment is a force, of which other rows tell, at a point that geometry
+            # tells: one that is off by more is no law of contact.
+            rows = np.arange(len(self.coordinates) + self.n_wrench)
+            rows = rows[len(self.coordinates) :][sensor.moments]
+            off[rows] = np.minimum(off[rows], WRENCHED * self.acting[rows])
+        return off
+
+    def _set(self, allowance: np.ndarray) -> None:
+        self.allow(allowance)
+        self._base, self._nuisances = None, None
+
+    def reweigh(self, left: np.ndarray) -> bool:
+        less = np.minimum(self._misfit(left), self.allowance)
+        if (less >= LESS * self.allowance).all():
+            return False
+        self._set(less)
+        return True
+
+    # ----- What may be slightly wrong
+
+    def nuisances(self) -> Nuisances:
+        """The drives' timing, the robot's links, where a camera is, and its clock."""
+        if self._nuisances is not None:
+            return self._nuisances
+        base = self.base()
+        columns, prior, names = [], [], []
+
+        def add(name: str, moved: np.ndarray, step: float, size: float) -> None:
+            column = (base - moved) / step
+            if np.abs(column).max(initial=0.0) * size > 1e-3:
+                columns.append(column)
+                prior.append(size)
+                names.append(name)
+
+        if np.abs(self.means.effort_slope).max(initial=0.0) > 0.0:
+            step, kept = 1e-4, self._needs
+            self._needs = kept - step * self.means.effort_slope
+            try:
+                add("timing of the drives", self.residual(), step, TIMING)
+            finally:
+                self._needs = kept
+        for sensor in self.sensors:
+            at, kept, forces = sensor.place, self.means.wrench, sensor.forces
+            ripple = self._ripple(sensor.welded)
+            for name, own, more, step, size in (
+                (f"gain of {at}", sensor.rows, kept[:, sensor.rows], 0.01, FELT),
+                (f"ripple of {at}", forces, ripple, 1e-4, self._row_sec()),
+            ):
+                self.means.wrench = np.array(kept)
+                self.means.wrench[:, own] += step * more
+                try:
+                    add(name, self.residual(), step, size)
+                finally:
+                    self.means.wrench = kept
+        for name, effect, size in link_changes(self.dynamics, self.scene):
+            if set(effect.at) & set(self.bodies):
+                continue
+            add(name, self.residual([effect]), size, size)
+        for body in self.bodies:
+            period = self._period(body)
+            for k, axis in enumerate("xyz"):
+                place = tuple(np.eye(3)[k] * 1e-3)
+                moved = self._flat(self.left((), Shift(body, place=place)))
+                add(f"place of {body}, {axis}", moved, 1e-3, PLACED)
+            for k, axis in enumerate("xy"):
+                turn = tuple(np.eye(3)[k] * 1e-3)
+                moved = self._flat(self.left((), Shift(body, turn=turn)))
+                add(f"turn of {body}, {axis}", moved, 1e-3, TURNED)
+            moved = self._flat(self.left((), Shift(body, late=1e-3)))
+            add(f"clock of {body}", moved, 1e-3, LATE * period)
+        self._nuisances = (
+            Nuisances(np.stack(columns, axis=1), np.array(prior), tuple(names), BEYOND)
+            if columns
+            else Nuisances.none(len(base))
+        )
+        return self._nuisances
+
+    def _ripple(self, welded: Sequence[int]) -> np.ndarray:
+        """(K, 3) force at a sensor by a delay of all commands [N/s]: a drive's effort
+        steps up with each command and falls until the next, and a sensor that is read
+        with the commands sees the top of it, not the mean."""
+        m, shown = self.means, [k for k in welded if k in self._J]
+        if not shown:
+            return np.zeros((len(m.time), 3))
+        middle = np.searchsorted(self._rows, m.centre)
+        J = self._J[shown[0]][np.clip(middle, 0, len(self._rows) - 1), 3:]
+        inverse = np.linalg.pinv(J.transpose(0, 2, 1), rcond=1e-3)
+        return np.einsum("kij,kj->ki", inverse, m.effort_slope)
+
+    def _row_sec(self) -> float:
+        return float(np.median([np.median(np.diff(t.time)) for t in self.tracks]))
+
+    def _period(self, body: str) -> float:
+        steps = []
+        for recording in self.recordings:
+            for episode in recording.episodes:
+                t, _ = recording.samples(f"{body}.x", episode)
+                if len(t) > 2:
+                    steps.append(float(np.median(np.diff(t))))
+        return float(np.median(steps))
+
+    # ----- Candidates
+
+    def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
+        found = self._plain_candidates(current.r, current.effects)
+        for pair in self._pairs_met:
+            found += self._patches(pair, current)
+        return found
+
+    def _plain_candidates(self, r: np.ndarray, there: Sequence[Effect]):
+        """All but patches, each by the difference that a trial makes."""
+        found: list[Candidate] = []
+        taken = {(e.kind, at) for e in there for at in e.at}
+        for kind, at, size, names, fixed, trials in self._trials():
+            if (kind, at) in taken:
+                continue
+            columns, readers = [], []
+            for trial in trials:
+                made = []
+                for step, parameters in trial:
+                    moved = self._try(there, Effect(kind, [at], parameters))
+                    if moved is None:
+                        break
+                    made.append((r - moved) / step)
+                if len(made) < len(names):
+                    continue
+                X = np.stack(made, axis=1)
+                if not np.isfinite(X).all() or not np.abs(X).max() > 1e-6:
+                    continue
+                columns.append(X)
+                readers.append(reader_of_trial(kind, names, trial))
+            if columns:
+                least = self.dynamics.least(kind, [at])
+                found.append(
+                    Candidate(kind, (at,), size, tuple(columns), tuple(readers), fixed,
+                              least=least)
+                )  # fmt: skip
+        return found
+
+    def _try(self, there: Sequence[Effect], effect: Effect) -> np.ndarray | None:
+        """With the weights of what is there: columns are then as linear as can be."""
+        try:
+            r = self.left([*there, effect], weighed_as=there)
+            return np.clip(self._flat(r), -LARGEST, LARGEST)
+        except (ValueError, RuntimeError):
+            return None
+
+    def _trials(self):
+        """(kind, place, size, names of what is fitted, names of what stays, trials);
+        a trial is (step, parameters) for each of the names."""
+        for pair in self._pairs_met:
+            at = self.pair_name(pair)
+            mu = self._friction_now(pair)
+            if mu > 0.0:
+                steps = [[((f - 1.0) * mu, {"friction": f * mu})] for f in (0.85, 1.3)]
+                yield "contact_friction", at, 1, ("friction",), (), steps
+        for body in self.bodies:
+            yield from self._of_body(body)
+        for at in self.dynamics.places("plane_tilt"):
+            zero = {"roll": 0.0, "pitch": 0.0}
+            steps = [[(0.004, {**zero, a: 0.004}) for a in zero]]
+            yield "plane_tilt", at, 2, ("roll", "pitch"), (), steps
+        for at in self.dynamics.places("plane_height"):
+            yield "plane_height", at, 1, ("height",), (), [[(1e-3, {"height": 1e-3})]]
+        yield from self._of_mechanism()
+
+    def _friction_now(self, pair) -> float:
+        """Of the slots that act."""
+        for s, on in zip(self.slots, self._masks, strict=True):
+            if self._pair_of(s) == pair and on.any():
+                return s.friction
+        return 0.0
+
+    def _of_body(self, body: str):
+        mass = self.dynamics.now("object_mass", [body])["mass"]
+        steps = [[((f - 1.0) * mass, {"mass": f * mass})] for f in (0.85, 1.2)]
+        yield "object_mass", body, 1, ("mass",), (), steps
+        com = self.dynamics.now("object_com", [body])
+        steps = [[(2e-3, {**com, a: com[a] + 2e-3}) for a in "xy"]]
+        yield "object_com", body, 2, ("x", "y"), ("z",), steps
+        inertia = self.dynamics.now("object_inertia", [body])
+        mid = {k: inertia[k] for k in ("ixx", "iyy", "izz")}
+        for f in (0.9,):
+            each = {**mid, "izz": f * mid["izz"]}
+            yield (
+                "object_inertia", body, 1, ("izz",), ("ixx", "iyy"),
+                [[((f - 1.0) * mid["izz"], each)]],
+            )  # fmt: skip
+        size = 0.05 * mass * 9.81
+        zero = {"fx": 0.0, "fy": 0.0, "fz": 0.0}
+        steps = [[(size, {**zero, a: size}) for a in ("fx", "fy")]]
+        yield "constant_force", body, 2, ("fx", "fy"), ("fz",), steps
+        zero = {"linear": 0.0, "angular": 0.0}
+        step = mass
+        yield (
+            "body_drag", body, 1, ("linear",), ("angular",),
+            [[(step, {**zero, "linear": step})]],
+        )  # fmt: skip
+
+    def _of_mechanism(self):
+        """Kinds with one parameter at joints and links of the robot."""
+        m = self.means
+        effort = np.sqrt(np.mean(m.effort**2, axis=0))
+        speed = np.sqrt(np.mean(self.motion.v**2, axis=0))
+        index = {joint: i for joint, (_, i) in self.joints.items()}
+        inertia = np.mean(self._M[:, range(len(effort)), range(len(effort))], axis=0)
+        for kind, entry in KINDS.items():
+            if entry.at not in ("joint", "actuator") or len(entry.parameters) != 1:
+                continue
+            if entry.path and entry.path not in ("gain", "bias"):
+                continue
+            if not entry.path and entry.signature is None and entry.added is None:
+                continue
+            (p,) = entry.parameters
+            for at in self.dynamics.places(kind):
+                i = index.get(at)
+                if i is None or self.by[at] == "":
+                    continue
+                if entry.path and self.by[at] == "passive":
+                    continue
+                now = self.dynamics.now(kind, [at]).get(p.name, 0.0)
+                force = SMALL * max(effort[i], 1e-3 * effort.max() + 1e-9)
+                step = {
+                    "N m": force,
+                    "N m s/rad": force / max(speed[i], 1e-3),
+                    "N m s2/rad2": force / max(speed[i], 1e-3) ** 2,
+                    "kg m2": 0.2 * inertia[i],
+                    "": 0.05,
+                }.get(p.unit)
+                if step is not None and np.isfinite(now):
+                    yield kind, at, 1, (p.name,), (), [[(step, {p.name: now + step})]]
+
+    # ----- A patch of other friction
+
+    def _patches(self, pair, current: Fitted) -> list[Candidate]:
+        """A rectangle: cells of the ground that was slid over are tried one by one, a
+        rectangle is the sum of its cells; the best is searched on exactly."""
+        at = self.pair_name(pair)
+        there = list(current.effects)
+        if not self._may_have_patch(pair, there):
+            return []
+        mu = self._friction_now(pair)
+        for e in there:
+            if e.kind == "contact_friction" and at in e.at:
+                mu = e.parameters["friction"]
+        places = self._slid_over(pair)
+        if mu <= 0.0 or len(places) < 40:
+            return []
+        grid = []
+        for c in places.T:
+            low, high = float(c.min()) - 1e-3, float(c.max()) + 1e-3
+            n = int(np.clip(round((high - low) / CELL), 1, MOST_CELLS))
+            if n < LEAST_CELLS:
+                return []
+            grid.append(np.linspace(low, high, n + 1))
+        r, train = current.r, self.train()
+
+        def patch(friction, sides) -> dict[str, float]:
+            names = ("x_min", "x_max", "y_min", "y_max")
+            named = dict(zip(names, map(float, sides), strict=True))
+            return {"friction": float(friction)} | named
+
+        def moved(friction, sides) -> np.ndarray | None:
+            effect = Effect("friction_patch", [at], patch(friction, sides))
+            return self._try(there, effect)
+
+        nx, ny = len(grid[0]) - 1, len(grid[1]) - 1
+        count, _, _ = np.histogram2d(places[:, 0], places[:, 1], bins=grid)
+        rectangles = []
+        # More friction is not less of it turned round: other forces are at limits.
+        for step in (-0.2 * mu, 0.2 * mu):
+            cells = np.zeros((nx, ny, int(train.sum())))
+            for i, j in np.argwhere(count):
+                new = moved(mu + step, (*grid[0][i : i + 2], *grid[1][j : j + 2]))
+                if new is not None:
+                    cells[i, j] = ((r - new) / step)[train]
+            rectangles += _best_rectangles(cells, r[train], mu)
+        found = []
+        for c, (i0, i1, j0, j1) in rectangles:
+            box = np.array([grid[0][i0], grid[0][i1], grid[1][j0], grid[1][j1]])
+            for f in dict.fromkeys((mu + c, 0.5 * mu, 1.6 * mu)):
+                new = moved(f, box)
+                if new is not None:
+                    found.append((float(np.mean(new[train] ** 2)), f, box))
+        found.sort(key=lambda each: each[0])
+        best: list[tuple] = []
+        for _, f, box in found:  # Of each rectangle the best, and few of them.
+            if len(best) < PATCH_STARTS and not any(box is b[3] for b in best):
+                best.append((*self._search_patch(moved, mu, f, box, train, 60), box))
+        if not best:
+            return []
+        best = [(error, f, sides) for error, f, sides, _ in best]
+        _, friction, sides = min(best, key=lambda each: each[0])
+        _, friction, sides = self._search_patch(
+            moved, mu, friction, sides, train, PATCH_RUNS
+        )
+        new = moved(friction, sides)
+        if new is None or abs(friction - mu) < 1e-6:
+            return []
+        column = ((r - new) / (friction - mu))[:, None]
+
+        def read(c) -> dict[str, float]:
+            return patch(np.clip(mu + c[0], 0.05 * mu, max(1.5, 2.0 * mu)), sides)
+
+        return [Candidate("friction_patch", (at,), 5, (column,), (read,))]
+
+    def _may_have_patch(self, pair, there: Sequence[Effect]) -> bool:
+        at = self.pair_name(pair)
+        if not self._lies(pair) or at not in self.dynamics.places("friction_patch"):
+            return False
+        return not any(e.kind in ("plane_tilt", "friction_patch") for e in there)
+
+    def _search_patch(self, moved: Callable, mu, friction, sides, train, most):
+        """The error, friction and sides from which no small move takes off more."""
+        scale = np.array([0.1 * mu, 0.01, 0.01, 0.01, 0.01])
+
+        def cost(z) -> float:
+            f, box = friction + scale[0] * z[0], sides + scale[1:] * z[1:]
+            if not (f > 0.0 and box[0] < box[1] and box[2] < box[3]):
+                return 1e9
+            r = moved(f, box)
+            return 1e9 if r is None else float(np.mean(r[train] ** 2))
+
+        corners = np.vstack([np.zeros(5), np.eye(5)])
+        found = minimize(
+            cost, np.zeros(5), method="Nelder-Mead",
+            options={"initial_simplex": corners, "maxfev": most, "xatol": 0.01,
+                     "fatol": 1e-5},
+        )  # fmt: skip
+        x = scale * found.x
+        return float(found.fun), friction + x[0], sides + x[1:]
+
+    def widened(self, end: Fitted, k: int) -> dict[str, float]:
+        """A patch's side that nothing slid across can be anywhere until something did:
+        it is moved by ever more, and its deviation is half of how far that goes without
+        a loss of PROFILE noise variances; infinite where it goes on."""
+        effect, std = end.effects[k], dict(end.std[k])
+        if effect.kind != "friction_patch":
+            return std
+        calm = self.nuisances().columns @ end.b
+        limit = PROFILE * max(end.score, 1.0) ** 2
+
+        def cost(parameters) -> float:
+            others = [*end.effects]
+            others[k] = replace(effect, parameters=parameters)
+            try:
+                return float(np.sum((self.residual(others) - calm) ** 2))
+            except ValueError:  # The patch is empty.
+                return np.inf
+
+        least = cost(effect.parameters)
+        for name in ("x_min", "x_max", "y_min", "y_max"):
+            now = effect.parameters[name]
+            for sign in (-1.0, 1.0):
+                far = np.inf
+                for d in MOVED:
+                    moved = {**effect.parameters, name: now + sign * d}
+                    if cost(moved) - least > limit:
+                        far = d
+                        break
+                std[name] = max(std.get(name, 0.0), 0.5 * far)
+        return std
+
+    def _slid_over(self, pair) -> np.ndarray:
+        """(n, 2) places of the ground over which a point of the pair slid."""
+        out = []
+        for s, on in zip(self.slots, self._masks, strict=True):
+            if self._pair_of(s) == pair and on.any():
+                v = np.einsum("nij,nj->ni", self._relative(s), self._node_v)
+                slides = on & (np.linalg.norm(v, axis=1) > 0.01)
+                out.append(s.place[slides, :2])
+        return np.vstack(out) if out else np.zeros((0, 2))
+
+    # ----- What it comes to
+
+    def loudest(self, fitted: Fitted) -> tuple[str, float]:
+        found = ("", 0.0)
+        for k, name in enumerate(self.row_names()):
+            mine = fitted.left[self.channel_of_rows() == k]
+            if len(mine) >= FEWEST_ROWS:
+                found = max(found, (name, rms(mine)), key=lambda each: each[1])
+        return found
+
+    def where(self, left: np.ndarray) -> list[Where]:
+        r = np.zeros(self._shown.shape)
+        r[self._shown] = left
+        m, names = self.means, self.row_names()
+        found, p = [], []
+        for number, t in enumerate(self.tracks):
+            mine = m.episode == number
+            stretch = (m.time / 0.5).astype(int)
+            for part in np.unique(stretch[mine]):
+                rows = np.flatnonzero(mine & (stretch == part))
+                for k, name in enumerate(names):
+                    some = rows[self._shown[rows, k]]
+                    if len(some) < 2:
+                        continue
+                    score = float(np.sqrt(np.mean(r[some, k] ** 2)))
+                    p.append(
+                        float(np.exp(-0.5 * len(some) * max(score / 1.3, 0.0) ** 2))
+                    )
+                    found.append(
+                        Where(
+                            name, float(m.time[rows[0]]), float(m.time[rows[-1]]),
+                            t.episode.number, self.recordings[t.recording].name,
+                            "in contact", score,
+                        )
+                    )  # fmt: skip
+        out = benjamini_hochberg(p, 0.01)
+        kept = [
+            w for w, is_out in zip(found, out, strict=True) if is_out and w.score > 1.3
+        ]
+        return sorted(kept, key=lambda w: -w.score)[:40]
+
+    def judged(self) -> dict[str, str]:
+        """Positions and poses by the equations and in simulation; all that is measured
+        twice, and wrenches, in equations."""
+        _, led = led_as_measured(self.scene, self.recordings)
+        how = {
+            f"{j}.position": "equations" if j in led else "equations and simulation"
+            for j in self.joints
+        }
+        for body in self.bodies:
+            for a in ("qw", "qx", "qy", "qz", "x", "y", "z"):
+                both = varies(self.recordings, name := f"{body}.{a}")
+                how[name] = "equations and simulation" if both else "equations"
+        for name, _ in self.extra:
+            how[name] = "equations"
+        for joint, by in self.by.items():
+            if by == "measured":
+                how[f"{joint}.effort_measured"] = "equations"
+        for sensor in self.sensors:
+            for name in sensor.names:
+                how[name] = "equations"
+        return how
+
+    def outcome(
+        self, effects, start: Fitted, end: Fitted, nuisances: Nuisances,
+        recordings=None, jobs: int = 1,
+    ) -> Outcome | None:  # fmt: skip
+        if recordings is not None:
+            try:
+                model = PushWindows(self.scene, recordings)
+            except ValueError:  # No window fits in.
+                return None
+            held = [True] * len(model.windows)
+        else:
+            if self._windows is None:
+                episodes = {
+                    (t.recording, t.episode.number)
+                    for k, t in enumerate(self.tracks)
+                    if not self._train[self.means.episode == k].all()
+                }
+                try:
+                    self._windows = PushWindows(self.scene, self.recordings, episodes)
+                except ValueError:
+                    return None
+            model = self._windows
+            held = [True] * len(model.windows)
+        before = model.simulate(())
+        after = model.simulate(effects) if effects else before
+        return Outcome(
+            gap_measure(model, before, after, held),
+            series_of(model, before, after, held),
+            unexplained_in_windows(model, after),
+        )
+
+
+def reader_of_trial(kind: str, names: Sequence[str], trial) -> Callable:
+    """From coefficients to parameters."""
+    start = dict(trial[0][1])
+    for name, (step, parameters) in zip(names, trial, strict=True):
+        start[name] = parameters[name] - step
+
+    def read(c) -> dict[str, float]:
+        out = dict(start)
+        for name, x in zip(names, c, strict=True):
+            out[name] = start[name] + float(x)
+        for p in KINDS[kind].parameters:
+            if p.valid in (">= 0", "> 0") and p.name in out:
+                low = 0.1 * abs(start[p.name]) if p.valid == "> 0" else 0.0
+                out[p.name] = max(out[p.name], low)
+        return out
+
+    return read
+
+
+def _best_rectangles(cells: np.ndarray, r: np.ndarray, mu: float, most: int = 12):
+    """Rectangles of cells, each with what is added to their friction, that take most
+    off r (n,) to first order, none of which is nearly another. cells (nx, ny, n).
+    Returns: [(c, (i0, i1, j0, j1))]."""
+    nx, ny, n = cells.shape
+    sums = np.zeros((nx + 1, ny + 1, n))
+    sums[1:, 1:] = cells.cumsum(axis=0).cumsum(axis=1)
+    found = []
+    for i0, i1 in combinations(range(nx + 1), 2):
+        strip = sums[i1] - sums[i0]  # (ny + 1, n)
+        # Of all j0 < j1 at once: x = strip[j1] - strip[j0].
+        gram, pull = strip @ strip.T, strip @ r
+        d = np.diag(gram)
+        size = d[:, None] + d[None, :] - 2.0 * gram
+        dot = pull[None, :] - pull[:, None]  # [j0, j1]
+        c = np.where(size > 1e-12, dot / np.maximum(size, 1e-12), 0.0)
+        c = np.clip(c, -0.8 * mu, 1.5 * mu)
+        gain = 2.0 * c * dot - c * c * size
+        gain[np.tril_indices(ny + 1)] = 0.0
+        for flat in np.argsort(gain, axis=None)[::-1][:4]:
+            j0, j1 = np.unravel_index(int(flat), gain.shape)
+            if gain[j0, j1] > 0.0:
+                corners = (i0, i1, int(j0), int(j1))
+                found.append((float(gain[j0, j1]), float(c[j0, j1]), corners))
+    found.sort(key=lambda each: -each[0])
+    kept: list[tuple[float, tuple[int, int, int, int]]] = []
+    for _, added, box in found:
+        if len(kept) < most and all(_overlap(box, other) < 0.6 for _, other in kept):
+            kept.append((added, box))
+    return kept
+
+
+def _overlap(a, b) -> float:
+    """What two rectangles have in common, as a share of what they cover together."""
+    x = max(min(a[1], b[1]) - max(a[0], b[0]), 0)
+    y = max(min(a[3], b[3]) - max(a[2], b[2]), 0)
+    area = (a[1] - a[0]) * (a[3] - a[2]) + (b[1] - b[0]) * (b[3] - b[2])
+    return x * y / (area - x * y)

@@ -1,0 +1,504 @@
+"""A mechanism whose drives follow commands and whose joints stick, by its windows.
+
+A joint at rest only says that friction is at most so much, and without a measured
+effort its equation says what the drive's law makes of its own error: equations of
+motion mislead. Here windows are simulated by compiled code
+(gap/simulation/driven_arm.py), a hundred times as fast as by Drake, and what effects
+would do is seen by differences.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from makebreak.gap.data.recording import Recording
+from makebreak.gap.numerics.selection import Screen
+from makebreak.gap.problem import (
+    Candidate,
+    Fitted,
+    GapProblem,
+    Nuisances,
+    Outcome,
+    SearchPlan,
+    rms,
+)
+from makebreak.gap.residuals.inverse import LOOP_SEC
+from makebreak.gap.residuals.mechanism import (
+    LESS,
+    MISFIT,
+    beyond_noise,
+    link_changes,
+    moved_links,
+)
+from makebreak.gap.residuals.objects import unexplained_in_windows
+from makebreak.gap.result import Where
+from makebreak.gap.search.fit import fit_effects
+from makebreak.gap.search.screen import REACH
+from makebreak.gap.search.where import where_in_windows
+from makebreak.gap.simulation.driven_arm import DrivenArmSimulation, can_have
+from makebreak.gap.simulation.measure import gap_measure, series_of
+from makebreak.gap.simulation.windows import LARGEST, WindowModel
+from makebreak.models.drives import DRIVEN_BY, law_of
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect, find_joints, full_name
+from makebreak.models.scene import Scene
+from makebreak.models.scene_schema import COMMANDS_OF
+
+WINDOW_SEC, MOST_WINDOWS = 0.5, 60
+# A joint below this speed is at rest; one that is for this share of the time sticks.
+REST_SPEED, REST_SEC, STICKS = 0.005, 0.2, 0.2
+# How far a parameter is moved to see what it does, in shares of a typical size.
+SMALL = 0.1
+BESIDE_SEC = 0.06  # About a start, within which a jerk spoils what is known of it.
+
+
+class DrivenWindows(WindowModel):
+    """Windows of a mechanism, simulated by compiled code. What an uncertain start does
+    is simulated, too: a stiff drive soon makes it forgotten.
+
+    Raises: ValueError where the scene takes Drake's steps, or no window fits in.
+    """
+
+    def __init__(self, scene: Scene, recordings: Sequence[Recording]):
+        super().__init__(
+            scene, recordings, WINDOW_SEC, most=MOST_WINDOWS,
+            simulation=DrivenArmSimulation(scene),
+        )  # fmt: skip
+        base = self.simulate(())
+        given = self.windows
+        variance = [np.tile(self.noise**2, (len(y), 1)) for y in base]
+        for k in range(2):  # Along each axis of the start's covariance.
+            self.windows = [replace(w, state=_moved_start(w, k)) for w in given]
+            for of, a, b in zip(variance, self.simulate(()), base, strict=True):
+                off = a - b
+                of += np.where(np.isfinite(off), off, 0.0) ** 2
+        self.windows = [
+            replace(w, std=np.sqrt(of)) for w, of in zip(given, variance, strict=True)
+        ]
+
+    def _best_start(self, time, states, row: int) -> int:
+        """Within half a window, the row about which accelerations jump least: a joint
+        that a command or its friction jerks there has another speed than the smoothed
+        one."""
+        last = int(np.searchsorted(time, time[row] + 0.5 * WINDOW_SEC))
+        rows = np.arange(row, max(min(last, len(time) - 4), row + 1))
+        worst = np.zeros(len(rows))
+        for x in states.values():
+            jump = _jumps(time, x)
+            worst += (jump[rows] / max(float(np.sqrt(np.mean(jump**2))), 1e-12)) ** 2
+        return int(rows[np.argmin(worst)])
+
+
+class DrivenProblem(DrivenWindows, GapProblem):
+    """Windows of joints that follow commands, as a problem for the search."""
+
+    plan = SearchPlan(  # fmt: skip
+        evaluations=4,
+        diff_step=1e-2,
+        most_effects=8,
+        by_channel=True,
+        own_values=True,
+        shortlist=4,
+    )
+
+    def __init__(self, scene: Scene, recordings: Sequence[Recording]):
+        super().__init__(scene, recordings)
+        # What models are off by, of each channel, beside noise.
+        self.misfit = np.zeros(len(self.channels))
+        self._sizes = self._typical_sizes()
+        self._rich: tuple[Effect, ...] = ()
+        self._nuisances: Nuisances | None = None
+        self._explained: bool | None = None
+
+    # ----- Residuals
+
+    def errors(self, simulated: Sequence[np.ndarray]) -> list[np.ndarray]:
+        stds = [np.hypot(w.std, self.misfit) for w in self.windows]
+        each = self.errors_over(simulated, stds)
+        return [np.clip(e, -LARGEST, LARGEST) for e in each]
+
+    def in_noise(self, left: np.ndarray) -> np.ndarray:
+        return left * self._misfit_ratio()
+
+    def error(self, fitted: Fitted) -> float:
+        whole = float(np.sqrt(np.mean(self.in_noise(fitted.left) ** 2)))
+        return max(self.noise_error(fitted.left), whole)
+
+    def _misfit_ratio(self) -> np.ndarray:
+        """(m,) what rows were divided by over the noise alone."""
+        each = [np.hypot(w.std, self.misfit) / w.std for w in self.windows]
+        return np.concatenate([x.ravel() for x in each])[self.measured()]
+
+    def _noise_of_rows(self) -> np.ndarray:
+        return np.concatenate([w.std.ravel() for w in self.windows])[self.measured()]
+
+    # ----- What models are off by
+
+    def is_explained(self) -> bool:
+        """Whether the scene as it came, its background within its tolerance, explains
+        each channel's windows as well as noise lets it."""
+        if self._explained is None:
+            n = self.nuisances()
+            screen = Screen(
+                self.base(), n.columns, n.prior, self.train(), reach=n.reach
+            )
+            left = self.in_noise(screen.settle(self.base())[1])
+            channel = self.channel_of_rows()
+            each = [left[channel == c] for c in np.unique(channel)]
+            self._explained = all(rms(x) < MISFIT for x in each)
+            self._nuisances = None  # They are seen beside a rich model, if need be.
+        return self._explained
+
+    def learn_misfit(self) -> None:
+        """To be called before a search. What a model with all that a drive may have at
+        all joints leaves is what models are off by: no fit is believed beyond that."""
+        held = ~self.train()
+        if not held.any() or held.all() or self.is_explained():
+            return
+        # Of kinds with the same unit one is enough.
+        start: dict[tuple[str, str], Effect] = {}
+        for kind, at, name, now, step in self._shared():
+            unit = KINDS[kind].parameter(name).unit
+            if step is not None and not KINDS[kind].channel:
+                start.setdefault((unit, at), Effect(kind, [at], {name: now + step}))
+        n = Nuisances.none(len(held))
+        screen = Screen(self.base(), n.columns, n.prior, self.train())
+        rich = fit_effects(self, screen, list(start.values()), evaluations=6)
+        left = rich.r
+        if rich.fit.train > screen.judge(self.base()).train:  # It went astray.
+            left = self.base()
+        else:
+            self._rich = rich.effects
+        self.misfit = np.minimum(self._misfit_of(left), self._misfit_of(self.base()))
+        self.correlation = self._correlation_of(left)
+        self._base = None
+
+    def _misfit_of(self, left: np.ndarray) -> np.ndarray:
+        held, of = ~self.train(), self.channel_of_rows()
+        noise, ratio = self._noise_of_rows(), self.in_noise(left)
+        found = np.zeros(len(self.channels))
+        for c in range(len(found)):
+            mine = held & (of == c)
+            if mine.any():
+                found[c] = beyond_noise(ratio[mine] * noise[mine], noise[mine])
+        return found
+
+    def _correlation_of(self, left: np.ndarray) -> float:
+        """Root of how many neighbouring rows of a window err together."""
+        sums, squares, n = 0.0, 0.0, 0
+        window, channel = self.blocks(), self.channel_of_rows()
+        for k in np.unique(window):
+            for c in np.unique(channel):
+                x = left[(window == k) & (channel == c)]
+                sums, squares = sums + np.sum(x) ** 2, squares + np.sum(x**2)
+                n = max(n, len(x))
+        return float(np.sqrt(np.clip(sums / max(squares, 1e-300), 1.0, max(n, 1))))
+
+    def reweigh(self, left: np.ndarray) -> bool:
+        less = np.minimum(self._misfit_of(left), self.misfit)
+        if (less >= LESS * self.misfit).all():
+            return False
+        self.misfit, self._base, self._nuisances = less, None, None
+        return True
+
+    # ----- The search
+
+    def nuisances(self) -> Nuisances:
+        """The links' masses and centres of mass, and how late drives' loops are, where
+        all is as it may be (a joint that friction holds hardly shows them)."""
+        if self._nuisances is None:
+            columns, prior, names = [], [], []
+            there = self.residual(self._rich)
+            changes = [*link_changes(self.dynamics, self.scene), *self._late_loops()]
+            for name, effect, size in changes:
+                moved = self.residual([*self._rich, effect])
+                columns.append((there - moved) / size)
+                prior.append(abs(size))
+                names.append(name)
+            self._nuisances = Nuisances(
+                np.stack(columns, axis=1), np.array(prior), tuple(names), REACH
+            ) if columns else Nuisances.none(len(self.train()))  # fmt: skip
+        return self._nuisances
+
+    def _late_loops(self):
+        """(name, effect, size) as link_changes, of drives' own loops: a velocity that
+        is fed back late adds to a joint what a smaller rotor would take away."""
+        for joint in self.joints:
+            law = law_of(self.scene.actuation, joint)
+            if law is None or not law.kd > 0.0:
+                continue
+            if self._takes("rotor_inertia", joint):
+                inertia = float(law.kd) * LOOP_SEC
+                more = Effect("rotor_inertia", [joint], {"inertia": inertia})
+                yield f"input_delay of {joint}, loop", more, -LOOP_SEC
+
+    def _moved_loops(self, effects, nuisances: Nuisances, b) -> list[Effect]:
+        """Drives' loops as the nuisances (n_b,) have them."""
+        found = dict(zip(nuisances.names, b, strict=True))
+        there = {(e.kind, at) for e in effects for at in e.at}
+        moved = []
+        for name, more, size in self._late_loops():
+            if (more.kind, more.at[0]) not in there:
+                times = float(found.get(name, 0.0)) / size
+                p = {k: times * x for k, x in more.parameters.items()}
+                moved.append(Effect(more.kind, more.at, p))
+        return moved
+
+    def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
+        """Kinds at all joints of a model with one value, at each joint, and at bodies
+        and bases. Of a joint alone only what its own channels show of the kind at all
+        joints is looked at: an exact fit follows."""
+        found: list[Candidate] = []
+        taken = {(e.kind, at) for e in current.effects for at in e.at}
+        for kind, at, name, now, step in self._shared():
+            if (kind, at) in taken:
+                continue
+            tries = [now + step] if step is not None else self._limits(at)
+            columns, readers = [], []
+            for value in tries:
+                effect = Effect(kind, [at], {name: value})
+                moved = self._residual(current, effect)
+                scale = step if step is not None else 1.0
+                columns.append(((current.r - moved) / scale)[:, None])
+                readers.append(_reader(name, now if step is not None else value,
+                                       1.0 if step is not None else 0.0))  # fmt: skip
+            least = self.dynamics.least(kind, [at])
+            joints = self._joints_of(kind, at)
+            if len(joints) > 1:
+                found.append(
+                    Candidate(kind, (at,), 1, tuple(columns), tuple(readers),
+                              least=least)
+                )  # fmt: skip
+            for joint in joints:
+                if (kind, joint) in taken:
+                    continue
+                mine = self._rows_of(joint)[:, None]
+                own = tuple(np.where(mine, x, 0.0) for x in columns)
+                if any(x.any() for x in own):
+                    found.append(
+                        Candidate(kind, (joint,), 1, own, tuple(readers),
+                                  least=self.dynamics.least(kind, [joint]))
+                    )  # fmt: skip
+        return [c for c in found if any(x.any() for x in c.columns)]
+
+    def _residual(self, current: Fitted, effect: Effect) -> np.ndarray:
+        try:
+            return self.residual([*current.effects, effect])
+        except ValueError:  # Not with these.
+            return current.r
+
+    def own_values(
+        self, effects: Sequence[Effect], k: int, r: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """{joint: (m,) column} of a value of its own for each joint that effect k has,
+        beside the shared one."""
+        effect = effects[k]
+        plant = self.dynamics.plant
+        joints = [full_name(plant, j) for j in find_joints(effect, plant)]
+        joints = [j for j in joints if self._takes(effect.kind, j)]
+        names = [p.name for p in KINDS[effect.kind].parameters]
+        if len(joints) < 2 or len(names) != 1:
+            return {}
+        column = self.column(effects, k, names[0], r)
+        return {j: np.where(self._rows_of(j), column, 0.0) for j in joints}
+
+    def column(self, effects, k: int, name: str, r: np.ndarray) -> np.ndarray:
+        """(m,) what more of a parameter takes off the residual r (m,)."""
+        value = effects[k].parameters[name]
+        step = 0.05 * abs(value) or 1e-3
+        more = Effect(effects[k].kind, effects[k].at, {**effects[k].parameters,
+                                                       name: value + step})  # fmt: skip
+        moved = self.residual([*effects[:k], more, *effects[k + 1 :]])
+        return (r - moved) / step
+
+    def _rows_of(self, joint: str) -> np.ndarray:
+        mine = [c.rsplit(".", 1)[0] == joint for c in self.channels]
+        return np.array(mine)[self.channel_of_rows()]
+
+    def _takes(self, kind: str, joint: str) -> bool:
+        return joint in self.dynamics.places(kind)
+
+    def _joints_of(self, kind: str, model: str) -> list[str]:
+        return [p for p in self.dynamics.places(kind) if p.split(".")[0] == model]
+
+    def _shared(self):
+        """(kind, model, parameter, its value now, a step; None where values are tried)
+        of all kinds with one parameter at joints."""
+        models = list(dict.fromkeys(j.split(".")[0] for j in self.joints))
+        for kind, entry in KINDS.items():
+            if entry.at not in ("joint", "actuator", "drive") or not can_have(kind):
+                continue
+            if len(entry.parameters) != 1:
+                continue
+            (parameter,) = entry.parameters
+            for model in models:
+                joints = self._joints_of(kind, model)
+                if not joints:
+                    continue
+                each = [self.dynamics.now(kind, [j])[parameter.name] for j in joints]
+                now = float(np.median(each))
+                step = None
+                if now < 1e20:
+                    step = self._step(parameter.unit, now, joints)
+                yield kind, model, parameter.name, now, step
+
+    def _step(self, unit: str, now: float, joints: Sequence[str]) -> float:
+        rows = [self.joints.index(j) for j in joints]
+        effort, speed, inertia = (float(np.median(x[rows])) for x in self._sizes)
+        typical = {
+            "N m": SMALL * effort,
+            "N m s/rad": SMALL * effort / speed,
+            "N m s2/rad2": SMALL * effort / speed**2,
+            "N m/rad": 0.2 * now,
+            "kg m2": 0.3 * inertia,
+            "s": 0.01,
+            "rad": 0.01,
+        }
+        return typical.get(unit, 0.15)
+
+    def _limits(self, model: str) -> list[float]:
+        effort = self._sizes[0]
+        return [float(x * effort.max()) for x in (0.5, 1.0, 1.5, 2.0)]
+
+    def _typical_sizes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of each joint: rms of what its drive gives by its law [N m], rms speed
+        [rad/s], inertia [kg m2]."""
+        efforts, speeds = [], []
+        for joint in self.joints:
+            law = law_of(self.scene.actuation, joint)
+            u, v = [np.zeros(1)], [np.zeros(1)]
+            for i, recording in enumerate(self.recordings):
+                for episode in recording.episodes:
+                    path = self._paths.get((i, episode.first))
+                    if path is None:
+                        continue
+                    x = path[f"{joint}.position"]
+                    v.append(x[:, 1])
+                    error, rate = np.zeros(len(x)), np.zeros(len(x))
+                    held = self._commands[i][episode.first].columns
+                    if f"{joint}.position_command" in held:
+                        error = held[f"{joint}.position_command"] - x[:, 0]
+                    if f"{joint}.velocity_command" in held:
+                        rate = held[f"{joint}.velocity_command"]
+                    if law is not None:
+                        u.append(law.effort(error, rate, x[:, 1]))
+            efforts.append(np.sqrt(np.mean(np.concatenate(u) ** 2)))
+            speeds.append(np.sqrt(np.mean(np.concatenate(v) ** 2)))
+        plant = self.dynamics.plant
+        context = plant.CreateDefaultContext()
+        M = np.diag(plant.CalcMassMatrix(context))
+        effort, speed = np.array(efforts), np.array(speeds)
+        return (
+            np.maximum(effort, 1e-3 * effort.max() + 1e-9),
+            np.maximum(speed, 1e-3 * speed.max() + 1e-6), M,
+        )  # fmt: skip
+
+    # ----- What it comes to
+
+    def judged(self) -> dict[str, str]:
+        return dict.fromkeys(self.channels, "simulation")
+
+    def parts(self) -> np.ndarray:
+        return self._by_row([w.recording for w in self.windows])
+
+    def nuisance_effects(self, nuisances: Nuisances, b: np.ndarray) -> list[Effect]:
+        return moved_links(self, nuisances, b)
+
+    def where(self, left: np.ndarray) -> list[Where]:
+        base = self.simulate(())
+        return where_in_windows(
+            self, self.errors_over(base, [w.std for w in self.windows])
+        )
+
+    def outcome(
+        self, effects, start: Fitted, end: Fitted, nuisances: Nuisances,
+        recordings=None, jobs: int = 1,
+    ) -> Outcome | None:  # fmt: skip
+        model: DrivenWindows = self
+        held = [not w.train for w in self.windows]
+        if recordings is not None:
+            try:
+                model = DrivenWindows(self.scene, recordings)
+            except ValueError:  # No window fits in.
+                return None
+            held = [True] * len(model.windows)
+        if not any(held):
+            return None
+        moved = [
+            *moved_links(self, nuisances, end.b),
+            *self._moved_loops(effects, nuisances, end.b),
+        ]
+        try:
+            before, after = model.simulate(moved), model.simulate([*moved, *effects])
+        except ValueError:  # A link that its background would make impossible.
+            before, after = model.simulate(()), model.simulate(effects)
+        return Outcome(
+            gap_measure(model, before, after, held),
+            series_of(model, before, after, held),
+            unexplained_in_windows(model, after),
+        )
+
+
+def is_driven(scene: Scene, recordings: Sequence[Recording]) -> bool:
+    """Whether all that moves are joints that follow commands of their drives, which are
+    in the recordings, and no effort is measured."""
+    takes = [c for c in COMMANDS_OF[scene.actuation.type] if c in DRIVEN_BY]
+    joints = scene.actuation.joints
+    if not takes or not joints:
+        return False
+    for recording in recordings:
+        for joint in joints:
+            if f"{joint}.position" not in recording:
+                return False
+            if f"{joint}.effort_measured" in recording:
+                return False
+            if not any(f"{joint}.{what}" in recording for what in takes):
+                return False
+    return True
+
+
+def sticks(scene: Scene, recordings: Sequence[Recording]) -> bool:
+    """Whether a joint stands still for much of the time."""
+    for joint in scene.actuation.joints:
+        still, whole = 0.0, 0.0
+        for recording in recordings:
+            channel = recording.channels[f"{joint}.position"]
+            for episode in recording.episodes:
+                y, t = recording.samples(channel.name, episode)[::-1]
+                n = int(REST_SEC / max(float(np.median(np.diff(t))), 1e-6))
+                if len(y) <= n or n < 2:
+                    continue
+                spans = np.lib.stride_tricks.sliding_window_view(y, n)
+                off = np.ptp(spans, axis=1)
+                still += np.sum(off < REST_SPEED * REST_SEC + 4.0 * channel.noise)
+                whole += len(off)
+        if whole and still > STICKS * whole:
+            return True
+    return False
+
+
+def _jumps(time: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """(n,) by how much a smoothed acceleration, of states x (n, 3), changes about each
+    row."""
+    beside = max(int(BESIDE_SEC / float(np.median(np.diff(time)))), 1)
+    row, n = np.arange(len(time)), len(time)
+    spans = [
+        np.abs(x[np.clip(row + k, 0, n - 1), 2] - x[:, 2])
+        for k in (-beside, -1, 1, beside)
+    ]
+    return np.max(spans, axis=0) + np.abs(x[:, 2])
+
+
+def _moved_start(window, k: int):
+    """The window's state, each signal moved by one deviation along axis k."""
+    state = dict(window.state)
+    for name, P in window.spread.items():
+        w, u = np.linalg.eigh(P)
+        state[name] = np.array(state[name])
+        state[name][:2] += np.sqrt(max(w[k], 0.0)) * u[:, k]
+    return state
+
+
+def _reader(name: str, now: float, share: float):
+    return lambda c: {name: now + share * float(c[0])}

@@ -1,0 +1,479 @@
+"""A mechanism that runs against what is fixed: windows through impacts.
+
+Joints are all that moves, and every so often a link touches a wall. Equations of motion
+without contact say nothing there. Windows are simulated instead, by a continuous plant:
+short ones about each touch, which show the contact's stiffness and dissipation, and
+some of the free motion between, which show friction and drives. A window begins before
+the touch, from a state that is smoothed on that side alone.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from makebreak.gap.data.findings import Finding
+from makebreak.gap.data.recording import FEWEST_ROWS, Episode, Recording, part_of
+from makebreak.gap.problem import Candidate, Fitted, Nuisances, SearchPlan
+from makebreak.gap.residuals.contact_problem import reader_of_trial
+from makebreak.gap.residuals.contact_shapes import ContactShapes, poses_of
+from makebreak.gap.residuals.mechanism import link_changes
+from makebreak.gap.residuals.objects import WindowedProblem
+from makebreak.gap.simulation.windows import Window, WindowModel, with_step
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.contact import CONTACT_LAW, DAMPER, DISSIPATION, STIFFNESS
+from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
+from makebreak.models.scene import Scene
+from makebreak.systems.numerics.smoother import smooth_filtered
+
+ROWS_BEFORE, ROWS_AFTER = 12, 12  # Of a window about a touch, beside the touch itself.
+LONGEST_SEC = 0.3  # Of a window.
+FREE_SEC, MOST_FREE, MOST_TOUCHES = 0.25, 6, 9
+AS_LONG = 0.8  # As the longest free windows; some are much shorter.
+LOOKS = 4000  # Rows at which it is first asked whether anything comes near.
+NEAR = 0.01  # [m]
+FEWEST = 3  # Touches.
+MOST_SHARE = 0.5  # Of the time, that may be spent in touch: else it lies there.
+BESIDE_SEC, LEAST_SEC = 0.1, 0.5  # About a touch; a stretch without one.
+DRAWS = 3  # Of uncertain starts.
+BLUR = 0.003  # Of how far a channel goes in a window: laws are no better.
+TRIED = (0.2, 0.4, 0.7, 0.9, 1.15, 1.7, 2.6, 4.5)  # Times what the scene has.
+DAMPED = (0.02, 0.06, 0.12, 0.25, 0.5, 1.0)  # Of critical damping: a linear damper's.
+SMALL = 0.2  # First trial of an effect on joints, of the efforts there.
+REACH = 3.0
+
+
+def runs_against(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
+    """Whether a link touches something fixed every now and then, as the scene has the
+    shapes; what belongs to the robot's own model does not count."""
+    return _met_walls(dynamics, recordings) is not None
+
+
+def _met_walls(
+    dynamics: SceneDynamics, recordings: Sequence[Recording]
+) -> ContactShapes | None:
+    """The shapes that run against each other every now and then; those of a robot's own
+    base only if no others do, as models overlap there. None: none do."""
+    for own in (False, True):
+        try:
+            shapes = walls_of(dynamics, own)
+        except ValueError:
+            return None
+        if shapes is not None and _now_and_then(dynamics, shapes, recordings):
+            return shapes
+    return None
+
+
+def without_contact(
+    dynamics: SceneDynamics, recordings: Sequence[Recording]
+) -> tuple[list[Recording], list[Finding]]:
+    """The recordings less the few times at which a link touches what is fixed, for
+    equations that know of no contact; and what was left out. All of them where nothing
+    touches, or so much that it is no touch."""
+    kept = list(recordings)
+    for own in (False, True):
+        try:
+            shapes = walls_of(dynamics, own)
+        except ValueError:
+            return kept, []
+        if shapes is None:
+            continue
+        parts = [_apart(dynamics, shapes, recording) for recording in recordings]
+        if all(part is None for part in parts) or any(
+            part is not None and not part[0] for part in parts
+        ):
+            continue
+        found = []
+        for k, part in enumerate(parts):
+            if part is None:
+                continue
+            episodes, seconds = part
+            name = recordings[k].name
+            kept[k] = part_of(recordings[k], episodes)
+            says = (
+                f"A link touches what is fixed now and then; {seconds:.2g} s about "
+                "that are left out: too few touches to judge contact by."
+            )
+            found.append(Finding("touches", name, "time", seconds, "s", "info", says))
+        return kept, found
+    return kept, []
+
+
+def _apart(dynamics: SceneDynamics, shapes, recording: Recording):
+    """Episodes without touches and how long the rest is; None: nothing touches; no
+    episodes where too much would be left out."""
+    q = positions(dynamics, recording)
+    episodes: list[Episode] = []
+    seconds, some = 0.0, False
+    for episode in recording.episodes:
+        time = recording.time[episode.rows]
+        near = nearest(shapes, dynamics, q[episode.rows]) < 0.0
+        some |= bool(near.any())
+        for k in np.flatnonzero(near):
+            near |= np.abs(time - time[k]) < BESIDE_SEC
+        edges = np.flatnonzero(np.diff(np.concatenate([[1], near, [1]]).astype(int)))
+        seconds += float(np.median(np.diff(time)) * near.sum())
+        for number, (a, b) in enumerate(zip(edges[::2], edges[1::2], strict=True)):
+            if b - a >= FEWEST_ROWS and time[b - 1] - time[a] >= LEAST_SEC:
+                first, last = episode.first + int(a), episode.first + int(b)
+                episodes.append(
+                    Episode(episode.number, first, last, episode.stretch + number)
+                )
+    if not some:
+        return None
+    return (
+        episodes if seconds < MOST_SHARE * recording.duration_sec() else []
+    ), seconds
+
+
+def _now_and_then(dynamics: SceneDynamics, shapes, recordings) -> bool:
+    touches, inside, whole = 0, 0, 0
+    for recording in recordings:
+        q = positions(dynamics, recording)
+        for episode in recording.episodes:
+            rows = np.arange(episode.first, episode.last)
+            whole += len(rows)
+            some = rows[:: max(len(rows) // LOOKS, 1)]
+            if not nearest(shapes, dynamics, q[some]).min(initial=np.inf) < NEAR:
+                continue
+            near = nearest(shapes, dynamics, q[rows]) < 0.0
+            touches += int(np.sum(np.diff(near.astype(int)) == 1))
+            inside += int(near.sum())
+    return touches >= FEWEST and inside < MOST_SHARE * whole
+
+
+def walls_of(dynamics: SceneDynamics, own: bool = False) -> ContactShapes | None:
+    """Shapes of links, and of what is fixed and, unless `own`, no part of a robot; None
+    if there are not both. Raises: ValueError as ContactShapes."""
+    plant = dynamics.plant
+    moving = {
+        plant.GetModelInstanceName(j.model_instance()) for j in one_dof_joints(plant)
+    }
+    shapes = ContactShapes(dynamics.loaded, hulls=False)
+
+    def counts(body: int) -> bool:
+        model = shapes.names[body].split(".")[0]
+        return own or body not in shapes.anchored or model not in moving
+
+    shapes.keep(counts)
+    sides = {s.body in shapes.anchored for s in shapes.surfaces}
+    return shapes if sides == {True, False} else None
+
+
+def positions(dynamics: SceneDynamics, recording: Recording) -> np.ndarray:
+    """(n, n_q) as measured, with lines over what is missing."""
+    plant = dynamics.plant
+    q = np.tile(
+        plant.GetPositions(plant.CreateDefaultContext()), (len(recording.time), 1)
+    )
+    for joint in one_dof_joints(plant):
+        name = f"{full_name(plant, joint)}.position"
+        if name in recording:
+            y = recording[name]
+            good = np.isfinite(y)
+            q[:, joint.position_start()] = np.interp(
+                recording.time, recording.time[good], y[good]
+            )
+    return q
+
+
+def nearest(shapes: ContactShapes, dynamics: SceneDynamics, q) -> np.ndarray:
+    """(n,) distance of the nearest pair."""
+    if not len(q):
+        return np.zeros(0)
+    slots = shapes.slots(poses_of(dynamics.plant, q, shapes), np.inf)
+    each = [
+        s.phi for s in slots if (s.a in shapes.anchored) != (s.b in shapes.anchored)
+    ]
+    return np.min(each, axis=0) if each else np.full(len(q), np.inf)
+
+
+class ImpactWindows(WindowModel):
+    """Windows about touches, and of free motion.
+
+    Raises: ValueError where there are fewer than FEWEST touches.
+    """
+
+    def __init__(self, scene: Scene, recordings: Sequence[Recording]):
+        scene = with_step(scene, 0.0)
+        self.shapes = _met_walls(SceneDynamics(scene), recordings)
+        if self.shapes is None:
+            raise ValueError("nothing fixed that a link touches now and then")
+        self._touches = 0
+        self._touch_sec: list[float] = []  # How long each lasts.
+        self._free: list[Window] = []
+        super().__init__(scene, recordings, LONGEST_SEC, most=10**6)
+        if self._touches < FEWEST:
+            raise ValueError(f"{self._touches} touches, expected {FEWEST} or more")
+        both = []
+        touching = [w for w in self.windows if w not in self._free]
+        for some, most in ((touching, MOST_TOUCHES), (self._longest(), MOST_FREE)):
+            keep = np.unique(np.linspace(0, len(some) - 1, most).astype(int))
+            # Every third is held out, of each sort.
+            both += [
+                replace(some[k], train=i % 3 != 1)
+                for i, k in enumerate(keep if some else [])
+            ]
+        self.windows = both
+        self.window_sec = float(np.median([
+            np.ptp(self.recordings[w.recording].time[w.rows]) for w in both
+        ]))  # fmt: skip
+        self._add_spread()
+
+    def _cut(self, i, recording: Recording, episode: Episode, hop, block, number):
+        assert self.shapes is not None
+        time = recording.time[episode.rows]
+        if len(time) < 3 * ROWS_BEFORE:
+            return
+        q = positions(self.dynamics, recording)[episode.rows]
+        near = nearest(self.shapes, self.dynamics, q) < 0.0
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], near, [0]]).astype(int)))
+        touches = list(zip(edges[::2], edges[1::2], strict=True))
+        # Free stretches, and the states in them: a smoother across a touch blurs both.
+        names = self._signals()
+        paths = {name: np.zeros((len(time), 3)) for name in names}
+        spread = {name: np.zeros((len(time), 3, 3)) for name in names}
+        free = []
+        starts = [0, *(t[1] for t in touches)]
+        ends = [*(t[0] for t in touches), len(time)]
+        for a, b in zip(starts, ends, strict=True):
+            if b - a < ROWS_BEFORE:
+                continue
+            free.append((a, b))
+            for name in names:
+                y = recording[name][episode.rows][a:b]
+                if np.isfinite(y).sum() < 8:
+                    return
+                channel = recording.channels[name]
+                s = smooth_filtered(time[a:b], y, channel.noise, channel.stages or ())
+                paths[name][a:b], spread[name][a:b] = s.x, s.P
+        self._paths[i, episode.first] = {"time": time, **paths}
+        commands = [recording.held(c.name)[episode.rows] for c in recording.commands()]
+
+        def window(k: int, end: int) -> Window | None:
+            if end - k < 8 or not all(np.isfinite(u[k]) for u in commands):
+                return None
+            state = {n: x[k] for n, x in paths.items()}
+            std = np.tile(self.noise, (end - k, 1))
+            return Window(
+                i, episode.number, float(time[k]),
+                slice(episode.first + k, episode.first + end), state, std, True,
+                {n: P[k, :2, :2] for n, P in spread.items()},
+            )  # fmt: skip
+
+        for a, b in touches:
+            self._touch_sec.append(float(time[min(b, len(time) - 1)] - time[a]))
+            before = [s for s in free if s[1] == a]
+            if not before or a - before[0][0] < ROWS_BEFORE:
+                continue
+            k = a - ROWS_BEFORE
+            last = int(np.searchsorted(time, time[k] + LONGEST_SEC, "right"))
+            after = next((t[0] for t in touches if t[0] > a), len(time))
+            found = window(k, min(b + ROWS_AFTER, last, after, len(time)))
+            if found is not None:
+                self._touches += 1
+                self.windows.append(found)
+        for a, b in free:
+            # What bounces to and fro is free for less: the whole of each way then.
+            start, last = a + 3, b - 3
+            while last - start >= ROWS_BEFORE:
+                end = int(np.searchsorted(time, time[start] + FREE_SEC, "right"))
+                found = window(start, min(end, last))
+                if found is not None:
+                    self.windows.append(found)
+                    self._free.append(found)
+                start = end
+
+    def _longest(self) -> list[Window]:
+        """Free windows that are about as long as the longest few: friction and drives
+        show in them by the square of the time."""
+        rows = [w.rows.stop - w.rows.start for w in self._free]
+        least = AS_LONG * min(sorted(rows)[-MOST_FREE:], default=0)
+        return [w for w, n in zip(self._free, rows, strict=True) if n >= least]
+
+    def _add_spread(self) -> None:
+        """Noise, what uncertain starts do in the scene as it is, and BLUR."""
+        rng = np.random.default_rng(0)
+        plain, kept = self.simulate(()), self.windows
+        wide = [np.zeros_like(y) for y in plain]
+        try:
+            for _ in range(DRAWS):
+                self.windows = [drawn(w, rng) for w in kept]
+                for total, y, y0 in zip(wide, self.simulate(()), plain, strict=True):
+                    off = (y - y0) ** 2
+                    total += np.where(np.isfinite(off), off, 1.0) / DRAWS
+        finally:
+            self.windows = kept
+        self.windows = [
+            replace(w, std=np.sqrt(w.std**2 + v + (BLUR * np.ptp(y, axis=0)) ** 2))
+            for w, v, y in zip(self.windows, wide, plain, strict=True)
+        ]
+
+
+def drawn(w: Window, rng) -> Window:
+    """The window from another start that its measurements allow."""
+    state = {}
+    for name, x in w.state.items():
+        values, u = np.linalg.eigh(w.spread[name])
+        state[name] = np.array(x)
+        state[name][:2] += u @ (np.sqrt(np.maximum(values, 0.0)) * rng.normal(size=2))
+    return replace(w, state=state)
+
+
+class ImpactProblem(ImpactWindows, WindowedProblem):
+    """A mechanism that runs against walls, as a problem for the search."""
+
+    _names: tuple[str, ...] | None = None  # Of the nuisances.
+
+    plan = SearchPlan(
+        evaluations=10, diff_step=0.01, least_gain=0.05, most_effects=4, shortlist=8
+    )
+
+    def _model(self) -> WindowModel:
+        return self
+
+    def _again(self, recordings: Sequence[Recording]) -> WindowModel:
+        return ImpactWindows(self.scene, recordings)
+
+    def nuisances(self) -> Nuisances:
+        """The links' masses and centres, and contact stiffness and dissipation as far
+        as the scene's `tolerance` says."""
+        columns, prior, names = [], [], []
+        changes = list(link_changes(self.dynamics, self.scene))
+        for kind in CONTACT_LAW:
+            share = float(self.scene.tolerance.get(kind, 0.0))
+            for at in self._pairs() if share > 0.0 else ():
+                ((name, now),) = self.dynamics.now(kind, [at]).items()
+                step = min(0.3 * share, 0.2) * now
+                changes.append(
+                    (f"{kind} of {at}", Effect(kind, [at], {name: now + step}), step)
+                )
+        for name, effect, size in changes:
+            moved = self._try((), effect)
+            if moved is None:
+                continue
+            column = (self.base() - moved) / size
+            if np.abs(column).max() * size > 1e-2:
+                columns.append(column)
+                prior.append(self._tolerance(name, effect, size))
+                names.append(name)
+        self._names = tuple(names)
+        if not columns:
+            return Nuisances.none(len(self.base()))
+        return Nuisances(np.stack(columns, 1), np.array(prior), self._names, REACH)
+
+    def replaced(self, effects: Sequence[Effect]) -> np.ndarray | None:
+        """The dissipation of a contact that a linear damper damps."""
+        names = {f"{DISSIPATION} of {at}" for e in effects for at in e.at
+                 if e.kind == DAMPER}  # fmt: skip
+        if not names:
+            return None
+        return np.array([name in names for name in self._named()])
+
+    def _named(self) -> tuple[str, ...]:
+        if self._names is None:
+            self._names = self.nuisances().names
+        return self._names
+
+    def _tolerance(self, name: str, effect: Effect, size: float) -> float:
+        if not effect.kind.startswith("contact_"):
+            return size
+        ((_, now),) = self.dynamics.now(effect.kind, effect.at).items()
+        return float(self.scene.tolerance[effect.kind]) * now
+
+    def _pairs(self) -> list[str]:
+        """Links and walls that come near each other."""
+        assert self.shapes is not None
+        found = {}
+        for recording in self.recordings:
+            q = positions(self.dynamics, recording)
+            q = q[:: max(len(q) // LOOKS, 1)]
+            poses = poses_of(self.dynamics.plant, q, self.shapes)
+            for s in self.shapes.slots(poses, NEAR):
+                if (s.a in self.shapes.anchored) != (s.b in self.shapes.anchored):
+                    a, b = (s.a, s.b) if s.b in self.shapes.anchored else (s.b, s.a)
+                    found[f"{self.shapes.names[a]}~{self.shapes.names[b]}"] = True
+        return list(found)
+
+    def _try(self, there: Sequence[Effect], effect: Effect) -> np.ndarray | None:
+        try:
+            return self.residual([*there, effect])
+        except (ValueError, RuntimeError):
+            return None
+
+    def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
+        found = []
+        taken = {(e.kind, at) for e in current.effects for at in e.at}
+        for kind, at, name, trials in [*self._of_contacts(), *self._of_joints()]:
+            if (kind, at) in taken:
+                continue
+            columns, readers = [], []
+            for step, value in trials:
+                trial = [(step, {name: value})]
+                moved = self._try(current.effects, Effect(kind, [at], {name: value}))
+                if moved is None or not np.abs(current.r - moved).max() > 1e-3:
+                    continue
+                columns.append(((current.r - moved) / step)[:, None])
+                readers.append(reader_of_trial(kind, (name,), trial))
+            if columns:
+                least = self.dynamics.least(kind, [at])
+                found.append(
+                    Candidate(
+                        kind, (at,), 1, tuple(columns), tuple(readers), least=least
+                    )
+                )
+        return found
+
+    def _of_contacts(self):
+        for at in self._pairs():
+            for kind in CONTACT_LAW:
+                try:
+                    ((name, now),) = self.dynamics.now(kind, [at]).items()
+                except ValueError:
+                    continue
+                trials = [((f - 1.0) * now, f * now) for f in TRIED]
+                if now > 0.0:
+                    yield kind, at, name, trials
+            try:
+                stiffness = self.dynamics.now(STIFFNESS, [at])["stiffness"]
+            except ValueError:
+                continue
+            # A mass m on a spring k touches for pi sqrt(m/k).
+            critical = 2.0 * stiffness * float(np.median(self._touch_sec)) / np.pi
+            values = [share * critical for share in DAMPED]
+            yield DAMPER, at, "damping", [(c, c) for c in values]
+
+    def _of_joints(self):
+        """Kinds with one parameter, at each joint."""
+        dynamics, plant = self.dynamics, self.dynamics.plant
+        M = np.diag(plant.CalcMassMatrix(plant.CreateDefaultContext()))
+        for joint in one_dof_joints(plant):
+            at, i = full_name(plant, joint), joint.velocity_start()
+            path = [
+                p[f"{at}.position"]
+                for p in self._paths.values()
+                if f"{at}.position" in p
+            ]
+            if not path:
+                continue
+            x = np.concatenate(path)
+            speed = float(np.sqrt(np.mean(x[:, 1] ** 2))) or 1e-3
+            effort = float(M[i] * np.median(np.abs(x[:, 2]))) or 1e-3
+            for kind, entry in KINDS.items():
+                if entry.at not in ("joint", "actuator") or len(entry.parameters) != 1:
+                    continue
+                if at not in dynamics.places(kind) or entry.hidden_state:
+                    continue
+                (p,) = entry.parameters
+                now = dynamics.now(kind, [at]).get(p.name, 0.0)
+                step = {
+                    "N m": SMALL * effort,
+                    "N m s/rad": SMALL * effort / speed,
+                    "N m s2/rad2": SMALL * effort / speed**2,
+                    "kg m2": 0.1 * float(M[i]),
+                    "s": 0.002,
+                    "": 0.05,
+                }.get(p.unit)
+                if step is not None and abs(now) < 1e20:
+                    yield kind, at, p.name, [(step, now + step)]

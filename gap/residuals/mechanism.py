@@ -1,0 +1,485 @@
+"""A mechanism whose joints are measured, as a problem for the search."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from makebreak.gap.data.findings import Finding
+from makebreak.gap.data.recording import Recording
+from makebreak.gap.numerics.selection import Screen, is_predicted
+from makebreak.gap.problem import (
+    Candidate,
+    Fitted,
+    GapProblem,
+    Nuisances,
+    Outcome,
+    SearchPlan,
+    rms,
+    share_left,
+)
+from makebreak.gap.residuals.inverse import InverseModel
+from makebreak.gap.residuals.pushes import ROBUST, Push, find_pushes
+from makebreak.gap.result import Where
+from makebreak.gap.search.screen import (
+    LINK_COM,
+    LINK_MASS,
+    candidates,
+    inseparable,
+    nuisances,
+    rich_columns,
+)
+from makebreak.gap.search.where import unexplained, where_in_motion
+from makebreak.gap.simulation.measure import measure
+from makebreak.gap.simulation.windows import Window
+from makebreak.gap.verdict import UNNAMED
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect, find_body, sliding_joints
+from makebreak.models.scene import Scene
+
+# Below this over the sensors' noise a rich model leaves what noise may: models are
+# right. A weight is changed where it would become less by this share.
+MISFIT, LESS = 1.3, 0.8
+AT_REST = 2.0  # Times the least uncertainty: rows with more are of joints at rest.
+RICH_PRIOR = 10.0  # Times a nuisance's tolerance, in a rich model.
+# What is left of a measured effort is noise where less than this share of it repeats,
+# and no block of time has so many times the usual power.
+REPEATS, EVENT = 0.1, 10.0
+MOST_WANDER = 5.0  # Times a sample's noise: more is no sensor's.
+HALF = 0.5  # Of a channel's power: what one effect more must explain to be a law of it.
+# A rich model is fitted without what it leaves more than TRIM_Z of beside the usual, at
+# most such a share of all, until that stays the same.
+TRIMS, TRIMMED, TRIM_Z = 8, 0.3, 4.0
+UNWEIGHTED = 10.0  # Times what a push left, as its rows' noise.
+LAGS = 9  # Test functions over which errors may go together (0.9 s).
+OVERLAP = 1.3  # What neighbouring test functions share of white noise.
+
+
+class MechanismProblem(InverseModel, GapProblem):
+    """Equations of motion of all joints, and other channels beside them."""
+
+    def __init__(self, scene: Scene, recordings: Sequence[Recording]):
+        super().__init__(scene, recordings)
+        self.plan = SearchPlan(evaluations=25, most_effects=6, by_channel=True)
+        self._found: list[Candidate] | None = None
+        self._nuisances: Nuisances | None = None
+        # Stretches in which something else moved it: they have next to no weight.
+        self.pushes: list[Push] = []
+        self._learn_misfit()
+
+    # ----- What models are off by
+
+    def _learn_misfit(self) -> None:
+        """What a model with friction, rotors, gains, biases, loads and delays of all
+        joints leaves is what models are off by: no fit is believed beyond that."""
+        held = ~self.train()
+        if not held.any() or held.all():
+            return
+        n = self.nuisances()
+        plain = Screen(self.base(), n.columns, n.prior, self.train(), reach=n.reach)
+        left = plain.settle(self.base())[1]
+        if self.noise_error(left) < MISFIT:
+            return
+        self._found = candidates(self, n, left)
+        for _ in range(5):
+            n = self.nuisances()
+            rich = rich_columns(self, self._found)
+            prior = RICH_PRIOR * n.prior
+            screen = Screen(self.base(), n.columns, prior, self.train())
+            fit = screen.fit(rich)
+            left = self.base() - rich @ fit.c - n.columns @ fit.b
+            unbent = self._unbent(rich, n, prior)
+            pushes = self._pushes_in(unbent)
+            if len(pushes) > len(self.pushes):
+                self._set_pushes(pushes, unbent)
+                continue  # What they bent is fitted again.
+            error = self._misfit(left)
+            # A rich model may do worse than none, where noise is all that is left; and
+            # what one more effect of the catalogue explains is nothing models lack.
+            others = [self._settled(self.base()), self._with_best(left, rich)]
+            for other in map(self._misfit, others):
+                error = {w: np.minimum(error[w], other[w]) for w in error}
+            old = self.model_error
+            if all(np.allclose(error[w], old[w], rtol=0.1, atol=1e-12) for w in error):
+                break
+            self._set(error)
+        self.correlation = self._correlation(left)
+
+    def _settled(self, r: np.ndarray) -> np.ndarray:
+        """What the nuisances leave of r (m,), free within their limits."""
+        n = self.nuisances()
+        return Screen(r, n.columns, n.prior, self.train(), reach=n.reach).settle(r)[1]
+
+    def _with_best(self, left: np.ndarray, rich: np.ndarray) -> np.ndarray:
+        """What a rich model and one candidate more leave of rows (m,): of each channel
+        with the candidate that fits its training rows best, if that takes half of it.
+        rich (m, p)."""
+        t, channel = self.train(), self.channel_of_rows()
+        size = np.linalg.norm(rich[t], axis=0)
+        rich = rich[:, size > 0.0] / size[size > 0.0]
+        back = np.linalg.pinv(rich[t], rcond=1e-8)
+        out = np.array(left)
+        rows = [np.flatnonzero(channel == k) for k in range(len(self.names()))]
+        fitted = [mine[t[mine]] for mine in rows]
+        least = [HALF * float(left[some] @ left[some]) for some in fitted]
+        # A gain is in the rich model, of what the model needs. Beside that a gain of
+        # the measured effort would cancel all, also what models are off by.
+        found = [c for c in self._found or () if KINDS[c.kind].path != "gain"]
+        for X in (x for c in found for x in c.columns):
+            beside = X - rich @ (back @ X[t])
+            size = np.linalg.norm(beside[t], axis=0)
+            beside = beside[:, size > 1e-6 * np.linalg.norm(X[t], axis=0)]
+            if not beside.shape[1]:
+                continue
+            r = left - beside @ np.linalg.lstsq(beside[t], left[t], rcond=1e-8)[0]
+            for k, some in enumerate(fitted):
+                power = float(r[some] @ r[some])
+                if power < least[k]:
+                    least[k], out[rows[k]] = power, r[rows[k]]
+        return out
+
+    def _unbent(self, rich: np.ndarray, n: Nuisances, prior) -> np.ndarray:
+        """What a rich model leaves (m,) that was fitted without the test functions that
+        it explains least: least trimmed squares, so that what acts for a short while
+        bends nothing."""
+        k, joints = len(self.names()), len(self.joints)
+        noise = np.median(self.noise_in_units()[:, :joints], axis=0)
+        whole = self.train()
+        train, left = whole, self.base()
+        for _ in range(TRIMS):
+            fit = Screen(self.base(), n.columns, prior, train).fit(rich)
+            left = self.base() - rich @ fit.c - n.columns @ fit.b
+            units = np.abs(self.in_units(left)[:, :joints])
+            z = (units / np.maximum(ROBUST * np.median(units, axis=0), noise)).max(1)
+            most = np.quantile(z, 1.0 - TRIMMED)
+            kept = np.repeat(z <= max(most, TRIM_Z), k) & whole
+            if (kept == train).all():
+                break
+            train = kept
+        return left
+
+    def _pushes_in(self, left: np.ndarray) -> list[Push]:
+        n = len(self.joints)
+        units, noise = self.in_units(left)[:, :n], self.noise_in_units()[:, :n]
+        known = [row for push in self.pushes for row in push.rows]
+        units[known], noise[known] = 0.0, np.median(noise, axis=0)
+        found = find_pushes(self.tracks, self.joints, units, noise, self._needed_rms())
+        return [*self.pushes, *found] if found else self.pushes
+
+    def _needed_rms(self) -> np.ndarray:
+        """(n_joints,) of the efforts that the scene as it came needs [N m]."""
+        efforts = np.concatenate([m.effort for m in self.needed_motions()])
+        return np.sqrt(np.mean(efforts**2, axis=0))
+
+    def _is_pushed(self, window: Window) -> bool:
+        name = self.recordings[window.recording].name
+        end = self.recordings[window.recording].time[window.rows][-1]
+        return any(
+            (push.recording, push.episode) == (name, window.episode)
+            and window.start < push.end and end > push.start
+            for push in self.pushes
+        )  # fmt: skip
+
+    def _set_pushes(self, pushes: list[Push], left: np.ndarray) -> None:
+        """What nothing explains while something else moves it counts as its noise, at
+        all joints: where a push sets in, none moves as smoothly as it is taken to."""
+        units = self.in_units(left)[:, : len(self.joints)]
+        more = np.zeros_like(units)
+        for push in pushes[len(self.pushes) :]:
+            rows = list(push.rows)
+            size = np.sqrt(np.mean(units[rows] ** 2, axis=0))
+            more[rows] = UNWEIGHTED * np.maximum(size, self._needed_rms())
+        self.pushes = pushes
+        self._set(self.model_error, more)
+
+    def push_findings(self) -> list[Finding]:
+        sliding = sliding_joints(self.dynamics.plant)
+        found = []
+        for push in self.pushes:
+            each = [
+                f"{effort:.3g} {'N' if joint in sliding else 'N m'} at {joint}"
+                for joint, effort in push.efforts
+            ]
+            joint, effort = push.efforts[0]
+            unit = "N" if joint in sliding else "N m"
+            says = (
+                f"From {push.start:.3g} to {push.end:.3g} s something that comes back "
+                f"nowhere else moved the robot, as a person's push would (rms: "
+                f"{', '.join(each)}); these {push.end - push.start:.2g} s have next to "
+                "no weight, and no effect is named for them."
+            )
+            found.append(
+                Finding("push", push.recording, joint, effort, unit, "warning", says)
+            )
+        return found
+
+    def _misfit(self, left: np.ndarray) -> dict[str, np.ndarray]:
+        """What held-out rows (m,) are off by beside noise: robust, of each channel."""
+        held = (~self.train()).reshape(-1, len(self.names()))[:, 0]
+        held[[row for push in self.pushes for row in push.rows]] = False
+        if not held.any():
+            return self.model_error
+        off, noise = self.in_units(left)[held], self.noise_in_units()[held]
+        # A joint at rest may be held by anything: its rows say nothing of models.
+        usual = noise <= AT_REST * np.quantile(noise, 0.1, axis=0)
+        error = {w: np.zeros(len(self.joints)) for w in self.model_error}
+        for k, (what, joint) in enumerate(self.names()):
+            mine = usual[:, k]
+            beside = beyond_noise(off[mine, k], noise[mine, k])
+            error[what][self.joints.index(joint)] = beside
+        return error
+
+    def _correlation(self, left: np.ndarray) -> float:
+        """Root of how many neighbouring rows err together, where models are off."""
+        k = len(self.names())
+        off = np.array([self.model_error[w][self.joints.index(j)] for w, j in
+                        self.names()]) > 0.0  # fmt: skip
+        if not off.any():
+            return 1.0
+        r = left.reshape(-1, k)[:, off]
+        block = self.blocks().reshape(-1, k)[:, 0]
+        held = (~self.train()).reshape(-1, k)[:, 0]
+        sums, counts = np.zeros(LAGS + 1), np.zeros(LAGS + 1)
+        for number in np.unique(block[held]):
+            x = r[block == number]
+            x = x / np.maximum(np.sqrt(np.mean(r[held] ** 2, axis=0)), 1e-12)
+            for lag in range(min(LAGS + 1, len(x))):
+                sums[lag] += np.sum(x[lag:] * x[: len(x) - lag])
+                counts[lag] += x[lag:].size
+        rho = sums / np.maximum(counts, 1) / max(sums[0] / max(counts[0], 1), 1e-12)
+        ends = np.flatnonzero(rho <= 0.0)
+        last = int(ends[0]) if len(ends) else LAGS + 1
+        return float(np.sqrt(max((1.0 + 2.0 * rho[1:last].sum()) / OVERLAP, 1.0)))
+
+    def _set(self, error: dict[str, np.ndarray], more=None) -> None:
+        to_new = self.allow(error, more)
+        if self._found is not None:
+            self._found = [_moved(c, to_new) for c in self._found]
+        if self._nuisances is not None:
+            n = self._nuisances
+            self._nuisances = replace(n, columns=to_new(n.columns))
+
+    def reweigh(self, left: np.ndarray) -> bool:
+        error = self._misfit(left)
+        old = self.model_error
+        less = {w: np.minimum(error[w], old[w]) for w in old}
+        if all((less[w] >= LESS * old[w]).all() for w in old):
+            return False
+        self._set(less)
+        return True
+
+    # ----- The search
+
+    def nuisances(self) -> Nuisances:
+        if self._nuisances is None:
+            self._nuisances = nuisances(self)
+        return self._nuisances
+
+    def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
+        if self._found is None:
+            self._found = candidates(self, nuisances, current.left)
+        return self._found
+
+    def error(self, fitted: Fitted) -> float:
+        # Which blocks are held out is by the clock: some hold next to nothing of it.
+        rows = self.in_noise(fitted.left)
+        wanders = self.wandering(fitted.r)
+        for k in np.flatnonzero(wanders > 0.0):
+            mine = self.channel_of_rows() == k
+            rows[mine] /= max(rms(rows[mine]), 1.0)
+        held = rows[~self.train()] if not self.train().all() else rows
+        return float(np.sqrt(max(np.mean(held**2), np.mean(rows**2))))
+
+    def closed(self, start: Fitted, end: Fitted) -> float:
+        # All joints together would say little where one of them has a measured effort
+        # that nothing explains: what is closed of another does not show beside that.
+        held = ~self.train()
+        each = [super().closed(start, end)]
+        for k, (what, _) in enumerate(self.names()):
+            mine = held & (self.channel_of_rows() == k)
+            if what == "effort" and mine.any():
+                before, after = (
+                    rms(self.in_noise(fitted.left)[mine]) for fitted in (start, end)
+                )
+                if before > UNNAMED:
+                    each.append(1.0 - share_left(before, after))
+        return max(each)
+
+    def wandering(self, r: np.ndarray) -> np.ndarray:
+        """(n_names,) what rows (m,), before the nuisances, leave of an effort that is
+        measured, in its unit [N m], where that is no gap but noise that goes together
+        over a while: nothing of it is told by where the joint is, how it moves and what
+        it needs, and it is there all the time. 0 for all other channels."""
+        names = self.names()
+        found = np.zeros(len(names))
+        left = self._settled(r)
+        rows = self.in_noise(left).reshape(-1, len(names))
+        off, noise = self.in_units(left), self.noise_in_units()
+        block = self.blocks().reshape(-1, len(names))[:, 0]
+        state = None
+        for k, (what, joint) in enumerate(names):
+            i = self.joints.index(joint)
+            loud = rms(rows[:, k]) > MISFIT
+            if what != "effort" or not self.by_measured[i] or not loud:
+                continue
+            mine = noise[:, k] <= AT_REST * np.quantile(noise[:, k], 0.1)
+            y = off[mine, k]
+            if rms(y) > MOST_WANDER * self._sample_noise(f"{joint}.effort_measured"):
+                continue
+            power = [np.mean(y[block[mine] == b] ** 2) for b in np.unique(block[mine])]
+            if max(power) > EVENT * np.median(power):
+                continue  # Something happened, once.
+            state = self._mean_motion() if state is None else state
+            X = features_of(i, *state)[mine]
+            if not is_predicted(y, X, block[mine], REPEATS):
+                found[k] = rms(y)
+        return found
+
+    def _sample_noise(self, channel: str) -> float:
+        """Of one sample, before means over many were taken."""
+        every = [r.channels[channel] for r in self.recordings]
+        return max(c.noise * np.sqrt(c.averaged) for c in every)
+
+    def _mean_motion(self) -> list[np.ndarray]:
+        """q, v, vd, effort needed and sign of v, each (n_bumps, n_v), over bumps."""
+        parts = []
+        for track, motion in zip(self.tracks, self.needed_motions(), strict=True):
+            signals = (motion.q, motion.v, motion.vd, motion.effort, np.sign(motion.v))
+            parts.append([track.bumps.mean(x) for x in signals])
+        return [np.concatenate(x) for x in zip(*parts, strict=True)]
+
+    def judged(self) -> dict[str, str]:
+        how = {}
+        for i, joint in enumerate(self.joints):
+            how[f"{joint}.position"] = "equations and simulation"
+            if self.has["velocity"][i]:
+                how[f"{joint}.velocity"] = "equations and simulation"
+            if self.has["effort_measured"][i]:
+                how[f"{joint}.effort_measured"] = "equations"
+        return how
+
+    def nuisance_effects(self, nuisances: Nuisances, b: np.ndarray) -> list[Effect]:
+        return moved_links(self, nuisances, b)
+
+    def parts(self) -> np.ndarray:
+        k = len(self.names())
+        names = [r.name for r in self.recordings]
+        return np.concatenate(
+            [np.full(len(t.bumps.centre) * k, names.index(t.recording))
+             for t in self.tracks]
+        )  # fmt: skip
+
+    def inseparable(self, effect: Effect) -> Effect | None:
+        return inseparable(effect, self)
+
+    def is_one_place(self, one: Sequence[str], other: Sequence[str]) -> bool:
+        plant = self.dynamics.plant
+        try:
+            a, b = (
+                find_body(Effect("", list(at), {}), plant, at[0]) for at in (one, other)
+            )
+        except ValueError:
+            return False
+        return b.index() in {body.index() for body in plant.GetBodiesWeldedTo(a)}
+
+    # ----- What it comes to
+
+    def where(self, left: np.ndarray) -> list[Where]:
+        return where_in_motion(self, self.in_noise(left))
+
+    def outcome(
+        self, effects, start: Fitted, end: Fitted, nuisances: Nuisances,
+        recordings=None, jobs: int = 1,
+    ) -> Outcome | None:  # fmt: skip
+        if recordings is not None:
+            try:
+                model = InverseModel(self.scene, recordings)
+            except ValueError:  # No episode is long enough.
+                return None
+        elif self.train().all():
+            return None
+        else:
+            model = self
+        moved = moved_links(self, nuisances, end.b)
+        measured = measure(
+            self.scene, effects, moved, model, model is not self, jobs,
+            self._is_pushed if model is self else lambda window: False,
+        )  # fmt: skip
+        if measured is None:  # In every window something pushes.
+            return None
+        rest = unexplained(self, self.in_noise(end.left))
+        return Outcome(*measured, rest)
+
+
+def beyond_noise(off: np.ndarray, noise: np.ndarray) -> float:
+    """What rows (m,) are off by beside their noise (m,), robust; 0 where noise may
+    leave as much."""
+    size, times = (ROBUST * np.median(np.abs(x)) for x in (off, off / noise))
+    return float(size * np.sqrt(1.0 - 1.0 / times**2)) if times > MISFIT else 0.0
+
+
+def features_of(i: int, q, v, vd, effort, sign) -> np.ndarray:
+    """(m, k) of what an effect on joint i could go with: its place, speed and effort,
+    and how all joints move; all arguments (m, n_v)."""
+    own = [
+        sign[:, i], np.abs(v[:, i]), v[:, i] * np.abs(v[:, i]), effort[:, i],
+        sign[:, i] * np.abs(effort[:, i]), sign[:, i] * np.exp(-np.abs(v[:, i]) / 0.1),
+        q[:, i] ** 2, *(f(n * q[:, i]) for n in (1, 2) for f in (np.sin, np.cos)),
+    ]  # fmt: skip
+    return np.column_stack([*own, q, v, vd])
+
+
+def _moved(candidate: Candidate, to_new) -> Candidate:
+    return replace(
+        candidate,
+        columns=tuple(to_new(x) for x in candidate.columns),
+        members=tuple(_moved(m, to_new) for m in candidate.members),
+    )
+
+
+def link_changes(dynamics: SceneDynamics, scene: Scene):
+    """(name, effect, size) of each nuisance of the links: the mass, or a coordinate of
+    the centre of mass, moved by `size`, which is its tolerance."""
+    said = scene.tolerance
+    share = float(said.get("link_mass", LINK_MASS))
+    reach = float(said.get("link_com_m", LINK_COM))
+    links = [
+        (at, mass)
+        for at in dynamics.places("link_mass")
+        if (mass := dynamics.now("object_mass", [at])["mass"]) > 0.0
+    ]
+    for at, mass in links:
+        size = share * mass
+        effect = Effect("object_mass", [at], {"mass": mass + size})
+        yield f"object_mass of {at}, mass", effect, size
+    for at, _ in links:
+        com = dynamics.now("object_com", [at])
+        for axis in "xyz":
+            effect = Effect("object_com", [at], {**com, axis: com[axis] + reach})
+            yield f"object_com of {at}, {axis}", effect, reach
+
+
+def moved_links(model: Any, nuisances: Nuisances, values) -> list[Effect]:
+    """The links as the nuisances (n_b,) have them, as effects of a scene."""
+    masses: dict[str, float] = {}
+    shifts: dict[str, np.ndarray] = {}
+    for name, b in zip(nuisances.names, values, strict=True):
+        kind, rest = name.split(" of ", 1)
+        if kind not in ("object_mass", "object_com"):  # No part of the scene.
+            continue
+        at, unknown = rest.rsplit(", ", 1)
+        if kind == "object_mass":
+            masses[at] = float(b)
+        else:
+            shifts.setdefault(at, np.zeros(3))["xyz".index(unknown[0])] = b
+    out = []
+    for at, change in masses.items():
+        now = model.dynamics.now("object_mass", [at])["mass"]
+        out.append(Effect("object_mass", [at], {"mass": max(now + change, 0.1 * now)}))
+    for at, shift in shifts.items():
+        com = model.dynamics.now("object_com", [at])
+        there = {k: com[k] + float(d) for k, d in zip("xyz", shift, strict=True)}
+        out.append(Effect("object_com", [at], there))
+    return out

@@ -1,0 +1,218 @@
+"""Scenes with free bodies, as problems for the search: touches, flights, rollouts."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from makebreak.gap.data.recording import Recording
+from makebreak.gap.problem import (
+    DISTANCES,
+    Candidate,
+    Fitted,
+    GapProblem,
+    Nuisances,
+    Outcome,
+    SearchPlan,
+)
+from makebreak.gap.residuals.contact import contact_candidates, contact_nuisances
+from makebreak.gap.residuals.touch import TouchModel, touch_candidates
+from makebreak.gap.result import Unexplained, Where
+from makebreak.gap.search.where import where_in_windows
+from makebreak.gap.simulation.free_windows import FreeBodyModel
+from makebreak.gap.simulation.measure import gap_measure, series_of
+from makebreak.gap.simulation.windows import WindowModel
+from makebreak.models.scene import Scene
+
+# A real object differs from its model in more ways than a mechanism.
+MOST_EFFECTS = 6
+# Windows of scenes that Drake has to simulate: length, and how many at most.
+DRAKE_SEC, DRAKE_MOST = 0.3, 16
+
+
+# What distances are computed from.
+COMPARED = ("position", "x", "y", "z", "qw", "qx", "qy", "qz", "fx", "fy", "fz")
+
+
+class TouchProblem(TouchModel, GapProblem):
+    """A measured mechanism, and a wrench that tells when it touches an object."""
+
+    # Two explanations that both leave less than the allowance for shapes are a tie.
+    plan = SearchPlan(least_error=1.0)
+
+    def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
+        return touch_candidates(self)
+
+    def judged(self) -> dict[str, str]:
+        """That shapes meet says nothing of how anything moves."""
+        things = {touch.thing for touch in self.touches}
+        tools = {touch.tool for touch in self.touches}
+        return {
+            c.name: DISTANCES
+            for r in self.recordings
+            for c in r.measured()
+            if c.quantity in COMPARED
+            and (c.at in things or c.at in tools or c.at in self.joints)
+        }
+
+    def outcome(
+        self, effects, start: Fitted, end: Fitted, nuisances: Nuisances,
+        recordings=None, jobs: int = 1,
+    ) -> Outcome | None:  # fmt: skip
+        if recordings is None:
+            held = ~self.train()
+            if not held.any():
+                return None
+            gap = self.measure(start.left, end.left, held)
+            return Outcome(gap, self.series(start.left, end.left))
+        try:
+            other = TouchModel(self.scene, recordings)
+        except ValueError:  # Nothing is touched in them.
+            return None
+        there = other.nuisances()
+        left = []
+        for of, fitted in (((), start), (effects, end)):
+            known = dict(zip(nuisances.names, fitted.b, strict=True))
+            b = np.array([known.get(name, 0.0) for name in there.names])
+            left.append(other.residual(of) - there.columns @ b)
+        before, after = left
+        gap = other.measure(before, after, np.ones(len(before), bool))
+        return Outcome(gap, other.series(before, after))
+
+
+class WindowedProblem(GapProblem):
+    """What problems of simulated windows share."""
+
+    def nuisances(self) -> Nuisances:
+        return contact_nuisances(self._model())
+
+    def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
+        return contact_candidates(self._model(), current.effects, current.r)
+
+    def judged(self) -> dict[str, str]:
+        return dict.fromkeys(self._model().channels, "simulation")
+
+    def where(self, left: np.ndarray) -> list[Where]:
+        model = self._model()
+        return where_in_windows(model, model.errors(model.simulate(())))
+
+    def outcome(
+        self, effects, start: Fitted, end: Fitted, nuisances: Nuisances,
+        recordings=None, jobs: int = 1,
+    ) -> Outcome | None:  # fmt: skip
+        model = self._model()
+        held = [not w.train for w in model.windows]
+        if recordings is not None:
+            try:
+                model = self._again(recordings)
+            except ValueError:  # No window fits in.
+                return None
+            held = [True] * len(model.windows)
+        if not any(held):
+            return None
+        before, after = model.simulate(()), model.simulate(effects)
+        return Outcome(
+            gap_measure(model, before, after, held),
+            series_of(model, before, after, held),
+            unexplained_in_windows(model, after),
+        )
+
+    def _model(self) -> FreeBodyModel | WindowModel:
+        raise NotImplementedError
+
+    def _again(self, recordings: Sequence[Recording]) -> FreeBodyModel | WindowModel:
+        raise NotImplementedError
+
+
+class FlightProblem(FreeBodyModel, WindowedProblem):
+    """One body of spheres that flies, bounces, slides or rolls on what is fixed."""
+
+    plan = SearchPlan(
+        jumps=True,  # Where an object's spheres land in another order.
+        # Errors below the noise, which is mostly how unsure a start is, tell no two
+        # models apart.
+        least_error=1.0,
+        diff_step=2e-3,  # Smaller ones drown in the error of the steps.
+        # Laws of contact leave so much that no effect but the first takes off a tenth.
+        least_gain=0.05,
+        most_effects=MOST_EFFECTS,
+    )
+
+    def _model(self) -> FreeBodyModel:
+        return self
+
+    def _again(self, recordings: Sequence[Recording]) -> FreeBodyModel:
+        return FreeBodyModel(self.scene, recordings)
+
+
+class RolloutProblem(WindowModel, WindowedProblem):
+    """Anything else: windows simulated by Drake."""
+
+    # Each residual takes seconds.
+    plan = SearchPlan(evaluations=5, most_effects=MOST_EFFECTS)
+
+    def __init__(self, scene: Scene, recordings: Sequence[Recording]):
+        many = sum(len(r.episodes) for r in recordings) >= 6
+        super().__init__(scene, recordings, DRAKE_SEC, by_episode=many, most=DRAKE_MOST)
+
+    def _model(self) -> WindowModel:
+        return self
+
+    def _again(self, recordings: Sequence[Recording]) -> WindowModel:
+        return WindowModel(self.scene, recordings, DRAKE_SEC, most=DRAKE_MOST)
+
+
+def unexplained_in_windows(
+    model: FreeBodyModel | WindowModel, simulated: Sequence[np.ndarray]
+) -> list[Unexplained]:
+    """Of each channel what is left, while what, and what its size goes with."""
+    errors = model.errors(simulated)
+    used = [k for k, e in enumerate(errors) if len(e)]
+    names = model.channels
+    features: dict[str, list[np.ndarray]] = {}
+    for k in used:
+        w = model.windows[k]
+        recording = model.recordings[w.recording]
+        time = recording.time[w.rows]
+        features.setdefault("time since the window's start", []).append(time - w.start)
+        for c in names:
+            if c.rsplit(".", 1)[-1] in ("x", "y", "z", "position"):
+                y = recording[c][w.rows]
+                good = np.isfinite(y)
+                if good.sum() < 2:
+                    y, good = np.zeros(len(time)), np.ones(len(time), bool)
+                y = np.interp(time, time[good], y[good])
+                features.setdefault(f"the value of {c}", []).append(y)
+                rate = np.gradient(y, time)
+                features.setdefault(f"the rate of {c}", []).append(rate)
+    E = np.concatenate([errors[k] for k in used])
+    out = []
+    for i, name in enumerate(names):
+        size = float(np.sqrt(np.mean(E[:, i] ** 2)))
+        if size < 2.0:
+            continue
+        shares = {
+            what: share_explained(np.concatenate(x), E[:, i])
+            for what, x in features.items()
+        }
+        best = max(shares, key=lambda what: shares[what])
+        goes = "nothing that is measured"
+        if shares[best] > 0.2:
+            goes = f"{best} (it tells {shares[best]:.0%} of its variance)"
+        worst = max(used, key=lambda k: float(np.mean(errors[k][:, i] ** 2)))
+        w = model.windows[worst]
+        region = f"most in episode {w.episode}, from {w.start:.3g} s"
+        out.append(Unexplained(name, region, size, goes))
+    return sorted(out, key=lambda each: -each.size)
+
+
+def share_explained(x: np.ndarray, y: np.ndarray, bins: int = 12) -> float:
+    """Share of the variance of y (n,) that its mean in bins of x (n,) tells, less what
+    chance gives."""
+    if np.std(x) == 0.0 or np.std(y) == 0.0 or len(y) <= bins:
+        return 0.0
+    edges = np.quantile(x, np.linspace(0, 1, bins + 1)[1:-1])
+    group = np.searchsorted(edges, x)
+    count = np.bincount(group, minlength=bins)
+    mean = np.bincount(group, y, minlength=bins) / np.maximum(count, 1)
+    within = float(np.sum((y - mean[group]) ** 2))
+    return 1.0 - within / (len(y) - bins) / float(np.var(y, ddof=1))

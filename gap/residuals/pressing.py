@@ -1,0 +1,594 @@
+"""A robot whose tool touches, slides along and presses on what is fixed.
+
+The equations of motion with permitted contact forces (contact_dynamics.py), for scenes
+in which joints are all that moves. What is fixed may stand elsewhere than the scene has
+it: a face that is touched is never passed, so how near the tool came to it is how far
+it is off, if forces without another cause are felt there, or if the scene's face was
+passed. What touches what, and its distance, follow from that.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from makebreak.gap.data.recording import Recording
+from makebreak.gap.numerics.permitted_forces import explain
+from makebreak.gap.numerics.selection import Screen
+from makebreak.gap.problem import Candidate, Fitted, Nuisances
+from makebreak.gap.residuals.contact_dynamics import THIN
+from makebreak.gap.residuals.contact_means import FORCE, MEETS, WrenchSensor
+from makebreak.gap.residuals.contact_problem import ContactProblem
+from makebreak.gap.residuals.contact_shapes import Slot
+from makebreak.gap.residuals.impacts import MOST_SHARE, nearest, positions, walls_of
+from makebreak.gap.residuals.permitted_contacts import SLACK, Shift
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.kind import Effect
+from makebreak.models.scene import Scene
+
+REACH = 0.12  # What is fixed is no farther off than this [m].
+KNOCKED = 8e-3  # A knock goes no deeper than this [m].
+FEWEST_ROWS = 5  # In which a face is pressed on.
+SAME = 5e-4  # A face that is off by less is where the scene has it [m].
+PASSED = 4e-3  # No contact lets a tool so far in [m].
+FELT, LESS = 4.0, 0.5  # Mean square of what is left where a face is felt; with it.
+CLEAR, LEAST_FORCE, FELT_SHARE = 6.0, 0.5, 0.03  # Times noise, [N], of the rows.
+MOVES = ("wall_position", "plane_height")
+WHOLE = 0.9  # Of the squares left: what one more of a body leaves is tried first.
+SOFTER = (0.3, 0.6, 2.0)  # Times the stiffness of the scene: trials.
+MOST_FRICTION = 2.0  # Of what is taken for any.
+MOST_PATCHES, MOST_EFFECTS = 3, 10
+MOST_KEPT = 12  # Geometries.
+SMALL_SHIFT = 1e-3  # First trial of a place [m].
+AXES = "xyz"
+
+
+@dataclass(frozen=True, eq=False)
+class _Face:
+    """A face of a fixed body: its normal (3,) and by how far along it the body may be
+    off [m]; passed: by so much the tool went through it as the scene has it."""
+
+    body: int
+    normal: np.ndarray
+    off: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Geometry:
+    """Slots that act where fixed bodies are put, {key: (n_nodes,) when} and columns."""
+
+    slots: list[Slot]
+    masks: dict[tuple[int, int], np.ndarray]
+    columns: list
+
+
+def presses(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
+    """Whether a mechanism rests on what is fixed: a wrench is felt for a while, or most
+    of the time shapes are in touch."""
+    try:
+        shapes = walls_of(dynamics)
+    except ValueError:
+        return False
+    if shapes is None:
+        return False
+    felt = rows = 0
+    for recording in recordings:
+        for place in recording.places(FORCE):
+            names = [f"{place}.{a}" for a in FORCE]
+            if not all(name in recording for name in names):
+                continue
+            size = np.linalg.norm([recording[name] for name in names], axis=0)
+            noise = max(recording.channels[name].noise for name in names)
+            good = np.isfinite(size)
+            rows += int(good.sum())
+            felt += int((size[good] > max(CLEAR * noise, LEAST_FORCE)).sum())
+    if rows and felt > FELT_SHARE * rows:
+        return True
+    inside = whole = 0
+    for recording in recordings:
+        q = positions(dynamics, recording)
+        q = q[:: max(len(q) // 2000, 1)]
+        inside += int((nearest(shapes, dynamics, q) < MEETS).sum())
+        whole += len(q)
+    return inside > MOST_SHARE * whole
+
+
+class PressingProblem(ContactProblem):
+    """Raises: ValueError where anything but joints moves, or as ContactDynamics."""
+
+    # A wall that was met for a moment shows in its own distance alone.
+    plan = replace(ContactProblem.plan, by_channel=True, most_effects=MOST_EFFECTS)
+
+    def __init__(self, scene: Scene, recordings: Sequence[Recording]):
+        self._geometries: dict[tuple, _Geometry] = {}
+        self._any_friction = False
+        self._mu: float | None = None
+        super().__init__(scene, recordings)
+
+    # ----- What may touch
+
+    def _read_coordinates(self) -> None:
+        super()._read_coordinates()
+        if self.bodies:
+            raise ValueError("something moves freely")
+
+    def pair_name(self, pair: tuple[int, int]) -> str:
+        """What is fixed first: its surface is the one that an effect changes."""
+        a, b = sorted(pair, key=lambda k: k not in self.shapes.anchored)
+        return f"{self.shapes.names[a]}~{self.shapes.names[b]}"
+
+    def _lies(self, pair: tuple[int, int]) -> bool:
+        """Nothing lies there by its own weight."""
+        return False
+
+    def _touching_rows(self):
+        """As the scene has it, and as it might be: no contact may come or go within a
+        test function."""
+        poses = self._poses_at(self._q)
+        self.faces = self._possible_faces(poses)
+        found = super()._touching_rows()
+        for number, face in enumerate(self.faces):
+            R, p = poses[face.body]
+            moved = poses | {face.body: (R, p + face.off * face.normal)}
+            for s in self.shapes.slots(moved, MEETS):
+                if face.body in (s.a, s.b):
+                    key = (-1 - number, s.a if s.b == face.body else s.b)
+                    now = found.get(key, np.zeros(len(self._q), bool))
+                    found[key] = now | (s.phi < MEETS)
+        return found
+
+    def _possible_faces(self, poses) -> list[_Face]:
+        """Faces of fixed boxes over which the tool came, with how near it kept to them:
+        so far they may be off, if it pressed on them there."""
+        moving = [p for p in self.shapes.points
+                  if p.body not in self.shapes.anchored and not p.rim]  # fmt: skip
+        found = []
+        for s in self.shapes.surfaces:
+            if s.body not in self.shapes.anchored or s.kind != "box":
+                continue
+            R_b, p_b = poses[s.body][0][0], poses[s.body][1][0]
+            R, centre = R_b @ s.R_BG, p_b + R_b @ s.p_BG
+            (half,) = s.size
+            nearest = np.full((len(self._q), 3, 2), np.inf)
+            for point in moving:
+                if self.shapes.never_touch(point, s):
+                    continue
+                R_a, p_a = poses[point.body]
+                local = (p_a + R_a @ point.p_B - centre) @ R
+                # How far outside of each pair of faces; of the deepest inside of all
+                # the nearest face is the one that was passed.
+                out = np.abs(local) - half
+                for axis in range(3):
+                    others = np.delete(out, axis, axis=1).max(axis=1)
+                    over = (others < 0.0) & (out[:, axis] > others)
+                    d = np.where(over, out[:, axis] - point.radius, np.inf)
+                    side = (local[:, axis] > 0.0).astype(int)
+                    rows = np.arange(len(d))
+                    nearest[rows, axis, side] = np.minimum(nearest[rows, axis, side], d)
+            for axis in range(3):
+                for side, sign in enumerate((-1.0, 1.0)):
+                    normal = sign * R[:, axis]
+                    off = self._kept_distance(nearest[:, axis, side], normal)
+                    if abs(off) < REACH:
+                        found.append(_Face(s.body, normal, off))
+        return found
+
+    def _kept_distance(self, d: np.ndarray, normal: np.ndarray) -> float:
+        """Of distances (n_rows,) from a face the one that was kept longest where the
+        tool came nearest to it and, with a wrench, felt it; inf: none. A hard knock
+        goes deeper for a moment."""
+        near = d < REACH
+        for sensor in self.sensors:
+            near &= self._force_along(sensor.place, normal) > LEAST_FORCE
+        if near.sum() < FEWEST_ROWS:
+            return np.inf
+        values = np.sort(d[near & (d < d[near].min() + KNOCKED)])
+        count = np.searchsorted(values, values + SAME) - np.arange(len(values))
+        first = int(np.argmax(count))
+        return float(np.median(values[first : first + count[first]]))
+
+    def _force_along(self, place: str, normal: np.ndarray) -> np.ndarray:
+        """(n_rows,) of a measured force, lines over what is missing [N]."""
+        out = []
+        for t in self.tracks:
+            recording, rows = self.recordings[t.recording], t.episode.rows
+            total = np.zeros(len(t.time))
+            for n, a in zip(normal, FORCE, strict=True):
+                y = recording[f"{place}.{a}"][rows]
+                good = np.isfinite(y)
+                if good.any():
+                    total += n * np.interp(t.time, t.time[good], y[good])
+            out.append(total)
+        return np.concatenate(out)
+
+    # ----- Where it touches
+
+    def _slots(self, effects: Sequence[Effect], shift: Shift | None = None):
+        poses = dict(self._node_poses)
+        for e in effects:
+            if e.kind not in MOVES:
+                continue
+            by = np.array([e.parameters.get(a, 0.0) for a in AXES])
+            by[2] += e.parameters.get("height", 0.0)
+            for k in poses:
+                if k in self.shapes.anchored and self._is_at(e, k):
+                    R, p = poses[k]
+                    poses[k] = R, p + by
+        if any(e.kind == "plane_tilt" for e in effects):
+            raise ValueError("plane_tilt: not of what a robot presses on")
+        return self.shapes.slots(poses, REACH), poses
+
+    def _touches(self, slots: Sequence[Slot]) -> list[np.ndarray]:
+        """Of each slot (n_nodes,) whether it may act: points nearly as near as the
+        nearest of two bodies that meet."""
+        of: dict[tuple[int, int], list[int]] = {}
+        for k, s in enumerate(slots):
+            of.setdefault(self._pair_of(s), []).append(k)
+        out = [np.zeros(0, bool)] * len(slots)
+        for index in of.values():
+            nearest = np.min([slots[k].phi for k in index], axis=0)
+            for k in index:
+                s = slots[k]
+                out[k] = s.best & (s.phi < nearest + SLACK) & (nearest < MEETS)
+        return out
+
+    def _geometry(self, effects: Sequence[Effect]) -> _Geometry:
+        moved = [e for e in effects if e.kind in MOVES]
+        key = tuple((e.kind, *e.at, *sorted(e.parameters.items())) for e in moved)
+        if key not in self._geometries:
+            slots, poses = self._slots(moved)
+            masks = {
+                s.key: on
+                for s, on in zip(slots, self._touches(slots), strict=True)
+                if on.any()
+            }
+            slots = [s for s in slots if s.key in masks]
+            if len(self._geometries) > MOST_KEPT:
+                self._geometries.clear()
+            self._geometries[key] = _Geometry(
+                slots, masks, self._columns(slots, poses, masks)
+            )
+        return self._geometries[key]
+
+    def _contacts_at(self, effects: Sequence[Effect], shift: Shift | None):
+        found = self._geometry(effects)
+        return found.slots, found.columns
+
+    def _when(self, geometry: _Geometry, s: Slot) -> np.ndarray:
+        """(K,) over how much of a test function a slot may act."""
+        return np.asarray(self._W @ geometry.masks[s.key].astype(float)).ravel()
+
+    def _sharing(self, made, slots) -> np.ndarray:
+        return np.zeros((len(self.means.time), 1, max(len(made), 1)))
+
+    # ----- What is felt
+
+    def _condition(self) -> None:
+        """Encoders tell accelerations; contacts would tell no more."""
+        m = self.means
+        a, covariance = self._expected_acceleration(self._v[m.centre])
+        m.acceleration, self._a_covariance = a, covariance
+
+    def _prepare(self) -> None:
+        geometry = self._geometry(())
+        self.slots = geometry.slots
+        self._masks = [geometry.masks[s.key] for s in self.slots]
+        super()._prepare()
+        self.off = self._felt_faces()
+        self._pressed, self._met = self._pressing()
+        self._pairs_met = sorted({*self._met, *map(self._pair_of, self.slots)})
+
+    def _displacing(self, off: dict[int, dict[str, float]]) -> list[Effect]:
+        return [
+            Effect("wall_position", [self.shapes.names[body]], by)
+            for body, by in off.items()
+        ]
+
+    def _felt_faces(self) -> dict[int, dict[str, float]]:
+        """{body: {axis: by how far [m]}} of faces that are off and felt, or passed."""
+        off: dict[int, dict[str, float]] = {}
+        left = [f for f in self.faces if abs(f.off) > SAME]
+        for face in [f for f in left if f.off < -PASSED]:
+            self._add(off, face)
+            left.remove(face)
+        while left:
+            before = self._mean_squares(off)
+            best, gain = None, 0.0
+            for face in left:
+                trial = {k: dict(v) for k, v in off.items()}
+                self._add(trial, face)
+                geometry = self._geometry(self._displacing(trial))
+                on = np.zeros(len(before), bool)
+                for s in geometry.slots:
+                    if face.body in (s.a, s.b):
+                        on |= self._when(geometry, s) > 0.999
+                if on.sum() < 3:
+                    continue
+                after = self._mean_squares(trial)
+                if (
+                    before[on].mean() < FELT
+                    or after[on].mean() > LESS * before[on].mean()
+                ):
+                    continue
+                taken = float(before.sum() - after.sum())
+                if taken > gain:
+                    best, gain = face, taken
+            if best is None:
+                break
+            self._add(off, best)
+            left.remove(best)
+        return off
+
+    def _add(self, off: dict[int, dict[str, float]], face: _Face) -> None:
+        axis = int(np.argmax(np.abs(face.normal)))
+        by = off.setdefault(face.body, {})
+        by[AXES[axis]] = face.off / float(face.normal[axis])
+
+    def _mean_squares(self, off) -> np.ndarray:
+        """(K,) of what equations and wrenches leave with bodies displaced."""
+        needs = self._all_needs(())
+        G, there, _, _, sharing = self._generators(self._displacing(off))
+        left = np.zeros_like(needs)
+        explain(
+            needs, G, there, self.root, sharing, left,
+            np.zeros((len(left), there.shape[1])), np.zeros(len(left), np.int64),
+        )  # fmt: skip
+        return np.mean(left**2, axis=1)
+
+    def _pressing(self):
+        """Where bodies may really be: {pair: (K,) the sum of its normal forces over how
+        many points share it}, {pair: (K,) when it presses}."""
+        there = self._displacing(self.off)
+        needs = self._all_needs(())
+        G, can, of, slots, sharing = self._generators(there)
+        weights = np.zeros(can.shape)
+        explain(
+            needs, G, can, self.root, sharing, np.zeros_like(needs), weights,
+            np.zeros(len(needs), np.int64),
+        )  # fmt: skip
+        geometry, K = self._geometry(there), len(needs)
+        total: dict[tuple[int, int], np.ndarray] = {}
+        points: dict[tuple[int, int], np.ndarray] = {}
+        whole: dict[tuple[int, int], np.ndarray] = {}
+        for s in slots:
+            pair, n = self._pair_of(s), self._when(geometry, s)
+            points[pair] = points.get(pair, np.zeros(K)) + n
+            whole[pair] = whole.get(pair, np.zeros(K, bool)) | (n > 0.999)
+            total.setdefault(pair, np.zeros(K))
+        for column, number in enumerate(of):
+            total[self._pair_of(slots[number])] += weights[:, column]
+        clear = self._clear_force()
+        met = {pair: on & (total[pair] > clear) for pair, on in whole.items()}
+        each = {pair: total[pair] / np.maximum(points[pair], 1.0) for pair in total}
+        return each, {pair: on for pair, on in met.items() if on.any()}
+
+    def _clear_force(self) -> float:
+        """A pressing force of less may be nothing [N]."""
+        var = [np.median(self.means.wrench_var[:, s.forces]) for s in self.sensors]
+        return max([LEAST_FORCE, *(CLEAR * float(np.sqrt(x)) for x in var)])
+
+    # ----- Rows
+
+    def allow(self, allowance: np.ndarray) -> None:
+        # Which rows forces take up is asked of the scene as it came.
+        kept, self._any_friction = self._any_friction, False
+        try:
+            super().allow(allowance)
+        finally:
+            self._any_friction = kept
+        if hasattr(self, "_met"):  # Else not all is prepared.
+            self._pressed, _ = self._pressing()
+
+    def _learn_misfit(self) -> None:
+        """What a model with everything ordinary leaves where bodies may really be and
+        friction may be anything, other at each place."""
+        self._any_friction = True
+        try:
+            super()._learn_misfit()
+        finally:
+            self._any_friction = False
+        self._set(self.allowance)
+
+    def _friction(self, s: Slot, effects: Iterable[Effect]) -> np.ndarray:
+        if self._mu is not None:
+            return np.full(len(s.phi), self._mu)
+        return super()._friction(s, effects)
+
+    def _generators(self, effects: Sequence[Effect], shift: Shift | None = None):
+        """With any friction: of each contact a force with none and one with the most,
+        so that all between them are their sums."""
+        self._mu = None
+        if not self._any_friction:
+            return super()._generators(effects, shift)
+        effects = [*effects, *self._displacing(self.off)]
+        self._mu = 0.0
+        least = super()._generators(effects, shift)
+        self._mu = MOST_FRICTION
+        most = super()._generators(effects, shift)
+        self._mu = None
+        G, there, of, slots, _ = least
+        made = [np.concatenate([x, y], axis=-1) for x, y in
+                ((G, most[0]), (there, most[1]))]  # fmt: skip
+        return (*made, of + most[2], slots, self._sharing(of + of, slots))
+
+    def left(
+        self,
+        effects: Sequence[Effect] = (),
+        shift: Shift | None = None,
+        weighed_as: Sequence[Effect] | None = None,
+    ):
+        self._softened = [e for e in effects if e.kind == "contact_stiffness"]
+        self._placed = [e for e in effects if e.kind in MOVES]
+        if self._any_friction:
+            self._placed += self._displacing(self.off)
+        return super().left(effects, shift, weighed_as)
+
+    def _distances(self, slots: Sequence[Slot]) -> np.ndarray:
+        """(K, pairs) over what shapes are known to: of each pair, when it is felt."""
+        shape = float(self.scene.tolerance.get("shape_m", 2e-4))
+        K = len(self.means.time)
+        thinned = np.arange(K) % THIN == 0
+        every, _ = self._slots(self._placed)
+        columns = []
+        for pair in self._pairs_met:
+            mine = [s for s in every if self._pair_of(s) == pair]
+            on = self._met.get(pair, np.zeros(K, bool)) & thinned
+            if not mine or not on.any():
+                columns.append(np.zeros(K))
+                continue
+            nearest = np.min([s.phi for s in mine], axis=0)
+            stiffness = mine[0].stiffness
+            for e in self._softened:
+                if self._at_pair(e, pair):
+                    stiffness = e.parameters["stiffness"]
+            if not stiffness > 0.0:
+                raise ValueError("contact_stiffness: not above zero")
+            d = self._W @ nearest + self._pressed.get(pair, 0.0) / stiffness
+            columns.append(np.where(on, d / shape, 0.0))
+        return -np.stack(columns, axis=1) if columns else np.zeros((K, 0))
+
+    def counts(self) -> np.ndarray:
+        out = super().counts()
+        n = out.shape[1] - len(self._pairs_met)
+        for k, pair in enumerate(self._pairs_met):
+            on = self._met.get(pair)
+            out[:, n + k] = (
+                False if on is None else on & (np.arange(len(on)) % THIN == 0)
+            )
+        return out
+
+    # ----- What may be slightly wrong, and candidates
+
+    def nuisances(self) -> Nuisances:
+        """Beside those of any robot: what is mounted beyond a sensor, whose inertia it
+        feels."""
+        if self._nuisances is not None:
+            return self._nuisances
+        plain = super().nuisances()
+        columns, prior, names = [plain.columns], list(plain.prior), list(plain.names)
+        for sensor in self.sensors:
+            column = self._carried(sensor)
+            if column is not None:
+                columns.append(column[0][:, None])
+                prior.append(column[1])
+                names.append(f"mass beyond {sensor.place}")
+        self._nuisances = Nuisances(
+            np.hstack(columns), np.array(prior), tuple(names), plain.reach
+        )
+        return self._nuisances
+
+    def _carried(self, sensor: WrenchSensor) -> tuple[np.ndarray, float] | None:
+        """The column of a kilogram beyond a sensor, and what may be there [kg]: the
+        sensor feels what is outside less mass times acceleration, at the body's centre
+        of mass."""
+        body = sensor.frame.body()
+        mass = body.default_mass()
+        if not mass > 0.0:
+            return None
+        m = self.means
+        q, v, vd = (x[m.centre] for x in (self._q, self._v, self._vd))
+        _, V, A, R = self.dynamics.body_motion(body, q, v, vd)
+        arm, turns = R @ body.default_com(), V[:, :3]  # To the centre of mass.
+        a = A[:, 3:] + np.cross(A[:, :3], arm) + np.cross(turns, np.cross(turns, arm))
+        kept = m.wrench
+        m.wrench = kept.copy()
+        m.wrench[:, sensor.forces] += mass * a
+        if sensor.feels_moments:
+            about = arm - R @ sensor.frame.GetFixedPoseInBodyFrame().translation()
+            m.wrench[:, sensor.moments] += mass * np.cross(about, a)
+        try:
+            column = (self.base() - self.residual()) / mass
+        finally:
+            m.wrench = kept
+        return column, mass
+
+    def _friction_now(self, pair) -> float:
+        """Wherever its bodies are."""
+        for s in self.slots:
+            if self._pair_of(s) == pair:
+                return s.friction
+        for s in self._geometry(self._displacing(self.off)).slots:
+            if self._pair_of(s) == pair:
+                return s.friction
+        return 0.0
+
+    def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
+        """Patches of friction, which explain much at some places, only where no other
+        place or friction of a whole body explains more."""
+        found = self._plain_candidates(current.r, current.effects)
+        train = self.train()
+        screen = Screen(current.r, nuisances.columns, nuisances.prior, train)
+        r = screen.settle(current.r)[1][train]
+        for c in found:
+            if c.kind in (*MOVES, "contact_friction"):
+                for X in c.columns:
+                    fit = np.linalg.lstsq(X[train], r, rcond=None)[0]
+                    if np.sum((r - X[train] @ fit) ** 2) < WHOLE * np.sum(r**2):
+                        return found
+        for pair in self._pairs_met:
+            found += self._patches(pair, current)
+        return found
+
+    def _plain_candidates(self, r: np.ndarray, there: Sequence[Effect]):
+        found = super()._plain_candidates(r, there)
+        taken = {at for e in there if e.kind in MOVES for at in e.at}
+        # Trials of any other size than what is felt would tell nothing.
+        return [c for c in found if c.kind not in MOVES or not taken & set(c.at)]
+
+    def _may_have_patch(self, pair, there: Sequence[Effect]) -> bool:
+        """Of level ground, up to MOST_PATCHES."""
+        at = self.pair_name(pair)
+        if (
+            sum(e.kind == "friction_patch" and at in e.at for e in there)
+            >= MOST_PATCHES
+        ):
+            return False
+        try:
+            self.dynamics.now("friction_patch", [at])
+        except ValueError:
+            return False
+        return True
+
+    def _trials(self):
+        for each in super()._trials():
+            if each[0] not in ("plane_tilt", "plane_height"):
+                yield each
+        for pair in self._met:
+            # How deep a point goes under a force that is known.
+            at = self.pair_name(pair)
+            try:
+                now = self.dynamics.now("contact_stiffness", [at])["stiffness"]
+            except ValueError:
+                continue
+            steps = [[((f - 1.0) * now, {"stiffness": f * now})] for f in SOFTER]
+            yield "contact_stiffness", at, 1, ("stiffness",), (), steps
+        for body, by in self._touched_axes().items():
+            at, names = self.shapes.names[body], tuple(by)
+            if names == ("z",):
+                step = by["z"] or SMALL_SHIFT
+                yield (
+                    "plane_height", at, 1, ("height",), (), [[(step, {"height": step})]]
+                )  # fmt: skip
+                continue
+            zero = dict.fromkeys(names, 0.0)
+            trial = [
+                (step, {**zero, a: step})
+                for a, step in ((a, by[a] or SMALL_SHIFT) for a in names)
+            ]
+            yield "wall_position", at, len(names), names, (), [trial]
+
+    def _touched_axes(self) -> dict[int, dict[str, float]]:
+        """{fixed body: {axis along which it is felt: how far it is off there [m]}}."""
+        found: dict[int, dict[str, float]] = {}
+        geometry = self._geometry(self._displacing(self.off))
+        for s in geometry.slots:
+            pair = self._pair_of(s)
+            if pair not in self._met:
+                continue
+            (body,) = set(pair) & self.shapes.anchored
+            on = geometry.masks[s.key]
+            mean = np.abs(s.normal[on]).mean(axis=0)
+            axis = AXES[int(np.argmax(mean))]
+            known = self.off.get(body, {}).get(axis, 0.0)
+            found.setdefault(body, {})[axis] = known
+        return {body: {a: by[a] for a in AXES if a in by} for body, by in found.items()}

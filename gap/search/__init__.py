@@ -1,0 +1,1 @@
+"""Which effects a scene lacks: screened, selected, fitted, and what to trust."""

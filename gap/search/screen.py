@@ -1,0 +1,338 @@
+"""Every effect of the catalogue that could act in a scene, by what it explains."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from makebreak.gap.numerics.selection import LinearFit, Screen
+from makebreak.gap.problem import Candidate, Nuisances
+from makebreak.gap.residuals.inverse import SENSED, InverseModel
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import (
+    Effect,
+    find_joints,
+    full_name,
+)
+
+# How well links are known where the scene does not say [-], [m].
+LINK_MASS, LINK_COM = 0.03, 0.002
+REACH = 3.0  # Tolerances: beyond them a link is not known too little but wrong.
+_DELAYS = (0.004, 0.01, 0.02, 0.04)
+_ELASTIC = ("joint_elasticity", "joint_backlash")
+_DRIVEN = ("actuator_saturation",)
+# Of links: link_mass and link_com say it as a difference.
+_HIDDEN = ("object_mass", "object_com", "object_inertia")
+WAVES = 12  # Frequencies of a force that are tried on every link.
+
+
+@dataclass(frozen=True, eq=False)
+class Ranked:
+    """A candidate with the fit of its best alternative, and what that says."""
+
+    candidate: Candidate
+    fit: LinearFit
+    effects: tuple[Effect, ...]
+    valid: bool
+    alternative: int
+
+    @property
+    def columns(self) -> np.ndarray:
+        return self.candidate.columns[self.alternative]
+
+    def fixed(self) -> tuple[tuple[str, ...], ...]:
+        return self.candidate.fixed_of_each()
+
+
+def candidates(
+    model: InverseModel, nuisances: Nuisances, left: np.ndarray
+) -> list[Candidate]:
+    """All that can be seen in the equations of motion.
+
+    Args: left (m,): what the nuisances leave of the scene as it came.
+    """
+    dynamics, motions = model.dynamics, model.motions()
+    worst = _worst_joints(model, left)
+    # A joint that has such an element in the scene can have no second one.
+    elastic = {
+        full_name(dynamics.plant, joint)
+        for e in model.scene.effects if e.kind in _ELASTIC
+        for joint in find_joints(e, dynamics.plant)
+    }  # fmt: skip
+    screen = Screen(left, nuisances.columns, nuisances.prior, model.train())
+    found: list[Candidate] = []
+    for kind, entry in KINDS.items():
+        if kind in _HIDDEN or entry.at in ("free body", "length", "pair", "ground"):
+            continue
+        if kind in SENSED:
+            found += _of_sensors(model, kind)
+            continue
+        if kind in ("input_delay", "actuator_lag"):
+            found += _of_delays(model, kind)
+            continue
+        if entry.drive:
+            found += _of_drives(model, kind)
+            continue
+        if entry.signature is None:
+            continue
+        waves: list | None = None
+        places = dynamics.places(kind)
+        for at in reversed(places) if kind == "sinusoidal_force" else places:
+            if entry.at == "base" and at == "world":
+                continue
+            if kind in _DRIVEN and not _driven(model, at):
+                continue
+            if kind in _ELASTIC and (at not in worst or at in elastic):
+                continue
+            columns, readers = [], []
+            grids = _grids(model, kind, at, motions)
+            if kind == "sinusoidal_force":
+                grids = waves if waves is not None else grids
+            # One value of a grid after the other: all at once would be gigabytes.
+            for grid in grids:
+                groups = [dynamics.signatures(kind, [at], m, grid) for m in motions]
+                for same in zip(*groups, strict=True):
+                    columns.append(model.columns_of([s.columns for s in same]))
+                    readers.append(same[0].to_parameters)
+            if not columns:
+                continue
+            if not any(np.abs(x).max(initial=0.0) > 0.0 for x in columns):
+                continue
+            if kind == "sinusoidal_force" and waves is None:
+                # All frequencies at the last link, and the best of them elsewhere.
+                fits = [screen.fit(x).train for x in columns]
+                best = np.argsort(fits)[:WAVES]
+                waves = [grids[k] for k in best]
+                columns = [columns[k] for k in best]
+                readers = [readers[k] for k in best]
+            size = sum(not p.optional for p in entry.parameters)
+            if kind == "body_drag":  # Few bodies show that they are slowed in turning.
+                found.append(
+                    Candidate(
+                        kind, (at,), 1, (columns[0][:, [0]],),
+                        (_one_of(readers[0], 0),), ("angular",),
+                    )
+                )  # fmt: skip
+            found.append(
+                Candidate(
+                    kind, (at,), size, tuple(columns), tuple(readers),
+                    least=dynamics.least(kind, [at]),
+                )
+            )  # fmt: skip
+    return found
+
+
+def rich_columns(model: InverseModel, found: Sequence[Candidate]) -> np.ndarray:
+    """(m, k) of all kinds with one parameter at all of their places, and a load at the
+    last link: what a model that lacks nothing ordinary would have.
+
+    A gain multiplies what the model needs: as a factor on the measured effort it would
+    cancel all of that, and with it what anything is off by.
+    """
+    last = _links(model)[-1:]
+    columns = []
+    for c in found:
+        if KINDS[c.kind].path == "gain":
+            each = [
+                model.dynamics.signatures(c.kind, list(c.at), m)[0].columns
+                for m in model.needed_motions()
+            ]
+            columns.append(model.columns_of(each))
+        elif c.columns[0].shape[1] == 1 and KINDS[c.kind].at != "base":
+            columns.append(c.columns[0])
+        elif KINDS[c.kind].at == "body" and list(c.at) == last and len(c.columns) == 1:
+            columns.append(c.columns[0])
+    return np.hstack(columns) if columns else np.zeros((len(model.train()), 0))
+
+
+def nuisances(model: InverseModel) -> Nuisances:
+    """The links' masses and centres of mass."""
+    said = model.scene.tolerance
+    share = float(said.get("link_mass", LINK_MASS))
+    reach = float(said.get("link_com_m", LINK_COM))
+    dynamics, motions = model.dynamics, model.motions()
+    columns, prior, names = [], [], []
+    for kind, size in (("object_mass", share), ("object_com", reach)):
+        for at in _links(model):
+            groups = [dynamics.signatures(kind, [at], m) for m in motions]
+            for same in zip(*groups, strict=True):
+                x = model.columns_of([s.columns for s in same])
+                now = dynamics.now(kind, [at])
+                for k, unknown in enumerate(same[0].unknowns):
+                    if not np.abs(x[:, k]).max(initial=0.0) > 0.0:
+                        continue
+                    columns.append(x[:, k])
+                    prior.append(size * now["mass"] if kind == "object_mass" else size)
+                    names.append(f"{kind} of {at}, {unknown}")
+    for late, period, of_what in (model.filter_timing(), model.loop_timing()):
+        columns, prior, names = columns + late, prior + period, names + of_what
+    # A mass is known to its share, whatever unit its signature has.
+    if not columns:
+        return Nuisances.none(len(model.train()))
+    return Nuisances(np.stack(columns, axis=1), np.array(prior), tuple(names), REACH)
+
+
+def rank(screen: Screen, found: Sequence[Candidate]) -> list[Ranked]:
+    """Candidates, the least held-out error first. Of alternatives that which fits the
+    training rows best is judged. Of a group any member may be none (it is pruned)."""
+    ranked = []
+    for candidate in found:
+        fits = [screen.fit(columns) for columns in candidate.columns]
+        k = min(range(len(fits)), key=lambda i: fits[i].train)
+        effects = candidate.effects(k, fits[k].c)
+        valid = bool(candidate.members) or candidate.is_sane(effects)
+        ranked.append(Ranked(candidate, fits[k], effects, valid, k))
+    return sorted(ranked, key=lambda r: r.fit.score)
+
+
+def _links(model: InverseModel) -> list[str]:
+    return [at for at in model.dynamics.places("body_drag") if _mass(model, at) > 0.0]
+
+
+def _mass(model: InverseModel, at: str) -> float:
+    try:
+        return model.dynamics.now("object_mass", [at])["mass"]
+    except ValueError:
+        return 0.0
+
+
+def _driven(model: InverseModel, joint: str) -> bool:
+    return model.commanded[model.joints.index(joint)]
+
+
+def _motor_seen(model: InverseModel, joint: str) -> bool:
+    """Whether what the motor gives is known: it is commanded, or measured before the
+    gear."""
+    i = model.joints.index(joint)
+    return model.commanded[i] or (model.by_measured[i] and model.is_motor_side(i))
+
+
+def _worst_joints(model: InverseModel, left: np.ndarray, most: int = 3) -> list[str]:
+    """Those whose equations are met least, after the background."""
+    names = model.names()
+    size = {
+        joint: float(np.mean(left[k :: len(names)] ** 2))
+        for k, (what, joint) in enumerate(names)
+        if what == "effort" and _motor_seen(model, joint)
+    }
+    return sorted(size, key=lambda joint: -size[joint])[:most]
+
+
+def _one_of(reader: Callable, k: int) -> Callable:
+    def read(c):
+        both = np.zeros(2)
+        both[k] = c[0]
+        return reader(both)
+
+    return read
+
+
+def _grids(model: InverseModel, kind: str, at: str, motions) -> list:
+    tries = KINDS[kind].tries
+    if tries is None:
+        return [None]
+    grid = tries(Effect(kind, [at], {}), model.dynamics.plant, motions)
+    ((name, values),) = grid.items()
+    return [{name: [value]} for value in values]
+
+
+def _of_delays(model: InverseModel, kind: str) -> list[Candidate]:
+    """Of commands: by the difference that a delay makes, for a few delays."""
+    name = "delay" if kind == "input_delay" else "time_constant"
+    models = dict.fromkeys(j.split(".")[0] for j in model.joints)
+    driven = [j for j in model.joints if _driven(model, j)]
+    places = [(m,) for m in models if any(j.startswith(f"{m}.") for j in driven)]
+    if len(driven) > 1:
+        places += [(j,) for j in driven]
+    return [c for at in places if (c := _secant(model, kind, at, name)) is not None]
+
+
+def _of_drives(model: InverseModel, kind: str) -> list[Candidate]:
+    """Of drives' own numbers: by the difference that one more or less makes."""
+    found = []
+    for at in model.dynamics.places(kind):
+        if not _driven(model, at):
+            continue
+        ((name, now),) = model.dynamics.now(kind, [at]).items()
+        step = 0.2 * now
+        moved = model.residual([Effect(kind, [at], {name: now - step})])
+        columns = ((moved - model.base()) / step)[:, None]
+
+        def read(c, name=name, now=now):
+            return {name: now + float(c[0])}
+
+        found.append(Candidate(kind, (at,), 1, (columns,), (read,)))
+    return found
+
+
+def _of_sensors(model: InverseModel, kind: str) -> list[Candidate]:
+    joints = model.joints
+    models = tuple(dict.fromkeys(j.split(".")[0] for j in joints))
+    name = {"joint_offset": "offset", "sensor_bias": "bias", "clock_skew": "skew",
+            "sensor_lag": "time_constant"}  # fmt: skip
+    velocities = tuple(
+        f"{j}.velocity" for i, j in enumerate(joints) if model.has["velocity"][i]
+    )
+    efforts = tuple(
+        f"{j}.effort_measured"
+        for i, j in enumerate(joints)
+        if model.has["effort_measured"][i] and not model.by_measured[i]
+    )
+    positions = tuple(f"{j}.position" for j in joints)
+    places: list[tuple[str, ...]]
+    if kind == "joint_offset":
+        places = [(j,) for j in joints]
+    elif kind == "sensor_bias":
+        places = [(c,) for c in (*velocities, *efforts)]
+    elif kind == "clock_skew":
+        places = [models]
+    else:
+        places = [positions, velocities, *((c,) for c in velocities)]
+        places += [efforts, *((c,) for c in efforts)]
+        if kind == "sensor_delay":
+            places.append(models)
+    unique = [p for p in dict.fromkeys(places) if p]
+    found = [_secant(model, kind, at, name.get(kind, "delay")) for at in unique]
+    return [c for c in found if c is not None]
+
+
+def inseparable(effect: Effect, model: InverseModel) -> Effect | None:
+    """What no recording of commands and joints can tell from an effect: commands that
+    act late, and all channels that show late. (A measured effort would tell.)"""
+    models = sorted({joint.split(".")[0] for joint in model.joints})
+    sensed = {
+        f"{joint}.{what}"
+        for k, joint in enumerate(model.joints)
+        for what in ("position", "velocity")
+        if what == "position" or model.has[what][k]
+    }
+    driven = {joint for joint in model.joints if _driven(model, joint)}
+    if not driven or any(model.has["effort_measured"]):
+        return None
+    at = set(effect.at)
+    if effect.kind == "input_delay" and (at == set(models) or at >= driven):
+        return Effect("sensor_delay", models, dict(effect.parameters))
+    if effect.kind == "sensor_delay" and (at == set(models) or at >= sensed):
+        return Effect("input_delay", models, dict(effect.parameters))
+    return None
+
+
+def _secant(model: InverseModel, kind: str, at, name: str) -> Candidate | None:
+    steps = {"offset": (1e-3,), "bias": (1e-3,), "skew": (1e-4,)}.get(name, _DELAYS)
+    if kind == "sensor_delay" and all(c.endswith(".velocity") for c in at):
+        steps = (0.01,)
+    base, columns = model.base(), []
+    least = -np.inf
+    if kind == "sensor_lag":  # It can take from a declared filter what that has.
+        least = -0.9 * min(model.declared_lag(c) for c in at)
+    for step in steps:
+        moved = model.residual([Effect(kind, list(at), {name: step})])
+        columns.append(((base - moved) / step)[:, None])
+
+    def read(c):
+        return {name: max(float(c[0]), least)}
+
+    if not any(np.abs(x).max(initial=0.0) > 0.0 for x in columns):
+        return None
+    readers = (read,) * len(columns)
+    return Candidate(kind, tuple(at), 1, tuple(columns), readers)

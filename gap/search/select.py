@@ -1,0 +1,905 @@
+"""Which effects a scene lacks: forward by held-out error, then backward.
+
+Models are fitted to the rows that a problem's `train` names and chosen by the others.
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from makebreak.gap.numerics.selection import (
+    NESTED_GAIN,
+    SAME,
+    Screen,
+    is_plausible,
+    paired,
+    paired_t,
+    simplest,
+)
+from makebreak.gap.problem import (
+    Candidate,
+    Fitted,
+    GapProblem,
+    Nuisances,
+    is_sane,
+    rms,
+)
+from makebreak.gap.result import Considered
+from makebreak.gap.search.fit import derivative_free_search, fit_effects, tangents
+from makebreak.gap.search.screen import Ranked, rank
+from makebreak.gap.search.trust import steady
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect
+
+FINALISTS, FINALIST_RUNS = 4, 80  # Searched without slopes before one is chosen.
+LOUD = 3.0  # Rms over noise of one channel that is a gap, whatever the others leave.
+FLOOR = 1.15  # Rms over noise that noise alone may leave (its estimate is that good).
+# Laws are approximations (how dry friction turns round, how commands are held): errors
+# that differ by less than this share of the whole gap do not tell two models apart.
+PRECISION = 0.015
+# The same of one channel: less of a large gap is how its law was written down.
+CHANNEL_PRECISION = 0.03
+# A rival that needs more parameters than these beyond the chosen effect's, to say the
+# same, is a coincidence: it contains the effect as a special case.
+MORE = 1
+# Two models that differ block by block by more than chance: less than this p-value.
+CHANCE = 0.01
+# A rival that leaves more by more than SAME, by each of two weights, is worse then.
+TOLD_APART = 0.05
+# An effect that does not take off `least_gain` of the whole may do it of one channel,
+# if blocks of time say so together (t) and the channel is above the noise.
+CHANNEL_GAIN, LEAST_T, ABOVE = 0.10, 2.0, 1.3
+# A member of a group stays if it is so many deviations from neutral, and its channel
+# is worse by this share without it; or worse by CHANNEL_GAIN.
+MEMBER_Z, MEMBER_GAIN = 3.0, 0.02
+FEWEST_MEMBERS = 2  # Of a group.
+NEARLY = 0.9  # Of what a group takes off the error: one effect that does it goes first.
+BEYOND = 1.0  # Tolerances over a nuisance's limit that are no chance among dozens.
+FREE = 1e3  # Of its size, how far what is chosen may give way to a candidate.
+# Standard deviations from neutral that an effect must be where what it is differs from
+# one part of the data to the next.
+STEADY = 2.0
+# Joints that get a value of their own, at most; and how many are fitted for each.
+MOST_OWN, OWN_TRIES = 8, 3
+PAIRED = 10  # Candidates of which all pairs are tried against a single one.
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """One effect as chosen. before, after: held-out error without and with it."""
+
+    effect: Effect
+    std: dict[str, float]
+    before: float
+    after: float
+    runner_up: str
+    margin: float
+    ties: tuple[Effect, ...]
+    fixed: tuple[str, ...]
+    size: int
+    in_group: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """The chosen effects, in the order added. start: with no effect; end: with all.
+    nuisances: as weighed at the end. beyond: those that would go beyond their limit,
+    and how far, in tolerances; far: whether all together are implausible."""
+
+    choices: tuple[Choice, ...]
+    start: Fitted
+    end: Fitted
+    nuisances: Nuisances
+    table: tuple[Considered, ...] = ()
+    beyond: tuple[tuple[str, float], ...] = ()
+    far: bool = False
+
+    def screen(self, problem: GapProblem) -> Screen:
+        """As the end was fitted with."""
+        n, scale = self.nuisances, max(self.end.fit.train, 1.0) * problem.correlation
+        return Screen(self.end.r, n.columns, n.prior, problem.train(), scale, n.reach)
+
+    def effects(self) -> list[Effect]:
+        return [c.effect for c in self.choices]
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """Candidates that were added at once, with their exact fit."""
+
+    fitted: Fitted
+    chosen: tuple[Choice, ...]
+
+
+def select(
+    problem: GapProblem, say: Callable[[str], None] = lambda text: None
+) -> Selection:
+    """Greedy forward selection with a refit of all after each addition; then whatever
+    is not needed any more is dropped."""
+    return _Search(problem, say).run()
+
+
+def without(problem: GapProblem, selection: Selection, effect: Effect) -> Selection:
+    """A selection less the effect of that kind and place, all others fitted again."""
+    rest = [
+        c for c in selection.choices
+        if (c.effect.kind, list(c.effect.at)) != (effect.kind, list(effect.at))
+    ]  # fmt: skip
+    fitted = fit_effects(
+        problem, selection.screen(problem), [c.effect for c in rest],
+        [c.fixed for c in rest],
+    )  # fmt: skip
+    return replace(selection, choices=tuple(_refreshed(rest, fitted)), end=fitted)
+
+
+class _Search:
+    def __init__(self, problem: GapProblem, say: Callable[[str], None]):
+        self.problem, self.say, self.plan = problem, say, problem.plan
+        self.train = problem.train()
+        self.nuisances = problem.nuisances()
+        self.start = fit_effects(problem, self._screen(problem.base()), ())
+        self.channel = problem.channel_of_rows()
+
+    def run(self) -> Selection:
+        problem = self.problem
+        current, chosen = self.start, list[Choice]()
+        table: list[Considered] = []
+        for _ in range(self.plan.most_effects):  # A group counts as one.
+            if not self._needs_more(current):
+                break
+            found = problem.candidates(self.nuisances, current)
+            step, rows = self._forward(found, chosen, current)
+            table = table or rows
+            if step is None:
+                break
+            chosen += step.chosen
+            current = self._settled(chosen, step.fitted)
+            chosen = _refreshed(chosen, current)  # The next are fitted from here.
+            if problem.reweigh(current.left):
+                # Less is left than was taken for the least: all is weighed by that.
+                self.nuisances = problem.nuisances()
+                self.start = fit_effects(problem, self._screen(problem.base()), ())
+                current = self._refitted(chosen, current)
+                chosen = _refreshed(chosen, current)
+        if self.plan.own_values and chosen:
+            chosen, current = self._with_own_values(chosen, current)
+        chosen, current = self._backward(chosen, current)
+        chosen, current = self._simplified(chosen, current)
+        while chosen:  # At last, against what all of them leave.
+            current = self._refitted(chosen, current)
+            chosen = _refreshed(chosen, current)
+            sure = [c for c in chosen if is_significant(c)]
+            if len(sure) == len(chosen):
+                # Then the least steady one, if parts of the data contradict it.
+                off = steady(problem, current)
+                k = int(np.argmin(off))
+                if not off[k] < STEADY:
+                    break
+                sure = [*chosen[:k], *chosen[k + 1 :]]
+            chosen = sure
+        else:
+            current = self.start
+        if chosen:
+            chosen = [
+                replace(c, ties=self._still_tied(chosen, current, k))
+                for k, c in enumerate(chosen)
+            ]
+        beyond = self._beyond(current)
+        far = bool(beyond) or not is_plausible(current.b, self.nuisances.prior)
+        return Selection(
+            tuple(chosen), self.start, current, self.nuisances, tuple(table),
+            beyond, far,
+        )  # fmt: skip
+
+    # ----- What is asked again and again
+
+    def _screen(
+        self, r: np.ndarray, scale: float = 1.0, reach: float | None = None, slopes=None
+    ) -> Screen:
+        """Nuisances are weighed against what is left, and by how many rows of it are
+        independent. reach: another limit than theirs. slopes (m, k): columns that are
+        free beside them."""
+        n = self.nuisances
+        scale = max(scale, 1.0) * self.problem.correlation
+        limit = n.reach if reach is None else reach
+        columns, prior = n.columns, n.prior
+        if slopes is not None and slopes.shape[1]:
+            columns = np.hstack([columns, slopes])
+            prior = np.append(prior, np.full(slopes.shape[1], FREE))
+        return Screen(r, columns, prior, self.train, scale, limit)
+
+    def _needs_more(self, fitted: Fitted) -> bool:
+        """Whether held-out rows are worse than noise, or the background is beyond what
+        its tolerance allows."""
+        far = not is_plausible(fitted.b, self.nuisances.prior)
+        loud = self.problem.noise_error(fitted.left) > FLOOR
+        loud |= self.problem.loudest(fitted)[1] > LOUD
+        return loud or far or bool(self._beyond(fitted))
+
+    def _beyond(self, fitted: Fitted) -> tuple[tuple[str, float], ...]:
+        """Nuisances that would go clearly beyond their limit if they could, and how
+        far, in tolerances; none where that would not gain what an effect must gain."""
+        n = self.nuisances
+        screen = self._screen(fitted.r, fitted.fit.train)
+        off = screen.wanted(fitted.r)
+        beyond = tuple(
+            (name, float(x))
+            for name, x in zip(n.names, off, strict=True)
+            if abs(x) > n.reach + BEYOND
+        )
+        if not beyond:
+            return ()
+        free = self._screen(fitted.r, fitted.fit.train, np.inf)
+        left, freed = (each.settle(fitted.r)[1] for each in (screen, free))
+        a, b = (self._error(each.judge(fitted.r).score) for each in (screen, free))
+        gained = b < (1.0 - self.plan.least_gain) * a
+        return beyond if self._earns(left, freed, gained) else ()
+
+    def _error(self, score: float) -> float:
+        """A held-out error as far as it tells models apart."""
+        blur = PRECISION * self.start.score
+        return float(np.hypot(max(score, self.plan.least_error), blur))
+
+    def _refitted(self, chosen: Sequence[Choice], current: Fitted) -> Fitted:
+        screen = self._screen(current.r, current.fit.train)
+        effects = [c.effect for c in chosen]
+        return fit_effects(self.problem, screen, effects, [c.fixed for c in chosen])
+
+    def _earns(self, without: np.ndarray, with_: np.ndarray, pooled: bool) -> bool:
+        """Whether what an effect takes off residuals (m,) is worth it: of the whole, or
+        of one channel while no chance does it."""
+        if pooled:
+            return True
+        if not self.plan.by_channel:
+            return False
+        gain = self._channel_gains(without, with_)
+        t = paired_t(without, with_, self.train, self.channel)
+        return bool(len(gain)) and max(gain.values()) >= CHANNEL_GAIN and t > LEAST_T
+
+    def _channel_gains(self, without, with_, above=ABOVE) -> dict[int, float]:
+        """Of each channel above so many times the noise, the share that is taken off
+        its held-out error, as far as laws are told apart."""
+        held = ~self.train
+        noisy = self.problem.in_noise(without)
+        found = {}
+        for k in np.unique(self.channel):
+            mine = held & (self.channel == k)
+            if not mine.any() or rms(noisy[mine]) < above:
+                continue
+            blur = CHANNEL_PRECISION * rms(self.start.left[mine])
+            a, b = (
+                np.hypot(rms(without[mine]), blur),
+                np.hypot(rms(with_[mine]), blur),
+            )
+            found[int(k)] = 1.0 - b / a
+        return found
+
+    # ----- Forward
+
+    def _forward(
+        self, found: Sequence[Candidate], chosen: Sequence[Choice], current: Fitted
+    ) -> tuple[_Step | None, list[Considered]]:
+        taken = {(c.effect.kind, tuple(c.effect.at)) for c in chosen}
+        open_ = [
+            c for c in found if (c.kind, c.at) not in taken or KINDS[c.kind].several
+        ]
+        open_ += _groups(open_)
+        # With what is chosen free to give way, as far as slopes tell.
+        slopes = np.zeros((len(current.r), 0))
+        if chosen and not self.plan.jumps:
+            slopes = tangents(self.problem, current, [c.fixed for c in chosen])
+        wide = self._screen(current.r, slopes=slopes)
+        ranked = [r for r in rank(wide, open_) if r.valid]
+        if not ranked:
+            return None, []
+        # What even the best leaves is no noise: nuisances are weighed against it.
+        scale = 1.0
+        for _ in range(2):
+            best = max(ranked[0].fit.train, 1.0)
+            if best < 1.2 * scale and scale < 1.2 * best:
+                break
+            scale = best
+            wide = self._screen(current.r, scale, slopes=slopes)
+            ranked = [r for r in rank(wide, open_) if r.valid]
+        screen = self._screen(current.r, scale)
+        base = screen.judge(current.r)
+        ranked = self._pruned(wide, ranked)
+        table = [
+            Considered(
+                r.candidate.kind, tuple(r.candidate.at),
+                r.fit.score / max(base.score, 1e-12), dict(r.effects[0].parameters),
+            )
+            for r in ranked[:15]
+        ]  # fmt: skip
+        short = _shortlist(ranked, base.score, self.plan.shortlist)
+        if not self.plan.by_channel and ranked[0].fit.score > 0.95 * base.score:
+            short = []
+        if not short:
+            return None, table
+        sound = self._fit_each(screen, chosen, short)
+        for _ in range(2 if len(self.nuisances.prior) else 0):
+            least = min((f.fit.train for f, _ in sound), default=scale)
+            if not max(least, 1.0) < 0.8 * scale:
+                break
+            # Exactly fitted less is left: nuisances are weighed against that.
+            scale = max(least, 1.0)
+            screen = self._screen(current.r, scale)
+            base = screen.judge(current.r)
+            sound = self._fit_each(screen, chosen, [r for _, r in sound], sound)
+        if not sound:
+            return None, table
+        pick = self._picked(sound, found, base.score)
+        pair = self._pair(wide, screen, chosen, ranked, *sound[pick])
+        if pair is not None:
+            sound.append(pair)
+            pick = len(sound) - 1
+        left = screen.settle(current.r)[1]
+        least = (1.0 - self.plan.least_gain) * self._error(base.score)
+        worth = [self._earns(left, f.left, self._error(f.score) < least)
+                 for f, _ in sound]  # fmt: skip
+        if not worth[pick]:
+            # The simplest of those that do as well on the whole may do it by a little
+            # everywhere, where another does it at the joint that it acts on.
+            earning = [each for each, earns in zip(sound, worth, strict=True) if earns]
+            if not earning:
+                return None, table
+            taken_one = earning[self._picked(earning, found, base.score)]
+            pick = next(k for k, each in enumerate(sound) if each is taken_one)
+        return self._step(sound, pick, chosen, base.score, left), table
+
+    def _picked(self, sound, found: Sequence[Candidate], base: float) -> int:
+        """The simplest of those that do as well as the best."""
+        errors = [self._error(f.score) for f, _ in sound]
+        pick = simplest(errors, [_weight(r.candidate) for _, r in sound], SAME)
+        fit, best = sound[pick]
+        # Before a group, one effect that does nearly all that the group does with no
+        # more parameters: what it leaves is looked for next.
+        most = base - NEARLY * (base - fit.score)
+        alone = [
+            k for k, (f, r) in enumerate(sound)
+            if not r.candidate.members
+            and r.candidate.size <= best.candidate.size
+            and f.score <= most
+        ]  # fmt: skip
+        if best.candidate.members and alone:
+            pick = min(alone, key=lambda k: errors[k])
+            fit, best = sound[pick]
+        order = {id(c): k for k, c in enumerate(found)}
+        # Bodies whose origins coincide: the outermost, as loads and forces mostly are.
+        # The others are told as ties.
+        for k, (other, r) in enumerate(sound):
+            one, two = r.candidate, best.candidate
+            same = (one.kind, one.size) == (two.kind, two.size) and not one.members
+            if same and self._error(other.score) <= 1.002 * self._error(fit.score):
+                if order.get(id(one), -1) > order.get(id(two), -1):
+                    pick, fit, best = k, other, r
+        # A model inside a bigger one stays unless the bigger gains clearly.
+        for k, (inner, r) in enumerate(sound):
+            inside = r.candidate.kind in KINDS[best.candidate.kind].contains
+            near = self._error(inner.score) <= (1.0 + NESTED_GAIN) * self._error(
+                fit.score
+            )
+            if inside and near and r.candidate.at == best.candidate.at:
+                return k
+        return pick
+
+    def _pair(
+        self, wide, screen, chosen, ranked: Sequence[Ranked], single: Fitted, of: Ranked
+    ):
+        """Two other effects at once where they leave clearly less than the best single
+        one: what two do together another kind may imitate better than either of them.
+        Two of which it is one, if they leave least, are found step by step."""
+        if self.plan.jumps or self.problem.noise_error(single.left) < FLOOR:
+            return None
+        best: dict[str, Ranked] = {}
+        own = of.candidate.kind
+        for r in ranked:
+            if not r.candidate.members:
+                best.setdefault(r.candidate.kind, r)
+        tried = list(best.values())[:PAIRED]
+        trials = []
+        for a, b in itertools.combinations(tried, 2):
+            X = np.hstack([a.columns, b.columns])
+            fit = wide.fit(X)
+            k = a.columns.shape[1]
+            effects = (
+                *a.candidate.effects(a.alternative, fit.c[:k]),
+                *b.candidate.effects(b.alternative, fit.c[k:]),
+            )
+            if a.candidate.is_sane(effects[:1]) and b.candidate.is_sane(effects[1:]):
+                trials.append((fit.score, a, b, effects))
+        trials.sort(key=lambda t: t[0])
+        for score, a, b, effects in trials[:2]:
+            if any(k == own or own in KINDS[k].contains for k in
+                   (a.candidate.kind, b.candidate.kind)):  # fmt: skip
+                break  # The single one with another is as good or better.
+            if not self._error(score) < (1.0 - NESTED_GAIN) * self._error(single.score):
+                break
+            both = Candidate(
+                f"{a.candidate.kind} and {b.candidate.kind}",
+                (*a.candidate.at, *b.candidate.at),
+                a.candidate.size + b.candidate.size,
+                (np.hstack([a.columns, b.columns]),), (),
+                members=(a.candidate, b.candidate),
+            )  # fmt: skip
+            found = self._fit_each(
+                screen, chosen,
+                [Ranked(both, screen.fit(both.columns[0]), effects, True, 0)],
+            )  # fmt: skip
+            for fitted, r in found:
+                less = (1.0 - NESTED_GAIN) * self._error(single.score)
+                if self._error(fitted.score) < less:
+                    return fitted, r
+        return None
+
+    def _step(self, sound, pick: int, chosen, base: float, before) -> _Step:
+        """Args: base, before (m,): error and residual without it."""
+        fit, best = sound[pick]
+        others = [(f, r) for k, (f, r) in enumerate(sound) if k != pick]
+        runner = min(others, key=lambda o: o[0].score, default=None)
+        ties = () if best.candidate.members else self._ties(fit, best, others, before)
+        new = fit.effects[len(chosen) :]
+        sizes = [len(fit.std[len(chosen) + k]) for k in range(len(new))]
+        if len(new) == 1:
+            sizes = [best.candidate.size]
+        fixed = best.fixed()
+        together = len(new) > 1 and len({e.kind for e in new}) == 1
+        return _Step(
+            fit,
+            tuple(
+                Choice(
+                    effect, {}, base, fit.score,
+                    runner[1].candidate.name if runner else "",
+                    runner[0].score / fit.score - 1.0 if runner else np.inf,
+                    ties, fixed[k], sizes[k], together,
+                )
+                for k, effect in enumerate(new)
+            ),
+        )  # fmt: skip
+
+    def _ties(self, fit: Fitted, best: Ranked, others, before) -> tuple[Effect, ...]:
+        """Of another kind, or of the same at another place.
+
+        Args: before (m,): what is left without the effect.
+        """
+        error, floor = self._error, self.plan.least_error
+        ties = []
+        # Where it helps most a rival must do so too, not by a little everywhere.
+        gains = self._channel_gains(before, fit.left) if self.plan.by_channel else {}
+        most = max(gains, key=lambda k: gains[k], default=None)
+        for f, r in others:
+            if r.candidate.members:
+                continue
+            if best.candidate.kind in KINDS[r.candidate.kind].contains:
+                continue
+            if r.candidate.size > best.candidate.size + MORE or not _is_used(f):
+                continue
+            if r.candidate.kind == best.candidate.kind and self.problem.is_one_place(
+                r.candidate.at, best.candidate.at
+            ):
+                continue
+            alike = (
+                paired(f.left, fit.left, self.train) > CHANCE
+                or max(f.score, fit.score) < floor
+            )
+            near = error(f.score) <= (1.0 + SAME) * error(fit.score)
+            if near and alike and self._is_worse(f, fit):
+                continue
+            if most is not None:
+                there = self._channel_gains(before, f.left)[most]
+                near &= 1.0 - there <= (1.0 + SAME) * (1.0 - gains[most])
+            if near and alike:
+                ties.append(f.effects[-1])
+        return tuple(ties)
+
+    def _is_worse(self, rival: Fitted, fit: Fitted) -> bool:
+        """Whether a rival that seems as good is clearly worse, below the noise too, by
+        the weights of either model."""
+        screen = self._screen(fit.r, fit.fit.train)
+        pairs = self.problem.weighed_alike(rival.effects, fit.effects)
+        for worse, better in pairs:
+            a, b = (self._blurred(screen.judge(r).score) for r in (worse, better))
+            one, two = (screen.settle(r)[1] for r in (worse, better))
+            if a <= (1.0 + SAME) * b or paired(one, two, self.train) > TOLD_APART:
+                return False
+        return bool(pairs)
+
+    def _blurred(self, score: float) -> float:
+        return float(np.hypot(score, PRECISION * self.start.score))
+
+    def _fit_each(
+        self, screen: Screen, chosen, short: Sequence[Ranked], known=()
+    ) -> list[tuple[Fitted, Ranked]]:
+        """Each of the short list with what is chosen already; those that make sense.
+
+        Args: known: fits of the same, from where to go on.
+        """
+        sound = []
+        for k, each in enumerate(short):
+            trial = [*[c.effect for c in chosen], *each.effects]
+            if known:
+                trial = list(known[k][0].effects)
+            fixed = [*[c.fixed for c in chosen], *each.fixed()]
+            try:
+                fit = fit_effects(self.problem, screen, trial, fixed)
+            except ValueError:
+                continue
+            self.say(f"  {each.candidate.name}: {fit.score:.3g}")
+            if _is_fit(fit, each, len(chosen)):
+                sound.append((fit, each))
+        if known or not self.plan.jumps:
+            return sound
+        # The best few once more, without slopes: else one whose fit got stuck loses.
+        best = sorted(range(len(sound)), key=lambda k: sound[k][0].score)[:FINALISTS]
+        for k in best if sound and sound[best[0]][0].score > FLOOR else []:
+            fit, each = sound[k]
+            fixed = [*[c.fixed for c in chosen], *each.fixed()]
+            try:
+                effects = derivative_free_search(
+                    self.problem, screen, fit.effects, fixed, most=FINALIST_RUNS
+                )
+                better = fit_effects(self.problem, screen, effects, fixed)
+            except ValueError:
+                continue
+            if better.fit.train < fit.fit.train and _is_fit(better, each, len(chosen)):
+                sound[k] = better, each
+                self.say(f"  {each.candidate.name}: {better.score:.3g}")
+        return sound
+
+    def _pruned(self, screen: Screen, ranked: list[Ranked]) -> list[Ranked]:
+        """Groups without the members that do not earn their place; those that are then
+        smaller than a group are none."""
+        out = []
+        for each in ranked:
+            if each.candidate.members:
+                smaller = self._prune(screen, each)
+                if smaller is not None:
+                    out.append(smaller)
+            else:
+                out.append(each)
+        return sorted(out, key=lambda r: r.fit.score)
+
+    def _prune(self, screen: Screen, group: Ranked) -> Ranked | None:
+        members = list(group.candidate.members)
+        held = ~self.train
+
+        def fit_of(some):
+            X = np.hstack([m.columns[0] for m in some])
+            fit = screen.fit(X)
+            return X, fit, screen.r - X @ fit.c
+
+        while len(members) >= 2:
+            X, fit, r = fit_of(members)
+            left = screen.settle(r)[1]
+            z = np.abs(fit.c) / np.maximum(fit.c_std, 1e-300)
+            effects = [m.effects(0, fit.c[[k]])[0] for k, m in enumerate(members)]
+            bad = [k for k, m in enumerate(members) if not m.is_sane([effects[k]])]
+            order = bad or np.argsort(z).tolist()
+            for k in order:
+                rest = members[:k] + members[k + 1 :]
+                if k in bad:
+                    members = rest
+                    break
+                without = screen.settle(fit_of(rest)[2])[1]
+                gains = [
+                    1.0 - rms(left[mine]) / max(rms(without[mine]), 1e-12)
+                    for c in np.unique(self.channel)
+                    if (mine := held & (self.channel == c)).any()
+                ]
+                least = MEMBER_GAIN if z[k] >= MEMBER_Z else CHANNEL_GAIN
+                if max(gains, default=0.0) < least:
+                    members = rest
+                    break
+            else:
+                break
+        if len(members) < 2:
+            return None
+        X, fit, _ = fit_of(members)
+        candidate = replace(
+            group.candidate,
+            at=tuple(at for m in members for at in m.at),
+            size=len(members),
+            columns=(X,),
+            members=tuple(members),
+        )
+        found = candidate.effects(0, fit.c)
+        sane = candidate.is_sane(found)
+        return Ranked(candidate, fit, found, sane, 0) if sane else None
+
+    # ----- After a step
+
+    def _settled(self, chosen: Sequence[Choice], current: Fitted) -> Fitted:
+        """A fit that was stopped short, as all of a short list are, carried on: what it
+        has not reached yet would be looked for in other effects."""
+        fixed = [c.fixed for c in chosen]
+        steps = 2 * self.plan.evaluations
+        for far in (False, True) if self.plan.jumps else (False,):
+            if not self._needs_more(current):
+                break
+            screen = self._screen(current.r, current.fit.train)
+            effects = current.effects
+            if self.plan.jumps:
+                effects = derivative_free_search(
+                    self.problem, screen, effects, fixed, far
+                )
+            more = fit_effects(self.problem, screen, effects, fixed, steps)
+            if more.fit.train < current.fit.train:
+                current = more
+        return current
+
+    def _with_own_values(self, chosen: Sequence[Choice], current: Fitted):
+        """Values that joints share become one of its own for a joint, where that earns
+        its place as an effect does; the joint that gains most first."""
+        problem, chosen = self.problem, list(chosen)
+        for _ in range(MOST_OWN):
+            screen = self._screen(current.r, current.fit.train)
+            now, left = screen.judge(current.r), screen.settle(current.r)[1]
+            shared = np.stack(
+                [problem.column(current.effects, i, name, current.r)
+                 for i, name in current.names], axis=1,
+            )  # fmt: skip
+            tried = []
+            for k in range(len(chosen)):
+                own = problem.own_values(current.effects, k, current.r)
+                for joint, column in own.items():
+                    X = np.hstack([shared, column[:, None]])
+                    tried.append((screen.fit(X).score, k, joint, own))
+            for score, k, joint, own in sorted(tried, key=lambda t: t[0])[:OWN_TRIES]:
+                if not score < now.score:
+                    break
+                effect, choice = current.effects[k], chosen[k]
+                parts = [
+                    Effect(effect.kind, [j for j in own if j != joint],
+                           dict(effect.parameters)),
+                    Effect(effect.kind, [joint], dict(effect.parameters)),
+                ]  # fmt: skip
+                trial = [*current.effects[:k], *parts, *current.effects[k + 1 :]]
+                split = [*chosen[:k], choice, choice, *chosen[k + 1 :]]
+                fixed = [c.fixed for c in split]
+                try:
+                    fit = fit_effects(problem, screen, trial, fixed)
+                except ValueError:
+                    continue
+                self.say(f"  {effect.kind} at {joint} of its own: {fit.score:.3g}")
+                pooled = self._error(fit.score) < (1.0 - self.plan.least_gain) * (
+                    self._error(now.score)
+                )
+                if all(map(is_sane, fit.effects)) and self._earns(
+                    left, fit.left, pooled
+                ):
+                    chosen, current = _refreshed(split, fit), fit
+                    break
+            else:
+                break
+        return chosen, current
+
+    def _still_tied(self, chosen, current: Fitted, k: int) -> tuple[Effect, ...]:
+        """Rivals of an effect that do as well as it among all the others."""
+        if len(chosen) < 2:
+            return chosen[k].ties
+        screen = self._screen(current.r, current.fit.train)
+        fixed = [c.fixed for c in chosen]
+        tied = []
+        for rival in chosen[k].ties:
+            trial = [*current.effects[:k], rival, *current.effects[k + 1 :]]
+            held = [*fixed[:k], (), *fixed[k + 1 :]]
+            try:
+                fit = fit_effects(self.problem, screen, trial, held)
+            except ValueError:
+                continue
+            near = self._error(fit.score) <= (1.0 + SAME) * self._error(current.score)
+            alike = paired(fit.left, current.left, self.train) > CHANCE
+            if near and alike and not self._is_worse(fit, current):
+                tied.append(fit.effects[k])
+        return tuple(tied)
+
+    def _backward(self, chosen: list[Choice], current: Fitted):
+        """Drops effects without which the error hardly grows, the least needed
+        first."""
+        while len(chosen) > 1:
+            screen = self._screen(current.r, current.fit.train)
+            now = screen.judge(current.r)
+            left = screen.settle(current.r)[1]
+            needless: list[tuple[float, int, Fitted]] = []
+            for k in range(len(chosen)):
+                rest = [e for i, e in enumerate(current.effects) if i != k]
+                fixed = [c.fixed for i, c in enumerate(chosen) if i != k]
+                try:
+                    smaller = fit_effects(self.problem, screen, rest, fixed, 5)
+                except ValueError:  # What is left would be no scene.
+                    continue
+                least = (1.0 - self.plan.least_gain) * self._error(smaller.score)
+                pooled = self._error(now.score) < least
+                if not self._stays(chosen[k], smaller.left, left, pooled):
+                    needless.append((smaller.score, k, smaller))
+            if not needless:
+                break
+            _, k, current = min(needless, key=lambda each: each[0])
+            chosen = [c for i, c in enumerate(chosen) if i != k]
+        return chosen, current
+
+    def _simplified(self, chosen: list[Choice], current: Fitted):
+        """A kind that contains others gives way to one of them that does as well among
+        all that was chosen: others may have taken what it was needed for."""
+        taken = {(c.effect.kind, tuple(c.effect.at)) for c in chosen}
+        open_: Sequence[Candidate] = ()
+        if any(KINDS[c.effect.kind].contains for c in chosen):
+            open_ = self.problem.candidates(self.nuisances, current)
+        for k, choice in enumerate(chosen):
+            inner = [
+                c for c in open_
+                if c.kind in KINDS[choice.effect.kind].contains
+                and list(c.at) == list(choice.effect.at)
+                and (c.kind, c.at) not in taken
+            ]  # fmt: skip
+            found = [x for c in inner if (x := self._instead(c, k, chosen, current))]
+            if not found:
+                continue
+            fit, ranked = min(found, key=lambda x: x[0].score)
+            least = (1.0 - NESTED_GAIN) * self._error(fit.score)
+            if self._earns(fit.left, current.left, self._error(current.score) < least):
+                continue
+            chosen = [*chosen]
+            chosen[k] = replace(
+                choice, effect=fit.effects[k], ties=(), fixed=ranked.candidate.fixed,
+                size=ranked.candidate.size,
+            )  # fmt: skip
+            current = fit
+            chosen = _refreshed(chosen, current)
+        return chosen, current
+
+    def _instead(
+        self, candidate: Candidate, k: int, chosen: Sequence[Choice], current: Fitted
+    ) -> tuple[Fitted, Ranked] | None:
+        """All that was chosen, with a candidate in place of the k-th."""
+        rest = [*current.effects[:k], *current.effects[k + 1 :]]
+        fixed = [c.fixed for c in chosen]
+        fixed[k] = candidate.fixed
+        try:
+            without = self.problem.residual(rest)
+            screen = self._screen(without, current.fit.train)
+            [ranked] = rank(screen, [candidate])
+            trial = [*current.effects[:k], *ranked.effects, *current.effects[k + 1 :]]
+            fit = fit_effects(self.problem, screen, trial, fixed)
+        except (ValueError, RuntimeError):
+            return None
+        sane = candidate.is_sane(fit.effects[k : k + 1])
+        return (fit, ranked) if sane and np.isfinite(fit.score) else None
+
+    def _stays(self, choice: Choice, without, with_, pooled: bool) -> bool:
+        if self._earns(without, with_, pooled):
+            return True
+        if not self.plan.by_channel or not choice.in_group:
+            return False
+        # One of a group, of which the others were seen.
+        gains = self._channel_gains(without, with_, 0.0)
+        return max(gains.values(), default=0.0) >= MEMBER_GAIN and _is_sure(choice)
+
+
+def _refreshed(chosen: Sequence[Choice], fitted: Fitted) -> list[Choice]:
+    """The choices with the parameters of a fit of all of them."""
+    return [
+        replace(c, effect=effect, std=std, after=fitted.score if k == len(chosen) - 1
+                else c.after)
+        for k, (c, effect, std) in enumerate(
+            zip(chosen, fitted.effects, fitted.std, strict=True)
+        )
+    ]  # fmt: skip
+
+
+def _groups(found: Sequence[Candidate]) -> list[Candidate]:
+    """Each kind with one parameter at all of its joints or channels at once."""
+    by_kind: dict[str, list[Candidate]] = {}
+    for c in found:
+        place = KINDS[c.kind].at
+        single = len(c.columns) == 1 and c.columns[0].shape[1] == 1 and len(c.at) == 1
+        single = single and "." in c.at[0]  # Not all joints of a model, with one value.
+        if (
+            place in ("joint", "actuator", "channel", "drive")
+            and single
+            and not c.fixed
+        ):
+            by_kind.setdefault(c.kind, []).append(c)
+    return [
+        Candidate(
+            kind, tuple(m.at[0] for m in members), len(members),
+            (np.hstack([m.columns[0] for m in members]),), (), members=tuple(members),
+        )
+        for kind, members in by_kind.items()
+        if len(members) >= FEWEST_MEMBERS
+    ]  # fmt: skip
+
+
+def _weight(candidate: Candidate) -> int:
+    """What a candidate counts where the simplest is taken: twice its parameters. A kind
+    some of whose parameters are left at neutral counts little less than all of it."""
+    all_of_them = candidate.size + len(candidate.fixed)
+    return 2 * all_of_them - bool(candidate.fixed)
+
+
+def _is_fit(fit: Fitted, of: Ranked, first: int) -> bool:
+    """Whether a fit of a candidate came to something that can be."""
+    sane = of.candidate.is_sane(fit.effects[first:])
+    return bool(np.isfinite(fit.score)) and sane
+
+
+def is_significant(choice: Choice) -> bool:
+    """Whether an effect is told from none: the parameters that make it one are off
+    neutral by more than their deviation, within what the kind can be, and no interval
+    of them is infinite; and so are half of all."""
+    kind = KINDS[choice.effect.kind]
+    clear, some, wide, n = 0, 0, 0, 0
+    for each in kind.parameters:
+        value = choice.effect.parameters.get(each.name)
+        spread = choice.std.get(each.name)
+        if value is None or spread is None or each.name in choice.fixed:
+            continue
+        if each.neutral is None and each.valid == ">= 0" and value == 0.0:
+            continue  # At its limit it is as good as fixed, and has no interval.
+        n += 1
+        infinite = not spread < each.high - each.low
+        wide += infinite
+        if each.neutral is not None:
+            some += 1
+            clear += abs(value - each.neutral) > spread and not infinite
+    return 2 * wide < max(n, 1) and (clear > 0 or some == 0)
+
+
+def _is_sure(choice: Choice) -> bool:
+    """Whether a parameter is clearly off its neutral value."""
+    return any(
+        abs(choice.effect.parameters[p.name] - p.neutral) > MEMBER_Z * spread
+        for p in KINDS[choice.effect.kind].parameters
+        if p.neutral is not None and (spread := choice.std.get(p.name, np.inf)) < np.inf
+    )
+
+
+def _is_used(fit: Fitted) -> bool:
+    """Whether each parameter of the last effect tells: else it is another, smaller
+    effect under its name."""
+    last, std = fit.effects[-1], fit.std[-1]
+    for each in KINDS[last.kind].parameters:
+        if each.neutral is not None and each.name in std:
+            off = abs(last.parameters[each.name] - each.neutral)
+            if not off > 2.0 * std[each.name]:
+                return False
+    return True
+
+
+def _shortlist(ranked: list[Ranked], base: float, most: int) -> list[Ranked]:
+    """Those worth an exact fit: near the best, at most two of a kind and size, or all
+    places that do alike; and of each kind that the catalogue says to be confused with
+    the best, the best place."""
+    if not ranked:
+        return []
+    best = ranked[0].fit.score
+    short: list[Ranked] = []
+    for each in ranked:
+        like = [
+            r for r in short
+            if (r.candidate.kind, r.candidate.size, bool(r.candidate.members))
+            == (each.candidate.kind, each.candidate.size, bool(each.candidate.members))
+        ]  # fmt: skip
+        near = each.fit.score < max(1.6 * best, best + 0.15 * (base - best))
+        alike = like and each.fit.score <= 1.02 * like[0].fit.score
+        if near and len(like) < (4 if alike else 2) and len(short) < most:
+            short.append(each)
+    there = {r.candidate.kind for r in short}
+    first = ranked[0].candidate.kind
+    for each in ranked:
+        kind = each.candidate.kind
+        alike = kind in KINDS[first].confused_with or first in KINDS[kind].confused_with
+        if alike and kind not in there:
+            short.append(each)
+            there.add(kind)
+    # A bigger kind is compared with those inside it, which may rank far below others.
+    known = {id(r) for r in short}
+    for each in [*short]:
+        for r in ranked:
+            inside = r.candidate.kind in KINDS[each.candidate.kind].contains
+            if inside and r.candidate.at == each.candidate.at and id(r) not in known:
+                short.append(r)
+                known.add(id(r))
+    return short

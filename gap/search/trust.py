@@ -1,0 +1,170 @@
+"""What each fitted parameter would be on parts of the data, and from other starts."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from makebreak.gap.numerics.selection import Screen, random_effects
+from makebreak.gap.problem import Fitted, GapProblem
+from makebreak.gap.result import Trust
+from makebreak.gap.search.fit import fit_effects
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect
+
+PARTS = 5  # Stretches of time of a recording.
+FEWEST_PARTS = 4  # Of which a scatter is taken.
+STARTS = (0.5, 1.6)  # Of each parameter's distance from neutral.
+RIDGE = 0.98  # Two parameters whose errors go together like this: their sum shows.
+
+
+def trust_in(
+    problem: GapProblem, screen: Screen, fitted: Fitted, fixed: Sequence[Sequence[str]]
+) -> list[Trust]:
+    """Each parameter of `fitted` over recordings, stretches of time and starts.
+
+    Args: screen: as it was fitted with; fixed: parameters that stay as they are.
+    """
+    if not fitted.names:
+        return []
+    J, r = _data_rows(problem, fitted)
+    value = _values(fitted)
+    recording, stretches_of = _parts(problem)
+    by_recording = {
+        int(k): value + gauss_newton(J, r, recording == k) for k in np.unique(recording)
+    }
+    stretches = [value + gauss_newton(J, r, some) for some in stretches_of]
+    starts = [_from_elsewhere(problem, screen, fitted, fixed, s) for s in STARTS]
+    ridge = ridges(fitted.J)
+    found = []
+    for k, (i, name) in enumerate(fitted.names):
+        effect = fitted.effects[i]
+        other = ""
+        if ridge[k] >= 0:
+            j, its = fitted.names[ridge[k]]
+            other = f"{its} of {_called(fitted.effects[j])}"
+        found.append(
+            Trust(
+                effect.kind, tuple(effect.at), name,
+                KINDS[effect.kind].parameter(name).unit, float(value[k]),
+                fitted.std[i].get(name, 0.0),
+                {
+                    problem.recordings[number].name: float(of[k])
+                    for number, of in by_recording.items()
+                },
+                tuple(float(of[k]) for of in stretches),
+                tuple(float(of[i][name]) for of in starts if of is not None),
+                other,
+            )
+        )  # fmt: skip
+    return found
+
+
+def steady(problem: GapProblem, fitted: Fitted) -> list[float]:
+    """Of each effect, by how many standard deviations it is off neutral if what it is
+    on parts of the data (recordings; stretches of time where there are few) differs
+    from part to part by more than noise: its surest parameter's. What imitates another
+    law is one thing here and another there. Infinite where parts say nothing."""
+    sure = [np.inf] * len(fitted.effects)
+    if not fitted.names:
+        return sure
+    J, r = _data_rows(problem, fitted)
+    recording, parts = _parts(problem)
+    several = np.unique(recording)
+    if len(several) >= FEWEST_PARTS:
+        parts = [recording == k for k in several]
+    value = _values(fitted)
+    x = np.array([value + gauss_newton(J, r, some) for some in parts])
+    variance = np.array([_variances(J, r, some) for some in parts])
+    found: dict[int, float] = {}
+    for k, (i, name) in enumerate(fitted.names):
+        neutral = KINDS[fitted.effects[i].kind].parameter(name).neutral
+        there = np.isfinite(x[:, k]) & np.isfinite(variance[:, k])
+        if neutral is None or there.sum() < FEWEST_PARTS:
+            continue
+        mean, std = random_effects(x[there, k], variance[there, k])
+        off = abs(mean - neutral) / std
+        found[i] = max(found.get(i, 0.0), off)
+    return [found.get(i, off) for i, off in enumerate(sure)]
+
+
+def _data_rows(problem: GapProblem, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
+    """J (m, k) and r (m,) of the rows that were fitted, without the nuisances'."""
+    n = int(problem.train().sum())
+    return fitted.J[:n], fitted.rows[:n]
+
+
+def _values(fitted: Fitted) -> np.ndarray:
+    return np.array([fitted.effects[i].parameters[p] for i, p in fitted.names])
+
+
+def _parts(problem: GapProblem) -> tuple[np.ndarray, list[np.ndarray]]:
+    """(m,) the recording of each fitted row, and the rows (m,) of each stretch."""
+    train = problem.train()
+    recording, block = problem.parts()[train], problem.blocks()[train]
+    stretches = np.array_split(np.unique(block), PARTS)
+    return recording, [np.isin(block, some) for some in stretches if len(some)]
+
+
+def _variances(J: np.ndarray, r: np.ndarray, some: np.ndarray) -> np.ndarray:
+    """(k,) of the step that gauss_newton takes; NaN where it takes none."""
+    out = np.full(J.shape[1], np.nan)
+    step = gauss_newton(J, r, some)
+    shown = np.isfinite(step)
+    if shown.any():
+        A = J[some][:, shown]
+        left = r[some] + A @ step[shown]
+        size = np.linalg.norm(A, axis=0)
+        C = np.linalg.pinv((A / size).T @ (A / size), rcond=1e-12, hermitian=True)
+        out[shown] = np.diag(C) / size**2 * max(float(np.mean(left**2)), 1.0)
+    return out
+
+
+def gauss_newton(J: np.ndarray, r: np.ndarray, some: np.ndarray) -> np.ndarray:
+    """(k,) by which parameters change if only some (m,) of the rows r (m,), J (m, k)
+    are fitted; NaN where those do not show a parameter."""
+    step = np.full(J.shape[1], np.nan)
+    size = np.linalg.norm(J[some], axis=0)
+    shown = size > 1e-3 * np.linalg.norm(J, axis=0) * np.sqrt(np.mean(some))
+    if shown.any():
+        A = J[some][:, shown] / size[shown]
+        step[shown] = -np.linalg.lstsq(A, r[some], rcond=1e-8)[0] / size[shown]
+    return step
+
+
+def ridges(J: np.ndarray) -> np.ndarray:
+    """(k,) of each parameter the other with which its errors go together so closely
+    that only a sum of the two shows; -1 where there is none. J (m, k)."""
+    k = J.shape[1]
+    size = np.linalg.norm(J, axis=0)
+    size[size == 0.0] = 1.0
+    A = J / size
+    C = np.linalg.pinv(A.T @ A, rcond=1e-14, hermitian=True)
+    std = np.sqrt(np.maximum(np.diag(C), 1e-300))
+    R = np.abs(C / std[:, None] / std) - np.eye(k)
+    # A truncated direction has no variance in the inverse: it is a ridge all the same.
+    R = np.maximum(R, np.abs(A.T @ A) - np.eye(k))
+    out = np.full(k, -1)
+    if k > 1:
+        best = np.argmax(R, axis=1)
+        out = np.where(R[np.arange(k), best] > RIDGE, best, -1)
+    return out
+
+
+def _from_elsewhere(problem, screen, fitted: Fitted, fixed, factor: float):
+    """{parameter: value} of each effect, fitted from other starts; None if refused."""
+    start = []
+    for effect, held in zip(fitted.effects, fixed, strict=True):
+        p = dict(effect.parameters)
+        for each in KINDS[effect.kind].parameters:
+            if each.name in p and each.name not in held and each.neutral is not None:
+                p[each.name] = each.neutral + factor * (p[each.name] - each.neutral)
+        start.append(Effect(effect.kind, list(effect.at), p))
+    try:
+        again = fit_effects(problem, screen, start, fixed)
+    except ValueError:
+        return None
+    return [e.parameters for e in again.effects]
+
+
+def _called(effect: Effect) -> str:
+    return f"{effect.kind} at {', '.join(effect.at)}"

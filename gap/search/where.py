@@ -1,0 +1,189 @@
+"""Where a scene and its recordings disagree: channel, time, and what went on there."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from makebreak.gap.data.recording import unit_of
+from makebreak.gap.numerics.selection import benjamini_hochberg
+from makebreak.gap.residuals.inverse import REST_SPEED, InverseModel
+from makebreak.gap.result import Unexplained, Where
+from makebreak.models.effects.kind import full_name, one_dof_joints
+
+FALSE_RATE = 0.01  # Share of the windows told that may stand out by chance.
+ALLOWED = 1.3  # What estimates of noise may be off by.
+MOST = 300
+ALIKE = 2.0  # Neighbours are told as one if what happened, and how much, is alike.
+
+
+def where_in_motion(model: InverseModel, left: np.ndarray) -> list[Where]:
+    """Stretches of half a second in which a joint's equation, or another channel, is
+    not met.
+
+    Args: left (m,) the residual over its noise, of InverseModel's rows.
+    """
+    names = model.names()
+    R = left.reshape(-1, len(names))
+    units = {
+        full_name(model.dynamics.plant, joint): (
+            "m/s" if joint.type_name() == "prismatic" else "rad/s"
+        )
+        for joint in one_dof_joints(model.dynamics.plant)
+    }
+    found, p = [], []
+    first = 0
+    for track in model.tracks:
+        n = len(track.bumps.centre)
+        rows = R[first : first + n]
+        first += n
+        stretch = ((track.bumps.centre - track.time[0]) / 0.5).astype(int)
+        _, v = model._qv(track)
+        for number in np.unique(stretch):
+            mine = np.flatnonzero(stretch == number)
+            half = 0.5 * track.bumps.width
+            a = float(track.bumps.centre[mine[0]] - half)
+            b = float(track.bumps.centre[mine[-1]] + half)
+            here = (track.middle >= a) & (track.middle <= b)
+            for k, (what, joint) in enumerate(names):
+                e = rows[mine, k] / ALLOWED
+                # Neighbouring bumps share half of their samples.
+                df = max(0.7 * len(mine), 1.0)
+                p.append(float(chi2.sf(np.sum(e**2) * df / len(mine), df)))
+                region = _moving(v[here, model.joints.index(joint)], units[joint])
+                channel = f"{joint}.{'effort' if what == 'effort' else what}"
+                score = float(np.sqrt(np.mean(rows[mine, k] ** 2)))
+                found.append(
+                    Where(channel, a, b, track.episode, track.recording, region, score)
+                )
+    return _merged(found, benjamini_hochberg(p, FALSE_RATE))
+
+
+def where_in_windows(model: Any, errors: Sequence[np.ndarray]) -> list[Where]:
+    """Windows whose end is not where the scene would have it."""
+    found, p = [], []
+    for w, e in zip(model.windows, errors, strict=True):
+        if not len(e):
+            continue
+        recording = model.recordings[w.recording]
+        time = recording.time[w.rows]
+        for c, channel in enumerate(model.channels):
+            score = float(np.sqrt(np.mean(e[:, c] ** 2)))
+            # The samples of a window err together: they count as three.
+            p.append(float(chi2.sf(3.0 * (score / ALLOWED) ** 2, 3.0)))
+            region = _moving(*_rate(channel, recording[channel][w.rows], time))
+            found.append(
+                Where(
+                    channel, float(time[0]), float(time[-1]), w.episode,
+                    recording.name, region, score,
+                )
+            )  # fmt: skip
+    return _merged(found, benjamini_hochberg(p, FALSE_RATE))
+
+
+def unexplained(model: InverseModel, left: np.ndarray, least: float = 2.0):
+    """What is left of each joint's equation, and what it goes with."""
+    names = model.names()
+    R = left.reshape(-1, len(names))
+    features: dict[str, np.ndarray] = {}
+    q: list[np.ndarray] = []
+    v: list[np.ndarray] = []
+    a: list[np.ndarray] = []
+    u: list[np.ndarray] = []
+    t: list[np.ndarray] = []
+    for track in model.tracks:
+        m = model.motion(track)
+        mean = track.bumps.mean
+        for into, value in ((q, m.q), (v, m.v), (a, m.vd), (u, m.effort)):
+            into.append(mean(value))
+        t.append(track.bumps.centre)
+    for i, joint in enumerate(model.joints):
+        features[f"the position of {joint}"] = np.concatenate(q)[:, i]
+        features[f"the velocity of {joint}"] = np.concatenate(v)[:, i]
+        features[f"the acceleration of {joint}"] = np.concatenate(a)[:, i]
+        features[f"the effort of {joint}"] = np.concatenate(u)[:, i]
+    features["time"] = np.concatenate(t)
+    out = []
+    for k, (what, joint) in enumerate(names):
+        size = float(np.sqrt(np.mean(R[:, k] ** 2)))
+        if size < least:
+            continue
+        shares = {n: _explained_share(x, R[:, k]) for n, x in features.items()}
+        best = max(shares, key=lambda n: shares[n])
+        text = (
+            f"{best} (it explains {shares[best]:.0%} of its variance)"
+            if shares[best] > 0.2
+            else "nothing that is measured"
+        )
+        out.append(Unexplained(f"{joint}.{what}", "everywhere", size, text))
+    return sorted(out, key=lambda each: -each.size)
+
+
+def _explained_share(x, y, bins: int = 12) -> float:
+    """Share of y's variance between bins of x, less what chance gives."""
+    if np.std(x) == 0.0 or np.std(y) == 0.0:
+        return 0.0
+    edges = np.quantile(x, np.linspace(0, 1, bins + 1)[1:-1])
+    group = np.searchsorted(edges, x)
+    within = 0.0
+    for g in range(bins):
+        part = y[group == g]
+        if len(part):
+            within += np.sum((part - part.mean()) ** 2)
+    n = len(y)
+    return float(1.0 - within / (n - bins) / np.var(y, ddof=1)) if n > bins else 0.0
+
+
+def _rate(channel: str, y: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, str]:
+    """How fast what a channel measures changes, and the unit."""
+    quantity = channel.rsplit(".", 1)[1]
+    unit = unit_of(quantity)
+    if unit.endswith("/s"):
+        return y, unit
+    return np.gradient(y, time), "1/s" if unit == "1" else f"{unit}/s"
+
+
+def _moving(v: np.ndarray, unit: str) -> str:
+    v = v[np.isfinite(v)]
+    if not len(v) or np.mean(np.abs(v) < REST_SPEED) > 0.5:
+        return "at rest"
+    fastest = np.abs(v).max()
+    turning = v.min() < -0.02 * fastest and v.max() > 0.02 * fastest
+    how = "reversing" if turning else "moving"
+    return f"{how}, up to {fastest:.2g} {unit}"
+
+
+def _merged(found: list[Where], stands_out: np.ndarray) -> list[Where]:
+    """Those that stand out, neighbours of a channel as one, the strongest first."""
+    groups: dict[tuple, list[Where]] = {}
+    for each, is_out in zip(found, stands_out, strict=True):
+        if is_out:
+            key = (each.recording, each.episode, each.channel)
+            groups.setdefault(key, []).append(each)
+    out: list[Where] = []
+    for group in groups.values():
+        run: list[Where] = []
+        for window in sorted(group, key=lambda w: w.from_s):
+            if run and not _alike(run[-1], window):
+                out.append(_one(run))
+                run = []
+            run.append(window)
+        if run:
+            out.append(_one(run))
+    return sorted(out, key=lambda w: -w.score)[:MOST]
+
+
+def _alike(a: Where, b: Where) -> bool:
+    """Whether b, which starts later, goes on where a ends."""
+    same = a.region.split(",")[0] == b.region.split(",")[0]
+    near = b.from_s <= a.to_s + 0.01
+    return near and same and 1.0 / ALIKE < a.score / max(b.score, 1e-12) < ALIKE
+
+
+def _one(run: list[Where]) -> Where:
+    top = max(run, key=lambda w: w.score)
+    return Where(
+        top.channel, run[0].from_s, max(w.to_s for w in run), top.episode,
+        top.recording, top.region, top.score,
+    )  # fmt: skip

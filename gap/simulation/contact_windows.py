@@ -1,0 +1,225 @@
+"""Windows through contact, simulated by Drake with the scene's own law.
+
+A window begins where the robot does not touch what it is about to push, and what it
+pushes is at rest: the object's place is then the mean of many samples, and nothing is
+pressed into anything. From the middle of a push a tenth of a millimetre, which noise
+is, would be newtons. Where there is no such start, windows begin as elsewhere.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from makebreak.gap.data.recording import Episode, Recording
+from makebreak.gap.simulation.windows import TURN, Window, WindowModel
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.kind import full_name, one_dof_joints
+from makebreak.models.scene import Scene
+from makebreak.models.scene_schema import COMMANDS_OF, ActuationSection
+from makebreak.systems.numerics.smoother import smooth_filtered
+
+WINDOW_SEC = 0.6  # Reaches into the sliding.
+BEFORE_SEC = 0.04  # It begins so long before the object moves,
+REST_SEC = 0.1  # after as much rest, or more.
+RESTS = 3e-3  # Slower is at rest [m/s], [rad/s] over ten.
+DRAWS = 3  # Of uncertain starts.
+# Laws of contact are approximations: of how far an object moves, and a driven joint.
+BLUR, BLUR_DRIVEN = 0.005, 0.0005
+MOST = 4
+# How fast joints that are led follow their measured motion [rad/s], told so often [s].
+LED_RATE, LED_SEC = 300.0, 1e-3
+
+
+class PushWindows(WindowModel):
+    """Args: episodes: (recording, number) of those that count, else all.
+
+    Raises: ValueError where no window fits in.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        recordings: Sequence[Recording],
+        episodes: set[tuple[int, int]] | None = None,
+    ):
+        self._only = episodes
+        scene, led = led_as_measured(scene, recordings)
+        super().__init__(scene, recordings, WINDOW_SEC, by_episode=True, most=MOST)
+        keep = [
+            k for k, c in enumerate(self.channels)
+            if c.rsplit(".", 1)[0] not in led and varies(recordings, c)
+        ]  # fmt: skip
+        if not keep:
+            raise ValueError("nothing but joints that are led as they were measured")
+        self.channels = [self.channels[k] for k in keep]
+        self.noise = self.noise[keep]
+        self.windows = [replace(w, std=w.std[:, keep]) for w in self.windows]
+        self._add_spread()
+
+    def _given(self, recording: Recording, episode: Episode, i: int):
+        """times and columns of commands: the smoothed motion."""
+        path = self._paths.get((i, episode.first))
+        if path is None:  # No window begins here.
+            return recording.time[episode.rows], {}
+        rows = path["time"]
+        count = int((rows[-1] - rows[0]) / LED_SEC) + 1
+        time = rows[0] + LED_SEC * np.arange(count)
+        columns = {}
+        for joint in self.scene.actuation.joints:
+            if f"{joint}.position" in path:
+                x, v, _ = path[f"{joint}.position"].T
+                now = np.interp(time + 0.5 * LED_SEC, rows, x)
+                columns[f"{joint}.position_command"] = now
+                columns[f"{joint}.velocity_command"] = np.interp(time, rows, v)
+        return time, columns
+
+    def _cut(self, i, recording: Recording, episode: Episode, hop, block, number):
+        if self._only is not None and (i, episode.number) not in self._only:
+            return
+        before = len(self.windows)
+        found = self._from_rest(i, recording, episode)
+        if not found:
+            super()._cut(i, recording, episode, hop, block, number)
+            self.windows[before + 2 :] = []
+            return
+        self.windows += found[:2]
+
+    def _from_rest(self, i, recording: Recording, episode: Episode) -> list[Window]:
+        time = recording.time[episode.rows]
+        if len(time) < 24 or not self.bodies:
+            return []
+        states, spreads = {}, {}
+        for name in self._signals():
+            y = recording[name][episode.rows]
+            channel = recording.channels[name]
+            if np.isfinite(y).sum() < 12:
+                return []
+            s = smooth_filtered(time, y, channel.noise, channel.stages or ())
+            states[name], spreads[name] = s.x, s.P
+        self._paths[i, episode.first] = {"time": time, **states}
+        rests = np.ones(len(time), bool)
+        for body in self.bodies:
+            for a in (*TURN, "x", "y", "z"):
+                if (name := f"{body}.{a}") in states:
+                    limit = RESTS * (10.0 if a in TURN else 1.0)
+                    rests &= np.abs(states[name][:, 1]) < limit
+        # Stretches of rest that end in motion.
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], rests, [0]]).astype(int)))
+        found = []
+        for a, b in zip(edges[::2], edges[1::2], strict=True):
+            if b >= len(time) or time[b] - time[a] < REST_SEC + BEFORE_SEC:
+                continue
+            if a > 0:  # It has come to rest, against what pushed it perhaps.
+                continue
+            k = int(np.searchsorted(time, time[b] - BEFORE_SEC))
+            window = self._window_at(i, recording, episode, time, states, spreads, a, k)
+            if window is not None:
+                found.append(window)
+        return found
+
+    def _window_at(self, i, recording, episode, time, states, spreads, a, k):
+        end = int(np.searchsorted(time, time[k] + self.window_sec, "right"))
+        if end - k < 12 or time[end - 1] - time[k] < 0.5 * self.window_sec:
+            return None
+        state = {n: np.array(x[k]) for n, x in states.items()}
+        spread = {n: np.array(P[k, :2, :2]) for n, P in spreads.items()}
+        for body in self.bodies:
+            for axis in (*TURN, "x", "y", "z"):
+                if (name := f"{body}.{axis}") not in states:
+                    continue
+                y = recording[name][episode.rows][a:k]
+                y = y[np.isfinite(y)]
+                state[name] = np.array([float(np.mean(y)), 0.0, 0.0])
+                var = recording.channels[name].noise ** 2 / len(y)
+                spread[name] = np.diag([var, 1e-12])
+        std = np.empty((end - k, len(self.channels)))
+        std[:] = self.noise
+        return Window(
+            i, episode.number, float(time[k]),
+            slice(episode.first + k, episode.first + end), state, std, True, spread,
+        )  # fmt: skip
+
+    def _add_spread(self) -> None:
+        """Noise, what uncertain starts do in the scene as it is, and a share
+        of how far each channel goes."""
+        rng = np.random.default_rng(0)
+        plain = self.simulate(())
+        wide = [np.zeros_like(y) for y in plain]
+        kept = self.windows
+        try:
+            for _ in range(DRAWS):
+                self.windows = [_drawn(w, rng) for w in kept]
+                for total, y, y0 in zip(wide, self.simulate(()), plain, strict=True):
+                    off = np.minimum((y - y0) ** 2, 1.0)
+                    total += np.where(np.isfinite(off), off, 1.0) / DRAWS
+        finally:
+            self.windows = kept
+        far = np.zeros(len(self.channels))
+        for y in plain:
+            y = np.where(np.isfinite(y), y, np.nanmean(y, axis=0))
+            far = np.maximum(far, np.ptp(y, axis=0))
+        far *= [
+            BLUR_DRIVEN if c.rsplit(".", 1)[0] in self.joints else BLUR
+            for c in self.channels
+        ]
+        self.windows = [
+            replace(w, std=np.sqrt(w.std**2 + v + far**2))
+            for w, v in zip(self.windows, wide, strict=True)
+        ]
+
+
+def varies(recordings: Sequence[Recording], channel: str) -> bool:
+    """Whether a channel is ever other than one value: height and tilt by a camera that
+    sees a plane alone are said, not measured, and no simulation agrees with them to the
+    last digit."""
+    values = np.concatenate([r[channel] for r in recordings])
+    values = values[np.isfinite(values)]
+    return bool(len(values)) and bool(np.ptp(values) > 0.0)
+
+
+def led_as_measured(
+    scene: Scene, recordings: Sequence[Recording]
+) -> tuple[Scene, list[str]]:
+    """The scene with joints led along their measured motion, and these joints, where
+    efforts were measured and no command: with these efforts as an input a robot drifts
+    by their noise, and by what an impact does between two rows. What the joints do is
+    then judged by the equations alone, what objects do in simulation. Else the scene as
+    it is, and none."""
+    act = scene.actuation
+    takes = COMMANDS_OF[act.type]
+    commanded = any(f"{j}.{what}" in r for r in recordings for j in act.joints
+                    for what in takes)  # fmt: skip
+    known = [
+        j for j in act.joints
+        if all(f"{j}.{what}" in r for r in recordings
+               for what in ("position", "effort_measured"))
+    ]  # fmt: skip
+    if commanded or not known or len(known) < len(act.joints):
+        return scene, []
+    plant = SceneDynamics(scene).plant
+    context = plant.CreateDefaultContext()
+    of = {full_name(plant, j): j for j in one_dof_joints(plant)}
+    q = plant.GetPositions(context)
+    for joint in known:
+        y = recordings[0][f"{joint}.position"]
+        q[of[joint].position_start()] = y[np.isfinite(y)][0]
+    plant.SetPositions(context, q)
+    ease = np.diag(np.linalg.inv(plant.CalcMassMatrix(context)))
+    inertia = [1.0 / ease[of[joint].velocity_start()] for joint in known]
+    drive = ActuationSection(
+        "pd", list(known), kp=[float(m * LED_RATE**2) for m in inertia],
+        kd=[float(2.0 * m * LED_RATE) for m in inertia], rate_hz=act.rate_hz,
+    )  # fmt: skip
+    return replace(scene, actuation=drive), known
+
+
+def _drawn(w: Window, rng) -> Window:
+    """The window from another start that its measurements allow."""
+    state = {}
+    for name, x in w.state.items():
+        P = w.spread[name]
+        values, u = np.linalg.eigh(P)
+        state[name] = np.array(x)
+        state[name][:2] += u @ (np.sqrt(np.maximum(values, 0.0)) * rng.normal(size=2))
+    return replace(w, state=state)

@@ -1,0 +1,305 @@
+"""A scene of joints alone, stepped by compiled code and not by Drake."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, PrismaticJoint, RevoluteJoint
+from pydrake.systems.framework import DiagramBuilder
+
+from makebreak.gap.numerics.driven_arm import (
+    EFFORT,
+    LOOP,
+    NO_COMMAND,
+    DrivenArm,
+    rollout,
+)
+from makebreak.gap.simulation.scene_simulation import SceneSimulation
+from makebreak.models.drives import (
+    CHANNEL_STEPS,
+    actuators_of_model,
+    drive_law,
+    path_numbers,
+)
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.actuation_path import (
+    BIAS,
+    GAIN,
+    KP,
+    LIMIT,
+    OWN,
+    SHARE,
+    TIME_CONSTANT,
+    DriveLaw,
+)
+from makebreak.models.effects.kind import (
+    Effect,
+    find_joints,
+    full_name,
+    model_names,
+    one_dof_joints,
+    velocity_unit,
+)
+from makebreak.models.effects.measured_channels import ChannelMap, channel_maps
+from makebreak.models.scene import Scene, load_scene
+from makebreak.models.scene_schema import COMMANDS_OF, as_kind
+from makebreak.systems.numerics.joint_laws import LAWS
+
+_MOST_KEPT = 64  # Plants whose numbers are remembered.
+
+
+class DrivenArmScene:
+    """A scene's joints and drives, read off its plant; effects that do not change the
+    plant change the numbers without another plant.
+
+    Contact is left out. Raises: ValueError where anything moves that is no joint of
+    one degree of freedom, or effects do what is not in DrivenArm.
+    """
+
+    def __init__(self, scene: Scene):
+        self.scene = scene = replace(scene, plant=replace(scene.plant, time_step=0.0))
+        self._plants: dict[tuple, tuple[MultibodyPlant, dict]] = {}
+        self._plant(scene.effects)
+        self.arm(())
+
+    def arm(self, effects: Sequence[Effect]) -> DrivenArm:
+        """Its numbers with these effects, which do not include the scene's own, added.
+
+        Raises: ValueError for effects that the scene cannot have.
+        """
+        every = [as_kind(e) for e in (*self.scene.effects, *effects)]
+        every.sort(key=lambda e: KINDS[e.kind].rank)
+        for effect in every:
+            if not can_have(effect.kind):
+                raise ValueError(f"effect {effect.kind} takes Drake's own steps")
+        plant, body_numbers = self._plant([e for e in every if _in_plant(e.kind)])
+        for effect in every:
+            possible = KINDS[effect.kind].possible
+            if possible is not None:
+                possible(effect, plant, every)
+        return DrivenArm(**body_numbers, **self._drives(plant, every))
+
+    @property
+    def has_shapes(self) -> bool:
+        """Whether there is anything that could touch."""
+        ((plant, _), *_) = self._plants.values()
+        return plant.num_collision_geometries() > 0
+
+    def received(self, told: np.ndarray) -> np.ndarray:
+        """Position commands (..., n) as the drives have them, in whole steps."""
+        return np.where(
+            self._step > 0.0,
+            np.round(told / np.where(self._step > 0.0, self._step, 1.0)) * self._step,
+            told,
+        )
+
+    def _plant(self, effects) -> tuple[MultibodyPlant, dict]:
+        """A plant with these effects, and what of a DrivenArm it decides."""
+        key = tuple(e.key for e in effects)
+        if key not in self._plants:
+            if len(self._plants) >= _MOST_KEPT:
+                self._plants.pop(next(iter(self._plants)))
+            loaded = load_scene(
+                replace(self.scene, effects=list(effects)), DiagramBuilder()
+            )
+            self._plants[key] = loaded.plant, _tree(loaded.plant)
+        return self._plants[key]
+
+    def _drives(self, plant: MultibodyPlant, effects: Sequence[Effect]) -> dict:
+        n, actuation = plant.num_velocities(), self.scene.actuation
+        takes = COMMANDS_OF[actuation.type]
+        driven = np.full(n, NO_COMMAND)
+        law, path = np.zeros((n, 6)), np.zeros((n, 5))
+        law[:, 2] = path[:, 2] = np.inf
+        path[:, 0], most = 1.0, np.full(n, np.inf)
+        self._step = np.zeros(n)
+        slow = np.full(n, 0.005)
+        looped = bool(takes) and "effort_command" not in takes
+        of = {name: i for i, name in enumerate(actuation.joints)}
+        whole = drive_law(actuation) if looped else None
+        offsets = [e for e in effects if KINDS[e.kind].channel == "offset"]
+        names = [f"{name}.position" for name in of]
+        maps = channel_maps(offsets, CHANNEL_STEPS, names)
+        for model in model_names(plant):
+            actuators = actuators_of_model(plant, model)
+            if not actuators:
+                continue
+            numbers, _ = path_numbers(plant, model, effects)
+            for k, actuator in enumerate(actuators):
+                joint = actuator.joint()
+                name, i = full_name(plant, joint), joint.velocity_start()
+                path[i] = numbers[[GAIN, BIAS, LIMIT, TIME_CONSTANT, SHARE], k]
+                slow[i], most[i] = velocity_unit(joint), actuator.effort_limit()
+                if not looped:
+                    driven[i] = EFFORT
+                elif whole is not None and name in of:
+                    driven[i] = LOOP
+                    own: DriveLaw = whole[of[name]]
+                    kp = own.kp if numbers[KP, k] == OWN else numbers[KP, k]
+                    seen = maps.get(f"{name}.position", ChannelMap()).bias
+                    law[i] = kp, own.kd, own.limit, own.emf, own.dead_band, seen
+                    if "position_command" not in takes:
+                        law[i, 0] = 0.0
+                    else:
+                        self._step[i] = own.resolution
+        forces: list[tuple[int, int, list[float]]] = []
+        for effect in effects:
+            kind = KINDS[effect.kind]
+            if kind.joint_law is None or kind.joint_numbers is None:
+                continue
+            for joint in find_joints(effect, plant):
+                p = kind.joint_numbers(effect, plant, joint)
+                number = LAWS.index(kind.joint_law)
+                forces.append((joint.velocity_start(), number, p))
+        law_p = np.zeros((len(forces), 4))
+        for row, (_, _, p) in zip(law_p, forces, strict=True):
+            row[: len(p)] = p
+        return dict(
+            driven=driven, law=law, path=path, slow=slow, most=most,
+            law_joint=np.array([i for i, _, _ in forces], dtype=np.int64),
+            law_kind=np.array([k for _, k, _ in forces], dtype=np.int64),
+            law_p=law_p,
+        )  # fmt: skip
+
+
+class DrivenArmSimulation(SceneSimulation):
+    """As SceneSimulation, by compiled code: some hundred times as fast. A plant with a
+    time step is taken as a continuous one.
+
+    Raises: ValueError as DrivenArmScene.
+    """
+
+    def __init__(self, scene: Scene):
+        self.arms = DrivenArmScene(scene)
+        super().__init__(scene)
+        self.tol = 1e-3
+        self._own = len(scene.effects)
+        self._arm = self.arms.arm(())
+
+    def set_effects(self, effects: Sequence[Effect]) -> None:
+        """The scene's effects from now on, of which the scene's own come first."""
+        own = self.arms.scene.effects
+        if list(effects[: len(own)]) != list(own):
+            raise ValueError("the scene's own effects stay as they are")
+        self._arm = self.arms.arm(effects[len(own) :])
+        self._scene = replace(self._scene, effects=list(effects))
+        self._current = tuple(sorted(effects, key=lambda e: KINDS[e.kind].rank))
+        self._read_effects()
+
+    def _simulate(self, initial, start, needed, is_true, efforts, twists):
+        self.failure = ""
+        plant = self._plant
+        self._set_state(initial, is_true)
+        x = plant.GetPositionsAndVelocities(self._plant_context)
+        n = plant.num_velocities()
+        if not len(needed):
+            return np.zeros((0, 2 * n)), {}
+        events = self._events[
+            (self._events > start + 1e-9) & (self._events < needed[-1])
+        ]
+        times = np.union1d(np.append(needed, start), events)
+        told = np.zeros((len(times) - 1, 2, n))
+        for model, what, delays, table, _ in self._tables:
+            row = 1 if what == "velocity_command" else 0
+            for k, actuator in enumerate(actuators_of_model(plant, model)):
+                i = actuator.joint().velocity_start()
+                if not len(self._command_time):
+                    continue
+                late = times[:-1] - delays[k] + 1e-9
+                at = np.searchsorted(self._command_time, late, "right") - 1
+                told[:, row, i] = table[np.maximum(at, 0), k]
+        told[:, 0] = self.arms.received(told[:, 0])
+        y = np.empty((len(times), 2 * n))
+        y[0] = x
+        y[1:] = rollout(self._arm, x[:n], x[n:], times, told, self.tol)
+        if not np.isfinite(y[-1]).all():
+            self.failure = "steps became too short"
+        return y[np.searchsorted(times, needed - 1e-12)], {}
+
+
+def can_have(kind: str) -> bool:
+    """Whether a DrivenArm can have effects of a kind."""
+    entry = KINDS[kind]
+    return not (entry.hidden_state or entry.body_law or entry.after_finalize)
+
+
+def _in_plant(kind: str) -> bool:
+    entry = KINDS[kind]
+    return not (entry.joint_law or entry.path or entry.channel)
+
+
+def _tree(plant: MultibodyPlant) -> dict:
+    """The joints and links of a plant, as of a DrivenArm.
+
+    Raises: ValueError for anything else that moves, or pulls.
+    """
+    joints = sorted(
+        (j for j in one_dof_joints(plant) if j.num_velocities()),
+        key=lambda j: j.velocity_start(),
+    )
+    n = plant.num_velocities()
+    if len(joints) != n or plant.num_positions() != n:
+        raise ValueError(
+            "expected joints that turn or slide and nothing else that moves"
+        )
+    if not all(isinstance(j, RevoluteJoint | PrismaticJoint) for j in joints):
+        raise ValueError("expected joints that turn or slide")
+    if plant.num_force_elements() > 1:
+        raise ValueError("expected no force elements but gravity")
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, np.zeros(n))
+    carried = {j.child_body().index(): i for i, j in enumerate(joints)}
+    inner = {
+        j.child_body().index(): j.parent_body().index()
+        for j in (plant.get_joint(i) for i in plant.GetJointIndices())
+    }
+
+    def link_of(body) -> int:
+        """The joint that a body moves with; -1 for the world."""
+        while body not in carried:
+            if body not in inner:
+                return -1
+            body = inner[body]
+        return carried[body]
+
+    X_WM = [j.frame_on_child().CalcPoseInWorld(context) for j in joints]
+    parent = np.array([link_of(j.parent_body().index()) for j in joints])
+    if (parent >= np.arange(n)).any():
+        raise ValueError("expected joints in order, from the base outwards")
+    R_PJ, p_PJ, axis = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3))
+    mass, moment, about = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3, 3))
+    for i, joint in enumerate(joints):
+        X = X_WM[i] if parent[i] < 0 else X_WM[parent[i]].inverse() @ X_WM[i]
+        R_PJ[i], p_PJ[i] = X.rotation().matrix(), X.translation()
+        turns = isinstance(joint, RevoluteJoint)
+        a = joint.revolute_axis() if turns else joint.translation_axis()
+        axis[i] = a / np.linalg.norm(a)
+    for k in range(1, plant.num_bodies()):
+        body = plant.get_body(BodyIndex(k))
+        i = link_of(body.index())
+        if i < 0:
+            continue
+        X = X_WM[i].inverse() @ plant.EvalBodyPoseInWorld(context, body)
+        M = body.CalcSpatialInertiaInBodyFrame(context)
+        M = M.ReExpress(X.rotation()).Shift(-X.translation())
+        mass[i] += M.get_mass()
+        moment[i] += M.CalcComMoment()
+        about[i] += M.CalcRotationalInertia().CopyToFullMatrix3()
+    p_com = moment / np.where(mass == 0.0, 1.0, mass)[:, None]
+    for i, c in enumerate(p_com):
+        about[i] -= mass[i] * (c @ c * np.eye(3) - np.outer(c, c))
+    rotor = np.zeros(n)
+    for index in plant.GetJointActuatorIndices():
+        actuator = plant.get_joint_actuator(index)
+        rotor[actuator.joint().velocity_start()] += actuator.calc_reflected_inertia(
+            context
+        )
+    return dict(
+        parent=parent.astype(np.int64),
+        slides=np.array([isinstance(j, PrismaticJoint) for j in joints]),
+        R_PJ=R_PJ, p_PJ=p_PJ, axis=axis, mass=mass, p_com=p_com, I_com=about,
+        rotor=rotor,
+        damping=np.array([j.GetDampingVector(context)[0] for j in joints]),
+        gravity=np.array(plant.gravity_field().gravity_vector()),
+    )  # fmt: skip

@@ -1,0 +1,417 @@
+"""Windows of one free body that flies, bounces, slides or rolls on what is fixed.
+
+A window starts from a state smoothed on one side of an impact, never across it, at the
+row from which the next impact is told best. It ends 0.1 s after that impact: beyond the
+second one all is chaos. How an uncertain start grows through the contact is simulated
+and counts as noise.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from makebreak.gap.data.recording import Episode, Recording
+from makebreak.gap.numerics.free_body import FreeBody, lowest_gap, placed, simulate
+from makebreak.gap.numerics.free_flight import fit_flight, turned_by
+from makebreak.gap.simulation.free_body import FreeBodyScene
+from makebreak.gap.simulation.windows import TURN, WindowedResidual, spin_of
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.kind import Effect
+from makebreak.models.scene import Scene
+from makebreak.systems.numerics.filters import Stage, filtered, mean_delay
+from makebreak.systems.numerics.smoother import smooth_filtered
+
+AFTER_SEC = 0.1  # Of a window after its impact.
+LONG_SEC, LEAST_SEC = 2.0, 0.25  # Windows in which nothing hits: a tilt of 0.01
+# degree moves a ball by 2 mm in 2 s, and by a twentieth of a millimetre in 0.3 s.
+HIT = 20.0  # A faster change of velocity [m/s2] is an impact; gravity's is half of it.
+BESIDE = 3  # Rows beside an impact that a smoothed state would mix with it.
+BLUR = 0.02  # Laws of contact are approximations, which noise alone does not tell.
+DRAWS = 12  # Of uncertain starts.
+ENOUGH = 30  # Windows up to the first impact: then later ones are not needed.
+FEWEST_ROWS, FEWEST_IN_FLIGHT = 8, 6
+FLIES = 1.5  # Times the noise that a fit of free flight may leave, to be one.
+UNEVEN = 0.5  # Of the error of all windows: what is held out must have as much of it.
+NEAR = 2e-3  # [m] So near it is taken to touch.
+DENSE = 4  # Parts of a row's period at which a signal before a filter is simulated.
+_PLACE = ("x", "y", "z")
+_STATE = (*TURN, *_PLACE, "wx", "wy", "wz", "vx", "vy", "vz")
+
+
+@dataclass(frozen=True, eq=False)
+class FreeWindow:
+    """state (7, 3): orientation and place with two derivatives; spread (7, 2, 2): the
+    covariances of the first two. std (n, n_channels) of measured minus simulated."""
+
+    recording: int
+    episode: int
+    start: float  # [s]
+    rows: slice
+    state: np.ndarray
+    spread: np.ndarray
+    std: np.ndarray
+    block: int
+    train: bool  # Every third block is held out.
+    after_hits: int  # Impacts of the episode before it.
+
+
+class FreeBodyModel(WindowedResidual):
+    """Residuals of windows of one free body, as InverseModel gives those of mechanisms.
+
+    Raises: ValueError where scene or recordings hold anything else (FreeBodyScene); the
+        body's x, y and z must be measured.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        recordings: Sequence[Recording],
+        after_sec: float = AFTER_SEC,
+        most: int = 48,
+    ):
+        self.scene, self.recordings = scene, list(recordings)
+        self._numbers = FreeBodyScene(scene)
+        self.name, self._body = self._numbers.name, self._numbers.body()
+        self.bodies, self.joints = [self.name], list[str]()
+        self.dynamics = SceneDynamics(scene)
+        if not all(f"{self.name}.{a}" in r for a in _PLACE for r in recordings):
+            raise ValueError(f"expected x, y and z of {self.name} in all recordings")
+        self._turns = all(f"{self.name}.{a}" in r for a in TURN for r in recordings)
+        if not self._turns and (len(self._body.spheres) > 1 or self._body.com.any()):
+            raise ValueError(f"expected the orientation of {self.name}")
+        self.channels = [
+            c for a in _STATE if all((c := f"{self.name}.{a}") in r for r in recordings)
+        ]
+        self.noise = np.array(
+            [max(r.channels[c].noise for r in recordings) for c in self.channels]
+        )
+        self.noise = np.maximum(self.noise, 1e-9)
+        reach = np.linalg.norm(self._body.spheres[:, :3], axis=1)
+        size = float((reach + self._body.spheres[:, 3]).max())
+        # Errors beyond the body's size, or a radian, say no more than these.
+        self._cap = np.array([self._most(c, size) for c in self.channels])
+        # What recordings say of their sensors.
+        self._filters: list[dict[str, tuple[Stage, ...]]] = [
+            {c: stages for c in self.channels if (stages := r.channels[c].stages)}
+            for r in recordings
+        ]
+        self._after = after_sec
+        self.windows: list[FreeWindow] = []
+        number = 0
+        total = sum(len(r.episodes) for r in recordings)
+        for i, recording in enumerate(recordings):
+            for episode in recording.episodes:
+                self._cut(i, recording, episode, number if total >= 6 else None)
+                number += 1
+        first = [w for w in self.windows if w.after_hits == 0]
+        if len(first) >= ENOUGH and len(first) < len(self.windows):
+            self.windows = first  # Later ones start from states that are less sure.
+        if len(self.windows) > most:  # Those before and at early impacts say most.
+            order = np.argsort([w.after_hits for w in self.windows], kind="stable")
+            self.windows = [self.windows[k] for k in sorted(order[:most])]
+        if not self.windows:
+            raise ValueError(
+                f"no episode holds {FEWEST_ROWS} samples of {self.name} between impacts"
+            )
+        self._seen = [self._measured(w) for w in self.windows]
+        self._add_spread()
+        self.runs = 0
+        self._share_out()
+        self.window_sec = float(
+            np.median([recordings[w.recording].time[w.rows][-1] - w.start
+                       for w in self.windows])
+        )  # fmt: skip
+
+    def _most(self, channel: str, size: float) -> float:
+        what = channel.rsplit(".", 1)[-1]
+        if what in _PLACE:
+            return size
+        return 0.5 if what in TURN else (20.0 * size if what[0] == "v" else 20.0)
+
+    @property
+    def body(self) -> FreeBody:
+        """The scene's, without further effects."""
+        return self._body
+
+    # ----- Cutting
+
+    def _signals(self) -> list[str]:
+        turns = TURN if self._turns else ()
+        return [f"{self.name}.{a}" for a in (*turns, *_PLACE)]
+
+    def _cut(self, i: int, recording: Recording, episode: Episode, number) -> None:
+        time = recording.time[episode.rows]
+        values = {n: recording[n][episode.rows] for n in self._signals()}
+        if any(np.isfinite(y).sum() < FEWEST_ROWS for y in values.values()):
+            return
+        rough = np.zeros(len(time), bool)
+        for a in _PLACE:
+            c = f"{self.name}.{a}"
+            stages = recording.channels[c].stages or ()
+            s = smooth_filtered(time, values[c], recording.channels[c].noise, stages)
+            rough |= np.abs(s.x[:, 2]) > HIT
+        hit = np.flatnonzero(rough)
+        near = np.zeros(len(time), bool)
+        late = max(mean_delay(recording.channels[c].stages or ()) for c in values)
+        for k in hit:  # What a filter remembers of it is gone after a while.
+            gone = int(np.searchsorted(time, time[k] + 4.0 * late))
+            near[max(k - BESIDE, 0) : gone + BESIDE + 1] = True
+        edges = np.flatnonzero(np.diff(np.concatenate([[1], near, [1]]).astype(int)))
+        for a, b in zip(edges[::2], edges[1::2], strict=True):
+            before = int(np.sum(np.diff(rough[:a].astype(int), prepend=0) == 1))
+            self._cut_segment(
+                i, recording, episode, time, values, a, b, rough, number, before
+            )
+
+    def _cut_segment(
+        self, i, recording, episode, time, values, a, b, rough, number, before
+    ):
+        before_hit = b < len(time) and rough[b : b + BESIDE + 1].any()
+        may_fly = before_hit and not self._filters[i]
+        rows = min(np.isfinite(y[a:b]).sum() for y in values.values())
+        if rows < (FEWEST_IN_FLIGHT if may_fly else FEWEST_ROWS):
+            return
+        n = b - a
+        states = np.zeros((n, 7, 3))
+        spreads = np.zeros((n, 7, 2, 2))
+        states[:, 0, 0] = 1.0
+        for k, name in enumerate((*TURN, *_PLACE)):
+            c = f"{self.name}.{name}"
+            if c in values:
+                stages = recording.channels[c].stages or ()
+                noise = recording.channels[c].noise
+                s = smooth_filtered(time[a:b], values[c][a:b], noise, stages)
+                states[:, k], spreads[:, k] = s.x, s.P[:, :2, :2]
+                # Where the acceleration jumps (it comes to rest, say) a smoothed state
+                # is wrong by more than it knows.
+                row, beside = np.arange(n), 4
+                late = s.x[np.minimum(row + beside, n - 1), 2]
+                jump = np.abs(late - s.x[np.maximum(row - beside, 0), 2])
+                reach = beside * float(np.median(np.diff(time[a:b])))
+                spreads[:, k, 1, 1] += (0.25 * jump * reach) ** 2
+                spreads[:, k, 0, 0] += (0.06 * jump * reach**2) ** 2
+        flies = may_fly and self._fly(recording, time[a:b], values, a, states, spreads)
+        if rows < FEWEST_ROWS and not flies:
+            return
+        spans = []
+        if before_hit:
+            first = b + int(np.argmax(rough[b:]))
+            end = int(np.searchsorted(time, time[first] + self._after, "right"))
+            spans.append((a, b, time[first], min(end, len(time))))
+        if time[b - 1] - time[a] >= LEAST_SEC:
+            starts = np.arange(time[a], time[b - 1] - LEAST_SEC, LONG_SEC)
+            for t in starts:
+                k = int(np.searchsorted(time, t))
+                end = min(int(np.searchsorted(time, t + LONG_SEC, "right")), b)
+                late = min(int(np.searchsorted(time, t + 0.15)), end)
+                spans.append((k, max(late, k + 1), time[end - 1], end))
+        for k0, k1, aim, end in spans:
+            tau = aim - time[k0:k1]
+            P = spreads[k0 - a : k1 - a, 4:]
+            wide = np.sum(
+                P[:, :, 0, 0]
+                + 2 * tau[:, None] * P[:, :, 0, 1]
+                + tau[:, None] ** 2 * P[:, :, 1, 1],
+                axis=1,
+            )
+            # A vague start's round-off may leave a covariance that is none.
+            sound = (P[..., 0, 0] > 0.0) & (
+                P[..., 0, 0] * P[..., 1, 1] > P[..., 0, 1] ** 2
+            )
+            wide = np.where(sound.all(axis=1), wide, np.inf)
+            k = k0 + int(np.argmin(wide))
+            if end - k < 4:
+                continue
+            block = len(self.windows) if number is None else number
+            self.windows.append(
+                FreeWindow(
+                    i, episode.number, float(time[k]),
+                    slice(episode.first + k, episode.first + end), states[k - a],
+                    spreads[k - a], np.zeros(0), block, block % 3 != 1, before,
+                )
+            )  # fmt: skip
+
+    def _fly(self, recording, time, values, first: int, states, spreads) -> bool:
+        """Where nothing is touched before an impact, the states (n, 7, 3) and their
+        covariances (n, 7, 2, 2) that all poses of the flight together tell. Returns:
+        whether they are of a flight."""
+        signals = [f"{self.name}.{a}" for a in (*TURN, *_PLACE)]
+        n = len(time)
+        pose, noise = np.full((n, 7), np.nan), np.ones(7)
+        for k, c in enumerate(signals):
+            if c in values:
+                pose[:, k] = values[c][first : first + n]
+                noise[k] = recording.channels[c].noise
+        if not self._turns:
+            pose[:, :4] = [1.0, 0.0, 0.0, 0.0]
+        at = [lowest_gap(self._body, x) for x in pose[np.isfinite(pose).all(axis=1)]]
+        if np.mean(np.array(at) < NEAR) > 0.5:  # It slides or rolls.
+            return False
+        q, dq = states[n // 2, :4, 0], states[n // 2, :4, 1]
+        q = q / np.linalg.norm(q)
+        guess = np.concatenate(
+            [states[0, :4, 0], states[0, 4:, 0], spin_of(q, dq - q * (q @ dq)),
+             states[n // 2, 4:, 1]]
+        )  # fmt: skip
+        guess[12] -= self._body.gravity[2] * (time[n // 2] - time[0])
+        flight = fit_flight(self._body, time, pose, noise, guess)
+        if flight is None or flight.rms > FLIES:
+            return False
+        path, covariance = flight.path(self._body, time - time[0])
+        if not np.isfinite(path).all() or not np.isfinite(covariance).all():
+            return False
+        covariance *= max(flight.rms, 1.0) ** 2
+        for k, (x, C) in enumerate(zip(path, covariance, strict=True)):
+            states[k, 4:] = np.stack([x[4:7], x[10:], self._body.gravity], axis=1)
+            for i in range(3):
+                of = np.ix_([3 + i, 9 + i], [3 + i, 9 + i])
+                spreads[k, 4 + i] = C[of]
+            if self._turns:
+                x[:4] *= np.sign(x[:4] @ states[k, :4, 0])
+                states[k, :4, 0], states[k, :4, 1] = x[:4], turned_by(x[:4], x[7:10])
+                G = np.stack([turned_by(x[:4], e) for e in np.eye(3)], axis=1)
+                both = np.zeros((8, 6))
+                both[:4, :3] = both[4:, 3:] = G
+                P = both @ C[np.ix_([0, 1, 2, 6, 7, 8], [0, 1, 2, 6, 7, 8])] @ both.T
+                for i in range(4):
+                    spreads[k, i] = P[np.ix_([i, 4 + i], [i, 4 + i])]
+        return True
+
+    def _measured(self, w: FreeWindow) -> np.ndarray:
+        recording = self.recordings[w.recording]
+        return np.stack([recording[c][w.rows] for c in self.channels], axis=1)
+
+    def _add_spread(self) -> None:
+        """Noise, and what uncertain starts do in the scene as it is."""
+        rng = np.random.default_rng(0)
+        plain = [self._simulate(self._body, w, w.state, 1.0) for w in self.windows]
+        stds = []
+        for w, y in zip(self.windows, plain, strict=True):
+            wide = np.zeros_like(y)
+            roots = [_root(P) for P in w.spread]
+            for _ in range(DRAWS):
+                state = np.array(w.state)
+                for k, L in enumerate(roots):
+                    state[k, :2] += L @ rng.normal(size=2)
+                off = self._simulate(self._body, w, state, 1.0) - y
+                off[~np.isfinite(off)] = 1e3
+                wide += np.minimum(off**2, self._cap**2) / DRAWS
+            stds.append(np.sqrt(self.noise**2 + wide))
+        ones = [np.ones_like(std) for std in stds]
+        off = np.concatenate(self.errors_over(plain, ones))
+        # A gap is not measured to better than a share of itself.
+        place = [k for k, c in enumerate(self.channels) if c[-2:] in (".x", ".y", ".z")]
+        least = BLUR * float(np.sqrt(np.mean(np.sum(off[:, place] ** 2, axis=1))))
+        floor = least * self._cap / self._cap[place[0]]
+        self.windows = [
+            replace(w, std=np.sqrt(std**2 + floor**2))
+            for w, std in zip(self.windows, stds, strict=True)
+        ]
+
+    def _share_out(self) -> None:
+        """Other blocks are held out if those that are hold next to nothing of the gap:
+        then they could not tell any two models apart."""
+        off = self.errors(self.simulate())
+        size = np.array([np.mean(e**2) for e in off])
+        third = np.array([w.block % 3 for w in self.windows])
+
+        def held(k: int) -> float:
+            return (
+                float(np.sqrt(size[third == k].mean())) if (third == k).any() else 0.0
+            )
+
+        whole = float(np.sqrt(size.mean()))
+        if held(1) >= UNEVEN * whole or not (third == 1).any():
+            return
+        best = min(range(3), key=lambda k: abs(np.log((held(k) + 1e-9) / whole)))
+        if (third != best).any():
+            self.windows = [replace(w, train=w.block % 3 != best) for w in self.windows]
+
+    # ----- Simulating
+
+    def _simulate(
+        self, body: FreeBody, w: FreeWindow, state, length: float
+    ) -> np.ndarray:
+        """(n, n_channels) of a window."""
+        q = state[:4, 0] / np.linalg.norm(state[:4, 0])
+        dq = state[:4, 1] - q * (q @ state[:4, 1])
+        place, velocity = state[4:, 0] / length, state[4:, 1] / length
+        spin = spin_of(q, dq)
+        if not self._turns:
+            radius = body.spheres[0, 3]
+            if lowest_gap(body, np.concatenate([q, place])) < 0.03 * radius:
+                spin = np.array([-velocity[1], velocity[0], 0.0]) / radius
+        times = self.recordings[w.recording].time[w.rows]
+        filters = self._filters[w.recording]
+        n = DENSE if filters and len(times) > 1 else 1
+        rows = np.arange(len(times))
+        dense = np.interp(np.arange(n * (len(times) - 1) + 1) / n, rows, times)
+        x = simulate(body, np.concatenate([q, place, spin, velocity]), dense)
+        x[:, 4:7] *= length
+        x[:, 10:] *= length
+        columns = [_STATE.index(c.rsplit(".", 1)[-1]) for c in self.channels]
+        y = x[:, columns]
+        for k, channel in enumerate(self.channels):
+            if channel in filters and n > 1:
+                y[:, k] = filtered(filters[channel], dense, y[:, k])
+        return y[::n]
+
+    def simulate(self, effects: Sequence[Effect] = ()) -> list[np.ndarray]:
+        """(n, n_channels) of each window, in the scene with these effects added."""
+        body = self._numbers.body(effects) if effects else self._body
+        length = 1.0
+        for e in (*self.scene.effects, *effects):
+            if e.kind == "length_scale" and {
+                "world", self.name, self.name.split(".")[0],
+            } & set(e.at):  # fmt: skip
+                length *= e.parameters["scale"]
+        self.runs += 1
+        each = [self._simulate(body, w, w.state, length) for w in self.windows]
+        return [np.where(np.isnan(y), np.inf, y) for y in each]
+
+    def errors(self, simulated: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """(measured - simulated)/std of each window, no more than the cap; 0 where
+        nothing was measured."""
+        return self.errors_over(simulated, [w.std for w in self.windows])
+
+    def errors_over(
+        self, simulated: Sequence[np.ndarray], stds: Sequence[np.ndarray]
+    ) -> list[np.ndarray]:
+        """The same over given deviations."""
+        out = []
+        turn = [k for k, c in enumerate(self.channels) if c.rsplit(".", 1)[1] in TURN]
+        for std, y, seen in zip(stds, simulated, self._seen, strict=True):
+            if turn:  # q and -q are one orientation.
+                same = np.sign(np.nansum(y[:, turn] * seen[:, turn], axis=1))
+                y = np.array(y)
+                y[:, turn] *= np.where(same < 0, -1.0, 1.0)[:, None]
+            e = np.where(np.isfinite(y), seen - y, 1e3)
+            e = e / np.sqrt(1.0 + (e / self._cap) ** 2)
+            out.append(np.where(np.isfinite(seen), e / std, 0.0))
+        return out
+
+
+def touched(model: FreeBodyModel) -> np.ndarray:
+    """(n, 2) where in x and y the body's spheres touched what is fixed, as measured."""
+    body, found = model.body, [np.zeros((0, 2))]
+    for w in model.windows:
+        recording = model.recordings[w.recording]
+        pose = np.zeros((w.rows.stop - w.rows.start, 7))
+        pose[:, 0] = 1.0
+        for i, a in enumerate((*TURN, *_PLACE)):
+            if f"{model.name}.{a}" in recording:
+                pose[:, i] = recording[f"{model.name}.{a}"][w.rows]
+        pose = pose[np.isfinite(pose).all(axis=1)]
+        for row in pose[:: max(len(pose) // 20, 1)]:
+            if lowest_gap(body, row) < NEAR:
+                feet = placed(row, body.spheres[:, :3])
+                low = feet[:, 2] - body.spheres[:, 3]
+                found.append(feet[low < low.min() + NEAR, :2])
+    return np.concatenate(found)
+
+
+def _root(P: np.ndarray) -> np.ndarray:
+    """L with L L' = P (2, 2), also where P is singular."""
+    w, u = np.linalg.eigh(P)
+    return u * np.sqrt(np.maximum(w, 0.0))

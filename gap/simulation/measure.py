@@ -1,0 +1,204 @@
+"""The gap before and after, over held-out windows simulated from measured states."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, Protocol
+
+import numpy as np
+
+from makebreak.gap.data.recording import Recording, unit_of
+from makebreak.gap.parallel import side_by_side
+from makebreak.gap.problem import rms
+from makebreak.gap.residuals.inverse import InverseModel
+from makebreak.gap.result import GapMeasure, InUnits, Series
+from makebreak.gap.simulation.windows import Window, WindowModel, seen_in
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect, sliding_joints
+from makebreak.models.effects.transmission import twists
+from makebreak.models.scene import Scene
+
+WINDOW_SEC = 0.3
+# What a perfect model would leave: an error is divided by what the channel's noise and
+# the uncertainty of its window's start give together.
+NOISE_FLOOR = 1.0
+
+
+class Windows(Protocol):
+    """Windows of recordings, simulated: WindowModel, FreeBodyModel."""
+
+    recordings: list[Recording]
+    windows: list[Any]  # Each with recording, episode, rows, train.
+    channels: list[str]
+    noise: np.ndarray
+    window_sec: float
+    dynamics: SceneDynamics
+
+    def errors_over(
+        self, simulated: Sequence[np.ndarray], std: Sequence[np.ndarray]
+    ) -> list[np.ndarray]: ...
+
+
+def measure(
+    scene: Scene,
+    effects: Sequence[Effect],
+    moved: Sequence[Effect],
+    motion: InverseModel,
+    every: bool,
+    jobs: int = 1,
+    skip: Callable[[Window], bool] = lambda window: False,
+) -> tuple[GapMeasure, list[Series]] | None:
+    """Before and after over windows of the recordings that `motion` has; None where no
+    window counts.
+
+    Args: effects: to be added. moved: the background as far as its tolerance lets it,
+        in both, as it is neither the gap nor its cure. motion: what tells how far a
+        joint lags its motor where a window starts. every: all windows, of recordings
+        that are only reported on; else those that were not fitted. skip: windows that
+        count in neither.
+    """
+    model = WindowModel(scene, motion.recordings, WINDOW_SEC, most=240)
+    taken = {(e.kind, tuple(e.at)) for e in effects}
+    moved = [e for e in moved if (e.kind, tuple(e.at)) not in taken]
+    trials = [moved, [*moved, *effects]] if effects else [moved]
+    held = [(every or not w.train) and not skip(w) for w in model.windows]
+    if not any(held):
+        return None
+    lag = _twists(motion, effects)
+    calls = [partial(model.simulate, trial, held, lag) for trial in trials]
+    try:
+        found = list(side_by_side(calls, jobs))
+    except ValueError:  # A link that its background would make impossible.
+        trials = [[], list(effects)]
+        found = [model.simulate(each, held, lag) for each in trials]
+    before, after = found[0], found[-1]
+    gap = gap_measure(model, before, after, held)
+    gap = replace(
+        gap,
+        equations=_equations(motion, trials[0], trials[-1], every),
+    )
+    return gap, series_of(model, before, after, held)
+
+
+def _equations(motion: InverseModel, before, after, every: bool) -> dict[str, InUnits]:
+    """What the model leaves of each joint's effort, in its unit."""
+    rows = np.ones(len(motion.train()), bool) if every else ~motion.train()
+    rows = rows.reshape(-1, len(motion.names()))[:, 0]
+    try:
+        left = [motion.in_units(motion.residual(each)) for each in (before, after)]
+    except ValueError:
+        return {}
+    noise = motion.noise_in_units()
+    slides = sliding_joints(motion.dynamics.plant)
+    return {
+        f"{joint}.effort": InUnits(
+            "N" if joint in slides else "N m", rms(left[0][rows, k]),
+            rms(left[1][rows, k]), rms(noise[rows, k]),
+        )
+        for k, (what, joint) in enumerate(motion.names())
+        if what == "effort"
+    }  # fmt: skip
+
+
+def _twists(motion: InverseModel, effects: Sequence[Effect]):
+    """Function of a window: {joint: (twist, its rate)} at its start, of the motion as
+    measured in the scene as it came. None if nothing twists."""
+    every = (*motion.scene.effects, *effects)
+    hidden = [e for e in every if KINDS[e.kind].hidden_state]
+    if not hidden:
+        return None
+    known: dict[tuple[str, int], list[tuple[np.ndarray, dict]]] = {}
+    for track, each in zip(motion.tracks, motion.motions(), strict=True):
+        of: dict[str, np.ndarray] = {}
+        for effect in hidden:
+            of |= twists(effect, motion.dynamics, each)
+        stretches = known.setdefault((track.recording, track.episode), [])
+        stretches.append((each.time, of))
+
+    def at(window) -> dict[str, tuple[float, float]]:
+        name = motion.recordings[window.recording].name
+        for time, of in known.get((name, window.episode), []):
+            if time[0] - 0.05 <= window.start <= time[-1]:
+                k = int(np.searchsorted(time, window.start))
+                return {j: (float(z[0, k]), float(z[1, k])) for j, z in of.items()}
+        return {}  # Too short a stretch to tell.
+
+    return at
+
+
+def gap_measure(model: Windows, before, after, held: Sequence[bool]) -> GapMeasure:
+    """Args: before, after: what windows simulate without and with effects; held: which
+    windows count. Samples that were not measured, or that one of them does not tell,
+    and windows that one of them does not finish, count in neither."""
+    picked = [k for k, h in enumerate(held) if h]
+    failed = [
+        [bool(np.isinf(each[k]).any()) for k in picked] for each in (before, after)
+    ]
+    whole = [k for k, *f in zip(picked, *failed, strict=True) if not any(f)] or picked
+
+    def of_whole(each) -> np.ndarray:
+        return np.concatenate([each[k] for k in whole])
+
+    both = ~(np.isnan(of_whole(before)) | np.isnan(of_whole(after)))
+    both &= np.isfinite(of_whole([seen_in(model, w) for w in model.windows]))
+    stds = [w.std for w in model.windows]
+    ones = [np.ones_like(std) for std in stds]
+    over = [of_whole(model.errors_over(each, stds)) for each in (before, after)]
+    plain = [of_whole(model.errors_over(each, ones)) for each in (before, after)]
+
+    def rms_of(e: np.ndarray, c) -> float:
+        return rms(e[:, c][both[:, c]])
+
+    everything = slice(None)
+    sliding = sliding_joints(model.dynamics.plant)
+    recordings = model.recordings
+    return GapMeasure(
+        rms_of(over[0], everything), rms_of(over[1], everything), NOISE_FLOOR,
+        model.window_sec,
+        {
+            name: {"before": rms_of(over[0], c), "after": rms_of(over[1], c)}
+            for c, name in enumerate(model.channels)
+        },
+        {
+            name: InUnits(
+                unit_of(name.rsplit(".", 1)[1], name.rsplit(".", 1)[0] in sliding),
+                rms_of(plain[0], c), rms_of(plain[1], c), float(model.noise[c]),
+            )
+            for c, name in enumerate(model.channels)
+        },
+        {}, len(picked), (sum(failed[0]), sum(failed[1])),
+        seconds=float(sum(
+            np.ptp(recordings[w.recording].time[w.rows])
+            for w in (model.windows[k] for k in picked)
+        )),
+    )  # fmt: skip
+
+
+def series_of(
+    model: Windows, before, after, held: Sequence[bool], most: int = 12
+) -> list[Series]:
+    """The channels over the first windows that count."""
+    rows = np.flatnonzero(held)
+    first = model.windows[rows[0]]
+    same = [
+        k for k in rows
+        if (model.windows[k].recording, model.windows[k].episode)
+        == (first.recording, first.episode)
+    ][:most]  # fmt: skip
+    recording = model.recordings[first.recording]
+    time = np.concatenate([recording.time[model.windows[k].rows] for k in same])
+    lengths = [len(before[k]) for k in same]
+    starts = np.cumsum([0, *lengths[:-1]])
+    out = []
+    for c, channel in enumerate(model.channels):
+        seen = [recording[channel][model.windows[k].rows] for k in same]
+        out.append(
+            Series(
+                channel, recording.name, first.episode, time, np.concatenate(seen),
+                np.concatenate([before[k][:, c] for k in same]),
+                np.concatenate([after[k][:, c] for k in same]),
+                starts, float(model.noise[c]),
+            )
+        )  # fmt: skip
+    return out

@@ -1,0 +1,555 @@
+"""Episodes cut into windows that start from measured states, and simulated anew.
+
+A window's first state is smoothed from the positions around it; how uncertain that is
+grows with time in the window and counts as noise. Which windows are held out is fixed
+by their block of time before anything is fitted.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from makebreak.gap.data.recording import Episode, Recording
+from makebreak.gap.residuals.inverse import _lag, _sensing, rotor_before
+from makebreak.gap.simulation.scene_simulation import Commands, SceneSimulation
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
+from makebreak.models.scene import InitialSection, Scene, initial_for
+from makebreak.models.scene_schema import COMMANDS_OF
+from makebreak.systems.numerics.filters import Stage, memory, with_lag
+from makebreak.systems.numerics.smoother import smooth_filtered
+
+_POSITIONS = ("x", "y", "z")
+TURN = ("qw", "qx", "qy", "qz")
+_G = 9.81
+MARGIN_SEC = 0.1  # Before the first window of an episode.
+MEASURED_SEC = 0.005  # Between rows a measured effort is given in steps of this.
+LARGEST = 200.0  # An error beyond so many standard deviations counts as this: after a
+# bounce the other way, how much farther it goes says nothing.
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """rows: of the recording. state: {signal: (value, rate, accel.)} at the start."""
+
+    recording: int
+    episode: int
+    start: float  # [s]
+    rows: slice
+    state: dict[str, np.ndarray]
+    std: np.ndarray  # (n, n_channels) Of a measured sample about the simulated one.
+    train: bool
+    # {signal: (2, 2)} covariance of the state's value and rate.
+    spread: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+class WindowedResidual:
+    """The residual of a model compared window by window, and which of it is
+    fitted: what a fit asks of a model (gap/search/fit.py).
+
+    A model has `channels`, `windows` (each with `rows` and `train`),
+    `simulate(effects)` and `errors(simulated)`, a list of (n, channels) per window.
+    """
+
+    recordings: list[Recording]
+    channels: list[str]
+    windows: Sequence[Any]
+    _base: np.ndarray | None = None
+    _kept: np.ndarray | None = None
+
+    def simulate(self, effects: Sequence[Effect]) -> Sequence[np.ndarray]:
+        raise NotImplementedError
+
+    def errors(self, simulated: Sequence[np.ndarray]) -> list[np.ndarray]:
+        raise NotImplementedError
+
+    def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
+        e = self.errors(self.simulate(effects))
+        return np.concatenate([x.ravel() for x in e])[self.measured()]
+
+    def measured(self) -> np.ndarray:
+        """(n,) which entries of all windows were measured: rows are of these."""
+        if self._kept is None:
+            self._kept = np.concatenate(
+                [np.isfinite(seen_in(self, w)).ravel() for w in self.windows]
+            )
+        return self._kept
+
+    def _by_row(self, of_window: Sequence) -> np.ndarray:
+        """A window's value for each of its rows, (m,)."""
+        k = len(self.channels)
+        each = [
+            np.full((w.rows.stop - w.rows.start) * k, x)
+            for w, x in zip(self.windows, of_window, strict=True)
+        ]
+        return np.concatenate(each)[self.measured()]
+
+    def base(self) -> np.ndarray:
+        if self._base is None:
+            self._base = self.residual()
+        return self._base
+
+    def train(self) -> np.ndarray:
+        return self._by_row([w.train for w in self.windows])
+
+    def blocks(self) -> np.ndarray:
+        """(m,) number of the window of each row."""
+        return self._by_row(range(len(self.windows)))
+
+    def channel_of_rows(self) -> np.ndarray:
+        """(m,) index of the channel of each row."""
+        k = len(self.channels)
+        n = sum(w.rows.stop - w.rows.start for w in self.windows)
+        return np.tile(np.arange(k), n)[self.measured()]
+
+
+def seen_in(model, window) -> np.ndarray:
+    """(n, n_channels) what was measured in a window; NaN where nothing was."""
+    recording = model.recordings[window.recording]
+    return np.stack([recording[c][window.rows] for c in model.channels], axis=1)
+
+
+class WindowModel(WindowedResidual):
+    """Residuals of simulated windows: the same questions as InverseModel answers, for
+    scenes with free bodies and contact, and for judging any scene.
+
+    Args: window_sec, hop_sec: length, and from one start to the next. most: windows at
+        most; a larger number is thinned evenly. simulation: of the scene, if not by
+        Drake's steps.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        recordings: Sequence[Recording],
+        window_sec: float = 0.3,
+        hop_sec: float | None = None,
+        block_sec: float = 1.2,
+        most: int = 400,
+        by_episode: bool = False,
+        simulation: SceneSimulation | None = None,
+    ):
+        self.scene, self.recordings = scene, list(recordings)
+        self.window_sec = window_sec
+        self.simulation = simulation or SceneSimulation(scene)
+        self.dynamics = SceneDynamics(scene)
+        plant = self.dynamics.plant
+        self.joints = [
+            full_name(plant, j)
+            for j in one_dof_joints(plant)
+            if j.num_velocities()
+            and all(f"{full_name(plant, j)}.position" in r for r in recordings)
+        ]
+        self.bodies = [
+            full_name(plant, plant.get_body(i))
+            for i in sorted(plant.GetFloatingBaseBodies())
+            if all(f"{full_name(plant, plant.get_body(i))}.x" in r for r in recordings)
+        ]
+        known = set(self.simulation.channels())
+        self.channels = [
+            name
+            for name in recordings[0].channels
+            if name in known
+            and all(name in r for r in recordings)
+            and not recordings[0].channels[name].is_command
+            and not name.endswith(".effort_measured")
+            and name.rsplit(".", 1)[0] in (*self.joints, *self.bodies)
+        ]
+        if not self.channels:
+            raise ValueError(
+                "no measured channel of the recordings can be simulated: expected "
+                "positions of joints or poses of free bodies"
+            )
+        self.noise = np.array(
+            [max(r.channels[c].noise for r in recordings) for c in self.channels]
+        )
+        self.noise = np.maximum(self.noise, 1e-9)
+        # What recordings say of their sensors.
+        self._filters: list[dict[str, tuple[Stage, ...]]] = [
+            {c: stages for c in self.channels if (stages := r.channels[c].stages)}
+            for r in recordings
+        ]
+        self.windows: list[Window] = []
+        self._paths: dict[tuple[int, int], dict[str, np.ndarray]] = {}
+        number = 0
+        for i, recording in enumerate(recordings):
+            for episode in recording.episodes:
+                self._cut(
+                    i, recording, episode, hop_sec or window_sec, block_sec,
+                    number if by_episode else None,
+                )  # fmt: skip
+                number += 1
+        if len(self.windows) > most:
+            keep = np.unique(np.linspace(0, len(self.windows) - 1, most).astype(int))
+            self.windows = [self.windows[k] for k in keep]
+        if not self.windows:
+            raise ValueError(
+                f"no episode of the recordings holds a window of {window_sec} s"
+            )
+        self._commands = self._all_commands()
+        self.runs = 0
+
+    # ----- Cutting
+
+    def _signals(self) -> list[str]:
+        names = [f"{joint}.position" for joint in self.joints]
+        for body in self.bodies:
+            # x there is; a camera from above, say, sees no height.
+            names += [
+                f"{body}.{axis}" for axis in _POSITIONS
+                if all(f"{body}.{axis}" in r for r in self.recordings)
+            ]  # fmt: skip
+            names += [
+                f"{body}.{q}" for q in TURN
+                if all(f"{body}.{q}" in r for r in self.recordings)
+            ]  # fmt: skip
+        return names
+
+    def _cut(self, i, recording: Recording, episode: Episode, hop, block, number):
+        time = recording.time[episode.rows]
+        if len(time) < 12 or time[-1] - time[0] < 0.6 * self.window_sec:
+            return
+        states, spreads = {}, {}
+        rough = np.zeros(len(time), bool)
+        for name in self._signals():
+            y = recording[name][episode.rows]
+            if np.isfinite(y).sum() < 8:
+                return
+            stages = recording.channels[name].stages or ()
+            s = smooth_filtered(time, y, recording.channels[name].noise, stages)
+            states[name] = s.x
+            spreads[name] = s.P
+            if name.rsplit(".", 1)[0] in self.bodies and name[-2:] in (
+                ".x",
+                ".y",
+                ".z",
+            ):
+                rough |= np.abs(s.x[:, 2]) > 2.0 * _G
+        self._paths[i, episode.first] = {"time": time, **states}
+        if rough.any():  # No start amid an impact, where the smoothed state is a mean.
+            at = np.flatnonzero(rough)
+            for k in at:
+                rough[max(k - 4, 0) : k + 5] = True
+        commands = [recording.held(c.name)[episode.rows] for c in recording.commands()]
+        # At an end a smoothed state is less sure than it knows, and what was commanded
+        # before is not known.
+        margin = min(MARGIN_SEC, 0.1 * (time[-1] - time[0]))
+        start_row = int(np.searchsorted(time, time[0] + margin))
+        while start_row < len(time) - 3:
+            start_row = self._best_start(time, states, start_row)
+            t0 = time[start_row]
+            last = int(np.searchsorted(time, t0 + self.window_sec, "right"))
+            if time[-1] - t0 < 0.6 * self.window_sec:
+                break
+            ok = not rough[start_row] and all(
+                np.isfinite(u[start_row]) for u in commands
+            )
+            if ok:
+                after = time[start_row:last] - t0
+                std = np.empty((last - start_row, len(self.channels)))
+                state = {n: x[start_row] for n, x in states.items()}
+                shaken = self._effort_noise(recording, state)
+                for c, name in enumerate(self.channels):
+                    std[:, c] = self._std(name, c, spreads, start_row, after)
+                    joint, what = name.rsplit(".", 1)
+                    if joint in shaken:  # White noise, integrated once or twice.
+                        t = after**3 / 3.0 if what == "position" else after
+                        std[:, c] = np.sqrt(std[:, c] ** 2 + shaken[joint] * t)
+                block_number = number
+                if number is None:
+                    block_number = int((t0 - time[0]) / block)
+                self.windows.append(
+                    Window(
+                        i, episode.number, float(t0),
+                        slice(episode.first + start_row, episode.first + last),
+                        state, std,
+                        block_number % 3 != 1,
+                        {n: P[start_row, :2, :2] for n, P in spreads.items()},
+                    )
+                )  # fmt: skip
+            start_row = max(int(np.searchsorted(time, t0 + hop)), start_row + 1)
+
+    def _best_start(self, time, states, row: int) -> int:
+        """The row at or soon after one at which a window begins."""
+        return row
+
+    def _std(self, name, c, spreads, k, after) -> np.ndarray:
+        """Noise of a sample, and of where a window's start is, carried along."""
+        at, quantity = name.rsplit(".", 1)
+        extra = np.zeros(len(after))
+        if quantity in ("position", "x", "y", "z", *TURN) and name in spreads:
+            P = spreads[name][k]
+            extra = P[0, 0] + 2.0 * after * P[0, 1] + after**2 * P[1, 1]
+        elif quantity == "velocity":
+            extra += spreads[f"{at}.position"][k][1, 1]
+        elif quantity in ("vx", "vy", "vz"):
+            extra += spreads[f"{at}.{quantity[1]}"][k][1, 1]
+        elif quantity in ("wx", "wy", "wz") and f"{at}.qw" in spreads:
+            extra += 4.0 * np.mean([spreads[f"{at}.{q}"][k][1, 1] for q in TURN])
+        return np.sqrt(self.noise[c] ** 2 + np.maximum(extra, 0.0))
+
+    def _all_commands(self) -> list[dict[int, Commands]]:
+        out = []
+        for i, recording in enumerate(self.recordings):
+            names = self._commanded(recording)
+            of: dict[int, Commands] = {}
+            for episode in recording.episodes:
+                time = recording.time[episode.rows]
+                columns = {n: recording.held(n)[episode.rows] for n in names}
+                if not names:  # What the motors gave stands in for it.
+                    time, columns = self._given(recording, episode, i)
+                of[episode.first] = Commands(time, columns)
+            out.append(of)
+        return out
+
+    def _given(self, recording: Recording, episode: Episode, i: int):
+        """times and columns of commands that give what the motors gave: measured
+        efforts, as a line between rows, in steps of MEASURED_SEC or shorter."""
+        rows = recording.time[episode.rows]
+        period = float(np.median(np.diff(rows)))
+        parts = max(int(np.ceil(period / MEASURED_SEC - 1e-6)), 1)
+        time = np.interp(
+            np.arange(parts * (len(rows) - 1) + 1) / parts, np.arange(len(rows)), rows
+        )
+        middle = time + 0.5 * np.diff(time, append=time[-1])
+        columns = {}
+        for joint in self._driven("effort_command"):
+            key = f"{joint}.effort_measured"
+            if key not in recording:
+                continue
+            y = recording[key][episode.rows]
+            good = np.isfinite(y)
+            y = np.interp(middle, rows[good], y[good])
+            rotor = rotor_before(self.scene, self.dynamics.plant, joint)
+            path = self._paths.get((i, episode.first), {})
+            if rotor and f"{joint}.position" in path:
+                # What turned the rotor was not measured.
+                rate = np.interp(middle, rows, path[f"{joint}.position"][:, 2])
+                y = y + rotor * rate
+            columns[f"{joint}.effort_command"] = y
+        return time, columns
+
+    def _effort_noise(self, recording: Recording, state) -> dict[str, float]:
+        """{joint: (rad/s2)^2 s} white noise of acceleration that the noise of measured
+        efforts makes where these stand in for commands."""
+        driven = self._driven("effort_command")
+        keys = [f"{joint}.effort_measured" for joint in driven]
+        if self._commanded(recording) or not any(k in recording for k in keys):
+            return {}
+        plant = self.dynamics.plant
+        if plant.num_positions() != plant.num_velocities():
+            return {}
+        joints = {
+            full_name(plant, j): j.velocity_start() for j in one_dof_joints(plant)
+        }
+        context = plant.CreateDefaultContext()
+        q = np.array(plant.GetPositions(context))
+        density = np.zeros(plant.num_velocities())
+        for name, i in joints.items():
+            if f"{name}.position" in state:
+                q[i] = state[f"{name}.position"][0]
+            key = f"{name}.effort_measured"
+            if name in driven and key in recording:
+                channel = recording.channels[key]
+                density[i] = channel.noise**2 / max(channel.rate_hz, 1e-6)
+        plant.SetPositions(context, q)
+        W = np.linalg.inv(plant.CalcMassMatrix(context))
+        made = (W**2) @ density
+        return {name: float(made[i]) for name, i in joints.items()}
+
+    def _commanded(self, recording: Recording) -> list[str]:
+        """Names of the commands that the scene's drives take."""
+        return [
+            c.name for c in recording.commands()
+            if c.name.rsplit(".", 1)[0] in self._driven(c.quantity)
+        ]  # fmt: skip
+
+    def _driven(self, quantity: str) -> list[str]:
+        act = self.scene.actuation
+        return act.joints if quantity in COMMANDS_OF[act.type] else []
+
+    # ----- Simulating
+
+    def simulate(
+        self, effects: Sequence[Effect], chosen=None, twists=None
+    ) -> list[np.ndarray]:
+        """(n, n_channels) of each window, in the scene with these effects added; NaN
+        where a delayed sample shows what was before the window, infinite where Drake
+        could not go on.
+
+        Args: chosen: which windows, else all. twists: gives {joint: (twist, rate)} of a
+            window's start, for joints behind an elastic element or a gap.
+        """
+        self.simulation.set_effects([*self.scene.effects, *effects])
+        self.runs += 1
+        out = []
+        for k, w in enumerate(self.windows):
+            if chosen is not None and not chosen[k]:
+                out.append(np.zeros((0, len(self.channels))))
+                continue
+            recording = self.recordings[w.recording]
+            episode = next(
+                e for e in recording.episodes if e.first <= w.rows.start < e.last
+            )
+            y = self.simulation.run(
+                self._initial(w, episode, effects),
+                recording.time[w.rows],
+                self.channels,
+                self._commands[w.recording][episode.first],
+                start_sec=w.start,
+                initial_is_true=True,
+                twists=twists(w) if twists else None,
+                filters=self._filters[w.recording],
+                before=self._before(w, episode, [*self.scene.effects, *effects]),
+            )
+            if self.simulation.failure:
+                y[np.isnan(y)] = np.inf
+            out.append(y)
+        return out
+
+    def _before(self, w: Window, episode: Episode, effects):
+        """{channel: (times, true values)} of what filters remember."""
+        filters = {}
+        for channel in self.channels:
+            own = self._filters[w.recording].get(channel, ())
+            if stages := with_lag(own, _lag(effects, channel)):
+                filters[channel] = stages
+        if not filters:
+            return None
+        path = self._paths[w.recording, episode.first]
+        time, end = path["time"], w.rows.start - episode.first + 1
+        found = {}
+        for channel, stages in filters.items():
+            since = int(np.searchsorted(time, w.start - memory(stages))) - 1
+            rows = slice(max(since, 0), end)
+            value = self._true_path(channel, path, rows)
+            if value is not None:
+                found[channel] = (time[rows], value)
+        return found
+
+    def _true_path(self, channel: str, path, rows: slice) -> np.ndarray | None:
+        at, what = channel.rsplit(".", 1)
+        if channel in path:
+            return path[channel][rows, 0]
+        if what == "velocity":
+            return path[f"{at}.position"][rows, 1]
+        if what in ("vx", "vy", "vz") and f"{at}.{what[1]}" in path:
+            return path[f"{at}.{what[1]}"][rows, 1]
+        if what in ("wx", "wy", "wz") and f"{at}.qw" in path:
+            q, dq = (
+                np.stack([path[f"{at}.{a}"][rows, k] for a in TURN]) for k in (0, 1)
+            )
+            return spin_of(q.T, dq.T)[:, "xyz".index(what[1])]
+        return None
+
+    def _initial(self, w: Window, episode: Episode, effects) -> InitialSection:
+        """The true state at the start, if the effects on measurement are these beside
+        the scene's own."""
+        said = self._said(w, episode)
+        initial = InitialSection(
+            dict(said.positions), dict(said.velocities),
+            dict(said.poses), dict(said.body_velocities),
+        )  # fmt: skip
+        path = self._paths[w.recording, episode.first]
+        measured = [e for e in (*self.scene.effects, *effects) if KINDS[e.kind].channel]
+
+        def state(name: str) -> np.ndarray:
+            scale, late, bias = _sensing(measured, name)
+            if scale == 1.0 and late == 0.0:
+                x = w.state[name]
+            else:
+                at = w.start * scale + late
+                x = np.array([np.interp(at, path["time"], y) for y in path[name].T])
+                x = x * np.array([1.0, scale, scale**2])
+            lag = _lag(measured, name)
+            if lag:  # What a low-pass took: true = measured + T d/dt measured.
+                x = x + lag * np.array([x[1], x[2], 0.0])
+            return x - np.array([bias, 0.0, 0.0])
+
+        for joint in self.joints:
+            x = state(f"{joint}.position")
+            initial.positions[joint] = float(x[0])
+            initial.velocities[joint] = float(x[1])
+        for body in self.bodies:
+            length = _length_scale(measured, body)
+            place = np.zeros((3, 3))
+            for i, axis in enumerate(_POSITIONS):
+                if f"{body}.{axis}" in w.state:
+                    place[i] = state(f"{body}.{axis}") / length
+                elif body in said.poses:
+                    place[i, 0] = said.poses[body][4 + i]
+                    place[i, 1] = said.body_velocities.get(body, [0.0] * 6)[3 + i]
+            q, dq = np.array([1.0, 0, 0, 0]), np.zeros(4)
+            if body in said.poses:
+                q = np.array(said.poses[body][:4])
+                q = q / np.linalg.norm(q)
+            if f"{body}.qw" in w.state:
+                turn = np.array([state(f"{body}.{a}") for a in TURN])
+                size = np.linalg.norm(turn[:, 0])
+                q, dq = turn[:, 0] / size, turn[:, 1] / size
+            spin = spin_of(q, dq)
+            if f"{body}.qw" not in w.state:
+                spin = np.array(said.body_velocities.get(body, [0.0] * 6)[:3])
+            initial.poses[body] = [*map(float, q), *map(float, place[:, 0])]
+            initial.body_velocities[body] = [
+                *map(float, spin),
+                *map(float, place[:, 1]),
+            ]
+            if f"{body}.z" not in w.state:  # It lies, and rolls, on what is below it.
+                initial = self.simulation.put_down(initial, body)
+        return initial
+
+    def _said(self, w: Window, episode: Episode) -> InitialSection:
+        """What the scene says of an episode's start: it holds for what is not measured;
+        velocities only in the episode's first window."""
+        path = str(self.recordings[w.recording].path)
+        said = initial_for(self.scene, path, episode.number)
+        if not (said.velocities or said.body_velocities):
+            return said
+        before = (x for x in self.windows if x.recording == w.recording)
+        if episode.is_start and not any(
+            episode.first <= x.rows.start < w.rows.start for x in before
+        ):
+            return said
+        return replace(said, velocities={}, body_velocities={})
+
+    def errors(self, simulated: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """(measured - simulated)/std of each window, clipped as fits need it; 0 where
+        nothing was measured or simulated."""
+        each = self.errors_over(simulated, [w.std for w in self.windows])
+        return [np.clip(e, -LARGEST, LARGEST) for e in each]
+
+    def errors_over(
+        self, simulated: Sequence[np.ndarray], std: Sequence[np.ndarray]
+    ) -> list[np.ndarray]:
+        """(measured - simulated)/std of each window, as it is."""
+        out = []
+        for w, y, size in zip(self.windows, simulated, std, strict=True):
+            e = (seen_in(self, w) - y) / size if len(y) else y
+            out.append(np.where(np.isnan(e), 0.0, e))
+        return out
+
+
+def with_step(scene: Scene, time_step: float) -> Scene:
+    """The scene with another time step [s]; 0 is continuous."""
+    return replace(scene, plant=replace(scene.plant, time_step=time_step))
+
+
+def _length_scale(effects, body: str) -> float:
+    scale = 1.0
+    for effect in effects:
+        if effect.kind == "length_scale" and any(
+            at in ("world", body, body.split(".")[0]) for at in effect.at
+        ):
+            scale *= effect.parameters["scale"]
+    return scale
+
+
+def spin_of(q, dq) -> np.ndarray:
+    """(..., 3) rate of turn in the world [rad/s], of a unit quaternion (..., 4) wxyz
+    and its rate: the vector part of 2 dq q*. What of dq lies along q does not count."""
+    v, dv = q[..., 1:], dq[..., 1:]
+    return 2.0 * (q[..., :1] * dv - dq[..., :1] * v - np.cross(dv, v))
