@@ -51,6 +51,8 @@ _EXPORTS = {
     "make_tip_and_object": "models.pushed_object",
     "ImpedanceController": "systems.arm.impedance_controller",
     "ImpedanceConfig": "systems.arm.impedance_controller",
+    "serial_chain_of": "systems.arm.impedance_controller",
+    "TipState": "systems.arm.tip_state",
 }
 __all__ = ["model_path", *_EXPORTS]
 
