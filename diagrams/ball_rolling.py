@@ -13,6 +13,7 @@ Nothing passes from the world to the controllers but encoders, torques and pictu
 """
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -26,6 +27,7 @@ from pydrake.systems.primitives import (
     MatrixGain,
 )
 
+from makebreak.diagrams import wiring
 from makebreak.diagrams.camera import CameraConfig, camera_model
 from makebreak.diagrams.fault_kinds import read_faults
 from makebreak.diagrams.faults import faulty_lcs
@@ -79,6 +81,7 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
     V_BALL,
     V_TIP,
     W_BALL,
+    plus_weights,
 )
 from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Options, C3Weights
 from makebreak.systems.contact_mpc.numerics.c3_projections import (
@@ -86,7 +89,6 @@ from makebreak.systems.contact_mpc.numerics.c3_projections import (
     PlusProjection,
     QpProjection,
 )
-from makebreak.systems.contact_mpc.numerics.lcs import LCS
 from makebreak.systems.contact_mpc.path_target import PathTargetConfig
 from makebreak.systems.contact_mpc.residual_learner import (
     PosteriorConfig,
@@ -327,16 +329,7 @@ def c3_config(planner: PlannerConfig, n_lam: int, projection: str = "plus") -> C
     Q[P_TIP], Q[V_TIP] = planner.tip, planner.tip / 50.0
     Q[P_BALL] = planner.ball
     Q[V_BALL] = Q[W_BALL] = planner.ball_velocity
-    # lam : eta = 10 : 1 makes the two comparable; the table's contact is left loose, so
-    # that the first rounds may lift the ball a little to find a push.
-    contact = np.full(n_lam, 0.002)
-    contact[:N_TIP] = 1.0
-    G = np.concatenate([
-        np.full(N_X, 1e-9),
-        planner.force * contact,
-        np.full(3, 1e-9),
-        0.1 * planner.force * contact,
-    ])  # fmt: skip
+    G = plus_weights(planner.force, n_lam, N_TIP)
     if projection != "plus":
         G = G[: N_X + n_lam + 3]
     return C3Config(
@@ -530,7 +523,7 @@ def add_ball_rolling(
             ),
             n_lam,
             p_tip,
-            _example(lcs_of["command"]),
+            lcs_of["command"].at_default(),
         ),
     )
     impedance = builder.AddNamedSystem(
@@ -545,9 +538,7 @@ def add_ball_rolling(
         ),
     )
 
-    def connect(source, output, target, port):
-        builder.Connect(source.GetOutputPort(output), target.GetInputPort(port))
-
+    connect = partial(wiring.connect, builder)
     no_force = builder.AddNamedSystem("no_force", ConstantVectorSource(np.zeros(3)))
     for one in lcs.values():
         connect(estimator, "x", one, "x")
@@ -580,7 +571,7 @@ def add_ball_rolling(
     connect(estimator, "x", c3, "x")
     connect(target, "x_desired", c3, "x_desired")
     if wrong is not None:
-        example = _example(lcs_of["plan"])
+        example = lcs_of["plan"].at_default()
         lcs_port["plan"] = faulty_lcs(builder, lcs_port["plan"], example, wrong.faults)
     builder.Connect(lcs_port["plan"], c3.GetInputPort("lcs"))
     builder.Connect(lcs_port["command"], c3.GetInputPort("lcs_command"))
@@ -652,10 +643,6 @@ def _add_models(
         lcs_of[name] = own.model
         lcs[name] = builder.AddNamedSystem(f"lcs_{name}", own)
     return lcs, lcs_of
-
-
-def _example(lcs: AnitescuLcs) -> LCS:
-    return lcs.build(lcs.x_default, np.zeros(lcs.n_u))
 
 
 def _mean_of_tip(
@@ -748,21 +735,22 @@ def _add_dynamics_residual(
         "dynamics_residual_learner",
         DynamicsResidualLearner(
             DynamicsResidualLearnerConfig(),
-            _example(lcs_of["learn"]),
+            lcs_of["learn"].at_default(),
             LEARN,
             OFFSET["learner"],
         ),
     )
     for name in ("x", "u_measured"):
-        builder.Connect(estimator.GetOutputPort(name), r_dyn.GetInputPort(name))
-    builder.Connect(lcs["learn"].GetOutputPort("lcs"), r_dyn.GetInputPort("lcs"))
+        wiring.connect(builder, estimator, name, r_dyn, name)
+    wiring.connect(builder, lcs["learn"], "lcs", r_dyn, "lcs")
     ports = {}
     for name in ("plan", "command"):
         added = builder.AddNamedSystem(
-            f"dynamics_residual_{name}", DynamicsResidual(_example(lcs_of[name]), LEARN)
+            f"dynamics_residual_{name}",
+            DynamicsResidual(lcs_of[name].at_default(), LEARN),
         )
-        builder.Connect(lcs[name].GetOutputPort("lcs"), added.GetInputPort("lcs"))
-        builder.Connect(r_dyn.GetOutputPort("r_dyn"), added.GetInputPort("r_dyn"))
+        wiring.connect(builder, lcs[name], "lcs", added, "lcs")
+        wiring.connect(builder, r_dyn, "r_dyn", added, "r_dyn")
         ports[name] = added.get_output_port()
     return ports
 
@@ -784,16 +772,18 @@ def _add_learner(
         settings = learner_config(config.learning, config.contacts if samples else None)
     learner = builder.AddNamedSystem(
         "residual_learner",
-        ResidualLearner(settings, _example(lcs_of["learn"]), LEARN, OFFSET["learner"]),
+        ResidualLearner(
+            settings, lcs_of["learn"].at_default(), LEARN, OFFSET["learner"]
+        ),
     )
     for name, port in (
         ("x", "x"), ("u_measured", "u_measured"), ("window_valid", "enable"),
     ):  # fmt: skip
-        builder.Connect(estimator.GetOutputPort(name), learner.GetInputPort(port))
-    builder.Connect(lcs["learn"].GetOutputPort("lcs"), learner.GetInputPort("lcs"))
+        wiring.connect(builder, estimator, name, learner, port)
+    wiring.connect(builder, lcs["learn"], "lcs", learner, "lcs")
     r_comp = learner.GetOutputPort("r_comp")
     if not samples:
-        builder.Connect(learner.GetOutputPort("r_std"), task.GetInputPort("r_std"))
+        wiring.connect(builder, learner, "r_std", task, "r_std")
         return r_comp
     taken = np.zeros(n_lam)
     taken[:N_TIP] = -config.contacts.gap_allowance / LEARN

@@ -400,7 +400,7 @@ def _add_learner(builder, config, model, friction, x, u) -> OutputPort:
         ),
     )
     zero = builder.GetSubsystemByName("u_of_lcs")
-    initial = lcs.model.build(lcs.model.x_default, np.zeros(4))
+    initial = lcs.model.at_default()
     learner = builder.AddNamedSystem(
         "learner",
         ResidualLearner(config.learning, initial, period, LEARNER_OFFSET),

@@ -16,6 +16,7 @@ sensor, or a camera, measures of the object.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -24,6 +25,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
+from makebreak.diagrams import wiring
 from makebreak.diagrams.camera import CameraConfig, camera_model
 from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.scene_facts import sphere_radius
@@ -72,6 +74,7 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
     Q_BALL,
     V_BALL,
     V_TIP,
+    plus_weights,
 )
 from makebreak.systems.contact_mpc.numerics.c3_mpc import (
     C3Options,
@@ -369,12 +372,7 @@ def c3_config(
     Q_N[P_BALL.start : P_BALL.start + 2] *= p.last
     if axis:
         Q_N[V_BALL] += p.last * p.position * p.coast_sec**2
-    # As in ball_rolling: lam : eta = 10 : 1, and the table's contacts loose.
-    contact = np.full(n_lam, 0.002)
-    contact[:N_TIP] = 1.0
-    G = np.concatenate([
-        np.full(N_X, 1e-9), 5.0 * contact, np.full(3, 1e-9), 0.5 * contact,
-    ])  # fmt: skip
+    G = plus_weights(force=5.0, n_lam=n_lam, n_tip=N_TIP)
     turn = p.position * p.angle_radius**2
     return C3Config(
         weights=C3Weights(
@@ -598,10 +596,7 @@ def make_push_object(
         ),
     )
     c3 = builder.AddNamedSystem("c3_mpc", C3Mpc(c3_settings, CONTROL, OFFSET["c3"]))
-    at_default = {
-        name: one.build(one.x_default, np.zeros(one.n_u))
-        for name, one in lcs_of.items()
-    }
+    at_default = {name: one.at_default() for name, one in lcs_of.items()}
     reference = builder.AddNamedSystem(
         "arm_reference",
         ArmReference(
@@ -628,9 +623,7 @@ def make_push_object(
     )
     no_force = builder.AddNamedSystem("no_force", ConstantVectorSource(np.zeros(3)))
 
-    def connect(source, output, target, port):
-        builder.Connect(source.GetOutputPort(output), target.GetInputPort(port))
-
+    connect = partial(wiring.connect, builder)
     for name, port in (
         ("p_WB", "p_ball"), ("v_WB", "v_ball"), ("seen", "seen"),
         ("q_WB", "q_object"), ("w_WB", "w_object"),

@@ -9,10 +9,12 @@ The tip pushes from beside the ball, at one height. Everything else is ball_roll
 """
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
+from makebreak.diagrams import wiring
 from makebreak.diagrams.wiring import refuse_changed
 from makebreak.models.tip_and_ball import TipAndBall
 from makebreak.systems.arm.arm_reference import ArmReferenceConfig
@@ -28,6 +30,7 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
     V_BALL,
     V_TIP,
     W_BALL,
+    plus_weights,
 )
 from makebreak.systems.contact_mpc.numerics.c3_mpc import (
     C3Options,
@@ -179,13 +182,7 @@ def sampled_c3_config(
     Q = np.zeros(N_X)
     Q[0:2], Q[2], Q[V_TIP] = p.tip, p.tip_height, p.tip_speed
     Q[P_BALL], Q[V_BALL], Q[W_BALL] = p.position, p.velocity, p.velocity * radius**2
-    # As of c3_config: lam : eta = 10 : 1, and the table's contact loose.
-    contact = np.full(n_lam, 0.002)
-    contact[:n_tip] = 1.0
-    G = np.concatenate([
-        np.full(N_X, 1e-9), p.force * contact,
-        np.full(3, 1e-9), 0.1 * p.force * contact,
-    ])  # fmt: skip
+    G = plus_weights(p.force, n_lam, n_tip)
     return C3Config(
         weights=C3Weights(Q, np.full(3, 0.01), G, G),
         options=C3Options(N=p.N, rounds=p.rounds, rho=2.2, polish=p.polish),
@@ -266,9 +263,7 @@ def add_sampled_contacts(
         ),
     )
 
-    def connect(source, output, system, port):
-        builder.Connect(source.GetOutputPort(output), system.GetInputPort(port))
-
+    connect = partial(wiring.connect, builder)
     for system in (target, task, sampler):
         connect(estimator, "x", system, "x")
         connect(estimator, "valid", system, "valid")

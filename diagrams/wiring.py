@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 from pydrake.geometry import Meshcat
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import DiagramBuilder, LeafSystem, OutputPort
+from pydrake.systems.framework import DiagramBuilder, LeafSystem, OutputPort, System
 from pydrake.systems.primitives import Adder, Demultiplexer
 
 from makebreak.systems.views.legend import Legend, LegendConfig
@@ -36,6 +36,13 @@ def timed(part: _Config, period: float, offset: float) -> _Config:
     refuse_changed(type(part).__name__, part, ("period_sec", "offset_sec"))
     changed: Any = part
     return replace(changed, period_sec=period, offset_sec=offset)
+
+
+def connect(
+    builder: DiagramBuilder, source: System, output: str, target: System, port: str
+) -> None:
+    """An output port to an input port, both by name."""
+    builder.Connect(source.GetOutputPort(output), target.GetInputPort(port))
 
 
 def connect_command(

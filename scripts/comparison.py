@@ -7,7 +7,35 @@ from makebreak.scripts.table import Table
 from makebreak.scripts.trials import run_many, setting_texts
 
 
-class Comparison:
+class Rows:
+    """Rows of a table. Args: command: of a row that names none."""
+
+    def __init__(self, command: str):
+        self.command = command
+        self.rows: list[tuple] = []
+        self.met: list[bool | None] = []
+
+    def row(
+        self,
+        what: str,
+        paper: str,
+        ours,
+        good: bool | None = None,
+        command: str | None = None,
+    ) -> None:
+        """Args: good: whether a stated target is met; None: there is none."""
+        self.rows.append(
+            (what, paper, ours, self.command if command is None else command)
+        )
+        self.met.append(None if good is None else bool(good))
+
+    def to_table(self, title: str, notes: Sequence[str] = (), theirs="paper") -> Table:
+        """Args: theirs: the head of what ours is compared with."""
+        columns = ("what", theirs, "ours", "command")
+        return Table(title, columns, self.rows, self.met, notes)
+
+
+class Comparison(Rows):
     """Trials of one experiment, and the rows that are made of them.
 
     Args: experiment: its name. session: whose folder the trials go to. jobs: how many
@@ -17,10 +45,8 @@ class Comparison:
     def __init__(
         self, experiment: str, session: Session, jobs: int, command: str | None = None
     ):
+        super().__init__(command or f"makebreak run {experiment} --seed S")
         self.experiment, self.session, self.jobs = experiment, session, jobs
-        self.command = command or f"makebreak run {experiment} --seed S"
-        self.rows: list[tuple] = []
-        self.met: list[bool | None] = []
 
     def runs(self, settings: Mapping, seeds: int) -> list[dict]:
         """The results of seeds 0 .. seeds - 1, as run_many gives them."""
@@ -42,22 +68,3 @@ class Comparison:
         """The command of a run with settings, as one types it."""
         words = " ".join(setting_texts(settings)).replace(", ", ",")
         return f"{self.command} --set {words}" if words else self.command
-
-    def row(
-        self,
-        what: str,
-        paper: str,
-        ours,
-        good: bool | None = None,
-        command: str | None = None,
-    ) -> None:
-        """Args: good: whether a stated target is met; None: there is none."""
-        self.rows.append(
-            (what, paper, ours, self.command if command is None else command)
-        )
-        self.met.append(None if good is None else bool(good))
-
-    def to_table(self, title: str, notes: Sequence[str] = (), theirs="paper") -> Table:
-        """Args: theirs: the head of what ours is compared with."""
-        columns = ("what", theirs, "ours", "command")
-        return Table(title, columns, self.rows, self.met, notes)

@@ -31,6 +31,7 @@ from makebreak.systems.perception.numerics.pose_tracker import (
     find_pose,
     make_shape,
     nearest_yaw,
+    rolling_turn,
 )
 from makebreak.systems.perception.pose_tracker import (
     HOLD_SEC,
@@ -42,7 +43,6 @@ from makebreak.systems.perception.pose_tracker import (
     Marker,
     PoseTracker,
     PoseTrackerConfig,
-    rolling_turn,
 )
 
 WEIGHTS = strength_weights(HUE)

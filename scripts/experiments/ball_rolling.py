@@ -33,6 +33,7 @@ from makebreak.diagrams.station import (
 )
 from makebreak.gap.data.table import read_table
 from makebreak.models.scene import load_scene
+from makebreak.scripts.comparison import Rows
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.lcm_loop import drive
 from makebreak.scripts.sweep import rate_text
@@ -605,14 +606,12 @@ def reproduce(session, seeds, jobs) -> Table:
     group = {n: results[i * seeds : (i + 1) * seeds] for i, n in enumerate(names)}
     rendered = results[len(names) * seeds :]
     failed = [r for r in results if "error" in r]
-    rows: list[tuple] = []
-    met: list[bool | None] = []
+    table = Rows("makebreak reproduce ball_rolling")
 
     def add(what, paper, ours, goal=None):
         if failed and goal:
             goal = False  # A run that ended in an error proves nothing.
-        rows.append((what, paper, ours, "makebreak reproduce ball_rolling"))
-        met.append(goal)
+        table.row(what, paper, ours, goal)
 
     def count(runs, test):
         return sum(bool(test(r)) for r in runs if "error" not in r)
@@ -731,10 +730,7 @@ def reproduce(session, seeds, jobs) -> Table:
         "than its mean one or just that.",
     ]
     notes += [f"seed {r['seed']} failed: {r['error']}" for r in failed]
-    return Table(
+    return table.to_table(
         "Rolling a ball and fruits that are modelled wrongly (ACI-MPC VII-B, VII-C)",
-        ("what", "paper", "ours", "command"),
-        rows,
-        met,
         notes,
     )

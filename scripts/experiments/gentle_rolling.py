@@ -29,6 +29,7 @@ from makebreak.diagrams.station import (
     make_control_plant,
 )
 from makebreak.models.scene import load_scene
+from makebreak.scripts.comparison import Rows
 from makebreak.scripts.experiments import ball_rolling as rolling
 from makebreak.scripts.table import Table
 from makebreak.scripts.trials import run_many
@@ -331,12 +332,8 @@ def table_of(
     groups: Mapping[str, Sequence[dict]], frozen: Mapping[str, Sequence[dict]]
 ) -> Table:
     """The table of results per subset, and per frozen system; "": with none frozen."""
-    rows: list[tuple] = []
-    met: list[bool | None] = []
-
-    def add(what, wanted, ours, good=None):
-        rows.append((what, wanted, ours, "makebreak reproduce gentle_rolling"))
-        met.append(good)
+    table = Rows("makebreak reproduce gentle_rolling")
+    add = table.row
 
     def values(group, key):
         found = [r[key] for r in group if r.get(key) is not None]
@@ -412,10 +409,6 @@ def table_of(
         for r in group
         if "error" in r
     ]
-    return Table(
-        "All seven systems: rolling a ball and touching it gently",
-        ("what", "wanted", "ours", "command"),
-        rows,
-        met,
-        notes,
+    return table.to_table(
+        "All seven systems: rolling a ball and touching it gently", notes, "wanted"
     )

@@ -24,6 +24,7 @@ from makebreak.diagrams.recorder import recorded
 from makebreak.diagrams.scene_facts import actuators_of
 from makebreak.diagrams.station import ARM, TIP_FRAME, TORQUE_RATE_MAX
 from makebreak.models.pushed_object import hull_obj, object_sdf, parts
+from makebreak.scripts.comparison import Rows
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.sweep import rate_text
 from makebreak.scripts.table import Table
@@ -441,13 +442,8 @@ def reproduce(session, seeds, jobs) -> Table:
 def table_of(group: dict[str, list[dict]]) -> Table:
     """{case: results of its runs} as the table of `reproduce`; a case may lack runs."""
     named = cases()
-    rows: list[tuple] = []
-    met: list[bool | None] = []
-
-    def add(what, published, ours, goal=None):
-        rows.append((what, published, ours, "makebreak reproduce push_object"))
-        met.append(goal)
-
+    table = Rows("makebreak reproduce push_object")
+    add = table.row
     found = {}
     for name, runs in group.items():
         t = found[name] = totals(runs, named[name]["n_goals"])
@@ -502,10 +498,8 @@ def table_of(group: dict[str, list[dict]]) -> Table:
         for run in runs
         if "error" in run
     ]
-    return Table(
+    return table.to_table(
         "Pushing an object to poses, the planner choosing where to touch it",
-        ("what", "published", "ours", "command"),
-        rows,
-        met,
         notes,
+        "published",
     )

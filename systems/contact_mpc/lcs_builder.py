@@ -159,7 +159,11 @@ class AnitescuLcs:
         self._check_distances()
         self._model = self._constant_mass_model(scene_graph) if analytic else None
         self.is_analytic = self._model is not None
-        self.build(self.x_default, np.zeros(self.n_u))  # Compiles, and proves it works.
+        self.at_default()  # Compiles, and proves it works.
+
+    def at_default(self) -> LCS:
+        """The LCS about the plant's default state, without input."""
+        return self.build(self.x_default, np.zeros(self.n_u))
 
     def build(self, x, u) -> LCS:
         """The LCS about the state x = [q, v] (n_x,) and the input u (n_u,).
@@ -696,7 +700,7 @@ class AnitescuLcsBuilder(LeafSystem):
         self.model = AnitescuLcs(
             diagram, c.contacts, c.dt_sec, c.eps_c, closest=c.closest
         )
-        initial = self.model.build(self.model.x_default, np.zeros(self.model.n_u))
+        initial = self.model.at_default()
         self._knots = int(c.knots)
         self._x = self.DeclareVectorInputPort("x", self.model.n_x)
         self._u = self.DeclareVectorInputPort("u", self.model.n_u)

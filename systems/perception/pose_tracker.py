@@ -17,6 +17,7 @@ from makebreak.systems.perception.numerics.pose_tracker import (
     find_marker,
     find_pose,
     nearest_yaw,
+    rolling_turn,
 )
 
 # Values of the status port.
@@ -63,19 +64,6 @@ class Marker:
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         xy = self.side / 2.0 * square @ np.array([[c, s], [-s, c]])
         return np.hstack([xy, np.zeros((4, 1))]) + self.center
-
-
-def rolling_turn(rate, yaw, axis, height):
-    """Angular velocity (3,) of an object that rolls without slipping [rad/s].
-
-    Args: rate (3,) = v_x, v_y [m/s] and yaw's [rad/s]; axis (3,) that it rolls about,
-        level, in its frame, zero: it slides; yaw [rad]; height of its origin [m].
-    """
-    c, s = np.cos(yaw), np.sin(yaw)
-    level = np.array([c * axis[0] - s * axis[1], s * axis[0] + c * axis[1]])
-    about = (level[1] * rate[0] - level[0] * rate[1]) / height
-    # v = w x (height z): w along the level axis.
-    return np.array([*(about * level), rate[2]])
 
 
 class PoseTracker(LeafSystem):

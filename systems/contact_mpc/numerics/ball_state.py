@@ -14,6 +14,21 @@ P_TIP, Q_BALL, P_BALL = slice(0, 3), slice(3, 7), slice(7, 10)
 V_TIP, W_BALL, V_BALL = slice(10, 13), slice(13, 16), slice(16, 19)
 
 
+def plus_weights(force, n_lam, n_tip):
+    """Weights G (N_X + n_lam + 3 + n_lam,) of C3+ on [x, lam, u, eta]; all but the
+    last n_lam are those of a projection without eta.
+
+    Args: force: of lam; n_tip: forces of tip and ball, the first of n_lam.
+
+    lam : eta = 10 : 1 makes the two comparable. The table's contact is left loose, so
+    that the first rounds may lift the ball a little to find a push.
+    """
+    contact = np.full(n_lam, 0.002)
+    contact[:n_tip] = 1.0
+    free = [np.full(n, 1e-9) for n in (N_X, 3)]
+    return np.concatenate([free[0], force * contact, free[1], 0.1 * force * contact])
+
+
 def rolling_velocity(v_ball, radius):
     """Angular velocity (3,) [rad/s] of a ball of radius [m] that rolls on a level
     table at v_ball [m/s], of which x and y count: v = omega x (radius z), and no spin

@@ -605,9 +605,11 @@ def sample_round(
     elif t - m.since_sec > c.stuck_sec:
         m = replace(m, error=error, since_sec=t)
         cost[0] = NO_PLAN
-    reached = m.reached_sec if in_contact else None
-    m = replace(m, reached_sec=t if in_contact and reached is None else reached)
-    keep = in_contact and t - (m.reached_sec or 0.0) < c.keep_sec
+    if not in_contact:
+        m = replace(m, reached_sec=None)
+    elif m.reached_sec is None:
+        m = replace(m, reached_sec=t)
+    keep = m.reached_sec is not None and t - m.reached_sec < c.keep_sec
     chosen = 0 if keep and np.isfinite(cost[0]) else choose(cost, c.hysteresis)
     found = Round(places, cost, chosen, plans[chosen])
     m = replace(m, count=m.count + 1)

@@ -178,6 +178,19 @@ def nearest_yaw(yaw, fold, reference):
     return yaw + turn * np.round((reference - yaw) / turn)
 
 
+def rolling_turn(rate, yaw, axis, height):
+    """Angular velocity (3,) of an object that rolls without slipping [rad/s].
+
+    Args: rate (3,) = v_x, v_y [m/s] and yaw's [rad/s]; axis (3,) that it rolls about,
+        level, in its frame, zero: it slides; yaw [rad]; height of its origin [m].
+    """
+    c, s = np.cos(yaw), np.sin(yaw)
+    level = np.array([c * axis[0] - s * axis[1], s * axis[0] + c * axis[1]])
+    about = (level[1] * rate[0] - level[0] * rate[1]) / height
+    # v = w x (height z): w along the level axis.
+    return np.array([*(about * level), rate[2]])
+
+
 def find_pose(
     image, camera: Pinhole, hue_weights, shape: Shape, z, guess=None
 ) -> Detection | None:
