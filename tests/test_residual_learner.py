@@ -143,7 +143,7 @@ def test_active_set_and_lemke_find_the_same_exact_solution():
         Q_d = 10.0 ** rng.uniform(0, 5, size=lcs.n_x)
         step = measured_step(lcs, x, u, x_next, Q_d, eps)
         problem = (step.P[0], step.p[0], step.F[0], step.q[0], 5e-4)
-        ours = numerics._solve_step(*problem)
+        ours = numerics.solve_step(*problem)
         lemke = numerics._solve_step_by_lemke(*problem)
         assert ours[0] and lemke[0]
         for a, b in zip(ours[2:], lemke[2:], strict=True):

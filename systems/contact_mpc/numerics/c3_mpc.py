@@ -503,7 +503,7 @@ def solve_c3(
     unit = np.ones(p.n_z)
     unit[p.n_x : i_u] = unit[i_u + p.n_u :] = scale
     A, B, D, d, E, F, H, c = (_stacked(models, name) for name in "ABDdEFHc")
-    (AB, d, C, c), E, F, H, pushes = _model(A, B, D, d, E, F, H, c, scale)
+    (AB, d, C, c), E, F, H, pushes = scaled_model(A, B, D, d, E, F, H, c, scale)
     matrices: list = []
     if not p.is_plus:
         for i in np.flatnonzero((p.U[i_u:] == 0.0) & H.any(axis=(0, 1))):
@@ -538,7 +538,7 @@ def solve_c3(
     bounds = None if unbounded else (p.lower, p.upper)
     given, cut = (h, x0, lam0), 0
     if p.is_plus:
-        status, x, v, delta, w, inputs = _admm_plus(
+        status, x, v, delta, w, inputs = admm_plus(
             *model, *weights, bounds, p.U, *given, delta, w, o.rounds, o.rho
         )
         if status != SOLVED:
@@ -656,7 +656,7 @@ def _admm(model, weights, bounds, given, delta, w, options, lcp):
 
 
 @njit(cache=True)
-def _model(A, B, D, d, E, F, H, c, scale):
+def scaled_model(A, B, D, d, E, F, H, c, scale):
     """The LCS in lam / scale: the model of _qp_step; E, F, H; whether H is not zero.
 
     All arrays have the knots first: one for all, or N.
@@ -674,9 +674,7 @@ def _model(A, B, D, d, E, F, H, c, scale):
 
 
 @njit(cache=True)
-def _admm_plus(
-    AB, d, C, c, Q, R, Q_N, G, bounds, U, h, x0, lam0, delta, w, rounds, rho
-):
+def admm_plus(AB, d, C, c, Q, R, Q_N, G, bounds, U, h, x0, lam0, delta, w, rounds, rho):
     """The same for C3+, compiled as a whole; the first result is _qp_step's status."""
     (N, n_z), n_lam = delta.shape, C.shape[1]
     model = AB, d, C, c

@@ -27,7 +27,11 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
     V_BALL,
     V_TIP,
 )
-from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Problem, _admm_plus, _model
+from makebreak.systems.contact_mpc.numerics.c3_mpc import (
+    C3Problem,
+    admm_plus,
+    scaled_model,
+)
 from makebreak.systems.contact_mpc.numerics.c3_polish import polish
 from makebreak.systems.contact_mpc.numerics.lcp import SOLVED, solve_lcp_kernel
 
@@ -322,7 +326,7 @@ def _score(lcs, x, x_desired, weights, bounds, polish_bounds, U, guess, options)
     """cost (n,), u (n, N, n_u), x (n, N + 1, n_x): solve_c3's C3+, one after the other.
 
     Args: lcs: A, B, D, d, E, F, H, c, each of n; x (n, n_x); weights: Q, Q_N, R, G, h;
-        bounds as of _admm_plus, polish_bounds as of polish; guess (n, N, n_u); options:
+        bounds as of admm_plus, polish_bounds as of polish; guess (n, N, n_u); options:
         rounds, rho, scale_lam, start_at_x0, polish.
     """
     A, B, D, d, E, F, H, c = lcs
@@ -339,7 +343,7 @@ def _score(lcs, x, x_desired, weights, bounds, polish_bounds, U, guess, options)
         scale = 1.0
         if scale_lam:
             scale = np.sqrt((A[i] ** 2).sum()) / np.sqrt((D[i] ** 2).sum())
-        model, E_s, F_s, _, pushes = _model(
+        model, E_s, F_s, _, pushes = scaled_model(
             A[one], B[one], D[one], d[one], E[one], F[one], H[one], c[one], scale
         )
         AB, d_s, C, c_s = model
@@ -352,7 +356,7 @@ def _score(lcs, x, x_desired, weights, bounds, polish_bounds, U, guess, options)
         if start_at_x0:
             for k in range(N):
                 delta[k, : x.shape[1]] = x[i]
-        status, x_i, v_i, _, _, inputs = _admm_plus(
+        status, x_i, v_i, _, _, inputs = admm_plus(
             AB, d_s, C, c_s, Q, R, Q_N, G, bounds, U, h, x[i], lam0, delta, w, rounds,
             rho,
         )  # fmt: skip

@@ -112,7 +112,7 @@ def violation_loss(steps: Buffer, r, eps, gamma):
     lam, eta = np.zeros((n, n_lam)), np.zeros((n, n_lam))
     for k in range(n):
         step = (steps.P[k], steps.p[k], steps.F[k], steps.q[k] + r)
-        solved, cost, lam[k], eta[k], force[k] = _solve_step(*step, gamma)
+        solved, cost, lam[k], eta[k], force[k] = solve_step(*step, gamma)
         if not solved:
             raise ValueError(f"violation_loss: the QP of step {k} was not solved")
         loss[k] = steps.constant[k] + cost / eps
@@ -208,7 +208,7 @@ def _adam(P, p, F, q, constant, group, state, eps, gamma, rate, n_steps, r_max, 
         for k in range(n):
             for i in range(n_lam):
                 b[i] = q[k, i] + (state[0, group[i]] if group[i] >= 0 else 0.0)
-            solved, cost, _, _, force_k = _solve_step(P[k], p[k], F[k], b, gamma)
+            solved, cost, _, _, force_k = solve_step(P[k], p[k], F[k], b, gamma)
             if not solved or not np.isfinite(cost):
                 return False, np.nan
             if step == 0:
@@ -230,7 +230,7 @@ def _adam(P, p, F, q, constant, group, state, eps, gamma, rate, n_steps, r_max, 
 
 
 @njit(cache=True)
-def _solve_step(P, p, F, b, gamma):
+def solve_step(P, p, F, b, gamma):
     """min over lam, eta >= 0: 1/2 lam'P lam + p'lam + lam'eta + |b + F lam - eta|^2/2g.
 
     A primal-dual active set on which entries of lam and eta are free; it ends when the
@@ -259,7 +259,7 @@ def _solve_step(P, p, F, b, gamma):
 
 @njit(cache=True)
 def _solve_step_by_lemke(P, p, F, b, gamma):
-    """_solve_step as the LCP of the QP's optimality conditions in (lam, eta)."""
+    """solve_step as the LCP of the QP's optimality conditions in (lam, eta)."""
     n = b.size
     hessian, linear = np.empty((2 * n, 2 * n)), np.empty(2 * n)
     transposed = np.ascontiguousarray(F.T)

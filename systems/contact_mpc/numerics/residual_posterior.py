@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from makebreak.systems.contact_mpc.numerics.residual_learner import Buffer, _solve_step
+from makebreak.systems.contact_mpc.numerics.residual_learner import Buffer, solve_step
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ def _costs(P, p, F, q, shared, values, gamma):
     for j in range(values.size):
         for i in range(q.size):
             b[i] = q[i] + (values[j] if shared[i] else 0.0)
-        solved, cost, _, _, _ = _solve_step(P, p, F, b, gamma)
+        solved, cost, _, _, _ = solve_step(P, p, F, b, gamma)
         costs[j] = cost if solved else np.nan
     return costs
 
