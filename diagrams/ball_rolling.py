@@ -103,6 +103,7 @@ from makebreak.systems.perception.state_estimator import (
 )
 from makebreak.systems.views.adapt_button import AdaptButton
 from makebreak.systems.views.legend import LegendConfig
+from makebreak.systems.views.model_sliders import ModelSliders
 from makebreak.systems.views.rolling_view import RollingView, RollingViewConfig
 
 # Periods [s]. The estimator's divides C3's and the learner's: no reading is stale.
@@ -545,6 +546,14 @@ def add_ball_rolling(
         builder.Connect(no_force.get_output_port(), one.GetInputPort("u"))
     # Where C3 and the arm's reference have their models from.
     lcs_port = {name: one.GetOutputPort("lcs") for name, one in lcs.items()}
+    if meshcat is not None and not samples:  # The sampler has a model of its own.
+        sliders = builder.AddNamedSystem(
+            "model_sliders",
+            ModelSliders(lcs_of["plan"].n_pairs * [config.planner.friction], meshcat),
+        )
+        for one in lcs.values():
+            connect(sliders, "friction", one, "friction")
+            connect(sliders, "gap", one, "gap")
     if learner_kind in ("r_dyn", "both"):
         lcs_port |= _add_dynamics_residual(builder, lcs, lcs_of, estimator)
     if learner_kind in ("r_comp", "both"):

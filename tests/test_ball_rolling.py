@@ -290,6 +290,13 @@ def test_no_ground_truth_reaches_a_controller():
         assert meshcat.HasPath(f"/makebreak/{name}"), name
 
 
+def test_the_sliders_of_meshcat_act_on_all_three_models():
+    wires = connections(make_ball_rolling(config(), Meshcat()))
+    models = {"lcs_plan", "lcs_command", "lcs_learn"}
+    read = {(port, to) for of, port, to in wires if of == "model_sliders"}
+    assert read == {(port, to) for port in ("friction", "gap") for to in models}
+
+
 def test_what_the_controllers_measure_is_noisy_and_not_the_truth(diagram, rolling):
     run = Run(diagram, rolling.context.Clone())
     plant = diagram.GetSubsystemByName("station").GetSubsystemByName("plant")

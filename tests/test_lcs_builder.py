@@ -1137,6 +1137,86 @@ def test_the_nearest_of_all_pairs_keep_their_own_friction_and_stiffness():
             )
 
 
+@pytest.mark.parametrize("analytic", [True, False])
+@pytest.mark.parametrize("closest", [None, 2])
+def test_a_friction_that_is_given_is_that_of_a_model_made_with_it(analytic, closest):
+    def model_with(*mu):
+        pairs = [
+            ContactPair("finger_link", "ball_link", mu[0], closest=closest),
+            ContactPair("ball_link", "table_link", mu[1], closest=closest),
+        ]
+        return AnitescuLcs(rough_ball(), pairs, 0.05, analytic=analytic)
+
+    model, made_so = model_with(0.5, 0.3), model_with(0.8, 0.1)
+    x = random_state(np.random.default_rng(7), model.x_default)
+    given = model.build(x, np.zeros(3), friction=[0.8, 0.1])
+    for name in MATRICES:
+        expected = getattr(made_so.build(x, np.zeros(3)), name)
+        np.testing.assert_array_equal(getattr(given, name), expected)
+    assert (model.build(x, np.zeros(3)).E != given.E).any()
+
+
+@pytest.mark.parametrize("analytic", [True, False])
+def test_a_gap_that_is_given_is_as_if_the_finger_were_farther_off(
+    ball_diagram, analytic
+):
+    model = AnitescuLcs(ball_diagram, ball_pairs(), 0.05, analytic=analytic)
+    x = random_state(np.random.default_rng(8), model.x_default)
+    x[:3], x[7:10] = [0.2, 0.1, 0.4], [0.0, 0.0, 0.1]
+    n = (x[:3] - x[7:10]) / np.linalg.norm(x[:3] - x[7:10])  # Two spheres.
+    far = x.copy()
+    far[:3] += 0.003 * n
+    given = model.build(x, np.zeros(3), gap=[0.003, -0.001])
+    moved, plain = model.build(far, np.zeros(3)), model.build(x, np.zeros(3))
+    np.testing.assert_allclose(given.phi[:4], moved.phi[:4], atol=1e-12)
+    np.testing.assert_allclose(given.phi[4:], plain.phi[4:] - 0.001, atol=1e-12)
+    w, w_plain = given.E @ x + given.c, plain.E @ x + plain.c
+    w_moved = moved.E @ far + moved.c
+    np.testing.assert_allclose(w[:4], w_moved[:4], atol=1e-10)
+    np.testing.assert_allclose(w[4:], w_plain[4:] - 0.001 / 0.05, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        (dict(friction=[0.5]), r"friction is \[0.5\], expected \(2,\) of at least 0"),
+        (dict(friction=[0.5, -0.1]), "of at least 0"),
+        (dict(friction=[np.nan, 0.1]), "of at least 0"),
+        (dict(friction=[0.1, 0.1]), "friction 0.1 came for a contact that was made"),
+        (dict(gap=[0.0, np.inf]), r"expected \(2,\), finite"),
+        (dict(gap=0.0), r"expected \(2,\), finite"),
+    ],
+)
+def test_a_bad_friction_or_gap_is_refused(ball_diagram, given, message):
+    pairs = ball_pairs()
+    pairs[1] = ContactPair(
+        "ball_link", "table_link", 0.0, contact_model=StewartTrinkle()
+    )
+    model = AnitescuLcs(ball_diagram, pairs, 0.05)
+    model.build(model.x_default, np.zeros(3), friction=[0.1, 0.0])
+    with pytest.raises(ValueError, match=message):
+        model.build(model.x_default, np.zeros(3), **given)
+
+
+def test_the_ports_of_friction_and_gap_act_where_they_are_connected(
+    ball_diagram, reference
+):
+    system, x = system_of(ball_diagram), reference["x_touch"]
+    builder = DiagramBuilder()
+    builder.AddSystem(system)
+    given = dict(x=x, u=np.zeros(3), friction=[0.2, 0.9], gap=[1e-3, 2e-3])
+    for name, value in given.items():
+        source = builder.AddSystem(ConstantVectorSource(value))
+        builder.Connect(source.get_output_port(), system.GetInputPort(name))
+    simulator = Simulator(builder.Build())
+    simulator.AdvanceTo(0.001)
+    lcs, status = outputs(simulator, system)
+    assert status == 1.0
+    for name in MATRICES:
+        expected = getattr(system.model.build(*given.values()), name)
+        np.testing.assert_array_equal(getattr(lcs, name), expected)
+
+
 def test_bad_kinds_of_contact_are_refused_in_one_line(ball_diagram):
     def refused(message, closest=None, **change):
         pairs = ball_pairs()

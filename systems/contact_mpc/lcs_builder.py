@@ -12,7 +12,7 @@ added to it:
 See docs/lcs.md for the state's layout, quaternions, units and limits.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from enum import IntEnum
 from typing import Any
@@ -117,7 +117,7 @@ class AnitescuLcs:
         analytic: use the fast path where the model allows it; False: never.
 
     Attributes:
-        n_q, n_v, n_x, n_u, n_lam: sizes; x = [q, v] in the plant's order.
+        n_q, n_v, n_x, n_u, n_lam, n_pairs: sizes; x = [q, v] in the plant's order.
         x_default: (n_x,) the plant's default state.
         x_names, lam_names: of each state, and of each entry of lam, "geometry~geometry
             edge" (where the nearest are taken: "nearest k of geometry~... edge").
@@ -165,14 +165,17 @@ class AnitescuLcs:
         """The LCS about the plant's default state, without input."""
         return self.build(self.x_default, np.zeros(self.n_u))
 
-    def build(self, x, u) -> LCS:
+    def build(self, x, u, friction=None, gap=None) -> LCS:
         """The LCS about the state x = [q, v] (n_x,) and the input u (n_u,).
 
         Quaternions in x are normalised first; the LCS's d and c refer to the
         normalised state.
 
+        Args: friction (n_pairs,): of each pair, None: as it was given; gap (n_pairs,)
+            [m]: added to each pair's distances, None: nothing.
         Raises: ValueError on a wrong size, an entry that is not finite, a quaternion
-            whose norm is not between 0.5 and 2, or geometry without a unique normal.
+            whose norm is not between 0.5 and 2, geometry without a unique normal,
+            friction below 0, or friction for a Stewart-Trinkle pair that has none.
         """
         x, u = np.array(x, dtype=float), np.array(u, dtype=float)
         if x.shape != (self.n_x,) or u.shape != (self.n_u,):
@@ -190,14 +193,44 @@ class AnitescuLcs:
                     "expected 1"
                 )
             x[start : start + 4] /= norm
+        mu = self._mu if friction is None else self._friction_of(friction)
         if self._model is not None:
-            chosen, rows = None, (self._weight, self._F_0)
+            chosen = self._every
             if self._groups is not None:
                 gaps = self._model.gaps(x[: self.n_q])
                 chosen = nearest_contacts(gaps, self._groups)
-                rows = self._rows_of(chosen)
-            return self._model.build(x, u, self.dt_sec, self._rows, *rows, chosen)
-        return self._build_general(x, u)
+            lcs = self._model.build(
+                x, u, self.dt_sec, self._rows, *self._rows_of(chosen, mu),
+                None if self._groups is None else chosen,
+            )  # fmt: skip
+        else:
+            lcs = self._build_general(x, u, mu)
+        return lcs if gap is None else self._moved_apart(lcs, gap)
+
+    def _friction_of(self, friction):
+        """(n_contacts,) of the frictions (n_pairs,)."""
+        friction = np.array(friction, dtype=float)
+        if friction.shape != (self.n_pairs,) or not (
+            is_finite(friction) and (friction >= 0.0).all()
+        ):
+            raise ValueError(
+                f"friction is {friction}, expected ({self.n_pairs},) of at least 0"
+            )
+        mu = friction[self._pair_of]
+        for i in np.flatnonzero(self._without_friction & (mu > 0.0)):
+            raise ValueError(
+                f"{self._pair_names[i]}: friction {mu[i]:g} came for a contact that "
+                "was made without"
+            )
+        return mu
+
+    def _moved_apart(self, lcs: LCS, gap) -> LCS:
+        gap = np.array(gap, dtype=float)
+        if gap.shape != (self.n_pairs,) or not is_finite(gap):
+            raise ValueError(f"gap is {gap}, expected ({self.n_pairs},), finite [m]")
+        of_row = self._pair_of[np.asarray(lcs.contact, dtype=int)]
+        further = np.where(self._rows.normal > 0.0, gap[of_row], 0.0)
+        return replace(lcs, c=lcs.c + further / self.dt_sec, phi=lcs.phi + further)
 
     def build_many(self, x, u) -> tuple[np.ndarray, ...]:
         """The LCS about each of many states x (n, n_x) and one input u (n_u,).
@@ -242,17 +275,20 @@ class AnitescuLcs:
                 array[good] = of_good
         return out
 
-    def _rows_of(self, chosen):
-        """The rows' weight and F_0 for the friction and stiffness of these pairs."""
-        mu, compliance = self._mu[chosen], self._compliance[chosen]
+    def _rows_of(self, chosen, mu):
+        """The rows' weight and F_0 for the friction mu (n_contacts,) and stiffness of
+        these contacts."""
+        if mu is self._mu and chosen is self._every:
+            return self._weight, self._F_0
+        mu, compliance = mu[chosen], self._compliance[chosen]
         F_0 = self._rows.F_0(mu, compliance, self.dt_sec, self.eps_c)
         return self._rows.weight(mu), F_0
 
     # The general path: AutoDiff for the smooth dynamics, witness points for contact.
 
-    def _build_general(self, x, u):
+    def _build_general(self, x, u, mu):
         f, J_q, J_v, J_u, M = self._smooth(x, u)
-        phi, J_n, J_c, F_0, chosen = self._contact()
+        phi, J_n, J_c, F_0, chosen = self._contact(mu)
         N, N_plus = self._velocity_maps(x[: self.n_q])
         return assemble_lcs(
             x, f, J_q, J_v, J_u, u, M, N, N_plus, phi, J_n, J_c, self._rows.contact,
@@ -287,18 +323,18 @@ class AnitescuLcs:
         J_q, J_v, J_u = np.split(J, [self.n_q, self.n_x], axis=1)
         return f, J_q, J_v, J_u, M
 
-    def _contact(self):
+    def _contact(self, mu):
         """phi, J_n, J_c, F_0 and the numbers of the contacts, at the state that the
-        plant's context is at."""
+        plant's context is at, for the friction mu (n_contacts,)."""
         plant, context, rows = self._plant, self._plant_context, self._rows
         world, wrt = plant.world_frame(), JacobianWrtVariable.kV
         query = self._query_port.Eval(context)
         found = [self._distance(query, *ids) for ids in self._geometries]
-        chosen, weight, F_0 = np.arange(len(found)), self._weight, self._F_0
+        chosen = self._every
         if self._groups is not None:
             gaps = np.array([gap for gap, *_ in found])
             chosen = nearest_contacts(gaps, self._groups)
-            weight, F_0 = self._rows_of(chosen)
+        weight, F_0 = self._rows_of(chosen, mu)
         phi, J = np.empty(len(chosen)), np.empty((len(chosen), 3, self.n_v))
         for k, i in enumerate(chosen):
             (id_A, id_B), (phi[k], n, p_A, p_B) = self._geometries[i], found[i]
@@ -385,9 +421,9 @@ class AnitescuLcs:
         self._frames = {}
         self._radius: dict[GeometryId, float] = {}
         self._hull: dict[GeometryId, tuple[np.ndarray, np.ndarray]] = {}
-        mu, compliance, kinds, reference, planar = [], [], [], [], []
+        mu, compliance, kinds, reference, planar, pair_of = [], [], [], [], [], []
         groups: list[tuple[np.ndarray, int]] = []
-        for pair in pairs:
+        for number, pair in enumerate(pairs):
             a = _geometries_named(pair.a, bodies, ambiguous, collision)
             b = _geometries_named(pair.b, bodies, ambiguous, collision)
             name = f"{pair.a}~{pair.b}"
@@ -440,6 +476,7 @@ class AnitescuLcs:
                         f"{inspector.GetName(id_A)}~{inspector.GetName(id_B)}"
                     )
                     mu.append(float(pair.friction))
+                    pair_of.append(number)
                     compliance.append(
                         0.0 if pair.stiffness is None else 1.0 / pair.stiffness
                     )
@@ -491,9 +528,15 @@ class AnitescuLcs:
             )
         self._mu, self._reference = np.array(mu), np.array(reference).reshape(-1, 3)
         self._compliance, self._planar = np.array(compliance), np.array(planar)
+        self._pair_of, self._every = np.array(pair_of), np.arange(len(pair_of))
+        self._without_friction = np.array([not (k[0] or k[2]) for k in kinds])
+        self.n_pairs = len(pairs)
         slots = np.concatenate([of_group[:count] for of_group, count in groups])
         self._rows = contact_rows([kinds[i] for i in slots])
-        self._weight, self._F_0 = self._rows_of(slots)
+        self._weight = self._rows.weight(self._mu[slots])
+        self._F_0 = self._rows.F_0(
+            self._mu[slots], self._compliance[slots], self.dt_sec, self.eps_c
+        )
         self.n_lam = len(self._rows.contact)
         names = [self._pair_names[i] for i in slots]
         if not fixed:
@@ -678,6 +721,8 @@ class AnitescuLcsBuilder(LeafSystem):
     """The LCS about the present state, held between updates.
 
     Inputs:  x (n_x,) state [q, v] of the model plant; u (n_u,) its actuation;
+             friction (n_pairs,) of the pairs and gap (n_pairs,), added to their
+             distances [m]: where they are not connected, all is as configured;
              plan (abstract, Plan), with config.knots > 0 only: the last plan, along
              which the LCS of all knots but the first are taken. Where there is none
              yet, all are about x.
@@ -704,6 +749,10 @@ class AnitescuLcsBuilder(LeafSystem):
         self._knots = int(c.knots)
         self._x = self.DeclareVectorInputPort("x", self.model.n_x)
         self._u = self.DeclareVectorInputPort("u", self.model.n_u)
+        self._changes = [
+            self.DeclareVectorInputPort(name, self.model.n_pairs)
+            for name in ("friction", "gap")
+        ]
         if self._knots:
             self._plan = self.DeclareAbstractInputPort(
                 "plan", AbstractValue.Make(object())
@@ -724,7 +773,7 @@ class AnitescuLcsBuilder(LeafSystem):
         x, u = self._x.Eval(context), self._u.Eval(context)
         status = LcsBuilderStatus.BUILT
         try:
-            lcs = self.model.build(x, u)
+            lcs = self.model.build(x, u, *self._changed(context))
         except (ValueError, RuntimeError):
             status, lcs = LcsBuilderStatus.HELD, None
         if lcs is not None and self._knots:
@@ -732,6 +781,13 @@ class AnitescuLcsBuilder(LeafSystem):
         if lcs is not None:
             state.get_mutable_abstract_state(int(self._lcs)).set_value(lcs)
         state.get_mutable_discrete_state(self._status).set_value([float(status)])
+
+    def _changed(self, context):
+        """friction and gap, of AnitescuLcs.build."""
+        return (
+            port.Eval(context) if port.HasValue(context) else None
+            for port in self._changes
+        )
 
     def _along_plan(self, context, first):
         """The LCS of all knots, the first given; and a status."""
@@ -742,9 +798,10 @@ class AnitescuLcsBuilder(LeafSystem):
         x, u = plan.at(
             context.get_time() + self.model.dt_sec * np.arange(1, self._knots)
         )
+        changed = list(self._changed(context))
         for k in range(1, self._knots):
             try:
-                models[k] = self.model.build(x[k - 1], u[k - 1])
+                models[k] = self.model.build(x[k - 1], u[k - 1], *changed)
             except (ValueError, RuntimeError):
                 status = LcsBuilderStatus.BUILT_IN_PART
         return tuple(models), status
