@@ -42,6 +42,7 @@ from makebreak.systems.contact_mpc.numerics.contact_sampling import (
     SamplingMemory,
     choose,
     distance_to_outline,
+    in_reach,
     inward,
     outline_of,
     places_around,
@@ -911,3 +912,20 @@ def test_a_setting_out_of_range_is_named(planner, change, message):
     config = ContactSamplerConfig(SamplingConfig(**change))
     with pytest.raises(ValueError, match=message):
         ContactSampler(config, *planner)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "inside"),
+    [
+        (0.40, 0.0, True), (0.75, 0.0, True), (0.3999, 0.0, False),
+        (0.7501, 0.0, False), (0.0, 0.5, False), (-0.5, 0.0, False),
+        # 1.0 rad to either side of x, a hair within it and beyond.
+        (0.5 * np.cos(0.999), 0.5 * np.sin(0.999), True),
+        (0.5 * np.cos(0.999), -0.5 * np.sin(0.999), True),
+        (0.5 * np.cos(1.001), 0.5 * np.sin(1.001), False),
+        (0.5 * np.cos(1.001), -0.5 * np.sin(1.001), False),
+    ],
+)  # fmt: skip
+def test_a_place_is_in_reach_within_two_radii_and_a_bearing(x, y, inside):
+    found = in_reach(np.array([[0.5, 0.1], [x, y]]), [0.40, 0.75], 1.0)
+    assert found.tolist() == [True, inside]

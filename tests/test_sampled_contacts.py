@@ -13,6 +13,7 @@ from makebreak.diagrams.camera import CameraConfig
 from makebreak.diagrams.gentle_rolling import GentleRollingConfig, ball_config
 from makebreak.diagrams.sampled_contacts import (
     SampledContactsConfig,
+    SampledPlannerConfig,
     ball_shape,
     beside,
     check_contacts,
@@ -463,11 +464,34 @@ def test_what_does_not_go_with_it_is_refused_in_one_line():
         ({"path": PathTargetConfig(radius=0.2)}, "contacts.path.radius is 0.2"),
         ({"push": PushConfig()}, "contacts.push.follow"),
         ({"learning_weight": -1.0}, "contacts.learning_weight is -1.0"),
+        ({"learning_drift": -0.1}, "contacts.learning_drift is -0.1"),
+        ({"gap_allowance": np.inf}, "contacts.gap_allowance is inf"),
+        ({"learning_eps": 0.0}, "contacts.learning_eps is 0.0, expected > 0"),
+    ]
+    + [
+        (
+            {"planner": replace(SampledPlannerConfig(), **{name: 0.0})},
+            f"contacts.planner.{name} is 0.0, expected > 0",
+        )
+        for name in (
+            "position",
+            "velocity",
+            "tip",
+            "tip_height",
+            "tip_speed",
+            "force",
+            "friction",
+        )
     ],
 )
 def test_settings_that_cannot_act_are_refused_by_name(change, message):
     with pytest.raises(ValueError, match=message):
         check_contacts(replace(SampledContactsConfig(), **change))
+
+
+def test_zero_is_no_bad_weight_drift_or_allowance():
+    free = {"learning_weight": 0.0, "learning_drift": 0.0, "gap_allowance": 0.0}
+    check_contacts(replace(SampledContactsConfig(), **free))
 
 
 def test_rounds_of_things_that_lie_still_are_as_before():
