@@ -291,6 +291,13 @@ class GapProblem(ABC):
         those of the other; none where weights do not depend on the model."""
         return []
 
+    def weighed_by(
+        self, effects: Sequence[Effect], every_row: bool = False
+    ) -> "GapProblem | None":
+        """The same rows, of which every model is weighed as one with these effects;
+        None where weights do not depend on the model. every_row: all are fitted."""
+        return None
+
     def is_one_place(self, one: Sequence[str], other: Sequence[str]) -> bool:
         """Whether two places are one rigid body."""
         return False

@@ -1,5 +1,6 @@
 """The statistics of the gap workflow: each against a value from elsewhere."""
 
+from copy import copy
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -576,6 +577,80 @@ def test_below_the_noise_a_rival_is_worse_only_by_the_weights_of_either(lighter,
     (choice,) = select(BelowTheNoise(lighter)).choices
     assert choice.effect.kind == "actuator_bias"
     assert [t.kind for t in choice.ties] == ties
+
+
+class TwoForces(TwoChannels):
+    """A mass (times an acceleration) and a friction (of one size), both below the noise
+    in what they leave. Noise of the acceleration makes rows of a model with a larger
+    mass lighter. speeds: how much the acceleration changes, as a share of friction."""
+
+    plan = SearchPlan(least_gain=0.05, most_effects=1, least_error=1.0)
+
+    def __init__(self, mass: float, friction: float, speeds: float):
+        super().__init__(damping=0.0, bias=0.0)
+        rest, change = np.random.default_rng(8).normal(size=(2, len(self._base)))
+        self._acts = {"object_mass": 1.0 + speeds * change,
+                      "contact_friction": np.ones(len(rest))}  # fmt: skip
+        self._needed = mass * self._acts["object_mass"] + friction + 0.2 * rest
+        self._weights = None
+        self._every = False
+        self._base = self.residual()
+
+    def residual(self, effects=()):
+        r = np.array(self._needed)
+        for e in effects:
+            r = r - sum(e.parameters.values()) * self._acts[e.kind]
+        weighed = effects if self._weights is None else self._weights
+        heavy = sum(e.parameters["mass"] for e in weighed if e.kind == "object_mass")
+        return r / np.hypot(0.4, 0.2 * heavy)
+
+    def weighed_by(self, effects, every_row=False):
+        alike = copy(self)
+        alike._weights, alike._every = list(effects), every_row
+        return alike
+
+    def train(self):
+        return super().train() | self._every
+
+    def candidates(self, nuisances, current):
+        none = {"object_mass": "mass", "contact_friction": "friction"}
+        return [
+            Candidate(kind, ("a",), 1, (self._acts[kind][:, None] / 0.4,),
+                      (lambda c, name=name: {name: float(c[0])},))
+            for kind, name in none.items()
+        ]  # fmt: skip
+
+
+def named_forces(**hidden):
+    return {
+        c.effect.kind: (*c.effect.parameters.values(), [t.kind for t in c.ties])
+        for c in select(TwoForces(**hidden)).choices
+    }
+
+
+def test_of_two_rivals_below_the_noise_that_is_named_which_the_other_needs_beside_it():
+    found = named_forces(mass=1.2, friction=0.0, speeds=0.1)
+    assert list(found) == ["object_mass"] and found["object_mass"][1] == []
+    assert found["object_mass"][0] == pytest.approx(1.2, abs=0.02)
+    found = named_forces(mass=0.0, friction=1.2, speeds=0.1)
+    assert list(found) == ["contact_friction"] and found["contact_friction"][1] == []
+
+
+@pytest.mark.parametrize(("mass", "friction"), [(1.2, 0.0), (0.0, 1.2)])
+def test_rivals_that_differ_by_less_than_laws_are_known_to_are_one(mass, friction):
+    """By 2 % of the gap, which many rows tell from nothing by twelve deviations."""
+    ((first, (_, ties)),) = named_forces(
+        mass=mass, friction=friction, speeds=0.02
+    ).items()
+    assert {first, *ties} == {"object_mass", "contact_friction"}
+
+
+def test_two_rivals_that_are_both_needed_are_both_named():
+    """One of them leaves less than the noise alone, with a wrong value."""
+    found = named_forces(mass=0.7, friction=0.7, speeds=0.2)
+    assert set(found) == {"object_mass", "contact_friction"}
+    assert found["object_mass"][0] == pytest.approx(0.7, abs=0.05)
+    assert found["contact_friction"][0] == pytest.approx(0.7, abs=0.05)
 
 
 class Wavering(TwoChannels):

@@ -5,6 +5,7 @@ Residuals are those of gap/residuals/contact_dynamics.py; simulated windows
 """
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import replace
 from itertools import combinations
 
@@ -81,6 +82,8 @@ class ContactProblem(ContactDynamics, GapProblem):
         self._nuisances: Nuisances | None = None
         self._shown = self.counts()
         self._windows: PushWindows | None = None
+        # The model whose noise weighs all others'; None: each is weighed by its own.
+        self._weights: Sequence[Effect] | None = None
         self._share_out()
         self._learn_misfit()
 
@@ -94,7 +97,8 @@ class ContactProblem(ContactDynamics, GapProblem):
         return np.broadcast_to(value[:, None], self._shown.shape)[self._shown]
 
     def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
-        return np.clip(self._flat(self.left(effects)), -LARGEST, LARGEST)
+        r = self.left(effects, weighed_as=self._weights)
+        return np.clip(self._flat(r), -LARGEST, LARGEST)
 
     def weighed_alike(self, one: Sequence[Effect], other: Sequence[Effect]):
         """A heavier body makes more noise of the same accelerations: by its own weights
@@ -106,6 +110,15 @@ class ContactProblem(ContactDynamics, GapProblem):
             return np.clip(r, -LARGEST, LARGEST)
 
         return [(row(one, w), row(other, w)) for w in (one, other)]
+
+    def weighed_by(
+        self, effects: Sequence[Effect], every_row: bool = False
+    ) -> GapProblem:
+        alike = copy(self)
+        alike._weights = list(effects)
+        if every_row:
+            alike._train = np.ones_like(self._train)
+        return alike
 
     def base(self) -> np.ndarray:
         if self._base is None:

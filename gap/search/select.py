@@ -29,6 +29,7 @@ from makebreak.gap.problem import (
 from makebreak.gap.result import Considered
 from makebreak.gap.search.fit import derivative_free_search, fit_effects, tangents
 from makebreak.gap.search.screen import Ranked, rank
+from makebreak.gap.search.together import ROUNDS, Together, fit_together
 from makebreak.gap.search.trust import steady
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
@@ -39,7 +40,8 @@ FLOOR = 1.15  # Rms over noise that noise alone may leave (its estimate is that 
 # Laws are approximations (how dry friction turns round, how commands are held): errors
 # that differ by less than this share of the whole gap do not tell two models apart.
 PRECISION = 0.015
-# The same of one channel: less of a large gap is how its law was written down.
+# The same of one channel, and of two rivals that are fitted together: less of a large
+# gap is how its law was written down.
 CHANNEL_PRECISION = 0.03
 # A rival that needs more parameters than these beyond the chosen effect's, to say the
 # same, is a coincidence: it contains the effect as a special case.
@@ -48,6 +50,9 @@ MORE = 1
 CHANCE = 0.01
 # A rival that leaves more by more than SAME, by each of two weights, is worse then.
 TOLD_APART = 0.05
+# Rivals that are fitted together: how much more than the best one leaves; what two must
+# take off the held-out error of one, by one model's weights.
+RIVALS, TWO_GAIN = 1.3, 0.02
 # An effect that does not take off `least_gain` of the whole may do it of one channel,
 # if blocks of time say so together (t) and the channel is above the noise.
 CHANNEL_GAIN, LEAST_T, ABOVE = 0.10, 2.0, 1.3
@@ -68,7 +73,8 @@ PAIRED = 10  # Candidates of which all pairs are tried against a single one.
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """One effect as chosen. before, after: held-out error without and with it."""
+    """One effect as chosen. before, after: held-out error without and with it;
+    of_two: it was needed beside its rival, which was, too."""
 
     effect: Effect
     std: dict[str, float]
@@ -80,6 +86,7 @@ class Choice:
     fixed: tuple[str, ...]
     size: int
     in_group: bool = False
+    of_two: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +148,8 @@ class _Search:
         self.nuisances = problem.nuisances()
         self.start = fit_effects(problem, self._screen(problem.base()), ())
         self.channel = problem.channel_of_rows()
+        self._fitted_together: dict[tuple[int, int], tuple] = {}
+        self._pairs: list[Ranked] = []  # Of rivals that are both needed.
 
     def run(self) -> Selection:
         problem = self.problem
@@ -244,8 +253,15 @@ class _Search:
 
     def _refitted(self, chosen: Sequence[Choice], current: Fitted) -> Fitted:
         screen = self._screen(current.r, current.fit.train)
-        effects = [c.effect for c in chosen]
-        return fit_effects(self.problem, screen, effects, [c.fixed for c in chosen])
+        effects, fixed = [c.effect for c in chosen], [c.fixed for c in chosen]
+        fitted = fit_effects(self.problem, screen, effects, fixed)
+        # Of two rivals more of the one that makes noise larger would take over.
+        for _ in range(ROUNDS if any(c.of_two for c in chosen) else 0):
+            alike = self.problem.weighed_by(fitted.effects)
+            assert alike is not None
+            screen = self._screen(alike.residual(fitted.effects), fitted.fit.train)
+            fitted = fit_effects(alike, screen, fitted.effects, fixed)
+        return fitted
 
     def _earns(self, without: np.ndarray, with_: np.ndarray, pooled: bool) -> bool:
         """Whether what an effect takes off residuals (m,) is worth it: of the whole, or
@@ -331,7 +347,10 @@ class _Search:
         if not sound:
             return None, table
         pick = self._picked(sound, found, base.score)
-        pair = self._pair(wide, screen, chosen, ranked, *sound[pick])
+        pick = self._needed(sound, pick, chosen)
+        pair = self._both(screen, chosen, sound, pick)
+        if pair is None:
+            pair = self._pair(wide, screen, chosen, ranked, *sound[pick])
         if pair is not None:
             sound.append(pair)
             pick = len(sound) - 1
@@ -434,18 +453,104 @@ class _Search:
                     return fitted, r
         return None
 
+    def _together(self, chosen, one, other) -> Together | None:
+        """Two rivals (fit, ranked) of one parameter each, fitted at once; None where
+        they are none, or nothing is gained by it."""
+        for _, r in (one, other):
+            if r.candidate.members or r.columns.shape[1] != 1 or r.candidate.fixed:
+                return None
+        key = (id(one[1]), id(other[1]))
+        if key not in self._fitted_together:
+            try:
+                found = fit_together(
+                    self.problem, self.nuisances, [c.effect for c in chosen],
+                    [c.fixed for c in chosen], one[0].effects[-1],
+                    other[0].effects[-1], (_nothing(one[1]), _nothing(other[1])),
+                )  # fmt: skip
+            except (ValueError, RuntimeError):
+                found = None
+            # The pair is kept along: of what is gone another might have the number.
+            self._fitted_together[key] = found, one, other
+        return self._fitted_together[key][0]
+
+    def _least_lost(self) -> float:
+        """What laws, which are approximations, may leave of the gap, in noise. (Where a
+        block was pushed at one speed, friction that is 1 % off as it sets in looks like
+        a third of the mass: by deviations alone the wrong one of two is needed.)"""
+        return CHANNEL_PRECISION * self.start.score
+
+    def _needed(self, sound, pick: int, chosen) -> int:
+        """Of the one that is picked and its rivals that one which is needed beside the
+        other, if the other is not."""
+        for k, other in enumerate(sound):
+            if k == pick or not _are_rivals(sound[pick], other):
+                continue
+            both = self._together(chosen, sound[pick], other)
+            if both is None:
+                continue
+            least = self._least_lost()
+            if both.needs(1, least) and not both.needs(0, least):
+                pick = k
+        return pick
+
+    def _both(self, screen, chosen, sound, pick: int):
+        """Two rivals, each of which is needed beside the other; of several such pairs
+        the one that leaves least. One of them may do it alone below the noise, where
+        its value is then wrong."""
+        found = []
+        for k, other in enumerate(sound):
+            if k == pick or not _are_rivals(sound[pick], other):
+                continue
+            both, least = self._together(chosen, sound[pick], other), self._least_lost()
+            if both is None or not (both.needs(0, least) and both.needs(1, least)):
+                continue
+            if self._gained_by_two(chosen, both) >= TWO_GAIN:
+                found.append((rms(both.fitted.left), other[1], both))
+        if not found:
+            return None
+        _, rival, both = min(found, key=lambda each: each[0])
+        a, b = sound[pick][1], rival
+        ranked = Ranked(
+            Candidate(
+                f"{a.candidate.kind} and {b.candidate.kind}",
+                (*a.candidate.at, *b.candidate.at), 2,
+                (np.hstack([a.columns, b.columns]),), (),
+                members=(a.candidate, b.candidate),
+            ),
+            a.fit, both.fitted.effects[len(chosen) :], True, 0,
+        )  # fmt: skip
+        self._pairs.append(ranked)
+        pairs = self._fit_each(screen, chosen, [ranked])
+        return pairs[0] if pairs else None
+
+    def _gained_by_two(self, chosen, both: Together) -> float:
+        """Share of the held-out error of the first alone that both take off, fitted to
+        the other rows, by the weights of both."""
+        alike = self.problem.weighed_by(both.fitted.effects)
+        assert alike is not None
+        errors = []
+        for start in (both.single.effects, both.fitted.effects):
+            r = alike.residual(start)
+            fixed = [*[c.fixed for c in chosen], *[()] * (len(start) - len(chosen))]
+            fit = fit_effects(alike, self._screen(r), start, fixed)
+            errors.append(self._blurred(fit.score))
+        return 1.0 - errors[1] / errors[0]
+
     def _step(self, sound, pick: int, chosen, base: float, before) -> _Step:
         """Args: base, before (m,): error and residual without it."""
         fit, best = sound[pick]
         others = [(f, r) for k, (f, r) in enumerate(sound) if k != pick]
         runner = min(others, key=lambda o: o[0].score, default=None)
-        ties = () if best.candidate.members else self._ties(fit, best, others, before)
+        ties: tuple[Effect, ...] = ()
+        if not best.candidate.members:
+            ties = self._ties(fit, best, others, before, chosen)
         new = fit.effects[len(chosen) :]
         sizes = [len(fit.std[len(chosen) + k]) for k in range(len(new))]
         if len(new) == 1:
             sizes = [best.candidate.size]
         fixed = best.fixed()
         together = len(new) > 1 and len({e.kind for e in new}) == 1
+        of_two = any(best is pair for pair in self._pairs)
         return _Step(
             fit,
             tuple(
@@ -453,16 +558,18 @@ class _Search:
                     effect, {}, base, fit.score,
                     runner[1].candidate.name if runner else "",
                     runner[0].score / fit.score - 1.0 if runner else np.inf,
-                    ties, fixed[k], sizes[k], together,
+                    ties, fixed[k], sizes[k], together, of_two,
                 )
                 for k, effect in enumerate(new)
             ),
         )  # fmt: skip
 
-    def _ties(self, fit: Fitted, best: Ranked, others, before) -> tuple[Effect, ...]:
+    def _ties(
+        self, fit: Fitted, best: Ranked, others, before, chosen: Sequence[Choice] = ()
+    ) -> tuple[Effect, ...]:
         """Of another kind, or of the same at another place.
 
-        Args: before (m,): what is left without the effect.
+        Args: before (m,): what is left without the effect; chosen: what else is there.
         """
         error, floor = self._error, self.plan.least_error
         ties = []
@@ -479,6 +586,13 @@ class _Search:
             if r.candidate.kind == best.candidate.kind and self.problem.is_one_place(
                 r.candidate.at, best.candidate.at
             ):
+                continue
+            both = None
+            if _are_rivals((fit, best), (f, r)):
+                both = self._together(chosen, (fit, best), (f, r))
+            if both is not None:
+                if not both.needs(0, self._least_lost()):
+                    ties.append(f.effects[-1])
                 continue
             alike = (
                 paired(f.left, fit.left, self.train) > CHANCE
@@ -701,23 +815,33 @@ class _Search:
         while len(chosen) > 1:
             screen = self._screen(current.r, current.fit.train)
             now = screen.judge(current.r)
+            # By the weights of all: a smaller model must not seem better by its own.
+            alike = self.problem.weighed_by(current.effects)
+            problem = self.problem if alike is None else alike
             left = screen.settle(current.r)[1]
             needless: list[tuple[float, int, Fitted]] = []
             for k in range(len(chosen)):
                 rest = [e for i, e in enumerate(current.effects) if i != k]
                 fixed = [c.fixed for i, c in enumerate(chosen) if i != k]
                 try:
-                    smaller = fit_effects(self.problem, screen, rest, fixed, 5)
+                    smaller = fit_effects(problem, screen, rest, fixed, 5)
                 except ValueError:  # What is left would be no scene.
                     continue
-                least = (1.0 - self.plan.least_gain) * self._error(smaller.score)
-                pooled = self._error(now.score) < least
+                # Of two that were told apart by one model's weights the noise is no
+                # floor.
+                two = chosen[k].of_two and alike is not None
+                error = self._blurred if two else self._error
+                gain = TWO_GAIN if two else self.plan.least_gain
+                pooled = error(now.score) < (1.0 - gain) * error(smaller.score)
                 if not self._stays(chosen[k], smaller.left, left, pooled):
                     needless.append((smaller.score, k, smaller))
             if not needless:
                 break
             _, k, current = min(needless, key=lambda each: each[0])
             chosen = [c for i, c in enumerate(chosen) if i != k]
+            if alike is not None:
+                chosen = _refreshed(chosen, current)
+                current = self._refitted(chosen, current)
         return chosen, current
 
     def _simplified(self, chosen: list[Choice], current: Fitted):
@@ -787,6 +911,22 @@ def _refreshed(chosen: Sequence[Choice], fitted: Fitted) -> list[Choice]:
             zip(chosen, fitted.effects, fitted.std, strict=True)
         )
     ]  # fmt: skip
+
+
+def _nothing(ranked: Ranked) -> Effect:
+    """A candidate as it is in the scene: with nothing of it."""
+    (effect,) = ranked.candidate.effects(ranked.alternative, np.zeros(1))
+    return effect
+
+
+def _are_rivals(one, other) -> bool:
+    """Whether two (fit, ranked) may stand for each other: the catalogue says so, or
+    they leave about as much."""
+    (a, r), (b, q) = one, other
+    first, second = r.candidate.kind, q.candidate.kind
+    if second in KINDS[first].confused_with or first in KINDS[second].confused_with:
+        return True
+    return bool(b.score <= RIVALS * a.score)
 
 
 def _groups(found: Sequence[Candidate]) -> list[Candidate]:
@@ -888,9 +1028,14 @@ def _shortlist(ranked: list[Ranked], base: float, most: int) -> list[Ranked]:
             short.append(each)
     there = {r.candidate.kind for r in short}
     first = ranked[0].candidate.kind
+    # What looks like a kind looks like one that it contains, too.
+    best_kinds = (first, *KINDS[first].contains)
     for each in ranked:
         kind = each.candidate.kind
-        alike = kind in KINDS[first].confused_with or first in KINDS[kind].confused_with
+        alike = any(
+            kind in KINDS[k].confused_with or k in KINDS[kind].confused_with
+            for k in best_kinds
+        )
         if alike and kind not in there:
             short.append(each)
             there.add(kind)
