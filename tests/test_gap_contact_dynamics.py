@@ -23,7 +23,7 @@ from makebreak.gap.residuals.contact_problem import ContactProblem, _best_rectan
 from makebreak.gap.residuals.contact_shapes import _Point, _Surface
 from makebreak.gap.residuals.permitted_contacts import Shift
 from makebreak.gap.result import Considered, GapMeasure
-from makebreak.gap.search.fit import fit_effects
+from makebreak.gap.search.fit import _Free, fit_effects
 from makebreak.gap.search.select import Choice, Selection
 from makebreak.gap.simulation import contact_windows
 from makebreak.gap.simulation.contact_windows import PushWindows, led_as_measured
@@ -268,6 +268,32 @@ def test_rectangles_of_cells_are_those_of_brute_force():
     assert box == (1, 3, 0, 2)
     x = cells[1:3, 0:2].sum(axis=(0, 1))
     assert c == pytest.approx(x @ r / (x @ x))
+
+
+def test_a_place_that_explains_less_is_among_the_rectangles_too():
+    """Of feet in a fixed pattern one is over another place whenever one is over the
+    patch. Where the wrong place does better in the fitted rows, many rectangles about
+    it do so, and the right one must still be tried."""
+    rng = np.random.default_rng(1)
+    cells, r = 0.05 * rng.normal(size=(12, 12, 400)), 0.1 * rng.normal(size=400)
+    wrong, right = rng.normal(size=(2, 400))
+    cells[7:11, 7:11] += wrong / 16
+    cells[1:3, 1:3] += right / 4
+    r += 0.3 * wrong - 0.15 * right
+    boxes = [box for _, box in _best_rectangles(cells, r, 0.5)]
+    assert boxes[0][0] >= 6 and boxes[0][2] >= 6
+    assert any(box[1] <= 4 and box[3] <= 4 for box in boxes)
+
+
+def test_a_patch_s_friction_ends_where_surfaces_do():
+    """A corner of a patch with friction of 45 leaves as little in few rows."""
+    free = _Free(
+        SimpleNamespace(dynamics=SimpleNamespace(least=lambda kind, at: {})),
+        [Effect("friction_patch", [PAIR], {"friction": 45.0, "x_min": 0.0,
+                "x_max": 0.1, "y_min": 0.0, "y_max": 0.1})], [()],
+    )  # fmt: skip
+    assert free.x0[0] <= free.high[0] == 1.5
+    assert np.isinf(free.high[1:]).all()
 
 
 @pytest.mark.parametrize(("mass", "friction"), [(4.0, 1.6), (4.0, 3.9), (1.2, 0.5)])

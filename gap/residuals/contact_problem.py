@@ -54,7 +54,8 @@ LESS = 0.85
 EXACT = 4  # Single effects that are fitted for what models are off by.
 CELL, MOST_CELLS = 0.015, 20  # A side of the cells in which a patch is looked for [m].
 LEAST_CELLS = 4
-PATCH_RUNS, PATCH_STARTS = 200, 4
+APART = 0.25  # Of rectangles, what they may have in common.
+PATCH_RUNS, PATCH_STARTS, PATCHES = 120, 8, 3
 # Of a patch's side: how far it is moved [m], and what that may add to the sum of
 # squares (neighbouring rows err together: four times what one row would count).
 MOVED, PROFILE = (5e-4, 1e-3, 2e-3, 4e-3, 8e-3, 0.016, 0.032, 0.064), 16.0
@@ -483,6 +484,9 @@ class ContactProblem(ContactDynamics, GapProblem):
                 if new is not None:
                     cells[i, j] = ((r - new) / step)[train]
             rectangles += _best_rectangles(cells, r[train], mu)
+        # Less steep than 1.5 is what surfaces are: a corner of a patch with more of it
+        # does in few rows what the patch does in many.
+        most = KINDS["friction_patch"].parameter("friction").high
         found = []
         for c, (i0, i1, j0, j1) in rectangles:
             box = np.array([grid[0][i0], grid[0][i1], grid[1][j0], grid[1][j1]])
@@ -494,23 +498,28 @@ class ContactProblem(ContactDynamics, GapProblem):
         best: list[tuple] = []
         for _, f, box in found:  # Of each rectangle the best, and few of them.
             if len(best) < PATCH_STARTS and not any(box is b[3] for b in best):
-                best.append((*self._search_patch(moved, mu, f, box, train, 60), box))
-        if not best:
-            return []
-        best = [(error, f, sides) for error, f, sides, _ in best]
-        _, friction, sides = min(best, key=lambda each: each[0])
-        _, friction, sides = self._search_patch(
-            moved, mu, friction, sides, train, PATCH_RUNS
-        )
-        new = moved(friction, sides)
-        if new is None or abs(friction - mu) < 1e-6:
-            return []
-        column = ((r - new) / (friction - mu))[:, None]
+                best.append((*self._search_patch(moved, f, box, train, 60, most), box))
+        # What passes over one place passes over others with its other feet: rows that
+        # are held out say which it is.
+        best.sort(key=lambda each: each[0])
+        columns, readers = [], []
+        for _, friction, sides, _ in best[:PATCHES]:
+            _, friction, sides = self._search_patch(
+                moved, friction, sides, train, PATCH_RUNS, most
+            )
+            new = moved(friction, sides)
+            if new is None or abs(friction - mu) < 1e-6:
+                continue
+            columns.append(((r - new) / (friction - mu))[:, None])
 
-        def read(c) -> dict[str, float]:
-            return patch(np.clip(mu + c[0], 0.05 * mu, max(1.5, 2.0 * mu)), sides)
+            def read(c, sides=sides) -> dict[str, float]:
+                return patch(np.clip(mu + c[0], 0.05 * mu, most), sides)
 
-        return [Candidate("friction_patch", (at,), 5, (column,), (read,))]
+            readers.append(read)
+        return [
+            Candidate("friction_patch", (at,), 5, (column,), (read,))
+            for column, read in zip(columns, readers, strict=True)
+        ]
 
     def _may_have_patch(self, pair, there: Sequence[Effect]) -> bool:
         at = self.pair_name(pair)
@@ -518,13 +527,16 @@ class ContactProblem(ContactDynamics, GapProblem):
             return False
         return not any(e.kind in ("plane_tilt", "friction_patch") for e in there)
 
-    def _search_patch(self, moved: Callable, mu, friction, sides, train, most):
-        """The error, friction and sides from which no small move takes off more."""
-        scale = np.array([0.1 * mu, 0.01, 0.01, 0.01, 0.01])
+    def _search_patch(
+        self, moved: Callable, friction, sides, train, runs: int, most: float
+    ):
+        """The error, friction (at most `most`) and sides from which no small move takes
+        off more."""
+        scale = np.array([0.1 * friction, 0.01, 0.01, 0.01, 0.01])
 
         def cost(z) -> float:
             f, box = friction + scale[0] * z[0], sides + scale[1:] * z[1:]
-            if not (f > 0.0 and box[0] < box[1] and box[2] < box[3]):
+            if not (0.0 < f <= most and box[0] < box[1] and box[2] < box[3]):
                 return 1e9
             r = moved(f, box)
             return 1e9 if r is None else float(np.mean(r[train] ** 2))
@@ -532,7 +544,7 @@ class ContactProblem(ContactDynamics, GapProblem):
         corners = np.vstack([np.zeros(5), np.eye(5)])
         found = minimize(
             cost, np.zeros(5), method="Nelder-Mead",
-            options={"initial_simplex": corners, "maxfev": most, "xatol": 0.01,
+            options={"initial_simplex": corners, "maxfev": runs, "xatol": 0.01,
                      "fatol": 1e-5},
         )  # fmt: skip
         x = scale * found.x
@@ -693,9 +705,10 @@ def reader_of_trial(kind: str, names: Sequence[str], trial) -> Callable:
     return read
 
 
-def _best_rectangles(cells: np.ndarray, r: np.ndarray, mu: float, most: int = 12):
+def _best_rectangles(cells: np.ndarray, r: np.ndarray, mu: float, most: int = 8):
     """Rectangles of cells, each with what is added to their friction, that take most
-    off r (n,) to first order, none of which is nearly another. cells (nx, ny, n).
+    off r (n,) to first order, none of which has much in common with another. cells
+    (nx, ny, n).
     Returns: [(c, (i0, i1, j0, j1))]."""
     nx, ny, n = cells.shape
     sums = np.zeros((nx + 1, ny + 1, n))
@@ -720,7 +733,7 @@ def _best_rectangles(cells: np.ndarray, r: np.ndarray, mu: float, most: int = 12
     found.sort(key=lambda each: -each[0])
     kept: list[tuple[float, tuple[int, int, int, int]]] = []
     for _, added, box in found:
-        if len(kept) < most and all(_overlap(box, other) < 0.6 for _, other in kept):
+        if len(kept) < most and all(_overlap(box, other) < APART for _, other in kept):
             kept.append((added, box))
     return kept
 

@@ -243,9 +243,11 @@ def _lowest(kind: str, name: str) -> float:
 
 
 def _highest(kind: str, name: str) -> float:
-    """A share ends where robots' do: at 1 nothing is left."""
+    """A share ends where robots' do: at 1 nothing is left. So does a patch's friction:
+    with more of it a patch shrinks to a point."""
     parameter = KINDS[kind].parameter(name)
-    return parameter.high if parameter.valid == "share" else np.inf
+    ends = parameter.valid == "share" or (kind, name) == ("friction_patch", "friction")
+    return parameter.high if ends else np.inf
 
 
 def _tidy(effect: Effect) -> Effect:
