@@ -329,7 +329,8 @@ class _Search:
             )
             for r in ranked[:15]
         ]  # fmt: skip
-        short = _shortlist(ranked, base.score, self.plan.shortlist)
+        by_model = self.problem.weighed_by([c.effect for c in chosen]) is not None
+        short = _shortlist(ranked, base.score, self.plan.shortlist, by_model)
         if not self.plan.by_channel and ranked[0].fit.score > 0.95 * base.score:
             short = []
         if not short:
@@ -1008,7 +1009,9 @@ def _is_used(fit: Fitted) -> bool:
     return True
 
 
-def _shortlist(ranked: list[Ranked], base: float, most: int) -> list[Ranked]:
+def _shortlist(
+    ranked: list[Ranked], base: float, most: int, inner_rivals: bool = False
+) -> list[Ranked]:
     """Those worth an exact fit: near the best, at most two of a kind and size, or all
     places that do alike; and of each kind that the catalogue says to be confused with
     the best, the best place."""
@@ -1028,8 +1031,8 @@ def _shortlist(ranked: list[Ranked], base: float, most: int) -> list[Ranked]:
             short.append(each)
     there = {r.candidate.kind for r in short}
     first = ranked[0].candidate.kind
-    # What looks like a kind looks like one that it contains, too.
-    best_kinds = (first, *KINDS[first].contains)
+    # What looks like a kind that the best contains is its rival, too.
+    best_kinds = (first, *KINDS[first].contains) if inner_rivals else (first,)
     for each in ranked:
         kind = each.candidate.kind
         alike = any(
