@@ -10,6 +10,7 @@ from scipy.optimize import lsq_linear
 from scipy.signal import lfilter
 
 from makebreak.gap.numerics.selection import (
+    LinearFit,
     Screen,
     benjamini_hochberg,
     boxed_minimum,
@@ -34,7 +35,14 @@ from makebreak.gap.problem import (
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.result import GapMeasure
 from makebreak.gap.search.fit import derivative_free_search, fit_effects
-from makebreak.gap.search.select import Choice, Selection, is_significant, select
+from makebreak.gap.search.screen import Ranked
+from makebreak.gap.search.select import (
+    Choice,
+    Selection,
+    _shortlist,
+    is_significant,
+    select,
+)
 from makebreak.gap.search.trust import gauss_newton, ridges, steady
 from makebreak.gap.verdict import after_simulation, verdict_of, withdrawn_if_weak
 from makebreak.gap.workflow import kept_by_simulation
@@ -651,6 +659,24 @@ def test_two_rivals_that_are_both_needed_are_both_named():
     assert set(found) == {"object_mass", "contact_friction"}
     assert found["object_mass"][0] == pytest.approx(0.7, abs=0.05)
     assert found["contact_friction"][0] == pytest.approx(0.7, abs=0.05)
+
+
+@pytest.mark.parametrize(("inner", "tried"), [(True, True), (False, False)])
+def test_a_patch_s_rivals_are_those_of_friction_where_weights_depend_on_the_model(
+    inner, tried
+):
+    """By slopes a mass half as large again ranks far below; fitted it does as well."""
+    ranked = [
+        Ranked(
+            Candidate(kind, ("a",), size, (np.zeros((4, 1)),), (lambda c: {},)),
+            LinearFit(np.zeros(1), np.zeros(1), np.zeros(0), score, score, score),
+            (), True, 0,
+        )
+        for kind, size, score in (("friction_patch", 5, 1.5),
+                                  ("contact_friction", 1, 1.6), ("object_mass", 1, 9.0))
+    ]  # fmt: skip
+    kinds = [r.candidate.kind for r in _shortlist(ranked, 10.0, 10, inner)]
+    assert ("object_mass" in kinds) == tried and "contact_friction" in kinds
 
 
 class Wavering(TwoChannels):
