@@ -291,6 +291,10 @@ class GapProblem(ABC):
         those of the other; none where weights do not depend on the model."""
         return []
 
+    def change(self, effect: Effect) -> float:
+        """How far an effect is from the scene as it came, in any unit of its kind."""
+        return 0.0
+
     def weighed_by(
         self, effects: Sequence[Effect], every_row: bool = False
     ) -> "GapProblem | None":

@@ -679,6 +679,34 @@ def test_a_patch_s_rivals_are_those_of_friction_where_weights_depend_on_the_mode
     assert ("object_mass" in kinds) == tried and "contact_friction" in kinds
 
 
+class FoundTwice(TwoForces):
+    """The same kind at one place is a candidate twice, for fits that end elsewhere: the
+    second leaves 1 % less, and is the larger change."""
+
+    def candidates(self, nuisances, current):
+        (first,) = [c for c in super().candidates(nuisances, current)
+                    if c.kind == "contact_friction"]  # fmt: skip
+        other = replace(
+            first, to_parameters=(lambda c: {"friction": 1.01 * float(c[0])},)
+        )
+        return [first, other]
+
+    def residual(self, effects=()):
+        # Two valleys, of which the one farther off is a little deeper.
+        off = [e.parameters["friction"] for e in effects]
+        far = bool(off) and off[0] > 1.2045
+        return super().residual(effects) * (0.99 if far else 1.0)
+
+    def change(self, effect):
+        return abs(effect.parameters["friction"])
+
+
+def test_what_is_found_twice_is_no_rival_of_itself():
+    (choice,) = select(FoundTwice(mass=0.0, friction=1.2, speeds=0.1)).choices
+    assert choice.ties == ()
+    assert choice.effect.parameters["friction"] < 1.2045
+
+
 class Wavering(TwoChannels):
     """Five recordings, in each of which the bias is another."""
 

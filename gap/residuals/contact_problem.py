@@ -112,6 +112,16 @@ class ContactProblem(ContactDynamics, GapProblem):
 
         return [(row(one, w), row(other, w)) for w in (one, other)]
 
+    def change(self, effect: Effect) -> float:
+        """Of a patch by how much its friction is another: a small one with much does
+        nearly what a larger one with less does, if few things slid over it."""
+        if effect.kind != "friction_patch":
+            return 0.0
+        now = [
+            self._friction_now(p) for p in self._pairs_met if self._at_pair(effect, p)
+        ]
+        return abs(effect.parameters["friction"] - (now[0] if now else 0.0))
+
     def weighed_by(
         self, effects: Sequence[Effect], every_row: bool = False
     ) -> GapProblem:

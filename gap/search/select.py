@@ -347,6 +347,7 @@ class _Search:
             sound = self._fit_each(screen, chosen, [r for _, r in sound], sound)
         if not sound:
             return None, table
+        sound = self._one_of_each(sound)
         pick = self._picked(sound, found, base.score)
         pick = self._needed(sound, pick, chosen)
         pair = self._both(screen, chosen, sound, pick)
@@ -368,6 +369,25 @@ class _Search:
             taken_one = earning[self._picked(earning, found, base.score)]
             pick = next(k for k, each in enumerate(sound) if each is taken_one)
         return self._step(sound, pick, chosen, base.score, left), table
+
+    def _one_of_each(self, sound):
+        """Of one kind at one place (a patch that was found twice) one: no rival of
+        itself. Of those that do as well as the best the one that changes least."""
+        of: dict[tuple, list] = {}
+        for fit, r in sound:
+            key = (r.candidate.kind, tuple(r.candidate.at), r.candidate.size)
+            of.setdefault(key, []).append((fit, r))
+        out = []
+        for same in of.values():
+            best = min(self._error(f.score) for f, _ in same)
+            near = [x for x in same if self._error(x[0].score) <= (1.0 + SAME) * best]
+            out.append(
+                min(
+                    near,
+                    key=lambda x: (self.problem.change(x[0].effects[-1]), x[0].score),
+                )
+            )
+        return out
 
     def _picked(self, sound, found: Sequence[Candidate], base: float) -> int:
         """The simplest of those that do as well as the best."""
