@@ -215,3 +215,37 @@ def test_a_servo_is_proposed_with_the_stiffness_that_its_sag_tells(tmp_path):
     assert scene.actuation.type == "servo"
     np.testing.assert_allclose(scene.actuation.kp, 6.0, rtol=0.01)
     SceneSimulation(scene)  # It can be simulated.
+
+
+@pytest.mark.parametrize(
+    "name, channel, scale",
+    [
+        ("mast actual position [mm]", "a.mast.position", 1e-3),
+        ("mast actual speed [mm/s]", "a.mast.velocity", 1e-3),
+        ("mast_pos_cm", "a.mast.position", 1e-2),
+        ("mast motor force torque (kN)", "a.mast.effort_measured", 1e3),
+        ("elbow_position_mrad", "a.elbow.position", 1e-3),
+        ("elbow position [deg]", "a.elbow.position", np.pi / 180),
+        ("elbow position [rad]", "a.elbow.position", 1.0),
+        ("elbow_velocity_deg_per_s", "a.elbow.velocity", np.pi / 180),
+        ("elbow velocity {1/min}", "a.elbow.velocity", np.pi / 30),
+        ("elbow torque [N cm]", "a.elbow.effort_measured", 1e-2),
+        ("elbow torque [%]", None, 1.0),
+        ("elbow torque [A]", None, 1.0),
+        # No unit of such a quantity, and an index, say nothing.
+        ("elbow position [mm]", "a.elbow.position", 1.0),
+        ("elbow position[0]", "a.elbow.position", 1.0),
+    ],
+)
+def test_the_unit_in_a_name_is_believed(name, channel, scale):
+    joints = [JointName("a.mast", True, -0.2, 0.2), JointName("a.elbow", False, -2, 2)]
+    [_, match] = propose({"time": T, name: 0.5 * np.sin(3.0 * T)}, joints)
+    assert (match.channel, match.scale) == (channel, pytest.approx(scale))
+
+
+def test_the_unit_in_a_name_is_no_matter_of_size():
+    """0.5 could be m, and what a velocity is beside it could be anything."""
+    joints = [JointName("a.mast", True)]
+    names = ("mast position [mm]", "mast speed [m/s]")
+    [_, q, v] = propose({"time": T} | sines(names, 100.0), joints)
+    assert (q.scale, v.scale) == (1e-3, 1.0)

@@ -39,6 +39,18 @@ _RATES = (
 )  # fmt: skip
 
 
+# What a column's own name says of its unit, as a factor to SI.
+_LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
+_ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": DEG, "degree": DEG, "degrees": DEG,
+           "°": DEG, "mdeg": 1e-3 * DEG, "rev": 2.0 * np.pi}  # fmt: skip
+_SPIN = {"rpm": 2.0 * np.pi / 60.0, "degps": DEG, "dps": DEG, "radps": 1.0,
+         "1/min": 2.0 * np.pi / 60.0, "rev/min": 2.0 * np.pi / 60.0}  # fmt: skip
+_FORCES = {"n": 1.0, "kn": 1e3, "mn": 1e-3}
+_TORQUES = {"nm": 1.0, "n.m": 1.0, "ncm": 1e-2, "nmm": 1e-3, "mnm": 1e-3, "knm": 1e3}
+# Of an effort these need a number that the log does not have.
+_NO_EFFORT = ("%", "a", "ma", "percent", "permille", "‰")
+
+
 @dataclass(frozen=True)
 class JointName:
     """A joint of the robot. name: `<model>.<joint>`; limits in rad or m."""
@@ -267,11 +279,57 @@ def _counts(value: np.ndarray) -> bool:
     return bool(len(there)) and bool((there == np.rint(there)).all())
 
 
+def _unit_said(name: str) -> str:
+    """What stands in brackets at a name's end, or after its last underscore or space,
+    in lower case; "" if that is none, or one letter that may be anything."""
+    inside = re.search(r"[\[({<]\s*([^\[\](){}<>]+?)\s*[\])}>]\s*$", name)
+    if inside:
+        return re.sub(r"[\s*·]", "", inside.group(1).lower())
+    low = re.sub(r"_(per_)?s(ec)?$", "/s", name.strip().lower())
+    last = re.split(r"[_\s]", low)[-1]
+    return last if len(last) > 1 else ""
+
+
+def _scale_said(name: str, channel: str, prismatic: bool) -> tuple[str, float | None]:
+    """The unit that a column's name has, and its factor to SI; None: without another
+    number it has none. "" where the name says no unit of this quantity."""
+    unit = _unit_said(name)
+    what = channel.rsplit(".", 1)[-1].split("_")[0]
+    if what == "effort":
+        known = _FORCES if prismatic else _TORQUES
+        if unit in _NO_EFFORT:
+            return unit, None
+    else:
+        known = _LENGTHS if prismatic else _ANGLES
+        if what == "velocity":
+            known = {f"{u}{end}": f for u, f in known.items() for end in ("/s", "/sec")}
+            known |= {} if prismatic else _SPIN
+    return (unit, known[unit]) if unit in known else ("", 1.0)
+
+
 def _in_si(found, columns, joints: Sequence[JointName]) -> dict[str, Match]:
-    """Scales of positions and of what goes with them."""
+    """Scales of positions, of what goes with them, and where names say a unit."""
     of = {joint.name: joint for joint in joints}
-    out = dict(found)
-    time = next((m for m in found.values() if m.channel == "time"), None)
+    told = {}
+    for name, match in found.items():
+        joint = of.get((match.channel or "").rsplit(".", 1)[0])
+        if joint is None or match.channel is None or match.channel == name:
+            continue
+        unit, scale = _scale_said(name, match.channel, joint.prismatic)
+        if scale is None:
+            why = f"in {unit}, and of what is not said: give channel and scale"
+            told[name] = Match(name, None, why=why)
+        elif unit:
+            why = f"{match.why}; in {unit}, by its name"
+            told[name] = Match(name, match.channel, scale, why=why)
+    rest = {name: match for name, match in found.items() if name not in told}
+    return {**found, **_in_si_by_size(rest, told, columns, of), **told}
+
+
+def _in_si_by_size(found, told, columns, of) -> dict[str, Match]:
+    """Of columns `found`, whose names say no unit. told: the others."""
+    out = {**found, **told}
+    time = next((m for m in out.values() if m.channel == "time"), None)
     degrees: dict[str, bool] = {}  # By the way a column is named.
     for name, match in found.items():
         if match.channel is None or not match.channel.endswith(
