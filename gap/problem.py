@@ -34,6 +34,7 @@ class SearchPlan:
     own_values: whether a value that joints share may become one for each.
     shortlist: candidates that are fitted exactly before one is taken.
     simulation_agrees: whether agreement also needs simulated windows that agree.
+    loud: rms over noise of one channel that is a gap, whatever the others leave.
     """
 
     evaluations: int = 8
@@ -46,6 +47,7 @@ class SearchPlan:
     own_values: bool = False
     shortlist: int = 8
     simulation_agrees: bool = False
+    loud: float = 3.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,7 +32,7 @@ from makebreak.gap.residuals.objects import FlightProblem, RolloutProblem, Touch
 from makebreak.gap.residuals.pressing import PressingProblem, presses
 from makebreak.gap.result import GapMeasure, GapResult, JudgedChannel
 from makebreak.gap.search.fit import fit_effects
-from makebreak.gap.search.select import LOUD, Choice, Selection, select, without
+from makebreak.gap.search.select import Choice, Selection, select, without
 from makebreak.gap.search.trust import trust_in
 from makebreak.gap.simulation.measure import WINDOW_SEC
 from makebreak.gap.simulation.windows import WindowModel, with_step
@@ -208,7 +208,7 @@ def conclude(
             verdict = "gap_unnamed"
             differs = " The equations of motion agree, simulated windows do not."
     name, size = problem.loudest(selection.start)
-    if verdict == "no_gap" and size > LOUD:
+    if verdict == "no_gap" and size > max(problem.plan.loud, UNNAMED):
         # Among many others one that is off would not show.
         verdict = "gap_unnamed"
         differs = f" {name} is off by {size:.2g} times its noise."

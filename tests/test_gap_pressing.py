@@ -6,7 +6,7 @@ import pytest
 from makebreak.gap.data.recording import read_recordings
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.residuals.pressing import PressingProblem, presses
-from makebreak.gap.search.select import LOUD, select
+from makebreak.gap.search.select import select
 from makebreak.gap.workflow import judged_channels, problem_for, unjudged_channels
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
@@ -170,7 +170,7 @@ def test_where_nothing_is_hidden_nothing_is_left_and_nothing_named(right):
     assert problem.noise_error(problem.base()) < 1.5  # What `no_gap` allows.
     found = select(problem)
     assert found.choices == ()
-    assert problem.loudest(found.start)[1] < LOUD
+    assert problem.loudest(found.start)[1] < problem.plan.loud
     # Nothing that was measured is left out.
     assert unjudged_channels(judged_channels(problem)) == ""
 
@@ -182,7 +182,7 @@ def test_a_moment_is_what_the_force_has_where_shapes_touch(tmp_path):
     start = select(problem).start
     # The table's force is 8 N: 48 mN m about x, and of the wall's as much about z.
     assert problem.loudest(start)[0] in ("gantry.tip.tx", "gantry.tip.tz")
-    assert problem.loudest(start)[1] > LOUD
+    assert problem.loudest(start)[1] > problem.plan.loud
 
 
 def test_bodies_that_stand_elsewhere_are_felt_there(displaced):

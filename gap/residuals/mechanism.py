@@ -42,6 +42,7 @@ from makebreak.models.scene import Scene
 # Below this over the sensors' noise a rich model leaves what noise may: models are
 # right. A weight is changed where it would become less by this share.
 MISFIT, LESS = 1.3, 0.8
+LOUD = 1.5  # Rms over noise of one joint's rows that is looked into by itself.
 AT_REST = 2.0  # Times the least uncertainty: rows with more are of joints at rest.
 RICH_PRIOR = 10.0  # Times a nuisance's tolerance, in a rich model.
 # What is left of a measured effort is noise where less than this share of it repeats,
@@ -62,7 +63,9 @@ class MechanismProblem(InverseModel, GapProblem):
 
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
         super().__init__(scene, recordings)
-        self.plan = SearchPlan(evaluations=25, most_effects=6, by_channel=True)
+        self.plan = SearchPlan(
+            evaluations=25, most_effects=6, by_channel=True, loud=LOUD
+        )
         self._found: list[Candidate] | None = None
         self._nuisances: Nuisances | None = None
         # Stretches in which something else moved it: they have next to no weight.
@@ -291,6 +294,20 @@ class MechanismProblem(InverseModel, GapProblem):
             rows[mine] /= max(rms(rows[mine]), 1.0)
         held = rows[~self.train()] if not self.train().all() else rows
         return float(np.sqrt(max(np.mean(held**2), np.mean(rows**2))))
+
+    def loudest(self, fitted: Fitted) -> tuple[str, float]:
+        """By the rows that were fitted and by those that were not, whichever is less:
+        one of many joints hardly shows in what all leave together."""
+        rows = self.in_noise(fitted.left)
+        wanders, held = self.wandering(fitted.r), ~self.train()
+        found = ("", 0.0)
+        for k, (what, joint) in enumerate(self.names()):
+            mine = self.channel_of_rows() == k
+            if wanders[k] > 0.0 or not (mine & held).any():
+                continue
+            size = min(rms(rows[mine & some]) for some in (held, ~held))
+            found = max(found, (f"{joint}.{what}", size), key=lambda each: each[1])
+        return found
 
     def closed(self, start: Fitted, end: Fitted) -> float:
         # All joints together would say little where one of them has a measured effort

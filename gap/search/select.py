@@ -35,7 +35,6 @@ from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
 FINALISTS, FINALIST_RUNS = 4, 80  # Searched without slopes before one is chosen.
-LOUD = 3.0  # Rms over noise of one channel that is a gap, whatever the others leave.
 FLOOR = 1.15  # Rms over noise that noise alone may leave (its estimate is that good).
 # Laws are approximations (how dry friction turns round, how commands are held): errors
 # that differ by less than this share of the whole gap do not tell two models apart.
@@ -224,7 +223,7 @@ class _Search:
         its tolerance allows."""
         far = not is_plausible(fitted.b, self.nuisances.prior)
         loud = self.problem.noise_error(fitted.left) > FLOOR
-        loud |= self.problem.loudest(fitted)[1] > LOUD
+        loud |= self.problem.loudest(fitted)[1] > self.plan.loud
         return loud or far or bool(self._beyond(fitted))
 
     def _beyond(self, fitted: Fitted) -> tuple[tuple[str, float], ...]:
