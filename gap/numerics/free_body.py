@@ -97,6 +97,18 @@ def _matrix(q):
 
 
 @njit(cache=True)
+def _is_far(c, radius, fixed):
+    """Whether a sphere at c is outside of the ball about a box, where it cannot touch
+    it: most boxes are, where a scene has many of them."""
+    if fixed[12] < 0.0:
+        return False
+    d0, d1, d2 = c[0] - fixed[9], c[1] - fixed[10], c[2] - fixed[11]
+    h0, h1, h2 = fixed[12], fixed[13], fixed[14]
+    far = radius + np.sqrt(h0 * h0 + h1 * h1 + h2 * h2)
+    return d0 * d0 + d1 * d1 + d2 * d2 > far * far
+
+
+@njit(cache=True)
 def _gap(c, radius, fixed):
     """Distance of a sphere at c to a fixed shape, and the normal out of the shape."""
     d0, d1, d2 = c[0] - fixed[9], c[1] - fixed[10], c[2] - fixed[11]
@@ -178,6 +190,8 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, fixed, pairs, lev
             c[i] = s[4 + i] + R[i, 0] * b0 + R[i, 1] * b1 + R[i, 2] * b2
         radius = spheres[j, 3]
         for m in range(len(fixed)):
+            if _is_far(c, radius, fixed[m]):
+                continue
             gap, n = _gap(c, radius, fixed[m])
             if gap >= 0.0:
                 continue
