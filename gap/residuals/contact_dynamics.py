@@ -19,7 +19,7 @@ import numpy as np
 
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.numerics.permitted_forces import explain, roots_of
-from makebreak.gap.residuals.contact_means import MODELLED, SLIDES
+from makebreak.gap.residuals.contact_means import LEAST_FELT, MODELLED, SLIDES
 from makebreak.gap.residuals.contact_shapes import Slot
 from makebreak.gap.residuals.permitted_contacts import (
     SURFACES,
@@ -36,6 +36,7 @@ from makebreak.models.scene import Scene
 
 HOLDS = 0.03  # Known of the distance's acceleration where bodies stay in touch [m/s2].
 SHAPES = 2e-4  # How well shapes are known where the scene does not say [m].
+PRESSED = 4.0  # Times a body's noise [N]: a force that tells that it is touched.
 THIN = 4  # Distances change slowly: every so many test functions are told.
 WRENCHED = 0.05  # A wrench sampled amid a drive's ripple is off by as much.
 SHAPED = (*SURFACES, *CONTACT_LAW)
@@ -392,6 +393,9 @@ class ContactDynamics(PermittedContacts):
         for pair in self._pairs_met:
             mine = [s for s in slots if self._pair_of(s) == pair and s.key in masks]
             mask = np.stack([masks[s.key] for s in mine]).astype(float)
+            free = self._is_of_a_free_body(pair)
+            if self._lies(pair) and free:
+                mask *= np.stack([self.carries(s) for s in mine])
             phi = np.stack([s.phi for s in mine])
             n = mask.sum(axis=0)
             some = n > 0.0
@@ -422,8 +426,24 @@ class ContactDynamics(PermittedContacts):
                 least = np.where(mask > 0.0, phi, np.inf).min(axis=0)
                 least = np.where(some, least, 0.0)
                 d = self._W @ least + pressed
+                if not self.shapes.anchored & set(pair) or free:
+                    # Seen near each other, but known to touch by a force alone.
+                    good = good & self._is_pressed(pair)
                 columns.append(np.where(good, d / np.hypot(shape, place), 0.0))
         return -np.stack(columns, axis=1) if columns else np.zeros((K, 0))
+
+    def _is_pressed(self, pair: tuple[int, int]) -> np.ndarray:
+        """(K,) whether two bodies press on each other, beyond what noise may feign."""
+        K = len(self.means.time)
+        if pair in self._apart:  # A sensor tells.
+            return np.ones(K, bool)
+        least = np.full(K, LEAST_FELT)
+        for k in pair:
+            if self.shapes.names[k] in self.bodies:
+                i = self.bodies[self.shapes.names[k]][1] + 3 + np.arange(3)
+                noise = np.sqrt(self._sensors_alone[:, i, i].max(axis=1))
+                least = np.maximum(least, PRESSED * noise)
+        return self._pressed.get(pair, np.zeros(K)) > least
 
     def _pose_noise(self, pair: tuple[int, int]) -> tuple[float, float]:
         """Of a smoothed place [m] and turn [rad] of a pair's seen bodies."""

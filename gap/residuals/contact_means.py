@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.numerics.permitted_forces import held_means, test_functions
-from makebreak.gap.residuals.contact_shapes import ContactShapes, poses_of
+from makebreak.gap.residuals.contact_shapes import ContactShapes, Slot, poses_of
 from makebreak.gap.simulation.windows import TURN, spin_of
 from makebreak.models.drives import law_of
 from makebreak.models.dynamics import SceneDynamics
@@ -31,6 +31,10 @@ HOP = 0.75  # From one test function to the next, in half widths.
 NODES = 5  # Rows of a test function at which geometry and dynamics are evaluated.
 MOST = 420  # Test functions at most, and how many of them without a moving object.
 STILL = 80
+BESIDE = -1  # Marks what a body touches beside what carries it.
+FAR = 1.0  # Of what is not there [m].
+HIT = 20.0  # Smoothed, a free body is accelerated so much by an impact alone [m/s2].
+UPRIGHT = 0.7  # Cosine of normal and vertical: less, and it is a wall.
 NEAR = 0.02  # Shapes that never come so near do not matter [m].
 MEETS = 2.5e-3  # Two bodies touch when the nearest points are within this [m].
 APPROACH = 0.02  # Faster along the normal is no lasting contact [m/s].
@@ -296,33 +300,64 @@ class ContactMeans:
     def _poses_at(self, q: np.ndarray):
         return poses_of(self.plant, q, self.shapes)
 
-    def _touching_rows(self) -> dict[tuple[int, int], np.ndarray]:
-        """{bodies: (n_rows,) whether they touch}, of pairs with a moving mechanism."""
+    def _pair_of(self, s: Slot) -> tuple[int, int]:
+        return min(s.a, s.b), max(s.a, s.b)
+
+    def _up(self) -> np.ndarray:
+        """(3,) against gravity; of weightless scenes z."""
+        g = self.dynamics.gravity
+        size = np.linalg.norm(g)
+        return -g / size if size > 0.0 else np.array([0.0, 0.0, 1.0])
+
+    def carries(self, s: Slot) -> np.ndarray:
+        """(n,) whether what is fixed is below what moves, at each pose of a slot."""
+        sign = -1.0 if s.a in self.shapes.anchored else 1.0
+        return sign * (s.normal @ self._up()) > UPRIGHT
+
+    def _is_of_a_free_body(self, pair: tuple[int, int]) -> bool:
+        """Whether something free touches what is fixed."""
+        return bool(set(pair) & self.shapes.anchored) and any(
+            self.shapes.names[k] in self.bodies for k in pair
+        )
+
+    def _touching_rows(self) -> dict[tuple[int, ...], np.ndarray]:
+        """{bodies: (n_rows,) whether they touch}; with BESIDE behind them, of what a
+        free body touches that does not carry it."""
         poses = self._poses_at(self._q)
         slots = self.shapes.slots(poses, NEAR)
-        least: dict[tuple[int, int], np.ndarray] = {}
+        least: dict[tuple[int, ...], np.ndarray] = {}
+
+        def add(key: tuple[int, ...], phi: np.ndarray) -> None:
+            least[key] = np.minimum(least.get(key, np.full(len(phi), FAR)), phi)
+
         for s in slots:
-            pair = (min(s.a, s.b), max(s.a, s.b))
-            now = least.get(pair)
-            least[pair] = s.phi if now is None else np.minimum(now, s.phi)
-        found = {}
+            pair = self._pair_of(s)
+            if not self._is_of_a_free_body(pair):
+                add(pair, s.phi)
+                continue
+            below = self.carries(s)
+            if below.any():
+                add(pair, np.where(below, s.phi, FAR))
+            if not below.all():
+                add((*pair, BESIDE), np.where(below | ~s.best, FAR, s.phi))
+        found: dict[tuple[int, ...], np.ndarray] = {}
         # How far what a sensor may feel is apart (n_rows,) [m].
-        self._apart: dict[tuple[int, int], np.ndarray] = {}
-        for pair, phi in least.items():
+        self._apart: dict[tuple[int, ...], np.ndarray] = {}
+        for key, phi in least.items():
             rate = np.concatenate([
                 np.gradient(phi[a:b], t.time)
                 for a, b, t in zip(self._offset, self._offset[1:], self.tracks,
                                    strict=False)
             ])  # fmt: skip
-            found[pair] = (phi < MEETS) & (np.abs(rate) < APPROACH)
+            found[key] = (phi < MEETS) & (np.abs(rate) < APPROACH)
         for sensor in self.sensors:
             size, welded = self._force_size(sensor.place), sensor.welded
-            for pair in found:
-                if set(pair) & set(welded) and np.isfinite(size).all():
-                    partner = pair[0] if pair[1] in welded else pair[1]
+            for key in found:
+                if set(key) & set(welded) and np.isfinite(size).all():
+                    partner = key[0] if key[1] in welded else key[1]
                     if partner not in self.shapes.anchored:
-                        found[pair] = (size > 0.0) & (least[pair] < NEAR)
-                        self._apart[pair] = least[pair]
+                        found[key] = (size > 0.0) & (least[key] < NEAR)
+                        self._apart[key] = least[key]
         return found
 
     def _force_size(self, place: str) -> np.ndarray:
@@ -406,6 +441,8 @@ class ContactMeans:
             total = np.concatenate([[0], np.cumsum(own)])
             inside = total[last] - total[first]
             good &= (inside == 0) | (inside == last - first)
+        total = np.concatenate([[0], np.cumsum(self._is_struck(rows))])
+        good &= total[last] == total[first]
         centres = centres[good]
         if not len(centres):
             return None
@@ -516,6 +553,14 @@ class ContactMeans:
             maybe |= near & ~on & (size > MAYBE_FELT * noise)
         return maybe
 
+    def _is_struck(self, rows: slice) -> np.ndarray:
+        """(n,) whether something free lands at a row: other points carry it then, and
+        the force is over before it is seen."""
+        struck = np.zeros(rows.stop - rows.start, bool)
+        for _, i in self.bodies.values():
+            struck |= np.linalg.norm(self._vd[rows, i + 3 : i + 6], axis=1) > HIT
+        return struck
+
     def _effort(self, joint, recording, t: _Track, held, w, there, centres):
         """Mean effort of a drive, its variance, its slope by a delay of commands."""
         by, act = self.by[joint], self.scene.actuation
@@ -574,10 +619,10 @@ class ContactMeans:
                 ok = np.isfinite(y)
                 w, _ = test_functions(t.time[ok], centres, self.half)
                 columns.append(w @ y[ok])
-                var = np.asarray(w.multiply(w).sum(axis=1)).ravel()
-                noise = recording.channels[name].noise
+                # A knock is over between two samples: its force is hardly known.
+                var = variance_of_means(w, y[ok], recording.channels[name].noise)
                 # Where there are no samples, nothing is known.
-                variances.append(np.where(var > 0.0, var * noise**2, 1e12))
+                variances.append(np.where(var > 0.0, var, 1e12))
         K = len(centres)
         if not columns:
             return np.zeros((K, 0)), np.zeros((K, 0))

@@ -3,8 +3,8 @@
 Spheres are their centres, boxes and hulls their corners. A cylinder that stands on
 something is points on its rims; where its side touches, of each rim the point that is
 nearest to the other surface. Each is compared with the surfaces of other bodies. Edges
-that cross edges are left out. Friction and stiffness of a pair are those that Drake
-makes of two surfaces.
+that cross edges are those of boxes, of which one moves freely. Friction and stiffness
+of a pair are those that Drake makes of two surfaces.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,12 +17,14 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 
 from makebreak.gap.numerics import surface_distance
+from makebreak.gap.numerics.edge_crossings import Edge, crossing, edges_of_box
 from makebreak.models.effects.kind import full_name
 from makebreak.models.scene import LoadedScene
 
 RIM = 12  # Points on a rim.
 SIDE = 0.9  # Cosine of normal and axis: less, and a cylinder touches with its side.
 MOST_CORNERS = 200  # Of a hull; more are thinned.
+BEYOND = 2.5e-3  # A corner so far beyond the edge of a face still touches it [m].
 SAME_NORMAL = 0.64  # Cosine: a point touches one of two surfaces that face alike.
 
 
@@ -35,6 +37,7 @@ class _Point:
     friction: float
     stiffness: float
     is_sphere: bool = False
+    is_corner: bool = False  # Of a box.
     axis: np.ndarray | None = None  # Of the cylinder that it is on the rim of.
     rim: float = 0.0  # Any point on a rim of this radius about p_B, if not 0 [m].
 
@@ -73,6 +76,11 @@ class _Surface:
     friction: float
     stiffness: float
 
+    def local(self, places, R_b, p_b) -> np.ndarray:
+        """(n, 3) places in world in the surface's own frame, at poses of its body."""
+        p = np.einsum("nji,nj->ni", R_b, places - p_b)
+        return (p - self.p_BG) @ self.R_BG
+
     def distance(self, p) -> tuple[np.ndarray, np.ndarray]:
         """Of points (n, 3) in the body's frame, and normals there."""
         local = (p - self.p_BG) @ self.R_BG
@@ -81,8 +89,23 @@ class _Surface:
 
 
 @dataclass(frozen=True, eq=False)
+class _BoxEdges:
+    """centre (3,) in the body's frame, radius [m]: of the ball about the box."""
+
+    body: int
+    geometry: object
+    is_free: bool
+    edges: list[Edge]
+    centre: np.ndarray
+    radius: float
+    friction: float
+    stiffness: float
+
+
+@dataclass(frozen=True, eq=False)
 class Slot:
-    """One point and one surface at n poses. a, b: bodies of the point and the surface.
+    """One point and one surface at n poses, or two edges. a, b: bodies of the point and
+    the surface.
 
     phi (n,) distance [m]; normal (n, 3) from b to a; place (n, 3), both in world;
     best (n,): no other surface that faces alike is nearer to the point.
@@ -91,7 +114,7 @@ class Slot:
 
     a: int
     b: int
-    key: tuple[int, int]  # Number of the point and of the surface.
+    key: tuple[int, int]  # Number of the point and of the surface; below 0: of edges.
     phi: np.ndarray
     normal: np.ndarray
     place: np.ndarray
@@ -114,6 +137,7 @@ class ContactShapes:
             raise ValueError("friction zones are Drake's alone")
         self.points: list[_Point] = []
         self.surfaces: list[_Surface] = []
+        self.boxes: list[_BoxEdges] = []
         self.names: dict[int, str] = {}
         self.anchored: set[int] = set()
         for k in range(plant.num_bodies()):
@@ -132,6 +156,14 @@ class ContactShapes:
                 own = (mu.dynamic_friction(), float(stiffness))
                 R, p = X.rotation().matrix(), X.translation()
                 self.names[k] = full_name(plant, body)
+                if isinstance(shape, Box):
+                    half = shape.size() / 2.0
+                    radius, edges = (
+                        float(np.linalg.norm(half)),
+                        edges_of_box(half, R, p),
+                    )
+                    free = body.is_floating_base_body()
+                    self.boxes.append(_BoxEdges(k, g, free, edges, p, radius, *own))
                 if not self._add(k, g, shape, R, p, own):
                     if body.is_floating_base_body():
                         raise ValueError(
@@ -149,7 +181,9 @@ class ContactShapes:
     def _add(self, k: int, g, shape, R, p, own) -> bool:
         friction, stiffness = own
 
-        def points(local, radius=0.0, is_sphere=False, axis=None, rim=0.0):
+        def points(
+            local, radius=0.0, is_sphere=False, axis=None, rim=0.0, is_corner=False
+        ):
             for x in np.atleast_2d(local):
                 self.points.append(
                     _Point(
@@ -160,6 +194,7 @@ class ContactShapes:
                         friction,
                         stiffness,
                         is_sphere,
+                        is_corner,
                         axis,
                         rim,
                     )
@@ -173,7 +208,7 @@ class ContactShapes:
             surface("sphere", shape.radius())
         elif isinstance(shape, Box):
             half = shape.size() / 2.0
-            points(np.array(list(product((-1, 1), repeat=3))) * half)
+            points(np.array(list(product((-1, 1), repeat=3))) * half, is_corner=True)
             surface("box", half)
         elif isinstance(shape, HalfSpace):
             surface("half_space")
@@ -201,6 +236,7 @@ class ContactShapes:
         """Only the shapes of bodies for which counts(body)."""
         self.points = [p for p in self.points if counts(p.body)]
         self.surfaces = [s for s in self.surfaces if counts(s.body)]
+        self.boxes = [b for b in self.boxes if counts(b.body)]
 
     def never_touch(self, point: _Point, surface: _Surface) -> bool:
         """Whether the scene filters their contact."""
@@ -217,6 +253,7 @@ class ContactShapes:
         Args: poses: {body: R (n, 3, 3), p (n, 3)} of all bodies that have shapes.
         """
         found = []
+        facing: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
         for i, point in enumerate(self.points):
             each: list[tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
             for j, s in enumerate(self.surfaces):
@@ -234,6 +271,11 @@ class ContactShapes:
                     if s.body > point.body:
                         continue  # Two spheres are one pair.
                 c, phi, n, may = point.near(s, *poses[point.body], *poses[s.body])
+                if s.kind == "box" and point.is_corner and phi.min() < near:
+                    key = (point.geometry, s.geometry)
+                    if key not in facing:
+                        facing[key] = self._facing(point, s, poses)
+                    phi, n = _by_face(s, c, phi, n, *poses[s.body], *facing[key])
                 if phi.min() < near:
                     each.append((j, phi, n, c, may))
             for k, (j, phi, n, c, may) in enumerate(each):
@@ -255,11 +297,70 @@ class ContactShapes:
                         _in_row(point.stiffness, s.stiffness),
                     )
                 )  # fmt: skip
+        return found + self._crossings(poses, near)
+
+    def _facing(self, corner: _Point, s: _Surface, poses):
+        """Of the box that a corner is of, axis (n,) and side (n,) of the face of box s
+        that it is farthest outside of with all its corners: the one that it meets. The
+        nearest feature to one corner may be an edge, and its normal any, where two
+        boxes of one height stand side by side."""
+        mine = [p for p in self.points if p.geometry == corner.geometry]
+        (R_a, p_a), (R_b, p_b) = poses[corner.body], poses[s.body]
+        local = np.stack([s.local(p_a + R_a @ p.p_B, R_b, p_b) for p in mine])
+        (half,) = s.size
+        apart = np.stack([local.min(axis=0), -local.max(axis=0)], axis=2)
+        apart -= np.asarray(half)[:, None]
+        best = apart.reshape(len(p_a), 6).argmax(axis=1)
+        return best // 2, np.where(best % 2, -1.0, 1.0)
+
+    def _crossings(self, poses, near: float) -> list[Slot]:
+        """Of edges of a free box and those of another body's."""
+        found = []
+        for i, one in enumerate(self.boxes):
+            for j, other in enumerate(self.boxes):
+                twice = other.is_free and other.body <= one.body
+                if not one.is_free or other.body == one.body or twice:
+                    continue
+                if self._apart[one.geometry, other.geometry]:
+                    continue
+                at, to = poses[one.body], poses[other.body]
+                centre = at[1] + at[0] @ one.centre
+                for m, edge in enumerate(other.edges):
+                    start = to[1] + to[0] @ edge.start
+                    along, w = to[0] @ edge.along, centre - start
+                    t = np.sum(w * along, axis=1) / np.sum(along**2, axis=1)
+                    off = w - np.clip(t, 0.0, 1.0)[:, None] * along
+                    if np.linalg.norm(off, axis=1).min() > one.radius + near:
+                        continue
+                    for k, mine in enumerate(one.edges):
+                        c, phi, n, may = crossing(
+                            mine, at[0], at[1], edge, to[0], to[1]
+                        )
+                        if phi.min() < near:
+                            key = (-1 - 12 * i - k, -1 - 12 * j - m)
+                            friction = _pair(one.friction, other.friction)
+                            stiffness = _in_row(one.stiffness, other.stiffness)
+                            found.append(
+                                Slot(one.body, other.body, key, phi, n, c, may,
+                                     friction, stiffness)
+                            )  # fmt: skip
         return found
 
     def _is_seen_by(self, sphere: _Surface, corner: _Point) -> bool:
         """Whether the corner's shape is a surface that the sphere is compared with."""
         return any(s.geometry == corner.geometry for s in self.surfaces)
+
+
+def _by_face(s: _Surface, places, phi, normal, R_b, p_b, axis, side):
+    """Distances (n,) and normals (n, 3) of places (n, 3), from the face that is met
+    where they are over it."""
+    rows, local = np.arange(len(phi)), s.local(places, R_b, p_b)
+    out = np.abs(local) - np.asarray(s.size[0])
+    d = side * local[rows, axis] - np.asarray(s.size[0])[axis]
+    out[rows, axis] = -np.inf
+    over = out.max(axis=1) < BEYOND
+    face = side[:, None] * np.einsum("nij,nj->ni", R_b, s.R_BG.T[axis])
+    return np.where(over, d, phi), np.where(over[:, None], face, normal)
 
 
 def _pair(a: float, b: float) -> float:

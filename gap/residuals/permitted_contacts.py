@@ -17,8 +17,15 @@ from scipy.special import expit
 
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.numerics.permitted_forces import tangential, unshared_load
-from makebreak.gap.residuals.contact_means import MEETS, NEAR, SLIDES, ContactMeans
+from makebreak.gap.residuals.contact_means import (
+    BESIDE,
+    MEETS,
+    NEAR,
+    SLIDES,
+    ContactMeans,
+)
 from makebreak.gap.residuals.contact_shapes import Slot
+from makebreak.gap.simulation.windows import TURN
 from makebreak.models.effects.kind import Effect
 from makebreak.models.effects.loads import rotation
 from makebreak.models.scene import Scene
@@ -26,6 +33,7 @@ from makebreak.models.scene import Scene
 SLACK = 8e-4  # Points so little farther than the nearest of two bodies touch too [m].
 CARRIES = 0.012  # What is fixed may carry what is measured so far above it [m],
 STEEP = 0.12  # and turned by so much against how it would rest [rad].
+TIPPED = 0.01  # Turned by more than as it mostly lies, it stands on an edge [rad].
 EDGE = 8e-4  # Over which a patch of friction sets in [m].
 UNEVEN = 2e-5  # How flat what carries is; points share a load to k times it [m].
 ONE_WAY = 0.9  # Mean of the directions of slip within a test function, at least.
@@ -68,6 +76,7 @@ class PermittedContacts(ContactMeans):
         self._context = self.plant.CreateDefaultContext()
         self._known_columns: list[_Column] | None = None
         self._known_sharing: np.ndarray | None = None
+        self._lying: dict[tuple[int, int], bool] = {}
         self._evaluate_nodes()
         self.slots, _ = self._slots(())
         self._masks = self._touches(self.slots)
@@ -142,9 +151,6 @@ class PermittedContacts(ContactMeans):
         name = self.shapes.names.get(body, "")
         return any(at in (name, name.split(".")[0]) for at in effect.at)
 
-    def _pair_of(self, s: Slot) -> tuple[int, int]:
-        return min(s.a, s.b), max(s.a, s.b)
-
     def pair_name(self, pair: tuple[int, int]) -> str:
         """As an effect names it: the free body first."""
         a, b = (self.shapes.names[k] for k in pair)
@@ -160,7 +166,15 @@ class PermittedContacts(ContactMeans):
         return False
 
     def _lies(self, pair: tuple[int, int]) -> bool:
-        return bool(set(pair) & self.shapes.anchored)
+        """Whether something free lies on what is fixed: not if that is a wall."""
+        if not self._is_of_a_free_body(pair):
+            return bool(set(pair) & self.shapes.anchored)
+        if pair not in self._lying:
+            mine = [s for s in self.slots if self._pair_of(s) == pair]
+            self._lying[pair] = self._is_of_a_free_body(pair) and any(
+                (self.carries(s) & (s.phi < CARRIES)).any() for s in mine
+            )
+        return self._lying[pair]
 
     def _touches(self, slots: Sequence[Slot]) -> list[np.ndarray]:
         """Of each slot (n_nodes,) whether it may act. What lies on something fixed is
@@ -173,18 +187,23 @@ class PermittedContacts(ContactMeans):
         for pair, index in of.items():
             phi = np.stack([slots[k].phi for k in index], axis=1)
             best = np.stack([slots[k].best for k in index], axis=1)
-            nearest = phi.min(axis=1)
-            close: np.ndarray = phi < nearest[:, None] + SLACK
-            may = np.logical_and(best, close)
             touching = self._touching.get(pair)
-            if set(pair) & self.shapes.anchored and any(
-                self.shapes.names[k] in self.bodies for k in pair
-            ):
-                rests = self._at_rest_on([slots[k] for k in index])
-                rested = np.any(rests, axis=1, keepdims=True)
-                may = np.where(rested, rests & best, may)
-                may &= nearest[:, None] < CARRIES
-            elif touching is not None:
+            if self._lies(pair) and self._is_of_a_free_body(pair):
+                below = np.stack([self.carries(slots[k]) for k in index], axis=1)
+                may = self._carrying([slots[k] for k in index], best & below)
+                # What stands beside it is touched or not, by its distance.
+                beside = self._touching.get((*pair, BESIDE))
+                if beside is not None:
+                    far = np.where(below, np.inf, phi)
+                    close = far < far.min(axis=1)[:, None] + SLACK
+                    may |= close & best & ~below & beside[self._rows][:, None]
+                for column, k in enumerate(index):
+                    out[k] = may[:, column]
+                continue
+            nearest = phi.min(axis=1)
+            close = phi < nearest[:, None] + SLACK
+            may = np.logical_and(best, close)
+            if touching is not None:
                 may &= touching[self._rows][:, None]
             else:
                 may &= nearest[:, None] < MEETS
@@ -192,24 +211,36 @@ class PermittedContacts(ContactMeans):
                 out[k] = may[:, column]
         return out
 
-    def _at_rest_on(self, slots: Sequence[Slot]) -> np.ndarray:
+    def _carrying(self, slots: Sequence[Slot], best: np.ndarray) -> np.ndarray:
+        """(n_nodes, n_slots) which points carry a body on what is below it, of those
+        that are (n_nodes, n_slots) best."""
+        phi = np.where(best, np.stack([s.phi for s in slots], axis=1), np.inf)
+        nearest = phi.min(axis=1)
+        may = best & (phi < nearest[:, None] + SLACK)
+        rests = self._at_rest_on(slots, best)
+        rested = np.any(rests, axis=1, keepdims=True)
+        may = np.where(rested, rests & best, may)
+        return may & (nearest[:, None] < CARRIES)
+
+    def _at_rest_on(self, slots: Sequence[Slot], best: np.ndarray) -> np.ndarray:
         """(n_nodes, n_slots) which points would touch once the body has come to rest on
         a plane below it as it is: the highest plane under all points at the body's
-        middle (a linear program). None where the plane would be steep."""
+        middle (a linear program). None where the plane would be steep, or is not as it
+        mostly is: the body has been tipped."""
         n = len(slots[0].phi)
         out = np.zeros((n, len(slots)), bool)
         if len(slots) < 3:
             return out
         place = np.stack([s.place for s in slots], axis=1)
         phi = np.stack([s.phi for s in slots], axis=1)
-        best = np.stack([s.best for s in slots], axis=1)
-        normal = slots[0].normal
-        known: dict[tuple, np.ndarray] = {}
+        up = self._up()
+        slope = np.full((n, 2), np.nan)
+        known: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
         for k in range(n):
             some = np.flatnonzero(best[k])
             if len(some) < 3:
                 continue
-            e3 = normal[k]
+            e3 = up
             e1 = np.cross(e3, [1.0, 0.0, 0.0] if abs(e3[0]) < 0.9 else [0.0, 1.0, 0.0])
             e1 /= np.linalg.norm(e1)
             at = place[k, some] - place[k, some].mean(axis=0)
@@ -223,11 +254,21 @@ class PermittedContacts(ContactMeans):
                     bounds=[(None, None), (-STEEP, STEEP), (-STEEP, STEEP)],
                 )  # fmt: skip
                 rests = np.zeros(len(some), bool)
+                steep = np.full(2, np.nan)
                 if found.success and np.abs(found.x[1:]).max() < 0.999 * STEEP:
-                    rests = z - A @ found.x < SLACK
-                known[key] = rests
-            out[k, some] = known[key]
+                    rests, steep = z - A @ found.x < SLACK, found.x[1:]
+                known[key] = rests, steep
+            out[k, some], slope[k] = known[key]
+        if np.isfinite(slope).any():
+            off = np.linalg.norm(slope - np.nanmedian(slope, axis=0), axis=1)
+            out[off > max(TIPPED, 6.0 * self._turn_noise())] = False
         return out
+
+    def _turn_noise(self) -> float:
+        """Of the noisiest pose [rad]."""
+        every = [2.0 * r.channels[f"{body}.{a}"].noise for r in self.recordings
+                 for body in self.bodies for a in TURN]  # fmt: skip
+        return max(every, default=0.0)
 
     def _relative(self, s: Slot, poses=None) -> np.ndarray:
         """(n_nodes, 3, n_v): how the point of a moves against that of b, with v."""
@@ -370,7 +411,8 @@ class PermittedContacts(ContactMeans):
         of = np.array([c.slot for c in made], int)
         row = np.zeros(K, int)
         for pair in self._pairs_met:
-            mine = [k for k in dict.fromkeys(of) if self._pair_of(slots[k]) == pair]
+            mine = [k for k in dict.fromkeys(of) if self._pair_of(slots[k]) == pair
+                    and self.carries(slots[k]).any()]  # fmt: skip
             if not self._lies(pair) or len(mine) < 4:
                 continue
             ease = 1.0 / (slots[mine[0]].stiffness * UNEVEN)

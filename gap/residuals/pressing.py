@@ -135,6 +135,35 @@ class PressingProblem(ContactProblem):
                     key = (-1 - number, s.a if s.b == face.body else s.b)
                     now = found.get(key, np.zeros(len(self._q), bool))
                     found[key] = now | (s.phi < MEETS)
+        for k, on in enumerate(self._felt_along(poses)):
+            found[-1 - len(self.faces) - k, -1] = on
+        return found
+
+    def _felt_along(self, poses) -> list[np.ndarray]:
+        """(n_rows,) whether a sensor is pressed away from a face that is near, of each
+        direction of such faces. In a hole all walls are near all the time: that one of
+        them is met, or left, is told by the force alone."""
+        near: dict[tuple[float, ...], np.ndarray] = {}
+        for s in self.shapes.slots(poses, MEETS):
+            if not {s.a, s.b} & self.shapes.anchored:
+                continue
+            sign = -1.0 if s.a in self.shapes.anchored else 1.0
+            rows = s.phi < MEETS
+            normals = np.round(sign * s.normal[rows], 1) + 0.0
+            for normal in np.unique(normals, axis=0):
+                on = np.zeros(len(rows), bool)
+                on[rows] = (normals == normal).all(axis=1)
+                key = tuple(map(float, normal))
+                near[key] = near.get(key, np.zeros(len(rows), bool)) | on
+        opposite = [n for n in near if tuple(-x + 0.0 for x in n) in near]
+        found = []
+        for sensor in self.sensors:
+            noise = max(r.channels[n].noise for r in self.recordings
+                        for n in sensor.names[: len(FORCE)])  # fmt: skip
+            least = max(CLEAR * noise, LEAST_FORCE)
+            for normal in opposite:
+                f = self._force_along(sensor.place, np.array(normal))
+                found.append(near[normal] & (f > least))
         return found
 
     def _possible_faces(self, poses) -> list[_Face]:

@@ -32,12 +32,13 @@ STUCK = 1e-3  # [m] over which what adheres holds on.
 @dataclass(frozen=True)
 class Shape:
     """kind: sphere (radius), box (half sizes), cylinder (radius, half height), or
-    ground, whose top is at z = 0 of its thing."""
+    ground, whose top is at z = 0 of its thing. turn: roll, pitch, yaw in its thing."""
 
     kind: str
     size: tuple[float, ...]
     friction: float
     place: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,12 @@ def _text(values) -> str:
     return " ".join(f"{float(v):.17g}" for v in values)
 
 
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(4,) of two quaternions, the second acts first."""
+    w = a[0] * b[0] - a[1:] @ b[1:]
+    return np.append(w, a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:]))
+
+
 def mjcf(s: Setting) -> str:
     """Every pair of shapes that may touch is one <pair>, named <body>/<number>."""
     shaped: list[tuple[str, bool, int, Shape]] = []
@@ -140,6 +147,7 @@ def mjcf(s: Setting) -> str:
     def geom(body: str, i: int, x: Shape, at="", of="") -> str:
         kind = "plane" if x.kind == "ground" else x.kind
         size = (5.0, 5.0, 1.0) if x.kind == "ground" else x.size
+        of = of or f'quat="{_text(quaternion(x.turn))}"'
         return (
             f'<geom name="{body}/{i}" type="{kind}" size="{_text(size)}" '
             f'pos="{at or _text(x.place)}" {of} contype="0" conaffinity="0"/>'
@@ -158,7 +166,8 @@ def mjcf(s: Setting) -> str:
             turn = quaternion((t.roll, t.pitch, 0.0))
             for i, x in enumerate(t.shapes):
                 at = np.array(t.place) + rotation(turn) @ np.array(x.place)
-                world += geom(t.body, i, x, _text(at), f'quat="{_text(turn)}"')
+                both = _product(turn, quaternion(x.turn))
+                world += geom(t.body, i, x, _text(at), f'quat="{_text(both)}"')
     pairs = ""
     for i, (a, moves, j, x) in enumerate(shaped):
         for b, also, k, y in shaped[i + 1 :]:
@@ -521,10 +530,10 @@ def to_sdf(t: Thing, s: Setting, compliant: bool = False) -> str:
     shapes = ""
     for i, x in enumerate(t.shapes):
         geometry, place = _geometry(x)
-        at = " ".join(repr(float(p)) for p in place)
+        at = " ".join(repr(float(p)) for p in (*place, *x.turn))
         surface = _surface(x.friction, s, compliant, compliant and t.mass == 0.0)
         shapes += (
-            f'<collision name="shape{i}"><pose>{at} 0 0 0</pose><geometry>{geometry}'
+            f'<collision name="shape{i}"><pose>{at}</pose><geometry>{geometry}'
             f"</geometry>{surface}</collision>"
         )
     inertial = ""
@@ -550,8 +559,11 @@ def robot_urdf(s: Setting, hydroelastic: bool = False) -> str:
     if s.tool is None:
         return text
     x = s.tool
-    if x.kind != "sphere":
-        raise ValueError(f"a tool is a sphere, not a {x.kind}")
+    if x.kind not in ("sphere", "box"):
+        raise ValueError(f"a tool is a sphere or a box, not a {x.kind}")
+    geometry = f'<sphere radius="{x.size[0]!r}"/>'
+    if x.kind == "box":
+        geometry = f'<box size="{_text(2.0 * np.array(x.size))}"/>'
     values = (("mu_static", x.friction), ("mu_dynamic", x.friction),
               ("point_contact_stiffness", 2 * s.stiffness),
               ("hunt_crossley_dissipation", s.dissipation))  # fmt: skip
@@ -561,8 +573,8 @@ def robot_urdf(s: Setting, hydroelastic: bool = False) -> str:
             '<drake:rigid_hydroelastic/><drake:mesh_resolution_hint value="0.004"/>'
         )
     shape = (
-        f'<collision name="tool"><origin xyz="{_text(x.place)}"/><geometry><sphere '
-        f'radius="{x.size[0]!r}"/></geometry><drake:proximity_properties>{properties}'
+        f'<collision name="tool"><origin xyz="{_text(x.place)}"/><geometry>'
+        f"{geometry}</geometry><drake:proximity_properties>{properties}"
         "</drake:proximity_properties></collision>"
     )
     last = f'<link name="{s.robot.bodies[-1].name}">'
