@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from makebreak.gap.data.check_drives import check_drives, check_initial_names
+from makebreak.gap.data.check_meshes import check_meshes
 from makebreak.gap.data.checks import check_recordings
 from makebreak.gap.data.conditioning import condition
 from makebreak.gap.data.findings import Finding
@@ -94,6 +95,7 @@ def run_gap(
         check_against_scene(recording, joints, bodies)
         check_drives(recording, scene)
     check_initial_names(scene, recordings)
+    check_meshes(dynamics.loaded, recordings)
     # What is reported on is cut off before anything is looked at.
     parts = split(recordings)
     say("checking the recordings")
