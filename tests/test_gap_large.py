@@ -280,7 +280,7 @@ def test_one_quiet_joint_among_four_is_looked_into(tmp_path):
     result = json.loads((out / "result.json").read_text())
     assert result["verdict"] == "gap_named"
     [named] = result["effects"]
-    assert (named["kind"], named["at"]) == (effect["kind"], [effect["at"]])
+    assert (named["kind"], named["at"]) == (effect["kind"], effect["at"])
     value = named["parameters"]["coefficient"]["value"]
     assert value == pytest.approx(effect["parameters"]["coefficient"], rel=0.1)
 
