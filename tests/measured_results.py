@@ -43,12 +43,16 @@ def gap(folder: Path, recordings: Sequence[Path]) -> Path:
     return out
 
 
-def errors(scene: Path, recordings: Sequence[Path], window_sec: float) -> dict:
-    """{channel: rms} over all samples of windows from measured states."""
+def errors(
+    scene: Path, recordings: Sequence[Path], window_sec: float, of: str = "rms"
+) -> dict[str, float]:
+    """{channel: error} in windows from measured states.
+
+    Args: of: rms, over all samples, or at_end, over the last one of each window.
+    """
     tables = read_recordings([str(each) for each in recordings])
-    return {
-        each.channel: each.rms for each in judge(read_scene(scene), tables, window_sec)
-    }
+    judged = judge(read_scene(scene), tables, window_sec)
+    return {each.channel: getattr(each, of) for each in judged}
 
 
 def of_double_pendulum(data: Path, folder: Path) -> list[Row]:
@@ -58,7 +62,7 @@ def of_double_pendulum(data: Path, folder: Path) -> list[Row]:
     scenes = folder / "scene.yaml", gap(folder, fitted) / "scene.yaml"
     before, after = (errors(scene, judged, 0.4) for scene in scenes)
     return [
-        Row(f"{joint}, 0.4 s ahead", "rad", before[name], after[name], goal)
+        Row(f"{joint}, windows of 0.4 s", "rad", before[name], after[name], goal)
         for joint, goal in (("shoulder", 0.027), ("elbow", 0.075))
         for name in [f"arm.{joint}.position"]
     ]
@@ -73,8 +77,8 @@ def of_so101(data: Path, folder: Path) -> list[Row]:
     scenes = folder / "scene.yaml", gap(folder, fitted) / "scene.yaml"
     both = []
     for scene in scenes:
-        found = errors(scene, judged, 0.5)
-        of = {joint: found[f"arm.{joint}.position"] for joint in so101.JOINTS}
+        found = errors(scene, judged, 0.5, "at_end")
+        of = {joint: found[f"so101.{joint}.position"] for joint in so101.JOINTS}
         both.append({joint: 1e3 * value for joint, value in of.items()})
     before, after = both
 

@@ -39,6 +39,7 @@ TOLERANCE = (0.02, 0.1)  # [m], [rad] A goal is reached within these ...
 LOOSE = (0.05, 0.4)  # ... and within these it counts as in arXiv:2505.13350.
 LIMIT_SEC = 60.0  # For a goal.
 FORCE_MAX = 40.0  # [N] Of all contacts of the arm and its finger, at 1 kHz.
+STOP_MAX = 0.995  # Of half a joint's range.
 FORCE_HZ = 100.0  # Told as well: on the finger, below it.
 REACHED, REACHED_LOOSE = 0.95, 0.99  # Shares of the goals.
 # What `makebreak bench diagrams` takes the real-time factor of.
@@ -116,7 +117,7 @@ def run(config, session):
 
     `success`: 95 % of the goals reached within 2 cm, 0.1 rad and 60 s, 99 % within 5 cm
     and 0.4 rad, the forces of all contacts on arm and finger together at most 40 N, and
-    the arm's limits kept.
+    the arm's limits kept, with no joint at its stop.
     """
     diagram = make_push_object(config, session.meshcat)
     system = diagram.GetSubsystemByName
@@ -217,6 +218,9 @@ def score(config, diagram, log, truth, goals):
     }
     worst = float(np.max(list(shares.values())))  # NaN, if one is.
     criteria.at_most("limits", "of the arm's limits, used", worst, 1.0 + 1e-6)
+    # A simulated joint does not go beyond its stop, so that "at most 1" says nothing.
+    stop = shares["joint_range"]
+    criteria.at_most("stops", "of half a joint's range, used", stop, STOP_MAX)
     r = log["r"][-1, :N_TIP].mean() * LEARN if "r" in log and len(log.time) else 0.0
     return criteria.result() | {
         "n_goals": n,

@@ -55,7 +55,7 @@ class SamplingConfig:
     height: float = 0.024  # Of the tip's centre while pushing [m].
     # From the world's origin, where the arm stands [m]: nearer, the elbow of a Panda
     # with the finger upright is at its limit.
-    reach: list[float] = field(default_factory=lambda: [0.38, 0.78])
+    reach: list[float] = field(default_factory=lambda: [0.41, 0.78])
     # To either side of the x axis, which the arm looks along [rad]: beyond, the way to
     # a place may lead through the arm's own base.
     bearing: float = 1.05
