@@ -182,18 +182,19 @@ def prism(outline, cap) -> str:
 
 
 @pytest.mark.parametrize(
-    "outline, cap, z, model, is_refused",
+    "outline, cap, z, radius, model, is_refused",
     [
-        (U, CAP, 0.02, "point", True),
-        (U, CAP, 0.05, "point", False),  # Above it.
-        (U, CAP, 0.02, "hydroelastic", False),
-        ([(0, 0), (4, 0), (4, 3), (0, 3)], [(0, 1, 2), (0, 2, 3)], 0.02, "point",
-         False),
+        (U, CAP, 0.02, 0.008, "point", True),
+        (U, CAP, 0.05, 0.008, "point", False),  # Above it.
+        (U, CAP, 0.02, 0.012, "point", False),  # 10 mm: not deeper than it is large.
+        (U, CAP, 0.02, 0.008, "hydroelastic", False),
+        ([(0, 0), (4, 0), (4, 3), (0, 3)], [(0, 1, 2), (0, 2, 3)], 0.02, 0.008,
+         "point", False),
     ],
-    ids=["in the hollow", "above it", "as a surface", "a solid one"],
+    ids=["in the hollow", "above it", "a large one", "as a surface", "a solid one"],
 )  # fmt: skip
 def test_a_hollow_mesh_is_refused_where_something_was_in_it(
-    tmp_path, outline, cap, z, model, is_refused
+    tmp_path, outline, cap, z, radius, model, is_refused
 ):
     (tmp_path / "trough.obj").write_text(prism(outline, cap))
     (tmp_path / "trough.sdf").write_text(
@@ -201,7 +202,7 @@ def test_a_hollow_mesh_is_refused_where_something_was_in_it(
         'name="c"><geometry><mesh><uri>trough.obj</uri></mesh></geometry></collision>'
         "</link></model></sdf>"
     )
-    ball = Thing("ball", (Shape("sphere", (0.008,), 0.3),), 0.1, (1e-5,) * 3)
+    ball = Thing("ball", (Shape("sphere", (radius,), 0.3),), 0.1, (1e-5,) * 3)
     (tmp_path / "ball.sdf").write_text(to_sdf(ball, Setting((ball,))))
     (tmp_path / "scene.yaml").write_text(
         "directives:\n  - add_model: {name: trough, file: trough.sdf}\n"

@@ -223,6 +223,7 @@ def test_a_servo_is_proposed_with_the_stiffness_that_its_sag_tells(tmp_path):
         ("mast actual position [mm]", "a.mast.position", 1e-3),
         ("mast actual speed [mm/s]", "a.mast.velocity", 1e-3),
         ("mast_pos_cm", "a.mast.position", 1e-2),
+        ("mast_pos_\u00b5m", "a.mast.position", 1e-6),
         ("mast motor force torque (kN)", "a.mast.effort_measured", 1e3),
         ("elbow_position_mrad", "a.elbow.position", 1e-3),
         ("elbow position [deg]", "a.elbow.position", np.pi / 180),
@@ -241,6 +242,51 @@ def test_the_unit_in_a_name_is_believed(name, channel, scale):
     joints = [JointName("a.mast", True, -0.2, 0.2), JointName("a.elbow", False, -2, 2)]
     [_, match] = propose({"time": T, name: 0.5 * np.sin(3.0 * T)}, joints)
     assert (match.channel, match.scale) == (channel, pytest.approx(scale))
+
+
+@pytest.mark.parametrize(
+    "joint, prismatic, name",
+    [
+        ("a.wrist_rev", False, "position_wrist_rev"),
+        ("a.j1", False, "position_j1_rev"),
+        ("a.lift_cm", True, "position_lift_cm"),
+        ("a.arm_ma", False, "effort_arm_ma"),
+        ("a.A", False, "torque (A)"),
+    ],
+)
+def test_a_word_of_a_joints_own_name_is_no_unit(joint, prismatic, name):
+    joints = [JointName(joint, prismatic, -2.0, 2.0)]
+    [_, match] = propose({"time": T, name: 0.5 * np.sin(3.0 * T)}, joints)
+    assert match.channel is not None and match.channel.startswith(joint)
+    assert match.scale == 1.0
+
+
+@pytest.mark.parametrize(
+    "scale, expected",
+    [(1.0, 1.0), (-1.0, -1.0), (180.0 / np.pi, np.pi / 180), (7.0, 1.0),
+     (-180.0 / np.pi, -np.pi / 180)],
+)  # fmt: skip
+def test_a_velocity_with_a_unit_is_held_against_its_position(scale, expected):
+    """Of the other sign, or in deg/s by what it does; a scale of 7 is of no unit."""
+    q, v = 0.5 * np.sin(3.0 * T), 1.5 * np.cos(3.0 * T)
+    columns = {"time": T, "position_j1_rad": q, "velocity_j1_rad_s": scale * v}
+    [_, _, match] = propose(columns, [JointName("a.j1", False, -2.0, 2.0)])
+    assert match.channel == "a.j1.velocity"
+    assert match.scale == pytest.approx(expected)
+
+
+def test_an_effort_in_percent_gives_way_to_one_in_newton_metres():
+    names = ("torque_j1 (%)", "torque_j1 (Nm)")
+    [_, share, torque] = propose({"time": T} | sines(names, 1.0), [JointName("a.j1")])
+    assert share.channel is None and torque.channel == "a.j1.effort_measured"
+
+
+@pytest.mark.parametrize(
+    "name, scale", [("lift torque [mN]", 1e-3), ("lift torque [MN]", 1e6)]
+)
+def test_mega_is_no_milli(name, scale):
+    [_, match] = propose({"time": T} | sines([name], 1.0), [JointName("a.lift", True)])
+    assert match.scale == pytest.approx(scale)
 
 
 def test_the_unit_in_a_name_is_no_matter_of_size():

@@ -6,7 +6,7 @@ units by the joints' limits and by how a velocity relates to its position's deri
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,15 +40,19 @@ _RATES = (
 
 
 # What a column's own name says of its unit, as a factor to SI.
-_LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
+_LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6,
+            "\u00b5m": 1e-6, "\u03bcm": 1e-6}  # fmt: skip
 _ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": DEG, "degree": DEG, "degrees": DEG,
            "°": DEG, "mdeg": 1e-3 * DEG, "rev": 2.0 * np.pi}  # fmt: skip
 _SPIN = {"rpm": 2.0 * np.pi / 60.0, "degps": DEG, "dps": DEG, "radps": 1.0,
          "1/min": 2.0 * np.pi / 60.0, "rev/min": 2.0 * np.pi / 60.0}  # fmt: skip
-_FORCES = {"n": 1.0, "kn": 1e3, "mn": 1e-3}
-_TORQUES = {"nm": 1.0, "n.m": 1.0, "ncm": 1e-2, "nmm": 1e-3, "mnm": 1e-3, "knm": 1e3}
+_FORCES = {"n": 1.0, "kn": 1e3, "mn": 1e-3, "megan": 1e6}
+_TORQUES = {"nm": 1.0, "n.m": 1.0, "ncm": 1e-2, "nmm": 1e-3, "mnm": 1e-3, "knm": 1e3,
+            "meganm": 1e6}  # fmt: skip
 # Of an effort these need a number that the log does not have.
 _NO_EFFORT = ("%", "a", "ma", "percent", "permille", "‰")
+# These may be anything, such as a part of a joint's name, if not in brackets.
+_IN_BRACKETS = ("rev", "ma", "a", "m")
 
 
 @dataclass(frozen=True)
@@ -116,7 +120,7 @@ def propose(
             )
         else:
             found[name] = Match(name, f"{joint.name}.{quantity}", why="by its name")
-    found = _once(found)
+    found = _once(_without_unknown_efforts(found, joints))
     found = _in_si(_by_motion(found, columns), columns, joints)
     return [found[name] for name in [*columns, *text]]
 
@@ -279,21 +283,24 @@ def _counts(value: np.ndarray) -> bool:
     return bool(len(there)) and bool((there == np.rint(there)).all())
 
 
-def _unit_said(name: str) -> str:
+def _unit_said(name: str, joint: str) -> str:
     """What stands in brackets at a name's end, or after its last underscore or space,
-    in lower case; "" if that is none, or one letter that may be anything."""
+    in lower case (MN and MNm: megan, meganm); "" if that is none, or a word of the
+    joint's own name."""
+    own = words_of(joint.rsplit(".", 1)[-1])
     inside = re.search(r"[\[({<]\s*([^\[\](){}<>]+?)\s*[\])}>]\s*$", name)
     if inside:
-        return re.sub(r"[\s*·]", "", inside.group(1).lower())
+        unit = re.sub(r"[\s*·]", "", re.sub(r"^MN", "megan", inside.group(1)).lower())
+        return "" if unit in own else unit
     low = re.sub(r"_(per_)?s(ec)?$", "/s", name.strip().lower())
     last = re.split(r"[_\s]", low)[-1]
-    return last if len(last) > 1 else ""
+    return "" if last in own or last in _IN_BRACKETS or len(last) == 1 else last
 
 
-def _scale_said(name: str, channel: str, prismatic: bool) -> tuple[str, float | None]:
+def _scale_said(name: str, channel: str, joint: JointName) -> tuple[str, float | None]:
     """The unit that a column's name has, and its factor to SI; None: without another
     number it has none. "" where the name says no unit of this quantity."""
-    unit = _unit_said(name)
+    unit, prismatic = _unit_said(name, joint.name), joint.prismatic
     what = channel.rsplit(".", 1)[-1].split("_")[0]
     if what == "effort":
         known = _FORCES if prismatic else _TORQUES
@@ -307,6 +314,24 @@ def _scale_said(name: str, channel: str, prismatic: bool) -> tuple[str, float | 
     return (unit, known[unit]) if unit in known else ("", 1.0)
 
 
+def _without_unknown_efforts(
+    found: dict[str, Match], joints: Sequence[JointName]
+) -> dict[str, Match]:
+    """Efforts in a unit that says too little are left out; another column of the same
+    joint may have them."""
+    of = {joint.name: joint for joint in joints}
+    out = dict(found)
+    for name, match in found.items():
+        joint = of.get((match.channel or "").rsplit(".", 1)[0])
+        if joint is None or match.channel is None or match.channel == name:
+            continue
+        unit, scale = _scale_said(name, match.channel, joint)
+        if scale is None:
+            why = f"in {unit}, and of what is not said: give channel and scale"
+            out[name] = Match(name, None, why=why)
+    return out
+
+
 def _in_si(found, columns, joints: Sequence[JointName]) -> dict[str, Match]:
     """Scales of positions, of what goes with them, and where names say a unit."""
     of = {joint.name: joint for joint in joints}
@@ -315,15 +340,38 @@ def _in_si(found, columns, joints: Sequence[JointName]) -> dict[str, Match]:
         joint = of.get((match.channel or "").rsplit(".", 1)[0])
         if joint is None or match.channel is None or match.channel == name:
             continue
-        unit, scale = _scale_said(name, match.channel, joint.prismatic)
-        if scale is None:
-            why = f"in {unit}, and of what is not said: give channel and scale"
-            told[name] = Match(name, None, why=why)
-        elif unit:
+        unit, scale = _scale_said(name, match.channel, joint)
+        if unit and scale is not None:
             why = f"{match.why}; in {unit}, by its name"
             told[name] = Match(name, match.channel, scale, why=why)
     rest = {name: match for name, match in found.items() if name not in told}
-    return {**found, **_in_si_by_size(rest, told, columns, of), **told}
+    out = {**found, **_in_si_by_size(rest, told, columns, of)}
+    for name, match in told.items():
+        out[name] = _against_position(match, out, columns)
+    return out
+
+
+def _against_position(match: Match, found, columns) -> Match:
+    """A velocity whose name says its unit, with the sign that its position's derivative
+    has, and with that one's unit if the two contradict each other."""
+    at, _, what = (match.channel or "").rpartition(".")
+    time = next((m for m in found.values() if m.channel == "time"), None)
+    position = next((m for m in found.values() if m.channel == f"{at}.position"), None)
+    if what != "velocity" or time is None or position is None:
+        return match
+    ratio = _ratio_to_rate(columns, time, position, match.column) or match.scale
+    sign, other = float(np.sign(ratio)), "of the other sign than the position's rate"
+    if abs(abs(ratio) / match.scale - 1.0) >= 0.1:
+        for unit, factor in _RATES:
+            if abs(abs(ratio) / factor - 1.0) < 0.1:
+                why = f"in {unit or 'SI'} against the position's derivative, "
+                why += "not as its name says"
+                why += f"; {other}" if sign < 0.0 else ""
+                return replace(match, scale=sign * factor, why=why)
+        return match
+    if sign < 0.0:
+        return replace(match, scale=-match.scale, why=f"{match.why}; {other}")
+    return match
 
 
 def _in_si_by_size(found, told, columns, of) -> dict[str, Match]:
@@ -409,27 +457,35 @@ def _rate_scale(columns, time: Match, position: Match | None, name: str):
         return 2.0 * np.pi / 60.0, "in rpm, by its name"
     if "deg" in words or "degps" in words or "dps" in words:
         return DEG, "in degrees per second, by its name"
-    if position is None:
+    ratio = _ratio_to_rate(columns, time, position, name)
+    if ratio is None:
         return 1.0, ""
-    t = time.scale * columns[time.column]
-    q, v = position.scale * columns[position.column], columns[name]
-    good = np.isfinite(t) & np.isfinite(q) & np.isfinite(v)
-    good[1:] &= np.diff(t) > 0.0
-    if good.sum() < 50:
-        return 1.0, ""
-    t, q, v = t[good], q[good], v[good]
-    # Means over a few rows: differences of single ones are mostly noise.
-    n = max(len(t) // 2000, 5)
-    mean = np.cumsum(v)[n:] - np.cumsum(v)[:-n]
-    rate, mean = (q[n:] - q[:-n]) / (t[n:] - t[:-n]), mean / n
-    if not rate.std() > 0.0 or not mean.std() > 0.0:
-        return 1.0, ""
-    if abs(np.corrcoef(rate, mean)[0, 1]) < 0.7:
-        return 1.0, ""
-    ratio = float(np.sign(np.sum(rate * mean)) * rate.std() / mean.std())
     for unit, factor in _RATES:
         if abs(abs(ratio) / factor - 1.0) < 0.1:
             if ratio < 0.0:
                 return -factor, "of the other sign than the position's derivative"
             return factor, f"in {unit}, against the position's derivative"
     return 1.0, ""
+
+
+def _ratio_to_rate(columns, time: Match, position: Match | None, name: str):
+    """What the position's derivative is, times a column; None where the two do not go
+    together."""
+    if position is None:
+        return None
+    t = time.scale * columns[time.column]
+    q, v = position.scale * columns[position.column], columns[name]
+    good = np.isfinite(t) & np.isfinite(q) & np.isfinite(v)
+    good[1:] &= np.diff(t) > 0.0
+    if good.sum() < 50:
+        return None
+    t, q, v = t[good], q[good], v[good]
+    # Means over a few rows: differences of single ones are mostly noise.
+    n = max(len(t) // 2000, 5)
+    mean = np.cumsum(v)[n:] - np.cumsum(v)[:-n]
+    rate, mean = (q[n:] - q[:-n]) / (t[n:] - t[:-n]), mean / n
+    if not rate.std() > 0.0 or not mean.std() > 0.0:
+        return None
+    if abs(np.corrcoef(rate, mean)[0, 1]) < 0.7:
+        return None
+    return float(np.sign(np.sum(rate * mean)) * rate.std() / mean.std())

@@ -477,7 +477,7 @@ class _Search:
         """Two rivals (fit, ranked) of one parameter each, fitted at once; None where
         they are none, or nothing is gained by it."""
         for _, r in (one, other):
-            if r.candidate.members or r.columns.shape[1] != 1 or r.candidate.fixed:
+            if r.candidate.members or r.candidate.size != 1 or r.candidate.fixed:
                 return None
         key = (id(one[1]), id(other[1]))
         if key not in self._fitted_together:
@@ -611,7 +611,9 @@ class _Search:
             if _are_rivals((fit, best), (f, r)):
                 both = self._together(chosen, (fit, best), (f, r))
             if both is not None:
-                if not both.needs(0, self._least_lost()):
+                # A kind that is often confused with it, but explains less, is none.
+                like = f.score <= RIVALS * fit.score
+                if like and not both.needs(0, self._least_lost()):
                     ties.append(f.effects[-1])
                 continue
             alike = (
