@@ -34,6 +34,7 @@ from makebreak.gap.problem import (
 )
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.result import GapMeasure
+from makebreak.gap.search import fit
 from makebreak.gap.search.fit import derivative_free_search, fit_effects
 from makebreak.gap.search.screen import Ranked
 from makebreak.gap.search.select import (
@@ -861,3 +862,13 @@ def test_a_gap_in_a_gear_that_windows_do_not_show_is_dropped(both, one, kept):
     # Alone it is judged as any other.
     alone = replace(selection, choices=choices[1:])
     assert kept_by_simulation(problem, alone, 1)[0] is alone
+
+
+def test_a_fit_goes_beyond_what_is_searched_but_for_what_ends():
+    """A patch with ever more friction would shrink to a point; a surface may have it."""
+    highest = {
+        (kind, name): fit._highest(kind, name)
+        for kind, name in (("friction_patch", "friction"), ("friction_patch", "x_max"),
+                           ("contact_friction", "friction"))
+    }  # fmt: skip
+    assert list(highest.values()) == [1.5, np.inf, np.inf]

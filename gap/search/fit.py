@@ -243,10 +243,9 @@ def _lowest(kind: str, name: str) -> float:
 
 
 def _highest(kind: str, name: str) -> float:
-    """A share ends where robots' do: at 1 nothing is left. So does a patch's friction:
-    with more of it a patch shrinks to a point."""
+    """A share ends where robots' do: at 1 nothing is left."""
     parameter = KINDS[kind].parameter(name)
-    ends = parameter.valid == "share" or (kind, name) == ("friction_patch", "friction")
+    ends = parameter.ends or parameter.valid == "share"
     return parameter.high if ends else np.inf
 
 

@@ -639,7 +639,8 @@ KINDS = {
         at="pair",
         several=True,
         parameters=(
-            Parameter("friction", "", 0.01, 1.5, None, valid=">= 0"),
+            # With ever more of it a patch shrinks to a point.
+            Parameter("friction", "", 0.01, 1.5, None, valid=">= 0", ends=True),
             *(
                 Parameter(f"{a}_{end}", "m", -2.0, 2.0, None, endless=True)
                 for a in "xy"

@@ -54,6 +54,7 @@ class Parameter:
     valid: what is refused: "any" number, ">= 0", "> 0" or "share" (of 0 to below 1).
     rough: what it does jumps with it, so that it is found by trying values.
     endless: beyond low and high it says the same as there, and is allowed.
+    ends: a fit does not look beyond high, where other parameters make up for it.
     """
 
     name: str
@@ -65,6 +66,7 @@ class Parameter:
     optional: bool = False
     rough: bool = False
     endless: bool = False
+    ends: bool = False
 
     @property
     def most(self) -> float:
