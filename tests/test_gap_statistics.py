@@ -865,7 +865,7 @@ def test_a_gap_in_a_gear_that_windows_do_not_show_is_dropped(both, one, kept):
 
 
 def test_a_fit_goes_beyond_what_is_searched_but_for_what_ends():
-    """A patch with ever more friction would shrink to a point; a surface may have it."""
+    """A patch with ever more friction would shrink to a point."""
     highest = {
         (kind, name): fit._highest(kind, name)
         for kind, name in (("friction_patch", "friction"), ("friction_patch", "x_max"),
