@@ -52,7 +52,7 @@ _TORQUES = {"nm": 1.0, "n.m": 1.0, "ncm": 1e-2, "nmm": 1e-3, "mnm": 1e-3, "knm":
 # Of an effort these need a number that the log does not have.
 _NO_EFFORT = ("%", "a", "ma", "percent", "permille", "‰")
 # These may be anything, such as a part of a joint's name, if not in brackets.
-_IN_BRACKETS = ("rev", "ma", "a", "m")
+_IN_BRACKETS = ("rev", "ma")
 
 
 @dataclass(frozen=True)
@@ -314,21 +314,29 @@ def _scale_said(name: str, channel: str, joint: JointName) -> tuple[str, float |
     return (unit, known[unit]) if unit in known else ("", 1.0)
 
 
-def _without_unknown_efforts(
-    found: dict[str, Match], joints: Sequence[JointName]
-) -> dict[str, Match]:
-    """Efforts in a unit that says too little are left out; another column of the same
-    joint may have them."""
+def _units_said(found: dict[str, Match], joints: Sequence[JointName]):
+    """(match, unit, factor) of each column of a joint whose name says a unit;
+    _scale_said."""
     of = {joint.name: joint for joint in joints}
-    out = dict(found)
     for name, match in found.items():
         joint = of.get((match.channel or "").rsplit(".", 1)[0])
         if joint is None or match.channel is None or match.channel == name:
             continue
         unit, scale = _scale_said(name, match.channel, joint)
+        if unit:
+            yield match, unit, scale
+
+
+def _without_unknown_efforts(
+    found: dict[str, Match], joints: Sequence[JointName]
+) -> dict[str, Match]:
+    """Efforts in a unit that says too little are left out; another column of the same
+    joint may have them."""
+    out = dict(found)
+    for match, unit, scale in _units_said(found, joints):
         if scale is None:
             why = f"in {unit}, and of what is not said: give channel and scale"
-            out[name] = Match(name, None, why=why)
+            out[match.column] = Match(match.column, None, why=why)
     return out
 
 
@@ -336,14 +344,10 @@ def _in_si(found, columns, joints: Sequence[JointName]) -> dict[str, Match]:
     """Scales of positions, of what goes with them, and where names say a unit."""
     of = {joint.name: joint for joint in joints}
     told = {}
-    for name, match in found.items():
-        joint = of.get((match.channel or "").rsplit(".", 1)[0])
-        if joint is None or match.channel is None or match.channel == name:
-            continue
-        unit, scale = _scale_said(name, match.channel, joint)
-        if unit and scale is not None:
+    for match, unit, scale in _units_said(found, joints):
+        if scale is not None:
             why = f"{match.why}; in {unit}, by its name"
-            told[name] = Match(name, match.channel, scale, why=why)
+            told[match.column] = replace(match, scale=scale, why=why)
     rest = {name: match for name, match in found.items() if name not in told}
     out = {**found, **_in_si_by_size(rest, told, columns, of)}
     for name, match in told.items():
@@ -355,20 +359,21 @@ def _against_position(match: Match, found, columns) -> Match:
     """A velocity whose name says its unit, with the sign that its position's derivative
     has, and with that one's unit if the two contradict each other."""
     at, _, what = (match.channel or "").rpartition(".")
-    time = next((m for m in found.values() if m.channel == "time"), None)
-    position = next((m for m in found.values() if m.channel == f"{at}.position"), None)
+    time = _with_channel(found, "time")
+    position = _with_channel(found, f"{at}.position")
     if what != "velocity" or time is None or position is None:
         return match
     ratio = _ratio_to_rate(columns, time, position, match.column) or match.scale
     sign, other = float(np.sign(ratio)), "of the other sign than the position's rate"
     if abs(abs(ratio) / match.scale - 1.0) >= 0.1:
-        for unit, factor in _RATES:
-            if abs(abs(ratio) / factor - 1.0) < 0.1:
-                why = f"in {unit or 'SI'} against the position's derivative, "
-                why += "not as its name says"
-                why += f"; {other}" if sign < 0.0 else ""
-                return replace(match, scale=sign * factor, why=why)
-        return match
+        rate = _rate_of(ratio)
+        if rate is None:
+            return match
+        unit, factor = rate
+        why = f"in {unit or 'SI'} against the position's derivative, "
+        why += "not as its name says"
+        why += f"; {other}" if sign < 0.0 else ""
+        return replace(match, scale=sign * factor, why=why)
     if sign < 0.0:
         return replace(match, scale=-match.scale, why=f"{match.why}; {other}")
     return match
@@ -377,7 +382,7 @@ def _against_position(match: Match, found, columns) -> Match:
 def _in_si_by_size(found, told, columns, of) -> dict[str, Match]:
     """Of columns `found`, whose names say no unit. told: the others."""
     out = {**found, **told}
-    time = next((m for m in out.values() if m.channel == "time"), None)
+    time = _with_channel(out, "time")
     degrees: dict[str, bool] = {}  # By the way a column is named.
     for name, match in found.items():
         if match.channel is None or not match.channel.endswith(
@@ -400,9 +405,7 @@ def _in_si_by_size(found, told, columns, of) -> dict[str, Match]:
         channel = match.channel or ""
         if not channel.endswith(".velocity") or time is None:
             continue
-        position = next(
-            (m for m in out.values() if m.channel == f"{channel[:-9]}.position"), None
-        )
+        position = _with_channel(out, f"{channel[:-9]}.position")
         scale, why = _rate_scale(columns, time, position, name)
         if scale != 1.0:
             out[name] = Match(name, channel, scale, why=f"{match.why}; {why}")
@@ -417,9 +420,7 @@ def _by_motion(found: dict[str, Match], columns) -> dict[str, Match]:
         if "qd" not in words_of(name) or not channel.endswith(".velocity"):
             continue
         at = channel.removesuffix(".velocity")
-        position = next(
-            (m for m in found.values() if m.channel == f"{at}.position"), None
-        )
+        position = _with_channel(found, f"{at}.position")
         taken = any(m.channel == f"{at}.position_command" for m in found.values())
         if position is None or taken:
             continue
@@ -460,12 +461,25 @@ def _rate_scale(columns, time: Match, position: Match | None, name: str):
     ratio = _ratio_to_rate(columns, time, position, name)
     if ratio is None:
         return 1.0, ""
+    rate = _rate_of(ratio)
+    if rate is None:
+        return 1.0, ""
+    unit, factor = rate
+    if ratio < 0.0:
+        return -factor, "of the other sign than the position's derivative"
+    return factor, f"in {unit}, against the position's derivative"
+
+
+def _rate_of(ratio: float) -> tuple[str, float] | None:
+    """Unit and factor of _RATES that a ratio is, of either sign."""
     for unit, factor in _RATES:
         if abs(abs(ratio) / factor - 1.0) < 0.1:
-            if ratio < 0.0:
-                return -factor, "of the other sign than the position's derivative"
-            return factor, f"in {unit}, against the position's derivative"
-    return 1.0, ""
+            return unit, factor
+    return None
+
+
+def _with_channel(found: Mapping[str, Match], channel: str) -> Match | None:
+    return next((m for m in found.values() if m.channel == channel), None)
 
 
 def _ratio_to_rate(columns, time: Match, position: Match | None, name: str):

@@ -171,7 +171,7 @@ class PermittedContacts(ContactMeans):
             return bool(set(pair) & self.shapes.anchored)
         if pair not in self._lying:
             mine = [s for s in self.slots if self._pair_of(s) == pair]
-            self._lying[pair] = self._is_of_a_free_body(pair) and any(
+            self._lying[pair] = any(
                 (self.carries(s) & (s.phi < CARRIES)).any() for s in mine
             )
         return self._lying[pair]

@@ -62,12 +62,10 @@ def fit_together(
     held: list[Sequence[str]] = [*fixed, (), ()]
     n = nuisances
     scale = 1.0
-    alike = problem.weighed_by(effects, every_row=True)
-    if alike is None:
-        return None
     for _ in range(ROUNDS):
         alike = problem.weighed_by(effects, every_row=True)
-        assert alike is not None
+        if alike is None:
+            return None
         every = np.ones(len(alike.train()), bool)
         r = alike.residual(effects)
         screen = Screen(
