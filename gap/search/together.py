@@ -62,10 +62,12 @@ def fit_together(
     held: list[Sequence[str]] = [*fixed, (), ()]
     n = nuisances
     scale = 1.0
+    alike = problem.weighed_by(effects, every_row=True)
+    if alike is None:
+        return None
     for _ in range(ROUNDS):
         alike = problem.weighed_by(effects, every_row=True)
-        if alike is None:
-            return None
+        assert alike is not None
         every = np.ones(len(alike.train()), bool)
         r = alike.residual(effects)
         screen = Screen(
