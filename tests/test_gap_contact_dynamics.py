@@ -492,14 +492,48 @@ def test_what_is_seen_in_two_blocks_is_fitted_and_held_out():
     r[loud, 1] = 9.0
     model = SimpleNamespace(
         means=SimpleNamespace(time=time, episode=np.zeros(len(time), int)),
-        _shown=np.ones(r.shape, bool), left=lambda: r,
-    )  # fmt: skip
-    ContactProblem._share_out(model)
+        _shown=np.ones(r.shape, bool),
+    )
+    ContactProblem._share_out(model, r)
     train = model._train
     assert train.mean() == pytest.approx(2 / 3, abs=0.05)
     assert train[loud].mean() == pytest.approx(0.5, abs=0.1)
     for block in np.unique(model._block):  # Neighbours err together.
         assert len(set(train[model._block == block])) == 1
+
+
+def test_blocks_that_are_loud_by_what_was_learned_are_shared_out_again(
+    tmp_path, monkeypatch
+):
+    """And not those of which less is left: first touches are in few blocks, too."""
+    scene, recordings, _ = pushed(tmp_path, 15, [], episodes=3)
+    plain = ContactProblem(scene, recordings)
+    fitted_blocks = np.unique(plain.blocks()[plain.train()])[:2]
+    for size, shared in ((4.0, True), (2.0, False)):
+
+        def left(model, size=size):
+            loud = np.isin(model.blocks(), fitted_blocks)
+            return np.where(loud, size, 0.5)
+
+        monkeypatch.setattr(ContactProblem, "_without_nuisances", left)
+        model = ContactProblem(scene, recordings)
+        train = [model.train()[model.blocks() == k].all() for k in fitted_blocks]
+        assert sorted(train) == ([False, True] if shared else [True, True])
+
+
+def test_a_loud_block_is_told_though_it_is_fitted(tmp_path):
+    """`no_gap` asks held-out rows, and what is met once may be in none of them."""
+    scene, recordings, _ = pushed(tmp_path, 15, [], episodes=3)
+    model = ContactProblem(scene, recordings)
+    number = int(model.blocks()[model.train()][0])
+    left = np.where(model.blocks() == number, 4.0, 0.5)
+    name, size = model.loudest(SimpleNamespace(left=left))
+    assert size == pytest.approx(4.0)
+    time = model.means.time[model._block == number]
+    assert f"from {time.min():.3g} to {time.max():.3g} s" in name
+    # An equation that is louder goes first.
+    left = np.where(model.channel_of_rows() == 0, 5.0, left)
+    assert model.loudest(SimpleNamespace(left=left)) == (model.row_names()[0], 5.0)
 
 
 def test_a_patch_s_side_that_nothing_crossed_may_be_anywhere():

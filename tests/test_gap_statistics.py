@@ -35,11 +35,13 @@ from makebreak.gap.problem import (
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.result import GapMeasure
 from makebreak.gap.search import fit
+from makebreak.gap.search import select as search_module
 from makebreak.gap.search.fit import derivative_free_search, fit_effects
 from makebreak.gap.search.screen import Ranked
 from makebreak.gap.search.select import (
     Choice,
     Selection,
+    _Search,
     _shortlist,
     is_significant,
     select,
@@ -744,6 +746,33 @@ def test_a_parameter_at_its_limit_has_no_interval_that_could_be_infinite(
         spring, {"stiffness": 50.0, "damping": std}, 2.0, 1.0, "", 1.0, (), (), 2
     )
     assert is_significant(choice) == named
+
+
+@pytest.mark.parametrize("after, named", [(1.6, True), (1.9, False)])
+def test_whether_a_patch_is_there_is_told_by_held_out_rows(after, named):
+    """Its friction and its sides make up for one another: their intervals are infinite
+    where its being there is sure."""
+    sides = {"x_min": 0.0, "x_max": 0.1, "y_min": 0.0, "y_max": 0.1}
+    patch = Effect("friction_patch", ["a.a~b.b"], {"friction": 0.5} | sides)
+    std = dict.fromkeys(patch.parameters, np.inf)
+    assert is_significant(Choice(patch, std, 2.0, after, "", 1.0, (), (), 5)) == named
+
+
+@pytest.mark.parametrize("score, kept", [(1.3, True), (1.02, False)])
+def test_a_refit_along_what_fitted_rows_do_not_tell_is_not_taken(
+    monkeypatch, score, kept
+):
+    effect = Effect("friction_patch", ["a.a~b.b"], {"friction": 0.5})
+    old = SimpleNamespace(
+        effects=(effect,), score=1.0, r=np.zeros(4), fit=SimpleNamespace(train=1.0)
+    )
+    new = SimpleNamespace(effects=(effect,), score=score)
+    search = object.__new__(_Search)
+    search.problem, search._error = None, lambda error: error
+    search._screen = lambda r, scale: None
+    monkeypatch.setattr(search_module, "fit_effects", lambda *a: new)
+    choice = Choice(effect, {}, 2.0, 1.0, "", 1.0, (), (), 5)
+    assert (search._refitted([choice], old) is old) == kept
 
 
 def windows_leave(before: float, after: float) -> GapMeasure:

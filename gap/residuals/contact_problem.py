@@ -85,8 +85,15 @@ class ContactProblem(ContactDynamics, GapProblem):
         self._windows: PushWindows | None = None
         # The model whose noise weighs all others'; None: each is weighed by its own.
         self._weights: Sequence[Effect] | None = None
-        self._share_out()
+        self._share_out(self.left())
         self._learn_misfit()
+        # What is seen in few blocks may be loud only by the weights that were learned:
+        # then these are shared out by them.
+        left = self._without_nuisances()
+        if max(size for size, _ in self._blocks_left(left)) > self.plan.loud:
+            calm = np.zeros(self._shown.shape)
+            calm[self._shown] = left
+            self._share_out(calm)
 
     # ----- Rows
 
@@ -136,10 +143,16 @@ class ContactProblem(ContactDynamics, GapProblem):
             self._base = self.residual()
         return self._base
 
-    def _share_out(self) -> None:
-        """Which blocks are fitted. What is seen at one place alone (a patch, a wall) is
-        seen in few blocks, and must be in both parts: so of each three blocks of which
-        the scene leaves about as much, the middle one is held out."""
+    def _without_nuisances(self) -> np.ndarray:
+        """(m,) what the scene as it came leaves, its nuisances fitted to all rows."""
+        n, r = self.nuisances(), self.base()
+        return Screen(r, n.columns, n.prior, np.ones(len(r), bool)).settle(r)[1]
+
+    def _share_out(self, left: np.ndarray) -> None:
+        """Which blocks are fitted, by what the scene leaves (rows as `_shown`). What is
+        seen at one place alone (a patch, a wall) is seen in few blocks, and must be in
+        both parts: so of each three blocks of which about as much is left, the middle
+        one is held out."""
         m = self.means
         block = np.zeros(len(m.time), int)
         first = 0
@@ -150,7 +163,7 @@ class ContactProblem(ContactDynamics, GapProblem):
             first = int(block[mine].max()) + 1
         self._block = block
         _, order = np.unique(block, return_inverse=True)
-        size = np.sum(np.where(self._shown, self.left() ** 2, 0.0), axis=1)
+        size = np.sum(np.where(self._shown, left**2, 0.0), axis=1)
         total = np.bincount(order, weights=size)
         rank = np.empty(len(total), int)
         rank[np.argsort(-total, kind="stable")] = np.arange(len(total))
@@ -604,12 +617,28 @@ class ContactProblem(ContactDynamics, GapProblem):
     # ----- What it comes to
 
     def loudest(self, fitted: Fitted) -> tuple[str, float]:
-        found = ("", 0.0)
+        """Of equations, and of blocks of time, fitted or not: what is met once may be
+        among the fitted ones alone."""
+        found = [("", 0.0)]
         for k, name in enumerate(self.row_names()):
             mine = fitted.left[self.channel_of_rows() == k]
             if len(mine) >= FEWEST_ROWS:
-                found = max(found, (name, rms(mine)), key=lambda each: each[1])
-        return found
+                found.append((name, rms(mine)))
+        size, number = max(self._blocks_left(fitted.left))
+        if size > max(each[1] for each in found):
+            block = self._block == number
+            t, time = self.tracks[int(self.means.episode[block][0])], self.means.time
+            found = [(
+                f"{self.recordings[t.recording].name} from {time[block].min():.3g} to "
+                f"{time[block].max():.3g} s (episode {t.episode.number})", size
+            )]  # fmt: skip
+        return max(found, key=lambda each: each[1])
+
+    def _blocks_left(self, left: np.ndarray) -> list[tuple[float, int]]:
+        """Rms of rows (m,) and number of each block that has enough of them."""
+        of_rows = self.blocks()
+        found = [(left[of_rows == k], int(k)) for k in np.unique(of_rows)]
+        return [(rms(r), k) for r, k in found if len(r) >= FEWEST_ROWS] or [(0.0, 0)]
 
     def where(self, left: np.ndarray) -> list[Where]:
         r = np.zeros(self._shown.shape)

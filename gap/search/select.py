@@ -67,6 +67,11 @@ FREE = 1e3  # Of its size, how far what is chosen may give way to a candidate.
 STEADY = 2.0
 # Joints that get a value of their own, at most; and how many are fitted for each.
 MOST_OWN, OWN_TRIES = 8, 3
+# Of the held-out error, what an effect takes off that is told by this alone.
+THERE = 0.1
+# A refit that leaves so much more of held-out rows went along what fitted rows do not
+# tell.
+DRIFT = 0.05
 PAIRED = 10  # Candidates of which all pairs are tried against a single one.
 
 
@@ -254,6 +259,9 @@ class _Search:
         screen = self._screen(current.r, current.fit.train)
         effects, fixed = [c.effect for c in chosen], [c.fixed for c in chosen]
         fitted = fit_effects(self.problem, screen, effects, fixed)
+        before, after = self._error(current.score), self._error(fitted.score)
+        if effects == list(current.effects) and after > (1.0 + DRIFT) * before:
+            return current
         # Of two rivals more of the one that makes noise larger would take over.
         for _ in range(ROUNDS if any(c.of_two for c in chosen) else 0):
             alike = self.problem.weighed_by(fitted.effects)
@@ -990,8 +998,12 @@ def _is_fit(fit: Fitted, of: Ranked, first: int) -> bool:
 def is_significant(choice: Choice) -> bool:
     """Whether an effect is told from none: the parameters that make it one are off
     neutral by more than their deviation, within what the kind can be, and no interval
-    of them is infinite; and so are half of all."""
+    of them is infinite; and so are half of all. Of one that may end anywhere (a small
+    patch with much friction is as good as a larger one with less) held-out rows say
+    whether it is there at all."""
     kind = KINDS[choice.effect.kind]
+    if any(each.endless for each in kind.parameters):
+        return choice.after < (1.0 - THERE) * choice.before
     clear, some, wide, n = 0, 0, 0, 0
     for each in kind.parameters:
         value = choice.effect.parameters.get(each.name)
