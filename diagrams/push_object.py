@@ -464,7 +464,7 @@ _OWN = {
     "goals": ("period_sec", "offset_sec"),
     "task": ("height", "clearance", "period_sec", "offset_sec"),
     "sampler": ("angle_radius", "residual_dt_sec", "offset_sec"),
-    "reference": ("height", "period_sec", "offset_sec"),
+    "reference": ("height", "nearest", "period_sec", "offset_sec"),
     "impedance": ("period_sec", "offset_sec"),
     "pose": ("height", "rolling_axis", "offset_sec"),
     "tracker": ("z", "hue", "rolling_axis", "period_sec", "offset_sec"),
@@ -603,6 +603,7 @@ def make_push_object(
             replace(
                 config.reference,
                 height=sampling.height,
+                nearest=max(sampling.reach[0] - sampling.inwards, 0.0),
                 period_sec=CONTROL,
                 offset_sec=OFFSET["reference"],
             ),

@@ -9,6 +9,7 @@ from makebreak.systems.arm.arm_reference import ArmReference, ArmReferenceConfig
 from makebreak.systems.arm.numerics.arm_reference import (
     clip_norm,
     next_end,
+    no_nearer,
     on_the_line,
 )
 from makebreak.systems.contact_mpc.numerics.lcs import LCS
@@ -73,12 +74,13 @@ def run(
     tip_force=None,
     feel=1.0,
     height=None,
+    p_tip=(0.0, 0.0, 0.0),
     **config,
 ):
     builder = DiagramBuilder()
     lcs = one_force_lcs(2.0)
     settings = ArmReferenceConfig(tip_mass=2.0, height=height, **config)
-    arm = builder.AddNamedSystem("arm", ArmReference(settings, 1, np.zeros(3), lcs))
+    arm = builder.AddNamedSystem("arm", ArmReference(settings, 1, np.array(p_tip), lcs))
     for name, value in dict(
         phase=[phase], reference=reference, x_next=x_next, lam=lam, status=[status]
     ).items():
@@ -124,6 +126,33 @@ def test_a_held_height_leaves_what_is_across_the_table():
     np.testing.assert_allclose(pose[0:3], [0.001, 0.0, 0.003], atol=1e-15)
     np.testing.assert_allclose(pose[7:10], [0.01, 0.0, 0.0], atol=1e-15)
     np.testing.assert_allclose(wrench, 0.0)  # This contact pushes up alone.
+
+
+@pytest.mark.parametrize("bearing", [0.0, 0.8, 3.0])
+def test_a_pushing_tip_comes_no_nearer_to_the_arm_than_it_may(bearing):
+    out = np.array([np.cos(bearing), np.sin(bearing), 0.0])
+    along = np.array([-out[1], out[0], 0.0])
+    start = 0.402 * out
+    x_next = np.zeros(19)
+    x_next[0:3], x_next[10:13] = start - 4e-3 * out, -0.01 * out + 0.01 * along
+    free = run(ROLL, x_next, [0.0], p_tip=start)[0]
+    pose, wrench = run(ROLL, x_next, [0.0], p_tip=start, nearest=0.4)
+    np.testing.assert_allclose(np.hypot(*free[:2]), 0.398, atol=1e-6)
+    np.testing.assert_allclose(np.hypot(*pose[:2]), 0.4, atol=1e-6)
+    np.testing.assert_allclose(pose[7:10], 0.01 * along, atol=1e-9)
+    # Outwards, and along the table where it is far enough, it goes as C3 says.
+    x_next[0:3], x_next[10:13] = start + 4e-3 * out, 0.01 * out
+    for nearest in (0.0, 0.4):
+        pose, _ = run(ROLL, x_next, [0.0], p_tip=start, nearest=nearest)
+        np.testing.assert_allclose(pose[:3], start + 4e-3 * out, atol=1e-9)
+
+
+def test_a_tip_that_may_come_no_nearer_pushes_only_outwards_and_along():
+    p, v, force = np.array([0.3, 0.0, 0.02]), np.ones(3), np.array([-5.0, 2.0, 1.0])
+    p, v, force = no_nearer(p, v, force, 0.4)
+    np.testing.assert_allclose(p, [0.4, 0.0, 0.02])
+    np.testing.assert_allclose(v, np.ones(3))
+    np.testing.assert_allclose(force, [0.0, 2.0, 1.0])
 
 
 def test_half_a_period_later_the_reference_is_half_way():
@@ -227,6 +256,10 @@ def test_a_tip_that_feels_nothing_yet_goes_slowly():
 
 
 def test_what_cannot_be_followed_is_refused_by_name():
+    with pytest.raises(ValueError, match="nearest is -0.1, expected at least 0"):
+        ArmReference(
+            ArmReferenceConfig(nearest=-0.1), 1, np.zeros(3), one_force_lcs(1.0)
+        )
     with pytest.raises(ValueError, match="touch_speed is 0.0, expected more"):
         ArmReference(
             ArmReferenceConfig(touch_speed=0.0), 1, np.zeros(3), one_force_lcs(1.0)

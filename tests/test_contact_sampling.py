@@ -44,6 +44,7 @@ from makebreak.systems.contact_mpc.numerics.contact_sampling import (
     distance_to_outline,
     in_reach,
     inward,
+    out_of_reach,
     outline_of,
     places_around,
     rotation_of,
@@ -482,6 +483,32 @@ def test_places_out_of_reach_are_not_looked_at(planner):
     assert 2 < len(side) < 14 and (side <= 1.05).all()
 
 
+def test_a_plan_that_leads_the_tip_out_of_reach_costs_more(planner):
+    plans = np.zeros((4, 2, 19))
+    plans[:, :, 1] = [[0.41, 0.45], [0.39, 0.38], [0.5, 0.81], [0.4, 0.78]]
+    expected = [0.0, 0.01**2 + 0.02**2, 0.03**2, 0.0]
+    np.testing.assert_allclose(out_of_reach(plans, [0.41, 0.78], 0.01), expected)
+    model, problem, shape = planner
+    # A tip on the far side, which has to push the object towards the arm.
+    x = state([0.41, 0.0, 0.024], (0.31, 0.0, 0.0))
+    x_desired = target(x, [0.24, 0.0, 0.0], problem.options.N + 1)
+
+    def cost(price):
+        _, found = sample_round(
+            SamplingConfig(out_of_reach=price, hysteresis=[0.0, 1e6]), SamplingMemory(),
+            model.build_many, problem, shape, x, x_desired, 0.1, True, 0.0,
+        )  # fmt: skip
+        assert found.chosen == 0
+        return found.cost[0], found.x
+
+    (free, plan), (paid, _) = cost(0.0), cost(1e5)
+    near = np.hypot(plan[:, 0], plan[:, 1])
+    assert near.min() < 0.395
+    np.testing.assert_allclose(
+        paid - free, 1e5 * (np.maximum(0.4 - near, 0) ** 2).sum(), rtol=1e-6
+    )
+
+
 def test_the_way_through_the_air_has_its_price_but_not_for_a_tip_that_pushes(planner):
     model, problem, shape = planner
     x = state([0.35, 0.0, 0.024], (0.5, 0.0, 0.3))
@@ -906,6 +933,8 @@ def test_a_context_replays_the_same_choices(planner):
         ({"travel": -1.0}, "sampling.travel is -1.0"),
         ({"hysteresis": [1.0, 0.0]}, "sampling.hysteresis"),
         ({"reach": [0.5, 0.4]}, "sampling.reach"),
+        ({"out_of_reach": -1.0}, "sampling.out_of_reach is -1.0"),
+        ({"inwards": -0.1}, "sampling.inwards is -0.1"),
     ],
 )
 def test_a_setting_out_of_range_is_named(planner, change, message):

@@ -7,6 +7,7 @@ from pydrake.systems.framework import LeafSystem
 from makebreak.systems.arm.numerics.arm_reference import (
     clip_norm,
     next_end,
+    no_nearer,
     on_the_line,
     pose_and_wrench,
 )
@@ -38,6 +39,9 @@ class ArmReferenceConfig:
     # Rolling, the tip stays at this height, and only what C3 wants across the table
     # counts [m]; None: C3 moves it up and down too.
     height: float | None = None
+    # Rolling, the tip goes no nearer than this to the world's origin, where the arm
+    # stands, across the table: a C3 that knows no arm would fold its elbow up [m].
+    nearest: float = 0.0
     period_sec: float = 0.0125  # Of C3 and of the task.
     offset_sec: float = 0.0  # A little after theirs.
 
@@ -80,6 +84,8 @@ class ArmReference(LeafSystem):
                 raise ValueError(
                     f"{name} is {getattr(config, name)}, expected more than 0"
                 )
+        if not 0.0 <= config.nearest < np.inf:
+            raise ValueError(f"nearest is {config.nearest}, expected at least 0 m")
         self._config, self._period = config, config.period_sec
         self._phase = self.DeclareVectorInputPort("phase", 1)
         self._reference = self.DeclareVectorInputPort("reference", 9)
@@ -138,6 +144,7 @@ class ArmReference(LeafSystem):
             v[2] = max(v[2], -c.down_max)
             if c.height is not None:
                 p[2], v[2], force[2] = c.height, 0.0, 0.0
+            p, v, force = no_nearer(p, v, force, c.nearest)
             if c.touch_speed < np.inf:
                 felt = np.linalg.norm(self._tip_force.Eval(context))
                 if not felt >= c.touch_force:

@@ -170,7 +170,7 @@ def _check(config: ContactSamplerConfig) -> None:
     for name in ("clearance", "height", "stuck_sec", "bearing"):
         if not 0.0 < getattr(c, name) < np.inf:
             raise ValueError(f"sampling.{name} is {getattr(c, name)}, expected > 0")
-    for name in ("travel", "push"):
+    for name in ("travel", "push", "out_of_reach", "inwards"):
         if not 0.0 <= getattr(c, name) < np.inf:
             raise ValueError(f"sampling.{name} is {getattr(c, name)}, expected >= 0")
     for name in ("hysteresis", "reach"):

@@ -36,6 +36,19 @@ def pose_and_wrench(line, t, period_sec):
     return both
 
 
+def no_nearer(p, v, force, nearest):
+    """The same command, none of which leads nearer to the world's origin, across the
+    table, than nearest [m]: p (3,) lies at least so far away, and there v (3,) and
+    force (3,) have no part towards the origin."""
+    far = np.hypot(p[0], p[1])
+    if far >= nearest:
+        return p, v, force
+    out = np.zeros(3)
+    out[:2] = p[:2] / max(far, 1e-9)
+    p = p + (nearest - far) * out
+    return p, v - min(v @ out, 0.0) * out, force - min(force @ out, 0.0) * out
+
+
 def next_end(start, target, dp_max, v_max, dv_max, a_max):
     """Where the line from `start` towards `target` ends.
 

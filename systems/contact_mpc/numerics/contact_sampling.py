@@ -59,6 +59,10 @@ class SamplingConfig:
     # To either side of the x axis, which the arm looks along [rad]: beyond, the way to
     # a place may lead through the arm's own base.
     bearing: float = 1.05
+    # Of a plan that leads the tip out of reach, for each knot: it will not be carried
+    # out as it is [1/m2]. Less than `inwards` nearer than reach[0] is within [m].
+    out_of_reach: float = 2e4
+    inwards: float = 0.01
     travel: float = 15.0  # Cost of a metre through the air [1/m].
     # Another place has to cost so much less than the present one: a share of the
     # latter's cost, and an absolute amount.
@@ -459,6 +463,15 @@ def in_reach(places, reach, bearing):
     return (far >= reach[0]) & (far <= reach[1]) & (abs(np.arctan2(y, x)) <= bearing)
 
 
+def out_of_reach(plans, reach, inwards):
+    """(n,) the sum of squares of how far the tip of plans (n, N + 1, 19) is nearer than
+    reach[0] - inwards to the origin, or farther than reach[1] [m2]."""
+    far = np.hypot(plans[:, :, P_TIP.start], plans[:, :, P_TIP.start + 1])
+    too_near = np.maximum(reach[0] - inwards - far, 0.0)
+    too_far = np.maximum(far - reach[1], 0.0)
+    return (too_near**2 + too_far**2).sum(axis=1)
+
+
 def choose(cost, hysteresis):
     """Which place to take: the first (the present one), unless another is clearly
     better.
@@ -603,6 +616,7 @@ def sample_round(
     elif not going or not in_reach(present[None], c.reach, c.bearing)[0]:
         cost[0] = NO_PLAN
     cost = cost + c.travel * np.array(way)
+    cost = cost + c.out_of_reach * out_of_reach(plans, c.reach, c.inwards)
     progressed = not in_contact or error < m.error - PROGRESS
     if progressed or not np.isfinite(m.error):
         m = replace(m, error=error, since_sec=t)
