@@ -206,7 +206,11 @@ class PushObjectConfig:
     learning: PushLearnerConfig = field(default_factory=PushLearnerConfig)
     reference: ArmReferenceConfig = field(
         default_factory=lambda: ArmReferenceConfig(
-            force_max=8.0, acceleration_max=3.0, tip_mass=TIP_MASS, touch_speed=0.15
+            force_max=8.0,
+            acceleration_max=3.0,
+            tip_mass=TIP_MASS,
+            touch_speed=0.15,
+            push_speed=0.2,
         )
     )
     impedance: ImpedanceConfig = field(

@@ -255,6 +255,21 @@ def test_a_tip_that_feels_nothing_yet_goes_slowly():
     np.testing.assert_allclose(early[2.0], [4e-3, 3e-3], atol=1e-6)
 
 
+def test_a_tip_that_pushes_goes_no_faster_than_it_may():
+    x_next = np.zeros(19)
+    x_next[0:2], x_next[10:12] = [0.004, 0.003], [0.32, 0.24]
+    both = dict(tip_force=5.0, feel=0.0, touch_speed=0.05)
+    for settings, speed in (
+        (dict(), 0.1),
+        (both, 0.1),
+        (both | dict(tip_force=0.0), 0.05),
+    ):
+        early, _ = run(ROLL, x_next, [0.0], 0.012499, push_speed=0.1, **settings)
+        late, _ = run(ROLL, x_next, [0.0], 0.0999, push_speed=0.1, **settings)
+        np.testing.assert_allclose(np.hypot(*early[:2]), speed * 0.0125, rtol=1e-3)
+        np.testing.assert_allclose(np.hypot(*late[7:9]), speed, rtol=1e-3)
+
+
 def test_what_cannot_be_followed_is_refused_by_name():
     with pytest.raises(ValueError, match="nearest is -0.1, expected at least 0"):
         ArmReference(

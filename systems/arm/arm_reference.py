@@ -32,6 +32,9 @@ class ArmReferenceConfig:
     # what it is to touch earlier than planned, and hits it the harder the faster it is.
     touch_speed: float = np.inf  # [m/s]
     touch_force: float = 1.0  # [N]
+    # Nor faster than this whatever it feels: a tip that slides along a side feels that,
+    # and hits the next corner at the speed that it has by then.
+    push_speed: float = np.inf  # [m/s]
     # No command moves the reference faster than that, however far away it is. The task
     # itself stays below 0.35 m/s and 4 m/s2.
     speed_max: float = 0.5  # [m/s]
@@ -79,7 +82,7 @@ class ArmReference(LeafSystem):
             raise ValueError(
                 f"follow_force is {config.follow_force}, expected more than 0"
             )
-        for name in ("touch_speed", "touch_force"):
+        for name in ("touch_speed", "touch_force", "push_speed"):
             if not getattr(config, name) > 0.0:
                 raise ValueError(
                     f"{name} is {getattr(config, name)}, expected more than 0"
@@ -145,12 +148,14 @@ class ArmReference(LeafSystem):
             if c.height is not None:
                 p[2], v[2], force[2] = c.height, 0.0, 0.0
             p, v, force = no_nearer(p, v, force, c.nearest)
-            if c.touch_speed < np.inf:
+            fastest = c.push_speed
+            if c.touch_speed < fastest:
                 felt = np.linalg.norm(self._tip_force.Eval(context))
                 if not felt >= c.touch_force:
-                    v = clip_norm(v, c.touch_speed)
-                    far = c.touch_speed * c.period_sec
-                    p = start[:3] + clip_norm(p - start[:3], far)
+                    fastest = c.touch_speed
+            if fastest < np.inf:
+                v = clip_norm(v, fastest)
+                p = start[:3] + clip_norm(p - start[:3], fastest * c.period_sec)
             target = np.concatenate((p, v, self._zero, force))
             dv_max = c.acceleration_max * c.period_sec
         else:
