@@ -8,6 +8,7 @@
     pose_sensor, state_estimator --> past_state --> lcs_learn, residual_learner
     residual_learner --r_comp--> c3_mpc, contact_sampler
     c3_mpc (contact), push_task (travel) --> arm_reference
+    gentle: state_estimator --tip_force--> touch_down --touch_speed--> arm_reference
     arm_reference --> impedance_controller --tau--> station
 
 Nothing passes from the world to the controllers but encoders, torques and what a pose
@@ -58,6 +59,7 @@ from makebreak.systems.arm.impedance_controller import (
     ImpedanceController,
     serial_chain_of,
 )
+from makebreak.systems.changing_contact.touch_down import TouchDown, TouchDownConfig
 from makebreak.systems.contact_mpc.c3_mpc import C3Config, C3Mpc
 from makebreak.systems.contact_mpc.contact_sampler import (
     ContactSampler,
@@ -122,6 +124,7 @@ ESTIMATE, LEARN, ARM_TICK = CONTROL / 3.0, 0.05, 0.001
 # are a tick old where they are used.
 OFFSET = dict(
     sensor=1e-4, estimator=2e-4, goals=2.5e-4, past=2.5e-4, task=3e-4, lcs=3e-4,
+    touch=3.2e-4,
     learner=3.5e-4, sampler=3.5e-4, c3=4e-4, reference=4.5e-4, impedance=7e-4,
 )  # fmt: skip
 PLAN_DT, TIP_MASS, N_TIP = 0.1, 1.0, 4  # N_TIP: forces of tip and object, the first.
@@ -204,6 +207,9 @@ class PushObjectConfig:
     task: PushTaskConfig = field(default_factory=PushTaskConfig)
     planner: PushPlannerConfig = field(default_factory=PushPlannerConfig)
     learning: PushLearnerConfig = field(default_factory=PushLearnerConfig)
+    # Whether the speed of a touch is learned, and falls where one is anticipated.
+    gentle: bool = False
+    touch: TouchDownConfig = field(default_factory=TouchDownConfig)
     reference: ArmReferenceConfig = field(
         default_factory=lambda: ArmReferenceConfig(
             force_max=8.0,
@@ -626,6 +632,17 @@ def make_push_object(
             TIP_FRAME,
         ),
     )
+    if config.gentle:
+        touch = builder.AddNamedSystem(
+            "touch_down",
+            TouchDown(config.touch, shape, ESTIMATE, OFFSET["touch"]),
+        )
+        for source, name in (
+            (estimator, "x"), (estimator, "valid"), (task, "phase"),
+            (estimator, "tip_force"),
+        ):  # fmt: skip
+            wiring.connect(builder, source, name, touch, name)
+        wiring.connect(builder, touch, "touch_speed", reference, "touch_speed")
     no_force = builder.AddNamedSystem("no_force", ConstantVectorSource(np.zeros(3)))
 
     connect = partial(wiring.connect, builder)

@@ -75,6 +75,7 @@ def run(
     feel=1.0,
     height=None,
     p_tip=(0.0, 0.0, 0.0),
+    touch=None,
     **config,
 ):
     builder = DiagramBuilder()
@@ -91,6 +92,9 @@ def run(
         builder.Connect(source.get_output_port(), arm.GetInputPort("tip_force"))
         source = builder.AddSystem(ConstantVectorSource([feel]))
         builder.Connect(source.get_output_port(), arm.GetInputPort("feel"))
+    if touch is not None:
+        source = builder.AddSystem(ConstantVectorSource([touch]))
+        builder.Connect(source.get_output_port(), arm.GetInputPort("touch_speed"))
     source = builder.AddSystem(ConstantValueSource(AbstractValue.Make(lcs)))
     builder.Connect(source.get_output_port(), arm.GetInputPort("lcs"))
     diagram = builder.Build()
@@ -268,6 +272,23 @@ def test_a_tip_that_pushes_goes_no_faster_than_it_may():
         late, _ = run(ROLL, x_next, [0.0], 0.0999, push_speed=0.1, **settings)
         np.testing.assert_allclose(np.hypot(*early[:2]), speed * 0.0125, rtol=1e-3)
         np.testing.assert_allclose(np.hypot(*late[7:9]), speed, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("touch", "setting", "felt", "speed"),
+    [
+        (0.05, np.inf, 0.0, 0.05), (0.05, 0.08, 0.0, 0.05), (0.2, 0.08, 0.0, 0.08),
+        (np.nan, 0.08, 0.0, 0.08), (0.05, np.inf, 5.0, 0.1), (-1.0, np.inf, 0.0, 0.0),
+    ],
+)  # fmt: skip
+def test_a_learned_speed_of_touching_holds_until_something_is_felt(
+    touch, setting, felt, speed
+):
+    x_next = np.zeros(19)
+    x_next[0:2], x_next[10:12] = [0.004, 0.003], [0.32, 0.24]
+    settings = dict(tip_force=felt, feel=0.0, push_speed=0.1, touch_speed=setting)
+    late, _ = run(ROLL, x_next, [0.0], 0.0999, touch=touch, **settings)
+    np.testing.assert_allclose(np.hypot(*late[7:9]), speed, rtol=1e-3, atol=1e-9)
 
 
 def test_what_cannot_be_followed_is_refused_by_name():

@@ -70,7 +70,8 @@ class ArmReference(LeafSystem):
     Inputs:  phase (1,), reference (9,) of RollingTask; x_next (19,), lam (n_lam,),
              status (1,) of C3; lcs (abstract), the one-step LCS that made them;
              optional feel (1,) of RollingTask, and then tip_force (3,) on the tip, as
-             the arm feels it [N], which a touch_speed needs, too.
+             the arm feels it [N], which a touch_speed needs, too; optional touch_speed
+             (1,) [m/s], of TouchDown: takes the setting's place where it is less.
     Outputs: x_desired (19,) = [p, quaternion, v, w, a, alpha], position and its
              derivatives only (the quaternion is the identity); wrench (6,) force first;
              command (25,), one after the other: for who asks for both each millisecond.
@@ -98,6 +99,7 @@ class ArmReference(LeafSystem):
         self._lcs = self.DeclareAbstractInputPort("lcs", AbstractValue.Make(lcs))
         self._tip_force = self.DeclareVectorInputPort("tip_force", 3)
         self._feel = self.DeclareVectorInputPort("feel", 1)
+        self._touch_speed = self.DeclareVectorInputPort("touch_speed", 1)
         self._zero = np.zeros(3)
         at_rest = np.concatenate([p_tip, np.zeros(9)])
         reference = np.zeros(25)
@@ -148,11 +150,14 @@ class ArmReference(LeafSystem):
             if c.height is not None:
                 p[2], v[2], force[2] = c.height, 0.0, 0.0
             p, v, force = no_nearer(p, v, force, c.nearest)
-            fastest = c.push_speed
-            if c.touch_speed < fastest:
+            fastest, touch_speed = c.push_speed, c.touch_speed
+            if self._touch_speed.HasValue(context):
+                # One that is no number changes nothing.
+                touch_speed = min(touch_speed, self._touch_speed.Eval(context)[0])
+            if touch_speed < fastest:
                 felt = np.linalg.norm(self._tip_force.Eval(context))
                 if not felt >= c.touch_force:
-                    fastest = c.touch_speed
+                    fastest = max(touch_speed, 0.0)
             if fastest < np.inf:
                 v = clip_norm(v, fastest)
                 p = start[:3] + clip_norm(p - start[:3], fastest * c.period_sec)

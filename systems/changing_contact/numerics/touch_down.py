@@ -1,0 +1,123 @@
+"""How fast a tip may go where it may meet an object, learned touch by touch.
+
+The contact is anticipated where the model has the object's side, and a little nearer or
+farther: a Gaussian over the distance between tip and side at which a touch is felt,
+which every touch corrects. Far from there the tip goes at full speed; in the region of
+anticipated contact it goes at the speed at which the last touches say that the impact
+has the desired force. Between the two its speed falls with the distance that is left,
+smooth in all orders.
+
+Source: Sidhik, Sridharan, Ruiken, "An adaptive framework for trajectory following in
+changing-contact robot manipulation tasks": sections 3.3 (Kalman filter), 3.4.1 (speed
+of approach; here by regression, numerics/contact_anticipator.py) and 3.5.2 (eq. 11).
+There a trial is a motion along one line that is repeated; here it is any touch of any
+side, so that what is learned is a distance, not a place.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from makebreak.systems.changing_contact.numerics.contact_anticipator import (
+    capped,
+    speed_by_regression,
+)
+from makebreak.systems.changing_contact.numerics.velocity_profile import unit_step
+
+KEPT = 5  # Impacts that are remembered.
+# So late is a touch felt, at the most: by then the tip is slower than it came [s].
+LATE_SEC = 0.03
+
+
+@dataclass
+class TouchDownConfig:
+    force_desired: float = 8.0  # Peak of a touch, as the arm feels it [N].
+    first: float = 0.05  # Speed in the region before any touch was felt [m/s],
+    growth: float = (
+        1.4  # and after a touch at most so many times that of the one before,
+    )
+    least: float = 0.01  # but never less or more than these [m/s].
+    most: float = 0.15
+    touch_force: float = 1.0  # From here on a touch is felt [N].
+    peak_sec: float = 0.08  # The peak of an impact comes within so long a time [s].
+    apart_sec: float = 0.05  # Nothing felt for so long: the next touch is another one.
+    # The distance at which a touch is felt: before any [m], of one measurement, and by
+    # how much it changes from touch to touch.
+    std_first: float = 0.004
+    std_measured: float = 0.0015
+    std_drift: float = 0.001
+    sigmas: float = 2.0  # Half width of the region.
+    brake: float = 0.01  # Before the region the speed falls over so long a way [m].
+
+
+@dataclass(frozen=True)
+class TouchDownState:
+    """Memory between two ticks."""
+
+    speed: float  # v_a, in the region [m/s].
+    mean: float = 0.0  # Of the distance at which a touch is felt [m].
+    variance: float = 0.0  # [m2]
+    impacts: tuple[tuple[float, float], ...] = ()  # (speed, peak force), oldest first.
+    apart_sec: float = np.inf  # For how long nothing was felt,
+    since_sec: float = np.inf  # and how long ago the last touch began.
+    at: float = 0.0  # The speed when it did [m/s].
+    peak: float = 0.0  # Of the force since [N].
+    recent: tuple[float, ...] = ()  # The tip's speed, over LATE_SEC, oldest first.
+
+    def __deepcopy__(self, memo) -> "TouchDownState":
+        return self
+
+
+def first_state(config: TouchDownConfig) -> TouchDownState:
+    return TouchDownState(config.first, variance=config.std_first**2)
+
+
+def next_touch(
+    config: TouchDownConfig,
+    state: TouchDownState,
+    dt: float,
+    distance: float,
+    speed: float,
+    force: float,
+    pushing: bool,
+) -> TouchDownState:
+    """One tick.
+
+    Args: dt [s]; distance of tip and side as the model has it [m]; speed of the tip
+        [m/s]; force on it [N]; pushing: whether it is to touch; else what it feels is
+        its own acceleration.
+    """
+    c, s = config, state
+    s = replace(s, since_sec=s.since_sec + dt)
+    if s.since_sec <= c.peak_sec:
+        s = replace(s, peak=max(s.peak, force))
+    elif s.peak > 0.0:  # The touch is over: v_a of the next one.
+        impacts = (*s.impacts, (s.at, s.peak))[-KEPT:]
+        wanted = speed_by_regression(impacts, c.force_desired)
+        if wanted is not None:
+            wanted = capped(wanted, s.speed, c.growth, c.least, c.most)
+            s = replace(s, speed=wanted)
+        s = replace(s, impacts=impacts, peak=0.0)
+    felt = pushing and force >= c.touch_force
+    if felt and s.apart_sec >= c.apart_sec:
+        predicted = s.variance + c.std_drift**2
+        gain = predicted / (predicted + c.std_measured**2)
+        s = replace(
+            s,
+            mean=s.mean + gain * (distance - s.mean),
+            variance=(1.0 - gain) * predicted,
+            since_sec=0.0,
+            at=max(s.recent, default=speed),
+            peak=force,
+        )
+    apart = 0.0 if felt else s.apart_sec + dt
+    recent = (*s.recent, speed)[-max(1, round(LATE_SEC / dt)) :]
+    return replace(s, apart_sec=apart, recent=recent)
+
+
+def allowed_speed(config: TouchDownConfig, state: TouchDownState, distance) -> float:
+    """[m/s] of a tip at a distance [m] from the side that has not touched it yet."""
+    c, s = config, state
+    half = c.sigmas * np.sqrt(s.variance + c.std_drift**2 + c.std_measured**2)
+    ahead = distance - s.mean - half
+    return float(s.speed + (c.most - s.speed) * unit_step(ahead / c.brake)[0])
