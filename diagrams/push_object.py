@@ -115,8 +115,8 @@ from makebreak.systems.views.push_view import PushView, PushViewConfig
 
 PUSH_OBJECT = str(MODELS / "push_object.scene.yaml")
 OBJECT = "object"
-# Of a recording: the object's quaternion and place.
-POSE_COLUMNS = [f"{OBJECT}.{OBJECT}.{p}" for p in ("qw", "qx", "qy", "qz", *"xyz")]
+# Of a recording: the object's place and quaternion.
+READING_COLUMNS = [f"{OBJECT}.{OBJECT}.{p}" for p in (*"xyz", "qw", "qx", "qy", "qz")]
 CONTROL = 0.0125
 ESTIMATE, LEARN, ARM_TICK = CONTROL / 3.0, 0.05, 0.001
 # As in ball_rolling: each system runs a little after the one that it listens to, within
@@ -736,10 +736,14 @@ def make_push_object(
         ("command_log", sampler.GetOutputPort("command"), CONTROL),
     ):
         LogVectorOutput(source, builder, period).set_name(name)
-    of_object = [""] * N_X
-    of_object[Q_BALL.start : P_BALL.stop] = POSE_COLUMNS
-    seen = {"object": (estimator.GetOutputPort("x"), of_object)}
-    record_station(builder, station, tau, TOOL, CONTROL, seen)
+    # As it was measured: what the estimators make of it comes late, and is smoothed.
+    readings = {"object": (sensor.GetOutputPort("reading"), ["", *READING_COLUMNS])}
+    late = CONTROL
+    if config.pose_from == "sensor":
+        late = config.pose.delay_sec + config.pose.period_sec
+    record_station(
+        builder, station, tau, TOOL, CONTROL, readings=readings, behind_sec=late
+    )
     if meshcat is not None:
         view = builder.AddNamedSystem(
             "push_view",

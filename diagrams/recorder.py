@@ -3,7 +3,8 @@
 A diagram has a Recorder beside its station or plant; after a simulation `recorded`
 gives the columns of recording.csv (gap/data/table.py). Sensors are sampled once a row.
 An effort command changes faster than rows come: a row has the mean of what acted from
-its instant until the next row's, which does the same to a mechanism.
+its instant until the next row's, which does the same to a mechanism. What comes at a
+rate of its own and late, as a camera's poses, is in rows of its own instants.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,9 +37,12 @@ class Recorder(Diagram):
     Args:
         measured, commanded: {input: names of its entries}; an entry without a name is
             not recorded.
+        readings: likewise; the first entry, which has no name, is the time at which the
+            others were so [s], negative before the first reading.
         row_sec: from one row to the next, a multiple of TICK [s].
         late: whether a command that is seen at an instant acted in the TICK before it,
             not from it on.
+        behind_sec: a reading is known so long after its time, at most.
     """
 
     def __init__(
@@ -47,12 +51,23 @@ class Recorder(Diagram):
         commanded: Mapping[str, Sequence[str]],
         row_sec: float = ROW_SEC,
         late: bool = False,
+        readings: Mapping[str, Sequence[str]] | None = None,
+        behind_sec: float = 0.0,
     ):
         super().__init__()
-        self.names = {"measured": measured, "commanded": commanded}
+        self.names = {
+            "measured": measured,
+            "commanded": commanded,
+            "readings": readings or {},
+        }
         self.late = late
+        self.behind_sec = behind_sec + row_sec if readings else 0.0
         builder = DiagramBuilder()
-        for what, period in (("measured", row_sec), ("commanded", TICK)):
+        for what, period in (
+            ("measured", row_sec),
+            ("commanded", TICK),
+            ("readings", row_sec),
+        ):
             sizes = [len(names) for names in self.names[what].values()]
             if not sizes:
                 continue
@@ -78,6 +93,22 @@ class Recorder(Diagram):
         times = np.array(log.sample_times()[first:])
         return times, {n: np.array(x) for n, x in values if n}
 
+    def read(
+        self, context: Context, begin: float = -np.inf
+    ) -> list[tuple[np.ndarray, dict]]:
+        """Of each input of `readings` the times (n,) of what was read, from `begin` on
+        [s], and {channel: (n,)}."""
+        found = []
+        if self.HasSubsystemNamed("readings"):
+            data = self.GetSubsystemByName("readings").FindLog(context).data()
+            for names in self.names["readings"].values():
+                own, data = data[: len(names)], data[len(names) :]
+                times, first = np.unique(own[0], return_index=True)
+                new = (times >= 0.0) & (times >= begin - 1e-9)
+                values = own[1:, first[new]]
+                found.append((times[new], dict(zip(names[1:], values, strict=True))))
+        return found
+
 
 def add_recorder(
     builder: DiagramBuilder,
@@ -85,9 +116,12 @@ def add_recorder(
     commanded: Channels,
     row_sec: float = ROW_SEC,
     late: bool = False,
+    readings: Channels | None = None,
+    behind_sec: float = 0.0,
 ) -> None:
     """A Recorder of output ports. Args: {input: (port, names of its entries)}; the rest
     as of Recorder."""
+    readings = readings or {}
     recorder = builder.AddNamedSystem(
         "recorder",
         Recorder(
@@ -95,9 +129,11 @@ def add_recorder(
             {name: entries for name, (_, entries) in commanded.items()},
             row_sec,
             late,
+            {name: entries for name, (_, entries) in readings.items()},
+            behind_sec,
         ),
     )
-    for name, (port, _) in {**measured, **commanded}.items():
+    for name, (port, _) in {**measured, **commanded, **readings}.items():
         builder.Connect(port, recorder.GetInputPort(name))
 
 
@@ -108,12 +144,14 @@ def record_station(
     tool: str,
     row_sec: float = ROW_SEC,
     seen: Channels | None = None,
+    readings: Channels | None = None,
+    behind_sec: float = 0.0,
 ) -> None:
     """A Recorder of a station: its arm's joints, and the wrench at the tool's tip where
     it has one.
 
     Args: tau (7,), what is commanded; tool, the model of TIP_FRAME; seen, of what else
-        is measured, as by a camera.
+        is measured, as by a camera; readings, behind_sec: as of Recorder.
     """
     joints = [f"{ARM}.{joint}" for joint in PANDA_JOINTS]
 
@@ -132,12 +170,24 @@ def record_station(
             [f"{tool}.{TIP_FRAME}.{name}" for name in WRENCH],
         )
     commanded = {"tau": (tau, [f"{joint}.effort_command" for joint in joints])}
-    add_recorder(builder, measured | dict(seen or {}), commanded, row_sec)
+    add_recorder(
+        builder,
+        measured | dict(seen or {}),
+        commanded,
+        row_sec,
+        readings=readings,
+        behind_sec=behind_sec,
+    )
 
 
 def has_recorder(diagram: Diagram) -> bool:
     """Whether `recorded` can be asked."""
     return any(isinstance(system, Recorder) for system in _within(diagram))
+
+
+def behind_sec(diagram: Diagram) -> float:
+    """How much later than its instant a row may be complete [s]."""
+    return max(s.behind_sec for s in _within(diagram) if isinstance(s, Recorder))
 
 
 def recorded(
@@ -153,6 +203,8 @@ def recorded(
         raise ValueError(f"{diagram.get_name()} has no recorder")
     (recorder,) = found
     time, columns = recorder.log("measured", context, begin)
+    for times, values in recorder.read(context, begin):
+        time, columns = _with_rows(time, columns, times, values)
     ticks, commands = recorder.log("commanded", context, begin)
     if commands and len(time):
         fine = np.column_stack(list(commands.values()))
@@ -162,6 +214,20 @@ def recorded(
     else:  # None yet.
         columns |= commands
     return {"time": time, **columns}
+
+
+def _with_rows(time, columns, times, values):
+    """A table with the rows of another: one for each instant of either; where the one
+    or the other has none, its cells are empty (NaN). A nanosecond apart is the same."""
+    at = np.round(1e9 * np.asarray(time)), np.round(1e9 * times)
+    both, first = np.unique(np.concatenate(at), return_index=True)
+    merged = {}
+    for own, part in ((at[0], columns), (at[1], values)):
+        row = np.searchsorted(both, own)
+        for name, y in part.items():
+            merged[name] = np.full(len(both), np.nan)
+            merged[name][row] = y
+    return np.concatenate([time, times])[first], merged
 
 
 def _within(diagram: Diagram) -> Iterator[System]:

@@ -6,7 +6,7 @@ from time import monotonic
 import numpy as np
 from pydrake.systems.framework import Context, Diagram
 
-from makebreak.diagrams.recorder import has_recorder, recorded
+from makebreak.diagrams.recorder import behind_sec, has_recorder, recorded
 from makebreak.gap.data.table import csv_rows
 
 EVERY_SEC = 1.0  # By the clock: so much is lost at most.
@@ -41,7 +41,13 @@ class RecordingStream:
         if not self._open:
             return
         columns = recorded(self._diagram, context, self._next)
-        n = len(columns["time"]) - (not ended)
+        time = columns["time"]
+        n = len(time)
+        if (
+            n and not ended
+        ):  # The last row may still change, and what is read late come.
+            until = time[-1] - behind_sec(self._diagram)
+            n = int(np.searchsorted(time, until - 1e-9))
         if n < 1:
             return
         last = columns["time"][n:]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import LinearSystem, TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
@@ -13,7 +13,13 @@ from makebreak.diagrams.multi_spring import (
     make_multi_spring,
 )
 from makebreak.diagrams.planar import PLANAR
-from makebreak.diagrams.recorder import add_recorder, episodes, recorded, with_noise
+from makebreak.diagrams.recorder import (
+    add_recorder,
+    behind_sec,
+    episodes,
+    recorded,
+    with_noise,
+)
 from makebreak.gap.data.recording import check_against_scene, read_recordings
 from makebreak.gap.data.scene_facts import scene_names
 from makebreak.models.dynamics import SceneDynamics
@@ -44,6 +50,57 @@ def test_a_row_has_samples_and_the_mean_of_what_acted_until_the_next(late, shift
     # Ten ticks, 0 to 9 ms after the row: 4.5 ms on in the mean.
     expected = 3.0 * (got["time"] + 4.5e-3 + shift)
     np.testing.assert_allclose(got["a.j.effort_command"][:4], expected[:4], atol=1e-9)
+
+
+def late_readings(context):
+    """Of a line, every 4 ms, known 7 ms later: its time and its value then."""
+    t = 0.004 * np.floor((context.get_time() - 0.007) / 0.004 + 1e-9)
+    return [t, 2.0 * t] if t >= 0.0 else [-1.0, 0.0]
+
+
+class LateSensor(LeafSystem):
+    def __init__(self):
+        super().__init__()
+        self.DeclareVectorOutputPort(
+            "reading",
+            2,
+            lambda context, output: output.SetFromVector(late_readings(context)),
+        )
+
+
+def test_what_is_read_late_stands_at_the_time_it_was_so():
+    builder = DiagramBuilder()
+    q = builder.AddSystem(ramp(1.0)).get_output_port()
+    u = builder.AddSystem(ramp(3.0)).get_output_port()
+    reading = builder.AddSystem(LateSensor()).get_output_port()
+    add_recorder(
+        builder, {"q": (q, ["a.j.position"])}, {"u": (u, ["a.j.effort_command"])},
+        0.005, readings={"r": (reading, ["", "o.o.x"])}, behind_sec=0.011,
+    )  # fmt: skip
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    simulator.AdvanceTo(0.03)
+    context = simulator.get_context()
+    got = recorded(diagram, context)
+    # Rows of the joints every 5 ms, of the object every 4 ms up to 30 - 7 ms; of what
+    # was read between two rows' instants the last alone was seen.
+    of_joints, of_object = (~np.isnan(got[n]) for n in ("a.j.position", "o.o.x"))
+    np.testing.assert_allclose(1e3 * got["time"][of_joints], np.arange(0, 31, 5))
+    at = 1e3 * got["time"][of_object]
+    assert set(np.round(at)) <= {0, 4, 8, 12, 16, 20} and len(at) >= 4
+    np.testing.assert_allclose(got["o.o.x"][of_object], 2e-3 * at)
+    assert (np.diff(got["time"]) > 1e-9).all()
+    # Commands are of the row until the next one, whatever it holds.
+    width = np.append(np.diff(got["time"]), 0.0)
+    inner = slice(0, -2)
+    expected = 3.0 * (got["time"] + 0.5 * (width - 1e-3))
+    np.testing.assert_allclose(
+        got["a.j.effort_command"][inner], expected[inner], atol=1e-9
+    )
+    # From a time on: the rows from then on, and no others.
+    later = recorded(diagram, context, 0.012)
+    np.testing.assert_array_equal(later["time"], got["time"][got["time"] > 0.0119])
+    assert behind_sec(diagram) == pytest.approx(0.016)
 
 
 def test_an_entry_without_a_name_and_a_diagram_without_a_recorder():

@@ -13,23 +13,26 @@ from makebreak.diagrams.push_object import (
     LEARN,
     N_TIP,
     OBJECT,
-    POSE_COLUMNS,
+    READING_COLUMNS,
     PushObjectConfig,
+    believed_object,
     make_push_object,
     model_scene,
     outline_fold,
     poses_of,
+    rolling_axis,
 )
 from makebreak.diagrams.recorder import recorded
 from makebreak.diagrams.scene_facts import actuators_of
 from makebreak.diagrams.station import ARM, TIP_FRAME, TORQUE_RATE_MAX
-from makebreak.models.pushed_object import hull_obj, object_sdf, parts
+from makebreak.models.pushed_object import hull_obj, object_sdf, parts, rest_height
 from makebreak.scripts.comparison import Rows
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.sweep import rate_text
 from makebreak.scripts.table import Table
 from makebreak.scripts.trials import run_many
 from makebreak.systems.contact_mpc.numerics.push_task import WAIT
+from makebreak.systems.perception.numerics.pose_filter import on_the_table
 
 SUMMARY = "a Panda pushes an object to poses; the planner chooses where to touch it"
 Config = PushObjectConfig
@@ -262,7 +265,15 @@ def write_recording(session, log, config):
     known = np.flatnonzero(phases.data()[0] != WAIT)
     begin = phases.sample_times()[known[0]] if len(known) else -np.inf
     columns = recorded(log.diagram, log.context, begin)
-    pose = [float(columns[name][0]) for name in POSE_COLUMNS]
+    read = np.column_stack([columns[name] for name in READING_COLUMNS])
+    read = read[np.isfinite(read[:, 0])]
+    # What lies on the table, where it was read first: the file has no noise but that.
+    p, q = (read[0, :3], read[0, 3:]) if len(read) else (np.zeros(3), [1.0, 0, 0, 0])
+    height = rest_height(believed_object(config)[0])
+    axis = np.array(rolling_axis(config.object) or np.zeros(3))
+    zero = np.zeros(3)
+    p, _, q, _ = on_the_table(0.0, p, zero, np.array(q), zero, height, axis)
+    pose = [*map(float, q), *map(float, p)]
     file = Path(session.out_dir).resolve() / OBJECT_FILE
     session.write_recording(columns, model_scene(config, file, pose))
 

@@ -52,7 +52,7 @@ class PoseSensor(LeafSystem):
     Outputs: p_WB (3,) [m]; q_WB (4,) [w x y z]; v_WB (3,) [m/s]; w_WB (3,) [rad/s];
              seen (1,): 1 when there has been a reading; readings (abstract): those of
              the last KEPT_SEC that are known, as they were measured: (time [s], p (3,),
-             q (4,)).
+             q (4,)); reading (8,): the last of them; its time is -1 before the first.
 
     Args: config; body, its index in body_poses; seed of the noise.
     """
@@ -100,6 +100,8 @@ class PoseSensor(LeafSystem):
         self.DeclareVectorOutputPort("seen", 1, self._calc_seen, ticket)
         self._known = self.DeclareAbstractState(Value[object](()))
         self.DeclareStateOutputPort("readings", self._known)
+        ticket = {self.abstract_state_ticket(self._known)}
+        self.DeclareVectorOutputPort("reading", 8, self._calc_reading, ticket)
         self.DeclarePeriodicUnrestrictedUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
@@ -169,6 +171,11 @@ class PoseSensor(LeafSystem):
             output.SetFromVector(now[i])
 
         return calc
+
+    def _calc_reading(self, context, output):
+        known = context.get_abstract_state(int(self._known)).get_value()
+        t, p, q = known[-1] if known else (-1.0, np.zeros(3), [1.0, 0.0, 0.0, 0.0])
+        output.SetFromVector([t, *p, *q])
 
     def _calc_seen(self, context, output):
         pose = self._pose_of(context)

@@ -31,7 +31,9 @@ P_MAX = 1.0  # [m2, rad2] A variance grows no further.
 
 # Layout of the state: pose and its rate, covariances of place and yaw, and memory.
 _POSE, _RATE, _P, _P_YAW = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
-_UNSEEN_SEC, _N_OUTLIERS, _STATUS, _SIZE = 12, 13, 14, 15
+_UNSEEN_SEC, _N_OUTLIERS, _STATUS = 12, 13, 14
+# The last measurement that was believed, and when that was [s].
+_READ, _READ_AT, _SIZE = slice(15, 18), 18, 19
 
 
 @dataclass
@@ -80,7 +82,9 @@ class PoseTracker(LeafSystem):
     Outputs: p_WB (3,) [m]; q_WB (4,) = [w, x, y, z]; yaw (1,) [rad], without jumps;
              v_WB (3,) [m/s]; w_WB (3,) [rad/s]; seen (1,): 1 if the last picture showed
              the object where it can be, else 0; status (1,): TRACKED, NOT_FOUND,
-             OUTLIER or WRONG_IMAGE; std (2,): of p_WB each way [m], of yaw [rad].
+             OUTLIER or WRONG_IMAGE; std (2,): of p_WB each way [m], of yaw [rad];
+             reading (8,): time, place and quaternion of the last measurement that was
+             believed, as it was measured; the time is -1 before the first.
 
     Of an outline that some turn leaves as it is (a box: half a turn), yaw is that one
     which is nearest to the last. A disc's yaw stays as it was at first.
@@ -136,6 +140,7 @@ class PoseTracker(LeafSystem):
         start[_POSE.start : _POSE.start + 2] = camera.p_WC[:2]
         start[_P], start[_P_YAW] = self._fresh()
         start[_UNSEEN_SEC], start[_STATUS] = 2.0 * HOLD_SEC, NOT_FOUND
+        start[_READ], start[_READ_AT] = start[_POSE], -1.0
         self._state = self.DeclareDiscreteState(start)
         ticket = {self.discrete_state_ticket(self._state)}
         for name, size, calc in (
@@ -147,6 +152,7 @@ class PoseTracker(LeafSystem):
             ("seen", 1, self._seen),
             ("status", 1, self._status),
             ("std", 2, self._std),
+            ("reading", 8, self._reading),
         ):
             self.DeclareVectorOutputPort(name, size, calc, prerequisites_of_calc=ticket)
         self.DeclarePeriodicDiscreteUpdateEvent(
@@ -217,7 +223,11 @@ class PoseTracker(LeafSystem):
             rate = rate if unseen_sec <= HOLD_SEC else np.zeros(3)
             P = P_next if P_next[0] < P_MAX else P
             P_yaw = P_yaw_next if P_yaw_next[0] < P_MAX else P_yaw
-        state = np.concatenate([pose, rate, P, P_yaw, [unseen_sec, n_outliers, status]])
+        read, read_at = state[_READ], state[_READ_AT]
+        if status == TRACKED:
+            read, read_at = measured, context.get_time()
+        memory = [unseen_sec, n_outliers, status, *read, read_at]
+        state = np.concatenate([pose, rate, P, P_yaw, memory])
         if np.isfinite(state).all():
             discrete_state.set_value(self._state, state)
 
@@ -250,6 +260,12 @@ class PoseTracker(LeafSystem):
 
     def _position(self, context, output):
         output.SetFromVector([*self._get(context)[_POSE][:2], self._config.z])
+
+    def _reading(self, context, output):
+        state = self._get(context)
+        x, y, yaw = state[_READ]
+        q = [np.cos(yaw / 2.0), 0.0, 0.0, np.sin(yaw / 2.0)]
+        output.SetFromVector([state[_READ_AT], x, y, self._config.z, *q])
 
     def _quaternion(self, context, output):
         half = self._get(context)[_POSE][2] / 2.0
