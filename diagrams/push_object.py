@@ -741,9 +741,7 @@ def make_push_object(
     late = CONTROL
     if config.pose_from == "sensor":
         late = config.pose.delay_sec + config.pose.period_sec
-    record_station(
-        builder, station, tau, TOOL, CONTROL, readings=readings, behind_sec=late
-    )
+    record_station(builder, station, tau, TOOL, readings=readings, behind_sec=late)
     if meshcat is not None:
         view = builder.AddNamedSystem(
             "push_view",

@@ -95,11 +95,16 @@ def check_clock(recording: Recording) -> list[Finding]:
             rows = np.flatnonzero(~np.isnan(channel.values[episode.rows]))
             there += len(rows)
             if len(rows) > 2:
-                jumps = np.diff(rows)
-                usual = max(float(np.median(jumps)), 1.0)
-                lost += float(np.sum(np.rint(jumps / usual) - 1.0))
                 t = recording.time[episode.rows][rows]
-                longest = max(longest, float(np.diff(t).max()))
+                # Lost are neither whole rows, which the clock shows, nor the rows of
+                # channels that come at instants of their own.
+                of_rows, of_time = np.diff(rows), np.diff(t)
+                jumps = np.minimum(
+                    of_rows / max(float(np.median(of_rows)), 1.0),
+                    of_time / float(np.median(of_time)),
+                )
+                lost += float(np.sum(np.maximum(np.rint(jumps) - 1.0, 0.0)))
+                longest = max(longest, float(of_time.max()))
         if lost > 0:
             share = lost / (there + lost)
             found.append(
