@@ -227,6 +227,31 @@ def test_a_slow_channel_is_not_called_lossy(tmp_path):
     assert findings(tmp_path, columns) == []
 
 
+@pytest.mark.parametrize("every", [33.3e-3, 1.7e-3])
+def test_channels_at_instants_of_their_own_lack_nothing(tmp_path, every):
+    """As in a bag: each message is a row, of the joints' or of another sensor's."""
+    columns = arm(10)
+    own = columns["time"][0] + 4.07e-4 + every * np.arange(int(2.0 / every))
+    time = np.concatenate([columns["time"], own])
+    order = np.argsort(time)
+    table = {}
+    for name, y in columns.items():
+        both = np.concatenate([y, np.full(len(own), np.nan)])
+        table[name] = both[order]
+    other = 5e-3 * np.random.default_rng(3).normal(size=len(own))
+    slow = np.concatenate([np.full(N, np.nan), np.sin(own) + other])
+    table["arm.j0.velocity"] = slow[order]
+    table["time"] = time[order]
+    found = findings(tmp_path, table)
+    assert not [f for f in found if f.kind in ("samples_lost", "rows_lost")]
+    # What one of them does lack is counted.
+    there = np.flatnonzero(~np.isnan(table["arm.j0.velocity"]))
+    table["arm.j0.velocity"][there[3::10]] = np.nan
+    lost = [f for f in findings(tmp_path, table) if f.kind == "samples_lost"]
+    assert [f.channel for f in lost] == ["arm.j0.velocity"]
+    assert lost[0].size == pytest.approx(0.1, rel=0.1)
+
+
 def test_resolution_and_a_stuck_channel_are_found(tmp_path):
     columns = arm(11)
     columns["arm.j0.position"] = np.round(columns["arm.j0.position"] / 2e-3) * 2e-3
