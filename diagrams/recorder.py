@@ -61,12 +61,12 @@ class Recorder(Diagram):
             "readings": readings or {},
         }
         self.late = late
-        self.behind_sec = behind_sec + row_sec if readings else 0.0
+        self.behind_sec = behind_sec + TICK if readings else 0.0
         builder = DiagramBuilder()
         for what, period in (
             ("measured", row_sec),
             ("commanded", TICK),
-            ("readings", row_sec),
+            ("readings", TICK),  # As often as they may come.
         ):
             sizes = [len(names) for names in self.names[what].values()]
             if not sizes:
@@ -187,7 +187,8 @@ def has_recorder(diagram: Diagram) -> bool:
 
 def behind_sec(diagram: Diagram) -> float:
     """How much later than its instant a row may be complete [s]."""
-    return max(s.behind_sec for s in _within(diagram) if isinstance(s, Recorder))
+    of_each = (s.behind_sec for s in _within(diagram) if isinstance(s, Recorder))
+    return max(of_each, default=0.0)
 
 
 def recorded(
@@ -205,7 +206,8 @@ def recorded(
     time, columns = recorder.log("measured", context, begin)
     for times, values in recorder.read(context, begin):
         time, columns = _with_rows(time, columns, times, values)
-    ticks, commands = recorder.log("commanded", context, begin)
+    # What holds at the first row began up to a tick before it.
+    ticks, commands = recorder.log("commanded", context, begin - 2.0 * TICK)
     if commands and len(time):
         fine = np.column_stack(list(commands.values()))
         acting = ticks - TICK if recorder.late else ticks
@@ -240,6 +242,10 @@ def _within(diagram: Diagram) -> Iterator[System]:
 def mean_until_next(time, fine_time, fine):
     """Mean (n, k) of what held from each of the times (n,) until the next.
 
+    A plant's step at an instant takes what holds at it, so values count from the first
+    of fine_time at or after a time on. Of two times between which there is none the
+    first has the value that holds there.
+
     Args: fine_time (m,), fine (m, k): values that hold from their time on. After the
         last of the times: the value that holds there.
     """
@@ -247,7 +253,8 @@ def mean_until_next(time, fine_time, fine):
     row = np.minimum(row, len(fine) - 1)
     total = np.vstack([np.zeros(fine.shape[1]), np.cumsum(fine, axis=0)])
     last = np.minimum(np.append(row[1:], row[-1] + 1), len(fine))
-    first = np.minimum(row, last - 1)
+    first = np.maximum(np.minimum(row, last - 1), 0)
+    last = np.maximum(last, first + 1)
     return (total[last] - total[first]) / (last - first)[:, None]
 
 

@@ -1,5 +1,7 @@
 """What diagrams record for the gap workflow."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
@@ -17,6 +19,7 @@ from makebreak.diagrams.recorder import (
     add_recorder,
     behind_sec,
     episodes,
+    mean_until_next,
     recorded,
     with_noise,
 )
@@ -82,25 +85,33 @@ def test_what_is_read_late_stands_at_the_time_it_was_so():
     simulator.AdvanceTo(0.03)
     context = simulator.get_context()
     got = recorded(diagram, context)
-    # Rows of the joints every 5 ms, of the object every 4 ms up to 30 - 7 ms; of what
-    # was read between two rows' instants the last alone was seen.
+    # Rows of the joints every 5 ms, of the object every 4 ms, up to 30 - 7 ms.
     of_joints, of_object = (~np.isnan(got[n]) for n in ("a.j.position", "o.o.x"))
     np.testing.assert_allclose(1e3 * got["time"][of_joints], np.arange(0, 31, 5))
     at = 1e3 * got["time"][of_object]
-    assert set(np.round(at)) <= {0, 4, 8, 12, 16, 20} and len(at) >= 4
+    np.testing.assert_allclose(at, [0, 4, 8, 12, 16, 20], atol=1e-9)
     np.testing.assert_allclose(got["o.o.x"][of_object], 2e-3 * at)
     assert (np.diff(got["time"]) > 1e-9).all()
-    # Commands are of the row until the next one, whatever it holds.
-    width = np.append(np.diff(got["time"]), 0.0)
-    inner = slice(0, -2)
-    expected = 3.0 * (got["time"] + 0.5 * (width - 1e-3))
-    np.testing.assert_allclose(
-        got["a.j.effort_command"][inner], expected[inner], atol=1e-9
-    )
+    # Commands are of the row until the next one, whatever it holds: of its ticks.
+    expected = [
+        3e-3 * np.arange(np.ceil(a), b).mean() for a, b in pairwise(1e3 * got["time"])
+    ]
+    np.testing.assert_allclose(got["a.j.effort_command"][:-1], expected, atol=1e-9)
     # From a time on: the rows from then on, and no others.
-    later = recorded(diagram, context, 0.012)
-    np.testing.assert_array_equal(later["time"], got["time"][got["time"] > 0.0119])
-    assert behind_sec(diagram) == pytest.approx(0.016)
+    for begin in [*got["time"], 0.011]:
+        later = recorded(diagram, context, begin)
+        for name, y in got.items():
+            expected = y[got["time"] >= begin - 1e-9]
+            np.testing.assert_allclose(later[name], expected, atol=1e-9, err_msg=name)
+    assert behind_sec(diagram) == pytest.approx(0.012)
+
+
+def test_rows_between_two_ticks_have_what_holds_there():
+    fine_time, fine = 1e-3 * np.arange(10, 20), np.arange(10.0, 20.0)[:, None]
+    time = np.array([0.0091, 0.0092, 0.0093, 0.0121, 0.0122, 0.0123, 0.015])
+    got = mean_until_next(time, fine_time, fine)[:, 0]
+    # Before the first tick its value; then those of ticks 10 to 12, of 12, and so on.
+    np.testing.assert_allclose(got, [10.0, 10.0, 11.0, 12.0, 12.0, 13.5, 15.0])
 
 
 def test_an_entry_without_a_name_and_a_diagram_without_a_recorder():

@@ -6,9 +6,10 @@ import sys
 import time
 
 import numpy as np
+import pydrake.all as drake
 import pytest
 
-from makebreak.diagrams.recorder import recorded
+from makebreak.diagrams.recorder import add_recorder, recorded
 from makebreak.gap.data.recording import read_recording
 from makebreak.scripts import recording_stream
 from makebreak.scripts.session import Session
@@ -99,6 +100,38 @@ def test_what_was_streamed_is_what_is_written_at_the_end(tmp_path, monkeypatch):
         session.finish()
     # What was streamed beside it is gone with a complete run.
     assert {p.name for p in (tmp_path / "out").glob("*.csv")} == {"recording.csv"}
+
+
+class LateSensor(drake.LeafSystem):
+    """Reads a line every 7 ms, and knows it 20 ms later."""
+
+    def __init__(self):
+        super().__init__()
+        self.DeclareVectorOutputPort("reading", 2, self._read)
+
+    def _read(self, context, output):
+        t = 0.007 * np.floor((context.get_time() - 0.02) / 0.007 + 1e-9)
+        output.SetFromVector([t, 2.0 * t] if t >= 0.0 else [-1.0, 0.0])
+
+
+def test_what_is_read_late_is_streamed_in_its_place(tmp_path, monkeypatch):
+    monkeypatch.setattr(recording_stream, "EVERY_SEC", 0.0)  # At each sample.
+    builder = drake.DiagramBuilder()
+    line = builder.AddSystem(drake.Sine(1.0, 3.0, 0.0, 1)).get_output_port(0)
+    reading = builder.AddSystem(LateSensor()).get_output_port()
+    add_recorder(
+        builder, {"q": (line, ["a.j.position"])}, {"u": (line, ["a.j.effort_command"])},
+        readings={"r": (reading, ["", "o.o.x"])}, behind_sec=0.027,
+    )  # fmt: skip
+    with Session(tmp_path / "out", progress=False) as session:
+        log = session.simulate(builder.Build(), 0.5, {})
+        columns = recorded(log.diagram, log.context)
+        streamed = session.outputs.file("recording.csv")
+        table = np.genfromtxt(streamed, delimiter=",", names=True, deletechars="")
+    assert np.isfinite(columns["o.o.x"]).sum() == 69  # 0 to 480 ms.
+    assert set(table.dtype.names) == set(columns)
+    for name, y in columns.items():
+        np.testing.assert_allclose(table[name], y, atol=1e-12, err_msg=name)
 
 
 def test_an_interrupted_run_keeps_what_was_streamed(tmp_path):
