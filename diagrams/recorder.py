@@ -25,6 +25,7 @@ from makebreak.diagrams.station import ARM, TIP_FRAME
 TICK = 0.001  # Of commands [s].
 ENCODER_NOISE = {"position": 2e-5, "velocity": 2e-3}  # [m], [rad] and their rates.
 ROW_SEC = 0.005  # From row to row [s].
+SAME = 2e-4  # A reading so near to a row is in it: systems of one tick run in turn [s].
 WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
 Channels = Mapping[str, tuple[OutputPort, Sequence[str]]]
 
@@ -204,8 +205,10 @@ def recorded(
         raise ValueError(f"{diagram.get_name()} has no recorder")
     (recorder,) = found
     time, columns = recorder.log("measured", context, begin)
-    for times, values in recorder.read(context, begin):
+    for times, values in recorder.read(context, begin - SAME):
         time, columns = _with_rows(time, columns, times, values)
+    asked = time >= begin - 1e-9
+    time, columns = time[asked], {name: y[asked] for name, y in columns.items()}
     # What holds at the first row began up to a tick before it.
     ticks, commands = recorder.log("commanded", context, begin - 2.0 * TICK)
     if commands and len(time):
@@ -220,16 +223,18 @@ def recorded(
 
 def _with_rows(time, columns, times, values):
     """A table with the rows of another: one for each instant of either; where the one
-    or the other has none, its cells are empty (NaN). A nanosecond apart is the same."""
-    at = np.round(1e9 * np.asarray(time)), np.round(1e9 * times)
-    both, first = np.unique(np.concatenate(at), return_index=True)
+    or the other has none, its cells are empty (NaN). Less than SAME apart is one."""
+    if len(time):
+        near = time[np.searchsorted(0.5 * (time[1:] + time[:-1]), times)]
+        times = np.where(abs(near - times) < SAME, near, times)
+    both = np.unique(np.concatenate([time, times]))
     merged = {}
-    for own, part in ((at[0], columns), (at[1], values)):
+    for own, part in ((time, columns), (times, values)):
         row = np.searchsorted(both, own)
         for name, y in part.items():
             merged[name] = np.full(len(both), np.nan)
             merged[name][row] = y
-    return np.concatenate([time, times])[first], merged
+    return both, merged
 
 
 def _within(diagram: Diagram) -> Iterator[System]:

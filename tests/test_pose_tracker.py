@@ -382,6 +382,7 @@ def test_before_the_first_sight_it_is_below_the_camera_and_not_seen():
     np.testing.assert_allclose(follower.get("p_WB"), [0.5, 0.0, 0.02])
     np.testing.assert_allclose(follower.get("q_WB"), [1, 0, 0, 0])
     assert follower.get("seen") == 0.0 and follower.get("status") == NOT_FOUND
+    assert follower.get("reading")[0] == -1.0
 
 
 def test_moving_and_turning_object_is_followed_with_its_rates():
@@ -413,12 +414,18 @@ def test_hidden_object_is_held_and_comes_to_rest_and_is_found_again():
     for k in range(40):
         follower.show(photograph([0.45 + 0.1 * k * 0.0125, 0.0, 0.3]))
     held, std = follower.get("p_WB"), follower.get("std")
+    # As it was measured: where it is, and not where a filter has it.
+    read, half = follower.get("reading"), [np.cos(0.15), 0.0, 0.0, np.sin(0.15)]
+    assert read[0] == pytest.approx(39 * 0.0125, abs=1e-9)
+    np.testing.assert_allclose(read[1:4], [0.45 + 0.1 * read[0], 0.0, 0.02], atol=5e-4)
+    np.testing.assert_allclose(read[4:], half, atol=3e-3)
     empty = photograph([0.5, 2.0, 0.0])
     follower.show(empty)
     assert follower.get("seen") == 0.0 and follower.get("v_WB")[0] > 0.05
     for _ in range(int(HOLD_SEC / 0.0125) + 1):
         follower.show(empty)
     np.testing.assert_allclose(follower.get("p_WB"), held, atol=1e-12)
+    np.testing.assert_array_equal(follower.get("reading"), read)
     assert (follower.get("v_WB") == 0.0).all() and (follower.get("w_WB") == 0.0).all()
     assert (follower.get("std") > std).all()
     follower.show(photograph([0.55, 0.1, -2.0]))  # Elsewhere.

@@ -157,6 +157,21 @@ def test_a_pose_is_known_after_its_delay_and_laid_on_the_table():
     assert sensor.GetOutputPort("v_WB").Eval(own)[2] == 0.0
 
 
+def test_the_last_reading_is_told_as_it_was_measured_and_when():
+    pose = RigidTransform(RotationMatrix.MakeXRotation(0.2), [0.5, 0.1, 0.05])
+    diagram, sensor = sensor_at(pose, noise=[0.0, 0.0], delay_sec=0.1, height=0.02)
+    simulator = Simulator(diagram)
+    own = sensor.GetMyContextFromRoot(simulator.get_context())
+    port = sensor.GetOutputPort("reading")
+    simulator.AdvanceTo(0.09)
+    assert port.Eval(own)[0] == -1.0
+    for t, at in ((0.12, 0.0), (0.15, 1.0 / 30.0), (0.36, 7.0 / 30.0)):
+        simulator.AdvanceTo(t)
+        half = [np.cos(0.1), np.sin(0.1), 0.0, 0.0]
+        expected = [at, 0.5, 0.1, 0.05, *half]
+        np.testing.assert_allclose(port.Eval(own), expected, atol=1e-9)
+
+
 def test_readings_have_the_noise_that_is_asked_for():
     diagram, sensor = sensor_at(RigidTransform([0.5, 0.0, 0.02]), density=[1e6, 1e6])
     simulator = Simulator(diagram)

@@ -55,27 +55,26 @@ def test_a_row_has_samples_and_the_mean_of_what_acted_until_the_next(late, shift
     np.testing.assert_allclose(got["a.j.effort_command"][:4], expected[:4], atol=1e-9)
 
 
-def late_readings(context):
-    """Of a line, every 4 ms, known 7 ms later: its time and its value then."""
-    t = 0.004 * np.floor((context.get_time() - 0.007) / 0.004 + 1e-9)
-    return [t, 2.0 * t] if t >= 0.0 else [-1.0, 0.0]
-
-
 class LateSensor(LeafSystem):
-    def __init__(self):
+    """Reads a line every 4 ms, a little after the tick, and knows it 7 ms later."""
+
+    def __init__(self, after):
         super().__init__()
-        self.DeclareVectorOutputPort(
-            "reading",
-            2,
-            lambda context, output: output.SetFromVector(late_readings(context)),
-        )
+        self._after = after
+        self.DeclareVectorOutputPort("reading", 2, self._read)
+
+    def _read(self, context, output):
+        t = 0.004 * np.floor((context.get_time() - 0.007) / 0.004 + 1e-9)
+        t += self._after
+        output.SetFromVector([t, 2.0 * t] if t >= 0.0 else [-1.0, 0.0])
 
 
-def test_what_is_read_late_stands_at_the_time_it_was_so():
+@pytest.mark.parametrize("after", [0.0, 1e-4, 4e-4])
+def test_what_is_read_late_stands_at_the_time_it_was_so(after):
     builder = DiagramBuilder()
     q = builder.AddSystem(ramp(1.0)).get_output_port()
     u = builder.AddSystem(ramp(3.0)).get_output_port()
-    reading = builder.AddSystem(LateSensor()).get_output_port()
+    reading = builder.AddSystem(LateSensor(after)).get_output_port()
     add_recorder(
         builder, {"q": (q, ["a.j.position"])}, {"u": (u, ["a.j.effort_command"])},
         0.005, readings={"r": (reading, ["", "o.o.x"])}, behind_sec=0.011,
@@ -89,13 +88,21 @@ def test_what_is_read_late_stands_at_the_time_it_was_so():
     of_joints, of_object = (~np.isnan(got[n]) for n in ("a.j.position", "o.o.x"))
     np.testing.assert_allclose(1e3 * got["time"][of_joints], np.arange(0, 31, 5))
     at = 1e3 * got["time"][of_object]
-    np.testing.assert_allclose(at, [0, 4, 8, 12, 16, 20], atol=1e-9)
-    np.testing.assert_allclose(got["o.o.x"][of_object], 2e-3 * at)
+    read = np.arange(0, 21, 4) + 1e3 * after
+    # One of a row's tick is in the row: systems of one tick run one after the other.
+    in_rows = read - 1e3 * after if after < 2e-4 else read
+    expected = np.where(np.isin(np.arange(0, 21, 4), [0, 20]), in_rows, read)
+    np.testing.assert_allclose(at, expected, atol=1e-9)
+    np.testing.assert_allclose(got["o.o.x"][of_object], 2e-3 * read, atol=1e-12)
     assert (np.diff(got["time"]) > 1e-9).all()
     # Commands are of the row until the next one, whatever it holds: of its ticks.
-    expected = [
-        3e-3 * np.arange(np.ceil(a), b).mean() for a, b in pairwise(1e3 * got["time"])
+    rows = pairwise(np.round(1e3 * got["time"], 6))
+    ticks = [np.arange(np.ceil(a), b) for a, b in rows]
+    # Between two ticks: what holds there.
+    held = [
+        t.mean() if len(t) else np.floor(1e3 * a) for t, a in zip(ticks, got["time"])
     ]
+    expected = 3e-3 * np.array(held)
     np.testing.assert_allclose(got["a.j.effort_command"][:-1], expected, atol=1e-9)
     # From a time on: the rows from then on, and no others.
     for begin in [*got["time"], 0.011]:
