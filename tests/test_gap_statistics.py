@@ -748,31 +748,53 @@ def test_a_parameter_at_its_limit_has_no_interval_that_could_be_infinite(
     assert is_significant(choice) == named
 
 
-@pytest.mark.parametrize("after, named", [(1.6, True), (1.9, False)])
-def test_whether_a_patch_is_there_is_told_by_held_out_rows(after, named):
+@pytest.mark.parametrize(
+    "after, spread, named",
+    [(1.78, np.inf, True), (1.82, np.inf, False), (1.9, 1e-3, True)],
+)
+def test_whether_a_patch_is_there_is_told_by_held_out_rows(after, spread, named):
     """Its friction and its sides make up for one another: their intervals are infinite
-    where its being there is sure."""
+    where its being there is sure. One that few rows are on takes little off them all,
+    and is told by its intervals."""
     sides = {"x_min": 0.0, "x_max": 0.1, "y_min": 0.0, "y_max": 0.1}
     patch = Effect("friction_patch", ["a.a~b.b"], {"friction": 0.5} | sides)
-    std = dict.fromkeys(patch.parameters, np.inf)
+    std = dict.fromkeys(patch.parameters, spread)
     assert is_significant(Choice(patch, std, 2.0, after, "", 1.0, (), (), 5)) == named
 
 
-@pytest.mark.parametrize("score, kept", [(1.3, True), (1.02, False)])
+@pytest.mark.parametrize(
+    "score, still, kept",
+    [(1.3, 1.0, True), (1.02, 1.0, False), (1.3, 1.28, False), (1.3, 1.2, True)],
+)
 def test_a_refit_along_what_fitted_rows_do_not_tell_is_not_taken(
-    monkeypatch, score, kept
+    monkeypatch, score, still, kept
 ):
+    """The old fit is weighed as the new one is, and is what it leaves by that."""
     effect = Effect("friction_patch", ["a.a~b.b"], {"friction": 0.5})
+    left = np.arange(4.0)
     old = SimpleNamespace(
-        effects=(effect,), score=1.0, r=np.zeros(4), fit=SimpleNamespace(train=1.0)
+        effects=(effect,), score=1.0, r=left, fit=SimpleNamespace(train=1.0)
     )
     new = SimpleNamespace(effects=(effect,), score=score)
+
+    def fit(problem, screen, effects, fixed, evaluations=None):
+        if evaluations is None:
+            return new
+        # No step is taken: the parameters are the old ones.
+        assert evaluations == 1 and effects == [effect]
+        return SimpleNamespace(effects=(effect,), score=still, r=screen)
+
     search = object.__new__(_Search)
-    search.problem, search._error = None, lambda error: error
-    search._screen = lambda r, scale: None
-    monkeypatch.setattr(search_module, "fit_effects", lambda *a: new)
+    search.problem = SimpleNamespace(residual=lambda effects: 2.0 * left)
+    search._error = lambda error: error
+    search._screen = lambda r, scale: r
+    monkeypatch.setattr(search_module, "fit_effects", fit)
     choice = Choice(effect, {}, 2.0, 1.0, "", 1.0, (), (), 5)
-    assert (search._refitted([choice], old) is old) == kept
+    found = search._refitted([choice], old)
+    assert (found is not new) == kept
+    if kept:
+        assert found.score == still
+        np.testing.assert_array_equal(found.r, 2.0 * left)
 
 
 def windows_leave(before: float, after: float) -> GapMeasure:

@@ -99,9 +99,8 @@ def test_what_is_read_late_stands_at_the_time_it_was_so(after):
     rows = pairwise(np.round(1e3 * got["time"], 6))
     ticks = [np.arange(np.ceil(a), b) for a, b in rows]
     # Between two ticks: what holds there.
-    held = [
-        t.mean() if len(t) else np.floor(1e3 * a) for t, a in zip(ticks, got["time"])
-    ]
+    starts = np.floor(1e3 * got["time"][:-1] + 1e-6)
+    held = [t.mean() if len(t) else a for t, a in zip(ticks, starts, strict=True)]
     expected = 3e-3 * np.array(held)
     np.testing.assert_allclose(got["a.j.effort_command"][:-1], expected, atol=1e-9)
     # From a time on: the rows from then on, and no others.

@@ -23,6 +23,7 @@ from makebreak.gap.problem import (
     SearchPlan,
     is_sane,
     rms,
+    trimmed_rms,
 )
 from makebreak.gap.residuals.contact_dynamics import WRENCHED, ContactDynamics
 from makebreak.gap.residuals.mechanism import link_changes
@@ -635,10 +636,11 @@ class ContactProblem(ContactDynamics, GapProblem):
         return max(found, key=lambda each: each[1])
 
     def _blocks_left(self, left: np.ndarray) -> list[tuple[float, int]]:
-        """Rms of rows (m,) and number of each block that has enough of them."""
+        """How loud rows (m,) are, and the number, of each block with enough of them."""
         of_rows = self.blocks()
         found = [(left[of_rows == k], int(k)) for k in np.unique(of_rows)]
-        return [(rms(r), k) for r, k in found if len(r) >= FEWEST_ROWS] or [(0.0, 0)]
+        found = [(r, k) for r, k in found if len(r) >= FEWEST_ROWS]
+        return [(trimmed_rms(r), k) for r, k in found] or [(0.0, 0)]
 
     def where(self, left: np.ndarray) -> list[Where]:
         r = np.zeros(self._shown.shape)
