@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import Frame
+from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from scipy.sparse import block_diag, csr_matrix
 from scipy.spatial.transform import Rotation
 
@@ -43,6 +43,7 @@ MODELLED = 0.02  # What models are off by, as a share of the forces in a row.
 # A force is felt where the mean of so many samples is clear of noise, and at least this
 # [N]; where one may be felt, the mean over a test function is so many times its noise.
 FELT_SAMPLES, LEAST_FELT, MAYBE_FELT = 9, 0.2, 4.0
+SHORT = 0.5  # Of half a test function: a contact that is lost for less goes on.
 POSE = (*TURN, "x", "y", "z")
 FORCE, MOMENT = ("fx", "fy", "fz"), ("tx", "ty", "tz")
 
@@ -351,20 +352,52 @@ class ContactMeans:
             ])  # fmt: skip
             found[key] = (phi < MEETS) & (np.abs(rate) < APPROACH)
         for sensor in self.sensors:
-            size, welded = self._force_size(sensor.place), sensor.welded
+            size, welded = self._force_size(sensor), sensor.welded
             for key in found:
                 if set(key) & set(welded) and np.isfinite(size).all():
                     partner = key[0] if key[1] in welded else key[1]
                     if partner not in self.shapes.anchored:
-                        found[key] = (size > 0.0) & (least[key] < NEAR)
+                        felt = (size > 0.0) & (least[key] < NEAR)
+                        found[key] = self._without_short_losses(felt)
                         self._apart[key] = least[key]
         return found
 
-    def _force_size(self, place: str) -> np.ndarray:
-        """(n_rows,) of the measured force where it is clear of noise, else 0; of few
-        newtons too, as of a tool that leans on something at rest."""
-        out = []
-        for t in self.tracks:
+    def _without_short_losses(self, felt: np.ndarray) -> np.ndarray:
+        """(n_rows,) felt too where it is lost for little of a test function: a tip that
+        hardly presses is felt now and then, and a contact that may act need not."""
+        out = felt.copy()
+        for a, b, t in zip(self._offset, self._offset[1:], self.tracks, strict=False):
+            on = np.flatnonzero(felt[a:b])
+            lost = np.diff(t.time[on]) < SHORT * self.half
+            for k in np.flatnonzero(lost & (np.diff(on) > 1)):
+                out[a + on[k] : a + on[k + 1]] = True
+        return out
+
+    def _own_force(self, sensor: WrenchSensor) -> np.ndarray:
+        """(n_rows,) what it takes to accelerate a sensor's own tool [N]: one in the
+        tool's mount feels that too."""
+        plant, body = self.plant, sensor.frame.body()
+        context = plant.CreateDefaultContext()
+        mass, world = body.default_mass(), plant.world_frame()
+        out = np.zeros(len(self._q))
+        if not mass > 0.0:
+            return out
+        com = body.default_com()
+        at = (context, JacobianWrtVariable.kV, body.body_frame(), com, world, world)
+        for k, (q, v, vd) in enumerate(zip(self._q, self._v, self._vd, strict=True)):
+            plant.SetPositions(context, q)
+            plant.SetVelocities(context, v)
+            a = plant.CalcJacobianTranslationalVelocity(*at) @ vd
+            bias = plant.CalcBiasTranslationalAcceleration(*at)
+            out[k] = mass * np.linalg.norm(a + bias.ravel())
+        return out
+
+    def _force_size(self, sensor: WrenchSensor) -> np.ndarray:
+        """(n_rows,) of the measured force where it is clear of noise and of what the
+        tool's own motion makes, else 0; of few newtons too, as of a tool that leans on
+        something at rest."""
+        out, place, own = [], sensor.place, self._own_force(sensor)
+        for first, t in zip(self._offset, self.tracks, strict=False):
             recording = self.recordings[t.recording]
             f = np.stack(
                 [recording[f"{place}.{a}"][t.episode.rows] for a in FORCE], axis=1
@@ -379,6 +412,7 @@ class ContactMeans:
             )
             size = np.interp(t.time, t.time[good], np.linalg.norm(f, axis=1))
             least = max(6.0 * noise / np.sqrt(n), LEAST_FELT)
+            least = least + own[first : first + len(t.time)]
             out.append(np.where(size > least, size, 0.0))
         return np.concatenate(out)
 
