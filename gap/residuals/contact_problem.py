@@ -28,6 +28,11 @@ from makebreak.gap.residuals.contact_dynamics import WRENCHED, ContactDynamics
 from makebreak.gap.residuals.mechanism import link_changes
 from makebreak.gap.residuals.objects import unexplained_in_windows
 from makebreak.gap.residuals.permitted_contacts import Shift
+from makebreak.gap.residuals.widened_contacts import (
+    distances_off,
+    sentence,
+    widened_contacts,
+)
 from makebreak.gap.result import Where
 from makebreak.gap.search.fit import fit_effects
 from makebreak.gap.simulation.contact_windows import (
@@ -47,6 +52,7 @@ LATE = 0.25  # and its clock, in periods of its samples.
 TIMING = 2.5e-4  # Of what drives get [s].
 FELT = 0.05  # What a force sensor shows more, sampled amid a drive's ripple too.
 BEYOND = 3.0
+NO_GAP = 1.5  # Times the noise: less in the equations needs no hint.
 MISFIT = 1.15  # Less than so many times the sensors' noise is no misfit.
 ROBUST = 1.4826
 LEAST_MISFIT = 0.002  # Of the forces in a row: laws are no better than that.
@@ -633,6 +639,12 @@ class ContactProblem(ContactDynamics, GapProblem):
                 f"{time[block].max():.3g} s (episode {t.episode.number})", size
             )]  # fmt: skip
         return max(found, key=lambda each: each[1])
+
+    def hint(self, end: Fitted) -> str:
+        """Which pair would have to press otherwise, and how."""
+        now, found = widened_contacts(self, end, NO_GAP)
+        off = distances_off(self, end, self.plan.loud)
+        return "".join(off) + sentence(now, found)
 
     def _blocks_left(self, left: np.ndarray) -> list[tuple[float, int]]:
         """Rms of rows (m,) and number of each block that has enough of them."""
