@@ -21,6 +21,7 @@ from makebreak.gap.residuals.widened_contacts import (
 from makebreak.gap.result import GapMeasure
 from makebreak.gap.search.select import _Search
 from makebreak.gap.verdict import two_figures
+from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
 
 
@@ -131,3 +132,20 @@ def test_a_scene_that_sap_lifts_gets_a_warning(problem, monkeypatch):
              if TABLE in problem.pair_name(problem._pair_of(s)))  # fmt: skip
     expected = mu * (0.2 + plant.time_step) * np.percentile(v, 95.0)
     assert found.size == pytest.approx(expected, rel=0.3)
+
+
+def test_friction_of_what_sticks_is_a_bound_and_its_deviation_says_so(problem):
+    """The tip sticks, and 0.9 permits no more than 0.8 does; the block slides over the
+    table, and there the cost grows with the square: a deviation is what adds one."""
+    start = started(problem)
+    table = f"{BLOCK}~{TABLE}"
+    mu = problem.dynamics.now("contact_friction", [table])["friction"]
+    deviation = {}
+    for at, value in ((tip_pair(problem), 0.9), (table, mu)):
+        end = replace(
+            start, effects=[Effect("contact_friction", [at], {"friction": value})],
+            std=[{"friction": 1e-6}],
+        )  # fmt: skip
+        deviation[at] = problem.widened(end, 0)["friction"]
+    assert deviation[tip_pair(problem)] == np.inf
+    assert 1e-6 < deviation[table] < 0.03 * mu

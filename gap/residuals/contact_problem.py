@@ -65,6 +65,8 @@ PATCH_RUNS, PATCH_STARTS, PATCHES = 120, 8, 3
 # Of a patch's side: how far it is moved [m], and what that may add to the sum of
 # squares (neighbouring rows err together: four times what one row would count).
 MOVED, PROFILE = (5e-4, 1e-3, 2e-3, 4e-3, 8e-3, 0.016, 0.032, 0.064), 16.0
+# By what share of itself a friction is moved likewise.
+SHARES = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 0.9)
 LARGEST = 200.0  # An error beyond so many standard deviations counts as this.
 FEWEST_ROWS = 8  # Of a channel that is looked at by itself.
 SMALL = 0.1  # First trial of an effect on joints, of the efforts there.
@@ -580,11 +582,20 @@ class ContactProblem(ContactDynamics, GapProblem):
         return float(found.fun), friction + x[0], sides + x[1:]
 
     def widened(self, end: Fitted, k: int) -> dict[str, float]:
-        """A patch's side that nothing slid across can be anywhere until something did:
-        it is moved by ever more, and its deviation is half of how far that goes without
-        a loss of PROFILE noise variances; infinite where it goes on."""
+        """A patch's side that nothing slid across can be anywhere until something did,
+        and what sticks says of friction only that it is not less: each is moved by ever
+        more, and its deviation is half of how far that goes without a loss of PROFILE
+        noise variances; infinite where it goes on. Of a friction held-out rows are
+        asked: a single fitted one may want more and more of it."""
         effect, std = end.effects[k], dict(end.std[k])
-        if effect.kind != "friction_patch":
+        p, asked = effect.parameters, np.ones(len(end.r), bool)
+        if effect.kind == "friction_patch":
+            moves = {name: MOVED for name in ("x_min", "x_max", "y_min", "y_max")}
+        elif effect.kind == "contact_friction":
+            moves = {"friction": tuple(x * p["friction"] for x in SHARES)}
+            if not self._train.all():
+                asked = ~self.train()
+        else:
             return std
         calm = self.nuisances().columns @ end.b
         limit = PROFILE * max(end.score, 1.0) ** 2
@@ -593,18 +604,16 @@ class ContactProblem(ContactDynamics, GapProblem):
             others = [*end.effects]
             others[k] = replace(effect, parameters=parameters)
             try:
-                return float(np.sum((self.residual(others) - calm) ** 2))
+                return float(np.sum((self.residual(others) - calm)[asked] ** 2))
             except ValueError:  # The patch is empty.
                 return np.inf
 
-        least = cost(effect.parameters)
-        for name in ("x_min", "x_max", "y_min", "y_max"):
-            now = effect.parameters[name]
+        least = cost(p)
+        for name, steps in moves.items():
             for sign in (-1.0, 1.0):
                 far = np.inf
-                for d in MOVED:
-                    moved = {**effect.parameters, name: now + sign * d}
-                    if cost(moved) - least > limit:
+                for d in steps:
+                    if cost({**p, name: p[name] + sign * d}) - least > limit:
                         far = d
                         break
                 std[name] = max(std.get(name, 0.0), 0.5 * far)
