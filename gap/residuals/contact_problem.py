@@ -590,7 +590,8 @@ class ContactProblem(ContactDynamics, GapProblem):
         effect, std = end.effects[k], dict(end.std[k])
         p, asked = effect.parameters, np.ones(len(end.r), bool)
         if effect.kind == "friction_patch":
-            moves = {name: MOVED for name in ("x_min", "x_max", "y_min", "y_max")}
+            sides = ("x_min", "x_max", "y_min", "y_max")
+            moves: dict[str, tuple[float, ...]] = dict.fromkeys(sides, MOVED)
         elif effect.kind == "contact_friction":
             moves = {"friction": tuple(x * p["friction"] for x in SHARES)}
             if not self._train.all():
