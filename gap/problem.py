@@ -277,6 +277,10 @@ class GapProblem(ABC):
         and how many times that; no name where it is not asked."""
         return "", 0.0
 
+    def hint(self, end: Fitted) -> str:
+        """Where to look for what no effect explains, as sentences; "": not known."""
+        return ""
+
     def reweigh(self, left: np.ndarray) -> bool:
         """Weighs rows by what is left now (m,), where that is clearly less than what
         models were taken to be off by. Returns: whether anything changed; then

@@ -88,8 +88,8 @@ def two_figures(start: float, end: float, gap: GapMeasure) -> str:
     if gap.before <= NO_GAP:
         return (
             " Simulated windows do not show this gap; in the equations of motion the "
-            f"error falls from {start:.3g} to {end:.3g} times the noise."
-            if end < start else ""
+            + (f"error falls from {start:.3g} to {end:.3g} times the noise."
+               if end < start else f"error is {start:.3g} times the noise.")
         )  # fmt: skip
 
     equations, simulated = (

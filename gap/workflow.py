@@ -31,6 +31,7 @@ from makebreak.gap.residuals.impacts import ImpactProblem, runs_against, without
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.residuals.objects import FlightProblem, RolloutProblem, TouchProblem
 from makebreak.gap.residuals.pressing import PressingProblem, presses
+from makebreak.gap.residuals.sap_lift import sap_lift
 from makebreak.gap.result import GapMeasure, GapResult, JudgedChannel
 from makebreak.gap.search.fit import fit_effects
 from makebreak.gap.search.select import Choice, Selection, select, without
@@ -165,7 +166,8 @@ def problem_for(
         return mechanism, [*touches, *finding, *mechanism.push_findings()]
     if any(joint.num_velocities() for joint in one_dof_joints(dynamics.plant)):
         try:
-            return ContactProblem(scene, recordings), []
+            contact = ContactProblem(scene, recordings)
+            return contact, sap_lift(contact)
         except ValueError:  # Not the whole motion is measured, or nothing touches.
             pass
         try:
@@ -262,6 +264,8 @@ def conclude(
         verdict = "not_judged"
         near += unjudged
     near += two_figures(start, problem.error(selection.end), final.gap)
+    if verdict == "gap_unnamed":
+        near += problem.hint(selection.end)
     effects = [named(c, problem.dynamics.plant) for c in selection.choices]
     fixed = [c.fixed for c in selection.choices]
     prior = nuisances.prior

@@ -13,12 +13,14 @@ from gap_benchmark.contact_cases import (
     Recipe,
     block,
     contact_cases,
+    height,
     hide,
     lying,
     table,
     write,
 )
 from gap_benchmark.contact_scenes import (
+    DRAKE_STEP,
     STUCK,
     WORLDS,
     MujocoWorld,
@@ -73,6 +75,48 @@ def test_there_are_enough_cases_and_their_seeds_are_apart():
 def test_a_block_slides_as_far_as_friction_says(world):
     far, _ = slid(world, 0.3)
     assert far == pytest.approx(0.4**2 / (2.0 * 0.3 * G), rel=0.02)
+
+
+@pytest.mark.parametrize("world", sorted(set(WORLDS) - {"mujoco"}))
+def test_what_slides_in_drake_is_lifted_as_its_dissipation_says(world):
+    """SAP takes the depth of what slides at v for larger by mu (tau + dt) v (Castro et
+    al., IEEE Trans. Robotics 38(6), 2022, section V), other solvers do not. A ball
+    that is soft as hydroelastic ones are carries (z^2 + 2 z mu (tau + dt) v) at a depth
+    of z."""
+    mu, v, seconds = 0.3, 0.4, 0.1
+    box = block(np.random.default_rng(0))
+    feet = tuple(replace(x, friction=mu) for x in box.shapes)
+    s = Setting((table(mu), replace(box, shapes=feet)))
+
+    def height_after(world: str, v: float, seconds: float) -> float:
+        simulated = WORLDS[world](s)
+        x = np.append(lying(s.things[1], s, (0.0, 0.0), 0.0), [v, *[0.0] * 5])
+        simulated.reset(np.zeros(0), {"block.block": x})
+        simulated.advance(nothing, seconds)
+        return float(simulated.pose("block.block")[2])
+
+    # How deep it lies at rest has nothing to do with what it dissipates.
+    rest = height_after("drake" if world == "drake_damped" else world, 0.0, 0.3)
+    depth = height(box) - rest
+    # The scene's dissipation, 2 s/m, at a depth of 0.5 mm is a tau of 1 ms.
+    tau = {"drake": 1e-3, "drake_damped": 0.2}.get(world)
+    a = 0.0 if tau is None else mu * (tau + DRAKE_STEP) * (v - mu * G * seconds)
+    lift = depth - (np.hypot(a, depth) - a)
+    # By a fifth, as it was faster a while (tau) ago, and by how it still sinks in.
+    assert height_after(world, v, seconds) - rest == pytest.approx(
+        lift, rel=0.2, abs=2e-5
+    )
+
+
+def test_friction_of_a_tip_in_drake_is_what_was_hidden():
+    """By Coulomb's law on the tool's and the object's own coefficients together."""
+    rng = np.random.default_rng(1)
+    s, _ = SCENES["push"](Recipe("push", "drake"), rng)
+    true, (effect,) = hide(s, ["tip_friction"], rng)
+    world = WORLDS["drake"](true).s
+    value = effect["parameters"]["friction"]
+    assert pair_friction(world.tool, world.free[0].shapes[0]) == pytest.approx(value)
+    assert world.things == s.things
 
 
 def test_a_block_that_lies_sinks_in_by_its_weight_and_stays():

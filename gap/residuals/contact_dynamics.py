@@ -386,7 +386,7 @@ class ContactDynamics(PermittedContacts):
         """(K, n) over what shapes and poses are known to, and their numbers: of each
         pair that lies, height and slopes; of each other one, the distance."""
         masks = dict(zip((s.key for s in self.slots), self._masks, strict=True))
-        shape = float(self.scene.tolerance.get("shape_m", SHAPES))
+        shape = self.shape_std()
         K = len(self.means.time)
         thinned = np.arange(K) % THIN == 0
         columns = []
@@ -401,7 +401,7 @@ class ContactDynamics(PermittedContacts):
             some = n > 0.0
             there = np.asarray(self._W @ some.astype(float)).ravel()
             good = (there > 0.999) & thinned
-            place, turn = self._pose_noise(pair)
+            _, turn = self._pose_noise(pair)
             stiffness = mine[0].stiffness
             mean = np.sum(mask * phi, axis=0) / np.maximum(n, 1.0)
             pressed = self._pressed.get(pair, np.zeros(K)) / stiffness
@@ -415,7 +415,7 @@ class ContactDynamics(PermittedContacts):
                 arm = float(np.sqrt(np.median(A[some].trace(axis1=1, axis2=2)) / 4.0))
                 # Each of several points carries its share.
                 h = self._W @ mean + pressed / np.maximum(self._W @ n, 1.0)
-                columns.append(np.where(good, h / np.hypot(shape, place), 0.0))
+                columns.append(np.where(good, h / self.distance_std(pair), 0.0))
                 std = np.sqrt((shape / max(arm, 1e-3)) ** 2 + turn**2 + 1e-6)
                 spread = np.asarray(self._W @ (n >= 3).astype(float)).ravel() > 0.999
                 for k in range(2):
@@ -429,8 +429,16 @@ class ContactDynamics(PermittedContacts):
                 if not self.shapes.anchored & set(pair) or free:
                     # Seen near each other, but known to touch by a force alone.
                     good = good & self._is_pressed(pair)
-                columns.append(np.where(good, d / np.hypot(shape, place), 0.0))
+                columns.append(np.where(good, d / self.distance_std(pair), 0.0))
         return -np.stack(columns, axis=1) if columns else np.zeros((K, 0))
+
+    def shape_std(self) -> float:
+        """[m] to which shapes are known."""
+        return float(self.scene.tolerance.get("shape_m", SHAPES))
+
+    def distance_std(self, pair: tuple[int, int]) -> float:
+        """[m] to which shapes and poses of a pair are known."""
+        return float(np.hypot(self.shape_std(), self._pose_noise(pair)[0]))
 
     def _is_pressed(self, pair: tuple[int, int]) -> np.ndarray:
         """(K,) whether two bodies press on each other, beyond what noise may feign."""

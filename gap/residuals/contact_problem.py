@@ -31,6 +31,11 @@ from makebreak.gap.residuals.contact_means import WrenchSensor
 from makebreak.gap.residuals.mechanism import link_changes
 from makebreak.gap.residuals.objects import unexplained_in_windows
 from makebreak.gap.residuals.permitted_contacts import Shift
+from makebreak.gap.residuals.widened_contacts import (
+    distances_off,
+    sentence,
+    widened_contacts,
+)
 from makebreak.gap.result import Where
 from makebreak.gap.search.fit import fit_effects
 from makebreak.gap.simulation.contact_windows import (
@@ -50,6 +55,7 @@ LATE = 0.25  # and its clock, in periods of its samples.
 TIMING = 2.5e-4  # Of what drives get [s].
 FELT = 0.05  # What a force sensor shows more, sampled amid a drive's ripple too.
 BEYOND = 3.0
+NO_GAP = 1.5  # Times the noise: less in the equations needs no hint.
 MISFIT = 1.15  # Less than so many times the sensors' noise is no misfit.
 ROBUST = 1.4826
 LEAST_MISFIT = 0.002  # Of the forces in a row: laws are no better than that.
@@ -62,6 +68,8 @@ PATCH_RUNS, PATCH_STARTS, PATCHES = 120, 8, 3
 # Of a patch's side: how far it is moved [m], and what that may add to the sum of
 # squares (neighbouring rows err together: four times what one row would count).
 MOVED, PROFILE = (5e-4, 1e-3, 2e-3, 4e-3, 8e-3, 0.016, 0.032, 0.064), 16.0
+# By what share of itself a friction is moved likewise.
+SHARES = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 0.9)
 LARGEST = 200.0  # An error beyond so many standard deviations counts as this.
 FEWEST_ROWS = 8  # Of a channel that is looked at by itself.
 SMALL = 0.1  # First trial of an effect on joints, of the efforts there.
@@ -607,11 +615,21 @@ class ContactProblem(ContactDynamics, GapProblem):
         return float(found.fun), friction + x[0], sides + x[1:]
 
     def widened(self, end: Fitted, k: int) -> dict[str, float]:
-        """A patch's side that nothing slid across can be anywhere until something did:
-        it is moved by ever more, and its deviation is half of how far that goes without
-        a loss of PROFILE noise variances; infinite where it goes on."""
+        """A patch's side that nothing slid across can be anywhere until something did,
+        and what sticks says of friction only that it is not less: each is moved by ever
+        more, and its deviation is half of how far that goes without a loss of PROFILE
+        noise variances; infinite where it goes on. Of a friction held-out rows are
+        asked: a single fitted one may want more and more of it."""
         effect, std = end.effects[k], dict(end.std[k])
-        if effect.kind != "friction_patch":
+        p, asked = effect.parameters, np.ones(len(end.r), bool)
+        if effect.kind == "friction_patch":
+            sides = ("x_min", "x_max", "y_min", "y_max")
+            moves: dict[str, tuple[float, ...]] = dict.fromkeys(sides, MOVED)
+        elif effect.kind == "contact_friction":
+            moves = {"friction": tuple(x * p["friction"] for x in SHARES)}
+            if not self._train.all():
+                asked = ~self.train()
+        else:
             return std
         calm = self.nuisances().columns @ end.b
         limit = PROFILE * max(end.score, 1.0) ** 2
@@ -620,18 +638,16 @@ class ContactProblem(ContactDynamics, GapProblem):
             others = [*end.effects]
             others[k] = replace(effect, parameters=parameters)
             try:
-                return float(np.sum((self.residual(others) - calm) ** 2))
+                return float(np.sum((self.residual(others) - calm)[asked] ** 2))
             except ValueError:  # The patch is empty.
                 return np.inf
 
-        least = cost(effect.parameters)
-        for name in ("x_min", "x_max", "y_min", "y_max"):
-            now = effect.parameters[name]
+        least = cost(p)
+        for name, steps in moves.items():
             for sign in (-1.0, 1.0):
                 far = np.inf
-                for d in MOVED:
-                    moved = {**effect.parameters, name: now + sign * d}
-                    if cost(moved) - least > limit:
+                for d in steps:
+                    if cost({**p, name: p[name] + sign * d}) - least > limit:
                         far = d
                         break
                 std[name] = max(std.get(name, 0.0), 0.5 * far)
@@ -666,6 +682,12 @@ class ContactProblem(ContactDynamics, GapProblem):
                 f"{time[block].max():.3g} s (episode {t.episode.number})", size
             )]  # fmt: skip
         return max(found, key=lambda each: each[1])
+
+    def hint(self, end: Fitted) -> str:
+        """Which pair would have to press otherwise, and how."""
+        now, found = widened_contacts(self, end, NO_GAP)
+        off = distances_off(self, end, self.plan.loud)
+        return "".join(off) + sentence(now, found)
 
     def _blocks_left(self, left: np.ndarray) -> list[tuple[float, int]]:
         """How loud rows (m,) are, and the number, of each block with enough of them."""

@@ -506,6 +506,10 @@ class PressingProblem(ContactProblem):
         )
         return self._nuisances
 
+    def hint(self, end: Fitted) -> str:
+        """None: where what is fixed stands is felt, and is not widened beside that."""
+        return ""
+
     def _carried(self, sensor: WrenchSensor) -> tuple[np.ndarray, float] | None:
         """The column of a kilogram beyond a sensor, and what may be there [kg]: the
         sensor feels what is outside less mass times acceleration, at the body's centre

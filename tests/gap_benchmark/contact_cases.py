@@ -46,7 +46,7 @@ TIE_SIZE = (("object_size", "plane_height"),)
 
 @dataclass(frozen=True)
 class Recipe:
-    """scene: a key of SCENES. world: mujoco, drake, ode. hide: names of hide().
+    """scene: a key of SCENES. world: a key of WORLDS, or ode. hide: names of hide().
     options: camera30, camera60, no_wrench, effort, slow. ties: of kinds."""
 
     scene: str

@@ -2,13 +2,14 @@
 
 A `Setting` is written as a scene (URDF, SDF, scene.yaml), and the true one, which is
 other by what is hidden, is run in MuJoCo, or in Drake with another law of contact
-(SAP, hydroelastic) and a finer step than the scene's. The robot's drives hold their
+(hydroelastic, SAP) and a finer step than the scene's. The robot's drives hold their
 commands from row to row; a camera sees the objects.
 """
 
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import mujoco
@@ -25,7 +26,8 @@ FELT_STEPS = 10  # Of MuJoCo's, which a force sensor takes the mean of.
 # 1 - i + i r, where r is how much easier the point is to move than it is taken for (at
 # the tip of a rod: 8).
 IMPEDANCE = 0.001
-MODULUS = 2e7  # [Pa] of compliant hydroelastic shapes.
+MODULUS = 2e7  # [Pa] of compliant hydroelastic shapes,
+DEPTH = 5e-4  # which press in by 0.3 to 0.6 mm [m].
 STUCK = 1e-3  # [m] over which what adheres holds on.
 
 
@@ -339,11 +341,28 @@ class MujocoWorld:
 # ----- As it truly is: Drake, with another law and a finer step
 
 
-class DrakeWorld:
-    """As MujocoWorld; hydroelastic contact, SAP. Friction of single pairs is that of
-    what the ground is made of; no patch, no adhesion, no other stiffness."""
+@dataclass(frozen=True)
+class DrakeLaw:
+    """hydroelastic: else point contact. approximation: of the discrete solver. SAP
+    ignores the scene's dissipation and takes relaxation times; as_in_scene: such that
+    they damp as much, else those that Drake has if nobody sets them (0.1 s for each
+    surface, 200 times as much)."""
 
-    def __init__(self, s: Setting):
+    hydroelastic: bool = True
+    approximation: str = "sap"
+    as_in_scene: bool = True
+
+    def relaxation(self, s: Setting) -> float | None:
+        """[s] of each of two surfaces; a pair has the sum. Hunt and Crossley's
+        k x (1 + d v) damps as k (x + tau v) with tau = d x, x the depth."""
+        return 0.5 * s.dissipation * DEPTH if self.as_in_scene else None
+
+
+class DrakeWorld:
+    """As MujocoWorld, by a DrakeLaw. Friction of single pairs is that of what the
+    ground, or the tool, is made of; no patch, no adhesion, no other stiffness."""
+
+    def __init__(self, s: Setting, law: DrakeLaw | None = None):
         from pydrake.multibody.parsing import Parser
         from pydrake.multibody.plant import (
             AddMultibodyPlant,
@@ -355,25 +374,25 @@ class DrakeWorld:
         if s.patch or s.adhesion or s.springs or s.drag or s.force:
             raise ValueError("not in Drake's world")
         self.s = s = _with_ground(s)
+        law = law or DrakeLaw()
+        surfaces = law.hydroelastic, law.relaxation(s)
         builder = DiagramBuilder()
         plant, _ = AddMultibodyPlant(
             MultibodyPlantConfig(
                 time_step=DRAKE_STEP, contact_model="hydroelastic_with_fallback",
-                discrete_contact_approximation="sap",
+                discrete_contact_approximation=law.approximation,
             ),
             builder,
         )  # fmt: skip
         self.plant, parser = plant, Parser(plant)
         parser.SetAutoRenaming(True)
         for t in s.things:
-            (model,) = parser.AddModelsFromString(to_sdf(t, s, True), "sdf")
+            (model,) = parser.AddModelsFromString(to_sdf(t, s, *surfaces), "sdf")
             if t.mass == 0.0:
                 self._weld(plant, model, t)
         self.robot = None
         if s.robot is not None:
-            (self.robot,) = parser.AddModelsFromString(
-                robot_urdf(s, hydroelastic=True), "urdf"
-            )
+            (self.robot,) = parser.AddModelsFromString(robot_urdf(s, *surfaces), "urdf")
             base = plant.GetFrameByName("base", self.robot)
             plant.WeldFrames(plant.world_frame(), base)
         plant.Finalize()
@@ -464,8 +483,15 @@ class DrakeWorld:
 
 
 def _with_ground(s: Setting) -> Setting:
-    """Friction of pairs as that of what is fixed, or of the tool."""
+    """Friction of pairs as that of what is fixed, or of the tool that meets the first
+    shape of a thing."""
     for (a, b), mu in s.friction.items():
+        if s.robot is not None and s.tool is not None and s.tool_body in (a, b):
+            free = [t for t in s.free if t.body in (a, b)]
+            if free:
+                theirs = free[0].shapes[0].friction
+                s = replace(s, tool=replace(s.tool, friction=_own(mu, theirs)))
+                continue
         for fixed, other in ((a, b), (b, a)):
             t = next((t for t in s.things if t.body == fixed and not t.mass), None)
             if t is None:
@@ -473,9 +499,7 @@ def _with_ground(s: Setting) -> Setting:
             # What lies on the ground are a thing's last shapes, its feet.
             feet = [u.shapes[-1].friction for u in s.things if u.body == other]
             low = feet[0] if feet else (s.tool.friction if s.tool else 0.0)
-            if mu >= 2.0 * low:
-                raise ValueError("no ground makes so much friction with it")
-            own = mu * low / (2.0 * low - mu)
+            own = _own(mu, low)
             shapes = tuple(replace(x, friction=own) for x in t.shapes)
             s = s.with_thing(t.name, shapes=shapes)
             break
@@ -484,13 +508,32 @@ def _with_ground(s: Setting) -> Setting:
     return replace(s, friction={})
 
 
-WORLDS = {"mujoco": MujocoWorld, "drake": DrakeWorld}
+def _own(mu: float, other: float) -> float:
+    """The friction of a surface that makes mu with another one (pair_friction)."""
+    if mu >= 2.0 * other:
+        raise ValueError("no surface makes so much friction with it")
+    return float(mu * other / (2.0 * other - mu))
+
+
+WORLDS: dict[str, Callable] = {
+    "mujoco": MujocoWorld,
+    "drake": DrakeWorld,
+    # Drake's own default solver, which keeps the scene's dissipation.
+    "drake_lagged": partial(DrakeWorld, law=DrakeLaw(approximation="lagged")),
+    "drake_point": partial(
+        DrakeWorld, law=DrakeLaw(hydroelastic=False, approximation="lagged")
+    ),
+    "drake_damped": partial(DrakeWorld, law=DrakeLaw(as_in_scene=False)),
+}
 
 
 # ----- As a user has it
 
 
-def _surface(friction: float, s: Setting, compliant=False, rigid=False) -> str:
+def _surface(
+    friction: float, s: Setting, compliant=False, rigid=False,
+    relaxation: float | None = None,
+) -> str:  # fmt: skip
     hydro = ""
     if rigid:
         hydro = "<drake:rigid_hydroelastic/>"
@@ -501,6 +544,8 @@ def _surface(friction: float, s: Setting, compliant=False, rigid=False) -> str:
         )
     if hydro:
         hydro += "<drake:mesh_resolution_hint>0.004</drake:mesh_resolution_hint>"
+    if relaxation is not None:
+        hydro += f"<drake:relaxation_time>{relaxation!r}</drake:relaxation_time>"
     return (
         f"<drake:proximity_properties>{hydro}<drake:mu_static>{float(friction)!r}"
         f"</drake:mu_static><drake:mu_dynamic>{float(friction)!r}</drake:mu_dynamic>"
@@ -526,12 +571,15 @@ def _geometry(x: Shape) -> tuple[str, np.ndarray]:
     return f"<box><size>{size}</size></box>", place
 
 
-def to_sdf(t: Thing, s: Setting, compliant: bool = False) -> str:
+def to_sdf(
+    t: Thing, s: Setting, compliant: bool = False, relaxation: float | None = None
+) -> str:
     shapes = ""
     for i, x in enumerate(t.shapes):
         geometry, place = _geometry(x)
         at = " ".join(repr(float(p)) for p in (*place, *x.turn))
-        surface = _surface(x.friction, s, compliant, compliant and t.mass == 0.0)
+        rigid = compliant and t.mass == 0.0
+        surface = _surface(x.friction, s, compliant, rigid, relaxation)
         shapes += (
             f'<collision name="shape{i}"><pose>{at}</pose><geometry>{geometry}'
             f"</geometry>{surface}</collision>"
@@ -552,7 +600,9 @@ def to_sdf(t: Thing, s: Setting, compliant: bool = False) -> str:
     )
 
 
-def robot_urdf(s: Setting, hydroelastic: bool = False) -> str:
+def robot_urdf(
+    s: Setting, hydroelastic: bool = False, relaxation: float | None = None
+) -> str:
     """The robot's URDF, its tool a shape of the last link."""
     assert s.robot is not None
     text = to_urdf(s.robot)
@@ -572,6 +622,8 @@ def robot_urdf(s: Setting, hydroelastic: bool = False) -> str:
         properties += (
             '<drake:rigid_hydroelastic/><drake:mesh_resolution_hint value="0.004"/>'
         )
+    if relaxation is not None:
+        properties += f'<drake:relaxation_time value="{relaxation!r}"/>'
     shape = (
         f'<collision name="tool"><origin xyz="{_text(x.place)}"/><geometry>'
         f"{geometry}</geometry><drake:proximity_properties>{properties}"
