@@ -249,6 +249,14 @@ def conclude(
     else:
         final, data = Outcome(_nothing(start, end)), "fitted"
     final = replace(final, gap=replace(final.gap, data=data))
+    if verdict == "no_gap" and problem.plan.simulation_agrees:
+        if final.gap.before > UNNAMED:
+            verdict = "gap_unnamed"
+            differs = (
+                " Nothing is left beyond noise in what was decided on, but the data "
+                f"held out for the report are simulated {final.gap.before:.2g} times "
+                "their noise off."
+            )
     if verdict in ("gap_named", "ambiguous") and not _borne_out(final.gap):
         verdict = "gap_unnamed"
         near += (

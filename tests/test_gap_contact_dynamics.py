@@ -460,10 +460,42 @@ def test_a_tool_that_leans_on_something_with_little_is_felt():
     track = SimpleNamespace(
         recording=0, time=time, episode=SimpleNamespace(rows=slice(0, 400))
     )
-    model = SimpleNamespace(tracks=[track], recordings=[log], _offset=[0, 400])
-    size = ContactDynamics._force_size(model, "tip.tip")
+    own = np.zeros(400)
+    model = SimpleNamespace(
+        tracks=[track], recordings=[log], _offset=[0, 400],
+        _own_force=lambda sensor: own,
+    )  # fmt: skip
+    sensor = SimpleNamespace(place="tip.tip")
+    size = ContactDynamics._force_size(model, sensor)
     assert size[:190].max() == 0.0
     np.testing.assert_allclose(size[210:390], 0.4, atol=0.15)  # Five deviations.
+    # What the tool's own motion makes in a sensor in its mount is no touch.
+    own[200:300] = 0.5
+    size = ContactDynamics._force_size(model, sensor)
+    assert size[210:295].max() == 0.0 and size[305:390].min() > 0.2
+
+
+def test_a_touch_that_is_lost_for_a_moment_goes_on():
+    time = np.arange(200) / 200.0
+    felt = np.ones(200, bool)
+    felt[20:32] = False  # 60 ms,
+    felt[80:101] = False  # and 110 ms, of half a test function of 0.2 s,
+    felt[150:] = False  # and for good: these are losses.
+    track = SimpleNamespace(time=time)
+    model = SimpleNamespace(tracks=[track], _offset=[0, 200], half=0.2)
+    found = ContactDynamics._without_short_losses(model, felt)
+    expected = felt.copy()
+    expected[20:32] = True
+    np.testing.assert_array_equal(found, expected)
+    # One episode's last touch is not held on to in the next one.
+    two = SimpleNamespace(
+        tracks=[SimpleNamespace(time=time[:100])] * 2, _offset=[0, 100, 200], half=0.2
+    )
+    felt = np.ones(200, bool)
+    felt[95:105] = False
+    np.testing.assert_array_equal(
+        ContactDynamics._without_short_losses(two, felt), felt
+    )
 
 
 def test_where_a_force_may_be_felt_it_is_not_known_whether_they_touch():
