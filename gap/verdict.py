@@ -61,6 +61,17 @@ def after_simulation(
     return verdict
 
 
+def not_borne_out(verdict: str, gap: GapMeasure) -> str:
+    """Why an agreement does not stand, in words; empty where it does. gap: of windows
+    that nothing was decided on."""
+    if verdict != "no_gap" or not gap.before > UNNAMED:
+        return ""
+    return (
+        " Nothing is left beyond noise in what was decided on, but what was held out "
+        f"for the report is simulated {gap.before:.2g} times its noise off."
+    )
+
+
 def withdrawn_if_weak(
     selection: Selection, verdict: str, closed: float
 ) -> tuple[Selection, str]:

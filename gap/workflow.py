@@ -44,6 +44,7 @@ from makebreak.gap.verdict import (
     UNNAMED,
     after_simulation,
     named,
+    not_borne_out,
     says,
     two_figures,
     verdict_of,
@@ -249,14 +250,8 @@ def conclude(
     else:
         final, data = Outcome(_nothing(start, end)), "fitted"
     final = replace(final, gap=replace(final.gap, data=data))
-    if verdict == "no_gap" and problem.plan.simulation_agrees:
-        if final.gap.before > UNNAMED:
-            verdict = "gap_unnamed"
-            differs = (
-                " Nothing is left beyond noise in what was decided on, but the data "
-                f"held out for the report are simulated {final.gap.before:.2g} times "
-                "their noise off."
-            )
+    if problem.plan.simulation_agrees and (why := not_borne_out(verdict, final.gap)):
+        verdict, differs = "gap_unnamed", why
     if verdict in ("gap_named", "ambiguous") and not _borne_out(final.gap):
         verdict = "gap_unnamed"
         near += (

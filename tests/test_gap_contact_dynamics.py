@@ -8,6 +8,10 @@ import pytest
 from gap_benchmark import contact_cases, contact_scenes, push_world
 from gap_benchmark.contact_scenes import Sensing, record, write_scene
 from gap_benchmark.push_world import BLOCK, TABLE
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import FixedOffsetFrame
 from scipy.optimize import least_squares
 from scipy.sparse import eye_array
 from scipy.spatial.transform import Rotation
@@ -473,6 +477,66 @@ def test_a_tool_that_leans_on_something_with_little_is_felt():
     own[200:300] = 0.5
     size = ContactDynamics._force_size(model, sensor)
     assert size[210:295].max() == 0.0 and size[305:390].min() > 0.2
+
+
+ARM_WITH_TOOL = """<robot name="arm">
+<link name="one"><inertial><mass value="1.0"/><origin xyz="0.1 0 0"/>
+<inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="two"><inertial><mass value="0.7"/><origin xyz="0.05 0 0.1"/>
+<inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="tool"><inertial><mass value="0.3"/><origin xyz="0.02 0.03 0.06"/>
+<inertia ixx="1e-3" iyy="2e-3" izz="1.5e-3" ixy="2e-4" ixz="-1e-4" iyz="0"/></inertial>
+</link><link name="world"/>
+<joint name="j1" type="revolute"><parent link="world"/><child link="one"/>
+<axis xyz="0 0 1"/></joint>
+<joint name="j2" type="revolute"><parent link="one"/><child link="two"/>
+<origin xyz="0.3 0 0"/><axis xyz="0 1 0"/></joint>
+<joint name="mount" type="fixed"><parent link="two"/><child link="tool"/>
+<origin xyz="0.1 0 0.2" rpy="0.3 0.2 0.1"/></joint></robot>"""
+
+
+def test_what_a_tool_s_motion_adds_to_its_sensor_is_what_its_mount_carries():
+    """Against Drake's reaction in the mount, with the weight taken off."""
+    plant = MultibodyPlant(0.0)
+    Parser(plant).AddModelsFromString(ARM_WITH_TOOL, "urdf")
+    tool, mount = plant.GetBodyByName("tool"), plant.GetJointByName("mount")
+    p_tip = np.array([0.05, -0.02, 0.15])
+    tip = plant.AddFrame(
+        FixedOffsetFrame("point", tool.body_frame(), RigidTransform(p_tip))
+    )
+    plant.Finalize()
+    context = plant.CreateDefaultContext()
+    rng = np.random.default_rng(3)
+    q, v = rng.normal(size=(4, 2)), 3.0 * rng.normal(size=(4, 2))
+    acceleration, expected = [], []
+    for k in range(4):
+        plant.SetPositions(context, q[k])
+        plant.SetVelocities(context, v[k])
+        dx = plant.EvalTimeDerivatives(context)
+        acceleration.append(dx.get_generalized_velocity().CopyToVector())
+        felt = plant.get_reaction_forces_output_port().Eval(context)[mount.index()]
+        X = mount.frame_on_child().CalcPoseInWorld(context)
+        R, p = X.rotation().matrix(), X.translation()
+        weight = tool.default_mass() * plant.gravity_field().gravity_vector()
+        com = tool.EvalPoseInWorld(context) @ tool.default_com()
+        at = tip.CalcPoseInWorld(context).translation()
+        force = -R @ felt.translational() - weight
+        moment = -R @ felt.rotational() - np.cross(p - at, R @ felt.translational())
+        expected.append([*force, *(moment - np.cross(com - at, weight))])
+    means = SimpleNamespace(
+        time=np.arange(4), centre=np.arange(4), acceleration=np.array(acceleration)
+    )
+    model = SimpleNamespace(plant=plant, means=means, _q=q, _v=v)
+    sensor = SimpleNamespace(frame=tip, names=("fx", "fy", "fz", "tx", "ty", "tz"))
+    found = ContactProblem._inertia(model, sensor)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert np.abs(found[:, 3:]).max() > 0.05
+    of_rows = SimpleNamespace(plant=plant, _q=q, _v=v, _vd=np.array(acceleration))
+    np.testing.assert_allclose(
+        ContactProblem._own_force(of_rows, sensor),
+        np.linalg.norm(found[:, :3], axis=1),
+        atol=1e-9,
+    )
 
 
 def test_a_touch_that_is_lost_for_a_moment_goes_on():

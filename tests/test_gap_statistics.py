@@ -47,7 +47,12 @@ from makebreak.gap.search.select import (
     select,
 )
 from makebreak.gap.search.trust import gauss_newton, ridges, steady
-from makebreak.gap.verdict import after_simulation, verdict_of, withdrawn_if_weak
+from makebreak.gap.verdict import (
+    after_simulation,
+    not_borne_out,
+    verdict_of,
+    withdrawn_if_weak,
+)
 from makebreak.gap.workflow import kept_by_simulation
 from makebreak.models.effects.kind import Effect
 from makebreak.systems.numerics.smoother import smooth
@@ -799,6 +804,17 @@ def test_a_refit_along_what_fitted_rows_do_not_tell_is_not_taken(
 
 def windows_leave(before: float, after: float) -> GapMeasure:
     return GapMeasure(before, after, 1.0, 0.3)
+
+
+@pytest.mark.parametrize(
+    "verdict, before, said",
+    [("no_gap", 2.1, "2.1 times"), ("no_gap", 1.9, ""), ("gap_named", 9.0, "")],
+)
+def test_an_agreement_that_simulation_does_not_show_at_the_end_is_taken_back(
+    verdict, before, said
+):
+    words = not_borne_out(verdict, windows_leave(before, before))
+    assert (said in words) and bool(words) == bool(said)
 
 
 @pytest.mark.parametrize(
