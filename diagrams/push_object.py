@@ -633,6 +633,11 @@ def make_push_object(
         ),
     )
     if config.gentle:
+        if config.touch.most > config.reference.push_speed:
+            raise ValueError(
+                f"touch.most is {config.touch.most}, expected at most "
+                f"reference.push_speed, {config.reference.push_speed} m/s"
+            )
         touch = builder.AddNamedSystem(
             "touch_down",
             TouchDown(config.touch, shape, ESTIMATE, OFFSET["touch"]),

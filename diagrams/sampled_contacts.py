@@ -75,6 +75,7 @@ class SampledContactsConfig:
             SamplingConfig(
                 height=0.038,
                 reach=[0.35, 0.78],
+                out_of_reach=0.0,
                 travel=5.0,
                 hysteresis=[0.3, 1.0],
                 push=0.5,

@@ -277,7 +277,7 @@ def test_a_tip_that_pushes_goes_no_faster_than_it_may():
 @pytest.mark.parametrize(
     ("touch", "setting", "felt", "speed"),
     [
-        (0.05, np.inf, 0.0, 0.05), (0.05, 0.08, 0.0, 0.05), (0.2, 0.08, 0.0, 0.08),
+        (0.05, np.inf, 0.0, 0.05), (0.05, 0.08, 0.0, 0.05), (0.09, 0.08, 0.0, 0.09),
         (np.nan, 0.08, 0.0, 0.08), (0.05, np.inf, 5.0, 0.1), (-1.0, np.inf, 0.0, 0.0),
     ],
 )  # fmt: skip
@@ -292,6 +292,11 @@ def test_a_learned_speed_of_touching_holds_until_something_is_felt(
 
 
 def test_what_cannot_be_followed_is_refused_by_name():
+    with pytest.raises(ValueError, match="touch_speed is 0.3, expected at most push"):
+        ArmReference(
+            ArmReferenceConfig(touch_speed=0.3, push_speed=0.2), 1, np.zeros(3),
+            one_force_lcs(1.0),
+        )  # fmt: skip
     with pytest.raises(ValueError, match="nearest is -0.1, expected at least 0"):
         ArmReference(
             ArmReferenceConfig(nearest=-0.1), 1, np.zeros(3), one_force_lcs(1.0)

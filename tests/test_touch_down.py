@@ -84,9 +84,9 @@ def test_what_a_travelling_tip_feels_is_no_touch():
     for _ in range(100):
         state = next_touch(C, state, DT, 0.01, 0.3, 20.0, False)
     assert state.impacts == () and state.mean == 0.0 and state.speed == C.first
-    # Nor is a push that goes on: one touch, however long.
-    for _ in range(100):
-        state = next_touch(C, state, DT, 0.0, 0.1, 5.0, True)
+    # And a push that goes on is one touch, however long.
+    for force in (0.0,) * 20 + (5.0,) * 100:
+        state = next_touch(C, state, DT, 0.0, 0.1, force, True)
     assert len(state.impacts) == 1
 
 
@@ -101,6 +101,30 @@ def test_only_a_touch_after_a_while_without_one_is_another():
             for _ in range(40):
                 found = next_touch(C, found, DT, 0.0, 0.0, 4.0, True)
         assert len(found.impacts) == expected, name
+
+
+@pytest.mark.parametrize("elsewhere", [0.06, -0.03])
+def test_a_touch_of_something_else_teaches_nothing(elsewhere):
+    """As of the table: far from where the object's side is anticipated."""
+    states, _ = touches(6, 0.001, 160.0)
+    state = states[-1]
+    for force in (0.0,) * 40 + (10.0,) * 40:
+        state = next_touch(C, state, DT, elsewhere, 0.05, force, True)
+    assert state.mean == states[-1].mean and state.impacts == states[-1].impacts
+    assert state.variance > states[-1].variance  # It is less sure.
+
+
+def test_a_push_that_was_interrupted_is_no_other_touch():
+    state = first_state(C)
+    for _ in range(40):
+        state = next_touch(C, state, DT, 0.0, 0.05, 0.0, True)
+    for pushing in (True,) * 40 + (False,) * 40 + (True,) * 40:  # It presses all along.
+        state = next_touch(C, state, DT, 0.0, 0.0, 5.0, pushing)
+    assert len(state.impacts) == 1
+    # Leaning on it from rest is no impact.
+    for force in (0.0,) * 40 + (5.0,) * 40:
+        state = next_touch(C, state, DT, 0.0, 1e-3, force, True)
+    assert len(state.impacts) == 1
 
 
 SQUARE = ObjectShape(
@@ -147,13 +171,16 @@ def test_the_system_measures_from_the_tips_side_to_the_objects():
 def test_bad_input_leaves_all_as_it_is():
     for change in (
         dict(x=np.full(N_X, np.nan)),
-        dict(valid=0.0),
         dict(force=[np.nan, 0.0, 3.0]),
     ):
         settings = dict(x=state_at(0.002), force=[3.0, 0.0, 0.0]) | change
         (speed,), belief = system_outputs(**settings)
         assert speed == C.first
         np.testing.assert_array_equal(belief, [0.0, C.std_first])
+    # Of what is not seen nothing is learned.
+    for valid, learned in ((0.0, False), (1.0, True)):
+        _, belief = system_outputs(state_at(0.002), valid=valid, force=[3.0, 0.0, 0.0])
+        assert (belief[0] != 0.0) == learned
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,7 @@ class ArmReference(LeafSystem):
              status (1,) of C3; lcs (abstract), the one-step LCS that made them;
              optional feel (1,) of RollingTask, and then tip_force (3,) on the tip, as
              the arm feels it [N], which a touch_speed needs, too; optional touch_speed
-             (1,) [m/s], of TouchDown: takes the setting's place where it is less.
+             (1,) [m/s], of TouchDown: takes the setting's place, if it is a number.
     Outputs: x_desired (19,) = [p, quaternion, v, w, a, alpha], position and its
              derivatives only (the quaternion is the identity); wrench (6,) force first;
              command (25,), one after the other: for who asks for both each millisecond.
@@ -88,6 +88,11 @@ class ArmReference(LeafSystem):
                 raise ValueError(
                     f"{name} is {getattr(config, name)}, expected more than 0"
                 )
+        if config.push_speed < config.touch_speed < np.inf:
+            raise ValueError(
+                f"touch_speed is {config.touch_speed}, expected at most push_speed, "
+                f"{config.push_speed} m/s"
+            )
         if not 0.0 <= config.nearest < np.inf:
             raise ValueError(f"nearest is {config.nearest}, expected at least 0 m")
         self._config, self._period = config, config.period_sec
@@ -152,8 +157,8 @@ class ArmReference(LeafSystem):
             p, v, force = no_nearer(p, v, force, c.nearest)
             fastest, touch_speed = c.push_speed, c.touch_speed
             if self._touch_speed.HasValue(context):
-                # One that is no number changes nothing.
-                touch_speed = min(touch_speed, self._touch_speed.Eval(context)[0])
+                learned = self._touch_speed.Eval(context)[0]
+                touch_speed = touch_speed if np.isnan(learned) else learned
             if touch_speed < fastest:
                 felt = np.linalg.norm(self._tip_force.Eval(context))
                 if not felt >= c.touch_force:

@@ -37,7 +37,8 @@ class TouchDown(LeafSystem):
              as it feels nothing; belief (2,): mean and standard deviation of the
              distance to the object's side at which a touch is felt [m].
 
-    Where an input is not finite, or the object is not seen, all stays as it is.
+    Where an input is not finite all stays as it is; of an object that is not seen
+    nothing is learned.
 
     Args: config; shape of the object and the tip; period_sec, offset_sec.
     Raises: ValueError for a setting out of range, by name.
@@ -72,7 +73,7 @@ class TouchDown(LeafSystem):
             np.asarray(port.Eval(context))
             for port in (self._x, self._valid, self._phase, self._tip_force)
         )
-        if not (is_finite(x) and is_finite(force) and valid[0] > 0.5):
+        if not (is_finite(x) and is_finite(force)):
             return
         try:
             outline = outline_of(self._shape.parts, rotation_of(x[Q_BALL]), x[P_BALL])
@@ -87,7 +88,7 @@ class TouchDown(LeafSystem):
             distance,
             float(np.linalg.norm(x[V_TIP])),
             float(np.linalg.norm(force)),
-            phase[0] == CONTACT,
+            phase[0] == CONTACT and valid[0] > 0.5,
         )
         state.get_mutable_abstract_state(int(self._touch)).set_value(touch)
         discrete = state.get_mutable_discrete_state()

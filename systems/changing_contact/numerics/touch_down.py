@@ -27,6 +27,9 @@ from makebreak.systems.changing_contact.numerics.velocity_profile import unit_st
 KEPT = 5  # Impacts that are remembered.
 # So late is a touch felt, at the most: by then the tip is slower than it came [s].
 LATE_SEC = 0.03
+# A touch that is felt so many deviations from where it is anticipated is of something
+# else (the table); then where the side is, is known less well.
+GATE = 4.0
 
 
 @dataclass
@@ -92,24 +95,29 @@ def next_touch(
     if s.since_sec <= c.peak_sec:
         s = replace(s, peak=max(s.peak, force))
     elif s.peak > 0.0:  # The touch is over: v_a of the next one.
-        impacts = (*s.impacts, (s.at, s.peak))[-KEPT:]
+        slow = s.at < 0.5 * c.least  # It leaned on it; that was no impact.
+        impacts = s.impacts if slow else (*s.impacts, (s.at, s.peak))[-KEPT:]
         wanted = speed_by_regression(impacts, c.force_desired)
         if wanted is not None:
             wanted = capped(wanted, s.speed, c.growth, c.least, c.most)
             s = replace(s, speed=wanted)
         s = replace(s, impacts=impacts, peak=0.0)
-    felt = pushing and force >= c.touch_force
-    if felt and s.apart_sec >= c.apart_sec:
+    felt = force >= c.touch_force
+    if felt and pushing and s.apart_sec >= c.apart_sec:
         predicted = s.variance + c.std_drift**2
-        gain = predicted / (predicted + c.std_measured**2)
-        s = replace(
-            s,
-            mean=s.mean + gain * (distance - s.mean),
-            variance=(1.0 - gain) * predicted,
-            since_sec=0.0,
-            at=max(s.recent, default=speed),
-            peak=force,
-        )
+        spread = np.sqrt(predicted + c.std_measured**2)
+        gain = predicted / spread**2
+        if abs(distance - s.mean) > GATE * spread:
+            s = replace(s, variance=min(2.0 * predicted, c.std_first**2))
+        else:
+            s = replace(
+                s,
+                mean=s.mean + gain * (distance - s.mean),
+                variance=(1.0 - gain) * predicted,
+                since_sec=0.0,
+                at=max(s.recent, default=speed),
+                peak=force,
+            )
     apart = 0.0 if felt else s.apart_sec + dt
     recent = (*s.recent, speed)[-max(1, round(LATE_SEC / dt)) :]
     return replace(s, apart_sec=apart, recent=recent)

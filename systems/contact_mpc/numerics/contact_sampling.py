@@ -616,7 +616,8 @@ def sample_round(
     elif not going or not in_reach(present[None], c.reach, c.bearing)[0]:
         cost[0] = NO_PLAN
     cost = cost + c.travel * np.array(way)
-    cost = cost + c.out_of_reach * out_of_reach(plans, c.reach, c.inwards)
+    # Where the tip is now no plan can change.
+    cost = cost + c.out_of_reach * out_of_reach(plans[:, 1:], c.reach, c.inwards)
     progressed = not in_contact or error < m.error - PROGRESS
     if progressed or not np.isfinite(m.error):
         m = replace(m, error=error, since_sec=t)
