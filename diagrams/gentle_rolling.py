@@ -35,7 +35,12 @@ from makebreak.diagrams.ball_rolling import (
     connect_reference,
 )
 from makebreak.diagrams.camera import CameraConfig
-from makebreak.diagrams.station import ARM, TIP_FRAME, make_control_plant
+from makebreak.diagrams.station import (
+    ARM,
+    TIP_FRAME,
+    from_wrist,
+    make_control_plant,
+)
 from makebreak.diagrams.wiring import timed
 from makebreak.systems.arm.impedance_controller import HybridConfig, serial_chain_of
 from makebreak.systems.arm.tip_state import TipState
@@ -299,15 +304,6 @@ def _to_freeze(config: GentleRollingConfig) -> list[str]:
     return out
 
 
-def _from_wrist(arm) -> np.ndarray:
-    """(2,) from the wrist to the tip, seen from above [m]: the tool's orientation is
-    held, so that it stays what it is in the arm's initial posture."""
-    context = arm.CreateDefaultContext()
-    wrist = arm.GetJointByName(f"{ARM}_joint7").child_body().EvalPoseInWorld(context)
-    tip = arm.GetFrameByName(TIP_FRAME).CalcPoseInWorld(context)
-    return (tip.translation() - wrist.translation())[:2]
-
-
 def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) -> None:
     """The second paper's systems, and what leads from both planners to the arm."""
     touch = config.touch
@@ -325,7 +321,7 @@ def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) ->
         model.ball_radius,
         model.tip_radius,
         touch.shaper.acceleration_max,
-        _from_wrist(arm),
+        from_wrist(arm),
         CONTROL,
         MOTION_OFFSET,
     )

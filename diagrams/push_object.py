@@ -35,10 +35,16 @@ from makebreak.diagrams.station import (
     TIP_FRAME,
     TOOL,
     StationConfig,
+    from_wrist,
     make_control_plant,
     make_station,
 )
-from makebreak.diagrams.wiring import add_legend, check_own, connect_command
+from makebreak.diagrams.wiring import (
+    add_legend,
+    check_own,
+    connect_command,
+    refuse_changed,
+)
 from makebreak.models.effects.kind import Effect
 from makebreak.models.model_files import MODELS
 from makebreak.models.pushed_object import (
@@ -84,7 +90,10 @@ from makebreak.systems.contact_mpc.numerics.c3_mpc import (
     C3Weights,
     OrientationWeight,
 )
-from makebreak.systems.contact_mpc.numerics.contact_sampling import ObjectShape
+from makebreak.systems.contact_mpc.numerics.contact_sampling import (
+    ObjectShape,
+    SamplingConfig,
+)
 from makebreak.systems.contact_mpc.push_goals import (
     PushGoals,
     PushGoalsConfig,
@@ -203,7 +212,9 @@ class PushObjectConfig:
     pose: PoseSensorConfig = field(default_factory=PoseSensorConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
     tracker: PoseTrackerConfig = field(default_factory=PoseTrackerConfig)
-    sampler: ContactSamplerConfig = field(default_factory=ContactSamplerConfig)
+    sampler: ContactSamplerConfig = field(
+        default_factory=lambda: ContactSamplerConfig(SamplingConfig(reach=[0.32, 0.78]))
+    )
     task: PushTaskConfig = field(default_factory=PushTaskConfig)
     planner: PushPlannerConfig = field(default_factory=PushPlannerConfig)
     learning: PushLearnerConfig = field(default_factory=PushLearnerConfig)
@@ -474,7 +485,7 @@ _OWN = {
     "goals": ("period_sec", "offset_sec"),
     "task": ("height", "clearance", "period_sec", "offset_sec"),
     "sampler": ("angle_radius", "residual_dt_sec", "offset_sec"),
-    "reference": ("height", "nearest", "period_sec", "offset_sec"),
+    "reference": ("height", "nearest", "wrist", "period_sec", "offset_sec"),
     "impedance": ("period_sec", "offset_sec"),
     "pose": ("height", "rolling_axis", "offset_sec"),
     "tracker": ("z", "hue", "rolling_axis", "period_sec", "offset_sec"),
@@ -494,6 +505,7 @@ def make_push_object(
     ContactSampler, at 80 Hz. A diagram is done when the number in goal_log is n_goals.
     """
     check_own(config, _OWN)
+    refuse_changed("sampler.sampling", config.sampler.sampling, ("wrist",))
     builder = DiagramBuilder()
     spec, friction = believed_object(config)
     station = builder.AddNamedSystem(
@@ -568,7 +580,8 @@ def make_push_object(
     rolls = bool(rolling_axis(spec))
     push = replace(config.task.push, follow=config.task.push.follow or rolls)
     sampling = config.sampler.sampling
-    sampling = replace(sampling, follow=sampling.follow or rolls)
+    wrist = from_wrist(arm).tolist()
+    sampling = replace(sampling, follow=sampling.follow or rolls, wrist=wrist)
     if not tip.tip_radius < sampling.height < top:
         raise ValueError(
             f"sampler.sampling.height is {sampling.height:g}, expected above the tip's "
@@ -614,6 +627,7 @@ def make_push_object(
                 config.reference,
                 height=sampling.height,
                 nearest=max(sampling.reach[0] - sampling.inwards, 0.0),
+                wrist=wrist,
                 period_sec=CONTROL,
                 offset_sec=OFFSET["reference"],
             ),

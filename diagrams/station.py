@@ -372,3 +372,12 @@ def make_control_plant(
         friction_zones=[],
     )
     return load_scene(part, DiagramBuilder()).plant
+
+
+def from_wrist(arm: MultibodyPlant) -> np.ndarray:
+    """(2,) from the wrist to the tip, seen from above [m]: the tool's orientation is
+    held, so that it stays what it is in the arm's initial posture."""
+    context = arm.CreateDefaultContext()
+    wrist = arm.GetJointByName(f"{ARM}_joint7").child_body().EvalPoseInWorld(context)
+    tip = arm.GetFrameByName(TIP_FRAME).CalcPoseInWorld(context)
+    return (tip.translation() - wrist.translation())[:2]

@@ -157,6 +157,10 @@ def test_a_tip_that_may_come_no_nearer_pushes_only_outwards_and_along():
     np.testing.assert_allclose(p, [0.4, 0.0, 0.02])
     np.testing.assert_allclose(v, np.ones(3))
     np.testing.assert_allclose(force, [0.0, 2.0, 1.0])
+    # What counts is where the wrist is: here straight below the tip's x, 0.1 m aside.
+    p, v, _ = no_nearer(np.array([0.1, 0.4, 0.0]), -np.ones(3), force, 0.35, [0.1, 0.1])
+    np.testing.assert_allclose(p, [0.1, 0.45, 0.0])
+    np.testing.assert_allclose(v, [-1.0, 0.0, -1.0])
 
 
 def test_half_a_period_later_the_reference_is_half_way():

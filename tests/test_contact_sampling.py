@@ -488,6 +488,12 @@ def test_a_plan_that_leads_the_tip_out_of_reach_costs_more(planner):
     plans[:, :, 1] = [[0.41, 0.45], [0.39, 0.38], [0.5, 0.81], [0.4, 0.78]]
     expected = [0.0, 0.01**2 + 0.02**2, 0.03**2, 0.0]
     np.testing.assert_allclose(out_of_reach(plans, [0.41, 0.78], 0.01), expected)
+    # With the wrist 0.1 m nearer along y, it is where the tips were; they are farther.
+    plans[:, :, 1] += 0.1
+    expected = [0.0, 0.01**2 + 0.02**2, 0.13**2, 0.1**2]
+    found = out_of_reach(plans, [0.41, 0.78], 0.01, [0.0, 0.1])
+    np.testing.assert_allclose(found, expected)
+    plans[:, :, 1] -= 0.1
     model, problem, shape = planner
     # A tip on the far side, which has to push the object towards the arm.
     x = state([0.41, 0.0, 0.024], (0.31, 0.0, 0.0))
@@ -958,3 +964,10 @@ def test_a_setting_out_of_range_is_named(planner, change, message):
 def test_a_place_is_in_reach_within_two_radii_and_a_bearing(x, y, inside):
     found = in_reach(np.array([[0.5, 0.1], [x, y]]), [0.40, 0.75], 1.0)
     assert found.tolist() == [True, inside]
+
+
+def test_it_is_the_wrist_that_may_not_be_too_near():
+    wrist = [0.065, 0.11]
+    near, aside, beyond = [0.38, 0.12], [0.38, -0.1], [0.1, 0.79]
+    found = in_reach(np.array([near, aside, beyond]), [0.32, 0.78], 2.0, wrist)
+    np.testing.assert_array_equal(found, [False, True, False])

@@ -26,6 +26,7 @@ from makebreak.models.effects.kind import Effect
 from makebreak.models.pushed_object import PushedObject
 from makebreak.models.scene import read_scene
 from makebreak.models.scene_file import write_scene
+from makebreak.systems.changing_contact.touch_down import TouchDownConfig
 from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL, Q_BALL
 from makebreak.systems.contact_mpc.numerics.push_task import (
     CONTACT,
@@ -450,3 +451,33 @@ def test_the_arm_goes_to_the_object_and_moves_it_towards_its_goal():
     assert (load[1] == 0.0).all()
     tau = log("torque_log").data()
     assert np.isfinite(tau).all() and np.abs(np.diff(tau, axis=1)).max() < 87.0
+    # Sampler and reference know where the wrist is, and how near it may come.
+    reference, sampler = (
+        diagram.GetSubsystemByName(name)._config
+        for name in ("arm_reference", "contact_sampler")
+    )
+    assert np.hypot(*reference.wrist) > 0.1
+    assert reference.wrist == sampler.sampling.wrist
+    assert reference.nearest == pytest.approx(sampler.sampling.reach[0] - 0.01)
+
+
+@pytest.mark.parametrize("gentle", [False, True])
+def test_a_gentle_touch_is_wired_and_its_speed_is_checked(gentle):
+    diagram = make_push_object(PushObjectConfig(gentle=gentle))
+    assert diagram.HasSubsystemNamed("touch_down") == gentle
+    reference = diagram.GetSubsystemByName("arm_reference")
+    port = reference.GetInputPort("touch_speed")
+    context = diagram.CreateDefaultContext()
+    assert port.HasValue(reference.GetMyContextFromRoot(context)) == gentle
+    if gentle:
+        with pytest.raises(ValueError, match="touch.most is 0.3, expected at most"):
+            make_push_object(
+                PushObjectConfig(gentle=True, touch=TouchDownConfig(most=0.3))
+            )
+
+
+def test_the_wrist_is_the_arm_s_and_no_setting():
+    config = PushObjectConfig()
+    config.sampler.sampling.wrist = [0.1, 0.0]
+    with pytest.raises(ValueError, match="sampler.sampling"):
+        make_push_object(config)

@@ -1,4 +1,4 @@
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -42,9 +42,11 @@ class ArmReferenceConfig:
     # Rolling, the tip stays at this height, and only what C3 wants across the table
     # counts [m]; None: C3 moves it up and down too.
     height: float | None = None
-    # Rolling, the tip goes no nearer than this to the world's origin, where the arm
+    # Rolling, the wrist goes no nearer than this to the world's origin, where the arm
     # stands, across the table: a C3 that knows no arm would fold its elbow up [m].
     nearest: float = 0.0
+    # From the wrist to the tip, seen from above [m].
+    wrist: list[float] = field(default_factory=lambda: [0.0, 0.0])
     period_sec: float = 0.0125  # Of C3 and of the task.
     offset_sec: float = 0.0  # A little after theirs.
 
@@ -154,7 +156,7 @@ class ArmReference(LeafSystem):
             v[2] = max(v[2], -c.down_max)
             if c.height is not None:
                 p[2], v[2], force[2] = c.height, 0.0, 0.0
-            p, v, force = no_nearer(p, v, force, c.nearest)
+            p, v, force = no_nearer(p, v, force, c.nearest, c.wrist)
             fastest, touch_speed = c.push_speed, c.touch_speed
             if self._touch_speed.HasValue(context):
                 learned = self._touch_speed.Eval(context)[0]

@@ -173,7 +173,7 @@ def _check(config: ContactSamplerConfig) -> None:
     for name in ("travel", "push", "out_of_reach", "inwards"):
         if not 0.0 <= getattr(c, name) < np.inf:
             raise ValueError(f"sampling.{name} is {getattr(c, name)}, expected >= 0")
-    for name in ("hysteresis", "reach"):
+    for name in ("hysteresis", "reach", "wrist"):
         if np.shape(getattr(c, name)) != (2,):
             raise ValueError(
                 f"sampling.{name} is {getattr(c, name)}, expected two numbers"

@@ -36,15 +36,18 @@ def pose_and_wrench(line, t, period_sec):
     return both
 
 
-def no_nearer(p, v, force, nearest):
-    """The same command, none of which leads nearer to the world's origin, across the
-    table, than nearest [m]: p (3,) lies at least so far away, and there v (3,) and
-    force (3,) have no part towards the origin."""
-    far = np.hypot(p[0], p[1])
+def no_nearer(p, v, force, nearest, wrist=(0.0, 0.0)):
+    """The same command, none of which leads the wrist nearer to the world's origin,
+    across the table, than nearest [m]: the tip's p (3,) lies at least so far away, and
+    there v (3,) and force (3,) have no part towards the origin.
+
+    Args: wrist (2,): from the wrist to the tip, seen from above [m].
+    """
+    x, y = p[0] - wrist[0], p[1] - wrist[1]
+    far = np.hypot(x, y)
     if far >= nearest:
         return p, v, force
-    out = np.zeros(3)
-    out[:2] = p[:2] / max(far, 1e-9)
+    out = np.array([x, y, 0.0]) / max(far, 1e-9)
     p = p + (nearest - far) * out
     return p, v - min(v @ out, 0.0) * out, force - min(force @ out, 0.0) * out
 

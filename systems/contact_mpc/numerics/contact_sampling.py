@@ -53,14 +53,16 @@ class SamplingConfig:
     places: int = 14  # Sampled in a round, beside the present one and the last best.
     clearance: float = 0.004  # Of the tip from the object at a place [m].
     height: float = 0.024  # Of the tip's centre while pushing [m].
-    # From the world's origin, where the arm stands [m]: nearer, the elbow of a Panda
-    # with the finger upright is at its limit.
+    # Least distance of the wrist from the world's origin, where the arm stands, nearer
+    # than which the elbow is at its limit, and the largest of the tip [m].
     reach: list[float] = field(default_factory=lambda: [0.41, 0.78])
+    # From the wrist to the tip, seen from above [m], where the tool's turn is held.
+    wrist: list[float] = field(default_factory=lambda: [0.0, 0.0])
     # To either side of the x axis, which the arm looks along [rad]: beyond, the way to
     # a place may lead through the arm's own base.
     bearing: float = 1.05
     # Of a plan that leads the tip out of reach, for each knot: it will not be carried
-    # out as it is [1/m2]. Less than `inwards` nearer than reach[0] is within [m].
+    # out as it is [1/m2]. Less than `inwards` nearer than reach[0] is within it [m].
     out_of_reach: float = 2e4
     inwards: float = 0.01
     travel: float = 15.0  # Cost of a metre through the air [1/m].
@@ -455,20 +457,23 @@ def score_within(budget_sec, lcs, x, x_desired, problem, guess=None, at_once=4):
     return cost, *(np.sum([part[i] for part in parts], axis=0) for i in (1, 2))
 
 
-def in_reach(places, reach, bearing):
-    """(n,) whether places (n, 2) are from reach[0] to reach[1] from the origin [m], and
-    at most bearing from the x axis [rad]."""
+def in_reach(places, reach, bearing, wrist=(0.0, 0.0)):
+    """(n,) whether a tip at places (n, 2) is at most reach[1] from the origin [m], its
+    wrist, from which it is `wrist` (2,), at least reach[0], and the tip at most bearing
+    from the x axis [rad]."""
     x, y = np.transpose(places)
-    far = np.hypot(x, y)
-    return (far >= reach[0]) & (far <= reach[1]) & (abs(np.arctan2(y, x)) <= bearing)
+    far = np.hypot(x, y) <= reach[1]
+    near = np.hypot(x - wrist[0], y - wrist[1]) < reach[0]
+    return far & ~near & (abs(np.arctan2(y, x)) <= bearing)
 
 
-def out_of_reach(plans, reach, inwards):
-    """(n,) the sum of squares of how far the tip of plans (n, N + 1, 19) is nearer than
-    reach[0] - inwards to the origin, or farther than reach[1] [m2]."""
-    far = np.hypot(plans[:, :, P_TIP.start], plans[:, :, P_TIP.start + 1])
-    too_near = np.maximum(reach[0] - inwards - far, 0.0)
-    too_far = np.maximum(far - reach[1], 0.0)
+def out_of_reach(plans, reach, inwards, wrist=(0.0, 0.0)):
+    """(n,) the sum of squares of how far in plans (n, N + 1, 19) the wrist is nearer
+    than reach[0] - inwards to the origin, or the tip farther than reach[1] [m2]."""
+    x, y = plans[:, :, P_TIP.start], plans[:, :, P_TIP.start + 1]
+    of_wrist = np.hypot(x - wrist[0], y - wrist[1])
+    too_near = np.maximum(reach[0] - inwards - of_wrist, 0.0)
+    too_far = np.maximum(np.hypot(x, y) - reach[1], 0.0)
     return (too_near**2 + too_far**2).sum(axis=1)
 
 
@@ -579,11 +584,12 @@ def sample_round(
     distance = shape.tip_radius + c.clearance + nearer
     phase = (m.count * GOLDEN) % 1.0
     around = places_around(outline, distance, c.places, phase)
-    around = around[in_reach(around, c.reach, c.bearing)]
+    reach = c.reach, c.bearing, c.wrist
+    around = around[in_reach(around, *reach)]
     going = m.place is not None and not in_contact
     present = to_world(x, m.place) if going else x[P_TIP][:2]
     last = [] if m.best is None else [to_world(x, m.best)]
-    last = [place for place in last if in_reach(place[None], c.reach, c.bearing)[0]]
+    last = [place for place in last if in_reach(place[None], *reach)[0]]
     places = np.array([present, *last, *around])
     n, N = len(places), problem.options.N
     starts = np.tile(x, (n, 1))
@@ -613,11 +619,12 @@ def sample_round(
     ]  # fmt: skip
     if in_contact:
         way[0] = 0.0
-    elif not going or not in_reach(present[None], c.reach, c.bearing)[0]:
+    elif not going or not in_reach(present[None], *reach)[0]:
         cost[0] = NO_PLAN
     cost = cost + c.travel * np.array(way)
     # Where the tip is now no plan can change.
-    cost = cost + c.out_of_reach * out_of_reach(plans[:, 1:], c.reach, c.inwards)
+    led_out = out_of_reach(plans[:, 1:], c.reach, c.inwards, c.wrist)
+    cost = cost + c.out_of_reach * led_out
     progressed = not in_contact or error < m.error - PROGRESS
     if progressed or not np.isfinite(m.error):
         m = replace(m, error=error, since_sec=t)
