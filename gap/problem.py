@@ -121,16 +121,6 @@ def rms(x: np.ndarray) -> float:
     return float(np.sqrt(np.mean(x**2))) if len(x) else 0.0
 
 
-TRIMMED, OF_NORMAL = 0.1, 0.7892  # Rms of the smallest 90 % of normal deviates.
-
-
-def trimmed_rms(x: np.ndarray) -> float:
-    """Rms without the largest tenth, 1 of normal deviates of size 1: one glitch of a
-    sensor does not make a stretch of time loud, nor do heavy tails; 0 of nothing."""
-    few = np.sort(np.abs(x))[: int(np.ceil((1.0 - TRIMMED) * len(x)))]
-    return rms(few) / OF_NORMAL
-
-
 def is_sane(effect: Effect, least: Mapping[str, float] | None = None) -> bool:
     """Whether the parameters are allowed, and of a size that robots have.
 

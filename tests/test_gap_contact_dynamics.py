@@ -632,11 +632,16 @@ def test_a_loud_block_is_told_though_it_is_fitted(tmp_path):
     # An equation that is louder goes first.
     louder = np.where(model.channel_of_rows() == 0, 9.0, left)
     assert model.loudest(SimpleNamespace(left=louder)) == (model.row_names()[0], 9.0)
-    # A glitch of a sensor, in few of a block's rows, makes no stretch of time loud.
+    # A row that is far off makes no stretch of time loud; one in ten off by 18 does, as
+    # a patch that is crossed once.
     rows = np.flatnonzero(model.blocks() == number)
-    glitch = 0.5 * noise
-    glitch[rows[: len(rows) // 12]] = 60.0
-    assert max(model._blocks_left(glitch))[0] < 1.0
+    glitch, crossed = 0.5 * noise, 0.5 * noise
+    glitch[rows[0]] = 90.0
+    crossed[rows[: len(rows) // 10]] = 18.0
+    loud = model.plan.loud
+    assert (
+        max(model._blocks_left(glitch))[0] < loud < max(model._blocks_left(crossed))[0]
+    )
 
 
 def test_a_patch_s_side_that_nothing_crossed_may_be_anywhere():

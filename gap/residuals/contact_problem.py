@@ -24,7 +24,6 @@ from makebreak.gap.problem import (
     SearchPlan,
     is_sane,
     rms,
-    trimmed_rms,
 )
 from makebreak.gap.residuals.contact_dynamics import WRENCHED, ContactDynamics
 from makebreak.gap.residuals.contact_means import WrenchSensor
@@ -70,6 +69,7 @@ PATCH_RUNS, PATCH_STARTS, PATCHES = 120, 8, 3
 MOVED, PROFILE = (5e-4, 1e-3, 2e-3, 4e-3, 8e-3, 0.016, 0.032, 0.064), 16.0
 # By what share of itself a friction is moved likewise.
 SHARES = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 0.9)
+AT_MOST = 20.0  # Of a row, where a block of time is asked whether it is loud.
 LARGEST = 200.0  # An error beyond so many standard deviations counts as this.
 FEWEST_ROWS = 8  # Of a channel that is looked at by itself.
 SMALL = 0.1  # First trial of an effect on joints, of the efforts there.
@@ -690,11 +690,12 @@ class ContactProblem(ContactDynamics, GapProblem):
         return "".join(off) + sentence(now, found)
 
     def _blocks_left(self, left: np.ndarray) -> list[tuple[float, int]]:
-        """How loud rows (m,) are, and the number, of each block with enough of them."""
+        """Rms of rows (m,) and number of each block that has enough of them. Of a row
+        counts AT_MOST: what one reading is off by says nothing of a stretch of time."""
         of_rows = self.blocks()
         found = [(left[of_rows == k], int(k)) for k in np.unique(of_rows)]
         found = [(r, k) for r, k in found if len(r) >= FEWEST_ROWS]
-        return [(trimmed_rms(r), k) for r, k in found] or [(0.0, 0)]
+        return [(rms(np.clip(r, -AT_MOST, AT_MOST)), k) for r, k in found] or [(0.0, 0)]
 
     def where(self, left: np.ndarray) -> list[Where]:
         r = np.zeros(self._shown.shape)
