@@ -173,6 +173,14 @@ def test_the_last_reading_is_told_as_it_was_measured_and_when():
         np.testing.assert_allclose(port.Eval(own), expected, atol=1e-9)
 
 
+def test_a_reading_that_is_older_than_what_is_kept_is_still_the_last():
+    diagram, sensor = sensor_at(RigidTransform([0.5, 0.0, 0.02]), delay_sec=1.2)
+    simulator = Simulator(diagram)
+    own = sensor.GetMyContextFromRoot(simulator.get_context())
+    simulator.AdvanceTo(1.45)
+    assert sensor.GetOutputPort("reading").Eval(own)[0] == pytest.approx(7.0 / 30.0)
+
+
 def test_readings_have_the_noise_that_is_asked_for():
     diagram, sensor = sensor_at(RigidTransform([0.5, 0.0, 0.02]), density=[1e6, 1e6])
     simulator = Simulator(diagram)

@@ -267,8 +267,10 @@ def write_recording(session, log, config):
     columns = recorded(log.diagram, log.context, begin)
     read = np.column_stack([columns[name] for name in READING_COLUMNS])
     read = read[np.isfinite(read[:, 0])]
-    # What lies on the table, where it was read first: the file has no noise but that.
-    p, q = (read[0, :3], read[0, 3:]) if len(read) else (np.zeros(3), [1.0, 0, 0, 0])
+    # What lies on the table, where it was read first; if it never was, amid the goals.
+    p, q = np.array([*config.goals.center, 0.0]), [1.0, 0.0, 0.0, 0.0]
+    if len(read):
+        p, q = read[0, :3], read[0, 3:]
     height = rest_height(believed_object(config)[0])
     axis = np.array(rolling_axis(config.object) or np.zeros(3))
     zero = np.zeros(3)

@@ -136,7 +136,7 @@ class PoseSensor(LeafSystem):
                 pose = pose._replace(
                     p=np.array([x, y, pose.p[2]]), v=np.array([*v, 0.0])
                 )
-        known = tuple(one for one in known if one[0] > t - KEPT_SEC)
+        known = tuple(one for one in known if one[0] > t - KEPT_SEC) or known[-1:]
         state.get_mutable_abstract_state(int(self._late)).set_value(late)
         state.get_mutable_abstract_state(int(self._pose)).set_value(pose)
         state.get_mutable_abstract_state(int(self._rolling)).set_value(rolling)
