@@ -37,6 +37,7 @@ from makebreak.models.scene import Scene
 HOLDS = 0.03  # Known of the distance's acceleration where bodies stay in touch [m/s2].
 SHAPES = 2e-4  # How well shapes are known where the scene does not say [m].
 PRESSED = 4.0  # Times a body's noise [N]: a force that tells that it is touched.
+ROUNDING = 1e-11  # Of a column, per newton [-], [m].
 THIN = 4  # Distances change slowly: every so many test functions are told.
 WRENCHED = 0.05  # A wrench sampled amid a drive's ripple is off by as much.
 SHAPED = (*SURFACES, *CONTACT_LAW)
@@ -369,7 +370,9 @@ class ContactDynamics(PermittedContacts):
         r = np.zeros_like(needs)
         if self._last is not None and self._last[1].shape == G.shape:
             P_last, G_last, there_last, root_last, r_last = self._last
-            new = (needs != P_last).any(axis=1) | (G != G_last).any(axis=(1, 2))
+            # A sum that was taken in another order is no other column.
+            moved = np.abs(G - G_last).max(axis=(1, 2))
+            new = (needs != P_last).any(axis=1) | (moved > ROUNDING)
             new |= (there != there_last).any(axis=1) | (root is not root_last)
             r[:] = r_last
         if new.any():
