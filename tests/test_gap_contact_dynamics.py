@@ -21,8 +21,9 @@ from makebreak.gap.data.recording import read_recordings
 from makebreak.gap.numerics import permitted_forces
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Outcome, SearchPlan, is_sane
+from makebreak.gap.residuals import contact_means
 from makebreak.gap.residuals.contact_dynamics import ContactDynamics
-from makebreak.gap.residuals.contact_means import variance_of_means
+from makebreak.gap.residuals.contact_means import felt_motion, variance_of_means
 from makebreak.gap.residuals.contact_problem import ContactProblem, _best_rectangles
 from makebreak.gap.residuals.contact_shapes import _Point, _Surface
 from makebreak.gap.residuals.permitted_contacts import Shift
@@ -452,7 +453,7 @@ class _Logged(dict):
     channels = {f"tip.tip.{a}": SimpleNamespace(noise=0.07) for a in ("fx", "fy", "fz")}
 
 
-def test_a_tool_that_leans_on_something_with_little_is_felt():
+def test_a_tool_that_leans_on_something_with_little_is_felt(monkeypatch):
     """0.4 N is less than six times a sample's noise."""
     rng = np.random.default_rng(0)
     time = np.arange(400) / 250.0
@@ -464,17 +465,18 @@ def test_a_tool_that_leans_on_something_with_little_is_felt():
     track = SimpleNamespace(
         recording=0, time=time, episode=SimpleNamespace(rows=slice(0, 400))
     )
-    own = np.zeros(400)
+    own = np.zeros((400, 6))
+    monkeypatch.setattr(contact_means, "felt_motion", lambda *args: own)
     model = SimpleNamespace(
-        tracks=[track], recordings=[log], _offset=[0, 400],
-        _own_force=lambda sensor: own,
+        tracks=[track], recordings=[log], _offset=[0, 400], plant=None,
+        _q=None, _v=None, _vd=None,
     )  # fmt: skip
-    sensor = SimpleNamespace(place="tip.tip")
+    sensor = SimpleNamespace(place="tip.tip", frame=None)
     size = ContactDynamics._force_size(model, sensor)
     assert size[:190].max() == 0.0
     np.testing.assert_allclose(size[210:390], 0.4, atol=0.15)  # Five deviations.
     # What the tool's own motion makes in a sensor in its mount is no touch.
-    own[200:300] = 0.5
+    own[200:300, 1] = -0.5
     size = ContactDynamics._force_size(model, sensor)
     assert size[210:295].max() == 0.0 and size[305:390].min() > 0.2
 
@@ -523,20 +525,9 @@ def test_what_a_tool_s_motion_adds_to_its_sensor_is_what_its_mount_carries():
         force = -R @ felt.translational() - weight
         moment = -R @ felt.rotational() - np.cross(p - at, R @ felt.translational())
         expected.append([*force, *(moment - np.cross(com - at, weight))])
-    means = SimpleNamespace(
-        time=np.arange(4), centre=np.arange(4), acceleration=np.array(acceleration)
-    )
-    model = SimpleNamespace(plant=plant, means=means, _q=q, _v=v)
-    sensor = SimpleNamespace(frame=tip, names=("fx", "fy", "fz", "tx", "ty", "tz"))
-    found = ContactProblem._inertia(model, sensor)
+    found = felt_motion(plant, tip, q, v, acceleration)
     np.testing.assert_allclose(found, expected, atol=1e-9)
     assert np.abs(found[:, 3:]).max() > 0.05
-    of_rows = SimpleNamespace(plant=plant, _q=q, _v=v, _vd=np.array(acceleration))
-    np.testing.assert_allclose(
-        ContactProblem._own_force(of_rows, sensor),
-        np.linalg.norm(found[:, :3], axis=1),
-        atol=1e-9,
-    )
 
 
 def test_a_touch_that_is_lost_for_a_moment_goes_on():

@@ -79,6 +79,39 @@ class WrenchSensor:
         return len(self.names) > len(FORCE)
 
 
+def felt_motion(plant: MultibodyPlant, frame: Frame, q, v, vd) -> np.ndarray:
+    """What a tool's own motion adds to a force sensor in its mount, from which the
+    weight alone is taken off: -m a, and its moment about the frame.
+
+    Args: frame, of the sensor, on the tool; q (n, n_q), v, vd (n, n_v).
+    Returns: (n, 6), force first, in world axes [N], [N m].
+    """
+    body, world, own = frame.body(), plant.world_frame(), JacobianWrtVariable.kV
+    context = plant.CreateDefaultContext()
+    M = body.CalcSpatialInertiaInBodyFrame(context)
+    out = np.zeros((len(q), 6))
+    if not M.get_mass() > 0.0:
+        return out
+    p_BC = M.get_com()
+    about_com = M.Shift(p_BC).CalcRotationalInertia().CopyToFullMatrix3()
+    at = (context, own, body.body_frame(), p_BC, world, world)
+    for k in range(len(q)):
+        plant.SetPositions(context, q[k])
+        plant.SetVelocities(context, v[k])
+        a = plant.CalcJacobianSpatialVelocity(*at) @ vd[k]
+        bias = plant.CalcBiasSpatialAcceleration(*at)
+        alpha, a_com = a[:3] + bias.rotational(), a[3:] + bias.translational()
+        X_WB = body.EvalPoseInWorld(context)
+        R = X_WB.rotation().matrix()
+        w = body.EvalSpatialVelocityInWorld(context).rotational()
+        I_W = R @ about_com @ R.T
+        force = -M.get_mass() * a_com
+        arm = X_WB @ p_BC - frame.CalcPoseInWorld(context).translation()
+        moment = np.cross(arm, force) - I_W @ alpha - np.cross(w, I_W @ w)
+        out[k] = [*force, *moment]
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class _Track:
     """An episode, smoothed: n rows. raw: {coordinate: (samples' times, values)}."""
@@ -373,30 +406,13 @@ class ContactMeans:
                 out[a + on[k] : a + on[k + 1]] = True
         return out
 
-    def _own_force(self, sensor: WrenchSensor) -> np.ndarray:
-        """(n_rows,) what it takes to accelerate a sensor's own tool [N]: one in the
-        tool's mount feels that too."""
-        plant, body = self.plant, sensor.frame.body()
-        context = plant.CreateDefaultContext()
-        mass, world = body.default_mass(), plant.world_frame()
-        out = np.zeros(len(self._q))
-        if not mass > 0.0:
-            return out
-        com = body.default_com()
-        at = (context, JacobianWrtVariable.kV, body.body_frame(), com, world, world)
-        for k, (q, v, vd) in enumerate(zip(self._q, self._v, self._vd, strict=True)):
-            plant.SetPositions(context, q)
-            plant.SetVelocities(context, v)
-            a = plant.CalcJacobianTranslationalVelocity(*at) @ vd
-            bias = plant.CalcBiasTranslationalAcceleration(*at)
-            out[k] = mass * np.linalg.norm(a + bias.ravel())
-        return out
-
     def _force_size(self, sensor: WrenchSensor) -> np.ndarray:
         """(n_rows,) of the measured force where it is clear of noise and of what the
         tool's own motion makes, else 0; of few newtons too, as of a tool that leans on
         something at rest."""
-        out, place, own = [], sensor.place, self._own_force(sensor)
+        out, place = [], sensor.place
+        own = felt_motion(self.plant, sensor.frame, self._q, self._v, self._vd)
+        own = np.linalg.norm(own[:, :3], axis=1)
         for first, t in zip(self._offset, self.tracks, strict=False):
             recording = self.recordings[t.recording]
             f = np.stack(

@@ -10,7 +10,6 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
-from pydrake.multibody.tree import JacobianWrtVariable
 from scipy.optimize import minimize
 
 from makebreak.gap.data.recording import Recording
@@ -26,7 +25,7 @@ from makebreak.gap.problem import (
     rms,
 )
 from makebreak.gap.residuals.contact_dynamics import WRENCHED, ContactDynamics
-from makebreak.gap.residuals.contact_means import WrenchSensor
+from makebreak.gap.residuals.contact_means import felt_motion
 from makebreak.gap.residuals.mechanism import link_changes
 from makebreak.gap.residuals.objects import unexplained_in_windows
 from makebreak.gap.residuals.permitted_contacts import Shift
@@ -285,11 +284,15 @@ class ContactProblem(ContactDynamics, GapProblem):
         for sensor in self.sensors:
             at, kept, forces = sensor.place, self.means.wrench, sensor.forces
             ripple = self._ripple(sensor.welded)
+            m, row = self.means, self.means.centre
+            motion = felt_motion(
+                self.plant, sensor.frame, self._q[row], self._v[row], m.acceleration
+            )[:, : len(sensor.names)]
             for name, own, more, step, size in (
                 (f"gain of {at}", sensor.rows, kept[:, sensor.rows], 0.01, FELT),
                 (f"ripple of {at}", forces, ripple, 1e-4, self._row_sec()),
                 # From none of it, of a sensor at the tip, to all, of one in the mount.
-                (f"inertia felt by {at}", sensor.rows, self._inertia(sensor), 1.0, 1.0),
+                (f"inertia felt by {at}", sensor.rows, motion, 1.0, 1.0),
             ):
                 self.means.wrench = np.array(kept)
                 self.means.wrench[:, own] += step * more
@@ -319,34 +322,6 @@ class ContactProblem(ContactDynamics, GapProblem):
             else Nuisances.none(len(base))
         )
         return self._nuisances
-
-    def _inertia(self, sensor: WrenchSensor) -> np.ndarray:
-        """(K, n) what the motion of its own tool adds to a sensor in the tool's mount,
-        from which the weight alone is taken off: -m a and its moment about the frame,
-        in world axes [N], [N m]."""
-        m, plant = self.means, self.plant
-        body, world = sensor.frame.body(), plant.world_frame()
-        context = plant.CreateDefaultContext()
-        M = body.CalcSpatialInertiaInBodyFrame(context)
-        out = np.zeros((len(m.time), len(sensor.names)))
-        p_BC, own = M.get_com(), JacobianWrtVariable.kV
-        about_com = M.Shift(p_BC).CalcRotationalInertia().CopyToFullMatrix3()
-        for k, row in enumerate(m.centre):
-            plant.SetPositions(context, self._q[row])
-            plant.SetVelocities(context, self._v[row])
-            at = (context, own, body.body_frame(), p_BC, world, world)
-            a = plant.CalcJacobianSpatialVelocity(*at) @ m.acceleration[k]
-            bias = plant.CalcBiasSpatialAcceleration(*at)
-            alpha, a_com = a[:3] + bias.rotational(), a[3:] + bias.translational()
-            X_WB = body.EvalPoseInWorld(context)
-            R = X_WB.rotation().matrix()
-            w = body.EvalSpatialVelocityInWorld(context).rotational()
-            I_W = R @ about_com @ R.T
-            force = -M.get_mass() * a_com
-            arm = X_WB @ p_BC - sensor.frame.CalcPoseInWorld(context).translation()
-            moment = np.cross(arm, force) - I_W @ alpha - np.cross(w, I_W @ w)
-            out[k] = [*force, *moment][: out.shape[1]]
-        return out
 
     def _ripple(self, welded: Sequence[int]) -> np.ndarray:
         """(K, 3) force at a sensor by a delay of all commands [N/s]: a drive's effort
