@@ -646,22 +646,6 @@ def make_push_object(
             TIP_FRAME,
         ),
     )
-    if config.gentle:
-        if config.touch.most > config.reference.push_speed:
-            raise ValueError(
-                f"touch.most is {config.touch.most}, expected at most "
-                f"reference.push_speed, {config.reference.push_speed} m/s"
-            )
-        touch = builder.AddNamedSystem(
-            "touch_down",
-            TouchDown(config.touch, shape, ESTIMATE, OFFSET["touch"]),
-        )
-        for source, name in (
-            (estimator, "x"), (estimator, "valid"), (task, "phase"),
-            (estimator, "tip_force"),
-        ):  # fmt: skip
-            wiring.connect(builder, source, name, touch, name)
-        wiring.connect(builder, touch, "touch_speed", reference, "touch_speed")
     no_force = builder.AddNamedSystem("no_force", ConstantVectorSource(np.zeros(3)))
 
     connect = partial(wiring.connect, builder)
@@ -729,6 +713,22 @@ def make_push_object(
     connect(c3, "lam", reference, "lam")
     connect(c3, "status", reference, "status")
     connect(lcs["command"], "lcs", reference, "lcs")
+    if config.gentle:
+        if config.touch.most > config.reference.push_speed:
+            raise ValueError(
+                f"touch.most is {config.touch.most}, expected at most "
+                f"reference.push_speed, {config.reference.push_speed} m/s"
+            )
+        touch = builder.AddNamedSystem(
+            "touch_down",
+            TouchDown(config.touch, shape, ESTIMATE, OFFSET["touch"]),
+        )
+        for source, name in (
+            (estimator, "x"), (estimator, "valid"), (task, "phase"),
+            (estimator, "tip_force"),
+        ):  # fmt: skip
+            connect(source, name, touch, name)
+        connect(touch, "touch_speed", reference, "touch_speed")
     connect(station, f"{ARM}.position_measured", impedance, "q")
     connect(station, f"{ARM}.velocity_measured", impedance, "v")
     connect_command(builder, reference, impedance)

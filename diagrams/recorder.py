@@ -101,7 +101,9 @@ class Recorder(Diagram):
         [s], and {channel: (n,)}."""
         found = []
         if self.HasSubsystemNamed("readings"):
-            data = self.GetSubsystemByName("readings").FindLog(context).data()
+            log = self.GetSubsystemByName("readings").FindLog(context)
+            # No reading is known before its time.
+            data = log.data()[:, np.searchsorted(log.sample_times(), begin - 1e-9) :]
             for names in self.names["readings"].values():
                 own, data = data[: len(names)], data[len(names) :]
                 times, first = np.unique(own[0], return_index=True)

@@ -9,7 +9,8 @@ from pydrake.systems.framework import Context, Diagram
 from makebreak.diagrams.recorder import behind_sec, has_recorder, recorded
 from makebreak.gap.data.table import csv_rows
 
-EVERY_SEC = 1.0  # By the clock: so much is lost at most.
+# By the clock: so much is lost at most, and the time by which readings are late.
+EVERY_SEC = 1.0
 
 
 class RecordingStream:
@@ -43,9 +44,8 @@ class RecordingStream:
         columns = recorded(self._diagram, context, self._next)
         time = columns["time"]
         n = len(time)
-        if (
-            n and not ended
-        ):  # The last row may still change, and what is read late come.
+        # The last row may still change, and what is read late come.
+        if n and not ended:
             until = time[-1] - behind_sec(self._diagram)
             n = int(np.searchsorted(time, until - 1e-9))
         if n < 1:

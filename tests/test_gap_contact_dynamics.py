@@ -1,6 +1,7 @@
 """Equations of motion with permitted contact forces, on pushes of another simulator."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -468,7 +469,7 @@ def test_a_tool_that_leans_on_something_with_little_is_felt(monkeypatch):
     own = np.zeros((400, 6))
     monkeypatch.setattr(contact_means, "felt_motion", lambda *args: own)
     model = SimpleNamespace(
-        tracks=[track], recordings=[log], _offset=[0, 400], plant=None,
+        tracks=[track], recordings=[log], _offset=[0, 400], dynamics=None,
         _q=None, _v=None, _vd=None,
     )  # fmt: skip
     sensor = SimpleNamespace(place="tip.tip", frame=None)
@@ -525,7 +526,9 @@ def test_what_a_tool_s_motion_adds_to_its_sensor_is_what_its_mount_carries():
         force = -R @ felt.translational() - weight
         moment = -R @ felt.rotational() - np.cross(p - at, R @ felt.translational())
         expected.append([*force, *(moment - np.cross(com - at, weight))])
-    found = felt_motion(plant, tip, q, v, acceleration)
+    own = SimpleNamespace(plant=plant, _context=plant.CreateDefaultContext())
+    dynamics = SimpleNamespace(body_motion=partial(SceneDynamics.body_motion, own))
+    found = felt_motion(dynamics, tip, q, v, acceleration)
     np.testing.assert_allclose(found, expected, atol=1e-9)
     assert np.abs(found[:, 3:]).max() > 0.05
 

@@ -8,13 +8,13 @@ from gap_benchmark import push_world
 from gap_benchmark.push_world import BLOCK, TABLE
 
 from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.numerics.permitted_forces import tangents
 from makebreak.gap.problem import Fitted
 from makebreak.gap.residuals.contact_problem import NO_GAP, ContactProblem
 from makebreak.gap.residuals.sap_lift import sap_lift
 from makebreak.gap.residuals.widened_contacts import (
     distances_off,
     sentence,
-    tangents,
     widened_contacts,
     widened_slots,
 )

@@ -1,8 +1,6 @@
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource
 
 from makebreak.systems.changing_contact.numerics.touch_down import (
     TouchDownConfig,
@@ -139,15 +137,11 @@ SQUARE = ObjectShape(
 
 
 def system_outputs(x, valid=1.0, force=(0.0, 0.0, 0.0), phase=PUSH, t_end=0.0042):
-    builder = DiagramBuilder()
-    touch = builder.AddSystem(TouchDown(C, SQUARE, DT))
+    touch = TouchDown(C, SQUARE, DT)
+    context = touch.CreateDefaultContext()
     for name, value in dict(x=x, valid=[valid], phase=[phase], tip_force=force).items():
-        source = builder.AddSystem(ConstantVectorSource(value))
-        builder.Connect(source.get_output_port(), touch.GetInputPort(name))
-    diagram = builder.Build()
-    simulator = Simulator(diagram)
-    simulator.AdvanceTo(t_end)
-    context = touch.GetMyContextFromRoot(simulator.get_context())
+        touch.GetInputPort(name).FixValue(context, value)
+    Simulator(touch, context).AdvanceTo(t_end)
     return [touch.GetOutputPort(n).Eval(context) for n in ("touch_speed", "belief")]
 
 

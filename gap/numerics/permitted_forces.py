@@ -33,6 +33,14 @@ def tangential(u, normal):
     return u - np.sum(u * normal, axis=1)[:, None] * normal
 
 
+def tangents(normal) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors (n, 3) across unit normals (n, 3), and each other."""
+    across = np.where(np.abs(normal[:, :1]) > 0.7, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
+    e1 = np.cross(normal, across)
+    e1 /= np.linalg.norm(e1, axis=1)[:, None]
+    return e1, np.cross(normal, e1)
+
+
 def test_functions(times, centres, half: float) -> tuple[csr_matrix, csr_matrix]:
     """Weights (n_centres, n) that give, from samples at times (n,), the mean of a
     signal over a test function about each centre, and the mean of its second

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import Frame, JacobianWrtVariable
+from pydrake.multibody.tree import Frame
 from scipy.sparse import block_diag, csr_matrix
 from scipy.spatial.transform import Rotation
 
@@ -79,37 +79,27 @@ class WrenchSensor:
         return len(self.names) > len(FORCE)
 
 
-def felt_motion(plant: MultibodyPlant, frame: Frame, q, v, vd) -> np.ndarray:
+def felt_motion(dynamics: SceneDynamics, frame: Frame, q, v, vd) -> np.ndarray:
     """What a tool's own motion adds to a force sensor in its mount, from which the
     weight alone is taken off: -m a, and its moment about the frame.
 
     Args: frame, of the sensor, on the tool; q (n, n_q), v, vd (n, n_v).
     Returns: (n, 6), force first, in world axes [N], [N m].
     """
-    body, world, own = frame.body(), plant.world_frame(), JacobianWrtVariable.kV
-    context = plant.CreateDefaultContext()
-    M = body.CalcSpatialInertiaInBodyFrame(context)
-    out = np.zeros((len(q), 6))
-    if not M.get_mass() > 0.0:
-        return out
-    p_BC = M.get_com()
-    about_com = M.Shift(p_BC).CalcRotationalInertia().CopyToFullMatrix3()
-    at = (context, own, body.body_frame(), p_BC, world, world)
-    for k in range(len(q)):
-        plant.SetPositions(context, q[k])
-        plant.SetVelocities(context, v[k])
-        a = plant.CalcJacobianSpatialVelocity(*at) @ vd[k]
-        bias = plant.CalcBiasSpatialAcceleration(*at)
-        alpha, a_com = a[:3] + bias.rotational(), a[3:] + bias.translational()
-        X_WB = body.EvalPoseInWorld(context)
-        R = X_WB.rotation().matrix()
-        w = body.EvalSpatialVelocityInWorld(context).rotational()
-        I_W = R @ about_com @ R.T
-        force = -M.get_mass() * a_com
-        arm = X_WB @ p_BC - frame.CalcPoseInWorld(context).translation()
-        moment = np.cross(arm, force) - I_W @ alpha - np.cross(w, I_W @ w)
-        out[k] = [*force, *moment]
-    return out
+    body = frame.body()
+    mass = body.default_mass()
+    if not mass > 0.0:
+        return np.zeros((len(q), 6))
+    _, V, A, R = dynamics.body_motion(body, q, v, vd)
+    w, alpha = V[:, :3], A[:, :3]
+    arm = R @ body.default_com()  # To the centre of mass, from the body's origin.
+    a = A[:, 3:] + np.cross(alpha, arm) + np.cross(w, np.cross(w, arm))
+    about = body.default_spatial_inertia().Shift(body.default_com())
+    I_W = R @ about.CalcRotationalInertia().CopyToFullMatrix3() @ R.transpose(0, 2, 1)
+    spin = np.einsum("nij,nj->ni", I_W, alpha)
+    spin += np.cross(w, np.einsum("nij,nj->ni", I_W, w))
+    from_frame = arm - R @ frame.GetFixedPoseInBodyFrame().translation()
+    return np.hstack([-mass * a, -mass * np.cross(from_frame, a) - spin])
 
 
 @dataclass(frozen=True, eq=False)
@@ -411,7 +401,7 @@ class ContactMeans:
         tool's own motion makes, else 0; of few newtons too, as of a tool that leans on
         something at rest."""
         out, place = [], sensor.place
-        own = felt_motion(self.plant, sensor.frame, self._q, self._v, self._vd)
+        own = felt_motion(self.dynamics, sensor.frame, self._q, self._v, self._vd)
         own = np.linalg.norm(own[:, :3], axis=1)
         for first, t in zip(self._offset, self.tracks, strict=False):
             recording = self.recordings[t.recording]

@@ -42,6 +42,8 @@ from makebreak.gap.simulation.contact_windows import (
     varies,
 )
 from makebreak.gap.simulation.measure import gap_measure, series_of
+from makebreak.gap.simulation.windows import LARGEST
+from makebreak.gap.verdict import NO_GAP
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
@@ -53,7 +55,6 @@ LATE = 0.25  # and its clock, in periods of its samples.
 TIMING = 2.5e-4  # Of what drives get [s].
 FELT = 0.05  # What a force sensor shows more, sampled amid a drive's ripple too.
 BEYOND = 3.0
-NO_GAP = 1.5  # Times the noise: less in the equations needs no hint.
 MISFIT = 1.15  # Less than so many times the sensors' noise is no misfit.
 ROBUST = 1.4826
 LEAST_MISFIT = 0.002  # Of the forces in a row: laws are no better than that.
@@ -69,7 +70,6 @@ MOVED, PROFILE = (5e-4, 1e-3, 2e-3, 4e-3, 8e-3, 0.016, 0.032, 0.064), 16.0
 # By what share of itself a friction is moved likewise.
 SHARES = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 0.9)
 AT_MOST = 20.0  # Of a row, where a block of time is asked whether it is loud.
-LARGEST = 200.0  # An error beyond so many standard deviations counts as this.
 FEWEST_ROWS = 8  # Of a channel that is looked at by itself.
 SMALL = 0.1  # First trial of an effect on joints, of the efforts there.
 
@@ -286,7 +286,7 @@ class ContactProblem(ContactDynamics, GapProblem):
             ripple = self._ripple(sensor.welded)
             m, row = self.means, self.means.centre
             motion = felt_motion(
-                self.plant, sensor.frame, self._q[row], self._v[row], m.acceleration
+                self.dynamics, sensor.frame, self._q[row], self._v[row], m.acceleration
             )[:, : len(sensor.names)]
             for name, own, more, step, size in (
                 (f"gain of {at}", sensor.rows, kept[:, sensor.rows], 0.01, FELT),

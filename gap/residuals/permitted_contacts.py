@@ -16,7 +16,11 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
 from makebreak.gap.data.recording import Recording
-from makebreak.gap.numerics.permitted_forces import tangential, unshared_load
+from makebreak.gap.numerics.permitted_forces import (
+    tangential,
+    tangents,
+    unshared_load,
+)
 from makebreak.gap.residuals.contact_means import (
     BESIDE,
     MEETS,
@@ -368,11 +372,7 @@ class PermittedContacts(ContactMeans):
             along = slip / np.maximum(speed, 1e-9)[:, None]
             one_way = np.linalg.norm(W @ (along * mine[:, None]), axis=1)
             slides &= one_way >= ONE_WAY * weight  # Turning round, it may stick.
-            e1 = np.cross(s.normal, np.where(
-                np.abs(s.normal[:, :1]) > 0.7, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]]
-            ))  # fmt: skip
-            e1 /= np.linalg.norm(e1, axis=1)[:, None]
-            e2 = np.cross(s.normal, e1)
+            e1, e2 = tangents(s.normal)
             ways = [(-along, acts)]
             may = acts & ~slides
             for k in range(PYRAMID if may.any() else 0):

@@ -17,7 +17,7 @@ from makebreak.gap.numerics.permitted_forces import explain
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate, Fitted, Nuisances
 from makebreak.gap.residuals.contact_dynamics import THIN
-from makebreak.gap.residuals.contact_means import FORCE, MEETS, WrenchSensor
+from makebreak.gap.residuals.contact_means import FORCE, MEETS
 from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.contact_shapes import Slot
 from makebreak.gap.residuals.impacts import MOST_SHARE, nearest, positions, walls_of
@@ -454,7 +454,7 @@ class PressingProblem(ContactProblem):
 
     def _distances(self, slots: Sequence[Slot]) -> np.ndarray:
         """(K, pairs) over what shapes are known to: of each pair, when it is felt."""
-        shape = float(self.scene.tolerance.get("shape_m", 2e-4))
+        shape = self.shape_std()
         K = len(self.means.time)
         thinned = np.arange(K) % THIN == 0
         every, _ = self._slots(self._placed)
@@ -488,52 +488,9 @@ class PressingProblem(ContactProblem):
 
     # ----- What may be slightly wrong, and candidates
 
-    def nuisances(self) -> Nuisances:
-        """Beside those of any robot: what is mounted beyond a sensor, whose inertia it
-        feels."""
-        if self._nuisances is not None:
-            return self._nuisances
-        plain = super().nuisances()
-        columns, prior, names = [plain.columns], list(plain.prior), list(plain.names)
-        for sensor in self.sensors:
-            column = self._carried(sensor)
-            if column is not None:
-                columns.append(column[0][:, None])
-                prior.append(column[1])
-                names.append(f"mass beyond {sensor.place}")
-        self._nuisances = Nuisances(
-            np.hstack(columns), np.array(prior), tuple(names), plain.reach
-        )
-        return self._nuisances
-
     def hint(self, end: Fitted) -> str:
         """None: where what is fixed stands is felt, and is not widened beside that."""
         return ""
-
-    def _carried(self, sensor: WrenchSensor) -> tuple[np.ndarray, float] | None:
-        """The column of a kilogram beyond a sensor, and what may be there [kg]: the
-        sensor feels what is outside less mass times acceleration, at the body's centre
-        of mass."""
-        body = sensor.frame.body()
-        mass = body.default_mass()
-        if not mass > 0.0:
-            return None
-        m = self.means
-        q, v, vd = (x[m.centre] for x in (self._q, self._v, self._vd))
-        _, V, A, R = self.dynamics.body_motion(body, q, v, vd)
-        arm, turns = R @ body.default_com(), V[:, :3]  # To the centre of mass.
-        a = A[:, 3:] + np.cross(A[:, :3], arm) + np.cross(turns, np.cross(turns, arm))
-        kept = m.wrench
-        m.wrench = kept.copy()
-        m.wrench[:, sensor.forces] += mass * a
-        if sensor.feels_moments:
-            about = arm - R @ sensor.frame.GetFixedPoseInBodyFrame().translation()
-            m.wrench[:, sensor.moments] += mass * np.cross(about, a)
-        try:
-            column = (self.base() - self.residual()) / mass
-        finally:
-            m.wrench = kept
-        return column, mass
 
     def _friction_now(self, pair) -> float:
         """Wherever its bodies are."""

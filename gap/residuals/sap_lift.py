@@ -11,6 +11,7 @@ Contact, IEEE Trans. Robotics 38(6), 2022, section V.
 import numpy as np
 
 from makebreak.gap.data.findings import Finding
+from makebreak.gap.numerics.permitted_forces import tangential
 from makebreak.gap.residuals.contact_dynamics import ContactDynamics
 
 DEFAULT = 0.1  # [s] Relaxation time of a surface that has none.
@@ -39,8 +40,8 @@ def sap_lift(contacts: ContactDynamics) -> list[Finding]:
         tau = relaxation(contacts.shapes.points[point].geometry)
         tau += relaxation(contacts.shapes.surfaces[surface].geometry)
         v = np.einsum("nij,nj->ni", contacts._relative(s), contacts._node_v)[on]
-        v -= np.sum(v * s.normal[on], axis=1)[:, None] * s.normal[on]
-        fast = float(np.percentile(np.linalg.norm(v, axis=1), FAST))
+        slip = np.linalg.norm(tangential(v, s.normal[on]), axis=1)
+        fast = float(np.percentile(slip, FAST))
         lift = s.friction * (tau + plant.time_step) * fast
         worst = max(worst, (lift, tau, contacts.pair_name(contacts._pair_of(s))))
     lift, tau, pair = worst

@@ -10,11 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from makebreak.gap.numerics.permitted_forces import explain
+from makebreak.gap.numerics.permitted_forces import explain, tangents
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Fitted, rms
 from makebreak.gap.residuals.contact_dynamics import SHAPED, ContactDynamics
 from makebreak.gap.residuals.contact_shapes import Slot
+from makebreak.gap.simulation.windows import LARGEST
 from makebreak.models.effects.kind import Effect
 
 TURNED = (2.0, 5.0, 10.0, 20.0)  # [degrees] that a force may turn away,
@@ -23,7 +24,6 @@ WORTH = 0.5  # What is left then, of what is left now, at most.
 ENOUGH = 1.1  # Of what the largest size leaves, for a smaller one to be said.
 ALIKE = 0.9  # More of what is left now is no less of it.
 MOST_SAID = 2
-LARGEST = 200.0  # An error beyond so many standard deviations counts as this.
 FEWEST = 8  # Rows of a distance.
 
 
@@ -47,14 +47,6 @@ class Widened:
             f"if the forces of {self.pair} were up to {self.size:g} degrees away from "
             "what its shapes and its friction permit"
         )
-
-
-def tangents(normal) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors (n, 3) across unit normals (n, 3), and each other."""
-    across = np.where(np.abs(normal[:, :1]) > 0.7, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
-    e1 = np.cross(normal, across)
-    e1 /= np.linalg.norm(e1, axis=1)[:, None]
-    return e1, np.cross(normal, e1)
 
 
 def widened_slots(slots: Sequence[Slot], size: float, unit: str) -> list[Slot]:

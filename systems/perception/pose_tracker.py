@@ -264,12 +264,10 @@ class PoseTracker(LeafSystem):
     def _reading(self, context, output):
         state = self._get(context)
         x, y, yaw = state[_READ]
-        q = [np.cos(yaw / 2.0), 0.0, 0.0, np.sin(yaw / 2.0)]
-        output.SetFromVector([state[_READ_AT], x, y, self._config.z, *q])
+        output.SetFromVector([state[_READ_AT], x, y, self._config.z, *_upright(yaw)])
 
     def _quaternion(self, context, output):
-        half = self._get(context)[_POSE][2] / 2.0
-        output.SetFromVector([np.cos(half), 0.0, 0.0, np.sin(half)])
+        output.SetFromVector(_upright(self._get(context)[_POSE][2]))
 
     def _yaw(self, context, output):
         output.SetAtIndex(0, self._get(context)[_POSE][2])
@@ -292,3 +290,8 @@ class PoseTracker(LeafSystem):
     def _std(self, context, output):
         state = self._get(context)
         output.SetFromVector(np.sqrt([state[_P][0], state[_P_YAW][0]]))
+
+
+def _upright(yaw: float) -> list[float]:
+    """Quaternion [w x y z] of a turn about the vertical [rad]."""
+    return [np.cos(yaw / 2.0), 0.0, 0.0, np.sin(yaw / 2.0)]
