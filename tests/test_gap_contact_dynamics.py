@@ -255,6 +255,34 @@ def test_a_side_of_a_patch_that_nothing_crosses_is_said_not_to_be_known(tmp_path
     assert max(std["y_min"], std["y_max"]) <= 0.002
 
 
+def test_of_a_friction_s_deviation_held_out_rows_are_asked(tmp_path, monkeypatch):
+    """A fitted row that the friction alone would explain makes it no better known."""
+    scene, recordings, _ = pushed(tmp_path, 15, [], episodes=2)
+    problem = ContactProblem(scene, recordings)
+    n = problem.nuisances()
+    screen = Screen(problem.base(), n.columns, n.prior, problem.train(), reach=n.reach)
+    friction = Effect("contact_friction", [PAIR], {"friction": 0.5})
+    end = fit_effects(problem, screen, [friction], [("friction",)])
+    fitted, best = problem.train(), end.effects[0].parameters["friction"]
+    assert fitted.any() and not fitted.all()
+    calm = n.columns @ end.b
+
+    def deviation(rows) -> float:
+        """Where the rows (n,) want the friction to be what it is, and others nothing."""
+
+        def residual(effects):
+            off = effects[0].parameters["friction"] - best
+            return calm + 1e4 * off * rows / np.sqrt(rows.sum())
+
+        monkeypatch.setattr(problem, "residual", residual)
+        return problem.widened(end, 0)["friction"]
+
+    assert deviation(fitted) == np.inf
+    assert deviation(~fitted) < 0.01
+    monkeypatch.setattr(problem, "_train", np.ones_like(problem._train))
+    assert deviation(fitted) < 0.01  # Nothing is held out: what there is is asked.
+
+
 def test_a_patch_of_all_that_was_slid_over_is_friction_and_is_known_to_be(tmp_path):
     """Else it is named in place of the friction with another effect beside it."""
     scene, recordings, _ = pushed(tmp_path, 15, [], episodes=3)
