@@ -33,7 +33,7 @@ def test_weights_that_are_not_negative_agree_with_scipy(seed):
     if seed % 2:  # Columns that say the same, as four feet of a block do.
         A = np.hstack([A, A[:, :1] + A[:, -1:], 2.0 * A[:, :1]])
     x = np.zeros(A.shape[1])
-    nonnegative(A.T @ A, A.T @ y, x, 400)
+    nonnegative(A, y, x, 400)
     assert (x >= 0.0).all()
     # The error is unique, the weights need not be.
     least = nnls(A, y)[1]

@@ -89,12 +89,12 @@ def test_functions(times, centres, half: float) -> tuple[csr_matrix, csr_matrix]
 
 
 @njit(cache=True)
-def _solve_some(H, g, index, n, ridge, S, x):
-    """Writes x (n,), the solution of (H + ridge) x = g among the rows index[:n], by
-    Cholesky's factors; S (k, k) is scratch."""
-    for a in range(n):
+def _solve_some(H, g, known, n, ridge, S, x):
+    """Writes x (n,), the solution of (H + ridge) x = g among the first n rows, by
+    Cholesky's factors S, of which the first `known` rows stand."""
+    for a in range(known, n):
         for c in range(a + 1):
-            value = H[index[a], index[c]]
+            value = H[a, c]
             if a == c:
                 value += ridge
             for b in range(c):
@@ -104,7 +104,7 @@ def _solve_some(H, g, index, n, ridge, S, x):
             else:
                 S[a, c] = value / S[c, c]
     for a in range(n):
-        value = g[index[a]]
+        value = g[a]
         for b in range(a):
             value -= S[a, b] * x[b]
         x[a] = value / S[a, a]
@@ -116,51 +116,49 @@ def _solve_some(H, g, index, n, ridge, S, x):
 
 
 @njit(cache=True)
-def nonnegative(H, g, weights, most):
-    """weights (k,) >= 0 with weights'H weights/2 - g'weights least, by Lawson's and
-    Hanson's active set; of |A weights - y|^2 these are H = A'A (k, k), g = A'y (k,).
-    Writes weights; returns how many steps were taken.
+def nonnegative(A, y, weights, most):
+    """weights (k,) >= 0 with which |A weights - y|^2 is least, by Lawson's and Hanson's
+    active set; A (m, k). Writes weights; returns how many steps were taken.
 
     Columns that say the same (four feet of a block) are no harm: one of them stays out.
     """
-    k = len(g)
-    scale, size = 1e-300, 0.0
-    for j in range(k):
-        scale = max(scale, H[j, j])
-        size = max(size, abs(g[j]))
-    passive = np.zeros(k, np.bool_)
-    banned = np.zeros(k, np.bool_)
-    index = np.empty(k, np.int64)
-    S, x = np.empty((k, k)), np.empty(k)
+    m, k = A.shape
+    squares, pull = np.zeros(k), np.zeros(k)
+    for a in range(m):
+        for i in range(k):
+            squares[i] += A[a, i] * A[a, i]
+            pull[i] += A[a, i] * y[a]
+    ridge, tol = 1e-11 * max(1e-300, squares.max()), 1e-10 * np.abs(pull).max()
+    # Of the n columns that are in use: their numbers, products, products with y, and
+    # Cholesky's factors, of which `known` rows stand.
+    index, n, known = np.empty(k, np.int64), 0, 0
+    H, S = np.empty((k, k)), np.empty((k, k))
+    g, x = np.empty(k), np.empty(k)
+    used, banned = np.zeros(k, np.bool_), np.zeros(k, np.bool_)
+    left = y.copy()
     weights[:] = 0.0
-    tol = 1e-10 * size
     steps = 0
     while steps < most:
         steps += 1
         best, j = tol, -1
         for i in range(k):
-            if not passive[i] and not banned[i]:
-                pull = g[i]
-                for a in range(k):
-                    if weights[a] > 0.0:
-                        pull -= H[i, a] * weights[a]
-                if pull > best:
-                    best, j = pull, i
+            if pull[i] > best and not used[i] and not banned[i]:
+                best, j = pull[i], i
         if j < 0:
             break
-        passive[j] = True
-        while True:
-            n = 0
-            for i in range(k):
-                if passive[i]:
-                    index[n] = i
-                    n += 1
-            _solve_some(H, g, index, n, 1e-11 * scale, S, x)
-            least = np.inf
-            for a in range(n):
-                least = min(least, x[a])
-            if least > 0.0:
-                weights[:] = 0.0
+        used[j], index[n], g[n] = True, j, 0.0
+        for a in range(m):
+            g[n] += A[a, j] * y[a]
+        n += 1
+        for c in range(n):
+            value = 0.0
+            for a in range(m):
+                value += A[a, j] * A[a, index[c]]
+            H[n - 1, c] = H[c, n - 1] = value
+        while n:
+            _solve_some(H, g, known, n, ridge, S, x)
+            known = n
+            if x[:n].min() > 0.0:
                 for a in range(n):
                     weights[index[a]] = x[a]
                 banned[:] = False
@@ -171,18 +169,34 @@ def nonnegative(H, g, weights, most):
                     w = weights[index[a]]
                     share = w / (w - x[a]) if w > x[a] else 0.0
                     step = min(step, share)
-            moved = False
+            kept = 0
             for a in range(n):
                 i = index[a]
                 weights[i] += step * (x[a] - weights[i])
                 if x[a] <= 0.0 and weights[i] <= 1e-13 * (1.0 + abs(x[a])):
                     weights[i] = 0.0
-                    passive[i] = False
-                    moved = True
-            if not passive[j] and weights[j] == 0.0:
-                banned[j] = True  # It came in and went out again: no gain there.
-            if not moved or not passive.any():
+                    used[i] = False
+                    if i == j:
+                        banned[j] = True  # It came in and went out: no gain there.
+                    known = min(known, kept)
+                    continue
+                if kept < a:
+                    index[kept], g[kept] = i, g[a]
+                    H[kept, :n] = H[a, :n]
+                    H[:n, kept] = H[:n, a]
+                kept += 1
+            moved, n = kept < n, kept
+            if not moved:
                 break
+        left[:] = y
+        for c in range(n):
+            w = weights[index[c]]
+            for a in range(m):
+                left[a] -= A[a, index[c]] * w
+        pull[:] = 0.0
+        for a in range(m):
+            for i in range(k):
+                pull[i] += A[a, i] * left[a]
     return steps
 
 
@@ -197,52 +211,36 @@ def explain(P, G, is_there, root, share, left, weights, rank):
         weights (n, k) and rank (n,), how many weights are above zero.
     """
     n, m, k = G.shape
-    y, A = np.empty(m), np.empty((m, k))
+    d = share.shape[1]
+    index = np.empty(k, np.int64)
     for i in range(n):
         count = 0
-        index = np.empty(k, np.int64)
         for c in range(k):
             weights[i, c] = 0.0
             if is_there[i, c]:
                 index[count] = c
                 count += 1
+        y, A = np.zeros(m + d), np.zeros((m + d, count))
         for a in range(m):
-            value = 0.0
             for b in range(a + 1):  # root is a lower triangle.
-                value += root[i, a, b] * P[i, b]
-            y[a] = value
+                weight = root[i, a, b]
+                y[a] += weight * P[i, b]
+                for c in range(count):
+                    A[a, c] += weight * G[i, b, index[c]]
+        for a in range(d):
             for c in range(count):
-                value = 0.0
-                for b in range(a + 1):
-                    value += root[i, a, b] * G[i, b, index[c]]
-                A[a, c] = value
+                A[m + a, c] = share[i, a, index[c]]
         rank[i] = 0
         if count:
-            H, g, x = np.empty((count, count)), np.empty(count), np.empty(count)
-            for c in range(count):
-                value = 0.0
-                for a in range(m):
-                    value += A[a, c] * y[a]
-                g[c] = value
-                for d in range(c + 1):
-                    value = 0.0
-                    for a in range(m):
-                        value += A[a, c] * A[a, d]
-                    H[c, d] = H[d, c] = value
-                for d in range(c + 1):
-                    value = 0.0
-                    for a in range(share.shape[1]):
-                        value += share[i, a, index[c]] * share[i, a, index[d]]
-                    H[c, d] += value
-                    if d < c:
-                        H[d, c] += value
-            nonnegative(H, g, x, 4 * count + 20)
+            x = np.empty(count)
+            nonnegative(A, y, x, 4 * count + 20)
             for c in range(count):
                 weights[i, index[c]] = x[c]
-                rank[i] += x[c] > 0.0
-                for a in range(m):
-                    y[a] -= A[a, c] * x[c]
-        left[i] = y
+                if x[c] > 0.0:
+                    rank[i] += 1
+                    for a in range(m):
+                        y[a] -= A[a, c] * x[c]
+        left[i] = y[:m]
 
 
 def unshared_load(places) -> np.ndarray:
