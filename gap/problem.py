@@ -222,6 +222,11 @@ class GapProblem(ABC):
     @abstractmethod
     def nuisances(self) -> Nuisances: ...
 
+    def prior_rows(self, effects: Sequence[Effect]) -> np.ndarray:
+        """(n,) what is known of parameters beforehand, in deviations: of those that
+        data may leave open."""
+        return np.zeros(0)
+
     def replaced(self, effects: Sequence[Effect]) -> np.ndarray | None:
         """(n_b,) which nuisances mean nothing beside these effects, which stand in the
         place of what they change; None: all go on."""
@@ -316,9 +321,10 @@ class GapProblem(ABC):
         """Another effect that no recording of these channels could tell from it."""
         return None
 
-    def widened(self, end: Fitted, k: int) -> dict[str, float]:
-        """Deviations of effect k of a fit, wider where slopes say too little."""
-        return dict(end.std[k])
+    def widened(self, end: Fitted, k: int) -> tuple[dict[str, float], tuple[str, ...]]:
+        """Deviations of effect k of a fit, wider where slopes say too little; and the
+        parameters that may as well be any larger."""
+        return dict(end.std[k]), ()
 
     def error(self, fitted: Fitted) -> float:
         """What the verdict goes by: held-out error in units of the noise."""

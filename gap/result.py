@@ -31,11 +31,13 @@ class Where:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A parameter's value, and how sure it is."""
+    """A parameter's value, and how sure it is. or_more: it may as well be any larger;
+    the deviation is then that of the least that it can be."""
 
     value: float
     std: float
     unit: str
+    or_more: bool = False
 
 
 @dataclass(frozen=True)
@@ -271,7 +273,12 @@ def _effect_json(each: NamedEffect) -> dict[str, Any]:
         "kind": each.kind,
         "at": at,
         "parameters": {
-            name: {"value": _number(p.value), "std": _number(p.std), "unit": p.unit}
+            name: {
+                "value": _number(p.value),
+                "std": _number(p.std),
+                "unit": p.unit,
+                "or_more": p.or_more,
+            }
             for name, p in each.parameters.items()
         },
         "says": each.says,

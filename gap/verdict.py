@@ -136,13 +136,15 @@ def named(choice: Choice, plant: MultibodyPlant) -> NamedEffect:
             spread = float("inf")
         weak |= spread > max(abs(value), 1e-3 * width)
         unit = own_unit if each.unit == OF_CHANNEL else unit_at(each.unit, slides)
-        parameters[each.name] = Estimate(value, spread, unit)
+        or_more = each.name in choice.or_more
+        parameters[each.name] = Estimate(value, spread, unit, or_more)
         if spread > 0.0:
             std[each.name] = spread
     apart = ""
     if choice.ties or kind.tell_apart:
         apart = kind.tell_apart[:1].upper() + kind.tell_apart[1:] + "."
-    says = sentence(choice.effect, kind, std, slides).replace(OF_CHANNEL, own_unit)
+    says = sentence(choice.effect, kind, std, slides, choice.or_more)
+    says = says.replace(OF_CHANNEL, own_unit)
     return NamedEffect(
         choice.effect.kind,
         tuple(choice.effect.at),

@@ -515,7 +515,10 @@ def _settle_step(
 
 def _widened(choice: Choice, problem: GapProblem, end: Fitted) -> Choice:
     k = end.effects.index(choice.effect) if choice.effect in end.effects else -1
-    return replace(choice, std=problem.widened(end, k)) if k >= 0 else choice
+    if k < 0:
+        return choice
+    std, or_more = problem.widened(end, k)
+    return replace(choice, std=std, or_more=or_more)
 
 
 def _with_inseparable(choice: Choice, problem: GapProblem) -> Choice:

@@ -183,7 +183,7 @@ def effects_table(result: GapResult) -> Table:
     rows: list[tuple] = []
     for each in result.effects:
         values = ", ".join(
-            f"{name} {with_deviation(p.value, p.std)} {p.unit}".rstrip()
+            f"{name} {with_deviation(p.value, p.std, p.or_more)} {p.unit}".rstrip()
             for name, p in each.parameters.items()
         )
         e = each.evidence

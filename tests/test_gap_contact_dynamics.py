@@ -248,7 +248,7 @@ def test_a_side_of_a_patch_that_nothing_crosses_is_said_not_to_be_known(tmp_path
     patch = Effect("friction_patch", [PAIR], {"friction": mu, **sides})
     end = fit_effects(problem, screen, [patch], [tuple(sides)])
     assert problem.reweigh(end.left)  # As the search does with what it has chosen.
-    std = problem.widened(end, 0)
+    std, _ = problem.widened(end, 0)
     assert std["x_max"] == np.inf
     # No foot comes near this one, as these pushes go; across the others they do.
     assert 0.004 <= std["x_min"] < np.inf
@@ -268,14 +268,14 @@ def test_of_a_friction_s_deviation_held_out_rows_are_asked(tmp_path, monkeypatch
     calm = n.columns @ end.b
 
     def deviation(rows) -> float:
-        """Where the rows (n,) want the friction to be what it is, and others nothing."""
+        """Where the rows (n,) want the friction as it is, and others nothing."""
 
         def residual(effects):
             off = effects[0].parameters["friction"] - best
             return calm + 1e4 * off * rows / np.sqrt(rows.sum())
 
         monkeypatch.setattr(problem, "residual", residual)
-        return problem.widened(end, 0)["friction"]
+        return problem.widened(end, 0)[0]["friction"]
 
     assert deviation(fitted) == np.inf
     assert deviation(~fitted) < 0.01

@@ -9,8 +9,13 @@ from gap_benchmark.push_world import BLOCK, TABLE
 
 from makebreak.gap.data.recording import read_recordings
 from makebreak.gap.numerics.permitted_forces import tangents
+from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Fitted
-from makebreak.gap.residuals.contact_problem import NO_GAP, ContactProblem
+from makebreak.gap.residuals.contact_problem import (
+    FRICTION_SPREAD,
+    NO_GAP,
+    ContactProblem,
+)
 from makebreak.gap.residuals.sap_lift import sap_lift
 from makebreak.gap.residuals.widened_contacts import (
     distances_off,
@@ -19,9 +24,12 @@ from makebreak.gap.residuals.widened_contacts import (
     widened_slots,
 )
 from makebreak.gap.result import GapMeasure
+from makebreak.gap.search.fit import fit_effects
 from makebreak.gap.search.select import _Search
 from makebreak.gap.verdict import two_figures
+from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
+from makebreak.models.effects.kind import sentence as effect_sentence
 from makebreak.models.scene import read_scene
 
 
@@ -137,15 +145,40 @@ def test_a_scene_that_sap_lifts_gets_a_warning(problem, monkeypatch):
 def test_friction_of_what_sticks_is_a_bound_and_its_deviation_says_so(problem):
     """The tip sticks, and 0.9 permits no more than 0.8 does; the block slides over the
     table, and there the cost grows with the square: a deviation is what adds one."""
-    start = started(problem)
-    table = f"{BLOCK}~{TABLE}"
+    start, tip, table = started(problem), tip_pair(problem), f"{BLOCK}~{TABLE}"
     mu = problem.dynamics.now("contact_friction", [table])["friction"]
-    deviation = {}
-    for at, value in ((tip_pair(problem), 0.9), (table, mu)):
+    of_tip = problem.dynamics.now("contact_friction", [tip])["friction"]
+
+    def widened(at, value):
         end = replace(
             start, effects=[Effect("contact_friction", [at], {"friction": value})],
             std=[{"friction": 1e-6}],
         )  # fmt: skip
-        deviation[at] = problem.widened(end, 0)["friction"]
-    assert deviation[tip_pair(problem)] == np.inf
-    assert 1e-6 < deviation[table] < 0.03 * mu
+        std, or_more = problem.widened(end, 0)
+        return std["friction"], or_more
+
+    # More than the scene's is known from below, of which two deviations are no more
+    # than what held the tip; less than the scene's is not known at all.
+    std, or_more = widened(tip, 0.9)
+    assert or_more == ("friction",) and 0.0 < 0.9 - 2.0 * std < of_tip
+    assert widened(tip, 0.95 * of_tip) == (np.inf, ())
+    std, or_more = widened(table, mu)
+    assert or_more == () and 1e-6 < std < 0.03 * mu
+
+
+def test_a_friction_that_holds_is_fitted_no_farther_off_than_it_must_be(problem):
+    """All that holds explains alike: what is nearest to the scene's is taken, and the
+    sentence says that it may be more."""
+    tip = tip_pair(problem)
+    now = problem.dynamics.now("contact_friction", [tip])["friction"]
+    three = Effect("contact_friction", [tip], {"friction": 3.0 * now})
+    [row] = problem.prior_rows([three])
+    assert row == pytest.approx(np.log(3.0) / FRICTION_SPREAD)
+    n = problem.nuisances()
+    screen = Screen(problem.base(), n.columns, n.prior, problem.train(), reach=n.reach)
+    effect = Effect("contact_friction", [tip], {"friction": 1.4})
+    end = fit_effects(problem, screen, [effect])
+    assert end.effects[0].parameters["friction"] == pytest.approx(now, rel=0.1)
+    kind = KINDS["contact_friction"]
+    said = effect_sentence(effect, kind, {"friction": 0.2}, or_more=("friction",))
+    assert said.endswith("is 1.4 (at least 1)")

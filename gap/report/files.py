@@ -221,7 +221,7 @@ def _doubts(result: GapResult) -> str:
 def _effect(each: NamedEffect, result: GapResult, i: int) -> str:
     rows = ""
     for name, p in each.parameters.items():
-        value = _text(with_deviation(p.value, p.std))
+        value = _text(with_deviation(p.value, p.std, p.or_more))
         rows += f"<tr><td>{escape(name)}</td><td class=n>{value}</td>"
         rows += f"<td>{escape(p.unit)}</td></tr>"
     e = each.evidence

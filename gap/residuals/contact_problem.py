@@ -67,6 +67,9 @@ PATCH_RUNS, PATCH_STARTS, PATCHES = 120, 8, 3
 # Of a patch's side: how far it is moved [m], and what that may add to the sum of
 # squares (neighbouring rows err together: four times what one row would count).
 MOVED, PROFILE = (5e-4, 1e-3, 2e-3, 4e-3, 8e-3, 0.016, 0.032, 0.064), 16.0
+# A friction that sticks may be anything larger: its logarithm is known to be off the
+# scene's by about so much.
+FRICTION_SPREAD = 1.0
 # By what share of itself a friction is moved likewise.
 SHARES = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 0.9)
 AT_MOST = 20.0  # Of a row, where a block of time is asked whether it is loud.
@@ -589,12 +592,26 @@ class ContactProblem(ContactDynamics, GapProblem):
         x = scale * found.x
         return float(found.fun), friction + x[0], sides + x[1:]
 
-    def widened(self, end: Fitted, k: int) -> dict[str, float]:
+    def prior_rows(self, effects: Sequence[Effect]) -> np.ndarray:
+        """Where something sticks all friction that is enough explains alike: what is
+        nearest to the scene's is taken."""
+        rows = []
+        for e in effects:
+            if e.kind == "contact_friction":
+                for pair in self._pairs_met:
+                    now = self._friction_now(pair)
+                    if now > 0.0 and self._at_pair(e, pair):
+                        off = np.log(max(e.parameters["friction"], 1e-3) / now)
+                        rows.append(off / FRICTION_SPREAD)
+        return np.array(rows)
+
+    def widened(self, end: Fitted, k: int) -> tuple[dict[str, float], tuple[str, ...]]:
         """A patch's side that nothing slid across can be anywhere until something did,
         and what sticks says of friction only that it is not less: each is moved by ever
         more, and its deviation is half of how far that goes without a loss of PROFILE
         noise variances; infinite where it goes on. Of a friction held-out rows are
-        asked: a single fitted one may want more and more of it."""
+        asked: a single fitted one may want more and more of it; one that is larger than
+        the scene's, and may be any larger, is known from below."""
         effect, std = end.effects[k], dict(end.std[k])
         p, asked = effect.parameters, np.ones(len(end.r), bool)
         if effect.kind == "friction_patch":
@@ -605,7 +622,7 @@ class ContactProblem(ContactDynamics, GapProblem):
             if not self._train.all():
                 asked = ~self.train()
         else:
-            return std
+            return std, ()
         calm = self.nuisances().columns @ end.b
         limit = PROFILE * max(end.score, 1.0) ** 2
 
@@ -618,15 +635,31 @@ class ContactProblem(ContactDynamics, GapProblem):
                 return np.inf
 
         least = cost(p)
+        or_more: tuple[str, ...] = ()
         for name, steps in moves.items():
-            for sign in (-1.0, 1.0):
-                far = np.inf
+            far = {-1.0: np.inf, 1.0: np.inf}
+            for sign in far:
                 for d in steps:
                     if cost({**p, name: p[name] + sign * d}) - least > limit:
-                        far = d
+                        far[sign] = d
                         break
-                std[name] = max(std.get(name, 0.0), 0.5 * far)
-        return std
+            if name == "friction" and far[-1.0] < far[1.0] == np.inf:
+                if p[name] > self._friction_at(effect):
+                    std[name], or_more = 0.5 * far[-1.0], (name,)
+                    continue
+            std[name] = max(std.get(name, 0.0), 0.5 * max(far.values()))
+        return std, or_more
+
+    def _friction_at(self, effect: Effect) -> float:
+        """In the scene, of the pair that an effect is of."""
+        return next(
+            (
+                self._friction_now(p)
+                for p in self._pairs_met
+                if self._at_pair(effect, p)
+            ),
+            np.inf,
+        )
 
     def _slid_over(self, pair) -> np.ndarray:
         """(n, 2) places of the ground over which a point of the pair slid."""

@@ -54,6 +54,7 @@ def fit_effects(
             rows = screen.cost_rows(residual(z))
         except (ValueError, RuntimeError):  # Drake refuses such parameters.
             rows = np.full(_n_rows(screen), 1e6)
+        rows = np.append(rows, problem.prior_rows(free.effects(z)))
         return np.where(np.isfinite(rows), rows, 1e6)
 
     solved = least_squares(

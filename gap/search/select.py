@@ -78,7 +78,8 @@ PAIRED = 10  # Candidates of which all pairs are tried against a single one.
 @dataclass(frozen=True, eq=False)
 class Choice:
     """One effect as chosen. before, after: held-out error without and with it;
-    of_two: it was needed beside its rival, which was, too."""
+    of_two: it was needed beside its rival, which was, too; or_more: parameters that may
+    as well be any larger."""
 
     effect: Effect
     std: dict[str, float]
@@ -91,6 +92,7 @@ class Choice:
     size: int
     in_group: bool = False
     of_two: bool = False
+    or_more: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,8 @@
 A window begins where the robot does not touch what it is about to push, and what it
 pushes is at rest: the object's place is then the mean of many samples, and nothing is
 pressed into anything. From the middle of a push a tenth of a millimetre, which noise
-is, would be newtons. Where there is no such start, windows begin as elsewhere.
+is, would be newtons. Where there is no such start, windows begin as elsewhere; in a
+long episode, in which an object is pushed, left and pushed again, they begin so, too.
 """
 
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from makebreak.gap.data.recording import Episode, Recording
+from makebreak.gap.residuals.contact_shapes import ContactShapes, poses_of
 from makebreak.gap.simulation.windows import TURN, Window, WindowModel
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import full_name, one_dof_joints
@@ -23,6 +25,11 @@ WINDOW_SEC = 0.6  # Reaches into the sliding.
 BEFORE_SEC = 0.04  # It begins so long before the object moves,
 REST_SEC = 0.1  # after as much rest, or more.
 RESTS = 3e-3  # Slower is at rest [m/s], [rad/s] over ten.
+LONG_SEC, EVERY_SEC = 3.0, 1.5  # A longer episode has a window in so long, at most,
+MOST_OF_LONG = 24  # and this many.
+APART = 5e-3  # What is so far from all that could push it is left alone [m],
+GOES, SEEMS = 3e-3, 4.0  # It is pushed if it goes so far [m], times its noise.
+SEEN_APART, COMES_SEC = 0.02, 0.2  # asked every so often, and no longer before a push.
 DRAWS = 3  # Of uncertain starts.
 # Laws of contact are approximations: of how far an object moves, and a driven joint.
 BLUR, BLUR_DRIVEN = 0.005, 0.0005
@@ -44,8 +51,11 @@ class PushWindows(WindowModel):
         episodes: set[tuple[int, int]] | None = None,
     ):
         self._only = episodes
+        self._shapes: ContactShapes | None = None
         scene, led = led_as_measured(scene, recordings)
-        super().__init__(scene, recordings, WINDOW_SEC, by_episode=True, most=MOST)
+        every = [_most_of(r, e) for r in recordings for e in r.episodes]
+        most = max(MOST, min(sum(n for n in every if n > 2), MOST_OF_LONG))
+        super().__init__(scene, recordings, WINDOW_SEC, by_episode=True, most=most)
         keep = [
             k for k, c in enumerate(self.channels)
             if c.rsplit(".", 1)[0] not in led and varies(recordings, c)
@@ -77,13 +87,13 @@ class PushWindows(WindowModel):
     def _cut(self, i, recording: Recording, episode: Episode, hop, block, number):
         if self._only is not None and (i, episode.number) not in self._only:
             return
-        before = len(self.windows)
+        before, most = len(self.windows), _most_of(recording, episode)
         found = self._from_rest(i, recording, episode)
-        if not found:
+        if not found or most > 2:
             super()._cut(i, recording, episode, hop, block, number)
-            self.windows[before + 2 :] = []
-            return
-        self.windows += found[:2]
+            others = self.windows[before:]
+            self.windows[before:] = _evenly(others, most) if most > 2 else others[:2]
+        self.windows += _evenly(found, most) if most > 2 else found[:2]
 
     def _from_rest(self, i, recording: Recording, episode: Episode) -> list[Window]:
         time = recording.time[episode.rows]
@@ -110,13 +120,60 @@ class PushWindows(WindowModel):
         for a, b in zip(edges[::2], edges[1::2], strict=True):
             if b >= len(time) or time[b] - time[a] < REST_SEC + BEFORE_SEC:
                 continue
-            if a > 0:  # It has come to rest, against what pushed it perhaps.
-                continue
             k = int(np.searchsorted(time, time[b] - BEFORE_SEC))
+            if a > 0:  # It has come to rest, against what pushed it perhaps.
+                if _most_of(recording, episode) <= 2:
+                    continue
+                first = int(np.searchsorted(time, time[b] - COMES_SEC))
+                k = self._last_apart(time, states, max(a, first), k)
+                if k < 0 or time[k] - time[a] < REST_SEC:
+                    continue
+                if not self._goes(recording, states, time, k):
+                    continue
             window = self._window_at(i, recording, episode, time, states, spreads, a, k)
             if window is not None:
                 found.append(window)
         return found
+
+    def _goes(self, recording: Recording, states, time, k: int) -> bool:
+        """Whether a body goes farther in a window from row k on than noise seems to."""
+        end = int(np.searchsorted(time, time[k] + self.window_sec))
+        for body in self.bodies:
+            for name in (f"{body}.{axis}" for axis in "xyz"):
+                if name in states:
+                    least = max(GOES, SEEMS * recording.channels[name].noise)
+                    if np.ptp(states[name][k:end, 0]) > least:
+                        return True
+        return False
+
+    def _last_apart(self, time, states, first: int, last: int) -> int:
+        """The last of some rows at which no robot is near what it pushes; -1: none."""
+        if self._shapes is None:
+            self._shapes = ContactShapes(self.dynamics.loaded)
+        plant, shapes = self.dynamics.plant, self._shapes
+        joints = {
+            full_name(plant, j): j.position_start() for j in one_dof_joints(plant)
+        }
+        asked = np.arange(time[last], time[first] - 1e-9, -SEEN_APART)
+        rows = np.unique(np.searchsorted(time, asked).clip(first, last))
+        q = np.tile(plant.GetPositions(plant.CreateDefaultContext()), (len(rows), 1))
+        for name, index in joints.items():
+            if f"{name}.position" in states:
+                q[:, index] = states[f"{name}.position"][rows, 0]
+        free = set()
+        for k in plant.GetFloatingBaseBodies():
+            body = plant.get_body(k)
+            free.add(int(k))
+            for n, axis in enumerate((*TURN, "x", "y", "z")):
+                if (name := f"{full_name(plant, body)}.{axis}") in states:
+                    q[:, body.floating_positions_start() + n] = states[name][rows, 0]
+            i = body.floating_positions_start()
+            q[:, i : i + 4] /= np.linalg.norm(q[:, i : i + 4], axis=1)[:, None]
+        near = np.zeros(len(rows), bool)
+        for s in shapes.slots(poses_of(plant, q, shapes), APART):
+            if free & {s.a, s.b} and not shapes.anchored & {s.a, s.b}:
+                near |= s.phi < APART
+        return int(rows[~near][-1]) if not near.all() else -1
 
     def _window_at(self, i, recording, episode, time, states, spreads, a, k):
         end = int(np.searchsorted(time, time[k] + self.window_sec, "right"))
@@ -167,6 +224,18 @@ class PushWindows(WindowModel):
             replace(w, std=np.sqrt(w.std**2 + v + far**2))
             for w, v in zip(self.windows, wide, strict=True)
         ]
+
+
+def _most_of(recording: Recording, episode: Episode) -> int:
+    """Windows of an episode, at most."""
+    length = float(np.ptp(recording.time[episode.rows]))
+    return 2 if length < LONG_SEC else int(length / EVERY_SEC)
+
+
+def _evenly(windows: list[Window], most: int) -> list[Window]:
+    if len(windows) <= most:
+        return windows
+    return [windows[k] for k in np.linspace(0, len(windows) - 1, most).astype(int)]
 
 
 def varies(recordings: Sequence[Recording], channel: str) -> bool:

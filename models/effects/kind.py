@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 from xml.dom.minidom import Element
@@ -249,11 +249,14 @@ def of_slides(effect: Effect, plant: MultibodyPlant) -> bool:
     return bool(joints) and all(isinstance(j, PrismaticJoint) for j in joints)
 
 
-def with_deviation(value: float, std: float) -> str:
+def with_deviation(value: float, std: float, or_more: bool = False) -> str:
     """value +- std, to the digits that the deviation leaves: 0.03149 +- 0.00002.
 
     A deviation that begins with 1 has two digits. Without a finite one: three digits.
+    or_more: the value may as well be any larger, and is "0.8 (at least 0.4)".
     """
+    if or_more and 0.0 < std < np.inf:
+        return f"{value:.2g} (at least {value - 2.0 * std:.2g})"
     if not 0.0 < std < np.inf:
         return f"{value:.3g}"
     digits = 2 if f"{std:.0e}"[0] == "1" else 1
@@ -269,11 +272,13 @@ def sentence(
     kind: EffectKind,
     std: Mapping[str, float] | None = None,
     slides: bool = False,
+    or_more: Collection[str] = (),
 ) -> str:
     """The report's sentence on an effect.
 
     Args: std, of the parameters where they are known: as "+- ...", an infinite one
-        in words; slides, whether it is of joints that slide.
+        in words; slides, whether it is of joints that slide; or_more, parameters that
+        may as well be any larger than two deviations below what they are.
     """
     first = effect.parameters.get(kind.parameters[0].name, 0.0)
     is_less = bool(kind.says_less) and first < 0.0
@@ -286,7 +291,8 @@ def sentence(
             words[each.name] = "(unset)"
             continue
         spread = (std or {}).get(each.name)
-        text = with_deviation(value, 0.0 if spread is None else spread)
+        at_least = each.name in or_more and spread is not None
+        text = with_deviation(value, 0.0 if spread is None else spread, at_least)
         words[each.name] = f"{text} {unit_at(each.unit, slides)}".rstrip()
         if spread is not None and not np.isfinite(spread):
             words[each.name] += " (not identifiable from these data)"
