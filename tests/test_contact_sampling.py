@@ -767,6 +767,37 @@ def test_a_tip_that_comes_down_on_the_object_goes_up_and_comes_down_farther_out(
     assert task.extra == 0.0
 
 
+@pytest.mark.parametrize(("moves", "learned"), [(0.003, 0.0), (0.0, 0.003)])
+def test_a_place_that_the_object_came_nearer_to_is_reached(planner, moves, learned):
+    """While the tip travels the object still moves, by less than would make the place
+    another, or is learned to reach farther out: what is left of the 4 mm is too little
+    for a way along the table."""
+    shape, config = planner[2], PushConfig()
+    x = state([0.35, 0.0, 0.1], (0.5, 0.0, 0.3))
+    place = places_of(planner)[0][0, :2]
+    in_object = to_object(x, place)
+    outline = outline_at((0.5, 0.0, 0.3))
+    task = PushState(WAIT, x[P_TIP].copy(), np.zeros(3), np.zeros(3))
+    nearer = 0.0
+    for k in range(800):
+        if k == 4:  # The place is held by now.
+            assert task.place is not None
+            x[P_BALL.start : P_BALL.start + 2] -= (
+                moves * inward(place[None], outline)[0]
+            )
+            in_object, nearer = to_object(x, place), learned
+            outline = outline_at((*x[P_BALL][:2], 0.3))
+        task = next_push(
+            config, task, shape, 0.0125, x, True, in_object, 1, HEIGHT, 0.004, nearer
+        )
+        x[P_TIP] = task.p
+        if task.phase == CONTACT:
+            break
+    assert task.phase == CONTACT
+    near = distance_to_outline(task.p[None, :2], outline)[0] - 0.0195
+    assert near >= 0.002 + nearer - 1.5e-3  # As near as a tip counts as arrived.
+
+
 @pytest.mark.parametrize("off", [[0.02, 0.0, 0.0], [0.0, 0.0, 0.02]])
 def test_a_place_that_is_not_reached_does_not_keep_the_tip_for_ever(planner, off):
     """The arm stays 20 mm beside its place, or 20 mm above it, whatever it does."""

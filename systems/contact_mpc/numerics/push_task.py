@@ -189,6 +189,11 @@ def next_push(
     held = state.place if state.place is None else state.place + dt * along[:2]
     if held is None or np.hypot(*(now - held)) > config.place_change:
         held = now
+    # One that came nearer since, by an object that was still moving, or by what was
+    # learned, would be no way's end: the tip would go down to it and up again for ever.
+    short = distance - distance_to_outline(held[None], outline)[0]
+    if short > 0.0:
+        held = held - (short + 1e-4) * inward(held[None], outline)[0]
     goal = np.array([*held, height])
     # Below the object's top it meets a side, not an edge.
     if state.p[2] > max(height + LOW, EDGE * shape.top):
