@@ -41,18 +41,19 @@ def tangents(normal) -> tuple[np.ndarray, np.ndarray]:
     return e1, np.cross(normal, e1)
 
 
-def test_functions(times, centres, half: float) -> tuple[csr_matrix, csr_matrix]:
+def test_functions(times, centres, half) -> tuple[csr_matrix, csr_matrix]:
     """Weights (n_centres, n) that give, from samples at times (n,), the mean of a
     signal over a test function about each centre, and the mean of its second
     derivative. Both are exact for cubics, however samples lie. A row is empty where
     fewer than FEWEST samples are within, or where none is in one of its thirds.
 
-    Args: half, half the width of a test function [s].
+    Args: half, half the width of a test function [s]; of each (n_centres,), or of all.
     """
     t, rows, columns = np.asarray(times, float), [], []
     means: list[np.ndarray] = []
     seconds: list[np.ndarray] = []
-    for i, c in enumerate(np.asarray(centres, float)):
+    halves = np.broadcast_to(half, np.shape(centres))
+    for i, (c, half) in enumerate(zip(np.asarray(centres, float), halves, strict=True)):
         a, b = np.searchsorted(t, [c - half, c + half])
         u = (t[a:b] - c) / half
         if len(u) < FEWEST or any(
@@ -76,6 +77,7 @@ def test_functions(times, centres, half: float) -> tuple[csr_matrix, csr_matrix]
             A = (V * bump) @ V.T
             change = np.linalg.solve(A, np.array(moments) - V @ weights)
             into.append(weights + bump * (change @ V))
+        seconds[-1] = seconds[-1] / half**2
         rows.append(np.full(b - a, i))
         columns.append(np.arange(a, b))
     shape = (len(centres), len(t))
@@ -84,7 +86,7 @@ def test_functions(times, centres, half: float) -> tuple[csr_matrix, csr_matrix]
     where = (np.concatenate(rows), np.concatenate(columns))
     return (
         csr_matrix((np.concatenate(means), where), shape),
-        csr_matrix((np.concatenate(seconds) / half**2, where), shape),
+        csr_matrix((np.concatenate(seconds), where), shape),
     )
 
 
@@ -262,12 +264,14 @@ def roots_of(covariance) -> np.ndarray:
     return np.linalg.solve(L, np.broadcast_to(np.eye(L.shape[-1]), L.shape))
 
 
-def held_means(times, centres, half: float) -> csr_matrix:
+def held_means(times, centres, half) -> csr_matrix:
     """(n_centres, n) weights that give the means of a signal that holds each of its n
-    values from its time until the next one's; the last holds on."""
+    values from its time until the next one's; the last holds on. half: as of
+    test_functions."""
     t = np.asarray(times, float)
     rows, columns, values = [], [], []
-    for i, c in enumerate(np.asarray(centres, float)):
+    halves = np.broadcast_to(half, np.shape(centres))
+    for i, (c, half) in enumerate(zip(np.asarray(centres, float), halves, strict=True)):
         a = max(int(np.searchsorted(t, c - half, "right")) - 1, 0)
         b = int(np.searchsorted(t, c + half))
         u = np.clip((np.append(t[a:b], c + half) - c) / half, -1.0, 1.0)

@@ -19,10 +19,15 @@ import numpy as np
 
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.numerics.permitted_forces import explain, roots_of
-from makebreak.gap.residuals.contact_means import LEAST_FELT, MODELLED, SLIDES
-from makebreak.gap.residuals.contact_shapes import Slot
+from makebreak.gap.residuals.contact_means import (
+    HOP,
+    LEAST_FELT,
+    MODELLED,
+    SLIDES,
+)
 from makebreak.gap.residuals.permitted_contacts import (
     SURFACES,
+    Geometry,
     PermittedContacts,
     Shift,
 )
@@ -356,12 +361,12 @@ class ContactDynamics(PermittedContacts):
         whose noise divides the rows, if it is not that of `effects`."""
         needs = self._all_needs(effects)
         shaped = [e for e in effects if e.kind in SHAPED]
-        G, there, _, slots, sharing = self._generators(shaped, shift)
+        G, there, _, geometry, sharing = self._generators(shaped, shift)
         root = self._root(effects if weighed_as is None else weighed_as)
         r = self._explained(needs, G, there, sharing, root)
         r = r * self.free[:, None]
         more = self.means.extra / np.sqrt(np.maximum(self.means.extra_var, 1e-300))
-        return np.hstack([r, more, self._distances(slots)])
+        return np.hstack([r, more, self._distances(geometry)])
 
     def _explained(self, needs, G, there, sharing, root) -> np.ndarray:
         """What permitted forces leave; only where anything is other than the last time
@@ -385,13 +390,12 @@ class ContactDynamics(PermittedContacts):
         self._last = (needs, G, there, root, r)
         return r
 
-    def _distances(self, slots: Sequence[Slot]) -> np.ndarray:
+    def _distances(self, geometry: Geometry) -> np.ndarray:
         """(K, n) over what shapes and poses are known to, and their numbers: of each
         pair that lies, height and slopes; of each other one, the distance."""
-        masks = dict(zip((s.key for s in self.slots), self._masks, strict=True))
+        slots, masks = geometry.slots, geometry.masks
         shape = self.shape_std()
         K = len(self.means.time)
-        thinned = np.arange(K) % THIN == 0
         columns = []
         for pair in self._pairs_met:
             mine = [s for s in slots if self._pair_of(s) == pair and s.key in masks]
@@ -403,7 +407,7 @@ class ContactDynamics(PermittedContacts):
             n = mask.sum(axis=0)
             some = n > 0.0
             there = np.asarray(self._W @ some.astype(float)).ravel()
-            good = (there > 0.999) & thinned
+            good = there > 0.999
             _, turn = self._pose_noise(pair)
             stiffness = mine[0].stiffness
             mean = np.sum(mask * phi, axis=0) / np.maximum(n, 1.0)
@@ -418,6 +422,7 @@ class ContactDynamics(PermittedContacts):
                 arm = float(np.sqrt(np.median(A[some].trace(axis1=1, axis2=2)) / 4.0))
                 # Each of several points carries its share.
                 h = self._W @ mean + pressed / np.maximum(self._W @ n, 1.0)
+                good = self._thinned(good)
                 columns.append(np.where(good, h / self.distance_std(pair), 0.0))
                 std = np.sqrt((shape / max(arm, 1e-3)) ** 2 + turn**2 + 1e-6)
                 spread = np.asarray(self._W @ (n >= 3).astype(float)).ravel() > 0.999
@@ -432,8 +437,20 @@ class ContactDynamics(PermittedContacts):
                 if not self.shapes.anchored & set(pair) or free:
                     # Seen near each other, but known to touch by a force alone.
                     good = good & self._is_pressed(pair)
+                good = self._thinned(good)
                 columns.append(np.where(good, d / self.distance_std(pair), 0.0))
         return -np.stack(columns, axis=1) if columns else np.zeros((K, 0))
+
+    def _thinned(self, good: np.ndarray) -> np.ndarray:
+        """(K,) of the test functions that are good those that tell a distance: the
+        first, and after each the next one that is so much later."""
+        m, out = self.means, np.zeros(len(good), bool)
+        apart = (THIN - 0.5) * HOP * self.half
+        last = (-1, -np.inf)
+        for k in np.flatnonzero(good):
+            if m.episode[k] != last[0] or m.time[k] - last[1] > apart:
+                out[k], last = True, (m.episode[k], m.time[k])
+        return out
 
     def shape_std(self) -> float:
         """[m] to which shapes are known."""

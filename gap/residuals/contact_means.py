@@ -15,7 +15,11 @@ from scipy.sparse import block_diag, csr_matrix
 from scipy.spatial.transform import Rotation
 
 from makebreak.gap.data.recording import Episode, Recording
-from makebreak.gap.numerics.permitted_forces import held_means, test_functions
+from makebreak.gap.numerics.permitted_forces import (
+    FEWEST,
+    held_means,
+    test_functions,
+)
 from makebreak.gap.residuals.contact_shapes import ContactShapes, Slot, poses_of
 from makebreak.gap.simulation.windows import TURN, spin_of
 from makebreak.models.drives import law_of
@@ -31,6 +35,7 @@ HOP = 0.75  # From one test function to the next, in half widths.
 NODES = 5  # Rows of a test function at which geometry and dynamics are evaluated.
 MOST = 420  # Test functions at most, and how many of them without a moving object.
 STILL = 80
+FEWEST_MEANS = 30
 BESIDE = -1  # Marks what a body touches beside what carries it.
 FAR = 1.0  # Of what is not there [m].
 HIT = 20.0  # Smoothed, a free body is accelerated so much by an impact alone [m/s2].
@@ -135,6 +140,10 @@ class _Means:
     extra: np.ndarray  # (K, n_extra) measured rates and efforts less what they must be.
     extra_var: np.ndarray
 
+    def of(self, some: np.ndarray) -> "_Means":
+        """Of some (K,) test functions."""
+        return _Means(**{name: x[some] for name, x in vars(self).items()})
+
 
 class ContactMeans:
     """The recordings of a scene as means over test functions.
@@ -166,7 +175,7 @@ class ContactMeans:
         self._choose_half()
         self._touching = self._touching_rows()
         self.means = self._all_means()
-        if len(self.means.time) < 30:
+        if len(self.means.time) < FEWEST_MEANS:
             raise ValueError("the recordings hold too little motion")
 
     # ----- What is there
@@ -320,6 +329,7 @@ class ContactMeans:
                     if len(t) > 2:
                         slowest = max(slowest, float(np.median(np.diff(t))))
         self.half = float(np.clip(SAMPLES * slowest, LEAST_HALF, MOST_HALF))
+        self._least_half = max(0.5 * (FEWEST + 1) * slowest, LEAST_HALF)
 
     def _poses_at(self, q: np.ndarray):
         return poses_of(self.plant, q, self.shapes)
@@ -470,12 +480,13 @@ class ContactMeans:
 
     def _means_of(self, number: int, t: _Track) -> _Means | None:
         recording = self.recordings[t.recording]
-        half, n_v = self.half, self.plant.num_velocities()
-        centres = np.arange(t.time[0] + half, t.time[-1] - half, HOP * half)
+        n_v = self.plant.num_velocities()
+        whole = self.half
+        centres = np.arange(t.time[0] + whole, t.time[-1] - whole, HOP * whole)
         rows = slice(self._offset[number], self._offset[number + 1])
         good = np.ones(len(centres), bool)
-        first = np.searchsorted(t.time, centres - half)
-        last = np.searchsorted(t.time, centres + half)
+        first = np.searchsorted(t.time, centres - whole)
+        last = np.searchsorted(t.time, centres + whole)
         for touching in self._touching.values():  # No contact that comes or goes.
             own = touching[rows].astype(int)
             total = np.concatenate([[0], np.cumsum(own)])
@@ -483,9 +494,11 @@ class ContactMeans:
             good &= (inside == 0) | (inside == last - first)
         total = np.concatenate([[0], np.cumsum(self._is_struck(rows))])
         good &= total[last] == total[first]
-        centres = centres[good]
+        centres, half = self._with_short_touches(t, rows, centres[good])
         if not len(centres):
             return None
+        first = np.searchsorted(t.time, centres - half)
+        last = np.searchsorted(t.time, centres + half)
         K = len(centres)
         a, a_var = np.zeros((K, n_v)), np.zeros((K, n_v))
         held = held_means(t.time, centres, half)
@@ -509,7 +522,9 @@ class ContactMeans:
             dd, w, y, there, var = second(name, t.q[:, i_q] if stages else None)
             a[:, i_v] = dd @ y
             a_var[:, i_v] = np.asarray(dd.multiply(dd).sum(axis=1)).ravel() * var
-            u, u_var, du = self._effort(joint, recording, t, held, w, there, centres)
+            u, u_var, du = self._effort(
+                joint, recording, t, held, w, there, centres, half
+            )
             effort[:, i_v], effort_var[:, i_v], slope[:, i_v] = u, u_var, du
         for body, (i_q, i_v) in self.bodies.items():
             for k, axis in enumerate("xyz"):
@@ -543,9 +558,9 @@ class ContactMeans:
         # Nodes: rows spread over each test function.
         wr, wc, wv = [], [], []
         for k in range(K):
-            b, e = np.searchsorted(t.time, [centres[k] - half, centres[k] + half])
+            b, e = first[k], last[k]
             some = np.unique(np.linspace(b, e - 1, NODES + 2).astype(int))[1:-1]
-            u = (t.time[some] - centres[k]) / half
+            u = (t.time[some] - centres[k]) / half[k]
             w_k = np.maximum(1.0 - u * u, 0.0) ** 4
             wr.append(np.full(len(some), k))
             wc.append(some)
@@ -554,19 +569,45 @@ class ContactMeans:
             (np.concatenate(wv), (np.concatenate(wr), np.concatenate(wc))),
             (K, len(t.time)),
         )
-        wrench, wrench_var = self._wrench_means(recording, t, centres)
-        extra, extra_var = self._extra_means(recording, t, centres, effort)
+        wrench, wrench_var = self._wrench_means(recording, t, centres, half)
+        extra, extra_var = self._extra_means(recording, t, centres, half, effort)
         centre = self._offset[number] + np.clip(
             np.searchsorted(t.time, centres), 0, len(t.time) - 1
         )
-        full &= ~self._maybe_felt(first[good], last[good], rows, wrench, wrench_var)
+        full &= ~self._maybe_felt(first, last, rows, wrench, wrench_var)
         part = _Means(
             np.full(K, number), centres, a, a_var, effort, effort_var, slope, centre,
             weights, wrench, wrench_var, extra, extra_var,
         )  # fmt: skip
         if not full.all():
-            part = _Means(**{name: x[full] for name, x in vars(part).items()})
+            part = part.of(full)
         return part if len(part.time) else None
+
+    def _with_short_touches(self, t: _Track, rows: slice, centres):
+        """Centres (K,), sorted, and half widths (K,) of test functions: those that are
+        given, and one for each touch that is felt and holds none of them, as wide as
+        the touch lasts. A push often takes less than a slow camera's test function."""
+        halves = np.full(len(centres), self.half)
+        felt = np.zeros(len(t.time), bool)
+        changes = np.zeros(len(t.time), bool)
+        for key, touching in self._touching.items():
+            own = touching[rows]
+            changes[1:] |= own[1:] != own[:-1]
+            if key in self._apart:
+                felt |= own
+        changes |= self._is_struck(rows)
+        edges = np.flatnonzero(np.concatenate([[True], changes[1:], [True]]))
+        added, widths = [], []
+        for a, b in zip(edges, edges[1:], strict=False):
+            start, end = t.time[a], t.time[b - 1]
+            half = min(0.5 * (end - start), self.half)
+            inside = (centres > start) & (centres < end)
+            if felt[a] and half >= self._least_half and not inside.any():
+                added.append(0.5 * (start + end))
+                widths.append(half)
+        centres = np.concatenate([centres, added])
+        order = np.argsort(centres)
+        return centres[order], np.concatenate([halves, widths])[order]
 
     def _maybe_felt(self, first, last, rows: slice, wrench, wrench_var) -> np.ndarray:
         """(K,) whether a sensor near something free feels a force that is too small to
@@ -601,7 +642,7 @@ class ContactMeans:
             struck |= np.linalg.norm(self._vd[rows, i + 3 : i + 6], axis=1) > HIT
         return struck
 
-    def _effort(self, joint, recording, t: _Track, held, w, there, centres):
+    def _effort(self, joint, recording, t: _Track, held, w, there, centres, half):
         """Mean effort of a drive, its variance, its slope by a delay of commands."""
         by, act = self.by[joint], self.scene.actuation
         i_q, i_v = self.joints[joint]
@@ -613,7 +654,7 @@ class ContactMeans:
             name = f"{joint}.effort_measured"
             y = recording[name][t.episode.rows]
             ok = np.isfinite(y)
-            means, _ = test_functions(t.time[ok], centres, self.half)
+            means, _ = test_functions(t.time[ok], centres, half)
             var = variance_of_means(means, y[ok], recording.channels[name].noise)
             return means @ y[ok], var, np.zeros(K)
         if by == "command":
@@ -651,13 +692,13 @@ class ContactMeans:
         late = -(kp * rate + float(law.kd) * np.gradient(dp, t.time))
         return mean, var, held @ late
 
-    def _wrench_means(self, recording: Recording, t: _Track, centres):
+    def _wrench_means(self, recording: Recording, t: _Track, centres, half):
         columns, variances = [], []
         for sensor in self.sensors:
             for name in sensor.names:
                 y = recording[name][t.episode.rows]
                 ok = np.isfinite(y)
-                w, _ = test_functions(t.time[ok], centres, self.half)
+                w, _ = test_functions(t.time[ok], centres, half)
                 columns.append(w @ y[ok])
                 # A knock is over between two samples: its force is hardly known.
                 var = variance_of_means(w, y[ok], recording.channels[name].noise)
@@ -668,12 +709,12 @@ class ContactMeans:
             return np.zeros((K, 0)), np.zeros((K, 0))
         return np.stack(columns, axis=1), np.stack(variances, axis=1)
 
-    def _extra_means(self, recording: Recording, t: _Track, centres, effort):
+    def _extra_means(self, recording: Recording, t: _Track, centres, half, effort):
         columns, variances = [], []
         for name, i in self.extra:
             y = recording[name][t.episode.rows]
             ok = np.isfinite(y)
-            w, _ = test_functions(t.time[ok], centres, self.half)
+            w, _ = test_functions(t.time[ok], centres, half)
             if name.endswith(".effort_measured"):
                 other, off = effort[:, i], MODELLED * float(np.std(effort[:, i]))
             else:

@@ -429,6 +429,8 @@ class ContactProblem(ContactDynamics, GapProblem):
         com = self.dynamics.now("object_com", [body])
         steps = [[(2e-3, {**com, a: com[a] + 2e-3}) for a in "xy"]]
         yield "object_com", body, 2, ("x", "y"), ("z",), steps
+        steps = [[(d, {"scale": 1.0 + d})] for d in (0.03, -0.03)]
+        yield "object_size", body, 1, ("scale",), (), steps
         inertia = self.dynamics.now("object_inertia", [body])
         mid = {k: inertia[k] for k in ("ixx", "iyy", "izz")}
         for f in (0.9,):
@@ -611,9 +613,11 @@ class ContactProblem(ContactDynamics, GapProblem):
         more, and its deviation is half of how far that goes without a loss of PROFILE
         noise variances; infinite where it goes on. Of a friction held-out rows are
         asked: a single fitted one may want more and more of it; one that is larger than
-        the scene's, and may be any larger, is known from below."""
+        the scene's, and may be any larger, is known from below, if not by one moment
+        alone."""
         effect, std = end.effects[k], dict(end.std[k])
-        p, asked = effect.parameters, np.ones(len(end.r), bool)
+        p, every = effect.parameters, np.ones(len(end.r), bool)
+        asked = every
         if effect.kind == "friction_patch":
             sides = ("x_min", "x_max", "y_min", "y_max")
             moves: dict[str, tuple[float, ...]] = dict.fromkeys(sides, MOVED)
@@ -626,32 +630,40 @@ class ContactProblem(ContactDynamics, GapProblem):
         calm = self.nuisances().columns @ end.b
         limit = PROFILE * max(end.score, 1.0) ** 2
 
-        def cost(parameters) -> float:
+        def squares(parameters) -> np.ndarray:
             others = [*end.effects]
             others[k] = replace(effect, parameters=parameters)
             try:
-                return float(np.sum((self.residual(others) - calm)[asked] ** 2))
+                return (self.residual(others) - calm) ** 2
             except ValueError:  # The patch is empty.
-                return np.inf
+                return np.full(len(end.r), np.inf)
 
-        least = cost(p)
+        least = squares(p)
+        moment = self._of_rows(np.arange(len(self.means.time)))
+
+        def far(name: str, sign: float, rows, but_one: bool = False) -> float:
+            for d in moves[name]:
+                more = (squares({**p, name: p[name] + sign * d}) - least)[rows]
+                lost = float(np.sum(more))
+                if but_one and np.isfinite(lost):
+                    lost -= float(np.bincount(moment[rows], weights=more).max())
+                if lost > limit:
+                    return d
+            return np.inf
+
         or_more: tuple[str, ...] = ()
-        for name, steps in moves.items():
-            far = {-1.0: np.inf, 1.0: np.inf}
-            for sign in far:
-                for d in steps:
-                    if cost({**p, name: p[name] + sign * d}) - least > limit:
-                        far[sign] = d
-                        break
-            if name == "friction" and far[-1.0] < far[1.0] == np.inf:
-                if p[name] > self._friction_at(effect):
-                    std[name], or_more = 0.5 * far[-1.0], (name,)
+        for name in moves:
+            below, above = far(name, -1.0, asked), far(name, 1.0, asked)
+            if name == "friction" and above == np.inf > p[name] > self._now_at(effect):
+                below = far(name, -1.0, every, but_one=True)
+                if p[name] - below >= self._now_at(effect):
+                    std[name], or_more = 0.5 * below, (name,)
                     continue
-            std[name] = max(std.get(name, 0.0), 0.5 * max(far.values()))
+            std[name] = max(std.get(name, 0.0), 0.5 * max(below, above))
         return std, or_more
 
-    def _friction_at(self, effect: Effect) -> float:
-        """In the scene, of the pair that an effect is of."""
+    def _now_at(self, effect: Effect) -> float:
+        """Friction in the scene, of the pair that an effect is of."""
         return next(
             (
                 self._friction_now(p)

@@ -8,7 +8,8 @@ of a pair are those that Drake makes of two surfaces.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -80,6 +81,13 @@ class _Surface:
         """(n, 3) places in world in the surface's own frame, at poses of its body."""
         p = np.einsum("nji,nj->ni", R_b, places - p_b)
         return (p - self.p_BG) @ self.R_BG
+
+    def scaled(self, scale: float) -> "_Surface":
+        """About the body's origin."""
+        size = tuple(scale * x for x in self.size)
+        if self.kind == "hull":  # Normals of its faces, how far out they are.
+            size = (self.size[0], scale * self.size[1])
+        return replace(self, p_BG=scale * self.p_BG, size=size)
 
     def distance(self, p) -> tuple[np.ndarray, np.ndarray]:
         """Of points (n, 3) in the body's frame, and normals there."""
@@ -237,6 +245,29 @@ class ContactShapes:
         self.points = [p for p in self.points if counts(p.body)]
         self.surfaces = [s for s in self.surfaces if counts(s.body)]
         self.boxes = [b for b in self.boxes if counts(b.body)]
+
+    def scaled(self, body: int, scale: float) -> "ContactShapes":
+        """With the shapes of one body so many times as large, about its origin."""
+        other = copy(self)
+        other.points = [
+            replace(p, p_B=scale * p.p_B, radius=scale * p.radius, rim=scale * p.rim)
+            if p.body == body else p
+            for p in self.points
+        ]  # fmt: skip
+        other.surfaces = [
+            s.scaled(scale) if s.body == body else s for s in self.surfaces
+        ]
+        other.boxes = [
+            replace(
+                b, centre=scale * b.centre, radius=scale * b.radius,
+                edges=[
+                    replace(e, start=scale * e.start, along=scale * e.along)
+                    for e in b.edges
+                ],
+            ) if b.body == body else b
+            for b in self.boxes
+        ]  # fmt: skip
+        return other
 
     def never_touch(self, point: _Point, surface: _Surface) -> bool:
         """Whether the scene filters their contact."""

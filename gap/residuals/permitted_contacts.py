@@ -23,6 +23,7 @@ from makebreak.gap.numerics.permitted_forces import (
 )
 from makebreak.gap.residuals.contact_means import (
     BESIDE,
+    FEWEST_MEANS,
     MEETS,
     NEAR,
     SLIDES,
@@ -40,13 +41,17 @@ STEEP = 0.12  # and turned by so much against how it would rest [rad].
 TIPPED = 0.01  # Turned by more than as it mostly lies, it stands on an edge [rad].
 EDGE = 8e-4  # Over which a patch of friction sets in [m].
 UNEVEN = 2e-5  # How flat what carries is; points share a load to k times it [m].
+STEADY = 0.995  # Mean of a normal within a test function, at least: 0.1 rad, rms.
 ONE_WAY = 0.9  # Mean of the directions of slip within a test function, at least.
 PYRAMID = 12  # Sides about a friction cone.
 MOST_SHARED = 6  # Rows that share loads.
 # What changes shapes, surfaces and where they are.
 SURFACES = (
     "contact_friction", "friction_patch", "plane_tilt", "plane_height", "wall_position",
+    "object_size",
 )  # fmt: skip
+# Of them those that move points and surfaces of what lies or is pushed.
+MOVED = ("plane_tilt", "plane_height", "object_size")
 
 
 @dataclass(frozen=True)
@@ -72,24 +77,51 @@ class _Column:
     mean_rubbing: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """Slots that may act where effects put the shapes, {key: (n_nodes,) when}, and
+    their columns."""
+
+    slots: list[Slot]
+    masks: dict[tuple[int, int], np.ndarray]
+    columns: list[_Column]
+
+
 class PermittedContacts(ContactMeans):
     """Generators of contact forces at the nodes of the test functions."""
 
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
         super().__init__(scene, recordings)
         self._context = self.plant.CreateDefaultContext()
-        self._known_columns: list[_Column] | None = None
+        self._as_it_came: Geometry | None = None
         self._known_sharing: np.ndarray | None = None
         self._lying: dict[tuple[int, int], bool] = {}
-        self._evaluate_nodes()
-        self.slots, _ = self._slots(())
-        self._masks = self._touches(self.slots)
+        self._find_slots()
+        steady = ~self._turning()
+        if not steady.all() and steady.sum() >= FEWEST_MEANS:
+            self.means = self.means.of(steady)
+            self._find_slots()
         self._pairs_met = sorted(
             {self._pair_of(s) for s, on in zip(self.slots, self._masks, strict=True)
              if on.any()}
         )  # fmt: skip
 
     # ----- Geometry at nodes
+
+    def _find_slots(self) -> None:
+        self._evaluate_nodes()
+        self.slots, _ = self._slots(())
+        self._masks = self._touches(self.slots)
+
+    def _turning(self) -> np.ndarray:
+        """(K,) where a normal turns so far in a test function that a force that comes
+        or goes meanwhile is along none of its mean."""
+        out = np.zeros(len(self.means.time), bool)
+        for s, on in zip(self.slots, self._masks, strict=True):
+            weight = np.asarray(self._W @ on.astype(float)).ravel()
+            mean = np.linalg.norm(self._W @ (s.normal * on[:, None]), axis=1)
+            out |= mean < STEADY * weight
+        return out
 
     def _evaluate_nodes(self) -> None:
         m, plant = self.means, self.plant
@@ -128,8 +160,12 @@ class PermittedContacts(ContactMeans):
 
     def _slots(self, effects: Sequence[Effect], shift: Shift | None = None):
         """Slots at the nodes, and the poses that they are of."""
-        poses = dict(self._node_poses)
+        poses, shapes = dict(self._node_poses), self.shapes
         for e in effects:
+            if e.kind == "object_size":
+                for k in poses:
+                    if self._is_at(e, k):
+                        shapes = shapes.scaled(k, self._scale_of(e, k))
             if e.kind not in ("plane_tilt", "plane_height"):
                 continue
             for k in poses:
@@ -149,7 +185,16 @@ class PermittedContacts(ContactMeans):
                     late = shift.late * self._node_v[:, i_v + 3 : i_v + 6]
                 turn = Rotation.from_rotvec(shift.turn).as_matrix()
                 poses[k] = turn @ R, p + np.array(shift.place) + late
-        return self.shapes.slots(poses, NEAR), poses
+        return shapes.slots(poses, NEAR), poses
+
+    def _scale_of(self, effect: Effect, body: int) -> float:
+        """By an effect that gives a scale, or the radius of the body's only sphere."""
+        p = effect.parameters
+        radius = next((x.radius for x in self.shapes.points if x.body == body), 0.0)
+        scale = p["scale"] if "scale" in p else p["radius"] / radius
+        if not scale > 0.0:
+            raise ValueError("object_size: not above zero")
+        return float(scale)
 
     def _is_at(self, effect: Effect, body: int) -> bool:
         name = self.shapes.names.get(body, "")
@@ -312,8 +357,9 @@ class PermittedContacts(ContactMeans):
 
     def _generators(self, effects: Sequence[Effect], shift: Shift | None = None):
         """G (K, rows, columns), which can act (K, columns), slot of each column; the
-        slots; how loads are shared."""
-        slots, made = self._contacts_at(effects, shift)
+        geometry; how loads are shared."""
+        geometry = self._contacts_at(effects, shift)
+        slots, made = geometry.slots, geometry.columns
         K, n = len(self.means.time), len(self.coordinates) + self.n_wrench
         frictions = {
             number: self._friction(slots[number], effects)
@@ -329,29 +375,35 @@ class PermittedContacts(ContactMeans):
                 rubbing = self._W @ (mu[:, None] * c.rubbing)
                 G[:, :, k] = c.pressing + c.scale[:, None] * rubbing
             there[:, k] = c.can
-        if made is not self._known_columns or self._known_sharing is None:
+        if geometry is not self._as_it_came or self._known_sharing is None:
             sharing = self._sharing(made, slots)
-            if made is self._known_columns:
+            if geometry is self._as_it_came:
                 self._known_sharing = sharing
         else:
             sharing = self._known_sharing
-        return G, there, [c.slot for c in made], slots, sharing
+        return G, there, [c.slot for c in made], geometry, sharing
 
-    def _contacts_at(self, effects: Sequence[Effect], shift: Shift | None):
-        """The slots where effects put the shapes, and their columns."""
-        moved = shift or any(e.kind in ("plane_tilt", "plane_height") for e in effects)
-        if moved:
-            slots, poses = self._slots(effects, shift)
-            masks = dict(zip((s.key for s in self.slots), self._masks, strict=True))
-            slots = [s for s in slots if s.key in masks]
-            made = self._columns(slots, poses, masks)
-        else:
-            slots = self.slots
-            if self._known_columns is None:
-                masks = dict(zip((s.key for s in slots), self._masks, strict=True))
-                self._known_columns = self._columns(slots, self._node_poses, masks)
-            made = self._known_columns
-        return slots, made
+    def _contacts_at(self, effects: Sequence[Effect], shift: Shift | None) -> Geometry:
+        """Where effects put the shapes. What carries a thing carries it still."""
+        masks = dict(zip((s.key for s in self.slots), self._masks, strict=True))
+        if not (shift or any(e.kind in MOVED for e in effects)):
+            if self._as_it_came is None:
+                columns = self._columns(self.slots, self._node_poses, masks)
+                self._as_it_came = Geometry(self.slots, masks, columns)
+            return self._as_it_came
+        slots, poses = self._slots(effects, shift)
+        if any(e.kind == "object_size" for e in effects):
+            # Another part of what is pushed may be the nearest one.
+            beside = [s for s in slots if not self._lies(self._pair_of(s))]
+            masks = {
+                s.key: masks[s.key] for s in self.slots if self._lies(self._pair_of(s))
+            } | {
+                s.key: on
+                for s, on in zip(beside, self._touches(beside), strict=True)
+                if on.any()
+            }
+        slots = [s for s in slots if s.key in masks]
+        return Geometry(slots, masks, self._columns(slots, poses, masks))
 
     def _columns(self, slots: Sequence[Slot], poses, masks) -> list[_Column]:
         """Of each slot the force along its slip, and where it may stick those of a

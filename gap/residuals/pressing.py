@@ -21,7 +21,7 @@ from makebreak.gap.residuals.contact_means import FORCE, MEETS
 from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.contact_shapes import Slot
 from makebreak.gap.residuals.impacts import MOST_SHARE, nearest, positions, walls_of
-from makebreak.gap.residuals.permitted_contacts import SLACK, Shift
+from makebreak.gap.residuals.permitted_contacts import SLACK, Geometry, Shift
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
@@ -51,15 +51,6 @@ class _Face:
     body: int
     normal: np.ndarray
     off: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Geometry:
-    """Slots that act where fixed bodies are put, {key: (n_nodes,) when} and columns."""
-
-    slots: list[Slot]
-    masks: dict[tuple[int, int], np.ndarray]
-    columns: list
 
 
 def presses(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
@@ -100,7 +91,7 @@ class PressingProblem(ContactProblem):
     plan = replace(ContactProblem.plan, by_channel=True, most_effects=MOST_EFFECTS)
 
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
-        self._geometries: dict[tuple, _Geometry] = {}
+        self._geometries: dict[tuple, Geometry] = {}
         self._any_friction = False
         self._mu: float | None = None
         super().__init__(scene, recordings)
@@ -261,7 +252,7 @@ class PressingProblem(ContactProblem):
                 out[k] = s.best & (s.phi < nearest + SLACK) & (nearest < MEETS)
         return out
 
-    def _geometry(self, effects: Sequence[Effect]) -> _Geometry:
+    def _geometry(self, effects: Sequence[Effect]) -> Geometry:
         moved = [e for e in effects if e.kind in MOVES]
         key = tuple((e.kind, *e.at, *sorted(e.parameters.items())) for e in moved)
         if key not in self._geometries:
@@ -274,16 +265,15 @@ class PressingProblem(ContactProblem):
             slots = [s for s in slots if s.key in masks]
             if len(self._geometries) > MOST_KEPT:
                 self._geometries.clear()
-            self._geometries[key] = _Geometry(
+            self._geometries[key] = Geometry(
                 slots, masks, self._columns(slots, poses, masks)
             )
         return self._geometries[key]
 
-    def _contacts_at(self, effects: Sequence[Effect], shift: Shift | None):
-        found = self._geometry(effects)
-        return found.slots, found.columns
+    def _contacts_at(self, effects: Sequence[Effect], shift: Shift | None) -> Geometry:
+        return self._geometry(effects)
 
-    def _when(self, geometry: _Geometry, s: Slot) -> np.ndarray:
+    def _when(self, geometry: Geometry, s: Slot) -> np.ndarray:
         """(K,) over how much of a test function a slot may act."""
         return np.asarray(self._W @ geometry.masks[s.key].astype(float)).ravel()
 
@@ -369,13 +359,14 @@ class PressingProblem(ContactProblem):
         many points share it}, {pair: (K,) when it presses}."""
         there = self._displacing(self.off)
         needs = self._all_needs(())
-        G, can, of, slots, sharing = self._generators(there)
+        G, can, of, geometry, sharing = self._generators(there)
+        slots = geometry.slots
         weights = np.zeros(can.shape)
         explain(
             needs, G, can, self.root, sharing, np.zeros_like(needs), weights,
             np.zeros(len(needs), np.int64),
         )  # fmt: skip
-        geometry, K = self._geometry(there), len(needs)
+        K = len(needs)
         total: dict[tuple[int, int], np.ndarray] = {}
         points: dict[tuple[int, int], np.ndarray] = {}
         whole: dict[tuple[int, int], np.ndarray] = {}
@@ -435,10 +426,11 @@ class PressingProblem(ContactProblem):
         self._mu = MOST_FRICTION
         most = super()._generators(effects, shift)
         self._mu = None
-        G, there, of, slots, _ = least
+        G, there, of, geometry, _ = least
         made = [np.concatenate([x, y], axis=-1) for x, y in
                 ((G, most[0]), (there, most[1]))]  # fmt: skip
-        return (*made, of + most[2], slots, self._sharing(of + of, slots))
+        sharing = self._sharing(of + of, geometry.slots)
+        return (*made, of + most[2], geometry, sharing)
 
     def left(
         self,
@@ -452,7 +444,7 @@ class PressingProblem(ContactProblem):
             self._placed += self._displacing(self.off)
         return super().left(effects, shift, weighed_as)
 
-    def _distances(self, slots: Sequence[Slot]) -> np.ndarray:
+    def _distances(self, geometry: Geometry) -> np.ndarray:
         """(K, pairs) over what shapes are known to: of each pair, when it is felt."""
         shape = self.shape_std()
         K = len(self.means.time)

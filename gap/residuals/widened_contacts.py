@@ -71,10 +71,10 @@ def left_if_widened(
     """(K, rows) of equations and wrenches, over the noise: what forces leave if those
     of a pair of bodies are permitted so much more; size 0: as they are."""
     shaped = [e for e in effects if e.kind in SHAPED]
-    G, there, _, slots, sharing = problem._generators(shaped)
+    G, there, _, geometry, sharing = problem._generators(shaped)
     if size:
-        masks = dict(zip((s.key for s in problem.slots), problem._masks, strict=True))
-        own = [s for s in slots if problem._pair_of(s) == pair and s.key in masks]
+        masks = geometry.masks
+        own = [s for s in geometry.slots if problem._pair_of(s) == pair]
         more = widened_slots(own, size, unit)
         # What is fixed may have been moved by an effect: arms are of what moves.
         made = problem._columns(more, problem._node_poses, masks)

@@ -628,7 +628,10 @@ DAMPER = "contact_damping"  # In the place of the dissipation.
 KINDS = {
     "contact_friction": EffectKind(
         at="pair",
-        parameters=(Parameter("friction", "", 0.01, 1.5, None, valid=">= 0"),),
+        # What holds may be any larger: there a fit ends.
+        parameters=(
+            Parameter("friction", "", 0.01, 1.5, None, valid=">= 0", ends=True),
+        ),
         says="the friction coefficient of {at} is {friction}",
         confused_with=("plane_tilt", "contact_dissipation", "object_com"),
         tell_apart="let it slide both ways, and look at windows of 0.1 s or longer",
