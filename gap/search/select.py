@@ -72,14 +72,15 @@ THERE = 0.1
 # A refit that leaves so much more of held-out rows went along what fitted rows do not
 # tell.
 DRIFT = 0.05
+MOST_RIVALS = 3  # Of one of two that were added at once.
 PAIRED = 10  # Candidates of which all pairs are tried against a single one.
 
 
 @dataclass(frozen=True, eq=False)
 class Choice:
     """One effect as chosen. before, after: held-out error without and with it;
-    of_two: it was needed beside its rival, which was, too; or_more: parameters that may
-    as well be any larger."""
+    of_two: it was needed beside its rival, which was, too; paired: it was added with
+    another kind at once; or_more: parameters that may as well be any larger."""
 
     effect: Effect
     std: dict[str, float]
@@ -92,6 +93,7 @@ class Choice:
     size: int
     in_group: bool = False
     of_two: bool = False
+    paired: bool = False
     or_more: tuple[str, ...] = ()
 
 
@@ -197,6 +199,8 @@ class _Search:
         else:
             current = self.start
         if chosen:
+            if any(c.paired for c in chosen):
+                chosen = self._with_rivals(chosen, current)
             chosen = [
                 replace(c, ties=self._still_tied(chosen, current, k))
                 for k, c in enumerate(chosen)
@@ -593,6 +597,7 @@ class _Search:
                     runner[1].candidate.name if runner else "",
                     runner[0].score / fit.score - 1.0 if runner else np.inf,
                     ties, fixed[k], sizes[k], together, of_two,
+                    len(new) > 1 and not together,
                 )
                 for k, effect in enumerate(new)
             ),
@@ -825,6 +830,32 @@ class _Search:
                 break
         return chosen, current
 
+    def _with_rivals(self, chosen: Sequence[Choice], current: Fitted) -> list[Choice]:
+        """Of two kinds that were added at once none was compared with others: here the
+        best of them in its place, beside all the rest."""
+        taken = {(c.effect.kind, tuple(c.effect.at)) for c in chosen}
+        open_ = [
+            c for c in self.problem.candidates(self.nuisances, current)
+            if (c.kind, c.at) not in taken
+        ]  # fmt: skip
+        out = []
+        for k, choice in enumerate(chosen):
+            rivals: list[Effect] = []
+            if choice.paired:
+                rest = [*current.effects[:k], *current.effects[k + 1 :]]
+                screen = self._screen(self.problem.residual(rest), current.fit.train)
+                near = [
+                    r for r in rank(screen, open_)
+                    if r.valid and r.candidate.size <= choice.size + MORE
+                    and choice.effect.kind not in KINDS[r.candidate.kind].contains
+                ]  # fmt: skip
+                for r in near[:MOST_RIVALS]:
+                    found = self._instead(r.candidate, k, chosen, current)
+                    if found is not None and _is_used(found[0], k):
+                        rivals.append(found[0].effects[k])
+            out.append(replace(choice, ties=(*choice.ties, *rivals)))
+        return out
+
     def _still_tied(self, chosen, current: Fitted, k: int) -> tuple[Effect, ...]:
         """Rivals of an effect that do as well as it among all the others."""
         if len(chosen) < 2:
@@ -1037,10 +1068,10 @@ def _is_sure(choice: Choice) -> bool:
     )
 
 
-def _is_used(fit: Fitted) -> bool:
-    """Whether each parameter of the last effect tells: else it is another, smaller
-    effect under its name."""
-    last, std = fit.effects[-1], fit.std[-1]
+def _is_used(fit: Fitted, k: int = -1) -> bool:
+    """Whether each parameter of the last effect, or of effect k, tells: else it is
+    another, smaller effect under its name."""
+    last, std = fit.effects[k], fit.std[k]
     for each in KINDS[last.kind].parameters:
         if each.neutral is not None and each.name in std:
             off = abs(last.parameters[each.name] - each.neutral)
