@@ -208,6 +208,14 @@ def test_camera_knows_a_box_to_half_a_turn_and_no_yaw_of_a_disc():
 # ----- The run.
 
 
+def test_a_run_whose_object_fell_off_the_table_ends(tmp_path):
+    """A minute later it falls at 600 m/s, and Drake's numbers end."""
+    config = PushObjectConfig(start=[3.0, 0.0, 0.0])
+    with Session(tmp_path / "out", duration_sec=3.0, progress=False) as session:
+        result = experiment.run(config, session)
+    assert result["simulated_s"] < 1.0 and result["goals_reached"] == 0
+
+
 def test_run_with_the_camera_is_scored_recorded_and_drawn(tmp_path):
     """Half a second: nothing is reached, and everything is written. The estimate is the
     camera's, and near to the truth that it never sees."""

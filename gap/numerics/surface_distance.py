@@ -1,9 +1,10 @@
 """Signed distances of points to simple shapes, many at once, with outward normals.
 
 A shape is in its own frame, centred there: a box of half sizes (3,), a sphere of a
-radius, a cylinder along z of radius and half length, a half-space below z = 0, or a
-hull: planes N x <= d with unit N (k, 3), of which the distance outside is that to the
-planes (right but for edges and corners, beyond which it is too small).
+radius, a cylinder or capsule along z of radius and half length (of its axis), a
+half-space below z = 0, or a hull: planes N x <= d with unit N (k, 3), of which the
+distance outside is that to the planes (right but for edges and corners, beyond which it
+is too small).
 """
 
 import numpy as np
@@ -46,6 +47,11 @@ def cylinder(p, radius: float, half_length: float):
         rho[:, None] > 1e-12, p[:, :2] / np.maximum(rho, 1e-12)[:, None], [1.0, 0.0]
     )
     return distance, np.column_stack([away * n[:, :1], n[:, 2]])
+
+
+def capsule(p, radius: float, half_length: float):
+    z = np.clip(p[:, 2], -half_length, half_length)
+    return sphere(p - z[:, None] * [0.0, 0.0, 1.0], radius)
 
 
 def hull(p, N, d):

@@ -47,7 +47,7 @@ THIN = 4  # Distances change slowly: every so many test functions are told.
 WRENCHED = 0.05  # A wrench sampled amid a drive's ripple is off by as much.
 SHAPED = (*SURFACES, *CONTACT_LAW)
 # What changes a free body's inertial parameters.
-INERTIAL = ("object_mass", "object_com", "object_inertia")
+INERTIAL = ("object_mass", "object_com", "object_inertia", "object_size")
 
 
 class ContactDynamics(PermittedContacts):
@@ -276,11 +276,11 @@ class ContactDynamics(PermittedContacts):
         inertial: dict[str, list[Effect]] = {}
         for e in effects:
             kind = KINDS[e.kind]
-            if e.kind in SHAPED:
-                continue
             if e.kind in INERTIAL:
                 for body in find_bodies(e, self.plant):
                     inertial.setdefault(full_name(self.plant, body), []).append(e)
+                continue
+            if e.kind in SHAPED:
                 continue
             if kind.path:
                 P -= self._driven_more(e)
@@ -340,6 +340,9 @@ class ContactDynamics(PermittedContacts):
                 if not p["mass"] > 0.0:
                     raise ValueError("object_mass: not above zero")
                 central, mass = central * (p["mass"] / mass), p["mass"]
+            elif e.kind == "object_size":  # The same mass, farther out.
+                scale = self._scale_of(e, int(found.index()))
+                com, central = scale * com, scale**2 * central
             elif e.kind == "object_com":
                 com = np.array([p.get(a, x) for a, x in zip("xyz", com, strict=True)])
             else:

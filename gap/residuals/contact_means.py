@@ -36,6 +36,7 @@ NODES = 5  # Rows of a test function at which geometry and dynamics are evaluate
 MOST = 420  # Test functions at most, and how many of them without a moving object.
 STILL = 80
 FEWEST_MEANS = 30
+BETWEEN_ROWS = 1.5  # Commands from one row to the next: more, and some are not known.
 BESIDE = -1  # Marks what a body touches beside what carries it.
 FAR = 1.0  # Of what is not there [m].
 HIT = 20.0  # Smoothed, a free body is accelerated so much by an impact alone [m/s2].
@@ -660,7 +661,10 @@ class ContactMeans:
         if by == "command":
             u = np.nan_to_num(recording.held(f"{joint}.effort_command")[t.episode.rows])
             rate = np.gradient(held @ u, centres) if K > 1 else np.zeros(K)
-            return held @ u, np.zeros(K), rate
+            var = np.zeros(K)
+            if act.rate_hz and act.rate_hz * np.median(np.diff(t.time)) > BETWEEN_ROWS:
+                var = variance_of_means(held, u, 0.0)
+            return held @ u, var, rate
         law = law_of(act, joint)
         assert law is not None
         takes = COMMANDS_OF[act.type]

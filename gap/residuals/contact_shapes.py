@@ -2,7 +2,8 @@
 
 Spheres are their centres, boxes and hulls their corners. A cylinder that stands on
 something is points on its rims; where its side touches, of each rim the point that is
-nearest to the other surface. Each is compared with the surfaces of other bodies. Edges
+nearest to the other surface; of a capsule's axis the point that is nearest. Each is
+compared with the surfaces of other bodies. Edges
 that cross edges are those of boxes, of which one moves freely. Friction and stiffness
 of a pair are those that Drake makes of two surfaces.
 """
@@ -13,7 +14,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from pydrake.geometry import Box, Convex, Cylinder, HalfSpace, Mesh, Sphere
+from pydrake.geometry import Box, Capsule, Convex, Cylinder, HalfSpace, Mesh, Sphere
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 
@@ -26,6 +27,7 @@ RIM = 12  # Points on a rim.
 SIDE = 0.9  # Cosine of normal and axis: less, and a cylinder touches with its side.
 MOST_CORNERS = 200  # Of a hull; more are thinned.
 BEYOND = 2.5e-3  # A corner so far beyond the edge of a face still touches it [m].
+THIRDS = 24  # Of a capsule's axis: what is left of it is 6e-5.
 SAME_NORMAL = 0.64  # Cosine: a point touches one of two surfaces that face alike.
 
 
@@ -41,6 +43,8 @@ class _Point:
     is_corner: bool = False  # Of a box.
     axis: np.ndarray | None = None  # Of the cylinder that it is on the rim of.
     rim: float = 0.0  # Any point on a rim of this radius about p_B, if not 0 [m].
+    # (3,) Any point up to so far to either side of p_B, of a capsule's axis [m].
+    along: np.ndarray | None = None
 
     def near(
         self, s: "_Surface", R_a, p_a, R_b, p_b
@@ -48,6 +52,8 @@ class _Point:
         """The point's place (n, 3) in world at poses of the two bodies, its distance
         (n,) from the surface, the normal (n, 3), and whether it may touch so (n,)."""
         c = p_a + R_a @ self.p_B
+        if self.along is not None:
+            c = c + self._nearest(s, c, R_a, R_b, p_b)[:, None] * (R_a @ self.along)
         d, n = s.distance(np.einsum("nji,nj->ni", R_b, c - p_b))
         n = np.einsum("nij,nj->ni", R_b, n)
         if self.axis is None:
@@ -64,6 +70,22 @@ class _Point:
         c = c - self.rim * out / size[:, None]
         d, _ = s.distance(np.einsum("nji,nj->ni", R_b, c - p_b))
         return c, d - self.radius, n, side
+
+    def _nearest(self, s: "_Surface", c, R_a, R_b, p_b) -> np.ndarray:
+        """(n,) where on the axis, from -1 to 1, it is nearest to a convex surface, of
+        which the distance is convex along a line: by thirds."""
+        assert self.along is not None
+        start = np.einsum("nji,nj->ni", R_b, c - p_b)
+        along = np.einsum("nji,nj->ni", R_b, R_a @ self.along)
+        low, high = -np.ones(len(c)), np.ones(len(c))
+        for _ in range(THIRDS):
+            a, b = low + (high - low) / 3.0, high - (high - low) / 3.0
+            nearer = (
+                s.distance(start + a[:, None] * along)[0]
+                <= s.distance(start + b[:, None] * along)[0]
+            )
+            low, high = np.where(nearer, low, a), np.where(nearer, b, high)
+        return 0.5 * (low + high)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,8 +212,9 @@ class ContactShapes:
         friction, stiffness = own
 
         def points(
-            local, radius=0.0, is_sphere=False, axis=None, rim=0.0, is_corner=False
-        ):
+            local, radius=0.0, is_sphere=False, axis=None, rim=0.0, is_corner=False,
+            along=None,
+        ):  # fmt: skip
             for x in np.atleast_2d(local):
                 self.points.append(
                     _Point(
@@ -205,6 +228,7 @@ class ContactShapes:
                         is_corner,
                         axis,
                         rim,
+                        along,
                     )
                 )
 
@@ -228,6 +252,10 @@ class ContactShapes:
                 points(np.column_stack([x, y, np.full(RIM, z)]), axis=axis)
             points([[0.0, 0.0, -h], [0.0, 0.0, h]], axis=axis, rim=r)
             surface("cylinder", r, h)
+        elif isinstance(shape, Capsule):
+            r, h = shape.radius(), shape.length() / 2.0
+            points(np.zeros(3), r, along=h * R[:, 2])
+            surface("capsule", r, h)
         elif isinstance(shape, (Convex, Mesh)) and self._hulls:
             mesh = shape.GetConvexHull()
             corners = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())])
@@ -250,8 +278,10 @@ class ContactShapes:
         """With the shapes of one body so many times as large, about its origin."""
         other = copy(self)
         other.points = [
-            replace(p, p_B=scale * p.p_B, radius=scale * p.radius, rim=scale * p.rim)
-            if p.body == body else p
+            replace(
+                p, p_B=scale * p.p_B, radius=scale * p.radius, rim=scale * p.rim,
+                along=None if p.along is None else scale * p.along,
+            ) if p.body == body else p
             for p in self.points
         ]  # fmt: skip
         other.surfaces = [

@@ -41,6 +41,7 @@ SAMPLE = 0.05  # [s] Of what decides when a run is over.
 TOLERANCE = (0.02, 0.1)  # [m], [rad] A goal is reached within these ...
 LOOSE = (0.05, 0.4)  # ... and within these it counts as in arXiv:2505.13350.
 LIMIT_SEC = 60.0  # For a goal.
+FALLEN = -0.2  # So low an object is off the table, and falls for ever [m].
 FORCE_MAX = 40.0  # [N] Of all contacts of the arm and its finger, at 1 kHz.
 STOP_MAX = 0.995  # Of half a joint's range.
 FORCE_HZ = 100.0  # Told as well: on the finger, below it.
@@ -127,11 +128,16 @@ def run(config, session):
     ports = {
         "goal": system("push_goals").GetOutputPort("log"),
         "x": system("state_estimator").GetOutputPort("x"),
+        "state": system("station").GetOutputPort("state"),
     }
+    plant = system("station").GetSubsystemByName("plant")
+    height = plant.GetBodyByName(OBJECT).floating_positions_start() + 6
     if diagram.HasSubsystemNamed("residual_learner"):
         ports["r"] = system("residual_learner").GetOutputPort("r_comp")
 
     def done(t, sample) -> str:
+        if sample["state"][height] < FALLEN:
+            return "the object fell off the table"
         return "all goals are done" if sample["goal"][0] >= config.n_goals else ""
 
     duration = config.n_goals * config.goals.limit_sec + 1.0

@@ -1,0 +1,112 @@
+"""Shapes that touch, against Drake's own distances and its own scaled shapes."""
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.tree import BodyIndex
+from pydrake.systems.framework import DiagramBuilder
+
+from makebreak.gap.residuals.contact_shapes import ContactShapes
+from makebreak.models.effects.kind import Effect
+from makebreak.models.scene import load_scene, read_scene
+
+SHAPES = {
+    "sphere": "<sphere><radius>0.03</radius></sphere>",
+    "box": "<box><size>0.08 0.06 0.04</size></box>",
+    "cylinder": "<cylinder><radius>0.03</radius><length>0.1</length></cylinder>",
+    "capsule": "<capsule><radius>0.01</radius><length>0.12</length></capsule>",
+    "hull": "<mesh><uri>hull.obj</uri><drake:declare_convex/></mesh>",
+}
+
+
+def scene_of(folder, effects=(), **shapes):
+    """{body: text of its shape}, each off its body's origin and turned."""
+    corners = np.random.default_rng(0).normal(size=(12, 3)) * 0.03
+    lines = [f"v {x} {y} {z}" for x, y, z in corners]
+    lines += ["f 1 2 3", "f 4 5 6", "f 7 8 9", "f 10 11 12"]
+    (folder / "hull.obj").write_text("\n".join(lines))
+    text = "directives:\n"
+    for name, shape in shapes.items():
+        (folder / f"{name}.sdf").write_text(
+            f'<sdf version="1.9" xmlns:drake="d"><model name="{name}">'
+            f'<link name="{name}"><inertial><mass>1</mass><inertia><ixx>1e-3</ixx>'
+            "<iyy>1e-3</iyy><izz>1e-3</izz></inertia></inertial>"
+            f'<collision name="c"><pose>0.01 -0.02 0.03 0.3 0.2 0.1'
+            f"</pose><geometry>{shape}</geometry></collision></link></model></sdf>"
+        )
+        text += f"  - add_model: {{name: {name}, file: {name}.sdf}}\n"
+    (folder / "scene.yaml").write_text(text)
+    scene = read_scene(folder / "scene.yaml")
+    scene.effects.extend(effects)
+    builder = DiagramBuilder()
+    loaded = load_scene(scene, builder)
+    return loaded, builder
+
+
+def random_poses(rng, n: int, size: float):
+    R = np.stack([RotationMatrix(_quaternion(rng)).matrix() for _ in range(n)])
+    return R, rng.uniform(-size, size, (n, 3))
+
+
+def _quaternion(rng):
+    from pydrake.common.eigen_geometry import Quaternion
+
+    q = rng.normal(size=4)
+    return Quaternion(q / np.linalg.norm(q))
+
+
+@pytest.mark.parametrize("other", ["box", "sphere", "hull"])
+def test_a_capsule_is_as_far_from_a_shape_as_drake_says(tmp_path, other):
+    loaded, builder = scene_of(tmp_path, one=SHAPES["capsule"], two=SHAPES[other])
+    shapes = ContactShapes(loaded)
+    number = {name.split(".")[0]: k for k, name in shapes.names.items()}
+    rng = np.random.default_rng(3)
+    R, p = random_poses(rng, 60, 0.12)
+    poses = {
+        number["one"]: (R, p),
+        number["two"]: (np.tile(np.eye(3), (60, 1, 1)), np.zeros((60, 3))),
+    }
+    nearest = np.min([s.phi for s in shapes.slots(poses, np.inf)], axis=0)
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    plant, graph = loaded.plant, loaded.scene_graph
+    of = plant.GetMyMutableContextFromRoot(context)
+    compared = 0
+    for n in range(60):
+        for k in number.values():
+            X = RigidTransform(RotationMatrix(poses[k][0][n]), poses[k][1][n])
+            plant.SetFreeBodyPose(of, plant.get_body(BodyIndex(k)), X)
+        query = graph.get_query_output_port().Eval(graph.GetMyContextFromRoot(context))
+        (pair,) = query.ComputeSignedDistancePairwiseClosestPoints(1.0)
+        if pair.distance > 1e-3:
+            compared += 1
+            # A hull's distance is that to its planes: too small beside its edges.
+            if other == "hull":
+                assert nearest[n] <= pair.distance + 1e-5
+            else:
+                assert nearest[n] == pytest.approx(pair.distance, abs=1e-5)
+    assert compared > 20
+
+
+@pytest.mark.parametrize("scale", [0.8, 1.3])
+@pytest.mark.parametrize("shape", list(SHAPES))
+def test_scaled_shapes_are_those_of_the_scene_with_the_effect(tmp_path, shape, scale):
+    things = {"one": SHAPES[shape], "two": SHAPES["box"]}
+    effect = Effect("object_size", ["one"], {"scale": scale})
+    plain = ContactShapes(scene_of(tmp_path, **things)[0])
+    changed = ContactShapes(scene_of(tmp_path, [effect], **things)[0])
+    number = {name.split(".")[0]: k for k, name in plain.names.items()}
+    R, p = random_poses(np.random.default_rng(5), 40, 0.1)
+    poses = {
+        number["one"]: (R, p),
+        number["two"]: (np.tile(np.eye(3), (40, 1, 1)), np.zeros((40, 3))),
+    }
+    found, expected = (
+        {s.key: s for s in shapes.slots(poses, np.inf)}
+        for shapes in (plain.scaled(number["one"], scale), changed)
+    )
+    assert found.keys() == expected.keys() and found
+    for key, s in found.items():
+        np.testing.assert_allclose(s.phi, expected[key].phi, atol=1e-9)
+        np.testing.assert_allclose(s.place, expected[key].place, atol=1e-9)
+        np.testing.assert_allclose(s.normal, expected[key].normal, atol=1e-7)
