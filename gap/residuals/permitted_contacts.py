@@ -50,8 +50,7 @@ SURFACES = (
     "contact_friction", "friction_patch", "plane_tilt", "plane_height", "wall_position",
     "object_size",
 )  # fmt: skip
-# Of them those that move points and surfaces of what lies or is pushed.
-MOVED = ("plane_tilt", "plane_height", "object_size")
+MOST_KEPT = 12  # Geometries.
 
 
 @dataclass(frozen=True)
@@ -77,24 +76,27 @@ class _Column:
     mean_rubbing: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Geometry:
-    """Slots that may act where effects put the shapes, {key: (n_nodes,) when}, and
-    their columns."""
+    """Slots that may act where effects put the shapes, {key: (n_nodes,) when}, their
+    columns, and how loads are shared (K, d, columns), once that was asked."""
 
     slots: list[Slot]
     masks: dict[tuple[int, int], np.ndarray]
     columns: list[_Column]
+    sharing: np.ndarray | None = None
 
 
 class PermittedContacts(ContactMeans):
     """Generators of contact forces at the nodes of the test functions."""
 
+    # Kinds that move points and surfaces of what lies or is pushed.
+    moves: tuple[str, ...] = ("plane_tilt", "plane_height", "object_size")
+
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
         super().__init__(scene, recordings)
         self._context = self.plant.CreateDefaultContext()
-        self._as_it_came: Geometry | None = None
-        self._known_sharing: np.ndarray | None = None
+        self._geometries: dict[tuple, Geometry] = {}
         self._lying: dict[tuple[int, int], bool] = {}
         self._find_slots()
         steady = ~self._turning()
@@ -375,22 +377,28 @@ class PermittedContacts(ContactMeans):
                 rubbing = self._W @ (mu[:, None] * c.rubbing)
                 G[:, :, k] = c.pressing + c.scale[:, None] * rubbing
             there[:, k] = c.can
-        if geometry is not self._as_it_came or self._known_sharing is None:
-            sharing = self._sharing(made, slots)
-            if geometry is self._as_it_came:
-                self._known_sharing = sharing
-        else:
-            sharing = self._known_sharing
-        return G, there, [c.slot for c in made], geometry, sharing
+        if geometry.sharing is None:
+            geometry.sharing = self._sharing(made, slots)
+        return G, there, [c.slot for c in made], geometry, geometry.sharing
 
     def _contacts_at(self, effects: Sequence[Effect], shift: Shift | None) -> Geometry:
-        """Where effects put the shapes. What carries a thing carries it still."""
+        """Where effects put the shapes; the last few are kept."""
+        moved = [e for e in effects if e.kind in self.moves]
+        if shift is not None:
+            return self._new_geometry(moved, shift)
+        key = tuple((e.kind, *e.at, *sorted(e.parameters.items())) for e in moved)
+        if key not in self._geometries:
+            if len(self._geometries) > MOST_KEPT:  # The one as it came is the first.
+                del self._geometries[list(self._geometries)[1]]
+            self._geometries[key] = self._new_geometry(moved, None)
+        return self._geometries[key]
+
+    def _new_geometry(self, effects: Sequence[Effect], shift: Shift | None) -> Geometry:
+        """What carries a thing carries it still."""
         masks = dict(zip((s.key for s in self.slots), self._masks, strict=True))
-        if not (shift or any(e.kind in MOVED for e in effects)):
-            if self._as_it_came is None:
-                columns = self._columns(self.slots, self._node_poses, masks)
-                self._as_it_came = Geometry(self.slots, masks, columns)
-            return self._as_it_came
+        if not effects and shift is None:
+            columns = self._columns(self.slots, self._node_poses, masks)
+            return Geometry(self.slots, masks, columns)
         slots, poses = self._slots(effects, shift)
         if any(e.kind == "object_size" for e in effects):
             # Another part of what is pushed may be the nearest one.

@@ -38,7 +38,6 @@ WHOLE = 0.9  # Of the squares left: what one more of a body leaves is tried firs
 SOFTER = (0.3, 0.6, 2.0)  # Times the stiffness of the scene: trials.
 MOST_FRICTION = 2.0  # Of what is taken for any.
 MOST_PATCHES, MOST_EFFECTS = 3, 10
-MOST_KEPT = 12  # Geometries.
 SMALL_SHIFT = 1e-3  # First trial of a place [m].
 AXES = "xyz"
 
@@ -87,11 +86,11 @@ def presses(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
 class PressingProblem(ContactProblem):
     """Raises: ValueError where anything but joints moves, or as ContactDynamics."""
 
+    moves = MOVES
     # A wall that was met for a moment shows in its own distance alone.
     plan = replace(ContactProblem.plan, by_channel=True, most_effects=MOST_EFFECTS)
 
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
-        self._geometries: dict[tuple, Geometry] = {}
         self._any_friction = False
         self._mu: float | None = None
         super().__init__(scene, recordings)
@@ -253,25 +252,17 @@ class PressingProblem(ContactProblem):
         return out
 
     def _geometry(self, effects: Sequence[Effect]) -> Geometry:
-        moved = [e for e in effects if e.kind in MOVES]
-        key = tuple((e.kind, *e.at, *sorted(e.parameters.items())) for e in moved)
-        if key not in self._geometries:
-            slots, poses = self._slots(moved)
-            masks = {
-                s.key: on
-                for s, on in zip(slots, self._touches(slots), strict=True)
-                if on.any()
-            }
-            slots = [s for s in slots if s.key in masks]
-            if len(self._geometries) > MOST_KEPT:
-                self._geometries.clear()
-            self._geometries[key] = Geometry(
-                slots, masks, self._columns(slots, poses, masks)
-            )
-        return self._geometries[key]
+        return self._contacts_at(effects, None)
 
-    def _contacts_at(self, effects: Sequence[Effect], shift: Shift | None) -> Geometry:
-        return self._geometry(effects)
+    def _new_geometry(self, effects: Sequence[Effect], shift: Shift | None) -> Geometry:
+        slots, poses = self._slots(effects, shift)
+        masks = {
+            s.key: on
+            for s, on in zip(slots, self._touches(slots), strict=True)
+            if on.any()
+        }
+        slots = [s for s in slots if s.key in masks]
+        return Geometry(slots, masks, self._columns(slots, poses, masks))
 
     def _when(self, geometry: Geometry, s: Slot) -> np.ndarray:
         """(K,) over how much of a test function a slot may act."""

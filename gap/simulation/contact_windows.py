@@ -54,7 +54,7 @@ class PushWindows(WindowModel):
         self._shapes: ContactShapes | None = None
         scene, led = led_as_measured(scene, recordings)
         every = [_most_of(r, e) for r in recordings for e in r.episodes]
-        most = max(MOST, min(sum(n for n in every if n > 2), MOST_OF_LONG))
+        most = max(MOST, min(2 * sum(n for n in every if n > 2), MOST_OF_LONG))
         super().__init__(scene, recordings, WINDOW_SEC, by_episode=True, most=most)
         keep = [
             k for k, c in enumerate(self.channels)
