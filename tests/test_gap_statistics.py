@@ -275,6 +275,9 @@ class Steps:
     def replaced(self, effects):
         return None
 
+    def prior_rows(self, effects):
+        return np.zeros(0)
+
     def residual(self, effects=()):
         x = effects[0].parameters["damping"] if effects else 0.0
         return np.full(8, 10.0 * np.round(abs(x - 0.3) / 0.02) * 0.02)
@@ -932,10 +935,11 @@ def test_a_gap_in_a_gear_that_windows_do_not_show_is_dropped(both, one, kept):
 
 
 def test_a_fit_goes_beyond_what_is_searched_but_for_what_ends():
-    """A patch with ever more friction would shrink to a point."""
+    """A patch with ever more friction would shrink to a point; what holds may have any
+    friction that is enough."""
     highest = {
         (kind, name): fit._highest(kind, name)
         for kind, name in (("friction_patch", "friction"), ("friction_patch", "x_max"),
                            ("contact_friction", "friction"))
     }  # fmt: skip
-    assert list(highest.values()) == [1.5, np.inf, np.inf]
+    assert list(highest.values()) == [1.5, np.inf, 1.5]

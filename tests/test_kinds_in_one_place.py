@@ -35,11 +35,11 @@ KNOWN = {
     "gap/residuals/contact.py": CONTACT,
     "gap/residuals/contact_dynamics.py": {
         "actuator_bias", "actuator_gain", "input_delay", "object_com",
-        "object_inertia", "object_mass",
+        "object_inertia", "object_mass", "object_size",
     },
     "gap/residuals/permitted_contacts.py": {
-        "contact_friction", "friction_patch", "plane_height", "plane_tilt",
-        "wall_position",
+        "contact_friction", "friction_patch", "object_size", "plane_height",
+        "plane_tilt", "wall_position",
     },
     "gap/residuals/pressing.py": {
         "contact_friction", "contact_stiffness", "friction_patch", "plane_height",
@@ -47,7 +47,8 @@ KNOWN = {
     },
     "gap/residuals/contact_problem.py": {
         "body_drag", "constant_force", "contact_friction", "friction_patch",
-        "object_com", "object_inertia", "object_mass", "plane_height", "plane_tilt",
+        "object_com", "object_inertia", "object_mass", "object_size", "plane_height",
+        "plane_tilt",
     },
     "gap/residuals/driven.py": {"rotor_inertia"},
     "gap/simulation/free_windows.py": {"length_scale"},
