@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from gap_benchmark import push_world
-from gap_benchmark.push_world import BLOCK
+from gap_benchmark.push_world import BLOCK, TIP
 from scipy.interpolate import PchipInterpolator
 from scipy.sparse import csr_matrix
 from test_gap_statistics import TwoChannels
@@ -153,6 +153,13 @@ def test_a_long_recording_is_simulated_from_push_to_push(tmp_path, monkeypatch):
         assert len(before) and moves - before[-1] < BEFORE_SEC + 0.25
     error = np.concatenate(made.errors(made.simulate(())))
     assert np.sqrt(np.nanmean(error**2)) < 1.5
+    # A window is no surer than it is in the other model, and as sure in its own.
+    slippery = Effect("contact_friction", [f"{BLOCK}~{TIP}"], {"friction": 1e-3})
+    for effects, changes in (((), False), ((slippery,), True)):
+        wider = [w.std for w in made.with_spread_of(effects).windows]
+        more = [b - w.std for b, w in zip(wider, made.windows, strict=True)]
+        assert min(m.min() for m in more) >= 0.0
+        assert (max(m.max() for m in more) > 1e-5) == changes
     assert len(windows(2.6)[0].windows) <= 2
 
 

@@ -793,6 +793,8 @@ class ContactProblem(ContactDynamics, GapProblem):
                     return None
             model = self._windows
             held = [True] * len(model.windows)
+        if effects:
+            model = model.with_spread_of(effects)
         before = model.simulate(())
         after = model.simulate(effects) if effects else before
         return Outcome(

@@ -8,6 +8,7 @@ long episode, in which an object is pushed, left and pushed again, they begin so
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.residuals.contact_shapes import ContactShapes, poses_of
 from makebreak.gap.simulation.windows import TURN, Window, WindowModel
 from makebreak.models.dynamics import SceneDynamics
-from makebreak.models.effects.kind import full_name, one_dof_joints
+from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import Scene
 from makebreak.models.scene_schema import COMMANDS_OF, ActuationSection
 from makebreak.systems.numerics.smoother import smooth_filtered
@@ -197,21 +198,38 @@ class PushWindows(WindowModel):
             slice(episode.first + k, episode.first + end), state, std, True, spread,
         )  # fmt: skip
 
-    def _add_spread(self) -> None:
-        """Noise, what uncertain starts do in the scene as it is, and a share
-        of how far each channel goes."""
+    def with_spread_of(self, effects: Sequence[Effect]) -> "PushWindows":
+        """The same windows, each no surer than it is with these effects, too: one that
+        is chaotic in either model tells nothing of the other."""
+        other = copy(self)
+        _, wide = self._spread(effects)
+        other.windows = [
+            replace(w, std=np.sqrt(w.std**2 + np.maximum(more - known, 0.0)))
+            for w, more, known in zip(self.windows, wide, self._wide, strict=True)
+        ]
+        return other
+
+    def _spread(self, effects: Sequence[Effect]):
+        """Of each window what it does, and the variance that uncertain starts make."""
         rng = np.random.default_rng(0)
-        plain = self.simulate(())
+        plain = self.simulate(effects)
         wide = [np.zeros_like(y) for y in plain]
         kept = self.windows
         try:
             for _ in range(DRAWS):
                 self.windows = [_drawn(w, rng) for w in kept]
-                for total, y, y0 in zip(wide, self.simulate(()), plain, strict=True):
+                drawn = self.simulate(effects)
+                for total, y, y0 in zip(wide, drawn, plain, strict=True):
                     off = np.minimum((y - y0) ** 2, 1.0)
                     total += np.where(np.isfinite(off), off, 1.0) / DRAWS
         finally:
             self.windows = kept
+        return plain, wide
+
+    def _add_spread(self) -> None:
+        """Noise, what uncertain starts do in the scene as it is, and a share
+        of how far each channel goes."""
+        plain, self._wide = self._spread(())
         far = np.zeros(len(self.channels))
         for y in plain:
             y = np.where(np.isfinite(y), y, np.nanmean(y, axis=0))
@@ -222,7 +240,7 @@ class PushWindows(WindowModel):
         ]
         self.windows = [
             replace(w, std=np.sqrt(w.std**2 + v + far**2))
-            for w, v in zip(self.windows, wide, strict=True)
+            for w, v in zip(self.windows, self._wide, strict=True)
         ]
 
 
