@@ -157,13 +157,37 @@ def test_friction_of_what_sticks_is_a_bound_and_its_deviation_says_so(problem):
         std, or_more = problem.widened(end, 0)
         return std["friction"], or_more
 
-    # More than the scene's is known from below, of which two deviations are no more
-    # than what held the tip; less than the scene's is not known at all.
-    std, or_more = widened(tip, 0.9)
-    assert or_more == ("friction",) and 0.0 < 0.9 - 2.0 * std < of_tip
+    # What held with the scene's friction is not known at all.
+    assert widened(tip, 0.9) == (np.inf, ())
     assert widened(tip, 0.95 * of_tip) == (np.inf, ())
     std, or_more = widened(table, mu)
     assert or_more == () and 1e-6 < std < 0.03 * mu
+
+
+@pytest.mark.parametrize(("moments", "known"), [(40, True), (1, False)])
+def test_what_holds_from_a_friction_on_is_known_from_below(
+    problem, monkeypatch, moments, known
+):
+    """Less than twice the scene's leaves something, in many moments or in one alone."""
+    start, tip = started(problem), tip_pair(problem)
+    now = problem.dynamics.now("contact_friction", [tip])["friction"]
+    calm = problem.nuisances().columns @ start.b
+    rows = problem._of_rows(np.arange(len(problem.means.time))) < moments
+
+    def residual(effects):
+        short = max(2.0 * now - effects[0].parameters["friction"], 0.0)
+        return calm + 1e3 * short * rows / np.sqrt(rows.sum())
+
+    monkeypatch.setattr(problem, "residual", residual)
+    effect = Effect("contact_friction", [tip], {"friction": 2.5 * now})
+    end = replace(start, effects=[effect], std=[{"friction": 1e-6}])
+    std, or_more = problem.widened(end, 0)
+    assert or_more == (("friction",) if known else ())
+    if known:
+        # In steps of 2, 5, 10, 20, 50 %: 1.25 of 2.5 times is the first that is short.
+        assert 2.5 * now - 2.0 * std["friction"] == pytest.approx(1.25 * now)
+    else:
+        assert std["friction"] == np.inf
 
 
 def test_a_friction_that_holds_is_fitted_no_farther_off_than_it_must_be(problem):

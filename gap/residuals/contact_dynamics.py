@@ -60,6 +60,7 @@ class ContactDynamics(PermittedContacts):
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
         super().__init__(scene, recordings)
         self._last: tuple | None = None
+        self._told: dict[tuple[int, int], np.ndarray] = {}
         self._inertial_of: dict[str, np.ndarray] = {}
         self._prepare()
 
@@ -402,6 +403,10 @@ class ContactDynamics(PermittedContacts):
         columns = []
         for pair in self._pairs_met:
             mine = [s for s in slots if self._pair_of(s) == pair and s.key in masks]
+            if not mine:
+                raise ValueError(
+                    f"{self.pair_name(pair)}: not near each other any more"
+                )
             mask = np.stack([masks[s.key] for s in mine]).astype(float)
             free = self._is_of_a_free_body(pair)
             if self._lies(pair) and free:
@@ -425,7 +430,7 @@ class ContactDynamics(PermittedContacts):
                 arm = float(np.sqrt(np.median(A[some].trace(axis1=1, axis2=2)) / 4.0))
                 # Each of several points carries its share.
                 h = self._W @ mean + pressed / np.maximum(self._W @ n, 1.0)
-                good = self._thinned(good)
+                good = self._thinned(pair, good)
                 columns.append(np.where(good, h / self.distance_std(pair), 0.0))
                 std = np.sqrt((shape / max(arm, 1e-3)) ** 2 + turn**2 + 1e-6)
                 spread = np.asarray(self._W @ (n >= 3).astype(float)).ravel() > 0.999
@@ -440,19 +445,23 @@ class ContactDynamics(PermittedContacts):
                 if not self.shapes.anchored & set(pair) or free:
                     # Seen near each other, but known to touch by a force alone.
                     good = good & self._is_pressed(pair)
-                good = self._thinned(good)
+                good = self._thinned(pair, good)
                 columns.append(np.where(good, d / self.distance_std(pair), 0.0))
         return -np.stack(columns, axis=1) if columns else np.zeros((K, 0))
 
-    def _thinned(self, good: np.ndarray) -> np.ndarray:
+    def _thinned(self, pair: tuple[int, int], good: np.ndarray) -> np.ndarray:
         """(K,) of the test functions that are good those that tell a distance: the
-        first, and after each the next one that is so much later."""
+        first, and after each the next one that is so much later. They are chosen once:
+        what a model makes of them chooses no others."""
+        if pair in self._told:
+            return good & self._told[pair]
         m, out = self.means, np.zeros(len(good), bool)
         apart = (THIN - 0.5) * HOP * self.half
         last = (-1, -np.inf)
         for k in np.flatnonzero(good):
             if m.episode[k] != last[0] or m.time[k] - last[1] > apart:
                 out[k], last = True, (m.episode[k], m.time[k])
+        self._told[pair] = out
         return out
 
     def shape_std(self) -> float:

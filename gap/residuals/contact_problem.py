@@ -44,6 +44,7 @@ from makebreak.gap.simulation.contact_windows import (
 from makebreak.gap.simulation.measure import gap_measure, series_of
 from makebreak.gap.simulation.windows import LARGEST
 from makebreak.gap.verdict import NO_GAP
+from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
@@ -91,6 +92,7 @@ class ContactProblem(ContactDynamics, GapProblem):
     )
 
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
+        self._scalable: dict[str, bool] = {}
         super().__init__(scene, recordings)
         self._base: np.ndarray | None = None
         self._nuisances: Nuisances | None = None
@@ -429,8 +431,9 @@ class ContactProblem(ContactDynamics, GapProblem):
         com = self.dynamics.now("object_com", [body])
         steps = [[(2e-3, {**com, a: com[a] + 2e-3}) for a in "xy"]]
         yield "object_com", body, 2, ("x", "y"), ("z",), steps
-        steps = [[(d, {"scale": 1.0 + d})] for d in (0.03, -0.03)]
-        yield "object_size", body, 1, ("scale",), (), steps
+        if self._can_be_scaled(body):
+            steps = [[(d, {"scale": 1.0 + d})] for d in (0.03, -0.03)]
+            yield "object_size", body, 1, ("scale",), (), steps
         inertia = self.dynamics.now("object_inertia", [body])
         mid = {k: inertia[k] for k in ("ixx", "iyy", "izz")}
         for f in (0.9,):
@@ -449,6 +452,18 @@ class ContactProblem(ContactDynamics, GapProblem):
             "body_drag", body, 1, ("linear",), ("angular",),
             [[(step, {**zero, "linear": step})]],
         )  # fmt: skip
+
+    def _can_be_scaled(self, body: str) -> bool:
+        """Whether Drake can, with all that is seen of it (not a mesh)."""
+        if body not in self._scalable:
+            effect = Effect("object_size", [body], {"scale": 1.01})
+            more = replace(self.scene, effects=[*self.scene.effects, effect])
+            try:
+                SceneDynamics(more)
+                self._scalable[body] = True
+            except (ValueError, RuntimeError):
+                self._scalable[body] = False
+        return self._scalable[body]
 
     def _of_mechanism(self):
         """Kinds with one parameter at joints and links of the robot."""

@@ -2,10 +2,10 @@
 
 Spheres are their centres, boxes and hulls their corners. A cylinder that stands on
 something is points on its rims; where its side touches, of each rim the point that is
-nearest to the other surface; of a capsule's axis the point that is nearest. Each is
-compared with the surfaces of other bodies. Edges
-that cross edges are those of boxes, of which one moves freely. Friction and stiffness
-of a pair are those that Drake makes of two surfaces.
+nearest to the other surface; of a capsule's axis the ends, and the nearest point. Each
+is compared with the surfaces of other bodies. Edges that cross edges are those of
+boxes, of which one moves freely. Friction and stiffness of a pair are those that Drake
+makes of two surfaces.
 """
 
 from collections.abc import Callable, Mapping
@@ -255,6 +255,7 @@ class ContactShapes:
         elif isinstance(shape, Capsule):
             r, h = shape.radius(), shape.length() / 2.0
             points(np.zeros(3), r, along=h * R[:, 2])
+            points([[0.0, 0.0, -h], [0.0, 0.0, h]], r)  # Along a plane both touch.
             surface("capsule", r, h)
         elif isinstance(shape, (Convex, Mesh)) and self._hulls:
             mesh = shape.GetConvexHull()

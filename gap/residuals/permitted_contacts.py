@@ -102,6 +102,7 @@ class PermittedContacts(ContactMeans):
         steady = ~self._turning()
         if not steady.all() and steady.sum() >= FEWEST_MEANS:
             self.means = self.means.of(steady)
+            self._lying.clear()
             self._find_slots()
         self._pairs_met = sorted(
             {self._pair_of(s) for s, on in zip(self.slots, self._masks, strict=True)
@@ -192,10 +193,12 @@ class PermittedContacts(ContactMeans):
     def _scale_of(self, effect: Effect, body: int) -> float:
         """By an effect that gives a scale, or the radius of the body's only sphere."""
         p = effect.parameters
-        radius = next((x.radius for x in self.shapes.points if x.body == body), 0.0)
-        scale = p["scale"] if "scale" in p else p["radius"] / radius
+        radii = [x.radius for x in self.shapes.points if x.body == body and x.is_sphere]
+        scale = p.get("scale", 0.0)
+        if "scale" not in p and "radius" in p and len(radii) == 1:
+            scale = p["radius"] / radii[0]
         if not scale > 0.0:
-            raise ValueError("object_size: not above zero")
+            raise ValueError(f"object_size: {p} is no size of {effect.at}")
         return float(scale)
 
     def _is_at(self, effect: Effect, body: int) -> bool:

@@ -199,7 +199,7 @@ class _Search:
         else:
             current = self.start
         if chosen:
-            if any(c.paired for c in chosen):
+            if len(chosen) > 1 and any(c.paired for c in chosen):
                 chosen = self._with_rivals(chosen, current)
             chosen = [
                 replace(c, ties=self._still_tied(chosen, current, k))
@@ -851,7 +851,11 @@ class _Search:
                 ]  # fmt: skip
                 for r in near[:MOST_RIVALS]:
                     found = self._instead(r.candidate, k, chosen, current)
-                    if found is not None and _is_used(found[0], k):
+                    known = any(
+                        (t.kind, tuple(t.at)) == (r.candidate.kind, r.candidate.at)
+                        for t in choice.ties
+                    )
+                    if found is not None and not known and _is_used(found[0], k):
                         rivals.append(found[0].effects[k])
             out.append(replace(choice, ties=(*choice.ties, *rivals)))
         return out

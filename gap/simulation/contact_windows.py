@@ -26,8 +26,9 @@ WINDOW_SEC = 0.6  # Reaches into the sliding.
 BEFORE_SEC = 0.04  # It begins so long before the object moves,
 REST_SEC = 0.1  # after as much rest, or more.
 RESTS = 3e-3  # Slower is at rest [m/s], [rad/s] over ten.
-LONG_SEC, EVERY_SEC = 3.0, 1.5  # A longer episode has a window in so long, at most,
-MOST_OF_LONG = 24  # and this many.
+# A longer episode has a window in so long, at most, and as many before pushes; all long
+# ones together this many.
+LONG_SEC, EVERY_SEC, MOST_OF_LONG = 4.5, 1.5, 24
 APART = 5e-3  # What is so far from all that could push it is left alone [m],
 GOES, SEEMS = 3e-3, 4.0  # It is pushed if it goes so far [m], times its noise.
 SEEN_APART, COMES_SEC = 0.02, 0.2  # asked every so often, and no longer before a push.
@@ -172,7 +173,8 @@ class PushWindows(WindowModel):
             q[:, i : i + 4] /= np.linalg.norm(q[:, i : i + 4], axis=1)[:, None]
         near = np.zeros(len(rows), bool)
         for s in shapes.slots(poses_of(plant, q, shapes), APART):
-            if free & {s.a, s.b} and not shapes.anchored & {s.a, s.b}:
+            pair = {s.a, s.b}
+            if pair & free and pair - free - shapes.anchored:
                 near |= s.phi < APART
         return int(rows[~near][-1]) if not near.all() else -1
 
