@@ -16,7 +16,7 @@ from makebreak.gap.data.recording import read_recordings
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.report.comparison import comparison_html, measured_state
 from makebreak.gap.report.files import extents_of, summary_lines, write_report
-from makebreak.gap.report.pictures import picture_of_where
+from makebreak.gap.report.pictures import picture_of_series, picture_of_where
 from makebreak.gap.result import (
     Considered,
     Estimate,
@@ -364,3 +364,19 @@ def test_a_thrown_and_turning_body_starts_as_it_was(tmp_path):
     np.testing.assert_allclose(state.body_velocities["b.box"][:3], spin, atol=0.1)
     fall = [0.5, -0.2, -9.81 * time[k]]
     np.testing.assert_allclose(state.body_velocities["b.box"][3:], fall, atol=0.01)
+
+
+def test_errors_of_a_channel_with_rows_of_its_own_are_one_line_in_each_window():
+    """Every third row is a camera's; between two of them others have rows."""
+    n = 90
+    measured = np.where(np.arange(n) % 3 == 0, 0.5, np.nan)
+    series = Series(
+        "p.j1.position", "log", 0, 0.01 * np.arange(n), measured, np.zeros(n),
+        np.zeros(n), np.array([0, 45]), 0.1,
+    )  # fmt: skip
+    figure = picture_of_series([series])
+    line = figure.axes[1].lines[0].get_ydata()
+    np.testing.assert_allclose(line[np.isfinite(line)], 5.0)
+    # Thirty rows, and one break: where the second window begins.
+    assert np.isfinite(line).sum() == 30 and np.isnan(line).sum() == 1
+    assert np.flatnonzero(np.isnan(line)).tolist() == [15]

@@ -169,8 +169,11 @@ def picture_of_series(series: Sequence[Series], most: int = 3) -> Figure | None:
         ):
             gapped_t, gapped = _broken(t, value, each.starts)
             left.plot(gapped_t, gapped, color=colour, lw=1.3, label=label)
-            error = (each.measured - value) / max(each.noise, 1e-300)
-            gapped_t, gapped = _broken(t, error, each.starts)
+            # Between rows of a channel others may have rows: no break of the line.
+            rows = np.flatnonzero(np.isfinite(each.measured))
+            error = (each.measured - value)[rows] / max(each.noise, 1e-300)
+            starts = np.searchsorted(rows, each.starts)
+            gapped_t, gapped = _broken(t[rows], error, starts)
             right.plot(gapped_t, gapped, color=colour, lw=1.0, label=label)
         right.axhspan(-2.0, 2.0, color="0.88", lw=0)
         left.set_title(
