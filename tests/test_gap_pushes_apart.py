@@ -97,9 +97,35 @@ def test_a_touch_that_is_too_short_for_a_test_function_has_one_of_its_own():
     np.testing.assert_allclose(short_touches([(0.1, 0.6)], [0.85])[1], [0.2, 0.2])
     # What no sensor feels may touch or not; an impact ends what goes before.
     assert len(short_touches([(0.1, 0.4)], [], felt=False)[0]) == 0
-    np.testing.assert_allclose(
-        short_touches([(0.1, 0.7)], [], struck=[0.4])[0][0], 0.25, atol=0.01
+    centres, halves = short_touches([(0.1, 0.7)], [], struck=[0.4])
+    np.testing.assert_allclose(centres, [0.2475, 0.55])
+    # From 0.1 to 0.395 s; from 0.405 s, after the struck row, to 0.695 s.
+    np.testing.assert_allclose(halves, [0.1475, 0.145])
+
+
+@pytest.mark.parametrize(("rate", "sure"), [(200.0, True), (1000.0, False)])
+def test_a_step_of_an_effort_between_rows_is_not_known_to_the_row(rate, sure):
+    """Rows at 200 Hz of commands at 200 Hz hold; of five commands one is seen."""
+    t, centres = np.arange(0.0, 1.0, 0.005), np.array([0.3, 0.5])
+    u = np.where(t < 0.5, 0.0, 3.0)
+    means = SimpleNamespace(
+        by={"j": "command"}, joints={"j": (0, 0)},
+        scene=SimpleNamespace(actuation=SimpleNamespace(rate_hz=rate)),
+    )  # fmt: skip
+    log = SimpleNamespace(held=lambda name: u)
+    track = SimpleNamespace(time=t, episode=SimpleNamespace(rows=slice(None)))
+    held = held_means(t, centres, 0.1)
+    mean, var, _ = ContactMeans._effort(
+        means, "j", log, track, held, None, None, centres, 0.1
     )
+    np.testing.assert_allclose(mean, [0.0, 1.5], atol=0.02)
+    assert var[0] == 0.0 and (var[1] == 0.0) == sure
+    if not sure:
+        # A step of 3 N m, at a time that is uniform within 5 ms, where the weight of a
+        # test function is at its most, (315/256)/half.
+        assert np.sqrt(var[1]) == pytest.approx(
+            3.0 * 0.005 / np.sqrt(12.0) * 315.0 / 256.0 / 0.1, rel=0.1
+        )
 
 
 @pytest.mark.parametrize(("turn", "drops"), [(0.05, False), (0.3, True)])

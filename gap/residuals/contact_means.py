@@ -596,7 +596,9 @@ class ContactMeans:
             changes[1:] |= own[1:] != own[:-1]
             if key in self._apart:
                 felt |= own
-        changes |= self._is_struck(rows)
+        struck = self._is_struck(rows)
+        changes |= struck
+        changes[1:] |= struck[:-1]
         edges = np.flatnonzero(np.concatenate([[True], changes[1:], [True]]))
         added, widths = [], []
         for a, b in zip(edges, edges[1:], strict=False):
