@@ -227,3 +227,24 @@ def test_two_effects_that_were_added_at_once_have_ties_too():
     assert found["joint_viscous_damping"] == []
     (one,) = set(found) - {"joint_viscous_damping"}
     assert {one, *found[one]} == {"actuator_bias", "joint_coulomb_friction"}
+
+
+def test_a_body_that_drake_cannot_scale_has_no_size_to_name(tmp_path):
+    """It is seen as a mesh; a simulation with another size would end in an error."""
+    rng = np.random.default_rng(71)
+    world = push_world.a_world(rng)
+    table, noise = push_world.record(world, rng, episodes=3)
+    scene = push_world.write(tmp_path, world, table, noise)
+    recordings = read_recordings([tmp_path / "recording.csv"])
+    for sized in (True, False):
+        if not sized:
+            (tmp_path / "seen.obj").write_text("v 0 0 0\nv .1 0 0\nv 0 .1 0\nf 1 2 3\n")
+            (file,) = tmp_path.glob("block*.sdf")
+            seen = "<visual name='v'><geometry><mesh><uri>seen.obj</uri></mesh>"
+            text = file.read_text().replace(
+                "</link>", f"{seen}</geometry></visual></link>"
+            )
+            file.write_text(text)
+        problem = ContactProblem(read_scene(scene), recordings)
+        kinds = {trial[0] for trial in problem._trials()}
+        assert ("object_size" in kinds) == sized and "object_mass" in kinds
