@@ -270,7 +270,9 @@ def test_a_ball_that_is_learned_to_be_smaller_is_passed_and_reached_nearer():
     far = np.hypot(*(rows[:, :2] - [0.5, 0.0]).T)
     assert far[-1] == pytest.approx(0.0515, abs=2e-3)
     _, kept = travelled([0.0, 0.0], config, inside=0.004)
-    assert np.hypot(*(kept.p[:2] - [0.5, 0.0])) > 0.0525 or kept.p[2] > HEIGHT + 0.01
+    # As modelled it is passed no nearer than with half the clearance, 52.5 mm from its
+    # middle; a place that is nearer is reached as far out as that.
+    assert np.hypot(*(kept.p[:2] - [0.5, 0.0])) == pytest.approx(0.0525, abs=4e-4)
 
 
 # Rounds and the loop.
