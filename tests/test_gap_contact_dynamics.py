@@ -9,6 +9,7 @@ import pytest
 from gap_benchmark import contact_cases, contact_scenes, push_world
 from gap_benchmark.contact_scenes import Sensing, record, write_scene
 from gap_benchmark.push_world import BLOCK, TABLE
+from push_problems import pushed_problem, screen_of
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
@@ -238,13 +239,8 @@ def test_a_side_of_a_patch_that_nothing_crosses_is_said_not_to_be_known(tmp_path
     sides = {"x_min": 0.0, "x_max": 0.6, "y_min": -0.05, "y_max": 0.04}
     mu = 1.7 * world.friction
     truth = replace(world, patch=(mu, *sides.values()))
-    table, noise = push_world.record(truth, rng, episodes=5)
-    scene = push_world.write(tmp_path, world, table, noise)
-    problem = ContactProblem(
-        read_scene(scene), read_recordings([tmp_path / "recording.csv"])
-    )
-    n = problem.nuisances()
-    screen = Screen(problem.base(), n.columns, n.prior, problem.train(), reach=n.reach)
+    problem = pushed_problem(tmp_path, world, truth, rng, 5)
+    screen = screen_of(problem)
     patch = Effect("friction_patch", [PAIR], {"friction": mu, **sides})
     end = fit_effects(problem, screen, [patch], [tuple(sides)])
     assert problem.reweigh(end.left)  # As the search does with what it has chosen.
@@ -259,8 +255,7 @@ def test_of_a_friction_s_deviation_held_out_rows_are_asked(tmp_path, monkeypatch
     """A fitted row that the friction alone would explain makes it no better known."""
     scene, recordings, _ = pushed(tmp_path, 15, [], episodes=2)
     problem = ContactProblem(scene, recordings)
-    n = problem.nuisances()
-    screen = Screen(problem.base(), n.columns, n.prior, problem.train(), reach=n.reach)
+    screen = screen_of(problem)
     friction = Effect("contact_friction", [PAIR], {"friction": 0.5})
     end = fit_effects(problem, screen, [friction], [("friction",)])
     # Less than the scene's: more than that might be known from below.
@@ -268,7 +263,7 @@ def test_of_a_friction_s_deviation_held_out_rows_are_asked(tmp_path, monkeypatch
     friction = replace(friction, parameters={"friction": best})
     fitted, end = problem.train(), replace(end, effects=[friction])
     assert fitted.any() and not fitted.all()
-    calm = n.columns @ end.b
+    calm = problem.nuisances().columns @ end.b
 
     def deviation(rows) -> float:
         """Where the rows (n,) want the friction as it is, and others nothing."""

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from gap_benchmark import push_world
 from gap_benchmark.push_world import BLOCK, TIP
+from push_problems import pushed_problem, screen_of
 from scipy.interpolate import PchipInterpolator
 from scipy.sparse import csr_matrix
 from test_gap_statistics import TwoChannels
 
 from makebreak.gap.data.recording import read_recordings
 from makebreak.gap.numerics.permitted_forces import held_means, test_functions
-from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate, SearchPlan
 from makebreak.gap.residuals.contact_means import ContactMeans
 from makebreak.gap.residuals.contact_problem import ContactProblem
@@ -36,19 +36,16 @@ def test_an_object_s_size_is_measured_by_where_it_is_pushed(tmp_path, scale):
     truth = replace(
         world, half=tuple(scale * x for x in world.half), foot=scale * world.foot
     )
-    table, noise = push_world.record(truth, rng, episodes=5)
-    scene = push_world.write(tmp_path, world, table, noise)
-    problem = ContactProblem(
-        read_scene(scene), read_recordings([tmp_path / "recording.csv"])
-    )
-    n = problem.nuisances()
-    screen = Screen(problem.base(), n.columns, n.prior, problem.train(), reach=n.reach)
+    problem = pushed_problem(tmp_path, world, truth, rng, 5)
+    screen = screen_of(problem)
     start = Effect("object_size", [BLOCK], {"scale": 1.0})
     end = fit_effects(problem, screen, [start])
     assert end.effects[0].parameters["scale"] == pytest.approx(scale, abs=0.01)
     assert end.score < 0.6 * fit_effects(problem, screen, []).score
     (found,) = [
-        c for c in problem.candidates(n, fit_effects(problem, screen, []))
+        c for c in problem.candidates(
+            problem.nuisances(), fit_effects(problem, screen, [])
+        )
         if c.kind == "object_size"
     ]  # fmt: skip
     assert found.at == (BLOCK,)
@@ -248,3 +245,12 @@ def test_a_body_that_drake_cannot_scale_has_no_size_to_name(tmp_path):
         problem = ContactProblem(read_scene(scene), recordings)
         kinds = {trial[0] for trial in problem._trials()}
         assert ("object_size" in kinds) == sized and "object_mass" in kinds
+
+
+def test_a_recording_of_too_few_means_is_refused(tmp_path):
+    rng = np.random.default_rng(71)
+    world = push_world.a_world(rng)
+    table, noise = push_world.record(world, rng, episodes=1, seconds=1.0)
+    scene = push_world.write(tmp_path, world, table, noise)
+    with pytest.raises(ValueError, match="too little motion"):
+        ContactProblem(read_scene(scene), read_recordings([tmp_path / "recording.csv"]))

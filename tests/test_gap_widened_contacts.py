@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from gap_benchmark import push_world
 from gap_benchmark.push_world import BLOCK, TABLE
+from push_problems import screen_of
 
 from makebreak.gap.data.recording import read_recordings
 from makebreak.gap.numerics.permitted_forces import tangents
-from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Fitted
 from makebreak.gap.residuals.contact_problem import (
     FRICTION_SPREAD,
@@ -198,8 +198,7 @@ def test_a_friction_that_holds_is_fitted_no_farther_off_than_it_must_be(problem)
     three = Effect("contact_friction", [tip], {"friction": 3.0 * now})
     [row] = problem.prior_rows([three])
     assert row == pytest.approx(np.log(3.0) / FRICTION_SPREAD)
-    n = problem.nuisances()
-    screen = Screen(problem.base(), n.columns, n.prior, problem.train(), reach=n.reach)
+    screen = screen_of(problem)
     effect = Effect("contact_friction", [tip], {"friction": 1.4})
     end = fit_effects(problem, screen, [effect])
     assert end.effects[0].parameters["friction"] == pytest.approx(now, rel=0.1)

@@ -845,17 +845,16 @@ class _Search:
                 rest = [*current.effects[:k], *current.effects[k + 1 :]]
                 screen = self._screen(self.problem.residual(rest), current.fit.train)
                 near = [
-                    r for r in rank(screen, open_)
+                    r.candidate for r in rank(screen, open_)
                     if r.valid and r.candidate.size <= choice.size + MORE
                     and choice.effect.kind not in KINDS[r.candidate.kind].contains
                 ]  # fmt: skip
-                for r in near[:MOST_RIVALS]:
-                    found = self._instead(r.candidate, k, chosen, current)
-                    known = any(
-                        (t.kind, tuple(t.at)) == (r.candidate.kind, r.candidate.at)
-                        for t in choice.ties
-                    )
-                    if found is not None and not known and _is_used(found[0], k):
+                known = {(t.kind, tuple(t.at)) for t in choice.ties}
+                for c in near[:MOST_RIVALS]:
+                    if (c.kind, c.at) in known:
+                        continue
+                    found = self._instead(c, k, chosen, current)
+                    if found is not None and _is_used(found[0], k):
                         rivals.append(found[0].effects[k])
             out.append(replace(choice, ties=(*choice.ties, *rivals)))
         return out
