@@ -169,8 +169,6 @@ class PushWindows(WindowModel):
             for n, axis in enumerate((*TURN, "x", "y", "z")):
                 if (name := f"{full_name(plant, body)}.{axis}") in states:
                     q[:, body.floating_positions_start() + n] = states[name][rows, 0]
-            i = body.floating_positions_start()
-            q[:, i : i + 4] /= np.linalg.norm(q[:, i : i + 4], axis=1)[:, None]
         near = np.zeros(len(rows), bool)
         for s in shapes.slots(poses_of(plant, q, shapes), APART):
             pair = {s.a, s.b}
