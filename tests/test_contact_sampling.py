@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numba
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
@@ -263,6 +264,26 @@ def test_a_batch_is_what_build_and_solve_c3_give_one_by_one(planner):
         # The angle's cost is quadratic in the batch, the angle itself in plan_cost.
         real = plan_cost(lcs, x[i], plan.u, x_desired, problem)
         assert cost[i] == pytest.approx(real, rel=0.1)
+
+
+def test_no_bit_of_a_score_depends_on_the_number_of_threads(planner):
+    model, problem, _ = planner
+    x, guess = places_of(planner)
+    lcs = model.build_many(x, np.zeros(3))
+    x_desired = target(x[0], [0.55, 0.02, 0.6], problem.options.N + 1)
+    threads = numba.get_num_threads()
+    found = []
+    for n in {1, threads}:
+        numba.set_num_threads(n)
+        try:
+            found.append(score_plans(lcs, x, x_desired, problem, guess))
+        finally:
+            numba.set_num_threads(threads)
+    # And a place alone has the score that it has among others.
+    alone = score_plans(lcs, x, x_desired, problem, guess, 2, 3)
+    for first, last, one in zip(found[0], found[-1], alone, strict=True):
+        np.testing.assert_array_equal(first, last)
+        np.testing.assert_array_equal(first[2], one[2])
 
 
 def test_many_lcs_are_those_of_one_after_the_other(planner):

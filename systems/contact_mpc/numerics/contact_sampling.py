@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from time import perf_counter
 
 import numpy as np
-from numba import njit
+from numba import get_num_threads, njit, prange
 
 from makebreak.systems.contact_mpc.numerics.ball_state import (
     P_BALL,
@@ -328,59 +328,63 @@ def travel_step(
 
 
 @njit(cache=True)
+def _score_one(lcs, x, x_desired, weights, bounds, polish_bounds, U, guess, options):
+    """cost, u (N, n_u), x (N + 1, n_x) of _score's place, whose arrays have one row."""
+    A, B, D, d, E, F, H, c = lcs
+    Q, Q_N, R, G, h = weights
+    rounds, rho, scale_lam, start_at_x0, evaluations = options
+    _, N, n_u = guess.shape
+    no_u, no_x = np.zeros((N, n_u)), np.zeros((N + 1, x.shape[1]))
+    if not (np.isfinite(c).all() and np.isfinite(F).all()):
+        return NO_PLAN, no_u, no_x
+    scale = 1.0
+    if scale_lam:
+        scale = np.sqrt((A[0] ** 2).sum()) / np.sqrt((D[0] ** 2).sum())
+    model, E_s, F_s, _, pushes = scaled_model(A, B, D, d, E, F, H, c, scale)
+    AB, d_s, C, c_s = model
+    lam0 = np.empty(0)
+    if not pushes:
+        lam0, status = solve_lcp_kernel(F_s[0], E_s[0] @ x[0] + c_s[0])
+        if status != SOLVED:
+            return NO_PLAN, no_u, no_x
+    delta, w = np.zeros((N, G.size)), np.zeros((N, G.size))
+    if start_at_x0:
+        delta[:, : x.shape[1]] = x
+    status, _, _, _, _, inputs = admm_plus(
+        AB, d_s, C, c_s, Q, R, Q_N, G, bounds, U, h, x[0], lam0, delta, w, rounds, rho
+    )
+    if status != SOLVED:
+        return NO_PLAN, no_u, no_x
+    starts = np.empty((rounds + 3, N, n_u))
+    starts[: rounds + 1] = inputs
+    starts[rounds + 1] = guess[0]
+    starts[rounds + 2, : N - 1], starts[rounds + 2, N - 1] = guess[0, 1:], guess[0, -1]
+    plan, u, _, cost = polish(
+        lcs, x[0], starts, x_desired, no_u, (Q, R, Q_N), polish_bounds, evaluations
+    )[:4]
+    return cost, u, plan
+
+
+@njit(cache=True, parallel=True)
 def _score(lcs, x, x_desired, weights, bounds, polish_bounds, U, guess, options):
-    """cost (n,), u (n, N, n_u), x (n, N + 1, n_x): solve_c3's C3+, one after the other.
+    """cost (n,), u (n, N, n_u), x (n, N + 1, n_x): solve_c3's C3+, side by side.
+
+    No place knows of another, so that the threads' number changes no bit.
 
     Args: lcs: A, B, D, d, E, F, H, c, each of n; x (n, n_x); weights: Q, Q_N, R, G, h;
         bounds as of admm_plus, polish_bounds as of polish; guess (n, N, n_u); options:
         rounds, rho, scale_lam, start_at_x0, polish.
     """
     A, B, D, d, E, F, H, c = lcs
-    Q, Q_N, R, G, h = weights
-    rounds, rho, scale_lam, start_at_x0, evaluations = options
-    n, n_z = len(x), G.size
-    _, N, n_u = guess.shape
-    cost, u_of = np.full(n, NO_PLAN), np.zeros((n, N, n_u))
-    x_of = np.zeros((n, N + 1, x.shape[1]))
-    for i in range(n):
+    n, N, n_u = guess.shape
+    cost, u_of = np.empty(n), np.empty((n, N, n_u))
+    x_of = np.empty((n, N + 1, x.shape[1]))
+    for i in prange(n):
         one = slice(i, i + 1)
-        if not (np.isfinite(c[i]).all() and np.isfinite(F[i]).all()):
-            continue
-        scale = 1.0
-        if scale_lam:
-            scale = np.sqrt((A[i] ** 2).sum()) / np.sqrt((D[i] ** 2).sum())
-        model, E_s, F_s, _, pushes = scaled_model(
-            A[one], B[one], D[one], d[one], E[one], F[one], H[one], c[one], scale
-        )
-        AB, d_s, C, c_s = model
-        lam0 = np.empty(0)
-        if not pushes:
-            lam0, status = solve_lcp_kernel(F_s[0], E_s[0] @ x[i] + c_s[0])
-            if status != SOLVED:
-                continue
-        delta, w = np.zeros((N, n_z)), np.zeros((N, n_z))
-        if start_at_x0:
-            for k in range(N):
-                delta[k, : x.shape[1]] = x[i]
-        status, x_i, v_i, _, _, inputs = admm_plus(
-            AB, d_s, C, c_s, Q, R, Q_N, G, bounds, U, h, x[i], lam0, delta, w, rounds,
-            rho,
+        cost[i], u_of[i], x_of[i] = _score_one(
+            (A[one], B[one], D[one], d[one], E[one], F[one], H[one], c[one]), x[one],
+            x_desired, weights, bounds, polish_bounds, U, guess[one], options,
         )  # fmt: skip
-        if status != SOLVED:
-            continue
-        starts = np.empty((rounds + 3, N, n_u))
-        starts[: rounds + 1] = inputs
-        starts[rounds + 1] = guess[i]
-        starts[rounds + 2, : N - 1], starts[rounds + 2, N - 1] = (
-            guess[i, 1:],
-            guess[i, -1],
-        )
-        found = polish(
-            (A[one], B[one], D[one], d[one], E[one], F[one], H[one], c[one]), x[i],
-            starts, x_desired, np.zeros((N, n_u)), (Q, R, Q_N), polish_bounds,
-            evaluations,
-        )  # fmt: skip
-        x_of[i], u_of[i], cost[i] = found[0], found[1], found[3]
     return cost, u_of, x_of
 
 
@@ -434,16 +438,18 @@ def score_plans(lcs, x, x_desired, problem: C3Problem, guess=None, first=0, last
     return cost, *whole
 
 
-def score_within(budget_sec, lcs, x, x_desired, problem, guess=None, at_once=4):
+def score_within(budget_sec, lcs, x, x_desired, problem, guess=None, at_once=None):
     """score_plans of as many states as the budget has time for, the first ones first.
 
     Args: budget_sec: wall-clock time [s]; infinite: all, in one go, which repeats
-        whatever the computer does. at_once: states between two looks at the clock.
+        whatever the computer does. at_once: states between two looks at the clock;
+        None: 4, or as many as there are threads.
     Returns: as score_plans.
     """
     if np.isinf(budget_sec):
         return score_plans(lcs, x, x_desired, problem, guess)
     start, n = perf_counter(), len(x)
+    at_once = max(4, get_num_threads()) if at_once is None else at_once
     parts = []
     for first in range(0, n, at_once):
         spent = perf_counter() - start
