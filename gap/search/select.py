@@ -74,6 +74,8 @@ THERE = 0.1
 DRIFT = 0.05
 MOST_RIVALS = 3  # Of one of two that were added at once.
 PAIRED = 10  # Candidates of which all pairs are tried against a single one.
+# Looked ahead from: the best one and so many others. Seconds of each that are fitted.
+FIRSTS, SECONDS = 4, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -370,6 +372,8 @@ class _Search:
         pair = self._both(screen, chosen, sound, pick)
         if pair is None:
             pair = self._pair(wide, screen, chosen, ranked, *sound[pick])
+        if pair is None:
+            pair = self._ahead(screen, chosen, sound, pick)
         if pair is not None:
             sound.append(pair)
             pick = len(sound) - 1
@@ -474,22 +478,55 @@ class _Search:
                 break  # The single one with another is as good or better.
             if not self._error(score) < (1.0 - NESTED_GAIN) * self._error(single.score):
                 break
-            both = Candidate(
-                f"{a.candidate.kind} and {b.candidate.kind}",
-                (*a.candidate.at, *b.candidate.at),
-                a.candidate.size + b.candidate.size,
-                (np.hstack([a.columns, b.columns]),), (),
-                members=(a.candidate, b.candidate),
-            )  # fmt: skip
-            found = self._fit_each(
-                screen, chosen,
-                [Ranked(both, screen.fit(both.columns[0]), effects, True, 0)],
-            )  # fmt: skip
-            for fitted, r in found:
+            for fitted, r in self._fit_each(screen, chosen, [_pair_of(a, b, effects)]):
                 less = (1.0 - NESTED_GAIN) * self._error(single.score)
                 if self._error(fitted.score) < less:
                     return fitted, r
         return None
+
+    def _ahead(self, screen: Screen, chosen: Sequence[Choice], sound, pick: int):
+        """Two other effects where they leave clearly less than the best single one does
+        and no more than that one with a second: fitted exactly, each second by columns
+        of the scene with the first in it. (Two frictions that are wrong at once: a
+        patch, with its five parameters, does more than either, and by the columns of
+        the scene as it came the second one does nothing.)"""
+        single, of = sound[pick]
+        if of.candidate.members or self.problem.noise_error(single.left) < FLOOR:
+            return None
+        others = [
+            k for k, (_, r) in enumerate(sound)
+            if k != pick and not r.candidate.members
+        ]  # fmt: skip
+        others.sort(key=lambda k: sound[k][0].score)
+        pairs = []
+        for k in (pick, *others[:FIRSTS]):
+            fit, first = sound[k]
+            there = _refreshed([*chosen, _untold(first, fit.effects[-1])], fit)
+            found = self.problem.next_candidates(fit)
+            if not found:
+                continue
+            slopes = tangents(self.problem, fit, [c.fixed for c in there])
+            wide = self._screen(fit.r, fit.fit.train, slopes=slopes)
+            less = [
+                r for r in rank(wide, found)
+                if r.valid and self._error(r.fit.score) < self._error(fit.score)
+            ]  # fmt: skip
+            for both, second in self._fit_each(screen, there, less[:SECONDS]):
+                pairs.append((k, both, _pair_of(first, second, both.effects[-2:])))
+        if not pairs:
+            return None
+        errors = [self._error(both.score) for _, both, _ in pairs]
+        # Of as many parameters those of one kind, which may have one cause.
+        sizes = [
+            2 * _weight(r.candidate) - (len({e.kind for e in r.effects}) == 1)
+            for *_, r in pairs
+        ]  # fmt: skip
+        best = simplest(errors, sizes, SAME)
+        k, both, pair = pairs[best]
+        if k == pick or any(m is of.candidate for m in pair.candidate.members):
+            return None  # The second is found when the first is there.
+        most = (1.0 - NESTED_GAIN) * self._error(single.score)
+        return (both, pair) if errors[best] < most else None
 
     def _together(self, chosen, one, other) -> Together | None:
         """Two rivals (fit, ranked) of one parameter each, fitted at once; None where
@@ -548,15 +585,7 @@ class _Search:
             return None
         _, rival, both = min(found, key=lambda each: each[0])
         a, b = sound[pick][1], rival
-        ranked = Ranked(
-            Candidate(
-                f"{a.candidate.kind} and {b.candidate.kind}",
-                (*a.candidate.at, *b.candidate.at), 2,
-                (np.hstack([a.columns, b.columns]),), (),
-                members=(a.candidate, b.candidate),
-            ),
-            a.fit, both.fitted.effects[len(chosen) :], True, 0,
-        )  # fmt: skip
+        ranked = _pair_of(a, b, both.fitted.effects[len(chosen) :])
         self._pairs.append(ranked)
         pairs = self._fit_each(screen, chosen, [ranked])
         return pairs[0] if pairs else None
@@ -587,7 +616,7 @@ class _Search:
         if len(new) == 1:
             sizes = [best.candidate.size]
         fixed = best.fixed()
-        together = len(new) > 1 and len({e.kind for e in new}) == 1
+        together = len(new) > 1 and best.candidate.kind in KINDS  # A group's.
         of_two = any(best is pair for pair in self._pairs)
         return _Step(
             fit,
@@ -987,6 +1016,22 @@ def _nothing(ranked: Ranked) -> Effect:
     """A candidate as it is in the scene: with nothing of it."""
     (effect,) = ranked.candidate.effects(ranked.alternative, np.zeros(1))
     return effect
+
+
+def _pair_of(a: Ranked, b: Ranked, effects: Sequence[Effect]) -> Ranked:
+    """Two candidates that are added at once, as these effects."""
+    one, two = a.candidate, b.candidate
+    both = Candidate(
+        f"{one.kind} and {two.kind}", (*one.at, *two.at), one.size + two.size,
+        (np.hstack([a.columns, b.columns]),), (), members=(one, two),
+    )  # fmt: skip
+    return Ranked(both, a.fit, tuple(effects), True, 0)
+
+
+def _untold(ranked: Ranked, effect: Effect) -> Choice:
+    """An effect that is tried, as one that was chosen; nothing is told of it yet."""
+    of = ranked.candidate
+    return Choice(effect, {}, np.inf, np.inf, "", np.inf, (), of.fixed, of.size)
 
 
 def _are_rivals(one, other) -> bool:
