@@ -75,6 +75,9 @@ FRICTION_SPREAD = 1.0
 SHARES = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 0.9)
 AT_MOST = 20.0  # Of a row, where a block of time is asked whether it is loud.
 FEWEST_ROWS = 8  # Of a channel that is looked at by itself.
+# Of what the scene has, tried: small steps, and far ones, for what a friction changes
+# ends where the contact holds.
+FRICTIONS, MASSES = (0.85, 1.3, 0.5, 2.0), (0.85, 1.2, 0.6, 1.6)
 SMALL = 0.1  # First trial of an effect on joints, of the efforts there.
 
 
@@ -408,7 +411,7 @@ class ContactProblem(ContactDynamics, GapProblem):
             at = self.pair_name(pair)
             mu = self._friction_now(pair)
             if mu > 0.0:
-                steps = [[((f - 1.0) * mu, {"friction": f * mu})] for f in (0.85, 1.3)]
+                steps = [[((f - 1.0) * mu, {"friction": f * mu})] for f in FRICTIONS]
                 yield "contact_friction", at, 1, ("friction",), (), steps
         for body in self.bodies:
             yield from self._of_body(body)
@@ -429,7 +432,7 @@ class ContactProblem(ContactDynamics, GapProblem):
 
     def _of_body(self, body: str):
         mass = self.dynamics.now("object_mass", [body])["mass"]
-        steps = [[((f - 1.0) * mass, {"mass": f * mass})] for f in (0.85, 1.2)]
+        steps = [[((f - 1.0) * mass, {"mass": f * mass})] for f in MASSES]
         yield "object_mass", body, 1, ("mass",), (), steps
         com = self.dynamics.now("object_com", [body])
         steps = [[(2e-3, {**com, a: com[a] + 2e-3}) for a in "xy"]]
