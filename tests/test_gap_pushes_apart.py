@@ -20,6 +20,7 @@ from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.contact_shapes import Slot
 from makebreak.gap.residuals.permitted_contacts import STEADY, PermittedContacts
 from makebreak.gap.search.fit import fit_effects
+from makebreak.gap.search.screen import rank
 from makebreak.gap.search.select import select
 from makebreak.gap.simulation.contact_windows import BEFORE_SEC, PushWindows
 from makebreak.models.effects.kind import Effect
@@ -224,6 +225,21 @@ def test_two_effects_that_were_added_at_once_have_ties_too():
     assert found["joint_viscous_damping"] == []
     (one,) = set(found) - {"joint_viscous_damping"}
     assert {one, *found[one]} == {"actuator_bias", "joint_coulomb_friction"}
+
+
+@pytest.mark.parametrize("factor", [0.4, 2.5])
+def test_a_friction_far_off_is_guessed_by_steps_as_far(tmp_path, factor):
+    """What more friction changes ends where the tip sticks: by small steps half of what
+    is missing is found."""
+    rng = np.random.default_rng(73)
+    world = push_world.a_world(rng)
+    truth = replace(world, tip_friction=factor * world.tip_friction)
+    problem = pushed_problem(tmp_path, world, truth, rng, 5)
+    screen = screen_of(problem)
+    found = problem.next_candidates(fit_effects(problem, screen, []))
+    (one,) = [r for r in rank(screen, found) if r.candidate.at == (f"{BLOCK}~tip.tip",)]
+    guess = one.effects[0].parameters["friction"]
+    assert guess == pytest.approx(truth.tip_friction, rel=0.15)
 
 
 class OneHidesTheOther(TwoAtOnce):
