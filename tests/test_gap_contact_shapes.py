@@ -55,6 +55,31 @@ def _quaternion(rng):
     return Quaternion(q / np.linalg.norm(q))
 
 
+def test_what_stays_away_is_left_out_and_nothing_else(tmp_path, monkeypatch):
+    """One pose at a time, so that what comes nearest counts alone; near to the limit,
+    too."""
+    loaded, _ = scene_of(tmp_path, **SHAPES)
+    shapes = ContactShapes(loaded)
+    rng = np.random.default_rng(4)
+    poses = [
+        {k: random_poses(rng, 1, 0.12) for k in shapes.bodies()} for _ in range(40)
+    ]
+    some = [shapes.slots(each, 0.02) for each in poses]
+    left_out = [
+        point.stays_away(s, *each[point.body], *each[s.body], 0.02)
+        for each in poses for point in shapes.points for s in shapes.surfaces
+        if s.body != point.body
+    ]  # fmt: skip
+    assert 0.5 < np.mean(left_out) < 1.0
+    monkeypatch.setattr(type(shapes.points[0]), "stays_away", lambda *_: False)
+    for each, found in zip(poses, some, strict=True):
+        every = shapes.slots(each, 0.02)
+        assert [s.key for s in found] == [s.key for s in every]
+        for one, other in zip(found, every, strict=True):
+            np.testing.assert_array_equal(one.phi, other.phi)
+            np.testing.assert_array_equal(one.best, other.best)
+
+
 @pytest.mark.parametrize("other", ["box", "sphere", "hull"])
 def test_a_capsule_is_as_far_from_a_shape_as_drake_says(tmp_path, other):
     loaded, builder = scene_of(tmp_path, one=SHAPES["capsule"], two=SHAPES[other])

@@ -78,6 +78,8 @@ FEWEST_ROWS = 8  # Of a channel that is looked at by itself.
 # Of what the scene has, tried: small steps, and far ones, for what a friction changes
 # ends where the contact holds.
 FRICTIONS, MASSES = (0.85, 1.3, 0.5, 2.0), (0.85, 1.2, 0.6, 1.6)
+SIZES = (0.03, -0.03, 0.1, -0.1)  # Likewise, and added to 1.
+OFFSETS = (2e-3, 0.01, -0.01)  # Of a centre of mass [m].
 SMALL = 0.1  # First trial of an effect on joints, of the efforts there.
 
 
@@ -435,10 +437,10 @@ class ContactProblem(ContactDynamics, GapProblem):
         steps = [[((f - 1.0) * mass, {"mass": f * mass})] for f in MASSES]
         yield "object_mass", body, 1, ("mass",), (), steps
         com = self.dynamics.now("object_com", [body])
-        steps = [[(2e-3, {**com, a: com[a] + 2e-3}) for a in "xy"]]
+        steps = [[(d, {**com, a: com[a] + d}) for a in "xy"] for d in OFFSETS]
         yield "object_com", body, 2, ("x", "y"), ("z",), steps
         if self._can_be_scaled(body):
-            steps = [[(d, {"scale": 1.0 + d})] for d in (0.03, -0.03)]
+            steps = [[(d, {"scale": 1.0 + d})] for d in SIZES]
             yield "object_size", body, 1, ("scale",), (), steps
         inertia = self.dynamics.now("object_inertia", [body])
         mid = {k: inertia[k] for k in ("ixx", "iyy", "izz")}

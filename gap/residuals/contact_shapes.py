@@ -71,6 +71,20 @@ class _Point:
         d, _ = s.distance(np.einsum("nji,nj->ni", R_b, c - p_b))
         return c, d - self.radius, n, side
 
+    def stays_away(self, s: "_Surface", R_a, p_a, R_b, p_b, near: float) -> bool:
+        """Whether it is farther than `near` [m] at all poses, as balls about the two
+        say, or the distance of its middle: what takes little time."""
+        c = p_a + R_a @ self.p_B
+        half = 0.0 if self.along is None else float(np.linalg.norm(self.along))
+        most = near + self.radius + self.rim + half
+        between = np.linalg.norm(c - (p_b + R_b @ s.p_BG), axis=1)
+        if between.min() > most + s.reach():
+            return True
+        if self.along is None:
+            return False
+        d, _ = s.distance(np.einsum("nji,nj->ni", R_b, c - p_b))
+        return bool(d.min() > most)
+
     def _nearest(self, s: "_Surface", c, R_a, R_b, p_b) -> np.ndarray:
         """(n,) where on the axis, from -1 to 1, it is nearest to a convex surface, of
         which the distance is convex along a line: by thirds."""
@@ -103,6 +117,14 @@ class _Surface:
         """(n, 3) places in world in the surface's own frame, at poses of its body."""
         p = np.einsum("nji,nj->ni", R_b, places - p_b)
         return (p - self.p_BG) @ self.R_BG
+
+    def reach(self) -> float:
+        """How far it is from its own origin at most [m]; infinite where it is open."""
+        if self.kind == "box":
+            return float(np.linalg.norm(self.size[0]))
+        if self.kind in ("sphere", "capsule", "cylinder"):
+            return float(sum(self.size))
+        return np.inf
 
     def scaled(self, scale: float) -> "_Surface":
         """About the body's origin."""
@@ -316,6 +338,8 @@ class ContactShapes:
         """
         found = []
         facing: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
+        of_points = {p.geometry for p in self.points}
+        of_surfaces = {s.geometry for s in self.surfaces}
         for i, point in enumerate(self.points):
             each: list[tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
             for j, s in enumerate(self.surfaces):
@@ -325,14 +349,17 @@ class ContactShapes:
                 if self._apart[point.geometry, s.geometry]:
                     continue
                 # A sphere as a surface says no more than its centre as a point.
+                # (Where the point's own shape is a surface for that centre, too.)
                 if s.kind == "sphere" and not point.is_sphere:
-                    if any(q.geometry == s.geometry for q in self.points):
-                        if self._is_seen_by(s, point):
-                            continue
+                    if s.geometry in of_points and point.geometry in of_surfaces:
+                        continue
                 if s.kind == "sphere" and point.is_sphere and j < i:
                     if s.body > point.body:
                         continue  # Two spheres are one pair.
-                c, phi, n, may = point.near(s, *poses[point.body], *poses[s.body])
+                at, to = poses[point.body], poses[s.body]
+                if point.stays_away(s, *at, *to, near):
+                    continue
+                c, phi, n, may = point.near(s, *at, *to)
                 if s.kind == "box" and point.is_corner and phi.min() < near:
                     key = (point.geometry, s.geometry)
                     if key not in facing:
@@ -407,10 +434,6 @@ class ContactShapes:
                                      friction, stiffness)
                             )  # fmt: skip
         return found
-
-    def _is_seen_by(self, sphere: _Surface, corner: _Point) -> bool:
-        """Whether the corner's shape is a surface that the sphere is compared with."""
-        return any(s.geometry == corner.geometry for s in self.surfaces)
 
 
 def _by_face(s: _Surface, places, phi, normal, R_b, p_b, axis, side):
