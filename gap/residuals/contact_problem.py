@@ -73,6 +73,7 @@ MOVED, PROFILE = (5e-4, 1e-3, 2e-3, 4e-3, 8e-3, 0.016, 0.032, 0.064), 16.0
 FRICTION_SPREAD = 1.0
 # By what share of itself a friction is moved likewise.
 SHARES = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 0.9)
+JUMP = 20.0  # Times the noise, between what a shift does forwards and backwards.
 AT_MOST = 20.0  # Of a row, where a block of time is asked whether it is loud.
 FEWEST_ROWS = 8  # Of a channel that is looked at by itself.
 # Of what the scene has, tried: small steps, and far ones, for what a friction changes
@@ -123,6 +124,10 @@ class ContactProblem(ContactDynamics, GapProblem):
     def _of_rows(self, value: np.ndarray) -> np.ndarray:
         """A value of each test function, for each row."""
         return np.broadcast_to(value[:, None], self._shown.shape)[self._shown]
+
+    def _of_moments(self) -> np.ndarray:
+        """(m,) number of each row's test function."""
+        return self._of_rows(np.arange(len(self.means.time)))
 
     def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
         r = self.left(effects, weighed_as=self._weights)
@@ -315,23 +320,39 @@ class ContactProblem(ContactDynamics, GapProblem):
                 continue
             add(name, self.residual([effect]), size, size)
         for body in self.bodies:
-            period = self._period(body)
-            for k, axis in enumerate("xyz"):
-                place = tuple(np.eye(3)[k] * 1e-3)
-                moved = self._flat(self.left((), Shift(body, place=place)))
-                add(f"place of {body}, {axis}", moved, 1e-3, PLACED)
-            for k, axis in enumerate("xy"):
-                turn = tuple(np.eye(3)[k] * 1e-3)
-                moved = self._flat(self.left((), Shift(body, turn=turn)))
-                add(f"turn of {body}, {axis}", moved, 1e-3, TURNED)
-            moved = self._flat(self.left((), Shift(body, late=1e-3)))
-            add(f"clock of {body}", moved, 1e-3, LATE * period)
+            step = 1e-3
+            shifts: list[tuple[str, float, list[Shift]]] = []
+            for name, by in zip("xyz", step * np.eye(3), strict=True):
+                both = [Shift(body, place=tuple(x)) for x in (by, -by)]
+                shifts.append((f"place of {body}, {name}", PLACED, both))
+            for name, by in zip("xy", step * np.eye(3)[:2], strict=True):
+                both = [Shift(body, turn=tuple(x)) for x in (by, -by)]
+                shifts.append((f"turn of {body}, {name}", TURNED, both))
+            both = [Shift(body, late=late) for late in (step, -step)]
+            shifts.append((f"clock of {body}", LATE * self._period(body), both))
+            for name, size, both in shifts:
+                ahead, back = (self._flat(self.left((), shift)) for shift in both)
+                slope = self._without_jumps((base - ahead) / step, (back - base) / step,
+                                            size)  # fmt: skip
+                add(name, base - slope, 1.0, size)
         self._nuisances = (
             Nuisances(np.stack(columns, axis=1), np.array(prior), tuple(names), BEYOND)
             if columns
             else Nuisances.none(len(base))
         )
         return self._nuisances
+
+    def _without_jumps(self, ahead, back, size: float) -> np.ndarray:
+        """(m,) a slope, of those one way and the other. Where one of the two shifts
+        meets another face, or none, that is a jump and no slope, and would count many
+        times as much: at such moments the lesser of the two is taken, none where they
+        contradict each other. size: of the shift."""
+        apart = np.abs(ahead - back) * size > JUMP
+        of = self._of_moments()
+        jumps = np.bincount(of, weights=apart) > 0.0
+        lesser = np.where(np.abs(ahead) < np.abs(back), ahead, back)
+        lesser = np.where(ahead * back > 0.0, lesser, 0.0)
+        return np.where(jumps[of], lesser, ahead)
 
     def _ripple(self, welded: Sequence[int]) -> np.ndarray:
         """(K, 3) force at a sensor by a delay of all commands [N/s]: a drive's effort
@@ -634,10 +655,10 @@ class ContactProblem(ContactDynamics, GapProblem):
         """A patch's side that nothing slid across can be anywhere until something did,
         and what sticks says of friction only that it is not less: each is moved by ever
         more, and its deviation is half of how far that goes without a loss of PROFILE
-        noise variances; infinite where it goes on. Of a friction held-out rows are
-        asked: a single fitted one may want more and more of it; one that is larger than
-        the scene's, and may be any larger, is known from below, if not by one moment
-        alone."""
+        noise variances; infinite where it goes on. Of a friction and a size held-out
+        rows are asked: a single fitted one may want more and more of it. A friction
+        that is larger than the scene's, and may be any larger, is known from below, if
+        not by one moment alone."""
         effect, std = end.effects[k], dict(end.std[k])
         p, every = effect.parameters, np.ones(len(end.r), bool)
         asked = every
@@ -646,10 +667,12 @@ class ContactProblem(ContactDynamics, GapProblem):
             moves: dict[str, tuple[float, ...]] = dict.fromkeys(sides, MOVED)
         elif effect.kind == "contact_friction":
             moves = {"friction": tuple(x * p["friction"] for x in SHARES)}
-            if not self._train.all():
-                asked = ~self.train()
+        elif effect.kind == "object_size":  # Another face is met: its slopes jump.
+            moves = {"scale": tuple(x * p["scale"] for x in SHARES)}
         else:
             return std, ()
+        if effect.kind != "friction_patch" and not self._train.all():
+            asked = ~self.train()
         calm = self.nuisances().columns @ end.b
         limit = PROFILE * max(end.score, 1.0) ** 2
 
@@ -662,7 +685,7 @@ class ContactProblem(ContactDynamics, GapProblem):
                 return np.full(len(end.r), np.inf)
 
         least = squares(p)
-        moment = self._of_rows(np.arange(len(self.means.time)))
+        moment = self._of_moments()
 
         def far(name: str, sign: float, rows, but_one: bool = False) -> float:
             for d in moves[name]:
@@ -734,11 +757,17 @@ class ContactProblem(ContactDynamics, GapProblem):
 
     def _blocks_left(self, left: np.ndarray) -> list[tuple[float, int]]:
         """Rms of rows (m,) and number of each block that has enough of them. Of a row
-        counts AT_MOST: what one reading is off by says nothing of a stretch of time."""
+        counts AT_MOST: what one reading is off by says nothing of a stretch of time. As
+        if each had one moment more, which nothing is off in: of a hundred blocks of one
+        moment each some meet their object just as it tips, or a touch sets in."""
         of_rows = self.blocks()
         found = [(left[of_rows == k], int(k)) for k in np.unique(of_rows)]
         found = [(r, k) for r, k in found if len(r) >= FEWEST_ROWS]
-        return [(rms(np.clip(r, -AT_MOST, AT_MOST)), k) for r, k in found] or [(0.0, 0)]
+        moments = np.bincount(self._block)
+        seen = np.sqrt(moments / (moments + 1.0))
+        return [
+            (rms(np.clip(r, -AT_MOST, AT_MOST)) * float(seen[k]), k) for r, k in found
+        ] or [(0.0, 0)]
 
     def where(self, left: np.ndarray) -> list[Where]:
         r = np.zeros(self._shown.shape)
