@@ -227,6 +227,26 @@ def test_two_effects_that_were_added_at_once_have_ties_too():
     assert {one, *found[one]} == {"actuator_bias", "joint_coulomb_friction"}
 
 
+def test_a_jump_is_no_slope():
+    """Of three moments with two rows each: alike both ways but for curvature; one way
+    another face is met; both ways, which contradict each other."""
+    moments = SimpleNamespace(_of_moments=lambda: np.repeat([0, 1, 2], 2))
+    ahead = np.array([10.0, -3.0, 9e3, 2.0, 5e3, 1.0])
+    back = np.array([11.0, -2.0, 40.0, 3.0, -4e3, 1.5])
+    found = ContactProblem._without_jumps(moments, ahead, back, 0.01)  # type: ignore
+    np.testing.assert_array_equal(found, [10.0, -3.0, 40.0, 2.0, 0.0, 1.0])
+
+
+def test_a_block_of_one_moment_is_less_loud_than_one_of_many():
+    blocks = SimpleNamespace(
+        _block=np.array([0] * 8 + [1]), blocks=lambda: np.repeat([0, 1], [80, 10])
+    )
+    left = np.full(90, 4.0)
+    (many, _), (one, _) = ContactProblem._blocks_left(blocks, left)  # type: ignore
+    assert many == pytest.approx(4.0 * np.sqrt(8 / 9))
+    assert one == pytest.approx(4.0 * np.sqrt(1 / 2))
+
+
 @pytest.mark.parametrize("factor", [0.4, 2.5])
 def test_a_friction_far_off_is_guessed_by_steps_as_far(tmp_path, factor):
     """What more friction changes ends where the tip sticks: by small steps half of what
