@@ -68,7 +68,7 @@ STEADY = 2.0
 # Joints that get a value of their own, at most; and how many are fitted for each.
 MOST_OWN, OWN_TRIES = 8, 3
 # Of the held-out error, what an effect takes off that is told by this alone.
-THERE = 0.1
+THERE = 0.25
 # A refit that leaves so much more of held-out rows went along what fitted rows do not
 # tell.
 DRIFT = 0.05
@@ -486,7 +486,8 @@ class _Search:
 
     def _ahead(self, screen: Screen, chosen: Sequence[Choice], sound, pick: int):
         """Two other effects where they leave clearly less than the best single one does
-        and no more than that one with a second: fitted exactly, each second by columns
+        (as little, if they have fewer parameters) and no more than that one with a
+        second: fitted exactly, each second by columns
         of the scene with the first in it. (Two frictions that are wrong at once: a
         patch, with its five parameters, does more than either, and by the columns of
         the scene as it came the second one does nothing.)"""
@@ -507,10 +508,18 @@ class _Search:
                 continue
             slopes = tangents(self.problem, fit, [c.fixed for c in there])
             wide = self._screen(fit.r, fit.fit.train, slopes=slopes)
-            less = [
-                r for r in rank(wide, found)
-                if r.valid and self._error(r.fit.score) < self._error(fit.score)
+            # Each alternative by itself: that which fits best may bend where rows are
+            # held out, and the next one be right.
+            split = [
+                replace(c, columns=(x,), to_parameters=(read,))
+                for c in found
+                for x, read in zip(c.columns, c.to_parameters, strict=True)
             ]  # fmt: skip
+            best_of: dict[tuple, Ranked] = {}
+            for r in rank(wide, split):
+                if r.valid and self._error(r.fit.score) < self._error(fit.score):
+                    best_of.setdefault((r.candidate.kind, r.candidate.at), r)
+            less = list(best_of.values())
             for both, second in self._fit_each(screen, there, less[:SECONDS]):
                 pairs.append((k, both, _pair_of(first, second, both.effects[-2:])))
         if not pairs:
@@ -525,7 +534,10 @@ class _Search:
         k, both, pair = pairs[best]
         if k == pick or any(m is of.candidate for m in pair.candidate.members):
             return None  # The second is found when the first is there.
-        most = (1.0 - NESTED_GAIN) * self._error(single.score)
+        simpler = _weight(pair.candidate) < _weight(of.candidate)
+        most = self._error(single.score) * (
+            1.0 + SAME if simpler else 1.0 - NESTED_GAIN
+        )
         return (both, pair) if errors[best] < most else None
 
     def _together(self, chosen, one, other) -> Together | None:
