@@ -757,17 +757,25 @@ def test_a_parameter_at_its_limit_has_no_interval_that_could_be_infinite(
 
 
 @pytest.mark.parametrize(
-    "after, spread, named",
-    [(1.78, np.inf, True), (1.82, np.inf, False), (1.9, 1e-3, True)],
+    "after, spread, alone, named",
+    [
+        (1.78, np.inf, True, True),
+        (1.82, np.inf, True, False),
+        (1.9, 1e-3, True, True),
+        (1.52, np.inf, False, False),
+        (1.48, np.inf, False, True),
+        (1.9, 1e-3, False, True),
+    ],
 )
-def test_whether_a_patch_is_there_is_told_by_held_out_rows(after, spread, named):
+def test_whether_a_patch_is_there_is_told_by_held_out_rows(after, spread, alone, named):
     """Its friction and its sides make up for one another: their intervals are infinite
     where its being there is sure. One that few rows are on takes little off them all,
-    and is told by its intervals."""
+    and is told by its intervals. Beside others it must take a quarter."""
     sides = {"x_min": 0.0, "x_max": 0.1, "y_min": 0.0, "y_max": 0.1}
     patch = Effect("friction_patch", ["a.a~b.b"], {"friction": 0.5} | sides)
     std = dict.fromkeys(patch.parameters, spread)
-    assert is_significant(Choice(patch, std, 2.0, after, "", 1.0, (), (), 5)) == named
+    choice = Choice(patch, std, 2.0, after, "", 1.0, (), (), 5)
+    assert is_significant(choice, alone) == named
 
 
 @pytest.mark.parametrize(

@@ -67,8 +67,9 @@ FREE = 1e3  # Of its size, how far what is chosen may give way to a candidate.
 STEADY = 2.0
 # Joints that get a value of their own, at most; and how many are fitted for each.
 MOST_OWN, OWN_TRIES = 8, 3
-# Of the held-out error, what an effect takes off that is told by this alone.
-THERE = 0.25
+# Of the held-out error, what an effect takes off that is told by this alone; and beside
+# others, of which it may take what they leave.
+THERE, THERE_TOO = 0.1, 0.25
 # A refit that leaves so much more of held-out rows went along what fitted rows do not
 # tell.
 DRIFT = 0.05
@@ -189,7 +190,7 @@ class _Search:
         while chosen:  # At last, against what all of them leave.
             current = self._refitted(chosen, current)
             chosen = _refreshed(chosen, current)
-            sure = [c for c in chosen if is_significant(c)]
+            sure = [c for c in chosen if is_significant(c, len(chosen) == 1)]
             if len(sure) == len(chosen):
                 # Then the least steady one, if parts of the data contradict it.
                 off = steady(problem, current)
@@ -1092,14 +1093,15 @@ def _is_fit(fit: Fitted, of: Ranked, first: int) -> bool:
     return bool(np.isfinite(fit.score)) and sane
 
 
-def is_significant(choice: Choice) -> bool:
+def is_significant(choice: Choice, alone: bool = True) -> bool:
     """Whether an effect is told from none: the parameters that make it one are off
     neutral by more than their deviation, within what the kind can be, and no interval
     of them is infinite; and so are half of all. Of one that may end anywhere (a small
     patch with much friction is as good as a larger one with less) held-out rows may say
-    that it is there, whatever its intervals."""
+    that it is there, whatever its intervals: more of them if it is not alone."""
     kind = KINDS[choice.effect.kind]
-    there = choice.after < (1.0 - THERE) * choice.before
+    gain = THERE if alone else THERE_TOO
+    there = choice.after < (1.0 - gain) * choice.before
     if there and any(each.endless for each in kind.parameters):
         return True
     clear, some, wide, n = 0, 0, 0, 0
