@@ -43,6 +43,10 @@ def test_an_object_s_size_is_measured_by_where_it_is_pushed(tmp_path, scale):
     end = fit_effects(problem, screen, [start])
     assert end.effects[0].parameters["scale"] == pytest.approx(scale, abs=0.01)
     assert end.score < 0.6 * fit_effects(problem, screen, []).score
+    # What held-out rows allow, not what the slope at the end says.
+    wide = problem.widened(replace(end, std=({"scale": 1e-9},)), 0)[0]["scale"]
+    assert 0.5 * abs(end.effects[0].parameters["scale"] - scale) < wide < 0.03
+    assert wide > 1e-4
     (found,) = [
         c for c in problem.candidates(
             problem.nuisances(), fit_effects(problem, screen, [])
