@@ -15,7 +15,7 @@ from makebreak.diagrams.camera import (
     camera_model,
     vtk_works,
 )
-from makebreak.scripts.bench import median_cpu_ms
+from makebreak.scripts.bench import median_call_ms
 from makebreak.systems.perception.ball_tracker import BallTrackerConfig
 from makebreak.systems.perception.numerics.ball_tracker import (
     find_ball,
@@ -96,10 +96,10 @@ def _rows(config, name):
         find_ball(pictures[i], camera, weights, BALL, 0.0, guess)
 
     found = [
-        {"what": f"{name}: picture", "value": median_cpu_ms(render, 80), "unit": "ms"}
+        {"what": f"{name}: picture", "value": median_call_ms(render, 80), "unit": "ms"}
     ]
     for where in ("near", "everywhere"):
-        value = median_cpu_ms(partial(search, where), 80)
+        value = median_call_ms(partial(search, where), 80)
         row = {"what": f"{name}: find the ball, {where}", "value": value, "unit": "ms"}
         if where == "near" and config.width == 320:
             row |= {"target": "<= 1.5", "met": value <= 1.5}

@@ -14,7 +14,7 @@ from makebreak.diagrams.station import (
     make_station,
 )
 from makebreak.models.scene import read_scene
-from makebreak.scripts.bench import median_cpu_ms
+from makebreak.scripts.bench import median_call_ms
 from makebreak.systems.arm.impedance_controller import (
     HybridConfig,
     ImpedanceConfig,
@@ -103,7 +103,7 @@ def rows() -> list[dict]:
         found.append(
             {
                 "what": f"impedance tick, {what}",
-                "value": 1e3 * median_cpu_ms(tick, 2000),
+                "value": 1e3 * median_call_ms(tick, 2000),
                 "unit": "us",
             }
         )

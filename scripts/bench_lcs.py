@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 
 from makebreak.models.tip_and_ball import TipAndBall, make_tip_and_ball
-from makebreak.scripts.bench import median_cpu_ms
+from makebreak.scripts.bench import median_call_ms
 from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs, ContactPair
 
 
@@ -24,6 +24,6 @@ def rows() -> list[dict]:
         u = np.zeros(model.n_u)
         path = "analytic" if model.is_analytic else "AutoDiff"
         what = f"LCS build, {path}, n_x {model.n_x}, n_lam {model.n_lam}"
-        value = median_cpu_ms(partial(model.build, x, u))
+        value = median_call_ms(partial(model.build, x, u))
         found.append({"what": what, "value": value, "unit": "ms"})
     return found

@@ -488,10 +488,9 @@ class _Search:
     def _ahead(self, screen: Screen, chosen: Sequence[Choice], sound, pick: int):
         """Two other effects where they leave clearly less than the best single one does
         (as little, if they have fewer parameters) and no more than that one with a
-        second: fitted exactly, each second by columns
-        of the scene with the first in it. (Two frictions that are wrong at once: a
-        patch, with its five parameters, does more than either, and by the columns of
-        the scene as it came the second one does nothing.)"""
+        second. (Two frictions that are wrong at once: a patch, with its five
+        parameters, does more than either, and by the columns of the scene as it came
+        the second one does nothing.)"""
         single, of = sound[pick]
         if of.candidate.members or self.problem.noise_error(single.left) < FLOOR:
             return None
@@ -500,29 +499,11 @@ class _Search:
             if k != pick and not r.candidate.members
         ]  # fmt: skip
         others.sort(key=lambda k: sound[k][0].score)
-        pairs = []
-        for k in (pick, *others[:FIRSTS]):
-            fit, first = sound[k]
-            there = _refreshed([*chosen, _untold(first, fit.effects[-1])], fit)
-            found = self.problem.next_candidates(fit)
-            if not found:
-                continue
-            slopes = tangents(self.problem, fit, [c.fixed for c in there])
-            wide = self._screen(fit.r, fit.fit.train, slopes=slopes)
-            # Each alternative by itself: that which fits best may bend where rows are
-            # held out, and the next one be right.
-            split = [
-                replace(c, columns=(x,), to_parameters=(read,))
-                for c in found
-                for x, read in zip(c.columns, c.to_parameters, strict=True)
-            ]  # fmt: skip
-            best_of: dict[tuple, Ranked] = {}
-            for r in rank(wide, split):
-                if r.valid and self._error(r.fit.score) < self._error(fit.score):
-                    best_of.setdefault((r.candidate.kind, r.candidate.at), r)
-            less = list(best_of.values())
-            for both, second in self._fit_each(screen, there, less[:SECONDS]):
-                pairs.append((k, both, _pair_of(first, second, both.effects[-2:])))
+        pairs = [
+            (k, both, pair)
+            for k in (pick, *others[:FIRSTS])
+            for both, pair in self._with_a_second(screen, chosen, *sound[k])
+        ]
         if not pairs:
             return None
         errors = [self._error(both.score) for _, both, _ in pairs]
@@ -533,13 +514,40 @@ class _Search:
         ]  # fmt: skip
         best = simplest(errors, sizes, SAME)
         k, both, pair = pairs[best]
-        if k == pick or any(m is of.candidate for m in pair.candidate.members):
+        if k == pick:
             return None  # The second is found when the first is there.
         simpler = _weight(pair.candidate) < _weight(of.candidate)
         most = self._error(single.score) * (
             1.0 + SAME if simpler else 1.0 - NESTED_GAIN
         )
         return (both, pair) if errors[best] < most else None
+
+    def _with_a_second(self, screen: Screen, chosen, fit: Fitted, first: Ranked):
+        """(fit, pair) of a first effect with each of the best seconds, fitted exactly;
+        seconds by their columns in the scene with the first in it."""
+        there = _refreshed([*chosen, _untold(first, fit.effects[-1])], fit)
+        found = self.problem.next_candidates(fit)
+        if not found:
+            return []
+        slopes = tangents(self.problem, fit, [c.fixed for c in there])
+        wide = self._screen(fit.r, fit.fit.train, slopes=slopes)
+        # Each alternative by itself: that which fits best may bend where rows are held
+        # out, and the next one be right.
+        split = [
+            replace(c, columns=(x,), to_parameters=(read,))
+            for c in found
+            for x, read in zip(c.columns, c.to_parameters, strict=True)
+        ]
+        best_of: dict[tuple, Ranked] = {}
+        for r in rank(wide, split):
+            if r.valid and self._error(r.fit.score) < self._error(fit.score):
+                best_of.setdefault((r.candidate.kind, r.candidate.at), r)
+        return [
+            (both, _pair_of(first, second, both.effects[-2:]))
+            for both, second in self._fit_each(
+                screen, there, list(best_of.values())[:SECONDS]
+            )
+        ]
 
     def _together(self, chosen, one, other) -> Together | None:
         """Two rivals (fit, ranked) of one parameter each, fitted at once; None where
