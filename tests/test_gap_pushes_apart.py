@@ -188,6 +188,11 @@ def test_a_long_recording_is_simulated_from_push_to_push(tmp_path, monkeypatch):
         more = [b - w.std for b, w in zip(wider, made.windows, strict=True)]
         assert min(m.min() for m in more) >= 0.0
         assert (max(m.max() for m in more) > 1e-5) == changes
+        # Squares add up: what starts do in it beyond what they do in the scene.
+        spread, plain = made._spread(effects)[1], made._spread(())[1]
+        for b, w, a, c in zip(wider, made.windows, spread, plain, strict=True):
+            added = np.where(a > c, a - c, 0.0)
+            np.testing.assert_allclose(b**2 - w.std**2, added, atol=1e-12)
     assert len(windows(2.6)[0].windows) <= 2
 
 
@@ -274,14 +279,19 @@ class OneHidesTheOther(TwoAtOnce):
     plan = SearchPlan(least_gain=0.05, most_effects=1)
     FIRST, SECOND = "a.a~table.table", "a.a~tip.tip"
 
-    def __init__(self, looks_ahead: bool):
+    def __init__(self, looks_ahead: bool, alike: bool = False, size: int = 4):
+        """Args: alike: the drag does what both frictions do; size: how many parameters
+        it has."""
         super().__init__()
-        self._ahead = looks_ahead
+        self._ahead, self._size = looks_ahead, size
         one, two, other, rest = np.random.default_rng(9).normal(
             size=(4, len(self._base))
         )
         self._one, self._two = 30.0 * one, 30.0 * two
         self._like = self._one + 0.8 * self._two + 30.0 * other
+        if alike:
+            # Something is left by either: below the noise no second is looked for.
+            self._like, rest = self._effect(0.2, 0.2), 6.0 * rest
         self._base = rest + self._effect(0.2, 0.2)
 
     def _effect(self, first: float, second: float) -> np.ndarray:
@@ -310,7 +320,7 @@ class OneHidesTheOther(TwoAtOnce):
             if all(at not in e.at for e in there)
         ]  # fmt: skip
         like = Candidate(
-            "joint_quadratic_drag", ("a.j",), 4, (self._like[:, None],),
+            "joint_quadratic_drag", ("a.j",), self._size, (self._like[:, None],),
             (lambda c: {"coefficient": float(c[0])},),
         )  # fmt: skip
         return [c for c in [*friction, like] if np.abs(c.columns[0]).max() > 0.0]
@@ -332,6 +342,15 @@ def test_two_effects_of_which_one_hides_the_other_are_looked_for_ahead():
     for c in ahead:
         assert c.effect.parameters["friction"] == pytest.approx(0.2, abs=0.002)
         assert c.ties == ()
+
+
+@pytest.mark.parametrize(("size", "kinds"), [
+    (2, ["joint_quadratic_drag"]), (4, 2 * ["contact_friction"]),
+])  # fmt: skip
+def test_two_effects_that_leave_as_much_need_fewer_parameters(size, kinds):
+    """Than the single one, whose place they would take."""
+    found = select(OneHidesTheOther(True, alike=True, size=size)).choices
+    assert [c.effect.kind for c in found] == kinds
 
 
 def test_a_body_that_drake_cannot_scale_has_no_size_to_name(tmp_path):
