@@ -1,6 +1,6 @@
 """Objects that are pushed for short whiles: their size, short touches, long runs."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -188,12 +188,24 @@ def test_a_long_recording_is_simulated_from_push_to_push(tmp_path, monkeypatch):
         more = [b - w.std for b, w in zip(wider, made.windows, strict=True)]
         assert min(m.min() for m in more) >= 0.0
         assert (max(m.max() for m in more) > 1e-5) == changes
-        # Squares add up: what starts do in it beyond what they do in the scene.
-        spread, plain = made._spread(effects)[1], made._spread(())[1]
-        for b, w, a, c in zip(wider, made.windows, spread, plain, strict=True):
-            added = np.where(a > c, a - c, 0.0)
-            np.testing.assert_allclose(b**2 - w.std**2, added, atol=1e-12)
     assert len(windows(2.6)[0].windows) <= 2
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A window of which only the deviation counts."""
+
+    std: np.ndarray
+
+
+def test_what_starts_do_in_another_model_is_added_to_a_deviation_in_squares():
+    known, more = [np.array([7.0, 2.0])], [np.array([23.0, 1.0])]
+    made = SimpleNamespace(
+        windows=[Spread(np.array([3.0, 3.0]))], _wide=known,
+        _spread=lambda effects: (None, more),
+    )  # fmt: skip
+    (window,) = PushWindows.with_spread_of(made, ()).windows
+    np.testing.assert_allclose(window.std, [5.0, 3.0])
 
 
 class TwoAtOnce(TwoChannels):
