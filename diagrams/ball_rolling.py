@@ -572,6 +572,11 @@ def add_ball_rolling(
             builder.Connect(r_comp, system.GetInputPort("r_comp"))
         nearer = _mean_of_tip(builder, "learned_reach", r_comp, n_lam, -LEARN)
         builder.Connect(nearer, task.GetInputPort("nearer"))
+        if builder.HasSubsystemNamed("ball_tracker"):
+            # Beside the ball the gap is what its radius is too large by.
+            too_large = _mean_of_tip(builder, "learned_radius", r_comp, n_lam, LEARN)
+            tracker = builder.GetSubsystemByName("ball_tracker")
+            builder.Connect(too_large, tracker.GetInputPort("radius_error"))
     else:
         connect(estimator, "x", task, "x")
         connect(estimator, "valid", task, "valid")

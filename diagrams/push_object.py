@@ -136,6 +136,7 @@ OFFSET = dict(
     touch=3.2e-4,
     learner=3.5e-4, sampler=3.5e-4, c3=4e-4, reference=4.5e-4, impedance=7e-4,
 )  # fmt: skip
+ROLLING_RESISTANCE = 0.005  # Of a cylinder: lever arm over radius.
 PLAN_DT, TIP_MASS, N_TIP = 0.1, 1.0, 4  # N_TIP: forces of tip and object, the first.
 
 
@@ -201,6 +202,9 @@ class PushObjectConfig:
     adapt: bool = True
     object: PushedObject = field(default_factory=PushedObject)
     friction: float = 0.5  # Of the object with tip and table, in the world.
+    # Lever arm over radius of a cylinder that rolls, in the world; no model knows it.
+    # None: 0.005, as of ball_rolling's ball.
+    rolling_resistance: float | None = None
     model: PushModelConfig = field(default_factory=PushModelConfig)
     scene: str = PUSH_OBJECT  # The world's.
     seed: int = 0
@@ -270,6 +274,19 @@ def world_scene(config: PushObjectConfig) -> Scene:
     ]
     _lay(scene, object_file(config.object), pose)
     _rub(scene, config.friction)
+    resistance = config.rolling_resistance
+    rolls = bool(rolling_axis(config.object))
+    if resistance is None:
+        resistance = ROLLING_RESISTANCE if rolls else 0.0
+    if not resistance >= 0.0 or (resistance > 0.0 and not rolls):
+        raise ValueError(
+            f"rolling_resistance is {resistance}, expected >= 0"
+            + ("" if rolls else f"; object.shape {config.object.shape} does not roll")
+        )
+    if resistance > 0.0:
+        lever = {"coefficient": resistance}
+        pair = f"{OBJECT}~table"
+        scene.effects.append(Effect("rolling_resistance", [pair], lever))
     return scene
 
 

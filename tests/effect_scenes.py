@@ -66,6 +66,17 @@ BALL = """<?xml version="1.0"?>
 <inertial><mass>0.07</mass><inertia><ixx>2.7783e-5</ixx><iyy>2.7783e-5</iyy>
 <izz>2.7783e-5</izz></inertia></inertial><collision name="c"><geometry><sphere>
 <radius>0.0315</radius></sphere></geometry>%s</collision></link></model></sdf>"""
+# Full, 140 mm long, lying along x on two spheres of its radius.
+CYLINDER = """<?xml version="1.0"?>
+<sdf version="1.9" xmlns:drake="drake.mit.edu"><model name="b"><link name="roller">
+<inertial><mass>0.4</mass><inertia><ixx>8e-5</ixx><iyy>6.9333e-4</iyy>
+<izz>6.9333e-4</izz></inertia></inertial>
+<collision name="c"><pose>0 0 0 0 1.5707963 0</pose><geometry><cylinder>
+<radius>%g</radius><length>0.14</length></cylinder></geometry>%s</collision>
+<collision name="s1"><pose>-0.035 0 0 0 0 0</pose><geometry><sphere><radius>0.02
+</radius></sphere></geometry>%s</collision>
+<collision name="s2"><pose>0.035 0 0 0 0 0</pose><geometry><sphere><radius>0.02
+</radius></sphere></geometry>%s</collision></link></model></sdf>"""
 GROUND = """<?xml version="1.0"?>
 <sdf version="1.9" xmlns:drake="drake.mit.edu"><model name="g"><link name="plate">
 <collision name="c"><pose>0 0 -0.05 0 0 0</pose><geometry><box><size>4 4 0.1</size>
@@ -114,7 +125,8 @@ def surface(mu=0.5, stiffness=2e5, dissipation=1.0) -> str:
 
 
 def on_ground(folder, thing: str, time_step=0.001, ground=None, gravity=G, z=None):
-    """`block`, `cube` or `ball` (body b.box or b.ball) on the ground plate g.plate."""
+    """`block`, `cube`, `ball` or `roller` (body b.box, b.ball or b.roller) on the
+    ground plate g.plate; `roller 0.019`: with a cylinder of that radius [m]."""
     own = surface()
     if thing == "block":
         corners = [(x, y) for x in (-0.1, 0.1) for y in (-0.1, 0.1)]
@@ -122,6 +134,9 @@ def on_ground(folder, thing: str, time_step=0.001, ground=None, gravity=G, z=Non
         body, rest = "b.box", 0.02
     elif thing == "cube":
         text, body, rest = CUBE % own, "b.box", 0.05
+    elif thing.startswith("roller"):
+        radius = float((thing.split() + ["0.0198"])[1])
+        text, body, rest = CYLINDER % (radius, own, own, own), "b.roller", 0.02
     else:
         text, body, rest = BALL % own, "b.ball", 0.0315
     height = rest if z is None else z

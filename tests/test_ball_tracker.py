@@ -409,6 +409,28 @@ def test_a_single_false_sight_is_not_followed():
     assert rig.seen == 1.0
 
 
+@pytest.mark.parametrize("error", [-0.004, 0.005])
+def test_a_learned_radius_puts_the_ball_where_it_is(error):
+    """Seen from the side, a ball of which the model's radius is wrong lies elsewhere on
+    the camera's ray."""
+    ball = np.array([0.62, 0.15, RADIUS - error])  # The sketch's is as large as RADIUS.
+    off = {}
+    for told in (None, error, np.nan):
+        rig = Rig()
+        if told is not None:
+            rig.tracker.GetInputPort("radius_error").FixValue(rig.context, [told])
+        for _ in range(40):
+            rig.show(sketch(ball))
+        off[told] = rig.p_WB[:2] - ball[:2]
+        assert rig.p_WB[2] == RADIUS
+    # As many times the error as the ray goes sideways per metre down.
+    np.testing.assert_allclose(
+        off[None], -error * (ball - CAMERA.p_WC)[:2] / (0.8 - RADIUS), atol=3e-4
+    )
+    np.testing.assert_allclose(off[error], 0.0, atol=3e-4)
+    np.testing.assert_array_equal(*(v for k, v in off.items() if k != error))
+
+
 def test_a_picture_of_wrong_size_is_a_status_and_the_estimate_is_held():
     rig = Rig()
     ball = np.array([0.5, 0.05, RADIUS])

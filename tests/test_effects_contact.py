@@ -438,6 +438,37 @@ def test_rolling_resistance_slows_evenly(tmp_path, time_step):
     np.testing.assert_allclose(slowing, 5 / 7 * c * G, rtol=1e-2)
 
 
+@pytest.mark.parametrize("c", [0.0, 0.02])
+def test_a_lying_cylinder_rolls_against_a_resistance(tmp_path, c):
+    scene = with_effects(
+        on_ground(tmp_path, "roller", 0.0005),
+        ("rolling_resistance", PAIR, dict(coefficient=c)),
+    )
+    radius, speed, z = 0.02, 0.3, 0.02 - 0.4 * G / 2.0 / 1e5
+    start = at_rest_but(
+        body="b.roller",
+        pose=[1, 0, 0, 0, 0, 0, z],
+        twist=[-speed / radius, 0, 0, 0, speed, 0],
+    )
+    columns = ["b.roller.vx", "b.roller.vy"]
+    rows = SceneSimulation(scene).run(start, np.array([0.0, 0.05, 0.15]), columns)
+    # A full cylinder; each of the two contacts carries half.
+    np.testing.assert_allclose(
+        (rows[1, 1] - rows[2, 1]) / 0.1, 2 / 3 * c * G, rtol=1e-2, atol=2e-4
+    )
+    np.testing.assert_allclose(rows[:, 0], 0.0, atol=1e-6)
+
+
+def test_what_rolls_on_other_radii_has_no_one_lever(tmp_path):
+    """A disc stands on its feet; a cylinder inside two larger spheres may tilt."""
+    scene = with_effects(
+        on_ground(tmp_path, "roller 0.019"),
+        ("rolling_resistance", PAIR, dict(coefficient=0.01)),
+    )
+    with pytest.raises(ValueError, match=r"cylinders \(and spheres\) of one radius"):
+        load_scene(scene, DiagramBuilder())
+
+
 @pytest.mark.parametrize(
     "kind, at, parameters, words",
     [

@@ -1,5 +1,7 @@
 """The parts of push_object beside its planner, and the whole diagram for a moment."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydrake.common.value import Value
@@ -23,7 +25,7 @@ from makebreak.diagrams.push_object import (
     world_scene,
 )
 from makebreak.models.effects.kind import Effect
-from makebreak.models.pushed_object import PushedObject
+from makebreak.models.pushed_object import PushedObject, object_file
 from makebreak.models.scene import read_scene
 from makebreak.models.scene_file import write_scene
 from makebreak.systems.changing_contact.touch_down import TouchDownConfig
@@ -416,6 +418,30 @@ def test_controllers_know_no_effect_of_the_world(tmp_path):
     config.model.scene = config.scene
     told = model_scene(config, "o.sdf", POSE).effects
     assert told[0].kind == "joint_coulomb_friction"
+
+
+def test_a_cylinder_rolls_against_a_resistance_that_no_model_knows(tmp_path):
+    def levers(scene):
+        return [
+            e.parameters["coefficient"]
+            for e in scene.effects
+            if e.kind == "rolling_resistance"
+        ]
+
+    cylinder = PushObjectConfig(object=PushedObject("cylinder"))
+    assert levers(world_scene(cylinder)) == [0.005]
+    assert levers(world_scene(replace(cylinder, rolling_resistance=0.02))) == [0.02]
+    assert levers(world_scene(replace(cylinder, rolling_resistance=0.0))) == []
+    assert levers(world_scene(PushObjectConfig())) == []
+    pose = [1.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.02]
+    file = object_file(cylinder.object)
+    assert levers(model_scene(cylinder, file, pose)) == []
+    for config, words in (
+        (replace(cylinder, rolling_resistance=-0.1), "is -0.1, expected >= 0"),
+        (PushObjectConfig(rolling_resistance=0.1), "object.shape t does not roll"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            world_scene(config)
 
 
 def test_the_object_starts_where_the_seed_says_it_does():

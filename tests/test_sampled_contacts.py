@@ -443,6 +443,13 @@ def test_the_arm_goes_to_the_ball_and_rolls_it_on_along_the_circle():
     assert abs(far - 0.1) < 0.02
     assert read("arm_reference", "x_desired")[2] == pytest.approx(HEIGHT, abs=5e-3)
     assert np.isfinite(read("impedance_controller", "tau")).all()
+    # What touch has learned of the radius, the camera's ray heeds.
+    tracker = diagram.GetSubsystemByName("ball_tracker")
+    told = tracker.GetInputPort("radius_error").Eval(
+        tracker.GetMyContextFromRoot(context)
+    )
+    r = read("residual_learner", "r_comp")[:4].mean() - 0.003 / 0.05
+    assert told == pytest.approx(0.05 * r) and abs(told) > 1e-4
 
 
 def test_what_does_not_go_with_it_is_refused_in_one_line():

@@ -38,6 +38,7 @@ from makebreak.models.effects.kind import (
 FADE_RATE = 0.05
 
 
+ALIKE = 0.02  # Shapes whose radii differ by no more than this share roll as one.
 STANDS = 1e-3  # Of shapes that reach down to within this a body stands on all [m].
 
 # What Drake takes where a shape has none of its own [N/m], [s/m]: MultibodyPlant's
@@ -432,14 +433,15 @@ def _is_free(plant: MultibodyPlant, body: RigidBody) -> bool:
 
 
 class RollingResistance(LeafSystem):
-    """The torque that resists the rolling of a free ball on another body.
+    """The torque that resists the rolling of a free ball, or a cylinder that lies, on
+    another body.
 
         tau = -coefficient R f_n omega_t / max(|omega_t|, fade rate)
 
-    with the ball's radius R [m], the normal force f_n [N] of the contact and the ball's
-    rate of turn relative to the other body, along the surface, omega_t. The reaction
-    acts on the other body. So a ball that rolls freely on a level table under its
-    weight is slowed by coefficient g (5/7).
+    with the ball's radius R [m], the normal force f_n [N] of each contact and the
+    ball's rate of turn relative to the other body, along the surface, omega_t. The
+    reaction acts on the other body. So a ball that rolls freely on a level table under
+    its weight is slowed by coefficient g (5/7), a full cylinder by coefficient g (2/3).
 
     Force and rate are those of the step before: the contact force of this step depends
     on the torque itself.
@@ -532,7 +534,7 @@ def rolling_torque(generalized, x, force, normal, lever, at, n_q, fade_rate):
 
 
 def _ball(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph):
-    """The free sphere of the pair, the other body, and the radius [m].
+    """The free body of the pair that rolls, the other one, and the radius [m].
 
     Raises: ValueError if it is no such pair.
     """
@@ -549,19 +551,29 @@ def _ball(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph):
         )
     inspector = scene_graph.model_inspector()
     shapes = [inspector.GetShape(g) for g in plant.GetCollisionGeometriesForBody(ball)]
-    if not shapes or not all(isinstance(shape, Sphere) for shape in shapes):
+    round_ = bool(shapes) and all(isinstance(s, (Sphere, Cylinder)) for s in shapes)
+    rolls = False
+    if round_ and any(isinstance(s, Cylinder) for s in shapes):
+        # One that lies: its spheres and cylinders reach equally far from its axis.
+        radii = [shape.radius() for shape in shapes]
+        rolls = max(radii) <= (1.0 + ALIKE) * min(radii)
+        reach = [max(radii)]
+    elif round_:
+        # Several spheres make a bumpy object, about as large as they reach on average.
+        rolls = True
+        reach = [
+            float(np.linalg.norm(inspector.GetPoseInFrame(g).translation()))
+            + shape.radius()
+            for g, shape in zip(
+                plant.GetCollisionGeometriesForBody(ball), shapes, strict=True
+            )
+        ]
+    if not rolls:
         raise ValueError(
             f"effect rolling_resistance at {at!r}: expected {ball.scoped_name()} to "
-            "have spheres as collision geometry"
+            "have spheres as collision geometry, or cylinders (and spheres) of one "
+            "radius"
         )
-    # Several make a bumpy object, about as large as they reach on average.
-    reach = [
-        float(np.linalg.norm(inspector.GetPoseInFrame(g).translation()))
-        + shape.radius()
-        for g, shape in zip(
-            plant.GetCollisionGeometriesForBody(ball), shapes, strict=True
-        )
-    ]
     return ball, other, float(np.mean(reach))
 
 

@@ -55,7 +55,10 @@ class BallTracker(LeafSystem):
     (numerics/interacting_models.py). The ball is taken to lie on the table: p_WB z is
     the table's height plus the model's radius, v_WB z is 0.
 
-    Inputs:  image, abstract ImageRgba8U of the camera model's size.
+    Inputs:  image, abstract ImageRgba8U of the camera model's size; radius_error (1,)
+             [m], optional: the model's radius minus the ball's, as learned by touch. A
+             ball that is smaller lies lower, and so elsewhere on the ray on which it is
+             seen.
     Outputs: p_WB (3,) [m]; v_WB (3,) [m/s]; seen (1,): 1 if the last picture showed the
              ball where it can be, else 0; status (1,): TRACKED, NOT_FOUND, OUTLIER
              or WRONG_IMAGE; position_std (1,) [m], of p_WB each way.
@@ -94,6 +97,7 @@ class BallTracker(LeafSystem):
         self._weights = strength_weights(config.hue)
         self._shape = (camera.height, camera.width, 4)
         self._image = self.DeclareAbstractInputPort("image", Value(ImageRgba8U()))
+        self._radius_error = self.DeclareVectorInputPort("radius_error", 1)
         densities, dwell = [config.acceleration_density], [config.free_sec]
         if config.driven_density > 0.0:
             densities.append(config.driven_density)
@@ -148,7 +152,7 @@ class BallTracker(LeafSystem):
                 image, self._camera, self._weights, c.ball_radius, c.table_z, guess
             )
             if found is not None:
-                measured, status = found.p_WB[:2], TRACKED
+                measured, status = self._lowered(context, found.p_WB), TRACKED
         n_outliers = 0
         if measured is None:
             n_outliers = state[_N_OUTLIERS]
@@ -179,6 +183,17 @@ class BallTracker(LeafSystem):
         )
         if np.isfinite(state).all():
             discrete_state.set_value(self._state, state)
+
+    def _lowered(self, context, p_WB):
+        """(2,) where on its ray a centre that is seen at p_WB (3,) is, if the ball is
+        smaller than its model and so lies lower."""
+        error = 0.0
+        if self._radius_error.HasValue(context):
+            error = float(self._radius_error.Eval(context)[0])
+        if not abs(error) < self._config.ball_radius:  # Nor where it is not finite.
+            error = 0.0
+        p_WC = self._camera.p_WC
+        return p_WC[:2] + (p_WB - p_WC)[:2] * (1.0 + error / (p_WC[2] - p_WB[2]))
 
     def _predict(self, estimate: interacting_models.Estimate):
         return interacting_models.predict(
