@@ -190,7 +190,8 @@ class _Search:
         while chosen:  # At last, against what all of them leave.
             current = self._refitted(chosen, current)
             chosen = _refreshed(chosen, current)
-            sure = [c for c in chosen if is_significant(c, len(chosen) == 1)]
+            told = [self._is_told(chosen, current, k) for k in range(len(chosen))]
+            sure = [c for c, is_one in zip(chosen, told, strict=True) if is_one]
             if len(sure) == len(chosen):
                 # Then the least steady one, if parts of the data contradict it.
                 off = steady(problem, current)
@@ -214,6 +215,17 @@ class _Search:
             tuple(chosen), self.start, current, self.nuisances, tuple(table),
             beyond, far,
         )  # fmt: skip
+
+    def _is_told(self, chosen: Sequence[Choice], current: Fitted, k: int) -> bool:
+        """Whether the k-th effect is told from none; beside others one that may end
+        anywhere also by how far it may, which slopes at where it ends do not say."""
+        choice, alone = chosen[k], len(chosen) == 1
+        if alone or not is_significant(choice, alone):
+            return is_significant(choice, alone)
+        if not any(each.endless for each in KINDS[choice.effect.kind].parameters):
+            return True
+        std, _ = self.problem.widened(current, k)
+        return is_significant(replace(choice, std=std), alone)
 
     # ----- What is asked again and again
 
