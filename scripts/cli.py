@@ -278,6 +278,7 @@ def _run_in(session, args, run, config, duration) -> int:
     """Runs the experiment in the session. Returns: the exit status."""
     from makebreak.scripts import compile_ahead
     from makebreak.scripts.criteria import told
+    from makebreak.scripts.run_buttons import StartOver
     from makebreak.scripts.table import Table
     from makebreak.scripts.trials import duration_line
 
@@ -298,9 +299,14 @@ def _run_in(session, args, run, config, duration) -> int:
     if not args.no_meshcat:
         session.meshcat = _open_meshcat()
 
+    session.restarts = True
     result = None
     try:
-        result = dict(run(config, session))
+        while result is None:
+            try:
+                result = dict(run(config, session))
+            except StartOver:
+                session.start_over()
     except KeyboardInterrupt:
         session.interrupted = True
     except (Exception, SystemExit) as error:

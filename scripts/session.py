@@ -143,6 +143,7 @@ class Session:
         self._figures: list[tuple[Any, str]] = []  # Drawn when the rest is written.
         self.started = False  # Whether anything has been simulated yet.
         self.interrupted = False
+        self.restarts = False  # Whether StartOver is caught, and the run begun again.
         self.on_first_compile: Callable[[], None] = lambda: None
         self.endings: list[str] = []  # Of each simulation that ended early: why.
         self.first_calls: list[Callable[[], object]] = []  # That wait.
@@ -181,7 +182,7 @@ class Session:
         A sample at time t is taken before the events at t; the first is at time 0, and
         each is at a multiple of period_sec. Ctrl-C, or the button `stop` in Meshcat,
         ends the simulation at the next sample; all that was recorded until then is in
-        the log.
+        the log. The button `start over`, where `restarts`, raises StartOver.
 
         Args:
             diagram: what is simulated.
@@ -257,7 +258,7 @@ class Session:
             self.meshcat.StartRecording(frames_per_second=fps)
         with (
             CatchInterrupt() as interrupt,
-            RunButtons(self.meshcat) as buttons,
+            RunButtons(self.meshcat, self.restarts) as buttons,
             self._bar(duration, label) as bar,
             CompilingShown(partial(_tell, bar), self.on_first_compile),
         ):
@@ -387,6 +388,18 @@ class Session:
             "ticks_not_finite": sum(each.not_finite for each in seen),
             "first_violation_s": [each.first_violation_s for each in seen],
         }
+
+    def start_over(self) -> None:
+        """Forgets what was simulated; what is in Meshcat goes, too."""
+        self._drop_streams()
+        for of_a_run in (
+            self.endings, self._figures, self._partial, self._timing, self._watched,
+        ):  # fmt: skip
+            of_a_run.clear()
+        self.first_calls.clear()
+        if self.meshcat is not None:
+            self.meshcat.Delete()
+            self.meshcat.DeleteAddedControls()
 
     def save_plot(self, fig, name: str) -> None:
         """Keeps the matplotlib figure; `finish` writes it as <name>.png, after what

@@ -2,6 +2,7 @@
 
 import json
 from time import sleep
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,8 +10,8 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, Integrator
 
-from makebreak.scripts import run_buttons
-from makebreak.scripts.run_buttons import PAUSE, STOP
+from makebreak.scripts import cli, run_buttons
+from makebreak.scripts.run_buttons import OVER, PAUSE, STOP
 from makebreak.scripts.session import Session
 
 
@@ -91,3 +92,50 @@ def test_a_paused_run_can_be_stopped(tmp_path, monkeypatch):
     _, log, _ = run(tmp_path, at, 1e6)
     assert log.interrupted and len(looks) == 10
     np.testing.assert_allclose(log.time[-1], 0.25)
+
+
+@pytest.mark.parametrize("paused", [False, True])
+def test_a_run_starts_over_and_only_the_last_one_counts(tmp_path, monkeypatch, paused):
+    """As by `makebreak run`: the result is that of a run in which nothing was pressed,
+    but for the table of times."""
+    runs = []
+    monkeypatch.setattr(cli, "_open_meshcat", Meshcat)
+
+    def experiment(_, session):
+        diagram = ramp()
+        runs.append(diagram)
+        _, pauses = pause(monkeypatch, OVER)
+
+        def at(t, _):
+            if len(runs) == 1:
+                if paused:
+                    pauses(t, session.meshcat)
+                elif t == 0.25:
+                    press(session.meshcat, OVER)
+            return False
+
+        ends = {"q": diagram.GetOutputPort("q")}
+        log = session.simulate(diagram, 0.5, ends, until=at)
+        return {"success": True, "end": float(log["q"][-1, 0]), "rows": len(log.time)}
+
+    args = SimpleNamespace(
+        diagram=None, is_trial=True, no_meshcat=False, experiment="ramp"
+    )
+    out = tmp_path / "out"
+    with Session(out, progress=False) as session:
+        status = cli._run_in(session, args, experiment, {}, None)
+    assert status == 0 and len(runs) == 2 and runs[0] is not runs[1]
+    result = json.loads((out / "result.json").read_text())
+    assert result["end"] == pytest.approx(0.5) and result["rows"] == 41
+    assert not result["interrupted"] and result["ended"] == []
+    timing = json.loads((out / "timing.json").read_text())
+    assert timing["simulated_s"] == 0.5
+
+
+def test_what_nobody_begins_again_has_no_button_for_it(tmp_path):
+    def at(t, meshcat):
+        if t == 0.25:
+            with pytest.raises(RuntimeError):
+                meshcat.GetButtonClicks(OVER)
+
+    run(tmp_path, at)
