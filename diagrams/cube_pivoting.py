@@ -13,7 +13,13 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-from pydrake.geometry import Box, Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
+from pydrake.geometry import (
+    Box,
+    Meshcat,
+    MeshcatVisualizer,
+    MeshcatVisualizerParams,
+    Rgba,
+)
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import JointActuatorIndex
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
@@ -26,6 +32,7 @@ from pydrake.systems.primitives import (
 )
 
 from makebreak.diagrams.recorder import add_recorder
+from makebreak.diagrams.wiring import add_legend
 from makebreak.models.drives import add_actuators
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
@@ -55,9 +62,17 @@ from makebreak.systems.contact_mpc.residual_learner import (
     ResidualLearnerConfig,
 )
 from makebreak.systems.views.contact_probe import ContactProbe
+from makebreak.systems.views.legend import LegendConfig
 
 SCENE = str(MODELS / "cube_pivoting.scene.yaml")
 FINGERS = ("left", "right")
+CAMERA = ([0.05, -0.45, 0.16], [-0.02, 0.0, 0.06])  # Where it is, what it looks at.
+# As in the model files.
+LEGEND = (
+    ("cube, to be tipped by 90 degrees", Rgba(0.85, 0.5, 0.2)),
+    ("its two fingers, each driven in a plane", Rgba(0.2, 0.35, 0.6)),
+    ("platform", Rgba(0.55, 0.57, 0.6)),
+)
 CUBE_BODY, CORNERS_BODY, PLATFORM = "pivot.cube", "pivot.corners", "pivot.platform"
 JOINTS = (
     "pivot.x", "pivot.z", "pivot.angle", "left.x", "left.z", "right.x", "right.z"
@@ -369,13 +384,14 @@ def make_cube_pivoting(
         {"effort": (effort.get_output_port(), efforts)},
     )
     if meshcat is not None:
-        meshcat.SetCameraPose([0.05, -0.45, 0.16], [-0.02, 0.0, 0.06])
+        meshcat.SetCameraPose(*CAMERA)
         MeshcatVisualizer.AddToBuilder(
             builder,
             loaded.scene_graph,
             meshcat,
             MeshcatVisualizerParams(publish_period=1.0 / 30.0),
         )
+        add_legend(builder, meshcat, LegendConfig(LEGEND, (), *CAMERA))
     builder.ExportOutput(x, "x")
     builder.ExportOutput(u, "u")
     builder.ExportOutput(touches, "touches")

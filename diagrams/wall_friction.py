@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from pydrake.geometry import Meshcat
+from pydrake.geometry import Meshcat, Rgba
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import (
     LogVectorOutput,
@@ -35,6 +35,7 @@ from makebreak.diagrams.station import (
     make_station,
 )
 from makebreak.diagrams.tabletop import TABLETOP_WALLS, TOOL, set_friction
+from makebreak.diagrams.wiring import add_legend
 from makebreak.models.scene import read_scene
 from makebreak.systems.arm.impedance_controller import (
     ImpedanceConfig,
@@ -56,8 +57,15 @@ from makebreak.systems.changing_contact.mode_detector import (
     ModeDetector,
     ModeDetectorConfig,
 )
+from makebreak.systems.views.legend import LegendConfig
 
 WALL, N_ARM = "blue_wall", 7
+CAMERA = ([0.45, -0.95, 0.45], [0.55, 0.05, 0.05])  # Where it is, what it looks at.
+# As in the model files.
+LEGEND = (
+    ("wall along which the tool slides", Rgba(0.2, 0.36, 0.7)),
+    ("block at the end of the tool", Rgba(0.72, 0.53, 0.32)),
+)
 # Of the motion [s]: down, rest on the table, to the wall, rest, along it, rest.
 TIMES = np.cumsum([0.0, 2.4, 0.4, 2.6, 0.5, 3.0, 0.3])
 DURATION = float(TIMES[-1])
@@ -313,6 +321,9 @@ def make_wall_friction(
     log.set_name("telemetry_log")
     builder.ExportOutput(wrench, "wrench")
     record_station(builder, station, impedance.GetOutputPort("tau"), TOOL)
+    if meshcat is not None:
+        meshcat.SetCameraPose(*CAMERA)
+        add_legend(builder, meshcat, LegendConfig(LEGEND, (), *CAMERA))
     return builder.Build()
 
 

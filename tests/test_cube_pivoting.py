@@ -10,6 +10,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.diagrams.cube_pivoting import (
     FINGERS,
+    LEGEND,
     SCENE,
     Cube,
     CubePivotingConfig,
@@ -26,6 +27,7 @@ from makebreak.diagrams.cube_pivoting import (
     weights_of,
     world_cube,
 )
+from makebreak.models.model_files import MODELS
 from makebreak.models.scene import load_scene
 from makebreak.scripts import comparison
 from makebreak.scripts.cli import main
@@ -363,6 +365,11 @@ def test_meshcat_shows_cube_and_fingers():
     Simulator(diagram, start(diagram, initial_state(config))).AdvanceTo(0.01)
     for path in ("pivot/cube", "left/finger", "right/finger", "pivot/platform"):
         assert meshcat.HasPath(f"/drake/visualizer/{path}"), path
+    assert meshcat.HasPath("/makebreak/legend/lines")
+    model = (MODELS / "cube_pivoting.sdf").read_text()
+    model += (MODELS / "planar_finger.sdf").read_text()
+    for _, color in LEGEND:  # Which are those of the models.
+        assert f"<diffuse>{color.r():g} {color.g():g} {color.b():g} 1<" in model
 
 
 def test_command_line_writes_result_recording_and_model(tmp_path, capsys):
