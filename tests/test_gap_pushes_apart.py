@@ -393,3 +393,20 @@ def test_a_recording_of_too_few_means_is_refused(tmp_path):
     scene = push_world.write(tmp_path, world, table, noise)
     with pytest.raises(ValueError, match="too little motion"):
         ContactProblem(read_scene(scene), read_recordings([tmp_path / "recording.csv"]))
+
+
+def test_a_slip_that_may_be_the_smoother_s_may_stick(tmp_path):
+    """One that is known sure presses along its slip; else a pyramid of ways is free."""
+    rng = np.random.default_rng(71)
+    world = push_world.a_world(rng)
+    problem = pushed_problem(tmp_path, world, world, rng, 3)
+
+    def ways(times: float) -> int:
+        problem._node_v_off = times * known
+        masks = dict(zip((s.key for s in problem.slots), problem._masks, strict=True))
+        columns = problem._columns(problem.slots, problem._node_poses, masks)
+        return sum(int(c.can.sum()) for c in columns)
+
+    known = problem._node_v_off.copy()
+    assert known.shape == problem._node_v.shape and np.abs(known).max() > 0.0
+    assert ways(0.0) < ways(1.0) < ways(1e3)

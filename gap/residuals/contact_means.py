@@ -27,7 +27,7 @@ from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import full_name, one_dof_joints
 from makebreak.models.scene import Scene
 from makebreak.models.scene_schema import COMMANDS_OF
-from makebreak.systems.numerics.smoother import smooth_filtered
+from makebreak.systems.numerics.smoother import Smoothed, blur_sec, smooth_filtered
 
 SAMPLES = 8  # Of the slowest pose, in half a test function.
 LEAST_HALF, MOST_HALF = 0.05, 0.2  # [s]
@@ -110,7 +110,7 @@ def felt_motion(dynamics: SceneDynamics, frame: Frame, q, v, vd) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Track:
-    """An episode, smoothed: n rows. raw: {coordinate: (samples' times, values)}."""
+    """An episode, smoothed: n rows. blur (n_v,): as of blur_sec."""
 
     recording: int
     episode: Episode
@@ -118,6 +118,7 @@ class _Track:
     q: np.ndarray
     v: np.ndarray
     vd: np.ndarray
+    blur: np.ndarray
     turn: dict[str, np.ndarray] = field(default_factory=dict)
 
 
@@ -172,6 +173,8 @@ class ContactMeans:
         self._offset = np.cumsum([0, *(len(t.time) for t in self.tracks)])
         self._q = np.vstack([t.q for t in self.tracks])
         self._v = np.vstack([t.v for t in self.tracks])
+        # What a velocity may be off by where it just jumped.
+        self._v_off = np.vstack([t.vd * t.blur for t in self.tracks])
         self._vd = np.vstack([t.vd for t in self.tracks])
         self._choose_half()
         self._touching = self._touching_rows()
@@ -296,11 +299,19 @@ class ContactMeans:
                 return None
             return smooth_filtered(time, y, channel.noise, channel.stages or ())
 
+        def spread_over(name: str, s: Smoothed) -> float:
+            t, _ = recording.samples(name, episode)
+            every = float(np.median(np.diff(t)))
+            return blur_sec(recording.channels[name].noise, every, s.density)
+
+        blur = np.zeros(plant.num_velocities())
+
         for joint, (i_q, i_v) in self.joints.items():
             s = smoothed(f"{joint}.position")
             if s is None:
                 return None
             q[:, i_q], v[:, i_v], vd[:, i_v] = s.x.T
+            blur[i_v] = spread_over(f"{joint}.position", s)
         turns = {}
         for body, (i_q, i_v) in self.bodies.items():
             each = [smoothed(f"{body}.{a}") for a in POSE]
@@ -313,10 +324,16 @@ class ContactMeans:
             v[:, i_v : i_v + 3] = spin_of(unit, rate)
             vd[:, i_v : i_v + 3] = spin_of(unit, turn[:, :, 2] / size)
             turns[body] = unit
+            spread = [
+                spread_over(f"{body}.{a}", s)  # type: ignore[arg-type]
+                for a, s in zip(POSE, each, strict=True)
+            ]
+            blur[i_v : i_v + 3] = min(spread[:4])  # By the part that turns most.
+            blur[i_v + 3 : i_v + 6] = spread[4:]
             for k in range(3):
                 x = each[4 + k].x  # type: ignore[union-attr]
                 q[:, i_q + 4 + k], v[:, i_v + 3 + k], vd[:, i_v + 3 + k] = x.T
-        return _Track(i, episode, time, q, v, vd, turns)
+        return _Track(i, episode, time, q, v, vd, blur, turns)
 
     def _choose_half(self) -> None:
         """Half a test function: as many samples of the slowest pose as it needs."""

@@ -143,7 +143,7 @@ class PermittedContacts(ContactMeans):
                 self._J[k][n] = plant.CalcJacobianSpatialVelocity(
                     self._context, wrt, frame, np.zeros(3), W, W
                 )
-        self._node_v = v
+        self._node_v, self._node_v_off = v, self._v_off[self._rows]
         # Where wrenches are measured (n_nodes, 3) [m].
         self._felt_at = [self._places_of(sensor.frame, q) for sensor in self.sensors]
         # The equations without acceleration at nodes, the mass matrix in the middle.
@@ -430,7 +430,10 @@ class PermittedContacts(ContactMeans):
             u = np.einsum("nij,nj->ni", J, self._node_v)
             slip = tangential(u, s.normal)
             speed = np.linalg.norm(slip, axis=1)
-            fast = np.asarray(W @ ((speed >= SLIDES) & mine).astype(float)).ravel()
+            # Of what just set in or stopped the smoothed slip is not known.
+            off = tangential(np.einsum("nij,nj->ni", J, self._node_v_off), s.normal)
+            sure = speed >= np.maximum(SLIDES, np.linalg.norm(off, axis=1))
+            fast = np.asarray(W @ (sure & mine).astype(float)).ravel()
             slides = fast >= 0.999 * weight  # Slower in any part: it may stick.
             along = slip / np.maximum(speed, 1e-9)[:, None]
             one_way = np.linalg.norm(W @ (along * mine[:, None]), axis=1)

@@ -101,6 +101,14 @@ def smooth_filtered(
     return Smoothed(x[rows], first.P[rows], first.density, first.innovation)
 
 
+def blur_sec(noise: float, every: float, density: float) -> float:
+    """Within about how long of a jump of its true velocity a smoothed one passes from
+    before to after it [s]: the T for which samples of a deviation `noise`, one each
+    `every` seconds, say as much as the signal's density does, noise^2 every = density
+    T^6. Times the smoothed acceleration there it is how far the velocity may be off."""
+    return (noise**2 * every / max(density, 1e-12)) ** (1.0 / 6.0)
+
+
 @njit(cache=True)
 def _step(x, P, dt, s):
     """Prediction over dt."""
