@@ -51,6 +51,7 @@ from makebreak.diagrams.station import (
     make_station,
 )
 from makebreak.diagrams.wiring import add_legend, check_own, connect_command
+from makebreak.models.effects.contact import rolls_against
 from makebreak.models.effects.kind import Effect
 from makebreak.models.fruit import FRUITS, fruit_file, make_fruit
 from makebreak.models.scene import Scene, load_scene, read_scene
@@ -270,8 +271,7 @@ def world_scene(config: BallRollingConfig) -> Scene:
             Effect("contact_friction", [pair], {"friction": config.friction})
         )
     if resistance > 0.0:
-        lever = {"coefficient": resistance}
-        scene.effects.append(Effect("rolling_resistance", ["ball~table"], lever))
+        scene.effects.append(rolls_against("ball~table", resistance))
     return scene
 
 

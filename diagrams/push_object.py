@@ -45,6 +45,7 @@ from makebreak.diagrams.wiring import (
     connect_command,
     refuse_changed,
 )
+from makebreak.models.effects.contact import rolls_against
 from makebreak.models.effects.kind import Effect
 from makebreak.models.model_files import MODELS
 from makebreak.models.pushed_object import (
@@ -284,9 +285,7 @@ def world_scene(config: PushObjectConfig) -> Scene:
             + ("" if rolls else f"; object.shape {config.object.shape} does not roll")
         )
     if resistance > 0.0:
-        lever = {"coefficient": resistance}
-        pair = f"{OBJECT}~table"
-        scene.effects.append(Effect("rolling_resistance", [pair], lever))
+        scene.effects.append(rolls_against(f"{OBJECT}~table", resistance))
     return scene
 
 

@@ -577,6 +577,12 @@ def _ball(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph):
     return ball, other, float(np.mean(reach))
 
 
+def rolls_against(pair: str, coefficient: float) -> Effect:
+    """The rolling resistance of a pair, for a scene. Args: coefficient: lever arm over
+    radius."""
+    return Effect("rolling_resistance", [pair], {"coefficient": coefficient})
+
+
 def _rolling_now(effect: Effect, plant: MultibodyPlant, scene_graph) -> dict:
     _ball(effect, plant, scene_graph)
     return {"coefficient": 0.0}
