@@ -398,7 +398,8 @@ class Session:
             of_a_run.clear()
         self.first_calls.clear()
         if self.meshcat is not None:
-            self.meshcat.Delete()
+            for path in ("", "/makebreak"):  # Drake's, and what our views draw.
+                self.meshcat.Delete(path)
             self.meshcat.DeleteAddedControls()
 
     def save_plot(self, fig, name: str) -> None:

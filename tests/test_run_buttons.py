@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from pydrake.geometry import Meshcat
+from pydrake.math import RigidTransform
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, Integrator
 
@@ -104,6 +105,9 @@ def test_a_run_starts_over_and_only_the_last_one_counts(tmp_path, monkeypatch, p
     def experiment(_, session):
         diagram = ramp()
         runs.append(diagram)
+        for path in ("of_the_first", "/makebreak/of_the_first"):
+            assert not session.meshcat.HasPath(path)
+            session.meshcat.SetTransform(path, RigidTransform())
         _, pauses = pause(monkeypatch, OVER)
 
         def at(t, _):
