@@ -567,6 +567,7 @@ def add_ball_rolling(
             "no_residual", ConstantVectorSource(np.zeros(n_lam))
         )
         r_comp = zero.get_output_port()
+    gap = _mean_of_tip(builder, "learned_gap", r_comp, n_lam, LEARN)
     if samples:
         for system in (contacts.sampler, contacts.target):
             builder.Connect(r_comp, system.GetInputPort("r_comp"))
@@ -574,9 +575,8 @@ def add_ball_rolling(
         builder.Connect(nearer, task.GetInputPort("nearer"))
         if builder.HasSubsystemNamed("ball_tracker"):
             # Beside the ball the gap is what its radius is too large by.
-            too_large = _mean_of_tip(builder, "learned_radius", r_comp, n_lam, LEARN)
             tracker = builder.GetSubsystemByName("ball_tracker")
-            builder.Connect(too_large, tracker.GetInputPort("radius_error"))
+            builder.Connect(gap, tracker.GetInputPort("radius_error"))
     else:
         connect(estimator, "x", task, "x")
         connect(estimator, "valid", task, "valid")
@@ -610,7 +610,6 @@ def add_ball_rolling(
             builder.ExportInput(port, port.get_name())
 
     _add_records(builder, station, impedance, estimator)
-    gap = _mean_of_tip(builder, "learned_gap", r_comp, n_lam, LEARN)
     if meshcat is not None:
         _add_view(builder, config, model, meshcat, station, estimator, gap, task)
 

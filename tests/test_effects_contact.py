@@ -3,6 +3,7 @@
 Friction and rolling resistance on the project's own models: test_scene.py.
 """
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -465,7 +466,14 @@ def test_what_rolls_on_other_radii_has_no_one_lever(tmp_path):
         on_ground(tmp_path, "roller 0.019"),
         ("rolling_resistance", PAIR, dict(coefficient=0.01)),
     )
-    with pytest.raises(ValueError, match=r"cylinders \(and spheres\) of one radius"):
+    words = r"cylinders \(and spheres\) of one radius"
+    with pytest.raises(ValueError, match=words):
+        load_scene(scene, DiagramBuilder())
+    file = tmp_path / "b.sdf"  # A box between the spheres.
+    text = file.read_text().replace("\n", "")
+    box = "<box><size>0.14 0.04 0.04</size></box>"
+    file.write_text(re.sub("<cylinder>.*</cylinder>", box, text))
+    with pytest.raises(ValueError, match=words):
         load_scene(scene, DiagramBuilder())
 
 

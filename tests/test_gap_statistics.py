@@ -779,20 +779,23 @@ def test_whether_a_patch_is_there_is_told_by_held_out_rows(after, spread, alone,
 
 
 @pytest.mark.parametrize(
-    "after, far, others, named",
+    "after, slopes, far, others, named",
     [
-        (1.9, np.inf, 1, False),
-        (1.9, 1e-3, 1, True),
-        (1.9, np.inf, 0, True),
-        (1.48, np.inf, 1, True),
+        (1.9, 1e-3, np.inf, 1, False),
+        (1.9, 1e-3, 1e-3, 1, True),
+        (1.9, np.inf, 1e-3, 1, False),
+        (1.9, 1e-3, np.inf, 0, True),
+        (1.48, 1e-3, np.inf, 1, True),
     ],
 )
-def test_a_patch_beside_others_is_told_by_how_far_it_may_end(after, far, others, named):
+def test_a_patch_beside_others_is_told_by_how_far_it_may_end(
+    after, slopes, far, others, named
+):
     """Slopes at its end give it narrow intervals; moved, its sides lose nothing."""
     sides = {"x_min": 0.0, "x_max": 0.1, "y_min": 0.0, "y_max": 0.1}
     patch = Effect("friction_patch", ["a.a~b.b"], {"friction": 0.5} | sides)
-    narrow = dict.fromkeys(patch.parameters, 1e-3)
-    choice = Choice(patch, narrow, 2.0, after, "", 1.0, (), (), 5)
+    at_end = dict.fromkeys(patch.parameters, slopes)
+    choice = Choice(patch, at_end, 2.0, after, "", 1.0, (), (), 5)
     moved = {"friction": 1e-3} | dict.fromkeys(sides, far)
     problem = SimpleNamespace(widened=lambda end, k: (moved, ()))
     search = SimpleNamespace(problem=problem)

@@ -220,9 +220,10 @@ class _Search:
         """Whether the k-th effect is told from none; beside others one that may end
         anywhere also by how far it may, which slopes at where it ends do not say."""
         choice, alone = chosen[k], len(chosen) == 1
-        if alone or not is_significant(choice, alone):
-            return is_significant(choice, alone)
-        if not any(each.endless for each in KINDS[choice.effect.kind].parameters):
+        if not is_significant(choice, alone):
+            return False
+        endless = any(each.endless for each in KINDS[choice.effect.kind].parameters)
+        if alone or not endless:
             return True
         std, _ = self.problem.widened(current, k)
         return is_significant(replace(choice, std=std), alone)

@@ -549,32 +549,29 @@ def _ball(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph):
             f"effect rolling_resistance at {at!r}: {other.scoped_name()} is a link of "
             "a mechanism; expected a free or an anchored body"
         )
-    inspector = scene_graph.model_inspector()
-    shapes = [inspector.GetShape(g) for g in plant.GetCollisionGeometriesForBody(ball)]
-    round_ = bool(shapes) and all(isinstance(s, (Sphere, Cylinder)) for s in shapes)
-    rolls = False
-    if round_ and any(isinstance(s, Cylinder) for s in shapes):
-        # One that lies: its spheres and cylinders reach equally far from its axis.
-        radii = [shape.radius() for shape in shapes]
-        rolls = max(radii) <= (1.0 + ALIKE) * min(radii)
-        reach = [max(radii)]
-    elif round_:
-        # Several spheres make a bumpy object, about as large as they reach on average.
-        rolls = True
-        reach = [
-            float(np.linalg.norm(inspector.GetPoseInFrame(g).translation()))
-            + shape.radius()
-            for g, shape in zip(
-                plant.GetCollisionGeometriesForBody(ball), shapes, strict=True
-            )
-        ]
-    if not rolls:
+    radius = _rolling_radius(plant, scene_graph.model_inspector(), ball)
+    if radius is None:
         raise ValueError(
             f"effect rolling_resistance at {at!r}: expected {ball.scoped_name()} to "
             "have spheres as collision geometry, or cylinders (and spheres) of one "
             "radius"
         )
-    return ball, other, float(np.mean(reach))
+    return ball, other, radius
+
+
+def _rolling_radius(plant, inspector, body: RigidBody) -> float | None:
+    """On which a body rolls [m]; None: it is not round."""
+    geometries = plant.GetCollisionGeometriesForBody(body)
+    shapes = [inspector.GetShape(g) for g in geometries]
+    if not shapes or not all(isinstance(s, (Sphere, Cylinder)) for s in shapes):
+        return None
+    radii = [shape.radius() for shape in shapes]
+    if any(isinstance(s, Cylinder) for s in shapes):
+        # One that lies: its spheres and cylinders reach equally far from its axis.
+        return max(radii) if max(radii) <= (1.0 + ALIKE) * min(radii) else None
+    # Several spheres make a bumpy object, about as large as they reach on average.
+    poses = [inspector.GetPoseInFrame(g).translation() for g in geometries]
+    return float(np.mean(np.linalg.norm(poses, axis=1) + radii))
 
 
 def rolls_against(pair: str, coefficient: float) -> Effect:
