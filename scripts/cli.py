@@ -419,11 +419,16 @@ def _reproduce(args) -> int:
             if hasattr(module, "check"):
                 module.check(args.which)
     seeds = int(_number(args.seeds, "--seeds", 1, whole=True))
+    seed = None
+    if args.seed is not None:
+        if any(name not in _BENCHMARKS for name in names):
+            raise ValueError("--seed is of gap and faults; did you mean --seeds?")
+        seed = int(_number(args.seed, "--seed", 0, whole=True))
     jobs = _jobs(args.jobs)
     out = Path(args.out) if args.out else _default_out("reproduce")
     with Session(out, reuse=args.reuse, command="reproduce") as session:
         try:
-            status = _reproduce_in(session, modules, seeds, jobs, args)
+            status = _reproduce_in(session, modules, seeds, jobs, args, seed)
         except KeyboardInterrupt:
             _say_files(session.finish(complete=False))
             raise
@@ -432,8 +437,9 @@ def _reproduce(args) -> int:
     return status
 
 
-def _reproduce_in(session, modules, seeds: int, jobs: int, args) -> int:
-    """The tables of all modules. Returns: the exit status."""
+def _reproduce_in(session, modules, seeds: int, jobs: int, args, seed) -> int:
+    """The tables of all modules; seed: of benchmarks, or None. Returns: the exit
+    status."""
     from makebreak.scripts.hypotheses import verdicts
 
     tables = {}
@@ -451,7 +457,7 @@ def _reproduce_in(session, modules, seeds: int, jobs: int, args) -> int:
 
     for name, module in modules.items():
         if hasattr(module, "reproduce"):
-            extra = (args.which, args.only) if name in _BENCHMARKS else ()
+            extra = (args.which, args.only, seed) if name in _BENCHMARKS else ()
             with session.child(name) as child:
                 try:
                     table = module.reproduce(child, seeds, jobs, *extra)
@@ -719,6 +725,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="TEXT",
         help="of gap and faults: cases with this in the name",
     )
+    p.add_argument("--seed", metavar="N", help="of gap and faults: the first one")
     p.add_argument(
         "--reuse", action="store_true", help="keep trials of an earlier time"
     )

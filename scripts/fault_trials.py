@@ -81,10 +81,14 @@ def judge(fault: Injected, result: Mapping, plain: Mapping) -> str:
     return RECOVERED if there and rolled(result) >= SHARE * rolled(plain) else HELD
 
 
-def reproduce(session, seeds: int, jobs: int, which: str = "", only: str = "") -> Table:
-    """The table. Args: only: cases with this in their text."""
+def reproduce(
+    session, seeds: int, jobs: int, which: str = "", only: str = "",
+    seed: int | None = None,
+) -> Table:  # fmt: skip
+    """The table. Args: only: cases with this in their text; seed: the first one."""
     cases = [text for text in CASES if only in text]
-    run = [FIRST_SEED + i for i in range(seeds)]
+    first = FIRST_SEED if seed is None else seed
+    run = [first + i for i in range(seeds)]
     trials = [
         (SETTINGS | {"faults": [text]}, seed)
         for text in ("none", *cases)

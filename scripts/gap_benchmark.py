@@ -77,23 +77,27 @@ def check(which: str = "standard") -> None:
 
 
 def reproduce(
-    session: Session, seeds: int, jobs: int, which: str = "standard", only: str = ""
-) -> Table:
-    """A set, scored; its seeds are its own, `seeds` is not used."""
-    return run_benchmark(session.out_dir, jobs, which, only, session.reuse)
+    session: Session, seeds: int, jobs: int, which: str = "standard", only: str = "",
+    seed: int | None = None,
+) -> Table:  # fmt: skip
+    """A set, scored, as many cases as it has: `seeds` is not used. seed: of its first
+    case, where it is not its own."""
+    return run_benchmark(session.out_dir, jobs, which, only, session.reuse, seed)
 
 
 def run_benchmark(
-    folder: Path, jobs: int, which: str = "standard", only: str = "", reuse=False
-) -> Table:
+    folder: Path, jobs: int, which: str = "standard", only: str = "", reuse=False,
+    seed: int | None = None,
+) -> Table:  # fmt: skip
     """Makes the cases, runs the workflow on each, and scores it.
 
     Args: folder, of all files; which, set of cases; only, those whose name has this in
-        it; reuse, whether cases and results that are there are kept.
+        it; reuse, whether cases and results that are there are kept; seed, of the
+        first case, None: the set's own.
     """
     cases, truth_file = folder / "cases", folder / "truth.json"
     if not (reuse and truth_file.is_file()):
-        _make_cases(which, only, cases, truth_file, jobs)
+        _make_cases(which, only, cases, truth_file, jobs, seed)
     # Only the names, for now.
     names = sorted(path.name for path in cases.iterdir())
     folders = [folder / "results" / name for name in names]
@@ -125,11 +129,12 @@ def run_benchmark(
         (folder / "scores.json").write_text(json.dumps(rows, indent=1) + "\n")
 
     run_commands("gap", commands, folders, jobs, is_done, ended, CASE_LIMIT_SEC)
-    return table_of([scores[name] for name in names], which, SETS[which].goals)
+    name = which if seed is None else f"{which} --seed {seed}"
+    return table_of([scores[each] for each in names], name, SETS[which].goals)
 
 
 def _make_cases(
-    which: str, only: str, cases: Path, truth_file: Path, jobs: int
+    which: str, only: str, cases: Path, truth_file: Path, jobs: int, seed: int | None
 ) -> None:
     for parent in (cases, truth_file.parent / "results"):
         for old in (*parent.glob("case_*"), *parent.glob("log_*")):
@@ -138,6 +143,7 @@ def _make_cases(
     maker = SETS[which].maker
     words = [sys.executable, str(maker), "--set", which, "--only", only]
     words += ["--out", str(cases), "--truth", str(truth_file), "--jobs", str(jobs)]
+    words += [] if seed is None else ["--seed", str(seed)]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:

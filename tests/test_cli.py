@@ -149,7 +149,10 @@ BAD = [
     (["run", "spring_mass", "--sed", "1"], "option --sed; did you mean --seed?"),
     (["run", "spring_mass", "--durat=1"], "option --durat; did you mean --duration?"),
     (["run", "spring_mass", "--no-mesh"], "option --no-mesh; did you mean --no-mes"),
-    (["reproduce", "--seed", "1"], "unknown option --seed; did you mean --seeds?"),
+    (
+        ["reproduce", "--seed", "1"],
+        "--seed is of gap and faults; did you mean --seeds?",
+    ),
     (["gap", "a.yaml", "b.csv", "--job", "1"], "option --job; did you mean --jobs?"),
     (["bench", "--jobs", "1"], "unknown option --jobs; expected one of: --help"),
     (["list", "scenes"], "unexpected scenes"),

@@ -6,6 +6,8 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from gap_benchmark import log_cases
+from gap_benchmark.cases import cases as one_by_one
 from gap_benchmark.contact_cases import (
     RECIPES,
     SCENES,
@@ -69,6 +71,15 @@ def test_there_are_enough_cases_and_their_seeds_are_apart():
     assert options >= {"camera30", "camera60", "no_wrench", "effort"}
     assert any(c.recipe.ties for c in final)
     assert any(len(c.recipe.hide.split()) == 2 for c in final)
+
+
+def test_a_set_can_be_drawn_anew_from_another_seed():
+    drawn = contact_cases("contact-final", 30)
+    assert [c.seed for c in drawn] == list(range(30, 30 + len(RECIPES)))
+    assert [c.recipe for c in drawn] == RECIPES
+    logs = log_cases.cases("logs-final", 5), log_cases.cases("logs-final")
+    assert [a.seed - 5 for a in logs[0]] == [b.seed - logs[1][0].seed for b in logs[1]]
+    assert [c.seed for c in one_by_one("standard", 7)][:2] == [7, 8]
 
 
 @pytest.mark.parametrize("world", sorted(WORLDS))

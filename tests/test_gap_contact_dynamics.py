@@ -741,3 +741,39 @@ def test_what_a_planar_camera_says_of_the_height_is_not_compared(tmp_path):
 
     errors = np.concatenate(windows.errors(windows.simulate([effect])))
     assert np.sqrt(np.mean(errors**2)) < 1.2
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_noise_of_an_effort_is_that_of_positions_and_of_velocities(tmp_path, measured):
+    """Of a drive that damps: kd times a velocity is most of what noise makes of it."""
+    scene, recordings, _ = pushed(tmp_path, 16, [], episodes=2)
+    (recording,) = recordings
+    rng = np.random.default_rng(0)
+    joints = "tip.x", "tip.y"
+
+    def channels(add: float):
+        out = {}
+        for name, c in recording.channels.items():
+            if name.endswith(".velocity") and not measured:
+                continue
+            if name in [f"{j}.{of}" for j in joints for of in ("position", "velocity")]:
+                noise = add * c.noise * rng.normal(size=len(c.values))
+                c = replace(c, values=c.values + noise)
+            out[name] = c
+        return out
+
+    efforts = []
+    for add in (0.0, 1.0, 1.0, 1.0, 1.0):
+        noisy = replace(recording, channels=channels(add))
+        means = ContactDynamics(scene, [noisy]).means
+        efforts.append({
+            (i, round(t, 6)): u
+            for i, t, u in zip(means.episode, means.time, means.effort, strict=True)
+        })  # fmt: skip
+    said = np.sqrt(np.mean(means.effort_var[:, :2]))
+    off = [
+        efforts[k][at][:2] - efforts[0][at][:2]
+        for k in range(1, 5)
+        for at in efforts[k].keys() & efforts[0].keys()
+    ]
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(said, rel=0.15)

@@ -293,12 +293,13 @@ def test_where_the_benchmark_is_absent_one_line_says_so(monkeypatch, capsys, tmp
 MAKER = """import argparse, json
 from pathlib import Path
 p = argparse.ArgumentParser()
-for name in ("set", "only", "jobs"):
+for name in ("set", "only", "jobs", "seed"):
     p.add_argument("--" + name)
 for name in ("out", "truth"):
     p.add_argument("--" + name, type=Path)
 a = p.parse_args()
-for k in (1, 2):
+first = int(a.seed or 1)
+for k in (first, first + 1):
     folder = a.out / f"case_{k}"
     folder.mkdir(parents=True)
     (folder / "scene.yaml").write_text("actuation: {joints: [p.j1]}")
@@ -307,7 +308,8 @@ for k in (1, 2):
 hidden = {"kind": "rotor_inertia", "at": "p.j1", "parameters": {"inertia": 0.1}}
 none = {"name": "1_none", "verdict": "no_gap", "effects": [], "ties": []}
 one = {"name": "2_one", "verdict": "gap_named", "effects": [hidden], "ties": []}
-a.truth.write_text(json.dumps({"case_1": none, "case_2": one}))
+truth = {f"case_{first}": none, f"case_{first + 1}": one}
+a.truth.write_text(json.dumps(truth))
 """
 GAP = """import json, sys
 from pathlib import Path
@@ -368,3 +370,9 @@ def test_the_whole_way_from_the_cases_to_the_table(monkeypatch, tmp_path):
         assert table.notes == ["2_one: gap_named -> no_gap: nothing"]
     assert len(json.loads((folder / "scores.json").read_text())) == 2
     assert Path(folder / "results" / "case_1" / "log.txt").is_file()
+    table = gap_benchmark.run_benchmark(folder, 2, seed=70)
+    assert sorted(p.name for p in (folder / "cases").iterdir()) == [
+        "case_70",
+        "case_71",
+    ]
+    assert "--set standard --seed 70" in table.rows[0][3]

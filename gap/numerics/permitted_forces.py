@@ -25,6 +25,9 @@ from scipy.sparse import csr_matrix
 
 _POWER = 4  # w ~ (1 - u^2)^4 on |u| < 1.
 _SECOND_MOMENT = 1.0 / 11.0  # Of w, over the half width squared.
+# integral(w'^2) / integral(w^2), times the half width squared: noise of positions in a
+# mean velocity, -integral(w' q), by their noise in a mean position.
+RATE_OF_MEAN = 34.0 / 7.0
 FEWEST = 6  # Samples within a test function.
 
 

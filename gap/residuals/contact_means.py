@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.numerics.permitted_forces import (
     FEWEST,
+    RATE_OF_MEAN,
     held_means,
     test_functions,
 )
@@ -708,7 +709,14 @@ class ContactMeans:
         u = 0.5 * (effort(now) + effort(np.minimum(now + 1, len(x) - 1)))
         kp = float(law.kp) if has_p else 0.0
         noise = recording.channels[f"{joint}.position"].noise
-        var = np.asarray(w.multiply(w).sum(axis=1)).ravel() * (kp * noise) ** 2
+        size = np.asarray(w.multiply(w).sum(axis=1)).ravel()
+        # Velocities are smoothed ones: known by positions, and better if measured too.
+        v_var = RATE_OF_MEAN / np.broadcast_to(half, K) ** 2 * noise**2
+        if f"{joint}.velocity" in recording:
+            v_noise = recording.channels[f"{joint}.velocity"].noise
+            v_var = 1.0 / (1.0 / v_var + 1.0 / v_noise**2)
+        damping = float(law.kd + law.emf)
+        var = size * ((kp * noise) ** 2 + damping**2 * v_var)
         mean = held @ u
         # Commands that act later by a while: less of what they ask by their rate.
         rate = np.gradient(p, t.time) if has_p else np.zeros(len(x))

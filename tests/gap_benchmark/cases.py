@@ -134,15 +134,17 @@ TABLE: list[tuple] = [
 ]  # fmt: skip
 
 
-def cases(which: str = "standard") -> list[Case]:
-    """All cases of a set, `standard` or `development`."""
+def cases(which: str = "standard", seed: int | None = None) -> list[Case]:
+    """All cases of a set, `standard` or `development`; seed: of the first one, where it
+    is not the set's own."""
+    first = SEEDS[which] if seed is None else seed
     found = []
     for i, (world, kinds, background, *ties) in enumerate(TABLE):
         words = kinds.split()
         name = f"{i:02d}_{world.replace('!', '_tie')}_{'_and_'.join(words) or 'none'}"
         found.append(
             Case(
-                name, SEEDS[which] + i, world, tuple(words), background,
+                name, first + i, world, tuple(words), background,
                 ties[0] if ties else (),
             )
         )  # fmt: skip

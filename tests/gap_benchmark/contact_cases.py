@@ -121,9 +121,11 @@ class ContactCase:
         return f"case_{self.seed}"
 
 
-def contact_cases(which: str) -> list[ContactCase]:
+def contact_cases(which: str, seed: int | None = None) -> list[ContactCase]:
+    """All cases of a set; seed: of the first one, where it is not the set's own."""
+    first = SEEDS[which] if seed is None else seed
     return [
-        ContactCase(f"{i:02d}_{recipe.name}", SEEDS[which] + i, recipe)
+        ContactCase(f"{i:02d}_{recipe.name}", first + i, recipe)
         for i, recipe in enumerate(RECIPES)
     ]
 

@@ -205,11 +205,11 @@ RECIPES = [
 ]  # fmt: skip
 
 
-def cases(which: str) -> list[LogCase]:
-    """All cases of a set."""
+def cases(which: str, seed: int | None = None) -> list[LogCase]:
+    """All cases of a set; seed: of the first one, where it is not the set's own."""
+    first = SEEDS[which] if seed is None else seed
     return [
-        LogCase(f"{i:02d}_{r.name}", SEEDS[which] + 7 * i, r)
-        for i, r in enumerate(RECIPES)
+        LogCase(f"{i:02d}_{r.name}", first + 7 * i, r) for i, r in enumerate(RECIPES)
     ]
 
 

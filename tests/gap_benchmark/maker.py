@@ -24,7 +24,7 @@ C = TypeVar("C", bound=Case)
 def make_cases(
     what: str,
     sets: Sequence[str],
-    cases: Callable[[str], Sequence[C]],
+    cases: Callable[[str, int | None], Sequence[C]],
     write: Callable[[C, Path], dict],
 ) -> None:
     """Reads the command line and does what it says.
@@ -32,19 +32,20 @@ def make_cases(
     Args:
         what: is written, for --help.
         sets: names of them.
-        cases: those of a set.
+        cases: those of a set, and from a seed on; None: from its own.
         write: a case into a folder; returns the truth. It is called in processes.
     """
     parser = argparse.ArgumentParser(description=f"Writes {what}.")
     parser.add_argument("--set", choices=sorted(sets), required=True)
     parser.add_argument("--out", type=Path, required=True, help="folder of the cases")
     parser.add_argument("--truth", type=Path, required=True, help="file, elsewhere")
+    parser.add_argument("--seed", type=int, help="of the first case; else the set's")
     parser.add_argument("--only", default="", help="cases whose name has this in it")
     parser.add_argument("--jobs", type=int, default=1, help="processes at once")
     args = parser.parse_args()
     if args.out.resolve() in args.truth.resolve().parents:
         parser.error("--truth must not lie in --out: the workflow could read it")
-    wanted = [case for case in cases(args.set) if args.only in case.name]
+    wanted = [case for case in cases(args.set, args.seed) if args.only in case.name]
     truths = {}
     with ProcessPoolExecutor(args.jobs) as pool:
         written = pool.map(write, wanted, [args.out / case.folder for case in wanted])
