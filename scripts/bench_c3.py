@@ -27,6 +27,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.solvers import MathematicalProgram, OsqpSolver, SolverOptions
 from pydrake.systems.framework import DiagramBuilder
 
+from makebreak.scripts.bench import median_call_ms
 from makebreak.systems.contact_mpc.lcs_builder import (
     Anitescu,
     AnitescuLcs,
@@ -387,7 +388,7 @@ def combinations(repeats: int):
             # The file's weights are those of 16 forces, all alike.
             weights = C3Weights(p.Q, p.R, _widened(p.G, lcs), _widened(p.U, lcs))
             problem = C3Problem(weights, p.projection, p.options)
-            ms = median_ms(partial(solve_c3, lcs, x0, x_desired, problem), repeats)
+            ms = median_call_ms(partial(solve_c3, lcs, x0, x_desired, problem), repeats)
             u = solve_c3(lcs, x0, x_desired, problem)[0].u
             as_real = C3Problem(
                 C3Weights(p.Q, p.R, _widened(p.G, real), _widened(p.U, real)),
@@ -468,7 +469,7 @@ def variants(repeats: int):
         problem = C3Problem(
             C3Weights(plain.Q, plain.R, G, U), plain.projection, plain.options
         )
-        ms = median_ms(partial(solve_c3, lcs, x0, x_desired, problem), repeats)
+        ms = median_call_ms(partial(solve_c3, lcs, x0, x_desired, problem), repeats)
         found.append({"what": f"C3+, ball, N 5, n_lam {n}", "value": ms, "unit": "ms"})
         if n > 32:
             continue
@@ -480,7 +481,7 @@ def variants(repeats: int):
             [x0 + 0.05 * rng.normal(size=(60, 19)), rng.normal(size=(60, n + 3))]
         )
         times = [
-            median_ms(
+            median_call_ms(
                 partial(project_exact, zk, U, E, F, H, c, nodes, np.empty((1, n + 22))),
                 3,
             )
@@ -489,10 +490,6 @@ def variants(repeats: int):
         what = f"exact projection, ball, n_lam {n}, eps_c 5e-4, a knot"
         found.append({"what": what, "value": float(np.median(times)), "unit": "ms"})
     return found
-
-
-def median_ms(call, n):
-    return float(interleaved_ms([call], n)[0])
 
 
 def ball_lcs(n_f: int, law: Anitescu | StewartTrinkle | None = None) -> LCS:
