@@ -35,7 +35,7 @@ from makebreak.gap.residuals.sap_lift import sap_lift
 from makebreak.gap.result import GapMeasure, GapResult, JudgedChannel
 from makebreak.gap.search.fit import fit_effects
 from makebreak.gap.search.select import Choice, Selection, select, without
-from makebreak.gap.search.trust import trust_in
+from makebreak.gap.search.trust import scatter, trust_in
 from makebreak.gap.simulation.measure import WINDOW_SEC
 from makebreak.gap.simulation.windows import WindowModel, with_step
 from makebreak.gap.verdict import (
@@ -198,8 +198,9 @@ def conclude(
     nuisances = selection.nuisances
     selection, chosen_on = kept_by_simulation(problem, selection, jobs)
     selection, chosen_on = preferred_by_simulation(problem, selection, chosen_on, jobs)
+    scattered = scatter(problem, selection.end)
     choices = [
-        _with_inseparable(_widened(c, problem, selection.end), problem)
+        _with_inseparable(_widened(c, problem, selection.end, scattered), problem)
         for c in selection.choices
     ]
     selection = replace(selection, choices=tuple(choices))
@@ -513,11 +514,15 @@ def _settle_step(
     ]
 
 
-def _widened(choice: Choice, problem: GapProblem, end: Fitted) -> Choice:
+def _widened(
+    choice: Choice, problem: GapProblem, end: Fitted, scattered: Sequence[Mapping]
+) -> Choice:
+    """With deviations no less than data that are held out, or parts of them, say."""
     k = end.effects.index(choice.effect) if choice.effect in end.effects else -1
     if k < 0:
         return choice
     std, or_more = problem.widened(end, k)
+    std = {name: max(x, scattered[k].get(name, 0.0)) for name, x in std.items()}
     return replace(choice, std=std, or_more=or_more)
 
 

@@ -46,7 +46,7 @@ from makebreak.gap.search.select import (
     is_significant,
     select,
 )
-from makebreak.gap.search.trust import gauss_newton, ridges, steady
+from makebreak.gap.search.trust import gauss_newton, ridges, scatter, steady
 from makebreak.gap.verdict import (
     after_simulation,
     not_borne_out,
@@ -260,10 +260,15 @@ def test_an_effect_that_changes_from_part_to_part_is_not_steady(recordings):
     first, second = steady(problem, fitted)
     assert first > 20.0
     assert second < 2.0
+    # The one is as well known as its rows say; of the other the parts say how well.
+    calm, wild = (of["damping"] for of in scatter(problem, fitted))
+    assert calm == pytest.approx(1.0 / np.linalg.norm(X[:, 0]), rel=0.3)
+    assert wild == pytest.approx(np.std(b_of, ddof=1) / np.sqrt(parts), rel=0.1)
     # A scatter takes four parts at least.
     problem.blocks = lambda: np.arange(n) // 334
     if recordings == 1:
         assert steady(problem, fitted) == [np.inf, np.inf]
+        assert scatter(problem, fitted) == [{}, {}]
 
 
 class Steps:

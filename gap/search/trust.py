@@ -34,7 +34,7 @@ def trust_in(
     }
     stretches = [value + gauss_newton(J, r, some) for some in stretches_of]
     starts = [_from_elsewhere(problem, screen, fitted, fixed, s) for s in STARTS]
-    ridge = ridges(fitted.J)
+    ridge, scattered = ridges(fitted.J), scatter(problem, fitted)
     found = []
     for k, (i, name) in enumerate(fitted.names):
         effect = fitted.effects[i]
@@ -46,7 +46,7 @@ def trust_in(
             Trust(
                 effect.kind, tuple(effect.at), name,
                 KINDS[effect.kind].parameter(name).unit, float(value[k]),
-                fitted.std[i].get(name, 0.0),
+                max(fitted.std[i].get(name, 0.0), scattered[i].get(name, 0.0)),
                 {
                     problem.recordings[number].name: float(of[k])
                     for number, of in by_recording.items()
@@ -64,9 +64,32 @@ def steady(problem: GapProblem, fitted: Fitted) -> list[float]:
     on parts of the data (recordings; stretches of time where there are few) differs
     from part to part by more than noise: its surest parameter's. What imitates another
     law is one thing here and another there. Infinite where parts say nothing."""
-    sure = [np.inf] * len(fitted.effects)
+    found: dict[int, float] = {}
+    for (i, name), (mean, std) in _over_parts(problem, fitted).items():
+        neutral = KINDS[fitted.effects[i].kind].parameter(name).neutral
+        if neutral is not None:
+            found[i] = max(found.get(i, 0.0), abs(mean - neutral) / std)
+    return [found.get(i, np.inf) for i in range(len(fitted.effects))]
+
+
+def scatter(problem: GapProblem, fitted: Fitted) -> list[dict[str, float]]:
+    """Of each effect, the deviations of its parameters by how they differ from part to
+    part of the data: laws are approximations, and one that is not quite that of the
+    world has another best value where it moves otherwise, which rows, taken as
+    independent, do not say. Without those of which there are too few parts."""
+    out: list[dict[str, float]] = [{} for _ in fitted.effects]
+    for (i, name), (_, std) in _over_parts(problem, fitted).items():
+        out[i][name] = std
+    return out
+
+
+def _over_parts(
+    problem: GapProblem, fitted: Fitted
+) -> dict[tuple[int, str], tuple[float, float]]:
+    """{(effect, parameter): mean over recordings, or stretches of time where there are
+    few, and its deviation}, of those that enough parts show."""
     if not fitted.names:
-        return sure
+        return {}
     J, r = _data_rows(problem, fitted)
     recording, parts = _parts(problem)
     several = np.unique(recording)
@@ -75,16 +98,12 @@ def steady(problem: GapProblem, fitted: Fitted) -> list[float]:
     value = _values(fitted)
     x = np.array([value + gauss_newton(J, r, some) for some in parts])
     variance = np.array([_variances(J, r, some) for some in parts])
-    found: dict[int, float] = {}
-    for k, (i, name) in enumerate(fitted.names):
-        neutral = KINDS[fitted.effects[i].kind].parameter(name).neutral
-        there = np.isfinite(x[:, k]) & np.isfinite(variance[:, k])
-        if neutral is None or there.sum() < FEWEST_PARTS:
-            continue
-        mean, std = random_effects(x[there, k], variance[there, k])
-        off = abs(mean - neutral) / std
-        found[i] = max(found.get(i, 0.0), off)
-    return [found.get(i, off) for i, off in enumerate(sure)]
+    there = np.isfinite(x) & np.isfinite(variance)
+    return {
+        named: random_effects(x[there[:, k], k], variance[there[:, k], k])
+        for k, named in enumerate(fitted.names)
+        if there[:, k].sum() >= FEWEST_PARTS
+    }
 
 
 def _data_rows(problem: GapProblem, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
