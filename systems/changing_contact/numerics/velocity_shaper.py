@@ -109,29 +109,73 @@ class ShaperLaw(NamedTuple):
     period: float  # Of a tick [s].
 
 
-# --- The memory, one flat array.
-_STEPS = 12  # Of speed, running at once.
-_SEG, _S0, _T0, _V0, _TARGET, _N, _STEP = range(7)  # Of a track.
-_TRACK = _STEP + 3 * _STEPS
-(
-    _INIT, _MADE, _BROKEN, _ENTER_TIME, _SETTLE_UNTIL, _SETTLE_KIND, _HELD, _ENDED,
-    _OFF, _OFF1, _BAD_UNTIL, _STICKY, _IN_KIND, _BEGAN,
-) = range(14)  # fmt: skip
-_LOST, _LOST_AT = 14, 16  # Of each row: when it was lost, 0: not; and where, p.n.
-_C = 18  # (6,)
-_FADES, _FADE = 24, 8  # Four of [X 6, start, duration].
-_N_FADES = 4
-_NOW = _FADES + _N_FADES * _FADE
-_COASTS = _NOW + _TRACK  # Two of [track, s at its end].
-_N_COASTS, _COAST = 2, _TRACK + 1
-N_MEMORY = _COASTS + _N_COASTS * _COAST
+# --- Memory and regions. All fields are float64, so that Drake keeps each as a vector;
+# vector.view(MEMORY)[0] is its record: the same numbers, by name. Compiled code must
+# hold the vector for as long as the record.
 
-# --- Regions, one flat array: [count, status, rows].
+_STEPS, _FADES, _COASTS = 12, 4, 2  # At once, at most.
+STEP = np.dtype([("start", float), ("duration", float), ("change", float)], align=True)
+TRACK = np.dtype(  # s(t) along a segment: s0 + v0 (t - t0) and steps of the speed.
+    [
+        ("segment", float),  # Of a coast, -1: there is none.
+        ("s0", float),
+        ("t0", float),
+        ("v0", float),
+        ("target", float),  # The speed after all steps [m/s].
+        ("n_steps", float),
+        ("steps", STEP, _STEPS),
+    ],
+    align=True,
+)
+FADE = np.dtype([("X", float, 6), ("start", float), ("duration", float)], align=True)
+COAST = np.dtype([("track", TRACK), ("s_end", float)], align=True)
+MEMORY = np.dtype(
+    [
+        ("begun", float),  # 0: not yet; 2: it does not wait for its first time.
+        ("made", float),  # Counts of the contact detector, as last seen.
+        ("broken", float),
+        ("enter_time", float),  # Of the region; -1: in none.
+        ("settle_until", float),
+        ("settle_kind", float),
+        ("held", float),
+        ("ended", float),
+        ("off", float, 2),  # Of each force direction, 1: it was given up.
+        ("bad_until", float),
+        ("sticky", float),  # Of the status, what stays until the next segment.
+        ("region_kind", float),
+        ("began", float),
+        ("lost_time", float, 2),  # Of each force direction; 0: not lost.
+        ("lost_at", float, 2),  # And where, p.n.
+        ("c", float, 6),
+        ("fades", FADE, _FADES),
+        ("now", TRACK),
+        ("coasts", COAST, _COASTS),  # Segments that run out.
+    ],
+    align=True,
+)
+N_MEMORY = MEMORY.itemsize // 8
+
 REGIONS_MAX = 32
-_ROW = 5  # [segment, kind, entry, exit, speed]; arc lengths [m].
-N_REGIONS = 2 + REGIONS_MAX * _ROW
-# Contacts as the planner takes them: [mean 3, direction 3, sigma, kind, segment, v_a].
-N_EXPECTED = 10
+REGION_ROW = np.dtype(  # Arc lengths [m].
+    [(name, float) for name in ("segment", "kind", "entry", "leave", "speed")],
+    align=True,
+)
+REGIONS = np.dtype(
+    [("count", float), ("status", float), ("rows", REGION_ROW, REGIONS_MAX)], align=True
+)
+N_REGIONS = REGIONS.itemsize // 8
+
+EXPECTED = np.dtype(  # A contact as the planner takes it.
+    [
+        ("mean", float, 3),
+        ("direction", float, 3),
+        ("sigma", float),  # Along the direction.
+        ("kind", float),
+        ("segment", float),
+        ("speed", float),  # v_a
+    ],
+    align=True,
+)
 
 
 @numba.njit(cache=True)
@@ -160,13 +204,13 @@ def _add_along(C, n, distance):
 
 
 @numba.njit(cache=True)
-def _along(m, b, t):
-    """Arc length, speed and acceleration of the track at b, at time t."""
-    s, v, a = m[b + _S0] + m[b + _V0] * (t - m[b + _T0]), m[b + _V0], 0.0
-    for i in range(int(m[b + _N])):
-        j = b + _STEP + 3 * i
-        T, dv = m[j + 1], m[j + 2]
-        tau = (t - m[j]) / T
+def _along(track, t):
+    """Arc length, speed and acceleration of a track at time t."""
+    s, v, a = track.s0 + track.v0 * (t - track.t0), track.v0, 0.0
+    for i in range(int(track.n_steps)):
+        step = track.steps[i]
+        T, dv = step.duration, step.change
+        tau = (t - step.start) / T
         S, slope, _ = unit_step(tau)
         s += dv * T * unit_step_integral(tau)
         v += dv * S
@@ -175,32 +219,31 @@ def _along(m, b, t):
 
 
 @numba.njit(cache=True)
-def _steady_from(m, b, t):
-    """When the last step of the track at b ends; t if none runs."""
+def _steady_from(track, t):
+    """When the last step of a track ends; t if none runs."""
     end = t
-    for i in range(int(m[b + _N])):
-        j = b + _STEP + 3 * i
-        end = max(end, m[j] + m[j + 1])
+    for i in range(int(track.n_steps)):
+        step = track.steps[i]
+        end = max(end, step.start + step.duration)
     return end
 
 
 @numba.njit(cache=True)
-def _fold(m, b, t):
+def _fold(track, t):
     """Steps that are over become part of the constant speed."""
     i = 0
-    while i < m[b + _N]:
-        j = b + _STEP + 3 * i
-        if t < m[j] + m[j + 1]:
+    while i < track.n_steps:
+        step = track.steps[i]
+        if t < step.start + step.duration:
             i += 1
             continue
-        m[b + _S0] += m[j + 2] * (m[b + _T0] - m[j] - 0.5 * m[j + 1])
-        m[b + _V0] += m[j + 2]
-        m[b + _N] -= 1.0
-        last = b + _STEP + 3 * int(m[b + _N])
-        m[j], m[j + 1], m[j + 2] = m[last], m[last + 1], m[last + 2]
-        if m[b + _N] == 0.0:  # No rounding is left in the speed.
-            m[b + _S0] += m[b + _V0] * (t - m[b + _T0])
-            m[b + _T0], m[b + _V0] = t, m[b + _TARGET]
+        track.s0 += step.change * (track.t0 - step.start - 0.5 * step.duration)
+        track.v0 += step.change
+        track.n_steps -= 1.0
+        track.steps[i] = track.steps[int(track.n_steps)]
+        if track.n_steps == 0.0:  # No rounding is left in the speed.
+            track.s0 += track.v0 * (t - track.t0)
+            track.t0, track.v0 = t, track.target
 
 
 @numba.njit(cache=True)
@@ -209,51 +252,49 @@ def _step_sec(law, dv):
 
 
 @numba.njit(cache=True)
-def _begin(m, b, law, t, target):
-    """A step of the track at b to the speed `target`, from time t; none if too many
-    run already."""
-    n = int(m[b + _N])
-    dv = target - m[b + _TARGET]
+def _begin(track, law, t, target):
+    """A step of the track to the speed `target`, from time t; none if too many run
+    already."""
+    n = int(track.n_steps)
+    dv = target - track.target
     if n == _STEPS or dv == 0.0:
         return
-    j = b + _STEP + 3 * n
-    m[j], m[j + 2] = t, dv
-    m[j + 1] = max(_step_sec(law, dv), _steady_from(m, b, t) - t)
-    m[b + _N] += 1.0
-    m[b + _TARGET] = target
+    step = track.steps[n]
+    step.start, step.change = t, dv
+    step.duration = max(_step_sec(law, dv), _steady_from(track, t) - t)
+    track.n_steps += 1.0
+    track.target = target
 
 
 @numba.njit(cache=True)
 def _reference(table, m, t):
     """X and its two time derivatives (3, 6) at time t, and s, v along the path."""
     out = np.zeros((3, 6))
-    s, v, a = _along(m, _NOW, t)
-    D = path_point(table, int(m[_NOW + _SEG]), s)
+    s, v, a = _along(m.now, t)
+    D = path_point(table, int(m.now.segment), s)
     for i in range(6):
-        out[0, i] = m[_C + i] + D[0, i]
+        out[0, i] = m.c[i] + D[0, i]
         out[1, i] = D[1, i] * v
         out[2, i] = D[2, i] * v * v + D[1, i] * a
-    for c in range(_N_COASTS):
-        b = _COASTS + c * _COAST
-        if m[b + _SEG] < 0.0:
+    for coast in m.coasts:
+        if coast.track.segment < 0.0:
             continue
-        k = int(m[b + _SEG])
-        s_c, v_c, a_c = _along(m, b, t)
+        k = int(coast.track.segment)
+        s_c, v_c, a_c = _along(coast.track, t)
         D = path_point(table, k, s_c)
-        end = path_point(table, k, m[b + _TRACK])
+        end = path_point(table, k, coast.s_end)
         for i in range(6):
             out[0, i] += D[0, i] - end[0, i]
             out[1, i] += D[1, i] * v_c
             out[2, i] += D[2, i] * v_c * v_c + D[1, i] * a_c
-    for f in range(_N_FADES):
-        b = _FADES + f * _FADE
-        T = m[b + 7]
+    for fade in m.fades:
+        T = fade.duration
         if T > 0.0:
-            S, slope, bend = unit_step((t - m[b + 6]) / T)
+            S, slope, bend = unit_step((t - fade.start) / T)
             for i in range(6):
-                out[0, i] += m[b + i] * (1.0 - S)
-                out[1, i] -= m[b + i] * slope / T
-                out[2, i] -= m[b + i] * bend / (T * T)
+                out[0, i] += fade.X[i] * (1.0 - S)
+                out[1, i] -= fade.X[i] * slope / T
+                out[2, i] -= fade.X[i] * bend / (T * T)
     return out, s, v
 
 
@@ -264,25 +305,25 @@ def _fade_out(m, law, t, X):
     if size == 0.0 and turn == 0.0:
         return
     slot, oldest = -1, 0
-    for f in range(_N_FADES):
-        b = _FADES + f * _FADE
-        if m[b + 7] <= 0.0 or t >= m[b + 6] + m[b + 7]:
+    for f in range(_FADES):
+        fade = m.fades[f]
+        if fade.duration <= 0.0 or t >= fade.start + fade.duration:
             slot = f
-        elif m[b + 6] < m[_FADES + oldest * _FADE + 6]:
+        elif fade.start < m.fades[oldest].start:
             oldest = f
     if slot < 0:  # The oldest one's rest fades out with the new one.
         slot = oldest
-        b = _FADES + slot * _FADE
-        rest = 1.0 - unit_step((t - m[b + 6]) / m[b + 7])[0]
+        fade = m.fades[slot]
+        rest = 1.0 - unit_step((t - fade.start) / fade.duration)[0]
         for i in range(6):
-            X[i] += rest * m[b + i]
-    b = _FADES + slot * _FADE
+            X[i] += rest * fade.X[i]
+    fade = m.fades[slot]
     # Its acceleration is at most half of what the path may have; 1 rad counts as 1 m.
     T = np.sqrt(2.0 * BEND_MAX * max(size, turn) / law.acceleration_max)
     for i in range(6):
-        m[b + i] = X[i]
+        fade.X[i] = X[i]
     least = law.release_sec if law.release_sec < np.inf else TURN_BACK_SEC
-    m[b + 6], m[b + 7] = t, max(least, T)
+    fade.start, fade.duration = t, max(least, T)
 
 
 @numba.njit(cache=True)
@@ -305,15 +346,15 @@ def _change_segment(table, m, law, t, pose, X, s_end, s_start):
 
     Args: X (6,) the reference now; pose (7,) measured; the track is the caller's.
     """
-    k = int(m[_NOW + _SEG])
+    k = int(m.now.segment)
     end, start = path_point(table, k, s_end), path_point(table, k + 1, s_start)
     C = np.empty(6)
     for i in range(6):
-        C[i] = m[_C + i] + end[0, i] - start[0, i]
+        C[i] = m.c[i] + end[0, i] - start[0, i]
     if _finite(pose):
         for row in range(int(_head(table, k, N_FORCE))):
             n = _row(table, k, row)
-            if m[_OFF + row] == 0.0 and not _has_direction(table, k + 1, n):
+            if m.off[row] == 0.0 and not _has_direction(table, k + 1, n):
                 _add_along(C, n, _dot(n, pose) - _dot(n, X))
     kept = np.zeros(6)
     rows = int(_head(table, k + 1, N_FORCE))
@@ -327,80 +368,80 @@ def _change_segment(table, m, law, t, pose, X, s_end, s_start):
             _add_along(n2, n1, -_dot(n1, n2))
             _add_along(kept, n2, _dot(n2, C) / _dot(n2, n2))
     for i in range(6):
-        m[_C + i] = kept[i]
+        m.c[i] = kept[i]
         C[i] -= kept[i]
     _fade_out(m, law, t, C)
-    m[_NOW + _SEG] = k + 1.0
-    m[_OFF], m[_OFF1] = 0.0, 0.0
-    m[_LOST], m[_LOST + 1] = 0.0, 0.0
-    m[_STICKY] = 0.0
-    m[_ENTER_TIME], m[_IN_KIND] = -1.0, NO_CONTACT
-    m[_BEGAN] = t
+    m.now.segment = k + 1.0
+    for row in range(2):
+        m.off[row] = m.lost_time[row] = 0.0
+    m.sticky = 0.0
+    m.enter_time, m.region_kind = -1.0, NO_CONTACT
+    m.began = t
 
 
 @numba.njit(cache=True)
 def _after_contact(table, m, law, t, pose, X):
     """The contact has come: this segment runs out, the next one starts from rest."""
     slot, first = 0, np.inf
-    for c in range(_N_COASTS):
-        b = _COASTS + c * _COAST
-        ends = -1.0 if m[b + _SEG] < 0.0 else _steady_from(m, b, t)
+    for c in range(_COASTS):
+        track = m.coasts[c].track
+        ends = -1.0 if track.segment < 0.0 else _steady_from(track, t)
         if ends < first:
             slot, first = c, ends
-    b = _COASTS + slot * _COAST
-    m[b : b + _TRACK] = m[_NOW : _NOW + _TRACK]
-    if m[b + _N] == _STEPS:  # Too many to add one: it stops now.
-        m[b + _N] = 0.0
-        m[b + _V0], m[b + _TARGET] = 0.0, 0.0
-        m[b + _S0], m[b + _T0] = _along(m, _NOW, t)[0], t
-    _begin(m, b, law, t, 0.0)
-    s_end = _along(m, b, _steady_from(m, b, t))[0]
-    m[b + _TRACK] = s_end
-    _change_segment(table, m, law, t, pose, X, s_end, 0.0)
-    _start_track(m, t, m[_NOW + _SEG], 0.0)
-    m[_SETTLE_UNTIL], m[_SETTLE_KIND] = t + law.blend_sec, IMPACT
+    coast = m.coasts[slot]
+    coast.track = m.now
+    track = coast.track
+    if track.n_steps == _STEPS:  # Too many to add one: it stops now.
+        track.n_steps = 0.0
+        track.v0, track.target = 0.0, 0.0
+        track.s0, track.t0 = _along(m.now, t)[0], t
+    _begin(track, law, t, 0.0)
+    coast.s_end = _along(track, _steady_from(track, t))[0]
+    _change_segment(table, m, law, t, pose, X, coast.s_end, 0.0)
+    _start_track(m.now, t, m.now.segment, 0.0)
+    m.settle_until, m.settle_kind = t + law.blend_sec, IMPACT
 
 
 @numba.njit(cache=True)
-def _start_track(m, t, segment, speed):
-    m[_NOW : _NOW + _TRACK] = 0.0
-    m[_NOW + _SEG], m[_NOW + _T0] = segment, t
-    m[_NOW + _V0], m[_NOW + _TARGET] = speed, speed
+def _start_track(track, t, segment, speed):
+    track.segment, track.s0, track.t0 = segment, 0.0, t
+    track.v0, track.target, track.n_steps = speed, speed, 0.0
 
 
 @numba.njit(cache=True)
 def start(table, contact, t, speed):
     """Memory (N_MEMORY,) at the start of a pattern, at that speed [m/s]."""
-    m = np.zeros(N_MEMORY)
-    m[_INIT] = 1.0
+    memory = np.zeros(N_MEMORY)
+    m = memory.view(MEMORY)[0]
+    m.begun = 1.0
     if _finite(contact):
-        m[_MADE], m[_BROKEN] = contact[MADE], contact[BROKEN]
-    m[_ENTER_TIME], m[_BEGAN] = -1.0, t
-    m[_SETTLE_UNTIL] = m[_BAD_UNTIL] = -1.0
-    _start_track(m, t, 0.0, speed)
-    for c in range(_N_COASTS):
-        m[_COASTS + c * _COAST + _SEG] = -1.0
-    return m
+        m.made, m.broken = contact[MADE], contact[BROKEN]
+    m.enter_time, m.began = -1.0, t
+    m.settle_until = m.bad_until = -1.0
+    _start_track(m.now, t, 0.0, speed)
+    for coast in m.coasts:
+        coast.track.segment = -1.0
+    return memory
 
 
 def begin_anew(table, contact, t):
     """Memory (N_MEMORY,) of a pattern that begins now, at rest, whatever its times."""
     memory = start(table, contact, t, 0.0)
-    memory[_INIT] = 2.0  # It does not wait for its first time.
+    memory.view(MEMORY)["begun"] = 2.0
     return memory
 
 
 @numba.njit(cache=True)
-def _brake(m, law, t, s_limit, v_limit):
+def _brake(track, law, t, s_limit, v_limit):
     """When to begin the step down to v_limit that ends at s_limit; inf: not in this
     tick."""
-    v = m[_NOW + _TARGET]
+    v = track.target
     if not v > v_limit:
         return np.inf
-    steady = _steady_from(m, _NOW, t)
+    steady = _steady_from(track, t)
     T = max(_step_sec(law, v - v_limit), steady - t)
     # Where it would be slow if it began now: after `steady` the speed is v.
-    s_end = _along(m, _NOW, steady)[0] + v * (t + T - steady) - 0.5 * (v - v_limit) * T
+    s_end = _along(track, steady)[0] + v * (t + T - steady) - 0.5 * (v - v_limit) * T
     wait = (s_limit - s_end) / v
     if wait <= 0.0:
         return t
@@ -422,10 +463,9 @@ def _highest(law, v, v_limit, distance):
 
 
 @numba.njit(cache=True)
-def _active(table, regions, k, r):
-    """Entry and exit of region r on the track of segment k; entry inf: not on it."""
-    at = 2 + r * _ROW
-    segment = int(regions[at])
+def _active(table, region, k):
+    """Entry and exit of a region on the track of segment k; entry inf: not on it."""
+    segment = int(region.segment)
     shift = 0.0
     if segment == k + 1 and k + 1 < table[0]:
         flows = _head(table, k, GOES_ON) > 0.0 and _head(table, k, IN_LOSS) == 0.0
@@ -434,32 +474,33 @@ def _active(table, regions, k, r):
         shift = _head(table, k, LENGTH)
     elif segment != k:
         return np.inf, np.inf
-    leave = regions[at + 3] + shift
-    if regions[at + 1] == IMPACT and _head(table, segment, IN_CONTACT) > 0.0:
+    leave = region.leave + shift
+    if region.kind == IMPACT and _head(table, segment, IN_CONTACT) > 0.0:
         leave = np.inf  # Until the contact comes.
-    return regions[at + 2] + shift, leave
+    return region.entry + shift, leave
 
 
 @numba.njit(cache=True)
 def _choose_speed(table, m, law, regions, t, s, allowed):
     """Begins the step that is due, if one is."""
-    k = int(m[_NOW + _SEG])
-    v = m[_NOW + _TARGET]
+    k = int(m.now.segment)
+    v = m.now.target
     L = _head(table, k, LENGTH)
     cap = _head(table, k, SPEED) if allowed else 0.0
     highest, slower, when = cap, np.inf, np.inf
     search = np.inf
     if v > cap:
         slower, when = cap, t
-    for r in range(int(regions[0]) + 2):
-        if r < regions[0]:
-            entry, leave = _active(table, regions, k, r)
-            if regions[2 + r * _ROW + 1] != IMPACT or s >= leave or entry == np.inf:
+    for r in range(int(regions.count) + 2):
+        if r < regions.count:
+            region = regions.rows[r]
+            entry, leave = _active(table, region, k)
+            if region.kind != IMPACT or s >= leave or entry == np.inf:
                 continue
-            limit = regions[2 + r * _ROW + 4]
+            limit = region.speed
             if leave == np.inf:
                 search = min(search, limit)
-        elif r == regions[0]:  # The end of the path.
+        elif r == regions.count:  # The end of the path.
             entry, limit = L, 0.0
             if _head(table, k, IN_CONTACT) > 0.0:
                 limit = search if search < np.inf else law.search_speed
@@ -469,29 +510,29 @@ def _choose_speed(table, m, law, regions, t, s, allowed):
             if _head(table, k, IN_CONTACT) == 0.0:
                 continue
             entry, limit = L + law.search_max, 0.0
-        begin = _brake(m, law, t, entry, limit)
+        begin = _brake(m.now, law, t, entry, limit)
         if begin < np.inf and limit < slower:
             slower, when = limit, begin
         highest = min(highest, _highest(law, v, limit, entry - s))
     if when < np.inf:
-        _begin(m, _NOW, law, when, slower)
-    elif m[_NOW + _N] == 0.0 and highest > v + (max(1e-3, 0.02 * v) if v > 0 else 0.0):
-        _begin(m, _NOW, law, t, highest)
+        _begin(m.now, law, when, slower)
+    elif m.now.n_steps == 0.0 and highest > v + (max(1e-3, 0.02 * v) if v > 0 else 0.0):
+        _begin(m.now, law, t, highest)
 
 
 @numba.njit(cache=True)
-def _time_to(m, law, t, s_limit):
+def _time_to(track, law, t, s_limit):
     """How long until the arc length s_limit is reached, at most 10 blend_sec [s]."""
     far = 10.0 * law.blend_sec
-    steady = _steady_from(m, _NOW, t)
-    s_steady = _along(m, _NOW, steady)[0]
+    steady = _steady_from(track, t)
+    s_steady = _along(track, steady)[0]
     if s_steady <= s_limit:
-        v = m[_NOW + _TARGET]
+        v = track.target
         return min(far, steady - t + (s_limit - s_steady) / v) if v > 0.0 else far
     low, high = t, steady
     for _ in range(12):
         middle = 0.5 * (low + high)
-        if _along(m, _NOW, middle)[0] < s_limit:
+        if _along(track, middle)[0] < s_limit:
             low = middle
         else:
             high = middle
@@ -501,13 +542,14 @@ def _time_to(m, law, t, s_limit):
 @numba.njit(cache=True)
 def _stage(table, m, law, regions, t, s):
     """Stage and kind of the phase."""
-    k = int(m[_NOW + _SEG])
+    k = int(m.now.segment)
     kind, entry = NO_CONTACT, np.inf
-    for r in range(int(regions[0])):
-        begins, leave = _active(table, regions, k, r)
+    for r in range(int(regions.count)):
+        region = regions.rows[r]
+        begins, leave = _active(table, region, k)
         if begins == np.inf or s >= leave:
             continue
-        this = int(regions[2 + r * _ROW + 1])
+        this = int(region.kind)
         inside, before = s >= begins, s >= entry
         # Of two that overlap the impact counts; else the next one.
         if (inside and before and this == IMPACT) or (
@@ -515,30 +557,30 @@ def _stage(table, m, law, regions, t, s):
         ):
             kind, entry = this, begins
     if kind != NO_CONTACT and (
-        s >= entry or _time_to(m, law, t, entry) <= law.blend_sec
+        s >= entry or _time_to(m.now, law, t, entry) <= law.blend_sec
     ):
-        if m[_ENTER_TIME] < 0.0:
-            m[_ENTER_TIME] = t
-        m[_IN_KIND] = kind
-        inside = s >= entry and t - m[_ENTER_TIME] >= law.blend_sec - 1e-9
+        if m.enter_time < 0.0:
+            m.enter_time = t
+        m.region_kind = kind
+        inside = s >= entry and t - m.enter_time >= law.blend_sec - 1e-9
         return REGION if inside else ENTER, kind
-    if m[_ENTER_TIME] >= 0.0:  # Passed through.
-        m[_ENTER_TIME] = -1.0
-        m[_SETTLE_UNTIL], m[_SETTLE_KIND] = t + law.blend_sec, m[_IN_KIND]
-    if t < m[_SETTLE_UNTIL]:
-        return SETTLE, int(m[_SETTLE_KIND])
+    if m.enter_time >= 0.0:  # Passed through.
+        m.enter_time = -1.0
+        m.settle_until, m.settle_kind = t + law.blend_sec, m.region_kind
+    if t < m.settle_until:
+        return SETTLE, int(m.settle_kind)
     return MOVE, NO_CONTACT
 
 
 @numba.njit(cache=True)
 def _events(table, m, law, t, contact, pose):
     """What the contact detector has reported since the last tick."""
-    made = contact[MADE] > m[_MADE]
-    broken = contact[BROKEN] > m[_BROKEN]
-    m[_MADE], m[_BROKEN] = contact[MADE], contact[BROKEN]
-    if m[_HELD] > 0.0 or m[_ENDED] > 0.0 or not (made or broken):
+    made = contact[MADE] > m.made
+    broken = contact[BROKEN] > m.broken
+    m.made, m.broken = contact[MADE], contact[BROKEN]
+    if m.held > 0.0 or m.ended > 0.0 or not (made or broken):
         return
-    k = int(m[_NOW + _SEG])
+    k = int(m.now.segment)
     X, s, _ = _reference(table, m, t)
     if made:
         tangent = path_point(table, k, s)[1, :3]
@@ -546,45 +588,45 @@ def _events(table, m, law, t, contact, pose):
         if aligned and _head(table, k, IN_CONTACT) > 0.0:
             _after_contact(table, m, law, t, pose, X[0])
             return
-        if m[_OFF] > 0.0 or m[_OFF1] > 0.0:  # What was lost is there again.
-            m[_OFF], m[_OFF1] = 0.0, 0.0
-        elif m[_LOST] > 0.0 or m[_LOST + 1] > 0.0:  # The same, sooner.
+        if m.off[0] > 0.0 or m.off[1] > 0.0:  # What was lost is there again.
+            m.off[0] = m.off[1] = 0.0
+        elif m.lost_time[0] > 0.0 or m.lost_time[1] > 0.0:  # The same, sooner.
             pass
         elif aligned:
-            m[_STICKY] = float(int(m[_STICKY]) | CONTACT_UNEXPECTED)
+            m.sticky = float(int(m.sticky) | CONTACT_UNEXPECTED)
             if not law.go_on_unexpected:
-                m[_HELD] = 1.0
+                m.held = 1.0
     row = int(contact[BROKEN_ROW])
-    if broken and 0 <= row < _head(table, k, N_FORCE) and t >= m[_SETTLE_UNTIL]:
+    if broken and 0 <= row < _head(table, k, N_FORCE) and t >= m.settle_until:
         if _head(table, k, IN_LOSS) > 0.0:
             _go_on(table, m, law, t, pose, X[0], s)
-        elif m[_OFF + row] == 0.0 and _finite(pose):
-            m[_LOST + row], m[_LOST_AT + row] = t, _dot(_row(table, k, row), pose)
+        elif m.off[row] == 0.0 and _finite(pose):
+            m.lost_time[row], m.lost_at[row] = t, _dot(_row(table, k, row), pose)
 
 
 @numba.njit(cache=True)
 def _watch_lost(table, m, t, pose):
     """A contact that was lost and not found again is given up: its direction is held
     where the tip is, until a contact is felt."""
-    k = int(m[_NOW + _SEG])
+    k = int(m.now.segment)
     for row in range(int(_head(table, k, N_FORCE))):
-        if m[_LOST + row] == 0.0 or not _finite(pose):
+        if m.lost_time[row] == 0.0 or not _finite(pose):
             continue
         n = _row(table, k, row)
-        if t > m[_LOST + row] + LOST_SEC:
-            m[_LOST + row] = 0.0
-        elif _dot(n, pose) - m[_LOST_AT + row] > LOST_WAY:
-            m[_LOST + row], m[_OFF + row] = 0.0, 1.0
+        if t > m.lost_time[row] + LOST_SEC:
+            m.lost_time[row] = 0.0
+        elif _dot(n, pose) - m.lost_at[row] > LOST_WAY:
+            m.lost_time[row], m.off[row] = 0.0, 1.0
             X, _, _ = _reference(table, m, t)
-            _add_along(m[_C : _C + 3], n, _dot(n, pose) - _dot(n, X[0]))
+            _add_along(m.c, n, _dot(n, pose) - _dot(n, X[0]))
 
 
 @numba.njit(cache=True)
 def _go_on(table, m, law, t, pose, X, s):
     """To the next segment on the same line, without a stop."""
-    L = _head(table, int(m[_NOW + _SEG]), LENGTH)
+    L = _head(table, int(m.now.segment), LENGTH)
     _change_segment(table, m, law, t, pose, X, L, 0.0)
-    m[_NOW + _S0] -= L
+    m.now.s0 -= L
 
 
 @numba.njit(cache=True)
@@ -592,88 +634,92 @@ def tick(table, law, regions, memory, t, contact, pose):
     """One tick.
 
     Args: table of the pattern; law; regions (N_REGIONS,) as plan gives them; memory of
-        the last tick (memory[0] = 0: none yet); t [s]; contact (14,); pose (7,)
+        the last tick (zeros: none yet); t [s]; contact (14,); pose (7,)
         measured: anything may be NaN.
     Returns: memory; X, dX/dt, d2X/dt2 (3, 6); tangent (3,), zero at rest; force
         directions (6,); force targets (2,); phase (6,).
     """
-    m = start(table, contact, t, 0.0) if memory[_INIT] == 0.0 else memory.copy()
-    for c in range(_N_COASTS):
-        b = _COASTS + c * _COAST
-        if m[b + _SEG] >= 0.0:
-            _fold(m, b, t)
-            if m[b + _N] == 0.0:
-                m[b + _SEG] = -1.0
-    _fold(m, _NOW, t)
+    if memory.view(MEMORY)[0].begun == 0.0:
+        memory = start(table, contact, t, 0.0)
+    else:
+        memory = memory.copy()
+    m, regions = memory.view(MEMORY)[0], regions.view(REGIONS)[0]
+    for coast in m.coasts:
+        track = coast.track
+        if track.segment >= 0.0:
+            _fold(track, t)
+            if track.n_steps == 0.0:
+                track.segment = -1.0
+    _fold(m.now, t)
     if _finite(contact):
         _events(table, m, law, t, contact, pose)
     _watch_lost(table, m, t, pose)
     if not (_finite(contact) and contact[STATUS] == 0.0):
-        m[_BAD_UNTIL] = t + BAD_SEC
-    bad = t < m[_BAD_UNTIL]
+        m.bad_until = t + BAD_SEC
+    bad = t < m.bad_until
 
-    s, v, _ = _along(m, _NOW, t)
-    k = int(m[_NOW + _SEG])
+    s, v, _ = _along(m.now, t)
+    k = int(m.now.segment)
     L, last = _head(table, k, LENGTH), k + 1 >= table[0]
-    if m[_HELD] == 0.0 and m[_ENDED] == 0.0 and _head(table, k, IN_CONTACT) == 0.0:
-        at_rest = m[_NOW + _TARGET] == 0.0 and m[_NOW + _N] == 0.0
+    if m.held == 0.0 and m.ended == 0.0 and _head(table, k, IN_CONTACT) == 0.0:
+        at_rest = m.now.target == 0.0 and m.now.n_steps == 0.0
         if _head(table, k, GOES_ON) > 0.0:
             if s >= L + law.search_max * _head(table, k, IN_LOSS):
                 X, _, _ = _reference(table, m, t)
                 _go_on(table, m, law, t, pose, X[0], s)
         elif at_rest and s >= L - NEAR:
             if last:
-                m[_ENDED] = 1.0
+                m.ended = 1.0
             else:
                 X, _, _ = _reference(table, m, t)
                 _change_segment(table, m, law, t, pose, X[0], s, 0.0)
-                _start_track(m, t, k + 1.0, 0.0)
-        s, v, _ = _along(m, _NOW, t)
-        k = int(m[_NOW + _SEG])
+                _start_track(m.now, t, k + 1.0, 0.0)
+        s, v, _ = _along(m.now, t)
+        k = int(m.now.segment)
 
-    started = t >= _head(table, 0, START) or m[_INIT] > 1.0
-    allowed = started and not bad and m[_HELD] == 0.0 and m[_ENDED] == 0.0
+    started = t >= _head(table, 0, START) or m.begun > 1.0
+    allowed = started and not bad and m.held == 0.0 and m.ended == 0.0
     missing = (
         _head(table, k, IN_CONTACT) > 0.0
-        and m[_NOW + _TARGET] == 0.0
+        and m.now.target == 0.0
         and s > _head(table, k, LENGTH) + 0.5 * law.search_max
         and not bad
     )
-    if missing and m[_HELD] == 0.0:
-        m[_HELD] = 1.0
-        m[_STICKY] = float(int(m[_STICKY]) | CONTACT_MISSING)
+    if missing and m.held == 0.0:
+        m.held = 1.0
+        m.sticky = float(int(m.sticky) | CONTACT_MISSING)
         allowed = False
-    if m[_ENDED] == 0.0:
+    if m.ended == 0.0:
         _choose_speed(table, m, law, regions, t, s, allowed)
 
     stage, kind = _stage(table, m, law, regions, t, s)
-    if m[_ENDED] > 0.0:
+    if m.ended > 0.0:
         stage, kind = DONE, NO_CONTACT
-    elif m[_HELD] > 0.0 or bad:
+    elif m.held > 0.0 or bad:
         stage = HOLD
-    status = int(m[_STICKY]) | int(regions[1])
+    status = int(m.sticky) | int(regions.status)
     if bad:
         status |= BAD_INPUT
-    if m[_OFF] > 0.0 or m[_OFF1] > 0.0:
+    if m.off[0] > 0.0 or m.off[1] > 0.0:
         status |= CONTACT_MISSING
-    for r in range(int(regions[0])):
-        if regions[2 + r * _ROW + 1] == IMPACT and regions[2 + r * _ROW] == k:
-            if regions[2 + r * _ROW + 2] <= 0.0:
-                status |= REGION_COVERS_PATH
+    for r in range(int(regions.count)):
+        region = regions.rows[r]
+        if region.kind == IMPACT and region.segment == k and region.entry <= 0.0:
+            status |= REGION_COVERS_PATH
 
     X, s, v = _reference(table, m, t)
     tangent = np.zeros(3)
-    if v > 1e-6 or m[_NOW + _TARGET] > 0.0:
+    if v > 1e-6 or m.now.target > 0.0:
         tangent[:] = path_point(table, k, s)[1, :3]
     directions, targets = np.zeros(6), np.zeros(2)
     for row in range(int(_head(table, k, N_FORCE))):
-        if m[_OFF + row] == 0.0:
+        if m.off[row] == 0.0:
             directions[3 * row : 3 * row + 3] = _row(table, k, row)
             targets[row] = _head(table, k, 10 + row)
     phase = np.zeros(N_PHASE)
     phase[PHASE_SEGMENT], phase[PHASE_STAGE], phase[PHASE_KIND] = k, stage, kind
     phase[PHASE_SPEED], phase[PHASE_LENGTH], phase[PHASE_STATUS] = v, s, status
-    return m, X, tangent, directions, targets, phase
+    return memory, X, tangent, directions, targets, phase
 
 
 @numba.njit(cache=True)
@@ -684,7 +730,7 @@ def take_over(table, law, contact, t, old_table, old_memory):
     Returns: its memory, and how long the blend from the old one takes [s]: blend_sec,
         or longer, so that what the blend adds stays about within a_max.
     """
-    X, _, _ = _reference(old_table, old_memory, t)
+    X, _, _ = _reference(old_table, old_memory.view(MEMORY)[0], t)
     L, n = _head(table, 0, LENGTH), 256
     s, nearest = 0.0, np.inf
     for i in range(n + 1):
@@ -696,16 +742,16 @@ def take_over(table, law, contact, t, old_table, old_memory):
     s = min(max(s, 0.0), L)
     D = path_point(table, 0, s)
     speed = min(max(_dot(X[1], D[1]), 0.0), _head(table, 0, SPEED))
-    m = start(table, contact, t, speed)
-    m[_INIT] = 2.0  # It does not wait for its first time.
-    m[_NOW + _S0] = s
+    memory = start(table, contact, t, speed)
+    m = memory.view(MEMORY)[0]
+    m.begun, m.now.s0 = 2.0, s
     gap, dv = 0.0, 0.0
     for i in range(6):
         gap += (X[0, i] - D[0, i]) ** 2
         dv += (X[1, i] - speed * D[1, i]) ** 2
     T = np.sqrt(2.0 * BEND_MAX * np.sqrt(gap) / law.acceleration_max)
     # The gap grows by dv t: S'' dv t and 2 S' dv add up to about 6 dv / T.
-    return m, max(law.blend_sec, T, 6.0 * np.sqrt(dv) / law.acceleration_max)
+    return memory, max(law.blend_sec, T, 6.0 * np.sqrt(dv) / law.acceleration_max)
 
 
 @numba.njit(cache=True)
@@ -736,64 +782,64 @@ def pose_output(X, base):
 
 
 def expected(belief: ContactBelief) -> np.ndarray:
-    """(n, N_EXPECTED) rows of a belief, as plan takes them."""
-    rows = np.zeros((len(belief.contacts), N_EXPECTED))
-    for row, c in zip(rows, belief.contacts, strict=True):
+    """(n,) EXPECTED of a belief, as plan takes them."""
+    rows = []
+    for c in belief.contacts:
         sigma = np.sqrt(c.direction @ c.covariance @ c.direction)
-        row[:3], row[3:6], row[6] = c.mean, c.direction, sigma
-        row[7:] = c.kind, c.segment, c.approach_speed
-    return rows
+        rows.append((c.mean, c.direction, sigma, c.kind, c.segment, c.approach_speed))
+    return np.array(rows, dtype=EXPECTED)
 
 
 @numba.njit(cache=True)
 def plan(table, law, memory, t, contacts):
     """Regions (N_REGIONS,) of the expected contacts.
 
-    Args: contacts (n, N_EXPECTED); memory as tick has it: the offset of the running
+    Args: contacts (n,) EXPECTED; memory as tick has it: the offset of the running
         segment counts. A contact that the path does not approach has no region.
     """
-    regions = np.zeros(N_REGIONS)
+    regions, m = np.zeros(N_REGIONS), memory.view(MEMORY)[0]
+    out = regions.view(REGIONS)[0]
     current, offset, later = -1, np.zeros(3), np.zeros(3)
-    if memory[_INIT] > 0.0:
-        current = int(memory[_NOW + _SEG])
-        later[:] = memory[_C : _C + 3]
+    if m.begun > 0.0:
+        current = int(m.now.segment)
+        later[:] = m.c[:3]
         offset[:] = later
-        for f in range(_N_FADES):
-            b = _FADES + f * _FADE
-            if memory[b + 7] > 0.0:
-                rest = 1.0 - unit_step((t - memory[b + 6]) / memory[b + 7])[0]
-                _add_along(offset, memory[b : b + 3], rest)
+        for fade in m.fades:
+            if fade.duration > 0.0:
+                rest = 1.0 - unit_step((t - fade.start) / fade.duration)[0]
+                _add_along(offset, fade.X, rest)
     count, status = 0, 0
-    for i in range(contacts.shape[0]):
-        c = contacts[i]
-        k = int(c[8])
-        if not (_finite(c[:9]) and 0 <= k < table[0]) or c[7] == NO_CONTACT:
+    for c in contacts:
+        k = int(c.segment)
+        known = _finite(c.mean) and _finite(c.direction)
+        known = known and _finite((c.sigma, c.kind, c.segment))
+        if not (known and 0 <= k < table[0]) or c.kind == NO_CONTACT:
             status |= BAD_INPUT
             continue
         if count == REGIONS_MAX:
             status |= BAD_INPUT
             break
-        speed = c[9]
-        if c[7] == IMPACT and not speed >= law.speed_min:
+        speed = c.speed
+        if c.kind == IMPACT and not speed >= law.speed_min:
             speed = law.speed_min
             status |= SPEED_FLOOR
         speed = min(speed, 10.0)
-        half = law.sigmas * c[6] + law.margin
+        half = law.sigmas * c.sigma + law.margin
         before = half
-        if c[7] == IMPACT:
+        if c.kind == IMPACT:
             before += speed * law.settle_sec
-        d = c[3:6]
+        d = c.direction
         shift = 0.0
         if k == current:  # The nearer of what it is now and what it will be.
             shift = max(_dot(offset, d), _dot(later, d))
-        entry, leave = _crossing(table, law, k, c[:3], d, shift, before, half)
+        entry, leave = _crossing(table, law, k, c.mean, d, shift, before, half)
         if entry == np.inf:
             continue
-        at = 2 + count * _ROW
-        regions[at], regions[at + 1], regions[at + 2] = k, c[7], entry
-        regions[at + 3], regions[at + 4] = leave, speed
+        region = out.rows[count]
+        region.segment, region.kind = k, c.kind
+        region.entry, region.leave, region.speed = entry, leave, speed
         count += 1
-    regions[0], regions[1] = count, status
+    out.count, out.status = count, status
     return regions
 
 
@@ -861,5 +907,5 @@ def warm_up(pattern: MotionPattern, law: ShaperLaw) -> None:
         array.setflags(write=False)
     _, X, *_ = tick(pattern.table, law, regions, memory, 0.0, contact, pose)
     pose_output(blended(X, X, 0.0, 1.0), pattern.base)
-    plan(pattern.table, law, memory, 0.0, np.zeros((0, N_EXPECTED)))
+    plan(pattern.table, law, memory, 0.0, np.zeros(0, EXPECTED))
     take_over(pattern.table, law, contact, 0.0, pattern.table, memory)
