@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.systems.framework import Context, LeafSystem
 
 from makebreak.systems.changing_contact.numerics.contact_detector import (
-    ALONG,
+    MEMORY,
     Thresholds,
     detect,
     new_memory,
@@ -104,4 +104,5 @@ class ContactDetector(LeafSystem):
         )
         discrete_state.set_value(self._memory, memory)
         discrete_state.set_value(self._contact, contact)
-        discrete_state.set_value(self._along, memory[ALONG])
+        along = memory.view(MEMORY)["along"][0]
+        discrete_state.set_value(self._along, along)
