@@ -27,12 +27,21 @@ from scipy.spatial.transform import Rotation
 
 from makebreak.systems.changing_contact.numerics.path_geometry import (
     ARC,
+    DATA,
+    DIRECTIONS,
+    END,
     GOES_ON,
     HEAD,
     IN_CONTACT,
     IN_LOSS,
+    KIND,
+    LENGTH,
     LINE,
+    N_FORCE,
+    SPEED,
     SPLINE,
+    START,
+    TARGETS,
     arc_data,
     line_data,
     path_point,
@@ -176,11 +185,12 @@ class MotionPattern:
         at = 1 + heads.size
         for k, one in enumerate(segments):
             n = one.force_directions
-            heads[k, :4] = KINDS.index(one.kind), lengths[k], 0.0, len(n)
-            heads[k, 4 : 4 + n.size] = n.ravel()
-            heads[k, 10 : 10 + len(n)] = one.force_targets
-            heads[k, 15:17] = one.times
-            heads[k, 17] = at
+            heads[k, KIND], heads[k, LENGTH] = KINDS.index(one.kind), lengths[k]
+            heads[k, N_FORCE] = len(n)
+            heads[k, DIRECTIONS : DIRECTIONS + n.size] = n.ravel()
+            heads[k, TARGETS : TARGETS + len(n)] = one.force_targets
+            heads[k, [START, END]] = one.times
+            heads[k, DATA] = at
             at += data[k].size
         table = np.concatenate([[len(segments)], heads.ravel(), *data])
         for k in range(len(segments) - 1):
@@ -202,7 +212,7 @@ class MotionPattern:
                 speed = _cruise(lengths[k], duration, before, not keeps, a)
             except ValueError as error:
                 raise ValueError(f"segment {k}: {error}") from None
-            table[head + 2] = speed
+            table[head + SPEED] = speed
             before = speed if table[head + GOES_ON] else 0.0
         table.setflags(write=False)
         base = base.copy()
@@ -224,11 +234,11 @@ class MotionPattern:
 
     def length(self, k: int) -> float:
         """Arc length of segment k [m]."""
-        return self._head(k, 1)
+        return self._head(k, LENGTH)
 
     def speed(self, k: int) -> float:
         """Speed of segment k between its two ends [m/s]."""
-        return self._head(k, 2)
+        return self._head(k, SPEED)
 
     def ends_in_contact(self, k: int) -> bool:
         """Whether the next segment has a force direction that segment k lacks."""

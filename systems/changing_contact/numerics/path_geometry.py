@@ -25,7 +25,7 @@ LINE, ARC, SPLINE = range(3)
 HEAD = 24
 # In the head.
 KIND, LENGTH, SPEED, N_FORCE = 0, 1, 2, 3
-DIRECTIONS, TARGETS = slice(4, 10), slice(10, 12)
+DIRECTIONS, TARGETS = 4, 10  # Of the forces: two rows of three, two numbers.
 IN_CONTACT, IN_LOSS, GOES_ON, START, END, DATA = 12, 13, 14, 15, 16, 17
 _DEGREE = 7
 _NODES, _WEIGHTS = (0.5 * x for x in np.polynomial.legendre.leggauss(12))

@@ -65,6 +65,7 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
 )
 from makebreak.systems.changing_contact.numerics.motion_pattern import MotionPattern
 from makebreak.systems.changing_contact.numerics.path_geometry import (
+    DIRECTIONS,
     GOES_ON,
     HEAD,
     IN_CONTACT,
@@ -75,6 +76,7 @@ from makebreak.systems.changing_contact.numerics.path_geometry import (
     N_FORCE,
     SPEED,
     START,
+    TARGETS,
     path_point,
     rotation_motion,
 )
@@ -328,7 +330,7 @@ def _fade_out(m, law, t, X):
 
 @numba.njit(cache=True)
 def _row(table, k, row):
-    start = 1 + k * HEAD + 4 + 3 * row
+    start = 1 + k * HEAD + DIRECTIONS + 3 * row
     return table[start : start + 3]
 
 
@@ -715,7 +717,7 @@ def tick(table, law, regions, memory, t, contact, pose):
     for row in range(int(_head(table, k, N_FORCE))):
         if m.off[row] == 0.0:
             directions[3 * row : 3 * row + 3] = _row(table, k, row)
-            targets[row] = _head(table, k, 10 + row)
+            targets[row] = _head(table, k, TARGETS + row)
     phase = np.zeros(N_PHASE)
     phase[PHASE_SEGMENT], phase[PHASE_STAGE], phase[PHASE_KIND] = k, stage, kind
     phase[PHASE_SPEED], phase[PHASE_LENGTH], phase[PHASE_STATUS] = v, s, status
