@@ -145,7 +145,6 @@ MEMORY = np.dtype(
         ("bad_until", float),
         ("sticky", float),  # Of the status, what stays until the next segment.
         ("region_kind", float),
-        ("began", float),
         ("lost_time", float, 2),  # Of each force direction; 0: not lost.
         ("lost_at", float, 2),  # And where, p.n.
         ("c", float, 6),
@@ -378,7 +377,6 @@ def _change_segment(table, m, law, t, pose, X, s_end, s_start):
         m.off[row] = m.lost_time[row] = 0.0
     m.sticky = 0.0
     m.enter_time, m.region_kind = -1.0, NO_CONTACT
-    m.began = t
 
 
 @numba.njit(cache=True)
@@ -418,8 +416,7 @@ def start(table, contact, t, speed):
     m.begun = 1.0
     if _finite(contact):
         m.made, m.broken = contact[MADE], contact[BROKEN]
-    m.enter_time, m.began = -1.0, t
-    m.settle_until = m.bad_until = -1.0
+    m.enter_time = m.settle_until = m.bad_until = -1.0
     _start_track(m.now, t, 0.0, speed)
     for coast in m.coasts:
         coast.track.segment = -1.0
