@@ -130,7 +130,7 @@ class _Surface:
         """About the body's origin."""
         size = tuple(scale * x for x in self.size)
         if self.kind == "hull":  # Normals of its faces stay as they are.
-            size = (self.size[0], *(scale * x for x in self.size[1:]))
+            size = (self.size[0], scale * self.size[1])
         return replace(self, p_BG=scale * self.p_BG, size=size)
 
     def distance(self, p) -> tuple[np.ndarray, np.ndarray]:
@@ -286,12 +286,7 @@ class ContactShapes:
             d = (corners @ N.T).max(axis=0)
             step = max(len(corners) // MOST_CORNERS, 1)
             points(corners[::step])
-            triangles = [
-                corners[[face.vertex(0), face.vertex(j), face.vertex(j + 1)]]
-                for face in map(mesh.element, range(mesh.num_faces()))
-                for j in range(1, face.num_vertices() - 1)
-            ]
-            surface("hull", N, d, np.array(triangles))
+            surface("hull", N, d)
         else:
             return False
         return True
