@@ -165,5 +165,8 @@ def _steps(out: Path, error, seed, duration, settings, jobs) -> tuple[Table, dic
         notes.append("r_gap_error_m needs a whole circle: a longer --duration.")
     columns = ("result", "wrong model", "repaired model", "wanted")
     title = f"The loop closed: radius {1e3 * error:+.1f} mm, seed {seed}"
-    results = {"first": first, "gap": found, "second": second}
+    results = {
+        "first": first, "gap": found, "second": second,
+        "radius_right_m": right, "radius_wrong_m": wrong, "radius_m": radius,
+    }  # fmt: skip
     return Table(title, columns, rows, met, notes), results

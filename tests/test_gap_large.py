@@ -71,6 +71,32 @@ def test_boxes_of_one_height_side_by_side_touch_with_their_sides(tmp_path, dz, g
         np.testing.assert_allclose(s.normal[0], [sign, 0.0, 0.0], atol=1e-12)
 
 
+@pytest.mark.parametrize("dz", [-3e-4, 0.0, 3e-4])
+@pytest.mark.parametrize("gap", [-2e-4, 2e-4])
+def test_a_cylinder_of_a_box_s_height_touches_it_with_its_side(tmp_path, dz, gap):
+    """A point of its rim that is within the box is nearest to the top: forces up there
+    and down below it could be as large as one likes."""
+    shape = (Shape("cylinder", (0.04, 0.03), 0.3, (0.0, 0.0, 0.0)),)
+    disc = Thing("disc", shape, 1.0, (1e-3, 1e-3, 1e-3))
+    slots, number = slots_of(
+        tmp_path, (box("box", (0.05, 0.04, 0.03)), disc),
+        {"box": ((0.0, 0.0, 0.03), 0.0), "disc": ((0.09 + gap, 0.0, 0.03 + dz), 0.0)},
+    )  # fmt: skip
+    touching = [s for s in slots if s.best[0] and abs(s.phi[0]) < 1e-3]
+    assert len([s for s in touching if s.a == number["disc"]]) >= 2
+    for s in touching:
+        assert s.phi[0] == pytest.approx(gap, abs=1e-12)
+        sign = 1.0 if s.a == number["disc"] else -1.0
+        np.testing.assert_allclose(s.normal[0], [sign, 0.0, 0.0], atol=1e-12)
+    # On top of it, the points of its rim carry it.
+    slots, number = slots_of(
+        tmp_path, (box("box", (0.05, 0.04, 0.03)), disc),
+        {"box": ((0.0, 0.0, 0.03), 0.0), "disc": ((0.0, 0.0, 0.0901), 0.0)},
+    )  # fmt: skip
+    carried = [s for s in slots if s.best[0] and s.normal[0, 2] == 1.0]
+    assert len(carried) == 12 and all(s.phi[0] < 2e-4 for s in carried)
+
+
 def test_a_box_over_an_edge_stands_where_its_edges_cross_it(tmp_path):
     top = box("table", (0.3, 0.3, 0.05), 0.0, (0.0, 0.0, -0.05))
     slots, _ = slots_of(

@@ -46,6 +46,17 @@ class _Point:
     # (3,) Any point up to so far to either side of p_B, of a capsule's axis [m].
     along: np.ndarray | None = None
 
+    @property
+    def is_edge(self) -> bool:
+        """Whether it is where two faces of its own shape meet: the nearest face of
+        another shape may then be one that its shape is not over."""
+        return self.is_corner or self.axis is not None
+
+    def stands(self, normal, R_a) -> np.ndarray:
+        """(n,) whether its cylinder meets normals (n, 3) with an end."""
+        assert self.axis is not None
+        return abs(np.sum(normal * (R_a @ self.axis), axis=1)) >= SIDE
+
     def near(
         self, s: "_Surface", R_a, p_a, R_b, p_b
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -58,11 +69,11 @@ class _Point:
         n = np.einsum("nij,nj->ni", R_b, n)
         if self.axis is None:
             return c, d - self.radius, n, np.ones(len(c), bool)
+        if not self.rim:
+            return c, d - self.radius, n, self.stands(n, R_a)
         axis = R_a @ self.axis
         along = np.sum(n * axis, axis=1)
         side = abs(along) < SIDE
-        if not self.rim:
-            return c, d - self.radius, n, ~side
         # Towards the surface from the middle, which is outside: exact for planes, and
         # for upright shapes.
         out = n - along[:, None] * axis
@@ -360,11 +371,14 @@ class ContactShapes:
                 if point.stays_away(s, *at, *to, near):
                     continue
                 c, phi, n, may = point.near(s, *at, *to)
-                if s.kind == "box" and point.is_corner and phi.min() < near:
+                if s.kind == "box" and point.is_edge and phi.min() < near:
                     key = (point.geometry, s.geometry)
                     if key not in facing:
                         facing[key] = self._facing(point, s, poses)
                     phi, n = _by_face(s, c, phi, n, *poses[s.body], *facing[key])
+                    if point.axis is not None:
+                        stands = point.stands(n, at[0])
+                        may = ~stands if point.rim else stands
                 if phi.min() < near:
                     each.append((j, phi, n, c, may))
             for k, (j, phi, n, c, may) in enumerate(each):
@@ -389,11 +403,11 @@ class ContactShapes:
         return found + self._crossings(poses, near)
 
     def _facing(self, corner: _Point, s: _Surface, poses):
-        """Of the box that a corner is of, axis (n,) and side (n,) of the face of box s
-        that it is farthest outside of with all its corners: the one that it meets. The
-        nearest feature to one corner may be an edge, and its normal any, where two
-        boxes of one height stand side by side."""
-        mine = [p for p in self.points if p.geometry == corner.geometry]
+        """Of the box that a corner is of, or the cylinder of a point on a rim, axis
+        (n,) and side (n,) of the face of box s that it is farthest outside of with all
+        its corners: the one that it meets. The nearest feature to one corner may be an
+        edge, and its normal any, where two shapes of one height stand side by side."""
+        mine = [p for p in self.points if p.geometry == corner.geometry and not p.rim]
         (R_a, p_a), (R_b, p_b) = poses[corner.body], poses[s.body]
         local = np.stack([s.local(p_a + R_a @ p.p_B, R_b, p_b) for p in mine])
         (half,) = s.size
