@@ -22,6 +22,7 @@ from makebreak.gap.numerics.permitted_forces import (
     test_functions,
 )
 from makebreak.gap.residuals.contact_shapes import ContactShapes, Slot, poses_of
+from makebreak.gap.simulation.free_windows import IMPACT_ACCELERATION
 from makebreak.gap.simulation.windows import TURN, spin_of
 from makebreak.models.drives import law_of
 from makebreak.models.dynamics import SceneDynamics
@@ -40,7 +41,6 @@ FEWEST_MEANS = 30
 BETWEEN_ROWS = 1.5  # Commands from one row to the next: more, and some are not known.
 BESIDE = -1  # Marks what a body touches beside what carries it.
 FAR = 1.0  # Of what is not there [m].
-HIT = 20.0  # Smoothed, a free body is accelerated so much by an impact alone [m/s2].
 UPRIGHT = 0.7  # Cosine of normal and vertical: less, and it is a wall.
 NEAR = 0.02  # Shapes that never come so near do not matter [m].
 MEETS = 2.5e-3  # Two bodies touch when the nearest points are within this [m].
@@ -660,7 +660,8 @@ class ContactMeans:
         the force is over before it is seen."""
         struck = np.zeros(rows.stop - rows.start, bool)
         for _, i in self.bodies.values():
-            struck |= np.linalg.norm(self._vd[rows, i + 3 : i + 6], axis=1) > HIT
+            size = np.linalg.norm(self._vd[rows, i + 3 : i + 6], axis=1)
+            struck |= size > IMPACT_ACCELERATION
         return struck
 
     def _effort(self, joint, recording, t: _Track, held, w, there, centres, half):

@@ -44,7 +44,7 @@ PRECISION = 0.015
 CHANNEL_PRECISION = 0.03
 # A rival that needs more parameters than these beyond the chosen effect's, to say the
 # same, is a coincidence: it contains the effect as a special case.
-MORE = 1
+EXTRA_PARAMETERS = 1
 # Two models that differ block by block by more than chance: less than this p-value.
 CHANCE = 0.01
 # A rival that leaves more by more than SAME, by each of two weights, is worse then.
@@ -683,7 +683,10 @@ class _Search:
                 continue
             if best.candidate.kind in KINDS[r.candidate.kind].contains:
                 continue
-            if r.candidate.size > best.candidate.size + MORE or not _is_used(f):
+            if (
+                r.candidate.size > best.candidate.size + EXTRA_PARAMETERS
+                or not _is_used(f)
+            ):
                 continue
             if r.candidate.kind == best.candidate.kind and self.problem.is_one_place(
                 r.candidate.at, best.candidate.at
@@ -909,7 +912,7 @@ class _Search:
                 screen = self._screen(self.problem.residual(rest), current.fit.train)
                 near = [
                     r.candidate for r in rank(screen, open_)
-                    if r.valid and r.candidate.size <= choice.size + MORE
+                    if r.valid and r.candidate.size <= choice.size + EXTRA_PARAMETERS
                     and choice.effect.kind not in KINDS[r.candidate.kind].contains
                 ]  # fmt: skip
                 known = {(t.kind, tuple(t.at)) for t in choice.ties}

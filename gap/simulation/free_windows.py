@@ -25,7 +25,8 @@ from makebreak.systems.numerics.smoother import smooth_filtered
 AFTER_SEC = 0.1  # Of a window after its impact.
 LONG_SEC, LEAST_SEC = 2.0, 0.25  # Windows in which nothing hits: a tilt of 0.01
 # degree moves a ball by 2 mm in 2 s, and by a twentieth of a millimetre in 0.3 s.
-HIT = 20.0  # A faster change of velocity [m/s2] is an impact; gravity's is half of it.
+# A body that is accelerated by more [m/s2] is struck; gravity's is half of it.
+IMPACT_ACCELERATION = 20.0
 BESIDE = 3  # Rows beside an impact that a smoothed state would mix with it.
 BLUR = 0.02  # Laws of contact are approximations, which noise alone does not tell.
 DRAWS = 12  # Of uncertain starts.
@@ -150,7 +151,7 @@ class FreeBodyModel(WindowedResidual):
             c = f"{self.name}.{a}"
             stages = recording.channels[c].stages or ()
             s = smooth_filtered(time, values[c], recording.channels[c].noise, stages)
-            rough |= np.abs(s.x[:, 2]) > HIT
+            rough |= np.abs(s.x[:, 2]) > IMPACT_ACCELERATION
         hit = np.flatnonzero(rough)
         near = np.zeros(len(time), bool)
         late = max(mean_delay(recording.channels[c].stages or ()) for c in values)
