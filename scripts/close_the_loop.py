@@ -25,7 +25,7 @@ from makebreak.scripts.table import Table
 from makebreak.scripts.trials import makebreak_command, run_commands
 
 COMMAND = "close-the-loop ball_rolling"
-# Goals of the project. With the right model the first push makes contact at 0.7 s; a
+# Goals of the project. With the right model the first push makes contact by 1.2 s; a
 # push that ends short of the ball takes another second.
 RADIUS_M, GAP_M, FIRST_PUSH_SEC = 1e-3, 1.5e-3, 1.2
 _SHOWN = (
