@@ -96,8 +96,14 @@ def run_benchmark(
         first case, None: the set's own.
     """
     cases, truth_file = folder / "cases", folder / "truth.json"
-    if not (reuse and truth_file.is_file()):
+    drawn, asked = folder / "drawn.json", {"set": which, "only": only, "seed": seed}
+    if reuse and truth_file.is_file() and drawn.is_file():
+        there = json.loads(drawn.read_text())
+        if there != asked:
+            raise ValueError(f"--reuse: {folder} holds {there}, asked for {asked}")
+    else:
         _make_cases(which, only, cases, truth_file, jobs, seed)
+        drawn.write_text(json.dumps(asked) + "\n")
     # Only the names, for now.
     names = sorted(path.name for path in cases.iterdir())
     folders = [folder / "results" / name for name in names]

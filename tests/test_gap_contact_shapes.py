@@ -132,3 +132,49 @@ def test_scaled_shapes_are_those_of_the_scene_with_the_effect(tmp_path, shape, s
         np.testing.assert_allclose(s.phi, expected[key].phi, atol=1e-9)
         np.testing.assert_allclose(s.place, expected[key].place, atol=1e-9)
         np.testing.assert_allclose(s.normal, expected[key].normal, atol=1e-7)
+
+
+@pytest.mark.parametrize("fixed", ["box", "cylinder"])
+def test_an_upright_cylinder_meets_a_box_where_it_is_nearest(tmp_path, fixed):
+    """Beside faces and vertical edges, of one height and of others: what may touch has
+    the normal and the distance of a circle and a rectangle."""
+    rng = np.random.default_rng(7)
+    half, r, n = np.array([0.04, 0.03, 0.02]), 0.03, 80
+    upright = "<pose>0 0 0 0 0 0</pose>"
+    scene_of(tmp_path, box=SHAPES["box"], cylinder=SHAPES["cylinder"])
+    for name in ("box", "cylinder"):
+        text = (tmp_path / f"{name}.sdf").read_text()
+        text = text.replace("<pose>0.01 -0.02 0.03 0.3 0.2 0.1</pose>", upright)
+        (tmp_path / f"{name}.sdf").write_text(text.replace("0.1</len", "0.04</len"))
+    loaded = load_scene(read_scene(tmp_path / "scene.yaml"), DiagramBuilder())
+    shapes = ContactShapes(loaded)
+    number = {name.split(".")[0]: k for k, name in shapes.names.items()}
+    angle = rng.uniform(-np.pi, np.pi, n)
+    out = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(n)])
+    foot = np.sign(out) * half * [1, 1, 0]  # At an edge, or along a face.
+    faces = rng.uniform(size=n) < 0.5
+    axis = rng.integers(0, 2, n)
+    for i in np.flatnonzero(faces):
+        out[i] = np.eye(3)[axis[i]] * rng.choice([-1.0, 1.0])
+        other = 1 - axis[i]
+        foot[i] = out[i] * half
+        foot[i, other] = rng.uniform(-0.9, 0.9) * half[other]
+    dz = rng.choice([0.0, 3e-4, -3e-4, 0.01, -0.012], n)
+    p = foot + (r + 1e-4) * out + dz[:, None] * [0.0, 0.0, 1.0]
+    yaw = rng.uniform(-np.pi, np.pi)
+    turn = RotationMatrix.MakeZRotation(yaw).matrix()
+    R = np.tile(turn, (n, 1, 1))
+    poses = {number["box"]: (R, np.zeros((n, 3))), number["cylinder"]: (R, p @ turn.T)}
+    if fixed == "cylinder":
+        poses = {k: (R, x - p @ turn.T) for k, (R, x) in poses.items()}
+    best = [np.inf] * n
+    for s in shapes.slots(poses, 0.02):
+        sign = 1.0 if s.a == number["cylinder"] else -1.0
+        # A corner of the box may be nearest to the rim of a lower cylinder.
+        most = 5e-4 if s.a == number["cylinder"] else 1.5e-4
+        for i in np.flatnonzero(s.best & (np.abs(s.phi) < most)):
+            normal = sign * turn.T @ s.normal[i]
+            assert normal @ out[i] > np.cos(np.deg2rad(4.0)), (i, normal, out[i], dz[i])
+            assert s.phi[i] > 5e-5
+            best[i] = min(best[i], s.phi[i])
+    np.testing.assert_allclose(best, 1e-4, atol=2e-5)

@@ -376,3 +376,5 @@ def test_the_whole_way_from_the_cases_to_the_table(monkeypatch, tmp_path):
         "case_71",
     ]
     assert "--set standard --seed 70" in table.rows[0][3]
+    with pytest.raises(ValueError, match="'seed': 70}, asked for"):
+        gap_benchmark.run_benchmark(folder, 2, reuse=True, seed=80)

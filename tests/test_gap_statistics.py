@@ -9,10 +9,12 @@ import pytest
 from scipy.optimize import lsq_linear
 from scipy.signal import lfilter
 
+from makebreak.gap import workflow
 from makebreak.gap.numerics.selection import (
     LinearFit,
     Screen,
     benjamini_hochberg,
+    between_parts,
     boxed_minimum,
     is_plausible,
     is_predicted,
@@ -263,12 +265,42 @@ def test_an_effect_that_changes_from_part_to_part_is_not_steady(recordings):
     # The one is as well known as its rows say; of the other the parts say how well.
     calm, wild = (of["damping"] for of in scatter(problem, fitted))
     assert calm == pytest.approx(1.0 / np.linalg.norm(X[:, 0]), rel=0.3)
-    assert wild == pytest.approx(np.std(b_of, ddof=1) / np.sqrt(parts), rel=0.1)
+    few = 2.776 / 1.96  # By t of five.
+    assert wild == pytest.approx(few * np.std(b_of, ddof=1) / np.sqrt(parts), rel=0.1)
     # A scatter takes four parts at least.
     problem.blocks = lambda: np.arange(n) // 334
     if recordings == 1:
         assert steady(problem, fitted) == [np.inf, np.inf]
         assert scatter(problem, fitted) == [{}, {}]
+
+
+def test_a_fit_that_one_part_decides_is_as_wide_as_parts_differ():
+    """The mean of all parts, each with the same weight, would be known better."""
+    rng = np.random.default_rng(8)
+    n, parts = 1000, 5
+    part = np.repeat(np.arange(parts), n // parts)
+    b_of = np.array([0.5, -0.6, 0.4, -0.3, 0.2])
+    X = 10.0 * rng.normal(size=(n, 1)) * np.where(part == 0, 30.0, 1.0)[:, None]
+    y = X[:, 0] * b_of[part] + rng.normal(size=n)
+    best = np.linalg.lstsq(X, y, rcond=None)[0]
+    effect = Effect("joint_viscous_damping", ["arm.j1"], {"damping": float(best[0])})
+    fitted = SimpleNamespace(
+        effects=(effect,), names=((0, "damping"),), J=-X, rows=y - X @ best
+    )
+    problem = SimpleNamespace(
+        train=lambda: np.ones(n, bool), parts=lambda: part,
+        blocks=lambda: np.arange(n) // 20,
+        widened=lambda end, k: ({"damping": 1e-3}, ()),
+    )  # fmt: skip
+    [of] = scatter(problem, fitted)
+    assert of["damping"] > 0.8 * np.std(b_of, ddof=1)
+    # That is what is told of it.
+    choice = Choice(effect, {}, 1.0, 0.5, "", 1.0, (), (), 1)
+    told = workflow._widened(choice, problem, fitted, [of])
+    assert told.std == of
+    assert workflow._widened(choice, problem, fitted, [{}]).std == {"damping": 1e-3}
+    # Where one part is all there is to go by, nothing differs from it.
+    assert between_parts([1.0, 2.0, 3.0, 4.0], [1e-20, 1.0, 1.0, 1.0]) == 0.0
 
 
 class Steps:

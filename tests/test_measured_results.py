@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from measured_results import (
+    SETS,
     Found,
     Row,
     loop_cells,
@@ -95,3 +96,7 @@ def test_the_page_has_a_place_for_each_table_and_every_place_is_filled():
     names = {"all", "loops", *of_sets, *(f"{name}_named" for name in of_sets)}
     assert {name for name, _ in places} == names and len(places) == len(names)
     assert all("|---|" in table for _, table in places)
+    of_all = dict(places)["all"].strip().splitlines()[2:]
+    assert {row.split(":")[0] for row in of_all} == {
+        f"| {SETS[name][0]}" for name in of_sets
+    }

@@ -381,8 +381,17 @@ def random_effects(x, variance) -> tuple[float, float]:
     """
     x = np.asarray(x, dtype=float)
     variance = np.maximum(np.asarray(variance, dtype=float), 1e-300)
-    w = 1.0 / variance
-    Q = np.sum(w * (x - w @ x / w.sum()) ** 2)
-    between = max(Q - (len(x) - 1), 0.0) / (w.sum() - np.sum(w**2) / w.sum())
-    w = 1.0 / (variance + between)
+    w = 1.0 / (variance + between_parts(x, variance))
     return float(w @ x / w.sum()), float(1.0 / np.sqrt(w.sum()))
+
+
+def between_parts(x, variance) -> float:
+    """The variance by which values (n,) differ beyond their own variances (n,); 0 where
+    one of them has all of the weight. Source: as of random_effects."""
+    x = np.asarray(x, dtype=float)
+    w = 1.0 / np.maximum(np.asarray(variance, dtype=float), 1e-300)
+    spare = w.sum() - np.sum(w**2) / w.sum()
+    if not spare > 1e-12 * w.sum():
+        return 0.0
+    Q = np.sum(w * (x - w @ x / w.sum()) ** 2)
+    return float(max(Q - (len(x) - 1), 0.0) / spare)

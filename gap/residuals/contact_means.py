@@ -713,9 +713,9 @@ class ContactMeans:
         size = np.asarray(w.multiply(w).sum(axis=1)).ravel()
         # Velocities are smoothed ones: known by positions, and better if measured too.
         v_var = RATE_OF_MEAN / np.broadcast_to(half, K) ** 2 * noise**2
-        if f"{joint}.velocity" in recording:
-            v_noise = recording.channels[f"{joint}.velocity"].noise
-            v_var = 1.0 / (1.0 / v_var + 1.0 / v_noise**2)
+        velocity = recording.channels.get(f"{joint}.velocity")
+        if velocity is not None and velocity.noise > 0.0:  # 0: it is not known.
+            v_var = v_var * velocity.noise**2 / (v_var + velocity.noise**2)
         damping = float(law.kd + law.emf)
         var = size * ((kp * noise) ** 2 + damping**2 * v_var)
         mean = held @ u

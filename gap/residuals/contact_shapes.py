@@ -27,6 +27,7 @@ RIM = 12  # Points on a rim.
 SIDE = 0.9  # Cosine of normal and axis: less, and a cylinder touches with its side.
 MOST_CORNERS = 200  # Of a hull; more are thinned.
 BEYOND = 2.5e-3  # A corner so far beyond the edge of a face still touches it [m].
+OVERLAP = 5e-4  # More, and a face is not between a box and a cylinder [m].
 THIRDS = 24  # Of a capsule's axis: what is left of it is 6e-5.
 SAME_NORMAL = 0.64  # Cosine: a point touches one of two surfaces that face alike.
 
@@ -123,6 +124,7 @@ class _Surface:
     size: tuple
     friction: float
     stiffness: float
+    far: float = np.inf  # Of a hull, how far its corners are from its origin [m].
 
     def local(self, places, R_b, p_b) -> np.ndarray:
         """(n, 3) places in world in the surface's own frame, at poses of its body."""
@@ -135,14 +137,15 @@ class _Surface:
             return float(np.linalg.norm(self.size[0]))
         if self.kind in ("sphere", "capsule", "cylinder"):
             return float(sum(self.size))
-        return np.inf
+        return self.far
 
     def scaled(self, scale: float) -> "_Surface":
         """About the body's origin."""
         size = tuple(scale * x for x in self.size)
         if self.kind == "hull":  # Normals of its faces stay as they are.
             size = (self.size[0], scale * self.size[1])
-        return replace(self, p_BG=scale * self.p_BG, size=size)
+        far = scale * self.far
+        return replace(self, p_BG=scale * self.p_BG, size=size, far=far)
 
     def distance(self, p) -> tuple[np.ndarray, np.ndarray]:
         """Of points (n, 3) in the body's frame, and normals there."""
@@ -265,8 +268,10 @@ class ContactShapes:
                     )
                 )
 
-        def surface(kind, *size):
-            self.surfaces.append(_Surface(k, g, kind, R, p, size, friction, stiffness))
+        def surface(kind, *size, far=np.inf):
+            self.surfaces.append(
+                _Surface(k, g, kind, R, p, size, friction, stiffness, far)
+            )
 
         if isinstance(shape, Sphere):
             points(np.zeros(3), shape.radius(), True)
@@ -297,7 +302,7 @@ class ContactShapes:
             d = (corners @ N.T).max(axis=0)
             step = max(len(corners) // MOST_CORNERS, 1)
             points(corners[::step])
-            surface("hull", N, d)
+            surface("hull", N, d, far=float(np.linalg.norm(corners, axis=1).max()))
         else:
             return False
         return True
@@ -375,10 +380,11 @@ class ContactShapes:
                     key = (point.geometry, s.geometry)
                     if key not in facing:
                         facing[key] = self._facing(point, s, poses)
-                    phi, n = _by_face(s, c, phi, n, *poses[s.body], *facing[key])
-                    if point.axis is not None:
-                        stands = point.stands(n, at[0])
-                        may = ~stands if point.rim else stands
+                    face = facing[key]
+                    if point.axis is None:
+                        phi, n = _by_face(s, c, c, phi, n, *to, *face[:2])
+                    else:
+                        phi, n, may = _of_cylinder(point, s, c, phi, n, at, to, face)
                 if phi.min() < near:
                     each.append((j, phi, n, c, may))
             for k, (j, phi, n, c, may) in enumerate(each):
@@ -405,16 +411,18 @@ class ContactShapes:
     def _facing(self, corner: _Point, s: _Surface, poses):
         """Of the box that a corner is of, or the cylinder of a point on a rim, axis
         (n,) and side (n,) of the face of box s that it is farthest outside of with all
-        its corners: the one that it meets. The nearest feature to one corner may be an
-        edge, and its normal any, where two shapes of one height stand side by side."""
+        its corners: the one that it meets; and how far (n,) [m]. The nearest feature to
+        one corner may be an edge, and its normal any, where two shapes of one height
+        stand side by side."""
         mine = [p for p in self.points if p.geometry == corner.geometry and not p.rim]
         (R_a, p_a), (R_b, p_b) = poses[corner.body], poses[s.body]
         local = np.stack([s.local(p_a + R_a @ p.p_B, R_b, p_b) for p in mine])
         (half,) = s.size
         apart = np.stack([local.min(axis=0), -local.max(axis=0)], axis=2)
         apart -= np.asarray(half)[:, None]
-        best = apart.reshape(len(p_a), 6).argmax(axis=1)
-        return best // 2, np.where(best % 2, -1.0, 1.0)
+        apart = apart.reshape(len(p_a), 6)
+        best = apart.argmax(axis=1)
+        return best // 2, np.where(best % 2, -1.0, 1.0), apart.max(axis=1)
 
     def _crossings(self, poses, near: float) -> list[Slot]:
         """Of edges of a free box and those of another body's."""
@@ -450,11 +458,29 @@ class ContactShapes:
         return found
 
 
-def _by_face(s: _Surface, places, phi, normal, R_b, p_b, axis, side):
+def _of_cylinder(point: _Point, s: _Surface, places, phi, normal, at, to, facing):
+    """Distances (n,) and normals (n, 3) of places (n, 3) of a point of a cylinder from
+    the face of box s that it meets, and whether it may touch so (n,). A round side is
+    over what its middle is over: else it meets the box's edge. Where no face is between
+    the two, an edge is met, too."""
+    (R_a, p_a), (R_b, p_b), (axis, side, apart) = at, to, facing
+    face = side[:, None] * np.einsum("nij,nj->ni", R_b, s.R_BG.T[axis])
+    over = places
+    if point.rim:
+        middle = p_a + R_a @ point.p_B
+        over = np.where(point.stands(face, R_a)[:, None], places, middle)
+    d, n = _by_face(s, places, over, phi, normal, R_b, p_b, axis, side)
+    between = apart > -OVERLAP
+    d, n = np.where(between, d, phi), np.where(between[:, None], n, normal)
+    stands = point.stands(n, R_a)
+    return d, n, ~stands if point.rim else stands
+
+
+def _by_face(s: _Surface, places, over, phi, normal, R_b, p_b, axis, side):
     """Distances (n,) and normals (n, 3) of places (n, 3), from the face that is met
-    where they are over it."""
+    where what is `over` it (n, 3) is."""
     rows, local = np.arange(len(phi)), s.local(places, R_b, p_b)
-    out = np.abs(local) - np.asarray(s.size[0])
+    out = np.abs(s.local(over, R_b, p_b)) - np.asarray(s.size[0])
     d = side * local[rows, axis] - np.asarray(s.size[0])[axis]
     out[rows, axis] = -np.inf
     over = out.max(axis=1) < BEYOND

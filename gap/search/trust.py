@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.stats import t as student_t
 
-from makebreak.gap.numerics.selection import Screen, random_effects
+from makebreak.gap.numerics.selection import Screen, between_parts, random_effects
 from makebreak.gap.problem import Fitted, GapProblem
 from makebreak.gap.result import Trust
 from makebreak.gap.search.fit import fit_effects
@@ -14,6 +15,7 @@ from makebreak.models.effects.kind import Effect
 PARTS = 5  # Stretches of time of a recording.
 FEWEST_PARTS = 4  # Of which a scatter is taken.
 STARTS = (0.5, 1.6)  # Of each parameter's distance from neutral.
+NORMAL_975 = 1.96  # Deviations of a 95 % interval.
 RIDGE = 0.98  # Two parameters whose errors go together like this: their sum shows.
 
 
@@ -65,9 +67,10 @@ def steady(problem: GapProblem, fitted: Fitted) -> list[float]:
     from part to part by more than noise: its surest parameter's. What imitates another
     law is one thing here and another there. Infinite where parts say nothing."""
     found: dict[int, float] = {}
-    for (i, name), (mean, std) in _over_parts(problem, fitted).items():
+    for (i, name), (x, variance) in _over_parts(problem, fitted).items():
         neutral = KINDS[fitted.effects[i].kind].parameter(name).neutral
         if neutral is not None:
+            mean, std = random_effects(x, variance)
             found[i] = max(found.get(i, 0.0), abs(mean - neutral) / std)
     return [found.get(i, np.inf) for i in range(len(fitted.effects))]
 
@@ -78,16 +81,21 @@ def scatter(problem: GapProblem, fitted: Fitted) -> list[dict[str, float]]:
     world has another best value where it moves otherwise, which rows, taken as
     independent, do not say. Without those of which there are too few parts."""
     out: list[dict[str, float]] = [{} for _ in fitted.effects]
-    for (i, name), (_, std) in _over_parts(problem, fitted).items():
-        out[i][name] = std
+    for (i, name), (x, variance) in _over_parts(problem, fitted).items():
+        # Of the fit, in which each part has the weight that it has by itself. A few
+        # parts hardly tell how they differ.
+        w = 1.0 / np.maximum(variance, 1e-300)
+        few = float(student_t.ppf(0.975, len(x) - 1)) / NORMAL_975
+        own = variance + few**2 * between_parts(x, variance)
+        out[i][name] = float(np.sqrt(np.sum(w**2 * own)) / np.sum(w))
     return out
 
 
 def _over_parts(
     problem: GapProblem, fitted: Fitted
-) -> dict[tuple[int, str], tuple[float, float]]:
-    """{(effect, parameter): mean over recordings, or stretches of time where there are
-    few, and its deviation}, of those that enough parts show."""
+) -> dict[tuple[int, str], tuple[np.ndarray, np.ndarray]]:
+    """{(effect, parameter): its values in recordings, or stretches of time where there
+    are few, and their variances}, of those that enough parts show."""
     if not fitted.names:
         return {}
     J, r = _data_rows(problem, fitted)
@@ -100,7 +108,7 @@ def _over_parts(
     variance = np.array([_variances(J, r, some) for some in parts])
     there = np.isfinite(x) & np.isfinite(variance)
     return {
-        named: random_effects(x[there[:, k], k], variance[there[:, k], k])
+        named: (x[there[:, k], k], variance[there[:, k], k])
         for k, named in enumerate(fitted.names)
         if there[:, k].sum() >= FEWEST_PARTS
     }
@@ -146,7 +154,7 @@ def gauss_newton(J: np.ndarray, r: np.ndarray, some: np.ndarray) -> np.ndarray:
     shown = size > 1e-3 * np.linalg.norm(J, axis=0) * np.sqrt(np.mean(some))
     if shown.any():
         A = J[some][:, shown] / size[shown]
-        step[shown] = -np.linalg.lstsq(A, r[some], rcond=1e-8)[0] / size[shown]
+        step[shown] = -np.linalg.lstsq(A, r[some], rcond=1e-6)[0] / size[shown]
     return step
 
 
