@@ -299,6 +299,13 @@ def test_a_fit_that_one_part_decides_is_as_wide_as_parts_differ():
     told = workflow._widened(choice, problem, fitted, [of])
     assert told.std == of
     assert workflow._widened(choice, problem, fitted, [{}]).std == {"damping": 1e-3}
+    # A part that knows next to nothing is elsewhere because columns bend: two parts
+    # that show a friction and three that do not are no scatter.
+    X = 10.0 * rng.normal(size=(n, 1)) * np.where(part < 2, 30.0, 0.02)[:, None]
+    y = X[:, 0] * np.where(part < 2, 0.5, -3.0) + rng.normal(size=n)
+    best = np.linalg.lstsq(X, y, rcond=None)[0]
+    fitted.J, fitted.rows = -X, y - X @ best
+    assert scatter(problem, fitted) == [{}]
     # Where one part is all there is to go by, nothing differs from it.
     assert between_parts([1.0, 2.0, 3.0, 4.0], [1e-20, 1.0, 1.0, 1.0]) == 0.0
 

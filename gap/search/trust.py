@@ -14,6 +14,9 @@ from makebreak.models.effects.kind import Effect
 
 PARTS = 5  # Stretches of time of a recording.
 FEWEST_PARTS = 4  # Of which a scatter is taken.
+FEWEST_TELLING = 3  # Of those, that tell the parameter by themselves: with this share
+LEAST_SHARE = 0.01  # of what all of them say, or to this share of its value. What a
+STRAIGHT = 0.2  # part knows less well it puts where columns are no longer straight.
 STARTS = (0.5, 1.6)  # Of each parameter's distance from neutral.
 NORMAL_975 = 1.96  # Deviations of a 95 % interval.
 RIDGE = 0.98  # Two parameters whose errors go together like this: their sum shows.
@@ -79,14 +82,20 @@ def scatter(problem: GapProblem, fitted: Fitted) -> list[dict[str, float]]:
     """Of each effect, the deviations of its parameters by how they differ from part to
     part of the data: laws are approximations, and one that is not quite that of the
     world has another best value where it moves otherwise, which rows, taken as
-    independent, do not say. Without those of which there are too few parts."""
+    independent, do not say. Without those of which too few parts tell something."""
     out: list[dict[str, float]] = [{} for _ in fitted.effects]
     for (i, name), (x, variance) in _over_parts(problem, fitted).items():
+        w = 1.0 / np.maximum(variance, 1e-300)
+        value = fitted.effects[i].parameters[name]
+        telling = w >= LEAST_SHARE * w.sum()
+        telling |= variance <= (STRAIGHT * value) ** 2
+        n = int(telling.sum())
+        if n < FEWEST_TELLING:
+            continue
         # Of the fit, in which each part has the weight that it has by itself. A few
         # parts hardly tell how they differ.
-        w = 1.0 / np.maximum(variance, 1e-300)
-        few = float(student_t.ppf(0.975, len(x) - 1)) / NORMAL_975
-        own = variance + few**2 * between_parts(x, variance)
+        few = float(student_t.ppf(0.975, n - 1)) / NORMAL_975
+        own = variance + few**2 * between_parts(x[telling], variance[telling])
         out[i][name] = float(np.sqrt(np.sum(w**2 * own)) / np.sum(w))
     return out
 
