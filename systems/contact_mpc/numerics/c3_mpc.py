@@ -608,8 +608,16 @@ def _one_per_knot(lcs, p: C3Problem) -> list[LCS]:
 def _stacked(models, name):
     """That array of all models (K, ...), of C order: one compiled version serves."""
     if len(models) == 1:
-        return np.ascontiguousarray(getattr(models[0], name))[None]
-    return np.array([getattr(m, name) for m in models])
+        return compiled_once(np.ascontiguousarray(getattr(models[0], name))[None])
+    return compiled_once(np.array([getattr(m, name) for m in models]))
+
+
+def compiled_once(a):
+    """a, read-only: to the compiler what may be written is another type, for which it
+    would compile everything once more."""
+    a = a.view()
+    a.setflags(write=False)
+    return a
 
 
 def _admm(model, weights, bounds, given, delta, w, options, lcp):

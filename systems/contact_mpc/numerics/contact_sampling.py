@@ -14,11 +14,14 @@ global contact-implicit MPC via sampling and local complementarity", arXiv:2505.
 """
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import cache
+from os import getpid
 from time import perf_counter
 
 import numpy as np
-from numba import get_num_threads, njit, prange
+from numba import get_num_threads, njit
 
 from makebreak.systems.contact_mpc.numerics.ball_state import (
     P_BALL,
@@ -30,6 +33,7 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
 from makebreak.systems.contact_mpc.numerics.c3_mpc import (
     C3Problem,
     admm_plus,
+    compiled_once,
     scaled_model,
 )
 from makebreak.systems.contact_mpc.numerics.c3_polish import polish
@@ -327,65 +331,82 @@ def travel_step(
     return p_next, v_next, change / dt, bool(arrived)
 
 
-@njit(cache=True)
-def _score_one(lcs, x, x_desired, weights, bounds, polish_bounds, U, guess, options):
-    """cost, u (N, n_u), x (N + 1, n_x) of _score's place, whose arrays have one row."""
-    A, B, D, d, E, F, H, c = lcs
-    Q, Q_N, R, G, h = weights
-    rounds, rho, scale_lam, start_at_x0, evaluations = options
-    _, N, n_u = guess.shape
-    no_u, no_x = np.zeros((N, n_u)), np.zeros((N + 1, x.shape[1]))
-    if not (np.isfinite(c).all() and np.isfinite(F).all()):
-        return NO_PLAN, no_u, no_x
-    scale = 1.0
-    if scale_lam:
-        scale = np.sqrt((A[0] ** 2).sum()) / np.sqrt((D[0] ** 2).sum())
-    model, E_s, F_s, _, pushes = scaled_model(A, B, D, d, E, F, H, c, scale)
-    AB, d_s, C, c_s = model
-    lam0 = np.empty(0)
-    if not pushes:
-        lam0, status = solve_lcp_kernel(F_s[0], E_s[0] @ x[0] + c_s[0])
-        if status != SOLVED:
-            return NO_PLAN, no_u, no_x
-    delta, w = np.zeros((N, G.size)), np.zeros((N, G.size))
-    if start_at_x0:
-        delta[:, : x.shape[1]] = x
-    status, _, _, _, _, inputs = admm_plus(
-        AB, d_s, C, c_s, Q, R, Q_N, G, bounds, U, h, x[0], lam0, delta, w, rounds, rho
-    )
-    if status != SOLVED:
-        return NO_PLAN, no_u, no_x
-    starts = np.empty((rounds + 3, N, n_u))
-    starts[: rounds + 1] = inputs
-    starts[rounds + 1] = guess[0]
-    starts[rounds + 2, : N - 1], starts[rounds + 2, N - 1] = guess[0, 1:], guess[0, -1]
-    plan, u, _, cost = polish(
-        lcs, x[0], starts, x_desired, no_u, (Q, R, Q_N), polish_bounds, evaluations
-    )[:4]
-    return cost, u, plan
-
-
-@njit(cache=True, parallel=True)
-def _score(lcs, x, x_desired, weights, bounds, polish_bounds, U, guess, options):
-    """cost (n,), u (n, N, n_u), x (n, N + 1, n_x): solve_c3's C3+, side by side.
-
-    No place knows of another, so that the threads' number changes no bit.
+@njit(cache=True, nogil=True)
+def _score(
+    first, last, lcs, x, x_desired, weights, bounds, polish_bounds, U, guess, options,
+    found,
+):  # fmt: skip
+    """The places first .. last - 1 into found, as solve_c3's C3+ plans them.
 
     Args: lcs: A, B, D, d, E, F, H, c, each of n; x (n, n_x); weights: Q, Q_N, R, G, h;
         bounds as of admm_plus, polish_bounds as of polish; guess (n, N, n_u); options:
-        rounds, rho, scale_lam, start_at_x0, polish.
+        rounds, rho, scale_lam, start_at_x0, polish; found: cost (n,), NO_PLAN where it
+        stays as it is; u (n, N, n_u); x (n, N + 1, n_x).
     """
-    A, B, D, d, E, F, H, c = lcs
-    n, N, n_u = guess.shape
-    cost, u_of = np.empty(n), np.empty((n, N, n_u))
-    x_of = np.empty((n, N + 1, x.shape[1]))
-    for i in prange(n):
+    Q, Q_N, R, G, h = weights
+    rounds, rho, scale_lam, start_at_x0, evaluations = options
+    _, N, n_u = guess.shape
+    cost_of, u_of, x_of = found
+    for i in range(first, last):
         one = slice(i, i + 1)
-        cost[i], u_of[i], x_of[i] = _score_one(
-            (A[one], B[one], D[one], d[one], E[one], F[one], H[one], c[one]), x[one],
-            x_desired, weights, bounds, polish_bounds, U, guess[one], options,
+        A, B, D, d = lcs[0][one], lcs[1][one], lcs[2][one], lcs[3][one]
+        E, F, H, c = lcs[4][one], lcs[5][one], lcs[6][one], lcs[7][one]
+        if not (np.isfinite(c).all() and np.isfinite(F).all()):
+            continue
+        scale = 1.0
+        if scale_lam:
+            scale = np.sqrt((A[0] ** 2).sum()) / np.sqrt((D[0] ** 2).sum())
+        model, E_s, F_s, _, pushes = scaled_model(A, B, D, d, E, F, H, c, scale)
+        AB, d_s, C, c_s = model
+        lam0 = np.empty(0)
+        if not pushes:
+            lam0, status = solve_lcp_kernel(F_s[0], E_s[0] @ x[i] + c_s[0])
+            if status != SOLVED:
+                continue
+        delta, w = np.zeros((N, G.size)), np.zeros((N, G.size))
+        if start_at_x0:
+            delta[:, : x.shape[1]] = x[i]
+        status, _, _, _, _, inputs = admm_plus(
+            AB, d_s, C, c_s, Q, R, Q_N, G, bounds, U, h, x[i], lam0, delta, w, rounds,
+            rho,
         )  # fmt: skip
-    return cost, u_of, x_of
+        if status != SOLVED:
+            continue
+        starts = np.empty((rounds + 3, N, n_u))
+        starts[: rounds + 1] = inputs
+        starts[rounds + 1] = guess[i]
+        starts[rounds + 2, : N - 1], starts[rounds + 2, N - 1] = (
+            guess[i, 1:],
+            guess[i, -1],
+        )
+        plan, u, _, cost = polish(
+            (A, B, D, d, E, F, H, c), x[i], starts, x_desired, np.zeros((N, n_u)),
+            (Q, R, Q_N), polish_bounds, evaluations,
+        )[:4]  # fmt: skip
+        cost_of[i], u_of[i], x_of[i] = cost, u, plan
+
+
+@cache
+def _threads(number, process):
+    """A pool for this process: one that was forked has none of its parent's threads."""
+    return ThreadPoolExecutor(number, f"contact_sampling_{process}")
+
+
+def _score_side_by_side(first, last, *args):
+    """_score on as many threads as numba uses; no place knows of another, so that their
+    number changes no bit. Threads, not numba's prange: that compiles for a minute."""
+    threads = min(get_num_threads(), last - first)
+    if threads <= 1:
+        _score(first, last, *args)
+        return
+    ends = np.linspace(first, last, threads + 1).round().astype(int).tolist()
+    parts = [
+        _threads(get_num_threads() - 1, getpid()).submit(_score, i, j, *args)
+        for i, j in zip(ends[1:-1], ends[2:], strict=True)
+    ]
+    _score(ends[0], ends[1], *args)
+    for part in parts:
+        part.result()
 
 
 def score_plans(lcs, x, x_desired, problem: C3Problem, guess=None, first=0, last=None):
@@ -417,25 +438,24 @@ def score_plans(lcs, x, x_desired, problem: C3Problem, guess=None, first=0, last
         np.split(bound[p.n_lam :], [p.n_u]) for bound in (p.lower, p.upper)
     )
     guess = np.zeros((len(x), o.N, p.n_u)) if guess is None else guess
-    own = slice(first, last)
-    found = _score(
-        tuple(a[own] for a in lcs[:8]),
-        np.ascontiguousarray(x[own]),
+    n = len(x)
+    found = np.full(n, NO_PLAN), np.zeros((n, o.N, p.n_u)), np.zeros((n, *x_goal.shape))
+    first, last, _ = slice(first, last).indices(n)
+    _score_side_by_side(
+        first,
+        last,
+        tuple(compiled_once(np.ascontiguousarray(a)) for a in lcs[:8]),
+        np.ascontiguousarray(x),
         np.ascontiguousarray(x_goal),
         (Q, Q_N, p.R, p.G, h),
         None if unbounded else (p.lower, p.upper),
         (u_lower, u_upper, x_lower, x_upper),
         p.U,
-        guess[own],
+        guess,
         (o.rounds, o.rho, o.scale_lam, o.start_at_x0, o.polish),
+        found,
     )
-    if first == 0 and last is None:
-        return found
-    cost = np.full(len(x), NO_PLAN)
-    whole = [np.zeros((len(x), *a.shape[1:])) for a in found[1:]]
-    for a, part in zip((cost, *whole), found, strict=True):
-        a[own] = part
-    return cost, *whole
+    return found
 
 
 def score_within(budget_sec, lcs, x, x_desired, problem, guess=None, at_once=None):
