@@ -280,8 +280,10 @@ def conclude(
         {n: float(b / p) for n, b, p in
          zip(nuisances.names, selection.end.b, prior, strict=True)},
         checks, final.series, selection.table,
-        trust=trust_in(problem, selection.screen(problem), selection.end, fixed)
-        if selection.choices else (),
+        trust=trust_in(
+            problem, selection.screen(problem), selection.end, fixed,
+            [c.std for c in selection.choices],
+        ) if selection.choices else (),
         channels=channels,
         nuisance_scene=problem.nuisance_effects(nuisances, selection.end.b),
     )  # fmt: skip

@@ -1,6 +1,6 @@
 """What each fitted parameter would be on parts of the data, and from other starts."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.stats import t as student_t
@@ -23,11 +23,13 @@ RIDGE = 0.98  # Two parameters whose errors go together like this: their sum sho
 
 
 def trust_in(
-    problem: GapProblem, screen: Screen, fitted: Fitted, fixed: Sequence[Sequence[str]]
-) -> list[Trust]:
+    problem: GapProblem, screen: Screen, fitted: Fitted,
+    fixed: Sequence[Sequence[str]], std: Sequence[Mapping[str, float]],
+) -> list[Trust]:  # fmt: skip
     """Each parameter of `fitted` over recordings, stretches of time and starts.
 
-    Args: screen: as it was fitted with; fixed: parameters that stay as they are.
+    Args: screen: as it was fitted with; of each effect, fixed: parameters that stay as
+        they are; std: the deviations that are reported.
     """
     if not fitted.names:
         return []
@@ -39,7 +41,7 @@ def trust_in(
     }
     stretches = [value + gauss_newton(J, r, some) for some in stretches_of]
     starts = [_from_elsewhere(problem, screen, fitted, fixed, s) for s in STARTS]
-    ridge, scattered = ridges(fitted.J), scatter(problem, fitted)
+    ridge = ridges(fitted.J)
     found = []
     for k, (i, name) in enumerate(fitted.names):
         effect = fitted.effects[i]
@@ -51,7 +53,7 @@ def trust_in(
             Trust(
                 effect.kind, tuple(effect.at), name,
                 KINDS[effect.kind].parameter(name).unit, float(value[k]),
-                max(fitted.std[i].get(name, 0.0), scattered[i].get(name, 0.0)),
+                std[i].get(name, fitted.std[i].get(name, 0.0)),
                 {
                     problem.recordings[number].name: float(of[k])
                     for number, of in by_recording.items()
