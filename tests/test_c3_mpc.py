@@ -37,6 +37,7 @@ from makebreak.systems.contact_mpc.numerics.c3_mpc import (
     Plan,
     WarmStart,
     _qp_step,
+    compiled_once,
     plan_cost,
     solve_c3,
     warm_up,
@@ -147,7 +148,9 @@ def random_qp(rng, bounded=False):
         if i < n_v and rng.random() < 0.1:
             lower[i] = upper[i] = 0.3  # A fixed value.
     x0 = rng.normal(size=n_x)
-    return A, B, d, T, L_N @ L_N.T, h, x0, v0, lower, upper
+    # Read-only as C3Problem's: what may be written is compiled by itself.
+    T_N, lower, upper = map(compiled_once, (L_N @ L_N.T, lower, upper))
+    return A, B, d, T, T_N, h, x0, v0, lower, upper
 
 
 def riccati(qp):
@@ -632,22 +635,23 @@ def test_many_active_bounds_agree_with_the_interior_point_method():
     rng = np.random.default_rng(1)
     N, n_x, n_v = 30, 4, 3
     A, B, d = 0.9 * np.eye(n_x), rng.normal(size=(n_x, n_v)), rng.normal(size=n_x)
-    T, T_N = np.eye(n_x + n_v)[None], np.eye(n_x)
+    T, T_N = np.eye(n_x + n_v)[None], compiled_once(np.eye(n_x))
     h, x0 = 10.0 * rng.normal(size=(N + 1, n_x + n_v)), rng.normal(size=n_x)
     fac = new_factor(np.hstack([B, A])[None], d[None], N)
     assert factor(fac, T, T_N, NO_BARRIER, 0)
     x, v = np.empty((N + 1, n_x)), np.empty((N, n_v))
     solve(fac, h, x0, np.empty(0), x, v)
-    bound = np.r_[np.inf, 0.3, 0.3, np.full(n_x, np.inf)]
+    upper = compiled_once(np.r_[np.inf, 0.3, 0.3, np.full(n_x, np.inf)])
+    lower = compiled_once(-upper)
     found = []
     for method in (solve_active, solve_interior):
         ours = x.copy(), v.copy()
         if method is solve_active:
             sides = np.zeros(h.shape, np.int64)
-            status = solve_active(fac, h, x0, np.empty(0), -bound, bound, sides, *ours)
+            status = solve_active(fac, h, x0, np.empty(0), lower, upper, sides, *ours)
             assert status == MET and np.count_nonzero(sides) > 40
         else:
-            assert solve_interior(fac, T, T_N, h, x0, np.empty(0), -bound, bound, *ours)
+            assert solve_interior(fac, T, T_N, h, x0, np.empty(0), lower, upper, *ours)
         found.append(ours[1])
     # The interior point's complementarity: 1e-9 of where it started, at the worst.
     np.testing.assert_allclose(found[0], found[1], atol=1e-6)
@@ -913,12 +917,15 @@ def polish_problem(seed=0, eps_c=5e-4, N=5):
     lcs, x0, x_desired, p = ball(True, N)
     lcs = replace(lcs, F=lcs.F + eps_c * np.eye(16))
     x0 = x0 + 0.01 * rng.normal(size=19)
-    model = tuple(np.array(getattr(lcs, name), order="C")[None] for name in "ABDdEFHc")
+    model = tuple(
+        compiled_once(np.array(getattr(lcs, name), order="C")[None])
+        for name in "ABDdEFHc"
+    )
     return lcs, model, x0, x_desired, p, rng.normal(size=(N, 3))
 
 
 def unbounded(n):
-    return np.full(n, -np.inf), np.full(n, np.inf)
+    return compiled_once(np.full(n, -np.inf)), compiled_once(np.full(n, np.inf))
 
 
 def rolled_out(model, x0, u):
@@ -951,7 +958,9 @@ def test_the_adjoint_gradient_is_that_of_finite_differences(seed):
     centre = np.full((5, 3), 0.1)
     x_lower, x_upper = unbounded(19)
     # A bound that is breached at two of five knots: its penalty has a gradient too.
+    x_upper = x_upper.copy()
     x_upper[10] = np.median(rolled_out(model, x0, u)[0][1:, 10])
+    x_upper = compiled_once(x_upper)
     penalty = 7.0
 
     def cost(u):

@@ -142,7 +142,8 @@ def test_active_set_and_lemke_find_the_same_exact_solution():
         eps = 10.0 ** rng.uniform(-8, 0)
         Q_d = 10.0 ** rng.uniform(0, 5, size=lcs.n_x)
         step = measured_step(lcs, x, u, x_next, Q_d, eps)
-        problem = (step.P[0], step.p[0], step.F[0], step.q[0], 5e-4)
+        # A copy of q, as the learner has: what may be written is compiled by itself.
+        problem = (step.P[0], step.p[0], step.F[0], step.q[0].copy(), 5e-4)
         ours = numerics.solve_step(*problem)
         lemke = numerics._solve_step_by_lemke(*problem)
         assert ours[0] and lemke[0]

@@ -657,7 +657,7 @@ def _admm(model, weights, bounds, given, delta, w, options, lcp):
                 raise C3Failure("the projection has no solution")
             cut += got
         w = (w + z - delta) / options.rho
-        G = options.rho * G
+        G = compiled_once(options.rho * G)
     _, x, v = qp_step(G, delta - w)
     inputs[-1] = v[:, n_lam:]
     return x, v, delta, w, inputs, cut

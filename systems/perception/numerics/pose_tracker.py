@@ -96,7 +96,7 @@ def make_shape(colored, whole=None) -> Shape:
         if not points:
             raise ValueError(f"{name} is empty, expected one part or more")
         start = np.cumsum([0, *map(len, points)])
-        lists.append(Parts(np.concatenate(points), start))
+        lists.append(Parts(np.ascontiguousarray(np.concatenate(points)), start))
     plan = [_hull(part[:, :2]) for part in _each(lists[0])]
     radius = float(np.hypot(*lists[0].points[:, :2].T).max())
     return Shape(lists[0], lists[1], _fold(plan, radius), radius)
@@ -454,6 +454,8 @@ def _refine(image, strength, camera, corner, shape, z, pose, usual, windows):
         usual (3,): the whole picture's usual colour.
     """
     n_free = 2 if shape.fold == 0 else 3
+    image = image.view()
+    image.setflags(write=False)  # Whatever it came as: one machine code for all.
     pose, seen_part, rms, bare, determined = _fit(
         image, strength, shape.colored, shape.whole, pose, z, camera.p_WC, camera.R_WC,
         camera.focal, camera.center - corner, usual, shape.radius, n_free,
