@@ -41,7 +41,7 @@ from makebreak.systems.perception.pose_tracker import PoseTrackerConfig
 
 PUSH_OBJECT = str(MODELS / "push_object.scene.yaml")
 OBJECT = "object"  # Name of the object's model instance and of its body.
-# Periods [s]: planner and task; state estimator; learner; impedance controller and logs.
+# Periods of planner and task, state estimator, learner, impedance controller [s].
 CONTROL = 0.0125
 ESTIMATE, LEARN, ARM_TICK = CONTROL / 3.0, 0.05, 0.001
 # Phase of each system's events [s]. As in ball_rolling, each system runs a little after
@@ -55,7 +55,7 @@ OFFSET = dict(
 PLAN_DT = 0.1  # Time step of the planner's LCS [s].
 TIP_MASS = 1.0  # Mass of the point that stands for the arm in the planner's model [kg].
 N_TIP = 4  # The first entries of lam: the contact of tip and object.
-# Settings of the systems' configs that make_push_object computes: users cannot set them.
+# Settings of the systems that make_push_object computes, so that users cannot.
 SET_BY_DIAGRAM = {
     "goals": ("period_sec", "offset_sec"),
     "task": ("height", "clearance", "period_sec", "offset_sec"),
@@ -117,9 +117,8 @@ class PushModelConfig:
     # Scene file of arm and table; None: the world's without its effects, which stand
     # for what no model knows.
     scene: str | None = None
-    friction: float | None = (
-        None  # Of the object with tip and table; None: the world's.
-    )
+    # Of the object with tip and table; None: the world's.
+    friction: float | None = None
     scale: float = 1.0  # The object's size over the world's.
     mass: float = 1.0  # The object's mass over the world's.
     com_offset: list[float] = field(default_factory=lambda: [0.0, 0.0])  # Added [m].
