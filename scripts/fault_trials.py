@@ -7,7 +7,8 @@ of its own (systems/faults/safety_monitor.py) watches the arm at 1 kHz.
     recovered    from AFTER_SEC after the fault (after its beginning, if it stays) the
                  ball rolls on at least half as far as without the fault
     safely held  it does not, but all limits are kept, no number is NaN, and tip and
-                 ball press no harder than FORCE_MAX
+                 ball press no harder than FORCE_MAX. The arm may still try: the table
+                 says in how many of these runs its tip was AT_REST in the last second
     failed       anything else
 
 A case whose run without the fault does not roll is not judged, and no case of it counts
@@ -52,11 +53,13 @@ DURATION_SEC = 20.0
 AFTER_SEC = 2.0
 SHARE = 0.5  # Of the way without the fault that counts as rolling on.
 FORCE_MAX = 60.0  # [N] About twice the most that was ever seen without a fault.
+AT_REST = 0.01  # [m/s] The tip, at most.
 RECOVERED_MIN = 0.8  # Of the recoverable ones.
 SETTINGS = {"camera.renderer": "drawn", "radius_error_m": 0.005}
 ROLLED_MIN = 0.5  # [rad] Without the fault; else nothing can be told.
 RECOVERED, HELD, FAILED = "recovered", "safely held", "failed"
 UNJUDGED = "not judged"
+COLUMNS = ("fault", "recoverable", "at rest", "rate", "speed", "force")
 
 
 def judge(fault: Injected, result: Mapping, plain: Mapping) -> str:
@@ -113,6 +116,7 @@ def reproduce(
             text,
             "yes" if wanted else "no",
             *(found.count(name) for name in (RECOVERED, HELD, FAILED)),
+            at_rest(own, found),
             _worst(own, "torque_rate_share_max"),
             _worst(own, "joint_speed_share_max"),
             _worst(own, "contact_force_peak_N"),
@@ -121,7 +125,7 @@ def reproduce(
     share = recovered / recoverable if recoverable else 1.0
     rows.append((
         "recoverable ones that were recovered", f"{100 * share:.0f} %", recovered,
-        recoverable - recovered, "", "", "", "",
+        recoverable - recovered, "", "", "", "", "",
     ))  # fmt: skip
     met.append(share >= RECOVERED_MIN)
     notes = [
@@ -129,6 +133,8 @@ def reproduce(
         "Shares of the limits of torque rate and joint speed, and the force of tip and "
         f"ball [N]: the largest. Wanted: none failed, {100 * RECOVERED_MIN:.0f} % of "
         "the recoverable ones recovered.",
+        f"At rest: of those safely held, in how many the tip moved at {AT_REST} m/s at "
+        "most in the last second; the others went on trying.",
     ]
     notes += [
         f"{text}: not judged, the run without it does not roll"
@@ -137,11 +143,17 @@ def reproduce(
     notes += [f"{r['out_dir']}: {r['error']}" for r in results if "error" in r]
     return Table(
         "Faults",
-        ("fault", "recoverable", RECOVERED, HELD, FAILED, "rate", "speed", "force"),
+        (*COLUMNS[:2], RECOVERED, HELD, FAILED, *COLUMNS[2:]),
         rows,
         met,
         notes,
     )
+
+
+def at_rest(runs: Sequence[Mapping], verdicts: Sequence[str]) -> int:
+    """How many of the runs that were safely held ended with the tip at rest."""
+    held = (r for r, v in zip(runs, verdicts, strict=True) if v == HELD)
+    return sum(r.get("tip_speed_end_m_s", float("nan")) <= AT_REST for r in held)
 
 
 def check(which: str) -> None:

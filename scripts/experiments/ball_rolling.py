@@ -151,10 +151,21 @@ def run(config, session):
     if config.faults:  # For `reproduce faults`: how far it had come, each second.
         second = np.searchsorted(track.time, np.arange(0.0, track.time[-1]) - 1e-9)
         result["angle_by_second_rad"] = track.progress[second].round(4).tolist()
+        result["tip_speed_end_m_s"] = speed_at_the_end(track)
     write_recording(session, log, config)
     plot_path(session, config, track)
     plot_residual(session, log, track)
     return result
+
+
+def speed_at_the_end(track: Track) -> float:
+    """The tip's largest speed within the last second [m/s], over 0.1 s each."""
+    step = round(0.1 / SAMPLE)
+    p_tip = track.p_tip[track.time >= track.time[-1] - 1.0][::step]
+    if len(p_tip) < 2:
+        return float("nan")
+    moved = np.linalg.norm(np.diff(p_tip, axis=0), axis=1)
+    return float(moved.max() / (step * SAMPLE))
 
 
 def run_on_lcm(config, session, url: str) -> dict:

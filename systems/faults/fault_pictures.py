@@ -29,7 +29,8 @@ class _Film:
 
 class LatePictures(LeafSystem):
     """From `start` on and before `end` [s] each picture comes `frames` frames late, and
-    a share of them does not come: the one before stays.
+    a share of them does not come: the one before stays. Outside that time the picture
+    is passed on as it is, so that nothing differs from a camera without the fault.
 
     Inputs:  image, abstract ImageRgba8U.
     Outputs: rgb_image, abstract ImageRgba8U.
@@ -54,7 +55,11 @@ class LatePictures(LeafSystem):
             "rgb_image",
             lambda: Value(blank),
             self._show,
-            {self.abstract_state_ticket(self._film), self._image.ticket()},
+            {
+                self.abstract_state_ticket(self._film),
+                self._image.ticket(),
+                self.time_ticket(),
+            },
         )
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_sec, 0.0, self._expose)
 
@@ -65,7 +70,7 @@ class LatePictures(LeafSystem):
         frames = (*film.frames, now)[-(self._frames + 1) :]
         time = context.get_time()
         shown = now
-        if lasts(time, self._start, self._end):
+        if self._acts(context):
             shown = frames[0]
             number = int(time / self._period + 0.5)
             lost = np.random.default_rng([self._seed, 29, number]).random()
@@ -75,9 +80,12 @@ class LatePictures(LeafSystem):
             _Film(frames, shown)
         )
 
+    def _acts(self, context) -> bool:
+        return lasts(context.get_time(), self._start, self._end)
+
     def _show(self, context, output):
         film = context.get_abstract_state(int(self._film)).get_value()
-        if film.shown is None:
+        if film.shown is None or not self._acts(context):
             picture: Any = self._image.Eval(context)
             output.get_mutable_value().mutable_data[:] = picture.data
         else:
