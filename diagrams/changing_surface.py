@@ -17,6 +17,7 @@ from makebreak.diagrams.changing_contact import (
     Knowledge,
     make_changing_contact,
 )
+from makebreak.diagrams.given_pattern import begin_there, expected_contacts
 from makebreak.diagrams.realism import StationErrors, draw_errors
 from makebreak.diagrams.tabletop import (
     THREE_SURFACES,
@@ -64,6 +65,7 @@ PATH: tuple[tuple[tuple[float, float], ...], ...] = (
 FRICTION, GAP = (0.1, 0.6), 0.1
 FORCE = (0.75, 1.5)  # Of a segment, in shares of the config's.
 SPEED_DOWN = 0.1  # [m/s]
+GIVEN_STD = 0.005  # Of where a given motion expects its contacts [m].
 # The corners on which the block stands, from its centre; along its sides [m].
 FEET = {"block": 0.012, "sphere": 0.0}
 # A sphere crosses at one point; what is averaged over takes some way.
@@ -80,6 +82,9 @@ class ChangingSurfaceConfig:
     baselines: bool = True  # Constant K_max and constant K_free as well.
     # Of the three surfaces; empty: drawn by the seed.
     friction: list[float] = field(default_factory=list)
+    # File of a motion to follow in place of the shipped one: a pattern (.yaml) or a
+    # recorded demonstration; `speed` and `normal_force` have no meaning then.
+    pattern: str = ""
     model: str = ""  # Scene that the controllers believe; "": the shipped one.
     rehearse: int = 0  # Trials in the model before the first real one.
     control: ChangingContactConfig = field(default_factory=ChangingContactConfig)
@@ -94,7 +99,7 @@ class SurfaceTask:
     pattern: MotionPattern
     prior: ContactBelief  # Where the table is is known.
     friction: np.ndarray  # (3,)
-    forces: np.ndarray  # (n_segments - 1,) [N]
+    forces: np.ndarray  # (n,) of the segments that press on the surfaces [N]
     errors: StationErrors
     feet: float  # From the tip to the corners it stands on, along x and y [m].
 
@@ -107,11 +112,19 @@ def draw_friction(rng: np.random.Generator) -> np.ndarray:
             return mu
 
 
-def make_task(config: ChangingSurfaceConfig) -> SurfaceTask:
+def make_task(
+    config: ChangingSurfaceConfig, given: MotionPattern | None = None
+) -> SurfaceTask:
     """The world and the motion of config.seed.
 
-    Raises: ValueError for an unknown tool, or numbers that are not positive.
+    Args: given, the motion of config.pattern, if that is not empty.
+    Raises: ValueError for an unknown tool, numbers that are not positive, or a motion
+        that the arm cannot follow.
     """
+    if bool(config.pattern) != (given is not None):
+        raise ValueError(
+            f'pattern is "{config.pattern}", expected the motion of that file beside it'
+        )
     for name in ("speed", "normal_force"):
         value = getattr(config, name)
         if not 0.0 < value < np.inf:
@@ -129,11 +142,16 @@ def make_task(config: ChangingSurfaceConfig) -> SurfaceTask:
     contact = ExpectedContact(
         np.array([START[0], START[1], half]), 1e-6 * np.eye(3), DOWN, segment=0
     )
+    pattern, prior = make_pattern(config, half, forces), ContactBelief((contact,))
+    if given is not None:
+        begin_there(given, world, model, TOOL)
+        pattern, prior = given, expected_contacts(given, GIVEN_STD)
+        forces = np.concatenate([s.force_targets for s in given.segments])
     return SurfaceTask(
         world,
         model,
-        make_pattern(config, half, forces),
-        ContactBelief((contact,)),
+        pattern,
+        prior,
         friction,
         forces,
         draw_errors(config.realism, config.seed),
