@@ -32,7 +32,7 @@ from makebreak.systems.numerics.timing import timed
 
 
 class LearnerStatus(IntEnum):
-    """What became of the newest pair. But for the first three, r_comp was held."""
+    """What happened to the newest pair. From DISABLED on, r_comp was held."""
 
     LEARNED = 0  # r_comp was updated.
     AT_BOUND = 1  # As LEARNED, and an entry of r_comp stands at r_max.
@@ -48,17 +48,18 @@ class LearnerStatus(IntEnum):
 class PosteriorConfig:
     """The residual as a probability on a grid (numerics/residual_posterior.py)."""
 
-    prior_std: float = 0.16  # About zero [m/s]: 8 mm at dt = .05 s.
-    # How it may change in a second, as a deviation [m/s / sqrt(s)], ...
+    prior_std: float = 0.16  # Deviation about zero at first [m/s]: 8 mm at dt = .05 s.
+    # How much r may change, as a deviation in a second [m/s / sqrt(s)], ...
     drift: float = 0.02
-    growth: float = 0.08  # ... and how much more, as a share of itself [1 / sqrt(s)].
+    growth: float = 0.08  # ... and how much more, as a share of |r| [1 / sqrt(s)].
     spacing: float = 0.01  # Of the grid [m/s].
     trust: float = 0.2  # Share of a step's loss that counts.
-    loss_max: float = 20.0  # What one step can say at most.
-    # States that also change for reasons which no model has (an object that rocks): by
-    # how much is watched where nothing can touch, over this time, and they weigh less.
+    loss_max: float = 20.0  # A step's loss counts at most so much.
+    # States that also change for reasons that are not in the model (a velocity of an
+    # object that rocks): their change is measured where nothing can touch, as a mean
+    # square over free_sec, and their weight in Q_d is at most its inverse.
     free_states: list[int] = field(default_factory=list)
-    free_sec: float = 2.0
+    free_sec: float = 2.0  # [s]
 
 
 @dataclass
@@ -72,18 +73,18 @@ class ResidualLearnerConfig:
     # Softness of the contact equation, .01 dt for dt = .05 s [m/s per N].
     gamma: float = 5e-4
     n_b: int = 10  # Measured steps in the buffer.
-    # What an Adam step moves, about [m/s].
+    # About how far an Adam step moves r [m/s].
     learning_rate: float = 3e-3
     n_steps: int = 1  # Adam steps per update.
     # Entries of r_comp that share one value; entries in no group do not adapt.
     # Empty: all adapt, each for itself.
     groups: list[list[int]] = field(default_factory=list)
     r_max: float = 1.0  # Bound on each entry of r_comp [m/s].
-    # More than this of mu |v_t| is taken out of what a contact that slides is felt from
-    # (opening_speed) [m/s]; infinite: nothing is, as in the paper.
+    # Anitescu's contact opens by mu |v_t| as it slides. What exceeds this is removed
+    # from a measured step (opening_speed) [m/s]; infinite: nothing, as in the paper.
     slip_noise: float = np.inf
-    # Given: r_comp is a probability's mode instead of Adam's, for one group; Q_d
-    # then has inverse variances, and n_b, learning_rate and n_steps have no effect.
+    # If given, r_comp is the mode of a probability instead of Adam's result, for one
+    # group. Q_d is then inverse variances; n_b, learning_rate and n_steps do nothing.
     posterior: PosteriorConfig | None = None
 
 
@@ -250,9 +251,9 @@ class ResidualLearner(LeafSystem):
         status = LearnerStatus.LEARNED if solved else LearnerStatus.NOT_SOLVED
         if abs(mode) > c.r_max - c.posterior.spacing:
             status = LearnerStatus.AT_BOUND
-        told = float(np.interp(before, grid.values, loss)) if solved else memory.loss
+        at_old = float(np.interp(before, grid.values, loss)) if solved else memory.loss
         return LearnerMemory(
-            sample, memory.buffer, residual, told, status, belief, std, unexplained
+            sample, memory.buffer, residual, at_old, status, belief, std, unexplained
         )
 
     def _unexplained(self, memory, lcs_next, lcs, x, u, x_next):
