@@ -13,7 +13,11 @@ from time import perf_counter
 import numba
 import numpy as np
 
-from makebreak.diagrams.push_object import PushPlannerConfig, c3_config, contact_pairs
+from makebreak.diagrams.push_object_config import (
+    PushPlannerConfig,
+    c3_config,
+    contact_pairs,
+)
 from makebreak.models.pushed_object import (
     PushedObject,
     make_tip_and_object,
