@@ -33,7 +33,6 @@ from makebreak.diagrams.station import (
 )
 from makebreak.scripts import cli
 from makebreak.scripts.contact_runs import rehearsed
-from makebreak.scripts.experiments.ball_rolling import Track, speed_at_the_end
 from makebreak.scripts.fault_trials import (
     FAILED,
     HELD,
@@ -42,6 +41,7 @@ from makebreak.scripts.fault_trials import (
     at_rest,
     judge,
 )
+from makebreak.scripts.rolling_score import Track, speed_at_the_end
 from makebreak.scripts.session import Session
 from makebreak.systems.arm.impedance_controller import (
     ImpedanceConfig,

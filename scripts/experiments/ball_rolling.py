@@ -28,6 +28,7 @@ from makebreak.scripts.rolling_score import (
     plot_residual,
     progress_of,
     score,
+    speed_at_the_end,
     turned,
     write_recording,
 )
@@ -102,16 +103,6 @@ def run(config, session):
     plot_path(session, config, track)
     plot_residual(session, log, track)
     return result
-
-
-def speed_at_the_end(track: Track) -> float:
-    """The tip's largest speed within the last second [m/s], over 0.1 s each."""
-    step = round(0.1 / SAMPLE)
-    p_tip = track.p_tip[track.time >= track.time[-1] - 1.0][::step]
-    if len(p_tip) < 2:
-        return float("nan")
-    moved = np.linalg.norm(np.diff(p_tip, axis=0), axis=1)
-    return float(moved.max() / (step * SAMPLE))
 
 
 def run_on_lcm(config, session, url: str) -> dict:
