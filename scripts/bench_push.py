@@ -27,7 +27,8 @@ from makebreak.models.pushed_object import (
 from makebreak.scripts.bench import median_call_ms
 from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs
 from makebreak.systems.contact_mpc.numerics.ball_state import P_BALL
-from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Problem, WarmStart, solve_c3
+from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Problem, solve_c3
+from makebreak.systems.contact_mpc.numerics.c3_plan import WarmStart
 from makebreak.systems.contact_mpc.numerics.contact_sampling import (
     inward,
     outline_of,

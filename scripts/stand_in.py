@@ -24,7 +24,8 @@ from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.sensors import ImageToLcmImageArrayT, PixelType
 
-from makebreak.diagrams.ball_rolling import BallRollingConfig, make_world
+from makebreak.diagrams.ball_rolling import make_world
+from makebreak.diagrams.ball_rolling_config import BallRollingConfig
 from makebreak.diagrams.lcm_station import (
     COMMAND,
     IMAGES,

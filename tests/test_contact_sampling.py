@@ -37,10 +37,10 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
 )
 from makebreak.systems.contact_mpc.numerics.c3_mpc import (
     C3Problem,
-    WarmStart,
     plan_cost,
     solve_c3,
 )
+from makebreak.systems.contact_mpc.numerics.c3_plan import WarmStart
 from makebreak.systems.contact_mpc.numerics.contact_sampling import (
     ObjectShape,
     SamplingConfig,

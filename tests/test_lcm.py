@@ -8,7 +8,8 @@ from drake import lcmt_panda_command
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.diagrams.ball_rolling import BallRollingConfig, make_ball_rolling
+from makebreak.diagrams.ball_rolling import make_ball_rolling
+from makebreak.diagrams.ball_rolling_config import BallRollingConfig
 from makebreak.diagrams.camera import CameraConfig
 from makebreak.diagrams.lcm_station import (
     COMMAND,

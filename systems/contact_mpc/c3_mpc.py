@@ -9,19 +9,18 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import LeafSystem
 
+from makebreak.systems.contact_mpc.numerics.c3_admm import C3Failure
 from makebreak.systems.contact_mpc.numerics.c3_mpc import (
     C3Bounds,
-    C3Failure,
     C3Options,
     C3Problem,
     C3Weights,
-    Plan,
-    WarmStart,
     command_step,
     solve_c3,
     warm_up,
     with_gap_residual,
 )
+from makebreak.systems.contact_mpc.numerics.c3_plan import Plan, WarmStart
 from makebreak.systems.contact_mpc.numerics.c3_projections import (
     ExactProjection,
     PlusProjection,
