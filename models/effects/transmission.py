@@ -450,7 +450,7 @@ KINDS = {
         says="motor and link of {at} are joined by a spring of {stiffness} (damping "
         "{damping}) that the model lacks",
         confused_with=("input_delay", "actuator_lag", "joint_backlash"),
-        rest_twist=lambda e, effort: effort / e.parameters["stiffness"],
+        static_deflection=lambda e, effort: effort / e.parameters["stiffness"],
         tell_apart="sweep the frequency of the command through the resonance",
         rank=2,
         hidden_state=True,
@@ -469,7 +469,7 @@ KINDS = {
         says="motor and link of {at} have {gap} of backlash that the model lacks[, and "
         "bounce back from its sides with {restitution} of their speed]",
         confused_with=("joint_coulomb_friction", "joint_elasticity"),
-        rest_twist=lambda e, effort: np.sign(effort) * e.parameters["gap"] / 2.0,
+        static_deflection=lambda e, effort: np.sign(effort) * e.parameters["gap"] / 2.0,
         tell_apart="reverse with small motions, once without load and once with "
         "gravity pressing one way",
         rank=2,
