@@ -11,8 +11,8 @@ from makebreak.diagrams.push_object_config import (
     rolling_axis,
 )
 from makebreak.diagrams.station import TOOL
-from makebreak.models.effects.contact import rolls_against
 from makebreak.models.effects.kind import Effect
+from makebreak.models.effects.rolling_resistance import rolls_against
 from makebreak.models.pushed_object import (
     PushedObject,
     object_file,

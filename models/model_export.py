@@ -37,7 +37,7 @@ from makebreak.models.effects.model_text import (
     Inertial,
     children,
     model_path,
-    with_meshes_of,
+    make_mesh_paths_absolute,
     write_inertial,
 )
 from makebreak.models.scene import LoadedScene, Scene, load_scene
@@ -129,7 +129,7 @@ def to_urdf(scene: Scene, model: str) -> Exported:
         joint = plant.get_joint(index)
         if isinstance(joint, (RevoluteJoint, PrismaticJoint)):
             unsaid += _urdf_joint(loaded, joint, document)
-    with_meshes_of(document, files[model].parent)
+    make_mesh_paths_absolute(document, files[model].parent)
     return Exported(document.toxml() + "\n", tuple(unsaid))
 
 

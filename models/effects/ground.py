@@ -7,7 +7,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 
 from makebreak.models.effects.change_shape import change_shape
-from makebreak.models.effects.contact import anchored_pose
+from makebreak.models.effects.contact_surface import anchored_pose
 from makebreak.models.effects.kind import Effect, EffectKind, Parameter, find_bodies
 from makebreak.models.effects.loads import rotation
 

@@ -79,11 +79,13 @@ def tick(law, memory, error, predicted, collecting, phase, handing_over=0.0):
 
     Args:
         law: StiffnessLaw. memory (N_MEMORY,), zero at first.
-        error: eps [N]. predicted: W (6,), the wrench on the tool that is expected [N],
-            [N m]. collecting: 1 while a batch is collected, else 0. phase (N_PHASE,).
-            Anything may be NaN: then K_max, or no feed-forward, or the base controller.
-        handing_over: 1 while W is a mean that was learned before, for a place that is
-        reached now, and no last sample with its noise: it is hardly filtered.
+        error: prediction error eps [N].
+        predicted: W (6,), predicted wrench on the tool [N], [N m].
+        collecting: 1 while a batch is collected, else 0.
+        phase: (N_PHASE,).
+        handing_over: 1 while W is the mean of an earlier model for the place that is
+            reached now, which is filtered less than a single noisy prediction.
+        NaN in an input gives K_max, no feed-forward, or the base controller.
     Returns: memory, and output (N_OUTPUT,).
     """
     memory = memory.copy()
