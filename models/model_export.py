@@ -36,8 +36,8 @@ from makebreak.models.effects.kind import (
 from makebreak.models.effects.model_text import (
     Inertial,
     children,
-    model_path,
     make_mesh_paths_absolute,
+    model_path,
     write_inertial,
 )
 from makebreak.models.scene import LoadedScene, Scene, load_scene
