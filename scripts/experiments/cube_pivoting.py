@@ -16,13 +16,15 @@ from matplotlib.patches import Circle, Polygon
 
 from makebreak.diagrams.cube_pivoting import (
     TOUCHES,
-    CubePivotingConfig,
-    initial_state,
     logged_forces,
     make_cube_pivoting,
+    start,
+)
+from makebreak.diagrams.cube_pivoting_config import (
+    CubePivotingConfig,
+    initial_state,
     model_cube,
     scene_with,
-    start,
     world_cube,
 )
 from makebreak.diagrams.recorder import recorded, with_noise
