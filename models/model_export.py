@@ -1,7 +1,7 @@
 """Exports a scene's mechanism with its effects as URDF or MJCF.
 
 Both formats have inertias, damping, Coulomb friction (which Drake's parser ignores) and
-rotor inertias. Effects that a format cannot express are listed in `unsaid`.
+rotor inertias. Effects that a format cannot express are listed in `omitted`.
 """
 
 from collections.abc import Sequence
@@ -48,7 +48,7 @@ class Exported:
     """Text of a model file, and sentences of the effects that it cannot express."""
 
     text: str
-    unsaid: tuple[str, ...]
+    omitted: tuple[str, ...]
 
 
 def to_mjcf(scene: Scene) -> Exported:
@@ -124,13 +124,13 @@ def to_urdf(scene: Scene, model: str) -> Exported:
             own.appendChild(document.createElement("mass")).setAttribute("value", "0")
             own.appendChild(document.createElement("inertia"))
         write_inertial(link, inertial)
-    unsaid = list(_unsaid(scene))
+    omitted = list(_unsaid(scene))
     for index in plant.GetJointIndices(instance):
         joint = plant.get_joint(index)
         if isinstance(joint, (RevoluteJoint, PrismaticJoint)):
-            unsaid += _urdf_joint(loaded, joint, document)
+            omitted += _urdf_joint(loaded, joint, document)
     make_mesh_paths_absolute(document, files[model].parent)
-    return Exported(document.toxml() + "\n", tuple(unsaid))
+    return Exported(document.toxml() + "\n", tuple(omitted))
 
 
 def urdf_models(scene: Scene) -> dict[str, Path]:

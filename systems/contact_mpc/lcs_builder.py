@@ -527,12 +527,15 @@ class AnitescuLcs:
             return None
         joint_of, turning, inertias = floating
         ids = list(self._frames)
-        shapes = [_shape_and_size(inspector.GetShape(id)) for id in ids]
+        shapes = []
+        for id in ids:
+            shape = _shape_and_size(inspector.GetShape(id))
+            if shape is None:
+                return None
+            shapes.append(shape)
         number = {id: i for i, id in enumerate(ids)}
         pairs = [(number[a], number[b]) for a, b in self._geometries]
-        if None in shapes or not all(
-            SPHERE in (shapes[a][0], shapes[b][0]) for a, b in pairs
-        ):
+        if not all(SPHERE in (shapes[a][0], shapes[b][0]) for a, b in pairs):
             return None
 
         f, J_q, J_v, J_u, M = self._smooth(self.x_default, np.zeros(self.n_u))
