@@ -19,7 +19,7 @@ CONTACT = {
 }  # fmt: skip
 SENSORS = {"clock_skew", "joint_offset", "sensor_bias", "sensor_delay", "sensor_lag"}
 KNOWN = {
-    "diagrams/ball_rolling.py": {"contact_friction", "object_size"},
+    "diagrams/ball_rolling_config.py": {"contact_friction", "object_size"},
     "diagrams/cube_pivoting_config.py": {
         "contact_friction", "object_mass", "object_size"
     },
