@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from pydrake.multibody.parsing import ModelDirective
+from pydrake.multibody.plant import DiscreteContactApproximation
 
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, check_parameters
@@ -129,6 +130,12 @@ def check_scene(scene: Scene) -> None:
         raise ValueError(
             f"plant.time_step: got {step:g}, expected 0 (continuous) or at least "
             f"{LEAST_STEP:g} [s]"
+        )
+    approximation = scene.plant.discrete_contact_approximation
+    if approximation == "tamsi" and not hasattr(DiscreteContactApproximation, "kTamsi"):
+        raise ValueError(
+            "plant.discrete_contact_approximation: got tamsi, which Drake 1.58 no "
+            "longer has; expected lagged, similar or sap"
         )
     if len(scene.plant.gravity) != 3:
         raise ValueError(f"plant.gravity is {scene.plant.gravity}, expected [x, y, z]")

@@ -7,7 +7,9 @@ monitor (systems/faults/safety_monitor.py) checks the arm at 1 kHz.
     recovered    from AFTER_SEC after the end of the fault (after its start, if it is
                  permanent) the ball rolls at least half as far as without the fault
     safely held  it does not, but all limits are kept, all numbers are finite, and the
-                 force of tip and ball is at most FORCE_MAX
+                 force of tip and ball is at most FORCE_MAX. The arm may still try: the
+                 table has the number of these runs whose tip was AT_REST in the last
+                 second
     failed       anything else
 
 A case whose run without fault does not roll is not judged, and does not count as met.
@@ -51,11 +53,13 @@ DURATION_SEC = 20.0
 AFTER_SEC = 2.0
 SHARE = 0.5  # Fraction of the way without fault that counts as recovered.
 FORCE_MAX = 60.0  # About twice the greatest force without faults [N].
+AT_REST = 0.01  # Greatest speed of a tip at rest [m/s].
 RECOVERED_MIN = 0.8  # Fraction of the recoverable faults.
 SETTINGS = {"camera.renderer": "drawn", "radius_error_m": 0.005}
 ROLLED_MIN = 0.5  # Angle without fault below which a case is not judged [rad].
 RECOVERED, HELD, FAILED = "recovered", "safely held", "failed"
 UNJUDGED = "not judged"
+COLUMNS = ("fault", "recoverable", "at rest", "rate", "speed", "force")
 
 
 def judge(fault: Injected, result: Mapping, plain: Mapping) -> str:
@@ -112,6 +116,7 @@ def reproduce(
             text,
             "yes" if wanted else "no",
             *(found.count(name) for name in (RECOVERED, HELD, FAILED)),
+            at_rest(own, found),
             _worst(own, "torque_rate_share_max"),
             _worst(own, "joint_speed_share_max"),
             _worst(own, "contact_force_peak_N"),
@@ -120,7 +125,7 @@ def reproduce(
     share = recovered / recoverable if recoverable else 1.0
     rows.append((
         "recoverable ones that were recovered", f"{100 * share:.0f} %", recovered,
-        recoverable - recovered, "", "", "", "",
+        recoverable - recovered, "", "", "", "", "",
     ))  # fmt: skip
     met.append(share >= RECOVERED_MIN)
     notes = [
@@ -128,6 +133,8 @@ def reproduce(
         "Shares of the limits of torque rate and joint speed, and the force of tip and "
         f"ball [N]: the largest. Wanted: none failed, {100 * RECOVERED_MIN:.0f} % of "
         "the recoverable ones recovered.",
+        f"At rest: of those safely held, in how many the tip moved at {AT_REST} m/s at "
+        "most in the last second; the others went on trying.",
     ]
     notes += [
         f"{text}: not judged, the run without it does not roll"
@@ -136,11 +143,17 @@ def reproduce(
     notes += [f"{r['out_dir']}: {r['error']}" for r in results if "error" in r]
     return Table(
         "Faults",
-        ("fault", "recoverable", RECOVERED, HELD, FAILED, "rate", "speed", "force"),
+        (*COLUMNS[:2], RECOVERED, HELD, FAILED, *COLUMNS[2:]),
         rows,
         met,
         notes,
     )
+
+
+def at_rest(runs: Sequence[Mapping], verdicts: Sequence[str]) -> int:
+    """Number of the safely held runs that ended with the tip at rest."""
+    held = (r for r, v in zip(runs, verdicts, strict=True) if v == HELD)
+    return sum(r.get("tip_speed_end_m_s", float("nan")) <= AT_REST for r in held)
 
 
 def check(which: str) -> None:

@@ -62,6 +62,16 @@ def progress_of(p, center, radius):
     return np.append(0.0, np.cumsum(turned(off[:-1], off[1:], radius)))
 
 
+def speed_at_the_end(track: Track) -> float:
+    """The tip's largest speed within the last second [m/s], over 0.1 s each."""
+    step = round(0.1 / SAMPLE)
+    p_tip = track.p_tip[track.time >= track.time[-1] - 1.0][::step]
+    if len(p_tip) < 2:
+        return float("nan")
+    moved = np.linalg.norm(np.diff(p_tip, axis=0), axis=1)
+    return float(moved.max() / (step * SAMPLE))
+
+
 def first_time(time, condition):
     """The first time at which the condition (n,) holds; NaN if never."""
     return float(time[np.argmax(condition)]) if condition.any() else float("nan")

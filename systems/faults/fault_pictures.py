@@ -28,7 +28,8 @@ class _Film:
 
 class LatePictures(LeafSystem):
     """From `start` until before `end` [s] each image is `frames` frames late, and a
-    fraction of them is lost: the one before stays.
+    fraction of them is lost: the one before stays. Outside that time images pass
+    unchanged.
 
     Inputs:  image (abstract ImageRgba8U).
     Outputs: rgb_image (abstract ImageRgba8U).
@@ -53,7 +54,11 @@ class LatePictures(LeafSystem):
             "rgb_image",
             lambda: Value(blank),
             self._show,
-            {self.abstract_state_ticket(self._film), self._image.ticket()},
+            {
+                self.abstract_state_ticket(self._film),
+                self._image.ticket(),
+                self.time_ticket(),
+            },
         )
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_sec, 0.0, self._expose)
 
@@ -64,7 +69,7 @@ class LatePictures(LeafSystem):
         frames = (*film.frames, now)[-(self._frames + 1) :]
         time = context.get_time()
         shown = now
-        if lasts(time, self._start, self._end):
+        if self._acts(context):
             shown = frames[0]
             number = int(time / self._period + 0.5)
             lost = np.random.default_rng([self._seed, 29, number]).random()
@@ -74,9 +79,12 @@ class LatePictures(LeafSystem):
             _Film(frames, shown)
         )
 
+    def _acts(self, context) -> bool:
+        return lasts(context.get_time(), self._start, self._end)
+
     def _show(self, context, output):
         film = context.get_abstract_state(int(self._film)).get_value()
-        if film.shown is None:
+        if film.shown is None or not self._acts(context):
             image: Any = self._image.Eval(context)
             output.get_mutable_value().mutable_data[:] = image.data
         else:
