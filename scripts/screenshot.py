@@ -1,4 +1,4 @@
-"""A picture of a meshcat.html, taken without a screen: needs Debian's chromium.
+"""An image of a meshcat.html, taken without a screen: needs Debian's chromium.
 
 python -m makebreak.scripts.screenshot runs/<run>/meshcat.html picture.png
 """
@@ -9,9 +9,21 @@ import subprocess
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from urllib.request import urlopen
+
+from makebreak.scripts.meshcat_page import with_controls
 
 LIMIT_SEC = 300
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+
+
+def live_page(address: str) -> str:
+    """The page of a Meshcat that runs, with its controls open; it connects to it."""
+    base = address.rstrip("/") + "/"
+    with urlopen(base) as answer:
+        page = answer.read().decode()
+    page = page.replace("url = location.toString();", f'url = "{base}";')
+    return with_controls(page.replace("<head>", f'<head><base href="{base}">', 1))
 
 
 def screenshot(page: Path | str, picture: Path, size=(1280, 800), wait_ms: int = 15000):
@@ -25,16 +37,17 @@ def screenshot(page: Path | str, picture: Path, size=(1280, 800), wait_ms: int =
     Raises: ValueError if there is no page or no browser; RuntimeError if the browser
         writes no picture.
     """
-    address = str(page)
-    if not address.startswith("http://"):
-        if not Path(page).is_file():
-            raise ValueError(f'page: got "{page}", expected an HTML file')
-        address = Path(page).resolve().as_uri()
+    live = str(page).startswith("http://")
+    if not live and not Path(page).is_file():
+        raise ValueError(f'page: got "{page}", expected an HTML file')
     browser = next(filter(None, map(shutil.which, _BROWSERS)), None)
     if browser is None:
         raise ValueError("no browser found, expected one of: " + ", ".join(_BROWSERS))
     with TemporaryDirectory() as folder:
         profile, taken = Path(folder) / "profile", Path(folder) / "page.png"
+        file = Path(folder) / "page.html" if live else Path(page).resolve()
+        if live:
+            file.write_text(live_page(str(page)))
         options = [
             "--headless=new",
             "--no-sandbox",
@@ -50,7 +63,7 @@ def screenshot(page: Path | str, picture: Path, size=(1280, 800), wait_ms: int =
             f"--window-size={size[0]},{size[1]}",
             f"--virtual-time-budget={wait_ms}",
             f"--screenshot={taken}",
-            address,
+            file.as_uri(),
         ]
         try:
             done = subprocess.run(
