@@ -1,4 +1,4 @@
-"""Makes the images of docs/pictures from runs: needs Debian's chromium.
+"""Regenerates docs/pictures from runs; needs Debian's chromium.
 
 python -m makebreak.scripts.pictures [--out docs/pictures] [PICTURE ...]
 """
@@ -97,10 +97,11 @@ PLOTS = {"contact_figure_3.png": plot_speed_transition}  # Without a run.
 
 
 def make_pictures(names: list[str], out: Path, work: Path) -> None:
-    """One run for all pictures that name the same command.
+    """Makes pictures, with one run for all that have the same command.
 
-    Args: names: keys of PICTURES and PLOTS. out: where they go. work: where runs go.
-    Raises: ValueError where there is no browser; RuntimeError where a run fails.
+    Args: names: keys of PICTURES and PLOTS; out: folder for them; work: folder for
+        runs.
+    Raises: ValueError without a browser; RuntimeError if a run fails.
     """
     out.mkdir(parents=True, exist_ok=True)
     for name in names:
@@ -121,7 +122,7 @@ def make_pictures(names: list[str], out: Path, work: Path) -> None:
             capture_output=True,
             text=True,
         )
-        # With status 1 it ran, and did not meet its goals.
+        # Status 1: the run is complete but did not meet its goals.
         if done.returncode not in (0, 1):
             lines = done.stderr.strip().splitlines() or ["no output"]
             raise RuntimeError(f"{command}: {lines[-1]}")
