@@ -49,7 +49,7 @@ from makebreak.systems.baselines.numerics.fixed_gmm import fit_mixture
 from makebreak.systems.changing_contact.numerics.igmm import regress
 from makebreak.systems.planar.numerics.planar_impedance import features_of, persistence
 
-SUMMARY = "stirring porridge that thickens: fixed and incremental models (CC 4.1)"
+SUMMARY = "stirring thickening porridge: fixed and incremental models (CC fig. 4)"
 Config = PorridgeConfig
 
 RATIO_BOUND = 5.0

@@ -35,7 +35,7 @@ from makebreak.scripts.trials import run_many
 from makebreak.systems.contact_mpc.numerics.push_task import WAIT
 from makebreak.systems.perception.numerics.pose_filter import on_the_table
 
-SUMMARY = "a Panda pushes an object to poses; the planner chooses where to touch it"
+SUMMARY = "a Panda pushes an object to poses; the planner chooses where to touch"
 Config = PushObjectConfig
 
 SAMPLE = 0.05  # Period at which the end of a run is checked [s].
