@@ -17,8 +17,8 @@ from makebreak.systems.changing_contact.numerics.impact_score import low_pass
 def plot_trials(trials: Mapping[str, Any]):
     """CC figure 16: speed, acceleration and force over time, a column for each trial.
 
-    Args: trials: each has `log`, `touched` (n,) [s], `force` (n,) [N] and `completion`
-        [s].
+    Args: trials: {name: trial with `log`, `touched` (n,) [s], `force` (n,) [N] and
+        `completion` [s]}.
     """
     figure, axes = plt.subplots(
         3, len(trials), figsize=(5.0 * len(trials), 8), layout="constrained",
@@ -58,7 +58,7 @@ def plot_path(trials: Mapping[str, Any], prior: ContactBelief):
     """CC figure 15: the tip's path, from ahead and from above, and the estimates of the
     contacts with two standard deviations.
 
-    Args: trials: each has `log`.
+    Args: trials: {name: trial with `log`}.
     """
     figure, axes = plt.subplots(1, 2, figsize=(12, 5), layout="constrained")
     for ax, (i, j), title in zip(

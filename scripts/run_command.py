@@ -160,13 +160,13 @@ def _failed(session, error: BaseException) -> int:
 
 def _print_outcome(session, name: str, result: dict | None, files) -> None:
     """The table of the result, why the run ended, and which files were written."""
-    from makebreak.scripts.criteria import told
+    from makebreak.scripts.criteria import success_text
     from makebreak.scripts.table import Table
 
     if result is not None:
         rows = [(k, v) for k, v in result.items() if k not in ("criteria", "ended")]
         print(Table(name, ("result", "value"), rows).to_text())
-        lines = [*session.endings, *session.too_slow(), told(result)]
+        lines = [*session.endings, *session.too_slow(), success_text(result)]
         print("\n".join(lines), flush=True)
     print_files(files)
     if session.compared_by:
