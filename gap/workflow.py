@@ -28,6 +28,7 @@ from makebreak.gap.problem import DISTANCES, Fitted, GapProblem, Outcome, is_san
 from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.driven import DrivenProblem, is_driven, sticks
 from makebreak.gap.residuals.impacts import ImpactProblem, runs_against, without_contact
+from makebreak.gap.residuals.lying_on_faces import point_on_face
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.residuals.objects import FlightProblem, RolloutProblem, TouchProblem
 from makebreak.gap.residuals.pressing import PressingProblem, presses
@@ -168,7 +169,7 @@ def problem_for(
     if any(joint.num_velocities() for joint in one_dof_joints(dynamics.plant)):
         try:
             contact = ContactProblem(scene, recordings)
-            return contact, sap_lift(contact)
+            return contact, sap_lift(contact) + point_on_face(contact)
         except ValueError:  # Not the whole motion is measured, or nothing touches.
             pass
         try:

@@ -4,7 +4,7 @@ The file's sections are in scene_schema.py, its reading in scene_reader.py, what
 the joints in drives.py; here is how a plant is made of it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -276,7 +276,10 @@ def _changes_new_values(effects: Sequence[Effect]) -> bool:
 
 
 def load_scene(
-    scene: Scene | str | Path, builder: DiagramBuilder, command_delays: bool = True
+    scene: Scene | str | Path,
+    builder: DiagramBuilder,
+    command_delays: bool = True,
+    before_finalize: Callable[[MultibodyPlant, SceneGraph], None] | None = None,
 ) -> LoadedScene:
     """Adds the scene's plant, with every effect applied, and its scene graph.
 
@@ -286,7 +289,8 @@ def load_scene(
     commands something lies in the way of: use the ports that LoadedScene tells.
 
     Args: scene, or the path of its file; command_delays, False if whoever commands
-        delays the commands itself.
+        delays the commands itself; before_finalize, called with the plant when all
+        models and effects are in it.
     Raises: ValueError, naming what in the scene is wrong.
     """
     if not isinstance(scene, Scene):
@@ -314,6 +318,8 @@ def load_scene(
         before = KINDS[effect.kind].before_finalize
         if before is not None:
             before(effect, plant, scene_graph)
+    if before_finalize is not None:
+        before_finalize(plant, scene_graph)
     try:
         plant.Finalize()
     except DRAKE_ERRORS as error:  # Welds in a loop, and the like.

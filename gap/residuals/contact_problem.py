@@ -26,6 +26,7 @@ from makebreak.gap.problem import (
 )
 from makebreak.gap.residuals.contact_dynamics import WRENCHED, ContactDynamics
 from makebreak.gap.residuals.contact_means import felt_motion
+from makebreak.gap.residuals.lying_on_faces import lying_on_faces
 from makebreak.gap.residuals.mechanism import link_changes
 from makebreak.gap.residuals.objects import unexplained_in_windows
 from makebreak.gap.residuals.permitted_contacts import Shift
@@ -828,7 +829,9 @@ class ContactProblem(ContactDynamics, GapProblem):
     ) -> Outcome | None:  # fmt: skip
         if recordings is not None:
             try:
-                model = PushWindows(self.scene, recordings)
+                model = PushWindows(
+                    self.scene, recordings, lying=lying_on_faces(self)
+                )
             except ValueError:  # No window fits in.
                 return None
             held = [True] * len(model.windows)
@@ -840,7 +843,9 @@ class ContactProblem(ContactDynamics, GapProblem):
                     if not self._train[self.means.episode == k].all()
                 }
                 try:
-                    self._windows = PushWindows(self.scene, self.recordings, episodes)
+                    self._windows = PushWindows(
+                        self.scene, self.recordings, episodes, lying_on_faces(self)
+                    )
                 except ValueError:
                     return None
             model = self._windows
