@@ -18,11 +18,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 
+from makebreak.diagrams.arm_reach import ArmReach
 from makebreak.diagrams.fault_kinds import read_faults
+from makebreak.diagrams.given_pattern import drawn
 from makebreak.diagrams.realism import StationErrors, with_errors
 from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.station import (
@@ -125,30 +126,12 @@ def tip_mass(arm: MultibodyPlant):
         1 / (d' J M^-1 J' d) [kg], in the configuration nearest to the arm's default
         positions in which the tip is at p_WE with its default orientation.
     """
-    context = arm.CreateDefaultContext()
-    q_default = arm.GetPositions(context)
-    world, tip = arm.world_frame(), arm.GetFrameByName(TIP_FRAME)
-    R_default = tip.CalcRotationMatrixInWorld(context)
+    reach = ArmReach(arm)
 
     def mass(p, d) -> float:
-        q = q_default.copy()
-        for _ in range(30):  # Gauss-Newton; damped, so that it also ends out of reach.
-            arm.SetPositions(context, q)
-            X = tip.CalcPoseInWorld(context)
-            J = arm.CalcJacobianSpatialVelocity(
-                context, JacobianWrtVariable.kV, tip, np.zeros(3), world, world
-            )
-            turn = (R_default @ X.rotation().inverse()).ToAngleAxis()
-            away = np.r_[turn.angle() * turn.axis(), p - X.translation()]
-            inverse = J.T @ np.linalg.inv(J @ J.T + 1e-4 * np.eye(6))
-            back = q_default - q
-            step = inverse @ (away - J @ back) + back  # Null space: to the defaults.
-            q = q + step
-            if np.linalg.norm(step) < 1e-4:
-                break
-        J = J[3:]
-        M = arm.CalcMassMatrix(context)
-        return float(1.0 / (d @ J @ np.linalg.solve(M, J.T @ d)))
+        q = reach.positions(p, reach.R_default, reach.q_default)
+        J = reach.jacobian(q)[3:]
+        return float(1.0 / (d @ J @ np.linalg.solve(reach.mass_matrix(q), J.T @ d)))
 
     return mass
 
@@ -330,7 +313,7 @@ def make_changing_contact(
     # Only for scoring and plots.
     _add_telemetry(builder, SIGNALS)
     if meshcat is not None:
-        seen = ContactView(view or ContactViewConfig(), meshcat)
+        seen = ContactView(view or ContactViewConfig(), meshcat, plan=drawn(pattern))
         add("contact_view", seen)
         connect(anticipator, "contacts", seen)
         connect(station, felt, seen, port="wrench")

@@ -17,6 +17,7 @@ from makebreak.diagrams.changing_contact import (
     Knowledge,
     make_changing_contact,
 )
+from makebreak.diagrams.given_pattern import begin_there, expected_contacts
 from makebreak.diagrams.realism import StationErrors, draw_errors
 from makebreak.diagrams.tabletop import (
     THREE_SURFACES,
@@ -65,6 +66,7 @@ PATH: tuple[tuple[tuple[float, float], ...], ...] = (
 FRICTION, GAP = (0.1, 0.6), 0.1  # Range, and the least difference of two surfaces.
 FORCE = (0.75, 1.5)  # Range of a segment's force over the config's normal_force.
 SPEED_DOWN = 0.1  # [m/s]
+GIVEN_STD = 0.005  # Of where a given motion expects its contacts [m].
 # Distance of the corners on which the tool stands from its centre, in x and in y [m].
 FEET = {"block": 0.012, "sphere": 0.0}
 # Length over which a sphere's crossing of a seam shows in the features: it crosses at
@@ -82,6 +84,9 @@ class ChangingSurfaceConfig:
     baselines: bool = True  # Also runs constant stiffnesses, K_max and K_free.
     # Of the three surfaces; empty: drawn by the seed.
     friction: list[float] = field(default_factory=list)
+    # File of a motion to follow in place of the shipped one: a pattern (.yaml) or a
+    # recorded demonstration; `speed` and `normal_force` have no meaning then.
+    pattern: str = ""
     model: str = ""  # Scene file of the controllers' model; "": the shipped one.
     rehearse: int = 0  # Trials in the model before the first real one.
     control: ChangingContactConfig = field(default_factory=ChangingContactConfig)
@@ -96,7 +101,7 @@ class SurfaceTask:
     pattern: MotionPattern
     prior: ContactBelief  # The contact with the table, whose position is known.
     friction: np.ndarray  # (3,) of the surfaces.
-    forces: np.ndarray  # (n_segments - 1,) [N]
+    forces: np.ndarray  # (n,) of the segments that press on the surfaces [N]
     errors: StationErrors
     feet: float  # From the tip to the corners it stands on, in x and in y [m].
 
@@ -109,11 +114,19 @@ def draw_friction(rng: np.random.Generator) -> np.ndarray:
             return mu
 
 
-def make_task(config: ChangingSurfaceConfig) -> SurfaceTask:
+def make_task(
+    config: ChangingSurfaceConfig, given: MotionPattern | None = None
+) -> SurfaceTask:
     """World, motion and prior of config.seed.
 
-    Raises: ValueError for an unknown tool or a setting out of range.
+    Args: given, the motion of config.pattern, if that is not empty.
+    Raises: ValueError for an unknown tool, a setting out of range, or a motion that the
+        arm cannot follow.
     """
+    if bool(config.pattern) != (given is not None):
+        raise ValueError(
+            f'pattern is "{config.pattern}", expected the motion of that file beside it'
+        )
     for name in ("speed", "normal_force"):
         value = getattr(config, name)
         if not 0.0 < value < np.inf:
@@ -131,11 +144,16 @@ def make_task(config: ChangingSurfaceConfig) -> SurfaceTask:
     contact = ExpectedContact(
         np.array([START[0], START[1], half]), 1e-6 * np.eye(3), DOWN, segment=0
     )
+    pattern, prior = make_pattern(config, half, forces), ContactBelief((contact,))
+    if given is not None:
+        begin_there(given, world, model, TOOL)
+        pattern, prior = given, expected_contacts(given, GIVEN_STD)
+        forces = np.concatenate([s.force_targets for s in given.segments])
     return SurfaceTask(
         world,
         model,
-        make_pattern(config, half, forces),
-        ContactBelief((contact,)),
+        pattern,
+        prior,
         friction,
         forces,
         draw_errors(config.realism, config.seed),

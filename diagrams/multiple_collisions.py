@@ -18,6 +18,7 @@ from makebreak.diagrams.changing_contact import (
     Knowledge,
     make_changing_contact,
 )
+from makebreak.diagrams.given_pattern import begin_there, expected_contacts
 from makebreak.diagrams.realism import StationErrors, draw_errors
 from makebreak.diagrams.tabletop import (
     SPREAD,
@@ -93,6 +94,9 @@ class MultipleCollisionsConfig:
     # scene has them [m], and their frictions.
     spread: float = SPREAD
     friction: list[float] = field(default_factory=list)  # Empty: drawn by the seed.
+    # File of a motion to follow in place of the shipped one: a pattern (.yaml) or a
+    # recorded demonstration (docs/shaping.md). `speed` has no meaning then.
+    pattern: str = ""
     model: str = ""  # Scene file of the controllers' model; "": the shipped one.
     rehearse: int = 0  # Trials in the model before the first real one.
     control: ChangingContactConfig = field(
@@ -127,18 +131,28 @@ class CollisionTask:
     pattern: MotionPattern
     prior: ContactBelief  # Initial estimate.
     model_prior: ContactBelief  # Initial estimate from the model scene.
-    truth: np.ndarray  # (4,) p_WE . direction at each impact [m].
+    # (4,) p_WE . direction at each impact [m]; (0,) of a given motion.
+    truth: np.ndarray
     friction: dict[str, float]
     stiffness: dict[str, float]  # Of the tool against each surface [N/m].
     errors: StationErrors
     corner: float  # From the tip to the tool's corners, in x and in y; 0: none [m].
 
 
-def make_task(config: MultipleCollisionsConfig) -> CollisionTask:
+def make_task(
+    config: MultipleCollisionsConfig, given: MotionPattern | None = None
+) -> CollisionTask:
     """World, motion and prior of config.seed.
 
-    Raises: ValueError for an unknown tool or a setting out of range.
+    Args: given, the motion of config.pattern, if that is not empty. Its contacts are
+        expected where its segments end.
+    Raises: ValueError for an unknown tool, a setting out of range, or a motion that the
+        arm cannot follow.
     """
+    if bool(config.pattern) != (given is not None):
+        raise ValueError(
+            f'pattern is "{config.pattern}", expected the motion of that file beside it'
+        )
     for name in ("trials", "speed"):
         if not 0.0 < getattr(config, name) < np.inf:
             raise ValueError(
@@ -160,27 +174,31 @@ def make_task(config: MultipleCollisionsConfig) -> CollisionTask:
         move(world, name, [0.0, 0.0, up])
     move(world, "red_block", left * LEFT)
     move(world, "blue_wall", ahead * AHEAD)
-    pattern = make_pattern(config, half)
     truth = surfaces(world, half)
     prior: list[ExpectedContact] = []
     modelled: list[ExpectedContact] = []
     sigma = max(0.5 * config.error_max, 0.001)
     # Uniform errors up to error_max: two standard deviations contain them all.
     covariance = sigma**2 * np.eye(3)
+    shipped = make_pattern(config, half)
     for (d, _, k), in_world, in_model in zip(
         IMPACTS, truth, surfaces(model, half), strict=True
     ):
         estimate = in_world + rng.uniform(-config.error_max, config.error_max)
-        start = pattern.segments[k].positions[0]
+        start = shipped.segments[k].positions[0]
         for contacts, along in ((modelled, in_model), (prior, estimate)):
             mean = start + d * (along - start @ d)
             contacts.append(ExpectedContact(mean, covariance, d, segment=k))
     stiffness = draw_stiffness(rng, SURFACES, config.stiffness)
     set_stiffness(world, config.tool, stiffness)
+    if given is not None:  # The world is the seed's, whatever moves in it.
+        begin_there(given, world, model, TOOL)
+        there = expected_contacts(given, sigma)
+        prior, modelled, truth = [*there.contacts], [*there.contacts], np.zeros(0)
     return CollisionTask(
         world,
         model,
-        pattern,
+        shipped if given is None else given,
         ContactBelief(tuple(prior)),
         ContactBelief(tuple(modelled)),
         truth,

@@ -124,6 +124,9 @@ def _config(module, args: argparse.Namespace):
         path = _scene(text, f"--{option}")
         config = dataclasses.replace(config, **{option: path})
     config = apply_settings(config, args.set)
+    motion = getattr(config, "pattern", "")
+    if isinstance(motion, str) and Path(motion).is_file():
+        config = dataclasses.replace(config, pattern=str(Path(motion).resolve()))
     config = _with_faults(config, getattr(args, "fault", []), args.experiment)
     if args.seed is not None:
         seed = int(_number(args.seed, "--seed", 0, whole=True))
@@ -154,8 +157,8 @@ def _with_faults(config, texts: Sequence[str], experiment: str):
 
 def _inputs(args, config) -> list[str]:
     """The files that a run reads."""
-    scenes = [getattr(config, name, None) for name in ("world", "model")]
-    return [path for path in (args.config, *scenes) if isinstance(path, str) and path]
+    files = [getattr(config, name, None) for name in ("world", "model", "pattern")]
+    return [path for path in (args.config, *files) if isinstance(path, str) and path]
 
 
 def _default_out(name: str) -> Path:
