@@ -63,12 +63,18 @@ def point_on_face(contacts: PermittedContacts) -> list[Finding]:
         where = "on its side" if one.on_side else "on a face"
         says = (
             f"{name} lies {where}, and Drake's point contact gives {pair} a single "
-            "point: in the scene's own simulation it turns without friction and rocks. "
-            "Here it was simulated standing on small spheres at the corners of that "
-            "face (of a lying cylinder on two of its own radius). Give it such spheres "
-            "in its model, or use hydroelastic contact, before you simulate with the "
-            "scene."
+            "point, which jumps about: in the scene's own simulation it rocks, slides "
+            "and turns wrongly. Here it was simulated standing on "
+            + (
+                "two spheres of its own radius"
+                if one.on_side
+                else "small spheres at the corners of that face"
+            )
+            + ". Give it such spheres in its model, or use hydroelastic contact, "
+            "before you simulate with the scene."
         )
         recording = contacts.recordings[0].name
-        found.append(Finding("point_on_face", recording, pair, 1.0, "1", "warning", says))
+        found.append(
+            Finding("point_on_face", recording, pair, 1.0, "1", "warning", says)
+        )
     return found

@@ -1,11 +1,11 @@
 """Spheres that stand in for the faces on which free bodies lie.
 
 Drake's point contact gives two shapes one point, however large the area is in which
-they meet. A box on a table then has no friction against turning, and rocks about a
-point that jumps from place to place. The equations of motion of
-gap/residuals/contact_dynamics.py let such a body stand on all corners of its face; so
-that simulated windows mean the same, small spheres at these corners carry it there, and
-its own shapes no longer touch what it lies on. Nothing else touches the spheres.
+they meet. Of a box on a table that point jumps from corner to corner: the box rocks,
+and slides and turns otherwise than one that stands on its face. The equations of
+motion of gap/residuals/contact_dynamics.py let such a body stand on all corners of its
+face. So that simulated windows mean the same, small spheres at these corners carry it,
+and its own shapes no longer touch what it lies on. Nothing else touches the spheres.
 """
 
 from collections.abc import Iterable
