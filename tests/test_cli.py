@@ -155,7 +155,7 @@ BAD = [
     ),
     (["gap", "a.yaml", "b.csv", "--job", "1"], "option --job; did you mean --jobs?"),
     (["bench", "--jobs", "1"], "unknown option --jobs; expected one of: --help"),
-    (["list", "scenes"], "unexpected scenes"),
+    (["list", "scenes"], "unknown experiment scenes"),
     (["run", "--set", "noise=1", "spring_mass"], "EXPERIMENT comes before --set"),
     (["reproduce", "spring"], "unknown experiment spring; did you mean spring_mass?"),
     (["reproduce", "--seeds", "0"], '--seeds: got "0", expected a whole number, 1'),
