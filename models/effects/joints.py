@@ -105,6 +105,11 @@ def _change_rotor(old: Effect, new: Effect, plant: MultibodyPlant, context) -> N
         actuator.SetRotorInertia(context, left / share)
 
 
+def rotor(joint: str, inertia: float) -> Effect:
+    """A rotor [kg m2] at a joint, as an effect."""
+    return Effect("rotor_inertia", [joint], {"inertia": inertia})
+
+
 # Kinds whose forces add up over a scene's effects.
 
 

@@ -77,6 +77,19 @@ class Parameter:
 
 
 @dataclass(frozen=True)
+class Tolerance:
+    """How well any scene knows what a kind changes, one standard deviation.
+
+    key: its name in a scene's `tolerance`; default: where the scene does not give it;
+    relative: whether both are shares of the value.
+    """
+
+    key: str
+    default: float
+    relative: bool = False
+
+
+@dataclass(frozen=True)
 class EffectKind:
     """A kind of effect: what it is called, what it does, how it shows.
 
@@ -95,6 +108,11 @@ class EffectKind:
     several: a place may have more than one.
     hidden_state: it adds coordinates that no channel measures.
     weighs: it changes weights or gravity: what two such add is not what both add.
+    absolute: its parameters are the body's own numbers; of a mechanism's links other
+        kinds give the same as a difference.
+    tolerance: of what it changes, which is then a nuisance of every fit; None: it is
+        known exactly.
+    may_lack: parameters without which it is a candidate of its own.
 
     What it does; a kind has those steps that it needs:
     edit_text(effect, link): the link's element in the model's URDF or SDF text.
@@ -142,6 +160,9 @@ class EffectKind:
     several: bool = False
     hidden_state: bool = False
     weighs: bool = False
+    absolute: bool = False
+    tolerance: Tolerance | None = None
+    may_lack: tuple[str, ...] = ()
     check: Callable[[Effect], None] | None = None
     edit_text: Callable[[Effect, Element], None] | None = None
     before_finalize: Callable[[Effect, MultibodyPlant, SceneGraph], None] | None = None
