@@ -29,11 +29,10 @@ from pydrake.systems.primitives import (
 from makebreak.diagrams.ball_rolling import (
     ARM_TICK,
     CONTROL,
-    BallRollingConfig,
     add_ball_rolling,
-    believed,
     connect_reference,
 )
+from makebreak.diagrams.ball_rolling_config import BallRollingConfig, believed
 from makebreak.diagrams.camera import CameraConfig
 from makebreak.diagrams.station import (
     ARM,

@@ -7,16 +7,23 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from time import perf_counter
 
 from tqdm import tqdm
 
 from makebreak.gap.data.recording import has_sidecar, read_recordings, sidecar_of
 from makebreak.gap.report.comparison import comparison_html
-from makebreak.gap.report.files import summary_lines, windows_of, write_report
+from makebreak.gap.report.files import (
+    next_best,
+    summary_lines,
+    windows_of,
+    write_report,
+)
 from makebreak.gap.result import GapResult
 from makebreak.models.effects.kind import with_deviation
 from makebreak.models.scene import Scene, read_scene
+from makebreak.models.typed_yaml import read_yaml
 from makebreak.scripts.interrupts import undisturbed
 from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.table import Table
@@ -80,9 +87,10 @@ def run_and_report(
     from makebreak.gap.workflow import run_gap  # Late: it is long to load.
 
     start = perf_counter()
+    given = scene_path
     inputs = [scene_path, *recording_paths]
-    notes: list[str] = []
-    sidecars: dict[Path, Path] = {}
+    sidecars = {} if is_robot else sidecars_beside(scene_path, recording_paths)
+    notes = [f"{log.name}: columns as in {own}" for log, own in sidecars.items()]
     with OutputFolder(out_dir, "gap", inputs) as out:
         if is_robot:
             scene_path, sidecars, notes = _proposed(
@@ -100,9 +108,7 @@ def run_and_report(
                 recordings = read_recordings(recording_paths, skip_bad_rows, sidecars)
                 moving = comparison_html(result, scene, recordings)
                 folder = out.stage
-                write_report(
-                    result, scene, folder, recordings, scene_path, moving, out_dir
-                )
+                write_report(result, scene, folder, recordings, given, moving, out_dir)
                 effects = [*scene.effects, *result.scene_effects()]
                 repaired = replace(scene, effects=effects)
                 for name, text in exported(repaired, export).items():
@@ -122,6 +128,23 @@ def run_and_report(
             return result, out.commit(), notes
 
 
+def sidecars_beside(
+    scene_path: Path, recording_paths: Sequence[Path]
+) -> dict[Path, Path]:
+    """{recording: sidecar in the scene's folder} of those that have none of their own:
+    a proposal writes both there, and they are used from there."""
+    found = {}
+    for path in recording_paths:
+        near = scene_path.parent / sidecar_of(path).name
+        if has_sidecar(path) or not near.is_file() or near.samefile(scene_path):
+            continue
+        with suppress(ValueError):
+            content = read_yaml(near)
+            if isinstance(content, dict) and "columns" in content:
+                found[path] = near
+    return found
+
+
 def _proposed(
     robot_path: Path, recording_paths: Sequence[Path], out: OutputFolder, out_dir: Path
 ) -> tuple[Path, dict[Path, Path], list[str]]:
@@ -137,13 +160,12 @@ def _proposed(
         if not has_sidecar(path):
             sidecars[path] = out.file(sidecar_of(path).name)
             sidecars[path].write_text(text)
-    notes = ["Proposed, to be corrected: " + "; ".join(proposal.notes) + "."]
-    names = [f"{sidecar_of(path).name} beside {path.name}" for path in sidecars]
-    where = f"Correct {out_dir / scene.name}"
-    where += f", put {', '.join(names)}" if names else ""
-    again = " ".join(str(path) for path in recording_paths)
+    notes = ["A proposal, to be checked: " + "; ".join(proposal.notes) + "."]
+    names = [str(out_dir / file.name) for file in (scene, *sidecars.values())]
+    again = " ".join(quote(str(path)) for path in recording_paths)
     notes.append(
-        f"{where}, and run again: makebreak gap {out_dir / scene.name} {again}"
+        f"Correct {' and '.join(names)} where they are wrong. Then run: "
+        f"makebreak gap {quote(names[0])} {again}"
     )
     return scene, sidecars, notes
 
@@ -179,22 +201,17 @@ def exported(scene: Scene, formats: Sequence[str]) -> dict[str, str]:
 
 def effects_table(result: GapResult) -> Table:
     """The end of a run: what was found, and what it does to the held-out error."""
-    columns = ("effect", "at", "parameters", "error before", "after", "next best")
     rows: list[tuple] = []
     for each in result.effects:
         values = ", ".join(
             f"{name} {with_deviation(p.value, p.std, p.or_more)} {p.unit}".rstrip()
             for name, p in each.parameters.items()
         )
-        e = each.evidence
-        rows.append(
-            (each.kind, list(each.at), values, e.held_out_before, e.held_out_after,
-             e.runner_up or "-")
-        )  # fmt: skip
+        rows.append((each.kind, list(each.at), values, next_best(each.evidence) or "-"))
     g = result.gap
-    rows.append(("the whole model", "", "", g.before, g.after, ""))
     note = (
-        f"error: rms over held-out {windows_of(result)}, in units of noise, which is "
+        f"held-out error: {g.before:.3g} before, {g.after:.3g} after, in units of the "
+        f"noise (rms over {windows_of(result)}; a perfect model leaves 1)"
     )
-    note += "what a perfect model would leave"
+    columns = ("effect", "at", "parameters", "next best")
     return Table("\n".join(summary_lines(result)), columns, rows, notes=[note])

@@ -22,14 +22,14 @@ from pydrake.systems.framework import Context, Diagram, OutputPort
 from makebreak.diagrams.lcm_station import (
     COMMAND,
     COMMAND_PORT,
-    PICTURES,
-    PICTURES_PORT,
+    IMAGES,
+    IMAGES_PORT,
     STATUS,
     STATUS_PORT,
     TORQUE_MODE,
     Messages,
     empty_status,
-    no_pictures,
+    no_images,
 )
 from makebreak.diagrams.scene_facts import N_JOINTS
 from makebreak.diagrams.station import TORQUE_RATE_MAX
@@ -114,7 +114,7 @@ class LcmLoop:
         self._messages = Messages()
         context = diagram.CreateDefaultContext()
         self._fix(context, STATUS_PORT, empty_status().encode())
-        self._fix(context, PICTURES_PORT, no_pictures())
+        self._fix(context, IMAGES_PORT, no_images())
         diagram.GetInputPort("delay").FixValue(context, [0.0])
         self._simulator = Simulator(diagram, context)
         self.context = self._simulator.get_mutable_context()
@@ -122,7 +122,7 @@ class LcmLoop:
         self.report = LoopReport()
         self._lcm = DrakeLcm(url)
         self._newest: dict[str, bytes] = {}
-        for channel in (STATUS, PICTURES):
+        for channel in (STATUS, IMAGES):
             self._lcm.Subscribe(channel, self._keeper(channel))
         self._tick = -1  # Of the diagram.
         self._robot: int | None = None  # The robot's tick that was answered last.
@@ -281,13 +281,13 @@ class LcmLoop:
 
     def _show_picture(self, utime: int) -> None:
         """The newest picture to the diagram, none if it is too old."""
-        data = self._newest.pop(PICTURES, None)
+        data = self._newest.pop(IMAGES, None)
         if data is not None:
             self._picture_utime = lcmt_image_array.decode(data).header.utime
-            self._fix(self.context, PICTURES_PORT, data)
+            self._fix(self.context, IMAGES_PORT, data)
             self._shown = True
         if self._shown and utime - self._picture_utime > PICTURE_SEC * 1e6:
-            self._fix(self.context, PICTURES_PORT, no_pictures())
+            self._fix(self.context, IMAGES_PORT, no_images())
             self._shown = False
 
     def _send(self, utime: int) -> None:

@@ -24,11 +24,12 @@ from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.sensors import ImageToLcmImageArrayT, PixelType
 
-from makebreak.diagrams.ball_rolling import BallRollingConfig, make_world
+from makebreak.diagrams.ball_rolling import make_world
+from makebreak.diagrams.ball_rolling_config import BallRollingConfig
 from makebreak.diagrams.lcm_station import (
     COMMAND,
-    PICTURES,
-    PICTURES_PORT,
+    IMAGES,
+    IMAGES_PORT,
     STATUS,
     TORQUE_MODE,
     Messages,
@@ -253,14 +254,14 @@ class StandIn:
         self._publish(STATUS, status.encode())
         if 2 * k >= self._next_frame:
             self._next_frame += self._frame_ticks
-            self._publish(PICTURES, self._picture(status.utime))
+            self._publish(IMAGES, self._picture(status.utime))
 
     def _picture(self, utime: int) -> bytes:
         image = self._station.GetOutputPort("overhead.rgb_image").Eval(self._context)
         self._film_in.FixValue(self._film_context, Value(image))
         self._film_context.SetTime(utime * 1e-6)
         value = self._film.get_output_port().EvalAbstract(self._film_context)
-        return self._messages.encode(PICTURES_PORT, value)
+        return self._messages.encode(IMAGES_PORT, value)
 
     def listen(self) -> None:
         """Takes the commands that have come, and sends what was to wait."""

@@ -15,11 +15,8 @@ from pydrake.systems.primitives import TrajectorySource, ZeroOrderHold
 from pydrake.systems.sensors import ImageRgba8U
 from pydrake.trajectories import PiecewisePolynomial
 
-from makebreak.diagrams.ball_rolling import (
-    BallRollingConfig,
-    make_ball_rolling,
-    make_world,
-)
+from makebreak.diagrams.ball_rolling import make_ball_rolling, make_world
+from makebreak.diagrams.ball_rolling_config import BallRollingConfig
 from makebreak.diagrams.camera import CameraConfig, camera_model
 from makebreak.diagrams.changing_contact import Knowledge
 from makebreak.diagrams.contact_learning import ContactLearningConfig, make_task

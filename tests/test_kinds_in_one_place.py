@@ -21,7 +21,7 @@ SENSORS = {"clock_skew", "joint_offset", "sensor_bias", "sensor_delay", "sensor_
 KNOWN = {
     "diagrams/ball_rolling.py": {"contact_friction", "object_size"},
     "diagrams/cube_pivoting.py": {"contact_friction", "object_mass", "object_size"},
-    "diagrams/push_object.py": {
+    "diagrams/push_object_scenes.py": {
         "contact_friction", "object_com", "object_mass", "object_size"
     },
     "diagrams/realism.py": {"joint_offset", "plane_tilt"},

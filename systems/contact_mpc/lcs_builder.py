@@ -39,7 +39,7 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Diagram, LeafSystem
 
-from makebreak.systems.contact_mpc.numerics.c3_mpc import Plan
+from makebreak.systems.contact_mpc.numerics.c3_plan import Plan
 from makebreak.systems.contact_mpc.numerics.convex_hull import point_on_hull
 from makebreak.systems.contact_mpc.numerics.lcs import LCS, is_finite
 from makebreak.systems.contact_mpc.numerics.lcs_builder import (

@@ -1,5 +1,6 @@
 """Meshcat's view of a motion that makes and breaks contact."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,6 +25,7 @@ _NOWHERE = RigidTransform([0.0, 0.0, -5.0])
 _BESIDE = np.array([0.045, -0.045, 0.06])  # Of the tip, where the mode is seen [m].
 _REGIONS = 6  # Of each kind that can be seen at once.
 _KIND_COLORS = {IMPACT: Rgba(0.9, 0.2, 0.2, 0.3), IMPACTLESS: Rgba(0.2, 0.4, 0.95, 0.3)}
+_PLAN = Rgba(0.65, 0.25, 0.75)
 _TARGET, _TRACK, _FORCE = Rgba(0.1, 0.1, 0.2), Rgba(1.0, 0.5, 0.0), Rgba(0.1, 0.1, 0.1)
 _GOOD, _BAD = Rgba(0.3, 0.7, 0.3), Rgba(0.85, 0.25, 0.2)  # Bars.
 # Unknown, free, then the modes in their order, again from the third on.
@@ -55,8 +57,10 @@ class ContactView(LeafSystem):
     """Draws the regions in which contacts are expected (ellipsoids: red for an impact,
     blue for a change without one), the contact force (an arrow from the tool), the mode
     (colour of the ball beside the tool), the target path (dark) and the tip's track
-    (orange), and the peak forces of the trials before (bars).
+    (orange), and the peak forces of the trials before (bars). The planned path
+    (purple) is there before the simulation begins; contacts shift the target path.
 
+    Args: plan: (n, 3) positions of each piece of the planned path [m].
     Inputs: contacts (ContactBelief); wrench (6,) on the tool [N], [N m]; ee_pose (7,);
             mode (1,); phase (6,); optional x_desired (19,), for the target path.
     """
@@ -66,6 +70,7 @@ class ContactView(LeafSystem):
         ("an impact is expected", _KIND_COLORS[IMPACT]),
         ("a change of contact is expected", _KIND_COLORS[IMPACTLESS]),
         ("contact force", _FORCE),
+        ("planned path, before contacts shift it", _PLAN),
         ("target path", _TARGET),
         ("track of the tool", _TRACK),
         ("ball beside the tool: no contact", _MODE_COLORS[1]),
@@ -73,7 +78,11 @@ class ContactView(LeafSystem):
     )
 
     def __init__(
-        self, config: ContactViewConfig, meshcat: Meshcat, offset_sec: float = 0.0
+        self,
+        config: ContactViewConfig,
+        meshcat: Meshcat,
+        offset_sec: float = 0.0,
+        plan: Sequence[np.ndarray] = (),
     ):
         super().__init__()
         self._config, self._meshcat = config, meshcat
@@ -98,6 +107,8 @@ class ContactView(LeafSystem):
                 (f"bars: above {limit}", _BAD),
             ]
         meshcat.SetCameraPose(config.camera, self.LOOK_AT)
+        for k, piece in enumerate(plan):
+            meshcat.SetLine(f"{_ROOT}/plan/{k}", np.asarray(piece).T, 3.0, _PLAN)
         self._target = Trail(meshcat, f"{_ROOT}/target", _TARGET, 2.0)
         self._track = Trail(meshcat, f"{_ROOT}/track", _TRACK)
         for kind, color in _KIND_COLORS.items():
