@@ -13,8 +13,8 @@ from makebreak.diagrams.fault_kinds import read_faults
 from makebreak.diagrams.sampled_contacts import SampledContactsConfig
 from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.station import ARM, BALL_ROLLING, TOOL, StationFaults
-from makebreak.models.effects.contact import rolls_against
 from makebreak.models.effects.kind import Effect
+from makebreak.models.effects.rolling_resistance import rolls_against
 from makebreak.models.fruit import FRUITS, fruit_file, make_fruit
 from makebreak.models.scene import Scene, load_scene, read_scene
 from makebreak.models.tip_and_ball import TipAndBall

@@ -73,6 +73,10 @@ CLEAR = 0.05  # Height above the blue wall's top at which the motion turns [m].
 OVER, BACK, GOAL = 0.08, 0.05, 0.12  # Over the red block, and along its top [m].
 NORMAL_FORCE = 5.0  # On each surface that has been reached [N].
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # Of the tip's frame: the flange straight down.
+TABLE, TOP = 0, 3  # Which of IMPACTS are with the table, with the red block's top.
+# Of the height of the block's top above the table [m]: sizes are known to a millimetre,
+# and a table that is tilted by 0.5 degrees rises by 4 mm on the way there.
+HEIGHT_STD = 0.002
 A_MAX = 1.0  # Of the pattern [m/s2].
 # Largest approach speed [m/s]: stopping from 0.03 m/s takes 1 m/s2 (low-pass, 10 Hz),
 # the goal for the acceleration.
@@ -94,6 +98,9 @@ class MultipleCollisionsConfig:
     # scene has them [m], and their frictions.
     spread: float = SPREAD
     friction: list[float] = field(default_factory=list)  # Empty: drawn by the seed.
+    # Whether the sizes of the model's objects are used: the red block stands on the
+    # table, so the contact with the table tells where the block's top is.
+    known_heights: bool = True
     # File of a motion to follow in place of the shipped one: a pattern (.yaml) or a
     # recorded demonstration (docs/shaping.md). `speed` has no meaning then.
     pattern: str = ""
@@ -189,6 +196,10 @@ def make_task(
         for contacts, along in ((modelled, in_model), (prior, estimate)):
             mean = start + d * (along - start @ d)
             contacts.append(ExpectedContact(mean, covariance, d, segment=k))
+    if config.known_heights:
+        heights = surfaces(model, half)[TOP] - surfaces(model, half)[TABLE]
+        prior = with_known_height(prior, float(heights), config.error_max)
+        modelled = with_known_height(modelled, float(heights), config.error_max)
     stiffness = draw_stiffness(rng, SURFACES, config.stiffness)
     set_stiffness(world, config.tool, stiffness)
     if given is not None:  # The world is the seed's, whatever moves in it.
@@ -207,6 +218,40 @@ def make_task(
         draw_errors(config.realism, config.seed),
         tool_corner(config.tool),
     )
+
+
+def with_known_height(contacts, distance: float, error_max: float):
+    """The contacts, where it is known how far the block's top is from the table.
+
+    Both estimates are estimates of one height then. Each is at most error_max off, so
+    it lies where both ranges overlap: the middle of that is the new estimate, and two
+    standard deviations are half its width. Estimates that contradict each other stay as
+    they are. In a trial the contact with the table decides (`known_from`).
+
+    Args: contacts, of IMPACTS; distance from the table to the top along DOWN [m].
+    """
+    table, top = contacts[TABLE], contacts[TOP]
+    means = table.mean @ DOWN, top.mean @ DOWN - distance
+    low = max(means) - error_max - 2.0 * HEIGHT_STD * (means[1] > means[0])
+    high = min(means) + error_max + 2.0 * HEIGHT_STD * (means[1] < means[0])
+    found = list(contacts)
+    sigma = np.sqrt(DOWN @ table.covariance @ DOWN)
+    if low < high:
+        sigma = max(0.25 * (high - low), 0.001)
+        middle = 0.5 * (low + high)
+        found[TABLE] = replace(
+            table,
+            mean=table.mean + DOWN * (middle - table.mean @ DOWN),
+            covariance=sigma**2 * np.eye(3),
+        )
+        top = replace(
+            top,
+            mean=top.mean + DOWN * (middle + distance - top.mean @ DOWN),
+            covariance=np.hypot(sigma, HEIGHT_STD) ** 2 * np.eye(3),
+        )
+    known = (IMPACTS[TABLE][2], distance, HEIGHT_STD)
+    found[TOP] = replace(top, known_from=known)
+    return found
 
 
 def surfaces(scene: Scene, half: float) -> np.ndarray:

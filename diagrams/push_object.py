@@ -99,7 +99,7 @@ from makebreak.systems.contact_mpc.numerics.contact_sampling import (
 from makebreak.systems.contact_mpc.push_goals import PushGoals
 from makebreak.systems.contact_mpc.push_task import PushTask
 from makebreak.systems.contact_mpc.residual_learner import ResidualLearner
-from makebreak.systems.perception.numerics.pose_tracker import make_shape
+from makebreak.systems.perception.numerics.object_outline import make_shape
 from makebreak.systems.perception.past_state import PastState
 from makebreak.systems.perception.pose_sensor import PoseSensor
 from makebreak.systems.perception.pose_tracker import PoseTracker

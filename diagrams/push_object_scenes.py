@@ -11,8 +11,8 @@ from makebreak.diagrams.push_object_config import (
     rolling_axis,
 )
 from makebreak.diagrams.station import TOOL
-from makebreak.models.effects.contact import rolls_against
 from makebreak.models.effects.kind import Effect
+from makebreak.models.effects.rolling_resistance import rolls_against
 from makebreak.models.pushed_object import (
     PushedObject,
     object_file,
@@ -21,15 +21,15 @@ from makebreak.models.pushed_object import (
 )
 from makebreak.models.scene import Scene, read_scene
 from makebreak.systems.contact_mpc.push_goals import draw_poses
-from makebreak.systems.perception.numerics.pose_tracker import make_shape
+from makebreak.systems.perception.numerics.object_outline import make_shape
 
 ROLLING_RESISTANCE = 0.005  # Of a cylinder in the world: lever arm over radius.
 
 
 def outline_fold(config: PushObjectConfig) -> int:
-    """Rotational symmetry of the object for what measures it (pose_tracker.Shape.fold):
-    number of equal turns that leave its outline unchanged, 0 for a disc. A pose sensor
-    measures every turn: 1."""
+    """Rotational symmetry of the object for what measures it (Shape.fold): number of
+    equal turns that leave its outline unchanged, 0 for a disc. A pose sensor measures
+    every turn: 1."""
     if config.pose_from == "sensor":
         return 1
     return make_shape(*seen_parts(config.object)).fold

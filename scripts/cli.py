@@ -286,7 +286,7 @@ def _runner(module, args):
 def _run_in(session, args, run, config, duration) -> int:
     """Runs the experiment in the session. Returns: the exit status."""
     from makebreak.scripts import compile_ahead
-    from makebreak.scripts.criteria import told
+    from makebreak.scripts.criteria import success_text
     from makebreak.scripts.run_buttons import StartOver
     from makebreak.scripts.table import Table
     from makebreak.scripts.trials import duration_line
@@ -344,7 +344,7 @@ def _run_in(session, args, run, config, duration) -> int:
     if result is not None:
         rows = [(k, v) for k, v in result.items() if k not in ("criteria", "ended")]
         print(Table(args.experiment, ("result", "value"), rows).to_text())
-        lines = [*session.endings, *session.too_slow(), told(result)]
+        lines = [*session.endings, *session.too_slow(), success_text(result)]
         print("\n".join(lines), flush=True)
     _say_files(files)
     if session.compared_by:

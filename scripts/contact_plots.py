@@ -17,8 +17,8 @@ from makebreak.systems.changing_contact.numerics.impact_score import low_pass
 def plot_trials(trials: Mapping[str, Any]):
     """CC figure 16: speed, acceleration and force over time, a column for each trial.
 
-    Args: trials: each has `log`, `touched` (n,) [s], `force` (n,) [N] and `completion`
-        [s].
+    Args: trials: {name: trial with `log`, `touched` (n,) [s], `force` (n,) [N] and
+        `completion` [s]}.
     """
     figure, axes = plt.subplots(
         3, len(trials), figsize=(5.0 * len(trials), 8), layout="constrained",

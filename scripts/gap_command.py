@@ -1,4 +1,4 @@
-"""`makebreak gap`: reads, runs the workflow with a progress bar, writes the report."""
+"""`makebreak gap`: runs the workflow with a progress bar and writes the report."""
 
 import json
 import sys
@@ -32,13 +32,14 @@ EXPORTS = ("urdf", "mjcf")
 
 
 class StageBar:
-    """A progress bar that is told, in a line of text, what is being done. Each line is
-    taken to be a tenth of what is left, an indented one a fiftieth, unless `share` says
-    how much is done, 0 to 1: nobody knows how many effects there are to be found. To be
-    used in a `with`."""
+    """A progress bar with a line of text for the present stage, for a `with`.
+
+    As the number of effects to be found is not known, each call advances it by a tenth
+    of the remainder (a fiftieth for indented text), unless `share`, 0 to 1, is given.
+    """
 
     def __init__(self, shown: bool = True):
-        self.told = False  # Whether anything was.
+        self.started = False  # Whether any stage was reported.
         tty = sys.stderr.isatty()
         self._bar = tqdm(
             total=1.0,
@@ -51,7 +52,7 @@ class StageBar:
         )
 
     def __call__(self, text: str, share: float | None = None) -> None:
-        self.told = True
+        self.started = True
         if share is None:
             step = 0.02 if text.startswith(" ") else 0.1
             share = self._bar.n + step * (1.0 - self._bar.n)
@@ -77,14 +78,15 @@ def run_and_report(
     is_robot: bool = False,
     skip_bad_rows: bool = False,
 ) -> tuple[GapResult, list[Path], list[str]]:
-    """The workflow's result, the files that tell of it, and what is to be said beside.
+    """The workflow's result, the files written, and notes for the user.
 
-    Args: export: of EXPORTS; the repaired model is written so as well. is_robot:
-        scene_path is a robot's own file; a scene is proposed for it, and a sidecar for
-        each recording that has none, and both are among the files.
+    Args: export: formats of EXPORTS in which the repaired model is written too;
+        is_robot: whether scene_path is a robot's own URDF or MJCF. Then a scene is
+        proposed for it, with a sidecar for each recording that has none, and both are
+        written too.
     Raises: ValueError for a scene, a recording or a folder that cannot be used.
     """
-    from makebreak.gap.workflow import run_gap  # Late: it is long to load.
+    from makebreak.gap.workflow import run_gap  # Here, as it takes long to import.
 
     start = perf_counter()
     given = scene_path
@@ -96,7 +98,7 @@ def run_and_report(
             scene_path, sidecars, notes = _proposed(
                 scene_path, recording_paths, out, out_dir
             )
-        if export:  # Refused before anything is computed.
+        if export:  # Raises before anything is computed.
             exported(read_scene(scene_path), export)
         try:
             with StageBar() as progress:
@@ -113,11 +115,11 @@ def run_and_report(
                 repaired = replace(scene, effects=effects)
                 for name, text in exported(repaired, export).items():
                     out.file(name).write_text(text)
-        except (Exception, SystemExit) as error:  # Of Drake.
+        except (Exception, SystemExit) as error:  # Drake raises SystemExit, too.
             if isinstance(error.__cause__ or error, OSError) and any(out.written()):
                 kept = ", ".join(path.name for path in out.commit(complete=False))
                 raise ValueError(f"{error}; kept: {kept}") from error
-            if progress.told:  # Not merely an input that was refused.
+            if progress.started:  # Otherwise the input was refused: no report.
                 with suppress(OSError):
                     out.file("error.txt").write_text(traceback.format_exc())
                 out.commit(complete=False)
@@ -131,8 +133,8 @@ def run_and_report(
 def sidecars_beside(
     scene_path: Path, recording_paths: Sequence[Path]
 ) -> dict[Path, Path]:
-    """{recording: sidecar in the scene's folder} of those that have none of their own:
-    a proposal writes both there, and they are used from there."""
+    """{recording: sidecar in the scene's folder} for recordings without a sidecar of
+    their own: a proposal writes scene and sidecars into one folder."""
     found = {}
     for path in recording_paths:
         near = scene_path.parent / sidecar_of(path).name
@@ -148,7 +150,10 @@ def sidecars_beside(
 def _proposed(
     robot_path: Path, recording_paths: Sequence[Path], out: OutputFolder, out_dir: Path
 ) -> tuple[Path, dict[Path, Path], list[str]]:
-    """A scene and sidecars for a robot and its logs, written to be corrected."""
+    """Writes a proposed scene and sidecars for a robot and its logs.
+
+    Returns: the scene's path, {recording: sidecar}, notes for the user.
+    """
     from makebreak.gap.data.robot import propose_scene, read_log, read_robot
 
     robot = read_robot(robot_path)
@@ -171,11 +176,11 @@ def _proposed(
 
 
 def exported(scene: Scene, formats: Sequence[str]) -> dict[str, str]:
-    """{file name: text} of a scene's model in other formats: `repaired.xml` (MJCF), and
-    `<model>.urdf` of each model that comes from a URDF. What a format cannot say is in
-    a comment at its end.
+    """{file name: text} of a scene's models in other formats: `repaired.xml` (MJCF),
+    and `<model>.urdf` for each model that comes from a URDF. Effects that a format
+    cannot express are listed in a comment at its end.
 
-    Raises: ValueError for an unknown format, and for a scene that it cannot say.
+    Raises: ValueError for an unknown format, or a scene that it cannot express.
     """
     from makebreak.models.model_export import to_mjcf, to_urdf, urdf_models
 
@@ -194,13 +199,15 @@ def exported(scene: Scene, formats: Sequence[str]) -> dict[str, str]:
         found |= {f"{model}.urdf": to_urdf(scene, model) for model in models}
     texts = {}
     for name, one in found.items():
-        lost = "".join(f"<!-- Not in this file: {said} -->\n" for said in one.unsaid)
+        lost = "".join(
+            f"<!-- Not in this file: {effect} -->\n" for effect in one.omitted
+        )
         texts[name] = one.text + lost
     return texts
 
 
 def effects_table(result: GapResult) -> Table:
-    """The end of a run: what was found, and what it does to the held-out error."""
+    """The table at the end of a run: the effects found and the held-out error."""
     rows: list[tuple] = []
     for each in result.effects:
         values = ", ".join(

@@ -1,4 +1,4 @@
-"""`makebreak inspect`: what a log holds, and what its columns may be."""
+"""`makebreak inspect`: the columns of a log, and the channels they may be."""
 
 from pathlib import Path
 
@@ -64,7 +64,7 @@ def _short(value: float) -> str:
 def run_inspect(
     path: Path, robot_path: Path | None, out: Path | None
 ) -> tuple[Table, str, list[Path]]:
-    """The table, the drafted sidecar and the files written, if any were asked for.
+    """The table, the drafted sidecar, and the files written.
 
     Raises: ValueError, one line, for a log or a robot that cannot be read.
     """

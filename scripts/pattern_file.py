@@ -1,10 +1,10 @@
-"""A motion pattern from a user's file: a pattern as YAML, or the recording of a
-demonstration with the tool's pose and the wrench on it.
+"""Reads a motion pattern from a user's file: a pattern in YAML, or the recording of a
+demonstration with the tool's pose and the force on it.
 
-A recording is a table as gap reads it (docs/recordings.md). The pose is that of a body
-or frame, `<model>.<frame>.x .y .z .qw .qx .qy .qz`; where there is none, it is worked
-out from the positions of the arm's joints and the controllers' model of the arm. The
-force is `<model>.<frame>.fx .fy .fz`, on the tool, in world axes.
+A recording is a table as in docs/recordings.md. The pose is that of a body or frame,
+`<model>.<frame>.x .y .z .qw .qx .qy .qz`; without one, it is computed from the arm's
+joint positions with the controllers' model of the arm. The force on the tool is
+`<model>.<frame>.fx .fy .fz`, in world axes.
 """
 
 from pathlib import Path
@@ -24,18 +24,18 @@ from makebreak.systems.changing_contact.numerics.motion_pattern import (
 )
 
 YAML = (".yaml", ".yml")
-LONGEST_SEC = 600.0  # Of a demonstration.
+LONGEST_SEC = 600.0  # Longest demonstration.
 FORCE = ("fx", "fy", "fz")
-RATE_HZ = 100.0  # Of what a demonstration is thinned to: its motion is below 3 Hz.
-# A demonstration begins at rest: in this time a force that is less than one of a
-# contact is the sensor's bias.
-REST_SEC, BIAS_MOST = 0.1, 1.0  # [s], [N]
+RATE_HZ = 100.0  # Rate to which a demonstration is resampled; its motion is below 3 Hz.
+# A demonstration starts at rest: during this time a force up to the second number is
+# taken for the sensor's bias.
+REST_SEC, BIAS_MAX = 0.1, 1.0  # [s], [N]
 
 
 def read_pattern(path: str | Path, model: Scene) -> MotionPattern:
     """The pattern of a file.
 
-    Args: model, the scene that the controllers use: its arm and tool.
+    Args: model: the controllers' scene, with arm and tool.
     Raises: ValueError in one line: the file, what was wrong, what was expected.
     """
     path = Path(path)
@@ -90,7 +90,7 @@ def _demonstration(path: Path, model: Scene):
     at = _element(path, columns, FORCE, "force on the tool", "fx .fy .fz")
     force = np.stack([columns[f"{at}.{name}"] for name in FORCE], axis=1)
     rest = force[time <= time[0] + REST_SEC].mean(axis=0)
-    if np.linalg.norm(rest) < BIAS_MOST:
+    if np.linalg.norm(rest) < BIAS_MAX:
         force = force - rest
     pose = _poses(path, columns, model)
     step = 1
@@ -100,7 +100,7 @@ def _demonstration(path: Path, model: Scene):
 
 
 def _poses(path: Path, columns, model: Scene) -> np.ndarray:
-    """(n, 7) of the tip: as recorded, or from the arm's joints."""
+    """(n, 7) poses of the tip, as recorded or from the arm's joint positions."""
     joints = [f"{ARM}.{name}.position" for name in PANDA_JOINTS]
     if not any(name.endswith(".qw") for name in columns):
         missing = [name for name in joints if name not in columns]
@@ -139,7 +139,7 @@ def _poses(path: Path, columns, model: Scene) -> np.ndarray:
 
 
 def _element(path: Path, columns, quantities, what: str, wanted: str) -> str:
-    """Which body or frame has all of these quantities: `tool.tip`, or the only one."""
+    """The body or frame with all of these quantities: `tool.tip`, or the only one."""
     last = f".{quantities[-1]}"
     found = [
         name.removesuffix(last)
@@ -166,6 +166,6 @@ def _listed(columns) -> str:
 
 
 def _thinned(values: np.ndarray, step: int) -> np.ndarray:
-    """(n // step, ...) means of `step` rows each, so that the noise gets less."""
+    """(n // step, ...) means of `step` rows each, which also reduces the noise."""
     n = len(values) // step
     return values[: n * step].reshape(n, step, *values.shape[1:]).mean(axis=1)

@@ -1,9 +1,9 @@
-"""A user's own motion, followed in the world of multiple_collisions: first without
-handling of contacts, then with it, again and again.
+"""Follows a user's own motion in the world of multiple_collisions: first without
+handling of contacts, then with it, for a number of trials.
 
-Nothing but the motion and what the sensors show is scored: which contacts came, in the
-order of the motion, with which forces, and how long it took. Impact force and
-acceleration are those of multiple_collisions (numerics/impact_score.py).
+Scores are computed from the motion and the sensors alone: the contacts made in the
+order of the motion, their forces, and the time taken. Impact force and acceleration are
+those of multiple_collisions (numerics/impact_score.py).
 """
 
 from dataclasses import dataclass, replace
@@ -41,7 +41,7 @@ from makebreak.systems.changing_contact.numerics.impact_score import impact
 from makebreak.systems.changing_contact.numerics.motion_pattern import save_pattern
 from makebreak.systems.views.contact_view import ContactViewConfig
 
-LONGER_SEC = 60.0  # Than the motion a trial may take.
+LONGER_SEC = 60.0  # Time by which a trial may be longer than the motion.
 FIRST_MAX, KNOWN_MAX, A10_MAX = 10.0, 8.0, 1.0  # [N], [N], [m/s2]
 TROUBLES = {
     CONTACT_MISSING: "a contact did not come, or was lost and not found again",
@@ -52,21 +52,21 @@ TROUBLES = {
 
 @dataclass(frozen=True, eq=False)
 class PatternTrial:
-    """One trial's log and its scores: numbers for each contact of the motion, nan where
-    it did not come."""
+    """The log and the scores of one trial, with an entry for each contact of the
+    motion; nan for contacts that were not made."""
 
     log: dict[str, np.ndarray]
     done: bool
-    completion: float  # From the motion's first time to its end [s].
+    completion: float  # From the motion's start to its end [s].
     touched: np.ndarray  # (n,) [s]
     force: np.ndarray  # (n,) F100 [N]
     speed: np.ndarray  # (n,) into each contact [m/s]
-    a10: np.ndarray  # (n,) at each contact; the motion between them is the user's.
-    troubles: list[str]  # What the velocity shaper reported.
+    a10: np.ndarray  # (n,) at each contact, as the motion between them is the user's.
+    troubles: list[str]  # Problems reported by the velocity shaper.
 
     @property
     def whole(self) -> bool:
-        """The whole motion, with all of its contacts."""
+        """Whether the motion was completed, with all of its contacts."""
         return self.done and bool(np.isfinite(self.force).all())
 
 
@@ -120,7 +120,7 @@ def follow_pattern(config: MultipleCollisionsConfig, session: Session) -> dict:
 
 
 def scored(log: dict[str, np.ndarray], task: CollisionTask) -> PatternTrial:
-    """A trial, from its log: a contact is the one that ended its segment."""
+    """Scores a trial by its log; a contact is the one that ended its segment."""
     time, contact = log["time"], log["contact"]
     segment, stage = log["phase"][:, PHASE_SEGMENT], log["phase"][:, PHASE_STAGE]
     made = np.flatnonzero(np.diff(contact[:, MADE]) > 0) + 1

@@ -1,4 +1,4 @@
-"""`makebreak reproduce ball_rolling`: the paper's ball and fruits beside ours."""
+"""`makebreak reproduce ball_rolling`: the paper's results for its objects, and ours."""
 
 import numpy as np
 from scipy.stats import t as student
@@ -10,8 +10,8 @@ from makebreak.scripts.sweep import rate_text
 from makebreak.scripts.table import Table
 from makebreak.scripts.trials import run_many
 
-# What `reproduce` runs, beside random conditions. The drawn picture is as good to the
-# tracker as VTK's, whose rendering takes most of a run's time: a few seeds show that.
+# The tracker works equally well on drawn images as on VTK's, whose rendering takes most
+# of the time of a run; a few seeds with VTK show that.
 DRAWN = {"camera.renderer": "drawn"}
 RADIUS_ERRORS = (-0.008, -0.005, 0.0, 0.005, 0.008, 0.012)  # Both signs [m].
 FRUIT = ("orange", "lime")
@@ -20,7 +20,7 @@ FORCE_MAX = 40.0  # [N]
 
 
 def cases() -> dict[str, dict]:
-    """{name: settings} of what is run once per seed."""
+    """{name: settings} of the runs that are made with each seed."""
     found: dict[str, dict] = {}
     for error in RADIUS_ERRORS:
         for adapt in (True, False):
@@ -47,7 +47,7 @@ VTK_SEEDS = 3
 
 
 def conditions(seed):
-    """Settings drawn from the ranges in which the controller should work."""
+    """Random settings from the ranges in which the controller should work."""
     rng = np.random.default_rng([seed, 1])
     return {
         "adapt": True,
@@ -59,8 +59,8 @@ def conditions(seed):
 
 
 def no_worse(adapted, frozen) -> bool:
-    """Whether adapting is no worse than not: as often four circles, and where both
-    have a mean error, no significantly larger one (paired by seed, 95 %)."""
+    """Whether adaptation is not worse: at least as many runs complete four circles, and
+    the mean error is not significantly larger (paired by seed, 95 %)."""
     done = [sum(r.get("circles_completed", 0) >= CIRCLES for r in g)
             for g in (adapted, frozen)]  # fmt: skip
     pairs = [
@@ -79,8 +79,8 @@ def no_worse(adapted, frozen) -> bool:
 
 
 def reproduce(session, seeds, jobs) -> Table:
-    """The paper's ball and fruits beside ours, over seeds 0 .. seeds - 1, camera in the
-    loop; the same over conditions drawn at random; and both signs of an error."""
+    """The paper's results for ball and fruits, and ours over seeds 0 .. seeds - 1 with
+    the camera in the loop; ours under random conditions; both signs of an error."""
     named = cases()
     trials = [(settings, s) for settings in named.values() for s in range(seeds)]
     trials += [(conditions(s), s) for s in range(seeds)]
@@ -98,7 +98,7 @@ def reproduce(session, seeds, jobs) -> Table:
 
     def add(what, paper, ours, goal=None):
         if failed and goal:
-            goal = False  # A run that ended in an error proves nothing.
+            goal = False  # Runs that ended in an error do not count as met.
         table.row(what, paper, ours, goal)
 
     def count(runs, test):

@@ -1,5 +1,5 @@
-"""How `ball_rolling` and `gentle_rolling` are scored: where ball and tip really were,
-the figures of result.json, the recording and the plots."""
+"""Scores of `ball_rolling` and `gentle_rolling`: ground truth of ball and tip, the
+entries of result.json, the recording and the plots."""
 
 from dataclasses import dataclass
 
@@ -24,32 +24,31 @@ from makebreak.systems.contact_mpc.numerics.rolling_task import ROLL
 
 DURATION_SEC = 240.0
 CIRCLES = 4
-ERROR_MAX = 0.004  # Success: mean distance to the path of at most this [m].
+ERROR_MAX = 0.004  # Greatest mean distance to the path of a success [m].
 SAMPLE = 0.0125  # [s]
-SETTLED_SEC = 10.0  # From then on the learned gap is scored.
-Z_90 = 1.645  # Standard deviations to either side that hold 90 %.
+SETTLED_SEC = 10.0  # Time from which the learned gap is scored.
+Z_90 = 1.645  # Half width of a 90 % interval [standard deviations].
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """The run as ground truth has it, a row per sample."""
+    """Ground truth of a run, with a row for each sample."""
 
     time: np.ndarray  # (n,) [s]
     p_ball: np.ndarray  # (n, 3) [m]
     p_tip: np.ndarray  # (n, 3) [m]
-    progress: np.ndarray  # (n,) angle run through along the circle [rad].
+    progress: np.ndarray  # (n,) angle covered along the circle [rad].
     error: np.ndarray  # (n,) distance to the path [m].
     gap: np.ndarray  # (n,) learned residual as a length [m].
     gap_true: np.ndarray  # (n,) true minus modelled distance of tip and ball [m].
     gap_std: np.ndarray  # (n,) standard deviation of gap [m]; 0: not estimated.
-    rolling: np.ndarray  # (n,) whether the task pushes.
+    rolling: np.ndarray  # (n,) whether the task is pushing.
 
 
 def turned(before, after, radius):
-    """Angle(s) [rad] about the origin from the points before, (2,) or (n, 2), to after.
-    It counts only within half a radius of the circle: near the centre, a large angle
-    is a short way.
-    """
+    """Angle(s) [rad] about the origin from points before, (2,) or (n, 2), to after; 0
+    further than half a radius from the circle, as near the centre a large angle is a
+    short way."""
     before, after = np.asarray(before), np.asarray(after)
     angle = np.arctan2(after[..., 1], after[..., 0])
     angle = angle - np.arctan2(before[..., 1], before[..., 0])
@@ -58,9 +57,19 @@ def turned(before, after, radius):
 
 
 def progress_of(p, center, radius):
-    """Angle (n,) [rad] by which the points p (n, 3) have gone around the circle."""
+    """Angle (n,) [rad] that the points p (n, 3) have covered around the circle."""
     off = p[:, :2] - center
     return np.append(0.0, np.cumsum(turned(off[:-1], off[1:], radius)))
+
+
+def speed_at_the_end(track: Track) -> float:
+    """The tip's largest speed within the last second [m/s], over 0.1 s each."""
+    step = round(0.1 / SAMPLE)
+    p_tip = track.p_tip[track.time >= track.time[-1] - 1.0][::step]
+    if len(p_tip) < 2:
+        return float("nan")
+    moved = np.linalg.norm(np.diff(p_tip, axis=0), axis=1)
+    return float(moved.max() / (step * SAMPLE))
 
 
 def first_time(time, condition):
@@ -69,7 +78,7 @@ def first_time(time, condition):
 
 
 def ground_truth(config, log, plant) -> Track:
-    """Where ball and tip really were, for scoring alone."""
+    """True positions of ball and tip, for scoring only."""
     context = plant.CreateDefaultContext()
     tip, ball = plant.GetFrameByName(TIP_FRAME), plant.GetBodyByName("ball")
     p_tip, p_ball = np.zeros((2, len(log.time), 3))
@@ -128,10 +137,9 @@ def contact_truth(config, diagram, log, plant):
 
 
 def score(config, log, track, contact):
-    """The entries of result.json; NaN (null in the file) for what did not happen.
+    """The entries of result.json; NaN (null in the file) for events that did not occur.
 
-    Args: track: where ball and tip really were; contact: (time, force) of
-        contact_truth.
+    Args: track: ground truth; contact: (time, force) of contact_truth.
     """
     circles = track.progress.max() / (2.0 * np.pi)
     initiated = bool(track.progress.max() >= np.pi / 2)
@@ -159,7 +167,7 @@ def score(config, log, track, contact):
     # First-order low-pass of 100 Hz at 1 kHz.
     pole = np.exp(-2.0 * np.pi * 100.0 * 1e-3)
     filtered = lfilter([1.0 - pole], [1.0, -pole], force)
-    # A tenth of a minute at either end: a single sample says little.
+    # Means over 6 s at either end, as single samples are noisy.
     span = round(6.0 / SAMPLE)
     criteria = Criteria()
     criteria.at_least("circles", "circles completed", float(circles), CIRCLES)
@@ -199,8 +207,8 @@ def score(config, log, track, contact):
 
 
 def write_recording(session, log, config):
-    """Writes what a real robot could have recorded (the ball only while the camera saw
-    it), and the scene that the controllers assumed."""
+    """Writes a recording as of a real robot (the ball only while the camera sees it),
+    and the controllers' scene."""
     columns = recorded(log.diagram, log.context)
     row = np.searchsorted(log.time, columns["time"] - 1e-9).clip(0, len(log.time) - 1)
     seen = log["seen"][row, 0] > 0.5
@@ -226,7 +234,7 @@ def plot_path(session, config, track):
 
 
 def plot_residual(session, log, track):
-    """Fig. 6: residual and loss over time; and the error of the track."""
+    """Fig. 6: residual and loss over time, and the tracking error."""
     fig, axes = plt.subplots(3, 1, figsize=(7, 7), sharex=True, layout="constrained")
     true = np.where(log["seen"][:, 0] > 0.5, 1e3 * track.gap_true, np.nan)
     axes[0].plot(track.time, true, lw=0.4, color="0.7", label="true")

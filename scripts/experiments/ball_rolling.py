@@ -28,6 +28,7 @@ from makebreak.scripts.rolling_score import (
     plot_residual,
     progress_of,
     score,
+    speed_at_the_end,
     turned,
     write_recording,
 )
@@ -97,6 +98,7 @@ def run(config, session):
     if config.faults:  # For `reproduce faults`: how far it had come, each second.
         second = np.searchsorted(track.time, np.arange(0.0, track.time[-1]) - 1e-9)
         result["angle_by_second_rad"] = track.progress[second].round(4).tolist()
+        result["tip_speed_end_m_s"] = speed_at_the_end(track)
     write_recording(session, log, config)
     plot_path(session, config, track)
     plot_residual(session, log, track)

@@ -12,15 +12,11 @@ from pydrake.systems.sensors import ImageRgba8U
 from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.timing import timed
 from makebreak.systems.perception.numerics import constant_velocity
+from makebreak.systems.perception.numerics.aruco_marker import find_marker
 from makebreak.systems.perception.numerics.ball_tracker import strength_weights
+from makebreak.systems.perception.numerics.object_outline import Shape, nearest_yaw
 from makebreak.systems.perception.numerics.pinhole import Pinhole
-from makebreak.systems.perception.numerics.pose_tracker import (
-    Shape,
-    find_marker,
-    find_pose,
-    nearest_yaw,
-    rolling_turn,
-)
+from makebreak.systems.perception.numerics.pose_tracker import find_pose, rolling_turn
 
 # Values of the status port.
 TRACKED, NOT_FOUND, OUTLIER, WRONG_IMAGE = 0.0, 1.0, 2.0, 3.0
@@ -102,7 +98,7 @@ class PoseTracker(LeafSystem):
         shape: Shape,
         marker: Marker | None = None,
     ):
-        """Args: camera: its pinhole model; shape: of numerics.pose_tracker.make_shape;
+        """Args: camera: its pinhole model; shape: of object_outline.make_shape;
         marker: by which the object is found instead of its outline.
 
         Raises: ValueError for a setting out of range.
