@@ -932,7 +932,8 @@ def test_an_agreement_that_simulation_does_not_show_at_the_end_is_taken_back(
 
 
 @pytest.mark.parametrize(
-    "closed, expected", [(0.12, "close 12% of the gap"), (float("nan"), "not be judged")]
+    "closed, expected",
+    [(0.12, "close 12% of the gap"), (float("nan"), "not be judged")],
 )
 def test_candidates_that_close_too_little_are_told_and_not_named(closed, expected):
     choice = Choice(Effect("joint_backlash", ["a.j"], {"gap": 0.02}), {"gap": 1e-3},
