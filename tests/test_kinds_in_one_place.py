@@ -46,7 +46,7 @@ KNOWN = {
         "plane_tilt", "wall_position",
     },
     "gap/residuals/contact_problem.py": {
-        "body_drag", "constant_force", "contact_friction", "friction_patch",
+        "actuator_gain", "sensor_delay", "body_drag", "constant_force", "contact_friction", "friction_patch",
         "object_com", "object_inertia", "object_mass", "object_size", "plane_height",
         "plane_tilt",
     },
