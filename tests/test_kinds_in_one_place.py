@@ -34,7 +34,7 @@ KNOWN = {
     "gap/data/check_relations.py": {"clock_skew"},
     "gap/residuals/contact.py": CONTACT,
     "gap/residuals/contact_dynamics.py": {
-        "actuator_bias", "actuator_gain", "input_delay", "object_com",
+        "actuator_bias", "actuator_gain", "input_delay", "object_com", "sensor_bias",
         "object_inertia", "object_mass", "object_size",
     },
     "gap/residuals/permitted_contacts.py": {
@@ -46,7 +46,8 @@ KNOWN = {
         "plane_tilt", "wall_position",
     },
     "gap/residuals/contact_problem.py": {
-        "actuator_gain", "sensor_delay", "body_drag", "constant_force", "contact_friction", "friction_patch",
+        "actuator_gain", "sensor_bias", "sensor_delay",
+        "body_drag", "constant_force", "contact_friction", "friction_patch",
         "object_com", "object_inertia", "object_mass", "object_size", "plane_height",
         "plane_tilt",
     },
