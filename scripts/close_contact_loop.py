@@ -129,10 +129,12 @@ def _places(row, task, effects: Sequence[Mapping]) -> None:
     """Adds a row for the displacement of each surface along its normal."""
     for name, axis in (("table", 2), ("red_block", 1), ("blue_wall", 0)):
         off = float((position(task.world, name) - position(task.model, name))[axis])
-        said = displacement(effects, name, AXES[axis])
-        good = abs(said - off) <= PLACE_M
+        moved = displacement(effects, name, AXES[axis])
+        good = abs(moved - off) <= PLACE_M
         wanted = f"{1e3 * off:.2f} +- {1e3 * PLACE_M:.1f}"
-        row(f"{name}, displaced along {AXES[axis]} [mm]", 0.0, 1e3 * said, wanted, good)
+        row(
+            f"{name}, displaced along {AXES[axis]} [mm]", 0.0, 1e3 * moved, wanted, good
+        )
 
 
 def displacement(effects: Sequence[Mapping], model: str, axis: str) -> float:
@@ -149,10 +151,10 @@ def displacement(effects: Sequence[Mapping], model: str, axis: str) -> float:
 
 def _frictions(row, task, effects: Sequence[Mapping]) -> None:
     for k, (place, truth) in enumerate(zip(PROBES, task.friction, strict=True)):
-        said = friction_at(effects, place, 0.3)
-        good = abs(said / truth - 1.0) <= FRICTION_SHARE
+        mu = friction_at(effects, place, 0.3)
+        good = abs(mu / truth - 1.0) <= FRICTION_SHARE
         what, wanted = f"friction of surface {k + 1}", f"{truth:.4f} +- 5 %"
-        row(what, 0.3, said, wanted, good)
+        row(what, 0.3, mu, wanted, good)
 
 
 def friction_at(effects: Sequence[Mapping], place, own: float) -> float:
