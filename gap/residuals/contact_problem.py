@@ -42,7 +42,7 @@ from makebreak.gap.simulation.contact_windows import (
     varies,
 )
 from makebreak.gap.simulation.measure import gap_measure, series_of
-from makebreak.gap.verdict import NO_GAP
+from makebreak.gap.thresholds import AGREEMENT_RMS_MAX
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
@@ -117,7 +117,7 @@ class ContactProblem(ContactCandidates, GapProblem):
     def _without_nuisances(self) -> np.ndarray:
         """(m,) what the scene as it came leaves, its nuisances fitted to all rows."""
         n, r = self.nuisances(), self.base()
-        return Screen(r, n.columns, n.prior, np.ones(len(r), bool)).settle(r)[1]
+        return Screen(r, n.columns, n.prior, np.ones(len(r), bool)).fit_nuisances(r)[1]
 
     # ----- What models are off by
 
@@ -421,7 +421,7 @@ class ContactProblem(ContactCandidates, GapProblem):
         otherwise, and how."""
         if late := self.late_poses(end):  # All else may follow from it.
             return "".join(late)
-        now, found = widened_contacts(self, end, NO_GAP)
+        now, found = widened_contacts(self, end, AGREEMENT_RMS_MAX)
         off = distances_off(self, end, self.plan.loud)
         return "".join(off) + sentence(now, found)
 
