@@ -19,7 +19,7 @@ from urllib.request import urlopen
 from makebreak.scripts.meshcat_page import with_controls
 
 LIMIT_SEC = 600
-CONNECTS_SEC = 10.0  # So long a page that runs may take to get its scene.
+CONNECTS_SEC = 10.0  # Time in which a running page gets its scene.
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
