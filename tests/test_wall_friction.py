@@ -12,6 +12,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from makebreak.diagrams.wall_friction import (
     BEYOND,
     DURATION,
+    LAST,
     TABLE_Z,
     TIMES,
     WALL_X,
@@ -29,6 +30,9 @@ from makebreak.scripts.experiments.wall_friction import (
     force_trial,
     run,
     share_in_band,
+    simulated,
+    tracking_error,
+    without_noise,
 )
 from makebreak.scripts.session import Session
 from makebreak.systems.baselines.long_term_predictor import OneStepPredictor
@@ -238,6 +242,27 @@ def test_the_share_in_the_band_counts_two_standard_deviations():
 def test_bad_settings_are_refused_by_name(change, says):
     with pytest.raises(ValueError, match=says):
         make_wall_friction(replace(WallFrictionConfig(), **change))
+
+
+def test_a_fed_forward_prediction_takes_the_lag_off(trial):
+    config, watched = trial
+    before = tracking_error(watched, config)
+    # 7.2 N of friction against 300 N/m: 24 mm, less while it builds up.
+    assert 0.015 < before < 0.025
+    data, _ = simulated(config, feedforward=LAST)
+    assert tracking_error(data, config) < 0.1 * before
+    # The friction is what it was.
+    late = along_the_wall(data["time"]) & (data["time"] > TIMES[4] + 1.5)
+    force = data["wrench"][late, 1].mean()
+    assert force == pytest.approx(watched["wrench"][late, 1].mean(), abs=0.3)
+
+
+def test_noise_that_is_independent_is_taken_out_of_an_error():
+    rng = np.random.default_rng(0)
+    error, noise = 0.2 * rng.normal(size=200_000), 0.1 * rng.normal(size=200_000)
+    both = np.sqrt(np.mean((error + noise) ** 2))
+    assert without_noise(both) == pytest.approx(0.2, rel=0.01)
+    assert without_noise(0.05) == 0.0
 
 
 def test_too_few_trials_are_refused_by_name(tmp_path):
