@@ -25,9 +25,10 @@ from makebreak.gap.data.scene_facts import scene_facts, scene_names
 from makebreak.gap.data.split import split, with_noise_of
 from makebreak.gap.parallel import side_by_side
 from makebreak.gap.problem import DISTANCES, Fitted, GapProblem, Outcome, is_sane
-from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.driven import DrivenProblem, is_driven, sticks
 from makebreak.gap.residuals.impacts import ImpactProblem, runs_against, without_contact
+from makebreak.gap.residuals.late_poses import contact_problem
+from makebreak.gap.residuals.lying_on_faces import point_on_face
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.residuals.objects import FlightProblem, RolloutProblem, TouchProblem
 from makebreak.gap.residuals.pressing import PressingProblem, presses
@@ -167,8 +168,8 @@ def problem_for(
         return mechanism, [*touches, *finding, *mechanism.push_findings()]
     if any(joint.num_velocities() for joint in one_dof_joints(dynamics.plant)):
         try:
-            contact = ContactProblem(scene, recordings)
-            return contact, sap_lift(contact)
+            contact = contact_problem(scene, recordings)
+            return contact, sap_lift(contact) + point_on_face(contact)
         except ValueError:  # Not the whole motion is measured, or nothing touches.
             pass
         try:
@@ -196,6 +197,10 @@ def conclude(
     back; they change no effect and no parameter.
     """
     nuisances = selection.nuisances
+    if problem.error(selection.start) <= NO_GAP and all(
+        problem.is_within_law(c.effect) for c in selection.choices
+    ):
+        selection = replace(selection, choices=(), end=selection.start)
     selection, chosen_on = kept_by_simulation(problem, selection, jobs)
     selection, chosen_on = preferred_by_simulation(problem, selection, chosen_on, jobs)
     scattered = scatter(problem, selection.end)
@@ -270,7 +275,13 @@ def conclude(
     near += two_figures(start, problem.error(selection.end), final.gap)
     if verdict == "gap_unnamed":
         near += problem.hint(selection.end)
-    effects = [named(c, problem.dynamics.plant) for c in selection.choices]
+    before = [
+        Choice(f.effect, f.std, f.before, f.after, "", 0.0, (), (), 1)
+        for f in problem.found_before()
+    ]
+    if before and verdict == "no_gap":
+        verdict = "gap_named"
+    effects = [named(c, problem.dynamics.plant) for c in (*before, *selection.choices)]
     fixed = [c.fixed for c in selection.choices]
     prior = nuisances.prior
     return GapResult(

@@ -499,12 +499,12 @@ def test_a_tool_that_leans_on_something_with_little_is_felt(monkeypatch):
         _q=None, _v=None, _vd=None,
     )  # fmt: skip
     sensor = SimpleNamespace(place="tip.tip", frame=None)
-    size = ContactDynamics._force_size(model, sensor)
+    size = ContactDynamics._force_size(model, sensor, np.zeros((1, 3)))
     assert size[:190].max() == 0.0
     np.testing.assert_allclose(size[210:390], 0.4, atol=0.15)  # Five deviations.
     # What the tool's own motion makes in a sensor in its mount is no touch.
     own[200:300, 1] = -0.5
-    size = ContactDynamics._force_size(model, sensor)
+    size = ContactDynamics._force_size(model, sensor, np.zeros((1, 3)))
     assert size[210:295].max() == 0.0 and size[305:390].min() > 0.2
 
 
