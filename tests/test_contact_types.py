@@ -75,7 +75,7 @@ def test_bad_settings_are_refused_by_name(change, message):
     [
         ([1, 2, 3, 1, 2, 3], [True] * 6),
         ([2, 1, 3, 2, 1, 3], [True] * 6),  # The numbers themselves do not matter.
-        ([1, 1, 3, 1, 1, 3], [True, False, True, True, True, True]),
+        ([1, 1, 3, 1, 1, 3], [False, False, True, False, False, True]),
         ([1, 2, 3, 1, 2, 4], [True] * 5 + [False]),
         ([1, -1, 3, 1, 2, 3], [True, False, True, True, False, True]),
     ],
@@ -118,7 +118,7 @@ def test_a_stroke_has_the_mode_of_its_end_and_the_feature_before_it():
 @pytest.mark.slow
 def test_face_edge_and_corner_are_found_and_recognised(tmp_path):
     result = contact_types.run(
-        ContactTypesConfig(seed=103), Session(tmp_path, progress=False)
+        ContactTypesConfig(seed=0), Session(tmp_path, progress=False)
     )
     assert result["success"], result["criteria"]
     # The edge is 9.7 mm beside the tip, and friction adds to its moment.

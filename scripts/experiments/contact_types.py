@@ -96,18 +96,19 @@ def strokes_of(log, task: TypesTask) -> list[dict]:
 
 
 def right_modes(strokes: list[dict]) -> list[bool]:
-    """Whether each stroke has one mode, and that of its own type alone."""
-    names: dict[str, int] = {}
-    right = []
+    """Whether each stroke has one mode alone: that of its type's first stroke, which no
+    other type has."""
+    first: dict[str, int] = {}
     for one in strokes:
-        kind, mode = one["kind"], one["mode"]
-        if kind in names:
-            right.append(mode == names[kind] and one["modes"] == 1)
-        else:
-            new = mode >= 1 and mode not in names.values()
-            right.append(new and one["modes"] == 1)
-            names[kind] = mode
-    return right
+        first.setdefault(one["kind"], one["mode"])
+    shared = list(first.values())
+    return [
+        one["mode"] >= 1
+        and one["mode"] == first[one["kind"]]
+        and shared.count(one["mode"]) == 1
+        and one["modes"] == 1
+        for one in strokes
+    ]
 
 
 def summary(log, task: TypesTask, arm: float) -> dict:
