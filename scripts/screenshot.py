@@ -19,7 +19,7 @@ from urllib.request import urlopen
 from makebreak.scripts.meshcat_page import with_controls
 
 LIMIT_SEC = 600
-CONNECTS_SEC = 10.0  # So long a page that runs may take to get its scene.
+CONNECTS_SEC = 10.0  # Time in which a running page gets its scene.
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
@@ -90,6 +90,7 @@ def screenshot(page: Path | str, picture: Path, size=(1280, 800), wait_ms: int =
             "--enable-unsafe-swiftshader",
             "--ignore-gpu-blocklist",
             "--disable-quic",
+            "--hide-scrollbars",
             "--no-first-run",
             "--disable-background-networking",
             "--disable-component-update",
@@ -100,6 +101,8 @@ def screenshot(page: Path | str, picture: Path, size=(1280, 800), wait_ms: int =
             f"--screenshot={taken}",
             file.as_uri(),
         ]
+        if live:  # Else Meshcat's textures are black: they are of another origin.
+            options.insert(0, "--disable-web-security")
         try:
             done = subprocess.run(
                 [browser, *options], capture_output=True, text=True, timeout=LIMIT_SEC

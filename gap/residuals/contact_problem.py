@@ -45,7 +45,7 @@ from makebreak.gap.simulation.contact_windows import (
 )
 from makebreak.gap.simulation.measure import gap_measure, series_of
 from makebreak.gap.simulation.windows import LARGEST
-from makebreak.gap.verdict import NO_GAP
+from makebreak.gap.thresholds import AGREEMENT_RMS_MAX
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
@@ -177,7 +177,7 @@ class ContactProblem(ContactDynamics, GapProblem):
     def _without_nuisances(self) -> np.ndarray:
         """(m,) what the scene as it came leaves, its nuisances fitted to all rows."""
         n, r = self.nuisances(), self.base()
-        return Screen(r, n.columns, n.prior, np.ones(len(r), bool)).settle(r)[1]
+        return Screen(r, n.columns, n.prior, np.ones(len(r), bool)).fit_nuisances(r)[1]
 
     def _share_out(self, left: np.ndarray) -> None:
         """Which blocks are fitted, by what the scene leaves (rows as `_shown`). What is
@@ -812,7 +812,7 @@ class ContactProblem(ContactDynamics, GapProblem):
         otherwise, and how."""
         if late := self.late_poses(end):  # All else may follow from it.
             return "".join(late)
-        now, found = widened_contacts(self, end, NO_GAP)
+        now, found = widened_contacts(self, end, AGREEMENT_RMS_MAX)
         off = distances_off(self, end, self.plan.loud)
         return "".join(off) + sentence(now, found)
 
