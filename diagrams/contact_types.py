@@ -18,7 +18,7 @@ from makebreak.diagrams.changing_contact import (
     Knowledge,
     make_changing_contact,
 )
-from makebreak.diagrams.given_pattern import begin_there, expected_contacts
+from makebreak.diagrams.given_pattern import expected_contacts, start_at_pattern
 from makebreak.diagrams.tabletop import (
     THREE_SURFACES,
     TOOL,
@@ -145,7 +145,7 @@ def make_task(config: ContactTypesConfig) -> TypesTask:
     set_tool(world, "block")
     set_friction(world, {"surfaces": friction})
     pattern, strokes = make_pattern(config)
-    begin_there(pattern, world, model, TOOL)
+    start_at_pattern(pattern, world, model, TOOL)
     prior = expected_contacts(pattern, PLACE_STD)
     return TypesTask(world, model, pattern, strokes, prior, friction)
 
