@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from makebreak.gap.data.recording import Recording
-from makebreak.gap.numerics.selection import NESTED_GAIN, LinearFit
+from makebreak.gap.numerics.selection import LinearFit
 from makebreak.gap.result import GapMeasure, Series, Unexplained, Where
+from makebreak.gap.thresholds import NESTED_GAIN
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, check_parameters

@@ -104,7 +104,7 @@ def test_a_bias_of_a_force_sensor_is_seen_while_nothing_is_touched(right, tmp_pa
     assert {("sensor_bias", f"tip.tip.{axis}") for axis in BIAS} <= kinds
     screen = screen_of(problem)
     before, after = (
-        screen.judge(problem.residual(effects)).score for effects in ((), there)
+        screen.evaluate(problem.residual(effects)).score for effects in ((), there)
     )
     assert after < 1.1 and before > 1.5 * after
     with pytest.raises(ValueError, match="sensor_bias: of forces"):
@@ -121,7 +121,7 @@ def test_poses_that_come_late_are_put_where_they_belong(right, tmp_path):
     assert (found.effect.kind, found.effect.at) == ("sensor_delay", [BLOCK])
     assert found.effect.parameters["delay"] == pytest.approx(LATE, abs=0.002)
     assert found.after < 0.9 * found.before
-    left = screen_of(problem).judge(problem.base()).score
+    left = screen_of(problem).evaluate(problem.base()).score
     assert left < 1.15
 
 

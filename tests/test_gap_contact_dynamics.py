@@ -24,14 +24,15 @@ from makebreak.gap.numerics import permitted_forces
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Outcome, SearchPlan, is_sane
 from makebreak.gap.residuals import contact_means
+from makebreak.gap.residuals.contact_candidates import _best_rectangles
 from makebreak.gap.residuals.contact_dynamics import ContactDynamics
 from makebreak.gap.residuals.contact_means import felt_motion, variance_of_means
-from makebreak.gap.residuals.contact_problem import ContactProblem, _best_rectangles
+from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.contact_shapes import _Point, _Surface
 from makebreak.gap.residuals.permitted_contacts import Shift
 from makebreak.gap.result import Considered, GapMeasure
+from makebreak.gap.search.choice import Choice, Selection
 from makebreak.gap.search.fit import _Free, fit_effects
-from makebreak.gap.search.select import Choice, Selection
 from makebreak.gap.simulation import contact_windows
 from makebreak.gap.simulation.contact_windows import PushWindows, led_as_measured
 from makebreak.gap.simulation.windows import WindowModel
@@ -675,8 +676,8 @@ def test_a_patch_s_side_that_nothing_crossed_may_be_anywhere():
     "before, after, good",
     [(0.9, 0.8, True), (0.9, 2.1, False), (8.0, 2.0, True), (8.0, 5.0, False)],
 )
-def test_effects_that_make_a_gap_in_simulation_are_not_borne_out(before, after, good):
-    assert workflow._borne_out(GapMeasure(before, after, 1.0, 0.6)) == good
+def test_effects_that_make_a_gap_in_simulation_are_not_confirmed(before, after, good):
+    assert workflow._is_confirmed(GapMeasure(before, after, 1.0, 0.6)) == good
 
 
 def test_a_signal_that_jumps_between_samples_is_known_less_well():

@@ -494,7 +494,7 @@ class PressingProblem(ContactProblem):
         found = self._plain_candidates(current.r, current.effects)
         train = self.train()
         screen = Screen(current.r, nuisances.columns, nuisances.prior, train)
-        r = screen.settle(current.r)[1][train]
+        r = screen.fit_nuisances(current.r)[1][train]
         for c in found:
             if c.kind in (*MOVES, "contact_friction"):
                 for X in c.columns:

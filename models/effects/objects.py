@@ -35,6 +35,7 @@ from makebreak.models.effects.kind import (
     Effect,
     EffectKind,
     Parameter,
+    Tolerance,
     find_bodies,
     find_body,
 )
@@ -296,11 +297,11 @@ KINDS = {
             Parameter("scale", "", 0.5, 2.0, 1.0, valid="> 0", optional=True),
             Parameter("radius", "m", 0.002, 0.5, None, valid="> 0", optional=True),
         ),
-        says="{at} has another size than modelled[: it is {scale} times as large]"
-        "[, its radius is {radius}]",
+        says="{at} has a wrong size in the model[; it really is {scale} times as large]"
+        "[; its radius really is {radius}]",
         confused_with=("plane_height", "contact_stiffness", "length_scale"),
         tell_apart="let it rest on several faces, or roll: height and rate of rolling "
-        "both go with the size",
+        "both depend on the size",
         edit_text=_scale_in_text,
         before_finalize=_scale_shapes,
         now=_size_now,
@@ -323,6 +324,8 @@ KINDS = {
         exported="inertia",
         tell_apart="lift it or knock it: a slow push shows friction times weight only",
         weighs=True,
+        absolute=True,
+        tolerance=Tolerance("link_mass", 0.03, relative=True),
         edit_text=_mass_in_text,
         set_in_context=change_inertia(
             lambda old, new, mass, com, central: (
@@ -347,6 +350,8 @@ KINDS = {
         rank=1,
         check=_some_are_given,
         weighs=True,
+        absolute=True,
+        tolerance=Tolerance("link_com_m", 0.002),
         edit_text=_com_in_text,
         set_in_context=change_inertia(
             lambda old, new, mass, com, central: (mass, _new_com(new, com), central)
@@ -368,6 +373,7 @@ KINDS = {
         rank=1,
         check=_some_are_given,
         weighs=True,
+        absolute=True,
         edit_text=_inertia_in_text,
         set_in_context=change_inertia(
             lambda old, new, mass, com, central: (
