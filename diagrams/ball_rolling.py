@@ -398,9 +398,15 @@ def paper_learner_config(n_lam: int) -> ResidualLearnerConfig:
 
 
 def make_world(
-    config: BallRollingConfig, meshcat: Meshcat | None = None, sampled: bool = False
+    config: BallRollingConfig,
+    meshcat: Meshcat | None = None,
+    sampled: bool = False,
+    scene: Scene | None = None,
 ) -> Diagram:
-    """The station: what is simulated of the experiment, without any controller."""
+    """The station: what is simulated of the experiment, without any controller.
+
+    Args: scene, in place of world_scene(config).
+    """
     if config.camera.position_noise_m != 0.0:
         raise ValueError(
             f"camera.position_noise_m is {config.camera.position_noise_m}, expected 0: "
@@ -417,7 +423,7 @@ def make_world(
             sampled=sampled,
         ),
         meshcat,
-        world_scene(config),
+        world_scene(config) if scene is None else scene,
         wrong=what_goes_wrong(config),
     )
 

@@ -59,6 +59,7 @@ from makebreak.systems.changing_contact.contact_detector import (
 from makebreak.systems.changing_contact.forward_model import (
     ForwardModelBank,
     ForwardModelConfig,
+    HandoverConfig,
 )
 from makebreak.systems.changing_contact.impact_reflex import (
     ImpactReflex,
@@ -116,6 +117,11 @@ class Knowledge:
     contacts: ContactBelief = ContactBelief()
     modes: ModeTable | None = None  # ModeDetector.knowledge
     models: ModelBank | None = None  # ForwardModelBank.knowledge
+
+
+def friction_from_rest() -> ForwardModelConfig:
+    """Forward models that predict the friction of a motion that begins from rest."""
+    return ForwardModelConfig(handover=HandoverConfig(from_rest=True))
 
 
 def tip_mass(arm: MultibodyPlant):
@@ -297,12 +303,13 @@ def make_changing_contact(
     connect(shaper, "force_directions", detector, modes, forward, variable, impedance)
     connect(shaper, "force_targets", detector, variable, impedance)
     connect(shaper, "phase", detector, anticipator, variable)
-    connect(shaper, "x_desired", impedance)
+    connect(shaper, "x_desired", impedance, forward)
     connect(detector, "contact", anticipator, shaper, variable)
     connect(modes, "transition", anticipator, forward)
     connect(modes, "mode", forward)
     connect(modes, "touch_mode", anticipator)
     connect(modes, "collecting", variable)
+    connect(modes, "undecided", forward)
     connect(forward, "wrench_predicted", variable)
     connect(forward, "prediction_error", variable)
     connect(forward, "handing_over", variable)

@@ -15,6 +15,7 @@ from pydrake.systems.framework import Diagram
 from makebreak.diagrams.changing_contact import (
     ChangingContactConfig,
     Knowledge,
+    friction_from_rest,
     make_changing_contact,
 )
 from makebreak.diagrams.realism import StationErrors, draw_errors
@@ -64,10 +65,19 @@ PATH: tuple[tuple[tuple[float, float], ...], ...] = (
 FRICTION, GAP = (0.1, 0.6), 0.1
 FORCE = (0.75, 1.5)  # Of a segment, in shares of the config's.
 SPEED_DOWN = 0.1  # [m/s]
+TOUCH_SPEED = 0.015  # Where the table is expected [m/s].
 # The corners on which the block stands, from its centre; along its sides [m].
 FEET = {"block": 0.012, "sphere": 0.0}
 # A sphere crosses at one point; what is averaged over takes some way.
 SPHERE_CROSSING = 0.01  # [m]
+
+
+def _control() -> ChangingContactConfig:
+    """The defaults, but for a first touch that is no blow: at 50 mm/s the tool bounces,
+    and is in the air while the motion along the surface begins."""
+    config = ChangingContactConfig(forward_model=friction_from_rest())
+    speed = replace(config.anticipator.speed, first=TOUCH_SPEED)
+    return replace(config, anticipator=replace(config.anticipator, speed=speed))
 
 
 @dataclass
@@ -82,7 +92,7 @@ class ChangingSurfaceConfig:
     friction: list[float] = field(default_factory=list)
     model: str = ""  # Scene that the controllers believe; "": the shipped one.
     rehearse: int = 0  # Trials in the model before the first real one.
-    control: ChangingContactConfig = field(default_factory=ChangingContactConfig)
+    control: ChangingContactConfig = field(default_factory=_control)
 
 
 @dataclass(frozen=True, eq=False)
