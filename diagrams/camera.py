@@ -1,4 +1,4 @@
-"""The overhead camera: rendered where the graphics libraries are, else drawn."""
+"""The overhead camera: rendered by VTK if that works on this machine, else drawn."""
 
 import functools
 import subprocess
@@ -27,16 +27,16 @@ from makebreak.systems.perception.camera_shake import CameraShake
 from makebreak.systems.perception.numerics.pinhole import Pinhole, look_down
 from makebreak.systems.perception.pinhole_camera import PinholeCamera
 
-# Drake's VTK picture lies half a pixel towards -u and -v of what its CameraInfo says
-# (tests/test_camera.py measures it); the drawn one lies where VTK's does.
+# Drake's VTK images are shifted by half a pixel towards -u and -v against their
+# CameraInfo (tests/test_camera.py measures it); the drawn images have the same shift.
 VTK_CENTER_SHIFT = -0.5  # [px]
 
-# Pictures this small gain nothing by OpenCV's threads, which spin while they wait: a
-# tenth of all CPU time of a run. The results are the same.
+# On images this small OpenCV's threads gain nothing but spin while they wait: a tenth
+# of a run's CPU time. The results are the same.
 cv2.setNumThreads(1)
 
-# Run in a process of its own: with libegl1 but without Mesa's drivers Drake does not
-# raise, it crashes.
+# Runs in a process of its own: with libegl1 but without Mesa's drivers Drake does not
+# raise an error but crashes.
 _PROBE = """
 from pydrake.geometry import (ClippingRange, ColorRenderCamera, MakeRenderEngineVtk,
                               RenderCameraCore, RenderEngineVtkParams)
@@ -53,17 +53,19 @@ engine.RenderColorImage(ColorRenderCamera(core, False), ImageRgba8U(8, 8))
 class CameraConfig:
     width: int = 320  # [px]
     height: int = 240  # [px]
-    fov_y: float = 0.7  # [rad], of the picture's height (along world x).
+    fov_y: float = 0.7  # Field of view along the image's height (world x) [rad].
     position: list[float] = field(default_factory=lambda: [0.5, 0.0, 0.8])  # [m]
     renderer: str = "auto"  # "vtk", "drawn", or "auto": vtk where it works.
-    position_noise_m: float = 0.0  # Standard deviation of a frame's shift, each way,
-    noise_height: float = 0.0315  # as seen at this height above the world's z = 0 [m].
-    period_sec: float = 0.0125  # Of a frame.
+    # Each frame is shifted at random: standard deviation along u and v, as a length at
+    # a height above the world's z = 0 [m].
+    position_noise_m: float = 0.0
+    noise_height: float = 0.0315
+    period_sec: float = 0.0125  # Between frames.
 
 
 @functools.cache
 def vtk_works() -> bool:
-    """Whether Drake can render here; tried once, in a process of its own."""
+    """Whether Drake can render on this machine; tried once, in its own process."""
     try:
         probe = subprocess.run(
             [sys.executable, "-c", _PROBE], capture_output=True, timeout=120
@@ -74,9 +76,9 @@ def vtk_works() -> bool:
 
 
 def resolve_renderer(config: CameraConfig) -> str:
-    """ "vtk" or "drawn": which one this config means on this machine.
+    """ "vtk" or "drawn": the renderer that this config gives on this machine.
 
-    Raises: ValueError for another name, and for "vtk" where Drake cannot render.
+    Raises: ValueError for an unknown name, or "vtk" where Drake cannot render.
     """
     if config.renderer not in ("auto", "vtk", "drawn"):
         raise ValueError(
@@ -95,12 +97,12 @@ def resolve_renderer(config: CameraConfig) -> str:
 
 
 def describe_camera(config: CameraConfig) -> str:
-    """As result.json has it, like "vtk 320x240"."""
+    """The camera as in result.json: "vtk 320x240"."""
     return f"{resolve_renderer(config)} {config.width}x{config.height}"
 
 
 def camera_model(config: CameraConfig) -> Pinhole:
-    """The pinhole model that fits the pictures of either renderer."""
+    """The pinhole model of the images of either renderer."""
     return look_down(
         config.width, config.height, config.fov_y, config.position, VTK_CENTER_SHIFT
     )
@@ -114,11 +116,11 @@ def add_camera(
     seed: int,
     name: str = "overhead",
 ) -> OutputPort:
-    """Adds a camera that looks straight down, +x of the world up in its picture.
+    """Adds a camera that looks straight down, the world's +x up in its image.
 
-    Args: plant, finalized; seed of the random shifts.
-    Returns: the abstract ImageRgba8U port; a picture is made when it is evaluated.
-    Raises: ValueError for a config that makes no camera.
+    Args: plant: finalized; seed: of the random shifts; name: of the systems.
+    Returns: the abstract ImageRgba8U port; an image is rendered when it is evaluated.
+    Raises: ValueError for a setting out of range.
     """
     if not config.position_noise_m >= 0.0:
         raise ValueError(
@@ -156,9 +158,9 @@ def add_camera(
 
 def _add_vtk(builder, scene_graph, config, camera, name):
     renderer = f"{name}_renderer"
-    # Lit from one point, at the camera: then every way across a sphere is lit alike,
-    # wherever it lies in the picture. (Drake's own light is a direction: it pushes the
-    # picture's centre outwards. Each further light costs a tenth of the time.)
+    # One point light at the camera lights a sphere symmetrically wherever it is in the
+    # image. Drake's default, a directional light, shifts the centre of a sphere's image
+    # outwards. Each further light would cost a tenth of the time.
     light = LightParameter(type="point", frame="camera")
     engine = MakeRenderEngineVtk(RenderEngineVtkParams(lights=[light]))
     scene_graph.AddRenderer(renderer, engine)

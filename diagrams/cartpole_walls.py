@@ -1,10 +1,10 @@
-"""A cart-pole between two soft walls whose places it believes wrongly (ACI-MPC VII-A).
+"""A cart-pole between two soft walls that its model misplaces (ACI-MPC VII-A).
 
     plant --x--> learner --r_comp--> c3 --u--> plant (and, as measured, the learner)
                     ^ lcs             ^ lcs: the model, its walls wrong by gap_error
 
-The plant is either the LCS itself, with the right walls, or a scene's MultibodyPlant:
-the pole then swings nonlinearly and the walls are Drake's compliant point contact.
+The plant is either the LCS itself, with the true walls, or a scene's MultibodyPlant:
+a nonlinear pole and walls of Drake's compliant point contact.
 """
 
 from dataclasses import dataclass, field
@@ -46,15 +46,15 @@ from makebreak.systems.views.legend import LegendConfig
 from makebreak.systems.views.walls_view import WallsView, WallsViewConfig
 
 SCENE = str(MODELS / "cartpole_walls.scene.yaml")
-CAMERA = (0.25, -1.3, 0.6), (0.0, 0.0, 0.35)  # In Meshcat, and what it looks at [m].
+CAMERA = (0.25, -1.3, 0.6), (0.0, 0.0, 0.35)  # Meshcat's position and target [m].
 DT = 0.01  # Time step of the LCS, of C3 and of the learner [s].
-# Learner, C3, then the LCS as plant: no value waits for the next period. (The
-# MultibodyPlant steps every millisecond, and holds u from C3 on.)
+# The learner runs first, then C3, then the LCS as plant, so that no value is a period
+# late. (The MultibodyPlant steps every millisecond and uses u as soon as C3 gives it.)
 LEARNER_OFFSET, C3_OFFSET, PLANT_OFFSET = 1e-4, 2e-4, 3e-4
 
 
 def _learner() -> ResidualLearnerConfig:
-    """For a gap in metres: eps in m/N per squared SI unit, gamma in m/N."""
+    """Settings for gaps in metres: eps [m/N per squared SI unit], gamma [m/N]."""
     return ResidualLearnerConfig(
         eps=30.0, gamma=0.01, n_b=10, learning_rate=3e-3, n_steps=5, r_max=0.5
     )
@@ -62,14 +62,14 @@ def _learner() -> ResidualLearnerConfig:
 
 @dataclass
 class CartpoleWallsConfig:
-    seed: int = 0  # Draws where around x_initial a run starts.
-    # Cart [m], pole [rad], and velocities. At rest, the tip 24 cm towards wall 0.
+    seed: int = 0  # Draws the initial state around x_initial.
+    # Cart [m], pole [rad], and their velocities: at rest, the tip 24 cm towards wall 0.
     x_initial: list[float] = field(default_factory=lambda: [0.0, -0.4, 0.0, 0.0])
     # Half width of the uniform draw in each entry [SI].
     x_spread: list[float] = field(default_factory=lambda: [0.02, 0.02, 0.02, 0.02])
-    adapt: bool = True  # false: learner=none.
-    # What is learned: a residual on the contact equation (r_comp), the baseline on the
-    # dynamics (r_dyn, eq. 10), both or none.
+    adapt: bool = True  # False: as learner=none.
+    # A learned residual of the contact equation (r_comp), of the dynamics (r_dyn, the
+    # baseline, eq. 10), both or none.
     learner: Literal["none", "r_comp", "r_dyn", "both"] = "r_comp"
     projection: Literal["qp", "exact", "plus"] = "qp"  # Of C3.
     # True distance of each wall minus the distance that the model starts with [m].
@@ -79,11 +79,15 @@ class CartpoleWallsConfig:
 
 
 def true_lcs() -> LCS:
+    """The LCS with the true walls."""
     return cartpole_lcs(CartPole(), DT)
 
 
 def model_lcs(config: CartpoleWallsConfig) -> LCS:
-    """What the controllers start from: c = c_true - gap_error."""
+    """The LCS that the controllers start with: c = c_true - gap_error.
+
+    Raises: ValueError for gap_error of another shape.
+    """
     truth = true_lcs()
     error = np.array(config.gap_error, dtype=float)
     if error.shape != (truth.n_lam,) or not np.isfinite(error).all():
@@ -95,12 +99,10 @@ PROJECTIONS = {"qp": QpProjection, "exact": ExactProjection, "plus": PlusProject
 
 
 def c3_config(N: int = 10, projection: str = "qp") -> C3Config:
-    """C3 with a projection of PROJECTIONS, 10 rounds, rho 2, and the public weights.
+    """C3 with a projection of PROJECTIONS, 10 rounds, rho 2, and the published weights.
 
-    The plus projection has weights of eta, too: 1 m of gap weighs as 100 N of force,
-    the wall's stiffness.
-
-    The penetration of a soft wall is its force, so no gap is clamped.
+    The plus projection weights eta too: 1 m of gap as 100 N of force, the wall's
+    stiffness. No gap is clamped, because a soft wall's force is its penetration.
     """
     lcs, n_x = true_lcs(), 4
     Q, R = np.diag([10.0, 2.0, 1.0, 1.0]), np.eye(1)
@@ -121,7 +123,7 @@ def c3_config(N: int = 10, projection: str = "qp") -> C3Config:
 
 
 def initial_state(config: CartpoleWallsConfig) -> np.ndarray:
-    """Where the run of config.seed starts, (n_x,)."""
+    """Initial state (4,) of the run of config.seed. Raises: ValueError."""
     x = np.array(config.x_initial, dtype=float)
     if x.shape != (4,) or not np.isfinite(x).all():
         raise ValueError(f"x_initial is {config.x_initial}, expected 4 numbers")
@@ -137,12 +139,12 @@ def make_cartpole_walls(
 ) -> Diagram:
     """The closed loop.
 
-    Outputs: x (4,) the plant's state; u (1,) [N]; r_comp (2,) [m], zero without
-        adaptation of the contact; with it loss (1,), learner_status (1,);
-        c3_status (1,).
+    Outputs: x (4,): the plant's state; u (1,) [N]; r_comp (2,) [m], zero if it is not
+        learned; if it is, loss (1,) and learner_status (1,); c3_status (1,).
 
-    Args: multibody: the plant is the scene's, else the LCS with the right walls;
-        meshcat: where a multibody plant is seen, with the walls as they are believed.
+    Args: multibody: the plant is the scene's, else the LCS with the true walls;
+        meshcat: shows a multibody plant, and the walls of the learned model.
+    Raises: ValueError for a setting out of range, or a scene of other sizes.
     """
     builder = DiagramBuilder()
     model = model_lcs(config)
@@ -192,7 +194,7 @@ def make_cartpole_walls(
             "learner", ResidualLearner(config.learning, model, DT, LEARNER_OFFSET)
         )
         builder.Connect(x, learner.GetInputPort("x"))
-        # Until C3's next update this is what acted since its last one.
+        # The learner runs before C3's update: u still is what acted in this period.
         builder.Connect(u, learner.GetInputPort("u_measured"))
         builder.Connect(lcs.get_output_port(), learner.GetInputPort("lcs"))
         r_comp = learner.GetOutputPort("r_comp")

@@ -10,7 +10,7 @@
     impedance_controller --tau--> station
 
 Experiments choose the world, the motion and what is known beforehand. A trial is one
-simulation; `knowledge` reads what was learned in it, for the next one.
+simulation; `learned` reads what was learned in it, for the next trial.
 """
 
 from dataclasses import dataclass, field, replace
@@ -18,11 +18,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 
+from makebreak.diagrams.arm_reach import ArmReach
 from makebreak.diagrams.fault_kinds import read_faults
+from makebreak.diagrams.given_pattern import drawn
 from makebreak.diagrams.realism import StationErrors, with_errors
 from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.station import (
@@ -82,9 +83,9 @@ from makebreak.systems.views.legend import LegendConfig
 
 # Periods [s].
 TICK, ESTIMATE, ANTICIPATE = 0.001, 0.005, 0.01
-# All that estimates or plans runs at one instant, 0.1 ms after the plant's step, and
-# reads the others' values of the millisecond before; the arm's law runs last. One more
-# instant per millisecond would cost more than these systems' own work.
+# All systems that estimate or plan run at one instant, 0.1 ms after the plant's step,
+# and read the others' values of the last millisecond; the impedance controller runs
+# after them. Further instants would cost more computing time than the systems do.
 OFFSET, IMPEDANCE_OFFSET = 1e-4, 7e-4
 
 
@@ -107,7 +108,7 @@ class ChangingContactConfig:
         default_factory=lambda: HybridConfig(damping_ratio=0.9)
     )
     reflex: ImpactReflexConfig = field(default_factory=ImpactReflexConfig)  # Off.
-    faults: list[str] = field(default_factory=list)  # What goes wrong, by --fault.
+    faults: list[str] = field(default_factory=list)  # Injected by --fault.
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,39 +126,23 @@ def friction_from_rest() -> ForwardModelConfig:
 
 
 def tip_mass(arm: MultibodyPlant):
-    """The arm's effective mass at its tip: a function of p_WE (3,) and a unit vector d
-    (3,) that gives 1/(d' J M^-1 J' d) [kg], by the control plant, with the tip's
-    orientation of its default positions, in the configuration nearest to those.
+    """The arm's effective mass at its tip as a function of position and direction.
+
+    Returns: a function of p_WE (3,) [m] and a unit vector d (3,) that gives
+        1 / (d' J M^-1 J' d) [kg], in the configuration nearest to the arm's default
+        positions in which the tip is at p_WE with its default orientation.
     """
-    context = arm.CreateDefaultContext()
-    q_default = arm.GetPositions(context)
-    world, tip = arm.world_frame(), arm.GetFrameByName(TIP_FRAME)
-    R_default = tip.CalcRotationMatrixInWorld(context)
+    reach = ArmReach(arm)
 
     def mass(p, d) -> float:
-        q = q_default.copy()
-        for _ in range(30):  # Gauss-Newton; out of its reach the arm stays near it.
-            arm.SetPositions(context, q)
-            X = tip.CalcPoseInWorld(context)
-            J = arm.CalcJacobianSpatialVelocity(
-                context, JacobianWrtVariable.kV, tip, np.zeros(3), world, world
-            )
-            turn = (R_default @ X.rotation().inverse()).ToAngleAxis()
-            away = np.r_[turn.angle() * turn.axis(), p - X.translation()]
-            inverse = J.T @ np.linalg.inv(J @ J.T + 1e-4 * np.eye(6))
-            back = q_default - q
-            step = inverse @ (away - J @ back) + back  # The null space goes back.
-            q = q + step
-            if np.linalg.norm(step) < 1e-4:
-                break
-        J = J[3:]
-        M = arm.CalcMassMatrix(context)
-        return float(1.0 / (d @ J @ np.linalg.solve(M, J.T @ d)))
+        q = reach.positions(p, reach.R_default, reach.q_default)
+        J = reach.jacobian(q)[3:]
+        return float(1.0 / (d @ J @ np.linalg.solve(reach.mass_matrix(q), J.T @ d)))
 
     return mass
 
 
-# What `telemetry` gives: name -> (system, port, size).
+# Signals of `telemetry`: name -> (system, port, size).
 SIGNALS = {
     "ee_pose": ("tip_state", "ee_pose", 7),
     "ee_velocity": ("tip_state", "ee_velocity", 6),
@@ -196,21 +181,21 @@ def make_changing_contact(
     view: ContactViewConfig | None = None,
     errors: StationErrors | None = None,
 ) -> Diagram:
-    """The station and the systems of both levels, each by name in the diagram.
+    """The station and all systems; each can be asked for by name.
 
     Args:
-        config: of the systems; their periods and offsets are set here.
-        world: the scene that is simulated; only sensor readings leave it.
-        model: the scene from which the arm's control plant is made.
+        config: of the systems; this function sets their periods and offsets.
+        world: the simulated scene; only sensor readings leave it.
+        model: the scene of the arm's control plant.
         pattern: the motion to follow.
-        knowledge: what is known beforehand; None: nothing.
-        tool: name of the model instance of the tool.
+        knowledge: from earlier trials; None: none.
+        tool: name of the tool's model instance.
         noise: of the sensors; None: the station's default.
         seed: of the sensors' noise.
-        meshcat: where it is seen; None: nowhere.
-        view: how it is seen there; None: as by default.
-        errors: of the station, which the model does not have; None: none. The first of
-            the world's objects is its table.
+        meshcat: shows the run; None: it is not shown.
+        view: settings of Meshcat's view; None: the defaults.
+        errors: of the station, which the model lacks; None: none. The first of the
+            world's objects has to be its table.
     Raises: ValueError for periods or offsets in config that are not the defaults.
     """
     known = knowledge or Knowledge()
@@ -218,10 +203,10 @@ def make_changing_contact(
     if errors is not None:
         world = with_errors(world, errors, ARM, tool, objects(world)[0])
     wrong = None
-    if config.faults:  # A stray box is half way along the first segment.
-        way = pattern.segments[0].positions[:, :3]
+    if config.faults:  # A stray box stands in the middle of the first segment.
+        first = pattern.segments[0].positions[:, :3]
         faults = read_faults(config.faults, ("scene",))
-        wrong = StationFaults(faults, tuple(way.mean(axis=0).tolist()))
+        wrong = StationFaults(faults, tuple(first.mean(axis=0).tolist()))
     station = builder.AddNamedSystem(
         "station",
         make_station(
@@ -240,7 +225,7 @@ def make_changing_contact(
     )
     arm = make_control_plant(model, tool)
     chain = serial_chain_of(arm, TIP_FRAME)
-    # The speed of approach depends on how hard the arm brakes.
+    # The approach speed of the anticipator depends on how hard the reflex brakes.
     speed = replace(
         config.anticipator.speed,
         reflex_gain=config.reflex.gain,
@@ -332,10 +317,10 @@ def make_changing_contact(
     connect(impedance, "tau", station, port=f"{ARM}.torque_commanded")
 
     record_station(builder, station, impedance.GetOutputPort("tau"), tool)
-    # For scoring and for the eye alone.
+    # Only for scoring and plots.
     _add_telemetry(builder, SIGNALS)
     if meshcat is not None:
-        seen = ContactView(view or ContactViewConfig(), meshcat)
+        seen = ContactView(view or ContactViewConfig(), meshcat, plan=drawn(pattern))
         add("contact_view", seen)
         connect(anticipator, "contacts", seen)
         connect(station, felt, seen, port="wrench")
@@ -351,7 +336,7 @@ def make_changing_contact(
 
 
 def _add_telemetry(builder: DiagramBuilder, signals) -> None:
-    """One log at 1 kHz of all signals side by side."""
+    """One log of all signals side by side, at 1 kHz."""
     bundle = builder.AddNamedSystem(
         "telemetry", Multiplexer([size for _, _, size in signals.values()])
     )
@@ -363,8 +348,8 @@ def _add_telemetry(builder: DiagramBuilder, signals) -> None:
 
 
 def telemetry(diagram: Diagram, context: Context) -> dict[str, np.ndarray]:
-    """What was logged in a simulation that ended in `context`: time (n,), and each of
-    SIGNALS (n, k), a row per millisecond, taken before the events of that instant."""
+    """The logs of a simulation that ended in `context`: time (n,) [s] and each of
+    SIGNALS (n, k), a row per millisecond, sampled before the events of that instant."""
     log = diagram.GetSubsystemByName("telemetry_log").FindLog(context)
     out = {"time": np.array(log.sample_times())}
     data, start = log.data(), 0
@@ -375,7 +360,7 @@ def telemetry(diagram: Diagram, context: Context) -> dict[str, np.ndarray]:
 
 
 def learned(diagram: Diagram, context: Context) -> Knowledge:
-    """What the systems know at the end of a trial, for the next one."""
+    """What the systems have learned at the end of a trial, for the next one."""
 
     def of(name):
         system = diagram.GetSubsystemByName(name)

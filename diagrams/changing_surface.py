@@ -1,9 +1,9 @@
 """A block slides over three surfaces of unknown friction (CC 4.3, figures 8 to 10).
 
-It comes down on the first surface and goes along a path of straight lines and an arc
-that crosses every seam in several directions; each segment presses with a force of its
-own. Nothing is known of the surfaces at first. The frictions (0.1 to 0.6, gaps of 0.1
-and more), the forces and the sensors' noise differ by seed.
+It comes down on the first surface and follows a path of straight lines and an arc that
+crosses every seam in several directions, pressing with another force in each segment.
+At first nothing is known about the surfaces. The seed draws the frictions (0.1 to 0.6,
+at least 0.1 apart), the forces and the sensors' noise.
 """
 
 from dataclasses import dataclass, field, replace
@@ -18,6 +18,7 @@ from makebreak.diagrams.changing_contact import (
     friction_from_rest,
     make_changing_contact,
 )
+from makebreak.diagrams.given_pattern import begin_there, expected_contacts
 from makebreak.diagrams.realism import StationErrors, draw_errors
 from makebreak.diagrams.tabletop import (
     THREE_SURFACES,
@@ -46,9 +47,10 @@ AREAS = [
     FrictionZone(x=[0.0, SEAM_X], y=[SEAM_Y, 1.0]),
     FrictionZone(x=[SEAM_X, 1.0], y=[-1.0, 1.0]),
 ]
-START = (0.42, -0.16, 0.195)  # Of the tip in the scene [m].
+START = (0.42, -0.16, 0.195)  # Initial position of the tip in the world [m].
 DOWN = np.array([0.0, 0.0, -1.0])
-# The path on the surfaces [m]; three points: an arc.
+# The path on the surfaces, x and y [m]; three points make an arc. Beside each piece the
+# surfaces that it crosses.
 PATH: tuple[tuple[tuple[float, float], ...], ...] = (
     ((0.42, -0.16), (0.42, 0.12)),  # 1 -> 2
     ((0.42, 0.12), (0.58, 0.12)),  # 2 -> 3
@@ -62,14 +64,16 @@ PATH: tuple[tuple[tuple[float, float], ...], ...] = (
     ((0.58, 0.07), (0.43, 0.08)),  # 3 -> 2: a seam the other way.
     ((0.43, 0.08), (0.42, -0.12)),  # 2 -> 1
 )
-FRICTION, GAP = (0.1, 0.6), 0.1
-FORCE = (0.75, 1.5)  # Of a segment, in shares of the config's.
+FRICTION, GAP = (0.1, 0.6), 0.1  # Range, and the least difference of two surfaces.
+FORCE = (0.75, 1.5)  # Range of a segment's force over the config's normal_force.
 SPEED_DOWN = 0.1  # [m/s]
 TOUCH_SPEED = 0.015  # Where the table is expected [m/s].
-# The corners on which the block stands, from its centre; along its sides [m].
+GIVEN_STD = 0.005  # Of where a given motion expects its contacts [m].
+# Distance of the corners on which the tool stands from its centre, in x and in y [m].
 FEET = {"block": 0.012, "sphere": 0.0}
-# A sphere crosses at one point; what is averaged over takes some way.
-SPHERE_CROSSING = 0.01  # [m]
+# Length over which a sphere's crossing of a seam shows in the features: it crosses at
+# one point, but the features are averages [m].
+SPHERE_CROSSING = 0.01
 
 
 def _control() -> ChangingContactConfig:
@@ -85,43 +89,54 @@ class ChangingSurfaceConfig:
     seed: int = 0
     tool: str = "block"  # Or "sphere".
     speed: float = 0.1  # Of sliding [m/s].
-    normal_force: float = 8.0  # About; each segment has its own [N].
+    normal_force: float = 8.0  # Each segment has its own, within FORCE of this [N].
     realism: str = "none"  # Errors of the station: "none", "lab" or "poor".
-    baselines: bool = True  # Constant K_max and constant K_free as well.
+    baselines: bool = True  # Also runs constant stiffnesses, K_max and K_free.
     # Of the three surfaces; empty: drawn by the seed.
     friction: list[float] = field(default_factory=list)
-    model: str = ""  # Scene that the controllers believe; "": the shipped one.
+    # File of a motion to follow in place of the shipped one: a pattern (.yaml) or a
+    # recorded demonstration; `speed` and `normal_force` have no meaning then.
+    pattern: str = ""
+    model: str = ""  # Scene file of the controllers' model; "": the shipped one.
     rehearse: int = 0  # Trials in the model before the first real one.
     control: ChangingContactConfig = field(default_factory=_control)
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceTask:
-    """The world and the motion of a seed."""
+    """World, motion and prior of a seed."""
 
     world: Scene
     model: Scene
     pattern: MotionPattern
-    prior: ContactBelief  # Where the table is is known.
-    friction: np.ndarray  # (3,)
-    forces: np.ndarray  # (n_segments - 1,) [N]
+    prior: ContactBelief  # The contact with the table, whose position is known.
+    friction: np.ndarray  # (3,) of the surfaces.
+    forces: np.ndarray  # (n,) of the segments that press on the surfaces [N]
     errors: StationErrors
-    feet: float  # From the tip to the corners it stands on, along x and y [m].
+    feet: float  # From the tip to the corners it stands on, in x and in y [m].
 
 
 def draw_friction(rng: np.random.Generator) -> np.ndarray:
-    """(3,) at random, each GAP or more from the others."""
+    """Three frictions (3,) from the range FRICTION, at least GAP apart."""
     while True:
         mu = rng.uniform(*FRICTION, size=3)
         if np.diff(np.sort(mu)).min() >= GAP:
             return mu
 
 
-def make_task(config: ChangingSurfaceConfig) -> SurfaceTask:
-    """The world and the motion of config.seed.
+def make_task(
+    config: ChangingSurfaceConfig, given: MotionPattern | None = None
+) -> SurfaceTask:
+    """World, motion and prior of config.seed.
 
-    Raises: ValueError for an unknown tool, or numbers that are not positive.
+    Args: given, the motion of config.pattern, if that is not empty.
+    Raises: ValueError for an unknown tool, a setting out of range, or a motion that the
+        arm cannot follow.
     """
+    if bool(config.pattern) != (given is not None):
+        raise ValueError(
+            f'pattern is "{config.pattern}", expected the motion of that file beside it'
+        )
     for name in ("speed", "normal_force"):
         value = getattr(config, name)
         if not 0.0 < value < np.inf:
@@ -139,11 +154,16 @@ def make_task(config: ChangingSurfaceConfig) -> SurfaceTask:
     contact = ExpectedContact(
         np.array([START[0], START[1], half]), 1e-6 * np.eye(3), DOWN, segment=0
     )
+    pattern, prior = make_pattern(config, half, forces), ContactBelief((contact,))
+    if given is not None:
+        begin_there(given, world, model, TOOL)
+        pattern, prior = given, expected_contacts(given, GIVEN_STD)
+        forces = np.concatenate([s.force_targets for s in given.segments])
     return SurfaceTask(
         world,
         model,
-        make_pattern(config, half, forces),
-        ContactBelief((contact,)),
+        pattern,
+        prior,
         friction,
         forces,
         draw_errors(config.realism, config.seed),
@@ -152,7 +172,10 @@ def make_task(config: ChangingSurfaceConfig) -> SurfaceTask:
 
 
 def make_pattern(config: ChangingSurfaceConfig, half: float, forces) -> MotionPattern:
-    """Down, then along PATH, at rest between its pieces."""
+    """Down, then along PATH, stopping after each piece.
+
+    Args: half: half width of the tool [m]; forces (n_pieces,) [N].
+    """
     a_max = 1.0
     down = np.array([START, (START[0], START[1], half)])
     time = segment_time(START[2] - half, SPEED_DOWN, a_max, stops=False)
@@ -160,7 +183,7 @@ def make_pattern(config: ChangingSurfaceConfig, half: float, forces) -> MotionPa
     for piece, force in zip(PATH, forces, strict=True):
         points = np.column_stack([np.array(piece), np.full(len(piece), half)])
         kind = "arc" if len(piece) == 3 else "line"
-        # The length of an arc is the pattern's to find; this one's to 1e-3.
+        # Only for the duration; MotionPattern computes the arc's exact length.
         length = float(np.linalg.norm(points[-1] - points[0]))
         if kind == "arc":
             sagitta = float(np.linalg.norm(points[1] - (points[0] + points[-1]) / 2))
@@ -183,7 +206,7 @@ def make_pattern(config: ChangingSurfaceConfig, half: float, forces) -> MotionPa
 def constant_stiffness(
     config: ChangingSurfaceConfig, stiffness: float
 ) -> ChangingSurfaceConfig:
-    """The baseline: the same but for a stiffness [N/m] that stays, no feed-forward."""
+    """The baseline: a constant stiffness [N/m] and no feed-forward."""
     law = config.control.variable_impedance
     fixed = replace(law.stiffness, free=stiffness, maximum=stiffness)
     law = replace(law, stiffness=fixed, feedforward=False)
@@ -196,9 +219,9 @@ def make_changing_surface(
     knowledge: Knowledge | None = None,
     meshcat: Meshcat | None = None,
 ) -> Diagram:
-    """The station and all systems. Args: knowledge: of an earlier trial, if any."""
+    """The diagram of one trial. Args: knowledge: from an earlier trial; None: prior."""
     modes = config.control.modes
-    # How the tool crosses a seam is its own geometry.
+    # The length of a crossing follows from the tool's own geometry.
     crossing = modes.crossing if task.feet else SPHERE_CROSSING
     return make_changing_contact(
         replace(config.control, modes=replace(modes, crossing=crossing)),
@@ -214,9 +237,9 @@ def make_changing_surface(
 
 
 def surface_at(p, feet: float):
-    """Which surface each foot stands on. Args: p (n, 3) of the tip [m].
+    """Number of the surface (n, 4), 1 to 3, under each corner of the tool.
 
-    Returns: (n, 4) numbers from 1 to 3.
+    Args: p (n, 3): of the tip [m]; feet: as in SurfaceTask [m].
     """
     p = np.asarray(p)
     at = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * feet

@@ -1,9 +1,9 @@
-"""Three contacts, met again and again (CC section 4.5.1, figures 17, 18, table 1).
+"""Positions of three contacts, learned over trials (CC 4.5.1, fig. 17, 18, table 1).
 
 A block comes down on a table, slides along it to a wall, and along both to a second
-wall. Where they are is known to 0.1 m at first; each trial begins with what the last
-one has learned. The world differs by seed: positions within 5 cm, frictions 0.1 to 0.6,
-the signs of the initial errors, the stiffness of each surface.
+wall. At first the positions of the three surfaces are known to 0.1 m; each trial starts
+with what the last one learned. The seed draws the surfaces' positions (within 5 cm),
+frictions (0.1 to 0.6) and stiffnesses, and the signs of the initial errors.
 """
 
 from dataclasses import dataclass, field
@@ -58,14 +58,15 @@ from makebreak.systems.changing_contact.velocity_shaper import (
 )
 
 SURFACES = ("table", "red_block", "blue_wall")  # Of contacts 1, 2, 3.
+# Direction of the motion into each contact, in the world.
 DIRECTIONS = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
 ERRORS = (0.12, 0.09, 0.10)  # Of the initial estimates, along DIRECTIONS [m].
-SIGMA = 0.08  # Of them [m].
-FRICTION = (0.1, 0.6)
-START = (0.42, -0.16, 0.195)  # Of the tip in the scene [m].
-BEYOND = 0.06  # How far behind the nominal surfaces the motion pattern goes [m].
+SIGMA = 0.08  # Standard deviation of the initial estimates [m].
+FRICTION = (0.1, 0.6)  # Range.
+START = (0.42, -0.16, 0.195)  # Initial position of the tip in the world [m].
+BEYOND = 0.06  # Distance by which the motion pattern aims behind each surface [m].
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # Of the tip's frame: the flange straight down.
-BACK = 0.03  # Length of the last segment, which takes the third contact up [m].
+BACK = 0.03  # Length of the last segment, in which the third contact is held [m].
 
 
 @dataclass
@@ -78,11 +79,11 @@ class ContactLearningConfig:
     realism: str = "none"  # Errors of the station: "none", "lab" or "poor".
     # Of each surface, drawn log-uniformly from this range [N/m].
     stiffness: list[float] = field(default_factory=lambda: list(STIFFNESS_RANGE))
-    # In the world table, red block and blue wall are up to so far from where the
-    # scene has them [m], and have these frictions.
+    # Largest displacement of table, red block and blue wall in the world from where the
+    # scene has them [m], and their frictions.
     spread: float = SPREAD
     friction: list[float] = field(default_factory=list)  # Empty: drawn by the seed.
-    model: str = ""  # Scene that the controllers believe; "": the shipped one.
+    model: str = ""  # Scene file of the controllers' model; "": the shipped one.
     rehearse: int = 0  # Trials in the model before the first real one.
     control: ChangingContactConfig = field(
         default_factory=lambda: ChangingContactConfig(
@@ -91,7 +92,7 @@ class ContactLearningConfig:
                     stiffness_most=STIFFNESS_RANGE[1], growth=10.0
                 )
             ),
-            # Contacts are felt to 0.1 mm here, so the margin is less than elsewhere.
+            # Contacts are located to 0.1 mm here, so a smaller margin will do.
             shaper=VelocityShaperConfig(region=RegionConfig(margin=0.002)),
             detector=ContactDetectorConfig(impact_force=1.0),
             reflex=ImpactReflexConfig(gain=4.0, force_least=2.0),
@@ -101,14 +102,14 @@ class ContactLearningConfig:
 
 @dataclass(frozen=True, eq=False)
 class ContactTask:
-    """What the trials of one seed have in common."""
+    """World, motion and prior, which all trials of one seed share."""
 
     world: Scene
     model: Scene
     pattern: MotionPattern
-    truth: np.ndarray  # (3, 3) p_WE at each contact, along its direction only [m].
-    prior: ContactBelief
-    model_prior: ContactBelief  # Where the model has them, about.
+    truth: np.ndarray  # (3, 3) p_WE at each contact [m]; counts along its direction.
+    prior: ContactBelief  # Initial estimate, wrong by ERRORS.
+    model_prior: ContactBelief  # Initial estimate from the model scene.
     friction: np.ndarray  # (3,)
     stiffness: dict[str, float]  # Of the tool against each surface [N/m].
     errors: StationErrors
@@ -116,9 +117,9 @@ class ContactTask:
 
 
 def make_task(config: ContactLearningConfig) -> ContactTask:
-    """The world, the motion and the initial belief of config.seed.
+    """World, motion and prior of config.seed.
 
-    Raises: ValueError for an unknown tool, or numbers that are not positive.
+    Raises: ValueError for an unknown tool or a setting out of range.
     """
     for name in ("trials", "speed", "normal_force"):
         value = getattr(config, name)
@@ -142,7 +143,7 @@ def make_task(config: ContactLearningConfig) -> ContactTask:
     pattern = make_pattern(config, half)
     for i, d in enumerate(DIRECTIONS):
         axis = int(np.argmax(abs(d)))
-        # Across, where the motion comes: surfaces met before decide it.
+        # This coordinate holds for the later contacts too: the tool stays in contact.
         truth[i:, axis] = places[i, axis] - half * d[axis]
     prior: list[ExpectedContact] = []
     modelled: list[ExpectedContact] = []
@@ -150,11 +151,11 @@ def make_task(config: ContactLearningConfig) -> ContactTask:
         mean = pattern.segments[i].positions[0].copy()
         sign = rng.choice([-1.0, 1.0])
         axis = int(np.argmax(abs(d)))
-        there = mean.copy()
-        there[axis] = position(model, SURFACES[i])[axis] - half * d[axis]
+        model_mean = mean.copy()
+        model_mean[axis] = position(model, SURFACES[i])[axis] - half * d[axis]
         mean[axis] = truth[i, axis] + sign * ERRORS[i]
-        for each, place in ((prior, mean), (modelled, there)):
-            each.append(ExpectedContact(place, SIGMA**2 * np.eye(3), d, segment=i))
+        for contacts, p in ((prior, mean), (modelled, model_mean)):
+            contacts.append(ExpectedContact(p, SIGMA**2 * np.eye(3), d, segment=i))
     stiffness = draw_stiffness(rng, SURFACES, config.stiffness)
     set_stiffness(world, config.tool, stiffness)
     return ContactTask(
@@ -172,7 +173,10 @@ def make_task(config: ContactLearningConfig) -> ContactTask:
 
 
 def make_pattern(config: ContactLearningConfig, half: float) -> MotionPattern:
-    """Down, to the left, forwards, a little back; BEYOND each nominal surface."""
+    """Down, to the left, forwards, then back a little, BEYOND each nominal surface.
+
+    Args: half: half width of the tool [m].
+    """
     scene = read_scene(TABLETOP_WALLS)
     corners, p = [np.array(START)], np.array(START)
     for name, d in zip(SURFACES, DIRECTIONS, strict=True):
@@ -215,7 +219,11 @@ def make_contact_learning(
     trial: int = 0,
     meshcat: Meshcat | None = None,
 ) -> Diagram:
-    """One trial. Args: knowledge: of the trial before; None: the prior alone."""
+    """The diagram of one trial.
+
+    Args: knowledge: from the trial before, None: the prior alone; trial: its number,
+        for the noise's seed.
+    """
     return make_changing_contact(
         config.control,
         task.world,

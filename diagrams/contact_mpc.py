@@ -1,4 +1,4 @@
-"""A controller that plans through contact, for any plant: the LCS builder and C3."""
+"""A controller that plans through contact for any plant: LCS builder and C3."""
 
 from dataclasses import dataclass, field
 
@@ -22,25 +22,26 @@ class ContactMpcConfig:
     Q: list[float] = field(default_factory=list)
     R: list[float] = field(default_factory=list)
     x_desired: list[float] = field(default_factory=list)  # (n_x,) [SI]
-    dt_sec: float = 0.05  # Of the plan's knots [s].
+    dt_sec: float = 0.05  # Between the knots of a plan [s].
     period_sec: float = 0.0125  # Between two plans [s].
     options: C3Options = field(
         default_factory=lambda: C3Options(N=10, rounds=5, polish=3)
     )
     bounds: C3Bounds = field(default_factory=C3Bounds)
-    closest: int | None = None  # So many contacts, the nearest of all; None: all.
-    # Each knot has its own LCS, along the last plan; else all have that of the state.
+    closest: int | None = None  # Only so many contacts, the nearest ones; None: all.
+    # Each knot has its own LCS, taken along the last plan; else all have the LCS about
+    # the present state.
     lcs_along_plan: bool = False
 
 
 def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
-    """C3+ on the LCS about the present state, its plan polished.
+    """C3+ on the LCS about the present state.
 
     Inputs:  x (n_x,), the state [q, v] of the model's plant.
     Outputs: u (n_u,) [N, N m]; status (1,), a C3Status; plan, a Plan (abstract).
 
-    Args: model: holds the controller's own plant and its scene graph; see AnitescuLcs.
-    Raises: ValueError naming what does not fit.
+    Args: model: a diagram of the controller's own plant and scene graph (AnitescuLcs).
+    Raises: ValueError for weights or a goal of another size.
     """
     c, builder = config, DiagramBuilder()
     lcs = builder.AddNamedSystem(
@@ -67,7 +68,8 @@ def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
             f"ContactMpcConfig.x_desired has {len(c.x_desired)} entries, expected "
             f"{n_x}: {lcs.model.x_names}"
         )
-    # Consensus of [x, lam, u, eta]: forces and gaps agree, x and u hardly have to.
+    # Consensus weights of [x, lam, u, eta]: forces and gaps have to agree between C3's
+    # two steps, x and u hardly.
     G = np.repeat([0.01, 1.0, 0.01, 1.0], [n_x, n_lam, n_u, n_lam])
     U = np.repeat([1.0, 1.0, 1.0, 10.0], [n_x, n_lam, n_u, n_lam])
     weights = C3Weights(np.array(c.Q), np.array(c.R), G, U)
@@ -76,7 +78,7 @@ def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
         C3Mpc(
             C3Config(weights, options=c.options, bounds=c.bounds),
             c.period_sec,
-            offset_sec=1e-4,  # After the builder: the LCS is that of this state.
+            offset_sec=1e-4,  # After the builder, so that the LCS is about this state.
         ),
     )
     goal = builder.AddSystem(

@@ -1,7 +1,7 @@
-"""What can go wrong in a station, by name, and how `--fault` is read.
+"""The faults that `--fault` can inject into a station, and how its text is parsed.
 
-A fault is a text, NAME[:from=S,for=S,...=...]. `from` is when it begins and `for` how
-long it lasts [s]. What it does is in faults.py.
+A fault is written NAME[:from=S,for=S,...=...]: `from` is its start and `for` its
+duration [s]. faults.py implements them.
 """
 
 import math
@@ -18,17 +18,19 @@ TICK = 0.001  # Of the station [s].
 class Fault:
     """A kind of fault.
 
-    on: what it acts on: camera, ball, arm, command, position_velocity,
-        torque or wrench (a sensor), planner or scene.
-    recoverable: whether the task should go on during it or after it; else the arm is
-        to be held safely. Said before anything was run.
-    numbers: {name: value}, its own settings with their defaults.
+    says: what happens, in one line.
+    on: what it acts on: camera, ball, arm, command, planner, scene, or the sensor
+        position_velocity, torque or wrench.
+    recoverable: whether the task should continue during or after it; else the arm has
+        to be held safely. Decided before anything was run.
+    lasts: duration [s], unless `for` is given.
+    numbers: its own settings, {name: default}.
     """
 
     says: str
     on: str
     recoverable: bool
-    lasts: float  # Unless `for` says otherwise [s].
+    lasts: float
     numbers: dict[str, float] = field(default_factory=dict)
 
 
@@ -112,21 +114,21 @@ FAULTS: dict[str, Fault] = {
         "a fixed box stands on the path, from the beginning on", "scene", False, ALWAYS
     ),
 }  # fmt: skip
-# Of settings: least, most, whether it is a whole number.
+# Range of a setting: minimum, maximum, whether it is an integer.
 RANGES: dict[str, tuple[float, float, bool]] = {
     "sec": (TICK, 1.0, False),
     "joint": (1, 7, True),
     "joints": (1, 7, True),
-    "frames": (0, 80, True),  # A second of them.
+    "frames": (0, 80, True),  # 80: one second.
     "share": (0.0, 1.0, False),
     "coulomb": (0.0, 100.0, False),
 }
-FROM = 6.0  # When a fault begins, unless `from` says otherwise [s].
+FROM = 6.0  # Start of a fault, unless `from` is given [s].
 
 
 @dataclass(frozen=True)
 class Injected:
-    """A fault that is asked for: FAULTS[name] from `start` to `end` [s]."""
+    """A requested fault: FAULTS[name] from `start` to `end` [s]."""
 
     name: str
     start: float
@@ -139,10 +141,9 @@ class Injected:
 
 
 def read_fault(text: str) -> Injected:
-    """NAME[:from=S,for=S,...=...] as a fault.
+    """Parses NAME[:from=S,for=S,...=...].
 
-    Raises: ValueError in one line for an unknown name or setting, or a value that is
-        no number.
+    Raises: ValueError for an unknown name or setting, or a value out of range.
     """
     name, _, rest = text.partition(":")
     if name not in FAULTS:
@@ -150,7 +151,7 @@ def read_fault(text: str) -> Injected:
     kind = FAULTS[name]
     start = 0.0 if kind.on == "scene" else FROM
     numbers = {"from": start, "for": kind.lasts} | dict(kind.numbers)
-    if kind.on == "scene":  # It does not come and go.
+    if kind.on == "scene":  # Present from the beginning to the end.
         numbers = dict(kind.numbers)
     for setting in filter(None, rest.split(",")):
         key, _, value = setting.partition("=")
@@ -184,11 +185,11 @@ def _known(numbers) -> str:
 
 
 def read_faults(texts: Sequence[str], has: Sequence[str]) -> list[Injected]:
-    """The faults of an experiment.
+    """Parses the faults of an experiment.
 
-    Args: has: what there is beside the arm and its sensors: camera, ball, planner,
-        scene (a place for a box).
-    Raises: ValueError as read_fault, and for a fault of what is not there.
+    Args: has: what the experiment has beside the arm and its sensors: camera, ball,
+        planner, scene (a place for a box).
+    Raises: ValueError as read_fault, and for a fault that acts on something else.
     """
     faults = [read_fault(text) for text in texts]
     for fault in faults:

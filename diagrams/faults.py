@@ -1,7 +1,7 @@
-"""Faults that are injected into a station: `makebreak run ... --fault NAME`.
+"""Injects faults into a station: `makebreak run ... --fault NAME` (fault_kinds.py).
 
-They act in the world alone, on what leaves it and on what comes in: controllers have
-no way to know of them but their own senses. What there is, is in fault_kinds.py.
+They act only on the world and on the signals that leave or enter it: controllers can
+notice them only through their sensors.
 """
 
 import math
@@ -38,8 +38,10 @@ GLARE_SHARE = 0.7  # Of the ball's radius.
 
 
 def with_box(scene: Scene, faults: Sequence[Injected], place, folder) -> Scene:
-    """The scene, with the box at `place` (3,) [m] if a fault asks for it. Args: folder,
-    of the models."""
+    """The scene, with a box at `place` (3,) [m] if a fault asks for it.
+
+    Args: folder: of the model files.
+    """
     if not any(fault.name == "box" for fault in faults):
         return scene
     scene = deepcopy(scene)
@@ -57,6 +59,7 @@ def with_box(scene: Scene, faults: Sequence[Injected], place, folder) -> Scene:
 
 
 def _entries(n: int, which) -> np.ndarray:
+    """A mask (n,) that is true at the entries `which`."""
     mask = np.zeros(n, dtype=bool)
     mask[which] = True
     return mask
@@ -65,8 +68,10 @@ def _entries(n: int, which) -> np.ndarray:
 def faulty_sensor(
     builder: DiagramBuilder, port: OutputPort, sensor: str, faults: Sequence[Injected]
 ) -> OutputPort:
-    """`port` (of position_velocity, side by side, torque or wrench) with the faults
-    of it; the port itself if there are none."""
+    """The sensor's port behind its faults; the port itself if it has none.
+
+    Args: sensor: position_velocity (side by side), torque or wrench.
+    """
     for i, fault in enumerate(faults):
         if fault.kind.on != sensor:
             continue
@@ -101,8 +106,10 @@ def faulty_sensor(
 def faulty_command(
     builder: DiagramBuilder, limit: np.ndarray, faults: Sequence[Injected]
 ) -> list[LateSignal | LimitedSignal]:
-    """The systems, in order, that a command (n,) passes before it reaches the motors,
-    whose limits are given; they are connected to each other."""
+    """The systems, connected in order, that a command (n,) passes before the motors.
+
+    Args: limit (n,): of the motors [N m].
+    """
     chain: list[LateSignal | LimitedSignal] = []
     for i, fault in enumerate(faults):
         if fault.kind.on != "command":
@@ -135,7 +142,7 @@ def faulty_image(
     seed: int,
     faults: Sequence[Injected],
 ) -> OutputPort:
-    """The camera's picture with its faults. Args: ball: the model that is seen."""
+    """The camera's image behind its faults. Args: ball: name of the ball's model."""
     plant = loaded.plant
     for i, fault in enumerate(faults):
         if fault.kind.on != "camera":
@@ -184,9 +191,9 @@ def add_forces(
     center,
     faults: Sequence[Injected],
 ) -> None:
-    """The faults that push, rub or take away, beside the forces that the scene has.
+    """Adds the faults that are forces to the forces of the scene.
 
-    Args: arm, tool, ball: names of models; center (2,) of the ball's circle [m].
+    Args: arm, tool, ball: names of models; center (2,): of the ball's circle [m].
     """
     plant, forces = loaded.plant, []
     for i, fault in enumerate(faults):
@@ -217,7 +224,10 @@ def add_forces(
 def faulty_lcs(
     builder: DiagramBuilder, port: OutputPort, example, faults: Sequence[Injected]
 ) -> OutputPort:
-    """The planner's model, which its solver cannot solve while such a fault lasts."""
+    """The planner's LCS, unsolvable while a fault of the planner lasts.
+
+    Args: example: an LCS of the same sizes.
+    """
     for i, fault in enumerate(faults):
         if fault.kind.on == "planner":
             spoiled = SpoiledLcs(example, fault.start, fault.end)
@@ -228,7 +238,8 @@ def faulty_lcs(
 
 
 def _timed_friction(q, v, t, p):
-    """p: dry friction, the speed below which it fades, from when and until when."""
+    """Joint torque [N m]. p: Coulomb friction [N m], the speed below which it fades
+    [rad/s], start and end [s]."""
     if lasts(t, p[2], p[3]):
         return -p[0] * math.tanh(v / p[1])
     return 0.0
@@ -240,6 +251,7 @@ def _only_body(plant: MultibodyPlant, model: str):
 
 
 def _between(builder, name, system, port) -> OutputPort:
+    """Adds a system behind a port; its output."""
     builder.AddNamedSystem(name, system)
     builder.Connect(port, system.GetInputPort("value"))
     return system.GetOutputPort("value")

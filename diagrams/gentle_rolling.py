@@ -29,11 +29,13 @@ from pydrake.systems.primitives import (
 from makebreak.diagrams.ball_rolling import (
     ARM_TICK,
     CONTROL,
-    BallRollingConfig,
     add_ball_rolling,
-    believed,
     connect_reference,
     make_world,
+)
+from makebreak.diagrams.ball_rolling_config import (
+    BallRollingConfig,
+    believed,
     world_scene,
 )
 from makebreak.diagrams.camera import CameraConfig
@@ -309,7 +311,8 @@ def make_gentle_rolling(
         )
     if config.table == "felt_and_glass":
         config = on_two_surfaces(config)
-    ball, station, hybrid = ball_config(config), None, HYBRID
+    ball, station = ball_config(config), None
+    hybrid: HybridConfig | None = HYBRID
     if config.table == "felt_and_glass":
         station = make_world(ball, meshcat, True, felt_and_glass(ball))
         hybrid = replace(HYBRID, closing_speed=0.004)

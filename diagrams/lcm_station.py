@@ -1,12 +1,12 @@
 """A real Panda behind Drake's LCM messages, with the ports of the simulated station.
 
     status message --> panda_status_receiver --> q, v, torques
-    picture message --> images --> overhead.rgb_image
+    image message --> images --> overhead.rgb_image
     torque_commanded --> gravity_left_out --> panda_command_sender --> command message
 
-The channels are those of drake-franka-driver, and one for pictures. Source: Drake's
-pydrake.manipulation and drake::lcmt_panda_status, lcmt_panda_command; the driver's
-README (RobotLocomotion/drake-franka-driver).
+The channels are those of drake-franka-driver, and one for images. Source: Drake's
+pydrake.manipulation, drake::lcmt_panda_status, lcmt_panda_command; the driver's README
+(RobotLocomotion/drake-franka-driver).
 """
 
 import numpy as np
@@ -28,10 +28,10 @@ from makebreak.diagrams.station import ARM, DELAY, TIP_FRAME
 from makebreak.systems.arm.gravity_left_out import GravityLeftOut
 from makebreak.systems.arm.impedance_controller import serial_chain_of
 
-STATUS, COMMAND, PICTURES = "PANDA_STATUS", "PANDA_COMMAND", "OVERHEAD_IMAGES"
-URL = "udpm://239.255.76.67:7671?ttl=0"  # This machine alone.
+STATUS, COMMAND, IMAGES = "PANDA_STATUS", "PANDA_COMMAND", "OVERHEAD_IMAGES"
+URL = "udpm://239.255.76.67:7671?ttl=0"  # Packets do not leave this machine.
 TORQUE_MODE = int(PandaControlMode.kTorque)
-STATUS_PORT, PICTURES_PORT = "lcmt_panda_status", "lcmt_image_array"
+STATUS_PORT, IMAGES_PORT = "lcmt_panda_status", "lcmt_image_array"
 COMMAND_PORT = "lcmt_panda_command"
 _ARRAYS = (
     "joint_position", "joint_position_desired", "joint_velocity",
@@ -41,7 +41,7 @@ _ARRAYS = (
 
 
 def empty_status() -> lcmt_panda_status:
-    """A status of an arm at rest whose joints are all at zero."""
+    """The status message of an arm at rest with all joints at zero."""
     status = lcmt_panda_status()
     status.num_joints = N_JOINTS
     for name in _ARRAYS:
@@ -50,19 +50,19 @@ def empty_status() -> lcmt_panda_status:
 
 
 def make_lcm_station(arm: MultibodyPlant) -> Diagram:
-    """The ports of a station, of messages.
+    """The ports of a station, made from LCM messages.
 
-    Inputs:  lcmt_panda_status, lcmt_image_array: the newest messages (abstract);
-             delay (1,) from a status to when its command acts [s];
-             panda.torque_commanded (7,) [N m], gravity's included.
-    Outputs: panda.position_measured, velocity_measured (7,) [rad], [rad/s];
-             panda.torque_measured (7,) of the joints' sensors, with gravity's [N m];
-             panda.torque_external (7,) that the surroundings put on the joints, the
-             message's negative [N m]; overhead.rgb_image; panda.delay, the input;
-             lcmt_panda_command, for torque control, gravity left out, stamped with the
-             Context's time.
+    Inputs:  lcmt_panda_status, lcmt_image_array (abstract): the newest messages;
+             delay (1,) [s]: from a status to the time when its command acts;
+             panda.torque_commanded (7,) [N m], gravity's torque included.
+    Outputs: panda.position_measured, panda.velocity_measured (7,) [rad], [rad/s];
+             panda.torque_measured (7,) [N m]: of the joint sensors, gravity included;
+             panda.torque_external (7,) [N m]: of contacts on the joints (the driver
+             sends the negative); overhead.rgb_image; panda.delay: the input;
+             lcmt_panda_command (abstract): torque control, without gravity's torque,
+             stamped with the Context's time.
 
-    Args: arm, the control plant: its gravity is what the driver compensates.
+    Args: arm: the control plant; the driver compensates its gravity.
     """
     builder = DiagramBuilder()
     receiver = builder.AddNamedSystem(
@@ -78,7 +78,7 @@ def make_lcm_station(arm: MultibodyPlant) -> Diagram:
     builder.ExportOutput(external.get_output_port(), f"{ARM}.torque_external")
 
     images = builder.AddNamedSystem("images", LcmImageArrayToImages())
-    builder.ExportInput(images.get_input_port(), PICTURES_PORT)
+    builder.ExportInput(images.get_input_port(), IMAGES_PORT)
     builder.ExportOutput(images.GetOutputPort("color_image"), "overhead.rgb_image")
 
     passed = builder.AddNamedSystem("delay", PassThrough(1))
@@ -103,33 +103,33 @@ def make_lcm_station(arm: MultibodyPlant) -> Diagram:
 
 
 class Messages:
-    """Bytes of messages into a Context's input ports, and out of an output port: in a
-    Context Drake's systems have C++ messages, which Python has no other way to."""
+    """Converts LCM messages between bytes and the C++ messages in a Context's ports,
+    which Python cannot read or write otherwise."""
 
     def __init__(self):
         self._kinds = {
             STATUS_PORT: _Serializer_[lcmt_panda_status](),
-            PICTURES_PORT: _Serializer_[lcmt_image_array](),
+            IMAGES_PORT: _Serializer_[lcmt_image_array](),
             COMMAND_PORT: _Serializer_[lcmt_panda_command](),
         }
 
     def fix(self, diagram: Diagram, context: Context, port: str, data: bytes) -> None:
-        """Puts a message on the exported input `port` of a diagram."""
+        """Sets the exported input `port` of a diagram to a message."""
         value = self._kinds[port].CreateDefaultValue()
         self._kinds[port].Deserialize(data, value)
         diagram.GetInputPort(port).FixValue(context, value)
 
     def read(self, system: System, context: Context, port: str) -> bytes:
-        """The message at the output `port` of a system, in a Context of its own."""
+        """The message at the output `port` of a system. Args: context: the system's."""
         return self.encode(port, system.GetOutputPort(port).EvalAbstract(context))
 
     def encode(self, port: str, value: AbstractValue) -> bytes:
-        """A C++ message of the kind that `port` has, as bytes."""
+        """The bytes of a C++ message of the type of `port`."""
         return self._kinds[port].Serialize(value)
 
 
-def no_pictures() -> bytes:
-    """A message without a picture."""
+def no_images() -> bytes:
+    """An image message without an image."""
     message = lcmt_image_array()
     message.num_images, message.images = 0, []
     return message.encode()

@@ -33,17 +33,20 @@ from makebreak.systems.planar.planar_impedance import (
 )
 from makebreak.systems.planar.planar_world import CircleTargetConfig, PlanarWorldConfig
 
-REACH = 0.7  # Of springs that engage and let go [m]; the circle is .5 to 1 m away.
-# Before the seed varies them: the springs' anchors [m], stiffness [N/m], rest length
-# [m]. On the circle they pull with 7 to 40 N.
+SPRINGS = "springs"  # The setting of the paper: only the force sensor has noise.
+# Largest length at which springs of the setting "engaging" pull [m]; the circle is 0.5
+# to 1 m from their anchors.
+REACH = 0.7
+# Nominal anchors (distance from the circle's centre [m], direction), stiffness [N/m],
+# rest length [m]; the seed varies them. On the circle they pull with 7 to 40 N.
 DISTANCE, DIRECTIONS = 0.75, np.radians([90.0, 210.0, 330.0])
-SPRINGS = "springs"  # The setting of the paper: perfect sensors but for force.
 STIFFNESS, REST_LENGTH = np.array([20.0, 40.0, 60.0]), 0.3
 
 
-# Tuned with the same budget on seeds 100 to 113 (scripts/tune_planar.py).
 @dataclass
 class BaselinesConfig:
+    """Tuned with one budget on seeds 100 to 113 (scripts/tune_planar.py)."""
+
     mrac: MracConfig = field(default_factory=lambda: tuned_mrac(SPRINGS))
     active_inference: ActiveInferenceConfig = field(
         default_factory=lambda: tuned_active_inference(SPRINGS)
@@ -55,13 +58,13 @@ class BaselinesConfig:
 
 @dataclass
 class MultiSpringConfig:
-    """What of the controllers is left at its default is as tuned for the setting."""
+    """Controllers left at their defaults get the values tuned for the setting."""
 
     seed: int = 0  # Draws start, direction, springs and noise.
-    # springs, springs_lab or engaging: what pulls, sensors, greatest stiffness.
+    # springs, springs_lab or engaging (planar_tuned.SETTINGS).
     setting: str = SPRINGS
-    trials: int = 30  # Of the biomimetic controller.
-    # Half width of the uniform draw of each spring's stiffness and distance.
+    trials: int = 30  # Of the biomimetic controller, which learns over trials.
+    # Half width of the uniform draw of each spring's stiffness and distance, relative.
     spread: float = 0.2
     impedance: PlanarImpedanceConfig = field(
         default_factory=lambda: tuned_impedance(SPRINGS)[0]
@@ -71,12 +74,12 @@ class MultiSpringConfig:
 
 
 def as_tuned(config: MultiSpringConfig) -> MultiSpringConfig:
-    """The config with what is left at its default as tuned for its setting."""
+    """The config with each controller at its default replaced by the tuned one."""
     c, default = config, MultiSpringConfig()
     law, model = tuned_impedance(c.setting)
 
-    def tuned(mine, first, found):
-        return found if mine == first else mine
+    def tuned(given, default, found):
+        return found if given == default else given
 
     b, b0 = c.baselines, default.baselines
     return replace(
@@ -96,7 +99,7 @@ def as_tuned(config: MultiSpringConfig) -> MultiSpringConfig:
 
 
 def draw(config: MultiSpringConfig) -> tuple[PlanarWorldConfig, CircleTargetConfig]:
-    """The world and the circle of the config's seed."""
+    """World and circle of the config's seed. Raises: ValueError."""
     c = config
     if c.seed < 0:
         raise ValueError(f"seed is {c.seed}, expected 0 or more")
@@ -113,10 +116,10 @@ def draw(config: MultiSpringConfig) -> tuple[PlanarWorldConfig, CircleTargetConf
 def draw_springs(
     seed: int, spread: float = 0.2, engaging: bool = False
 ) -> tuple[PlanarWorldConfig, CircleTargetConfig]:
-    """The world and the circle of a seed; spread as in MultiSpringConfig.
+    """World and circle of a seed; spread as in MultiSpringConfig.
 
-    Args: engaging: whether springs pull within a reach of REACH alone, which the seed
-        draws too: the force jumps by up to 30 N as they engage and let go.
+    Args: engaging: whether springs pull only at lengths below a reach, which the seed
+        draws about REACH: the force then jumps by up to 30 N.
     """
     rng = np.random.default_rng(seed)
     target = circle_of_seed(rng)
@@ -145,7 +148,7 @@ def make_multi_spring(
     meshcat: Meshcat | None = None,
     feedforward: bool = False,
 ) -> Diagram:
-    """The closed loop of make_planar with this controller, in the seed's world."""
+    """The closed loop of make_planar with a controller in the seed's world."""
     world, target = draw(config)
     sensing = setting_of(config.setting).sensing
     return make_planar(
@@ -154,7 +157,7 @@ def make_multi_spring(
 
 
 def impedance(config: PlanarImpedanceConfig, model: ForceModelConfig, knowledge=None):
-    """Our controller."""
+    """Our controller: adaptive impedance with a learned force model."""
     return PlanarImpedance(config, model, MASS, FORCE_MAX, knowledge, PERIOD)
 
 
@@ -167,5 +170,5 @@ def active_inference(config: ActiveInferenceConfig):
 
 
 def biomimetic(config: BiomimeticConfig, knowledge=None, duration_sec: float = 6.0):
-    """Args: knowledge, what earlier trials taught."""
+    """Args: knowledge: learned in earlier trials; duration_sec: of a trial [s]."""
     return Biomimetic(config, duration_sec, knowledge, MASS, FORCE_MAX, PERIOD)

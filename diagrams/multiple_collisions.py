@@ -1,10 +1,10 @@
-"""A chain of contacts made and lost (CC section 4.5.1, figures 15 and 16).
+"""A sequence of contacts made and lost (CC section 4.5.1, figures 15 and 16).
 
 Down onto the table, along it to the red block, along both to the blue wall, up this
 wall until it ends, free over the red block, down onto its top, along it to the goal:
-four impacts and one loss of contact. Where the contacts are is known from estimates
-with errors, as a camera would give them. The world differs by seed: positions within
-5 cm, frictions 0.1 to 0.6, the errors of the estimates.
+four impacts and one loss of contact. The positions of the contacts are estimates with
+errors, as from a camera. The seed draws the surfaces' positions (within 5 cm), their
+frictions (0.1 to 0.6) and the errors of the estimates.
 """
 
 from dataclasses import dataclass, field, replace
@@ -18,6 +18,7 @@ from makebreak.diagrams.changing_contact import (
     Knowledge,
     make_changing_contact,
 )
+from makebreak.diagrams.given_pattern import begin_there, expected_contacts
 from makebreak.diagrams.realism import StationErrors, draw_errors
 from makebreak.diagrams.tabletop import (
     SPREAD,
@@ -61,22 +62,25 @@ from makebreak.systems.views.contact_view import ContactViewConfig
 
 SURFACES = ("table", "red_block", "blue_wall")
 DOWN, LEFT, AHEAD = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
-# The impacts: direction, the surface, and the segment that each of them ends.
+# The impacts: direction of the motion, surface, and the segment that the impact ends.
 IMPACTS = ((DOWN, "table", 0), (LEFT, "red_block", 1), (AHEAD, "blue_wall", 2),
            (DOWN, "red_top", 6))  # fmt: skip
-START = (0.42, -0.16, 0.195)  # Of the tip in the scene [m].
-RED_TOP, BLUE_TOP = 0.06, 0.09  # Above the table [m].
-FRICTION = (0.1, 0.6)
-BEYOND = 0.06  # How far behind the nominal surfaces the pattern goes [m].
-CLEAR = 0.05  # Above the blue wall's top, before it turns [m].
+START = (0.42, -0.16, 0.195)  # Initial position of the tip in the world [m].
+RED_TOP, BLUE_TOP = 0.06, 0.09  # Heights above the table [m].
+FRICTION = (0.1, 0.6)  # Range.
+BEYOND = 0.06  # Distance by which the motion pattern aims behind each surface [m].
+CLEAR = 0.05  # Height above the blue wall's top at which the motion turns [m].
 OVER, BACK, GOAL = 0.08, 0.05, 0.12  # Over the red block, and along its top [m].
 NORMAL_FORCE = 5.0  # On each surface that has been reached [N].
-UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # Of the tip's frame: the flange straight down.
+TABLE, TOP = 0, 3  # Which of IMPACTS are with the table, with the red block's top.
+# Of the height of the block's top above the table [m]: sizes are known to a millimetre,
+# and a table that is tilted by 0.5 degrees rises by 4 mm on the way there.
+HEIGHT_STD = 0.002
 A_MAX = 1.0  # Of the pattern [m/s2].
-
-
-# From 0.03 m/s a stop comes to 1 m/s2 at 10 Hz, so that is the most [m/s].
-MOST_SPEED = 0.03
+# Largest approach speed [m/s]: stopping from 0.03 m/s takes 1 m/s2 (low-pass, 10 Hz),
+# the goal for the acceleration.
+APPROACH_SPEED_MAX = 0.03
 
 
 @dataclass
@@ -84,17 +88,23 @@ class MultipleCollisionsConfig:
     handling: bool = True  # False: no anticipation, no transition-phase controllers.
     tool: str = "sphere"  # Or "block".
     speed: float = 0.2  # Of the motion pattern [m/s].
-    error_max: float = 0.03  # Of the initial estimates, along the motion [m].
+    error_max: float = 0.03  # Of the initial estimates, along each motion [m].
     # Of each surface, drawn log-uniformly from this range [N/m].
     stiffness: list[float] = field(default_factory=lambda: list(STIFFNESS_RANGE))
     realism: str = "none"  # Errors of the station: "none", "lab" or "poor".
-    trials: int = 2  # Each knows what the one before has learned.
+    trials: int = 2  # Each starts with what the last one learned.
     seed: int = 0
-    # In the world table, red block and blue wall are up to so far from where the
-    # scene has them [m], and have these frictions.
+    # Largest displacement of table, red block and blue wall in the world from where the
+    # scene has them [m], and their frictions.
     spread: float = SPREAD
     friction: list[float] = field(default_factory=list)  # Empty: drawn by the seed.
-    model: str = ""  # Scene that the controllers believe; "": the shipped one.
+    # Whether the sizes of the model's objects are used: the red block stands on the
+    # table, so the contact with the table tells where the block's top is.
+    known_heights: bool = True
+    # File of a motion to follow in place of the shipped one: a pattern (.yaml) or a
+    # recorded demonstration (docs/shaping.md). `speed` has no meaning then.
+    pattern: str = ""
+    model: str = ""  # Scene file of the controllers' model; "": the shipped one.
     rehearse: int = 0  # Trials in the model before the first real one.
     control: ChangingContactConfig = field(
         default_factory=lambda: ChangingContactConfig(
@@ -102,10 +112,10 @@ class MultipleCollisionsConfig:
                 speed=ApproachSpeedConfig(
                     force_desired=7.0,
                     stiffness_most=STIFFNESS_RANGE[1],
-                    # The reflex comes late at the stiffest ones: 10 N at most there.
+                    # The reflex is too late on the stiffest surfaces: 10 N at most.
                     force_first=8.0,
-                    most=MOST_SPEED,
-                    growth=4.0,  # What was measured decides, from the first time on.
+                    most=APPROACH_SPEED_MAX,
+                    growth=4.0,  # The first measured impact decides already.
                 )
             ),
             shaper=VelocityShaperConfig(
@@ -113,7 +123,7 @@ class MultipleCollisionsConfig:
                 region=RegionConfig(margin=0.001, settle_sec=0.05),
             ),
             detector=ContactDetectorConfig(impact_force=1.0),
-            # Less force_least makes so soft a stop that it is taken for friction.
+            # With less force_least the stop is so soft that it looks like friction.
             reflex=ImpactReflexConfig(gain=4.0, force_least=2.0),
         )
     )
@@ -121,25 +131,35 @@ class MultipleCollisionsConfig:
 
 @dataclass(frozen=True, eq=False)
 class CollisionTask:
-    """What the trials of one seed have in common."""
+    """World, motion and prior, which all trials of one seed share."""
 
     world: Scene
     model: Scene
     pattern: MotionPattern
-    prior: ContactBelief
-    model_prior: ContactBelief  # Where the model has them, about.
-    truth: np.ndarray  # (4,) p_WE . direction at each impact [m].
+    prior: ContactBelief  # Initial estimate.
+    model_prior: ContactBelief  # Initial estimate from the model scene.
+    # (4,) p_WE . direction at each impact [m]; (0,) of a given motion.
+    truth: np.ndarray
     friction: dict[str, float]
     stiffness: dict[str, float]  # Of the tool against each surface [N/m].
     errors: StationErrors
     corner: float  # From the tip to the tool's corners, in x and in y; 0: none [m].
 
 
-def make_task(config: MultipleCollisionsConfig) -> CollisionTask:
-    """The world, the motion and the initial estimates of config.seed.
+def make_task(
+    config: MultipleCollisionsConfig, given: MotionPattern | None = None
+) -> CollisionTask:
+    """World, motion and prior of config.seed.
 
-    Raises: ValueError for an unknown tool, or numbers out of their range.
+    Args: given, the motion of config.pattern, if that is not empty. Its contacts are
+        expected where its segments end.
+    Raises: ValueError for an unknown tool, a setting out of range, or a motion that the
+        arm cannot follow.
     """
+    if bool(config.pattern) != (given is not None):
+        raise ValueError(
+            f'pattern is "{config.pattern}", expected the motion of that file beside it'
+        )
     for name in ("trials", "speed"):
         if not 0.0 < getattr(config, name) < np.inf:
             raise ValueError(
@@ -161,27 +181,35 @@ def make_task(config: MultipleCollisionsConfig) -> CollisionTask:
         move(world, name, [0.0, 0.0, up])
     move(world, "red_block", left * LEFT)
     move(world, "blue_wall", ahead * AHEAD)
-    pattern = make_pattern(config, half)
     truth = surfaces(world, half)
     prior: list[ExpectedContact] = []
     modelled: list[ExpectedContact] = []
     sigma = max(0.5 * config.error_max, 0.001)
-    for (d, _, k), where, there in zip(
+    # Uniform errors up to error_max: two standard deviations contain them all.
+    covariance = sigma**2 * np.eye(3)
+    shipped = make_pattern(config, half)
+    for (d, _, k), in_world, in_model in zip(
         IMPACTS, truth, surfaces(model, half), strict=True
     ):
-        estimate = where + rng.uniform(-config.error_max, config.error_max)
-        start = pattern.segments[k].positions[0]
-        believed = start + d * (there - start @ d)
-        modelled.append(ExpectedContact(believed, sigma**2 * np.eye(3), d, segment=k))
-        mean = start + d * (estimate - start @ d)
-        # Uniform errors up to error_max: two sigma hold them all.
-        prior.append(ExpectedContact(mean, sigma**2 * np.eye(3), d, segment=k))
+        estimate = in_world + rng.uniform(-config.error_max, config.error_max)
+        start = shipped.segments[k].positions[0]
+        for contacts, along in ((modelled, in_model), (prior, estimate)):
+            mean = start + d * (along - start @ d)
+            contacts.append(ExpectedContact(mean, covariance, d, segment=k))
+    if config.known_heights:
+        heights = surfaces(model, half)[TOP] - surfaces(model, half)[TABLE]
+        prior = with_known_height(prior, float(heights), config.error_max)
+        modelled = with_known_height(modelled, float(heights), config.error_max)
     stiffness = draw_stiffness(rng, SURFACES, config.stiffness)
     set_stiffness(world, config.tool, stiffness)
+    if given is not None:  # The world is the seed's, whatever moves in it.
+        begin_there(given, world, model, TOOL)
+        there = expected_contacts(given, sigma)
+        prior, modelled, truth = [*there.contacts], [*there.contacts], np.zeros(0)
     return CollisionTask(
         world,
         model,
-        pattern,
+        shipped if given is None else given,
         ContactBelief(tuple(prior)),
         ContactBelief(tuple(modelled)),
         truth,
@@ -192,8 +220,45 @@ def make_task(config: MultipleCollisionsConfig) -> CollisionTask:
     )
 
 
+def with_known_height(contacts, distance: float, error_max: float):
+    """The contacts, where it is known how far the block's top is from the table.
+
+    Both estimates are estimates of one height then. Each is at most error_max off, so
+    it lies where both ranges overlap: the middle of that is the new estimate, and two
+    standard deviations are half its width. Estimates that contradict each other stay as
+    they are. In a trial the contact with the table decides (`known_from`).
+
+    Args: contacts, of IMPACTS; distance from the table to the top along DOWN [m].
+    """
+    table, top = contacts[TABLE], contacts[TOP]
+    means = table.mean @ DOWN, top.mean @ DOWN - distance
+    low = max(means) - error_max - 2.0 * HEIGHT_STD * (means[1] > means[0])
+    high = min(means) + error_max + 2.0 * HEIGHT_STD * (means[1] < means[0])
+    found = list(contacts)
+    sigma = np.sqrt(DOWN @ table.covariance @ DOWN)
+    if low < high:
+        sigma = max(0.25 * (high - low), 0.001)
+        middle = 0.5 * (low + high)
+        found[TABLE] = replace(
+            table,
+            mean=table.mean + DOWN * (middle - table.mean @ DOWN),
+            covariance=sigma**2 * np.eye(3),
+        )
+        top = replace(
+            top,
+            mean=top.mean + DOWN * (middle + distance - top.mean @ DOWN),
+            covariance=np.hypot(sigma, HEIGHT_STD) ** 2 * np.eye(3),
+        )
+    known = (IMPACTS[TABLE][2], distance, HEIGHT_STD)
+    found[TOP] = replace(top, known_from=known)
+    return found
+
+
 def surfaces(scene: Scene, half: float) -> np.ndarray:
-    """p_WE . direction at each of the four impacts [m]."""
+    """p_WE . direction at each of the four impacts (4,) [m].
+
+    Args: half: half width of the tool [m].
+    """
     table, red, blue = (position(scene, name) for name in SURFACES)
     return np.array([
         DOWN @ table - half,
@@ -204,8 +269,11 @@ def surfaces(scene: Scene, half: float) -> np.ndarray:
 
 
 def make_pattern(config: MultipleCollisionsConfig, half: float) -> MotionPattern:
-    """The motion, for the surfaces where the scene file has them. Each segment that
-    ends in an impact goes BEYOND it, so that the impact is met at full speed."""
+    """The motion, planned for the surfaces of the scene file. Segments that end in an
+    impact aim BEYOND the surface, so that the tool reaches it at full speed.
+
+    Args: half: half width of the tool [m].
+    """
     z_table, y_red, x_blue, z_top = (
         abs(x) for x in surfaces(read_scene(TABLETOP_WALLS), half)
     )
@@ -218,7 +286,7 @@ def make_pattern(config: MultipleCollisionsConfig, half: float) -> MotionPattern
     p6 = p5 + [-BACK, OVER, 0.0]
     p7 = np.array([p6[0], p6[1], z_top])
     p8 = p7 + [-GOAL, 0.0, 0.0]
-    plan: tuple = (  # Start, end, force directions, whether it goes beyond.
+    plan: tuple = (  # Start, end, force directions, direction of its impact or None.
         (p0, p1, [], DOWN),
         (p1, p2, [DOWN], LEFT),
         (p2, p3, [DOWN, LEFT], AHEAD),
@@ -233,7 +301,7 @@ def make_pattern(config: MultipleCollisionsConfig, half: float) -> MotionPattern
         if into is not None:
             end = end + BEYOND * into
         length = float(np.linalg.norm(end - start))
-        goes_on = k == 3  # Up the wall and on, on one line.
+        goes_on = k == 3  # Segments 3 and 4 are one line: no stop between.
         duration = segment_time(
             length, config.speed, A_MAX, not moving, into is None and not goes_on
         )
@@ -259,10 +327,13 @@ def make_multiple_collisions(
     task: CollisionTask | None = None,
     view: ContactViewConfig | None = None,
 ) -> Diagram:
-    """One trial; knowledge is what the one before has left (None: the estimates).
+    """The diagram of one trial.
 
-    Without handling nothing is anticipated, the motion does not slow down where the
-    plan ends, and the base controller goes through the contacts.
+    Without config.handling no contact is anticipated, the motion keeps its speed where
+    the plan ends, and the base controller alone meets the contacts.
+
+    Args: knowledge: from the trial before; None: the prior. trial: its number, for the
+        noise's seed. task: of make_task, None: made here. view: of Meshcat.
     """
     task = task or make_task(config)
     control = config.control

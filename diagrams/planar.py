@@ -1,12 +1,12 @@
-"""A point effector in the plane under any one controller (CC 4.1, 4.2).
+"""A point effector in the plane under one of several controllers (CC 4.1, 4.2).
 
     target --x_desired--> controller --u--> world --state--> sensor -> controller
                              ^                |
-                             +-- force sensor-+ (where the controller listens)
+                             +-- force sensor-+ (if the controller has this input)
 
-The world comes to the state of t_k just before t_k; the controller reads it at t_k, and
+The world reaches the state of t_k just before t_k; the controller reads it at t_k, and
 its u acts from t_k to t_{k+1}. Sensors add noise and a delay (PlanarSensing). With
-force feedforward the measured force is taken off u, whatever the controller.
+force feedforward the measured force is subtracted from the u of any controller.
 """
 
 from dataclasses import dataclass
@@ -30,8 +30,8 @@ from makebreak.systems.planar.planar_world import (
 from makebreak.systems.views.legend import LegendConfig
 from makebreak.systems.views.planar_view import PlanarView, PlanarViewConfig
 
-PLANAR = str(MODELS / "planar.scene.yaml")  # The effector alone: what is believed.
-AXES = "effector"  # The model there; its joints are x and y.
+PLANAR = str(MODELS / "planar.scene.yaml")  # The effector alone: the model.
+AXES = "effector"  # Name of its model instance; the joints are x and y.
 PERIOD = 0.001  # Of world and controllers [s].
 FORCE_MAX = 100.0  # |u| of every controller [N].
 MASS = 1.0  # Of the effector; known to the controllers that use a mass [kg].
@@ -40,12 +40,12 @@ _VIEW_OFFSET = 5e-4
 
 @dataclass(frozen=True)
 class PlanarSensing:
-    """What the controllers see; noise as the standard deviation of each axis."""
+    """The controllers' sensors; noise as standard deviation along each axis."""
 
     position_noise: float = 0.0  # [m]
     velocity_noise: float = 0.0  # [m/s]
     force_noise: float = 0.2  # [N]
-    delay_sec: float = 0.0  # Of all that is measured, whole milliseconds.
+    delay_sec: float = 0.0  # Of all measurements, whole milliseconds.
 
     @property
     def delay_ticks(self) -> int:
@@ -55,12 +55,12 @@ class PlanarSensing:
         return 2 * [self.position_noise] + 2 * [self.velocity_noise]
 
 
-# An arm in a laboratory; by default only the force has noise, and nothing is late.
+# As on an arm in a laboratory. The default: noise of the force only, and no delay.
 LAB = PlanarSensing(2e-5, 2e-3, 0.2, 0.001)
 
 
 def state_noise_seed(seed: int) -> int:
-    """Of the state's sensor, where the force sensor has `seed`."""
+    """Seed of the state sensor's noise; `seed` itself is the force sensor's."""
     return seed + 2**32
 
 
@@ -73,13 +73,14 @@ def make_planar(
     meshcat: Meshcat | None = None,
     feedforward: bool = False,
 ) -> Diagram:
-    """The closed loop. The effector starts at rest on the target's first position.
+    """The closed loop. The effector starts at rest at the target's first position.
 
-    Outputs: state (4,), x_desired (6,), force (2,) true, of the world on the effector,
-        state_measured (4,), force_measured (2,), and every output of the controller.
+    Outputs: state (4,), x_desired (6,), force (2,): the true force of the world on the
+        effector [N], state_measured (4,), force_measured (2,), and every output of the
+        controller.
 
-    Args: seed, of the sensors' noise; feedforward: whether the measured force is fed
-        forward beside what the controller asks for.
+    Args: seed: of the sensors' noise; feedforward: whether the measured force is also
+        fed forward.
     """
     builder = DiagramBuilder()
     goal = builder.AddNamedSystem("target", CircleTarget(target))
@@ -91,7 +92,7 @@ def make_planar(
     state = plant.GetOutputPort("state")
 
     def sensed(name, port, std, noise_seed):
-        """What a sensor says of the port."""
+        """The port behind a sensor with noise and delay."""
         if np.any(std):
             sensor = NoisySensor(std, noise_seed, PERIOD)
             builder.AddNamedSystem(f"{name}_sensor", sensor)
@@ -166,13 +167,13 @@ def make_planar(
 
 
 def knowledge_of(diagram: Diagram, context: Context):
-    """What the controller of make_planar learned in this context."""
+    """What the controller of make_planar has learned in this context."""
     controller = diagram.GetSubsystemByName("controller")
     return controller.knowledge(controller.GetMyContextFromRoot(context))
 
 
 def circle_of_seed(rng: np.random.Generator) -> CircleTargetConfig:
-    """Where the circle starts, and which way around it goes."""
+    """A circle with random start and direction."""
     return CircleTargetConfig(
         phase=float(rng.uniform(0.0, 2.0 * np.pi)), turn=int(rng.choice([-1, 1]))
     )

@@ -1,4 +1,4 @@
-"""The controllers of the planar experiments as scripts/tune_planar.py found them."""
+"""Settings of the planar experiments' controllers, found by scripts/tune_planar.py."""
 
 import json
 from dataclasses import dataclass
@@ -22,9 +22,9 @@ TUNED_FILE = Path(__file__).with_name("planar_tuned.json")
 
 @dataclass(frozen=True)
 class Setting:
-    """What all controllers are tuned for and compared in."""
+    """A task in which all controllers are tuned and compared."""
 
-    world: str = "springs"  # Or "porridge", or "engaging": springs with a reach.
+    world: str = "springs"  # Or "porridge", or "engaging": springs that let go.
     sensing: PlanarSensing = PlanarSensing()
     stiffness_max: float = 500.0  # Of every controller [N/m].
 
@@ -43,7 +43,7 @@ SETTINGS = {
 
 
 def setting_of(name: str) -> Setting:
-    """Raises: ValueError for a name that is none of SETTINGS."""
+    """The setting of this name. Raises: ValueError for an unknown name."""
     if name not in SETTINGS:
         raise ValueError(f'setting is "{name}", expected one of {", ".join(SETTINGS)}')
     return SETTINGS[name]
@@ -59,7 +59,7 @@ def _parts(setting: str, controller: str) -> list[dict]:
 
 
 def tuned_mrac(setting: str, controller: str = "mrac") -> MracConfig:
-    """Args: setting and controller, as scripts/tune_planar.py names them."""
+    """Args: setting, controller: names as in scripts/tune_planar.py."""
     return MracConfig(**_parts(setting, controller)[0])
 
 
@@ -76,7 +76,7 @@ def tuned_biomimetic(setting: str, controller: str = "biomimetic") -> Biomimetic
 def tuned_impedance(
     setting: str, controller: str = "adaptive"
 ) -> tuple[PlanarImpedanceConfig, ForceModelConfig]:
-    """The law, and the model of the force."""
+    """The control law and the force model."""
     law, model = _parts(setting, controller)
     mixture = IgmmConfig(**model["mixture"])
     return PlanarImpedanceConfig(**law), ForceModelConfig(

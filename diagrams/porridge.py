@@ -23,14 +23,15 @@ from makebreak.systems.planar.planar_impedance import (
 from makebreak.systems.planar.planar_world import CircleTargetConfig, PlanarWorldConfig
 
 
-# The law as found on springs; a few settings of the mixture were tried, see there.
 def _impedance() -> PlanarImpedanceConfig:
+    """The control law as tuned on springs (docs/planar.md)."""
     return PlanarImpedanceConfig(
         stiffness_free=110.0, damping_ratio=2.0, steepness=11.9, error_mid=1.78
     )
 
 
 def _model() -> ForceModelConfig:
+    """The best of a few settings of the mixture that were tried (docs/planar.md)."""
     mixture = IgmmConfig(sigma_ini=[0.05, 1.0, 1.0], sp_max=55.7)
     return ForceModelConfig(mixture, along_motion=True)
 
@@ -40,18 +41,18 @@ class PorridgeConfig:
     seed: int = 0  # Draws start, direction, final viscosity of the test, and noise.
     # Final viscosity in training and in the test [N s/m]; it rises from 0.
     viscosity: list[float] = field(default_factory=lambda: [80.0, 150.0])
-    spread: float = 0.2  # Half width of the uniform draw of the latter.
+    spread: float = 0.2  # Half width of the uniform draw of the second one, relative.
     force_noise: float = 0.2  # Standard deviation, each axis [N].
     impedance: PlanarImpedanceConfig = field(default_factory=_impedance)
     model: ForceModelConfig = field(default_factory=_model)
-    # As scripts/tune_planar.py found it on seeds 100 to 113; see docs/planar.md.
+    # Tuned on seeds 100 to 113 (scripts/tune_planar.py, docs/planar.md).
     mrac: MracConfig = field(default_factory=lambda: tuned_mrac("porridge"))
 
 
 def draw(
     config: PorridgeConfig, training: bool
 ) -> tuple[PlanarWorldConfig, CircleTargetConfig, int]:
-    """The world, the circle and the noise's seed, for training or for the test."""
+    """World, circle and the noise's seed, for training or test. Raises: ValueError."""
     c = config
     if c.seed < 0:
         raise ValueError(f"seed is {c.seed}, expected 0 or more")
@@ -82,7 +83,7 @@ def make_porridge(
     training: bool = False,
     meshcat: Meshcat | None = None,
 ) -> Diagram:
-    """The closed loop of make_planar with this controller, in the seed's porridge."""
+    """The closed loop of make_planar with a controller in the seed's porridge."""
     world, target, noise_seed = draw(config, training)
     sensing = PlanarSensing(force_noise=config.force_noise)
     return make_planar(controller, world, target, sensing, noise_seed, meshcat)

@@ -1,7 +1,7 @@
-"""Errors that a real station has and its model does not: the `realism` setting.
+"""Errors of a real station that its model lacks: the `realism` setting.
 
-A level says how large they are, the seed what they are. They stay the same from trial
-to trial, as those of a robot do. Controllers know nothing of them.
+A level gives the size of the errors; the seed draws them. They are constant over
+trials, as on a robot, and unknown to the controllers.
 """
 
 from copy import deepcopy
@@ -21,10 +21,10 @@ class Level:
     """Sizes of the errors."""
 
     encoder: float  # Standard deviation of each encoder's offset [rad].
-    tool: float  # The tool is so much longer than modelled [m].
-    tilt: float  # Of the table, in any direction [rad].
-    force: float  # Bias of each force, up to so much either way [N].
-    drift: float  # And its change, up to so much either way [N/s].
+    tool: float  # Length of the tool beyond the model's [m].
+    tilt: float  # Of the table, in a random direction [rad].
+    force: float  # Largest bias of each force component [N].
+    drift: float  # Largest drift of each force component [N/s].
     delay: float  # Of encoders and wrench [s].
 
 
@@ -33,7 +33,7 @@ REALISM = {
     "lab": Level(5e-4, 0.002, np.radians(0.5), 0.5, 0.01, 0.001),
     "poor": Level(1e-3, 0.004, np.radians(1.0), 1.0, 0.03, 0.003),
 }
-REACH = 0.7  # From an encoder to the tip, about [m].
+REACH = 0.7  # Typical distance from an encoder to the tip [m].
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,19 +49,20 @@ class StationErrors:
 
     @property
     def place(self) -> float:
-        """How far from the truth the arm may believe its tip, about [m]."""
+        """Typical error of the tip's position by the encoders [m]."""
         return abs(self.tool) + 3.0 * REACH * float(np.std(self.encoders))
 
     def table_rise(self, p, origin, corner: float = 0.0) -> np.ndarray:
-        """How much higher than a level table an upright tool meets it, (n,) [m].
+        """Height above a level table at which an upright tool touches the tilted one,
+        (n,) [m].
 
         Args:
-            p: (n, 3) of places in the world [m].
-            origin: (3,) about which the table is tilted [m].
-            corner: from there to the corners of the tool, in x and in y [m].
+            p: (n, 3) positions of the tool in the world [m].
+            origin: (3,) point about which the table is tilted [m].
+            corner: from p to the corners of the tool, in x and in y [m].
         """
         roll, pitch = self.tilt
-        # Of the normal Ry(pitch) Rx(roll) z.
+        # The table's normal, Ry(pitch) Rx(roll) z.
         normal = np.array([
             np.sin(pitch) * np.cos(roll),
             -np.sin(roll),
@@ -73,10 +74,7 @@ class StationErrors:
 
 
 def draw_errors(level: str, seed: int) -> StationErrors:
-    """The errors of the station of this seed.
-
-    Raises: ValueError for a level that there is not.
-    """
+    """The errors of the station of this seed. Raises: ValueError: unknown level."""
     if level not in REALISM:
         raise ValueError(f"realism is {level!r}: {nearest(level, REALISM)}")
     size = REALISM[level]
@@ -95,8 +93,8 @@ def draw_errors(level: str, seed: int) -> StationErrors:
 def with_errors(
     scene: Scene, errors: StationErrors, arm: str, tool: str, table: str
 ) -> Scene:
-    """The world with these errors: all but the wrench's and the delays, which the
-    station adds.
+    """The world scene with these errors, except those of the wrench and the delays,
+    which make_station adds.
 
     Args: arm, tool, table: names of models; the tool is welded to the arm.
     """

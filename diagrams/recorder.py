@@ -1,10 +1,10 @@
-"""What a real robot could record of a run, for `makebreak gap`: one way for all.
+"""Records of a run what a real robot could record, for `makebreak gap`.
 
 A diagram has a Recorder beside its station or plant; after a simulation `recorded`
 gives the columns of recording.csv (gap/data/table.py). Sensors are sampled once a row.
-An effort command changes faster than rows come: a row has the mean of what acted from
-its instant until the next row's, which does the same to a mechanism. What comes at a
-rate of its own and late, as a camera's poses, is in rows of its own instants.
+Effort commands change faster: a row has the mean of the command from its time until the
+next row's, which moves a mechanism in the same way. Readings with a rate of their own
+and a delay, such as a camera's poses, are in rows at the times when they were taken.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,28 +22,32 @@ from pydrake.systems.primitives import Multiplexer, VectorLogSink
 from makebreak.diagrams.scene_facts import PANDA_JOINTS
 from makebreak.diagrams.station import ARM, TIP_FRAME
 
-TICK = 0.001  # Of commands [s].
-ENCODER_NOISE = {"position": 2e-5, "velocity": 2e-3}  # [m], [rad] and their rates.
-ROW_SEC = 0.005  # From row to row [s].
-SAME = 2e-4  # A reading so near to a row is in it: systems of one tick run in turn [s].
+TICK = 0.001  # Period at which commands are logged [s].
+# Standard deviations [m], [rad] and their rates.
+ENCODER_NOISE = {"position": 2e-5, "velocity": 2e-3}
+ROW_SEC = 0.005  # Time between rows [s].
+# A reading this near to a row is put into it: the systems of one tick have different
+# offsets [s].
+ROW_TOLERANCE_SEC = 2e-4
 WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
+# {input of the Recorder: (port, names of its entries)}
 Channels = Mapping[str, tuple[OutputPort, Sequence[str]]]
 
 
 class Recorder(Diagram):
-    """Logs of measured and of commanded channels.
+    """Logs of measured and commanded channels and of readings.
 
-    Inputs: one for each port that is recorded, of the same name.
+    Inputs: one for each key of measured, commanded and readings.
 
     Args:
-        measured, commanded: {input: names of its entries}; an entry without a name is
-            not recorded.
-        readings: likewise; the first entry, which has no name, is the time at which the
-            others were so [s], negative before the first reading.
-        row_sec: from one row to the next, a multiple of TICK [s].
-        late: whether a command that is seen at an instant acted in the TICK before it,
-            not from it on.
-        behind_sec: a reading is known so long after its time, at most.
+        measured, commanded: {input: names of its entries}; an entry whose name is empty
+            is not recorded.
+        readings: likewise; the first entry, whose name is empty, is the time at which
+            the others were measured [s], negative before the first reading.
+        row_sec: time between rows, a multiple of TICK [s].
+        late: whether a command that is logged at an instant acted in the TICK before it
+            instead of after it.
+        behind_sec: largest delay of a reading [s].
     """
 
     def __init__(
@@ -67,7 +71,7 @@ class Recorder(Diagram):
         for what, period in (
             ("measured", row_sec),
             ("commanded", TICK),
-            ("readings", TICK),  # As often as they may come.
+            ("readings", TICK),  # They may come at any tick.
         ):
             sizes = [len(names) for names in self.names[what].values()]
             if not sizes:
@@ -83,8 +87,8 @@ class Recorder(Diagram):
     def log(
         self, what: str, context: Context, begin: float = -np.inf
     ) -> tuple[np.ndarray, dict]:
-        """The times and {channel: (n,)} of "measured" or "commanded" from `begin` on
-        [s], in a root context; empty where there are none."""
+        """Times (n,) [s] and {channel: (n,)} of "measured" or "commanded" from the time
+        `begin` on; empty if nothing is logged. Args: context: of the whole diagram."""
         if not self.HasSubsystemNamed(what):
             return np.zeros(0), {}
         log = self.GetSubsystemByName(what).FindLog(context)
@@ -97,12 +101,12 @@ class Recorder(Diagram):
     def read(
         self, context: Context, begin: float = -np.inf
     ) -> list[tuple[np.ndarray, dict]]:
-        """Of each input of `readings` the times (n,) of what was read, from `begin` on
-        [s], and {channel: (n,)}."""
+        """For each input of `readings` the times of measurement (n,) [s] from `begin`
+        on, and {channel: (n,)}."""
         found = []
         if self.HasSubsystemNamed("readings"):
             log = self.GetSubsystemByName("readings").FindLog(context)
-            # No reading is known before its time.
+            # A reading is logged at or after its time of measurement.
             data = log.data()[:, np.searchsorted(log.sample_times(), begin - 1e-9) :]
             for names in self.names["readings"].values():
                 own, data = data[: len(names)], data[len(names) :]
@@ -122,8 +126,11 @@ def add_recorder(
     readings: Channels | None = None,
     behind_sec: float = 0.0,
 ) -> None:
-    """A Recorder of output ports. Args: {input: (port, names of its entries)}; the rest
-    as of Recorder."""
+    """Adds a Recorder of output ports.
+
+    Args: measured, commanded, readings: {input: (port, names of its entries)}; others
+        as of Recorder.
+    """
     readings = readings or {}
     recorder = builder.AddNamedSystem(
         "recorder",
@@ -150,11 +157,12 @@ def record_station(
     readings: Channels | None = None,
     behind_sec: float = 0.0,
 ) -> None:
-    """A Recorder of a station: its arm's joints, and the wrench at the tool's tip where
-    it has one.
+    """Adds a Recorder of a station: its arm's joints, and the wrench at the tool's tip
+    if it is measured.
 
-    Args: tau (7,), what is commanded; tool, the model of TIP_FRAME; seen, of what else
-        is measured, as by a camera; readings, behind_sec: as of Recorder.
+    Args: tau (7,): commanded [N m]; tool: name of the model that has TIP_FRAME; seen:
+        other measured channels, such as a camera's; readings, behind_sec: as of
+        Recorder.
     """
     joints = [f"{ARM}.{joint}" for joint in PANDA_JOINTS]
 
@@ -184,21 +192,21 @@ def record_station(
 
 
 def has_recorder(diagram: Diagram) -> bool:
-    """Whether `recorded` can be asked."""
+    """Whether `recorded` has something to return."""
     return any(isinstance(system, Recorder) for system in _within(diagram))
 
 
 def behind_sec(diagram: Diagram) -> float:
-    """How much later than its instant a row may be complete [s]."""
-    of_each = (s.behind_sec for s in _within(diagram) if isinstance(s, Recorder))
-    return max(of_each, default=0.0)
+    """Largest delay after which a row is complete [s]."""
+    delays = (s.behind_sec for s in _within(diagram) if isinstance(s, Recorder))
+    return max(delays, default=0.0)
 
 
 def recorded(
     diagram: Diagram, context: Context, begin: float = -np.inf
 ) -> dict[str, np.ndarray]:
-    """The columns of a simulation that ended in `context`: time (n,) and every channel
-    (n,), a row per row_sec of its Recorder, from `begin` on [s].
+    """The columns of a simulation that ended in `context`, from the time `begin` on:
+    time (n,) [s] and every channel (n,), a row every row_sec of its Recorder.
 
     Raises: ValueError for a diagram without a Recorder.
     """
@@ -207,28 +215,28 @@ def recorded(
         raise ValueError(f"{diagram.get_name()} has no recorder")
     (recorder,) = found
     time, columns = recorder.log("measured", context, begin)
-    for times, values in recorder.read(context, begin - SAME):
+    for times, values in recorder.read(context, begin - ROW_TOLERANCE_SEC):
         time, columns = _with_rows(time, columns, times, values)
     asked = time >= begin - 1e-9
     time, columns = time[asked], {name: y[asked] for name, y in columns.items()}
-    # What holds at the first row began up to a tick before it.
+    # The command that acts at the first row began up to a tick before it.
     ticks, commands = recorder.log("commanded", context, begin - 2.0 * TICK)
     if commands and len(time):
         fine = np.column_stack(list(commands.values()))
         acting = ticks - TICK if recorder.late else ticks
         held = mean_until_next(time, acting, fine)
         columns |= dict(zip(commands, held.T, strict=True))
-    else:  # None yet.
+    else:  # No command was logged, or no row.
         columns |= commands
     return {"time": time, **columns}
 
 
 def _with_rows(time, columns, times, values):
-    """A table with the rows of another: one for each instant of either; where the one
-    or the other has none, its cells are empty (NaN). Less than SAME apart is one."""
+    """Two tables merged: a row for each time of either, NaN in the columns of a table
+    that has no row there. Times nearer than ROW_TOLERANCE_SEC are one row."""
     if len(time):
         near = time[np.searchsorted(0.5 * (time[1:] + time[:-1]), times)]
-        times = np.where(abs(near - times) < SAME, near, times)
+        times = np.where(abs(near - times) < ROW_TOLERANCE_SEC, near, times)
     both = np.unique(np.concatenate([time, times]))
     merged = {}
     for own, part in ((time, columns), (times, values)):
@@ -240,6 +248,7 @@ def _with_rows(time, columns, times, values):
 
 
 def _within(diagram: Diagram) -> Iterator[System]:
+    """All systems in a diagram, at any depth."""
     for system in diagram.GetSystems():
         yield system
         if isinstance(system, Diagram):
@@ -247,14 +256,14 @@ def _within(diagram: Diagram) -> Iterator[System]:
 
 
 def mean_until_next(time, fine_time, fine):
-    """Mean (n, k) of what held from each of the times (n,) until the next.
+    """Mean (n, k) of a piecewise constant signal from each of the times (n,) until the
+    next one; at the last time the value there.
 
-    A plant's step at an instant takes what holds at it, so values count from the first
-    of fine_time at or after a time on. Of two times between which there is none the
-    first has the value that holds there.
+    A plant's step uses the value at the step's start, so the mean starts with the first
+    sample at or after a time. Without a sample between two times the mean is the
+    signal's value at the first of them.
 
-    Args: fine_time (m,), fine (m, k): values that hold from their time on. After the
-        last of the times: the value that holds there.
+    Args: fine_time (m,), fine (m, k): samples, which hold until the next one.
     """
     row = np.searchsorted(fine_time, time - 1e-9)
     row = np.minimum(row, len(fine) - 1)
@@ -266,10 +275,10 @@ def mean_until_next(time, fine_time, fine):
 
 
 def with_noise(columns, seed: int) -> dict[str, np.ndarray]:
-    """The columns with the noise of encoders, of experiments whose sensors have none:
-    without any a comparison would be one of rounding errors.
+    """The columns with encoder noise, for experiments whose sensors have none: without
+    noise `gap` would compare rounding errors.
 
-    Args: columns, as `recorded` gives them; seed, of the noise.
+    Args: columns: of `recorded`; seed: of the noise.
     """
     rng, found = np.random.default_rng([seed, 17]), dict(columns)
     for name, y in columns.items():
@@ -280,7 +289,7 @@ def with_noise(columns, seed: int) -> dict[str, np.ndarray]:
 
 
 def episodes(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Several simulations as one table, each an episode; channels of all of them."""
+    """Several simulations with the same channels as one table, one episode each."""
     number = [np.full(len(part["time"]), k) for k, part in enumerate(parts)]
     table = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
     return {"time": table.pop("time"), "episode": np.concatenate(number), **table}

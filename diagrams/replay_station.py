@@ -1,8 +1,8 @@
-"""A recording in place of a station: its sensors, as they were, whatever is commanded.
+"""A recording in place of a station: its sensors give what was recorded.
 
-Between two rows of the recording its values are interpolated: rows come every 12.5 ms,
-controllers ask every millisecond. What they answer can then be compared with what was
-commanded (open loop: nothing that they command is felt).
+Controllers can so be compared with what was commanded in the recording, open loop:
+their commands have no effect. Values are interpolated between the recording's rows,
+which come every 12.5 ms, while controllers read every millisecond.
 """
 
 from collections.abc import Mapping
@@ -20,14 +20,16 @@ from scipy.signal import savgol_filter
 from makebreak.diagrams.scene_facts import N_JOINTS, PANDA_JOINTS
 from makebreak.diagrams.station import ARM
 
-SMOOTH_ROWS = 9  # Of a parabola through the ball's places, whose slope is its speed.
+SMOOTH_ROWS = 9  # The ball's velocity is the slope of a parabola through these rows.
 
 
 class RecordedSignals(LeafSystem):
-    """Signals that were recorded, by interpolation; the last ones stay.
+    """Recorded signals, interpolated between rows; the last row stays.
 
-    Outputs: one for each of `signals`, {name: (n, k)}; those in `held` are taken from
-             the row before.
+    Outputs: one (k,) for each of `signals`.
+
+    Args: time (n,) [s]; signals: {name: (n, k)}; held: names of signals that keep the
+        value of the row before, instead of being interpolated.
     """
 
     def __init__(self, time, signals: Mapping[str, np.ndarray], held=()):
@@ -48,14 +50,14 @@ class RecordedSignals(LeafSystem):
             if is_held or i == len(time) - 1:
                 output.SetFromVector(rows[i])
                 return
-            share = (t - time[i]) / (time[i + 1] - time[i])
-            output.SetFromVector(rows[i] + max(share, 0.0) * (rows[i + 1] - rows[i]))
+            s = (t - time[i]) / (time[i + 1] - time[i])
+            output.SetFromVector(rows[i] + max(s, 0.0) * (rows[i + 1] - rows[i]))
 
         return read
 
 
 def joint_columns(what: str) -> list[str]:
-    """Names of a recording's columns of the arm's joints, such as `position`."""
+    """Column names of the arm's joints in a recording. Args: what: as `position`."""
     return [f"{ARM}.{joint}.{what}" for joint in PANDA_JOINTS]
 
 
@@ -64,23 +66,23 @@ def make_replay_station(
 ) -> Diagram:
     """The sensors of a recording with the ports of a station.
 
-    Inputs:  panda.torque_commanded (7,), which moves nothing.
+    Inputs:  panda.torque_commanded (7,), without effect.
     Outputs: panda.position_measured, velocity_measured, torque_measured (7,);
-             ball.p_WB, ball.v_WB (3,), ball.seen (1,).
+             ball.p_WB [m], ball.v_WB [m/s] (3,), ball.seen (1,).
 
-    Args: columns, of gap/data/table.py; ball: names of those of the ball's place in the
-        plane [m]; radius: its height, as it is believed [m].
-    Raises: ValueError for a column that is not there or has holes where none may be.
+    Args: columns: as in gap/data/table.py; ball: names of the columns of the ball's x
+        and y [m]; radius: of the modelled ball, which gives its z [m].
+    Raises: ValueError for a missing column, or NaN in a column of the joints.
     """
-    lacks = [
+    missing = [
         name
         for what in ("position", "velocity", "effort_measured", "effort_command")
         for name in joint_columns(what)
         if name not in columns
     ]
-    lacks += [name for name in ("time", *ball) if name not in columns]
-    if lacks:
-        raise ValueError(f"the recording lacks {', '.join(lacks[:3])}")
+    missing += [name for name in ("time", *ball) if name not in columns]
+    if missing:
+        raise ValueError(f"the recording lacks {', '.join(missing[:3])}")
     time = np.asarray(columns["time"], dtype=float)
     if len(time) < SMOOTH_ROWS:
         raise ValueError(f"the recording has {len(time)} rows, expected {SMOOTH_ROWS}")
@@ -113,15 +115,15 @@ def make_replay_station(
     for port in signals:
         of = "ball" if port in ("p_WB", "v_WB", "seen") else ARM
         builder.ExportOutput(source.GetOutputPort(port), f"{of}.{port}")
-    nobody = builder.AddNamedSystem("nobody", _Nobody())
-    builder.ExportInput(nobody.get_input_port(), f"{ARM}.torque_commanded")
+    sink = builder.AddNamedSystem("torque_sink", _TorqueSink())
+    builder.ExportInput(sink.get_input_port(), f"{ARM}.torque_commanded")
     diagram = builder.Build()
     diagram.set_name("station")
     return diagram
 
 
-class _Nobody(LeafSystem):
-    """Takes torques and does nothing."""
+class _TorqueSink(LeafSystem):
+    """Ignores the torque (7,)."""
 
     def __init__(self):
         super().__init__()

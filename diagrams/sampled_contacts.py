@@ -1,11 +1,12 @@
-"""ball_rolling without a hand-written cycle: ContactSampler says where to touch.
+"""ball_rolling with ContactSampler instead of a hand-written sequence of touches.
 
     state_estimator --x--> path_target --x_desired--> c3_mpc, contact_sampler
     path_target --goal (the next point on the circle)--> contact_sampler, push_task
     contact_sampler --command (where to touch)--> push_task
     c3_mpc (contact), push_task (travel) --> arm_reference
 
-The tip pushes from beside the ball, at one height. Everything else is ball_rolling's.
+The tip pushes the ball from the side, at constant height. All else is as in
+ball_rolling.
 """
 
 from dataclasses import dataclass, field, replace
@@ -45,24 +46,24 @@ from makebreak.systems.contact_mpc.numerics.push_task import PushConfig
 from makebreak.systems.contact_mpc.path_target import PathTarget, PathTargetConfig
 from makebreak.systems.contact_mpc.push_task import PushTask, PushTaskConfig
 
-CORNERS = 24  # Of the ball's outline: it is 0.3 mm within the circle at most.
+CORNERS = 24  # Of the polygon inscribed in the ball's outline; error below 0.3 mm.
 
 
 @dataclass
 class SampledPlannerConfig:
-    """Costs of C3+; forces in newtons."""
+    """Weights of C3+, with forces in newtons."""
 
     N: int = 5  # Knots of 0.1 s.
     rounds: int = 2
     polish: int = 6
-    position: float = 5000.0  # Of the ball, across the table [1/m2].
-    velocity: float = 100.0  # Of the ball; its turning counts as much [s2/m2].
-    # Of the tip beside the ball, on the side from which it is to be pushed next: where
-    # nothing touches, the plan else does not care where the tip is [1/m2].
+    position: float = 5000.0  # Q of the ball's x and y [1/m2].
+    velocity: float = 100.0  # Q of the ball's velocity, and of w R [s2/m2].
+    # Q of the tip's x and y [1/m2]. Its reference is beside the ball, on the side from
+    # which it is pushed next: without contact nothing else places the tip.
     tip: float = 3000.0
-    tip_height: float = 1e4  # [1/m2]
-    tip_speed: float = 10.0  # [s2/m2]
-    force: float = 5.0  # G of lam of tip and ball; eta's is 1/10 of it.
+    tip_height: float = 1e4  # Q of the tip's z [1/m2].
+    tip_speed: float = 10.0  # Q of the tip's velocity [s2/m2].
+    force: float = 5.0  # G of lam of tip and ball; that of eta is 1/10 of it.
     friction: float = 0.5  # Of both contacts, for planning and learning.
 
 
@@ -89,17 +90,17 @@ class SampledContactsConfig:
             believed_sec=0.5, follow=True, place_change=0.0, around=True
         )
     )
-    # Q_d of the learner on the ball's v_x, v_y, as from above: 7 mm/s. The arm that
-    # moves the tip hardly feels a ball beside it.
+    # The learner's Q_d on v_x, v_y of the ball: a standard deviation of 7 mm/s. Only
+    # the ball's motion is informative, as the arm hardly feels a ball beside the tip.
     learning_weight: float = 2e4
-    # As learning.eps: a ball beside the tip is pushed with far less than the newtons of
-    # a tip on top of it, so a force over a gap has to cost more.
+    # Replaces learning.eps: pushing from the side takes far less force than from above,
+    # so a force over a gap has to cost more.
     learning_eps: float = 1e-4
-    # As posterior.drift of the learner [m/s / sqrt(s)]: a tip at one height touches the
-    # ball at one angle, where the gap stays what it is.
+    # Replaces posterior.drift of the learner [m/s / sqrt(s)]: at constant height the
+    # contact normal's slope is constant, and so is the gap residual.
     learning_drift: float = 0.005
-    # The gap is learned too large by 1.5 to 3 mm, for the ball is seen late; a tip that
-    # believes it strikes the ball. So much is taken off what is learned [m].
+    # The delay of the camera makes the learned gap 1.5 to 3 mm too large, so that the
+    # tip would strike the ball: this is subtracted from it [m].
     gap_allowance: float = 0.003
     reference: ArmReferenceConfig = field(
         default_factory=lambda: ArmReferenceConfig(force_max=8.0, acceleration_max=3.0)
@@ -107,7 +108,7 @@ class SampledContactsConfig:
 
 
 def check_contacts(config: SampledContactsConfig) -> None:
-    """Raises: ValueError for a setting that the diagram sets, or out of range."""
+    """Raises: ValueError for values out of range, or that the diagram sets itself."""
     p = config.planner
     for name in (
         "position",
@@ -150,35 +151,35 @@ def check_contacts(config: SampledContactsConfig) -> None:
 
 
 def beside(model: TipAndBall, height: float) -> float:
-    """How far beside the ball's centre, seen from above, a tip's surface is that
-    touches the ball with its centre at a height [m]; negative: it does not."""
+    """Horizontal distance [m] from the ball's centre to the surface of a tip that
+    touches the ball, with the tip's centre at `height` [m]; negative if it cannot."""
     R, r = model.ball_radius, model.tip_radius
     return float(np.sqrt(max((R + r) ** 2 - (height - R) ** 2, 0.0)) - r)
 
 
 def ball_shape(model: TipAndBall, height: float) -> ObjectShape:
-    """The ball for a tip whose centre stays at a height [m]: its outline is as far from
-    the tip, seen from above, as the ball is.
+    """The ball as an outline in the plane, for a tip with its centre at `height` [m]:
+    the horizontal distances of tip and outline are those of tip and ball.
 
     Raises: ValueError for a height at which the tip does not touch the ball's side.
     """
     R, r = model.ball_radius, model.tip_radius
-    far = beside(model, height)
+    radius = beside(model, height)
     if not r < height < 2.0 * R:
         raise ValueError(
             f"contacts.sampler.sampling.height is {height:g}, expected above the tip's "
             f"radius, {r:g}, and below the ball's top, {2.0 * R:g} m"
         )
     angle = 2.0 * np.pi * np.arange(CORNERS) / CORNERS
-    ring = far * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    ring = radius * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
     return ObjectShape([ring], r, 2.0 * R)
 
 
 def sampled_c3_config(
     planner: SampledPlannerConfig, n_lam: int, n_tip: int, radius: float, residual_dt
 ) -> C3Config:
-    """Args: n_tip: forces of tip and ball, the first of n_lam; radius: of the ball [m];
-    residual_dt [s]."""
+    """C3's settings. Args: n_tip: number of forces of tip and ball, the first of n_lam;
+    radius: of the ball [m]; residual_dt: time step of r_comp [s]."""
     p = planner
     Q = np.zeros(N_X)
     Q[0:2], Q[2], Q[V_TIP] = p.tip, p.tip_height, p.tip_speed
@@ -194,7 +195,7 @@ def sampled_c3_config(
 
 @dataclass(frozen=True, eq=False)
 class SampledContacts:
-    """The systems that take the task's place."""
+    """The systems that replace the RollingTask of ball_rolling."""
 
     target: PathTarget
     task: PushTask
@@ -214,11 +215,11 @@ def add_sampled_contacts(
     offset: dict[str, float],
     estimator: LeafSystem,
 ) -> SampledContacts:
-    """Adds and connects them, but for r_comp and what leads to C3 and the arm.
+    """Adds and connects them, except for r_comp and the inputs of C3 and the arm.
 
-    Args: path: where the circle is; lcs: of the plan; p_tip (3,) where the tip is at
-        first [m]; n_tip: forces of tip and ball; period of the task [s]; offset of
-        `target`, `task`, `sampler` [s].
+    Args: path: centre and radius of the circle; lcs: that of C3; p_tip (3,): initial
+        position of the tip [m]; n_tip: number of forces of tip and ball; period: of the
+        task [s]; offset: {"target", "task", "sampler": first update [s]}.
     """
     sampling = config.sampler.sampling
     shape = ball_shape(model, sampling.height)

@@ -1,4 +1,4 @@
-"""What can be read off a loaded scene."""
+"""Look-ups in a loaded scene."""
 
 import numpy as np
 from pydrake.geometry import SceneGraph, Sphere
@@ -10,7 +10,7 @@ N_JOINTS = len(PANDA_JOINTS)
 
 
 def actuators_of(plant: MultibodyPlant, model: str) -> list[JointActuator]:
-    """The actuators of a model, in the order of its inputs."""
+    """The actuators of a model, in the order of its actuation input."""
     indices = plant.GetJointActuatorIndices(plant.GetModelInstanceByName(model))
     return [plant.get_joint_actuator(index) for index in indices]
 
@@ -34,10 +34,10 @@ def sphere_radius(plant: MultibodyPlant, scene_graph: SceneGraph, model: str) ->
 
 
 def spheres_of(plant: MultibodyPlant, scene_graph: SceneGraph, model: str):
-    """The collision spheres of the model's only body: centres (n, 3) in its frame and
-    radii (n,) [m].
+    """Collision spheres of a model of one body: centres (n, 3) in its frame and radii
+    (n,) [m].
 
-    Raises: ValueError if it has another shape, or several bodies.
+    Raises: ValueError if it has other shapes, or several bodies.
     """
     inspector = scene_graph.model_inspector()
     bodies = plant.GetBodyIndices(plant.GetModelInstanceByName(model))

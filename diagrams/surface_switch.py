@@ -1,10 +1,10 @@
-"""A block slides over a seam, along a wall and back over the seam, again and again (CC
-section 4.5.2, figures 1a, 19 and 20).
+"""A block slides over a seam, along a wall and back over the seam, for several trials
+(CC section 4.5.2, figures 1a, 19 and 20).
 
 Down on a table (1), along it to a wall (2), along the wall (3), back along the table to
-a stop (4). Half-way in 2 and in 4 the surface changes: to more friction, and to less.
-Of the contacts there is a noisy estimate; the surfaces and their seams are not known in
-the first trial. A trial begins with what the one before has learned.
+a stop (4). Half-way in 2 the surface changes to one of more friction, in 4 back. The
+contacts are known from noisy estimates; surfaces and seam are unknown in the first
+trial. Each trial starts with what the last one learned.
 """
 
 from dataclasses import dataclass, field, replace
@@ -46,34 +46,37 @@ from makebreak.systems.changing_contact.numerics.motion_pattern import (
     segment_time,
 )
 
-START = (0.42, -0.16, 0.195)  # Of the tip in the scene [m].
-SEAM_Y = 0.0  # [m]
+START = (0.42, -0.16, 0.195)  # Initial position of the tip in the world [m].
+SEAM_Y = 0.0  # Where the two surfaces meet [m].
 ALONG_WALL = 0.15  # Length of segment 3 [m].
-BEYOND = 0.04  # How far behind wall and stop the motion pattern goes [m].
-BACK = 0.03  # Length of the last segment, which takes the last contact up [m].
-ERROR, SIGMA = 0.03, 0.02  # Of the estimates of the contacts, along each motion [m].
-# Low friction, high friction, and of the walls.
+BEYOND = 0.04  # Distance by which the motion pattern aims behind wall and stop [m].
+BACK = 0.03  # Length of the last segment, in which the last contact is held [m].
+# Of the contacts' estimates along each motion: largest error, standard deviation [m].
+ERROR, SIGMA = 0.03, 0.02
+# Ranges of the frictions of surface 1, of surface 2, and of wall and stop.
 LOW, HIGH, WALL = (0.1, 0.3), (0.4, 0.6), (0.1, 0.6)
 DOWN, Y = np.array([0.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0])
 CROSSINGS = (1, 3)  # Segments in which the surface changes.
-FEET = {"block": 0.012, "sphere": 0.0}  # From the tip to where it stands [m].
-# A sphere crosses at one point; what is averaged over takes some way.
-SPHERE_CROSSING = 0.01  # [m]
+# Distance of the corners on which the tool stands from its centre, along y [m].
+FEET = {"block": 0.012, "sphere": 0.0}
+# Length over which a sphere's crossing of a seam shows in the features: it crosses at
+# one point, but the features are averages [m].
+SPHERE_CROSSING = 0.01
 
 
 @dataclass
 class Anticipation:
-    """What a trial takes over from the one before about impact-less changes."""
+    """What a trial uses of the last one's knowledge about changes without impact."""
 
-    places: bool = True  # Where they are: K_max there.
-    models: bool = True  # And which mode begins there: its model is handed over.
+    places: bool = True  # Their places, where the stiffness is set to K_max.
+    models: bool = True  # The mode behind them, whose forward model is used at once.
 
 
 def _control() -> ChangingContactConfig:
-    """The defaults, with a lead for what a hint takes to reach the arm: 5 to 10 ms
-    through the estimators, 1 ms to the arm's law, and the 5 ms of the feed-forward's
-    filter. The force on wall and stop is let go within 30 ms: for as long as it fades
-    the tool stays there, while the reference leaves."""
+    """The defaults, with hints given early by the time that they take to reach the arm:
+    5 to 10 ms through the estimators, 1 ms to the impedance controller, 5 ms for the
+    filter of the feed-forward. The force on wall and stop is released within 30 ms:
+    while it fades, the tool stays there, and the reference moves on."""
     config = ChangingContactConfig(
         forward_model=friction_from_rest(),
         hybrid=HybridConfig(damping_ratio=0.9, release_sec=0.03),
@@ -89,9 +92,9 @@ class SurfaceSwitchConfig:
     speed: float = 0.1  # Of sliding [m/s].
     normal_force: float = 8.0  # On each surface that has been reached [N].
     realism: str = "none"  # Errors of the station: "none", "lab" or "poor".
-    # Low, high, of the walls; empty: drawn by the seed.
+    # Of surface 1, of surface 2, and of wall and stop; empty: drawn by the seed.
     friction: list[float] = field(default_factory=list)
-    model: str = ""  # Scene that the controllers believe; "": the shipped one.
+    model: str = ""  # Scene file of the controllers' model; "": the shipped one.
     rehearse: int = 0  # Trials in the model before the first real one.
     anticipation: Anticipation = field(default_factory=Anticipation)
     control: ChangingContactConfig = field(default_factory=_control)
@@ -99,21 +102,21 @@ class SurfaceSwitchConfig:
 
 @dataclass(frozen=True, eq=False)
 class SwitchTask:
-    """What the trials of one seed have in common."""
+    """World, motion and prior, which all trials of one seed share."""
 
     world: Scene
     model: Scene
     pattern: MotionPattern
-    prior: ContactBelief
-    friction: np.ndarray  # (3,) of surface 1, of surface 2, of the walls.
+    prior: ContactBelief  # Initial estimate of the three contacts.
+    friction: np.ndarray  # (3,) of surface 1, of surface 2, of wall and stop.
     errors: StationErrors
     feet: float  # From the tip to the corners it stands on, along y [m].
 
 
 def make_task(config: SurfaceSwitchConfig) -> SwitchTask:
-    """The world, the motion and the initial belief of config.seed.
+    """World, motion and prior of config.seed.
 
-    Raises: ValueError for an unknown tool, or numbers that are not positive.
+    Raises: ValueError for an unknown tool or a setting out of range.
     """
     for name in ("trials", "speed", "normal_force"):
         value = getattr(config, name)
@@ -132,14 +135,14 @@ def make_task(config: SurfaceSwitchConfig) -> SwitchTask:
     set_friction_by_place(world, "surfaces", friction[:2].tolist(), areas)
     set_friction(world, {name: float(friction[2]) for name in ("red_block", "stop")})
     pattern = make_pattern(config, half)
-    # Where the tool really meets table, wall and stop: the pattern goes beyond.
-    touch = [
+    # Segment, direction and true coordinate of the contacts with table, wall and stop.
+    contacts = [
         (0, DOWN, half),
         (1, Y, position(world, "red_block")[1] - half),
         (3, -Y, position(world, "stop")[1] + half),
     ]
     prior = []
-    for segment, d, place in touch:
+    for segment, d, place in contacts:
         mean = np.array(pattern.segments[segment].positions[-1])
         axis = int(np.argmax(abs(d)))
         mean[axis] = place + rng.uniform(-ERROR, ERROR)
@@ -156,7 +159,10 @@ def make_task(config: SurfaceSwitchConfig) -> SwitchTask:
 
 
 def make_pattern(config: SurfaceSwitchConfig, half: float) -> MotionPattern:
-    """Down, to the wall, along it, back to the stop, a little along that."""
+    """Down, to the wall, along it, back to the stop, and along that for a short way.
+
+    Args: half: half width of the tool [m].
+    """
     scene = read_scene(SURFACE_SWITCH)
     x, y, z = START
     wall = position(scene, "red_block")[1] - half
@@ -173,7 +179,7 @@ def make_pattern(config: SurfaceSwitchConfig, half: float) -> MotionPattern:
     segments, time, a_max = [], 0.0, 1.0
     for k, n in enumerate(forces):
         length = float(np.linalg.norm(corners[k + 1] - corners[k]))
-        # The last piece is short: half the speed will do.
+        # The last segment is short, so half the speed is enough.
         speed = config.speed / 2.0 if k == len(forces) - 1 else config.speed
         stops = k in (2, len(forces) - 1)  # The others end in a contact.
         duration = segment_time(length, speed, a_max, stops=stops)
@@ -191,7 +197,7 @@ def make_pattern(config: SurfaceSwitchConfig, half: float) -> MotionPattern:
 
 
 def taken_over(knowledge: Knowledge, anticipation: Anticipation) -> Knowledge:
-    """What the next trial is told: all, or less, for comparison."""
+    """The knowledge that the next trial uses: all, or less for comparison."""
     contacts = []
     for contact in knowledge.contacts.contacts:
         if contact.kind == IMPACTLESS:
@@ -210,10 +216,14 @@ def make_surface_switch(
     trial: int = 0,
     meshcat: Meshcat | None = None,
 ) -> Diagram:
-    """One trial. Args: knowledge: of the trial before; None: the prior alone."""
+    """The diagram of one trial.
+
+    Args: knowledge: from the trial before, None: the prior alone; trial: its number,
+        for the noise's seed.
+    """
     control = config.control
     modes, models = control.modes, control.forward_model
-    # How the tool crosses a seam is its own geometry.
+    # The length of a crossing follows from the tool's own geometry.
     crossing = modes.crossing if task.feet else SPHERE_CROSSING
     handover = replace(models.handover, rows=2.0 * task.feet)
     return make_changing_contact(

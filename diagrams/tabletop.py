@@ -1,7 +1,6 @@
-"""Worlds of the changing-contact experiments: what stands on the table, and where.
+"""The worlds of the changing-contact experiments: objects on a table and the tool.
 
-A world is read from a scene file and then changed in memory: these functions take the
-scene that was read and change it in place.
+A world is read from a scene file; these functions then change that scene in place.
 """
 
 import numpy as np
@@ -16,31 +15,34 @@ from makebreak.models.typed_yaml import nearest
 TABLETOP_WALLS = str(MODELS / "tabletop_walls.scene.yaml")
 THREE_SURFACES = str(MODELS / "three_surfaces.scene.yaml")
 SURFACE_SWITCH = str(MODELS / "surface_switch.scene.yaml")
-TOOL = "tool"  # The model instance in each of them.
+TOOL = "tool"  # Name of the tool's model instance in each of them.
 
-# The file of each tool, and the distance [m] from its tip to what it touches, straight
-# down and straight to the sides.
+# File of each tool, and the distance from its tip to its surface, straight down and to
+# the sides [m].
 TOOLS = {"block": ("block.sdf", 0.015), "sphere": ("sphere_tool.sdf", 0.02)}
-# On how many points each stands, and the stiffness of every surface in the files [N/m].
+# Number of contact points on which a tool stands.
 POINTS = {"block": 4, "sphere": 1}
-SURFACE_STIFFNESS = 4e4
-# Of a tool against a surface [N/m]; controllers know the most.
+SURFACE_STIFFNESS = 4e4  # Of every surface in the model files [N/m].
+# Stiffness of a tool against a surface [N/m]; controllers know the largest one.
 STIFFNESS_RANGE = (5e3, 2e5)
-SPREAD = 0.05  # Of the surfaces' positions [m].
-FRICTION_MAX = 1.8  # A surface reaches 2 with none of its own left to give.
+SPREAD = 0.05  # Largest displacement of the surfaces [m].
+# Drake's combination 2 m1 m2/(m1 + m2) with the tool's m1 = 1 stays below 2.
+FRICTION_MAX = 1.8
 
 
 def _known_tool(tool: str) -> tuple[str, float]:
+    """File and half width [m] of a tool. Raises: ValueError."""
     if tool not in TOOLS:
         raise ValueError(f"tool is {tool!r}: {nearest(tool, TOOLS)}")
     return TOOLS[tool]
 
 
 def read_model(path: str, shipped: str, tool: str) -> Scene:
-    """The scene that controllers believe: the file, with the tool on the arm.
+    """The scene of the controllers' model: the file, with the tool on the arm.
 
-    Args: path, a scene file; "": the shipped one.
-    Raises: ValueError if there is no such tool, or a part of the shipped scene lacks.
+    Args: path: of a scene file; "": the shipped one.
+    Raises: ValueError for an unknown tool, or an object of the shipped scene that the
+        file lacks.
     """
     model = read_scene(path or shipped)
     set_tool(model, tool)
@@ -50,31 +52,31 @@ def read_model(path: str, shipped: str, tool: str) -> Scene:
 
 
 def tool_half_width(tool: str) -> float:
-    """From the tip to what it touches, straight down or to a side [m].
+    """Distance from the tip to the tool's surface, straight down or to a side [m].
 
-    Raises: ValueError if there is no such tool.
+    Raises: ValueError for an unknown tool.
     """
     return _known_tool(tool)[1]
 
 
 def tool_corner(tool: str) -> float:
-    """From the tip to the tool's corners, in x and in y; 0: it has none [m].
+    """Distance from the tip to the tool's corners, in x and in y [m]; 0: no corners.
 
-    Raises: ValueError if there is no such tool.
+    Raises: ValueError for an unknown tool.
     """
     return tool_half_width(tool) if POINTS[tool] > 1 else 0.0
 
 
 def check_spread(spread: float) -> None:
-    """Raises: ValueError if surfaces cannot be so far from their places [m]."""
+    """Raises: ValueError for a displacement of surfaces that is out of range [m]."""
     if not 0.0 <= spread <= SPREAD:
         raise ValueError(f"spread is {spread}, expected 0 to {SPREAD} m")
 
 
 def set_tool(scene: Scene, tool: str) -> None:
-    """Mounts the block or the sphere.
+    """Mounts the block or the sphere on the arm.
 
-    Raises: ValueError if there is no such tool, or no model `tool` in the scene.
+    Raises: ValueError for an unknown tool, or a scene without a model `tool`.
     """
     file, _ = _known_tool(tool)
     for directive in scene.directives:
@@ -86,7 +88,7 @@ def set_tool(scene: Scene, tool: str) -> None:
 
 
 def objects(scene: Scene) -> list[str]:
-    """Names of the models that are welded to the world, but for the arm."""
+    """Names of the models that are welded to the world, without the arm."""
     return [
         weld.child.split("::")[0]
         for weld in (d.add_weld for d in scene.directives)
@@ -95,6 +97,7 @@ def objects(scene: Scene) -> list[str]:
 
 
 def _weld(scene: Scene, name: str):
+    """The directive that welds an object to the world. Raises: ValueError."""
     for directive in scene.directives:
         weld = directive.add_weld
         if (
@@ -110,9 +113,9 @@ def _weld(scene: Scene, name: str):
 
 
 def position(scene: Scene, name: str) -> np.ndarray:
-    """Where an object's origin is in the world, (3,) [m].
+    """Position of an object's origin in the world (3,) [m].
 
-    Raises: ValueError if there is no such object.
+    Raises: ValueError for an unknown object.
     """
     return np.array(_weld(scene, name).X_PC.translation, dtype=float)
 
@@ -120,7 +123,7 @@ def position(scene: Scene, name: str) -> np.ndarray:
 def move(scene: Scene, name: str, by) -> None:
     """Moves an object by (3,) [m] in the world.
 
-    Raises: ValueError if there is no such object, or `by` is not three numbers.
+    Raises: ValueError for an unknown object, or unless `by` is three numbers.
     """
     by = np.asarray(by, dtype=float)
     if by.shape != (3,) or not np.all(np.isfinite(by)):
@@ -130,7 +133,7 @@ def move(scene: Scene, name: str, by) -> None:
 
 
 def frictions(given: list[float], drawn: np.ndarray) -> np.ndarray:
-    """Those that are given, else those that were drawn.
+    """The given frictions, or the drawn ones if none are given.
 
     Raises: ValueError for another number of them.
     """
@@ -140,12 +143,12 @@ def frictions(given: list[float], drawn: np.ndarray) -> np.ndarray:
 
 
 def set_friction(scene: Scene, friction: dict[str, float]) -> None:
-    """Gives each named object its coefficient of friction with the tool.
+    """Sets the coefficients of friction between objects and the tool, {name: value}.
 
-    Drake combines two surfaces to 2 m1 m2/(m1 + m2). The tool has m1 = 1, so an object
-    is given m2 = m/(2 - m): any m below 2 can be had. Objects not named keep 0.3.
+    Drake combines two surfaces to m = 2 m1 m2/(m1 + m2). The tool has m1 = 1, so the
+    object gets m2 = m/(2 - m), for any m below 2. Other objects keep 0.3.
 
-    Raises: ValueError if there is no such object, or a value is not from 0 to 1.8.
+    Raises: ValueError for an unknown object, or a value that is not from 0 to 1.8.
     """
     for name, value in friction.items():
         _weld(scene, name)
@@ -153,16 +156,16 @@ def set_friction(scene: Scene, friction: dict[str, float]) -> None:
             raise ValueError(
                 f"friction of {name} is {value}, expected 0 to {FRICTION_MAX}"
             )
-        # The object first: the effect changes the first one's surface.
+        # The object first: the effect changes the surface of the first one.
         scene.effects.append(
             Effect("contact_friction", [f"{name}~{TOOL}"], {"friction": float(value)})
         )
 
 
 def draw_stiffness(rng: np.random.Generator, names, span) -> dict[str, float]:
-    """Stiffness of each of the names, log-uniform in span (2,) [N/m].
+    """A stiffness for each of the names, log-uniform in span (2,) [N/m].
 
-    Raises: ValueError for a span that is none.
+    Raises: ValueError for a span that is not 0 < low <= high.
     """
     if len(span) != 2 or not 0.0 < span[0] <= span[1] < np.inf:
         raise ValueError(f"stiffness is {span}, expected two numbers, 0 < low <= high")
@@ -172,14 +175,15 @@ def draw_stiffness(rng: np.random.Generator, names, span) -> dict[str, float]:
 
 
 def set_stiffness(scene: Scene, tool: str, stiffness: dict[str, float]) -> None:
-    """Gives each named object its stiffness of contact with the tool's flat side or
-    sphere: of all its points together [N/m].
+    """Sets the stiffness of contact between objects and the tool, {name: [N/m]}, of all
+    contact points of the tool together.
 
-    An effect scales both surfaces of a pair alike, the tool's for all objects with it.
-    So what each is asked for is such that all have their value when the last is done.
+    The effect contact_stiffness scales both surfaces of a pair, so each pair also
+    changes the tool's. The effects' values are computed so that every pair has its
+    stiffness after the last effect.
 
     Args: tool: its name in TOOLS.
-    Raises: ValueError if there is no such object or tool, or a stiffness is not
+    Raises: ValueError for an unknown object or tool, or a stiffness that is not
         positive.
     """
     _known_tool(tool)
@@ -191,7 +195,7 @@ def set_stiffness(scene: Scene, tool: str, stiffness: dict[str, float]) -> None:
             )
     k = np.array(list(stiffness.values())) / POINTS[tool]
 
-    def scale(log_tool):  # Of each object's surface, if the tool's ends up with this.
+    def scale(log_tool):  # Of each object's surface, for this final one of the tool.
         end = np.exp(log_tool)
         return k * end / ((end - k) * SURFACE_STIFFNESS)
 
@@ -214,10 +218,10 @@ def set_stiffness(scene: Scene, tool: str, stiffness: dict[str, float]) -> None:
 def set_friction_by_place(
     scene: Scene, name: str, friction: list[float], areas: list[FrictionZone]
 ) -> None:
-    """Gives one flat object a friction with the tool that depends on the place.
+    """Sets a friction between one flat object and the tool that depends on the place.
 
-    Args: friction: of each area; areas: FrictionZones of which x and y count, and
-        which cover the object. The smallest friction becomes the object's own.
+    Args: friction: of each area; areas: zones that together cover the object; only
+        their x and y are used. The smallest friction becomes the object's own.
     Raises: ValueError as set_friction.
     """
     least = float(min(friction))

@@ -1,13 +1,13 @@
-"""A Panda presses a block on a table and along a wall whose friction is not known
-(CC 4.4, figure 1b): an impedance controller of constant stiffness follows a motion.
+"""A Panda presses a block on a table and along a wall of unknown friction (CC 4.4,
+figure 1b): an impedance controller of constant stiffness follows a motion.
 
     motion --x_desired, gains, push--> impedance_controller --tau--> station
     station --wrench, q, v--> mode_detector, forward_model_bank, one-step predictors
 
-From above the block comes down on the table, slides to the wall, and along wall and
-table. When a surface is reached the stiffness along its normal is faded out and a
-constant force faded in: the motion knows when, nothing is adapted. What predicts only
-watches: no prediction reaches the controller.
+The block comes down on the table, slides to the wall, and along wall and table. When it
+reaches a surface, the stiffness along the normal fades out and a constant force fades
+in, at times given by the motion: nothing adapts. Predictors are only compared with the
+measured force; no prediction reaches the controller.
 """
 
 from collections.abc import Mapping, Sequence
@@ -60,21 +60,22 @@ from makebreak.systems.changing_contact.mode_detector import (
 from makebreak.systems.views.legend import LegendConfig
 
 WALL, N_ARM = "blue_wall", 7
-CAMERA = ([0.45, -0.95, 0.45], [0.55, 0.05, 0.05])  # Where it is, what it looks at.
-# As in the model files.
+CAMERA = ([0.45, -0.95, 0.45], [0.55, 0.05, 0.05])  # Meshcat's position, target [m].
+# Text and color of each part, as in the model files.
 LEGEND = (
     ("wall along which the tool slides", Rgba(0.2, 0.36, 0.7)),
     ("block at the end of the tool", Rgba(0.72, 0.53, 0.32)),
 )
-# Of the motion [s]: down, rest on the table, to the wall, rest, along it, rest.
+# Times [s] between the parts of the motion: down, rest on the table, to the wall, rest,
+# along it, rest.
 TIMES = np.cumsum([0.0, 2.4, 0.4, 2.6, 0.5, 3.0, 0.3])
 DURATION = float(TIMES[-1])
-TABLE_Z, WALL_X = 0.015, 0.62  # Of the tip, where the block touches them [m].
-BEYOND = 0.005  # The motion goes on behind the surface, so that the block meets it [m].
-ALONG = 0.26  # Of the wall [m].
-FADE = 0.25  # [s] from stiffness to force along a normal, just before the rest.
-NORMAL_DAMPING = 250.0  # Along it then, so that the block does not bounce [N s/m].
-DAMPING_RATIO, MASS = 0.9, 5.0  # [kg]: what the tip weighs, about; for the damping.
+TABLE_Z, WALL_X = 0.015, 0.62  # Of the tip when the block touches them [m].
+BEYOND = 0.005  # The motion aims so far behind a surface, to reach it for sure [m].
+ALONG = 0.26  # Length of the motion along the wall [m].
+FADE = 0.25  # Time from stiffness to force along a normal, before the rest [s].
+NORMAL_DAMPING = 250.0  # Along a normal under force, against bouncing [N s/m].
+DAMPING_RATIO, MASS = 0.9, 5.0  # Effective mass at the tip, for the damping [kg].
 TURNING_STIFFNESS, TURNING_DAMPING = 50.0, 15.0  # [N m/rad], [N m s/rad]
 TICK, ESTIMATE = 0.001, 0.005  # Periods [s].
 # After the plant's step, as in changing_contact.
@@ -83,7 +84,7 @@ OFFSET, IMPEDANCE_OFFSET = 1e-4, 7e-4
 
 @dataclass
 class WallTraining:
-    """What the baseline learns from, and how much of it."""
+    """Training data of the baseline, and how much of it is used."""
 
     trials: int = 14  # In each of the three training sets.
     every: int = 10  # Samples of 5 ms between two steps of a long-term prediction.
@@ -92,7 +93,7 @@ class WallTraining:
             points_per_mode=120, segment_min=2, predict_change=False
         )
     )
-    # At every sample; each once with the next force as output, once with its change.
+    # For one step of 5 ms; trained once on the next force, once on its change.
     one_step: TrainingBudget = field(
         default_factory=lambda: TrainingBudget(segment_min=20, predict_change=False)
     )
@@ -101,22 +102,23 @@ class WallTraining:
 @dataclass
 class WallFrictionConfig:
     friction: float = 0.9  # Of the wall.
-    stiffness: float = 300.0  # [N/m] of the controller.
-    stiffness_high: float = 2000.0  # [N/m] of figure 12.
-    normal_force: float = 8.0  # [N] on the table, and on the wall.
-    start_spread: float = 0.003  # [m], standard deviation of the path's corners.
+    stiffness: float = 300.0  # Of the controller [N/m].
+    stiffness_high: float = 2000.0  # Of figure 12 [N/m].
+    normal_force: float = 8.0  # On the table and on the wall [N].
+    start_spread: float = 0.003  # Standard deviation of the path's corners [m].
     training: WallTraining = field(default_factory=WallTraining)
     seed: int = 0
-    faults: list[str] = field(default_factory=list)  # What goes wrong, by --fault.
+    faults: list[str] = field(default_factory=list)  # Injected by --fault.
 
 
 def motion(config: WallFrictionConfig, p_start) -> dict[str, np.ndarray]:
-    """The plan, every 5 ms: what the controller is asked for, and what it means.
+    """The planned inputs of the impedance controller and the predictors, every 5 ms.
 
-    Args: p_start (3,) where the tip is at first [m].
-    Returns: time (n,); x_desired (n, 19); stiffness (n, 6); damping (n, 6); push (n, 6)
-        fed forward; direction (n, 3) of the motion, zero at rest; force_directions
-        (n, 6), two rows n that the block is pressed along, zero while there is none.
+    Args: p_start (3,): initial position of the tip [m].
+    Returns: time (n,) [s]; x_desired (n, 19); stiffness (n, 6); damping (n, 6); push
+        (n, 6): fed forward [N], [N m]; direction (n, 3): of the motion, zero at rest;
+        force_directions (n, 6): two unit vectors along which the block presses, zero
+        while it does not.
     """
     time = np.arange(0.0, DURATION + 0.0025, 0.005)
     rng = np.random.default_rng([config.seed, 1])
@@ -138,11 +140,11 @@ def motion(config: WallFrictionConfig, p_start) -> dict[str, np.ndarray]:
         span = TIMES[i + 1] - TIMES[i]
         now = (time >= TIMES[i]) & (time <= TIMES[i + 1] + 1e-9)
         s = ((time[now] - TIMES[i]) / span)[:, None]
-        way = corners[i + 1] - corners[i]
-        # Rest to rest with the least jerk.
-        p[now] = corners[i] + way * (10 * s**3 - 15 * s**4 + 6 * s**5)
-        v[now] = way * (30 * s**2 - 60 * s**3 + 30 * s**4) / span
-        a[now] = way * (60 * s - 180 * s**2 + 120 * s**3) / span**2
+        line = corners[i + 1] - corners[i]
+        # Minimum jerk, from rest to rest.
+        p[now] = corners[i] + line * (10 * s**3 - 15 * s**4 + 6 * s**5)
+        v[now] = line * (30 * s**2 - 60 * s**3 + 30 * s**4) / span
+        a[now] = line * (60 * s - 180 * s**2 + 120 * s**3) / span**2
     speed = np.linalg.norm(v, axis=1, keepdims=True)
     direction = np.where(speed > 1e-9, v / np.maximum(speed, 1e-9), 0.0)
 
@@ -156,15 +158,14 @@ def motion(config: WallFrictionConfig, p_start) -> dict[str, np.ndarray]:
     )
     push, normals = np.zeros((len(time), 6)), np.zeros((len(time), 6))
     for row, (axis, sign, end) in enumerate(((2, -1.0, TIMES[1]), (0, 1.0, TIMES[3]))):
-        share = np.clip((time - end) / FADE + 1.0, 0.0, 1.0)
-        stiffness[:, axis] *= 1.0 - share
-        damping[:, axis] += share * max(NORMAL_DAMPING - linear, 0.0)
-        push[:, axis] = sign * config.normal_force * share
-        pressed = share > 0.0
-        normals[pressed, 3 * row + axis] = sign
-        # What is under force control has no reference of its own.
-        x_desired[:, 7 + axis] *= 1.0 - share
-        x_desired[:, 13 + axis] *= 1.0 - share
+        faded = np.clip((time - end) / FADE + 1.0, 0.0, 1.0)  # 1: force control.
+        stiffness[:, axis] *= 1.0 - faded
+        damping[:, axis] += faded * max(NORMAL_DAMPING - linear, 0.0)
+        push[:, axis] = sign * config.normal_force * faded
+        normals[faded > 0.0, 3 * row + axis] = sign
+        # A direction under force control has no velocity or acceleration to follow.
+        x_desired[:, 7 + axis] *= 1.0 - faded
+        x_desired[:, 13 + axis] *= 1.0 - faded
     return {
         "time": time,
         "x_desired": x_desired,
@@ -182,17 +183,16 @@ def make_wall_friction(
     predictors: Mapping[str, LongTermPredictor] | None = None,
     knowledge: tuple | None = None,
 ) -> Diagram:
-    """One trial, and a log of it: see `telemetry`.
+    """The diagram of one trial, with a log that `telemetry` reads.
 
     Args:
         config: its `training` is not used here.
-        meshcat: where it is seen; None: nowhere.
+        meshcat: shows the trial; None: it is not shown.
         predictors: baselines that predict one step ahead, by name; their system in the
             diagram is predictor_<name>.
-        knowledge: of the mode detector and the forward models, from an earlier trial
+        knowledge: of mode detector and forward models, from an earlier trial
             (`learned`); None: none.
-    Raises: ValueError for a stiffness or force that is not positive, a friction that
-        is not from 0 to 1.8.
+    Raises: ValueError for a setting out of range.
     """
     for name in ("stiffness", "stiffness_high", "normal_force"):
         if not 0.0 < getattr(config, name) < np.inf:
@@ -268,8 +268,8 @@ def make_wall_friction(
     forward = add(
         "forward_model_bank",
         ForwardModelBank(
-            # A face slides: its torque says nothing of friction.
-            # The mixture alone is compared.
+            # Without torque: that of a sliding face depends on where it is pressed, not
+            # on friction. Without correction: the mixture alone is compared.
             ForwardModelConfig(with_torque=False, tau_nov=0.01, correction=0.0),
             known_models,
             ESTIMATE,
@@ -308,9 +308,10 @@ def make_wall_friction(
             if system.HasInputPort(name):
                 builder.Connect(port, system.GetInputPort(name))
 
-    # Sampled just before the predictors read, of the same plant step: a row of the log
-    # is what they are about to read, and what they had predicted for it. (At their own
-    # instant it would be what they predict next: abstract state is updated first.)
+    # Sampled just before the predictors run, after the same step of the plant: a row of
+    # the log has the values that they are about to read beside their predictions of
+    # them. (At their own instant the log would get the next predictions, because
+    # abstract state is updated first.)
     sizes = [size for _, size in signals.values()]
     bundle = add("telemetry", Multiplexer(sizes))
     for i, (port, _) in enumerate(signals.values()):
@@ -328,15 +329,15 @@ def make_wall_friction(
 
 
 def plan_of(config: WallFrictionConfig) -> dict[str, np.ndarray]:
-    """The motion from where the tip is at first."""
+    """The motion from the tip's initial position."""
     return motion(config, start_of(make_control_plant(TABLETOP_WALLS, TOOL)))
 
 
 def policy(config: WallFrictionConfig, every: int):
-    """What the controller does, for the baseline: u(t, x) at steps of `every` samples.
+    """The controller's law as the baseline needs it, at steps of `every` samples.
 
-    Returns: a function of the step t and x (k, 14) = [q, v] that gives (k, 6): the
-        force that the impedance commands [N], and the plan's acceleration [m/s2].
+    Returns: u(t, x) of the step t and states x (k, 14) = [q, v] that gives (k, 6): the
+        force of the impedance controller [N] and the plan's acceleration [m/s2].
     """
     control_plant = make_control_plant(TABLETOP_WALLS, TOOL)
     chain = serial_chain_of(control_plant, TIP_FRAME)
@@ -360,7 +361,7 @@ def policy(config: WallFrictionConfig, every: int):
 
 
 def tip_states(data: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (n, 3) [m] and velocities (n, 3) [m/s] of the tip, from the joints'."""
+    """Positions (n, 3) [m] and velocities (n, 3) [m/s] of the tip, from joint data."""
     control_plant = make_control_plant(TABLETOP_WALLS, TOOL)
     chain = serial_chain_of(control_plant, TIP_FRAME)
     position, velocity = np.empty((2, len(data["q"]), 3))
@@ -371,7 +372,7 @@ def tip_states(data: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def start_of(control_plant) -> np.ndarray:
-    """(3,) where the tip is at first [m]."""
+    """Initial position of the tip (3,) [m]."""
     chain = serial_chain_of(control_plant, TIP_FRAME)
     positions = control_plant.GetPositions(control_plant.CreateDefaultContext())
     return tip_kinematics(chain, positions)[0]
@@ -380,18 +381,19 @@ def start_of(control_plant) -> np.ndarray:
 def telemetry(
     diagram: Diagram, context: Context, names: Sequence[str] = ()
 ) -> dict[str, np.ndarray]:
-    """What was logged in a simulation that ended in `context`.
+    """The log of a simulation that ended in `context`.
 
-    Args: names of the one-step predictors.
-    Returns: time (n,), every 5 ms; q, v (n, 7), wrench (n, 6) as measured then; mode
-        (n, 1), wrench_predicted (n, 6) and <name>.wrench_predicted (n, 6), <name>.std
-        (n, 3) that had been predicted for then.
+    Args: names: of the one-step predictors.
+    Returns: time (n,) [s], every 5 ms; q, v (n, 7), wrench (n, 6): measured then; mode
+        (n, 1), wrench_predicted (n, 6), <name>.wrench_predicted (n, 6), <name>.std
+        (n, 3): predicted for then.
     """
     log = diagram.GetSubsystemByName("telemetry_log").FindLog(context)
     sizes = {"q": N_ARM, "v": N_ARM, "wrench": 6, "mode": 1, "wrench_predicted": 6}
     for name in names:
         sizes |= {f"{name}.wrench_predicted": 6, f"{name}.std": 3}
-    # The first row is from before the first sample; each is taken just before the next.
+    # The first row is from before the first sample; the others are logged one period
+    # after they were sampled.
     data, start = log.data()[:, 1:], 0
     out = {"time": np.array(log.sample_times()[1:]) - ESTIMATE}
     for name, size in sizes.items():
@@ -401,7 +403,7 @@ def telemetry(
 
 
 def learned(diagram: Diagram, context: Context) -> tuple:
-    """What mode detector and forward models know at the end of a trial."""
+    """What mode detector and forward models have learned at the end of a trial."""
     return tuple(
         system.knowledge(system.GetMyContextFromRoot(context))
         for system in map(

@@ -1,4 +1,4 @@
-"""What several diagrams do alike: settings that are theirs to give, and the arm's."""
+"""Helpers that several diagrams share: connections, and settings that they compute."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -15,7 +15,8 @@ _Config = TypeVar("_Config")
 
 
 def refuse_changed(name: str, part: Any, keys: Sequence[str]) -> None:
-    """Raises: ValueError for a setting that the diagram sets: it would not act."""
+    """Raises: ValueError if one of the settings `keys` of a config is not the default:
+    the diagram computes it, so a user's value would have no effect."""
     plain = type(part)()
     for key in keys:
         value, default = getattr(part, key), getattr(plain, key)
@@ -26,13 +27,14 @@ def refuse_changed(name: str, part: Any, keys: Sequence[str]) -> None:
 
 
 def check_own(config: Any, own: Mapping[str, Sequence[str]]) -> None:
-    """refuse_changed of each part of a config, {field: keys}."""
+    """refuse_changed for parts of a config. Args: own: {field: keys}."""
     for name, keys in own.items():
         refuse_changed(name, getattr(config, name), keys)
 
 
 def timed(part: _Config, period: float, offset: float) -> _Config:
-    """A system's config with the diagram's period and offset [s]."""
+    """A system's config with the diagram's period and offset [s]. Raises: ValueError if
+    the config has its own."""
     refuse_changed(type(part).__name__, part, ("period_sec", "offset_sec"))
     changed: Any = part
     return replace(changed, period_sec=period, offset_sec=offset)
@@ -41,15 +43,15 @@ def timed(part: _Config, period: float, offset: float) -> _Config:
 def connect(
     builder: DiagramBuilder, source: System, output: str, target: System, port: str
 ) -> None:
-    """An output port to an input port, both by name."""
+    """Connects an output port to an input port, both by name."""
     builder.Connect(source.GetOutputPort(output), target.GetInputPort(port))
 
 
 def connect_command(
     builder: DiagramBuilder, reference: LeafSystem, arm: LeafSystem
 ) -> None:
-    """An ArmReference to an ImpedanceController, pose and wrench at once: a port of a
-    Python system costs more than what it works out."""
+    """Connects an ArmReference to an ImpedanceController. Pose and wrench share a port,
+    as evaluating a Python system's port takes longer than computing its value."""
     sizes = [reference.GetOutputPort(name).size() for name in ("x_desired", "wrench")]
     split = builder.AddNamedSystem("arm_command_split", Demultiplexer(sizes))
     builder.Connect(reference.GetOutputPort("command"), split.get_input_port())
@@ -63,7 +65,7 @@ def add_legend(
     config: LegendConfig,
     phase: OutputPort | None = None,
 ) -> None:
-    """A legend beside a view. Args: phase (1,): the number of one of config.phases."""
+    """Adds a legend beside a view. Args: phase (1,): index into config.phases."""
     legend = builder.AddNamedSystem("legend", Legend(config, meshcat))
     if phase is not None:
         builder.Connect(phase, legend.GetInputPort("phase"))
@@ -72,7 +74,7 @@ def add_legend(
 def add_generalized_forces(
     builder: DiagramBuilder, plant: MultibodyPlant, forces: Sequence[OutputPort]
 ) -> None:
-    """Ports (n_v,) to a plant, beside the forces that the scene has there already."""
+    """Adds generalized forces (n_v,) to those that the scene applies to a plant."""
     if not forces:
         return
     into = plant.get_applied_generalized_force_input_port()

@@ -1,4 +1,4 @@
-"""An own planner in place of C3: random shooting on the LCS that the builder gives."""
+"""An own planner in place of C3: random shooting on the LCS of the builder."""
 
 import numpy as np
 from pydrake.all import (
@@ -10,8 +10,7 @@ from pydrake.all import (
     Simulator,
 )
 
-from makebreak import AnitescuLcsBuilder as LcsBuilder
-from makebreak import ContactPair, LcsBuilderConfig, model_path, simulate
+import makebreak as mb
 
 Q, GOAL, N = np.array([0, 200, 1, 20]), np.array([0.4, 0.5, 0, 0]), 10
 
@@ -19,27 +18,29 @@ Q, GOAL, N = np.array([0, 200, 1, 20]), np.array([0.4, 0.5, 0, 0]), 10
 class RandomShooting(LeafSystem):  # C3Mpc has these ports, too, so either fits.
     def __init__(self, lcs):
         super().__init__()
-        self.rng, self.plan = np.random.default_rng(0), np.zeros(N)
         self.lcs = self.DeclareAbstractInputPort("lcs", AbstractValue.Make(lcs))
         self.x = self.DeclareVectorInputPort("x", len(Q))
-        state = self.DeclareDiscreteState(1)
-        self.DeclareStateOutputPort("u", state)
+        self.plan = self.DeclareDiscreteState(N)  # All memory is in the Context.
+        self.DeclareVectorOutputPort("u", 1, self.first)
         self.DeclarePeriodicDiscreteUpdateEvent(0.05, 1e-3, self.update)
+
+    def first(self, context, u):
+        u.SetFromVector(context.get_discrete_state(self.plan).value()[:1])
 
     def update(self, context, state):
         lcs, x = self.lcs.Eval(context), self.x.Eval(context)
-        mean = np.append(self.plan[1:], 0.0)
+        rng = np.random.default_rng(round(1e3 * context.get_time()))
+        mean = np.append(context.get_discrete_state(self.plan).value()[1:], 0.0)
         for spread in (2.0, 0.5):  # The best of many, then of those near it.
-            tries = mean + spread * self.rng.normal(size=(60, N))
+            tries = mean + spread * rng.normal(size=(60, N))
             tries[0] = mean
             mean = min(tries, key=lambda u: self.cost(lcs, x, u))
-        self.plan = mean
-        state.set_value(mean[:1])
+        state.set_value(self.plan, mean)
 
     def cost(self, lcs, x, u):
         total = 0.01 * u @ u
         for u_k in u:
-            x, _ = simulate(lcs, x, np.array([u_k]))
+            x, _ = mb.simulate(lcs, x, np.array([u_k]))
             total += (x - GOAL) @ (Q * (x - GOAL))
         return total
 
@@ -48,12 +49,13 @@ builders = []
 for time_step in (0.0, 0.001):  # The controller's model, and the world.
     builders.append(builder := DiagramBuilder())
     plant, _ = AddMultibodyPlantSceneGraph(builder, time_step)
-    Parser(plant).AddModels(model_path("puck.sdf"))
+    Parser(plant).AddModels(mb.model_path("puck.sdf"))
     plant.Finalize()
-config = LcsBuilderConfig([ContactPair("finger", "puck", 0.3)], 0.05, period_sec=0.05)
-lcs = builder.AddSystem(LcsBuilder(builders[0].Build(), config))
-shooting = RandomShooting(lcs.model.build(lcs.model.x_default, [0.0]))
-planner = builder.AddSystem(shooting)
+pairs = [mb.ContactPair("finger", "puck", 0.3)]
+config = mb.LcsBuilderConfig(pairs, 0.05, period_sec=0.05)
+lcs = builder.AddSystem(mb.AnitescuLcsBuilder(builders[0].Build(), config))
+lcs_here = lcs.model.build(lcs.model.x_default, [0.0])
+planner = builder.AddSystem(RandomShooting(lcs_here))
 builder.Connect(plant.get_state_output_port(), lcs.GetInputPort("x"))
 builder.Connect(plant.get_state_output_port(), planner.GetInputPort("x"))
 builder.Connect(planner.GetOutputPort("u"), lcs.GetInputPort("u"))

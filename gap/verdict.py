@@ -67,8 +67,9 @@ def not_borne_out(verdict: str, gap: GapMeasure) -> str:
     if verdict != "no_gap" or not gap.before > UNNAMED:
         return ""
     return (
-        " Nothing is left beyond noise in what was decided on, but what was held out "
-        f"for the report is simulated {gap.before:.2g} times its noise off."
+        " The data used for the decision show no error beyond noise, but on the data "
+        f"held out for the report the simulation error is {gap.before:.2g} times the "
+        "noise."
     )
 
 
@@ -85,7 +86,7 @@ def withdrawn_if_weak(
     if isnan(closed):  # No window could be simulated to its end.
         near += "could not be judged by simulation, so none is named."
     else:
-        near += f"close {max(closed, 0.0):.0%} of it, too little to be named."
+        near += f"close {max(closed, 0.0):.0%} of the gap, too little to be named."
     return replace(selection, choices=(), end=selection.start), near
 
 
@@ -167,16 +168,16 @@ def says(
     before, after = f"{gap.before:.3g}", f"{gap.after:.3g}"
     if verdict == "no_gap":
         return (
-            "The scene and the recordings agree: nothing is left beyond noise and "
-            f"tolerance (held-out error {gap.before:.2g} times the noise).{more}"
+            "The scene and the recordings agree to within noise and tolerance "
+            f"(held-out error {gap.before:.2g} times the noise).{more}"
         )
     if verdict == "not_judged":
         return (
-            "What was compared agrees (held-out error "
+            "The channels that were compared agree (held-out error "
             f"{gap.before:.2g} times the noise), but not every measured channel was "
             f"compared, so the scene is not confirmed.{more} "
-            "A channel that does not belong here is left out with `columns: {name: "
-            "null}` beside the recording."
+            "To leave a channel out, write `columns: {name: null}` in the recording's "
+            "sidecar."
         )
     words = " ".join(each.says for each in effects)
     if verdict == "gap_unnamed":
@@ -189,7 +190,10 @@ def says(
     if verdict == "ambiguous":
         tail = _apart_from(effects)
     goes = "falls" if gap.after < gap.before else "goes"
-    return f"{words}{tail} Held-out error {goes} from {before} to {after}.{more}"
+    return (
+        f"{words}{tail} The held-out error {goes} from {before} to {after} times the "
+        f"noise.{more}"
+    )
 
 
 def _apart_from(effects: Sequence[NamedEffect]) -> str:
@@ -203,7 +207,7 @@ def _apart_from(effects: Sequence[NamedEffect]) -> str:
     )  # fmt: skip
     text = ""
     if kinds:
-        text += f" These data cannot tell it apart from {', '.join(kinds)}."
+        text += f" These data cannot distinguish it from {', '.join(kinds)}."
     if places:
         text += f" It could equally be at {' or '.join(places)}."
     return text

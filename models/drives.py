@@ -1,4 +1,4 @@
-"""What drives a scene's joints: actuators, and what lies before them."""
+"""The actuation of a scene's joints: actuators, drives, and effects on the commands."""
 
 from collections.abc import Iterable, Sequence
 
@@ -38,18 +38,21 @@ from makebreak.models.effects.transmission import motor_joint
 from makebreak.models.scene_schema import COMMANDS_OF, ActuationSection
 from makebreak.models.typed_yaml import nearest
 
-DRIVEN_BY = ("position_command", "velocity_command")  # A drive with a loop of its own.
+DRIVEN_BY = ("position_command", "velocity_command")  # Of drives with a control loop.
 STIFF_TYPES = ("servo", "velocity")
 CHANNEL_STEPS = {name: kind.channel for name, kind in KINDS.items() if kind.channel}
 
 
 def step_or_default(plant: MultibodyPlant) -> float:
-    """Of the systems that sample beside the plant [s]."""
+    """Period of systems that sample beside the plant [s]."""
     return plant.time_step() or 0.001
 
 
 def add_actuators(actuation: ActuationSection, plant: MultibodyPlant) -> None:
-    """A joint that the scene drives gets an actuator if its model has none."""
+    """Adds actuators to the joints that the scene drives, if their models have none.
+
+    Raises: ValueError for an unknown joint.
+    """
     if actuation.type == "none":
         return
     named = {full_name(plant, joint): joint for joint in one_dof_joints(plant)}
@@ -64,7 +67,7 @@ def add_actuators(actuation: ActuationSection, plant: MultibodyPlant) -> None:
 
 
 def actuators_of_model(plant: MultibodyPlant, model: str) -> list:
-    """In the order of the model's actuation port."""
+    """The actuators of a model, in the order of its actuation port."""
     instance = plant.GetModelInstanceByName(model)
     return [
         plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(instance)
@@ -74,11 +77,13 @@ def actuators_of_model(plant: MultibodyPlant, model: str) -> list:
 def path_numbers(
     plant: MultibodyPlant, model: str, effects: Iterable[Effect]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What lies between a model's commands and its joints: the numbers (ROWS, n_u) of
-    its ActuationPath, and the delays (n_u,) [s] before it. Gains multiply, biases,
-    lags, delays and shares add up; the least limit holds, and the last kp.
+    """Effects between a model's commands and its joints: the numbers (ROWS, n_u) of its
+    ActuationPath, and the delays (n_u,) before it [s].
 
-    Raises: ValueError for a joint that nothing drives.
+    Gains multiply; biases, lags, delays and load friction add up; the smallest limit
+    and the last kp are taken.
+
+    Raises: ValueError for an effect on a joint without an actuator.
     """
     actuators = actuators_of_model(plant, model)
     at = {actuator.joint().index(): i for i, actuator in enumerate(actuators)}
@@ -116,9 +121,9 @@ def path_numbers(
 
 
 def drive_law(actuation: ActuationSection) -> DriveLaw:
-    """The law of the scene's drives, an entry for each of actuation.joints.
+    """The law of the scene's drives, with an entry for each of actuation.joints.
 
-    Raises: ValueError for numbers that are too few, too many or out of range.
+    Raises: ValueError for too few or too many numbers, or one out of range.
     """
     n = len(actuation.joints)
 
@@ -161,7 +166,7 @@ def drive_law(actuation: ActuationSection) -> DriveLaw:
 
 
 def law_of(actuation: ActuationSection, joint: str) -> DriveLaw | None:
-    """The law of one joint's drive; None if a drive has no loop of its own there."""
+    """The law of one joint's drive; None if it has no control loop."""
     if joint not in actuation.joints:
         return None
     if not set(COMMANDS_OF[actuation.type]) & set(DRIVEN_BY):
@@ -170,7 +175,7 @@ def law_of(actuation: ActuationSection, joint: str) -> DriveLaw | None:
 
 
 def _gear(plant: MultibodyPlant, model: str) -> Gear:
-    """Of all actuators of a model."""
+    """Where load friction of a model's actuators fades (Gear)."""
     actuators = actuators_of_model(plant, model)
     n_q, dt = plant.num_positions(), plant.time_step()
     context = plant.CreateDefaultContext()
@@ -182,8 +187,8 @@ def _gear(plant: MultibodyPlant, model: str) -> Gear:
 
 
 def _check_stiffness(plant: MultibodyPlant, drive, joints, names) -> None:
-    """Raises: ValueError where a drive stops a joint faster than can be simulated. So
-    it is where the model leaves out what turns in the motor."""
+    """Raises: ValueError if a drive stops a joint faster than can be simulated, as it
+    does if the model lacks the motor's rotor."""
     damping, driven = drive
     context, dt = plant.CreateDefaultContext(), plant.time_step()
     mobility = np.diag(np.linalg.inv(plant.CalcMassMatrix(context)))
@@ -202,7 +207,7 @@ def _check_stiffness(plant: MultibodyPlant, drive, joints, names) -> None:
 def _drive(
     actuation: ActuationSection, effects, plant: MultibodyPlant, model: str
 ) -> Drive | None:
-    """The position control of a model's drives, if the scene has it."""
+    """The control loops of a model's drives; None if it has none."""
     actuators = actuators_of_model(plant, model)
     names = [full_name(plant, actuator.joint()) for actuator in actuators]
     driven = np.array([name in actuation.joints for name in names], dtype=bool)
@@ -235,7 +240,11 @@ def add_paths(
     builder: DiagramBuilder,
     command_delays: bool,
 ) -> dict[str, PathPorts]:
-    """An actuation path for each model that needs one."""
+    """Adds and connects an ActuationPath for each model that needs one: {model: ports}.
+
+    Args: command_delays: whether delays of commands are simulated.
+    Raises: ValueError for an effect on a joint without an actuator.
+    """
     paths = {}
     elastic_motors = {
         motor.index(): joint.index()
@@ -302,7 +311,7 @@ def add_paths(
                     plant.get_actuation_input_port(motor.model_instance()),
                 )
         paths[model] = ports
-    # Asked for, so that a joint that nothing drives is refused by name.
+    # An effect that acts on no actuator at all.
     for effect in effects:
         if KINDS[effect.kind].path and not any(
             actuator_of(plant, joint) for joint in find_joints(effect, plant)

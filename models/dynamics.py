@@ -2,9 +2,9 @@
 
     effort = ID(q, v, vd) = d/dt (M v) + rest(q, v)
 
-with gravity, the model's own damping, rotors and the effects that the scene has. What
-is left out: contact, the actuation path (the effort is what acts on the joints), and
-effects with coordinates that no channel measures (elasticity, backlash).
+with gravity, damping, rotors and the effects of the scene. Not included: contact, the
+actuation path (the effort is what acts on the joints), and effects with hidden states,
+which no channel measures (elasticity, backlash).
 """
 
 from collections.abc import Sequence
@@ -38,9 +38,9 @@ from makebreak.models.scene_schema import COMMANDS_OF
 
 
 class SceneDynamics:
-    """Residuals of a scene's model and what any kind of effect would add to them.
+    """Residuals of a scene's model, and signatures of effects in them.
 
-    It has one Context of its own, so one of these serves one thread.
+    It owns one Context, so it must be used by one thread only.
     """
 
     def __init__(self, scene: Scene | str | Path):
@@ -64,8 +64,8 @@ class SceneDynamics:
     # ----- The model
 
     def inverse_dynamics(self, q, v, vd, time=None) -> np.ndarray:
-        """Effort (n, n_v) for the motion q (n, n_q), v, vd (n, n_v) at time (n,) [s],
-        which only matters for forces that depend on it."""
+        """Effort (n, n_v) for the motion q (n, n_q), v, vd (n, n_v) at the times (n,)
+        [s], which are only needed for time-dependent forces."""
         plant, context, forces = self.plant, self._context, self._forces
         n = len(v)
         time = np.zeros(n) if time is None else time
@@ -92,22 +92,22 @@ class SceneDynamics:
         return out
 
     def rest(self, q, v, time=None) -> np.ndarray:
-        """ID(q, v, 0) - dM/dt v, (n, n_v): what the effort is beside d/dt (M v)."""
-        step = 1e-5  # [s]: central difference, error step^2.
+        """ID(q, v, 0) - dM/dt v, (n, n_v): the effort minus d/dt (M v)."""
+        step = 1e-5  # Of the central difference [s]; its error is of order step^2.
         after = self.momentum(self.shifted(q, v, step), v)
         before = self.momentum(self.shifted(q, v, -step), v)
         still = self.inverse_dynamics(q, v, np.zeros_like(v), time)
         return still - (after - before) / (2.0 * step)
 
     def residual(self, motion: Motion) -> np.ndarray:
-        """effort - ID, (n, n_v): what the model does not explain."""
+        """effort - ID, (n, n_v)."""
         return motion.effort - self.inverse_dynamics(
             motion.q, motion.v, motion.vd, motion.time
         )
 
     def body_motion(self, body: RigidBody, q, v, vd):
-        """Of a body's origin in world, rotation first: Jacobian (n, 6, n_v), velocity
-        (n, 6), acceleration (n, 6); and the body's rotation (n, 3, 3)."""
+        """Motion of a body's origin in the world, rotation first: Jacobian (n, 6, n_v),
+        velocity (n, 6), acceleration (n, 6); and the body's rotation (n, 3, 3)."""
         plant, context, W = self.plant, self._context, self.plant.world_frame()
         n, n_v = len(v), plant.num_velocities()
         J, V, A = np.empty((n, 6, n_v)), np.empty((n, 6)), np.empty((n, 6))
@@ -123,7 +123,8 @@ class SceneDynamics:
         return J, V, A, R
 
     def mass_times_com_jacobian(self, q) -> np.ndarray:
-        """(n, 3, n_v): gravity's generalized force is its transpose times gravity."""
+        """Total mass times the Jacobian of the centre of mass (n, 3, n_v); gravity's
+        generalized force is its transpose times gravity."""
         plant, context, W = self.plant, self._context, self.plant.world_frame()
         out = np.zeros((len(q), 3, plant.num_velocities()))
         if plant.num_velocities() == 0:
@@ -137,7 +138,7 @@ class SceneDynamics:
         return out
 
     def shifted(self, q, dq, step: float) -> np.ndarray:
-        """q (n, n_q) moved by step times dq (n, n_v), as a velocity would."""
+        """q (n, n_q) moved by step times the velocities dq (n, n_v)."""
         out = np.array(q, dtype=float)
         for k in range(len(out)):
             self.plant.SetPositions(self._context, q[k])
@@ -147,15 +148,16 @@ class SceneDynamics:
     # ----- Channels
 
     def channels(self) -> list[str]:
-        """The channels of joints and free bodies that are coordinates of this model."""
+        """The channels of joints and free bodies that measure coordinates of the
+        plant."""
         return list(self._coordinates)
 
     def coordinates(self, channel: str) -> tuple[str, int]:
-        """What a channel measures: "q", "v" or "effort", and its index in v's order."""
+        """What a channel measures ("q", "v" or "effort"), and its index in v."""
         return self._coordinates[channel][:2]
 
     def value(self, motion: Motion, channel: str) -> np.ndarray:
-        """(n,) the channel in a motion."""
+        """The values (n,) of a channel in a motion."""
         what, i_v, i_q = self._coordinates[channel]
         return (
             motion.q[:, i_q]
@@ -168,12 +170,12 @@ class SceneDynamics:
     def signatures(
         self, kind: str, at: Sequence[str], motion: Motion, grid: Grid | None = None
     ) -> list[Signature]:
-        """How an effect of a kind at a place would show in the residual.
+        """Signatures of a kind of effect at a place in the residual.
 
-        Args: grid: values to hold for a kind's nonlinear parameters, in place of the
-            kind's own ({"periods_per_rev": [6, 12]}).
-        Returns: alternatives, one for each held value; empty if the kind shows in
-            simulation alone (contact, shapes, elasticity).
+        Args: grid: values at which nonlinear parameters are held, instead of the kind's
+            own ({"periods_per_rev": [6, 12]}).
+        Returns: alternatives, one for each held value; empty if the kind is only
+            visible in simulation (contact, shapes, elasticity).
         Raises: ValueError if `at` is not in the scene.
         """
         signature = KINDS[kind].signature
@@ -182,16 +184,17 @@ class SceneDynamics:
         return signature(Effect(kind, list(at), {}), self, motion, grid)
 
     def places(self, kind: str) -> list[str]:
-        """Where a kind could act in this scene: one `at` each.
+        """All `at` at which a kind could act in this scene.
 
-        For channels: those that this model has; a recording may have fewer. Pairs: of
-        a free body and another with shapes; whether they ever touch is not asked.
+        Channels: all of this model; a recording may have fewer. Pairs: a free body and
+        another body with shapes, whether they ever touch or not.
         """
         found = places(self.loaded, KINDS[kind].at, self.channels())
         return [at for at in found if self._fits(kind, at)]
 
     def _fits(self, kind: str, at: str) -> bool:
-        """Whether the model has there what the kind changes (a box to round, ...)."""
+        """Whether the model has there what the kind changes (such as a box for
+        corner_radius)."""
         try:
             self.now(kind, [at])
         except ValueError:
@@ -199,14 +202,14 @@ class SceneDynamics:
         return True
 
     def now(self, kind: str, at: Sequence[str]) -> dict[str, float]:
-        """The parameters at which the effect would change nothing: where a search
-        starts. Parameters that then have no meaning are left out."""
+        """The parameters at which the effect changes nothing, where a search starts;
+        without those that then have no meaning."""
         entry = KINDS[kind]
         if entry.drive:
             law = law_of(self.loaded.scene.actuation, at[0])
             if law is None:
                 raise ValueError(f"no drive at {at[0]}")
-            # As the scene's own effects have set it, the last one holds.
+            # Effects of the scene may have set it; the last one counts.
             (name,) = (each.name for each in entry.parameters)
             value = float(getattr(law, entry.drive))
             for effect in self.loaded.effects:
@@ -223,8 +226,8 @@ class SceneDynamics:
         }
 
     def least(self, kind: str, at: Sequence[str]) -> dict[str, float]:
-        """The least values that parameters can have, where the model sets a bound: it
-        can lose no more damping, friction, rotor or mass than it has."""
+        """Lower bounds of parameters from the model: an effect cannot remove more
+        damping, friction, rotor inertia or mass than the model has."""
         entry = KINDS[kind]
         if entry.least is None:
             return {}
@@ -258,7 +261,7 @@ def _depth(plant: MultibodyPlant, body: RigidBody) -> int:
 
 
 def places(loaded: LoadedScene, at: str, channels: Sequence[str]) -> list[str]:
-    """The places of a scene at which an effect on `at` (EffectKind.at) can be."""
+    """All places in a scene for an effect that acts on `at` (EffectKind.at)."""
     plant = loaded.plant
     joints = [
         joint
@@ -308,13 +311,13 @@ def places(loaded: LoadedScene, at: str, channels: Sequence[str]) -> list[str]:
         return list(channels)
     if at in ("length", "free body"):
         return named(free)
-    # base: the models that hold a mechanism, and the world.
+    # base: models that have joints, and the world.
     models = {plant.GetModelInstanceName(joint.model_instance()) for joint in joints}
     return [*sorted(models), "world"]
 
 
 def _laws(loaded: LoadedScene):
-    """Numbers of the joint laws as built; body laws with their bodies and numbers."""
+    """Numbers of the joint laws, and body laws with their bodies and numbers."""
     joint_numbers = np.zeros(0)
     if loaded.joint_forces is not None:
         context = loaded.joint_forces.CreateDefaultContext()
@@ -334,7 +337,7 @@ def _laws(loaded: LoadedScene):
 
 
 def _coordinates(plant: MultibodyPlant) -> dict[str, tuple[str, int, int]]:
-    """Channel -> what, index in v, index in q (of positions)."""
+    """{channel: ("q", "v" or "effort", index in v, index in q of positions)}."""
     found: dict[str, tuple[str, int, int]] = {}
     driven = {
         plant.get_joint_actuator(i).joint().index()

@@ -1,15 +1,15 @@
 """Friction that depends on the place, on one flat body without seams.
 
-Drake's friction belongs to a shape. Two boxes side by side are no flat surface: where a
-rounded foot stands over the seam it touches both, and is held up twice. So one body
-has the smallest friction, which Drake's solver knows, and where there is more the
-rest is a force on what slides:
+In Drake friction belongs to a shape, and two boxes side by side are no flat surface: a
+rounded foot over the seam touches both and is supported twice. So one body has the
+smallest friction mu_0 in Drake's solver, and additional friction is a force on the
+sliding body:
 
     f = -(mu(p) - mu_0) f_n v_t / max(|v_t|, FADE_SPEED)
 
-at each point p of contact, f_n [N] its normal force and v_t [m/s] the velocity there
-along the surface. The normal force is that of the step before, as in Drake's own
-`lagged` contact. Below FADE_SPEED this part is viscous: at rest only mu_0 holds.
+at each contact point p, with the normal force f_n [N] and the tangential velocity v_t
+[m/s]. The normal force is that of the step before, as in Drake's `lagged` contact.
+Below FADE_SPEED this part is viscous: at rest only mu_0 acts.
 """
 
 from collections.abc import Sequence
@@ -28,20 +28,20 @@ from pydrake.multibody.plant import (
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import LeafSystem
 
-# It acts explicitly: 0.5 times 12 N over 5 mm/s is 1200 N s/m, which takes a mass of
-# 4 kg 30 % of its speed in a step of 1 ms.
+# The force is explicit in time: 0.5 times 12 N over 5 mm/s is 1200 N s/m, which takes
+# 30 % of the speed of 4 kg in a step of 1 ms.
 FADE_SPEED = 0.005  # [m/s]
-MOST_FRICTION = 1e3
-N_POINTS = 16  # Of contact that are remembered; a block's face has 4.
-_POINT = 7  # Of each: p_WC, the normal, (mu(p) - mu_0) f_n.
+FRICTION_MAX = 1e3
+N_POINTS = 16  # Largest number of contact points in the state; a block's face has 4.
+_POINT = 7  # Numbers of a point: p_WC, the normal, (mu(p) - mu_0) f_n.
 
 
 @dataclass
 class FrictionZone:
-    """Where a pair's friction is greater than its bodies' own.
+    """A rectangle in which a pair's friction is greater than its bodies' own.
 
-    at: contact pair `<a>~<b>`, one of them welded to the world. x, y: from, to, in the
-    world [m]; `to` belongs to the next zone. Of zones that overlap the first counts.
+    at: contact pair `<a>~<b>`, one of them welded to the world. x, y: [from, to) in the
+    world [m]. Where zones overlap the first one counts.
     """
 
     at: str = ""
@@ -51,13 +51,13 @@ class FrictionZone:
 
 
 def check_zones(zones: Sequence[FrictionZone]) -> None:
-    """Raises: ValueError for a zone that is none, and for zones of several pairs."""
+    """Raises: ValueError for a zone out of range, or zones of several pairs."""
     for zone in zones:
         where = f"friction zone at {zone.at!r}"
-        if not 0.0 <= zone.friction <= MOST_FRICTION:
+        if not 0.0 <= zone.friction <= FRICTION_MAX:
             raise ValueError(
                 f"{where}: friction is {zone.friction}, expected >= 0 and at most "
-                f"{MOST_FRICTION:g}"
+                f"{FRICTION_MAX:g}"
             )
         for name in "xy":
             span = getattr(zone, name)
@@ -70,18 +70,16 @@ def check_zones(zones: Sequence[FrictionZone]) -> None:
 
 
 class FrictionZones(LeafSystem):
-    """The friction of zones beyond that of the pair's own surfaces.
+    """The force of the zones' friction beyond that of the pair's own surfaces.
 
-    Inputs:
-        contact_results, body_poses, body_spatial_velocities of the plant (abstract).
-        spatial_forces (list[ExternallyAppliedSpatialForce]), optional: others', which
-            are passed on.
+    Inputs:  contact_results, body_poses, body_spatial_velocities (abstract) of the
+             plant; spatial_forces (list[ExternallyAppliedSpatialForce]), optional:
+             further forces, which are passed on.
     Outputs: spatial_forces (list[ExternallyAppliedSpatialForce]).
+    State:   contact points and their normal forces.
 
-    The points of contact and their normal forces are discrete state.
-
-    Args: thing, the body that slides on the anchored body ground; friction, of the pair
-        as Drake combines it; zones.
+    Args: thing: the body that slides; ground: the anchored body; friction: of the pair
+        as Drake combines it; zones; period_sec: of the plant.
     Raises: ValueError if a zone has less than `friction`.
     """
 
@@ -115,7 +113,7 @@ class FrictionZones(LeafSystem):
         self._others = self.DeclareAbstractInputPort("spatial_forces", none)
         points = self.DeclareDiscreteState(N_POINTS * _POINT)
         self._points = points
-        # Without the contact results: they depend on these forces.
+        # Not on the contact results, which depend on these forces.
         self.DeclareAbstractOutputPort(
             "spatial_forces",
             lambda: none.Clone(),
@@ -166,7 +164,7 @@ class FrictionZones(LeafSystem):
 
 
 def friction_at(zones, p) -> float:
-    """What the zones (n, 5) = [x, x, y, y, friction], from and to, have at p (2 or 3,);
+    """Friction at p (2 or 3,) of zones (n, 5) = [x from, x to, y from, y to, friction];
     0 outside of them."""
     for x0, x1, y0, y1, friction in zones:
         if x0 <= p[0] < x1 and y0 <= p[1] < y1:
@@ -176,11 +174,10 @@ def friction_at(zones, p) -> float:
 
 @numba.njit(cache=True)
 def zone_force(points, p_WB, v, w):
-    """(6,) spatial force on the body at its origin, torque first, world axes.
+    """Spatial force (6,) on the body at its origin, torque first, in world axes.
 
-    Args: points (N_POINTS * 7,), of each its place p_WC [m], normal, and the friction
-        force that it has when it slides [N]; p_WB (3,) [m], v (3,) [m/s] and w (3,)
-        [rad/s] of the body's origin.
+    Args: points (N_POINTS * 7,): of each p_WC [m], normal, and its sliding friction
+        force [N]; p_WB (3,) [m], v (3,) [m/s], w (3,) [rad/s]: of the body's origin.
     """
     F = np.zeros(6)
     rows = points.reshape(-1, 7)
@@ -199,11 +196,11 @@ def zone_force(points, p_WB, v, w):
 
 
 def add_friction_zones(zones, pair, friction, plant: MultibodyPlant, builder, before):
-    """Adds the system of a scene's zones to its plant.
+    """Adds a FrictionZones system to a plant.
 
-    Args: pair of bodies; friction, of that pair; before: a port with spatial forces
-        that the plant gets already, or None.
-    Raises: ValueError if neither body is welded to the world, or both are.
+    Args: pair: of bodies; friction: of that pair; before: the port that is connected to
+        the plant's spatial forces so far, or None.
+    Raises: ValueError unless exactly one body is welded to the world.
     """
     ground, thing = pair
     if not plant.IsAnchored(ground):

@@ -1,8 +1,8 @@
-"""Fruits to roll: nearly round, bumpy and a little soft, each made from a seed.
+"""Fruits to roll: nearly round, bumpy and a little soft, generated from a seed.
 
-The surface is the outer envelope of many spheres, a little smaller than the fruit.
-Their outermost points lie on a sphere (or, of a lime, on an ellipsoid), and above or
-below it by up to 3 % of its radius: bumps, and dents between them.
+The surface is the outer envelope of many spheres that are a little smaller than the
+fruit. Their outermost points lie within 3 % of the radius of a sphere (for a lime: of
+an ellipsoid), which makes bumps and dents.
 """
 
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 N_SPHERES = 48
-SPHERE = 0.8  # Radius of a sphere, of the fruit's.
+SPHERE = 0.8  # Radius of a sphere over the fruit's.
 
 
 @dataclass(frozen=True)
 class FruitKind:
     radius: float  # Mean, across the long axis [m].
-    elongation: float  # Of the long axis.
-    bump: float  # Height of bumps and depth of dents, at most, of the radius.
+    elongation: float  # Length of the long axis over the others.
+    bump: float  # Largest height of bumps and depth of dents over the radius.
     density: float  # [kg/m3]
     stiffness: float  # Of a point contact [N/m].
     dissipation: float  # Hunt-Crossley [s/m].
@@ -46,7 +46,7 @@ class Fruit:
 
     @property
     def mean_radius(self) -> float:
-        """Of the sphere of the same volume, if it had no bumps [m]."""
+        """Radius of the sphere with the same volume, without bumps [m]."""
         return self.kind.radius * self.kind.elongation ** (1.0 / 3.0)
 
 
@@ -56,7 +56,7 @@ def make_fruit(name: str, seed: int) -> Fruit:
         raise ValueError(f"object is {name}, expected {' or '.join(FRUITS)}")
     kind = FRUITS[name]
     rng = np.random.default_rng([seed, 2])
-    # Evenly over the sphere: a Fibonacci lattice, turned at random.
+    # Directions evenly over the sphere: a Fibonacci lattice, randomly rotated.
     i = np.arange(N_SPHERES) + 0.5
     z, angle = 1.0 - 2.0 * i / N_SPHERES, np.pi * (1.0 + 5.0**0.5) * i
     ring = np.sqrt(1.0 - z**2)
@@ -118,7 +118,7 @@ def _folder() -> TemporaryDirectory:
 
 @cache
 def fruit_file(name: str, seed: int) -> str:
-    """A file of fruit_sdf, which is there as long as this process is."""
+    """Path of a temporary file of fruit_sdf, deleted when this process ends."""
     path = Path(_folder().name) / f"{name}-{seed}.sdf"
     path.write_text(fruit_sdf(make_fruit(name, seed)))
     return str(path)

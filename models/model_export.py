@@ -1,7 +1,7 @@
-"""A scene's mechanism with its effects, as URDF or MJCF, as far as these can say it.
+"""Exports a scene's mechanism with its effects as URDF or MJCF.
 
-Both say inertias, damping, dry friction (which Drake's own parser leaves out) and what
-turns in the motors. What they cannot say is told: `unsaid`.
+Both formats have inertias, damping, Coulomb friction (which Drake's parser ignores) and
+rotor inertias. Effects that a format cannot express are listed in `omitted`.
 """
 
 from collections.abc import Sequence
@@ -36,8 +36,8 @@ from makebreak.models.effects.kind import (
 from makebreak.models.effects.model_text import (
     Inertial,
     children,
+    make_mesh_paths_absolute,
     model_path,
-    with_meshes_of,
     write_inertial,
 )
 from makebreak.models.scene import LoadedScene, Scene, load_scene
@@ -45,24 +45,24 @@ from makebreak.models.scene import LoadedScene, Scene, load_scene
 
 @dataclass(frozen=True)
 class Exported:
-    """A model file as text, and the effects (sentences) that it cannot say."""
+    """Text of a model file, and sentences of the effects that it cannot express."""
 
     text: str
-    unsaid: tuple[str, ...]
+    omitted: tuple[str, ...]
 
 
 def to_mjcf(scene: Scene) -> Exported:
-    """The joints and inertias of a scene whose bodies are all held by joints that turn,
-    slide or do not move, with motors or position servos; no shapes, so no contact.
+    """The joints, inertias, motors and servos of a scene as MJCF, without shapes, so
+    without contact.
 
-    Raises: ValueError for another scene.
+    Raises: ValueError unless all joints are revolute, prismatic or fixed.
     """
     loaded = _load(scene)
     plant = loaded.plant
     root = ET.Element("mujoco", model="makebreak")
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")
     gravity = plant.gravity_field().gravity_vector()
-    # Implicit in damping; the step of a robot's controller.
+    # An integrator that is implicit in damping, with the step of a robot's controller.
     ET.SubElement(
         root, "option", timestep="0.001", integrator="implicitfast",
         gravity=_numbers(gravity),
@@ -79,8 +79,9 @@ def to_mjcf(scene: Scene) -> Exported:
             raise ValueError("the scene's joints form a loop, which MJCF cannot say so")
         for joint in ready:
             body = joint.child_body()
-            said = {"name": full_name(plant, body), **_pose(joint)}
-            at = ET.SubElement(elements[joint.parent_body().index()], "body", said)
+            attributes = {"name": full_name(plant, body), **_pose(joint)}
+            parent = elements[joint.parent_body().index()]
+            at = ET.SubElement(parent, "body", attributes)
             elements[body.index()] = at
             inertial = _inertial(body, payloads)
             if inertial.mass > 0.0:
@@ -123,17 +124,17 @@ def to_urdf(scene: Scene, model: str) -> Exported:
             own.appendChild(document.createElement("mass")).setAttribute("value", "0")
             own.appendChild(document.createElement("inertia"))
         write_inertial(link, inertial)
-    unsaid = list(_unsaid(scene))
+    omitted = list(_unsaid(scene))
     for index in plant.GetJointIndices(instance):
         joint = plant.get_joint(index)
         if isinstance(joint, (RevoluteJoint, PrismaticJoint)):
-            unsaid += _urdf_joint(loaded, joint, document)
-    with_meshes_of(document, files[model].parent)
-    return Exported(document.toxml() + "\n", tuple(unsaid))
+            omitted += _urdf_joint(loaded, joint, document)
+    make_mesh_paths_absolute(document, files[model].parent)
+    return Exported(document.toxml() + "\n", tuple(omitted))
 
 
 def urdf_models(scene: Scene) -> dict[str, Path]:
-    """{model: its file} of those that come from URDFs."""
+    """{model: its file} of the models that come from URDFs."""
     parser = Parser(MultibodyPlant(0.0))
     flat = FlattenModelDirectives(
         ModelDirectives(directives=scene.directives), parser.package_map()
@@ -168,11 +169,12 @@ def _load(scene: Scene) -> LoadedScene:
 
 
 def _is_added(model: str) -> bool:
+    """Whether load_scene has added a model for an effect (payload, elastic motor)."""
     return model.startswith(("payload_on_", "motor_of_"))
 
 
 def _payloads(plant: MultibodyPlant) -> dict[int, list[RigidBody]]:
-    """{index of the carrier: the payloads that are welded to it}."""
+    """{index of a body: the payloads that are welded to it}."""
     found: dict[int, list[RigidBody]] = {}
     for joint in (plant.get_joint(i) for i in plant.GetJointIndices()):
         body = joint.child_body()
@@ -182,7 +184,7 @@ def _payloads(plant: MultibodyPlant) -> dict[int, list[RigidBody]]:
 
 
 def _inertial(body: RigidBody, payloads) -> Inertial:
-    """Of a body and the payloads on it, whose axes are the body's."""
+    """Inertial properties of a body with its payloads, which have the body's axes."""
     M = body.default_spatial_inertia()
     mass, moment = M.get_mass(), M.get_mass() * M.get_com()
     about = M.CalcRotationalInertia().CopyToFullMatrix3()
@@ -206,7 +208,7 @@ def _numbers(values: Sequence[float] | np.ndarray) -> str:
 
 
 def _pose(joint: Joint) -> dict[str, str]:
-    """Of the child in its parent, at the joint's zero."""
+    """Pose of the child in its parent at the joint's zero, as MJCF attributes."""
     X_PF = joint.frame_on_parent().GetFixedPoseInBodyFrame()
     X_BM = joint.frame_on_child().GetFixedPoseInBodyFrame()
     X_PM = X_PF @ joint.X_FM() if isinstance(joint, WeldJoint) else X_PF
@@ -224,9 +226,9 @@ def _mjcf_joint(loaded: LoadedScene, joint: Joint, body, motors) -> None:
     X_BM = joint.frame_on_child().GetFixedPoseInBodyFrame()
     law = law_of(loaded.scene.actuation, name)
     damping = float(joint.default_damping_vector()[0])
-    if law is not None:  # What turning costs a motor at its supply is damping.
+    if law is not None:  # The motor's back-EMF acts as damping.
         damping += float(law.emf)
-    said = {
+    attributes = {
         "name": name,
         "type": "hinge" if turns else "slide",
         "pos": _numbers(X_BM.translation()),
@@ -237,30 +239,30 @@ def _mjcf_joint(loaded: LoadedScene, joint: Joint, body, motors) -> None:
     }
     low, high = joint.position_lower_limit(), joint.position_upper_limit()
     if np.isfinite([low, high]).all():
-        said["range"] = _numbers([low, high])
-    ET.SubElement(body, "joint", said)
+        attributes["range"] = _numbers([low, high])
+    ET.SubElement(body, "joint", attributes)
     actuator = actuator_of(plant, joint)
     if actuator is None or name not in loaded.scene.actuation.joints:
         return
     limit = actuator.effort_limit()
     if law is None:
-        said = {"name": name, "joint": name}
+        attributes = {"name": name, "joint": name}
         if np.isfinite(limit):
-            said["ctrlrange"] = _numbers([-limit, limit])
-        ET.SubElement(motors, "motor", said)
+            attributes["ctrlrange"] = _numbers([-limit, limit])
+        ET.SubElement(motors, "motor", attributes)
         return
     kp, limit = _kp(loaded, name, float(law.kp)), min(limit, float(law.limit))
     gains = {"kp": repr(kp), "kv": repr(float(law.kd))}
     if kp == 0.0:
         gains = {"kv": repr(float(law.kd))}
-    said = {"name": name, "joint": name, **gains}
+    attributes = {"name": name, "joint": name, **gains}
     if np.isfinite(limit):
-        said["forcerange"] = _numbers([-limit, limit])
-    ET.SubElement(motors, "position" if kp else "velocity", said)
+        attributes["forcerange"] = _numbers([-limit, limit])
+    ET.SubElement(motors, "position" if kp else "velocity", attributes)
 
 
 def _urdf_joint(loaded: LoadedScene, joint: Joint, document) -> list[str]:
-    """Returns: what could not be said."""
+    """Writes a joint's damping, friction and rotor. Returns: what cannot be written."""
     plant = loaded.plant
     (element,) = [
         e for e in document.getElementsByTagName("joint")
@@ -297,13 +299,14 @@ def _rotor(plant: MultibodyPlant, joint: Joint) -> float:
     return 0.0 if actuator is None else float(actuator.default_reflected_inertia())
 
 
-def _of_kind(loaded: LoadedScene, said: str) -> list[Effect]:
-    return [e for e in loaded.effects if KINDS[e.kind].exported == said]
+def _exported_as(loaded: LoadedScene, attribute: str) -> list[Effect]:
+    """The effects that are exported as "friction" or "kp"."""
+    return [e for e in loaded.effects if KINDS[e.kind].exported == attribute]
 
 
 def _dry_friction(loaded: LoadedScene, joint: Joint) -> float:
     total = 0.0
-    for effect in _of_kind(loaded, "friction"):
+    for effect in _exported_as(loaded, "friction"):
         (value,) = effect.parameters.values()
         if any(j.index() == joint.index() for j in find_joints(effect, loaded.plant)):
             total += value
@@ -311,7 +314,7 @@ def _dry_friction(loaded: LoadedScene, joint: Joint) -> float:
 
 
 def _kp(loaded: LoadedScene, joint: str, kp: float) -> float:
-    for effect in _of_kind(loaded, "kp"):
+    for effect in _exported_as(loaded, "kp"):
         names = [full_name(loaded.plant, j) for j in find_joints(effect, loaded.plant)]
         if joint in names:
             (kp,) = effect.parameters.values()

@@ -1,8 +1,7 @@
-"""From a scene's directives to models in a plant: files, packages, inertias.
+"""Adds the models of a scene's directives to a plant: files, packages, inertias.
 
-What Drake would replace silently (an inertia that no body has), abort on (directives
-that add themselves) or stop at although it could do without (a visual mesh that is not
-there) is found here.
+Checks what Drake would replace silently (impossible inertias), abort on (directives
+that include themselves) or refuse without need (missing visual meshes).
 """
 
 import logging
@@ -44,19 +43,19 @@ from makebreak.models.effects.model_text import (
 from makebreak.models.scene_schema import COMMANDS_OF, Scene
 from makebreak.models.typed_yaml import one_line, read_yaml
 
-MODELS = Path(__file__).resolve().parent  # What this package ships.
-# pydrake makes SystemExit of an assertion that fails in Drake, and ValueError of some
-# of what its parser says.
+MODELS = Path(__file__).resolve().parent  # Folder of the shipped models.
+# pydrake raises SystemExit for a failed assertion in Drake, and ValueError for some
+# errors of its parser.
 DRAKE_ERRORS = (RuntimeError, SystemExit, ValueError)
 _LOG = logging.getLogger("makebreak")
-_MOST_INCLUDES = 20  # Directives in directives in ...
+_INCLUDES_MAX = 20  # Depth of directives that include directives.
 
 
 def add_models(scene: Scene, effects: Sequence[Effect], plant: MultibodyPlant) -> None:
-    """Adds the directives' models; inertia effects edit a copy of the model's text,
-    as a body's default inertia can be given to Drake in no other way.
+    """Adds the directives' models. Inertia effects edit a copy of the model's text,
+    because a body's default inertia cannot be changed otherwise.
 
-    Raises: ValueError, naming what is wrong: a file, a package, a link.
+    Raises: ValueError that names the file, package or link that is wrong.
     """
     parser = Parser(plant)
     packages = parser.package_map()
@@ -76,7 +75,7 @@ def add_models(scene: Scene, effects: Sequence[Effect], plant: MultibodyPlant) -
                 for directive in flat.directives:
                     add = directive.add_model
                     if add is not None and add.name == model:
-                        # A copy: the scene must stay as it was.
+                        # A copy, as the scene must not change.
                         copy = Path(folder) / f"{i}_{model}"
                         add.file = edited_model_file(
                             add.file, packages, body, effect, edit, copy
@@ -95,10 +94,10 @@ def add_models(scene: Scene, effects: Sequence[Effect], plant: MultibodyPlant) -
 
 
 def with_actuated_joints(scene: Scene) -> Scene:
-    """The scene with its actuation's joints named: where it names none, those that the
-    models' own files have actuators of.
+    """The scene with the joints of its actuation filled in: if it names none, those
+    with an actuator in the models' own files.
 
-    Raises: ValueError if there are none either; as add_models.
+    Raises: ValueError if there are none; as add_models.
     """
     actuation = scene.actuation
     if actuation.joints or not COMMANDS_OF[actuation.type]:
@@ -117,7 +116,7 @@ def with_actuated_joints(scene: Scene) -> Scene:
 
 
 def check_can_move(plant: MultibodyPlant) -> None:
-    """Raises: ValueError, naming a joint that moves nothing which has inertia."""
+    """Raises: ValueError that names a joint which moves no inertia."""
     context = plant.CreateDefaultContext()
     M = plant.CalcMassMatrix(context)
     if not M.size:
@@ -138,7 +137,7 @@ def check_can_move(plant: MultibodyPlant) -> None:
 
 
 def _velocity_names(plant: MultibodyPlant) -> list[str]:
-    """What each velocity of the plant is of, for messages."""
+    """Name of the joint or body of each velocity of the plant, for messages."""
     names = ["a joint"] * plant.num_velocities()
     for index in plant.GetJointIndices():
         joint = plant.get_joint(index)
@@ -165,8 +164,8 @@ def _add_packages(scene: Scene, packages: PackageMap) -> None:
 
 
 def _path_of(uri: str, near: Path, packages: PackageMap) -> Path | None:
-    """The file that a URI means, None if its package is unknown; near: the file that
-    names it. As Drake reads it: no %20, and "#" is part of the name."""
+    """The file of a URI as Drake reads it (no %20, and "#" is part of the name); None
+    for an unknown package. Args: near: the file that contains the URI."""
     scheme, separator, rest = uri.partition("://")
     if not separator:
         return near.parent / uri
@@ -182,7 +181,7 @@ def _path_of(uri: str, near: Path, packages: PackageMap) -> Path | None:
 
 
 def _package_above(name: str, near: Path) -> Path | None:
-    """A folder above a file that is called as the package, or whose package.xml is."""
+    """The folder above a file whose name, or whose package.xml, is the package's."""
     for folder in near.resolve().parents:
         manifest = folder / "package.xml"
         if folder.name == name or (
@@ -200,9 +199,9 @@ _MESH = re.compile(r"""<mesh\b[^>]*?filename\s*=\s*["']([^"']+)|<uri>\s*([^<]+?)
 
 
 def _usable(uri: str, packages: PackageMap, copy: Path) -> str:
-    """The model's URI; that of a copy without the visual meshes that are not there.
+    """URI of the model, or of a copy without its missing visual meshes.
 
-    Raises: ValueError for other meshes that are not there.
+    Raises: ValueError for other missing meshes.
     """
     path = _path_of(uri, Path("/"), packages)
     if path is None:
@@ -221,7 +220,7 @@ def _usable(uri: str, packages: PackageMap, copy: Path) -> str:
     try:
         document = minidom.parseString(source.encode())
     except ExpatError:
-        return uri  # Drake says it better.
+        return uri  # Drake's own message is better.
     gone = []
     for visual in document.getElementsByTagName("visual"):
         shapes = children(visual, "geometry", "mesh")
@@ -289,12 +288,13 @@ def _flattened(
 def _check_includes(
     uri: str, near: Path, packages: PackageMap, above: tuple[Path, ...]
 ) -> None:
-    """Drake follows directives that add themselves until its stack is full."""
+    """Raises: ValueError for directives that include themselves, at which Drake would
+    overflow its stack."""
     path = _path_of(uri, near, packages)
     if path is None:
         raise _unknown_package(uri)
     path = path.resolve()
-    if path in above or len(above) >= _MOST_INCLUDES:
+    if path in above or len(above) >= _INCLUDES_MAX:
         chain = " -> ".join(each.name for each in (*above, path))
         raise ValueError(f"add_directives: {path} adds itself ({chain})")
     try:
@@ -313,15 +313,15 @@ def _check_includes(
 
 @contextmanager
 def _drake_warnings() -> Iterator[list[str]]:
-    """Drake's warnings on inertias while it parses; others go on as they would."""
+    """Collects Drake's warnings about inertias while it parses; others pass."""
     found: list[str] = []
     log = logging.getLogger("drake")
 
     def keep(record: logging.LogRecord) -> bool:
-        said = record.getMessage()
-        if "inertia" not in said.lower():
+        message = record.getMessage()
+        if "inertia" not in message.lower():
             return True
-        found.append(one_line(ValueError(said)))
+        found.append(one_line(ValueError(message)))
         return False
 
     log.addFilter(keep)
@@ -334,7 +334,8 @@ def _drake_warnings() -> Iterator[list[str]]:
 def _refuse_inertias(
     directives: Sequence[ModelDirective], packages: PackageMap, warnings: list[str]
 ) -> None:
-    """Drake would replace an inertia that no body has by one of its own."""
+    """Raises: ValueError that names a link with an impossible inertia, which Drake
+    would replace by another one."""
     if not warnings:
         return
     for directive in directives:
@@ -353,7 +354,7 @@ def _refuse_inertias(
 
 
 def _fault(link: minidom.Element) -> str:
-    """What is wrong with a link's inertia, if anything."""
+    """What is wrong with a link's inertia; "" if nothing is."""
     if not children(link, "inertial", "mass"):
         return ""
     try:

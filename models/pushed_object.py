@@ -1,20 +1,19 @@
-"""Objects to push over a table: their files, and what a planner knows of them.
+"""Objects that are pushed over a table: their files and the planner's model of them.
 
-The frame of an object has its origin over its centroid, half-way up, and z up: on a
-table at z = 0 it lies at z = rest_height(spec). Shapes, at scale 1:
+The origin of an object's frame is at the centroid of its plan, half-way up; z is up. On
+a table at z = 0 the origin is at z = rest_height(spec). Shapes, at scale 1:
 
     t         two bars of 160 x 40 mm and 40 x 120 mm; the cross bar is at +y
     l         two bars of 40 x 160 mm and 80 x 40 mm; the foot is at -y, towards +x
     box       100 x 140 mm
     disc      an upright cylinder of radius 60 mm
     cylinder  lying along x: 140 mm long; it rolls
-    mesh      the convex hull of the points of a file, as it stands there (z up)
+    mesh      the convex hull of the points of a file, in the file's orientation (z up)
 
-Drake's point contact gives two boxes one point, which jumps about as they tilt. An
-object therefore stands on small spheres, and its solid parts end SKIN above the table:
-many spheres, evenly spread, in a simulated world (their loads are then close to an even
-pressure), three in a planner's model, placed where they resist turning as much as an
-even pressure does.
+Drake's point contact of two boxes has one point, which jumps as they tilt. An object
+therefore stands on small spheres, and its solid parts end SKIN above the table: many
+spheres in a simulated world, for an almost even pressure; three in a planner's model,
+placed so that their friction torque is that of an even pressure.
 """
 
 import hashlib
@@ -41,29 +40,30 @@ from makebreak.models.tip_and_ball import (
     check_layout,
 )
 
-UNIT = 0.04  # [m] of which T and L are made.
-SKIN = 2e-4  # [m] Solid parts end so far above the table.
-FOOT = 2e-3  # [m] Radius of the spheres that a flat object stands on.
-SPACING = 0.03  # [m] Of these in a world, about.
-LINE = 0.25  # A lying cylinder's spheres are so far from its middle, of its length.
-N_ROUND = 48  # Corners of a circle, in an outline.
-LOWER_FACE = 1e-3  # [m] Points of a mesh so near to its lowest one belong to it.
-# Of point contacts, on the object's side: as the ball's; a support's is less, for they
-# are many [N/m], [s/m].
+UNIT = 0.04  # Width of the bars of T and L [m].
+SKIN = 2e-4  # Distance of the solid parts from the table [m].
+FOOT = 2e-3  # Radius of the spheres under a flat object [m].
+SPACING = 0.03  # Approximate distance of these spheres in a world [m].
+LINE = 0.25  # Distance of a lying cylinder's spheres from its middle, over its length.
+N_ROUND = 48  # Corners of a circle in an outline.
+LOWER_FACE = 1e-3  # Points of a mesh within this of the lowest one are its foot [m].
+# Point contact on the object's side [N/m], [s/m]: as the ball's; the many supports are
+# softer.
 STIFFNESS, SUPPORT_STIFFNESS, DISSIPATION = 2e5, 2e4, 1.0
 SHAPES = ("t", "box", "l", "disc", "cylinder", "mesh")
-COLOR, HUE = (0.95, 0.4, 0.05), 0.41  # Of an object: for the eye, for a camera [rad].
-BODY_COLOR, PLATE = (0.25, 0.26, 0.28), 1e-3  # Of what is below it; its thickness [m].
+COLOR, HUE = (0.95, 0.4, 0.05), 0.41  # Of an object: diffuse colour, its hue [rad].
+# Colour of a flat object below its coloured top plate; thickness of the plate [m].
+BODY_COLOR, PLATE = (0.25, 0.26, 0.28), 1e-3
 
 
 @dataclass
 class PushedObject:
     shape: Literal["t", "box", "l", "disc", "cylinder", "mesh"] = "t"
-    scale: float = 1.0  # Of its size, all ways.
+    scale: float = 1.0  # Of all dimensions.
     mass: float = 0.4  # [kg]
-    # Of the centre of mass from the frame's origin, x and y [m], whatever the scale.
+    # x, y of the centre of mass from that of an even density [m], not scaled.
     com_offset: list[float] = field(default_factory=lambda: [0.0, 0.0])
-    height: float = 0.04  # [m] at scale 1; a lying cylinder's diameter. Not of a mesh.
+    height: float = 0.04  # At scale 1; a lying cylinder's diameter; not of a mesh [m].
     file: str = ""  # Of a mesh (.obj, .gltf or .vtk).
 
 
@@ -71,12 +71,12 @@ class Part(NamedTuple):
     """A convex part of an object."""
 
     shape: Shape
-    X_BS: RigidTransform  # Its pose in the object's frame.
-    points: np.ndarray  # (n, 3) [m] whose convex hull it is, in the object's frame.
+    X_BS: RigidTransform  # Pose of the shape in the object's frame.
+    points: np.ndarray  # (n, 3) in the object's frame; the part is their hull [m].
 
 
 def check_object(spec: PushedObject) -> None:
-    """Raises: ValueError for what makes no object."""
+    """Raises: ValueError that names a setting out of range."""
     if spec.shape not in SHAPES:
         raise ValueError(f"shape is {spec.shape}, expected one of {', '.join(SHAPES)}")
     for name in ("scale", "mass", "height"):
@@ -123,9 +123,9 @@ def _mesh(spec: PushedObject) -> Part:
 
 
 def parts(spec: PushedObject) -> list[Part]:
-    """The convex parts that an object is made of; they do not overlap.
+    """The convex parts of an object; they do not overlap.
 
-    Raises: ValueError for what makes no object.
+    Raises: ValueError as check_object, or for a mesh that Drake cannot use.
     """
     check_object(spec)
     h, u = spec.scale * spec.height, spec.scale * UNIT
@@ -149,13 +149,13 @@ def parts(spec: PushedObject) -> list[Part]:
 
 
 def rest_height(spec: PushedObject) -> float:
-    """Of the object's frame over the table that it lies on [m]."""
+    """Height of the object's origin above the table that it lies on [m]."""
     return -float(min(part.points[:, 2].min() for part in parts(spec)))
 
 
 def object_inertia(spec: PushedObject) -> SpatialInertia:
-    """About the frame's origin: as of an even density, but that the centre of mass is
-    elsewhere (the inertia about it stays, as an effect object_com has it)."""
+    """Spatial inertia about the frame's origin: that of an even density with the centre
+    of mass moved (the central inertia stays, as with an effect object_com)."""
     whole = parts(spec)
     M_BBo = CalcSpatialInertia(whole[0].shape, 1.0)
     M_BBo = _placed(M_BBo, whole[0].X_BS)
@@ -174,13 +174,12 @@ def _placed(M_SSo: SpatialInertia, X_BS: RigidTransform) -> SpatialInertia:
 
 
 def support_spheres(spec: PushedObject, even: bool = False) -> tuple[np.ndarray, float]:
-    """What the object stands on: centres (n, 3) [m] in its frame, and their radius [m].
+    """Spheres on which the object stands: centres (n, 3) in its frame, and radius [m].
 
-    Args: even: many, evenly over the lower face, as a world has them; else three that
-        carry the same each (with the centre of mass over the centroid) and give the
-        same friction torque about the vertical as an even pressure. A lying cylinder
-        stands, and rolls, on two of its own radius, even or not, for which the same
-        holds.
+    Args: even: many, evenly over the lower face, for a world; otherwise three with
+        equal loads (if the centre of mass is over the centroid) and the friction torque
+        about the vertical of an even pressure. A lying cylinder always has two of its
+        own radius, for which the same holds.
     Raises: ValueError for a mesh without a flat lower face.
     """
     low = -rest_height(spec)
@@ -193,21 +192,21 @@ def support_spheres(spec: PushedObject, even: bool = False) -> tuple[np.ndarray,
     else:
         fine = np.concatenate([_grid(face, SPACING * spec.scale / 8) for face in faces])
         r = np.hypot(*fine.T).mean()
-        # Turned to where the three are furthest within the lower face.
+        # Rotated so that the three are as far inside of the lower face as possible.
         turns = np.linspace(0.0, 2.0 * np.pi / 3.0, 60, endpoint=False)
         angle = turns[:, None] + np.arange(3) * 2.0 * np.pi / 3.0 - np.pi / 2.0
-        ways = r * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        triples = r * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         outside = np.min(
-            [_outside(face, ways.reshape(-1, 2)).reshape(-1, 3) for face in faces],
+            [_outside(face, triples.reshape(-1, 2)).reshape(-1, 3) for face in faces],
             axis=0,
         )
-        spheres = ways[int(np.argmin(np.round(outside.max(axis=1), 6)))]
+        spheres = triples[int(np.argmin(np.round(outside.max(axis=1), 6)))]
     z = np.full((len(spheres), 1), low + FOOT)
     return np.hstack([spheres, z]), FOOT
 
 
 def _lower_face(part: Part, low: float) -> ConvexHull:
-    """The lower face of a part, in its plan."""
+    """The lower face of a part, seen from above. Raises: ValueError if it has none."""
     at = part.points[part.points[:, 2] < low + LOWER_FACE, :2]
     try:
         return ConvexHull(at)
@@ -219,13 +218,13 @@ def _lower_face(part: Part, low: float) -> ConvexHull:
 
 
 def _outside(face: ConvexHull, p: np.ndarray) -> np.ndarray:
-    """How far points (n, 2) are outside of a face (n,) [m], negative within."""
+    """Distances (n,) of points (n, 2) outside of a face, negative inside [m]."""
     return (p @ face.equations[:, :2].T + face.equations[:, 2]).max(axis=1)
 
 
 def _grid(face: ConvexHull, spacing: float) -> np.ndarray:
-    """Points (n, 2) in the middle of equal cells of a face's bounding box, those that
-    are within the face."""
+    """Midpoints (n, 2) of equal cells of a face's bounding box that are inside of the
+    face."""
     axes = []
     for a, b in zip(face.points.min(axis=0), face.points.max(axis=0), strict=True):
         n = max(2, round((b - a) / spacing))
@@ -235,10 +234,10 @@ def _grid(face: ConvexHull, spacing: float) -> np.ndarray:
 
 
 def hull_obj(spec: PushedObject) -> str:
-    """The convex hull of a mesh as a Wavefront file, in the frame and unit of the file
-    that it is of: for a copy of the object that needs that file no more.
+    """The convex hull of a mesh as text of a Wavefront file, in the frame and unit of
+    the mesh's own file, for a copy of the object without that file.
 
-    Raises: ValueError for what is no mesh.
+    Raises: ValueError for another shape.
     """
     (part,) = parts(spec)
     if not isinstance(part.shape, Convex):
@@ -254,11 +253,11 @@ def hull_obj(spec: PushedObject) -> str:
 
 
 def object_sdf(spec: PushedObject, mesh: str = "") -> str:
-    """The object as a model `object` with the body `object`, in SDFormat, standing on
+    """The object in SDFormat: a model `object` with a body `object` that stands on
     evenly spread spheres.
 
-    Args: mesh: where the file with a mesh's hull (hull_obj) is, seen from this one;
-        empty: the mesh itself, by its whole path.
+    Args: mesh: relative path of a file with the mesh's hull (hull_obj); empty: the
+        mesh's own file, by its absolute path.
     """
     M = object_inertia(spec)
     com = M.get_com()
@@ -290,8 +289,8 @@ def object_sdf(spec: PushedObject, mesh: str = "") -> str:
 
 
 def _visuals(spec: PushedObject):
-    """(name, shape, pose, colour) of what is seen: a flat object has a coloured top on
-    a dark body, others are of that colour all over."""
+    """(name, shape, pose, colour) of the visible shapes: a flat object has a coloured
+    top on a dark body, others are coloured all over."""
     if spec.shape in ("cylinder", "mesh"):
         for i, part in enumerate(parts(spec)):
             yield f"part_{i}", part.shape, part.X_BS, COLOR
@@ -312,7 +311,7 @@ def _visuals(spec: PushedObject):
 
 
 def _overlapping(spec: PushedObject) -> list[Part]:
-    """The parts of a flat object, of T and L so that no seam shows where they meet."""
+    """The parts of a flat object; those of T and L overlap, so that no seam shows."""
     made, u = parts(spec), spec.scale * UNIT
     if spec.shape not in ("t", "l"):
         return made
@@ -323,10 +322,9 @@ def _overlapping(spec: PushedObject) -> list[Part]:
 
 
 def seen_parts(spec: PushedObject) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """What a camera above sees of the object, in its frame: the parts that have its
-    colour, the top of a flat one, and the parts of all of it; each the points (n, 3)
-    [m] of which it is the convex hull. Parts may overlap.
-    """
+    """The object as a camera above sees it: its coloured parts (the top of a flat one)
+    and all its parts, each as points (n, 3) in the object's frame whose convex hull it
+    is [m]. Parts may overlap."""
     if spec.shape in ("cylinder", "mesh"):
         whole = [part.points for part in parts(spec)]
         return whole, whole
@@ -335,7 +333,7 @@ def seen_parts(spec: PushedObject) -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 
 def _above_table(part: Part, spec: PushedObject) -> tuple[Shape, RigidTransform]:
-    """A part that ends SKIN above the table, where spheres carry it."""
+    """Shape and pose of a part that ends SKIN above the table."""
     shape, X_BS = part.shape, part.X_BS
     up = RigidTransform([0.0, 0.0, SKIN / 2.0])
     if isinstance(shape, Box):
@@ -404,7 +402,7 @@ def _folder() -> TemporaryDirectory:
 
 
 def object_file(spec: PushedObject) -> str:
-    """A file of object_sdf, which is there as long as this process is."""
+    """Path of a temporary file of object_sdf, deleted when this process ends."""
     text = object_sdf(spec)
     name = hashlib.sha256(text.encode()).hexdigest()[:16]
     path = Path(_folder().name) / f"{spec.shape}-{name}.sdf"
@@ -414,16 +412,16 @@ def object_file(spec: PushedObject) -> str:
 
 
 def make_tip_and_object(spec: PushedObject, tip: TipAndBall | None = None):
-    """What the planner knows of an arm that pushes an object: a point of some mass, and
-    a free body on a table, as make_tip_and_ball has it for a ball.
+    """The planner's model of an arm that pushes an object: a point mass and a free body
+    on a table, as make_tip_and_ball for a ball.
 
-    Args: tip: whose tip_mass [kg] and tip_radius [m] count.
-    Returns: (diagram, plant, scene_graph): bodies `tip`, a sphere; `object`, with
-        collision geometries object::part_i, its convex parts, and object::support_i,
-        the spheres that it stands on; and `table`, a wide box with its top at z = 0.
-        u (3,) is the force on the tip [N], which has no weight (the arm carries it).
-        The state is laid out as in numerics/ball_state.py, with the object for the
-        ball.
+    Args: tip: only its tip_mass [kg] and tip_radius [m] are used.
+    Returns: (diagram, plant, scene_graph) with the bodies `tip`, a sphere; `object`,
+        with collision geometries object::part_i, its convex parts, and
+        object::support_i, the spheres that it stands on; and `table`, a wide box with
+        its top at z = 0. u (3,) is the force on the tip [N], which has no weight (the
+        arm carries it). The state is that of contact_mpc/numerics/ball_state.py, with
+        the object in place of the ball.
     """
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)

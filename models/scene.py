@@ -1,7 +1,7 @@
-"""Scenes: what a world, or a model of it, consists of. YAML in, a Drake plant out.
+"""Loads a scene, the description of a world or of a model, into a Drake plant.
 
-The file's sections are in scene_schema.py, its reading in scene_reader.py, what drives
-the joints in drives.py; here is how a plant is made of it.
+scene_schema.py has the sections of a scene file, scene_reader.py reads it, drives.py
+has the actuation; here the plant is built.
 """
 
 from collections.abc import Sequence
@@ -102,8 +102,8 @@ __all__ = [
 class LoadedScene:
     """A scene in a diagram.
 
-    effects: as applied, those of lower rank first, else in the scene's order.
-    paths: of each model between whose commands and joints something lies.
+    effects: in the order of application: by rank, then as in the scene.
+    paths: {model: ports} of the models that have an ActuationPath.
     """
 
     plant: MultibodyPlant  # Finalized.
@@ -116,10 +116,10 @@ class LoadedScene:
     couplings: tuple[Coupling, ...]  # In the order of their effects.
 
     def command_input_port(self, model: str) -> InputPort:
-        """Where effort commands of a model go in, (n_u,) [N m]: to the plant's own port
-        if nothing lies between.
+        """Input for a model's effort commands (n_u,) [N m]: of its actuation path, or
+        the plant's own port.
 
-        Raises: ValueError if the scene's drives take positions.
+        Raises: ValueError if the scene's drives take other commands.
         """
         path = self.paths.get(model)
         if path is None:
@@ -134,18 +134,18 @@ class LoadedScene:
         return path.command
 
     def effort_output_port(self, model: str) -> OutputPort | None:
-        """The motors' effort (n_u,) [N m], before the plant's own limits. None if
-        nothing lies between: then it is the command."""
+        """The motors' effort (n_u,) [N m], before the plant's own limits. None if the
+        model has no actuation path: then it is the command."""
         path = self.paths.get(model)
         return None if path is None else path.effort
 
     def measured_output_port(
         self, builder: DiagramBuilder, port: OutputPort, channels: Sequence[str]
     ) -> OutputPort:
-        """`port` as the scene's sensors give it; the very same port if they add
-        nothing. A clock_skew is in the time stamps of a recording, not in here.
+        """`port` behind the scene's effects on sensors; the port itself if there are
+        none. A clock_skew is not included: it changes the time stamps of a recording.
 
-        Args: channels: what each entry of the port is, `<model>.<joint>.position`, ...
+        Args: channels: names of the port's entries, `<model>.<joint>.position`, ...
         """
         maps = channel_maps(self.effects, CHANNEL_STEPS, channels)
         elastic = self.motor_side(channels)
@@ -161,7 +161,7 @@ class LoadedScene:
             )
         port = measured.GetOutputPort("y")
         for lags in zip_longest(*(channel.lags for channel in each), fillvalue=0.0):
-            # Below 0: less than a recording's declared filter, which is not in here.
+            # A lag below 0 reduces a recording's declared filter, not included here.
             slow = np.maximum(lags, 0.0)
             line = builder.AddSystem(LagLine(slow, step_or_default(self.plant)))
             builder.Connect(port, line.get_input_port())
@@ -175,7 +175,7 @@ class LoadedScene:
 
     def motor_side(self, channels: Sequence[str]) -> dict[int, int]:
         """{entry: index in the plant's state} of channels that are measured at a motor
-        and not at its joint, because the transmission gives way."""
+        behind an elastic transmission, instead of at its joint."""
         found = {}
         for joint in one_dof_joints(self.plant):
             motor = motor_joint(self.plant, joint)
@@ -192,22 +192,22 @@ class LoadedScene:
         return found
 
     def is_link_side(self, channel: str) -> bool:
-        """Whether the scene's `channels` say so: an entry for the channel, or for its
-        last part, that begins with `link`."""
-        words = self.scene.channels
-        said = words.get(channel, words.get(channel.rsplit(".", 1)[-1], ""))
-        return said.strip().lower().startswith("link")
+        """Whether the scene's section `channels` has an entry for the channel, or for
+        its last part, that begins with `link`."""
+        sides = self.scene.channels
+        side = sides.get(channel, sides.get(channel.rsplit(".", 1)[-1], ""))
+        return side.strip().lower().startswith("link")
 
     def set_effects(
         self, root_context: Context, current: Sequence[Effect], new: Sequence[Effect]
     ) -> bool:
-        """Gives the effects other parameters in a Context of the whole diagram.
+        """Changes the effects' parameters in a Context of the whole diagram.
 
-        Args: current, new: effects like self.effects, of the same kinds at the same
-            places; current are those whose parameters the Context has.
-        Returns: whether that could be done; if not, the Context is as it was, and the
-            scene has to be loaded anew.
-        Raises: ValueError for bad parameters.
+        Args: current, new: effects like self.effects, with the same kinds and places;
+            current: with the Context's present parameters.
+        Returns: whether this is possible; if not, the Context is unchanged, and the
+            scene has to be loaded again.
+        Raises: ValueError for parameters out of range.
         """
         new = [as_kind(effect) for effect in new]
         if [(e.kind, e.at) for e in new] != [(e.kind, e.at) for e in self.effects]:
@@ -263,8 +263,8 @@ class LoadedScene:
 
 
 def _changes_new_values(effects: Sequence[Effect]) -> bool:
-    """Whether one body has a new inertia and a change of it: in a Context one does not
-    know of the other."""
+    """Whether a body has both an effect with a new inertia and one that changes it: in
+    a Context they cannot be combined."""
     new: set[str] = set()
     changed: set[str] = set()
     for effect in effects:
@@ -280,14 +280,14 @@ def load_scene(
 ) -> LoadedScene:
     """Adds the scene's plant, with every effect applied, and its scene graph.
 
-    What is added depends on the scene alone, and its default context is the scene's
-    initial state. If an effect needs it, the plant's applied_generalized_force and
-    applied_spatial_force ports are connected, and the actuation port of a model whose
-    commands something lies in the way of: use the ports that LoadedScene tells.
+    The default Context is the scene's initial state, except velocities
+    (apply_initial_velocities). Where effects need them, the plant's ports
+    applied_generalized_force, applied_spatial_force and actuation are connected: use
+    the ports of LoadedScene instead.
 
-    Args: scene, or the path of its file; command_delays, False if whoever commands
-        delays the commands itself.
-    Raises: ValueError, naming what in the scene is wrong.
+    Args: scene: or the path of its file; command_delays: False if the caller delays the
+        commands itself.
+    Raises: ValueError that names what is wrong in the scene.
     """
     if not isinstance(scene, Scene):
         scene = read_scene(scene)
@@ -299,7 +299,8 @@ def load_scene(
             time_step=section.time_step,
             contact_model=section.contact_model,
             discrete_contact_approximation=section.discrete_contact_approximation,
-            use_sampled_output_ports=False,  # A 1 kHz law must read x[n] at t_n.
+            # A controller at 1 kHz must read x[n] at t_n.
+            use_sampled_output_ports=False,
         ),
         builder,
     )
@@ -316,7 +317,7 @@ def load_scene(
             before(effect, plant, scene_graph)
     try:
         plant.Finalize()
-    except DRAKE_ERRORS as error:  # Welds in a loop, and the like.
+    except DRAKE_ERRORS as error:  # Such as a loop of welds.
         raise ValueError(f"scene's directives: {one_line(error)}") from None
     for effect in effects:
         possible = KINDS[effect.kind].possible
@@ -324,9 +325,7 @@ def load_scene(
             possible(effect, plant, effects)
         if KINDS[effect.kind].channel:
             check_channels(effect, KINDS[effect.kind].channel, plant)
-    check_can_move(
-        plant
-    )  # After the effects, which say best what they make impossible.
+    check_can_move(plant)  # After the effects, whose own messages are better.
     for episodes in scene.initial_of.values():
         for state in episodes.values():
             _check_names(state, plant)
@@ -442,8 +441,8 @@ def _add_body_forces(effects, plant: MultibodyPlant, builder: DiagramBuilder):
 
 
 class InitialVelocities(LeafSystem):
-    """Keeps the scene's initial velocities in the diagram, for whoever simulates it:
-    Drake has no default for them, and no system may write another's state."""
+    """Stores the scene's initial velocities in the diagram, for the caller to apply:
+    Drake has no default velocities, and a system cannot write another's state."""
 
     NAME = "initial_velocities"
 
@@ -452,16 +451,16 @@ class InitialVelocities(LeafSystem):
         self._plant, self._initial = plant, initial
 
     def apply(self, root_context: Context) -> None:
-        """Gives the plant its velocities, in a Context of the whole diagram."""
+        """Sets the plant's velocities in a Context of the whole diagram."""
         own = self._plant.GetMyMutableContextFromRoot(root_context)
         _set_velocities(self._initial, self._plant, own)
 
 
 def apply_initial_velocities(diagram: Diagram, root_context: Context) -> None:
-    """Gives each scene of a diagram its initial velocities; they are not part of the
+    """Sets the initial velocities of all scenes in a diagram, which are not part of its
     default Context.
 
-    Args: root_context, of the diagram, which is the whole one.
+    Args: diagram: the whole one; root_context: its Context.
     """
     for system in diagram.GetSystems():
         if isinstance(system, InitialVelocities):
@@ -497,7 +496,8 @@ def _set_velocities(
 def _set_initial(
     initial: InitialSection, effects: Sequence[Effect], plant: MultibodyPlant
 ) -> None:
-    """The initial values are measured ones: what sensors add is taken off."""
+    """Sets the default positions. The scene has measured values, so effects on sensors
+    are inverted."""
     channels = [f"{name}.position" for name in initial.positions]
     channels += [f"{name}.{axis}" for name in initial.poses for axis in "xyz"]
     maps = channel_maps(effects, CHANNEL_STEPS, channels)
@@ -522,7 +522,7 @@ def _set_initial(
 
 
 def _check_names(initial: InitialSection, plant: MultibodyPlant) -> None:
-    """Raises: ValueError for a joint or body that the scene has not, or not so."""
+    """Raises: ValueError for an unknown joint or body, or one of another type."""
     for section in ("positions", "velocities"):
         for name in getattr(initial, section):
             _one_dof(plant, name, section)
@@ -554,7 +554,7 @@ def _free_body(plant: MultibodyPlant, name: str, section: str):
 
 
 def _find(plant: MultibodyPlant, name: str, what: str):
-    """The joint or body called `<model>.<name>`."""
+    """The joint or body with the name `<model>.<name>`. Raises: ValueError."""
     indices = plant.GetJointIndices if what == "joint" else plant.GetBodyIndices
     get = plant.get_joint if what == "joint" else plant.get_body
     named = {}

@@ -1,4 +1,4 @@
-"""A scene as a file, for people to read and for read_scene to read again."""
+"""Writes a scene as a readable YAML file that read_scene reads back."""
 
 import os
 from dataclasses import asdict, fields, is_dataclass
@@ -21,12 +21,12 @@ def write_scene(
 ) -> None:
     """Writes the scene as YAML, so that read_scene(path) gives the same scene.
 
-    Model files are named relative to the file's folder, where there is such a path;
-    `package://` stays. What has its default is left out.
+    Paths of model files are relative to the file's folder, if possible; `package://`
+    stays. Defaults are left out.
 
-    Args: heading: comment lines at the top; `makebreak list` shows the first. place:
-        the folder that the file will be moved to; None: it stays.
-    Raises: ValueError as scene_text, and where the file cannot be written.
+    Args: heading: comment lines at the top; `makebreak list` shows the first one.
+        place: folder to which the file will be moved; None: it stays.
+    Raises: ValueError as scene_text, or if the file cannot be written.
     """
     path = Path(path)
     text = "".join(f"# {line}".rstrip() + "\n" for line in heading.splitlines())
@@ -67,7 +67,7 @@ def scene_text(scene: Scene, folder: str | Path) -> str:
     of_files = plain.pop("initial_of")
     plain = _pruned(plain)
     if of_files:
-        # A file's `initial` is one or the other; the reader takes both by these names.
+        # A file's `initial` is one or the other; the reader accepts both keys together.
         plain["initial_of" if "initial" in plain else "initial"] = _pruned(of_files)
     lines = []
     for key, value in plain.items():
@@ -82,7 +82,7 @@ def scene_text(scene: Scene, folder: str | Path) -> str:
 
 
 def _relative(file: str, folder: Path) -> str:
-    """The file's name as seen from the folder; it stays if there is no such name."""
+    """The file's path relative to the folder; unchanged if there is none."""
     name = file.removeprefix("file://")
     if "://" in name:
         return file
@@ -93,7 +93,7 @@ def _relative(file: str, folder: Path) -> str:
 
 
 def _plain(value):
-    """Dataclasses, also those in lists and maps, as maps."""
+    """A value with dataclasses, also in lists and maps, converted to maps."""
     if isinstance(value, dict):
         return {key: _plain(each) for key, each in value.items()}
     if isinstance(value, list):
@@ -102,7 +102,7 @@ def _plain(value):
 
 
 def _effect(effect: Effect) -> list[str]:
-    """An effect with its sentence above it and each parameter's unit behind it."""
+    """Lines of an effect, with its sentence above and the units of its parameters."""
     if effect.kind not in KINDS:
         raise ValueError(f"effect kind {effect.kind!r} is unknown")
     kind = KINDS[effect.kind]
@@ -118,7 +118,7 @@ def _effect(effect: Effect) -> list[str]:
 
 
 def _pruned(value):
-    """Without empty lists and maps, which are the defaults of all that can be empty."""
+    """A value without empty lists and maps, which are defaults."""
     if isinstance(value, dict):
         kept = {key: _pruned(each) for key, each in value.items()}
         return {key: each for key, each in kept.items() if each not in ({}, [])}
@@ -133,12 +133,12 @@ def _flow(value) -> str:
         return f"{tag}{{{', '.join(pairs)}}}"
     if isinstance(value, list):
         return f"[{', '.join(map(_flow, value))}]"
-    # In brackets, so that what is special inside them is quoted.
+    # In brackets, so that characters that are special inside brackets are quoted.
     return yaml.safe_dump([value], default_flow_style=True, width=10**9).strip()[1:-1]
 
 
 def _entry(key: str, value, indent: int) -> list[str]:
-    """`key: value` on one line if it fits, else on several."""
+    """Lines of `key: value`, one if it fits."""
     line = f"{' ' * indent}{_flow(key)}: {_flow(value)}"
     if len(line) <= _WIDTH or not isinstance(value, dict | list):
         return [line]

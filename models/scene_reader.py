@@ -22,21 +22,20 @@ from makebreak.models.typed_yaml import (
     shown,
 )
 
-# NAME=PATH, with os.pathsep between them: what `--package` says, for this process and
-# those that it starts.
+# Settings NAME=PATH of `--package`, separated by os.pathsep, for this process and those
+# that it starts.
 PACKAGES_VARIABLE = "MAKEBREAK_PACKAGES"
 _DIRECTIVES = [each.name for each in ModelDirective.__fields__]
-_FARTHEST = 1e6  # [m]; of angles, degrees: far beyond all sense.
+_NUMBER_MAX = 1e6  # Bound of a directive's numbers [m], [deg].
 
 
 def read_scene(path: str | Path) -> Scene:
-    """The scene that a YAML or JSON file describes.
+    """Reads a scene from a YAML or JSON file.
 
-    Relative model files become absolute: they are relative to the scene's own folder.
-    Where `actuation` drives joints and names none, it gets those that the models have
-    actuators of.
+    Paths of model files, relative to the scene's folder, become absolute. If
+    `actuation` names no joints, it gets those with an actuator in the models' files.
 
-    Raises: ValueError if the file is missing, or is not a scene.
+    Raises: ValueError that names what is wrong.
     """
     path = Path(path)
     if not path.is_file():
@@ -46,7 +45,7 @@ def read_scene(path: str | Path) -> Scene:
         check_scene(scene)
         scene = with_actuated_joints(scene)
         for joint in scene.actuation.joints:
-            law_of(scene.actuation, joint)  # As many gains as joints.
+            law_of(scene.actuation, joint)  # Checks the number of gains.
         return scene
     except ValueError as error:
         raise ValueError(f"scene file {path}: {one_line(error)}") from None
@@ -57,7 +56,7 @@ def _scene(raw: Any, folder: Path) -> Scene:
         raise ValueError("it is empty, expected directives: [...]")
     if not isinstance(raw, dict):
         raise ValueError(f'got "{shown(raw)}", expected sections: {_sections()}')
-    # Keys that begin with an underscore are for anchors and templates, as in Drake's.
+    # Keys that begin with an underscore are for anchors and templates, as in Drake.
     raw = {k: v for k, v in raw.items() if not str(k).startswith("_")}
     raw = {k: v for k, v in raw.items() if v is not None}
     directives = _directives(raw.pop("directives", []), folder)
@@ -68,7 +67,7 @@ def _scene(raw: Any, folder: Path) -> Scene:
         _as_lists(raw["actuation"])
     initial = raw.get("initial")
     sections = {f.name for f in fields(InitialSection)}
-    # A misspelt section has numbers below it, a file has episodes.
+    # A recording's name is followed by episodes, a misspelt section by numbers.
     if (
         isinstance(initial, dict)
         and initial
@@ -100,7 +99,7 @@ def _sections() -> str:
 
 
 def _as_lists(section: dict) -> None:
-    """One number for all joints becomes a list of one."""
+    """Replaces a single number for all joints by a list of one, in place."""
     for key, value in section.items():
         if key == "supply" and isinstance(value, dict):
             _as_lists(value)
@@ -109,14 +108,14 @@ def _as_lists(section: dict) -> None:
 
 
 def _with_list(effect: Any) -> Any:
-    """`at` may be one name."""
+    """The effect with `at` as a list, if it is a single name."""
     if isinstance(effect, dict) and isinstance(effect.get("at"), str):
         return effect | {"at": [effect["at"]]}
     return effect
 
 
 def _directives(raw: Any, folder: Path) -> list[ModelDirective]:
-    """Drake's own, with messages that name the place."""
+    """Drake's model directives. Raises: ValueError that names the directive."""
     if not isinstance(raw, list):
         raise ValueError(
             f'directives: got "{shown(raw)}", expected a list of Drake model directives'
@@ -137,25 +136,25 @@ def _directives(raw: Any, folder: Path) -> list[ModelDirective]:
         _check_directive(f"{name}.{what}", what, content)
         try:
             directive = yaml_load_typed(schema=ModelDirective, data=yaml_dump(each))
-        except Exception as error:  # The reader raises several kinds.
-            said = one_line(error).partition(" ((<class")[0]
+        except Exception as error:  # Drake's reader raises several types.
+            message = one_line(error).partition(" ((<class")[0]
             if (
                 not isinstance(error, RuntimeError)
-                or "incompatible function arguments" in said
-                or "schema sum type" in said
-            ):  # No help.
-                said = f'got "{shown(content)}", one of its values has a wrong form'
-            raise ValueError(f"{name}.{what}: {said}") from None
+                or "incompatible function arguments" in message
+                or "schema sum type" in message
+            ):  # These messages do not help a user.
+                message = f'got "{shown(content)}", one of its values has a wrong form'
+            raise ValueError(f"{name}.{what}: {message}") from None
         for part in (directive.add_model, directive.add_directives):
             if part is not None and "://" not in part.file:
-                # Not as_uri(): Drake does not decode %20.
+                # Not as_uri(), because Drake does not decode %20.
                 part.file = f"file://{(folder / part.file).resolve()}"
         found.append(directive)
     return found
 
 
 def _check_directive(name: str, what: str, content: Any) -> None:
-    """What Drake's reader would say in its own words, or not at all."""
+    """Raises: ValueError where Drake's reader would give no clear message, or none."""
     schema = {f.name: f.type for f in ModelDirective.__fields__}[what].__args__[0]
     known = [f.name for f in schema.__fields__]
     if not isinstance(content, dict):
@@ -191,27 +190,27 @@ def _check_numbers(name: str, value: Any) -> None:
             _check_numbers(f"{name}[{i}]", each)
     elif isinstance(value, int | float):
         try:
-            good = math.isfinite(value) and abs(value) <= _FARTHEST
+            good = math.isfinite(value) and abs(value) <= _NUMBER_MAX
         except OverflowError:  # An int of 400 digits.
             good = False
         if not good:
             raise ValueError(
                 f'{name}: got "{shown(value)}", expected a number from '
-                f"{-_FARTHEST:g} to {_FARTHEST:g}"
+                f"{-_NUMBER_MAX:g} to {_NUMBER_MAX:g}"
             )
 
 
 def _given_packages() -> dict[str, str]:
-    """Those of `--package`, which win over the file's."""
-    said = os.environ.get(PACKAGES_VARIABLE, "")
-    pairs = (each.partition("=") for each in said.split(os.pathsep) if each)
+    """The packages of `--package`, which have priority over the file's."""
+    text = os.environ.get(PACKAGES_VARIABLE, "")
+    pairs = (each.partition("=") for each in text.split(os.pathsep) if each)
     return {name: str(Path(where).resolve()) for name, _, where in pairs}
 
 
 def give_packages(settings: list[str]) -> None:
-    """Takes `--package NAME=PATH` for all scenes that are read from now on.
+    """Stores settings NAME=PATH of `--package` for all scenes that are read afterwards.
 
-    Raises: ValueError.
+    Raises: ValueError for another form, or a folder that does not exist.
     """
     for each in settings:
         name, equals, where = each.partition("=")
@@ -227,9 +226,10 @@ def give_packages(settings: list[str]) -> None:
 
 
 def initial_for(scene: Scene, recording: str, episode: int | None) -> InitialSection:
-    """The initial state of an episode (None: of a recording without episodes).
+    """The initial state of an episode.
 
-    Args: recording: name of its file, with or without its folder and suffix.
+    Args: recording: name of its file, with or without folder and suffix; episode: None
+        for a recording without episodes.
     """
     for name in (recording, Path(recording).name, Path(recording).stem):
         episodes = scene.initial_of.get(name, {})

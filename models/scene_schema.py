@@ -1,10 +1,11 @@
-"""What a scene file may say, as dataclasses, and the checks of their values."""
+"""The sections of a scene file as dataclasses, and checks of their values."""
 
 import math
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from pydrake.multibody.parsing import ModelDirective
+from pydrake.multibody.plant import DiscreteContactApproximation
 
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, check_parameters
@@ -12,15 +13,15 @@ from makebreak.models.effects.measured_channels import torque_constant
 from makebreak.models.friction_zones import FrictionZone, check_zones
 from makebreak.models.typed_yaml import Between, check, convert, hints_of, nearest
 
-# Bounds are far outside of what robots do: they catch wrong units and slips of the
-# keyboard, and keep Drake from what it cannot compute.
+# Bounds are far outside of the range of robots: they catch wrong units and typing
+# errors, and numbers that Drake cannot compute with.
 Coordinate = Annotated[float, Between(-1e4, 1e4, "rad or m")]
 Rate = Annotated[float, Between(-1e4, 1e4, "rad/s or m/s")]
 Gain = Annotated[float, Between(0.0, 1e9)]
 Positive = Annotated[float, Between(1e-9, 1e9)]
 LEAST_STEP = 1e-6  # [s]
 
-# What the commands of a recording may be, by the type of a scene's actuation.
+# Commands that a recording may have, by the type of a scene's actuation.
 COMMANDS_OF: dict[str, tuple[str, ...]] = {
     "none": (),
     "effort": ("effort_command",),
@@ -28,7 +29,7 @@ COMMANDS_OF: dict[str, tuple[str, ...]] = {
     "servo": ("position_command",),
     "velocity": ("velocity_command",),
 }
-# What a scene's `tolerance` may speak of, and the largest that makes sense.
+# Keys of a scene's `tolerance`, and the range of their values.
 TOLERANCES = {
     "link_mass": Between(0.0, 10.0, "of the mass"),
     "link_com_m": Between(0.0, 1.0, "m"),
@@ -56,7 +57,7 @@ class PlantSection:
 
 @dataclass
 class SupplySection:
-    """A motor at a supply: each one number, or one for each joint."""
+    """A motor and its voltage supply: one number each, or one for each joint."""
 
     voltage: list[Positive] = field(default_factory=list)  # [V]
     kt: list[Positive] = field(default_factory=list)  # [N m/A], at the joint.
@@ -65,17 +66,17 @@ class SupplySection:
 
 @dataclass
 class ActuationSection:
-    """Who drives the joints. The effort of the types pd, servo and velocity is
+    """The actuation of the joints. For the types pd, servo and velocity the effort is
 
         clip(kp (position_command - position) + kd (velocity_command - velocity),
              +-limit) - kt^2/R velocity
 
-    pd has all of the commands, servo the position (with kd against its velocity),
-    velocity the velocity. The limit is at most voltage kt/R, if there is a supply. An
-    error of position counts from the dead band's edge on; a position command is
-    received in whole steps of `resolution`. Each is one number, or one for each joint.
+    pd has both commands, servo only the position (kd damps the joint's velocity),
+    velocity only the velocity. With a supply the limit is at most voltage kt/R. A
+    position error is measured from the edge of the dead band; a position command is
+    rounded to steps of `resolution`. Each is one number, or one for each joint.
 
-    joints: `<model>.<joint>`; none: those that the models' own files have actuators of.
+    joints: `<model>.<joint>`; none: those with an actuator in the models' files.
     """
 
     type: str = "none"  # A key of COMMANDS_OF.
@@ -92,7 +93,7 @@ class ActuationSection:
 
 @dataclass
 class InitialSection:
-    """Named `<model>.<joint>` and `<model>.<body>`; bodies in the world's axes."""
+    """Keys are `<model>.<joint>` and `<model>.<body>`; bodies are in world axes."""
 
     positions: dict[str, Coordinate] = field(default_factory=dict)
     velocities: dict[str, Rate] = field(default_factory=dict)
@@ -107,8 +108,8 @@ class Scene:
     plant: PlantSection = field(default_factory=PlantSection)
     actuation: ActuationSection = field(default_factory=ActuationSection)
     initial: InitialSection = field(default_factory=InitialSection)
-    # Recording's file name -> episode -> its initial state. In a file: `initial`, with
-    # file names in place of positions, velocities, poses, body_velocities.
+    # {recording's file name: {episode: initial state}}. In a file it is `initial` with
+    # file names instead of positions, velocities, poses, body_velocities.
     initial_of: dict[str, dict[str, InitialSection]] = field(default_factory=dict)
     tolerance: dict[str, float] = field(default_factory=dict)
     channels: dict[str, str] = field(default_factory=dict)
@@ -117,9 +118,9 @@ class Scene:
 
 
 def check_scene(scene: Scene) -> None:
-    """Checks all that can be without the models.
+    """Checks that need no models.
 
-    Raises: ValueError, naming what in the scene is wrong.
+    Raises: ValueError that names what is wrong in the scene.
     """
     for name, hint in hints_of(Scene).items():
         if name not in ("directives", "effects"):
@@ -129,6 +130,12 @@ def check_scene(scene: Scene) -> None:
         raise ValueError(
             f"plant.time_step: got {step:g}, expected 0 (continuous) or at least "
             f"{LEAST_STEP:g} [s]"
+        )
+    approximation = scene.plant.discrete_contact_approximation
+    if approximation == "tamsi" and not hasattr(DiscreteContactApproximation, "kTamsi"):
+        raise ValueError(
+            "plant.discrete_contact_approximation: got tamsi, which Drake 1.58 no "
+            "longer has; expected lagged, similar or sap"
         )
     if len(scene.plant.gravity) != 3:
         raise ValueError(f"plant.gravity is {scene.plant.gravity}, expected [x, y, z]")
@@ -175,7 +182,8 @@ def _check_actuation(actuation: ActuationSection) -> None:
 
 
 def check_initial(where: str, initial: InitialSection) -> None:
-    """Raises: ValueError for a number out of bounds; for a pose that is none."""
+    """Raises: ValueError for a number out of bounds, or a pose or velocity of another
+    form."""
     check(initial, f"{where}.")
     for name, pose in initial.poses.items():
         if len(pose) != 7 or not abs(math.hypot(*pose[:4]) - 1.0) < 1e-3:
@@ -192,7 +200,7 @@ def check_initial(where: str, initial: InitialSection) -> None:
 
 
 def as_kind(effect: Effect) -> Effect:
-    """The effect, checked. Raises: ValueError."""
+    """The effect itself. Raises: ValueError for an unknown kind or bad parameters."""
     if effect.kind not in KINDS:
         raise ValueError(
             f"effect kind {effect.kind!r} is unknown: {nearest(effect.kind, KINDS)}"

@@ -1,5 +1,6 @@
-"""What the planner knows of an arm that rolls a ball: a point of some mass, pushed by
-a force, above a free ball on a table. No arm: the impedance controller is the arm."""
+"""The planner's model of an arm that rolls a ball: a point mass that a force moves, and
+a free ball on a table. It has no arm: the impedance controller makes the arm's tip act
+like the point mass."""
 
 from dataclasses import dataclass
 
@@ -27,7 +28,7 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
     V_TIP,
 )
 
-UNUSED_FRICTION = CoulombFriction(1.0, 1.0)  # Contact pairs state their own.
+UNUSED_FRICTION = CoulombFriction(1.0, 1.0)  # An LCS has the friction of its pairs.
 
 
 @dataclass
@@ -39,10 +40,13 @@ class TipAndBall:
 
 
 def make_tip_and_ball(config: TipAndBall):
-    """Returns: (diagram, plant, scene_graph): bodies `tip` and `ball`, both spheres,
-    and `table`, a wide box with its top at z = 0. u (3,) is the force on the tip [N],
-    which has no weight (the arm carries it). The state is laid out as in
-    numerics/ball_state.py.
+    """The planner's model.
+
+    Returns: (diagram, plant, scene_graph) with the bodies `tip` and `ball`, spheres,
+        and `table`, a wide box with its top at z = 0. u (3,) is the force on the tip
+        [N], which has no weight (the arm carries it). The state is that of
+        contact_mpc/numerics/ball_state.py.
+    Raises: ValueError for a setting out of range.
     """
     for name in ("ball_mass", "ball_radius"):
         _check_positive(config, name)
@@ -73,7 +77,8 @@ def _check_positive(config: TipAndBall, name: str) -> None:
 
 
 def add_tip(plant: MultibodyPlant, config: TipAndBall) -> None:
-    """The body `tip`, a weightless sphere of some mass that a force (3,) moves."""
+    """Adds the body `tip`, a sphere with mass but without weight, moved by a force (3,)
+    [N]."""
     for name in ("tip_mass", "tip_radius"):
         _check_positive(config, name)
     arm = plant.AddModelInstance("tip")
@@ -105,7 +110,7 @@ def add_tip(plant: MultibodyPlant, config: TipAndBall) -> None:
 
 
 def add_table(plant: MultibodyPlant) -> None:
-    """The body `table`, a wide box with its top at z = 0."""
+    """Adds the body `table`, a wide box with its top at z = 0."""
     table = plant.AddRigidBody("table", plant.AddModelInstance("table"))
     plant.WeldFrames(plant.world_frame(), table.body_frame())
     below = RigidTransform([0.0, 0.0, -0.5])
@@ -115,8 +120,8 @@ def add_table(plant: MultibodyPlant) -> None:
 
 
 def check_layout(plant: MultibodyPlant, body: RigidBody) -> None:
-    """Raises: RuntimeError if the state of a tip and a free body is not laid out as in
-    numerics/ball_state.py."""
+    """Raises: RuntimeError unless the state of tip and free body has the layout of
+    contact_mpc/numerics/ball_state.py."""
     nq = plant.num_positions()
     starts = (
         plant.GetJointByName("tip_x").position_start(),

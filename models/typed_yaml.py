@@ -1,7 +1,7 @@
-"""YAML text into dataclasses, checked as it is read: names, types, bounds of numbers.
+"""Reads YAML text into dataclasses and checks names, types and bounds of numbers.
 
-Not Drake's yaml_load_typed: its messages do not name the field's path, and it knows no
-nearest names, no tuples and no bounds. Imports no pydrake, so that it loads at once.
+Drake's yaml_load_typed is not used, because its messages do not name the field's path,
+and it has no nearest names, tuples or bounds. Without pydrake, so that it loads fast.
 """
 
 import dataclasses
@@ -16,9 +16,9 @@ from typing import Annotated, Any
 import numpy as np
 import yaml
 
-MOST_DEEP = 40  # Brackets in brackets; a scene needs about six.
-MOST_BYTES = 4_000_000
-MOST_ALIASES = 1000  # `*name`: nine lines of ten each would be a billion.
+DEPTH_MAX = 40  # Of nested brackets or indents; a scene needs about six.
+BYTES_MAX = 4_000_000
+ALIASES_MAX = 1000  # Nine lines with ten aliases each would expand to a billion.
 _EXPECTED = {int: "an integer", float: "a number", bool: "true or false", str: "a text"}
 
 
@@ -26,7 +26,7 @@ _EXPECTED = {int: "an integer", float: "a number", bool: "true or false", str: "
 class Between:
     """Bounds of a field: `period_sec: Annotated[float, Between(1e-4, 10.0, "s")]`.
 
-    None: without a bound on that side; then infinity is a value.
+    None: no bound on that side; infinity is then valid.
     """
 
     low: float | None
@@ -50,7 +50,7 @@ _Fastest: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class _Loader(_Fastest):
-    """Safe, but no key twice, and with a tag such as !Rpy kept under `_tag`."""
+    """A safe loader that refuses duplicate keys; tags such as !Rpy go into `_tag`."""
 
     def construct_mapping(self, node, deep=False):
         seen = set()
@@ -75,9 +75,9 @@ _Loader.add_multi_constructor("!", _Loader.with_tag)
 
 
 def load_yaml(text: str) -> Any:
-    """What a YAML (or JSON) text says, as dicts, lists and scalars.
+    """YAML or JSON text as dicts, lists and scalars.
 
-    Raises: ValueError in one line: not YAML, a key twice, brackets too deep.
+    Raises: ValueError in one line for invalid YAML, duplicate keys, too deep nesting.
     """
     try:
         depth = aliases = 0
@@ -87,10 +87,10 @@ def load_yaml(text: str) -> Any:
             elif isinstance(event, yaml.CollectionEndEvent):
                 depth -= 1
             aliases += isinstance(event, yaml.AliasEvent)
-            if depth > MOST_DEEP or aliases > MOST_ALIASES:
-                what = f"{MOST_DEEP} levels of brackets or indents"
-                if depth <= MOST_DEEP:
-                    what = f"{MOST_ALIASES} aliases"
+            if depth > DEPTH_MAX or aliases > ALIASES_MAX:
+                what = f"{DEPTH_MAX} levels of brackets or indents"
+                if depth <= DEPTH_MAX:
+                    what = f"{ALIASES_MAX} aliases"
                 line = event.start_mark.line + 1
                 raise ValueError(f"line {line}: expected at most {what}")
         return yaml.load(text, Loader=_Loader)
@@ -105,11 +105,11 @@ def load_yaml(text: str) -> Any:
 
 
 def read_yaml(path: Path) -> Any:
-    """As load_yaml, of a file. Raises: ValueError, without the file's name."""
+    """load_yaml of a file. Raises: ValueError, without the file's name."""
     try:
         size = path.stat().st_size
-        if size > MOST_BYTES:
-            raise ValueError(f"{size} bytes, expected at most {MOST_BYTES}")
+        if size > BYTES_MAX:
+            raise ValueError(f"{size} bytes, expected at most {BYTES_MAX}")
         return load_yaml(path.read_text(encoding="utf-8-sig"))
     except UnicodeDecodeError as error:
         raise ValueError(f"not YAML: {one_line(error)}") from None
@@ -118,15 +118,17 @@ def read_yaml(path: Path) -> Any:
 
 
 def one_line(error: BaseException) -> str:
+    """The message of an error on one line."""
     return " ".join(str(error).split())
 
 
 def nearest(name: str, valid: Iterable[str]) -> str:
-    """The end of a refusal: the valid names nearest to `name`, or all of them."""
+    """Hint of an error message: the valid names nearest to `name`, or all of them."""
     valid = list(valid)
 
     def likeness(other: str) -> tuple[float, float]:
-        """Of the last parts, as often only that is given; then of the whole names."""
+        """Similarity of the last parts, which users often give alone, then of the whole
+        names."""
         pairs = [(name.rpartition(".")[2], other.rpartition(".")[2]), (name, other)]
         last, whole = (difflib.SequenceMatcher(None, *p).ratio() for p in pairs)
         return last, whole
@@ -142,7 +144,7 @@ def nearest(name: str, valid: Iterable[str]) -> str:
 
 
 def shown(value) -> str:
-    """A value for a message: as in YAML, one line, not endless."""
+    """A value for a message: as YAML, on one line, shortened."""
     text = value
     if not isinstance(value, str):
         try:
@@ -158,14 +160,14 @@ def _refuse(name: str, value, expected: str):
 
 
 def convert(name: str, value, hint, raw: str | None = None):
-    """`value`, as YAML reads it, as the declared type `hint`.
+    """Converts a value from YAML to the declared type `hint`.
 
     Args:
-        name: the field, for the message.
-        value: what YAML made of the text.
-        hint: the field's declared type, with its Between if it has one.
-        raw: the text itself: a field that is a str takes it as it stands.
-    Raises: ValueError naming the field, the value and what was expected.
+        name: of the field, for messages.
+        value: as YAML reads it.
+        hint: the field's declared type, annotated with its Between if it has one.
+        raw: the original text, which a str field takes unchanged.
+    Raises: ValueError that names the field, the value and what was expected.
     """
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
@@ -240,7 +242,7 @@ def convert(name: str, value, hint, raw: str | None = None):
 
 def _number(name: str, value, hint: type):
     number = value
-    if isinstance(value, str):  # YAML 1.1 takes 1e-3, without a dot, for a text.
+    if isinstance(value, str):  # YAML 1.1 reads 1e-3, without a dot, as text.
         try:
             number = float(value)
         except ValueError:
@@ -258,15 +260,15 @@ def _number(name: str, value, hint: type):
 
 
 def hints_of(schema: type) -> dict[str, Any]:
-    """{field: declared type}, with what is annotated."""
+    """{field: declared type}, with annotations."""
     return typing.get_type_hints(schema, include_extras=True)
 
 
 def merge(schema: type, mapping: dict, config=None, prefix: str = ""):
-    """`config` with the fields that `mapping` names replaced, nested ones merged; a new
+    """`config` with the fields in `mapping` replaced, nested ones merged; a new
     `schema` if `config` is None.
 
-    Raises: ValueError: an unknown key, with the nearest names; as convert.
+    Raises: ValueError for an unknown key, with the nearest names; as convert.
     """
     hints = hints_of(schema)
     fields = {prefix + f.name: f for f in dataclasses.fields(schema)}
@@ -290,9 +292,9 @@ def merge(schema: type, mapping: dict, config=None, prefix: str = ""):
 
 
 def check(instance, prefix: str = "") -> None:
-    """Checks a dataclass that was not read from a file: as convert, field by field.
+    """Checks the fields of a dataclass that was not read from a file.
 
-    Raises: ValueError.
+    Raises: ValueError as convert.
     """
     for name, hint in hints_of(type(instance)).items():
         convert(f"{prefix}{name}", getattr(instance, name), hint)

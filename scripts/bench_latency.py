@@ -23,13 +23,8 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.sensors import ImageRgba8U
 
-from makebreak.diagrams.ball_rolling import (
-    CONTROL,
-    LEARN,
-    BallRollingConfig,
-    make_ball_rolling,
-    make_world,
-)
+from makebreak.diagrams.ball_rolling import CONTROL, make_ball_rolling, make_world
+from makebreak.diagrams.ball_rolling_config import LEARN, BallRollingConfig
 from makebreak.diagrams.camera import CameraConfig
 from makebreak.diagrams.station import ARM
 from makebreak.scripts.bench_rows import failed

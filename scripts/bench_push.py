@@ -13,7 +13,11 @@ from time import perf_counter
 import numba
 import numpy as np
 
-from makebreak.diagrams.push_object import PushPlannerConfig, c3_config, contact_pairs
+from makebreak.diagrams.push_object_config import (
+    PushPlannerConfig,
+    c3_config,
+    contact_pairs,
+)
 from makebreak.models.pushed_object import (
     PushedObject,
     make_tip_and_object,
@@ -23,7 +27,8 @@ from makebreak.models.pushed_object import (
 from makebreak.scripts.bench import median_call_ms
 from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs
 from makebreak.systems.contact_mpc.numerics.ball_state import P_BALL
-from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Problem, WarmStart, solve_c3
+from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Problem, solve_c3
+from makebreak.systems.contact_mpc.numerics.c3_plan import WarmStart
 from makebreak.systems.contact_mpc.numerics.contact_sampling import (
     inward,
     outline_of,

@@ -124,6 +124,9 @@ def _config(module, args: argparse.Namespace):
         path = _scene(text, f"--{option}")
         config = dataclasses.replace(config, **{option: path})
     config = apply_settings(config, args.set)
+    motion = getattr(config, "pattern", "")
+    if isinstance(motion, str) and Path(motion).is_file():
+        config = dataclasses.replace(config, pattern=str(Path(motion).resolve()))
     config = _with_faults(config, getattr(args, "fault", []), args.experiment)
     if args.seed is not None:
         seed = int(_number(args.seed, "--seed", 0, whole=True))
@@ -154,8 +157,8 @@ def _with_faults(config, texts: Sequence[str], experiment: str):
 
 def _inputs(args, config) -> list[str]:
     """The files that a run reads."""
-    scenes = [getattr(config, name, None) for name in ("world", "model")]
-    return [path for path in (args.config, *scenes) if isinstance(path, str) and path]
+    files = [getattr(config, name, None) for name in ("world", "model", "pattern")]
+    return [path for path in (args.config, *files) if isinstance(path, str) and path]
 
 
 def _default_out(name: str) -> Path:
@@ -180,6 +183,12 @@ def fault_lines() -> dict[str, str]:
 
 
 def _list(args) -> int:
+    if args.experiment is not None:
+        from makebreak.scripts.settings_list import settings_table
+
+        config = _experiment(args.experiment).Config()
+        print(settings_table(args.experiment, config, args.text).to_text())
+        return 0
     names: dict[str, dict[str, str]] = {"experiments": {}, "scenes": {}}
     for name in EXPERIMENTS:
         try:
@@ -277,7 +286,7 @@ def _runner(module, args):
 def _run_in(session, args, run, config, duration) -> int:
     """Runs the experiment in the session. Returns: the exit status."""
     from makebreak.scripts import compile_ahead
-    from makebreak.scripts.criteria import told
+    from makebreak.scripts.criteria import success_text
     from makebreak.scripts.run_buttons import StartOver
     from makebreak.scripts.table import Table
     from makebreak.scripts.trials import duration_line
@@ -335,7 +344,7 @@ def _run_in(session, args, run, config, duration) -> int:
     if result is not None:
         rows = [(k, v) for k, v in result.items() if k not in ("criteria", "ended")]
         print(Table(args.experiment, ("result", "value"), rows).to_text())
-        lines = [*session.endings, *session.too_slow(), told(result)]
+        lines = [*session.endings, *session.too_slow(), success_text(result)]
         print("\n".join(lines), flush=True)
     _say_files(files)
     if session.compared_by:
@@ -538,7 +547,7 @@ def _inspect(args) -> int:
     table, sidecar, files = run_inspect(Path(args.log), robot, out)
     print(table.to_text())
     if out is None:
-        print("\nA sidecar for it, to be corrected (--out DIR writes it):\n")
+        print("\nProposed sidecar; check it (--out DIR writes it to a file):\n")
         print(sidecar, end="")
     else:
         _say_files(files)
@@ -648,13 +657,16 @@ def _completion(args) -> int:
 
 def _config_options(
     p: argparse.ArgumentParser,
-    model: str = "the scene that control believes",
-    seed: str = "all randomness comes from it",
+    model: str = "scene used by the controllers",
+    seed: str = "seed of all random numbers",
 ) -> None:
     """What _config reads. Args: model, seed: the help of these two."""
-    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", nargs="+")
+    p.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", nargs="+",
+        help="settings; `makebreak list EXPERIMENT` shows them",
+    )  # fmt: skip
     p.add_argument("--config", metavar="FILE", help="a YAML file of settings")
-    p.add_argument("--world", metavar="SCENE", help="the scene that is simulated")
+    p.add_argument("--world", metavar="SCENE", help="simulated scene")
     p.add_argument("--model", metavar="SCENE", help=model)
     p.add_argument("--seed", metavar="N", help=seed)
 
@@ -662,7 +674,7 @@ def _config_options(
 def _fault_option(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--fault", action="append", default=[], metavar="NAME[:from=S,for=S]",
-        help="what is to go wrong; `list` has the names",
+        help="fault to inject; `list` has the names",
     )  # fmt: skip
 
 
@@ -676,90 +688,115 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    p = commands.add_parser("list", help="experiments and scenes, a line each")
+    p = commands.add_parser(
+        "list",
+        help="all experiments, scenes and faults; or the settings of one experiment",
+    )
+    p.add_argument(
+        "experiment", nargs="?", metavar="EXPERIMENT", help="list its settings"
+    )
+    p.add_argument(
+        "text", nargs="?", default="", metavar="TEXT", help="only settings with it"
+    )
     p.set_defaults(function=_list)
 
-    p = commands.add_parser("run", help="one experiment, seen in Meshcat")
+    p = commands.add_parser("run", help="run one experiment, with Meshcat")
     p.add_argument("experiment", nargs="?", default="ball_rolling")
     _config_options(p)
     p.add_argument("--duration", metavar="S", help="simulated seconds")
     _fault_option(p)
     p.add_argument(
         "--robot", nargs="+", default=["sim"], metavar=("sim", "RECORDING"),
-        help="sim; lcm [URL], one behind LCM; replay RECORDING",
+        help="sim (default); lcm [URL]: a robot behind LCM; replay RECORDING",
     )  # fmt: skip
-    p.add_argument("--no-meshcat", action="store_true", help="no viewer, no html")
-    p.add_argument("--realtime", metavar="RATE", help="at most so fast; 1: real time")
     p.add_argument(
-        "--diagram", metavar="FILE", help="a picture of it: .svg, .png, .pdf"
+        "--no-meshcat", action="store_true", help="no viewer, no meshcat.html"
+    )
+    p.add_argument("--realtime", metavar="RATE", help="speed limit; 1: real time")
+    p.add_argument(
+        "--diagram", metavar="FILE", help="write the diagram as .svg, .png or .pdf"
     )
     p.add_argument("--out", metavar="DIR", help="default: runs/<experiment>-<time>")
     p.set_defaults(function=_run)
 
     p = commands.add_parser(
-        "station", help="a robot behind LCM to try `run --robot lcm` with"
+        "station", help="simulate a robot behind LCM, for `run --robot lcm`"
     )
     p.add_argument("experiment", nargs="?", default="ball_rolling")
-    p.add_argument("--rate", default="1", metavar="R", help="simulated s per s (1)")
-    p.add_argument("--drop", default="0", metavar="SHARE", help="of messages, lost")
-    p.add_argument("--delay", default="0", metavar="S", help="sent so much later")
-    p.add_argument("--url", metavar="URL", help="of LCM; default: this machine alone")
-    p.add_argument("--duration", default="86400", metavar="S", help="of its own time")
+    p.add_argument(
+        "--rate", default="1", metavar="R", help="simulated seconds per second (1)"
+    )
+    p.add_argument(
+        "--drop", default="0", metavar="SHARE", help="fraction of messages lost (0)"
+    )
+    p.add_argument("--delay", default="0", metavar="S", help="delay of messages (0)")
+    p.add_argument("--url", metavar="URL", help="of LCM; default: this machine only")
+    p.add_argument(
+        "--duration", default="86400", metavar="S", help="simulated seconds (86400)"
+    )
     _fault_option(p)
     _config_options(p, model="not used by a station")
     p.set_defaults(function=_station)
 
-    p = commands.add_parser("reproduce", help="the paper's figure or table beside ours")
+    p = commands.add_parser(
+        "reproduce", help="the papers' figures and tables beside ours"
+    )
     p.add_argument(
-        "experiments", nargs="*", metavar="EXPERIMENT", help="or: gap, faults"
+        "experiments",
+        nargs="*",
+        metavar="EXPERIMENT",
+        help="an experiment, gap or faults; default: all experiments",
     )
     p.add_argument("--seeds", default="10", metavar="N", help="trials per case (10)")
     p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
     p.add_argument(
         "--set", dest="which", default="standard", metavar="SET",
-        help="of gap: standard, development, logs-..., contact-development or -final",
+        help="for gap: standard, development, logs-development, logs-final, "
+        "contact-development or contact-final",
     )  # fmt: skip
     p.add_argument(
         "--only",
         default="",
         metavar="TEXT",
-        help="of gap and faults: cases with this in the name",
+        help="for gap and faults: only cases with TEXT in the name",
     )
-    p.add_argument("--seed", metavar="N", help="of gap and faults: the first one")
+    p.add_argument("--seed", metavar="N", help="for gap and faults: first seed")
     p.add_argument(
-        "--reuse", action="store_true", help="keep trials of an earlier time"
+        "--reuse", action="store_true", help="keep complete trials of an earlier call"
     )
     p.add_argument("--out", metavar="DIR", help="default: runs/reproduce-<time>")
     p.set_defaults(function=_reproduce)
 
     p = commands.add_parser(
-        "sweep", help="one experiment over seeds and ranges of its settings"
+        "sweep", help="run one experiment with many seeds and settings"
     )
     p.add_argument("experiment", metavar="EXPERIMENT")
-    p.add_argument("--trials", required=True, metavar="N", help="seeds per case")
+    p.add_argument("--trials", required=True, metavar="N", help="seeds for each case")
     p.add_argument(
         "--vary", action="append", default=[], metavar="KEY=LO:HI", nargs="+",
-        help="LO:HI is drawn from for each trial; A,B,C: each is a case",
+        help="LO:HI: drawn for each trial; A,B,C: each value is a case",
     )  # fmt: skip
-    _config_options(p, seed="of the first trial (0)")
+    _config_options(p, seed="seed of the first trial (0)")
     p.add_argument("--duration", metavar="S", help="simulated seconds")
     p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
     p.add_argument(
         "--cluster", metavar="ADDRESS", help="Dask: tcp://HOST:PORT; Ray: ray:HOST:PORT"
     )
     p.add_argument(
-        "--out", metavar="DIR", help="one of an earlier sweep: it goes on there"
+        "--out",
+        metavar="DIR",
+        help="default: runs/sweep-<experiment>-<time>; an earlier sweep is continued",
     )
     p.set_defaults(function=_sweep)
 
     p = commands.add_parser(
-        "gap", help="where a model and recordings disagree, and what it lacks"
+        "gap", help="compare a model with recordings and name what the model lacks"
     )
     p.add_argument(
         "scene",
         metavar="SCENE",
-        help="the model: a file, or a listed name; or a robot's .urdf or .sdf alone, "
-        "for which a scene is proposed",
+        help="the model: a scene file, a name of `list`, or a .urdf or .sdf (a scene "
+        "is then proposed)",
     )
     p.add_argument(
         "recordings",
@@ -770,66 +807,78 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--skip-bad-rows",
         action="store_true",
-        help="leave out rows that cannot be read, and say how many",
+        help="skip rows that cannot be read; their number is printed",
     )
     p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
     p.add_argument("--out", metavar="DIR", help="default: runs/gap-<time>")
     p.add_argument(
-        "--export", metavar="FORMATS", help="the repaired model also as: urdf,mjcf"
+        "--export", metavar="FORMATS", help="also write the repaired model: urdf,mjcf"
     )
     p.set_defaults(function=_gap)
 
     p = commands.add_parser(
-        "inspect", help="what a log holds: columns or topics, rates, holes, units"
+        "inspect", help="show columns or topics of a log, with rates, holes and units"
     )
-    p.add_argument("log", metavar="LOG", help=".csv, .npz, .parquet, a bag, a dataset")
-    p.add_argument("--robot", metavar="FILE", help=".urdf or .sdf, to match columns to")
-    p.add_argument("--out", metavar="DIR", help="write the drafted sidecar there")
+    p.add_argument(
+        "log", metavar="LOG", help=".csv, .npz, .parquet, a ROS bag, a LeRobot dataset"
+    )
+    p.add_argument(
+        "--robot",
+        metavar="FILE",
+        help=".urdf or .sdf; columns are matched to its joints",
+    )
+    p.add_argument("--out", metavar="DIR", help="write the proposed sidecar there")
     p.set_defaults(function=_inspect)
 
     p = commands.add_parser(
         "close-the-loop",
-        help="a run with a wrong model, gap on its recording, a run with the repaired",
+        help="run with a wrong model, gap on it, run with the repaired model",
     )
     p.add_argument("experiment", nargs="?", default="ball_rolling")
     p.add_argument(
-        "--radius-error", default="0.005", metavar="M", help="of the ball (0.005 m)"
+        "--radius-error",
+        default="0.005",
+        metavar="M",
+        help="radius error of the ball's model (0.005 m)",
     )
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", nargs="+")
-    p.add_argument("--seed", default="0", metavar="N", help="of both runs (0)")
+    p.add_argument("--seed", default="0", metavar="N", help="seed of both runs (0)")
     p.add_argument("--duration", metavar="S", help="simulated seconds of each run")
-    p.add_argument("--jobs", metavar="N", help="processes of gap at once")
+    p.add_argument("--jobs", metavar="N", help="processes at once in gap")
     p.add_argument("--out", metavar="DIR", help="default: runs/close-the-loop-<time>")
     p.set_defaults(function=_close_the_loop)
 
     p = commands.add_parser(
-        "export-tests", help="a test of each system alone, from what it did in a run"
+        "export-tests",
+        help="write a test for each system, from its inputs and outputs in a run",
     )
     p.add_argument("experiment", metavar="EXPERIMENT")
-    p.add_argument("--systems", metavar="A,B", help="by name; default: all that update")
+    p.add_argument(
+        "--systems", metavar="A,B", help="names; default: all systems with updates"
+    )
     p.add_argument("--out", metavar="DIR", required=True, help="a new folder")
-    p.add_argument("--seconds", metavar="S", default="5", help="recorded (default 5)")
+    p.add_argument("--seconds", metavar="S", default="5", help="recorded seconds (5)")
     _config_options(p)
     p.set_defaults(function=_export_tests)
 
     p = commands.add_parser(
-        "compile", help="compiles beforehand what the first run would wait for"
+        "compile", help="compile now what the first run would compile"
     )
     p.add_argument("experiments", nargs="*", metavar="EXPERIMENT")
     p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
     p.set_defaults(function=_compile)
 
-    p = commands.add_parser("bench", help="how long the parts take, as table and JSON")
+    p = commands.add_parser("bench", help="measure compute times, as table and JSON")
     p.add_argument("names", nargs="*", metavar="NAME")
     p.set_defaults(function=_bench)
 
-    p = commands.add_parser("completion", help="what a shell completes, as its script")
+    p = commands.add_parser("completion", help="print the script for tab completion")
     p.add_argument("shell", metavar="SHELL", help="bash, zsh, fish or tcsh")
     p.set_defaults(function=_completion)
     for name in ("run", "gap", "export-tests"):
         commands.choices[name].add_argument(
             "--package", action="append", default=[], metavar="NAME=PATH",
-            help="where package://NAME is, for the scenes' models",
+            help="folder of package://NAME in model files",
         )  # fmt: skip
     for each in commands.choices.values():
         each.set_defaults(options=list(each._option_string_actions))

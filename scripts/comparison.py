@@ -1,4 +1,4 @@
-"""What `reproduce` makes: a paper's figures or goals beside ours, row by row."""
+"""Tables of `reproduce`: results of a paper, or goals, beside ours."""
 
 from collections.abc import Mapping, Sequence
 
@@ -8,7 +8,7 @@ from makebreak.scripts.trials import run_many, setting_texts
 
 
 class Rows:
-    """Rows of a table. Args: command: of a row that names none."""
+    """Collects the rows of a table. Args: command: default of the column `command`."""
 
     def __init__(self, command: str):
         self.command = command
@@ -23,23 +23,24 @@ class Rows:
         good: bool | None = None,
         command: str | None = None,
     ) -> None:
-        """Args: good: whether a stated target is met; None: there is none."""
+        """Adds a row. Args: good: whether its target is met; None without target."""
         self.rows.append(
             (what, paper, ours, self.command if command is None else command)
         )
         self.met.append(None if good is None else bool(good))
 
     def to_table(self, title: str, notes: Sequence[str] = (), theirs="paper") -> Table:
-        """Args: theirs: the head of what ours is compared with."""
+        """Args: theirs: heading of the column that ours is compared with."""
         columns = ("what", theirs, "ours", "command")
         return Table(title, columns, self.rows, self.met, notes)
 
 
 class Comparison(Rows):
-    """Trials of one experiment, and the rows that are made of them.
+    """Runs trials of one experiment, and collects rows made of their results.
 
-    Args: experiment: its name. session: whose folder the trials go to. jobs: how many
-        run at once. command: of a row that names none; None: a run of the experiment.
+    Args: experiment: its name; session: its folder takes the trials; jobs: number of
+        parallel processes; command: default of the column `command`, None for a run of
+        the experiment.
     """
 
     def __init__(
@@ -53,7 +54,7 @@ class Comparison(Rows):
         return self.runs_of({"": settings}, seeds)[""]
 
     def runs_of(self, variants: Mapping[str, Mapping], seeds: int) -> dict:
-        """{name: runs(settings, seeds)} of {name: settings}, side by side."""
+        """{name: runs(settings, seeds)} of {name: settings}, all in parallel."""
         trials = [(s, seed) for s in variants.values() for seed in range(seeds)]
         results = run_many(
             self.experiment, trials, self.jobs, self.session.out_dir,
@@ -65,6 +66,6 @@ class Comparison(Rows):
         }
 
     def with_settings(self, settings: Mapping) -> str:
-        """The command of a run with settings, as one types it."""
+        """The command line of a run with these settings."""
         words = " ".join(setting_texts(settings)).replace(", ", ",")
         return f"{self.command} --set {words}" if words else self.command

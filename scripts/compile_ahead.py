@@ -1,7 +1,8 @@
-"""A first run compiles with two cores: a second process begins with the last function.
+"""Lets the first run of an experiment compile on two cores.
 
-It makes the same diagram, and makes the first calls (systems/numerics/first_calls.py)
-backwards. What one of the two has compiled the other reads from Numba's files.
+A second process builds the same diagram and makes the first calls
+(systems/numerics/first_calls.py) in reverse order. Each of the two processes reads from
+Numba's cache what the other has compiled.
 
     python -m makebreak.scripts.compile_ahead EXPERIMENT CONFIG
 """
@@ -21,7 +22,7 @@ from makebreak.scripts.trials import run_environment
 
 
 def start(experiment: str, config_file: Path) -> None:
-    """Starts the second process, which ends with this one; with one core, does not."""
+    """Starts the second process, which ends with this one, if there are two cores."""
     if joblib.cpu_count() > 1:
         subprocess.Popen(
             [sys.executable, "-m", __spec__.name, experiment, str(config_file)],
@@ -33,11 +34,11 @@ def start(experiment: str, config_file: Path) -> None:
 
 
 class _Compiled(Exception):
-    """There is nothing more to do."""
+    """Raised when all first calls have been made."""
 
 
 class _Backwards(Session):
-    """Makes the first calls of the first diagram, and does not simulate it."""
+    """A session that makes the first calls of its first diagram, without simulating."""
 
     def simulate(self, *_, **__):
         for call in reversed(self.first_calls):

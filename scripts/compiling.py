@@ -1,4 +1,4 @@
-"""Tells what Numba compiles; its first time takes a minute or two."""
+"""Shows what Numba compiles, which takes a minute or two the first time."""
 
 import sys
 from collections.abc import Callable
@@ -9,13 +9,12 @@ FIRST = "Compiling, the first time only: a minute or two of one core"
 
 
 class CompilingShown:
-    """While entered, each function of makebreak that is compiled is told, the first one
-    with a line before it. What is read from an earlier run's files is not compiled.
+    """Context that reports each function of makebreak that Numba compiles (and does not
+    read from its cache).
 
     Args:
-        show: called with "compiling lcp.solve" and the like, and with "" when that is
-            done.
-        first: called before the first one is compiled.
+        show: called with e.g. "compiling lcp.solve", and with "" after it.
+        first: called before the first one.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""What a shell completes after `makebreak`."""
+"""Shell completion for `makebreak`."""
 
 import argparse
 from collections.abc import Iterable
@@ -11,10 +11,10 @@ FILES, FOLDERS = ("FILE", "SCENE", "RECORDING", "LOG", "ROBOT"), ("DIR",)
 def completion(
     parser: argparse.ArgumentParser, shell: str, experiments: Iterable[str]
 ) -> str:
-    """A script for the shell: commands, options, experiments, files where one belongs.
+    """A script for a shell that completes commands, options, experiments and files.
 
     Args:
-        parser: of the command line; it is changed, and no longer of use.
+        parser: of the command line; it is changed and must not be used afterwards.
         shell: "bash", "zsh", "fish" or "tcsh".
         experiments: their names.
     Raises: ValueError for another shell.
@@ -35,7 +35,7 @@ def completion(
             elif action.dest == "shell":
                 action.choices = list(shtab.SUPPORTED_SHELLS)
             elif action.dest == "names":
-                continue  # Of `bench`.
+                continue  # The positional argument of `bench`.
             elif action.metavar in FOLDERS:
                 action.complete = shtab.DIRECTORY  # type: ignore[attr-defined]
             elif action.metavar in FILES or not action.option_strings:

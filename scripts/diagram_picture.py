@@ -1,7 +1,6 @@
-"""Draws a Drake diagram: the station and the systems beside it, not their insides.
+"""Draws the top level of a Drake diagram, without Graphviz, which pip cannot install.
 
-Columns follow the data from the station on; what goes back to an earlier column runs
-below. Graphviz would need a program that pip cannot install.
+Columns follow the data flow, starting at the station; feedback edges run below.
 """
 
 import math
@@ -12,14 +11,14 @@ from matplotlib.patches import FancyBboxPatch
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Diagram, System
 
-WIDTH, HEIGHT, GAP_X, GAP_Y = 2.2, 0.62, 1.5, 0.6  # Of a box, and between boxes.
-LETTER, LINE = 0.085, 0.18  # Of a label.
+WIDTH, HEIGHT, GAP_X, GAP_Y = 2.2, 0.62, 1.5, 0.6  # Size of boxes and gaps.
+LETTER, LINE = 0.085, 0.18  # Width of a letter and height of a line of a label.
 FORMATS = (".svg", ".png", ".pdf")
 COLORS = ("#4c72b0", "#dd8452", "#55a868", "#c44e52", "#8172b3", "#937860", "#da8bc3")
 
 
 def shown_systems(diagram: Diagram) -> list[System]:
-    """What gives something: diagrams in `diagram`, plants, systems of this project."""
+    """The systems that are drawn: subdiagrams, plants and systems of this project."""
     return [
         system
         for system in diagram.GetSystems()
@@ -32,10 +31,10 @@ def shown_systems(diagram: Diagram) -> list[System]:
 
 
 def shown_edges(diagram: Diagram) -> dict[tuple[str, str], list[str]]:
-    """{(from, to): names of the ports that are passed on} among the systems shown.
+    """{(from, to): names of the output ports connected} among the systems shown.
 
-    What passes through a system that is not shown (a gain, an adder) counts as passed
-    on by the one before it.
+    A connection through a system that is not shown (a gain, an adder) counts as one
+    from the system before it.
     """
     shown = [system.get_name() for system in shown_systems(diagram)]
     into: dict[str, list[tuple[str, str]]] = {}
@@ -70,10 +69,10 @@ def _wires(diagram: Diagram):
 
 
 def columns(names: list[str], edges) -> dict[str, int]:
-    """Column of each system: one more than the farthest of those it listens to.
+    """Column of each system: one more than the greatest of its inputs' columns.
 
-    Loops are cut: a depth-first walk in the order of `names` skips the edges that lead
-    back to a system which is still being walked through.
+    Loops are cut by a depth-first search in the order of `names`, which skips edges
+    back to a system on its present path.
     """
     after: dict[str, list[str]] = {name: [] for name in names}
     for source, target in edges:
@@ -124,7 +123,7 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
     for pair, chain in sorted(chains.items()):
         color = COLORS[names.index(pair[0]) % len(COLORS)]
         points = [(x[chain[0]] + WIDTH / 2, y[chain[0]] + _spread(chain, chains, y, 0))]
-        for one in chain[1:-1]:  # Straight across the column, so that no box is cut.
+        for one in chain[1:-1]:  # Horizontal within a column, clear of its boxes.
             points += [(x[one] - WIDTH / 2, y[one]), (x[one] + WIDTH / 2, y[one])]
         end = (x[chain[-1]] - WIDTH / 2, y[chain[-1]] + _spread(chain, chains, y, 1))
         _arrow(ax, [*points, end], color)
@@ -153,7 +152,7 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
     ax.set_aspect("equal")
     is_text = path.suffix == ".svg"
     try:
-        with plt.rc_context({"svg.fonttype": "none"}):  # Text can be searched for.
+        with plt.rc_context({"svg.fonttype": "none"}):  # Keeps text searchable.
             figure.savefig(path, metadata={"Date": None} if is_text else None)
     except OSError as error:
         raise ValueError(
@@ -164,7 +163,7 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
 
 
 def _chains(edges, column) -> dict[tuple[str, str], list]:
-    """Each forward edge as the boxes and free slots that it passes, a column each."""
+    """{edge: its boxes and free slots, one in each column} of the forward edges."""
     return {
         (a, b): [a, *((a, b, c) for c in range(column[a] + 1, column[b])), b]
         for a, b in edges
@@ -212,7 +211,7 @@ def _places(names, chains, column):
 
 
 def _spread(chain, chains, y, end) -> float:
-    """Where on its side of the box an edge leaves or arrives: in order of height."""
+    """Offset of an edge's end on its side of the box, in the order of height."""
     box, step = (chain[-1], -2) if end else (chain[0], 1)
     others = sorted(
         (c[step] for c in chains.values() if c[-1 if end else 0] == box),
@@ -233,10 +232,10 @@ def _arrow(ax, points, color) -> None:
 
 
 def _label(ax, route, ports, color, taken) -> None:
-    """Names the ports where the route has most room, rather early than late.
+    """Labels a route with its ports, at the first spot with the most room.
 
-    `taken` are the rectangles (x, y, width, height) that have something in them; this
-    one is added."""
+    `taken` are occupied rectangles (x, y, width, height), to which the label is added.
+    """
     lines = [port.removeprefix("panda.") for port in ports]
     w, h = LETTER * max(map(len, lines)) + 0.1, LINE * len(lines)
     spots = _along(route, 0.1)

@@ -1,7 +1,7 @@
-"""Writes tests of single systems, from what they saw and said in a run.
+"""`makebreak export-tests`: regression tests of single systems, recorded from a run.
 
-One file per system: it builds that system alone, replays its inputs at its own rate
-and offset, and compares its outputs. Neither the plant nor a camera is needed there.
+There is one file for each system. It builds that system alone, replays its recorded
+inputs at its own period and offset, and compares its outputs, without plant or camera.
 """
 
 import dataclasses
@@ -35,29 +35,30 @@ from makebreak.scripts.session import Log, Session, leaf_systems
 from makebreak.systems.arm.impedance_controller import serial_chain_of
 from makebreak.systems.numerics.timing import observed
 
-# What makes a plant, or constants of one, that a system is built with: such an argument
-# is written as the call that made it.
+# Functions that make a plant, or constants of one, from which systems are built. Such
+# an argument is written into the test as the call that made it.
 MAKERS: tuple[Callable, ...] = (make_control_plant, make_tip_and_ball, serial_chain_of)
-INLINE = 12  # Longer arrays go to the data file.
+INLINE = 12  # Number of entries above which an array goes to the data file.
 
 
 @dataclasses.dataclass(frozen=True)
 class Call:
-    """A call that made something."""
+    """A call and its result."""
 
     function: Callable
     args: tuple
     kwargs: dict
-    result: Any  # Kept, so that no other object gets its id.
+    result: Any  # Kept alive, so that its id stays unique.
 
 
 class _Done(Exception):
-    """All that was asked for has been recorded."""
+    """Raised when all systems that were asked for have been recorded."""
 
 
 @contextmanager
 def calls_kept() -> Iterator[dict[int, Call]]:
-    """While entered, notes how each system and plant is made: {id(object): Call}."""
+    """Context in which the calls that make systems and plants are kept, as
+    {id(object): Call}."""
     made: dict[int, Call] = {}
     undo: list[tuple[Any, str, Any]] = []
 
@@ -68,7 +69,7 @@ def calls_kept() -> Iterator[dict[int, Call]]:
     def keeping(cls, init):
         @wraps(init)
         def wrapper(self, *args, **kwargs):
-            # Before the constructor: what it is given may not be changed by it.
+            # Noted before the constructor runs, as it may change its arguments.
             made.setdefault(id(self), Call(cls, args, kwargs, self))
             init(self, *args, **kwargs)
 
@@ -113,7 +114,7 @@ def _modules(package: ModuleType) -> list[ModuleType]:
 
 
 class _Source:
-    """Python source of values: the code, its imports, the arrays beside it."""
+    """Python source for values: code, its imports, and arrays for the data file."""
 
     def __init__(self, made: dict[int, Call], folder: Path, place: Path):
         self.imports: set[tuple[str, str]] = set()
@@ -130,7 +131,7 @@ class _Source:
         return thing.__qualname__
 
     def of(self, value) -> str:
-        """The code of one value. Raises: Unsupported."""
+        """The source of one value. Raises: Unsupported."""
         if id(value) in self._made and not isinstance(value, str | int | float):
             call = self._made[id(value)]
             code = self.of_call(call)
@@ -176,7 +177,7 @@ class _Source:
         raise Unsupported(f"it is built with a {type(value).__name__}")
 
     def _scene(self, scene: Scene) -> str:
-        """A scene becomes a file beside the tests, with copies of its models."""
+        """Writes a scene, with copies of its models, into a file beside the tests."""
         models = self._folder / "models"
         models.mkdir(exist_ok=True)
         scene = dataclasses.replace(scene, directives=deepcopy(scene.directives))
@@ -206,12 +207,12 @@ def _is_default(f: dataclasses.Field, value) -> bool:
         return False
     try:
         return type(value) is type(default) and bool(value == default)
-    except ValueError:  # Arrays.
+    except ValueError:  # An array has no single truth value.
         return False
 
 
 class _Recorder:
-    """What the systems of one diagram saw and said at each update."""
+    """Records inputs and outputs of the systems of one diagram at each update."""
 
     def __init__(
         self, diagram: Diagram, wanted: Sequence[str], seconds: float, initial: Context
@@ -240,7 +241,7 @@ class _Recorder:
         self.time[name].append(now)
 
     def _start(self, name, system, context) -> None:
-        """The first inputs are those of an initialization: before any update."""
+        """Records the inputs of the initialization, before the first update."""
         self.time[name] = []
         self.tracks[name] = {"in": {}, "out": {}}
         for i in range(system.num_input_ports()):
@@ -261,7 +262,7 @@ class _Recorder:
 
 
 class _RecordingSession(Session):
-    """A session whose simulations are recorded, until all is there."""
+    """A session that records its simulations until all wanted systems are recorded."""
 
     def __init__(self, out_dir: Path, wanted: Sequence[str], seconds: float):
         super().__init__(out_dir)
@@ -275,8 +276,8 @@ class _RecordingSession(Session):
         initial = kwargs["context"].Clone()
         recorder = _Recorder(diagram, self._wanted, self._seconds, initial)
         self.recorders.append(recorder)
-        # One without a label is the only one of its run; of several, a later one may
-        # have systems that no earlier one has, and may need the earlier one's end.
+        # A simulation without a label is the only one of its run. Of several ones, the
+        # later may have other systems and may depend on the end of the earlier.
         only = not kwargs.get("label")
         if self._wanted or only:
             duration_sec = min(duration_sec, self._seconds)
@@ -303,16 +304,16 @@ def export_tests(
 
     Args:
         name, module, config: of the experiment.
-        out: folder to be made; if it exists, it is empty or of an earlier export.
-        wanted: names of systems in the experiment's diagram, which is then run no
-            longer than needed; empty: all that update, and an experiment of several
-            simulations is run to its end.
-        seconds: how long is recorded [s].
+        out: folder, which must not exist, be empty, or hold an earlier export.
+        wanted: names of systems in the experiment's diagram, which then runs no longer
+            than needed; empty: all systems with updates, where an experiment with
+            several simulations runs to its end.
+        seconds: simulated time that is recorded [s].
         inputs: files that `out` must not hold.
     Returns: {system: number of updates}, and {system: why it was left out}.
-    Raises: ValueError for a folder that is in use, an unknown system, a system that
-        cannot be exported and was asked for, an experiment that fails, and where the
-        files cannot be written. Then the folder is as it was.
+    Raises: ValueError for a folder in use, an unknown system, a wanted system that
+        cannot be exported, an experiment that fails, or files that cannot be written.
+        Then the folder is unchanged.
     """
     with OutputFolder(out, f"export-tests {name}", inputs, only_new=True) as outputs:
         folder = outputs.stage
@@ -328,8 +329,7 @@ def export_tests(
 
 
 def _export(name, module, config, folder: Path, place: Path, wanted, seconds):
-    """Records a run and writes the tests into the folder, from where they are moved to
-    their place."""
+    """Records a run and writes its tests into `folder`, to be moved to `place`."""
     with calls_kept() as made, TemporaryDirectory() as elsewhere:
         session = _RecordingSession(Path(elsewhere) / "run", wanted, seconds)
         try:

@@ -1,9 +1,9 @@
-"""What is said when something fails: one line, and where the traceback is.
+"""Error messages and exit statuses: one line, and the place of the traceback.
 
-2: makebreak refused an input by a check of its own, or anything failed (in Drake, in
-numpy, in makebreak) before something was computed: then the input does not fit.
-3: anything else: a fault of makebreak itself, or of what it is built on.
-MAKEBREAK_DEBUG=1 prints the traceback as well.
+2: an input was refused by a check of makebreak's, or anything failed (in Drake, numpy
+or makebreak) before any computation, so that the input must be at fault.
+3: any other failure, of makebreak itself or of a library.
+MAKEBREAK_DEBUG=1 prints the traceback, too.
 """
 
 import linecache
@@ -18,13 +18,13 @@ from types import TracebackType
 _PACKAGE = Path(__file__).resolve().parent.parent
 _LIBRARIES = [Path(each).resolve() for each in set(sysconfig.get_paths().values())]
 _ROOMS = ("models", "systems", "diagrams", "gap", "scripts")
-# Where an error of a worker process is raised again.
+# Modules in which errors of worker processes are raised again.
 _PASSES_ON = ("concurrent/futures", "multiprocessing")
 
 
 def on_purpose(error: BaseException) -> bool:
-    """Whether it is a ValueError that makebreak's code, or a user's experiment, raised
-    by `raise`: a refusal, and no slip of a computation in a library."""
+    """Whether it is a ValueError that a `raise` in makebreak or in a user's experiment
+    raised, which refuses an input, and not one from within a library."""
     if not isinstance(error, ValueError) or error.__traceback__ is None:
         return False
     last: TracebackType = error.__traceback__
@@ -41,12 +41,12 @@ def on_purpose(error: BaseException) -> bool:
 
 
 def is_drakes(error: BaseException) -> bool:
-    """Whether an assertion failed in Drake, of which pydrake makes SystemExit."""
+    """Whether an assertion failed in Drake, which pydrake turns into SystemExit."""
     return isinstance(error, SystemExit) and isinstance(error.code, str)
 
 
 def refused(error: BaseException) -> int:
-    """Says why an input is not used. Returns: the exit status."""
+    """Prints why an input is refused. Returns: the exit status."""
     said = _one_line(error)
     if on_purpose(error):
         print(f"makebreak: {said}", file=sys.stderr)
@@ -60,7 +60,7 @@ def refused(error: BaseException) -> int:
 
 
 def fault(error: BaseException, kept: Path | None = None) -> int:
-    """Says that makebreak failed, and where the traceback is: in `kept`, if given.
+    """Prints that makebreak failed, and the traceback's place: `kept`, if given.
 
     Returns: the exit status.
     """
@@ -84,7 +84,7 @@ def _one_line(error: BaseException) -> str:
 
 
 def _kept(error: BaseException) -> str:
-    """A file with the traceback."""
+    """Path of a new file with the traceback."""
     text = "".join(traceback.format_exception(error))
     try:
         handle, name = tempfile.mkstemp(prefix="makebreak-error-", suffix=".txt")

@@ -1,9 +1,9 @@
 """`makebreak reproduce gap`: the workflow on recordings with hidden effects, scored.
 
-The recordings are made by tests/gap_benchmark, in other simulators than Drake, and are
-there in a checkout only. Each case is a `makebreak gap` in a process of its own, which
-gets the scene and the recording; what was hidden stays in this process. Results are on
-disk as the cases end, and `--reuse` goes on where a run was stopped.
+The recordings are made by tests/gap_benchmark, in other simulators than Drake, which is
+in a checkout only. Each case is a `makebreak gap` in a process of its own, which gets
+the scene and the recording but not the hidden effects. Results are written as the cases
+end, so that `--reuse` continues a run that was stopped.
 """
 
 import json
@@ -32,12 +32,12 @@ from makebreak.scripts.table import Table, json_value
 from makebreak.scripts.trials import makebreak_command, run_commands
 
 _TESTS = Path(makebreak.__file__).resolve().parent.parent / "tests/gap_benchmark"
-CASE_LIMIT_SEC = 1200.0  # Then a case is stopped, and counts as failed.
+CASE_LIMIT_SEC = 1200.0  # A case that takes longer is stopped and counts as failed.
 
 
 @dataclass(frozen=True)
 class BenchmarkSet:
-    """Which cases, who makes them, and what is wanted of them."""
+    """A set of cases: the script that makes them, and the goals."""
 
     maker: Path
     goals: Goals
@@ -61,7 +61,7 @@ SETS = {
 
 
 def check(which: str = "standard") -> None:
-    """Raises: ValueError where the benchmark cannot be run."""
+    """Raises: ValueError if the benchmark cannot be run here."""
     if which not in SETS:
         raise ValueError(f'--set: got "{which}", expected one of {", ".join(SETS)}')
     if not SETS[which].maker.is_file():
@@ -80,8 +80,8 @@ def reproduce(
     session: Session, seeds: int, jobs: int, which: str = "standard", only: str = "",
     seed: int | None = None,
 ) -> Table:  # fmt: skip
-    """A set, scored, as many cases as it has: `seeds` is not used. seed: of its first
-    case, where it is not its own."""
+    """The scores of one set of cases. Args: seeds: not used, as a set has its own
+    number of cases; seed: of the first case, None for the set's own."""
     return run_benchmark(session.out_dir, jobs, which, only, session.reuse, seed)
 
 

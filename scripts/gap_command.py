@@ -1,4 +1,4 @@
-"""`makebreak gap`: reads, runs the workflow with a progress bar, writes the report."""
+"""`makebreak gap`: runs the workflow with a progress bar and writes the report."""
 
 import json
 import sys
@@ -7,16 +7,23 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from time import perf_counter
 
 from tqdm import tqdm
 
 from makebreak.gap.data.recording import has_sidecar, read_recordings, sidecar_of
 from makebreak.gap.report.comparison import comparison_html
-from makebreak.gap.report.files import summary_lines, windows_of, write_report
+from makebreak.gap.report.files import (
+    next_best,
+    summary_lines,
+    windows_of,
+    write_report,
+)
 from makebreak.gap.result import GapResult
 from makebreak.models.effects.kind import with_deviation
 from makebreak.models.scene import Scene, read_scene
+from makebreak.models.typed_yaml import read_yaml
 from makebreak.scripts.interrupts import undisturbed
 from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.table import Table
@@ -25,13 +32,14 @@ EXPORTS = ("urdf", "mjcf")
 
 
 class StageBar:
-    """A progress bar that is told, in a line of text, what is being done. Each line is
-    taken to be a tenth of what is left, an indented one a fiftieth, unless `share` says
-    how much is done, 0 to 1: nobody knows how many effects there are to be found. To be
-    used in a `with`."""
+    """A progress bar with a line of text for the present stage, for a `with`.
+
+    As the number of effects to be found is not known, each call advances it by a tenth
+    of the remainder (a fiftieth for indented text), unless `share`, 0 to 1, is given.
+    """
 
     def __init__(self, shown: bool = True):
-        self.told = False  # Whether anything was.
+        self.started = False  # Whether any stage was reported.
         tty = sys.stderr.isatty()
         self._bar = tqdm(
             total=1.0,
@@ -44,7 +52,7 @@ class StageBar:
         )
 
     def __call__(self, text: str, share: float | None = None) -> None:
-        self.told = True
+        self.started = True
         if share is None:
             step = 0.02 if text.startswith(" ") else 0.1
             share = self._bar.n + step * (1.0 - self._bar.n)
@@ -70,25 +78,27 @@ def run_and_report(
     is_robot: bool = False,
     skip_bad_rows: bool = False,
 ) -> tuple[GapResult, list[Path], list[str]]:
-    """The workflow's result, the files that tell of it, and what is to be said beside.
+    """The workflow's result, the files written, and notes for the user.
 
-    Args: export: of EXPORTS; the repaired model is written so as well. is_robot:
-        scene_path is a robot's own file; a scene is proposed for it, and a sidecar for
-        each recording that has none, and both are among the files.
+    Args: export: formats of EXPORTS in which the repaired model is written too;
+        is_robot: whether scene_path is a robot's own URDF or MJCF. Then a scene is
+        proposed for it, with a sidecar for each recording that has none, and both are
+        written too.
     Raises: ValueError for a scene, a recording or a folder that cannot be used.
     """
-    from makebreak.gap.workflow import run_gap  # Late: it is long to load.
+    from makebreak.gap.workflow import run_gap  # Here, as it takes long to import.
 
     start = perf_counter()
+    given = scene_path
     inputs = [scene_path, *recording_paths]
-    notes: list[str] = []
-    sidecars: dict[Path, Path] = {}
+    sidecars = {} if is_robot else sidecars_beside(scene_path, recording_paths)
+    notes = [f"{log.name}: columns as in {own}" for log, own in sidecars.items()]
     with OutputFolder(out_dir, "gap", inputs) as out:
         if is_robot:
             scene_path, sidecars, notes = _proposed(
                 scene_path, recording_paths, out, out_dir
             )
-        if export:  # Refused before anything is computed.
+        if export:  # Raises before anything is computed.
             exported(read_scene(scene_path), export)
         try:
             with StageBar() as progress:
@@ -100,18 +110,16 @@ def run_and_report(
                 recordings = read_recordings(recording_paths, skip_bad_rows, sidecars)
                 moving = comparison_html(result, scene, recordings)
                 folder = out.stage
-                write_report(
-                    result, scene, folder, recordings, scene_path, moving, out_dir
-                )
+                write_report(result, scene, folder, recordings, given, moving, out_dir)
                 effects = [*scene.effects, *result.scene_effects()]
                 repaired = replace(scene, effects=effects)
                 for name, text in exported(repaired, export).items():
                     out.file(name).write_text(text)
-        except (Exception, SystemExit) as error:  # Of Drake.
+        except (Exception, SystemExit) as error:  # Drake raises SystemExit, too.
             if isinstance(error.__cause__ or error, OSError) and any(out.written()):
                 kept = ", ".join(path.name for path in out.commit(complete=False))
                 raise ValueError(f"{error}; kept: {kept}") from error
-            if progress.told:  # Not merely an input that was refused.
+            if progress.started:  # Otherwise the input was refused: no report.
                 with suppress(OSError):
                     out.file("error.txt").write_text(traceback.format_exc())
                 out.commit(complete=False)
@@ -122,10 +130,30 @@ def run_and_report(
             return result, out.commit(), notes
 
 
+def sidecars_beside(
+    scene_path: Path, recording_paths: Sequence[Path]
+) -> dict[Path, Path]:
+    """{recording: sidecar in the scene's folder} for recordings without a sidecar of
+    their own: a proposal writes scene and sidecars into one folder."""
+    found = {}
+    for path in recording_paths:
+        near = scene_path.parent / sidecar_of(path).name
+        if has_sidecar(path) or not near.is_file() or near.samefile(scene_path):
+            continue
+        with suppress(ValueError):
+            content = read_yaml(near)
+            if isinstance(content, dict) and "columns" in content:
+                found[path] = near
+    return found
+
+
 def _proposed(
     robot_path: Path, recording_paths: Sequence[Path], out: OutputFolder, out_dir: Path
 ) -> tuple[Path, dict[Path, Path], list[str]]:
-    """A scene and sidecars for a robot and its logs, written to be corrected."""
+    """Writes a proposed scene and sidecars for a robot and its logs.
+
+    Returns: the scene's path, {recording: sidecar}, notes for the user.
+    """
     from makebreak.gap.data.robot import propose_scene, read_log, read_robot
 
     robot = read_robot(robot_path)
@@ -137,23 +165,22 @@ def _proposed(
         if not has_sidecar(path):
             sidecars[path] = out.file(sidecar_of(path).name)
             sidecars[path].write_text(text)
-    notes = ["Proposed, to be corrected: " + "; ".join(proposal.notes) + "."]
-    names = [f"{sidecar_of(path).name} beside {path.name}" for path in sidecars]
-    where = f"Correct {out_dir / scene.name}"
-    where += f", put {', '.join(names)}" if names else ""
-    again = " ".join(str(path) for path in recording_paths)
+    notes = ["A proposal, to be checked: " + "; ".join(proposal.notes) + "."]
+    names = [str(out_dir / file.name) for file in (scene, *sidecars.values())]
+    again = " ".join(quote(str(path)) for path in recording_paths)
     notes.append(
-        f"{where}, and run again: makebreak gap {out_dir / scene.name} {again}"
+        f"Correct {' and '.join(names)} where they are wrong. Then run: "
+        f"makebreak gap {quote(names[0])} {again}"
     )
     return scene, sidecars, notes
 
 
 def exported(scene: Scene, formats: Sequence[str]) -> dict[str, str]:
-    """{file name: text} of a scene's model in other formats: `repaired.xml` (MJCF), and
-    `<model>.urdf` of each model that comes from a URDF. What a format cannot say is in
-    a comment at its end.
+    """{file name: text} of a scene's models in other formats: `repaired.xml` (MJCF),
+    and `<model>.urdf` for each model that comes from a URDF. Effects that a format
+    cannot express are listed in a comment at its end.
 
-    Raises: ValueError for an unknown format, and for a scene that it cannot say.
+    Raises: ValueError for an unknown format, or a scene that it cannot express.
     """
     from makebreak.models.model_export import to_mjcf, to_urdf, urdf_models
 
@@ -172,29 +199,26 @@ def exported(scene: Scene, formats: Sequence[str]) -> dict[str, str]:
         found |= {f"{model}.urdf": to_urdf(scene, model) for model in models}
     texts = {}
     for name, one in found.items():
-        lost = "".join(f"<!-- Not in this file: {said} -->\n" for said in one.unsaid)
+        lost = "".join(
+            f"<!-- Not in this file: {effect} -->\n" for effect in one.omitted
+        )
         texts[name] = one.text + lost
     return texts
 
 
 def effects_table(result: GapResult) -> Table:
-    """The end of a run: what was found, and what it does to the held-out error."""
-    columns = ("effect", "at", "parameters", "error before", "after", "next best")
+    """The table at the end of a run: the effects found and the held-out error."""
     rows: list[tuple] = []
     for each in result.effects:
         values = ", ".join(
             f"{name} {with_deviation(p.value, p.std, p.or_more)} {p.unit}".rstrip()
             for name, p in each.parameters.items()
         )
-        e = each.evidence
-        rows.append(
-            (each.kind, list(each.at), values, e.held_out_before, e.held_out_after,
-             e.runner_up or "-")
-        )  # fmt: skip
+        rows.append((each.kind, list(each.at), values, next_best(each.evidence) or "-"))
     g = result.gap
-    rows.append(("the whole model", "", "", g.before, g.after, ""))
     note = (
-        f"error: rms over held-out {windows_of(result)}, in units of noise, which is "
+        f"held-out error: {g.before:.3g} before, {g.after:.3g} after, in units of the "
+        f"noise (rms over {windows_of(result)}; a perfect model leaves 1)"
     )
-    note += "what a perfect model would leave"
+    columns = ("effect", "at", "parameters", "next best")
     return Table("\n".join(summary_lines(result)), columns, rows, notes=[note])

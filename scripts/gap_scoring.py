@@ -1,4 +1,4 @@
-"""Scores a result of `makebreak gap` against what was hidden."""
+"""Scores results of `makebreak gap` against the hidden effects."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,13 +12,13 @@ VERDICTS = ("no_gap", "not_judged", "gap_named", "ambiguous", "gap_unnamed")
 
 @dataclass(frozen=True)
 class Goals:
-    """Of the project; shares, and the median relative error of a parameter."""
+    """The project's goals for a set of cases."""
 
-    verdict: float = 0.9
-    first: float = 0.85
-    error: float = 0.1
-    closed: float = 0.85
-    covered: float | None = None
+    verdict: float = 0.9  # Fraction of right verdicts.
+    first: float = 0.85  # Fraction of cases with a hidden effect named first.
+    error: float = 0.1  # Median relative error of the parameters.
+    closed: float = 0.85  # Mean fraction of the reducible gap that is closed.
+    covered: float | None = None  # Fraction of intervals that hold the true value.
 
 
 STANDARD = Goals()
@@ -27,36 +27,34 @@ LOGS = Goals(verdict=0.92, first=0.9, error=0.05, covered=0.85)
 
 _DRIVES = ("actuator_", "input_delay")
 _ONE_CHANNEL = ("sensor_bias", "sensor_delay", "sensor_lag")
-# Simulated windows with a smaller error do not show the gap [times the noise]: what is
-# closed of it there is chance.
+# Error of simulated windows, over the noise, below which the gap does not show in them.
 _SHOWN = 1.5
-_INTERVAL = 2.0  # Standard deviations, either way.
+_INTERVAL = 2.0  # Half width of an interval [standard deviations].
 
 
 @dataclass(frozen=True)
 class Score:
-    """How one case went. None: not asked of this case.
+    """The score of one case; None where a question does not apply to it.
 
-    verdict: what is right, several where the data leave it open.
-    first: whether the first effect is a hidden one, or one that by the benchmark's own
-        computation cannot be told from it; first_or_tied: or says that it cannot be
-        told from one.
+    first: whether the first effect is a hidden one, or one that the benchmark's own
+        computation cannot distinguish from it; first_or_tied: the same, or whether the
+        result says that it is indistinguishable from one of them.
     errors: relative errors of the parameters of the hidden effects that were named;
-        inside: for each parameter, whether it lies in its interval.
-    before: what simulated windows show of the gap, in units of the noise.
-    named, needed: how many of the hidden effects that show were named, of how many.
+        inside: for each parameter, whether its interval holds the true value.
+    before: error of simulated windows before the repair, over the noise.
+    named, needed: number of hidden effects that were named, and that show in the data.
     """
 
     name: str
-    verdict: str
-    found: str  # What was said; "failed" if nothing was.
+    verdict: str  # The right one; several, joined by " or ", if the data allow them.
+    found: str  # The verdict of the result; "failed" without one.
     first: bool | None
     first_or_tied: bool | None
     errors: tuple[float, ...]
-    closed: float | None  # Share of the reducible gap, on held-out data.
-    extra: int  # Effects that are not hidden.
+    closed: float | None  # Fraction of the reducible gap closed, on held-out data.
+    extra: int  # Number of effects that are not hidden.
     seconds: float
-    says: str
+    says: str  # The effects that were named, or the error.
     inside: tuple[bool, ...] = ()
     named: int = 0
     needed: int = 0
@@ -64,6 +62,7 @@ class Score:
 
     @property
     def right(self) -> bool:
+        """Whether the verdict is right."""
         return self.found in self.verdict.split(" or ")
 
 
@@ -73,13 +72,14 @@ def score(
     driven: Sequence[str] = (),
     seconds: float = float("nan"),
 ) -> Score:
-    """How well a result tells what was hidden.
+    """Scores the result of one case.
 
-    Args: truth, of the benchmark: effects, each perhaps with `equivalents` (what the
-        recording cannot tell from it, with their own parameters), `needed` (whether it
-        shows) and `loose` (parameters that the recording does not tell), `verdict` or
-        `verdicts`, `ties` of kinds; result, a result.json, or one with `error` in it;
-        driven, the joints that the scene drives.
+    Args: truth: of the benchmark: `effects`, each perhaps with `equivalents` (effects,
+        with parameters, that the recording cannot distinguish from it), `needed`
+        (whether it shows in the data) and `loose` (parameters that are not
+        identifiable); `verdict` or `verdicts`; `ties`, sets of kinds that count as one;
+        result: a result.json, or a dictionary with an `error`; driven: the joints that
+        the scene drives.
     """
     verdicts = truth.get("verdicts") or [truth["verdict"]]
     hidden = [] if verdicts == ["gap_unnamed"] else truth["effects"]
@@ -104,12 +104,12 @@ def score(
         every = ((i, _match(each, h, driven)) for i, h in enumerate(hidden))
         match = [(i, p) for i, p in every if p is not None]
         if match:
-            # Of two it may be, one that nothing else was taken for.
+            # Of several matches, prefer one that no other effect has been matched to.
             i, parameters = min(match, key=lambda m: m[0] not in left)
             left = [k for k in left if k != i]
-            # What the recording does not tell cannot be wrong; its interval can.
-            told = {k: v for k, v in parameters.items() if k not in loose[i]}
-            errors += parameter_errors(each["parameters"], told)
+            # A parameter that is not identifiable has no error, but an interval.
+            known = {k: v for k, v in parameters.items() if k not in loose[i]}
+            errors += parameter_errors(each["parameters"], known)
             inside += parameters_inside(each["parameters"], parameters)
         elif not _in_tie(each["kind"], truth):
             extra += 1
@@ -139,12 +139,12 @@ def score(
     )
 
 
-# Kinds of which one value for several joints says the same of each.
+# Kinds whose value for several joints is that of each of them.
 _EACH = ("joint_", "rotor_inertia", "actuator_gain", "actuator_bias")
 
 
 def _members(effects: Sequence[Mapping], driven: Sequence[str]) -> list[Mapping]:
-    """An effect on several joints as one on each."""
+    """The effects, with one on several joints as one on each of them."""
     out: list[Mapping] = []
     for each in effects:
         at = [each["at"]] if isinstance(each["at"], str) else list(each["at"])
@@ -156,8 +156,7 @@ def _members(effects: Sequence[Mapping], driven: Sequence[str]) -> list[Mapping]
 
 
 def _match(found: Mapping, hidden: Mapping, driven: Sequence[str]) -> Mapping | None:
-    """The parameters that `found` should have if it is what is hidden, or cannot be
-    told from it."""
+    """The true parameters of `found` if it is the hidden effect or an equivalent."""
     for each in (hidden, *hidden.get("equivalents", ())):
         if same_effect(found, each, driven):
             return each["parameters"]
@@ -172,8 +171,8 @@ def same_effect(one: Mapping, two: Mapping, driven: Sequence[str] = ()) -> bool:
 
 
 def same_place(one, two, kind: str, driven: Sequence[str] = ()) -> bool:
-    """Whether two `at` mean the same: a model is all of its joints or its one body, a
-    pair has no order."""
+    """Whether two `at` name the same place: a model stands for all of its joints or for
+    its only body, and a pair has no order."""
     a, b = _places(one, kind, driven), _places(two, kind, driven)
     if a == b:
         return True
@@ -201,7 +200,7 @@ def _places(at, kind: str, driven: Sequence[str]) -> set[str]:
 
 
 def _body(name: str) -> str:
-    """A model that is one body, by the body's name."""
+    """The full name of a body; that of a model with one body is `model.model`."""
     return name if "." in name or name == "world" else f"{name}.{name}"
 
 
@@ -210,11 +209,11 @@ def _in_tie(kind: str, truth: Mapping) -> bool:
 
 
 def parameter_errors(found: Mapping, hidden: Mapping) -> list[float]:
-    """Relative errors; parts of one vector are taken together, a phase relative to
-    half a turn, an angle at which a spring rests to one radian, a patch's sides to the
-    patch. What is truly zero and alone is left out.
+    """Relative errors of parameters. Components of a vector give one error; a phase is
+    relative to half a turn, the rest angle of a spring to one radian, an edge of a
+    patch to the patch's size. Scalars whose true value is zero are omitted.
 
-    Args: found {name: {value, ...}} as in result.json; hidden {name: value}.
+    Args: found: {name: {value, ...}} as in result.json; hidden: {name: value}.
     """
     value = {name: float(found[name]["value"]) for name in found if name in hidden}
     if "phase" not in value:
@@ -228,7 +227,7 @@ def parameter_errors(found: Mapping, hidden: Mapping) -> list[float]:
 
 def _errors(value: dict[str, float], hidden: Mapping) -> list[float]:
     if "radius" in value and "scale" in value:
-        del value["radius"]  # The same thing, said twice.
+        del value["radius"]  # It follows from the scale.
     errors: list[float] = []
     vectors: tuple[tuple[str, ...], ...] = (
         ("com_x", "com_y", "com_z"), ("x", "y", "z"), ("fx", "fy", "fz"),
@@ -250,15 +249,15 @@ def _errors(value: dict[str, float], hidden: Mapping) -> list[float]:
         elif name[:2] in ("x_", "y_"):
             size = abs(hidden[f"{name[:2]}max"] - hidden[f"{name[:2]}min"])
         elif name in ("gain", "scale"):
-            size = abs(hidden[name] - 1.0)  # Of what is changed.
+            size = abs(hidden[name] - 1.0)  # Relative to the change.
         if size > 0.0:
             errors.append(float(abs(off) / size))
     return errors
 
 
 def parameters_inside(found: Mapping, hidden: Mapping) -> list[bool]:
-    """Whether each hidden value lies in the interval that was named, two standard
-    deviations either way; False for an interval that is not finite."""
+    """For each parameter, whether the true value lies within two standard deviations;
+    False for a standard deviation that is not finite."""
     options = [hidden]
     if "phase" in hidden:  # The same force, half a turn later.
         sizes = ("fx", "fy", "fz", "amplitude")
@@ -283,7 +282,7 @@ def parameters_inside(found: Mapping, hidden: Mapping) -> list[bool]:
 def table_of(
     scores: Sequence[Score], which: str = "standard", goals: Goals = STANDARD
 ) -> Table:
-    """The benchmark's table; what went wrong stands under it, a line a case."""
+    """The benchmark's table, with a note for each case that went wrong."""
     command = "makebreak reproduce gap"
     if which != "standard":
         command += f" --set {which}"
@@ -340,8 +339,8 @@ def table_of(
         of_it = [s.found for s in scores if s.verdict == verdict]
         if of_it:
             counts = {v: of_it.count(v) for v in (*VERDICTS, "failed")}
-            said = ", ".join(f"{v} {n}" for v, n in counts.items() if n)
-            add(f"said of {verdict} ({len(of_it)})", "-", said)
+            text = ", ".join(f"{v} {n}" for v, n in counts.items() if n)
+            add(f"said of {verdict} ({len(of_it)})", "-", text)
     times = [s.seconds for s in scores if np.isfinite(s.seconds)]
     if times:
         add("seconds a case, median (most)", "-", f"{np.median(times):.0f} "

@@ -1,4 +1,4 @@
-"""The paper's hypotheses (CC section 4) and what our tables say of each."""
+"""The paper's hypotheses (CC section 4), and whether our tables support them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from makebreak.scripts.table import Table, format_cell
 class Hypothesis:
     name: str
     claim: str
-    experiments: tuple[str, ...]  # On whose targets the verdict rests.
+    experiments: tuple[str, ...]  # Their targets decide.
 
 
 HYPOTHESES = (
@@ -40,24 +40,24 @@ HYPOTHESES = (
 
 
 def verdicts(tables: Mapping[str, Table]) -> Table | None:
-    """What the tables of `reproduce` say of each hypothesis.
+    """Whether the tables of `reproduce` support each hypothesis.
 
-    Supported: every row with a target, of every experiment behind it, meets it. Else
-    the rows that miss theirs are named. A hypothesis of which no experiment was run
-    is left out; one of which some were says so.
+    It is supported if every row with a target, of all its experiments, meets it;
+    otherwise the rows that miss it are named. A hypothesis without any experiment run
+    is omitted; of others the experiments that are missing are named.
 
-    Args: tables, by experiment.
-    Returns: the table, or None if no hypothesis was touched.
+    Args: tables: {experiment: table}.
+    Returns: the table, or None if no hypothesis has an experiment.
     """
     rows: list[tuple] = []
     met: list[bool | None] = []
     for one in HYPOTHESES:
-        there = [name for name in one.experiments if name in tables]
-        if not there:
+        run = [name for name in one.experiments if name in tables]
+        if not run:
             continue
         targets = [
             (name, row, good)
-            for name in there
+            for name in run
             for row, good in zip(
                 tables[name].rows,
                 tables[name].met or [None] * len(tables[name].rows),

@@ -1,4 +1,4 @@
-"""`makebreak inspect`: what a log holds, and what its columns may be."""
+"""`makebreak inspect`: the columns of a log, and the channels they may be."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from makebreak.scripts.table import Table
 
 
 def inspect_table(log: Log, robot: Robot | None) -> tuple[Table, list[Match]]:
-    """One row a column: samples, rate, holes, range, and what it may be."""
+    """One row for each column: samples, rate, holes, range, and a proposed channel."""
     matches = matches_of(log, robot)
     columns, found = log.table.columns, {m.column: m for m in matches}
     time = next((m for m in matches if m.channel == "time"), None)
@@ -44,8 +44,8 @@ def inspect_table(log: Log, robot: Robot | None) -> tuple[Table, list[Match]]:
              _short(high), "" if np.isnan(repeats) else f"{repeats:.0%}", target,
              match.why)
         )  # fmt: skip
-    heads = ("column", "samples", "rate [Hz]", "longest hole [s]", "least", "most",
-             "repeats", "may be", "because")  # fmt: skip
+    heads = ("column", "samples", "rate [Hz]", "longest hole [s]", "min", "max",
+             "repeated", "proposed channel", "reason")  # fmt: skip
     title = f"{log.path}: {log.table.n_rows} rows"
     notes = []
     if t is not None and np.isfinite(t).any():
@@ -53,7 +53,7 @@ def inspect_table(log: Log, robot: Robot | None) -> tuple[Table, list[Match]]:
     else:
         notes.append("no column looks like a time")
     if robot is None:
-        notes.append("with --robot ROBOT.urdf columns are matched to its joints")
+        notes.append("--robot ROBOT.urdf matches the columns to its joints")
     return Table(title, heads, rows, notes=notes), matches
 
 
@@ -64,7 +64,7 @@ def _short(value: float) -> str:
 def run_inspect(
     path: Path, robot_path: Path | None, out: Path | None
 ) -> tuple[Table, str, list[Path]]:
-    """The table, the drafted sidecar and the files written, if any were asked for.
+    """The table, the drafted sidecar, and the files written.
 
     Raises: ValueError, one line, for a log or a robot that cannot be read.
     """

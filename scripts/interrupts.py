@@ -1,4 +1,4 @@
-"""SIGTERM (kill, timeout) and SIGHUP (a closed terminal) count as Ctrl-C."""
+"""Handles SIGTERM (kill, timeout) and SIGHUP (a closed terminal) like Ctrl-C."""
 
 import os
 import select
@@ -14,7 +14,7 @@ _GONE = select.POLLHUP | select.POLLERR | select.POLLNVAL
 
 @contextmanager
 def handled(handler: Callable[[int, object], None]) -> Iterator[None]:
-    """While entered, `handler` is called for all three signals, but for one that is
+    """Context in which `handler` is called for all three signals, except those that are
     ignored (SIGHUP under nohup). Without effect outside the main thread."""
     old = {}
     if threading.current_thread() is threading.main_thread():
@@ -29,7 +29,7 @@ def handled(handler: Callable[[int, object], None]) -> Iterator[None]:
 
 
 def interrupts():
-    """While entered, all three raise KeyboardInterrupt."""
+    """Context in which all three signals raise KeyboardInterrupt."""
 
     def interrupt(number, _):
         leave_terminal(number)
@@ -39,13 +39,13 @@ def interrupts():
 
 
 def undisturbed():
-    """While entered, the three do nothing: what is being written is soon complete."""
+    """Context in which the three signals are ignored, for short writes of files."""
     return handled(lambda number, _: leave_terminal(number))
 
 
 def leave_terminal(number: int) -> None:
-    """After SIGHUP the terminal may be gone: what would be printed there goes nowhere,
-    instead of being an error that ends the run."""
+    """After SIGHUP, redirects output to a terminal to /dev/null: the terminal may be
+    gone, and writing to it would end the run with an error."""
     if number != signal.SIGHUP:
         return
     for stream in (sys.__stdout__, sys.__stderr__):

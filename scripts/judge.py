@@ -1,10 +1,10 @@
-"""How well scenes predict recordings: one number for each channel and scene.
+"""Prediction error of scenes on recordings, for each channel and scene.
 
     python -m makebreak.scripts.judge SCENE... --on RECORDING... --window 0.4
 
-Each recording is cut into windows that start from measured states; each scene simulates
-them with the recording's commands. To see what a repair is worth, give the scene as it
-came and the one that `makebreak gap` wrote, and recordings that gap has not seen.
+Each recording is cut into windows that start from measured states, which each scene
+simulates with the recorded commands. To evaluate a repair, give the original scene, the
+one that `makebreak gap` wrote, and recordings that were not given to `makebreak gap`.
 """
 
 import argparse

@@ -1,10 +1,9 @@
-"""Runs controllers on a robot behind LCM: a step on each status message.
+"""Runs controllers on a robot behind LCM, one step for each status message.
 
-The controllers' clock is the robot's: each status says which millisecond it is of, and
-the diagram is simulated up to it, with the sensors of that status. So a status that is
-lost or late costs the controllers nothing but its reading, and the other side may run
-slower than real time. A command bears the time stamp of the status that it answers: the
-driver refuses what is too old, whatever made it so.
+The controllers use the robot's clock: the diagram is advanced to the time stamp of each
+status, with the sensor values in it. So a lost or late status only costs its readings,
+and the robot may be simulated slower than real time. A command has the time stamp of
+the status that it answers, so that the driver can refuse outdated commands.
 """
 
 import sys
@@ -22,51 +21,51 @@ from pydrake.systems.framework import Context, Diagram, OutputPort
 from makebreak.diagrams.lcm_station import (
     COMMAND,
     COMMAND_PORT,
-    PICTURES,
-    PICTURES_PORT,
+    IMAGES,
+    IMAGES_PORT,
     STATUS,
     STATUS_PORT,
     TORQUE_MODE,
     Messages,
     empty_status,
-    no_pictures,
+    no_images,
 )
 from makebreak.diagrams.scene_facts import N_JOINTS
 from makebreak.diagrams.station import TORQUE_RATE_MAX
 from makebreak.scripts.recording_stream import RecordingStream
 from makebreak.scripts.session import CatchInterrupt, Log, Session
 
-TICK = 0.001  # [s] Of the robot.
-WITHIN = 0.0009  # [s] After a tick: all that follows from it has been worked out.
-# Without a status for longer, the robot is taken for gone: of its own time, which may
-# pass more slowly than ours.
+TICK = 0.001  # Period of the robot [s].
+WITHIN = 0.0009  # Time after a tick by which all updates of that tick have run [s].
+# Time without a status after which the robot is taken for gone, on the robot's clock,
+# which may be slower than ours.
 HOLD_SEC = 0.04  # With SPIN_MS, 50 ms.
 SPIN_MS = 10
-KNOWN_SEC = 0.05  # After so much of it, how much more slowly is known.
-CATCH_UP = 50  # [ticks] Fewer lost ones are simulated, more are a new beginning.
-DELAY_MEMORY_SEC = 1.0  # In which a delay that was once seen is forgotten.
-PICTURE_SEC = 0.1  # A picture that is older is not shown.
-FIRST_SEC = 20.0  # To wait for the first status.
-GONE_SEC = 120.0  # Without an answer for longer, the run ends.
-KEPT = 100_000  # Of the latest times, for the report.
-MOVES = (0, 1, 2)  # Robot modes of libfranka in which it may be commanded.
+KNOWN_SEC = 0.05  # Time after which the ratio of the clocks can be estimated [s].
+CATCH_UP = 50  # Lost ticks up to which the controllers go on; more: a restart.
+DELAY_MEMORY_SEC = 1.0  # Time constant in which a large delay is forgotten [s].
+PICTURE_SEC = 0.1  # Age above which an image is ignored [s].
+FIRST_SEC = 20.0  # Timeout for the first status [s].
+GONE_SEC = 120.0  # Timeout without an answered status, after which the run ends [s].
+KEPT = 100_000  # Number of latest times in the report.
+MOVES = (0, 1, 2)  # libfranka's robot modes in which commands are accepted.
 
 
 @dataclass
 class LoopReport:
-    """How a run went, as the controllers' side has seen it."""
+    """Statistics of a run on the controllers' side."""
 
     steps: int = 0  # Commands sent.
-    lost: int = 0  # Ticks without a status of their own.
-    not_finite: int = 0  # Commands that were not sent for it.
-    rate_limited: int = 0  # Commands that were shortened to the torque's rate.
-    not_read: int = 0  # Messages that are none of a Panda's.
-    not_begun: int = 0  # Statuses from a place where the task cannot begin.
-    # The latest: from a status to its command, and until that acts [s].
+    lost: int = 0  # Ticks without a status.
+    not_finite: int = 0  # Commands that were not sent, as they are not finite.
+    rate_limited: int = 0  # Commands limited to the torque's rate.
+    not_read: int = 0  # Messages that are not a Panda's status.
+    not_begun: int = 0  # Statuses with positions from which the task cannot start.
+    # The latest times from a status to its command, and until the command acts [s].
     compute_sec: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))
     delay_sec: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))
-    holds_sec: list[float] = field(default_factory=list)  # From the last status on.
-    begun: int = 0  # Times that the controllers began at the robot's place.
+    holds_sec: list[float] = field(default_factory=list)  # Durations without status.
+    begun: int = 0  # Number of (re)starts of the controllers.
 
     def result(self) -> dict:
         ms = 1e3 * np.array(self.compute_sec or [np.nan])
@@ -91,15 +90,15 @@ class LoopReport:
 
 
 class LcmLoop:
-    """The controllers' side of the messages.
+    """Receives status messages, advances the controllers and sends their commands.
 
     Args:
-        diagram: with a subsystem `station` that make_lcm_station made.
-        begin: called with the diagram, its root context and the joints' positions (n,)
-            whenever the controllers are to begin where the robot is: at first, and
-            after it was gone.
+        diagram: with a subsystem `station` from make_lcm_station.
+        begin: called with the diagram, its root context and the joint positions (n,)
+            whenever the controllers start at the robot's present state: at first, and
+            after the robot was gone.
         url: of LCM.
-        clock: of the wall [s].
+        clock: wall clock [s].
     """
 
     def __init__(
@@ -114,7 +113,7 @@ class LcmLoop:
         self._messages = Messages()
         context = diagram.CreateDefaultContext()
         self._fix(context, STATUS_PORT, empty_status().encode())
-        self._fix(context, PICTURES_PORT, no_pictures())
+        self._fix(context, IMAGES_PORT, no_images())
         diagram.GetInputPort("delay").FixValue(context, [0.0])
         self._simulator = Simulator(diagram, context)
         self.context = self._simulator.get_mutable_context()
@@ -122,21 +121,22 @@ class LcmLoop:
         self.report = LoopReport()
         self._lcm = DrakeLcm(url)
         self._newest: dict[str, bytes] = {}
-        for channel in (STATUS, PICTURES):
+        for channel in (STATUS, IMAGES):
             self._lcm.Subscribe(channel, self._keeper(channel))
-        self._tick = -1  # Of the diagram.
+        self._tick = -1  # Tick of the diagram.
         self._robot: int | None = None  # The robot's tick that was answered last.
-        self._heard = clock()  # When the last status came [s].
-        self._since: tuple[float, int] | None = None  # Then, and its time stamp [us].
-        self._robot_utime = 0  # Of the last status.
-        self._slowness = 1.0  # Our seconds in one of the robot's.
+        self._heard = clock()  # Wall time of the last status [s].
+        # Wall time [s] and time stamp [us] of a status, from which pace is measured.
+        self._since: tuple[float, int] | None = None
+        self._robot_utime = 0  # Time stamp of the last status [us].
+        self._slowness = 1.0  # Seconds of our clock in one of the robot's.
         self._picture_utime = 0
         self._shown = False
-        self._sent = np.zeros(0)  # The last torques.
-        # (time stamp, torques) of the last commands, to be found again in a status.
+        self._sent = np.zeros(0)  # The last torques sent.
+        # (time stamp, torques) of the last commands, to recognise them in a status.
         self._on_the_way: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=100)
         self._delay = 0.0  # [s]
-        self._acting: tuple[float, ...] = ()  # By the last status.
+        self._acting: tuple[float, ...] = ()  # The torques in the last status.
 
     def _keeper(self, channel: str) -> Callable[[bytes], None]:
         def keep(data: bytes) -> None:
@@ -149,19 +149,19 @@ class LcmLoop:
 
     @property
     def time(self) -> float:
-        """Of the controllers [s]."""
+        """Time of the controllers [s]."""
         return max(self._tick, 0) * TICK
 
     @property
     def is_held(self) -> bool:
-        """Whether the robot is gone, or was never there."""
+        """Whether no robot is connected."""
         return self._robot is None
 
     def spin(self, timeout_ms: int = SPIN_MS) -> bool:
-        """Waits for messages and answers the newest status. Returns: whether there was
-        one, and it was answered."""
+        """Waits for messages and answers the newest status. Returns: whether a status
+        was answered."""
         self._lcm.HandleSubscriptions(timeout_ms)
-        # What came meanwhile waits in the queue: only the newest is of use.
+        # Empty the queue, as only the newest status is of use.
         while self._lcm.HandleSubscriptions(0) > 0:
             pass
         now = self._clock()
@@ -172,19 +172,19 @@ class LcmLoop:
             return False
         start = perf_counter()
         if not self.is_held and self._is_silent(now):
-            self._hold(now)  # This process itself was away.
+            self._hold(now)  # This process itself was suspended.
         self._heard = now
         status = self._read(data)
         if status is None:
             return False
         if status.robot_utime < self._robot_utime:
-            self._since = None  # It was started anew.
+            self._since = None  # The robot was restarted.
         self._robot_utime = status.robot_utime
         self._note_pace(status.utime)
         return self.answer(status, data, start)
 
     def _read(self, data: bytes) -> lcmt_panda_status | None:
-        """A status of an arm with as many joints as ours; None: it is none."""
+        """The message as a status of an arm with our number of joints, or None."""
         try:
             status = lcmt_panda_status.decode(data)
         except ValueError:
@@ -196,14 +196,14 @@ class LcmLoop:
 
     @property
     def silent_sec(self) -> float:
-        """Since the last status, in the robot's own time."""
+        """Time since the last status, on the robot's clock."""
         return (self._clock() - self._heard) / self._slowness
 
     def _is_silent(self, now: float) -> bool:
         return now - self._heard > HOLD_SEC * self._slowness
 
     def _note_pace(self, utime: int) -> None:
-        # Both clocks go on while nothing is heard; another robot has another one.
+        # Measured from the first status on, anew for a robot with another clock.
         if self._since is None or utime < self._since[1]:
             self._since = self._heard, utime
             return
@@ -212,17 +212,17 @@ class LcmLoop:
             self._slowness = max(1.0, (self._heard - self._since[0]) / passed)
 
     def _hold(self, now: float) -> None:
-        """Nothing is sent any more: the driver lets the arm come to rest."""
+        """Stops sending commands, upon which the driver brings the arm to rest."""
         self.report.holds_sec.append((now - self._heard) / self._slowness)
         self._robot = None
 
     def answer(
         self, status: lcmt_panda_status, data: bytes, start: float | None = None
     ) -> bool:
-        """Steps to the tick of a status, and sends the command that follows.
+        """Advances to the tick of a status, and sends the command.
 
-        Args: data: the status as it came; start: when its work began, perf_counter().
-        Returns: whether a command followed.
+        Args: data: the encoded status; start: perf_counter() at its arrival.
+        Returns: whether a command was sent.
         """
         start = perf_counter() if start is None else start
         robot = round(status.robot_utime * 1e-6 / TICK)
@@ -231,21 +231,21 @@ class LcmLoop:
                 self._hold(self._clock())
             return False
         if self._robot is not None and not 0 < robot - self._robot <= CATCH_UP:
-            if 0 <= self._robot - robot <= CATCH_UP:  # Twice, or out of order.
+            if 0 <= self._robot - robot <= CATCH_UP:  # Duplicate or out of order.
                 return False
-            self._robot = None  # Another robot, or one that was away.
+            self._robot = None  # Another robot, or one that was gone.
         self._fix(self.context, STATUS_PORT, data)
         if self._robot is None:
             self._tick += 1
             q = np.array(status.joint_position)
-            if self._tick > 0:  # To the new time, with nothing in between.
+            if self._tick > 0:  # Jump to the new time without simulating.
                 self._simulator.AdvanceTo(self._tick * TICK - 1e-5)
             try:
                 self._begin(self._diagram, self.context, q)
             except ValueError:
                 if self.report.begun == 0:
                     raise
-                self.report.not_begun += 1  # It may be moved there.
+                self.report.not_begun += 1  # The user may move the arm to the start.
                 self._tick -= 1
                 return False
             self._sent = np.zeros(len(q))
@@ -263,11 +263,13 @@ class LcmLoop:
         return True
 
     def _note_delay(self, status: lcmt_panda_status, follows: bool) -> None:
-        """How old the status was that the torque which acts now was worked out of: of
-        the last second's the largest, roughly. It counts when that torque is new, in a
-        status that follows the one before: a driver that hears nothing goes on with
-        what it has, and that grows older without any delay. A driver that filters what
-        it is sent does not let it be found again; then it stays as it was."""
+        """Updates the delay from a status to the torque that answers it.
+
+        It is about the largest of the last second. Only a torque that is new in
+        consecutive statuses counts, as a driver without new commands repeats the last
+        one. With a driver that filters commands they are not recognised in its status,
+        and the delay is not updated.
+        """
         acting = tuple(status.joint_torque_desired)
         is_new = follows and acting != self._acting
         self._acting = acting
@@ -280,14 +282,14 @@ class LcmLoop:
         self._diagram.GetInputPort("delay").FixValue(self.context, [self._delay])
 
     def _show_picture(self, utime: int) -> None:
-        """The newest picture to the diagram, none if it is too old."""
-        data = self._newest.pop(PICTURES, None)
+        """Gives the newest image to the diagram, or none if it is too old."""
+        data = self._newest.pop(IMAGES, None)
         if data is not None:
             self._picture_utime = lcmt_image_array.decode(data).header.utime
-            self._fix(self.context, PICTURES_PORT, data)
+            self._fix(self.context, IMAGES_PORT, data)
             self._shown = True
         if self._shown and utime - self._picture_utime > PICTURE_SEC * 1e6:
-            self._fix(self.context, PICTURES_PORT, no_pictures())
+            self._fix(self.context, IMAGES_PORT, no_images())
             self._shown = False
 
     def _send(self, utime: int) -> None:
@@ -298,7 +300,7 @@ class LcmLoop:
         if not np.isfinite(torque).all():
             self.report.not_finite += 1
             return
-        # Of what the robot has: lost ticks do not make a larger step a smaller one.
+        # The step per command is limited; lost ticks do not allow a larger one.
         step = TORQUE_RATE_MAX * TICK
         sent = self._sent + (torque - self._sent).clip(-step, step)
         self.report.rate_limited += int(abs(sent - torque).max() > 1e-9)
@@ -311,10 +313,7 @@ class LcmLoop:
 
 
 def wait_for_robot(loop: LcmLoop, url: str, done: Callable[[], bool]) -> None:
-    """Until the first status is answered.
-
-    Raises: ValueError if none comes.
-    """
+    """Waits until the first status is answered. Raises: ValueError if none comes."""
     until = monotonic() + FIRST_SEC
     while not loop.spin() and not done():
         if monotonic() > until:
@@ -335,14 +334,15 @@ def drive(
     period_sec: float,
     until: Callable[[float, dict[str, np.ndarray]], str],
 ) -> tuple[Log, LoopReport]:
-    """Session.simulate's counterpart for a robot behind LCM.
+    """Session.simulate for a robot behind LCM.
 
-    Args: as Session.simulate and LcmLoop. duration_sec is of the robot's time.
-    Returns: the samples, one each period_sec while the robot answers, and how it went.
+    Args: as Session.simulate and LcmLoop, with duration_sec on the robot's clock.
+    Returns: the log, with a sample every period_sec while the robot answers, and the
+        report.
     Raises: ValueError if no robot answers.
     """
     duration = session.duration_sec or duration_sec
-    while session.first_calls:  # Compiled before the robot is spoken to.
+    while session.first_calls:  # Compile before the first message.
         session.first_calls.pop(0)()
     _rehearse(diagram, begin)
     loop = LcmLoop(diagram, begin, url)
@@ -391,8 +391,7 @@ def drive(
 
 
 def _rehearse(diagram: Diagram, begin) -> None:
-    """A tenth of a second with messages that nobody sent: what is slow at first, is
-    slow now."""
+    """Simulates 0.1 s with made-up messages, so that everything is compiled."""
     loop = LcmLoop(diagram, begin, "memq://")
     status = empty_status()
     status.control_mode, status.robot_mode = TORQUE_MODE, MOVES[-1]

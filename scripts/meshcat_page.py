@@ -1,4 +1,4 @@
-"""meshcat.html: what a run looked like, played in a browser without a server."""
+"""meshcat.html: the animation of a run, for a browser without a server."""
 
 from pydrake.geometry import Meshcat
 

@@ -1,4 +1,4 @@
-"""The folder that one command writes into, and how nothing in it is ever lost."""
+"""Output folders of commands: results appear complete, and no file is ever lost."""
 
 import errno
 import fcntl
@@ -9,12 +9,12 @@ from collections.abc import Iterable
 from hashlib import sha256
 from pathlib import Path
 
-MARK = ".makebreak.json"  # Which command wrote the folder, and which files.
-STAGE = ".unfinished"  # In it, files are written before they are moved.
-KILLED = "killed"  # Where what a killed run had recorded goes when the next one begins.
-KEPT = "unfinished"  # Where an interrupted run goes beside an older, complete one.
+MARK = ".makebreak.json"  # Names the command that wrote the folder, and its files.
+STAGE = ".unfinished"  # Folder in which files are written before they are moved.
+KILLED = "killed"  # Folder to which the next run moves recordings of a killed one.
+KEPT = "unfinished"  # Folder of an interrupted run beside an older, complete one.
 _LOCK = "lock"
-# What commands write: in a folder that none of them made, such a file is the user's.
+# Suffixes of files that commands write; in a folder without a mark they are the user's.
 _SUFFIXES = ".csv .html .json .npz .parquet .png .py .sdf .yaml".split()
 _NAMES = ("reproduce.md", "error.txt")
 
@@ -22,19 +22,18 @@ _NAMES = ("reproduce.md", "error.txt")
 class OutputFolder:
     """A folder for the files of one command, locked until it is closed.
 
-    A file is written under the path that `file` gives, in a hidden folder, and moved to
-    its place by `commit`. Until then an earlier result of the same command stays as it
-    is; with it, that result's files are replaced, or removed where the new one has no
-    file of that name. Nothing else in the folder is touched. To be used in a `with`,
-    whose end drops what was not moved.
+    Files are written into a hidden folder, to the path that `file` gives, and moved to
+    their places by `commit`. Until then an earlier result of the same command is kept;
+    `commit` replaces its files, and removes those that the new result does not have.
+    Nothing else in the folder is touched. For a `with`, which drops uncommitted files.
 
     Args:
-        path: the folder; made where it is missing.
-        command: what writes there, such as "run ball_rolling".
+        path: the folder; made if it is missing.
+        command: that writes there, such as "run ball_rolling".
         inputs: files that the command reads.
         only_new: whether a folder that the command did not make must be empty.
     Raises: ValueError, in one line, for a folder that cannot be made or written to,
-        that holds inputs, files of another command or of the user, and one that another
+        that holds inputs or files of another command or of the user, or that another
         process is writing to. Then nothing has been changed.
     """
 
@@ -48,9 +47,9 @@ class OutputFolder:
         self.path = Path(path)
         self.command = command
         self.stage = self.path / STAGE
-        self.salvaged: Path | None = None  # What a run that was killed had recorded.
+        self.salvaged: Path | None = None  # Recordings of a run that was killed.
         self._lock: int | None = None
-        self._made: list[Path] = []  # Folders that were not there.
+        self._made: list[Path] = []  # Folders that did not exist before.
         for each in inputs:
             if self._may_write(Path(each)):
                 self._refuse(f"holds {Path(each).name}, which this command reads")
@@ -67,7 +66,7 @@ class OutputFolder:
             raise
 
     def _may_write(self, file: Path) -> bool:
-        """Whether the file, or what it is a link to, is where this command writes."""
+        """Whether the file, with links resolved, is in a place that may be written."""
         here = self.path.resolve()
         old = {(here / name).resolve() for name in _read_mark(here).get("files", {})}
         folders = (here, here / KEPT)
@@ -98,8 +97,8 @@ class OutputFolder:
             except FileNotFoundError:  # Another process has just ended there.
                 continue
             try:
-                # Not flock: a lock of that kind is inherited by worker processes, which
-                # may outlive a run that is killed.
+                # Not flock, as worker processes inherit its locks and may outlive a run
+                # that is killed.
                 fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
                 if error.errno in (errno.EACCES, errno.EAGAIN):
@@ -117,7 +116,7 @@ class OutputFolder:
                 os.close(lock)
         os.ftruncate(self._lock, 0)
         os.pwrite(self._lock, str(os.getpid()).encode(), 0)
-        # Of a run that was killed.
+        # Left by a run that was killed.
         recorded = sorted(self.stage.glob("recording*.csv"))
         if recorded:
             place = self.path / KILLED
@@ -160,13 +159,13 @@ class OutputFolder:
         return mark
 
     def file(self, name: str) -> Path:
-        """Where the file `name` is to be written; its folder is there."""
+        """The path to write the file `name` to; makes its folder."""
         path = self.stage / name
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
     def written(self) -> list[Path]:
-        """The files that wait to be moved, where they are."""
+        """The uncommitted files."""
         return [
             path
             for path in sorted(self.stage.rglob("*"))
@@ -176,9 +175,9 @@ class OutputFolder:
     def commit(self, complete: bool = True) -> list[Path]:
         """Moves all files to their places, and closes the folder.
 
-        Args: complete: False keeps an older, complete result, and moves the files into
-            the subfolder `unfinished` beside it.
-        Returns: the files, where they are now.
+        Args: complete: False keeps an older, complete result and moves the files into
+            the subfolder `unfinished`.
+        Returns: the files at their places.
         """
         target = self.path
         old: dict[str, str] = self._old.get("files", {})
@@ -188,7 +187,7 @@ class OutputFolder:
             target.mkdir(exist_ok=True)
         new = {path.relative_to(self.stage).as_posix(): path for path in self.written()}
         digests = {name: _digest(path) for name, path in new.items()}
-        # Should it end between the two marks, all files are known as its own.
+        # If the process ends between the two marks, all files are still known.
         self._mark(target, old | digests, complete=False)
         try:
             for name, path in new.items():
@@ -216,17 +215,17 @@ class OutputFolder:
         try:
             new.write_text(json.dumps(mark, indent=1) + "\n")
             os.replace(new, target / MARK)
-        except OSError:  # A full disk. The files matter more than the list of them.
+        except OSError:  # Disk full: the files matter more than their list.
             new.unlink(missing_ok=True)
 
     def close(self, keep_stage: bool = False) -> None:
-        """Drops what was not moved, and gives the folder free. May be called again."""
+        """Drops uncommitted files and unlocks the folder. May be called twice."""
         if self._lock is not None:
             if not keep_stage:
                 shutil.rmtree(self.stage, ignore_errors=True)
             os.close(self._lock)
             self._lock = None
-        for folder in self._made:  # Unless something has come into them.
+        for folder in self._made:  # Only empty ones can be removed.
             try:
                 folder.rmdir()
             except OSError:
@@ -244,7 +243,7 @@ def _read_mark(folder: Path) -> dict:
     try:
         mark = json.loads((folder / MARK).read_text())
         if isinstance(mark["command"], str) and isinstance(mark["files"], dict):
-            # A mark is no reason to go anywhere else.
+            # Paths in a mark that lead out of the folder are ignored.
             inside = {
                 name: digest
                 for name, digest in mark["files"].items()
@@ -257,14 +256,14 @@ def _read_mark(folder: Path) -> dict:
 
 
 def _digest(path: Path) -> str:
-    """What tells whether a file was changed by hand; "" of one that nobody changes."""
+    """A digest that shows edits by the user; "" for files that nobody edits."""
     if path.suffix != ".yaml":
         return ""
     return sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def _free(path: Path) -> Path:
-    """A name beside `path` that is not taken."""
+    """An unused name beside `path`."""
     n = 1
     while os.path.lexists(path.with_name(f"{path.name}.{n}")):
         n += 1

@@ -1,4 +1,4 @@
-"""Makes the pictures of docs/pictures anew, from runs: needs Debian's chromium.
+"""Regenerates docs/pictures from runs; needs Debian's chromium.
 
 python -m makebreak.scripts.pictures [--out docs/pictures] [PICTURE ...]
 """
@@ -25,7 +25,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs" / "pictures"
 
 @dataclass(frozen=True)
 class Picture:
-    """What a picture is taken of: a page, at a time of its own clock, or a plot."""
+    """The source of a picture: a page at a time of its own clock, or a plot."""
 
     command: str
     file: str
@@ -89,10 +89,11 @@ PLOTS = {"contact_figure_3.png": plot_speed_transition}  # Without a run.
 
 
 def make_pictures(names: list[str], out: Path, work: Path) -> None:
-    """One run for all pictures that name the same command.
+    """Makes pictures, with one run for all that have the same command.
 
-    Args: names: keys of PICTURES and PLOTS. out: where they go. work: where runs go.
-    Raises: ValueError where there is no browser; RuntimeError where a run fails.
+    Args: names: keys of PICTURES and PLOTS; out: folder for them; work: folder for
+        runs.
+    Raises: ValueError without a browser; RuntimeError if a run fails.
     """
     out.mkdir(parents=True, exist_ok=True)
     for name in names:
@@ -108,7 +109,7 @@ def make_pictures(names: list[str], out: Path, work: Path) -> None:
             capture_output=True,
             text=True,
         )
-        # With status 1 it ran, and did not meet its goals.
+        # Status 1: the run is complete but did not meet its goals.
         if done.returncode not in (0, 1):
             lines = done.stderr.strip().splitlines() or ["no output"]
             raise RuntimeError(f"{command}: {lines[-1]}")

@@ -1,5 +1,5 @@
-"""All tuned controllers on springs, in every setting of scripts/tune_planar.py, over
-many seeds: as plain loops, which are the diagrams tick for tick."""
+"""Compares all tuned controllers on springs, in every setting of tune_planar.py, over
+many seeds. Trials are plain loops, which are equal to the diagrams tick for tick."""
 
 import numpy as np
 
@@ -13,8 +13,7 @@ from makebreak.diagrams.planar_tuned import (
 )
 from makebreak.scripts.tune_planar import FORCE, TRIALS, errors_of
 
-# Trials of all but the biomimetic controller: what it learned shows in the later ones.
-OUR_TRIALS = 6
+OUR_TRIALS = 6  # Number of trials of all controllers but the biomimetic one.
 
 
 def compare(seeds: int) -> dict[str, dict[str, list[float]]]:
@@ -30,8 +29,8 @@ def compare(seeds: int) -> dict[str, dict[str, list[float]]]:
 def errors_in(name: str, setting: Setting, seed: int) -> dict[str, float]:
     """{controller: RMS tracking error [m]} of one seed.
 
-    First trials are of the usual speed; later ones are the last two together, which
-    where springs engage are one of each speed.
+    "first": of the first trial, at the usual speed; "later": of the last two trials
+    together, which with springs are one at each speed.
     """
 
     def later(errors) -> float:

@@ -1,6 +1,6 @@
-"""Trials of the planar experiments as plain loops, for tuning and for comparing many.
+"""Trials of the planar experiments as compiled loops, for tuning and comparisons.
 
-tests/test_planar_experiments.py holds them against the diagrams, tick for tick.
+tests/test_planar_experiments.py checks them against the diagrams, tick for tick.
 """
 
 from collections.abc import Sequence
@@ -54,21 +54,21 @@ from makebreak.systems.planar.planar_world import (
     springs_of,
 )
 
-_EVERY = 5  # Ticks from one sample of the error to the next.
+_EVERY = 5  # Ticks between samples of the error.
 
 
 @dataclass(frozen=True, eq=False)
 class PlanarTrial:
-    """A world, a circle and what the sensors make of them, as compiled loops take it.
+    """A world, a circle and sensor errors, as arguments of compiled loops.
 
     n is the number of ticks.
     """
 
-    world: tuple  # Of numerics.planar_world.step, after the mass.
-    circle: tuple  # Of circle_target, after t.
+    world: tuple  # Arguments of numerics.planar_world.step after the mass.
+    circle: tuple  # Arguments of circle_target after t.
     state_noise: np.ndarray  # (n, 4) [m], [m/s]
     force_noise: np.ndarray  # (n, 2) [N]
-    delay: int  # Of what is measured [ticks].
+    delay: int  # Of the measurements [ticks].
 
     @property
     def start(self) -> np.ndarray:
@@ -87,7 +87,7 @@ def trial_of(
     sensing: PlanarSensing,
     seed: int,
 ) -> PlanarTrial:
-    """What make_planar makes of the same arguments."""
+    """The trial that make_planar builds from the same arguments."""
     n = round(target.duration_sec / PERIOD)
     state_noise = _noise(np.array(sensing.state_std()), state_noise_seed(seed), n)
     force_noise = _noise(np.full(2, sensing.force_noise), seed, n)
@@ -103,7 +103,7 @@ def trial_of(
 
 @njit(cache=True)
 def _noise(std, seed, n):
-    """(n, len(std)): what a NoisySensor adds at each tick."""
+    """(n, len(std)) noise that a NoisySensor adds at each tick."""
     out, zero = np.empty((n, std.shape[0])), np.zeros(std.shape[0])
     for k in range(n):
         out[k] = add_noise(zero, std, seed, k)
@@ -112,13 +112,13 @@ def _noise(std, seed, n):
 
 @njit(cache=True)
 def _target(k, circle):
-    """(6,) of circle_target at the beginning of tick k."""
+    """(6,) circle_target at the start of tick k."""
     return circle_target(k * PERIOD, circle[0], circle[1], circle[2], circle[3])
 
 
 @njit(cache=True)
 def _squared_error(state, k, circle):
-    """At the end of tick k, every fifth; else 0 [m2]."""
+    """Squared error at the end of tick k [m2], for one tick in _EVERY; else 0."""
     if (k + 1) % _EVERY != 0:
         return 0.0
     goal = _target(k + 1, circle)
@@ -137,14 +137,14 @@ def _world_force(state, k, w):
 
 @njit(cache=True)
 def _seen(values, noise, delay, k):
-    """What a sensor says at tick k of values (n, m), known up to k."""
+    """The measurement at tick k of values (n, m), which are known up to k."""
     late = max(k - delay, 0)
     return values[late] + noise[late]
 
 
 @njit(cache=True)
 def _total(u, forces, k, sensing, feedforward):
-    """u with the measured force taken off, if it is fed forward."""
+    """u minus the measured force, if that is fed forward."""
     if not feedforward:
         return u
     return compensated(u, _seen(forces, sensing[1], sensing[2], k), FORCE_MAX)
@@ -258,10 +258,10 @@ def active_inference_error(
 def learning_curve(
     config: BiomimeticConfig, trials: Sequence[PlanarTrial], feedforward: bool = False
 ) -> list[float]:
-    """RMS tracking error of each of the trials, one after the other [m].
+    """RMS tracking error of each of consecutive trials [m].
 
-    What was learned is by time steps of the first trial; in one that takes another time
-    it stays with the place on the path.
+    Gains are learned for time steps of the first trial; in a trial of other duration
+    they are those of the same place on the path.
     """
     gains = no_gains(round(trials[0].circle[1] / config.step_sec))
     fixed = np.array([config.stiffness, config.damping])
@@ -289,7 +289,7 @@ def adaptive_error(
     trial: PlanarTrial,
     knowledge: Mixture | None = None,
 ) -> tuple[float, Mixture]:
-    """RMS tracking error of a trial [m], and what the model knows after it."""
+    """RMS tracking error of a trial [m], and the model after it."""
     tuning, along = igmm_tuning(config.mixture), config.along_motion
     model = new_model(tuning, knowledge, along)
     state, total, every = trial.start, 0.0, round(config.period_sec / PERIOD)

@@ -1,4 +1,4 @@
-"""What the planar experiments share: one trial, its scores, its picture."""
+"""Common parts of the planar experiments: trials, scores and plots."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,7 +18,7 @@ AT_LIMIT = 2  # Bit of every planar controller's status.
 
 
 def trial(session: Session, diagram: Diagram, label: str) -> Log:
-    """One trial of a diagram of make_planar; the columns are its ports' names."""
+    """Simulates one trial of a diagram of make_planar, and logs its output ports."""
     names = [name for name in _PORTS if diagram.HasOutputPort(name)]
     return session.simulate(
         diagram,
@@ -44,12 +44,13 @@ def error_rms(log: Log) -> float:
 
 
 def limit_share(log: Log) -> float:
-    """The share of samples at which the controller's force was at its limit."""
+    """The fraction of samples with the controller's force at its limit."""
     return float(np.mean((log["status"][:, 0].astype(int) & AT_LIMIT) > 0))
 
 
 def along_motion(log: Log, column: str) -> np.ndarray:
-    """The force in `column` against the effector's motion (n,) [N]; 0 at rest."""
+    """The component of the force in `column` against the effector's motion (n,) [N]; 0
+    at rest."""
     v = log["state"][:, 2:]
     speed = np.linalg.norm(v, axis=1, keepdims=True)
     direction = np.divide(v, speed, out=np.zeros_like(v), where=speed > 1e-3)
@@ -57,7 +58,7 @@ def along_motion(log: Log, column: str) -> np.ndarray:
 
 
 def plot_path(ax: Axes, log: Log, label: str, target: bool = True, **style):
-    """The effector's path; what leaves the picture is cut off."""
+    """Plots the effector's path within the axes' limits."""
     if target:
         ax.plot(*log["x_desired"][:, :2].T, ":", color="0.3", label="target")
     ax.plot(*log["state"][:, :2].T, label=label, **style)
@@ -65,7 +66,7 @@ def plot_path(ax: Axes, log: Log, label: str, target: bool = True, **style):
 
 
 def write_recording(session: Session, log: Log, sensing: PlanarSensing, seed: int):
-    """What could be measured of a trial, and the effector alone as the model."""
+    """Writes the measurements of a trial, with the effector alone as the model."""
     columns = recorded(log.diagram, log.context)
     if not any(sensing.state_std()):
         columns = with_noise(columns, seed)
@@ -73,7 +74,7 @@ def write_recording(session: Session, log: Log, sensing: PlanarSensing, seed: in
 
 
 def median_range(values, scale: float = 1.0, unit: str = "") -> str:
-    """ "median (least to greatest)", of those that are numbers."""
+    """ "median (min to max)" of the finite values."""
     good = scale * np.array([v for v in values if v is not None], dtype=float)
     if good.size == 0:
         return "-"
@@ -82,6 +83,6 @@ def median_range(values, scale: float = 1.0, unit: str = "") -> str:
 
 
 def with_count(values, bound: float) -> str:
-    """median_range, and how many of the values reach the bound."""
+    """median_range, and the number of values that reach the bound."""
     reached = sum(value >= bound for value in values)
     return f"{median_range(values)}; {reached} of {len(values)} reach {bound:g}"

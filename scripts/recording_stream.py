@@ -1,4 +1,4 @@
-"""A recording on disk while it is made: what a run that is killed leaves behind."""
+"""Writes a recording to disk during the run, in case the run is killed."""
 
 from pathlib import Path
 from time import monotonic
@@ -9,42 +9,41 @@ from pydrake.systems.framework import Context, Diagram
 from makebreak.diagrams.recorder import behind_sec, has_recorder, recorded
 from makebreak.gap.data.table import csv_rows
 
-# By the clock: so much is lost at most, and the time by which readings are late.
-EVERY_SEC = 1.0
+EVERY_SEC = 1.0  # Wall time between writes; at most this much is lost.
 
 
 class RecordingStream:
-    """Appends the rows that a diagram's Recorder has gathered to a csv file, as
-    write_recording writes it (gap/data/table.py), but as the sensors gave them: what an
-    experiment leaves out at the end (a ball that the camera did not see) is there.
+    """Appends the rows of a diagram's Recorder to a csv file.
 
-    A diagram without a Recorder has no file. A file that cannot be written, as on a
-    full disk, is not tried again.
+    The format is that of write_recording (gap/data/table.py). The rows are the raw
+    readings, including those that an experiment removes at its end (such as of a ball
+    that the camera does not see). Without a Recorder there is no file; after an error,
+    such as a full disk, no more is written.
     """
 
     def __init__(self, path: Path, diagram: Diagram):
         self.path = path
         self._diagram = diagram
-        self._next = -np.inf  # Time of the first row that is not on disk [s].
+        self._next = -np.inf  # Simulated time of the first row not on disk [s].
         self._due = monotonic() + EVERY_SEC
         self._open = has_recorder(diagram)
         self._begun = False
 
     def tick(self, context: Context) -> None:
-        """Writes what has come, if it is time. context: the simulation's root."""
+        """Writes new rows every EVERY_SEC. context: the simulation's root context."""
         if self._open and monotonic() >= self._due:
             self.catch_up(context)
             self._due = monotonic() + EVERY_SEC
 
     def catch_up(self, context: Context, ended: bool = False) -> None:
-        """Writes what has come. ended: the last row is whole, too; else its command
-        is still acting."""
+        """Writes new rows. ended: whether the last row is complete; otherwise its
+        command is still acting."""
         if not self._open:
             return
         columns = recorded(self._diagram, context, self._next)
         time = columns["time"]
         n = len(time)
-        # The last row may still change, and what is read late come.
+        # The last row may still change, and late readings may still arrive.
         if n and not ended:
             until = time[-1] - behind_sec(self._diagram)
             n = int(np.searchsorted(time, until - 1e-9))

@@ -1,4 +1,4 @@
-"""Replays recorded inputs into one system alone, and compares what comes out.
+"""Replays recorded inputs into a single system, and compares its outputs.
 
 `makebreak export-tests` writes the data; the tests that it writes call `replay`.
 """
@@ -18,16 +18,18 @@ from pydrake.systems.sensors import ImageRgba8U
 
 from makebreak.systems.numerics.timing import observed
 
-RTOL = 1e-6  # Of the largest number in the array. Compilers may order sums otherwise.
+# Tolerances, the relative one to the largest number in an array: the order of sums may
+# depend on the compiler.
+RTOL = 1e-6
 ATOL = 1e-9
 
 
 class Unsupported(ValueError):
-    """A value that cannot be written down."""
+    """A value that cannot be stored."""
 
 
 def flatten(value: Any, leaves: list[np.ndarray]):
-    """What `value` is made of, as JSON; its numbers are appended to `leaves`.
+    """The structure of `value`, as JSON; its numbers are appended to `leaves`.
 
     Raises: Unsupported for anything but numbers, texts, arrays, lists, dictionaries,
         dataclasses, named tuples and 8-bit images of those.
@@ -79,7 +81,7 @@ def _class(name: str) -> Any:
 
 
 def rebuild(spec: dict, leaves: list[np.ndarray]):
-    """The value that `flatten` took apart; leaves are used up from the front."""
+    """The inverse of `flatten`; removes the leaves that it uses from the front."""
     if "value" in spec:
         return spec["value"]
     if "enum" in spec:
@@ -109,8 +111,8 @@ def rebuild(spec: dict, leaves: list[np.ndarray]):
 
 
 class Track:
-    """The values that one port had, one per update: equal ones in a row are kept once,
-    and those of one make are stacked, so that the file is small."""
+    """The values of one port, one per update. Equal values in a row are kept once, and
+    values of the same structure are stacked, to keep the file small."""
 
     def __init__(self):
         self._specs: list[str] = []
@@ -138,39 +140,39 @@ class Track:
             if spec not in self._specs:
                 self._specs.append(spec)
                 self._rows.append([])
-            make = self._specs.index(spec)
-            self._index.append((make, len(self._rows[make])))
-            self._rows[make].append(leaves)
-        # An image is drawn anew in the same memory, so it may not be told by `is`.
+            k = self._specs.index(spec)
+            self._index.append((k, len(self._rows[k])))
+            self._rows[k].append(leaves)
+        # A new image may be drawn into the same memory, so `is` says nothing.
         keep = None if isinstance(value, ImageRgba8U) else value
         self._last = (keep if keep is not None else object(), spec, leaves)
 
     def arrays(self, name: str) -> dict[str, np.ndarray]:
-        """For np.savez, all names beginning with `name`."""
+        """Arrays for np.savez, whose names all begin with `name`."""
         out = {
             f"{name}/index": np.array(self._index, dtype=np.int32).reshape(-1, 2),
             f"{name}/specs": np.array(self._specs, dtype=np.str_),
         }
-        for make, rows in enumerate(self._rows):
+        for i, rows in enumerate(self._rows):
             for k in range(len(rows[0])):
-                out[f"{name}/{make}/{k}"] = np.stack([row[k] for row in rows])
+                out[f"{name}/{i}/{k}"] = np.stack([row[k] for row in rows])
         return out
 
 
 class StoredTrack:
-    """What `Track.arrays` wrote: per update (spec, leaves)."""
+    """Reads what `Track.arrays` wrote: (structure, leaves) of each update."""
 
     def __init__(self, data, name: str):
         self._specs = [json.loads(text) for text in data[f"{name}/specs"]]
         self._stacks: list[list[np.ndarray]] = [[] for _ in self._specs]
-        for make, stack in enumerate(self._stacks):
-            while f"{name}/{make}/{len(stack)}" in data:
-                stack.append(data[f"{name}/{make}/{len(stack)}"])
+        for i, stack in enumerate(self._stacks):
+            while f"{name}/{i}/{len(stack)}" in data:
+                stack.append(data[f"{name}/{i}/{len(stack)}"])
         self._index = data[f"{name}/index"]
 
     def __getitem__(self, k: int) -> tuple[dict, list[np.ndarray]]:
-        make, row = self._index[k]
-        return self._specs[make], [stack[row] for stack in self._stacks[make]]
+        i, row = self._index[k]
+        return self._specs[i], [stack[row] for stack in self._stacks[i]]
 
     def is_new(self, k: int) -> bool:
         """Whether the value differs from that of the update before."""
@@ -183,11 +185,11 @@ def replay(system: LeafSystem, file: Path, ports: Sequence[str] = ()) -> int:
     Args:
         system: as it was built for the recording.
         file: the recording's .npz.
-        ports: outputs to compare; empty: all that were recorded.
-    Returns: how many updates were compared.
-    Raises: AssertionError, naming port, update and time, where an output differs by
-        more than RTOL of its largest number plus ATOL, and if the system updates at
-        other times than it did.
+        ports: outputs to compare; empty: all recorded ones.
+    Returns: number of updates compared.
+    Raises: AssertionError, naming port, update and time, if an output differs by more
+        than RTOL times its largest number plus ATOL, or if the system updates at other
+        times than recorded.
     """
     with np.load(file) as stored:
         data = {name: stored[name] for name in stored.files}
@@ -205,7 +207,7 @@ def replay(system: LeafSystem, file: Path, ports: Sequence[str] = ()) -> int:
     def note(_, at):
         updates.append(at.get_time())
 
-    def fix(k: int) -> None:  # 0: as they are before anything has run.
+    def fix(k: int) -> None:  # k = 0: the inputs before the first update.
         for name, track in inputs.items():
             if not track.is_new(k):
                 continue
@@ -220,7 +222,7 @@ def replay(system: LeafSystem, file: Path, ports: Sequence[str] = ()) -> int:
     simulator.Initialize()
     with observed(note):
         for k, time in enumerate(times):
-            # To a time that it has reached already, it would run the update at once.
+            # AdvanceTo the present time would run the update right away.
             if time > context.get_time():
                 simulator.AdvanceTo(float(time))
             fix(k + 1)

@@ -1,4 +1,4 @@
-"""Buttons in Meshcat that act on a simulation that runs."""
+"""Buttons in Meshcat that control a running simulation."""
 
 from collections.abc import Callable
 from time import perf_counter, sleep
@@ -6,19 +6,19 @@ from time import perf_counter, sleep
 from pydrake.geometry import Meshcat
 
 PAUSE, STOP, OVER = "pause, go on", "stop", "start over"
-LOOK_SEC = 0.05  # While it stands still, between two looks at the buttons.
+LOOK_SEC = 0.05  # Period at which the buttons are polled while paused.
 
 
 class StartOver(BaseException):
-    """The run is to begin again: no error, which somebody might handle."""
+    """Asks for a restart of the run; no Exception, so that nothing handles it."""
 
 
 class RunButtons:
-    """Pause (the space bar, too), stop and start over, in Meshcat while entered.
+    """Context with the buttons pause (or space bar), stop and start over in Meshcat.
 
-    waited_sec: for how long it has stood still.
+    waited_sec: total time for which the simulation was paused [s].
 
-    Args: restarts: whether there is one who begins the run again.
+    Args: restarts: whether the caller handles StartOver.
     """
 
     def __init__(self, meshcat: Meshcat | None, restarts: bool = False):
@@ -38,11 +38,11 @@ class RunButtons:
                 self._meshcat.DeleteButton(name)
 
     def stopped(self, ended: Callable[[], bool], at_rest: Callable[[], None]) -> bool:
-        """Waits while the simulation is paused. Returns: whether it is to end.
+        """Waits while the simulation is paused. Returns: whether it should end.
 
-        Args: ended: whether it is to end for another reason, asked while waiting.
+        Args: ended: whether it should end for another reason, polled while waiting;
             at_rest: called after each pause.
-        Raises: StartOver where that is asked for, paused or not.
+        Raises: StartOver when that button was pressed, paused or not.
         """
         if self._meshcat is None:
             return False

@@ -1,4 +1,4 @@
-"""A picture of a meshcat.html, taken without a screen: needs Debian's chromium.
+"""Takes a screenshot of a meshcat.html without a display; needs Debian's chromium.
 
 python -m makebreak.scripts.screenshot runs/<run>/meshcat.html picture.png
 """
@@ -15,15 +15,15 @@ _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
 def screenshot(page: Path | str, picture: Path, size=(1280, 800), wait_ms: int = 15000):
-    """Draws `page` with a browser's software renderer and writes `picture`.
+    """Renders `page` in a headless browser and writes `picture`.
 
     Args:
-        page: an HTML file, or the address of one, as of a Meshcat that runs.
+        page: an HTML file, or an address such as that of a running Meshcat.
         picture: the PNG to write.
         size: width and height [pixels].
-        wait_ms: how long the page may take, on its own clock [ms].
-    Raises: ValueError if there is no page or no browser; RuntimeError if the browser
-        writes no picture.
+        wait_ms: time at which it is taken, on the page's own clock [ms].
+    Raises: ValueError without page or browser; RuntimeError if the browser writes no
+        picture.
     """
     address = str(page)
     if not address.startswith("http://"):

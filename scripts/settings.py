@@ -1,4 +1,4 @@
-"""Reads settings into an experiment's config dataclass, and refuses what is wrong."""
+"""Reads settings into an experiment's config dataclass, and checks them."""
 
 import dataclasses
 import typing
@@ -84,24 +84,21 @@ def apply_settings(config, settings: Iterable[str]):
     return config
 
 
-# Bounds of numbers, by the last word of their names; a field's own Between wins.
+# Bounds of numbers by the suffix of their names; a field's own Between has priority.
 _BOUNDS = {
     "period_sec": Between(1e-4, 10.0, "s"),
     "offset_sec": Between(0.0, 10.0, "s"),
     "seed": Between(None, 2.0**63 - 1.0),
     "friction": Between(0.0, 100.0),
 }
-# Of others: how many times the default, or as many times 1 or 10, they may be.
-_MOST_TIMES, _MOST_COUNT = 1e4, 1000
-_LEAST = 1e-30  # One over a smaller number may be no number.
+# Limits of other numbers: real ones over the default (or 1), integers over it (or 10).
+_RATIO_MAX, _COUNT_RATIO_MAX = 1e4, 1000
+_MAGNITUDE_MIN = 1e-30  # The inverse of a smaller number may overflow.
 
 
 def check_sizes(config, default, prefix: str = "") -> None:
-    """Refuses numbers that no experiment can mean: infinite ones, where the default is
-    finite, and those that are thousands of times the default.
-
-    Raises: ValueError.
-    """
+    """Raises: ValueError for numbers that must be a mistake: infinite where the default
+    is finite, or thousands of times the default."""
     hints = hints_of(type(config))
     for f in dataclasses.fields(config):
         value, usual = getattr(config, f.name), getattr(default, f.name)
@@ -125,22 +122,22 @@ def _check_size(name: str, value, usual) -> None:
     bounds = _BOUNDS.get(last)
     if bounds is None:
         if isinstance(value, int):
-            most = _MOST_COUNT * max([10, *sizes])
+            most = _COUNT_RATIO_MAX * max([10, *sizes])
         else:
-            most = _MOST_TIMES * max([1.0, *sizes])
+            most = _RATIO_MAX * max([1.0, *sizes])
         bounds = Between(-most, most)
-    tiny = 0.0 < abs(value) < _LEAST
+    tiny = 0.0 < abs(value) < _MAGNITUDE_MIN
     if value in usual or (bounds.holds(value) and not tiny):
         return
     if tiny:
         raise ValueError(
-            f'{name}: got "{shown(value)}", expected 0 or at least {_LEAST}'
+            f'{name}: got "{shown(value)}", expected 0 or at least {_MAGNITUDE_MIN}'
         )
     raise ValueError(f'{name}: got "{shown(value)}", expected {bounds}')
 
 
 def _replace(config, path: list[str], value, raw: str, hint, name: str):
-    """`config` with the field at `path` replaced; the configs around it are copied."""
+    """A copy of `config` with the field at `path` replaced."""
     first, *rest = path
     if rest:
         new = _replace(getattr(config, first), rest, value, raw, hint, name)
@@ -153,7 +150,7 @@ def _replace(config, path: list[str], value, raw: str, hint, name: str):
 
 
 def to_plain(config) -> dict:
-    """The config as dicts, lists and scalars, for a YAML file that reads back."""
+    """The config as dicts, lists and scalars, for YAML."""
 
     def plain(value):
         if dataclasses.is_dataclass(value) and not isinstance(value, type):

@@ -1,11 +1,14 @@
 #!/usr/bin/env bash
 # Makes .venv with the pinned dependencies; run.sh and test.sh call it first.
 #
-# Does nothing when .venv is complete and fits pyproject.toml and requirements.lock.
-# Missing system packages are installed where that needs no password; otherwise the one
-# command to type is printed. Exit status: 0 ready, 4 not ready (one line says why).
-# MAKEBREAK_PYTHON names another Python than python3. With --compile, what the first run
-# would compile, for a minute or two, is compiled as well.
+# Does nothing when .venv is complete and fits pyproject.toml and the lock file. Missing
+# system packages are installed where that needs no password; otherwise the one command
+# to type is printed. Exit status: 0 ready, 4 not ready (one line says why).
+#
+# MAKEBREAK_PYTHON names another Python than python3. MAKEBREAK_DRAKE=1.58 installs the
+# newer Drake, from its own lock file; .venv keeps it until MAKEBREAK_DRAKE=1.51 is set.
+# With --compile, what the first run would compile, for a minute or two, is compiled as
+# well.
 set -euo pipefail
 
 case "${1:-}" in
@@ -29,8 +32,16 @@ fail() {
     exit 4
 }
 
+# Which Drake: the one asked for, else the one that .venv has, else the pinned one.
+drake="${MAKEBREAK_DRAKE:-$(cat "$venv/.drake" 2>/dev/null || echo 1.51)}"
+case "$drake" in
+    1.51) lock="$root/requirements.lock" versions="3.10 to 3.14" ;;
+    1.58) lock="$root/requirements-drake-1.58.lock" versions="3.12 to 3.14" ;;
+    *) fail "MAKEBREAK_DRAKE is $drake, expected 1.51 or 1.58" ;;
+esac
+
 fingerprint() {
-    cat "$root/pyproject.toml" "$root/requirements.lock" | sha256sum
+    cat "$root/pyproject.toml" "$lock" | sha256sum
     readlink -f "$venv/bin/python" # A new Python of the system: make .venv anew.
     printf '%s\n' "$root"          # Scripts in .venv/bin contain this path.
 }
@@ -175,14 +186,14 @@ python="${MAKEBREAK_PYTHON:-python3}"
 command -v "$python" >/dev/null ||
     fail "no $python; type this once, then try again: $(apt_command python3-venv)"
 version="$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')"
-case "$version" in
-    3.10 | 3.11 | 3.12 | 3.13 | 3.14) ;;
-    *) fail "$python is Python $version, expected 3.10 to 3.14 (for Drake 1.51.1);" \
+case "$drake $version" in
+    "1.51 3.10" | "1.51 3.11" | 1.5[18]\ 3.1[234]) ;;
+    *) fail "$python is Python $version, expected $versions (for Drake $drake);" \
         "set MAKEBREAK_PYTHON to one of these" ;;
 esac
 case "$(uname -sm)" in
     "Linux x86_64" | "Darwin arm64") ;;
-    *) fail "this is $(uname -sm), expected Linux x86_64: Drake 1.51.1 has no wheel" ;;
+    *) fail "this is $(uname -sm), expected Linux x86_64: Drake $drake has no wheel" ;;
 esac
 
 # Two scripts started at once: the second waits here, and then has nothing to do.
@@ -207,10 +218,11 @@ touch "$unfinished"
 rm -f "$ready"
 [[ -x "$venv/bin/python" ]] || "$python" -m venv "$venv" >>"$log" 2>&1 ||
     fail "$python -m venv failed (log: $log)"
-pip_install -r "$root/requirements.lock"
+pip_install -r "$lock"
 pip_install --no-deps --no-build-isolation -e "$root"
 "$venv/bin/python" -c 'import pydrake.multibody.plant' >>"$log" 2>&1 ||
     fail "Drake does not load: $(tail -n 1 "$log")"
+printf '%s\n' "$drake" >"$venv/.drake"
 fingerprint >"$ready"
 rm -f "$unfinished" "$log"
 say "ready"

@@ -1,13 +1,13 @@
-"""`makebreak station`: a robot to try `run --robot lcm` with, in a process of its own.
+"""`makebreak station`: a simulated robot behind LCM, to try `run --robot lcm` with.
 
-It simulates arm, ball, table and camera, and behaves as drake-franka-driver does: it
-sends a status each millisecond of its own loop; a command is refused if its time stamp
-is more than EXPIRE_SEC off, if it is not one of torques, or holds a NaN; without a
-fresh command the torque falls back to damping. Gravity is compensated here, and
-joint_torque_external has libfranka's sign turned round.
+It simulates arm, ball, table and camera, and behaves like drake-franka-driver: it sends
+a status each millisecond; it refuses commands whose time stamp is more than EXPIRE_SEC
+off, that are not torque commands, or that hold a NaN; without a fresh command the
+torque falls back to damping. It compensates gravity, and joint_torque_external has the
+opposite of libfranka's sign.
 
-With a rate below 1 its clock, which all time stamps come from, runs as much slower than
-the wall's: then both sides have more time for a millisecond, and nothing else changes.
+With a rate below 1 its clock, from which all time stamps come, is slower than the wall
+clock by that factor: both sides then have more time for each millisecond.
 """
 
 import heapq
@@ -24,11 +24,12 @@ from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.sensors import ImageToLcmImageArrayT, PixelType
 
-from makebreak.diagrams.ball_rolling import BallRollingConfig, make_world
+from makebreak.diagrams.ball_rolling import make_world
+from makebreak.diagrams.ball_rolling_config import BallRollingConfig
 from makebreak.diagrams.lcm_station import (
     COMMAND,
-    PICTURES,
-    PICTURES_PORT,
+    IMAGES,
+    IMAGES_PORT,
     STATUS,
     TORQUE_MODE,
     Messages,
@@ -49,26 +50,26 @@ TICK = 0.001  # [s]
 EXPIRE_SEC = 0.1
 MOVING = 2  # libfranka's robot mode kMove.
 DAMPING = np.array([20.0, 20.0, 20.0, 20.0, 5.0, 5.0, 5.0])  # [N m s/rad]
-BEHIND_SEC = 0.05  # Of its own time; more is let go.
+BEHIND_SEC = 0.05  # Lag behind its clock that is made up for; more is dropped [s].
 
 
 @dataclass
 class StandInConfig:
     rate: float = 1.0  # Simulated seconds per second, at most 1.
-    drop: float = 0.0  # Share of messages, either way, that are lost.
-    delay_sec: float = 0.0  # By which what is sent comes later, in its own time.
+    drop: float = 0.0  # Probability that a message is lost, in both directions.
+    delay_sec: float = 0.0  # Delay of the messages it sends, on its own clock.
     url: str = ""
 
 
 @dataclass
 class StandInReport:
-    """What the driver has seen."""
+    """Statistics of a run on the driver's side."""
 
     ticks: int = 0
-    damped: int = 0  # Ticks without a command to follow.
+    damped: int = 0  # Ticks without a fresh command.
     received: int = 0
-    refused: dict[str, int] = field(default_factory=dict)  # {why: commands}
-    # Of the latest accepted commands.
+    refused: dict[str, int] = field(default_factory=dict)  # {reason: commands}
+    # Ages of the latest accepted commands.
     age_sec: deque[float] = field(default_factory=lambda: deque(maxlen=100_000))
     steps_too_large: int = 0  # Torques that had to be limited to the rate.
     slipped_sec: float = 0.0  # Time by which it fell behind its rate [s].
@@ -91,8 +92,7 @@ class StandInReport:
 
 
 class Driver:
-    """What a command must pass, and the torque that follows from it. Its clock is given
-    with each call: epoch [us]."""
+    """Checks commands and computes the torque. Each call has the time, epoch [us]."""
 
     def __init__(self, report: StandInReport):
         self._report = report
@@ -100,7 +100,7 @@ class Driver:
         self._torque = np.zeros(N_JOINTS)
 
     def receive(self, command: lcmt_panda_command, now: int) -> None:
-        """A command that came at `now`."""
+        """Accepts or refuses a command that arrives at `now`."""
         self._report.received += 1
         why = self._fault_of(command, now)
         if why:
@@ -110,7 +110,7 @@ class Driver:
         self._command = command.utime, np.array(command.joint_torque)
 
     def refuse(self, why: str) -> None:
-        """Notes that a command was."""
+        """Counts a refused command."""
         self._report.refused[why] = self._report.refused.get(why, 0) + 1
 
     def _fault_of(self, command: lcmt_panda_command, now: int) -> str:
@@ -127,8 +127,8 @@ class Driver:
         return ""
 
     def torque(self, v, now: int) -> np.ndarray:
-        """(7,) [N m] beside gravity's for the next tick, at joint speeds v (7,): the
-        command's while it is fresh, else damping; within the torque's rate."""
+        """(7,) [N m] without gravity for the next tick at joint speeds v (7,): that of
+        the command while it is fresh, else damping; limited in its rate."""
         if self._command is not None and now - self._command[0] > EXPIRE_SEC * 1e6:
             self._command = None
         if self._command is None:
@@ -149,7 +149,7 @@ class Driver:
 class StandIn:
     """The simulated robot behind LCM.
 
-    Args: seed, of lost messages; clock, of the wall [s].
+    Args: seed: of lost messages; clock: wall clock [s].
     """
 
     def __init__(
@@ -221,14 +221,14 @@ class StandIn:
     def tick(self) -> None:
         """One millisecond: the torque, the plant, the status."""
         k = self.report.ticks
-        # What the driver itself does rests on what is: faults are what it tells.
+        # The driver acts on true values; faults are only in the messages.
         plant = self._station.GetSubsystemByName("plant")
         at, robot = plant.GetMyContextFromRoot(self._context), self._robot
         q, v = plant.GetPositions(at, robot), plant.GetVelocities(at, robot)
         torque = self.driver.torque(v, self.now())
         carrying = gravity_torque(self._chain, q)
         self._in.FixValue(self._context, torque + carrying)
-        # Between two steps of the plant: the one at k ms is made with this torque.
+        # To between two steps of the plant, so that the one at k ms has this torque.
         self._simulator.AdvanceTo((k + 0.5) * TICK)
         self.report.ticks += 1
         q, v, felt = (
@@ -243,7 +243,7 @@ class StandIn:
         status.joint_position, status.joint_velocity = q.tolist(), v.tolist()
         status.joint_torque = felt.tolist()
         status.joint_torque_desired = torque.tolist()
-        # The driver turns libfranka's sign round.
+        # The driver inverts libfranka's sign.
         contact = np.array(
             self._station.GetOutputPort(f"{ARM}.contact_torque").Eval(self._context)
         )
@@ -253,22 +253,22 @@ class StandIn:
         self._publish(STATUS, status.encode())
         if 2 * k >= self._next_frame:
             self._next_frame += self._frame_ticks
-            self._publish(PICTURES, self._picture(status.utime))
+            self._publish(IMAGES, self._picture(status.utime))
 
     def _picture(self, utime: int) -> bytes:
         image = self._station.GetOutputPort("overhead.rgb_image").Eval(self._context)
         self._film_in.FixValue(self._film_context, Value(image))
         self._film_context.SetTime(utime * 1e-6)
         value = self._film.get_output_port().EvalAbstract(self._film_context)
-        return self._messages.encode(PICTURES_PORT, value)
+        return self._messages.encode(IMAGES_PORT, value)
 
     def listen(self) -> None:
-        """Takes the commands that have come, and sends what was to wait."""
+        """Receives commands, and sends the messages whose delay is over."""
         self._lcm.HandleSubscriptions(0)
         self._send_due()
 
     def run(self, duration_sec: float, done=lambda: False) -> None:
-        """Until `duration_sec` of its own time are over, or done() is true."""
+        """Runs for `duration_sec` of its own time, or until done() is true."""
         start, rate = self._clock(), self._config.rate
         while self.report.ticks * TICK < duration_sec and not done():
             self.tick()

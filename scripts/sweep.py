@@ -1,4 +1,4 @@
-"""One experiment over seeds and over ranges of its settings."""
+"""`makebreak sweep`: one experiment over seeds and over ranges of its settings."""
 
 import csv
 import dataclasses
@@ -28,11 +28,11 @@ from makebreak.scripts.table import Table, json_value
 from makebreak.scripts.trials import run_many, setting_texts
 
 CONFIDENCE = 0.95
-UNITS = ("m", "mm", "s", "N", "Nm", "rad", "deg", "kg")  # That keys end with.
+UNITS = ("m", "mm", "s", "N", "Nm", "rad", "deg", "kg")  # Suffixes of result keys.
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """Wilson's interval of a success rate, at 95 %. (0, 1) without trials."""
+    """Wilson's 95 % confidence interval of a success rate; (0, 1) without trials."""
     if trials == 0:
         return 0.0, 1.0
     interval = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
@@ -47,15 +47,15 @@ def rate_text(successes: int, trials: int) -> str:
 
 @dataclass(frozen=True)
 class Sweep:
-    """What is swept.
+    """The trials of a sweep.
 
     Args:
         experiment: its name.
-        config: the settings that all trials have.
-        vary: texts `key=lo:hi`, drawn from uniformly for each trial, whole numbers for
-            a key that is one, and `key=a,b,c`, of which each value is a case.
-        trials: how many per case, with the seeds first_seed, first_seed + 1, ...
-        duration_sec: overrides the experiment's own.
+        config: the settings that all trials share.
+        vary: texts `key=lo:hi`, a range from which each trial draws uniformly (whole
+            numbers for an integer key), and `key=a,b,c`, whose values are the cases.
+        trials: number per case, with the seeds first_seed, first_seed + 1, ...
+        duration_sec: overrides the duration of the experiment.
     Raises: ValueError for a key, a value or a range that does not fit the config.
     """
 
@@ -100,8 +100,8 @@ class Sweep:
         ]
 
     def drawn(self, seed: int) -> dict:
-        """The values that a trial draws: the same for a seed whatever else varies, so
-        that cases are compared on the same draws, and more trials keep the first."""
+        """The values drawn for a seed. They depend on nothing else, so that all cases
+        share them, and a sweep with more trials keeps those of the first."""
         values: dict[str, float] = {}
         for key, (low, high) in self.ranges.items():
             rng = np.random.default_rng([seed, zlib.crc32(key.encode())])
@@ -119,7 +119,8 @@ class Sweep:
 
 
 def _differing(config) -> dict:
-    """{dotted key: value} of what differs from the defaults, but for the seed."""
+    """{dotted key: value} of the settings that differ from the defaults, without the
+    seed."""
     default = to_plain(type(config)())
 
     def walk(now, was, prefix):
@@ -159,14 +160,14 @@ def run_sweep(
     command: Sequence[str] = (),
     inputs: Iterable[str | Path] = (),
 ) -> tuple[Table, list[Path]]:
-    """Runs what is not there yet, and writes sweep.md, .json, .csv and plots.
+    """Runs the trials, and writes sweep.md, .json, .csv and plots.
 
-    Args: out_dir: trials of an earlier sweep there that have the same settings and have
-        ended are read instead of repeated; jobs, cluster, command as in run_many;
-        inputs, files that the trials read.
-    Returns: the table, a row per case; the files.
-    Raises: ValueError for an out_dir that cannot be written to, or holds anything that
-        another command wrote.
+    Args: out_dir: trials of an earlier sweep there with the same settings are not
+        repeated; jobs, cluster, command: as in run_many; inputs: files that the trials
+        read.
+    Returns: the table, with a row for each case; the files written.
+    Raises: ValueError for an out_dir that cannot be written to, or that holds files of
+        another command.
     """
     with OutputFolder(out_dir, f"sweep {sweep.experiment}", inputs) as outputs:
         return _run(sweep, outputs, jobs, cluster, command)
@@ -212,7 +213,7 @@ def _numeric(sweep, key) -> bool:
 
 
 def _kind(key: str, value) -> str | None:
-    """A key of result.json as a "rate" (yes or no), a "mean", or neither."""
+    """How a key of result.json is summarised: "rate" of a bool, "mean", or not."""
     if isinstance(value, bool):
         return "rate"
     if isinstance(value, int | float):
@@ -225,7 +226,7 @@ def _values(group, key) -> list[float]:
 
 
 def _is_error(key: str) -> bool:
-    """Whether a plot and the table show it: errors, and the peak of a force."""
+    """Whether table and plots show a key: errors and peak forces."""
     return "error" in key or "peak_N" in key
 
 
@@ -235,7 +236,7 @@ def _table(sweep, groups, measured) -> Table:
     rows, notes = [], []
     for case, group in zip(sweep.cases, groups, strict=True):
         row: list = [" ".join(setting_texts(case)) or "all"]
-        for key in rates:  # A trial that failed is one without success.
+        for key in rates:  # A trial that failed counts as one without success.
             row.append(rate_text(sum(bool(r.get(key)) for r in group), len(group)))
         for key in means:
             values = _values(group, key)
@@ -258,7 +259,7 @@ def _table(sweep, groups, measured) -> Table:
 
 
 def _summary(sweep, groups, measured) -> dict:
-    """The same for programs."""
+    """The content of sweep.json."""
     cases = []
     for case, group in zip(sweep.cases, groups, strict=True):
         entry: dict = {"case": case, "failed": sum("error" in r for r in group)}
@@ -298,8 +299,8 @@ def _write_csv(path, runs, results, varied):
 
 
 def _plot(sweep, key, runs, results, measured) -> Figure:
-    """Success, and the errors, against a setting that was varied: a colour per case of
-    the other listed settings, crosses for trials without success."""
+    """Success and errors over a varied setting: one colour for each case of the other
+    listed settings, crosses for trials without success."""
     shown = [k for k, kind in measured.items() if kind == "mean" and _is_error(k)]
     figure = Figure(figsize=(7, 2.4 + 1.6 * len(shown)), layout="constrained")
     axes = np.atleast_1d(figure.subplots(len(shown) + 1, sharex=True))
@@ -323,7 +324,7 @@ def _plot(sweep, key, runs, results, measured) -> Figure:
         x = np.array([all_x[i] for i in members])
         drawn_x = x + apart * (at - 0.5 * (len(groups) - 1))
         good = np.array([bool(results[i].get("success")) for i in members])
-        if listed:  # The rate of each value, with its interval.
+        if listed:  # The success rate at each value, with its interval.
             places = np.unique(x)
             rates = [(good[x == place].sum(), (x == place).sum()) for place in places]
             middle = np.array([k / n for k, n in rates])
@@ -366,7 +367,7 @@ def _text(value) -> str:
 
 
 def _label(name: str) -> str:
-    """A key with its unit, which its end names: `radius error [m]`."""
+    """A label from a key and the unit in its suffix: `radius error [m]`."""
     stem, _, unit = name.rpartition("_")
     words = name.replace("_", " ")
     return f"{stem.replace('_', ' ')} [{unit}]" if stem and unit in UNITS else words

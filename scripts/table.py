@@ -12,12 +12,12 @@ class Table:
 
     Args:
         title: what the table shows; one line.
-        columns: the heads; a table of `reproduce` has
+        columns: the headings; a table of `reproduce` has
             ("what", "paper", "ours", "command").
         rows: one sequence per row, as long as `columns`.
-        met: per row, whether it meets its stated target; None where it has none.
-            Empty: no row has a target.
-        notes: lines that stand under the table.
+        met: for each row, whether it meets its target; None where it has none. Empty:
+            no row has a target.
+        notes: lines under the table.
     Raises: ValueError if a row or `met` is of the wrong length.
     """
 
@@ -42,11 +42,11 @@ class Table:
 
     @property
     def missed(self) -> int:
-        """How many rows miss their stated target."""
+        """Number of rows that miss their target."""
         return sum(1 for met in self.met if met is not None and not met)
 
     def _cells(self) -> tuple[list[str], list[list[str]]]:
-        """Heads and rows as text; with a last column for the targets, if any."""
+        """Headings and rows as text; with a last column for the targets, if any."""
         heads = [str(c) for c in self.columns]
         rows = [[format_cell(value) for value in row] for row in self.rows]
         if any(met is not None for met in self.met):
@@ -56,7 +56,7 @@ class Table:
         return heads, rows
 
     def to_text(self) -> str:
-        """Aligned columns; numbers at the right, the title above."""
+        """The table in aligned columns, numbers to the right, under its title."""
         heads, rows = self._cells()
         widths = [max(map(len, col)) for col in zip(heads, *rows, strict=True)]
         right = [
@@ -76,7 +76,7 @@ class Table:
         return "\n".join(lines) + "\n"
 
     def to_markdown(self) -> str:
-        """The same as a Markdown section."""
+        """The table as a Markdown section."""
         heads, rows = self._cells()
 
         def line(cells):
@@ -109,7 +109,7 @@ def _is_number(value) -> bool:
 
 
 def format_cell(value) -> str:
-    """A value as a person reads it: four significant digits, yes and no, - for none."""
+    """A value as text: four significant digits, yes or no, - for None."""
     if isinstance(value, list | tuple | np.ndarray):
         return ", ".join(map(format_cell, value))
     if value is None:
@@ -122,8 +122,8 @@ def format_cell(value) -> str:
 
 
 def json_value(value):
-    """A scalar, or a list of them, as JSON has it: numpy becomes Python, NaN and
-    infinity become None."""
+    """A scalar or nested list for JSON: numpy types become Python's, NaN and infinity
+    become None."""
     if isinstance(value, list | tuple | np.ndarray):
         return [json_value(one) for one in value]
     if isinstance(value, np.generic):

@@ -1,5 +1,5 @@
-"""Runs one experiment many times, each in a process of its own, several at once:
-on this machine's cores, or on a Dask or Ray cluster, with joblib."""
+"""Runs many trials of an experiment in parallel, each in a process of its own: on the
+cores of this machine, or with joblib on a Dask or Ray cluster."""
 
 import json
 import math
@@ -28,14 +28,14 @@ from makebreak.scripts.parent import PARENT
 from makebreak.scripts.settings import apply_settings, dump_config
 
 _COMMAND = (sys.executable, "-m", "makebreak")
-_LATE = "late"  # In place of an exit status: the run took too long.
-_PATIENCE_SEC = 3.0  # For runs that are to end; then they are killed.
-# What a cluster's worker sends back of a run: the recording and the plots stay there.
+_LATE = "late"  # Instead of an exit status: the time limit was exceeded.
+_PATIENCE_SEC = 3.0  # Time from SIGTERM to SIGKILL.
+# Files of a run that a cluster's worker returns; recording and plots stay there.
 _SENT_BACK = ("result.json", "config.yaml", "timing.json", "log.txt", "error.txt")
 
 
 def setting_texts(settings: Mapping) -> list[str]:
-    """{field: value} as the texts that follow --set."""
+    """The arguments of --set for {field: value}."""
     return [
         f"{key}={value if isinstance(value, str) else json.dumps(value)}"
         for key, value in settings.items()
@@ -43,7 +43,7 @@ def setting_texts(settings: Mapping) -> list[str]:
 
 
 def config_text(experiment: str, settings: Sequence[str], seed: int | None) -> str:
-    """The config.yaml that a run of these settings writes."""
+    """The config.yaml that a run with these settings writes."""
     config = apply_settings(load_experiment(experiment).Config(), settings)
     if seed is not None:
         config = apply_settings(config, [f"seed={seed}"])
@@ -51,17 +51,17 @@ def config_text(experiment: str, settings: Sequence[str], seed: int | None) -> s
 
 
 def _folder(settings: Mapping, seed: int) -> str:
-    """A folder name that tells what was run."""
+    """A folder name from the settings and the seed of a run."""
     texts = [re.sub(r"[^\w.=+-]", "", text) for text in setting_texts(settings)]
     name = "_".join([*texts, f"seed={seed}"])
-    if len(name) > 120:  # Cut, and told apart by what was cut off.
+    if len(name) > 120:  # Shortened, with a hash to keep it unique.
         name = f"{name[:110]}_{sha256(name.encode()).hexdigest()[:8]}"
     return name
 
 
 def run_environment() -> dict[str, str]:
-    """Of a run in a process of its own: one thread, this very package on the path, and
-    an end with this process."""
+    """Environment variables of a trial: one thread, this package on the path, and an
+    end when this process ends."""
     env = dict(os.environ)
     for name in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
         env[f"{name}_NUM_THREADS"] = "1"
@@ -72,7 +72,7 @@ def run_environment() -> dict[str, str]:
 
 
 def _read(folder: Path, status: int | None) -> dict:
-    """The result of a run that has ended, or what its last line on stderr says."""
+    """The result of a run that has ended, or an error with its last line on stderr."""
     if status in (0, 1):
         try:
             return json.loads((folder / "result.json").read_text())
@@ -109,15 +109,15 @@ def run_many(
     Args:
         experiment: its name.
         runs: ({field: value}, seed) of each run.
-        jobs: how many run at once.
-        out_dir: each run's files go to a subfolder, named after its settings.
-        duration: overrides the experiment's own [s].
-        reuse: whether a run that has already ended there, with the same settings and
-            duration, is read instead of repeated.
-        command: what starts makebreak; empty: this interpreter with -m makebreak.
+        jobs: number of parallel runs.
+        out_dir: each run's files go to a subfolder named after its settings.
+        duration: overrides the duration of the experiment [s].
+        reuse: whether completed runs in out_dir with the same settings and duration are
+            read instead of repeated.
+        command: that starts makebreak; empty: this interpreter with -m makebreak.
         cluster: as in run_commands.
-    Returns: per run its result.json with `seed` and `out_dir` added; of a failed one
-        `success` False and `error`, the last line that it printed.
+    Returns: the result.json of each run, with `seed` and `out_dir` added; for a failed
+        run `success` False and `error`, the last line that it printed.
     Raises: ValueError if jobs is below 1 or two runs are the same.
     """
     if jobs < 1:
@@ -150,7 +150,7 @@ def run_many(
 
 
 def makebreak_command(*words: str) -> list[str]:
-    """What starts `makebreak WORDS` in this interpreter."""
+    """The command `makebreak WORDS` for this interpreter."""
     return [*_COMMAND, *words]
 
 
@@ -164,19 +164,19 @@ def run_commands(
     limit_sec: float = math.inf,
     cluster: str | None = None,
 ) -> list[dict]:
-    """Runs commands that each write result.json into a folder, `jobs` at a time, with
-    one thread each and their output in the folder's log.txt. The files of a run are in
-    its folder as soon as it ends. Ctrl-C, SIGTERM, SIGHUP or the end of this process by
-    whatever means ends all of them; one that fails is reported and does not stop the
-    others.
+    """Runs commands, `jobs` at a time, each of which writes a result.json.
 
-    Args: label, of the progress bar; is_done(i): whether the folder has the result
-        already; ended(i, result): called as each has ended; limit_sec: after so long
-        [s] a command is stopped, and has failed; cluster: address of a Dask scheduler
-        (tcp://HOST:PORT) or, on a machine of it, of a Ray cluster (ray:HOST:PORT),
-        whose workers run the commands, as many at a time as it has threads.
-    Returns: per command its result.json; of a failed one `success` False and `error`,
-        how it ended and the last line that it printed.
+    Each has one thread and writes its output to log.txt in its folder; its files are
+    there as soon as it ends. One that fails is reported and does not stop the others.
+    All are ended by Ctrl-C, SIGTERM, SIGHUP, and when this process ends in any way.
+
+    Args: label: of the progress bar; is_done(i): whether the folder has the result
+        already; ended(i, result): called after each; limit_sec: time limit of a command
+        [s], after which it has failed; cluster: address of a Dask scheduler
+        (tcp://HOST:PORT), or of a Ray cluster that this machine belongs to
+        (ray:HOST:PORT), whose workers then run the commands, one in each thread.
+    Returns: the result.json of each command; for a failed one `success` False and
+        `error`, its exit status and the last line that it printed.
     Raises: ValueError for a cluster that cannot be reached.
     """
     results: list[dict] = [{} for _ in commands]
@@ -221,7 +221,7 @@ def run_commands(
 
 
 def _written(folder: Path) -> int:
-    """When result.json was written; 0 without one."""
+    """Modification time of result.json [ns]; 0 without one."""
     try:
         return (folder / "result.json").stat().st_mtime_ns
     except OSError:
@@ -229,14 +229,15 @@ def _written(folder: Path) -> int:
 
 
 class _Running:
-    """The processes that run here, each watched by a thread."""
+    """The processes on this machine, each of which a thread waits for."""
 
     def __init__(self):
         self._processes: set[subprocess.Popen] = set()
         self._lock, self._ended = threading.Lock(), False
 
     def run(self, i: int, command: Sequence[str], folder: Path, limit_sec: float):
-        """i, the exit status, and no files: they are in the folder."""
+        """Runs one command. Returns: i, the exit status, and {}, as the files are in
+        the folder already (_run_far returns them)."""
         before = _written(folder)
         with (folder / "log.txt").open("wb") as log:
             with self._lock:
@@ -248,7 +249,7 @@ class _Running:
                     stdout=log,
                     stderr=subprocess.STDOUT,
                     env=run_environment(),
-                    start_new_session=True,  # Ctrl-C reaches us alone.
+                    start_new_session=True,  # So that Ctrl-C reaches only this process.
                 )
                 self._processes.add(process)
             status: int | str | None
@@ -261,11 +262,11 @@ class _Running:
             with self._lock:
                 self._processes.discard(process)
         if status in (0, 1) and _written(folder) == before:
-            status = None  # The result is another run's.
+            status = None  # The result.json is that of an earlier run.
         return i, status, {}
 
     def end(self):
-        """Ends what still runs; nothing starts afterwards."""
+        """Ends all processes, and lets no more start."""
         with self._lock:
             self._ended = True
             left = list(self._processes)
@@ -284,13 +285,13 @@ _OUT, _PYTHON = "<out>", "<python>"
 
 
 def _portable(command: Sequence[str], folder: Path) -> list[str]:
-    """A command in which this machine's folder and interpreter have no part."""
+    """The command without paths of this machine's folder and interpreter."""
     own = {str(folder): _OUT, sys.executable: _PYTHON}
     return [own.get(word, word) for word in command]
 
 
 def _run_far(i: int, command: Sequence[str], limit_sec: float):
-    """On a cluster's worker: i, the exit status, and {name: content} of the files."""
+    """Runs on a cluster's worker. Returns: i, the exit status, {file name: content}."""
     with tempfile.TemporaryDirectory() as folder:
         own = {_OUT: folder, _PYTHON: sys.executable}
         there = [own.get(word, word) for word in command]
@@ -301,13 +302,13 @@ def _run_far(i: int, command: Sequence[str], limit_sec: float):
 
 @contextmanager
 def _workers(cluster: str | None, jobs: int):
-    """joblib's Parallel, which gives each result as it comes.
+    """A joblib Parallel that yields results as they come.
 
-    Raises: ValueError if the cluster's library or the cluster is not there.
+    Raises: ValueError if the cluster or its library is not available.
     """
     now = dict(return_as="generator_unordered", batch_size=1)
     if cluster is None:
-        # Threads that wait: the work is in processes, which may crash alone.
+        # Threads suffice, as they only wait for processes.
         yield joblib.Parallel(n_jobs=jobs, backend="threading", **now)
         return
     kind, close = _connect(cluster)
@@ -319,7 +320,7 @@ def _workers(cluster: str | None, jobs: int):
 
 
 def _connect(cluster: str) -> tuple[str, Callable[[], object]]:
-    """The name of joblib's backend for a cluster, and what ends the connection."""
+    """The name of joblib's backend for a cluster, and a function that disconnects."""
     if cluster.startswith(("tcp://", "tls://")):
         extra, address = "dask", cluster
     elif cluster.startswith("ray:") and not cluster.startswith("ray:/"):
@@ -331,7 +332,7 @@ def _connect(cluster: str) -> tuple[str, Callable[[], object]]:
         )
     host, _, port = address.rpartition(":")
     try:
-        # Before any library: Ray would try for minutes, and then end the process.
+        # Tested first, as Ray would try for minutes and then end the process.
         socket.create_connection((host.split("//")[-1], int(port)), 10.0).close()
     except (OSError, ValueError) as error:
         raise ValueError(f"--cluster: {cluster} not reached: {error}") from error
@@ -347,8 +348,8 @@ def _connect(cluster: str) -> tuple[str, Callable[[], object]]:
 
         ray.init(address=address, log_to_driver=False, logging_level="ERROR")
         register_ray()
-        # joblib holds results of pools of processes back until all are there; Ray's
-        # pool calls back for each, so that they can be had one by one.
+        # joblib assumes that pools of processes return all results together, but Ray's
+        # pool calls back for each of them.
         RayBackend.supports_return_generator = True
         return "ray", ray.shutdown
     except ImportError as error:
@@ -361,12 +362,12 @@ def _connect(cluster: str) -> tuple[str, Callable[[], object]]:
 
 
 def duration_line(duration: float | None) -> str:
-    """The comment at the head of config.yaml, which tells of --duration."""
+    """The first line of config.yaml, a comment that records --duration."""
     return f"# duration_sec: {'default' if duration is None else float(duration)}\n"
 
 
 def _is_done(folder: Path, experiment: str, texts, seed, duration) -> bool:
-    """Whether the folder holds the result of the very same run."""
+    """Whether the folder holds the result of the same run."""
     try:
         text = (folder / "config.yaml").read_text()
         result = json.loads((folder / "result.json").read_text())

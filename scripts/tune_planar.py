@@ -1,28 +1,27 @@
-"""Tunes every controller of the planar experiments with one and the same budget.
+"""Tunes the controllers of the planar experiments by random search.
 
     python -m makebreak.scripts.tune_planar SETTING [CONTROLLER ...] [--scale S]
 
-A setting is a world, what its sensors are like, and how stiff controllers may be
-(SETTINGS). Random search: settings of a controller drawn log-uniformly, then as many
-drawn around the best one so far, nearer and nearer, each tried on seeds 100 to 102 and
-scored by the mean RMS tracking error; the best five are tried on seeds 100 to 113, and
-the one with the least median wins. 160 in all for the adaptive controller, 1200 for
-MRAC and active inference, whose trials are quick; 160 for the biomimetic one, of which
-a trial is a whole learning run of 30 trials, scored by the last. What is found goes to
-diagrams/planar_tuned.json, from where the experiments take it.
+A setting is a world with its sensors and the greatest stiffness (SETTINGS). Parameters
+of a controller are drawn log-uniformly, then as many more around the best ones so far,
+ever closer. Each is tried on seeds 100 to 102 and scored by the mean RMS tracking
+error; the best five are tried on seeds 100 to 113, and the one with the least median
+wins. 160 are tried for the adaptive controller, and 1200 for MRAC and active inference,
+whose trials are quick. For the biomimetic one 160 are tried, each in a learning run of
+30 trials, which is scored by the last. The result goes to diagrams/planar_tuned.json,
+which the experiments read.
 
-No range has an edge that matters: they are so wide that the best lies inside, or the
-bound is one that all share. Such are: proportional stiffness at most stiffness_max,
-proportional damping at most twice critical there, as else a high gain does what
-adaptation is to do. Active inference
-integrates its error of velocity, k_a P_y' int de/dt dt: that factor is its proportional
-stiffness.
+The ranges are so wide that the optimum is inside, apart from bounds that all
+controllers share: proportional stiffness is at most stiffness_max, and proportional
+damping at most twice critical at that stiffness, as otherwise high gain would replace
+adaptation. Active inference integrates the velocity error, k_a P_y' int de/dt dt, so
+that this factor is its proportional stiffness.
 
-A controller with "+force" has the measured force fed forward, which the adaptive one
-has in its law. `measured_force` is the adaptive law without any model: the last
-measured force is the prediction.
+"+force" marks a controller with feedforward of the measured force, which the adaptive
+one has in its law. `measured_force` is the adaptive law without a model, whose
+prediction is the last measured force.
 
-Trials run as plain loops here (scripts/planar_loops.py), without a diagram.
+Trials run as plain loops (scripts/planar_loops.py), without a diagram.
 """
 
 import argparse
@@ -56,11 +55,13 @@ from makebreak.systems.planar.planar_impedance import (
 )
 
 SEARCH_SEEDS, FINAL_SEEDS = (100, 101, 102), tuple(range(100, 114))
-SLOW, QUICK, FINALISTS = 160, 1200, 5  # Settings tried; half of them around the best.
-# On the circle, at most: |x| [m], |v| [m/s].
+# Number of parameter sets tried for controllers with slow and with quick trials, half
+# of them around the best; and of finalists.
+SLOW, QUICK, FINALISTS = 160, 1200, 5
+# Greatest |x| [m] and |v| [m/s] on the circle.
 X_MAX, V_MAX = 0.25, 0.49
 TRIALS = 30
-FAST = 2.0 / 3.0  # Of the usual time, where springs engage.
+FAST = 2.0 / 3.0  # Duration of the fast trials with springs, over the usual one.
 FORCE = "+force"
 
 
@@ -68,7 +69,7 @@ def spaces(setting: Setting) -> dict[str, dict[str, tuple[float, float]]]:
     """{controller: {parameter: (lowest, highest)}}."""
     K = setting.stiffness_max
     law = {
-        "stiffness_free": (0.02 * K, 0.22 * K),  # Compliant: that is the comparison.
+        "stiffness_free": (0.02 * K, 0.22 * K),  # Compliant, as is compared here.
         "damping_ratio": (0.1, 4.0),
         "steepness": (1.0, 100.0),
         "error_mid": (0.1, 20.0),
@@ -122,7 +123,7 @@ def spaces(setting: Setting) -> dict[str, dict[str, tuple[float, float]]]:
 
 
 def config_of(name: str, p: dict[str, float], setting: Setting):
-    """The config, or the two, of a controller with the parameters p."""
+    """The config (or both configs) of a controller with the parameters p."""
     name, K_max = name.removesuffix(FORCE), setting.stiffness_max
     if name in ("adaptive", "adaptive_position", "measured_force"):
         law = PlanarImpedanceConfig(
@@ -132,7 +133,7 @@ def config_of(name: str, p: dict[str, float], setting: Setting):
             steepness=p["steepness"],
             error_mid=p["error_mid"],
         )
-        # Damping at most as the others': at the greatest stiffness.
+        # Damping at most that of the others at the greatest stiffness.
         critical = 2.0 * float(np.sqrt(K_max * MASS))
         ratio = min(law.damping_ratio, setting.damping_max / critical)
         law = replace(law, damping_ratio=ratio)
@@ -149,7 +150,7 @@ def config_of(name: str, p: dict[str, float], setting: Setting):
         p2, p3 = error_weights(p["omega"], p["zeta"], p["rate_weight"])
         alpha = p["stiffness"] / p2
         now = np.array([alpha, p["position_now"], p["velocity_now"]])
-        # What multiplies q at once, at most: K0 x, Q0 x_m, K1 v and Q1 v_m too.
+        # The greatest gain on q at any time, of K0 x, Q0 x_m, K1 v and Q1 v_m.
         most = now @ [1.0, 2.0 * X_MAX**2, 2.0 * V_MAX**2]
         now *= min(1.0, K_max / (p2 * most), setting.damping_max / (p3 * most))
         return MracConfig(
@@ -178,9 +179,9 @@ def config_of(name: str, p: dict[str, float], setting: Setting):
 
 @cache
 def task_of(setting: Setting, seed: int, training: bool = False) -> PlanarTrial:
-    """The seed's springs, or its porridge (in training or in the test)."""
+    """The seed's world: springs, or porridge (in training or in the test)."""
     if setting.world == "porridge":
-        # Its MRAC is what is being tuned, and may not be there yet.
+        # With the default MRAC, as the tuned one may not exist yet.
         stirred = porridge.PorridgeConfig(seed=seed, mrac=MracConfig())
         world, target, noise_seed = porridge.draw(stirred, training)
         return trial_of(world, target, setting.sensing, noise_seed)
@@ -192,8 +193,8 @@ def task_of(setting: Setting, seed: int, training: bool = False) -> PlanarTrial:
 
 @cache
 def path_again(setting: Setting, seed: int, trials: int) -> tuple[PlanarTrial, ...]:
-    """So many trials in the seed's world, each with noise of its own; where springs
-    engage, every second one is faster."""
+    """A number of trials in the seed's world, each with its own noise; with springs,
+    every second one is faster."""
     world, target = multi_spring.draw_springs(
         seed, engaging=setting.world == "engaging"
     )
@@ -206,10 +207,8 @@ def path_again(setting: Setting, seed: int, trials: int) -> tuple[PlanarTrial, .
 
 
 def errors_of(name: str, config, setting: Setting, seed: int, trials: int):
-    """RMS tracking errors of so many trials on one path, a list [m].
-
-    What learns does so from trial to trial.
-    """
+    """RMS tracking errors of a number of trials on one path [m]; controllers that learn
+    between trials keep their gains."""
     each, force = path_again(setting, seed, trials), name.endswith(FORCE)
     if name.startswith("biomimetic"):
         return learning_curve(config, each, force)
@@ -228,16 +227,16 @@ def errors_of(name: str, config, setting: Setting, seed: int, trials: int):
 
 
 def rms_of(name: str, config, setting: Setting, seed: int) -> float:
-    """The score of one setting of a controller on one seed [m].
+    """The score of one parameter set on one seed: RMS tracking error [m].
 
-    Where springs engage: of the fifth and the sixth trial, one of each speed (of the
-    biomimetic controller the last two); else of the first trial (of the biomimetic one
-    the last).
+    With springs that of the fifth and the sixth trial, one at each speed (for the
+    biomimetic controller the last two); else that of the first trial (for the
+    biomimetic one the last).
     """
     if setting.world == "engaging":
         n = TRIALS if name.startswith("biomimetic") else 6
         if name.startswith(("mrac", "active_inference", "measured_force")):
-            n = 2  # They learn nothing from trial to trial.
+            n = 2  # They do not learn between trials.
         errors = errors_of(name, config, setting, seed, n)[-2:]
         return float(np.sqrt(np.mean(np.square(errors))))
     if setting.world == "porridge":
@@ -247,7 +246,7 @@ def rms_of(name: str, config, setting: Setting, seed: int) -> float:
 
 
 def tune(name: str, setting: Setting, scale: float = 1.0) -> dict:
-    """The best setting of a controller; scale shrinks the budget, to try it out."""
+    """The best parameters of a controller; scale: of the budget, below 1 for tests."""
     space = spaces(setting)[name]
     low, high = np.log([list(pair) for pair in space.values()]).T
     rng = np.random.default_rng(0)

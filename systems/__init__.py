@@ -1,19 +1,20 @@
-"""The systems: LeafSystems that meet at ports, in wings by subject.
+"""LeafSystems, in packages by subject. They are connected at ports only.
 
-contact_mpc/       a contact model of any plant (LCS), plans through contact (C3), what
-                   the model has wrong (residual), where to touch, the tasks
-changing_contact/  contacts felt and expected, contact modes and their forward models,
-                   motions slowed down before a contact and blended after it
-arm/               from what a planner wants to torques: references, impedance, tool
-perception/        cameras and noisy sensors, trackers, the state that planners use
-planar/            a point in the plane with adaptive impedance
-baselines/         what ours is compared with
-faults/            faults injected into signals, pictures and forces, and the monitor
-views/             what is seen and pressed in Meshcat, and ground truth for scores
+contact_mpc/       contact models of any plant (LCS), MPC through contact (C3), residual
+                   learning, contact sampling, and the tasks of the controller
+changing_contact/  contact detection and anticipation, contact modes and their forward
+                   models, slowing down before contacts and blending after them
+arm/               from planned references to joint torques: impedance control, tool
+perception/        cameras and noisy sensors, trackers, state estimators
+planar/            adaptive impedance control of a point in the plane
+baselines/         methods of other authors, for comparison
+faults/            faults injected into signals, images and forces; safety monitor
+views/             displays and buttons in Meshcat, and ground truth for evaluation
 
-Each file has one LeafSystem and its config. Its maths is in the wing's numerics/, most
-often under the same name; numerics/ here is what all share. Systems never import each
-other. Maths of a wing does, of some wings and one way: MATHS_OF in tests/test_code.py.
+Each file has one LeafSystem and its config. Its maths is in the package's numerics/,
+usually under the same name; what all packages share is in systems/numerics/. Systems
+never import each other. Which packages may use whose numerics is in MATHS_OF in
+tests/test_code.py.
 """
 
 import sys

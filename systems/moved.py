@@ -1,6 +1,6 @@
-"""Modules under the names that they had before the wings: makebreak.systems.c3_mpc is
-makebreak.systems.contact_mpc.c3_mpc, and so on. What users wrote, exported tests among
-it, imports them so."""
+"""Former names of modules: makebreak.systems.c3_mpc is now
+makebreak.systems.contact_mpc.c3_mpc, and so on. Code of users, such as exported tests,
+may still import the former names."""
 
 import sys
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from importlib.machinery import ModuleSpec
 from importlib.util import spec_from_loader
 from types import ModuleType
 
-# Wing: the modules that stood in systems/, and in systems/numerics/.
+# {package: its modules that were in systems/}; _NUMERICS: in systems/numerics/.
 _SYSTEMS = {
     "contact_mpc": (
         "c3_mpc contact_sampler lcs_builder lcs_plant pivot_target push_goals "
@@ -75,8 +75,8 @@ MOVED |= {
 
 
 class FormerNames(MetaPathFinder, Loader):
-    """Gives the present module itself, so that nothing is there twice. It stands first
-    in sys.meta_path: below a former package others would load a second copy."""
+    """Imports the present module for a former name, so that there is only one copy of
+    it. It must be first in sys.meta_path: another finder would load a second copy."""
 
     def find_spec(
         self,

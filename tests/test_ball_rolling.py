@@ -11,16 +11,14 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.diagrams.ball_rolling import (
-    CONTROL,
-    ESTIMATE,
+from makebreak.diagrams.ball_rolling import CONTROL, ESTIMATE, make_ball_rolling
+from makebreak.diagrams.ball_rolling_config import (
     BallRollingConfig,
     LearnerConfig,
     PlannerConfig,
     believed,
     c3_config,
     learner_config,
-    make_ball_rolling,
     paper_learner_config,
     world_scene,
 )
@@ -28,8 +26,8 @@ from makebreak.diagrams.camera import CameraConfig
 from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.station import MODELS
 from makebreak.models.scene import load_scene
+from makebreak.scripts import rolling_score
 from makebreak.scripts.cli import main
-from makebreak.scripts.experiments import ball_rolling as experiment
 from makebreak.systems.baselines.dynamics_residual import DynamicsResidual
 from makebreak.systems.contact_mpc.numerics.ball_state import P_BALL, P_TIP, pack
 from makebreak.systems.contact_mpc.numerics.c3_projections import (
@@ -505,7 +503,7 @@ def test_scored_contact_force_is_drakes(faulty):
     log = SimpleNamespace(context=faulty.run.context)
     run = faulty.run
     plant = run.diagram.GetSubsystemByName("station").GetSubsystemByName("plant")
-    time, force = experiment.contact_truth(
+    time, force = rolling_score.contact_truth(
         config(radius_error_m=0.0), run.diagram, log, plant
     )
     assert force.max() > 0.2  # It pressed.
@@ -530,7 +528,7 @@ def circle(turns, n=2001, radius=0.1):
 
 @pytest.mark.parametrize("turns", [4.0, -3.0, 0.25])
 def test_progress_counts_full_turns_both_ways(turns):
-    progress = experiment.progress_of(circle(turns), (0.5, 0.0), 0.1)
+    progress = rolling_score.progress_of(circle(turns), (0.5, 0.0), 0.1)
     np.testing.assert_allclose(progress[[0, -1]], [0.0, 2.0 * np.pi * turns], atol=1e-9)
 
 
@@ -538,7 +536,7 @@ def test_angles_near_the_centre_are_no_progress():
     """A ball that goes around the centre of the circle has followed no path."""
     for radius, counted in ((0.04, 0.0), (0.06, 2.0), (0.14, 2.0), (0.16, 0.0)):
         p = circle(2.0, radius=radius)
-        progress = experiment.progress_of(p, (0.5, 0.0), 0.1)
+        progress = rolling_score.progress_of(p, (0.5, 0.0), 0.1)
         np.testing.assert_allclose(progress[-1], 2.0 * np.pi * counted, atol=1e-9)
 
 
@@ -551,11 +549,11 @@ def scored(
     n = len(p)
     one = np.ones((n, 1))
     time = np.linspace(0.0, t, n)
-    track = experiment.Track(
+    track = rolling_score.Track(
         time=time,
         p_ball=p,
         p_tip=p,
-        progress=experiment.progress_of(p, (0.5, 0.0), 0.1),
+        progress=rolling_score.progress_of(p, (0.5, 0.0), 0.1),
         error=np.broadcast_to(error, n),
         gap=np.broadcast_to(gap, n),
         gap_true=np.broadcast_to(gap_true, n),
@@ -567,7 +565,7 @@ def scored(
         log["loss"] = 2.0 * one
     force = np.broadcast_to(force, 5000)
     contact = np.arange(5000) * 1e-3, force
-    return experiment.score(config(adapt=adapt), log, track, contact)
+    return rolling_score.score(config(adapt=adapt), log, track, contact)
 
 
 def test_four_perfect_circles_score_as_such():
@@ -668,7 +666,7 @@ def test_true_gap_is_the_radius_error_where_the_estimate_is_right(diagram):
         gap=np.zeros((2, 1)),
         phase=np.zeros((2, 1)),
     )
-    track = experiment.ground_truth(config(radius_error_m=0.005), log, plant)
+    track = rolling_score.ground_truth(config(radius_error_m=0.005), log, plant)
     np.testing.assert_allclose(track.gap_true, [0.005, 0.007], atol=1e-12)
     np.testing.assert_allclose(track.p_ball[0], p_ball, atol=1e-15)
     np.testing.assert_allclose(track.error, 0.0, atol=1e-12)  # It starts on the path.

@@ -11,7 +11,7 @@ from pydrake.systems.primitives import (
 )
 from pydrake.systems.sensors import ImageRgba8U
 
-from makebreak.diagrams.ball_rolling import LEARN
+from makebreak.diagrams.ball_rolling_config import LEARN
 from makebreak.scripts import bench_latency
 from makebreak.scripts.bench_latency import (
     ENCODERS,

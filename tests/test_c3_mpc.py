@@ -27,22 +27,31 @@ from makebreak.scripts.bench_c3 import (
 from makebreak.systems.contact_mpc.c3_mpc import C3Config, C3Mpc, C3Status
 from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs, ContactPair
 from makebreak.systems.contact_mpc.lcs_plant import LcsPlant
+from makebreak.systems.contact_mpc.numerics.c3_admm import (
+    C3Failure,
+    compiled_once,
+    qp_step,
+)
+from makebreak.systems.contact_mpc.numerics.c3_bounds import (
+    CANNOT_BE_MET,
+    MET,
+    solve_active,
+    solve_bounded,
+    solve_interior,
+    within,
+)
 from makebreak.systems.contact_mpc.numerics.c3_mpc import (
     C3Bounds,
-    C3Failure,
     C3Options,
     C3Problem,
     C3Weights,
     OrientationWeight,
-    Plan,
-    WarmStart,
-    _qp_step,
-    compiled_once,
     plan_cost,
     solve_c3,
     warm_up,
     with_gap_residual,
 )
+from makebreak.systems.contact_mpc.numerics.c3_plan import Plan, WarmStart
 from makebreak.systems.contact_mpc.numerics.c3_polish import (
     backward,
     roll_out,
@@ -58,17 +67,7 @@ from makebreak.systems.contact_mpc.numerics.c3_projections import (
     project_qp,
     projection_matrices,
 )
-from makebreak.systems.contact_mpc.numerics.c3_qp import (
-    CANNOT_BE_MET,
-    MET,
-    factor,
-    new_factor,
-    solve,
-    solve_active,
-    solve_bounded,
-    solve_interior,
-    within,
-)
+from makebreak.systems.contact_mpc.numerics.c3_qp import factor, new_factor, solve
 from makebreak.systems.contact_mpc.numerics.lcp import solve_lcp
 from makebreak.systems.contact_mpc.numerics.lcs import (
     CLOSED,
@@ -128,7 +127,7 @@ def ball_lcs(n_f=4, eps_c=None, x=None):
 
 
 def random_qp(rng, bounded=False):
-    """A strictly convex linear-quadratic problem; see c3_qp.solve_bounded."""
+    """A strictly convex linear-quadratic problem; see c3_bounds.solve_bounded."""
     n_x, n_u, n_lam, N = rng.integers(1, 6), *rng.integers(1, 4, 2), rng.integers(1, 9)
     n_v, n = n_lam + n_u, n_x + n_lam + n_u
     A = rng.normal(size=(n_x, n_x))
@@ -839,7 +838,7 @@ def test_a_system_whose_contacts_change_rows_plans_as_if_they_had_not(projection
 def test_nothing_is_compiled_after_warm_up():
     problem = cartpole_problem(warm_start=True)
     warm_up(problem)
-    compiled = len(_qp_step.signatures)
+    compiled = len(qp_step.signatures)
     # Fortran order and a free lam_0: other layouts than those of the warm-up.
     lcs = LCS(
         **{k: np.asfortranarray(CARTPOLE[k]) for k in "ABDdEFc"},
@@ -848,7 +847,7 @@ def test_nothing_is_compiled_after_warm_up():
     )
     _, warm = solve_c3(lcs, CARTPOLE["x0"], np.zeros((6, 4), order="F"), problem)
     solve_c3(lcs, CARTPOLE["x0"], np.zeros((6, 4)), problem, warm)
-    assert len(_qp_step.signatures) == compiled
+    assert len(qp_step.signatures) == compiled
 
 
 @pytest.mark.parametrize(

@@ -251,7 +251,7 @@ class Recorder:
         self.x[path] = X.translation()[0]
 
 
-def test_believed_walls_are_shown_at_the_modelled_gap_plus_the_residual():
+def test_modelled_walls_are_shown_at_the_modelled_gap_plus_the_residual():
     builder, recorder = DiagramBuilder(), Recorder()
     config = WallsViewConfig(gap=[0.5, 0.2], tip_radius=0.02)
     view = builder.AddSystem(WallsView(config, recorder))
@@ -269,7 +269,7 @@ def test_a_meshcat_shows_cart_pole_and_walls():
     diagram = make_cartpole_walls(config, multibody=True, meshcat=meshcat)
     simulator = Simulator(diagram, start(diagram, initial_state(config)))
     simulator.AdvanceTo(0.05)
-    for path in ("/makebreak/believed_wall_1", "/drake/visualizer/cartpole/pole"):
+    for path in ("/makebreak/model_wall_1", "/drake/visualizer/cartpole/pole"):
         assert meshcat.HasPath(path), path
 
 

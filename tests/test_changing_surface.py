@@ -65,6 +65,7 @@ def made_up(decisions):
         "time": time,
         "ee_pose": np.column_stack([np.full(n, 0.42), y, np.zeros((n, 5))]),
         "phase": np.tile([1.0, 0, 0, 0, 0, 0], (n, 1)),
+        "force_directions": np.tile([0.0, 0, -1, 0, 0, 0], (n, 1)),
         "transition": np.zeros((n, 6)),
         "mode": np.ones((n, 1)),
         "confidence": np.tile([1.0, 0.0], (n, 1)),

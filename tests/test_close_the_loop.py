@@ -11,7 +11,7 @@ from effect_scenes import on_ground
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak import model_path
-from makebreak.diagrams.ball_rolling import BallRollingConfig, believed
+from makebreak.diagrams.ball_rolling_config import BallRollingConfig, believed
 from makebreak.diagrams.recorder import mean_until_next
 from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.station import BALL_ROLLING

@@ -406,6 +406,38 @@ def test_five_trials_learn_place_and_speed():
     np.testing.assert_allclose(contact.approach_speed * slope, 8.0, rtol=1e-9)
 
 
+def test_a_contact_tells_where_another_of_known_distance_is_until_it_is_felt(tmp_path):
+    top = ExpectedContact(
+        [0.6, 0.2, 0.09], 0.015**2 * np.eye(3), DOWN, segment=6,
+        known_from=(0, -0.06, 0.002),
+    )  # fmt: skip
+    wall = ExpectedContact([0.6, 0.2, 0.09], 0.015**2 * np.eye(3), RIGHT, segment=2,
+                           known_from=(0, 0.0, 0.002))  # fmt: skip
+    belief = ContactBelief((prior(0.02, 0.015), top, wall))
+    belief.save(tmp_path / "belief.json")
+    trial = Trial(ContactBelief.load(tmp_path / "belief.json"))
+    truth = np.array([0.5, 0.0, 0.01])
+    trial.walk(truth - 0.1 * DOWN, DOWN, 0.1, 1.0, 0)
+    trial.impact(truth, DOWN)
+    _, there, other = trial.belief().contacts
+    # The gain is 1 - (2.1/15)^2, so the estimate of 20 mm too much leaves 0.4 mm.
+    assert there.mean[2] == pytest.approx(0.01 + 0.06, abs=5e-4)
+    np.testing.assert_allclose(there.mean[:2], [0.6, 0.2], atol=1e-9)
+    sigma = spread_along(there.covariance, DOWN)
+    assert sigma == pytest.approx(np.hypot(0.002, 0.0007), rel=0.02)
+    assert spread_along(there.covariance, RIGHT) == pytest.approx(0.015, rel=1e-6)
+    assert there.seen == 0 and len(there.impacts) == 0  # Its stiffness is not known.
+    np.testing.assert_allclose(other.mean, wall.mean)  # Another direction.
+    # Once it was felt, its own position counts.
+    trial.walk([0.6, 0.2, 0.1], DOWN, 0.05, 0.6, 6)
+    trial.impact([0.6, 0.2, 0.0715], DOWN)
+    again = Trial(trial.belief())
+    again.walk(truth - 0.1 * DOWN, DOWN, 0.1, 1.0, 0)
+    before = again.belief().contacts[1]
+    again.impact(truth, DOWN)
+    np.testing.assert_array_equal(again.belief().contacts[1].mean, before.mean)
+
+
 def test_from_trial_to_trial_a_contact_that_was_felt_drifts():
     told, felt = prior(0.0, 1e-3), replace(prior(0.0, 1e-3), seen=1)
     first, second = Trial(ContactBelief((told, felt))).belief().contacts

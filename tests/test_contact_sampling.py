@@ -11,7 +11,11 @@ from pydrake.systems.primitives import ConstantVectorSource
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from makebreak.diagrams.push_object import PushPlannerConfig, c3_config, contact_pairs
+from makebreak.diagrams.push_object_config import (
+    PushPlannerConfig,
+    c3_config,
+    contact_pairs,
+)
 from makebreak.models.pushed_object import (
     PushedObject,
     make_tip_and_object,
@@ -33,10 +37,10 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
 )
 from makebreak.systems.contact_mpc.numerics.c3_mpc import (
     C3Problem,
-    WarmStart,
     plan_cost,
     solve_c3,
 )
+from makebreak.systems.contact_mpc.numerics.c3_plan import WarmStart
 from makebreak.systems.contact_mpc.numerics.contact_sampling import (
     ObjectShape,
     SamplingConfig,

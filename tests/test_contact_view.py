@@ -108,3 +108,12 @@ def test_the_legend_names_the_bars_where_there_are_bars():
     assert "bars: above 9 N" in texts
     plain = ContactView(ContactViewConfig(), Recorder()).legend
     assert len(plain) == len(texts) - 2
+
+
+def test_the_planned_path_is_drawn_before_anything_is_simulated():
+    meshcat = Meshcat()
+    pieces = [np.zeros((2, 3)), np.ones((60, 3))]
+    ContactView(ContactViewConfig(), meshcat, plan=pieces)
+    assert all(meshcat.HasPath(f"/makebreak/contact/plan/{k}") for k in (0, 1))
+    ContactView(ContactViewConfig(), meshcat)  # Another one takes it away.
+    assert not meshcat.HasPath("/makebreak/contact/plan")

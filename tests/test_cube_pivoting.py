@@ -9,8 +9,15 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.diagrams.cube_pivoting import (
-    FINGERS,
     LEGEND,
+    logged_forces,
+    make_cube_pivoting,
+    make_model,
+    start,
+    weights_of,
+)
+from makebreak.diagrams.cube_pivoting_config import (
+    FINGERS,
     SCENE,
     Cube,
     CubePivotingConfig,
@@ -18,13 +25,8 @@ from makebreak.diagrams.cube_pivoting import (
     PivotStart,
     contact_pairs,
     initial_state,
-    logged_forces,
-    make_cube_pivoting,
-    make_model,
     model_cube,
     scene_with,
-    start,
-    weights_of,
     world_cube,
 )
 from makebreak.models.model_files import MODELS

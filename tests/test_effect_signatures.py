@@ -552,7 +552,7 @@ def test_every_kind_is_complete(name):
     assert kind.confused_with and kind.tell_apart
     assert set(kind.confused_with) <= set(KINDS)
     assert set(kind.contains) <= set(KINDS)
-    assert (kind.rest_twist is not None) == kind.hidden_state
+    assert (kind.static_deflection is not None) == kind.hidden_state
 
 
 @pytest.mark.parametrize(

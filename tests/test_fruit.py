@@ -4,7 +4,11 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.diagrams.ball_rolling import BallRollingConfig, believed, world_scene
+from makebreak.diagrams.ball_rolling_config import (
+    BallRollingConfig,
+    believed,
+    world_scene,
+)
 from makebreak.diagrams.scene_facts import spheres_of
 from makebreak.models.fruit import FRUITS, fruit_sdf, make_fruit
 from makebreak.models.scene import load_scene

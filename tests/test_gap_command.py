@@ -10,7 +10,7 @@ import pytest
 from test_gap_report import made_by_hand, small_case
 
 from makebreak.scripts import cli
-from makebreak.scripts.gap_command import StageBar, effects_table
+from makebreak.scripts.gap_command import StageBar, effects_table, sidecars_beside
 
 
 @pytest.fixture(scope="module")
@@ -132,10 +132,28 @@ def test_the_bar_never_goes_back_and_is_full_only_at_the_end(capsys):
     assert shares()[-1] == 25
 
 
-def test_the_table_has_the_held_out_errors(case):
+def test_the_table_has_one_pair_of_held_out_errors(case):
     text = effects_table(case[2]).to_text()
     assert text.startswith("Gap named: joint p.j1 has Coulomb friction")
-    e = case[2].effects[0].evidence
+    gap = case[2].gap
+    pair = f"held-out error: {gap.before:.3g} before, {gap.after:.3g} after"
+    assert text.count(pair) == 1
     [row] = [r for r in text.splitlines() if r.startswith("joint_coulomb")]
-    assert f"{e.held_out_before:.4g}" in row and f"{e.held_out_after:.4g}" in row
     assert "coulomb 0.350 +- 0.010 N m" in row
+    assert row.endswith("joint_viscous_damping at p.j1, error 62 % larger")
+
+
+def test_a_sidecar_beside_the_scene_serves_a_log_without_its_own(tmp_path):
+    scene, log = tmp_path / "first" / "proposed_scene.yaml", tmp_path / "log.csv"
+    scene.parent.mkdir()
+    near = scene.with_name("log.yaml")
+    near.write_text("columns:\n  t: time\n")
+    scene.write_text("directives: []\n")
+    assert sidecars_beside(scene, [log]) == {log: near}
+    # Its own wins; a scene is no sidecar, nor is the given one.
+    log.with_suffix(".yaml").write_text("columns: {t: time}\n")
+    assert sidecars_beside(scene, [log]) == {}
+    log.with_suffix(".yaml").unlink()
+    near.write_text("directives: []\n")
+    assert sidecars_beside(scene, [log]) == {}
+    assert sidecars_beside(near, [log]) == {}

@@ -15,7 +15,12 @@ from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.recording import read_recordings
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.report.comparison import comparison_html, measured_state
-from makebreak.gap.report.files import extents_of, summary_lines, write_report
+from makebreak.gap.report.files import (
+    extents_of,
+    next_best,
+    summary_lines,
+    write_report,
+)
 from makebreak.gap.report.pictures import picture_of_series, picture_of_where
 from makebreak.gap.result import (
     Considered,
@@ -185,7 +190,47 @@ def test_the_page_stands_alone_and_says_it_first(case, tmp_path):
     assert "0.350 +- 0.010 N m" in first
     assert "Next best: joint_viscous_damping at p.j1, error 62 % larger." in first
     assert "It lags 4 ms." in text and "1 note Noise" in text
-    assert f"makebreak run --model {tmp_path / 'scene.yaml'}" in text
+    assert f"makebreak gap {tmp_path / 'scene.yaml'} {case[1]}" in text
+    # Only the model of a run is one that an experiment can be run with.
+    assert "makebreak run" not in text
+    write_report(
+        case[2], read_scene(case[0]), tmp_path, scene_path=tmp_path / "model.yaml"
+    )
+    page = text_of((tmp_path / "report.html").read_text())
+    assert f"makebreak run EXPERIMENT --model {tmp_path / 'scene.yaml'}" in page
+
+
+def test_stamps_that_count_from_a_date_are_shown_from_the_start(case, tmp_path):
+    scene_path, recording_path, made = case
+    [recording] = read_recordings([recording_path])
+    first = 1.7e9
+    dated = replace(recording, time=recording.time + first)
+    where = [
+        replace(w, from_s=w.from_s + first, to_s=w.to_s + first) for w in made.where
+    ]
+    series = [replace(s, time=s.time + first) for s in made.series]
+    result = replace(made, where=where, series=series)
+    pages = {}
+    for name, r, rec in (("plain", made, recording), ("dated", result, dated)):
+        write_report(r, read_scene(scene_path), tmp_path / name, [rec], scene_path)
+        pages[name] = text_of((tmp_path / name / "report.html").read_text())
+    note = " Times count from the start of a recording."
+    assert note in pages["dated"] and note not in pages["plain"]
+    again = pages["dated"].replace(note, "").replace("/dated/", "/plain/")
+    assert again.replace("/dated", "/plain") == pages["plain"]
+    written = json.loads((tmp_path / "dated" / "result.json").read_text())
+    assert written["where"][0]["from_s"] >= first  # As the recording has it.
+
+
+def test_the_next_best_is_said_with_its_error():
+    def words(margin):
+        return next_best(Evidence(9.0, 1.0, "payload at p.rod", margin))
+
+    assert words(0.62) == "payload at p.rod, error 62 % larger"
+    assert words(0.001) == words(-0.001) == "payload at p.rod, the same error"
+    assert words(-0.03).endswith(", error 3 % smaller: too little to prefer it")
+    assert words(np.nan) == "payload at p.rod"
+    assert next_best(Evidence(9.0, 1.0, "", np.nan)) == ""
 
 
 def test_the_files_are_those_of_the_design(case, tmp_path):
@@ -216,10 +261,12 @@ def test_a_tie_is_said_with_what_tells_it_apart(case, tmp_path):
     )
     result = replace(case[2], verdict="ambiguous", effects=[effect])
     text = text_of(written(case, tmp_path, result))
-    assert "These data cannot tell it from: " in text
+    assert "These data cannot distinguish it from: " in text
     assert "Joint p.j1 has 0.2 N m s/rad of viscous damping" in text
-    assert "To tell: Move the joint at two speeds" in text
-    assert "    to tell: move the joint at two speeds" in summary_lines(result)
+    assert "To distinguish them: Move the joint at two speeds" in text
+    assert "    to distinguish them: move the joint at two speeds" in summary_lines(
+        result
+    )
 
 
 def test_a_runner_up_that_is_ahead_is_said_to_be(case, tmp_path):
@@ -227,7 +274,7 @@ def test_a_runner_up_that_is_ahead_is_said_to_be(case, tmp_path):
     evidence = replace(case[2].effects[0].evidence, margin=-0.08)
     effect = replace(case[2].effects[0], evidence=evidence)
     text = text_of(written(case, tmp_path, replace(case[2], effects=[effect])))
-    assert "error 8 % smaller." in text
+    assert "error 8 % smaller: too little to prefer it." in text
 
 
 def test_no_gap_and_no_name_are_said_and_nothing_is_added(case, tmp_path):
@@ -317,18 +364,18 @@ def test_the_comparison_moves_all_three_and_says_what_is_shown(case):
     page = comparison_html(case[2], read_scene(case[0]), read_recordings([case[1]]))
     assert page is not None
     legend = text_of(page[page.index("position:fixed") :])
-    assert "measured" in legend and "with the effects added" in legend
+    assert "measured" in legend and "with the named effects" in legend
     [(start, end)] = re.findall(r"([\d.]+) - ([\d.]+) s of run, episode 0", legend)
     worst = max(case[2].where, key=lambda each: each.score)
     assert float(start) <= worst.from_s + 0.01 and worst.to_s <= float(end) + 0.01
-    assert "at 0.38 of real time" in legend  # 1.5 s in 4 s.
+    assert "at 0.38 times real time" in legend  # 1.5 s in 4 s.
 
 
 def test_without_an_effect_or_a_series_there_is_less_to_compare(case):
     recordings, scene = read_recordings([case[1]]), read_scene(case[0])
     alone = replace(case[2], effects=[], verdict="gap_unnamed")
     page = comparison_html(alone, scene, recordings)
-    assert page is not None and "with the effects added" not in page
+    assert page is not None and "with the named effects" not in page
     assert comparison_html(replace(case[2], series=[]), scene, recordings) is None
 
 

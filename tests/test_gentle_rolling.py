@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from makebreak.diagrams.ball_rolling import believed
+from makebreak.diagrams.ball_rolling_config import believed
 from makebreak.diagrams.gentle_rolling import (
     FELT,
     SEAM_Y,

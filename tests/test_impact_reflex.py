@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from makebreak.systems.changing_contact.impact_reflex import (
     ImpactReflex,
@@ -19,6 +20,7 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
 from makebreak.systems.changing_contact.numerics.impact_reflex import (
     N_MEMORY,
     ReflexLaw,
+    fastest_impact,
     tick,
 )
 
@@ -117,3 +119,27 @@ def test_nan_gives_no_reflex(which):
 def test_bad_numbers_are_refused_by_name(name):
     with pytest.raises(ValueError, match=f"{name} is -1.0"):
         ImpactReflex(ImpactReflexConfig(**{name: -1.0}))
+
+
+@pytest.mark.parametrize("stiffness", [5e3, 2e5])
+@pytest.mark.parametrize("rate", [0.0, 2e3, 5e4])
+def test_the_fastest_impact_has_just_the_force_that_is_allowed(stiffness, rate):
+    mass, delay, force = 5.0, 0.002, 8.0
+    v = fastest_impact(force, stiffness, mass, delay, rate)
+
+    def slope(t, x):
+        brake = rate * max(t - delay, 0.0)
+        return [x[1], -(stiffness * x[0] + brake) / mass]
+
+    half = np.pi * np.sqrt(mass / stiffness)
+    path = solve_ivp(slope, (0.0, half), [0.0, v], rtol=1e-9, atol=1e-14, max_step=1e-4)
+    # The peak between samples of solve_ivp is missed by less than 1e-4 of it.
+    assert stiffness * path.y[0].max() == pytest.approx(force, rel=1e-3)
+    unbraked = force / np.sqrt(stiffness * mass)
+    assert v >= unbraked * (1.0 - 1e-9) and (rate > 0.0 or v < unbraked * 1.001)
+
+
+def test_a_blow_that_is_over_before_the_arm_can_answer_is_not_braked():
+    # A quarter period of 1.6 ms is shorter than the delay.
+    v = fastest_impact(8.0, 5e6, 5.0, 0.002, 1e6)
+    assert v == pytest.approx(8.0 / np.sqrt(5e6 * 5.0), rel=1e-9)

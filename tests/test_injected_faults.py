@@ -15,11 +15,8 @@ from pydrake.systems.primitives import TrajectorySource, ZeroOrderHold
 from pydrake.systems.sensors import ImageRgba8U
 from pydrake.trajectories import PiecewisePolynomial
 
-from makebreak.diagrams.ball_rolling import (
-    BallRollingConfig,
-    make_ball_rolling,
-    make_world,
-)
+from makebreak.diagrams.ball_rolling import make_ball_rolling, make_world
+from makebreak.diagrams.ball_rolling_config import BallRollingConfig
 from makebreak.diagrams.camera import CameraConfig, camera_model
 from makebreak.diagrams.changing_contact import Knowledge
 from makebreak.diagrams.contact_learning import ContactLearningConfig, make_task
@@ -36,7 +33,15 @@ from makebreak.diagrams.station import (
 )
 from makebreak.scripts import cli
 from makebreak.scripts.contact_runs import rehearsed
-from makebreak.scripts.fault_trials import FAILED, HELD, RECOVERED, UNJUDGED, judge
+from makebreak.scripts.fault_trials import (
+    FAILED,
+    HELD,
+    RECOVERED,
+    UNJUDGED,
+    at_rest,
+    judge,
+)
+from makebreak.scripts.rolling_score import Track, speed_at_the_end
 from makebreak.scripts.session import Session
 from makebreak.systems.arm.impedance_controller import (
     ImpedanceConfig,
@@ -206,6 +211,23 @@ def test_lost_frames_leave_the_one_before():
     new = np.diff(half) > 0
     # Of 199 tosses of a coin: 99.5, standard deviation 7.
     assert 71 < new.sum() < 128
+
+
+def test_outside_a_fault_the_picture_of_the_moment_is_shown():
+    """Not that of the last frame's instant: with a fault that begins later a run goes
+    on as without it until then."""
+    late = LatePictures(8, 8, 2, 0.0, 0, 0.05, 0.1, 0.01)
+    simulator = Simulator(late)
+    context = simulator.get_mutable_context()
+    image = ImageRgba8U(8, 8)
+    # A frame of 30 ms is taken as the simulator goes on from there, with picture 31.
+    for time, shown in ((0.021, 21), (0.026, 26), (0.051, 31), (0.099, 71), (0.1, 100)):
+        for ms in range(round(1e3 * context.get_time()), round(1e3 * time)):
+            image.mutable_data[:] = ms + 1
+            late.GetInputPort("image").FixValue(context, Value(image))
+            simulator.AdvanceTo(1e-3 * (ms + 1))
+        got = int(late.GetOutputPort("rgb_image").Eval(context).data[0, 0, 0])
+        assert got == shown
 
 
 def test_a_second_ball_is_painted_where_it_would_be_seen():
@@ -473,6 +495,23 @@ def test_recovered_held_and_failed_are_told_apart():
     assert judge(fault, runs(slow, limits_kept=False), plain) == FAILED
     assert judge(fault, runs(slow, contact_force_peak_N=80.0), plain) == FAILED
     assert judge(fault, {"error": "exit status 3"}, plain) == FAILED
+
+
+def test_runs_that_were_held_and_came_to_rest_are_counted():
+    speeds = [0.004, 0.2, 0.0, float("nan")]
+    ended = [{"tip_speed_end_m_s": speed} for speed in speeds] + [{"error": "x"}]
+    assert at_rest(ended, [HELD, HELD, RECOVERED, HELD, FAILED]) == 1
+
+
+def test_speed_at_the_end_is_that_of_the_last_second_alone():
+    time = np.arange(0.0, 3.0, 0.0125)
+    p_tip = np.zeros((len(time), 3))
+    p_tip[:, 1] = np.where(time < 1.9, 5.0 * time, 9.5)  # At rest for 1.1 s.
+    nothing = np.zeros(len(time))
+    track = Track(time, p_tip, p_tip, *[nothing] * 6)
+    assert speed_at_the_end(track) == 0.0
+    track.p_tip[:, 0] = 0.3 * time
+    np.testing.assert_allclose(speed_at_the_end(track), 0.3, rtol=1e-12)
 
 
 def test_a_run_says_whether_its_limits_were_kept(tmp_path):

@@ -19,9 +19,11 @@ CONTACT = {
 }  # fmt: skip
 SENSORS = {"clock_skew", "joint_offset", "sensor_bias", "sensor_delay", "sensor_lag"}
 KNOWN = {
-    "diagrams/ball_rolling.py": {"contact_friction", "object_size"},
-    "diagrams/cube_pivoting.py": {"contact_friction", "object_mass", "object_size"},
-    "diagrams/push_object.py": {
+    "diagrams/ball_rolling_config.py": {"contact_friction", "object_size"},
+    "diagrams/cube_pivoting_config.py": {
+        "contact_friction", "object_mass", "object_size"
+    },
+    "diagrams/push_object_scenes.py": {
         "contact_friction", "object_com", "object_mass", "object_size"
     },
     "diagrams/realism.py": {"joint_offset", "plane_tilt"},

@@ -8,19 +8,20 @@ from drake import lcmt_panda_command
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.diagrams.ball_rolling import BallRollingConfig, make_ball_rolling
+from makebreak.diagrams.ball_rolling import make_ball_rolling
+from makebreak.diagrams.ball_rolling_config import BallRollingConfig
 from makebreak.diagrams.camera import CameraConfig
 from makebreak.diagrams.lcm_station import (
     COMMAND,
     COMMAND_PORT,
-    PICTURES_PORT,
+    IMAGES_PORT,
     STATUS,
     STATUS_PORT,
     TORQUE_MODE,
     Messages,
     empty_status,
     make_lcm_station,
-    no_pictures,
+    no_images,
 )
 from makebreak.diagrams.replay_station import joint_columns, make_replay_station
 from makebreak.diagrams.scene_facts import N_JOINTS
@@ -116,7 +117,7 @@ def test_messages_become_the_stations_signals_and_back():
         0, joint_velocity=[0.5] * 7, joint_torque_external=tau_external.tolist()
     )
     messages.fix(station, context, STATUS_PORT, status.encode())
-    messages.fix(station, context, PICTURES_PORT, no_pictures())
+    messages.fix(station, context, IMAGES_PORT, no_images())
     station.GetInputPort("delay").FixValue(context, [0.0])
     plant_context = arm.CreateDefaultContext()
     arm.SetPositions(plant_context, HOME)

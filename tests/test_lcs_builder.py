@@ -1045,8 +1045,13 @@ def test_a_compliant_contact_steps_as_drakes_point_contact(law):
     plant, _ = AddMultibodyPlantSceneGraph(builder, dt)
     Parser(plant).AddModelsFromString(DROPPED, "sdf")
     on_soft_ground(plant)
-    # TAMSI: Drake's only one of which the contact does not open as it slips.
-    plant.set_discrete_contact_approximation(DiscreteContactApproximation.kTamsi)
+    # TAMSI: Drake's only one whose contact does not open as it slips. Drake 1.58 has it
+    # no more; kLagged's does not open either, but its friction is that of the normal
+    # force before the step, so that only what is along the normal can be compared.
+    tamsi = getattr(DiscreteContactApproximation, "kTamsi", None)
+    plant.set_discrete_contact_approximation(
+        DiscreteContactApproximation.kLagged if tamsi is None else tamsi
+    )
     plant.set_contact_model(ContactModel.kPoint)
     plant.Finalize()
     diagram = builder.Build()
@@ -1066,8 +1071,10 @@ def test_a_compliant_contact_steps_as_drakes_point_contact(law):
         assert change > 5e-4
         # Drake's solver ends at 1e-4 of its stiction tolerance of 1e-4 m/s. Its force
         # acts in the middle of the overlap, ours on the surface: half of at most 2 %.
-        np.testing.assert_allclose(ours[3:], drakes[3:], atol=1e-6)
-        np.testing.assert_allclose(ours[:3], drakes[:3], rtol=0.01, atol=1e-9)
+        np.testing.assert_allclose(ours[5], drakes[5], atol=1e-6)
+        if tamsi is not None or slip == 0.0:
+            np.testing.assert_allclose(ours[3:5], drakes[3:5], atol=1e-6)
+            np.testing.assert_allclose(ours[:3], drakes[:3], rtol=0.01, atol=1e-9)
 
 
 # The nearest of many.

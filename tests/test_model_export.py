@@ -109,7 +109,7 @@ def test_a_urdf_has_what_the_repaired_scene_has(tmp_path):
     ]  # fmt: skip
     scene = replace(base, effects=[*base.effects, *more])
     exported = to_urdf(scene, "p")
-    assert exported.unsaid == ()
+    assert exported.omitted == ()
     assert 'friction="0.2"' in exported.text
     file = tmp_path / "again.urdf"
     file.write_text(exported.text)
@@ -133,11 +133,11 @@ def test_a_urdf_has_what_the_repaired_scene_has(tmp_path):
 
 def test_what_a_format_cannot_say_is_told(tmp_path):
     scene = with_effects(double(tmp_path), *SAID, LOST)
-    (said,) = to_mjcf(scene).unsaid
+    (said,) = to_mjcf(scene).omitted
     assert "square of its speed" in said and "0.1" in said
     # The double pendulum's file has no transmissions to write rotors to.
-    unsaid = to_urdf(scene, "d").unsaid
-    assert [("rotor" in each) for each in unsaid] == [False, True, True]
+    omitted = to_urdf(scene, "d").omitted
+    assert [("rotor" in each) for each in omitted] == [False, True, True]
     with pytest.raises(ValueError, match="b.box: only mechanisms"):
         to_mjcf(on_ground(tmp_path, "cube"))
     with pytest.raises(ValueError, match="'q' comes from no URDF"):

@@ -16,12 +16,15 @@ from makebreak.diagrams.multiple_collisions import (
     make_multiple_collisions,
     make_pattern,
     make_task,
+    with_known_height,
 )
 from makebreak.diagrams.realism import StationErrors
 from makebreak.diagrams.tabletop import tool_half_width
 from makebreak.scripts.experiments import multiple_collisions
 from makebreak.scripts.experiments.multiple_collisions import (
     CollisionTrial,
+    creeping_distances,
+    extra_time_bound,
     scored,
     summary,
 )
@@ -61,10 +64,10 @@ def test_the_pattern_ends_in_four_contacts_and_one_loss(tool):
 
 
 def test_surfaces_frictions_and_estimates_vary_by_seed_within_their_bounds():
-    nominal = make_task(MultipleCollisionsConfig(seed=0))
+    nominal = make_task(MultipleCollisionsConfig(known_heights=False))
     seen = []
     for seed in range(20):
-        config = MultipleCollisionsConfig(seed=seed)
+        config = MultipleCollisionsConfig(seed=seed, known_heights=False)
         task = make_task(config)
         assert abs(task.truth - nominal.truth).max() <= 2.0 * SPREAD
         # The top of the red block moves with the table that it stands on.
@@ -85,6 +88,52 @@ def test_surfaces_frictions_and_estimates_vary_by_seed_within_their_bounds():
     np.testing.assert_array_equal(
         make_task(MultipleCollisionsConfig()).truth, nominal.truth
     )
+
+
+def test_a_known_height_narrows_both_regions_and_they_still_hold_the_surfaces():
+    narrower = []
+    for seed in range(100):
+        plain, task = (
+            make_task(MultipleCollisionsConfig(seed=seed, known_heights=known))
+            for known in (False, True)
+        )
+        np.testing.assert_array_equal(task.truth, plain.truth)
+        for i, (d, *_) in enumerate(IMPACTS):
+            c, before = task.prior.contacts[i], plain.prior.contacts[i]
+            sigma = np.sqrt(d @ c.covariance @ d)
+            assert abs(c.mean @ d - task.truth[i]) <= 2.0 * sigma + 1e-12
+            if i in (1, 2):  # Sideways nothing is known of one from another.
+                np.testing.assert_array_equal(c.mean, before.mean)
+            narrower.append(sigma / np.sqrt(d @ before.covariance @ d))
+        assert task.prior.contacts[3].known_from[:2] == (0.0, pytest.approx(-0.06))
+    table = np.array(narrower).reshape(-1, 4)[:, 0]
+    # Two ranges of 6 cm about two uniform estimates overlap by 4 cm on average; the
+    # height's tolerance adds up to 4 mm.
+    assert 0.63 < table.mean() < 0.74
+
+
+def test_estimates_that_contradict_a_known_height_stay_as_they_are():
+    contacts = make_task(MultipleCollisionsConfig(known_heights=False)).prior.contacts
+    wrong = with_known_height(list(contacts), -0.2, 0.03)
+    for a, b in zip(contacts, wrong, strict=True):
+        np.testing.assert_array_equal(a.mean, b.mean)
+        np.testing.assert_array_equal(a.covariance, b.covariance)
+
+
+def test_the_bound_of_the_extra_time_is_that_of_creeping_at_the_fastest_impacts():
+    config = MultipleCollisionsConfig(seed=100)
+    task = make_task(config)
+    far = creeping_distances(task)
+    # From the nearest end of the range of errors to the surface.
+    c, (d, *_) = task.prior.contacts[1], IMPACTS[1]
+    assert far[1] == pytest.approx(0.03 - (c.mean @ d - task.truth[1]), abs=1e-9)
+    bound, speeds = extra_time_bound(task, config)
+    assert bound == pytest.approx(np.sum(far * (1.0 / speeds - 1.0 / config.speed)))
+    # 10 N at 2e5 N/m and 3 to 8 kg without any braking: 8 to 13 mm/s; with it more.
+    assert np.all(speeds > 0.008) and np.all(speeds < 0.02)
+    soft = replace(config, stiffness=[2e4, 2e4])
+    soft.control.anticipator.speed.stiffness_most = 2e4
+    assert np.all(extra_time_bound(task, soft)[1] > speeds)
 
 
 def test_the_model_does_not_know_where_the_world_is(task):

@@ -24,13 +24,12 @@ from makebreak.models.pushed_object import (
     seen_parts,
 )
 from makebreak.models.scene import load_scene, read_scene
+from makebreak.systems.perception.numerics.aruco_marker import find_marker
 from makebreak.systems.perception.numerics.ball_tracker import strength_weights
+from makebreak.systems.perception.numerics.object_outline import make_shape, nearest_yaw
 from makebreak.systems.perception.numerics.pose_tracker import (
     MIN_SEEN,
-    find_marker,
     find_pose,
-    make_shape,
-    nearest_yaw,
     rolling_turn,
 )
 from makebreak.systems.perception.pose_tracker import (

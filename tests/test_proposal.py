@@ -173,6 +173,12 @@ def test_gap_runs_on_a_robot_and_a_strangers_log(robot_and_log, tmp_path):
     assert [e["kind"] for e in result["effects"]] == ["actuator_gain"]
     assert (out / "proposed_scene.yaml").is_file() and (out / "log.yaml").is_file()
     assert sorted(folder.iterdir()) == before
+    # The report's own command is the one that was given; the proposal's also runs.
+    page = (out / "report.html").read_text()
+    assert f"makebreak gap {robot} {log} --out {out}" in page
+    assert ".unfinished" not in page
+    again = ["gap", str(out / "proposed_scene.yaml"), str(log), "--jobs", "1"]
+    assert main([*again, "--out", str(tmp_path / "again")]) == 0
 
 
 def test_a_log_or_a_robot_that_tells_nothing_is_refused(

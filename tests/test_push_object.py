@@ -18,8 +18,10 @@ from makebreak.diagrams.push_object import (
     PUSH_OBJECT,
     PushModelConfig,
     PushObjectConfig,
-    believed_object,
     make_push_object,
+)
+from makebreak.diagrams.push_object_scenes import (
+    model_object,
     model_scene,
     poses_of,
     world_scene,
@@ -393,8 +395,8 @@ def test_all_contacts_of_some_bodies_count_and_none_among_themselves():
 
 def test_errors_change_the_model_and_leave_the_world_alone():
     wrong = PushModelConfig(friction=0.25, scale=1.1, mass=0.9, com_offset=[0.015, 0.0])
-    spec, friction = believed_object(PushObjectConfig(model=wrong))
-    right, _ = believed_object(PushObjectConfig())
+    spec, friction = model_object(PushObjectConfig(model=wrong))
+    right, _ = model_object(PushObjectConfig())
     assert friction == 0.25 and spec.scale == 1.1 and spec.com_offset == [0.015, 0.0]
     assert spec.mass == pytest.approx(0.9 * right.mass)
     scene = world_scene(PushObjectConfig(model=wrong))
@@ -408,11 +410,11 @@ def test_controllers_know_no_effect_of_the_world(tmp_path):
     scene.effects.append(Effect("joint_coulomb_friction", [joint], {"coulomb": 3.0}))
     write_scene(scene, tmp_path / "world.scene.yaml")
     config = PushObjectConfig(scene=str(tmp_path / "world.scene.yaml"))
-    of_world, believed = world_scene(config).effects, model_scene(config, "o.sdf", POSE)
+    of_world, modelled = world_scene(config).effects, model_scene(config, "o.sdf", POSE)
     assert [effect.kind for effect in of_world] == [
         "joint_coulomb_friction", "contact_friction", "contact_friction",
     ]  # fmt: skip
-    kinds = [effect.kind for effect in believed.effects]
+    kinds = [effect.kind for effect in modelled.effects]
     assert kinds == ["contact_friction", "contact_friction"]
     # Unless they are told.
     config.model.scene = config.scene

@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.diagrams import push_object as diagrams
 from makebreak.diagrams.camera import CameraConfig
 from makebreak.diagrams.push_object import (
     PushModelConfig,
     PushObjectConfig,
-    believed_object,
     make_push_object,
+)
+from makebreak.diagrams.push_object_config import past_config
+from makebreak.diagrams.push_object_scenes import (
+    model_object,
     model_scene,
     outline_fold,
-    past_config,
     poses_of,
 )
 from makebreak.models.pushed_object import PushedObject, object_inertia, object_sdf
@@ -176,7 +177,7 @@ def test_model_scene_is_what_the_controllers_believe(name, tmp_path):
     write_scene(model_scene(config, path, POSE), tmp_path / "model.yaml")
     loaded = load_scene(read_scene(tmp_path / "model.yaml"), DiagramBuilder())
     body = loaded.plant.GetBodyByName("object")
-    spec, friction = believed_object(config)
+    spec, friction = model_object(config)
     np.testing.assert_allclose(
         body.default_spatial_inertia().CopyToFullMatrix6(),
         object_inertia(spec).CopyToFullMatrix6(),
@@ -358,7 +359,7 @@ def test_only_what_is_wrong_is_an_effect_of_the_model(tmp_path):
     config = replace(PushObjectConfig(), model=PushModelConfig(mass=2.0))
     kinds = [e.kind for e in model_scene(config, tmp_path / "object.sdf", POSE).effects]
     assert kinds.count("object_mass") == 1
-    assert diagrams.believed_object(config)[0].mass == pytest.approx(0.8)
+    assert model_object(config)[0].mass == pytest.approx(0.8)
 
 
 def test_model_is_no_scene_here_and_says_so(capsys, tmp_path):

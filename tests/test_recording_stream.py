@@ -82,6 +82,61 @@ def test_a_killed_run_loses_a_second_at_most(tmp_path):
     assert read_recording(out / "killed" / "recording.csv").time[-1] == t[-1]
 
 
+ROW_SEC = 0.0125  # Of ball_rolling's recording, and its samples.
+
+# ball_rolling, which says the clock and its simulated time at each sample.
+ROLL = """
+import os, sys
+from pathlib import Path
+from time import monotonic
+from makebreak.diagrams.ball_rolling import BallRollingConfig, make_ball_rolling
+from makebreak.diagrams.camera import CameraConfig
+from makebreak.scripts.session import Session
+
+def say(t, sample):
+    os.write(1, f"{monotonic()!r} {t!r}\\n".encode())
+
+with Session(Path(sys.argv[1]), realtime=1.0, progress=False) as session:
+    config = BallRollingConfig(camera=CameraConfig(renderer="drawn"))
+    diagram = make_ball_rolling(config)
+    tau = diagram.GetSubsystemByName("impedance_controller").GetOutputPort("tau")
+    session.simulate(diagram, 60.0, {"tau": tau}, until=say)
+"""
+
+
+@pytest.mark.slow
+def test_ball_rolling_that_is_killed_at_ten_random_moments_loses_a_second(tmp_path):
+    script = tmp_path / "roll.py"
+    script.write_text(ROLL)
+    moments = np.random.default_rng(0).uniform(2.0, 8.0, 10)
+    for k, moment in enumerate(moments):
+        out = tmp_path / f"out_{k}"
+        process = subprocess.Popen(
+            [sys.executable, str(script), str(out)], stdout=subprocess.PIPE, text=True
+        )
+        assert process.stdout is not None
+        said = []
+        try:
+            while not said or time.monotonic() < said[0][0] + moment:
+                line = process.stdout.readline()
+                assert line, "it ended by itself"
+                said.append([float(number) for number in line.split()])
+        finally:
+            process.send_signal(signal.SIGKILL)
+            rest = process.communicate()[0]
+        clock, simulated = np.array(
+            said + [[float(n) for n in s.split()] for s in rest.splitlines()]
+        ).T
+        recording = read_recording(out / ".unfinished" / "recording.csv")
+        np.testing.assert_allclose(np.diff(recording.time), ROW_SEC, atol=1e-9)
+        # At the sample of the last writing two rows were not yet whole. It had ended
+        # when the next one was said. From then on a second may pass until one sample,
+        # the last, begins to write again: whatever else the machine does.
+        written = np.searchsorted(simulated, recording.time[-1] + 2 * ROW_SEC - 1e-6)
+        later = clock[written + 1 : -1]
+        assert len(later) == 0 or later[-1] - later[0] < 1.0
+
+
 def test_what_was_streamed_is_what_is_written_at_the_end(tmp_path, monkeypatch):
     monkeypatch.setattr(recording_stream, "EVERY_SEC", 0.0)  # At each sample.
     scope: dict = {}

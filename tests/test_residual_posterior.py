@@ -8,7 +8,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from test_residual_learner import PUSH, Script, point_mass
 
-from makebreak.diagrams.ball_rolling import (
+from makebreak.diagrams.ball_rolling_config import (
     LEARN,
     LearnerConfig,
     learner_config,

@@ -8,7 +8,8 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from makebreak.diagrams.ball_rolling import BallRollingConfig, make_ball_rolling
+from makebreak.diagrams.ball_rolling import make_ball_rolling
+from makebreak.diagrams.ball_rolling_config import BallRollingConfig
 from makebreak.diagrams.camera import CameraConfig
 from makebreak.diagrams.gentle_rolling import GentleRollingConfig, ball_config
 from makebreak.diagrams.sampled_contacts import (

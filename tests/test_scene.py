@@ -6,6 +6,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.diagrams.station import BALL_ROLLING
+from makebreak.models import scene_schema
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.models.model_files import MODELS
@@ -272,6 +273,15 @@ def test_bad_scene_files_are_refused_in_one_line(tmp_path, text, words):
     with pytest.raises(ValueError, match=words) as error:
         load_scene(tmp_path / "bad.yaml", DiagramBuilder())
     assert "\n" not in str(error.value)
+
+
+def test_approximation_that_drake_no_longer_has_is_refused(ball_scene, monkeypatch):
+    """As with Drake 1.58, whose DiscreteContactApproximation has no kTamsi."""
+    section = replace(ball_scene.plant, discrete_contact_approximation="tamsi")
+    scene = replace(ball_scene, plant=section)
+    monkeypatch.setattr(scene_schema, "DiscreteContactApproximation", object)
+    with pytest.raises(ValueError, match="got tamsi, which Drake 1.58 no longer has"):
+        load_scene(scene, DiagramBuilder())
 
 
 def test_each_episode_of_a_recording_may_start_from_its_own_state(tmp_path):

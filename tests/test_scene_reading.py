@@ -11,7 +11,7 @@ from pydrake.systems.framework import DiagramBuilder
 from makebreak.models.scene import load_scene, read_scene
 from makebreak.models.scene_reader import give_packages
 from makebreak.models.scene_schema import LEAST_STEP
-from makebreak.models.typed_yaml import MOST_DEEP, load_yaml
+from makebreak.models.typed_yaml import DEPTH_MAX, load_yaml
 
 INERTIAL = """<inertial><origin xyz="0 0 -0.3"/><mass value="{mass}"/><inertia
  ixx="{i}" iyy="{i}" izz="{izz}" ixy="0" ixz="0" iyz="0"/></inertial>"""
@@ -238,7 +238,7 @@ def test_a_wrong_package_option_is_refused(given):
 def test_tags_of_rotations_and_small_numbers_are_read():
     value = load_yaml("a: !Rpy {deg: [1, 2, 3]}\nb: 1e-3")
     assert value == {"a": {"_tag": "!Rpy", "deg": [1, 2, 3]}, "b": "1e-3"}
-    np.testing.assert_equal(len(load_yaml("[" * MOST_DEEP + "]" * MOST_DEEP)), 1)
+    np.testing.assert_equal(len(load_yaml("[" * DEPTH_MAX + "]" * DEPTH_MAX)), 1)
 
 
 def test_aliases_that_would_fill_the_memory_are_refused():

@@ -9,9 +9,11 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.markers import Marker
 
 ROOT = Path(__file__).resolve().parent.parent
 ROOMS = ("models", "systems", "diagrams", "gap", "scripts")
+LOCKS = {"1.51": "requirements.lock", "1.58": "requirements-drake-1.58.lock"}
 
 # Answers like a Python that lacks nothing. Each call is a line of calls.txt; a file
 # `fail` makes pip fail with that output, a file `kill` kills the set-up in pip.
@@ -30,6 +32,7 @@ case "$1 ${2:-}" in
         ;;
     "-m pip")
         echo pip >>"$here/calls.txt"
+        echo "$*" >>"$here/pip.txt"
         if [[ -e "$here/kill" ]]; then kill -KILL $PPID; exit 1; fi
         if [[ -e "$here/fail" ]]; then cat "$here/fail"; exit 1; fi
         ;;
@@ -54,7 +57,7 @@ class Checkout:
         (folder / "scripts").mkdir()
         for name in ("setup.sh", "run.sh", "test.sh"):
             shutil.copy(ROOT / "scripts" / name, folder / "scripts" / name)
-        for name in ("pyproject.toml", "requirements.lock"):
+        for name in ("pyproject.toml", *LOCKS.values()):
             shutil.copy(ROOT / name, folder / name)
         python = self.tools / "python"
         python.write_text(STAND_IN)
@@ -150,6 +153,59 @@ def test_unsuitable_python_is_refused_by_version(checkout):
     assert done.returncode == 4
     assert "is Python 3.9, expected 3.10 to 3.14" in done.stderr
     assert checkout.calls() == []
+
+
+def test_newer_drake_is_installed_when_asked_for_and_kept_until_another_is(checkout):
+    def installed():
+        path = checkout.tools / "pip.txt"
+        lines = path.read_text().splitlines() if path.exists() else []
+        path.unlink(missing_ok=True)
+        return [name for line in lines for name in LOCKS.values() if f"/{name}" in line]
+
+    assert checkout("setup.sh", MAKEBREAK_DRAKE="1.58").returncode == 0
+    assert installed() == [LOCKS["1.58"]]
+    assert checkout("setup.sh").returncode == 0
+    assert installed() == []
+    assert checkout("setup.sh", MAKEBREAK_DRAKE="1.51").returncode == 0
+    assert installed() == [LOCKS["1.51"]]
+    assert checkout("setup.sh").returncode == 0
+    assert installed() == []
+
+
+@pytest.mark.parametrize(
+    ("drake", "python", "says"),
+    [
+        ("1.58", "3.11", "is Python 3.11, expected 3.12 to 3.14 (for Drake 1.58)"),
+        ("1.58", "3.15", "is Python 3.15, expected 3.12 to 3.14"),
+        ("1.57", "3.12", "MAKEBREAK_DRAKE is 1.57, expected 1.51 or 1.58"),
+    ],
+)
+def test_drake_that_cannot_be_installed_is_refused(checkout, drake, python, says):
+    done = checkout("setup.sh", MAKEBREAK_DRAKE=drake, STAND_IN_VERSION=python)
+    assert done.returncode == 4
+    assert says in done.stderr
+    assert checkout.calls() == []
+
+
+def test_lock_files_differ_in_drake_alone():
+    """On Python 3.12, which both are for; so that a difference between two
+    environments can only come from Drake."""
+
+    def pins(name):
+        found = {}
+        for line in (ROOT / name).read_text().splitlines():
+            pin, _, marker = line.partition(";")
+            environment = {"python_full_version": "3.12.0", "python_version": "3.12"}
+            if not pin.strip() or pin.startswith("#"):
+                continue
+            if not marker or Marker(marker).evaluate(environment):
+                package, _, version = pin.strip().partition("==")
+                found[package] = version
+        return found
+
+    old, new = pins(LOCKS["1.51"]), pins(LOCKS["1.58"])
+    assert (old.pop("drake"), new.pop("drake")) == ("1.51.1", "1.58.0")
+    assert old == new
 
 
 APT_GET = r"""#!/bin/bash

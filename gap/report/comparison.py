@@ -22,6 +22,7 @@ from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context, DiagramBuilder
 
 from makebreak.gap.data.recording import Episode, Recording
+from makebreak.gap.report.clock import zero_of
 from makebreak.gap.result import GapResult, Series
 from makebreak.gap.simulation.scene_simulation import Commands, SceneSimulation
 from makebreak.models.effects.kind import full_name, one_dof_joints
@@ -101,7 +102,9 @@ def comparison_html(
     slow = max(1.0, _SHOWN_SEC / (end - start))
     _draw(meshcat, loaded, motions, slow)
     page = meshcat.StaticHtml()
-    where = f"{start:.2f} - {end:.2f} s of {recording.name}, episode {episode.number}"
+    zero = zero_of(float(recording.time[0]))
+    where = f"{start - zero:.2f} - {end - zero:.2f} s of {recording.name}, "
+    where += f"episode {episode.number}"
     return _with_legend(page, list(scenes), where, slow)
 
 
@@ -269,6 +272,7 @@ def _draw(
     start = next(iter(motions.values())).time[0]
     meshcat.SetProperty("/Background", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
+    meshcat.SetProperty("/Grid", "visible", False)  # From below it hides what moves.
     meshcat.StartRecording(
         frames_per_second=_FRAMES / _SHOWN_SEC, set_visualizations_while_recording=False
     )
@@ -405,7 +409,7 @@ def _path(name: str) -> str:
 
 
 def _with_legend(page: str, models: Sequence[str], where: str, slow: float) -> str:
-    says = {"before": "the model as it came", "after": "with the effects added"}
+    says = {"before": "the given model", "after": "with the named effects"}
 
     def dot(who: str) -> str:
         c = _COLOURS[who]
@@ -414,7 +418,7 @@ def _with_legend(page: str, models: Sequence[str], where: str, slow: float) -> s
 
     lines = [f"{dot('measured')} measured"]
     lines += [f"{dot(who)} {who}: {says[who]}" for who in models]
-    pace = "" if slow == 1.0 else f", at {1.0 / slow:.2g} of real time"
+    pace = "" if slow == 1.0 else f", at {1.0 / slow:.2g} times real time"
     lines.append(f"{where}{pace}. All start from the measured state.")
     box = (
         '<div style="position:fixed;left:14px;top:12px;z-index:10;padding:8px 12px;'

@@ -14,13 +14,14 @@ from matplotlib.figure import Figure
 
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.recording import Recording
+from makebreak.gap.report.clock import zero_of
 from makebreak.gap.report.pictures import (
     picture_of_channels,
     picture_of_series,
     picture_of_trust,
     picture_of_where,
 )
-from makebreak.gap.result import GapResult, NamedEffect, Where
+from makebreak.gap.result import Evidence, GapResult, NamedEffect, Where
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sentence, with_deviation
 from makebreak.models.scene import Scene
@@ -58,10 +59,12 @@ def write_report(
     Raises: ValueError where they cannot be written.
     """
     out, place = Path(out_dir), Path(out_dir if place is None else place)
+    zeros = zeros_of(recordings)
+    shown = from_zero(result, zeros)
     pictures = {
         "channels": picture_of_channels(result) if result.gap.per_channel else None,
-        "where": picture_of_where(result, extents_of(recordings)),
-        "series": picture_of_series(result.series),
+        "where": picture_of_where(shown, extents_of(recordings)),
+        "series": picture_of_series(shown.series),
         "trust": picture_of_trust(result),
     }
     drawn = {name: _png(each) for name, each in pictures.items() if each is not None}
@@ -82,7 +85,7 @@ def write_report(
                 _scene_heading(result, scene_path), place,
             )  # fmt: skip
         page = report_html(
-            result, drawn, place, scene_path, recordings, comparison is not None
+            shown, drawn, place, scene_path, recordings, comparison is not None
         )
         _write(out / "report.html", page)
         # What would be missed least comes last, should the disk be full.
@@ -108,14 +111,33 @@ def _write(path: Path, content: str | bytes) -> None:
         raise
 
 
+def zeros_of(recordings: Sequence[Recording]) -> dict[str, float]:
+    """{recording: the stamp [s] that its times are shown from}: see `zero_of`."""
+    return {each.name: zero_of(float(each.time[0])) for each in recordings}
+
+
+def from_zero(result: GapResult, zeros: Mapping[str, float]) -> GapResult:
+    """The result with the times that a reader sees counted from `zeros`."""
+    where = [
+        replace(w, from_s=w.from_s - zero, to_s=w.to_s - zero)
+        for w in result.where
+        for zero in (zeros.get(w.recording, 0.0),)
+    ]
+    series = [
+        replace(s, time=s.time - zeros.get(s.recording, 0.0)) for s in result.series
+    ]
+    return replace(result, where=where, series=series)
+
+
 def extents_of(
     recordings: Sequence[Recording],
 ) -> dict[tuple[str, int], tuple[float, float]]:
-    """{(recording, episode): (first, last time) [s]}, in their order."""
+    """{(recording, episode): (first, last time) [s] as shown}, in their order."""
     found: dict[tuple[str, int], tuple[float, float]] = {}
     for recording in recordings:
+        zero = zero_of(float(recording.time[0]))
         for episode in recording.episodes:
-            time = recording.time[episode.rows]
+            time = recording.time[episode.rows] - zero
             key = (recording.name, episode.number)
             low, high = found.get(key, (np.inf, -np.inf))
             found[key] = (min(low, float(time[0])), max(high, float(time[-1])))
@@ -132,7 +154,7 @@ def summary_lines(result: GapResult) -> list[str]:
         for other in each.indistinguishable_from:
             lines.append(f"    or: {_says(other)}")
         if each.tell_apart:
-            lines.append(f"    to tell: {each.tell_apart}")
+            lines.append(f"    to distinguish them: {each.tell_apart}")
     return lines
 
 
@@ -181,7 +203,7 @@ def report_html(
         "</div></div>",
     ]
     sections = [
-        _where(result, pictures),
+        _where(result, pictures, recordings),
         _series(result, pictures),
         _in_units(result),
         _trust(result, pictures),
@@ -213,8 +235,8 @@ def _doubts(result: GapResult) -> str:
         return ""
     items = "".join(f"<li>{_text(says)}</li>" for says, _ in found[:4])
     return (
-        '<div class="doubt"><b>Correct the data first:</b> what is said above rests '
-        f"on it.<ul>{items}</ul></div>"
+        '<div class="doubt"><b>Correct the data first:</b> the result depends on '
+        f"them.<ul>{items}</ul></div>"
     )
 
 
@@ -224,15 +246,8 @@ def _effect(each: NamedEffect, result: GapResult, i: int) -> str:
         value = _text(with_deviation(p.value, p.std, p.or_more))
         rows += f"<tr><td>{escape(name)}</td><td class=n>{value}</td>"
         rows += f"<td>{escape(p.unit)}</td></tr>"
-    e = each.evidence
-    share = _share(e.held_out_before, e.held_out_after, result.gap.noise_floor)
-    sure = f"It closes {share} of the gap that is there without it." if share else ""
-    if e.runner_up:
-        sure += f" Next best: {escape(e.runner_up)}"
-        if np.isfinite(e.margin):
-            size = "larger" if e.margin >= 0.0 else "smaller"
-            sure += f", error {100.0 * abs(e.margin):.0f} % {size}"
-        sure += "."
+    other = next_best(each.evidence)
+    sure = f"Next best: {escape(other)}." if other else ""
     if each.identifiable == "weak":
         sure += " It is only weakly identifiable from these data."
     elif each.identifiable == "not":
@@ -249,13 +264,25 @@ def _effect(each: NamedEffect, result: GapResult, i: int) -> str:
     )
 
 
+def next_best(evidence: Evidence) -> str:
+    """The best other explanation and its error, beside that of the effect."""
+    if not evidence.runner_up or not np.isfinite(evidence.margin):
+        return evidence.runner_up
+    percent = round(100.0 * abs(evidence.margin))
+    if percent == 0:
+        return f"{evidence.runner_up}, the same error"
+    if evidence.margin > 0.0:
+        return f"{evidence.runner_up}, error {percent} % larger"
+    return f"{evidence.runner_up}, error {percent} % smaller: too little to prefer it"
+
+
 def _ties(each: NamedEffect) -> str:
     if not each.indistinguishable_from:
         return ""
     others = "".join(f"<li>{_text(_says(o))}</li>" for o in each.indistinguishable_from)
-    tell = f"<p><b>To tell:</b> {_text(each.tell_apart)}</p>"
+    tell = f"<p><b>To distinguish them:</b> {_text(each.tell_apart)}</p>"
     return (
-        '<div class="tie"><b>These data cannot tell it from:</b>'
+        '<div class="tie"><b>These data cannot distinguish it from:</b>'
         f"<ul>{others}</ul>{tell if each.tell_apart else ''}</div>"
     )
 
@@ -265,12 +292,12 @@ def _no_effect(result: GapResult) -> str:
         says = "The model explains the recording to within its noise and the stated "
         says += "tolerance of the model. Nothing was added to the scene."
     elif result.verdict == "not_judged":
-        says = "What was compared agrees, to within its noise and the stated tolerance "
-        says += "of the model; some channels were not compared (below). Nothing was "
-        says += "added to the scene."
+        says = "The channels that were compared agree, to within their noise and the "
+        says += "stated tolerance of the model. Some channels were not compared "
+        says += "(below). Nothing was added to the scene."
     else:
-        says = "No kind of effect in the catalogue explains what is left, so none is "
-        says += "named and the scene is as it was. Where it occurs, and what it "
+        says = "No effect of the catalogue explains the remaining error, so none is "
+        says += "named and the scene is unchanged. Where the error is, and what it "
         says += "correlates with:"
     items = "".join(
         f"<li>{escape(_left(each))}</li>" for each in result.unexplained[:4]
@@ -319,7 +346,7 @@ def windows_of(result: GapResult) -> str:
 # ----- Below it
 
 
-def _where(result: GapResult, pictures) -> str:
+def _where(result: GapResult, pictures, recordings) -> str:
     if not result.where:
         return ""
     groups: dict[tuple[str, str], list[Where]] = {}
@@ -336,11 +363,14 @@ def _where(result: GapResult, pictures) -> str:
         ]
         for (channel, region), found in groups.items()
     ]
-    heads = ["channel", "while", "together", "worst error / noise", "there"]
+    heads = ["channel", "while", "in total", "largest error / noise", "where that is"]
     table = _table(heads, rows, most=6)
+    clock = ""
+    if any(zeros_of(recordings).values()):
+        clock = " Times count from the start of a recording."
     note = (
         '<p class="small">Coloured: windows whose error is significantly larger than '
-        "the noise. Grey: no significant error, or nothing was measured.</p>"
+        f"the noise. Grey: no significant error, or nothing was measured.{clock}</p>"
     )
     picture = _image(pictures, "where", "Where the disagreement stands out")
     return _section("Where", picture + note + table)
@@ -362,7 +392,12 @@ def _considered(result: GapResult) -> str:
         return ""
     heads = ("kind", "at", "score", "parameters")
     rows = [[_cell(getattr(each, h)) for h in heads] for each in result.candidates]
-    return _section("What else was considered", _table(heads, rows, most=8))
+    note = (
+        '<p class="small">Each candidate alone. Score: its held-out error, as a '
+        "fraction of the error without it. Of candidates with nearly the same score "
+        "the one with the fewest parameters is chosen.</p>"
+    )
+    return _section("What else was considered", note + _table(heads, rows, most=8))
 
 
 def _unexplained(result: GapResult) -> str:
@@ -373,14 +408,12 @@ def _unexplained(result: GapResult) -> str:
         for u in sorted(result.unexplained, key=lambda u: -u.size)
     ]
     heads = ["channel", "where", "error / noise", "correlates with"]
-    return _section("What is left", _table(heads, rows, most=6))
+    return _section("Remaining error", _table(heads, rows, most=6))
 
 
 def _checks(result: GapResult) -> str:
     if not result.checks:
-        return _section(
-            "Checks before any fit", "<p>Nothing was found to be wrong.</p>"
-        )
+        return _section("Checks of the data", "<p>Nothing wrong was found.</p>")
     grave: list[tuple[str, tuple[str, list[str]]]] = []
     light: list[tuple[str, tuple[str, list[str]]]] = []
     for severity in _SEVERITIES:
@@ -400,7 +433,7 @@ def _checks(result: GapResult) -> str:
     if light:
         title = "1 note" if len(light) == 1 else f"{len(light)} notes"
         body += _folded(title, f"<ul>{items(light)}</ul>")
-    return _section("Checks before any fit", body)
+    return _section("Checks of the data", body)
 
 
 def _background(result: GapResult) -> str:
@@ -408,12 +441,12 @@ def _background(result: GapResult) -> str:
         return ""
     moved = sorted(result.background.items(), key=lambda item: -abs(item[1]))
     most = abs(moved[0][1])
-    says = "What may be slightly wrong in any model, in units of its stated "
-    says += "tolerance (1: as wrong as the scene says it may be). "
+    says = "What may be slightly wrong in any model: the fitted change, in units of "
+    says += "its tolerance. "
     says += (
-        f"The most is {most:.2g}."
+        f"The largest is {most:.2g}."
         if most <= 2.0
-        else f"<b>The most is {most:.2g}: more than the tolerance allows for.</b>"
+        else f"<b>The largest is {most:.2g}: more than the tolerance allows for.</b>"
     )
     rows = [[name, f"{value:+.2f}"] for name, value in moved]
     return _section(
@@ -438,11 +471,11 @@ def _in_units(result: GapResult) -> str:
     ]
     if rows:
         body += (
-            "<p>What is left of each joint's equation of motion on the same data, with "
-            "the nuisance parameters moved in both.</p>"
+            "<p>Residual of each joint's equation of motion on the same data, with the "
+            "nuisance parameters fitted in both.</p>"
         )
         body += _table(heads, rows, most=14)
-    return _section("Errors in their units", body)
+    return _section("Errors in SI units", body)
 
 
 def _trust(result: GapResult, pictures) -> str:
@@ -457,18 +490,22 @@ def _trust(result: GapResult, pictures) -> str:
             [f"{t.parameter} of {t.kind} at {', '.join(t.at)}", _n(t.value),
              _n(t.std, 2), spread,
              f"{_n(min(starts))} to {_n(max(starts))}" if starts else "-",
-             f"only its sum with {t.ridge_with} shows" if t.ridge_with else ""]
+             _ridge(t.ridge_with)]
         )  # fmt: skip
-    heads = ["parameter", "value", "deviation", "over stretches of time",
-             "from other starts", ""]  # fmt: skip
+    heads = ["parameter", "value", "std", "on parts of the data",
+             "from other initial values", ""]  # fmt: skip
     note = (
-        '<p class="small">Each parameter fitted on one stretch of time, or one '
-        "recording, alone (all others as they are), and from other starts.</p>"
+        '<p class="small">Each parameter fitted again on one part of the data (all '
+        "others unchanged), and from other initial values.</p>"
     )
     picture = _image(pictures, "trust", "Each parameter on parts of the data")
     return _section(
         "How certain the parameters are", picture + note + _table(heads, rows, most=12)
     )
+
+
+def _ridge(other: str) -> str:
+    return f"only its sum with {other} is identifiable" if other else ""
 
 
 def _channels(result: GapResult) -> str:
@@ -478,7 +515,7 @@ def _channels(result: GapResult) -> str:
         [c.channel, c.judged, f"{_n(c.noise)} {c.unit}", c.noise_from]
         for c in result.channels
     ]
-    heads = ["channel", "judged by", "noise, as used", "which is"]
+    heads = ["channel", "judged by", "noise (std)", "noise is"]
     return _section("Channels", _table(heads, rows, most=8))
 
 
@@ -486,22 +523,29 @@ def _go_on(result, out, scene_path, recordings, has_comparison) -> str:
     scene = quote(str(out / "scene.yaml"))
     tables = " ".join(quote(str(each.path)) for each in recordings) or "RECORDING"
     lines = []
+    again = f"makebreak gap {quote(str(scene_path))} {tables}"
+    if result.effects and Path(scene_path).name == "model.yaml":  # Of a run.
+        run = f"makebreak run EXPERIMENT --model {scene}"
+        lines.append(("Run the experiment with the repaired model:", run))
     if result.effects:
-        lines.append(("run with the repaired model", f"makebreak run --model {scene}"))
-        lines.append(("is anything left?", f"makebreak gap {scene} {tables}"))
-    same = f"makebreak gap {quote(str(scene_path))} {tables} --out {quote(str(out))}"
-    lines.append(("this run again", same))
+        lines.append(
+            (
+                "Is there a gap left in the repaired model?",
+                f"makebreak gap {scene} {tables}",
+            )
+        )
+        export = f"{again} --export urdf,mjcf"
+        lines.append(("The repaired model for other simulators:", export))
+    lines.append(("This comparison again:", f"{again} --out {quote(str(out))}"))
     body = "".join(
         f"<p class=small>{escape(says)}</p><pre>{escape(line)}</pre>"
         for says, line in lines
     )
     if has_comparison:
-        body += '<p><a href="compare.html">compare.html</a>: an animation of '
-        body += "what was measured (a ghost), the model before and after.</p>"
-    body += (
-        '<p class="small">Beside this page: result.json has all numbers, scene.yaml '
-    )
-    body += "the scene with the effects.</p>"
+        body += '<p><a href="compare.html">compare.html</a>: an animation of the '
+        body += "measured motion (grey) and of the model before and after.</p>"
+    body += '<p class="small">In the same folder: result.json has all numbers, '
+    body += "scene.yaml is the repaired model.</p>"
     return _section("Next steps", body)
 
 
@@ -510,7 +554,7 @@ def _seconds(result: GapResult) -> str:
         return ""
     total = sum(result.seconds.values())
     parts = ", ".join(f"{name} {value:.1f}" for name, value in result.seconds.items())
-    return f'<p class="small">{total:.0f} s: {escape(parts)}.</p>'
+    return f'<p class="small">Computed in {total:.0f} s: {escape(parts)}.</p>'
 
 
 # ----- Pieces
@@ -519,7 +563,7 @@ def _seconds(result: GapResult) -> str:
 def _scene_heading(result: GapResult, scene_path: str | Path) -> str:
     name = Path(scene_path).name
     if not result.effects:
-        return f"{name}, to which makebreak gap added nothing."
+        return f"{name}; makebreak gap added nothing to it."
     n = len(result.effects)
     what = "an effect" if n == 1 else f"{n} effects"
     return f"{name} with {what} that makebreak gap found."

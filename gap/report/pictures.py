@@ -36,32 +36,33 @@ def picture_of_channels(result: GapResult) -> Figure:
     )
     axes = figure.add_subplot()
     rows = np.arange(len(names))
+    floor = result.gap.noise_floor
     for shift, key, colour in ((-0.19, "before", BEFORE), (0.19, "after", AFTER)):
         values = [_finite(per_channel[name].get(key)) for name in names]
         axes.barh(rows + shift, values, 0.36, color=colour, label=key)
         for row, value in zip(rows, values, strict=True):
+            at = max(value, _beside(value, floor))
             axes.annotate(
-                f"{value:.3g}", (max(value, 1e-3), row + shift), (3, 0), fontsize=8,
+                f"{value:.3g}", (at, row + shift), (3, 0), fontsize=8,
                 textcoords="offset points", va="center", color="0.3",
             )  # fmt: skip
     values = [_finite(v) for each in per_channel.values() for v in each.values()]
     top = max([2.0, *values])
     axes.set_xlim(min([0.5, *(0.7 * v for v in values if v > 0.0)]), 2.2 * top)
     axes.set_xscale("log")
-    floor = result.gap.noise_floor
     if np.isfinite(floor) and floor > 0.0:
         axes.axvline(floor, color="0.2", lw=1.2, ls="--", label="noise floor")
     _plain_numbers(axes.xaxis)
     axes.set_yticks(rows, names, fontsize=9)
     axes.invert_yaxis()
-    axes.set_xlabel("held-out error / noise (1: nothing but noise)", fontsize=9)
+    axes.set_xlabel("held-out error / noise (1: noise only)", fontsize=9)
     axes.legend(
         fontsize=8, frameon=False, ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0)
     )
     _plain(axes)
     left = len(per_channel) - len(names)
     if left > 0:
-        axes.set_title(f"the worst; {left} more are in result.json", fontsize=8)
+        axes.set_title(f"the largest; {left} more are in result.json", fontsize=8)
     return figure
 
 
@@ -226,9 +227,9 @@ def picture_of_trust(result: GapResult) -> Figure | None:
     axes = figure.add_subplot()
     axes.axvspan(-2.0, 2.0, color="0.92", lw=0)
     marks = (
-        ("stretches", "o", "stretches of time", "#d98032"),
+        ("stretches", "o", "intervals of time", "#d98032"),
         ("recordings", "D", "recordings", "#2b6cb0"),
-        ("starts", "|", "other starts", "#222222"),
+        ("starts", "|", "other initial values", "#222222"),
     )
     widest = 3.0
     for row, each in enumerate(shown):
@@ -252,7 +253,7 @@ def picture_of_trust(result: GapResult) -> Figure | None:
     axes.set_xticks([x for x in ticks if abs(x) <= 1.3 * widest])
     _plain_numbers(axes.xaxis)
     axes.set_xlabel(
-        "off the value, in deviations that such a part should have (grey: within two)",
+        "difference from the fitted value, in its standard deviations (grey: within 2)",
         fontsize=9,
     )
     axes.legend(
@@ -278,6 +279,12 @@ def _rms_before(each: Series) -> float:
     error = (each.measured - each.before) / max(each.noise, 1e-300)
     good = np.isfinite(error)
     return float(np.sqrt(np.mean(error[good] ** 2))) if good.any() else 0.0
+
+
+def _beside(value: float, floor: float) -> float:
+    """Where a bar's number begins: not on the line of the noise floor."""
+    near = np.isfinite(floor) and 0.3 * floor < value <= 1.1 * floor
+    return floor if near else 1e-3
 
 
 def _finite(value) -> float:

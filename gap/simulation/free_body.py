@@ -12,8 +12,9 @@ from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.gap.numerics.free_body import FreeBody
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.contact import DEFAULT_DISSIPATION, FADE_RATE
+from makebreak.models.effects.contact_surface import DEFAULT_DISSIPATION
 from makebreak.models.effects.kind import Effect, check_parameters, full_name
+from makebreak.models.effects.rolling_resistance import FADE_RATE
 from makebreak.models.scene import LoadedScene, Scene, load_scene
 
 # Forces that have their own numbers here; what changes shapes, inertias and surfaces is

@@ -581,9 +581,9 @@ class SceneSimulation:
             for a in actuators_of_model(self._plant, model)
         ]
         effort = path.effort.Eval(own)[names.index(name)]
-        rest_twist = KINDS[effect.kind].rest_twist
-        assert rest_twist is not None
-        return rest_twist(effect, float(effort))
+        static_deflection = KINDS[effect.kind].static_deflection
+        assert static_deflection is not None
+        return static_deflection(effect, float(effort))
 
     def _simulate(
         self, initial, start: float, needed: np.ndarray, is_true: bool,

@@ -1,6 +1,6 @@
 """The catalogue of physical effects that a scene can have.
 
-One file a family; a new kind is one entry of its family's KINDS.
+Each family of kinds has a file; a new kind is one entry of its family's KINDS.
 """
 
 from makebreak.models.effects import (

@@ -1,5 +1,5 @@
-"""Effects between a command and the torque on the joint. They are no part of the plant:
-load_scene puts them between the command's port and the plant (actuation_path.py)."""
+"""Effects between a command and the torque on the joint, outside of the plant:
+load_scene adds them in front of its actuation port (actuation_path.py)."""
 
 import numpy as np
 
@@ -12,10 +12,9 @@ from makebreak.models.effects.signature import (
     without_momentum,
 )
 
-# The residual is of the effort that the recording tells: for these kinds take the
-# commanded one. r = commanded - applied.
+# For these kinds the residual has to use the commanded effort: r = commanded - applied.
 DELAYS = (0.002, 0.005, 0.01, 0.02, 0.04)  # [s]
-SHARES = (0.3, 0.5, 0.7, 0.85, 0.95)  # Of the greatest effort.
+LIMITS = (0.3, 0.5, 0.7, 0.85, 0.95)  # Over the largest effort.
 
 
 def _gain_signature(effect, model, motion, grid=None) -> list[Signature]:
@@ -39,10 +38,10 @@ def _bias_signature(effect, model, motion, grid=None) -> list[Signature]:
 
 
 def _saturation_signature(effect, model, motion, grid=None) -> list[Signature]:
-    """Each alternative holds a limit; its coefficient is 1 where the limit is right."""
+    """Each alternative holds a limit; its coefficient is 1 for the right limit."""
     joints = find_joints(effect, model.plant)
     greatest = max(abs(motion.effort[:, j.velocity_start()]).max() for j in joints)
-    limits = (grid or {}).get("limit", [share * greatest for share in SHARES])
+    limits = (grid or {}).get("limit", [part * greatest for part in LIMITS])
     return [
         at_joints(
             effect,
@@ -60,8 +59,8 @@ def _saturation_signature(effect, model, motion, grid=None) -> list[Signature]:
 
 
 def _limits_to_try(effect, plant, motions) -> dict[str, list[float]]:
-    """Shares of the greatest effort; and as a controller that loses its joint asks for
-    far more than the limit, by how often it is exceeded as well."""
+    """Fractions of the largest effort; and quantiles, as a controller whose joint does
+    not follow commands far more than the limit."""
     i = find_joints(effect, plant)[0].velocity_start()
     u = np.concatenate([np.abs(m.effort[:, i]) for m in motions])
     often = np.quantile(u, np.linspace(0.3, 0.98, 14))
@@ -69,7 +68,8 @@ def _limits_to_try(effect, plant, motions) -> dict[str, list[float]]:
 
 
 def _shifted(effect, model, motion, name, values, late) -> list[Signature]:
-    """For each value: (u - late(u, value)) / value, the coefficient is the value."""
+    """Alternatives for values of a delay or lag: columns (u - late(u, value)) / value,
+    so that the coefficient is the value."""
     found = []
     for value in values:
         columns = np.zeros((*motion.v.shape, 1))
@@ -100,8 +100,8 @@ def _lag_signature(effect, model, motion, grid=None) -> list[Signature]:
 
 
 def _kp_signature(effect, model, motion, grid=None) -> list[Signature]:
-    """Of a drive that neither reaches its limit nor turns fast: then its effort goes
-    with its gain. (gap asks the drive itself, by its law.)"""
+    """For a drive below its limit and at low speed, where the effort is proportional to
+    the gain. (gap uses the drive's law itself.)"""
     joints = find_joints(effect, model.plant)
     kp = model.now(effect.kind, effect.at)["kp"]
     return [

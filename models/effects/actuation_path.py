@@ -1,4 +1,4 @@
-"""What lies between a model's commands and its joints, when it is not nothing."""
+"""The path from a model's commands to its joints, if effects or drives lie on it."""
 
 from dataclasses import dataclass, field, fields, replace
 
@@ -8,11 +8,11 @@ from pydrake.systems.framework import BasicVector, InputPort, LeafSystem, Output
 GAIN, BIAS, LIMIT, TIME_CONSTANT, KP, SHARE = range(6)
 ROWS = 6
 NO_LIMIT = 1e30  # [N m]
-# A drive should stop a joint no faster than so [1/s]: a continuous plant's integrator
-# follows it. Twice as fast is refused.
+# Rate at which a drive may stop a joint of a continuous plant [1/s], so that the
+# integrator can follow it. Twice this rate is refused.
 FASTEST = 2000.0
-OWN = -1.0  # As a KP: the drive's own.
-# What a kind of effect may name as its step: (parameter, its row in the numbers).
+OWN = -1.0  # As KP: the drive's own gain.
+# Steps on the path (EffectKind.path): (parameter, its row in the numbers).
 STEPS = {
     "gain": ("gain", GAIN),
     "bias": ("bias", BIAS),
@@ -26,13 +26,13 @@ STEPS = {
 
 @dataclass(frozen=True, eq=False)
 class DriveLaw:
-    """What a drive makes of a command, entry by entry:
+    """The control law of a drive, for arrays:
 
         effort = clip(kp band(p_command - p) + kd (v_command - v), +-limit) - emf v
 
-    p_command to the nearest step of `resolution`, if that is not 0; band(e) is e less
-    the dead band, 0 within it; emf = kt^2/R: what a motor at a supply loses by turning.
-    So its ceiling falls with speed. SI units of a joint that turns, or slides.
+    with p_command rounded to steps of `resolution` (0: not rounded); band(e) is e
+    reduced by the dead band; emf = kt^2/R is the motor's back-EMF, by which the largest
+    effort falls with speed. SI units of a revolute or prismatic joint.
     """
 
     kp: np.ndarray
@@ -46,11 +46,11 @@ class DriveLaw:
         return DriveLaw(*(getattr(self, each.name)[i] for each in fields(self)))
 
     def with_kp(self, kp) -> "DriveLaw":
-        """With other gains, where they are not OWN."""
+        """The law with other gains, where they are not OWN."""
         return replace(self, kp=np.where(np.equal(kp, OWN), self.kp, kp))
 
     def received(self, p_command):
-        """The position command as the drive has it."""
+        """The position command, rounded to the drive's resolution."""
         r = self.resolution
         step = np.where(np.greater(r, 0.0), r, 1.0)
         return np.where(
@@ -58,26 +58,27 @@ class DriveLaw:
         )
 
     def effort(self, p_error, v_command, v):
-        """p_error: of the position command as received, 0 for a drive without one."""
+        """The drive's effort. Args: p_error: received position command minus position;
+        0 for a drive without a position loop."""
         e = np.sign(p_error) * np.maximum(np.abs(p_error) - self.dead_band, 0.0)
         u = self.kp * e + self.kd * (v_command - v)
         return np.clip(u, -self.limit, self.limit) - self.emf * v
 
 
 def slowed(effort, share, direction):
-    """What a gear lets through of an effort, if it loses a share of that: with tau let
-    through, effort = tau + share |tau| direction. direction: of the motion, -1 to 1."""
+    """The effort tau behind a gear with load friction: effort = tau + share |tau|
+    direction. Args: direction: of the motion, -1 to 1."""
     return effort / (1.0 + share * direction * np.sign(effort))
 
 
 @dataclass
 class Drive:
-    """A loop in the drive itself, an entry for each actuator.
+    """Drives with a control loop, with an entry for each actuator.
 
-    takes: the commands, of position_command, velocity_command.
-    driven: which actuators it drives; the others get no effort.
-    position, velocity: where each joint's are in the plant's state.
-    offset: what the joint's encoder adds to its position [rad] or [m].
+    takes: their commands: position_command, velocity_command, or both.
+    driven: which actuators they drive; the others get no effort.
+    position, velocity: indices of the joints in the plant's state.
+    offset: of the joints' encoders [rad] or [m].
     """
 
     law: DriveLaw
@@ -90,10 +91,11 @@ class Drive:
 
 @dataclass
 class Gear:
-    """Where friction that goes with the load fades, an entry for each actuator.
+    """Gears with load friction, with an entry for each actuator.
 
-    velocity: where each motor's is in the plant's state. slow [rad/s]: dry friction
-    fades below it, or below `step` times the friction (2 dt/J in a discrete plant).
+    velocity: indices of the motors' velocities in the plant's state. slow: speed below
+    which friction fades [rad/s]; or below `step` times the friction, if that is larger
+    (2 dt/J in a discrete plant).
     """
 
     velocity: np.ndarray
@@ -103,9 +105,9 @@ class Gear:
 
 @dataclass(eq=False)
 class PathPorts:
-    """A model's actuation path and its ports. position_command, velocity_command: with
-    a drive; command: without one. effort: of the motors; nominal: before gain and
-    bias. systems: the path, and before it what delays its commands."""
+    """A model's actuation path and its ports: position_command, velocity_command with a
+    drive, command without; effort of the motors; nominal, the effort before gain and
+    bias. systems: the delays of its commands, and the path."""
 
     path: "ActuationPath"
     command: InputPort | None = None
@@ -117,28 +119,28 @@ class PathPorts:
 
 
 class ActuationPath(LeafSystem):
-    """Command to effort, for the actuators of one model in their order.
+    """Efforts from commands, for the actuators of one model in their order.
 
         effort = lag(clip(gain x commanded + bias, +-limit))
-        commanded = command, or with a drive what its law makes of the commands
+        commanded = command, or the output of the drive's law
 
-    The lag is of first order. In a discrete plant it steps with the plant, exact for a
-    held command. What is not connected is zero. A gear whose friction goes with the
-    load lets less through to the joint.
+    The lag is of first order. In a discrete plant it steps with the plant and is exact
+    for a held command. Unconnected inputs are zero. A gear with load friction reduces
+    the effort on the joint.
 
-    Inputs:  command (n,) [N m]; or position_command (n,) and velocity_command (n,), as
-             the drive takes them; state (n_x,) of the plant with a drive or a gear.
-    Outputs: effort (n,) of the motors; nominal (n,) = commanded; joint_effort (n,):
-             what the gear lets through of the effort, 0 where a motor moves the joint
-             through an elastic element; motor_effort_<i> (1,): the same of actuator i
-             if it is such a one.
+    Inputs:  command (n,) [N m]; or position_command (n,), velocity_command (n,) of a
+             drive; state (n_x,) of the plant, with a drive or a gear.
+    Outputs: effort (n,): of the motors; nominal (n,) = commanded; joint_effort (n,):
+             the effort behind the gear, 0 for a motor that moves its joint through an
+             elastic element; motor_effort_<i> (1,): the effort behind the gear of such
+             an actuator i.
 
-    Numeric parameter 0 of the Context: the numbers row by row: gain, bias, limit, time
-    constant, kp (OWN: the drive's), share of the load that is friction.
+    Numeric parameter 0 of the Context: the numbers, row by row: gain, bias, limit, time
+    constant, kp (OWN: the drive's), load friction as fraction of the load.
 
-    Args: numbers: (ROWS, n); time_step: of the plant [s], 0: continuous; drive: or
-        None; n_x: size of the plant's state; elastic: which actuators act through an
-        elastic element; gear: None if none loses a share.
+    Args: numbers (ROWS, n); time_step: of the plant [s], 0: continuous; drive: None
+        without a loop; n_x: size of the plant's state; elastic (n,): which actuators
+        act through an elastic element; gear: None without load friction.
     """
 
     def __init__(
@@ -165,7 +167,7 @@ class ActuationPath(LeafSystem):
             }
         if drive is not None or gear is not None:
             self._state = self.DeclareVectorInputPort("state", n_x)
-        # A lag that is there when the path is built may have its time changed later.
+        # A lag has a state, so only a path that is built with one can change it later.
         self._lags = bool((numbers[TIME_CONSTANT] > 0.0).any())
         if self._lags and time_step == 0.0:
             self._lagged = self.DeclareContinuousState(n)
@@ -180,7 +182,7 @@ class ActuationPath(LeafSystem):
                 f"motor_effort_{i}",
                 1,
                 lambda context, output, i=i: output.SetFromVector(
-                    self._let_through(context)[i : i + 1]
+                    self._behind_gear(context)[i : i + 1]
                 ),
             )
 
@@ -193,9 +195,9 @@ class ActuationPath(LeafSystem):
         return self._gear is not None
 
     def set_numbers(self, context, numbers) -> None:
-        """New numbers (ROWS, n) in a Context of this system.
+        """Sets the numbers (ROWS, n) in a Context of this system.
 
-        Raises: ValueError if a lag or a gear is new: that takes a new path.
+        Raises: ValueError for a lag or a load friction that the path was built without.
         """
         numbers = np.asarray(numbers, dtype=float)
         if not self._lags and (numbers[TIME_CONSTANT] > 0.0).any():
@@ -207,14 +209,14 @@ class ActuationPath(LeafSystem):
         )
 
     def set_lagged(self, context, effort) -> None:
-        """Where the lag starts from, (n,) [N m]."""
+        """Sets the state of the lag (n,) [N m]."""
         if self._lags and self._dt == 0.0:
             context.SetContinuousState(effort)
         elif self._lags:
             context.SetDiscreteState(self._lagged, effort)
 
     def unlagged(self, context) -> np.ndarray:
-        """(n,): gain, bias and limit on what is commanded."""
+        """The effort (n,) before the lag: gain, bias and limit of the commanded one."""
         p = self._rows(context)
         effort = p[GAIN] * self._commanded(context) + p[BIAS]
         return np.clip(effort, -p[LIMIT], p[LIMIT])
@@ -230,20 +232,20 @@ class ActuationPath(LeafSystem):
             return port.Eval(context) if port.HasValue(context) else np.zeros(self._n)
         x = self._state.Eval(context)
         law = drive.law.with_kp(self._rows(context)[KP])
-        told = {
+        commands = {
             name: port.Eval(context)
             for name, port in self._commands.items()
             if port.HasValue(context)
         }
         error = np.zeros(self._n)
-        if "position_command" in told:
+        if "position_command" in commands:
             position = x[drive.position] + drive.offset
-            error = law.received(told["position_command"]) - position
-        v_command = told.get("velocity_command", 0.0)
+            error = law.received(commands["position_command"]) - position
+        v_command = commands.get("velocity_command", 0.0)
         effort = law.effort(error, v_command, x[drive.velocity])
         return np.where(drive.driven, effort, 0.0)
 
-    def _let_through(self, context) -> np.ndarray:
+    def _behind_gear(self, context) -> np.ndarray:
         effort, gear = self._effort(context), self._gear
         if gear is None:
             return effort
@@ -285,4 +287,4 @@ class ActuationPath(LeafSystem):
         output.SetFromVector(self._commanded(context))
 
     def _calc_joint_effort(self, context, output):
-        output.SetFromVector(np.where(self._elastic, 0.0, self._let_through(context)))
+        output.SetFromVector(np.where(self._elastic, 0.0, self._behind_gear(context)))

@@ -1,4 +1,4 @@
-"""Forces on bodies that depend on their velocity and on time, all in one system."""
+"""One system for all forces on bodies that depend on velocity and time."""
 
 from collections.abc import Callable, Sequence
 
@@ -45,7 +45,7 @@ class BodyForces(LeafSystem):
             law(np.zeros(6), 0.0, np.ones(MAX_NUMBERS), np.zeros(6))  # Compiles it.
 
     def set_numbers(self, context, numbers: Sequence[Sequence[float]]) -> None:
-        """New numbers p of all laws, in a Context of this system."""
+        """Sets the numbers p of all laws in a Context of this system."""
         context.get_mutable_numeric_parameter(self._numbers).SetFromVector(
             _padded(numbers)
         )

@@ -1,4 +1,4 @@
-"""Other shapes of a body that is already in the scene graph."""
+"""Replaces shapes of a body that is already in the scene graph."""
 
 from collections.abc import Iterable
 
@@ -21,8 +21,8 @@ def change_shape(
     shape: Shape,
     X_BG: RigidTransform,
 ) -> None:
-    """Gives the geometry this shape and pose in its body; what it does not collide with
-    stays so, which Drake's ChangeShape forgets."""
+    """Changes a geometry's shape and pose in its body, and keeps its collision filters,
+    which Drake's ChangeShape would remove."""
     apart = not_colliding_with(scene_graph, geometry)
     scene_graph.ChangeShape(plant.get_source_id(), geometry, shape, X_BG)
     keep_apart(scene_graph, [geometry], apart)
@@ -31,7 +31,8 @@ def change_shape(
 def not_colliding_with(
     scene_graph: SceneGraph, geometry: GeometryId
 ) -> list[GeometryId]:
-    """What the geometry is kept from colliding with; nothing if it is only seen."""
+    """The geometries with which a geometry cannot collide by a filter; [] if it has no
+    collision role."""
     inspector = scene_graph.model_inspector()
     if inspector.GetProximityProperties(geometry) is None:
         return []
@@ -45,7 +46,7 @@ def not_colliding_with(
 def keep_apart(
     scene_graph: SceneGraph, these: Iterable[GeometryId], others: Iterable[GeometryId]
 ) -> None:
-    """None of these collides with any of the others from now on."""
+    """Adds a filter so that none of `these` collides with any of `others`."""
     scene_graph.collision_filter_manager().Apply(
         CollisionFilterDeclaration().ExcludeBetween(
             GeometrySet(list(these)), GeometrySet(list(others))

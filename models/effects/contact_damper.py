@@ -1,4 +1,4 @@
-"""A linear damper in the contact of two bodies, in the place of Drake's damping."""
+"""A linear damper in the contact of two bodies, instead of Drake's damping."""
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -11,18 +11,18 @@ STICTION = 1e-3  # Below this speed friction fades, as Drake's does [m/s].
 
 
 class ContactDamper(LeafSystem):
-    """The force with which the contact of two bodies is damped: damping times the rate
-    at which they sink into each other. Drake's spring, with its friction, is there
-    without it; the two together do not pull, and rub as one normal force.
+    """Linear damping of the contact of two bodies: damping times the rate of
+    penetration, with the friction of this normal force. Drake's contact gives the
+    spring with its friction; spring and damper together never pull.
 
-    In a discrete plant the force is that of the step's beginning, so at most what stops
-    the two within the step: a stiffer damper would throw them apart.
+    In a discrete plant the force is explicit in time, and bounded to what stops the two
+    bodies within a step: more would throw them apart.
 
-    Inputs:  state (n_x,) of the plant; query, of the scene graph (abstract).
+    Inputs:  state (n_x,) of the plant; query (abstract) of the scene graph.
     Outputs: generalized_force (n_v,).
 
-    Args: pair: the bodies; stiffness [N/m], damping [N s/m] and coefficient of friction
-        of a contact of theirs.
+    Args: plant; pair: the bodies; stiffness [N/m], damping [N s/m], friction: of their
+        contact.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class ContactDamper(LeafSystem):
         for touch in touches:
             a, b, n = of[touch.id_A], of[touch.id_B], touch.nhat_BA_W
             middle = (touch.p_WCa + touch.p_WCb) / 2.0
-            # Of the point of A as B sees it: the velocity at which they slide and part.
+            # Of the point of A relative to B: velocity of sliding and separation.
             J = plant.CalcJacobianTranslationalVelocity(
                 own,
                 JacobianWrtVariable.kV,

@@ -5,15 +5,15 @@ from pydrake.systems.framework import LeafSystem
 
 
 class DelayLine(LeafSystem):
-    """y_i(t) = u_i(t - delay_i): samples of u every period, a line between them.
+    """y_i(t) = u_i(t - delay_i), from samples of u every period, linear in between.
 
-    Before the start u is what it is at the start. A delay of whole periods is exact
-    where u is held between samples.
+    Before the start u counts as constant. A delay of whole periods is exact for a u
+    that is held between samples.
 
     Inputs:  u (n,); zero if it is not connected.
     Outputs: y (n,).
 
-    Args: delays: (n,) [s], each 0 or more; period_sec: of the samples.
+    Args: delays (n,): each 0 or more [s]; period_sec: of the samples [s].
     """
 
     def __init__(self, delays, period_sec: float):
@@ -55,24 +55,24 @@ class DelayLine(LeafSystem):
             # Ages: 0 is u itself, then `newest`, `newest` + period, ...
             behind = (delay - newest) / self._period
             if behind < 0.0:
-                share = delay / newest
-                y[i] = (1.0 - share) * u[i] + share * samples[0, i]
+                s = delay / newest
+                y[i] = (1.0 - s) * u[i] + s * samples[0, i]
                 continue
             k = min(int(behind + 1e-6), self._length - 1)
-            share = min(max(behind - k, 0.0), 1.0)
+            s = min(max(behind - k, 0.0), 1.0)
             older = samples[min(k + 1, self._length - 1), i]
-            y[i] = (1.0 - share) * samples[k, i] + share * older
+            y[i] = (1.0 - s) * samples[k, i] + s * older
         output.SetFromVector(y)
 
 
 class LagLine(LeafSystem):
-    """T_i dy_i/dt = u_i - y_i, exact for lines between samples of u every period; T_i
-    of 0 lets u_i through. It starts as if u had always been what it is at the start.
+    """T_i dy_i/dt = u_i - y_i from samples of u every period, exact for a u that is
+    linear in between; y_i = u_i if T_i is 0. Before the start u counts as constant.
 
     Inputs:  u (n,); zero if it is not connected.
-    Outputs: y (n,), as of the last sample.
+    Outputs: y (n,): of the last sample.
 
-    Args: time_constants: (n,) [s], each 0 or more; period_sec: of the samples.
+    Args: time_constants (n,): each 0 or more [s]; period_sec: of the samples [s].
     """
 
     def __init__(self, time_constants, period_sec: float):
@@ -83,7 +83,7 @@ class LagLine(LeafSystem):
         self._n, self._through = T.size, T <= 1e-3 * period_sec
         safe = np.where(self._through, 1.0, T)
         self._keep = np.exp(-period_sec / safe)
-        # Of a line's end: what of its rise over the period has arrived.
+        # Fraction of a linear rise over the period that has arrived at its end.
         self._rise = 1.0 - (1.0 - self._keep) * safe / period_sec
         self._u = self.DeclareVectorInputPort("u", self._n)
         self._last = self.DeclareDiscreteState(2 * self._n)  # u, then y.

@@ -42,7 +42,7 @@ def _numbers(*names):
 
 
 def _jacobians(effect: Effect, model, motion):
-    """Jacobian (n, 6, n_v) and velocity (n, 6) of each body that `at` names."""
+    """Jacobian (n, 6, n_v) and velocity (n, 6) of each body of `at`."""
     for body in find_bodies(effect, model.plant):
         J, V, _, _ = model.body_motion(body, motion.q, motion.v, motion.vd)
         yield J, V
@@ -56,9 +56,9 @@ def _constant_signature(effect, model, motion, grid=None) -> list[Signature]:
 
 
 def _sinusoidal_signature(effect, model, motion, grid=None) -> list[Signature]:
-    """The direction is free, and the phase; one phase for all three axes: a force along
-    a line. Each alternative holds a frequency; its coefficients are sine and cosine of
-    each axis, and to_parameters takes the line along which the power is greatest."""
+    """A force along a line of free direction, with one phase. Each alternative holds a
+    frequency; its coefficients are sine and cosine along each axis, and to_parameters
+    takes the direction of the greatest power."""
     columns = sum(
         -J[:, 3:].swapaxes(1, 2) for J, _ in _jacobians(effect, model, motion)
     )
@@ -74,7 +74,7 @@ def _sinusoidal_signature(effect, model, motion, grid=None) -> list[Signature]:
             # c = [a cos(phase), a sin(phase)] for the amplitude's vector a.
             a, b = np.reshape(c, (2, 3))
             u, s, w = np.linalg.svd(np.stack([a, b], axis=1))
-            # Of the two that are the same force, its greatest component positive.
+            # Of the two equal solutions the one whose largest component is positive.
             sign = 1.0 if u[abs(u[:, 0]).argmax(), 0] >= 0.0 else -1.0
             amplitude = sign * u[:, 0] * s[0]
             phase = math.atan2(sign * w[0, 1], sign * w[0, 0])

@@ -1,4 +1,4 @@
-"""Effects on where the ground is: its height, its tilt."""
+"""Effects on the pose of fixed bodies: height, position, tilt."""
 
 import numpy as np
 from pydrake.geometry import SceneGraph
@@ -7,7 +7,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 
 from makebreak.models.effects.change_shape import change_shape
-from makebreak.models.effects.contact import anchored_pose
+from makebreak.models.effects.contact_surface import anchored_pose
 from makebreak.models.effects.kind import Effect, EffectKind, Parameter, find_bodies
 from makebreak.models.effects.loads import rotation
 
@@ -52,7 +52,7 @@ def _some_are_given(effect: Effect) -> None:
 
 
 def _tilt(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-    """About the body's origin, along the world's axes."""
+    """Rotates the body's shapes about its origin, in world axes."""
     R = rotation(effect)
 
     def moved(X_WG, p_WB):

@@ -1,4 +1,4 @@
-"""What is common to the kinds that change a body's inertia."""
+"""Common parts of the kinds that change a body's inertia."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,7 +11,7 @@ from pydrake.multibody.tree import RigidBody, RotationalInertia, SpatialInertia
 from makebreak.models.effects.kind import Effect, find_bodies
 from makebreak.models.effects.signature import Signature
 
-# Where ixx, iyy, izz, ixy, ixz, iyz are in a (3, 3).
+# Indices of ixx, iyy, izz, ixy, ixz, iyz in a (3, 3) inertia.
 SIX = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
@@ -23,7 +23,10 @@ def central_inertia(M: SpatialInertia) -> np.ndarray:
 
 
 def spatial_inertia(mass: float, com, central) -> SpatialInertia:
-    """Raises: RuntimeError if no body has it."""
+    """From mass [kg], com (3,) [m] and central (3, 3) [kg m2].
+
+    Raises: RuntimeError if they are not physical.
+    """
     products = [central[0, 1], central[0, 2], central[1, 2]]
     return SpatialInertia.MakeFromCentralInertia(
         mass, com, RotationalInertia(*np.diag(central), *products)
@@ -31,7 +34,8 @@ def spatial_inertia(mass: float, com, central) -> SpatialInertia:
 
 
 def change_inertia(new_values: Callable):
-    """set_in_context by new_values(old, new, mass, com, central) -> the last three."""
+    """A set_in_context from new_values(old, new, mass, com, central) ->
+    (mass, com, central), with the effect before and after the change."""
 
     def set_in_context(old: Effect, new: Effect, plant: MultibodyPlant, context):
         for body in find_bodies(new, plant):
@@ -50,8 +54,8 @@ def change_inertia(new_values: Callable):
 
 
 def mass_mix(M: SpatialInertia) -> np.ndarray:
-    """(10, 1) what a kg more of a body adds to the unknowns of inertial_columns, spread
-    as the body is."""
+    """(10, 1) derivative of the unknowns of inertial_columns by the mass, for a mass
+    distribution that stays as it is."""
     mix = np.zeros((10, 1))
     mix[0], mix[1:4, 0] = 1.0, M.get_com()
     about = M.get_unit_inertia().CopyToFullMatrix3()  # Per kg, about the origin.
@@ -60,8 +64,8 @@ def mass_mix(M: SpatialInertia) -> np.ndarray:
 
 
 def com_mix(M: SpatialInertia) -> np.ndarray:
-    """(10, 3) the same of a metre by which the centre of mass moves, to first order:
-    the inertia about the body's origin goes with its square."""
+    """(10, 3) derivative of the unknowns of inertial_columns by the centre of mass,
+    about which the inertia is kept."""
     mass, com, mix = M.get_mass(), M.get_com(), np.zeros((10, 3))
     for i, e in enumerate(np.eye(3)):
         mix[1:4, i] = mass * e
@@ -71,13 +75,12 @@ def com_mix(M: SpatialInertia) -> np.ndarray:
 
 
 def inertial_columns(model, motion, body: RigidBody) -> tuple[np.ndarray, np.ndarray]:
-    """How a body's inertial parameters enter the inverse dynamics.
+    """The regressor of the inverse dynamics by the inertial parameters of one body.
 
     Unknowns: mass m, h = m com (3), and the inertia about the body's origin ixx, iyy,
     izz, ixy, ixz, iyz, in the body's axes.
-    Returns: columns and momentum (n, n_v, 10).
+    Returns: (n, n_v, 10) of the effort, and of the generalized momentum.
     """
-
     J, V, A, R = model.body_motion(body, motion.q, motion.v, motion.vd)
     w, alpha, a = V[:, :3], A[:, :3], A[:, 3:] - model.gravity
     n = len(w)
@@ -105,8 +108,8 @@ def inertial_columns(model, motion, body: RigidBody) -> tuple[np.ndarray, np.nda
 def inertial_signature(
     effect, model, motion, body, unknowns, mix, to_parameters, exact
 ) -> Signature:
-    """A signature whose columns are inertial_columns @ mix (10, k). The rest is what is
-    there without acceleration, less the momentum's own rate along v."""
+    """A signature whose columns are inertial_columns @ mix (10, k). Its weak-form rest
+    is the effort without acceleration less the momentum's rate along v."""
     columns, momentum = inertial_columns(model, motion, body)
 
     def at(q, vd):
@@ -132,17 +135,17 @@ def inertial_signature(
 
 
 def ten_parameters(mass: float, com: np.ndarray) -> np.ndarray:
-    """(10,) the unknowns of inertial_columns of a point mass, which may be negative."""
+    """(10,) unknowns of inertial_columns of a point mass, perhaps negative, at com."""
     about = mass * (com @ com * np.eye(3) - np.outer(com, com))
     return np.array([mass, *(mass * com), *(about[at] for at in SIX)])
 
 
-_columns: WeakKeyDictionary = WeakKeyDictionary()  # Of motions, as long as they are.
+_columns: WeakKeyDictionary = WeakKeyDictionary()  # {motion: inertial_columns}
 
 
 def added_inertia(effect: Effect, model, motion, more: Callable) -> np.ndarray:
-    """(n, n_v) the effort that bodies need which have more(M) (10,) more of the
-    unknowns of inertial_columns; M: the body's inertia."""
+    """(n, n_v) effort that the bodies of an effect add with a change more(M) (10,) of
+    the unknowns of inertial_columns; M: the SpatialInertia of the body."""
     known = _columns.setdefault(motion, {})
     added = np.zeros_like(motion.v)
     for body in find_bodies(effect, model.plant):

@@ -1,6 +1,7 @@
-"""Forces on joints that depend on their own position and velocity, all in one system.
+"""Forces on joints that depend on the joint's own position and velocity.
 
-One system for a whole scene: a call from Drake into Python costs more than the laws.
+One system holds all of a scene, as a call from Drake into Python costs more than the
+laws.
 """
 
 from collections.abc import Callable, Sequence
@@ -10,7 +11,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Joint
 from pydrake.systems.framework import BasicVector, LeafSystem
 
-MAX_NUMBERS = 4
+MAX_NUMBERS = 4  # Numbers p of one law.
 
 
 class JointForces(LeafSystem):
@@ -21,8 +22,8 @@ class JointForces(LeafSystem):
 
     The numbers p of all laws are numeric parameter 0 of the Context.
 
-    Args: laws: compiled functions; joints: the one-dof joint of each; numbers: p of
-        each, up to four.
+    Args: laws: compiled functions; joints: the one-dof joint of each law; numbers: p of
+        each law, up to four.
     """
 
     def __init__(
@@ -34,7 +35,7 @@ class JointForces(LeafSystem):
     ):
         super().__init__()
         n_q, self._n_v = plant.num_positions(), plant.num_velocities()
-        # law, where its q and its v are in the state, where its force goes.
+        # (law, index of q and of v in the state, index of the force in v).
         self._laws = [
             (law, joint.position_start(), n_q + joint.velocity_start(), i_v)
             for law, joint in zip(laws, joints, strict=True)
@@ -44,7 +45,7 @@ class JointForces(LeafSystem):
         self._numbers = self.DeclareNumericParameter(BasicVector(_padded(numbers)))
         self.DeclareVectorOutputPort("generalized_force", self._n_v, self._calc)
         for law in set(laws):
-            law(0.0, 0.0, 0.0, np.ones(MAX_NUMBERS))  # Compiles it.
+            law(0.0, 0.0, 0.0, np.ones(MAX_NUMBERS))  # Compile it now.
 
     def set_numbers(self, context, numbers: Sequence[Sequence[float]]) -> None:
         """New numbers p of all laws, in a Context of this system."""

@@ -31,12 +31,12 @@ from makebreak.systems.numerics.joint_laws import (
     stribeck_law,
 )
 
-# ----- What they do
+# ----- How they act on the plant
 
 
 def _left(effect: Effect, has: float, change: float) -> float:
-    """What a joint has with a change. Raises: ValueError if that is less than none."""
-    # Not below 0 by rounding: Drake would throw.
+    """has + change, at least 0. Raises: ValueError if it is negative."""
+    # Rounding below 0 is clipped, as Drake would throw.
     if not has + change >= -1e-6 * abs(has):
         ((name, value),) = effect.parameters.items()
         raise ValueError(
@@ -66,8 +66,8 @@ def _change_damping(old: Effect, new: Effect, plant: MultibodyPlant, context) ->
 
 
 def _add_rotor(effect: Effect, plant: MultibodyPlant, scene_graph) -> None:
-    """On the actuator: reflected inertia = rotor inertia x gear ratio^2. A joint
-    without one gets an actuator that nobody drives."""
+    """Sets the actuator's rotor inertia: reflected inertia / gear ratio^2. A joint
+    without an actuator gets one that is never commanded."""
     for joint in find_joints(effect, plant):
         actuator = actuator_of(plant, joint)
         if actuator is None:
@@ -83,7 +83,7 @@ def _add_rotor(effect: Effect, plant: MultibodyPlant, scene_graph) -> None:
 
 
 def _least_rotor(effect, plant: MultibodyPlant, effects, damped) -> dict[str, float]:
-    """Of a joint that its drive damps, enough is left for that to be simulated."""
+    """A joint that its drive damps keeps enough inertia for a stable time step."""
     context = plant.CreateDefaultContext()
     mobility = np.linalg.inv(plant.CalcMassMatrix(context))
     low = []
@@ -100,16 +100,16 @@ def _change_rotor(old: Effect, new: Effect, plant: MultibodyPlant, context) -> N
     change = new.parameters["inertia"] - old.parameters["inertia"]
     for joint in find_joints(new, plant):
         actuator = actuator_of(plant, motor_joint(plant, joint) or joint)
-        share = actuator.gear_ratio(context) ** 2
-        left = _left(new, actuator.rotor_inertia(context) * share, change)
-        actuator.SetRotorInertia(context, left / share)
+        ratio_squared = actuator.gear_ratio(context) ** 2
+        left = _left(new, actuator.rotor_inertia(context) * ratio_squared, change)
+        actuator.SetRotorInertia(context, left / ratio_squared)
 
 
-# Kinds whose forces add up over a scene's effects.
+# Effects of these kinds may be negative where their sum at a joint is not.
 
 
 def _totals(effect: Effect, effects, plant, name: str) -> dict[str, float]:
-    """Of each joint, a parameter's sum over the effects of this kind."""
+    """{joint: sum of a parameter over the scene's effects of this kind}."""
     totals: dict[str, float] = {}
     for each in effects:
         if each.kind == effect.kind:
@@ -137,21 +137,22 @@ def _check_total(effect: Effect, plant: MultibodyPlant, effects) -> None:
 
 
 def fade_velocity(plant: MultibodyPlant, joint: Joint, friction: float) -> float:
-    """Speed below which dry friction fades, c tanh(v / fade): 0.005 rad/s or 0.001 m/s.
+    """Speed `fade` below which dry friction c tanh(v / fade) fades: 0.005 rad/s or
+    0.001 m/s, and more where a discrete plant needs it.
 
-    In a discrete plant the force acts a step late. There it fades where one step of it
-    would change the joint's speed by half the fading speed, so that it never turns the
-    motion round: fade >= 2 c dt / J, with J the joint's inertia alone at the default
-    positions, all other joints free (which is when it is smallest).
+    In a discrete plant the force acts one step late. There fade >= 2 c dt / J, so that
+    one step of friction changes the speed by at most half of fade and never reverses
+    the motion. J is the joint's effective inertia at the default positions with all
+    other joints free, which is its smallest.
     """
-    slowest = velocity_unit(joint)
+    fade_min = velocity_unit(joint)
     dt = plant.time_step()
     if dt == 0.0:
-        return slowest
+        return fade_min
     context = plant.CreateDefaultContext()
     mobility = np.linalg.inv(plant.CalcMassMatrix(context))
     i = joint.velocity_start()
-    return max(slowest, 2.0 * friction * dt * mobility[i, i])
+    return max(fade_min, 2.0 * friction * dt * mobility[i, i])
 
 
 def _coulomb_numbers(effect, plant, joint):
@@ -174,7 +175,7 @@ def _numbers(*names):
     return lambda effect, plant, joint: [effect.parameters[name] for name in names]
 
 
-# ----- How they show: the residual is minus the effect's force.
+# ----- Their signatures: the residual is minus the effect's force.
 
 STRIBECK_VELOCITIES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)  # [rad/s]
 TRIED_SPEEDS = (0.03, 0.06, 0.1, 0.2)
@@ -226,7 +227,7 @@ def _stribeck_signature(effect, model, motion, grid=None) -> list[Signature]:
 
 
 def _load_signature(effect, model, motion, grid=None) -> list[Signature]:
-    """Linear in the share of the torque that all else needs."""
+    """Linear in the share of the torque that the joint needs without the effect."""
     needed = model.inverse_dynamics(motion.q, motion.v, motion.vd, motion.time)
     columns = _load_column(effect, model, motion, needed)[:, :, None]
     return [without_momentum(effect, ["share"], columns)]

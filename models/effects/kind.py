@@ -1,4 +1,4 @@
-"""What an effect is in a scene file, and what a kind of effect is to the project."""
+"""Effects of a scene, and the description of a kind of effect (EffectKind)."""
 
 import math
 import re
@@ -21,8 +21,8 @@ from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 
 from makebreak.models.typed_yaml import nearest
 
-_MOST_TIMES = 1e4  # Of the range that is searched.
-_MOST_SEC = 10.0  # A delay keeps that many samples.
+_MAX_OVER_RANGE = 1e4  # Bound of a parameter over its search range.
+_MAX_SEC = 10.0  # Bound of a delay, whose samples are stored.
 
 
 @dataclass
@@ -40,7 +40,7 @@ class Effect:
 
     @property
     def key(self) -> tuple:
-        """All of it, to be looked up by."""
+        """A hashable copy of the effect."""
         return self.kind, tuple(self.at), tuple(sorted(self.parameters.items()))
 
 
@@ -48,13 +48,14 @@ class Effect:
 class Parameter:
     """One parameter of a kind.
 
-    low, high: where to search for it in robots that people build; not limits.
-    neutral: the value that changes nothing; None where that is the model's own value
-        (EffectKind.now) or where another parameter must be neutral instead.
-    valid: what is refused: "any" number, ">= 0", "> 0" or "share" (of 0 to below 1).
-    rough: what it does jumps with it, so that it is found by trying values.
-    endless: beyond low and high it says the same as there, and is allowed.
-    ends: a fit does not look beyond high, where other parameters make up for it.
+    low, high: range in real robots, in which a search looks for it; not limits.
+    neutral: the value without effect; None if that is the model's own value
+        (EffectKind.now), or if another parameter has to be neutral instead.
+    valid: valid values: "any", ">= 0", "> 0" or "share" (from 0 to below 1).
+    optional: whether it may be missing.
+    rough: its effect is discontinuous, so a fit tries values instead of gradients.
+    endless: values beyond low and high have the same effect as these, and are allowed.
+    ends: a fit does not go above high, where other parameters could compensate it.
     """
 
     name: str
@@ -70,65 +71,70 @@ class Parameter:
 
     @property
     def most(self) -> float:
-        """No robot has more: a wrong unit, or what a computer cannot hold."""
+        """Largest magnitude accepted; more is a wrong unit, or too much data."""
         if self.unit == "s":
-            return _MOST_SEC
-        return _MOST_TIMES * max(abs(self.low), abs(self.high))
+            return _MAX_SEC
+        return _MAX_OVER_RANGE * max(abs(self.low), abs(self.high))
 
 
 @dataclass(frozen=True)
 class EffectKind:
-    """A kind of effect: what it is called, what it does, how it shows.
+    """A kind of effect: its name and parameters, what it does in Drake, and how it is
+    found in data.
 
-    at: what it acts on: "joint" (with one degree of freedom), "actuator" (a joint that
-        scene.actuation drives or that has an actuator), "drive" (a joint whose drive
-        has a loop of position), "body", "free body" (where to
-        look for it; it may be on another), "ground" (an anchored body with shapes),
-        "pair" (of bodies that touch), "channel", "length" (channels that are lengths),
-        "base" (a model that stands on the world, or the world).
-    says: the report's sentence; {at} and the parameters' names are filled in.
-    says_less: the same where the first parameter is negative, which is then told
-        without its sign.
-    confused_with, tell_apart: kinds that look alike, and what tells them apart.
-    time: "both", or "discrete"/"continuous" where it makes sense in one only.
-    rank: effects of lower rank are applied first, else in the scene's order.
-    several: a place may have more than one.
+    Identity:
+    at: what it acts on: "joint" (of one degree of freedom), "actuator" (a joint that is
+        driven by scene.actuation or has an actuator), "drive" (a joint whose drive has
+        a position loop), "body", "free body" (a search looks only there), "ground" (an
+        anchored body with shapes), "pair" (of bodies that touch), "channel", "length"
+        (the channels of a body that are lengths), "base" (a model that stands on the
+        world, or the world).
+    parameters: see Parameter.
+    says: sentence of the report, with {at} and {parameter} filled in.
+    says_less: the same if the first parameter is negative; it is given without sign.
+    confused_with: kinds with similar signatures. tell_apart: an experiment that
+        distinguishes them.
+    time: "both", or "discrete" or "continuous" for plants of that kind only.
+    rank: effects are applied by rank, then in the scene's order.
+    several: one place may have more than one.
     hidden_state: it adds coordinates that no channel measures.
-    weighs: it changes weights or gravity: what two such add is not what both add.
+    weighs: it changes masses or gravity, so that two such effects do not just add up.
+    exported: how URDF and MJCF express it: "inertia" (also damping and rotors: they are
+        in the plant), "friction" or "kp" (its only parameter); "": not at all.
 
-    What it does; a kind has those steps that it needs:
-    edit_text(effect, link): the link's element in the model's URDF or SDF text.
-    before_finalize(effect, plant, scene_graph): bodies, shapes and their properties.
-    possible(effect, plant, effects): raises ValueError if the finalized plant, with
-        these effects in it, is none that could be.
-    after_finalize(effect, plant, scene_graph, builder): adds systems; the port that it
-        returns gives generalized forces (n_v,) on the plant.
+    What it does in Drake; a kind has only the steps that it needs:
+    check(effect): raises ValueError for parameters that do not fit together.
+    edit_text(effect, link): edits the link's element in the model's URDF or SDF text.
+    before_finalize(effect, plant, scene_graph): changes bodies, shapes, properties.
+    possible(effect, plant, effects): raises ValueError if the finalized plant with
+        these effects is physically impossible.
+    after_finalize(effect, plant, scene_graph, builder): adds systems; returns a port of
+        generalized forces (n_v,) on the plant.
     joint_law: compiled (q, v, t, p) -> force of the effect on the joint [N m] or [N];
-        joint_numbers(effect, plant, joint) -> its numbers p, up to four.
-    body_law: compiled (V_WB (6,), t, p, F (6,)): adds to F the spatial force, torque
-        first, on the body at its origin; body_numbers(effect) -> its numbers p.
-    exported: how URDF and MJCF say it: "inertia" (damping and rotors too: the plant has
-        it), "friction" or "kp" (its one parameter); "": they cannot.
-    drive: the number of the drive's law (DriveLaw) that its parameter replaces.
-    path: what it does between command and plant, of a name in actuation_path.STEPS.
-    channel: what it does to a measured channel, of a name in measurement.STEPS.
-    set_in_context(old, new, plant, plant_context): other parameters without a new
-        plant; old: the effect whose parameters the context has.
-    least(effect, plant, effects, damped): least values of parameters that a plant
-        without the effect allows, where there are such; `effects`: those that it has,
-        `damped`: {joint: what its drive damps it with [N m s/rad]}.
-    contains: kinds that are this one with fewer parameters: it is named only where it
-        gains clearly over them.
-    plausible(effect): whether its parameters go together in robots that people build.
-    tries(effect, plant, motions): {a nonlinear parameter: values that a search tries}.
-    rest_twist(effect, effort): how far a motor leads its joint at rest.
-    now(effect, plant, scene_graph): the parameters at which `effect` (whose own do not
-        matter) would leave the model as it is; None: the neutral values.
-    signature: see models/effects/signature.py; None: it is seen in simulation alone.
-    on_top(effect, model, motion, needed) -> (n, n_v): what it adds where the effort
-        that all else needs is `needed` (n, n_v); `added` is then of the model alone.
-    added(effect, model, motion) -> (n, n_v): what the effect adds to the inverse
-        dynamics, where the signature's unknowns are not the parameters.
+        joint_numbers(effect, plant, joint) -> p, up to four numbers.
+    body_law: compiled (V_WB (6,), t, p, F (6,)): adds to F the spatial force on the
+        body at its origin, torque first; body_numbers(effect) -> p.
+    path: its step between command and plant: a key of actuation_path.STEPS.
+    drive: the entry of the drive's law (DriveLaw) that its parameter replaces.
+    channel: its step on a measured channel: one of measured_channels.STEPS.
+    set_in_context(old, new, plant, plant_context): changes the parameters without a new
+        plant; old: the effect with the Context's present parameters.
+
+    How it is found in data:
+    now(effect, plant, scene_graph): the parameters at which the effect (whose own are
+        not used) changes nothing; None: the neutral values.
+    least(effect, plant, effects, damped): {parameter: lower bound} from the model;
+        effects: that it has; damped: {joint: damping of its drive [N m s/rad]}.
+    plausible(effect): whether the combination of parameters occurs in real robots.
+    tries(effect, plant, motions): {nonlinear parameter: values that a search tries}.
+    contains: kinds that are special cases of this one with fewer parameters: it is only
+        named if it is clearly better than they are.
+    signature: see signature.py; None: it is only visible in simulation.
+    added(effect, model, motion) -> (n, n_v): contribution to the inverse dynamics, if
+        the signature's unknowns are not the parameters.
+    on_top(effect, model, motion, needed) -> (n, n_v): contribution that depends on the
+        effort `needed` (n, n_v) for everything else.
+    static_deflection(effect, effort): angle by which a motor leads its joint at rest.
     """
 
     at: str
@@ -160,7 +166,7 @@ class EffectKind:
     contains: tuple[str, ...] = ()
     plausible: Callable[[Effect], bool] | None = None
     tries: Callable[..., Mapping[str, Sequence[float]]] | None = None
-    rest_twist: Callable[[Effect, float], float] | None = None
+    static_deflection: Callable[[Effect, float], float] | None = None
     joint_law: Callable | None = None
     joint_numbers: Callable[[Effect, MultibodyPlant, Joint], list[float]] | None = None
     body_law: Callable | None = None
@@ -187,7 +193,7 @@ class EffectKind:
 
 
 def check_parameters(effect: Effect, kind: EffectKind) -> None:
-    """Raises: ValueError for a parameter that is unknown, missing or not valid."""
+    """Raises: ValueError for an unknown, missing or invalid parameter."""
     known = [each.name for each in kind.parameters]
     for name, value in effect.parameters.items():
         if name not in known:
@@ -212,9 +218,9 @@ def check_parameters(effect: Effect, kind: EffectKind) -> None:
             "share": 0.0 <= value < 1.0,
         }[each.valid]
         if not good:
-            wanted = "0 or more and below 1" if each.valid == "share" else each.valid
+            expected = "0 or more and below 1" if each.valid == "share" else each.valid
             raise ValueError(
-                f"effect {effect.kind}: {each.name} is {value}, expected {wanted}"
+                f"effect {effect.kind}: {each.name} is {value}, expected {expected}"
             )
         if abs(value) > each.most:
             raise ValueError(
@@ -225,7 +231,7 @@ def check_parameters(effect: Effect, kind: EffectKind) -> None:
         kind.check(effect)
 
 
-# What a joint's units are where it slides.
+# Units of a revolute joint's parameters, and the same of a prismatic joint's.
 _ALONG = {
     "rad": "m", "rad/s": "m/s", "N m": "N", "N m/rad": "N/m", "N m s/rad": "N s/m",
     "N m s2/rad2": "N s2/m2", "kg m2": "kg",
@@ -233,27 +239,27 @@ _ALONG = {
 
 
 def unit_at(unit: str, slides: bool) -> str:
-    """A parameter's unit, which for a joint is written as of one that turns."""
+    """A parameter's unit, which is declared for revolute joints, at a prismatic one."""
     return _ALONG.get(unit, unit) if slides else unit
 
 
 def sliding_joints(plant: MultibodyPlant) -> set[str]:
-    """Full names of the joints that slide."""
+    """Full names of the prismatic joints."""
     joints = one_dof_joints(plant)
     return {full_name(plant, j) for j in joints if isinstance(j, PrismaticJoint)}
 
 
 def of_slides(effect: Effect, plant: MultibodyPlant) -> bool:
-    """Whether it is of joints that slide, all of them."""
+    """Whether all joints of an effect are prismatic."""
     joints = find_joints(effect, plant)
     return bool(joints) and all(isinstance(j, PrismaticJoint) for j in joints)
 
 
 def with_deviation(value: float, std: float, or_more: bool = False) -> str:
-    """value +- std, to the digits that the deviation leaves: 0.03149 +- 0.00002.
+    """Text of value +- std with the significant digits: 0.03149 +- 0.00002.
 
-    A deviation that begins with 1 has two digits. Without a finite one: three digits.
-    or_more: the value may as well be any larger, and is "0.8 (at least 0.4)".
+    The std has one digit, or two if it begins with 1; without a finite std the value
+    has three digits. or_more: only a lower bound is known: "0.8 (at least 0.4)".
     """
     if or_more and 0.0 < std < np.inf:
         return f"{value:.2g} (at least {value - 2.0 * std:.2g})"
@@ -262,7 +268,7 @@ def with_deviation(value: float, std: float, or_more: bool = False) -> str:
     digits = 2 if f"{std:.0e}"[0] == "1" else 1
     decimals = digits - 1 - int(f"{std:.{digits - 1}e}".split("e")[1])
     size = int(f"{value:.0e}".split("e")[1]) if value else 0
-    if not 0 <= decimals <= 8 or decimals + size > 7:  # Beyond what is read easily.
+    if not 0 <= decimals <= 8 or decimals + size > 7:  # Too long to read.
         return f"{value:.3g} +- {std:.1g}"
     return f"{value:.{decimals}f} +- {std:.{decimals}f}"
 
@@ -274,11 +280,11 @@ def sentence(
     slides: bool = False,
     or_more: Collection[str] = (),
 ) -> str:
-    """The report's sentence on an effect.
+    """The report's sentence about an effect.
 
-    Args: std, of the parameters where they are known: as "+- ...", an infinite one
-        in words; slides, whether it is of joints that slide; or_more, parameters that
-        may as well be any larger than two deviations below what they are.
+    Args: std: standard deviations of parameters, written as "+- ..." (an infinite one
+        in words); slides: whether its joints are prismatic; or_more: parameters of
+        which only a lower bound, two std below the value, is known.
     """
     first = effect.parameters.get(kind.parameters[0].name, 0.0)
     is_less = bool(kind.says_less) and first < 0.0
@@ -296,7 +302,7 @@ def sentence(
         words[each.name] = f"{text} {unit_at(each.unit, slides)}".rstrip()
         if spread is not None and not np.isfinite(spread):
             words[each.name] += " (not identifiable from these data)"
-    # An optional parameter that is not there takes its [bracket] with it.
+    # A [bracket] with an optional parameter that is not set is left out.
     says = re.sub(
         r"\[([^\]]*)\]", lambda m: "" if "(unset)" in _fill(m[1], words) else m[1],
         kind.says_less if is_less else kind.says,
@@ -309,6 +315,7 @@ def _fill(template: str, words: Mapping[str, str]) -> str:
 
 
 def _place(effect: Effect, kind: EffectKind) -> str:
+    """The words for `at` in a sentence."""
     what = {
         "joint": "joint",
         "actuator": "the actuator of",
@@ -334,7 +341,7 @@ def _place(effect: Effect, kind: EffectKind) -> str:
 
 
 def parameter(effect: Effect, name: str) -> float:
-    """A parameter that must be there. Raises: ValueError."""
+    """The value of a parameter. Raises: ValueError if it is missing."""
     if name not in effect.parameters:
         raise ValueError(f"effect {effect.kind} at {effect.at} needs `{name}`")
     return effect.parameters[name]
@@ -350,7 +357,7 @@ def model_names(plant: MultibodyPlant) -> list[str]:
 def find_body(effect: Effect, plant: MultibodyPlant, name: str) -> RigidBody:
     """The body `<model>.<body>`, or the only body of `<model>`, or the world's.
 
-    Raises: ValueError.
+    Raises: ValueError for an unknown body.
     """
     if name == "world":
         return plant.world_body()
@@ -462,7 +469,7 @@ def velocity_unit(joint: Joint) -> float:
 
 
 def actuator_of(plant: MultibodyPlant, joint: Joint):
-    """The joint's actuator, or None."""
+    """The joint's actuator; None if it has none."""
     for i in plant.GetJointActuatorIndices():
         actuator = plant.get_joint_actuator(i)
         if actuator.joint().index() == joint.index():

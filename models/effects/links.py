@@ -1,4 +1,4 @@
-"""Effects on a link of a mechanism: its mass and where its centre of mass is."""
+"""Effects on a link of a mechanism: its mass and its centre of mass."""
 
 from xml.dom.minidom import Element
 
@@ -17,19 +17,19 @@ from makebreak.models.effects.kind import Effect, EffectKind, Parameter, find_bo
 from makebreak.models.effects.model_text import read_inertial, write_inertial
 from makebreak.models.effects.signature import Signature
 
-# Of its mass a link keeps at least this share, so that what is spread with the mass can
-# grow again.
-LEAST_SHARE = 1e-9
+# A link keeps at least this fraction of its mass, so that its moments of inertia, which
+# scale with the mass, can be scaled up again.
+MASS_FRACTION_MIN = 1e-9
 
 
 def _left(effect: Effect, mass: float, change: float) -> float:
-    """The mass that is left. Raises: ValueError if it is less than none."""
+    """mass + change [kg]. Raises: ValueError if it is negative."""
     if not mass + change >= -1e-6 * mass:
         raise ValueError(
             f"effect link_mass at {effect.at}: {-change:g} kg less, and the link has "
             f"{mass:g} kg"
         )
-    return max(mass + change, LEAST_SHARE * mass)
+    return max(mass + change, MASS_FRACTION_MIN * mass)
 
 
 def _mass_in_text(effect: Effect, link: Element) -> None:
@@ -59,8 +59,8 @@ def _com_in_context(old: Effect, new: Effect, mass, com, central):
     return mass, com + _shift(new) - _shift(old), central
 
 
-def _nothing(effect: Effect, plant: MultibodyPlant, scene_graph):
-    """Raises: ValueError for a body without mass: there is nothing to change."""
+def _no_change(effect: Effect, plant: MultibodyPlant, scene_graph):
+    """The neutral values. Raises: ValueError for a body without mass."""
     for body in find_bodies(effect, plant):
         if not body.default_spatial_inertia().get_mass() > 0.0:
             raise ValueError(
@@ -78,7 +78,7 @@ def _least_mass(effect, plant: MultibodyPlant, effects, damped) -> dict[str, flo
 
 
 def _signature(effect: Effect, model, motion, grid=None) -> list[Signature]:
-    """Linear in the mass; in the centre of mass linearised."""
+    """Linear in the mass; linearised in the centre of mass."""
     body = find_bodies(effect, model.plant)[0]
     M = body.default_spatial_inertia()
     is_mass = effect.kind == "link_mass"
@@ -108,7 +108,7 @@ def _com_added(effect: Effect, model, motion) -> np.ndarray:
 
 
 KINDS = {
-    # Spread as before: moments of inertia go with the mass.
+    # The moments of inertia scale with the mass: its distribution stays.
     "link_mass": EffectKind(
         at="body",
         parameters=(Parameter("mass", "kg", -20.0, 20.0),),
@@ -123,11 +123,11 @@ KINDS = {
         edit_text=_mass_in_text,
         set_in_context=change_inertia(_mass_in_context),
         least=_least_mass,
-        now=_nothing,
+        now=_no_change,
         signature=_signature,
         added=_mass_added,
     ),
-    # The inertia about the centre of mass stays.
+    # The inertia about the centre of mass is kept.
     "link_com": EffectKind(
         at="body",
         parameters=tuple(Parameter(axis, "m", -0.3, 0.3) for axis in "xyz"),
@@ -141,7 +141,7 @@ KINDS = {
         weighs=True,
         edit_text=_com_in_text,
         set_in_context=change_inertia(_com_in_context),
-        now=_nothing,
+        now=_no_change,
         signature=_signature,
         added=_com_added,
     ),

@@ -1,4 +1,4 @@
-"""Effects on what a mechanism carries and on what it stands: payload, tilt."""
+"""Effects of the load of a mechanism and of its base: payload, gravity_tilt."""
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
@@ -30,7 +30,7 @@ from makebreak.models.effects.signature import Signature, without_momentum
 # ----- payload
 
 _PLACE = ("com_x", "com_y", "com_z")
-FARTHEST = 0.5  # [m] A load's place from its body's origin.
+PLACE_MAX = 0.5  # Coordinates of a load in its body's frame [m].
 
 
 def _payload_name(plant: MultibodyPlant, body: RigidBody) -> str:
@@ -38,8 +38,8 @@ def _payload_name(plant: MultibodyPlant, body: RigidBody) -> str:
 
 
 def _payload_inertia(effect: Effect) -> SpatialInertia:
-    """Of a mass that may be negative: then it is no body's, which Drake takes as long
-    as nobody asks."""
+    """A point mass, perhaps negative. Drake's check for physical validity is skipped;
+    _check_left checks the sum with the body."""
     com = _payload_place(effect)
     unit = UnitInertia.PointMass(com)
     return SpatialInertia(effect.parameters["mass"], com, unit, True)
@@ -52,8 +52,9 @@ def _payload_place(effect: Effect) -> np.ndarray:
 def _check_left(
     effect: Effect, plant: MultibodyPlant, body: RigidBody, more: SpatialInertia | None
 ) -> None:
-    """Raises: ValueError if less than nothing is left of the body and what is welded
-    to it, with `more` (at the body's origin) if it is not in the plant yet."""
+    """Raises: ValueError if the inertia of the body and of all that is welded to it is
+    not physical; `more`: a load that is not in the plant yet, about the body's
+    origin."""
     if effect.parameters["mass"] >= 0.0:
         return
     fixed = [each.index() for each in plant.GetBodiesWeldedTo(body)]
@@ -94,8 +95,8 @@ def _least_payload(effect, plant: MultibodyPlant, effects, damped) -> dict[str, 
 
 
 def _add_payload(effect: Effect, plant: MultibodyPlant, scene_graph) -> None:
-    """A point mass, welded on. It is a model of its own: the carrier's bodies and its
-    share of the state stay what they are."""
+    """Welds a point mass to the body, in a model instance of its own, so that bodies
+    and state of the carrier keep their layout."""
     for body in find_bodies(effect, plant):
         name = _payload_name(plant, body)
         if plant.HasModelInstanceNamed(name):
@@ -116,28 +117,27 @@ def _change_payload(old: Effect, new: Effect, plant: MultibodyPlant, context) ->
 
 
 def point_of(c: np.ndarray) -> tuple[float, np.ndarray]:
-    """(mass [kg], place (3,) [m]) of a point mass from coefficients c of mass, mass
-    times place and perhaps the moments of inertia about the origin.
+    """(mass [kg], place (3,) [m]) of a point mass from c: mass, mass times place (3),
+    and perhaps moments of inertia about the origin (0 where not identified).
 
-    The mass of a load on a link that turns about a fixed axis shows in no weight of its
-    own. There it is what mass times place and those moments that show say:
-    ixx = ((m y)^2 + (m z)^2) / m, and so on.
+    On a link that turns about a fixed axis the mass alone is not identifiable. There it
+    follows from mass times place and the moments: ixx = ((m y)^2 + (m z)^2) / m, etc.
     """
     mass, moment = float(c[0]), np.array(c[1:4])
-    if abs(mass) > 1e-12 and np.abs(moment / mass).max() <= FARTHEST:
+    if abs(mass) > 1e-12 and np.abs(moment / mass).max() <= PLACE_MAX:
         return mass, moment / mass
     about = np.array(c[4:7])
     squares = (moment @ moment - moment**2)[: len(about)]
-    shown = about != 0.0
-    if not about[shown].sum() != 0.0 or not squares[shown].sum() > 0.0:
+    found = about != 0.0
+    if not about[found].sum() != 0.0 or not squares[found].sum() > 0.0:
         return mass, moment / mass if abs(mass) > 1e-12 else np.zeros(3)
-    mass = float(squares[shown].sum() / about[shown].sum())
+    mass = float(squares[found].sum() / about[found].sum())
     return mass, moment / mass
 
 
 def _payload_signature(effect, model, motion, grid=None) -> list[Signature]:
-    """Mass, mass times place, and the moments of inertia about the origin, which follow
-    from these but are coefficients of their own: so all is linear, and one solution."""
+    """Linear in mass, mass times place and the moments of inertia about the origin.
+    The moments follow from the others, but are free here to keep the fit linear."""
     (body,) = find_bodies(effect, model.plant)[:1]
 
     def to_parameters(c):
@@ -164,14 +164,15 @@ def _payload_added(effect, model, motion) -> np.ndarray:
 
 
 def rotation(effect: Effect):
+    """RotationMatrix of a gravity_tilt."""
     return RollPitchYaw(
         effect.parameters["roll"], effect.parameters["pitch"], 0.0
     ).ToRotationMatrix()
 
 
 def _tilt(effect: Effect, plant: MultibodyPlant, scene_graph) -> None:
-    """A model that is welded to the world turns about its base's origin; else, and at
-    `world`, gravity turns the other way."""
+    """Rotates a model that is welded to the world about its base's origin. For other
+    models, and at `world`, gravity is rotated the opposite way instead."""
     R = rotation(effect)
     for at in effect.at:
         if at != "world" and at not in model_names(plant):
@@ -212,8 +213,8 @@ def _tilt(effect: Effect, plant: MultibodyPlant, scene_graph) -> None:
 
 
 def _tilt_signature(effect, model, motion, grid=None) -> list[Signature]:
-    """Gravity's generalized force is linear in gravity; R^T g = g - axis x g, nearly.
-    Free bodies feel a base's tilt only at `world`."""
+    """Linear in small angles: R^T g = g - axis x g. Free bodies feel the tilt only at
+    `world`."""
     tilted = _weight(effect, model, motion)
     columns = np.stack(
         [tilted(np.cross(axis, model.gravity)) for axis in np.eye(3)[:2]], axis=2
@@ -227,20 +228,21 @@ def _tilt_added(effect, model, motion) -> np.ndarray:
 
 
 def _weight(effect, model, motion):
-    """A function: less gravity (3,) -> effort (n, n_v) of the joints that feel it."""
+    """Function of a change of gravity (3,) with opposite sign -> effort (n, n_v) at the
+    joints that feel the tilt."""
     plant = model.plant
     mJ = model.mass_times_com_jacobian(motion.q)  # (n, 3, n_v)
-    stay = np.zeros(plant.num_velocities(), dtype=bool)
+    unaffected = np.zeros(plant.num_velocities(), dtype=bool)
     if effect.at != ["world"]:
-        stay[:] = True
+        unaffected[:] = True
         for joint in one_dof_joints(plant):
             if _stands_on(plant, joint.child_body(), effect.at):
-                stay[joint.velocity_start()] = False
-    return lambda less: np.where(stay, 0.0, less @ mJ)
+                unaffected[joint.velocity_start()] = False
+    return lambda less: np.where(unaffected, 0.0, less @ mJ)
 
 
 def _stands_on(plant: MultibodyPlant, body: RigidBody, models: list[str]) -> bool:
-    """Whether the way from the body to the world leads over one of the models."""
+    """Whether a body of one of the models lies between the body and the world."""
     parent = {
         joint.child_body().index(): joint.parent_body()
         for joint in (plant.get_joint(i) for i in plant.GetJointIndices())
@@ -259,7 +261,7 @@ KINDS = {
         at="body",
         parameters=(
             Parameter("mass", "kg", -20.0, 20.0),
-            *(Parameter(name, "m", -FARTHEST, FARTHEST, None) for name in _PLACE),
+            *(Parameter(name, "m", -PLACE_MAX, PLACE_MAX, None) for name in _PLACE),
         ),
         says="{at} carries {mass} that the model lacks, at ({com_x}, {com_y}, {com_z}) "
         "in its frame",

@@ -1,4 +1,4 @@
-"""What lies between a true value and its measured channel, when it is not nothing."""
+"""The map from a true value to its measured channel: scale, bias, delay, skew, lag."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,14 +16,14 @@ BODY = "x y z qw qx qy qz vx vy vz wx wy wz".split()
 WRENCH = "fx fy fz tx ty tz".split()
 LENGTHS = ("x", "y", "z", "vx", "vy", "vz")
 _CURRENT = re.compile(r"current[, :x*]*(-?\d*\.?\d+(?:e[+-]?\d+)?)\s*n\s?m\s?/\s?a")
-# What a kind of effect may name as its step.
+# Steps of the map that a kind of effect can change (EffectKind.channel).
 STEPS = ("offset", "delay", "skew", "bias", "scale", "lag")
 
 
 @dataclass(frozen=True)
 class ChannelMap:
-    """measured(t) = scale true((t - delay) / (1 + skew)) + bias, the true value behind
-    first-order low-passes, each with its time constant in `lags`."""
+    """measured(t) = scale true((t - delay) / (1 + skew)) + bias, with the true value
+    after first-order low-passes of the time constants `lags`."""
 
     scale: float = 1.0
     bias: float = 0.0  # [unit of the channel]
@@ -32,11 +32,11 @@ class ChannelMap:
     lags: tuple[float, ...] = ()  # [s]
 
     def true_value(self, measured):
-        """The value that is measured so, without the shift in time."""
+        """The true value of a measured one, apart from the shift in time."""
         return (measured - self.bias) / self.scale
 
     def stamp(self, time):
-        """The stamp under which the value of `time` is measured."""
+        """The time stamp at which the value of `time` is measured [s]."""
         return time * (1.0 + self.skew) + self.delay
 
 
@@ -54,25 +54,28 @@ def acts_on(effect: Effect, step: str, channel: str) -> bool:
     )
 
 
-def is_link_side(words: Mapping[str, str], channel: str) -> bool:
-    """Whether a scene's `channels` say so: an entry for the channel, or for its last
-    part, that begins with `link`."""
-    said = words.get(channel, words.get(channel.rsplit(".", 1)[-1], ""))
-    return said.strip().lower().startswith("link")
+def is_link_side(notes: Mapping[str, str], channel: str) -> bool:
+    """Whether the scene's `channels` place the sensor on the link's side: whether the
+    entry for the channel, or for its last part, begins with `link`."""
+    note = notes.get(channel, notes.get(channel.rsplit(".", 1)[-1], ""))
+    return note.strip().lower().startswith("link")
 
 
-def torque_constant(words: Mapping[str, str], channel: str) -> float:
-    """[N m/A] by which a measured effort that is a current becomes one, as "current,
-    0.11 N m/A"; 1 where it is no current. Raises: ValueError where none is given."""
-    said = words.get(channel, words.get(channel.rsplit(".", 1)[-1], ""))
-    said = said.strip().lower()
-    if not said.startswith("current"):
+def torque_constant(notes: Mapping[str, str], channel: str) -> float:
+    """Torque constant [N m/A] of a channel that the scene's `channels` declare as a
+    motor current ("current, 0.11 N m/A"); 1 for other channels.
+
+    Raises: ValueError for a current without a usable constant.
+    """
+    note = notes.get(channel, notes.get(channel.rsplit(".", 1)[-1], ""))
+    note = note.strip().lower()
+    if not note.startswith("current"):
         return 1.0
-    found = _CURRENT.fullmatch(said)
+    found = _CURRENT.fullmatch(note)
     value = float(found.group(1)) if found else 0.0
     if value == 0.0 or abs(value) > 1e6:
         raise ValueError(
-            f'channels.{channel}: got "{said}", expected a torque constant, as in '
+            f'channels.{channel}: got "{note}", expected a torque constant, as in '
             '"current, 0.11 N m/A"'
         )
     return value
@@ -81,9 +84,9 @@ def torque_constant(words: Mapping[str, str], channel: str) -> float:
 def channel_maps(
     effects: Iterable[Effect], steps: Mapping[str, str], channels: Iterable[str]
 ) -> dict[str, ChannelMap]:
-    """The map of each of the channels that is not measured as it is.
+    """{channel: ChannelMap} of those channels that an effect changes.
 
-    Args: steps: kind -> its step, for the kinds that act on channels.
+    Args: steps: {kind: step} of the kinds that act on channels.
     """
     maps: dict[str, ChannelMap] = {}
     effects = list(effects)
@@ -160,8 +163,8 @@ class MeasuredChannels(LeafSystem):
     Inputs:  u (n,); state (n_x,) of the plant, if `from_state` is not empty.
     Outputs: y (n,).
 
-    Args: maps: of each entry; from_state: {entry: index in the state}, for a joint
-        whose encoder sits on the motor's side of an elastic element.
+    Args: maps: one of each entry; from_state: {entry: index in the state} of the joints
+        whose encoder is on the motor's side of an elastic element.
     """
 
     def __init__(

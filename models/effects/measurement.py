@@ -1,10 +1,10 @@
-"""Effects on what is measured and not on what happens.
+"""Effects on the measurement, not on the motion.
 
     measured(t) = scale true((t - delay) / (1 + skew)) + bias
 
-A sensor_lag is a first-order low-pass before that: T dy/dt = true - y. An offset is in
-a joint's encoder: the drive of a position-controlled joint sees it as well. All others
-are in the recorded channel alone.
+A sensor_lag is a first-order low-pass of the true value: T dy/dt = true - y. An offset
+is in a joint's encoder, so that the drive of a position-controlled joint sees it as
+well. All others are in the recorded channel alone.
 """
 
 from dataclasses import dataclass, replace
@@ -18,8 +18,8 @@ from makebreak.models.effects.signature import Signature, without_momentum
 
 @dataclass
 class _Error:
-    """What one unit of the coefficient adds to the motion as measured, (n, n_v) each;
-    positions as velocities times 1 s."""
+    """Derivative of the measured motion by the coefficient, (n, n_v) each; that of the
+    positions as a velocity times 1 s."""
 
     q: np.ndarray
     v: np.ndarray
@@ -28,10 +28,11 @@ class _Error:
 
 
 def _signature(step: str, unknown: str, to_parameters):
-    """The derivative of each channel, and through the inverse dynamics of the residual:
-    r = effort - ID(measured motion), so r = error of effort - dID/d(q, v, vd) error.
+    """The signature of a measurement error, to first order.
 
-    A channel `position` is q, `velocity` is v and, by differences, vd.
+    The residual r = effort - ID(measured motion) changes by
+    error of effort - dID/d(q, v, vd) error of (q, v, vd). A channel `position` gives
+    q, `velocity` gives v and, by differences, vd.
     """
 
     def signature(effect: Effect, model, motion, grid=None) -> list[Signature]:
@@ -89,7 +90,7 @@ def _signature(step: str, unknown: str, to_parameters):
 def _derivative(step, time, value, rate):
     if step in ("offset", "bias"):
         return np.ones_like(value)
-    if step in ("delay", "lag"):  # To first order they are the same.
+    if step in ("delay", "lag"):  # To first order a lag is a delay.
         return -rate
     if step == "skew":
         return -time * rate
@@ -97,7 +98,7 @@ def _derivative(step, time, value, rate):
 
 
 def _step(*errors) -> float:
-    """A step at which a central difference is good to 1e-8 of its size."""
+    """A step for central differences with a relative error of about 1e-8."""
     greatest = max(abs(error).max(initial=0.0) for error in errors)
     return 1e-4 / max(greatest, 1e-3)
 
@@ -146,7 +147,7 @@ KINDS = {
     ),
     "sensor_lag": EffectKind(
         at="channel",
-        # Below 0: less than what the recording's sidecar declares.
+        # Negative: a shorter lag than the recording's sidecar declares.
         parameters=(Parameter("time_constant", "s", -0.05, 0.2),),
         says="{at} is low-passed, first order, with a time constant of {time_constant} "
         "beyond what is declared",

@@ -1,4 +1,4 @@
-"""Edits of a model's URDF or SDF text: what Drake can take only from a file."""
+"""Edits of URDF and SDF files, for properties that Drake reads only from a file."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,8 +22,8 @@ def edited_model_file(
 ) -> str:
     """Writes a copy of a model file with one link edited.
 
-    Args: uri, of the model; body, name of the link, may be empty if there is but one;
-        copy, path of the copy without the suffix.
+    Args: uri: of the model; body: name of the link, or empty if there is only one;
+        copy: path of the copy without its suffix.
     Returns: the copy's URI.
     Raises: ValueError if the file is neither URDF nor SDF, or has no such link.
     """
@@ -31,7 +31,7 @@ def edited_model_file(
     where = f"effect {effect.kind} at {effect.at}"
     if path.suffix not in (".urdf", ".sdf"):
         raise ValueError(f"{where}: {path.name} is neither URDF nor SDF")
-    document = minidom.parse(str(path))  # It keeps prefixes, as in drake:..., as is.
+    document = minidom.parse(str(path))  # Keeps prefixes such as drake: as they are.
     links = [x for x in document.getElementsByTagName("link") if x.hasAttribute("name")]
     chosen = [
         link
@@ -42,14 +42,15 @@ def edited_model_file(
         names = ", ".join(link.getAttribute("name") for link in links)
         raise ValueError(f"{where}: expected one link of {path.name}: {names}")
     edit(effect, chosen[0])
-    with_meshes_of(document, path.parent)
+    make_mesh_paths_absolute(document, path.parent)
     target = copy.with_suffix(path.suffix)
     target.write_text(document.toxml())
     return f"file://{target}"
 
 
 def model_path(uri: str, package_map: PackageMap) -> Path:
-    """As Drake reads it: no %20, and "#" is part of the name."""
+    """Path of a file:// or package:// URI as Drake reads it: without %-escapes or
+    fragments."""
     scheme, _, rest = uri.partition("://")
     path = Path(rest)
     if scheme == "package":
@@ -58,8 +59,8 @@ def model_path(uri: str, package_map: PackageMap) -> Path:
     return path
 
 
-def with_meshes_of(document: minidom.Document, folder: Path) -> None:
-    """Meshes stay where they are, in the folder of the original; the copy does not."""
+def make_mesh_paths_absolute(document: minidom.Document, folder: Path) -> None:
+    """Makes paths relative to `folder` absolute, so that the document can be moved."""
     for element in document.getElementsByTagName("uri"):
         uri = text(element)
         if "://" not in uri:
@@ -71,6 +72,7 @@ def with_meshes_of(document: minidom.Document, folder: Path) -> None:
 
 
 def text(element: minidom.Element) -> str:
+    """The element's own text, without that of its children."""
     return "".join(node.data for node in element.childNodes if hasattr(node, "data"))
 
 
@@ -97,7 +99,7 @@ def children(element: minidom.Element, *path: str) -> list[minidom.Element]:
 
 
 def scale_inertia(link: minidom.Element, scale: float) -> None:
-    """The link's mass stays; it is spread `scale` times as far: centre of mass times
+    """Scales a link about its frame's origin at constant mass: centre of mass times
     scale, moments of inertia times scale^2. Raises: ValueError without inertia."""
     inertias = children(link, "inertial", "inertia")
     if not inertias:
@@ -115,7 +117,7 @@ def scale_inertia(link: minidom.Element, scale: float) -> None:
 
 
 def _scaled(numbers: str, scale: float) -> str:
-    """The first three numbers times scale, the others as they are."""
+    """Numbers of a pose, the first three (the translation) times scale."""
     values = [float(x) for x in numbers.split()]
     return " ".join(repr(scale * x if i < 3 else x) for i, x in enumerate(values))
 
@@ -135,8 +137,11 @@ PRODUCTS = {"xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
 
 
 def read_inertial(link: minidom.Element) -> Inertial:
-    """Raises: ValueError where a number is missing or a pose is given otherwise than
-    by six numbers in radians."""
+    """The inertia of a link element.
+
+    Raises: ValueError if mass or inertia is missing, or if the inertial pose has
+        attributes other than its six numbers in radians.
+    """
     name = link.getAttribute("name")
     inertia = children(link, "inertial", "inertia")
     mass = children(link, "inertial", "mass")
@@ -170,10 +175,9 @@ def read_inertial(link: minidom.Element) -> Inertial:
 
 
 def write_inertial(link: minidom.Element, inertial: Inertial) -> None:
-    """Writes what read_inertial reads, its axes the link's.
+    """Writes an inertia into a link element, with the inertial frame along the link's.
 
-    Raises: ValueError for an inertia that no body has: Drake would replace it by
-        another.
+    Raises: ValueError for an unphysical inertia, which Drake would replace by another.
     """
     least, middle, greatest = np.linalg.eigvalsh(inertial.central)
     if not (least >= 0.0 and least + middle >= greatest * (1.0 - 1e-9)):
@@ -194,7 +198,7 @@ def write_inertial(link: minidom.Element, inertial: Inertial) -> None:
             set_text(element, value)
         if not elements and not inertia.hasChildNodes():
             inertia.setAttribute(f"i{key}", value)
-        elif not elements:  # SDF may leave products out.
+        elif not elements:  # SDF may omit products of inertia.
             element = minidom.Document().createElement(f"i{key}")
             element.ownerDocument = link.ownerDocument
             inertia.appendChild(element)

@@ -1,4 +1,4 @@
-"""Effects on an object itself: its size, edges, mass, centre of mass and inertia."""
+"""Effects on an object itself: size, corner radius, mass, centre of mass, inertia."""
 
 from itertools import product
 from xml.dom.minidom import Element
@@ -50,6 +50,7 @@ from makebreak.models.effects.signature import Signature
 
 
 def _scale_in_text(effect: Effect, link: Element) -> None:
+    """Edits the inertia in the file; _scale_shapes changes the shapes in the plant."""
     spheres = children(link, "collision", "geometry", "sphere")
     radii = [float(text(r)) for sphere in spheres for r in children(sphere, "radius")]
     radii += [
@@ -59,7 +60,11 @@ def _scale_in_text(effect: Effect, link: Element) -> None:
 
 
 def _scale(effect: Effect, radii: list[float]) -> float:
-    """Radii are those of the body's collision spheres."""
+    """The factor of an object_size; radii [m]: of the body's collision spheres.
+
+    Raises: ValueError if it is not given, not positive, or given twice with different
+        values, or if `radius` is given for a body without one sphere.
+    """
     given = [name for name in ("scale", "radius") if name in effect.parameters]
     if not given:
         raise ValueError(f"effect object_size at {effect.at} needs `scale` or `radius`")
@@ -105,7 +110,7 @@ def _scaled_shape(shape: Shape, scale: float) -> Shape:
 def _scale_shapes(
     effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph
 ) -> None:
-    """All shapes of the body, seen and touched, about the body's origin."""
+    """Scales visual and collision shapes of the body about its origin."""
     inspector = scene_graph.model_inspector()
     for at in effect.at:
         body = find_body(effect, plant, at)
@@ -128,7 +133,7 @@ def _size_now(effect: Effect, plant: MultibodyPlant, scene_graph) -> dict[str, f
 
 
 def _touched(body: RigidBody, plant: MultibodyPlant, scene_graph: SceneGraph):
-    """(id, shape, pose in the body) of what can be touched."""
+    """(id, shape, pose in the body's frame) of each collision shape."""
     inspector = scene_graph.model_inspector()
     return [
         (g, inspector.GetShape(g), inspector.GetPoseInFrame(g))
@@ -141,10 +146,10 @@ def _touched(body: RigidBody, plant: MultibodyPlant, scene_graph: SceneGraph):
 
 
 def _block(effect: Effect, body: RigidBody, plant, scene_graph):
-    """Half sizes (3,) and frame of the block that the body is: one box, or the eight
-    spheres of its corners; with their present radius.
+    """Half sizes (3,) [m], pose in the body's frame and corner radius [m] of a block,
+    whose collision shapes are one box, or eight spheres at its corners.
 
-    Raises: ValueError if it is neither.
+    Raises: ValueError if they are neither.
     """
     shapes = _touched(body, plant, scene_graph)
     if len(shapes) == 1 and isinstance(shapes[0][1], Box):
@@ -165,7 +170,7 @@ def _block(effect: Effect, body: RigidBody, plant, scene_graph):
 def _round_corners(
     effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph
 ) -> None:
-    """Eight spheres, each touching three faces of the block from inside."""
+    """Replaces the block by eight spheres, each tangent to three faces from inside."""
     radius = effect.parameters["radius"]
     for body in find_bodies(effect, plant):
         half, X_BG, _ = _block(effect, body, plant, scene_graph)
@@ -204,7 +209,7 @@ def _radius_now(effect: Effect, plant: MultibodyPlant, scene_graph) -> dict[str,
 
 
 def _mass_in_text(effect: Effect, link: Element) -> None:
-    """The mass is spread as before: moments of inertia go with it."""
+    """The moments of inertia scale with the mass: its distribution stays."""
     inertial = read_inertial(link)
     mass = effect.parameters["mass"]
     inertial.central *= mass / inertial.mass
@@ -213,7 +218,7 @@ def _mass_in_text(effect: Effect, link: Element) -> None:
 
 
 def _com_in_text(effect: Effect, link: Element) -> None:
-    """The inertia about the centre of mass stays."""
+    """The inertia about the centre of mass is kept."""
     inertial = read_inertial(link)
     inertial.com = _new_com(effect, inertial.com)
     write_inertial(link, inertial)
@@ -230,7 +235,7 @@ def _new_com(effect: Effect, com) -> np.ndarray:
 
 
 def _new_central(effect: Effect, central) -> np.ndarray:
-    """Moments about the centre of mass along the body's axes; the products stay."""
+    """Moments of inertia about the centre of mass, body axes; products are kept."""
     new = np.array(central)
     for key, at in MOMENTS.items():
         new[at] = effect.parameters.get(f"i{key}", new[at])
@@ -248,8 +253,8 @@ def _inertial_now(effect: Effect, plant: MultibodyPlant, scene_graph):
 
 
 def _inertial_signature(effect: Effect, model, motion, grid=None) -> list[Signature]:
-    """Linear in the mass; in the centre of mass linearised, as the inertia about the
-    body's origin goes with its square; linear in the moments of inertia."""
+    """Linear in mass and moments of inertia; linearised in the centre of mass, as the
+    inertia about the body's origin depends on its square."""
     body = find_bodies(effect, model.plant)[0]
     M = body.default_spatial_inertia()
     now = _inertial_now(effect, model.plant, None)

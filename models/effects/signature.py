@@ -1,12 +1,12 @@
-"""How a kind of effect shows in measured motion: its columns in the residual.
+"""Signatures: how a kind of effect appears in the residual of measured motion.
 
-The residual of inverse dynamics is r = effort - ID(q, v, vd), generalized forces [N m]
-or [N] in the order of the plant's velocities, with the effort that the recording tells
-and the model's inverse dynamics at the measured motion. An effect that the model lacks
-shows as r = columns @ coefficients. For a free body the rows of r are the wrench on it
-that the model does not know: torque, then force at its origin, world axes.
+The residual of inverse dynamics is r = effort - ID(q, v, vd): generalized forces [N m]
+or [N] in the order of the plant's velocities, with the recorded effort and the model's
+inverse dynamics at the measured motion. An effect that the model lacks appears as
+r = columns @ coefficients. For a free body the rows of r are the unmodelled wrench on
+it: torque, then force, at its origin in world axes.
 
-In weak form nothing needs vd: columns = d/dt momentum + rest, so with a test function w
+The weak form needs no vd: columns = d/dt momentum + rest, so with a test function w
 that is zero at both ends of a window, integral(w columns) = integral(w rest - w'
 momentum); and ID = d/dt (M v) + Dynamics.rest in the same way.
 """
@@ -27,11 +27,11 @@ Grid = Mapping[str, Sequence[float]]
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Measured motion in the plant's own order; n samples of one episode.
+    """Measured motion in the plant's order: n samples of one episode.
 
-    effort: of the actuators as the recording tells, 0 where nothing drives (commanded
-        or measured, the caller decides which).
-    jerk: d/dt vd, for the kinds that shift time; differences of vd if None.
+    effort: recorded effort of the actuators, commanded or measured as the caller
+        decides; 0 at joints without an actuator.
+    jerk: d/dt vd, for kinds that shift time; None: differences of vd.
     """
 
     time: np.ndarray  # (n,) [s]
@@ -58,15 +58,17 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Signature:
-    """Columns of one effect at one place; the nonlinear parameters are held.
+    """Columns of one effect at one place, with nonlinear parameters held.
 
-    columns (n, n_v, k). weak(): momentum and rest of the same shape, columns = d/dt
-    momentum + rest; computed when they are asked for.
+    columns: (n, n_v, k).
+    weak(): momentum and rest, of the same shape: columns = d/dt momentum + rest.
     unknowns: names of the k coefficients, for tables.
-    to_parameters(coefficients (k,)): the effect's parameters, the held ones too.
-    exact: the residual is linear in the coefficients, else linearised at no effect.
-    channels: what a unit of each coefficient adds to a measured channel, (n, k); for
-        the kinds that change measurement and not motion.
+    held: the nonlinear parameters.
+    to_parameters(coefficients (k,)): the effect's parameters, with the held ones.
+    exact: whether the residual is linear in the coefficients; otherwise it is
+        linearised at zero effect.
+    channels: {channel: (n, k) change of the channel per unit of each coefficient}, for
+        kinds that change the measurement instead of the motion.
     """
 
     effect: Effect  # kind and at.
@@ -92,7 +94,7 @@ class Signature:
 
 
 class Dynamics(Protocol):
-    """What a signature asks of the model: models/dynamics.py gives it."""
+    """The interface of the model that a signature uses (models/dynamics.py)."""
 
     plant: MultibodyPlant
     gravity: np.ndarray  # (3,) [m/s2]
@@ -110,8 +112,8 @@ class Dynamics(Protocol):
 def added_effort(
     effect: Effect, kind: EffectKind, model: Dynamics, motion: Motion
 ) -> np.ndarray | None:
-    """(n, n_v) what an effect adds to the inverse dynamics of a model without it, by
-    its signature; None where only a model with the effect tells."""
+    """Contribution (n, n_v) of an effect to the inverse dynamics of a model without it,
+    from its signature; None if only a model with the effect gives it."""
     if kind.added is not None:
         return kind.added(effect, model, motion)
     if kind.signature is None:
@@ -133,8 +135,8 @@ def at_joints(
     to_parameters: Callable | None = None,
     exact: bool = True,
 ) -> Signature:
-    """A signature without momentum; column i of joint j is entries[i](q_j, v_j, j's
-    effort): one coefficient for all the joints that `at` names."""
+    """A signature without momentum, with the same coefficients for all joints of `at`:
+    column i at joint j is entries[i](q_j, v_j, effort_j)."""
     columns = np.zeros((*motion.v.shape, len(unknowns)))
     for joint in joints:
         i_q, i_v = joint.position_start(), joint.velocity_start()
@@ -154,6 +156,7 @@ def without_momentum(
     exact: bool = True,
     channels: Mapping[str, np.ndarray] | None = None,
 ) -> Signature:
+    """A signature whose columns contain no derivative: momentum 0, rest = columns."""
     held = dict(held or {})
     names = tuple(unknowns)
 
@@ -176,15 +179,15 @@ def without_momentum(
 
 
 def lagged(time: np.ndarray, u: np.ndarray, delay: float) -> np.ndarray:
-    """u (n, ...) as it was `delay` earlier, linear between samples; before the first
-    sample u is the first sample."""
+    """u (n, ...) delayed by `delay` [s], linear between samples and constant before the
+    first one."""
     flat = u.reshape(len(time), -1)
     out = [np.interp(time - delay, time, column) for column in flat.T]
     return np.stack(out, axis=1).reshape(u.shape)
 
 
 def filtered(time: np.ndarray, u: np.ndarray, time_constant: float) -> np.ndarray:
-    """u (n, ...) after a first-order lag, each value held until the next sample."""
+    """u (n, ...) after a first-order lag, with values held between samples."""
     keep = np.exp(-np.diff(time) / time_constant)
     out = np.array(u, dtype=float)
     for i, a in enumerate(keep):

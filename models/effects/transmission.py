@@ -1,9 +1,9 @@
 """Effects between a motor and its joint: elasticity, backlash.
 
-The motor becomes a coordinate of its own: a massless body on the joint's parent that
-turns about the joint's axis, with the rotor's reflected inertia; a force couples it
-with the joint. It is a model of its own, `motor_of_<model>_<joint>`, so the
-mechanism's share of the state stays what it is. The motor's torque goes to it
+The motor gets a degree of freedom of its own: a massless body on the joint's parent
+that turns about the joint's axis, with the rotor's reflected inertia; a force couples
+it to the joint. It is a separate model instance, `motor_of_<model>_<joint>`, so that
+the mechanism's part of the state keeps its layout. The motor torque acts on it
 (actuation_path.py), and position and velocity are measured at it, unless the scene's
 channels say `link`.
 """
@@ -39,20 +39,21 @@ from makebreak.models.effects.kind import (
 from makebreak.models.effects.signature import Signature, without_momentum
 from makebreak.systems.numerics.smoother import smooth
 
-# A rotor where the model has none, as a share of the joint's inertia [-].
+# Rotor inertia over the joint's inertia, where the model has no rotor [-].
 ROTOR_SHARE = 0.01
-# Backlash: once the gap is closed, motor and joint swing at this many radians a time
-# step of a discrete plant, and at this rate [rad/s] in a continuous one.
+# Natural frequency of motor and joint against each other while a backlash gap is
+# closed: radians per time step of a discrete plant, and at most [rad/s].
 CONTACT_RATE, CONTACT_RATE_MAX = 0.3, 2000.0
-CONTACT_DAMPING = 0.3  # Damping ratio of that swing, where no restitution is said.
+CONTACT_DAMPING = 0.3  # Its damping ratio, where no restitution is given.
 
 
 def motor_model(plant: MultibodyPlant, joint: Joint) -> str:
+    """Name of the model instance of the joint's motor."""
     return f"motor_of_{full_name(plant, joint).replace('.', '_')}"
 
 
 def motor_joint(plant: MultibodyPlant, joint: Joint) -> Joint | None:
-    """The motor's own joint, where the joint is driven through an elastic element."""
+    """The joint of the motor; None unless it drives through an elastic element."""
     name = motor_model(plant, joint)
     if not plant.HasModelInstanceNamed(name):
         return None
@@ -88,15 +89,14 @@ def _add_motor(effect: Effect, plant: MultibodyPlant, scene_graph) -> None:
             new.set_default_rotor_inertia(old.default_rotor_inertia())
             old.set_default_rotor_inertia(0.0)
         if new.default_reflected_inertia() == 0.0:
-            share = ROTOR_SHARE * _inertia(plant, joint)
+            rotor = ROTOR_SHARE * _inertia(plant, joint)
             new.set_default_gear_ratio(1.0)
-            new.set_default_rotor_inertia(share)
+            new.set_default_rotor_inertia(rotor)
 
 
 def _inertia(plant: MultibodyPlant, joint: Joint) -> float:
-    """Rough inertia of what the joint moves, before the plant is finalized: of the
-    bodies beyond it at its zero, about its axis."""
-    # Bodies beyond, with their poses in the joint's frame on the child.
+    """Rough inertia that the joint moves, before Finalize: that of all bodies outboard
+    of it about its axis, at zero positions [kg m2]; a prismatic joint: mass [kg]."""
     children: dict = {}
     for each in (plant.get_joint(i) for i in plant.GetJointIndices()):
         children.setdefault(each.parent_body().index(), []).append(each)
@@ -106,6 +106,7 @@ def _inertia(plant: MultibodyPlant, joint: Joint) -> float:
         else joint.translation_axis()
     )
     X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
+    # Outboard bodies and their poses in frame M, the joint's frame on its child.
     todo, total = [(joint.child_body(), X_MB)], 0.0
     while todo:
         body, X = todo.pop()
@@ -133,7 +134,7 @@ class Coupling(LeafSystem):
         k deadzone(twist, gap/2) + d (v_motor - v_joint) while the gap is closed
 
     on the joint, and its opposite on the motor. With a gap the damping fades in over
-    the first thousandth of the gap, and the force never pulls.
+    a penetration of 0.001 gap, and the force never pulls.
 
     Inputs:  state (n_x,) of the plant.
     Outputs: generalized_force (n_v,).
@@ -167,9 +168,9 @@ class Coupling(LeafSystem):
         rate = v[self._v[1]] - v[self._v[0]]
         pressed = np.sign(twist) * np.maximum(abs(twist) - gap / 2.0, 0.0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            share = np.where(gap > 0.0, np.minimum(abs(pressed) / (1e-3 * gap), 1.0), 1)
-        force = k * pressed + d * share * rate
-        # Through a gap nothing pulls back.
+            fade = np.where(gap > 0.0, np.minimum(abs(pressed) / (1e-3 * gap), 1.0), 1)
+        force = k * pressed + d * fade * rate
+        # The sides of a gap cannot pull.
         force = np.where((gap > 0.0) & (force * pressed <= 0.0), 0.0, force)
         out = np.zeros(self._n_v)
         out[self._v[0]] += force
@@ -178,34 +179,35 @@ class Coupling(LeafSystem):
 
 
 def restitution_of(damping: float) -> float:
-    """Of an impact on a spring with this damping ratio that never pulls: speed after
-    over speed before (Schwager and Poeschel, Phys. Rev. E 78, 051304, 2008)."""
+    """Coefficient of restitution of an impact on a spring and damper that never pull,
+    by their damping ratio (Schwager and Poeschel, Phys. Rev. E 78, 051304, 2008)."""
     b, w = damping, np.sqrt(max(1.0 - damping**2, 1e-12))
     turn = np.arctan2(2.0 * b * w, w**2 - b**2)
     return float(np.exp(-b / w * (np.pi - turn)))
 
 
 def damping_of(restitution: float) -> float:
-    """Its inverse; at most 0.999, which leaves less than a sixth of the speed."""
+    """The damping ratio for a restitution: the inverse of restitution_of, at most
+    0.999 (a restitution below 1/6)."""
     if restitution <= restitution_of(0.999):
         return 0.999
     return float(brentq(lambda d: restitution_of(d) - restitution, 0.0, 0.999))
 
 
-def _bounces(effect: Effect) -> float:
-    """The share of its speed that a joint keeps at the other side of its gap."""
-    least = restitution_of(CONTACT_DAMPING)
-    return effect.parameters.get("restitution", least)
+def _restitution(effect: Effect) -> float:
+    """Speed after over speed before an impact on the side of the gap."""
+    default = restitution_of(CONTACT_DAMPING)
+    return effect.parameters.get("restitution", default)
 
 
 def coupling_numbers(effect: Effect, plant: MultibodyPlant) -> list[list[float]]:
-    """k, d, gap of each joint that `at` names."""
+    """[k, d, gap] of each joint that `at` names, as in Coupling."""
     p, numbers = effect.parameters, []
     for joint in find_joints(effect, plant):
         if effect.kind == "joint_elasticity":
             numbers.append([p["stiffness"], p["damping"], 0.0])
             continue
-        # Stiff enough that the gap is all that shows, soft enough for the time step.
+        # Stiff enough for the gap to dominate, soft enough for the time step.
         dt = plant.time_step()
         rate = min(CONTACT_RATE / dt, CONTACT_RATE_MAX) if dt else CONTACT_RATE_MAX
         motor = motor_joint(plant, joint)
@@ -215,12 +217,13 @@ def coupling_numbers(effect: Effect, plant: MultibodyPlant) -> list[list[float]]
         i, j = joint.velocity_start(), motor.velocity_start()
         both = 1.0 / (np.linalg.inv(M)[i, i] + 1.0 / M[j, j])
         k = both * rate**2
-        damping = damping_of(_bounces(effect))
+        damping = damping_of(_restitution(effect))
         numbers.append([k, 2.0 * damping * np.sqrt(k * both), p["gap"]])
     return numbers
 
 
 def coupling_name(effect: Effect) -> str:
+    """Name of the Coupling system in the diagram."""
     return f"{effect.kind}_{'_'.join(effect.at)}".replace(".", "_")
 
 
@@ -236,47 +239,51 @@ def _add_coupling(
     return system.GetOutputPort("generalized_force")
 
 
-# ----- How they show
+# ----- Their signatures
 #
-# The motor moves as measured, theta; the joint is behind it by the twist z. With J the
-# rotor's inertia, and ID of the model, which has the rotor on the joint,
+# The motor follows the measured motion theta, the joint lags behind by the twist z.
+# With rotor inertia J, and ID of the model, which has the rotor on the joint,
 #
 #     u = ID(theta - z) + J z'',
 #
-# to first order in z. Torque through the element: tau = u - J theta''. A spring twists
-# by z = tau/k - d tau'/k^2. In a gap, with the side that touches given by the sign of
-# the torque that the joint needs at theta, T = ID(theta) - J theta'': while it touches
-# z = +- gap/2, and once T turns round the joint is on its own, M z'' = T, until it
-# touches again: it bounces, keeping a share of its speed, unless that is nothing.
+# to first order in z. The element transmits tau = u - J theta''. A spring twists by
+# z = tau/k - d tau'/k^2. In a gap, T = ID(theta) - J theta'' is the torque that holds
+# the joint on the motor's path, and its sign gives the side that touches: z = +- gap/2.
+# When T changes sign the joint moves freely, M z'' = T, until it hits the other side,
+# where it bounces with the restitution or comes to rest.
 
-BOUNCES = (None, 0.1, 0.75)  # None: as CONTACT_DAMPING has it.
-GAPS = tuple(0.002 * 1.15**k for k in range(29))  # [rad] or [m]
-_linearised: WeakKeyDictionary = WeakKeyDictionary()  # Of motions.
+RESTITUTIONS = (None, 0.1, 0.75)  # Tried values; None: that of CONTACT_DAMPING.
+GAPS = tuple(0.002 * 1.15**k for k in range(29))  # Tried values [rad] or [m].
+_by_motion: WeakKeyDictionary = WeakKeyDictionary()  # Intermediate results.
 
 
 @dataclass(frozen=True, eq=False)
 class _Linear:
-    """What a twist of a joint, its rate and its acceleration add to the effort,
-    (n, n_v, 3); needs (n,): torque T; M (n,): the joint's own inertia, others held."""
+    """The inverse dynamics along a motion, linearised in the twist of one joint.
 
-    adds: np.ndarray
-    needs: np.ndarray
+    derivative (n, n_v, 3): of the effort by twist, its rate and its acceleration;
+    torque (n,): T; M (n,): the joint's inertia with the other joints held.
+    """
+
+    derivative: np.ndarray
+    torque: np.ndarray
     M: np.ndarray
 
     def effort(self, twist) -> np.ndarray:
-        return np.einsum("nik,kn->ni", self.adds, twist)
+        """(n, n_v) that a twist (3, n) with its derivatives adds."""
+        return np.einsum("nik,kn->ni", self.derivative, twist)
 
 
 def _elasticity_signature(effect, model, motion, grid=None) -> list[Signature]:
     columns = np.zeros((*motion.v.shape, 2))
     for joint in find_joints(effect, model.plant):
         linear = _linear(model, motion, joint)
-        twist = _carried(model, motion, joint)
+        twist = _transmitted(model, motion, joint)
         columns[:, :, 0] += linear.effort(twist[:3])
         columns[:, :, 1] -= linear.effort(twist[1:])
 
     def to_parameters(c):
-        k = 1.0 / max(c[0], 1e-9)  # None, or the wrong way round: rigid.
+        k = 1.0 / max(c[0], 1e-9)  # A compliance of 0 or less: rigid.
         return {"stiffness": float(k), "damping": float(max(c[1], 0.0) * k**2)}
 
     unknowns = ("compliance", "damping_times_compliance2")
@@ -288,44 +295,46 @@ def _elasticity_signature(effect, model, motion, grid=None) -> list[Signature]:
 
 
 def _elasticity_added(effect, model, motion) -> np.ndarray:
-    """Of the whole twist, not to first order."""
+    """Of the whole twist, not linearised."""
     k, d = effect.parameters["stiffness"], effect.parameters["damping"]
-    known = _kept(model, motion)
+    known = _cache(model, motion)
     key = (tuple(effect.at), k, d)
     if key in known:
         return known[key]
     q, v, vd = (np.array(x) for x in (motion.q, motion.v, motion.vd))
-    own = np.zeros_like(v)
+    rotor = np.zeros_like(v)
     for joint in find_joints(effect, model.plant):
         i_q, i_v = joint.position_start(), joint.velocity_start()
         z = _twist(effect, model, motion, joint)
         q[:, i_q] -= z[0]
         v[:, i_v] -= z[1]
         vd[:, i_v] -= z[2]
-        own[:, i_v] = _rotor(model, joint) * z[2]
-    if "now" not in known:
-        known["now"] = model.inverse_dynamics(
+        rotor[:, i_v] = _rotor(model, joint) * z[2]
+    if "rigid" not in known:
+        known["rigid"] = model.inverse_dynamics(
             motion.q, motion.v, motion.vd, motion.time
         )
-    now = known["now"]
-    known[key] = model.inverse_dynamics(q, v, vd, motion.time) + own - now
+    rigid = known["rigid"]
+    known[key] = model.inverse_dynamics(q, v, vd, motion.time) + rotor - rigid
     return known[key]
 
 
-def _kept(model, motion) -> dict:
-    """What is known of a motion, as long as it is there."""
-    known = _linearised.setdefault(motion, {}).setdefault(id(model), {})
+def _cache(model, motion) -> dict:
+    """Intermediate results for a motion, dropped with it."""
+    known = _by_motion.setdefault(motion, {}).setdefault(id(model), {})
     if len(known) > 200:
         known.clear()
     return known
 
 
 def _backlash_signature(effect, model, motion, grid=None) -> list[Signature]:
-    """For each gap what it adds, over the gap: the coefficient is the gap."""
+    """One signature for each gap and restitution tried: the effort that the gap adds,
+    divided by it, so that the coefficient is the gap."""
     found = []
     grid = grid or {}
-    for bounce in grid.get("restitution", () if "gap" in grid else BOUNCES) or (None,):
-        held = {} if bounce is None else {"restitution": float(bounce)}
+    tried = grid.get("restitution", () if "gap" in grid else RESTITUTIONS) or (None,)
+    for restitution in tried:
+        held = {} if restitution is None else {"restitution": float(restitution)}
         for gap in grid.get("gap", GAPS):
             one = Effect(effect.kind, effect.at, {"gap": float(gap), **held})
             columns = _backlash_added(one, model, motion)[:, :, None] / gap
@@ -350,24 +359,27 @@ def twists(effect: Effect, model, motion) -> dict[str, np.ndarray]:
 
 
 def _twist(effect: Effect, model, motion, joint: Joint) -> np.ndarray:
+    """(3, n) twist of one joint, its rate and acceleration."""
     p = effect.parameters
     if effect.kind == "joint_elasticity":
-        tau, k = _carried(model, motion, joint), p["stiffness"]
+        tau, k = _transmitted(model, motion, joint), p["stiffness"]
         return tau[:3] / k - p["damping"] / k**2 * tau[1:]
     linear = _linear(model, motion, joint)
-    return through_gap(motion.time, linear.needs, linear.M, p["gap"], _bounces(effect))
+    return through_gap(
+        motion.time, linear.torque, linear.M, p["gap"], _restitution(effect)
+    )
 
 
 @numba.njit(cache=True)
-def through_gap(time, needs, M, gap, restitution):
+def through_gap(time, torque, M, gap, restitution):
     """(3, n) twist, its rate and its acceleration (mean until the next sample).
 
-    Args: needs (n,) torque that holds the joint on its motor's path; M (n,) its
-        inertia; restitution, the share of its speed that it keeps at the other side.
+    Args: torque (n,) that holds the joint on the motor's path; M (n,) its inertia;
+        restitution of an impact on a side of the gap.
     """
     n, parts = len(time), 8
     out = np.zeros((3, n))
-    z = 0.5 * gap * np.sign(needs[0])
+    z = 0.5 * gap * np.sign(torque[0])
     w = 0.0
     for k in range(n):
         out[0, k], out[1, k] = z, w
@@ -376,12 +388,12 @@ def through_gap(time, needs, M, gap, restitution):
         h = (time[k + 1] - time[k]) / parts
         before = w
         for part in range(parts):
-            T = needs[k] + (needs[k + 1] - needs[k]) * part / parts
+            T = torque[k] + (torque[k + 1] - torque[k]) * part / parts
             w += h * T / M[k]
             z += h * w
             if abs(z) >= 0.5 * gap:
                 z = 0.5 * gap * np.sign(z)
-                # A bounce that is over within a step is none.
+                # A bounce that ends within a step counts as rest.
                 back = -restitution * w
                 rests = T * z >= 0.0 and abs(back) < 2.0 * h * abs(T) / M[k]
                 w = 0.0 if rests or w * z < 0.0 else back
@@ -390,14 +402,15 @@ def through_gap(time, needs, M, gap, restitution):
 
 
 def _rotor(model, joint: Joint) -> float:
+    """Reflected inertia of the model's rotor."""
     old = actuator_of(model.plant, joint)
     return 0.0 if old is None else old.default_reflected_inertia()
 
 
-def _carried(model, motion, joint: Joint) -> np.ndarray:
+def _transmitted(model, motion, joint: Joint) -> np.ndarray:
     """(4, n) torque through the transmission, smoothed, and three derivatives."""
-    known, i = _kept(model, motion), joint.velocity_start()
-    if (key := ("carried", i)) not in known:
+    known, i = _cache(model, motion), joint.velocity_start()
+    if (key := ("transmitted", i)) not in known:
         tau = motion.effort[:, i] - _rotor(model, joint) * motion.vd[:, i]
         x = _smooth(motion.time, tau)
         known[key] = np.concatenate([x, [np.gradient(x[2], motion.time)]])
@@ -405,7 +418,7 @@ def _carried(model, motion, joint: Joint) -> np.ndarray:
 
 
 def _smooth(time, y) -> np.ndarray:
-    """(3, n) of a signal with noise of its own: value, first and second derivative."""
+    """(3, n) smoothed value, first and second derivative of y, by its own noise."""
     period = float(np.quantile(np.diff(time), 0.9))
     grid = np.arange(time[0], time[-1] + 0.5 * period, period)
     even = np.interp(grid, time, y)
@@ -415,28 +428,31 @@ def _smooth(time, y) -> np.ndarray:
 
 
 def _linear(model, motion, joint: Joint) -> _Linear:
-    known = _kept(model, motion)
+    """By forward differences of the model's inverse dynamics."""
+    known = _cache(model, motion)
     i_q, i_v = joint.position_start(), joint.velocity_start()
     key = ("linear", i_v)
     if key in known:
         return known[key]
     rotor, h = _rotor(model, joint), 1e-4
 
-    def needed(dq=0.0, dv=0.0, dvd=0.0):
+    def effort(dq=0.0, dv=0.0, dvd=0.0):
         q, v, vd = (np.array(x) for x in (motion.q, motion.v, motion.vd))
         q[:, i_q] += dq
         v[:, i_v] += dv
         vd[:, i_v] += dvd
         return model.inverse_dynamics(q, v, vd, motion.time)
 
-    if "now" not in known:
-        known["now"] = needed()
-    now = known["now"]
-    M = needed(dvd=1.0) - now  # Linear in the acceleration.
+    if "rigid" not in known:
+        known["rigid"] = effort()
+    rigid = known["rigid"]
+    M = effort(dvd=1.0) - rigid  # Linear in the acceleration.
     M[:, i_v] -= rotor
-    adds = np.stack([-(needed(dq=h) - now) / h, -(needed(dv=h) - now) / h, -M], axis=2)
-    needs = now[:, i_v] - rotor * motion.vd[:, i_v]
-    known[key] = _Linear(adds, needs, np.maximum(M[:, i_v], 1e-9))
+    derivative = np.stack(
+        [-(effort(dq=h) - rigid) / h, -(effort(dv=h) - rigid) / h, -M], axis=2
+    )
+    torque = rigid[:, i_v] - rotor * motion.vd[:, i_v]
+    known[key] = _Linear(derivative, torque, np.maximum(M[:, i_v], 1e-9))
     return known[key]
 
 
@@ -450,7 +466,7 @@ KINDS = {
         says="motor and link of {at} are joined by a spring of {stiffness} (damping "
         "{damping}) that the model lacks",
         confused_with=("input_delay", "actuator_lag", "joint_backlash"),
-        rest_twist=lambda e, effort: effort / e.parameters["stiffness"],
+        static_deflection=lambda e, effort: effort / e.parameters["stiffness"],
         tell_apart="sweep the frequency of the command through the resonance",
         rank=2,
         hidden_state=True,
@@ -469,7 +485,7 @@ KINDS = {
         says="motor and link of {at} have {gap} of backlash that the model lacks[, and "
         "bounce back from its sides with {restitution} of their speed]",
         confused_with=("joint_coulomb_friction", "joint_elasticity"),
-        rest_twist=lambda e, effort: np.sign(effort) * e.parameters["gap"] / 2.0,
+        static_deflection=lambda e, effort: np.sign(effort) * e.parameters["gap"] / 2.0,
         tell_apart="reverse with small motions, once without load and once with "
         "gravity pressing one way",
         rank=2,

@@ -33,10 +33,13 @@ from makebreak.diagrams.changing_surface import (
     make_task,
     surface_at,
 )
+from makebreak.diagrams.given_pattern import drawn
 from makebreak.diagrams.recorder import recorded
+from makebreak.diagrams.tabletop import THREE_SURFACES, read_model
 from makebreak.scripts.comparison import Comparison
 from makebreak.scripts.contact_runs import rehearsed, simulate_motion
 from makebreak.scripts.criteria import Criteria
+from makebreak.scripts.pattern_file import read_pattern
 from makebreak.scripts.session import Session
 from makebreak.scripts.table import Table
 from makebreak.systems.changing_contact.numerics.contact_task import (
@@ -45,7 +48,6 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
     DECIDED_TIME,
     DONE,
     IS_NEW,
-    PHASE_SEGMENT,
     PHASE_STAGE,
     TO_MODE,
 )
@@ -83,7 +85,7 @@ class Change:
 
 def run(config: ChangingSurfaceConfig, session: Session) -> dict:
     """The motion with adaptive and with constant stiffness, scored."""
-    task = make_task(config)
+    task = task_of(config)
     stiffness = config.control.variable_impedance.stiffness
     configs = {}
     if config.baselines:
@@ -116,9 +118,33 @@ def run(config: ChangingSurfaceConfig, session: Session) -> dict:
     return summary(logs, done, changes, surplus, task, stiffness.maximum)
 
 
+def task_of(config: ChangingSurfaceConfig) -> SurfaceTask:
+    """The task, of the shipped motion or of a user's.
+
+    Raises: ValueError in one line for a motion that cannot be followed.
+    """
+    if not config.pattern:
+        return make_task(config)
+    given = read_pattern(
+        config.pattern, read_model(config.model, THREE_SURFACES, config.tool)
+    )
+    try:
+        path = np.concatenate(drawn(given))
+        if len(np.unique(surface_at(path, 0.0))) < 2:
+            raise ValueError("it crosses no seam, expected a path over two surfaces")
+        return make_task(config, given)
+    except ValueError as error:
+        raise ValueError(f"pattern {config.pattern}: {error}") from None
+
+
+def pressing(log) -> np.ndarray:
+    """(n,) whether the motion presses on something."""
+    return np.any(log["force_directions"] != 0.0, axis=1)
+
+
 def sliding(log) -> np.ndarray:
     """(n,) whether the block slides on the surfaces, its first touch settled."""
-    on = log["phase"][:, PHASE_SEGMENT] >= 1
+    on = pressing(log)
     if not on.any():
         return on
     return on & (log["time"] >= log["time"][np.argmax(on)] + SETTLED_SEC)
@@ -147,7 +173,7 @@ def changes_of(log, feet: float, rehearsed: bool = False) -> tuple[list[Change],
     Returns: the changes; the number of reports that belong to none or came twice.
     """
     time, p = log["time"], log["ee_pose"][:, :3]
-    on = log["phase"][:, PHASE_SEGMENT] >= 1
+    on = pressing(log)
     stands = surface_at(p, feet)
     here = surface_at(p, 0.0)[:, 0]
     whole = np.where((stands == stands[:, :1]).all(axis=1), stands[:, 0], 0)
@@ -217,6 +243,7 @@ def summary(logs, done, changes, surplus, task: SurfaceTask, k_max: float) -> di
         delays = [c.decided - getattr(c, since) for c in rows]
         return float(np.nanmax(delays)) if np.isfinite(delays).any() else np.nan
 
+    confidence = np.array([c.confidence for c in changes])
     result: dict = {
         "success": False,
         "friction": task.friction.tolist(),
@@ -224,8 +251,8 @@ def summary(logs, done, changes, surplus, task: SurfaceTask, k_max: float) -> di
         "changes_right": sum(c.right for c in changes),
         "changes_surplus": surplus,
         "modes": len(modes_of(main)),
-        "confidence_min": float(np.nanmin([c.confidence[0] for c in changes])),
-        "confidence_second_max": float(np.nanmax([c.confidence[1] for c in changes])),
+        "confidence_min": float(np.nanmin(confidence[:, 0])),
+        "confidence_second_max": float(np.nanmax(confidence[:, 1])),
     }
     for name, rows in (("known", known), ("new", new)):
         result[f"delay_{name}_max_s"] = most(rows, "ends")
@@ -272,7 +299,7 @@ COLORS = {1: "#86a57f", 2: "#9a9a9a", 3: "#b98b5e"}
 def _shade(ax, log, feet):
     """The surface that the tip is on, as a colour."""
     here = surface_at(log["ee_pose"][:, :3], 0.0)[:, 0]
-    on = log["phase"][:, PHASE_SEGMENT] >= 1
+    on = pressing(log)
     for surface, color in COLORS.items():
         ax.fill_between(
             log["time"], 0, 1, where=on & (here == surface), color=color, alpha=0.25,

@@ -1,22 +1,21 @@
-"""Three contacts, met five times: CC 4.5.1, figures 17 and 18, table 1.
+"""Three contacts, made in five trials each: CC 4.5.1, figures 17 and 18, table 1.
 
-The tool comes down on a table, slides to a wall, and along both to a second wall. At
-first the contacts are believed 0.12, 0.09 and 0.10 m off (along the motion into each;
-table 1 calls it the most significant axis), with sigma 0.08 m; the sign, the places,
-the frictions and the stiffness of each surface (5e3 to 2e5 N/m, log-uniform) are drawn
-by the seed. A trial begins with what the one before has learned. The desired impact
-force is 8 N. The first approach is as slow as a surface of 2e5 N/m asks for: no more is
-known of a surface that was never felt.
+The tool comes down on a table, slides to a wall, and along both to a second wall. The
+prior of the contacts is wrong by 0.12, 0.09 and 0.10 m along the motion into each
+(table 1 calls it the most significant axis), with sigma 0.08 m. The seed draws the sign
+of these errors, the places, the frictions and the stiffness of each surface (5e3 to 2e5
+N/m, log-uniform). Each trial starts with the contacts learned in the one before. The
+desired impact force is 8 N. The first approach is slow enough for 2e5 N/m, as nothing
+is known of a surface before its first contact.
 
-Impact force: F100, along the motion, measured at the wrist, 100 Hz, less its value
-before the contact. Acceleration: a10, 10 Hz (numerics/impact_score.py). The raw peaks
-stand beside both.
+Impact force: F100, along the motion, measured at the wrist, low-passed at 100 Hz, less
+its value before the contact. Acceleration: a10, low-passed at 10 Hz
+(numerics/impact_score.py). The raw peaks are reported, too.
 
-Criterion, set beforehand. A run is a success if every trial comes to its end; no
-contact is missed and none is reported that is not there; each error is at most 2 mm
-after one trial and 1 mm after three; no impact of the first trial is above 15 N; from
-trial 2 on each is within 8 +- 0.6 N; and the last of five trials is at least 50 %
-shorter than the first.
+Criterion, set beforehand. A run is a success if every trial is completed; no contact is
+missed or falsely reported; each error is at most 2 mm after one trial and 1 mm after
+three; no impact of the first trial is above 15 N; from trial 2 on each is within
+8 +- 0.6 N; and the last of five trials is at least 50 % shorter than the first.
 
 See docs/contacts.md.
 """
@@ -66,26 +65,26 @@ SUMMARY = "three contacts, their places and approach speeds learned (CC 4.5.1, f
 Config = ContactLearningConfig
 
 DURATION_SEC = 120.0  # Of a trial, at most.
-PEAK_WAIT = 0.2  # A trial goes on so long after its end [s].
-REACHED, TOUCHED = 3e-4, 3e-5  # So near to a surface it counts as reached, touched [m].
-MATCH = 0.003  # A contact reported so near to a surface is that surface's [m].
-ERROR_MAX = {1: 0.002, 3: 0.001}  # After so many trials [m].
+PEAK_WAIT = 0.2  # Time that is simulated after the end of a trial [s].
+REACHED, TOUCHED = 3e-4, 3e-5  # Distances that count as reached and as touched [m].
+MATCH = 0.003  # A reported contact belongs to a surface within this distance [m].
+ERROR_MAX = {1: 0.002, 3: 0.001}  # {number of trials: greatest error [m]}
 FORCE_DESIRED, FORCE_TOL, FORCE_FROM = 8.0, 0.6, 2  # [N], [N], trial.
-FIRST_MAX = 15.0  # In the first trial [N].
-SHORTER = 0.5  # Share of the first trial's time.
+FIRST_MAX = 15.0  # Greatest impact force in the first trial [N].
+SHORTER = 0.5  # Time saved by the last trial, as a fraction of the first one's.
 N = len(DIRECTIONS)
 
 
 @dataclass(frozen=True, eq=False)
 class LearningTrial:
-    """One trial's log, and what was made of it; nan where a contact did not come."""
+    """The log and the score of one trial; nan for contacts that were not made."""
 
     log: dict[str, np.ndarray]
     belief: ContactBelief
     done: bool
     completion: float  # [s]
-    transition: float  # In the transition-phase controller or blending to or from it.
-    touched: np.ndarray  # (3,) when the tip was at each surface [s].
+    transition: float  # Time in the transition controller, blending included [s].
+    touched: np.ndarray  # (3,) time at which the tip touched each surface [s].
     force: np.ndarray  # (3,) F100 [N].
     force_raw: np.ndarray  # (3,) [N]
     force_felt: np.ndarray  # (3,) F_m of the detector [N].
@@ -99,7 +98,7 @@ class LearningTrial:
 
 
 def run(config: ContactLearningConfig, session: Session) -> dict:
-    """config.trials trials in a row, scored; see the module for the criterion."""
+    """Runs config.trials trials in a row; see the module for the criterion."""
     task = make_task(config)
     knowledge = Knowledge(contacts=task.prior)
 
@@ -126,7 +125,7 @@ def run(config: ContactLearningConfig, session: Session) -> dict:
 
 
 def scored(log: dict[str, np.ndarray], task: ContactTask, belief) -> LearningTrial:
-    """A trial, from its log and the truth."""
+    """Scores a trial by its log, the contacts learned, and the true surfaces."""
     time, p = log["time"], log["tip_true"]
     stage, segment = log["phase"][:, PHASE_STAGE], log["phase"][:, PHASE_SEGMENT]
     ended = np.flatnonzero(stage == DONE)
@@ -169,7 +168,7 @@ def scored(log: dict[str, np.ndarray], task: ContactTask, belief) -> LearningTri
     error, std = np.full(N, np.nan), np.full(N, np.nan)
     for i, d in enumerate(DIRECTIONS):
         mine = [c for c in belief.contacts if c.kind == IMPACT and c.segment == i]
-        if mine:  # The one that will be met first is what the next trial expects.
+        if mine:  # The next trial expects the first one along the motion.
             c = mine[int(np.argmin([one.mean @ d for one in mine]))]
             error[i] = c.mean @ d - where[i]
             std[i] = spread_along(c.covariance, d)
@@ -229,7 +228,7 @@ def summary(trials: list[LearningTrial], task: ContactTask) -> dict:
 
 
 def checks(trials: list[LearningTrial]) -> dict:
-    """The parts of the criterion for which there are trials enough."""
+    """The parts of the criterion that the number of trials allows."""
     forces = np.array([t.force for t in trials[FORCE_FROM - 1 :]]).reshape(-1, N)
     criteria = Criteria()
     criteria.holds("done", "every trial is carried out", all(t.done for t in trials))
@@ -275,7 +274,7 @@ def plot_trials(trials: list[LearningTrial], task: ContactTask):
         for i, axis in enumerate("xyz"):
             ax[0].plot(time, v[:, i], lw=0.9, label=axis)
         a = np.gradient(v, dt, axis=0)
-        a[0] = 0.0  # The filter starts from it: at rest, not at its noise.
+        a[0] = 0.0  # The filter starts from rest, not from a noisy value.
         a = low_pass(a, 10.0, dt)
         ax[1].plot(time, np.linalg.norm(a, axis=1), lw=0.9)
         F = low_pass(log["wrench"][:, :3], 100.0, dt)
@@ -345,7 +344,7 @@ def plot_learning(trials: list[LearningTrial], task: ContactTask):
     return figure
 
 
-# The paper's, table 1 and the text of 4.5.1.
+# Results of the paper, from table 1 and the text of 4.5.1.
 PAPER_ERROR = (0.016, 0.011, 0.018)  # After five trials [m].
 PAPER_TIME = (14.4, 9.2)  # [s]
 APPROACH = "control.anticipator.speed"

@@ -1,13 +1,13 @@
 """Two fingers tip a cube over an edge, by 90 degrees, in a plane.
 
-C3+ plans which finger pushes, presses or lets go; the target only says how fast the
-cube is to turn, and beside which faces the fingers are to be. Cube, fingers and the
-friction of all pairs start where the seed draws them.
+C3+ plans which finger pushes, presses or lets go; the reference only gives the cube's
+rate of turn and the faces beside which the fingers should be. The seed draws the start
+of cube and fingers, and the friction of all pairs.
 
 Criterion, set beforehand: over the last half second the angle is within 0.1 rad of 90
-degrees, the cube is at rest on the platform, and its place within 2 cm of where pure
-pivoting leads from where it stood at the start; and in the whole run no two bodies
-press on each other with more than 40 N. (The two corners on the platform count as one.)
+degrees, the cube is at rest on the platform, and its place is within 2 cm of where pure
+pivoting leads from its place at the start; and in the whole run no two bodies press on
+each other with more than 40 N. (The two corners on the platform count as one.)
 """
 
 import matplotlib.pyplot as plt
@@ -16,13 +16,15 @@ from matplotlib.patches import Circle, Polygon
 
 from makebreak.diagrams.cube_pivoting import (
     TOUCHES,
-    CubePivotingConfig,
-    initial_state,
     logged_forces,
     make_cube_pivoting,
+    start,
+)
+from makebreak.diagrams.cube_pivoting_config import (
+    CubePivotingConfig,
+    initial_state,
     model_cube,
     scene_with,
-    start,
     world_cube,
 )
 from makebreak.diagrams.recorder import recorded, with_noise
@@ -46,17 +48,17 @@ Config = CubePivotingConfig
 
 DURATION, SAMPLE = 6.0, 0.02  # [s]
 GOAL = PivotTargetConfig().goal  # [rad]
-LAST = 0.5  # What is judged at the end [s].
+LAST = 0.5  # Time at the end over which the criteria hold [s].
 ANGLE_BOUND, PLACE_BOUND = 0.1, 0.02  # [rad], [m]
 SPEED_BOUND, TURN_BOUND = 0.02, 0.2  # Of a cube at rest [m/s], [rad/s].
 FORCE_BOUND = 40.0  # [N]
-LOST = 0.4  # The platform's end [m].
-# Of whose contact with the cube, or the platform, a residual is told.
+LOST = 0.4  # x of the platform's end [m].
+# The bodies whose residual is reported: fingers on the cube, corners on the platform.
 RESIDUALS = ("left", "right", "corners")
 
 
 def run(config: CubePivotingConfig, session: Session) -> dict:
-    """One start, scored; see the module for the criterion."""
+    """Runs one start; see the module for the criterion."""
     x0 = initial_state(config)
     diagram = make_cube_pivoting(config, session.meshcat)
     log = session.simulate(
@@ -89,9 +91,9 @@ def run(config: CubePivotingConfig, session: Session) -> dict:
 
 
 def score(log: Log, time, force, side: float) -> dict:
-    """The criteria and what is told beside them.
+    """The criteria and the other results of a run.
 
-    Args: time (n,) [s], force (n, 6) [N] as of logged_forces; side of the cube [m].
+    Args: time (n,) [s], force (n, 6) [N] from logged_forces; side of the cube [m].
     """
     x = log["x"]
     last = x[log.time >= log.time[-1] - LAST]
@@ -133,14 +135,14 @@ def score(log: Log, time, force, side: float) -> dict:
 
 
 def standing_place(x, side: float) -> float:
-    """Where the centre of a tilted cube is once it has fallen back on its face [m]."""
+    """x of a tilted cube's centre after it has fallen back on its face [m]."""
     lowest = corners(x, side)[:2]
     pivot = int(np.argmin(lowest[:, 1]))  # Lower left or lower right.
     return float(lowest[pivot, 0] + (0.5 - pivot) * side)
 
 
 def time_to_stay(time, error, bound) -> float | None:
-    """From when on error (n,) stays below bound [s]; None if it ends above."""
+    """The time from which error (n,) stays below bound [s]; None if it ends above."""
     above = np.flatnonzero(error > bound)
     if above.size == 0:
         return float(time[0])
@@ -180,7 +182,7 @@ def plot_run(log: Log, time, force, gap=None):
 
 
 def plot_motion(log: Log, side: float):
-    """Cube and fingers at several instants, one picture each."""
+    """Cube and fingers at several instants."""
     n = 8
     end = time_to_stay(log.time, abs(log["x"][:, THETA] - GOAL), 0.01)
     instants = np.linspace(0.0, log.time[-1] if end is None else end, n)
@@ -207,7 +209,7 @@ def plot_motion(log: Log, side: float):
 
 
 def _variants() -> dict[str, dict]:
-    """What is compared: name -> settings."""
+    """{name: settings} of the runs that are compared."""
     found: dict[str, dict] = {
         "as it is": {},
         "adapting": {"adapt": True},
@@ -239,7 +241,7 @@ VARIANTS = _variants()
 
 
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
-    """How many starts succeed, as it is and with each thing changed."""
+    """Number of starts that succeed, as configured and with each variant."""
     comparison = Comparison("cube_pivoting", session, jobs)
     for what, results in comparison.runs_of(VARIANTS, seeds).items():
         settings = VARIANTS[what]

@@ -30,6 +30,7 @@ from makebreak.diagrams.station import (
     make_control_plant,
 )
 from makebreak.models.scene import load_scene
+from makebreak.scripts import rolling_score
 from makebreak.scripts.comparison import Rows
 from makebreak.scripts.experiments import ball_rolling as rolling
 from makebreak.scripts.table import Table
@@ -52,7 +53,7 @@ from makebreak.systems.changing_contact.numerics.push_motion import (
 SUMMARY = "all seven systems: a ball is rolled and touched gently"
 Config = GentleRollingConfig
 
-DURATION_SEC, SAMPLE = rolling.DURATION_SEC, rolling.SAMPLE
+DURATION_SEC, SAMPLE = rolling_score.DURATION_SEC, rolling_score.SAMPLE
 TICK = 0.001  # Of the logs [s].
 STUCK_SEC = 30.0  # A run ends that has rolled no quarter of a circle for so long.
 BENCH = {"all seven": {}, "without the second paper's": {"gentle": False}}
@@ -80,9 +81,9 @@ def run(config: GentleRollingConfig, session) -> dict:
     log = session.simulate(
         diagram, DURATION_SEC, record, SAMPLE, until=_Ending(ball, plant)
     )
-    track = rolling.ground_truth(ball, log, plant)
+    track = rolling_score.ground_truth(ball, log, plant)
     time, on_ball, up = contact_truth(ball, diagram, log, plant)
-    result = rolling.score(ball, log, track, (time, np.maximum(on_ball, up)))
+    result = rolling_score.score(ball, log, track, (time, np.maximum(on_ball, up)))
     said = telemetry(diagram, log.context)
     believed = None
     if config.gentle:
@@ -96,8 +97,8 @@ def run(config: GentleRollingConfig, session) -> dict:
     result["torque_peak_Nm"] = float(abs(torque).max())
     result["gentle"] = config.gentle
     result["frozen"] = ", ".join(config.frozen)
-    rolling.write_recording(session, log, ball)
-    rolling.plot_path(session, ball, track)
+    rolling_score.write_recording(session, log, ball)
+    rolling_score.plot_path(session, ball, track)
     plot_forces(session, log, time, on_ball, up)
     return result
 

@@ -24,9 +24,9 @@ be had: docs/shaping.md derives the bound.
 
 from dataclasses import dataclass, replace
 
-import matplotlib.pyplot as plt
 import numpy as np
 
+from makebreak.diagrams.arm_reach import ArmReach
 from makebreak.diagrams.changing_contact import Knowledge, learned, telemetry
 from makebreak.diagrams.multiple_collisions import (
     IMPACTS,
@@ -36,10 +36,13 @@ from makebreak.diagrams.multiple_collisions import (
     make_task,
 )
 from makebreak.diagrams.recorder import episodes, recorded
-from makebreak.diagrams.tabletop import position
+from makebreak.diagrams.station import TORQUE_RATE_MAX, make_control_plant
+from makebreak.diagrams.tabletop import TOOL, position
 from makebreak.scripts.comparison import Comparison
+from makebreak.scripts.contact_plots import plot_path, plot_trials
 from makebreak.scripts.contact_runs import rehearsed, simulate_motion
 from makebreak.scripts.criteria import Criteria
+from makebreak.scripts.pattern_runs import follow_pattern
 from makebreak.scripts.session import Session
 from makebreak.scripts.table import Table
 from makebreak.systems.changing_contact.numerics.contact_task import (
@@ -50,9 +53,9 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
     PHASE_SEGMENT,
     PHASE_STAGE,
     POSITION,
-    REGION,
     SPEED,
 )
+from makebreak.systems.changing_contact.numerics.impact_reflex import fastest_impact
 from makebreak.systems.changing_contact.numerics.impact_score import impact, low_pass
 from makebreak.systems.views.contact_view import ContactViewConfig
 
@@ -66,6 +69,9 @@ A10_MAX, EXTRA_MAX, EXTRA_KNOWN_MAX = 1.0, 3.0, 1.0  # [m/s2], [s], [s]
 REACHED, TOUCHED = 3e-4, 3e-5  # So near to a surface it counts as reached, touched [m].
 MATCH = 0.003  # A contact reported so near to a surface is that surface's [m].
 LOSS_SEGMENT = 3
+DELAY = 0.001  # From a touch to the torque that answers it, at least: a tick [s].
+# a10 of a sudden stop from 1 m/s: the peak of the filter's impulse response [1/s].
+STOP_A10 = 28.6
 BEGINS = 0.2  # Of the motion [s].
 N = len(IMPACTS)
 
@@ -96,6 +102,8 @@ class CollisionTrial:
 
 def run(config: MultipleCollisionsConfig, session: Session) -> dict:
     """Without handling, then the trials with it; see the module for the criterion."""
+    if config.pattern:
+        return follow_pattern(config, session)
     task = make_task(config)
     trials: dict[str, CollisionTrial] = {}
     recordings = []
@@ -126,7 +134,7 @@ def run(config: MultipleCollisionsConfig, session: Session) -> dict:
         knowledge = learned(log.diagram, log.context)
         keep(log, name)
     session.save_plot(plot_trials(trials), "profiles")
-    session.save_plot(plot_path(trials, task), "path")
+    session.save_plot(plot_path(trials, task.prior), "path")
     if knowledge is not None:
         knowledge.contacts.save(session.path("contacts.json"))
     session.write_recording(episodes(recordings), task.model)
@@ -194,16 +202,50 @@ def is_told(config: MultipleCollisionsConfig) -> bool:
     return all(k == most for k in config.stiffness)
 
 
+def creeping_distances(task: CollisionTask) -> np.ndarray:
+    """(4,) how far the tip has to creep before each impact in the first trial [m]: from
+    the nearest place where the surface may be to where it is."""
+    far = []
+    for c, (d, *_), where in zip(task.prior.contacts, IMPACTS, task.truth, strict=True):
+        if c.known_from:  # From the impact before it, to two standard deviations.
+            far.append(2.0 * c.known_from[2])
+        else:
+            far.append(2.0 * np.sqrt(d @ c.covariance @ d) - (c.mean @ d - where))
+    return np.maximum(far, 0.0)
+
+
 def extra_time_least(first: CollisionTrial, task: CollisionTask, config) -> float:
     """What the trial's approach speeds cost if each region began just where the range
     of errors does, and the arm could brake in no time [s]."""
-    way = np.array([
-        config.error_max - (c.mean @ d - where)
-        for c, (d, *_), where in zip(
-            task.prior.contacts, IMPACTS, task.truth, strict=True
-        )
-    ])  # fmt: skip
-    return float(np.sum(way * (1.0 / first.speed - 1.0 / config.speed)))
+    slower = 1.0 / first.speed - 1.0 / config.speed
+    return float(np.sum(creeping_distances(task) * slower))
+
+
+def extra_time_bound(task: CollisionTask, config) -> tuple[float, np.ndarray]:
+    """The same at the highest speeds that any control could have, and those speeds.
+
+    They are limited by the force on the stiffest surface that there may be, with an arm
+    that is DELAY late and whose torques grow as fast as they may, and by the 10 Hz
+    acceleration of a sudden stop.
+
+    Returns: [s], and (4,) [m/s].
+    """
+    reach = ArmReach(make_control_plant(task.model, TOOL))
+    most = config.control.anticipator.speed.stiffness_most or max(config.stiffness)
+    force = TOLD_MAX if is_told(config) else FIRST_MAX
+    speeds = []
+    for c in task.prior.contacts:
+        q = reach.positions(c.mean, reach.R_default, reach.q_default)
+        along = c.direction @ reach.jacobian(q)[3:]
+        moved = np.linalg.solve(reach.mass_matrix(q), along)  # d' J M^-1
+        mass = 1.0 / (along @ moved)
+        # All torques change as fast as they may, each the way that slows the tip down.
+        rate = mass * TORQUE_RATE_MAX * np.sum(np.abs(moved))
+        by_force = fastest_impact(force, most, mass, DELAY, rate)
+        speeds.append(min(by_force, A10_MAX / STOP_A10, config.speed))
+    v = np.array(speeds)
+    slower = 1.0 / v - 1.0 / config.speed
+    return float(np.sum(creeping_distances(task) * slower)), v
 
 
 def summary(
@@ -259,6 +301,9 @@ def summary(
         what = "trials with all contacts made and lost, none missed or false"
         criteria.at_least("whole", what, whole, len(names))
         result["extra_time_least_s"] = extra_time_least(first, task, config)
+        bound, speeds = extra_time_bound(task, config)
+        result["extra_time_bound_s"] = bound
+        result["impact_speed_bound_mps"] = numbers(speeds)
         first_max = TOLD_MAX if is_told(config) else FIRST_MAX
         for key, which, trial, bound in (
             ("first", "first", first, first_max),
@@ -279,68 +324,12 @@ def summary(
     return result | criteria.result()
 
 
-def plot_trials(trials: dict[str, CollisionTrial]):
-    """Figure 16: speed, acceleration and force over time, without and with handling."""
-    figure, axes = plt.subplots(
-        3, len(trials), figsize=(5.0 * len(trials), 8), layout="constrained",
-        sharey="row", squeeze=False,
-    )  # fmt: skip
-    for ax, (name, one) in zip(axes.T, trials.items(), strict=True):
-        log, t = one.log, one.log["time"]
-        v = log["ee_velocity"][:, :3]
-        dt = t[1] - t[0]
-        a = low_pass(np.gradient(v, dt, axis=0), 10.0, dt)
-        force = low_pass(log["wrench"][:, :3], 100.0, dt)
-        for i, axis in enumerate("xyz"):
-            ax[0].plot(t, v[:, i], lw=1, label=axis)
-            ax[1].plot(t, a[:, i], lw=1)
-            ax[2].plot(t, force[:, i], lw=1)
-        inside = log["phase"][:, PHASE_STAGE] == REGION
-        for one_ax in ax:
-            one_ax.fill_between(
-                t, 0, 1, where=inside, transform=one_ax.get_xaxis_transform(),
-                color="0.85", lw=0,
-            )  # fmt: skip
-            for when in one.touched[np.isfinite(one.touched)]:
-                one_ax.axvline(when, color="0.3", lw=0.7, ls=":")
-        ax[0].set_title(
-            f"{name.replace('_', ' ')}: {one.completion:.1f} s, "
-            f"peaks {', '.join(f'{f:.1f}' for f in one.force)} N"
-        )
-        ax[2].set_xlabel("time [s]; grey: in a region, dotted: contact")
-    axes[0, 0].set_ylabel("tip velocity [m/s]")
-    axes[1, 0].set_ylabel("acceleration, 10 Hz [m/s2]")
-    axes[2, 0].set_ylabel("force on the tool, 100 Hz [N]")
-    axes[0, 0].legend(loc="upper right", ncols=3)
-    return figure
-
-
-def plot_path(trials: dict[str, CollisionTrial], task: CollisionTask):
-    """Figure 15: the way of the tip, from the side and from above, and the estimates
-    with two standard deviations."""
-    figure, axes = plt.subplots(1, 2, figsize=(12, 5), layout="constrained")
-    for ax, (i, j), title in zip(
-        axes, ((1, 2), (0, 1)), ("from ahead", "from above"), strict=True
-    ):
-        for name, one in trials.items():
-            p = one.log["ee_pose"]
-            ax.plot(p[:, i], p[:, j], lw=1.2, label=name.replace("_", " "))
-        for c in task.prior.contacts:
-            sizes = 2.0 * np.sqrt(np.diag(c.covariance))
-            ax.add_patch(plt.matplotlib.patches.Ellipse(  # type: ignore[attr-defined]
-                (c.mean[i], c.mean[j]), 2 * sizes[i], 2 * sizes[j], color="C3",
-                alpha=0.15, lw=0))  # fmt: skip
-        ax.set(xlabel=f"{'xyz'[i]} [m]", ylabel=f"{'xyz'[j]} [m]", title=title)
-        ax.set_aspect("equal")
-    axes[0].legend()
-    return figure
-
-
 SPEEDS = "control.anticipator.speed"
 TOLD = "sphere, stiffness told"
 VARIANTS: dict[str, dict] = {
     "sphere": {"tool": "sphere"},
     "block": {"tool": "block"},
+    "sphere, heights not known": {"tool": "sphere", "known_heights": False},
     "sphere, realism lab": {"tool": "sphere", "realism": "lab"},
     TOLD: {
         "stiffness": [2e4, 2e4],
@@ -409,6 +398,9 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         x = values("extra_time_least_s")
         text = f"{spread(x, 's')}, median {np.median(x):.1f} s"
         row("of it, creeping over the range of errors alone", "-", text)
+        x = values("extra_time_bound_s")
+        text = f"{spread(x, 's')}, median {np.median(x):.1f} s"
+        row("the least that force and acceleration allow", "-", text)
         x = values("extra_time_known_s")
         good = most(x, EXTRA_KNOWN_MAX)
         row("contacts known, extra time", "-", spread(x, "s"), good)

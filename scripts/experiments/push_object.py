@@ -9,18 +9,19 @@ from scipy.signal import lfilter
 from scipy.spatial import ConvexHull
 
 from makebreak.diagrams.camera import describe_camera
-from makebreak.diagrams.push_object import (
+from makebreak.diagrams.push_object import READING_COLUMNS, make_push_object
+from makebreak.diagrams.push_object_config import (
     LEARN,
     N_TIP,
     OBJECT,
-    READING_COLUMNS,
     PushObjectConfig,
-    believed_object,
-    make_push_object,
+    rolling_axis,
+)
+from makebreak.diagrams.push_object_scenes import (
+    model_object,
     model_scene,
     outline_fold,
     poses_of,
-    rolling_axis,
 )
 from makebreak.diagrams.recorder import recorded
 from makebreak.diagrams.scene_facts import actuators_of
@@ -277,7 +278,7 @@ def write_recording(session, log, config):
     p, q = np.array([*config.goals.center, 0.0]), [1.0, 0.0, 0.0, 0.0]
     if len(read):
         p, q = read[0, :3], read[0, 3:]
-    height = rest_height(believed_object(config)[0])
+    height = rest_height(model_object(config)[0])
     axis = np.array(rolling_axis(config.object) or np.zeros(3))
     zero = np.zeros(3)
     p, _, q, _ = on_the_table(0.0, p, zero, np.array(q), zero, height, axis)

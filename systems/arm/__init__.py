@@ -1,9 +1,9 @@
-"""The arm: from what a planner wants to torques.
+"""The arm: from a planner's output to joint torques.
 
 arm_reference         C3's next state as a pose that the arm can follow, and a force
-impedance_controller  torques for a wanted stiffness, damping and force
-variable_impedance    stiffness and feed-forward from what the forward model predicts
-tool_wrench           what the tool feels
-tip_state             where the tip is, and how it moves
-gravity_left_out      for a robot that carries its own weight
+impedance_controller  torques for a desired stiffness, damping and force
+variable_impedance    stiffness and feed-forward from the forward model's prediction
+tool_wrench           force-torque sensor between flange and tool
+tip_state             pose and velocity of the tip
+gravity_left_out      torques for a robot that compensates gravity itself
 """

@@ -1,3 +1,5 @@
+"""The arm's reference from the planner's commands (numerics/arm_reference.py)."""
+
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,30 +22,31 @@ from makebreak.systems.numerics.timing import timed
 
 @dataclass
 class ArmReferenceConfig:
-    tip_mass: float = 1.0  # [kg] of the tip in the LCS.
-    force_max: float = 3.0  # Feed-forward is clipped to it [N].
+    tip_mass: float = 1.0  # Of the tip in the LCS [kg].
+    force_max: float = 3.0  # Bound of the feed-forward force [N].
     acceleration_max: float = 1.5  # Of the velocity reference while rolling [m/s2].
-    down_max: float = 0.04  # Downwards while rolling, where contact may be early [m/s].
-    # Where a push that has to feel for the ball feels less than follow_force, the tip
-    # goes down so much faster, and with the ball.
-    follow_speed: float = 0.015  # [m/s]
-    follow_force: float = 1.0  # [N]
-    # Rolling, until the tip feels touch_force it goes no faster than this: it may meet
-    # what it is to touch earlier than planned, and hits it the harder the faster it is.
-    touch_speed: float = np.inf  # [m/s]
-    touch_force: float = 1.0  # [N]
-    # Nor faster than this whatever it feels: a tip that slides along a side feels that,
-    # and hits the next corner at the speed that it has by then.
-    push_speed: float = np.inf  # [m/s]
-    # No command moves the reference faster than that, however far away it is. The task
+    # Bound of the downward speed while rolling: contact may come early [m/s].
+    down_max: float = 0.04
+    # While the tip has to feel for the ball and the force is below follow_force [N], it
+    # moves down faster by follow_speed [m/s], and along with the ball.
+    follow_speed: float = 0.015
+    follow_force: float = 1.0
+    # While rolling, bound of the speed until the force reaches touch_force [N]: the tip
+    # may touch earlier than planned, and the impact grows with the speed [m/s].
+    touch_speed: float = np.inf
+    touch_force: float = 1.0
+    # While rolling, bound of the speed in contact too: a tip that slides along a side
+    # would hit the next corner at the speed that it has reached by then [m/s].
+    push_speed: float = np.inf
+    # Bound of the reference's speed, however far away a command is [m/s]. The task
     # itself stays below 0.35 m/s and 4 m/s2.
-    speed_max: float = 0.5  # [m/s]
+    speed_max: float = 0.5
     acceleration_fed_forward_max: float = 10.0  # While repositioning [m/s2].
-    # Rolling, the tip stays at this height, and only what C3 wants across the table
-    # counts [m]; None: C3 moves it up and down too.
+    # While rolling, the tip stays at this height and follows C3 only horizontally [m];
+    # None: C3 moves it up and down too.
     height: float | None = None
-    # Rolling, the wrist goes no nearer than this to the world's origin, where the arm
-    # stands, across the table: a C3 that knows no arm would fold its elbow up [m].
+    # While rolling, least horizontal distance of the wrist from the world's origin, the
+    # arm's base: C3 does not know the arm and would fold up its elbow [m].
     nearest: float = 0.0
     # From the wrist to the tip, seen from above [m].
     wrist: list[float] = field(default_factory=lambda: [0.0, 0.0])
@@ -52,31 +55,35 @@ class ArmReferenceConfig:
 
 
 class ArmReference(LeafSystem):
-    """The arm's reference between two 80 Hz commands, at any time that it is asked for.
+    """The arm's reference between two 80 Hz commands, interpolated at any time.
 
-    While rolling it goes to C3's x_next and feeds the planned contact force forward;
-    else it follows the task's reference. Each update starts a straight line from where
-    the reference is to the new command, which it reaches one period later, so that no
-    step reaches the arm; a step in torque would meet its rate limit.
+    While rolling it leads to C3's x_next and feeds the planned contact force forward;
+    otherwise it follows the task's reference. Each update starts a straight line from
+    the present reference to the new command, which is reached one period later: a step
+    of the reference would saturate the arm's torque rate.
 
-    While C3 holds an old command (its status is not 0), a rolling reference stays where
-    it is and pushes nothing; so does any while its command is not finite. A command far
-    away is gone to at speed_max, not within one period.
+    While C3 keeps an old command (its status is not 0), a rolling reference stays where
+    it is, with zero force; so does any reference while its command is not finite. A
+    distant command is approached at speed_max, not within one period.
 
     The fed-forward force alone moves a well damped tip by some mm/s: too slow for the
     dents of an object that rolls by under it, and without contact C3's tip runs ahead
-    of the ball alone. So a rolling tip that has to feel for the ball and feels nothing
-    goes down, and along with the ball, until it does. (On a hard and smooth ball, which
-    needs it not, it would hop.)
+    of the ball. So a tip that has to feel for the ball and measures no force moves down
+    and along with the ball until it does. (On a hard and smooth ball, which does not
+    need this, it would hop.)
 
-    Inputs:  phase (1,), reference (9,) of RollingTask; x_next (19,), lam (n_lam,),
-             status (1,) of C3; lcs (abstract), the one-step LCS that made them;
-             optional feel (1,) of RollingTask, and then tip_force (3,) on the tip, as
-             the arm feels it [N], which a touch_speed needs, too; optional touch_speed
-             (1,) [m/s], of TouchDown: takes the setting's place, if it is a number.
-    Outputs: x_desired (19,) = [p, quaternion, v, w, a, alpha], position and its
-             derivatives only (the quaternion is the identity); wrench (6,) force first;
-             command (25,), one after the other: for who asks for both each millisecond.
+    Inputs:  phase (1,), reference (9,) of RollingTask or PushTask; x_next (19,), lam
+             (n_lam,), status (1,) of C3; lcs (abstract): the LCS of C3's command;
+             feel (1,), optional, of RollingTask; tip_force (3,) [N]: estimated contact
+             force on the tip, needed with feel or a touch_speed; touch_speed (1,)
+             [m/s], optional, of TouchDown: replaces the setting unless it is NaN.
+    Outputs: x_desired (19,) = [p, quaternion, v, w, a, alpha], with the identity as
+             quaternion and no rotation; wrench (6,), force first [N], [N m];
+             command (25,): both in one, for a reader at 1 kHz.
+
+    Args: config; n_lam: forces of the LCS; p_tip (3,): initial position of the tip [m];
+        lcs: an example of what the input port carries.
+    Raises: ValueError for a setting out of range.
     """
 
     def __init__(self, config: ArmReferenceConfig, n_lam: int, p_tip, lcs: LCS):
@@ -123,7 +130,7 @@ class ArmReference(LeafSystem):
         )
 
     def start_at(self, context, p_tip) -> None:
-        """The reference rests at p_tip (3,) [m], in a Context of this system."""
+        """Sets a reference at rest at p_tip (3,) [m] in a Context of this system."""
         at_rest = np.concatenate([p_tip, np.zeros(9)])
         line = np.concatenate([at_rest, at_rest, [context.get_time()]])
         context.SetDiscreteState(self._line, line)
@@ -140,7 +147,7 @@ class ArmReference(LeafSystem):
             target = np.concatenate((start[:3], np.zeros(9)))
         elif rolling:
             x_next = self._x_next.Eval(context)
-            # D lam is the change of velocity that the contact gives the tip.
+            # D lam is the change of the tip's velocity by the contact in one step.
             lcs = self._lcs.Eval(context)
             on_tip = c.tip_mass / lcs.dt * (lcs.D[V_TIP] @ self._lam.Eval(context))
             force = clip_norm(-on_tip, c.force_max)

@@ -1,4 +1,4 @@
-"""Torques for a robot that carries its own weight."""
+"""Torques for a robot whose driver compensates gravity."""
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
@@ -8,16 +8,19 @@ from makebreak.systems.arm.numerics.serial_chain import SerialChain, chain_state
 
 
 def gravity_torque(chain, q) -> np.ndarray:
-    """(n,) [N m] that carry the arm at rest at q (n,) [rad]. Args: chain, packed."""
+    """Torques (n,) [N m] that hold the arm at rest against gravity.
+
+    Args: chain: packed SerialChain; q (n,) [rad].
+    """
     return chain_state(chain[0], q, np.zeros(len(q))).bias
 
 
 class GravityLeftOut(LeafSystem):
-    """tau - g(q): what is sent to a robot whose driver adds g(q) itself.
+    """torque = tau - g(q): the command for a robot whose driver adds g(q) itself.
 
-    Inputs:  tau (n,) [N m]; q (n,) measured [rad].
-    Outputs: torque (n,) [N m]; zero before q was ever finite.
-    State: q (n,), the last finite one.
+    Inputs:  tau (n,) [N m]; q (n,): measured [rad].
+    Outputs: torque (n,) [N m]; zero until q is finite for the first time.
+    State:   the last finite q (n,).
     """
 
     def __init__(self, chain: SerialChain):
@@ -40,8 +43,8 @@ class GravityLeftOut(LeafSystem):
         )
 
     def _calc(self, context: Context, output: BasicVector):
-        # A sensor that fails for a moment does not take the arm's weight from the sum:
-        # the law itself goes on, and so does what is left out of it.
+        # While a sensor fails, the controller continues with the last good q; so must
+        # the gravity torque that is subtracted here.
         q = self._now(context)
         torque = np.zeros(len(q))
         if np.isfinite(q).all():

@@ -21,9 +21,9 @@ from makebreak.systems.arm.numerics.serial_chain import SerialChain, chain_state
 from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.timing import timed
 
-# Of the tip's mass over the delay, that damping may be. It begins to swing by itself at
-# pi/2: a third of that leaves the spring a margin.
-DELAY_SHARE = 0.5
+# Largest damping over (mass of the tip / delay). Damping alone is unstable above pi/2;
+# a third of that leaves a margin for the spring.
+DELAY_DAMPING_MAX = 0.5
 
 
 @dataclass
@@ -35,8 +35,7 @@ class ImpedanceConfig:
         default_factory=lambda: [400.0] * 3 + [15.0] * 3
     )
     control_orientation: bool = False  # False: position only, kept upright by posture.
-    # Spring and damper together push the tip no harder, whatever is in its way [N].
-    force_max: float = math.inf
+    force_max: float = math.inf  # Bound of spring and damper force together [N].
     posture_stiffness: float = 100.0  # [1/s2]
     posture_damping: float = 20.0  # [1/s]
     period_sec: float = 0.001
@@ -45,21 +44,22 @@ class ImpedanceConfig:
 
 @dataclass
 class HybridConfig:
-    """Force control, and damping that goes with the stiffness."""
+    """Force control, and damping that follows the stiffness."""
 
-    # 0: damping as given. Else 2 damping_ratio sqrt(K lambda_i) in place of the config
-    # one, lambda_i the tip's mass along each axis; a connected port `damping` wins.
+    # Above 0: the damping is 2 damping_ratio sqrt(K lambda_i) instead of the config's,
+    # with lambda_i the tip's mass along each axis. A connected port `damping` has
+    # priority.
     damping_ratio: float = 0.0
     integral_gain: float = 0.5  # k_i [1/s]
     integral_max: float = 8.0  # [N]
-    normal_damping: float = 200.0  # D_n at least [N s/m].
-    closing_speed: float = 0.012  # [m/s] D_n is such that F_c alone moves no faster.
-    ramp_sec: float = 0.1  # From no force to its target.
-    release_sec: float = 0.12  # A direction that is dropped fades so long.
+    normal_damping: float = 200.0  # Lower bound of D_n [N s/m].
+    closing_speed: float = 0.012  # D_n is at least F_c over this speed [m/s].
+    ramp_sec: float = 0.1  # Time from zero force to its target.
+    release_sec: float = 0.12  # Time in which a direction that is dropped fades out.
 
 
 class ImpedanceController(LeafSystem):
-    """Joint torques that make the tool's tip E a spring and damper, and let it press
+    """Joint torques that make the tool's tip E a spring and damper, with force control
     along up to two directions n.
 
         F = S (K (x_d - x) + D (v_d - v)) + f_fc + f_ff + Lambda (S a_d - Jdot qdot)
@@ -67,43 +67,45 @@ class ImpedanceController(LeafSystem):
         tau = J' F + bias + posture in the dynamically consistent null space of J
 
     K (x_d - x) + D (v_d - v) is shortened to force_max. Two directions that are not
-    orthogonal are made so, the first one kept. F_c rises in
-    ramp_sec; D_n >= F_c/closing_speed bounds the speed of a lost contact's return. The
-    integral waits while less than 0.5 N is felt, and goes on where the next segment has
-    (nearly) the same n. A dropped n fades over release_sec, and stiffness along it
-    returns as it fades.
+    orthogonal are made so, keeping the first one. F_c rises in ramp_sec;
+    D_n >= F_c / closing_speed bounds the speed at which a lost contact is closed again.
+    The integral is frozen while less than 0.5 N is measured, and kept if the next
+    segment has (nearly) the same n. A dropped n fades out over release_sec while the
+    stiffness along it returns.
 
     With `control_orientation` False the task is the tip's position; the posture keeps
-    the tool as upright, and turned, as at the control plant's default positions. With
-    True it is the full pose.
+    the tool's orientation as at the control plant's default positions. With True the
+    task is the full pose.
     tau is the motors' torque: the mass matrix contains the rotors' inertia.
 
-    tau never leaves the effort limits of the control plant and never changes by more
-    than torque_rate_max x period. If an entry of q or v is NaN, tau goes, at that rate,
-    to what carries the arm and slows it down, qdd = -20/s qd: joints that are still
-    measured by what is measured, the others by their last good q and v, predicted on.
-    If the reference is NaN (or a stiffness or damping is negative), the last good pose
-    is held at rest. `status` says so.
+    tau stays within the effort limits of the control plant and changes by at most
+    torque_rate_max x period per tick. If an entry of q or v is NaN, tau changes, at
+    that rate, to the torque that carries the arm and slows it down, qdd = -20/s qd,
+    with the measured entries and predictions of the others from their last good values.
+    If the reference is NaN (or a stiffness or damping negative), the last good pose is
+    held at rest. `status` reports these cases.
 
     Inputs:  q (n,) [rad], v (n,) [rad/s]; x_desired (19,) = [p_WE 3, quaternion wxyz 4,
-             v 3, w 3, a 3, alpha 3] of E in the world; optional stiffness (6,),
-             damping (6,) in place of the config's; optional wrench_feedforward (6,),
-             force first [N], [N m] (its torque acts only if orientation is controlled);
-             optional force_directions (6,), two rows n, unit vectors into the surface,
-             zero for none, force_targets (2,) F_c [N], wrench_measured (6,) on the tool
-             [N], [N m]: without it, or while it is NaN, F_c is fed forward alone;
-             optional damping_stiffness (6,): with a damping ratio, the stiffness that
-             the damping belongs to, where that is not the stiffness itself; optional
-             delay (1,) [s] from a reading to when its torque acts: damping d of a mass
-             m that is told so late is stable while d delay < pi/2 m, so the tip's is
-             bounded to DELAY_SHARE m / delay.
+             v 3, w 3, a 3, alpha 3] of E in the world. Optional:
+             stiffness (6,), damping (6,): replace the config's;
+             wrench_feedforward (6,), force first [N], [N m] (the torque acts only if
+             the orientation is controlled);
+             force_directions (6,): two rows n, unit vectors into the surface, zero for
+             none; force_targets (2,): F_c [N]; wrench_measured (6,): on the tool [N],
+             [N m]. Without it, or while it is NaN, F_c is only fed forward;
+             damping_stiffness (6,): with a damping ratio, the stiffness from which the
+             damping is computed, instead of `stiffness`;
+             delay (1,) [s]: from a reading to the time when its torque acts. Damping d
+             of a mass m with this delay is stable while d delay < pi/2 m, so the tip's
+             damping is bounded to DELAY_DAMPING_MAX m / delay.
     Outputs: tau (n,) [N m]; status (1,), a sum: 1 reference held, 2 sensors held,
              4 effort limit reached, 8 torque rate limit reached, 16 wrench not used.
 
-    Args: plant, finalized, the arm with its tool alone, never the simulated one;
-        tip_frame, name of E; torque_rate_max [N m/s]; hybrid, of force and damping.
+    Args: config; plant: finalized, the arm with its tool alone, never the simulated
+        one; tip_frame: name of E; torque_rate_max [N m/s]; hybrid: settings of force
+        control and damping.
     Raises: ValueError for a plant that is not one chain of revolute joints with a motor
-        each, and for gains that are negative.
+        each, or a setting out of range.
     """
 
     def __init__(
@@ -186,7 +188,7 @@ class ImpedanceController(LeafSystem):
         at_rest = chain_state(self._packed[0][0], q_nominal, np.zeros(n))
         mobility = at_rest.J[:3] @ np.linalg.solve(at_rest.M, at_rest.J[:3].T)
         self._mass = 1.0 / np.diag(mobility)  # Of the tip along each axis [kg].
-        # The first torque carries the arm at its nominal position.
+        # The initial torque carries the arm at its nominal position.
         carrying = chain_state(self._packed[0][0], q_nominal, np.zeros(n)).bias
         self._tau = self.DeclareDiscreteState(carrying)
         self._status = self.DeclareDiscreteState(1)
@@ -199,7 +201,8 @@ class ImpedanceController(LeafSystem):
         )
 
     def start_at(self, context: Context, q) -> None:
-        """The torque carries the arm at q (n,) [rad], and nothing is remembered."""
+        """Sets the state in a Context of this system: a torque that carries the arm at
+        q (n,) [rad], and an empty memory."""
         n = self._tau_size
         q = np.array(q, dtype=float)
         carrying = chain_state(self._packed[0][0], q, np.zeros(n)).bias
@@ -218,13 +221,13 @@ class ImpedanceController(LeafSystem):
             damping = self._law.damping
         if ratio == 0.0 and self._delay.HasValue(context):
             delay = float(self._delay.Eval(context)[0])
-            if delay > self._law.period:  # Less is what every tick has.
+            if delay > self._law.period:  # A period is the delay of every tick.
                 damping = np.array(damping)
-                most = DELAY_SHARE * self._mass / delay
+                most = DELAY_DAMPING_MAX * self._mass / delay
                 damping[:3] = np.minimum(damping[:3], most)
         directions, targets = self._none, self._no_targets
         measured = self._none
-        if self._directions.HasValue(context):  # Else there is no force to control.
+        if self._directions.HasValue(context):  # Otherwise there is no force control.
             directions = self._directions.Eval(context)
             targets = self._or(self._targets, context, self._no_targets)
             measured = self._or(self._measured, context, self._none)
@@ -267,11 +270,11 @@ def _motors(plant: MultibodyPlant) -> list[JointActuator]:
 
 
 def serial_chain_of(plant: MultibodyPlant, tip_frame: str) -> SerialChain:
-    """The constants of a plant that is one chain of revolute joints, a motor each.
+    """The constants of an arm: one chain of revolute joints with a motor each.
 
-    Args: plant, finalized; tip_frame, name of a frame on the last link or on what is
+    Args: plant: finalized; tip_frame: name of a frame on the last link or on a body
         welded to it.
-    Raises: ValueError if it is anything else.
+    Raises: ValueError for any other plant.
     """
     moving = [
         joint

@@ -1,4 +1,4 @@
-"""Where the tool's tip is and how it moves, from the joints."""
+"""Pose and velocity of the tool's tip from the joints (numerics/tip_state.py)."""
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
@@ -10,13 +10,13 @@ from makebreak.systems.numerics.first_calls import first_call
 
 
 class TipState(LeafSystem):
-    """Pose and velocity of the tip E, computed when asked for. NaN in, NaN out.
+    """Pose and velocity of the tip E, computed when evaluated; NaN for NaN inputs.
 
     Inputs:  q (n,) [rad], v (n,) [rad/s].
     Outputs: ee_pose (7,) = [p_WE 3 [m], quaternion wxyz 4, w >= 0];
              ee_velocity (6,) = [v 3 [m/s], w 3 [rad/s]] of E in world axes.
 
-    Args: chain, constants of the arm with its tool.
+    Args: chain: of the arm with its tool.
     """
 
     def __init__(self, chain: SerialChain):

@@ -11,22 +11,22 @@ from makebreak.systems.numerics.first_calls import first_call
 
 
 class ToolWrench(LeafSystem):
-    """The wrench from outside on the tool, from the reaction in its mount.
+    """The external wrench on the tool: the reaction in its mount minus its weight.
 
-    What the mount carries, less the tool's weight. The tool's inertia stays in it
-    (m a, some 0.1 N for a light finger), as on a robot without accelerometer.
+    The tool's inertial force (m a, some 0.1 N for a light finger) is not removed, as on
+    a robot without accelerometer.
 
     Inputs:  reaction_forces (abstract) and state (n_x,) of the plant.
-    Outputs: wrench (6,) on the tool at its tip, world axes, force first [N], [N m].
+    Outputs: wrench (6,): on the tool at its tip, in world axes, force first [N], [N m].
 
-    It is worked out when asked for, from the torques and the state of that instant:
-    for a discrete plant, what the mount would carry in a step that begins with them.
-    With a period it is sampled just as the plant steps, and is what the mount carries
-    in the step that is then made (and costs no solution of the contact of its own).
+    Without a period it is computed when evaluated, from the torques and the state of
+    that instant: for a discrete plant, the reaction in a step that starts with them.
+    With a period it is sampled as the plant steps and is the reaction in that step,
+    without a contact solution of its own.
 
-    Args: plant, finalized; joint, name of the weld that mounts the tool, the tool its
-        child; tip, name of a frame on the tool; period_sec, the plant's time step, or
-        None.
+    Args: plant: finalized; joint: name of the weld that mounts the tool, with the tool
+        as its child; tip: name of a frame on the tool; period_sec: the plant's time
+        step, or None.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The stiffness of the moment: see numerics/variable_impedance.py for the law."""
+"""Variable stiffness and feed-forward as a system (numerics/variable_impedance.py)."""
 
 from dataclasses import dataclass, field
 
@@ -15,57 +15,59 @@ from makebreak.systems.changing_contact.numerics.contact_task import N_PHASE
 from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.timing import timed
 
-# Of the feed-forward, while a model is handed over [s]: what it says is no measured
-# force with its noise, and the filter keeps no more than the torque's rate bounded.
+# Filter of the feed-forward while a learned model is handed over [s]: its prediction
+# has no measurement noise, so the filter only has to bound the torque's rate.
 HANDOVER_FILTER_SEC = 0.005
 
 
 @dataclass
 class StiffnessConfig:
-    """Along each axis [N/m]; free = maximum = impact is constant stiffness."""
+    """Along each axis [N/m]; free = maximum = impact gives a constant stiffness."""
 
-    free: float = 200.0  # K_free, where the forward model is right.
-    maximum: float = 1000.0  # K_max, where it is wrong, and while modes are told apart.
-    impact: float = 150.0  # Where an impact is expected.
-    rotational: float = 40.0  # [N m/rad], constant.
+    free: float = 200.0  # K_free: the forward model predicts well.
+    maximum: float = 1000.0  # K_max: it does not, or the mode is being identified.
+    impact: float = 150.0  # K_impact: an impact is expected.
+    rotational: float = 40.0  # Constant [N m/rad].
     paper_damping: bool = False  # D = sqrt(K)/4: see docs/impedance.md.
 
 
 @dataclass
 class TrustConfig:
+    """Trust in the forward model as a function of its error (CC eq. 4c)."""
+
     steepness: float = 8.0  # r [1/N]
     midpoint: float = 0.8  # eps_0 [N]
-    filter_sec: float = 0.02  # Of stiffness and feed-forward; 0: none.
+    filter_sec: float = 0.02  # Time constant for stiffness and feed-forward; 0: none.
 
 
 @dataclass
 class VariableImpedanceConfig:
     stiffness: StiffnessConfig = field(default_factory=StiffnessConfig)
     trust: TrustConfig = field(default_factory=TrustConfig)
-    blend_sec: float = 0.1  # T of eq. 10.
-    feedforward: bool = True  # Of the predicted wrench.
-    transition: bool = True  # False: the base controller at changes of contact too.
+    blend_sec: float = 0.1  # T of CC eq. 10.
+    feedforward: bool = True  # Whether the predicted wrench is fed forward.
+    transition: bool = True  # False: the base controller alone, also at contacts.
     period_sec: float = 0.001
     offset_sec: float = 0.0
 
 
 class VariableImpedance(LeafSystem):
-    """Stiffness, damping and feed-forward of the base controller, of the transition-
-    phase controllers, and of the blend of both.
+    """Stiffness, damping and feed-forward of the base controller, the transition-phase
+    controllers, and the blend of both.
 
-    Inputs:  prediction_error (1,) [N], wrench_predicted (6,) on the tool [N], [N m];
-             collecting (1,), 1 while the mode detector collects a batch; phase (6,);
-             optional handing_over (1,), 1 while a model that was announced takes over:
-             its prediction is fed forward with a filter of 5 ms.
-    Outputs, all of them state: stiffness (6,) [N/m] x 3, [N m/rad] x 3;
-             damping_stiffness (6,), the one that the damping belongs to (in an impact
-             the tip is damped as by K_max), or, with paper_damping, in its place
+    Inputs:  prediction_error (1,) [N]; wrench_predicted (6,): on the tool [N], [N m];
+             collecting (1,): 1 while the mode detector collects a batch; phase (6,) of
+             VelocityShaper; handing_over (1,), optional: 1 while a model of an earlier
+             trial takes over: its prediction is fed forward with a filter of 5 ms.
+    Outputs (all state): stiffness (6,) [N/m] x 3, [N m/rad] x 3;
+             damping_stiffness (6,): the stiffness from which the damping is computed
+             (in an impact the tip is damped as for K_max); with paper_damping instead
              damping (6,) [N s/m] x 3, [N m s/rad] x 3;
-             wrench_feedforward (6,) [N], [N m]; trust (1,), lambda of eq. 4c;
-             status (1,), 1 while an input is NaN: then K_max, no feed-forward, or the
-             base controller.
+             wrench_feedforward (6,) [N], [N m]; trust (1,): lambda of CC eq. 4c;
+             status (1,): 1 while an input is NaN; then K_max, no feed-forward, or the
+             base controller is used.
 
-    Raises: ValueError for numbers out of their range.
+    Raises: ValueError for a setting out of range.
     Source: CC eq. 4b, 4c, 8, 10.
     """
 
@@ -112,7 +114,7 @@ class VariableImpedance(LeafSystem):
         self._collecting = self.DeclareVectorInputPort("collecting", 1)
         self._phase = self.DeclareVectorInputPort("phase", N_PHASE)
         self._handing_over = self.DeclareVectorInputPort("handing_over", 1)
-        # Before the first update: stiff, nothing fed forward.
+        # Before the first update: K_max, no feed-forward.
         first = np.repeat([stiffness.maximum, stiffness.rotational], 3)
         self._memory = self.DeclareDiscreteState(N_MEMORY)
         self._stiffness = self.DeclareDiscreteState(first)

@@ -1,1 +1,1 @@
-"""Other people's answers, to compare with; and frozen, a system that does nothing."""
+"""Methods of other authors for comparison; and Frozen, for ablations."""

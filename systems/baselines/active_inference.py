@@ -1,4 +1,4 @@
-"""Active inference control of a point in the plane, a baseline."""
+"""Baseline: active inference control of a point in the plane."""
 
 from dataclasses import dataclass, field
 
@@ -8,28 +8,29 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from makebreak.systems.baselines.numerics.active_inference import MEMORY, tick
 from makebreak.systems.numerics.timing import timed
 
-HELD, AT_LIMIT = 1, 2  # Status, a sum.
+HELD, AT_LIMIT = 1, 2  # Bits of the status.
 
 
 @dataclass
 class ActiveInferenceConfig:
-    # Of position and velocity as sensed, and of the belief and of its rate.
+    # Variances of measured position and velocity, of the belief and of its rate.
     variance: list[float] = field(default_factory=lambda: [1.0, 1.0, 5.0, 5.0])
     k_belief: float = 20.0  # k_mu [1/s].
     k_action: float = 1200.0  # k_a [N/(m s)].
-    # Whether the model knows how the goal moves. In the source it does not.
+    # Whether the generative model includes the goal's motion; not so in the source.
     goal_moves: bool = False
 
 
 class ActiveInference(LeafSystem):
-    """Believes that it goes to the goal, and acts until what it senses agrees.
+    """Minimises free energy under a generative model in which the point goes to the
+    goal.
 
     Inputs:  state (4,) p, v; x_desired (6,) p, v, a, of which p is the goal; v and a
-             count where the config says that it moves.
+             are used with config.goal_moves.
     Outputs: u (2,) [N]; status (1,), a sum: 1 not finite, u held; 2 u at its limit;
              belief (6,) mu, mu', mu''.
 
-    Args: force_max, the limit of |u| [N].
+    Args: force_max: limit of |u| [N].
     Raises: ValueError for numbers that are not positive.
     Source: Pezzato et al. (2020); see numerics/active_inference.py.
     """
@@ -71,11 +72,11 @@ class ActiveInference(LeafSystem):
         self.DeclareVectorOutputPort("belief", 6, self._calc_belief, ticket)
         self.DeclareStateOutputPort("status", self._status)
         self.DeclarePeriodicDiscreteUpdateEvent(period_sec, offset_sec, self._update)
-        tick(np.zeros(MEMORY), np.zeros(4), np.zeros(6), *self._law)  # Compiles it.
+        tick(np.zeros(MEMORY), np.zeros(4), np.zeros(6), *self._law)  # Compile now.
 
     @timed
     def _update(self, context: Context, discrete_state):
-        # A Context's arrays are read-only, another type for the compiled law.
+        # A copy: Drake's arrays are read-only, which numba would compile separately.
         memory = context.get_discrete_state(self._memory).value().copy()
         state, target = self._state.Eval(context), self._target.Eval(context)
         _, memory, limit = tick(memory, state, target, *self._law)

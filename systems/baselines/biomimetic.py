@@ -1,4 +1,4 @@
-"""Biomimetic adaptive control of a point in the plane, a baseline."""
+"""Baseline: biomimetic adaptive control of a point in the plane."""
 
 from dataclasses import dataclass, field
 
@@ -13,31 +13,32 @@ from makebreak.systems.baselines.numerics.biomimetic import (
 )
 from makebreak.systems.numerics.timing import timed
 
-HELD, AT_LIMIT = 1, 2  # Status, a sum.
+HELD, AT_LIMIT = 1, 2  # Bits of the status.
 
 
 @dataclass
 class BiomimeticConfig:
     kappa: float = 10.0  # Weight of the position in eps [1/s].
-    # Q_F [N s/m], Q_K [N s/m2], Q_D [N s2/m2].
+    # Learning rates Q_F [N s/m], Q_K [N s/m2], Q_D [N s2/m2].
     rates: list[float] = field(default_factory=lambda: [10.0, 100.0, 10.0])
     stiffness: float = 200.0  # K_0 [N/m].
     damping: float = 28.0  # D_0 [N s/m].
     forget: float = 0.05  # a, per trial.
     forget_less: float = 5.0  # b [s2/m2].
-    step_sec: float = 0.01  # What F, K and D are learned for.
+    step_sec: float = 0.01  # Time for which F, K and D are constant [s].
 
 
 class Biomimetic(LeafSystem):
-    """Follows the target with what earlier trials taught, and records the errors.
+    """Follows the target with the gains learned in earlier trials, and records the
+    errors of this one.
 
-    Gains are constant over a time step of step_sec; beyond the last one they stay.
+    Gains are constant over each time step of step_sec; the last ones are held.
 
     Inputs:  state (4,) p, v; x_desired (6,) p, v, a.
     Outputs: u (2,) [N]; status (1,), a sum: 1 not finite, u held; 2 u at its limit.
 
-    Args: duration_sec of a trial; knowledge, of earlier trials (None: none); mass [kg];
-        force_max, the limit of |u| [N].
+    Args: duration_sec: of a trial; knowledge: gains from earlier trials, None for the
+        first one; mass [kg]; force_max: limit of |u| [N].
     Raises: ValueError that names what is wrong.
     Source: Yang et al. (2011); see numerics/biomimetic.py.
     """
@@ -87,18 +88,18 @@ class Biomimetic(LeafSystem):
         self._mass, self._force_max = float(mass), float(force_max)
         self._state = self.DeclareVectorInputPort("state", 4)
         self._target = self.DeclareVectorInputPort("x_desired", 6)
-        self._count = self.DeclareDiscreteState(1)  # Ticks since time 0.
+        self._count = self.DeclareDiscreteState(1)  # Updates since time 0.
         self._u = self.DeclareDiscreteState(2)
         self._status = self.DeclareDiscreteState(1)
-        # e, de/dt at the beginning of each time step; NaN until then.
+        # e, de/dt at the start of each time step; NaN before it.
         self._errors = self.DeclareDiscreteState(np.full(4 * n, np.nan))
         self.DeclareStateOutputPort("u", self._u)
         self.DeclareStateOutputPort("status", self._status)
         self.DeclarePeriodicDiscreteUpdateEvent(period_sec, offset_sec, self._update)
-        self._command(np.zeros(4), np.zeros(6), 0)  # Compiles it.
+        self._command(np.zeros(4), np.zeros(6), 0)  # Compile it now.
 
     def knowledge(self, context: Context) -> LearnedGains:
-        """What the trial so far taught, for the constructor of the next trial."""
+        """The gains after this trial, for the constructor of the next trial's."""
         errors = context.get_discrete_state(self._errors).value().reshape(self._n, 4)
         c = self._config
         return after_trial(

@@ -10,8 +10,8 @@ from makebreak.systems.contact_mpc.numerics.lcs import LCS
 
 
 class DynamicsResidual(LeafSystem):
-    """The LCS with d + r_dyn lcs.dt / residual_dt: an error per step of one length is
-    taken to be in proportion in a step of another.
+    """The LCS with d + r_dyn lcs.dt / residual_dt: the error of a step is taken to be
+    proportional to its length.
 
     Inputs:  lcs (abstract); r_dyn (n_x,) of DynamicsResidualLearner [x per step].
     Outputs: lcs (abstract).

@@ -1,4 +1,4 @@
-"""A baseline for the residual learner: it learns the dynamics' error, not contact's."""
+"""Baseline of the residual learner: a residual of the dynamics, not of the contact."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -17,11 +17,11 @@ from makebreak.systems.numerics.timing import timed
 
 
 class DynamicsStatus(IntEnum):
-    """What became of the newest pair; but for LEARNED, r_dyn was held."""
+    """Use of the newest pair of samples; r_dyn is held unless it is LEARNED."""
 
     LEARNED = 0
-    WAITING = 1  # No pair yet: it takes two good samples in a row.
-    BAD_SAMPLE = 2  # x, u_measured or lcs was not finite, or lcs has no solution there.
+    WAITING = 1  # No pair yet, which takes two good samples in a row.
+    BAD_SAMPLE = 2  # x, u_measured or lcs is not finite, or lcs has no solution there.
 
 
 @dataclass
@@ -40,11 +40,12 @@ class DynamicsMemory:
 
 
 class DynamicsResidualLearner(LeafSystem):
-    """Learns r_dyn, a constant on the dynamics of an LCS (eq. 10).
+    """Learns r_dyn, a constant residual of an LCS's dynamics (eq. 10).
 
-    Inputs:  x (n_x,), u_measured (n_u,), lcs (abstract), as of ResidualLearner.
-    Outputs: r_dyn (n_x,) the mean error of the model's step over the last n_b pairs
-             [x per step]; lcs (abstract) the input's LCS with d + r_dyn; status (1,).
+    Inputs:  x (n_x,), u_measured (n_u,), lcs (abstract), as those of ResidualLearner.
+    Outputs: r_dyn (n_x,) mean one-step prediction error over the last n_b pairs [x per
+             step]; lcs (abstract): the input with d + r_dyn; status (1,), a
+             DynamicsStatus.
 
     Source: ACI-MPC, section VI, eq. 9 and 10.
     """
@@ -56,7 +57,7 @@ class DynamicsResidualLearner(LeafSystem):
         period_sec: float,
         offset_sec: float = 0.0,
     ):
-        """Args: lcs: one that the input port may carry; period_sec is to be its dt."""
+        """Args: lcs: an example of the input's LCS, with the dt period_sec."""
         super().__init__()
         if config.n_b < 1:
             raise ValueError(f"n_b is {config.n_b}, expected 1 or more")

@@ -1,5 +1,4 @@
-"""Takes the measured force off what a controller asks for: a force sensor for those
-controllers that have none in their law."""
+"""Force feedforward for baselines whose control law has no measured force."""
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
@@ -9,14 +8,14 @@ from makebreak.systems.planar.numerics.planar_world import compensated
 
 
 class ForceFeedforward(LeafSystem):
-    """u_total = u - force, within the limit; the force as it was measured at the tick.
+    """u_total = u - force, within the limit, with the force sampled every period_sec.
 
-    A force that is not finite is left out.
+    A force that is not finite counts as zero.
 
     Inputs:  u (2,) [N]; force (2,) measured, of the world on the effector [N].
     Outputs: u_total (2,) [N].
 
-    Args: force_max, the limit of |u_total| [N].
+    Args: force_max: limit of |u_total| [N].
     """
 
     def __init__(self, force_max: float = 100.0, period_sec: float = 0.001):

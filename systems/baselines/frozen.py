@@ -1,22 +1,20 @@
-"""A system that says for ever what another one says before its first update."""
+"""Ablation of any system: its outputs stay as they are before the first update."""
 
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import LeafSystem, PortDataType
 
 
 class Frozen(LeafSystem):
-    """The ports of `system`, and on each output what that has in its default context.
+    """A system with the ports of `system`, whose outputs are constant: their values in
+    the default context. Inputs are ignored.
 
-    For finding out what a system contributes. Inputs are read by nobody. Outputs that
-    are not functions of state alone cannot be frozen.
-
-    Raises: ValueError for a system whose outputs need its inputs.
+    Raises: ValueError if an output depends on an input.
     """
 
     def __init__(self, system: LeafSystem):
         super().__init__()
         context = system.CreateDefaultContext()
-        self._kept = system  # Values of its ports may refer to it.
+        self._system = system  # Kept alive: values of its ports may refer to it.
         for i in range(system.num_input_ports()):
             port = system.get_input_port(i)
             if port.get_data_type() == PortDataType.kVectorValued:

@@ -1,5 +1,5 @@
-"""The long-term predictor of Khader et al. used one step at a time, with feedback: what
-ForwardModelBank is compared with."""
+"""Baseline of ForwardModelBank: the long-term predictor of Khader et al., used one step
+ahead with feedback."""
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
@@ -10,23 +10,23 @@ from makebreak.systems.baselines.numerics.long_term_predictor import (
 )
 from makebreak.systems.numerics.timing import timed
 
-N_X = 3  # The force.
-N_XU = 9  # Force, velocity, position.
+N_X = 3  # x: force.
+N_XU = 9  # x and u: force, velocity, position.
 
 
 class OneStepPredictor(LeafSystem):
-    """Predicts the force on the tool one sample ahead. It learns nothing on the way.
+    """Predicts the force on the tool one sample ahead. It does not learn online.
 
     Inputs:  wrench (6,) measured on the tool, world axes, force first [N], [N m];
              ee_velocity (6,) [m/s], [rad/s]; ee_pose (7,), position first [m].
     Outputs, all of them state:
              wrench_predicted (6,) of the next sample, its torque zero [N];
-             std (3,) of its force [N]; mode (1,) that the SVM expects there;
-             status (1,) 0, or 1: an input is not finite, the last prediction is held.
+             std (3,) of its force [N]; mode (1,) that the SVM predicts there;
+             status (1,) 0, or 1 if an input is not finite and the outputs are held.
 
-    Args: predictor, trained with x = force (3), u = [velocity (3), position (3)] at
-        steps of period_sec; mode, at the start.
-    Raises: ValueError for a predictor over anything else.
+    Args: predictor: trained with x = force (3,), u = [velocity (3,), position (3,)]
+        and steps of period_sec; mode: initial contact mode.
+    Raises: ValueError for a predictor of other dimensions.
 
     Source: CC section 4.4.3.
     """

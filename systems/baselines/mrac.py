@@ -1,4 +1,4 @@
-"""Model reference adaptive control of a point in the plane, a baseline."""
+"""Baseline: model reference adaptive control (MRAC) of a point in the plane."""
 
 from dataclasses import dataclass, field
 
@@ -8,31 +8,32 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from makebreak.systems.baselines.numerics.mrac import MEMORY, error_weights, tick
 from makebreak.systems.numerics.timing import timed
 
-HELD, AT_LIMIT = 1, 2  # Status, a sum.
+HELD, AT_LIMIT = 1, 2  # Bits of the status.
 
 
 @dataclass
 class MracConfig:
     omega: float = 1.5  # Natural frequency of the reference model [1/s].
     zeta: float = 1.0  # Its damping ratio.
-    rate_weight: float = 1.0  # l: what a velocity error counts [s2].
-    # Proportional and integral gain: of the auxiliary force f, of K0 and Q0, and of K1
+    rate_weight: float = 1.0  # l: weight of the velocity error [s2].
+    # Proportional and integral gains of the auxiliary force f, of K0 and Q0, and of K1
     # and Q1.
     force_gains: list[float] = field(default_factory=lambda: [400.0, 400.0])
     position_gains: list[float] = field(default_factory=lambda: [20.0, 20.0])
     velocity_gains: list[float] = field(default_factory=lambda: [10.0, 10.0])
-    # False: the reference model is commanded so that its response is the target.
-    # True: its command is the target, which it follows with its own lag.
+    # False: the reference model's command is such that its response is the target.
+    # True: its command is the target, which it follows with a lag.
     lag: bool = False
 
 
 class Mrac(LeafSystem):
-    """Adapts its gains until the effector answers as a reference model does.
+    """Adapts its gains until the effector responds like a reference model.
 
     Inputs:  state (4,) p, v; x_desired (6,) p, v, a.
-    Outputs: u (2,) [N]; status (1,), a sum: 1 not finite, u held; 2 u at its limit.
+    Outputs: u (2,) [N]; status (1,), a sum: 1 not finite, u held; 2 u at its limit;
+             x_model (4,) p, v of the reference model.
 
-    Args: force_max, the limit of |u| [N].
+    Args: force_max: limit of |u| [N].
     Source: Tarokh (ICRA 1991); see numerics/mrac.py.
     """
 
@@ -80,11 +81,11 @@ class Mrac(LeafSystem):
             "x_model", 4, self._calc_model, {self.discrete_state_ticket(self._memory)}
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period_sec, offset_sec, self._update)
-        tick(np.zeros(MEMORY), np.zeros(4), np.zeros(6), *self._law)  # Compiles it.
+        tick(np.zeros(MEMORY), np.zeros(4), np.zeros(6), *self._law)  # Compile now.
 
     @timed
     def _update(self, context: Context, discrete_state):
-        # A Context's arrays are read-only, another type for the compiled law.
+        # A copy: Drake's arrays are read-only, which numba would compile separately.
         memory = context.get_discrete_state(self._memory).value().copy()
         u, memory, limit = tick(
             memory, self._state.Eval(context), self._target.Eval(context), *self._law

@@ -59,6 +59,7 @@ HISTORY = 150  # Poses kept: 1.5 s at 100 Hz.
 # to it; it is no impact-less change.
 SETTLE_SEC = 0.3
 HINT_WAY = 0.02  # [m] past the place, and 3 sigma, for which the hint is given.
+ANYWHERE = 1e3  # Standard deviation [m] along axes on which nothing is measured.
 FORGET_STD = 0.02  # A learned contact that is not felt is given up at this sigma [m].
 
 
@@ -391,8 +392,28 @@ class KalmanContactAnticipator(LeafSystem):
             k = len(belief.contacts) - 1
         else:
             belief = self._corrected(memory.belief, k, p, R)
+            belief = self._informed(belief, k, p)
         updated = (*memory.updated, k)
         return replace(memory, belief=belief, last=k, touch=k, updated=updated)
+
+    def _informed(self, belief, k, p):
+        """The belief after contact k was felt at p (3,): contacts whose positions
+        follow from its position are where it says, until they are felt themselves."""
+        source = belief.contacts[k]
+        for i, contact in enumerate(belief.contacts):
+            if not contact.known_from or contact.seen > 0:
+                continue
+            segment, distance, std = contact.known_from
+            d = contact.direction
+            if segment != source.segment or d @ source.direction < 0.99:
+                continue
+            there = contact.mean + d * ((p - contact.mean) @ d + distance)
+            R = measurement_covariance(
+                d, np.hypot(self._filter.std_along, std), ANYWHERE
+            )
+            mean, covariance = update(contact.mean, contact.covariance, there, R)
+            belief = belief.changed(i, mean=mean, covariance=covariance)
+        return belief
 
     def _matching(self, belief, kind, segment, p, d, std_along) -> int | None:
         """Index of the expected contact that was felt: the nearest along d."""

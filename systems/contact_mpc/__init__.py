@@ -1,9 +1,9 @@
-"""Contact-implicit MPC: a linear complementarity model of any plant, plans through it.
+"""Contact-implicit MPC: linear complementarity models (LCS) of plants, and C3 on them.
 
-lcs_builder       the LCS of a plant about a state
-lcs_plant         an LCS as a world
-c3_mpc            C3, C3+: plans through contact
-residual_learner  what the LCS has wrong, learned while the robot works
-contact_sampler   where to touch an object that is to be pushed
-rolling_task, push_goals, push_task, pivot_target: what C3 is to do next
+lcs_builder       the LCS of any MultibodyPlant about its state
+lcs_plant         an LCS as the simulated plant
+c3_mpc            C3 and C3+: MPC through contact
+residual_learner  online learning of the LCS's contact residual
+contact_sampler   choice of the point at which to touch an object that is to be pushed
+rolling_task, push_goals, push_task, pivot_target: the reference of C3
 """

@@ -1,4 +1,4 @@
-"""C3 as a system: plans through contact, and commands one step of the model."""
+"""C3 as a system: plans through contact and commands the first input of the plan."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -9,19 +9,18 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import LeafSystem
 
+from makebreak.systems.contact_mpc.numerics.c3_admm import C3Failure
 from makebreak.systems.contact_mpc.numerics.c3_mpc import (
     C3Bounds,
-    C3Failure,
     C3Options,
     C3Problem,
     C3Weights,
-    Plan,
-    WarmStart,
     command_step,
     solve_c3,
     warm_up,
     with_gap_residual,
 )
+from makebreak.systems.contact_mpc.numerics.c3_plan import Plan, WarmStart
 from makebreak.systems.contact_mpc.numerics.c3_projections import (
     ExactProjection,
     PlusProjection,
@@ -38,33 +37,34 @@ from makebreak.systems.numerics.timing import timed
 
 
 class C3Status(IntEnum):
-    """The `status` port: 0 is good, anything else says why the last plan is held."""
+    """The `status` port: if it is not 0, the last plan is kept, for this reason."""
 
     SOLVED = 0
     NO_PLAN_YET = 1
-    BAD_X = 2  # A NaN or an infinity in x, ...
+    BAD_X = 2  # Not finite, as for the next three.
     BAD_X_DESIRED = 3
     BAD_R_COMP = 4
-    BAD_LCS = 5  # ... also: of other dimensions than the weights.
+    BAD_LCS = 5  # Not finite, or its sizes differ from those of the weights.
     SOLVE_FAILED = 6
-    COMMAND_FAILED = 7  # The plan is new; x_next and lam are not.
+    COMMAND_FAILED = 7  # The plan is new, but x_next and lam are the last ones.
 
 
 @dataclass
 class C3Config:
     weights: C3Weights = field(default_factory=C3Weights)  # Must be given.
     # In YAML `projection: !PlusProjection {}`, `!QpProjection {alpha: 0.01}`,
-    # `!ExactProjection {}`: each carries its own numbers and no others.
+    # `!ExactProjection {}`.
     projection: PlusProjection | QpProjection | ExactProjection = field(
         default_factory=PlusProjection
     )
     options: C3Options = field(default_factory=C3Options)
     bounds: C3Bounds = field(default_factory=C3Bounds)
-    residual_dt_sec: float = 0.05  # Time step at which r_comp is a velocity.
-    # The first knots keep the contact modes that the last plan's inputs have from x.
+    residual_dt_sec: float = 0.05  # Time step over which r_comp is a velocity [s].
+    # Number of first knots whose contact modes are fixed to those that a rollout of the
+    # last plan's inputs from x passes through.
     fixed_knots: int = 0
-    clamp_command_gap: bool = True  # Treat penetration as touching in x_next.
-    # In x_next a contact that slides is not felt from a distance (opening_speed).
+    clamp_command_gap: bool = True  # x_next treats penetration as a gap of zero.
+    # x_next leaves out the gap that a sliding Anitescu contact opens (opening_speed).
     sliding_command: bool = False
 
 
@@ -72,27 +72,28 @@ class C3Mpc(LeafSystem):
     """Model predictive control through contact: C3 with its projections, and C3+.
 
     Inputs:  x (n_x,) [SI];
-             x_desired ((N + 1) n_x,), the target (N + 1, n_x) flattened row by row;
-             lcs (abstract): LCS of the horizon, or a sequence of N, one per knot;
-             lcs_command: LCS of the command's step (abstract), optional, else lcs (of
-             the first knot);
-             r_comp (n_lam,) [m/s at residual_dt_sec], optional, else zero.
+             x_desired ((N + 1) n_x,): the target (N + 1, n_x), row by row;
+             lcs (abstract): the LCS of the horizon, or a sequence of N, one per knot;
+             lcs_command (abstract), optional: the LCS of one control step, for x_next;
+             default: lcs, or its first one;
+             r_comp (n_lam,) [m/s], optional: the learned residual; default: zero.
     Outputs: u (n_u,) [N], always within its bounds;
-             x_next (n_x,), lam (n_lam,) [N]: one step of the command's LCS under u;
+             x_next (n_x,), lam (n_lam,) [N]: one step of lcs_command under u;
              plan: Plan (abstract);
              status (1,): a C3Status.
 
-    r_comp is added to c of both models, scaled by residual_dt_sec / lcs.dt (a gap's
-    residual counts as a velocity over one step). In the command's model the residual
-    gap phi + r dt of a penetrated contact is taken for zero, if clamp_command_gap:
-    a short step would otherwise command the penetration out at phi / dt.
+    r_comp is an error of the gaps over residual_dt_sec; for an LCS of another time step
+    it is scaled by residual_dt_sec / lcs.dt and added to c. With clamp_command_gap the
+    corrected gap phi + r dt of a penetrating contact is set to zero in lcs_command: a
+    short step would otherwise command the penetration out at the speed phi / dt.
 
-    Where an input is not finite or the solve fails, u follows the last plan as time
-    goes on and is zero (or the bound next to it) behind its end, x_next and lam stay,
-    and status says why. Before the first solve u is that zero and x_next is the x of
-    the initialisation.
+    If an input is not finite or the solve fails, u follows the last plan (after its end
+    u is zero, or the bound nearest to zero), x_next and lam stay, and status gives the
+    reason. Before the first solve u is zero likewise, and x_next is the initial x.
 
-    Source: ACI-MPC, section IV and VI.
+    Args: config; period_sec, offset_sec: of the updates [s].
+    Raises: ValueError for a setting out of range.
+    Source: ACI-MPC, sections IV and VI.
     """
 
     def __init__(self, config: C3Config, period_sec: float, offset_sec: float = 0.0):
@@ -111,7 +112,7 @@ class C3Mpc(LeafSystem):
                 f"C3Config.fixed_knots is {config.fixed_knots}, expected an integer "
                 f"from 0 to N = {p.options.N}"
             )
-        self._per_force = [p.n_x]  # Where the entries per force begin in z.
+        self._per_force = [p.n_x]  # Where blocks of n_lam entries begin in z.
         if p.is_plus:
             self._per_force.append(p.n_x + p.n_lam + p.n_u)
         self._clamp, self._sliding = config.clamp_command_gap, config.sliding_command
@@ -134,15 +135,16 @@ class C3Mpc(LeafSystem):
         self._u = state(p.n_u, value=self._u_idle)
         self._x_next, self._lam = state(p.n_x), state(p.n_lam)
         self._status = state(1, value=float(C3Status.NO_PLAN_YET))
-        # How old the plan is, and how long its knots are [s].
+        # The plan's age and the time between its knots [s].
         self._age, self._plan_dt = state(1), state(1, value=1.0)
-        self._plan_time = state(1, value=np.nan)  # Of its first knot [s].
-        self._plan_cut = state(1)  # Its projections that were cut short.
+        self._plan_time = state(1, value=np.nan)  # Time of its first knot [s].
+        self._plan_cut = state(1)  # Number of projections that hit their limit.
         self._plan_x = state(N + 1, p.n_x)
         self._plan_u = state(N, p.n_u, value=self._u_idle)
         self._plan_lam = state(N, p.n_lam)
         self._delta, self._w = state(N, p.n_z), state(N, p.n_z)
-        self._contact = state(N, p.n_lam, value=-1.0)  # Of each force; -1: unknown.
+        # Number of the contact that each force belongs to; -1: unknown.
+        self._contact = state(N, p.n_lam, value=-1.0)
         self.DeclareStateOutputPort("u", self._u[0])
         self.DeclareStateOutputPort("x_next", self._x_next[0])
         self.DeclareStateOutputPort("lam", self._lam[0])
@@ -210,7 +212,7 @@ class C3Mpc(LeafSystem):
         write(self._lam, lam)
 
     def _contacts_of(self, lcs):
-        """(N, n_lam) the contact of each knot's forces; -1 where the LCS says none."""
+        """(N, n_lam) the contact number of each force; -1 where the LCS has none."""
         N, n_lam = self._problem.options.N, self._problem.n_lam
         models = [lcs] * N if isinstance(lcs, LCS) else lcs
         unknown = np.full(n_lam, -1.0)
@@ -219,18 +221,19 @@ class C3Mpc(LeafSystem):
         ])  # fmt: skip
 
     def _modes(self, context, lcs, x, dt):
-        """Contact modes of the first knots under the last plan's inputs; or None."""
+        """Contact modes of the first fixed_knots knots, from a rollout of the last
+        plan's inputs; None without a last plan or where the rollout fails."""
         last = self._plan_now(context) if self._fixed_knots else None
         if last is None or last.time is None:
             return None
         times = context.get_time() + dt * np.arange(self._fixed_knots)
         try:
             return contact_modes(lcs, x, last.at(times)[1])
-        except ValueError:  # No rollout, no modes: they stay free.
+        except ValueError:
             return None
 
     def _read_inputs(self, context):
-        """SOLVED and (x, x_desired, lcs, lcs_command); or why not, and None."""
+        """SOLVED and (x, x_desired, lcs, lcs_command), or a failure and None."""
         p = self._problem
         x = np.asarray(self._x_in.Eval(context))
         x_desired = np.asarray(self._x_desired.Eval(context))
@@ -264,7 +267,7 @@ class C3Mpc(LeafSystem):
         )
 
     def _are_good(self, models):
-        """Whether these are one LCS, or N of one time step, of the weights' sizes."""
+        """Whether these are one finite LCS of the weights' sizes, or N with one dt."""
         p = self._problem
         if not isinstance(models, Sequence) or len(models) not in (1, p.options.N):
             return False
@@ -281,9 +284,9 @@ class C3Mpc(LeafSystem):
         return context.get_discrete_state(index).value().reshape(shape)
 
     def _hold(self, context, write):
-        """The plan that there is, one period older."""
+        """Keeps the last plan and commands its input for the present time."""
         age = self._get(context, self._age)[0] + self._period
-        # age is a sum of periods: its rounding must not delay a knot by a period.
+        # 1e-6: the rounding of this sum of periods must not delay a knot by a period.
         knot = int(age / self._get(context, self._plan_dt)[0] + 1e-6)
         plan_u = self._get(context, self._plan_u)
         write(self._age, age)

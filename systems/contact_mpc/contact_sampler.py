@@ -1,4 +1,4 @@
-"""Where to touch next, as a system: see numerics/contact_sampling.py."""
+"""The system that chooses where to touch next (numerics/contact_sampling.py)."""
 
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -21,21 +21,21 @@ from makebreak.systems.contact_mpc.numerics.lcs import is_finite
 from makebreak.systems.contact_mpc.numerics.push_task import CONTACT, errors
 from makebreak.systems.numerics.timing import timed
 
-PLACES_MAX = 1000  # In a round.
+PLACES_MAX = 1000  # Candidate places in a round.
 
 
 class SamplerStatus(IntEnum):
-    """The `status` port: 0 is good, anything else says why the last place is held."""
+    """The `status` port: if it is not 0, the last place is kept, for this reason."""
 
     CHOSEN = 0
-    NONE_YET = 1
-    NOT_FINITE = 2  # x, x_desired, goal or r_comp.
-    NOT_SEEN = 3
-    NO_PLAN = 4  # From no place.
+    NONE_YET = 1  # Before the first update.
+    NOT_FINITE = 2  # An entry of x, x_desired, goal, phase, valid or r_comp.
+    NOT_SEEN = 3  # The object.
+    NO_PLAN = 4  # C3 found a plan from no place.
 
 
 class Model(Protocol):
-    """What makes the LCS of many states: AnitescuLcs of lcs_builder.py."""
+    """What gives the LCS about many states: AnitescuLcs of lcs_builder.py."""
 
     n_x: int
     n_u: int
@@ -49,10 +49,11 @@ class Model(Protocol):
 @dataclass
 class ContactSamplerConfig:
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
-    angle_radius: float = 0.12  # An angle to the goal counts as so much of a way [m].
-    residual_dt_sec: float = 0.05  # Time step at which r_comp is a velocity.
-    # Of a round, in wall-clock time; what is not scored by then is not looked at.
-    # Infinite: all of it, and runs repeat bit for bit.
+    # An angle to the goal counts as the distance that it turns at this radius [m].
+    angle_radius: float = 0.12
+    residual_dt_sec: float = 0.05  # Time step over which r_comp is a velocity [s].
+    # Wall-clock time for a round [s]; places that are not scored by then are left out.
+    # Infinite: all are scored, and runs repeat bit for bit.
     budget_sec: float = np.inf
     period_sec: float = 0.1
     offset_sec: float = 0.0
@@ -62,18 +63,22 @@ class ContactSampler(LeafSystem):
     """Chooses the place beside an object where the tip is to touch it.
 
     Inputs:  x (19,) of numerics/ball_state.py; x_desired ((N + 1) 19,) of C3;
-             goal (3,) = x, y [m], yaw [rad]; phase (1,) of PushTask; valid (1,): 1 if
-             the object is seen; r_comp (n_lam,) [m/s at residual_dt_sec], optional: it
-             counts in every plan, and where the object turns out to reach farther out,
-             the places do too (with follow also where it reaches less far).
+             goal (3,) = x, y [m], yaw [rad]; phase (1,) of PushTask; valid (1,): above
+             0.5 if the object is seen; r_comp (n_lam,) [m/s], optional: the learned
+             residual, used in every plan. Where it says that the object reaches farther
+             than modelled, the places lie farther out (with sampling.follow they also
+             lie nearer where it reaches less far).
     Outputs: command (3,) = [number, x, y]: a place in the object's frame, seen from
-             above [m]; each new number is a new command to go there, 0: none yet;
+             above [m]. A new number is a new command to move there; 0: none yet;
              status (1,): a SamplerStatus; round (abstract): the last Round, or None.
 
-    What is not finite, not seen, or has no plan, leaves the command as it is.
+    The command is kept while an input is not finite, the object is not seen or no place
+    has a plan (status).
 
-    Args: config; model, the planner's; problem, what is planned with, as C3Mpc has it;
-        shape of the object and the tip.
+    Args: config; model: the planner's contact model; problem: the same C3 problem as
+        C3Mpc solves; shape: of object and tip.
+    Raises: ValueError for a setting out of range, or sizes of model and problem that
+        differ.
     """
 
     def __init__(
@@ -110,7 +115,8 @@ class ContactSampler(LeafSystem):
         self.DeclarePeriodicUnrestrictedUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
-        x = model.x_default[None]  # Compiles.
+        # Compiles the machine code before the first update.
+        x = model.x_default[None]
         lcs = model.build_many(x, np.zeros(p.n_u))
         score_plans(lcs, x, np.tile(x, (n_knots, 1)), p)
 
@@ -125,7 +131,7 @@ class ContactSampler(LeafSystem):
             np.asarray(port.Eval(context))
             for port in (self._x, self._x_desired, self._goal, self._phase, self._valid)
         )
-        gap = np.zeros(p.n_lam)  # Learned [m].
+        gap = np.zeros(p.n_lam)  # Learned error of the gaps [m].
         if self._r_comp.HasValue(context):
             gap = np.asarray(self._r_comp.Eval(context)) * c.residual_dt_sec
         r = gap / self._model.dt_sec
@@ -135,7 +141,7 @@ class ContactSampler(LeafSystem):
             return SamplerStatus.NOT_SEEN
         memory = context.get_abstract_state(int(self._memory)).get_value()
         length, angle = errors(x, goal)
-        # What lies still is approached from no nearer than its model says.
+        # An object that lies still is approached no nearer than its model says.
         nearer = -float(gap.min())
         nearer = nearer if c.sampling.follow else max(0.0, nearer)
         try:
@@ -161,7 +167,7 @@ class ContactSampler(LeafSystem):
 
 
 def _check(config: ContactSamplerConfig) -> None:
-    """Raises: ValueError for a config out of range, by name."""
+    """Raises: ValueError that names a setting out of range."""
     c = config.sampling
     if c.places != int(c.places) or not 1 <= c.places <= PLACES_MAX:
         raise ValueError(

@@ -1,7 +1,8 @@
-"""LCS of any MultibodyPlant with named contacts: AnitescuLcs and its LeafSystem.
+"""Linear complementarity systems (LCS) of any MultibodyPlant with named contacts.
 
-The caller makes a diagram of a plant and its scene graph and hands it over; nothing is
-added to it:
+AnitescuLcs linearises a plant and its contacts about a state; AnitescuLcsBuilder is its
+LeafSystem. The caller hands over a diagram of a plant and its scene graph, to which
+nothing is added:
 
     builder = DiagramBuilder()
     plant, _ = AddMultibodyPlantSceneGraph(builder, 0.0)
@@ -39,7 +40,7 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Diagram, LeafSystem
 
-from makebreak.systems.contact_mpc.numerics.c3_mpc import Plan
+from makebreak.systems.contact_mpc.numerics.c3_plan import Plan
 from makebreak.systems.contact_mpc.numerics.convex_hull import point_on_hull
 from makebreak.systems.contact_mpc.numerics.lcs import LCS, is_finite
 from makebreak.systems.contact_mpc.numerics.lcs_builder import (
@@ -63,15 +64,14 @@ _LCS_FIELDS = ("A", "B", "D", "d", "E", "F", "H", "c", "phi")
 
 @dataclass
 class Anitescu:
-    """Convex contact: 2 n_f forces. A contact that slides opens by dt mu |v_t|."""
+    """Convex contact: 2 n_f entries of lam. As an artefact of the relaxation, a sliding
+    contact opens by dt mu |v_t|."""
 
 
 @dataclass
 class StewartTrinkle:
-    """Coulomb's cone as a polyhedron: 2 n_f + 2 entries of lam (1 without friction).
-
-    They are the normal force, 2 n_f friction forces, and the sliding speed.
-    """
+    """Polyhedral friction cone: 2 n_f + 2 entries of lam, which are the normal force,
+    2 n_f friction forces and the sliding speed; without friction only the first."""
 
 
 @dataclass
@@ -80,25 +80,25 @@ class ContactPair:
 
     A body is named "model::body", or "body" where that is unique; a geometry by its
     name in the scene graph ("ball::ball_collision"). A body stands for all of its
-    collision geometries: every combination is a contact of its own, or the `closest`
-    of them are.
+    collision geometries: every combination of two geometries is a contact of its own,
+    unless `closest` limits them to the nearest ones.
     """
 
     a: str = ""
     b: str = ""
     friction: float = 1.0  # Coulomb coefficient mu.
     friction_directions: int = 2  # n_f; 2 n_f friction edges, so 2 n_f forces.
-    # World direction that the first friction edge follows (its projection); empty: the
-    # basis of Drake's MakeFromOneVector, which jumps as the normal turns.
+    # World direction (3,) onto whose projection the first friction edge is aligned;
+    # empty: the basis of Drake's MakeFromOneVector, which jumps as the normal turns.
     tangent: list[float] = field(default_factory=list)
-    # Of a plant that moves in a plane: the plane's normal, in the world. The edges then
-    # start in the plane; with friction_directions = 1 they are its two.
+    # For a plant that moves in a plane: the plane's normal in the world (3,). The first
+    # edge is then in the plane; with friction_directions = 1 both edges are.
     plane_normal: list[float] = field(default_factory=list)
     # In YAML `contact_model: !StewartTrinkle {}`.
     contact_model: Anitescu | StewartTrinkle = field(default_factory=Anitescu)
     # Normal force over penetration [N/m], without damping; None: rigid, but for eps_c.
     stiffness: float | None = None
-    # How many of the pair's combinations are contacts, the nearest; None: all.
+    # Number of contacts, the nearest combinations of geometries; None: all.
     closest: int | None = None
 
 
@@ -109,12 +109,13 @@ class AnitescuLcs:
         diagram: holds one finalized MultibodyPlant connected to a SceneGraph.
         pairs: the contacts; their order is the order of the forces.
         dt_sec: time step [s].
-        eps_c: added to F's diagonal, for lam in newtons [m/s per N]; None: 0.01 dt_sec,
-            the paper's 0.01 for lam as an impulse. It softens no normal force of a
-            pair that has a stiffness.
-        closest: how many of all combinations of all pairs are contacts, the nearest at
-            each state; None: all. The pairs must have the same kind of contact.
-        analytic: use the fast path where the model allows it; False: never.
+        eps_c: regularisation on F's diagonal, for lam in newtons [m/s per N]; None:
+            0.01 dt_sec, which is the paper's 0.01 for lam as an impulse. It is not
+            added to the normal force of a pair that has a stiffness.
+        closest: number of contacts over all pairs, the nearest combinations of
+            geometries at each state; None: all. The pairs must then have the same kind
+            of contact.
+        analytic: whether the fast path is used where the model allows it.
 
     Attributes:
         n_q, n_v, n_x, n_u, n_lam, n_pairs: sizes; x = [q, v] in the plant's order.
@@ -144,7 +145,7 @@ class AnitescuLcs:
         self._check_model()
         self._resolve(scene_graph.model_inspector(), pairs, closest)
 
-        # Scratch: overwritten before each read.
+        # Scratch memory, which every method sets before it reads it.
         self._context = diagram.CreateDefaultContext()
         self._plant_context = plant.GetMyContextFromRoot(self._context)
         self._forces = MultibodyForces(plant)
@@ -159,7 +160,7 @@ class AnitescuLcs:
         self._check_distances()
         self._model = self._constant_mass_model(scene_graph) if analytic else None
         self.is_analytic = self._model is not None
-        self.at_default()  # Compiles, and proves it works.
+        self.at_default()  # Compile now, and fail now if anything is wrong.
 
     def at_default(self) -> LCS:
         """The LCS about the plant's default state, without input."""
@@ -171,8 +172,8 @@ class AnitescuLcs:
         Quaternions in x are normalised first; the LCS's d and c refer to the
         normalised state.
 
-        Args: friction (n_pairs,): of each pair, None: as it was given; gap (n_pairs,)
-            [m]: added to each pair's distances, None: nothing.
+        Args: friction (n_pairs,): coefficient of each pair; None: as configured;
+            gap (n_pairs,) [m]: added to the distances of each pair; None: zero.
         Raises: ValueError on a wrong size, an entry that is not finite, a quaternion
             whose norm is not between 0.5 and 2, geometry without a unique normal,
             friction below 0, or friction for a Stewart-Trinkle pair that has none.
@@ -208,7 +209,7 @@ class AnitescuLcs:
         return lcs if gap is None else self._moved_apart(lcs, gap)
 
     def _friction_of(self, friction):
-        """(n_contacts,) of the frictions (n_pairs,)."""
+        """(n_contacts,) friction of each contact, from that of the pairs (n_pairs,)."""
         friction = np.array(friction, dtype=float)
         if friction.shape != (self.n_pairs,) or not (
             is_finite(friction) and (friction >= 0.0).all()
@@ -225,6 +226,7 @@ class AnitescuLcs:
         return mu
 
     def _moved_apart(self, lcs: LCS, gap) -> LCS:
+        """The LCS with gap (n_pairs,) [m] added to its contacts' distances."""
         gap = np.array(gap, dtype=float)
         if gap.shape != (self.n_pairs,) or not is_finite(gap):
             raise ValueError(f"gap is {gap}, expected ({self.n_pairs},), finite [m]")
@@ -276,15 +278,15 @@ class AnitescuLcs:
         return out
 
     def _rows_of(self, chosen, mu):
-        """The rows' weight and F_0 for the friction mu (n_contacts,) and stiffness of
-        these contacts."""
+        """Friction weights and F_0 of the rows, for the contacts `chosen` with the
+        friction mu (n_contacts,)."""
         if mu is self._mu and chosen is self._every:
             return self._weight, self._F_0
         mu, compliance = mu[chosen], self._compliance[chosen]
         F_0 = self._rows.F_0(mu, compliance, self.dt_sec, self.eps_c)
         return self._rows.weight(mu), F_0
 
-    # The general path: AutoDiff for the smooth dynamics, witness points for contact.
+    # The general path: smooth dynamics by AutoDiff, contacts from Drake's queries.
 
     def _build_general(self, x, u, mu):
         f, J_q, J_v, J_u, M = self._smooth(x, u)
@@ -296,7 +298,7 @@ class AnitescuLcs:
         )  # fmt: skip
 
     def _smooth(self, x, u):
-        """f, its derivatives in q, v and u, and M; leaves the plant's context at x.
+        """f(x, u), its derivatives by q, v and u, and M; sets the plant's context to x.
 
         M f = tau(u) - r(q, v), so M df = dtau - d(M(q) f* + r) at the fixed f*: one
         inverse dynamics in AutoDiff, and no derivative of a factorised M.
@@ -324,8 +326,8 @@ class AnitescuLcs:
         return f, J_q, J_v, J_u, M
 
     def _contact(self, mu):
-        """phi, J_n, J_c, F_0 and the numbers of the contacts, at the state that the
-        plant's context is at, for the friction mu (n_contacts,)."""
+        """phi, J_n, J_c and F_0 at the state of the plant's context, for the friction
+        mu (n_contacts,), and the indices of the contacts chosen."""
         plant, context, rows = self._plant, self._plant_context, self._rows
         world, wrt = plant.world_frame(), JacobianWrtVariable.kV
         query = self._query_port.Eval(context)
@@ -362,10 +364,11 @@ class AnitescuLcs:
             )
 
     def _distance(self, query, id_A, id_B):
-        """Gap, normal from B to A in the world, and witness points in each geometry."""
+        """Distance [m], normal from B to A in the world (3,), and the witness points
+        (3,) on A and B, each in its geometry's frame."""
         for sphere, other, sign in ((id_A, id_B, 1.0), (id_B, id_A, -1.0)):
             if sphere in self._radius and other in self._hull:
-                # Drake's iteration does not end where the centre is near a vertex.
+                # Drake's iteration does not converge with the centre near a vertex.
                 X_WS, X_WH = query.GetPoseInWorld(sphere), query.GetPoseInWorld(other)
                 centre = X_WH.inverse() @ X_WS.translation()
                 distance, n_H, p_H = point_on_hull(*self._hull[other], centre)
@@ -403,118 +406,23 @@ class AnitescuLcs:
                 )
 
     def _resolve(self, inspector, pairs, closest):
-        """Names to geometries: fills what `_contact` reads."""
-        plant = self._plant
-        bodies, ambiguous = {}, set()
-        collision = {}
-        for i in range(plant.num_bodies()):
-            body = plant.get_body(BodyIndex(i))
-            geometries = plant.GetCollisionGeometriesForBody(body)
-            bodies[body.scoped_name().get_full()] = geometries
-            if body.name() in bodies:
-                ambiguous.add(body.name())
-            bodies[body.name()] = geometries
-            for geometry in geometries:
-                collision[inspector.GetName(geometry)] = geometry
-        self._geometries: list[tuple[GeometryId, GeometryId]] = []
-        self._pair_names: list[str] = []
-        self._frames = {}
-        self._radius: dict[GeometryId, float] = {}
-        self._hull: dict[GeometryId, tuple[np.ndarray, np.ndarray]] = {}
-        mu, compliance, kinds, reference, planar, pair_of = [], [], [], [], [], []
-        groups: list[tuple[np.ndarray, int]] = []
-        for number, pair in enumerate(pairs):
-            a = _geometries_named(pair.a, bodies, ambiguous, collision)
-            b = _geometries_named(pair.b, bodies, ambiguous, collision)
-            name = f"{pair.a}~{pair.b}"
-            if not (np.isfinite(pair.friction) and pair.friction >= 0.0):
-                raise ValueError(
-                    f"{name}: friction is {pair.friction}, expected at least 0"
-                )
-            if pair.friction_directions != int(pair.friction_directions) or not (
-                pair.friction_directions >= 1
-            ):
-                raise ValueError(
-                    f"{name}: friction_directions is {pair.friction_directions}, "
-                    "expected an integer of at least 1"
-                )
-            tangent = _direction(f"{name}: tangent", pair.tangent)
-            plane_normal = _direction(f"{name}: plane_normal", pair.plane_normal)
-            in_plane = plane_normal.any()
-            if in_plane and tangent.any():
-                raise ValueError(
-                    f"{name}: tangent and plane_normal came, expected one of them"
-                )
-            one_direction = pair.friction_directions == 1 and pair.friction > 0.0
-            if one_direction and not (in_plane or tangent.any()):
-                raise ValueError(
-                    f"{name}: friction_directions is 1 without a direction, expected "
-                    "a plane_normal (of a plant in a plane) or a tangent"
-                )
-            if not isinstance(pair.contact_model, (Anitescu, StewartTrinkle)):
-                raise ValueError(
-                    f"{name}: contact_model is {pair.contact_model!r}, expected "
-                    "Anitescu() or StewartTrinkle()"
-                )
-            if pair.stiffness is not None and not 0.0 < pair.stiffness < np.inf:
-                raise ValueError(
-                    f"{name}: stiffness is {pair.stiffness}, expected a positive "
-                    "number [N/m], or None for a rigid contact"
-                )
-            edges = friction_edges(int(pair.friction_directions))
-            if in_plane:  # t1 follows the plane's normal, so the edges start at t2.
-                edges = edges[:, ::-1] * [-1.0, 1.0]
-            first = len(self._geometries)
-            for one in a:
-                for other in b:
-                    # As in c3_reference: A is the geometry that was registered first.
-                    id_A, id_B = sorted([one, other], key=lambda g: g.get_value())
-                    if inspector.GetFrameId(id_A) == inspector.GetFrameId(id_B):
-                        raise ValueError(f"{name}: both are on the same body")
-                    self._geometries.append((id_A, id_B))
-                    self._pair_names.append(
-                        f"{inspector.GetName(id_A)}~{inspector.GetName(id_B)}"
-                    )
-                    mu.append(float(pair.friction))
-                    pair_of.append(number)
-                    compliance.append(
-                        0.0 if pair.stiffness is None else 1.0 / pair.stiffness
-                    )
-                    anitescu = isinstance(pair.contact_model, Anitescu)
-                    kinds.append(
-                        (anitescu, edges, pair.friction > 0.0, compliance[-1] > 0.0)
-                    )
-                    reference.append(plane_normal if in_plane else tangent)
-                    planar.append(in_plane)
-            combinations = np.arange(first, len(self._geometries))
-            count = combinations.size
-            if pair.closest is not None:
-                count = _how_many(f"{name}: closest", pair.closest, count)
-            groups.append((combinations, count))
-        for id in {id for ids in self._geometries for id in ids}:
-            body = plant.GetBodyFromFrameId(inspector.GetFrameId(id))
-            self._frames[id] = (body.body_frame(), inspector.GetPoseInFrame(id))
-            shape = inspector.GetShape(id)
-            if isinstance(shape, Sphere):
-                self._radius[id] = shape.radius()
-            elif isinstance(shape, (Mesh, Convex)):
-                hull = inspector.GetConvexHull(id)
-                faces = range(hull.num_faces())
-                normals = np.array([hull.face_normal(f) for f in faces])
-                on_face = [hull.vertex(hull.element(f).vertex(0)) for f in faces]
-                offsets = np.einsum("fi,fi->f", normals, np.array(on_face))
-                self._hull[id] = normals, offsets
-        if not self._geometries:
+        """Finds the geometries of the pairs, and lays out the contacts and rows."""
+        contacts, groups = _contacts_of(pairs, _NamedGeometries(self._plant, inspector))
+        if not contacts:
             raise ValueError("no contact pairs came, expected at least one")
+        self.n_pairs = len(pairs)
+        self._geometries = [contact.geometries for contact in contacts]
+        self._pair_names = [contact.name for contact in contacts]
         if closest is not None:
-            n = len(self._geometries)
+            n = len(contacts)
             groups = [(np.arange(n), _how_many("closest", closest, n))]
             if any(pair.closest is not None for pair in pairs):
                 raise ValueError(
                     "closest came for all pairs and for one of them, expected one of "
                     "the two"
                 )
-            self._check_alike(kinds)
+            _check_alike(contacts)
+        self._read_shapes(inspector)
         # None: every combination is a contact at every state.
         fixed = all(count == len(of_group) for of_group, count in groups)
         self._groups = None if fixed else groups
@@ -526,20 +434,41 @@ class AnitescuLcs:
                 np.cumsum([len(of_group) for of_group, _ in groups]),
                 np.array([count for _, count in groups]),
             )
-        self._mu, self._reference = np.array(mu), np.array(reference).reshape(-1, 3)
-        self._compliance, self._planar = np.array(compliance), np.array(planar)
-        self._pair_of, self._every = np.array(pair_of), np.arange(len(pair_of))
-        self._without_friction = np.array([not (k[0] or k[2]) for k in kinds])
-        self.n_pairs = len(pairs)
+        self._mu = np.array([contact.mu for contact in contacts])
+        self._compliance = np.array([contact.compliance for contact in contacts])
+        self._reference = np.array([contact.reference for contact in contacts])
+        self._planar = np.array([contact.planar for contact in contacts])
+        self._pair_of = np.array([contact.pair for contact in contacts])
+        self._every = np.arange(len(contacts))
+        self._without_friction = np.array(
+            [not (contact.anitescu or contact.mu > 0.0) for contact in contacts]
+        )
         slots = np.concatenate([of_group[:count] for of_group, count in groups])
-        self._rows = contact_rows([kinds[i] for i in slots])
+        self._rows = contact_rows([contacts[i].kind for i in slots])
         self._weight = self._rows.weight(self._mu[slots])
         self._F_0 = self._rows.F_0(
             self._mu[slots], self._compliance[slots], self.dt_sec, self.eps_c
         )
         self.n_lam = len(self._rows.contact)
+        self.lam_names = self._names_of_rows(slots, groups)
+
+    def _read_shapes(self, inspector):
+        """Frame and pose of each geometry; radii of spheres and faces of hulls."""
+        self._frames = {}
+        self._radius: dict[GeometryId, float] = {}
+        self._hull: dict[GeometryId, tuple[np.ndarray, np.ndarray]] = {}
+        for id in {id for ids in self._geometries for id in ids}:
+            body = self._plant.GetBodyFromFrameId(inspector.GetFrameId(id))
+            self._frames[id] = (body.body_frame(), inspector.GetPoseInFrame(id))
+            shape = inspector.GetShape(id)
+            if isinstance(shape, Sphere):
+                self._radius[id] = shape.radius()
+            elif isinstance(shape, (Mesh, Convex)):
+                self._hull[id] = _hull_faces(inspector.GetConvexHull(id))
+
+    def _names_of_rows(self, slots, groups):
         names = [self._pair_names[i] for i in slots]
-        if not fixed:
+        if self._groups is not None:
             names = [
                 self._pair_names[of_group[k]]
                 if count == len(of_group)
@@ -547,22 +476,10 @@ class AnitescuLcs:
                 for of_group, count in groups
                 for k in range(count)
             ]
-        self.lam_names = [
+        return [
             f"{names[i]} {of_contact}"
             for i, of_contact in zip(self._rows.contact, self._rows.names, strict=True)
         ]
-
-    def _check_alike(self, kinds):
-        """Raises: ValueError unless one contact can take the other's rows."""
-        first = kinds[0]
-        for name, kind in zip(self._pair_names, kinds, strict=True):
-            same_edges = np.array_equal(kind[1], first[1])
-            if not (same_edges and kind[0] == first[0] and kind[2:] == first[2:]):
-                raise ValueError(
-                    f"closest: {name} and {self._pair_names[0]} differ in contact "
-                    "model, friction directions or in having friction or stiffness, "
-                    "expected one kind"
-                )
 
     def _check_distances(self):
         query = self._query_port.Eval(self._plant_context)
@@ -581,7 +498,8 @@ class AnitescuLcs:
             self._check_plane(i, n)
 
     def _velocity_layout(self):
-        """Where qdot = v, where quaternions are, and whether that is all there is."""
+        """(index in q, index in v) of coordinates with qdot = v, and of the start of
+        floating joints; whether these are all coordinates of the plant."""
         plant, plain, floating, known = self._plant, [], [], True
         for index in plant.GetJointIndices():
             joint = plant.get_joint(index)
@@ -598,13 +516,62 @@ class AnitescuLcs:
         return *as_pairs, known
 
     def _constant_mass_model(self, scene_graph):
-        """The fast path's data; None where it does not apply: ConstantMassModel."""
+        """The data of the fast path; None where it does not apply (ConstantMassModel):
+        other joints than floating, prismatic and weld, bodies on floating ones, other
+        force elements than gravity, shapes without a closed-form distance."""
         plant, inspector = self._plant, scene_graph.model_inspector()
         if plant.num_force_elements() != 1:  # Gravity is always there, and constant.
             return None
-        floating_bodies = {}
-        turning: list[tuple[int, int]] = []
-        inertias: list[np.ndarray] = []
+        floating = self._floating_joints()
+        if floating is None:
+            return None
+        joint_of, turning, inertias = floating
+        ids = list(self._frames)
+        shapes = []
+        for id in ids:
+            shape = _shape_and_size(inspector.GetShape(id))
+            if shape is None:
+                return None
+            shapes.append(shape)
+        number = {id: i for i, id in enumerate(ids)}
+        pairs = [(number[a], number[b]) for a, b in self._geometries]
+        if not all(SPHERE in (shapes[a][0], shapes[b][0]) for a, b in pairs):
+            return None
+
+        f, J_q, J_v, J_u, M = self._smooth(self.x_default, np.zeros(self.n_u))
+        f_0 = f - J_v @ self.x_default[self.n_q :]
+        joints = [joint_of.get(self._frames[id][0].body().index()) for id in ids]
+        q_of = [-1 if joint is None else joint.position_start() for joint in joints]
+        v_of = [-1 if joint is None else joint.velocity_start() for joint in joints]
+        R, p_0, P, J_p = zip(
+            *(
+                self._geometry_motion(*self._frames[id], joint is not None)
+                for id, joint in zip(ids, joints, strict=True)
+            ),
+            strict=True,
+        )
+
+        def array(values, dtype=float):
+            return np.ascontiguousarray(np.array(values, dtype=dtype))
+
+        return ConstantMassModel(
+            M_inv=array(np.linalg.inv(M)), f_0=array(f_0), J_v=array(J_v),
+            J_u=array(J_u), plain=self._plain, floating=self._floating,
+            turning=array(turning, np.int64).reshape(-1, 2),
+            body=array(inertias).reshape(-1, 5, 3),
+            shape=array([shape for shape, _ in shapes], np.int64),
+            size=array([size for _, size in shapes]),
+            quaternion=array(q_of, np.int64), omega=array(v_of, np.int64),
+            R=array(R), p_0=array(p_0), P=array(P), J_p=array(J_p),
+            pairs=array(pairs, np.int64), reference=self._reference,
+        )  # fmt: skip
+
+    def _floating_joints(self):
+        """{body index: its floating joint}; (q, v) and (5, 3) inertia of the bodies
+        whose angular acceleration depends on the state (not isotropic about their
+        origin). None where a joint rules out the fast path."""
+        plant = self._plant
+        joint_of, turning, inertias = {}, [], []
         joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
         for joint in joints:
             if joint.type_name() == "quaternion_floating":
@@ -619,7 +586,7 @@ class AnitescuLcs:
                     frames[0] == plant.world_frame() and frames[1] == child.body_frame()
                 ):
                     return None
-                floating_bodies[child.index()] = joint
+                joint_of[child.index()] = joint
                 if not (at_origin and isotropic):
                     turning.append((joint.position_start(), joint.velocity_start()))
                     centre, mass = I_B.get_com(), I_B.get_mass()
@@ -629,71 +596,28 @@ class AnitescuLcs:
                     )
             elif joint.type_name() not in ("prismatic", "weld"):
                 return None
-        if any(joint.parent_body().index() in floating_bodies for joint in joints):
+        if any(joint.parent_body().index() in joint_of for joint in joints):
             return None
+        return joint_of, turning, inertias
 
-        f, J_q, J_v, J_u, M = self._smooth(self.x_default, np.zeros(self.n_u))
-        f_0 = f - J_v @ self.x_default[self.n_q :]
-        ids = list(self._frames)
-        rows: dict[str, list] = dict(shape=[], size=[], quaternion=[], omega=[])
-        R, p_0, P, J_p = [], [], [], []
-        for id in ids:
-            shape = inspector.GetShape(id)
-            frame, X_BG = self._frames[id]
-            if isinstance(shape, Sphere):
-                rows["shape"].append(SPHERE)
-                rows["size"].append([shape.radius()] * 3)
-            elif isinstance(shape, Box):
-                rows["shape"].append(BOX)
-                rows["size"].append([0.5 * length for length in np.array(shape.size())])
-            elif isinstance(shape, Cylinder):
-                rows["shape"].append(CYLINDER)
-                half = 0.5 * shape.length()
-                rows["size"].append([shape.radius(), half, half])
-            elif isinstance(shape, HalfSpace):
-                rows["shape"].append(HALF_SPACE)
-                rows["size"].append([0.0] * 3)
-            else:
-                return None
-            P_G, J_G = np.zeros((3, self.n_q)), np.zeros((3, self.n_v))
-            joint = floating_bodies.get(frame.body().index())
-            if joint is not None:
-                rows["quaternion"].append(joint.position_start())
-                rows["omega"].append(joint.velocity_start())
-                X = X_BG
-            else:
-                rows["quaternion"].append(-1)
-                rows["omega"].append(-1)
-                X = frame.CalcPoseInWorld(self._plant_context) @ X_BG
-                world = plant.world_frame()
-                J_G = plant.CalcJacobianTranslationalVelocity(
-                    self._plant_context, JacobianWrtVariable.kV, frame, np.zeros(3),
-                    world, world,
-                )  # fmt: skip
-                P_G[:, self._plain[:, 0]] = J_G[:, self._plain[:, 1]]
-            R.append(X.rotation().matrix())
-            p_0.append(X.translation() - P_G @ self.x_default[: self.n_q])
-            P.append(P_G)
-            J_p.append(J_G)
-        number = {id: i for i, id in enumerate(ids)}
-        ab = [(number[a], number[b]) for a, b in self._geometries]
-        if not all(SPHERE in (rows["shape"][a], rows["shape"][b]) for a, b in ab):
-            return None
+    def _geometry_motion(self, frame, X_BG, floats):
+        """R (3, 3) and p_0 (3,) of a geometry, P (3, n_q) and J_p (3, n_v).
 
-        def array(values, dtype=float):
-            return np.ascontiguousarray(np.array(values, dtype=dtype))
-
-        return ConstantMassModel(
-            M_inv=array(np.linalg.inv(M)), f_0=array(f_0), J_v=array(J_v),
-            J_u=array(J_u), plain=self._plain, floating=self._floating,
-            turning=array(turning, np.int64).reshape(-1, 2),
-            body=array(inertias).reshape(-1, 5, 3),
-            shape=array(rows["shape"], np.int64), size=array(rows["size"]),
-            quaternion=array(rows["quaternion"], np.int64),
-            omega=array(rows["omega"], np.int64), R=array(R), p_0=array(p_0),
-            P=array(P), J_p=array(J_p), pairs=array(ab, np.int64),
-            reference=self._reference,
-        )  # fmt: skip
+        On a floating body its pose in the body, P and J_p zero. Otherwise R is its
+        rotation in the world, its position is p_0 + P q, and its velocity J_p v.
+        """
+        P, J_p = np.zeros((3, self.n_q)), np.zeros((3, self.n_v))
+        X = X_BG
+        if not floats:
+            X = frame.CalcPoseInWorld(self._plant_context) @ X_BG
+            world = self._plant.world_frame()
+            J_p = self._plant.CalcJacobianTranslationalVelocity(
+                self._plant_context, JacobianWrtVariable.kV, frame, np.zeros(3),
+                world, world,
+            )  # fmt: skip
+            P[:, self._plain[:, 0]] = J_p[:, self._plain[:, 1]]
+        p_0 = X.translation() - P @ self.x_default[: self.n_q]
+        return X.rotation().matrix(), p_0, P, J_p
 
 
 @dataclass
@@ -702,18 +626,18 @@ class LcsBuilderConfig:
     dt_sec: float = 0.1  # Time step of the LCS [s].
     eps_c: float | None = None  # [m/s per N]; None: 0.01 dt_sec.
     period_sec: float = 0.0125  # Between two linearisations [s].
-    offset_sec: float = 0.0  # Of the first one [s].
-    closest: int | None = None  # So many contacts, the nearest of all; None: all.
-    # 0: one LCS, about x. N: a tuple of N, one per knot along the plan at `plan`.
+    offset_sec: float = 0.0  # Time of the first one [s].
+    closest: int | None = None  # Number of contacts, the nearest ones; None: all.
+    # 0: one LCS about x. N: a tuple of N, one for each knot along the input `plan`.
     knots: int = 0
 
 
 class LcsBuilderStatus(IntEnum):
-    """The `status` port of AnitescuLcsBuilder."""
+    """Values of the `status` port of AnitescuLcsBuilder."""
 
-    HELD = 0  # The last LCS: x or u was not usable.
+    HELD = 0  # The last LCS is held, as x or u is not usable.
     BUILT = 1
-    # Some state of the plan was not usable; the LCS about x stands in for its knot.
+    # Some states of the plan are not usable; their knots have the LCS about x.
     BUILT_IN_PART = 2
 
 
@@ -721,11 +645,11 @@ class AnitescuLcsBuilder(LeafSystem):
     """The LCS about the present state, held between updates.
 
     Inputs:  x (n_x,) state [q, v] of the model plant; u (n_u,) its actuation;
-             friction (n_pairs,) of the pairs and gap (n_pairs,), added to their
-             distances [m]: where they are not connected, all is as configured;
-             plan (abstract, Plan), with config.knots > 0 only: the last plan, along
-             which the LCS of all knots but the first are taken. Where there is none
-             yet, all are about x.
+             friction (n_pairs,) of the pairs, optional; gap (n_pairs,) added to their
+             distances [m], optional;
+             plan (abstract, Plan), with config.knots > 0 only: the last plan, about
+             whose states the LCS of all knots but the first are built. Before the
+             first plan, all are about x.
     Outputs: lcs (abstract, LCS with dt and phi; with config.knots > 0 a tuple of
              them); status (1,): an LcsBuilderStatus.
 
@@ -760,7 +684,7 @@ class AnitescuLcsBuilder(LeafSystem):
         self._lcs = self.DeclareAbstractState(
             Value[object]((initial,) * self._knots if self._knots else initial)
         )
-        status: Any = [float(LcsBuilderStatus.BUILT)]  # The stubs know no list.
+        status: Any = [float(LcsBuilderStatus.BUILT)]  # The stubs expect an array.
         self._status = self.DeclareDiscreteState(status)
         self.DeclareStateOutputPort("lcs", self._lcs)
         self.DeclareStateOutputPort("status", self._status)
@@ -783,14 +707,14 @@ class AnitescuLcsBuilder(LeafSystem):
         state.get_mutable_discrete_state(self._status).set_value([float(status)])
 
     def _changed(self, context):
-        """friction and gap, of AnitescuLcs.build."""
+        """The arguments friction and gap of AnitescuLcs.build."""
         return (
             port.Eval(context) if port.HasValue(context) else None
             for port in self._changes
         )
 
     def _along_plan(self, context, first):
-        """The LCS of all knots, the first given; and a status."""
+        """The LCS of all knots, with `first` at the first one, and a status."""
         models, status = [first] * self._knots, LcsBuilderStatus.BUILT
         plan: Any = self._plan.Eval(context) if self._plan.HasValue(context) else None
         if not isinstance(plan, Plan) or plan.time is None:
@@ -807,8 +731,181 @@ class AnitescuLcsBuilder(LeafSystem):
         return tuple(models), status
 
 
+class _NamedGeometries:
+    """The collision geometries of a plant by the names of bodies and geometries."""
+
+    def __init__(self, plant: MultibodyPlant, inspector):
+        self.inspector = inspector
+        self._of_body: dict[str, list[GeometryId]] = {}
+        self._by_name: dict[str, GeometryId] = {}
+        self._ambiguous = set()
+        for i in range(plant.num_bodies()):
+            body = plant.get_body(BodyIndex(i))
+            geometries = plant.GetCollisionGeometriesForBody(body)
+            self._of_body[body.scoped_name().get_full()] = geometries
+            if body.name() in self._of_body:
+                self._ambiguous.add(body.name())
+            self._of_body[body.name()] = geometries
+            for geometry in geometries:
+                self._by_name[inspector.GetName(geometry)] = geometry
+
+    def find(self, name: str) -> list[GeometryId]:
+        """Those of a body, or the one of that name. Raises: ValueError."""
+        if name in self._ambiguous:
+            scoped = sorted(n for n in self._of_body if n.endswith(f"::{name}"))
+            raise ValueError(f"body {name!r} is not unique, expected one of {scoped}")
+        if name in self._of_body:
+            if not self._of_body[name]:
+                raise ValueError(f"body {name!r} has no collision geometry")
+            return self._of_body[name]
+        if name in self._by_name:
+            return [self._by_name[name]]
+        names = [*self._of_body, *self._by_name]
+        near = get_close_matches(name, names, n=3, cutoff=0.3) or sorted(names)
+        raise ValueError(f"no body or geometry is named {name!r}; nearest: {near}")
+
+
+@dataclass
+class _Contact:
+    """One combination of two geometries of a pair."""
+
+    geometries: tuple[GeometryId, GeometryId]  # The one registered first is A.
+    name: str
+    pair: int  # Number of its pair.
+    mu: float
+    compliance: float  # [m/N]
+    anitescu: bool
+    edges: np.ndarray  # (2 n_f, 2), friction_edges.
+    reference: np.ndarray  # (3,) for tangent_basis.
+    planar: bool  # Whether `reference` is the normal of the plant's plane.
+
+    @property
+    def kind(self) -> tuple:
+        """What decides the contact's rows: contact_rows."""
+        return self.anitescu, self.edges, self.mu > 0.0, self.compliance > 0.0
+
+
+def _contacts_of(pairs, named: _NamedGeometries):
+    """All contacts, and of each pair (numbers of its contacts, how many of them count).
+
+    Raises: ValueError that names the pair and what is wrong.
+    """
+    contacts: list[_Contact] = []
+    groups: list[tuple[np.ndarray, int]] = []
+    inspector = named.inspector
+    for number, pair in enumerate(pairs):
+        of_a, of_b = named.find(pair.a), named.find(pair.b)
+        name = f"{pair.a}~{pair.b}"
+        reference, planar = _check_pair(name, pair)
+        edges = friction_edges(int(pair.friction_directions))
+        if planar:  # t1 follows the plane's normal, so the edges start at t2.
+            edges = edges[:, ::-1] * [-1.0, 1.0]
+        first = len(contacts)
+        for one in of_a:
+            for other in of_b:
+                # As in c3_reference: A is the geometry that was registered first.
+                id_A, id_B = sorted([one, other], key=lambda g: g.get_value())
+                if inspector.GetFrameId(id_A) == inspector.GetFrameId(id_B):
+                    raise ValueError(f"{name}: both are on the same body")
+                contacts.append(
+                    _Contact(
+                        geometries=(id_A, id_B),
+                        name=f"{inspector.GetName(id_A)}~{inspector.GetName(id_B)}",
+                        pair=number,
+                        mu=float(pair.friction),
+                        compliance=0.0
+                        if pair.stiffness is None
+                        else 1.0 / pair.stiffness,
+                        anitescu=isinstance(pair.contact_model, Anitescu),
+                        edges=edges,
+                        reference=reference,
+                        planar=planar,
+                    )
+                )
+        combinations = np.arange(first, len(contacts))
+        count = combinations.size
+        if pair.closest is not None:
+            count = _how_many(f"{name}: closest", pair.closest, count)
+        groups.append((combinations, count))
+    return contacts, groups
+
+
+def _check_pair(name: str, pair: ContactPair) -> tuple[np.ndarray, bool]:
+    """The pair's reference direction (3,) and whether it is a plane's normal.
+
+    Raises: ValueError for a parameter out of range.
+    """
+    if not (np.isfinite(pair.friction) and pair.friction >= 0.0):
+        raise ValueError(f"{name}: friction is {pair.friction}, expected at least 0")
+    if pair.friction_directions != int(pair.friction_directions) or not (
+        pair.friction_directions >= 1
+    ):
+        raise ValueError(
+            f"{name}: friction_directions is {pair.friction_directions}, "
+            "expected an integer of at least 1"
+        )
+    tangent = _direction(f"{name}: tangent", pair.tangent)
+    plane_normal = _direction(f"{name}: plane_normal", pair.plane_normal)
+    planar = bool(plane_normal.any())
+    if planar and tangent.any():
+        raise ValueError(f"{name}: tangent and plane_normal came, expected one of them")
+    one_direction = pair.friction_directions == 1 and pair.friction > 0.0
+    if one_direction and not (planar or tangent.any()):
+        raise ValueError(
+            f"{name}: friction_directions is 1 without a direction, expected "
+            "a plane_normal (of a plant in a plane) or a tangent"
+        )
+    if not isinstance(pair.contact_model, (Anitescu, StewartTrinkle)):
+        raise ValueError(
+            f"{name}: contact_model is {pair.contact_model!r}, expected "
+            "Anitescu() or StewartTrinkle()"
+        )
+    if pair.stiffness is not None and not 0.0 < pair.stiffness < np.inf:
+        raise ValueError(
+            f"{name}: stiffness is {pair.stiffness}, expected a positive "
+            "number [N/m], or None for a rigid contact"
+        )
+    return (plane_normal if planar else tangent), planar
+
+
+def _check_alike(contacts) -> None:
+    """Raises: ValueError unless each contact can take any other's rows."""
+    first = contacts[0].kind
+    for contact in contacts:
+        kind = contact.kind
+        same_edges = np.array_equal(kind[1], first[1])
+        if not (same_edges and kind[0] == first[0] and kind[2:] == first[2:]):
+            raise ValueError(
+                f"closest: {contact.name} and {contacts[0].name} differ in contact "
+                "model, friction directions or in having friction or stiffness, "
+                "expected one kind"
+            )
+
+
+def _hull_faces(hull) -> tuple[np.ndarray, np.ndarray]:
+    """Outward normals (n, 3) of a hull's faces, and their offsets (n,) [m]."""
+    faces = range(hull.num_faces())
+    normals = np.array([hull.face_normal(f) for f in faces])
+    on_face = [hull.vertex(hull.element(f).vertex(0)) for f in faces]
+    return normals, np.einsum("fi,fi->f", normals, np.array(on_face))
+
+
+def _shape_and_size(shape) -> tuple[int, list[float]] | None:
+    """A shape of ConstantMassModel: its number and size (3,) [m]; None: no such."""
+    if isinstance(shape, Sphere):
+        return SPHERE, [shape.radius()] * 3
+    if isinstance(shape, Box):
+        return BOX, [0.5 * length for length in np.array(shape.size())]
+    if isinstance(shape, Cylinder):
+        half = 0.5 * shape.length()
+        return CYLINDER, [shape.radius(), half, half]
+    if isinstance(shape, HalfSpace):
+        return HALF_SPACE, [0.0] * 3
+    return None
+
+
 def _how_many(name, value, most) -> int:
-    """An integer from 1 to most. Raises: ValueError."""
+    """The value as an integer from 1 to `most`. Raises: ValueError."""
     if value != int(value) or not 1 <= value <= most:
         raise ValueError(
             f"{name} is {value}, expected an integer from 1 to {most}, the "
@@ -818,7 +915,7 @@ def _how_many(name, value, most) -> int:
 
 
 def _direction(name, value) -> np.ndarray:
-    """A unit vector (3,), or zero where none came. Raises: ValueError."""
+    """The value as a unit vector (3,), or zeros if it is empty. Raises: ValueError."""
     direction = np.array(value or [0.0, 0.0, 0.0], dtype=float)
     if direction.shape != (3,) or not np.isfinite(direction).all():
         raise ValueError(f"{name} is {value}, expected (3,)")
@@ -827,6 +924,7 @@ def _direction(name, value) -> np.ndarray:
 
 
 def _plant_and_scene_graph(diagram):
+    """The one plant and scene graph of a diagram. Raises: ValueError."""
     if not isinstance(diagram, Diagram):
         raise ValueError(
             f"diagram is a {type(diagram).__name__}, expected the Diagram that holds "
@@ -843,18 +941,3 @@ def _plant_and_scene_graph(diagram):
     if not plants[0].is_finalized():
         raise ValueError("the plant is not finalized, expected plant.Finalize() before")
     return plants[0], graphs[0]
-
-
-def _geometries_named(name, bodies, ambiguous, collision):
-    if name in ambiguous:
-        scoped = sorted(n for n in bodies if n.endswith(f"::{name}"))
-        raise ValueError(f"body {name!r} is not unique, expected one of {scoped}")
-    if name in bodies:
-        if not bodies[name]:
-            raise ValueError(f"body {name!r} has no collision geometry")
-        return bodies[name]
-    if name in collision:
-        return [collision[name]]
-    names = [*bodies, *collision]
-    near = get_close_matches(name, names, n=3, cutoff=0.3) or sorted(names)
-    raise ValueError(f"no body or geometry is named {name!r}; nearest: {near}")

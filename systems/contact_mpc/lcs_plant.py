@@ -1,4 +1,4 @@
-"""An LCS stepped as the plant: the model is then exact, which tests rely on."""
+"""An LCS as the simulated plant: a controller's LCS is then exact (for tests)."""
 
 from dataclasses import dataclass
 
@@ -16,14 +16,13 @@ class LcsPlantConfig:
 
 
 class LcsPlant(LeafSystem):
-    """An LCS, stepped as the plant.
+    """Steps an LCS as the plant.
 
     Inputs:  u (n_u,), held over each step.
     Outputs: x (n_x,) state; lam (n_lam,) contact force of the last step [N].
 
-    Args: lcs; x_initial (n_x,), the default state, zero if None; config.
-
-    Raises (from a step): ValueError where no contact force satisfies the LCS.
+    Args: lcs; x_initial (n_x,): default state, None: zero; config.
+    Raises: ValueError; a step raises it where no contact force satisfies the LCS.
     """
 
     def __init__(self, lcs: LCS, x_initial=None, config: LcsPlantConfig | None = None):

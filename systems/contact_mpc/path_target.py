@@ -1,4 +1,4 @@
-"""A circle as a target that moves and as goals: see numerics/path_target.py."""
+"""Targets for a ball that is rolled along a circle (numerics/path_target.py)."""
 
 from dataclasses import dataclass, field, replace
 
@@ -18,36 +18,41 @@ from makebreak.systems.contact_mpc.numerics.rolling_task import (
 )
 from makebreak.systems.numerics.timing import timed
 
-AWAY = 0.001  # The tip's target does not touch the ball by itself [m].
+AWAY = 0.001  # Distance of the tip's target from the ball, so that it is no push [m].
 
 
 @dataclass
 class PathTargetConfig:
     center: list[float] = field(default_factory=lambda: [0.5, 0.0])  # [m]
     radius: float = 0.1  # Of the circle [m].
-    lead_deg: float = 6.0  # The target runs so far ahead of the ball ...
-    speed: float = 0.05  # ... and moves along the circle with it [m/s].
-    goal_deg: float = 10.0  # From one goal to the next.
-    integral_sec: float = 6.0  # Of the integral action on the ball's distance.
+    lead_deg: float = 6.0  # Angle by which the target is ahead of the ball.
+    speed: float = 0.05  # Of the target along the circle [m/s].
+    goal_deg: float = 10.0  # Angle from one goal to the next.
+    integral_sec: float = 6.0  # Time constant of the integral action [s].
     height: float = 0.038  # Of the tip's centre while pushing [m].
     period_sec: float = 0.0125
     offset_sec: float = 0.0
 
 
 class PathTarget(LeafSystem):
-    """What C3 and ContactSampler are to make of a ball that rolls along a circle.
+    """The moving target of C3 and the goals of ContactSampler along a circle.
 
-    Inputs:  x (19,) of numerics/ball_state.py; valid (1,): above 0.5 where it can be
-             trusted; r_comp (n_lam,) [m/s] of the learner, whose first n_tip entries
-             belong to tip and ball, optional: the tip is to be as much nearer.
+    Inputs:  x (19,) of numerics/ball_state.py; valid (1,): above 0.5 if x can be used;
+             r_comp (n_lam,) [m/s], optional: the learned residual. The tip's target is
+             nearer to the ball by the gap that its first n_tip entries, the contact of
+             tip and ball, stand for.
     Outputs: x_desired ((N + 1) 19,) for C3; goal (3,) = x, y [m], 0: the next point on
              the circle.
 
-    The circle that is aimed at is larger or smaller than the path by the integral of
-    the ball's distance to it, as in RollingTask. What is not finite changes nothing.
+    Integral action, as in RollingTask: the radius that is aimed at differs from the
+    path's by the integral of the ball's distance from the path. Nothing changes while
+    an input is not finite.
 
-    Args: n_knots = N + 1; knot_sec between them [s]; radius_ball as modelled [m]; away:
-        of the tip's centre from the ball's, seen from above, where they touch [m].
+    Args: config; n_knots: N + 1; knot_sec: between them [s]; radius_ball: as modelled
+        [m]; away: distance of the centres of tip and ball, seen from above, where they
+        touch [m]; n_lam, n_tip: entries of r_comp, and those of tip and ball;
+        residual_dt_sec: time step over which r_comp is a velocity [s].
+    Raises: ValueError for a setting out of range.
     """
 
     def __init__(
@@ -79,8 +84,9 @@ class PathTarget(LeafSystem):
         self._valid = self.DeclareVectorInputPort("valid", 1)
         self._r_comp = self.DeclareVectorInputPort("r_comp", n_lam)
         at_rest = np.eye(N_X)[3]
-        self._shift = self.DeclareDiscreteState([0.0])  # Of the circle's radius [m].
-        self._angle = self.DeclareDiscreteState([np.nan])  # Of the goal [rad].
+        self._shift = self.DeclareDiscreteState([0.0])  # Added to the radius [m].
+        # Angle of the goal on the circle [rad]; NaN: none yet.
+        self._angle = self.DeclareDiscreteState([np.nan])
         self._x_desired = self.DeclareDiscreteState(np.tile(at_rest, n_knots))
         self._goal = self.DeclareDiscreteState(3)
         self.DeclareStateOutputPort("x_desired", self._x_desired)

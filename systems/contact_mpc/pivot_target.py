@@ -1,4 +1,4 @@
-"""The target of a planner that tips a planar cube: PivotTarget."""
+"""The target of a planner that tips a planar cube (numerics/pivot_target.py)."""
 
 from dataclasses import dataclass
 
@@ -17,25 +17,26 @@ from makebreak.systems.contact_mpc.numerics.pivot_target import (
 class PivotTargetConfig:
     side: float = 0.1  # Of the cube [m].
     finger_radius: float = 0.012  # [m]
-    goal: float = np.pi / 2  # [rad]
-    rate: float = 1.0  # [rad/s]
-    # Where the fingers touch, as shares of the side from the face's middle: the left
-    # one upwards, the right one to the right.
+    goal: float = np.pi / 2  # Angle of the cube [rad].
+    rate: float = 1.0  # Of the angle towards the goal [rad/s].
+    # Where the fingers touch: distance from the middle of the face over the side, the
+    # left finger's upwards, the right one's to the right (on the upper face).
     left_at: float = 0.2
     right_at: float = 0.15
-    # The full rate with the fingers this near to their places, and none from so far on.
-    near: float = 0.03  # [m]
-    far: float = 0.06  # [m]
+    # The rate is full while both fingers are nearer than `near` to their places, and
+    # zero beyond `far` [m].
+    near: float = 0.03
+    far: float = 0.06
 
 
 class PivotTarget(LeafSystem):
-    """Where cube and fingers are to be at the knots of a plan.
+    """Desired states of cube and fingers at the knots of a plan.
 
     Inputs:  x (14,), as in numerics/pivot_target.py.
     Outputs: x_desired ((N + 1) 14,), row by row.
 
-    Args: config; dt_sec between the knots [s]; N, knots after the first.
-    Raises: ValueError for a number out of range.
+    Args: config; dt_sec: between the knots [s]; N: number of knots after the first.
+    Raises: ValueError for a setting out of range.
     """
 
     def __init__(self, config: PivotTargetConfig, dt_sec: float, N: int):

@@ -1,4 +1,4 @@
-"""Goals for an object that is pushed, one after the other."""
+"""A sequence of goal poses for a pushed object."""
 
 from dataclasses import dataclass, field
 
@@ -16,22 +16,23 @@ from makebreak.systems.numerics.timing import timed
 
 @dataclass
 class PushGoalsConfig:
-    # Drawn evenly: x, y within size about center [m], yaw over the whole circle.
+    # Goals are drawn uniformly: x, y in a rectangle [m], yaw over the whole circle.
     center: list[float] = field(default_factory=lambda: [0.5, 0.0])
     size: list[float] = field(default_factory=lambda: [0.16, 0.36])
     tolerance: list[float] = field(default_factory=lambda: [0.02, 0.1])  # [m], [rad]
-    # By the estimate it has to be nearer than that, as a share, for so long.
+    # A goal is reached when the estimated errors were below this fraction of the
+    # tolerance for dwell_sec.
     share: float = 0.8
     dwell_sec: float = 0.25
-    limit_sec: float = 60.0  # Then the next goal comes, and this one was missed.
+    limit_sec: float = 60.0  # After this time the next goal follows in any case.
     period_sec: float = 0.0125
     offset_sec: float = 0.0
 
 
 def draw_poses(config: PushGoalsConfig, n: int, seed: int) -> np.ndarray:
-    """(n, 3) x, y [m], yaw [rad]: evenly within the region.
+    """(n, 3) x, y [m], yaw [rad], drawn uniformly from the region of the config.
 
-    Raises: ValueError for a config out of range, by name.
+    Raises: ValueError that names a setting out of range.
     """
     _check(config)
     rng = np.random.default_rng([seed, 1])
@@ -40,9 +41,10 @@ def draw_poses(config: PushGoalsConfig, n: int, seed: int) -> np.ndarray:
 
 
 def nearest_turn(goal: float, yaw: float, fold: int) -> float:
-    """Added to the goal [rad], of the yaws that are the same the one nearest to yaw.
+    """Turn [rad] that, added to the goal's yaw, gives the equivalent yaw nearest to
+    `yaw` [rad].
 
-    Args: fold: as of PushGoals.
+    Args: fold: rotational symmetry of the object (PushGoals).
     """
     off = angle_between(goal, yaw)
     if fold == 0:
@@ -51,19 +53,20 @@ def nearest_turn(goal: float, yaw: float, fold: int) -> float:
 
 
 class PushGoals(LeafSystem):
-    """Gives a goal until the object is there, as far as the estimate tells, or the time
-    is up; then the next.
+    """Outputs one goal until the estimate says that the object is there or its time is
+    up, then the next one.
 
-    Inputs:  x (19,) of numerics/ball_state.py; valid (1,).
-    Outputs: goal (3,) = x, y [m], yaw [rad]; log (5,) = [number of the goal, goal 3,
-             since when s]. After the last goal the last one stays, its number one more.
+    Inputs:  x (19,) of numerics/ball_state.py; valid (1,): above 0.5 if x can be used.
+    Outputs: goal (3,) = x, y [m], yaw [rad]; log (5,) = [number of the goal, goal (3),
+             its start time [s]]. After the last goal its pose stays, and the number is
+             the number of goals.
 
-    A turn that leaves the object as it is does not count: of the yaws that are the same
-    then, the one nearest to the object's, as it was first seen after the goal came, is
-    given.
+    Where turns leave the object unchanged, the goal's yaw is the equivalent one nearest
+    to the object's yaw when it was first seen after the goal had come.
 
-    Args: goals (n, 3); fold: so many turns about z leave the object as it is, as far as
-        what measures it can tell; 0: any.
+    Args: config; goals (n, 3); fold: number of equal turns about z that leave the
+        object unchanged for what measures it; 0: any turn does.
+    Raises: ValueError for a setting out of range, or goals of another shape.
     """
 
     def __init__(self, config: PushGoalsConfig, goals, fold: int = 1):
@@ -76,8 +79,8 @@ class PushGoals(LeafSystem):
         self._x = self.DeclareVectorInputPort("x", N_X)
         self._valid = self.DeclareVectorInputPort("valid", 1)
         self._fold = fold
-        # Number of the goal, since when [s], how long it has been reached [s], and the
-        # turn that is added to its yaw [rad], NaN: not known yet.
+        # Number of the goal, its start time [s], for how long it has been reached [s],
+        # and the turn that is added to its yaw [rad] (NaN: not known yet).
         self._state = self.DeclareDiscreteState([0.0, 0.0, 0.0, np.nan])
         ticket = {self.discrete_state_ticket(self._state)}
         self.DeclareVectorOutputPort("goal", 3, self._calc_goal, ticket)
@@ -123,13 +126,13 @@ class PushGoals(LeafSystem):
         held = held + c.period_sec if there else 0.0
         if held >= c.dwell_sec or t - since >= c.limit_sec:
             number, since, held = number + 1.0, t, 0.0
-            if number < len(self._goals):  # At once: others read it at this instant.
+            if number < len(self._goals):  # Now: others read it at this instant.
                 turn = turn_of(self._goals[int(number)]) if is_seen else np.nan
         discrete_state.set_value(self._state, [number, since, held, turn])
 
 
 def _check(config: PushGoalsConfig) -> None:
-    """Raises: ValueError for a config out of range, by name."""
+    """Raises: ValueError that names a setting out of range."""
     for name in ("center", "size", "tolerance"):
         value = getattr(config, name)
         if np.shape(value) != (2,) or not np.isfinite(value).all():

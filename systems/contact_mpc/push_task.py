@@ -1,4 +1,4 @@
-"""What the tip does between plans, as a system: see numerics/push_task.py."""
+"""The phases of pushing an object as a system (numerics/push_task.py)."""
 
 from dataclasses import dataclass, field
 
@@ -23,26 +23,27 @@ from makebreak.systems.numerics.timing import timed
 class PushTaskConfig:
     push: PushConfig = field(default_factory=PushConfig)
     height: float = 0.024  # Of the tip's centre while pushing [m].
-    clearance: float = 0.004  # From the object at a place [m].
+    clearance: float = 0.004  # Between tip and object at a place to touch [m].
     period_sec: float = 0.0125
     offset_sec: float = 0.0
 
 
 class PushTask(LeafSystem):
-    """Phases of pushing an object to a pose, the target of C3 and the way between.
+    """Phases of pushing an object: C3's target in contact, the tip's path in between.
 
-    Inputs:  x (19,) of numerics/ball_state.py; valid (1,): above 0.5 where it can be
-             trusted; goal (3,) = x, y [m], yaw [rad]; command (3,) of ContactSampler;
-             nearer (1,) [m], optional: by how much the object reaches farther out than
-             its shape, as learned (negative: less far), which its ways heed.
+    Inputs:  x (19,) of numerics/ball_state.py; valid (1,): above 0.5 if x can be used;
+             goal (3,) = x, y [m], yaw [rad]; command (3,) of ContactSampler;
+             nearer (1,) [m], optional: learned distance by which the object reaches
+             farther out than its shape (negative: less far); paths keep clear of that.
     Outputs: x_desired ((N + 1) 19,) for C3; reference (9,) = p, v, a of the tip at the
              next tick, used unless in CONTACT; phase (1,): 0 CONTACT, 1 TRAVEL, 2 WAIT.
 
-    Where x, command or nearer is not finite all stays as it is; where goal is not, the
-    target stays, and the tip waits.
+    Nothing changes while x, command or nearer is not finite. While the goal is not
+    finite the target stays and the tip waits.
 
-    Args: n_knots = N + 1; shape of object and tip; p_tip (3,): where the tip is at
-        first [m].
+    Args: config; n_knots: N + 1; shape: of object and tip; p_tip (3,): initial position
+        of the tip [m].
+    Raises: ValueError for a setting out of range.
     """
 
     def __init__(self, config: PushTaskConfig, n_knots: int, shape: ObjectShape, p_tip):
@@ -109,7 +110,7 @@ class PushTask(LeafSystem):
                 c.push, task, self._shape, c.period_sec, x, seen, place,
                 int(command[0]), c.height, c.clearance, nearer,
             )  # fmt: skip
-        except ValueError:  # An object on edge has no outline: everything stays.
+        except ValueError:  # An object on edge has no outline: nothing changes.
             return
         state.get_mutable_abstract_state(int(self._task)).set_value(task)
         discrete.set_value(

@@ -1,4 +1,4 @@
-"""The residual learner: see numerics/residual_learner.py for what it learns and how."""
+"""The residual learner as a system (numerics/residual_learner.py has its maths)."""
 
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
@@ -32,38 +32,40 @@ from makebreak.systems.numerics.timing import timed
 
 
 class LearnerStatus(IntEnum):
-    """What became of the newest pair. But for the first three, r_comp was held."""
+    """What happened to the newest pair; r_comp changes with LEARNED, AT_BOUND only."""
 
     LEARNED = 0  # r_comp was updated.
-    AT_BOUND = 1  # As LEARNED, and an entry of r_comp stands at r_max.
+    AT_BOUND = 1  # As LEARNED, and an entry of r_comp is at its bound r_max.
     WAITING = 2  # No pair yet: it takes two good samples in a row.
     DISABLED = 3  # enable was 0: the pair was dropped.
     NOT_FINITE = 4  # x, u_measured or lcs was not finite: the pair was dropped.
-    GAMMA_REFUSED = 5  # gamma is beyond the bound of this pair's F: it was dropped.
+    GAMMA_REFUSED = 5  # gamma exceeds the bound of this pair's F: it was dropped.
     NOT_SOLVED = 6  # A QP of the buffer was not solved.
-    BAD_LCS = 7  # lcs is of other sizes or another dt: the pair was dropped.
+    BAD_LCS = 7  # lcs has other sizes or another dt: the pair was dropped.
 
 
 @dataclass
 class PosteriorConfig:
-    """The residual as a probability on a grid (numerics/residual_posterior.py)."""
+    """The residual's probability on a grid (numerics/residual_posterior.py)."""
 
-    prior_std: float = 0.16  # About zero [m/s]: 8 mm at dt = .05 s.
-    # How it may change in a second, as a deviation [m/s / sqrt(s)], ...
+    prior_std: float = 0.16  # Mean zero [m/s]; 8 mm at dt = .05 s.
+    # Random walk of the residual: std after one second [m/s / sqrt(s)], and more in
+    # proportion to the residual's own size [1 / sqrt(s)].
     drift: float = 0.02
-    growth: float = 0.08  # ... and how much more, as a share of itself [1 / sqrt(s)].
+    growth: float = 0.08
     spacing: float = 0.01  # Of the grid [m/s].
-    trust: float = 0.2  # Share of a step's loss that counts.
-    loss_max: float = 20.0  # What one step can say at most.
-    # States that also change for reasons which no model has (an object that rocks): by
-    # how much is watched where nothing can touch, over this time, and they weigh less.
+    trust: float = 0.2  # Factor on a step's loss; below 1, as steps are correlated.
+    loss_max: float = 20.0  # Bound of a step's loss, against outliers.
+    # States that also change for reasons that no model has (an object that rocks). The
+    # variance of these changes is measured over free_sec while nothing can touch, and
+    # bounds the weight of the states.
     free_states: list[int] = field(default_factory=list)
     free_sec: float = 2.0
 
 
 @dataclass
 class ResidualLearnerConfig:
-    """The defaults are the paper's ball rolling at dt = .05 s, for lam in newtons."""
+    """Defaults: the paper's for rolling a ball at dt = .05 s, with lam in newtons."""
 
     # Weight of the one-step error in each state, (n_x,) [1/SI^2]; empty: all 1.
     Q_d: list[float] = field(default_factory=list)
@@ -72,33 +74,32 @@ class ResidualLearnerConfig:
     # Softness of the contact equation, .01 dt for dt = .05 s [m/s per N].
     gamma: float = 5e-4
     n_b: int = 10  # Measured steps in the buffer.
-    # What an Adam step moves, about [m/s].
-    learning_rate: float = 3e-3
+    learning_rate: float = 3e-3  # Of Adam: about the change of r_comp per step [m/s].
     n_steps: int = 1  # Adam steps per update.
-    # Entries of r_comp that share one value; entries in no group do not adapt.
-    # Empty: all adapt, each for itself.
+    # Entries of r_comp that share one value; entries in no group stay zero.
+    # Empty: each entry has its own value.
     groups: list[list[int]] = field(default_factory=list)
     r_max: float = 1.0  # Bound on each entry of r_comp [m/s].
-    # More than this of mu |v_t| is taken out of what a contact that slides is felt from
-    # (opening_speed) [m/s]; infinite: nothing is, as in the paper.
+    # Of the gap speed mu |v_t| that a sliding Anitescu contact opens (opening_speed),
+    # all above this noise level is removed [m/s]; infinite: nothing, as in the paper.
     slip_noise: float = np.inf
-    # Given: r_comp is a probability's mode instead of Adam's, for one group; Q_d
-    # then has inverse variances, and n_b, learning_rate and n_steps have no effect.
+    # If given, r_comp is the mode of a posterior instead of Adam's result, for a single
+    # group. Q_d then are inverse variances, and n_b, learning_rate and n_steps unused.
     posterior: PosteriorConfig | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class LearnerMemory:
-    """All that the learner remembers, as a value: an update makes a new one."""
+    """The learner's state, as an immutable value: an update makes a new one."""
 
     sample: tuple[np.ndarray, LCS] | None  # x_k and the LCS at x_k.
     buffer: Buffer
     residual: Residual
     loss: float
     status: LearnerStatus
-    belief: np.ndarray | None = None  # (n,) on the grid of the posterior.
+    density: np.ndarray | None = None  # (n,) the posterior on its grid.
     std: float = 0.0  # Of the residual [m/s]; 0 without a posterior.
-    # Of the posterior's free states: the mean square of what is not explained [SI^2].
+    # Of each free state: mean square of the changes that the model lacks [SI^2].
     unexplained: np.ndarray | None = None
 
     def __deepcopy__(self, memo):
@@ -109,20 +110,20 @@ class ResidualLearner(LeafSystem):
     """Learns r_comp, the residual on the contact equation of an LCS (eq. 12).
 
     Inputs:
-        x (n_x,) measured state.
-        u_measured (n_u,) mean of the measured input over the period that ends now.
-        lcs (abstract) LCS linearised at the measured state x of the same instant, with
+        x (n_x,): measured state.
+        u_measured (n_u,): mean of the measured input over the period that ends now.
+        lcs (abstract): LCS about the measured state x of the same instant, with
             dt = period_sec: its builder must be updated just before the learner.
-        enable (1,) optional: 0 drops the pairs that this sample belongs to.
+        enable (1,), optional: 0 drops the pairs that this sample belongs to.
 
     Outputs:
-        r_comp (n_lam,) [m/s] for the contact equation at dt = period_sec.
-        r_std (1,) its standard deviation [m/s]; 0 without a posterior.
-        loss (1,) mean loss per buffered pair before the last update.
-        status (1,) a LearnerStatus.
+        r_comp (n_lam,) [m/s]: for the contact equation at dt = period_sec.
+        r_std (1,): its standard deviation [m/s]; 0 without a posterior.
+        loss (1,): mean loss per buffered pair before the last update.
+        status (1,): a LearnerStatus.
 
     At tick k+1 the pair (x_k, u_measured, the lcs read at tick k, x_{k+1}) joins the
-    buffer, and Adam steps on the mean loss over the last n_b pairs.
+    buffer, and Adam takes n_steps steps on the mean loss of the last n_b pairs.
 
     Source: ACI-MPC, section VI, algorithm 1.
     """
@@ -134,9 +135,9 @@ class ResidualLearner(LeafSystem):
         period_sec: float,
         offset_sec: float = 0.0,
     ):
-        """Args: lcs: one that the input port may carry; its sizes and F are checked.
+        """Args: lcs: an example of what the input port carries; gives sizes and dt.
 
-        Raises: ValueError if config does not fit it.
+        Raises: ValueError for a setting out of range, or gamma above the bound of F.
         """
         super().__init__()
         self._config = _checked(config, lcs, period_sec)
@@ -165,7 +166,7 @@ class ResidualLearner(LeafSystem):
             _, std = mode_and_std(self._grid, self._grid.prior)
             memory = replace(
                 memory,
-                belief=self._grid.prior,
+                density=self._grid.prior,
                 std=std,
                 unexplained=np.zeros(len(c.free_states)),
             )
@@ -228,7 +229,7 @@ class ResidualLearner(LeafSystem):
         return LearnerMemory(sample, buffer, residual, loss, status)
 
     def _with_posterior(self, memory, sample, pair) -> LearnerMemory:
-        """The memory after one more measured step, of the pair lcs, x, u, x_next."""
+        """The memory after one more pair (lcs, x, u, x_next), with a posterior."""
         c, grid = self._config, self._grid
         assert grid is not None and c.posterior is not None
         shared = self._group == 0
@@ -240,23 +241,27 @@ class ResidualLearner(LeafSystem):
         step = measured_step(lcs, x, u, x_next, Q_d, c.eps, c.slip_noise)
         loss = losses_on_grid(step, shared, grid.values, c.eps, c.gamma)
         solved = bool(np.isfinite(loss).all())
-        belief = updated(
-            grid, memory.belief, loss, c.posterior.trust, c.posterior.loss_max
+        density = updated(
+            grid, memory.density, loss, c.posterior.trust, c.posterior.loss_max
         )
-        belief.setflags(write=False)
-        mode, std = mode_and_std(grid, belief)
+        density.setflags(write=False)
+        mode, std = mode_and_std(grid, density)
         before = float(memory.residual.value[0])
         residual = replace(memory.residual, value=np.array([mode]))
         status = LearnerStatus.LEARNED if solved else LearnerStatus.NOT_SOLVED
         if abs(mode) > c.r_max - c.posterior.spacing:
             status = LearnerStatus.AT_BOUND
-        told = float(np.interp(before, grid.values, loss)) if solved else memory.loss
+        loss_before = memory.loss
+        if solved:
+            loss_before = float(np.interp(before, grid.values, loss))
         return LearnerMemory(
-            sample, memory.buffer, residual, told, status, belief, std, unexplained
-        )
+            sample, memory.buffer, residual, loss_before, status, density, std,
+            unexplained,
+        )  # fmt: skip
 
     def _unexplained(self, memory, lcs_next, lcs, x, u, x_next):
-        """Mean squares of how the free states change where nothing can touch."""
+        """Mean squares (n_free,) of the free states' changes that the model lacks,
+        updated while no contact is possible [SI^2]."""
         c = self._config.posterior
         assert c is not None
         if not len(c.free_states):
@@ -317,7 +322,10 @@ def _held(memory: LearnerMemory, sample, status: LearnerStatus) -> LearnerMemory
 
 
 def _checked(config: ResidualLearnerConfig, lcs: LCS, period_sec: float):
-    """config as it is now (a later edit of it must not reach the system)."""
+    """A copy of the config, so that a later edit does not reach the system.
+
+    Raises: ValueError that names a setting out of range.
+    """
     c = config
     if abs(lcs.dt - period_sec) > 1e-9 * lcs.dt:
         raise ValueError(

@@ -1,3 +1,5 @@
+"""The phases of rolling a ball as a system (numerics/rolling_task.py)."""
+
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,18 +20,19 @@ from makebreak.systems.contact_mpc.numerics.rolling_task import (
 from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.timing import timed
 
-OUT_OF_REACH = 0.12  # A ball that is so far outside the circle is waited for [m].
+# The tip waits for a ball that is farther than this outside of the circle [m].
+OUT_OF_REACH = 0.12
 
 
 @dataclass
 class RollingTaskConfig:
     center: list[float] = field(default_factory=lambda: [0.5, 0.0])  # [m]
     radius: float = 0.1  # Of the circle [m].
-    lead_deg: float = 6.0  # The target runs so far ahead of the ball ...
-    speed: float = 0.045  # ... and moves along the circle with it [m/s].
-    press: float = 0.045  # Tip target below the ball's top, as learned [m].
-    # Where the tip hides nothing of the circle from the camera [m]: between the circle
-    # and the arm's base.
+    lead_deg: float = 6.0  # Angle by which the target is ahead of the ball.
+    speed: float = 0.045  # Of the target along the circle [m/s].
+    press: float = 0.045  # Depth of the tip's target below the learned ball's top [m].
+    # Position at which the tip hides nothing of the circle from the camera [m]: between
+    # the circle and the arm's base.
     withdrawn: list[float] = field(default_factory=lambda: [0.3, 0.0])
     rolling: RollingConfig = field(default_factory=RollingConfig)
     period_sec: float = 0.0125
@@ -37,22 +40,28 @@ class RollingTaskConfig:
 
 
 class RollingTask(LeafSystem):
-    """Phases of rolling a ball along a circle, the target of C3 and the reposition.
+    """Phases of rolling a ball: C3's target while rolling, the tip's path in between.
 
-    Inputs:  x (19,); valid (1,); r_comp (n_lam,) [m/s] of the learner, whose first
-             n_tip entries belong to tip and ball; optional r_std (1,), how sure of it
-             the learner is [m/s], and tip_force (3,) on the tip as the arm feels it
-             [N], with which a surface of uncertain height is approached slowly;
-             optional landed (1,): where another system carries the reposition out, it
-             ends when this is 1, not in time.
-    Outputs: x_desired ((N+1) 19,) for C3; reference (9,) = p, v, a of the tip at the
+    Inputs:  x (19,) of numerics/ball_state.py; valid (1,): above 0.5 if x can be used;
+             r_comp (n_lam,) [m/s]: the learned residual, its first n_tip entries for
+             tip and ball; r_std (1,) [m/s], optional: its standard deviation, and
+             tip_force (3,) [N], optional: the estimated contact force on the tip. With
+             both, a surface of uncertain height is approached slowly;
+             landed (1,), optional: if another system carries out the reposition, it
+             ends when this is 1, instead of after its time.
+    Outputs: x_desired ((N + 1) 19,) for C3; reference (9,) = p, v, a of the tip at the
              next tick, used unless rolling; phase (1,): 0 roll, 1 reposition, 2 wait,
-             3 approach; feel (1,): 1 in a push of a ball that does not coast as a ball
-             does, so that the tip has to feel for it.
+             3 approach; feel (1,): 1 while the tip pushes a ball that did not coast as
+             a ball should, so that the tip has to feel for it.
 
-    A ball that is OUT_OF_REACH is as one that is not seen.
+    A ball beyond OUT_OF_REACH is treated as one that is not seen. Before the first
+    update the phase is WAIT, with the tip at p_tip.
 
-    Before the first update the phase is WAIT at the height of the tip that was given.
+    Args: config; n_knots: N + 1; knot_sec: between them [s]; radius_ball, radius_tip:
+        as modelled [m]; n_lam, n_tip: entries of r_comp, and those of tip and ball;
+        residual_dt_sec: time step over which r_comp is a velocity [s]; p_tip (3,):
+        initial position of the tip [m].
+    Raises: ValueError for a setting out of range.
     """
 
     def __init__(
@@ -86,7 +95,7 @@ class RollingTask(LeafSystem):
         first_call(target_over_horizon, *circle, radius_ball, knot_sec, n_knots)
         self._x_desired = self.DeclareDiscreteState(x_desired)
         self._reference = self.DeclareDiscreteState([*p_tip, *np.zeros(6)])
-        self._shift = self.DeclareDiscreteState([0.0])  # Of the circle's radius [m].
+        self._shift = self.DeclareDiscreteState([0.0])  # Added to the radius [m].
         self._phase = self.DeclareDiscreteState([float(WAIT)])
         self._feel = self.DeclareDiscreteState([0.0])
         self.DeclareStateOutputPort("x_desired", self._x_desired)
@@ -98,8 +107,8 @@ class RollingTask(LeafSystem):
         )
 
     def start_at(self, context, p_tip) -> None:
-        """The task waits with the tip at p_tip (3,) [m], in a Context of this system:
-        then it begins as from there."""
+        """Sets the state in a Context of this system: waiting, the tip at p_tip (3,)
+        [m]."""
         t, still = context.get_time(), np.zeros(3)
         start = TaskState(WAIT, t, p_tip, still, still, float(p_tip[2]))
         context.SetAbstractState(int(self._task), start)
@@ -114,9 +123,9 @@ class RollingTask(LeafSystem):
         gap = self._r_comp.Eval(context)[: self._n_tip].mean() * self._residual_dt_sec
         away = x[P_BALL][:2] - self._path.center
         reach = self._path.radius + OUT_OF_REACH
-        # Who runs after a ball that is out of reach, stretches the arm for nothing.
-        said, near = self._valid.Eval(context)[0], away @ away < reach**2
-        valid, hidden = said > 0.5 and near, said == 0.0 and near
+        # Following a ball that is out of reach would only stretch the arm.
+        seen, near = self._valid.Eval(context)[0], away @ away < reach**2
+        valid, hidden = seen > 0.5 and near, seen == 0.0 and near
         landed = None
         if self._landed.HasValue(context):
             landed = bool(self._landed.Eval(context)[0] > 0.5)
@@ -134,8 +143,8 @@ class RollingTask(LeafSystem):
             self._radius_ball, self._radius_tip, landed, gap_std, force_z,
             np.array(c.withdrawn), hidden,
         )  # fmt: skip
-        # Below the top where it is believed to be: a ball larger than modelled would
-        # else be pressed as much harder.
+        # Relative to the learned top of the ball: relative to the modelled one a ball
+        # that is larger than modelled would be pressed harder.
         z_tip = 2.0 * self._radius_ball + self._radius_tip - gap - c.press
         goal = target_over_horizon(
             path, x, np.deg2rad(c.lead_deg), c.speed, z_tip, self._radius_ball,
@@ -154,7 +163,7 @@ class RollingTask(LeafSystem):
 
 
 def _check(config: RollingTaskConfig):
-    """Raises: ValueError for a config that makes no task, by name."""
+    """Raises: ValueError that names a setting out of range."""
     rolling = config.rolling
     for name in ("center", "withdrawn"):
         place = getattr(config, name)

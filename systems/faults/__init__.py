@@ -1,1 +1,1 @@
-"""Faults in signals, pictures and forces, and safety_monitor, which watches limits."""
+"""Faults in signals, images and forces; safety_monitor checks the arm's limits."""

@@ -1,5 +1,5 @@
-"""Forces that no controller expects: a push, a hand that takes the ball; for tests
-alone. Both are generalized forces on the plant."""
+"""Disturbances for tests: a push, and a hand that moves the ball; as generalized forces
+on the plant."""
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
@@ -8,14 +8,14 @@ from pydrake.systems.framework import LeafSystem
 
 from makebreak.systems.faults.numerics.time_span import lasts
 
-HAND_RATE = 60.0  # [1/s] of the hand's spring and damper.
+HAND_RATE = 60.0  # Natural frequency of the hand's spring and damper [rad/s].
 HAND_SPEED = 0.8  # [m/s]
-HAND_HEIGHT = 1.2  # [m] Above any camera.
-ASIDE = 0.12  # [m] First to the side, from under whatever presses on it.
+HAND_HEIGHT = 1.2  # Above any camera [m].
+ASIDE = 0.12  # The hand first moves the ball to the side, from under the finger [m].
 
 
 class BodyForce(LeafSystem):
-    """A force on a body's origin, as generalized forces.
+    """A force at a body's origin as generalized forces.
 
     Inputs:  state (n_x,) of the plant; force (3,) in the world [N].
     Outputs: generalized_force (n_v,).
@@ -53,8 +53,8 @@ class BodyForce(LeafSystem):
 
 
 class Push(BodyForce):
-    """A constant force (3,) in the world [N] from `start` on and before `end` [s]; its
-    input of that name is not read."""
+    """A constant force (3,) in the world [N] from `start` until before `end` [s]; the
+    input `force` is not used."""
 
     def __init__(self, plant: MultibodyPlant, body, force, start, end):
         super().__init__(plant, body)
@@ -67,11 +67,11 @@ class Push(BodyForce):
 
 
 class Hand(LeafSystem):
-    """Takes a free body away at `start`, to the side and up, and puts it down at `end`
-    [s], turned about `center`, where it lets go.
+    """Takes a free body at `start`, moves it to the side and up, and puts it down and
+    lets go at `end` [s], at its old position turned about `center`.
 
-    A spring and a damper of the body's mass lead it along straight lines; it does not
-    turn meanwhile.
+    A spring and a damper, scaled with the body's mass, lead it along straight lines;
+    its rotation is damped.
 
     Inputs:  state (n_x,) of the plant.
     Outputs: generalized_force (n_v,).
@@ -100,10 +100,10 @@ class Hand(LeafSystem):
         self.DeclareVectorOutputPort("generalized_force", self._n_v, self._calc)
         self.DeclareInitializationDiscreteUpdateEvent(self._note)
         self.DeclarePeriodicDiscreteUpdateEvent(period_sec, 0.0, self._note)
-        way = 2.0 * (ASIDE + HAND_HEIGHT) / HAND_SPEED
-        if not self._end - self._start > way + 0.2:
+        least = 2.0 * (ASIDE + HAND_HEIGHT) / HAND_SPEED
+        if not self._end - self._start > least + 0.2:
             raise ValueError(
-                f"a hand takes {way + 0.2:.1f} s to take the ball away and to put it "
+                f"a hand takes {least + 0.2:.1f} s to take the ball away and to put it "
                 f"back, got {self._end - self._start:g}"
             )
 
@@ -114,7 +114,7 @@ class Hand(LeafSystem):
             discrete_state.set_value(self._taken, p)
 
     def _goal(self, t, p):
-        """Where the hand is t seconds after it took the body at p (3,)."""
+        """Position (3,) of the hand t [s] after it took the body at p (3,) [m]."""
         out = p[:2] - self._center
         length = max(float(np.sqrt(out @ out)), 1e-6)
         cos, sin = np.cos(self._turn), np.sin(self._turn)
@@ -131,7 +131,7 @@ class Hand(LeafSystem):
             np.append(self._center + turned, HAND_HEIGHT),
             np.append(self._center + turned, p[2]),
         ]
-        # The way over the top takes what time is left.
+        # The motion above the table takes the remaining time.
         steps = [ASIDE / HAND_SPEED, (HAND_HEIGHT - p[2]) / HAND_SPEED]
         steps = [*steps, total - 0.2 - steps[0] - 2.0 * steps[1], steps[1]]
         for k, step in enumerate(steps):

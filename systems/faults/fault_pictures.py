@@ -1,5 +1,4 @@
-"""Faults of a camera: pictures that do not come, come late, or show what is not there;
-for tests alone."""
+"""Camera faults for tests: images that are lost, late, or show what is not there."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,8 +16,8 @@ from makebreak.systems.perception.numerics.pinhole import Pinhole
 
 @dataclass(frozen=True, eq=False)
 class _Film:
-    """The last pictures, the oldest first; nothing in them changes, so that copies of
-    a Context may share them."""
+    """The last images, oldest first; immutable, so that copies of a Context share
+    them."""
 
     frames: tuple[np.ndarray, ...]
     shown: np.ndarray | None = None
@@ -28,14 +27,15 @@ class _Film:
 
 
 class LatePictures(LeafSystem):
-    """From `start` on and before `end` [s] each picture comes `frames` frames late, and
-    a share of them does not come: the one before stays.
+    """From `start` until before `end` [s] each image is `frames` frames late, and a
+    fraction of them is lost: the one before stays. Outside that time images pass
+    unchanged.
 
-    Inputs:  image, abstract ImageRgba8U.
-    Outputs: rgb_image, abstract ImageRgba8U.
+    Inputs:  image (abstract ImageRgba8U).
+    Outputs: rgb_image (abstract ImageRgba8U).
 
-    Args: share, 0 to 1, of the pictures that are lost, drawn from the seed; period_sec,
-        of a frame.
+    Args: share: fraction of images that are lost, drawn from the seed; period_sec:
+        between frames [s].
     """
 
     def __init__(self, width, height, frames, share, seed, start, end, period_sec):
@@ -54,18 +54,22 @@ class LatePictures(LeafSystem):
             "rgb_image",
             lambda: Value(blank),
             self._show,
-            {self.abstract_state_ticket(self._film), self._image.ticket()},
+            {
+                self.abstract_state_ticket(self._film),
+                self._image.ticket(),
+                self.time_ticket(),
+            },
         )
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_sec, 0.0, self._expose)
 
     def _expose(self, context, state):
         film = context.get_abstract_state(int(self._film)).get_value()
-        picture: Any = self._image.Eval(context)
-        now = picture.data.copy()
+        image: Any = self._image.Eval(context)
+        now = image.data.copy()
         frames = (*film.frames, now)[-(self._frames + 1) :]
         time = context.get_time()
         shown = now
-        if lasts(time, self._start, self._end):
+        if self._acts(context):
             shown = frames[0]
             number = int(time / self._period + 0.5)
             lost = np.random.default_rng([self._seed, 29, number]).random()
@@ -75,24 +79,27 @@ class LatePictures(LeafSystem):
             _Film(frames, shown)
         )
 
+    def _acts(self, context) -> bool:
+        return lasts(context.get_time(), self._start, self._end)
+
     def _show(self, context, output):
         film = context.get_abstract_state(int(self._film)).get_value()
-        if film.shown is None:
-            picture: Any = self._image.Eval(context)
-            output.get_mutable_value().mutable_data[:] = picture.data
+        if film.shown is None or not self._acts(context):
+            image: Any = self._image.Eval(context)
+            output.get_mutable_value().mutable_data[:] = image.data
         else:
             output.get_mutable_value().mutable_data[:] = film.shown
 
 
 class PaintedPictures(LeafSystem):
-    """From `start` on and before `end` [s] a disc is painted at a fixed distance from a
-    body: a second ball, or glare on the first.
+    """From `start` until before `end` [s] a disc is painted at a fixed offset from a
+    body: a second ball, or glare on the first one.
 
-    Inputs:  image, abstract ImageRgba8U; body_poses, the plant's.
-    Outputs: rgb_image, abstract ImageRgba8U.
+    Inputs:  image (abstract ImageRgba8U); body_poses (abstract) of the plant.
+    Outputs: rgb_image (abstract ImageRgba8U).
 
-    Args: body_index; offset (3,) of the disc's centre from the body's origin, world
-        axes [m]; radius [m]; color (3,) 0 to 255.
+    Args: camera: its pinhole model; body_index; offset (3,): of the disc's centre from
+        the body's origin, in world axes [m]; radius [m]; color (3,), 0 to 255.
     """
 
     def __init__(self, camera: Pinhole, body_index, offset, radius, color, start, end):
@@ -109,9 +116,9 @@ class PaintedPictures(LeafSystem):
         self.DeclareAbstractOutputPort("rgb_image", lambda: Value(blank), self._paint)
 
     def _paint(self, context, output):
-        picture: Any = self._image.Eval(context)
+        image: Any = self._image.Eval(context)
         pixels = output.get_mutable_value().mutable_data
-        pixels[:] = picture.data
+        pixels[:] = image.data
         if not lasts(context.get_time(), self._start, self._end):
             return
         poses: Any = self._poses.Eval(context)

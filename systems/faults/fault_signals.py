@@ -1,7 +1,7 @@
-"""Faults of a signal on its way: lost, biased, stuck, late, limited; for tests alone.
+"""Signal faults for tests: bias, NaN, limit, stuck, delay.
 
-Each is a system between a port and who reads it, which passes the value on outside its
-time, from `start` on and before `end` [s].
+Each is a system between a port and its readers, which changes the value from `start`
+until before `end` [s].
 """
 
 from dataclasses import replace
@@ -18,7 +18,7 @@ HUGE = 1e200
 
 
 class _Timed(LeafSystem):
-    """What all have in common: when they act, and one input and output of n numbers."""
+    """Base of the faults: their time, and one input and one output (n,)."""
 
     def __init__(self, n: int, start: float, end: float):
         super().__init__()
@@ -59,7 +59,7 @@ class BiasedSignal(_Timed):
 
 
 class LimitedSignal(_Timed):
-    """value, within +-limit (n,).
+    """value, clipped to +-limit (n,).
 
     Inputs:  value (n,).
     Outputs: value (n,).
@@ -76,7 +76,7 @@ class LimitedSignal(_Timed):
 
 
 class StuckSignal(_Timed):
-    """Entries (n,) that are True stay as they were a period before `start`.
+    """The entries (n,) that are True keep their value from one period before `start`.
 
     Inputs:  value (n,).
     Outputs: value (n,).
@@ -87,7 +87,7 @@ class StuckSignal(_Timed):
         super().__init__(len(self._entries), start, end)
         self._kept = self.DeclareDiscreteState(len(self._entries))
         self.DeclareInitializationDiscreteUpdateEvent(self._keep)
-        # In the middle of a period: the plant's value is that of its beginning.
+        # In the middle of a period: the plant's value is that of the period's start.
         self.DeclarePeriodicDiscreteUpdateEvent(
             period_sec, 0.5 * period_sec, self._keep
         )
@@ -102,11 +102,11 @@ class StuckSignal(_Timed):
 
 
 class LateSignal(_Timed):
-    """Entries (n,) that are True are as they were `periods` periods before. When the
-    fault begins, the last value is held until the late ones come.
+    """The entries (n,) that are True are delayed by `periods` periods. At the start the
+    last value is held until the delayed ones arrive.
 
     Inputs:  value (n,).
-    Outputs: value (n,); age (1,), how late it is [s].
+    Outputs: value (n,); age (1,): the present delay [s].
     """
 
     def __init__(self, entries, periods: int, start, end, period_sec: float = 0.001):
@@ -132,7 +132,7 @@ class LateSignal(_Timed):
         discrete_state.set_value(self._past, later)
 
     def _behind(self, context) -> int:
-        """How many periods late it is now: what is on its way has not arrived yet."""
+        """Present delay in periods; it grows from 0 while the last value is held."""
         since = (context.get_time() - self._start) / self._period
         return min(self._periods, max(0, int(since + 1e-6)))
 
@@ -150,8 +150,8 @@ class LateSignal(_Timed):
 
 
 class SpoiledLcs(LeafSystem):
-    """Passes an LCS on, but in its time one that no solver can solve: its numbers are
-    finite, but their products are not.
+    """An LCS that is unsolvable during the fault: its numbers are finite, but their
+    products overflow.
 
     Inputs:  lcs (abstract LCS).
     Outputs: lcs (abstract LCS).

@@ -1,4 +1,4 @@
-"""Whether an arm keeps its limits, judged by someone who does not control it."""
+"""Checks whether an arm keeps its limits, independently of its controller."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from pydrake.systems.framework import Context, LeafSystem
 
 # Entries of the output `worst`.
 TORQUE, TORQUE_RATE, SPEED, POSITION, NOT_FINITE, FIRST = range(6)
-ROUNDING = 1e-9  # A limit that is reached is kept.
+ROUNDING = 1e-9  # Tolerance: reaching a limit is no violation.
 
 
 @dataclass
@@ -21,12 +21,12 @@ class ArmLimits:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a monitor has seen until now."""
+    """What a monitor has measured so far."""
 
     torque_share: float  # Largest |tau| over its limit.
     torque_rate_share: float  # Largest change of tau from tick to tick over its limit.
     speed_share: float  # Largest |v| over its limit.
-    position_excess: float  # Furthest outside of a position limit [rad]; < 0 inside.
+    position_excess: float  # Largest excess over a position limit [rad]; < 0: inside.
     not_finite: int  # Ticks in which any number was not finite.
     first_violation_s: float  # NaN: none.
 
@@ -37,13 +37,13 @@ class Verdict:
 
 class SafetyMonitor(LeafSystem):
     """Compares torque, torque rate, joint speeds and positions with their limits, and
-    looks for NaN, each tick.
+    checks for NaN, each tick.
 
-    Inputs:  tau (n,) as commanded [N m]; q (n,) [rad], v (n,) [rad/s], the true ones.
-    Outputs: worst (6,): shares of the limits of torque, torque rate and speed, each the
-             largest until now; how far a joint has been outside its range [rad], < 0
-             inside; ticks with a number that is not finite; time of the first violation
-             [s], -1 for none.
+    Inputs:  tau (n,): commanded [N m]; q (n,) [rad], v (n,) [rad/s]: the true ones.
+    Outputs: worst (6,): the largest ratios so far of torque, torque rate and speed to
+             their limits; largest excess over a position limit [rad], < 0: inside;
+             ticks with a number that is not finite; time of the first violation [s],
+             -1 for none.
     """
 
     def __init__(self, limits: ArmLimits, period_sec: float, offset_sec: float = 0.0):

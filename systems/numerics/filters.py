@@ -1,14 +1,14 @@
-"""What lies between a true signal and its samples: low-passes, means and delays.
+"""Filters between a true signal and its samples: low-passes, moving averages, delays.
 
-All are linear, of unit gain at rest, and of continuous time, so that they can be
-applied to a signal whose samples are uneven:
+All are linear, with unit gain at zero frequency, and in continuous time, so that they
+can be applied to unevenly sampled signals:
 
     low-pass        dz_i/dt = p_i z_i + x,  y = sum_i r_i z_i   (order 1, Butterworth)
     moving average  y(t) = 1/T integral(x, t - T .. t), or centred about t
     delay           y(t) = x(t - d)
 
 A velocity by backward differences is the moving average of the true one over a period.
-Between its samples a signal is taken as a line; each low-pass is solved exactly for it.
+Signals are linear between their samples; each low-pass is solved exactly for that.
 Source: Butterworth, Wireless Engineer 7, 1930; poles as in Oppenheim and Schafer,
 Discrete-Time Signal Processing, appendix B.
 """
@@ -19,14 +19,14 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-MOST_ORDER = 8  # Beyond that the sum of its parts loses digits.
+ORDER_MAX = 8  # With a higher order the sum of partial fractions loses digits.
 
 
 @dataclass(frozen=True)
 class LowPass:
-    """Butterworth's low-pass; of order 1 the plain one, tau dy/dt = x - y.
+    """A Butterworth low-pass; for order 1, tau dy/dt = x - y.
 
-    cutoff: [rad/s], where the gain is 1/sqrt(2); 1/tau for order 1.
+    cutoff: where the gain is 1/sqrt(2) [rad/s]; 1/tau for order 1.
     """
 
     cutoff: float
@@ -35,9 +35,9 @@ class LowPass:
     def __post_init__(self):
         if not (np.isfinite(self.cutoff) and self.cutoff > 0.0):
             raise ValueError(f"a cut-off is {self.cutoff} rad/s, expected more than 0")
-        if not 1 <= self.order <= MOST_ORDER:
+        if not 1 <= self.order <= ORDER_MAX:
             raise ValueError(
-                f"the order of a low-pass is {self.order}, expected 1 to {MOST_ORDER}"
+                f"the order of a low-pass is {self.order}, expected 1 to {ORDER_MAX}"
             )
 
     def poles(self) -> np.ndarray:
@@ -69,7 +69,7 @@ class LowPass:
 
 @dataclass(frozen=True)
 class MovingAverage:
-    """The mean over the last `width` [s]; centred, over half of it on either side."""
+    """The mean over the last `width` [s]; centred: over half of it on either side."""
 
     width: float
     centred: bool = False
@@ -97,7 +97,7 @@ class MovingAverage:
             k = np.clip(np.searchsorted(t, at, "right") - 1, 0, len(t) - 2)
             d = at - t[k]
             rise = (x[k + 1] - x[k]) / (t[k + 1] - t[k])
-            before = at < t[0]  # There a line goes on.
+            before = at < t[0]  # The first line is extended to before the samples.
             return np.where(
                 before,
                 x[0] * (at - t[0]) + 0.5 * slope * (at - t[0]) ** 2,
@@ -110,7 +110,7 @@ class MovingAverage:
 
 @dataclass(frozen=True)
 class Delay:
-    """All `delay` [s] later."""
+    """A delay [s]."""
 
     delay: float
 
@@ -135,17 +135,17 @@ Stage = LowPass | MovingAverage | Delay
 
 
 def first_order(time_constant: float) -> LowPass:
-    """tau dy/dt = x - y, tau [s]."""
+    """The low-pass tau dy/dt = x - y. Args: time_constant: tau [s]."""
     if not time_constant > 0.0:
         raise ValueError(f"a time constant is {time_constant} s, expected more than 0")
     return LowPass(1.0 / time_constant)
 
 
 def with_lag(stages: Sequence[Stage], lag: float) -> tuple[Stage, ...]:
-    """The stages with a time constant that is `lag` [s] more, or less, in the slowest
-    stage of first order; where there is none, one more stage.
+    """The stages with `lag` [s] added to the time constant of the slowest first-order
+    stage, or with one more stage if there is none.
 
-    Raises: ValueError if that would make it negative.
+    Raises: ValueError if the time constant would be negative.
     """
     if lag == 0.0:
         return tuple(stages)
@@ -164,11 +164,12 @@ def with_lag(stages: Sequence[Stage], lag: float) -> tuple[Stage, ...]:
 
 
 def filtered(stages: Sequence[Stage], times, samples, at=None) -> np.ndarray:
-    """A signal after all stages, (n,) or at other times (m,).
+    """A signal after all stages (n,), or at other times (m,).
 
-    Args: times (n,) increasing [s]; samples (n,) of the true signal, at least two, a
-        line between them; before the first it is the line through the first two, and
-        the filters have long settled on that. at (m,): times within them, else all.
+    Args: times (n,): increasing [s]; samples (n,): of the true signal, at least two,
+        linear in between. Before the first sample the signal is the line through the
+        first two, on which the filters have settled. at (m,): times of the result,
+        within `times`; None: `times`.
     """
     t, y = np.asarray(times, float), np.asarray(samples, float)
     for stage in stages:
@@ -185,7 +186,8 @@ def gain(stages: Sequence[Stage], w) -> np.ndarray:
 
 
 def subdivided(times, longest: float) -> np.ndarray:
-    """The times (n,), with others between them so that no step is longer [s]."""
+    """The times (n,) with more in between, so that no step is longer than `longest`
+    [s]."""
     t = np.asarray(times, float)
     n = np.maximum(np.ceil(np.diff(t) / longest - 1e-6), 1.0).astype(int)
     starts, parts = np.repeat(t[:-1], n), np.repeat(np.diff(t) / n, n)
@@ -194,12 +196,12 @@ def subdivided(times, longest: float) -> np.ndarray:
 
 
 def mean_delay(stages: Sequence[Stage]) -> float:
-    """[s] by which a signal that is slow enough comes late: -dH/ds at s = 0."""
+    """Delay of slow signals, -dH/ds at s = 0 [s]."""
     return float(sum(stage.mean_delay() for stage in stages))
 
 
 def memory(stages: Sequence[Stage]) -> float:
-    """[s] after which nothing of what was before shows."""
+    """Time after which earlier values have no effect [s]."""
     return float(sum(stage.memory() for stage in stages))
 
 
@@ -211,7 +213,7 @@ def _on_lines(at: np.ndarray, t: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 @njit(cache=True)
 def _low_pass(t, x, poles, residues):
-    """Exact for lines between samples: with z the state of one pole p, over a step h
+    """Exact for a piecewise linear signal: for the state z of one pole p, over a step h
 
     z(t + h) = e z + x0 (e - 1)/p + slope ((e - 1)/p - h)/p,   e = exp(p h).
     """
@@ -225,7 +227,7 @@ def _low_pass(t, x, poles, residues):
         for k in range(n - 1):
             h = t[k + 1] - t[k]
             ph = p * h
-            if abs(ph) < 1e-3:  # Else digits cancel.
+            if abs(ph) < 1e-3:  # Series: the closed form would lose digits.
                 a = h * (1.0 + ph * (0.5 + ph * (1.0 / 6.0 + ph / 24.0)))
                 b = h * h * (0.5 + ph * (1.0 / 6.0 + ph * (1.0 / 24.0 + ph / 120.0)))
                 e = 1.0 + p * a

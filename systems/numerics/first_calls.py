@@ -1,5 +1,5 @@
-"""When functions are compiled: as a system is made, so that no tick waits for it; or,
-where many systems are made, all together afterwards."""
+"""When functions are compiled: in the constructor of a system, so that no update waits
+for it; or, for many systems, all together afterwards."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,8 +9,8 @@ _waiting: list[Callable[[], object]] | None = None
 
 
 def first_call(function: Callable, *args) -> None:
-    """Calls function(*args) for what that compiles; while `deferred` is entered, it
-    joins its list instead."""
+    """Calls function(*args) so that it is compiled; inside of `deferred` the call is
+    appended to its list instead."""
     if _waiting is None:
         function(*args)
     else:
@@ -19,7 +19,7 @@ def first_call(function: Callable, *args) -> None:
 
 @contextmanager
 def deferred() -> Iterator[list[Callable[[], object]]]:
-    """While entered, first calls wait in the list that this gives, in their order."""
+    """A context manager that collects first calls in the list that it yields."""
     global _waiting
     before, _waiting = _waiting, []
     try:

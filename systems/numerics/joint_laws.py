@@ -1,7 +1,7 @@
 """Forces on one joint that depend on its own position and velocity, compiled.
 
 Each law (q, v, t, p) gives the force on the joint [N m] or [N] from its position,
-velocity, the time and its numbers p, up to four.
+velocity, the time and up to four parameters p.
 """
 
 import math
@@ -11,31 +11,33 @@ import numba
 
 @numba.njit(cache=True)
 def coulomb_law(q, v, t, p):
-    """p: dry friction, the speed below which it fades."""
+    """p: Coulomb friction, speed below which it fades."""
     return -p[0] * math.tanh(v / p[1])
 
 
 @numba.njit(cache=True)
 def direction_law(q, v, t, p):
-    """p: dry friction where q grows, where it falls, the speed below which it fades."""
+    """p: Coulomb friction for v > 0, for v < 0, speed below which it fades."""
     return -(p[0] if v > 0.0 else p[1]) * math.tanh(v / p[2])
 
 
 @numba.njit(cache=True)
 def stribeck_law(q, v, t, p):
-    """p: sliding friction, static friction, Stribeck's speed, where it fades."""
+    """p: sliding friction, static friction, Stribeck velocity, speed below which it
+    fades."""
     peak = (p[1] - p[0]) * math.exp(-((v / p[2]) ** 2))
     return -(p[0] + peak) * math.tanh(v / p[3])
 
 
 @numba.njit(cache=True)
 def drag_law(q, v, t, p):
+    """p: coefficient of quadratic drag."""
     return -p[0] * v * abs(v)
 
 
 @numba.njit(cache=True)
 def ripple_law(q, v, t, p):
-    """p: amplitude, periods a turn, phase."""
+    """p: amplitude, periods per revolution, phase [rad]."""
     return p[0] * math.sin(p[1] * q + p[2])
 
 

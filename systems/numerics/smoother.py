@@ -1,9 +1,9 @@
 """Position, velocity and acceleration of a signal from noisy samples of its position.
 
-The prior is a signal whose third derivative is white noise of a density that the
-samples themselves choose (maximum likelihood); filter and smoother are exact for
-uneven and missing samples. Source: Rauch, Tung, Striebel, AIAA J. 3(8), 1965; as a
-spline: Wahba, Spline Models for Observational Data, 1990, section 1.
+The prior is a signal whose third derivative is white noise; its density is estimated
+from the samples (maximum likelihood). Filter and smoother are exact for uneven and
+missing samples. Source: Rauch, Tung, Striebel, AIAA J. 3(8), 1965; as a spline: Wahba,
+Spline Models for Observational Data, 1990, section 1.
 """
 
 from collections.abc import Sequence
@@ -20,25 +20,25 @@ from makebreak.systems.numerics.filters import (
     subdivided,
 )
 
-_REFINED = 4  # Times at most that what a filter took is put back.
+_ITERATIONS_MAX = 4  # Of van Cittert's iteration.
 
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """States at the asked times. P: their covariances. density: of the third
-    derivative [unit2/s5]."""
+    """States at the requested times."""
 
     x: np.ndarray  # (n, 3): value, first and second derivative.
-    P: np.ndarray  # (n, 3, 3)
-    density: float
-    innovation: float  # Rms of one-step errors over their expected size; 1 is right.
+    P: np.ndarray  # (n, 3, 3) covariances of x.
+    density: float  # Of the third derivative [unit2/s5].
+    innovation: float  # Rms of the one-step errors over their expected one: about 1.
 
 
 def smooth(times, samples, noise: float, density: float | None = None) -> Smoothed:
     """The states at all times.
 
-    Args: times (n,) increasing [s]; samples (n,), NaN where there is none: there the
-        state is wanted all the same; noise, standard deviation of a sample.
+    Args: times (n,): increasing [s]; samples (n,): NaN where there is no sample (the
+        state is estimated there too); noise: standard deviation of a sample; density:
+        of the third derivative, None: estimated.
     Raises: ValueError for fewer than 6 samples.
     """
     t, y = np.asarray(times, float), np.asarray(samples, float)
@@ -68,12 +68,12 @@ def smooth(times, samples, noise: float, density: float | None = None) -> Smooth
 def smooth_filtered(
     times, samples, noise: float, stages: Sequence[Stage] = ()
 ) -> Smoothed:
-    """The states of a true signal of which the samples are what filters let through.
+    """The states of a true signal whose samples were filtered by the stages.
 
-    First the filters count as their mean delay alone; then what the true signal found
-    so far would look like behind them is compared with the samples, and the difference
-    put back, as smooth as the signal (van Cittert's iteration). That converges as the
-    powers of 1 - H(s) exp(s mean delay), 3 % for a first-order filter of 4 ms at 10 Hz.
+    Van Cittert's iteration: the first estimate treats the filters as their mean delay;
+    then the estimate is filtered and compared with the samples, and the difference,
+    smoothed with the signal's density, is added to it. The error decreases with powers
+    of 1 - H(s) exp(s mean delay), 3 % for a first-order filter of 4 ms at 10 Hz.
 
     Args, Raises: as smooth.
     """
@@ -82,30 +82,30 @@ def smooth_filtered(
         return smooth(t, y, noise)
     late = mean_delay(stages)
     there = np.isfinite(y)
-    # A sample shows about what was `late` before it.
+    # A sample is approximately the true value at `late` before it.
     grid, where = np.unique(np.concatenate([t, t[there] - late]), return_inverse=True)
     rows, stamps = where[: len(t)], where[len(t) :]
     seen = np.full(len(grid), np.nan)
     seen[stamps] = y[there]
     first = smooth(grid, seen, noise)
     x = first.x
-    # Between samples a signal is taken as a line: a few of these an interval.
+    # `filtered` is linear between samples, so it gets several samples per interval.
     dense = subdivided(grid, 0.1 * float(np.median(np.diff(t))))
-    for _ in range(_REFINED):
+    for _ in range(_ITERATIONS_MAX):
         guess = CubicHermiteSpline(grid, x[:, 0], x[:, 1])(dense)
         seen[stamps] = y[there] - filtered(stages, dense, guess, t[there])
         more = smooth(grid, seen, noise, first.density).x
         if np.sqrt(np.mean(more[:, 0] ** 2)) < 0.5 * noise:
-            break  # What is put back now is noise.
+            break  # The correction is smaller than the noise.
         x = x + more
     return Smoothed(x[rows], first.P[rows], first.density, first.innovation)
 
 
 def blur_sec(noise: float, every: float, density: float) -> float:
-    """Within about how long of a jump of its true velocity a smoothed one passes from
-    before to after it [s]: the T for which samples of a deviation `noise`, one each
-    `every` seconds, say as much as the signal's density does, noise^2 every = density
-    T^6. Times the smoothed acceleration there it is how far the velocity may be off."""
+    """Time over which the smoother blurs a jump of the true velocity [s]: the T at
+    which samples of standard deviation `noise`, one every `every` seconds, weigh as
+    much as the prior, noise^2 every = density T^6. The velocity near a jump may be
+    wrong by T times the smoothed acceleration."""
     return (noise**2 * every / max(density, 1e-12)) ** (1.0 / 6.0)
 
 
@@ -129,8 +129,8 @@ def _step(x, P, dt, s):
 def _likelihood(dt, y, r, s):
     """-2 log likelihood of the samples, the first three left out.
 
-    The filter of _run, written out: it runs two dozen times for each signal, and most
-    of the time of small arrays is that they are made.
+    The filter of _run in scalars: it runs two dozen times for each signal, and small
+    arrays would take most of the time.
     """
     x0 = x1 = x2 = 0.0
     p00 = p11 = p22 = 1e8
@@ -141,7 +141,7 @@ def _likelihood(dt, y, r, s):
         if h > 0.0:
             g = 0.5 * h * h
             x0, x1 = x0 + h * x1 + g * x2, x1 + h * x2
-            # F P, of which F P F' needs these.
+            # The entries of F P that F P F' needs.
             a00, a01, a02 = (
                 p00 + h * p01 + g * p02,
                 p01 + h * p11 + g * p12,
@@ -191,7 +191,7 @@ def _run(dt, y, r, s):
             e = y[k] - x[0]
             K = P[:, 0] / S
             x = x + K * e
-            # Joseph's form: the vague start would cost digits otherwise.
+            # Joseph's form keeps the digits that the vague initial P would cost.
             A = np.eye(3)
             A[:, 0] -= K
             P = A @ P @ A.T + r * np.outer(K, K)

@@ -1,6 +1,6 @@
-"""Watching the updates of systems from outside: how long each took, and what it saw.
+"""Observes the updates of systems from outside: duration and inputs.
 
-Diagnostics, never an input to anything that is simulated.
+For diagnostics only, never an input of the simulation.
 """
 
 from collections import deque
@@ -13,10 +13,11 @@ _observers: list[Callable] = []
 
 
 def timed(update):
-    """Decorates an update callback: each call's duration [s] goes to `compute_sec`.
+    """Decorates an update callback: each call's duration [s] is appended to the
+    system's `compute_sec`.
 
-    The deque lives on the system, not in the Context: it tells of the computer, not
-    of the simulated world, and nothing that is simulated may read it.
+    It is an attribute of the system, not in the Context: it describes the computer, and
+    nothing in the simulation may read it.
     """
 
     @wraps(update)

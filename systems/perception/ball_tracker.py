@@ -1,3 +1,5 @@
+"""Position and velocity of a ball from images (numerics/ball_tracker.py)."""
+
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,12 +21,12 @@ from makebreak.systems.perception.numerics.pinhole import Pinhole
 # Values of the status port.
 TRACKED, NOT_FOUND, OUTLIER, WRONG_IMAGE = 0.0, 1.0, 2.0, 3.0
 
-GATE = 8.0  # [standard deviations] A measurement that is further off is not believed,
-PATIENCE = 3  # unless this many in a row are: then the ball was moved, start afresh.
-HOLD_SEC = 0.1  # Unseen for longer: velocity zero, and look everywhere.
-START_SPEED = 0.3  # [m/s] Standard deviation of the velocity at a fresh start.
+GATE = 8.0  # A measurement farther from its prediction is an outlier [std].
+PATIENCE = 3  # So many outliers in a row restart the filter: the ball was moved.
+HOLD_SEC = 0.1  # Unseen for longer: velocity zero, and the whole image is searched.
+START_SPEED = 0.3  # Standard deviation of the velocity after a restart [m/s].
 
-# Layout of the state; then, per model of motion, its mean, covariance and probability.
+# Layout of the state; then, per motion model, its mean, covariance and probability.
 _P, _V, _COVARIANCE = slice(0, 2), slice(2, 4), slice(4, 7)
 _UNSEEN_SEC, _N_OUTLIERS, _STATUS, _MODELS = 7, 8, 9, 10
 _PER_MODEL = 4 + 3 + 1
@@ -32,13 +34,14 @@ _PER_MODEL = 4 + 3 + 1
 
 @dataclass
 class BallTrackerConfig:
-    ball_radius: float = 0.0315  # [m] as the model has it.
-    table_z: float = 0.0  # [m] height of the table.
-    hue: float = 0.41  # [rad] of the ball: 0 red, 2.09 green, 4.19 blue.
-    position_std: float = 1e-3  # [m] of one measurement.
-    acceleration_density: float = 0.03  # [m^2/s^3] how freely the ball moves.
-    # The same while something drives it (a push, a bump that it rolls off); 0: it
-    # always moves as above. How long each of the two lasts, on average [s].
+    ball_radius: float = 0.0315  # Of the model [m].
+    table_z: float = 0.0  # Height of the table [m].
+    hue: float = 0.41  # Of the ball [rad]: 0 red, 2.09 green, 4.19 blue.
+    position_std: float = 1e-3  # Of one measurement [m].
+    # Spectral density of the white acceleration in the filter [m^2/s^3].
+    acceleration_density: float = 0.03
+    # The same of a second motion model, for a ball that is driven (a push, a bump that
+    # it rolls off); 0: only one model. Mean duration of each of the two [s].
     driven_density: float = 0.0
     free_sec: float = 1.0
     driven_sec: float = 0.1
@@ -47,25 +50,27 @@ class BallTrackerConfig:
 
 
 class BallTracker(LeafSystem):
-    """Where the ball is and how fast it moves, from an overhead camera's pictures.
+    """Position and velocity of a ball from the images of an overhead camera.
 
-    Each period the picture is asked for, the ball is found in it (numerics/
-    ball_tracker.py) and a constant-velocity Kalman filter is corrected (numerics/
-    constant_velocity.py), or two of them, one for a ball that something drives
-    (numerics/interacting_models.py). The ball is taken to lie on the table: p_WB z is
-    the table's height plus the model's radius, v_WB z is 0.
+    Each period the ball is found in the image (numerics/ball_tracker.py) and corrects a
+    constant-velocity Kalman filter (numerics/constant_velocity.py), or two of them, the
+    second one for a ball that is driven (numerics/interacting_models.py). The ball is
+    assumed to lie on the table: p_WB has z = table height plus the model's radius, v_WB
+    z = 0.
 
-    Inputs:  image, abstract ImageRgba8U of the camera model's size; radius_error (1,)
-             [m], optional: the model's radius minus the ball's, as learned by touch. A
-             ball that is smaller lies lower, and so elsewhere on the ray on which it is
-             seen.
-    Outputs: p_WB (3,) [m]; v_WB (3,) [m/s]; seen (1,): 1 if the last picture showed the
-             ball where it can be, else 0; status (1,): TRACKED, NOT_FOUND, OUTLIER
-             or WRONG_IMAGE; position_std (1,) [m], of p_WB each way.
+    Inputs:  image (abstract ImageRgba8U) of the camera model's size; radius_error (1,)
+             [m], optional: the model's radius minus the learned one. A smaller ball
+             lies lower, and so at another point of the ray on which it is seen.
+    Outputs: p_WB (3,) [m]; v_WB (3,) [m/s]; seen (1,): 1 if the last image showed the
+             ball at a plausible place, else 0; status (1,): TRACKED, NOT_FOUND, OUTLIER
+             or WRONG_IMAGE; position_std (1,) [m]: of x and y of p_WB.
 
-    A ball that is not seen is not guessed: p_WB is held, v_WB is held for HOLD_SEC and
-    zero from then on, and position_std grows. Before the first sight p_WB is the point
+    While the ball is not seen, p_WB is held, v_WB is held for HOLD_SEC and then zero,
+    and position_std grows. Before the ball is seen for the first time p_WB is the point
     below the camera.
+
+    Args: config; camera: its pinhole model.
+    Raises: ValueError for a setting out of range.
     """
 
     def __init__(self, config: BallTrackerConfig, camera: Pinhole):
@@ -140,13 +145,13 @@ class BallTracker(LeafSystem):
         lost = state[_UNSEEN_SEC] > HOLD_SEC
         estimate: interacting_models.Estimate = self._predict(_unflat(state[_MODELS:]))
         p_next, _, P_next = interacting_models.combined(*estimate)
-        picture: Any = self._image.Eval(context)
-        image = picture.data
+        image_in: Any = self._image.Eval(context)
+        image = image_in.data
         measured, status = None, WRONG_IMAGE
         if image.shape == self._shape:
             status = NOT_FOUND
             z = c.table_z + c.ball_radius
-            near = state[_STATUS] == TRACKED  # Else it may be anywhere.
+            near = state[_STATUS] == TRACKED  # Otherwise search the whole image.
             guess = np.array([*p_next, z]) if near else None
             found = find_ball(
                 image, self._camera, self._weights, c.ball_radius, c.table_z, guess
@@ -157,7 +162,7 @@ class BallTracker(LeafSystem):
         if measured is None:
             n_outliers = state[_N_OUTLIERS]
         elif lost:
-            estimate = self._afresh(measured)
+            estimate = self._restarted(measured)
         elif (
             constant_velocity.distance_in_sigmas(
                 p_next, P_next, measured, c.position_std
@@ -166,13 +171,13 @@ class BallTracker(LeafSystem):
         ):
             estimate = interacting_models.correct(*estimate, measured, c.position_std)
         elif state[_N_OUTLIERS] + 1 >= PATIENCE:
-            estimate = self._afresh(measured)
+            estimate = self._restarted(measured)
         else:
             n_outliers, status = state[_N_OUTLIERS] + 1, OUTLIER
         if status == TRACKED:
             unseen_sec = 0.0
         else:
-            # Held where it was, and less and less sure.
+            # The position is held while its variance grows.
             unseen_sec = min(state[_UNSEEN_SEC] + c.period_sec, 2.0 * HOLD_SEC)
             v = v if unseen_sec <= HOLD_SEC else np.zeros(2)
             P = P_next if P_next[0] < 1.0 else P
@@ -185,12 +190,12 @@ class BallTracker(LeafSystem):
             discrete_state.set_value(self._state, state)
 
     def _lowered(self, context, p_WB):
-        """(2,) where on its ray a centre that is seen at p_WB (3,) is, if the ball is
-        smaller than its model and so lies lower."""
+        """x, y (2,) of the centre that is seen at p_WB (3,), corrected along its ray
+        for a ball that is smaller than its model and so lies lower."""
         error = 0.0
         if self._radius_error.HasValue(context):
             error = float(self._radius_error.Eval(context)[0])
-        if not abs(error) < self._config.ball_radius:  # Nor where it is not finite.
+        if not abs(error) < self._config.ball_radius:  # Too large, or not finite.
             error = 0.0
         p_WC = self._camera.p_WC
         return p_WC[:2] + (p_WB - p_WC)[:2] * (1.0 + error / (p_WC[2] - p_WB[2]))
@@ -200,7 +205,7 @@ class BallTracker(LeafSystem):
             *estimate, self._chances, self._config.period_sec, self._densities
         )
 
-    def _afresh(self, measured):
+    def _restarted(self, measured):
         P = np.array([self._config.position_std**2, 0.0, START_SPEED**2])
         return interacting_models.start(measured, np.zeros(2), P, len(self._densities))
 
@@ -225,7 +230,7 @@ class BallTracker(LeafSystem):
 
 
 def _flat(estimate):
-    """An estimate of interacting_models as numbers in a row."""
+    """An estimate of interacting_models as one vector."""
     return np.concatenate([part.ravel() for part in estimate])
 
 

@@ -1,3 +1,5 @@
+"""Random shifts of a camera's images."""
+
 from typing import Any
 
 import numpy as np
@@ -10,13 +12,17 @@ from makebreak.systems.perception.numerics.pinhole import frame_shift, shifted
 
 
 class CameraShake(LeafSystem):
-    """Shifts each picture by a random amount: a camera that is never quite still.
+    """Shifts each image by a random amount, as of a camera that vibrates.
 
-    The shift is drawn anew for every frame k = floor(time / period_sec), from the
-    seed and k alone: it needs no memory, and any context replays it.
+    The shift of frame k = floor(time / period_sec) is a function of the seed and k
+    alone: there is no state, and any Context replays it.
 
-    Inputs:  image, abstract ImageRgba8U.
-    Outputs: rgb_image, abstract ImageRgba8U, made when it is asked for.
+    Inputs:  image (abstract ImageRgba8U).
+    Outputs: rgb_image (abstract ImageRgba8U), computed when evaluated.
+
+    Args: width, height [px]; shift_std_px: standard deviation along u and v [px]; seed;
+        period_sec: between frames [s].
+    Raises: ValueError for a setting out of range.
     """
 
     def __init__(self, width, height, shift_std_px, seed, period_sec):

@@ -1,4 +1,4 @@
-"""A sensor's reading: the truth plus noise that a restored Context replays."""
+"""Sensors with noise, drift or delay; a restored Context replays them."""
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
@@ -8,15 +8,18 @@ from makebreak.systems.perception.numerics.sensor_noise import add_noise
 
 
 class NoisySensor(LeafSystem):
-    """value + std x (standard Gaussian), new noise at each sample.
+    """measured = value + std x (standard Gaussian), with new noise in each sample.
 
-    The reading is made when it is asked for, without delay. Samples are numbered by
-    time, the nearest multiple of the period. With `held`, for a value that changes at
-    multiples of the period alone, one reading is made of each value, whoever asks and
-    when: samples are numbered by the multiple before.
+    It is computed when evaluated, without delay. The noise is a function of the seed
+    and the sample's number, the multiple of the period nearest to the time. With `held`
+    (for a value that changes at multiples of the period only) it is the last multiple
+    before, so that all readers between two changes get the same reading.
 
     Inputs:  value (n,).
     Outputs: measured (n,).
+
+    Args: std (n,): in the unit of the value; seed; period_sec [s]; held.
+    Raises: ValueError for a setting out of range.
     """
 
     def __init__(self, std, seed: int, period_sec: float = 0.001, held: bool = False):
@@ -31,8 +34,8 @@ class NoisySensor(LeafSystem):
         self._seed = int(seed)
         self._rate = 1.0 / period_sec
         n = len(self._std)
-        # A value of a step that ends at k periods is asked for after that, up to the
-        # very end of the next one. The hundredth is for rounding.
+        # A value that is computed at k periods is read after that and up to the end of
+        # the next period. The hundredth is for rounding.
         self._shift = 0.99 if held else 0.5
         self._value = self.DeclareVectorInputPort("value", n)
         needs = {self._value.ticket()} if held else {self.all_sources_ticket()}
@@ -47,7 +50,7 @@ class NoisySensor(LeafSystem):
 
 
 class DriftingSensor(LeafSystem):
-    """value + bias + drift x time.
+    """measured = value + bias + drift x time.
 
     Inputs:  value (n,).
     Outputs: measured (n,).
@@ -68,14 +71,14 @@ class DriftingSensor(LeafSystem):
 
 
 class LateSensor(LeafSystem):
-    """What `value`, which changes at multiples of a period alone, was periods ago.
+    """A delay by whole periods, for a value that changes at multiples of the period.
 
-    Before the start it was what it is at the start.
+    Before the start the value counts as constant.
 
     Inputs:  value (n,).
     Outputs: measured (n,).
 
-    Args: size n; periods, 1 or more; period_sec.
+    Args: size: n; periods: of delay, 1 or more; period_sec [s].
     """
 
     def __init__(self, size: int, periods: int, period_sec: float):

@@ -1,4 +1,4 @@
-"""The state a moment ago, without the lag of what is known now."""
+"""The state at a past time, without the lag of a filter (numerics/past_state.py)."""
 
 from dataclasses import dataclass
 
@@ -22,29 +22,33 @@ from makebreak.systems.perception.numerics.pose_filter import on_the_table
 
 @dataclass
 class PastStateConfig:
-    ticks: int = 4  # So many periods ago.
-    half_width: float = 0.1  # Readings so long before and after count [s].
+    ticks: int = 4  # How many periods ago.
+    half_width: float = 0.1  # Readings within this time before and after are used [s].
     height: float = 0.02  # Of the object's origin on the table [m].
     period_sec: float = 0.05  # The learner's.
     offset_sec: float = 0.0
 
 
 class PastState(LeafSystem):
-    """Tip and object some periods ago: for who learns and can wait.
+    """State of tip and object some periods ago, for a learner that can wait.
 
-    The tip is known at once and remembered; of the object's pose the readings around
-    that moment count (numerics/past_state.py), laid on the table. So the two belong
-    together, which those of the present do not while the object's motion changes.
+    The tip's state is measured at once and stored. The object's pose comes from the
+    readings before and after that time (numerics/past_state.py), laid on the table. Tip
+    and object are then of the same time, which a filter's present estimates are not
+    while the object's motion changes.
 
-    Inputs:  x (19,) of contact_mpc/numerics/ball_state.py, of which the tip counts;
-             u_measured (3,) mean over the last period [N]; readings (abstract) of
+    Inputs:  x (19,) of contact_mpc/numerics/ball_state.py (only the tip is used);
+             u_measured (3,): mean over the last period [N]; readings (abstract) of
              PoseSensor.
-    Outputs: x (19,), u_measured (3,) of that moment; ready (1,): 1 where both are
-             known. Where not, they are the last that were.
+    Outputs: x (19,), u_measured (3,) of that time; ready (1,): 1 if both are known,
+             else they are the last known ones.
     """
 
     def __init__(self, config: PastStateConfig, axis=(0.0, 0.0, 0.0)):
-        """Args: axis, as of on_the_table."""
+        """Args: axis: about which the object rolls (pose_filter.on_the_table).
+
+        Raises: ValueError for a setting out of range.
+        """
         super().__init__()
         if config.ticks != int(config.ticks) or config.ticks < 1:
             raise ValueError(f"ticks is {config.ticks}, expected at least 1")

@@ -1,3 +1,5 @@
+"""A colour camera without a graphics library (numerics/pinhole.py)."""
+
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,7 +33,7 @@ from makebreak.systems.perception.numerics.pinhole import (
     visible,
 )
 
-SKY = (204, 229, 255, 255)  # Drake's own clear colour for rendering.
+SKY = (204, 229, 255, 255)  # Drake's default clear colour.
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,16 +42,15 @@ class PaintedShape:
 
     body_index: int
     X_BG: RigidTransform  # Pose in its body.
-    kind: int  # Its place in SHAPES of numerics/pinhole.py.
-    extent: np.ndarray  # (3,) [m], see `extents` there.
+    kind: int  # Index into SHAPES of numerics/pinhole.py.
+    extent: np.ndarray  # (3,) [m] of `extents` in numerics/pinhole.py.
     color: np.ndarray  # (3,) 0..255
     points: np.ndarray | None = None  # (n, 3) [m] of a convex hull.
 
 
 def painted_shapes(plant: MultibodyPlant, scene_graph: SceneGraph):
     """The visible primitives and convex hulls of a finalized plant. Other meshes are
-    left out; a half-space becomes a wide, thin box.
-    """
+    ignored; a half-space becomes a wide, thin box."""
     inspector = scene_graph.model_inspector()
     shapes = []
     for frame_id in inspector.GetAllFrameIds():
@@ -99,8 +100,8 @@ def painted_shapes(plant: MultibodyPlant, scene_graph: SceneGraph):
 
 
 def _centred_hull(shape: Convex, X_BG: RigidTransform):
-    """The corners (n, 3) of a convex hull about the middle of its extents, and the pose
-    of that in the body."""
+    """Corners (n, 3) of a convex hull relative to the middle of its bounding box, and
+    the pose of this middle in the body."""
     hull = shape.GetConvexHull()
     points = np.array([hull.vertex(i) for i in range(hull.num_vertices())])
     middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
@@ -108,16 +109,19 @@ def _centred_hull(shape: Convex, X_BG: RigidTransform):
 
 
 def _pose_if_anchored(plant, context, shape):
+    """Pose of the shape's body in the world if it is fixed there, else None."""
     body = plant.get_body(BodyIndex(shape.body_index))
     return plant.EvalBodyPoseInWorld(context, body) if plant.IsAnchored(body) else None
 
 
 class PinholeCamera(LeafSystem):
-    """A colour camera without a graphics library: OpenCV paints the plant's spheres,
-    capsules, cylinders, boxes, ellipsoids and convex hulls, far ones first.
+    """Draws a plant's spheres, capsules, cylinders, boxes, ellipsoids and convex hulls
+    with OpenCV, distant ones first.
 
-    Inputs:  body_poses, abstract, the plant's port of that name.
-    Outputs: rgb_image, abstract ImageRgba8U, drawn when it is asked for.
+    Inputs:  body_poses (abstract) of the plant.
+    Outputs: rgb_image (abstract ImageRgba8U), drawn when evaluated.
+
+    Args: camera: its pinhole model; plant: finalized.
     """
 
     def __init__(self, camera: Pinhole, plant: MultibodyPlant, scene_graph: SceneGraph):
@@ -140,7 +144,7 @@ class PinholeCamera(LeafSystem):
             [X_WB[i] for i in bodies],
         )
         scratch, ahead = self._background.copy(), np.array([0.0, 0.0, 1.0])
-        # Compiles; no stall in the first picture.
+        # Compiles the machine code before the first image.
         draw(scratch, camera, "sphere", (0.1,), ahead, np.eye(3), np.zeros(3))
         self._poses = self.DeclareAbstractInputPort(
             "body_poses", Value[list[RigidTransform]]()
@@ -154,7 +158,7 @@ class PinholeCamera(LeafSystem):
 
     @staticmethod
     def _prepared(shapes, bodies):
-        """Of n shapes: where its body is in `bodies` (n,), p_BG (n, 3), R_BG
+        """For n shapes: index of the body in `bodies` (n,), p_BG (n, 3), R_BG
         (n, 3, 3), extents (n, 3)."""
         n = len(shapes)
         return (
@@ -172,7 +176,9 @@ class PinholeCamera(LeafSystem):
         X_WB = [poses[i] for i in self._bodies]
         self._paint(pixels, self._moving, self._in_body, X_WB)
 
-    def _paint(self, picture, shapes, in_body, X_WB):
+    def _paint(self, image, shapes, in_body, X_WB):
+        """Draws shapes into an image. Args: in_body: of _prepared; X_WB: poses of the
+        bodies."""
         if not shapes:
             return
         camera, (body, p_BG, R_BG, extent) = self._camera, in_body
@@ -183,6 +189,4 @@ class PinholeCamera(LeafSystem):
         seen = np.flatnonzero(visible(p, extent, camera))
         for i in seen[np.argsort(-p[seen, 2], kind="stable")]:
             s = shapes[i]
-            draw_visible(
-                picture, camera, s.kind, s.extent, p[i], R[i], s.color, s.points
-            )
+            draw_visible(image, camera, s.kind, s.extent, p[i], R[i], s.color, s.points)

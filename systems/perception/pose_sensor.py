@@ -1,4 +1,4 @@
-"""The pose of an object as a motion capture system tells it: late, noisy, filtered."""
+"""The pose of an object from a motion capture system: delayed, noisy, filtered."""
 
 from dataclasses import dataclass, field
 
@@ -19,7 +19,7 @@ from makebreak.systems.perception.numerics.pose_filter import (
     turned,
 )
 
-KEPT_SEC = 1.0  # How old a reading is kept.
+KEPT_SEC = 1.0  # Age up to which readings are kept.
 
 
 @dataclass
@@ -27,34 +27,36 @@ class PoseSensorConfig:
     noise: list[float] = field(default_factory=lambda: [1e-3, 1e-2])  # [m], [rad]
     delay_sec: float = 1.0 / 30.0
     period_sec: float = 1.0 / 30.0
-    # Of white acceleration in the filter [m2/s3], [rad2/s3].
+    # Spectral density of the white acceleration in the filter [m2/s3], [rad2/s3].
     density: list[float] = field(default_factory=lambda: [0.02, 2.0])
-    height: float = 0.02  # Of the object's origin as the model has it [m].
-    # Of an object that rolls, in its frame; empty: it lies flat.
+    height: float = 0.02  # Of the object's origin in the model [m].
+    # Axis in the object's frame about which it rolls; empty: it lies flat.
     rolling_axis: list[float] = field(default_factory=list)
-    # What rolls mostly goes straight on, with this density, for so long on average;
-    # else it is driven, as density says (numerics/interacting_models.py).
-    free_density: float = 1e-5  # [m2/s3]
+    # A rolling object has a second motion model (numerics/interacting_models.py): it
+    # rolls freely with the density free_density [m2/s3] or is driven with `density`.
+    # Mean duration of each [s].
+    free_density: float = 1e-5
     free_sec: float = 2.0
     driven_sec: float = 0.3
     offset_sec: float = 0.0
 
 
 class PoseSensor(LeafSystem):
-    """Measures a body's pose, and says where it is now and how it moves.
+    """Measures a body's pose and estimates its present pose and velocity.
 
-    Each reading is of the period's beginning, is known delay_sec later, and has
-    Gaussian noise of the two deviations on each axis. The filter's pose is predicted to
-    the present time, and laid on the table (numerics/pose_filter.py). What rolls keeps
-    its speed where nothing drives it: then its velocity is known five times better.
+    A reading is taken at the start of each period, arrives delay_sec later, and has
+    Gaussian noise about each axis. The filter's pose is predicted to the present time
+    and laid on the table (numerics/pose_filter.py). A rolling object keeps its speed
+    while nothing drives it, which makes its velocity five times more accurate.
 
-    Inputs:  body_poses (abstract, of a MultibodyPlant).
+    Inputs:  body_poses (abstract) of a MultibodyPlant.
     Outputs: p_WB (3,) [m]; q_WB (4,) [w x y z]; v_WB (3,) [m/s]; w_WB (3,) [rad/s];
-             seen (1,): 1 when there has been a reading; readings (abstract): those of
-             the last KEPT_SEC that are known, as they were measured: (time [s], p (3,),
-             q (4,)); reading (8,): the last of them; its time is -1 before the first.
+             seen (1,): 1 after the first reading; readings (abstract): those of the
+             last KEPT_SEC that have arrived, as measured: (time [s], p (3,), q (4,));
+             reading (8,): the last of them; its time is -1 before the first.
 
-    Args: config; body, its index in body_poses; seed of the noise.
+    Args: config; body: its index in body_poses; seed: of the noise.
+    Raises: ValueError for a setting out of range.
     """
 
     def __init__(self, config: PoseSensorConfig, body: int, seed: int = 0):
@@ -87,10 +89,10 @@ class PoseSensor(LeafSystem):
         self._poses = self.DeclareAbstractInputPort(
             "body_poses", AbstractValue.Make([RigidTransform()])
         )
-        # Readings that are not known yet, oldest first; and how many there were.
+        # Readings that have not arrived yet, oldest first.
         self._late = self.DeclareAbstractState(Value[object](()))
         self._pose = self.DeclareAbstractState(Value[object](None))
-        # Of what rolls: an estimate of numerics/interacting_models.py.
+        # Of a rolling object: an estimate of numerics/interacting_models.py.
         self._rolling = self.DeclareAbstractState(Value[object](None))
         ticket = {self.abstract_state_ticket(self._pose), self.time_ticket()}
         for i, (name, size) in enumerate(
@@ -122,7 +124,7 @@ class PoseSensor(LeafSystem):
         pose = context.get_abstract_state(int(self._pose)).get_value()
         known = context.get_abstract_state(int(self._known)).get_value()
         rolling = context.get_abstract_state(int(self._rolling)).get_value()
-        std = np.maximum(c.noise, 1e-6)  # A filter of no noise at all divides by it.
+        std = np.maximum(c.noise, 1e-6)  # The filter divides by it.
         while late and late[0][0] <= t - c.delay_sec + 1e-9:
             known = (*known, late[0])
             (at, p, q), late = late[0], late[1:]
@@ -131,7 +133,7 @@ class PoseSensor(LeafSystem):
             else:
                 pose = corrected(predicted(pose, at, c.density), p, q, std)
             if c.rolling_axis:
-                rolling = self._followed(rolling, p[:2], std[0])
+                rolling = self._corrected_rolling(rolling, p[:2], std[0])
                 (x, y), v, _ = interacting_models.combined(*rolling)
                 pose = pose._replace(
                     p=np.array([x, y, pose.p[2]]), v=np.array([*v, 0.0])
@@ -142,10 +144,11 @@ class PoseSensor(LeafSystem):
         state.get_mutable_abstract_state(int(self._rolling)).set_value(rolling)
         state.get_mutable_abstract_state(int(self._known)).set_value(known)
 
-    def _followed(
+    def _corrected_rolling(
         self, rolling: interacting_models.Estimate | None, measured, std
     ) -> interacting_models.Estimate:
-        """The estimate of what rolls, a period later, where it was measured."""
+        """The estimate of a rolling object, predicted by a period and corrected with a
+        measurement (2,) [m]; a new one if there was none."""
         if rolling is None:
             P = np.array([std**2, 0.0, 0.1**2])
             return interacting_models.start(measured, np.zeros(2), P, 2)
@@ -155,7 +158,7 @@ class PoseSensor(LeafSystem):
         return interacting_models.correct(means, covariances, chances, measured, std)
 
     def _pose_of(self, context) -> PoseEstimate | None:
-        """The filter's, of the last reading that is known."""
+        """The filter's pose at the last reading that has arrived; None: none yet."""
         return context.get_abstract_state(int(self._pose)).get_value()
 
     def _calc(self, i):

@@ -1,3 +1,5 @@
+"""Pose and velocity of a flat object from images (numerics/pose_tracker.py)."""
+
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,42 +12,38 @@ from pydrake.systems.sensors import ImageRgba8U
 from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.timing import timed
 from makebreak.systems.perception.numerics import constant_velocity
+from makebreak.systems.perception.numerics.aruco_marker import find_marker
 from makebreak.systems.perception.numerics.ball_tracker import strength_weights
+from makebreak.systems.perception.numerics.object_outline import Shape, nearest_yaw
 from makebreak.systems.perception.numerics.pinhole import Pinhole
-from makebreak.systems.perception.numerics.pose_tracker import (
-    Shape,
-    find_marker,
-    find_pose,
-    nearest_yaw,
-    rolling_turn,
-)
+from makebreak.systems.perception.numerics.pose_tracker import find_pose, rolling_turn
 
 # Values of the status port.
 TRACKED, NOT_FOUND, OUTLIER, WRONG_IMAGE = 0.0, 1.0, 2.0, 3.0
 
-GATE = 8.0  # [standard deviations] A measurement that is further off is not believed,
-PATIENCE = 3  # unless this many in a row are: then it was moved, start afresh.
-HOLD_SEC = 0.1  # Unseen for longer: velocities zero, and look everywhere.
-START_SPEED, START_RATE = 0.3, 2.0  # [m/s], [rad/s] Deviations at a fresh start.
-P_MAX = 1.0  # [m2, rad2] A variance grows no further.
+GATE = 8.0  # A measurement farther from its prediction is an outlier [std].
+PATIENCE = 3  # So many outliers in a row restart the filter: the object was moved.
+HOLD_SEC = 0.1  # Unseen for longer: velocities zero, and the whole image is searched.
+START_SPEED, START_RATE = 0.3, 2.0  # Std of velocities after a restart [m/s], [rad/s].
+P_MAX = 1.0  # Bound of the variances [m2], [rad2].
 
-# Layout of the state: pose and its rate, covariances of place and yaw, and memory.
+# Layout of the state: pose and its rate, covariances of position and yaw, and memory.
 _POSE, _RATE, _P, _P_YAW = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 _UNSEEN_SEC, _N_OUTLIERS, _STATUS = 12, 13, 14
-# The last measurement that was believed, and when that was [s].
+# The last accepted measurement, and its time [s].
 _READ, _READ_AT, _SIZE = slice(15, 18), 18, 19
 
 
 @dataclass
 class PoseTrackerConfig:
-    z: float = 0.02  # [m] height of the object's frame.
-    hue: float = 0.41  # [rad] of its colour: 0 red, 2.09 green, 4.19 blue.
-    position_std: float = 1e-3  # [m] of one measurement, each way.
+    z: float = 0.02  # Height of the object's frame [m].
+    hue: float = 0.41  # Of its colour [rad]: 0 red, 2.09 green, 4.19 blue.
+    position_std: float = 1e-3  # Of one measurement, along x and y [m].
     yaw_std: float = 0.01  # [rad]
-    # How freely it moves [m^2/s^3] and turns [rad^2/s^3].
+    # Spectral densities of white acceleration in the filters [m^2/s^3], [rad^2/s^3].
     acceleration_density: float = 0.01
     turning_density: float = 2.0
-    # Of an object that rolls on the table, in its frame; empty: it slides.
+    # Axis in the object's frame about which it rolls; empty: it slides.
     rolling_axis: list[float] = field(default_factory=list)
     period_sec: float = 0.0125
     offset_sec: float = 0.0
@@ -53,15 +51,15 @@ class PoseTrackerConfig:
 
 @dataclass
 class Marker:
-    """An ArUco marker (4X4_50) on top of the object, which it is found by."""
+    """An ArUco marker (4X4_50) on top of the object, by which it is found."""
 
     number: int = 0
     side: float = 0.04  # [m]
-    center: tuple[float, float, float] = (0.0, 0.0, 0.02)  # [m] in the object's frame.
-    yaw: float = 0.0  # [rad] of its upper edge from the object's x axis.
+    center: tuple[float, float, float] = (0.0, 0.0, 0.02)  # In the object's frame [m].
+    yaw: float = 0.0  # Of its upper edge from the object's x axis [rad].
 
     def corners(self) -> np.ndarray:
-        """(4, 3) [m] in the object's frame, as numbered by OpenCV."""
+        """(4, 3) [m] in the object's frame, in OpenCV's order."""
         square = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         xy = self.side / 2.0 * square @ np.array([[c, s], [-s, c]])
@@ -69,29 +67,28 @@ class Marker:
 
 
 class PoseTracker(LeafSystem):
-    """Where a flat object lies on a table, how it is turned, and how fast it moves and
-    turns, from an overhead camera's pictures.
+    """Pose and velocity of a flat object on a table from an overhead camera's images.
 
-    Each period the picture is asked for, the object is found in it (numerics/
-    pose_tracker.py) and Kalman filters of constant velocity are corrected (numerics/
-    constant_velocity.py), one for its place and one for its yaw. It is taken to lie
-    flat: z is as configured, roll and pitch are 0. One that rolls is taken to roll
-    without slipping: about its axis it turns as fast as its place says.
+    Each period the object is found in the image (numerics/pose_tracker.py) and corrects
+    constant-velocity Kalman filters (numerics/constant_velocity.py), one for position
+    and one for yaw. The object is assumed to lie flat: z is as configured, roll and
+    pitch are 0. One that rolls is assumed to roll without slipping, so that its turn
+    about its axis follows from its velocity.
 
-    Inputs:  image, abstract ImageRgba8U of the camera model's size.
+    Inputs:  image (abstract ImageRgba8U) of the camera model's size.
     Outputs: p_WB (3,) [m]; q_WB (4,) = [w, x, y, z]; yaw (1,) [rad], without jumps;
-             v_WB (3,) [m/s]; w_WB (3,) [rad/s]; seen (1,): 1 if the last picture showed
-             the object where it can be, else 0; status (1,): TRACKED, NOT_FOUND,
-             OUTLIER or WRONG_IMAGE; std (2,): of p_WB each way [m], of yaw [rad];
-             reading (8,): time, place and quaternion of the last measurement that was
-             believed, as it was measured; the time is -1 before the first.
+             v_WB (3,) [m/s]; w_WB (3,) [rad/s]; seen (1,): 1 if the last image showed
+             the object at a plausible place, else 0; status (1,): TRACKED, NOT_FOUND,
+             OUTLIER or WRONG_IMAGE; std (2,): of x and y [m], of yaw [rad];
+             reading (8,): time [s], position and quaternion of the last accepted
+             measurement; the time is -1 before the first.
 
-    Of an outline that some turn leaves as it is (a box: half a turn), yaw is that one
-    which is nearest to the last. A disc's yaw stays as it was at first.
+    Where a turn leaves the outline unchanged (a box: half a turn), yaw is the one
+    nearest to the last yaw. A disc's yaw keeps its initial value.
 
-    An object that is not seen is not guessed: its pose is held, its velocities are held
-    for HOLD_SEC and zero from then on, and std grows. Before the first sight it is at
-    the point below the camera, with yaw 0.
+    While the object is not seen, its pose is held, its velocities are held for HOLD_SEC
+    and then zero, and std grows. Before it is seen for the first time its pose is the
+    point below the camera, with yaw 0.
     """
 
     def __init__(
@@ -101,8 +98,11 @@ class PoseTracker(LeafSystem):
         shape: Shape,
         marker: Marker | None = None,
     ):
-        """Args: shape: of numerics.pose_tracker.make_shape; marker: what the object is
-        found by in place of its outline."""
+        """Args: camera: its pinhole model; shape: of object_outline.make_shape;
+        marker: by which the object is found instead of its outline.
+
+        Raises: ValueError for a setting out of range.
+        """
         super().__init__()
         for name in (
             "position_std",
@@ -138,7 +138,7 @@ class PoseTracker(LeafSystem):
         self._image = self.DeclareAbstractInputPort("image", Value(ImageRgba8U()))
         start: Any = np.zeros(_SIZE)
         start[_POSE.start : _POSE.start + 2] = camera.p_WC[:2]
-        start[_P], start[_P_YAW] = self._fresh()
+        start[_P], start[_P_YAW] = self._initial_covariances()
         start[_UNSEEN_SEC], start[_STATUS] = 2.0 * HOLD_SEC, NOT_FOUND
         start[_READ], start[_READ_AT] = start[_POSE], -1.0
         self._state = self.DeclareDiscreteState(start)
@@ -182,17 +182,17 @@ class PoseTracker(LeafSystem):
         _, _, P_yaw_next = constant_velocity.predict(
             pose, rate, P_yaw, dt, c.turning_density
         )
-        picture: Any = self._image.Eval(context)
-        image = picture.data
+        image_in: Any = self._image.Eval(context)
+        image = image_in.data
         measured: Any = None
         status = WRONG_IMAGE
         if image.shape == self._size:
-            # Where it should be; where it was seen last, if it was not there.
+            # Search near the prediction, or near the last pose if it was not tracked.
             near = ahead if state[_STATUS] == TRACKED else pose
             measured = self._find(image, None if lost else near)
             status = NOT_FOUND if measured is None else TRACKED
         n_outliers = 0
-        afresh = lost
+        restart = lost
         if measured is None:
             n_outliers = state[_N_OUTLIERS]
         else:
@@ -200,10 +200,10 @@ class PoseTracker(LeafSystem):
             if not lost and self._off(measured - ahead, P_next, P_yaw_next) > GATE:
                 n_outliers, status = state[_N_OUTLIERS] + 1, OUTLIER
                 if n_outliers >= PATIENCE:
-                    n_outliers, status, afresh = 0, TRACKED, True
-        if status == TRACKED and afresh:
+                    n_outliers, status, restart = 0, TRACKED, True
+        if status == TRACKED and restart:
             pose, rate, unseen_sec = measured, np.zeros(3), 0.0
-            P, P_yaw = self._fresh()
+            P, P_yaw = self._initial_covariances()
         elif status == TRACKED:
             pose, rate, unseen_sec = ahead.copy(), rate.copy(), 0.0
             for at, var, sigma in (
@@ -218,7 +218,7 @@ class PoseTracker(LeafSystem):
                 else:
                     P_yaw = after
         else:
-            # Held where it was, and less and less sure.
+            # The pose is held while its variances grow.
             unseen_sec = min(state[_UNSEEN_SEC] + dt, 2.0 * HOLD_SEC)
             rate = rate if unseen_sec <= HOLD_SEC else np.zeros(3)
             P = P_next if P_next[0] < P_MAX else P
@@ -232,7 +232,8 @@ class PoseTracker(LeafSystem):
             discrete_state.set_value(self._state, state)
 
     def _find(self, image, near):
-        """x, y, yaw (3,) of the object in a picture, near a pose or anywhere."""
+        """x, y [m], yaw [rad] (3,) of the object in an image; None: not found. Args:
+        near: pose near which it is searched, None: everywhere."""
         z = self._config.z
         if self._marker is not None:
             found = find_marker(
@@ -243,12 +244,13 @@ class PoseTracker(LeafSystem):
         return None if found is None else found.pose.copy()
 
     def _off(self, error, P, P_yaw):
-        """How far off a measurement is, in standard deviations of its prediction."""
+        """Error of a measurement in standard deviations of its prediction."""
         c = self._config
-        of_place = np.hypot(*error[:2]) / np.sqrt(P[0] + c.position_std**2)
-        return max(of_place, abs(error[2]) / np.sqrt(P_yaw[0] + c.yaw_std**2))
+        distance = np.hypot(*error[:2]) / np.sqrt(P[0] + c.position_std**2)
+        return max(distance, abs(error[2]) / np.sqrt(P_yaw[0] + c.yaw_std**2))
 
-    def _fresh(self):
+    def _initial_covariances(self):
+        """Covariances (3,) of position and of yaw after a restart."""
         c = self._config
         return (
             np.array([c.position_std**2, 0.0, START_SPEED**2]),

@@ -1,3 +1,5 @@
+"""State and input of the LCS from sensors (numerics/state_estimator.py)."""
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,37 +21,40 @@ from makebreak.systems.perception.numerics.state_estimator import (
 
 @dataclass
 class StateEstimatorConfig:
-    ball_radius: float = 0.0315  # [m] as the model has it.
-    tip_mass: float = 1.0  # [kg] of the tip in the LCS.
-    window_sec: float = 0.05  # Of the mean force: the learner's period.
+    ball_radius: float = 0.0315  # Of the model [m].
+    tip_mass: float = 1.0  # Of the tip in the LCS [kg].
+    window_sec: float = 0.05  # Over which the force is averaged: the learner's period.
     period_sec: float = 0.0125 / 3.0  # Divides the periods of C3 and of the learner.
-    force_bandwidth: float = 60.0  # Of the tip force's observer [1/s].
+    force_bandwidth: float = 60.0  # Of the tip force observer [1/s].
     offset_sec: float = 0.0
 
 
 class StateEstimator(LeafSystem):
-    """Joint sensors and the ball tracker, as the state and input of the LCS.
+    """State and input of the LCS from joint sensors and an object's tracker.
 
-    The LCS knows the arm as a point of some mass; u_measured is the force on it that
-    explains the tip's motion (numerics/state_estimator.py), as a mean over the window,
-    which is what the residual learner needs.
+    In the LCS the arm is a point with a mass; u_measured is the force on this point
+    that explains the tip's motion (numerics/state_estimator.py), averaged over the
+    window, as the residual learner needs it.
 
-    Inputs:  q (7,), v (7,), torque (7,) motor side [rad, rad/s, N m]; p_ball (3,),
-             v_ball (3,) [m, m/s]; seen (1,); of an object whose pose is known, both of
-             q_object (4,) its quaternion [w x y z] and w_object (3,) [rad/s]: without
-             them it is a ball that rolls.
-    Outputs: x (19,), the layout of contact_mpc/numerics/ball_state.py; u_measured (3,)
-             [N]; valid (1,): 1 if every reading was finite and the ball is seen, 0 if
-             it is not seen, -1 if one was not finite (x is of the last good ones);
-             window_valid (1,): 1 if that was so all over the window; tip_force (3,) [N]
-             that the surroundings put on the tip, from joint torques and velocities.
+    Inputs:  q (7,) [rad], v (7,) [rad/s], torque (7,): of the motors [N m]; p_ball (3,)
+             [m], v_ball (3,) [m/s], seen (1,): of a tracker; optional, both for an
+             object of known orientation: q_object (4,) [w x y z], w_object (3,)
+             [rad/s]. Without them the object is a rolling ball.
+    Outputs: x (19,) of contact_mpc/numerics/ball_state.py; u_measured (3,) [N];
+             valid (1,): 1 if all readings are finite and the object is seen, 0 if it is
+             not seen, -1 if a reading is not finite; window_valid (1,): 1 if valid was
+             1 during the whole window; tip_force (3,) [N]: estimated contact force on
+             the tip, from joint torques and velocities.
 
-    A reading that is not finite leaves x, u_measured and tip_force as they were.
+    x, u_measured and tip_force are held while a reading is not finite.
     """
 
     def __init__(self, config: StateEstimatorConfig, chain: SerialChain, q_default):
-        """Args: chain, the arm with its tool as the model has it; q_default (n,) [rad],
-        where x is before the first reading."""
+        """Args: chain: model of the arm with its tool; q_default (n,) [rad]: gives x
+        before the first reading.
+
+        Raises: ValueError for a setting out of range.
+        """
         super().__init__()
         if not config.ball_radius > 0.0 or not config.tip_mass > 0.0:
             raise ValueError(
@@ -74,8 +79,8 @@ class StateEstimator(LeafSystem):
         self._w_object = self.DeclareVectorInputPort("w_object", 3)
         x0 = pack(p_tip, np.zeros(3), [0, 0, config.ball_radius], np.zeros(3), 1.0)
         self._x = self.DeclareDiscreteState(x0)
-        # The forces, and how many readings in a row were valid; a learner that starts
-        # is told that all were.
+        # The forces of the window, and the number of valid readings in a row. At the
+        # start all readings count as valid.
         self._window = self.DeclareDiscreteState(
             np.append(np.zeros(3 * n_window), n_window)
         )
@@ -133,8 +138,8 @@ class StateEstimator(LeafSystem):
         output.SetFromVector([1.0 if n_valid >= self._n_window else 0.0])
 
     def start_at(self, context) -> None:
-        """Begins anew in a Context of this system: no window is whole until another
-        window_sec has passed."""
+        """Resets the state in a Context of this system: the window is valid again only
+        after window_sec."""
         window = np.zeros(3 * self._n_window + 1)
         context.SetDiscreteState(self._window, window)
         context.SetDiscreteState(self._observer, np.zeros(7))

@@ -30,13 +30,13 @@ HELD, AT_LIMIT, NO_MODEL = 1, 2, 4  # Status, a sum.
 
 @dataclass
 class PlanarImpedanceConfig:
-    stiffness_free: float = 50.0  # [N/m]
-    stiffness_max: float = 500.0  # [N/m]
-    damping_ratio: float = 1.0  # 1 is critical; the paper's sqrt(K)/4 is 0.125.
+    stiffness_free: float = 50.0  # K_free of eq. 4b [N/m].
+    stiffness_max: float = 500.0  # K_max of eq. 4b [N/m].
+    damping_ratio: float = 1.0  # 1: critical; the paper's sqrt(K)/4 is 0.125.
     steepness: float = 8.0  # r of eq. 4c [1/N].
     error_mid: float = 1.0  # eps_0 of eq. 4c [N].
-    # Whether the mixture goes on learning, and whether it drives stiffness and
-    # feed-forward; if not, stiffness is stiffness_max and there is no feed-forward.
+    # Whether the mixture learns, and whether stiffness and feed-forward depend on it;
+    # if they do not, the stiffness is stiffness_max, without feed-forward.
     learn: bool = True
     adapt: bool = True
 
@@ -47,8 +47,8 @@ def _default_model() -> IgmmConfig:
 
 @dataclass
 class ForceModelConfig:
-    # Over [v 2, F 2, next F 2]; with the position over [p 2, v 2, F 2, next F 2]; or
-    # along the motion over [|v|, f, next f].
+    # Mixture over [v 2, F 2, next F 2]; with `position` over [p 2, v 2, F 2, next F 2];
+    # with `along_motion` over [|v|, f, next f].
     mixture: IgmmConfig = field(default_factory=_default_model)
     along_motion: bool = False
     period_sec: float = 0.005
@@ -56,23 +56,23 @@ class ForceModelConfig:
 
 
 class PlanarImpedance(LeafSystem):
-    """Stiff while its model of the force is bad; soft, with feed-forward, when good.
+    """Impedance control that is stiff while its force model predicts badly, and soft
+    with feed-forward while it predicts well (numerics/planar_impedance.py).
 
-    The model is updated at its own rate, the force at 1 kHz; where both fall on one
-    instant the model comes first. Inputs that are not finite, and a force sensor that
-    is not: the last u is held, or the feed-forward is dropped for full stiffness.
+    The model is updated at its own rate, u at 1 kHz; at a common instant the model is
+    first. While state or x_desired is not finite, u is held; while force is not finite,
+    the stiffness is full, without feed-forward.
 
-    Inputs:  state (4,) p, v; x_desired (6,) p, v, a; force (2,) measured, of the world
+    Inputs:  state (4,) p, v; x_desired (6,) p, v, a; force (2,): measured, of the world
              on the effector [N].
-    Outputs: u (2,) [N]; stiffness (1,) [N/m]; force_predicted (2,) for the next sample
-             of the model, along the motion of now [N]; prediction_error (1,) of the
-             newest sample, as |.| [N], -1 where there was no prediction; trust (1,)
-             lambda; status (1,), a sum: 1 inputs not finite, u held, 2 u at its limit,
-             4 no model yet.
+    Outputs: u (2,) [N]; stiffness (1,) [N/m]; force_predicted (2,): for the model's
+             next sample, along the present motion [N]; prediction_error (1,): |error|
+             of the newest sample [N], -1 without a prediction; trust (1,): lambda;
+             status (1,), a sum: 1 u held, 2 u at its limit, 4 no model yet.
 
-    Args: mass [kg]; force_max, the limit of |u| [N]; knowledge, a mixture from earlier;
-        see numerics/planar_impedance.py.
-    Raises: ValueError that names what is wrong.
+    Args: config; model; mass [kg]; force_max: limit of |u| [N]; knowledge: a mixture
+        learned earlier; period_sec, offset_sec: of u [s].
+    Raises: ValueError that names a setting out of range.
     """
 
     def __init__(
@@ -151,7 +151,7 @@ class PlanarImpedance(LeafSystem):
         stiffness_of(0.0, float(c.stiffness_free), float(c.stiffness_max))
 
     def knowledge(self, context: Context) -> Mixture:
-        """What the model has learned, for the constructor of the next trial."""
+        """The learned mixture, for the constructor in the next trial."""
         return self._model_of(context).mixture
 
     def _model_of(self, context) -> Any:

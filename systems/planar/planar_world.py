@@ -16,21 +16,21 @@ from makebreak.systems.planar.numerics.planar_world import (
 @dataclass
 class PlanarWorldConfig:
     mass: float = 1.0  # [kg]
-    # First and last viscosity [N s/m]; it rises over ramp_sec, from time 0 on.
+    # Initial and final viscosity [N s/m]; it rises over ramp_sec, from time 0 on.
     viscosity: list[float] = field(default_factory=lambda: [0.0, 0.0])
     ramp_sec: float = 6.0
     anchors: list[list[float]] = field(default_factory=list)  # Of the springs [m].
     stiffness: list[float] = field(default_factory=list)  # One per anchor [N/m].
     rest_length: list[float] = field(default_factory=list)  # One per anchor [m].
-    # One per anchor: farther away than this it does not pull [m]. None: it always does.
+    # One per anchor: largest length at which the spring pulls [m]. None: no limit.
     reach: list[float] | None = None
     period_sec: float = 0.001
 
 
 def springs_of(config: PlanarWorldConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Anchors (n, 2) [m], and springs (n, 3) as numerics/planar_world.py has them.
+    """Anchors (n, 2) [m] and springs (n, 3) for numerics/planar_world.py.
 
-    Raises: ValueError that names what is wrong.
+    Raises: ValueError that names a setting out of range.
     """
     c = config
     anchors = np.array(c.anchors, dtype=float).reshape(-1, 2)
@@ -50,18 +50,18 @@ def springs_of(config: PlanarWorldConfig) -> tuple[np.ndarray, np.ndarray]:
 
 
 class PlanarWorld(LeafSystem):
-    """The effector and what pulls at it; see numerics/planar_world.py.
+    """The effector, and the forces of porridge and springs on it
+    (numerics/planar_world.py).
 
-    The update that ends a period comes at t_k - lead_sec and brings the state to t_k,
-    so that whoever reads at t_k reads the state of t_k, and u, held over the period, is
-    what was there at its beginning.
+    The update to the state of t_k happens at t_k - lead_sec, so that systems that read
+    at t_k read the state of t_k, while u is the one from the period's start.
 
-    Inputs:  u (2,) [N], held over each period; not finite counts as zero.
-    Outputs: state (4,) p, v [m], [m/s]; external_force (2,) of the world on the
+    Inputs:  u (2,) [N], held over each period; zero if it is not finite.
+    Outputs: state (4,) p, v [m], [m/s]; external_force (2,): of the world on the
              effector [N].
 
-    Args: state, (4,) the first one.
-    Raises: ValueError that names what is wrong in the config.
+    Args: config; state (4,): the initial one; lead_sec [s].
+    Raises: ValueError that names a setting out of range.
     """
 
     def __init__(self, config: PlanarWorldConfig, state, lead_sec: float = 1e-4):
@@ -134,7 +134,7 @@ class CircleTargetConfig:
 
 
 class CircleTarget(LeafSystem):
-    """Once around a circle about the origin, from rest to rest.
+    """A target that moves once around a circle about the origin, from rest to rest.
 
     Outputs: x_desired (6,) p, v, a [m], [m/s], [m/s2].
     """

@@ -1,1 +1,1 @@
-"""What is seen in Meshcat and pressed there, and contact_probe's truth for scores."""
+"""Views and buttons in Meshcat; contact_probe gives true contact forces for scores."""

@@ -1,4 +1,4 @@
-"""A button in Meshcat that takes a learned residual away from those who use it."""
+"""A button in Meshcat that turns the use of a learned residual off and on."""
 
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import LeafSystem
@@ -7,12 +7,12 @@ ADAPT = "adapt: off, on"
 
 
 class AdaptButton(LeafSystem):
-    """Passes a residual on, or zeros while the button has been pressed an odd number of
-    times. The learner goes on learning; what is known of it (its deviation) stays.
+    """Outputs the residual, or zeros after an odd number of clicks. The learner itself
+    continues to learn.
 
-    Inputs:  r_comp (n,) of the learner [m/s].
-    Outputs: r_comp (n,), what the controllers get [m/s].
-    State: 1 while it is passed on.
+    Inputs:  r_comp (n,): of the learner [m/s].
+    Outputs: r_comp (n,): for the controllers [m/s].
+    State:   1 while the residual is used.
     """
 
     def __init__(self, n_lam: int, meshcat: Meshcat, period_sec: float = 0.05):

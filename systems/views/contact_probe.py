@@ -1,4 +1,4 @@
-"""Ground truth of contacts, for scoring."""
+"""True contact forces, for scoring only."""
 
 from collections.abc import Iterable
 
@@ -16,10 +16,11 @@ from makebreak.systems.numerics.first_calls import first_call
 
 
 class ContactProbe(LeafSystem):
-    """The force between a body and others (point contact), found when it is asked for.
+    """Contact forces between a body and n others (point contact), computed when
+    evaluated.
 
     Inputs:  contact_results (abstract).
-    Outputs: contact_force (4 n,): for each of n others [normal force, force on it xyz
+    Outputs: contact_force (4 n,): for each of the others [normal force, force on it xyz
              in the world] [N]; zeros while they do not touch.
     """
 
@@ -51,14 +52,14 @@ class ContactProbe(LeafSystem):
 
 
 class ContactLoad(LeafSystem):
-    """How much all contacts together push on some bodies, such as an arm and its tool:
-    the sum of the sizes of the forces, so that pushes against each other count (point
-    contact). Contacts among the bodies themselves are left out.
+    """Sum of the magnitudes of all contact forces on some bodies, such as an arm and
+    its tool (point contact). Opposing forces do not cancel; contacts among the bodies
+    themselves are ignored.
 
     Inputs:  contact_results (abstract).
-    Outputs: load (2,): from one other body, and from everything else [N].
+    Outputs: load (2,): from the body `other`, and from everything else [N].
 
-    Args: bodies; other, the body whose contacts are told apart.
+    Args: bodies; other: the body whose contacts are summed separately.
     """
 
     def __init__(self, bodies: Iterable[RigidBody], other: RigidBody):
@@ -85,12 +86,12 @@ class ContactLoad(LeafSystem):
 
 
 class TrueTip(LeafSystem):
-    """Where the tip is.
+    """The true position of the tip.
 
     Inputs:  state (2 n,) of the arm.
     Outputs: tip_position (3,) in the world [m].
 
-    Args: chain, constants of the arm with its tool, as they are in the world.
+    Args: chain: of the arm with its tool in the world.
     """
 
     def __init__(self, chain: SerialChain):
@@ -107,16 +108,16 @@ class TrueTip(LeafSystem):
 
 
 class ToolContactForce(LeafSystem):
-    """The force of all contacts on the tool, found when it is asked for.
+    """The force of all contacts on the tool, computed when evaluated.
 
-    It is the one that makes the joint torques of the contacts, so it takes no part of
-    Drake's contact results, whose copy costs more than a step of the plant. If a link
-    of the arm touches something, too, that is in it.
+    It is computed from the joint torques of the contacts: copying Drake's contact
+    results would take longer than a step of the plant. Contacts of the arm's links
+    contribute to it too.
 
-    Inputs:  state (2 n,) of the arm; contact_torque (n,) of its contacts [N m].
-    Outputs: contact_force (3,) on the tool in the world [N].
+    Inputs:  state (2 n,) of the arm; contact_torque (n,): of all contacts [N m].
+    Outputs: contact_force (3,): on the tool in the world [N].
 
-    Args: chain, constants of the arm with its tool.
+    Args: chain: of the arm with its tool.
     """
 
     def __init__(self, chain: SerialChain):

@@ -1,5 +1,6 @@
 """Meshcat's view of a motion that makes and breaks contact."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,12 +22,14 @@ from makebreak.systems.views.numerics.trail import Trail
 
 _ROOT = "/makebreak/contact"
 _NOWHERE = RigidTransform([0.0, 0.0, -5.0])
-_BESIDE = np.array([0.045, -0.045, 0.06])  # Of the tip, where the mode is seen [m].
-_REGIONS = 6  # Of each kind that can be seen at once.
+_BESIDE = np.array([0.045, -0.045, 0.06])  # From the tip to the ball of the mode [m].
+_REGIONS = 6  # Largest number of regions of each kind that are drawn.
 _KIND_COLORS = {IMPACT: Rgba(0.9, 0.2, 0.2, 0.3), IMPACTLESS: Rgba(0.2, 0.4, 0.95, 0.3)}
+_PLAN = Rgba(0.65, 0.25, 0.75)
 _TARGET, _TRACK, _FORCE = Rgba(0.1, 0.1, 0.2), Rgba(1.0, 0.5, 0.0), Rgba(0.1, 0.1, 0.1)
 _GOOD, _BAD = Rgba(0.3, 0.7, 0.3), Rgba(0.85, 0.25, 0.2)  # Bars.
-# Unknown, free, then the modes in their order, again from the third on.
+# Unknown, free, then the contact modes in their order; further ones repeat from the
+# third colour on.
 _MODE_COLORS = (
     Rgba(1.0, 1.0, 1.0),
     Rgba(0.6, 0.6, 0.6),
@@ -43,9 +46,9 @@ FORCE_SLIDER, SPEED_SLIDER = "contact force [N]", "target speed [mm/s]"
 class ContactViewConfig:
     sigmas: float = 2.0  # Half axes of the regions, in standard deviations.
     force_scale: float = 0.012  # Length of the arrow [m/N].
-    # Peak forces of the trials before, per trial one list [N]: a group of bars each.
+    # Peak forces of earlier trials, one list per trial [N]: a group of bars each.
     peaks: list[list[float]] = field(default_factory=list)
-    peak_limit: float = 8.5  # Higher bars are red [N].
+    peak_limit: float = 8.5  # Bars above it are red [N].
     bars_at: list[float] = field(default_factory=lambda: [0.25, -0.42])  # [m]
     camera: list[float] = field(default_factory=lambda: [1.0, -0.6, 0.5])  # [m]
     period_sec: float = 1.0 / 15.0
@@ -54,11 +57,14 @@ class ContactViewConfig:
 class ContactView(LeafSystem):
     """Draws the regions in which contacts are expected (ellipsoids: red for an impact,
     blue for a change without one), the contact force (an arrow from the tool), the mode
-    (colour of the ball beside the tool), the target path (dark) and the tip's track
-    (orange), and the peak forces of the trials before (bars).
+    (colour of the ball beside the tool), the target path (dark), the tip's track
+    (orange), and the peak forces of earlier trials (bars). The planned path (purple) is
+    drawn before the simulation begins; contacts shift the target path away from it.
 
-    Inputs: contacts (ContactBelief); wrench (6,) on the tool [N], [N m]; ee_pose (7,);
-            mode (1,); phase (6,); optional x_desired (19,), for the target path.
+    Inputs: contacts (ContactBelief); wrench (6,): on the tool [N], [N m]; ee_pose (7,);
+            mode (1,); phase (6,); x_desired (19,), optional: for the target path.
+
+    Args: plan: positions (n, 3) of each piece of the planned path [m].
     """
 
     LOOK_AT = (0.48, 0.0, 0.05)  # [m]
@@ -66,6 +72,7 @@ class ContactView(LeafSystem):
         ("an impact is expected", _KIND_COLORS[IMPACT]),
         ("a change of contact is expected", _KIND_COLORS[IMPACTLESS]),
         ("contact force", _FORCE),
+        ("planned path, before contacts shift it", _PLAN),
         ("target path", _TARGET),
         ("track of the tool", _TRACK),
         ("ball beside the tool: no contact", _MODE_COLORS[1]),
@@ -73,7 +80,11 @@ class ContactView(LeafSystem):
     )
 
     def __init__(
-        self, config: ContactViewConfig, meshcat: Meshcat, offset_sec: float = 0.0
+        self,
+        config: ContactViewConfig,
+        meshcat: Meshcat,
+        offset_sec: float = 0.0,
+        plan: Sequence[np.ndarray] = (),
     ):
         super().__init__()
         self._config, self._meshcat = config, meshcat
@@ -98,6 +109,8 @@ class ContactView(LeafSystem):
                 (f"bars: above {limit}", _BAD),
             ]
         meshcat.SetCameraPose(config.camera, self.LOOK_AT)
+        for k, piece in enumerate(plan):
+            meshcat.SetLine(f"{_ROOT}/plan/{k}", np.asarray(piece).T, 3.0, _PLAN)
         self._target = Trail(meshcat, f"{_ROOT}/target", _TARGET, 2.0)
         self._track = Trail(meshcat, f"{_ROOT}/track", _TRACK)
         for kind, color in _KIND_COLORS.items():
@@ -180,7 +193,7 @@ class ContactView(LeafSystem):
                     self._meshcat.SetTransform(path, _NOWHERE, t)
                     continue
                 half, axes = semi_axes(contacts[i].covariance, self._config.sigmas)
-                # At least a millimetre, so that what is well known is still seen.
+                # At least a millimetre, so that small regions remain visible.
                 half = np.maximum(half, 0.001)
                 X = RigidTransform(RotationMatrix(axes), contacts[i].mean)
                 self._meshcat.SetTransform(path, X, t)

@@ -1,4 +1,4 @@
-"""What the colours of a view mean, and what the controllers do just now."""
+"""A legend in Meshcat: the meaning of the colours, and the controllers' phase."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,25 +12,25 @@ from pydrake.systems.framework import LeafSystem
 from makebreak.systems.views.numerics.text_board import text_board
 
 ROOT = "/makebreak/legend"
-# Of the board's upper left corner as the camera sees it: to the right, up and away, and
-# a line's height. Meshcat sees 37 degrees up and down, and as the page is wide.
+# Position of the board's upper left corner in the camera's frame (right, up, away), and
+# a line's height [m]. Meshcat's field of view is 37 degrees up and down.
 _CORNER, _LINE = np.array([-0.75, 0.62, 1.0]), 0.04
 
 
 @dataclass
 class LegendConfig:
-    lines: Sequence[tuple[str, Rgba]] = ()  # A text, and the colour of what it names.
-    phases: Sequence[str] = ()  # The text of each number of the phase.
-    camera: Sequence[float] = (1.0, -0.6, 0.5)  # From where it is seen [m] ...
+    lines: Sequence[tuple[str, Rgba]] = ()  # Text, and the colour that it explains.
+    phases: Sequence[str] = ()  # Text of each value of the phase.
+    camera: Sequence[float] = (1.0, -0.6, 0.5)  # Position of the view's camera [m].
     look_at: Sequence[float] = field(default_factory=lambda: [0.4, 0.0, 0.1])  # [m]
     period_sec: float = 1.0 / 15.0
 
 
 class Legend(LeafSystem):
-    """A board in Meshcat, at the upper left as the camera sees it first, with what each
-    colour means, and below it the phase. It is in the recording too.
+    """A board in Meshcat at the upper left of the initial view, with the meaning of
+    each colour and the phase. It is part of Meshcat's recording.
 
-    Inputs: phase (1,), a whole number: which of the phases; optional.
+    Inputs: phase (1,), optional: index into config.phases.
     """
 
     def __init__(self, config: LegendConfig, meshcat: Meshcat):
@@ -45,7 +45,7 @@ class Legend(LeafSystem):
             self._draw(path, [(text, None)], len(config.lines) + 0.3)
             meshcat.SetProperty(path, "visible", False)
         if config.phases:
-            self._shown, self._time = -2, np.inf  # What the page shows, since when.
+            self._shown, self._time = -2, np.inf  # Phase on the page, and its time.
             self.DeclarePeriodicPublishEvent(config.period_sec, 0.0, self._publish)
 
     def _draw(self, path, lines, below: float):
@@ -66,7 +66,7 @@ class Legend(LeafSystem):
             raise ValueError(f"camera is at {camera}, expected not where it looks at")
         away /= np.linalg.norm(away)
         right = np.cross(away, [0.0, 0.0, 1.0])
-        if np.linalg.norm(right) < 1e-6:  # Straight down: so Meshcat turns it.
+        if np.linalg.norm(right) < 1e-6:  # Straight down: as Meshcat orients it.
             right = np.array([1.0, 0.0, 0.0])
         right /= np.linalg.norm(right)
         up = np.cross(right, away)
@@ -81,7 +81,7 @@ class Legend(LeafSystem):
         value = self._phase.Eval(context)[0]
         phase = int(value) if np.isfinite(value) else -1
         t = context.get_time()
-        # Where time went back another simulation began, perhaps another recording.
+        # If time went back, another simulation has begun, perhaps another recording.
         is_known = phase == self._shown and t >= self._time
         self._shown, self._time = phase, t
         if not is_known:
@@ -91,6 +91,7 @@ class Legend(LeafSystem):
 
 
 def _on_white(color: Rgba) -> tuple[float, float, float]:
-    alpha = max(color.a(), 0.5)  # What is paler could not be told apart.
+    """The colour as it looks on a white board."""
+    alpha = max(color.a(), 0.5)  # Paler colours could not be distinguished.
     r, g, b = (alpha * c + 1.0 - alpha for c in (color.r(), color.g(), color.b()))
     return r, g, b

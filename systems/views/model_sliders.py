@@ -1,4 +1,4 @@
-"""Sliders in Meshcat that make a controller's model of contact wrong, or right."""
+"""Sliders in Meshcat that change the contact model of a controller."""
 
 from collections.abc import Sequence
 
@@ -11,13 +11,13 @@ FRICTION_MAX, GAP_MAX = 2.0, 15.0  # [-], [mm]
 
 
 class ModelSliders(LeafSystem):
-    """What AnitescuLcsBuilder takes for the friction of all pairs, and what it adds to
-    the distance of the first one. A slider that nobody has moved changes nothing.
+    """Inputs of AnitescuLcsBuilder: the friction of all pairs, and a distance that is
+    added to the first one's gap. A slider that was not moved has no effect.
 
     Outputs: friction (n_pairs,); gap (n_pairs,) [m].
-    State: where both sliders are, NaN for one that nobody has moved.
+    State:   values of both sliders, NaN for one that was not moved.
 
-    Args: friction (n_pairs,), of the pairs as they are configured.
+    Args: friction (n_pairs,): of the configured pairs.
     """
 
     def __init__(
@@ -25,7 +25,7 @@ class ModelSliders(LeafSystem):
     ):
         super().__init__()
         self._friction, self._meshcat = np.array(friction, dtype=float), meshcat
-        # As it comes back: a slider stands on its steps.
+        # As Meshcat returns the values: rounded to the sliders' steps.
         self._first = [
             meshcat.AddSlider(FRICTION, 0.0, FRICTION_MAX, 0.01, self._friction[0]),
             meshcat.AddSlider(GAP, -GAP_MAX, GAP_MAX, 0.1, 0.0),

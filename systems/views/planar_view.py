@@ -7,7 +7,7 @@ from pydrake.geometry import Box, Cylinder, Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import LeafSystem
 
-_HEIGHT = 0.02  # Of all that moves, above the floor [m].
+_HEIGHT = 0.02  # Of moving objects above the floor [m].
 _TRACE_DOTS = 120
 _ROOT = "/makebreak/planar"
 
@@ -19,7 +19,7 @@ _SPRING = Rgba(0.4, 0.4, 0.4)
 class PlanarViewConfig:
     anchors: list[list[float]] = field(default_factory=list)  # Of the springs [m].
     stiffness: list[float] = field(default_factory=list)  # One per anchor [N/m].
-    # First and last viscosity [N s/m], over ramp_sec: how long the bar gets.
+    # Initial and final viscosity [N s/m], shown as a bar that grows over ramp_sec.
     viscosity: list[float] = field(default_factory=lambda: [0.0, 0.0])
     ramp_sec: float = 6.0
     period_sec: float = 1.0 / 30.0
@@ -28,9 +28,9 @@ class PlanarViewConfig:
 class PlanarView(LeafSystem):
     """Shows effector (blue), target (orange) and springs, and the path of both.
 
-    A spring is as thick as it is stiff. The paths are rows of dots, laid down over
-    ramp_sec. In porridge a bar beside the circle is as long as the viscosity is high,
-    0.5 m at 200 N s/m.
+    A spring's thickness grows with its stiffness. The paths are rows of dots, drawn
+    over ramp_sec. In porridge the length of a bar beside the circle shows the
+    viscosity, 0.5 m at 200 N s/m.
 
     Inputs: state (4,) p, v; x_desired (6,) p, v, a.
     """
@@ -88,7 +88,7 @@ class PlanarView(LeafSystem):
         length, bar = 0.001 + 0.5 * c / 200.0, f"{_ROOT}/viscosity"
         place = RigidTransform([0.4, -0.25 + 0.5 * length, _HEIGHT])
         self._meshcat.SetTransform(bar, place, t)
-        # On the object below: a transform sets its own path's scale back to 1.
+        # Scale the object, not its path: a transform resets the scale of its path.
         self._meshcat.SetProperty(f"{bar}/<object>", "scale", [1.0, length, 1.0], t)
 
     def _publish(self, context):

@@ -9,10 +9,10 @@ FORCE, LASTS_SEC = 20.0, 0.2  # [N], [s]
 
 
 class PushButton(LeafSystem):
-    """20 N for 0.2 s after each press; each comes from the next of four sides.
+    """20 N for 0.2 s after each click, each time from the next of four sides.
 
     Outputs: force (3,) in the world [N].
-    State: presses that were seen, and when the last one was [s].
+    State:   number of clicks, and the time of the last one [s].
     """
 
     def __init__(self, meshcat: Meshcat, period_sec: float = 0.02):

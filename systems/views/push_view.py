@@ -1,3 +1,5 @@
+"""Meshcat's view of an object that is pushed to poses."""
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,17 +20,17 @@ _TRACK = Rgba(1.0, 0.5, 0.0)
 @dataclass
 class PushViewConfig:
     height: float = 0.02  # Of the object's frame on the table [m].
-    track_m: float = 0.003  # The track grows where the object has gone so far.
+    track_m: float = 0.003  # Least distance between points of the track [m].
     period_sec: float = 1.0 / 15.0
 
 
 class PushView(LeafSystem):
-    """Meshcat's live view of an object that is pushed: the goal (green) and the object
-    as it is estimated (blue), both as ghosts, and its track since the last goal.
+    """Draws the goal (green) and the estimated object (blue) as ghosts, and its track
+    since the last goal.
 
-    Inputs: goal (3,) = x, y [m], yaw [rad]; x (19,), the estimate, as
-            contact_mpc/numerics/ball_state.py has it; valid (1,): above 0.5 where it is
-            one.
+    Inputs: goal (3,) = x, y [m], yaw [rad]; x (19,): the estimate
+            (contact_mpc/numerics/ball_state.py); valid (1,): above 0.5 if x can be
+            used.
     """
 
     GOAL, MODEL, TRACK = "/makebreak/goal", "/makebreak/model", "/makebreak/track"
@@ -45,8 +47,11 @@ class PushView(LeafSystem):
         parts: Sequence[tuple[Shape, RigidTransform]],
         meshcat: Meshcat,
     ):
-        """Args: parts: the object's shapes as the model has them, each with its pose in
-        the object's frame."""
+        """Args: parts: the modelled object's shapes, each with its pose in the object's
+        frame.
+
+        Raises: ValueError without parts.
+        """
         super().__init__()
         if not parts:
             raise ValueError("parts is empty, expected the object's shapes")
@@ -54,7 +59,7 @@ class PushView(LeafSystem):
         self._goal = self.DeclareVectorInputPort("goal", 3)
         self._x = self.DeclareVectorInputPort("x", N_X)
         self._valid = self.DeclareVectorInputPort("valid", 1)
-        # The goal that it belongs to, and the points (n, 3).
+        # The goal that the track belongs to, and its points (n, 3).
         self._track = self.DeclareAbstractState(
             AbstractValue.Make((np.full(3, np.nan), np.zeros((0, 3))))
         )

@@ -1,3 +1,5 @@
+"""Meshcat's view of a ball that is rolled along a circle."""
+
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,18 +19,18 @@ _MODEL, _RESIDUAL = Rgba(0.3, 0.5, 1.0, 0.25), Rgba(0.2, 0.45, 1.0)
 class RollingViewConfig:
     center: list[float] = field(default_factory=lambda: [0.5, 0.0])  # [m]
     radius: float = 0.1  # Of the path [m].
-    ball_radius: float = 0.0315  # As the model has it [m].
-    gap_scale: float = 10.0  # The bar is so much longer than the gap it shows.
+    ball_radius: float = 0.0315  # Of the model [m].
+    gap_scale: float = 10.0  # Length of the bar over the learned gap.
     period_sec: float = 1.0 / 15.0
 
 
 class RollingView(LeafSystem):
-    """Meshcat's live view of an adaptive roll: the target path (dark), the ball's
-    track (orange), the ball as the model has it (a ghost), and a bar beside the path
-    whose height is the learned residual as a length; a slider shows the same in mm.
+    """Draws the target path (dark), the ball's track (orange), the modelled ball (a
+    ghost), and a bar beside the path whose height shows the learned gap; a slider shows
+    the gap in mm.
 
-    Inputs: p_ball (3,) true position, for the track; x (19,) the estimate, for the
-            ghost; gap (1,) the learned residual times its time step [m].
+    Inputs: p_ball (3,): true position, for the track; x (19,): the estimate, for the
+            ghost; gap (1,): the learned residual times its time step [m].
     """
 
     BAR = "/makebreak/r_comp"
@@ -70,7 +72,7 @@ class RollingView(LeafSystem):
         x, y = self._config.center[0], self._config.center[1] + 0.22
         height = max(self._config.gap_scale * gap, 0.001) if np.isfinite(gap) else 0.001
         self._meshcat.SetTransform(self.BAR, RigidTransform([x, y, height / 2]), t)
-        # On the object below: a transform sets its own path's scale back to 1.
+        # Scale the object, not its path: a transform resets the scale of its path.
         self._meshcat.SetProperty(
             f"{self.BAR}/<object>", "scale", [1.0, 1.0, height], t
         )

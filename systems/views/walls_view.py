@@ -1,4 +1,4 @@
-"""Meshcat's view of where a controller believes two walls to be."""
+"""Meshcat's view of the two walls in a controller's model."""
 
 from dataclasses import dataclass, field
 
@@ -12,9 +12,10 @@ _WALL = Rgba(0.2, 0.45, 1.0, 0.4)
 
 @dataclass
 class WallsViewConfig:
-    # Modelled distance of the wall at +x and of the one at -x from the middle [m].
+    # Modelled distances of the walls at +x and at -x from the middle, for the tip's
+    # centre [m].
     gap: list[float] = field(default_factory=lambda: [0.35, 0.35])
-    tip_radius: float = 0.02  # The walls' faces are so much farther out [m].
+    tip_radius: float = 0.02  # Distance from the tip's centre to a wall in contact [m].
     height: float = 0.5  # Of the walls' centre [m].
     period_sec: float = 1.0 / 30.0
 
@@ -41,7 +42,7 @@ class WallsView(LeafSystem):
         self.DeclarePeriodicPublishEvent(config.period_sec, offset_sec, self._publish)
 
     def _paths(self):
-        return [f"/makebreak/believed_wall_{i}" for i in range(2)]
+        return [f"/makebreak/model_wall_{i}" for i in range(2)]
 
     def _show(self, gap, t):
         faces = (gap[0] + 0.005, -gap[1] - 0.005)

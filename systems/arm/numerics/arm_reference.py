@@ -1,13 +1,13 @@
-"""Between two commands of a slow planner: straight lines and bounded slopes."""
+"""Interpolation between two commands of a slow planner, with bounded rates."""
 
 import numba
 import numpy as np
 
 
 def clip_norm(vector, limit):
-    """vector (n,), shortened to the norm limit if it is longer."""
+    """vector (n,), scaled down to the norm `limit` if it is longer."""
     largest = np.abs(vector).max()
-    if largest > limit:  # So that no square overflows.
+    if largest > limit:  # First by the largest entry, so that no square overflows.
         vector = vector / largest * limit
     size = np.sqrt(vector @ vector)
     return vector if size <= limit else vector * (limit / size)
@@ -15,19 +15,20 @@ def clip_norm(vector, limit):
 
 @numba.njit(cache=True)
 def on_the_line(line, t, period_sec):
-    """Where the reference is at time t [s] on a line that takes period_sec.
+    """The reference at time t [s] on a line that takes period_sec [s].
 
     Args: line: (25,) = [start 12, end 12, time of the start].
-    Returns: (12,); before the line the start, after it the end.
+    Returns: (12,) = [p, v, a, feed-forward force]; the start before the line, the end
+        after it.
     """
-    share = min(max((t - line[24]) / period_sec, 0.0), 1.0)
-    return line[:12] + share * (line[12:24] - line[:12])
+    s = min(max((t - line[24]) / period_sec, 0.0), 1.0)
+    return line[:12] + s * (line[12:24] - line[:12])
 
 
 @numba.njit(cache=True)
 def pose_and_wrench(line, t, period_sec):
-    """The same as x_desired (19,) = [p, quaternion, v, w, a, alpha], unturned, and as
-    wrench (6,), force first: (25,)."""
+    """on_the_line as (25,): x_desired (19,) = [p, quaternion, v, w, a, alpha] without
+    rotation, and wrench (6,), force first."""
     now = on_the_line(line, t, period_sec)
     both = np.zeros(25)
     both[0:3], both[3] = now[0:3], 1.0
@@ -37,9 +38,9 @@ def pose_and_wrench(line, t, period_sec):
 
 
 def no_nearer(p, v, force, nearest, wrist=(0.0, 0.0)):
-    """The same command, none of which leads the wrist nearer to the world's origin,
-    across the table, than nearest [m]: the tip's p (3,) lies at least so far away, and
-    there v (3,) and force (3,) have no part towards the origin.
+    """The command with the wrist kept at least `nearest` [m] from the world's vertical
+    axis: p (3,) is moved outwards, and components of v (3,) and force (3,) towards the
+    axis are removed.
 
     Args: wrist (2,): from the wrist to the tip, seen from above [m].
     """
@@ -53,13 +54,12 @@ def no_nearer(p, v, force, nearest, wrist=(0.0, 0.0)):
 
 
 def next_end(start, target, dp_max, v_max, dv_max, a_max):
-    """Where the line from `start` towards `target` ends.
+    """End of the line from `start` towards `target`, within bounds.
 
     Args: start, target: (12,) = [p, v, a, feed-forward force], each (3,); dp_max: bound
-        on how far p goes [m]; v_max, a_max: bounds on v and a at the end [m/s],
-        [m/s2]; dv_max: on how far v goes [m/s].
-    Returns: (12,), p, v, a within these bounds; start at rest, without force, if target
-        is not finite.
+        of the change of p [m]; v_max, a_max: bounds of v and a [m/s], [m/s2]; dv_max:
+        bound of the change of v [m/s].
+    Returns: (12,); start at rest, without force, if target is not finite.
     """
     if not np.isfinite(target).all():
         return np.concatenate((start[:3], np.zeros(9)))

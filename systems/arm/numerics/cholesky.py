@@ -6,8 +6,8 @@ import numpy as np
 
 @numba.njit(cache=True)
 def cholesky(L, A):
-    """Fills the lower factor L of A (n, n), which may be the same array. Of A the lower
-    half is read. Returns: whether A is positive definite."""
+    """Fills the lower factor L of A (n, n), which may be the same array; only the lower
+    half of A is read. Returns: whether A is positive definite."""
     n = A.shape[0]
     for j in range(n):
         d = A[j, j]
@@ -27,7 +27,7 @@ def cholesky(L, A):
 
 @numba.njit(cache=True)
 def forward_solve(L, b):
-    """In place: b becomes inv(L) b, b (n,)."""
+    """Replaces b (n,) by inv(L) b."""
     for i in range(L.shape[0]):
         s = b[i]
         for k in range(i):
@@ -37,7 +37,7 @@ def forward_solve(L, b):
 
 @numba.njit(cache=True)
 def cholesky_solve(L, b):
-    """In place: b becomes inv(L L') b."""
+    """Replaces b (n,) by inv(L L') b."""
     forward_solve(L, b)
     n = L.shape[0]
     for i in range(n - 1, -1, -1):

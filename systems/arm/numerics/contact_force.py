@@ -1,4 +1,4 @@
-"""The force at a contact of a serial arm, from what it does to the joints."""
+"""The contact force on a serial arm, from the joint torques that it causes."""
 
 import numba
 import numpy as np
@@ -8,7 +8,7 @@ from makebreak.systems.arm.numerics.serial_chain import tip_kinematics
 
 @numba.njit(cache=True)
 def contact_forces(chain, q, torque, offset):
-    """The force on the tool that explains a contact's joint torques, tau = J' f.
+    """The force on the tool that causes a contact's joint torques, tau = J' f.
 
     Args:
         chain: SerialChain of the arm with its tool.
@@ -31,10 +31,10 @@ def contact_forces(chain, q, torque, offset):
 
 @numba.njit(cache=True)
 def tip_wrench(chain, q, torque):
-    """The wrench at the tip that explains a contact's joint torques, tau = J' w.
+    """The wrench at the tip that causes a contact's joint torques, tau = J' w.
 
-    Args: chain, of the arm with its tool, packed; q (n,) [rad]; torque (n,) [N m].
-    Returns: (6,) on the tool, world axes, force first [N], [N m]; zero where torque is.
+    Args: chain: of the arm with its tool, packed; q (n,) [rad]; torque (n,) [N m].
+    Returns: (6,) on the tool, in world axes, force first [N], [N m]; zero if torque is.
     """
     if not np.any(torque):
         return np.zeros(6)

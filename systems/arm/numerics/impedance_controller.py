@@ -1,15 +1,15 @@
-"""Cartesian impedance of a redundant arm: one tick, from measurement to joint torque.
+"""Cartesian impedance control of a redundant arm: one tick of the controller.
 
     F = S (K (x_d - x) + D (v_d - v)) + f_fc + f_ff + Lambda (S a_d - Jdot qdot)
     tau = J' F + bias + N' M (k_q (q_n - q) + k_v (v_n - v))
     N' = I - J' Lambda J inv(M)
     S = I - sum n n',  f_fc = sum n (F_c + k_i integral (F_c - F) dt - D_n n' v)
 
-with the directions n along which force, not motion, is controlled: none, one or two.
-M is the mass matrix with the motors' rotors, so tau is a motor's torque; Lambda is the
-inverse of J inv(M) J'. Stiffness K and damping D are plain N/m and N s/m, not scaled by
-Lambda, which multiplies the reference's acceleration alone. The posture q_n follows the
-tip with the tool upright; v_n is the joint velocity that does so.
+with none, one or two directions n along which force instead of motion is controlled. M
+is the mass matrix with the motors' rotors, so tau is the motors' torque; Lambda is the
+inverse of J inv(M) J'. Stiffness K [N/m] and damping D [N s/m] are not scaled by
+Lambda, which multiplies only the reference's acceleration. The posture q_n follows the
+tip with the tool upright, at the joint velocity v_n.
 
 Source: Khatib, "A unified approach for motion and force control of robot manipulators:
 the operational space formulation" (1987), sections III and V; CC eq. 1 and 4a.
@@ -34,31 +34,31 @@ EFFORT_LIMITED = 4
 RATE_LIMITED = 8
 FORCE_SENSOR_HELD = 16
 
-IK_DAMPING = 0.02  # [m] and [rad]: of the posture's inverse kinematics.
-IK_STEP_MAX = 0.05  # [rad] a joint of the posture moves in one step.
-LIMIT_MARGIN = 0.03  # [rad] that the posture keeps from the joint limits.
+IK_DAMPING = 0.02  # Of the posture's damped inverse kinematics [m], [rad].
+IK_STEP_MAX = 0.05  # Largest change of a joint of the posture in one step [rad].
+LIMIT_MARGIN = 0.03  # Distance of the posture from the joint limits [rad].
 
-# While an encoder gives NaN. The rate is what 1 ms and an encoder's noise allow.
-HOLD_DAMPING = 20.0  # [1/s] at which the arm is slowed down.
-HOLD_SPEED_MAX = 10.0  # [rad/s] A joint was not faster than that, whatever was read.
-HOLD_GAIN = 0.1  # Share of a good encoder's surprise that corrects its joint's speed.
+# While an encoder gives NaN (held_motion):
+HOLD_DAMPING = 20.0  # Rate at which the arm is slowed down [1/s].
+HOLD_SPEED_MAX = 10.0  # Bound of a joint's speed, against wrong readings [rad/s].
+HOLD_GAIN = 0.1  # Gain from a measured position to the predicted speed.
 
-# Of an arm without a spare joint: part of a direction of the task that is its own,
-# below which a pose counts as singular. The tip's inertia along it is the inverse of
-# that part times what it would be alone, and what Lambda makes of Jdot qdot grows so
-# much that it throws a stretching arm about. There it fades, and the spring and the
-# damper, which need no Lambda, remain.
+# For an arm without a redundant joint: a pose is singular if the smallest independent
+# part of a task direction is below this. The tip's inertia along that direction grows
+# with the inverse of the part, and Lambda Jdot qdot would make a stretched arm
+# unstable. The Lambda terms fade there; spring and damper, without Lambda, remain.
 SINGULAR = 0.1
 
-CONTACT_FORCE_MIN = 0.5  # [N] Below it the integral of the force waits.
-SAME_DIRECTION = 0.98  # Cosine above which a direction goes on as the one before.
-ENGAGE_SEC = 0.02  # In which stiffness along a new direction fades.
-# Directions under force control, those being released included: [n (3), force asked
-# for now, integral, weight 0 to 1, D_n, 1 while asked for, n'v filtered].
+CONTACT_FORCE_MIN = 0.5  # Below this measured force the integral is frozen [N].
+SAME_DIRECTION = 0.98  # Cosine above which a direction counts as the one before.
+ENGAGE_SEC = 0.02  # Time in which the stiffness along a new direction fades out.
+# A slot for each direction under force control, also while it is released: [n (3),
+# present target, integral, weight 0 to 1, D_n, 1 while active, n'v filtered].
 N_SLOTS, SLOT = 4, 9
 LEVEL, INTEGRAL, WEIGHT, DAMPING, ACTIVE, SPEED = 3, 4, 5, 6, 7, 8
-# Of n'v [s]. D_n is large, and the encoders' velocity is noisy: without it the noise
-# alone reaches the torque's rate limit. A contact's own frequency is below 20 Hz.
+# Filter of n'v [s]. D_n is large and the encoders' velocity is noisy: without it the
+# noise alone would reach the torque's rate limit. The natural frequency of a contact is
+# below 20 Hz.
 SPEED_FILTER_SEC = 0.003
 
 
@@ -66,12 +66,12 @@ class ForceLaw(NamedTuple):
     """Constants of force control."""
 
     integral_gain: float  # k_i [1/s]
-    integral_max: float  # [N] of either sign.
-    normal_damping: float  # D_n at least [N s/m].
-    closing_speed: float  # [m/s] at which F_c alone would close a gap: F_c / D_n.
-    ramp_sec: float  # In which the force rises to its target.
-    release_sec: float  # In which a direction that is dropped fades.
-    speed_keep: float  # Of the filtered n'v, per tick.
+    integral_max: float  # Bound of the magnitude [N].
+    normal_damping: float  # Lower bound of D_n [N s/m].
+    closing_speed: float  # Largest speed at which F_c alone closes a gap [m/s].
+    ramp_sec: float  # Time in which the force rises to its target.
+    release_sec: float  # Time in which a dropped direction fades out.
+    speed_keep: float  # Factor per tick of the filter of n'v.
 
 
 class Law(NamedTuple):
@@ -81,30 +81,31 @@ class Law(NamedTuple):
     step_max: np.ndarray  # (n,) change of torque in one tick [N m].
     q_lower: np.ndarray  # (n,) [rad]
     q_upper: np.ndarray  # (n,) [rad]
-    q_nominal: np.ndarray  # (n,) posture where the task leaves a choice [rad].
-    R_upright: np.ndarray  # (3, 3) orientation of the tip frame that counts as upright.
+    q_nominal: np.ndarray  # (n,) posture in the null space of the task [rad].
+    R_upright: np.ndarray  # (3, 3) orientation of the tip frame in the posture.
     stiffness: np.ndarray  # (6,) [N/m] x 3, [N m/rad] x 3
     damping: np.ndarray  # (6,) [N s/m] x 3, [N m s/rad] x 3
     force_max: float  # Of spring and damper together [N].
     posture_stiffness: float  # k_q [1/s2]
     posture_damping: float  # k_v [1/s]
     posture_every: int  # Ticks between two steps of the posture.
-    control_orientation: bool  # The task is the full pose, not the position alone.
+    control_orientation: bool  # The task is the full pose, not only the position.
     period: float  # Of a tick [s].
     force: ForceLaw
 
 
 def memory_size(n: int) -> int:
-    """[q_n, last good q, last good pose (7), ticks, has a good pose, has a good q,
-    last good force directions (6) and targets (2), slots (N_SLOTS x SLOT), last v].
+    """Size of the memory: [q_n, last good q, last good pose (7), ticks, has a good
+    pose, has a good q, last good force directions (6) and targets (2), slots (N_SLOTS x
+    SLOT), last v].
 
-    While a sensor is held, the last good q and v are predicted on (held_motion)."""
+    While a sensor is held, q and v are predictions (held_motion)."""
     return 3 * n + 18 + N_SLOTS * SLOT
 
 
 @numba.njit(cache=True)
 def rotation_of(quaternion):
-    """(3, 3) of a quaternion wxyz of any length but 0."""
+    """Rotation (3, 3) of a quaternion wxyz of any length above 0."""
     w, x, y, z = quaternion / np.sqrt(np.sum(quaternion**2))
     R = np.empty((3, 3))
     R[0, 0], R[0, 1], R[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 0.0
@@ -118,7 +119,7 @@ def rotation_of(quaternion):
 
 @numba.njit(cache=True)
 def quaternion_of(R):
-    """wxyz of a rotation (3, 3), w >= 0."""
+    """Quaternion wxyz, w >= 0, of a rotation (3, 3)."""
     q = np.empty(4)
     trace = R[0, 0] + R[1, 1] + R[2, 2]
     best = max(trace, R[0, 0], R[1, 1], R[2, 2])
@@ -137,7 +138,7 @@ def quaternion_of(R):
 
 @numba.njit(cache=True)
 def rotation_error(R_d, R):
-    """Rotation vector (3,) [rad], world axes, that takes R to R_d."""
+    """Rotation vector (3,) in world axes from R to R_d [rad]."""
     E = R_d @ R.T
     q = quaternion_of(E)
     sine = np.sqrt(q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
@@ -148,7 +149,8 @@ def rotation_error(R_d, R):
 
 @numba.njit(cache=True)
 def posture_step(chain, law, q_n, p_tip):
-    """q_n (n,) one damped step nearer to: tip at p_tip (3,), upright, else nominal."""
+    """q_n (n,) after one damped step towards the tip at p_tip (3,), upright; in the
+    null space towards the nominal posture."""
     n = q_n.shape[0]
     p, R, J = tip_kinematics(chain, q_n)
     pull = 0.05 * (law.q_nominal - q_n)
@@ -166,7 +168,7 @@ def posture_step(chain, law, q_n, p_tip):
 
 @numba.njit(cache=True)
 def _damped_inverse(J, y):
-    """J' inv(J J' + damping^2 I) y: joint motion (n,) for a tip motion y (6,)."""
+    """Joint motion (n,) for a tip motion y (6,): J' inv(J J' + damping^2 I) y."""
     A = J @ J.T
     for i in range(6):
         A[i, i] += IK_DAMPING**2
@@ -179,8 +181,8 @@ def _damped_inverse(J, y):
 
 @numba.njit(cache=True)
 def _orthonormal(directions):
-    """Two rows (6,) as orthonormal rows (2, 3); a zero row stays zero, and a second one
-    that (nearly) repeats the first becomes zero."""
+    """Two rows (6,) as orthonormal rows (2, 3). A zero row stays zero; a second row
+    that is (nearly) parallel to the first becomes zero."""
     out = np.zeros((2, 3))
     for k in range(2):
         row = directions[3 * k : 3 * k + 3].copy()
@@ -200,12 +202,13 @@ def _orthonormal(directions):
 
 @numba.njit(cache=True)
 def force_control(law, slots, directions, targets, measured):
-    """One tick of force control.
+    """One tick of force control: updates the slots (N_SLOTS, SLOT) in place.
 
-    Args: slots (N_SLOTS, SLOT), changed in place. directions (6,): two rows n, zero for
-        none; targets (2,) [N]; measured (6,) wrench on the tool [N]: all finite.
-    Returns: nothing; the force that is added along a slot's n is its
-        weight (level + integral - D_n n'v), at least 0 at rest.
+    The force along a slot's n is weight (level + integral - D_n n'v), at least 0 at
+    rest (impedance_torque).
+
+    Args: directions (6,): two rows n, zero for none; targets (2,) [N]; measured (6,):
+        wrench on the tool [N], [N m]; all finite.
     """
     force = law.force
     rows = _orthonormal(directions)
@@ -214,12 +217,13 @@ def force_control(law, slots, directions, targets, measured):
         n = rows[k]
         if np.sum(n**2) == 0.0:
             continue
-        best, likeness = -1, SAME_DIRECTION
+        best, best_cosine = -1, SAME_DIRECTION
         for j in range(N_SLOTS):
-            alike = np.sum(slots[j, :3] * n)
-            if slots[j, WEIGHT] > 0.0 and slots[j, ACTIVE] == 0.0 and alike > likeness:
-                best, likeness = j, alike
-        if best < 0:  # A direction that was not there: in the slot that is least used.
+            cosine = np.sum(slots[j, :3] * n)
+            free = slots[j, WEIGHT] > 0.0 and slots[j, ACTIVE] == 0.0
+            if free and cosine > best_cosine:
+                best, best_cosine = j, cosine
+        if best < 0:  # A new direction takes the slot of the least weight.
             least = np.inf
             for j in range(N_SLOTS):
                 if slots[j, ACTIVE] == 0.0 and slots[j, WEIGHT] < least:
@@ -229,7 +233,7 @@ def force_control(law, slots, directions, targets, measured):
         slot[:3] = n
         slot[ACTIVE] = 1.0
         target = max(targets[k], 0.0)
-        # In proportion, so that the ramp takes the same time whatever the force.
+        # Proportional to the force, so that every ramp takes the same time.
         step = max(target, slot[LEVEL]) * law.period / force.ramp_sec
         slot[LEVEL] += min(max(target - slot[LEVEL], -step), step)
         slot[DAMPING] = max(target / force.closing_speed, force.normal_damping)
@@ -252,15 +256,15 @@ def force_control(law, slots, directions, targets, measured):
 def impedance_torque(
     chain, law, q, v, q_n, x_d, R_d, stiffness, damping, ratio, wrench, slots
 ):
-    """The law, without limits.
+    """The control law, without limits.
 
     Args: chain, law: constants. q, v, q_n (n,) [rad], [rad/s]. x_d (19,) =
-        [p, quaternion (unused), v, w, a, alpha] of the tip in the world; R_d (3, 3)
-        its orientation. stiffness, damping (6,). ratio: 0, or the damping ratio, and
-        then `damping` is the stiffness that it belongs to: along each axis D becomes
-        2 ratio sqrt(damping lambda), lambda = 1/(J inv(M) J')_ii. wrench (6,) fed
+        [p, quaternion (unused), v, w, a, alpha] of the tip in the world; R_d (3, 3):
+        its orientation. stiffness, damping (6,). ratio: 0, or a damping ratio; then
+        `damping` is the stiffness from which D along each axis is computed,
+        D = 2 ratio sqrt(damping lambda), lambda = 1/(J inv(M) J')_ii. wrench (6,): fed
         forward, force first [N], [N m]. slots (N_SLOTS, SLOT) of force_control; their
-        filtered speeds are brought up to date.
+        filtered speeds are updated.
     Returns: tau (n,) [N m] and the tip's position p_WE (3,) [m].
     """
     n = q.shape[0]
@@ -280,10 +284,10 @@ def impedance_torque(
     for i in range(m):
         largest = max(largest, mobility[i, i])
     for i in range(m):
-        mobility[i, i] += 1e-9 * largest  # Near a singular pose Lambda stays finite.
+        mobility[i, i] += 1e-9 * largest  # Keeps Lambda finite near a singular pose.
     L_task = np.zeros((m, m))
     cholesky(L_task, mobility)
-    # A row's pivot over its diagonal: the part of it that is not along the rows before.
+    # A row's pivot over its diagonal: its part that is independent of earlier rows.
     part = 1.0
     for i in range(m):
         part = min(part, L_task[i, i] ** 2 / mobility[i, i])
@@ -301,8 +305,8 @@ def impedance_torque(
     a_ref = np.empty(m)
     a_ref[:3] = x_d[13:16]
     if m == 6:
-        # Explicit damping d is stable while d period < inertia; the wrist's may be
-        # small, so stiffness and damping are lessened together where it is.
+        # Explicit damping d is stable while d period < inertia. The wrist's inertia may
+        # be small: then stiffness and damping are reduced together.
         turning = mobility[3, 3] + mobility[4, 4] + mobility[5, 5]
         most = max(damping[3], damping[4], damping[5]) * turning * law.period
         scale = 1.0 if most < 0.5 else 0.5 / most
@@ -311,7 +315,7 @@ def impedance_torque(
         a_ref[3:] = x_d[16:19]
     for j in range(slots.shape[0]):
         weight = slots[j, WEIGHT]
-        if weight > 0.0:  # Of motion, the part across n; along n, the push.
+        if weight > 0.0:  # Motion control only across n; along n the push.
             n_j = slots[j, :3]
             v_n = np.sum(n_j * twist[:3])
             slots[j, SPEED] = v_n + law.force.speed_keep * (slots[j, SPEED] - v_n)
@@ -321,12 +325,12 @@ def impedance_torque(
             a_ref[:3] -= weight * np.sum(n_j * a_ref[:3]) * n_j
     F += wrench[:m]
 
-    # Posture: the acceleration it asks for, less the part that the tip would feel.
+    # Posture: its acceleration, minus the part that would move the tip.
     follow = np.zeros(6)
     follow[:m] = twist
     v_n = _damped_inverse(s.J, follow)
     qdd = law.posture_stiffness * (q_n - q) + law.posture_damping * (v_n - v)
-    if n <= m:  # The task leaves no choice: the posture would show in Lambda's errors.
+    if n <= m:  # No null space: the posture would only act through errors of Lambda.
         qdd[:] = 0.0
     inertial = a_ref - s.bias_a[:m] - J @ qdd
     cholesky_solve(L_task, inertial)
@@ -337,11 +341,11 @@ def impedance_torque(
 
 @numba.njit(cache=True)
 def held_motion(q, v, q_last, v_last, period):
-    """Where the joints are while some encoders give NaN: predicted with the damping of
-    HOLD_DAMPING that the arm is under, corrected by what is still measured.
+    """Joint positions and velocities while some encoders give NaN: predicted with
+    HOLD_DAMPING, which acts on the arm, and corrected by the measured entries.
 
-    Args: q, v (n,) measured, NaN where nothing is; q_last, v_last (n,) of the tick
-        before, [rad], [rad/s]; period [s].
+    Args: q, v (n,): measured, NaN where an encoder fails; q_last, v_last (n,): of the
+        last tick [rad], [rad/s]; period [s].
     Returns: q (n,), v (n,), finite.
     """
     n = q.shape[0]
@@ -380,8 +384,8 @@ def tick(
 ):
     """One tick of the controller.
 
-    Args: tau (n,) of the last tick; memory as memory_size says; the rest as in
-        impedance_torque and force_control, measured or received: anything may be NaN.
+    Args: tau (n,): of the last tick; memory: of memory_size; others as in
+        impedance_torque and force_control; any of them may contain NaN.
     Returns: tau (n,) within all limits, status (bits), memory.
     """
     n = q.shape[0]
@@ -426,7 +430,7 @@ def tick(
     else:
         status |= REFERENCE_HELD
     if not np.all(np.isfinite(measured)):
-        measured = np.zeros(6)  # Below CONTACT_FORCE_MIN: the integral waits.
+        measured = np.zeros(6)  # Below CONTACT_FORCE_MIN: freezes the integral.
         status |= FORCE_SENSOR_HELD
     slots = memory[2 * n + 18 : -n].reshape(N_SLOTS, SLOT)
 
@@ -448,10 +452,10 @@ def tick(
         )
         if count % law.posture_every == 0:
             memory[:n] = posture_step(chain, law, memory[:n].copy(), p_tip)
-    else:  # Carry the arm, and slow it down: qdd = -HOLD_DAMPING v.
+    else:  # Carry the arm and slow it down: qdd = -HOLD_DAMPING v.
         now = chain_state(chain, q_now, v_now)
         asked = now.bias - HOLD_DAMPING * (now.M @ v_now)
-    if not np.all(np.isfinite(asked)):  # Numbers too large to calculate with.
+    if not np.all(np.isfinite(asked)):  # Overflow.
         asked = chain_state(chain, q_now, np.zeros(n)).bias
         status |= REFERENCE_HELD
     memory[2 * n + 7] = (count + 1) % law.posture_every
@@ -470,7 +474,7 @@ def tick(
 
 @numba.njit(cache=True)
 def _reference(chain, memory, q, x_d, has_pose, n):
-    """x_d, its rotation, and whether it had to be replaced by the last good pose."""
+    """x_d, its rotation, and whether it was replaced by the last good pose."""
     square = np.sum(x_d[3:7] ** 2)
     if np.all(np.isfinite(x_d)) and 0.25 < square < 4.0:
         memory[2 * n : 2 * n + 7] = x_d[:7]
@@ -491,7 +495,7 @@ def packed_tick(
     chain, law, tau, memory, q, v, x_d, stiffness, damping, ratio, wrench,
     directions, targets, measured,
 ):  # fmt: skip
-    """The tick, with chain and law packed (numerics/packed.py)."""
+    """The tick with packed chain and law (packed.py)."""
     return tick(
         chain[0], law[0], tau, memory, q, v, x_d, stiffness, damping, ratio, wrench,
         directions, targets, measured,
@@ -499,10 +503,10 @@ def packed_tick(
 
 
 def warm_up(chain: np.ndarray, law: np.ndarray) -> None:
-    """Compiles the law, so that no tick has to wait for it. Both are packed.
+    """Compiles the tick before the first update. Args: chain, law: packed.
 
-    tau and memory are read-only, as a Context's state is: to the compiler those are
-    arrays of another type.
+    tau and memory are read-only, as a Context's state is: for the compiler read-only
+    arrays are another type.
     """
     n = law["effort_max"].size
     tau, memory = np.zeros(n), np.zeros(memory_size(n))

@@ -1,17 +1,15 @@
-"""Constants of a compiled function in one piece of memory.
+"""Constants of a compiled function in one structured array.
 
-A call from Python into a compiled function takes a tuple of arrays apart, each time:
-some 0.3 us an array, more than many a kernel needs. A packed tuple is one array.
+A call from Python into a compiled function unpacks a tuple of arrays each time, which
+takes some 0.3 us per array, longer than many kernels run. A packed tuple is one array.
 """
 
 import numpy as np
 
 
 def packed(constants) -> np.ndarray:
-    """A NamedTuple of numbers, arrays and such tuples, as one structured array (1,).
-
-    In a compiled function `packed(x)[0]` has the fields of x by the same names.
-    """
+    """A NamedTuple of numbers, arrays and further such tuples as one structured array
+    (1,). In a compiled function `packed(x)[0]` has the fields of x by name."""
     out = np.zeros(1, dtype=_dtype(constants))
     _fill(out[0], constants)
     return out

@@ -1,9 +1,9 @@
 """Kinematics and dynamics of an arm of revolute joints, in world axes.
 
 Mass matrix, Coriolis, centrifugal and gravity torque and the tip's Jacobian in one
-compiled pass (about a tenth of the time of asking a general plant for each of them).
+compiled pass (about a tenth of the time that a general plant takes for them).
 
-Spatial vectors are angular first and taken at the world's origin, so that they add
+Spatial vectors are angular first and refer to the world's origin, so that they add
 without a shift: twist [w, v0], force [n0, f].
 
 Source: Featherstone, "Rigid Body Dynamics Algorithms" (2008): recursive Newton-Euler
@@ -47,8 +47,8 @@ def _cross(out, a, b):
     out[2] = a[0] * b[1] - a[1] * b[0]
 
 
-# Loops of our own: for so few numbers a call of BLAS, or a new array for a sum, costs
-# more than the arithmetic.
+# Explicit loops: for so few numbers a BLAS call, or a new array for a sum, takes longer
+# than the arithmetic.
 @numba.njit(cache=True)
 def _dot(a, b):
     total = 0.0

@@ -11,7 +11,7 @@ from makebreak.systems.arm.numerics.serial_chain import tip_kinematics
 def tip_pose(chain, q):
     """(7,) = [p_WE 3 [m], quaternion wxyz 4 with w >= 0] at joint angles q (n,).
 
-    Args: chain, a SerialChain, packed.
+    Args: chain: a packed SerialChain.
     """
     p, R, _ = tip_kinematics(chain[0], q)
     pose = np.empty(7)
@@ -24,7 +24,7 @@ def tip_pose(chain, q):
 def tip_velocity(chain, q, v):
     """(6,) = [v 3 [m/s], w 3 [rad/s]] of the tip in world axes, at q (n,), v (n,).
 
-    Args: chain, a SerialChain, packed.
+    Args: chain: a packed SerialChain.
     """
     J = tip_kinematics(chain[0], q)[2]
     velocity = np.zeros(6)

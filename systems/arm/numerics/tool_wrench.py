@@ -1,4 +1,4 @@
-"""What acts on a tool from outside, from what its mount carries."""
+"""The external wrench on a tool, from the reaction in its mount."""
 
 import numba
 import numpy as np
@@ -6,12 +6,12 @@ import numpy as np
 
 @numba.njit(cache=True)
 def external_wrench(f_C, t_C, R_WC, weight, p_CM, p_CE):
-    """The wrench on a tool at rest that balances mount and weight, taken at E.
+    """The wrench on a tool at rest that balances mount and weight, taken at the tip E.
 
     Args: f_C, t_C (3,): force [N] and torque [N m] of the mount on the tool at the
-        mount's frame C, in its axes. R_WC (3, 3) that frame's orientation. weight (3,)
-        of the tool [N] in the world, at its centre of mass p_CM (3,); p_CE (3,) the
-        tip: both from C in C's axes [m].
+        mount's frame C, in its axes; R_WC (3, 3): orientation of C; weight (3,): of the
+        tool in the world [N], at its centre of mass p_CM (3,); p_CE (3,): tip. Both are
+        from C in C's axes [m].
     Returns: (6,) force first, in world axes: 0 = f + f_mount + weight, and the same
         for the moments about E.
     """

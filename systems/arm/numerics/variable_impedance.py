@@ -1,21 +1,21 @@
-"""Stiffness and feed-forward of the moment: adaptive, and at changes of contact.
+"""Variable stiffness and feed-forward: adaptive, and at changes of contact.
 
-The base controller is stiff where the forward model is bad, and feeds its prediction
-forward where it is good:
+The base controller is stiff while the forward model predicts badly, and feeds its
+prediction forward while it predicts well:
 
     lambda = 1 - 1 / (1 + exp(-r (eps - eps_0)))                            (CC 4c)
     K_1    = K_free + (1 - lambda) (K_max - K_free),  f_ff = -lambda W      (CC 4b, 4a)
 
 K_1 is K_max while the mode detector collects a batch. The transition-phase controller
 (CC 3.4) has K_2 = K_impact, low, with the damping of K_max, where an impact is
-expected, and K_2 = K_max where the contact changes without one. Between the two
+expected, and K_2 = K_max where the contact changes without one. The two are blended,
 
     u = (1 - alpha) u_1 + alpha u_2                                         (CC 10)
 
-with alpha linear in time over T, both ways. Both laws are linear in K, D and f_ff over
-the same errors, so what is blended here are K and D. D = 2 zeta sqrt(lambda_i K) with a
-mass lambda_i that is not known here; blending D is blending sqrt(K), so the stiffness
-that the damping belongs to is ((1 - alpha) sqrt(K_1) + alpha sqrt(K_max))^2.
+with alpha linear in time over T, in both directions. Both laws are linear in K, D and
+f_ff with the same errors, so blending K and D is enough. D = 2 zeta sqrt(lambda_i K)
+with a mass lambda_i that is not known here; blending D is blending sqrt(K), so the
+damping is computed from the stiffness ((1 - alpha) sqrt(K_1) + alpha sqrt(K_max))^2.
 
 Source: CC sections 3.1, 3.2 (Algorithm 1), 3.4 and 3.5.1.
 """
@@ -36,11 +36,11 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
     REGION,
 )
 
-# Memory: filtered K_1 [N/m], filtered feed-forward (6), alpha, the kind that it blends
-# to, whether there was a tick.
+# Memory: filtered K_1 [N/m], filtered feed-forward (6), alpha, the kind of contact that
+# alpha belongs to, whether there was a tick.
 N_MEMORY = 10
 STIFFNESS, FEEDFORWARD, ALPHA, KIND, STARTED = 0, slice(1, 7), 7, 8, 9
-# Output: K (6), the stiffness that D belongs to (6), f_ff (6), lambda, status.
+# Output: K (6), the stiffness for the damping (6), f_ff (6), lambda, status.
 N_OUTPUT = 20
 BAD_INPUT = 1
 
@@ -54,11 +54,11 @@ class StiffnessLaw(NamedTuple):
     rotational: float
     steepness: float  # r [1/N]
     midpoint: float  # eps_0 [N]
-    decay: float  # Of K_1 and f_ff per tick, in [0, 1): a first-order filter.
+    decay: float  # First-order filter of K_1 and f_ff: factor per tick, in [0, 1).
     blend_ticks: float  # T in ticks.
     feedforward: bool
-    transition: bool  # False: the base controller throughout.
-    decay_handover: float = 0.0  # Of f_ff, while a model is handed over.
+    transition: bool  # False: the base controller alone.
+    decay_handover: float = 0.0  # Filter of f_ff while a model is handed over.
 
 
 @numba.njit(cache=True)
@@ -79,11 +79,13 @@ def tick(law, memory, error, predicted, collecting, phase, handing_over=0.0):
 
     Args:
         law: StiffnessLaw. memory (N_MEMORY,), zero at first.
-        error: eps [N]. predicted: W (6,), the wrench on the tool that is expected [N],
-            [N m]. collecting: 1 while a batch is collected, else 0. phase (N_PHASE,).
-            Anything may be NaN: then K_max, or no feed-forward, or the base controller.
-        handing_over: 1 while W is a mean that was learned before, for a place that is
-        reached now, and no last sample with its noise: it is hardly filtered.
+        error: prediction error eps [N].
+        predicted: W (6,), predicted wrench on the tool [N], [N m].
+        collecting: 1 while a batch is collected, else 0.
+        phase: (N_PHASE,).
+        handing_over: 1 while W is the mean of an earlier model for the place that is
+            reached now, which is filtered less than a single noisy prediction.
+        NaN in an input gives K_max, no feed-forward, or the base controller.
     Returns: memory, and output (N_OUTPUT,).
     """
     memory = memory.copy()
@@ -106,14 +108,15 @@ def tick(law, memory, error, predicted, collecting, phase, handing_over=0.0):
     keep = law.decay if memory[STARTED] > 0.0 else 0.0
     memory[STARTED] = 1.0
     memory[STIFFNESS] = K_1 + keep * (memory[STIFFNESS] - K_1)
-    told = np.all(np.isfinite(phase))
-    if not told:
+    phase_known = np.all(np.isfinite(phase))
+    if not phase_known:
         status = BAD_INPUT
-    # A one-step model follows an impact as it would follow friction: fed forward, it
-    # would push on against what is being met. So it is held where one is expected.
+    # A one-step model follows the force of an impact as it follows friction: fed
+    # forward, its prediction would push harder against the new surface. So it is held
+    # where an impact is expected.
     waiting = (
         law.transition
-        and told
+        and phase_known
         and phase[PHASE_STAGE] == REGION
         and phase[PHASE_KIND] == IMPACT
     )
@@ -122,13 +125,13 @@ def tick(law, memory, error, predicted, collecting, phase, handing_over=0.0):
         keep_force = min(keep, law.decay_handover)
     if not waiting:
         for i in range(6):
-            wanted = -weight * predicted[i] if law.feedforward and usable else 0.0
+            force = -weight * predicted[i] if law.feedforward and usable else 0.0
             at = FEEDFORWARD.start + i
-            memory[at] = wanted + keep_force * (memory[at] - wanted)
+            memory[at] = force + keep_force * (memory[at] - force)
 
     kind = NO_CONTACT
     if (
-        told
+        phase_known
         and law.transition
         and (phase[PHASE_STAGE] == ENTER or phase[PHASE_STAGE] == REGION)
     ):
@@ -138,7 +141,7 @@ def tick(law, memory, error, predicted, collecting, phase, handing_over=0.0):
         memory[KIND] = kind
     if kind != NO_CONTACT and memory[KIND] == kind:
         memory[ALPHA] = min(memory[ALPHA] + step, 1.0)
-    else:  # Back to the base controller, before it may go to another one.
+    else:  # Blend back to the base controller before blending to another kind.
         memory[ALPHA] = max(memory[ALPHA] - step, 0.0)
     if memory[ALPHA] < 1e-9:
         memory[ALPHA] = 0.0
@@ -157,7 +160,7 @@ def tick(law, memory, error, predicted, collecting, phase, handing_over=0.0):
 
 
 def warm_up(law: StiffnessLaw) -> None:
-    """Compiles the tick, for a memory that is read-only as a Context's state is."""
+    """Compiles the tick for a read-only memory, as a Context's state is."""
     memory = np.zeros(N_MEMORY)
     memory.setflags(write=False)
     phase = np.zeros(N_PHASE)

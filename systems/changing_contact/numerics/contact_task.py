@@ -73,6 +73,10 @@ class ExpectedContact:
     impacts: np.ndarray = None  # type: ignore[assignment]
     from_mode: int = UNKNOWN_MODE  # Of an IMPACTLESS change.
     to_mode: int = UNKNOWN_MODE
+    # An impact from which the position of this one follows, as where both surfaces
+    # belong to bodies of known sizes: (its segment, the distance from it along
+    # `direction` [m], the standard deviation of that distance [m]). Empty: none.
+    known_from: tuple[float, ...] = ()
 
     def __post_init__(self):
         if self.impacts is None:
@@ -93,6 +97,13 @@ class ExpectedContact:
             value = value.reshape(shape)
             value.setflags(write=False)
             object.__setattr__(self, name, value)
+        known = np.array(self.known_from, dtype=float).ravel()
+        if known.size not in (0, 3) or not (np.isfinite(known).all()):
+            raise ValueError(
+                f"expected contact: known_from is {self.known_from}, expected none or "
+                "three numbers: segment, distance, standard deviation"
+            )
+        object.__setattr__(self, "known_from", tuple(known.tolist()))
         C = self.covariance
         if abs(C - C.T).max() > 1e-9 * max(abs(C).max(), 1e-12) or not np.all(
             np.linalg.eigvalsh(C) > 0.0

@@ -88,6 +88,41 @@ def tick(law, memory, wrench, velocity, direction, phase):
     return m, force
 
 
+def fastest_impact(force, stiffness, mass, delay, rate) -> float:
+    """The highest speed [m/s] at which an impact stays below `force`, if from `delay`
+    after the touch on the arm brakes harder and harder, at its limit.
+
+    A mass on a spring, m x'' = -k x - r max(t - t_d, 0), x(0) = 0, x'(0) = v: no law of
+    control can have a lower peak k x, whatever it knows.
+
+    Args: force, the peak allowed [N]; stiffness k [N/m]; mass m [kg]; delay t_d of
+        sensor and control [s]; rate r at which the braking force can grow [N/s].
+    """
+    w = np.sqrt(stiffness / mass)
+    s = np.linspace(
+        0.0, np.pi / w, 4001
+    )  # Since t_d; the peak is within half a period.
+
+    def peak(v):
+        if w * delay >= 0.5 * np.pi:
+            return v / w
+        x, speed = v / w * np.sin(w * delay), v * np.cos(w * delay)
+        ramp = rate / stiffness
+        out = x * np.cos(w * s) + (speed + ramp) / w * np.sin(w * s) - ramp * s
+        return float(out.max())
+
+    low, high = 0.0, force / np.sqrt(stiffness * mass)
+    while stiffness * peak(high) < force:
+        high *= 2.0
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        if stiffness * peak(middle) < force:
+            low = middle
+        else:
+            high = middle
+    return float(low)
+
+
 def warm_up(law: ReflexLaw) -> None:
     """Compiles the tick, for a memory that is read-only as a Context's state is."""
     memory = np.zeros(N_MEMORY)

@@ -486,6 +486,7 @@ def save_pattern(pattern: MotionPattern, path: str | Path) -> None:
 
 # --- Demonstrations.
 
+SLOWEST = 0.002  # [m/s]: a tip that is slower counts as standing.
 AXES = tuple(sign * row for row in np.eye(3) for sign in (1.0, -1.0))
 
 
@@ -551,7 +552,7 @@ def pattern_from_demonstration(
     p, r, f = smooth(X[:, :3]), smooth(turn.as_rotvec()), smooth(F)
     v = np.gradient(p, dt, axis=0)
     speed = np.linalg.norm(v, axis=1)
-    moving = speed > 0.1 * speed.max()
+    moving = speed > max(0.02 * speed.max(), SLOWEST)
     d = v / np.maximum(speed, 1e-9)[:, None]
     pressed = np.zeros((len(grid), len(normals)), dtype=bool)
     for i, normal in enumerate(normals):

@@ -5,13 +5,14 @@ z obey the complementarity, z obeys the dynamics, and w drives them together. A 
 
     1. z <- argmin  sum (x - x_desired)'Q(x - x_desired) + (u - u_prev)'R(u - u_prev)
                         + |z - (delta - w)|^2_G  subject to dynamics, x_0, bounds
-       (c3_qp.py; the last knot's state is weighed by Q_N)
+       (c3_qp.py, c3_bounds.py; the last knot's state is weighed by Q_N)
     2. delta <- projection of z + w, knot by knot (c3_projections.py)
     3. w <- (w + z - delta) / rho,  G <- rho G
 
 and after the last round step 1 once more gives the plan (for C3+ with the target delta
 instead of delta - w). Where u does not act on the gap (H = 0), lam_0 follows from x_0
-alone and is fixed beforehand.
+alone and is fixed beforehand. c3_admm.py has these rounds; here are the problem, its
+checks, and what comes before and after the rounds.
 
 Source: Aydinoglu, Wei, Huang, Posa, arXiv:2304.11259, algorithm 1; ACI-MPC section IV.
 docs/c3.md lists every choice in which implementations differ.
@@ -23,25 +24,23 @@ from numbers import Integral
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from makebreak.systems.contact_mpc.numerics.c3_admm import (
+    FAILURES,
+    C3Failure,
+    admm,
+    admm_plus,
+    compiled_once,
+    scaled_model,
+)
+from makebreak.systems.contact_mpc.numerics.c3_plan import Plan, WarmStart
 from makebreak.systems.contact_mpc.numerics.c3_polish import polish
 from makebreak.systems.contact_mpc.numerics.c3_projections import (
-    FAILED,
     ExactProjection,
     PlusProjection,
     Projection,
     QpProjection,
-    project,
-    project_plus,
     projection_matrices,
-)
-from makebreak.systems.contact_mpc.numerics.c3_qp import (
-    factor,
-    new_factor,
-    solve,
-    solve_bounded,
-    within,
 )
 from makebreak.systems.contact_mpc.numerics.lcp import SOLVED, solve_lcp_kernel
 from makebreak.systems.contact_mpc.numerics.lcs import (
@@ -58,10 +57,6 @@ from makebreak.systems.contact_mpc.numerics.orientation_cost import (
     orientation_quadratic,
     squared_angle,
 )
-
-
-class C3Failure(RuntimeError):
-    """A solve that has no result, with the reason: bounds, an LCP, an indefinite QP."""
 
 
 def _required() -> Any:
@@ -118,101 +113,6 @@ class C3Bounds:
     u_upper: np.ndarray | None = None  # (n_u,) [N]
     x_lower: np.ndarray | None = None  # (n_x,) [SI]
     x_upper: np.ndarray | None = None  # (n_x,) [SI]
-
-
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """What C3 intends; u obeys its bounds exactly, x to 1e-6 of their size.
-
-    A polished plan is the LCS's own rollout of u, of which C3 knew an approximation:
-    lam is exact, and x breaches its bounds where that approximation hid it.
-    """
-
-    x: np.ndarray  # (N + 1, n_x) [SI]
-    u: np.ndarray  # (N, n_u) [N]
-    lam: np.ndarray  # (N, n_lam) [N]; complementary only as far as ADMM got.
-    status: int = 0  # 0: of this tick. Else the reason why it is an older one.
-    time: float | None = None  # Of x[0] [s]; None: unknown, or no plan has been made.
-    dt: float = 0.0  # Between knots [s].
-    # Of all rounds' knots, those whose exact projection ended at its nodes_max.
-    cut_projections: int = 0
-
-    def __post_init__(self):
-        for name in ("x", "u", "lam"):
-            getattr(self, name).setflags(write=False)
-
-    def at(self, times):
-        """x (n, n_x) and u (n, n_u) at times (n,) [s]: x linear between the knots and
-        still beyond the last, u held from each knot to the next and beyond the last.
-
-        Raises: ValueError where the plan has no time.
-        """
-        if self.time is None or not self.dt > 0.0:
-            raise ValueError(
-                f"Plan: time is {self.time} and dt {self.dt}, expected a plan in time"
-            )
-        N = len(self.u)
-        # Times are sums of periods: their rounding must not delay a knot by one.
-        knots = (np.asarray(times, float) - self.time) / self.dt + 1e-6
-        before = np.clip(np.floor(knots).astype(int), 0, N - 1)
-        share = np.clip(knots - before, 0.0, 1.0)[:, None]
-        x = (1.0 - share) * self.x[before] + share * self.x[before + 1]
-        return x, self.u[before]
-
-
-@dataclass(frozen=True, eq=False)
-class WarmStart:
-    """A solve's memory; the lam and eta parts are in newtons and m/s, not scaled."""
-
-    u: np.ndarray  # (N, n_u) last inputs, for the input-change penalty [N]
-    delta: np.ndarray  # (N, n_z)
-    w: np.ndarray  # (N, n_z)
-
-    def shifted(self, knots: float, contacts=None) -> "WarmStart":
-        """delta and w moved ahead in time by knots (0 .. 1), linear between knots.
-
-        Args: contacts: (of, to, starts). The contacts that the forces belonged to at
-            each knot and belong to now, (N, n_lam) each, and where in z the entries per
-            force begin. What is known of a force goes with its contact; of a contact
-            that is new it is zero. None: they are the same.
-        """
-
-        def ahead(a):
-            after = np.vstack([a[1:], a[-1:]])
-            if contacts is not None:
-                of, to, starts = contacts
-                a = moved_with_contacts(a, of, to, starts)
-                of_after = np.vstack([of[1:], of[-1:]])
-                after = moved_with_contacts(after, of_after, to, starts)
-            return (1.0 - knots) * a + knots * after
-
-        return WarmStart(self.u, ahead(self.delta), ahead(self.w))
-
-
-def moved_with_contacts(a, of, to, starts):
-    """a (N, n_z), whose rows' entries per force belong to the contacts of (N, n_lam),
-    for the contacts to (N, n_lam); starts: where these entries begin in a row.
-
-    The forces of a contact keep their order in it.
-    """
-    if (of == to).all():
-        return a
-    moved, n_lam = a.copy(), of.shape[1]
-    for k in np.flatnonzero((of != to).any(axis=1)):
-        old = {key: i for i, key in enumerate(_in_their_contacts(of[k]))}
-        came_from = [old.get(key, -1) for key in _in_their_contacts(to[k])]
-        for start in starts:
-            entries = np.append(a[k, start : start + n_lam], 0.0)
-            moved[k, start : start + n_lam] = entries[came_from]
-    return moved
-
-
-def _in_their_contacts(contact):
-    """(its contact, its place in it) of each force."""
-    seen: dict = {}
-    for number in contact.tolist():
-        seen[number] = seen.get(number, -1) + 1
-        yield number, seen[number]
 
 
 class C3Problem:
@@ -425,14 +325,6 @@ def _diagonal(name, weight):
     return _read_only(weight)
 
 
-# What _qp_step returns beside SOLVED.
-NOT_CONVEX, INFEASIBLE = 1, 2
-_FAILURES = {
-    NOT_CONVEX: "the QP is not strictly convex, or its numbers are not finite",
-    INFEASIBLE: "no plan meets the bounds",
-}
-
-
 def solve_c3(
     lcs: LCS | Sequence[LCS],
     x0,
@@ -542,10 +434,10 @@ def solve_c3(
             *model, *weights, bounds, p.U, *given, delta, w, o.rounds, o.rho
         )
         if status != SOLVED:
-            raise C3Failure(_FAILURES[status])
+            raise C3Failure(FAILURES[status])
     else:
         lcp = p.projection, p.U, (E, F, H, c), matrices
-        x, v, delta, w, inputs, cut = _admm(
+        x, v, delta, w, inputs, cut = admm(
             model, weights, bounds, given, delta, w, o, lcp
         )
     u, lam = np.ascontiguousarray(v[:, p.n_lam :]), v[:, : p.n_lam] * scale
@@ -610,173 +502,6 @@ def _stacked(models, name):
     if len(models) == 1:
         return compiled_once(np.ascontiguousarray(getattr(models[0], name))[None])
     return compiled_once(np.array([getattr(m, name) for m in models]))
-
-
-def compiled_once(a):
-    """a, read-only: to the compiler what may be written is another type, for which it
-    would compile everything once more."""
-    a = a.view()
-    a.setflags(write=False)
-    return a
-
-
-def _admm(model, weights, bounds, given, delta, w, options, lcp):
-    """The rounds of C3, and the last QP: x, v, delta, w, every QP's u, and how many
-    projections were cut short.
-
-    Args: model, weights, bounds as of _qp_step; given: h, x0, lam0 of it; lcp: what
-        `project` needs beside z and delta.
-    Raises: C3Failure.
-    """
-    (Q, R, Q_N, G), (h, x0, lam0) = weights, given
-    (N, n_z), n_lam = delta.shape, model[2].shape[1]
-    sides = np.zeros((N + 1, n_lam + len(R) + len(Q_N)), np.int64)
-
-    def qp_step(G, target):
-        x, v = np.empty((N + 1, len(Q_N))), np.empty((N, n_lam + len(R)))
-        z = np.empty((N, n_z))
-        status = _qp_step(
-            model, (Q, R, Q_N, G), bounds, (h, target, x0, lam0), (z, x, v, sides)
-        )
-        if status != SOLVED:
-            raise C3Failure(_FAILURES[status])
-        return z, x, v
-
-    projection, U, arrays, matrices = lcp
-    K, inputs, cut = len(matrices), np.empty((options.rounds + 1, N, len(R))), 0
-    for r in range(options.rounds):
-        z, _, v = qp_step(G, delta - w)
-        inputs[r] = v[:, n_lam:]
-        delta = np.empty((N, n_z))
-        for k in range(K):
-            knots = slice(None) if K == 1 else slice(k, k + 1)
-            arrays_k = tuple(a[k] for a in arrays)
-            goal = (z + w)[knots]
-            got = project(projection, goal, U, arrays_k, matrices[k], delta[knots])
-            if got == FAILED:
-                raise C3Failure("the projection has no solution")
-            cut += got
-        w = (w + z - delta) / options.rho
-        G = compiled_once(options.rho * G)
-    _, x, v = qp_step(G, delta - w)
-    inputs[-1] = v[:, n_lam:]
-    return x, v, delta, w, inputs, cut
-
-
-@njit(cache=True)
-def scaled_model(A, B, D, d, E, F, H, c, scale):
-    """The LCS in lam / scale: the model of _qp_step; E, F, H; whether H is not zero.
-
-    All arrays have the knots first: one for all, or N.
-    """
-    K, n_x, n_lam = D.shape
-    n_v = n_lam + B.shape[2]
-    AB, C = np.empty((K, n_x, n_v + n_x)), np.empty((K, n_lam, n_v + n_x))
-    E, F, H = E / scale, F.copy(), H / scale
-    AB[:, :, :n_lam], AB[:, :, n_lam:n_v], AB[:, :, n_v:] = D * scale, B, A
-    C[:, :, :n_lam], C[:, :, n_lam:n_v], C[:, :, n_v:] = F, H, E
-    pushes = False
-    for number in H[0].flat:
-        pushes |= number != 0.0
-    return (AB, d.copy(), C, c / scale), E, F, H, pushes
-
-
-@njit(cache=True)
-def admm_plus(AB, d, C, c, Q, R, Q_N, G, bounds, U, h, x0, lam0, delta, w, rounds, rho):
-    """The same for C3+, compiled as a whole; the first result is _qp_step's status."""
-    (N, n_z), n_lam = delta.shape, C.shape[1]
-    model = AB, d, C, c
-    x, v = np.empty((N + 1, len(Q_N))), np.empty((N, n_lam + len(R)))
-    z, sides = np.empty((N, n_z)), np.zeros((N + 1, AB.shape[2]), np.int64)
-    inputs = np.zeros((rounds + 1, N, len(R)))
-    for r in range(rounds):
-        status = _qp_step(
-            model, (Q, R, Q_N, G), bounds, (h, delta - w, x0, lam0), (z, x, v, sides)
-        )
-        if status != SOLVED:
-            return status, x, v, delta, w, inputs
-        inputs[r] = v[:, n_lam:]
-        delta = np.empty((N, n_z))
-        project_plus(z + w, U, len(Q_N), n_lam, delta)
-        w = (w + z - delta) / rho
-        G = rho * G
-    status = _qp_step(
-        model, (Q, R, Q_N, G), bounds, (h, delta, x0, lam0), (z, x, v, sides)
-    )
-    inputs[rounds] = v[:, n_lam:]
-    return status, x, v, delta, w, inputs
-
-
-@njit(cache=True)
-def _qp_step(model, weights, bounds, given, found):
-    """One QP of C3; fills found and returns SOLVED, NOT_CONVEX or INFEASIBLE.
-
-    Args:
-        model: AB = [D B A], d, C = [F H E], c, each (K, ...) with K = 1 or N.
-        weights: Q (1 or N, n_x, n_x), R, Q_N and the diagonal G.
-        bounds: lower, upper over [lam, u, x]; None where there are none. (That is
-            another type, for which the methods with bounds are not compiled.)
-        given: h (N + 1, n) the linear term of the planning cost over [lam, u, x],
-            target (N, n_z) of the consensus, x0, lam0 (empty: free).
-        found: z (N, n_z), x (N + 1, n_x), v = [lam, u] (N, n_v), overwritten; sides,
-            the active bounds, from the last round to the next (solve_bounded).
-    """
-    AB, d, C, c = model
-    Q, R, Q_N, G = weights
-    h_plan, target, x0, lam0 = given
-    z, x, v, sides = found
-    K, n_x, n = AB.shape
-    n_lam, n_v, n_z, N = C.shape[1], n - n_x, G.size, v.shape[0]
-    i_eta, plus = n, n_z > n
-    # Stage cost and linear term: the planning cost, and |z - target|^2_G with
-    # eta = C [v, x] + c put in.
-    K_T = max(K, len(Q))
-    T, h = np.zeros((K_T, n, n)), h_plan.copy()
-    T[:, n_lam:n_v, n_lam:n_v] = R
-    for k in range(K_T):
-        T[k, n_v:, n_v:] = Q[k % len(Q)]
-    for i in range(n):
-        at = n_x + i if i < n_v else i - n_v  # Of [v, x] in z = [x, v, eta].
-        for k in range(K_T):
-            T[k, i, i] += G[at]
-        for k in range(N):
-            h[k, i] += G[at] * target[k, at]
-    if plus:
-        for k in range(K_T):
-            for m in range(n_lam):
-                for i in range(n):
-                    a = C[k % K, m, i] * G[i_eta + m]
-                    if a != 0.0:
-                        for j in range(n):
-                            T[k, i, j] += a * C[k % K, m, j]
-        for k in range(N):
-            for m in range(n_lam):
-                a = G[i_eta + m] * (target[k, i_eta + m] - c[k % K, m])
-                for i in range(n):
-                    h[k, i] += a * C[k % K, m, i]
-    fac = new_factor(AB, d, N)
-    if not factor(fac, T, Q_N, np.zeros((0, 0)), lam0.size):
-        return NOT_CONVEX
-    solve(fac, h, x0, lam0, x, v)
-    if bounds is not None:
-        lower, upper = bounds
-        if not within(x, v, lower, upper):
-            if not solve_bounded(fac, T, Q_N, h, x0, lam0, lower, upper, sides, x, v):
-                return INFEASIBLE
-    for k in range(N):
-        z[k, :n_x] = x[k]
-        z[k, n_x:i_eta] = v[k]
-        if plus:
-            for m in range(n_lam):
-                total = c[k % K, m]
-                for i in range(n_v):
-                    total += C[k % K, m, i] * v[k, i]
-                for i in range(n_x):
-                    total += C[k % K, m, n_v + i] * x[k, i]
-                z[k, i_eta + m] = total
-    if not (np.isfinite(x).all() and np.isfinite(v).all()):
-        return NOT_CONVEX
-    return SOLVED
 
 
 def plan_cost(lcs: LCS | Sequence[LCS], x0, u, x_desired, problem: C3Problem) -> float:

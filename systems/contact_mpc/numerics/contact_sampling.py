@@ -30,12 +30,12 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
     V_BALL,
     V_TIP,
 )
-from makebreak.systems.contact_mpc.numerics.c3_mpc import (
-    C3Problem,
+from makebreak.systems.contact_mpc.numerics.c3_admm import (
     admm_plus,
     compiled_once,
     scaled_model,
 )
+from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Problem
 from makebreak.systems.contact_mpc.numerics.c3_polish import polish
 from makebreak.systems.contact_mpc.numerics.lcp import SOLVED, solve_lcp_kernel
 

@@ -1,19 +1,19 @@
 """What the tip has to do to roll a ball along a circle: push, lift, go back, land.
 
-A tip on top of a rolling ball moves twice as fast as the ball and so leaves it in
-front. The task therefore alternates between
+A tip on top of a rolling ball moves twice as fast as the ball, so it runs ahead of it
+and has to go back. The task therefore alternates between
 
-    ROLL        the tip follows C3, which pushes the ball along the path,
+    ROLL        the tip follows C3, which pushes the ball along the path.
     REPOSITION  the tip lifts, passes over the ball and comes down behind it, on
-                quintics in time that end where the ball is expected to be,
-    APPROACH    from where the ball's surface may be, as far as the uncertainty of its
-                height goes, down to where it is believed to be, slowly, and over as
-                soon as something is felt. Where little is known of the surface, or the
-                ball does not coast as a ball does, down to where it may be at least,
-    WAIT        the ball has not been seen for as long as it takes to go 20 mm
-                (unseen_drift), or what is measured cannot be used: the tip lifts, and
-                nothing is pushed. The arm may hide the ball itself, so the tip then
-                withdraws until it is seen.
+                quintics in time that end where the ball is expected to be.
+    APPROACH    the last part of the way down, slowly: from the highest place where the
+                surface may be to where it is believed to be. It ends as soon as the tip
+                feels something. Where little is known of the surface, or the ball does
+                not coast, it goes on to the lowest place where the surface may be.
+    WAIT        the ball has not been seen for the time in which it may have gone 20 mm
+                (unseen_drift), or the measurement cannot be used. The tip lifts and
+                pushes nothing. Since the arm itself may hide the ball, the tip then
+                withdraws until the ball is seen.
 
 Source: ACI-MPC VII-B describes the behaviour (a push, then a new push from behind);
 times and distances are ours (docs/ball_rolling.md).
@@ -35,19 +35,20 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
 
 ROLL, REPOSITION, WAIT, APPROACH = 0, 1, 2, 3
 LOOK_AHEAD = 0.35  # A push is directed at the point so far along the circle [rad].
-APPROACH_PLAN = (
-    0.1  # The approach is planned at least so far ahead, seen from above [s].
-)
-APPROACH_SLOPE, APPROACH_STOP = 1.5, 0.3  # To its speed, and at its end [m/s2].
-REACH = 0.015  # The ball's target is at most so far away; a tip that were to go further
-# at once would slip over the ball and leave it behind [m].
-
+# On the way down the tip aims at where the ball will be so much later [s].
+APPROACH_PLAN = 0.1
+# Acceleration to the speed of the approach, and deceleration at its end [m/s2].
+APPROACH_SLOPE, APPROACH_STOP = 1.5, 0.3
+# The ball's target is at most so far away [m]: with a target further off the tip would
+# slip over the ball and leave it behind.
+REACH = 0.015
 WITHDRAW_ACCELERATION = 1.0  # [m/s2]
-LAND_CHANGE = 0.06  # More change of velocity than that of coasting [m/s].
-SPEED_SEC = 0.15
-GLIMPSE_SEC = 0.1  # A ball seen for a shorter time has no velocity yet.
-
-SHIFT_MAX = 0.008  # The aimed-at circle differs from the path by at most this [m].
+# With so much change of velocity beyond coast_change the tip lands at half the usual
+# distance behind the ball's top [m/s].
+LAND_CHANGE = 0.06
+SPEED_SEC = 0.15  # The speed of a hidden ball is a mean over this time [s].
+GLIMPSE_SEC = 0.1  # The velocity of a ball that was seen for less is not known [s].
+SHIFT_MAX = 0.008  # The circle aimed at differs from the path by at most this [m].
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,19 +104,17 @@ class TaskState:
     z_start: float = 0.0  # Height and climb where the phase began [m], [m/s].
     vz_start: float = 0.0
     tare: float = 0.0  # Vertical force on the tip where the approach began [N].
-    # Whether the tip has to feel for the ball: its approach goes on below the believed
-    # surface; and after a ball that does not coast, its push is longer.
+    # Whether the tip has to feel for the ball: the approach goes on below where the
+    # surface is believed to be, and the push of a ball that does not coast is longer.
     feel: bool = False
-    stretch: float = 1.0  # How much longer this reposition takes than the usual one.
-    # For how long the ball has been seen, or has not been seen; how fast it was when it
-    # was last seen for longer than GLIMPSE_SEC, as a mean over SPEED_SEC [m/s].
-    seen_sec: float = 0.0
-    unseen_sec: float = 0.0
+    stretch: float = 1.0  # Duration of this reposition over reposition_sec.
+    seen_sec: float = 0.0  # For how long the ball has been seen, ...
+    unseen_sec: float = 0.0  # ... or has not been seen.
+    # The ball's velocity when it was last seen, a mean over SPEED_SEC [m/s].
     v_seen: tuple[float, float] = (0.0, 0.0)
-    # How much the ball's velocity has differed from what it was at the start of the
-    # phase, at most [m/s]; that velocity (2,), None: not known yet.
+    # The largest change of the ball's velocity since this reposition began [m/s], ...
     strayed: float = 0.0
-    v_ball: np.ndarray | None = None
+    v_ball: np.ndarray | None = None  # ... and the velocity then (2,); None: unknown.
 
     def __post_init__(self):
         for name in ("p", "v", "a"):
@@ -129,32 +128,35 @@ class TaskState:
 
 @dataclass
 class RollingConfig:
-    roll_sec: float = 1.0
-    roll_feel_sec: float = 1.5  # The same where the tip has to feel for the ball.
-    roll_ahead: float = 0.025  # Tip at most so far from the ball, seen from above [m].
+    """Times and distances of the cycle."""
+
+    roll_sec: float = 1.0  # The longest push, ...
+    roll_feel_sec: float = 1.5  # ... and where the tip has to feel for the ball.
+    roll_ahead: float = 0.025  # A push ends with the tip so far from the ball [m].
     reposition_sec: float = 0.55
-    lift: float = 0.015  # Clearance over the ball while passing it [m].
-    land_behind: float = 0.018  # [m]
-    land_above: float = 0.003  # Above the surface as it is believed to be [m].
-    # Standard deviations of the gap that the approach begins above the surface as it is
-    # believed to be; and that it ends below it where it has to feel for it.
+    lift: float = 0.015  # Clearance over the ball while the tip passes it [m].
+    land_behind: float = 0.018  # The tip lands so far behind the ball's centre [m].
+    land_above: float = 0.003  # ... and above where the surface is believed to be [m].
+    # The approach begins so many standard deviations of the gap above where the surface
+    # is believed to be. Where the tip has to feel for the ball, it ends n_std_below
+    # deviations below that.
     n_std: float = 2.5
     n_std_below: float = 1.5
-    coast_change: float = (
-        0.06  # More change of velocity in the air is no coasting [m/s].
-    )
+    # A ball whose velocity changes by more while nothing touches it does not coast
+    # [m/s].
+    coast_change: float = 0.06
     approach_speed: float = 0.035  # [m/s]
     approach_max: float = 0.025  # The longest approach [m].
-    touch_force: float = 4.0  # More on the tip than before is a touch [N].
-    # A ball that the arm hides is where it was, until it may have gone so far [m] at
-    # the speed that it had, or at least the other [m/s]. Then the task waits, and the
-    # tip goes at withdraw_speed to where it hides nothing of the circle.
+    touch_force: float = 4.0  # So much more force than in the air is a touch [N].
+    # A hidden ball is believed to be where it was until it may have gone unseen_drift
+    # [m] at the speed that it had, at least unseen_speed [m/s]. Then the task waits,
+    # and the tip goes at withdraw_speed to where it hides nothing of the circle.
     unseen_drift: float = 0.02
     unseen_speed: float = 0.006
     withdraw_speed: float = 0.2  # [m/s]
-    reposition_far: float = 0.12  # Repositions that are longer take longer [m].
-    ease: float = 0.42  # Share of the reposition for going up, and for coming down.
-    integral_sec: float = 6.0  # Of the integral action on the ball's distance.
+    reposition_far: float = 0.12  # Repositions over a longer way take longer [m].
+    ease: float = 0.42  # Share of the reposition's time for going up, and down.
+    integral_sec: float = 6.0  # Time constant of the integral action (shifted).
 
 
 def surface_height(offset, radius_ball, radius_tip):
@@ -209,8 +211,9 @@ def reposition_step(
     """The reference (p, v, a), each (3,), a tick dt [s] after the last one.
 
     Seen from above: a quintic from the last reference to the landing point, which is
-    planned anew each tick, so that a rolling ball is met where it will be. Height: up
-    to the clearance in the first `ease` of the time, down in the last, both quintics.
+    planned again at each tick, so that a rolling ball is met where it will be. In
+    height: up to the clearance in the first `ease` of the time, down in the last, both
+    quintics.
 
     Args: above: how far above the landing point it ends [m]; the ball may also be so
         much larger than believed, and is passed over accordingly.

@@ -1,6 +1,6 @@
-"""Whether an event's instant lies in a span of time."""
+"""Whether a time lies in an interval."""
 
-# An instant is a sum of periods: its rounding is no reason to wait for the next [s].
+# Tolerance [s]: times of events are sums of periods with rounding errors.
 ROUNDING = 1e-9
 
 

@@ -1,16 +1,16 @@
-"""Finds a ball of known colour and radius in a picture, and where it lies on a table.
+"""Finds a ball of known colour and radius in an image, and its position on a table.
 
-1. "Strength": how much of the ball's hue a pixel has; 0 for every grey.
-2. Hough circles on the strength find the ball.
-3. Rays from beyond the circle inwards: where the strength first rises half-way, there
-   is a point of the outline. Where a ray comes from something other than the table
-   (the finger, which hides a part of the ball), it is dropped.
+1. "Strength" of a pixel: how much of the ball's hue it has; 0 for grey.
+2. Hough circles on the strength give candidates.
+3. On rays from outside the circle inwards, the outline is where the strength first
+   rises half-way. Rays that do not start on the table (but on the finger, which hides a
+   part of the ball) are dropped.
 4. A sphere's outline is where a cone of rays from the camera touches it: for unit
    vectors n_i to the outline, axis a and half-angle alpha, n_i . a = cos(alpha). With
    m = a / cos(alpha) this is linear, n_i . m = 1: exact in perspective, where the
    outline is an ellipse that is not centred on the sphere's centre.
-5. The axis meets the plane in which the ball's centre lies: the table's height plus
-   the model's radius. The radius that is seen serves only to reject what is no ball.
+5. The axis meets the plane of the ball's centre, at the table's height plus the model's
+   radius. The radius in the image only serves to reject other things.
 """
 
 from typing import NamedTuple
@@ -22,30 +22,31 @@ from numba import njit
 from makebreak.systems.perception.numerics.pinhole import Pinhole
 
 N_RAYS = 96
-STEP = 0.5  # [px] along a ray.
-MARGIN = 2  # Rays beside a hidden one that are left out too.
-THIN = 0.85  # Of the usual strength: less, just inside, is a sliver beside the finger.
-SMALLEST, LARGEST = 0.6, 1.6  # Of what the seen radius may be of the model's.
-MIN_STRENGTH = 40.0  # Of 255: less is not the ball's colour.
-MIN_SEEN = 0.2  # Part of the outline that must be seen.
-AGREE = 1.0  # [px] A point so near to a fitted outline agrees with it.
-OTHER_THAN_TABLE = 80.0  # Of 765 (r + g + b): so different is not the table.
+STEP = 0.5  # Between samples along a ray [px].
+MARGIN = 2  # Rays beside a hidden one that are dropped too.
+# Least strength just inside the outline over the median: less is a sliver of the ball
+# beside the finger.
+SLIVER_STRENGTH = 0.85
+SMALLEST, LARGEST = 0.6, 1.6  # Range of the radius in the image over the model's.
+MIN_STRENGTH = 40.0  # Of 255: less is another colour.
+MIN_SEEN = 0.2  # Least visible fraction of the outline.
+INLIER = 1.0  # Largest distance of an inlier from the fitted outline [px].
+TABLE_DIFFERENCE = 80.0  # Largest difference of table colour, of 765 (r + g + b).
 
 
 class Detection(NamedTuple):
-    """A ball in a picture. The radius is for rejection and reports only."""
+    """A ball in an image. The radius is for rejection and reports only."""
 
     p_WB: np.ndarray  # (3,) [m]
     seen_radius: float  # [m]
-    seen_part: float  # Of the outline, 0..1.
+    seen_part: float  # Visible fraction of the outline.
 
 
 def strength_weights(hue):
-    """Weights (1, 4) of r, g, b, alpha whose sum is the colour's part along a hue.
+    """Weights (1, 4) of r, g, b, alpha that give a pixel's strength along a hue: 0 for
+    grey, at least 2/3 of its value for the pure colour.
 
-    Every grey has 0, the pure colour of that hue 2/3 of its value or a little more.
-
-    Args: hue [rad], 0 red, 2 pi / 3 green, 4 pi / 3 blue.
+    Args: hue [rad]: 0 red, 2 pi / 3 green, 4 pi / 3 blue.
     """
     turn = 2.0 * np.pi / 3.0
     weights = [np.cos(hue), np.cos(hue - turn), np.cos(hue + turn), 0.0]
@@ -53,16 +54,15 @@ def strength_weights(hue):
 
 
 def find_ball(image, camera: Pinhole, hue_weights, radius, table_z, guess_p=None):
-    """The ball in a picture.
+    """Finds the ball in an image.
 
     Args:
         image: (height, width, 4) uint8 RGBA.
-        camera: the pinhole model; hue_weights from `strength_weights`.
-        radius: of the model's ball [m]; table_z, height of the table [m].
-        guess_p: (3,) where the ball's centre should be [m]: only the surroundings are
-            searched. None: everywhere.
-
-    Returns: a Detection, or None if there is no ball to be seen.
+        camera: the pinhole model; hue_weights: of `strength_weights`.
+        radius: of the model's ball [m]; table_z: height of the table [m].
+        guess_p: (3,) of the ball's centre [m]: the search is limited to its
+            surroundings. None: the whole image is searched.
+    Returns: a Detection, or None if no ball is found.
     """
     if guess_p is None:
         depth = camera.p_WC[2] - table_z - radius
@@ -76,7 +76,7 @@ def find_ball(image, camera: Pinhole, hue_weights, radius, table_z, guess_p=None
     if not depth > radius or (high - low < 8).any():
         return None
     radius_px = camera.focal * radius / depth
-    # A copy has the same layout for each part: one machine code for all.
+    # A copy has the same memory layout for all sizes: one compiled version.
     region = image[low[1] : high[1], low[0] : high[0]].copy()
     strength = cv2.transform(region, hue_weights)
     strength = cv2.GaussianBlur(strength, (3, 3), 0.0)
@@ -104,9 +104,8 @@ def find_ball(image, camera: Pinhole, hue_weights, radius, table_z, guess_p=None
 
 
 def _window(camera, p_C, half_px):
-    """Corners low and high (2,) [px] of the square about a point (3,) in C, cut to the
-    picture: rows low[1] to high[1] - 1 and so on.
-    """
+    """Corners low and high (2,) [px] of the square about a point (3,) in C, clipped to
+    the image (rows low[1] to high[1] - 1)."""
     corners = np.empty((2, 2), int)
     for i, size in enumerate((camera.width, camera.height)):
         center = camera.focal * p_C[i] / p_C[2] + camera.center[i]
@@ -116,9 +115,9 @@ def _window(camera, p_C, half_px):
 
 
 def find_circles(strength, radius_px, n=3):
-    """The n best Hough circles (k, 3) [px], k <= n: u, v, radius.
+    """The n best Hough circles (k, 3), k <= n: u, v, radius [px].
 
-    Args: strength (h, w) uint8; radius_px as expected.
+    Args: strength (h, w) uint8; radius_px: expected radius [px].
     """
     circles = cv2.HoughCircles(
         strength,
@@ -135,24 +134,24 @@ def find_circles(strength, radius_px, n=3):
 
 @njit(cache=True)
 def _fit_ball(strength, region, circles, reach, angles, low, focal, center):
-    """The first of the circles (k, 3) in a part of the picture that is a ball.
+    """The cone of the first of the circles (k, 3) that is a ball.
 
-    Args: strength, region, reach, angles as of outline_points; low (2,), where the part
-        begins in the picture [px]; focal [px] and center (2,) [px] of the camera.
-    Returns: as fit_cone; too few rays agree if none is a ball.
+    Args: strength, region, reach, angles: of outline_points; low (2,): corner of the
+        region in the image [px]; focal, center (2,): of the camera [px].
+    Returns: as fit_cone, with 0 rays if no circle is a ball.
     """
     m, n_kept = np.zeros(3), 0
     height, width = strength.shape
     for i in range(len(circles)):
         u, v = circles[i, 0], circles[i, 1]
         if not (0.0 < u < width - 1 and 0.0 < v < height - 1):
-            continue  # Hough's centres may lie beside the picture.
-        # The circle may be the finger's tip, whose edge is round, too: rays from there
-        # find a part of the ball, and those from that fit's centre all there is to see.
+            continue  # Hough's centres may lie outside of the image.
+        # The circle may be the finger's tip, whose edge is round too: rays from there
+        # find a part of the ball, and rays from the centre of this fit all of it.
         for _ in range(2):
             points = outline_points(strength, region, u, v, reach, angles)
             rays = _rays(points, low, focal, center)
-            m, n_kept = fit_cone(rays, AGREE / focal)
+            m, n_kept = fit_cone(rays, INLIER / focal)
             if n_kept < 6 or not m[2] > 0.0:
                 break
             u = focal * m[0] / m[2] + center[0] - low[0]
@@ -166,7 +165,7 @@ def _fit_ball(strength, region, circles, reach, angles, low, focal, center):
 
 @njit(cache=True)
 def _rays(points, low, focal, center):
-    """Pinhole.rays (k, 3) of points (k, 2) [px] in a part that begins at low (2,)."""
+    """Pinhole.rays (k, 3) of points (k, 2) in a region with corner low (2,) [px]."""
     rays = np.empty((len(points), 3))
     for i in range(len(points)):
         x = (points[i, 0] + low[0] - center[0]) / focal
@@ -178,7 +177,7 @@ def _rays(points, low, focal, center):
 
 @njit(cache=True)
 def _sample(image, u, v):
-    """Bilinear; u, v inside of the picture."""
+    """Bilinear interpolation at u, v inside of the image."""
     i, j = int(v), int(u)
     b, a = v - i, u - j
     i1, j1 = min(i + 1, image.shape[0] - 1), min(j + 1, image.shape[1] - 1)
@@ -189,15 +188,14 @@ def _sample(image, u, v):
 
 @njit(cache=True)
 def outline_points(strength, region, u0, v0, reach, angles):
-    """Where the ball's picture ends towards the table.
+    """Points of the ball's outline against the table.
 
     Args:
-        strength: (h, w) uint8; region: (h, w, 4) uint8, the same part of the picture.
+        strength: (h, w) uint8; region: (h, w, 4) uint8, the same part of the image.
         u0, v0: a point inside of the outline [px]; reach: start of the rays [px].
         angles: (n, 2) cosine and sine of the rays, once around.
-
-    Returns: points (k, 2) [px] in order of angle. Rays on which the outline is hidden
-        or in doubt give none.
+    Returns: points (k, 2) [px], in order of angle; none for rays on which the outline
+        is hidden or ambiguous.
     """
     h, w = strength.shape
     n = len(angles)
@@ -212,7 +210,7 @@ def outline_points(strength, region, u0, v0, reach, angles):
         edge[i] = _rise(strength, u0, v0, c, s, start[i], foot)
         if edge[i] < 0.0:
             continue
-        for d in range(1, 7):  # How strong is the ball, just inside?
+        for d in range(1, 7):  # Strength of the ball just inside.
             r = edge[i] - d * STEP
             top[i] = max(top[i], _sample(strength, u0 + r * c, v0 + r * s))
         u = int(u0 + (edge[i] + 2.5) * c + 0.5)
@@ -224,8 +222,8 @@ def outline_points(strength, region, u0, v0, reach, angles):
     if not found.any():
         return points[:0]
     usual, full = np.median(outside[found]), np.median(top[found])
-    clear = found & (np.abs(outside - usual) <= OTHER_THAN_TABLE)
-    clear &= top >= THIN * full
+    clear = found & (np.abs(outside - usual) <= TABLE_DIFFERENCE)
+    clear &= top >= SLIVER_STRENGTH * full
     k = 0
     for i in range(n):
         hidden = False
@@ -244,7 +242,7 @@ def outline_points(strength, region, u0, v0, reach, angles):
 
 @njit(cache=True)
 def _within(reach, u0, v0, c, s, w, h):
-    """The part of a ray's reach that lies in the picture [px]."""
+    """Length of a ray of length `reach` inside of the image [px]."""
     if c > 0.0:
         reach = min(reach, (w - 1 - u0) / c)
     elif c < 0.0:
@@ -258,14 +256,15 @@ def _within(reach, u0, v0, c, s, w, h):
 
 @njit(cache=True)
 def _rise(strength, u0, v0, c, s, start, level):
-    """Where, from start inwards, strength first reaches level [px]; -1 for nowhere."""
+    """Radius at which, from `start` inwards, the strength first reaches `level` [px];
+    -1 if it does not."""
     r = start
     last = _sample(strength, u0 + r * c, v0 + r * s)
     while r > 4.0:
         r -= STEP
         now = _sample(strength, u0 + r * c, v0 + r * s)
         if now >= level:
-            if now <= last:  # It was there from the start: cut by the picture's edge.
+            if now <= last:  # Reached from the start: the ball is cut by the border.
                 return -1.0
             return r + STEP * (now - level) / (now - last)
         last = now
@@ -276,12 +275,12 @@ def _rise(strength, u0, v0, c, s, start, level):
 def fit_cone(rays, tolerance):
     """The cone that touches a sphere, from unit vectors to its outline.
 
-    Triples of rays, spread evenly, each give a cone; the one that most rays agree with
-    wins, and least squares over these, repeated once, gives the answer.
+    Consensus over triples of rays, spread evenly: the cone with the most inliers is
+    taken, and refined by two least-squares fits to its inliers.
 
-    Args: rays (k, 3), in order around the cone; tolerance [rad] of agreement.
-    Returns: m (3,), the axis over the cosine of the half-angle; how many rays agree,
-        0 if there is no such cone.
+    Args: rays (k, 3), in order around the cone; tolerance: of an inlier [rad].
+    Returns: m (3,), the axis over the cosine of the half-angle; number of inliers, 0 if
+        there is no cone.
     """
     k = len(rays)
     best, best_count = np.zeros(3), 0
@@ -347,7 +346,7 @@ def _solve3(a, b, c):
 
 @njit(cache=True)
 def _solve3_matrix(A, b):
-    """Cramer's rule; (x, whether A is regular)."""
+    """x (3,) of A x = b by Cramer's rule, and whether A is regular."""
     c0 = np.cross(A[1], A[2])
     det = A[0] @ c0
     size = np.sqrt((A[0] @ A[0]) * (c0 @ c0))

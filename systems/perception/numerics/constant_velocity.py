@@ -1,8 +1,8 @@
-"""A Kalman filter for a point in the plane that goes straight on, more or less.
+"""A Kalman filter with a constant-velocity model for a point in the plane.
 
-Each way, x and y alike: state [p, v], dv = white noise of power density q [m^2/s^3],
-p measured with standard deviation sigma. Both ways share one covariance P, kept as
-(P_pp, P_pv, P_vv).
+Along x and y: state [p, v], dv = white noise of power density q [m^2/s^3], p measured
+with standard deviation sigma. Both axes have the same covariance P, stored as (P_pp,
+P_pv, P_vv).
 
 Source: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and
 Navigation", section 6.2.2 (continuous white noise acceleration).
@@ -12,7 +12,7 @@ import numpy as np
 
 
 def predict(p, v, P, dt, q):
-    """The estimate dt [s] later.
+    """Predicts the estimate by dt [s].
 
     Args: p, v (2,) [m], [m/s]; P (3,); q [m^2/s^3].
     Returns: p, v, P.
@@ -29,7 +29,7 @@ def predict(p, v, P, dt, q):
 
 
 def correct(p, v, P, measured, sigma):
-    """The estimate after p was measured.
+    """Corrects the estimate with a measurement of p.
 
     Args: p, v, measured (2,); P (3,); sigma [m].
     Returns: p, v, P.
@@ -42,5 +42,5 @@ def correct(p, v, P, measured, sigma):
 
 
 def distance_in_sigmas(p, P, measured, sigma):
-    """How far off a measurement (2,) is, in standard deviations of its prediction."""
+    """Error of a measurement (2,) in standard deviations of its prediction."""
     return float(np.hypot(*(measured - p)) / np.sqrt(P[0] + sigma**2))

@@ -1,12 +1,13 @@
-"""A point in the plane that mostly goes straight on and now and then is driven.
+"""An interacting-multiple-model filter for a point in the plane that moves freely most
+of the time and is driven now and then.
 
-Interacting multiple models: filters of numerics/constant_velocity.py run side by side,
-one per density of the acceleration, and a Markov chain says which of them holds. A
-single density must be either so small that the estimate lags behind what starts to roll
-by itself, or so large that the velocity of what rests is noise.
+Filters of constant_velocity.py run side by side, one per density of the acceleration; a
+Markov chain models the switching. A single density would be either so small that the
+estimate lags when the point starts to move, or so large that the velocity of a point at
+rest is noise.
 
 Layout of an estimate: means (m, 4) = [p 2, v 2] and covariances (m, 3) = (P_pp, P_pv,
-P_vv), which both ways share, one row per model, and the models' probabilities (m,).
+P_vv), the same along x and y, one row per model, and the models' probabilities (m,).
 
 Source: Blom, Bar-Shalom, "The interacting multiple model algorithm for systems with
 Markovian switching coefficients", IEEE TAC 33(8), 1988.
@@ -17,14 +18,14 @@ import numpy as np
 from makebreak.systems.perception.numerics import constant_velocity
 
 Estimate = tuple[np.ndarray, np.ndarray, np.ndarray]
-LEAST = 1e-6  # No model's probability falls below this: it could not come back.
+PROBABILITY_MIN = 1e-6  # Lower bound: a model at 0 could not recover.
 
 
 def transition(dwell_sec, dt):
-    """(m, m): row i, how probable each model is dt [s] after model i held.
+    """Transition probabilities (m, m) over dt [s], from model i (row) to each model.
 
-    Args: dwell_sec (m,), how long each model holds on average; it is left for any of
-        the others alike.
+    Args: dwell_sec (m,): mean duration of each model [s]; the others follow it with
+        equal probability.
     """
     dwell_sec = np.asarray(dwell_sec, dtype=float)
     m = len(dwell_sec)
@@ -37,7 +38,7 @@ def transition(dwell_sec, dt):
 
 
 def start(p, v, P, n_models):
-    """The estimate (means, covariances, probabilities) of models that all agree.
+    """An estimate (means, covariances, probabilities) with one state in all models.
 
     Args: p, v (2,) [m], [m/s]; P (3,).
     """
@@ -46,23 +47,23 @@ def start(p, v, P, n_models):
 
 
 def combined(means, covariances, probabilities):
-    """p (2,), v (2,), P (3,): mean and covariance of the mixture. How far the means are
-    apart counts, as the mean over x and y."""
+    """p (2,), v (2,), P (3,): mean and covariance of the mixture, with the spread of
+    the means averaged over x and y."""
     mean = probabilities @ means
     P = probabilities @ (covariances + _spread(means - mean))
     return mean[:2], mean[2:], P
 
 
 def _spread(off):
-    """(k, 3): what deviations off (k, 4) add to the covariances."""
+    """Contribution (k, 3) of deviations (k, 4) of the means to the covariances."""
     p, v = off[:, :2], off[:, 2:]
     return 0.5 * np.stack([(p * p).sum(1), (p * v).sum(1), (v * v).sum(1)], axis=1)
 
 
 def predict(means, covariances, probabilities, chances, dt, densities):
-    """The estimate dt [s] later, before anything is measured.
+    """Predicts the estimate by dt [s].
 
-    Args: chances (m, m) of `transition`; densities (m,) [m^2/s^3].
+    Args: chances (m, m): of `transition`; densities (m,) [m^2/s^3].
     """
     after = probabilities @ chances
     weights = probabilities[:, None] * chances / after  # (from, to), columns sum to 1.
@@ -78,7 +79,8 @@ def predict(means, covariances, probabilities, chances, dt, densities):
 
 
 def correct(means, covariances, probabilities, measured, sigma):
-    """The estimate after p was measured (2,) with standard deviation sigma [m]."""
+    """Corrects the estimate with a measurement of p (2,) of standard deviation sigma
+    [m]."""
     new_means, new_covariances = np.empty_like(means), np.empty_like(covariances)
     log_likelihood = np.empty(len(means))
     for j, (mean, P) in enumerate(zip(means, covariances, strict=True)):
@@ -90,5 +92,5 @@ def correct(means, covariances, probabilities, measured, sigma):
         )
         new_means[j] = *p, *v
     weight = probabilities * np.exp(log_likelihood - log_likelihood.max())
-    weight = np.maximum(weight / weight.sum(), LEAST)
+    weight = np.maximum(weight / weight.sum(), PROBABILITY_MIN)
     return new_means, new_covariances, weight / weight.sum()

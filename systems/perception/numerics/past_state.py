@@ -1,25 +1,26 @@
-"""The pose of an object a moment ago, from readings before and after that moment.
+"""The pose of an object at a past time, from readings before and after that time.
 
-What is known of a moving object now is late: a filter needs some readings to believe
-that it moves. A moment ago can be known without such a lag: a parabola through the
-readings around it has no bias for any steady acceleration.
+A filter's estimate of the present pose lags, because it needs some readings to follow a
+change of velocity. A parabola through the readings around a past time has no lag, and
+no bias for a constant acceleration.
 """
 
 import numpy as np
 
 from makebreak.systems.perception.numerics.pose_filter import turn_between, turned
 
-READINGS_MIN = 5  # A parabola has three numbers; two more average the noise.
+READINGS_MIN = 5  # Three determine a parabola; two more average the noise.
 
 
 def pose_at(t, readings, half_width):
-    """Least squares of a parabola in time, of position and of turn.
+    """Pose and velocity at time t [s], by a least-squares parabola in time through
+    positions and turns.
 
     Args:
-        t: when [s]; readings: (time [s], p (3,) [m], q (4,) [w x y z]) in the order of
-            time; half_width: those within it of t count [s].
-    Returns: p, v, q, w (PoseEstimate); None with fewer than READINGS_MIN of them, or
-        with none on either side of t.
+        readings: (time [s], p (3,) [m], q (4,) [w x y z]), in order of time.
+        half_width: readings within this time of t are used [s].
+    Returns: p, v, q, w (PoseEstimate); None with fewer than READINGS_MIN readings, or
+        unless there are some on both sides of t.
     """
     near = [one for one in readings if abs(one[0] - t) <= half_width + 1e-9]
     if len(near) < READINGS_MIN or not near[0][0] <= t <= near[-1][0]:

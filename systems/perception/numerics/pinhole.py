@@ -1,6 +1,6 @@
-"""A pinhole camera: where points and spheres appear, and how to paint them.
+"""A pinhole camera: projection, and drawing of simple shapes.
 
-Frames: W world, C camera (z along the view, x to the right and y down the picture).
+Frames: W world, C camera (z along the view, x to the right and y down in the image).
 Pixels (u, v): the centre of the first pixel is (0, 0), u to the right, v down.
 """
 
@@ -11,18 +11,18 @@ import numpy as np
 from numba import njit
 from scipy.spatial.transform import Rotation
 
-FIXED_POINT_BITS = 8  # cv2 draws polygons at 1/256 of a pixel.
-NEAR = 0.01  # [m] Nothing that reaches nearer to the camera's plane is seen.
+FIXED_POINT_BITS = 8  # cv2 draws polygons with 1/256 of a pixel.
+NEAR = 0.01  # Shapes that reach nearer to the camera's plane are not drawn [m].
 N_OUTLINE = 48  # Corners of a circle; its sagitta is 0.002 of the radius.
-BANDS = (0.3, 0.55, 0.8, 1.0)  # Cosines between which a drawn sphere is one shade.
-
+BANDS = (0.3, 0.55, 0.8, 1.0)  # Cosines between which a sphere is drawn in one shade.
 
 SHAPES = ("sphere", "capsule", "cylinder", "box", "ellipsoid")
 SPHERE, CAPSULE, CYLINDER, BOX, ELLIPSOID = range(5)
 
 
 def _unit_bodies():
-    """Points all over a cylinder, a box and an ellipsoid of extents 1, 1, 1."""
+    """Points on the surface of a cylinder, a box and an ellipsoid of extents 1, 1, 1,
+    whose convex hulls are these shapes."""
     angle = np.linspace(0.0, 2.0 * np.pi, N_OUTLINE, endpoint=False)
     ring = np.stack([np.cos(angle), np.sin(angle), np.ones(N_OUTLINE)], axis=1)
     corners = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, 8).T
@@ -44,7 +44,7 @@ class Pinhole:
     width: int  # [px]
     height: int  # [px]
     focal: float  # [px]
-    center: np.ndarray  # (2,) [px] where the optical axis meets the picture.
+    center: np.ndarray  # (2,) of the optical axis in the image [px].
     p_WC: np.ndarray  # (3,) [m]
     R_WC: np.ndarray  # (3, 3)
 
@@ -62,7 +62,7 @@ class Pinhole:
             object.__setattr__(self, name, value)
 
     def project(self, p_C):
-        """Pixels (n, 2) of points (n, 3) [m] in C that lie before the camera."""
+        """Pixels (n, 2) of points (n, 3) [m] in C in front of the camera."""
         return self.focal * p_C[:, :2] / p_C[:, 2:] + self.center
 
     def rays(self, uv):
@@ -72,13 +72,12 @@ class Pinhole:
         return ray / np.linalg.norm(ray, axis=1, keepdims=True)
 
     def to_camera(self, p_W):
-        """Points (n, 3) or a point (3,) [m] of the world, in C."""
+        """Points (n, 3) or a point (3,) of the world in C [m]."""
         return (p_W - self.p_WC) @ self.R_WC
 
     def meet_plane(self, ray, z):
-        """The point (3,) [m] of the world's plane at height z [m] that lies on a ray
-        (3,) in C from the camera; None where the ray does not meet it.
-        """
+        """The point (3,) in the world where a ray (3,) in C from the camera meets the
+        plane at height z [m]; None if it does not."""
         direction = self.R_WC @ ray
         drop = z - self.p_WC[2]
         if not drop * direction[2] > 0.0:
@@ -87,12 +86,13 @@ class Pinhole:
 
 
 def look_down(width, height, fov_y, position, center_shift=0.0) -> Pinhole:
-    """A camera that looks straight down, with +x of the world up in the picture.
+    """A camera that looks straight down, with the world's +x up in the image.
 
     Args:
-        width, height: [px]; fov_y: [rad], of the picture's height.
+        width, height: [px]; fov_y: field of view along the height [rad].
         position: (3,) of the camera [m].
-        center_shift: of the optical axis from the picture's middle, in u and v [px].
+        center_shift: of the optical axis from the image's middle, in u and v [px].
+    Raises: ValueError for a field of view out of range.
     """
     if not 0.0 < fov_y < np.pi:
         raise ValueError(f"fov_y must be between 0 and pi, got {fov_y}")
@@ -104,14 +104,13 @@ def look_down(width, height, fov_y, position, center_shift=0.0) -> Pinhole:
 
 @njit(cache=True)
 def sphere_circle(p, radius, cos_angle):
-    """A circle (N_OUTLINE, 3) [m] on a sphere, all round the line to the camera.
+    """A circle (N_OUTLINE, 3) on a sphere about the line to the camera, in C [m].
 
     Args:
         p: (3,) the sphere's centre in C [m]; the camera is outside of the sphere.
         radius: [m].
-        cos_angle: cosine of the angle, seen from the sphere's centre, between the
-            circle and the camera. radius / |p| is where the cone of the camera's rays
-            touches the sphere: its outline in the picture.
+        cos_angle: cosine of the angle at the sphere's centre between the circle and the
+            camera; radius / |p| gives the outline in the image.
     """
     distance = np.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2)
     x, y, z = p / distance
@@ -128,11 +127,11 @@ def sphere_circle(p, radius, cos_angle):
     return points
 
 
-def draw(picture, camera, shape, size, p, R, color):
-    """Paints one shape, lit from the camera: a sphere is dim at its rim.
+def draw(image, camera, shape, size, p, R, color):
+    """Draws one shape, lit from the camera (a sphere is dim at its rim).
 
     Args:
-        picture: (height, width, 3) uint8, or 4 with an opacity.
+        image: (height, width, 3) or (height, width, 4) uint8.
         camera: a Pinhole.
         shape: "sphere", "capsule", "cylinder", "box" or "ellipsoid".
         size: [m] as Drake has it: (radius,), (radius, length), (radius, length),
@@ -142,13 +141,12 @@ def draw(picture, camera, shape, size, p, R, color):
     """
     extent = extents(shape, size)
     if visible(p[None], extent[None], camera)[0]:
-        draw_visible(picture, camera, SHAPES.index(shape), extent, p, R, color)
+        draw_visible(image, camera, SHAPES.index(shape), extent, p, R, color)
 
 
 def extents(shape, size):
-    """(3,) [m] half of what a shape measures along its axes; a capsule without its
-    caps, whose radius is the first.
-    """
+    """Half extents (3,) of a shape along its axes [m]; for a capsule radius, radius and
+    half its length without the caps."""
     if shape == "sphere":
         return np.array([size[0], size[0], 0.0])
     if shape in ("capsule", "cylinder"):
@@ -157,9 +155,9 @@ def extents(shape, size):
 
 
 def visible(p, extent, camera):
-    """Which shapes may be in the picture: (n,) bool, by spheres around them.
+    """Whether shapes may be in the image (n,), by bounding spheres.
 
-    Args: p (n, 3) their centres in C [m]; extent (n, 3) as `extents` [m].
+    Args: p (n, 3): their centres in C [m]; extent (n, 3): of `extents` [m].
     """
     return _visible(p, extent, camera.focal, camera.center, camera.width, camera.height)
 
@@ -168,11 +166,11 @@ def visible(p, extent, camera):
 def _visible(p, extent, focal, center, width, height):
     seen = np.empty(len(p), np.bool_)
     for j in range(len(p)):
-        # Of a box's corner, or more; a capsule's end: half its length and a radius.
+        # At least a box's corner; for a capsule half its length plus a radius.
         radius = np.hypot(extent[j, 0], extent[j, 1]) + extent[j, 2]
         seen[j] = p[j, 2] + radius > NEAR
         for i, n in enumerate((width, height)):
-            # The planes through the camera and a pixel beyond the picture's edges.
+            # Planes through the camera and one pixel outside of the image's border.
             for edge, sign in ((-1.0, 1.0), (float(n), -1.0)):
                 slope = (edge - center[i]) / focal
                 away = sign * (slope * p[j, 2] - p[j, i]) / np.sqrt(1.0 + slope**2)
@@ -180,11 +178,11 @@ def _visible(p, extent, focal, center, width, height):
     return seen
 
 
-def draw_visible(picture, camera, kind, extent, p, R, color, points=None):
-    """As draw, of a shape that `visible` lets through; kind is its place in SHAPES.
+def draw_visible(image, camera, kind, extent, p, R, color, points=None):
+    """As draw, for a shape that `visible` has found visible.
 
-    Args: points: (n, 3) [m] whose convex hull the shape is, about p; kind does not
-        count then.
+    Args: kind: index into SHAPES; points (n, 3): relative to p, if the shape is their
+        convex hull (kind is then unused) [m].
     """
     if points is None:
         corners = _corners(kind, extent, p, R, camera.focal, camera.center)
@@ -196,19 +194,18 @@ def draw_visible(picture, camera, kind, extent, p, R, color, points=None):
     if len(corners) == 0:
         return
     if kind != SPHERE:
-        paint(picture, corners, color)
+        paint(image, corners, color)
         return
-    paint_exactly(picture, corners, np.multiply(color, BANDS[0] / 2))
+    paint_exactly(image, corners, np.multiply(color, BANDS[0] / 2))
     for low, high in zip(BANDS[:-1], BANDS[1:], strict=True):
         corners = camera.project(sphere_circle(p, extent[0], low))
-        paint(picture, corners, np.multiply(color, (low + high) / 2))
+        paint(image, corners, np.multiply(color, (low + high) / 2))
 
 
 @njit(cache=True)
 def _corners(kind, extent, p, R, focal, center):
-    """Pixels (n, 2) whose convex hull is the shape's in the picture; none (0, 2) of a
-    shape that reaches nearer to the camera's plane than NEAR.
-    """
+    """Pixels (n, 2) whose convex hull is the shape in the image; (0, 2) for a shape
+    that reaches nearer to the camera's plane than NEAR."""
     if kind == SPHERE or kind == CAPSULE:
         half = np.ascontiguousarray(R[:, 2]) * extent[2]
         radius = extent[0]
@@ -247,9 +244,8 @@ def paint(image, corners, color):
 
 @njit(cache=True)
 def _inset(hull, by):
-    """A convex polygon (n, 2) whose edges lie further inside [px], in cv2's fixed point
-    numbers: what OpenCV fills is as much larger than the polygon.
-    """
+    """A convex polygon (n, 2) moved inwards by `by` [px], in cv2's fixed-point numbers:
+    OpenCV fills an area that is larger than the polygon by as much."""
     n = len(hull)
     fixed = np.empty((n, 2), np.int32)
     limit = 2.0**30
@@ -264,7 +260,7 @@ def _inset(hull, by):
             before_u, before_v = before_u / a, before_v / a
             after_u, after_v = after_u / b, after_v / b
             # v = hull[i] + step (normal before + normal after), both normals unit.
-            turn = before_u * after_v - before_v * after_u  # Sign: the way round.
+            turn = before_u * after_v - before_v * after_u  # Sign: orientation.
             side = 1.0 if turn > 0.0 else -1.0
             cosine = before_u * after_u + before_v * after_v
             step = side * by / max(1.0 + cosine, 0.3)
@@ -276,7 +272,7 @@ def _inset(hull, by):
 
 
 def paint_exactly(image, corners, color):
-    """As paint; each pixel on the edge is mixed by how much of it is covered."""
+    """As paint, with border pixels blended by the fraction that is covered."""
     hull = cv2.convexHull(corners.astype(np.float32))[:, 0]
     _mix(image, hull, np.asarray(color, float))
 
@@ -302,7 +298,7 @@ def _mix(image, hull, color):
     bottom = min(int(np.ceil(hull[:, 1].max())) + 1, image.shape[0])
     for v in range(top, bottom):
         for u in range(left, right):
-            # The edge that cuts off most; 0.5 of a pixel if it passes the centre.
+            # Covered fraction by the edge that cuts off most; 0.5 at the centre.
             part = 1.0
             for i in range(n):
                 part = min(part, 0.5 - (edge[i, 0] * u + edge[i, 1] * v - edge[i, 2]))
@@ -315,40 +311,40 @@ def _mix(image, hull, color):
 
 
 def frame_shift(seed, frame):
-    """(2,) standard normal numbers that belong to frame >= 0 of a seed >= 0."""
+    """Standard normal numbers (2,), a function of seed >= 0 and frame >= 0."""
     bits = np.random.Philox(key=seed, counter=[0, 0, 0, frame])
     return np.random.Generator(bits).standard_normal(2)
 
 
 @njit(cache=True, fastmath={"contract"})
-def shifted(picture, u, v, out):
-    """Fills out with the picture moved by u, v [px], linear between its pixels.
+def shifted(image, u, v, out):
+    """Fills `out` with the image shifted by u, v [px], by linear interpolation.
 
-    What lies beyond the picture's edges is as they are. In single precision, with fused
-    multiply-adds where the processor has them: the same as cv2.warpAffine in less time,
-    since all pixels are mixed alike.
+    Pixels from outside of the image repeat its border. In single precision, with fused
+    multiply-adds where the processor has them: the same result as cv2.warpAffine in
+    less time, because all pixels have the same weights.
 
-    Args: picture, out: (height, width, n) uint8, different ones, contiguous.
+    Args: image, out: (height, width, n) uint8, two arrays, contiguous.
     """
-    height, width, n = picture.shape
+    height, width, n = image.shape
     row = width * n
-    source, result = picture.reshape(height, row), out.reshape(height, row)
+    source, result = image.reshape(height, row), out.reshape(height, row)
     left, weight = np.empty(width, np.int64), np.empty(row, np.float32)
     for j in range(width):
         left[j], part = _split(j, u)
         for k in range(n):
             weight[j * n + k] = part
-    # Columns from `first` to before `end` have both neighbours in the picture, `left`
-    # by a fixed number of columns.
+    # Columns from `first` to before `end` have both neighbours in the image, and
+    # `left` is a fixed number of columns away.
     start = left[width // 2] - width // 2
-    # (A picture that is shifted by more than its width has none.)
+    # (None, if the image is shifted by more than its width.)
     first = min(max(0, -start), width)
     end = max(min(width, width - 1 - start), 0)
     while first < end and left[first] != first + start:
         first += 1
     while end > first and left[end - 1] != end - 1 + start:
         end -= 1
-    mixed = np.empty((2, row), np.float32)  # Two rows of the picture, mixed sideways.
+    mixed = np.empty((2, row), np.float32)  # Two rows, interpolated along u.
     held = np.full(2, -1)
     for i in range(height):
         at, part = _split(i, v)
@@ -364,7 +360,7 @@ def shifted(picture, u, v, out):
 
 @njit(cache=True)
 def _split(i, shift):
-    """The pixel before i - shift, and how far that lies behind it."""
+    """The pixel before i - shift, and the distance from it."""
     place = np.float32(np.float32(i) - np.float32(shift))
     before = np.floor(place)
     return int(before), np.float32(place - before)
@@ -385,7 +381,7 @@ def _mix_row(source, mixed, left, weight, first, end, n):
 
 @njit(cache=True, fastmath={"contract"})
 def _mix_edge(source, mixed, left, weight, j, n):
-    """Column j, whose neighbours may lie beyond the picture."""
+    """Column j, whose neighbours may lie outside of the image."""
     last = mixed.size // n - 1
     p = min(max(left, 0), last) * n
     q = min(max(left + 1, 0), last) * n

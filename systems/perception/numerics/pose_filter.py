@@ -1,7 +1,7 @@
-"""A pose that is measured now and then, and how fast it changes.
+"""A filter of a pose and its velocity from readings of the pose.
 
-Position and orientation each by a Kalman filter of constant velocity
-(numerics/constant_velocity.py), the orientation's error as a turn in the world.
+Position and orientation each have a Kalman filter of constant velocity
+(constant_velocity.py); the orientation's error is a rotation vector in the world.
 """
 
 from typing import NamedTuple
@@ -13,20 +13,21 @@ from makebreak.systems.perception.numerics.constant_velocity import correct, pre
 
 
 class PoseEstimate(NamedTuple):
-    """Of a body at one time, in the world. Nothing in it is changed."""
+    """Pose and velocity of a body in the world at one time; never changed in place."""
 
     t: float  # [s]
     p: np.ndarray  # (3,) [m]
     v: np.ndarray  # (3,) [m/s]
     q: np.ndarray  # (4,) quaternion [w x y z]
     w: np.ndarray  # (3,) [rad/s]
-    P_p: np.ndarray  # (3,) covariance of p and v, of each axis
-    P_q: np.ndarray  # (3,) and of the turn and w
+    P_p: np.ndarray  # (3,) covariance of p and v, along each axis.
+    P_q: np.ndarray  # (3,) covariance of orientation and w, about each axis.
 
 
 @njit(cache=True)
 def turned(q, angle):
-    """q (4,), then turned by a vector (3,) in the world [rad]; of length one."""
+    """Unit quaternion of q (4,), then turned by a rotation vector (3,) in the world
+    [rad]."""
     size = np.sqrt(angle[0] ** 2 + angle[1] ** 2 + angle[2] ** 2)
     sine = np.sin(size / 2.0) / size if size > 1e-9 else 0.5
     w, x, y, z = np.cos(size / 2.0), sine * angle[0], sine * angle[1], sine * angle[2]
@@ -40,7 +41,7 @@ def turned(q, angle):
 
 
 def turn_between(a, b):
-    """The shortest turn (3,) in the world from a to b (4,) [rad]."""
+    """The shortest rotation vector (3,) in the world from a (4,) to b (4,) [rad]."""
     (aw, ax, ay, az), (bw, bx, by, bz) = a, b
     w = bw * aw + bx * ax + by * ay + bz * az
     axis = np.array([
@@ -55,8 +56,11 @@ def turn_between(a, b):
 
 
 def first_pose(t, p, q, std, speed_std) -> PoseEstimate:
-    """At rest where it was measured. Args: std, speed_std: [m], [rad] and [m/s],
-    [rad/s] of position and orientation."""
+    """An estimate at rest at a measured pose.
+
+    Args: std (2,), speed_std (2,): standard deviations of position and orientation [m],
+        [rad], and of their rates [m/s], [rad/s].
+    """
     P_p, P_q = ([s**2, 0.0, v**2] for s, v in zip(std, speed_std, strict=True))
     return PoseEstimate(
         t, np.array(p), np.zeros(3), np.array(q), np.zeros(3), np.array(P_p),
@@ -65,8 +69,10 @@ def first_pose(t, p, q, std, speed_std) -> PoseEstimate:
 
 
 def predicted(pose: PoseEstimate, t, density) -> PoseEstimate:
-    """The pose at t [s]. Args: density (2,): of white acceleration, [m2/s3] and
-    [rad2/s3]."""
+    """The estimate predicted to t [s].
+
+    Args: density (2,): of the white acceleration [m2/s3], [rad2/s3].
+    """
     dt = t - pose.t
     p, v, P_p = predict(pose.p, pose.v, pose.P_p, dt, density[0])
     turn, w, P_q = predict(np.zeros(3), pose.w, pose.P_q, dt, density[1])
@@ -74,7 +80,8 @@ def predicted(pose: PoseEstimate, t, density) -> PoseEstimate:
 
 
 def corrected(pose: PoseEstimate, p, q, std) -> PoseEstimate:
-    """The pose after p (3,) and q (4,) were measured at its time, with std (2,)."""
+    """The estimate corrected with p (3,) and q (4,), measured at its time with the
+    standard deviations std (2,) [m], [rad]."""
     p_new, v, P_p = correct(pose.p, pose.v, pose.P_p, p, std[0])
     turn, w, P_q = correct(
         np.zeros(3), pose.w, pose.P_q, turn_between(pose.q, q), std[1]
@@ -84,12 +91,12 @@ def corrected(pose: PoseEstimate, p, q, std) -> PoseEstimate:
 
 @njit(cache=True)
 def on_the_table(dt, p, v, q, w, height, axis):
-    """The pose dt [s] later of an object that lies on a level table: at its height,
-    upright, and turning about the vertical alone.
+    """The pose predicted by dt [s] and projected on that of an object on a level table:
+    at its height, upright, turning about the vertical only.
 
-    Args: p, v, q, w as in PoseEstimate; height of its origin [m]; axis (3,): of an
-        object that rolls, in its frame, which stays level; it turns about that axis
-        too, and rolls freely over the table. Zero: it lies flat.
+    Args: p, v, q, w: as in PoseEstimate; height: of its origin [m]; axis (3,): in the
+        object's frame about which it rolls; the axis stays level and the object also
+        turns about it. Zero: the object does not roll.
     Returns: p, v, q, w.
     """
     rolls = (axis**2).sum() > 0.0
@@ -99,7 +106,7 @@ def on_the_table(dt, p, v, q, w, height, axis):
         held[:] = axis
     else:
         held[2] = level[2] = 1.0
-    cross = np.cross(q[1:], held) * 2.0  # Of the body in the world:
+    cross = np.cross(q[1:], held) * 2.0  # Rotates `held` from the body to the world.
     held = held + q[0] * cross + np.cross(q[1:], cross)
     if rolls:
         level[:2] = held[:2]

@@ -1,8 +1,8 @@
 """Gaussian noise that is a pure function of seed, sample number and channel.
 
-A generator would have its state outside the Context, or as an abstract state that is
-copied at every event. A hash of (seed, sample, channel) needs no state: the same
-instant reads the same noise, and a restored Context replays it.
+A random generator would need a state outside of the Context, or an abstract state that
+is copied at every event. A hash of (seed, sample, channel) needs none: the noise at an
+instant is always the same, and a restored Context replays it.
 
 Source: Steele, Lea, Flood, "Fast splittable pseudorandom number generators" (2014),
 the mixer of SplitMix64; Box and Muller (1958).

@@ -1,4 +1,4 @@
-"""What the joint sensors say about the tip: where it is, and what force moves it."""
+"""The tip's motion and the force on it, from joint sensors."""
 
 import numba
 import numpy as np
@@ -13,14 +13,15 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
 
 @numba.njit(cache=True)
 def tip_motion(chain, q, v, torque, tip_mass):
-    """The tip of an arm, and the force that explains its motion as a point's.
+    """Position and velocity of an arm's tip, and the LCS's input that explains its
+    motion.
 
-    An LCS that takes the arm for a point of mass m needs the force that gives *this*
-    mass the acceleration that the motors give the tip where nothing touches it:
+    In the LCS the arm is a point of mass m. Its input is the force that gives this mass
+    the acceleration that the motors give the free tip:
 
         u = m (J M^-1 (tau - bias) + Jdot v)
 
-    Newtons at the real tip would not do: its apparent mass is another one, and differs
+    The force at the real tip would not do: the tip's effective mass differs from m, and
     with the direction.
 
     Args:
@@ -45,12 +46,12 @@ def tip_mobility(chain, q):
 
 @numba.njit(cache=True)
 def observe_force(observer, v_tip, a_free, mobility, gain, dt):
-    """A momentum observer: what else accelerates the tip than the motors.
+    """A momentum observer of the external force on the tip.
 
     Args: observer (7,) = [expected v_tip (3), force (3), started]; v_tip (3,) [m/s];
-        a_free (3,) that the motors alone give the tip [m/s2]; mobility (3, 3) [1/kg];
-        gain: of the observer, a first-order lag of 1/gain [1/s]; dt [s].
-    Returns: observer (7,); its force is what the surroundings do to the tip [N].
+        a_free (3,): acceleration of the tip by the motors alone [m/s2]; mobility (3, 3)
+        [1/kg]; gain: the observer is a first-order lag of 1/gain [1/s]; dt [s].
+    Returns: observer (7,) with the estimated external force [N].
     Source: De Luca, Haddadin et al., "Robot collisions: a survey on detection,
         isolation, and identification" (2017), III-D, here for the tip alone.
     """
@@ -66,17 +67,17 @@ def observe_force(observer, v_tip, a_free, mobility, gain, dt):
 
 @numba.njit(cache=True)
 def estimate(chain, q, v, torque, p_ball, v_ball, seen, tip_mass, radius, window):
-    """One reading: the state of the LCS, and the window of forces with it.
+    """The state of the LCS from one set of readings, and the window of forces.
 
     Args:
         chain: SerialChain, packed (arm/numerics/packed.py). q, v, torque: as in
             tip_motion.
         p_ball, v_ball: (3,) [m], [m/s]. seen: (1,) above 0.5 if the ball is seen.
-        radius: of the ball as the model has it [m].
-        window: (3 n + 1,) the last n forces, oldest first [N], and how many readings
-            in a row were valid, at most n.
-    Returns: whether every reading is finite (if not, the rest is not to be used);
-        x (19,); window; valid: 1.0, 0.0 where the ball is not seen, else -1.0.
+        radius: of the modelled ball [m].
+        window: (3 n + 1,) the last n forces, oldest first [N], and the number of valid
+            readings in a row, at most n.
+    Returns: whether all readings are finite (if not, ignore the rest); x (19,); window;
+        valid: 1.0, or 0.0 if the ball is not seen, or -1.0 if not all are finite.
     """
     after = np.empty(window.size)
     total = q.sum() + v.sum() + torque.sum() + p_ball.sum() + v_ball.sum()
@@ -93,8 +94,8 @@ def estimate(chain, q, v, torque, p_ball, v_ball, seen, tip_mass, radius, window
 
 
 def with_pose(finite, x, valid, q_object, w_object):
-    """What `estimate` returned (without the window), for an object whose orientation
-    q_object (4,) and turning rate w_object (3,) [rad/s] are known: it need not roll."""
+    """The results of `estimate` (without the window) for an object of known orientation
+    q_object (4,) and angular velocity w_object (3,) [rad/s], not a rolling ball."""
     known = np.isfinite(q_object).all() and np.isfinite(w_object).all()
     size = np.sqrt(q_object @ q_object)
     if not (finite and known and size > 0.5):

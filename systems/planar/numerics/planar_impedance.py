@@ -1,20 +1,20 @@
-"""Adaptive variable impedance in the plane: stiff where the model of the force is bad.
+"""Adaptive variable impedance in the plane: stiff where the force model is bad.
 
     u      = m a_d + K (p_d - p) + D (v_d - v) - lambda F_pred                (4a)
     K      = K_free + (1 - lambda) (K_max - K_free)                           (4b)
     lambda = 1 - 1 / (1 + exp(-r (eps - eps_0)))                              (4c)
 
-F_pred is the force of the world on the effector that the model expects, so the
-feed-forward is its opposite. D = 2 zeta sqrt(K m): zeta = 1 is critical damping. The
-paper's D = sqrt(K)/4, in SI units and for 1 kg, is zeta = 1/8, far from the critical
-damping that it names; it is had by damping_ratio = 0.125.
+F_pred is the predicted force of the world on the effector, so the feed-forward is its
+negative. D = 2 zeta sqrt(K m): zeta = 1 is critical damping. The paper's D = sqrt(K)/4,
+in SI units and for 1 kg, is zeta = 1/8, far from the critical damping that the paper
+names; damping_ratio = 0.125 gives it.
 
 The model is an incremental Gaussian mixture over [S, D']
-(changing_contact/numerics/igmm.py), S what is measured now and D' the force one model
-period later. Either S = [v, F] and D' = F', as vectors: the force of a spring has
-nothing to do with the direction of motion; or, as in eq. 2 and 3, S = [|v|, f] and
-D' = f', with f the force against the motion. Where the force changes at places,
-S = [p, v, F] can foresee it on a path that comes again.
+(changing_contact/numerics/igmm.py), with S measured now and D' the force one model
+period later. Either S = [v, F] and D' = F' as vectors, because a spring's force does
+not depend on the direction of motion; or, as in eq. 2 and 3, S = [|v|, f] and D' = f'
+with f the force against the motion. S = [p, v, F] can predict forces that change at
+certain places of a repeated path.
 
 Source: "Changing-contact manipulation" (CC) section 3.1, eq. 2 to 4, 6.
 """
@@ -33,9 +33,9 @@ from makebreak.systems.changing_contact.numerics.igmm import (
 )
 from makebreak.systems.planar.numerics.planar_world import limited
 
-# Weight of the newest prediction error; at 200 Hz it is a filter of 14 ms.
+# Weight of the newest prediction error; at 200 Hz a low-pass filter of 14 ms.
 ERROR_WEIGHT = 0.3
-SLOW = 1e-3  # What is slower than this has no direction [m/s].
+SPEED_MIN = 1e-3  # Below this speed a motion has no direction [m/s].
 
 
 def trust(error, steepness, midpoint):
@@ -77,14 +77,14 @@ def force_command(
 
 @dataclass(frozen=True, eq=False)
 class ForceModel:
-    """What the forward model knows and last said: a value."""
+    """State of the forward model: what it has learned, and its last prediction."""
 
     mixture: Mixture
     features: np.ndarray | None  # S of the last sample; None: there was none.
     measured: np.ndarray  # D of the last sample [N].
-    predicted: np.ndarray  # D of the next sample, as expected [N].
+    predicted: np.ndarray  # Predicted D of the next sample [N].
     error: float  # |measured - predicted| of the last sample [N]; NaN: no prediction.
-    filtered: float  # The same, low-passed; infinite: never a prediction [N].
+    filtered: float  # The error, low-pass filtered; infinite: no prediction yet [N].
 
     def __copy__(self):  # Every part is immutable, so a Context may share it.
         return self
@@ -94,7 +94,7 @@ class ForceModel:
 
 
 def new_model(tuning: IgmmTuning, mixture: Mixture | None, along_motion: bool):
-    """A model before its first sample; mixture: what is known already."""
+    """A model before its first sample. Args: mixture: learned earlier; None: empty."""
     n = 1 if along_motion else 2
     zero = _frozen(np.zeros(n))
     mixture = empty_mixture(tuning) if mixture is None else mixture
@@ -109,8 +109,8 @@ def _frozen(array) -> np.ndarray:
 def features_of(state, force, along_motion: bool, position: bool = False):
     """S and D of one sample.
 
-    Args: state (4,); force (2,) measured, of the world on the effector [N]; position:
-        whether S has the position too, where it is not along the motion.
+    Args: state (4,); force (2,): measured, of the world on the effector [N]; position:
+        whether S contains the position (not with along_motion).
     Returns: S (n,), D (m,).
     """
     if not along_motion:
@@ -122,11 +122,11 @@ def features_of(state, force, along_motion: bool, position: bool = False):
 def direction_of(state):
     """Unit vector of the velocity, (2,); zero at rest."""
     speed = np.hypot(state[2], state[3])
-    return state[2:] / speed if speed > SLOW else np.zeros(2)
+    return state[2:] / speed if speed > SPEED_MIN else np.zeros(2)
 
 
 def predicted_force(model: ForceModel, state, along_motion: bool):
-    """F_pred as a vector, (2,) [N]; state (4,): where the effector moves to now."""
+    """F_pred as a vector (2,) [N]. Args: state (4,): gives the direction of motion."""
     if along_motion:
         return -model.predicted[0] * direction_of(state)
     return model.predicted.copy()
@@ -143,9 +143,9 @@ def after_sample(
 ) -> ForceModel:
     """The model after one more sample, with its prediction of the next one.
 
-    A sample that is not finite is left out, and ends the pair that it belongs to.
+    A sample that is not finite is dropped, with the pair that it belongs to.
 
-    Args: as features_of; learn: whether the mixture takes the sample in.
+    Args: as features_of; learn: whether the mixture learns from the sample.
     """
     S, D = features_of(state, force, along_motion, position)
     mixture, error, filtered = model.mixture, np.nan, model.filtered
@@ -167,11 +167,11 @@ def after_sample(
 
 
 def persistence(n_in: int, n_out: int) -> Mixture:
-    """No model at all, as a mixture: the next D is the D in S, whatever S is.
+    """A mixture that predicts persistence: the next D is the D in S.
 
-    For comparison: what of a controller's performance is the measured force alone.
+    For comparison: the performance of a controller from the measured force alone.
 
-    Args: n_in, entries of S, of which the last n_out are D.
+    Args: n_in: entries of S; n_out: how many of them, the last ones, are D.
     """
     n, wide, narrow = n_in + n_out, 1e3, 1e-3
     factor = np.zeros((1, n, n))

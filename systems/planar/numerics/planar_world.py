@@ -1,36 +1,36 @@
-"""A point effector in the plane, in something that thickens, and pulled by springs.
+"""A point effector in the plane, in a fluid whose viscosity rises, pulled by springs.
 
     m dv/dt = u + F,    F = -c(t) v + sum_i k_i (|d_i| - l_i) d_i / |d_i|,
     d_i = anchor_i - p,    c(t) = c_0 + (c_1 - c_0) min(t / T, 1)
 
-A spring pulls where |d_i| < r_i, its reach: it engages and lets go as the effector
-comes and leaves, and the force jumps.
+A spring pulls only where |d_i| < r_i, its reach: the force jumps as it engages and
+lets go.
 
 u is held over each period. A period is integrated by four Runge-Kutta steps of fourth
-order; tests/test_planar_world.py holds the result against closed forms, scipy and
-Drake's own springs.
+order; tests/test_planar_world.py compares the result with closed forms, scipy and
+Drake's springs.
 
 Source: "Changing-contact manipulation" (CC) sections 4.1 and 4.2, Fig. 1c: "porridge
-stirring" and "multi-spring". Its worlds are drawn, not given in numbers.
+stirring" and "multi-spring". The paper draws its worlds without numbers.
 """
 
 import numpy as np
 from numba import njit
 
 SUBSTEPS = 4
-_NEAR = 1e-9  # Closer to an anchor than this a spring has no direction [m].
+_NEAR = 1e-9  # A shorter spring has no direction [m].
 
 
 @njit(cache=True)
 def viscosity_at(t, viscosity, ramp):
     """c(t) [N s/m]: from viscosity[0] at t = 0 to viscosity[1] at t = ramp [s]."""
-    share = min(max(t / ramp, 0.0), 1.0)
-    return viscosity[0] + (viscosity[1] - viscosity[0]) * share
+    s = min(max(t / ramp, 0.0), 1.0)
+    return viscosity[0] + (viscosity[1] - viscosity[0]) * s
 
 
 @njit(cache=True)
 def _force(x, y, vx, vy, t, viscosity, ramp, anchors, springs):
-    """external_force in scalars: arrays would cost most of the time."""
+    """external_force in scalars: arrays would take most of the time."""
     c = viscosity_at(t, viscosity, ramp)
     fx, fy = -c * vx, -c * vy
     for i in range(anchors.shape[0]):
@@ -45,12 +45,12 @@ def _force(x, y, vx, vy, t, viscosity, ramp, anchors, springs):
 
 @njit(cache=True)
 def external_force(state, t, viscosity, ramp, anchors, springs):
-    """What the world does to the effector.
+    """The force of the world on the effector.
 
     Args:
         state: (4,) p, v [m], [m/s].
         t: time [s].
-        viscosity: (2,) first and last [N s/m]; ramp [s].
+        viscosity: (2,) initial and final [N s/m]; ramp [s].
         anchors: (n, 2) [m].
         springs: (n, 3) stiffness [N/m], rest length [m] and reach [m] of each.
     Returns: F (2,) [N].
@@ -66,8 +66,8 @@ def step(state, t, u, period, mass, viscosity, ramp, anchors, springs):
     h = period / SUBSTEPS
     x, y, vx, vy = state
     for i in range(SUBSTEPS):
-        # The classical Runge-Kutta rule: a is evaluated at the beginning, twice in the
-        # middle and at the end; dx, dv sum the weighted slopes.
+        # The classical Runge-Kutta rule: slopes at the start, twice in the middle and
+        # at the end; dx, dy, dvx, dvy are their weighted sums.
         s = t + i * h
         px, py, wx, wy = x, y, vx, vy
         dx, dy, dvx, dvy = 0.0, 0.0, 0.0, 0.0
@@ -91,10 +91,10 @@ def step(state, t, u, period, mass, viscosity, ramp, anchors, springs):
 def circle_target(t, radius, duration, phase, turn):
     """Once around a circle about the origin, from rest to rest.
 
-    The angle follows the polynomial of least jerk, so the speed peaks at 1.875 times
-    its mean.
+    The angle is the minimum-jerk polynomial, so the speed peaks at 1.875 times its
+    mean.
 
-    Args: t [s]; radius [m]; duration [s]; phase, angle of the start [rad]; turn, +1 is
+    Args: t [s]; radius [m]; duration [s]; phase: angle of the start [rad]; turn: +1
         counter-clockwise, -1 clockwise.
     Returns: (6,) p, v, a [m], [m/s], [m/s2]; at rest before 0 and after duration.
     """

@@ -1,7 +1,7 @@
-"""A line behind something that moves, which grows in Meshcat's recording too.
+"""A line behind a moving object that also grows in Meshcat's recording.
 
-A line is no part of a recording: the page would show the whole of it from the start. So
-it is drawn in pieces, each of which becomes visible at its time.
+The points of a line are not recorded: a recording would show the whole line from its
+start. So it is drawn in pieces, and each piece becomes visible at its time.
 """
 
 import numpy as np
@@ -10,12 +10,11 @@ PIECE = 8  # Points of a piece.
 
 
 class Trail:
-    """Draws points that are appended to, on a Meshcat.
+    """Draws a growing sequence of points in Meshcat.
 
-    Where a recording is played the last few points, fewer than a piece, are seen once
-    the trail has ended.
+    In a recording the last points, fewer than a piece, appear at the end of the trail.
 
-    Args: path: in Meshcat's tree. color: Rgba. width [pixels].
+    Args: path: in Meshcat's tree. color: Rgba. width [px].
     """
 
     def __init__(self, meshcat, path: str, color, width: float = 4.0):
@@ -26,8 +25,8 @@ class Trail:
         meshcat.Delete(path)
 
     def show(self, points: np.ndarray, t: float) -> None:
-        """Args: points (n, 3) [m], all of them until now; fewer than before, or others,
-        are a new trail, and the one before is taken away. t [s]."""
+        """Draws all points (n, 3) [m] so far at time t [s]. Fewer points than before,
+        or another first point, start a new trail and hide the old one."""
         if not len(points):
             return
         known = self._points
@@ -40,7 +39,7 @@ class Trail:
         rest = points[self._pieces * PIECE :]
         if len(rest) > 1:
             self._draw(self._now, rest)
-            # The line that is there in the end is seen from its last change on.
+            # The final line becomes visible at its last change.
             for seen, at in ((False, 0.0), (False, self._seen_at), (True, t)):
                 self._meshcat.SetProperty(self._now, "visible", seen, at)
             self._seen_at = t

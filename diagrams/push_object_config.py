@@ -1,0 +1,269 @@
+"""The settings of push_object, and those of its planner and learner made from them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from makebreak.diagrams.camera import CameraConfig
+from makebreak.models.model_files import MODELS
+from makebreak.models.pushed_object import PushedObject, support_spheres
+from makebreak.systems.arm.arm_reference import ArmReferenceConfig
+from makebreak.systems.arm.impedance_controller import ImpedanceConfig
+from makebreak.systems.changing_contact.touch_down import TouchDownConfig
+from makebreak.systems.contact_mpc.c3_mpc import C3Config
+from makebreak.systems.contact_mpc.contact_sampler import ContactSamplerConfig
+from makebreak.systems.contact_mpc.lcs_builder import ContactPair
+from makebreak.systems.contact_mpc.numerics.ball_state import (
+    N_X,
+    P_BALL,
+    Q_BALL,
+    V_BALL,
+    V_TIP,
+    plus_weights,
+)
+from makebreak.systems.contact_mpc.numerics.c3_mpc import (
+    C3Options,
+    C3Weights,
+    OrientationWeight,
+)
+from makebreak.systems.contact_mpc.numerics.contact_sampling import SamplingConfig
+from makebreak.systems.contact_mpc.push_goals import PushGoalsConfig
+from makebreak.systems.contact_mpc.push_task import PushTaskConfig
+from makebreak.systems.contact_mpc.residual_learner import (
+    PosteriorConfig,
+    ResidualLearnerConfig,
+)
+from makebreak.systems.perception.past_state import PastStateConfig
+from makebreak.systems.perception.pose_sensor import KEPT_SEC, PoseSensorConfig
+from makebreak.systems.perception.pose_tracker import PoseTrackerConfig
+
+PUSH_OBJECT = str(MODELS / "push_object.scene.yaml")
+OBJECT = "object"  # Name of the object's model instance and of its body.
+# Periods of planner and task, state estimator, learner, impedance controller [s].
+CONTROL = 0.0125
+ESTIMATE, LEARN, ARM_TICK = CONTROL / 3.0, 0.05, 0.001
+# Phase of each system's events [s]. As in ball_rolling, each system runs a little after
+# those whose outputs it reads, within the millisecond between two steps of the plant.
+# Only the sampler's choice and the residual are used one period late.
+OFFSET = dict(
+    sensor=1e-4, estimator=2e-4, goals=2.5e-4, past=2.5e-4, task=3e-4, lcs=3e-4,
+    touch=3.2e-4,
+    learner=3.5e-4, sampler=3.5e-4, c3=4e-4, reference=4.5e-4, impedance=7e-4,
+)  # fmt: skip
+PLAN_DT = 0.1  # Time step of the planner's LCS [s].
+TIP_MASS = 1.0  # Mass of the point that stands for the arm in the planner's model [kg].
+N_TIP = 4  # The first entries of lam: the contact of tip and object.
+# Settings of the systems that make_push_object computes, so that users cannot.
+SET_BY_DIAGRAM = {
+    "goals": ("period_sec", "offset_sec"),
+    "task": ("height", "clearance", "period_sec", "offset_sec"),
+    "sampler": ("angle_radius", "residual_dt_sec", "offset_sec"),
+    "reference": ("height", "nearest", "wrist", "period_sec", "offset_sec"),
+    "impedance": ("period_sec", "offset_sec"),
+    "pose": ("height", "rolling_axis", "offset_sec"),
+    "tracker": ("z", "hue", "rolling_axis", "period_sec", "offset_sec"),
+}
+
+
+@dataclass
+class PushPlannerConfig:
+    """Horizon and cost of C3+; forces in newtons."""
+
+    N: int = 5  # Knots, PLAN_DT apart.
+    rounds: int = 2
+    polish: int = 6
+    position: float = 5000.0  # Weight of the object's position on the table [1/m2].
+    # Weight of the object's orientation: an angle costs as much as this radius times
+    # the angle costs as a distance [m].
+    angle_radius: float = 0.12
+    last: float = 5.0  # The last knot's weights over the others'.
+    tip_height: float = 1e4  # Weight [1/m2].
+    tip_speed: float = 10.0  # Weight [s2/m2].
+    # A rolling object continues after the end of the plan: its speed there is weighted
+    # as the distance that it rolls in this time [s].
+    coast_sec: float = 1.0
+
+
+@dataclass
+class PushLearnerConfig:
+    """The residual of the contact of tip and object, learned as in ball_rolling.
+
+    The weights Q_d are inverse variances of velocity changes over a step of 50 ms: v_x
+    and v_y of the object and of the tip (a wrong gap changes the tip's velocity too).
+    The pose at a past time (PastState) is accurate to 0.8 mm, which is 16 mm/s. The
+    present pose, the only one with a camera, is a few hundredths of a second old when a
+    push begins: the tip then seems to be up to 5 mm inside the object, 0.08 m/s.
+    """
+
+    weight: float = 4e3  # Of each velocity, with past poses [s2/m2].
+    weight_late: float = 150.0  # The same with present poses.
+    eps: float = 1e-3
+    gamma: float = 5e-4
+    r_max: float = 0.3  # Bound of the residual [m/s]; 15 mm over LEARN.
+    slip_noise: float = 0.03  # [m/s]
+    posterior: PosteriorConfig = field(
+        default_factory=lambda: PosteriorConfig(
+            free_states=[V_BALL.start, V_BALL.start + 1]
+        )
+    )
+
+
+@dataclass
+class PushModelConfig:
+    """In what the controllers' model differs from the world."""
+
+    # Scene file of arm and table; None: the world's without its effects, which stand
+    # for what no model knows.
+    scene: str | None = None
+    # Of the object with tip and table; None: the world's.
+    friction: float | None = None
+    scale: float = 1.0  # The object's size over the world's.
+    mass: float = 1.0  # The object's mass over the world's.
+    com_offset: list[float] = field(default_factory=lambda: [0.0, 0.0])  # Added [m].
+
+
+@dataclass
+class PushObjectConfig:
+    """World and model start from the same object; `model` holds the model's errors."""
+
+    adapt: bool = True
+    object: PushedObject = field(default_factory=PushedObject)
+    friction: float = 0.5  # Of the object with tip and table, in the world.
+    # Of a rolling cylinder, lever arm over radius, in the world; no model knows it.
+    # None: 0.005 for a cylinder, as of the ball of ball_rolling.
+    rolling_resistance: float | None = None
+    model: PushModelConfig = field(default_factory=PushModelConfig)
+    scene: str = PUSH_OBJECT  # The world's.
+    seed: int = 0
+    n_goals: int = 1  # Goals in a row, drawn by the seed.
+    start: list[float] = field(default_factory=list)  # x, y, yaw; empty: drawn.
+    goals: PushGoalsConfig = field(default_factory=PushGoalsConfig)
+    # What measures the object: a pose sensor, such as motion capture, or the camera.
+    pose_from: Literal["sensor", "camera"] = "sensor"
+    pose: PoseSensorConfig = field(default_factory=PoseSensorConfig)
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    tracker: PoseTrackerConfig = field(default_factory=PoseTrackerConfig)
+    sampler: ContactSamplerConfig = field(
+        default_factory=lambda: ContactSamplerConfig(SamplingConfig(reach=[0.32, 0.78]))
+    )
+    task: PushTaskConfig = field(default_factory=PushTaskConfig)
+    planner: PushPlannerConfig = field(default_factory=PushPlannerConfig)
+    learning: PushLearnerConfig = field(default_factory=PushLearnerConfig)
+    # Whether the speed before a touch is learned and reduced where a touch is expected.
+    gentle: bool = False
+    touch: TouchDownConfig = field(default_factory=TouchDownConfig)
+    reference: ArmReferenceConfig = field(
+        default_factory=lambda: ArmReferenceConfig(
+            force_max=8.0,
+            acceleration_max=3.0,
+            tip_mass=TIP_MASS,
+            touch_speed=0.15,
+            push_speed=0.2,
+        )
+    )
+    impedance: ImpedanceConfig = field(
+        default_factory=lambda: ImpedanceConfig(force_max=20.0)
+    )
+
+
+def rolling_axis(spec: PushedObject) -> list[float]:
+    """Axis (3,) in the object's frame about which it rolls; empty: it does not roll."""
+    return [1.0, 0.0, 0.0] if spec.shape == "cylinder" else []
+
+
+def contact_pairs(spec: PushedObject, friction: float) -> list[ContactPair]:
+    """Contacts of the planner's LCS: tip and object, then each support of the object
+    with the table."""
+    n = len(support_spheres(spec)[0])
+    # Friction edges along the vertical do not jump as the normal turns about it.
+    tip = ContactPair(
+        "tip::tip", f"{OBJECT}::{OBJECT}", friction, tangent=[0.0, 0.0, 1.0], closest=1
+    )
+    return [tip] + [
+        ContactPair(f"{OBJECT}::support_{i}", "table::table", friction)
+        for i in range(n)
+    ]
+
+
+def c3_config(
+    planner: PushPlannerConfig, n_lam: int, axis: Sequence[float] = ()
+) -> C3Config:
+    """Weights and options of C3+.
+
+    Args: n_lam: forces of the LCS; axis: about which the object rolls (rolling_axis). A
+        turn about it costs nothing, and the final speed costs (coast_sec).
+    Raises: ValueError for a weight out of range.
+    """
+    p = planner
+    if not 0.0 <= p.coast_sec < np.inf:
+        raise ValueError(f"planner.coast_sec is {p.coast_sec}, expected >= 0")
+    for name in ("position", "angle_radius", "last", "tip_height", "tip_speed"):
+        if not getattr(p, name) > 0.0:
+            raise ValueError(f"planner.{name} is {getattr(p, name)}, expected > 0")
+    Q = np.zeros(N_X)
+    Q[2], Q[V_TIP] = p.tip_height, p.tip_speed
+    Q[P_BALL.start : P_BALL.start + 2], Q[V_BALL] = p.position, 20.0
+    Q_N = Q.copy()
+    Q_N[P_BALL.start : P_BALL.start + 2] *= p.last
+    if axis:
+        Q_N[V_BALL] += p.last * p.position * p.coast_sec**2
+    G = plus_weights(force=5.0, n_lam=n_lam, n_tip=N_TIP)
+    turn = p.position * p.angle_radius**2
+    return C3Config(
+        weights=C3Weights(
+            Q, np.full(3, 0.01), G, G, Q_N=Q_N,
+            orientation=[
+                OrientationWeight(
+                    Q_BALL.start, turn, p.last * turn, list(axis) if axis else None
+                )
+            ],
+        ),
+        options=C3Options(N=p.N, rounds=p.rounds, rho=2.2, polish=p.polish),
+        residual_dt_sec=LEARN,
+        sliding_command=True,
+    )  # fmt: skip
+
+
+def learner_config(learner: PushLearnerConfig, late: bool) -> ResidualLearnerConfig:
+    """Config of the learner.
+
+    Args: late: whether the learner uses present poses instead of past ones.
+    Raises: ValueError for a negative weight.
+    """
+    weight = learner.weight_late if late else learner.weight
+    if not weight >= 0.0:
+        name = "weight_late" if late else "weight"
+        raise ValueError(f"learning.{name} is {weight}, expected >= 0")
+    Q_d = np.zeros(N_X)
+    Q_d[[V_TIP.start, V_TIP.start + 1, V_BALL.start, V_BALL.start + 1]] = weight
+    return ResidualLearnerConfig(
+        Q_d=Q_d.tolist(),
+        eps=learner.eps,
+        gamma=learner.gamma,
+        groups=[list(range(N_TIP))],
+        r_max=learner.r_max,
+        slip_noise=learner.slip_noise,
+        posterior=learner.posterior,
+    )
+
+
+def past_config(pose: PoseSensorConfig, height: float) -> PastStateConfig:
+    """Config of PastState: how far back the learner looks, so that all readings about
+    that time have arrived.
+
+    Args: height: of the object's frame [m].
+    Raises: ValueError for readings that are too rare or too late.
+    """
+    plain = PastStateConfig(height=height, period_sec=LEARN, offset_sec=OFFSET["past"])
+    # A parabola needs two readings on either side, and one is lost between ticks.
+    half_width = max(plain.half_width, 2.5 * pose.period_sec)
+    wait = pose.delay_sec + pose.period_sec + half_width
+    if wait + half_width > KEPT_SEC:
+        raise ValueError(
+            f"pose: period_sec {pose.period_sec:g}, delay_sec {pose.delay_sec:g} are "
+            "too long to learn from; expected less, or adapt=false"
+        )
+    ticks = max(plain.ticks, int(np.ceil(wait / LEARN - 1e-9)))
+    return replace(plain, ticks=ticks, half_width=half_width)
