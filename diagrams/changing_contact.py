@@ -14,6 +14,7 @@ simulation; `learned` reads what was learned in it, for the next trial.
 """
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from pydrake.geometry import Meshcat
@@ -87,6 +88,7 @@ TICK, ESTIMATE, ANTICIPATE = 0.001, 0.005, 0.01
 # and read the others' values of the last millisecond; the impedance controller runs
 # after them. Further instants would cost more computing time than the systems do.
 OFFSET, IMPEDANCE_OFFSET = 1e-4, 7e-4
+WRENCH = f"{ARM}.external_wrench"  # The station's port of the measured wrench.
 
 
 @dataclass
@@ -198,15 +200,9 @@ def make_changing_contact(
             world's objects has to be its table.
     Raises: ValueError for periods or offsets in config that are not the defaults.
     """
-    known = knowledge or Knowledge()
     builder = DiagramBuilder()
     if errors is not None:
         world = with_errors(world, errors, ARM, tool, objects(world)[0])
-    wrong = None
-    if config.faults:  # A stray box stands in the middle of the first segment.
-        first = pattern.segments[0].positions[:, :3]
-        faults = read_faults(config.faults, ("scene",))
-        wrong = StationFaults(faults, tuple(first.mean(axis=0).tolist()))
     station = builder.AddNamedSystem(
         "station",
         make_station(
@@ -220,119 +216,163 @@ def make_changing_contact(
             meshcat,
             world,
             errors,
-            wrong,
+            _station_faults(config, pattern),
         ),
     )
     arm = make_control_plant(model, tool)
-    chain = serial_chain_of(arm, TIP_FRAME)
+    systems = _add_systems(builder, config, arm, pattern, knowledge or Knowledge())
+    _connect_systems(builder, station, systems, config)
+    tau = systems.impedance.GetOutputPort("tau")
+    record_station(builder, station, tau, tool)
+    # Only for scoring and plots.
+    _add_telemetry(builder, SIGNALS)
+    if meshcat is not None:
+        _add_view(builder, station, systems, pattern, meshcat, view)
+    diagram = builder.Build()
+    diagram.set_name("changing_contact")
+    return diagram
+
+
+def _station_faults(config, pattern: MotionPattern) -> StationFaults | None:
+    """The faults of --fault; a stray box is in the middle of the first segment."""
+    if not config.faults:
+        return None
+    first = pattern.segments[0].positions[:, :3]
+    faults = read_faults(config.faults, ("scene",))
+    return StationFaults(faults, tuple(first.mean(axis=0).tolist()))
+
+
+@dataclass(frozen=True, eq=False)
+class _Systems:
+    """The systems beside the station."""
+
+    tip: TipState
+    detector: ContactDetector
+    modes: ModeDetector
+    forward: ForwardModelBank
+    anticipator: KalmanContactAnticipator
+    shaper: VelocityShaper
+    variable: VariableImpedance
+    impedance: ImpedanceController
+
+
+def _add_systems(
+    builder: DiagramBuilder, config, arm: MultibodyPlant, pattern, known: Knowledge
+) -> _Systems:
     # The approach speed of the anticipator depends on how hard the reflex brakes.
     speed = replace(
         config.anticipator.speed,
         reflex_gain=config.reflex.gain,
         reflex_force_least=config.reflex.force_least,
     )
-    config = replace(config, anticipator=replace(config.anticipator, speed=speed))
-
-    def add(name, system):
-        return builder.AddNamedSystem(name, system)
-
-    tip = add("tip_state", TipState(chain))
-    detector = add(
-        "contact_detector", ContactDetector(timed(config.detector, TICK, OFFSET))
-    )
-    modes = add(
-        "mode_detector", ModeDetector(config.modes, known.modes, ESTIMATE, OFFSET)
-    )
-    forward = add(
-        "forward_model_bank",
-        ForwardModelBank(config.forward_model, known.models, ESTIMATE, OFFSET),
-    )
-    anticipator = add(
-        "contact_anticipator",
-        KalmanContactAnticipator(
-            timed(config.anticipator, ANTICIPATE, OFFSET), known.contacts, tip_mass(arm)
+    anticipator = replace(config.anticipator, speed=speed)
+    add = builder.AddNamedSystem
+    return _Systems(
+        tip=add("tip_state", TipState(serial_chain_of(arm, TIP_FRAME))),
+        detector=add(
+            "contact_detector", ContactDetector(timed(config.detector, TICK, OFFSET))
+        ),
+        modes=add(
+            "mode_detector", ModeDetector(config.modes, known.modes, ESTIMATE, OFFSET)
+        ),
+        forward=add(
+            "forward_model_bank",
+            ForwardModelBank(config.forward_model, known.models, ESTIMATE, OFFSET),
+        ),
+        anticipator=add(
+            "contact_anticipator",
+            KalmanContactAnticipator(
+                timed(anticipator, ANTICIPATE, OFFSET), known.contacts, tip_mass(arm)
+            ),
+        ),
+        shaper=add(
+            "velocity_shaper",
+            VelocityShaper(timed(config.shaper, TICK, OFFSET), pattern),
+        ),
+        variable=add(
+            "variable_impedance",
+            VariableImpedance(timed(config.variable_impedance, TICK, OFFSET)),
+        ),
+        impedance=add(
+            "impedance_controller",
+            ImpedanceController(
+                timed(config.impedance, TICK, IMPEDANCE_OFFSET),
+                arm,
+                TIP_FRAME,
+                hybrid=config.hybrid,
+            ),
         ),
     )
-    shaper = add(
-        "velocity_shaper", VelocityShaper(timed(config.shaper, TICK, OFFSET), pattern)
-    )
-    variable = add(
-        "variable_impedance",
-        VariableImpedance(timed(config.variable_impedance, TICK, OFFSET)),
-    )
-    impedance = add(
-        "impedance_controller",
-        ImpedanceController(
-            timed(config.impedance, TICK, IMPEDANCE_OFFSET),
-            arm,
-            TIP_FRAME,
-            hybrid=config.hybrid,
-        ),
-    )
 
-    def connect(source, output, *targets, port=None):
-        for target in targets:
-            if target.HasInputPort(port or output):
-                builder.Connect(
-                    source.GetOutputPort(output), target.GetInputPort(port or output)
-                )
 
+def _connect(builder, source, output, *targets, port=None) -> None:
+    """Connects an output to an input of the same name, or `port`, of each target that
+    has it."""
+    for target in targets:
+        if target.HasInputPort(port or output):
+            builder.Connect(
+                source.GetOutputPort(output), target.GetInputPort(port or output)
+            )
+
+
+def _connect_systems(builder: DiagramBuilder, station, s: _Systems, config) -> None:
+    """Connects the systems with each other and the station; adds the impact reflex."""
+    connect = partial(_connect, builder)
     for q, measured in (("q", "position"), ("v", "velocity")):
-        connect(station, f"{ARM}.{measured}_measured", tip, impedance, port=q)
-    felt = f"{ARM}.external_wrench"
-    connect(station, felt, detector, modes, forward, variable, port="wrench")
-    connect(station, felt, impedance, port="wrench_measured")
-    connect(tip, "ee_pose", detector, anticipator, shaper)
-    connect(tip, "ee_velocity", detector, modes, forward, variable, anticipator)
-    connect(shaper, "direction", detector, modes, forward, variable)
-    connect(shaper, "force_directions", detector, modes, forward, variable, impedance)
-    connect(shaper, "force_targets", detector, variable, impedance)
-    connect(shaper, "phase", detector, anticipator, variable)
-    connect(shaper, "x_desired", impedance, forward)
-    connect(detector, "contact", anticipator, shaper, variable)
-    connect(modes, "transition", anticipator, forward)
-    connect(modes, "mode", forward)
-    connect(modes, "touch_mode", anticipator)
-    connect(modes, "collecting", variable)
-    connect(modes, "undecided", forward)
-    connect(forward, "wrench_predicted", variable)
-    connect(forward, "prediction_error", variable)
-    connect(forward, "handing_over", variable)
-    connect(anticipator, "contacts", shaper)
-    connect(anticipator, "mode_hint", modes)
-    connect(anticipator, "touch_hint", modes)
+        connect(station, f"{ARM}.{measured}_measured", s.tip, s.impedance, port=q)
+    watching = (s.detector, s.modes, s.forward, s.variable)
+    connect(station, WRENCH, *watching, port="wrench")
+    connect(station, WRENCH, s.impedance, port="wrench_measured")
+    connect(s.tip, "ee_pose", s.detector, s.anticipator, s.shaper)
+    connect(s.tip, "ee_velocity", *watching, s.anticipator)
+    connect(s.shaper, "direction", *watching)
+    connect(s.shaper, "force_directions", *watching, s.impedance)
+    connect(s.shaper, "force_targets", s.detector, s.variable, s.impedance)
+    connect(s.shaper, "phase", s.detector, s.anticipator, s.variable)
+    connect(s.shaper, "x_desired", s.impedance, s.forward)
+    connect(s.detector, "contact", s.anticipator, s.shaper, s.variable)
+    connect(s.modes, "transition", s.anticipator, s.forward)
+    connect(s.modes, "mode", s.forward)
+    connect(s.modes, "touch_mode", s.anticipator)
+    connect(s.modes, "collecting", s.variable)
+    connect(s.modes, "undecided", s.forward)
+    connect(s.forward, "wrench_predicted", s.variable)
+    connect(s.forward, "prediction_error", s.variable)
+    connect(s.forward, "handing_over", s.variable)
+    connect(s.anticipator, "contacts", s.shaper)
+    connect(s.anticipator, "mode_hint", s.modes)
+    connect(s.anticipator, "touch_hint", s.modes)
     for port in ("stiffness", "damping", "damping_stiffness", "wrench_feedforward"):
-        source = variable
+        source = s.variable
         if port == "wrench_feedforward" and config.reflex.gain > 0.0:
-            source = add(
+            source = builder.AddNamedSystem(
                 "impact_reflex", ImpactReflex(timed(config.reflex, TICK, OFFSET))
             )
-            connect(variable, port, source)
-            connect(station, felt, source, port="wrench")
-            connect(tip, "ee_velocity", source)
-            connect(shaper, "direction", source)
-            connect(shaper, "phase", source)
+            connect(s.variable, port, source)
+            connect(station, WRENCH, source, port="wrench")
+            connect(s.tip, "ee_velocity", source)
+            connect(s.shaper, "direction", source)
+            connect(s.shaper, "phase", source)
         if source.HasOutputPort(port):
-            connect(source, port, impedance)
-    connect(impedance, "tau", station, port=f"{ARM}.torque_commanded")
+            connect(source, port, s.impedance)
+    connect(s.impedance, "tau", station, port=f"{ARM}.torque_commanded")
 
-    record_station(builder, station, impedance.GetOutputPort("tau"), tool)
-    # Only for scoring and plots.
-    _add_telemetry(builder, SIGNALS)
-    if meshcat is not None:
-        seen = ContactView(view or ContactViewConfig(), meshcat, plan=drawn(pattern))
-        add("contact_view", seen)
-        connect(anticipator, "contacts", seen)
-        connect(station, felt, seen, port="wrench")
-        connect(tip, "ee_pose", seen)
-        connect(modes, "mode", seen)
-        connect(shaper, "phase", seen)
-        connect(shaper, "x_desired", seen)
-        legend = LegendConfig(seen.legend, (), seen.camera, seen.LOOK_AT)
-        add_legend(builder, meshcat, legend)
-    diagram = builder.Build()
-    diagram.set_name("changing_contact")
-    return diagram
+
+def _add_view(builder: DiagramBuilder, station, s: _Systems, pattern, meshcat, view):
+    """Adds ContactView and the legend in Meshcat."""
+    connect = partial(_connect, builder)
+    shown = builder.AddNamedSystem(
+        "contact_view",
+        ContactView(view or ContactViewConfig(), meshcat, plan=drawn(pattern)),
+    )
+    connect(s.anticipator, "contacts", shown)
+    connect(station, WRENCH, shown, port="wrench")
+    connect(s.tip, "ee_pose", shown)
+    connect(s.modes, "mode", shown)
+    connect(s.shaper, "phase", shown)
+    connect(s.shaper, "x_desired", shown)
+    legend = LegendConfig(shown.legend, (), shown.camera, shown.LOOK_AT)
+    add_legend(builder, meshcat, legend)
 
 
 def _add_telemetry(builder: DiagramBuilder, signals) -> None:

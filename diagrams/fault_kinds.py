@@ -36,21 +36,21 @@ class Fault:
 
 FAULTS: dict[str, Fault] = {
     "none": Fault(
-        "nothing goes wrong, but the arm is watched as with the others",
+        "no fault; only the arm's limits are monitored",
         "nothing", True, ALWAYS,
     ),
     "frames_dropped": Fault(
-        "a share of the camera's frames does not come; the one before stays",
+        "a fraction of the camera's frames is lost; the previous one stays",
         "camera", True, ALWAYS, {"share": 0.5},
     ),
     "frames_frozen": Fault(
-        "no new frame comes; the last one stays", "camera", True, 0.5
+        "the camera freezes at its last frame", "camera", True, 0.5
     ),
     "frames_delayed": Fault(
-        "each frame comes some frames late", "camera", True, ALWAYS, {"frames": 3}
+        "each frame is some frames late", "camera", True, ALWAYS, {"frames": 3}
     ),
     "second_ball": Fault(
-        "a ball of the same colour is seen at a distance from the real one",
+        "the camera shows a second ball of the same colour [m]",
         "camera", True, 3.0, {"x": 0.0, "y": 0.12},
     ),
     "glare": Fault(
@@ -65,37 +65,38 @@ FAULTS: dict[str, Fault] = {
     "torque_nan": Fault("the torque sensors give NaN", "torque", True, 0.5),
     "wrench_nan": Fault("the force sensor gives NaN", "wrench", True, 0.5),
     "position_stuck": Fault(
-        "one encoder's position does not change any more",
+        "one encoder is stuck at its position",
         "position_velocity", False, 0.2, {"joint": 4},
     ),
     "position_bias": Fault(
-        "one encoder's position is off [rad]",
+        "one encoder's position has an offset [rad]",
         "position_velocity", True, ALWAYS, {"joint": 2, "by": 0.003},
     ),
     "velocity_bias": Fault(
-        "all velocities are off [rad/s]",
+        "all velocities have an offset [rad/s]",
         "position_velocity", False, ALWAYS, {"by": 0.1},
     ),
     "torque_bias": Fault(
-        "one torque sensor is off [N m]",
+        "one torque sensor has an offset [N m]",
         "torque", True, ALWAYS, {"joint": 2, "by": 2.0},
     ),
     "wrench_bias": Fault(
-        "the force sensor is off along z [N]", "wrench", True, ALWAYS, {"by": 1.0}
+        "the force sensor has an offset along z [N]",
+        "wrench", True, ALWAYS, {"by": 1.0},
     ),
     "position_delay": Fault(
-        "positions come late [s], velocities do not",
+        "positions are delayed [s], velocities are not",
         "position_velocity", True, ALWAYS, {"sec": 0.05},
     ),
     "compute_delay": Fault(
-        "torques reach the arm late [s], as from a slow computer",
+        "torques reach the arm late, as from a slow computer [s]",
         "command", True, ALWAYS, {"sec": 0.005},
     ),
     "solver_fails": Fault(
-        "the planner's solver fails at each of its ticks", "planner", True, 0.5
+        "the planner's solver fails at every tick", "planner", True, 0.5
     ),
     "ball_taken": Fault(
-        "a hand takes the ball away and puts it back elsewhere on its circle",
+        "a hand moves the ball to another place on its circle [rad]",
         "ball", True, 4.0, {"turn": 1.57},
     ),
     "push": Fault(
@@ -103,7 +104,7 @@ FAULTS: dict[str, Fault] = {
         "arm", True, 0.3, {"x": 0.0, "y": 20.0, "z": 0.0},
     ),
     "weak_joint": Fault(
-        "one joint gives a share of its torque at most",
+        "one joint gives only a fraction of its torque",
         "command", False, ALWAYS, {"joint": 2, "share": 0.333},
     ),
     "joint_friction": Fault(
@@ -111,7 +112,7 @@ FAULTS: dict[str, Fault] = {
         "arm", False, ALWAYS, {"joints": 4, "coulomb": 2.0},
     ),
     "box": Fault(
-        "a fixed box stands on the path, from the beginning on", "scene", False, ALWAYS
+        "a fixed box stands on the path from the start", "scene", False, ALWAYS
     ),
 }  # fmt: skip
 # Range of a setting: minimum, maximum, whether it is an integer.

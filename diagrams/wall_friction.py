@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.geometry import Meshcat, Rgba
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import (
     LogVectorOutput,
     Multiplexer,
@@ -199,18 +199,27 @@ def make_wall_friction(
             raise ValueError(f"{name} is {getattr(config, name)}, expected > 0")
     if not config.start_spread >= 0.0:
         raise ValueError(f"start_spread is {config.start_spread}, expected >= 0")
+    builder = DiagramBuilder()
     scene = read_scene(TABLETOP_WALLS)
     control_plant = make_control_plant(scene, TOOL)
     set_friction(scene, {WALL: config.friction})
-    builder = DiagramBuilder()
+    station = _add_station(builder, config, scene, meshcat)
+    plan = _add_plan(builder, motion(config, start_of(control_plant)))
+    impedance, tip = _add_controller(builder, station, plan, control_plant)
+    _add_predictors(builder, station, tip, plan, predictors or {}, knowledge)
+    builder.ExportOutput(station.GetOutputPort(f"{ARM}.external_wrench"), "wrench")
+    record_station(builder, station, impedance.GetOutputPort("tau"), TOOL)
+    if meshcat is not None:
+        meshcat.SetCameraPose(*CAMERA)
+        add_legend(builder, meshcat, LegendConfig(LEGEND, (), *CAMERA))
+    return builder.Build()
 
-    def add(name, system):
-        return builder.AddNamedSystem(name, system)
 
-    wrong = None
+def _add_station(builder, config: WallFrictionConfig, scene, meshcat) -> Diagram:
+    faults = None
     if config.faults:
-        wrong = StationFaults(read_faults(config.faults, ()))
-    station = add(
+        faults = StationFaults(read_faults(config.faults, ()))
+    return builder.AddNamedSystem(
         "station",
         make_station(
             StationConfig(
@@ -221,12 +230,14 @@ def make_wall_friction(
             ),
             meshcat,
             scene,
-            wrong=wrong,
+            wrong=faults,
         ),
     )
-    chain = serial_chain_of(control_plant, TIP_FRAME)
-    plan = motion(config, start_of(control_plant))
-    sources = {}
+
+
+def _add_plan(builder, plan: dict[str, np.ndarray]) -> dict[str, OutputPort]:
+    """A TrajectorySource for each entry of a motion; gives their ports."""
+    ports = {}
     for name, values in plan.items():
         if name != "time":
             held = name in ("direction", "force_directions")
@@ -234,8 +245,16 @@ def make_wall_friction(
             line = (kind.ZeroOrderHold if held else kind.FirstOrderHold)(
                 plan["time"], values.T
             )
-            sources[name] = add(name, TrajectorySource(line)).get_output_port()
-    impedance = add(
+            source = builder.AddNamedSystem(name, TrajectorySource(line))
+            ports[name] = source.get_output_port()
+    return ports
+
+
+def _add_controller(
+    builder, station, plan: dict[str, OutputPort], control_plant
+) -> tuple[ImpedanceController, TipState]:
+    """The impedance controller, which follows the plan, and the tip's state."""
+    impedance = builder.AddNamedSystem(
         "impedance_controller",
         ImpedanceController(
             ImpedanceConfig(
@@ -245,27 +264,37 @@ def make_wall_friction(
             TIP_FRAME,
         ),
     )
-    tip = add("tip_state", TipState(chain))
-    q, v, wrench = (
-        station.GetOutputPort(f"{ARM}.{name}")
-        for name in ("position_measured", "velocity_measured", "external_wrench")
-    )
+    chain = serial_chain_of(control_plant, TIP_FRAME)
+    tip = builder.AddNamedSystem("tip_state", TipState(chain))
     for system in (impedance, tip):
-        builder.Connect(q, system.GetInputPort("q"))
-        builder.Connect(v, system.GetInputPort("v"))
+        for name, port in (("q", "position_measured"), ("v", "velocity_measured")):
+            builder.Connect(
+                station.GetOutputPort(f"{ARM}.{port}"), system.GetInputPort(name)
+            )
     for name in ("x_desired", "stiffness", "damping"):
-        builder.Connect(sources[name], impedance.GetInputPort(name))
-    builder.Connect(sources["push"], impedance.GetInputPort("wrench_feedforward"))
+        builder.Connect(plan[name], impedance.GetInputPort(name))
+    builder.Connect(plan["push"], impedance.GetInputPort("wrench_feedforward"))
     builder.Connect(
         impedance.GetOutputPort("tau"), station.GetInputPort(f"{ARM}.torque_commanded")
     )
+    return impedance, tip
 
+
+def _add_predictors(
+    builder,
+    station,
+    tip: TipState,
+    plan: dict[str, OutputPort],
+    predictors: Mapping[str, LongTermPredictor],
+    knowledge: tuple | None,
+) -> None:
+    """Mode detector, forward models and one-step predictors, and a log of them all."""
     known_modes, known_models = knowledge or (None, None)
-    modes = add(
+    modes = builder.AddNamedSystem(
         "mode_detector",
         ModeDetector(ModeDetectorConfig(), known_modes, ESTIMATE, OFFSET),
     )
-    forward = add(
+    forward = builder.AddNamedSystem(
         "forward_model_bank",
         ForwardModelBank(
             # Without torque: that of a sliding face depends on where it is pressed, not
@@ -276,56 +305,58 @@ def make_wall_friction(
             OFFSET,
         ),
     )
-    signals = {
-        "q": (q, N_ARM),
-        "v": (v, N_ARM),
-        "wrench": (wrench, 6),
-        "mode": (modes.GetOutputPort("mode"), 1),
-        "wrench_predicted": (forward.GetOutputPort("wrench_predicted"), 6),
-    }
+    wrench = station.GetOutputPort(f"{ARM}.external_wrench")
+    signals = [
+        station.GetOutputPort(f"{ARM}.position_measured"),
+        station.GetOutputPort(f"{ARM}.velocity_measured"),
+        wrench,
+        modes.GetOutputPort("mode"),
+        forward.GetOutputPort("wrench_predicted"),
+    ]
     watching = [modes, forward]
-    for name, predictor in (predictors or {}).items():
-        system = add(
+    for name, predictor in predictors.items():
+        system = builder.AddNamedSystem(
             f"predictor_{name}",
             OneStepPredictor(predictor, period_sec=ESTIMATE, offset_sec=OFFSET),
         )
         watching.append(system)
-        signals[f"{name}.wrench_predicted"] = (
+        signals += [
             system.GetOutputPort("wrench_predicted"),
-            6,
-        )
-        signals[f"{name}.std"] = (system.GetOutputPort("std"), 3)
+            system.GetOutputPort("std"),
+        ]
     inputs = {
         "wrench": wrench,
         "ee_pose": tip.GetOutputPort("ee_pose"),
         "ee_velocity": tip.GetOutputPort("ee_velocity"),
-        "direction": sources["direction"],
-        "force_directions": sources["force_directions"],
+        "direction": plan["direction"],
+        "force_directions": plan["force_directions"],
         "mode": modes.GetOutputPort("mode"),
     }
     for system in watching:
         for name, port in inputs.items():
             if system.HasInputPort(name):
                 builder.Connect(port, system.GetInputPort(name))
+    _add_log(builder, signals)
 
-    # Sampled just before the predictors run, after the same step of the plant: a row of
-    # the log has the values that they are about to read beside their predictions of
-    # them. (At their own instant the log would get the next predictions, because
-    # abstract state is updated first.)
-    sizes = [size for _, size in signals.values()]
-    bundle = add("telemetry", Multiplexer(sizes))
-    for i, (port, _) in enumerate(signals.values()):
+
+def _add_log(builder, signals: Sequence[OutputPort]) -> None:
+    """The log that `telemetry` reads.
+
+    It is sampled just before the predictors run, after the same step of the plant, so
+    that a row has the values that they are about to read beside their predictions of
+    them. (At their own instant the log would get the next predictions, because abstract
+    state is updated first.)
+    """
+    sizes = [port.size() for port in signals]
+    bundle = builder.AddNamedSystem("telemetry", Multiplexer(sizes))
+    for i, port in enumerate(signals):
         builder.Connect(port, bundle.get_input_port(i))
-    sampled = add("telemetry_hold", ZeroOrderHold(ESTIMATE, sum(sizes), 0.5 * OFFSET))
+    sampled = builder.AddNamedSystem(
+        "telemetry_hold", ZeroOrderHold(ESTIMATE, sum(sizes), 0.5 * OFFSET)
+    )
     builder.Connect(bundle.get_output_port(), sampled.get_input_port())
     log = LogVectorOutput(sampled.get_output_port(), builder, ESTIMATE)
     log.set_name("telemetry_log")
-    builder.ExportOutput(wrench, "wrench")
-    record_station(builder, station, impedance.GetOutputPort("tau"), TOOL)
-    if meshcat is not None:
-        meshcat.SetCameraPose(*CAMERA)
-        add_legend(builder, meshcat, LegendConfig(LEGEND, (), *CAMERA))
-    return builder.Build()
 
 
 def plan_of(config: WallFrictionConfig) -> dict[str, np.ndarray]:

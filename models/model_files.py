@@ -36,8 +36,8 @@ from makebreak.models.effects.kind import (
 from makebreak.models.effects.model_text import (
     children,
     edited_model_file,
+    make_mesh_paths_absolute,
     read_inertial,
-    set_text,
     text,
 )
 from makebreak.models.scene_schema import COMMANDS_OF, Scene
@@ -241,14 +241,7 @@ def _usable(uri: str, packages: PackageMap, copy: Path) -> str:
         f"({sorted(lost)[0]}{', ...' if len(lost) > 1 else ''})"
         + ("; --package NAME=PATH says where" if None in lost.values() else "")
     )
-    for element in document.getElementsByTagName("mesh"):
-        name = element.getAttribute("filename")
-        if name and "://" not in name:
-            element.setAttribute("filename", f"file://{(path.parent / name).resolve()}")
-    for element in document.getElementsByTagName("uri"):
-        name = text(element).strip()
-        if "://" not in name:
-            set_text(element, f"file://{(path.parent / name).resolve()}")
+    make_mesh_paths_absolute(document, path.parent)
     target = copy.with_suffix(path.suffix)
     target.write_text(document.toxml())
     return f"file://{target}"

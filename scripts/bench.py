@@ -1,7 +1,7 @@
-"""Measures how long the parts take; the figures of `makebreak bench`.
+"""`makebreak bench`: measures computing times.
 
-Each bench is a module with `rows() -> list[dict]`: what is measured, value, unit, and
-whatever stands beside it. Figures are process CPU time, or ratios taken in one run.
+Each benchmark is a module with `rows() -> list[dict]`: what is measured, value, unit,
+and further columns. Values are process CPU time, or ratios from one run.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,12 +32,12 @@ BENCHES: dict[str, str] = {
 def median_call_ms(
     call: Callable[[], object], n: int = 200, clock=process_time
 ) -> float:
-    """The median time of a call [ms]; the first, which may compile, is left out.
+    """The median time of a call [ms], without the first one, which may compile.
 
     Args:
-        call: what is timed.
-        n: how many calls.
-        clock: another one, as perf_counter where threads run side by side [s].
+        call: the function to time.
+        n: number of calls.
+        clock: clock [s]; perf_counter for calls with several threads.
     """
     call()
     times = np.empty(n)
@@ -49,11 +49,11 @@ def median_call_ms(
 
 
 def bench(names: Sequence[str] = ()) -> Table:
-    """Runs the benches of these names, or all.
+    """Runs the benchmarks of these names, or all.
 
-    A bench that fails is a row that says why; the others still run.
+    One that fails gives a row with the error, and does not stop the others.
 
-    Returns: the table; its first column is the bench.
+    Returns: the table; its first column is the benchmark.
     Raises: ValueError for an unknown name, with the nearest valid ones.
     """
     here = [name for name, module in BENCHES.items() if find_spec(module)]
@@ -64,10 +64,10 @@ def bench(names: Sequence[str] = ()) -> Table:
     for name in names or here:
         try:
             rows = import_module(BENCHES[name]).rows()
-        except Exception as error:  # Whatever it is, the other figures are wanted.
+        except Exception as error:  # Of any kind, so that the others still run.
             rows = [failed(name, error)]
         found += [{"bench": name, **row} for row in rows]
-    # A row's target, where it has one, is whether it was met.
+    # The key `met` becomes the table's column `target`.
     columns = list(dict.fromkeys(c for row in found for c in row if c != "met"))
     return Table(
         "makebreak bench",

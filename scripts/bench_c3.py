@@ -1,14 +1,15 @@
-"""C3 and C3+ beside a re-creation of the reference implementation with Drake's OSQP.
+"""Compares C3 and C3+ with a re-implementation of the reference with Drake's OSQP.
 
-The re-creation is the public C++ library's algorithm in pydrake: a MathematicalProgram
-whose consensus cost is replaced in every ADMM round, solved by OSQP, which sets itself
-up afresh each time; for C3 one more small program per knot and round, the projection.
-Its settings are the library's; it repeats tests/reference/c3_cartpole.npz to 1e-9
-(tests/test_c3_mpc.py). What is compared is the time within OsqpSolver.Solve alone, with
-the programs already built; the share of Python's own work in the re-creation (up to
-half, on the cart-pole) stands beside it. Ours is timed as it is called.
+The re-implementation is the algorithm of the public C++ library in pydrake: a
+MathematicalProgram whose consensus cost is replaced in every ADMM round, solved by OSQP
+with a new setup each time; and for C3 a small program for each knot and round, the
+projection. Its settings are the library's, and it reproduces
+tests/reference/c3_cartpole.npz to 1e-9 (tests/test_c3_mpc.py). Only the time within
+OsqpSolver.Solve is compared, with programs already built; the fraction of Python's work
+in the re-implementation (up to half, on the cart-pole) is given as well. Ours is the
+time of the whole call.
 
-Both do the same: rounds, rho, weights, scaling of lam, first solve from delta = w = 0.
+Rounds, rho, weights, scaling of lam and the first solve from delta = w = 0 are equal.
 The cost is that of the inputs, rolled out through the LCS with exact contact forces.
 """
 
@@ -77,8 +78,8 @@ QP_OPTIONS = dict(
 PROJECTION_OPTIONS = dict(
     max_iter=500, polishing=1, polish_refine_iter=1, rho=1e-4, scaled_termination=1
 )
-# rho of the ball problem; its file does not give one. It is that of the ball-rolling
-# controller; of the cart-pole the reference's.
+# rho of the ball problem is that of the ball-rolling controller, as its file gives
+# none; that of the cart-pole is the reference's.
 BALL_RHO, CARTPOLE_RHO = 2.2, 2.0
 
 
@@ -95,7 +96,7 @@ class OsqpC3:
     Args:
         lcs: the model, in its own units.
         problem: what `solve_c3` takes; without bounds and without input-change penalty.
-        scaling: divides the slack's rows in the projection, as the library does.
+        scaling: divisor of the slack's rows in the projection, as in the library.
     """
 
     def __init__(self, lcs: LCS, problem: C3Problem, scaling: float = 1e3):
@@ -158,7 +159,7 @@ class OsqpC3:
     def solve(self, x0, x_desired, u_prev=None):
         """Inputs u (N, n_u) from the state x0 (n_x,); x_desired (N + 1, n_x).
 
-        u_prev (N, n_u): centre of the input cost (the library's last solution, always).
+        u_prev (N, n_u): centre of the input cost; in the library the last solution.
         """
         o, p, lcs = self.problem.options, self.problem, self.lcs
         self.start.UpdateCoefficients(np.eye(p.n_x), x0)
@@ -276,7 +277,7 @@ def cartpole(plus: bool, N: int):
 
 @contextmanager
 def quiet():
-    """Sends what compiled code prints to nowhere (OSQP reports its polishing)."""
+    """Discards output of compiled code, as OSQP reports its polishing."""
     sys.stdout.flush()
     kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     try:
@@ -289,7 +290,7 @@ def quiet():
 
 
 def interleaved_ms(calls, n):
-    """Median process CPU time of each call [ms], taken in turns; the first is apart."""
+    """Median process CPU time of each call [ms], taken in turns, without the first."""
     times = np.empty((n + 1, len(calls)))
     for row in times:
         for j, call in enumerate(calls):
@@ -331,7 +332,7 @@ def measure(name: str, make, plus: bool, N: int, repeats: int) -> dict:
 
 
 def rows(horizons: Sequence[int] = (5, 10, 20, 40, 80), repeats: int = 41):
-    """The rows of `makebreak bench c3`, and the growth with N as the last ones."""
+    """The rows of `makebreak bench c3`; the last ones give the growth with N."""
     found = []
     for plus in (True, False):
         times = []
@@ -377,15 +378,15 @@ def rows(horizons: Sequence[int] = (5, 10, 20, 40, 80), repeats: int = 41):
 def combinations(repeats: int):
     """Both solvers with both contact models on the ball at N = 10, eps_c 5e-4.
 
-    The cost is that of the inputs rolled out with exact forces of Stewart's and
-    Trinkle's contact, whichever was planned with: it does not open as it slides.
+    The cost is always that of the inputs rolled out with exact Stewart-Trinkle contact
+    forces, as its contacts do not open while they slide.
     """
     found, real = [], ball_lcs(4, StewartTrinkle())
     for plus in (True, False):
         _, x0, x_desired, p = ball(plus, 10)
         for name, law in (("Anitescu", Anitescu()), ("S.-T.", StewartTrinkle())):
             lcs = ball_lcs(4, law)
-            # The file's weights are those of 16 forces, all alike.
+            # The file's weights are for 16 forces, and equal.
             weights = C3Weights(p.Q, p.R, _widened(p.G, lcs), _widened(p.U, lcs))
             problem = C3Problem(weights, p.projection, p.options)
             ms = median_call_ms(partial(solve_c3, lcs, x0, x_desired, problem), repeats)
@@ -408,7 +409,7 @@ def combinations(repeats: int):
 
 
 def _widened(weight, lcs: LCS):
-    """G or U of the ball problem for as many forces as lcs has."""
+    """G or U of the ball problem for the number of forces of lcs."""
     parts = [weight[:19], np.full(lcs.n_lam, weight[19]), weight[35:38]]
     if weight.size > 38:
         parts.append(np.full(lcs.n_lam, weight[38]))
@@ -420,7 +421,7 @@ def bounded(N: int, repeats: int, polish=()):
     lcs, x0, x_desired, plain = ball(True, N)
     weights = C3Weights(plain.Q, plain.R, plain.G, plain.U)
     free, _ = solve_c3(lcs, x0, x_desired, plain)
-    # Bounds that the free plan breaches: half of its largest input and velocity.
+    # Bounds that the free plan violates: half of its largest input and velocity.
     u_max = np.full(3, 0.5 * abs(free.u).max())
     x_max = np.full(19, np.inf)
     x_max[10:13] = 0.5 * abs(free.x[1:, 10:13]).max()
@@ -435,7 +436,7 @@ def bounded(N: int, repeats: int, polish=()):
         C3Problem(weights, plain.projection, replace(plain.options, polish=n), bounds)
         for _, bounds, n in cases
     ]
-    # In turns: what else the machine does meets all of them.
+    # In turns, so that other load on the machine affects all of them.
     calls = [partial(solve_c3, lcs, x0, x_desired, problem) for problem in problems]
     times = interleaved_ms(calls, repeats)
     found: list[dict] = []

@@ -1,4 +1,4 @@
-"""Time to make one picture and to find the ball in it, and how well it is found."""
+"""Time to render an image and to detect the ball in it, and the detection's error."""
 
 from functools import partial
 

@@ -8,7 +8,7 @@ from makebreak.scripts.bench_rows import failed
 from makebreak.scripts.experiments import EXPERIMENTS, load_experiment
 from makebreak.scripts.trials import run_many
 
-DURATION_SEC = 10.0  # Simulated; the first second, with its compiling, counts little.
+DURATION_SEC = 10.0  # Simulated time.
 
 
 def rows() -> list[dict]:
@@ -26,7 +26,7 @@ def rows() -> list[dict]:
             what = f"{name}, {label}"
             try:
                 found += _measured(name, values, what, seconds)
-            except Exception as error:  # The others are wanted all the same.
+            except Exception as error:  # So that the others still run.
                 found.append(failed(what, error))
     return found
 
@@ -44,8 +44,8 @@ def _measured(name: str, values: dict, what: str, seconds: float) -> list[dict]:
 
 
 def _without_pictures(figures: dict, what: str) -> list[dict]:
-    """The row of what is left without the time in which pictures are drawn, for an
-    experiment that draws any. The median, times their number: no preemption in it."""
+    """The row without the time for rendering, for an experiment with images. That time
+    is the median of an image times their number, which excludes preemption."""
     drawn = 0.0
     for name, system in figures.get("systems", {}).items():
         if name.endswith("_camera"):

@@ -1,4 +1,4 @@
-"""Time of a `makebreak gap` on a minute of a Panda's motion, 200 rows a second."""
+"""Time of `makebreak gap` on one minute of a Panda's motion at 200 rows per second."""
 
 import json
 import resource
@@ -20,7 +20,7 @@ from makebreak.scripts import bench_sysid
 from makebreak.scripts.trials import makebreak_command
 
 DURATION_SEC, RATE_HZ = 60.0, 200.0
-TARGET_SEC = 120.0  # By the clock, on two cores.
+TARGET_SEC = 120.0  # Wall time on two cores.
 POSITION_NOISE, VELOCITY_NOISE = 3e-5, 3e-3  # [rad], [rad/s]
 FRICTION_JOINT, FRICTION = 3, 1.8  # [N m] Coulomb, of panda_joint4.
 _STEP = 5e-4  # [s] of the integration; 1/_STEP is a multiple of the rate.
@@ -35,7 +35,7 @@ actuation: {{type: effort, joints: [{joints}], hold: zero_order, rate_hz: {rate}
 
 
 class _Arm:
-    """The arm's equations of motion. Its friction is no part of any scene."""
+    """The arm's equations of motion, with a friction that the scene does not have."""
 
     def __init__(self):
         self._plant = MultibodyPlant(0.0)
@@ -66,7 +66,7 @@ class _Arm:
 
 
 def sum_of_sines(rng) -> Callable[[float], tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Time [s] -> position, velocity, acceleration (7,) that the arm is to follow."""
+    """Function of time [s] to desired position, velocity, acceleration (7,)."""
     middle = np.array([0.0, -0.3, 0.0, -1.9, 0.0, 1.9, 0.0])
     reach = np.array([0.8, 0.5, 0.8, 0.6, 0.9, 0.7, 0.9])
     w = 2.0 * np.pi * rng.uniform(0.08, 0.6, (7, 5))
@@ -87,10 +87,10 @@ def sum_of_sines(rng) -> Callable[[float], tuple[np.ndarray, np.ndarray, np.ndar
 def record(
     folder: Path, seed: int = 0, duration: float = DURATION_SEC
 ) -> tuple[Path, Path]:
-    """Writes a scene without friction and a recording of an arm that has it.
+    """Writes a scene without friction, and a recording of an arm with friction.
 
-    The arm follows a sum of sines by computed torque, which knows of no friction; its
-    motion is integrated with the classical Runge-Kutta method.
+    The arm follows a sum of sines by computed torque without friction compensation; its
+    motion is integrated by the classical Runge-Kutta method.
 
     Returns: the scene, the recording.
     """
@@ -125,7 +125,7 @@ def record(
 
 
 def rows() -> list[dict]:
-    """Seconds of the command by the clock, and of all its processes' CPU time."""
+    """Wall time of the command, and CPU time of all its processes [s]."""
     with TemporaryDirectory() as folder:
         scene, recording = record(Path(folder))
         out = Path(folder) / "out"

@@ -97,7 +97,7 @@ def rows() -> list[dict]:
             controller.GetInputPort(name).FixValue(context, value)
 
         def tick(controller=controller, context=context):
-            context.SetTime(context.get_time() + 0.001)  # Else the last one is kept.
+            context.SetTime(context.get_time() + 0.001)  # Invalidates cached outputs.
             controller.EvalUniquePeriodicDiscreteUpdate(context)
 
         found.append(

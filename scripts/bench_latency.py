@@ -1,8 +1,8 @@
-"""Ages in `ball_rolling`: how long after a sensor changes each system shows it.
+"""Latencies in `ball_rolling`: from a change of a sensor to that of each output.
 
-Measured, not added up from periods: two copies of one Context go on, in one of which a
-sensor reads a little else from some instant on. What differs has seen it. In simulated
-time an update takes none: its computing time stands beside it.
+They are measured: two copies of one Context are simulated, and in one of them a sensor
+is perturbed from some instant on. An output has seen the change when it differs. As
+updates take no simulated time, their computing time is given as well.
 """
 
 import subprocess
@@ -31,19 +31,19 @@ from makebreak.scripts.bench_rows import failed
 from makebreak.scripts.trials import makebreak_command, run_commands
 from makebreak.systems.contact_mpc.numerics.rolling_task import ROLL
 
-WARM_SEC = 6.0  # Until then the ball rolls, and the learner's buffer is full.
-MOST_SEC = 30.0  # To wait for that.
-ROLLS = 8  # Periods of C3 in which it was rolled without a break.
+WARM_SEC = 6.0  # Time by which the ball rolls and the learner's buffer is full.
+WARM_MAX_SEC = 30.0  # Timeout for the ball to roll.
+ROLLS = 8  # Consecutive periods of C3 with a rolling ball before the measurement.
 PHASES = 32  # Instants within a period of the learner at which a sensor changes.
-LOOK_SEC = 2.5e-4  # Between two looks.
-WITHIN_SEC = 0.15  # What has not changed by then does not depend on it.
-# Each sensor, and by how much it changes: far more than rounding, too little for the
-# state machines to decide otherwise.
+LOOK_SEC = 2.5e-4  # Period at which outputs are compared.
+WITHIN_SEC = 0.15  # An output unchanged after this time does not depend on the sensor.
+# Size of the perturbation of each sensor: far above rounding, but too small to change
+# decisions of state machines.
 ENCODERS, TORQUES = f"{ARM}.position_measured", f"{ARM}.torque_measured"
 PICTURE = "overhead.rgb_image"
 NUDGES = {ENCODERS: 1e-6, TORQUES: 1e-3, PICTURE: 1.0}
 SAYS = {ENCODERS: "encoders", TORQUES: "joint torques", PICTURE: "picture"}
-# What is looked at, in the order of the data: (system, port).
+# Outputs that are compared, in the order of the data flow: (system, port).
 OUTPUTS = {
     "tracked ball": ("ball_tracker", "p_WB"),
     "state": ("state_estimator", "x"),
@@ -55,19 +55,18 @@ OUTPUTS = {
 }
 SHOWN = {
     ENCODERS: {name: port for name, port in OUTPUTS.items() if name != "tracked ball"},
-    # (The state shows them only when the arm has moved.)
+    # The state depends on torques only through the arm's motion.
     TORQUES: {
         name: OUTPUTS[name] for name in ("force on the tip", "learned gap", "plan")
     },
     PICTURE: OUTPUTS,
 }
-LCM_SEC, LCM_RATE = 4.0, 0.2  # Of the robot; simulated per real second.
+LCM_SEC, LCM_RATE = 4.0, 0.2  # Duration; simulated seconds per real second.
 LCM_URL = "udpm://239.255.76.67:7693?ttl=0"
 
 
 class Nudge(LeafSystem):
-    """Its input, and a little more while its state is not zero; of a picture: shifted
-    by so many pixels."""
+    """Adds its state (initially 0) to a vector, or shifts an image by that [pixels]."""
 
     def __init__(self, port):
         super().__init__()
@@ -97,7 +96,7 @@ class Nudge(LeafSystem):
 
 
 def make_nudged_station(station: Diagram) -> Diagram:
-    """The station with a Nudge, by the port's name, behind each sensor of NUDGES."""
+    """The station with a Nudge, named after the port, behind each sensor of NUDGES."""
     builder = DiagramBuilder()
     builder.AddNamedSystem("inner", station)
     for i in range(station.num_input_ports()):
@@ -123,11 +122,11 @@ def ages(
     outputs: Mapping[str, tuple[str, str]],
     phases: int,
 ) -> dict[str, np.ndarray]:
-    """{output: (phases,) s} from when `sensor` changes until the output does; inf: not
-    within WITHIN_SEC.
+    """{output: (phases,) time [s] from the change of `sensor` to that of the output};
+    inf if it does not change within WITHIN_SEC.
 
-    Args: context, of the diagram, which stays as it
-        is. sensor, of NUDGES; outputs, {name: (system, port)}.
+    Args: context: of the diagram, not changed; sensor: a key of NUDGES; outputs: {name:
+        (system, port)}.
     """
     nudge = diagram.GetSubsystemByName("station").GetSubsystemByName(sensor)
     ports = {
@@ -136,7 +135,7 @@ def ages(
     }
     found = {name: np.full(phases, np.inf) for name in ports}
     for k in range(phases):
-        # In the middle between two ticks: what is read at a tick is never old news.
+        # In the middle between two ticks, so that each tick reads a current value.
         start = context.get_time() + (k + 0.5) * LEARN / phases
         runs = [Simulator(diagram, context.Clone()) for _ in range(2)]
         for run in runs:
@@ -163,8 +162,8 @@ def ages(
 
 
 def rows() -> list[dict]:
-    """Mean and largest age [ms] of each sensor in each output that depends on it, with
-    the computing time of the output's system; then the loop over LCM."""
+    """Mean and largest latency [ms] from each sensor to each output that depends on it,
+    with the computing time of the output's system; then the loop over LCM."""
     config = BallRollingConfig(camera=CameraConfig(renderer="drawn"), seed=2)
     diagram = make_ball_rolling(config, station=make_nudged_station(make_world(config)))
     simulator = Simulator(diagram)
@@ -172,12 +171,12 @@ def rows() -> list[dict]:
     context = simulator.get_context()
     own = phase.get_system().GetMyContextFromRoot(context)
     periods, rolls = round(WARM_SEC / CONTROL), 0
-    while rolls < ROLLS:  # C3's command reaches the arm while it rolls, not else.
+    while rolls < ROLLS:  # C3's command reaches the arm only while the ball rolls.
         simulator.AdvanceTo(periods * CONTROL)
         rolls = rolls + 1 if phase.Eval(own)[0] == ROLL else 0
         periods += 1
-        if context.get_time() > MOST_SEC:
-            raise RuntimeError(f"the ball is not rolled within {MOST_SEC} s")
+        if context.get_time() > WARM_MAX_SEC:
+            raise RuntimeError(f"the ball is not rolled within {WARM_MAX_SEC} s")
     found = [row for sensor in NUDGES for row in _rows(sensor, diagram, context)]
     try:
         return found + _lcm_rows()
@@ -210,8 +209,8 @@ def _rows(sensor: str, diagram: Diagram, context: Context) -> list[dict]:
 
 
 def _lcm_rows() -> list[dict]:
-    """The controllers and a stand-in robot, in two processes that share this machine:
-    wall time of an answer, and the robot's time until it acts."""
+    """Controllers and simulated robot in two processes on this machine: wall time from
+    a status to its command, and the robot's time until that acts."""
     common = ["--set", "camera.renderer=drawn", "--seed", "2"]
     station = makebreak_command(
         "station", "--url", LCM_URL, "--rate", f"{LCM_RATE}", *common

@@ -20,7 +20,7 @@ def rows() -> list[dict]:
     for analytic in (True, False):
         model = AnitescuLcs(diagram, pairs, dt_sec=0.05, analytic=analytic)
         x = model.x_default.copy()
-        x[:3], x[7:10] = [0.0, 0.0, 0.1], [0.01, 0.0, 0.04]  # Apart, not in line.
+        x[:3], x[7:10] = [0.0, 0.0, 0.1], [0.01, 0.0, 0.04]  # A generic configuration.
         u = np.zeros(model.n_u)
         path = "analytic" if model.is_analytic else "AutoDiff"
         what = f"LCS build, {path}, n_x {model.n_x}, n_lam {model.n_lam}"

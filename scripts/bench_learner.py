@@ -1,4 +1,4 @@
-"""How long a residual update takes; at most 5 ms are allowed for n_b = 10."""
+"""Time of an update of the residual learner; the target is 5 ms for n_b = 10."""
 
 from time import process_time
 
@@ -18,10 +18,10 @@ EPS, GAMMA, DT = 2e-6, 5e-4, 0.05
 
 
 def finger_and_ball(rng) -> tuple[LCS, LCS]:
-    """Model and truth of a finger on a ball on a table, of the size of ball rolling.
+    """Model and truth of a finger on a ball on a table, of ball_rolling's dimensions.
 
     15 states, 3 inputs, two contacts of 4 friction edges; masses and lever arms are
-    those of the ball-rolling scene, the contacts are open or closed at random.
+    those of the ball-rolling scene, and contacts are open or closed at random.
     """
     normal = np.repeat([[1.0, 0, 0], [0, 0, 1.0]], 4, axis=0)
     tangents = np.array([[0, 1, 0], [0, 0, 1], [0, -1, 0], [0, 0, -1]])
@@ -31,7 +31,7 @@ def finger_and_ball(rng) -> tuple[LCS, LCS]:
     J_v = np.hstack([J_e, arm, push])  # v = [v_e, omega, v_b].
     inverse_mass = np.repeat([1.0, 1 / (0.4 * 0.07 * 0.0315**2), 1 / 0.07], 3)
     D_v = DT * inverse_mass[:, None] * J_v.T
-    pick = np.zeros((9, 6))  # Positions are those of the finger and of the ball.
+    pick = np.zeros((9, 6))  # Rates of the positions of finger and ball.
     pick[[0, 1, 2, 6, 7, 8], range(6)] = 1.0
     A = np.block([[np.eye(6), DT * pick.T], [np.zeros((9, 6)), np.eye(9)]])
     D = np.vstack([DT * pick.T @ D_v, D_v])

@@ -1,10 +1,8 @@
-"""Time to score 16 places around an object: one batch, and one after another.
+"""Time to score 16 contact candidates around an object, in a batch and one by one.
 
-The same plans, to rounding: 19 states, 16 forces, 5 knots. One after another is what
-the public functions take: AnitescuLcs.build and solve_c3 of each place, with the
-analytic LCS and with the general one, which was the only one for such an object before.
-The batch spreads the places over the computer's cores: what it gains is stated for one
-thread and for all.
+The plans are equal up to rounding: 19 states, 16 forces, 5 knots. One by one means
+AnitescuLcs.build and solve_c3 for each candidate, with the analytic LCS and with the
+general one. The batch uses all cores; its gain is given for one thread and for all.
 """
 
 from functools import partial
@@ -38,11 +36,11 @@ from makebreak.systems.contact_mpc.numerics.contact_sampling import (
 from makebreak.systems.contact_mpc.numerics.push_task import PushConfig, look_ahead
 
 PLACES = 16
-RATE_MIN, GAIN_MIN = 10.0, 4.0  # [Hz], and how many times faster.
+RATE_MIN, GAIN_MIN = 10.0, 4.0  # Targets of the rate [Hz] and of the speed-up.
 
 
 def rows() -> list[dict]:
-    """Milliseconds of a round, its rate on one core, and the gain of the batch."""
+    """Time of a round [ms], its rate on one core, and the speed-up by the batch."""
     spec = PushedObject("t")
     diagram, pairs = make_tip_and_object(spec)[0], contact_pairs(spec, 0.5)
     model = AnitescuLcs(diagram, pairs, 0.1)
@@ -78,7 +76,7 @@ def rows() -> list[dict]:
         batches = [("one thread", median_call_ms(batch, 30))]
     finally:
         numba.set_num_threads(threads)
-    if threads > 1:  # Cores side by side: by the clock, not their sum.
+    if threads > 1:  # Wall time, as CPU time would add up over cores.
         on_all = median_call_ms(batch, 30, perf_counter)
         batches.append((f"{threads} threads (elapsed)", on_all))
     rate = 1e3 / batches[0][1]

@@ -1,15 +1,15 @@
-"""`makebreak gap` beside MuJoCo's own toolbox, mujoco.sysid, on hidden effects.
+"""Compares `makebreak gap` with MuJoCo's toolbox mujoco.sysid on hidden effects.
 
-Six of the benchmark's mechanism cases, two of them with nothing hidden. The toolbox is
-set up as a user who knows it would: the robot's URDF with motors and rotors; damping,
-dry friction and rotor inertia of all joints free, and a load on the last link; mass and
-centre of mass of every link too where the scene says that they are known to per cents
-only; windows of 0.3 s from smoothed states; errors in units of noise, with what the
-starts make of it; x_scale='jac'.
+There are six of the benchmark's mechanism cases, two of them without hidden effects.
+The toolbox is set up as by an experienced user: the robot's URDF with motors and
+rotors; free parameters are damping, dry friction and rotor inertia of all joints and a
+load on the last link, and also mass and centre of mass of every link where the scene
+declares them as known to a few per cent only; windows of 0.3 s start from smoothed
+states; residuals are divided by the standard deviation of the noise, including that of
+the starts; x_scale='jac'.
 
-It is asked what it is made for, values with intervals. Which effect it is it does not
-say: what is counted is how many of the parameters that are right as they are it moves
-away from there by more than its interval.
+The toolbox gives values with intervals but does not name effects. So the number of
+correct parameters that it changes by more than their interval is counted.
 
     pip install 'makebreak[sysid]'
 """
@@ -40,15 +40,16 @@ CASES = (
     "10_arm_joint_viscous_damping", "19_arm_rotor_inertia", "21_arm_payload",
 )  # fmt: skip
 WINDOW_SEC, STEP_SEC = 0.3, 0.0025
-_SMOOTHING_ROWS = 21  # Of a cubic, for the windows' starts: 100 ms.
-_START = np.sqrt(9.0 / (4.0 * _SMOOTHING_ROWS))  # Its noise, in that of a sample.
+_SMOOTHING_ROWS = 21  # Rows of the cubic fit to a window's start: 100 ms.
+# Standard deviation of the fitted start, over that of a sample.
+_START = np.sqrt(9.0 / (4.0 * _SMOOTHING_ROWS))
 _PARTS = ("damping", "friction", "rotor")
 
 
 @dataclass(frozen=True)
 class Fit:
-    """values, intervals (95 %, either way), by name; what is right where nothing is
-    hidden; seconds of CPU time."""
+    """{name: value} and {name: half width of the 95 % interval} of the parameters;
+    their values without hidden effects; CPU time [s]."""
 
     values: Mapping[str, float]
     intervals: Mapping[str, float]
@@ -58,8 +59,8 @@ class Fit:
 
 @dataclass
 class Problem:
-    """A case as the toolbox takes it. rows: of one episode each, time (k,), q, v,
-    effort (k, n). noise: of position and velocity."""
+    """A case for the toolbox. rows: for each episode time (k,), q, v, effort (k, n);
+    noise: standard deviations of position and velocity."""
 
     urdf: str
     joints: list[str]
@@ -70,7 +71,7 @@ class Problem:
 
 
 def available() -> bool:
-    """Whether the toolbox can be loaded, with all that it needs."""
+    """Whether the toolbox and its dependencies are installed."""
     if find_spec("mujoco") is None:
         return False
     import mujoco.sysid
@@ -79,7 +80,7 @@ def available() -> bool:
 
 
 def read_case(folder: Path) -> Problem:
-    """The files of a case, without makebreak's own reader."""
+    """Reads the files of a case, without makebreak's own reader."""
     scene = yaml.safe_load((folder / "scene.yaml").read_text())
     model = scene["directives"][0]["add_model"]
     joints = scene["actuation"]["joints"]
@@ -108,7 +109,7 @@ def read_case(folder: Path) -> Problem:
 
         q, v = filled("position"), filled("velocity")
         each = {"time": time, "q": q, "effort": filled("effort_command")}
-        # Velocity from the positions where it is not measured.
+        # The velocity is differentiated from positions if it is not measured.
         each["v"] = np.gradient(q, time, axis=0) if v is None else v
         each["measured_v"] = np.array([v is not None])
         problem.rows.append(each)
@@ -122,7 +123,7 @@ def read_case(folder: Path) -> Problem:
 
 
 def _spec(problem: Problem):
-    """The URDF in MuJoCo, with motors, rotors, and sensors of every joint."""
+    """The URDF as an MjSpec, with motors, rotors, and sensors of every joint."""
     import mujoco
 
     plain = re.sub(r"<transmission.*?</transmission>", "", problem.urdf, flags=re.S)
@@ -131,7 +132,7 @@ def _spec(problem: Problem):
     plain = plain.replace("<link", f"{head}<link", 1)
     spec = mujoco.MjSpec.from_string(plain)
     spec.option.timestep = STEP_SEC
-    # Of first order the others are off by a hundred times the noise in a window.
+    # The errors of MuJoCo's first-order integrators are a hundred times the noise.
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
     rotors = dict(
         re.findall(
@@ -158,7 +159,7 @@ def _spec(problem: Problem):
 
 
 def _parameters(problem: Problem, spec, rotors):
-    """What is free, from the URDF's values."""
+    """The free parameters, which start at the URDF's values."""
     from mujoco import sysid
 
     free = sysid.ParameterDict()
@@ -189,7 +190,7 @@ def _parameters(problem: Problem, spec, rotors):
         return modify
 
     def set_load(body, mass, com, inertia):
-        """A point mass on the last link, whose own numbers are given."""
+        """Adds a point mass to the last link, whose own inertia is given."""
 
         def modify(spec, p):
             m, *place = map(float, p.value)
@@ -227,7 +228,7 @@ def _parameters(problem: Problem, spec, rotors):
         tensor = R @ np.diag(body.inertia) @ R.T
         mass, com = float(body.mass[0]), np.array(body.ipos)
         if body.name == problem.last:
-            # On the last link its own four numbers and a load's are one.
+            # The last link's own mass and centre of mass replace those of a load.
             start = np.array([0.01, *com])
             low, high = [0.0, *(com - 0.3)], [3.0, *(com + 0.3)]
             modify = set_load(body.name, mass, com, tensor)
@@ -281,7 +282,7 @@ def _sequences(problem: Problem, spec):
 
 
 def fit(problem: Problem, jobs: int = 1) -> Fit:
-    """What the toolbox finds."""
+    """Runs the toolbox on a case."""
     from mujoco import sysid
 
     begin = process_time()
@@ -294,15 +295,15 @@ def fit(problem: Problem, jobs: int = 1) -> Fit:
     seen_v = problem.rows[0]["measured_v"][0]
 
     def std_of(t) -> np.ndarray:
-        """(rows, 2 n): a sample's noise and what its window's start makes of it."""
+        """(rows, 2 n) standard deviation of a sample and of its window's start."""
         drift = _START * velocity * t
         q = np.sqrt((1.0 + _START**2) * position**2 + drift**2)
         v = np.full_like(q, np.sqrt(1.0 + _START**2) * velocity if seen_v else np.inf)
         return np.column_stack([q] * n + [v] * n)
 
     def in_noise(params, predicted, measured, model, return_all, state=None, **_):
-        # The states after each step (the toolbox's sensors are from before it), at the
-        # times at which something was measured.
+        # States after each step, as the toolbox's sensors are those before it, at the
+        # times of measurements.
         t, q, v = state[:, 0], state[:, 1 : 1 + n], state[:, 1 + n : 1 + 2 * n]
         at = measured.times
         got = np.hstack([CubicHermiteSpline(t, q, v)(at), CubicSpline(t, v)(at)])
@@ -326,7 +327,7 @@ def fit(problem: Problem, jobs: int = 1) -> Fit:
 
 
 def _names(free) -> list[str]:
-    """One for each number: link.mass, link.x, ..."""
+    """The name of each free number: link.mass, link.x, ..."""
     out = []
     for p in free.values():
         parts = ("mass", "x", "y", "z")
@@ -335,8 +336,8 @@ def _names(free) -> list[str]:
 
 
 def compare(found: Fit, truth: Mapping) -> tuple[dict[str, float], int, int]:
-    """Against what was hidden: the relative errors of the parameters that stand for it;
-    how many of the others are off by more than their interval, of how many."""
+    """Relative errors of the parameters of the hidden effects; the number of other
+    parameters that are off by more than their interval, and of all others."""
     expected = {k: v for k, v in found.nominal.items() if not k.endswith(_PARTS)}
     own = {k: 0.0 for k in found.nominal if k.endswith(("damping", "friction"))}
     rotors = {k: v for k, v in found.nominal.items() if k.endswith("rotor")}
@@ -360,9 +361,9 @@ def compare(found: Fit, truth: Mapping) -> tuple[dict[str, float], int, int]:
     for name, value in hidden.items():
         change = abs(value - (expected[name] if name.endswith("rotor") else 0.0))
         errors[name] = abs(found.values[name] - value) / change if change else 0.0
-    # A load of no mass may be anywhere.
+    # The place of a load without mass is arbitrary.
     loose = [k for k in expected if ".load." in k and not k.endswith("mass")]
-    # Links that are freed are off in truth, by what nobody wrote down.
+    # The true values of freed links differ from the URDF, and are not recorded.
     links = [k for k in expected if ".link." in k]
     others = [k for k in expected if k not in hidden and k not in (*loose, *links)]
     if any(k.endswith("load.mass") for k in others):
@@ -372,7 +373,7 @@ def compare(found: Fit, truth: Mapping) -> tuple[dict[str, float], int, int]:
 
 
 def rows(cases: Sequence[str] = CASES) -> list[dict]:
-    """Two rows a case, one a tool; or one that says what is missing."""
+    """Two rows for each case, one for each tool; or one that says what is missing."""
     what = "gap beside mujoco.sysid"
     try:
         check("development")

@@ -1,12 +1,12 @@
-"""Adapt now, understand later, where contacts change: trials with a wrong model, `gap`
-on their recording, and the first trial with the repaired one.
+"""Closes the loop with changing contacts: trials with a wrong model, `makebreak gap` on
+their recording, and a first trial with the repaired model.
 
     makebreak close-the-loop contact_learning --seed 0
 
-The shipped scene is the model; in the world of the seed walls stand elsewhere, or
-surfaces have other frictions. Before each run the motion is rehearsed in the model, so
-that what the model has right or wrong shows in the first real trial. Nothing but the
-recording and the scenes passes from one step to the next; the truth is for the table.
+The shipped scene is the model; in the simulated world walls are displaced, or surfaces
+have other frictions, as the seed draws them. Before each run the motion is rehearsed in
+the model, so that the first real trial shows the model's quality. Only the recording
+and the scenes pass from one step to the next; the truth is used for the table alone.
 """
 
 import json
@@ -24,18 +24,20 @@ from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.settings import apply_settings
 from makebreak.scripts.table import Table
 
-PLACE_M, FRICTION_SHARE = 5e-4, 0.05  # Goals of what is named.
-FORCE_N, FORCE_TOL_N = 8.0, 0.6  # Of the first impacts after the repair.
-ERROR_SHARE = 1 / 3  # Of the first trial's tracking error, of that before.
+# Goals: greatest error of displacements [m] and relative error of frictions; impact
+# force in the first trial after the repair; its tracking error over that before.
+PLACE_M, FRICTION_SHARE = 5e-4, 0.05
+FORCE_N, FORCE_TOL_N = 8.0, 0.6
+ERROR_SHARE = 1 / 3
 WALLS = ["spread=0.03", "stiffness=[8e4,8e4]", "rehearse=2"]
-# Of the first run, and of the one with the repaired model beside them.
+# Settings of both runs of each experiment.
 SETTINGS: dict[str, list[str]] = {
     "contact_learning": WALLS,
     "multiple_collisions": ["tool=block", *WALLS],
     "changing_surface": ["baselines=false", "rehearse=1"],
 }
 TRIALS = {"contact_learning": (5, 1), "multiple_collisions": (4, 1)}
-# Where on the plate each of three surfaces is looked at [m].
+# Points of the plate at which the friction of each of three surfaces is compared [m].
 PROBES = ((0.45, -0.08), (0.45, 0.08), (0.57, 0.0))
 MODULES: dict[str, Any] = {
     "contact_learning": contact_learning,
@@ -53,9 +55,9 @@ AXES = "xyz"
 def close_contact_loop(
     experiment: str, out: Path, seed: int, settings: Sequence[str] = (), jobs: int = 1
 ) -> Table:
-    """All three steps, each in a subfolder of `out`, and loop.json.
+    """Runs all three steps, each in a subfolder of `out`, and writes loop.json.
 
-    Args: experiment, of SETTINGS; the rest as of close_the_loop.
+    Args: experiment: a key of SETTINGS; others as in close_the_loop.
     Raises: as close_the_loop.
     """
     command = f"close-the-loop {experiment}"
@@ -111,7 +113,7 @@ def close_contact_loop(
 
 
 def _first_trial(row, key: str, before, after) -> None:
-    """Of a result of each trial, or of each impact of the first one."""
+    """Adds rows for a result of the first trial, or of each of its impacts."""
     a, b = (np.atleast_1d(np.array(x, dtype=float)) for x in (before, after))
     if "contact" in key or "time" in key:
         a, b = a[:1], b[:1]
@@ -124,17 +126,19 @@ def _first_trial(row, key: str, before, after) -> None:
 
 
 def _places(row, task, effects: Sequence[Mapping]) -> None:
-    """Of each surface by how far it is displaced, along what the tool touches."""
+    """Adds a row for the displacement of each surface along its normal."""
     for name, axis in (("table", 2), ("red_block", 1), ("blue_wall", 0)):
         off = float((position(task.world, name) - position(task.model, name))[axis])
-        said = displacement(effects, name, AXES[axis])
-        good = abs(said - off) <= PLACE_M
+        moved = displacement(effects, name, AXES[axis])
+        good = abs(moved - off) <= PLACE_M
         wanted = f"{1e3 * off:.2f} +- {1e3 * PLACE_M:.1f}"
-        row(f"{name}, displaced along {AXES[axis]} [mm]", 0.0, 1e3 * said, wanted, good)
+        row(
+            f"{name}, displaced along {AXES[axis]} [mm]", 0.0, 1e3 * moved, wanted, good
+        )
 
 
 def displacement(effects: Sequence[Mapping], model: str, axis: str) -> float:
-    """By how far effects of a result move a model along an axis [m]."""
+    """Displacement of a model along an axis by the effects of a result [m]."""
     total = 0.0
     for effect in effects:
         names = {"wall_position": axis, "plane_height": "height" if axis == "z" else ""}
@@ -147,15 +151,15 @@ def displacement(effects: Sequence[Mapping], model: str, axis: str) -> float:
 
 def _frictions(row, task, effects: Sequence[Mapping]) -> None:
     for k, (place, truth) in enumerate(zip(PROBES, task.friction, strict=True)):
-        said = friction_at(effects, place, 0.3)
-        good = abs(said / truth - 1.0) <= FRICTION_SHARE
+        mu = friction_at(effects, place, 0.3)
+        good = abs(mu / truth - 1.0) <= FRICTION_SHARE
         what, wanted = f"friction of surface {k + 1}", f"{truth:.4f} +- 5 %"
-        row(what, 0.3, said, wanted, good)
+        row(what, 0.3, mu, wanted, good)
 
 
 def friction_at(effects: Sequence[Mapping], place, own: float) -> float:
-    """The friction at a place (2,) [m] of a plate that has `own`, with effects of a
-    result: the last patch there, else that of the pair."""
+    """The friction at a place (2,) [m] of a plate with the effects of a result: that of
+    the last patch there, else of the pair, else `own`."""
     found = own
     for effect in effects:
         if effect["kind"] == "contact_friction":

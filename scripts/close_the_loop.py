@@ -1,11 +1,11 @@
-"""Adapt now, understand later: a run with a wrong model, `gap` on its recording, and a
+"""Closes the loop: a run with a wrong model, `makebreak gap` on its recording, and a
 run with the repaired model.
 
     makebreak close-the-loop ball_rolling --radius-error 0.005 --seed 0
 
-The robot is given a scene file in which the ball's radius is wrong. It adapts; what it
-recorded goes through the gap workflow; the scene that comes out is what the next run
-believes. Nothing else passes from one step to the next.
+The robot's scene file has a wrong radius of the ball, to which the controller adapts.
+`makebreak gap` repairs the scene by the recording, and the next run uses the repaired
+scene as its model. Nothing else passes from one step to the next.
 """
 
 import json
@@ -25,8 +25,9 @@ from makebreak.scripts.table import Table
 from makebreak.scripts.trials import makebreak_command, run_commands
 
 COMMAND = "close-the-loop ball_rolling"
-# Goals of the project. With the right model the first push makes contact by 1.2 s; a
-# push that ends short of the ball takes another second.
+# Goals: error of the radius, error of the learned gap, and time of the first contact.
+# With the right model the first push makes contact by 1.2 s; a push that ends short of
+# the ball takes another second.
 RADIUS_M, GAP_M, FIRST_PUSH_SEC = 1e-3, 1.5e-3, 1.2
 _SHOWN = (
     "time_to_quarter_circle_s", "circles_completed", "tracking_error_mean_m", "r_gap_m",
@@ -37,10 +38,10 @@ _SHOWN = (
 def write_wrong_scene(
     path: Path, error: float, place: Path | None = None
 ) -> tuple[float, float]:
-    """The shipped scene, but in the ball's file, beside `path`, the radius is off by
-    `error` [m], and the moments of inertia are those that go with it.
+    """Writes the shipped scene to `path` with a wrong ball beside it: a radius that is
+    off by `error` [m], and the moments of inertia of that radius.
 
-    Args: place: the folder that both files will be moved to; None: they stay.
+    Args: place: folder to which both files will be moved; None if they stay.
     Returns: the right radius and the wrong one [m].
     """
     place = path.parent if place is None else place
@@ -59,14 +60,14 @@ def write_wrong_scene(
                 text = _scaled(text, moment, (wrong / right) ** 2)
             (path.parent / "ball.sdf").write_text(text)
             add.file = f"file://{place.resolve() / 'ball.sdf'}"
-    scene.initial.poses["ball.ball"][6] = wrong  # It lies on what it is thought to be.
+    scene.initial.poses["ball.ball"][6] = wrong  # So that it lies on the table.
     heading = f"The model: a ball of {1e3 * wrong:.1f} mm radius."
     write_scene(scene, path, heading, place)
     return right, wrong
 
 
 def _scaled(text: str, tag: str, factor: float) -> str:
-    """The XML with each number of the tag times the factor."""
+    """The XML with the number in each element `tag` times the factor."""
     return re.sub(
         rf"<{tag}>([^<]*)</{tag}>",
         lambda m: f"<{tag}>{float(m[1]) * factor!r}</{tag}>",
@@ -82,15 +83,15 @@ def close_the_loop(
     settings: Sequence[str] = (),
     jobs: int = 1,
 ) -> Table:
-    """All three steps, each in a subfolder of `out`, and loop.json.
+    """Runs all three steps, each in a subfolder of `out`, and writes loop.json.
 
     Args:
         error: of the radius [m].
-        seed, duration: of both runs; None: the experiment's own [s].
+        seed, duration [s]: of both runs; None: those of the experiment.
         settings: key=value, of both runs.
-        jobs: processes of `gap` at once.
-    Raises: ValueError for a folder or a radius that cannot be used, and where a step
-        refuses its input; RuntimeError where one gives no result.
+        jobs: number of processes of `makebreak gap`.
+    Raises: ValueError for a folder or a radius that cannot be used, or if a step
+        refuses its input; RuntimeError if a step gives no result.
     """
     with OutputFolder(out, COMMAND) as outputs:
         table, results = _steps(out, error, seed, duration, settings, jobs)
@@ -100,9 +101,9 @@ def close_the_loop(
 
 
 def take_step(out: Path, folder: str, says: str, *words: str) -> dict:
-    """The result of a makebreak command, in its subfolder of `out`.
+    """Runs a makebreak command in a subfolder of `out`, and gives its result.
 
-    Raises: ValueError where it refuses its input, RuntimeError without a result.
+    Raises: ValueError if it refuses its input, RuntimeError without a result.
     """
     print(says, file=sys.stderr, flush=True)
     command = makebreak_command(*words, "--out", str(out / folder))

@@ -58,7 +58,7 @@ def plot_path(trials: Mapping[str, Any], prior: ContactBelief):
     """CC figure 15: the tip's path, from ahead and from above, and the estimates of the
     contacts with two standard deviations.
 
-    Args: trials: each has `log`.
+    Args: trials: {name: trial with `log`}.
     """
     figure, axes = plt.subplots(1, 2, figsize=(12, 5), layout="constrained")
     for ax, (i, j), title in zip(

@@ -1,5 +1,5 @@
-"""What the experiments of changing contact share: a motion simulated to its end, and
-trials that are rehearsed on the model before the first real one."""
+"""Common parts of the experiments with changing contacts: simulating a motion to its
+end, and rehearsing trials on the model before the first real one."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,13 +23,13 @@ def simulate_motion(
     label: str,
     wait_sec: float = 0.0,
 ) -> Log:
-    """Simulates a diagram until the motion of its velocity shaper is over: at rest,
-    complete or held.
+    """Simulates a diagram until its velocity shaper has stopped the motion, complete or
+    held.
 
     Args:
-        duration_sec: at most [s].
+        duration_sec: limit.
         label: of the simulation, as in Session.simulate.
-        wait_sec: for how long it goes on after that [s].
+        wait_sec: time that is simulated after the end of the motion.
     """
     shaper = diagram.GetSubsystemByName("velocity_shaper")
     ended: list[tuple[float, str]] = []
@@ -54,13 +54,12 @@ def simulate_motion(
 def rehearsed(
     config: Any, task: Any, simulate: Callable[..., Log], knowledge: Knowledge
 ) -> Knowledge:
-    """What is known after config.rehearse trials on the model, none of them scored.
-
-    Nothing goes wrong in the model: they have no faults.
+    """The knowledge after config.rehearse trials on the model, without faults and
+    without scores.
 
     Args:
-        simulate: a trial, by what is known, its number and its label; `config` and
-            `task` by name.
+        simulate: function of (knowledge, number, label, config=, task=) that runs a
+            trial.
         knowledge: before the first one.
     """
     config = replace(config, control=replace(config.control, faults=[]))

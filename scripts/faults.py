@@ -47,12 +47,12 @@ def is_drakes(error: BaseException) -> bool:
 
 def refused(error: BaseException) -> int:
     """Prints why an input is refused. Returns: the exit status."""
-    said = _one_line(error)
+    message = _one_line(error)
     if on_purpose(error):
-        print(f"makebreak: {said}", file=sys.stderr)
+        print(f"makebreak: {message}", file=sys.stderr)
     else:
         print(
-            f"makebreak: the input cannot be used: {_name(error)}{said} "
+            f"makebreak: the input cannot be used: {_name(error)}{message} "
             f"(the traceback is in {_kept(error)})",
             file=sys.stderr,
         )

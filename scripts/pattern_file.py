@@ -17,10 +17,12 @@ from makebreak.diagrams.station import ARM, TIP_FRAME, make_control_plant
 from makebreak.diagrams.tabletop import TOOL
 from makebreak.gap.data.table import FORMATS, POSE, read_table, suffix_of
 from makebreak.models.scene import Scene
+from makebreak.systems.changing_contact.numerics.demonstration import (
+    pattern_from_demonstration,
+)
 from makebreak.systems.changing_contact.numerics.motion_pattern import (
     MotionPattern,
     load_pattern,
-    pattern_from_demonstration,
 )
 
 YAML = (".yaml", ".yml")

@@ -798,6 +798,14 @@ def test_a_ball_smaller_than_modelled_is_found_and_only_with_adaptation(tmp_path
     assert frozen["time_to_first_contact_s"] is None
 
 
+def test_an_orange_is_found_and_rolled(tmp_path):
+    """The fruits in short: not round, softer, and modelled 3 mm too large."""
+    result = short(tmp_path, 8.0, "radius_error_m=0.003", "object=orange")
+    assert result["time_to_first_contact_s"] < 4.0
+    assert result["circles_completed"] > 0.1
+    assert 2.0 < result["contact_force_peak_N"] <= 40.0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("radius_error", [0.008, 0.012])
 def test_a_much_smaller_ball_is_found_gently_and_rolled(tmp_path, radius_error):

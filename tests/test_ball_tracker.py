@@ -27,6 +27,7 @@ from makebreak.systems.perception.ball_tracker import (
 )
 from makebreak.systems.perception.numerics import constant_velocity
 from makebreak.systems.perception.numerics.ball_tracker import (
+    bilinear,
     find_ball,
     fit_cone,
     outline_points,
@@ -119,6 +120,14 @@ class Scene:
 
 
 # Numerics: colour, outline, cone.
+
+
+def test_an_image_that_is_linear_is_interpolated_as_it_is_up_to_its_last_pixel():
+    v, u = np.mgrid[0:5, 0:7].astype(float)
+    image = 3.0 + 2.0 * u - 5.0 * v
+    for at in ([0.0, 0.0], [2.25, 1.5], [5.75, 3.1], [6.0, 4.0], [6.0, 0.5]):
+        expected = 3.0 + 2.0 * at[0] - 5.0 * at[1]
+        assert bilinear(image, *at) == pytest.approx(expected, abs=1e-12)
 
 
 def test_strength_is_zero_for_grey_and_largest_for_its_own_hue():

@@ -8,6 +8,7 @@ from makebreak.diagrams.multiple_collisions import MultipleCollisionsConfig
 from makebreak.scripts import comparison
 from makebreak.scripts.comparison import Comparison
 from makebreak.scripts.experiments.multiple_collisions import VARIANTS
+from makebreak.scripts.rolling_paper import PUSHES, adaptive_targets
 from makebreak.scripts.settings import apply_settings
 from makebreak.scripts.trials import setting_texts
 
@@ -63,3 +64,28 @@ def test_rows_are_met_missed_or_without_a_target(table):
     assert commands == ["makebreak run multiple_collisions --seed S", "other", ""]
     assert list(made.met) == [True, None, False] and made.missed == 1
     assert list(made.notes) == ["a note"]
+
+
+def test_what_did_not_happen_in_a_rolling_run_misses_its_target():
+    good = {
+        "success": True,
+        "time_to_first_contact_s": 8.0,
+        "r_gap_error_m": -2e-3,
+        "pushes_to_quarter_circle": PUSHES,
+        "contact_force_peak_N": 40.0,
+    }
+    worse = {
+        "success": [False],
+        "time_to_first_contact_s": [None, 8.01],
+        "r_gap_error_m": [None, 2.01e-3, -2.01e-3],
+        "pushes_to_quarter_circle": [None, PUSHES + 1],
+        "contact_force_peak_N": [40.1],
+    }
+    tests = adaptive_targets()
+    assert all(test(good) for test in tests.values())
+    for key, values in worse.items():
+        for value in values:
+            missed = [
+                what for what, test in tests.items() if not test({**good, key: value})
+            ]
+            assert len(missed) == 1, (key, value)

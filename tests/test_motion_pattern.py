@@ -7,12 +7,14 @@ import pytest
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation, Slerp
 
+from makebreak.systems.changing_contact.numerics.demonstration import (
+    pattern_from_demonstration,
+)
 from makebreak.systems.changing_contact.numerics.motion_pattern import (
     MotionPattern,
     Segment,
     load_pattern,
     pattern_from,
-    pattern_from_demonstration,
     save_pattern,
     segment_time,
 )

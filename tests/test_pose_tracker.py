@@ -24,6 +24,7 @@ from makebreak.models.pushed_object import (
     seen_parts,
 )
 from makebreak.models.scene import load_scene, read_scene
+from makebreak.systems.perception.numerics import constant_velocity
 from makebreak.systems.perception.numerics.aruco_marker import find_marker
 from makebreak.systems.perception.numerics.ball_tracker import strength_weights
 from makebreak.systems.perception.numerics.object_outline import make_shape, nearest_yaw
@@ -37,6 +38,8 @@ from makebreak.systems.perception.pose_tracker import (
     NOT_FOUND,
     OUTLIER,
     PATIENCE,
+    START_RATE,
+    START_SPEED,
     TRACKED,
     WRONG_IMAGE,
     Marker,
@@ -397,6 +400,23 @@ def test_moving_and_turning_object_is_followed_with_its_rates():
     assert abs(follower.get("q_WB") @ q) > 1.0 - 1e-4
     np.testing.assert_allclose(follower.get("v_WB"), [0.05, 0.1, 0.0], atol=0.015)
     np.testing.assert_allclose(follower.get("w_WB"), [0.0, 0.0, 0.8], atol=0.1)
+
+
+def test_position_and_yaw_are_filtered_by_their_own_standard_deviations():
+    follower = Follower()
+    c = follower.config
+    for _ in range(2):
+        follower.show(photograph(np.array([0.5, 0.0, 0.4])))
+    expected = []
+    for sigma, speed, density in (
+        (c.position_std, START_SPEED, c.acceleration_density),
+        (c.yaw_std, START_RATE, c.turning_density),
+    ):
+        P, zero = np.array([sigma**2, 0.0, speed**2]), np.zeros(2)
+        *_, P = constant_velocity.predict(zero, zero, P, c.period_sec, density)
+        *_, P = constant_velocity.correct(zero, zero, P, zero, sigma)
+        expected.append(np.sqrt(P[0]))
+    np.testing.assert_allclose(follower.get("std"), expected, rtol=1e-9)
 
 
 def test_yaw_of_a_box_goes_on_without_jumps_and_of_a_disc_stays():

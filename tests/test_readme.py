@@ -6,6 +6,8 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+import pytest
+
 from makebreak.models.effects import KINDS
 
 ROOT = Path(__file__).parent.parent
@@ -50,3 +52,51 @@ def test_the_seven_systems_are_where_the_table_says():
         example, page = re.findall(r"\]\((.*?)\)", rest)
         assert cls in (ROOT / example).read_text()
         (ROOT / page).stat()
+
+
+N = r"([\d.]+)"
+# A result that stands on several pages: {page: where its figures are there}.
+SAME_FIGURES = {
+    "extra time for contact handling": {
+        "README.md": rf"extra time.*\*\*{N} to {N} s\*\*; \[{N} to {N} s\]",
+        "docs/experiments.md": rf"extra time.*\*\*{N} to {N} s\*\*; \[{N} to {N} s\]",
+        "docs/shaping.md": rf"\| extra time \| 3.7 s \| [\d.]+ \({N} - {N}\)[\s\S]*?"
+        rf"\| the least that force and acceleration allow \| \| [\d.]+ \({N} - {N}\)",
+    },
+    "impacts of four contacts": {
+        "README.md": rf"four unknown contacts.*at most {N} N in (\d+) of (\d+)",
+        "docs/experiments.md": rf"four contacts.*at most {N} N in (\d+) of (\d+)",
+        "docs/shaping.md": rf"first trial: impact.* N; at most {N} N in (\d+) of (\d+)",
+    },
+    "position error after five trials": {
+        "docs/experiments.md": rf"contacts after five trials \|.*?\| {N} mm, perfect",
+        "docs/contacts.md": rf"after 1, 3, 5 trials \|.*\| [\d.]+ / [\d.]+ / {N} mm",
+    },
+    "porridge: fixed, incremental, no model": {
+        "docs/experiments.md": rf"porridge, prediction.*\| {N}; {N}; {N} N \|",
+        "docs/planar.md": rf"fixed mixture \(EM.*?\| {N} [\s\S]*?\| incremental \| {N} "
+        rf"[\s\S]*?no model: the last measured force \| {N} ",
+    },
+    "springs: ours, MRAC": {
+        "README.md": rf"circle on springs.*\*\*{N} mm\*\*; {N} mm",
+        "docs/experiments.md": rf"circle on springs.*\*\*{N}\*\*; {N}; ",
+        "docs/planar.md": rf"\| adaptive \(ours\), trial 1 \| .*? \| {N} \([\s\S]*?"
+        rf"\| MRAC \+ force, trial 1 \| .*? \| {N} \(",
+    },
+    "springs: active inference, biomimetic": {
+        "docs/experiments.md": rf"circle on springs.*\*\*; [\d.]+; {N}; {N} mm",
+        "docs/planar.md": rf"\| active inference \+ force, trial 1 \| .*? \| {N} \("
+        rf"[\s\S]*?\| biomimetic \+ force, trial 1 \| .*? \| {N} \(",
+    },
+}
+
+
+@pytest.mark.parametrize("result", SAME_FIGURES)
+def test_a_result_has_the_same_figures_on_each_page(result):
+    found = {}
+    for page, where in SAME_FIGURES[result].items():
+        match = re.search(where, (ROOT / page).read_text())
+        assert match, f"{result} is not on {page}"
+        # Pages round to two digits or more.
+        found[page] = [float(f"{float(x):.2g}") for x in match.groups()]
+    assert len(set(map(tuple, found.values()))) == 1, found

@@ -595,19 +595,18 @@ def test_a_period_that_is_not_the_lcs_time_step_is_refused():
 # The baseline: a residual on the dynamics.
 
 
-def baseline(n, edit=None):
-    """The scripted mass, whose true step is 0.01, -0.02 more than the model's."""
+def baseline(n, edit=None, error=lambda k: [0.01, -0.02], **changes):
+    """The scripted mass, whose true step k is by error(k) more than the model's."""
     base, period = point_mass(1e3), 0.05
-    truth = replace(base, d=[0.01, -0.02])
     x, u = np.zeros((n, 2)), np.zeros((n, 1))
     for k in range(n - 1):
         u[k + 1] = np.sin(k)  # Acts before sample k + 1.
-        x[k + 1] = simulate(truth, x[k], u[k + 1])[0]
+        x[k + 1] = simulate(replace(base, d=error(k)), x[k], u[k + 1])[0]
     if edit:
         edit(x)
     builder = DiagramBuilder()
     script = builder.AddSystem(Script(x, u, [base], np.ones((1, 1)), period))
-    config = DynamicsResidualLearnerConfig()
+    config = DynamicsResidualLearnerConfig(**changes)
     learner = builder.AddSystem(DynamicsResidualLearner(config, base, period, 1e-3))
     for port, name in (("x", "x"), ("u", "u_measured"), ("lcs", "lcs")):
         builder.Connect(script.GetOutputPort(port), learner.GetInputPort(name))
@@ -625,6 +624,15 @@ def test_baseline_finds_a_constant_error_of_the_dynamics_and_adds_it_to_d():
     lcs = learner.GetOutputPort("lcs").Eval(context)
     np.testing.assert_allclose(lcs.d, [0.01, -0.02], atol=1e-14)
     np.testing.assert_array_equal(lcs.A, point_mass(1e3).A)
+
+
+def test_baseline_gives_the_mean_error_of_the_last_n_b_steps():
+    simulator, learner = baseline(8, error=lambda k: [0.01 * k, 0.0], n_b=3)
+    context = learner.GetMyContextFromRoot(simulator.get_context())
+    for tick, expected in ((2, 0.005), (3, 0.01), (7, 0.05)):
+        after_tick(simulator, tick)
+        r_dyn = learner.GetOutputPort("r_dyn").Eval(context)
+        np.testing.assert_allclose(r_dyn, [expected, 0.0], atol=1e-14)
 
 
 def test_baseline_drops_a_sample_that_is_not_finite():

@@ -11,7 +11,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from makebreak.systems.contact_mpc.numerics.ball_state import pack
 from makebreak.systems.views.rolling_view import RollingView, RollingViewConfig
 
-SLIDER = "r_comp as a gap [mm]"
+SLIDER = "learned gap [mm]"
 BALL = np.array([0.6, 0.1, 0.0315])
 
 

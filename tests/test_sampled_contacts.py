@@ -57,6 +57,7 @@ from makebreak.systems.contact_mpc.numerics.push_task import (
 )
 from makebreak.systems.contact_mpc.numerics.rolling_task import CirclePath
 from makebreak.systems.contact_mpc.path_target import PathTarget, PathTargetConfig
+from makebreak.systems.contact_mpc.push_task import PushTask, PushTaskConfig
 
 MODEL = TipAndBall(ball_radius=0.0315)
 HEIGHT, R_BALL, R_TIP = 0.038, 0.0315, 0.0195
@@ -274,6 +275,31 @@ def test_a_ball_that_is_learned_to_be_smaller_is_passed_and_reached_nearer():
     # As modelled it is passed no nearer than with half the clearance, 52.5 mm from its
     # middle; a place that is nearer is reached as far out as that.
     assert np.hypot(*(kept.p[:2] - [0.5, 0.0])) == pytest.approx(0.0525, abs=4e-4)
+
+
+def test_a_task_without_a_learned_distance_takes_the_shape_as_it_is_modelled():
+    start = [0.5, -0.056, HEIGHT]
+    config = PushTaskConfig(PushConfig(follow=True, around=True), HEIGHT)
+
+    def reference(nearer):
+        """The tip's after half a second of travelling to the ball's other side."""
+        task = PushTask(config, 6, SHAPE, start)
+        context = task.CreateDefaultContext()
+        values = {
+            "x": ball_at([0.5, 0.0], tip=start),
+            "valid": [1.0],
+            "goal": [0.5, 0.1, 0.0],
+            "command": [1.0, 0.02, 0.0518],
+        }
+        if nearer is not None:
+            values["nearer"] = [nearer]
+        for name, value in values.items():
+            task.GetInputPort(name).FixValue(context, np.array(value))
+        Simulator(task, context).AdvanceTo(0.5)
+        return task.GetOutputPort("reference").Eval(context)
+
+    np.testing.assert_array_equal(reference(None), reference(0.0))
+    assert np.linalg.norm((reference(0.005) - reference(0.0))[:3]) > 1e-3
 
 
 # Rounds and the loop.

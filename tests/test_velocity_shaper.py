@@ -10,6 +10,10 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 from scipy.spatial.transform import Rotation
 
+from makebreak.systems.changing_contact.numerics.contact_regions import (
+    REGIONS_MAX,
+    expected,
+)
 from makebreak.systems.changing_contact.numerics.contact_task import (
     BAD_INPUT,
     BROKEN,
@@ -40,8 +44,6 @@ from makebreak.systems.changing_contact.numerics.motion_pattern import (
 )
 from makebreak.systems.changing_contact.numerics.velocity_shaper import (
     N_MEMORY,
-    REGIONS_MAX,
-    expected,
     plan,
     pose_output,
     tick,

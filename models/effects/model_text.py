@@ -62,7 +62,7 @@ def model_path(uri: str, package_map: PackageMap) -> Path:
 def make_mesh_paths_absolute(document: minidom.Document, folder: Path) -> None:
     """Makes paths relative to `folder` absolute, so that the document can be moved."""
     for element in document.getElementsByTagName("uri"):
-        uri = text(element)
+        uri = text(element).strip()
         if "://" not in uri:
             set_text(element, f"file://{(folder / uri).resolve()}")
     for element in document.getElementsByTagName("mesh"):

@@ -34,7 +34,7 @@ from makebreak.scripts.rolling_score import (
 )
 from makebreak.systems.contact_mpc.numerics.ball_state import P_BALL
 
-SUMMARY = "a Panda rolls a ball that it models wrongly, along a circle (ACI-MPC VII-B)"
+SUMMARY = "a Panda rolls a ball around a circle with a wrong model (ACI-MPC VII-B)"
 Config = BallRollingConfig
 reproduce = rolling_paper.reproduce
 

@@ -1,15 +1,15 @@
 """Cart-pole with soft walls: ACI-MPC VII-A, figures 3 and 4.
 
 C3 (N = 10 knots of 10 ms, 10 rounds, rho 2, the convex projection) stabilises a pole
-between two walls that its model has 15 cm too far and 15 cm too near. The learner
-starts from zero and runs at 100 Hz. Every run is done twice: with the LCS as the plant,
-so that the model is right but for the walls, and with a nonlinear MultibodyPlant whose
-walls are compliant contact; and, if it adapts, both are repeated without adaptation.
+between two walls, which are 15 cm too far and 15 cm too near in its model. The learner
+starts from zero and runs at 100 Hz. Every run is made with two plants: the LCS, so that
+only the walls are wrong in the model, and a nonlinear MultibodyPlant whose walls are
+compliant contacts. If it adapts, both are repeated without adaptation.
 
 Criterion, set beforehand. A run has settled if the pole never lay flat (1.57 rad) and
 max |x| over the last second, in m, rad, m/s and rad/s, is below 0.05. It is a success
-if with the LCS as plant it has settled with every entry of r_comp within 10 mm of the
-truth, and with the MultibodyPlant it has settled.
+if it has settled with both plants, and with the LCS every entry of r_comp is within
+10 mm of the truth.
 
 Of the paper's constants it gives the gap error, [-0.15, 0.15] m, and that r starts from
 zero. Ours: eps 30, gamma 0.01 m/N (bound: 0.02), buffer of 10, five Adam steps of 3 mm
@@ -44,7 +44,7 @@ from makebreak.systems.contact_mpc.numerics.residual_learner import (
     violation_loss,
 )
 
-SUMMARY = "a cart-pole finds soft walls that its model misplaces (ACI-MPC VII-A)"
+SUMMARY = "a cart-pole between soft walls, misplaced in its model (ACI-MPC VII-A)"
 Config = CartpoleWallsConfig
 
 DURATION = 8.0  # [s]
@@ -61,11 +61,11 @@ QUADRANTS = {
 
 
 def run(config: CartpoleWallsConfig, session: Session) -> dict:
-    """Both plants, scored; see the module for the criterion."""
+    """Runs both plants; see the module for the criterion."""
     x = initial_state(config)
     plain = replace(config, adapt=False)
-    # All are built before any is run, so that bad input is refused at once. The last
-    # one is what Meshcat's recording shows.
+    # All are built before any is run, so that bad settings raise at once. Meshcat's
+    # recording shows the last one.
     diagrams = {}
     if config.adapt:
         diagrams["lcs_plain"] = make_cartpole_walls(plain)
@@ -120,7 +120,7 @@ def run(config: CartpoleWallsConfig, session: Session) -> dict:
     session.save_plot(plot_runs(logs, truth), "stabilisation")
     result |= shares
     log = logs["multibody"]
-    # The walls that the controller believes are an LCS's: no scene has them.
+    # The walls of the controller's model are in an LCS, not in a scene.
     columns = with_noise(recorded(log.diagram, log.context), config.seed)
     session.write_recording(columns, read_scene(config.world))
     return result
@@ -132,12 +132,12 @@ def last(log: Log) -> np.ndarray:
 
 
 def has_settled(log: Log) -> bool:
-    """Whether it stands still at the end (a fall ends the log, lying)."""
+    """Whether the pole is at rest at the end (a fall ends the log)."""
     return bool(abs(last(log)).max() < SETTLED_BOUND)
 
 
 def time_to_stay(time, error, bound) -> float | None:
-    """From when on error (n,) stays below bound [s]; None if it ends above."""
+    """The time from which error (n,) stays below bound [s]; None if it ends above."""
     above = np.flatnonzero(error > bound)
     if above.size == 0:
         return float(time[0])
@@ -145,12 +145,12 @@ def time_to_stay(time, error, bound) -> float | None:
 
 
 def contact_and_gradient(config: CartpoleWallsConfig, gap_error, x):
-    """One step from each state x (n, 4) without input, and what the learner makes of it
-    at r = 0, its walls wrong by gap_error (2,) or (n, 2) [m]. Neither speed nor input
-    would change it: they enter no gap, and the rest of the dynamics is known.
+    """The learner's gradient at r = 0 for one step from each state x (n, 4) without
+    input, with walls wrong by gap_error (2,) or (n, 2) [m]. Speed and input have no
+    influence, as they do not enter the gaps and the other dynamics are known.
 
-    Returns: happened, predicted (n, 2) whether a force acts in truth and in the model;
-        force (n, 2) eps times the gradient [N].
+    Returns: happened, predicted (n, 2): whether a force acts in truth and in the model;
+        force (n, 2): eps times the gradient [N].
     """
     truth, u = true_lcs(), np.zeros(1)
     error = np.broadcast_to(gap_error, (len(x), 2))
@@ -167,9 +167,9 @@ def contact_and_gradient(config: CartpoleWallsConfig, gap_error, x):
 
 
 def gradient_map(config: CartpoleWallsConfig):
-    """Figure 3: where there is a gradient, over states and over gaps.
+    """Figure 3: where the gradient is not zero, over states and over gaps.
 
-    Returns: the figure; {key: share of pairs of state and wall without a gradient}.
+    Returns: the figure; {key: fraction of pairs of state and wall without gradient}.
     """
     cart, angle = np.linspace(-0.6, 0.6, 62), np.linspace(-0.5, 0.5, 52)
     grid = np.stack(np.meshgrid(cart, angle, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -177,7 +177,7 @@ def gradient_map(config: CartpoleWallsConfig):
     happened, predicted, force = contact_and_gradient(config, config.gap_error, x)
     zero = abs(force) < 1e-9  # [N]; rounding is 1e-13 here.
     shares: dict = {}
-    kind = np.zeros(happened.shape, int)  # Of each wall: the place in QUADRANTS.
+    kind = np.zeros(happened.shape, int)  # Index in QUADRANTS, for each wall.
     for k, ((h, p), name) in enumerate(QUADRANTS.items()):
         there = (happened == h) & (predicted == p)
         kind[there] = k
@@ -200,7 +200,7 @@ def gradient_map(config: CartpoleWallsConfig):
     handles.append(plt.Line2D([], [], marker=".", ls="", color="0.4"))
     axes[0].legend(handles, [*labels, "gradient is zero"], loc="lower left", fontsize=8)
 
-    # The same for any error: true against modelled gap of wall 0, the pole upright.
+    # For any error: true over modelled gap of wall 0, with the pole upright.
     gaps = np.linspace(-0.2, 0.2, 41)
     modelled, true = (g.ravel() for g in np.meshgrid(gaps, gaps, indexing="ij"))
     x, error = np.zeros((true.size, 4)), np.zeros((true.size, 2))
@@ -254,7 +254,7 @@ RIGHT = {"gap_error": [0.0, 0.0], "adapt": False}  # A baseline that must work.
 
 
 def reproduce(session: Session, seeds: int, jobs: int) -> Table:
-    """Figures 3 and 4 beside ours, over seeds, and from states far apart."""
+    """Figures 3 and 4 beside ours, over seeds, and from distant initial states."""
 
     comparison = Comparison("cartpole_walls", session, jobs)
     row = comparison.row
@@ -278,7 +278,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
     body_errors = residual_errors("multibody_residual_error_max")
     commands = {name: comparison.with_settings(s) for name, s in variants.items()}
     all_settled = all(r.get("settled") for r in near)
-    # A run that ended in an error proves nothing: its key is missing.
+    # A run that ended in an error lacks the key, and does not count.
     none_plain = all(r.get("settled_without_adaptation") is False for r in near)
     row("fig. 4: stabilised", "yes", count(near, "settled"), all_settled)
     worst = f"at most {1e3 * max(errors):.1f} mm"

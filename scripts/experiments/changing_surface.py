@@ -52,7 +52,7 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
     TO_MODE,
 )
 
-SUMMARY = "a block slides over three unknown surfaces (CC 4.3, fig. 9, 10)"
+SUMMARY = "a block slides over three unknown surfaces: contact modes (CC fig. 9, 10)"
 Config = ChangingSurfaceConfig
 
 DURATION_SEC = 200.0  # At most.

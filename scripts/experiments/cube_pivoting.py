@@ -43,7 +43,7 @@ from makebreak.systems.contact_mpc.numerics.pivot_target import (
 )
 from makebreak.systems.contact_mpc.pivot_target import PivotTargetConfig
 
-SUMMARY = "two fingers tip a cube by 90 degrees, planned by C3+"
+SUMMARY = "two fingers tip a cube by 90 degrees; C3+ plans the contacts"
 Config = CubePivotingConfig
 
 DURATION, SAMPLE = 6.0, 0.02  # [s]

@@ -50,7 +50,7 @@ from makebreak.systems.changing_contact.numerics.push_motion import (
     TABLE_SEGMENT,
 )
 
-SUMMARY = "all seven systems: a ball is rolled and touched gently"
+SUMMARY = "a ball is rolled with gentle contacts: all seven systems in one diagram"
 Config = GentleRollingConfig
 
 DURATION_SEC, SAMPLE = rolling_score.DURATION_SEC, rolling_score.SAMPLE

@@ -1,29 +1,29 @@
-"""A circle while three springs pull: adaptive impedance against MRAC, active inference
-and biomimetic control. CC 4.2, figures 5 to 7.
+"""A circle under the forces of three springs: adaptive impedance control against MRAC,
+active inference and biomimetic control. CC 4.2, figures 5 to 7.
 
 Every controller moves the same effector (1 kg, |u| <= 100 N, 1 kHz) around the same
-circle (radius 0.25 m, 6 s, from rest to rest), from one start. The seed draws where
-the circle starts, its direction, each spring's stiffness and distance within 20 %, and
-the sensors' noise. All are tuned on seeds 100 to 113, without edges to the search:
-scripts/tune_planar.py, docs/planar.md. The adaptive controller has a force sensor in
-its law; so the others stand beside it with one too, and without.
+circle (radius 0.25 m, 6 s, from rest to rest). The seed draws the start of the circle,
+its direction, stiffness and distance of each spring within 20 %, and the sensors'
+noise. All are tuned on seeds 100 to 113 in wide ranges: scripts/tune_planar.py,
+docs/planar.md. As the adaptive controller has a force sensor in its law, the others are
+run with feedforward of the measured force, and without.
 
-Criterion, set beforehand. In its first trial, without any knowledge, the adaptive
+Criterion, set beforehand. In its first trial, with an empty model, the adaptive
 controller's RMS tracking error is at most a third of that of each baseline in its first
-trial and below that of the biomimetic controller's last of 30 trials, at a mean
-stiffness of at most 25 % of stiffness_max. The ratios are reported whatever they are.
+trial, and below that of the last of 30 trials of the biomimetic controller, at a mean
+stiffness of at most 25 % of stiffness_max. The ratios are reported in any case.
 
-The paper's figure 5 changes MRAC's omega from 1.5 to 1, figure 7a starts the biomimetic
-controller badly; its numbers are not given. Here omega is varied with all other gains
-as tuned, in both forms (x_m is the target; x_m lags behind it); so is the integral of
-MRAC's auxiliary force, with and without the adaptive gains. "Badly" is 20 N/m and
-1 N s/m of fixed impedance, with the learning as tuned. Beside the tuned MRAC stands one
-of the proportions of public code, and beside active inference that knows how its goal
-moves the law as it was published, whose goal stands still.
+The paper's figure 5 changes MRAC's omega from 1.5 to 1, and figure 7a has a bad start
+of the biomimetic controller, without numbers. Here omega is varied with all other gains
+as tuned, in both forms (x_m is the target; x_m lags behind it), and so is the integral
+gain of MRAC's auxiliary force, with and without the adaptive gains. The bad start is a
+fixed impedance of 20 N/m and 1 N s/m, with the learning as tuned. Also reported are an
+MRAC with the gain ratios of public code, and active inference as published, whose goal
+does not move.
 
-`--set setting=springs_lab` has sensors as in a laboratory. In `engaging` all are a
-tenth as stiff, springs engage and let go, and a path comes again at two speeds: a task
-in which a model must help if it helps at all. `reproduce` compares all three.
+`--set setting=springs_lab` has the sensors of a laboratory. In `engaging` all is a
+tenth as stiff, springs engage and let go, and a path is repeated at two speeds, which
+is where a model can help most. `reproduce` compares all three.
 """
 
 from dataclasses import replace
@@ -68,7 +68,7 @@ from makebreak.scripts.table import Table
 from makebreak.systems.baselines.mrac import MracConfig
 from makebreak.systems.planar.numerics.planar_impedance import persistence
 
-SUMMARY = "a circle while three springs pull; MRAC, AIC and BAC beside it (CC 4.2)"
+SUMMARY = "a circle while three springs pull, with MRAC, AIC and BAC (CC fig. 5-7)"
 Config = MultiSpringConfig
 
 RATIO_BOUND, STIFFNESS_BOUND = 3.0, 0.25
@@ -87,7 +87,7 @@ SETTING_NAMES = {
 
 def run(config: MultiSpringConfig, session: Session) -> dict:
     """All controllers in the world of one seed."""
-    draw(config)  # Bad settings are refused before anything runs.
+    draw(config)  # Raises for bad settings before anything runs.
     config = as_tuned(config)
     baselines, setting = config.baselines, config.setting
 
@@ -103,7 +103,7 @@ def run(config: MultiSpringConfig, session: Session) -> dict:
     if setting == SPRINGS:
         fixed_goal = tuned_active_inference(setting, "active_inference_fixed_goal")
     bac = baselines.biomimetic
-    # All are made before any runs, so that bad settings are refused at once.
+    # All are built before any is run, so that bad settings raise at once.
     controllers = {
         "mrac": mrac(baselines.mrac),
         "mrac_force": mrac(tuned_mrac(setting, "mrac+force")),
@@ -150,7 +150,7 @@ def run(config: MultiSpringConfig, session: Session) -> dict:
         known = knowledge_of(ours[-1].diagram, ours[-1].context) if ours else None
         controller = impedance(config.impedance, config.model, known)
         ours.append(one(controller, f"adaptive_{i + 1}"))
-    if session.meshcat is not None:  # The last one is what its recording shows.
+    if session.meshcat is not None:  # Its recording shows the last simulation.
         one(impedance(config.impedance, config.model), "adaptive_seen", session.meshcat)
     plots(session, ours, logs, learning, bad, swept)
     write_recording(session, ours[0], setting_of(setting).sensing, config.seed)
@@ -158,7 +158,7 @@ def run(config: MultiSpringConfig, session: Session) -> dict:
 
 
 def learning_run(config, session, bac, trials, label) -> list[Log]:
-    """Trials of the biomimetic controller, each with what those before taught."""
+    """Consecutive trials of the biomimetic controller, which learns from each."""
     logs: list[Log] = []
     for i in range(trials):
         known = knowledge_of(logs[-1].diagram, logs[-1].context) if logs else None
@@ -217,7 +217,7 @@ def scored(config, ours, logs, learning, bad, swept) -> dict:
 
 
 def plots(session, ours, logs, learning, bad, swept):
-    """Figures 5, 6, 7, and what the adaptive controller does."""
+    """Figures 5, 6 and 7, and a plot of the adaptive controller."""
     first = ours[0]
     figure, axes = plt.subplots(1, 4, figsize=(18, 4.6), layout="constrained")
     plot_path(axes[0], logs["mrac"], "MRAC, tuned", color="C2")

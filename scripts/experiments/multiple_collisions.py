@@ -59,7 +59,7 @@ from makebreak.systems.changing_contact.numerics.impact_reflex import fastest_im
 from makebreak.systems.changing_contact.numerics.impact_score import impact, low_pass
 from makebreak.systems.views.contact_view import ContactViewConfig
 
-SUMMARY = "four impacts and a loss of contact, with and without handling (CC fig. 16)"
+SUMMARY = "four contacts, with and without contact handling (CC fig. 16)"
 Config = MultipleCollisionsConfig
 BENCH = {"multiple_collisions": {"trials": 1}}
 

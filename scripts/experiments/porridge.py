@@ -1,5 +1,5 @@
-"""Stirring porridge that thickens: fixed and incremental models of its force.
-CC 4.1, figure 4, and MRAC on the same task (4.2.1).
+"""Stirring porridge that thickens, with fixed and incremental models of its force:
+CC 4.1, figure 4; and MRAC on the same task (4.2.1).
 
 The effector (1 kg, |u| <= 100 N, 1 kHz) goes once around a circle (radius 0.25 m, 6 s,
 from rest to rest). In training, under constant stiffness_max, the viscosity rises from
@@ -8,18 +8,18 @@ noise of 0.2 N. The seed draws start, direction, final viscosity of the test, an
 Models predict the force against the motion 5 ms ahead from speed and force (eq. 2, 3).
 
 The fixed model is a Gaussian mixture fitted to the training data by expectation
-maximisation, with the number of components, up to 10, that the Bayesian information
-criterion chooses; other numbers are shown beside it, and they matter. The incremental
-one has seen the same data once, and goes on learning. Beside them: the incremental one,
-frozen after training; and no model, the last measured force.
+maximisation, with a number of components, up to 10, chosen by the Bayesian information
+criterion; other numbers give other errors and are reported, too. The incremental model
+learns from the same data, and goes on learning in the test. Baselines are the
+incremental model frozen after training, and the last measured force.
 
-Prediction is compared under constant stiffness_max, where the force does not depend on
-what is predicted: all models see the very same samples. (Where a controller feeds its
-prediction forward in thick porridge, the force becomes what was predicted.) Outside
-the training range means: a measured force above all of training.
+Predictions are compared under constant stiffness_max, where the force does not depend
+on them, so that all models see the same samples. (Feedforward of a prediction in thick
+porridge makes the force equal to the prediction.) Outside the training range means a
+measured force above all of training.
 
-Criterion, set beforehand: there, the incremental model's RMS error against the measured
-force is at most a fifth of the fixed model's. Tracking is reported whatever it is.
+Criterion, set beforehand: outside that range the incremental model's RMS error against
+the measured force is at most a fifth of the fixed model's. Tracking has no criterion.
 """
 
 from dataclasses import replace
@@ -49,12 +49,12 @@ from makebreak.systems.baselines.numerics.fixed_gmm import fit_mixture
 from makebreak.systems.changing_contact.numerics.igmm import regress
 from makebreak.systems.planar.numerics.planar_impedance import features_of, persistence
 
-SUMMARY = "stirring porridge that thickens: fixed and incremental models (CC 4.1)"
+SUMMARY = "stirring thickening porridge: fixed and incremental models (CC fig. 4)"
 Config = PorridgeConfig
 
 RATIO_BOUND = 5.0
-SIZES = (1, 2, 3, 5, 10, 15)  # Components of other fixed mixtures.
-# Name in result.json and plots -> what it is.
+SIZES = (1, 2, 3, 5, 10, 15)  # Numbers of components of other fixed mixtures.
+# {name in result.json and plots: description}
 MODELS = {
     "fixed": "fixed mixture",
     "frozen": "incremental, frozen",
@@ -64,8 +64,8 @@ MODELS = {
 
 
 def run(config: PorridgeConfig, session: Session) -> dict:
-    """Training, then every model under stiffness_max and driving eq. 4, then MRAC."""
-    draw(config, training=False)  # Bad settings are refused before anything runs.
+    """Training, then each model under stiffness_max and in eq. 4, then MRAC."""
+    draw(config, training=False)  # Raises for bad settings before anything runs.
     stiff = replace(config.impedance, adapt=False)
 
     def one(controller, label, training=False, meshcat=None) -> Log:
@@ -93,7 +93,7 @@ def run(config: PorridgeConfig, session: Session) -> dict:
         driving[name] = one(impedance(law, config.model, mixture), f"{name}_driving")
     driving["untrained"] = one(impedance(config.impedance, config.model), "untrained")
     driving["mrac"] = one(mrac(config.mrac), "mrac")
-    if session.meshcat is not None:  # The last one is what its recording shows.
+    if session.meshcat is not None:  # Its recording shows the last simulation.
         controller = impedance(config.impedance, config.model, learned)
         one(controller, "seen", meshcat=session.meshcat)
 
@@ -121,7 +121,7 @@ def run(config: PorridgeConfig, session: Session) -> dict:
             result[f"{name}_prediction_error_outside_N"]
             / result["incremental_prediction_error_outside_N"]
         )
-    # The same samples, for fixed mixtures of other sizes: no simulation is needed.
+    # Fixed mixtures of other sizes on the same samples, without simulation.
     test = joint_samples(first, config.model.along_motion)
     result["fixed_sizes"] = list(SIZES)
     result["fixed_sizes_error_outside_N"] = [
@@ -146,7 +146,7 @@ def run(config: PorridgeConfig, session: Session) -> dict:
 
 
 def joint_samples(log: Log, along: bool) -> np.ndarray:
-    """[S, next D] of successive samples, as the incremental mixture has them (n, d)."""
+    """(n, d) rows [S, next D] of successive samples, as for the incremental mixture."""
     pairs = [
         features_of(state, force, along)
         for state, force in zip(log["state"], log["force_measured"], strict=True)

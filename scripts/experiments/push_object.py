@@ -1,4 +1,4 @@
-"""Pushing an object to poses, the planner choosing where to touch it."""
+"""Pushes an object to goal poses; the planner chooses where to touch it."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,19 +35,19 @@ from makebreak.scripts.trials import run_many
 from makebreak.systems.contact_mpc.numerics.push_task import WAIT
 from makebreak.systems.perception.numerics.pose_filter import on_the_table
 
-SUMMARY = "a Panda pushes an object to poses; the planner chooses where to touch it"
+SUMMARY = "a Panda pushes an object to poses; the planner chooses where to touch"
 Config = PushObjectConfig
 
-SAMPLE = 0.05  # [s] Of what decides when a run is over.
-TOLERANCE = (0.02, 0.1)  # [m], [rad] A goal is reached within these ...
-LOOSE = (0.05, 0.4)  # ... and within these it counts as in arXiv:2505.13350.
-LIMIT_SEC = 60.0  # For a goal.
-FALLEN = -0.2  # So low an object is off the table, and falls for ever [m].
-FORCE_MAX = 40.0  # [N] Of all contacts of the arm and its finger, at 1 kHz.
-STOP_MAX = 0.995  # Of half a joint's range.
-FORCE_HZ = 100.0  # Told as well: on the finger, below it.
-REACHED, REACHED_LOOSE = 0.95, 0.99  # Shares of the goals.
-# What `makebreak bench diagrams` takes the real-time factor of.
+SAMPLE = 0.05  # Period at which the end of a run is checked [s].
+TOLERANCE = (0.02, 0.1)  # Errors within which a goal is reached [m], [rad].
+LOOSE = (0.05, 0.4)  # The same of arXiv:2505.13350.
+LIMIT_SEC = 60.0  # Time limit for a goal.
+FALLEN = -0.2  # Height below which the object is off the table [m].
+FORCE_MAX = 40.0  # Greatest contact force on arm and finger together, at 1 kHz [N].
+STOP_MAX = 0.995  # Greatest distance from the middle of a joint's half range.
+FORCE_HZ = 100.0  # Cutoff of the low-passed force on the finger, which is reported.
+REACHED, REACHED_LOOSE = 0.95, 0.99  # Fractions of goals to be reached.
+# Settings whose real-time factor `makebreak bench diagrams` measures.
 BENCH = {
     "pose by a sensor": {},
     "pose by a camera, drawn 320x240": {
@@ -60,7 +60,7 @@ OBJECT_FILE, MESH_FILE = "object.sdf", "object.obj"
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The run as it was, a row per tick; scoring alone sees it."""
+    """Ground truth of a run, with a row for each tick; used for scoring only."""
 
     time: np.ndarray  # (n,) [s]
     pose: np.ndarray  # (n, 3) x, y [m], yaw [rad] of the object.
@@ -73,19 +73,19 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """What became of one goal."""
+    """The outcome of one goal."""
 
     pose: np.ndarray  # (3,) x, y [m], yaw [rad].
     begin: float  # [s]
-    end: float  # When the next one came, or the run ended [s].
+    end: float  # Start of the next goal, or end of the run [s].
     error: np.ndarray  # (2,) at its end: [m], [rad].
     reached: bool
-    loose_sec: float  # Until it was first within LOOSE; NaN: never.
+    loose_sec: float  # Time until it was within LOOSE; NaN if never.
 
 
 def off_goal(pose, goal, fold):
-    """(n, 2) distance [m] and turn [rad] of poses (n, 3) to a goal (3,); turns that
-    leave the outline as it is do not count (`fold`: numerics/pose_tracker.py)."""
+    """(n, 2) distance [m] and angle [rad] of poses (n, 3) to a goal (3,), up to the
+    symmetry of the outline (`fold`: numerics/object_outline.py)."""
     distance = np.hypot(*(pose[:, :2] - goal[:2]).T)
     if fold == 0:
         return np.column_stack([distance, np.zeros(len(pose))])
@@ -95,9 +95,8 @@ def off_goal(pose, goal, fold):
 
 
 def score_goals(truth: Truth, goals, fold: int) -> list[Goal]:
-    """Goals (m, 3), each from when it was given until the next one was: reached if the
-    object truly was there at that moment, and that in time. One that was never given
-    was missed."""
+    """Scores goals (m, 3). A goal is reached if the object is truly there when the next
+    goal is given, and within the time limit; one that was never given is missed."""
     found = []
     for k, pose in enumerate(goals):
         own = np.flatnonzero(truth.goal == k)
@@ -157,7 +156,7 @@ def run(config, session):
 
 
 def the_truth(diagram, context) -> Truth:
-    """Where object and tip really were."""
+    """The true poses of object and tip."""
     system = diagram.GetSubsystemByName
     plant = system("station").GetSubsystemByName("plant")
     found = system("state_log").FindLog(context)
@@ -182,8 +181,8 @@ def the_truth(diagram, context) -> Truth:
 
 
 def force_on_finger(diagram, context):
-    """(n,) the size of all contacts' force on the finger, below FORCE_HZ (first order),
-    each ms [N]."""
+    """(n,) magnitude of the contact force on the finger at 1 kHz, after a first-order
+    low-pass of FORCE_HZ [N]."""
     log = diagram.GetSubsystemByName("touch_log").FindLog(context)
     pole = np.exp(-2.0 * np.pi * FORCE_HZ * 1e-3)
     filtered = lfilter([1.0 - pole], [1.0, -pole], log.data(), axis=1)
@@ -191,7 +190,7 @@ def force_on_finger(diagram, context):
 
 
 def score(config, diagram, log, truth, goals):
-    """The flat result; NaN (null in the file) for what did not happen."""
+    """The entries of result.json; NaN (null in the file) for what did not occur."""
     system = diagram.GetSubsystemByName
     n = len(goals)
     reached = [goal.reached for goal in goals]
@@ -228,7 +227,7 @@ def score(config, diagram, log, truth, goals):
     }
     worst = float(np.max(list(shares.values())))  # NaN, if one is.
     criteria.at_most("limits", "of the arm's limits, used", worst, 1.0 + 1e-6)
-    # A simulated joint does not go beyond its stop, so that "at most 1" says nothing.
+    # A simulated joint cannot pass its stop, so the limit is a little below 1.
     stop = shares["joint_range"]
     criteria.at_most("stops", "of half a joint's range, used", stop, STOP_MAX)
     r = log["r"][-1, :N_TIP].mean() * LEARN if "r" in log and len(log.time) else 0.0
@@ -262,19 +261,19 @@ def sees(config) -> bool:
 
 
 def write_recording(session, log, config):
-    """What a real robot could have recorded, and the scene that controllers believed,
-    with a file of the object beside it."""
+    """Writes a recording as of a real robot, and the controllers' scene with a file of
+    the object beside it."""
     session.write_text(OBJECT_FILE, object_sdf(config.object, MESH_FILE))
     if config.object.shape == "mesh":
         session.write_text(MESH_FILE, hull_obj(config.object))
-    # From when on the object's pose is known.
+    # Times from which the object's pose is known.
     phases = log.diagram.GetSubsystemByName("phase_log").FindLog(log.context)
     known = np.flatnonzero(phases.data()[0] != WAIT)
     begin = phases.sample_times()[known[0]] if len(known) else -np.inf
     columns = recorded(log.diagram, log.context, begin)
     read = np.column_stack([columns[name] for name in READING_COLUMNS])
     read = read[np.isfinite(read[:, 0])]
-    # What lies on the table, where it was read first; if it never was, amid the goals.
+    # The object where it was seen first; if it never was, at the centre of the goals.
     p, q = np.array([*config.goals.center, 0.0]), [1.0, 0.0, 0.0, 0.0]
     if len(read):
         p, q = read[0, :3], read[0, 3:]
@@ -287,13 +286,13 @@ def write_recording(session, log, config):
     session.write_recording(columns, model_scene(config, file, pose))
 
 
-# ----- Pictures.
+# ----- Plots.
 
-MOST_SHOWN = 12  # Goals that are drawn.
+SHOWN_MAX = 12  # Goals that are drawn.
 
 
 def outlines(spec):
-    """The corners (n, 2) of each part, seen from above, in the object's frame."""
+    """Corners (n, 2) of each part from above, in the object's frame."""
     plans = [part.points[:, :2] for part in parts(spec)]
     return [plan[ConvexHull(plan).vertices] for plan in plans]
 
@@ -308,9 +307,9 @@ def draw_outline(ax, plans, pose, **style):
 
 
 def plot_paths(session, config, truth, goals):
-    """From above, as the camera sees it (x up, y to the left): a picture per goal."""
+    """One plot for each goal, from above as the camera sees it (x up, y left)."""
     plans = outlines(config.object)
-    shown = [goal for goal in goals if not np.isnan(goal.begin)][:MOST_SHOWN]
+    shown = [goal for goal in goals if not np.isnan(goal.begin)][:SHOWN_MAX]
     columns = min(4, max(1, len(shown)))
     rows = max(1, -(-len(shown) // columns))
     fig, axes = plt.subplots(
@@ -349,7 +348,7 @@ def plot_paths(session, config, truth, goals):
 
 
 def plot_errors(session, truth, goals, fold, force_time, force, log):
-    """Distance and turn to the goal, contact forces, and what was learned."""
+    """Distance and angle to the goal, contact forces, and learned residuals."""
     rows = 4 if "r" in log else 3
     fig, axes = plt.subplots(
         rows, 1, figsize=(7, 1.9 * rows), sharex=True, layout="constrained"
@@ -378,13 +377,13 @@ def plot_errors(session, truth, goals, fold, force_time, force, log):
     session.save_plot(fig, "errors")
 
 
-# ----- What `reproduce` runs.
+# ----- reproduce
 
-# Goals in a row of one run: with 10 seeds 100 for the T, 50 for each other.
+# Consecutive goals of a run: with 10 seeds 100 for the T, 50 for the others.
 GOALS = {"t": 10, "box": 5, "l": 5}
 DEMANDED = {"T, model right": 100, "box, model right": 50, "L, model right": 50}
 GOALS_WRONG, GOALS_OTHER = 5, 2
-FRICTION = 0.5  # Of the world, where the model's is wrong.
+FRICTION = 0.5  # Of the world in the cases with a wrong model.
 WRONG: dict[str, dict] = {
     "friction halved": {"model.friction": 0.25},
     "friction doubled": {"model.friction": 1.0},
@@ -394,7 +393,7 @@ WRONG: dict[str, dict] = {
 }
 NAMES = {"t": "T", "l": "L"}
 CAMERA = {"pose_from": "camera", "camera.renderer": "drawn"}
-PAPER = {  # What is published, of other robots and objects.
+PAPER = {  # Published results, with other robots and objects.
     "reached": "98 % of 33 objects (Push Anything)",
     "loose": "73 of 73 (arXiv:2505.13350)",
     "time": "0.5 min per object (Push Anything)",
@@ -402,7 +401,7 @@ PAPER = {  # What is published, of other robots and objects.
 
 
 def cases() -> dict[str, dict]:
-    """{name: settings} of what is run once per seed."""
+    """{name: settings} of the runs that are made with each seed."""
     found: dict[str, dict] = {}
     for shape, n in GOALS.items():
         name = f"{NAMES.get(shape, shape)}, model right"
@@ -426,11 +425,11 @@ def cases() -> dict[str, dict]:
 
 
 def totals(runs, n_goals: int) -> dict:
-    """Of several results: how many goals there were, were reached, and when. A run that
-    failed has missed all of its n_goals."""
+    """Number of goals, goals reached, and times, over several results. A run that
+    failed counts as n_goals missed."""
     good = [run for run in runs if "error" not in run]
     lost = n_goals * (len(runs) - len(good))
-    # A goal that was missed has taken all of its time.
+    # A goal that was missed counts with the whole time limit.
     times = [LIMIT_SEC if t is None else t for run in good for t in run["time_s"]]
     times += [LIMIT_SEC] * lost
     return {
@@ -446,13 +445,14 @@ def totals(runs, n_goals: int) -> dict:
 
 
 def won_back(right: float, without: float, adapted: float) -> float:
-    """Which part of a loss the learner wins back; NaN where nothing was lost."""
+    """The fraction of a loss that the learner wins back; NaN without a loss."""
     lost = right - without
     return (adapted - without) / lost if abs(lost) > 1e-9 else float("nan")
 
 
 def reproduce(session, seeds, jobs) -> Table:
-    """Random goals in a row, model right and wrong, with the learner and without."""
+    """Consecutive random goals, with a right and a wrong model, with and without the
+    learner."""
     named = cases()
     trials = [(settings, s) for settings in named.values() for s in range(seeds)]
     results = run_many(
@@ -464,14 +464,14 @@ def reproduce(session, seeds, jobs) -> Table:
 
 
 def table_of(group: dict[str, list[dict]]) -> Table:
-    """{case: results of its runs} as the table of `reproduce`; a case may lack runs."""
+    """The table of `reproduce` from {case: results}; a case may lack runs."""
     named = cases()
     table = Rows("makebreak reproduce push_object")
     add = table.row
     found = {}
     for name, runs in group.items():
         t = found[name] = totals(runs, named[name]["n_goals"])
-        # Fewer goals in all than were asked for are no answer.
+        # Fewer goals than demanded do not count.
         demanded = t["n"] >= DEMANDED.get(name, np.inf)
         for key, what, share in (
             ("reached", "2 cm, 0.1 rad, 60 s", REACHED),

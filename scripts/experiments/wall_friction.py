@@ -55,7 +55,7 @@ from makebreak.systems.baselines.numerics.long_term_predictor import (
     train,
 )
 
-SUMMARY = "one-step forward models against a GP baseline at a wall (CC 4.4)"
+SUMMARY = "forward models compared with a GP baseline at a wall (CC 4.4)"
 Config = WallFrictionConfig
 # As little training as is accepted: what is timed is the trial.
 BENCH = {

@@ -6,6 +6,10 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, LeafSystem
 
+from makebreak.systems.changing_contact.numerics.contact_regions import (
+    N_REGIONS,
+    expected,
+)
 from makebreak.systems.changing_contact.numerics.contact_task import (
     N_CONTACT,
     ContactBelief,
@@ -13,11 +17,9 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
 from makebreak.systems.changing_contact.numerics.motion_pattern import MotionPattern
 from makebreak.systems.changing_contact.numerics.velocity_shaper import (
     N_MEMORY,
-    N_REGIONS,
     ShaperLaw,
     begin_anew,
     blended,
-    expected,
     plan,
     pose_output,
     take_over,

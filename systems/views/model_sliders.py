@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import LeafSystem
 
-FRICTION, GAP = "friction in the model", "gap in the model, wrong by [mm]"
+FRICTION, GAP = "model friction", "gap error [mm]"  # Longer ones are cut off.
 FRICTION_MAX, GAP_MAX = 2.0, 15.0  # [-], [mm]
 
 

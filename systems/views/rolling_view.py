@@ -64,7 +64,7 @@ class RollingView(LeafSystem):
         meshcat.SetObject(self.BAR, Box(0.012, 0.012, 1.0), _RESIDUAL)
         self._trail = Trail(meshcat, "/makebreak/track", _TRACK)
         self._show_gap(0.0, 0.0)
-        meshcat.AddSlider("r_comp as a gap [mm]", -20.0, 40.0, 0.1, 0.0)
+        meshcat.AddSlider("learned gap [mm]", -20.0, 40.0, 0.1, 0.0)
         self.DeclarePeriodicPublishEvent(config.period_sec, 0.0, self._publish)
         self.DeclarePeriodicUnrestrictedUpdateEvent(0.1, 0.0, self._remember)
 
@@ -91,6 +91,6 @@ class RollingView(LeafSystem):
         meshcat.SetTransform("/makebreak/model_ball", ghost, t)
         self._show_gap(gap, t)
         if np.isfinite(gap):
-            meshcat.SetSliderValue("r_comp as a gap [mm]", 1e3 * gap)
+            meshcat.SetSliderValue("learned gap [mm]", 1e3 * gap)
         track = context.get_abstract_state(int(self._track)).get_value()
         self._trail.show(track, t)

@@ -15,8 +15,8 @@ u is what acts on the system: known beforehand, or given by a policy u(t, x), th
 which the distribution of x passes too.
 
 Source: Khader, Yin, Falco, Kragic, "Data-efficient model learning and prediction for
-contact-rich manipulation tasks", IEEE RA-L 5 (2020): what its abstract and public
-program tell of the method. Rasmussen and Williams, "Gaussian processes for machine
+contact-rich manipulation tasks", IEEE RA-L 5 (2020), as far as its abstract and public
+code describe the method. Rasmussen and Williams, "Gaussian processes for machine
 learning" (2006), eq. 2.25, 2.26, 5.8, 5.9.
 """
 
@@ -35,37 +35,37 @@ from sklearn.mixture import BayesianGaussianMixture
 from sklearn.model_selection import GridSearchCV, GroupKFold
 from sklearn.svm import SVC
 
-# Of the hyperparameters, for inputs and outputs of unit variance.
+# Bounds of the hyperparameters, for inputs and outputs of unit variance.
 SIGNAL_BOUNDS = (1e-3, 1e3)
 LENGTH_BOUNDS = (1e-1, 1e3)
 NOISE_BOUNDS = (1e-6, 1e1)
 SVM_GRID = {"C": [1.0, 8.0, 64.0, 512.0], "gamma": [2.0**-8, 2.0**-6, 2.0**-4, 0.25]}
 KAPPA = 2.0  # Of the unscented transform, with alpha 1 and beta 0.
-SAMPLES_PER_DIMENSION = 3  # That vote for the next mode.
-# Fewer changes between two modes teach no transition of their own: the step is then the
-# expert's of the mode that is entered. (Of a dozen changes a GP of 20 inputs throws the
-# state so far off what the experts know that they never find back.)
+SAMPLES_PER_DIMENSION = 3  # Samples that vote for the next mode.
+# With fewer changes between two modes the step is that of the expert of the new mode,
+# not of a transition GP. (A GP of 20 inputs from a dozen changes throws the state far
+# outside the data of the experts, which then do not recover.)
 POINTS_MIN = 30
 JITTER = 1e-9
 
 
 @dataclass
 class TrainingBudget:
-    points_per_mode: int = 200  # That each GP is given.
-    svm_points: int = 2000  # That the SVM is given.
-    modes_max: int = 10  # Components of the mixture, of which it may leave some empty.
-    segment_min: int = 10  # Samples; shorter stays in a mode go to the one before.
-    restarts: int = 1  # Of each GP's marginal likelihood, from random points.
-    predict_change: bool = True  # The GPs' output: x_{t+1} - x_t, or x_{t+1}.
+    points_per_mode: int = 200  # Training points of each GP.
+    svm_points: int = 2000  # Training points of the SVM.
+    modes_max: int = 10  # Components of the mixture, some of which may stay empty.
+    segment_min: int = 10  # Samples; shorter segments get the mode before them.
+    restarts: int = 1  # Random restarts of each GP's likelihood maximisation.
+    predict_change: bool = True  # Whether GPs predict x_{t+1} - x_t, or x_{t+1}.
     seed: int = 0
 
 
 class TrainingTrial(NamedTuple):
     """One training trial; row t is taken at time t dt."""
 
-    x: np.ndarray  # (T, n_x) what is predicted.
-    u: np.ndarray  # (T, n_u) what is known beforehand, or measured.
-    features: np.ndarray  # (T, n_f) what tells the modes apart.
+    x: np.ndarray  # (T, n_x) predicted quantities.
+    u: np.ndarray  # (T, n_u) quantities that are known beforehand, or measured.
+    features: np.ndarray  # (T, n_f) features that distinguish the modes.
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,10 +224,10 @@ def fit_gp(X, Y, x_mean, x_scale, restarts=1, ard=True, seed=0) -> GaussianProce
 
 
 def find_modes(features: Sequence[np.ndarray], budget: TrainingBudget):
-    """The mode of each sample of each trial, without being told any.
+    """The mode of each sample of each trial, by unsupervised clustering.
 
     Args: features: one (T, n_f) per trial.
-    Returns: one (T,) of integers 0, 1, ... per trial: 0 is the mode that comes first.
+    Returns: one (T,) of integers 0, 1, ... per trial, numbered by first appearance.
     """
     flat = np.concatenate(features)
     scale = flat.std(0)
@@ -244,7 +244,7 @@ def find_modes(features: Sequence[np.ndarray], budget: TrainingBudget):
         random_state=budget.seed,
     )
     with warnings.catch_warnings():
-        # It goes on for as long as told; components that are of no use fade slowly.
+        # It stops at max_iter, as unused components fade slowly.
         warnings.simplefilter("ignore", ConvergenceWarning)
         mixture.fit(flat[some])
     labels, start = [], 0
@@ -257,8 +257,8 @@ def find_modes(features: Sequence[np.ndarray], budget: TrainingBudget):
 
 
 def without_short_stays(labels, shortest: int) -> np.ndarray:
-    """labels (T,), where a stay shorter than `shortest` is given to the mode before it
-    (the first one: to the mode after it)."""
+    """labels (T,) in which segments shorter than `shortest` have the mode before them
+    (the first ones: the mode after them)."""
     labels = np.array(labels)
     edges = np.flatnonzero(np.diff(labels)) + 1
     starts, ends = [0, *edges], [*edges, len(labels)]
@@ -275,7 +275,7 @@ def without_short_stays(labels, shortest: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class LongTermPredictor:
-    """What training gives."""
+    """The trained models."""
 
     svm: Any  # Its predict((k, n_x + n_u) standardised) gives (k,) modes.
     experts: dict[int, Any]  # mode -> GaussianProcesses
@@ -310,8 +310,8 @@ class LongTermPredictor:
 
 
 def one_of_each_stratum(n: int, wanted: int, rng) -> np.ndarray:
-    """At most `wanted` of the indices 0 .. n-1: one at random from each equal share, so
-    that all trials and all their times are in it."""
+    """At most `wanted` of the indices 0 .. n-1, one at random from each of as many
+    equal intervals, so that all trials and times are represented."""
     if n <= wanted:
         return np.arange(n)
     edges = np.linspace(0, n, wanted + 1).astype(int)
@@ -543,7 +543,7 @@ def predict_one_step(predictor: LongTermPredictor, x, u, mode: int):
     xu = np.concatenate([x, u])[None]
     after = int(predictor.next_modes(xu)[0])
     if not predictor.reachable(mode, after):
-        # With feedback the measurement is believed, not the order of training.
+        # With feedback the measurement counts more than the transitions in training.
         mode = after
     model = predictor.model(mode, after)
     mean, variance = model.predict(xu[:, list(predictor.gp_inputs)])

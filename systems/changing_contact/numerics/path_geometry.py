@@ -33,6 +33,41 @@ _NODES = _NODES + 0.5
 
 
 @numba.njit(cache=True)
+def dot(a, b):
+    """Of the first three entries; np.sum(a * b) takes a second to compile."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@numba.njit(cache=True)
+def all_finite(a):
+    """Whether every number of a is finite; np.all takes long to compile."""
+    for x in a:
+        if not np.isfinite(x):
+            return False
+    return True
+
+
+@numba.njit(cache=True)
+def add_along(C, n, distance):
+    """C += n distance in place, in the first three entries."""
+    for i in range(3):
+        C[i] += n[i] * distance
+
+
+@numba.njit(cache=True)
+def head(table, k, i):
+    """Entry i of the head of segment k in a pattern's table."""
+    return table[1 + k * HEAD + i]
+
+
+@numba.njit(cache=True)
+def force_direction(table, k, row):
+    """(3,) the force direction `row` (0 or 1) of segment k, a view."""
+    start = 1 + k * HEAD + DIRECTIONS + 3 * row
+    return table[start : start + 3]
+
+
+@numba.njit(cache=True)
 def _polynomial(table, at, x, order):
     """The polynomial's derivative of that order (6,) at x."""
     out = np.zeros(6)

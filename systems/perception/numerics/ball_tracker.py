@@ -176,8 +176,8 @@ def _rays(points, low, focal, center):
 
 
 @njit(cache=True)
-def _sample(image, u, v):
-    """Bilinear interpolation at u, v inside of the image."""
+def bilinear(image, u, v):
+    """The value at u, v [px], inside of an image (h, w), by bilinear interpolation."""
     i, j = int(v), int(u)
     b, a = v - i, u - j
     i1, j1 = min(i + 1, image.shape[0] - 1), min(j + 1, image.shape[1] - 1)
@@ -205,14 +205,14 @@ def outline_points(strength, region, u0, v0, reach, angles):
     for i in range(n):
         c, s = angles[i]
         start[i] = _within(reach, u0, v0, c, s, w, h)
-        ground[i] = _sample(strength, u0 + start[i] * c, v0 + start[i] * s)
+        ground[i] = bilinear(strength, u0 + start[i] * c, v0 + start[i] * s)
         foot = ground[i] + MIN_STRENGTH / 2
         edge[i] = _rise(strength, u0, v0, c, s, start[i], foot)
         if edge[i] < 0.0:
             continue
         for d in range(1, 7):  # Strength of the ball just inside.
             r = edge[i] - d * STEP
-            top[i] = max(top[i], _sample(strength, u0 + r * c, v0 + r * s))
+            top[i] = max(top[i], bilinear(strength, u0 + r * c, v0 + r * s))
         u = int(u0 + (edge[i] + 2.5) * c + 0.5)
         v = int(v0 + (edge[i] + 2.5) * s + 0.5)
         if 0 <= u < w and 0 <= v < h:
@@ -259,10 +259,10 @@ def _rise(strength, u0, v0, c, s, start, level):
     """Radius at which, from `start` inwards, the strength first reaches `level` [px];
     -1 if it does not."""
     r = start
-    last = _sample(strength, u0 + r * c, v0 + r * s)
+    last = bilinear(strength, u0 + r * c, v0 + r * s)
     while r > 4.0:
         r -= STEP
-        now = _sample(strength, u0 + r * c, v0 + r * s)
+        now = bilinear(strength, u0 + r * c, v0 + r * s)
         if now >= level:
             if now <= last:  # Reached from the start: the ball is cut by the border.
                 return -1.0

@@ -27,7 +27,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from makebreak.systems.perception.numerics.ball_tracker import MIN_STRENGTH
+from makebreak.systems.perception.numerics.ball_tracker import MIN_STRENGTH, bilinear
 from makebreak.systems.perception.numerics.object_outline import (
     Shape,
     convex_hull,
@@ -478,7 +478,7 @@ def _edges(image, strength, uv, normal, beyond, table, window, inset):
             if not _in_image(strength, u, v):
                 whole = False
                 break
-            profile[j] = _bilinear(strength, u, v)
+            profile[j] = bilinear(strength, u, v)
             highest = max(highest, profile[j])
         if not whole or highest < MIN_STRENGTH:
             continue
@@ -513,15 +513,6 @@ def _edges(image, strength, uv, normal, beyond, table, window, inset):
 @njit(cache=True)
 def _in_image(image, u, v):
     return 0.0 <= u <= image.shape[1] - 1 and 0.0 <= v <= image.shape[0] - 1
-
-
-@njit(cache=True)
-def _bilinear(image, u, v):
-    i, j = min(int(u), image.shape[1] - 2), min(int(v), image.shape[0] - 2)
-    a, b = u - i, v - j
-    top = (1.0 - a) * image[j, i] + a * image[j, i + 1]
-    bottom = (1.0 - a) * image[j + 1, i] + a * image[j + 1, i + 1]
-    return (1.0 - b) * top + b * bottom
 
 
 @njit(cache=True)
