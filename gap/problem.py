@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from makebreak.gap.data.recording import Recording
-from makebreak.gap.numerics.selection import NESTED_GAIN, LinearFit
+from makebreak.gap.numerics.selection import LinearFit
 from makebreak.gap.result import GapMeasure, Series, Unexplained, Where
+from makebreak.gap.thresholds import NESTED_GAIN
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, check_parameters
@@ -181,6 +182,17 @@ class Outcome:
     unexplained: Sequence[Unexplained] = ()
 
 
+@dataclass(frozen=True, eq=False)
+class Found:
+    """An effect that a problem has found, and taken off the recordings, before the
+    search; std of its parameters, and the error before and after."""
+
+    effect: Effect
+    std: dict[str, float]
+    before: float
+    after: float
+
+
 class GapProblem(ABC):
     """Residuals of recordings under effects that a scene may lack.
 
@@ -276,6 +288,15 @@ class GapProblem(ABC):
         """The channel, or equation, of which all rows together leave most of the noise,
         and how many times that; no name where it is not asked."""
         return "", 0.0
+
+    def found_before(self) -> list[Found]:
+        """Effects that were found, and taken off the recordings, before the search."""
+        return []
+
+    def is_within_law(self, effect: Effect) -> bool:
+        """Whether an effect is so small that the laws by which it was found are no
+        better: beside an error that is no gap it is then none."""
+        return False
 
     def hint(self, end: Fitted) -> str:
         """Where to look for what no effect explains, as sentences; "": not known."""

@@ -9,7 +9,14 @@ from pydrake.multibody.plant import MultibodyPlant
 from makebreak.gap.data.recording import unit_of
 from makebreak.gap.problem import share_left
 from makebreak.gap.result import Estimate, Evidence, GapMeasure, NamedEffect
-from makebreak.gap.search.select import FLOOR, Choice, Selection
+from makebreak.gap.search.choice import Choice, Selection
+from makebreak.gap.thresholds import (
+    AGREEMENT_RMS_MAX,
+    CLOSED_SHARE_MIN,
+    NOISE_RMS_MAX,
+    UNEXPLAINED_RMS,
+    UNEXPLAINED_SHARE,
+)
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import (
     of_slides,
@@ -18,14 +25,7 @@ from makebreak.models.effects.kind import (
     unit_at,
 )
 
-# Left after all that could be named: more than so many times the noise, and more than
-# this share of the gap, is a gap without a name.
-UNNAMED, UNNAMED_SHARE = 2.0, 0.2
-# Effects that leave a gap without a name are told only if they close this share of it,
-# simulated: less is what any model with a free parameter may fit to another law.
-TOLD = 0.5
 OF_CHANNEL = "(unit of the channel)"
-NO_GAP = 1.5  # Times the noise, after the background within its tolerance.
 
 
 def verdict_of(
@@ -34,9 +34,9 @@ def verdict_of(
     """Args: start, end: held-out error without and with all effects, the background
     within its tolerance; far: it had to be moved beyond."""
     if not choices:
-        calm = start <= max(NO_GAP, FLOOR) and not far
+        calm = start <= max(AGREEMENT_RMS_MAX, NOISE_RMS_MAX) and not far
         return "no_gap" if calm else "gap_unnamed"
-    if far or end > max(UNNAMED, UNNAMED_SHARE * start):
+    if far or end > max(UNEXPLAINED_RMS, UNEXPLAINED_SHARE * start):
         return "gap_unnamed"
     return "ambiguous" if any(c.ties for c in choices) else "gap_named"
 
@@ -50,21 +50,25 @@ def after_simulation(
     """
     if not choices:
         return verdict
-    if gap.after > max(gap.before, UNNAMED):
+    if gap.after > max(gap.before, UNEXPLAINED_RMS):
         return "gap_unnamed"  # Simulation does not bear the equations out.
-    if gap.after > UNNAMED and gap.reduction < TOLD:
+    if gap.after > UNEXPLAINED_RMS and gap.reduction < CLOSED_SHARE_MIN:
         return "gap_unnamed"  # Most of what it shows is something else.
-    if verdict == "gap_unnamed" and gap.before > UNNAMED and gap.after <= NO_GAP:
+    if (
+        verdict == "gap_unnamed"
+        and gap.before > UNEXPLAINED_RMS
+        and gap.after <= AGREEMENT_RMS_MAX
+    ):
         # With the effects no gap is left. What the equations leave is how a law was
         # written down in them (a backlash: where the link is in its gap).
         return verdict_of(choices, 1.0, 1.0, far)
     return verdict
 
 
-def not_borne_out(verdict: str, gap: GapMeasure) -> str:
+def why_not_confirmed(verdict: str, gap: GapMeasure) -> str:
     """Why an agreement does not stand, in words; empty where it does. gap: of windows
     that nothing was decided on."""
-    if verdict != "no_gap" or not gap.before > UNNAMED:
+    if verdict != "no_gap" or not gap.before > UNEXPLAINED_RMS:
         return ""
     return (
         " The data used for the decision show no error beyond noise, but on the data "
@@ -73,13 +77,13 @@ def not_borne_out(verdict: str, gap: GapMeasure) -> str:
     )
 
 
-def withdrawn_if_weak(
+def withdraw_if_weak(
     selection: Selection, verdict: str, closed: float
 ) -> tuple[Selection, str]:
     """The selection, without effects where they are no name for the gap, and then what
     they are worth, in words. closed: share of the gap that they close, simulated and in
     the equations."""
-    if verdict != "gap_unnamed" or not selection.choices or closed >= TOLD:
+    if verdict != "gap_unnamed" or not selection.choices or closed >= CLOSED_SHARE_MIN:
         return selection, ""
     names = [f"{c.effect.kind} at {', '.join(c.effect.at)}" for c in selection.choices]
     near = f" The best candidates ({'; '.join(names)}) "
@@ -95,9 +99,9 @@ def two_figures(start: float, end: float, gap: GapMeasure) -> str:
     windows disagree on what is left by more than a factor of two, or only equations
     show the gap (a heavier object goes where it is pushed all the same); else
     nothing."""
-    if not start > NO_GAP or not gap.window_s > 0.0:
+    if not start > AGREEMENT_RMS_MAX or not gap.window_s > 0.0:
         return ""
-    if gap.before <= NO_GAP:
+    if gap.before <= AGREEMENT_RMS_MAX:
         return (
             " Simulated windows do not show this gap; in the equations of motion the "
             + (f"error falls from {start:.3g} to {end:.3g} times the noise."

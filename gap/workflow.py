@@ -25,30 +25,37 @@ from makebreak.gap.data.scene_facts import scene_facts, scene_names
 from makebreak.gap.data.split import split, with_noise_of
 from makebreak.gap.parallel import side_by_side
 from makebreak.gap.problem import DISTANCES, Fitted, GapProblem, Outcome, is_sane
-from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.driven import DrivenProblem, is_driven, sticks
 from makebreak.gap.residuals.impacts import ImpactProblem, runs_against, without_contact
+from makebreak.gap.residuals.late_poses import contact_problem
+from makebreak.gap.residuals.lying_on_faces import point_on_face
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.residuals.objects import FlightProblem, RolloutProblem, TouchProblem
 from makebreak.gap.residuals.pressing import PressingProblem, presses
 from makebreak.gap.residuals.sap_lift import sap_lift
 from makebreak.gap.result import GapMeasure, GapResult, JudgedChannel
+from makebreak.gap.search.choice import Choice, Selection
 from makebreak.gap.search.fit import fit_effects
-from makebreak.gap.search.select import Choice, Selection, select, without
+from makebreak.gap.search.select import select, without
 from makebreak.gap.search.trust import scatter, trust_in
 from makebreak.gap.simulation.measure import WINDOW_SEC
 from makebreak.gap.simulation.windows import WindowModel, with_step
+from makebreak.gap.thresholds import (
+    AGREEMENT_RMS_MAX,
+    CLOSED_SHARE_MIN,
+    SIMULATED_RIVAL_GAIN,
+    SIMULATED_RIVAL_RATIO,
+    SIMULATED_RIVALS_MAX,
+    UNEXPLAINED_RMS,
+)
 from makebreak.gap.verdict import (
-    NO_GAP,
-    TOLD,
-    UNNAMED,
     after_simulation,
     named,
-    not_borne_out,
     says,
     two_figures,
     verdict_of,
-    withdrawn_if_weak,
+    why_not_confirmed,
+    withdraw_if_weak,
 )
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
@@ -62,9 +69,6 @@ from makebreak.models.scene import Scene, read_scene
 
 # Of longer recordings of a mechanism, and of more rows of anything, pieces are used.
 MOST_SEC, MOST_ROWS = 60.0, 120_000
-# Rivals that simulation decides between: how much worse they may be in equations, how
-# much less they must leave in simulation, and how many are tried.
-NEAR_BEST, CLEARLY, MOST_RIVALS = 1.3, 0.8, 3
 AGREES = ("no_gap", "not_judged")  # As far as anything was compared.
 # Of what is only reported on.
 REPORTED_SEC, REPORTED_ROWS = 20.0, 40_000
@@ -167,8 +171,8 @@ def problem_for(
         return mechanism, [*touches, *finding, *mechanism.push_findings()]
     if any(joint.num_velocities() for joint in one_dof_joints(dynamics.plant)):
         try:
-            contact = ContactProblem(scene, recordings)
-            return contact, sap_lift(contact)
+            contact = contact_problem(scene, recordings)
+            return contact, sap_lift(contact) + point_on_face(contact)
         except ValueError:  # Not the whole motion is measured, or nothing touches.
             pass
         try:
@@ -196,6 +200,10 @@ def conclude(
     back; they change no effect and no parameter.
     """
     nuisances = selection.nuisances
+    if problem.error(selection.start) <= AGREEMENT_RMS_MAX and all(
+        problem.is_within_law(c.effect) for c in selection.choices
+    ):
+        selection = replace(selection, choices=(), end=selection.start)
     selection, chosen_on = kept_by_simulation(problem, selection, jobs)
     selection, chosen_on = preferred_by_simulation(problem, selection, chosen_on, jobs)
     scattered = scatter(problem, selection.end)
@@ -210,11 +218,11 @@ def conclude(
     if verdict == "no_gap" and problem.plan.simulation_agrees:
         if chosen_on is None:
             verdict, differs = "not_judged", " No window could be simulated."
-        elif chosen_on.gap.before > UNNAMED:
+        elif chosen_on.gap.before > UNEXPLAINED_RMS:
             verdict = "gap_unnamed"
             differs = " The equations of motion agree, simulated windows do not."
     name, size = problem.loudest(selection.start)
-    if verdict == "no_gap" and size > max(problem.plan.loud, UNNAMED):
+    if verdict == "no_gap" and size > max(problem.plan.loud, UNEXPLAINED_RMS):
         # Among many others one that is off would not show.
         verdict = "gap_unnamed"
         differs = f" {name} is off by {size:.2g} times its noise."
@@ -223,7 +231,7 @@ def conclude(
         every = selection
         equations = problem.closed(selection.start, selection.end)
         closed = min(chosen_on.gap.reduction, equations)
-        selection, near = withdrawn_if_weak(every, verdict, closed)
+        selection, near = withdraw_if_weak(every, verdict, closed)
         if selection is not every:
             chosen_on = problem.outcome(
                 [], selection.start, selection.end, nuisances, jobs=jobs
@@ -251,9 +259,11 @@ def conclude(
     else:
         final, data = Outcome(_nothing(start, end)), "fitted"
     final = replace(final, gap=replace(final.gap, data=data))
-    if problem.plan.simulation_agrees and (why := not_borne_out(verdict, final.gap)):
+    if problem.plan.simulation_agrees and (
+        why := why_not_confirmed(verdict, final.gap)
+    ):
         verdict, differs = "gap_unnamed", why
-    if verdict in ("gap_named", "ambiguous") and not _borne_out(final.gap):
+    if verdict in ("gap_named", "ambiguous") and not _is_confirmed(final.gap):
         verdict = "gap_unnamed"
         near += (
             " On the data held out for the report the effects take the simulated "
@@ -270,7 +280,13 @@ def conclude(
     near += two_figures(start, problem.error(selection.end), final.gap)
     if verdict == "gap_unnamed":
         near += problem.hint(selection.end)
-    effects = [named(c, problem.dynamics.plant) for c in selection.choices]
+    before = [
+        Choice(f.effect, f.std, f.before, f.after, "", 0.0, (), (), 1)
+        for f in problem.found_before()
+    ]
+    if before and verdict == "no_gap":
+        verdict = "gap_named"
+    effects = [named(c, problem.dynamics.plant) for c in (*before, *selection.choices)]
     fixed = [c.fixed for c in selection.choices]
     prior = nuisances.prior
     return GapResult(
@@ -324,15 +340,18 @@ def preferred_by_simulation(
     as good are simulated too, and one that leaves clearly less is taken."""
     if not problem.plan.simulation_agrees or len(selection.choices) != 1:
         return selection, outcome
-    if outcome is None or outcome.gap.after <= NO_GAP or not selection.table:
+    if outcome is None or outcome.gap.after <= AGREEMENT_RMS_MAX or not selection.table:
         return selection, outcome
     (choice,) = selection.choices
-    known, limit = {choice.effect.kind}, NEAR_BEST * selection.table[0].score
+    known, limit = (
+        {choice.effect.kind},
+        SIMULATED_RIVAL_RATIO * selection.table[0].score,
+    )
     screen = selection.screen(problem)
     for each in selection.table:
         if each.kind in known or len(each.parameters) != 1 or len(each.at) != 1:
             continue
-        if each.score > limit or len(known) > MOST_RIVALS:
+        if each.score > limit or len(known) > SIMULATED_RIVALS_MAX:
             break
         known.add(each.kind)
         start = Effect(each.kind, list(each.at), dict(each.parameters))
@@ -345,7 +364,10 @@ def preferred_by_simulation(
         other = problem.outcome(
             fit.effects, selection.start, fit, selection.nuisances, jobs=jobs
         )
-        if other is not None and other.gap.after < CLEARLY * outcome.gap.after:
+        if (
+            other is not None
+            and other.gap.after < SIMULATED_RIVAL_GAIN * outcome.gap.after
+        ):
             new = replace(
                 choice, effect=fit.effects[0], std=fit.std[0], after=fit.score,
                 runner_up=f"{choice.effect.kind} at {', '.join(choice.effect.at)}",
@@ -356,12 +378,12 @@ def preferred_by_simulation(
     return selection, outcome
 
 
-def _borne_out(gap: GapMeasure) -> bool:
+def _is_confirmed(gap: GapMeasure) -> bool:
     """Whether simulated windows do better with what is named; where they show no gap
     without it, whether they show none with it."""
-    if gap.before <= NO_GAP:
-        return gap.after <= NO_GAP
-    return gap.reduction >= TOLD
+    if gap.before <= AGREEMENT_RMS_MAX:
+        return gap.after <= AGREEMENT_RMS_MAX
+    return gap.reduction >= CLOSED_SHARE_MIN
 
 
 def _nothing(start: float, end: float) -> GapMeasure:

@@ -28,6 +28,7 @@ from makebreak.models.effects.body_forces import MAX_NUMBERS as BODY_NUMBERS
 from makebreak.models.effects.kind import (
     Effect,
     find_bodies,
+    find_body,
     full_name,
     model_names,
     one_dof_joints,
@@ -191,6 +192,18 @@ class SceneDynamics:
         """
         found = places(self.loaded, KINDS[kind].at, self.channels())
         return [at for at in found if self._fits(kind, at)]
+
+    def links(self) -> dict[str, float]:
+        """{body that moves and has a mass: its mass [kg]}, from the base outwards."""
+        bodies = {
+            at: find_body(Effect("", [at], {}), self.plant, at)
+            for at in places(self.loaded, "body", ())
+        }
+        masses = {
+            at: float(body.default_spatial_inertia().get_mass())
+            for at, body in bodies.items()
+        }
+        return {at: mass for at, mass in masses.items() if mass > 0.0}
 
     def _fits(self, kind: str, at: str) -> bool:
         """Whether the model has there what the kind changes (such as a box for

@@ -4,7 +4,7 @@ scene_schema.py has the sections of a scene file, scene_reader.py reads it, driv
 has the actuation; here the plant is built.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -276,7 +276,10 @@ def _changes_new_values(effects: Sequence[Effect]) -> bool:
 
 
 def load_scene(
-    scene: Scene | str | Path, builder: DiagramBuilder, command_delays: bool = True
+    scene: Scene | str | Path,
+    builder: DiagramBuilder,
+    command_delays: bool = True,
+    before_finalize: Callable[[MultibodyPlant, SceneGraph], None] | None = None,
 ) -> LoadedScene:
     """Adds the scene's plant, with every effect applied, and its scene graph.
 
@@ -286,7 +289,8 @@ def load_scene(
     the ports of LoadedScene instead.
 
     Args: scene: or the path of its file; command_delays: False if the caller delays the
-        commands itself.
+        commands itself; before_finalize: called with the plant once all models and
+        effects are in it.
     Raises: ValueError that names what is wrong in the scene.
     """
     if not isinstance(scene, Scene):
@@ -315,6 +319,8 @@ def load_scene(
         before = KINDS[effect.kind].before_finalize
         if before is not None:
             before(effect, plant, scene_graph)
+    if before_finalize is not None:
+        before_finalize(plant, scene_graph)
     try:
         plant.Finalize()
     except DRAKE_ERRORS as error:  # Such as a loop of welds.

@@ -5,7 +5,8 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from datetime import datetime
 from hashlib import sha256
 from pathlib import Path
 
@@ -268,3 +269,32 @@ def _free(path: Path) -> Path:
     while os.path.lexists(path.with_name(f"{path.name}.{n}")):
         n += 1
     return path.with_name(f"{path.name}.{n}")
+
+
+def default_out(name: str) -> Path:
+    """runs/<name>-<time>, or with -2, -3 ... where that is taken."""
+    stem = f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
+    path, n = Path("runs") / stem, 1
+    while path.exists():
+        n += 1
+        path = Path("runs") / f"{stem}-{n}"
+    return path
+
+
+def print_files(files: Sequence[Path]) -> None:
+    """Prints which files were written, and where: in their common folder, as an
+    interrupted run may have a subfolder."""
+    if files:
+        folder = Path(os.path.commonpath([path.parent for path in files]))
+        names = " ".join(path.relative_to(folder).as_posix() for path in files)
+        print(f"Files in {folder}: {names}", flush=True)
+
+
+def check_written(session) -> None:
+    """Raises: ValueError if a file could not be written."""
+    if session.unwritten is not None:
+        error = session.unwritten
+        raise ValueError(
+            f"--out: not all files could be written in {session.out_dir} "
+            f"({error.strerror or error}); what could be written is kept"
+        )

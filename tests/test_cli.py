@@ -21,7 +21,7 @@ import pytest
 import spring_mass
 
 import makebreak
-from makebreak.scripts import bench, cli, experiments, trials
+from makebreak.scripts import bench, cli, command_inputs, experiments, trials
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.settings import apply_settings
 
@@ -33,7 +33,6 @@ PYPROJECT = Path(__file__).resolve().parent.parent / "pyproject.toml"
 def _registered(monkeypatch, tmp_path):
     """Each test has the one experiment, and a folder of its own to run in."""
     monkeypatch.setattr(experiments, "EXPERIMENTS", {"spring_mass": "spring_mass"})
-    monkeypatch.setattr(cli, "EXPERIMENTS", experiments.EXPERIMENTS)
     monkeypatch.chdir(tmp_path)
 
 
@@ -155,7 +154,7 @@ BAD = [
     ),
     (["gap", "a.yaml", "b.csv", "--job", "1"], "option --job; did you mean --jobs?"),
     (["bench", "--jobs", "1"], "unknown option --jobs; expected one of: --help"),
-    (["list", "scenes"], "unexpected scenes"),
+    (["list", "scenes"], "unknown experiment scenes"),
     (["run", "--set", "noise=1", "spring_mass"], "EXPERIMENT comes before --set"),
     (["reproduce", "spring"], "unknown experiment spring; did you mean spring_mass?"),
     (["reproduce", "--seeds", "0"], '--seeds: got "0", expected a whole number, 1'),
@@ -235,8 +234,8 @@ def test_a_world_is_found_by_path_or_by_name(monkeypatch):
     models.mkdir(parents=True)
     (models / "attic.scene.yaml").write_text("# An attic.\ndirectives: []\n")
     (models / "weights.yaml").write_text("a: 1\n")  # YAML, but no scene.
-    monkeypatch.setattr(cli, "_MODELS", models.parent)
-    assert list(cli.scenes()) == ["rooms/attic"]
+    monkeypatch.setattr(command_inputs, "MODELS", models.parent)
+    assert list(command_inputs.scenes()) == ["rooms/attic"]
     for name in (
         "rooms/attic",
         "rooms/attic.scene.yaml",
@@ -251,7 +250,7 @@ def test_a_world_is_found_by_path_or_by_name(monkeypatch):
 def test_list_names_experiments_and_scenes_with_a_line_each(capsys, monkeypatch):
     Path("models").mkdir()
     Path("models/attic.yaml").write_text("# An attic.\ndirectives: []\n")
-    monkeypatch.setattr(cli, "_MODELS", Path("models"))
+    monkeypatch.setattr(command_inputs, "MODELS", Path("models"))
     assert cli.main(["list"]) == 0
     lines = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
     assert ["spring_mass", spring_mass.SUMMARY] in lines

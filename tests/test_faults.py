@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 import spring_mass
 
-from makebreak.scripts import cli, experiments
+from makebreak.scripts import arguments, cli, experiments
 from makebreak.scripts.faults import on_purpose
 
 
 @pytest.fixture(autouse=True)
 def _registered(monkeypatch, tmp_path):
     monkeypatch.setattr(experiments, "EXPERIMENTS", {"spring_mass": "spring_mass"})
-    monkeypatch.setattr(cli, "EXPERIMENTS", experiments.EXPERIMENTS)
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", None)
     monkeypatch.delenv("MAKEBREAK_DEBUG", raising=False)
@@ -93,7 +92,7 @@ def test_a_fault_of_any_command_is_one_line_and_a_file(error, monkeypatch, capsy
     def fails(args):
         raise error
 
-    monkeypatch.setattr(cli, "_list", fails)
+    monkeypatch.setitem(cli._COMMANDS, "list", fails)
     assert cli.main(["list"]) == 3
     said = capsys.readouterr().err
     assert "a fault of makebreak itself" in said
@@ -104,7 +103,7 @@ def test_the_traceback_is_shown_when_asked_for(monkeypatch, capsys):
     def fails(args):
         raise KeyError("x")
 
-    monkeypatch.setattr(cli, "_list", fails)
+    monkeypatch.setitem(cli._COMMANDS, "list", fails)
     monkeypatch.setenv("MAKEBREAK_DEBUG", "1")
     assert cli.main(["list"]) == 3
     assert "Traceback" in capsys.readouterr().err
@@ -123,7 +122,7 @@ def test_only_a_raise_of_our_own_is_a_refusal():
         except ValueError as error:
             return on_purpose(error)
 
-    assert caught(lambda: cli._number("x", "--seed", 0.0))
+    assert caught(lambda: arguments.number("x", "--seed", 0.0))
     assert not caught(lambda: np.zeros(2) + np.zeros(3))
     assert not caught(lambda: int("x"))
 

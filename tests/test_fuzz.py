@@ -24,7 +24,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import makebreak.gap.workflow  # noqa: F401  (Imported before the fork.)
-from makebreak.scripts import cli, gap_command, session
+from makebreak.scripts import cli, gap_command, run_command, session
 from makebreak.scripts.experiments import EXPERIMENTS, load_experiment
 from makebreak.scripts.settings import field_types
 
@@ -265,7 +265,8 @@ def in_child(argv, folder: Path, only_reads: bool, cpu_sec: int = CPU_SEC):
                 if only_reads:
                     _stop_where_it_computes()
                 if "--duration" not in argv:  # Mere words: nothing bounds a run.
-                    cli._run_in = cli._reproduce_in = cli._bench = _accepted
+                    run_command.run_in = cli._reproduce_in = _accepted
+                    cli._COMMANDS["bench"] = _accepted
                     session.Session.simulate = _accepted
                 resource.setrlimit(resource.RLIMIT_CPU, (cpu_sec, cpu_sec + 5))
                 resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

@@ -30,8 +30,8 @@ from makebreak.gap.residuals.contact_problem import ContactProblem, _best_rectan
 from makebreak.gap.residuals.contact_shapes import _Point, _Surface
 from makebreak.gap.residuals.permitted_contacts import Shift
 from makebreak.gap.result import Considered, GapMeasure
+from makebreak.gap.search.choice import Choice, Selection
 from makebreak.gap.search.fit import _Free, fit_effects
-from makebreak.gap.search.select import Choice, Selection
 from makebreak.gap.simulation import contact_windows
 from makebreak.gap.simulation.contact_windows import PushWindows, led_as_measured
 from makebreak.gap.simulation.windows import WindowModel
@@ -499,12 +499,12 @@ def test_a_tool_that_leans_on_something_with_little_is_felt(monkeypatch):
         _q=None, _v=None, _vd=None,
     )  # fmt: skip
     sensor = SimpleNamespace(place="tip.tip", frame=None)
-    size = ContactDynamics._force_size(model, sensor)
+    size = ContactDynamics._force_size(model, sensor, np.zeros((1, 3)))
     assert size[:190].max() == 0.0
     np.testing.assert_allclose(size[210:390], 0.4, atol=0.15)  # Five deviations.
     # What the tool's own motion makes in a sensor in its mount is no touch.
     own[200:300, 1] = -0.5
-    size = ContactDynamics._force_size(model, sensor)
+    size = ContactDynamics._force_size(model, sensor, np.zeros((1, 3)))
     assert size[210:295].max() == 0.0 and size[305:390].min() > 0.2
 
 
@@ -675,8 +675,8 @@ def test_a_patch_s_side_that_nothing_crossed_may_be_anywhere():
     "before, after, good",
     [(0.9, 0.8, True), (0.9, 2.1, False), (8.0, 2.0, True), (8.0, 5.0, False)],
 )
-def test_effects_that_make_a_gap_in_simulation_are_not_borne_out(before, after, good):
-    assert workflow._borne_out(GapMeasure(before, after, 1.0, 0.6)) == good
+def test_effects_that_make_a_gap_in_simulation_are_not_confirmed(before, after, good):
+    assert workflow._is_confirmed(GapMeasure(before, after, 1.0, 0.6)) == good
 
 
 def test_a_signal_that_jumps_between_samples_is_known_less_well():

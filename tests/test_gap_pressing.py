@@ -233,3 +233,12 @@ def test_bodies_that_stand_nearer_are_felt_though_the_scene_has_no_contact(tmp_p
     off = {problem.shapes.names[k]: by for k, by in problem.off.items()}
     assert off[TABLE]["z"] == pytest.approx(0.01, abs=1e-3)
     assert off[WALL]["x"] == pytest.approx(-0.02, abs=1e-3)
+
+
+def test_no_contact_is_so_soft_that_a_tool_goes_in_by_centimetres(displaced):
+    """A wall that stands elsewhere, met with one force alone, would be one."""
+    at = f"{WALL}~gantry.tool"
+    now = displaced.dynamics.now("contact_stiffness", [at])["stiffness"]
+    displaced.left([Effect("contact_stiffness", [at], {"stiffness": 0.5 * now})])
+    with pytest.raises(ValueError, match="goes in too far"):
+        displaced.left([Effect("contact_stiffness", [at], {"stiffness": 0.01 * now})])

@@ -11,7 +11,8 @@ from makebreak.gap.data.recording import read_recordings
 from makebreak.gap.problem import Candidate
 from makebreak.gap.residuals.driven import DrivenProblem, is_driven, sticks
 from makebreak.gap.residuals.mechanism import MechanismProblem
-from makebreak.gap.search.select import _groups, select
+from makebreak.gap.search.groups import groups_of
+from makebreak.gap.search.select import select
 from makebreak.gap.simulation.driven_arm import DrivenArmSimulation
 from makebreak.gap.simulation.scene_simulation import Commands
 from makebreak.gap.workflow import problem_for, run_gap
@@ -167,7 +168,7 @@ def test_groups_have_joints_and_not_the_value_that_all_share():
     def candidate(at):
         return Candidate("joint_coulomb_friction", (at,), 1, (np.ones((4, 1)),), ())
 
-    (group,) = _groups([candidate(at) for at in ("d", "d.j1", "d.j2")])
+    (group,) = groups_of([candidate(at) for at in ("d", "d.j1", "d.j2")])
     assert group.at == ("d.j1", "d.j2")
     assert group.columns[0].shape == (4, 2)
 

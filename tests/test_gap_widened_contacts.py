@@ -13,7 +13,6 @@ from makebreak.gap.numerics.permitted_forces import tangents
 from makebreak.gap.problem import Fitted
 from makebreak.gap.residuals.contact_problem import (
     FRICTION_SPREAD,
-    NO_GAP,
     ContactProblem,
 )
 from makebreak.gap.residuals.sap_lift import sap_lift
@@ -24,8 +23,9 @@ from makebreak.gap.residuals.widened_contacts import (
     widened_slots,
 )
 from makebreak.gap.result import GapMeasure
+from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.fit import fit_effects
-from makebreak.gap.search.select import _Search
+from makebreak.gap.thresholds import AGREEMENT_RMS_MAX
 from makebreak.gap.verdict import two_figures
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
@@ -49,7 +49,7 @@ def problem(tmp_path_factory) -> ContactProblem:
 
 def started(problem: ContactProblem) -> Fitted:
     problem._base = problem._last = None
-    return _Search(problem, lambda text: None).start
+    return Comparison(problem, lambda text: None).start
 
 
 def tip_pair(problem: ContactProblem) -> str:
@@ -60,8 +60,10 @@ def tip_pair(problem: ContactProblem) -> str:
 
 
 def test_where_nothing_is_left_nothing_is_said(problem):
-    now, found = widened_contacts(problem, started(problem), NO_GAP)
-    assert now < NO_GAP and found == [] and problem.hint(started(problem)) == ""
+    now, found = widened_contacts(problem, started(problem), AGREEMENT_RMS_MAX)
+    assert (
+        now < AGREEMENT_RMS_MAX and found == [] and problem.hint(started(problem)) == ""
+    )
 
 
 def test_a_force_off_its_normal_is_said_of_its_pair_by_how_much(problem, monkeypatch):
@@ -72,7 +74,7 @@ def test_a_force_off_its_normal_is_said_of_its_pair_by_how_much(problem, monkeyp
                == tip_pair(problem)][:1]  # fmt: skip
     wrench[:, 2] = across * np.tan(np.arctan(slot.friction) + np.radians(7.0))
     monkeypatch.setattr(problem.means, "wrench", wrench)
-    now, found = widened_contacts(problem, started(problem), NO_GAP)
+    now, found = widened_contacts(problem, started(problem), AGREEMENT_RMS_MAX)
     assert found[0].pair == tip_pair(problem) and found[0].unit == "degrees"
     # Of 2, 5, 10 and 20 degrees one that holds 7; some is left, as what the table
     # carries, and its friction, was not changed with it.
@@ -85,9 +87,9 @@ def test_a_force_beside_where_shapes_meet_is_said_of_its_pair(problem, monkeypat
     needs = problem._needs.copy()
     needs[:, problem.bodies[BLOCK][1] + 2] += 6e-3 * push
     monkeypatch.setattr(problem, "_needs", needs)
-    _, found = widened_contacts(problem, started(problem), NO_GAP)
+    _, found = widened_contacts(problem, started(problem), AGREEMENT_RMS_MAX)
     best = [w for w in found if w.pair == tip_pair(problem) and w.unit == "mm"]
-    assert best and best[0].size == 8.0 and best[0].left < NO_GAP
+    assert best and best[0].size == 8.0 and best[0].left < AGREEMENT_RMS_MAX
     assert tip_pair(problem) in sentence(2.0, best)
 
 

@@ -32,6 +32,7 @@ from makebreak.diagrams.station import (
     make_station,
 )
 from makebreak.scripts import cli
+from makebreak.scripts.command_inputs import with_faults
 from makebreak.scripts.contact_runs import rehearsed
 from makebreak.scripts.fault_trials import (
     FAILED,
@@ -539,8 +540,8 @@ def test_beside_a_run_that_does_not_roll_nothing_is_recovered():
 
 
 def test_faults_of_the_command_line_come_beside_those_of_the_config():
-    own = cli._with_faults(ContactLearningConfig(), ["box"], "contact_learning")
-    both = cli._with_faults(own, ["push:from=2"], "contact_learning")
+    own = with_faults(ContactLearningConfig(), ["box"], "contact_learning")
+    both = with_faults(own, ["push:from=2"], "contact_learning")
     assert both.control.faults == ["box", "push:from=2"]
 
 

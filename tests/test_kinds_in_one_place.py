@@ -9,7 +9,8 @@ from makebreak.models.effects import KINDS
 
 ROOT = Path(__file__).resolve().parent.parent
 # Files of diagrams/ and gap/ that still know kinds by name, and which: what bodies in
-# contact are fitted with, the catalogue's screening, and scenes that experiments make.
+# contact are fitted with, and scenes that experiments make. Mechanisms are searched and
+# judged without.
 # The list may only get shorter.
 CONTACT = {
     "body_drag", "constant_force", "contact_dissipation", "contact_friction",
@@ -17,7 +18,6 @@ CONTACT = {
     "object_com", "object_inertia", "object_mass", "object_size", "plane_height",
     "plane_tilt", "rolling_resistance",
 }  # fmt: skip
-SENSORS = {"clock_skew", "joint_offset", "sensor_bias", "sensor_delay", "sensor_lag"}
 KNOWN = {
     "diagrams/ball_rolling_config.py": {"contact_friction", "object_size"},
     "diagrams/cube_pivoting_config.py": {
@@ -34,7 +34,7 @@ KNOWN = {
     "gap/data/check_relations.py": {"clock_skew"},
     "gap/residuals/contact.py": CONTACT,
     "gap/residuals/contact_dynamics.py": {
-        "actuator_bias", "actuator_gain", "input_delay", "object_com",
+        "actuator_bias", "actuator_gain", "input_delay", "object_com", "sensor_bias",
         "object_inertia", "object_mass", "object_size",
     },
     "gap/residuals/permitted_contacts.py": {
@@ -46,22 +46,13 @@ KNOWN = {
         "plane_tilt", "wall_position",
     },
     "gap/residuals/contact_problem.py": {
+        "actuator_gain", "sensor_bias", "sensor_delay",
         "body_drag", "constant_force", "contact_friction", "friction_patch",
         "object_com", "object_inertia", "object_mass", "object_size", "plane_height",
         "plane_tilt",
     },
-    "gap/residuals/driven.py": {"rotor_inertia"},
     "gap/simulation/free_windows.py": {"length_scale"},
     "gap/simulation/windows.py": {"length_scale"},
-    "gap/residuals/mechanism.py": {
-        "object_com", "object_mass", "link_com", "link_mass",
-    },
-    "gap/search/screen.py": SENSORS
-    | {
-        "actuator_lag", "actuator_saturation", "body_drag", "input_delay",
-        "joint_backlash", "joint_elasticity", "link_mass", "link_com", "object_com",
-        "object_inertia", "object_mass", "sinusoidal_force",
-    },
     "gap/residuals/touch.py": {
         "contact_stiffness", "joint_offset", "length_scale", "object_size",
         "plane_height", "sensor_bias",
@@ -87,3 +78,11 @@ def test_no_file_outside_the_catalogue_learns_a_kinds_name(file):
 
 def test_the_list_of_those_that_do_names_files_that_are_there():
     assert set(KNOWN) <= set(FILES)
+
+
+@pytest.mark.parametrize("kind", [k for k, e in KINDS.items() if e.may_lack])
+def test_what_a_kind_may_lack_are_parameters_with_a_neutral_value(kind):
+    entry = KINDS[kind]
+    for name in entry.may_lack:
+        assert entry.parameter(name).neutral is not None
+    assert len(entry.may_lack) < len(entry.parameters)

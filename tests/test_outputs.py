@@ -21,7 +21,6 @@ from makebreak.scripts.outputs import MARK, STAGE, OutputFolder
 @pytest.fixture(autouse=True)
 def _registered(monkeypatch, tmp_path):
     monkeypatch.setattr(experiments, "EXPERIMENTS", {"spring_mass": "spring_mass"})
-    monkeypatch.setattr(cli, "EXPERIMENTS", experiments.EXPERIMENTS)
     monkeypatch.chdir(tmp_path)
 
 

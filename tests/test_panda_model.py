@@ -258,3 +258,14 @@ def test_a_camera_sees_the_ball_as_past_the_arm_on_display(postures):
     # Nothing of the arm but a few blended pixels of its edge is missing.
     assert (arm_before & ~arm).sum(axis=(1, 2)).max() <= 10
     assert arm.sum() < 1.2 * arm_before.sum()
+
+
+def test_cameras_see_the_tables_top_alone():
+    """Its legs are under it; drawing them would cost time in every image."""
+    loaded = load_scene(BALL_ROLLING, DiagramBuilder())
+    inspector = loaded.scene_graph.model_inspector()
+    table = loaded.plant.GetBodyByName("table")
+    frame = loaded.plant.GetBodyFrameIdOrThrow(table.index())
+    seen = inspector.GetGeometries(frame, Role.kPerception)
+    assert [inspector.GetName(g) for g in seen] == ["table::top"]
+    assert len(inspector.GetGeometries(frame, Role.kIllustration)) == 5

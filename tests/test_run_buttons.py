@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, Integrator
 
-from makebreak.scripts import cli, run_buttons
+from makebreak.scripts import run_buttons, run_command
 from makebreak.scripts.run_buttons import OVER, PAUSE, STOP
 from makebreak.scripts.session import Session
 
@@ -100,7 +100,7 @@ def test_a_run_starts_over_and_only_the_last_one_counts(tmp_path, monkeypatch, p
     """As by `makebreak run`: the result is that of a run in which nothing was pressed,
     but for the table of times."""
     runs = []
-    monkeypatch.setattr(cli, "_open_meshcat", Meshcat)
+    monkeypatch.setattr(run_command, "_open_meshcat", Meshcat)
 
     def experiment(_, session):
         diagram = ramp()
@@ -127,7 +127,7 @@ def test_a_run_starts_over_and_only_the_last_one_counts(tmp_path, monkeypatch, p
     )
     out = tmp_path / "out"
     with Session(out, progress=False) as session:
-        status = cli._run_in(session, args, experiment, {}, None)
+        status = run_command.run_in(session, args, experiment, {}, None)
     assert status == 0 and len(runs) == 2 and runs[0] is not runs[1]
     result = json.loads((out / "result.json").read_text())
     assert result["end"] == pytest.approx(0.5) and result["rows"] == 41

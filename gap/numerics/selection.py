@@ -12,9 +12,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import chi2, wilcoxon
 
-SAME = 0.05  # Within this share of the best error, data cannot tell two models apart.
 _PENALTIES = 10.0 ** np.arange(-4.0, 2.0)  # Of a ridge, times the number of rows.
-NESTED_GAIN = 0.10  # What a bigger model must take off the error of one inside it.
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +54,7 @@ class Screen:
         self._Nr = self._T.T @ self.r[self._train]
         self._side = np.zeros(len(self._prior), int)
         if len(self._prior):
-            b = self.settle(self.r)[0]
+            b = self.fit_nuisances(self.r)[0]
             held = np.abs(b) >= self._limit * (1.0 - 1e-9)
             self._side = np.where(held, np.sign(b), 0).astype(int)
 
@@ -68,7 +66,7 @@ class Screen:
     def fit(self, columns=None) -> LinearFit:
         """With a candidate's columns (m, k), or with the nuisances alone."""
         if columns is None or columns.shape[1] == 0:
-            return self.judge(self.r)
+            return self.evaluate(self.r)
         t = self._train
         X = columns[t]
         size = np.linalg.norm(X, axis=0)
@@ -111,12 +109,12 @@ class Screen:
             self._factors[key] = cho_factor(self._NN[np.ix_(free, free)])
         return self._factors[key]
 
-    def judge(self, r, c=(), c_std=()) -> LinearFit:
+    def evaluate(self, r, c=(), c_std=()) -> LinearFit:
         """For another residual (m,): with the nuisances that its training rows want."""
-        b, left = self.settle(r)
+        b, left = self.fit_nuisances(r)
         return self._fit(np.array(c), np.array(c_std), b, left)
 
-    def settle(self, r) -> tuple[np.ndarray, np.ndarray]:
+    def fit_nuisances(self, r) -> tuple[np.ndarray, np.ndarray]:
         """The nuisances' coefficients for a residual (m,), and what they leave."""
         if not len(self._prior):
             return np.zeros(0), r
@@ -126,7 +124,7 @@ class Screen:
     def wanted(self, r) -> np.ndarray:
         """(n_b,) each nuisance in units of its prior; one that is at its limit as far
         as it would go alone beyond it."""
-        b, _ = self.settle(r)
+        b, _ = self.fit_nuisances(r)
         out = b / self._prior
         held = np.abs(b) >= self._limit * (1.0 - 1e-9)
         for i in np.flatnonzero(held):
@@ -139,7 +137,7 @@ class Screen:
     def cost_rows(self, r) -> np.ndarray:
         """Training rows of what the nuisances leave of r (m,), over the scale, and
         their own cost: what a least-squares fit of other parameters minimises."""
-        b, left = self.settle(r)
+        b, left = self.fit_nuisances(r)
         return np.concatenate([left[self._train] / np.sqrt(self._s2), b / self._prior])
 
     def _fit(self, c, c_std, b, left) -> LinearFit:
@@ -332,7 +330,7 @@ def paired_t(one, two, train, channel) -> float:
     return float(np.mean(gains) / max(np.std(gains, ddof=1), 1e-12) * len(gains) ** 0.5)
 
 
-def simplest(errors: Sequence[float], sizes: Sequence[int], same: float = SAME) -> int:
+def simplest(errors: Sequence[float], sizes: Sequence[int], same: float) -> int:
     """Index of the model with the fewest parameters whose error is within `same` of
     the least; of equally many the one with the least error."""
     least = np.nanmin(errors)

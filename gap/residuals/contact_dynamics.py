@@ -281,7 +281,7 @@ class ContactDynamics(PermittedContacts):
                 for body in find_bodies(e, self.plant):
                     inertial.setdefault(full_name(self.plant, body), []).append(e)
                 continue
-            if e.kind in SHAPED:
+            if e.kind in SHAPED or e.kind == "sensor_bias":
                 continue
             if kind.path:
                 P -= self._driven_more(e)
@@ -296,7 +296,18 @@ class ContactDynamics(PermittedContacts):
             P += more
         for body, own in inertial.items():
             P += self._inertial(body) @ self._more_inertia(body, own)
-        return np.hstack([P, m.wrench])
+        return np.hstack([P, self._unbiased(m.wrench, effects)])
+
+    def _unbiased(self, wrench: np.ndarray, effects: Sequence[Effect]) -> np.ndarray:
+        """(K, n_wrench) wrenches without the biases that effects give their sensors."""
+        names = [name for sensor in self.sensors for name in sensor.names]
+        for e in effects:
+            if e.kind != "sensor_bias":
+                continue
+            if not set(e.at) <= set(names):
+                raise ValueError("sensor_bias: of forces and moments alone")
+            wrench = wrench - e.parameters["bias"] * np.isin(names, e.at)
+        return wrench
 
     def _driven_more(self, effect: Effect) -> np.ndarray:
         """(K, n_v) what drives give more with an effect on their path."""

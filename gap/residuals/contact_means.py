@@ -43,6 +43,7 @@ BESIDE = -1  # Marks what a body touches beside what carries it.
 FAR = 1.0  # Of what is not there [m].
 UPRIGHT = 0.7  # Cosine of normal and vertical: less, and it is a wall.
 NEAR = 0.02  # Shapes that never come so near do not matter [m].
+ROBUST = 1.4826  # Standard deviation over median deviation, of normal noise.
 MEETS = 2.5e-3  # Two bodies touch when the nearest points are within this [m].
 APPROACH = 0.02  # Faster along the normal is no lasting contact [m/s].
 SLIDES = 0.01  # Slower slip may be sticking [m/s].
@@ -51,6 +52,12 @@ MODELLED = 0.02  # What models are off by, as a share of the forces in a row.
 # [N]; where one may be felt, the mean over a test function is so many times its noise.
 FELT_SAMPLES, LEAST_FELT, MAYBE_FELT = 9, 0.2, 4.0
 SHORT = 0.5  # Of half a test function: a contact that is lost for less goes on.
+# A tool farther than this from everything touches nothing [m]. The farthest share of
+# such rows, if they last so long in an episode, and in all [s], show what its force
+# sensor reads then: a bias, if it is this large [N] and so many times what these rows
+# scatter by.
+FREE, FARTHEST, FREE_SEC, ALL_FREE_SEC = 4e-3, 0.5, 0.1, 0.3
+LEAST_BIAS, STEADY_BIAS = 0.1, 1.5
 POSE = (*TURN, "x", "y", "z")
 FORCE, MOMENT = ("fx", "fy", "fz"), ("tx", "ty", "tz")
 
@@ -403,8 +410,12 @@ class ContactMeans:
                                    strict=False)
             ])  # fmt: skip
             found[key] = (phi < MEETS) & (np.abs(rate) < APPROACH)
+        self.biased: dict[str, float] = {}
         for sensor in self.sensors:
-            size, welded = self._force_size(sensor), sensor.welded
+            welded = sensor.welded
+            apart = [x for key, x in least.items() if set(key) & set(welded)]
+            bias = self._biases(sensor, np.min(apart, axis=0) if apart else None)
+            size = self._force_size(sensor, bias)
             for key in found:
                 if set(key) & set(welded) and np.isfinite(size).all():
                     partner = key[0] if key[1] in welded else key[1]
@@ -425,18 +436,65 @@ class ContactMeans:
                 out[a + on[k] : a + on[k + 1]] = True
         return out
 
-    def _force_size(self, sensor: WrenchSensor) -> np.ndarray:
-        """(n_rows,) of the measured force where it is clear of noise and of what the
-        tool's own motion makes, else 0; of few newtons too, as of a tool that leans on
-        something at rest."""
+    def _biases(self, sensor: WrenchSensor, apart: np.ndarray | None) -> np.ndarray:
+        """(n_tracks, 3) what a force sensor reads while its tool touches nothing, in
+        each episode, for a bias may drift [N]; noted in `biased`. 0 where it reads next
+        to nothing, or where that is not known.
+
+        Args: apart (n_rows,): how far the tool is from all that it could touch [m].
+        """
+        none = np.zeros((len(self.tracks), 3))
+        if apart is None or not self.bodies:  # Of walls it is not known where they are.
+            return none
+        forces, owner, known = [], [], 0.0
+        for number, t in enumerate(self.tracks):
+            rows = slice(self._offset[number], self._offset[number + 1])
+            f = np.stack(
+                [self.recordings[t.recording][f"{sensor.place}.{a}"][t.episode.rows]
+                 for a in FORCE], axis=1,
+            )  # fmt: skip
+            free = np.isfinite(f).all(axis=1) & (apart[rows] > FREE)
+            if free.any():
+                far = apart[rows][free]
+                free[free] = far >= np.quantile(far, 1.0 - FARTHEST)
+            if (lasts := float(free.sum()) * self._row_of(t)) >= FREE_SEC:
+                forces.append(f[free])
+                owner.append(number)
+                known += lasts
+        if known < ALL_FREE_SEC:
+            return none
+        every = np.vstack(forces)
+        bias = np.median(every, axis=0)
+        scatter = ROBUST * np.median(np.abs(every - bias), axis=0)
+        clear = np.maximum(LEAST_BIAS, STEADY_BIAS * scatter)
+        if not (np.abs(bias) > clear).any():
+            return none
+        self.biased |= {
+            f"{sensor.place}.{a}": float(b)
+            for a, b in zip(FORCE, bias, strict=True)
+            if abs(b) > 0.5 * LEAST_BIAS
+        }
+        none[:] = bias
+        none[owner] = [np.median(f, axis=0) for f in forces]
+        return none
+
+    @staticmethod
+    def _row_of(t: _Track) -> float:
+        """[s] from one row to the next."""
+        return float(np.median(np.diff(t.time)))
+
+    def _force_size(self, sensor: WrenchSensor, bias: np.ndarray) -> np.ndarray:
+        """(n_rows,) of the measured force, less the sensor's bias (n_tracks, 3), where
+        it is clear of noise and of what the tool's own motion makes, else 0; of few
+        newtons too, as of a tool that leans on something at rest."""
         out, place = [], sensor.place
         own = felt_motion(self.dynamics, sensor.frame, self._q, self._v, self._vd)
         own = np.linalg.norm(own[:, :3], axis=1)
-        for first, t in zip(self._offset, self.tracks, strict=False):
+        for first, t, off in zip(self._offset, self.tracks, bias, strict=False):
             recording = self.recordings[t.recording]
             f = np.stack(
                 [recording[f"{place}.{a}"][t.episode.rows] for a in FORCE], axis=1
-            )
+            ) - off  # fmt: skip
             noise = max(recording.channels[f"{place}.{a}"].noise for a in FORCE)
             good = np.isfinite(f).all(axis=1)
             if good.sum() < 2:

@@ -17,6 +17,7 @@ from makebreak.gap.numerics.selection import Screen, benjamini_hochberg
 from makebreak.gap.problem import (
     Candidate,
     Fitted,
+    Found,
     GapProblem,
     Nuisances,
     Outcome,
@@ -25,7 +26,8 @@ from makebreak.gap.problem import (
     rms,
 )
 from makebreak.gap.residuals.contact_dynamics import WRENCHED, ContactDynamics
-from makebreak.gap.residuals.contact_means import felt_motion
+from makebreak.gap.residuals.contact_means import ROBUST, felt_motion
+from makebreak.gap.residuals.lying_on_faces import lying_on_faces
 from makebreak.gap.residuals.mechanism import link_changes
 from makebreak.gap.residuals.objects import unexplained_in_windows
 from makebreak.gap.residuals.permitted_contacts import Shift
@@ -43,7 +45,7 @@ from makebreak.gap.simulation.contact_windows import (
 )
 from makebreak.gap.simulation.measure import gap_measure, series_of
 from makebreak.gap.simulation.windows import LARGEST
-from makebreak.gap.verdict import NO_GAP
+from makebreak.gap.thresholds import AGREEMENT_RMS_MAX
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
@@ -57,7 +59,7 @@ TIMING = 2.5e-4  # Of what drives get [s].
 FELT = 0.05  # What a force sensor shows more, sampled amid a drive's ripple too.
 BEYOND = 3.0
 MISFIT = 1.15  # Less than so many times the sensors' noise is no misfit.
-ROBUST = 1.4826
+LAW = 0.02  # How exact friction, a mass or a gain can be known by laws of contact.
 LEAST_MISFIT = 0.002  # Of the forces in a row: laws are no better than that.
 LESS = 0.85
 EXACT = 4  # Single effects that are fitted for what models are off by.
@@ -99,6 +101,10 @@ class ContactProblem(ContactDynamics, GapProblem):
 
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
         self._scalable: dict[str, bool] = {}
+        # By how much bodies' poses were moved earlier before this (late_poses.py) [s],
+        # and the error before and with that.
+        self.late: dict[str, float] = {}
+        self.late_errors = (np.nan, np.nan)
         super().__init__(scene, recordings)
         self._base: np.ndarray | None = None
         self._nuisances: Nuisances | None = None
@@ -171,7 +177,7 @@ class ContactProblem(ContactDynamics, GapProblem):
     def _without_nuisances(self) -> np.ndarray:
         """(m,) what the scene as it came leaves, its nuisances fitted to all rows."""
         n, r = self.nuisances(), self.base()
-        return Screen(r, n.columns, n.prior, np.ones(len(r), bool)).settle(r)[1]
+        return Screen(r, n.columns, n.prior, np.ones(len(r), bool)).fit_nuisances(r)[1]
 
     def _share_out(self, left: np.ndarray) -> None:
         """Which blocks are fitted, by what the scene leaves (rows as `_shown`). What is
@@ -218,11 +224,15 @@ class ContactProblem(ContactDynamics, GapProblem):
         found = self._plain_candidates(base, ())
         n = nuisances.columns
         screen = Screen(base, n, nuisances.prior, self.train())
-        left, least = base, screen.fit().score
+        plain = screen.fit()
+        left, least = base, plain.score
+        # What is left with all effects, and how far nuisances are moved beside them.
+        self.rich_left, self.rich_nuisances = plain.score, plain.b
         if found:
             X = np.hstack([c.columns[0] for c in found])
             rich = screen.fit(X)
             if rich.score < least:
+                self.rich_left, self.rich_nuisances = rich.score, rich.b
                 left, least = base - X @ rich.c - n @ rich.b, rich.score
         singles = [
             (fit.score, c.effects(k, fit.c))
@@ -444,6 +454,8 @@ class ContactProblem(ContactDynamics, GapProblem):
             yield "plane_tilt", at, 2, ("roll", "pitch"), (), steps
         for at in self.dynamics.places("plane_height"):
             yield "plane_height", at, 1, ("height",), (), [[(1e-3, {"height": 1e-3})]]
+        for at, bias in self.biased.items():
+            yield "sensor_bias", at, 1, ("bias",), (), [[(bias, {"bias": bias})]]
         yield from self._of_mechanism()
 
     def _friction_now(self, pair) -> float:
@@ -749,9 +761,58 @@ class ContactProblem(ContactDynamics, GapProblem):
             )]  # fmt: skip
         return max(found, key=lambda each: each[1])
 
+    def found_before(self) -> list[Found]:
+        """Late poses, which were moved before the search; to half a row's period."""
+        std = {"delay": 0.5 * self._row_sec()}
+        found = []
+        for body, late in self.late.items():
+            name, names = f"clock of {body}", self.nuisances().names
+            more = self.rich_nuisances[names.index(name)] if name in names else 0.0
+            effect = Effect("sensor_delay", [body], {"delay": late + float(more)})
+            found.append(Found(effect, std, *self.late_errors))
+        return found
+
+    def is_within_law(self, effect: Effect) -> bool:
+        """Coulomb's law, a mass by it and a drive's gain are no more accurate than
+        LAW: what is that near to the scene is no error of it."""
+        for at in effect.at:
+            if effect.kind == "contact_friction":
+                now = self._now_at(effect)
+            elif effect.kind in ("object_mass", "actuator_gain"):
+                (now,) = self.dynamics.now(effect.kind, [at]).values()
+            else:
+                return False
+            (value,) = effect.parameters.values()
+            if not abs(value - now) < LAW * now:
+                return False
+        return True
+
+    def late_poses(self, end: Fitted) -> list[str]:
+        """Of bodies whose poses would have to be later, or earlier, than a camera's
+        samples allow: by how much, in words."""
+        n, said = self.nuisances(), []
+        for body in self.bodies:
+            name = f"clock of {body}"
+            if name not in n.names:
+                continue
+            k = n.names.index(name)
+            late = float(end.b[k])
+            if abs(late) > BEYOND * n.prior[k]:
+                how = "late" if late > 0.0 else "early"
+                said.append(
+                    f" The poses of {body} seem to come {1e3 * abs(late):.0f} ms {how} "
+                    "beside the joints, or more: if so, declare it (`filters: {delay: "
+                    "...}` of these channels, or `sensor_delay`) and run gap again "
+                    "before you trust anything else here."
+                )
+        return said
+
     def hint(self, end: Fitted) -> str:
-        """Which pair would have to press otherwise, and how."""
-        now, found = widened_contacts(self, end, NO_GAP)
+        """What a camera's clock would explain; else which pair would have to press
+        otherwise, and how."""
+        if late := self.late_poses(end):  # All else may follow from it.
+            return "".join(late)
+        now, found = widened_contacts(self, end, AGREEMENT_RMS_MAX)
         off = distances_off(self, end, self.plan.loud)
         return "".join(off) + sentence(now, found)
 
@@ -828,7 +889,7 @@ class ContactProblem(ContactDynamics, GapProblem):
     ) -> Outcome | None:  # fmt: skip
         if recordings is not None:
             try:
-                model = PushWindows(self.scene, recordings)
+                model = PushWindows(self.scene, recordings, lying=lying_on_faces(self))
             except ValueError:  # No window fits in.
                 return None
             held = [True] * len(model.windows)
@@ -840,7 +901,9 @@ class ContactProblem(ContactDynamics, GapProblem):
                     if not self._train[self.means.episode == k].all()
                 }
                 try:
-                    self._windows = PushWindows(self.scene, self.recordings, episodes)
+                    self._windows = PushWindows(
+                        self.scene, self.recordings, episodes, lying_on_faces(self)
+                    )
                 except ValueError:
                     return None
             model = self._windows

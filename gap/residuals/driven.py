@@ -34,13 +34,14 @@ from makebreak.gap.residuals.mechanism import (
 from makebreak.gap.residuals.objects import unexplained_in_windows
 from makebreak.gap.result import Where
 from makebreak.gap.search.fit import fit_effects
-from makebreak.gap.search.screen import REACH
+from makebreak.gap.search.screen import NUISANCE_LIMIT
 from makebreak.gap.search.where import where_in_windows
 from makebreak.gap.simulation.driven_arm import DrivenArmSimulation, can_have
 from makebreak.gap.simulation.measure import gap_measure, series_of
 from makebreak.gap.simulation.windows import LARGEST, WindowModel
 from makebreak.models.drives import DRIVEN_BY, law_of
 from makebreak.models.effects import KINDS
+from makebreak.models.effects.joints import rotor
 from makebreak.models.effects.kind import Effect, find_joints, full_name
 from makebreak.models.scene import Scene
 from makebreak.models.scene_schema import COMMANDS_OF
@@ -143,7 +144,7 @@ class DrivenProblem(DrivenWindows, GapProblem):
             screen = Screen(
                 self.base(), n.columns, n.prior, self.train(), reach=n.reach
             )
-            left = self.in_noise(screen.settle(self.base())[1])
+            left = self.in_noise(screen.fit_nuisances(self.base())[1])
             channel = self.channel_of_rows()
             each = [left[channel == c] for c in np.unique(channel)]
             self._explained = all(rms(x) < MISFIT for x in each)
@@ -166,7 +167,7 @@ class DrivenProblem(DrivenWindows, GapProblem):
         screen = Screen(self.base(), n.columns, n.prior, self.train())
         rich = fit_effects(self, screen, list(start.values()), evaluations=6)
         left = rich.r
-        if rich.fit.train > screen.judge(self.base()).train:  # It went astray.
+        if rich.fit.train > screen.evaluate(self.base()).train:  # It went astray.
             left = self.base()
         else:
             self._rich = rich.effects
@@ -217,7 +218,7 @@ class DrivenProblem(DrivenWindows, GapProblem):
                 prior.append(abs(size))
                 names.append(name)
             self._nuisances = Nuisances(
-                np.stack(columns, axis=1), np.array(prior), tuple(names), REACH
+                np.stack(columns, axis=1), np.array(prior), tuple(names), NUISANCE_LIMIT
             ) if columns else Nuisances.none(len(self.train()))  # fmt: skip
         return self._nuisances
 
@@ -228,9 +229,8 @@ class DrivenProblem(DrivenWindows, GapProblem):
             law = law_of(self.scene.actuation, joint)
             if law is None or not law.kd > 0.0:
                 continue
-            if self._takes("rotor_inertia", joint):
-                inertia = float(law.kd) * LOOP_SEC
-                more = Effect("rotor_inertia", [joint], {"inertia": inertia})
+            more = rotor(joint, float(law.kd) * LOOP_SEC)
+            if self._takes(more.kind, joint):
                 yield f"input_delay of {joint}, loop", more, -LOOP_SEC
 
     def _moved_loops(self, effects, nuisances: Nuisances, b) -> list[Effect]:

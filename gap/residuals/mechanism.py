@@ -23,17 +23,16 @@ from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.gap.residuals.pushes import ROBUST, Push, find_pushes
 from makebreak.gap.result import Where
 from makebreak.gap.search.screen import (
-    LINK_COM,
-    LINK_MASS,
     candidates,
     inseparable,
     nuisances,
     rich_columns,
+    tolerances,
 )
 from makebreak.gap.search.where import unexplained, where_in_motion
 from makebreak.gap.simulation.measure import measure
 from makebreak.gap.simulation.windows import Window
-from makebreak.gap.verdict import UNNAMED
+from makebreak.gap.thresholds import UNEXPLAINED_RMS
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, find_body, sliding_joints
@@ -56,6 +55,7 @@ TRIMS, TRIMMED, TRIM_Z = 8, 0.3, 4.0
 UNWEIGHTED = 10.0  # Times what a push left, as its rows' noise.
 LAGS = 9  # Test functions over which errors may go together (0.9 s).
 OVERLAP = 1.3  # What neighbouring test functions share of white noise.
+KEPT = 0.1  # Of its mass, that a link keeps at least when nuisances move it.
 
 
 class MechanismProblem(InverseModel, GapProblem):
@@ -82,7 +82,7 @@ class MechanismProblem(InverseModel, GapProblem):
             return
         n = self.nuisances()
         plain = Screen(self.base(), n.columns, n.prior, self.train(), reach=n.reach)
-        left = plain.settle(self.base())[1]
+        left = plain.fit_nuisances(self.base())[1]
         if self.noise_error(left) < MISFIT:
             return
         self._found = candidates(self, n, left)
@@ -113,7 +113,9 @@ class MechanismProblem(InverseModel, GapProblem):
     def _settled(self, r: np.ndarray) -> np.ndarray:
         """What the nuisances leave of r (m,), free within their limits."""
         n = self.nuisances()
-        return Screen(r, n.columns, n.prior, self.train(), reach=n.reach).settle(r)[1]
+        return Screen(r, n.columns, n.prior, self.train(), reach=n.reach).fit_nuisances(
+            r
+        )[1]
 
     def _with_best(self, left: np.ndarray, rich: np.ndarray) -> np.ndarray:
         """What a rich model and one candidate more leave of rows (m,): of each channel
@@ -320,7 +322,7 @@ class MechanismProblem(InverseModel, GapProblem):
                 before, after = (
                     rms(self.in_noise(fitted.left)[mine]) for fitted in (start, end)
                 )
-                if before > UNNAMED:
+                if before > UNEXPLAINED_RMS:
                     each.append(1.0 - share_left(before, after))
         return max(each)
 
@@ -459,44 +461,30 @@ def _moved(candidate: Candidate, to_new) -> Candidate:
 def link_changes(dynamics: SceneDynamics, scene: Scene):
     """(name, effect, size) of each nuisance of the links: the mass, or a coordinate of
     the centre of mass, moved by `size`, which is its tolerance."""
-    said = scene.tolerance
-    share = float(said.get("link_mass", LINK_MASS))
-    reach = float(said.get("link_com_m", LINK_COM))
-    links = [
-        (at, mass)
-        for at in dynamics.places("link_mass")
-        if (mass := dynamics.now("object_mass", [at])["mass"]) > 0.0
-    ]
-    for at, mass in links:
-        size = share * mass
-        effect = Effect("object_mass", [at], {"mass": mass + size})
-        yield f"object_mass of {at}, mass", effect, size
-    for at, _ in links:
-        com = dynamics.now("object_com", [at])
-        for axis in "xyz":
-            effect = Effect("object_com", [at], {**com, axis: com[axis] + reach})
-            yield f"object_com of {at}, {axis}", effect, reach
+    for kind, tolerance in tolerances(scene).items():
+        for at in dynamics.links():
+            now = dynamics.now(kind, [at])
+            for name, value in now.items():
+                size = tolerance.of(value)
+                effect = Effect(kind, [at], {**now, name: value + size})
+                yield f"{kind} of {at}, {name}", effect, size
 
 
 def moved_links(model: Any, nuisances: Nuisances, values) -> list[Effect]:
     """The links as the nuisances (n_b,) have them, as effects of a scene."""
-    masses: dict[str, float] = {}
-    shifts: dict[str, np.ndarray] = {}
+    known = tolerances(model.scene)
+    moved: dict[tuple[str, str], dict[str, float]] = {}
     for name, b in zip(nuisances.names, values, strict=True):
         kind, rest = name.split(" of ", 1)
-        if kind not in ("object_mass", "object_com"):  # No part of the scene.
-            continue
-        at, unknown = rest.rsplit(", ", 1)
-        if kind == "object_mass":
-            masses[at] = float(b)
-        else:
-            shifts.setdefault(at, np.zeros(3))["xyz".index(unknown[0])] = b
+        if kind in known:  # Others are no part of the scene.
+            at, unknown = rest.rsplit(", ", 1)
+            parameter = unknown.removesuffix("_change")
+            moved.setdefault((kind, at), {})[parameter] = float(b)
     out = []
-    for at, change in masses.items():
-        now = model.dynamics.now("object_mass", [at])["mass"]
-        out.append(Effect("object_mass", [at], {"mass": max(now + change, 0.1 * now)}))
-    for at, shift in shifts.items():
-        com = model.dynamics.now("object_com", [at])
-        there = {k: com[k] + float(d) for k, d in zip("xyz", shift, strict=True)}
-        out.append(Effect("object_com", [at], there))
+    for (kind, at), changes in moved.items():
+        now = model.dynamics.now(kind, [at])
+        there = {name: value + changes.get(name, 0.0) for name, value in now.items()}
+        if known[kind].relative:  # No link is left without a mass.
+            there = {name: max(x, KEPT * now[name]) for name, x in there.items()}
+        out.append(Effect(kind, [at], there))
     return out

@@ -449,13 +449,16 @@ class PressingProblem(ContactProblem):
                 columns.append(np.zeros(K))
                 continue
             nearest = np.min([s.phi for s in mine], axis=0)
-            stiffness = mine[0].stiffness
+            stiffness, pressed = mine[0].stiffness, self._pressed.get(pair, np.zeros(K))
             for e in self._softened:
                 if self._at_pair(e, pair):
                     stiffness = e.parameters["stiffness"]
-            if not stiffness > 0.0:
-                raise ValueError("contact_stiffness: not above zero")
-            d = self._W @ nearest + self._pressed.get(pair, 0.0) / stiffness
+                    if not stiffness * PASSED > pressed[on].max():
+                        # Softer, and with one parameter it would explain a wall that
+                        # stands elsewhere.
+                        raise ValueError("contact_stiffness: a tool goes in too far")
+            depth = pressed / stiffness
+            d = self._W @ nearest + depth
             columns.append(np.where(on, d / shape, 0.0))
         return -np.stack(columns, axis=1) if columns else np.zeros((K, 0))
 
@@ -491,7 +494,7 @@ class PressingProblem(ContactProblem):
         found = self._plain_candidates(current.r, current.effects)
         train = self.train()
         screen = Screen(current.r, nuisances.columns, nuisances.prior, train)
-        r = screen.settle(current.r)[1][train]
+        r = screen.fit_nuisances(current.r)[1][train]
         for c in found:
             if c.kind in (*MOVES, "contact_friction"):
                 for X in c.columns:

@@ -112,7 +112,7 @@ def widened_contacts(problem, end: Fitted, most: float) -> tuple[float, list[Wid
         r[:, :n] = left_if_widened(problem, end.effects, pair, size, unit)
         flat = np.clip(r[problem._shown], -LARGEST, LARGEST)
         screen = Screen(flat, nuisances.columns, nuisances.prior, problem.train())
-        return rms(screen.settle(flat)[1][judged])
+        return rms(screen.fit_nuisances(flat)[1][judged])
 
     now = left_of(None, 0.0, "")
     found: list[Widened] = []

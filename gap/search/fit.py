@@ -94,9 +94,9 @@ def fit_effects(
             std[i][name] = float(each)
     for each, tried in zip(std, rough, strict=True):
         each.update(tried)
-    b, left = screen.settle(r)
+    b, left = screen.fit_nuisances(r)
     return Fitted(
-        tuple(_tidy(e) for e in effects), tuple(std), r, left, b, screen.judge(r),
+        tuple(_tidy(e) for e in effects), tuple(std), r, left, b, screen.evaluate(r),
         J, np.array(solved.fun) if solved is not None else np.zeros(0),
         tuple(free.names),
     )  # fmt: skip
@@ -142,7 +142,7 @@ def derivative_free_search(
         if np.any(z * free.scale < free.low):
             return 1e6
         try:
-            error = screen.judge(problem.residual(free.effects(z))).train
+            error = screen.evaluate(problem.residual(free.effects(z))).train
         except (ValueError, RuntimeError):  # Such parameters are refused.
             return 1e6
         return float(error) if np.isfinite(error) else 1e6
@@ -219,7 +219,7 @@ def _try_rough(problem, screen, start: list[Effect], fixed):
             for v in value * ROUGH:
                 other = Effect(effect.kind, effect.at, {**effect.parameters, name: v})
                 r = problem.residual([*start[:i], other, *start[i + 1 :]])
-                tried.append((screen.judge(r).train, other))
+                tried.append((screen.evaluate(r).train, other))
             start[i] = min(tried, key=lambda each: each[0])[1]
             steps[i][name] = float(value * (ROUGH[1] - ROUGH[0]))
     return start, steps

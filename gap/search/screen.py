@@ -14,16 +14,28 @@ from makebreak.models.effects.kind import (
     find_joints,
     full_name,
 )
+from makebreak.models.scene import Scene
 
-# How well links are known where the scene does not say [-], [m].
-LINK_MASS, LINK_COM = 0.03, 0.002
-REACH = 3.0  # Tolerances: beyond them a link is not known too little but wrong.
-_DELAYS = (0.004, 0.01, 0.02, 0.04)
-_ELASTIC = ("joint_elasticity", "joint_backlash")
-_DRIVEN = ("actuator_saturation",)
-# Of links: link_mass and link_com say it as a difference.
-_HIDDEN = ("object_mass", "object_com", "object_inertia")
-WAVES = 12  # Frequencies of a force that are tried on every link.
+# The limit of a nuisance, in tolerances: a link that is off by more is wrong, and not
+# known too little. Of 28 normally distributed nuisances one in 14 sets has one beyond.
+NUISANCE_LIMIT = 3.0
+_DELAYS = (0.004, 0.01, 0.02, 0.04)  # [s] at which a delay's column is taken.
+# Relative or absolute steps of other parameters of sensors.
+_STEPS = {"offset": (1e-3,), "bias": (1e-3,), "skew": (1e-4,)}
+_VELOCITY_DELAYS = (0.01,)
+_WAVES = 12  # Frequencies of a force that are tried on links other than the last.
+_HIDDEN_STATE_JOINTS = 3  # Joints at which a spring or a gap is tried: the worst ones.
+
+
+@dataclass(frozen=True)
+class KnownTo:
+    """A standard deviation, as a share of the value where `relative`."""
+
+    size: float
+    relative: bool
+
+    def of(self, value: float) -> float:
+        return self.size * value if self.relative else self.size
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +56,15 @@ class Ranked:
         return self.candidate.fixed_of_each()
 
 
+def tolerances(scene: Scene) -> dict[str, "KnownTo"]:
+    """{kind: how well the scene knows what it changes}."""
+    return {
+        kind: KnownTo(float(scene.tolerance.get(t.key, t.default)), t.relative)
+        for kind, entry in KINDS.items()
+        if (t := entry.tolerance) is not None
+    }
+
+
 def candidates(
     model: InverseModel, nuisances: Nuisances, left: np.ndarray
 ) -> list[Candidate]:
@@ -56,18 +77,19 @@ def candidates(
     # A joint that has such an element in the scene can have no second one.
     elastic = {
         full_name(dynamics.plant, joint)
-        for e in model.scene.effects if e.kind in _ELASTIC
+        for e in model.scene.effects if KINDS[e.kind].hidden_state
         for joint in find_joints(e, dynamics.plant)
     }  # fmt: skip
     screen = Screen(left, nuisances.columns, nuisances.prior, model.train())
     found: list[Candidate] = []
     for kind, entry in KINDS.items():
-        if kind in _HIDDEN or entry.at in ("free body", "length", "pair", "ground"):
+        of_things = entry.at in ("free body", "length", "pair", "ground")
+        if entry.absolute or of_things:
             continue
         if kind in SENSED:
             found += _of_sensors(model, kind)
             continue
-        if kind in ("input_delay", "actuator_lag"):
+        if entry.path in ("delay", "lag"):
             found += _of_delays(model, kind)
             continue
         if entry.drive:
@@ -77,16 +99,17 @@ def candidates(
             continue
         waves: list | None = None
         places = dynamics.places(kind)
-        for at in reversed(places) if kind == "sinusoidal_force" else places:
+        is_wave = any(p.name == "frequency" for p in entry.parameters)
+        for at in reversed(places) if is_wave else places:
             if entry.at == "base" and at == "world":
                 continue
-            if kind in _DRIVEN and not _driven(model, at):
+            if entry.path == "saturation" and not _driven(model, at):
                 continue
-            if kind in _ELASTIC and (at not in worst or at in elastic):
+            if entry.hidden_state and (at not in worst or at in elastic):
                 continue
             columns, readers = [], []
             grids = _grids(model, kind, at, motions)
-            if kind == "sinusoidal_force":
+            if is_wave:
                 grids = waves if waves is not None else grids
             # One value of a grid after the other: all at once would be gigabytes.
             for grid in grids:
@@ -98,19 +121,23 @@ def candidates(
                 continue
             if not any(np.abs(x).max(initial=0.0) > 0.0 for x in columns):
                 continue
-            if kind == "sinusoidal_force" and waves is None:
+            if is_wave and waves is None:
                 # All frequencies at the last link, and the best of them elsewhere.
                 fits = [screen.fit(x).train for x in columns]
-                best = np.argsort(fits)[:WAVES]
+                best = np.argsort(fits)[:_WAVES]
                 waves = [grids[k] for k in best]
                 columns = [columns[k] for k in best]
                 readers = [readers[k] for k in best]
             size = sum(not p.optional for p in entry.parameters)
-            if kind == "body_drag":  # Few bodies show that they are slowed in turning.
+            if entry.may_lack:
+                kept = [
+                    k for k, p in enumerate(entry.parameters)
+                    if p.name not in entry.may_lack
+                ]  # fmt: skip
                 found.append(
                     Candidate(
-                        kind, (at,), 1, (columns[0][:, [0]],),
-                        (_one_of(readers[0], 0),), ("angular",),
+                        kind, (at,), len(kept), (columns[0][:, kept],),
+                        (_some_of(readers[0], kept, size),), entry.may_lack,
                     )
                 )  # fmt: skip
             found.append(
@@ -129,7 +156,7 @@ def rich_columns(model: InverseModel, found: Sequence[Candidate]) -> np.ndarray:
     A gain multiplies what the model needs: as a factor on the measured effort it would
     cancel all of that, and with it what anything is off by.
     """
-    last = _links(model)[-1:]
+    last = list(model.dynamics.links())[-1:]
     columns = []
     for c in found:
         if KINDS[c.kind].path == "gain":
@@ -147,29 +174,27 @@ def rich_columns(model: InverseModel, found: Sequence[Candidate]) -> np.ndarray:
 
 def nuisances(model: InverseModel) -> Nuisances:
     """The links' masses and centres of mass."""
-    said = model.scene.tolerance
-    share = float(said.get("link_mass", LINK_MASS))
-    reach = float(said.get("link_com_m", LINK_COM))
     dynamics, motions = model.dynamics, model.motions()
     columns, prior, names = [], [], []
-    for kind, size in (("object_mass", share), ("object_com", reach)):
-        for at in _links(model):
+    for kind, tolerance in tolerances(model.scene).items():
+        for at in dynamics.links():
             groups = [dynamics.signatures(kind, [at], m) for m in motions]
             for same in zip(*groups, strict=True):
                 x = model.columns_of([s.columns for s in same])
-                now = dynamics.now(kind, [at])
+                now = list(dynamics.now(kind, [at]).values())
                 for k, unknown in enumerate(same[0].unknowns):
                     if not np.abs(x[:, k]).max(initial=0.0) > 0.0:
                         continue
                     columns.append(x[:, k])
-                    prior.append(size * now["mass"] if kind == "object_mass" else size)
+                    prior.append(tolerance.of(now[k]))
                     names.append(f"{kind} of {at}, {unknown}")
     for late, period, of_what in (model.filter_timing(), model.loop_timing()):
         columns, prior, names = columns + late, prior + period, names + of_what
-    # A mass is known to its share, whatever unit its signature has.
     if not columns:
         return Nuisances.none(len(model.train()))
-    return Nuisances(np.stack(columns, axis=1), np.array(prior), tuple(names), REACH)
+    return Nuisances(
+        np.stack(columns, axis=1), np.array(prior), tuple(names), NUISANCE_LIMIT
+    )
 
 
 def rank(screen: Screen, found: Sequence[Candidate]) -> list[Ranked]:
@@ -185,17 +210,6 @@ def rank(screen: Screen, found: Sequence[Candidate]) -> list[Ranked]:
     return sorted(ranked, key=lambda r: r.fit.score)
 
 
-def _links(model: InverseModel) -> list[str]:
-    return [at for at in model.dynamics.places("body_drag") if _mass(model, at) > 0.0]
-
-
-def _mass(model: InverseModel, at: str) -> float:
-    try:
-        return model.dynamics.now("object_mass", [at])["mass"]
-    except ValueError:
-        return 0.0
-
-
 def _driven(model: InverseModel, joint: str) -> bool:
     return model.commanded[model.joints.index(joint)]
 
@@ -207,22 +221,24 @@ def _motor_seen(model: InverseModel, joint: str) -> bool:
     return model.commanded[i] or (model.by_measured[i] and model.is_motor_side(i))
 
 
-def _worst_joints(model: InverseModel, left: np.ndarray, most: int = 3) -> list[str]:
-    """Those whose equations are met least, after the background."""
+def _worst_joints(model: InverseModel, left: np.ndarray) -> list[str]:
+    """Those whose equations are met least, after the nuisances: left (m,)."""
     names = model.names()
     size = {
         joint: float(np.mean(left[k :: len(names)] ** 2))
         for k, (what, joint) in enumerate(names)
         if what == "effort" and _motor_seen(model, joint)
     }
-    return sorted(size, key=lambda joint: -size[joint])[:most]
+    return sorted(size, key=lambda joint: -size[joint])[:_HIDDEN_STATE_JOINTS]
 
 
-def _one_of(reader: Callable, k: int) -> Callable:
+def _some_of(reader: Callable, kept: Sequence[int], n: int) -> Callable:
+    """A reader of n coefficients, for those that are kept; the others are zero."""
+
     def read(c):
-        both = np.zeros(2)
-        both[k] = c[0]
-        return reader(both)
+        every = np.zeros(n)
+        every[kept] = c
+        return reader(every)
 
     return read
 
@@ -238,7 +254,7 @@ def _grids(model: InverseModel, kind: str, at: str, motions) -> list:
 
 def _of_delays(model: InverseModel, kind: str) -> list[Candidate]:
     """Of commands: by the difference that a delay makes, for a few delays."""
-    name = "delay" if kind == "input_delay" else "time_constant"
+    name = KINDS[kind].parameters[0].name
     models = dict.fromkeys(j.split(".")[0] for j in model.joints)
     driven = [j for j in model.joints if _driven(model, j)]
     places = [(m,) for m in models if any(j.startswith(f"{m}.") for j in driven)]
@@ -268,8 +284,7 @@ def _of_drives(model: InverseModel, kind: str) -> list[Candidate]:
 def _of_sensors(model: InverseModel, kind: str) -> list[Candidate]:
     joints = model.joints
     models = tuple(dict.fromkeys(j.split(".")[0] for j in joints))
-    name = {"joint_offset": "offset", "sensor_bias": "bias", "clock_skew": "skew",
-            "sensor_lag": "time_constant"}  # fmt: skip
+    what, name = KINDS[kind].channel, KINDS[kind].parameters[0].name
     velocities = tuple(
         f"{j}.velocity" for i, j in enumerate(joints) if model.has["velocity"][i]
     )
@@ -280,19 +295,19 @@ def _of_sensors(model: InverseModel, kind: str) -> list[Candidate]:
     )
     positions = tuple(f"{j}.position" for j in joints)
     places: list[tuple[str, ...]]
-    if kind == "joint_offset":
+    if what == "offset":
         places = [(j,) for j in joints]
-    elif kind == "sensor_bias":
+    elif what == "bias":
         places = [(c,) for c in (*velocities, *efforts)]
-    elif kind == "clock_skew":
+    elif what == "skew":
         places = [models]
     else:
         places = [positions, velocities, *((c,) for c in velocities)]
         places += [efforts, *((c,) for c in efforts)]
-        if kind == "sensor_delay":
+        if what == "delay":
             places.append(models)
     unique = [p for p in dict.fromkeys(places) if p]
-    found = [_secant(model, kind, at, name.get(kind, "delay")) for at in unique]
+    found = [_secant(model, kind, at, name) for at in unique]
     return [c for c in found if c is not None]
 
 
@@ -309,21 +324,24 @@ def inseparable(effect: Effect, model: InverseModel) -> Effect | None:
     driven = {joint for joint in model.joints if _driven(model, joint)}
     if not driven or any(model.has["effort_measured"]):
         return None
-    at = set(effect.at)
-    if effect.kind == "input_delay" and (at == set(models) or at >= driven):
-        return Effect("sensor_delay", models, dict(effect.parameters))
-    if effect.kind == "sensor_delay" and (at == set(models) or at >= sensed):
-        return Effect("input_delay", models, dict(effect.parameters))
+    at, entry = set(effect.at), KINDS[effect.kind]
+    (late_command,) = (k for k, each in KINDS.items() if each.path == "delay")
+    (late_sensor,) = (k for k, each in KINDS.items() if each.channel == "delay")
+    if entry.path == "delay" and (at == set(models) or at >= driven):
+        return Effect(late_sensor, models, dict(effect.parameters))
+    if entry.channel == "delay" and (at == set(models) or at >= sensed):
+        return Effect(late_command, models, dict(effect.parameters))
     return None
 
 
 def _secant(model: InverseModel, kind: str, at, name: str) -> Candidate | None:
-    steps = {"offset": (1e-3,), "bias": (1e-3,), "skew": (1e-4,)}.get(name, _DELAYS)
-    if kind == "sensor_delay" and all(c.endswith(".velocity") for c in at):
-        steps = (0.01,)
+    steps = _STEPS.get(name, _DELAYS)
+    what = KINDS[kind].channel
+    if what == "delay" and all(c.endswith(".velocity") for c in at):
+        steps = _VELOCITY_DELAYS
     base, columns = model.base(), []
     least = -np.inf
-    if kind == "sensor_lag":  # It can take from a declared filter what that has.
+    if what == "lag":  # It can take from a declared filter what that has.
         least = -0.9 * min(model.declared_lag(c) for c in at)
     for step in steps:
         moved = model.residual([Effect(kind, list(at), {name: step})])

@@ -18,10 +18,10 @@ import numpy as np
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Fitted, GapProblem, Nuisances, rms
 from makebreak.gap.search.fit import fit_effects
+from makebreak.gap.thresholds import NEEDED_Z
 from makebreak.models.effects.kind import Effect
 
-ROUNDS = 4  # Of fit and weights.
-NEEDED = 5.0  # Deviations from nothing.
+WEIGHT_ROUNDS = 4  # Of fit and weights.
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Together:
     def needs(self, k: int, least: float) -> bool:
         """Whether effect k is needed beside the other. least: what is left more without
         it that laws, which are approximations, may leave too."""
-        return self.z[k] >= NEEDED and self.lost[k] > least
+        return self.z[k] >= NEEDED_Z and self.lost[k] > least
 
 
 def fit_together(
@@ -65,7 +65,7 @@ def fit_together(
     alike = problem.weighed_by(effects, every_row=True)
     if alike is None:
         return None
-    for _ in range(ROUNDS):
+    for _ in range(WEIGHT_ROUNDS):
         alike = problem.weighed_by(effects, every_row=True)
         assert alike is not None
         every = np.ones(len(alike.train()), bool)

@@ -19,6 +19,7 @@ LEAST_SHARE = 0.01  # of what all of them say, or to this share of its value. Wh
 STRAIGHT = 0.2  # part knows less well it puts where columns are no longer straight.
 STARTS = (0.5, 1.6)  # Of each parameter's distance from neutral.
 NORMAL_975 = 1.96  # Deviations of a 95 % interval.
+Known = tuple[np.ndarray, np.ndarray] | None
 RIDGE = 0.98  # Two parameters whose errors go together like this: their sum shows.
 
 
@@ -33,13 +34,14 @@ def trust_in(
     """
     if not fitted.names:
         return []
-    J, r = _data_rows(problem, fitted)
+    J, r, known = _rows(problem, fitted)
     value = _values(fitted)
     recording, stretches_of = _parts(problem)
     by_recording = {
-        int(k): value + gauss_newton(J, r, recording == k) for k in np.unique(recording)
+        int(k): value + gauss_newton(J, r, recording == k, known)
+        for k in np.unique(recording)
     }
-    stretches = [value + gauss_newton(J, r, some) for some in stretches_of]
+    stretches = [value + gauss_newton(J, r, some, known) for some in stretches_of]
     starts = [_from_elsewhere(problem, screen, fitted, fixed, s) for s in STARTS]
     ridge = ridges(fitted.J)
     found = []
@@ -66,7 +68,7 @@ def trust_in(
     return found
 
 
-def steady(problem: GapProblem, fitted: Fitted) -> list[float]:
+def consistency(problem: GapProblem, fitted: Fitted) -> list[float]:
     """Of each effect, by how many standard deviations it is off neutral if what it is
     on parts of the data (recordings; stretches of time where there are few) differs
     from part to part by more than noise: its surest parameter's. What imitates another
@@ -109,14 +111,14 @@ def _over_parts(
     are few, and their variances}, of those that enough parts show."""
     if not fitted.names:
         return {}
-    J, r = _data_rows(problem, fitted)
+    J, r, known = _rows(problem, fitted)
     recording, parts = _parts(problem)
     several = np.unique(recording)
     if len(several) >= FEWEST_PARTS:
         parts = [recording == k for k in several]
     value = _values(fitted)
-    x = np.array([value + gauss_newton(J, r, some) for some in parts])
-    variance = np.array([_variances(J, r, some) for some in parts])
+    x = np.array([value + gauss_newton(J, r, some, known) for some in parts])
+    variance = np.array([_variances(J, r, some, known) for some in parts])
     there = np.isfinite(x) & np.isfinite(variance)
     return {
         named: (x[there[:, k], k], variance[there[:, k], k])
@@ -125,10 +127,14 @@ def _over_parts(
     }
 
 
-def _data_rows(problem: GapProblem, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
-    """J (m, k) and r (m,) of the rows that were fitted, without the nuisances'."""
+def _rows(
+    problem: GapProblem, fitted: Fitted
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """J (m, k) and r (m,) of the rows that were fitted; and the same of the rows that
+    say what is known beforehand: the cost of the nuisances."""
     n = int(problem.train().sum())
-    return fitted.J[:n], fitted.rows[:n]
+    J, r = fitted.J, fitted.rows
+    return J[:n], r[:n], (J[n:], r[n:])
 
 
 def _values(fitted: Fitted) -> np.ndarray:
@@ -143,30 +149,53 @@ def _parts(problem: GapProblem) -> tuple[np.ndarray, list[np.ndarray]]:
     return recording, [np.isin(block, some) for some in stretches if len(some)]
 
 
-def _variances(J: np.ndarray, r: np.ndarray, some: np.ndarray) -> np.ndarray:
+def _variances(
+    J: np.ndarray, r: np.ndarray, some: np.ndarray, known: Known = None
+) -> np.ndarray:
     """(k,) of the step that gauss_newton takes; NaN where it takes none."""
     out = np.full(J.shape[1], np.nan)
-    step = gauss_newton(J, r, some)
+    step = gauss_newton(J, r, some, known)
     shown = np.isfinite(step)
     if shown.any():
         A = J[some][:, shown]
         left = r[some] + A @ step[shown]
+        A, _ = _with_known(A, r[some], shown, np.mean(some), known)
         size = np.linalg.norm(A, axis=0)
         C = np.linalg.pinv((A / size).T @ (A / size), rcond=1e-12, hermitian=True)
         out[shown] = np.diag(C) / size**2 * max(float(np.mean(left**2)), 1.0)
     return out
 
 
-def gauss_newton(J: np.ndarray, r: np.ndarray, some: np.ndarray) -> np.ndarray:
+def gauss_newton(
+    J: np.ndarray, r: np.ndarray, some: np.ndarray, known: Known = None
+) -> np.ndarray:
     """(k,) by which parameters change if only some (m,) of the rows r (m,), J (m, k)
-    are fitted; NaN where those do not show a parameter."""
+    are fitted; NaN where those do not show a parameter.
+
+    Args: known: (J, r) of what is known beforehand, of which a part has the share that
+        it has of the rows. Without it a load would seem to differ wildly from part to
+        part: the masses of links, which are known to a few per cent, could take its
+        place, and only their cost keeps them from it.
+    """
     step = np.full(J.shape[1], np.nan)
     size = np.linalg.norm(J[some], axis=0)
     shown = size > 1e-3 * np.linalg.norm(J, axis=0) * np.sqrt(np.mean(some))
     if shown.any():
-        A = J[some][:, shown] / size[shown]
-        step[shown] = -np.linalg.lstsq(A, r[some], rcond=1e-6)[0] / size[shown]
+        A, y = _with_known(J[some][:, shown], r[some], shown, np.mean(some), known)
+        size = np.linalg.norm(A, axis=0)
+        step[shown] = -np.linalg.lstsq(A / size, y, rcond=1e-6)[0] / size
     return step
+
+
+def _with_known(
+    A: np.ndarray, y: np.ndarray, shown: np.ndarray, share: float, known: Known
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows A (m, k), y (m,) of a part with its share of what is known beforehand."""
+    if known is None or not len(known[1]):
+        return A, y
+    J, r = known
+    weight = np.sqrt(share)
+    return np.vstack([A, weight * J[:, shown]]), np.append(y, weight * r)
 
 
 def ridges(J: np.ndarray) -> np.ndarray:

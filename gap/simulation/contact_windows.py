@@ -10,11 +10,14 @@ long episode, in which an object is pushed, left and pushed again, they begin so
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.residuals.contact_shapes import ContactShapes, poses_of
+from makebreak.gap.simulation.face_supports import LiesOn, add_supports
+from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.gap.simulation.windows import TURN, Window, WindowModel
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
@@ -41,7 +44,8 @@ LED_RATE, LED_SEC = 300.0, 1e-3
 
 
 class PushWindows(WindowModel):
-    """Args: episodes: (recording, number) of those that count, else all.
+    """Args: episodes: (recording, number) of those that count, else all. lying: bodies
+    that lie on faces, which are carried by face_supports.
 
     Raises: ValueError where no window fits in.
     """
@@ -51,13 +55,20 @@ class PushWindows(WindowModel):
         scene: Scene,
         recordings: Sequence[Recording],
         episodes: set[tuple[int, int]] | None = None,
+        lying: Sequence[LiesOn] = (),
     ):
         self._only = episodes
         self._shapes: ContactShapes | None = None
         scene, led = led_as_measured(scene, recordings)
         every = [_most_of(r, e) for r in recordings for e in r.episodes]
         most = max(MOST, min(2 * sum(n for n in every if n > 2), MOST_OF_LONG))
-        super().__init__(scene, recordings, WINDOW_SEC, by_episode=True, most=most)
+        simulation = SceneSimulation(
+            scene, before_finalize=partial(add_supports, lying) if lying else None
+        )
+        super().__init__(
+            scene, recordings, WINDOW_SEC, by_episode=True, most=most,
+            simulation=simulation,
+        )  # fmt: skip
         keep = [
             k for k, c in enumerate(self.channels)
             if c.rsplit(".", 1)[0] not in led and varies(recordings, c)

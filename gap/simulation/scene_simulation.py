@@ -1,11 +1,12 @@
 """Any scene as a diagram that runs, and windows of recordings simulated with it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from pydrake.geometry import Sphere
+from pydrake.geometry import SceneGraph, Sphere
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus
@@ -40,7 +41,10 @@ TWIST = "wx wy wz vx vy vz".split()
 
 
 def make_scene_diagram(
-    scene: Scene | str | Path, command_delays: bool = True, log: bool = False
+    scene: Scene | str | Path,
+    command_delays: bool = True,
+    log: bool = False,
+    before_finalize: Callable[[MultibodyPlant, SceneGraph], None] | None = None,
 ) -> tuple[Diagram, LoadedScene]:
     """The scene's plant, effects, actuation and sensors, for each model <m> that has
     actuators or joints.
@@ -54,10 +58,11 @@ def make_scene_diagram(
              state (n_x,), body_poses, contact_results: the truth.
 
     Args: command_delays: False if the caller delays the commands itself;
-        log: with a log of the state each step, for a discrete plant.
+        log: with a log of the state each step, for a discrete plant;
+        before_finalize: as of load_scene.
     """
     builder = DiagramBuilder()
-    loaded = load_scene(scene, builder, command_delays)
+    loaded = load_scene(scene, builder, command_delays, before_finalize)
     plant = loaded.plant
     builder.ExportOutput(plant.get_state_output_port(), "state")
     builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")
@@ -159,13 +164,17 @@ class SceneSimulation:
     where Drake allows it; where it does not, the diagram is built anew (`builds`
     counts). Not a system: it has one Context, whose parameters it remembers.
 
-    Args: scene, or its path.
+    Args: scene, or its path; before_finalize: as of load_scene.
     Raises: ValueError as load_scene.
     """
 
     def __init__(
-        self, scene: Scene | str | Path, config: SimulationConfig | None = None
+        self,
+        scene: Scene | str | Path,
+        config: SimulationConfig | None = None,
+        before_finalize: Callable[[MultibodyPlant, SceneGraph], None] | None = None,
     ):
+        self._before_finalize = before_finalize
         self._scene = scene if isinstance(scene, Scene) else read_scene(scene)
         self._config = config or SimulationConfig()
         self.builds = 0
@@ -332,8 +341,9 @@ class SceneSimulation:
     def _build(self) -> None:
         self.builds += 1
         self._diagram, self._loaded = make_scene_diagram(
-            self._scene, command_delays=False, log=True
-        )
+            self._scene, command_delays=False, log=True,
+            before_finalize=self._before_finalize,
+        )  # fmt: skip
         self._plant = plant = self._loaded.plant
         self._current = self._loaded.effects
         self._simulator = Simulator(self._diagram)

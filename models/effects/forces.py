@@ -155,5 +155,6 @@ KINDS = {
         body_law=drag_law,
         body_numbers=_numbers("linear", "angular"),
         signature=_drag_signature,
+        may_lack=("angular",),  # Few bodies show that turning slows them.
     ),
 }

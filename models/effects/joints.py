@@ -105,6 +105,11 @@ def _change_rotor(old: Effect, new: Effect, plant: MultibodyPlant, context) -> N
         actuator.SetRotorInertia(context, left / ratio_squared)
 
 
+def rotor(joint: str, inertia: float) -> Effect:
+    """A rotor [kg m2] at a joint, as an effect."""
+    return Effect("rotor_inertia", [joint], {"inertia": inertia})
+
+
 # Effects of these kinds may be negative where their sum at a joint is not.
 
 

@@ -78,6 +78,19 @@ class Parameter:
 
 
 @dataclass(frozen=True)
+class Tolerance:
+    """How well any scene knows what a kind changes, one standard deviation.
+
+    key: its name in a scene's `tolerance`; default: where the scene does not give it;
+    relative: whether both are shares of the value.
+    """
+
+    key: str
+    default: float
+    relative: bool = False
+
+
+@dataclass(frozen=True)
 class EffectKind:
     """A kind of effect: its name and parameters, what it does in Drake, and how it is
     found in data.
@@ -99,6 +112,11 @@ class EffectKind:
     several: one place may have more than one.
     hidden_state: it adds coordinates that no channel measures.
     weighs: it changes masses or gravity, so that two such effects do not just add up.
+    absolute: its parameters are the body's own values; for the links of a mechanism
+        other kinds give the same as a difference.
+    tolerance: of what it changes, which is then a nuisance of every fit; None: it is
+        known exactly.
+    may_lack: parameters without which it is a candidate of its own.
     exported: how URDF and MJCF express it: "inertia" (also damping and rotors: they are
         in the plant), "friction" or "kp" (its only parameter); "": not at all.
 
@@ -148,6 +166,9 @@ class EffectKind:
     several: bool = False
     hidden_state: bool = False
     weighs: bool = False
+    absolute: bool = False
+    tolerance: Tolerance | None = None
+    may_lack: tuple[str, ...] = ()
     check: Callable[[Effect], None] | None = None
     edit_text: Callable[[Effect, Element], None] | None = None
     before_finalize: Callable[[Effect, MultibodyPlant, SceneGraph], None] | None = None

@@ -35,6 +35,7 @@ from makebreak.models.effects.kind import (
     Effect,
     EffectKind,
     Parameter,
+    Tolerance,
     find_bodies,
     find_body,
 )
@@ -323,6 +324,8 @@ KINDS = {
         exported="inertia",
         tell_apart="lift it or knock it: a slow push shows friction times weight only",
         weighs=True,
+        absolute=True,
+        tolerance=Tolerance("link_mass", 0.03, relative=True),
         edit_text=_mass_in_text,
         set_in_context=change_inertia(
             lambda old, new, mass, com, central: (
@@ -347,6 +350,8 @@ KINDS = {
         rank=1,
         check=_some_are_given,
         weighs=True,
+        absolute=True,
+        tolerance=Tolerance("link_com_m", 0.002),
         edit_text=_com_in_text,
         set_in_context=change_inertia(
             lambda old, new, mass, com, central: (mass, _new_com(new, com), central)
@@ -368,6 +373,7 @@ KINDS = {
         rank=1,
         check=_some_are_given,
         weighs=True,
+        absolute=True,
         edit_text=_inertia_in_text,
         set_in_context=change_inertia(
             lambda old, new, mass, com, central: (

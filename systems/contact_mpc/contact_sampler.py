@@ -70,7 +70,7 @@ class ContactSampler(LeafSystem):
              lie nearer where it reaches less far).
     Outputs: command (3,) = [number, x, y]: a place in the object's frame, seen from
              above [m]. A new number is a new command to move there; 0: none yet;
-             status (1,): a SamplerStatus; round (abstract): the last Round, or None.
+             status (1,): a SamplerStatus; round (abstract): the last Round, or ().
 
     The command is kept while an input is not finite, the object is not seen or no place
     has a plan (status).
@@ -106,7 +106,8 @@ class ContactSampler(LeafSystem):
         self._valid = self.DeclareVectorInputPort("valid", 1)
         self._r_comp = self.DeclareVectorInputPort("r_comp", p.n_lam)
         self._memory = self.DeclareAbstractState(Value[object](SamplingMemory()))
-        self._round = self.DeclareAbstractState(Value[object](None))
+        # Not None, which Drake 1.58 cannot hold.
+        self._round = self.DeclareAbstractState(Value[object](()))
         self._command = self.DeclareDiscreteState(3)
         self._status = self.DeclareDiscreteState([float(SamplerStatus.NONE_YET)])
         self.DeclareStateOutputPort("command", self._command)

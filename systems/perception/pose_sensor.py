@@ -91,9 +91,10 @@ class PoseSensor(LeafSystem):
         )
         # Readings that have not arrived yet, oldest first.
         self._late = self.DeclareAbstractState(Value[object](()))
-        self._pose = self.DeclareAbstractState(Value[object](None))
+        # () until the first reading: Drake 1.58 cannot hold None.
+        self._pose = self.DeclareAbstractState(Value[object](()))
         # Of a rolling object: an estimate of numerics/interacting_models.py.
-        self._rolling = self.DeclareAbstractState(Value[object](None))
+        self._rolling = self.DeclareAbstractState(Value[object](()))
         ticket = {self.abstract_state_ticket(self._pose), self.time_ticket()}
         for i, (name, size) in enumerate(
             (("p_WB", 3), ("v_WB", 3), ("q_WB", 4), ("w_WB", 3))
@@ -128,7 +129,7 @@ class PoseSensor(LeafSystem):
         while late and late[0][0] <= t - c.delay_sec + 1e-9:
             known = (*known, late[0])
             (at, p, q), late = late[0], late[1:]
-            if pose is None:
+            if not pose:
                 pose = first_pose(at, p, q, std, (0.1, 1.0))
             else:
                 pose = corrected(predicted(pose, at, c.density), p, q, std)
@@ -145,11 +146,11 @@ class PoseSensor(LeafSystem):
         state.get_mutable_abstract_state(int(self._known)).set_value(known)
 
     def _corrected_rolling(
-        self, rolling: interacting_models.Estimate | None, measured, std
+        self, rolling: interacting_models.Estimate | tuple[()], measured, std
     ) -> interacting_models.Estimate:
         """The estimate of a rolling object, predicted by a period and corrected with a
         measurement (2,) [m]; a new one if there was none."""
-        if rolling is None:
+        if not rolling:
             P = np.array([std**2, 0.0, 0.1**2])
             return interacting_models.start(measured, np.zeros(2), P, 2)
         means, covariances, chances = interacting_models.predict(
@@ -157,14 +158,14 @@ class PoseSensor(LeafSystem):
         )
         return interacting_models.correct(means, covariances, chances, measured, std)
 
-    def _pose_of(self, context) -> PoseEstimate | None:
-        """The filter's pose at the last reading that has arrived; None: none yet."""
+    def _pose_of(self, context) -> PoseEstimate | tuple[()]:
+        """The filter's pose at the last reading that has arrived; (): none yet."""
         return context.get_abstract_state(int(self._pose)).get_value()
 
     def _calc(self, i):
         def calc(context, output):
             pose = self._pose_of(context)
-            if pose is None:
+            if not pose:
                 output.SetFromVector(self._unknown[i])
                 return
             dt = max(context.get_time() - pose.t, 0.0)
@@ -182,4 +183,4 @@ class PoseSensor(LeafSystem):
 
     def _calc_seen(self, context, output):
         pose = self._pose_of(context)
-        output.SetFromVector([0.0 if pose is None else 1.0])
+        output.SetFromVector([1.0 if pose else 0.0])

@@ -1,0 +1,80 @@
+"""What lies on faces in a scene whose contacts are points, and what to say of it."""
+
+from makebreak.gap.data.findings import Finding
+from makebreak.gap.residuals.permitted_contacts import PermittedContacts
+from makebreak.gap.simulation.face_supports import LiesOn
+
+
+def lying_on_faces(contacts: PermittedContacts) -> list[LiesOn]:
+    """The pairs of which Drake's point contact makes one point, though an area or a
+    line touches: a box, a cylinder or a hull on something fixed. Not where it also
+    hangs over an edge of that (its corners alone would not carry it there), where it
+    touches with spheres too, or where both shapes are hydroelastic."""
+    found = []
+    points, surfaces = contacts.shapes.points, contacts.shapes.surfaces
+    for pair in contacts._pairs_met:
+        if not contacts._lies(pair) or not contacts._is_of_a_free_body(pair):
+            continue
+        carrying = [
+            s
+            for s, on in zip(contacts.slots, contacts._masks, strict=True)
+            if contacts._pair_of(s) == pair and (on & contacts.carries(s)).any()
+        ]
+        if not carrying or any(s.key[0] < 0 for s in carrying):
+            continue
+        of_points = [points[s.key[0]] for s in carrying]
+        anchored = contacts.shapes.anchored
+        if any(p.is_sphere or p.along is not None or p.body in anchored
+               for p in of_points):  # fmt: skip
+            continue
+        on_side = {bool(p.rim) for p in of_points}
+        if len(on_side) > 1:  # It stands at times, and lies at others.
+            continue
+        if all(
+            _meets_in_an_area(contacts, points[s.key[0]].geometry,
+                              surfaces[s.key[1]].geometry)
+            for s in carrying
+        ):  # fmt: skip
+            continue
+        ground, body = sorted(pair, key=lambda k: k not in anchored)
+        found.append(LiesOn(body, ground, on_side.pop()))
+    return found
+
+
+def _meets_in_an_area(contacts: PermittedContacts, a, b) -> bool:
+    """Whether Drake makes a contact surface of two shapes, and not a point."""
+    if contacts.scene.plant.contact_model == "point":
+        return False
+    inspector = contacts.dynamics.loaded.scene_graph.model_inspector()
+    return all(
+        inspector.GetProximityProperties(g).HasProperty(
+            "hydroelastic", "compliance_type"
+        )
+        for g in (a, b)
+    )
+
+
+def point_on_face(contacts: PermittedContacts) -> list[Finding]:
+    """A warning for each pair of lying_on_faces()."""
+    found = []
+    for one in lying_on_faces(contacts):
+        pair = contacts.pair_name((one.body, one.ground))
+        name = contacts.shapes.names[one.body]
+        where = "on its side" if one.on_side else "on a face"
+        says = (
+            f"{name} lies {where}, and Drake's point contact gives {pair} a single "
+            "point, which jumps about: in the scene's own simulation it rocks, slides "
+            "and turns wrongly. Here it was simulated standing on "
+            + (
+                "two spheres of its own radius"
+                if one.on_side
+                else "small spheres at the corners of that face"
+            )
+            + ". Give it such spheres in its model, or use hydroelastic contact, "
+            "before you simulate with the scene."
+        )
+        recording = contacts.recordings[0].name
+        found.append(
+            Finding("point_on_face", recording, pair, 1.0, "1", "warning", says)
+        )
+    return found

@@ -1,0 +1,198 @@
+"""One step of the search: the effect, group or pair that is added next."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from makebreak.gap.numerics.selection import Screen
+from makebreak.gap.problem import Candidate, Fitted
+from makebreak.gap.result import Considered
+from makebreak.gap.search.choice import Choice, Trial, fixed_parameters, places
+from makebreak.gap.search.comparison import Comparison
+from makebreak.gap.search.fit import tangents
+from makebreak.gap.search.groups import groups_of, with_pruned_groups
+from makebreak.gap.search.pairs import look_ahead, pair_instead
+from makebreak.gap.search.rivals import Rivals
+from makebreak.gap.search.screen import Ranked, rank
+from makebreak.gap.search.trials import (
+    fit_each,
+    pick_simplest,
+    shortlist,
+    without_doubles,
+)
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect
+
+_ROUNDS = 2  # Of fitting and weighing nuisances by what is left.
+_SCALE_STEP = 1.2  # What is left, changed by less than this factor, is the same.
+_SCALE_DROP = 0.8  # Of exact fits, which leave less than columns do.
+_CLEAR_GAIN = 0.95  # Where channels do not count alone, the best must leave less.
+_TABLE_ROWS = 15
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What was added, with the exact fit of all effects; None: nothing earns its place.
+    table: the candidates, the best first."""
+
+    added: tuple[Choice, ...]
+    fitted: Fitted | None
+    table: tuple[Considered, ...]
+
+
+def add_next(
+    search: Comparison,
+    rivals: Rivals,
+    found: Sequence[Candidate],
+    chosen: Sequence[Choice],
+    current: Fitted,
+) -> Step:
+    """Ranks the candidates, fits the best exactly, and takes the simplest that does as
+    well as the best, if it earns its place.
+
+    Args: found: all candidates. current: the fit of all that is chosen.
+    """
+    taken = places(chosen)
+    free = [c for c in found if (c.kind, c.at) not in taken or KINDS[c.kind].several]
+    free += groups_of(free)
+    wide, scale, ranked = _ranked(search, free, chosen, current)
+    if not ranked:
+        return Step((), None, ())
+    screen = search.screen(current.r, scale)
+    base = screen.evaluate(current.r)
+    ranked = with_pruned_groups(search, wide, ranked)
+    table = tuple(
+        Considered(
+            r.candidate.kind, tuple(r.candidate.at),
+            r.fit.score / max(base.score, 1e-12), dict(r.effects[0].parameters),
+        )
+        for r in ranked[:_TABLE_ROWS]
+    )  # fmt: skip
+    none = Step((), None, table)
+    by_model = search.problem.weighed_by([c.effect for c in chosen]) is not None
+    short = shortlist(ranked, base.score, search.plan.shortlist, by_model)
+    if not short:
+        return none
+    if not search.plan.by_channel and ranked[0].fit.score > _CLEAR_GAIN * base.score:
+        return none
+    screen, trials = _fitted_exactly(search, scale, chosen, current, short)
+    if not trials:
+        return none
+    base = screen.evaluate(current.r)
+    trials = without_doubles(search, trials)
+    pick = pick_simplest(search, trials, found, base.score)
+    pick = rivals.needed(trials, pick, chosen)
+    pair = _pair(search, rivals, (wide, screen), chosen, ranked, trials, pick)
+    if pair is not None:
+        trials.append(pair)
+        pick = len(trials) - 1
+    before = screen.fit_nuisances(current.r)[1]
+    worth = [
+        search.earns_its_place(
+            before, t.fit.left,
+            search.error(t.fit.score) < search.enough(base.score),
+        )
+        for t in trials
+    ]  # fmt: skip
+    if not worth[pick]:
+        # The simplest of those that do as well on the whole may do it by a little
+        # everywhere, and another one at the joint that it acts on.
+        earning = [t for t, earns in zip(trials, worth, strict=True) if earns]
+        if not earning:
+            return none
+        instead = earning[pick_simplest(search, earning, found, base.score)]
+        pick = next(k for k, t in enumerate(trials) if t is instead)
+    added = _choices(rivals, trials, pick, chosen, base.score, before)
+    return Step(added, trials[pick].fit, table)
+
+
+def _ranked(
+    search: Comparison, free: Sequence[Candidate], chosen: Sequence[Choice],
+    current: Fitted,
+) -> tuple[Screen, float, list[Ranked]]:  # fmt: skip
+    """Candidates by their columns, the best first, while the parameters of all that is
+    chosen are free to adjust, to first order; with the screen that ranked them, and the
+    rms that the best leaves, against which nuisances are weighed."""
+    slopes = np.zeros((len(current.r), 0))
+    if chosen and not search.plan.jumps:
+        slopes = tangents(search.problem, current, fixed_parameters(chosen))
+    wide = search.screen(current.r, slopes=slopes)
+    ranked = [r for r in rank(wide, free) if r.valid]
+    scale = 1.0
+    for _ in range(_ROUNDS if ranked else 0):
+        best = max(ranked[0].fit.train, 1.0)
+        if best < _SCALE_STEP * scale and scale < _SCALE_STEP * best:
+            break
+        scale = best
+        wide = search.screen(current.r, scale, slopes=slopes)
+        ranked = [r for r in rank(wide, free) if r.valid]
+    return wide, scale, ranked
+
+
+def _fitted_exactly(
+    search: Comparison, scale: float, chosen: Sequence[Choice], current: Fitted,
+    short: Sequence[Ranked],
+) -> tuple[Screen, list[Trial]]:  # fmt: skip
+    """The short list, fitted exactly; again where less is left than by columns, so that
+    nuisances are weighed against that."""
+    screen = search.screen(current.r, scale)
+    trials = fit_each(search, screen, chosen, short)
+    for _ in range(_ROUNDS if len(search.nuisances.prior) else 0):
+        least = min((t.fit.fit.train for t in trials), default=scale)
+        if not max(least, 1.0) < _SCALE_DROP * scale:
+            break
+        scale = max(least, 1.0)
+        screen = search.screen(current.r, scale)
+        trials = fit_each(search, screen, chosen, [t.ranked for t in trials], trials)
+    return screen, trials
+
+
+def _pair(
+    search: Comparison, rivals: Rivals, screens: tuple[Screen, Screen],
+    chosen: Sequence[Choice], ranked: Sequence[Ranked], trials: Sequence[Trial],
+    pick: int,
+) -> Trial | None:  # fmt: skip
+    """Two effects in the place of the one that is picked: it and a rival that are both
+    needed, else two others that leave clearly less."""
+    wide, screen = screens
+    both = rivals.both_needed(trials, pick, chosen)
+    if both is not None:
+        for trial in fit_each(search, screen, chosen, [both]):
+            return trial
+    pair = pair_instead(search, wide, screen, chosen, ranked, trials[pick])
+    if pair is None:
+        pair = look_ahead(search, screen, chosen, trials, pick)
+    return pair
+
+
+def _choices(
+    rivals: Rivals, trials: Sequence[Trial], pick: int, chosen: Sequence[Choice],
+    base: float, before: np.ndarray,
+) -> tuple[Choice, ...]:  # fmt: skip
+    """The effects of what is picked, as choices.
+
+    Args: base, before (m,): error and residual without it.
+    """
+    fit, best = trials[pick]
+    others = [t for k, t in enumerate(trials) if k != pick]
+    runner = min(others, key=lambda t: t.fit.score, default=None)
+    ties: tuple[Effect, ...] = ()
+    if not best.candidate.members:
+        ties = rivals.ties_of(trials[pick], others, before, chosen)
+    new = fit.effects[len(chosen) :]
+    sizes = [len(fit.std[len(chosen) + k]) for k in range(len(new))]
+    if len(new) == 1:
+        sizes = [best.candidate.size]
+    fixed = best.fixed()
+    is_group = len(new) > 1 and best.candidate.kind in KINDS
+    return tuple(
+        Choice(
+            effect, {}, base, fit.score,
+            runner.ranked.candidate.name if runner else "",
+            runner.fit.score / fit.score - 1.0 if runner else np.inf,
+            ties, fixed[k], sizes[k], is_group, rivals.are_both_needed(best),
+            len(new) > 1 and not is_group,
+        )
+        for k, effect in enumerate(new)
+    )  # fmt: skip

@@ -1,0 +1,183 @@
+"""The effects that a search has chosen, and whether one of them is certain."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from makebreak.gap.numerics.selection import Screen
+from makebreak.gap.problem import Candidate, Fitted, GapProblem, Nuisances
+from makebreak.gap.result import Considered
+from makebreak.gap.search.screen import Ranked
+from makebreak.gap.thresholds import (
+    MEMBER_Z,
+    UNBOUNDED_GAIN,
+    UNBOUNDED_GAIN_BESIDE,
+)
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect
+
+
+class Trial(NamedTuple):
+    """A candidate that was fitted exactly, beside all that was chosen before it."""
+
+    fit: Fitted
+    ranked: Ranked
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """One effect as chosen.
+
+    std: standard deviations of its parameters. before, after: held-out error without
+    and with it. runner_up, margin: the best other candidate, and by which share its
+    error was larger. ties: effects that explain the data as well. fixed: parameters
+    that a fit leaves at neutral. size: parameters that a fit chooses. in_group: one of
+    several places of its kind that were added at once. of_two: it and its rival are
+    both needed. paired: it was added at once with an effect of another kind. or_more:
+    parameters that may as well be any larger.
+    """
+
+    effect: Effect
+    std: dict[str, float]
+    before: float
+    after: float
+    runner_up: str
+    margin: float
+    ties: tuple[Effect, ...]
+    fixed: tuple[str, ...]
+    size: int
+    in_group: bool = False
+    of_two: bool = False
+    paired: bool = False
+    or_more: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """The chosen effects, in the order in which they were added.
+
+    start: the fit without effects; end: with all. nuisances: by the weights of the end.
+    table: the candidates of the first step. beyond: (name, tolerances) of nuisances
+    that would go beyond their limit if they could. far: whether the nuisances, all
+    together, are implausible.
+    """
+
+    choices: tuple[Choice, ...]
+    start: Fitted
+    end: Fitted
+    nuisances: Nuisances
+    table: tuple[Considered, ...] = ()
+    beyond: tuple[tuple[str, float], ...] = ()
+    far: bool = False
+
+    def screen(self, problem: GapProblem) -> Screen:
+        """With which the end was fitted."""
+        n, scale = self.nuisances, max(self.end.fit.train, 1.0) * problem.correlation
+        return Screen(self.end.r, n.columns, n.prior, problem.train(), scale, n.reach)
+
+    def effects(self) -> list[Effect]:
+        return [c.effect for c in self.choices]
+
+
+def refreshed(chosen: Sequence[Choice], fitted: Fitted) -> list[Choice]:
+    """The choices with the parameters of a fit of all of them."""
+    return [
+        replace(c, effect=effect, std=std, after=fitted.score if k == len(chosen) - 1
+                else c.after)
+        for k, (c, effect, std) in enumerate(
+            zip(chosen, fitted.effects, fitted.std, strict=True)
+        )
+    ]  # fmt: skip
+
+
+def fixed_parameters(chosen: Sequence[Choice]) -> list[tuple[str, ...]]:
+    """For each choice, the parameters that a fit leaves as they are."""
+    return [c.fixed for c in chosen]
+
+
+def places(chosen: Sequence[Choice]) -> set[tuple[str, tuple[str, ...]]]:
+    """(kind, place) of all that is chosen."""
+    return {(c.effect.kind, tuple(c.effect.at)) for c in chosen}
+
+
+def on_trial(ranked: Ranked, effect: Effect) -> Choice:
+    """An effect that is tried, in the form of a choice; its errors are not known."""
+    of = ranked.candidate
+    return Choice(effect, {}, np.inf, np.inf, "", np.inf, (), of.fixed, of.size)
+
+
+def pair_of(a: Ranked, b: Ranked, effects: Sequence[Effect]) -> Ranked:
+    """Two candidates that are added at once, as these effects."""
+    one, two = a.candidate, b.candidate
+    both = Candidate(
+        f"{one.kind} and {two.kind}", (*one.at, *two.at), one.size + two.size,
+        (np.hstack([a.columns, b.columns]),), (), members=(one, two),
+    )  # fmt: skip
+    return Ranked(both, a.fit, tuple(effects), True, 0)
+
+
+def complexity(candidate: Candidate) -> int:
+    """Twice the number of parameters, by which the simplest is taken. A kind some of
+    whose parameters are left at neutral counts little less than all of it."""
+    all_of_them = candidate.size + len(candidate.fixed)
+    return 2 * all_of_them - bool(candidate.fixed)
+
+
+def is_possible(fit: Fitted, of: Ranked, first: int) -> bool:
+    """Whether a fit ended at values that the scene and robots can have. first: index of
+    the candidate's first effect in the fit."""
+    sane = of.candidate.is_sane(fit.effects[first:])
+    return bool(np.isfinite(fit.score)) and sane
+
+
+def is_significant(choice: Choice, alone: bool = True) -> bool:
+    """Whether an effect is certain: at least one parameter that makes it an effect is
+    off neutral by more than its deviation and has a finite interval, and so have half
+    of all parameters. For a kind whose parameters may end anywhere held-out rows may
+    show that it is there, whatever its intervals (UNBOUNDED_GAIN).
+
+    Args: alone: whether it is the only effect.
+    """
+    kind = KINDS[choice.effect.kind]
+    gain = UNBOUNDED_GAIN if alone else UNBOUNDED_GAIN_BESIDE
+    helps = choice.after < (1.0 - gain) * choice.before
+    if helps and any(each.endless for each in kind.parameters):
+        return True
+    clear, with_neutral, unknown, n = 0, 0, 0, 0
+    for each in kind.parameters:
+        value = choice.effect.parameters.get(each.name)
+        spread = choice.std.get(each.name)
+        if value is None or spread is None or each.name in choice.fixed:
+            continue
+        if each.neutral is None and each.valid == ">= 0" and value == 0.0:
+            continue  # At its limit it is as good as fixed, and has no interval.
+        n += 1
+        infinite = not spread < each.high - each.low
+        unknown += infinite
+        if each.neutral is not None:
+            with_neutral += 1
+            clear += abs(value - each.neutral) > spread and not infinite
+    return 2 * unknown < max(n, 1) and (clear > 0 or with_neutral == 0)
+
+
+def is_clearly_off(choice: Choice) -> bool:
+    """Whether a parameter is MEMBER_Z deviations off its neutral value."""
+    return any(
+        abs(choice.effect.parameters[p.name] - p.neutral) > MEMBER_Z * spread
+        for p in KINDS[choice.effect.kind].parameters
+        if p.neutral is not None and (spread := choice.std.get(p.name, np.inf)) < np.inf
+    )
+
+
+def uses_all_parameters(fit: Fitted, k: int = -1) -> bool:
+    """Whether each parameter of effect k of a fit is two deviations off neutral: else
+    it is another, smaller effect under this name."""
+    last, std = fit.effects[k], fit.std[k]
+    for each in KINDS[last.kind].parameters:
+        if each.neutral is not None and each.name in std:
+            off = abs(last.parameters[each.name] - each.neutral)
+            if not off > 2.0 * std[each.name]:
+                return False
+    return True

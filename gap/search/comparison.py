@@ -1,0 +1,180 @@
+"""How one search compares models: by held-out error, and by channel."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from makebreak.gap.numerics.selection import Screen, is_plausible, paired, paired_t
+from makebreak.gap.problem import Fitted, GapProblem, rms
+from makebreak.gap.search.choice import Choice, fixed_parameters
+from makebreak.gap.search.fit import fit_effects
+from makebreak.gap.search.together import WEIGHT_ROUNDS
+from makebreak.gap.thresholds import (
+    CHANNEL_GAIN,
+    CHANNEL_MODEL_ERROR_SHARE,
+    CHANNEL_RMS_MIN,
+    CHANNEL_T_MIN,
+    FREE_TOLERANCE,
+    MODEL_ERROR_SHARE,
+    NOISE_RMS_MAX,
+    NUISANCE_EXCESS,
+    REFIT_LOSS_MAX,
+    RIVAL_P_VALUE,
+    SAME_ERROR,
+)
+
+
+class Comparison:
+    """A problem with the fit of the scene as it came, against which all is measured.
+
+    say: called with a line of text for each candidate that is fitted.
+    """
+
+    def __init__(self, problem: GapProblem, say: Callable[[str], None]):
+        self.problem, self.say, self.plan = problem, say, problem.plan
+        self.train = problem.train()
+        self.channel = problem.channel_of_rows()
+        self.start_again()
+
+    def start_again(self) -> None:
+        """Nuisances and the fit without effects, by the rows' weights of now."""
+        self.nuisances = self.problem.nuisances()
+        self.start = fit_effects(self.problem, self.screen(self.problem.base()), ())
+
+    def screen(
+        self, r: np.ndarray, scale: float = 1.0, reach: float | None = None, slopes=None
+    ) -> Screen:
+        """Fits of the residual r (m,), with the nuisances.
+
+        Args: scale: rms that is left, against which nuisances are weighed, by the
+            number of rows that are independent. reach: another limit of the nuisances
+            than theirs. slopes (m, k): further columns, which are practically free.
+        """
+        n = self.nuisances
+        scale = max(scale, 1.0) * self.problem.correlation
+        limit = n.reach if reach is None else reach
+        columns, prior = n.columns, n.prior
+        if slopes is not None and slopes.shape[1]:
+            columns = np.hstack([columns, slopes])
+            prior = np.append(prior, np.full(slopes.shape[1], FREE_TOLERANCE))
+        return Screen(r, columns, prior, self.train, scale, limit)
+
+    # ----- Errors
+
+    def error(self, score: float) -> float:
+        """A held-out error, with what laws may be off by added, and no less than the
+        problem's least error."""
+        off = MODEL_ERROR_SHARE * self.start.score
+        return float(np.hypot(max(score, self.plan.least_error), off))
+
+    def error_without_floor(self, score: float) -> float:
+        """The same below the problem's least error too."""
+        return float(np.hypot(score, MODEL_ERROR_SHARE * self.start.score))
+
+    def enough(self, score: float) -> float:
+        """The error below which an effect takes enough off a held-out error."""
+        return (1.0 - self.plan.least_gain) * self.error(score)
+
+    def needs_more(self, fitted: Fitted) -> bool:
+        """Whether an effect is missing: held-out rows, or one channel, are above the
+        noise, or nuisances are beyond what their tolerance allows."""
+        far = not is_plausible(fitted.b, self.nuisances.prior)
+        loud = self.problem.noise_error(fitted.left) > NOISE_RMS_MAX
+        loud |= self.problem.loudest(fitted)[1] > self.plan.loud
+        return loud or far or bool(self.nuisances_beyond(fitted))
+
+    def nuisances_beyond(self, fitted: Fitted) -> tuple[tuple[str, float], ...]:
+        """(name, tolerances) of nuisances that would go clearly beyond their limit if
+        they could; none if the error would not fall by what an effect must gain."""
+        n = self.nuisances
+        screen = self.screen(fitted.r, fitted.fit.train)
+        off = screen.wanted(fitted.r)
+        beyond = tuple(
+            (name, float(x))
+            for name, x in zip(n.names, off, strict=True)
+            if abs(x) > n.reach + NUISANCE_EXCESS
+        )
+        if not beyond:
+            return ()
+        free = self.screen(fitted.r, fitted.fit.train, np.inf)
+        left, freed = (each.fit_nuisances(fitted.r)[1] for each in (screen, free))
+        a, b = (self.error(each.evaluate(fitted.r).score) for each in (screen, free))
+        gained = b < (1.0 - self.plan.least_gain) * a
+        return beyond if self.earns_its_place(left, freed, gained) else ()
+
+    def earns_its_place(
+        self, without: np.ndarray, with_: np.ndarray, on_the_whole: bool
+    ) -> bool:
+        """Whether an effect gains enough: on the whole, or on one channel and in blocks
+        of time together (CHANNEL_GAIN).
+
+        Args: without, with_ (m,): what is left without and with it. on_the_whole:
+            whether all rows together gain enough.
+        """
+        if on_the_whole:
+            return True
+        if not self.plan.by_channel:
+            return False
+        gain = self.channel_gains(without, with_)
+        t = paired_t(without, with_, self.train, self.channel)
+        return (
+            bool(len(gain)) and max(gain.values()) >= CHANNEL_GAIN and t > CHANNEL_T_MIN
+        )
+
+    def channel_gains(
+        self, without: np.ndarray, with_: np.ndarray, above: float = CHANNEL_RMS_MIN
+    ) -> dict[int, float]:
+        """{channel: share that is taken off its held-out error}, of channels that are
+        above so many times the noise; with what laws may be off by added."""
+        held = ~self.train
+        noisy = self.problem.in_noise(without)
+        found = {}
+        for k in np.unique(self.channel):
+            mine = held & (self.channel == k)
+            if not mine.any() or rms(noisy[mine]) < above:
+                continue
+            off = CHANNEL_MODEL_ERROR_SHARE * rms(self.start.left[mine])
+            a, b = np.hypot(rms(without[mine]), off), np.hypot(rms(with_[mine]), off)
+            found[int(k)] = 1.0 - b / a
+        return found
+
+    def is_worse(self, rival: Fitted, fit: Fitted) -> bool:
+        """Whether a rival that seems as good is clearly worse, below the noise too, by
+        the weights of either model."""
+        screen = self.screen(fit.r, fit.fit.train)
+        pairs = self.problem.weighed_alike(rival.effects, fit.effects)
+        for worse, better in pairs:
+            a, b = (
+                self.error_without_floor(screen.evaluate(r).score)
+                for r in (worse, better)
+            )
+            one, two = (screen.fit_nuisances(r)[1] for r in (worse, better))
+            if (
+                a <= (1.0 + SAME_ERROR) * b
+                or paired(one, two, self.train) > RIVAL_P_VALUE
+            ):
+                return False
+        return bool(pairs)
+
+    # ----- Fits
+
+    def refit(self, chosen: Sequence[Choice], current: Fitted) -> Fitted:
+        """All that is chosen, fitted again by the weights of now."""
+        screen = self.screen(current.r, current.fit.train)
+        effects, fixed = [c.effect for c in chosen], fixed_parameters(chosen)
+        fitted = fit_effects(self.problem, screen, effects, fixed)
+        before, after = self.error(current.score), self.error(fitted.score)
+        if effects == list(current.effects) and after > (1.0 + REFIT_LOSS_MAX) * before:
+            # Compared with the old parameters by the same weights.
+            screen = self.screen(self.problem.residual(effects), current.fit.train)
+            still = fit_effects(self.problem, screen, effects, fixed, evaluations=1)
+            if after > (1.0 + REFIT_LOSS_MAX) * self.error(still.score):
+                return still
+        # Of two rivals the one that makes the noise larger would grow: fits by the same
+        # weights, in turns with the weights.
+        for _ in range(WEIGHT_ROUNDS if any(c.of_two for c in chosen) else 0):
+            alike = self.problem.weighed_by(fitted.effects)
+            assert alike is not None
+            screen = self.screen(alike.residual(fitted.effects), fitted.fit.train)
+            fitted = fit_effects(alike, screen, fitted.effects, fixed)
+        return fitted

@@ -1,0 +1,151 @@
+"""What is not needed any more, or not certain, among the effects that were added."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from makebreak.gap.problem import Candidate, Fitted
+from makebreak.gap.search.choice import (
+    Choice,
+    is_clearly_off,
+    is_significant,
+    places,
+    refreshed,
+)
+from makebreak.gap.search.comparison import Comparison
+from makebreak.gap.search.fit import fit_effects
+from makebreak.gap.search.rivals import in_place_of
+from makebreak.gap.search.trust import consistency
+from makebreak.gap.thresholds import (
+    CONSISTENT_Z,
+    MEMBER_GAIN,
+    NESTED_GAIN,
+    PAIR_GAIN,
+)
+from makebreak.models.effects import KINDS
+
+_EVALUATIONS = 5  # Gauss-Newton steps of a fit with one effect less.
+
+
+def drop_needless(
+    search: Comparison, chosen: list[Choice], current: Fitted
+) -> tuple[list[Choice], Fitted]:
+    """Without effects whose removal hardly makes the error larger, the least needed
+    first."""
+    while len(chosen) > 1:
+        screen = search.screen(current.r, current.fit.train)
+        now = screen.evaluate(current.r)
+        # By the weights of all: a smaller model must not seem better by its own.
+        alike = search.problem.weighed_by(current.effects)
+        problem = search.problem if alike is None else alike
+        left = screen.fit_nuisances(current.r)[1]
+        needless: list[tuple[float, int, Fitted]] = []
+        for k in range(len(chosen)):
+            rest = [e for i, e in enumerate(current.effects) if i != k]
+            fixed = [c.fixed for i, c in enumerate(chosen) if i != k]
+            try:
+                smaller = fit_effects(
+                    problem, screen, rest, fixed, evaluations=_EVALUATIONS
+                )
+            except ValueError:  # What is left would be no scene.
+                continue
+            # Rivals that were separated by one model's weights differ below the noise.
+            two = chosen[k].of_two and alike is not None
+            error = search.error_without_floor if two else search.error
+            gain = PAIR_GAIN if two else search.plan.least_gain
+            gained = error(now.score) < (1.0 - gain) * error(smaller.score)
+            if not _stays(search, chosen[k], smaller.left, left, gained):
+                needless.append((smaller.score, k, smaller))
+        if not needless:
+            break
+        _, k, current = min(needless, key=lambda each: each[0])
+        chosen = [c for i, c in enumerate(chosen) if i != k]
+        if alike is not None:
+            chosen = refreshed(chosen, current)
+            current = search.refit(chosen, current)
+    return chosen, current
+
+
+def _stays(
+    search: Comparison, choice: Choice, without, with_, on_the_whole: bool
+) -> bool:
+    if search.earns_its_place(without, with_, on_the_whole):
+        return True
+    if not search.plan.by_channel or not choice.in_group:
+        return False
+    # A member of a group whose other members show.
+    gains = search.channel_gains(without, with_, 0.0)
+    return max(gains.values(), default=0.0) >= MEMBER_GAIN and is_clearly_off(choice)
+
+
+def simplify(
+    search: Comparison, chosen: list[Choice], current: Fitted
+) -> tuple[list[Choice], Fitted]:
+    """A kind that contains others gives way to one of them that does as well beside all
+    that was chosen: later effects may have taken what it was needed for."""
+    taken = places(chosen)
+    found: Sequence[Candidate] = ()
+    if any(KINDS[c.effect.kind].contains for c in chosen):
+        found = search.problem.candidates(search.nuisances, current)
+    for k, choice in enumerate(chosen):
+        inner = [
+            c for c in found
+            if c.kind in KINDS[choice.effect.kind].contains
+            and list(c.at) == list(choice.effect.at)
+            and (c.kind, c.at) not in taken
+        ]  # fmt: skip
+        trials = [t for c in inner if (t := in_place_of(search, c, k, chosen, current))]
+        if not trials:
+            continue
+        fit, ranked = min(trials, key=lambda t: t.fit.score)
+        least = (1.0 - NESTED_GAIN) * search.error(fit.score)
+        gained = search.error(current.score) < least
+        if search.earns_its_place(fit.left, current.left, gained):
+            continue
+        chosen = [*chosen]
+        chosen[k] = replace(
+            choice, effect=fit.effects[k], ties=(), fixed=ranked.candidate.fixed,
+            size=ranked.candidate.size,
+        )  # fmt: skip
+        current = fit
+        chosen = refreshed(chosen, current)
+    return chosen, current
+
+
+def keep_certain(
+    search: Comparison, chosen: list[Choice], current: Fitted
+) -> tuple[list[Choice], Fitted]:
+    """The effects that are certain, by a fit of these alone. Effects that are not
+    significant are dropped together; after that, one after another, those that parts of
+    the data contradict."""
+    while chosen:
+        current = search.refit(chosen, current)
+        chosen = refreshed(chosen, current)
+        sure = [
+            c for k, c in enumerate(chosen) if _is_certain(search, chosen, current, k)
+        ]
+        if len(sure) == len(chosen):
+            off = consistency(search.problem, current)
+            k = int(np.argmin(off))
+            if not off[k] < CONSISTENT_Z:
+                return chosen, current
+            sure = [*chosen[:k], *chosen[k + 1 :]]
+        chosen = sure
+    return [], search.start
+
+
+def _is_certain(
+    search: Comparison, chosen: Sequence[Choice], current: Fitted, k: int
+) -> bool:
+    """Whether the k-th effect is significant. A kind whose parameters may end anywhere
+    must be so, beside others, with its widened deviations too: slopes where it ended do
+    not say how far it may go."""
+    choice, alone = chosen[k], len(chosen) == 1
+    if not is_significant(choice, alone):
+        return False
+    endless = any(each.endless for each in KINDS[choice.effect.kind].parameters)
+    if alone or not endless:
+        return True
+    std, _ = search.problem.widened(current, k)
+    return is_significant(replace(choice, std=std), alone)

@@ -1,0 +1,129 @@
+"""Spheres that stand in for the faces on which free bodies lie.
+
+Drake's point contact gives two shapes one point, however large the area is in which
+they meet. Of a box on a table that point jumps from corner to corner: the box rocks,
+and slides and turns otherwise than one that stands on its face. The equations of
+motion of gap/residuals/contact_dynamics.py let such a body stand on all corners of its
+face. So that simulated windows mean the same, small spheres at these corners carry it,
+and its own shapes no longer touch what it lies on. Nothing else touches the spheres.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.geometry import (
+    Box,
+    CollisionFilterDeclaration,
+    Convex,
+    Cylinder,
+    GeometrySet,
+    Mesh,
+    SceneGraph,
+    Sphere,
+)
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex
+
+RADIUS = 2e-3  # Of a sphere [m], or this share of a small shape's least half size.
+SHARE = 0.2
+RIM = 12  # Spheres along a cylinder's rim.
+MOST = 48  # Spheres of a hull; of more corners, every n-th has one.
+ALIKE = 1e-6  # Normals of one face differ by no more than this.
+
+
+@dataclass(frozen=True)
+class LiesOn:
+    """A free body that lies on something fixed with a face, or with the side of a
+    cylinder; both are body indices."""
+
+    body: int
+    ground: int
+    on_side: bool = False
+
+
+def add_supports(
+    lying: Iterable[LiesOn], plant: MultibodyPlant, scene_graph: SceneGraph
+) -> None:
+    """Adds the spheres to a plant that is not yet finalized. They have the surface of
+    the shape whose corners they stand in for."""
+    inspector = scene_graph.model_inspector()
+    bodies = [plant.get_body(BodyIndex(k)) for k in range(plant.num_bodies())]
+    for one in lying:
+        body, faces, planned = bodies[one.body], [], []
+        for i, g in enumerate(plant.GetCollisionGeometriesForBody(body)):
+            properties = inspector.GetProximityProperties(g)
+            found = centres_of(inspector.GetShape(g), one.on_side)
+            if properties is None or found is None:
+                continue
+            faces.append(i)
+            X, (centres, radius) = inspector.GetPoseInFrame(g), found
+            planned += [
+                (RigidTransform(X @ p), radius, f"support_{i}_{k}", properties)
+                for k, p in enumerate(centres)
+            ]
+        added = [
+            plant.RegisterCollisionGeometry(body, X, Sphere(radius), name, properties)
+            for X, radius, name, properties in planned
+        ]
+        # Asked for again: registering has moved the plant's own lists of them.
+        own = plant.GetCollisionGeometriesForBody(body)
+        ground = plant.GetCollisionGeometriesForBody(bodies[one.ground])
+        others = [
+            g
+            for k, other in enumerate(bodies)
+            if k not in (one.body, one.ground)
+            for g in plant.GetCollisionGeometriesForBody(other)
+        ]
+        declare = CollisionFilterDeclaration()
+        declare.ExcludeBetween(
+            GeometrySet([own[i] for i in faces]), GeometrySet(ground)
+        )
+        if others:
+            declare.ExcludeBetween(GeometrySet(added), GeometrySet(others))
+        scene_graph.collision_filter_manager().Apply(declare)
+
+
+def centres_of(shape, on_side: bool = False) -> tuple[np.ndarray, float] | None:
+    """(n, 3) centres of spheres in the shape's frame, and their radius [m]: each
+    touches the faces that meet in its corner from within. None for a shape that meets a
+    plane in one point anyway.
+
+    Args: on_side: whether a cylinder lies on its side; then two spheres of its own
+        radius touch where the ends of that line do.
+    """
+    if isinstance(shape, Box):
+        half = shape.size() / 2.0
+        radius = min(RADIUS, SHARE * float(half.min()))
+        signs = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T
+        return signs * (half - radius), radius
+    if isinstance(shape, Cylinder):
+        r, h = shape.radius(), 0.5 * shape.length()
+        if on_side:
+            return np.array([[0.0, 0.0, -h], [0.0, 0.0, h]]), r
+        radius = min(RADIUS, SHARE * min(r, h))
+        angle = np.arange(RIM) * 2.0 * np.pi / RIM
+        x, y = (r - radius) * np.cos(angle), (r - radius) * np.sin(angle)
+        return np.vstack(
+            [np.column_stack([x, y, np.full(RIM, z)]) for z in (radius - h, h - radius)]
+        ), radius
+    if isinstance(shape, (Convex, Mesh)):
+        mesh = shape.GetConvexHull()
+        corners = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())])
+        normals = np.array([mesh.face_normal(i) for i in range(mesh.num_faces())])
+        offsets = (corners @ normals.T).max(axis=0)
+        size = float(np.ptp(corners, axis=0).min()) / 2.0
+        radius = min(RADIUS, SHARE * size)
+        step = -(-len(corners) // MOST)
+        return np.array(
+            [_within(p, normals, offsets, radius) for p in corners[::step]]
+        ), radius
+    return None
+
+
+def _within(corner, normals, offsets, radius: float) -> np.ndarray:
+    """(3,) the point nearest to being `radius` within all faces of a corner."""
+    mine = offsets - normals @ corner < ALIKE
+    N = np.unique(np.round(normals[mine], 6), axis=0)
+    return corner - radius * np.linalg.pinv(N) @ np.ones(len(N))
