@@ -46,7 +46,7 @@ _LOOP = "close-the-loop --seed 2"
 PICTURES = {
     "ball_rolling.png": Picture("run ball_rolling --duration 24", "meshcat.html"),
     "meshcat_live.png": Picture(
-        "run ball_rolling --seed 2", wait_ms=120000, live_sec=12.0
+        "run ball_rolling --seed 2", wait_ms=2000, live_sec=12.0
     ),
     "multiple_collisions.png": Picture("run multiple_collisions", "meshcat.html"),
     "push_object.png": Picture(

@@ -90,6 +90,7 @@ def screenshot(page: Path | str, picture: Path, size=(1280, 800), wait_ms: int =
             "--enable-unsafe-swiftshader",
             "--ignore-gpu-blocklist",
             "--disable-quic",
+            "--hide-scrollbars",
             "--no-first-run",
             "--disable-background-networking",
             "--disable-component-update",
@@ -100,6 +101,8 @@ def screenshot(page: Path | str, picture: Path, size=(1280, 800), wait_ms: int =
             f"--screenshot={taken}",
             file.as_uri(),
         ]
+        if live:  # Else Meshcat's textures are black: they are of another origin.
+            options.insert(0, "--disable-web-security")
         try:
             done = subprocess.run(
                 [browser, *options], capture_output=True, text=True, timeout=LIMIT_SEC
