@@ -32,8 +32,8 @@ from makebreak.diagrams.ball_rolling_config import (
     N_TIP,
     PLAN_DT,
     BallRollingConfig,
-    believed,
     c3_config,
+    controller_model,
     learner_config,
     paper_learner_config,
     what_goes_wrong,
@@ -189,7 +189,7 @@ def add_ball_rolling(
         positions (`ball.p_WB`, `ball.v_WB`, `ball.seen`) in place of pictures.
     """
     check_own(config, _OWN)
-    model, model_scene = believed(config)
+    model, model_scene = controller_model(config)
     learner_kind = config.learner if config.adapt else "none"
     projection = config.projection
     if projection == "auto":
@@ -573,7 +573,7 @@ def _add_view(
         plant = station.GetSubsystemByName("plant")
         state, size = station.GetOutputPort("state"), plant.num_multibody_states()
         at = plant.GetBodyByName("ball").floating_positions_start() + 4
-    else:  # As it is believed.
+    else:  # As it is estimated.
         state, size, at = x, N_X, P_BALL.start
     select = np.zeros((3, size))
     select[:, at : at + 3] = np.eye(3)

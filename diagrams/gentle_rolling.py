@@ -35,7 +35,7 @@ from makebreak.diagrams.ball_rolling import (
 )
 from makebreak.diagrams.ball_rolling_config import (
     BallRollingConfig,
-    believed,
+    controller_model,
     world_scene,
 )
 from makebreak.diagrams.camera import CameraConfig
@@ -273,7 +273,7 @@ def felt_and_glass(ball: BallRollingConfig) -> Scene:
 
 def prior(config: GentleRollingConfig) -> ContactBelief:
     """Where the model says that the finger will touch, in the frame under the ball."""
-    model, _ = believed(ball_config(config))
+    model, _ = controller_model(ball_config(config))
     shape = config.push.shape
     z = surface_height(shape.land_behind, model.ball_radius, model.tip_radius)
     # Twice the radius' error is the height's. The table is known better, but it is
@@ -365,7 +365,7 @@ def _to_freeze(config: GentleRollingConfig) -> list[str]:
 def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) -> None:
     """The second paper's systems, and what leads from both planners to the arm."""
     touch = config.touch
-    model, scene = believed(ball)
+    model, scene = controller_model(ball)
     arm = make_control_plant(scene)
     chain = serial_chain_of(arm, TIP_FRAME)
     path = CirclePath(np.array(ball.task.center), ball.task.radius)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from makebreak.diagrams.ball_rolling_config import believed
+from makebreak.diagrams.ball_rolling_config import controller_model
 from makebreak.diagrams.gentle_rolling import (
     FELT,
     SEAM_Y,
@@ -450,7 +450,7 @@ def test_felt_begins_at_the_seam_and_the_models_have_none():
     (zone,) = felt_and_glass(ball).friction_zones
     assert zone.at == "table~finger" and zone.friction == FELT
     assert zone.y[0] == SEAM_Y and zone.x[0] < 0.0 < 0.7 < zone.x[1]
-    assert not believed(ball)[1].friction_zones
+    assert not controller_model(ball)[1].friction_zones
     # The seam is on the ball's way.
     assert abs(SEAM_Y - ball.task.center[1]) < ball.task.radius
     # The ball starts so that after one push the way ahead leads to the wrist's side.

@@ -20,7 +20,7 @@ from makebreak.systems.numerics.filters import (
     subdivided,
 )
 
-_ITERATIONS_MAX = 4  # Of van Cittert's iteration.
+_ITERATIONS_MAX = 4  # Limit of van Cittert iterations.
 
 
 @dataclass(frozen=True, eq=False)
