@@ -23,8 +23,8 @@ from makebreak.diagrams.ball_rolling_config import (
     BallRollingConfig,
     LearnerConfig,
     PlannerConfig,
-    believed,
     c3_config,
+    controller_model,
     learner_config,
     paper_learner_config,
     world_scene,
@@ -321,11 +321,11 @@ def test_radius_error_is_the_models_alone(diagram):
     )
     assert world == R_BALL
     for error in (0.005, 0.0, -0.003):
-        model, _ = believed(config(radius_error_m=error))
+        model, _ = controller_model(config(radius_error_m=error))
         assert model.ball_radius == pytest.approx(R_BALL + error, abs=1e-15)
         assert model.tip_radius == R_TIP
-    right, _ = believed(config(radius_error_m=0.0))
-    wrong, _ = believed(config(radius_error_m=0.005))
+    right, _ = controller_model(config(radius_error_m=0.0))
+    wrong, _ = controller_model(config(radius_error_m=0.005))
     assert wrong.ball_mass == right.ball_mass == 0.07
 
 
@@ -361,8 +361,8 @@ def test_conditions_are_the_worlds_alone():
         for pair in (("finger", "ball"), ("ball", "table")):
             mu = surface_friction(world_scene(changed), *pair)
             assert mu == pytest.approx(friction, abs=1e-12)
-        model, scene = believed(changed)
-        assert model == believed(config())[0]
+        model, scene = controller_model(changed)
+        assert model == controller_model(config())[0]
         kinds = {effect.kind for effect in scene.effects}
         assert kinds <= {"object_size"}
     kinds = {e.kind for e in world_scene(changed).effects}
@@ -391,7 +391,7 @@ def test_a_push_is_told_whether_it_feels_for_the_ball_and_what_it_feels(
 
 def test_world_and_model_start_from_one_file():
     assert BallRollingConfig().world == BallRollingConfig().model
-    model, _ = believed(config(radius_error_m=0.0))
+    model, _ = controller_model(config(radius_error_m=0.0))
     world = load_scene(world_scene(config()), DiagramBuilder())
     for name, radius in (("ball", model.ball_radius), ("finger", model.tip_radius)):
         assert sphere_radius(world.plant, world.scene_graph, name) == radius
@@ -839,7 +839,7 @@ def test_adaptation_finds_the_ball_and_rolls_it_and_without_it_nothing_rolls(tmp
     assert not frozen["initiated"]
 
 
-@pytest.mark.parametrize("read", [world_scene, believed])
+@pytest.mark.parametrize("read", [world_scene, controller_model])
 def test_a_scene_without_arm_or_ball_is_refused_by_what_it_lacks(read):
     other = str(MODELS / "cartpole_walls.scene.yaml")
     wrong = BallRollingConfig(world=other, model=other)
