@@ -54,6 +54,17 @@ def test_columns_are_matched_by_their_names(names, expected):
         assert found[name] == (channel and f"panda.panda_joint{channel}"), name
 
 
+def test_a_force_is_the_effort_of_a_joint_that_slides_and_has_its_name():
+    """`joint` in a joint's own name does not make its force a position."""
+    joints = [JointName("g.lift_joint", prismatic=True), JointName("g.yaw_joint")]
+    names = ["lift_joint.actual_force", "lift_joint.force_cmd", "yaw_joint.force",
+             "force_1", "tool_force_x"]  # fmt: skip
+    found = channels({"time": T} | sines(names), joints)
+    assert found["lift_joint.actual_force"] == "g.lift_joint.effort_measured"
+    assert found["lift_joint.force_cmd"] == "g.lift_joint.effort_command"
+    assert [found[n] for n in names[2:]] == [None] * 3
+
+
 def test_numbers_count_from_zero_where_any_group_does():
     found = channels(sines([f"q{k}" for k in range(7)]), PANDA)
     assert found["q0"].startswith("panda.panda_joint1.")
