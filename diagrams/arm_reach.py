@@ -14,16 +14,16 @@ from makebreak.diagrams.scene_facts import PANDA_JOINTS
 from makebreak.diagrams.station import ARM, TIP_FRAME
 from makebreak.systems.changing_contact.numerics.motion_pattern import MotionPattern
 
-NEAR_M, NEAR_RAD = 1e-3, 0.01  # A pose is reached if the tip comes so near to it.
-STEPS = 30  # Of Gauss-Newton, at most.
-SAMPLE_SEC = 0.02  # Between the poses of a pattern that are tried.
-FEWEST, MOST = 50, 1500  # Of them.
+NEAR_M, NEAR_RAD = 1e-3, 0.01  # Errors of the tip within which a pose is reached.
+STEPS = 30  # Limit of Gauss-Newton steps.
+SAMPLE_SEC = 0.02  # Between the poses of a pattern that are checked.
+SAMPLES_MIN, SAMPLES_MAX = 50, 1500  # Number of these poses.
 
 
 class ArmReach:
-    """Inverse kinematics of a control plant's arm, with scratch of its own.
+    """Inverse kinematics of a control plant's arm, with its own Context.
 
-    Args: arm, a plant with the Panda and its tool alone.
+    Args: arm: a plant with only the Panda and its tool.
     """
 
     def __init__(self, arm: MultibodyPlant):
@@ -39,7 +39,7 @@ class ArmReach:
         return X.translation(), X.rotation()
 
     def jacobian(self, q) -> np.ndarray:
-        """(6, 7) of the tip's velocity, rotation first, in world axes."""
+        """(6, 7) Jacobian of the tip's angular and linear velocity, world axes."""
         self._arm.SetPositions(self._context, q)
         return self._arm.CalcJacobianSpatialVelocity(
             self._context, JacobianWrtVariable.kV, self._tip, np.zeros(3),
@@ -47,40 +47,42 @@ class ArmReach:
         )  # fmt: skip
 
     def mass_matrix(self, q) -> np.ndarray:
-        """(7, 7) of the arm at joint positions q (7,)."""
+        """(7, 7) mass matrix of the arm at joint positions q (7,)."""
         self._arm.SetPositions(self._context, q)
         return self._arm.CalcMassMatrix(self._context)
 
-    def _away(self, q, p, R) -> np.ndarray:
+    def _error(self, q, p, R) -> np.ndarray:
+        """(6,) rotation vector [rad] and translation [m] from the tip at q to p, R."""
         p_now, R_now = self.pose(q)
         turn = (R @ R_now.inverse()).ToAngleAxis()
         return np.r_[turn.angle() * turn.axis(), p - p_now]
 
     def positions(self, p, R: RotationMatrix, q_near) -> np.ndarray:
-        """Joint positions (7,) [rad] at which the tip is at p (3,) [m] and R, those
-        that are nearest to q_near (7,); where it cannot get there, near it."""
+        """Joint positions (7,) [rad] that bring the tip to p (3,) [m] and R, or near a
+        pose out of reach, as close to q_near (7,) as possible."""
         q = np.array(q_near, dtype=float)
         for _ in range(STEPS):
             J = self.jacobian(q)
             inverse = J.T @ np.linalg.inv(J @ J.T + 1e-4 * np.eye(6))
             back = q_near - q
-            # The null space goes back to q_near.
-            step = inverse @ (self._away(q, p, R) - J @ back) + back
+            # In the null space it moves back to q_near.
+            step = inverse @ (self._error(q, p, R) - J @ back) + back
             q = q + step
             if np.linalg.norm(step) < 1e-4:
                 break
         return q
 
     def misses(self, q, p, R: RotationMatrix) -> tuple[float, float]:
-        """How far the tip at q is from a pose: [m], [rad]."""
-        away = self._away(q, p, R)
-        return float(np.linalg.norm(away[3:])), float(np.linalg.norm(away[:3]))
+        """Distance [m] and angle [rad] of the tip at q to a pose."""
+        error = self._error(q, p, R)
+        return float(np.linalg.norm(error[3:])), float(np.linalg.norm(error[:3]))
 
 
 def joint_positions_along(pattern: MotionPattern, arm: MultibodyPlant) -> np.ndarray:
     """Joint positions (n, 7) [rad] of the arm along a pattern, from its first pose on.
 
-    Raises: ValueError that names segment, time, and what the arm cannot do.
+    Raises: ValueError with segment, time, and the pose, joint limit or speed that the
+        arm cannot achieve.
     """
     reach = ArmReach(arm)
     joints = [
@@ -89,19 +91,20 @@ def joint_positions_along(pattern: MotionPattern, arm: MultibodyPlant) -> np.nda
     ]
     lower = np.array([j.position_lower_limits()[0] for j in joints])
     upper = np.array([j.position_upper_limits()[0] for j in joints])
-    speed_most = np.array([j.velocity_upper_limits()[0] for j in joints])
+    speed_max = np.array([j.velocity_upper_limits()[0] for j in joints])
     start, ends = pattern.segments[0].times[0], [s.times[1] for s in pattern.segments]
-    n = int(np.clip(pattern.duration / SAMPLE_SEC, FEWEST, MOST)) + 1
+    n = int(np.clip(pattern.duration / SAMPLE_SEC, SAMPLES_MIN, SAMPLES_MAX)) + 1
     times = np.linspace(start, ends[-1], n)
 
     q, found = reach.q_default, []
     p_now, _ = reach.pose(q)
     first = pattern.pose(start)
-    for share in np.linspace(0.1, 1.0, 10):  # From where the arm is by default.
-        p = p_now + share * (first[:3] - p_now)
+    for s in np.linspace(0.1, 1.0, 10):  # From the default to the first pose.
+        p = p_now + s * (first[:3] - p_now)
         R = _rotation(first[3:7])
         q = reach.positions(p, R, q)
-    k_before, too_fast = -1, ""  # Said last: near the end of its reach an arm hurries.
+    # Reported last, as joints are also fast shortly before a pose is out of reach.
+    k_before, too_fast = -1, ""
     for t in times:
         pose = pattern.pose(t)
         R = _rotation(pose[3:7])
@@ -122,13 +125,13 @@ def joint_positions_along(pattern: MotionPattern, arm: MultibodyPlant) -> np.nda
                     f"{where}: {name} would be at {x:.2f} rad, expected {low:.2f} to "
                     f"{high:.2f} rad"
                 )
-        if k == k_before:  # From one to the next, contacts decide where the tip is.
+        if k == k_before:  # Between segments, contacts determine the tip's place.
             speed = abs(q_next - q) / (times[1] - times[0])
-            j = int(np.argmax(speed / speed_most))
-            if speed[j] > speed_most[j]:
+            j = int(np.argmax(speed / speed_max))
+            if speed[j] > speed_max[j]:
                 too_fast = too_fast or (
                     f"{where}: too fast, {PANDA_JOINTS[j]} would turn at "
-                    f"{speed[j]:.2f} rad/s, expected at most {speed_most[j]:.2f} rad/s"
+                    f"{speed[j]:.2f} rad/s, expected at most {speed_max[j]:.2f} rad/s"
                 )
         found.append(q_next)
         q, k_before = q_next, k

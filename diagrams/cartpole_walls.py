@@ -13,7 +13,13 @@ from typing import Literal
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.framework import (
+    Context,
+    Diagram,
+    DiagramBuilder,
+    InputPort,
+    OutputPort,
+)
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
 from makebreak.diagrams.recorder import add_recorder
@@ -149,27 +155,7 @@ def make_cartpole_walls(
     builder = DiagramBuilder()
     model = model_lcs(config)
     if multibody:
-        loaded = load_scene(config.world, builder)
-        plant = loaded.plant
-        if (plant.num_multibody_states(), plant.num_actuated_dofs()) != (4, 1):
-            raise ValueError(
-                f"the scene {config.world} has {plant.num_multibody_states()} states "
-                f"and {plant.num_actuated_dofs()} actuators, expected 4 and 1"
-            )
-        actuator = plant.get_joint_actuator(plant.GetJointActuatorIndices()[0])
-        driven = plant.GetModelInstanceName(actuator.model_instance())
-        x, u_of_plant = (
-            plant.get_state_output_port(),
-            loaded.command_input_port(driven),
-        )
-        if meshcat is not None:
-            meshcat.SetCameraPose(*CAMERA)
-            MeshcatVisualizer.AddToBuilder(
-                builder,
-                loaded.scene_graph,
-                meshcat,
-                MeshcatVisualizerParams(publish_period=1.0 / 30.0),
-            )
+        x, u_of_plant = _add_scene(builder, config, meshcat)
     else:
         lcs_plant = LcsPlant(true_lcs(), config=LcsPlantConfig(offset_sec=PLANT_OFFSET))
         builder.AddNamedSystem("plant", lcs_plant)
@@ -187,6 +173,61 @@ def make_cartpole_walls(
     builder.Connect(x, c3.GetInputPort("x"))
     builder.Connect(goal.get_output_port(), c3.GetInputPort("x_desired"))
     builder.Connect(u, u_of_plant)
+    r_comp, lcs_of_c3 = _add_learners(builder, config, model, x, u, lcs)
+    builder.Connect(lcs_of_c3, c3.GetInputPort("lcs"))
+    builder.Connect(r_comp, c3.GetInputPort("r_comp"))
+    if multibody and meshcat is not None:
+        view = builder.AddNamedSystem(
+            "walls_view", WallsView(WallsViewConfig(gap=list(model.c)), meshcat)
+        )
+        builder.Connect(r_comp, view.GetInputPort("r_comp"))
+        add_legend(builder, meshcat, LegendConfig(view.LEGEND, (), *CAMERA))
+    names = ("slide.position", "pivot.position", "slide.velocity", "pivot.velocity")
+    add_recorder(
+        builder,
+        {"x": (x, [f"cartpole.{name}" for name in names])},
+        {"u": (u, ["cartpole.slide.effort_command"])},
+        DT,
+    )
+    builder.ExportOutput(x, "x")
+    builder.ExportOutput(u, "u")
+    builder.ExportOutput(r_comp, "r_comp")
+    builder.ExportOutput(c3.GetOutputPort("status"), "c3_status")
+    diagram = builder.Build()
+    diagram.set_name("cartpole_walls")
+    return diagram
+
+
+def _add_scene(builder, config, meshcat) -> tuple[OutputPort, InputPort]:
+    """The plant of the scene; gives its state and its input.
+
+    Raises: ValueError for a scene of other sizes.
+    """
+    loaded = load_scene(config.world, builder)
+    plant = loaded.plant
+    if (plant.num_multibody_states(), plant.num_actuated_dofs()) != (4, 1):
+        raise ValueError(
+            f"the scene {config.world} has {plant.num_multibody_states()} states "
+            f"and {plant.num_actuated_dofs()} actuators, expected 4 and 1"
+        )
+    actuator = plant.get_joint_actuator(plant.GetJointActuatorIndices()[0])
+    driven = plant.GetModelInstanceName(actuator.model_instance())
+    if meshcat is not None:
+        meshcat.SetCameraPose(*CAMERA)
+        MeshcatVisualizer.AddToBuilder(
+            builder,
+            loaded.scene_graph,
+            meshcat,
+            MeshcatVisualizerParams(publish_period=1.0 / 30.0),
+        )
+    return plant.get_state_output_port(), loaded.command_input_port(driven)
+
+
+def _add_learners(
+    builder, config, model: LCS, x: OutputPort, u: OutputPort, lcs
+) -> tuple[OutputPort, OutputPort]:
+    """The learners of the config. Gives r_comp, zero without a learner of it, and the
+    LCS for C3, with r_dyn if that is learned."""
     lcs_of_c3 = lcs.get_output_port()
     learned = config.learner if config.adapt else "none"
     if learned in ("r_comp", "both"):
@@ -194,7 +235,7 @@ def make_cartpole_walls(
             "learner", ResidualLearner(config.learning, model, DT, LEARNER_OFFSET)
         )
         builder.Connect(x, learner.GetInputPort("x"))
-        # The learner runs before C3's update: u still is what acted in this period.
+        # The learner updates before C3, so this is the u of the period that has passed.
         builder.Connect(u, learner.GetInputPort("u_measured"))
         builder.Connect(lcs.get_output_port(), learner.GetInputPort("lcs"))
         r_comp = learner.GetOutputPort("r_comp")
@@ -219,28 +260,7 @@ def make_cartpole_walls(
         builder.Connect(u, baseline.GetInputPort("u_measured"))
         builder.Connect(lcs.get_output_port(), baseline.GetInputPort("lcs"))
         lcs_of_c3 = baseline.GetOutputPort("lcs")
-    builder.Connect(lcs_of_c3, c3.GetInputPort("lcs"))
-    builder.Connect(r_comp, c3.GetInputPort("r_comp"))
-    if multibody and meshcat is not None:
-        view = builder.AddNamedSystem(
-            "walls_view", WallsView(WallsViewConfig(gap=list(model.c)), meshcat)
-        )
-        builder.Connect(r_comp, view.GetInputPort("r_comp"))
-        add_legend(builder, meshcat, LegendConfig(view.LEGEND, (), *CAMERA))
-    names = ("slide.position", "pivot.position", "slide.velocity", "pivot.velocity")
-    add_recorder(
-        builder,
-        {"x": (x, [f"cartpole.{name}" for name in names])},
-        {"u": (u, ["cartpole.slide.effort_command"])},
-        DT,
-    )
-    builder.ExportOutput(x, "x")
-    builder.ExportOutput(u, "u")
-    builder.ExportOutput(r_comp, "r_comp")
-    builder.ExportOutput(c3.GetOutputPort("status"), "c3_status")
-    diagram = builder.Build()
-    diagram.set_name("cartpole_walls")
-    return diagram
+    return r_comp, lcs_of_c3
 
 
 def start(diagram: Diagram, x) -> Context:

@@ -24,7 +24,7 @@ from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 
 from makebreak.diagrams.arm_reach import ArmReach
 from makebreak.diagrams.fault_kinds import read_faults
-from makebreak.diagrams.given_pattern import drawn
+from makebreak.diagrams.given_pattern import segment_paths
 from makebreak.diagrams.realism import StationErrors, with_errors
 from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.station import (
@@ -356,7 +356,7 @@ def _add_view(builder: DiagramBuilder, station, s: _Systems, pattern, meshcat, v
     connect = partial(_connect, builder)
     shown = builder.AddNamedSystem(
         "contact_view",
-        ContactView(view or ContactViewConfig(), meshcat, plan=drawn(pattern)),
+        ContactView(view or ContactViewConfig(), meshcat, plan=segment_paths(pattern)),
     )
     connect(s.anticipator, "contacts", shown)
     connect(station, WRENCH, shown, port="wrench")

@@ -17,7 +17,7 @@ from makebreak.diagrams.changing_contact import (
     Knowledge,
     make_changing_contact,
 )
-from makebreak.diagrams.given_pattern import begin_there, expected_contacts
+from makebreak.diagrams.given_pattern import expected_contacts, start_at_pattern
 from makebreak.diagrams.realism import StationErrors, draw_errors
 from makebreak.diagrams.tabletop import (
     THREE_SURFACES,
@@ -146,7 +146,7 @@ def make_task(
     )
     pattern, prior = make_pattern(config, half, forces), ContactBelief((contact,))
     if given is not None:
-        begin_there(given, world, model, TOOL)
+        start_at_pattern(given, world, model, TOOL)
         pattern, prior = given, expected_contacts(given, GIVEN_STD)
         forces = np.concatenate([s.force_targets for s in given.segments])
     return SurfaceTask(

@@ -34,7 +34,7 @@ from makebreak.systems.faults.numerics.time_span import lasts
 
 GLARE = (255, 255, 255)
 BALL_COLOR = (242, 102, 13)  # Of models/ball.sdf.
-GLARE_SHARE = 0.7  # Of the ball's radius.
+GLARE_SHARE = 0.7  # Radius of the glare over that of the ball.
 
 
 def with_box(scene: Scene, faults: Sequence[Injected], place, folder) -> Scene:

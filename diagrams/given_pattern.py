@@ -1,9 +1,7 @@
-"""A motion pattern that a user gives: what is expected along it, and where the arm
-begins.
+"""A user's motion pattern: the contacts expected along it, and the arm's start.
 
-Contacts are expected where the pattern says that the tool will press: a segment ends in
-a contact if the next one has a force direction that it lacks. It is expected at the end
-of that segment's path, along the new force direction. Nothing is expected elsewhere.
+A segment ends in a contact if the next segment has a force direction that it lacks. The
+contact is expected at the end of the segment's path, along the new force direction.
 """
 
 from dataclasses import replace
@@ -21,19 +19,17 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
 )
 from makebreak.systems.changing_contact.numerics.motion_pattern import MotionPattern
 
-# A contact is felt only by a motion that leads into it: so much of the motion's
-# direction has to be along the new force direction (60 degrees).
-LEADS_INTO = 0.5
-DEPTH = 2e-4  # [m] that the tool may be inside something at the beginning.
+# Least cosine between a segment's final direction and the new force direction: only a
+# motion into a contact is felt.
+INTO_CONTACT = 0.5
+DEPTH = 2e-4  # Penetration that is accepted at the start [m].
 
 
 def expected_contacts(pattern: MotionPattern, std: float) -> ContactBelief:
     """The contacts in which the pattern's segments end.
 
-    Args: std, how far off each place may be: one standard deviation, along and across
-        the motion [m].
-    Raises: ValueError for a segment that is to end in a contact and does not lead into
-        it.
+    Args: std: standard deviation of each place, along and across the motion [m].
+    Raises: ValueError for a segment that ends in a contact but does not move into it.
     """
     found = []
     for k, (segment, after) in enumerate(
@@ -45,7 +41,7 @@ def expected_contacts(pattern: MotionPattern, std: float) -> ContactBelief:
         end = pattern.geometry(k, pattern.length(k))
         new = [n for n in after.force_directions if not any(here @ n > 1.0 - 1e-6)]
         n = max(new, key=lambda n: n @ end[1])
-        if n @ end[1] < LEADS_INTO:
+        if n @ end[1] < INTO_CONTACT:
             raise ValueError(
                 f"segment {k} is to end in a contact along {_shown(n)}, but moves "
                 f"along {_shown(end[1])} there, expected a motion into the contact"
@@ -54,11 +50,13 @@ def expected_contacts(pattern: MotionPattern, std: float) -> ContactBelief:
     return ContactBelief(tuple(found))
 
 
-def begin_there(pattern: MotionPattern, world: Scene, model: Scene, tool: str) -> None:
-    """Sets the arm of both scenes, in place, to where the pattern begins.
+def start_at_pattern(
+    pattern: MotionPattern, world: Scene, model: Scene, tool: str
+) -> None:
+    """Sets the initial arm positions of both scenes, in place, to the pattern's start.
 
     Raises: ValueError if the arm cannot follow the pattern, or if tool or arm would
-        begin inside something in the world.
+        penetrate something in the world at the start.
     """
     q = joint_positions_along(pattern, make_control_plant(model, tool))[0]
     positions = {
@@ -89,8 +87,8 @@ def begin_there(pattern: MotionPattern, world: Scene, model: Scene, tool: str) -
         )
 
 
-def drawn(pattern: MotionPattern) -> list[np.ndarray]:
-    """The path of each segment, (n, 3) positions [m], for the eye."""
+def segment_paths(pattern: MotionPattern) -> list[np.ndarray]:
+    """The path of each segment, (n, 3) positions [m], for drawing."""
     return [
         np.array([pattern.geometry(k, s)[0] for s in np.linspace(0.0, length, n)])
         for k, segment in enumerate(pattern.segments)

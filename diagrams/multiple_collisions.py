@@ -18,7 +18,7 @@ from makebreak.diagrams.changing_contact import (
     Knowledge,
     make_changing_contact,
 )
-from makebreak.diagrams.given_pattern import begin_there, expected_contacts
+from makebreak.diagrams.given_pattern import expected_contacts, start_at_pattern
 from makebreak.diagrams.realism import StationErrors, draw_errors
 from makebreak.diagrams.tabletop import (
     SPREAD,
@@ -203,7 +203,7 @@ def make_task(
     stiffness = draw_stiffness(rng, SURFACES, config.stiffness)
     set_stiffness(world, config.tool, stiffness)
     if given is not None:  # The world is the seed's, whatever moves in it.
-        begin_there(given, world, model, TOOL)
+        start_at_pattern(given, world, model, TOOL)
         there = expected_contacts(given, sigma)
         prior, modelled, truth = [*there.contacts], [*there.contacts], np.zeros(0)
     return CollisionTask(

@@ -19,7 +19,7 @@ Coordinate = Annotated[float, Between(-1e4, 1e4, "rad or m")]
 Rate = Annotated[float, Between(-1e4, 1e4, "rad/s or m/s")]
 Gain = Annotated[float, Between(0.0, 1e9)]
 Positive = Annotated[float, Between(1e-9, 1e9)]
-LEAST_STEP = 1e-6  # [s]
+TIME_STEP_MIN = 1e-6  # [s]
 
 # Commands that a recording may have, by the type of a scene's actuation.
 COMMANDS_OF: dict[str, tuple[str, ...]] = {
@@ -126,10 +126,10 @@ def check_scene(scene: Scene) -> None:
         if name not in ("directives", "effects"):
             convert(name, getattr(scene, name), hint)
     step = scene.plant.time_step
-    if 0.0 < step < LEAST_STEP:
+    if 0.0 < step < TIME_STEP_MIN:
         raise ValueError(
             f"plant.time_step: got {step:g}, expected 0 (continuous) or at least "
-            f"{LEAST_STEP:g} [s]"
+            f"{TIME_STEP_MIN:g} [s]"
         )
     approximation = scene.plant.discrete_contact_approximation
     if approximation == "tamsi" and not hasattr(DiscreteContactApproximation, "kTamsi"):

@@ -5,14 +5,11 @@ python -m makebreak.scripts.pictures [--out docs/pictures] [PICTURE ...]
 
 import argparse
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from time import sleep
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -28,14 +25,12 @@ DOCS = Path(__file__).resolve().parent.parent / "docs" / "pictures"
 
 @dataclass(frozen=True)
 class Picture:
-    """What a picture is taken of: a page, at a time of its own clock; a plot; or, with
-    live_sec, the Meshcat of a run that has simulated so many seconds."""
+    """The source of a picture: a page at a time of its own clock, or a plot."""
 
     command: str
-    file: str = ""
+    file: str
     wait_ms: int = 15000
     size: tuple[int, int] = (1280, 800)
-    live_sec: float = 0.0
 
 
 def _figure(experiment: str, plot: str) -> Picture:
@@ -45,9 +40,6 @@ def _figure(experiment: str, plot: str) -> Picture:
 _LOOP = "close-the-loop --seed 2"
 PICTURES = {
     "ball_rolling.png": Picture("run ball_rolling --duration 24", "meshcat.html"),
-    "meshcat_live.png": Picture(
-        "run ball_rolling --seed 2", wait_ms=120000, live_sec=12.0
-    ),
     "multiple_collisions.png": Picture("run multiple_collisions", "meshcat.html"),
     "push_object.png": Picture(
         "run push_object --seed 3 --set pose_from=camera model.friction=0.25 n_goals=3",
@@ -112,11 +104,6 @@ def make_pictures(names: list[str], out: Path, work: Path) -> None:
         folder = work / str(k)
         words = [word.replace("OUT", str(folder)) for word in command.split()]
         print(f"makebreak {command}", flush=True)
-        live = [name for name in names if PICTURES[name].command == command]
-        if PICTURES[live[0]].live_sec:
-            _photograph(PICTURES[live[0]], folder, out / live[0])
-            print(f"    {out / live[0]}", flush=True)
-            continue
         done = subprocess.run(
             [*makebreak_command(*words), "--out", str(folder)],
             capture_output=True,
@@ -140,44 +127,10 @@ def make_pictures(names: list[str], out: Path, work: Path) -> None:
             print(f"    {out / name}", flush=True)
 
 
-def _photograph(picture: Picture, folder: Path, to: Path) -> None:
-    """Takes the picture of a run's Meshcat, and then ends the run.
-
-    Raises: RuntimeError if the run ends before.
-    """
-    words = makebreak_command(*picture.command.split(), "--out", str(folder))
-    run = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
-    address, rows = "", folder / ".unfinished" / "recording.csv"
-    try:
-        assert run.stdout is not None
-        while not address:
-            line = run.stdout.readline()
-            if not line:
-                raise RuntimeError(f"{picture.command}: it ended without a Meshcat")
-            if line.startswith("Meshcat: "):
-                address = line.split()[1]
-        while _last_time(rows) < picture.live_sec:
-            if run.poll() is not None:
-                raise RuntimeError(f"{picture.command}: it ended before the picture")
-            sleep(0.2)
-        screenshot(address, to, picture.size, picture.wait_ms)
-    finally:
-        run.send_signal(signal.SIGINT)
-        run.communicate()
-
-
-def _last_time(recording: Path) -> float:
-    """The time of the last whole row of a recording that grows [s]."""
-    lines = recording.read_text().splitlines() if recording.is_file() else []
-    with suppress(IndexError, ValueError):
-        return float(lines[-2].split(",")[0])
-    return 0.0
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(
-        description="Makes the images of docs/pictures from runs.",
-        epilog=f"images: {', '.join([*PICTURES, *PLOTS])}",
+        description="The pictures of docs/pictures, from runs.",
+        epilog=f"pictures: {', '.join([*PICTURES, *PLOTS])}",
     )
     parser.add_argument("pictures", nargs="*", metavar="PICTURE")
     parser.add_argument("--out", type=Path, default=DOCS)

@@ -7,58 +7,11 @@ import argparse
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from threading import Thread
-from time import sleep
-from urllib.request import urlopen
 
-from makebreak.scripts.meshcat_page import with_controls
-
-LIMIT_SEC = 600
-CONNECTS_SEC = 10.0  # So long a page that runs may take to get its scene.
+LIMIT_SEC = 300
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
-
-
-class _Slow(BaseHTTPRequestHandler):
-    """Answers late: a browser's own clock stands still while an image is on its way,
-    but not while a socket's messages are."""
-
-    def do_GET(self):
-        sleep(CONNECTS_SEC)
-        self.send_error(404)
-
-    def log_message(self, *_):
-        pass
-
-
-@contextmanager
-def slow_server() -> Iterator[str]:
-    """While entered, the address of an image that comes late."""
-    server = ThreadingHTTPServer(("localhost", 0), _Slow)
-    Thread(target=server.serve_forever, daemon=True).start()
-    try:
-        yield f"http://localhost:{server.server_port}/late.png"
-    finally:
-        server.shutdown()
-        server.server_close()
-
-
-def live_page(address: str, late: str) -> str:
-    """The page of a Meshcat that runs, with its controls open; it connects to it.
-
-    Args: late: the address of an image that comes when the scene is there.
-    """
-    base = address.rstrip("/") + "/"
-    with urlopen(base) as answer:
-        page = answer.read().decode()
-    page = page.replace("url = location.toString();", f'url = "{base}";')
-    page = page.replace("<head>", f'<head><base href="{base}">', 1)
-    image = f'<img src="{late}" hidden>'
-    return with_controls(page.replace("</body>", f"{image}</body>"))
 
 
 def screenshot(page: Path | str, picture: Path, size=(1280, 800), wait_ms: int = 15000):
@@ -72,17 +25,16 @@ def screenshot(page: Path | str, picture: Path, size=(1280, 800), wait_ms: int =
     Raises: ValueError without page or browser; RuntimeError if the browser writes no
         picture.
     """
-    live = str(page).startswith("http://")
-    if not live and not Path(page).is_file():
-        raise ValueError(f'page: got "{page}", expected an HTML file')
+    address = str(page)
+    if not address.startswith("http://"):
+        if not Path(page).is_file():
+            raise ValueError(f'page: got "{page}", expected an HTML file')
+        address = Path(page).resolve().as_uri()
     browser = next(filter(None, map(shutil.which, _BROWSERS)), None)
     if browser is None:
         raise ValueError("no browser found, expected one of: " + ", ".join(_BROWSERS))
-    with TemporaryDirectory() as folder, slow_server() as late:
+    with TemporaryDirectory() as folder:
         profile, taken = Path(folder) / "profile", Path(folder) / "page.png"
-        file = Path(folder) / "page.html" if live else Path(page).resolve()
-        if live:
-            file.write_text(live_page(str(page), late))
         options = [
             "--headless=new",
             "--no-sandbox",
@@ -90,6 +42,7 @@ def screenshot(page: Path | str, picture: Path, size=(1280, 800), wait_ms: int =
             "--enable-unsafe-swiftshader",
             "--ignore-gpu-blocklist",
             "--disable-quic",
+            "--hide-scrollbars",
             "--no-first-run",
             "--disable-background-networking",
             "--disable-component-update",
@@ -98,7 +51,7 @@ def screenshot(page: Path | str, picture: Path, size=(1280, 800), wait_ms: int =
             f"--window-size={size[0]},{size[1]}",
             f"--virtual-time-budget={wait_ms}",
             f"--screenshot={taken}",
-            file.as_uri(),
+            address,
         ]
         try:
             done = subprocess.run(

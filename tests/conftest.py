@@ -1,4 +1,4 @@
-"""For all tests: one thread, no window, nothing that depends on the clock."""
+"""Settings of all tests: one thread, no windows, no deadlines."""
 
 import os
 import signal
@@ -7,14 +7,14 @@ import signal
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
 
-# A shell starts background jobs with SIGINT ignored, and a program inherits that: the
-# tests that press Ctrl-C would press it in vain.
+# Background jobs of a shell inherit an ignored SIGINT, with which the tests of Ctrl-C
+# would fail.
 signal.signal(signal.SIGINT, signal.default_int_handler)
-# And `nohup` one with SIGHUP ignored, which makebreak would then ignore as well.
+# `nohup` makes programs ignore SIGHUP, which makebreak would then ignore, too.
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 from hypothesis import settings  # noqa: E402  (numpy's threads must be set first)
 
-# The same examples in each run, and no deadline: a slow machine is no failure.
+# The same examples in each run, and no deadline, so that slow machines do not fail.
 settings.register_profile("makebreak", derandomize=True, deadline=None)
 settings.load_profile("makebreak")

@@ -21,7 +21,7 @@ from makebreak.models.scene import (
 
 G = 9.81
 MASS, LENGTH, CENTRAL = 1.0, 0.5, 0.01
-J = CENTRAL + MASS * LENGTH**2  # Of the pendulum about its joint [kg m2].
+J = CENTRAL + MASS * LENGTH**2  # Inertia of the pendulum about its joint [kg m2].
 
 PENDULUM = """<?xml version="1.0"?>
 <robot name="p"><link name="base"/><link name="rod">
@@ -66,7 +66,7 @@ BALL = """<?xml version="1.0"?>
 <inertial><mass>0.07</mass><inertia><ixx>2.7783e-5</ixx><iyy>2.7783e-5</iyy>
 <izz>2.7783e-5</izz></inertia></inertial><collision name="c"><geometry><sphere>
 <radius>0.0315</radius></sphere></geometry>%s</collision></link></model></sdf>"""
-# Full, 140 mm long, lying along x on two spheres of its radius.
+# A solid cylinder, 140 mm long, along x on two spheres of its radius.
 CYLINDER = """<?xml version="1.0"?>
 <sdf version="1.9" xmlns:drake="drake.mit.edu"><model name="b"><link name="roller">
 <inertial><mass>0.4</mass><inertia><ixx>8e-5</ixx><iyy>6.9333e-4</iyy>
@@ -102,7 +102,7 @@ def _weld(child: str) -> ModelDirective:
 
 
 def pendulum(folder, time_step=0.0, gravity=G, actuator=True, joint="", **actuation):
-    """A pendulum that takes effort commands, or what `actuation` says."""
+    """A pendulum with effort commands, or with the given actuation."""
     text = PENDULUM % (joint, TRANSMISSION if actuator else "")
     actuation = actuation or dict(type="effort", joints=["p.j1"])
     return Scene(

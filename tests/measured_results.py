@@ -1,4 +1,4 @@
-"""What `makebreak gap` makes of all measured data: the tables of docs/results.md.
+"""Runs `makebreak gap` on all measured data: the tables of docs/results.md.
 
     python tests/measured_results.py DATA_FOLDER OUT [--only NAME ...] [--write FILE]
 
@@ -33,7 +33,7 @@ LOOP_SEC = 40.0
 
 @dataclass(frozen=True)
 class Row:
-    """An error before and after; goal: at most so much, None: none was set."""
+    """An error before and after; goal: its upper bound, None if none was set."""
 
     what: str
     unit: str
@@ -44,8 +44,8 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Of one set: rows of the table of all, gap's result.json, and the set's own tables
-    by their names in docs/results.md."""
+    """Results of one set: rows of the common table, gap's result.json, and the set's
+    own tables by their names in docs/results.md."""
 
     rows: list[Row]
     result: dict
@@ -78,7 +78,7 @@ def errors(
 
 
 def named_table(result: dict) -> Table:
-    """What gap named, with intervals and ties."""
+    """The table of effects that gap named, with intervals and ties."""
 
     def place(at: str | list[str]) -> str:
         return at if isinstance(at, str) else ", ".join(at)

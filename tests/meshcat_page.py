@@ -1,12 +1,13 @@
-"""What a page makes of the messages that Meshcat sends to it."""
+"""A stand-in for the page that receives Meshcat's messages."""
 
 import numpy as np
 
 
 class Browser:
-    """Stands for Meshcat, and holds poses and scales as the page in the browser does:
-    a transform is split into place, turn and scale, so it sets its path's scale to 1,
-    and what lies below a path is scaled with it."""
+    """A fake Meshcat that keeps poses and scales as the page in the browser does: it
+    splits a transform into translation, rotation and scale, so that a transform resets
+    the scale of its path to 1, and the scale of a path applies to all paths below it.
+    """
 
     def __init__(self):
         self.pose, self.scale = {}, {}

@@ -9,7 +9,7 @@ from makebreak.models.scene import read_scene
 
 
 def pushed_problem(folder, world, truth, rng, episodes: int) -> ContactProblem:
-    """Of a few pushes of `truth`, in the scene that `world` is."""
+    """The problem of a few pushes of `truth` in the scene `world`."""
     table, noise = push_world.record(truth, rng, episodes=episodes)
     scene = push_world.write(folder, world, table, noise)
     return ContactProblem(
@@ -18,6 +18,6 @@ def pushed_problem(folder, world, truth, rng, episodes: int) -> ContactProblem:
 
 
 def screen_of(problem: ContactProblem) -> Screen:
-    """Its rows as they came, with its nuisances."""
+    """A Screen of the problem's training rows, with its nuisances."""
     n = problem.nuisances()
     return Screen(problem.base(), n.columns, n.prior, problem.train(), reach=n.reach)

@@ -10,17 +10,16 @@ TOOL_MASS = 0.3  # [kg]
 
 @dataclass
 class Slide:
-    """To and fro along a line in the plane, speed and normal force as given.
+    """Motion to and fro along a line in the plane, with given speed and normal force.
 
-    The friction along the way is `friction[k]` from `seams[k - 1]` to `seams[k]`, and
-    from one to the next it goes up over `ramp` m before the seam's end: as a ramp, or,
-    with `rows`, in two equal steps, as a block on four corners has it. The ramp begins
-    at the seam.
+    The friction is `friction[k]` from `seams[k - 1]` to `seams[k]`. From a seam on it
+    changes over `ramp` [m]: linearly, or, with `rows`, in two equal steps, as for a
+    block on four corners.
     """
 
     friction: list[float]
     seams: list[float]  # [m], increasing.
-    length: float = 0.6  # [m] of the way; then back again.
+    length: float = 0.6  # Of the line, which is followed to and fro [m].
     speed: float = 0.1  # [m/s]
     normal: float = 8.0  # [N]
     ramp: float = 0.03  # [m]
@@ -29,7 +28,7 @@ class Slide:
     seed: int = 0
     angle: float = 0.0  # Of the line in the plane [rad].
     accelerate_sec: float = 0.15
-    touch_sec: float = 0.1  # Before it, in free space.
+    touch_sec: float = 0.1  # Time at which the contact begins; free space before it.
     period: float = 0.005
     rng: np.random.Generator = field(init=False)
 
@@ -46,22 +45,22 @@ class Slide:
         return mu
 
     def surface_at(self, s):
-        """Index of the surface that it is wholly on, -1 where it is on two."""
+        """Index of the surface below the whole tool; -1 where it is on two."""
         k = int(np.searchsorted(self.seams, s))
         on_two = k > 0 and s < self.seams[k - 1] + self.ramp
         return -1 if on_two else k
 
     def samples(self, seconds, normal=None):
-        """time, wrench, velocity, direction, place s, sample by sample.
+        """Yields time, wrench, velocity, direction and place s of each sample.
 
-        Args: normal, a function of time [N] in place of the constant.
+        Args: normal: function of time [N] instead of the constant.
         """
         axis = np.array([np.cos(self.angle), np.sin(self.angle), 0.0])
         s, v, sign = 0.0, 0.0, 1.0
         for k in range(round(seconds / self.period)):
             time = k * self.period
             touching = time >= self.touch_sec
-            stop = self.accelerate_sec * self.speed / 2.0  # The way that braking takes.
+            stop = self.accelerate_sec * self.speed / 2.0  # Braking distance [m].
             if sign > 0.0 and s > self.length - stop:
                 sign = -1.0
             elif sign < 0.0 and s < stop:

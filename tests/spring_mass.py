@@ -50,7 +50,7 @@ class Config:
     world: str = ""
     whole_only: bool = False  # Whether scoring needs the whole recording.
     fail_at_sec: float = -1.0  # A fault of the program at this time.
-    flown: float = 10.0  # So far away it is lost [m].
+    flown: float = 10.0  # Distance at which the mass counts as lost [m].
     seed: int = 0
 
 

@@ -215,6 +215,20 @@ def test_median_error_over_the_workspace(renderer, size, limit, hidden):
     assert errors.max() < 1.5e-3  # Not one position is lost or far off.
 
 
+def test_the_ball_is_found_in_a_noisy_picture():
+    rng = np.random.default_rng(0)
+    errors = []
+    for _ in range(10):
+        ball = np.array([*([0.5, 0.0] + rng.uniform(-0.12, 0.12, 2)), RADIUS])
+        picture = sketch(ball).astype(float)
+        picture[:, :, :3] += rng.normal(0.0, 20.0, picture[:, :, :3].shape)
+        picture = np.clip(picture, 0, 255).astype(np.uint8)
+        found = find_ball(picture, CAMERA, WEIGHTS, RADIUS, 0.0, ball)
+        assert found is not None
+        errors.append(np.linalg.norm(found.p_WB - ball))
+    assert np.sqrt(np.mean(np.square(errors))) < 3e-4
+
+
 @pytest.mark.parametrize("model_radius", [RADIUS - 5e-3, RADIUS + 5e-3, RADIUS + 8e-3])
 def test_a_wrong_radius_moves_the_ball_along_its_ray_and_no_more(model_radius):
     for x, y in [(0.5, 0.0), (0.6, 0.1), (0.38, -0.12)]:

@@ -596,11 +596,11 @@ def test_a_sentence_reads_as_in_the_report():
         "the friction coefficient of b on g is 0.32"
     )
     assert says("object_size", ["ball"], scale=0.9, radius=0.03) == (
-        "body ball has another size than modelled: it is 0.9 times as large, "
-        "its radius is 0.03 m"
+        "body ball has a wrong size in the model; it really is 0.9 times as large; "
+        "its radius really is 0.03 m"
     )
     assert says("object_size", ["box"], scale=0.9) == (
-        "body box has another size than modelled: it is 0.9 times as large"
+        "body box has a wrong size in the model; it really is 0.9 times as large"
     )
     assert says("object_com", ["box"], x=0.01) == (
         "the centre of mass of body box is at x = 0.01 m in its frame"

@@ -1,6 +1,7 @@
 """An object's mass, centre of mass, inertia and corners. Its size: test_scene.py."""
 
 from dataclasses import replace
+from xml.dom import minidom
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from scipy.integrate import solve_ivp
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
+from makebreak.models.effects.model_text import make_mesh_paths_absolute, text
 from makebreak.models.scene import load_scene
 
 TIMES = np.linspace(0.0, 1.0, 11)
@@ -305,3 +307,19 @@ def test_bodies_that_a_scene_keeps_apart_stay_so(tmp_path, kind, at, parameters,
     )
     assert len(box) + len(plate) == 2 + more
     assert all(inspector.CollisionFiltered(a, b) for a in box for b in plate)
+
+
+def test_meshes_of_an_edited_copy_are_those_beside_the_original(tmp_path):
+    document = minidom.parseString(
+        """<model>
+        <mesh filename="../visual/arm.obj"/><mesh filename="package://robot/hand.obj"/>
+        <mesh><uri> meshes/leg.stl </uri></mesh><mesh><uri>file:///a.obj</uri></mesh>
+        </model>"""
+    )
+    make_mesh_paths_absolute(document, tmp_path / "urdf")
+    names = [m.getAttribute("filename") for m in document.getElementsByTagName("mesh")]
+    assert names[:2] == [
+        f"file://{tmp_path}/visual/arm.obj", "package://robot/hand.obj"
+    ]  # fmt: skip
+    uris = [text(uri) for uri in document.getElementsByTagName("uri")]
+    assert uris == [f"file://{tmp_path}/urdf/meshes/leg.stl", "file:///a.obj"]

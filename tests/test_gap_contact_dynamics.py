@@ -24,9 +24,10 @@ from makebreak.gap.numerics import permitted_forces
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Outcome, SearchPlan, is_sane
 from makebreak.gap.residuals import contact_means
+from makebreak.gap.residuals.contact_candidates import _best_rectangles
 from makebreak.gap.residuals.contact_dynamics import ContactDynamics
 from makebreak.gap.residuals.contact_means import felt_motion, variance_of_means
-from makebreak.gap.residuals.contact_problem import ContactProblem, _best_rectangles
+from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.contact_shapes import _Point, _Surface
 from makebreak.gap.residuals.permitted_contacts import Shift
 from makebreak.gap.result import Considered, GapMeasure

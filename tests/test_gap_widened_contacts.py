@@ -11,10 +11,8 @@ from push_problems import screen_of
 from makebreak.gap.data.recording import read_recordings
 from makebreak.gap.numerics.permitted_forces import tangents
 from makebreak.gap.problem import Fitted
-from makebreak.gap.residuals.contact_problem import (
-    FRICTION_SPREAD,
-    ContactProblem,
-)
+from makebreak.gap.residuals.contact_candidates import FRICTION_SPREAD
+from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.sap_lift import sap_lift
 from makebreak.gap.residuals.widened_contacts import (
     distances_off,

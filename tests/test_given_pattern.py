@@ -9,7 +9,11 @@ import numpy as np
 import pytest
 
 from makebreak.diagrams.arm_reach import ArmReach, joint_positions_along
-from makebreak.diagrams.given_pattern import begin_there, drawn, expected_contacts
+from makebreak.diagrams.given_pattern import (
+    expected_contacts,
+    segment_paths,
+    start_at_pattern,
+)
 from makebreak.diagrams.multiple_collisions import (
     IMPACTS,
     MultipleCollisionsConfig,
@@ -120,7 +124,7 @@ def test_a_segment_that_does_not_lead_into_its_contact_is_refused():
 def test_the_arm_of_world_and_model_begins_at_the_first_pose(model):
     world, mine = (read_model("", TABLETOP_WALLS, "sphere") for _ in range(2))
     pattern = down_and_along()
-    begin_there(pattern, world, mine, TOOL)
+    start_at_pattern(pattern, world, mine, TOOL)
     assert world.initial.positions == mine.initial.positions
     reach = ArmReach(make_control_plant(mine, TOOL))
     p, R = reach.pose(reach.q_default)
@@ -154,7 +158,7 @@ def line(a, b, seconds, **more):
 def test_what_the_arm_cannot_follow_is_refused(pattern, message):
     world, mine = (read_model("", TABLETOP_WALLS, "sphere") for _ in range(2))
     with pytest.raises(ValueError, match=message):
-        begin_there(pattern, world, mine, TOOL)
+        start_at_pattern(pattern, world, mine, TOOL)
 
 
 def test_the_world_is_the_seed_s_whatever_moves_in_it():
@@ -176,7 +180,7 @@ def test_the_world_is_the_seed_s_whatever_moves_in_it():
 
 def test_the_drawn_path_has_a_line_for_each_segment_from_start_to_end():
     pattern = down_and_along()
-    for piece, segment in zip(drawn(pattern), pattern.segments, strict=True):
+    for piece, segment in zip(segment_paths(pattern), pattern.segments, strict=True):
         np.testing.assert_allclose(piece[[0, -1]], segment.positions, atol=1e-12)
 
 

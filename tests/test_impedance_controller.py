@@ -23,6 +23,7 @@ from makebreak.diagrams.station import (
 from makebreak.models.model_files import MODELS
 from makebreak.models.scene import read_scene
 from makebreak.systems.arm.impedance_controller import (
+    DELAY_DAMPING_MAX,
     ImpedanceConfig,
     ImpedanceController,
     serial_chain_of,
@@ -567,6 +568,31 @@ def test_the_default_torque_carries_the_arm(plant, chain):
     context = plant.CreateDefaultContext()
     expected = -plant.CalcGravityGeneralizedForces(context)
     np.testing.assert_allclose(tau, expected, atol=1e-12)
+
+
+def test_a_delay_bounds_the_damping_of_the_tips_position(plant, chain):
+    config = ImpedanceConfig()
+    q = plant.GetPositions(plant.CreateDefaultContext())
+    at_rest = chain_state(chain, q, np.zeros(7))
+    mobility = at_rest.J[:3] @ np.linalg.solve(at_rest.M, at_rest.J[:3].T)
+    delay = 0.02
+    bound = DELAY_DAMPING_MAX / np.diag(mobility) / delay
+    assert np.all(bound < config.damping[:3])
+
+    def torque(**ports):
+        controller = ImpedanceController(config, plant)
+        context = controller.CreateDefaultContext()
+        values = {"q": q, "v": np.full(7, 0.03), "x_desired": reference()} | ports
+        for name, value in values.items():
+            controller.GetInputPort(name).FixValue(context, np.array(value))
+        Simulator(controller, context).AdvanceTo(0.2)
+        return controller.GetOutputPort("tau").Eval(context)
+
+    bounded = torque(damping=[*bound, *config.damping[3:]])
+    np.testing.assert_allclose(torque(delay=[delay]), bounded, rtol=1e-9)
+    # A delay of one period is that of every tick.
+    np.testing.assert_array_equal(torque(delay=[0.001]), torque())
+    assert np.max(abs(bounded - torque())) > 0.1
 
 
 # Refusals.

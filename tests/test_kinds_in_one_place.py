@@ -45,11 +45,13 @@ KNOWN = {
         "contact_friction", "contact_stiffness", "friction_patch", "plane_height",
         "plane_tilt", "wall_position",
     },
-    "gap/residuals/contact_problem.py": {
-        "actuator_gain", "sensor_bias", "sensor_delay",
+    "gap/residuals/contact_candidates.py": {
         "body_drag", "constant_force", "contact_friction", "friction_patch",
         "object_com", "object_inertia", "object_mass", "object_size", "plane_height",
         "plane_tilt",
+    },
+    "gap/residuals/contact_problem.py": {  # Of which the candidates were a part.
+        "contact_friction", "friction_patch", "object_mass", "object_size",
     },
     "gap/simulation/free_windows.py": {"length_scale"},
     "gap/simulation/windows.py": {"length_scale"},

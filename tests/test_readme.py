@@ -6,6 +6,7 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from makebreak.models.effects import KINDS
@@ -34,6 +35,13 @@ def test_the_readmes_diagram_pushes_its_puck_to_the_goal(tmp_path):
 def test_the_plan_of_the_page_on_c3_goes_to_the_goal(tmp_path):
     said = printed(ROOT / "docs" / "c3.md", tmp_path)
     assert abs(float(said.split()[-2]) - 0.5) < 0.1, said
+
+
+def test_the_lcs_of_its_page_is_a_step_of_the_finger(tmp_path):
+    # 1 N on 1 kg for 50 ms, not yet at the puck; implicit Euler: q = dt v.
+    said = printed(ROOT / "docs" / "lcs.md", tmp_path)
+    numbers = np.array(re.findall(r"-?\d+\.\d*", said), dtype=float)
+    np.testing.assert_allclose(numbers, [0.0025, 0, 0.05, 0, 0, 0, 0, 0], atol=5e-5)
 
 
 def test_the_number_of_kinds_is_told_as_it_is():

@@ -42,3 +42,13 @@ def test_blur_scales_as_noise_time_and_density_do():
     assert blur_sec(1e-3, 0.06, 2.0) == pytest.approx(blur_sec(1e-3, 0.03, 1.0))
     assert blur_sec(8e-3, 0.03, 1.0) == pytest.approx(2.0 * blur_sec(1e-3, 0.03, 1.0))
     assert blur_sec(0.0, 0.03, 1.0) == 0.0 and np.isfinite(blur_sec(1e-3, 0.03, 0.0))
+
+
+def test_an_offset_of_the_samples_is_one_of_the_values_alone():
+    t = np.linspace(0.0, 2.0, 60)
+    y = 0.3 * np.sin(3.0 * t) + np.random.default_rng(0).normal(0.0, 1e-3, len(t))
+    plain, moved = smooth(t, y, 1e-3), smooth(t, y + 50.0, 1e-3)
+    np.testing.assert_allclose(moved.x, plain.x + [50.0, 0.0, 0.0], atol=1e-7)
+    variance, same = (np.einsum("nii->ni", s.P)[3:] for s in (moved, plain))
+    np.testing.assert_allclose(variance, same, rtol=1e-4)
+    assert np.sqrt(np.mean((plain.x[:, 0] - 0.3 * np.sin(3.0 * t)) ** 2)) < 1e-3

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from makebreak.gap.result import GapResult, Series
 
@@ -123,11 +123,20 @@ def _time_ticks(axes, spans, starts, bins) -> None:
     keys = list(spans)
     for key in keys[1:]:
         axes.axvline(starts[key], color="white", lw=2.0)
-    if len(keys) <= 4:
+    if len(keys) == 1:
+        low, high = spans[keys[0]]
+        times = MaxNLocator(8).tick_values(low, high)
+        times = times[(times >= low) & (times <= high)]
+        per_second = bins[keys[0]] / max(high - low, 1e-9)
+        axes.set_xticks(
+            (times - low) * per_second, [f"{t:g}" for t in times], fontsize=8
+        )
+        axes.set_xlabel("time [s]", fontsize=9)
+    elif len(keys) <= 4:
         ticks, labels = [], []
         for key in keys:
             low, high = spans[key]
-            for share in (0.0, 0.5) if len(keys) > 1 else (0.0, 0.25, 0.5, 0.75, 1.0):
+            for share in (0.0, 0.5):
                 ticks.append(starts[key] + share * bins[key])
                 labels.append(f"{low + share * (high - low):.3g}")
         axes.set_xticks(ticks, labels, fontsize=8)

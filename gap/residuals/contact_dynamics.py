@@ -281,7 +281,7 @@ class ContactDynamics(PermittedContacts):
                 for body in find_bodies(e, self.plant):
                     inertial.setdefault(full_name(self.plant, body), []).append(e)
                 continue
-            if e.kind in SHAPED or e.kind == "sensor_bias":
+            if e.kind in SHAPED or kind.channel == "bias":
                 continue
             if kind.path:
                 P -= self._driven_more(e)
@@ -302,10 +302,10 @@ class ContactDynamics(PermittedContacts):
         """(K, n_wrench) wrenches without the biases that effects give their sensors."""
         names = [name for sensor in self.sensors for name in sensor.names]
         for e in effects:
-            if e.kind != "sensor_bias":
+            if KINDS[e.kind].channel != "bias":
                 continue
             if not set(e.at) <= set(names):
-                raise ValueError("sensor_bias: of forces and moments alone")
+                raise ValueError(f"{e.kind}: of forces and moments alone")
             wrench = wrench - e.parameters["bias"] * np.isin(names, e.at)
         return wrench
 

@@ -15,7 +15,7 @@ import numpy as np
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.recording import FEWEST_ROWS, Episode, Recording, part_of
 from makebreak.gap.problem import Candidate, Fitted, Nuisances, SearchPlan
-from makebreak.gap.residuals.contact_problem import reader_of_trial
+from makebreak.gap.residuals.contact_candidates import reader_of_trial
 from makebreak.gap.residuals.contact_shapes import ContactShapes, poses_of
 from makebreak.gap.residuals.mechanism import link_changes
 from makebreak.gap.residuals.objects import WindowedProblem

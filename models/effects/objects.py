@@ -297,11 +297,11 @@ KINDS = {
             Parameter("scale", "", 0.5, 2.0, 1.0, valid="> 0", optional=True),
             Parameter("radius", "m", 0.002, 0.5, None, valid="> 0", optional=True),
         ),
-        says="{at} has another size than modelled[: it is {scale} times as large]"
-        "[, its radius is {radius}]",
+        says="{at} has a wrong size in the model[; it really is {scale} times as large]"
+        "[; its radius really is {radius}]",
         confused_with=("plane_height", "contact_stiffness", "length_scale"),
         tell_apart="let it rest on several faces, or roll: height and rate of rolling "
-        "both go with the size",
+        "both depend on the size",
         edit_text=_scale_in_text,
         before_finalize=_scale_shapes,
         now=_size_now,

@@ -33,7 +33,7 @@ from makebreak.diagrams.changing_surface import (
     make_task,
     surface_at,
 )
-from makebreak.diagrams.given_pattern import drawn
+from makebreak.diagrams.given_pattern import segment_paths
 from makebreak.diagrams.recorder import recorded
 from makebreak.diagrams.tabletop import THREE_SURFACES, read_model
 from makebreak.scripts.comparison import Comparison
@@ -129,7 +129,7 @@ def task_of(config: ChangingSurfaceConfig) -> SurfaceTask:
         config.pattern, read_model(config.model, THREE_SURFACES, config.tool)
     )
     try:
-        path = np.concatenate(drawn(given))
+        path = np.concatenate(segment_paths(given))
         if len(np.unique(surface_at(path, 0.0))) < 2:
             raise ValueError("it crosses no seam, expected a path over two surfaces")
         return make_task(config, given)

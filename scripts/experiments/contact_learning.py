@@ -64,7 +64,7 @@ from makebreak.systems.changing_contact.numerics.impact_score import impact, low
 SUMMARY = "learns the positions and approach speeds of three contacts (CC fig. 18)"
 Config = ContactLearningConfig
 
-DURATION_SEC = 120.0  # Of a trial, at most.
+DURATION_SEC = 120.0  # Time limit of a trial.
 PEAK_WAIT = 0.2  # Time that is simulated after the end of a trial [s].
 REACHED, TOUCHED = 3e-4, 3e-5  # Distances that count as reached and as touched [m].
 MATCH = 0.003  # A reported contact belongs to a surface within this distance [m].

@@ -20,7 +20,7 @@ from makebreak.systems.numerics.filters import (
     subdivided,
 )
 
-_ITERATIONS_MAX = 4  # Of van Cittert's iteration.
+_ITERATIONS_MAX = 4  # Limit of van Cittert iterations.
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,9 @@ class Smoothed:
     """States at the requested times."""
 
     x: np.ndarray  # (n, 3): value, first and second derivative.
-    P: np.ndarray  # (n, 3, 3) covariances of x.
+    # (n, 3, 3) covariances of x. Rounding, from the vague prior, may leave those of the
+    # first three samples without positive variances.
+    P: np.ndarray
     density: float  # Of the third derivative [unit2/s5].
     innovation: float  # Rms of the one-step errors over their expected one: about 1.
 

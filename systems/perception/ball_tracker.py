@@ -22,7 +22,7 @@ from makebreak.systems.perception.numerics.pinhole import Pinhole
 TRACKED, NOT_FOUND, OUTLIER, WRONG_IMAGE = 0.0, 1.0, 2.0, 3.0
 
 GATE = 8.0  # A measurement farther from its prediction is an outlier [std].
-PATIENCE = 3  # So many outliers in a row restart the filter: the ball was moved.
+PATIENCE = 3  # Consecutive outliers that restart the filter: the ball was moved.
 HOLD_SEC = 0.1  # Unseen for longer: velocity zero, and the whole image is searched.
 START_SPEED = 0.3  # Standard deviation of the velocity after a restart [m/s].
 

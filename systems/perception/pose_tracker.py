@@ -22,7 +22,7 @@ from makebreak.systems.perception.numerics.pose_tracker import find_pose, rollin
 TRACKED, NOT_FOUND, OUTLIER, WRONG_IMAGE = 0.0, 1.0, 2.0, 3.0
 
 GATE = 8.0  # A measurement farther from its prediction is an outlier [std].
-PATIENCE = 3  # So many outliers in a row restart the filter: the object was moved.
+PATIENCE = 3  # Consecutive outliers that restart the filter: the object was moved.
 HOLD_SEC = 0.1  # Unseen for longer: velocities zero, and the whole image is searched.
 START_SPEED, START_RATE = 0.3, 2.0  # Std of velocities after a restart [m/s], [rad/s].
 P_MAX = 1.0  # Bound of the variances [m2], [rad2].

@@ -28,7 +28,7 @@ MARGIN = 2  # Rays beside a hidden one that are dropped too.
 # beside the finger.
 SLIVER_STRENGTH = 0.85
 SMALLEST, LARGEST = 0.6, 1.6  # Range of the radius in the image over the model's.
-MIN_STRENGTH = 40.0  # Of 255: less is another colour.
+MIN_STRENGTH = 40.0  # Least strength of the ball's colour, of 255.
 MIN_SEEN = 0.2  # Least visible fraction of the outline.
 INLIER = 1.0  # Largest distance of an inlier from the fitted outline [px].
 TABLE_DIFFERENCE = 80.0  # Largest difference of table colour, of 765 (r + g + b).

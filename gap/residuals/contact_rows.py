@@ -1,0 +1,93 @@
+"""The rows of a contact problem: which there are, and which of them are fitted.
+
+A row is one equation, wrench or distance of one test function, over its noise.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from makebreak.gap.residuals.contact_dynamics import ContactDynamics
+from makebreak.gap.simulation.windows import LARGEST
+from makebreak.models.effects.kind import Effect
+
+BLOCK_SEC = 0.6  # In which a tool goes a few centimetres.
+
+
+class ContactRows(ContactDynamics):
+    """Rows (m,) out of the table (K, n) of ContactDynamics.left()."""
+
+    # Which of the table are rows (K, n); which test functions are fitted, and the block
+    # of time of each (K,).
+    _shown: np.ndarray
+    _train: np.ndarray
+    _block: np.ndarray
+    _base: np.ndarray | None
+    # The model whose noise weighs all others'; None: each is weighed by its own.
+    _weights: Sequence[Effect] | None
+
+    def _flat(self, r: np.ndarray) -> np.ndarray:
+        return r[self._shown]
+
+    def _of_rows(self, value: np.ndarray) -> np.ndarray:
+        """A value of each test function, for each row."""
+        return np.broadcast_to(value[:, None], self._shown.shape)[self._shown]
+
+    def _of_moments(self) -> np.ndarray:
+        """(m,) number of each row's test function."""
+        return self._of_rows(np.arange(len(self.means.time)))
+
+    def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
+        r = self.left(effects, weighed_as=self._weights)
+        return np.clip(self._flat(r), -LARGEST, LARGEST)
+
+    def weighed_alike(self, one: Sequence[Effect], other: Sequence[Effect]):
+        """A heavier body makes more noise of the same accelerations: by its own weights
+        each of two models that are both below the noise seems better the heavier it is.
+        """
+
+        def row(effects, weights):
+            r = self._flat(self.left(effects, weighed_as=weights))
+            return np.clip(r, -LARGEST, LARGEST)
+
+        return [(row(one, w), row(other, w)) for w in (one, other)]
+
+    def base(self) -> np.ndarray:
+        if self._base is None:
+            self._base = self.residual()
+        return self._base
+
+    def _share_out(self, left: np.ndarray) -> None:
+        """Which blocks are fitted, by what the scene leaves (rows as `_shown`). What is
+        seen at one place alone (a patch, a wall) is seen in few blocks, and must be in
+        both parts: so of each three blocks of which about as much is left, the middle
+        one is held out."""
+        m = self.means
+        block = np.zeros(len(m.time), int)
+        first = 0
+        for number in np.unique(m.episode):
+            mine = m.episode == number
+            start = m.time[mine].min()
+            block[mine] = first + ((m.time[mine] - start) / BLOCK_SEC).astype(int)
+            first = int(block[mine].max()) + 1
+        self._block = block
+        _, order = np.unique(block, return_inverse=True)
+        size = np.sum(np.where(self._shown, left**2, 0.0), axis=1)
+        total = np.bincount(order, weights=size)
+        rank = np.empty(len(total), int)
+        rank[np.argsort(-total, kind="stable")] = np.arange(len(total))
+        self._train = rank[order] % 3 != 1
+
+    def train(self) -> np.ndarray:
+        return self._of_rows(self._train)
+
+    def blocks(self) -> np.ndarray:
+        return self._of_rows(self._block)
+
+    def channel_of_rows(self) -> np.ndarray:
+        index = np.arange(self._shown.shape[1])
+        return np.broadcast_to(index, self._shown.shape)[self._shown]
+
+    def parts(self) -> np.ndarray:
+        number = np.array([t.recording for t in self.tracks])
+        return self._of_rows(number[self.means.episode])
