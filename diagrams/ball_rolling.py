@@ -32,8 +32,8 @@ from makebreak.diagrams.ball_rolling_config import (
     N_TIP,
     PLAN_DT,
     BallRollingConfig,
-    believed,
     c3_config,
+    controller_model,
     learner_config,
     paper_learner_config,
     what_goes_wrong,
@@ -58,6 +58,7 @@ from makebreak.diagrams.station import (
 )
 from makebreak.diagrams.wiring import add_legend, check_own, connect_command
 from makebreak.models.fruit import FRUITS
+from makebreak.models.scene import Scene
 from makebreak.models.tip_and_ball import make_tip_and_ball
 from makebreak.systems.arm.arm_reference import ArmReference, ArmReferenceConfig
 from makebreak.systems.arm.impedance_controller import (
@@ -105,9 +106,15 @@ BALL_CHANNELS = ("ball.ball.x", "ball.ball.y")  # What a camera above sees of it
 
 
 def make_world(
-    config: BallRollingConfig, meshcat: Meshcat | None = None, sampled: bool = False
+    config: BallRollingConfig,
+    meshcat: Meshcat | None = None,
+    sampled: bool = False,
+    scene: Scene | None = None,
 ) -> Diagram:
-    """The station: what is simulated of the experiment, without any controller."""
+    """The station: what is simulated of the experiment, without any controller.
+
+    Args: scene, in place of world_scene(config).
+    """
     if config.camera.position_noise_m != 0.0:
         raise ValueError(
             f"camera.position_noise_m is {config.camera.position_noise_m}, expected 0: "
@@ -124,7 +131,7 @@ def make_world(
             sampled=sampled,
         ),
         meshcat,
-        world_scene(config),
+        world_scene(config) if scene is None else scene,
         wrong=what_goes_wrong(config),
     )
 
@@ -182,7 +189,7 @@ def add_ball_rolling(
         positions (`ball.p_WB`, `ball.v_WB`, `ball.seen`) in place of pictures.
     """
     check_own(config, _OWN)
-    model, model_scene = believed(config)
+    model, model_scene = controller_model(config)
     learner_kind = config.learner if config.adapt else "none"
     projection = config.projection
     if projection == "auto":
@@ -566,7 +573,7 @@ def _add_view(
         plant = station.GetSubsystemByName("plant")
         state, size = station.GetOutputPort("state"), plant.num_multibody_states()
         at = plant.GetBodyByName("ball").floating_positions_start() + 4
-    else:  # As it is believed.
+    else:  # As it is estimated.
         state, size, at = x, N_X, P_BALL.start
     select = np.zeros((3, size))
     select[:, at : at + 3] = np.eye(3)

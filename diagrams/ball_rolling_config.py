@@ -215,7 +215,7 @@ def _replace_ball(scene: Scene, config: BallRollingConfig) -> None:
     raise ValueError(f"the scene {config.world} has no model ball, which object needs")
 
 
-def believed(config: BallRollingConfig) -> tuple[TipAndBall, Scene]:
+def controller_model(config: BallRollingConfig) -> tuple[TipAndBall, Scene]:
     """What the controllers assume: tip and ball, and the model's scene."""
     scene = read_scene(config.model)
     check_parts(scene, "model")

@@ -61,6 +61,7 @@ from makebreak.systems.changing_contact.contact_detector import (
 from makebreak.systems.changing_contact.forward_model import (
     ForwardModelBank,
     ForwardModelConfig,
+    HandoverConfig,
 )
 from makebreak.systems.changing_contact.impact_reflex import (
     ImpactReflex,
@@ -119,6 +120,11 @@ class Knowledge:
     contacts: ContactBelief = ContactBelief()
     modes: ModeTable | None = None  # ModeDetector.knowledge
     models: ModelBank | None = None  # ForwardModelBank.knowledge
+
+
+def friction_from_rest() -> ForwardModelConfig:
+    """Forward models that predict the friction of a motion that begins from rest."""
+    return ForwardModelConfig(handover=HandoverConfig(from_rest=True))
 
 
 def tip_mass(arm: MultibodyPlant):
@@ -323,12 +329,13 @@ def _connect_systems(builder: DiagramBuilder, station, s: _Systems, config) -> N
     connect(s.shaper, "force_directions", *watching, s.impedance)
     connect(s.shaper, "force_targets", s.detector, s.variable, s.impedance)
     connect(s.shaper, "phase", s.detector, s.anticipator, s.variable)
-    connect(s.shaper, "x_desired", s.impedance)
+    connect(s.shaper, "x_desired", s.impedance, s.forward)
     connect(s.detector, "contact", s.anticipator, s.shaper, s.variable)
     connect(s.modes, "transition", s.anticipator, s.forward)
     connect(s.modes, "mode", s.forward)
     connect(s.modes, "touch_mode", s.anticipator)
     connect(s.modes, "collecting", s.variable)
+    connect(s.modes, "undecided", s.forward)
     connect(s.forward, "wrench_predicted", s.variable)
     connect(s.forward, "prediction_error", s.variable)
     connect(s.forward, "handing_over", s.variable)

@@ -15,6 +15,7 @@ from pydrake.systems.framework import Diagram
 from makebreak.diagrams.changing_contact import (
     ChangingContactConfig,
     Knowledge,
+    friction_from_rest,
     make_changing_contact,
 )
 from makebreak.diagrams.given_pattern import expected_contacts, start_at_pattern
@@ -66,12 +67,21 @@ PATH: tuple[tuple[tuple[float, float], ...], ...] = (
 FRICTION, GAP = (0.1, 0.6), 0.1  # Range, and the least difference of two surfaces.
 FORCE = (0.75, 1.5)  # Range of a segment's force over the config's normal_force.
 SPEED_DOWN = 0.1  # [m/s]
+TOUCH_SPEED = 0.015  # Where the table is expected [m/s].
 GIVEN_STD = 0.005  # Of where a given motion expects its contacts [m].
 # Distance of the corners on which the tool stands from its centre, in x and in y [m].
 FEET = {"block": 0.012, "sphere": 0.0}
 # Length over which a sphere's crossing of a seam shows in the features: it crosses at
 # one point, but the features are averages [m].
 SPHERE_CROSSING = 0.01
+
+
+def _control() -> ChangingContactConfig:
+    """The defaults, but for a first touch that is no blow: at 50 mm/s the tool bounces,
+    and is in the air while the motion along the surface begins."""
+    config = ChangingContactConfig(forward_model=friction_from_rest())
+    speed = replace(config.anticipator.speed, first=TOUCH_SPEED)
+    return replace(config, anticipator=replace(config.anticipator, speed=speed))
 
 
 @dataclass
@@ -89,7 +99,7 @@ class ChangingSurfaceConfig:
     pattern: str = ""
     model: str = ""  # Scene file of the controllers' model; "": the shipped one.
     rehearse: int = 0  # Trials in the model before the first real one.
-    control: ChangingContactConfig = field(default_factory=ChangingContactConfig)
+    control: ChangingContactConfig = field(default_factory=_control)
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,16 +31,24 @@ from makebreak.diagrams.ball_rolling import (
     CONTROL,
     add_ball_rolling,
     connect_reference,
+    make_world,
 )
-from makebreak.diagrams.ball_rolling_config import BallRollingConfig, believed
+from makebreak.diagrams.ball_rolling_config import (
+    BallRollingConfig,
+    controller_model,
+    world_scene,
+)
 from makebreak.diagrams.camera import CameraConfig
 from makebreak.diagrams.station import (
     ARM,
     TIP_FRAME,
+    TOOL,
     from_wrist,
     make_control_plant,
 )
 from makebreak.diagrams.wiring import timed
+from makebreak.models.friction_zones import FrictionZone
+from makebreak.models.scene import Scene
 from makebreak.systems.arm.impedance_controller import HybridConfig, serial_chain_of
 from makebreak.systems.arm.tip_state import TipState
 from makebreak.systems.arm.variable_impedance import (
@@ -69,6 +77,7 @@ from makebreak.systems.changing_contact.mode_detector import (
 )
 from makebreak.systems.changing_contact.moving_frame import MovingFrame
 from makebreak.systems.changing_contact.numerics.contact_task import (
+    N_CONTACT,
     N_TRANSITION,
     ContactBelief,
     ExpectedContact,
@@ -100,10 +109,19 @@ BRISK_SEC = 0.4  # A reposition, if nothing slows it.
 # Periods and offsets of what ball_rolling has not [s]. All that runs each millisecond
 # runs at one instant; the motion is chosen after the task, and before arm_reference.
 ESTIMATE, ANTICIPATE, PLAN = 0.005, 0.01, 0.005
+HINT_LEAD_SEC = 0.014  # As in surface_switch: what a hint takes to reach the arm.
 OFFSET, MOTION_OFFSET, BLEND_OFFSET = 1e-4, 3.2e-4, 3.4e-4
 # How well the model is thought to know the ball's radius and the table's height.
 RADIUS_STD = 0.003  # [m]
 TABLE_STD, TABLE_FORCE_PER_SPEED = 0.002, 700.0  # [m], [N s/m]
+# The finger's friction on felt, and where it begins: the rest of the table is glass.
+FELT, SEAM_Y = 0.8, 0.085  # -, [m]
+START_ANGLE = (
+    1.08,
+    1.3,
+)  # Of the ball on its circle: the table may be touched at once.
+TABLES = ("plain", "felt_and_glass")
+SEAM = "seam_anticipator"
 FINGER_MASS = 0.12  # [kg] Between the wrench sensor and the tip.
 # A direction that is let go is to be moved along at once.
 HYBRID = HybridConfig(release_sec=0.03, normal_damping=50.0, closing_speed=0.012)
@@ -180,6 +198,7 @@ class GentleRollingConfig:
     ball: BallRollingConfig = field(default_factory=_brisk_ball)
     touch: TouchConfig = field(default_factory=TouchConfig)
     push: PushMotionConfig = field(default_factory=PushMotionConfig)
+    table: str = "plain"  # Or "felt_and_glass": see on_two_surfaces.
     seed: int = 0
 
 
@@ -225,9 +244,36 @@ def ball_config(config: GentleRollingConfig) -> BallRollingConfig:
     return replace(config.ball, seed=config.seed, adapt=config.adapt)
 
 
+def on_two_surfaces(config: GentleRollingConfig) -> GentleRollingConfig:
+    """The settings of a table that is felt where y > SEAM_Y, glass elsewhere.
+
+    The ball starts before the seam. Once a circle the finger touches the table ahead
+    of it and slides over the seam to and fro, from rest each time.
+    """
+    angle = config.ball.start_angle_rad
+    if angle is None:
+        angle = float(np.random.default_rng([config.seed, 5]).uniform(*START_ANGLE))
+    shape = replace(config.push.shape, press_table=4.0, slide=0.07, survey=3)
+    push = replace(config.push, shape=shape, table_first=2, table_every=8)
+    models = config.touch.forward_model
+    handover = replace(models.handover, from_rest=True)
+    touch = replace(config.touch, forward_model=replace(models, handover=handover))
+    ball = replace(config.ball, start_angle_rad=angle)
+    return replace(config, ball=ball, push=push, touch=touch)
+
+
+def felt_and_glass(ball: BallRollingConfig) -> Scene:
+    """The world: the table as it is, with felt where y > SEAM_Y."""
+    scene = world_scene(ball)
+    scene.friction_zones.append(
+        FrictionZone(f"table~{TOOL}", FELT, [-1.0, 2.0], [SEAM_Y, 1.0])
+    )
+    return scene
+
+
 def prior(config: GentleRollingConfig) -> ContactBelief:
     """Where the model says that the finger will touch, in the frame under the ball."""
-    model, _ = believed(ball_config(config))
+    model, _ = controller_model(ball_config(config))
     shape = config.push.shape
     z = surface_height(shape.land_behind, model.ball_radius, model.tip_radius)
     # Twice the radius' error is the height's. The table is known better, but it is
@@ -259,11 +305,22 @@ def make_gentle_rolling(
     Raises: ValueError for a name in `frozen` that is none of SEVEN or is not in this
         diagram, and for periods and offsets that the diagram sets.
     """
-    ball = ball_config(config)
+    if config.table not in TABLES:
+        raise ValueError(
+            f"table is {config.table!r}, expected one of: {', '.join(TABLES)}"
+        )
+    if config.table == "felt_and_glass":
+        config = on_two_surfaces(config)
+    ball, station = ball_config(config), None
+    hybrid: HybridConfig | None = HYBRID
+    if config.table == "felt_and_glass":
+        station = make_world(ball, meshcat, True, felt_and_glass(ball))
+        hybrid = replace(HYBRID, closing_speed=0.004)
     freeze = _to_freeze(config)
     builder = _Freezer(freeze)
-    hybrid = HYBRID if config.gentle else None
-    add_ball_rolling(builder, ball, meshcat, sampled=True, hybrid=hybrid)
+    if not config.gentle:
+        hybrid = None
+    add_ball_rolling(builder, ball, meshcat, True, hybrid, station)
     if config.gentle:
         _add_touch(builder, config, ball)
     else:
@@ -300,13 +357,15 @@ def _to_freeze(config: GentleRollingConfig) -> list[str]:
                 f"frozen has {name!r}, expected some of: {', '.join(sorted(there))}"
             )
         out += SEVEN[name]
+        if name == "contact_anticipator":
+            out.append(SEAM)  # The same for changes without impact, if it is there.
     return out
 
 
 def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) -> None:
     """The second paper's systems, and what leads from both planners to the arm."""
     touch = config.touch
-    model, scene = believed(ball)
+    model, scene = controller_model(ball)
     arm = make_control_plant(scene)
     chain = serial_chain_of(arm, TIP_FRAME)
     path = CirclePath(np.array(ball.task.center), ball.task.radius)
@@ -401,6 +460,21 @@ def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) ->
     # contact.
     add("no_transition", ConstantVectorSource(np.zeros(N_TRANSITION)))
     connect("no_transition", "y0", ("contact_anticipator", "transition"))
+    if config.table == "felt_and_glass":
+        # Where the surface changed, in the world: there its mode is announced.
+        seam = replace(touch.anticipator, filter=ContactFilterConfig())
+        seam = replace(seam, hint_lead_sec=HINT_LEAD_SEC)
+        seam = timed(seam, ANTICIPATE, OFFSET)
+        add(SEAM, KalmanContactAnticipator(seam))
+        add("no_contact", ConstantVectorSource(np.zeros(N_CONTACT)))
+        connect("no_contact", "y0", (SEAM, "contact"))
+        connect("tip_state", "ee_pose", SEAM)
+        connect("velocity_shaper", "phase", SEAM)
+        connect("push_motion", "trial", SEAM)
+        connect("mode_detector", "transition", SEAM)
+        connect(SEAM, "mode_hint", "mode_detector")
+        connect("reference_blend", "x_desired", "forward_model_bank")
+        connect("mode_detector", "undecided", "forward_model_bank")
     connect("mode_detector", "transition", "forward_model_bank")
     connect("mode_detector", "mode", "forward_model_bank")
     connect("mode_detector", "collecting", "variable_impedance")

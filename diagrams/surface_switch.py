@@ -16,6 +16,7 @@ from pydrake.systems.framework import Diagram
 from makebreak.diagrams.changing_contact import (
     ChangingContactConfig,
     Knowledge,
+    friction_from_rest,
     make_changing_contact,
 )
 from makebreak.diagrams.realism import StationErrors, draw_errors
@@ -32,6 +33,7 @@ from makebreak.diagrams.tabletop import (
 )
 from makebreak.models.friction_zones import FrictionZone
 from makebreak.models.scene import Scene, read_scene
+from makebreak.systems.arm.impedance_controller import HybridConfig
 from makebreak.systems.changing_contact.numerics.contact_task import (
     IMPACTLESS,
     UNKNOWN_MODE,
@@ -73,8 +75,12 @@ class Anticipation:
 def _control() -> ChangingContactConfig:
     """The defaults, with hints given early by the time that they take to reach the arm:
     5 to 10 ms through the estimators, 1 ms to the impedance controller, 5 ms for the
-    filter of the feed-forward."""
-    config = ChangingContactConfig()
+    filter of the feed-forward. The force on wall and stop is released within 30 ms:
+    while it fades, the tool stays there, and the reference moves on."""
+    config = ChangingContactConfig(
+        forward_model=friction_from_rest(),
+        hybrid=HybridConfig(damping_ratio=0.9, release_sec=0.03),
+    )
     return replace(config, anticipator=replace(config.anticipator, hint_lead_sec=0.014))
 
 

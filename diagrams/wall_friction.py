@@ -6,8 +6,8 @@ figure 1b): an impedance controller of constant stiffness follows a motion.
 
 The block comes down on the table, slides to the wall, and along wall and table. When it
 reaches a surface, the stiffness along the normal fades out and a constant force fades
-in, at times given by the motion: nothing adapts. Predictors are only compared with the
-measured force; no prediction reaches the controller.
+in, at times given by the motion: nothing adapts. Predictors are compared with the
+measured force; the prediction of one can be fed forward along the motion.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,6 +37,10 @@ from makebreak.diagrams.station import (
 from makebreak.diagrams.tabletop import TABLETOP_WALLS, TOOL, set_friction
 from makebreak.diagrams.wiring import add_legend
 from makebreak.models.scene import read_scene
+from makebreak.systems.arm.force_feedforward import (
+    ForceFeedforward,
+    ForceFeedforwardConfig,
+)
 from makebreak.systems.arm.impedance_controller import (
     ImpedanceConfig,
     ImpedanceController,
@@ -60,6 +64,7 @@ from makebreak.systems.changing_contact.mode_detector import (
 from makebreak.systems.views.legend import LegendConfig
 
 WALL, N_ARM = "blue_wall", 7
+OURS, LAST = "ours", "last"  # What may be fed forward, beside the predictors.
 CAMERA = ([0.45, -0.95, 0.45], [0.55, 0.05, 0.05])  # Meshcat's position, target [m].
 # Text and color of each part, as in the model files.
 LEGEND = (
@@ -87,6 +92,8 @@ class WallTraining:
     """Training data of the baseline, and how much of it is used."""
 
     trials: int = 14  # In each of the three training sets.
+    tested: int = 1  # Trials that are tested, with seeds from the config's on.
+    joints: bool = True  # False: no predictions of the joints (figures 11 and 12).
     every: int = 10  # Samples of 5 ms between two steps of a long-term prediction.
     long_term: TrainingBudget = field(
         default_factory=lambda: TrainingBudget(
@@ -182,6 +189,7 @@ def make_wall_friction(
     meshcat: Meshcat | None = None,
     predictors: Mapping[str, LongTermPredictor] | None = None,
     knowledge: tuple | None = None,
+    feedforward: str = "",
 ) -> Diagram:
     """The diagram of one trial, with a log that `telemetry` reads.
 
@@ -192,6 +200,8 @@ def make_wall_friction(
             diagram is predictor_<name>.
         knowledge: of mode detector and forward models, from an earlier trial
             (`learned`); None: none.
+        feedforward: the prediction that is fed forward: OURS, of the forward models;
+            LAST, the force measured last; or a name of `predictors`. Empty: none.
     Raises: ValueError for a setting out of range.
     """
     for name in ("stiffness", "stiffness_high", "normal_force"):
@@ -207,6 +217,10 @@ def make_wall_friction(
     plan = _add_plan(builder, motion(config, start_of(control_plant)))
     impedance, tip = _add_controller(builder, station, plan, control_plant)
     _add_predictors(builder, station, tip, plan, predictors or {}, knowledge)
+    builder.Connect(
+        _add_feedforward(builder, station, plan, feedforward),
+        impedance.GetInputPort("wrench_feedforward"),
+    )
     builder.ExportOutput(station.GetOutputPort(f"{ARM}.external_wrench"), "wrench")
     record_station(builder, station, impedance.GetOutputPort("tau"), TOOL)
     if meshcat is not None:
@@ -273,7 +287,6 @@ def _add_controller(
             )
     for name in ("x_desired", "stiffness", "damping"):
         builder.Connect(plan[name], impedance.GetInputPort(name))
-    builder.Connect(plan["push"], impedance.GetInputPort("wrench_feedforward"))
     builder.Connect(
         impedance.GetOutputPort("tau"), station.GetInputPort(f"{ARM}.torque_commanded")
     )
@@ -337,6 +350,30 @@ def _add_predictors(
             if system.HasInputPort(name):
                 builder.Connect(port, system.GetInputPort(name))
     _add_log(builder, signals)
+
+
+def _add_feedforward(
+    builder, station, plan: dict[str, OutputPort], source: str
+) -> OutputPort:
+    """The wrench that is fed forward: the plan's push, and the prediction of `source`,
+    as of make_wall_friction."""
+    if not source:
+        return plan["push"]
+    fed = builder.AddNamedSystem(
+        "force_feedforward",
+        ForceFeedforward(
+            ForceFeedforwardConfig(period_sec=TICK, offset_sec=2.0 * OFFSET)
+        ),
+    )
+    if source == LAST:
+        predicted = station.GetOutputPort(f"{ARM}.external_wrench")
+    else:
+        name = "forward_model_bank" if source == OURS else f"predictor_{source}"
+        predicted = builder.GetSubsystemByName(name).GetOutputPort("wrench_predicted")
+    builder.Connect(predicted, fed.GetInputPort("wrench_predicted"))
+    builder.Connect(plan["direction"], fed.GetInputPort("direction"))
+    builder.Connect(plan["push"], fed.GetInputPort("wrench"))
+    return fed.GetOutputPort("wrench_feedforward")
 
 
 def _add_log(builder, signals: Sequence[OutputPort]) -> None:

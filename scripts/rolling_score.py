@@ -9,7 +9,7 @@ from pydrake.systems.framework import DiagramBuilder
 from scipy.signal import lfilter
 
 from makebreak.diagrams.ball_rolling import BALL_CHANNELS
-from makebreak.diagrams.ball_rolling_config import LEARN, believed, world_scene
+from makebreak.diagrams.ball_rolling_config import LEARN, controller_model, world_scene
 from makebreak.diagrams.camera import describe_camera
 from makebreak.diagrams.recorder import recorded
 from makebreak.diagrams.scene_facts import sphere_radius, spheres_of
@@ -89,7 +89,7 @@ def ground_truth(config, log, plant) -> Track:
         X_ball = plant.EvalBodyPoseInWorld(context, ball)
         p_ball[i], R_ball[i] = X_ball.translation(), X_ball.rotation().matrix()
     center = np.array(config.task.center)
-    model, _ = believed(config)
+    model, _ = controller_model(config)
     world = load_scene(world_scene(config), DiagramBuilder())
     r_tip = sphere_radius(world.plant, world.scene_graph, TOOL)
     centers, radii = spheres_of(world.plant, world.scene_graph, "ball")
@@ -214,7 +214,7 @@ def write_recording(session, log, config):
     seen = log["seen"][row, 0] > 0.5
     for name in BALL_CHANNELS:
         columns[name] = np.where(seen, columns[name], np.nan)
-    session.write_recording(columns, believed(config)[1])
+    session.write_recording(columns, controller_model(config)[1])
 
 
 def plot_path(session, config, track):

@@ -50,7 +50,7 @@ MODEL = "model.yaml"
 
 @dataclass(frozen=True, eq=False)
 class Log(Mapping):
-    """What one simulation gave: `log[column]` is (n, k), a row per sample."""
+    """The samples of one simulation: `log[column]` is (n, k), a row per sample."""
 
     time: np.ndarray  # (n,) [s]
     columns: dict[str, np.ndarray]
@@ -101,25 +101,26 @@ def leaf_systems(system: System):
 
 
 class Session:
-    """What an experiment is given to run with.
+    """Simulates an experiment's diagrams, records them, and writes the run's files.
 
-    Files are written into a hidden folder; `finish` moves them to out_dir. To be used
-    in a `with`, whose end drops what was not moved (outputs.OutputFolder). Systems that
-    are made inside it are compiled when they are simulated, with the scene in Meshcat.
+    Files are written into a hidden folder; `finish` moves them to out_dir. For a
+    `with`, which deletes files that were not moved (outputs.OutputFolder). Systems that
+    are made inside it are compiled when they are simulated, with the scene already in
+    Meshcat.
 
     Args:
         out_dir: the folder of the run's files; made if it is missing.
-        meshcat: where the run is seen; None: nowhere, and no meshcat.html.
-        duration_sec: overrides the experiment's own duration; None: does not [s].
+        meshcat: the viewer; None: no viewer, and no meshcat.html.
+        duration_sec: replaces the experiment's own duration, if given [s].
         realtime: the fastest that simulated time may pass, in simulated seconds per
             second; 0: as fast as possible.
         progress: whether a progress bar is shown.
-        reuse: whether trials that have ended in an earlier session with the same
-            settings are taken as they are; run_many is to be told.
-        command: what writes in the folder, such as "run ball_rolling".
-        inputs: files that it reads.
-    Raises: ValueError for an out_dir that cannot be made or written to, or holds
-        anything that this command did not write.
+        reuse: whether results of complete trials of an earlier session with the same
+            settings are kept; pass it on to run_many.
+        command: that writes in the folder, such as "run ball_rolling".
+        inputs: files that the command reads.
+    Raises: ValueError for an out_dir that cannot be made or written to, or that holds
+        files which this command did not write.
     """
 
     def __init__(
@@ -140,25 +141,25 @@ class Session:
         self.realtime = realtime
         self.reuse = reuse
         self.unwritten: OSError | None = None  # Why a file could not be written.
-        self._figures: list[tuple[Any, str]] = []  # Drawn when the rest is written.
+        self._figures: list[tuple[Any, str]] = []  # Written by `finish`, last.
         self.started = False  # Whether anything has been simulated yet.
         self.interrupted = False
         self.restarts = False  # Whether StartOver is caught, and the run begun again.
         self.on_first_compile: Callable[[], None] = lambda: None
-        self.endings: list[str] = []  # Of each simulation that ended early: why.
-        self.first_calls: list[Callable[[], object]] = []  # That wait.
+        self.endings: list[str] = []  # Why simulations ended early.
+        self.first_calls: list[Callable[[], object]] = []  # They compile, later.
         self._deferred = deferred()
         self._progress = progress
-        self.picture: Path | None = None  # Where the diagram is to be drawn.
-        self._drawn = 0  # Systems in the diagram that was.
+        self.picture: Path | None = None  # File for a drawing of the diagram.
+        self._drawn = 0  # Number of systems in the diagram drawn so far.
         self._partial: dict[str, dict[str, np.ndarray]] = {}
         self._timing: dict[str, dict] = {}
-        self._streams: list[Path] = []  # Recordings as they came.
-        self._watched: list[np.ndarray] = []  # What monitors saw, of each simulation.
+        self._streams: list[Path] = []  # Recordings that are written while it runs.
+        self._watched: list[np.ndarray] = []  # Output of each simulation's monitor.
         self.compared_by = ""  # The command that compares recording and model.
 
     def child(self, name: str) -> "Session":
-        """A session of its own for one of several trials, in the subfolder `name`."""
+        """A session for one of several trials, in the subfolder `name`."""
         return Session(
             self.out_dir / name,
             duration_sec=self.duration_sec,
@@ -179,19 +180,19 @@ class Session:
     ) -> Log:
         """Simulates the diagram and samples its ports, from time 0.
 
-        A sample at time t is taken before the events at t; the first is at time 0, and
-        each is at a multiple of period_sec. Ctrl-C, or the button `stop` in Meshcat,
-        ends the simulation at the next sample; all that was recorded until then is in
-        the log. The button `start over`, where `restarts`, raises StartOver.
+        Samples are taken at multiples of period_sec from time 0 on, each before the
+        events of that time. Ctrl-C, or the button `stop` in Meshcat, ends the
+        simulation at the next sample; the log has everything until then. The button
+        `start over`, if `restarts` is set, raises StartOver.
 
         Args:
             diagram: what is simulated.
             duration_sec: for how long, unless the session's own duration is set [s].
             record: {column: vector output port of the diagram or a system in it}.
             period_sec: time between samples [s].
-            until: called with the time and {column: (k,)} at each sample; a text, why
-                it is over, or True ends it.
-            label: tells apart several simulations of one run, in timing.json and on
+            until: called with the time and {column: (k,)} at each sample; the
+                simulation ends when it returns True, or a text that says why.
+            label: name of one of several simulations of a run, in timing.json and on
                 the progress bar.
             context: where to start from; None: the diagram's default context.
         Returns: the log.
@@ -350,8 +351,8 @@ class Session:
         self._timing[label] = entry
 
     def too_slow(self) -> list[str]:
-        """A line for each system of which more than one update in a hundred took longer
-        than its period: on this machine it would not keep real time."""
+        """A line for each system that would not keep real time on this machine: more
+        than one update in a hundred took longer than its period."""
         lines = {}
         for entry in self._timing.values():
             for name, system in entry["systems"].items():
@@ -374,8 +375,8 @@ class Session:
             self._watched.append(np.array(seen))
 
     def limits_kept(self) -> dict:
-        """What the monitors of the arm have seen, the worst of all simulations, as part
-        of a result; empty where there was none."""
+        """The worst values of the arm's monitors in all simulations, as part of a
+        result; empty if there was no monitor."""
         if not self._watched:
             return {}
         seen = [verdict(worst) for worst in self._watched]
@@ -390,7 +391,7 @@ class Session:
         }
 
     def start_over(self) -> None:
-        """Forgets what was simulated; what is in Meshcat goes, too."""
+        """Discards all simulations so far, and clears Meshcat."""
         self._drop_streams()
         for of_a_run in (
             self.endings, self._figures, self._partial, self._timing, self._watched,
@@ -403,12 +404,12 @@ class Session:
             self.meshcat.DeleteAddedControls()
 
     def save_plot(self, fig, name: str) -> None:
-        """Keeps the matplotlib figure; `finish` writes it as <name>.png, after what
-        matters more if the disk is full, and closes it."""
+        """Keeps the matplotlib figure; `finish` writes it as <name>.png and closes it.
+        Plots come last, so that a full disk loses them first."""
         self._figures.append((fig, f"{name.removesuffix('.png')}.png"))
 
     def path(self, name: str) -> Path:
-        """Where a file of another kind is to be written, before `finish`."""
+        """The path to write a file of another kind to, before `finish`."""
         return self.outputs.file(name)
 
     def write_recording(
@@ -417,16 +418,16 @@ class Session:
         scene: Scene | None = None,
         noise: Mapping | None = None,
     ) -> None:
-        """Writes recording.csv, noise.json where the noise is known, and as model.yaml
-        the scene that controllers believed: what `makebreak gap` is to compare it with.
+        """Writes recording.csv, noise.json if the noise is known, and the controllers'
+        scene as model.yaml, for `makebreak gap` to compare with the recording.
 
-        See gap/data/table.py for the columns' names. It takes the place of what was
-        written while it was simulated.
+        See gap/data/table.py for the columns' names. Replaces the recording that was
+        written during the simulation.
         """
         self._drop_streams()
         self._write("recording.csv", lambda path: write_recording(path, columns, noise))
         if scene is not None:
-            says = "What the controllers believed."
+            says = "The controllers' model."
             place = self.out_dir
             self._write(MODEL, lambda path: write_scene(scene, path, says, place=place))
             files = (self.out_dir / name for name in (MODEL, "recording.csv"))
@@ -468,8 +469,8 @@ class Session:
         self._write(name, lambda path: path.write_text(text))
 
     def _write(self, name: str, write: Callable[[Path], object]) -> None:
-        """A file that cannot be written, as on a full disk, is noted in `unwritten` and
-        left out: there may be room for others, and the run goes on."""
+        """Writes a file; if that fails, as on a full disk, sets `unwritten` and goes on
+        without it, since there may be room for other files."""
         path = self.outputs.file(name)
         try:
             write(path)
@@ -478,9 +479,9 @@ class Session:
             self.unwritten = error
 
     def keep_partial(self) -> bool:
-        """Writes partial.npz: all that was sampled, of a run that could not be scored.
+        """Writes partial.npz, the samples of a run that could not be scored.
 
-        Returns: whether anything was.
+        Returns: whether there were any samples.
         """
         arrays = {
             f"{label}.{name}" if label else name: value
@@ -513,7 +514,7 @@ class Session:
                 for fig, name in self._figures:
                     self._write(name, partial(_save_figure, fig))
                 if self.meshcat is not None:
-                    self.meshcat.DeleteAddedControls()  # Nobody listens there.
+                    self.meshcat.DeleteAddedControls()  # A page cannot answer them.
                     self.write_text("meshcat.html", page_of(self.meshcat))
             finally:  # A plot that fails does not lose the result.
                 files = self.outputs.commit(complete)
@@ -528,7 +529,8 @@ class Session:
         self.outputs.close()
 
     def _timing_summary(self) -> dict:
-        """The whole run's sums, and each simulation's own figures where several ran."""
+        """Sums over the whole run, and figures of each simulation if there were more
+        than one."""
         entries = list(self._timing.values())
         total = {
             key: sum(e[key] for e in entries)
@@ -559,7 +561,7 @@ def _tell(bar: tqdm, text: str) -> None:
 
 
 def _ending(label: str, time: float, duration: float, why: bool | str) -> str:
-    """Why a simulation ended before its time, for the reader."""
+    """A sentence that says when and why a simulation ended early."""
     after = f"{f'{label} ' * bool(label)}ended at {time:.4g} s of {duration:.4g} s"
     return f"{after}: {why}" if isinstance(why, str) else after
 

@@ -8,23 +8,30 @@ import numpy as np
 import pytest
 from pydrake.common.value import AbstractValue
 from pydrake.geometry import Meshcat
+from pydrake.math import RigidTransform
 from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.diagrams.ball_rolling import CONTROL, ESTIMATE, make_ball_rolling
+from makebreak.diagrams.arm_reach import ArmReach
+from makebreak.diagrams.ball_rolling import (
+    CONTROL,
+    ESTIMATE,
+    make_ball_rolling,
+    make_world,
+)
 from makebreak.diagrams.ball_rolling_config import (
     BallRollingConfig,
     LearnerConfig,
     PlannerConfig,
-    believed,
     c3_config,
+    controller_model,
     learner_config,
     paper_learner_config,
     world_scene,
 )
 from makebreak.diagrams.camera import CameraConfig
 from makebreak.diagrams.scene_facts import sphere_radius
-from makebreak.diagrams.station import MODELS
+from makebreak.diagrams.station import MODELS, make_control_plant
 from makebreak.models.scene import load_scene
 from makebreak.scripts import rolling_score
 from makebreak.scripts.cli import main
@@ -314,11 +321,11 @@ def test_radius_error_is_the_models_alone(diagram):
     )
     assert world == R_BALL
     for error in (0.005, 0.0, -0.003):
-        model, _ = believed(config(radius_error_m=error))
+        model, _ = controller_model(config(radius_error_m=error))
         assert model.ball_radius == pytest.approx(R_BALL + error, abs=1e-15)
         assert model.tip_radius == R_TIP
-    right, _ = believed(config(radius_error_m=0.0))
-    wrong, _ = believed(config(radius_error_m=0.005))
+    right, _ = controller_model(config(radius_error_m=0.0))
+    wrong, _ = controller_model(config(radius_error_m=0.005))
     assert wrong.ball_mass == right.ball_mass == 0.07
 
 
@@ -354,8 +361,8 @@ def test_conditions_are_the_worlds_alone():
         for pair in (("finger", "ball"), ("ball", "table")):
             mu = surface_friction(world_scene(changed), *pair)
             assert mu == pytest.approx(friction, abs=1e-12)
-        model, scene = believed(changed)
-        assert model == believed(config())[0]
+        model, scene = controller_model(changed)
+        assert model == controller_model(config())[0]
         kinds = {effect.kind for effect in scene.effects}
         assert kinds <= {"object_size"}
     kinds = {e.kind for e in world_scene(changed).effects}
@@ -384,7 +391,7 @@ def test_a_push_is_told_whether_it_feels_for_the_ball_and_what_it_feels(
 
 def test_world_and_model_start_from_one_file():
     assert BallRollingConfig().world == BallRollingConfig().model
-    model, _ = believed(config(radius_error_m=0.0))
+    model, _ = controller_model(config(radius_error_m=0.0))
     world = load_scene(world_scene(config()), DiagramBuilder())
     for name, radius in (("ball", model.ball_radius), ("finger", model.tip_radius)):
         assert sphere_radius(world.plant, world.scene_graph, name) == radius
@@ -832,9 +839,42 @@ def test_adaptation_finds_the_ball_and_rolls_it_and_without_it_nothing_rolls(tmp
     assert not frozen["initiated"]
 
 
-@pytest.mark.parametrize("read", [world_scene, believed])
+@pytest.mark.parametrize("read", [world_scene, controller_model])
 def test_a_scene_without_arm_or_ball_is_refused_by_what_it_lacks(read):
     other = str(MODELS / "cartpole_walls.scene.yaml")
     wrong = BallRollingConfig(world=other, model=other)
     with pytest.raises(ValueError, match="no model panda, finger, table, ball"):
         read(wrong)
+
+
+def test_where_the_tip_withdraws_it_hides_nothing_and_no_joint_is_at_its_stop():
+    """As drawn with the ball on its circle, and with the arm turned away. At [0.3, 0]
+    the elbow would be 0.02 rad beyond its limit."""
+    config = BallRollingConfig(camera=CameraConfig(renderer="drawn"), ball_noise_m=0.0)
+    arm = make_control_plant()
+    reach = ArmReach(arm)
+    q, (start, _) = reach.q_default, reach.pose(reach.q_default)
+    end = np.array([*config.task.withdrawn, 0.12])  # The height at which it waits.
+    for share in np.linspace(0.1, 1.0, 10):
+        q = reach.positions(start + share * (end - start), reach.R_default, q)
+    assert max(reach.misses(q, end, reach.R_default)) < 1e-3
+    lower, upper = arm.GetPositionLowerLimits(), arm.GetPositionUpperLimits()
+    assert np.minimum(q - lower, upper - q).min() > 0.1
+
+    station = make_world(config)
+    plant = station.GetSubsystemByName("plant")
+    root = station.CreateDefaultContext()
+    context = plant.GetMyMutableContextFromRoot(root)
+    ball = plant.GetBodyByName("ball")
+    away = np.r_[2.8, reach.q_default[1:]]
+    for angle in np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False):
+        p = [0.5 + 0.1 * np.cos(angle), 0.1 * np.sin(angle), 0.0315]
+        plant.SetFreeBodyPose(context, ball, RigidTransform(p))
+        seen = []
+        for joints in (q, away):
+            panda = plant.GetModelInstanceByName("panda")
+            plant.SetPositions(context, panda, joints)
+            image = station.GetOutputPort("overhead.rgb_image").Eval(root).data
+            pixels = image.astype(int)
+            seen.append(int((pixels[:, :, 0] - pixels[:, :, 2] > 60).sum()))
+        assert seen[0] == seen[1] > 500

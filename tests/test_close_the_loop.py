@@ -11,7 +11,7 @@ from effect_scenes import on_ground
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak import model_path
-from makebreak.diagrams.ball_rolling_config import BallRollingConfig, believed
+from makebreak.diagrams.ball_rolling_config import BallRollingConfig, controller_model
 from makebreak.diagrams.recorder import mean_until_next
 from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.station import BALL_ROLLING
@@ -102,7 +102,7 @@ def test_the_wrong_scene_is_wrong_in_the_radius_alone(tmp_path, error):
         assert one.initial.positions == other.initial.positions
     # What a controller believes of it, with no further error.
     config = BallRollingConfig(model=str(tmp_path / "model.yaml"), radius_error_m=0.0)
-    assert believed(config)[0].ball_radius == pytest.approx(wrong)
+    assert controller_model(config)[0].ball_radius == pytest.approx(wrong)
 
 
 def test_a_repair_added_to_the_wrong_scene_is_what_controllers_believe(tmp_path):
@@ -113,7 +113,7 @@ def test_a_repair_added_to_the_wrong_scene_is_what_controllers_believe(tmp_path)
     scene.effects.append(fixed)
     write_scene(scene, tmp_path / "fixed.yaml")
     config = BallRollingConfig(model=str(tmp_path / "fixed.yaml"), radius_error_m=0.0)
-    assert believed(config)[0].ball_radius == pytest.approx(0.0315)
+    assert controller_model(config)[0].ball_radius == pytest.approx(0.0315)
     bodies = [
         load_scene(s, DiagramBuilder()).plant.GetBodyByName("ball")
         for s in (tmp_path / "fixed.yaml", BALL_ROLLING)

@@ -24,6 +24,7 @@ from makebreak.systems.changing_contact.numerics.forward_model import (
     against_motion,
     bank_tuning,
     observe,
+    speed_along,
 )
 from makebreak.systems.changing_contact.numerics.igmm import (
     as_vector,
@@ -270,6 +271,7 @@ def test_a_bank_comes_back_from_its_file(tmp_path):
         np.testing.assert_array_equal(
             as_vector(again.get(mode)), as_vector(bank.get(mode))
         )
+        np.testing.assert_array_equal(again.ratios(mode), bank.ratios(mode))
     (tmp_path / "models.json").write_text('{"with_torque": true}')
     with pytest.raises(ValueError, match="forward models .*models.json"):
         ModelBank.load(tmp_path / "models.json")
@@ -482,3 +484,85 @@ def test_the_port_says_while_a_model_is_handed_over(announced):
     begins = 20 if announced else None
     assert (said.index(1.0) if 1.0 in said else None) == begins
     assert sum(said) == (10 if announced else 0)
+
+
+# From rest.
+
+
+def test_the_friction_of_a_mode_is_the_mean_share_of_the_normal_force():
+    t = tuning()
+    memory = feed(BankMemory(ModelBank()), t, Slide(R=8.0), 0.3, 1, 100)[-1]
+    memory = feed(memory, t, Slide(1, R=12.0), 0.3, 1, 100)[-1]
+    # The torque's lever is 15 mm; 100 samples of 0.1 N over 8 N are good to 1e-3.
+    ratios = memory.bank.ratios(1)
+    np.testing.assert_allclose(ratios, [0.3, 0.015 * 0.3], atol=3e-3)
+    # While it may be another surface, nothing is learned of it.
+    for _ in range(100):
+        sample = Slide(2).sample(0.6)
+        memory = observe(memory, t, *sample, DOWN, 1, undecided=True)
+    np.testing.assert_array_equal(memory.bank.ratios(1), ratios)
+    assert memory.bank.ratios(2) is None
+
+
+def at_rest(memory, t, normal, n, speed_desired=0.0):
+    """The memory after n samples of a tool that presses and does not move."""
+    wrench, still = np.array([0.0, 0.0, normal, 0.0, 0.0, 0.0]), np.zeros(6)
+    d = np.array([1.0, 0.0, 0.0]) if speed_desired else np.zeros(3)
+    for _ in range(n):
+        memory = observe(
+            memory, t, wrench, still, d, DOWN, 2, speed_desired=speed_desired
+        )
+    return memory
+
+
+def test_a_motion_that_begins_has_its_friction_before_it_is_felt():
+    t = tuning(from_rest=True)
+    rest = at_rest(BankMemory(known_bank(t)), t, 12.0, 40)
+    # Half the speed at which it slides, half the friction of 0.5 x 12 N.
+    for speed, force in ((0.004, 3.0), (0.008, 6.0), (0.1, 6.0)):
+        memory = at_rest(rest, t, 12.0, 1, speed)
+        np.testing.assert_allclose(memory.wrench[:3], [-force, 0, 0], atol=0.1)
+        assert memory.ahead and memory.error == rest.error
+    # Nothing of that where it is not asked for: the last force is 0.
+    plain = at_rest(rest, tuning(), 12.0, 2, 0.1)
+    assert abs(plain.predicted[0]) < 1.0 and not plain.ahead
+
+
+def test_once_it_slides_the_mixture_predicts_again():
+    t = tuning(from_rest=True)
+    memory = at_rest(BankMemory(known_bank(t)), t, 8.0, 10)
+    memory = at_rest(memory, t, 8.0, 3, 0.1)
+    slide, ahead = Slide(6), []
+    for _ in range(20):
+        memory = observe(memory, t, *slide.sample(0.2), DOWN, 2, speed_desired=0.1)
+        ahead.append(memory.ahead)
+    assert ahead[:5] == [True] * 5 and not any(ahead[6:])
+    assert abs(memory.predicted[0] - 1.6) < 0.4  # What is felt, not 0.5 x 8 N.
+
+
+def test_a_mode_that_is_not_known_has_the_last_force():
+    t = tuning(from_rest=True)
+    memory = feed(BankMemory(ModelBank()), t, Slide(noise=0.0), 0.5, UNKNOWN_MODE, 60)
+    np.testing.assert_allclose(memory[-1].predicted[0], 4.0, rtol=1e-9)
+    assert memory[-1].error < 0.1 and not memory[-1].bank.models
+    free = feed(BankMemory(ModelBank()), t, Slide(noise=0.0), 0.5, FREE_MODE, 3)[-1]
+    np.testing.assert_array_equal(free.wrench, 0.0)
+
+
+def test_a_hand_over_has_the_normal_force_of_now():
+    t = tuning(handover=10, from_rest=True)
+    memory = BankMemory(known_bank(t))  # Learned at 8 N.
+    slide = Slide(3, R=12.0)
+    for k in range(65):
+        mode = 1 if k < 60 else 2
+        memory = observe(memory, t, *slide.sample(0.2), DOWN, mode, 0.0)
+    np.testing.assert_allclose(memory.predicted[0], 6.0, atol=0.15)
+
+
+def test_the_speed_of_a_reference_is_along_its_direction_and_a_moment_ahead():
+    x = np.zeros(19)
+    x[7:10], x[13:16] = [0.03, 0.04, 0.2], [0.0, 1.0, 0.0]
+    d = np.array([0.6, 0.8, 0.0])
+    np.testing.assert_allclose(speed_along(x, d, 0.01), 0.058, rtol=1e-12)
+    assert speed_along(x, np.zeros(3), 0.01) == 0.0
+    assert speed_along(np.full(19, np.nan), d, 0.01) == 0.0

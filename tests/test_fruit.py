@@ -6,7 +6,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.diagrams.ball_rolling_config import (
     BallRollingConfig,
-    believed,
+    controller_model,
     world_scene,
 )
 from makebreak.diagrams.scene_facts import spheres_of
@@ -84,7 +84,7 @@ def test_the_world_has_the_fruit_and_the_model_a_sphere_of_about_its_size():
     assert len(spheres_of(world.plant, world.scene_graph, "ball")[1]) == len(
         fruit.radii
     )
-    model, scene = believed(config)
+    model, scene = controller_model(config)
     # The sphere of the lime's volume: 27 mm 1.12^(1/3), and 2 mm.
     assert model.ball_radius == pytest.approx(0.027 * 1.12 ** (1 / 3) + 0.002)
     loaded = load_scene(scene, DiagramBuilder())

@@ -25,9 +25,11 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
 )
 from makebreak.systems.changing_contact.numerics.mode_detector import (
     BAD_WRENCH,
+    COLLECTING,
     HINTED,
     NO_FEATURE,
     OK,
+    STIFF_SEC,
     TRACKING,
     ModeMemory,
     ModeTuning,
@@ -338,6 +340,47 @@ def test_a_blow_is_an_anomaly_and_leaves_the_mode():
     assert last.transition[COUNT] == 0
 
 
+def test_the_arm_is_stiff_at_a_departure_and_for_the_batch_not_on_both_surfaces():
+    slide = Slide([0.2, 0.5], [0.3], ramp=0.03)
+    rows = follow(slide, ModeTuning(crossing=0.03), 4.5)
+    collected = [(t, m) for t, _, m in rows if m.stage == COLLECTING]
+    departed = collected[0][1].change_time
+    # 30 mm at 0.1 m/s take 0.3 s.
+    for time, memory in collected:
+        assert memory.undecided
+        if time < departed + STIFF_SEC - 0.01 or len(memory.features):
+            assert memory.collecting
+        elif time > departed + STIFF_SEC:
+            assert not memory.collecting
+    soft = sum(not memory.collecting for _, memory in collected)
+    assert 30 <= soft <= 45  # Of 5 ms each.
+
+
+def test_pressed_as_before_it_slides_on_what_it_did_before():
+    """At a wall a surface's mode is another one; away from it the first one is back,
+    while it is found out again."""
+    tuning = ModeTuning(crossing=0.03)
+    memory = start(tuning)
+    wall = np.array([0.0, 0.0, -1.0, 0.0, 1.0, 0.0])
+    noise = np.random.default_rng(0)
+    modes = []
+    for k in range(300):
+        at_wall = 100 <= k < 200
+        normal = np.array([0.0, -8.0 if at_wall else 0.0, 8.0])
+        friction = 0.2 if not at_wall else 0.45
+        wrench = np.zeros(6)
+        wrench[:3] = normal + 0.1 * noise.normal(size=3)
+        wrench[0] -= friction * (16.0 if at_wall else 8.0)
+        v = np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
+        d, rows = np.array([1.0, 0.0, 0.0]), wall if at_wall else DOWN
+        memory = detect(memory, tuning, 0.005 * k, wrench, v, d, rows)
+        modes.append(memory.mode)
+    assert modes[99] == 1 and modes[199] == 2
+    # At the wall the table's mode stays until the new one is found; then no longer.
+    assert set(modes[100:110]) == {1} and set(modes[200:]) == {1}
+    assert memory.stage == TRACKING and memory.touch_mode == (3.0, 1.0)
+
+
 # Hints.
 
 
@@ -575,7 +618,9 @@ class Played(LeafSystem):
             )
 
 
-NAMES = ("mode", "confidence", "is_new", "transition", "collecting", "status")
+NAMES = (
+    "mode", "confidence", "is_new", "transition", "collecting", "undecided", "status",
+)  # fmt: skip
 
 
 def small_diagram(knowledge=None, slide=None):
@@ -600,13 +645,14 @@ def test_the_system_gives_what_the_maths_does():
     rows = follow(slide, ModeTuning(crossing=0.0), 8.0)
     simulator, detector = small_diagram()
     np.testing.assert_array_equal(
-        outputs(simulator, detector), [*[0.0] * 11, NO_FEATURE]
+        outputs(simulator, detector), [*[0.0] * 12, NO_FEATURE]
     )
     for k in (30, 100, 200, 400, 700, 1500):
         simulator.AdvanceTo(0.005 * k + 1e-3)
         m = rows[k][2]
         out = outputs(simulator, detector)
-        numbers = [m.mode, *m.confidence, m.is_new, *m.transition, m.collecting]
+        numbers = [m.mode, *m.confidence, m.is_new, *m.transition]
+        numbers += [m.collecting, m.undecided]
         # The detector's clock is 0.1 ms later.
         np.testing.assert_allclose(out[:-1], numbers, atol=1.1e-4)
         assert out[-1] == m.status

@@ -72,9 +72,13 @@ SAME_FIGURES = {
         rf"\| the least that force and acceleration allow \| \| [\d.]+ \({N} - {N}\)",
     },
     "impacts of four contacts": {
-        "README.md": rf"four unknown contacts.*at most {N} N in (\d+) of (\d+)",
-        "docs/experiments.md": rf"four contacts.*at most {N} N in (\d+) of (\d+)",
-        "docs/shaping.md": rf"first trial: impact.* N; at most {N} N in (\d+) of (\d+)",
+        "README.md": rf"four unknown contacts.*\| {N} N; \*\*{N} N\*\* \|",
+        "docs/experiments.md": rf"four contacts.*\| {N} N; \*\*{N} N\*\*",
+        "docs/shaping.md": rf"first trial: imp.*?\| {N} \([\d.]+ - {N}\) N; at most",
+    },
+    "impacts of at most 10 N": {
+        "docs/experiments.md": r"four contacts.*at most 10 N in (\d+) of (\d+)",
+        "docs/shaping.md": r"first trial: impact.* N; at most 10 N in (\d+) of (\d+)",
     },
     "position error after five trials": {
         "docs/experiments.md": rf"contacts after five trials \|.*?\| {N} mm, perfect",

@@ -12,6 +12,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from makebreak.diagrams.wall_friction import (
     BEYOND,
     DURATION,
+    LAST,
     TABLE_Z,
     TIMES,
     WALL_X,
@@ -23,12 +24,16 @@ from makebreak.diagrams.wall_friction import (
     telemetry,
     tip_states,
 )
+from makebreak.scripts.experiments import wall_friction
 from makebreak.scripts.experiments.wall_friction import (
     along_the_wall,
     contact_time,
     force_trial,
     run,
     share_in_band,
+    simulated,
+    tracking_error,
+    without_noise,
 )
 from makebreak.scripts.session import Session
 from makebreak.systems.baselines.long_term_predictor import OneStepPredictor
@@ -238,6 +243,87 @@ def test_the_share_in_the_band_counts_two_standard_deviations():
 def test_bad_settings_are_refused_by_name(change, says):
     with pytest.raises(ValueError, match=says):
         make_wall_friction(replace(WallFrictionConfig(), **change))
+
+
+def test_a_fed_forward_prediction_takes_the_lag_off(trial):
+    config, watched = trial
+    before = tracking_error(watched, config)
+    # 7.2 N of friction against 300 N/m: 24 mm, less while it builds up.
+    assert 0.015 < before < 0.025
+    data, _ = simulated(config, feedforward=LAST)
+    assert tracking_error(data, config) < 0.1 * before
+    # The friction is what it was.
+    late = along_the_wall(data["time"]) & (data["time"] > TIMES[4] + 1.5)
+    force = data["wrench"][late, 1].mean()
+    assert force == pytest.approx(watched["wrench"][late, 1].mean(), abs=0.3)
+
+
+def made_up_log(config):
+    """A tip that stands, and predictions that are 0.3, 0.4 and 0.5 N off."""
+    plan = plan_of(config)
+    n = len(plan["time"])
+    q = np.tile([-0.36, -0.11, 0.0, -2.53, 0.0, 2.42, -0.36], (n, 1))
+    log = {"time": plan["time"], "q": q, "v": 0.0 * q}
+    log["wrench"] = np.tile([-8.0, -9.0, 8.0, 0, 0, 0], (n, 1))
+    for name, off in (("", 0.3), ("one_step.", 0.4), ("one_step_change.", 0.5)):
+        log[f"{name}wrench_predicted"] = log["wrench"] + off
+    return log
+
+
+def test_each_prediction_is_fed_forward_in_turn_and_scored(monkeypatch):
+    config, seen = WallFrictionConfig(seed=5), []
+
+    def simulate(config, knowledge, predictors, source):
+        seen.append((source, knowledge, tuple(predictors)))
+        return made_up_log(config), None
+
+    monkeypatch.setattr(wall_friction, "simulated", simulate)
+    each = {}
+    names = {"one_step": 1, "one_step_change": 2}
+    wall_friction.in_the_loop(config, names, "known", made_up_log(config), each)
+    assert seen == [
+        ("last", "known", ()),
+        ("one_step", "known", ("one_step",)),
+        ("one_step_change", "known", ("one_step_change",)),
+        ("ours", "known", ()),
+        ("ours", None, ()),
+    ]
+    fed = {
+        name: each[f"{name}_fed_rmse_N"] for name in wall_friction.FED if name != "none"
+    }
+    expected = dict(
+        last=0.0, one_step=0.4, one_step_change=0.5, ours=0.3, ours_from_scratch=0.3
+    )
+    assert fed == {name: [pytest.approx(x)] for name, x in expected.items()}
+    assert all(len(each[f"tracking_error_{name}_m"]) == 1 for name in wall_friction.FED)
+
+
+def test_reproduce_has_a_row_for_each_that_was_fed_forward(tmp_path):
+    each = {f"tracking_error_{name}_m": [0.001, 0.003] for name in wall_friction.FED}
+    each |= {f"{name}_fed_rmse_N": [0.2, 0.2] for name in wall_friction.FED}
+    (tmp_path / "tested_trials.json").write_text(json.dumps(each))
+    rows = []
+
+    class Comparison:
+        def with_settings(self, settings):
+            return "its"
+
+        def row(self, *row):
+            rows.append(row)
+
+    results = [{"out_dir": str(tmp_path)}, {"error": "failed"}]
+    wall_friction._loop_rows(Comparison(), results)
+    assert len(rows) == len(wall_friction.FED)
+    assert rows[1][2].startswith("2.00 mm (1.00 to 3.00); predicts to 0.200 N, 0.173 N")
+    assert "2 trials" in rows[0][0]
+
+
+def test_noise_that_is_independent_is_taken_out_of_an_error():
+    rng = np.random.default_rng(0)
+    error, noise = 0.2 * rng.normal(size=200_000), 0.1 * rng.normal(size=200_000)
+    both = np.sqrt(np.mean((error + noise) ** 2))
+    assert without_noise(both) == pytest.approx(0.2, rel=0.01)
+    assert without_noise(0.05) == 0.0
 
 
 def test_too_few_trials_are_refused_by_name(tmp_path):

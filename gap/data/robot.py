@@ -216,8 +216,8 @@ def _actuation(robot: Robot, kinds, every, logs, notes: list[str]) -> list[str]:
         return lines
     if joints := named("velocity_command"):
         notes.append("drives follow velocities, with gains that are a guess")
-        inertia = _inertia(robot)
-        kd = [float(f"{SPEED_LOOP * inertia[j]:.2g}") for j in joints]
+        moved = _inertia(robot)
+        kd = [float(f"{SPEED_LOOP * moved[j]:.2g}") for j in joints]
         return [
             "actuation:",
             "  type: velocity  # The gains are guessed: correct them.",

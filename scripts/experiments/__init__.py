@@ -25,6 +25,7 @@ EXPERIMENTS: dict[str, str] = {
     "cartpole_walls": "makebreak.scripts.experiments.cartpole_walls",
     "changing_surface": "makebreak.scripts.experiments.changing_surface",
     "contact_learning": "makebreak.scripts.experiments.contact_learning",
+    "contact_types": "makebreak.scripts.experiments.contact_types",
     "cube_pivoting": "makebreak.scripts.experiments.cube_pivoting",
     "gentle_rolling": "makebreak.scripts.experiments.gentle_rolling",
     "multi_spring": "makebreak.scripts.experiments.multi_spring",

@@ -6,7 +6,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from makebreak.diagrams.ball_rolling import BALL_CHANNELS, make_ball_rolling, task_name
-from makebreak.diagrams.ball_rolling_config import LEARN, BallRollingConfig, believed
+from makebreak.diagrams.ball_rolling_config import (
+    LEARN,
+    BallRollingConfig,
+    controller_model,
+)
 from makebreak.diagrams.fault_kinds import read_fault
 from makebreak.diagrams.lcm_station import make_lcm_station
 from makebreak.diagrams.recorder import recorded
@@ -119,7 +123,7 @@ def run_on_lcm(config, session, url: str) -> dict:
             f"--robot lcm: contact_sequence is {config.contact_sequence}, expected "
             "cycle"
         )
-    arm = make_control_plant(believed(config)[1])
+    arm = make_control_plant(controller_model(config)[1])
     diagram = make_ball_rolling(config, station=make_lcm_station(arm))
     system = diagram.GetSubsystemByName
     ports = {
@@ -161,7 +165,7 @@ def run_on_lcm(config, session, url: str) -> dict:
     row = np.searchsorted(log.time, columns["time"] - 1e-9).clip(0, len(log.time) - 1)
     for name in BALL_CHANNELS:
         columns[name] = np.where(seen[row], columns[name], np.nan)
-    session.write_recording(columns, believed(config)[1])
+    session.write_recording(columns, controller_model(config)[1])
     torque = system("torque_log").FindLog(log.context).data()
     return criteria.result() | {
         "circles_completed_seen": circles,
@@ -191,7 +195,7 @@ def run_on_recording(config, session, recording: Path) -> dict:
         if read_fault(text).kind.on != "planner":
             raise ValueError(f"--fault {text}: a recording has no robot that it meets")
     columns = read_table(recording).columns
-    model, scene = believed(config)
+    model, scene = controller_model(config)
     station = make_replay_station(columns, BALL_CHANNELS, model.ball_radius)
     diagram = make_ball_rolling(config, session.meshcat, station)
     system = diagram.GetSubsystemByName

@@ -1,20 +1,20 @@
 """A block slides over three unknown surfaces: CC 4.3, figures 8, 9 and 10.
 
-The path crosses each seam in several directions, ten times; every segment presses with
-another force. The first time on a surface is a new mode, from then on it must be known
-again. Friction 0.1 to 0.6, gaps of 0.1 and more, forces 6 to 12 N, drawn by the seed.
-The same motion is done with constant K_max and with constant K_free, without
-feed-forward.
+The path crosses each seam in several directions, ten times in all; each segment
+presses with another force. The first time on a surface its mode is new, later it must
+be recognised. Friction is 0.1 to 0.6 with gaps of 0.1 and more, forces are 6 to 12 N,
+drawn by the seed. For comparison the same motion is done with constant K_max and with
+constant K_free, both without feed-forward.
 
-A seam begins where the first of the block's four feet leaves its surface, and is over
-when the last one has; in between the block stands on both. Delays count from there.
-From the moment at which the tip itself is over the seam they are 0.12 s longer at
+A seam begins where the first of the block's four feet leaves its surface, and ends
+when the last one has; in between the block stands on both. Delays count from the end.
+Counted from the moment when the tip itself is over the seam they are 0.12 s longer at
 0.1 m/s; result.json has both.
 
-Criterion, set beforehand. A run is a success if every change is recognised as what it
-is, a known mode within 0.15 s and a new one within 0.25 s; there is no mode too many;
-the tracking error (rms, across the force direction) is at most that of constant K_max;
-and the mean stiffness is at most 40 % of K_max.
+Criterion, set beforehand. A run is a success if every change is recognised correctly,
+a known mode within 0.15 s and a new one within 0.25 s; there is no surplus mode; the
+tracking error (rms, across the force direction) is at most that of constant K_max; and
+the mean stiffness is at most 40 % of K_max.
 
 See docs/modes.md.
 """
@@ -59,7 +59,7 @@ DURATION_SEC = 200.0  # At most.
 KNOWN_SEC, NEW_SEC = 0.15, 0.25  # From the end of a seam to the decision.
 STIFFNESS_SHARE = 0.4  # Of K_max.
 SETTLED_SEC = 0.3  # After the touch; before, there is an impact.
-EARLY_SEC = 0.05  # So long before a seam begins, noise may depart [s].
+EARLY_SEC = 0.05  # A report this long before a seam begins still counts as its [s].
 BENCH = {
     "block": {"baselines": False},
     "sphere": {"tool": "sphere", "baselines": False},
@@ -68,18 +68,18 @@ BENCH = {
 
 @dataclass(frozen=True)
 class Change:
-    """A change of surface, and what was made of it."""
+    """A change of surface, and what the mode detector reported of it."""
 
     before: int  # Numbers of the surfaces.
     after: int
-    begins: float  # When the first foot leaves [s],
-    centre: float  # the tip is over the seam,
-    ends: float  # and the last foot is across.
-    new: bool  # Whether it was not met before.
-    right: bool = False
-    mode: int = 0  # That was decided; 0: none.
-    decided: float = np.nan  # [s]
-    felt: float = np.nan  # The change time that was reported [s].
+    begins: float  # When the first foot leaves the old surface [s].
+    centre: float  # When the tip is over the seam [s].
+    ends: float  # When the last foot is on the new surface [s].
+    new: bool  # Whether the new surface is met for the first time.
+    right: bool = False  # Whether one report came, of the right mode.
+    mode: int = 0  # The reported mode; 0: no report.
+    decided: float = np.nan  # When it was reported [s].
+    felt: float = np.nan  # When, by the report, the change began [s].
     confidence: tuple[float, float] = (np.nan, np.nan)
 
 
@@ -91,7 +91,7 @@ def run(config: ChangingSurfaceConfig, session: Session) -> dict:
     if config.baselines:
         for label, value in (("k_free", stiffness.free), ("k_max", stiffness.maximum)):
             configs[label] = constant_stiffness(config, value)
-    configs["adaptive"] = config  # The last one is what Meshcat's recording shows.
+    configs["adaptive"] = config  # Last, because Meshcat's recording shows the last.
     logs, done = {}, {}
 
     def simulate(knowledge, _, label, config=config, task=task):
@@ -143,7 +143,7 @@ def pressing(log) -> np.ndarray:
 
 
 def sliding(log) -> np.ndarray:
-    """(n,) whether the block is on the surfaces and the touch has settled."""
+    """(n,) whether the block slides on the surfaces, its first touch settled."""
     on = pressing(log)
     if not on.any():
         return on
@@ -157,7 +157,7 @@ def modes_of(log) -> set[int]:
 
 
 def tracking_error(log) -> np.ndarray:
-    """(n,) distance of the tip from where it should be, in the surface [m]."""
+    """(n,) distance of the tip from its reference, within the surface [m]."""
     return np.linalg.norm((log["x_desired"] - _padded(log["ee_pose"]))[:, :2], axis=1)
 
 
@@ -166,11 +166,11 @@ def _padded(pose):
 
 
 def changes_of(log, feet: float, rehearsed: bool = False) -> tuple[list[Change], int]:
-    """Every change of surface in a log, from the truth, with what was decided.
+    """Every true change of surface in a log, with the report that belongs to it.
 
-    Args: rehearsed, whether modes were known before: then the first time on a surface
-        may be one of them, if no other surface has it.
-    Returns: the changes, and how many reports belong to none or came twice.
+    Args: rehearsed, whether modes were known before: then a surface that is met for the
+        first time may be one of them, if no other surface has it.
+    Returns: the changes; the number of reports that belong to none or came twice.
     """
     time, p = log["time"], log["ee_pose"][:, :3]
     on = pressing(log)
@@ -197,7 +197,7 @@ def changes_of(log, feet: float, rehearsed: bool = False) -> tuple[list[Change],
         met.add(int(whole[j]))
     transition = log["transition"]
     events = np.flatnonzero(np.diff(transition[:, COUNT]) > 0) + 1
-    # The mode of the first surface is found out after the touch.
+    # The mode of the first surface is identified after the touch.
     names: dict[int, int] = {}
     if found:
         first = time.searchsorted(found[0].begins)

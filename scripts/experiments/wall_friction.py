@@ -21,6 +21,7 @@ Ours: everything that figure 1b does not show; docs/wall_friction.md says it all
 """
 
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -33,6 +34,8 @@ from makebreak.diagrams.recorder import recorded
 from makebreak.diagrams.tabletop import TABLETOP_WALLS
 from makebreak.diagrams.wall_friction import (
     DURATION,
+    LAST,
+    OURS,
     TIMES,
     WallFrictionConfig,
     learned,
@@ -48,6 +51,7 @@ from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session
 from makebreak.scripts.table import Table
 from makebreak.systems.baselines.numerics.long_term_predictor import (
+    LongTermPredictor,
     Prediction,
     TrainingTrial,
     known,
@@ -81,6 +85,18 @@ ONE_STEP = {"one_step": False, "one_step_change": True}
 FORCE_INPUTS = range(6)  # F and velocity; the position is for the SVM.
 Y = 1  # The axis along the wall.
 TIMES_FILE = "training_times.json"
+EACH_FILE = "tested_trials.json"  # Scores of each tested trial; the result has means.
+NOISE = 0.1  # Of the force sensor [N].
+# As many training trials as in the paper; no joints, which take most of the time.
+IN_LOOP = {"training.trials": 40, "training.tested": 5, "training.joints": False}
+FED = {
+    "none": "nothing",
+    "last": "the last force",
+    "one_step": "GP of the next force",
+    "one_step_change": "GP of its change",
+    "ours": "our forward models",
+    "ours_from_scratch": "ours, from nothing",
+}
 CONTACT_FORCE = 3.0  # [N] of the wall, by which pictures mark the contact.
 
 
@@ -101,15 +117,24 @@ def run(config: WallFrictionConfig, session: Session) -> dict:
             f"--duration: got {session.duration_sec:g}, but a trial takes {DURATION:g} "
             "s, for which everything is predicted"
         )
+    if config.training.tested < 1:
+        raise ValueError(f"training.tested is {config.training.tested}, expected > 0")
     seconds: dict[str, float] = {}  # Not of the result: they differ from run to run.
     trials, knowledge = collect(config, seconds)
+    predictors = one_step_predictors(config, trials["varied"], seconds)
     result: dict = {"success": False}
-    data, scratch, recording = one_step_ahead(
-        config, session, trials, knowledge, seconds, result
-    )
-    force = force_from_the_start(config, trials["varied"], data, seconds, result)
-    joints = joints_from_the_start(config, trials, data, seconds, result)
-
+    each: dict[str, list[float]] = {}  # Scores of each tested trial.
+    for i in range(config.training.tested):
+        tested = replace(config, seed=config.seed * config.training.tested + i)
+        logs = one_step_ahead(tested, session, predictors, knowledge, i, each)
+        in_the_loop(tested, predictors, knowledge, logs[0], each)
+        if i == 0:
+            data, scratch, recording = logs
+            force = force_from_the_start(tested, trials["varied"], data, seconds, each)
+            if config.training.joints:
+                joints = joints_from_the_start(tested, trials, data, seconds, result)
+                session.save_plot(plot_joints(joints), "joint_prediction")
+    result |= {key: float(np.mean(values)) for key, values in each.items()}
     ours = [result["ours_rmse_N"], result["ours_from_scratch_rmse_N"]]
     best = min(result[f"{name}_rmse_N"] for name in (*ONE_STEP, "task_long"))
     result["ours_to_best_baseline"] = ours[0] / best
@@ -124,25 +149,31 @@ def run(config: WallFrictionConfig, session: Session) -> dict:
         )  # fmt: skip
     result |= criteria.result()
     session.write_json(TIMES_FILE, seconds)
-    session.save_plot(plot_joints(joints), "joint_prediction")
+    session.write_json(EACH_FILE, each)
     session.save_plot(plot_forces(data, scratch, force), "force_prediction")
     session.write_recording(recording, read_scene(TABLETOP_WALLS))
     return result
 
 
-def one_step_ahead(config, session, trials, knowledge, seconds, result):
-    """Figure 14: trains, simulates the tested trial with all that predicts, scores.
-
-    Returns: its log, that of the same trial where our models begin with nothing, and
-        what is recorded.
-    """
-    measured = [force_trial(data) for _, data in trials["varied"]]
+def one_step_predictors(config, trials, seconds) -> dict:
+    """The one-step baselines, trained: {name of ONE_STEP: LongTermPredictor}."""
+    measured = [force_trial(data) for _, data in trials]
     predictors = {}
     for name, change in ONE_STEP.items():
         budget = replace(config.training.one_step, predict_change=change)
         start = perf_counter()
         predictors[name], _ = train(measured, budget, FORCE_INPUTS)
         seconds[f"{name}_training_s"] = perf_counter() - start
+    return predictors
+
+
+def one_step_ahead(config, session, predictors, knowledge, number, each):
+    """Figure 14: simulates the `number`th tested trial with all predictors watching,
+    and scores them. Nothing is fed forward.
+
+    Returns: its log, that of the same trial where our models begin with nothing, and
+        what is recorded.
+    """
     logs = []
     for label, known_before in (("ours", knowledge), ("ours_from_scratch", None)):
         diagram = make_wall_friction(config, session.meshcat, predictors, known_before)
@@ -151,7 +182,7 @@ def one_step_ahead(config, session, trials, knowledge, seconds, result):
             DURATION,
             {"wrench": diagram.GetOutputPort("wrench")},
             period_sec=0.02,
-            label=label,
+            label=f"{label}_{number + 1}" if number else label,
         )
         if len(log.time) < DURATION / 0.02:
             raise ValueError(f"the trial takes {DURATION:.1f} s, got {log.time[-1]} s")
@@ -159,18 +190,57 @@ def one_step_ahead(config, session, trials, knowledge, seconds, result):
         logs.append(data)
         window = along_the_wall(data["time"])
         force = data["wrench"][window, Y]
-        result[f"{label}_rmse_N"] = rms(data["wrench_predicted"][window, Y] - force)
-        result[f"{label}_modes"] = len(np.unique(data["mode"][window]))
+        error = rms(data["wrench_predicted"][window, Y] - force)
+        _add(each, f"{label}_rmse_N", error)
+        _add(each, f"{label}_modes", len(np.unique(data["mode"][window])))
     for name in predictors:
         mean = data[f"{name}.wrench_predicted"][window, Y]
         std = data[f"{name}.std"][window, Y]
-        result[f"{name}_rmse_N"] = rms(mean - force)
-        result[f"{name}_in_band"] = share_in_band(force, mean, std)
-    result["persistence_rmse_N"] = rms(np.diff(data["wrench"][:, Y])[window[1:]])
+        _add(each, f"{name}_rmse_N", rms(mean - force))
+        _add(each, f"{name}_in_band", share_in_band(force, mean, std))
+    last = rms(np.diff(data["wrench"][:, Y])[window[1:]])
+    _add(each, "persistence_rmse_N", last)
     return *logs, recorded(diagram, log.context)
 
 
-def force_from_the_start(config, trials, data, seconds, result):
+def in_the_loop(config, predictors, knowledge, watched, each) -> None:
+    """The same trial with the prediction of one after the other fed forward: how far
+    the tip is from the plan along the wall, and how well the fed one predicts.
+
+    Args: watched, the log without any.
+    """
+    _add(each, "tracking_error_none_m", tracking_error(watched, config))
+    for label, known_before, source in (
+        ("last", knowledge, LAST),
+        *((name, knowledge, name) for name in ONE_STEP),
+        ("ours", knowledge, OURS),
+        ("ours_from_scratch", None, OURS),
+    ):
+        chosen = {name: one for name, one in predictors.items() if name == source}
+        data, _ = simulated(config, known_before, chosen, source)
+        window = along_the_wall(data["time"])
+        force = data["wrench"][:, Y]
+        if source == LAST:
+            error = rms(np.diff(force)[window[1:]])
+        else:
+            column = f"{source}." * (source in chosen) + "wrench_predicted"
+            error = rms((data[column][:, Y] - force)[window])
+        _add(each, f"{label}_fed_rmse_N", error)
+        _add(each, f"tracking_error_{label}_m", tracking_error(data, config))
+
+
+def tracking_error(data, config) -> float:
+    """Distance of the tip from the plan along the wall, rms over the way there [m]."""
+    window = along_the_wall(data["time"])
+    plan = plan_of(config)["x_desired"][: len(data["time"])]
+    return rms((tip_states(data)[0][:, Y] - plan[:, Y])[window])
+
+
+def _add(each: dict[str, list[float]], key: str, value) -> None:
+    each.setdefault(key, []).append(float(value))
+
+
+def force_from_the_start(config, trials, data, seconds, each):
     """Figure 13: the force over the whole trial, from the plan alone.
 
     Returns: time (n,), mean (n,) and standard deviation (n,) of the force along y.
@@ -192,8 +262,8 @@ def force_from_the_start(config, trials, data, seconds, result):
     seconds["task_long_prediction_s"] = perf_counter() - start
     time = data["time"][::every]
     mean, std, w = ahead.mean[:, Y], ahead.std[:, Y], along_the_wall(time)
-    result["task_long_rmse_N"] = rms((mean - tested.x[:, Y])[w])
-    result["task_long_in_band"] = share_in_band(tested.x[w, Y], mean[w], std[w])
+    _add(each, "task_long_rmse_N", rms((mean - tested.x[:, Y])[w]))
+    _add(each, "task_long_in_band", share_in_band(tested.x[w, Y], mean[w], std[w]))
     return time, mean, std
 
 
@@ -239,6 +309,8 @@ def collect(config: WallFrictionConfig, seconds: dict):
     knowledge = None
     start = perf_counter()
     for k, (name, (frictions, is_stiff, _)) in enumerate(SETS.items()):
+        if name != "varied" and not config.training.joints:
+            continue
         trials[name] = []
         before = None
         for i in range(config.training.trials):
@@ -257,13 +329,20 @@ def collect(config: WallFrictionConfig, seconds: dict):
     return trials, knowledge
 
 
-def simulated(config: WallFrictionConfig, knowledge: tuple | None = None):
-    """The log of one trial, and what our models know after it."""
-    diagram = make_wall_friction(config, knowledge=knowledge)
+def simulated(
+    config: WallFrictionConfig,
+    knowledge: tuple | None = None,
+    predictors: Mapping[str, LongTermPredictor] | None = None,
+    feedforward: str = "",
+):
+    """The log of one trial, and what our models know after it; the rest as of
+    make_wall_friction."""
+    predictors = predictors or {}
+    diagram = make_wall_friction(config, None, predictors, knowledge, feedforward)
     simulator = Simulator(diagram)
     simulator.AdvanceTo(DURATION)
     context = simulator.get_context()
-    return telemetry(diagram, context), learned(diagram, context)
+    return telemetry(diagram, context, tuple(predictors)), learned(diagram, context)
 
 
 def features(data) -> np.ndarray:
@@ -447,6 +526,7 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
         ("predictor_one_step", "the baseline's prediction, a sample"),
     ):
         row(label, "-", f"{online.get(name, np.nan):.2f} ms")
+    _loop_rows(comparison, comparison.runs(IN_LOOP, seeds))
     return comparison.to_table(
         "A wall of unknown friction (CC 4.4)",
         [
@@ -459,6 +539,34 @@ def reproduce(session: Session, seeds: int, jobs: int) -> Table:
             "of 40 trials.",
         ],
     )
+
+
+def _loop_rows(comparison: Comparison, results) -> None:
+    """What predictions that are fed forward do to the tracking error, over the tested
+    trials of all runs, beside their errors, with the sensor's noise and without."""
+    each: dict[str, list[float]] = {}
+    for result in results:
+        if "error" not in result:
+            path = Path(result["out_dir"]) / EACH_FILE
+            for key, values in json.loads(path.read_text()).items():
+                each.setdefault(key, []).extend(values)
+    its = comparison.with_settings(IN_LOOP)
+    n = len(each.get("tracking_error_none_m", []))
+    for label, what in FED.items():
+        x = 1e3 * np.array(each.get(f"tracking_error_{label}_m", [np.nan]))
+        text = f"{np.mean(x):.2f} mm ({np.min(x):.2f} to {np.max(x):.2f})"
+        if label != "none":
+            error = float(np.mean(each.get(f"{label}_fed_rmse_N", [np.nan])))
+            text += f"; predicts to {error:.3f} N, {without_noise(error):.3f} N of it "
+            text += "not the sensor's noise"
+        row = f"fed forward: {what}; tracking error, {n} trials"
+        comparison.row(row, "-", text, None, its)
+
+
+def without_noise(error: float) -> float:
+    """What is left of a prediction's rms error against a measured force when the
+    sensor's noise, which is independent of the prediction, is taken out [N]."""
+    return float(np.sqrt(max(error**2 - NOISE**2, 0.0)))
 
 
 def times(results) -> tuple[dict, dict]:

@@ -113,9 +113,9 @@ class AnticipatorMemory:
     count: float = 0.0
     updated: tuple[int, ...] = ()  # Contacts felt in this trial,
     passed: tuple[int, ...] = ()  # and those that were passed without.
-    last: int = -1  # The contact that was made last; -1: none that is to learn.
-    touch: int = -1  # The one whose mode is not found out yet; -1: none.
-    found: float = 0.0  # A counter, of touches whose mode was.
+    last: int = -1  # The last contact made, while its force is awaited; -1: none.
+    touch: int = -1  # The one whose mode is not identified yet; -1: none.
+    found: float = 0.0  # Counts the touches whose mode was identified.
     last_time: float = -np.inf  # When one was made or broken [s].
     segment_time: float = 0.0  # When this segment began [s].
     status: int = 0
@@ -158,8 +158,8 @@ class KalmanContactAnticipator(LeafSystem):
     without an impact, from `transition`, is an impact-less contact: its place is looked
     up in the recent past, at its change time, not where it was confirmed. A learned
     contact that is passed and not felt doubles its standard deviation; above FORGET_STD
-    it is given up before the next trial. Which mode a contact brought, from
-    `touch_mode`, is told when it is felt in a later trial.
+    it is given up before the next trial. The mode that a contact brought, from
+    `touch_mode`, is announced when that contact is felt in a later trial.
 
     The peak force of an impact gives the next approach speed: by regression of force on
     speed, or by eq. 9, at most `growth` times faster than before.
@@ -176,8 +176,8 @@ class KalmanContactAnticipator(LeafSystem):
              mode_hint (1,) the mode that begins at the expected place of an impact-less
              change, from hint_lead_sec before the tip passes it until HINT_WAY past its
              region; -1: none;
-             touch_hint (1,) the mode that the contact brought before which was felt
-             last, until that of now is found out; -1: none;
+             touch_hint (1,) the mode that the last felt contact brought in an earlier
+             trial, until its present mode is identified; -1: none;
              status (1,) 0, or BAD_INPUT: the belief is held.
 
     Source: CC 3.3, 3.4.1.
@@ -240,7 +240,7 @@ class KalmanContactAnticipator(LeafSystem):
             ("status", lambda memory: float(memory.status)),
         ):
             self.DeclareVectorOutputPort(name, 1, partial(self._put, calc), ticket)
-        # Whoever asks between two updates gets the hint of that time.
+        # Computed when read, between two updates too: it depends on time.
         self.DeclareVectorOutputPort(
             "mode_hint", 1, self._put_hint, ticket | {self.time_ticket()}
         )
@@ -288,7 +288,8 @@ class KalmanContactAnticipator(LeafSystem):
         return best
 
     def _next_trial(self, belief: ContactBelief) -> ContactBelief:
-        """What is expected at the beginning of a trial, after the one before."""
+        """The belief at the beginning of a trial: learned contacts have drifted,
+        uncertain ones are dropped, those never felt get the first speed."""
         drift = self._filter.std_drift**2 * np.eye(3)
         contacts = []
         for contact in belief.contacts:
@@ -305,7 +306,7 @@ class KalmanContactAnticipator(LeafSystem):
         return ContactBelief(tuple(contacts))
 
     def _begun(self, memory, context) -> AnticipatorMemory:
-        """The memory, of a new trial if the port `trial` says so."""
+        """The memory; that of a new trial if the number on the port `trial` changed."""
         if not self._trial.HasValue(context):
             return memory
         trial = float(self._trial.Eval(context)[0])
@@ -331,7 +332,7 @@ class KalmanContactAnticipator(LeafSystem):
         state.get_mutable_abstract_state(self._memory).set_value(memory)
 
     def _after(self, memory, time, pose, contact, transition, phase):
-        """The memory after one tick."""
+        """The memory after one update."""
         inputs = (pose[:3], contact, transition, phase)
         if not all(np.all(np.isfinite(x)) for x in inputs):
             return replace(memory, status=BAD_INPUT)
@@ -360,7 +361,8 @@ class KalmanContactAnticipator(LeafSystem):
     # An impact.
 
     def _felt(self, memory, contact):
-        """After a contact that was made."""
+        """The memory after a contact was made: the expected contact it belongs to is
+        corrected, or a new one is added."""
         p, d, time = contact[POSITION], contact[DIRECTION], contact[TIME]
         memory = replace(memory, made=contact[MADE], last=-1, last_time=time)
         if not abs(np.linalg.norm(d) - 1.0) < 1e-3:
@@ -435,7 +437,7 @@ class KalmanContactAnticipator(LeafSystem):
         )
 
     def _measured(self, memory, contact):
-        """After the peak force of the last contact is known: its next speed."""
+        """The memory after the last contact's peak force is known: its next speed."""
         memory = replace(memory, measured=contact[MEASURED])
         speed, force = contact[SPEED], contact[PEAK_FORCE]
         k = memory.last
@@ -465,7 +467,7 @@ class KalmanContactAnticipator(LeafSystem):
         return capped(speed, before, s.growth, LEAST_SPEED, s.most)
 
     def _carried_over(self, belief, k):
-        """The stiffness of contact k for those that have not been felt yet."""
+        """The belief with the stiffness of contact k assumed of contacts never felt."""
         s, source = self._speed, belief.contacts[k]
         speed, force = source.impacts[-1]
         mass = self._mass(source.mean, source.direction)
@@ -485,7 +487,8 @@ class KalmanContactAnticipator(LeafSystem):
     # A change without impact.
 
     def _changed(self, memory, transition):
-        """After a change of mode."""
+        """The memory after a change of mode: an impact-less contact is corrected or
+        added, unless the change belongs to a contact or a segment's beginning."""
         memory = replace(memory, count=transition[COUNT])
         time = transition[CHANGE_TIME]
         modes = int(transition[FROM_MODE]), int(transition[TO_MODE])
@@ -524,7 +527,8 @@ class KalmanContactAnticipator(LeafSystem):
         return replace(memory, belief=belief, updated=(*memory.updated, k))
 
     def _without_passed(self, memory):
-        """Contacts that have been felt before and were passed now are less certain."""
+        """The memory with double the standard deviation for each learned contact that
+        the tip has passed without feeling it."""
         p, segment = memory.history[-1, 1:4], int(memory.history[-1, 4])
         for k, contact in enumerate(memory.belief.contacts):
             if contact.segment != segment or contact.seen == 0:
@@ -548,14 +552,14 @@ class KalmanContactAnticipator(LeafSystem):
 
 
 def _touch_hint(memory: AnticipatorMemory) -> float:
-    """The mode that the contact which was felt last brought in an earlier trial."""
+    """The mode that the last felt contact brought in an earlier trial."""
     if memory.touch < 0:
         return float(UNKNOWN_MODE)
     return float(memory.belief.contacts[memory.touch].to_mode)
 
 
 def _found(memory: AnticipatorMemory, touch_mode) -> AnticipatorMemory:
-    """After the mode of a touch was found out."""
+    """The memory after the mode of a touch was identified."""
     if not touch_mode[FOUND] > memory.found:
         return memory
     belief = memory.belief
@@ -565,7 +569,7 @@ def _found(memory: AnticipatorMemory, touch_mode) -> AnticipatorMemory:
 
 
 def _segment_at(history, time) -> int:
-    """In which segment the tip was just before `time`."""
+    """The number of the segment that the tip was in just before `time`."""
     before = history[history[:, 0] < time]
     return int(before[-1, 4] if len(before) else history[0, 4])
 

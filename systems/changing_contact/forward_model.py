@@ -18,10 +18,15 @@ from makebreak.systems.changing_contact.numerics.forward_model import (
     ModelBank,
     bank_tuning,
     observe,
+    speed_along,
     warm_up,
 )
 from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.timing import timed
+
+# From the reference to the arm: half of this period, a tick, and the filter of what is
+# fed forward [s].
+LEAD_SEC = 0.008
 
 
 @dataclass
@@ -32,6 +37,10 @@ class HandoverConfig:
     # From the first row of the tool's feet to the second, along the motion; 0: it
     # touches with one point [m].
     rows: float = 0.0
+    # A motion that begins from rest gets the friction of its mode from the commanded
+    # speed and the normal force, and a mode that is not known yet the last force; a
+    # mode that was announced, too, has the friction of the normal force of now.
+    from_rest: bool = False
 
 
 @dataclass
@@ -61,11 +70,15 @@ class ForwardModelBank(LeafSystem):
         mode (1,) of the mode detector; a mode seen first gets a new model.
         transition (6,) optional, of the mode detector: a mode that changes without a
             new count there was announced, and its model is handed over.
+        x_desired (19,) optional, of the reference, for handover.from_rest.
+        undecided (1,) optional, 1 while the mode may be another one: meanwhile the
+            friction of the mode is not learned.
 
     Outputs, all of them state:
         wrench_predicted (6,) on the tool, against the motion [N], [N m]; zero in
             FREE_MODE and UNKNOWN_MODE, and without a usable wrench.
-        handing_over (1,) 1 while a model that was announced takes over.
+        handing_over (1,) 1 while a model that was announced takes over, and while the
+            friction of a motion that begins is predicted from its command.
         prediction_error (1,) |error of the last predictions of |F_t||, low-passed [N].
         status (1,) 0: a model predicts; 1: the wrench is NaN or at its limit; 2: the
             mode is one without a model.
@@ -115,6 +128,7 @@ class ForwardModelBank(LeafSystem):
             handover=round(config.handover.duration_sec / period_sec),
             rows=float(config.handover.rows),
             period=float(period_sec),
+            from_rest=bool(config.handover.from_rest),
         )
         mixtures = self._tuning.mixtures
         shape = (mixtures.n_max, mixtures.sigma_ini.size)
@@ -138,6 +152,8 @@ class ForwardModelBank(LeafSystem):
             )
         ]
         self._transition = self.DeclareVectorInputPort("transition", N_TRANSITION)
+        self._desired = self.DeclareVectorInputPort("x_desired", 19)
+        self._undecided = self.DeclareVectorInputPort("undecided", 1)
         empty = ModelBank((), self._tuning.with_torque)
         self._memory = self.DeclareAbstractState(Value(BankMemory(knowledge or empty)))
         ticket = {self.abstract_state_ticket(self._memory)}
@@ -167,6 +183,11 @@ class ForwardModelBank(LeafSystem):
             number = number if number == FREE_MODE else 1  # Nothing has to be told.
         elif self._transition.HasValue(context):
             changes = float(self._transition.Eval(context)[COUNT])
+        speed, undecided = 0.0, False
+        if self._desired.HasValue(context):
+            speed = speed_along(self._desired.Eval(context), direction, LEAD_SEC)
+        if self._per_mode and self._undecided.HasValue(context):
+            undecided = bool(self._undecided.Eval(context)[0] > 0.5)
         memory = observe(
             self._memory_of(context),
             self._tuning,
@@ -176,6 +197,8 @@ class ForwardModelBank(LeafSystem):
             rows,
             number,
             changes,
+            speed,
+            undecided,
         )
         state.get_mutable_abstract_state(self._memory).set_value(memory)
 
@@ -189,7 +212,7 @@ class ForwardModelBank(LeafSystem):
         output.SetFromVector([self._memory_of(context).error])
 
     def _calc_handing_over(self, context: Context, output: BasicVector):
-        output.SetFromVector([float(self._memory_of(context).left > 0)])
+        output.SetFromVector([float(self._memory_of(context).ahead)])
 
     def _calc_status(self, context: Context, output: BasicVector):
         output.SetFromVector([float(self._memory_of(context).status)])

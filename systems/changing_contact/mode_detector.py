@@ -34,32 +34,35 @@ class ModeDetectorConfig:
     normal_force_min: float = 1.0  # Less is no contact [N].
     batch: int = 15  # Samples that make a new mode.
     torque_arm: float = 0.0  # What a torque is divided by, with R; 0: none [m].
-    tool_mass: float = 0.3  # Between sensor and tip: its inertia is taken off [kg].
+    tool_mass: float = 0.3  # Between sensor and tip: its inertia is subtracted [kg].
 
 
 class ModeDetector(LeafSystem):
-    """Tells contact modes apart, knows them again, and names new ones.
+    """Recognises contact modes, and gives numbers to new ones.
 
     Inputs:
         wrench (6,) measured on the tool at its tip, world axes, force first [N], [N m].
         ee_velocity (6,) of the tip, v [m/s], w [rad/s].
         direction (3,) unit vector of the target motion, zero at rest.
         force_directions (6,) two rows n, pressed along; a zero row: none.
-        mode_hint (1,) optional: the mode that begins now, -1 for none. It is taken at
-            once if it is known, verified, and undone if it does not come true.
-        touch_hint (1,) optional: the mode that a touch brings, -1 for none.
+        mode_hint (1,) optional: the mode that begins now, -1 for none. A known mode is
+            used at once, and given up if the feature does not confirm it.
+        touch_hint (1,) optional: the mode that a touch brought before, -1 for none.
 
     Outputs, all of them state:
         mode (1,) 1, 2, ...; FREE_MODE without normal force; UNKNOWN_MODE after a touch,
-            until it is found out or hinted.
+            until it is identified or hinted.
         confidence (2,) shares of the last batch: in this mode, in the second best.
         is_new (1,) 1 while the mode is one that the last decision created.
         transition (6,) of numerics/contact_task.py: changes from one surface to
             another; the time of the first departing sample, and of the decision.
             Making and losing contact is not one.
-        touch_mode (2,) of how many touches the mode was found out, and the last one's.
-        collecting (1,) 1 while a batch is collected, and from a hint until it is
-            confirmed or undone: the arm should be stiff.
+        touch_mode (2,) the number of touches whose mode was identified, and the last
+            of these modes.
+        collecting (1,) 1 while the arm should be stiff: just after a departure, while
+            a batch is collected, and from a hint or touch until the mode is identified.
+        undecided (1,) 1 while the mode may be another one: from a departure, a touch
+            or a hint until the decision.
         status (1,) 0: there is a feature; 1: the wrench is NaN or at its limit: all is
             held; 2: no feature, for the tool is free or does not slide.
 
@@ -109,6 +112,7 @@ class ModeDetector(LeafSystem):
             ("transition", N_TRANSITION, lambda m: m.transition),
             ("touch_mode", N_TOUCH_MODE, lambda m: m.touch_mode),
             ("collecting", 1, lambda m: [m.collecting]),
+            ("undecided", 1, lambda m: [m.undecided]),
             ("status", 1, lambda m: [m.status]),
         ):
             self.DeclareVectorOutputPort(name, size, self._calc(value), ticket)

@@ -19,6 +19,7 @@ from makebreak.systems.changing_contact.numerics.push_motion import (
     BALL,
     N_FRAME,
     TABLE,
+    TABLE_SEGMENT,
     PushConfig,
     ball_pattern,
     frame_at,
@@ -187,9 +188,13 @@ class PushMotion(LeafSystem):
         # Where the ball is to go changes with where it is: so does what is behind it.
         turned = push.heading - self._path.heading(p)
         goal = p + c.shape.land_behind * np.append(turned, 0.0)
+        phase = self._phase.Eval(context)
+        surveys = push.kind == TABLE and c.shape.survey > 0
+        if surveys and phase[PHASE_SEGMENT] > TABLE_SEGMENT:
+            # What lies still is surveyed, in a frame that comes to rest.
+            goal, v = frame_at(push.frame, t), np.zeros(3)
         frame = moved_frame(push.frame, t, goal, v, c.follow_sec)
         push = replace(push, active=True, frame=frame)
-        phase = self._phase.Eval(context)
         # The shaper may not have read the new pattern yet.
         if t - push.since < 1.5 * self._period:
             return push
@@ -230,7 +235,10 @@ class PushMotion(LeafSystem):
 def _check(config: PushMotionConfig) -> None:
     """Raises: ValueError by name."""
     for name, value in vars(config.shape).items():
-        if not 0.0 < value < np.inf:
+        if name == "survey":
+            if value != int(value) or value < 0:
+                raise ValueError(f"push.shape.survey is {value}, expected 0, 1, ...")
+        elif not 0.0 < value < np.inf:
             raise ValueError(f"push.shape.{name} is {value}, expected > 0")
     for name in ("settle_sec", "follow_sec", "give_up_sec"):
         if not 0.0 < getattr(config, name) < np.inf:

@@ -33,7 +33,7 @@ class RollingTaskConfig:
     press: float = 0.045  # Depth of the tip's target below the learned ball's top [m].
     # Position at which the tip hides nothing of the circle from the camera [m]: between
     # the circle and the arm's base.
-    withdrawn: list[float] = field(default_factory=lambda: [0.3, 0.0])
+    withdrawn: list[float] = field(default_factory=lambda: [0.35, 0.0])
     rolling: RollingConfig = field(default_factory=RollingConfig)
     period_sec: float = 0.0125
     offset_sec: float = 0.0

@@ -15,6 +15,12 @@ time, in which nothing is learned. A tool that stands on two rows of feet crosse
 in two steps: half of the difference is handed over at first, the whole when it has gone
 from one row to the other.
 
+The same holds for a motion that begins from rest (`from_rest`): there the last force is
+that of the tool at rest. So the friction of the commanded motion is predicted before it
+is felt, mu R min(1, v/SLIDING) against the motion, with mu the mean |F_t|/R of the mode
+so far, R the normal force and v the commanded speed. In a mode that is not known yet,
+the last force is predicted.
+
 Source: CC section 3.1, eq. 2, 3, 5, 6.
 """
 
@@ -55,6 +61,8 @@ class ModelBank:
 
     models: tuple[tuple[int, Mixture], ...] = ()
     with_torque: bool = True
+    # Of each mode (3,): mean |F_t|/R, |tau|/R [m], and the samples that they rest on.
+    friction: tuple[tuple[int, np.ndarray], ...] = ()
 
     def __copy__(self):
         return self
@@ -76,13 +84,34 @@ class ModelBank:
             models.append((mode, mixture))
         return replace(self, models=tuple(models))
 
+    def ratios(self, mode: int) -> np.ndarray | None:
+        """(2,) mean |F_t|/R and |tau|/R [m] of a mode; None: too few samples."""
+        for known, mean in self.friction:
+            if known == mode and mean[2] >= SUPPORT_MIN:
+                return mean[:2]
+        return None
+
+    def with_sample(self, mode: int, ratios) -> "ModelBank":
+        """The bank after a sample of ratios (2,) in a mode."""
+        mean = dict(self.friction).get(mode, np.zeros(3))
+        n = min(mean[2] + 1.0, FRICTION_SAMPLES)
+        new = np.append(mean[:2] + (ratios - mean[:2]) / n, n)
+        new.setflags(write=False)
+        return replace(self, friction=tuple({**dict(self.friction), mode: new}.items()))
+
     def save(self, path: str | Path) -> None:
         """Writes it as JSON."""
+        friction = {str(mode): mean.tolist() for mode, mean in self.friction}
         rows = {str(mode): as_vector(mixture).tolist() for mode, mixture in self.models}
         n_max = self.models[0][1].mean.shape[0] if self.models else 0
         Path(path).write_text(
             json.dumps(
-                {"with_torque": self.with_torque, "n_max": n_max, "models": rows}
+                {
+                    "with_torque": self.with_torque,
+                    "n_max": n_max,
+                    "models": rows,
+                    "friction": friction,
+                }
             )
             + "\n"
         )
@@ -103,6 +132,10 @@ class ModelBank:
                     for mode, vector in data["models"].items()
                 ),
                 with_torque,
+                tuple(
+                    (int(mode), np.array(mean, dtype=float).reshape(3))
+                    for mode, mean in data.get("friction", {}).items()
+                ),
             )
         except (OSError, KeyError, TypeError, AttributeError, ValueError) as error:
             raise ValueError(
@@ -138,6 +171,9 @@ class BankMemory:
     count: float = 0.0  # Of mode changes that were confirmed.
     # (2,) what the model has been off by of late, in `predicted` already [N], [N m].
     offset: np.ndarray = None  # type: ignore[assignment]
+    normal: float = 0.0  # R, low-passed [N].
+    starting: int = 0  # Samples for which friction is predicted from the command.
+    ahead: bool = False  # What is predicted has not been felt yet.
 
     def __post_init__(self):
         for name, size in (("predicted", 2), ("wrench", 6), ("offset", 2)):
@@ -166,6 +202,7 @@ class BankTuning:
     rows: float = 0.0  # From the first row of feet to the second; 0: one point [m].
     period: float = 0.005  # [s]
     correction: float = 0.0  # Of the offset, per sample; 0: there is none.
+    from_rest: bool = False  # The friction of a motion that begins is predicted.
 
 
 def observe(
@@ -177,17 +214,22 @@ def observe(
     force_directions,
     mode: int,
     changes: float | None = None,
+    speed_desired: float = 0.0,
+    undecided: bool = False,
 ) -> BankMemory:
     """The memory after one sample: the last prediction's error, learning, the next one.
 
     Args: wrench (6,), velocity (6,), direction (3,) of the target motion, zero at rest,
         force_directions (6,) as motion_wrench; mode, of contact_task.py; changes: how
         many changes of mode were confirmed so far. A mode that changes without one was
-        announced; None: none is.
+        announced; None: none is; speed_desired, of the tip along direction, when what
+        is predicted now reaches the arm [m/s]; undecided: whether the mode may be
+        another one.
 
     A mode without a model gets an empty one, which predicts that nothing will change
     until it has learned (if nothing is learned: zero). In FREE_MODE and UNKNOWN_MODE
-    the prediction is zero, and the error the force that is there. A wrench that is not
+    the prediction is zero, and the error the force that is there; with from_rest, in
+    UNKNOWN_MODE the prediction is the last force. A wrench that is not
     finite or at its limit teaches nothing: the prediction is zero, and the error
     error_unknown.
     """
@@ -203,8 +245,17 @@ def observe(
         smoothed = error
     else:
         smoothed = memory.error + tuning.smoothing * (error - memory.error)
+    normal = memory.normal + tuning.smoothing * (size[4] - memory.normal)
+    starting = _starting(memory, tuning, size[0], speed_desired)
     if mode < 1:
-        return BankMemory(memory.bank, mode, error=smoothed)
+        predicted, acting = np.zeros(2), np.zeros(6)
+        if tuning.from_rest and mode == UNKNOWN_MODE:
+            predicted = actual.copy()
+            acting = against_motion(predicted, direction, velocity, force_directions)
+        return BankMemory(
+            memory.bank, mode, predicted=predicted, error=smoothed, wrench=acting,
+            normal=normal, starting=starting,
+        )  # fmt: skip
     bank = memory.bank
     mixture = bank.get(mode)
     if mixture is None:
@@ -219,14 +270,19 @@ def observe(
         off = np.clip(off, -OFFSET_MOST, OFFSET_MOST)
         offset = memory.offset + tuning.correction * (off - memory.offset)
     memory = _handing_over(memory, tuning, mixture, actual, size[0], mode, changes)
-    if memory.left > 0:
-        # What is fed forward belongs to a place that the tool is about to reach: it
-        # cannot be judged by what the sensor says meanwhile.
+    ratios = bank.ratios(mode)
+    begins = starting > 0 and speed_desired > 0.0 and ratios is not None
+    if memory.left > 0 or begins:
+        # What is fed forward belongs to a place that the tool is about to reach, or to
+        # a motion that is about to begin: it cannot be judged by what the sensor says
+        # meanwhile.
         smoothed = memory.error
     if tuning.learns and memory.state is not None and memory.left == 0:
         x = np.concatenate([memory.state, actual if tuning.with_torque else actual[:1]])
         mixture, _ = learned(mixture, x, tuning.mixtures)
         bank = bank.put(mode, mixture)
+        if not starting and not undecided and size[0] > SLIDING and size[4] > PRESSED:
+            bank = bank.with_sample(mode, actual / size[4])
     predicted = np.zeros(2)
     if mixture.count:
         n = 2 if tuning.with_torque else 1
@@ -240,9 +296,14 @@ def observe(
     if memory.before is not None and memory.left > 0:
         whole = memory.way >= tuning.rows
         predicted = _without_force(mixture, state, tuning.with_torque)
+        if tuning.from_rest and ratios is not None:
+            predicted = ratios * normal
         predicted = memory.before + (1.0 if whole else 0.5) * (
             predicted - memory.before
         )
+    if begins and memory.left == 0:
+        predicted = ratios * normal * min(1.0, speed_desired / SLIDING)
+        offset = np.zeros(2)
     # A magnitude; and an extrapolation is not to be trusted beyond what the sensor can
     # feel.
     predicted = np.clip(predicted, 0.0, tuning.wrench_limit)
@@ -259,7 +320,29 @@ def observe(
         memory.left,
         memory.count,
         offset,
+        normal,
+        starting,
+        begins or memory.left > 0,
     )
+
+
+# Slower than this the tool does not slide [m/s]; less is no normal force [N].
+SLIDING, PRESSED = 0.008, 1.0
+# After so many samples of sliding a motion has begun: the 30 ms in which the force of
+# rest has left the filters.
+START_SAMPLES = 6
+FRICTION_SAMPLES = 200.0  # That the mean |F_t|/R of a mode rests on, at most.
+
+
+def _starting(memory, tuning, speed, speed_desired) -> int:
+    """For how many samples more the motion is one that begins from rest."""
+    if not tuning.from_rest:
+        return 0
+    if speed < SLIDING and memory.starting == START_SAMPLES:
+        return START_SAMPLES
+    if speed < SLIDING and speed_desired < SLIDING:
+        return START_SAMPLES
+    return max(memory.starting - 1, 0)
 
 
 # More than that of |F_t|, |tau| in one sample is a change or an impact, which the model
@@ -341,6 +424,16 @@ def motion_part(direction, force_directions) -> np.ndarray:
     wrench[:3] = direction
     d = motion_wrench(wrench, force_directions)[:3]
     return d if np.all(np.isfinite(d)) else np.zeros(3)
+
+
+def speed_along(x_desired, direction, lead_sec) -> float:
+    """The speed of a reference (19,) along direction (3,), lead_sec from now [m/s].
+
+    At rest, where direction is zero, 0.
+    """
+    v = x_desired[7:10] + lead_sec * x_desired[13:16]
+    speed = float(v @ np.asarray(direction))
+    return speed if np.isfinite(speed) else 0.0
 
 
 def warm_up(tuning: BankTuning) -> None:

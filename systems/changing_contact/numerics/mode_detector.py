@@ -2,33 +2,42 @@
 
     feature = |F_t| / R   or   [|F_t| / R, |tau| / (R arm)]
 
-F_t is the force in the motion subspace without the tool's own inertia, R the sum of the
-normal forces: neither the direction of motion nor the normal force changes the feature
+F_t is the force in the motion subspace minus the tool's own inertia, R the sum of the
+normal forces. Neither the direction of motion nor the normal force changes the feature
 (CC eq. 7). Wrench and velocity are averaged over WINDOW samples before magnitudes are
-taken. While the tool does not slide, friction is not determined and there is no
-feature.
+taken. While the tool does not slide, friction is undetermined and there is no feature.
 
-    FREE      no normal force
-    TOUCHED   in contact anew: the mode is found out, after a run-in
-    TRACKING  the feature stays at its reference
-    COLLECTING  it has departed: a batch is collected, under high stiffness
-    HINTED    the mode was told beforehand and is being verified, as stiff
+`detect` takes one sample and returns the new memory. The stages are
 
-The mode that a touch brings may be told as well (`touch_hint`): then it is the mode
-from the touch on, and still found out as any other, under high stiffness.
+    FREE        no normal force
+    TOUCHED     a contact has begun, or a direction of pressing has changed: the mode is
+                identified after a short run-in
+    TRACKING    the feature stays near its reference
+    COLLECTING  the feature has departed from it: the mode is identified again
+    HINTED      a mode was announced and is in use, but not yet confirmed
 
-A *departure* is a difference to the reference of TRIGGER force_noise / R in SUSTAINED
-samples in a row, or of half of it in the mean over about 50 ms. The time of the change
-is that of the first departing sample. Nothing is decided before the tool has gone
-`crossing` on, the way that it needs to cross a seam: while it stands on both sides the
-feature is a mixture and no mode. Then the mode is
+A *departure* is a difference from the reference of TRIGGER force_noise / R in
+SUSTAINED samples in a row, or of half of that in the mean over about 50 ms. The change
+is dated to the first departing sample. Nothing is decided before the tool has moved on
+by `crossing`, the length that it needs to cross a seam: while it stands on both sides,
+the feature is a mixture and belongs to no mode. Then the mode is
 
   known   if EARLY samples in a row are near its centroid, or a share CONFIDENT of a
           batch belongs to it (mode_table.py);
   new     if a whole batch is stationary and belongs to none.
 
-A batch that is not stationary waits. Source: CC section 3.2, algorithm 1; what is meant
-by departure, crossing, stationary and hint is ours.
+A batch that is not stationary waits.
+
+Two modes can be assumed before they are identified: the one that a touch brought
+before (`touch_hint`), and, when a direction of pressing is dropped, the one before it
+was added.
+
+The arm is to be stiff (`collecting`) for STIFF_SEC after a departure, in which the
+forward model follows it, and while a batch is collected; after a touch and a hint until
+the mode is identified. While a tool merely crosses a seam it may be soft.
+
+Source: CC section 3.2, algorithm 1. What departure, crossing, stationary and hint mean
+is ours.
 """
 
 from dataclasses import dataclass, field, replace
@@ -68,6 +77,7 @@ DRIFT_NOISE = 1.2  # and how far a stationary batch's halves may be apart.
 TRIGGER_BAND, DRIFT_BAND = 0.6, 0.3
 R_CHANGE = 0.25  # Of R between the halves of the batch of a new mode.
 HINT_WAY = 0.015  # Beyond a crossing, until a hint must have come true [m].
+STIFF_SEC = 0.1  # After a departure, while the models follow the change.
 BATCH_MAX = 64
 TURNED = 0.98  # Cosine: another direction of pressing.
 WRENCH_LIMIT = 200.0  # At which the sensor saturates [N], [N m].
@@ -103,6 +113,8 @@ class ModeMemory:
     mode: int = FREE_MODE
     ring: np.ndarray = _zeros((0, 9))  # (<= WINDOW + 1, 9) wrench, v; newest last.
     rows: np.ndarray = _zeros(6)  # The force directions of the last sample.
+    # The force directions and the mode before they were others.
+    before_turn: tuple[np.ndarray, int] = (np.zeros(6), UNKNOWN_MODE)
     touching: int = 0  # Samples with normal force, negative: without.
     reference: np.ndarray = _zeros(0)  # (d,) What the feature was, empty: unknown.
     slow: float = 0.0  # Slow mean of the departure [N].
@@ -124,6 +136,11 @@ class ModeMemory:
     touch_mode: tuple[float, ...] = (0.0,) * N_TOUCH_MODE
     collecting: bool = False
     status: int = NO_FEATURE
+
+    @property
+    def undecided(self) -> bool:
+        """Whether the mode may be another one than `mode`."""
+        return self.stage in (TOUCHED, COLLECTING, HINTED)
 
     def __post_init__(self):
         for name in ("ring", "rows", "reference", "features", "forces"):
@@ -204,7 +221,7 @@ def detect(
         UNKNOWN_MODE: none; touch_hint: of the mode that a touch here brings.
 
     A wrench that is not finite or at its limit changes nothing but the status, and the
-    averages begin anew after it.
+    averages start again after it.
     """
     rows = np.array(force_directions, dtype=float)
     values = np.concatenate([wrench, velocity[:3], rows, direction])
@@ -214,16 +231,22 @@ def detect(
         )
     ring = np.concatenate([memory.ring[-WINDOW:], values[None, :9]])
     if is_turned(rows, memory.rows):
+        # Pressed as before the last such change, it is likely to slide on what it did.
+        earlier, mode = memory.before_turn
+        if is_turned(rows, earlier):
+            mode = memory.mode
+        if memory.stage in (TRACKING, COLLECTING, HINTED):
+            memory = replace(memory, before_turn=(memory.rows, memory.mode))
         memory = replace(memory, ring=ring[:0], rows=rows, status=NO_FEATURE)
         if memory.stage != FREE:
-            memory = _touched(memory, time, memory.mode)
+            memory = _touched(memory, time, mode)
         return memory
     memory = _hinted(replace(memory, ring=ring, rows=rows), hint)
     memory = _contact(memory, tuning, time, float(motion_wrench(ring[-1, :6], rows)[6]))
-    if memory.stage == TOUCHED and memory.mode == UNKNOWN_MODE:
-        told = int(touch_hint) if np.isfinite(touch_hint) else UNKNOWN_MODE
-        if 1 <= told <= len(memory.table):
-            memory = replace(memory, mode=told)
+    if memory.stage == TOUCHED:
+        hinted = int(touch_hint) if np.isfinite(touch_hint) else UNKNOWN_MODE
+        if 1 <= hinted <= len(memory.table):
+            memory = replace(memory, mode=hinted)
     if memory.stage == FREE or len(ring) <= WINDOW:
         return replace(memory, status=NO_FEATURE)
     f = contact_feature(ring, rows, tuning.tool_mass, tuning.torque_arm, tuning.period)
@@ -257,20 +280,20 @@ def detect(
 
 
 def _hinted(memory: ModeMemory, hint: float) -> ModeMemory:
-    """A hint is taken when it comes, and when it changes."""
-    told = int(hint) if np.isfinite(hint) else UNKNOWN_MODE
-    if told == memory.hint:
+    """The memory after a hint: a known mode is used at once, once per hint."""
+    hinted = int(hint) if np.isfinite(hint) else UNKNOWN_MODE
+    if hinted == memory.hint:
         return memory
-    memory = replace(memory, hint=told)
-    known = 1 <= told <= len(memory.table)
-    if not known or told == memory.mode or memory.mode < 1:
+    memory = replace(memory, hint=hinted)
+    known = 1 <= hinted <= len(memory.table)
+    if not known or hinted == memory.mode or memory.mode < 1:
         return memory
     if memory.stage == TRACKING:
         return replace(
             memory,
             stage=HINTED,
             hint_from=memory.mode,
-            mode=told,
+            mode=hinted,
             departed=False,
             way=0.0,
             slid=0,
@@ -284,7 +307,7 @@ def _hinted(memory: ModeMemory, hint: float) -> ModeMemory:
             memory,
             stage=HINTED,
             hint_from=memory.mode,
-            mode=told,
+            mode=hinted,
             departed=True,
             collecting=True,
             is_new=False,
@@ -293,7 +316,7 @@ def _hinted(memory: ModeMemory, hint: float) -> ModeMemory:
 
 
 def _contact(memory: ModeMemory, tuning: ModeTuning, time, R) -> ModeMemory:
-    """Whether there is a normal force at all."""
+    """The memory after the normal force R [N] of a sample: contact made or lost."""
     count = memory.touching
     if R > tuning.normal_force_min:
         count = max(count, 0) + 1
@@ -316,7 +339,7 @@ def _contact(memory: ModeMemory, tuning: ModeTuning, time, R) -> ModeMemory:
 
 
 def _touched(memory: ModeMemory, time, mode) -> ModeMemory:
-    """In contact anew, or with another surface as well."""
+    """The memory when a contact begins or a direction of pressing changes."""
     return replace(
         memory,
         stage=TOUCHED,
@@ -332,7 +355,8 @@ def _touched(memory: ModeMemory, time, mode) -> ModeMemory:
 
 
 def _departure(memory: ModeMemory, tuning: ModeTuning, feature, R):
-    """How far the feature is from its reference [N], and how far is a departure."""
+    """The distance of the feature from its reference, signed, and the least distance
+    that is a departure, both as forces [N]."""
     difference = float(np.sqrt(np.sum((feature - memory.reference) ** 2))) * R
     # The mean of a magnitude would never vanish: the sign of its change is kept.
     sign = 1.0 if feature[0] >= memory.reference[0] else -1.0
@@ -341,7 +365,8 @@ def _departure(memory: ModeMemory, tuning: ModeTuning, feature, R):
 
 
 def _watched(memory: ModeMemory, tuning: ModeTuning, time, feature, R):
-    """Counts departing samples. Returns: memory, whether that is a departure."""
+    """Counts the samples that depart. Returns: the memory; whether the feature has
+    departed."""
     departure, least = _departure(memory, tuning, feature, R)
     slow = memory.slow + SLOW * (departure - memory.slow)
     over = memory.over + 1 if abs(departure) > least else 0
@@ -358,7 +383,7 @@ def _watched(memory: ModeMemory, tuning: ModeTuning, time, feature, R):
 
 
 def _tracked(memory: ModeMemory, tuning: ModeTuning, time, feature, R) -> ModeMemory:
-    """TRACKING: waits for a departure."""
+    """TRACKING: the reference follows the feature slowly until it departs."""
     memory, departed = _watched(memory, tuning, time, feature, R)
     if memory.quiet_time == time:
         memory = replace(memory, way=0.0)  # The way counts from the change on.
@@ -386,7 +411,8 @@ def _tracked(memory: ModeMemory, tuning: ModeTuning, time, feature, R) -> ModeMe
 
 
 def _verified(memory: ModeMemory, tuning: ModeTuning, time, feature, R) -> ModeMemory:
-    """HINTED: the change must be felt before too long."""
+    """HINTED: the change must be felt within `crossing` + HINT_WAY, else the mode is
+    again the one before the hint."""
     memory, departed = _watched(memory, tuning, time, feature, R)
     if departed:
         return replace(
@@ -430,7 +456,8 @@ def _collected(memory: ModeMemory, tuning: ModeTuning, time, feature, R) -> Mode
             memory,
             features=features[:0],
             forces=forces[:0],
-            collecting=True,
+            collecting=memory.stage != COLLECTING
+            or time - memory.change_time < STIFF_SEC,
         )
     memory = replace(memory, features=features, forces=forces, collecting=True)
     noise = TOLERANCE * tuning.force_noise / R
@@ -472,7 +499,7 @@ def is_stationary(features, forces, tuning: ModeTuning) -> bool:
 
 
 def _decided(memory, tuning, time, mode, fractions, batch) -> ModeMemory:
-    """The batch is of this mode."""
+    """The memory after the decision that the batch (n, d) belongs to `mode`."""
     is_new = mode > len(memory.table)
     if is_new:
         # What the new cluster holds of its own batch; the best of the others beside it.

@@ -37,10 +37,16 @@ class PushConfig:
     press: float = 1.0  # On the ball that was met, until the push begins [N],
     press_table: float = 2.5  # and on the table [N].
     land_ahead: float = 0.075  # On the table, before the ball's centre [m].
-    slide: float = 0.04  # On the table, sideways [m].
+    slide: float = 0.04  # On the table, sideways [m],
+    # into the circle that the ball is rolled along and so many times, to and fro, from
+    # rest each time; 0: once, away from the circle, and as soon as it is felt.
+    survey: int = 0
 
 
 SLIDE_SPEED = 0.08  # [m/s]
+# Of a survey: the finger hardly moves until the landing has calmed down.
+REST_WAY, REST_SEC = 0.001, 0.25  # [m], [s]
+SURVEY_ACCELERATION = 1.0  # [m/s2]
 REFERENCE_WAY = 0.11  # [m] A way that is longer takes longer.
 BEYOND = 0.02  # [m] A motion into a contact is planned so far behind the model's.
 PRESS_WAY, PRESS_SEC = 0.002, 0.2  # Along the contact, where force decides.
@@ -120,6 +126,8 @@ def table_pattern(config, start, heading, radius_ball, radius_tip, a_max):
     down = np.append(config.land_ahead * heading, radius_tip - BEYOND)
     hop = segment_time(float(np.linalg.norm(ahead - start)), HOP_SPEED, a_max)
     fall = segment_time(ahead[2] - down[2], HOP_SPEED, a_max, stops=False)
+    if config.survey > 0:
+        return _survey(config, [start, ahead, down], [hop, fall], -side, a_max)
     slide = segment_time(config.slide, SLIDE_SPEED, a_max)
     return MotionPattern(
         (
@@ -132,3 +140,21 @@ def table_pattern(config, start, heading, radius_ball, radius_tip, a_max):
         ),
         a_max,
     )  # fmt: skip
+
+
+def _survey(config, points, seconds, side, a_max):
+    """Down on the table, a rest there, and then to and fro along side (3,)."""
+    near, far = points[-1] + REST_WAY * side, points[-1] + config.slide * side
+    targets = [config.press_table]
+    segments, time = [], 0.0
+    for k, duration in enumerate(seconds):
+        segments.append(_segment("line", points[k : k + 2], time, duration))
+        time += duration
+    ways = [(points[-1], near, REST_SEC)]
+    duration = segment_time(config.slide - REST_WAY, SLIDE_SPEED, SURVEY_ACCELERATION)
+    for k in range(config.survey):
+        ways.append((near, far, duration) if k % 2 == 0 else (far, near, duration))
+    for begin, end, duration in ways:
+        segments.append(_segment("line", [begin, end], time, duration, targets))
+        time += duration
+    return MotionPattern(tuple(segments), a_max)
