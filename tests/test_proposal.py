@@ -10,6 +10,7 @@ from makebreak.gap.data.proposal import JointName, of_one_drive, propose
 from makebreak.gap.data.recording import read_recording
 from makebreak.gap.data.robot import propose_scene, read_log, read_robot
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
+from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.scene import read_scene
 from makebreak.scripts.cli import main
 
@@ -51,6 +52,17 @@ def test_columns_are_matched_by_their_names(names, expected):
     assert found["time"] == "time"
     for name, channel in zip(names, expected, strict=True):
         assert found[name] == (channel and f"panda.panda_joint{channel}"), name
+
+
+def test_a_force_is_the_effort_of_a_joint_that_slides_and_has_its_name():
+    """`joint` in a joint's own name does not make its force a position."""
+    joints = [JointName("g.lift_joint", prismatic=True), JointName("g.yaw_joint")]
+    names = ["lift_joint.actual_force", "lift_joint.force_cmd", "yaw_joint.force",
+             "force_1", "tool_force_x"]  # fmt: skip
+    found = channels({"time": T} | sines(names), joints)
+    assert found["lift_joint.actual_force"] == "g.lift_joint.effort_measured"
+    assert found["lift_joint.force_cmd"] == "g.lift_joint.effort_command"
+    assert [found[n] for n in names[2:]] == [None] * 3
 
 
 def test_numbers_count_from_zero_where_any_group_does():
@@ -150,6 +162,38 @@ def test_what_is_proposed_for_a_stranger_is_read_as_it_was(robot_and_log, tmp_pa
         )
     assert {e.number for e in recording.episodes} == set(table["episode"])
     assert "type: effort" in proposal.scene
+
+
+def test_a_speed_loop_is_as_stiff_as_what_its_joint_moves_allows(tmp_path):
+    """An arm of 5 kg m2 with a wrist of 0.4 g m2: one gain for both would stop the
+    wrist faster than can be simulated, and the scene would be refused."""
+    link = """<link name="{n}"><inertial><origin xyz="{x} 0 0"/><mass value="{m}"/>
+      <inertia ixx="{i}" iyy="{i}" izz="{i}" ixy="0" ixz="0" iyz="0"/></inertial></link>
+      <joint name="j_{n}" type="revolute"><parent link="{on}"/><child link="{n}"/>
+      <origin xyz="{at} 0 0"/><axis xyz="0 1 0"/>
+      <limit lower="-2" upper="2" effort="50" velocity="3"/></joint>"""
+    robot = tmp_path / "arm.urdf"
+    robot.write_text(
+        '<robot name="arm"><link name="base"/>'
+        + link.format(n="big", on="base", m=20, x=0.4, i=1.8, at=0)
+        + link.format(n="small", on="big", m=0.2, x=0, i=4e-4, at=0.8)
+        + "</robot>"
+    )
+    q = {"j_big_pos": np.sin(T), "j_small_pos": np.cos(T)}
+    rows = {"time": T} | q | {f"{n[:-4]}_vel_cmd": np.gradient(x, T)
+                              for n, x in q.items()}  # fmt: skip
+    log = tmp_path / "log.csv"
+    np.savetxt(log, np.stack([*rows.values()], 1), delimiter=",",
+               header=",".join(rows), comments="")  # fmt: skip
+    proposal = propose_scene(read_robot(robot), [read_log(log)])
+    (tmp_path / "scene.yaml").write_text(proposal.scene)
+    scene = read_scene(tmp_path / "scene.yaml")
+    assert scene.actuation.type == "velocity"
+    # Parallel axes through its centre: the wrist's own moment of inertia.
+    big, small = scene.actuation.kd
+    assert small == pytest.approx(50.0 * 4e-4, rel=0.05)
+    assert big == pytest.approx(50.0 * (1.8 + 20 * 0.4**2 + 0.2 * 0.8**2), rel=0.05)
+    SceneDynamics(scene)  # It can be simulated.
 
 
 def test_inspect_prints_and_writes_only_where_asked(robot_and_log, tmp_path, capsys):

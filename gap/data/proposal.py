@@ -21,6 +21,7 @@ _WORDS = {
     "acceleration": set("acc acceleration accelerations ddq qdd accel".split()),
     "current": set("current currents amp amps ampere".split()),
     "effort": set("effort efforts torque torques tau trq moment moments u".split()),
+    "force": set("force forces thrust".split()),
     "velocity": set(
         "velocity velocities vel vels dq qd qdot speed speeds omega velo v".split()
     ),
@@ -29,6 +30,9 @@ _WORDS = {
         "joint joints encoder action".split()
     ),
 }
+# Of a joint that slides a force is its effort; else it is a wrench's, or nobody's.
+_FORCE, _FORCE_COMMAND = "force", "force_command"
+_OF_A_SLIDE = {_FORCE: "effort_measured", _FORCE_COMMAND: "effort_command"}
 _NEVER = set("temperature temp voltage volt status error mode flag id seq".split())
 _TIME = set("time t timestamp timestamps stamp ts sec secs seconds clock".split())
 _EPISODE = set("episode trial run".split())
@@ -114,6 +118,12 @@ def propose(
             quantities[name] = quantity
     for name, joint in _joints_of(quantities, joints).items():
         quantity = quantities[name]
+        if quantity in _OF_A_SLIDE:
+            if joint is None or not joint.prismatic or not _names(name, joint):
+                why = "a force, and not by its name that of a joint that slides"
+                found[name] = Match(name, None, why=why)
+                continue
+            quantity = _OF_A_SLIDE[quantity]
         if joint is None:
             found[name] = Match(
                 name, None, why=f"{quantity}, of which joint is not told"
@@ -200,7 +210,18 @@ def _quantity(name: str) -> str | None:
         return None
     if kind == "effort":
         return "effort_command" if command or "u" in words else "effort_measured"
+    if kind == "force":
+        return _FORCE_COMMAND if command else _FORCE
     return f"{kind}_command" if command else kind
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+def _names(column: str, joint: JointName) -> bool:
+    """Whether a column's name has the joint's in it."""
+    return _plain(joint.name.split(".", 1)[1]) in _plain(column)
 
 
 def _joints_of(
@@ -208,12 +229,10 @@ def _joints_of(
 ) -> dict[str, JointName | None]:
     """By the joint's own name in the column's; else by the number in it."""
     found: dict[str, JointName | None] = {}
-    plain = {
-        re.sub(r"[^a-z0-9]", "", j.name.split(".", 1)[1].lower()): j for j in joints
-    }
+    plain = {_plain(j.name.split(".", 1)[1]): j for j in joints}
     rest: dict[str, list[tuple[int, str]]] = {}
     for name in quantities:
-        own = re.sub(r"[^a-z0-9]", "", name.lower())
+        own = _plain(name)
         inside = [key for key in plain if key and key in own]
         # joint1 is in joint10: the longest that is there.
         if inside:

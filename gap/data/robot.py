@@ -23,7 +23,11 @@ from makebreak.gap.data.table import RecordingTable, read_table, stem_of, suffix
 from makebreak.models.effects.kind import actuator_of, one_dof_joints
 
 ROBOTS = (".urdf", ".sdf", ".xml")
-GUESSED_KP = 10.0  # [N m/rad], where the log does not tell.
+GUESSED_KP = 10.0  # [N m/rad], where the log does not show it.
+# [1/s] Of a loop of speed: it settles in a few hundredths of a second. Its gain is this
+# times what the joint moves: one number for all joints would be too stiff to simulate
+# at a wrist, or too soft to hold a shoulder.
+SPEED_LOOP = 50.0
 SERVO_DAMPING_SEC = 0.07  # Of kd to kp, of a small geared servo's back-EMF.
 ROTOR_SEC = 0.05  # Of its inertia at the joint to kd.
 LEAST_LOAD = 0.05  # Of a joint's rms gravity torque [N m], to tell its servo by.
@@ -211,15 +215,28 @@ def _actuation(robot: Robot, kinds, every, logs, notes: list[str]) -> list[str]:
             )
         return lines
     if joints := named("velocity_command"):
-        notes.append("drives follow velocities, with a gain that is a guess")
+        notes.append("drives follow velocities, with gains that are a guess")
+        moved = _inertia(robot)
+        kd = [float(f"{SPEED_LOOP * moved[j]:.2g}") for j in joints]
         return [
             "actuation:",
-            "  type: velocity  # The gain is guessed: correct it.",
+            "  type: velocity  # The gains are guessed: correct them.",
             f"  joints: [{', '.join(joints)}]",
-            f"  kd: {[GUESSED_KP] * len(joints)}  # [N m s/rad]",
+            f"  kd: {kd}  # [N m s/rad], or [N s/m] of one that slides.",
         ]
     notes.append("no command was found: nothing drives the joints")
     return ["actuation: {type: none}"]
+
+
+def _inertia(robot: Robot) -> dict[str, float]:
+    """{joint: inertia [kg m2], or mass [kg], that it moves in the pose of zeros while
+    all other joints are free}."""
+    plant = robot.plant
+    mobility = np.linalg.inv(plant.CalcMassMatrix(plant.CreateDefaultContext()))
+    own = {
+        f"{robot.model}.{j.name()}": j.velocity_start() for j in one_dof_joints(plant)
+    }
+    return {name: float(1.0 / mobility[i, i]) for name, i in own.items()}
 
 
 def _stiffness(robot: Robot, every, logs) -> dict[str, float]:
