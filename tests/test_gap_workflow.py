@@ -13,8 +13,10 @@ from test_gap_report import small_case
 from makebreak.gap import read_recordings, workflow
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.search import screen
+from makebreak.gap.simulation.measure import measure
 from makebreak.gap.workflow import run_gap
 from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
 from makebreak.models.scene_file import write_scene
 
@@ -146,3 +148,15 @@ def test_a_gain_does_not_explain_away_what_models_are_off_by(tmp_path):
     assert rich.shape[1] == 1
     left = problem.base()  # Friction, as something that models lack.
     np.testing.assert_array_equal(problem._with_best(left, rich), left)
+
+
+def test_effects_that_no_scene_can_have_leave_windows_that_did_not_end(tmp_path):
+    """A link cannot be 20 kg lighter than it is. The run goes on with the others."""
+    scene_path, recording_path = small_case(tmp_path)
+    scene, recordings = read_scene(scene_path), read_recordings([recording_path])
+    problem = MechanismProblem(scene, recordings)
+    link = problem.dynamics.plant.GetJointByName("j1").child_body().name()
+    impossible = Effect("link_mass", [f"p.{link}"], {"mass": -20.0})
+    gap, _ = measure(problem.scene, [impossible], [], problem, every=False)
+    assert gap.failed == (0, gap.n_windows) and gap.n_windows > 0
+    assert np.isfinite(gap.before) and gap.after == np.inf

@@ -69,9 +69,9 @@ def measure(
     calls = [partial(model.simulate, trial, held, lag) for trial in trials]
     try:
         found = list(side_by_side(calls, jobs))
-    except ValueError:  # A link that its background would make impossible.
+    except ValueError:  # A link that its nuisances would make impossible.
         trials = [[], list(effects)]
-        found = [model.simulate(each, held, lag) for each in trials]
+        found = [_simulated(model, each, held, lag) for each in trials]
     before, after = found[0], found[-1]
     gap = gap_measure(model, before, after, held)
     gap = replace(
@@ -79,6 +79,19 @@ def measure(
         equations=_equations(motion, trials[0], trials[-1], every),
     )
     return gap, series_of(model, before, after, held)
+
+
+def _simulated(model: WindowModel, effects: Sequence[Effect], held, lag):
+    """As model.simulate; infinite in every window if the scene cannot have these
+    effects (a link without mass, a joint too light for its drive)."""
+    try:
+        return model.simulate(effects, held, lag)
+    except ValueError:
+        lengths = [
+            w.rows.stop - w.rows.start if h else 0
+            for w, h in zip(model.windows, held, strict=True)
+        ]
+        return [np.full((n, len(model.channels)), np.inf) for n in lengths]
 
 
 def _equations(motion: InverseModel, before, after, every: bool) -> dict[str, InUnits]:
