@@ -4,7 +4,7 @@ them decides, and how it was set.
 Errors are held-out rms over noise: 1 is what a perfect model leaves. "The gap" is the
 error of the scene as it came. Unless a line says otherwise, a number was set on the
 development half of the benchmark of logs (tests/gap_benchmark), not on its final half.
-The rules that use them: docs/gap.md, "How it works".
+The rules that use them: docs/gap_method.md, "How it works".
 """
 
 # ----- When the search goes on, and what a difference between two errors means
@@ -62,7 +62,7 @@ EXTRA_PARAMETERS_MAX = 1
 # other, or if the error of one is at most this many times that of the other.
 RIVAL_ERROR_RATIO = 1.3
 # Deviations off neutral that an effect must be, with its rival free, to be needed
-# beside it. Set on 17 pushes (docs/gap.md, "Mass or friction").
+# beside it. Set on 17 pushes (docs/gap_method.md, "Mass or friction").
 NEEDED_Z = 5.0
 # Both of two rivals are named only if the second takes this share off the held-out
 # error that the first one leaves (the same pushes).
