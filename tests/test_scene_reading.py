@@ -10,7 +10,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.models.scene import load_scene, read_scene
 from makebreak.models.scene_reader import give_packages
-from makebreak.models.scene_schema import LEAST_STEP
+from makebreak.models.scene_schema import TIME_STEP_MIN
 from makebreak.models.typed_yaml import DEPTH_MAX, load_yaml
 
 INERTIAL = """<inertial><origin xyz="0 0 -0.3"/><mass value="{mass}"/><inertia
@@ -159,7 +159,7 @@ def test_a_link_of_no_inertia_between_two_joints_is_refused(tmp_path):
 
 def test_the_bounds_of_the_step_are_steps(tmp_path):
     robot(tmp_path)
-    for step in (LEAST_STEP, 0.1, 0.0):
+    for step in (TIME_STEP_MIN, 0.1, 0.0):
         plant = plant_of(tmp_path, SCENE + f"plant: {{time_step: {step}}}\n")
         assert plant.time_step() == step
 
