@@ -6,21 +6,17 @@ order of the motion, their forces, and the time taken. Impact force and accelera
 those of multiple_collisions (numerics/impact_score.py).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from makebreak.diagrams.changing_contact import Knowledge, learned, telemetry
 from makebreak.diagrams.multiple_collisions import (
     CollisionTask,
     MultipleCollisionsConfig,
-    make_multiple_collisions,
     make_task,
 )
-from makebreak.diagrams.recorder import episodes, recorded
 from makebreak.diagrams.tabletop import TABLETOP_WALLS, read_model
-from makebreak.scripts.contact_plots import plot_path, plot_trials
-from makebreak.scripts.contact_runs import rehearsed, simulate_motion
+from makebreak.scripts.collision_trials import run_trials
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.pattern_file import read_pattern
 from makebreak.scripts.session import Session
@@ -39,7 +35,6 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
 )
 from makebreak.systems.changing_contact.numerics.impact_score import impact
 from makebreak.systems.changing_contact.numerics.motion_pattern import save_pattern
-from makebreak.systems.views.contact_view import ContactViewConfig
 
 LONGER_SEC = 60.0  # Time by which a trial may be longer than the motion.
 FIRST_MAX, KNOWN_MAX, A10_MAX = 10.0, 8.0, 1.0  # [N], [N], [m/s2]
@@ -83,39 +78,8 @@ def follow_pattern(config: MultipleCollisionsConfig, session: Session) -> dict:
     except ValueError as error:
         raise ValueError(f"pattern {config.pattern}: {error}") from None
     save_pattern(pattern, session.path("pattern.yaml"))
-    trials: dict[str, PatternTrial] = {}
-    recordings = []
-    peaks: list[list[float]] = []
     duration = pattern.duration + LONGER_SEC
-
-    def simulate(knowledge, k, label, config=config, task=task):
-        view = ContactViewConfig(peaks=peaks)
-        diagram = make_multiple_collisions(
-            config, knowledge, k, session.meshcat, task, view
-        )
-        return simulate_motion(session, diagram, duration, label)
-
-    def keep(log, label):
-        trials[label] = scored(telemetry(log.diagram, log.context), task)
-        recordings.append(recorded(log.diagram, log.context))
-        peaks.append(list(trials[label].force))
-
-    if config.handling:
-        plain = replace(config, handling=False)
-        keep(simulate(None, 0, "baseline", plain), "baseline")
-    knowledge: Knowledge | None = None
-    if config.rehearse:
-        knowledge = rehearsed(config, task, simulate, Knowledge(task.model_prior))
-    for k in range(config.trials if config.handling else 1):
-        name = f"trial_{k + 1}" if config.handling else "baseline"
-        log = simulate(knowledge, k, name)
-        knowledge = learned(log.diagram, log.context)
-        keep(log, name)
-    session.save_plot(plot_trials(trials), "profiles")
-    session.save_plot(plot_path(trials, task.prior), "path")
-    if knowledge is not None:
-        knowledge.contacts.save(session.path("contacts.json"))
-    session.write_recording(episodes(recordings), task.model)
+    trials = run_trials(config, task, session, duration, scored)
     return summary(trials, task)
 
 

@@ -22,25 +22,21 @@ most 3 s longer than the motion without handling, the last one 1 s. Not all of t
 be had: docs/shaping.md derives the bound.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from makebreak.diagrams.arm_reach import ArmReach
-from makebreak.diagrams.changing_contact import Knowledge, learned, telemetry
 from makebreak.diagrams.multiple_collisions import (
     IMPACTS,
     CollisionTask,
     MultipleCollisionsConfig,
-    make_multiple_collisions,
     make_task,
 )
-from makebreak.diagrams.recorder import episodes, recorded
 from makebreak.diagrams.station import TORQUE_RATE_MAX, make_control_plant
 from makebreak.diagrams.tabletop import TOOL, position
+from makebreak.scripts.collision_trials import run_trials
 from makebreak.scripts.comparison import Comparison
-from makebreak.scripts.contact_plots import plot_path, plot_trials
-from makebreak.scripts.contact_runs import rehearsed, simulate_motion
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.pattern_runs import follow_pattern
 from makebreak.scripts.session import Session
@@ -57,7 +53,6 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
 )
 from makebreak.systems.changing_contact.numerics.impact_reflex import fastest_impact
 from makebreak.systems.changing_contact.numerics.impact_score import impact, low_pass
-from makebreak.systems.views.contact_view import ContactViewConfig
 
 SUMMARY = "four contacts, with and without contact handling (CC fig. 16)"
 Config = MultipleCollisionsConfig
@@ -105,39 +100,7 @@ def run(config: MultipleCollisionsConfig, session: Session) -> dict:
     if config.pattern:
         return follow_pattern(config, session)
     task = make_task(config)
-    trials: dict[str, CollisionTrial] = {}
-    recordings = []
-    peaks: list[list[float]] = []
-
-    def simulate(knowledge, k, label, config=config, task=task):
-        view = ContactViewConfig(peaks=peaks)
-        diagram = make_multiple_collisions(
-            config, knowledge, k, session.meshcat, task, view
-        )
-        return simulate_motion(session, diagram, DURATION_SEC, label)
-
-    def keep(log, label):
-        trials[label] = scored(telemetry(log.diagram, log.context), task)
-        recordings.append(recorded(log.diagram, log.context))
-        peaks.append(list(trials[label].force))
-
-    if config.handling:
-        plain = replace(config, handling=False)
-        keep(simulate(None, 0, "baseline", plain), "baseline")
-    knowledge: Knowledge | None = None
-    if config.rehearse:
-        known = Knowledge(task.model_prior)
-        knowledge = rehearsed(config, task, simulate, known)
-    for k in range(config.trials if config.handling else 1):
-        name = f"trial_{k + 1}" if config.handling else "baseline"
-        log = simulate(knowledge, k, name)
-        knowledge = learned(log.diagram, log.context)
-        keep(log, name)
-    session.save_plot(plot_trials(trials), "profiles")
-    session.save_plot(plot_path(trials, task.prior), "path")
-    if knowledge is not None:
-        knowledge.contacts.save(session.path("contacts.json"))
-    session.write_recording(episodes(recordings), task.model)
+    trials = run_trials(config, task, session, DURATION_SEC, scored)
     return summary(trials, task, config)
 
 
