@@ -285,6 +285,8 @@ def bad_files(tmp_path):
     )
     back["time"] = full["time"].copy()
     back["time"][300] = 0.1
+    twice = full | {"time": full["time"].copy()}
+    twice["time"][300] = twice["time"][299]
     for q in "xyz":
         still[f"tool.tip.{q}"] = np.full(len(full["time"]), 0.3)
     two = without("fx") | {
@@ -300,6 +302,7 @@ def bad_files(tmp_path):
         "two.csv": (recording(two), "2 columns of the force .*, or one named tool.tip"),
         "nan.csv": (recording(nan), "force of row .* is not finite"),
         "back.csv": (recording(back), "time 0.1 follows 1.495 in row 301, expected"),
+        "twice.csv": (recording(twice), "time 1.495 follows 1.495 in row 301"),
         "short.csv": (recording({n: x[:15] for n, x in full.items()}), "n >= 20"),
         "still.csv": (recording(still), "hardly moved"),
         "long.csv": (recording(full | {"time": 100 * full["time"]}), "at most 600 s"),
