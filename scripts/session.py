@@ -297,6 +297,7 @@ class Session:
                 if self.meshcat is not None:
                     self.meshcat.StopRecording()
                     self.meshcat.PublishRecording()
+                self.interrupted |= interrupt.hit  # During what is above.
         return log
 
     def _bar(self, duration: float, label: str):

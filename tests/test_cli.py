@@ -301,9 +301,8 @@ def wait_for(paths):
 def test_ctrl_c_ends_a_run_cleanly_and_keeps_what_was_recorded(
     number, whole_only, start
 ):
-    settings = ["steps=1000000", f"whole_only={str(whole_only).lower()}"]
-    process = start("run", "spring_mass", "--no-meshcat", "--out", "out", "--set",
-                    *settings)  # fmt: skip
+    settings = ["--duration", "1e6", "--set", f"whole_only={str(whole_only).lower()}"]
+    process = start("run", "spring_mass", "--no-meshcat", "--out", "out", *settings)
     wait_for([Path("out/running")])
     process.send_signal(number)
     _, error = process.communicate(timeout=60)
@@ -341,7 +340,7 @@ def test_a_closed_terminal_does_not_lose_the_run():
     master, terminal = pty.openpty()
     words = ["run", "spring_mass", "--no-meshcat", "--out", "out"]
     process = subprocess.Popen(
-        [*spring_mass.COMMAND, *words, "--set", "steps=1000000"],
+        [*spring_mass.COMMAND, *words, "--duration", "1e6"],
         stdin=terminal,
         stdout=terminal,
         stderr=terminal,
@@ -362,7 +361,7 @@ def test_a_closed_terminal_does_not_lose_the_run():
 def test_nohup_is_respected():
     words = ["run", "spring_mass", "--no-meshcat", "--out", "out"]
     process = subprocess.Popen(
-        [*spring_mass.COMMAND, *words, "--set", "steps=1000000"],
+        [*spring_mass.COMMAND, *words, "--duration", "1e6"],
         stderr=subprocess.DEVNULL,
         env=trials.run_environment(),
         preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN),

@@ -283,7 +283,7 @@ def start(*words, **more):
 
 def test_two_runs_at_once_are_refused_and_a_killed_one_blocks_nothing(capsys):
     words = ["run", "spring_mass", "--no-meshcat", "--out", "out"]
-    first = start(*words, "--set", "steps=1000000")
+    first = start(*words, "--duration", "1e6")
     end = time.monotonic() + 60
     while not Path("out/running").exists():
         assert time.monotonic() < end

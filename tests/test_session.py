@@ -236,6 +236,16 @@ def test_ctrl_c_ends_the_simulation_and_forbids_the_next(tmp_path, number):
         own.simulate(diagram, 1.0, {})
 
 
+def test_ctrl_c_while_the_log_is_put_together_is_not_lost(tmp_path, monkeypatch):
+    diagram, _ = ramp()
+    own = session(tmp_path)
+    monkeypatch.setattr(
+        own, "_note_limits", lambda *_: signal.raise_signal(signal.SIGTERM)
+    )
+    own.simulate(diagram, 1.0, {})
+    assert own.interrupted
+
+
 def test_a_second_ctrl_c_does_not_wait(tmp_path):
     diagram, _ = ramp()
 
