@@ -274,3 +274,11 @@ def links():
 def test_linked_files_exist():
     dead = [f"{d.name}: {t}" for d, t in links() if not (d.parent / t).exists()]
     assert dead == []
+
+
+def test_each_change_is_in_a_group_of_the_changelog():
+    """A merge has brought back an old list without groups, twice."""
+    text = (ROOT / "CHANGELOG.md").read_text()
+    for version in text.split("\n## ")[1:]:
+        before_groups = version.split("\n### ")[0]
+        assert "\n- " not in before_groups, version.splitlines()[0]

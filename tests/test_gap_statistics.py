@@ -37,13 +37,13 @@ from makebreak.gap.problem import (
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.result import GapMeasure
 from makebreak.gap.search import comparison, fit
-from makebreak.gap.search.choice import Choice, Selection, is_significant
+from makebreak.gap.search.choice import Choice, Selection, Trial, is_significant
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.drop import _is_certain
 from makebreak.gap.search.fit import derivative_free_search, fit_effects
 from makebreak.gap.search.screen import Ranked
 from makebreak.gap.search.select import select
-from makebreak.gap.search.trials import shortlist
+from makebreak.gap.search.trials import pick_simplest, shortlist
 from makebreak.gap.search.trust import consistency, gauss_newton, ridges, scatter
 from makebreak.gap.thresholds import SAME_ERROR
 from makebreak.gap.verdict import (
@@ -766,6 +766,54 @@ def test_a_patch_s_rivals_are_those_of_friction_where_weights_depend_on_the_mode
     ]  # fmt: skip
     kinds = [r.candidate.kind for r in shortlist(ranked, 10.0, 10, inner)]
     assert ("object_mass" in kinds) == tried and "contact_friction" in kinds
+
+
+def _picked(trials, correlation=1.0):
+    """Which of {kind: (size, what it leaves (m,))} is taken; blocks of 30 rows, every
+    third is held out."""
+    m = len(next(iter(trials.values()))[1])
+    train = np.arange(m) // 30 % 3 != 1
+    problem = SimpleNamespace(weighed_by=lambda _: None, correlation=correlation)
+    search = SimpleNamespace(problem=problem, train=train, error=lambda score: score)
+    each = []
+    for kind, (size, left) in trials.items():
+        score = float(np.sqrt(np.mean(left[~train] ** 2)))
+        fit = SimpleNamespace(left=left, score=score)
+        candidate = Candidate(kind, ("a.b",), size, (), ())
+        each.append((fit, SimpleNamespace(candidate=candidate)))
+    kinds = list(trials)
+    return kinds[pick_simplest(search, [Trial(*t) for t in each], [], 10.0)]
+
+
+@pytest.mark.parametrize(
+    ("size", "correlation", "picked"),
+    [
+        # A line of 0.3 noise units (rms) in 1000 held-out rows: 90, of the 36 of six
+        # standard deviations.
+        (0.3, 1.0, "link_com"),
+        # One row in four is independent: 22.
+        (0.3, 4.0, "actuator_bias"),
+        (0.1, 1.0, "actuator_bias"),
+    ],
+)
+def test_near_the_noise_a_larger_effect_is_taken_for_what_held_out_rows_say(
+    size, correlation, picked
+):
+    noise = np.random.default_rng(4).normal(size=3000)
+    line = size * np.sqrt(2.0) * np.sin(0.7 * np.arange(3000))
+    # Their errors are within SAME_ERROR of each other.
+    trials = {"actuator_bias": (1, noise + line), "link_com": (3, noise)}
+    assert _picked(trials, correlation) == picked
+
+
+def test_one_that_has_the_smaller_effect_as_a_special_case_must_gain_more():
+    noise = np.random.default_rng(4).normal(size=3000)
+    line = 0.3 * np.sqrt(2.0) * np.sin(0.7 * np.arange(3000))
+    trials = {
+        "joint_coulomb_friction": (1, noise + line),
+        "joint_stribeck_friction": (3, noise),
+    }
+    assert _picked(trials) == "joint_coulomb_friction"
 
 
 class FoundTwice(TwoForces):

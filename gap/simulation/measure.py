@@ -15,11 +15,18 @@ from makebreak.gap.result import GapMeasure, InUnits, Series
 from makebreak.gap.simulation.windows import Window, WindowModel, seen_in
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.kind import Effect, sliding_joints
+from makebreak.models.effects.kind import (
+    Effect,
+    find_joints,
+    full_name,
+    sliding_joints,
+)
 from makebreak.models.effects.transmission import twists
 from makebreak.models.scene import Scene
 
 WINDOW_SEC = 0.3
+# The rate of a smoothed torque errs by the torque's noise within this time, at most.
+TORQUE_SMOOTHED_SEC = 0.01
 # What a perfect model would leave: an error is divided by what the channel's noise and
 # the uncertainty of its window's start give together.
 NOISE_FLOOR = 1.0
@@ -72,6 +79,10 @@ def measure(
     except ValueError:  # A link that its nuisances would make impossible.
         trials = [[], list(effects)]
         found = [_simulated(model, each, held, lag) for each in trials]
+    found = [
+        _with_fitted_twists(model, motion, each, held, lag, y)
+        for each, y in zip(trials, found, strict=True)
+    ]
     before, after = found[0], found[-1]
     gap = gap_measure(model, before, after, held)
     gap = replace(
@@ -138,6 +149,76 @@ def _twists(motion: InverseModel, effects: Sequence[Effect]):
         return {}  # Too short a stretch to tell.
 
     return at
+
+
+def _with_fitted_twists(
+    model: WindowModel, motion: InverseModel, effects: Sequence[Effect], held, lag,
+    simulated: list[np.ndarray],
+) -> list[np.ndarray]:  # fmt: skip
+    """The windows simulated again, each from the twists of elastic joints that fit it
+    best. No channel measures a twist at a window's start, and an error of it, which the
+    torque's noise makes, grows with the window.
+
+    How far a twist and its rate may go is weighed against what the torque's noise makes
+    of them, so that a stiff joint has no such freedom.
+    """
+    deviations = _twist_deviations(motion, [*motion.scene.effects, *effects])
+    if lag is None or not deviations:
+        return simulated
+    prior = np.ravel(list(deviations.values()))
+    moved: list[dict[str, np.ndarray]] = [
+        {joint: np.zeros(2) for joint in deviations} for _ in model.windows
+    ]
+    number = {id(w): k for k, w in enumerate(model.windows)}
+
+    def start(window) -> dict[str, tuple[float, float]]:
+        found, by = lag(window), moved[number[id(window)]]
+        return {
+            joint: (z + by[joint][0], w + by[joint][1]) if joint in by else (z, w)
+            for joint, (z, w) in found.items()
+        }
+
+    slopes = []
+    for joint, size in deviations.items():
+        for k in range(2):
+            for each in moved:
+                each[joint][k] = size[k]
+            slopes.append(_simulated(model, effects, held, start))
+            for each in moved:
+                each[joint][k] = 0.0
+    for k, w in enumerate(model.windows):
+        if not held[k]:
+            continue
+        seen = seen_in(model, w)
+        e = (seen - simulated[k]) / w.std
+        columns = [(y[k] - simulated[k]) / w.std for y in slopes]
+        known = np.isfinite(e) & np.all([np.isfinite(c) for c in columns], axis=0)
+        J = np.stack([c[known] for c in columns], axis=1)
+        x = np.linalg.solve(J.T @ J + np.eye(len(prior)), J.T @ e[known])
+        for joint, by in zip(deviations, (prior * x).reshape(-1, 2), strict=True):
+            moved[k][joint] = by
+    return _simulated(model, effects, held, start)
+
+
+def _twist_deviations(
+    motion: InverseModel, effects: Sequence[Effect]
+) -> dict[str, np.ndarray]:
+    """{joint: standard deviations of the twist and its rate (2,)} at an instant, as the
+    noise of the joint's torque makes them. Joints are missing whose twist does not
+    depend on the size of the torque (a gap)."""
+    noise = motion.torque_noise()
+    found = {}
+    for effect in effects:
+        deflection = KINDS[effect.kind].static_deflection
+        if not KINDS[effect.kind].hidden_state or deflection is None:
+            continue
+        for joint in find_joints(effect, motion.dynamics.plant):
+            name = full_name(motion.dynamics.plant, joint)
+            torque = noise[motion.joints.index(name)]
+            size = abs(deflection(effect, 2.0 * torque) - deflection(effect, torque))
+            if size > 0.0:
+                found[name] = size * np.array([1.0, 1.0 / TORQUE_SMOOTHED_SEC])
+    return found
 
 
 def gap_measure(model: Windows, before, after, held: Sequence[bool]) -> GapMeasure:

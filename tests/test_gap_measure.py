@@ -1,0 +1,69 @@
+"""What windows that start from measured states say of a model."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from effect_scenes import pendulum
+
+from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.table import write_recording
+from makebreak.gap.residuals.inverse import InverseModel
+from makebreak.gap.simulation import measure as measuring
+from makebreak.gap.simulation.measure import measure
+from makebreak.gap.simulation.scene_simulation import Commands, SceneSimulation
+from makebreak.models.effects.kind import Effect
+from makebreak.models.scene import InitialSection
+
+CHANNELS = ("p.j1.position", "p.j1.velocity")
+NOISE = (1e-5, 2e-3, 0.05)
+
+
+def spring(stiffness: float) -> Effect:
+    parameters = {"stiffness": stiffness, "damping": 0.3}
+    return Effect("joint_elasticity", ["p.j1"], parameters)
+
+
+@pytest.fixture(scope="module")
+def elastic(tmp_path_factory):
+    """A pendulum behind a spring of 60 N m/rad, of which the scene does not know, and
+    a noisy torque sensor in the place of commands."""
+    folder = tmp_path_factory.mktemp("elastic")
+    rotor = Effect("rotor_inertia", ["p.j1"], {"inertia": 0.15})
+    scene = replace(pendulum(folder), effects=[rotor])
+    rng = np.random.default_rng(3)
+    time = np.arange(2000) * 0.002
+    effort = 2.5 * np.sin(3.0 * time) + 1.5 * np.sin(7.0 * time)
+    commands = Commands(time, {"p.j1.effort_command": effort})
+    world = SceneSimulation(replace(scene, effects=[rotor, spring(60.0)]))
+    start = InitialSection(positions={"p.j1": 0.4})
+    measured = np.column_stack([world.run(start, time, CHANNELS, commands), effort])
+    measured += rng.normal(size=measured.shape) * NOISE
+    names = (*CHANNELS, "p.j1.effort_measured")
+    columns = {"time": time} | dict(zip(names, measured.T, strict=True))
+    write_recording(
+        folder / "run.csv", columns, noise=dict(zip(names, NOISE, strict=True))
+    )
+    recordings = read_recordings([folder / "run.csv"])
+    return scene, InverseModel(scene, recordings)
+
+
+def test_a_window_may_start_with_any_twist_that_the_noise_of_the_torque_allows(elastic):
+    scene, motion = elastic
+    gap, _ = measure(scene, [spring(60.0)], [], motion, every=True)
+    assert gap.after < 1.2  # Noise levels are known to 10-20 %.
+    assert gap.before > 10.0
+
+
+def test_that_freedom_does_not_hide_a_wrong_spring(elastic):
+    scene, motion = elastic
+    gap, _ = measure(scene, [spring(85.0)], [], motion, every=True)
+    assert gap.after > 3.0
+
+
+def test_a_twist_is_as_uncertain_as_the_torque_over_the_stiffness(elastic):
+    _, motion = elastic
+    found = measuring._twist_deviations(motion, [spring(1e5)])
+    np.testing.assert_allclose(found["p.j1"][0], NOISE[2] / 1e5, rtol=0.1)
+    gap = Effect("joint_backlash", ["p.j1"], {"gap": 0.02})
+    assert measuring._twist_deviations(motion, [gap]) == {}
