@@ -12,9 +12,9 @@ faults/            faults injected into signals, images and forces; safety monit
 views/             displays and buttons in Meshcat, and ground truth for evaluation
 
 Each file has one LeafSystem and its config. Its maths is in the package's numerics/,
-usually under the same name; what all packages share is in systems/numerics/. Systems
-never import each other. Which packages may use whose numerics is in MATHS_OF in
-tests/test_code.py.
+usually under the same name; what all packages share is in systems/numerics/.
+contact_mpc/multibody/ asks a MultibodyPlant and is no system. Systems never import each
+other. Which packages may use whose numerics is in MATHS_OF in tests/test_code.py.
 """
 
 import sys

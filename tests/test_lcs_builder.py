@@ -43,13 +43,15 @@ from makebreak.systems.contact_mpc.lcs_builder import (
     LcsBuilderStatus,
     StewartTrinkle,
 )
+from makebreak.systems.contact_mpc.multibody.contact_layout import ContactLayout
+from makebreak.systems.contact_mpc.multibody.witness_points import WitnessPoints
 from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Options, Plan
-from makebreak.systems.contact_mpc.numerics.lcs import simulate
-from makebreak.systems.contact_mpc.numerics.lcs_builder import (
+from makebreak.systems.contact_mpc.numerics.contact_rows import (
     contact_rows,
     friction_edges,
     tangent_basis,
 )
+from makebreak.systems.contact_mpc.numerics.lcs import simulate
 
 REFERENCE = Path(__file__).parent / "reference"
 SDF = (REFERENCE / "ball_on_table.sdf").read_text()
@@ -856,9 +858,13 @@ def test_a_sphere_whose_centre_is_on_a_vertex_has_a_distance(tmp_path, sphere_fi
 def test_a_sphere_beside_a_hull_agrees_with_drake(tmp_path, sphere_first):
     """Where Drake's iteration ends: outside, and well away from vertices."""
     diagram = sphere_and_tetrahedron(tmp_path, sphere_first)
-    model = AnitescuLcs(diagram, [ContactPair("sphere", "hull")], eps_c=0.0)
+    plant = diagram.GetSubsystemByName("plant")
+    inspector = diagram.GetSubsystemByName("scene_graph").model_inspector()
+    layout = ContactLayout(
+        [ContactPair("sphere", "hull")], plant, inspector, None, 0.1, 0.0
+    )
+    points = WitnessPoints(plant, inspector, layout)
     context = diagram.CreateDefaultContext()
-    plant = model._plant
     plant_context = plant.GetMyContextFromRoot(context)
     query = plant.get_geometry_query_input_port().Eval(plant_context)
     rng, x = np.random.default_rng(1), np.zeros(13)
@@ -866,11 +872,11 @@ def test_a_sphere_beside_a_hull_agrees_with_drake(tmp_path, sphere_first):
     for _ in range(40):
         x[4:7] = [0.03, 0.03, 0.23] + 0.15 * rng.normal(size=3)
         plant.SetPositionsAndVelocities(plant_context, x)
-        id_A, id_B = model._geometries[0]
+        id_A, id_B = layout.geometries[0]
         drakes = query.ComputeSignedDistancePairClosestPoints(id_A, id_B)
         if drakes.distance < 0.001:
             continue
-        gap, n, p_A, p_B = model._distance(query, id_A, id_B)
+        gap, n, p_A, p_B = points.distance(query, id_A, id_B)
         # The hull's nearest point by non-negative least squares: weights of the
         # vertices, their sum held at one by a heavy row (1e-8 of its weight squared).
         p = x[4:7] - [0.0, 0.0, 0.2]

@@ -1,0 +1,228 @@
+"""The LCS of any MultibodyPlant with named contacts, about any state.
+
+The caller hands over a diagram of a plant and its scene graph, to which nothing is
+added:
+
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, 0.0)
+    Parser(plant).AddModels("ball_on_table.sdf")
+    plant.Finalize()
+    lcs = AnitescuLcs(builder.Build(), [ContactPair("finger_link", "ball_link", 0.5)])
+
+See docs/lcs.md for the state's layout, quaternions, units and limits.
+"""
+
+import numpy as np
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import Diagram
+
+from makebreak.systems.contact_mpc.multibody.constant_mass import constant_mass_model
+from makebreak.systems.contact_mpc.multibody.contact_layout import ContactLayout
+from makebreak.systems.contact_mpc.multibody.smooth_dynamics import SmoothDynamics
+from makebreak.systems.contact_mpc.multibody.witness_points import WitnessPoints
+from makebreak.systems.contact_mpc.numerics.constant_mass import (
+    ConstantMassModel,
+    build_many_constant_mass,
+)
+from makebreak.systems.contact_mpc.numerics.lcs import LCS, is_finite
+from makebreak.systems.contact_mpc.numerics.lcs_builder import assemble_lcs
+
+_LCS_FIELDS = ("A", "B", "D", "d", "E", "F", "H", "c", "phi")
+
+
+class AnitescuLcs:
+    """Builds the LCS of a plant's contacts about any state (ACI-MPC eq. 5-8).
+
+    Args:
+        diagram: holds one finalized MultibodyPlant connected to a SceneGraph.
+        pairs: the contacts; their order is the order of the forces.
+        dt_sec: time step [s].
+        eps_c: regularisation on F's diagonal, for lam in newtons [m/s per N]; None:
+            0.01 dt_sec, which is the paper's 0.01 for lam as an impulse. It is not
+            added to the normal force of a pair that has a stiffness.
+        closest: number of contacts over all pairs, the nearest combinations of
+            geometries at each state; None: all. The pairs must then have the same kind
+            of contact.
+        analytic: whether the fast path is used where the model allows it.
+
+    Attributes:
+        n_q, n_v, n_x, n_u, n_lam, n_pairs: sizes; x = [q, v] in the plant's order.
+        x_default: (n_x,) the plant's default state.
+        x_names, lam_names: of each state, and of each entry of lam, "geometry~geometry
+            edge" (where the nearest are taken: "nearest k of geometry~... edge").
+        is_analytic: which of the two paths `build` takes.
+
+    Raises: ValueError naming a pair that does not exist, a body without collision
+        geometry, shapes without a distance, or a parameter out of range.
+    """
+
+    def __init__(
+        self, diagram, pairs, dt_sec=0.1, eps_c=None, analytic=True, closest=None
+    ):
+        self._plant, scene_graph = _plant_and_scene_graph(diagram)
+        plant, inspector = self._plant, scene_graph.model_inspector()
+        if not (np.isfinite(dt_sec) and dt_sec > 0.0):
+            raise ValueError(f"dt_sec is {dt_sec}, expected a positive time [s]")
+        self.dt_sec = float(dt_sec)
+        self.eps_c = 0.01 * self.dt_sec if eps_c is None else float(eps_c)
+        if not (np.isfinite(self.eps_c) and self.eps_c >= 0.0):
+            raise ValueError(f"eps_c is {eps_c}, expected at least 0 [m/s per N]")
+        self.n_q, self.n_v = plant.num_positions(), plant.num_velocities()
+        self.n_x, self.n_u = self.n_q + self.n_v, plant.num_actuated_dofs()
+        self.x_names = list(plant.GetStateNames())
+
+        # Scratch memory, which every method sets before it reads it.
+        self._context = diagram.CreateDefaultContext()
+        self._plant_context = plant.GetMyContextFromRoot(self._context)
+        self.x_default = plant.GetPositionsAndVelocities(self._plant_context).copy()
+        self._dynamics = SmoothDynamics(plant, self._plant_context)
+        self._contacts = ContactLayout(
+            list(pairs), plant, inspector, closest, self.dt_sec, self.eps_c
+        )
+        self.n_pairs, self.n_lam = self._contacts.n_pairs, self._contacts.n_lam
+        self.lam_names = self._contacts.lam_names
+        self._points = WitnessPoints(plant, inspector, self._contacts)
+        self._points.check(self._plant_context)
+        self._model = None
+        if analytic:
+            self._model = constant_mass_model(
+                plant, self._plant_context, inspector, self._dynamics, self._contacts,
+                self._points.frames,
+            )  # fmt: skip
+        self.is_analytic = self._model is not None
+        self.at_default()  # Compile now, and fail now if anything is wrong.
+
+    def at_default(self) -> LCS:
+        """The LCS about the plant's default state, without input."""
+        return self.build(self.x_default, np.zeros(self.n_u))
+
+    def build(self, x, u, friction=None, gap=None) -> LCS:
+        """The LCS about the state x = [q, v] (n_x,) and the input u (n_u,).
+
+        Quaternions in x are normalised first; the LCS's d and c refer to the
+        normalised state.
+
+        Args: friction (n_pairs,): coefficient of each pair; None: as configured;
+            gap (n_pairs,) [m]: added to the distances of each pair; None: zero.
+        Raises: ValueError on a wrong size, an entry that is not finite, a quaternion
+            whose norm is not between 0.5 and 2, geometry without a unique normal,
+            friction below 0, or friction for a Stewart-Trinkle pair that has none.
+        """
+        x, u = np.array(x, dtype=float), np.array(u, dtype=float)
+        if x.shape != (self.n_x,) or u.shape != (self.n_u,):
+            raise ValueError(
+                f"x is {x.shape} and u is {u.shape}, "
+                f"expected ({self.n_x},) and ({self.n_u},)"
+            )
+        if not (is_finite(x) and is_finite(u)):
+            raise ValueError("x or u holds an entry that is not finite")
+        for start, _ in self._dynamics.floating:
+            norm = np.linalg.norm(x[start : start + 4])
+            if not 0.5 <= norm <= 2.0:
+                raise ValueError(
+                    f"the quaternion x[{start}:{start + 4}] has norm {norm:.3g}, "
+                    "expected 1"
+                )
+            x[start : start + 4] /= norm
+        contacts = self._contacts
+        mu = contacts.mu if friction is None else contacts.friction_of(friction)
+        if self._model is None:
+            lcs = self._build_general(x, u, mu)
+        else:
+            lcs = self._build_analytic(self._model, x, u, mu)
+        return lcs if gap is None else contacts.with_gap(lcs, gap)
+
+    def _build_analytic(self, model: ConstantMassModel, x, u, mu) -> LCS:
+        contacts, chosen = self._contacts, None
+        if contacts.chooses:
+            chosen = contacts.nearest(model.gaps(x[: self.n_q]))
+        weight, F_0 = contacts.rows_of(contacts.every if chosen is None else chosen, mu)
+        return model.build(x, u, self.dt_sec, contacts.rows, weight, F_0, chosen)
+
+    def _build_general(self, x, u, mu) -> LCS:
+        """Smooth dynamics by AutoDiff, contacts from Drake's distance queries."""
+        rows = self._contacts.rows
+        f, J_q, J_v, J_u, M = self._dynamics.linearise(x, u)  # Sets the context to x.
+        phi, J, chosen = self._points.jacobians(self._plant_context)
+        weight, F_0 = self._contacts.rows_of(chosen, mu)
+        J_n, on = J[:, 0], rows.contact
+        J_t = (rows.edge[:, :, None] * J[on, 1:]).sum(axis=1)
+        J_c = rows.normal[:, None] * J[on, 0] + weight[:, None] * J_t
+        N, N_plus = self._dynamics.velocity_maps(x[: self.n_q])
+        return assemble_lcs(
+            x, f, J_q, J_v, J_u, u, M, N, N_plus, phi, J_n, J_c, rows.contact,
+            rows.normal, F_0, self.dt_sec, chosen,
+        )  # fmt: skip
+
+    def build_many(self, x, u) -> tuple[np.ndarray, ...]:
+        """The LCS about each of many states x (n, n_x) and one input u (n_u,).
+
+        Returns: A, B, D, d, E, F, H, c and phi (LCS), each with the n states first;
+            not a number in those of a state that has no LCS.
+        Raises: ValueError on a wrong size.
+        """
+        x, u = np.array(x, dtype=float), np.array(u, dtype=float)
+        if x.ndim != 2 or x.shape[1] != self.n_x or u.shape != (self.n_u,):
+            raise ValueError(
+                f"x is {x.shape} and u is {u.shape}, expected (n, {self.n_x}) and "
+                f"({self.n_u},)"
+            )
+        n, n_x, n_u, n_lam = len(x), self.n_x, self.n_u, self.n_lam
+        shapes = ((n_x, n_x), (n_x, n_u), (n_x, n_lam), (n_x,), (n_lam, n_x),
+                  (n_lam, n_lam), (n_lam, n_u), (n_lam,), (n_lam,))  # fmt: skip
+        out = tuple(np.full((n, *shape), np.nan) for shape in shapes)
+        if self._model is None or self._contacts.groups_in_arrays is None:
+            self._fill_one_by_one(x, u, out)
+        else:
+            self._fill_compiled(x, u, out)
+        return out
+
+    def _fill_one_by_one(self, x, u, out) -> None:
+        for i in range(len(x)):
+            try:
+                lcs = self.build(x[i], u)
+            except (ValueError, RuntimeError):
+                continue
+            for array, name in zip(out, _LCS_FIELDS, strict=True):
+                array[i] = getattr(lcs, name)
+
+    def _fill_compiled(self, x, u, out) -> None:
+        """The same in one compiled loop; normalises the quaternions in x."""
+        good = np.isfinite(x).all(axis=1) & np.isfinite(u).all()
+        for start, _ in self._dynamics.floating:
+            norm = np.linalg.norm(x[:, start : start + 4], axis=1)
+            good &= (norm >= 0.5) & (norm <= 2.0)
+            x[good, start : start + 4] /= norm[good, None]
+        if not good.any():
+            return
+        contacts, rows = self._contacts, self._contacts.rows
+        part = tuple(array[good] for array in out)
+        finite = build_many_constant_mass(
+            x[good], u, self.dt_sec, tuple(vars(self._model).values()),
+            (rows.contact, rows.normal, contacts.weight, rows.edge, contacts.F_0),
+            contacts.groups_in_arrays, part,
+        )  # fmt: skip
+        for array, of_good in zip(out, part, strict=True):
+            of_good[~finite] = np.nan
+            array[good] = of_good
+
+
+def _plant_and_scene_graph(diagram):
+    """The one plant and scene graph of a diagram. Raises: ValueError."""
+    if not isinstance(diagram, Diagram):
+        raise ValueError(
+            f"diagram is a {type(diagram).__name__}, expected the Diagram that holds "
+            "the plant and its scene graph"
+        )
+    systems = diagram.GetSystems()
+    plants = [s for s in systems if isinstance(s, MultibodyPlant)]
+    graphs = [s for s in systems if isinstance(s, SceneGraph)]
+    if len(plants) != 1 or len(graphs) != 1:
+        raise ValueError(
+            f"diagram holds {len(plants)} MultibodyPlants and {len(graphs)} "
+            "SceneGraphs, expected one of each"
+        )
+    if not plants[0].is_finalized():
+        raise ValueError("the plant is not finalized, expected plant.Finalize() before")
+    return plants[0], graphs[0]
