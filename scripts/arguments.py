@@ -127,7 +127,7 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
         "experiments",
         nargs="*",
         metavar="EXPERIMENT",
-        help="an experiment, gap or faults; default: all experiments",
+        help="an experiment, gap, faults or close_the_loop; default: all experiments",
     )
     p.add_argument("--seeds", default="10", metavar="N", help="trials per case (10)")
     p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
@@ -140,9 +140,11 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
         "--only",
         default="",
         metavar="TEXT",
-        help="for gap and faults: only cases with TEXT in the name",
+        help="for gap, faults, close_the_loop: only cases with TEXT in the name",
     )
-    p.add_argument("--seed", metavar="N", help="for gap and faults: first seed")
+    p.add_argument(
+        "--seed", metavar="N", help="for gap, faults, close_the_loop: first seed"
+    )
     p.add_argument(
         "--reuse", action="store_true", help="keep complete trials of an earlier call"
     )

@@ -33,6 +33,7 @@ from makebreak.scripts.settings import apply_settings
 _BENCHMARKS = {
     "gap": "makebreak.scripts.gap_benchmark",
     "faults": "makebreak.scripts.fault_trials",
+    "close_the_loop": "makebreak.scripts.loop_trials",
 }
 _COMPILED = ("ball_rolling", "cartpole_walls")  # By `compile` without arguments.
 _REFUSED = "exit status 2"
@@ -89,12 +90,14 @@ def _reproduce(args) -> int:
             if not hasattr(module, "reproduce"):
                 raise ValueError(f"{name} has nothing to reproduce")
             if hasattr(module, "check"):
-                module.check(args.which)
+                module.check(args.which, args.only)
     seeds = int(number(args.seeds, "--seeds", 1, whole=True))
     seed = None
     if args.seed is not None:
         if any(name not in _BENCHMARKS for name in names):
-            raise ValueError("--seed is of gap and faults; did you mean --seeds?")
+            raise ValueError(
+                f"--seed is of {', '.join(_BENCHMARKS)}; did you mean --seeds?"
+            )
         seed = int(number(args.seed, "--seed", 0, whole=True))
     jobs = number_of_processes(args.jobs)
     out = Path(args.out) if args.out else default_out("reproduce")

@@ -9,7 +9,6 @@ the model, so that the first real trial shows the model's quality. Only the reco
 and the scenes pass from one step to the next; the truth is used for the table alone.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 
 from makebreak.diagrams import changing_surface, contact_learning, multiple_collisions
 from makebreak.diagrams.tabletop import position
-from makebreak.scripts.close_the_loop import take_step
+from makebreak.scripts.close_the_loop import take_step, write_loop
 from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.settings import apply_settings
 from makebreak.scripts.table import Table
@@ -55,7 +54,8 @@ AXES = "xyz"
 def close_contact_loop(
     experiment: str, out: Path, seed: int, settings: Sequence[str] = (), jobs: int = 1
 ) -> Table:
-    """Runs all three steps, each in a subfolder of `out`, and writes loop.json.
+    """Runs all three steps, each in a subfolder of `out`, and writes loop.json and
+    result.json.
 
     Args: experiment: a key of SETTINGS; others as in close_the_loop.
     Raises: as close_the_loop.
@@ -104,12 +104,12 @@ def close_contact_loop(
             for key, before in first.items():
                 if key.startswith(("impact_force_peak_N", "completion_time")):
                     _first_trial(row, key, before, second[key])
+        columns = ("result", "wrong model", "repaired model", "wanted")
+        title = f"The loop closed: {experiment}, seed {seed}"
+        table = Table(title, columns, rows, met, [found["says"]])
         results = {"first": first, "gap": found, "second": second}
-        outputs.file("loop.json").write_text(json.dumps(results, indent=2) + "\n")
-        outputs.commit()
-    columns = ("result", "wrong model", "repaired model", "wanted")
-    title = f"The loop closed: {experiment}, seed {seed}"
-    return Table(title, columns, rows, met, [found["says"]])
+        write_loop(outputs, table, results)
+    return table
 
 
 def _first_trial(row, key: str, before, after) -> None:

@@ -83,7 +83,8 @@ def close_the_loop(
     settings: Sequence[str] = (),
     jobs: int = 1,
 ) -> Table:
-    """Runs all three steps, each in a subfolder of `out`, and writes loop.json.
+    """Runs all three steps, each in a subfolder of `out`, and writes loop.json and
+    result.json.
 
     Args:
         error: of the radius [m].
@@ -95,9 +96,19 @@ def close_the_loop(
     """
     with OutputFolder(out, COMMAND) as outputs:
         table, results = _steps(out, error, seed, duration, settings, jobs)
-        outputs.file("loop.json").write_text(json.dumps(results, indent=2) + "\n")
-        outputs.commit()
+        write_loop(outputs, table, results)
     return table
+
+
+def write_loop(outputs: OutputFolder, table: Table, results: dict) -> None:
+    """Writes loop.json, the results of all steps, and result.json, the table."""
+    rows = table.to_dict()["rows"]
+    for name, each in (
+        ("loop.json", results),
+        ("result.json", {"success": table.missed == 0, "rows": rows}),
+    ):
+        outputs.file(name).write_text(json.dumps(each, indent=2) + "\n")
+    outputs.commit()
 
 
 def take_step(out: Path, folder: str, says: str, *words: str) -> dict:

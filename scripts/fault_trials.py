@@ -156,10 +156,13 @@ def at_rest(runs: Sequence[Mapping], verdicts: Sequence[str]) -> int:
     return sum(r.get("tip_speed_end_m_s", float("nan")) <= AT_REST for r in held)
 
 
-def check(which: str) -> None:
-    """Raises: ValueError for a --set, which this command does not have."""
+def check(which: str, only: str) -> None:
+    """Raises: ValueError for a --set, which this command does not have, or an --only
+    that is in no fault."""
     if which != "standard":
         raise ValueError(f"--set: got {which}, and reproduce faults has no sets")
+    if not any(only in text for text in CASES):
+        raise ValueError(f"--only: got {only}, expected part of: {'; '.join(CASES)}")
 
 
 def _worst(runs: Sequence[Mapping], key: str) -> str:

@@ -60,7 +60,7 @@ SETS = {
 }
 
 
-def check(which: str = "standard") -> None:
+def check(which: str = "standard", only: str = "") -> None:
     """Raises: ValueError if the benchmark cannot be run here."""
     if which not in SETS:
         raise ValueError(f'--set: got "{which}", expected one of {", ".join(SETS)}')

@@ -150,7 +150,7 @@ BAD = [
     (["run", "spring_mass", "--no-mesh"], "option --no-mesh; did you mean --no-mes"),
     (
         ["reproduce", "--seed", "1"],
-        "--seed is of gap and faults; did you mean --seeds?",
+        "--seed is of gap, faults, close_the_loop; did you mean --seeds?",
     ),
     (["gap", "a.yaml", "b.csv", "--job", "1"], "option --job; did you mean --jobs?"),
     (["bench", "--jobs", "1"], "unknown option --jobs; expected one of: --help"),

@@ -24,6 +24,7 @@ from makebreak.models.scene import InitialSection, load_scene, read_scene
 from makebreak.models.scene_file import write_scene
 from makebreak.scripts import close_contact_loop as contact_loop
 from makebreak.scripts import close_the_loop as loop
+from makebreak.scripts import loop_trials
 from makebreak.scripts.cli import main
 from makebreak.scripts.close_the_loop import write_wrong_scene
 
@@ -281,3 +282,58 @@ def test_the_contact_loop_passes_nothing_on_but_recording_and_scenes(
     off[0] = 6e-4
     assert main([*words, "again"]) == 1
     assert "MISSED" in capsys.readouterr().out
+
+
+def _loop(moved: float, met: bool) -> dict:
+    """result.json of a loop that displaces the table by `moved` [mm]."""
+    rows = [
+        {"result": "effects named", "wrong model": "", "repaired model": "plane_height",
+         "wanted": ""},
+        {"result": "table [mm]", "wrong model": 0.0, "repaired model": moved,
+         "wanted": f"{moved} +- 0.5", "met": met},
+    ]  # fmt: skip
+    return {"success": met, "rows": rows}
+
+
+def test_the_table_of_loops_counts_seeds_and_a_trial_without_a_result_meets_nothing():
+    results = [_loop(2.0, True), _loop(-3.0, False), {"success": False, "error": "x"}]
+    (named, table), whole = (
+        loop_trials.rows_of("contact_learning", results),
+        loop_trials.rows_of("contact_learning", [_loop(2.0, True)]),
+    )
+    assert named == (
+        ("contact_learning: effects named", "", "plane_height", "", ""),
+        None,
+    )
+    cells, met = table
+    assert cells == (
+        "contact_learning: table [mm]",
+        "0",
+        "-3 to 2",
+        "by seed",
+        "1 of 3",
+    )
+    assert met is False
+    assert whole[1][0][3:] == ("2.0 +- 0.5", "1 of 1") and whole[1][1] is True
+    [(cells, met)] = loop_trials.rows_of("ball_rolling", [{"error": "x"}])
+    assert cells[-1] == "0 of 1" and met is False
+
+
+def test_reproduce_closes_each_loop_with_each_seed(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    asked = []
+
+    def run_commands(label, commands, folders, jobs, is_done):
+        asked.extend(commands)
+        return [_loop(1.0, True) for _ in commands]
+
+    monkeypatch.setattr(loop_trials, "run_commands", run_commands)
+    words = ["reproduce", "close_the_loop", "--seeds", "2", "--seed", "7", "--out", "o"]
+    assert main([*words, "--only", "ball"]) == 0
+    assert len(asked) == 4 and len({tuple(words) for words in asked}) == 4
+    errors = {word for words in asked for word in words if "radius" in word}
+    assert errors == {"--radius-error=+0.005", "--radius-error=-0.005"}
+    assert {words[words.index("--seed") + 1] for words in asked} == {"7", "8"}
+    assert "2 of 2" in capsys.readouterr().out
+    assert main(["reproduce", "close_the_loop", "--only", "no_such_loop"]) == 2
+    assert "--only: got no_such_loop" in capsys.readouterr().err
