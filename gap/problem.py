@@ -347,6 +347,10 @@ class GapProblem(ABC):
         """Another effect that no recording of these channels could tell from it."""
         return None
 
+    def clock_of(self, effect: Effect) -> str:
+        """Beside what an effect makes channels late, in words; "": it says so."""
+        return ""
+
     def widened(self, end: Fitted, k: int) -> tuple[dict[str, float], tuple[str, ...]]:
         """Deviations of effect k of a fit, wider where slopes say too little; and the
         parameters that may as well be any larger."""

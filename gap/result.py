@@ -59,7 +59,8 @@ class NamedEffect:
     """An effect that the model lacks.
 
     indistinguishable_from: others that explain these data as well, with the parameters
-    that they would have. identifiable: "identifiable", "weak" or "not".
+    that they would have. identifiable: "identifiable", "weak" or "not". recordings: in
+    which it is, where it is not in all of them.
     """
 
     kind: str
@@ -70,6 +71,7 @@ class NamedEffect:
     indistinguishable_from: tuple[Effect, ...] = ()
     tell_apart: str = ""
     identifiable: str = "identifiable"
+    recordings: tuple[str, ...] = ()
 
     def effect(self) -> Effect:
         """As a scene file lists it."""
@@ -118,6 +120,17 @@ class Trust:
     stretches: Sequence[float]
     starts: Sequence[float]
     ridge_with: str = ""
+
+
+@dataclass(frozen=True)
+class Differs:
+    """A parameter of an effect that is not the same in all recordings, by recording."""
+
+    kind: str
+    at: tuple[str, ...]
+    parameter: str
+    recordings: Mapping[str, Estimate]
+    says: str
 
 
 @dataclass(frozen=True)
@@ -220,14 +233,23 @@ class GapResult:
     trust: Sequence[Trust] = ()
     channels: Sequence[JudgedChannel] = ()
     nuisance_scene: Sequence[Effect] = ()  # The links as the nuisances have them.
+    differs: Sequence[Differs] = ()
 
     def __post_init__(self):
         if self.verdict not in VERDICTS:
             raise ValueError(f"verdict is {self.verdict!r}, expected one of {VERDICTS}")
 
     def scene_effects(self) -> list[Effect]:
-        """The effects to add to the scene."""
-        return [each.effect() for each in self.effects]
+        """The effects to add to the scene: of the robot in all recordings."""
+        return [each.effect() for each in self.effects if not each.recordings]
+
+    def effects_in(self, recording: str) -> list[Effect]:
+        """The effects to add to the scene for one recording."""
+        return [
+            each.effect()
+            for each in self.effects
+            if not each.recordings or recording in each.recordings
+        ]
 
     def to_json(self) -> dict[str, Any]:
         """What result.json holds (docs/gap.md)."""
@@ -259,6 +281,15 @@ class GapResult:
             "unexplained": [dict(vars(each)) for each in self.unexplained],
             "background": {k: _number(v) for k, v in self.background.items()},
             "trust": [_plain(each) for each in self.trust],
+            "differs": [
+                {
+                    **_plain(each),
+                    "recordings": {
+                        name: _plain(of) for name, of in each.recordings.items()
+                    },
+                }
+                for each in self.differs
+            ],
             "channels": [_plain(each) for each in self.channels],
             "checks": [dict(vars(each)) for each in self.checks],
         }
@@ -282,6 +313,7 @@ def _effect_json(each: NamedEffect) -> dict[str, Any]:
             for name, p in each.parameters.items()
         },
         "says": each.says,
+        "recordings": list(each.recordings),
         "evidence": {
             "held_out_before": _number(each.evidence.held_out_before),
             "held_out_after": _number(each.evidence.held_out_after),

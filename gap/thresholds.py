@@ -108,6 +108,15 @@ UNBOUNDED_GAIN_BESIDE = 0.25
 # direction that the fitted rows do not determine: the parameters from before are kept.
 REFIT_LOSS_MAX = 0.05
 
+# ----- Recordings that differ
+
+# Two recordings differ in a parameter if it is so many standard deviations of both
+# apart, and by this share of the larger one: a law that is only nearly the world's has
+# another best value at other speeds (dry friction that sticks 1.4 times as high was
+# fitted 16 % apart).
+DIFFERS_Z = 5.0
+DIFFERS_SHARE = 0.3
+
 # ----- How much is tried
 
 # Where errors jump with parameters, so many of the best candidates are searched without

@@ -121,8 +121,11 @@ def two_figures(start: float, end: float, gap: GapMeasure) -> str:
     )
 
 
-def named(choice: Choice, plant: MultibodyPlant) -> NamedEffect:
-    """The choice in the report's words; plant: the scene's, without it."""
+def named(choice: Choice, plant: MultibodyPlant, beside: str = "") -> NamedEffect:
+    """The choice in the report's words.
+
+    Args: plant: the scene's, without it. beside: what it makes channels late beside.
+    """
     kind = KINDS[choice.effect.kind]
     slides = kind.at in ("joint", "actuator") and of_slides(choice.effect, plant)
     own_unit = OF_CHANNEL
@@ -150,6 +153,8 @@ def named(choice: Choice, plant: MultibodyPlant) -> NamedEffect:
         apart = kind.tell_apart[:1].upper() + kind.tell_apart[1:] + "."
     says = sentence(choice.effect, kind, std, slides, choice.or_more)
     says = says.replace(OF_CHANNEL, own_unit)
+    if beside:
+        says += f" beside {beside}"
     return NamedEffect(
         choice.effect.kind,
         tuple(choice.effect.at),

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from makebreak.gap.by_recording import Alone, may_differ, with_differences
 from makebreak.gap.data.check_drives import check_drives, check_initial_names
 from makebreak.gap.data.check_meshes import check_meshes
 from makebreak.gap.data.checks import check_recordings
@@ -129,6 +130,23 @@ def run_gap(
     reported = excerpt(reported, REPORTED_SEC, REPORTED_ROWS) if reported else []
     result = conclude(problem, selection, reported, checks, jobs)
     seconds["simulate"] = clock.lap()
+    if isinstance(problem, MechanismProblem) and may_differ(
+        problem, selection.end, result
+    ):
+
+        def alone(name: str) -> Alone:
+            say(f"looking at {name} by itself")
+            mine, its = ([r for r in some if r.name == name]
+                         for some in (decided, reported))  # fmt: skip
+            one, _ = problem_for(scene, mine, dynamics, jobs)
+            selected = select(one, say)
+            return Alone(
+                name, one, selected, conclude(one, selected, its, checks, jobs)
+            )
+
+        names = list(dict.fromkeys(r.name for r in decided))
+        result = with_differences(result, names, alone)
+        seconds["recordings"] = clock.lap()
     return _unless_doubtful(result).with_seconds(seconds)
 
 
@@ -286,7 +304,10 @@ def conclude(
     ]
     if before and verdict == "no_gap":
         verdict = "gap_named"
-    effects = [named(c, problem.dynamics.plant) for c in (*before, *selection.choices)]
+    effects = [
+        named(c, problem.dynamics.plant, problem.clock_of(c.effect))
+        for c in (*before, *selection.choices)
+    ]
     fixed = [c.fixed for c in selection.choices]
     prior = nuisances.prior
     return GapResult(

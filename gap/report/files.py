@@ -2,6 +2,7 @@
 
 import base64
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from html import escape
@@ -82,6 +83,13 @@ def write_report(
             files.append(out / "scene_moved.yaml")
             write_scene(
                 replace(scene, effects=moved), files[-1],
+                _scene_heading(result, scene_path), place,
+            )  # fmt: skip
+        for name in dict.fromkeys(r for e in result.effects for r in e.recordings):
+            own = [*scene.effects, *result.effects_in(name)]
+            files.append(out / _scene_of(name))
+            write_scene(
+                replace(scene, effects=own), files[-1],
                 _scene_heading(result, scene_path), place,
             )  # fmt: skip
         page = report_html(
@@ -567,6 +575,11 @@ def _scene_heading(result: GapResult, scene_path: str | Path) -> str:
     n = len(result.effects)
     what = "an effect" if n == 1 else f"{n} effects"
     return f"{name} with {what} that makebreak gap found."
+
+
+def _scene_of(recording: str) -> str:
+    """The file of the scene with what is in one recording only."""
+    return f"scene_{re.sub(r'[^A-Za-z0-9.-]+', '_', recording)}.yaml"
 
 
 def _says(effect: Effect) -> str:

@@ -376,7 +376,7 @@ class DrivenProblem(DrivenWindows, GapProblem):
                     x = path[f"{joint}.position"]
                     v.append(x[:, 1])
                     error, rate = np.zeros(len(x)), np.zeros(len(x))
-                    held = self._commands[i][episode.first].columns
+                    held = self.commands(())[i][episode.first].columns
                     if f"{joint}.position_command" in held:
                         error = held[f"{joint}.position_command"] - x[:, 0]
                     if f"{joint}.velocity_command" in held:

@@ -371,7 +371,8 @@ class InverseModel:
             elif self.by_measured[i]:
                 y = track.samples[f"{joint}.effort_measured"]
                 good = np.isfinite(y)
-                late = mean_delay(track.stages[f"{joint}.effort_measured"])
+                name = f"{joint}.effort_measured"
+                late = mean_delay(track.stages[name]) + given_late(effects, name)
                 t = track.middle - delay + late
                 u = np.interp(t, track.time[good], y[good])
             else:
@@ -626,7 +627,8 @@ class InverseModel:
 
     def _moved_by(self, k: int, moving: Sequence[Effect]) -> tuple[Motion, np.ndarray]:
         """A track's motion, and the effort that the scene as it came needs for it."""
-        sensed = tuple(_sensing(moving, f"{j}.position") for j in self.joints)
+        names = [f"{joint}.position" for joint in self.joints]
+        sensed = tuple((*_sensing(moving, n), _lag(moving, n)) for n in names)
         key = (k, *sensed) if moving else (k,)
         if key not in self._needed:
             motion = (
@@ -857,6 +859,18 @@ def _sensing(effects: Sequence[Effect], channel: str) -> tuple[float, float, flo
         scale += p.get("skew", 0.0)
         bias += p.get("bias", 0.0) + p.get("offset", 0.0)
     return scale, late, bias
+
+
+def given_late(effects: Sequence[Effect], channel: str) -> float:
+    """By how much [s] a measured effort that stands in for a command is late: by the
+    effects that name this very channel. Those of a whole joint or model say how late
+    its other channels are beside the commands, and so beside what stands in for them.
+    """
+    return sum(
+        effect.parameters["delay"]
+        for effect in effects
+        if KINDS[effect.kind].channel == "delay" and channel in effect.at
+    )
 
 
 def rotor_before(scene: Scene, plant: MultibodyPlant, joint: str) -> float:

@@ -393,6 +393,14 @@ class MechanismProblem(InverseModel, GapProblem):
     def inseparable(self, effect: Effect) -> Effect | None:
         return inseparable(effect, self)
 
+    def clock_of(self, effect: Effect) -> str:
+        # A measured effort that stands in for a command has the commands' clock.
+        is_late = KINDS[effect.kind].channel in ("delay", "skew")
+        whole = all("." not in at for at in effect.at)
+        if is_late and whole and all(self.by_measured):
+            return "its measured efforts"
+        return ""
+
     def is_one_place(self, one: Sequence[str], other: Sequence[str]) -> bool:
         plant = self.dynamics.plant
         try:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from makebreak.gap.problem import Candidate, Fitted
+from makebreak.gap.problem import Candidate, Fitted, is_sane
 from makebreak.gap.search.choice import (
     Choice,
     is_clearly_off,
@@ -138,11 +138,13 @@ def keep_certain(
 def _is_certain(
     search: Comparison, chosen: Sequence[Choice], current: Fitted, k: int
 ) -> bool:
-    """Whether the k-th effect is significant. A kind whose parameters may end anywhere
-    must be so, beside others, with its widened deviations too: slopes where it ended do
-    not say how far it may go."""
+    """Whether the k-th effect is significant, and of a size that robots have: beside
+    others it may have gone on, as far as gains of 0 with which nothing weighs anything.
+    A kind whose parameters may end anywhere must be significant, beside others, with
+    its widened deviations too: slopes where it ended do not say how far it may go."""
     choice, alone = chosen[k], len(chosen) == 1
-    if not is_significant(choice, alone):
+    least = search.problem.dynamics.least(choice.effect.kind, choice.effect.at)
+    if not is_significant(choice, alone) or not is_sane(choice.effect, least):
         return False
     endless = any(each.endless for each in KINDS[choice.effect.kind].parameters)
     if alone or not endless:

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from makebreak.gap.numerics.selection import LinearFit, Screen
-from makebreak.gap.problem import Candidate, Nuisances
+from makebreak.gap.problem import Candidate, Nuisances, share_left
 from makebreak.gap.residuals.inverse import SENSED, InverseModel
+from makebreak.gap.thresholds import SINGLE_SHARE_OF_GROUP
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import (
     Effect,
@@ -87,7 +88,7 @@ def candidates(
         if entry.absolute or of_things:
             continue
         if kind in SENSED:
-            found += _of_sensors(model, kind)
+            found += _of_sensors(model, kind, screen)
             continue
         if entry.path in ("delay", "lag"):
             found += _of_delays(model, kind)
@@ -281,7 +282,7 @@ def _of_drives(model: InverseModel, kind: str) -> list[Candidate]:
     return found
 
 
-def _of_sensors(model: InverseModel, kind: str) -> list[Candidate]:
+def _of_sensors(model: InverseModel, kind: str, screen: Screen) -> list[Candidate]:
     joints = model.joints
     models = tuple(dict.fromkeys(j.split(".")[0] for j in joints))
     what, name = KINDS[kind].channel, KINDS[kind].parameters[0].name
@@ -308,7 +309,26 @@ def _of_sensors(model: InverseModel, kind: str) -> list[Candidate]:
             places.append(models)
     unique = [p for p in dict.fromkeys(places) if p]
     found = [_secant(model, kind, at, name) for at in unique]
+    if what == "delay":
+        found.append(_late_efforts(model, kind, name, screen))
     return [c for c in found if c is not None]
+
+
+def _late_efforts(
+    model: InverseModel, kind: str, name: str, screen: Screen
+) -> Candidate | None:
+    """All efforts that stand in for commands are late, if nearly all of the gap is just
+    that. A late effort looks like damping where friction is most of what motors give,
+    so beside other effects it would be named in the place of it."""
+    given = tuple(
+        f"{j}.effort_measured"
+        for i, j in enumerate(model.joints) if model.by_measured[i]
+    )  # fmt: skip
+    if not given or (found := _secant(model, kind, given, name)) is None:
+        return None
+    before = screen.evaluate(screen.r).score
+    after = min(screen.fit(x).score for x in found.columns)
+    return found if share_left(before, after) <= 1.0 - SINGLE_SHARE_OF_GROUP else None
 
 
 def inseparable(effect: Effect, model: InverseModel) -> Effect | None:

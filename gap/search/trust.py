@@ -68,6 +68,30 @@ def trust_in(
     return found
 
 
+def by_recording(
+    problem: GapProblem, fitted: Fitted
+) -> dict[tuple[int, str], dict[str, tuple[float, float]]]:
+    """{(effect, parameter): {recording: (value, standard deviation)}} to first order,
+    of the recordings that show it."""
+    if not fitted.names:
+        return {}
+    J, r, known = _rows(problem, fitted)
+    recording, _ = _parts(problem)
+    value = _values(fitted)
+    found: dict[tuple[int, str], dict[str, tuple[float, float]]] = {
+        named: {} for named in fitted.names
+    }
+    for number in np.unique(recording):
+        some = recording == number
+        x = value + gauss_newton(J, r, some, known)
+        variance = _variances(J, r, some, known)
+        for k, named in enumerate(fitted.names):
+            if np.isfinite(x[k]) and np.isfinite(variance[k]):
+                name = problem.recordings[number].name
+                found[named][name] = float(x[k]), float(np.sqrt(variance[k]))
+    return found
+
+
 def consistency(problem: GapProblem, fitted: Fitted) -> list[float]:
     """Of each effect, by how many standard deviations it is off neutral if what it is
     on parts of the data (recordings; stretches of time where there are few) differs

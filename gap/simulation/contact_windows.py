@@ -80,7 +80,7 @@ class PushWindows(WindowModel):
         self.windows = [replace(w, std=w.std[:, keep]) for w in self.windows]
         self._add_spread()
 
-    def _given(self, recording: Recording, episode: Episode, i: int):
+    def _given(self, recording: Recording, episode: Episode, i: int, late):
         """times and columns of commands: the smoothed motion."""
         path = self._paths.get((i, episode.first))
         if path is None:  # No window begins here.

@@ -12,14 +12,19 @@ from typing import Any
 import numpy as np
 
 from makebreak.gap.data.recording import Episode, Recording
-from makebreak.gap.residuals.inverse import _lag, _sensing, rotor_before
+from makebreak.gap.residuals.inverse import (
+    _lag,
+    _sensing,
+    given_late,
+    rotor_before,
+)
 from makebreak.gap.simulation.scene_simulation import Commands, SceneSimulation
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import InitialSection, Scene, initial_for
 from makebreak.models.scene_schema import COMMANDS_OF
-from makebreak.systems.numerics.filters import Stage, memory, with_lag
+from makebreak.systems.numerics.filters import Stage, mean_delay, memory, with_lag
 from makebreak.systems.numerics.smoother import smooth_filtered
 
 _POSITIONS = ("x", "y", "z")
@@ -189,7 +194,7 @@ class WindowModel(WindowedResidual):
             raise ValueError(
                 f"no episode of the recordings holds a window of {window_sec} s"
             )
-        self._commands = self._all_commands()
+        self._commands: dict[tuple[float, ...], list[dict[int, Commands]]] = {}
         self.runs = 0
 
     # ----- Cutting
@@ -291,7 +296,16 @@ class WindowModel(WindowedResidual):
             extra += 4.0 * np.mean([spreads[f"{at}.{q}"][k][1, 1] for q in TURN])
         return np.sqrt(self.noise[c] ** 2 + np.maximum(extra, 0.0))
 
-    def _all_commands(self) -> list[dict[int, Commands]]:
+    def commands(self, effects: Sequence[Effect]) -> list[dict[int, Commands]]:
+        """Of each recording and episode; efforts that stand in for commands when they
+        were given, if effects make their measurement late."""
+        late = {
+            joint: given_late(effects, f"{joint}.effort_measured")
+            for joint in self._driven("effort_command")
+        }
+        key = tuple(late.values())
+        if key in self._commands:
+            return self._commands[key]
         out = []
         for i, recording in enumerate(self.recordings):
             names = self._commanded(recording)
@@ -300,14 +314,16 @@ class WindowModel(WindowedResidual):
                 time = recording.time[episode.rows]
                 columns = {n: recording.held(n)[episode.rows] for n in names}
                 if not names:  # What the motors gave stands in for it.
-                    time, columns = self._given(recording, episode, i)
+                    time, columns = self._given(recording, episode, i, late)
                 of[episode.first] = Commands(time, columns)
             out.append(of)
+        self._commands[key] = out
         return out
 
-    def _given(self, recording: Recording, episode: Episode, i: int):
+    def _given(self, recording: Recording, episode: Episode, i: int, late):
         """times and columns of commands that give what the motors gave: measured
-        efforts, as a line between rows, in steps of MEASURED_SEC or shorter."""
+        efforts, as a line between rows, in steps of MEASURED_SEC or shorter. late:
+        {joint: by how much its effort is measured late [s]}, beside its filters."""
         rows = recording.time[episode.rows]
         period = float(np.median(np.diff(rows)))
         parts = max(int(np.ceil(period / MEASURED_SEC - 1e-6)), 1)
@@ -322,7 +338,9 @@ class WindowModel(WindowedResidual):
                 continue
             y = recording[key][episode.rows]
             good = np.isfinite(y)
-            y = np.interp(middle, rows[good], y[good])
+            stages = recording.channels[key].stages or ()
+            shown = middle + mean_delay(stages) + late[joint]
+            y = np.interp(shown, rows[good], y[good])
             rotor = rotor_before(self.scene, self.dynamics.plant, joint)
             path = self._paths.get((i, episode.first), {})
             if rotor and f"{joint}.position" in path:
@@ -383,7 +401,9 @@ class WindowModel(WindowedResidual):
         Args: chosen: which windows, else all. twists: gives {joint: (twist, rate)} of a
             window's start, for joints behind an elastic element or a gap.
         """
-        self.simulation.set_effects([*self.scene.effects, *effects])
+        every = [*self.scene.effects, *effects]
+        self.simulation.set_effects(every)
+        commands = self.commands(every)
         self.runs += 1
         out = []
         for k, w in enumerate(self.windows):
@@ -398,12 +418,12 @@ class WindowModel(WindowedResidual):
                 self._initial(w, episode, effects),
                 recording.time[w.rows],
                 self.channels,
-                self._commands[w.recording][episode.first],
+                commands[w.recording][episode.first],
                 start_sec=w.start,
                 initial_is_true=True,
                 twists=twists(w) if twists else None,
                 filters=self._filters[w.recording],
-                before=self._before(w, episode, [*self.scene.effects, *effects]),
+                before=self._before(w, episode, every),
             )
             if self.simulation.failure:
                 y[np.isnan(y)] = np.inf

@@ -354,8 +354,8 @@ def _place(effect: Effect, kind: EffectKind) -> str:
         what = "each joint of" if kind.at == "joint" else "each actuator of"
     elif kind.at == "channel" and all(at.count(".") < 2 for at in effect.at):
         what = "each channel of"
-    elif len(places) > 1 and what == "joint":
-        what = "each of the joints"
+    elif len(places) > 1 and what in ("joint", "channel"):
+        what = f"each of the {what}s"
     if len(places) > 1:
         places = [f"{', '.join(places[:-1])} and {places[-1]}"]
     return f"{what} {places[0]}".strip()

@@ -1,0 +1,288 @@
+"""Whether an effect is the same in all recordings, or in some of them only.
+
+One value for all recordings explains none of them where they differ: a load that was
+taken up between two of them, or a joint that was warm in one. Each recording is then
+searched by itself, and what was found in one is fitted in the others.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from makebreak.gap.problem import GapProblem, is_sane
+from makebreak.gap.result import (
+    Differs,
+    Estimate,
+    GapMeasure,
+    GapResult,
+    NamedEffect,
+    Trust,
+)
+from makebreak.gap.search.choice import Selection
+from makebreak.gap.search.fit import fit_effects
+from makebreak.gap.search.trust import by_recording
+from makebreak.gap.thresholds import DIFFERS_SHARE, DIFFERS_Z
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect, with_deviation
+
+MOST_RECORDINGS = 6  # That are searched one by one.
+EXPLAINED = ("no_gap", "not_judged", "gap_named", "ambiguous")
+Values = Mapping[str, tuple[float, float]]  # {recording: (value, standard deviation)}
+
+
+@dataclass(frozen=True, eq=False)
+class Alone:
+    """What a recording comes to by itself."""
+
+    name: str
+    problem: GapProblem
+    selection: Selection
+    result: GapResult
+
+
+def may_differ(problem: GapProblem, fitted, result: GapResult) -> bool:
+    """Whether recordings should be looked at one by one: they leave a gap together, or
+    an effect, to first order, is another in each."""
+    if len({r.name for r in problem.recordings}) < 2:
+        return False
+    if result.verdict == "gap_unnamed":
+        return True
+    values = by_recording(problem, fitted)
+    return any(
+        _apart(of, KINDS[fitted.effects[i].kind].parameter(name).neutral)
+        for (i, name), of in values.items()
+    )
+
+
+def with_differences(
+    result: GapResult, names: Sequence[str], alone: Callable[[str], Alone]
+) -> GapResult:
+    """The result of all recordings together, corrected by what each is by itself.
+
+    Effects that differ are named for the recordings in which they are, if each
+    recording by itself is explained; otherwise the result says only that they differ.
+
+    Args: names: of the recordings. alone: judges one of them; ValueError where it is
+        too short by itself.
+    """
+    if len(names) > MOST_RECORDINGS:
+        more = (
+            f" Whether the {len(names)} recordings differ was not asked: give at most "
+            f"{MOST_RECORDINGS} of them."
+        )
+        return replace(result, says=result.says + more)
+    try:
+        each = [alone(name) for name in names]
+    except ValueError:
+        return result
+    told = [one for one in each if one.result.verdict in EXPLAINED]
+    found = _found(told)
+    values = {key: _values(effect, told) for key, effect in found.items()}
+    differs = {
+        key: d for key, effect in found.items()
+        if (d := _difference(effect, values[key], told)) is not None
+    }  # fmt: skip
+    if not differs:
+        return result
+    words = " ".join(d.says for d in differs.values())
+    if len(told) < len(each):
+        return replace(
+            result, says=f"{result.says} {words}", differs=tuple(differs.values())
+        )
+    effects = _effects(found, values, differs, each)
+    gap = _pooled([one.result.gap for one in each])
+    is_tied = any(one.result.verdict == "ambiguous" for one in each)
+    named = " ".join(e.says for e in effects)
+    return replace(
+        result,
+        verdict="ambiguous" if is_tied else "gap_named",
+        says=f"{words} {named} Each recording by itself: the held-out error falls from "
+        f"{gap.before:.3g} to {gap.after:.3g} times the noise.",
+        effects=effects,
+        gap=gap,
+        unexplained=(),
+        background=_largest([one.result.background for one in each]),
+        series=[s for one in each for s in one.result.series],
+        trust=_trust(each),
+        nuisance_scene=(),
+        differs=tuple(differs.values()),
+    )
+
+
+def _found(each: Sequence[Alone]) -> dict[tuple[str, tuple[str, ...]], Effect]:
+    """{(kind, place): effect} of all that was named in some recording, as it is in the
+    first of these."""
+    found: dict[tuple[str, tuple[str, ...]], Effect] = {}
+    for one in each:
+        for effect in one.result.effects:
+            found.setdefault((effect.kind, effect.at), effect.effect())
+    return found
+
+
+def _of(one: Alone, effect: Effect) -> NamedEffect | None:
+    """An effect as it was named in a recording."""
+    for named in one.result.effects:
+        if (named.kind, list(named.at)) == (effect.kind, list(effect.at)):
+            return named
+    return None
+
+
+def _values(effect: Effect, each: Sequence[Alone]) -> dict[str, Values]:
+    """{parameter: its values} in the recordings that tell it: as it was named, or
+    fitted beside what was named there."""
+    found: dict[str, dict[str, tuple[float, float]]] = {}
+    for one in each:
+        if (named := _of(one, effect)) is not None:
+            here = {n: (p.value, p.std) for n, p in named.parameters.items()}
+        else:
+            here = _beside(one, effect)
+        for name, value in here.items():
+            found.setdefault(name, {})[one.name] = value
+    return dict(found)
+
+
+def _beside(one: Alone, effect: Effect) -> dict[str, tuple[float, float]]:
+    """{parameter: (value, deviation)} of an effect beside what was named."""
+    start = [e.effect() for e in one.result.effects] + [effect]
+    # Where an effect is none, how far off its load is, say, means nothing.
+    free = [p.name for p in KINDS[effect.kind].parameters if p.neutral is not None]
+    fixed: list[Sequence[str]] = [[] for _ in start]
+    fixed[-1] = [name for name in effect.parameters if name not in free]
+    try:
+        fit = fit_effects(one.problem, one.selection.screen(one.problem), start, fixed)
+    except (ValueError, RuntimeError):  # A scene cannot have it there.
+        return {}
+    if not is_sane(fit.effects[-1], one.problem.dynamics.least(effect.kind, effect.at)):
+        return {}  # It says nothing here.
+    value, std = fit.effects[-1].parameters, fit.std[-1]
+    return {n: (value[n], std[n]) for n in free if n in std}
+
+
+def _apart(values: Values, neutral: float | None) -> float:
+    """By how many deviations the two values are apart that are the most; 0 where no two
+    differ by more than laws are good for, or the data do not tell."""
+    most = 0.0
+    if neutral is None:
+        return most
+    for x, s in values.values():
+        for y, t in values.values():
+            far = DIFFERS_SHARE * max(abs(x - neutral), abs(y - neutral))
+            std = float(np.hypot(s, t))
+            if np.isfinite(std) and std > 0.0 and abs(x - y) > far:
+                most = max(most, abs(x - y) / std)
+    return most if most > DIFFERS_Z else 0.0
+
+
+def _difference(
+    effect: Effect, values: Mapping[str, Values], each: Sequence[Alone]
+) -> Differs | None:
+    """What is to be said of an effect that differs; None: it does not."""
+    kind = KINDS[effect.kind]
+    sizes = {
+        p.name: apart for p in kind.parameters
+        if (apart := _apart(values.get(p.name, {}), p.neutral)) > 0.0
+    }  # fmt: skip
+    if not sizes:
+        return None
+    name = max(sizes, key=lambda n: sizes[n])
+    unit = next(
+        named.parameters[name].unit for one in each
+        if (named := _of(one, effect)) is not None and name in named.parameters
+    )  # fmt: skip
+    parts = [
+        f"{with_deviation(x, s)} {unit}".strip() + f" in {recording}"
+        for recording, (x, s) in values[name].items()
+    ]
+    says = (
+        f"The {name.replace('_', ' ')} of {effect.kind} at {', '.join(effect.at)} is "
+        f"{', '.join(parts[:-1])} and {parts[-1]}: it is not the same in all "
+        "recordings."
+    )
+    of = {r: Estimate(x, s, unit) for r, (x, s) in values[name].items()}
+    return Differs(effect.kind, tuple(effect.at), name, of, says)
+
+
+def _effects(found, values, differs, each: Sequence[Alone]) -> list[NamedEffect]:
+    """What is named: of the robot where recordings do not contradict it, else of the
+    recordings in which it is."""
+    out = []
+    for key, effect in found.items():
+        there = [(one, n) for one in each if (n := _of(one, effect)) is not None]
+        if key in differs:
+            for one, named in there:
+                says = f"In {one.name}: {named.says[:1].lower()}{named.says[1:]}"
+                out.append(replace(named, says=says, recordings=(one.name,)))
+            continue
+        out.append(min((n for _, n in there), key=_surest))
+    return out
+
+
+def _surest(named: NamedEffect) -> float:
+    """The smallest relative deviation of the parameters."""
+    return min(
+        (p.std / max(abs(p.value), 1e-12) for p in named.parameters.values()),
+        default=np.inf,
+    )
+
+
+def _pooled(gaps: Sequence[GapMeasure]) -> GapMeasure:
+    """Over the windows of all recordings."""
+    weight = np.array([max(g.n_windows, 1) for g in gaps], float)
+    weight /= weight.sum()
+
+    def pool(values) -> float:
+        return float(np.sqrt(np.sum(weight * np.square(list(values)))))
+
+    channels = [c for c in gaps[0].per_channel if all(c in g.per_channel for g in gaps)]
+    units = [c for c in gaps[0].in_units if all(c in g.in_units for g in gaps)]
+    joints = [c for c in gaps[0].equations if all(c in g.equations for g in gaps)]
+
+    def in_units(of, names):
+        return {
+            c: replace(
+                of[0][c], before=pool(g[c].before for g in of),
+                after=pool(g[c].after for g in of),
+            )
+            for c in names
+        }  # fmt: skip
+
+    return replace(
+        gaps[0],
+        before=pool(g.before for g in gaps),
+        after=pool(g.after for g in gaps),
+        per_channel={
+            c: {w: pool(g.per_channel[c][w] for g in gaps) for w in ("before", "after")}
+            for c in channels
+        },
+        in_units=in_units([g.in_units for g in gaps], units),
+        equations=in_units([g.equations for g in gaps], joints),
+        n_windows=sum(g.n_windows for g in gaps),
+        failed=(sum(g.failed[0] for g in gaps), sum(g.failed[1] for g in gaps)),
+        data="reported" if all(g.data == "reported" for g in gaps) else "chosen on",
+        seconds=sum(g.seconds for g in gaps),
+    )
+
+
+def _largest(each: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Of each nuisance, the value that is the farthest off."""
+    names = {n for values in each for n in values}
+    return {
+        n: max((v[n] for v in each if n in v), key=abs)
+        for n in sorted(names, key=list(each[0]).index if each[0] else None)
+    }
+
+
+def _trust(each: Sequence[Alone]) -> list[Trust]:
+    """Of each parameter what recordings say of it, one by one."""
+    found: dict[tuple, Trust] = {}
+    for one in each:
+        for t in one.result.trust:
+            key = (t.kind, t.at, t.parameter)
+            old = found.get(key)
+            here = {one.name: t.value}
+            found[key] = replace(
+                t if old is None else old,
+                recordings=here if old is None else {**old.recordings, **here},
+            )
+    return list(found.values())
