@@ -28,6 +28,7 @@ from makebreak.models.effects.kind import Effect, with_deviation
 
 MOST_RECORDINGS = 6  # That are searched one by one.
 EXPLAINED = ("no_gap", "not_judged", "gap_named", "ambiguous")
+Key = tuple[str, tuple[str, ...]]  # Kind and place of an effect.
 Values = Mapping[str, tuple[float, float]]  # {recording: (value, standard deviation)}
 
 
@@ -77,11 +78,12 @@ def with_differences(
     except ValueError:
         return result
     told = [one for one in each if one.result.verdict in EXPLAINED]
-    found = _found(told)
-    values = {key: _values(effect, told) for key, effect in found.items()}
+    found = _found([one.result for one in told] + [result])
+    together = {one.name: _together(one, result) for one in each if one not in told}
+    values = {key: _values(effect, told, together) for key, effect in found.items()}
     differs = {
         key: d for key, effect in found.items()
-        if (d := _difference(effect, values[key], told)) is not None
+        if (d := _difference(effect, values[key])) is not None
     }  # fmt: skip
     if not differs:
         return result
@@ -90,7 +92,7 @@ def with_differences(
         return replace(
             result, says=f"{result.says} {words}", differs=tuple(differs.values())
         )
-    effects = _effects(found, values, differs, each)
+    effects = _effects(found, differs, each)
     gap = _pooled([one.result.gap for one in each])
     is_tied = any(one.result.verdict == "ambiguous" for one in each)
     named = " ".join(e.says for e in effects)
@@ -110,36 +112,61 @@ def with_differences(
     )
 
 
-def _found(each: Sequence[Alone]) -> dict[tuple[str, tuple[str, ...]], Effect]:
-    """{(kind, place): effect} of all that was named in some recording, as it is in the
+def _found(each: Sequence[GapResult]) -> dict[Key, NamedEffect]:
+    """{(kind, place): effect} of all that was named in some result, as it is in the
     first of these."""
-    found: dict[tuple[str, tuple[str, ...]], Effect] = {}
+    found: dict[Key, NamedEffect] = {}
     for one in each:
-        for effect in one.result.effects:
-            found.setdefault((effect.kind, effect.at), effect.effect())
+        for effect in one.effects:
+            found.setdefault(_key(effect), effect)
     return found
 
 
-def _of(one: Alone, effect: Effect) -> NamedEffect | None:
+def _key(effect: Effect | NamedEffect) -> Key:
+    return effect.kind, tuple(effect.at)
+
+
+def _of(one: Alone, key: Key) -> NamedEffect | None:
     """An effect as it was named in a recording."""
-    for named in one.result.effects:
-        if (named.kind, list(named.at)) == (effect.kind, list(effect.at)):
-            return named
-    return None
+    return next((e for e in one.result.effects if _key(e) == key), None)
 
 
-def _values(effect: Effect, each: Sequence[Alone]) -> dict[str, Values]:
+def _values(
+    effect: NamedEffect, told: Sequence[Alone], together: Mapping[str, Mapping]
+) -> dict[str, Values]:
     """{parameter: its values} in the recordings that tell it: as it was named, or
-    fitted beside what was named there."""
+    fitted beside what was named there.
+
+    Args: told: recordings that are explained by themselves. together: of the others,
+        {(kind, place): {parameter: (value, deviation)}}.
+    """
     found: dict[str, dict[str, tuple[float, float]]] = {}
-    for one in each:
-        if (named := _of(one, effect)) is not None:
+    for recording, of in together.items():
+        for name, value in of.get(_key(effect), {}).items():
+            found.setdefault(name, {})[recording] = value
+    for one in told:
+        if (named := _of(one, _key(effect))) is not None:
             here = {n: (p.value, p.std) for n, p in named.parameters.items()}
         else:
-            here = _beside(one, effect)
+            here = _beside(one, effect.effect())
         for name, value in here.items():
             found.setdefault(name, {})[one.name] = value
     return dict(found)
+
+
+def _together(one: Alone, result: GapResult):
+    """{(kind, place): {parameter: (value, deviation)}} of what was named for all
+    recordings, fitted to one of them."""
+    start = [e.effect() for e in result.effects]
+    try:
+        fit = fit_effects(one.problem, one.selection.screen(one.problem), start)
+    except (ValueError, RuntimeError):  # A scene cannot have them.
+        return {}
+    return {
+        _key(e): {n: (e.parameters[n], s) for n, s in std.items()}
+        for e, std in zip(fit.effects, fit.std, strict=True)
+        if is_sane(e, one.problem.dynamics.least(e.kind, e.at))
+    }
 
 
 def _beside(one: Alone, effect: Effect) -> dict[str, tuple[float, float]]:
@@ -174,9 +201,7 @@ def _apart(values: Values, neutral: float | None) -> float:
     return most if most > DIFFERS_Z else 0.0
 
 
-def _difference(
-    effect: Effect, values: Mapping[str, Values], each: Sequence[Alone]
-) -> Differs | None:
+def _difference(effect: NamedEffect, values: Mapping[str, Values]) -> Differs | None:
     """What is to be said of an effect that differs; None: it does not."""
     kind = KINDS[effect.kind]
     sizes = {
@@ -186,10 +211,7 @@ def _difference(
     if not sizes:
         return None
     name = max(sizes, key=lambda n: sizes[n])
-    unit = next(
-        named.parameters[name].unit for one in each
-        if (named := _of(one, effect)) is not None and name in named.parameters
-    )  # fmt: skip
+    unit = effect.parameters[name].unit
     parts = [
         f"{with_deviation(x, s)} {unit}".strip() + f" in {recording}"
         for recording, (x, s) in values[name].items()
@@ -203,18 +225,23 @@ def _difference(
     return Differs(effect.kind, tuple(effect.at), name, of, says)
 
 
-def _effects(found, values, differs, each: Sequence[Alone]) -> list[NamedEffect]:
+def _effects(
+    found: Mapping[Key, NamedEffect],
+    differs: Mapping[Key, Differs],
+    each: Sequence[Alone],
+) -> list[NamedEffect]:
     """What is named: of the robot where recordings do not contradict it, else of the
     recordings in which it is."""
     out = []
-    for key, effect in found.items():
-        there = [(one, n) for one in each if (n := _of(one, effect)) is not None]
+    for key in found:
+        there = [(one, n) for one in each if (n := _of(one, key)) is not None]
         if key in differs:
             for one, named in there:
                 says = f"In {one.name}: {named.says[:1].lower()}{named.says[1:]}"
                 out.append(replace(named, says=says, recordings=(one.name,)))
             continue
-        out.append(min((n for _, n in there), key=_surest))
+        if there:
+            out.append(min((n for _, n in there), key=_surest))
     return out
 
 
