@@ -13,7 +13,7 @@ from makebreak.gap.data.check_drives import check_drives, check_initial_names
 from makebreak.gap.data.check_meshes import check_meshes
 from makebreak.gap.data.checks import check_recordings
 from makebreak.gap.data.conditioning import condition
-from makebreak.gap.data.findings import Finding
+from makebreak.gap.data.findings import GUESSED_GAINS, Finding
 from makebreak.gap.data.recording import (
     Recording,
     check_against_scene,
@@ -82,11 +82,13 @@ def run_gap(
     progress: Callable[[str], None] | None = None,
     skip_bad_rows: bool = False,
     sidecars: Mapping[Path, Path] | None = None,
+    doubts: Sequence[Finding] = (),
 ) -> GapResult:
     """Finds where a scene and recordings disagree, and names what the scene lacks.
 
     Args: jobs: processes at once. progress: called with a line of text now and then.
-        skip_bad_rows, sidecars: as of read_recordings.
+        skip_bad_rows, sidecars: as of read_recordings. doubts: what is to be said of
+        the scene beforehand.
     Raises: ValueError, one line, for a scene or recording that cannot be read or do
         not fit together.
     """
@@ -106,7 +108,7 @@ def run_gap(
     # What is reported on is cut off before anything is looked at.
     parts = split(recordings)
     say("checking the recordings")
-    checks = check_recordings(parts.decided, scene_facts(dynamics.plant))
+    checks = [*doubts, *check_recordings(parts.decided, scene_facts(dynamics.plant))]
     is_mechanism = _is_mechanism(dynamics, recordings)
     # An impact would be smeared by means over rows.
     meets = is_mechanism and (
@@ -451,8 +453,9 @@ def unjudged_channels(channels: Sequence[JudgedChannel]) -> str:
 
 
 def _unless_doubtful(result: GapResult) -> GapResult:
-    """Without effects where units, signs or axes are wrong, as they would explain that;
-    and without agreement where a channel's motion was taken for noise."""
+    """Without effects where units, signs, axes or drives' gains are wrong, as they
+    would explain that; and without agreement where a channel's motion was taken for
+    noise."""
     hunting = [c.says for c in result.checks if c.kind == "hunting"]
     if result.verdict in AGREES and hunting:
         return replace(
@@ -460,7 +463,23 @@ def _unless_doubtful(result: GapResult) -> GapResult:
             verdict="gap_unnamed",
             says=f"These recordings are inconclusive: {hunting[0]}",
         )
-    if not result.effects or all(c.severity != "error" for c in result.checks):
+    if not result.effects:
+        return result
+    guessed = any(c.kind == GUESSED_GAINS for c in result.checks)
+    if any(c.severity == "error" for c in result.checks):
+        says = (
+            "The scene and the recordings disagree, but units, signs or axes of what "
+            "was measured are wrong (see the checks): put that right first, for until "
+            "then nothing can be named."
+        )
+    elif guessed and not result.gap.after <= UNEXPLAINED_RMS:
+        # Whatever else is free makes up for a gain that is wrong.
+        says = (
+            "The scene and the recordings disagree, but the gains of the drives are a "
+            "guess, and no effect explains all of it: write the gains into the scene, "
+            "or record what the motors give, for until then nothing can be named."
+        )
+    else:
         return result
     per_channel = {
         name: {"before": each["before"], "after": each["before"]}
@@ -470,10 +489,9 @@ def _unless_doubtful(result: GapResult) -> GapResult:
     return replace(
         result,
         verdict="gap_unnamed",
-        says="The scene and the recordings disagree, but units, signs or axes of what "
-        "was measured are wrong (see the checks): put that right first, for until then "
-        "nothing can be named.",
+        says=says,
         effects=[],
+        differs=(),
         gap=gap,
         series=[replace(each, after=each.before) for each in result.series],
     )

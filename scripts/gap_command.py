@@ -12,6 +12,7 @@ from time import perf_counter
 
 from tqdm import tqdm
 
+from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.recording import has_sidecar, read_recordings, sidecar_of
 from makebreak.gap.report.comparison import comparison_html
 from makebreak.gap.report.files import (
@@ -91,11 +92,12 @@ def run_and_report(
     start = perf_counter()
     given = scene_path
     inputs = [scene_path, *recording_paths]
+    doubts: Sequence[Finding] = ()
     sidecars = {} if is_robot else sidecars_beside(scene_path, recording_paths)
     notes = [f"{log.name}: columns as in {own}" for log, own in sidecars.items()]
     with OutputFolder(out_dir, "gap", inputs) as out:
         if is_robot:
-            scene_path, sidecars, notes = _proposed(
+            scene_path, sidecars, notes, doubts = _proposed(
                 scene_path, recording_paths, out, out_dir
             )
         if export:  # Raises before anything is computed.
@@ -103,8 +105,9 @@ def run_and_report(
         try:
             with StageBar() as progress:
                 result = run_gap(
-                    scene_path, recording_paths, jobs, progress, skip_bad_rows, sidecars
-                )
+                    scene_path, recording_paths, jobs, progress, skip_bad_rows,
+                    sidecars, doubts,
+                )  # fmt: skip
                 progress("writing the report", 0.95)
                 scene = read_scene(scene_path)
                 recordings = read_recordings(recording_paths, skip_bad_rows, sidecars)
@@ -149,10 +152,11 @@ def sidecars_beside(
 
 def _proposed(
     robot_path: Path, recording_paths: Sequence[Path], out: OutputFolder, out_dir: Path
-) -> tuple[Path, dict[Path, Path], list[str]]:
+) -> tuple[Path, dict[Path, Path], list[str], list[Finding]]:
     """Writes a proposed scene and sidecars for a robot and its logs.
 
-    Returns: the scene's path, {recording: sidecar}, notes for the user.
+    Returns: the scene's path, {recording: sidecar}, notes for the user, and what the
+    result must not forget of them.
     """
     from makebreak.gap.data.robot import propose_scene, read_log, read_robot
 
@@ -172,7 +176,7 @@ def _proposed(
         f"Correct {' and '.join(names)} where they are wrong. Then run: "
         f"makebreak gap {quote(names[0])} {again}"
     )
-    return scene, sidecars, notes
+    return scene, sidecars, notes, proposal.findings()
 
 
 def exported(scene: Scene, formats: Sequence[str]) -> dict[str, str]:

@@ -1,13 +1,17 @@
 """Logs of a pendulum in closed form: late channels, and recordings that differ."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from makebreak.gap import read_recordings, run_gap, write_report
 from makebreak.gap.by_recording import _apart
+from makebreak.gap.data.findings import GUESSED_GAINS, Finding
 from makebreak.gap.residuals.inverse import InverseModel
+from makebreak.gap.result import Evidence, GapMeasure, GapResult, NamedEffect
+from makebreak.gap.workflow import _unless_doubtful
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
 
@@ -78,6 +82,7 @@ def test_late_states_are_named_beside_the_efforts(scene, tmp_path, late):
     assert result.verdict == "gap_named"
     (found,) = result.effects
     assert (found.kind, list(found.at)) == ("sensor_delay", ["rig"])
+    assert "beside its measured efforts" in result.says
     # Half a millisecond is what users were promised; noise alone gives 0.05 ms.
     assert found.parameters["delay"].value == pytest.approx(late, abs=5e-4)
 
@@ -138,3 +143,17 @@ def test_a_recording_that_does_not_show_a_parameter_contradicts_none():
     assert _apart({"a": (1.3, 0.05), "b": (0.0, 0.5)}, 0.0) == 0.0
     assert _apart({"a": (1.3, 0.05), "b": (0.0, np.inf)}, 0.0) == 0.0
     assert _apart({"a": (1.3, 0.01), "b": (1.1, 0.01)}, 0.0) == 0.0  # 15 % apart.
+
+
+def test_beside_guessed_gains_only_what_explains_all_is_named():
+    guess = Finding(GUESSED_GAINS, "a", "time", 0.0, "", "warning", "They are a guess.")
+    found = NamedEffect("link_mass", ("rig.rod",), {}, "", Evidence(9.0, 1.0, "", 1.0))
+    gap = GapMeasure(368.0, 79.7, 1.0, 0.3)
+    result = GapResult("gap_named", "", (), [found], gap, (), {}, [guess])
+    after = _unless_doubtful(result)
+    assert (after.verdict, after.effects) == ("gap_unnamed", [])
+    assert "guess" in after.says
+    explained = replace(result, gap=replace(gap, after=1.2))
+    assert _unless_doubtful(explained) == explained
+    known = replace(result, checks=[])
+    assert _unless_doubtful(known) == known

@@ -923,7 +923,8 @@ def test_a_patch_beside_others_is_told_by_how_far_it_may_end(
     at_end = dict.fromkeys(patch.parameters, slopes)
     choice = Choice(patch, at_end, 2.0, after, "", 1.0, (), (), 5)
     moved = {"friction": 1e-3} | dict.fromkeys(sides, far)
-    problem = SimpleNamespace(widened=lambda end, k: (moved, ()))
+    dynamics = SimpleNamespace(least=lambda kind, at: {})
+    problem = SimpleNamespace(widened=lambda end, k: (moved, ()), dynamics=dynamics)
     search = SimpleNamespace(problem=problem)
     chosen = [choice, *others * [replace(choice)]]
     assert _is_certain(search, chosen, None, 0) == named

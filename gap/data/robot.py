@@ -12,6 +12,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
 from makebreak.gap.data.csv_table import text_columns
+from makebreak.gap.data.findings import GUESSED_GAINS, Finding
 from makebreak.gap.data.proposal import (
     JointName,
     Match,
@@ -121,13 +122,29 @@ def matches_of(log: Log, robot: Robot | None) -> list[Match]:
     return propose(log.table.columns, joints, log.text)
 
 
+FROM_SAG = "from how far joints sag below their commands"
+
+
 @dataclass(frozen=True)
 class Proposal:
-    """A scene and a sidecar for each log, as texts. notes: what was guessed."""
+    """A scene and a sidecar for each log, as texts. notes: what was guessed. gains_of:
+    how drives' gains were guessed, in words; "" where none had to be."""
 
     scene: str
     sidecars: dict[Path, str]
     notes: tuple[str, ...]
+    gains_of: str = ""
+
+    def findings(self) -> list[Finding]:
+        """What a result must not forget."""
+        if not self.gains_of:
+            return []
+        says = (
+            f"The gains of the drives in this proposed scene are {self.gains_of}: they "
+            "are not known."
+        )
+        name = next(iter(self.sidecars), Path("")).stem
+        return [Finding(GUESSED_GAINS, name, "time", 0.0, "", "warning", says)]
 
 
 def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
@@ -167,32 +184,34 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
             "  # It stands upright on the world's origin."
         )
         notes.append(f"{base} is welded to the world, upright")
-    lines += [
-        "plant: {time_step: 0.001}",
-        *_actuation(robot, kinds, every, logs, notes),
-    ]
+    actuation, gains = _actuation(robot, kinds, every, logs, notes)
+    lines += ["plant: {time_step: 0.001}", *actuation]
     sidecars = {path: sidecar_text(matches) for path, matches in every.items()}
-    return Proposal("\n".join(lines) + "\n", sidecars, tuple(notes))
+    return Proposal("\n".join(lines) + "\n", sidecars, tuple(notes), gains)
 
 
 def _file(robot: Robot) -> str:
     return f"file://{robot.path.resolve()}"
 
 
-def _actuation(robot: Robot, kinds, every, logs, notes: list[str]) -> list[str]:
+def _actuation(
+    robot: Robot, kinds, every, logs, notes: list[str]
+) -> tuple[list[str], str]:
+    """Lines of the scene, and how drives' gains were guessed ("": there are none)."""
+
     def named(what: str) -> list[str]:
         return [j.name for j in robot.joints if j.name in kinds.get(what, ())]
 
     for what in ("effort_command", "effort_measured"):
         if joints := named(what):
             notes.append(f"joints are driven by what {what} says")
-            return [f"actuation: {{type: effort, joints: [{', '.join(joints)}]}}"]
+            return [f"actuation: {{type: effort, joints: [{', '.join(joints)}]}}"], ""
     if joints := named("position_command"):
         stiff = _stiffness(robot, every, logs)
         known = [k for k in stiff.values() if k > 0.0]
         guess = float(np.median(known)) if known else GUESSED_KP
         kp = [float(f"{stiff.get(j, 0.0) or guess:.3g}") for j in joints]
-        told = "from how far joints sag below their commands" if known else "a guess"
+        told = FROM_SAG if known else "a guess"
         notes.append(f"drives are position servos of kp {kp} N m/rad ({told})")
         lines = [
             "actuation:",
@@ -213,7 +232,7 @@ def _actuation(robot: Robot, kinds, every, logs, notes: list[str]) -> list[str]:
                 f"- {{kind: rotor_inertia, at: {joint}, "
                 f"parameters: {{inertia: {inertia}}}}}  # [kg m2]"
             )
-        return lines
+        return lines, told
     if joints := named("velocity_command"):
         notes.append("drives follow velocities, with gains that are a guess")
         moved = _inertia(robot)
@@ -223,9 +242,9 @@ def _actuation(robot: Robot, kinds, every, logs, notes: list[str]) -> list[str]:
             "  type: velocity  # The gains are guessed: correct them.",
             f"  joints: [{', '.join(joints)}]",
             f"  kd: {kd}  # [N m s/rad], or [N s/m] of one that slides.",
-        ]
+        ], "a guess"
     notes.append("no command was found: nothing drives the joints")
-    return ["actuation: {type: none}"]
+    return ["actuation: {type: none}"], ""
 
 
 def _inertia(robot: Robot) -> dict[str, float]:
