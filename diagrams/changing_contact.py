@@ -1,6 +1,7 @@
 """A Panda follows a motion that makes, keeps and breaks contact (CC section 3).
 
-    station --q, v, wrench--> tip_state --ee_pose, ee_velocity--> all
+    station --q, v--> tip_state --ee_pose, ee_velocity--> all
+    station --wrench--> wrench_tare --wrench without the sensor's bias--> all
     contact_detector --contact--> contact_anticipator, velocity_shaper
     mode_detector --mode--> forward_model_bank --prediction--> variable_impedance
     contact_anticipator --contacts--> velocity_shaper; --hints--> mode_detector
@@ -50,6 +51,7 @@ from makebreak.systems.arm.variable_impedance import (
     VariableImpedance,
     VariableImpedanceConfig,
 )
+from makebreak.systems.arm.wrench_tare import WrenchTare, WrenchTareConfig
 from makebreak.systems.changing_contact.contact_anticipator import (
     ContactAnticipatorConfig,
     KalmanContactAnticipator,
@@ -93,6 +95,7 @@ WRENCH = f"{ARM}.external_wrench"  # The station's port of the measured wrench.
 
 @dataclass
 class ChangingContactConfig:
+    tare: WrenchTareConfig = field(default_factory=WrenchTareConfig)
     detector: ContactDetectorConfig = field(default_factory=ContactDetectorConfig)
     modes: ModeDetectorConfig = field(default_factory=ModeDetectorConfig)
     forward_model: ForwardModelConfig = field(default_factory=ForwardModelConfig)
@@ -247,6 +250,7 @@ class _Systems:
     """The systems beside the station."""
 
     tip: TipState
+    tare: WrenchTare
     detector: ContactDetector
     modes: ModeDetector
     forward: ForwardModelBank
@@ -269,8 +273,10 @@ def _add_systems(
     add = builder.AddNamedSystem
     return _Systems(
         tip=add("tip_state", TipState(serial_chain_of(arm, TIP_FRAME))),
+        tare=add("wrench_tare", WrenchTare(timed(config.tare, TICK, OFFSET))),
         detector=add(
-            "contact_detector", ContactDetector(timed(config.detector, TICK, OFFSET))
+            "contact_detector",
+            ContactDetector(timed(config.detector, TICK, OFFSET), tared=True),
         ),
         modes=add(
             "mode_detector", ModeDetector(config.modes, known.modes, ESTIMATE, OFFSET)
@@ -321,12 +327,13 @@ def _connect_systems(builder: DiagramBuilder, station, s: _Systems, config) -> N
     for q, measured in (("q", "position"), ("v", "velocity")):
         connect(station, f"{ARM}.{measured}_measured", s.tip, s.impedance, port=q)
     watching = (s.detector, s.modes, s.forward, s.variable)
-    connect(station, WRENCH, *watching, port="wrench")
-    connect(station, WRENCH, s.impedance, port="wrench_measured")
+    connect(station, WRENCH, s.tare, port="wrench")
+    connect(s.tare, "wrench", *watching)
+    connect(s.tare, "wrench", s.impedance, port="wrench_measured")
     connect(s.tip, "ee_pose", s.detector, s.anticipator, s.shaper)
-    connect(s.tip, "ee_velocity", *watching, s.anticipator)
+    connect(s.tip, "ee_velocity", s.tare, *watching, s.anticipator)
     connect(s.shaper, "direction", *watching)
-    connect(s.shaper, "force_directions", *watching, s.impedance)
+    connect(s.shaper, "force_directions", s.tare, *watching, s.impedance)
     connect(s.shaper, "force_targets", s.detector, s.variable, s.impedance)
     connect(s.shaper, "phase", s.detector, s.anticipator, s.variable)
     connect(s.shaper, "x_desired", s.impedance, s.forward)
@@ -349,7 +356,7 @@ def _connect_systems(builder: DiagramBuilder, station, s: _Systems, config) -> N
                 "impact_reflex", ImpactReflex(timed(config.reflex, TICK, OFFSET))
             )
             connect(s.variable, port, source)
-            connect(station, WRENCH, source, port="wrench")
+            connect(s.tare, "wrench", source)
             connect(s.tip, "ee_velocity", source)
             connect(s.shaper, "direction", source)
             connect(s.shaper, "phase", source)
@@ -366,7 +373,7 @@ def _add_view(builder: DiagramBuilder, station, s: _Systems, pattern, meshcat, v
         ContactView(view or ContactViewConfig(), meshcat, plan=segment_paths(pattern)),
     )
     connect(s.anticipator, "contacts", shown)
-    connect(station, WRENCH, shown, port="wrench")
+    connect(s.tare, "wrench", shown)
     connect(s.tip, "ee_pose", shown)
     connect(s.modes, "mode", shown)
     connect(s.shaper, "phase", shown)

@@ -47,12 +47,12 @@ class ContactDetector(LeafSystem):
         along (2,) force against the motion and the part of it that is expected [N].
 
     The bias of the wrench is its mean over the first 0.1 s, if the tip is at rest in
-    free space for that long.
+    free space for that long. With `tared` there is none: WrenchTare has taken it off.
 
     Source: CC section 3.3.
     """
 
-    def __init__(self, config: ContactDetectorConfig):
+    def __init__(self, config: ContactDetectorConfig, tared: bool = False):
         """Raises: ValueError for a number that is not positive (tool_mass, offset_sec:
         that is negative) or a period above 2 ms."""
         super().__init__()
@@ -86,7 +86,7 @@ class ContactDetector(LeafSystem):
         ]
         self._contact = self.DeclareDiscreteState(N_CONTACT)
         self._along = self.DeclareDiscreteState(2)
-        self._memory = self.DeclareDiscreteState(new_memory())
+        self._memory = self.DeclareDiscreteState(new_memory(tared))
         self.DeclareStateOutputPort("contact", self._contact)
         self.DeclareStateOutputPort("along", self._along)
         self.DeclarePeriodicDiscreteUpdateEvent(

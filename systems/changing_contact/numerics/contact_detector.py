@@ -146,10 +146,11 @@ class Thresholds(NamedTuple):
     period: float = 0.001  # [s]
 
 
-def new_memory() -> np.ndarray:
-    """(N_MEMORY,) before the first tick."""
+def new_memory(tared: bool = False) -> np.ndarray:
+    """(N_MEMORY,) before the first tick. Args: tared: the wrench has no bias."""
     memory = np.zeros(N_MEMORY)
     memory.view(MEMORY)["segment"] = -1.0
+    memory.view(MEMORY)["zeroed"] = float(tared)
     return memory
 
 

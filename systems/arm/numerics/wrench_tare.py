@@ -1,0 +1,134 @@
+"""The bias of a force-torque sensor, from what it says in free space.
+
+Where nothing touches the tool the wrench is the sensor's bias: its mean over a window
+of WINDOW_SEC in which the motion presses on nothing and the tip rests or moves
+steadily. (The tool's own inertia, 0.3 kg times STEADY, is 15 mN.) Later windows follow
+the drift, by no more than a sensor may drift in a window. So a contact that nobody
+knows of, or the first milliseconds of an expected one, is not taken for a bias.
+
+Nothing is subtracted before the first window is complete. A first mean larger than
+bias_max is no bias but a contact: the run has begun in it, and waits for free space.
+While the tool is pressed the last bias is kept.
+"""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+# Status.
+TARED, NOT_TARED, REFUSED, BAD_WRENCH = range(4)
+
+SKIP_SEC = 0.01  # At the start: nothing is known of a sensor that is late.
+WINDOW_SEC = 0.1
+STEADY = 0.05  # Of the tip, mean acceleration over a window [m/s2].
+TURNING = 0.05  # Faster than that, a tool's moment changes [rad/s].
+LEFT = 1.0  # More than that beyond the bias is a contact, no drift [N].
+
+# Memory: ticks; samples in the window, their sum (6), v at the window's start (3); bias
+# (6); 1 when tared; status; the wrench before (6).
+N_MEMORY = 25
+_TICKS, _N, _SUM, _V, _BIAS, _TARED, _STATUS, _LAST = 0, 1, 2, 8, 11, 17, 18, 19
+BIAS, STATUS = slice(_BIAS, _BIAS + 6), slice(_STATUS, _STATUS + 1)
+
+
+class TareLaw(NamedTuple):
+    """Constants of the tare."""
+
+    bias_max: float = 3.0  # A larger force at first is a contact [N].
+    drift_max: float = 0.05  # Of a sensor [N/s].
+    drift_moment_max: float = 0.005  # [N m/s]
+    wrench_limit: float = 200.0  # At which the sensor saturates [N], [N m].
+    period: float = 0.001  # [s]
+
+
+def new_memory() -> np.ndarray:
+    """(N_MEMORY,) before the first tick."""
+    memory = np.zeros(N_MEMORY)
+    memory[_STATUS] = NOT_TARED
+    return memory
+
+
+@numba.njit(cache=True)
+def is_usable(wrench, limit):
+    """Whether a wrench (6,) is finite and within the sensor's range."""
+    for i in range(6):
+        if not np.isfinite(wrench[i]) or abs(wrench[i]) >= limit:
+            return False
+    return True
+
+
+@numba.njit(cache=True)
+def tared(law, memory, wrench):
+    """A wrench (6,) without its bias; one that cannot be used is left as it is."""
+    out = wrench.copy()
+    if is_usable(wrench, law.wrench_limit):
+        for i in range(6):
+            out[i] -= memory[_BIAS + i]
+    return out
+
+
+@numba.njit(cache=True)
+def tick(law, memory, wrench, velocity, force_directions):
+    """The memory after one sample.
+
+    Args: law: TareLaw. memory (N_MEMORY,). wrench (6,) measured, force first [N],
+        [N m]. velocity (6,) of the tip [m/s], [rad/s]. force_directions (6,): two rows
+        that the tool presses along; zero rows: none. Any of them may be NaN.
+    """
+    m = memory.copy()
+    m[_TICKS] += 1.0
+    known = m[_TARED] > 0.0
+    if not is_usable(wrench, law.wrench_limit):
+        m[_STATUS], m[_N] = BAD_WRENCH, 0.0
+        return m
+    if known:
+        m[_STATUS] = TARED
+    elif m[_STATUS] == BAD_WRENCH:
+        m[_STATUS] = NOT_TARED
+    changed = False
+    turning, pressed = 0.0, 0.0
+    for i in range(6):
+        changed = changed or wrench[i] != m[_LAST + i]
+        m[_LAST + i] = wrench[i]
+        pressed += force_directions[i] ** 2
+    for i in range(3):
+        turning += velocity[3 + i] ** 2 + 0.0 * velocity[i]  # NaN if any is.
+    free = pressed < 0.25 and turning < TURNING**2
+    # A sensor that is stuck says nothing of its drift.
+    if not free or (known and not changed) or m[_TICKS] * law.period <= SKIP_SEC:
+        m[_N] = 0.0
+        return m
+    if m[_N] == 0.0:
+        m[_SUM : _SUM + 6] = 0.0
+        m[_V : _V + 3] = velocity[:3]
+    for i in range(6):
+        m[_SUM + i] += wrench[i]
+    m[_N] += 1.0
+    seconds = m[_N] * law.period
+    if seconds < WINDOW_SEC - 1e-9:
+        return m
+    mean = m[_SUM : _SUM + 6] / m[_N]
+    m[_N] = 0.0
+    if np.sum((velocity[:3] - m[_V : _V + 3]) ** 2) > (STEADY * seconds) ** 2:
+        return m
+    off = mean - m[_BIAS : _BIAS + 6]
+    force = np.sqrt(np.sum(off[:3] ** 2))
+    if not known and force > law.bias_max:
+        m[_STATUS] = REFUSED
+    elif not known:
+        m[_BIAS : _BIAS + 6] = mean
+        m[_TARED], m[_STATUS] = 1.0, TARED
+    elif force <= LEFT:
+        for i in range(6):
+            most = seconds * (law.drift_max if i < 3 else law.drift_moment_max)
+            m[_BIAS + i] += min(max(off[i], -most), most)
+    return m
+
+
+def warm_up(law: TareLaw) -> None:
+    """Compiles it, for read-only arrays as a Context's state is."""
+    memory = new_memory()
+    memory.setflags(write=False)
+    tick(law, memory, np.zeros(6), np.zeros(6), np.zeros(6))
+    tared(law, memory, np.zeros(6))

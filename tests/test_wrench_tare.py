@@ -1,0 +1,170 @@
+"""The bias of the force-torque sensor: found in free space, taken off for all."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from makebreak.systems.arm.numerics.wrench_tare import (
+    BAD_WRENCH,
+    BIAS,
+    NOT_TARED,
+    REFUSED,
+    STATUS,
+    TARED,
+    TareLaw,
+    new_memory,
+    tared,
+    tick,
+)
+from makebreak.systems.arm.wrench_tare import WrenchTare, WrenchTareConfig
+
+LAW = TareLaw()
+TRUE_BIAS = np.array([0.4, -0.3, 0.5, 0.01, -0.02, 0.005])
+FREE, REST = np.zeros(6), np.zeros(6)
+DOWN = np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0])
+STD = np.array([0.1] * 3 + [0.01] * 3)
+
+
+def after(wrenches, velocities=REST, rows=FREE, memory=None, law=LAW):
+    """The memory after a sample per row of wrenches (n, 6)."""
+    memory = new_memory() if memory is None else memory
+    n = len(wrenches)
+    velocities, rows = (
+        np.broadcast_to(velocities, (n, 6)),
+        np.broadcast_to(rows, (n, 6)),
+    )
+    for sample in zip(wrenches, velocities, rows, strict=True):
+        memory = tick(law, memory, *(np.array(value) for value in sample))
+    return memory
+
+
+def noisy(n, seed=0, bias=TRUE_BIAS):
+    return bias + STD * np.random.default_rng(seed).normal(size=(n, 6))
+
+
+def test_the_bias_is_the_mean_in_free_space_and_is_taken_off():
+    wrench = noisy(115)
+    early = after(wrench[:60])
+    assert early[STATUS] == NOT_TARED
+    np.testing.assert_array_equal(tared(LAW, early, wrench[0]), wrench[0])
+    memory = after(wrench)
+    assert memory[STATUS] == TARED
+    # The first 10 ms are left out, then 100 samples: naively.
+    np.testing.assert_allclose(memory[BIAS], wrench[9:109].mean(axis=0), atol=0.02)
+    np.testing.assert_allclose(memory[BIAS], TRUE_BIAS, atol=0.04)  # 4 x 0.1/sqrt(100).
+    force = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
+    np.testing.assert_allclose(
+        tared(LAW, memory, force + memory[BIAS]), force, atol=1e-12
+    )
+
+
+def test_a_run_that_starts_in_contact_is_not_tared():
+    pressing = noisy(500) + [0.0, 0.0, 8.0, 0.0, 0.0, 0.0]
+    told = after(pressing, rows=DOWN)  # The motion says that it presses.
+    assert told[STATUS] == NOT_TARED and not np.any(told[BIAS])
+    untold = after(pressing)
+    assert untold[STATUS] == REFUSED and not np.any(untold[BIAS])
+    free = after(noisy(300, 1), memory=untold)  # Later it comes free.
+    assert free[STATUS] == TARED
+    np.testing.assert_allclose(free[BIAS], TRUE_BIAS, atol=0.04)
+
+
+def test_a_motion_that_speeds_up_or_turns_is_no_time_to_tare():
+    t = 1e-3 * np.arange(400)
+    a, mass = 0.5, 0.3
+    wrench = noisy(400) - np.array([mass * a, 0.0, 0.0, 0.0, 0.0, 0.0])
+    faster = np.zeros((400, 6))
+    faster[:, 0] = a * t
+    assert after(wrench, faster)[STATUS] == NOT_TARED
+    turning = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.2])
+    assert after(noisy(400), turning)[STATUS] == NOT_TARED
+    steady = np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert after(noisy(400), steady)[STATUS] == TARED
+
+
+def test_drift_is_followed_in_free_space_and_kept_under_pressure():
+    rate = np.array([0.02, -0.01, 0.0, 0.0, 0.0, 0.0])
+    t = 1e-3 * np.arange(20000)[:, None]
+    memory = after(noisy(20000) + rate * t)
+    # A window late, and its noise of 10 mN a few times over.
+    np.testing.assert_allclose(memory[BIAS], TRUE_BIAS + 20.0 * rate, atol=0.04)
+    kept = memory[BIAS].copy()
+    pressed = after(noisy(3000, 2) + 5.0, rows=DOWN, memory=memory)
+    np.testing.assert_array_equal(pressed[BIAS], kept)
+
+
+def test_what_touches_unknown_is_hardly_taken_for_a_bias():
+    memory = after(noisy(200))
+    weak = np.array([0.0, 0.0, 0.8, 0.0, 0.0, 0.0])
+    leaning = after(noisy(1000, 1) + weak, memory=memory)
+    # A second of it moves the bias by what a sensor may drift in that time.
+    moved = (leaning - memory)[BIAS]
+    assert 0.03 < moved[2] < LAW.drift_max * 1.01 + 0.005
+    strong = after(noisy(1000, 1) + 10.0 * weak, memory=memory)
+    # But for the window that was free space at first: one step.
+    np.testing.assert_allclose(strong[BIAS], memory[BIAS], atol=0.1 * LAW.drift_max)
+
+
+def test_bad_wrenches_pass_and_teach_nothing():
+    memory = after(noisy(200))
+    nan, limit = np.full(6, np.nan), np.full(6, 200.0)
+    for bad in (nan, limit):
+        np.testing.assert_array_equal(tared(LAW, memory, bad), bad)
+        now = after(bad[None].repeat(300, axis=0), memory=memory)
+        assert now[STATUS] == BAD_WRENCH
+        np.testing.assert_array_equal(now[BIAS], memory[BIAS])
+        assert after(noisy(1), memory=now)[STATUS] == TARED
+        assert after(bad[None])[STATUS] == BAD_WRENCH
+        assert after(noisy(1), memory=after(bad[None]))[STATUS] == NOT_TARED
+    stuck = noisy(1)[0] + 0.5
+    now = after(stuck[None].repeat(1000, axis=0), memory=memory)
+    np.testing.assert_allclose(now[BIAS], memory[BIAS], atol=1e-12)
+    lost = np.full(6, np.nan)
+    assert after(noisy(400), velocities=lost)[STATUS] == NOT_TARED
+    assert after(noisy(400), rows=lost)[STATUS] == NOT_TARED
+
+
+def test_the_system_does_what_the_numerics_do_and_a_context_replays():
+    builder = DiagramBuilder()
+    tare = builder.AddSystem(WrenchTare(WrenchTareConfig()))
+    for name, value in (("ee_velocity", REST), ("force_directions", FREE)):
+        source = builder.AddSystem(ConstantVectorSource(value))
+        builder.Connect(source.get_output_port(), tare.GetInputPort(name))
+    builder.ExportInput(tare.GetInputPort("wrench"), "wrench")
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    root = simulator.get_mutable_context()
+    own = tare.GetMyContextFromRoot(root)
+    port = diagram.GetInputPort("wrench")
+    rows = noisy(300)
+
+    def advance(simulator, steps):
+        root = simulator.get_mutable_context()
+        for k in steps:
+            port.FixValue(root, rows[k])
+            simulator.AdvanceTo(1e-3 * k + 5e-4)
+
+    advance(simulator, range(200))
+    expected = after(rows[:200])
+    np.testing.assert_array_equal(tare.GetOutputPort("bias").Eval(own), expected[BIAS])
+    assert tare.GetOutputPort("status").Eval(own) == TARED
+    port.FixValue(root, rows[0])  # Without delay.
+    np.testing.assert_array_equal(
+        tare.GetOutputPort("wrench").Eval(own), rows[0] - expected[BIAS]
+    )
+    copy = Simulator(diagram, root.Clone())
+    for one in (simulator, copy):
+        advance(one, range(200, 300))
+    for one in (simulator, copy):
+        its = tare.GetMyContextFromRoot(one.get_context())
+        np.testing.assert_array_equal(
+            tare.GetOutputPort("bias").Eval(its), after(rows)[BIAS]
+        )
+
+
+@pytest.mark.parametrize("name, value", [("bias_max", -1.0), ("period_sec", 0.0)])
+def test_settings_out_of_range_are_refused_by_name(name, value):
+    with pytest.raises(ValueError, match=f"{name} is {value}, expected"):
+        WrenchTare(WrenchTareConfig(**{name: value}))
