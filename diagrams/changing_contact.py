@@ -2,6 +2,7 @@
 
     station --q, v--> tip_state --ee_pose, ee_velocity--> all
     station --wrench--> wrench_tare --wrench without the sensor's bias--> all
+    velocity_shaper --> wrench_tare --force directions, at right angles--> all
     contact_detector --contact--> contact_anticipator, velocity_shaper
     mode_detector --mode--> forward_model_bank --prediction--> variable_impedance
     contact_anticipator --contacts--> velocity_shaper; --hints--> mode_detector
@@ -333,7 +334,8 @@ def _connect_systems(builder: DiagramBuilder, station, s: _Systems, config) -> N
     connect(s.tip, "ee_pose", s.detector, s.anticipator, s.shaper)
     connect(s.tip, "ee_velocity", s.tare, *watching, s.anticipator)
     connect(s.shaper, "direction", *watching)
-    connect(s.shaper, "force_directions", s.tare, *watching, s.impedance)
+    connect(s.shaper, "force_directions", s.tare)
+    connect(s.tare, "force_directions", *watching, s.impedance)
     connect(s.shaper, "force_targets", s.detector, s.variable, s.impedance)
     connect(s.shaper, "phase", s.detector, s.anticipator, s.variable)
     connect(s.shaper, "x_desired", s.impedance, s.forward)

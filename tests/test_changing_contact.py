@@ -19,6 +19,7 @@ from makebreak.diagrams.changing_contact import (
     telemetry,
     tip_mass,
 )
+from makebreak.diagrams.realism import StationErrors
 from makebreak.diagrams.station import make_control_plant
 from makebreak.diagrams.tabletop import TABLETOP_WALLS, move, set_friction, set_tool
 from makebreak.models.scene import read_scene
@@ -146,7 +147,7 @@ def test_every_system_runs_at_its_rate(trial):
     assert trial[3] == dict(
         contact_detector=500, mode_detector=100, forward_model_bank=100,
         contact_anticipator=50, velocity_shaper=500, variable_impedance=500,
-        impedance_controller=500,
+        impedance_controller=500, wrench_tare=500,
     )  # fmt: skip
 
 
@@ -226,3 +227,29 @@ def test_periods_are_the_diagrams():
         build(config=config)
     with pytest.raises(ValueError, match="hammer"):
         build(tool="hammer")
+
+
+def test_all_that_read_the_wrench_read_it_without_the_sensor_s_bias():
+    bias = np.array([0.4, -0.3, 0.5])
+    diagram = build(errors=StationErrors(force_bias=bias))
+    simulator = Simulator(diagram)
+    simulator.AdvanceTo(0.7)  # Above the table still.
+    root = simulator.get_context()
+
+    def value(system, port, get):
+        own = diagram.GetSubsystemByName(system)
+        return getattr(own, get)(port).Eval(own.GetMyContextFromRoot(root))
+
+    tared = value("wrench_tare", "bias", "GetOutputPort")
+    # The mean of 100 samples with 0.1 N, four times over, and the tool's inertia.
+    np.testing.assert_allclose(tared[:3], bias, atol=0.055)
+    for system, port in (
+        ("contact_detector", "wrench"),
+        ("mode_detector", "wrench"),
+        ("forward_model_bank", "wrench"),
+        ("impedance_controller", "wrench_measured"),
+    ):
+        np.testing.assert_array_equal(
+            value(system, port, "GetInputPort"),
+            value("wrench_tare", "wrench", "GetOutputPort"),
+        )

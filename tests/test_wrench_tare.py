@@ -8,13 +8,15 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from makebreak.systems.arm.numerics.wrench_tare import (
     BAD_WRENCH,
-    BIAS,
     NOT_TARED,
     REFUSED,
+    SLOPE,
     STATUS,
     TARED,
     TareLaw,
+    bias_of,
     new_memory,
+    sloped,
     tared,
     tick,
 )
@@ -52,23 +54,24 @@ def test_the_bias_is_the_mean_in_free_space_and_is_taken_off():
     memory = after(wrench)
     assert memory[STATUS] == TARED
     # The first 10 ms are left out, then 100 samples: naively.
-    np.testing.assert_allclose(memory[BIAS], wrench[9:109].mean(axis=0), atol=0.02)
-    np.testing.assert_allclose(memory[BIAS], TRUE_BIAS, atol=0.04)  # 4 x 0.1/sqrt(100).
+    np.testing.assert_allclose(bias_of(memory), wrench[9:109].mean(axis=0), atol=0.02)
+    # 4 x 0.1/sqrt(100).
+    np.testing.assert_allclose(bias_of(memory), TRUE_BIAS, atol=0.04)
     force = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
     np.testing.assert_allclose(
-        tared(LAW, memory, force + memory[BIAS]), force, atol=1e-12
+        tared(LAW, memory, force + bias_of(memory)), force, atol=1e-12
     )
 
 
 def test_a_run_that_starts_in_contact_is_not_tared():
     pressing = noisy(500) + [0.0, 0.0, 8.0, 0.0, 0.0, 0.0]
     told = after(pressing, rows=DOWN)  # The motion says that it presses.
-    assert told[STATUS] == NOT_TARED and not np.any(told[BIAS])
+    assert told[STATUS] == NOT_TARED and not np.any(bias_of(told))
     untold = after(pressing)
-    assert untold[STATUS] == REFUSED and not np.any(untold[BIAS])
+    assert untold[STATUS] == REFUSED and not np.any(bias_of(untold))
     free = after(noisy(300, 1), memory=untold)  # Later it comes free.
     assert free[STATUS] == TARED
-    np.testing.assert_allclose(free[BIAS], TRUE_BIAS, atol=0.04)
+    np.testing.assert_allclose(bias_of(free), TRUE_BIAS, atol=0.04)
 
 
 def test_a_motion_that_speeds_up_or_turns_is_no_time_to_tare():
@@ -89,10 +92,89 @@ def test_drift_is_followed_in_free_space_and_kept_under_pressure():
     t = 1e-3 * np.arange(20000)[:, None]
     memory = after(noisy(20000) + rate * t)
     # A window late, and its noise of 10 mN a few times over.
-    np.testing.assert_allclose(memory[BIAS], TRUE_BIAS + 20.0 * rate, atol=0.04)
-    kept = memory[BIAS].copy()
+    np.testing.assert_allclose(bias_of(memory), TRUE_BIAS + 20.0 * rate, atol=0.04)
+    kept = bias_of(memory).copy()
     pressed = after(noisy(3000, 2) + 5.0, rows=DOWN, memory=memory)
-    np.testing.assert_array_equal(pressed[BIAS], kept)
+    np.testing.assert_array_equal(bias_of(pressed), kept)
+
+
+DRIFT = np.array([0.008, -0.006, 0.009])
+TRUE_SLOPE = np.array([0.006, -0.007, 0.0])  # Half a degree [rad].
+
+
+def sliding(seconds=24.0, slope=TRUE_SLOPE, drift=DRIFT, seed=3):
+    """Wrenches and velocities (n, 6) of a tool that slides in pieces of 2 s, each in
+    another direction and with another force, over surfaces of friction 0.2 and 0.5."""
+    t = 1e-3 * np.arange(round(1e3 * seconds))
+    piece = (t // 2.0).astype(int)
+    rng = np.random.default_rng(seed)
+    R = rng.uniform(6.0, 12.0, 50)[piece]
+    angle = 1.9 * piece
+    velocities = np.zeros((len(t), 6))
+    speed = 0.1 * np.minimum(1.0, 5.0 * (t % 2.0))  # From rest.
+    velocities[:, 0], velocities[:, 1] = speed * np.cos(angle), speed * np.sin(angle)
+    mu = np.where(t % 2.0 < 1.0, 0.2, 0.5)
+    along = np.column_stack([np.cos(angle), np.sin(angle), 0.0 * t])
+    wrenches = noisy(len(t), seed)
+    wrenches[:, :3] += drift * t[:, None] - (mu * R)[:, None] * along
+    wrenches[:, :3] += R[:, None] * (slope - DOWN[:3])
+    return wrenches, velocities
+
+
+def test_sliding_tells_drift_from_slope():
+    known = after(noisy(115))
+    memory = after(*sliding(), DOWN, known)
+    off = (bias_of(memory) - TRUE_BIAS)[:2]  # Within the surface; nothing tells of z.
+    # It drifts by 0.19 and 0.14 N, which would be left without the force across.
+    np.testing.assert_allclose(off, 24.0 * DRIFT[:2], atol=0.04)
+    # 30 mN that the forces of 6 to 12 N tell apart poorly are 3 mrad.
+    np.testing.assert_allclose(memory[SLOPE], TRUE_SLOPE, atol=0.004)
+    across = off - 24.0 * DRIFT[:2] + 9.0 * (memory[SLOPE] - TRUE_SLOPE)[:2]
+    np.testing.assert_allclose(across, 0.0, atol=0.02)  # What it is all for [N].
+    turned = sloped(memory, DOWN)[:3]
+    normal = DOWN[:3] - TRUE_SLOPE
+    np.testing.assert_allclose(turned, normal / np.linalg.norm(normal), atol=0.004)
+    assert np.linalg.norm(turned) == pytest.approx(1.0)
+    # Off: the bias is kept, and the direction as it was.
+    law = TareLaw(sideways=False)
+    kept = after(*sliding(), DOWN, known, law)
+    np.testing.assert_array_equal(bias_of(kept), bias_of(known))
+    np.testing.assert_array_equal(sloped(kept, DOWN), DOWN)
+
+
+def test_sliding_on_a_level_surface_invents_little():
+    known = after(noisy(115))
+    memory = after(*sliding(slope=0.0, drift=0.0), DOWN, known)
+    np.testing.assert_allclose(bias_of(memory), bias_of(known), atol=0.03)
+    np.testing.assert_allclose(memory[SLOPE], 0.0, atol=0.004)
+
+
+def test_what_sliding_found_stays_where_it_belongs():
+    memory = after(*sliding(), DOWN, after(noisy(115)))
+    free = after(noisy(1), memory=memory)  # No jump as the tool lifts off.
+    np.testing.assert_allclose(bias_of(free), bias_of(memory), atol=1e-12)
+    wall = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(sloped(memory, wall), wall)  # Another surface.
+    wrenches, velocities = sliding(1.0)
+    back = after(wrenches[:10], velocities[:10], DOWN, free)
+    np.testing.assert_allclose(back[SLOPE], memory[SLOPE], atol=1e-4)
+    other = after(wrenches[:10], velocities[:10], wall, free)
+    np.testing.assert_array_equal(other[SLOPE], 0.0)
+
+
+def test_blows_rest_and_a_second_surface_teach_no_drift():
+    known = after(noisy(115))
+    wrenches, velocities = sliding(2.0)
+    blow = wrenches + [0.0, 3.0, 0.0, 0.0, 0.0, 0.0]  # Across the first piece.
+    corner = DOWN + [0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+    for memory in (
+        after(blow, velocities, DOWN, known),
+        after(wrenches, 0.1 * velocities, DOWN, known),
+        after(wrenches, velocities, corner, known),
+        after(wrenches, np.full(6, np.nan), DOWN, known),
+    ):
+        np.testing.assert_allclose(bias_of(memory), bias_of(known), atol=1e-12)
+        np.testing.assert_array_equal(memory[SLOPE], 0.0)
 
 
 def test_what_touches_unknown_is_hardly_taken_for_a_bias():
@@ -100,11 +182,13 @@ def test_what_touches_unknown_is_hardly_taken_for_a_bias():
     weak = np.array([0.0, 0.0, 0.8, 0.0, 0.0, 0.0])
     leaning = after(noisy(1000, 1) + weak, memory=memory)
     # A second of it moves the bias by what a sensor may drift in that time.
-    moved = (leaning - memory)[BIAS]
+    moved = bias_of(leaning) - bias_of(memory)
     assert 0.03 < moved[2] < LAW.drift_max * 1.01 + 0.005
     strong = after(noisy(1000, 1) + 10.0 * weak, memory=memory)
     # But for the window that was free space at first: one step.
-    np.testing.assert_allclose(strong[BIAS], memory[BIAS], atol=0.1 * LAW.drift_max)
+    np.testing.assert_allclose(
+        bias_of(strong), bias_of(memory), atol=0.1 * LAW.drift_max
+    )
 
 
 def test_bad_wrenches_pass_and_teach_nothing():
@@ -114,13 +198,13 @@ def test_bad_wrenches_pass_and_teach_nothing():
         np.testing.assert_array_equal(tared(LAW, memory, bad), bad)
         now = after(bad[None].repeat(300, axis=0), memory=memory)
         assert now[STATUS] == BAD_WRENCH
-        np.testing.assert_array_equal(now[BIAS], memory[BIAS])
+        np.testing.assert_array_equal(bias_of(now), bias_of(memory))
         assert after(noisy(1), memory=now)[STATUS] == TARED
         assert after(bad[None])[STATUS] == BAD_WRENCH
         assert after(noisy(1), memory=after(bad[None]))[STATUS] == NOT_TARED
     stuck = noisy(1)[0] + 0.5
     now = after(stuck[None].repeat(1000, axis=0), memory=memory)
-    np.testing.assert_allclose(now[BIAS], memory[BIAS], atol=1e-12)
+    np.testing.assert_allclose(bias_of(now), bias_of(memory), atol=1e-12)
     lost = np.full(6, np.nan)
     assert after(noisy(400), velocities=lost)[STATUS] == NOT_TARED
     assert after(noisy(400), rows=lost)[STATUS] == NOT_TARED
@@ -148,11 +232,13 @@ def test_the_system_does_what_the_numerics_do_and_a_context_replays():
 
     advance(simulator, range(200))
     expected = after(rows[:200])
-    np.testing.assert_array_equal(tare.GetOutputPort("bias").Eval(own), expected[BIAS])
+    np.testing.assert_array_equal(
+        tare.GetOutputPort("bias").Eval(own), bias_of(expected)
+    )
     assert tare.GetOutputPort("status").Eval(own) == TARED
     port.FixValue(root, rows[0])  # Without delay.
     np.testing.assert_array_equal(
-        tare.GetOutputPort("wrench").Eval(own), rows[0] - expected[BIAS]
+        tare.GetOutputPort("wrench").Eval(own), rows[0] - bias_of(expected)
     )
     copy = Simulator(diagram, root.Clone())
     for one in (simulator, copy):
@@ -160,7 +246,7 @@ def test_the_system_does_what_the_numerics_do_and_a_context_replays():
     for one in (simulator, copy):
         its = tare.GetMyContextFromRoot(one.get_context())
         np.testing.assert_array_equal(
-            tare.GetOutputPort("bias").Eval(its), after(rows)[BIAS]
+            tare.GetOutputPort("bias").Eval(its), bias_of(after(rows))
         )
 
 

@@ -6,10 +6,12 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from makebreak.systems.arm.numerics.wrench_tare import (
-    BIAS,
+    SLOPE,
     STATUS,
     TareLaw,
+    bias_of,
     new_memory,
+    sloped,
     tared,
     tick,
     warm_up,
@@ -24,6 +26,7 @@ class WrenchTareConfig:
     drift_max: float = 0.05  # Of a sensor [N/s].
     drift_moment_max: float = 0.005  # [N m/s]
     wrench_limit: float = 200.0  # At which the sensor saturates [N], [N m].
+    sideways: bool = True  # Drift and slope from the force across a sliding motion.
     period_sec: float = 0.001
     offset_sec: float = 0.0
 
@@ -40,7 +43,9 @@ class WrenchTare(LeafSystem):
     Outputs:
         wrench (6,) minus the bias, without delay. A wrench that is NaN or at its limit
             passes as it is.
-        bias (6,) state.
+        force_directions (6,) turned to be at right angles to the surface.
+        bias (6,) of now [N], [N m].
+        slope (3,) s of the surface: its outward normal is s - n [rad].
         status (1,) state; 0: tared; 1: not yet, as no time of 0.1 s in free space has
             passed: nothing is subtracted; 2: not, as the force there was more than
             bias_max, so the run has begun in contact; 3: the wrench is NaN or at its
@@ -64,40 +69,49 @@ class WrenchTare(LeafSystem):
             drift_max=float(config.drift_max),
             drift_moment_max=float(config.drift_moment_max),
             wrench_limit=float(config.wrench_limit),
+            sideways=bool(config.sideways),
             period=float(config.period_sec),
         )
         first_call(warm_up, self._law)
         self._wrench = self.DeclareVectorInputPort("wrench", 6)
-        self._ports = [
-            self._wrench,
-            self.DeclareVectorInputPort("ee_velocity", 6),
-            self.DeclareVectorInputPort("force_directions", 6),
-        ]
-        memory = new_memory()
-        self._memory = self.DeclareDiscreteState(memory)
+        velocity = self.DeclareVectorInputPort("ee_velocity", 6)
+        self._rows = self.DeclareVectorInputPort("force_directions", 6)
+        self._ports = [self._wrench, velocity, self._rows]
+        self._memory = self.DeclareDiscreteState(new_memory())
         ticket = {self.discrete_state_ticket(self._memory)}
-        self.DeclareVectorOutputPort(
-            "wrench", 6, self._calc, ticket | {self._wrench.ticket()}
-        )
-        for name, rows in (("bias", BIAS), ("status", STATUS)):
-            size = len(memory[rows])
-            self.DeclareVectorOutputPort(name, size, self._calc_rows(rows), ticket)
+
+        def memory(context):
+            return context.get_discrete_state(self._memory).value()
+
+        for name, size, value, inputs in (
+            ("wrench", 6, self._tared, {self._wrench.ticket()}),
+            ("force_directions", 6, self._sloped, {self._rows.ticket()}),
+            ("bias", 6, lambda c: bias_of(memory(c)), set()),
+            ("slope", 3, lambda c: memory(c)[SLOPE], set()),
+            ("status", 1, lambda c: memory(c)[STATUS], set()),
+        ):
+            self.DeclareVectorOutputPort(name, size, _calc(value), ticket | inputs)
         self.DeclarePeriodicDiscreteUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
 
-    def _calc(self, context: Context, output: BasicVector):
+    def _tared(self, context: Context) -> np.ndarray:
         memory = context.get_discrete_state(self._memory).value()
-        output.SetFromVector(tared(self._law, memory, self._wrench.Eval(context)))
+        return tared(self._law, memory, self._wrench.Eval(context))
 
-    def _calc_rows(self, rows: slice):
-        def calc(context: Context, output: BasicVector):
-            output.SetFromVector(context.get_discrete_state(self._memory).value()[rows])
-
-        return calc
+    def _sloped(self, context: Context) -> np.ndarray:
+        memory = context.get_discrete_state(self._memory).value()
+        return sloped(memory, self._rows.Eval(context))
 
     @timed
     def _update(self, context: Context, discrete_state):
         memory = context.get_discrete_state(self._memory).value()
         memory = tick(self._law, memory, *[p.Eval(context) for p in self._ports])
         discrete_state.set_value(self._memory, memory)
+
+
+def _calc(value):
+    def calc(context: Context, output: BasicVector):
+        output.SetFromVector(value(context))
+
+    return calc

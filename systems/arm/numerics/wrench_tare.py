@@ -8,13 +8,24 @@ knows of, or the first milliseconds of an expected one, is not taken for a bias.
 
 Nothing is subtracted before the first window is complete. A first mean larger than
 bias_max is no bias but a contact: the run has begun in it, and waits for free space.
-While the tool is pressed the last bias is kept.
+
+While the tool is pressed on one surface and slides, the drift goes on to be followed,
+and the surface's slope found, from the force across the motion (sideways_force.py).
 """
 
 from typing import NamedTuple
 
 import numba
 import numpy as np
+
+from makebreak.systems.arm.numerics import sideways_force
+from makebreak.systems.arm.numerics.sideways_force import (
+    PERIOD,
+    predict,
+    reset_bias,
+    reset_slope,
+    update,
+)
 
 # Status.
 TARED, NOT_TARED, REFUSED, BAD_WRENCH = range(4)
@@ -25,11 +36,17 @@ STEADY = 0.05  # Of the tip, mean acceleration over a window [m/s2].
 TURNING = 0.05  # Faster than that, a tool's moment changes [rad/s].
 LEFT = 1.0  # More than that beyond the bias is a contact, no drift [N].
 
+SAME_SURFACE = 0.98  # Cosine of two directions of pressing.
+
 # Memory: ticks; samples in the window, their sum (6), v at the window's start (3); bias
-# (6); 1 when tared; status; the wrench before (6).
-N_MEMORY = 25
+# at the last tare (6); 1 when tared; status; the wrench before (6); the direction in
+# which the surface is pressed whose slope is known (3); 1 while the tool is pressed;
+# the estimate of sideways_force.py.
 _TICKS, _N, _SUM, _V, _BIAS, _TARED, _STATUS, _LAST = 0, 1, 2, 8, 11, 17, 18, 19
-BIAS, STATUS = slice(_BIAS, _BIAS + 6), slice(_STATUS, _STATUS + 1)
+_ROW, _PRESSED, _SIDEWAYS = 25, 28, 29
+_SLOPE = _SIDEWAYS + sideways_force.S.start
+N_MEMORY = _SIDEWAYS + sideways_force.N_MEMORY
+STATUS, SLOPE = slice(_STATUS, _STATUS + 1), slice(_SLOPE, _SLOPE + 3)
 
 
 class TareLaw(NamedTuple):
@@ -39,6 +56,7 @@ class TareLaw(NamedTuple):
     drift_max: float = 0.05  # Of a sensor [N/s].
     drift_moment_max: float = 0.005  # [N m/s]
     wrench_limit: float = 200.0  # At which the sensor saturates [N], [N m].
+    sideways: bool = True  # Drift and slope while sliding.
     period: float = 0.001  # [s]
 
 
@@ -46,7 +64,31 @@ def new_memory() -> np.ndarray:
     """(N_MEMORY,) before the first tick."""
     memory = np.zeros(N_MEMORY)
     memory[_STATUS] = NOT_TARED
+    reset_bias(memory[_SIDEWAYS:])
+    reset_slope(memory[_SIDEWAYS:])
     return memory
+
+
+@numba.njit(cache=True)
+def bias_of(memory):
+    """The bias (6,) of now [N], [N m]."""
+    out = memory[_BIAS : _BIAS + 6].copy()
+    out[:3] += memory[_SIDEWAYS : _SIDEWAYS + 3]
+    return out
+
+
+@numba.njit(cache=True)
+def sloped(memory, force_directions):
+    """Force directions (6,) at right angles to the surface: a row in the direction
+    whose slope is known is turned by it."""
+    out = force_directions.copy()
+    for row in (0, 3):
+        n = out[row : row + 3]
+        if n @ memory[_ROW : _ROW + 3] > SAME_SURFACE:
+            length = np.sqrt(n @ n)
+            n -= length * memory[_SLOPE : _SLOPE + 3]
+            n *= length / np.sqrt(n @ n)
+    return out
 
 
 @numba.njit(cache=True)
@@ -61,11 +103,9 @@ def is_usable(wrench, limit):
 @numba.njit(cache=True)
 def tared(law, memory, wrench):
     """A wrench (6,) without its bias; one that cannot be used is left as it is."""
-    out = wrench.copy()
     if is_usable(wrench, law.wrench_limit):
-        for i in range(6):
-            out[i] -= memory[_BIAS + i]
-    return out
+        return wrench - bias_of(memory)
+    return wrench.copy()
 
 
 @numba.njit(cache=True)
@@ -95,6 +135,8 @@ def tick(law, memory, wrench, velocity, force_directions):
     for i in range(3):
         turning += velocity[3 + i] ** 2 + 0.0 * velocity[i]  # NaN if any is.
     free = pressed < 0.25 and turning < TURNING**2
+    if law.sideways and known and np.isfinite(turning + pressed):
+        _slide(law, m, wrench, velocity, force_directions)
     # A sensor that is stuck says nothing of its drift.
     if not free or (known and not changed) or m[_TICKS] * law.period <= SKIP_SEC:
         m[_N] = 0.0
@@ -112,7 +154,7 @@ def tick(law, memory, wrench, velocity, force_directions):
     m[_N] = 0.0
     if np.sum((velocity[:3] - m[_V : _V + 3]) ** 2) > (STEADY * seconds) ** 2:
         return m
-    off = mean - m[_BIAS : _BIAS + 6]
+    off = mean - bias_of(m)
     force = np.sqrt(np.sum(off[:3] ** 2))
     if not known and force > law.bias_max:
         m[_STATUS] = REFUSED
@@ -126,9 +168,40 @@ def tick(law, memory, wrench, velocity, force_directions):
     return m
 
 
+@numba.njit(cache=True)
+def _slide(law, m, wrench, velocity, force_directions):
+    """Drift and slope, while one surface is pressed. In place."""
+    first, second = force_directions[:3], force_directions[3:]
+    one = first @ first > 0.25
+    two = second @ second > 0.25
+    if not one and not two:
+        if m[_PRESSED] > 0.0:  # What was found of the drift belongs to the bias.
+            for i in range(3):
+                m[_BIAS + i] += m[_SIDEWAYS + i]
+            reset_bias(m[_SIDEWAYS:])
+        m[_PRESSED] = 0.0
+        return
+    if m[_PRESSED] == 0.0:
+        reset_bias(m[_SIDEWAYS:])
+        m[_PRESSED] = 1.0
+    if m[_TICKS] % max(1.0, np.round(PERIOD / law.period)) != 0.0:
+        return
+    predict(m[_SIDEWAYS:])
+    if one and two:
+        return
+    n = first / np.sqrt(first @ first) if one else second / np.sqrt(second @ second)
+    if n @ m[_ROW : _ROW + 3] < SAME_SURFACE:
+        m[_ROW : _ROW + 3] = n
+        reset_slope(m[_SIDEWAYS:])
+    force = wrench[:3] - m[_BIAS : _BIAS + 3]
+    update(m[_SIDEWAYS:], force, velocity[:3].copy(), n)
+
+
 def warm_up(law: TareLaw) -> None:
     """Compiles it, for read-only arrays as a Context's state is."""
-    memory = new_memory()
+    memory, zero = new_memory(), np.zeros(6)
     memory.setflags(write=False)
-    tick(law, memory, np.zeros(6), np.zeros(6), np.zeros(6))
-    tared(law, memory, np.zeros(6))
+    tick(law, memory, zero, zero, zero)
+    tared(law, memory, zero)
+    sloped(memory, zero)
+    bias_of(memory)
