@@ -221,19 +221,6 @@ class InverseModel:
 
     # ----- What was measured
 
-    def torque_noise(self) -> np.ndarray:
-        """(n_joints,) standard deviation of a sample of what drives each joint [N m]:
-        of its measured effort, or of what its drive makes of noise in position and
-        velocity."""
-        out = np.where(self.by_measured, self.effort_noise, 0.0)
-        for i, law in enumerate(self.laws):
-            if law is not None and not self.by_measured[i]:
-                out[i] = np.hypot(
-                    law.kp * self.noise[i],
-                    (law.kd + law.emf) * self.velocity_noise[i],
-                )
-        return out
-
     def _noise(self, what: str) -> np.ndarray:
         out = np.zeros(len(self.joints))
         for i, joint in enumerate(self.joints):

@@ -15,18 +15,11 @@ from makebreak.gap.result import GapMeasure, InUnits, Series
 from makebreak.gap.simulation.windows import Window, WindowModel, seen_in
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.kind import (
-    Effect,
-    find_joints,
-    full_name,
-    sliding_joints,
-)
-from makebreak.models.effects.transmission import twists
+from makebreak.models.effects.kind import Effect, sliding_joints
+from makebreak.models.effects.transmission import twist_deviations, twists
 from makebreak.models.scene import Scene
 
 WINDOW_SEC = 0.3
-# The rate of a smoothed torque errs by the torque's noise within this time, at most.
-TORQUE_SMOOTHED_SEC = 0.01
 # What a perfect model would leave: an error is divided by what the channel's noise and
 # the uncertainty of its window's start give together.
 NOISE_FLOOR = 1.0
@@ -203,21 +196,13 @@ def _with_fitted_twists(
 def _twist_deviations(
     motion: InverseModel, effects: Sequence[Effect]
 ) -> dict[str, np.ndarray]:
-    """{joint: standard deviations of the twist and its rate (2,)} at an instant, as the
-    noise of the joint's torque makes them. Joints are missing whose twist does not
-    depend on the size of the torque (a gap)."""
-    noise = motion.torque_noise()
-    found = {}
+    """{joint: standard deviations of the twist and its rate (2,)} at a window's start,
+    the largest of all stretches of the recordings."""
+    found: dict[str, np.ndarray] = {}
     for effect in effects:
-        deflection = KINDS[effect.kind].static_deflection
-        if not KINDS[effect.kind].hidden_state or deflection is None:
-            continue
-        for joint in find_joints(effect, motion.dynamics.plant):
-            name = full_name(motion.dynamics.plant, joint)
-            torque = noise[motion.joints.index(name)]
-            size = abs(deflection(effect, 2.0 * torque) - deflection(effect, torque))
-            if size > 0.0:
-                found[name] = size * np.array([1.0, 1.0 / TORQUE_SMOOTHED_SEC])
+        for each in motion.motions():
+            for joint, size in twist_deviations(effect, motion.dynamics, each).items():
+                found[joint] = np.maximum(size, found.get(joint, 0.0))
     return found
 
 

@@ -358,6 +358,32 @@ def twists(effect: Effect, model, motion) -> dict[str, np.ndarray]:
     }
 
 
+def twist_deviations(effect: Effect, model, motion) -> dict[str, np.ndarray]:
+    """{joint: standard deviations (2,)} of the twist of an elastic joint and of its
+    rate, as the noise of the torque through it makes them; empty for other kinds."""
+    if effect.kind != "joint_elasticity":
+        return {}
+    k, d = effect.parameters["stiffness"], effect.parameters["damping"]
+    found = {}
+    for joint in find_joints(effect, model.plant):
+        noise = _transmitted_noise(model, motion, joint)
+        found[full_name(model.plant, joint)] = np.hypot(
+            noise[:2] / k, d / k**2 * noise[1:]
+        )
+    return found
+
+
+def _transmitted_noise(model, motion, joint: Joint) -> np.ndarray:
+    """(3,) standard deviations of the smoothed torque of _transmitted and of two
+    derivatives: half of what two halves of its samples, smoothed apart, differ by."""
+    known, i = _cache(model, motion), joint.velocity_start()
+    if (key := ("transmitted noise", i)) not in known:
+        tau = motion.effort[:, i] - _rotor(model, joint) * motion.vd[:, i]
+        one, other = (_smooth(motion.time, tau, slice(k, None, 4)) for k in (0, 2))
+        known[key] = 0.5 * np.sqrt(np.mean((one - other) ** 2, axis=1))
+    return known[key]
+
+
 def _twist(effect: Effect, model, motion, joint: Joint) -> np.ndarray:
     """(3, n) twist of one joint, its rate and acceleration."""
     p = effect.parameters
@@ -412,16 +438,23 @@ def _transmitted(model, motion, joint: Joint) -> np.ndarray:
     known, i = _cache(model, motion), joint.velocity_start()
     if (key := ("transmitted", i)) not in known:
         tau = motion.effort[:, i] - _rotor(model, joint) * motion.vd[:, i]
-        x = _smooth(motion.time, tau)
+        x = _smooth(motion.time, tau, slice(0, None, 2))
         known[key] = np.concatenate([x, [np.gradient(x[2], motion.time)]])
     return known[key]
 
 
-def _smooth(time, y) -> np.ndarray:
-    """(3, n) smoothed value, first and second derivative of y, by its own noise."""
-    period = float(np.quantile(np.diff(time), 0.9))
-    grid = np.arange(time[0], time[-1] + 0.5 * period, period)
-    even = np.interp(grid, time, y)
+def _smooth(time, y, of: slice) -> np.ndarray:
+    """(3, n) smoothed value, first and second derivative of y, by its own noise.
+
+    Args: of: the samples that are smoothed. (A measured effort at the middle of two
+        rows is the mean of both, so that neighbouring samples err together; smoothed as
+        if they did not, the rate of a noisy torque was 35 times as far off as that of
+        every second sample.)
+    """
+    t, y = time[of], y[of]
+    period = float(np.quantile(np.diff(t), 0.9))
+    grid = np.arange(t[0], t[-1] + 0.5 * period, period)
+    even = np.interp(grid, t, y)
     noise = float(np.sqrt(np.mean(np.diff(even, 3) ** 2) / 20.0))
     x = smooth(grid, even, max(noise, 1e-9 * (np.std(y) + 1e-12))).x
     return np.stack([np.interp(time, grid, column) for column in x.T])
