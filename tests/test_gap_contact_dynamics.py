@@ -23,13 +23,14 @@ from makebreak.gap.data.recording import read_recordings
 from makebreak.gap.numerics import permitted_forces
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Outcome, SearchPlan, is_sane
-from makebreak.gap.residuals import contact_means
+from makebreak.gap.residuals import touching
 from makebreak.gap.residuals.contact_candidates import _best_rectangles
 from makebreak.gap.residuals.contact_dynamics import ContactDynamics
-from makebreak.gap.residuals.contact_means import felt_motion, variance_of_means
+from makebreak.gap.residuals.contact_means import variance_of_means
 from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.contact_shapes import _Point, _Surface
 from makebreak.gap.residuals.permitted_contacts import Shift
+from makebreak.gap.residuals.wrench_sensor import felt_motion
 from makebreak.gap.result import Considered, GapMeasure
 from makebreak.gap.search.choice import Choice, Selection
 from makebreak.gap.search.fit import _Free, fit_effects
@@ -494,7 +495,7 @@ def test_a_tool_that_leans_on_something_with_little_is_felt(monkeypatch):
         recording=0, time=time, episode=SimpleNamespace(rows=slice(0, 400))
     )
     own = np.zeros((400, 6))
-    monkeypatch.setattr(contact_means, "felt_motion", lambda *args: own)
+    monkeypatch.setattr(touching, "felt_motion", lambda *args: own)
     model = SimpleNamespace(
         tracks=[track], recordings=[log], _offset=[0, 400], dynamics=None,
         _q=None, _v=None, _vd=None,

@@ -111,15 +111,13 @@ def test_a_step_of_an_effort_between_rows_is_not_known_to_the_row(rate, sure):
     t, centres = np.arange(0.0, 1.0, 0.005), np.array([0.3, 0.5])
     u = np.where(t < 0.5, 0.0, 3.0)
     means = SimpleNamespace(
-        by={"j": "command"}, joints={"j": (0, 0)},
-        scene=SimpleNamespace(actuation=SimpleNamespace(rate_hz=rate)),
+        scene=SimpleNamespace(actuation=SimpleNamespace(rate_hz=rate))
     )  # fmt: skip
     log = SimpleNamespace(held=lambda name: u)
     track = SimpleNamespace(time=t, episode=SimpleNamespace(rows=slice(None)))
+    phi = SimpleNamespace(track=track, recording=log, centres=centres)
     held = held_means(t, centres, 0.1)
-    mean, var, _ = ContactMeans._effort(
-        means, "j", log, track, held, None, None, centres, 0.1
-    )
+    mean, var, _ = ContactMeans._commanded_effort(means, "j", phi, held)
     np.testing.assert_allclose(mean, [0.0, 1.5], atol=0.02)
     assert var[0] == 0.0 and (var[1] == 0.0) == sure
     if not sure:

@@ -19,18 +19,14 @@ import numpy as np
 
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.numerics.permitted_forces import explain, roots_of
-from makebreak.gap.residuals.contact_means import (
-    HOP,
-    LEAST_FELT,
-    MODELLED,
-    SLIDES,
-)
+from makebreak.gap.residuals.contact_means import HOP, MODELLED, SLIDES
 from makebreak.gap.residuals.permitted_contacts import (
     SURFACES,
     Geometry,
     PermittedContacts,
     Shift,
 )
+from makebreak.gap.residuals.touching import LEAST_FELT
 from makebreak.gap.simulation.windows import TURN
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.contact import CONTACT_LAW

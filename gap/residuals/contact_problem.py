@@ -24,16 +24,17 @@ from makebreak.gap.problem import (
 )
 from makebreak.gap.residuals.contact_candidates import ContactCandidates
 from makebreak.gap.residuals.contact_dynamics import WRENCHED
-from makebreak.gap.residuals.contact_means import ROBUST, felt_motion
 from makebreak.gap.residuals.lying_on_faces import lying_on_faces
 from makebreak.gap.residuals.mechanism import link_changes
 from makebreak.gap.residuals.objects import unexplained_in_windows
 from makebreak.gap.residuals.permitted_contacts import Shift
+from makebreak.gap.residuals.touching import ROBUST
 from makebreak.gap.residuals.widened_contacts import (
     distances_off,
     sentence,
     widened_contacts,
 )
+from makebreak.gap.residuals.wrench_sensor import felt_motion
 from makebreak.gap.result import Where
 from makebreak.gap.search.fit import fit_effects
 from makebreak.gap.simulation.contact_windows import (
