@@ -15,12 +15,8 @@ from tqdm import tqdm
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.recording import has_sidecar, read_recordings, sidecar_of
 from makebreak.gap.report.comparison import comparison_html
-from makebreak.gap.report.files import (
-    next_best,
-    summary_lines,
-    windows_of,
-    write_report,
-)
+from makebreak.gap.report.files import write_report
+from makebreak.gap.report.summary import next_best, summary_lines, windows_of
 from makebreak.gap.result import GapResult
 from makebreak.models.effects.kind import with_deviation
 from makebreak.models.scene import Scene, read_scene

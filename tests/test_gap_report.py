@@ -14,14 +14,11 @@ from pydrake.systems.framework import DiagramBuilder
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.recording import read_recordings
 from makebreak.gap.data.table import write_recording
+from makebreak.gap.report.clock import extents_of
 from makebreak.gap.report.comparison import comparison_html, measured_state
-from makebreak.gap.report.files import (
-    extents_of,
-    next_best,
-    summary_lines,
-    write_report,
-)
+from makebreak.gap.report.files import write_report
 from makebreak.gap.report.pictures import picture_of_series, picture_of_where
+from makebreak.gap.report.summary import next_best, summary_lines
 from makebreak.gap.result import (
     Considered,
     Estimate,

@@ -1,0 +1,176 @@
+"""The report as one HTML page: its first screen, and the sections below it."""
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+
+from makebreak.gap.data.recording import Recording
+from makebreak.gap.report import sections
+from makebreak.gap.report.markup import STYLE, image, sentence_html
+from makebreak.gap.report.summary import (
+    HEADINGS,
+    closed_share,
+    doubts,
+    next_best,
+    number,
+    says_of,
+    windows_of,
+)
+from makebreak.gap.result import GapResult, NamedEffect, Unexplained
+from makebreak.models.effects.kind import with_deviation
+
+
+def report_html(
+    result: GapResult,
+    pictures: Mapping[str, bytes],
+    out: Path,
+    scene_path: str | Path = "SCENE.yaml",
+    recordings: Sequence[Recording] = (),
+    has_comparison: bool = False,
+) -> str:
+    """The report as one HTML page, pictures inside.
+
+    Args: pictures: PNG files by name. out: the folder where the page will be. The
+        others: as of files.write_report.
+    """
+    heading, _ = HEADINGS[result.verdict]
+    below = [
+        sections.where(result, pictures, recordings),
+        sections.series(result, pictures),
+        sections.in_units(result),
+        sections.trust(result, pictures),
+        sections.considered(result),
+        sections.unexplained(result),
+        sections.checks(result),
+        sections.background(result),
+        sections.channels(result),
+        sections.next_steps(result, out, scene_path, recordings, has_comparison),
+        sections.seconds(result),
+    ]
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width">'
+        f"<title>{escape(heading)} - makebreak gap</title>"
+        f"<style>{STYLE}</style></head>\n<body><main>\n"
+        f'<section class="first">{_first_screen(result, pictures)}</section>\n'
+        + "\n".join(each for each in below if each)
+        + "\n</main></body></html>\n"
+    )
+
+
+def _first_screen(result: GapResult, pictures: Mapping[str, bytes]) -> str:
+    """The verdict, its effects, and how much of the gap they close."""
+    heading, colour = HEADINGS[result.verdict]
+    says = "Held-out error of each channel, before and after"
+    parts = [
+        f'<p class="badge" style="background:{colour}">{escape(heading)}</p>',
+        f"<h1>{sentence_html(result.says)}</h1>",
+        _doubts(result),
+        '<div class="two"><div>',
+        *[_effect(each, result, i) for i, each in enumerate(result.effects)],
+        _no_effect(result) if not result.effects else "",
+        "</div><div>",
+        _numbers(result),
+        image(pictures, "channels", says),
+        "</div></div>",
+    ]
+    return "".join(parts)
+
+
+def _doubts(result: GapResult) -> str:
+    found = doubts(result)
+    if not found:
+        return ""
+    items = "".join(f"<li>{sentence_html(says)}</li>" for says, _ in found[:4])
+    return (
+        '<div class="doubt"><b>Correct the data first:</b> the result depends on '
+        f"them.<ul>{items}</ul></div>"
+    )
+
+
+def _effect(each: NamedEffect, result: GapResult, i: int) -> str:
+    rows = ""
+    for name, p in each.parameters.items():
+        value = sentence_html(with_deviation(p.value, p.std, p.or_more))
+        rows += f"<tr><td>{escape(name)}</td><td class=n>{value}</td>"
+        rows += f"<td>{escape(p.unit)}</td></tr>"
+    other = next_best(each.evidence)
+    sure = f"Next best: {escape(other)}." if other else ""
+    if each.identifiable == "weak":
+        sure += " It is only weakly identifiable from these data."
+    elif each.identifiable == "not":
+        sure += " Its parameters are not identifiable from these data."
+    # Of a lone effect the headline is its sentence.
+    title = ""
+    if len(result.effects) > 1 or each.says not in result.says:
+        count = f"{i + 1}. " if len(result.effects) > 1 else ""
+        title = f"<h3>{count}{sentence_html(each.says)}</h3>"
+    return (
+        f'<div class="effect">{title}<p class="kind">{escape(each.kind)} '
+        f"at {escape(', '.join(each.at))}</p>"
+        f"<table>{rows}</table><p>{sure}</p>{_ties(each)}</div>"
+    )
+
+
+def _ties(each: NamedEffect) -> str:
+    if not each.indistinguishable_from:
+        return ""
+    others = "".join(
+        f"<li>{sentence_html(says_of(other))}</li>"
+        for other in each.indistinguishable_from
+    )
+    tell = f"<p><b>To distinguish them:</b> {sentence_html(each.tell_apart)}</p>"
+    return (
+        '<div class="tie"><b>These data cannot distinguish it from:</b>'
+        f"<ul>{others}</ul>{tell if each.tell_apart else ''}</div>"
+    )
+
+
+def _no_effect(result: GapResult) -> str:
+    if result.verdict == "no_gap":
+        says = "The model explains the recording to within its noise and the stated "
+        says += "tolerance of the model. Nothing was added to the scene."
+    elif result.verdict == "not_judged":
+        says = "The channels that were compared agree, to within their noise and the "
+        says += "stated tolerance of the model. Some channels were not compared "
+        says += "(below). Nothing was added to the scene."
+    else:
+        says = "No effect of the catalogue explains the remaining error, so none is "
+        says += "named and the scene is unchanged. Where the error is, and what it "
+        says += "correlates with:"
+    items = "".join(
+        f"<li>{escape(_left(each))}</li>" for each in result.unexplained[:4]
+    )
+    return f'<div class="effect"><p>{says}</p><ul>{items}</ul></div>'
+
+
+def _left(each: Unexplained) -> str:
+    text = f"{each.channel}, {each.region}: {each.size:.3g} times the noise"
+    return text + (
+        f"; correlates with {each.correlates_with}" if each.correlates_with else ""
+    )
+
+
+def _numbers(result: GapResult) -> str:
+    g = result.gap
+    closed = closed_share(g.before, g.after, g.noise_floor)
+    cells = [("before", number(g.before)), ("after", number(g.after))]
+    cells += [("noise floor", number(g.noise_floor))]
+    if closed and result.effects:
+        cells.append(("of the gap closed", closed))
+    shown = "".join(
+        f"<div><b>{value}</b><span>{name}</span></div>" for name, value in cells
+    )
+    seen = {
+        "reported": " used neither to fit nor to select",
+        "chosen on": " used to select effects: no data were left for a final test",
+    }.get(g.data, ": nothing could be held out")
+    if g.n_windows and any(g.failed):
+        seen += (
+            f"; {g.failed[0]} before and {g.failed[1]} after of {g.n_windows} could "
+            "not be simulated to their end and count in neither"
+        )
+    return (
+        f'<div class="numbers">{shown}</div><p class="small">Error over noise, rms '
+        f"over {windows_of(result)}{seen}.</p>"
+    )

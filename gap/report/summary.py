@@ -1,0 +1,91 @@
+"""What a result says in lines of text, for the command line and the page."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from makebreak.gap.data.findings import Finding
+from makebreak.gap.result import Evidence, GapResult
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect, sentence
+
+HEADINGS = {  # Of each verdict, and its colour on the page.
+    "no_gap": ("No gap", "#2f855a"),
+    "not_judged": ("Not every channel judged", "#b7791f"),
+    "gap_named": ("Gap named", "#2b6cb0"),
+    "ambiguous": ("Gap named, with a tie", "#b7791f"),
+    "gap_unnamed": ("Gap found, not explained", "#c53030"),
+}
+LEAST_GAP = 0.05  # Of the noise floor: less above it, and its share is noise.
+
+
+def summary_lines(result: GapResult) -> list[str]:
+    """The end of the command line's run: the verdict, and a line for each effect."""
+    lines = [f"{HEADINGS[result.verdict][0]}: {result.says}"]
+    lines += [f"  Doubtful data: {each}" for each, _ in doubts(result)]
+    for each in result.effects:
+        if each.says not in result.says:
+            lines.append(f"  {each.says}")
+        for other in each.indistinguishable_from:
+            lines.append(f"    or: {says_of(other)}")
+        if each.tell_apart:
+            lines.append(f"    to distinguish them: {each.tell_apart}")
+    return lines
+
+
+def doubts(result: GapResult) -> list[tuple[str, list[str]]]:
+    """What the checks found that no fit can be trusted with, and where."""
+    return together([c for c in result.checks if c.severity == "error"])
+
+
+def together(findings: Sequence[Finding]) -> list[tuple[str, list[str]]]:
+    """A sentence for each kind and channel, and the recordings that it is true of;
+    that of the largest of them, where sizes differ."""
+    groups: dict[tuple[str, str], list[Finding]] = {}
+    for each in findings:
+        groups.setdefault((each.kind, each.channel), []).append(each)
+    return [
+        (
+            max(found, key=lambda f: abs(f.size)).says,
+            list(dict.fromkeys(f.recording for f in found)),
+        )
+        for found in groups.values()
+    ]
+
+
+def next_best(evidence: Evidence) -> str:
+    """The best other explanation and its error, beside that of the effect."""
+    if not evidence.runner_up or not np.isfinite(evidence.margin):
+        return evidence.runner_up
+    percent = round(100.0 * abs(evidence.margin))
+    if percent == 0:
+        return f"{evidence.runner_up}, the same error"
+    if evidence.margin > 0.0:
+        return f"{evidence.runner_up}, error {percent} % larger"
+    return f"{evidence.runner_up}, error {percent} % smaller: too little to prefer it"
+
+
+def windows_of(result: GapResult) -> str:
+    """What the gap was measured over; a length of 0: nothing had to be simulated."""
+    seconds = result.gap.window_s
+    return f"simulated windows of {number(seconds)} s" if seconds > 0.0 else "samples"
+
+
+def says_of(effect: Effect) -> str:
+    """The sentence of an effect without deviations."""
+    return sentence(effect, KINDS[effect.kind])
+
+
+def closed_share(before: float, after: float, floor: float) -> str:
+    """How much of the gap is closed, in percent; "" where there was hardly any."""
+    above = before - floor
+    if not (np.isfinite(above) and np.isfinite(after)) or above <= LEAST_GAP * floor:
+        return ""
+    return f"{100.0 * max(min((before - after) / above, 1.0), 0.0):.0f} %"
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """So many digits, or "-" where it is not known."""
+    if value is None or not np.isfinite(value):
+        return "-"
+    return f"{value:.{digits}g}"
