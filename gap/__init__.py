@@ -21,8 +21,8 @@ from importlib import import_module
 _EXPORTS = {
     "GapResult": "gap.result",
     "Recording": "gap.data.recording",
-    "read_recording": "gap.data.recording",
-    "read_recordings": "gap.data.recording",
+    "read_recording": "gap.data.reading",
+    "read_recordings": "gap.data.reading",
     "read_scene": "models.scene",
     "run_gap": "gap.workflow",
     "write_recording": "gap.data.table",

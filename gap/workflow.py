@@ -9,19 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from makebreak.gap.by_recording import Alone, may_differ, with_differences
+from makebreak.gap.data.channel_noise import in_newton_metres
 from makebreak.gap.data.check_drives import check_drives, check_initial_names
 from makebreak.gap.data.check_meshes import check_meshes
 from makebreak.gap.data.checks import check_recordings
 from makebreak.gap.data.conditioning import condition
 from makebreak.gap.data.findings import GUESSED_GAINS, Finding
-from makebreak.gap.data.recording import (
-    Recording,
-    check_against_scene,
-    excerpt,
-    in_newton_metres,
-    read_recordings,
-    unit_of,
-)
+from makebreak.gap.data.pieces import excerpt
+from makebreak.gap.data.reading import check_against_scene, read_recordings
+from makebreak.gap.data.recording import Recording, unit_of
 from makebreak.gap.data.scene_facts import scene_facts, scene_names
 from makebreak.gap.data.split import split, with_noise_of
 from makebreak.gap.parallel import side_by_side

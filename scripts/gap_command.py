@@ -13,7 +13,8 @@ from time import perf_counter
 from tqdm import tqdm
 
 from makebreak.gap.data.findings import Finding
-from makebreak.gap.data.recording import has_sidecar, read_recordings, sidecar_of
+from makebreak.gap.data.reading import read_recordings
+from makebreak.gap.data.sidecar import has_sidecar, sidecar_of
 from makebreak.gap.report.comparison import comparison_html
 from makebreak.gap.report.files import write_report
 from makebreak.gap.report.summary import next_best, summary_lines, windows_of

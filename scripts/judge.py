@@ -12,7 +12,7 @@ import json
 import sys
 from pathlib import Path
 
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.simulation.judge import judge
 from makebreak.models.scene import read_scene
 from makebreak.scripts.table import Table, json_value

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from measured import cube_tosses, double_pendulum, so101
 
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.simulation.judge import judge
 from makebreak.models.scene import read_scene
 from makebreak.scripts import cli

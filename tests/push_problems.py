@@ -2,7 +2,7 @@
 
 from gap_benchmark import push_world
 
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.models.scene import read_scene

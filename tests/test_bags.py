@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from makebreak.gap.data.recording import read_recording
+from makebreak.gap.data.reading import read_recording
 from makebreak.gap.data.table import read_table
 
 N, PERIOD = 200, 5_000_000  # Rows; [ns]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.gap.data.recording import check_against_scene, read_recordings
+from makebreak.gap.data.reading import check_against_scene, read_recordings
 from makebreak.gap.data.scene_facts import scene_names
 from makebreak.models.scene import load_scene, read_scene
 from makebreak.scripts import bench_sysid

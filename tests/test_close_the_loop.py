@@ -15,7 +15,7 @@ from makebreak.diagrams.ball_rolling_config import BallRollingConfig, controller
 from makebreak.diagrams.recorder import mean_until_next
 from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.station import BALL_ROLLING
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.gap.simulation.windows import WindowModel

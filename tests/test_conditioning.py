@@ -13,7 +13,7 @@ from gap_benchmark.sensing import hermite
 from makebreak.gap.data.checks import check_recordings
 from makebreak.gap.data.clock import clock_period, even_clock
 from makebreak.gap.data.conditioning import condition
-from makebreak.gap.data.recording import read_recording
+from makebreak.gap.data.reading import read_recording
 from makebreak.gap.numerics.signal_noise import estimate_noise, noise_and_jitter
 from makebreak.gap.workflow import run_gap
 from makebreak.systems.numerics.filters import filtered

@@ -10,7 +10,7 @@ from scipy.signal import butter, lfilter
 
 from makebreak.gap.data.checks import check_recordings
 from makebreak.gap.data.filters import read_filter
-from makebreak.gap.data.recording import read_recording, read_recordings
+from makebreak.gap.data.reading import read_recording, read_recordings
 from makebreak.gap.workflow import run_gap
 from makebreak.systems.numerics.filters import Delay, LowPass, MovingAverage, filtered
 from makebreak.systems.numerics.smoother import smooth, smooth_filtered

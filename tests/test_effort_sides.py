@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from effect_scenes import LENGTH, MASS, G, J, pendulum, with_effects
 
-from makebreak.gap.data.recording import in_newton_metres, read_recording
+from makebreak.gap.data.channel_noise import in_newton_metres
+from makebreak.gap.data.reading import read_recording
 from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.models.effects.measured_channels import torque_constant
 from makebreak.models.scene_schema import check_scene

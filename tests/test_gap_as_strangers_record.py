@@ -7,7 +7,7 @@ from gap_benchmark import push_world
 from gap_benchmark.push_world import BLOCK, TABLE
 from push_problems import screen_of
 
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.residuals import late_poses
 from makebreak.gap.residuals.contact_problem import LAW, ContactProblem
 from makebreak.gap.residuals.lying_on_faces import lying_on_faces, point_on_face

@@ -8,7 +8,8 @@ from test_gap_report import small_case
 
 from makebreak.gap.data.checks import check_recordings
 from makebreak.gap.data.findings import JointFacts, SceneFacts
-from makebreak.gap.data.recording import excerpt, read_recording
+from makebreak.gap.data.pieces import excerpt
+from makebreak.gap.data.reading import read_recording
 from makebreak.gap.data.table import write_recording
 from makebreak.scripts import cli
 

@@ -35,7 +35,7 @@ from pydrake.multibody.plant import (  # noqa: E402
 from pydrake.systems.analysis import Simulator  # noqa: E402
 from pydrake.systems.framework import DiagramBuilder  # noqa: E402
 
-from makebreak.gap.data.recording import check_against_scene, read_recording  # noqa: E402
+from makebreak.gap.data.reading import check_against_scene, read_recording  # noqa: E402
 from makebreak.gap.data.scene_facts import scene_names  # noqa: E402
 from makebreak.gap.problem import is_sane  # noqa: E402
 from makebreak.models.effects.kind import Effect  # noqa: E402

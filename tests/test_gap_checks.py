@@ -10,7 +10,7 @@ from makebreak.diagrams.station import BALL_ROLLING
 from makebreak.gap.data.check_motion import excitation, free_flight_gravity
 from makebreak.gap.data.checks import check_recordings
 from makebreak.gap.data.findings import JointFacts, SceneFacts
-from makebreak.gap.data.recording import check_against_scene, read_recording
+from makebreak.gap.data.reading import check_against_scene, read_recording
 from makebreak.gap.data.scene_facts import scene_facts, scene_names
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.numerics.signal_relation import angular_velocity, relate

@@ -32,7 +32,7 @@ from gap_benchmark.contact_scenes import (
     pair_friction,
 )
 
-from makebreak.gap.data.recording import check_against_scene, read_recordings
+from makebreak.gap.data.reading import check_against_scene, read_recordings
 from makebreak.gap.data.scene_facts import scene_names
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.scene import read_scene

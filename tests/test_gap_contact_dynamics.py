@@ -19,7 +19,7 @@ from scipy.sparse import eye_array
 from scipy.spatial.transform import Rotation
 
 from makebreak.gap import workflow
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.numerics import permitted_forces
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Outcome, SearchPlan, is_sane

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from measured.double_pendulum import convert
 
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.simulation.judge import judge
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from effect_scenes import at_rest_but, double, with_effects
 
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.gap.simulation.scene_simulation import Commands, SceneSimulation
 from makebreak.gap.workflow import run_gap

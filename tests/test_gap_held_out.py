@@ -5,7 +5,7 @@ import pytest
 from gap_benchmark.cases import cases, make, write
 from test_gap_contact import ball_scene, rolled, touched
 
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.split import split
 from makebreak.gap.workflow import run_gap
 

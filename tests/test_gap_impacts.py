@@ -7,7 +7,7 @@ import pytest
 from gap_benchmark import cart_world
 from gap_benchmark.cart_world import PAIR
 
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.residuals.impacts import (
     FREE_SEC,

@@ -7,7 +7,7 @@ import pytest
 from effect_scenes import on_ground, pendulum
 
 from makebreak.gap.data.check_drives import check_drives, check_initial_names
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.simulation.windows import WindowModel
 from makebreak.gap.workflow import run_gap
 from makebreak.models.scene import InitialSection, read_scene

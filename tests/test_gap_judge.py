@@ -8,7 +8,7 @@ import pytest
 from effect_scenes import double, pendulum, with_effects
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.simulation.judge import judge
 from makebreak.models.scene import load_scene

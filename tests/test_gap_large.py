@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from makebreak.gap import run_gap
 from makebreak.gap.data.check_meshes import check_meshes
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.numerics.edge_crossings import FAR, crossing, edges_of_box
 from makebreak.gap.numerics.free_body import FreeBody, simulate
 from makebreak.gap.residuals.contact_dynamics import ContactDynamics

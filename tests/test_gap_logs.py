@@ -41,7 +41,7 @@ from gap_benchmark.ties import CLEAR, SAME, Comparison, velocity_rivals  # noqa:
 from gap_benchmark.two_link import TwoLinkWorld  # noqa: E402
 from pydrake.systems.framework import DiagramBuilder  # noqa: E402
 
-from makebreak.gap.data.recording import check_against_scene, read_recording  # noqa: E402
+from makebreak.gap.data.reading import check_against_scene, read_recording  # noqa: E402
 from makebreak.gap.data.scene_facts import scene_names  # noqa: E402
 from makebreak.models.scene import load_scene  # noqa: E402
 

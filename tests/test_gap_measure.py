@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from effect_scenes import pendulum
 
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.gap.simulation.measure import measure

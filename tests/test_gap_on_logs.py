@@ -10,7 +10,7 @@ pytest.importorskip("mujoco", reason="the logs are simulated in MuJoCo")
 
 from gap_benchmark.log_cases import LogCase, Recipe, write  # noqa: E402
 
-from makebreak.gap.data.recording import read_recording  # noqa: E402
+from makebreak.gap.data.reading import read_recording  # noqa: E402
 from makebreak.gap.residuals.inverse import InverseModel  # noqa: E402
 from makebreak.gap.workflow import run_gap  # noqa: E402
 from makebreak.models.effects.kind import Effect  # noqa: E402

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.residuals.pressing import PressingProblem, presses
 from makebreak.gap.search.select import select

@@ -12,7 +12,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.sparse import csr_matrix
 from test_gap_statistics import TwoChannels
 
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.numerics.permitted_forces import held_means, test_functions
 from makebreak.gap.problem import Candidate, SearchPlan
 from makebreak.gap.residuals.contact_means import ContactMeans

@@ -12,7 +12,7 @@ from pydrake.math import RotationMatrix
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.gap.data.findings import Finding
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.report.clock import extents_of
 from makebreak.gap.report.comparison import comparison_html, measured_state

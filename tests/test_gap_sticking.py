@@ -7,7 +7,7 @@ import pytest
 from effect_scenes import at_rest_but, double, with_effects
 from test_driven_arm import tree
 
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.problem import Candidate
 from makebreak.gap.residuals.driven import DrivenProblem, is_driven, sticks
 from makebreak.gap.residuals.mechanism import MechanismProblem

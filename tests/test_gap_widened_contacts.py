@@ -8,7 +8,7 @@ from gap_benchmark import push_world
 from gap_benchmark.push_world import BLOCK, TABLE
 from push_problems import screen_of
 
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.numerics.permitted_forces import tangents
 from makebreak.gap.problem import Fitted
 from makebreak.gap.residuals.contact_candidates import FRICTION_SPREAD

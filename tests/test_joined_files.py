@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from makebreak.gap.data.recording import read_recording
+from makebreak.gap.data.reading import read_recording
 
 TIME = 1e6 * np.arange(40) * 0.02  # [us], as the logger has it.
 MEASURED, TOLD = 0.1 * np.sin(1e-6 * TIME), 0.1 * np.cos(1e-6 * TIME)

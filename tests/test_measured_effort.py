@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from effect_scenes import J, pendulum
 
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.simulation.windows import WindowModel, seen_in
 

@@ -7,7 +7,7 @@ import pytest
 from gap_benchmark.cases import cases, make
 
 from makebreak.gap.data.proposal import JointName, of_one_drive, propose
-from makebreak.gap.data.recording import read_recording
+from makebreak.gap.data.reading import read_recording
 from makebreak.gap.data.robot import propose_scene, read_log, read_robot
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.dynamics import SceneDynamics

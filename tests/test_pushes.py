@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from effect_scenes import at_rest_but, double, with_effects
 
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.residuals.pushes import find_pushes
 from makebreak.gap.simulation.scene_simulation import Commands, SceneSimulation

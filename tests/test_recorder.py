@@ -23,7 +23,7 @@ from makebreak.diagrams.recorder import (
     recorded,
     with_noise,
 )
-from makebreak.gap.data.recording import check_against_scene, read_recordings
+from makebreak.gap.data.reading import check_against_scene, read_recordings
 from makebreak.gap.data.scene_facts import scene_names
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.scene import read_scene

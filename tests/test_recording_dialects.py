@@ -8,7 +8,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from makebreak.gap.data.recording import read_recording
+from makebreak.gap.data.reading import read_recording
 
 N = 40
 T = np.round(0.01 * np.arange(N), 4)

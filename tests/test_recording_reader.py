@@ -6,13 +6,12 @@ import sys
 import numpy as np
 import pytest
 
-from makebreak.gap.data.recording import (
+from makebreak.gap.data.reading import (
     check_against_scene,
     read_recording,
     read_recordings,
-    unit_of,
-    windows,
 )
+from makebreak.gap.data.recording import unit_of
 from makebreak.gap.data.table import read_table, write_recording
 from makebreak.gap.numerics.signal_noise import estimate_noise, resolution
 
@@ -96,7 +95,7 @@ def test_a_command_holds_until_the_next_one_within_its_episode(tmp_path):
     np.testing.assert_array_equal(held, expected)
 
 
-def test_episodes_rates_and_windows(tmp_path):
+def test_episodes_and_rates(tmp_path):
     n = 100
     time = np.concatenate([np.arange(n) * 0.01, np.arange(n) * 0.01])
     slow = np.full(2 * n, np.nan)
@@ -110,8 +109,6 @@ def test_episodes_rates_and_windows(tmp_path):
     ]
     assert all(e.is_start for e in recording.episodes)
     assert recording.channels["a.b.x"].rate_hz == pytest.approx(20.0)
-    found = list(windows(recording.episodes[1], recording.time, 0.2))
-    assert found[0] == slice(100, 121) and found[1].start == 120
     assert recording.duration_sec() == pytest.approx(1.98)
 
 

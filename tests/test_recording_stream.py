@@ -10,7 +10,7 @@ import pydrake.all as drake
 import pytest
 
 from makebreak.diagrams.recorder import add_recorder, recorded
-from makebreak.gap.data.recording import read_recording
+from makebreak.gap.data.reading import read_recording
 from makebreak.scripts import recording_stream
 from makebreak.scripts.session import Session
 

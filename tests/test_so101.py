@@ -12,7 +12,7 @@ import pytest
 from measured.so101 import FITTED, JOINTS, JUDGED, MOTIONS, STEP, convert
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.gap.data.recording import read_recordings
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.simulation.judge import judge
 from makebreak.gap.workflow import run_gap
 from makebreak.models.drives import law_of

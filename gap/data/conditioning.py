@@ -12,16 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from makebreak.gap.data.channel_noise import with_noise
 from makebreak.gap.data.clock import clock_period, even_clock
 from makebreak.gap.data.filters import FILTERED_SEC
 from makebreak.gap.data.findings import Finding
-from makebreak.gap.data.recording import (
-    Channel,
-    Episode,
-    Recording,
-    unit_of,
-    with_noise,
-)
+from makebreak.gap.data.recording import Channel, Episode, Recording, unit_of
 from makebreak.gap.numerics.signal_noise import (
     estimate_noise,
     noise_and_jitter,

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from makebreak.gap.data.recording import FEWEST_ROWS, Episode, Recording, part_of
+from makebreak.gap.data.pieces import part_of
+from makebreak.gap.data.recording import FEWEST_ROWS, Episode, Recording
 
 # Of each recording: its last fifth, in whole episodes where it has five or more.
 REPORTED_SHARE, WHOLE_EPISODES = 0.2, 5

@@ -13,7 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from makebreak.gap.data.findings import Finding
-from makebreak.gap.data.recording import FEWEST_ROWS, Episode, Recording, part_of
+from makebreak.gap.data.pieces import part_of
+from makebreak.gap.data.recording import FEWEST_ROWS, Episode, Recording
 from makebreak.gap.problem import Candidate, Fitted, Nuisances, SearchPlan
 from makebreak.gap.residuals.contact_candidates import reader_of_trial
 from makebreak.gap.residuals.contact_shapes import ContactShapes, poses_of

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from makebreak.gap.data.recording import Recording, check_against_scene, unit_of
+from makebreak.gap.data.reading import check_against_scene
+from makebreak.gap.data.recording import Recording, unit_of
 from makebreak.gap.data.scene_facts import scene_names
 from makebreak.gap.simulation.driven_arm import DrivenArmScene, DrivenArmSimulation
 from makebreak.gap.simulation.scene_simulation import SceneSimulation

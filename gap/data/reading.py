@@ -1,0 +1,319 @@
+"""Recordings read from tables and their sidecars, and checked."""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from difflib import get_close_matches
+from pathlib import Path
+
+import numpy as np
+
+from makebreak.gap.data.channel_noise import noise_told
+from makebreak.gap.data.csv_table import BadRows
+from makebreak.gap.data.episodes import (
+    broken_at_holes,
+    counted_parts,
+    episodes_of,
+    without_ignored,
+)
+from makebreak.gap.data.filters import read_filter
+from makebreak.gap.data.joined import joined, time_column
+from makebreak.gap.data.quaternions import mend_quaternions
+from makebreak.gap.data.recording import Channel, Episode, Recording
+from makebreak.gap.data.sidecar import read_sidecars, renamed, sidecar_of
+from makebreak.gap.data.table import (
+    COMMANDS,
+    JOINT_QUANTITIES,
+    MOST_CELLS,
+    check_columns,
+    is_channel,
+    read_table,
+    stem_of,
+)
+
+MOST_VALUE = 1e12  # In SI units nothing that a robot measures is larger.
+_TIME_UNITS = ((1e-3, "ms"), (1e-6, "us"), (1e-9, "ns"), (0.0, "no unit of time"))
+
+
+def read_recordings(
+    paths: Iterable[str | Path],
+    skip_bad_rows: bool = False,
+    sidecars: Mapping[Path, Path] | None = None,
+) -> list[Recording]:
+    """Several recordings, with names that tell them apart.
+
+    Args: skip_bad_rows: as of read_recording. sidecars: {recording: sidecar}, where it
+        is not beside it.
+    Raises: ValueError as read_recording; if a file is given twice; for no file.
+    """
+    files = [Path(path) for path in paths]
+    if not files:
+        raise ValueError("expected at least one recording")
+    seen: dict[Path, Path] = {}
+    for path in files:
+        if path.resolve() in seen:
+            raise ValueError(f"recording {path} is given twice")
+        seen[path.resolve()] = path
+    stems = [stem_of(path) for path in files]
+    if len(set(stems)) < len(stems):  # runs/a/recording.csv, runs/b/recording.csv
+        stems = [f"{path.resolve().parent.name}/{stem_of(path)}" for path in files]
+    if len(set(stems)) < len(stems):
+        stems = [str(path) for path in files]
+    return [
+        read_recording(
+            path, name, MOST_CELLS, skip_bad_rows, (sidecars or {}).get(path)
+        )
+        for path, name in zip(files, stems, strict=True)
+    ]
+
+
+def read_recording(
+    path: str | Path,
+    name: str | None = None,
+    most_cells: int = MOST_CELLS,
+    skip_bad_rows: bool = False,
+    sidecar_path: Path | None = None,
+) -> Recording:
+    """Reads a .csv, .npz or .parquet table, and what its sidecars say of it.
+
+    Quaternions are given unit length and one sign without jumps; what was done is in
+    the recording's fields and notes.
+
+    Args: skip_bad_rows: rows that cannot be read, that hold numbers beyond 1e12, or
+        whose time does not increase, are left out and counted in a note. sidecar_path:
+        in place of the one beside it.
+    Raises: ValueError: one line with file, column, row, what came, what was expected.
+    """
+    path = Path(path)
+    sidecar = read_sidecars(path, sidecar_path)
+    bad = BadRows(path, skip_bad_rows)
+    columns, row, n_rows = _read_columns(path, sidecar, most_cells, bad)
+    is_excerpt = len(row) + bad.count < n_rows
+    number = columns.get("episode")
+    try:
+        columns = check_columns(
+            columns | {"episode": counted_parts(path, columns, row, is_excerpt)}
+        )
+    except ValueError as error:
+        raise ValueError(_with_rows(path, error, row)) from None
+    time, part = columns.pop("time"), columns.pop("episode")
+    if not columns:
+        raise ValueError(f"recording {path} has no channel beside time")
+    episodes = episodes_of(path, number, part, time, row)
+    episodes, notes = broken_at_holes(path, episodes, time)
+    spans = sidecar.get("ignore") or []
+    episodes, more = without_ignored(path, episodes, time, spans)
+    notes += more + _without_empty(path, columns)
+    _check_sizes(path, columns, row)
+    flips, norm_errors = mend_quaternions(path, columns, episodes, row)
+    if is_excerpt:
+        says = f"{path.name} has {n_rows} rows, too many to hold: {len(time)} of them "
+        says += "are used, in evenly spread stretches"
+        notes.append(("rows_left_out", says))
+    notes += bad.note()
+    return Recording(
+        name=name or stem_of(path),
+        path=path,
+        time=time,
+        row=row,
+        episodes=episodes,
+        channels=_channels(path, columns, time, episodes, sidecar),
+        n_rows_in_file=n_rows,
+        provenance=str(sidecar.get("provenance") or ""),
+        notes=tuple(notes),
+        quaternion_flips=flips,
+        quaternion_norm_error=norm_errors,
+    )
+
+
+def _read_columns(
+    path: Path, sidecar: Mapping, most_cells: int, bad: BadRows
+) -> tuple[dict[str, np.ndarray], np.ndarray, int]:
+    """Columns under our names, (n,) numbers of their rows in the file, and how many
+    rows that has; time is there and in seconds."""
+    names = sidecar.get("columns") or {}
+    unused = frozenset(str(name) for name, to in names.items() if to is None)
+    table = read_table(path, most_cells, bad, unused)
+    if others := sidecar.get("join"):
+        tables = []
+        for file in others:
+            own = {name.removeprefix(f"{file.name}:") for name in unused}
+            tables.append((file, read_table(file, most_cells, bad, frozenset(own))))
+        table = joined(path, table, tables, time_column(names))
+    columns = renamed(path, table.columns, names, unused)
+    _check_time(path, columns)
+    columns, row = _without_bad_rows(columns, table.row, bad)
+    return columns, row, table.n_rows
+
+
+def _check_time(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Raises: ValueError where there is no time, or it is not in seconds."""
+    sidecar = sidecar_of(path).name
+    if "time" not in columns:
+        shown = ", ".join(list(columns)[:8]) + (", ..." if len(columns) > 8 else "")
+        raise ValueError(
+            f"recording {path} needs the column time, got {shown}; a column of another "
+            f"name is mapped in {sidecar}: columns: {{t: time}}"
+        )
+    steps = np.abs(np.diff(columns["time"][:100_000]))
+    step = float(np.median(steps[np.isfinite(steps)])) if len(steps) else 0.0
+    # A row a second for a quarter of an hour is 1 kHz in milliseconds.
+    if step > 1.5 or (step > 0.9 and len(steps) > 1000):
+        scale, unit = next((s, u) for s, u in _TIME_UNITS if step * s < 0.9)
+        mapping = f"{{time: {{channel: time, scale: {scale:g}}}}}"
+        raise ValueError(
+            f"recording {path}: rows are {step:.6g} s apart, as if time were in {unit}:"
+            f" expected seconds; map it in {sidecar}: columns: {mapping}"
+        )
+
+
+def _without_bad_rows(
+    columns: dict[str, np.ndarray], row: np.ndarray, bad: BadRows
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Columns and row numbers without rows that hold what nothing measures, or come
+    before the row above them, where such are left out."""
+    if not bad.skip:
+        return columns, row
+    good = np.ones(len(row), bool)
+    for name, value in columns.items():
+        for k in np.flatnonzero(good & (np.abs(value) > MOST_VALUE)):
+            bad.add(f"column {name}, row {row[k]}: got {value[k]:.4g}")
+            good[k] = False
+    time, episode = columns["time"], columns.get("episode", np.zeros(len(row)))
+    for k in np.flatnonzero(good & ~np.isfinite(time)):
+        bad.add(f"column time, row {row[k]}: got {time[k]}")
+        good[k] = False
+    rows = np.flatnonzero(good)
+    for number in np.unique(episode[rows]):
+        mine = rows[episode[rows] == number]
+        latest = np.maximum.accumulate(time[mine])
+        for k in mine[1:][time[mine[1:]] <= latest[:-1]]:
+            bad.add(f"column time, row {row[k]}: {time[k]} does not increase")
+            good[k] = False
+    return {name: value[good] for name, value in columns.items()}, row[good]
+
+
+def _without_empty(path: Path, columns: dict[str, np.ndarray]) -> list[tuple[str, str]]:
+    """Takes columns without any sample out of the table, in place, and says so."""
+    empty = [name for name, value in columns.items() if np.isnan(value).all()]
+    for name in empty:
+        del columns[name]
+    if not columns:
+        raise ValueError(f"recording {path}: no column beside time has any number")
+    return [
+        ("channel_empty", f"{path.name}: {name} has no sample at all and is left out")
+        for name in empty
+    ]
+
+
+def _check_sizes(path: Path, columns: Mapping[str, np.ndarray], row: np.ndarray):
+    """Raises: ValueError for a number that nothing measures."""
+    for name, value in columns.items():
+        bad = np.flatnonzero(np.abs(value) > MOST_VALUE)
+        if bad.size:
+            raise ValueError(
+                f"recording {path}: column {name}, row {row[bad[0]]}: got "
+                f"{value[bad[0]]:.4g}, expected a number in SI units, of less than "
+                f"{MOST_VALUE:g}"
+            )
+
+
+def _with_rows(path: Path, error: ValueError, row: np.ndarray) -> str:
+    """The message about a column, with the file's name."""
+    text = str(error).removeprefix("a recording ").removeprefix("recording ")
+    if len(row) and row[-1] != len(row):
+        text += " (rows counted among those that are used)"
+    return f"recording {path}: {text}"
+
+
+def _channels(
+    path: Path,
+    columns: Mapping[str, np.ndarray],
+    time: np.ndarray,
+    episodes: Sequence[Episode],
+    sidecar: Mapping,
+) -> dict[str, Channel]:
+    """The columns, with noise and filters. They and time become read-only."""
+    noise, filters = sidecar.get("noise") or {}, sidecar.get("filters") or {}
+    for section, known in (("noise", noise), ("filters", filters)):
+        # noise.json may speak of several recordings.
+        _check_names(path, section, known, columns, sidecar.get("own", ()))
+    for value in (time, *columns.values()):
+        value.setflags(write=False)
+    channels = {}
+    for name, values in columns.items():
+        periods = [np.diff(time[e.rows][~np.isnan(values[e.rows])]) for e in episodes]
+        stages = _stages(path, name, filters, np.concatenate(periods))
+        channel = Channel(name, values)
+        if channel.is_command:  # Known, not measured.
+            n, duration = int((~np.isnan(values)).sum()), sum(map(np.sum, periods))
+            rate = n / duration if duration > 0.0 else 0.0
+            channels[name] = replace(channel, rate_hz=rate)
+            continue
+        said = filters.get(name, "")
+        text = said if isinstance(said, str) else json.dumps(said)
+        # A given zero says nothing that one can weigh by.
+        given = max(noise.get(name, 0.0), 0.0)
+        channel = replace(channel, noise_given=given, filter=text, stages=stages)
+        channels[name] = noise_told(channel, time, episodes)
+    return channels
+
+
+def _check_names(path: Path, section: str, names, columns, own) -> None:
+    """Raises: ValueError where a sidecar speaks of what is no channel, or, in the
+    recording's `own` sidecar, of one that the recording lacks."""
+    for name in names:
+        if name in columns or (is_channel(name) and name not in own):
+            continue
+        close = get_close_matches(name, columns, n=1, cutoff=0.5)
+        hint = f'; did you mean "{close[0]}"?' if close else ""
+        what = "expected the name of a channel"
+        if is_channel(name):
+            what = "which the recording does not have"
+        raise ValueError(f'sidecar of {path}: {section} of "{name}", {what}{hint}')
+
+
+def _stages(path: Path, name: str, filters: Mapping, periods: np.ndarray):
+    """What the sidecar says of the sensor's filter; periods (m,) of its samples [s]."""
+    if name not in filters:
+        return ()
+    quantity = name.rsplit(".", 1)[1]
+    if quantity in COMMANDS:
+        raise ValueError(
+            f"sidecar of {path}: filters of {name}: a command is known, not "
+            "measured: expected a measured channel"
+        )
+    period = float(np.median(periods)) if len(periods) else np.inf
+    try:
+        return read_filter(name, filters[name], quantity, period)
+    except ValueError as error:
+        raise ValueError(f"sidecar of {path}: {error}") from None
+
+
+def check_against_scene(
+    recording: Recording, joints: Iterable[str], bodies: Iterable[str]
+) -> None:
+    """Refuses channels of what a scene does not have.
+
+    Args: joints, bodies: `<model>.<name>` of the scene's joints; bodies and frames.
+    Raises: ValueError, naming all of them and the nearest name of the first.
+    """
+    joints, bodies = set(joints), set(bodies)
+    lacking = {
+        c.name: (joints if c.quantity in JOINT_QUANTITIES else bodies, c)
+        for c in recording.channels.values()
+        if c.at not in (joints if c.quantity in JOINT_QUANTITIES else bodies)
+    }
+    if not lacking:
+        return
+    known, first = next(iter(lacking.values()))
+    what = "joint" if first.quantity in JOINT_QUANTITIES else "body or frame"
+    close = get_close_matches(first.at, known, n=1, cutoff=0.5)
+    hint = f'did you mean "{close[0]}"?' if close else f"it has {sorted(known)}"
+    others = f" (and {len(lacking) - 1} more)" if len(lacking) > 1 else ""
+    raise ValueError(
+        f"recording {recording.path}: column {first.name}{others}: no {what} "
+        f'"{first.at}" in the scene: {hint}; to leave a column out, map it to null '
+        "under `columns` "
+        f"in {sidecar_of(recording.path).name}"
+    )

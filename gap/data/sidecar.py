@@ -1,0 +1,177 @@
+"""What a sidecar says of a recording: noise, filters, names of columns, spans to leave
+out, files to join."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from makebreak.gap.data.table import stem_of
+
+_SECTIONS = ("noise", "filters", "columns", "ignore", "join", "provenance")
+
+
+def sidecar_of(path: Path) -> Path:
+    """Where a recording's sidecar is expected: monday.csv has monday.yaml."""
+    return path.with_name(f"{stem_of(path)}.yaml")
+
+
+def has_sidecar(path: Path) -> bool:
+    """Whether a file beside the recording speaks of it alone."""
+    return bool(_own_sidecars(path))
+
+
+def _own_sidecars(path: Path) -> list[Path]:
+    own = [sidecar_of(path), path.with_name(f"{path.name}.yaml")]
+    own += [file.with_suffix(".yml") for file in own]
+    return [file for file in dict.fromkeys(own) if file.is_file()]
+
+
+def read_sidecars(path: Path, given: Path | None) -> dict:
+    """noise.json in the folder, and `<recording>.yaml`, or .csv.yaml, which wins.
+
+    Args: given: in place of the one beside the recording.
+    Returns: {section: what it says}, as written but for `ignore`: (from, to, episode)
+        of spans; `join`: paths; `own`: channels that are named in the recording's own
+        sidecar.
+    Raises: ValueError that names the file and what is wrong in it.
+    """
+    merged: dict = {}
+    own = _own_sidecars(path) if given is None else [given]
+    if len(own) > 1:
+        raise ValueError(
+            f"recording {path} has two sidecars: {own[0].name} and {own[1].name}"
+        )
+    for file in (path.with_name("noise.json"), *own):
+        data = _sections(file) if file.is_file() else None
+        if data is None:
+            continue
+        for key, value in data.items():
+            if key not in _SECTIONS:
+                expected = ", ".join(_SECTIONS)
+                raise ValueError(f'{file}: "{key}", expected one of {expected}')
+            if key == "ignore":
+                value = _spans(file, value)
+            elif key == "join":
+                value = _files_of(file, value)
+            elif key != "provenance" and value is not None:
+                if not isinstance(value, dict):
+                    raise ValueError(f"{file}: {key} must be names with values")
+                value = (merged.get(key) or {}) | {str(k): v for k, v in value.items()}
+            merged[key] = value
+        for key, value in (data.get("noise") or {}).items():
+            number = _finite_number(f"{file}: noise of {key}", value, least=0.0)
+            merged["noise"][str(key)] = number
+        if file in own:  # It speaks of this recording alone.
+            merged["own"] = {str(key) for key in data.get("noise") or {}} | {
+                str(key) for key in data.get("filters") or {}
+            }
+    return merged
+
+
+def _sections(file: Path) -> dict | None:
+    """What is written in a file; None where nothing is."""
+    try:
+        # Not YAML for both: YAML reads 1e-5 as a text.
+        text = file.read_text()
+        data = json.loads(text) if file.suffix == ".json" else yaml.safe_load(text)
+    except (ValueError, yaml.YAMLError, RecursionError) as error:
+        raise ValueError(f"{file}: {' '.join(str(error).split())}") from None
+    if data is None:
+        return None
+    if not isinstance(data, dict):
+        raise ValueError(f"{file}: expected names with values")
+    if file.suffix == ".json" and not set(data) & set(_SECTIONS):
+        return {"noise": data}  # {channel: standard deviation}
+    return data
+
+
+def _files_of(file: Path, said) -> list[Path]:
+    """Files, named beside the sidecar, that belong to a recording."""
+    names = said if isinstance(said, list) else [said]
+    if not names or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"{file}: join: got {said}, expected a file name, or a list")
+    return [file.parent / name for name in names]
+
+
+def _spans(file: Path, said) -> list[tuple[float, float, int | None]]:
+    """From, to [s] and the episode, None for all, of spans that are to be left out."""
+    spans = []
+    for each in said if isinstance(said, list) else [said]:
+        if not isinstance(each, dict) or set(each) - {"from", "to", "episode"}:
+            raise ValueError(
+                f"{file}: ignore has {each!r}, expected a list of {{from: 16, to: 18}} "
+                "in seconds of the recording's time, and episode where it has several"
+            )
+        first, last = (
+            _finite_number(f"{file}: ignore, {key}", each.get(key))
+            for key in ("from", "to")
+        )
+        if not first < last:
+            raise ValueError(f"{file}: ignore is from {first} to {last} s")
+        episode = each.get("episode")
+        if episode is not None and not isinstance(episode, int):
+            raise ValueError(f"{file}: ignore, episode is {episode!r}")
+        spans.append((first, last, episode))
+    return spans
+
+
+def _finite_number(what: str, value, least: float = -np.inf) -> float:
+    try:
+        number = float(value)  # YAML reads 1e-5, without a point, as a text.
+    except (TypeError, ValueError):
+        number = np.nan
+    if not (np.isfinite(number) and number >= least) or isinstance(value, bool):
+        tail = f" of {least:g} or more" if np.isfinite(least) else ""
+        raise ValueError(f"{what} is {value!r}, expected a finite number{tail}")
+    return number
+
+
+def renamed(
+    path: Path,
+    columns: Mapping[str, np.ndarray],
+    names: Mapping,
+    unused: frozenset[str],
+) -> dict[str, np.ndarray]:
+    """The columns under our names.
+
+    names: {foreign: ours}, {foreign: null} to leave one out, or {foreign: {channel:
+    ours, scale: factor, offset: added after it}}.
+    """
+    file, result = sidecar_of(path), {}
+    for foreign in names:
+        if foreign not in columns and foreign not in unused:
+            raise ValueError(
+                f'{file}: columns names "{foreign}", {path.name} has '
+                f"{', '.join(columns)}"
+            )
+    for name, value in columns.items():
+        target = names.get(name, name)
+        if target is None:
+            continue
+        if isinstance(target, dict):
+            value, target = _scaled(f'{file}: columns, "{name}":', value, target)
+        if not isinstance(target, str):
+            raise ValueError(
+                f'{file}: columns, "{name}": got {target}, expected the name of a '
+                "channel, or null"
+            )
+        if target in result:
+            raise ValueError(f'{file}: two columns are mapped to "{target}"')
+        result[target] = value
+    return result
+
+
+def _scaled(what: str, value: np.ndarray, said: Mapping) -> tuple[np.ndarray, str]:
+    """A column in our unit, and its channel: {channel, scale, offset} applied."""
+    if set(said) - {"channel", "scale", "offset"} or "channel" not in said:
+        raise ValueError(
+            f"{what} got {sorted(said)}, expected channel, and scale or offset"
+        )
+    scale = _finite_number(f"{what} scale", said.get("scale", 1.0))
+    if scale == 0.0:
+        raise ValueError(f"{what} scale is 0, which leaves nothing")
+    offset = _finite_number(f"{what} offset", said.get("offset", 0.0))
+    return scale * value + offset, said["channel"]
