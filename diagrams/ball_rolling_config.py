@@ -52,17 +52,20 @@ BALL_RESISTANCE = 0.005  # Lever arm over radius.
 class PlannerConfig:
     """The costs of C3+ and its ADMM weights (docs/c3.md), for forces in newtons."""
 
-    N: int = 5  # Knots, PLAN_DT = 0.1 s apart.
-    rounds: int = 4  # Of ADMM.
-    rho: float = 2.2  # Growth of the consensus weights per round.
-    tip: float = 500.0  # Weight of the tip's position; of its velocity 1/50 of it.
+    N: int = 5  # Number of knots of the plan, PLAN_DT = 0.1 s apart.
+    rounds: int = 4  # Number of ADMM rounds.
+    rho: float = 2.2  # Growth of the consensus weights from round to round.
+    tip: float = 500.0  # Weight of the tip's position; its velocity has 1/50 of it.
     ball: float = 5000.0  # Weight of the ball's position on the table.
-    ball_velocity: float = 300.0  # Weight of its velocity and angular velocity.
-    force: float = 5.0  # Consensus weight of lam of tip and ball; of eta 1/10 of it.
-    friction: float = 1.0  # In the model: of both contacts, for planning and learning.
-    # The command's one-step model: contacts that slide do not open (C3Config).
+    ball_velocity: float = 300.0  # Weight of the ball's velocity and angular velocity.
+    # Consensus weight G of lam of tip and ball; that of eta is 1/10 of it.
+    force: float = 5.0
+    # Coefficient of friction of both contacts in the model, for planning and learning.
+    friction: float = 1.0
+    # Whether sliding contacts do not open in the one-step model of the command
+    # (C3Config).
     sliding_command: bool = True
-    polish: int = 0  # Rollouts that improve the plan (docs/c3.md); 0: none.
+    polish: int = 0  # Number of rollouts that improve the plan (docs/c3.md); 0: none.
 
 
 @dataclass
@@ -76,10 +79,15 @@ class LearnerConfig:
 
     weight_ball: float = 2e4  # Q_d of the ball's v_x and v_y [s2/m2].
     weight_tip: float = 1e5  # Q_d of the tip's v_z [s2/m2].
-    eps: float = 1e-3  # 3 N of contact over a gap of 0.05 mm are as unlikely as 2 std.
-    gamma: float = 5e-4  # 1e-2 * 0.05 s: the paper's, for forces in newtons.
-    r_max: float = 0.7  # Largest residual [m/s]: a gap of 35 mm.
-    slip_noise: float = 0.03  # Noise of the ball's measured speed at its top [m/s].
+    # Weight eps of the dynamics against the contact equation [m/s N]; with 1e-3, 3 N of
+    # contact over a gap of 0.05 mm are as unlikely as 2 std.
+    eps: float = 1e-3
+    # Softness gamma of the contact equation [m/s per N]; default: the paper's.
+    gamma: float = 5e-4
+    r_max: float = 0.7  # Bound of the residual [m/s]; 0.7 is a gap of 35 mm.
+    # Noise of the measured gap speed mu |v_t| of a sliding contact; what exceeds it is
+    # not taken for a gap [m/s].
+    slip_noise: float = 0.03
     posterior: PosteriorConfig = field(
         default_factory=lambda: PosteriorConfig(
             free_states=[V_BALL.start, V_BALL.start + 1]
@@ -95,28 +103,36 @@ class BallRollingConfig:
     friction, rolling_resistance, ball_noise_m and object change the world.
     """
 
-    adapt: bool = True  # false: learner=none.
-    # What is learned: a residual of the contact equation (r_comp), of the dynamics
-    # (r_dyn, eq. 10), both or none.
+    adapt: bool = True  # Whether a residual is learned; false: as learner=none.
+    # Residual that is learned: r_comp (of the contact equation), r_dyn (of the
+    # dynamics, eq. 10), both or none.
     learner: Literal["none", "r_comp", "r_dyn", "both"] = "r_comp"
-    # paper: the paper's learner and projection, with the paper's constants.
+    # Learner and projection: ours, or paper: those of the paper, with its constants.
     controller: Literal["ours", "paper"] = "ours"
-    # What decides when and where to touch: the hand-written cycle of RollingTask, or
-    # ContactSampler.
+    # What decides when and where to touch: cycle (the hand-written RollingTask;
+    # settings task, planner) or sampled (ContactSampler; settings contacts).
     contact_sequence: Literal["cycle", "sampled"] = "cycle"
-    # Of C3; auto: plus with our controller, qp with the paper's.
+    # Projection of C3: qp, exact, plus; or auto: plus with controller=ours, qp with
+    # controller=paper.
     projection: Literal["auto", "qp", "exact", "plus"] = "auto"
-    object: Literal["ball", "orange", "lime"] = "ball"  # What is rolled.
-    # The ball's radius in the model minus that in the world (of a fruit: its mean).
+    # Object that is rolled: ball, orange or lime.
+    object: Literal["ball", "orange", "lime"] = "ball"
+    # Radius of the ball in the model minus that in the world (of a fruit: its mean
+    # radius) [m].
     radius_error_m: float = 0.005
-    friction: float = 0.5  # Of the ball with tip and table.
-    # Lever arm over radius; None: 0.005 for the ball, the fruit's own for a fruit.
+    # Coefficient of friction of the ball with tip and table in the world.
+    friction: float = 0.5
+    # Rolling resistance in the world, as lever arm over radius; null: 0.005 for the
+    # ball, its own for a fruit.
     rolling_resistance: float | None = None
-    ball_noise_m: float = 0.001  # Deviation by which each picture is shifted.
-    start_angle_rad: float | None = None  # Where the ball starts; None: by the seed.
-    world: str = BALL_ROLLING
-    model: str = BALL_ROLLING
-    seed: int = 0
+    # Standard deviation of the random shift of each image, as a length at
+    # camera.noise_height [m].
+    ball_noise_m: float = 0.001
+    # Angle on the circle at which the ball starts [rad]; null: drawn by the seed.
+    start_angle_rad: float | None = None
+    world: str = BALL_ROLLING  # Scene file of the simulated world.
+    model: str = BALL_ROLLING  # Scene file of the controllers' model.
+    seed: int = 0  # Seed of the ball's start, a fruit's shape and the sensors' noise.
     camera: CameraConfig = field(default_factory=CameraConfig)
     tracker: BallTrackerConfig = field(
         default_factory=lambda: BallTrackerConfig(
@@ -134,7 +150,8 @@ class BallRollingConfig:
     impedance: ImpedanceConfig = field(
         default_factory=lambda: ImpedanceConfig(force_max=20.0)
     )
-    faults: list[str] = field(default_factory=list)  # What goes wrong, by --fault.
+    # Faults to inject, each NAME[:from=S,for=S] as of --fault.
+    faults: list[str] = field(default_factory=list)
 
 
 def check_parts(scene: Scene, what: str) -> None:

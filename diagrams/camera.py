@@ -51,16 +51,22 @@ engine.RenderColorImage(ColorRenderCamera(core, False), ImageRgba8U(8, 8))
 
 @dataclass
 class CameraConfig:
-    width: int = 320  # [px]
-    height: int = 240  # [px]
-    fov_y: float = 0.7  # Field of view along the image's height (world x) [rad].
-    position: list[float] = field(default_factory=lambda: [0.5, 0.0, 0.8])  # [m]
-    renderer: str = "auto"  # "vtk", "drawn", or "auto": vtk where it works.
-    # Each frame is shifted at random: standard deviation along u and v, as a length at
-    # a height above the world's z = 0 [m].
+    width: int = 320  # Width of the image [px].
+    height: int = 240  # Height of the image [px].
+    # Angle of view along the image's height, which is the world's x [rad].
+    fov_y: float = 0.7
+    # Position of the camera in the world; it looks straight down [m].
+    position: list[float] = field(default_factory=lambda: [0.5, 0.0, 0.8])
+    # Renderer of the images: vtk, drawn, or auto: vtk where it works, else drawn.
+    renderer: str = "auto"
+    # Standard deviation of each image's random shift along u and v, as a length at
+    # noise_height [m]; in ball_rolling ball_noise_m sets it.
     position_noise_m: float = 0.0
+    # Height above the world's z = 0 at which position_noise_m is measured [m].
     noise_height: float = 0.0315
-    period_sec: float = 0.0125  # Between frames.
+    # Period of the images, each with a random shift of its own [s]; fixed in
+    # ball_rolling.
+    period_sec: float = 0.0125
 
 
 @functools.cache

@@ -68,19 +68,22 @@ def _learner() -> ResidualLearnerConfig:
 
 @dataclass
 class CartpoleWallsConfig:
-    seed: int = 0  # Draws the initial state around x_initial.
-    # Cart [m], pole [rad], and their velocities: at rest, the tip 24 cm towards wall 0.
+    seed: int = 0  # Seed of the initial state, drawn around x_initial.
+    # Mean initial state: position of the cart [m], angle of the pole [rad], and their
+    # velocities. Default: at rest, the tip 24 cm towards wall 0.
     x_initial: list[float] = field(default_factory=lambda: [0.0, -0.4, 0.0, 0.0])
-    # Half width of the uniform draw in each entry [SI].
+    # Half width of the uniform draw of each entry of the initial state [SI].
     x_spread: list[float] = field(default_factory=lambda: [0.02, 0.02, 0.02, 0.02])
-    adapt: bool = True  # False: as learner=none.
-    # A learned residual of the contact equation (r_comp), of the dynamics (r_dyn, the
-    # baseline, eq. 10), both or none.
+    adapt: bool = True  # Whether a residual is learned; false: as learner=none.
+    # Residual that is learned: r_comp (of the contact equation), r_dyn (of the
+    # dynamics, the baseline, eq. 10), both or none.
     learner: Literal["none", "r_comp", "r_dyn", "both"] = "r_comp"
-    projection: Literal["qp", "exact", "plus"] = "qp"  # Of C3.
+    # Projection of C3: qp, exact or plus.
+    projection: Literal["qp", "exact", "plus"] = "qp"
     # True distance of each wall minus the distance that the model starts with [m].
     gap_error: list[float] = field(default_factory=lambda: [-0.15, 0.15])
-    world: str = SCENE  # Scene file of the MultibodyPlant.
+    # Scene file of the simulated world, where the plant is a MultibodyPlant.
+    world: str = SCENE
     learning: ResidualLearnerConfig = field(default_factory=_learner)
 
 

@@ -114,7 +114,8 @@ class ChangingContactConfig:
         default_factory=lambda: HybridConfig(damping_ratio=0.9)
     )
     reflex: ImpactReflexConfig = field(default_factory=ImpactReflexConfig)  # Off.
-    faults: list[str] = field(default_factory=list)  # Injected by --fault.
+    # Faults to inject, each NAME[:from=S,for=S] as of --fault.
+    faults: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)

@@ -86,19 +86,25 @@ def _control() -> ChangingContactConfig:
 
 @dataclass
 class ChangingSurfaceConfig:
+    # Seed of the frictions, the normal forces, the station's errors and the noise.
     seed: int = 0
-    tool: str = "block"  # Or "sphere".
-    speed: float = 0.1  # Of sliding [m/s].
-    normal_force: float = 8.0  # Each segment has its own, within FORCE of this [N].
-    realism: str = "none"  # Errors of the station: "none", "lab" or "poor".
-    baselines: bool = True  # Also runs constant stiffnesses, K_max and K_free.
-    # Of the three surfaces; empty: drawn by the seed.
+    tool: str = "block"  # Tool on the arm: block or sphere.
+    speed: float = 0.1  # Speed of sliding over the surfaces [m/s].
+    # Normal force on the surfaces [N]; each segment has 0.75 to 1.5 of it, drawn by the
+    # seed.
+    normal_force: float = 8.0
+    # Errors of the station that the model lacks: none, lab or poor.
+    realism: str = "none"
+    # Whether the motion is also run with constant stiffnesses, K_max and K_free.
+    baselines: bool = True
+    # Coefficients of friction of the three surfaces; empty: drawn by the seed.
     friction: list[float] = field(default_factory=list)
     # File of a motion to follow in place of the shipped one: a pattern (.yaml) or a
-    # recorded demonstration; `speed` and `normal_force` have no meaning then.
+    # recorded demonstration; speed and normal_force have no meaning then.
     pattern: str = ""
-    model: str = ""  # Scene file of the controllers' model; "": the shipped one.
-    rehearse: int = 0  # Trials in the model before the first real one.
+    model: str = ""  # Scene file of the controllers' model; empty: the shipped one.
+    # Number of trials that are simulated in the model before the first real one.
+    rehearse: int = 0
     control: ChangingContactConfig = field(default_factory=_control)
 
 

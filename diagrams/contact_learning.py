@@ -71,20 +71,24 @@ BACK = 0.03  # Length of the last segment, in which the third contact is held [m
 
 @dataclass
 class ContactLearningConfig:
-    seed: int = 0
-    tool: str = "block"  # Or "sphere".
-    trials: int = 5
-    speed: float = 0.25  # Of the motion pattern [m/s].
-    normal_force: float = 8.0  # On each surface that has been reached [N].
-    realism: str = "none"  # Errors of the station: "none", "lab" or "poor".
-    # Of each surface, drawn log-uniformly from this range [N/m].
+    seed: int = 0  # Seed of the world, the initial estimates and the noise.
+    tool: str = "block"  # Tool on the arm: block or sphere.
+    trials: int = 5  # Number of trials, each with what the one before has learned.
+    speed: float = 0.25  # Speed of the motion where no contact is expected [m/s].
+    normal_force: float = 8.0  # Normal force on each surface that has been reached [N].
+    # Errors of the station that the model lacks: none, lab or poor.
+    realism: str = "none"
+    # Range from which each surface's contact stiffness is drawn, log-uniformly [N/m].
     stiffness: list[float] = field(default_factory=lambda: list(STIFFNESS_RANGE))
-    # Largest displacement of table, red block and blue wall in the world from where the
-    # scene has them [m], and their frictions.
+    # Largest displacement of table, red block and blue wall in the world from their
+    # places in the scene file [m]; at most 0.05.
     spread: float = SPREAD
-    friction: list[float] = field(default_factory=list)  # Empty: drawn by the seed.
-    model: str = ""  # Scene file of the controllers' model; "": the shipped one.
-    rehearse: int = 0  # Trials in the model before the first real one.
+    # Coefficients of friction of table, red block and blue wall; empty: drawn by the
+    # seed.
+    friction: list[float] = field(default_factory=list)
+    model: str = ""  # Scene file of the controllers' model; empty: the shipped one.
+    # Number of trials that are simulated in the model before the first real one.
+    rehearse: int = 0
     control: ChangingContactConfig = field(
         default_factory=lambda: ChangingContactConfig(
             anticipator=ContactAnticipatorConfig(

@@ -50,11 +50,12 @@ DOWN = np.array([0.0, 0.0, -1.0])
 
 @dataclass
 class ContactTypesConfig:
-    seed: int = 0
-    tilt_deg: float = 10.0  # Of the block on its edge; on its corner about two axes.
-    speed: float = 0.1  # Of sliding [m/s].
-    normal_force: float = 8.0  # [N]
-    friction: float = 0.0  # Of the plate; 0: drawn by the seed.
+    seed: int = 0  # Seed of the friction and the noise.
+    # Tilt of the block: about one axis on its edge, about two on its corner [deg].
+    tilt_deg: float = 10.0
+    speed: float = 0.1  # Speed of sliding over the plate [m/s].
+    normal_force: float = 8.0  # Normal force on the plate [N].
+    friction: float = 0.0  # Coefficient of friction of the plate; 0: drawn by the seed.
     control: ChangingContactConfig = field(
         default_factory=lambda: ChangingContactConfig(
             # The moment of a face wanders by 3 mm times the normal force, which has to

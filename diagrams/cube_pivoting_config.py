@@ -44,27 +44,33 @@ CLEARANCE = 1e-3  # Least distance between bodies at the start [m].
 class PivotStart:
     """Ranges of the uniform distributions from which the seed draws a run."""
 
-    place: float = 0.05  # x of the cube's centre, about -0.1 m, to either side [m].
-    tilt: float = 0.15  # Angle of the cube, to either side [rad].
-    # [low, high]: from the cube's sides to the fingers' surfaces; height of the centres
-    # of the fingers [m].
+    place: float = 0.05  # Largest distance of the cube's centre from x = -0.1 m [m].
+    tilt: float = 0.15  # Largest tilt of the cube, to either side [rad].
+    # Range of the distance from the cube's sides to the fingers' surfaces, [low, high]
+    # [m].
     distance: list[float] = field(default_factory=lambda: [0.01, 0.06])
+    # Range of the height of the fingers' centres, [low, high] [m].
     height: list[float] = field(default_factory=lambda: [0.02, 0.12])
-    friction: list[float] = field(default_factory=lambda: [0.4, 1.0])  # Of all pairs.
+    # Range of the cube's friction with fingers and platform, [low, high].
+    friction: list[float] = field(default_factory=lambda: [0.4, 1.0])
 
 
 @dataclass
 class PivotPlanner:
-    projection: Literal["plus", "qp"] = "plus"
+    projection: Literal["plus", "qp"] = "plus"  # Projection of C3: plus or qp.
     options: C3Options = field(
         default_factory=lambda: C3Options(N=10, rounds=3, polish=10)
     )
-    dt_sec: float = 0.05  # Between knots [s].
-    period_sec: float = 0.02  # Between plans [s].
-    # Whether each knot has its own LCS, about the last plan, or all that of the state.
+    dt_sec: float = 0.05  # Time between two knots of the plan [s].
+    period_sec: float = 0.02  # Period of planning and of learning [s].
+    # Whether each knot has its own LCS, about the last plan; false: all have that of
+    # the present state.
     lcs_along_plan: bool = False
-    force_max: float = 10.0  # Of each slide of a finger, on top of its weight [N].
-    rate: float = 1.0  # Of the desired angle [rad/s].
+    # Largest force of each slide of a finger, in addition to its weight [N].
+    force_max: float = 10.0
+    # Speed at which the desired angle turns to its goal while the fingers are near
+    # their places [rad/s].
+    rate: float = 1.0
 
 
 def _learner() -> ResidualLearnerConfig:
@@ -86,17 +92,20 @@ def _learner() -> ResidualLearnerConfig:
 
 @dataclass
 class CubePivotingConfig:
-    seed: int = 0  # Of the start and the friction.
+    seed: int = 0  # Seed of the start and the friction.
     start: PivotStart = field(default_factory=PivotStart)
-    mass: float = 0.4  # Of the cube [kg].
-    size: float = 1.0  # Of the cube, over that in the scene.
-    # Friction, mass and size of the planner's model over those of the world.
+    mass: float = 0.4  # Mass of the cube in the world [kg].
+    size: float = 1.0  # Size of the cube in the world over that in the scene file.
+    # Friction in the planner's model over that in the world.
     friction_error: float = 1.0
+    # Mass of the cube in the planner's model over that in the world.
     mass_error: float = 1.0
+    # Size of the cube in the planner's model over that in the world.
     size_error: float = 1.0
     planner: PivotPlanner = field(default_factory=PivotPlanner)
-    adapt: bool = False  # Whether contact residuals are learned.
+    adapt: bool = False  # Whether the contacts' residuals are learned.
     learning: ResidualLearnerConfig = field(default_factory=_learner)
+    # Scene file of the simulated world; the planner's model is made from it too.
     world: str = SCENE
 
 

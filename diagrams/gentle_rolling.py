@@ -192,14 +192,21 @@ def _brisk_ball() -> BallRollingConfig:
 
 @dataclass
 class GentleRollingConfig:
-    gentle: bool = True  # False: without the second paper's systems.
-    adapt: bool = True  # False: without the residual learner.
-    frozen: list[str] = field(default_factory=list)  # Of SEVEN: held at their default.
+    # Whether the second paper's systems lead the tip to the ball; false: as in
+    # ball_rolling.
+    gentle: bool = True
+    adapt: bool = True  # Whether the residual learner runs.
+    # Systems that stay at their default outputs: any of lcs_builder, c3_mpc,
+    # residual_learner, mode_detector, contact_anticipator, velocity_shaper,
+    # impedance_controller.
+    frozen: list[str] = field(default_factory=list)
     ball: BallRollingConfig = field(default_factory=_brisk_ball)
     touch: TouchConfig = field(default_factory=TouchConfig)
     push: PushMotionConfig = field(default_factory=PushMotionConfig)
-    table: str = "plain"  # Or "felt_and_glass": see on_two_surfaces.
-    seed: int = 0
+    # Surface of the table: plain, or felt_and_glass: felt where y > 0.085 m, else glass
+    # (on_two_surfaces has the settings that it replaces).
+    table: str = "plain"
+    seed: int = 0  # Seed of the ball's start, a fruit's shape and the sensors' noise.
 
 
 # What `telemetry_log` holds: name -> (system, port, size).

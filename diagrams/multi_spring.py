@@ -60,11 +60,14 @@ class BaselinesConfig:
 class MultiSpringConfig:
     """Controllers left at their defaults get the values tuned for the setting."""
 
-    seed: int = 0  # Draws start, direction, springs and noise.
-    # springs, springs_lab or engaging (planar_tuned.SETTINGS).
+    seed: int = 0  # Seed of the start, the direction, the springs and the noise.
+    # World and sensors: springs, springs_lab or engaging (springs that let go).
+    # Controllers left at their defaults get the values tuned for it.
     setting: str = SPRINGS
-    trials: int = 30  # Of the biomimetic controller, which learns over trials.
-    # Half width of the uniform draw of each spring's stiffness and distance, relative.
+    # Number of trials of the biomimetic controller, which learns over trials.
+    trials: int = 30
+    # Half width of the uniform draw of each spring's stiffness and distance, as a
+    # fraction of the nominal value.
     spread: float = 0.2
     impedance: PlanarImpedanceConfig = field(
         default_factory=lambda: tuned_impedance(SPRINGS)[0]

@@ -85,27 +85,34 @@ APPROACH_SPEED_MAX = 0.03
 
 @dataclass
 class MultipleCollisionsConfig:
-    handling: bool = True  # False: no anticipation, no transition-phase controllers.
-    tool: str = "sphere"  # Or "block".
-    speed: float = 0.2  # Of the motion pattern [m/s].
-    error_max: float = 0.03  # Of the initial estimates, along each motion [m].
-    # Of each surface, drawn log-uniformly from this range [N/m].
+    # Whether contacts are anticipated and met by transition-phase controllers; false:
+    # the base controller alone, at full speed.
+    handling: bool = True
+    tool: str = "sphere"  # Tool on the arm: sphere or block.
+    speed: float = 0.2  # Speed of the motion where no contact is expected [m/s].
+    # Largest error of the initial estimate of each contact, along the motion [m].
+    error_max: float = 0.03
+    # Range from which each surface's contact stiffness is drawn, log-uniformly [N/m].
     stiffness: list[float] = field(default_factory=lambda: list(STIFFNESS_RANGE))
-    realism: str = "none"  # Errors of the station: "none", "lab" or "poor".
-    trials: int = 2  # Each starts with what the last one learned.
-    seed: int = 0
-    # Largest displacement of table, red block and blue wall in the world from where the
-    # scene has them [m], and their frictions.
+    # Errors of the station that the model lacks: none, lab or poor.
+    realism: str = "none"
+    trials: int = 2  # Number of trials, each with what the one before has learned.
+    seed: int = 0  # Seed of the world, the initial estimates and the noise.
+    # Largest displacement of table, red block and blue wall in the world from their
+    # places in the scene file [m]; at most 0.05.
     spread: float = SPREAD
-    friction: list[float] = field(default_factory=list)  # Empty: drawn by the seed.
+    # Coefficients of friction of table, red block and blue wall; empty: drawn by the
+    # seed.
+    friction: list[float] = field(default_factory=list)
     # Whether the sizes of the model's objects are used: the red block stands on the
     # table, so the contact with the table tells where the block's top is.
     known_heights: bool = True
     # File of a motion to follow in place of the shipped one: a pattern (.yaml) or a
-    # recorded demonstration (docs/shaping.md). `speed` has no meaning then.
+    # recorded demonstration (docs/shaping.md); speed has no meaning then.
     pattern: str = ""
-    model: str = ""  # Scene file of the controllers' model; "": the shipped one.
-    rehearse: int = 0  # Trials in the model before the first real one.
+    model: str = ""  # Scene file of the controllers' model; empty: the shipped one.
+    # Number of trials that are simulated in the model before the first real one.
+    rehearse: int = 0
     control: ChangingContactConfig = field(
         default_factory=lambda: ChangingContactConfig(
             anticipator=ContactAnticipatorConfig(

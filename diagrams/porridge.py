@@ -38,11 +38,14 @@ def _model() -> ForceModelConfig:
 
 @dataclass
 class PorridgeConfig:
-    seed: int = 0  # Draws start, direction, final viscosity of the test, and noise.
-    # Final viscosity in training and in the test [N s/m]; it rises from 0.
+    # Seed of the start, the direction, the final viscosity of the test and the noise.
+    seed: int = 0
+    # Final viscosity in training and in the test; it rises from 0 [N s/m].
     viscosity: list[float] = field(default_factory=lambda: [80.0, 150.0])
-    spread: float = 0.2  # Half width of the uniform draw of the second one, relative.
-    force_noise: float = 0.2  # Standard deviation, each axis [N].
+    # Half width of the uniform draw of the test's final viscosity, as a fraction of it.
+    spread: float = 0.2
+    # Standard deviation of the force sensor's noise along each axis [N].
+    force_noise: float = 0.2
     impedance: PlanarImpedanceConfig = field(default_factory=_impedance)
     model: ForceModelConfig = field(default_factory=_model)
     # Tuned on seeds 100 to 113 (scripts/tune_planar.py, docs/planar.md).

@@ -71,18 +71,18 @@ SET_BY_DIAGRAM = {
 class PushPlannerConfig:
     """Horizon and cost of C3+; forces in newtons."""
 
-    N: int = 5  # Knots, PLAN_DT apart.
-    rounds: int = 2
-    polish: int = 6
+    N: int = 5  # Number of knots of the plan, PLAN_DT = 0.1 s apart.
+    rounds: int = 2  # Number of ADMM rounds.
+    polish: int = 6  # Number of rollouts that improve the plan (docs/c3.md); 0: none.
     position: float = 5000.0  # Weight of the object's position on the table [1/m2].
-    # Weight of the object's orientation: an angle costs as much as this radius times
-    # the angle costs as a distance [m].
+    # Radius at which an angle of the object costs as much as its arc as a distance [m].
     angle_radius: float = 0.12
-    last: float = 5.0  # The last knot's weights over the others'.
-    tip_height: float = 1e4  # Weight [1/m2].
-    tip_speed: float = 10.0  # Weight [s2/m2].
-    # A rolling object continues after the end of the plan: its speed there is weighted
-    # as the distance that it rolls in this time [s].
+    # Weight of the object's pose at the last knot over that at the others.
+    last: float = 5.0
+    tip_height: float = 1e4  # Weight of the tip's height [1/m2].
+    tip_speed: float = 10.0  # Weight of the tip's velocity [s2/m2].
+    # Time for which a rolling object rolls on after the plan's end: its speed there
+    # costs as much as the distance in this time [s].
     coast_sec: float = 1.0
 
 
@@ -97,12 +97,17 @@ class PushLearnerConfig:
     push begins: the tip then seems to be up to 5 mm inside the object, 0.08 m/s.
     """
 
-    weight: float = 4e3  # Of each velocity, with past poses [s2/m2].
-    weight_late: float = 150.0  # The same with present poses.
+    # Q_d of v_x and v_y of object and tip, with past poses [s2/m2].
+    weight: float = 4e3
+    # Q_d of the same velocities, with present poses (pose_from=camera) [s2/m2].
+    weight_late: float = 150.0
+    # Weight eps of the dynamics against the contact equation [m/s N].
     eps: float = 1e-3
-    gamma: float = 5e-4
-    r_max: float = 0.3  # Bound of the residual [m/s]; 15 mm over LEARN.
-    slip_noise: float = 0.03  # [m/s]
+    gamma: float = 5e-4  # Softness gamma of the contact equation [m/s per N].
+    r_max: float = 0.3  # Bound of the residual [m/s]; 0.3 is a gap of 15 mm.
+    # Noise of the measured gap speed mu |v_t| of a sliding contact; what exceeds it is
+    # not taken for a gap [m/s].
+    slip_noise: float = 0.03
     posterior: PosteriorConfig = field(
         default_factory=lambda: PosteriorConfig(
             free_states=[V_BALL.start, V_BALL.start + 1]
@@ -114,33 +119,38 @@ class PushLearnerConfig:
 class PushModelConfig:
     """In what the controllers' model differs from the world."""
 
-    # Scene file of arm and table; None: the world's without its effects, which stand
-    # for what no model knows.
+    # Scene file of the model's arm and table; null: the world's without its effects,
+    # which stand for what no model knows.
     scene: str | None = None
-    # Of the object with tip and table; None: the world's.
+    # Coefficient of friction of the object with tip and table in the model; null: the
+    # world's.
     friction: float | None = None
-    scale: float = 1.0  # The object's size over the world's.
-    mass: float = 1.0  # The object's mass over the world's.
-    com_offset: list[float] = field(default_factory=lambda: [0.0, 0.0])  # Added [m].
+    scale: float = 1.0  # Size of the object in the model over that in the world.
+    mass: float = 1.0  # Mass of the object in the model over that in the world.
+    # Error in x and y of the centre of mass in the model, added to the world's [m].
+    com_offset: list[float] = field(default_factory=lambda: [0.0, 0.0])
 
 
 @dataclass
 class PushObjectConfig:
     """World and model start from the same object; `model` holds the model's errors."""
 
+    # Whether the residual of the contact of tip and object is learned.
     adapt: bool = True
     object: PushedObject = field(default_factory=PushedObject)
-    friction: float = 0.5  # Of the object with tip and table, in the world.
-    # Of a rolling cylinder, lever arm over radius, in the world; no model knows it.
-    # None: 0.005 for a cylinder, as of the ball of ball_rolling.
+    # Coefficient of friction of the object with tip and table in the world.
+    friction: float = 0.5
+    # Rolling resistance of a cylinder in the world, as lever arm over radius, which no
+    # model knows; null: 0.005, as of the ball of ball_rolling.
     rolling_resistance: float | None = None
     model: PushModelConfig = field(default_factory=PushModelConfig)
-    scene: str = PUSH_OBJECT  # The world's.
-    seed: int = 0
-    n_goals: int = 1  # Goals in a row, drawn by the seed.
-    start: list[float] = field(default_factory=list)  # x, y, yaw; empty: drawn.
+    scene: str = PUSH_OBJECT  # Scene file of the simulated world.
+    seed: int = 0  # Seed of the initial pose, the goals and the sensors' noise.
+    n_goals: int = 1  # Number of goals in a row, drawn by the seed.
+    # Initial pose of the object, [x, y, yaw] [m], [rad]; empty: drawn by the seed.
+    start: list[float] = field(default_factory=list)
     goals: PushGoalsConfig = field(default_factory=PushGoalsConfig)
-    # What measures the object: a pose sensor, such as motion capture, or the camera.
+    # What measures the object's pose: sensor (such as motion capture) or camera.
     pose_from: Literal["sensor", "camera"] = "sensor"
     pose: PoseSensorConfig = field(default_factory=PoseSensorConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
@@ -151,7 +161,8 @@ class PushObjectConfig:
     task: PushTaskConfig = field(default_factory=PushTaskConfig)
     planner: PushPlannerConfig = field(default_factory=PushPlannerConfig)
     learning: PushLearnerConfig = field(default_factory=PushLearnerConfig)
-    # Whether the speed before a touch is learned and reduced where a touch is expected.
+    # Whether the speed before a touch is learned, and reduced where a touch is
+    # expected.
     gentle: bool = False
     touch: TouchDownConfig = field(default_factory=TouchDownConfig)
     reference: ArmReferenceConfig = field(

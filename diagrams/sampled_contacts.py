@@ -53,18 +53,21 @@ CORNERS = 24  # Of the polygon inscribed in the ball's outline; error below 0.3 
 class SampledPlannerConfig:
     """Weights of C3+, with forces in newtons."""
 
-    N: int = 5  # Knots of 0.1 s.
-    rounds: int = 2
-    polish: int = 6
+    N: int = 5  # Number of knots of the plan, 0.1 s apart.
+    rounds: int = 2  # Number of ADMM rounds.
+    polish: int = 6  # Number of rollouts that improve the plan (docs/c3.md); 0: none.
     position: float = 5000.0  # Q of the ball's x and y [1/m2].
-    velocity: float = 100.0  # Q of the ball's velocity, and of w R [s2/m2].
-    # Q of the tip's x and y [1/m2]. Its reference is beside the ball, on the side from
+    # Q of the ball's velocity v, and of w R with its angular velocity w [s2/m2].
+    velocity: float = 100.0
+    # Q of the tip's x and y [1/m2]. Its target is beside the ball, on the side from
     # which it is pushed next: without contact nothing else places the tip.
     tip: float = 3000.0
     tip_height: float = 1e4  # Q of the tip's z [1/m2].
     tip_speed: float = 10.0  # Q of the tip's velocity [s2/m2].
-    force: float = 5.0  # G of lam of tip and ball; that of eta is 1/10 of it.
-    friction: float = 0.5  # Of both contacts, for planning and learning.
+    # Consensus weight G of lam of tip and ball; that of eta is 1/10 of it.
+    force: float = 5.0
+    # Coefficient of friction of both contacts in the model, for planning and learning.
+    friction: float = 0.5
 
 
 @dataclass
@@ -90,17 +93,18 @@ class SampledContactsConfig:
             believed_sec=0.5, follow=True, place_change=0.0, around=True
         )
     )
-    # The learner's Q_d on v_x, v_y of the ball: a standard deviation of 7 mm/s. Only
-    # the ball's motion is informative, as the arm hardly feels a ball beside the tip.
+    # Q_d of the ball's v_x and v_y [s2/m2]; 2e4: a standard deviation of 7 mm/s. The
+    # tip has none, as the arm hardly feels a ball beside it.
     learning_weight: float = 2e4
-    # Replaces learning.eps: pushing from the side takes far less force than from above,
-    # so a force over a gap has to cost more.
+    # Weight eps of the learner, in place of learning.eps [m/s N]: pushing from the side
+    # takes far less force than from above, so a force over a gap has to cost more.
     learning_eps: float = 1e-4
-    # Replaces posterior.drift of the learner [m/s / sqrt(s)]: at constant height the
-    # contact normal's slope is constant, and so is the gap residual.
+    # Drift of the learner's posterior, in place of posterior.drift [m/s / sqrt(s)]: at
+    # constant height the contact normal's slope is constant, and so is the gap
+    # residual.
     learning_drift: float = 0.005
-    # The delay of the camera makes the learned gap 1.5 to 3 mm too large, so that the
-    # tip would strike the ball: this is subtracted from it [m].
+    # Length that is subtracted from the learned gap [m]: the camera's delay makes it
+    # 1.5 to 3 mm too large, and the tip would strike the ball.
     gap_allowance: float = 0.003
     reference: ArmReferenceConfig = field(
         default_factory=lambda: ArmReferenceConfig(force_max=8.0, acceleration_max=3.0)

@@ -68,8 +68,12 @@ SPHERE_CROSSING = 0.01
 class Anticipation:
     """What a trial uses of the last one's knowledge about changes without impact."""
 
-    places: bool = True  # Their places, where the stiffness is set to K_max.
-    models: bool = True  # The mode behind them, whose forward model is used at once.
+    # Whether a change of surface is expected where it was in the last trial, and met
+    # with the stiffness K_max.
+    places: bool = True
+    # Whether the mode behind an expected change is known from the last trial: its
+    # forward model is used at once.
+    models: bool = True
 
 
 def _control() -> ChangingContactConfig:
@@ -86,16 +90,20 @@ def _control() -> ChangingContactConfig:
 
 @dataclass
 class SurfaceSwitchConfig:
+    # Seed of the frictions, the initial estimates, the station's errors and the noise.
     seed: int = 0
-    tool: str = "block"  # Or "sphere".
-    trials: int = 3
-    speed: float = 0.1  # Of sliding [m/s].
-    normal_force: float = 8.0  # On each surface that has been reached [N].
-    realism: str = "none"  # Errors of the station: "none", "lab" or "poor".
-    # Of surface 1, of surface 2, and of wall and stop; empty: drawn by the seed.
+    tool: str = "block"  # Tool on the arm: block or sphere.
+    trials: int = 3  # Number of trials, each with what the one before has learned.
+    speed: float = 0.1  # Speed of sliding over the surfaces [m/s].
+    normal_force: float = 8.0  # Normal force on each surface that has been reached [N].
+    # Errors of the station that the model lacks: none, lab or poor.
+    realism: str = "none"
+    # Coefficients of friction of surface 1, of surface 2, and of wall and stop; empty:
+    # drawn by the seed.
     friction: list[float] = field(default_factory=list)
-    model: str = ""  # Scene file of the controllers' model; "": the shipped one.
-    rehearse: int = 0  # Trials in the model before the first real one.
+    model: str = ""  # Scene file of the controllers' model; empty: the shipped one.
+    # Number of trials that are simulated in the model before the first real one.
+    rehearse: int = 0
     anticipation: Anticipation = field(default_factory=Anticipation)
     control: ChangingContactConfig = field(default_factory=_control)
 

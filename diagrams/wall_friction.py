@@ -91,10 +91,13 @@ OFFSET, IMPEDANCE_OFFSET = 1e-4, 7e-4
 class WallTraining:
     """Training data of the baseline, and how much of it is used."""
 
-    trials: int = 14  # In each of the three training sets.
-    tested: int = 1  # Trials that are tested, with seeds from the config's on.
-    joints: bool = True  # False: no predictions of the joints (figures 11 and 12).
-    every: int = 10  # Samples of 5 ms between two steps of a long-term prediction.
+    trials: int = 14  # Number of trials in each of the three training sets.
+    tested: int = 1  # Number of tested trials, each with a seed of its own.
+    # Whether the joints are predicted too (figures 11 and 12), which takes most of the
+    # time.
+    joints: bool = True
+    # Number of samples (5 ms each) from one step of a long-term prediction to the next.
+    every: int = 10
     long_term: TrainingBudget = field(
         default_factory=lambda: TrainingBudget(
             points_per_mode=120, segment_min=2, predict_change=False
@@ -108,14 +111,18 @@ class WallTraining:
 
 @dataclass
 class WallFrictionConfig:
-    friction: float = 0.9  # Of the wall.
-    stiffness: float = 300.0  # Of the controller [N/m].
-    stiffness_high: float = 2000.0  # Of figure 12 [N/m].
-    normal_force: float = 8.0  # On the table and on the wall [N].
-    start_spread: float = 0.003  # Standard deviation of the path's corners [m].
+    friction: float = 0.9  # Coefficient of friction of the wall in the tested trials.
+    # Stiffness of the impedance controller along each axis [N/m].
+    stiffness: float = 300.0
+    # Stiffness of the stiff controller of figure 12 along each axis [N/m].
+    stiffness_high: float = 2000.0
+    normal_force: float = 8.0  # Normal force on the table and on the wall [N].
+    # Standard deviation of the random displacement of the path's corners [m].
+    start_spread: float = 0.003
     training: WallTraining = field(default_factory=WallTraining)
-    seed: int = 0
-    faults: list[str] = field(default_factory=list)  # Injected by --fault.
+    seed: int = 0  # Seed of the paths and the sensors' noise.
+    # Faults to inject, each NAME[:from=S,for=S] as of --fault.
+    faults: list[str] = field(default_factory=list)
 
 
 def motion(config: WallFrictionConfig, p_start) -> dict[str, np.ndarray]:
