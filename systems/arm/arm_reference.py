@@ -22,36 +22,43 @@ from makebreak.systems.numerics.timing import timed
 
 @dataclass
 class ArmReferenceConfig:
-    tip_mass: float = 1.0  # Of the tip in the LCS [kg].
-    force_max: float = 3.0  # Bound of the feed-forward force [N].
-    acceleration_max: float = 1.5  # Of the velocity reference while rolling [m/s2].
-    # Bound of the downward speed while rolling: contact may come early [m/s].
+    # Mass of the tip in the LCS, by which lam is turned into a force [kg].
+    tip_mass: float = 1.0
+    force_max: float = 3.0  # Largest feed-forward force [N].
+    # Largest acceleration of the velocity reference while the tip follows C3 [m/s2].
+    acceleration_max: float = 1.5
+    # Largest downward speed while the tip follows C3: contact may come early [m/s].
     down_max: float = 0.04
-    # While the tip has to feel for the ball and the force is below follow_force [N], it
-    # moves down faster by follow_speed [m/s], and along with the ball.
+    # Speed that is added downwards where the tip has to feel for the ball and feels
+    # less than follow_force; it then also moves along with the ball [m/s].
     follow_speed: float = 0.015
+    # Force from which on a tip that feels for the ball has found it [N].
     follow_force: float = 1.0
-    # While rolling, bound of the speed until the force reaches touch_force [N]: the tip
-    # may touch earlier than planned, and the impact grows with the speed [m/s].
+    # Largest speed while the tip follows C3 and feels less than touch_force: it may
+    # touch earlier than planned, and the impact grows with the speed [m/s].
     touch_speed: float = np.inf
-    touch_force: float = 1.0
-    # While rolling, bound of the speed in contact too: a tip that slides along a side
-    # would hit the next corner at the speed that it has reached by then [m/s].
+    touch_force: float = 1.0  # Force from which on the tip counts as in contact [N].
+    # Largest speed while the tip follows C3, in contact too: a tip that slides along a
+    # side would hit the next corner at the speed that it has reached by then [m/s].
     push_speed: float = np.inf
-    # Bound of the reference's speed, however far away a command is [m/s]. The task
+    # Largest speed of the reference, however far away a command is [m/s]. The task
     # itself stays below 0.35 m/s and 4 m/s2.
     speed_max: float = 0.5
-    acceleration_fed_forward_max: float = 10.0  # While repositioning [m/s2].
-    # While rolling, the tip stays at this height and follows C3 only horizontally [m];
-    # None: C3 moves it up and down too.
+    # Largest acceleration that is fed forward between two contacts [m/s2].
+    acceleration_fed_forward_max: float = 10.0
+    # Height at which the tip stays while it follows C3 horizontally [m]; null: C3 moves
+    # it up and down too.
     height: float | None = None
-    # While rolling, least horizontal distance of the wrist from the world's origin, the
-    # arm's base: C3 does not know the arm and would fold up its elbow [m].
+    # Least horizontal distance of the wrist from the world's origin, the arm's base,
+    # while the tip follows C3, which does not know the arm and would fold its elbow
+    # [m].
     nearest: float = 0.0
-    # From the wrist to the tip, seen from above [m].
+    # Vector from the wrist to the tip, seen from above, [x, y] [m].
     wrist: list[float] = field(default_factory=lambda: [0.0, 0.0])
-    period_sec: float = 0.0125  # Of C3 and of the task.
-    offset_sec: float = 0.0  # A little after theirs.
+    # Period of the updates, that of C3 and of the task [s]; the diagram sets it.
+    period_sec: float = 0.0125
+    # Time of the first update, a little after C3 and the task [s]; the diagram sets it.
+    offset_sec: float = 0.0
 
 
 class ArmReference(LeafSystem):

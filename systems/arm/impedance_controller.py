@@ -28,34 +28,42 @@ DELAY_DAMPING_MAX = 0.5
 
 @dataclass
 class ImpedanceConfig:
-    stiffness: list[float] = field(  # [N/m] x 3, [N m/rad] x 3
-        default_factory=lambda: [1000.0] * 3 + [50.0] * 3
-    )
-    damping: list[float] = field(  # [N s/m] x 3, [N m s/rad] x 3
-        default_factory=lambda: [400.0] * 3 + [15.0] * 3
-    )
-    control_orientation: bool = False  # False: position only, kept upright by posture.
-    force_max: float = math.inf  # Bound of spring and damper force together [N].
-    posture_stiffness: float = 100.0  # [1/s2]
-    posture_damping: float = 20.0  # [1/s]
-    period_sec: float = 0.001
-    offset_sec: float = 0.0
+    # Stiffness along x, y, z [N/m] and about x, y, z [N m/rad]; not used where a
+    # variable impedance is connected.
+    stiffness: list[float] = field(default_factory=lambda: [1000.0] * 3 + [50.0] * 3)
+    # Damping along x, y, z [N s/m] and about x, y, z [N m s/rad]; not used with a
+    # damping ratio, or where another system gives the damping.
+    damping: list[float] = field(default_factory=lambda: [400.0] * 3 + [15.0] * 3)
+    # Whether the tool's orientation is controlled too; false: position only, and the
+    # posture keeps the tool upright.
+    control_orientation: bool = False
+    force_max: float = math.inf  # Largest force of spring and damper together [N].
+    # Stiffness of the posture, in the null space, per unit of inertia [1/s2].
+    posture_stiffness: float = 100.0
+    # Damping of the posture, in the null space, per unit of inertia [1/s].
+    posture_damping: float = 20.0
+    period_sec: float = 0.001  # Period of the updates [s]; the diagram sets it.
+    offset_sec: float = 0.0  # Time of the first update [s]; the diagram sets it.
 
 
 @dataclass
 class HybridConfig:
     """Force control, and damping that follows the stiffness."""
 
-    # Above 0: the damping is 2 damping_ratio sqrt(K lambda_i) instead of the config's,
-    # with lambda_i the tip's mass along each axis. A connected port `damping` has
-    # priority.
+    # Damping ratio: D = 2 damping_ratio sqrt(K lambda_i), with lambda_i the tip's mass
+    # along each axis; 0: the damping of ImpedanceConfig. A connected port `damping`
+    # replaces both.
     damping_ratio: float = 0.0
-    integral_gain: float = 0.5  # k_i [1/s]
-    integral_max: float = 8.0  # [N]
-    normal_damping: float = 200.0  # Lower bound of D_n [N s/m].
-    closing_speed: float = 0.012  # D_n is at least F_c over this speed [m/s].
-    ramp_sec: float = 0.1  # Time from zero force to its target.
-    release_sec: float = 0.12  # Time in which a direction that is dropped fades out.
+    integral_gain: float = 0.5  # Gain k_i of the integral of the force error [1/s].
+    integral_max: float = 8.0  # Largest force of the integral [N].
+    # Least damping D_n along a direction of force control [N s/m].
+    normal_damping: float = 200.0
+    # Largest speed at which force control closes a gap: D_n is at least F_c over it
+    # [m/s].
+    closing_speed: float = 0.012
+    ramp_sec: float = 0.1  # Time in which the force rises to its target [s].
+    # Time in which a direction of force control that is dropped fades out [s].
+    release_sec: float = 0.12
 
 
 class ImpedanceController(LeafSystem):

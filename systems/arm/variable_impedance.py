@@ -24,31 +24,42 @@ HANDOVER_FILTER_SEC = 0.005
 class StiffnessConfig:
     """Along each axis [N/m]; free = maximum = impact gives a constant stiffness."""
 
-    free: float = 200.0  # K_free: the forward model predicts well.
-    maximum: float = 1000.0  # K_max: it does not, or the mode is being identified.
-    impact: float = 150.0  # K_impact: an impact is expected.
-    rotational: float = 40.0  # Constant [N m/rad].
-    paper_damping: bool = False  # D = sqrt(K)/4: see docs/impedance.md.
+    # K_free: stiffness where the forward model predicts well [N/m].
+    free: float = 200.0
+    # K_max: stiffness where the forward model predicts badly, or the mode is being
+    # identified [N/m].
+    maximum: float = 1000.0
+    impact: float = 150.0  # K_impact: stiffness where an impact is expected [N/m].
+    rotational: float = 40.0  # Stiffness about each axis, which is constant [N m/rad].
+    # Whether the damping is the paper's, D = sqrt(K)/4 (docs/impedance.md); without
+    # effect in gentle_rolling, whose blend sets the damping.
+    paper_damping: bool = False
 
 
 @dataclass
 class TrustConfig:
     """Trust in the forward model as a function of its error (CC eq. 4c)."""
 
-    steepness: float = 8.0  # r [1/N]
-    midpoint: float = 0.8  # eps_0 [N]
-    filter_sec: float = 0.02  # Time constant for stiffness and feed-forward; 0: none.
+    # Steepness r of the trust in the forward model over its error (CC eq. 4c) [1/N].
+    steepness: float = 8.0
+    # Error eps_0 of the forward model at which the trust is 1/2 (CC eq. 4c) [N].
+    midpoint: float = 0.8
+    # Time constant of the filter of stiffness and feed-forward [s]; 0: none.
+    filter_sec: float = 0.02
 
 
 @dataclass
 class VariableImpedanceConfig:
     stiffness: StiffnessConfig = field(default_factory=StiffnessConfig)
     trust: TrustConfig = field(default_factory=TrustConfig)
-    blend_sec: float = 0.1  # T of CC eq. 10.
+    # Time T of the blend between base and transition-phase controller (CC eq. 10) [s].
+    blend_sec: float = 0.1
     feedforward: bool = True  # Whether the predicted wrench is fed forward.
-    transition: bool = True  # False: the base controller alone, also at contacts.
-    period_sec: float = 0.001
-    offset_sec: float = 0.0
+    # Whether expected changes of contact have a controller of their own; false: the
+    # base controller alone.
+    transition: bool = True
+    period_sec: float = 0.001  # Period of the updates [s]; the diagram sets it.
+    offset_sec: float = 0.0  # Time of the first update [s]; the diagram sets it.
 
 
 class VariableImpedance(LeafSystem):

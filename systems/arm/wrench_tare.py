@@ -22,13 +22,19 @@ from makebreak.systems.numerics.timing import timed
 
 @dataclass
 class WrenchTareConfig:
-    bias_max: float = 3.0  # A larger force at first is a contact [N]. 0: no taring.
-    drift_max: float = 0.05  # Of a sensor [N/s].
-    drift_moment_max: float = 0.005  # [N m/s]
-    wrench_limit: float = 200.0  # At which the sensor saturates [N], [N m].
-    sideways: bool = True  # Drift and slope from the force across a sliding motion.
-    period_sec: float = 0.001
-    offset_sec: float = 0.0
+    # Largest force that is taken for the sensor's bias; a larger one before the first
+    # tare is a contact [N]; 0: no taring.
+    bias_max: float = 3.0
+    drift_max: float = 0.05  # Largest drift of a force component of the sensor [N/s].
+    # Largest drift of a moment component of the sensor [N m/s].
+    drift_moment_max: float = 0.005
+    # Force or moment at which the sensor saturates [N], [N m].
+    wrench_limit: float = 200.0
+    # Whether the sensor's drift and the surface's slope are estimated while the tool
+    # slides, from the force across its motion.
+    sideways: bool = True
+    period_sec: float = 0.001  # Period of the updates [s]; the diagram sets it.
+    offset_sec: float = 0.0  # Time of the first update [s]; the diagram sets it.
 
 
 class WrenchTare(LeafSystem):
