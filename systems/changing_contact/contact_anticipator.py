@@ -67,38 +67,59 @@ FORGET_STD = 0.02  # A learned contact that is not felt is given up at this sigm
 class ContactFilterConfig:
     """Standard deviations of the Kalman filter."""
 
-    std_along: float = 0.0007  # Of a felt contact, along the motion [m].
-    std_across: float = 0.005  # And across: how well the motion repeats itself [m].
-    std_change: float = 0.002  # Of an impact-less change, along the motion [m].
-    std_drift: float = 0.0003  # Of a contact from trial to trial [m].
-    gate: float = 3.0  # Standard deviations of the innovation.
+    # Standard deviation of a felt contact's place along the motion [m].
+    std_along: float = 0.0007
+    # Standard deviation of a felt contact's place across the motion: how well the
+    # motion repeats itself [m].
+    std_across: float = 0.005
+    # Standard deviation along the motion of the place of a change without impact [m].
+    std_change: float = 0.002
+    # Standard deviation of a contact's drift from one trial to the next [m].
+    std_drift: float = 0.0003
+    # Largest innovation along the motion for which what is felt is an expected contact
+    # [standard deviations].
+    gate: float = 3.0
 
 
 @dataclass
 class ApproachSpeedConfig:
-    force_desired: float = 8.0  # F_d of an impact, along the motion [N].
-    first: float = 0.05  # v_a of a contact that has not been felt [m/s].
-    # Or, if not 0, the v_a at which the stiffest contact that there may be [N/m] gives
-    # force_first [N]; the arm's mass is the constructor's `effective_mass`.
+    # Desired peak force F_d of an impact, along the motion [N].
+    force_desired: float = 8.0
+    # Approach speed v_a of a contact that has not been felt, if stiffness_most is 0
+    # [m/s].
+    first: float = 0.05
+    # Stiffness of the stiffest contact that there may be [N/m]: the first approach
+    # speed is that at which it gives force_first, with the arm's effective mass; 0:
+    # `first` is used.
     stiffness_most: float = 0.0
+    # Peak force of the first impact on a contact of stiffness_most [N].
     force_first: float = 8.0
-    # Of the arm's impact reflex, if it has one: its gain and least force [N].
+    # Gain of the arm's impact reflex, on which the force of an impact depends; 0: no
+    # reflex. Taken from reflex.gain where there is that setting.
     reflex_gain: float = 0.0
+    # Least force of the arm's impact reflex [N]. Taken from reflex.force_least where
+    # there is that setting.
     reflex_force_least: float = 0.0
-    regression: bool = True  # F = s v from all impacts; False: eq. 9.
-    beta: float = 0.002  # Of eq. 9 [m/s per N].
-    growth: float = 1.4  # At most so many times faster than the trial before.
-    most: float = 0.2  # [m/s]
-    carry_over: bool = False  # The first stiffness felt is assumed of all the others.
+    # Whether the next approach speed follows from a regression F = s v over all
+    # impacts; false: from eq. 9.
+    regression: bool = True
+    beta: float = 0.002  # Gain beta of eq. 9, used without regression [m/s per N].
+    # Largest factor of the approach speed from one trial to the next.
+    growth: float = 1.4
+    most: float = 0.2  # Largest approach speed [m/s].
+    # Whether the first stiffness that is felt is assumed of all contacts that have not
+    # been felt.
+    carry_over: bool = False
 
 
 @dataclass
 class ContactAnticipatorConfig:
     filter: ContactFilterConfig = field(default_factory=ContactFilterConfig)
     speed: ApproachSpeedConfig = field(default_factory=ApproachSpeedConfig)
-    hint_lead_sec: float = 0.0  # So long before its place a mode is hinted [s].
-    period_sec: float = 0.01
-    offset_sec: float = 0.0
+    # Time before its expected place at which a mode is announced [s].
+    hint_lead_sec: float = 0.0
+    period_sec: float = 0.01  # Period of the updates [s]; the diagram sets it.
+    offset_sec: float = 0.0  # Time of the first update [s]; the diagram sets it.
 
 
 @dataclass(frozen=True, eq=False)

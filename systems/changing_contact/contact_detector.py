@@ -19,13 +19,18 @@ from makebreak.systems.numerics.timing import timed
 
 @dataclass
 class ContactDetectorConfig:
-    impact_force: float = 2.0  # What is beyond friction and may be an impact [N].
-    loss_force: float = 1.0  # A normal force below it is no contact [N].
-    stiffness_min: float = 1000.0  # Of a contact made while sliding [N/m].
-    tool_mass: float = 0.3  # Between sensor and tip: its inertia is taken off [kg].
-    wrench_limit: float = 200.0  # At which the sensor saturates [N], [N m].
-    period_sec: float = 0.001
-    offset_sec: float = 0.0
+    # Force beyond the expected friction that may be an impact [N].
+    impact_force: float = 2.0
+    loss_force: float = 1.0  # Normal force below which there is no contact [N].
+    # Least stiffness of a contact that is made while sliding; less is a change of
+    # friction [N/m].
+    stiffness_min: float = 1000.0
+    # Mass between force sensor and tip, whose inertia is subtracted [kg].
+    tool_mass: float = 0.3
+    # Force or moment at which the sensor saturates [N], [N m].
+    wrench_limit: float = 200.0
+    period_sec: float = 0.001  # Period of the updates [s]; the diagram sets it.
+    offset_sec: float = 0.0  # Time of the first update [s]; the diagram sets it.
 
 
 class ContactDetector(LeafSystem):

@@ -33,29 +33,39 @@ LEAD_SEC = 0.008
 class HandoverConfig:
     """How the model of a mode that was announced takes over."""
 
-    duration_sec: float = 0.05  # 0: by its one-step prediction, as any other.
-    # From the first row of the tool's feet to the second, along the motion; 0: it
-    # touches with one point [m].
+    # Time for which an announced mode's model predicts without the last force, which is
+    # still the old mode's [s]; 0: it predicts as any other.
+    duration_sec: float = 0.05
+    # Distance along the motion of the two rows of feet on which the tool stands [m]; 0:
+    # it touches with one point. In surface_switch the tool sets it.
     rows: float = 0.0
-    # A motion that begins from rest gets the friction of its mode from the commanded
-    # speed and the normal force, and a mode that is not known yet the last force; a
-    # mode that was announced, too, has the friction of the normal force of now.
+    # Whether the friction of a motion from rest is predicted from its commanded speed,
+    # the normal force and the mode (in an unknown mode: as the last force); an
+    # announced mode then has the friction of the present normal force.
     from_rest: bool = False
 
 
 @dataclass
 class ForwardModelConfig:
-    with_torque: bool = True  # False: models over |v| and |F_t| alone.
-    learns: bool = True  # False: the models stay as given, the fixed GMM.
-    # False: one model, learned in all modes of contact; what modes are worth (CC 3.2).
+    # Whether the models have |w| and |tau| too; false: |v| and |F_t| alone.
+    with_torque: bool = True
+    # Whether the models learn; false: they stay as they are given, the fixed GMM.
+    learns: bool = True
+    # Whether each mode has its own model; false: one model for all, which shows what
+    # modes are worth (CC 3.2).
     per_mode: bool = True
-    smoothing: float = 0.3  # Of the error, per sample; 1: none.
-    # Of what a model has been off by of late, which is added to what it predicts, per
-    # sample; 0: nothing is added.
+    # Weight of the newest sample in the low-passed prediction error; 1: no filter.
+    smoothing: float = 0.3
+    # Weight of the newest sample in the mean of a model's recent errors, which is added
+    # to its prediction; 0: nothing is added.
     correction: float = 0.05
-    tau_nov: float = 1e-3  # Of the mixtures: how unlikely a new component's sample is.
-    wrench_limit: float = 200.0  # At which the sensor saturates [N], [N m].
-    error_unknown: float = 10.0  # Said where the wrench cannot be used [N].
+    # Likelihood, relative to a component's peak, below which a sample makes a new
+    # component of the mixture.
+    tau_nov: float = 1e-3
+    # Force or moment at which the sensor saturates [N], [N m].
+    wrench_limit: float = 200.0
+    # Prediction error that is reported where the wrench cannot be used [N].
+    error_unknown: float = 10.0
     handover: HandoverConfig = field(default_factory=HandoverConfig)
 
 

@@ -18,12 +18,15 @@ from makebreak.systems.numerics.timing import timed
 
 @dataclass
 class ImpactReflexConfig:
-    gain: float = 0.0  # Newtons of braking per newton felt; 0: no reflex.
-    force_least: float = 0.5  # Less is noise [N].
-    force_max: float = 10.0  # Of what is felt; more does not brake more [N].
-    fade_sec: float = 0.1  # After the impact.
-    period_sec: float = 0.001
-    offset_sec: float = 0.0
+    # Braking force over the force that is felt beyond force_least; 0: no reflex.
+    gain: float = 0.0
+    # Force beyond friction below which what is felt is noise [N].
+    force_least: float = 0.5
+    # Largest force beyond force_least that counts; more does not brake more [N].
+    force_max: float = 10.0
+    fade_sec: float = 0.1  # Time in which the reflex fades out after the impact [s].
+    period_sec: float = 0.001  # Period of the updates [s]; the diagram sets it.
+    offset_sec: float = 0.0  # Time of the first update [s]; the diagram sets it.
 
 
 class ImpactReflex(LeafSystem):

@@ -26,15 +26,21 @@ from makebreak.systems.numerics.timing import timed
 class ModeDetectorConfig:
     """The feature is |F_t|/R, with a torque_arm [|F_t|/R, |tau|/(R torque_arm)]."""
 
-    threshold: float = 0.04  # BIRCH's: modes are some 2.5 of it apart, or one mode.
-    # The way that the tool needs to cross a seam: its length along it. Nothing is
-    # decided before; 0 for a tool that touches with one point [m].
+    # Threshold of BIRCH in units of the feature: modes have to be some 2.5 of it apart,
+    # or they are one mode.
+    threshold: float = 0.04
+    # Length of the tool along the motion, which it needs to cross a seam: nothing is
+    # decided before [m]; 0: it touches with one point. For a sphere the diagram sets it.
     crossing: float = 0.03
-    force_noise: float = 0.1  # Standard deviation of a sample of the wrench [N].
-    normal_force_min: float = 1.0  # Less is no contact [N].
-    batch: int = 15  # Samples that make a new mode.
-    torque_arm: float = 0.0  # What a torque is divided by, with R; 0: none [m].
-    tool_mass: float = 0.3  # Between sensor and tip: its inertia is subtracted [kg].
+    # Standard deviation of the noise of a sample of the wrench [N].
+    force_noise: float = 0.1
+    normal_force_min: float = 1.0  # Normal force below which there is no contact [N].
+    batch: int = 15  # Number of samples from which a new mode is made.
+    # Length by which a torque is divided, beside R, to be part of the feature [m]; 0:
+    # no torque in it.
+    torque_arm: float = 0.0
+    # Mass between force sensor and tip, whose inertia is subtracted [kg].
+    tool_mass: float = 0.3
 
 
 class ModeDetector(LeafSystem):

@@ -37,11 +37,17 @@ NEAR = 0.005  # Farther apart tip and ball, as modelled, do not touch [m].
 @dataclass
 class PushMotionConfig:
     shape: PushConfig = field(default_factory=PushConfig)
-    table_first: int = 3  # From which reposition on the table is touched, ...
-    table_every: int = 25  # ... and how many later again; 0: it is not.
-    settle_sec: float = 0.02  # Pressed so long, the push begins.
-    follow_sec: float = 0.15  # In which the frame follows a ball that turns.
-    give_up_sec: float = 4.0  # A motion that has not met anything by then is over.
+    # Number of the first reposition on which the table is touched.
+    table_first: int = 3
+    # Number of repositions from one touch of the table to the next; 0: it is never
+    # touched.
+    table_every: int = 25
+    # Time for which the tip presses on the ball before the push begins [s].
+    settle_sec: float = 0.02
+    # Time in which the motion's frame follows a ball that changes its course [s].
+    follow_sec: float = 0.15
+    # Time after which a motion that has met nothing is over [s].
+    give_up_sec: float = 4.0
 
 
 @dataclass(frozen=True, eq=False)

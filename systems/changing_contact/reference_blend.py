@@ -29,11 +29,13 @@ SPEED_MIN = 1e-3  # [m/s] A slower reference has no direction.
 
 @dataclass
 class ReferenceBlendConfig:
-    blend_sec: float = 0.1  # From one to the other.
-    damping: float = 400.0  # Of the arm [N s/m],
-    damping_impact: float = 120.0  # and where an impact is expected.
-    period_sec: float = 0.0125
-    offset_sec: float = 0.0
+    # Time of a blend between the planner's and the shaper's reference [s].
+    blend_sec: float = 0.1
+    damping: float = 400.0  # Damping of the arm's tip [N s/m].
+    # Damping of the arm's tip where an impact is expected [N s/m].
+    damping_impact: float = 120.0
+    period_sec: float = 0.0125  # Period of the updates [s]; the diagram sets it.
+    offset_sec: float = 0.0  # Time of the first update [s]; the diagram sets it.
 
 
 class ReferenceBlend(LeafSystem):

@@ -32,31 +32,44 @@ from makebreak.systems.numerics.timing import timed
 
 @dataclass
 class RegionConfig:
-    sigmas: float = 2.0  # The region begins so many standard deviations ahead ...
-    margin: float = 0.004  # ... and this [m] ...
-    settle_sec: float = 0.12  # ... and v_a times this.
-    blend_sec: float = 0.1  # Of the controllers, done at the region's entry (eq. 10).
-    anticipate: bool = True  # False: no regions; contacts are met at any speed.
+    # Half width of the region of an expected contact, in standard deviations of its
+    # place.
+    sigmas: float = 2.0
+    margin: float = 0.004  # Length that is added to the region at both ends [m].
+    # Time at the approach speed v_a by which the region of an impact begins earlier
+    # [s].
+    settle_sec: float = 0.12
+    # Time in which the base controller is blended into the transition-phase controller,
+    # before the region's entry (eq. 10) [s].
+    blend_sec: float = 0.1
+    # Whether there are regions of expected contact; false: contacts are met at any
+    # speed.
+    anticipate: bool = True
 
 
 @dataclass
 class SearchConfig:
-    speed: float = 0.05  # Where the pattern ends and no contact was expected [m/s].
-    distance: float = 0.1  # How far beyond its end a contact is searched for [m].
-    go_on_unexpected: bool = False  # After a contact where none should be.
+    # Speed of the search for a contact beyond the end of the path, where none was
+    # expected [m/s].
+    speed: float = 0.05
+    # Length beyond the end of the path over which a contact is searched for [m].
+    distance: float = 0.1
+    # Whether the motion goes on after a contact where none should be; false: it stops.
+    go_on_unexpected: bool = False
 
 
 @dataclass
 class VelocityShaperConfig:
-    acceleration_max: float = 0.9  # Along the path, of each change of speed [m/s2].
-    speed_min: float = 0.004  # A lower approach speed is raised to it [m/s].
-    # After a contact or its loss the pattern is shifted to where the tip is. In this
-    # time it fades back to where it was planned; inf: it stays shifted.
+    # Largest acceleration along the path in a change of speed [m/s2].
+    acceleration_max: float = 0.9
+    speed_min: float = 0.004  # Least approach speed; a lower one is raised to it [m/s].
+    # Time in which the pattern fades back to where it was planned, after a contact or
+    # its loss has shifted it to where the tip is [s]; inf: it stays shifted.
     release_sec: float = np.inf
     region: RegionConfig = field(default_factory=RegionConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
-    period_sec: float = 0.001
-    offset_sec: float = 0.0
+    period_sec: float = 0.001  # Period of the updates [s]; the diagram sets it.
+    offset_sec: float = 0.0  # Time of the first update [s]; the diagram sets it.
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,16 +43,20 @@ SIGMAS_MAX = 1e9
 class IgmmConfig:
     """Units are those of the samples. The defaults but for sigma_ini fit most uses."""
 
-    # (d,) standard deviations of a component of one sample.
+    # Standard deviations (d,) of a component made from one sample [as the samples].
     sigma_ini: list[float] = field(default_factory=list)
-    tau_nov: float = 1e-3  # A sample less likely than this, relative to a peak, is new.
-    v_min: float = 50.0  # Samples after which a component must have proved itself,
-    sp_min: float = 3.0  # by having got this many of them.
-    n_max: int = 20  # Components; one more takes the place of the least supported.
-    # Standard deviations (each given the entries before it) stay above this part of
+    # Likelihood, relative to a component's peak, below which a sample is novel and
+    # makes a component of its own.
+    tau_nov: float = 1e-3
+    # Age after which a component with less support than sp_min is removed [samples].
+    v_min: float = 50.0
+    sp_min: float = 3.0  # Support that a component needs at the age v_min [samples].
+    # Largest number of components; one more takes the place of the least supported.
+    n_max: int = 20
+    # Least standard deviation of each entry, given those before it, as a fraction of
     # sigma_ini: a constant stream does not make a component that nothing else fits.
     floor: float = 0.01
-    # A component forgets: it never counts for more samples than this.
+    # Largest support of a component, so that it forgets older samples [samples].
     sp_max: float = 1e6
 
 

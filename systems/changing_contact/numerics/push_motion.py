@@ -31,15 +31,20 @@ N_FRAME = 7  # Origin (3) [m], its velocity (3) [m/s], when it was there [s].
 class PushConfig:
     """The shape of the motions."""
 
-    reposition_sec: float = 0.4  # Of lift, over and land, if nothing slows it.
-    lift: float = 0.015  # Clearance over the ball as modelled [m].
-    land_behind: float = 0.018  # The ball's centre, along the way [m].
-    press: float = 1.0  # On the ball that was met, until the push begins [N],
-    press_table: float = 2.5  # and on the table [N].
-    land_ahead: float = 0.075  # On the table, before the ball's centre [m].
-    slide: float = 0.04  # On the table, sideways [m],
-    # into the circle that the ball is rolled along and so many times, to and fro, from
-    # rest each time; 0: once, away from the circle, and as soon as it is felt.
+    # Time to lift the tip, pass over the ball and land, if nothing slows it; a long way
+    # takes longer [s].
+    reposition_sec: float = 0.4
+    # Clearance over the modelled ball while the tip passes over it [m].
+    lift: float = 0.015
+    # Distance behind the ball's centre at which the tip lands, seen from above [m].
+    land_behind: float = 0.018
+    press: float = 1.0  # Force on the ball from the touch until the push begins [N].
+    press_table: float = 2.5  # Force on the table while the tip touches it [N].
+    # Distance ahead of the ball's centre at which the tip lands on the table [m].
+    land_ahead: float = 0.075
+    slide: float = 0.04  # Length of the sideways slide on the table [m].
+    # Number of slides to and fro on the table, into the circle, each from rest; 0: one
+    # slide out of the circle, as soon as the table is felt.
     survey: int = 0
 
 

@@ -34,23 +34,32 @@ GATE = 4.0
 
 @dataclass
 class TouchDownConfig:
-    force_desired: float = 8.0  # Peak of a touch, as the arm feels it [N].
-    first: float = 0.05  # Speed in the region before any touch was felt [m/s],
-    growth: float = (
-        1.4  # and after a touch at most so many times that of the one before,
-    )
-    least: float = 0.01  # but never less or more than these [m/s].
+    # Desired peak force of a touch, as the arm feels it [N].
+    force_desired: float = 8.0
+    # Speed in the region of anticipated contact before any touch was felt [m/s].
+    first: float = 0.05
+    # Largest factor of the speed in the region from one touch to the next.
+    growth: float = 1.4
+    least: float = 0.01  # Least speed in the region of anticipated contact [m/s].
+    # Largest speed of a tip that has not touched, in the region and before it [m/s].
     most: float = 0.15
-    touch_force: float = 1.0  # From here on a touch is felt [N].
-    peak_sec: float = 0.08  # The peak of an impact comes within so long a time [s].
-    apart_sec: float = 0.05  # Nothing felt for so long: the next touch is another one.
-    # The distance at which a touch is felt: before any [m], of one measurement, and by
-    # how much it changes from touch to touch.
+    touch_force: float = 1.0  # Force from which on a touch is felt [N].
+    # Time after the touch within which its peak force comes [s].
+    peak_sec: float = 0.08
+    # Time without a felt force after which the next touch counts as another one [s].
+    apart_sec: float = 0.05
+    # Standard deviation of the distance at which a touch is felt, before any touch [m].
     std_first: float = 0.004
+    # Standard deviation of one measurement of the distance at which a touch is felt
+    # [m].
     std_measured: float = 0.0015
+    # Standard deviation of the change from touch to touch of the distance at which a
+    # touch is felt [m].
     std_drift: float = 0.001
-    sigmas: float = 2.0  # Half width of the region.
-    brake: float = 0.01  # Before the region the speed falls over so long a way [m].
+    # Half width of the region of anticipated contact, in standard deviations.
+    sigmas: float = 2.0
+    # Length before the region over which the speed falls to that in the region [m].
+    brake: float = 0.01
 
 
 @dataclass(frozen=True)
