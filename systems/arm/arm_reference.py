@@ -27,12 +27,15 @@ class ArmReferenceConfig:
     force_max: float = 3.0  # Largest feed-forward force [N].
     # Largest acceleration of the velocity reference while the tip follows C3 [m/s2].
     acceleration_max: float = 1.5
-    # Largest downward speed while the tip follows C3: contact may come early [m/s].
+    # Largest downward speed while the tip follows C3 and `height` is null: contact may
+    # come early [m/s].
     down_max: float = 0.04
     # Speed that is added downwards where the tip has to feel for the ball and feels
-    # less than follow_force; it then also moves along with the ball [m/s].
+    # less than follow_force; it then also moves along with the ball [m/s]. Without
+    # effect where contacts are sampled.
     follow_speed: float = 0.015
-    # Force from which on a tip that feels for the ball has found it [N].
+    # Force from which on a tip that feels for the ball has found it [N]. Without effect
+    # where contacts are sampled.
     follow_force: float = 1.0
     # Largest speed while the tip follows C3 and feels less than touch_force: it may
     # touch earlier than planned, and the impact grows with the speed [m/s].
@@ -47,13 +50,13 @@ class ArmReferenceConfig:
     # Largest acceleration that is fed forward between two contacts [m/s2].
     acceleration_fed_forward_max: float = 10.0
     # Height at which the tip stays while it follows C3 horizontally [m]; null: C3 moves
-    # it up and down too.
+    # it up and down too. The diagram sets it.
     height: float | None = None
-    # Least horizontal distance of the wrist from the world's origin, the arm's base,
-    # while the tip follows C3, which does not know the arm and would fold its elbow
-    # [m].
+    # Least horizontal distance of the wrist from the arm's base while the tip follows
+    # C3, which does not know the arm and would fold its elbow [m]; push_object sets it.
     nearest: float = 0.0
-    # Vector from the wrist to the tip, seen from above, [x, y] [m].
+    # Vector from the wrist to the tip, seen from above, [x, y] [m]; push_object sets
+    # it.
     wrist: list[float] = field(default_factory=lambda: [0.0, 0.0])
     # Period of the updates, that of C3 and of the task [s]; the diagram sets it.
     period_sec: float = 0.0125

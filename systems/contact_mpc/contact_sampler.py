@@ -49,14 +49,16 @@ class Model(Protocol):
 @dataclass
 class ContactSamplerConfig:
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
-    # An angle to the goal counts as the distance that it turns at this radius [m].
+    # Radius at which an angle to the goal counts as the distance of its arc [m]; the
+    # diagram sets it.
     angle_radius: float = 0.12
-    residual_dt_sec: float = 0.05  # Time step over which r_comp is a velocity [s].
-    # Wall-clock time for a round [s]; places that are not scored by then are left out.
-    # Infinite: all are scored, and runs repeat bit for bit.
+    # Time step over which r_comp is a velocity [s]; the diagram sets it.
+    residual_dt_sec: float = 0.05
+    # Wall-clock time for a round [s]; places that are not scored by then are left out;
+    # inf: all are scored, and runs repeat bit for bit.
     budget_sec: float = np.inf
-    period_sec: float = 0.1
-    offset_sec: float = 0.0
+    period_sec: float = 0.1  # Period of the rounds of sampling [s].
+    offset_sec: float = 0.0  # Time of the first round [s]; the diagram sets it.
 
 
 class ContactSampler(LeafSystem):

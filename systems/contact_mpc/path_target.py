@@ -23,15 +23,20 @@ AWAY = 0.001  # Distance of the tip's target from the ball, so that it is no pus
 
 @dataclass
 class PathTargetConfig:
-    center: list[float] = field(default_factory=lambda: [0.5, 0.0])  # [m]
-    radius: float = 0.1  # Of the circle [m].
-    lead_deg: float = 6.0  # Angle by which the target is ahead of the ball.
-    speed: float = 0.05  # Of the target along the circle [m/s].
-    goal_deg: float = 10.0  # Angle from one goal to the next.
-    integral_sec: float = 6.0  # Time constant of the integral action [s].
-    height: float = 0.038  # Of the tip's centre while pushing [m].
-    period_sec: float = 0.0125
-    offset_sec: float = 0.0
+    # Centre of the circle along which the ball is rolled, [x, y] [m]; the diagram sets
+    # it.
+    center: list[float] = field(default_factory=lambda: [0.5, 0.0])
+    radius: float = 0.1  # Radius of the circle [m]; the diagram sets it.
+    # Angle on the circle by which C3's target is ahead of the ball [deg].
+    lead_deg: float = 6.0
+    speed: float = 0.05  # Speed of C3's target along the circle [m/s].
+    goal_deg: float = 10.0  # Angle on the circle from one goal to the next [deg].
+    # Time constant of the integral action on the circle's radius [s]; inf: none.
+    integral_sec: float = 6.0
+    # Height of the tip's centre while it pushes [m]; the diagram sets it.
+    height: float = 0.038
+    period_sec: float = 0.0125  # Period of the updates [s]; the diagram sets it.
+    offset_sec: float = 0.0  # Time of the first update [s]; the diagram sets it.
 
 
 class PathTarget(LeafSystem):

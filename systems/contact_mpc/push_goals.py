@@ -16,17 +16,22 @@ from makebreak.systems.numerics.timing import timed
 
 @dataclass
 class PushGoalsConfig:
-    # Goals are drawn uniformly: x, y in a rectangle [m], yaw over the whole circle.
+    # Centre of the rectangle from which goals are drawn, [x, y] [m]; yaw is drawn from
+    # the whole circle.
     center: list[float] = field(default_factory=lambda: [0.5, 0.0])
+    # Lengths in x and y of the rectangle from which goals are drawn [m].
     size: list[float] = field(default_factory=lambda: [0.16, 0.36])
-    tolerance: list[float] = field(default_factory=lambda: [0.02, 0.1])  # [m], [rad]
-    # A goal is reached when the estimated errors were below this fraction of the
-    # tolerance for dwell_sec.
+    # Tolerances of a goal's position [m] and yaw [rad].
+    tolerance: list[float] = field(default_factory=lambda: [0.02, 0.1])
+    # Fraction of the tolerance below which the estimated errors have to stay for
+    # dwell_sec, until a goal counts as reached.
     share: float = 0.8
+    # Time for which the estimated errors have to stay below share times the tolerance
+    # [s].
     dwell_sec: float = 0.25
-    limit_sec: float = 60.0  # After this time the next goal follows in any case.
-    period_sec: float = 0.0125
-    offset_sec: float = 0.0
+    limit_sec: float = 60.0  # Time after which the next goal follows in any case [s].
+    period_sec: float = 0.0125  # Period of the updates [s]; the diagram sets it.
+    offset_sec: float = 0.0  # Time of the first update [s]; the diagram sets it.
 
 
 def draw_poses(config: PushGoalsConfig, n: int, seed: int) -> np.ndarray:

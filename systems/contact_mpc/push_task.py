@@ -22,10 +22,12 @@ from makebreak.systems.numerics.timing import timed
 @dataclass
 class PushTaskConfig:
     push: PushConfig = field(default_factory=PushConfig)
-    height: float = 0.024  # Of the tip's centre while pushing [m].
-    clearance: float = 0.004  # Between tip and object at a place to touch [m].
-    period_sec: float = 0.0125
-    offset_sec: float = 0.0
+    # Height of the tip's centre while it pushes [m]; the diagram sets it.
+    height: float = 0.024
+    # Clearance of the tip from the object at a place [m]; the diagram sets it.
+    clearance: float = 0.004
+    period_sec: float = 0.0125  # Period of the updates [s]; the diagram sets it.
+    offset_sec: float = 0.0  # Time of the first update [s]; the diagram sets it.
 
 
 class PushTask(LeafSystem):

@@ -48,18 +48,23 @@ class LearnerStatus(IntEnum):
 class PosteriorConfig:
     """The residual's probability on a grid (numerics/residual_posterior.py)."""
 
-    prior_std: float = 0.16  # Mean zero [m/s]; 8 mm at dt = .05 s.
-    # Random walk of the residual: std after one second [m/s / sqrt(s)], and more in
-    # proportion to the residual's own size [1 / sqrt(s)].
+    # Standard deviation of the residual's prior, whose mean is zero [m/s]; 0.16 is 8 mm
+    # at dt = 0.05 s.
+    prior_std: float = 0.16
+    # Standard deviation of the residual's random walk after one second [m/s / sqrt(s)].
     drift: float = 0.02
+    # Standard deviation that is added to the drift in proportion to the residual's own
+    # size [1 / sqrt(s)].
     growth: float = 0.08
-    spacing: float = 0.01  # Of the grid [m/s].
-    trust: float = 0.2  # Factor on a step's loss; below 1, as steps are correlated.
-    loss_max: float = 20.0  # Bound of a step's loss, against outliers.
-    # States that also change for reasons that no model has (an object that rocks). The
-    # variance of these changes is measured over free_sec while nothing can touch, and
-    # bounds the weight of the states.
+    spacing: float = 0.01  # Spacing of the grid of residuals [m/s].
+    # Factor on the loss of a step; below 1, as the errors of steps are correlated.
+    trust: float = 0.2
+    loss_max: float = 20.0  # Largest loss of a step, against outliers.
+    # Indices of states that also change for reasons that no model has (an object that
+    # rocks): the variance of these changes bounds their weight.
     free_states: list[int] = field(default_factory=list)
+    # Time over which the variance of the free states' changes is averaged, while
+    # nothing can touch [s].
     free_sec: float = 2.0
 
 
@@ -67,24 +72,30 @@ class PosteriorConfig:
 class ResidualLearnerConfig:
     """Defaults: the paper's for rolling a ball at dt = .05 s, with lam in newtons."""
 
-    # Weight of the one-step error in each state, (n_x,) [1/SI^2]; empty: all 1.
+    # Weights (n_x,) of the one-step error in each state [1/SI^2]; empty: all 1.
     Q_d: list[float] = field(default_factory=list)
-    # Weight of the dynamics against the complementarity, 1e-7 / dt for dt = .05 s.
+    # Weight eps of the dynamics against the contact equation [m/s N]; the paper's is
+    # 2e-6 at dt = 0.05 s.
     eps: float = 2e-6
-    # Softness of the contact equation, .01 dt for dt = .05 s [m/s per N].
+    # Softness gamma of the contact equation [m/s per N]; the paper's is 5e-4 at dt =
+    # 0.05 s.
     gamma: float = 5e-4
-    n_b: int = 10  # Measured steps in the buffer.
-    learning_rate: float = 3e-3  # Of Adam: about the change of r_comp per step [m/s].
-    n_steps: int = 1  # Adam steps per update.
-    # Entries of r_comp that share one value; entries in no group stay zero.
-    # Empty: each entry has its own value.
+    n_b: int = 10  # Number of measured steps in the buffer.
+    # Learning rate of Adam, about the change of r_comp per step [m/s] (cartpole_walls:
+    # [m]).
+    learning_rate: float = 3e-3
+    n_steps: int = 1  # Number of Adam's steps per update.
+    # Entries of r_comp that share one value, as lists of indices; entries in no list
+    # stay zero; empty: each entry has its own value.
     groups: list[list[int]] = field(default_factory=list)
-    r_max: float = 1.0  # Bound on each entry of r_comp [m/s].
-    # Of the gap speed mu |v_t| that a sliding Anitescu contact opens (opening_speed),
-    # all above this noise level is removed [m/s]; infinite: nothing, as in the paper.
+    r_max: float = 1.0  # Bound of each entry of r_comp [m/s] (cartpole_walls: [m]).
+    # Noise of the measured gap speed mu |v_t| of a sliding Anitescu contact; what
+    # exceeds it is not taken for a gap [m/s]; inf: nothing is corrected, as in the
+    # paper.
     slip_noise: float = np.inf
-    # If given, r_comp is the mode of a posterior instead of Adam's result, for a single
-    # group. Q_d then are inverse variances, and n_b, learning_rate and n_steps unused.
+    # Posterior of the residual, for a single group: r_comp is its mode instead of
+    # Adam's result, Q_d are inverse variances, and n_b, learning_rate and n_steps are
+    # not used; null: Adam.
     posterior: PosteriorConfig | None = None
 
 

@@ -26,17 +26,21 @@ OUT_OF_REACH = 0.12
 
 @dataclass
 class RollingTaskConfig:
-    center: list[float] = field(default_factory=lambda: [0.5, 0.0])  # [m]
-    radius: float = 0.1  # Of the circle [m].
-    lead_deg: float = 6.0  # Angle by which the target is ahead of the ball.
-    speed: float = 0.045  # Of the target along the circle [m/s].
-    press: float = 0.045  # Depth of the tip's target below the learned ball's top [m].
-    # Position at which the tip hides nothing of the circle from the camera [m]: between
-    # the circle and the arm's base.
+    # Centre of the circle along which the ball is rolled, [x, y] [m].
+    center: list[float] = field(default_factory=lambda: [0.5, 0.0])
+    radius: float = 0.1  # Radius of the circle [m].
+    # Angle on the circle by which C3's target is ahead of the ball [deg].
+    lead_deg: float = 6.0
+    speed: float = 0.045  # Speed of C3's target along the circle [m/s].
+    # Depth of the tip's target below the place where it touches the learned ball's top
+    # [m].
+    press: float = 0.045
+    # Place where the tip hides nothing of the circle from the camera, between circle
+    # and arm's base, [x, y] [m].
     withdrawn: list[float] = field(default_factory=lambda: [0.35, 0.0])
     rolling: RollingConfig = field(default_factory=RollingConfig)
-    period_sec: float = 0.0125
-    offset_sec: float = 0.0
+    period_sec: float = 0.0125  # Period of the updates [s]; the diagram sets it.
+    offset_sec: float = 0.0  # Time of the first update [s]; the diagram sets it.
 
 
 class RollingTask(LeafSystem):

@@ -31,8 +31,8 @@ N_FRAME = 7  # Origin (3) [m], its velocity (3) [m/s], when it was there [s].
 class PushConfig:
     """The shape of the motions."""
 
-    # Time to lift the tip, pass over the ball and land, if nothing slows it; a long way
-    # takes longer [s].
+    # Time to lift the tip, pass over the ball and land, if nothing slows it; more for a
+    # long distance [s].
     reposition_sec: float = 0.4
     # Clearance over the modelled ball while the tip passes over it [m].
     lift: float = 0.015

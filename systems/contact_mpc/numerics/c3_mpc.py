@@ -93,16 +93,19 @@ class C3Weights:
 
 @dataclass
 class C3Options:
-    N: int = 5  # Knots, each lcs.dt long.
-    rounds: int = 3  # ADMM rounds.
-    rho: float = 2.0  # Growth of G per round, >= 1.
-    penalise_input_change: bool = False  # (u - u_prev)'R(u - u_prev), else u'R u.
-    scale_lam: bool = False  # Solve in lam / s, s = |A|_F / |D|_F.
-    start_at_x0: bool = False  # delta starts with x_0 in its x part instead of zero.
-    warm_start: bool = False  # delta and w start where the last solve ended.
-    polish: int = (
-        0  # Rollouts on the LCS that improve the plan (c3_polish.py); 0: none.
-    )
+    N: int = 5  # Number of knots of the plan, each lcs.dt long.
+    rounds: int = 3  # Number of ADMM rounds.
+    # Growth of the consensus weights G from round to round, at least 1.
+    rho: float = 2.0
+    # Whether changes of the input cost, (u - u_prev)'R(u - u_prev); false: u'R u.
+    penalise_input_change: bool = False
+    # Whether the problem is solved in lam / s, with s = |A|_F / |D|_F.
+    scale_lam: bool = False
+    # Whether delta starts with x_0 in its x part; false: with zero.
+    start_at_x0: bool = False
+    warm_start: bool = False  # Whether delta and w start where the last solve ended.
+    # Number of rollouts on the LCS that improve the plan (c3_polish.py); 0: none.
+    polish: int = 0
 
 
 @dataclass

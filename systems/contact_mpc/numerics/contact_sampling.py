@@ -54,30 +54,36 @@ PROGRESS = 0.003  # Less than this towards the goal is none [m].
 class SamplingConfig:
     """What a round of ContactSampler looks at, and what it prefers."""
 
-    places: int = 14  # Sampled in a round, beside the present one and the last best.
-    clearance: float = 0.004  # Of the tip from the object at a place [m].
-    height: float = 0.024  # Of the tip's centre while pushing [m].
-    # Least distance of the wrist from the world's origin, where the arm stands, nearer
-    # than which the elbow is at its limit, and the largest of the tip [m].
+    # Number of places sampled in a round, beside the present one and the last best.
+    places: int = 14
+    clearance: float = 0.004  # Clearance of the tip from the object at a place [m].
+    height: float = 0.024  # Height of the tip's centre while it pushes [m].
+    # Reach of the arm, [least, largest] [m]: least distance of the wrist from the arm's
+    # base, nearer than which the elbow is at its limit, and largest of the tip.
     reach: list[float] = field(default_factory=lambda: [0.41, 0.78])
-    # From the wrist to the tip, seen from above [m], where the tool's turn is held.
+    # Vector from the wrist to the tip, seen from above, where the tool's turn is held,
+    # [x, y] [m]; push_object sets it.
     wrist: list[float] = field(default_factory=lambda: [0.0, 0.0])
-    # To either side of the x axis, which the arm looks along [rad]: beyond, the way to
-    # a place may lead through the arm's own base.
+    # Largest angle of a place from the x axis, along which the arm looks: beyond, the
+    # way there may lead through the arm's own base [rad].
     bearing: float = 1.05
-    # Of a plan that leads the tip out of reach, for each knot: it will not be carried
-    # out as it is [1/m2]. Less than `inwards` nearer than reach[0] is within it [m].
+    # Cost of a plan that leads the tip out of reach, for each knot: it will not be
+    # carried out as it is [1/m2].
     out_of_reach: float = 2e4
+    # Length by which a plan may lead the wrist nearer than reach[0] at no cost [m].
     inwards: float = 0.01
-    travel: float = 15.0  # Cost of a metre through the air [1/m].
-    # Another place has to cost so much less than the present one: a share of the
-    # latter's cost, and an absolute amount.
+    travel: float = 15.0  # Cost of a metre of the tip's path through the air [1/m].
+    # Amount by which another place has to cost less than the present one: a fraction of
+    # the present cost, plus an absolute cost.
     hysteresis: list[float] = field(default_factory=lambda: [0.15, 1.0])
-    push: float = 4.0  # Force of the plan that is tried first, into the object [N].
-    stuck_sec: float = 1.2  # Without progress for so long, the present one is given up.
-    # Of an object that rolls on by itself: the tip arrives with its velocity.
+    # Force of the plan that is tried first, straight into the object [N].
+    push: float = 4.0
+    # Time without progress after which the present place is given up [s].
+    stuck_sec: float = 1.2
+    # Whether the tip arrives at a place with the velocity of the object, for one that
+    # rolls on by itself; always so for a cylinder.
     follow: bool = False
-    keep_sec: float = 0.0  # A place that is reached is kept for so long.
+    keep_sec: float = 0.0  # Time for which a place that was reached is kept [s].
 
 
 @dataclass(frozen=True, eq=False)

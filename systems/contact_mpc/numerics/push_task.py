@@ -44,32 +44,42 @@ TAKEN_BACK = 0.001
 
 @dataclass
 class PushConfig:
-    speed: float = 0.35  # Of a travelling tip [m/s].
-    acceleration: float = 2.0  # [m/s2]
-    descent: float = 0.08  # Of one that comes down beside the object [m/s].
-    # So much farther out than its place, where there is room, and then to it along the
-    # table: coming down on an edge, the tip is wedged between arm and object.
-    room: float = 0.008  # [m]
-    margin: float = 0.012  # Between tip and object where it passes above [m].
-    # C3's target is at most so far from where the object is.
-    look_ahead: float = 0.06  # [m]
-    look_ahead_angle: float = 0.5  # [rad]
-    unseen_sec: float = 0.3  # An object not seen for longer is waited for,
-    # or for longer while nothing touches it: then the arm hides it on its way.
+    speed: float = 0.35  # Largest speed of the tip as it travels [m/s].
+    acceleration: float = 2.0  # Largest acceleration of the tip as it travels [m/s2].
+    # Largest speed of the tip as it comes down beside the object [m/s].
+    descent: float = 0.08
+    # Distance beyond its place, away from the object, at which the tip comes down where
+    # there is room; it then goes to its place along the table [m]. Coming down on an
+    # edge, the tip would be wedged between arm and object.
+    room: float = 0.008
+    # Clearance of the tip over the object where it passes above it [m].
+    margin: float = 0.012
+    look_ahead: float = 0.06  # Largest distance of C3's target from the object [m].
+    # Largest turn of C3's target from the object's yaw [rad].
+    look_ahead_angle: float = 0.5
+    # Time for which the tip goes on pushing an object that is not seen, before it waits
+    # [s].
+    unseen_sec: float = 0.3
+    # Time for which the tip goes on travelling while the object is not seen, before it
+    # waits: the arm may hide the object on its way [s].
     believed_sec: float = 3.0
-    # One nearer to the world's origin, where the arm stands, or farther from it, or
-    # more to either side of the x axis, is not followed.
-    nearest: float = 0.25  # [m]
-    farthest: float = 0.75  # [m]
-    bearing: float = 1.05  # [rad]
-    withdrawn: list[float] = field(default_factory=lambda: [0.3, 0.0])  # [m]
-    # Of an object that rolls on by itself: the tip travels along with it, and arrives
-    # with its velocity.
+    # Least distance from the arm's base at which an object is followed [m].
+    nearest: float = 0.25
+    # Largest distance from the arm's base at which an object is followed [m].
+    farthest: float = 0.75
+    # Largest angle from the x axis at which an object is followed, to either side
+    # [rad].
+    bearing: float = 1.05
+    # Place where the tip waits and hides nothing from the camera, [x, y] [m].
+    withdrawn: list[float] = field(default_factory=lambda: [0.3, 0.0])
+    # Whether the tip travels along with an object that rolls on by itself, and arrives
+    # with its velocity; always so for a cylinder.
     follow: bool = False
-    # A place is where it was on the object (and goes along with it, with follow) as
-    # long as the object is not measured so far off from there: less is noise.
-    place_change: float = 0.008  # [m]
-    # Around an object that is one convex part, not over it, where the tip is low.
+    # Distance between the place that the tip travels to and the one measured on the
+    # object above which the latter replaces it: less is noise [m].
+    place_change: float = 0.008
+    # Whether a low tip goes around the object, not over it; for an object of one convex
+    # part.
     around: bool = False
 
 

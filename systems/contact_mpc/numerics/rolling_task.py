@@ -130,33 +130,45 @@ class TaskState:
 class RollingConfig:
     """Times and distances of the cycle."""
 
-    roll_sec: float = 1.0  # The longest push, ...
-    roll_feel_sec: float = 1.5  # ... and where the tip has to feel for the ball.
-    roll_ahead: float = 0.025  # A push ends with the tip so far from the ball [m].
+    roll_sec: float = 1.0  # Longest time of a push [s].
+    # Longest time of a push in which the tip has to feel for the ball [s].
+    roll_feel_sec: float = 1.5
+    # Horizontal distance of the tip from the ball's centre at which a push ends [m].
+    roll_ahead: float = 0.025
+    # Time of a reposition, from lifting the tip to the landing [s].
     reposition_sec: float = 0.55
-    lift: float = 0.015  # Clearance over the ball while the tip passes it [m].
-    land_behind: float = 0.018  # The tip lands so far behind the ball's centre [m].
-    land_above: float = 0.003  # ... and above where the surface is believed to be [m].
-    # The approach begins so many standard deviations of the gap above where the surface
-    # is believed to be. Where the tip has to feel for the ball, it ends n_std_below
-    # deviations below that.
+    lift: float = 0.015  # Clearance over the ball while the tip passes over it [m].
+    # Distance behind the ball's centre at which the tip lands, seen from above [m].
+    land_behind: float = 0.018
+    # Height of the landing point above where the ball's surface is believed to be [m].
+    land_above: float = 0.003
+    # Height above the believed surface at which the slow approach begins, in standard
+    # deviations of the gap.
     n_std: float = 2.5
+    # Depth below the believed surface at which the approach of a tip that has to feel
+    # for the ball ends, in standard deviations of the gap.
     n_std_below: float = 1.5
-    # A ball whose velocity changes by more while nothing touches it does not coast
-    # [m/s].
+    # Change of the velocity of an untouched ball above which it does not coast: the tip
+    # has to feel for it [m/s].
     coast_change: float = 0.06
-    approach_speed: float = 0.035  # [m/s]
-    approach_max: float = 0.025  # The longest approach [m].
-    touch_force: float = 4.0  # So much more force than in the air is a touch [N].
-    # A hidden ball is believed to be where it was until it may have gone unseen_drift
-    # [m] at the speed that it had, at least unseen_speed [m/s]. Then the task waits,
-    # and the tip goes at withdraw_speed to where it hides nothing of the circle.
+    approach_speed: float = 0.035  # Speed of the slow approach down to the ball [m/s].
+    approach_max: float = 0.025  # Longest distance of the slow approach [m].
+    # Vertical force, beyond that in the air, which is a touch [N].
+    touch_force: float = 4.0
+    # Distance that a hidden ball may have rolled before it counts as lost: then the
+    # task waits, and the tip withdraws [m].
     unseen_drift: float = 0.02
+    # Least speed at which a hidden ball is believed to roll [m/s].
     unseen_speed: float = 0.006
-    withdraw_speed: float = 0.2  # [m/s]
-    reposition_far: float = 0.12  # Repositions over a longer way take longer [m].
-    ease: float = 0.42  # Share of the reposition's time for going up, and down.
-    integral_sec: float = 6.0  # Time constant of the integral action (shifted).
+    # Speed at which the tip withdraws from a ball that is not seen [m/s].
+    withdraw_speed: float = 0.2
+    # Horizontal distance of a reposition above which it takes longer, in proportion
+    # [m].
+    reposition_far: float = 0.12
+    # Fraction of the reposition's time for going up, and the same for going down.
+    ease: float = 0.42
+    # Time constant of the integral action on the circle's radius [s]; inf: none.
+    integral_sec: float = 6.0
 
 
 def surface_height(offset, radius_ball, radius_tip):
