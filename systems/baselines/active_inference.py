@@ -13,10 +13,11 @@ HELD, AT_LIMIT = 1, 2  # Bits of the status.
 
 @dataclass
 class ActiveInferenceConfig:
-    # Variances of measured position and velocity, of the belief and of its rate.
+    # Variances of measured position, of measured velocity, of the belief and of its
+    # rate.
     variance: list[float] = field(default_factory=lambda: [1.0, 1.0, 5.0, 5.0])
-    k_belief: float = 20.0  # k_mu [1/s].
-    k_action: float = 1200.0  # k_a [N/(m s)].
+    k_belief: float = 20.0  # Rate k_mu at which the belief follows [1/s].
+    k_action: float = 1200.0  # Gain k_a of the action [N/(m s)].
     # Whether the generative model includes the goal's motion; not so in the source.
     goal_moves: bool = False
 

@@ -18,13 +18,16 @@ HELD, AT_LIMIT = 1, 2  # Bits of the status.
 
 @dataclass
 class BiomimeticConfig:
-    kappa: float = 10.0  # Weight of the position in eps [1/s].
-    # Learning rates Q_F [N s/m], Q_K [N s/m2], Q_D [N s2/m2].
+    kappa: float = 10.0  # Weight kappa of the position error in eps [1/s].
+    # Learning rates Q_F [N s/m], Q_K [N s/m2] and Q_D [N s2/m2] of force, stiffness and
+    # damping.
     rates: list[float] = field(default_factory=lambda: [10.0, 100.0, 10.0])
-    stiffness: float = 200.0  # K_0 [N/m].
-    damping: float = 28.0  # D_0 [N s/m].
-    forget: float = 0.05  # a, per trial.
-    forget_less: float = 5.0  # b [s2/m2].
+    stiffness: float = 200.0  # Stiffness K_0 that is never unlearned [N/m].
+    damping: float = 28.0  # Damping D_0 that is never unlearned [N s/m].
+    # Fraction a that is forgotten per trial where there is no error.
+    forget: float = 0.05
+    # Factor b by which larger errors reduce the forgetting [s2/m2].
+    forget_less: float = 5.0
     step_sec: float = 0.01  # Time for which F, K and D are constant [s].
 
 

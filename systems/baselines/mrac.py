@@ -14,15 +14,16 @@ HELD, AT_LIMIT = 1, 2  # Bits of the status.
 @dataclass
 class MracConfig:
     omega: float = 1.5  # Natural frequency of the reference model [1/s].
-    zeta: float = 1.0  # Its damping ratio.
-    rate_weight: float = 1.0  # l: weight of the velocity error [s2].
-    # Proportional and integral gains of the auxiliary force f, of K0 and Q0, and of K1
-    # and Q1.
+    zeta: float = 1.0  # Damping ratio of the reference model.
+    rate_weight: float = 1.0  # Weight l of the velocity error [s2].
+    # Proportional and integral gain of the auxiliary force f.
     force_gains: list[float] = field(default_factory=lambda: [400.0, 400.0])
+    # Proportional and integral gain of K0 and Q0, which act on positions.
     position_gains: list[float] = field(default_factory=lambda: [20.0, 20.0])
+    # Proportional and integral gain of K1 and Q1, which act on velocities.
     velocity_gains: list[float] = field(default_factory=lambda: [10.0, 10.0])
-    # False: the reference model's command is such that its response is the target.
-    # True: its command is the target, which it follows with a lag.
+    # Whether the target itself is the command of the reference model, which follows it
+    # with a lag; false: the command is such that the model's response is the target.
     lag: bool = False
 
 

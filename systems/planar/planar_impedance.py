@@ -30,14 +30,19 @@ HELD, AT_LIMIT, NO_MODEL = 1, 2, 4  # Status, a sum.
 
 @dataclass
 class PlanarImpedanceConfig:
-    stiffness_free: float = 50.0  # K_free of eq. 4b [N/m].
-    stiffness_max: float = 500.0  # K_max of eq. 4b [N/m].
-    damping_ratio: float = 1.0  # 1: critical; the paper's sqrt(K)/4 is 0.125.
-    steepness: float = 8.0  # r of eq. 4c [1/N].
-    error_mid: float = 1.0  # eps_0 of eq. 4c [N].
-    # Whether the mixture learns, and whether stiffness and feed-forward depend on it;
-    # if they do not, the stiffness is stiffness_max, without feed-forward.
-    learn: bool = True
+    # K_free of eq. 4b: stiffness where the force model predicts well [N/m].
+    stiffness_free: float = 50.0
+    # K_max of eq. 4b: stiffness where the force model predicts badly [N/m].
+    stiffness_max: float = 500.0
+    # Damping ratio; 1: critical; the paper's sqrt(K)/4 is 0.125.
+    damping_ratio: float = 1.0
+    # Steepness r of the trust in the force model over its error (eq. 4c) [1/N].
+    steepness: float = 8.0
+    # Error eps_0 of the force model at which the trust is 1/2 (eq. 4c) [N].
+    error_mid: float = 1.0
+    learn: bool = True  # Whether the mixture of the force model learns.
+    # Whether stiffness and feed-forward depend on the force model; false: the stiffness
+    # is stiffness_max, without feed-forward.
     adapt: bool = True
 
 
@@ -50,8 +55,13 @@ class ForceModelConfig:
     # Mixture over [v 2, F 2, next F 2]; with `position` over [p 2, v 2, F 2, next F 2];
     # with `along_motion` over [|v|, f, next f].
     mixture: IgmmConfig = field(default_factory=_default_model)
+    # Whether the mixture is over [|v|, f, next f], with f the force against the motion;
+    # false: over the vectors [v 2, F 2, next F 2].
     along_motion: bool = False
+    # Period of the force model's updates, over which it predicts [s].
     period_sec: float = 0.005
+    # Whether the mixture has the position too, [p 2, v 2, F 2, next F 2]; not with
+    # along_motion.
     position: bool = False
 
 

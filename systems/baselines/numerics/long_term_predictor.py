@@ -51,12 +51,20 @@ JITTER = 1e-9
 
 @dataclass
 class TrainingBudget:
-    points_per_mode: int = 200  # Training points of each GP.
-    svm_points: int = 2000  # Training points of the SVM.
-    modes_max: int = 10  # Components of the mixture, some of which may stay empty.
-    segment_min: int = 10  # Samples; shorter segments get the mode before them.
-    restarts: int = 1  # Random restarts of each GP's likelihood maximisation.
-    predict_change: bool = True  # Whether GPs predict x_{t+1} - x_t, or x_{t+1}.
+    # Largest number of training points of a Gaussian process (GP).
+    points_per_mode: int = 200
+    # Largest number of training points of the support vector machine.
+    svm_points: int = 2000
+    # Number of components of the mixture of modes, some of which may stay empty.
+    modes_max: int = 10
+    # Length below which a segment gets the mode of the one before [samples].
+    segment_min: int = 10
+    # Number of random restarts of the likelihood maximisation of each GP.
+    restarts: int = 1
+    # Whether GPs predict x_{t+1} - x_t; false: x_{t+1}. For one_step of wall_friction
+    # both are trained.
+    predict_change: bool = True
+    # Seed of the clustering, the choice of training points and the restarts.
     seed: int = 0
 
 
