@@ -34,19 +34,22 @@ _PER_MODEL = 4 + 3 + 1
 
 @dataclass
 class BallTrackerConfig:
-    ball_radius: float = 0.0315  # Of the model [m].
+    # Radius of the ball in the model [m]; the diagram sets it.
+    ball_radius: float = 0.0315
     table_z: float = 0.0  # Height of the table [m].
-    hue: float = 0.41  # Of the ball [rad]: 0 red, 2.09 green, 4.19 blue.
-    position_std: float = 1e-3  # Of one measurement [m].
+    # Hue of the ball's colour [rad]: 0 red, 2.09 green, 4.19 blue; a fruit has its own.
+    hue: float = 0.41
+    position_std: float = 1e-3  # Standard deviation of one measured position [m].
     # Spectral density of the white acceleration in the filter [m^2/s^3].
     acceleration_density: float = 0.03
-    # The same of a second motion model, for a ball that is driven (a push, a bump that
-    # it rolls off); 0: only one model. Mean duration of each of the two [s].
+    # Spectral density of the white acceleration in a second motion model, of a ball
+    # that is driven (a push, a bump that it rolls off) [m^2/s^3]; 0: only one model.
     driven_density: float = 0.0
+    # Mean time for which the ball rolls freely until it is driven [s].
     free_sec: float = 1.0
-    driven_sec: float = 0.1
-    period_sec: float = 0.0125
-    offset_sec: float = 0.0
+    driven_sec: float = 0.1  # Mean time for which the ball is driven [s].
+    period_sec: float = 0.0125  # Period of the updates [s]; the diagram sets it.
+    offset_sec: float = 0.0  # Time of the first update [s]; the diagram sets it.
 
 
 class BallTracker(LeafSystem):

@@ -24,21 +24,26 @@ KEPT_SEC = 1.0  # Age up to which readings are kept.
 
 @dataclass
 class PoseSensorConfig:
-    noise: list[float] = field(default_factory=lambda: [1e-3, 1e-2])  # [m], [rad]
+    # Standard deviations of the measured position [m] and orientation [rad], each axis.
+    noise: list[float] = field(default_factory=lambda: [1e-3, 1e-2])
+    # Delay of a reading from its measurement to its arrival [s].
     delay_sec: float = 1.0 / 30.0
-    period_sec: float = 1.0 / 30.0
-    # Spectral density of the white acceleration in the filter [m2/s3], [rad2/s3].
+    period_sec: float = 1.0 / 30.0  # Period of the readings [s].
+    # Spectral densities of the white acceleration in the filter: of the position
+    # [m2/s3], of the orientation [rad2/s3].
     density: list[float] = field(default_factory=lambda: [0.02, 2.0])
-    height: float = 0.02  # Of the object's origin in the model [m].
-    # Axis in the object's frame about which it rolls; empty: it lies flat.
+    # Height of the object's origin in the model [m]; the diagram sets it.
+    height: float = 0.02
+    # Axis in the object's frame about which it rolls; empty: it lies flat. The diagram
+    # sets it.
     rolling_axis: list[float] = field(default_factory=list)
-    # A rolling object has a second motion model (numerics/interacting_models.py): it
-    # rolls freely with the density free_density [m2/s3] or is driven with `density`.
-    # Mean duration of each [s].
+    # Spectral density of the white acceleration in a second motion model, of an object
+    # that rolls freely (numerics/interacting_models.py) [m2/s3].
     free_density: float = 1e-5
+    # Mean time for which an object rolls freely until it is driven [s].
     free_sec: float = 2.0
-    driven_sec: float = 0.3
-    offset_sec: float = 0.0
+    driven_sec: float = 0.3  # Mean time for which a rolling object is driven [s].
+    offset_sec: float = 0.0  # Time of the first reading [s]; the diagram sets it.
 
 
 class PoseSensor(LeafSystem):

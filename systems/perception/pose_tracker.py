@@ -36,17 +36,23 @@ _READ, _READ_AT, _SIZE = slice(15, 18), 18, 19
 
 @dataclass
 class PoseTrackerConfig:
-    z: float = 0.02  # Height of the object's frame [m].
-    hue: float = 0.41  # Of its colour [rad]: 0 red, 2.09 green, 4.19 blue.
-    position_std: float = 1e-3  # Of one measurement, along x and y [m].
-    yaw_std: float = 0.01  # [rad]
-    # Spectral densities of white acceleration in the filters [m^2/s^3], [rad^2/s^3].
+    z: float = 0.02  # Height of the object's frame [m]; the diagram sets it.
+    # Hue of the object's colour [rad]: 0 red, 2.09 green, 4.19 blue; the diagram sets
+    # it.
+    hue: float = 0.41
+    # Standard deviation of one measured position, along x and y [m].
+    position_std: float = 1e-3
+    yaw_std: float = 0.01  # Standard deviation of one measured yaw [rad].
+    # Spectral density of the white acceleration in the position's filter [m^2/s^3].
     acceleration_density: float = 0.01
+    # Spectral density of the white angular acceleration in the yaw's filter
+    # [rad^2/s^3].
     turning_density: float = 2.0
-    # Axis in the object's frame about which it rolls; empty: it slides.
+    # Axis in the object's frame about which it rolls; empty: it slides. The diagram
+    # sets it.
     rolling_axis: list[float] = field(default_factory=list)
-    period_sec: float = 0.0125
-    offset_sec: float = 0.0
+    period_sec: float = 0.0125  # Period of the updates [s]; the diagram sets it.
+    offset_sec: float = 0.0  # Time of the first update [s]; the diagram sets it.
 
 
 @dataclass
