@@ -58,13 +58,17 @@ BODY_COLOR, PLATE = (0.25, 0.26, 0.28), 1e-3
 
 @dataclass
 class PushedObject:
+    # Shape of the object: t, box, l, disc, cylinder (which lies and rolls) or mesh.
     shape: Literal["t", "box", "l", "disc", "cylinder", "mesh"] = "t"
-    scale: float = 1.0  # Of all dimensions.
-    mass: float = 0.4  # [kg]
-    # x, y of the centre of mass from that of an even density [m], not scaled.
+    scale: float = 1.0  # Scale of all dimensions of the object.
+    mass: float = 0.4  # Mass of the object [kg].
+    # Offset of the centre of mass from that of an even density, [x, y], which is not
+    # scaled [m].
     com_offset: list[float] = field(default_factory=lambda: [0.0, 0.0])
-    height: float = 0.04  # At scale 1; a lying cylinder's diameter; not of a mesh [m].
-    file: str = ""  # Of a mesh (.obj, .gltf or .vtk).
+    # Height of the object at scale 1, or diameter of a lying cylinder; not of a mesh
+    # [m].
+    height: float = 0.04
+    file: str = ""  # File of the mesh (.obj, .gltf or .vtk), for shape=mesh.
 
 
 class Part(NamedTuple):
