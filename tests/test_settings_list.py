@@ -1,5 +1,6 @@
 """`makebreak list EXPERIMENT` shows every setting as `--set` takes it."""
 
+import re
 from dataclasses import dataclass, field
 
 import pytest
@@ -50,3 +51,35 @@ def test_a_word_selects_settings_and_a_wrong_one_is_refused(capsys):
     assert 'no setting has "xyz" in its name' in capsys.readouterr().err
     assert cli.main(["list", "cartpol"]) == 2
     assert "cartpole_walls" in capsys.readouterr().err
+
+
+# How a meaning may begin: a capital letter or a digit (also of the paper's symbols,
+# K_free, Q_d), a quote, or a symbol that the papers write in lower case.
+BEGINS = re.compile(r"[A-Z0-9\"'(]|(lam|eta|eps|rho|gamma|delta|mu)\b")
+# With these begins what only completes the setting's name: "Of the ball."
+COMPLETES = {"Of", "Or", "And", "But", "At", "By", "From", "To", "In", "On", "Between"}
+
+
+def is_meaning(text: str) -> bool:
+    """Whether a setting's comment can be understood without its neighbours: two words
+    or more beside the units in brackets, and no second half of a sentence."""
+    words = re.findall(r"[A-Za-z][\w']*", re.sub(r"\[[^\]]*\]", "", text))
+    if len(words) < 2 or words[0] in COMPLETES or "..." in text:
+        return False
+    return BEGINS.match(text) is not None
+
+
+def test_a_unit_half_a_sentence_or_nothing_is_no_meaning():
+    for text in ("", "[m]", "Off.", "[N/m] x 3, [N m/rad] x 3", "1e-3 [s].",
+                 "of both contacts [N].", "Of both contacts [N].", "The longest, ...",
+                 "... and above the surface [m]."):  # fmt: skip
+        assert not is_meaning(text), text
+    for text in ("Radius of the circle [m].", "K_free of eq. 4b [N/m].",
+                 "0: no reflex at all.", '"vtk" or "drawn".'):  # fmt: skip
+        assert is_meaning(text), text
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_setting_has_a_meaning_that_stands_alone(experiment):
+    rows = settings_rows(load_experiment(experiment).Config())
+    assert [(key, text) for key, _, text in rows if not is_meaning(text)] == []
