@@ -252,7 +252,7 @@ ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="lift" type="revolute">
 
 def test_a_servo_is_proposed_with_the_stiffness_that_its_sag_tells(tmp_path):
     (tmp_path / "s.urdf").write_text(SERVO_ARM)
-    q = 0.5 * np.sin(0.3 * T)
+    q = 0.5 * np.sign(np.sin(3.0 * T))  # It stands: only its sag tells.
     # It holds 0.2 kg at 0.1 m with 6 N m/rad; about -y, upwards is positive.
     goal = q + 0.2 * 9.81 * 0.1 * np.cos(q) / 6.0
     rows = np.stack([T, np.degrees(q), np.degrees(goal)], axis=1)
@@ -265,6 +265,39 @@ def test_a_servo_is_proposed_with_the_stiffness_that_its_sag_tells(tmp_path):
     assert scene.actuation.type == "servo"
     np.testing.assert_allclose(scene.actuation.kp, 6.0, rtol=0.01)
     SceneSimulation(scene)  # It can be simulated.
+
+
+SERVO_SLIDE = """<robot name="s"><link name="base"/><link name="cart"><inertial>
+<mass value="6"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+</link><joint name="x" type="prismatic"><parent link="base"/><child link="cart"/>
+<axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="300" velocity="5"/></joint>
+</robot>"""
+
+
+def test_a_servo_is_proposed_with_the_gains_that_its_motion_tells(tmp_path):
+    """A slide on level ground sags nowhere; its dry friction is not taken for a gain,
+    nor that its command holds until the next one for damping."""
+    (tmp_path / "s.urdf").write_text(SERVO_SLIDE)
+    kp, kd, coulomb, step = 4000.0, 300.0, 15.0, 5e-4
+    x, v, u, rows, told = 0.0, 0.0, 0.0, [], 0.0
+    for k in range(int(20.0 / step)):
+        t = k * step
+        if k % 40 == 0:  # 50 rows a second.
+            told = 0.2 * np.sin(2.0 * t) + 0.05 * np.sin(7.0 * t)
+            rows.append([t, x, told])
+        u = kp * (told - x) - kd * v - coulomb * np.tanh(v / 1e-3)
+        v += step * u / 6.0
+        x += step * v
+    head = "t,x_pos,x_goal_pos"
+    np.savetxt(tmp_path / "log.csv", rows, "%.9g", ",", header=head, comments="")
+    robot = read_robot(tmp_path / "s.urdf")
+    proposal = propose_scene(robot, [read_log(tmp_path / "log.csv")])
+    (tmp_path / "scene.yaml").write_text(proposal.scene)
+    scene = read_scene(tmp_path / "scene.yaml")
+    # Half a row late would be 40 N s/m; a mean over 0.2 s bends the motion a little.
+    np.testing.assert_allclose(scene.actuation.kp, kp, rtol=0.01)
+    np.testing.assert_allclose(scene.actuation.kd, kd, rtol=0.02)
+    assert not scene.effects  # No rotor that is not there.
 
 
 @pytest.mark.parametrize(

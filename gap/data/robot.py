@@ -20,6 +20,7 @@ from makebreak.gap.data.proposal import (
     propose,
     sidecar_text,
 )
+from makebreak.gap.data.servo_gains import Motion, ServoGains, servo_gains
 from makebreak.gap.data.table import RecordingTable, read_table, stem_of, suffix_of
 from makebreak.models.effects.kind import actuator_of, one_dof_joints
 
@@ -31,6 +32,7 @@ GUESSED_KP = 10.0  # [N m/rad], where the log does not show it.
 SPEED_LOOP = 50.0
 SERVO_DAMPING_SEC = 0.07  # Of kd to kp, of a small geared servo's back-EMF.
 ROTOR_SEC = 0.05  # Of its inertia at the joint to kd.
+LEAST_ROTOR = 0.05  # Of what a joint moves: less is left out of a proposal.
 LEAST_LOAD = 0.05  # Of a joint's rms gravity torque [N m], to tell its servo by.
 
 
@@ -123,6 +125,7 @@ def matches_of(log: Log, robot: Robot | None) -> list[Match]:
 
 
 FROM_SAG = "from how far joints sag below their commands"
+FROM_MOTION = "from how joints followed their commands"
 
 
 @dataclass(frozen=True)
@@ -207,31 +210,39 @@ def _actuation(
             notes.append(f"joints are driven by what {what} says")
             return [f"actuation: {{type: effort, joints: [{', '.join(joints)}]}}"], ""
     if joints := named("position_command"):
+        gains = _gains_by_motion(robot, every, logs)
         stiff = _stiffness(robot, every, logs)
+        stiff |= {joint: own.kp for joint, own in gains.items()}
         known = [k for k in stiff.values() if k > 0.0]
         guess = float(np.median(known)) if known else GUESSED_KP
         kp = [float(f"{stiff.get(j, 0.0) or guess:.3g}") for j in joints]
-        told = FROM_SAG if known else "a guess"
+        kd = [
+            float(f"{gains[j].kd if j in gains else SERVO_DAMPING_SEC * k:.3g}")
+            for j, k in zip(joints, kp, strict=True)
+        ]
+        told = FROM_MOTION if gains else FROM_SAG if known else "a guess"
         notes.append(f"drives are position servos of kp {kp} N m/rad ({told})")
         lines = [
             "actuation:",
             "  type: servo  # Gains are guessed: correct them.",
             f"  joints: [{', '.join(joints)}]",
             f"  kp: {kp}  # [N m/rad], {told}.",
-            f"  kd: {[float(f'{SERVO_DAMPING_SEC * k:.3g}') for k in kp]}"
-            "  # [N m s/rad], a guess.",
+            f"  kd: {kd}  # [N m s/rad], {FROM_MOTION if gains else 'a guess'}.",
         ]
         limits = [robot.effort_limits.get(j, np.inf) for j in joints]
         if all(0.0 < limit < 1e6 for limit in limits):
             lines.append(f"  limit: {[float(x) for x in limits]}  # [N m]")
         # A geared motor's own inertia is what its back-EMF and its spring work on.
-        lines.append("effects:  # Rotors of the servos' motors, a guess.")
-        for joint, k in zip(joints, kp, strict=True):
-            inertia = float(f"{ROTOR_SEC * SERVO_DAMPING_SEC * k:.2g}")
-            lines.append(
-                f"- {{kind: rotor_inertia, at: {joint}, "
-                f"parameters: {{inertia: {inertia}}}}}  # [kg m2]"
-            )
+        rotors, moved = [], _inertia(robot)
+        for joint, k in zip(joints, kd, strict=True):
+            inertia = gains[joint].rotor if joint in gains else ROTOR_SEC * k
+            if joint not in gains or inertia > LEAST_ROTOR * moved[joint]:
+                rotors.append(
+                    f"- {{kind: rotor_inertia, at: {joint}, "
+                    f"parameters: {{inertia: {float(f'{inertia:.2g}')}}}}}  # [kg m2]"
+                )
+        if rotors:
+            lines += ["effects:  # Rotors of the servos' motors, a guess.", *rotors]
         return lines, told
     if joints := named("velocity_command"):
         notes.append("drives follow velocities, with gains that are a guess")
@@ -258,6 +269,39 @@ def _inertia(robot: Robot) -> dict[str, float]:
     return {name: float(1.0 / mobility[i, i]) for name, i in own.items()}
 
 
+def _scaled(log: Log, matches: Sequence[Match]) -> dict[str, np.ndarray]:
+    """{channel: its samples in SI units}."""
+    return {
+        m.channel: m.scale * log.table.columns[m.column] + m.offset
+        for m in matches
+        if m.channel
+    }
+
+
+def _gains_by_motion(robot: Robot, every, logs) -> dict[str, ServoGains]:
+    """{joint: gains} of position servos, where the logs say them."""
+    motions = []
+    for log in logs:
+        channels = _scaled(log, every[log.path])
+        if not all(f"{j.name}.position" in channels for j in robot.joints):
+            continue
+        time = channels["time"]
+        q = np.stack([channels[f"{j.name}.position"] for j in robot.joints], axis=1)
+        none = np.full(len(time), np.nan)
+        told = [channels.get(f"{j.name}.position_command", none) for j in robot.joints]
+        good = np.isfinite(q).all(axis=1) & np.isfinite(time)
+        good &= np.diff(time, prepend=-np.inf) > 0.0
+        motions.append(Motion(time[good], q[good], np.stack(told, axis=1)[good]))
+    if robot.plant.num_positions() != len(robot.joints) or not motions:
+        return {}
+    found = servo_gains(robot.plant, motions)
+    return {
+        joint.name: own
+        for joint, own in zip(robot.joints, found, strict=True)
+        if own is not None
+    }
+
+
 def _stiffness(robot: Robot, every, logs) -> dict[str, float]:
     """Of a position servo [N m/rad]: gravity's torque over how far a joint is from its
     command, by least squares; 0 where gravity hardly loads it."""
@@ -265,11 +309,7 @@ def _stiffness(robot: Robot, every, logs) -> dict[str, float]:
     context = plant.CreateDefaultContext()
     up: dict[str, list] = {}
     for log in logs:
-        scaled = {
-            m.channel: m.scale * log.table.columns[m.column] + m.offset
-            for m in every[log.path]
-            if m.channel
-        }
+        scaled = _scaled(log, every[log.path])
         names = [f"{j.name}.position" for j in robot.joints]
         if not all(name in scaled for name in names):
             continue

@@ -1,0 +1,158 @@
+"""The gains of position servos, from how joints moved and what they were told.
+
+A servo gives kp (command - position) - kd velocity, and the robot needs what inverse
+dynamics says. Both are averaged by one kernel and compared by least squares, with dry
+friction and a rotor free, so that neither is taken for a gain.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import MultibodyForces
+from scipy.ndimage import minimum_filter1d
+from scipy.optimize import nnls
+
+KERNEL_SEC = 0.2  # Slower than sensors' noise, faster than most motions.
+LEAST_SAMPLES = 9  # Of that kernel.
+MOST_SAMPLES = 3000  # At which inverse dynamics is computed.
+MOVES = 0.05  # Of its fastest: slower, a joint may be held by friction.
+PARTS = 5  # Of the data: each is predicted from the others,
+LARGEST_SPREAD = 0.15  # whose stiffnesses differ by less than this share (1 sigma),
+LEAST_EXPLAINED = 0.8  # and of what the rest leaves the stiffness explains this.
+
+
+@dataclass(frozen=True)
+class ServoGains:
+    """kp [N m/rad], kd [N m s/rad] with a joint's damping in it, rotor [kg m2], Coulomb
+    friction [N m]; of a joint that slides [N/m], [N s/m], [kg], [N]."""
+
+    kp: float
+    kd: float
+    rotor: float
+    friction: float
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """One log: time (n,) [s], positions q (n, n_q) and position commands (n, n_q), NaN
+    where there is none, as each is held from its row on."""
+
+    time: np.ndarray
+    q: np.ndarray
+    command: np.ndarray
+
+
+def servo_gains(
+    plant: MultibodyPlant, motions: Sequence[Motion]
+) -> list[ServoGains | None]:
+    """Of each joint, in the order of the plant's coordinates; None where the data do
+    not say: parts of them differ, or the stiffness explains too little.
+
+    Args: plant: a finalized mechanism, all of whose coordinates are in `motions`.
+    """
+    parts: list[list[tuple]] = [[] for _ in range(plant.num_positions())]
+    for motion in motions:
+        for own, rows in zip(parts, _equations(plant, motion), strict=True):
+            own.append(rows)
+    return [_fitted(own) for own in parts]
+
+
+def _equations(plant: MultibodyPlant, motion: Motion):
+    """Of each joint the regressors (m, 4) of kp, kd, friction and rotor, and the effort
+    that the robot needs (m,), while it moves; all averaged by one kernel."""
+    t, n = motion.time, motion.q.shape[1]
+    none = (np.zeros((0, 4)), np.zeros(0))
+    step = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
+    width = max(int(round(KERNEL_SEC / step)), LEAST_SAMPLES) | 1
+    even = np.arange(t[0], t[-1], step) if np.isfinite(step) else t[:0]
+    if len(even) < 4 * width:
+        return [none] * n
+    kernels = _bump(width, step)
+    q = np.stack([np.interp(even, t, x) for x in motion.q.T], axis=1)
+    mean, rate, rate2 = (
+        np.stack([np.convolve(x, kernel, "valid") for x in q.T], axis=1)
+        for kernel in kernels
+    )
+    some = slice(None, None, max(len(mean) // MOST_SAMPLES, 1))
+    needed = _needed(plant, mean[some], rate[some], rate2[some])
+    out = []
+    for i, command in enumerate(motion.command.T):
+        there = np.flatnonzero(np.isfinite(command))
+        if len(there) < 2:
+            out.append(none)
+            continue
+        told = np.convolve(
+            _mean_held(t[there], command[there], even, step), kernels[0], "valid"
+        )
+        v = rate[:, i]
+        X = np.stack([told - mean[:, i], -v, -np.sign(v), -rate2[:, i]], axis=1)
+        moves = np.abs(v) > MOVES * np.quantile(np.abs(v), 0.95)
+        moves = minimum_filter1d(moves, width)[some]
+        out.append((X[some][moves], needed[moves, i]))
+    return out
+
+
+def _mean_held(t, command, at, width: float) -> np.ndarray:
+    """(m,) means over intervals of this width [s] about `at` (m,) of a command (n,)
+    that holds from its time (n,) until the next. Sampled at its rows it would seem half
+    a row early, which is damping."""
+    total = np.append(0.0, np.cumsum(command[:-1] * np.diff(t)))
+    edges = np.append(at - 0.5 * width, at[-1] + 0.5 * width)
+    past = np.clip(edges, None, t[0]) - t[0], np.clip(edges, t[-1], None) - t[-1]
+    whole = np.interp(edges, t, total) + past[0] * command[0] + past[1] * command[-1]
+    return np.diff(whole) / width
+
+
+def _bump(width: int, step: float) -> list[np.ndarray]:
+    """(width,) weights of a mean over a smooth bump, and of its two derivatives: what
+    is averaged by one and the same kernel stays an equation."""
+    s, half = np.linspace(-1.0, 1.0, width), 0.5 * step * (width - 1)
+    b = 1.0 - s**2
+    mean = b**4 / np.sum(b**4)
+    rate, rate2 = -s * b**3, (6.0 * s**2 - b) * b**2
+    # A sum over a few samples is not the integral: exact for straight lines, parabolas.
+    rate2 -= np.sum(rate2) * mean
+    t = half * s
+    return [mean, rate / -np.sum(rate * t), 2.0 * rate2 / np.sum(rate2 * t**2)]
+
+
+def _needed(plant: MultibodyPlant, q, v, vd) -> np.ndarray:
+    """(m, n) efforts by inverse dynamics at states (m, n)."""
+    context, out = plant.CreateDefaultContext(), np.empty(q.shape)
+    forces = MultibodyForces(plant)
+    for k in range(len(q)):
+        plant.SetPositions(context, q[k])
+        plant.SetVelocities(context, v[k])
+        plant.CalcForceElementsContribution(context, forces)
+        out[k] = plant.CalcInverseDynamics(context, vd[k], forces)
+    return out
+
+
+def _fitted(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> ServoGains | None:
+    """From equations (m, 4), (m,) of each log, if parts of them agree."""
+    X, y = (np.concatenate(each) for each in zip(*parts, strict=True))
+    if len(y) < 10 * PARTS:
+        return None
+    size = np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-12)
+
+    def fit(rows: np.ndarray, columns: Sequence[int]) -> np.ndarray:
+        c = np.zeros(X.shape[1])
+        c[columns] = nnls(X[rows][:, columns] / size[columns], y[rows])[0]
+        return c / size
+
+    every, others = [0, 1, 2, 3], [1, 2, 3]
+    part = np.arange(len(y)) * PARTS // len(y)
+    stiff, left, without = [], 0.0, 0.0
+    for k in range(PARTS):
+        mine = part == k
+        c = fit(~mine, every)
+        stiff.append(c[0])
+        left += float(np.sum((y[mine] - X[mine] @ c) ** 2))
+        without += float(np.sum((y[mine] - X[mine] @ fit(~mine, others)) ** 2))
+    kp, kd, friction, rotor = fit(np.full(len(y), True), every)
+    agree = float(np.std(stiff)) <= LARGEST_SPREAD * kp
+    if not kp > 0.0 or not agree or left > (1.0 - LEAST_EXPLAINED) * without:
+        return None
+    return ServoGains(float(kp), float(kd), float(rotor), float(friction))
