@@ -150,6 +150,56 @@ def test_a_cube_on_a_plane_with_coulomb_friction_is_solved(corners, trials):
         assert_solves(F, q, solve_lcp(F, q))
 
 
+def pinched_cube(rng):
+    """The LCP of Stewart and Trinkle of a light cube that stands on a plane between two
+    fingers, each of which may touch a face and, as well, the four corners below."""
+    (dt, m), a, r, eye = 10.0 ** rng.uniform([-3, -3], [-1, 0]), 0.06, 0.01, np.eye(3)
+    mu, edges = rng.choice([0.01, 0.5, 3.0]), 4
+    M_inv = np.diag([6.0 / (m * a**2)] * 3 + [1.0 / m] * 3 + [1.0 / 0.3] * 6)
+    corners = [0.5 * a * np.array([*xy, -1]) for xy in product([-1, 1], repeat=2)]
+    contacts = [(p, None, eye[2], 0.0) for p in corners]
+    for finger, side in ((0, 1.0), (1, -1.0)):
+        contacts.append((side * 0.5 * a * eye[0], finger, -side * eye[0], r))
+        for p in corners:
+            to_corner = p - side * (0.5 * a + r) * eye[0]
+            distance = np.linalg.norm(to_corner)
+            contacts.append((p, finger, to_corner / distance, distance - r))
+    J_n, J_t = [], []
+    for (x, y, z), finger, n, _ in contacts:
+        J = np.zeros((3, 12))
+        J[:, :6] = [[0, z, -y, 1, 0, 0], [-z, 0, x, 0, 1, 0], [y, -x, 0, 0, 0, 1]]
+        if finger is not None:
+            J[:, 6 + 3 * finger : 9 + 3 * finger] = -eye
+        t1 = np.cross(n, eye[np.argmin(np.abs(n))])
+        t1 /= np.linalg.norm(t1)
+        J_n.append(n @ J)
+        J_t += [t @ J for t in (t1, -t1, np.cross(n, t1), -np.cross(n, t1))]
+    J, n = np.array(J_n + J_t), len(contacts)
+    E_t, v = np.kron(np.eye(n), np.ones((edges, 1))), 0.5 * rng.normal(size=12)
+    v[5] -= dt * 9.81
+    F, q = np.zeros((n * (edges + 2), n * (edges + 2))), np.zeros(n * (edges + 2))
+    F[: len(J), : len(J)] = dt * J @ M_inv @ J.T + 0.01 * dt * np.eye(len(J))
+    F[n : len(J), len(J) :] = E_t
+    F[len(J) :, :n], F[len(J) :, n : len(J)] = mu * np.eye(n), -E_t.T
+    q[: len(J)] = J @ v
+    q[:n] += np.array([gap for *_, gap in contacts]) / dt
+    return F, q
+
+
+def test_a_light_cube_between_two_fingers_is_solved():
+    # 84 unknowns, many of one kind. Rounding over many pivots made Lemke end in a ray,
+    # and the search behind it then gave 1e17 N, beside which any breach looked small.
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        F, q = pinched_cube(rng)
+        lam = solve_lcp(F, q)
+        w = F @ lam + q
+        size = np.abs(q).max()  # Of speeds: no breach is excused by large forces.
+        assert w.min() > -1e-6 * size
+        assert np.minimum(np.abs(w), lam).max() < 1e-6 * max(size, lam.max())
+        assert lam.max() < 1e6 * size
+
+
 def test_the_smallest_cube_problems_agree_with_drakes_moby_solver_in_motion():
     """Where Moby's answer obeys the definition (it does not check itself): for a
     frictionless cube F is semi-definite, and then F lam is unique."""

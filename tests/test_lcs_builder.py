@@ -26,6 +26,7 @@ from pydrake.multibody.tree import (
     FixedOffsetFrame,
     LinearSpringDamper,
     PdControllerGains,
+    QuaternionFloatingJoint,
     SpatialInertia,
 )
 from pydrake.systems.analysis import Simulator
@@ -665,6 +666,25 @@ def test_a_model_that_is_not_constant_takes_the_general_path(what):
     assert not AnitescuLcs(diagram_of(text, extend), ball_pairs()).is_analytic
 
 
+def test_a_damped_floating_joint_is_linearised_right():
+    # Drag on a body with a centre of mass and three moments is not constant in its
+    # orientation: the fast path, which took it for constant, had an A wrong by 10 %.
+    def add(plant):
+        two = plant.GetBodyByName("two").body_frame()
+        joint = QuaternionFloatingJoint("drag", plant.world_frame(), two, 0.4, 0.4)
+        plant.AddJoint(joint)
+
+    diagram, pairs = diagram_of(UNEVEN, add), [ContactPair("one", "two", 0.5)]
+    model = AnitescuLcs(diagram, pairs, 0.05)
+    general = AnitescuLcs(diagram, pairs, 0.05, analytic=False)
+    quaternions = [k for k in range(model.n_q) if model.x_default[k] == 1.0]
+    x = random_state(np.random.default_rng(0), model.x_default, quaternions)
+    u = np.zeros(model.n_u)
+    np.testing.assert_allclose(
+        model.build(x, u).A, general.build(x, u).A, atol=1e-12
+    )  # Rounding, of entries of about 1.
+
+
 # The system.
 
 
@@ -890,6 +910,29 @@ def test_a_sphere_beside_a_hull_agrees_with_drake(tmp_path, sphere_first):
         np.testing.assert_allclose(n, drakes.nhat_BA_W, atol=0.03)
         np.testing.assert_allclose(p_A, drakes.p_ACa, atol=2e-3)
         np.testing.assert_allclose(p_B, drakes.p_BCb, atol=2e-3)
+
+
+LYING = """<sdf version="1.9"><world name="w">
+  <model name="table"><static>true</static><link name="table">
+    <collision name="top"><pose>0 0 -.5 0 0 0</pose>
+      <geometry><box><size>4 4 1</size></box></geometry></collision></link></model>
+  <model name="object"><link name="object"><pose>0 0 .05 1.5707963267948966 0 .3</pose>
+    <inertial><mass>1</mass></inertial>
+    <collision name="c"><geometry><{shape}><radius>.05</radius><length>.1</length>
+      </{shape}></geometry></collision></link></model></world></sdf>"""
+
+
+@pytest.mark.parametrize("shape", ["cylinder", "capsule"])
+@pytest.mark.parametrize("gap", [0.0, 1e-13, -1e-12])
+def test_shapes_that_just_touch_have_a_normal(shape, gap):
+    # Drake's is a difference of witness points over the distance, here 1e-16 over 0.
+    diagram = diagram_of(LYING.format(shape=shape))
+    model = AnitescuLcs(diagram, [ContactPair("object", "table", 0.5)])
+    x = model.x_default.copy()
+    x[6] += gap
+    lcs = model.build(x, np.zeros(0))
+    np.testing.assert_allclose(lcs.phi, gap, atol=1e-11)
+    np.testing.assert_allclose(lcs.J.mean(axis=0)[3:], [0, 0, 1], atol=1e-6)
 
 
 # Other contact models: Stewart's and Trinkle's, a given stiffness, and mixtures.

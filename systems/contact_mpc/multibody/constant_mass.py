@@ -90,6 +90,8 @@ def _floating_bodies(plant: MultibodyPlant):
             joint_of[child.index()] = joint
             inertia = child.default_spatial_inertia()
             if not _is_isotropic(inertia):
+                if joint.default_damping_vector().any():
+                    return None  # In the body's frame such damping is not constant.
                 turning.append((joint.position_start(), joint.velocity_start()))
                 centre, mass = inertia.get_com(), inertia.get_mass()
                 about = inertia.Shift(centre).CalcRotationalInertia()

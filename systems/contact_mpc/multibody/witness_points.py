@@ -12,6 +12,9 @@ from makebreak.systems.contact_mpc.multibody.contact_layout import ContactLayout
 from makebreak.systems.contact_mpc.numerics.contact_rows import tangent_basis
 from makebreak.systems.contact_mpc.numerics.convex_hull import point_on_hull
 
+# Distances below this one are too short for a direction [m].
+TOUCHING = 1e-7
+
 
 class WitnessPoints:
     """Drake's signed distances of the contacts of a layout, and the Jacobians of their
@@ -64,8 +67,7 @@ class WitnessPoints:
         """
         plant, layout = self._plant, self._layout
         world, wrt = plant.world_frame(), JacobianWrtVariable.kV
-        query: Any = self._query_port.Eval(context)
-        found = [self.distance(query, *ids) for ids in layout.geometries]
+        found = self._distances(context)
         chosen = layout.every
         if layout.chooses:
             chosen = layout.nearest(np.array([gap for gap, *_ in found]))
@@ -73,7 +75,7 @@ class WitnessPoints:
         J = np.empty((len(chosen), 3, plant.num_velocities()))
         for k, i in enumerate(chosen):
             (id_A, id_B), (phi[k], n, p_A, p_B) = layout.geometries[i], found[i]
-            if not abs(n @ n - 1.0) < 1e-6:
+            if not _is_unit(n):
                 raise ValueError(f"{layout.names[i]}: no unique normal at {n}")
             self._check_plane(i, n)
             (frame_A, X_A), (frame_B, X_B) = self.frames[id_A], self.frames[id_B]
@@ -85,6 +87,31 @@ class WitnessPoints:
             t1, t2 = tangent_basis(n, layout.reference[i])
             J[k] = np.stack([n, t1, t2]) @ J_w
         return phi, J, chosen
+
+    def _distances(self, context: Context):
+        """distance() of all contacts. Where two geometries just touch, Drake's normal
+        is 0/0; it is then that of a state which is moved by about TOUCHING."""
+        query: Any = self._query_port.Eval(context)
+        found = [self.distance(query, *ids) for ids in self._layout.geometries]
+        touching = [
+            i for i, (gap, n, *_) in enumerate(found)
+            if abs(gap) < TOUCHING and not _is_unit(n, 1e-9)
+        ]  # fmt: skip
+        if not touching:
+            return found
+        plant = self._plant
+        q = plant.GetPositions(context).copy()
+        # A direction that is not along any surface but by chance.
+        aside = np.cos(1.0 + np.arange(plant.num_velocities()))
+        nearby = q + TOUCHING * plant.MapVelocityToQDot(context, aside)
+        plant.SetPositions(context, nearby)
+        query = self._query_port.Eval(context)
+        for i in touching:
+            gap, _, *points = found[i]
+            n = self.distance(query, *self._layout.geometries[i])[1]
+            found[i] = gap, n, *points
+        plant.SetPositions(context, q)
+        return found
 
     def distance(self, query: QueryObject, id_A: GeometryId, id_B: GeometryId):
         """Distance [m], normal from B to A in the world (3,), and the witness points
@@ -112,6 +139,10 @@ class WitnessPoints:
                 f"{layout.names[i]}: the contact normal {n} leaves the plane of "
                 f"plane_normal {layout.reference[i]}"
             )
+
+
+def _is_unit(n: np.ndarray, tolerance=1e-6) -> bool:
+    return bool(abs(n @ n - 1.0) < tolerance)
 
 
 def _hull_faces(hull) -> tuple[np.ndarray, np.ndarray]:

@@ -19,6 +19,11 @@ from makebreak.systems.contact_mpc.numerics.nearest_point import nearest_mode
 
 # Modes that the search behind Lemke's method looks at.
 NODES_MAX = 2000
+# Pivots after which the second try of Lemke's method computes its tableau anew.
+REBUILD = 10
+# Largest force z, in units in which diag(M) and max |b| are 1, that counts as the scale
+# of a rounding error; larger ones are no excuse for a breach of w >= 0.
+Z_SCALE_MAX = 1e3
 # Status of solve_lcp_kernel.
 SOLVED, NO_SOLUTION, NOT_PRECISE = 0, 1, 2
 
@@ -86,9 +91,15 @@ def solve_lcp_kernel(F, q):
             M[i, j] = scale[i] * F[i, j] * scale[j]
     status = NOT_PRECISE
     # A pivot below the tolerance is taken for rounding. Where that was wrong the check
-    # at the end says so, and another tolerance is tried.
-    for tolerance in (1e-11, 1e-9, 1e-13):
-        z, status = _lemke(M, b, tolerance)
+    # at the end says so, and another tolerance is tried, or a tableau without the
+    # rounding errors of many pivots.
+    for tolerance, rebuild in (
+        (1e-11, 0),
+        (1e-11, REBUILD),
+        (1e-9, REBUILD),
+        (1e-13, REBUILD),
+    ):
+        z, status = _lemke(M, b, tolerance, rebuild)
         if status == SOLVED:
             if _violation(M, b, z) < 1e-9:
                 for i in range(n):
@@ -100,7 +111,7 @@ def solve_lcp_kernel(F, q):
     # there is a solution, and does not shrink with the 1e-12 if there is none.
     for i in range(n):
         M[i, i] += 1e-12
-    z, regular = _lemke(M, b, 1e-13)
+    z, regular = _lemke(M, b, 1e-13, 0)
     for i in range(n):
         M[i, i] -= 1e-12
     if not (regular == SOLVED and _violation(M, b, z) * max(1.0, z.max()) < 1e-9):
@@ -140,18 +151,16 @@ def _search(M, b, z):
 
 
 @njit(cache=True)
-def _lemke(M, b, tolerance):
-    """Lemke's method on w - M z - 1 z0 = b; returns z (n,) and a status."""
+def _lemke(M, b, tolerance, rebuild):
+    """Lemke's method on w - M z - 1 z0 = b; returns z (n,) and a status.
+
+    rebuild: number of pivots after which the tableau is computed anew; 0: never.
+    """
     n = b.size
-    # Columns: w (n; these hold the basis inverse), z (n), z0, right-hand side.
-    T = np.zeros((n, 2 * n + 2))
+    T = np.empty((n, 2 * n + 2))
     basic = np.arange(n)
     z0, rhs = 2 * n, 2 * n + 1
-    for i in range(n):
-        T[i, i] = 1.0
-        T[i, n : 2 * n] = -M[i]
-        T[i, z0] = -1.0
-        T[i, rhs] = b[i]
+    _fill(T, M, b)
     # z0 enters for the most negative b; of equal ones the last, which is the
     # lexicographically smallest row of [b, I].
     row = 0
@@ -160,7 +169,7 @@ def _lemke(M, b, tolerance):
             row = i
     z = np.zeros(n)
     entering = z0
-    for _ in range(50 * (n + 1)):
+    for pivots in range(1, 50 * (n + 1)):
         leaving = basic[row]
         _pivot(T, row, entering)
         basic[row] = entering
@@ -168,10 +177,52 @@ def _lemke(M, b, tolerance):
             _read(T, M, b, basic, z)
             return z, SOLVED
         entering = leaving + n if leaving < n else leaving - n
+        if rebuild and pivots % rebuild == 0 and not _rebuild(T, M, b, basic):
+            return z, NOT_PRECISE
         row = _lexicographic_row(T, entering, basic, z0, rhs, tolerance)
         if row < 0:
+            for i in range(n):  # A tie that rounding has hidden: z0 is gone.
+                if basic[i] == z0 and abs(T[i, rhs]) < 1e-11:
+                    _read(T, M, b, basic, z)
+                    return z, SOLVED
             return z, NO_SOLUTION
     return z, NOT_PRECISE
+
+
+@njit(cache=True)
+def _fill(T, M, b):
+    """The first tableau; columns: w (n; these hold the basis inverse), z (n), z0,
+    right-hand side."""
+    n = b.size
+    T[:] = 0.0
+    for i in range(n):
+        T[i, i] = 1.0
+        T[i, n : 2 * n] = -M[i]
+        T[i, 2 * n] = -1.0
+        T[i, 2 * n + 1] = b[i]
+
+
+@njit(cache=True)
+def _rebuild(T, M, b, basic):
+    """The tableau of a basis from the problem's own numbers, with complete pivoting;
+    the rows change places. False if the basis is singular."""
+    n = b.size
+    _fill(T, M, b)
+    columns = basic.copy()
+    for k in range(n):  # columns[k:] are left, and the rows whose basic is -1.
+        basic[k] = -1
+    for k in range(n):
+        largest, row, at = 1e-14, -1, -1
+        for j in range(k, n):
+            for i in range(n):
+                if basic[i] < 0 and abs(T[i, columns[j]]) > largest:
+                    largest, row, at = abs(T[i, columns[j]]), i, j
+        if row < 0:
+            return False
+        _pivot(T, row, columns[at])
+        basic[row] = columns[at]
+        columns[at], columns[k] = columns[k], columns[at]
+    return True
 
 
 @njit(cache=True)
@@ -246,13 +297,16 @@ def _read(T, M, b, basic, z):
 
 @njit(cache=True)
 def _violation(M, b, z):
-    """Largest breach of w >= 0 and of w z = 0, of the scale of the terms."""
+    """Largest breach of w >= 0 and of w z = 0, of the scale of the terms (up to
+    Z_SCALE_MAX: beside forces without bound any breach would be small)."""
     worst, largest = 0.0, 1.0
     for i in range(b.size):
-        largest = max(largest, z[i])
+        largest = max(largest, min(z[i], Z_SCALE_MAX))
     for i in range(b.size):
         w = b[i]
         for j in range(b.size):
             w += M[i, j] * z[j]
+        if not np.isfinite(w):
+            return np.inf  # Comparisons with what is not a number are all false.
         worst = max(worst, -w, min(abs(w), z[i]))
     return worst / largest
