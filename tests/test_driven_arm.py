@@ -7,16 +7,13 @@ import pytest
 from effect_scenes import at_rest_but, double, pendulum, with_effects
 
 from makebreak.gap.numerics.driven_arm import mass_and_bias, rollout
+from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.driven_arm import (
     DrivenArmScene,
     DrivenArmSimulation,
     can_have,
 )
-from makebreak.gap.simulation.scene_simulation import (
-    Commands,
-    SceneSimulation,
-    SimulationConfig,
-)
+from makebreak.gap.simulation.scene_simulation import SceneSimulation, SimulationConfig
 from makebreak.models.effects import KINDS
 from makebreak.models.scene import ActuationSection
 from makebreak.models.scene_schema import SupplySection

@@ -19,11 +19,9 @@ from pydrake.systems.framework import DiagramBuilder
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from makebreak.gap.simulation.scene_simulation import (
-    Commands,
-    SceneSimulation,
-    make_scene_diagram,
-)
+from makebreak.gap.simulation.commands import Commands
+from makebreak.gap.simulation.scene_diagram import make_scene_diagram
+from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.drives import law_of
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.scene import load_scene, read_scene

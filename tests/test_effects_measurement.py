@@ -22,11 +22,9 @@ from makebreak.diagrams.station import (
     make_control_plant,
     make_station,
 )
-from makebreak.gap.simulation.scene_simulation import (
-    Commands,
-    SceneSimulation,
-    make_scene_diagram,
-)
+from makebreak.gap.simulation.commands import Commands
+from makebreak.gap.simulation.scene_diagram import make_scene_diagram
+from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import load_scene, read_scene
 

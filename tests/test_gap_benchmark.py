@@ -543,8 +543,8 @@ def windows_of(made, object_world):
 
 def gap_in_noise(made, scene, effects):
     """The worst channel's rms of measured - simulated, in standard deviations."""
+    from makebreak.gap.simulation.commands import Commands
     from makebreak.gap.simulation.scene_simulation import (
-        Commands,
         SceneSimulation,
         SimulationConfig,
     )

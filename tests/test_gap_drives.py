@@ -8,7 +8,8 @@ from effect_scenes import at_rest_but, double, with_effects
 
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.residuals.inverse import InverseModel
-from makebreak.gap.simulation.scene_simulation import Commands, SceneSimulation
+from makebreak.gap.simulation.commands import Commands
+from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.gap.workflow import run_gap
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import ActuationSection

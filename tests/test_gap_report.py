@@ -30,7 +30,8 @@ from makebreak.gap.result import (
     Unexplained,
     Where,
 )
-from makebreak.gap.simulation.scene_simulation import Commands, SceneSimulation
+from makebreak.gap.simulation.commands import Commands
+from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sentence
 from makebreak.models.scene import InitialSection, load_scene, read_scene

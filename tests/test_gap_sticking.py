@@ -13,8 +13,8 @@ from makebreak.gap.residuals.driven import DrivenProblem, is_driven, sticks
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.search.groups import groups_of
 from makebreak.gap.search.select import select
+from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.driven_arm import DrivenArmSimulation
-from makebreak.gap.simulation.scene_simulation import Commands
 from makebreak.gap.workflow import problem_for, run_gap
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.scene import ActuationSection, read_scene

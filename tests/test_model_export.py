@@ -8,7 +8,8 @@ import pytest
 from effect_scenes import at_rest_but, double, on_ground, pendulum, with_effects
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.gap.simulation.scene_simulation import Commands, SceneSimulation
+from makebreak.gap.simulation.commands import Commands
+from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.effects.kind import Effect
 from makebreak.models.model_export import to_mjcf, to_urdf
 from makebreak.models.scene import ActuationSection, load_scene

@@ -10,7 +10,8 @@ from effect_scenes import at_rest_but, double, with_effects
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.residuals.pushes import find_pushes
-from makebreak.gap.simulation.scene_simulation import Commands, SceneSimulation
+from makebreak.gap.simulation.commands import Commands
+from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.gap.workflow import run_gap
 from makebreak.models.scene_file import write_scene
 

@@ -24,7 +24,8 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.report.clock import zero_of
 from makebreak.gap.result import GapResult, Series
-from makebreak.gap.simulation.scene_simulation import Commands, SceneSimulation
+from makebreak.gap.simulation.commands import Commands
+from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.effects.kind import full_name, one_dof_joints
 from makebreak.models.scene import (
     InitialSection,

@@ -17,7 +17,7 @@ from makebreak.gap.data.recording import Recording
 from makebreak.gap.numerics.selection import benjamini_hochberg
 from makebreak.gap.problem import Candidate, Nuisances, rms
 from makebreak.gap.result import GapMeasure, InUnits, Series, Where
-from makebreak.gap.simulation.scene_simulation import stand_on_ground
+from makebreak.gap.simulation.stand_on_ground import stand_on_ground
 from makebreak.gap.simulation.windows import LARGEST
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS

@@ -16,6 +16,7 @@ from makebreak.gap.numerics.driven_arm import (
     rollout,
 )
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
+from makebreak.gap.simulation.sensor_samples import SAME_SEC
 from makebreak.models.drives import (
     CHANNEL_STEPS,
     actuators_of_model,
@@ -185,7 +186,7 @@ class DrivenArmSimulation(SceneSimulation):
         self._arm = self.arms.arm(effects[len(own) :])
         self._scene = replace(self._scene, effects=list(effects))
         self._current = tuple(sorted(effects, key=lambda e: KINDS[e.kind].rank))
-        self._read_effects()
+        self._commands.set_effects(self._current)
 
     def _simulate(self, initial, start, needed, is_true, efforts, twists):
         self.failure = ""
@@ -195,20 +196,14 @@ class DrivenArmSimulation(SceneSimulation):
         n = plant.num_velocities()
         if not len(needed):
             return np.zeros((0, 2 * n)), {}
-        events = self._events[
-            (self._events > start + 1e-9) & (self._events < needed[-1])
-        ]
+        events = self._commands.events
+        events = events[(events > start + SAME_SEC) & (events < needed[-1])]
         times = np.union1d(np.append(needed, start), events)
         told = np.zeros((len(times) - 1, 2, n))
-        for model, what, delays, table, _ in self._tables:
+        for model, what, values in self._commands.at(times[:-1]):
             row = 1 if what == "velocity_command" else 0
             for k, actuator in enumerate(actuators_of_model(plant, model)):
-                i = actuator.joint().velocity_start()
-                if not len(self._command_time):
-                    continue
-                late = times[:-1] - delays[k] + 1e-9
-                at = np.searchsorted(self._command_time, late, "right") - 1
-                told[:, row, i] = table[np.maximum(at, 0), k]
+                told[:, row, actuator.joint().velocity_start()] = values[:, k]
         told[:, 0] = self.arms.received(told[:, 0])
         y = np.empty((len(times), 2 * n))
         y[0] = x

@@ -18,7 +18,8 @@ from makebreak.gap.residuals.inverse import (
     given_late,
     rotor_before,
 )
-from makebreak.gap.simulation.scene_simulation import Commands, SceneSimulation
+from makebreak.gap.simulation.commands import Commands
+from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
