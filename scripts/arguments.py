@@ -19,6 +19,13 @@ class CommandParser(argparse.ArgumentParser):
     def error(self, message):
         raise ValueError(f"{message} (see {self.prog} --help)")
 
+    def _check_value(self, action, value):
+        """argparse's hook for words with fixed choices: here only the command."""
+        if action.choices is not None and value not in action.choices:
+            raise ValueError(
+                f"unknown command {value}; {nearest(value, action.choices)}"
+            )
+
 
 def number(text: str, name: str, least: float, whole: bool = False) -> float:
     """A number of the command line. Raises: ValueError below `least`, or if not one."""
@@ -55,6 +62,13 @@ def _config_options(
     p.add_argument("--seed", metavar="N", help=seed)
 
 
+def _experiment_argument(p: argparse.ArgumentParser) -> None:
+    p.add_argument(
+        "experiment", nargs="?", default="ball_rolling", metavar="EXPERIMENT",
+        help="a name of `makebreak list` (ball_rolling)",
+    )  # fmt: skip
+
+
 def _fault_option(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--fault", action="append", default=[], metavar="NAME[:from=S,for=S]",
@@ -78,20 +92,22 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
         help="all experiments, scenes and faults; or the settings of one experiment",
     )
     p.add_argument(
-        "experiment", nargs="?", metavar="EXPERIMENT", help="list its settings"
-    )
+        "experiment", nargs="?", metavar="EXPERIMENT",
+        help="show the settings of this experiment",
+    )  # fmt: skip
     p.add_argument(
-        "text", nargs="?", default="", metavar="TEXT", help="only settings with it"
-    )
+        "text", nargs="?", default="", metavar="TEXT",
+        help="only settings with this text in the name or meaning",
+    )  # fmt: skip
 
     p = commands.add_parser("run", help="run one experiment, with Meshcat")
-    p.add_argument("experiment", nargs="?", default="ball_rolling")
+    _experiment_argument(p)
     _config_options(p)
     p.add_argument("--duration", metavar="S", help="simulated seconds")
     _fault_option(p)
     p.add_argument(
-        "--robot", nargs="+", default=["sim"], metavar=("sim", "RECORDING"),
-        help="sim (default); lcm [URL]: a robot behind LCM; replay RECORDING",
+        "--robot", nargs="+", default=["sim"], metavar=("KIND", "FROM"),
+        help="sim (default), lcm [URL] (a robot behind LCM), or replay RECORDING",
     )  # fmt: skip
     p.add_argument(
         "--no-meshcat", action="store_true", help="no viewer, no meshcat.html"
@@ -105,15 +121,19 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
     p = commands.add_parser(
         "station", help="simulate a robot behind LCM, for `run --robot lcm`"
     )
-    p.add_argument("experiment", nargs="?", default="ball_rolling")
+    _experiment_argument(p)
     p.add_argument(
         "--rate", default="1", metavar="R", help="simulated seconds per second (1)"
     )
     p.add_argument(
         "--drop", default="0", metavar="SHARE", help="fraction of messages lost (0)"
     )
-    p.add_argument("--delay", default="0", metavar="S", help="delay of messages (0)")
-    p.add_argument("--url", metavar="URL", help="of LCM; default: this machine only")
+    p.add_argument(
+        "--delay", default="0", metavar="S", help="delay of messages [s] (0)"
+    )
+    p.add_argument(
+        "--url", metavar="URL", help="LCM address; default: this machine only"
+    )
     p.add_argument(
         "--duration", default="86400", metavar="S", help="simulated seconds (86400)"
     )
@@ -153,7 +173,9 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
     p = commands.add_parser(
         "sweep", help="run one experiment with many seeds and settings"
     )
-    p.add_argument("experiment", metavar="EXPERIMENT")
+    p.add_argument(
+        "experiment", metavar="EXPERIMENT", help="a name of `makebreak list`"
+    )
     p.add_argument("--trials", required=True, metavar="N", help="seeds for each case")
     p.add_argument(
         "--vary", action="append", default=[], metavar="KEY=LO:HI", nargs="+",
@@ -214,14 +236,17 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
         "close-the-loop",
         help="run with a wrong model, gap on it, run with the repaired model",
     )
-    p.add_argument("experiment", nargs="?", default="ball_rolling")
+    _experiment_argument(p)
     p.add_argument(
         "--radius-error",
         default="0.005",
         metavar="M",
         help="radius error of the ball's model (0.005 m)",
     )
-    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", nargs="+")
+    p.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", nargs="+",
+        help="settings of both runs",
+    )  # fmt: skip
     p.add_argument("--seed", default="0", metavar="N", help="seed of both runs (0)")
     p.add_argument("--duration", metavar="S", help="simulated seconds of each run")
     p.add_argument("--jobs", metavar="N", help="processes at once in gap")
@@ -231,7 +256,9 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
         "export-tests",
         help="write a test for each system, from its inputs and outputs in a run",
     )
-    p.add_argument("experiment", metavar="EXPERIMENT")
+    p.add_argument(
+        "experiment", metavar="EXPERIMENT", help="a name of `makebreak list`"
+    )
     p.add_argument(
         "--systems", metavar="A,B", help="names; default: all systems with updates"
     )
@@ -242,11 +269,18 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
     p = commands.add_parser(
         "compile", help="compile now what the first run would compile"
     )
-    p.add_argument("experiments", nargs="*", metavar="EXPERIMENT")
+    p.add_argument(
+        "experiments", nargs="*", metavar="EXPERIMENT",
+        help="default: ball_rolling and cartpole_walls",
+    )  # fmt: skip
     p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
 
     p = commands.add_parser("bench", help="measure compute times, as table and JSON")
-    p.add_argument("names", nargs="*", metavar="NAME")
+    p.add_argument(
+        "names", nargs="*", metavar="NAME",
+        help="c3, lcs, learner, impedance, push, camera, latency, diagrams or gap; "
+        "default: all",
+    )  # fmt: skip
 
     p = commands.add_parser("completion", help="print the script for tab completion")
     p.add_argument("shell", metavar="SHELL", help="bash, zsh, fish or tcsh")

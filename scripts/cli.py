@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
+from shutil import get_terminal_size
 
 from makebreak.scripts import experiments
 from makebreak.scripts.arguments import make_parser, number, number_of_processes, parse
@@ -52,10 +53,11 @@ def fault_lines() -> dict[str, str]:
 
 def _list(args) -> int:
     if args.experiment is not None:
-        from makebreak.scripts.settings_list import settings_table
+        from makebreak.scripts.settings_list import settings_text
 
         config = experiment_module(args.experiment).Config()
-        print(settings_table(args.experiment, config, args.text).to_text())
+        width = get_terminal_size().columns if sys.stdout.isatty() else None
+        print(settings_text(args.experiment, config, args.text, width))
         return 0
     names: dict[str, dict[str, str]] = {"experiments": {}, "scenes": {}}
     for name in experiments.EXPERIMENTS:
@@ -184,8 +186,18 @@ def _gap(args) -> int:
     recordings = [Path(text) for text in args.recordings]
     for path in recordings:
         if not (path.is_file() or is_bag(path) or is_dataset(path)):
-            raise ValueError(f'RECORDING: got "{path}", expected a file, or a bag')
+            raise ValueError(
+                f"recording {path} does not exist"
+                if not path.exists()
+                else f"recording {path} is a folder, expected a file, a ROS bag or a "
+                "LeRobot dataset"
+            )
     robot = Path(args.scene)
+    if robot.is_file() and robot.suffix.lower() in (".csv", ".npz", ".parquet", ".gz"):
+        raise ValueError(
+            f"{robot} is a recording, expected the scene or robot first: "
+            "makebreak gap SCENE RECORDING"
+        )
     is_robot = robot.suffix.lower() in (".urdf", ".sdf", ".xml")
     scene = robot if is_robot else Path(scene_file(args.scene, "SCENE"))
     out = Path(args.out) if args.out else default_out("gap")

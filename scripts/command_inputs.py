@@ -49,8 +49,10 @@ def scene_file(text: str, option: str) -> str:
     shipped = scenes()
     if _scene_name(text) in shipped:
         return str(shipped[_scene_name(text)])
-    hint = f" ({nearest(text, shipped)})" if shipped else ""
-    raise ValueError(f'{option}: got "{text}", expected a scene file{hint}')
+    hint = f", or a name of `makebreak list`; {nearest(text, shipped)}"
+    if Path(text).suffix:  # A file was meant.
+        hint = ""
+    raise ValueError(f'{option}: got "{text}", expected a scene file that exists{hint}')
 
 
 def experiment_config(module, args: argparse.Namespace):

@@ -9,7 +9,8 @@ import tokenize
 
 from makebreak.models.typed_yaml import hints_of
 from makebreak.scripts.settings import to_plain
-from makebreak.scripts.table import Table
+
+MEANING_FROM = 36  # Column at which the meanings begin.
 
 
 def comments_of(schema: type) -> dict[str, str]:
@@ -62,9 +63,13 @@ def _text(value) -> str:
     return f"[{','.join(map(str, plain))}]" if isinstance(plain, list) else str(plain)
 
 
-def settings_table(experiment: str, config, text: str = "") -> Table:
-    """The settings whose key or comment has `text` in it.
+def settings_text(
+    experiment: str, config, text: str = "", width: int | None = None
+) -> str:
+    """The settings whose key or comment has `text` in it, as key=default and meaning.
 
+    Args: width: of the terminal [characters], to which meanings are wrapped; None: one
+        line for each setting, as for grep.
     Raises: ValueError if there is none.
     """
     rows = settings_rows(config)
@@ -73,5 +78,16 @@ def settings_table(experiment: str, config, text: str = "") -> Table:
         rows = [r for r in rows if low in r[0].lower() or low in r[2].lower()]
         if not rows:
             raise ValueError(f'list {experiment}: no setting has "{text}" in its name')
-    title = f"{experiment}: settings for --set key=value"
-    return Table(title, ("key", "default", "meaning"), rows)
+    lines = [f"{experiment}: settings for --set, with their defaults", ""]
+    for key, default, meaning in rows:
+        head = f"{key}={default}".ljust(MEANING_FROM - 2)
+        if width is None:
+            lines.append(f"{head}  {meaning}".rstrip())
+            continue
+        wrapped = textwrap.wrap(meaning, max(30, width - MEANING_FROM)) or [""]
+        if len(head) > MEANING_FROM - 2:
+            lines.append(head)
+        else:
+            lines.append(f"{head}  {wrapped.pop(0)}".rstrip())
+        lines += [" " * MEANING_FROM + each for each in wrapped]
+    return "\n".join(lines)

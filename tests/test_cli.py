@@ -143,7 +143,7 @@ def test_without_out_each_run_has_a_folder_of_its_own():
 BAD = [
     (["run", "spring_mas"], "unknown experiment spring_mas; did you mean spring_mass?"),
     (["run", "x", "--no-meshcat"], "unknown experiment x; expected one of: spring_"),
-    (["runn"], "invalid choice: 'runn'"),
+    (["runn"], "unknown command runn; did you mean run?"),
     ([], "COMMAND"),
     (["run", "spring_mass", "--sed", "1"], "option --sed; did you mean --seed?"),
     (["run", "spring_mass", "--durat=1"], "option --durat; did you mean --duration?"),

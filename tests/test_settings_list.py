@@ -8,7 +8,11 @@ import pytest
 from makebreak.scripts import cli
 from makebreak.scripts.experiments import EXPERIMENTS, load_experiment
 from makebreak.scripts.settings import apply_settings, field_types, to_plain
-from makebreak.scripts.settings_list import comments_of, settings_rows
+from makebreak.scripts.settings_list import (
+    comments_of,
+    settings_rows,
+    settings_text,
+)
 
 
 @dataclass
@@ -46,11 +50,21 @@ def test_every_setting_is_there_and_its_default_changes_nothing(experiment):
 def test_a_word_selects_settings_and_a_wrong_one_is_refused(capsys):
     assert cli.main(["list", "cartpole_walls", "Learning_Rate"]) == 0
     out = capsys.readouterr().out
-    assert "learning.learning_rate  0.003" in out and "gap_error" not in out
+    assert "learning.learning_rate=0.003 " in out and "gap_error" not in out
     assert cli.main(["list", "cartpole_walls", "xyz"]) == 2
     assert 'no setting has "xyz" in its name' in capsys.readouterr().err
     assert cli.main(["list", "cartpol"]) == 2
     assert "cartpole_walls" in capsys.readouterr().err
+
+
+def test_meanings_are_wrapped_to_the_terminal_and_otherwise_one_line_each():
+    config = load_experiment("cartpole_walls").Config()
+    one_each = settings_text("x", config).splitlines()
+    assert len(one_each) == 2 + len(settings_rows(config))
+    wrapped = settings_text("x", config, width=80).splitlines()
+    assert all(len(line) <= 80 or " " not in line.strip() for line in wrapped)
+    assert any(len(line) > 80 for line in one_each)
+    assert " ".join("\n".join(wrapped).split()) == " ".join("\n".join(one_each).split())
 
 
 # How a meaning may begin: a capital letter or a digit (also of the paper's symbols,

@@ -113,7 +113,7 @@ def propose(
             continue
         quantity = _quantity(name)
         if quantity is None:
-            found[name] = Match(name, None, why="no quantity that is compared")
+            found[name] = Match(name, None, why="not a quantity that gap compares")
         else:
             quantities[name] = quantity
     for name, joint in _joints_of(quantities, joints).items():
@@ -125,9 +125,7 @@ def propose(
                 continue
             quantity = _OF_A_SLIDE[quantity]
         if joint is None:
-            found[name] = Match(
-                name, None, why=f"{quantity}, of which joint is not told"
-            )
+            found[name] = Match(name, None, why=f"{quantity} of an unknown joint")
         else:
             found[name] = Match(name, f"{joint.name}.{quantity}", why="by its name")
     found = _once(_without_unknown_efforts(found, joints))

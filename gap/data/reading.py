@@ -152,8 +152,9 @@ def _check_time(path: Path, columns: Mapping[str, np.ndarray]) -> None:
     if "time" not in columns:
         shown = ", ".join(list(columns)[:8]) + (", ..." if len(columns) > 8 else "")
         raise ValueError(
-            f"recording {path} needs the column time, got {shown}; a column of another "
-            f"name is mapped in {sidecar}: columns: {{t: time}}"
+            f"recording {path} needs the column time, got {shown}; `makebreak inspect` "
+            f"proposes names; or give the time column in {sidecar}: "
+            "columns: {t: time}"
         )
     steps = np.abs(np.diff(columns["time"][:100_000]))
     step = float(np.median(steps[np.isfinite(steps)])) if len(steps) else 0.0
