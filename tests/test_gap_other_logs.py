@@ -8,7 +8,7 @@ import pytest
 
 from makebreak.gap import read_recordings, run_gap, write_report
 from makebreak.gap.by_recording import _apart
-from makebreak.gap.data.findings import GUESSED_GAINS, Finding
+from makebreak.gap.data.findings import GUESSED_GAINS, NO_DRIVE, Finding
 from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.gap.result import Evidence, GapMeasure, GapResult, NamedEffect
 from makebreak.gap.workflow import _unless_doubtful
@@ -157,3 +157,12 @@ def test_beside_guessed_gains_only_what_explains_all_is_named():
     assert _unless_doubtful(explained) == explained
     known = replace(result, checks=[])
     assert _unless_doubtful(known) == known
+
+
+def test_a_gap_where_nothing_drives_the_joints_says_so():
+    check = Finding(NO_DRIVE, "a", "time", 0.0, "", "warning", "Nothing drives it.")
+    gap = GapMeasure(460.0, 460.0, 1.0, 0.3)
+    result = GapResult("gap_unnamed", "A gap.", (), [], gap, (), {}, [check])
+    assert _unless_doubtful(result).says == "A gap. Nothing drives it."
+    agrees = replace(result, verdict="no_gap")
+    assert _unless_doubtful(agrees) == agrees

@@ -54,6 +54,29 @@ def test_columns_are_matched_by_their_names(names, expected):
         assert found[name] == (channel and f"panda.panda_joint{channel}"), name
 
 
+def test_a_unit_tells_what_a_column_is_beside_a_joints_name_alone():
+    joints = [JointName("a.q1"), JointName("a.slide", prismatic=True)]
+    names = {
+        "q1_rad": "q1.position", "q1_rpm": "q1.velocity", "q1_Nm": "q1.effort_measured",
+        "slide [mm]": "slide.position", "slide [mm/s]": "slide.velocity",
+        "slide [N]": "slide.effort_measured",
+    }  # fmt: skip
+    found = channels({"time": T} | sines(names), joints)
+    assert [found[n] for n in names] == [f"a.{c}" for c in names.values()]
+
+
+def test_a_slide_beyond_its_limits_in_m_is_in_mm():
+    joints = [JointName("a.slide", True, 0.0, 0.18)]
+    columns = {"time": T, "slide_pos": 90.0 + 50.0 * np.sin(3.0 * T)}
+    columns["slide_vel"] = 150.0 * np.cos(3.0 * T)
+    columns["slide_goal_pos"] = columns["slide_pos"] + 1.0
+    scale = {m.channel: m.scale for m in propose(columns, joints)}
+    assert scale["a.slide.position"] == 1e-3 == scale["a.slide.velocity"]
+    assert scale["a.slide.position_command"] == 1e-3
+    columns = {"time": T, "slide_pos": 0.09 + 0.05 * np.sin(3.0 * T)}
+    assert [m.scale for m in propose(columns, joints)] == [1.0, 1.0]
+
+
 def test_a_force_is_the_effort_of_a_joint_that_slides_and_has_its_name():
     """`joint` in a joint's own name does not make its force a position."""
     joints = [JointName("g.lift_joint", prismatic=True), JointName("g.yaw_joint")]

@@ -111,7 +111,7 @@ def propose(
         if set(words_of(name)) & _EPISODE and _counts(columns[name]):
             found[name] = Match(name, "episode", why="counts episodes")
             continue
-        quantity = _quantity(name)
+        quantity = _quantity(name, any(_names(name, joint) for joint in joints))
         if quantity is None:
             found[name] = Match(name, None, why="not a quantity that gap compares")
         else:
@@ -192,12 +192,17 @@ def _quoted(name: str) -> str:
 # ----- Quantities
 
 
-def _quantity(name: str) -> str | None:
+def _quantity(name: str, of_joint: bool) -> str | None:
+    """What a column is by its words, and by its unit where it has a joint's name."""
     words = words_of(name)
     if set(words) & _NEVER:
         return None
     command = bool(set(words) & _COMMAND)
     kind = next((kind for kind, own in _WORDS.items() if own & set(words)), None)
+    if kind == "position":  # A joint's own name may be q1, or have a `joint` in it.
+        kind = _quantity_of_unit(name) or kind
+    elif kind is None and of_joint and not command:
+        kind = _quantity_of_unit(name)
     if re.search(r"(^|[^a-z])[qv]_d_?\d*$", name.lower()):  # q_d, as in papers.
         command = True
     if kind is None and command:  # The joint's name says the rest.
@@ -211,6 +216,19 @@ def _quantity(name: str) -> str | None:
     if kind == "force":
         return _FORCE_COMMAND if command else _FORCE
     return f"{kind}_command" if command else kind
+
+
+def _quantity_of_unit(name: str) -> str | None:
+    """What the unit at a name's end tells of its quantity."""
+    unit = _unit_said(name, "")
+    if unit in _ANGLES or unit in _LENGTHS:
+        return "position"
+    if unit in _TORQUES:
+        return "effort"
+    if unit in _FORCES:
+        return "force"
+    per_sec = [f"{u}{end}" for u in (*_ANGLES, *_LENGTHS) for end in ("/s", "/sec")]
+    return "velocity" if unit in _SPIN or unit in per_sec else None
 
 
 def _plain(name: str) -> str:
@@ -401,23 +419,31 @@ def _in_si_by_size(found, told, columns, of) -> dict[str, Match]:
     out = {**found, **told}
     time = _with_channel(out, "time")
     degrees: dict[str, bool] = {}  # By the way a column is named.
+    millimetres: set[str] = set()  # Joints.
     for name, match in found.items():
         if match.channel is None or not match.channel.endswith(
             (".position", ".position_command")
         ):
             continue
         joint = of.get(match.channel.rsplit(".", 1)[0])
-        if joint is None or joint.prismatic:
+        if joint is None:
+            continue
+        if joint.prismatic:
+            if _in_millimetres(columns[name], joint):
+                millimetres.add(joint.name)
             continue
         degrees.setdefault(_template(name), False)
         degrees[_template(name)] |= _in_degrees(name, columns[name], joint)
     for name, match in found.items():
         if match.channel is None or name not in columns:
             continue
-        what = match.channel.rsplit(".", 1)[-1]
+        at, _, what = match.channel.rpartition(".")
         if what in ("position", "position_command") and degrees.get(_template(name)):
             why = "in degrees, by its name or its size"
             out[name] = Match(name, match.channel, DEG, why=f"{match.why}; {why}")
+        elif what in ("position", "position_command") and at in millimetres:
+            why = "in mm, by its size"
+            out[name] = Match(name, match.channel, 1e-3, why=f"{match.why}; {why}")
     for name, match in found.items():
         channel = match.channel or ""
         if not channel.endswith(".velocity") or time is None:
@@ -466,6 +492,15 @@ def _in_degrees(name: str, value: np.ndarray, joint: JointName) -> bool:
     if np.isfinite(limit):
         return most > 2.0 * limit and DEG * most < 1.3 * limit
     return most > 20.0
+
+
+def _in_millimetres(value: np.ndarray, joint: JointName) -> bool:
+    """Whether positions of a joint that slides fit its limits in mm, and not in m."""
+    limit = max(abs(joint.lower), abs(joint.upper))
+    if not np.isfinite(limit) or not np.isfinite(value).any():
+        return False
+    most = float(np.nanmax(np.abs(value)))
+    return most > 2.0 * limit and 1e-3 * most < 1.3 * limit
 
 
 def _rate_scale(columns, time: Match, position: Match | None, name: str):

@@ -12,7 +12,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
 from makebreak.gap.data.csv_table import text_columns
-from makebreak.gap.data.findings import GUESSED_GAINS, Finding
+from makebreak.gap.data.findings import GUESSED_GAINS, NO_DRIVE, Finding
 from makebreak.gap.data.proposal import (
     JointName,
     Match,
@@ -124,6 +124,7 @@ def matches_of(log: Log, robot: Robot | None) -> list[Match]:
     return propose(log.table.columns, joints, log.text)
 
 
+NO_ACTUATION = ["actuation: {type: none}"]
 FROM_SAG = "from how far joints sag below their commands"
 FROM_MOTION = "from how joints followed their commands"
 
@@ -131,23 +132,33 @@ FROM_MOTION = "from how joints followed their commands"
 @dataclass(frozen=True)
 class Proposal:
     """A scene and a sidecar for each log, as texts. notes: what was guessed. gains_of:
-    how drives' gains were guessed, in words; "" where none had to be."""
+    how drives' gains were guessed, in words; "" where none had to be. is_driven:
+    whether a column says what drives the joints."""
 
     scene: str
     sidecars: dict[Path, str]
     notes: tuple[str, ...]
     gains_of: str = ""
+    is_driven: bool = True
 
     def findings(self) -> list[Finding]:
         """What a result must not forget."""
-        if not self.gains_of:
-            return []
-        says = (
-            f"The gains of the drives in this proposed scene are {self.gains_of}: they "
-            "are not known."
-        )
         name = next(iter(self.sidecars), Path("")).stem
-        return [Finding(GUESSED_GAINS, name, "time", 0.0, "", "warning", says)]
+        found = []
+        if self.gains_of:
+            says = (
+                f"The gains of the drives in this proposed scene are {self.gains_of}: "
+                "they are not known."
+            )
+            found.append(Finding(GUESSED_GAINS, name, "time", 0, "", "warning", says))
+        if not self.is_driven:
+            says = (
+                "No column was taken for an effort or a command, so nothing drives the "
+                "joints of this proposed scene; if something does, name its column in "
+                "the sidecar."
+            )
+            found.append(Finding(NO_DRIVE, name, "time", 0, "", "warning", says))
+        return found
 
 
 def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
@@ -190,7 +201,8 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
     actuation, gains = _actuation(robot, kinds, every, logs, notes)
     lines += ["plant: {time_step: 0.001}", *actuation]
     sidecars = {path: sidecar_text(matches) for path, matches in every.items()}
-    return Proposal("\n".join(lines) + "\n", sidecars, tuple(notes), gains)
+    is_driven = actuation != NO_ACTUATION
+    return Proposal("\n".join(lines) + "\n", sidecars, tuple(notes), gains, is_driven)
 
 
 def _file(robot: Robot) -> str:
@@ -255,7 +267,7 @@ def _actuation(
             f"  kd: {kd}  # [N m s/rad], or [N s/m] of one that slides.",
         ], "a guess"
     notes.append("no command was found: nothing drives the joints")
-    return ["actuation: {type: none}"], ""
+    return NO_ACTUATION, ""
 
 
 def _inertia(robot: Robot) -> dict[str, float]:
