@@ -52,10 +52,10 @@ BALL_RESISTANCE = 0.005  # Lever arm over radius.
 class PlannerConfig:
     """The costs of C3+ and its ADMM weights (docs/c3.md), for forces in newtons."""
 
-    N: int = 5  # Number of knots of the plan, PLAN_DT = 0.1 s apart.
+    N: int = 5  # Number of knots of the plan, 0.1 s (PLAN_DT) apart.
     rounds: int = 4  # Number of ADMM rounds.
-    rho: float = 2.2  # Growth of the consensus weights from round to round.
-    tip: float = 500.0  # Weight of the tip's position; its velocity has 1/50 of it.
+    rho: float = 2.2  # Factor by which the consensus weights grow from round to round.
+    tip: float = 500.0  # Weight of the tip's position; its velocity gets 1/50 of it.
     ball: float = 5000.0  # Weight of the ball's position on the table.
     ball_velocity: float = 300.0  # Weight of the ball's velocity and angular velocity.
     # Consensus weight G of lam of tip and ball; that of eta is 1/10 of it.
@@ -84,7 +84,8 @@ class LearnerConfig:
     eps: float = 1e-3
     # Softness gamma of the contact equation [m/s per N]; default: the paper's.
     gamma: float = 5e-4
-    r_max: float = 0.7  # Bound of the residual [m/s]; 0.7 is a gap of 35 mm.
+    # Largest magnitude of the residual [m/s]; 0.7 is a gap of 35 mm.
+    r_max: float = 0.7
     # Noise of the measured gap speed mu |v_t| of a sliding contact; what exceeds it is
     # not taken for a gap [m/s].
     slip_noise: float = 0.03

@@ -71,7 +71,7 @@ SET_BY_DIAGRAM = {
 class PushPlannerConfig:
     """Horizon and cost of C3+; forces in newtons."""
 
-    N: int = 5  # Number of knots of the plan, PLAN_DT = 0.1 s apart.
+    N: int = 5  # Number of knots of the plan, 0.1 s (PLAN_DT) apart.
     rounds: int = 2  # Number of ADMM rounds.
     polish: int = 6  # Number of rollouts that improve the plan (docs/c3.md); 0: none.
     position: float = 5000.0  # Weight of the object's position on the table [1/m2].
@@ -104,7 +104,8 @@ class PushLearnerConfig:
     # Weight eps of the dynamics against the contact equation [m/s N].
     eps: float = 1e-3
     gamma: float = 5e-4  # Softness gamma of the contact equation [m/s per N].
-    r_max: float = 0.3  # Bound of the residual [m/s]; 0.3 is a gap of 15 mm.
+    # Largest magnitude of the residual [m/s]; 0.3 is a gap of 15 mm.
+    r_max: float = 0.3
     # Noise of the measured gap speed mu |v_t| of a sliding contact; what exceeds it is
     # not taken for a gap [m/s].
     slip_noise: float = 0.03

@@ -30,7 +30,8 @@ class ModeDetectorConfig:
     # or they are one mode.
     threshold: float = 0.04
     # Length of the tool along the motion, which it needs to cross a seam: nothing is
-    # decided before [m]; 0: it touches with one point. The diagram sets a sphere's.
+    # decided before [m]; 0: it touches with one point. changing_surface and
+    # surface_switch set that of a sphere.
     crossing: float = 0.03
     # Standard deviation of the noise of a sample of the wrench [N].
     force_noise: float = 0.1

@@ -88,7 +88,8 @@ class ResidualLearnerConfig:
     # Entries of r_comp that share one value, as lists of indices; entries in no list
     # stay zero; empty: each entry has its own value.
     groups: list[list[int]] = field(default_factory=list)
-    r_max: float = 1.0  # Bound of each entry of r_comp [m/s] (cartpole_walls: [m]).
+    # Largest magnitude of an entry of r_comp [m/s] (cartpole_walls: [m]).
+    r_max: float = 1.0
     # Noise of the measured gap speed mu |v_t| of a sliding Anitescu contact; what
     # exceeds it is not taken for a gap [m/s]; inf: nothing is corrected, as in the
     # paper.

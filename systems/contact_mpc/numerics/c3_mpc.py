@@ -93,9 +93,9 @@ class C3Weights:
 
 @dataclass
 class C3Options:
-    N: int = 5  # Number of knots of the plan, each lcs.dt long.
+    N: int = 5  # Number of knots of the plan, each a time step of the LCS long.
     rounds: int = 3  # Number of ADMM rounds.
-    # Growth of the consensus weights G from round to round, at least 1.
+    # Factor by which the consensus weights G grow from round to round, at least 1.
     rho: float = 2.0
     # Whether changes of the input cost, (u - u_prev)'R(u - u_prev); false: u'R u.
     penalise_input_change: bool = False

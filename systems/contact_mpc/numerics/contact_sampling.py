@@ -65,7 +65,7 @@ class SamplingConfig:
     # [x, y] [m]; push_object sets it.
     wrist: list[float] = field(default_factory=lambda: [0.0, 0.0])
     # Largest angle of a place from the x axis, along which the arm looks: beyond, the
-    # way there may lead through the arm's own base [rad].
+    # path there may lead through the arm's own base [rad].
     bearing: float = 1.05
     # Cost of a plan that leads the tip out of reach, for each knot: it will not be
     # carried out as it is [1/m2].
@@ -73,8 +73,8 @@ class SamplingConfig:
     # Length by which a plan may lead the wrist nearer than reach[0] at no cost [m].
     inwards: float = 0.01
     travel: float = 15.0  # Cost of a metre of the tip's path through the air [1/m].
-    # Amount by which another place has to cost less than the present one: a fraction of
-    # the present cost, plus an absolute cost.
+    # Amount by which another place has to cost less than the present one, [fraction of
+    # the present cost, absolute cost].
     hysteresis: list[float] = field(default_factory=lambda: [0.15, 1.0])
     # Force of the plan that is tried first, straight into the object [N].
     push: float = 4.0
