@@ -309,8 +309,8 @@ def add_ball_rolling(
     connect(c3, "lam", reference, "lam")
     connect(c3, "status", reference, "status")
     connect(lcs["command"], "lcs", reference, "lcs")
+    connect(estimator, "tip_force", reference, "tip_force")
     if not samples:
-        connect(estimator, "tip_force", reference, "tip_force")
         connect(task, "feel", reference, "feel")
     connect(station, f"{ARM}.position_measured", impedance, "q")
     connect(station, f"{ARM}.velocity_measured", impedance, "v")

@@ -39,7 +39,7 @@ from makebreak.diagrams.station import (
     make_station,
 )
 from makebreak.diagrams.tabletop import TOOL, objects
-from makebreak.diagrams.wiring import add_legend, timed
+from makebreak.diagrams.wiring import add_legend, refuse_changed, timed
 from makebreak.models.scene import Scene
 from makebreak.systems.arm.impedance_controller import (
     HybridConfig,
@@ -113,7 +113,7 @@ class ChangingContactConfig:
     hybrid: HybridConfig = field(
         default_factory=lambda: HybridConfig(damping_ratio=0.9)
     )
-    reflex: ImpactReflexConfig = field(default_factory=ImpactReflexConfig)  # Off.
+    reflex: ImpactReflexConfig = field(default_factory=ImpactReflexConfig)
     # Faults to inject, each NAME[:from=S,for=S] as of --fault.
     faults: list[str] = field(default_factory=list)
 
@@ -266,6 +266,8 @@ def _add_systems(
     builder: DiagramBuilder, config, arm: MultibodyPlant, pattern, known: Knowledge
 ) -> _Systems:
     # The approach speed of the anticipator depends on how hard the reflex brakes.
+    own = ("reflex_gain", "reflex_force_least")
+    refuse_changed("anticipator.speed", config.anticipator.speed, own)
     speed = replace(
         config.anticipator.speed,
         reflex_gain=config.reflex.gain,

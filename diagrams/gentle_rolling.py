@@ -203,8 +203,9 @@ class GentleRollingConfig:
     ball: BallRollingConfig = field(default_factory=_brisk_ball)
     touch: TouchConfig = field(default_factory=TouchConfig)
     push: PushMotionConfig = field(default_factory=PushMotionConfig)
-    # Surface of the table: plain, or felt_and_glass: felt where y > 0.085 m, else glass
-    # (on_two_surfaces has the settings that it replaces).
+    # Surface of the table: plain, or felt_and_glass: felt where y > 0.085 m, else
+    # glass. The latter replaces push.table_first, push.table_every, and press_table,
+    # slide and survey of push.shape.
     table: str = "plain"
     seed: int = 0  # Seed of the ball's start, a fruit's shape and the sensors' noise.
 
@@ -416,7 +417,7 @@ def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) ->
         "variable_impedance",
         VariableImpedance(timed(touch.variable_impedance, ARM_TICK, OFFSET)),
     )
-    blend = replace(touch.blend, period_sec=CONTROL, offset_sec=BLEND_OFFSET)
+    blend = timed(touch.blend, CONTROL, BLEND_OFFSET)
     add("reference_blend", ReferenceBlend(blend))
 
     def connect(source, output, *targets):

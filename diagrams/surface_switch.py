@@ -31,6 +31,7 @@ from makebreak.diagrams.tabletop import (
     set_tool,
     tool_half_width,
 )
+from makebreak.diagrams.wiring import refuse_changed
 from makebreak.models.friction_zones import FrictionZone
 from makebreak.models.scene import Scene, read_scene
 from makebreak.systems.arm.impedance_controller import HybridConfig
@@ -233,6 +234,7 @@ def make_surface_switch(
     modes, models = control.modes, control.forward_model
     # The length of a crossing follows from the tool's own geometry.
     crossing = modes.crossing if task.feet else SPHERE_CROSSING
+    refuse_changed("forward_model.handover", models.handover, ("rows",))
     handover = replace(models.handover, rows=2.0 * task.feet)
     return make_changing_contact(
         replace(

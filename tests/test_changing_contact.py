@@ -229,6 +229,14 @@ def test_periods_are_the_diagrams():
         build(tool="hammer")
 
 
+def test_the_anticipator_has_the_gain_of_the_reflex_and_no_other():
+    config = ChangingContactConfig()
+    config.anticipator.speed.reflex_gain = 3.0
+    message = "anticipator.speed.reflex_gain is 3.0, expected 0.0: the diagram sets it"
+    with pytest.raises(ValueError, match=message):
+        build(config=config)
+
+
 def test_all_that_read_the_wrench_read_it_without_the_sensor_s_bias():
     bias = np.array([0.4, -0.3, 0.5])
     diagram = build(errors=StationErrors(force_bias=bias))

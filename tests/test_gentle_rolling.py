@@ -470,6 +470,7 @@ def test_bad_settings_are_one_line(tmp_path, capfd):
     for setting, message in (
         ("ball.seed=3", "ball.seed is 3, expected 0: seed sets it"),
         ("touch.shaper.period_sec=0.1", "VelocityShaperConfig.period_sec is 0.1"),
+        ("touch.blend.period_sec=0.1", "ReferenceBlendConfig.period_sec is 0.1"),
         ("push.settle_sec=0", "push.settle_sec is 0.0, expected > 0"),
     ):
         arguments = ["run", "gentle_rolling", "--no-meshcat", "--out", str(tmp_path)]

@@ -479,6 +479,15 @@ def test_the_arm_goes_to_the_ball_and_rolls_it_on_along_the_circle():
     assert told == pytest.approx(0.05 * r) and abs(told) > 1e-4
 
 
+def test_a_touch_speed_has_the_force_that_it_asks_for():
+    reference = replace(SampledContactsConfig().reference, touch_speed=0.1)
+    contacts = replace(SampledContactsConfig(), reference=reference)
+    diagram = make_ball_rolling(config(contacts=contacts))
+    arm = diagram.GetSubsystemByName("arm_reference")
+    own = arm.GetMyContextFromRoot(diagram.CreateDefaultContext())
+    assert arm.GetInputPort("tip_force").HasValue(own)
+
+
 def test_what_does_not_go_with_it_is_refused_in_one_line():
     for change, message in (
         ({"controller": "paper"}, "controller=paper"),

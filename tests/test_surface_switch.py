@@ -159,6 +159,13 @@ def test_wrong_settings_are_refused_by_name(changes, message):
         make_task(SurfaceSwitchConfig(**changes))
 
 
+def test_rows_of_feet_are_those_of_the_tool():
+    config = SurfaceSwitchConfig()
+    config.control.forward_model.handover.rows = 0.01
+    with pytest.raises(ValueError, match="handover.rows is 0.01, expected 0.0: the di"):
+        make_surface_switch(config, make_task(config))
+
+
 def test_the_tool_decides_how_a_seam_is_crossed():
     for tool, rows, crossing in (("block", 0.024, 0.03), ("sphere", 0.0, 0.01)):
         config = SurfaceSwitchConfig(tool=tool)
