@@ -48,32 +48,48 @@ def number_of_processes(text: str | None) -> int:
 
 def _config_options(
     p: argparse.ArgumentParser,
-    model: str = "scene used by the controllers",
+    model: str = "scene used by the controllers: a file, or a name of `list`",
     seed: str = "seed of all random numbers",
 ) -> None:
     """Options that experiment_config reads. Args: model, seed: help of these two."""
     p.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", nargs="+",
-        help="settings; `makebreak list EXPERIMENT` shows them",
+        help="changes settings; `makebreak list EXPERIMENT` shows them",
     )  # fmt: skip
-    p.add_argument("--config", metavar="FILE", help="a YAML file of settings")
-    p.add_argument("--world", metavar="SCENE", help="simulated scene")
+    p.add_argument(
+        "--config", metavar="FILE", help="YAML file of settings, as of an earlier run"
+    )
+    p.add_argument(
+        "--world", metavar="SCENE", help="simulated scene: a file, or a name of `list`"
+    )
     p.add_argument("--model", metavar="SCENE", help=model)
     p.add_argument("--seed", metavar="N", help=seed)
-
-
-def _experiment_argument(p: argparse.ArgumentParser) -> None:
-    p.add_argument(
-        "experiment", nargs="?", default="ball_rolling", metavar="EXPERIMENT",
-        help="a name of `makebreak list` (ball_rolling)",
-    )  # fmt: skip
 
 
 def _fault_option(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--fault", action="append", default=[], metavar="NAME[:from=S,for=S]",
-        help="fault to inject; `list` has the names",
+        help="fault to inject, from S seconds on, for S seconds; `list` has the names",
     )  # fmt: skip
+
+
+def _experiment(
+    p: argparse.ArgumentParser,
+    default: str | None = None,
+    text: str = "name of `makebreak list`",
+) -> None:
+    """The experiment's name, which may be left out if there is a default."""
+    if default is None:
+        p.add_argument("experiment", metavar="EXPERIMENT", help=text)
+    else:
+        p.add_argument(
+            "experiment", nargs="?", default=default, metavar="EXPERIMENT",
+            help=f"{text} (default: {default})",
+        )  # fmt: skip
+
+
+def _sentence(text: str | None) -> str:
+    return f"{text[0].upper()}{text[1:]}" if text else ""
 
 
 def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
@@ -89,39 +105,51 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
 
     p = commands.add_parser(
         "list",
-        help="all experiments, scenes and faults; or the settings of one experiment",
+        help="show all experiments, scenes and faults, or an experiment's settings",
     )
     p.add_argument(
-        "experiment", nargs="?", metavar="EXPERIMENT",
-        help="show the settings of this experiment",
-    )  # fmt: skip
+        "experiment", nargs="?", metavar="EXPERIMENT", help="show its settings"
+    )
     p.add_argument(
         "text", nargs="?", default="", metavar="TEXT",
-        help="only settings with this text in the name or meaning",
+        help="show only settings with TEXT in the name or the meaning",
     )  # fmt: skip
 
-    p = commands.add_parser("run", help="run one experiment, with Meshcat")
-    _experiment_argument(p)
+    p = commands.add_parser("run", help="run one experiment, seen in Meshcat")
+    _experiment(p, "ball_rolling")
     _config_options(p)
-    p.add_argument("--duration", metavar="S", help="simulated seconds")
+    p.add_argument(
+        "--duration", metavar="S", help="simulated seconds (default: the experiment's)"
+    )
     _fault_option(p)
     p.add_argument(
-        "--robot", nargs="+", default=["sim"], metavar=("KIND", "FROM"),
-        help="sim (default), lcm [URL] (a robot behind LCM), or replay RECORDING",
+        "--robot", nargs="+", default=["sim"], metavar=("sim|lcm|replay", "ARGUMENT"),
+        help="sim: the simulated world (default); lcm [URL]: a robot behind LCM; "
+        "replay RECORDING: the sensors of a recording",
     )  # fmt: skip
     p.add_argument(
-        "--no-meshcat", action="store_true", help="no viewer, no meshcat.html"
+        "--no-meshcat",
+        action="store_true",
+        help="open no viewer and write no meshcat.html",
     )
-    p.add_argument("--realtime", metavar="RATE", help="speed limit; 1: real time")
     p.add_argument(
-        "--diagram", metavar="FILE", help="write the diagram as .svg, .png or .pdf"
+        "--realtime",
+        metavar="RATE",
+        help="largest simulated seconds per second; 1: real time (default: no limit)",
     )
-    p.add_argument("--out", metavar="DIR", help="default: runs/<experiment>-<time>")
+    p.add_argument(
+        "--diagram",
+        metavar="FILE",
+        help="write an image of the diagram: .svg, .png or .pdf",
+    )
+    p.add_argument(
+        "--out", metavar="DIR", help="output folder (runs/<experiment>-<time>)"
+    )
 
     p = commands.add_parser(
-        "station", help="simulate a robot behind LCM, for `run --robot lcm`"
+        "station", help="simulate a robot behind LCM, to try `run --robot lcm`"
     )
-    _experiment_argument(p)
+    _experiment(p, "ball_rolling", "so far ball_rolling only")
     p.add_argument(
         "--rate", default="1", metavar="R", help="simulated seconds per second (1)"
     )
@@ -129,10 +157,10 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
         "--drop", default="0", metavar="SHARE", help="fraction of messages lost (0)"
     )
     p.add_argument(
-        "--delay", default="0", metavar="S", help="delay of messages [s] (0)"
+        "--delay", default="0", metavar="S", help="delay of messages in seconds (0)"
     )
     p.add_argument(
-        "--url", metavar="URL", help="LCM address; default: this machine only"
+        "--url", metavar="URL", help="LCM's address (default: this machine only)"
     )
     p.add_argument(
         "--duration", default="86400", metavar="S", help="simulated seconds (86400)"
@@ -141,56 +169,63 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
     _config_options(p, model="not used by a station")
 
     p = commands.add_parser(
-        "reproduce", help="the papers' figures and tables beside ours"
+        "reproduce", help="show the papers' figures and tables beside ours"
     )
     p.add_argument(
         "experiments",
         nargs="*",
         metavar="EXPERIMENT",
-        help="an experiment, gap, faults or close_the_loop; default: all experiments",
+        help="an experiment, gap, faults or close_the_loop (default: all experiments)",
     )
     p.add_argument("--seeds", default="10", metavar="N", help="trials per case (10)")
     p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
     p.add_argument(
         "--set", dest="which", default="standard", metavar="SET",
-        help="for gap: standard, development, logs-development, logs-final, "
-        "contact-development or contact-final",
+        help="set of cases, for gap: standard (default), development, "
+        "logs-development, logs-final, contact-development or contact-final",
     )  # fmt: skip
     p.add_argument(
         "--only",
         default="",
         metavar="TEXT",
-        help="for gap, faults, close_the_loop: only cases with TEXT in the name",
+        help="only cases with TEXT in the name, for gap, faults, close_the_loop",
     )
     p.add_argument(
-        "--seed", metavar="N", help="for gap, faults, close_the_loop: first seed"
+        "--seed", metavar="N", help="first seed, for gap, faults, close_the_loop"
     )
     p.add_argument(
-        "--reuse", action="store_true", help="keep complete trials of an earlier call"
+        "--reuse",
+        action="store_true",
+        help="do not repeat complete trials of an earlier call with the same --out",
     )
-    p.add_argument("--out", metavar="DIR", help="default: runs/reproduce-<time>")
+    p.add_argument("--out", metavar="DIR", help="output folder (runs/reproduce-<time>)")
 
     p = commands.add_parser(
         "sweep", help="run one experiment with many seeds and settings"
     )
+    _experiment(p)
     p.add_argument(
-        "experiment", metavar="EXPERIMENT", help="a name of `makebreak list`"
+        "--trials", required=True, metavar="N", help="trials per case, each with a seed"
     )
-    p.add_argument("--trials", required=True, metavar="N", help="seeds for each case")
     p.add_argument(
         "--vary", action="append", default=[], metavar="KEY=LO:HI", nargs="+",
-        help="LO:HI: drawn for each trial; A,B,C: each value is a case",
+        help="settings that vary; LO:HI: drawn for each trial; A,B,C: a case each",
     )  # fmt: skip
     _config_options(p, seed="seed of the first trial (0)")
-    p.add_argument("--duration", metavar="S", help="simulated seconds")
+    p.add_argument(
+        "--duration", metavar="S", help="simulated seconds (default: the experiment's)"
+    )
     p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
     p.add_argument(
-        "--cluster", metavar="ADDRESS", help="Dask: tcp://HOST:PORT; Ray: ray:HOST:PORT"
+        "--cluster",
+        metavar="ADDRESS",
+        help="cluster for the trials: tcp://HOST:PORT (Dask) or ray:HOST:PORT (Ray)",
     )
     p.add_argument(
         "--out",
         metavar="DIR",
-        help="default: runs/sweep-<experiment>-<time>; an earlier sweep is continued",
+        help="output folder (runs/sweep-<experiment>-<time>); a sweep that is there is "
+        "continued",
     )
 
     p = commands.add_parser(
@@ -199,87 +234,99 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
     p.add_argument(
         "scene",
         metavar="SCENE",
-        help="the model: a scene file, a name of `list`, or a .urdf or .sdf (a scene "
-        "is then proposed)",
+        help="the model: a scene file, a scene's name of `list`, or a .urdf or .sdf (a "
+        "scene is then proposed)",
     )
     p.add_argument(
         "recordings",
         nargs="+",
         metavar="RECORDING",
-        help=".csv, .npz, .parquet, a ROS bag, a LeRobot dataset",
+        help="a log: .csv, .npz, .parquet, a ROS bag or a LeRobot dataset",
     )
     p.add_argument(
         "--skip-bad-rows",
         action="store_true",
-        help="skip rows that cannot be read; their number is printed",
+        help="skip rows that cannot be read, and print their number",
     )
     p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
-    p.add_argument("--out", metavar="DIR", help="default: runs/gap-<time>")
+    p.add_argument("--out", metavar="DIR", help="output folder (runs/gap-<time>)")
     p.add_argument(
-        "--export", metavar="FORMATS", help="also write the repaired model: urdf,mjcf"
+        "--export",
+        metavar="FORMATS",
+        help="also write the repaired model as urdf, mjcf, or urdf,mjcf",
     )
 
     p = commands.add_parser(
-        "inspect", help="show columns or topics of a log, with rates, holes and units"
+        "inspect",
+        help="show the columns or topics of a log, with rates, missing samples, units",
     )
     p.add_argument(
-        "log", metavar="LOG", help=".csv, .npz, .parquet, a ROS bag, a LeRobot dataset"
+        "log",
+        metavar="LOG",
+        help="a log: .csv, .npz, .parquet, a ROS bag or a LeRobot dataset",
     )
     p.add_argument(
         "--robot",
         metavar="FILE",
-        help=".urdf or .sdf; columns are matched to its joints",
+        help="the robot's .urdf or .sdf; columns are matched to its joints",
     )
-    p.add_argument("--out", metavar="DIR", help="write the proposed sidecar there")
+    p.add_argument(
+        "--out", metavar="DIR", help="folder for the proposed sidecar (default: none)"
+    )
 
     p = commands.add_parser(
         "close-the-loop",
-        help="run with a wrong model, gap on it, run with the repaired model",
+        help="run with a wrong model, repair the model with gap, run again",
     )
-    _experiment_argument(p)
+    names = "ball_rolling, contact_learning, multiple_collisions or changing_surface"
+    _experiment(p, "ball_rolling", names)
     p.add_argument(
         "--radius-error",
         default="0.005",
         metavar="M",
-        help="radius error of the ball's model (0.005 m)",
+        help="error of the ball's radius in ball_rolling's model, in metres (0.005)",
     )
     p.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", nargs="+",
-        help="settings of both runs",
+        help="changes settings of both runs",
     )  # fmt: skip
     p.add_argument("--seed", default="0", metavar="N", help="seed of both runs (0)")
     p.add_argument("--duration", metavar="S", help="simulated seconds of each run")
-    p.add_argument("--jobs", metavar="N", help="processes at once in gap")
-    p.add_argument("--out", metavar="DIR", help="default: runs/close-the-loop-<time>")
+    p.add_argument(
+        "--jobs", metavar="N", help="processes at once in gap (one per core)"
+    )
+    p.add_argument(
+        "--out", metavar="DIR", help="output folder (runs/close-the-loop-<time>)"
+    )
 
     p = commands.add_parser(
         "export-tests",
         help="write a test for each system, from its inputs and outputs in a run",
     )
+    _experiment(p)
     p.add_argument(
-        "experiment", metavar="EXPERIMENT", help="a name of `makebreak list`"
+        "--systems",
+        metavar="A,B",
+        help="names of systems (default: all that update their state periodically)",
     )
-    p.add_argument(
-        "--systems", metavar="A,B", help="names; default: all systems with updates"
-    )
-    p.add_argument("--out", metavar="DIR", required=True, help="a new folder")
+    p.add_argument("--out", metavar="DIR", required=True, help="a new output folder")
     p.add_argument("--seconds", metavar="S", default="5", help="recorded seconds (5)")
     _config_options(p)
 
     p = commands.add_parser(
-        "compile", help="compile now what the first run would compile"
+        "compile", help="compile now what the first run of an experiment would compile"
     )
     p.add_argument(
         "experiments", nargs="*", metavar="EXPERIMENT",
-        help="default: ball_rolling and cartpole_walls",
+        help="names of `makebreak list` (default: ball_rolling and cartpole_walls)",
     )  # fmt: skip
     p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
 
     p = commands.add_parser("bench", help="measure compute times, as table and JSON")
     p.add_argument(
         "names", nargs="*", metavar="NAME",
-        help="c3, lcs, learner, impedance, push, camera, latency, diagrams or gap; "
-        "default: all",
+        help="c3, lcs, learner, impedance, push, camera, latency, diagrams or gap "
+        "(default: all)",
     )  # fmt: skip
 
     p = commands.add_parser("completion", help="print the script for tab completion")
@@ -287,8 +334,10 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
     for name in ("run", "gap", "export-tests"):
         commands.choices[name].add_argument(
             "--package", action="append", default=[], metavar="NAME=PATH",
-            help="folder of package://NAME in model files",
+            help="folder that package://NAME in model files stands for",
         )  # fmt: skip
+    for line in commands._choices_actions:  # Above a command's own options too.
+        commands.choices[line.dest].description = f"{_sentence(line.help)}."
     for name, each in commands.choices.items():
         options = list(each._option_string_actions)
         each.set_defaults(function=functions[name], options=options)

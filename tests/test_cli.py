@@ -22,6 +22,8 @@ import spring_mass
 
 import makebreak
 from makebreak.scripts import bench, cli, command_inputs, experiments, trials
+from makebreak.scripts.arguments import make_parser
+from makebreak.scripts.close_contact_loop import SETTINGS
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.settings import apply_settings
 
@@ -510,6 +512,23 @@ def test_the_settings_of_every_bench_are_accepted(name):
         config = apply_settings(module.Config(), trials.setting_texts(values))
         if name == "wall_friction":
             assert config.training.trials >= len(module.VARIED)
+
+
+def test_help_explains_every_argument_and_names_what_may_be_named():
+    parser = make_parser(cli._COMMANDS)
+    (commands,) = (a.choices for a in parser._actions if a.choices)
+    for name, command in commands.items():
+        assert command.description, name
+        for action in command._actions:
+            assert len((action.help or "").split()) > 1, (name, action.dest)
+
+    def said(name, dest):
+        (text,) = (a.help for a in commands[name]._actions if a.dest == dest)
+        return set(re.findall(r"\w+", text))
+
+    assert set(bench.BENCHES) <= said("bench", "names")
+    assert set(cli._COMPILED) <= said("compile", "experiments")
+    assert {"ball_rolling", *SETTINGS} <= said("close-the-loop", "experiment")
 
 
 @pytest.mark.parametrize("words", [["list"], ["--help"], ["run", "--help"]])

@@ -44,7 +44,7 @@ from makebreak.systems.contact_mpc.numerics.residual_learner import (
     violation_loss,
 )
 
-SUMMARY = "a cart-pole between soft walls, misplaced in its model (ACI-MPC VII-A)"
+SUMMARY = "a cart-pole between soft walls that its model misplaces (ACI-MPC VII-A)"
 Config = CartpoleWallsConfig
 
 DURATION = 8.0  # [s]

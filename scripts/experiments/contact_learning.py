@@ -61,7 +61,7 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
 )
 from makebreak.systems.changing_contact.numerics.impact_score import impact, low_pass
 
-SUMMARY = "learns the positions and approach speeds of three contacts (CC fig. 18)"
+SUMMARY = "an arm learns places and approach speeds of three contacts (CC fig. 18)"
 Config = ContactLearningConfig
 
 DURATION_SEC = 120.0  # Time limit of a trial.

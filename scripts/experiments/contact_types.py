@@ -36,7 +36,7 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
     PHASE_STAGE,
 )
 
-SUMMARY = "a block on its face, edge and corner: modes by force and torque (CC 3.2)"
+SUMMARY = "a block slides on face, edge, corner: modes by force and torque (CC 3.2)"
 Config = ContactTypesConfig
 DURATION_SEC = 120.0  # At most.
 BENCH: dict[str, dict] = {"contact_types": {}}

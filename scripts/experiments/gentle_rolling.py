@@ -50,7 +50,7 @@ from makebreak.systems.changing_contact.numerics.push_motion import (
     TABLE_SEGMENT,
 )
 
-SUMMARY = "a ball is rolled with gentle contacts: all seven systems in one diagram"
+SUMMARY = "a Panda rolls a ball with gentle contacts: all seven systems in one diagram"
 Config = GentleRollingConfig
 
 DURATION_SEC, SAMPLE = rolling_score.DURATION_SEC, rolling_score.SAMPLE

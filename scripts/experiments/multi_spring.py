@@ -68,7 +68,7 @@ from makebreak.scripts.table import Table
 from makebreak.systems.baselines.mrac import MracConfig
 from makebreak.systems.planar.numerics.planar_impedance import persistence
 
-SUMMARY = "a circle while three springs pull, with MRAC, AIC and BAC (CC fig. 5-7)"
+SUMMARY = "a point follows a circle while springs pull; baselines (CC fig. 5-7)"
 Config = MultiSpringConfig
 
 RATIO_BOUND, STIFFNESS_BOUND = 3.0, 0.25

@@ -54,7 +54,7 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
 from makebreak.systems.changing_contact.numerics.impact_reflex import fastest_impact
 from makebreak.systems.changing_contact.numerics.impact_score import impact, low_pass
 
-SUMMARY = "four contacts, with and without contact handling (CC fig. 16)"
+SUMMARY = "an arm makes four contacts, with and without handling them (CC fig. 16)"
 Config = MultipleCollisionsConfig
 BENCH = {"multiple_collisions": {"trials": 1}}
 

@@ -49,7 +49,7 @@ from makebreak.systems.baselines.numerics.fixed_gmm import fit_mixture
 from makebreak.systems.changing_contact.numerics.igmm import regress
 from makebreak.systems.planar.numerics.planar_impedance import features_of, persistence
 
-SUMMARY = "stirring thickening porridge: fixed and incremental models (CC fig. 4)"
+SUMMARY = "a point stirs porridge that thickens; force models compared (CC fig. 4)"
 Config = PorridgeConfig
 
 RATIO_BOUND = 5.0

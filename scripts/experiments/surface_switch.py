@@ -57,7 +57,7 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
 )
 from makebreak.systems.changing_contact.numerics.impact_score import low_pass
 
-SUMMARY = "a change of surface, unknown, then anticipated (CC fig. 19, 20)"
+SUMMARY = "a block meets a change of surface, later expects it (CC fig. 19, 20)"
 Config = SurfaceSwitchConfig
 
 DURATION_SEC = 120.0  # Of a trial, at most.

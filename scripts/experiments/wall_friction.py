@@ -59,7 +59,7 @@ from makebreak.systems.baselines.numerics.long_term_predictor import (
     train,
 )
 
-SUMMARY = "forward models compared with a GP baseline at a wall (CC 4.4)"
+SUMMARY = "a block slides along a wall: forward models and a GP baseline (CC 4.4)"
 Config = WallFrictionConfig
 # As little training as is accepted: what is timed is the trial.
 BENCH = {
