@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from makebreak.gap.residuals.inverse import Track
+from makebreak.gap.residuals.track import Track
 
 ROBUST = 1.4826  # Standard deviation over median absolute deviation, if normal.
 # Over what is left elsewhere, for so many test functions in a row (0.1 s apart).

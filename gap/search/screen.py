@@ -7,7 +7,8 @@ import numpy as np
 
 from makebreak.gap.numerics.selection import LinearFit, Screen
 from makebreak.gap.problem import Candidate, Nuisances, share_left
-from makebreak.gap.residuals.inverse import SENSED, InverseModel
+from makebreak.gap.residuals.inverse import InverseModel
+from makebreak.gap.simulation.channel_effects import SENSED
 from makebreak.gap.thresholds import SINGLE_SHARE_OF_GROUP
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import (

@@ -8,7 +8,8 @@ from scipy.stats import chi2
 
 from makebreak.gap.data.recording import unit_of
 from makebreak.gap.numerics.selection import benjamini_hochberg
-from makebreak.gap.residuals.inverse import REST_SPEED, InverseModel
+from makebreak.gap.residuals.inverse import InverseModel
+from makebreak.gap.residuals.whitened_rows import REST_SPEED
 from makebreak.gap.result import Unexplained, Where
 from makebreak.models.effects.kind import full_name, one_dof_joints
 
@@ -39,7 +40,7 @@ def where_in_motion(model: InverseModel, left: np.ndarray) -> list[Where]:
         rows = R[first : first + n]
         first += n
         stretch = ((track.bumps.centre - track.time[0]) / 0.5).astype(int)
-        _, v = model._qv(track)
+        _, v = track.motion_at_middles()
         for number in np.unique(stretch):
             mine = np.flatnonzero(stretch == number)
             half = 0.5 * track.bumps.width

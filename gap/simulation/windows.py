@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from makebreak.gap.data.recording import Episode, Recording
-from makebreak.gap.residuals.inverse import (
-    _lag,
-    _sensing,
+from makebreak.gap.simulation.channel_effects import (
     given_late,
+    lag_of,
     rotor_before,
+    sensing,
 )
 from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
@@ -436,7 +436,7 @@ class WindowModel(WindowedResidual):
         filters = {}
         for channel in self.channels:
             own = self._filters[w.recording].get(channel, ())
-            if stages := with_lag(own, _lag(effects, channel)):
+            if stages := with_lag(own, lag_of(effects, channel)):
                 filters[channel] = stages
         if not filters:
             return None
@@ -478,14 +478,14 @@ class WindowModel(WindowedResidual):
         measured = [e for e in (*self.scene.effects, *effects) if KINDS[e.kind].channel]
 
         def state(name: str) -> np.ndarray:
-            scale, late, bias = _sensing(measured, name)
+            scale, late, bias = sensing(measured, name)
             if scale == 1.0 and late == 0.0:
                 x = w.state[name]
             else:
                 at = w.start * scale + late
                 x = np.array([np.interp(at, path["time"], y) for y in path[name].T])
                 x = x * np.array([1.0, scale, scale**2])
-            lag = _lag(measured, name)
+            lag = lag_of(measured, name)
             if lag:  # What a low-pass took: true = measured + T d/dt measured.
                 x = x + lag * np.array([x[1], x[2], 0.0])
             return x - np.array([bias, 0.0, 0.0])

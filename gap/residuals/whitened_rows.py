@@ -1,0 +1,252 @@
+"""Residuals of a mechanism as rows over their noise, one for each test function.
+
+A row is the mean over a test function of a joint's equation, or of what another channel
+shows of the same motion: the noise of positions, twice differentiated, goes through the
+mass matrix into all joints' equations.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from makebreak.gap.data.recording import Recording
+from makebreak.gap.residuals.mechanism_motion import MechanismMotion
+from makebreak.gap.residuals.track import Track
+from makebreak.models.scene import Scene
+
+OTHERS = ("velocity", "effort_measured")  # Channels that are compared beside.
+# A joint that stands still, slower than this [rad/s], or [m/s], may be held by any
+# friction: what its equation says then is given this share of its rms effort as
+# uncertainty, by the share of time at rest.
+REST_SPEED, REST_SHARE, REST_EFFORT = 0.005, 0.04, 0.3
+# Sampled at the very instants at which a stiff drive gets new commands, a velocity is
+# off by a share of itself.
+DRIVE_VELOCITY = 0.01
+MODEL_ERROR = 2e-4  # Of a joint's rms effort: what smoothing and sampling leave.
+LEAST_EFFORT = 0.1  # Of a joint, as a share of the largest joint's: rms.
+LEAST_STD = 1e-12  # Of a channel that has no noise.
+
+
+class WhitenedRows(MechanismMotion):
+    """The rows of all tracks, track by track and test function by test function: the
+    joints' equations, then the other channels, in the order of names().
+
+    Arguments: as of MechanismMotion.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        recordings: Sequence[Recording],
+        bump_sec: float = 0.2,
+        block_sec: float = 1.2,
+        most_sec: float = 60.0,
+    ):
+        super().__init__(scene, recordings, bump_sec, block_sec, most_sec)
+        self._noises = self._noise_of_rows()
+        # What models are off by, beside noise [N m, rad/s].
+        self.model_error = {
+            what: np.zeros(len(self.joints)) for what in ("effort", *OTHERS)
+        }
+        self._plain = self._whitened_by(self.model_error)
+        self._whiteners = self._plain
+
+    def _noise_of_rows(self) -> list[dict[str, np.ndarray]]:
+        """For each track: the covariance of each bump's residual efforts, and standard
+        deviations of the other channels', as the sensors' noise gives them."""
+        efforts = [self._effort(t, (), *t.motion_at_middles()) for t in self.tracks]
+        rms = rms_of(np.concatenate(efforts))
+        rms = np.maximum(rms, LEAST_EFFORT * rms.max())
+        kp, kd = np.zeros(len(self.joints)), np.zeros(len(self.joints))
+        for i, law in enumerate(self.laws):
+            if law is not None:
+                kp[i], kd[i] = law.kp, law.kd + law.emf
+        return [self._noise_of(track, rms, kp, kd) for track in self.tracks]
+
+    def _noise_of(self, track: Track, rms, kp, kd) -> dict[str, np.ndarray]:
+        """The same of one track; rms (n_v,) of the efforts, kp, kd (n_v,) of drives'
+        own loops."""
+        q, v = track.motion_at_middles()
+        period = track.spacing([f"{j}.position" for j in self.joints])
+        g2 = track.bumps.position_noise_gain(period)
+        g0 = track.bumps.noise_gain(period)
+        g_v, g_e = (self._gains(track, what, g0) for what in OTHERS)
+        # When within a period an effort was sampled is not known.
+        mean = track.bumps.mean(self._effort(track, (), q, v))
+        rate = np.gradient(mean, track.bumps.centre, axis=0)
+        raw = min(r.period_sec() for r in self.recordings)
+        e_std = np.hypot(MODEL_ERROR * rms, 0.5 * raw * rms_of(rate))
+        direct = (kp * self.noise * g0) ** 2 + (MODEL_ERROR * rms) ** 2
+        direct += np.array(self.by_measured) * (self.effort_noise * g_e) ** 2
+        rest = track.bumps.mean((np.abs(v) < REST_SPEED).astype(float))
+        held = np.where(rest > REST_SHARE, rest, 0.0) * REST_EFFORT * rms
+        centre = np.clip(
+            np.searchsorted(track.middle, track.bumps.centre), 0, len(q) - 1
+        )
+        C = np.empty((len(centre), len(self.joints), len(self.joints)))
+        for b, k in enumerate(centre):
+            M = self._mass_matrix(q[k])
+            C[b] = (M * (g2 * self.noise) ** 2) @ M.T
+            C[b] += np.diag(direct + held[b] ** 2)
+        # The smoothed velocity's own error, as over one bump.
+        own = self.noise * np.sqrt(period * 12.0 / track.bumps.width**3)
+        v_std = np.hypot(self.velocity_noise * g_v * self._together, own)
+        v_std = np.hypot(v_std, np.where(kd > 0.0, DRIVE_VELOCITY * rms_of(v), 0.0))
+        return {
+            "effort": C,
+            "velocity": np.maximum(v_std, LEAST_STD),
+            "effort_measured": np.maximum(
+                np.hypot(self.effort_noise * g_e, e_std), LEAST_STD
+            ),
+        }
+
+    def _gains(self, track: Track, what: str, otherwise: float) -> np.ndarray:
+        """(n_v,) how much of a channel's noise a mean over a bump has."""
+        return np.array([
+            track.bumps.noise_gain(track.spacing([f"{j}.{what}"])) if has else otherwise
+            for j, has in zip(self.joints, self.has[what], strict=True)
+        ])  # fmt: skip
+
+    def _whitened_by(self, error) -> list[dict[str, np.ndarray]]:
+        """For each track: inverse square roots of the efforts' covariance with what
+        models are off by, and standard deviations of the other channels'."""
+        out = []
+        for noise in self._noises:
+            C = noise["effort"] + np.diag(error["effort"] ** 2)
+            each = {"effort": np.linalg.inv(np.linalg.cholesky(C))}
+            for what in OTHERS:
+                each[what] = np.hypot(noise[what], error[what])
+            out.append(each)
+        return out
+
+    def allow(
+        self, error: dict[str, np.ndarray], more: np.ndarray | None = None
+    ) -> Callable[[np.ndarray], np.ndarray]:
+        """Takes models to be off by so much, {what: (n_joints,)} [N m, rad/s], beside
+        noise. Returns: what gives rows (m, ...) of before in the new units.
+
+        Args: more (n_bumps, n_joints): further noise of the joints' equations [N m].
+        """
+        old = self._whiteners
+        if more is not None:
+            first = 0
+            for noise in self._noises:
+                C = noise["effort"]
+                each = more[first : first + len(C)]
+                first += len(C)
+                C += np.eye(C.shape[1]) * each[:, None] ** 2
+            self._plain = self._whitened_by({w: 0.0 * x for w, x in error.items()})
+        self.model_error = error
+        self._whiteners = self._whitened_by(error)
+        new = self._whiteners
+        return lambda rows: self._rewhitened(rows, old, new)
+
+    def in_noise(self, left: np.ndarray) -> np.ndarray:
+        """Rows (m,) over the sensors' noise alone."""
+        return self._rewhitened(left, self._whiteners, self._plain)
+
+    def in_units(self, left: np.ndarray) -> np.ndarray:
+        """(n_bumps, n_names) of rows (m,): [N m] or [N], and units of channels."""
+        return self._rewhitened(left, self._whiteners, None).reshape(
+            -1, len(self.names())
+        )
+
+    def noise_in_units(self) -> np.ndarray:
+        """(n_bumps, n_names) standard deviations that the sensors' noise gives."""
+        others = self._other_names()
+        found = []
+        for noise in self._noises:
+            C = noise["effort"]
+            std = np.sqrt(np.einsum("bii->bi", C))
+            row = [noise[what][self.joints.index(joint)] for what, joint in others]
+            found.append(np.hstack([std, np.tile(row, (len(C), 1))]))
+        return np.concatenate(found)
+
+    def _rewhitened(self, rows: np.ndarray, old, new) -> np.ndarray:
+        """Rows (m, ...) in the units of other whiteners; None: in the channels' own."""
+        k, n = len(self.names()), len(self.joints)
+        others = self._other_names()
+        parts, first = [], 0
+        for i, track in enumerate(self.tracks):
+            size = len(track.bumps.centre)
+            mine = np.array(rows[first : first + size * k])
+            first += size * k
+            mine = mine.reshape(size, k, *rows.shape[1:])
+            T = np.linalg.inv(old[i]["effort"])
+            if new is not None:
+                T = new[i]["effort"] @ T
+            mine[:, :n] = np.einsum("bij,bj...->bi...", T, mine[:, :n])
+            for c, (what, joint) in enumerate(others):
+                j = self.joints.index(joint)
+                by = 1.0 if new is None else new[i][what][j]
+                mine[:, n + c] *= old[i][what][j] / by
+            parts.append(mine.reshape(size * k, *rows.shape[1:]))
+        return np.concatenate(parts)
+
+    def _mass_matrix(self, q) -> np.ndarray:
+        plant, context = self.dynamics.plant, self.dynamics._context
+        plant.SetPositions(context, q)
+        return plant.CalcMassMatrix(context)
+
+    def _stacked(self, track, white, efforts, others) -> np.ndarray:
+        """Rows of one track: bump by bump, efforts of all joints, then the others."""
+        shape = efforts.shape[2:]
+        e = np.einsum("bij,bj...->bi...", white["effort"], efforts)
+        parts = [e]
+        for what in OTHERS:
+            for i, joint in enumerate(self.joints):
+                if (what, joint) not in self._other_names():
+                    continue
+                if others is None:
+                    parts.append(np.zeros((len(e), 1, *shape)))
+                else:
+                    y = others[f"{joint}.{what}"] / white[what][i]
+                    parts.append(y[:, None])
+        return np.concatenate(parts, axis=1).reshape(-1, *shape)
+
+    def _other_names(self) -> list[tuple[str, str]]:
+        v = [("velocity", j) for i, j in enumerate(self.joints)
+             if self.has["velocity"][i]]  # fmt: skip
+        u = [
+            ("effort_measured", j)
+            for i, j in enumerate(self.joints)
+            if self.has["effort_measured"][i] and not self.by_measured[i]
+        ]
+        return v + u
+
+    def names(self) -> list[tuple[str, str]]:
+        """(what, joint) of the entries of one bump."""
+        return [("effort", joint) for joint in self.joints] + self._other_names()
+
+    def train(self) -> np.ndarray:
+        """(m,) booleans."""
+        k = len(self.names())
+        return np.concatenate([np.repeat(t.train, k) for t in self.tracks])
+
+    def blocks(self) -> np.ndarray:
+        """(m,) number of the block of time of each row."""
+        k, first, numbers = len(self.names()), 0, []
+        for track in self.tracks:
+            numbers.append(np.repeat(first + track.block, k))
+            first += int(track.block.max(initial=-1)) + 1
+        return np.concatenate(numbers)
+
+    def channel_of_rows(self) -> np.ndarray:
+        """(m,) index in names() of each row."""
+        n = sum(len(t.bumps.centre) for t in self.tracks)
+        return np.tile(np.arange(len(self.names())), n)
+
+    def columns_of(self, efforts: Sequence[np.ndarray]) -> np.ndarray:
+        """(m, k) from columns of the residual effort at the middles of each track,
+        (n, n_v, k)."""
+        parts = []
+        for track, white, columns in zip(
+            self.tracks, self._whiteners, efforts, strict=True
+        ):
+            mean = track.bumps.mean(columns)
+            parts.append(self._stacked(track, white, mean, None))
+        return np.concatenate(parts)
+
+
+def rms_of(x: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.mean(x**2, axis=0))
