@@ -174,7 +174,8 @@ def _sweep(args) -> int:
     table, files = run_sweep(
         sweep, out, number_of_processes(args.jobs), args.cluster, inputs=inputs
     )
-    print(table.to_text())
+    is_wide = len(table.columns) > len(table.rows) + 1
+    print((table.transposed() if is_wide else table).to_text())
     print_files(files)
     return 1 if table.notes else 0  # A note: a trial failed.
 

@@ -251,7 +251,8 @@ def _table(sweep, groups, measured) -> Table:
             for r in group
             if "error" in r
         ]
-    title = f"{sweep.experiment}, {sweep.trials} trials per case"
+    trials = f"{sweep.trials} trial{'s' if sweep.trials > 1 else ''}"
+    title = f"{sweep.experiment}, {trials} per case"
     if sweep.ranges:
         drawn = ", ".join(f"{k} {lo:g}..{hi:g}" for k, (lo, hi) in sweep.ranges.items())
         title += f", drawn from {drawn}"

@@ -75,6 +75,13 @@ class Table:
         lines = [self.title, "", line(heads), rule, *map(line, rows), *self.notes]
         return "\n".join(lines) + "\n"
 
+    def transposed(self) -> "Table":
+        """Columns as rows: for few rows of many columns in a terminal."""
+        heads, rows = self._cells()
+        names = [heads[0], *(row[0] for row in rows)]
+        turned = list(zip(heads[1:], *(row[1:] for row in rows), strict=True))
+        return Table(self.title, names, turned, notes=self.notes)
+
     def to_markdown(self) -> str:
         """The table as a Markdown section."""
         heads, rows = self._cells()

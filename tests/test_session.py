@@ -442,6 +442,21 @@ def test_a_table_is_aligned_and_says_which_rows_miss_their_target():
         Table("Title", ("a",), [(1,), (2,)], met=(True,))
 
 
+def test_a_transposed_table_has_a_column_for_each_row():
+    table = Table(
+        "Title", ("case", "rate", "error"), [("a=1", "2 of 2", 0.5)], notes="n"
+    )
+    assert table.transposed().to_text().splitlines() == [
+        "Title",
+        "",
+        "case   a=1",
+        "-----  ------",
+        "rate   2 of 2",
+        "error  0.5",
+        "n",
+    ]
+
+
 @pytest.mark.parametrize(
     ("value", "hint", "expected"),
     [

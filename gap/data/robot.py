@@ -153,9 +153,9 @@ class Proposal:
             found.append(Finding(GUESSED_GAINS, name, "time", 0, "", "warning", says))
         if not self.is_driven:
             says = (
-                "No column was taken for an effort or a command, so nothing drives the "
-                "joints of this proposed scene; if something does, name its column in "
-                "the sidecar."
+                "No column is an effort or a command, so no torque acts on the joints "
+                "of this proposed scene. If the log has one, name its column in the "
+                "sidecar; without it, effects may only stand for the missing torque."
             )
             found.append(Finding(NO_DRIVE, name, "time", 0, "", "warning", says))
         return found
@@ -219,7 +219,7 @@ def _actuation(
 
     for what in ("effort_command", "effort_measured"):
         if joints := named(what):
-            notes.append(f"joints are driven by what {what} says")
+            notes.append(f"the joints are driven by the recorded {what}")
             return [f"actuation: {{type: effort, joints: [{', '.join(joints)}]}}"], ""
     if joints := named("position_command"):
         gains = _gains_by_motion(robot, every, logs)
@@ -266,7 +266,9 @@ def _actuation(
             f"  joints: [{', '.join(joints)}]",
             f"  kd: {kd}  # [N m s/rad], or [N s/m] of one that slides.",
         ], "a guess"
-    notes.append("no command was found: nothing drives the joints")
+    notes.append(
+        "the log has no command and no effort, so no torque acts on the joints"
+    )
     return NO_ACTUATION, ""
 
 
