@@ -1,0 +1,152 @@
+"""Forward selection: back to a tie, and one effect in the place of two."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_gap_statistics import TwoChannels
+
+from makebreak.gap.problem import Candidate, SearchPlan
+from makebreak.gap.search import forward, merge
+from makebreak.gap.search.select import select
+from makebreak.models.effects import KINDS
+
+
+class Columns(TwoChannels):
+    """Candidates that are columns: {(kind, place): (600, k)}, of which the residual is
+    a sum, with noise of 1."""
+
+    plan = SearchPlan(least_gain=0.1, most_effects=2)
+
+    def __init__(self, of, hidden):
+        self._channel, self._block = np.zeros(600, int), np.arange(600) // 20
+        self.of = of
+        self._base = np.random.default_rng(0).normal(size=600)
+        for key, values in hidden.items():
+            self._base += of[key] @ np.atleast_1d(values)
+
+    def residual(self, effects=()):
+        r = np.array(self._base)
+        for each in effects:
+            r -= self.of[each.kind, each.at[0]] @ list(each.parameters.values())
+        return r
+
+    def candidates(self, nuisances, current):
+        return [
+            Candidate(
+                kind, (at,), columns.shape[1], (columns,),
+                (
+                    lambda c, kind=kind: {
+                        p.name: float(x)
+                        for p, x in zip(KINDS[kind].parameters, c, strict=False)
+                    },
+                ),
+            )
+            for (kind, at), columns in self.of.items()
+        ]  # fmt: skip
+
+
+def directions(n):
+    """(600, n) columns of rms 10, perpendicular to each other."""
+    q, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(600, n)))
+    return 10.0 * q * np.sqrt(600.0)
+
+
+MASS, FRICTION = "link_mass", "joint_coulomb_friction"
+TRUTH = {(MASS, "arm.hand"): 4.0, (FRICTION, "arm.joint6"): 1.2}
+
+
+def where_a_mass_is(like_friction, wrong):
+    """A hand that is missing, and friction. A mass at the wrist takes off what the hand
+    does and a part of what friction does, and adds something else."""
+    hand, friction, more = directions(3).T
+    of = {
+        (MASS, "arm.wrist"): hand + like_friction * friction + wrong * more,
+        (MASS, "arm.hand"): hand,
+        (FRICTION, "arm.joint6"): friction,
+    }
+    return Columns({key: column[:, None] for key, column in of.items()}, TRUTH)
+
+
+def named(problem):
+    return {(c.effect.kind, c.effect.at[0]): c for c in select(problem).choices}
+
+
+def test_a_tie_is_taken_instead_if_what_comes_after_it_explains_the_rest():
+    """At first both masses do equally well; with friction beside it the wrist's leaves
+    seven times the noise, the hand's the noise."""
+    found = named(where_a_mass_is(0.06, wrong=0.17))
+    assert set(found) == set(TRUTH)
+    mass = found[MASS, "arm.hand"]
+    assert mass.effect.parameters["mass"] == pytest.approx(4.0, abs=0.03)
+    # The report says what it was chosen over, and by how much: 6.8 and 1 of noise.
+    assert mass.runner_up == "link_mass at arm.wrist" and mass.ties == ()
+    assert mass.margin == pytest.approx(np.hypot(6.8, 1.0) - 1.0, rel=0.15)
+
+
+def test_a_tie_that_does_no_better_in_the_end_stays_a_tie(monkeypatch):
+    """What nothing explains leaves three times the noise, whichever mass is taken."""
+    problem = where_a_mass_is(0.0, wrong=0.02)
+    problem._base += 3.0 * np.random.default_rng(2).normal(size=600)
+    (mass,) = [c for (kind, _), c in named(problem).items() if kind == MASS]
+    tied = [tie.at[0] for tie in mass.ties]
+    assert sorted([mass.effect.at[0], *tied]) == ["arm.hand", "arm.wrist"]
+    assert mass.margin < 0.05
+    # The one that did better at first, by a little, is kept.
+    monkeypatch.setattr(forward, "BRANCHES_MAX", 0)
+    assert (MASS, mass.effect.at[0]) in named(problem)
+
+
+class LateLoad(Columns):
+    """A load is no candidate before the link's mass and its centre of mass are there
+    (as where links that may be off by their tolerance imitate what it does more)."""
+
+    def candidates(self, nuisances, current):
+        found = super().candidates(nuisances, current)
+        kinds = {e.kind for e in current.effects}
+        late = kinds >= {MASS, "link_com"}
+        return [c for c in found if late or c.kind != "payload"]
+
+
+def loads(hidden, unexplained=0.0):
+    """Of what a load's inertia does, a mass and a centre of mass do nothing."""
+    of = directions(5)
+    mass, com = of[:, :1], 10.0 * of[:, 1:4]
+    columns = {
+        (MASS, "arm.link7"): mass,
+        ("link_com", "arm.link7"): com,
+        ("payload", "arm.link7"): np.hstack([mass + 0.2 * of[:, 4:], com]),
+    }
+    problem = LateLoad(columns, hidden)
+    problem._base += unexplained * np.random.default_rng(2).normal(size=600)
+    return named(problem)
+
+
+def test_two_effects_at_one_place_give_way_to_one_that_explains_more():
+    values = [3.0, 0.2, 0.09, 0.09]
+    found = loads({("payload", "arm.link7"): values})
+    assert set(found) == {("payload", "arm.link7")}
+    load = found["payload", "arm.link7"]
+    np.testing.assert_allclose(list(load.effect.parameters.values()), values, atol=0.03)
+    # Both together left 0.2 x 30 and the noise.
+    assert load.runner_up == "link_mass and link_com at arm.link7"
+    assert load.margin == pytest.approx(np.hypot(6.0, 1.0) - 1.0, rel=0.15)
+
+
+def test_a_mass_and_a_centre_of_mass_that_explain_as_much_stay():
+    hidden = {(MASS, "arm.link7"): 3.0, ("link_com", "arm.link7"): [0.2, 0.09, 0.09]}
+    assert set(loads(hidden)) == set(hidden)
+    assert set(loads(hidden, unexplained=3.0)) == set(hidden)
+
+
+@pytest.mark.parametrize(
+    "error, missing, better",
+    [(0.9, True, True), (1.0, True, False), (1.0, False, True), (1.1, False, False)],
+)
+def test_one_effect_that_leaves_as_much_is_better_if_nothing_is_missing_then(
+    error, missing, better
+):
+    """(Two took what they could not do from links that may be off by a tolerance.)"""
+    search = SimpleNamespace(error=lambda score: score, needs_more=lambda fit: missing)
+    one, two = SimpleNamespace(score=error), SimpleNamespace(score=1.0)
+    assert merge._does_better(search, one, two) == better
