@@ -1,4 +1,4 @@
-"""A tool slides from a smooth surface to a rough one and back: the modes are recognised."""
+"""A tool slides from a smooth surface to a rough one and back; both are recognised."""
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
