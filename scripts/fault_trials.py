@@ -4,13 +4,13 @@ Each fault is injected into ball_rolling, with drawn images and a radius error o
 while the ball rolls; the same run without fault, with the same seed, is compared. A
 monitor (systems/faults/safety_monitor.py) checks the arm at 1 kHz.
 
-    recovered    from AFTER_SEC after the end of the fault (after its start, if it is
-                 permanent) the ball rolls at least half as far as without the fault
-    safely held  it does not, but all limits are kept, all numbers are finite, and the
-                 force of tip and ball is at most FORCE_MAX. The arm may still try: the
-                 table has the number of these runs whose tip was AT_REST in the last
-                 second
-    failed       anything else
+    failed       a limit of the arm is violated, a number is not finite, or the force of
+                 tip and ball is above FORCE_MAX
+    recovered    not failed, and from AFTER_SEC after the end of the fault (after its
+                 start, if it is permanent) the ball rolls at least half as far as
+                 without the fault
+    safely held  neither. The arm may still try: the table has the number of these runs
+                 whose tip was AT_REST in the last second
 
 A case whose run without fault does not roll is not judged, and does not count as met.
 """
