@@ -27,12 +27,12 @@ from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs
 from makebreak.systems.contact_mpc.numerics.ball_state import P_BALL
 from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Problem, solve_c3
 from makebreak.systems.contact_mpc.numerics.c3_plan import WarmStart
-from makebreak.systems.contact_mpc.numerics.contact_sampling import (
+from makebreak.systems.contact_mpc.numerics.outline import (
     inward,
     outline_of,
     places_around,
-    score_plans,
 )
+from makebreak.systems.contact_mpc.numerics.plan_scores import score_plans
 from makebreak.systems.contact_mpc.numerics.push_task import PushConfig, look_ahead
 
 PLACES = 16

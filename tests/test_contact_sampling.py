@@ -46,23 +46,23 @@ from makebreak.systems.contact_mpc.numerics.contact_sampling import (
     SamplingConfig,
     SamplingMemory,
     choose,
-    distance_to_outline,
     in_reach,
-    inward,
     out_of_reach,
-    outline_of,
-    places_around,
-    rotation_of,
     sample_round,
-    score_plans,
-    score_within,
-    to_object,
-    to_world,
-    travel_length,
-    travel_step,
-    way_is_free,
 )
 from makebreak.systems.contact_mpc.numerics.lcs import simulate
+from makebreak.systems.contact_mpc.numerics.object_frame import (
+    rotation_of,
+    to_object,
+    to_world,
+)
+from makebreak.systems.contact_mpc.numerics.outline import (
+    distance_to_outline,
+    inward,
+    outline_of,
+    places_around,
+)
+from makebreak.systems.contact_mpc.numerics.plan_scores import score_plans, score_within
 from makebreak.systems.contact_mpc.numerics.push_task import (
     CONTACT,
     TRAVEL,
@@ -74,6 +74,11 @@ from makebreak.systems.contact_mpc.numerics.push_task import (
     heading,
     look_ahead,
     next_push,
+)
+from makebreak.systems.contact_mpc.numerics.tip_travel import (
+    travel_length,
+    travel_step,
+    way_is_free,
 )
 
 T = PushedObject("t")

@@ -35,13 +35,13 @@ from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Problem, solve_c3
 from makebreak.systems.contact_mpc.numerics.contact_sampling import (
     SamplingConfig,
     SamplingMemory,
-    distance_to_outline,
-    outline_of,
     sample_round,
-    way_around,
-    way_is_free,
 )
 from makebreak.systems.contact_mpc.numerics.lcs import simulate
+from makebreak.systems.contact_mpc.numerics.outline import (
+    distance_to_outline,
+    outline_of,
+)
 from makebreak.systems.contact_mpc.numerics.path_target import (
     moving_target,
     next_waypoint,
@@ -56,6 +56,7 @@ from makebreak.systems.contact_mpc.numerics.push_task import (
     next_push,
 )
 from makebreak.systems.contact_mpc.numerics.rolling_task import CirclePath
+from makebreak.systems.contact_mpc.numerics.tip_travel import way_around, way_is_free
 from makebreak.systems.contact_mpc.path_target import PathTarget, PathTargetConfig
 from makebreak.systems.contact_mpc.push_task import PushTask, PushTaskConfig
 

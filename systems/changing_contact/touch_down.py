@@ -17,13 +17,13 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
     Q_BALL,
     V_TIP,
 )
-from makebreak.systems.contact_mpc.numerics.contact_sampling import (
-    ObjectShape,
+from makebreak.systems.contact_mpc.numerics.contact_sampling import ObjectShape
+from makebreak.systems.contact_mpc.numerics.lcs import is_finite
+from makebreak.systems.contact_mpc.numerics.object_frame import rotation_of
+from makebreak.systems.contact_mpc.numerics.outline import (
     distance_to_outline,
     outline_of,
-    rotation_of,
 )
-from makebreak.systems.contact_mpc.numerics.lcs import is_finite
 from makebreak.systems.contact_mpc.numerics.push_task import CONTACT
 from makebreak.systems.numerics.timing import timed
 

@@ -15,9 +15,9 @@ from makebreak.systems.contact_mpc.numerics.contact_sampling import (
     SamplingConfig,
     SamplingMemory,
     sample_round,
-    score_plans,
 )
 from makebreak.systems.contact_mpc.numerics.lcs import is_finite
+from makebreak.systems.contact_mpc.numerics.plan_scores import score_plans
 from makebreak.systems.contact_mpc.numerics.push_task import CONTACT, errors
 from makebreak.systems.numerics.timing import timed
 

@@ -21,14 +21,15 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
 )
 from makebreak.systems.contact_mpc.numerics.contact_sampling import (
     ObjectShape,
-    distance_to_outline,
     in_reach,
+)
+from makebreak.systems.contact_mpc.numerics.object_frame import rotation_of, to_world
+from makebreak.systems.contact_mpc.numerics.outline import (
+    distance_to_outline,
     inward,
     outline_of,
-    rotation_of,
-    to_world,
-    travel_step,
 )
+from makebreak.systems.contact_mpc.numerics.tip_travel import travel_step
 
 # CONTACT is what ArmReference follows C3 in (numerics/rolling_task.py: ROLL).
 CONTACT, TRAVEL, WAIT = 0, 1, 2
