@@ -83,6 +83,20 @@ class MechanismMotion:
             or KINDS[e.kind].hidden_state
             or KINDS[e.kind].on_top is not None
         ]  # fmt: skip
+        self._read_noise()
+        self._read_drives()
+        self._read_tracks(bump_sec, block_sec, most_sec)
+
+    def is_motor_side(self, i: int) -> bool:
+        """Whether a joint's measured effort is the motor's, before its gear."""
+        return not is_link_side(
+            self.scene.channels, f"{self.joints[i]}.effort_measured"
+        )
+
+    # ----- What was measured
+
+    def _read_noise(self) -> None:
+        recordings = self.recordings
         self.noise = self._noise("position")
         self.velocity_noise = self._noise("velocity")
         # Root of how many neighbouring samples of a velocity err together.
@@ -93,6 +107,22 @@ class MechanismMotion:
             ]
         )
         self.effort_noise = self._noise("effort_measured")
+
+    def _noise(self, what: str) -> np.ndarray:
+        """(n_v,) the largest of all recordings."""
+        out = np.zeros(len(self.joints))
+        for i, joint in enumerate(self.joints):
+            found = [
+                r.channels[f"{joint}.{what}"].noise
+                for r in self.recordings
+                if f"{joint}.{what}" in r
+            ]
+            out[i] = max(found, default=0.0)
+        return out
+
+    def _read_drives(self) -> None:
+        """How the effort of each joint is known."""
+        scene, recordings = self.scene, self.recordings
         self.has = {
             what: [all(f"{j}.{what}" in r for r in recordings) for j in self.joints]
             for what in (
@@ -117,12 +147,14 @@ class MechanismMotion:
         ]
         # What turns the rotor is in no torque that is measured at the link.
         self._link_rotor = np.array(
-            [rotor_before(scene, plant, joint) for joint in self.joints]
+            [rotor_before(scene, self.dynamics.plant, joint) for joint in self.joints]
         )
         self._unseen_rotor = self._link_rotor * np.array(self.by_measured)
+
+    def _read_tracks(self, bump_sec: float, block_sec: float, most_sec: float) -> None:
         self.tracks: list[Track] = []
         seconds = 0.0
-        for recording in recordings:
+        for recording in self.recordings:
             for episode in recording.episodes:
                 if seconds > most_sec:
                     break
@@ -141,22 +173,7 @@ class MechanismMotion:
             np.median(np.concatenate([np.diff(t.time) for t in self.tracks]))
         )
 
-    def is_motor_side(self, i: int) -> bool:
-        """Whether a joint's measured effort is the motor's, before its gear."""
-        return not is_link_side(
-            self.scene.channels, f"{self.joints[i]}.effort_measured"
-        )
-
-    def _noise(self, what: str) -> np.ndarray:
-        out = np.zeros(len(self.joints))
-        for i, joint in enumerate(self.joints):
-            found = [
-                r.channels[f"{joint}.{what}"].noise
-                for r in self.recordings
-                if f"{joint}.{what}" in r
-            ]
-            out[i] = max(found, default=0.0)
-        return out
+    # ----- Motion and effort
 
     def motion(self, track: Track, effects: Sequence[Effect] = ()) -> Motion:
         """The true motion at the middles, if the effects on measurement are these

@@ -199,37 +199,35 @@ def sample_round(
     lcs = build_many(starts, np.zeros(problem.n_u))
     if r is not None:
         lcs = (*lcs[:7], lcs[7] + r, *lcs[8:])
+    heading = heading_of(x[Q_BALL])
     guess = np.zeros((len(places), problem.options.N, problem.n_u))
     guess[:, :, :2] = c.push * inward(places, outline)[:, None]
-    heading = heading_of(x[Q_BALL])
     if going and m.inputs is not None:
         # What it was chosen for counts again: whether the search finds as good a plan
         # in every round is chance, and the tip would turn round each time that it does
         # not.
         guess[0] = turned_inputs(m.inputs, heading)
     cost, u, plans = score_within(budget_sec, lcs, starts, x_desired, problem, guess)
-    high = shape.clear_height(0.0)
-    ends = [np.array([*place, c.height]) for place in places]
-    way = [travel_length(x[P_TIP], end, outline, distance, high) for end in ends]
+    way = _way_lengths(c, shape, x, places, outline, distance)
     if in_contact:
         way[0] = 0.0
     elif not going or not in_reach(places[:1], c.reach, c.bearing, c.wrist)[0]:
         cost[0] = NO_PLAN
-    cost = cost + c.travel * np.array(way)
     # Where the tip is now no plan can change.
     led_out = out_of_reach(plans[:, 1:], c.reach, c.inwards, c.wrist)
-    cost = cost + c.out_of_reach * led_out
+    cost = cost + c.travel * way + c.out_of_reach * led_out
     m, is_stuck = _with_progress(c, m, error, in_contact, t)
     if is_stuck:
         cost[0] = NO_PLAN
     keep = m.reached_sec is not None and t - m.reached_sec < c.keep_sec
     chosen = 0 if keep and np.isfinite(cost[0]) else choose(cost, c.hysteresis)
     m = replace(m, count=m.count + 1)
-    if len(places) > 1 and np.isfinite(cost[1:]).any():
+    known = np.isfinite(cost)
+    if known[1:].any():
         m = replace(m, best=to_object(x, places[1 + int(np.argmin(cost[1:]))]))
-    if np.isfinite(cost[chosen]) and (chosen != 0 or going):
+    if known[chosen] and (chosen != 0 or going):
         m = replace(m, inputs=turned_inputs(u[chosen], heading.T))
-    if np.isfinite(cost[chosen]) and chosen != 0:
+    if known[chosen] and chosen != 0:
         m = replace(m, place=to_object(x, places[chosen]), go=m.go + 1)
     return m, Round(places, cost, chosen, plans[chosen])
 
@@ -256,6 +254,17 @@ def _starts(c: SamplingConfig, x, places, in_contact: bool) -> np.ndarray:
     if in_contact:
         starts[0] = x
     return starts
+
+
+def _way_lengths(
+    c: SamplingConfig, shape: ObjectShape, x, places, outline, distance: float
+) -> np.ndarray:
+    """(n,) of the ways from the tip to the places, through the air [m]."""
+    high = shape.clear_height(0.0)
+    ends = [np.array([*place, c.height]) for place in places]
+    return np.array(
+        [travel_length(x[P_TIP], end, outline, distance, high) for end in ends]
+    )
 
 
 def _with_progress(
