@@ -42,12 +42,9 @@ from makebreak.systems.changing_contact.numerics.motion_pattern import (
     Segment,
     load_pattern,
 )
-from makebreak.systems.changing_contact.numerics.velocity_shaper import (
-    N_MEMORY,
-    plan,
-    pose_output,
-    tick,
-)
+from makebreak.systems.changing_contact.numerics.shaped_reference import pose_output
+from makebreak.systems.changing_contact.numerics.shaper_memory import N_MEMORY
+from makebreak.systems.changing_contact.numerics.velocity_shaper import plan, tick
 from makebreak.systems.changing_contact.velocity_shaper import (
     RegionConfig,
     SearchConfig,

@@ -15,13 +15,17 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
     ContactBelief,
 )
 from makebreak.systems.changing_contact.numerics.motion_pattern import MotionPattern
-from makebreak.systems.changing_contact.numerics.velocity_shaper import (
+from makebreak.systems.changing_contact.numerics.shaped_reference import (
+    blended,
+    pose_output,
+)
+from makebreak.systems.changing_contact.numerics.shaper_memory import (
     N_MEMORY,
     ShaperLaw,
     begin_anew,
-    blended,
+)
+from makebreak.systems.changing_contact.numerics.velocity_shaper import (
     plan,
-    pose_output,
     take_over,
     tick,
     warm_up,

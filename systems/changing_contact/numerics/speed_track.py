@@ -7,7 +7,7 @@ others run, and s is known in closed form. A step that begins later never ends e
 which keeps the speed from turning negative.
 
 A track is a record of float64 alone, TRACK, so that it can be part of a vector in a
-Context. Functions change it in place. `law` is a ShaperLaw (velocity_shaper.py).
+Context. Functions change it in place. `law` is a ShaperLaw (shaper_memory.py).
 
 Source: Sidhik et al., section 3.5.2.
 """
