@@ -459,8 +459,8 @@ def _unless_doubtful(result: GapResult) -> GapResult:
             verdict="gap_unnamed",
             says=f"These recordings are inconclusive: {hunting[0]}",
         )
+    undriven = [c.says for c in result.checks if c.kind == NO_DRIVE]
     if not result.effects:
-        undriven = [c.says for c in result.checks if c.kind == NO_DRIVE]
         if result.verdict == "gap_unnamed" and undriven:
             return replace(result, says=f"{result.says} {undriven[0]}")
         return result
@@ -470,6 +470,12 @@ def _unless_doubtful(result: GapResult) -> GapResult:
             "The scene and the recordings disagree, but units, signs or axes of what "
             "was measured are wrong (see the checks): put that right first, for until "
             "then nothing can be named."
+        )
+    elif undriven and not result.gap.after <= UNEXPLAINED_RMS:
+        # Whatever is named makes up for torques that are not in the log.
+        says = (
+            "The scene and the recordings disagree, and no effect explains all of it. "
+            f"{undriven[0]}"
         )
     elif guessed and not result.gap.after <= UNEXPLAINED_RMS:
         # Whatever else is free makes up for a gain that is wrong.

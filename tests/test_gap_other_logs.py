@@ -159,6 +159,19 @@ def test_beside_guessed_gains_only_what_explains_all_is_named():
     assert _unless_doubtful(known) == known
 
 
+def test_where_nothing_drives_the_joints_only_what_explains_all_is_named():
+    """Named were a rotor's inertia and a link's mass, in the place of the torques."""
+    check = Finding(NO_DRIVE, "a", "time", 0.0, "", "warning", "Nothing drives it.")
+    found = NamedEffect("link_mass", ("rig.rod",), {}, "", Evidence(9.0, 1.0, "", 1.0))
+    gap = GapMeasure(460.0, 198.0, 1.0, 0.3)
+    result = GapResult("gap_named", "", (), [found], gap, (), {}, [check])
+    after = _unless_doubtful(result)
+    assert (after.verdict, after.effects) == ("gap_unnamed", [])
+    assert after.says.endswith("Nothing drives it.") and after.gap.after == 460.0
+    passive = replace(result, gap=replace(gap, after=1.2))  # A pendulum that swings.
+    assert _unless_doubtful(passive) == passive
+
+
 def test_a_gap_where_nothing_drives_the_joints_says_so():
     check = Finding(NO_DRIVE, "a", "time", 0.0, "", "warning", "Nothing drives it.")
     gap = GapMeasure(460.0, 460.0, 1.0, 0.3)
