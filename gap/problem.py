@@ -298,6 +298,11 @@ class GapProblem(ABC):
         better: beside an error that is no gap it is then none."""
         return False
 
+    def is_within_tolerance(self, effect: Effect) -> bool:
+        """Whether an effect is one number so near to neutral that what the scene itself
+        may be off by could stand for it: among others it must then show by itself."""
+        return False
+
     def hint(self, end: Fitted) -> str:
         """Where to look for what no effect explains, as sentences; "": not known."""
         return ""

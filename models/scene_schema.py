@@ -36,6 +36,7 @@ TOLERANCES = {
     "contact_stiffness": Between(0.0, 100.0, "of the stiffness"),
     "contact_dissipation": Between(0.0, 100.0, "of the dissipation"),
     "shape_m": Between(0.0, 0.1, "m"),
+    "drive_gains": Between(0.0, 1.0, "of kp and kd"),
 }
 SIDES = ("motor", "motor side", "link", "link side")
 SIDED = ("position", "velocity", "effort_measured")  # Channels that have a side.

@@ -1,6 +1,7 @@
 """A robot's file and a log with foreign names: what is proposed, and that it runs."""
 
 import json
+from dataclasses import astuple
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from gap_benchmark.cases import cases, make
 from makebreak.gap.data.proposal import JointName, of_one_drive, propose
 from makebreak.gap.data.reading import read_recording
 from makebreak.gap.data.robot import propose_scene, read_log, read_robot
+from makebreak.gap.data.servo_gains import ServoGains, _fitted, _fitted_at
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.scene import read_scene
@@ -321,6 +323,20 @@ def test_a_servo_is_proposed_with_the_gains_that_its_motion_tells(tmp_path):
     np.testing.assert_allclose(scene.actuation.kp, kp, rtol=0.01)
     np.testing.assert_allclose(scene.actuation.kd, kd, rtol=0.02)
     assert not scene.effects  # No rotor that is not there.
+    assert scene.tolerance == {"drive_gains": 0.05} and not proposal.findings()
+
+
+def test_of_a_servo_that_needs_no_effort_the_rest_goes_with_its_stiffness():
+    """Without an effort it has no scale: kp e = kd v + friction + rotor v'."""
+    rng = np.random.default_rng(0)
+    kd, coulomb, rotor, kp = 0.5, 0.08, 0.02, 9.0
+    v, vd = rng.standard_normal(400), 5.0 * rng.standard_normal(400)
+    error = (kd * v + coulomb * np.sign(v) + rotor * vd) / kp
+    equations = np.stack([error, -v, -np.sign(v), -vd], axis=1), np.zeros(400)
+    assert _fitted([equations]) is None
+    found = _fitted_at(kp, [equations])
+    expected = ServoGains(kp, kd, rotor, coulomb)
+    np.testing.assert_allclose(astuple(found), astuple(expected), rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -32,6 +32,7 @@ GUESSED_KP = 10.0  # [N m/rad], where the log does not show it.
 SPEED_LOOP = 50.0
 SERVO_DAMPING_SEC = 0.07  # Of kd to kp, of a small geared servo's back-EMF.
 ROTOR_SEC = 0.05  # Of its inertia at the joint to kd.
+GAINS_KNOWN_TO = 0.05  # Of those that motion tells; the masses alone are off by 3 %.
 LEAST_ROTOR = 0.05  # Of what a joint moves: less is left out of a proposal.
 LEAST_LOAD = 0.05  # Of a joint's rms gravity torque [N m], to tell its servo by.
 
@@ -132,7 +133,8 @@ FROM_MOTION = "from how joints followed their commands"
 @dataclass(frozen=True)
 class Proposal:
     """A scene and a sidecar for each log, as texts. notes: what was guessed. gains_of:
-    how drives' gains were guessed, in words; "" where none had to be. is_driven:
+    how drives' gains were guessed, in words; "" where none had to be, or where motion
+    tells them. is_driven:
     whether a column says what drives the joints."""
 
     scene: str
@@ -232,18 +234,21 @@ def _actuation(
             float(f"{gains[j].kd if j in gains else SERVO_DAMPING_SEC * k:.3g}")
             for j, k in zip(joints, kp, strict=True)
         ]
-        told = FROM_MOTION if gains else FROM_SAG if known else "a guess"
+        every_one = all(joint in gains for joint in joints)
+        told = FROM_MOTION if every_one else FROM_SAG if known else "a guess"
         notes.append(f"drives are position servos of kp {kp} N m/rad ({told})")
         lines = [
             "actuation:",
             "  type: servo  # Gains are guessed: correct them.",
             f"  joints: [{', '.join(joints)}]",
             f"  kp: {kp}  # [N m/rad], {told}.",
-            f"  kd: {kd}  # [N m s/rad], {FROM_MOTION if gains else 'a guess'}.",
+            f"  kd: {kd}  # [N m s/rad], {FROM_MOTION if every_one else 'a guess'}.",
         ]
         limits = [robot.effort_limits.get(j, np.inf) for j in joints]
         if all(0.0 < limit < 1e6 for limit in limits):
             lines.append(f"  limit: {[float(x) for x in limits]}  # [N m]")
+        if every_one:
+            lines.append(f"tolerance: {{drive_gains: {GAINS_KNOWN_TO}}}")
         # A geared motor's own inertia is what its back-EMF and its spring work on.
         rotors, moved = [], _inertia(robot)
         for joint, k in zip(joints, kd, strict=True):
@@ -255,7 +260,7 @@ def _actuation(
                 )
         if rotors:
             lines += ["effects:  # Rotors of the servos' motors, a guess.", *rotors]
-        return lines, told
+        return lines, "" if every_one else told
     if joints := named("velocity_command"):
         notes.append("drives follow velocities, with gains that are a guess")
         moved = _inertia(robot)

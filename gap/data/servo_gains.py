@@ -14,6 +14,8 @@ from pydrake.multibody.tree import MultibodyForces
 from scipy.ndimage import minimum_filter1d
 from scipy.optimize import nnls
 
+from makebreak.models.effects.kind import one_dof_joints
+
 KERNEL_SEC = 0.2  # Slower than sensors' noise, faster than most motions.
 LEAST_SAMPLES = 9  # Of that kernel.
 MOST_SAMPLES = 3000  # At which inverse dynamics is computed.
@@ -50,13 +52,30 @@ def servo_gains(
     """Of each joint, in the order of the plant's coordinates; None where the data do
     not say: parts of them differ, or the stiffness explains too little.
 
+    A joint that needs next to no effort, as a light one with a rotor that the plant
+    lacks, shows only how its numbers compare: it gets the median stiffness of the
+    others that turn, or slide, as it does.
+
     Args: plant: a finalized mechanism, all of whose coordinates are in `motions`.
     """
     parts: list[list[tuple]] = [[] for _ in range(plant.num_positions())]
     for motion in motions:
         for own, rows in zip(parts, _equations(plant, motion), strict=True):
             own.append(rows)
-    return [_fitted(own) for own in parts]
+    found = [_fitted(own) for own in parts]
+    slides = [j.type_name() == "prismatic" for j in _joints(plant)]
+    for i, own in enumerate(parts):
+        alike = [
+            each.kp for each, s in zip(found, slides, strict=True)
+            if each is not None and s == slides[i]
+        ]  # fmt: skip
+        if found[i] is None and alike:
+            found[i] = _fitted_at(float(np.median(alike)), own)
+    return found
+
+
+def _joints(plant: MultibodyPlant) -> list:
+    return sorted(one_dof_joints(plant), key=lambda joint: joint.position_start())
 
 
 def _equations(plant: MultibodyPlant, motion: Motion):
@@ -156,3 +175,17 @@ def _fitted(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> ServoGains | None
     if not kp > 0.0 or not agree or left > (1.0 - LEAST_EXPLAINED) * without:
         return None
     return ServoGains(float(kp), float(kd), float(rotor), float(friction))
+
+
+def _fitted_at(kp: float, parts: Sequence[tuple[np.ndarray, np.ndarray]]):
+    """What goes with a given stiffness, if it explains the joint's error."""
+    X, y = (np.concatenate(each) for each in zip(*parts, strict=True))
+    if len(y) < 10 * PARTS:
+        return None
+    given = kp * X[:, 0] - y
+    size = np.maximum(np.sqrt(np.mean(X[:, 1:] ** 2, axis=0)), 1e-12)
+    c, left = nnls(-X[:, 1:] / size, given)
+    if left**2 > (1.0 - LEAST_EXPLAINED) * float(given @ given):
+        return None
+    kd, friction, rotor = c / size
+    return ServoGains(kp, float(kd), float(rotor), float(friction))

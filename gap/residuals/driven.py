@@ -23,6 +23,7 @@ from makebreak.gap.problem import (
     SearchPlan,
     rms,
 )
+from makebreak.gap.residuals.drive_gains import gain_changes, with_moved_gains
 from makebreak.gap.residuals.inverse import LOOP_SEC
 from makebreak.gap.residuals.mechanism import (
     LESS,
@@ -206,12 +207,16 @@ class DrivenProblem(DrivenWindows, GapProblem):
     # ----- The search
 
     def nuisances(self) -> Nuisances:
-        """The links' masses and centres of mass, and how late drives' loops are, where
-        all is as it may be (a joint that friction holds hardly shows them)."""
+        """The links' masses and centres of mass, gains of drives and how late their
+        loops are, where all is as it may be (a joint that friction holds hardly shows
+        them)."""
         if self._nuisances is None:
             columns, prior, names = [], [], []
             there = self.residual(self._rich)
-            changes = [*link_changes(self.dynamics, self.scene), *self._late_loops()]
+            changes = [
+                *link_changes(self.dynamics, self.scene), *self._late_loops(),
+                *gain_changes(self.scene, self.joints),
+            ]  # fmt: skip
             for name, effect, size in changes:
                 moved = self.residual([*self._rich, effect])
                 columns.append((there - moved) / size)
@@ -416,23 +421,26 @@ class DrivenProblem(DrivenWindows, GapProblem):
         recordings=None, jobs: int = 1,
     ) -> Outcome | None:  # fmt: skip
         model: DrivenWindows = self
-        held = [not w.train for w in self.windows]
-        if recordings is not None:
+        scene = with_moved_gains(self.scene, nuisances.names, end.b)
+        if recordings is not None or scene is not self.scene:
             try:
-                model = DrivenWindows(self.scene, recordings)
+                model = DrivenWindows(scene, recordings or self.recordings)
             except ValueError:  # No window fits in.
                 return None
-            held = [True] * len(model.windows)
+        held = [recordings is not None or not w.train for w in model.windows]
         if not any(held):
             return None
-        moved = [
-            *moved_links(self, nuisances, end.b),
-            *self._moved_loops(effects, nuisances, end.b),
-        ]
-        try:
-            before, after = model.simulate(moved), model.simulate([*moved, *effects])
-        except ValueError:  # A link that its background would make impossible.
-            before, after = model.simulate(()), model.simulate(effects)
+        links = moved_links(self, nuisances, end.b)
+        loops = self._moved_loops(effects, nuisances, end.b)
+        # What a background would make impossible is left out: a late loop takes from a
+        # rotor that may not be there.
+        for moved in ([*links, *loops], links, []):
+            try:
+                before = model.simulate(moved)
+                after = model.simulate([*moved, *effects])
+            except ValueError:
+                continue
+            break
         return Outcome(
             gap_measure(model, before, after, held),
             series_of(model, before, after, held),

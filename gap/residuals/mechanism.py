@@ -19,6 +19,7 @@ from makebreak.gap.problem import (
     rms,
     share_left,
 )
+from makebreak.gap.residuals.drive_gains import with_moved_gains
 from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.gap.residuals.pushes import ROBUST, Push, find_pushes
 from makebreak.gap.result import Where
@@ -390,6 +391,13 @@ class MechanismProblem(InverseModel, GapProblem):
              for t in self.tracks]
         )  # fmt: skip
 
+    def is_within_tolerance(self, effect: Effect) -> bool:
+        # All that a joint carries may be heavier by the masses' tolerance.
+        if KINDS[effect.kind].path != "gain":
+            return False
+        share = tolerances(self.scene)["object_mass"].size
+        return abs(effect.parameters["gain"] - 1.0) < share
+
     def inseparable(self, effect: Effect) -> Effect | None:
         return inseparable(effect, self)
 
@@ -420,6 +428,7 @@ class MechanismProblem(InverseModel, GapProblem):
         self, effects, start: Fitted, end: Fitted, nuisances: Nuisances,
         recordings=None, jobs: int = 1,
     ) -> Outcome | None:  # fmt: skip
+        scene = with_moved_gains(self.scene, nuisances.names, end.b)
         if recordings is not None:
             try:
                 model = InverseModel(self.scene, recordings)
@@ -431,7 +440,7 @@ class MechanismProblem(InverseModel, GapProblem):
             model = self
         moved = moved_links(self, nuisances, end.b)
         measured = measure(
-            self.scene, effects, moved, model, model is not self, jobs,
+            scene, effects, moved, model, model is not self, jobs,
             self._is_pushed if model is self else lambda window: False,
         )  # fmt: skip
         if measured is None:  # In every window something pushes.

@@ -74,6 +74,8 @@ def _stays(
         return True
     if not search.plan.by_channel or not choice.in_group:
         return False
+    if search.problem.is_within_tolerance(choice.effect):
+        return False
     # A member of a group whose other members show.
     gains = search.channel_gains(without, with_, 0.0)
     return max(gains.values(), default=0.0) >= MEMBER_GAIN and is_clearly_off(choice)

@@ -98,7 +98,9 @@ def _needless_member(
             for c in np.unique(search.channel)
             if (mine := held & (search.channel == c)).any()
         ]
-        least = MEMBER_GAIN if z[k] >= MEMBER_Z else CHANNEL_GAIN
+        own = members[k].effects(0, fit.c[[k]])[0]
+        clear = z[k] >= MEMBER_Z and not search.problem.is_within_tolerance(own)
+        least = MEMBER_GAIN if clear else CHANNEL_GAIN
         if max(gains, default=0.0) < least:
             return k
     return None

@@ -7,6 +7,7 @@ import numpy as np
 
 from makebreak.gap.numerics.selection import LinearFit, Screen
 from makebreak.gap.problem import Candidate, Nuisances, share_left
+from makebreak.gap.residuals.drive_gains import gain_columns
 from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.gap.simulation.channel_effects import SENSED
 from makebreak.gap.thresholds import SINGLE_SHARE_OF_GROUP
@@ -175,7 +176,7 @@ def rich_columns(model: InverseModel, found: Sequence[Candidate]) -> np.ndarray:
 
 
 def nuisances(model: InverseModel) -> Nuisances:
-    """The links' masses and centres of mass."""
+    """The links' masses and centres of mass, instants of sampling, gains of drives."""
     dynamics, motions = model.dynamics, model.motions()
     columns, prior, names = [], [], []
     for kind, tolerance in tolerances(model.scene).items():
@@ -190,8 +191,10 @@ def nuisances(model: InverseModel) -> Nuisances:
                     columns.append(x[:, k])
                     prior.append(tolerance.of(now[k]))
                     names.append(f"{kind} of {at}, {unknown}")
-    for late, period, of_what in (model.filter_timing(), model.loop_timing()):
-        columns, prior, names = columns + late, prior + period, names + of_what
+    for x, std, of_what in (
+        model.filter_timing(), model.loop_timing(), gain_columns(model),
+    ):  # fmt: skip
+        columns, prior, names = columns + x, prior + std, names + of_what
     if not columns:
         return Nuisances.none(len(model.train()))
     return Nuisances(

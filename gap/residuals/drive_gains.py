@@ -1,0 +1,95 @@
+"""Gains of drives that are known to a share only: nuisances, like masses of links.
+
+A scene's `tolerance: {drive_gains: 0.05}` says how well they are known. What a drive's
+stiffness and damping give may then be off by that share, and is no effect.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from makebreak.models.drives import law_of
+from makebreak.models.effects.kind import Effect
+from makebreak.models.scene import Scene
+
+KEY = "drive_gains"  # Of a scene's `tolerance`.
+_STEP = 0.01  # Of a gain, to see what it gives.
+
+
+def gain_changes(
+    scene: Scene, joints: Sequence[str]
+) -> Iterator[tuple[str, Effect, float]]:
+    """(name, effect, size) of each joint's stiffness and damping, more by the share
+    `size` that they are known to; none where the scene has no such tolerance."""
+    share = float(scene.tolerance.get(KEY, 0.0))
+    for joint in joints if share else ():
+        yield from _changes(scene, joint, share, share)
+
+
+def with_moved_gains(scene: Scene, names: Sequence[str], values) -> Scene:
+    """The scene with its drives as nuisances `names` have them; values (n_b,) in shares
+    of a gain."""
+    found = dict(zip(names, values, strict=True))
+    if not scene.tolerance.get(KEY, 0.0):
+        return scene
+    actuation = scene.actuation
+    kp, kd = [], []
+    for joint in actuation.joints:
+        law = law_of(actuation, joint)
+        if law is None:
+            return scene
+        more_kp, more_kd = (
+            float(found.get(_name(joint, gain), 0.0)) for gain in ("kp", "kd")
+        )
+        kp.append(float(law.kp) * (1.0 + more_kp))
+        more = more_kd * float(law.kd + law.emf)
+        kd.append(max(float(law.kd) + more, 0.0))
+    return replace(scene, actuation=replace(actuation, kp=kp, kd=kd))
+
+
+def gain_columns(model) -> tuple[list[np.ndarray], list[float], list[str]]:
+    """Columns (m,) of the residual of an InverseModel, standard deviations and names:
+    what each gain gives, per share of it."""
+    columns, prior, names = [], [], []
+    share = float(model.scene.tolerance.get(KEY, 0.0))
+    joints = [j for j, told in zip(model.joints, model.commanded, strict=True) if told]
+    for joint in joints if share else ():
+        i = model.joints.index(joint)
+        for name, effect, size in _changes(model.scene, joint, _STEP, _STEP):
+            efforts = []
+            for track, motion in zip(model.tracks, model.motions(), strict=True):
+                less = np.zeros((*motion.v.shape, 1))
+                if effect.kind == "servo_gain":
+                    given = [
+                        model._effort(track, some, motion.q, motion.v)[:, i]
+                        for some in ((), (effect,))
+                    ]
+                    less[:, i, 0] = (given[0] - given[1]) / size
+                else:
+                    less[:, i, 0] = effect.parameters["damping"] / size * motion.v[:, i]
+                efforts.append(less)
+            columns.append(model.columns_of(efforts)[:, 0])
+            prior.append(share)
+            names.append(name)
+    return columns, prior, names
+
+
+def _name(joint: str, gain: str) -> str:
+    return f"{KEY} of {joint}, {gain}"
+
+
+def _changes(scene: Scene, joint: str, more_kp: float, more_kd: float):
+    law = law_of(scene.actuation, joint)
+    if law is None:
+        return
+    if law.kp > 0.0:
+        kp = {"kp": float(law.kp) * (1.0 + more_kp)}
+        yield _name(joint, "kp"), Effect("servo_gain", [joint], kp), more_kp
+    if (damping := float(law.kd + law.emf)) > 0.0:
+        more = {"damping": more_kd * damping}
+        yield (
+            _name(joint, "kd"),
+            Effect("joint_viscous_damping", [joint], more),
+            more_kd,
+        )

@@ -1,0 +1,82 @@
+"""Gains of drives that are known to a share only are no gap, and move in figures."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from effect_scenes import at_rest_but, double
+
+from makebreak.gap.data.reading import read_recordings
+from makebreak.gap.numerics.selection import Screen
+from makebreak.gap.residuals.drive_gains import gain_columns, with_moved_gains
+from makebreak.gap.residuals.driven import DrivenProblem
+from makebreak.gap.residuals.inverse import InverseModel
+from makebreak.gap.simulation.commands import Commands
+from makebreak.gap.simulation.driven_arm import DrivenArmSimulation
+from makebreak.models.effects.kind import Effect
+from makebreak.models.scene import ActuationSection
+
+JOINTS = ["d.j1", "d.j2"]
+KP, KD = np.array([80.0, 50.0]), np.array([6.0, 3.0])
+NOISE = 3e-4  # [rad] of the encoders.
+
+
+def scene_and_log(folder, kp=KP, kd=KD):
+    """A scene with KP and KD, and a log of one with other gains, 100 rows a second."""
+    drive = ActuationSection(type="servo", joints=JOINTS, kp=list(KP), kd=list(KD))
+    scene = replace(double(folder), actuation=drive)
+    truth = replace(scene, actuation=replace(drive, kp=list(kp), kd=list(kd)))
+    time = np.arange(0.0, 20.0, 0.01)
+    told = np.stack([0.5 * np.sin(2.0 * time), 0.6 * np.sin(3.1 * time + 1.0)])
+    columns = dict(zip((f"{j}.position_command" for j in JOINTS), told, strict=True))
+    names = [f"{j}.position" for j in JOINTS]
+    rows = DrivenArmSimulation(truth).run(
+        at_rest_but(dict(zip(JOINTS, told[:, 0], strict=True))), time, names,
+        Commands(time, columns),
+    )  # fmt: skip
+    rows = rows + NOISE * np.random.default_rng(0).standard_normal(rows.shape)
+    file = folder / "log.csv"
+    np.savetxt(
+        file, np.column_stack([time, rows, *told]), "%.9g", ",",
+        header=",".join(["time", *names, *columns]), comments="",
+    )  # fmt: skip
+    return scene, read_recordings([file])
+
+
+def test_gains_within_their_tolerance_are_no_gap(tmp_path):
+    kp, kd = KP * [1.03, 0.98], KD * [0.97, 1.02]
+    scene, recordings = scene_and_log(tmp_path, kp, kd)
+    assert not DrivenProblem(scene, recordings).is_explained()
+    loose = replace(scene, tolerance={"drive_gains": 0.05})
+    problem = DrivenProblem(loose, recordings)
+    assert problem.is_explained()
+    # The nuisances are the gains that there are: the masses may be off as well.
+    n = problem.nuisances()
+    screen = Screen(problem.base(), n.columns, n.prior, problem.train(), reach=n.reach)
+    b, _ = screen.fit_nuisances(problem.base())
+    moved = with_moved_gains(loose, n.names, b).actuation
+    np.testing.assert_allclose(moved.kp, kp, rtol=0.02)
+    np.testing.assert_allclose(moved.kd, kd, rtol=0.02)
+    assert with_moved_gains(scene, n.names, b) is scene
+
+
+def test_gains_beyond_their_tolerance_are_a_gap(tmp_path):
+    scene, recordings = scene_and_log(tmp_path, KP * [1.4, 1.0], KD)
+    loose = replace(scene, tolerance={"drive_gains": 0.05})
+    assert not DrivenProblem(loose, recordings).is_explained()
+
+
+@pytest.mark.parametrize("i", range(2))
+def test_columns_are_what_a_gain_takes_off_the_equations(tmp_path, i):
+    scene, recordings = scene_and_log(tmp_path)
+    model = InverseModel(replace(scene, tolerance={"drive_gains": 0.05}), recordings)
+    columns, prior, names = gain_columns(model)
+    assert prior == [0.05] * 4 and len(set(names)) == 4
+    share = 1e-3
+    stiffer = Effect("servo_gain", [JOINTS[i]], {"kp": KP[i] * (1.0 + share)})
+    damped = Effect("joint_viscous_damping", [JOINTS[i]], {"damping": share * KD[i]})
+    for column, effect in zip(columns[2 * i :], (stiffer, damped), strict=False):
+        off = (model.base() - model.residual([effect])) / share
+        # The residual is linear in both gains.
+        np.testing.assert_allclose(column, off, atol=1e-6 * np.abs(off).max())
+        assert np.abs(off).max() > 1.0
