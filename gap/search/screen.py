@@ -191,10 +191,10 @@ def nuisances(model: InverseModel) -> Nuisances:
                     columns.append(x[:, k])
                     prior.append(tolerance.of(now[k]))
                     names.append(f"{kind} of {at}, {unknown}")
-    for x, std, of_what in (
+    for more, std, of_what in (
         model.filter_timing(), model.loop_timing(), gain_columns(model),
     ):  # fmt: skip
-        columns, prior, names = columns + x, prior + std, names + of_what
+        columns, prior, names = columns + more, prior + std, names + of_what
     if not columns:
         return Nuisances.none(len(model.train()))
     return Nuisances(
