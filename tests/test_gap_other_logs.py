@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,8 +10,12 @@ import pytest
 from makebreak.gap import read_recordings, run_gap, write_report
 from makebreak.gap.by_recording import _apart
 from makebreak.gap.data.findings import GUESSED_GAINS, NO_DRIVE, Finding
+from makebreak.gap.numerics.selection import Screen
+from makebreak.gap.problem import Candidate
 from makebreak.gap.residuals.inverse import InverseModel
+from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.result import Evidence, GapMeasure, GapResult, NamedEffect
+from makebreak.gap.search.groups import _needless_member
 from makebreak.gap.workflow import _unless_doubtful
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
@@ -179,3 +184,43 @@ def test_a_gap_where_nothing_drives_the_joints_says_so():
     assert _unless_doubtful(result).says == "A gap. Nothing drives it."
     agrees = replace(result, verdict="no_gap")
     assert _unless_doubtful(agrees) == agrees
+
+
+def test_a_gain_within_the_masses_tolerance_is_told_from_a_larger_one(scene, tmp_path):
+    recordings = read_recordings([log(tmp_path, "a", 10)])
+    rig = ["rig.hinge"]
+    for tolerance, gain, within in ((0.03, 0.98, True), (0.03, 1.05, False),
+                                    (0.01, 0.98, False)):  # fmt: skip
+        known = replace(read_scene(scene), tolerance={"link_mass": tolerance})
+        problem = MechanismProblem(known, recordings)
+        effect = Effect("actuator_gain", rig, {"gain": gain})
+        assert problem.is_within_tolerance(effect) is within
+    friction = Effect("joint_coulomb_friction", rig, {"coulomb": 0.01})
+    assert not problem.is_within_tolerance(friction)
+
+
+@pytest.mark.parametrize("within", [False, True])
+def test_a_member_of_a_group_within_the_tolerance_must_show_by_itself(within):
+    """Both gains are 20 deviations off; the second takes 7 % off its joint, less than
+    the 10 % that one effect alone must take."""
+    rng = np.random.default_rng(0)
+    m, channel = 6000, np.arange(6000) % 2
+    train = np.arange(m) // 20 % 3 != 1
+    columns = [np.where(channel == k, rng.standard_normal(m), 0.0)[:, None]
+               for k in range(2)]  # fmt: skip
+    left = rng.standard_normal(m) + columns[0][:, 0] + 0.4 * columns[1][:, 0]
+    members = [
+        Candidate("actuator_gain", (f"r.j{k}",), 1, (x,),
+                  (lambda c: {"gain": 1.0 + 0.04 * c[0]},))
+        for k, x in enumerate(columns)
+    ]  # fmt: skip
+
+    def is_within(effect):
+        return within and abs(effect.parameters["gain"] - 1.0) < 0.03
+
+    search = SimpleNamespace(
+        train=train, channel=channel,
+        problem=SimpleNamespace(is_within_tolerance=is_within),
+    )  # fmt: skip
+    screen = Screen(left, np.zeros((m, 0)), np.zeros(0), train)
+    assert _needless_member(search, screen, members) == (1 if within else None)
