@@ -61,11 +61,8 @@ def gain_columns(model) -> tuple[list[np.ndarray], list[float], list[str]]:
             for track, motion in zip(model.tracks, model.motions(), strict=True):
                 less = np.zeros((*motion.v.shape, 1))
                 if effect.kind == "servo_gain":
-                    given = [
-                        model._effort(track, some, motion.q, motion.v)[:, i]
-                        for some in ((), (effect,))
-                    ]
-                    less[:, i, 0] = (given[0] - given[1]) / size
+                    stiffer = model.motion(track, [effect]).effort
+                    less[:, i, 0] = (motion.effort - stiffer)[:, i] / size
                 else:
                     less[:, i, 0] = effect.parameters["damping"] / size * motion.v[:, i]
                 efforts.append(less)
