@@ -23,7 +23,7 @@ NODES_MAX = 2000
 REBUILD = 10
 # Largest force z, in units in which diag(M) and max |b| are 1, that counts as the scale
 # of a rounding error; larger ones are no excuse for a breach of w >= 0.
-Z_SCALE_MAX = 1e3
+Z_SCALE_MAX = 1e2
 # Status of solve_lcp_kernel.
 SOLVED, NO_SOLUTION, NOT_PRECISE = 0, 1, 2
 
@@ -36,7 +36,7 @@ def solve_lcp(F, q):
         q: (n,) gap velocities without contact force [m/s].
 
     Returns: lam (n,) [N], every entry >= 0. w = F lam + q holds w >= 0 and w lam = 0 to
-        1e-9 of the problem's own scale.
+        1e-9 of the problem's own scale (to 1e-7 where no such lam is found).
 
     Raises: ValueError on wrong shapes, entries that are not finite, and when there is
         no solution (or, for F that is not positive semi-definite, none was found).
@@ -55,7 +55,7 @@ def solve_lcp(F, q):
         raise ValueError("solve_lcp: F or q holds an entry that is not finite")
     if status == NO_SOLUTION:
         raise ValueError("solve_lcp: the LCP has no solution (Lemke ended in a ray)")
-    raise ValueError("solve_lcp: no solution precise to 1e-9 (is F nearly singular?)")
+    raise ValueError("solve_lcp: no solution precise to 1e-7 (is F nearly singular?)")
 
 
 @njit(cache=True)
@@ -83,6 +83,15 @@ def solve_lcp_kernel(F, q):
     for i in range(n):
         if F[i, i] > 0.0:
             scale[i] = 1.0 / np.sqrt(F[i, i])
+    for i in range(n):  # A sliding speed: beside the largest of its contact's forces.
+        if not F[i, i] > 0.0:
+            most = 0.0
+            for j in range(n):
+                if F[j, j] > 0.0:
+                    most = max(most, scale[j] * max(abs(F[i, j]), abs(F[j, i])))
+            if most > 0.0:
+                scale[i] = 1.0 / most
+    for i in range(n):
         largest = max(largest, scale[i] * abs(q[i]))
     M, b = np.empty((n, n)), np.empty(n)
     for i in range(n):
@@ -109,19 +118,29 @@ def solve_lcp_kernel(F, q):
     # Where feasible w leave no room (a wedge), rounding in q alone makes a ray. Then a
     # slightly regular F tells: its w is wrong by 1e-12 z, which stays below 1e-9 if
     # there is a solution, and does not shrink with the 1e-12 if there is none.
-    for i in range(n):
-        M[i, i] += 1e-12
-    z, regular = _lemke(M, b, 1e-13, 0)
-    for i in range(n):
-        M[i, i] -= 1e-12
-    if not (regular == SOLVED and _violation(M, b, z) * max(1.0, z.max()) < 1e-9):
-        # Lemke's path may end in a ray although there is a solution, where M is not
-        # positive semi-definite, and rounding may break it where it nearly is not.
-        if not _search(M, b, z):
-            return lam, status
+    # Lemke's path may also end in a ray although there is a solution, where M is not
+    # positive semi-definite, and rounding may break it where it nearly is not: hence the
+    # search. Where that finds nothing either, 1e-7 has to do.
+    if not (
+        _regular(M, b, 1e-12, 0, z) < 1e-9
+        or _search(M, b, z)
+        or _regular(M, b, 1e-8, REBUILD, z) < 1e-7
+    ):
+        return lam, status
     for i in range(n):
         lam[i] = scale[i] * largest * z[i]
     return lam, SOLVED
+
+
+@njit(cache=True)
+def _regular(M, b, more, rebuild, z):
+    """Fills z (n,) with the solution for `more` on M's diagonal; returns its violation
+    in the LCP itself, times |z| if large; infinite without a solution."""
+    R = M.copy()
+    for i in range(b.size):
+        R[i, i] += more
+    z[:], status = _lemke(R, b, 1e-13, rebuild)
+    return _violation(M, b, z) * max(1.0, z.max()) if status == SOLVED else np.inf
 
 
 @njit(cache=True)
