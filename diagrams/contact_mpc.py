@@ -41,7 +41,7 @@ def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
     Outputs: u (n_u,) [N, N m]; status (1,), a C3Status; plan, a Plan (abstract).
 
     Args: model: a diagram of the controller's own plant and scene graph (AnitescuLcs).
-    Raises: ValueError for weights or a goal of another size.
+    Raises: ValueError for weights or a goal of another size, a plant without actuators.
     """
     c, builder = config, DiagramBuilder()
     lcs = builder.AddNamedSystem(
@@ -58,6 +58,11 @@ def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
         ),
     )
     n_x, n_u, n_lam = lcs.model.n_x, lcs.model.n_u, lcs.model.n_lam
+    if n_u == 0:
+        raise ValueError(
+            "the model's plant has no actuators, expected at least one to plan for (a "
+            "free body is moved by what touches it)"
+        )
     for name, values, n in (("Q", c.Q, n_x), ("R", c.R, n_u)):
         if len(values) != n:
             raise ValueError(

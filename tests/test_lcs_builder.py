@@ -640,6 +640,13 @@ def test_a_plant_without_actuators_has_no_input():
     assert model.is_analytic
 
 
+def test_a_plant_without_actuators_is_refused_by_the_planner():
+    diagram = diagram_of(SDF.replace("<effort>20</effort>", "<effort>0</effort>"))
+    config = ContactMpcConfig(ball_pairs(), [1.0] * 19, [], [0.0] * 19)
+    with pytest.raises(ValueError, match="has no actuators, expected at least one"):
+        make_contact_mpc(diagram, config)
+
+
 # Where the fast path must not be taken.
 
 

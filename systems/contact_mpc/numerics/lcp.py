@@ -119,8 +119,8 @@ def solve_lcp_kernel(F, q):
     # slightly regular F tells: its w is wrong by 1e-12 z, which stays below 1e-9 if
     # there is a solution, and does not shrink with the 1e-12 if there is none.
     # Lemke's path may also end in a ray although there is a solution, where M is not
-    # positive semi-definite, and rounding may break it where it nearly is not: hence the
-    # search. Where that finds nothing either, 1e-7 has to do.
+    # positive semi-definite, and rounding may break it where it nearly is not: hence
+    # the search. Where that finds nothing either, 1e-7 has to do.
     if not (
         _regular(M, b, 1e-12, 0, z) < 1e-9
         or _search(M, b, z)
