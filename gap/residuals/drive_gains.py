@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from makebreak.models.drives import law_of
+from makebreak.models.effects.drive_gains import more_damping, other_kp
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
 
@@ -60,7 +61,7 @@ def gain_columns(model) -> tuple[list[np.ndarray], list[float], list[str]]:
             efforts = []
             for track, motion in zip(model.tracks, model.motions(), strict=True):
                 less = np.zeros((*motion.v.shape, 1))
-                if effect.kind == "servo_gain":
+                if "kp" in effect.parameters:
                     stiffer = model.motion(track, [effect]).effort
                     less[:, i, 0] = (motion.effort - stiffer)[:, i] / size
                 else:
@@ -81,12 +82,7 @@ def _changes(scene: Scene, joint: str, more_kp: float, more_kd: float):
     if law is None:
         return
     if law.kp > 0.0:
-        kp = {"kp": float(law.kp) * (1.0 + more_kp)}
-        yield _name(joint, "kp"), Effect("servo_gain", [joint], kp), more_kp
+        kp = float(law.kp) * (1.0 + more_kp)
+        yield _name(joint, "kp"), other_kp(joint, kp), more_kp
     if (damping := float(law.kd + law.emf)) > 0.0:
-        more = {"damping": more_kd * damping}
-        yield (
-            _name(joint, "kd"),
-            Effect("joint_viscous_damping", [joint], more),
-            more_kd,
-        )
+        yield _name(joint, "kd"), more_damping(joint, more_kd * damping), more_kd

@@ -37,6 +37,7 @@ from makebreak.gap.thresholds import UNEXPLAINED_RMS
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, find_body, sliding_joints
+from makebreak.models.effects.objects import MASS
 from makebreak.models.scene import Scene
 
 # Below this over the sensors' noise a rich model leaves what noise may: models are
@@ -395,7 +396,7 @@ class MechanismProblem(InverseModel, GapProblem):
         # All that a joint carries may be heavier by the masses' tolerance.
         if KINDS[effect.kind].path != "gain":
             return False
-        share = tolerances(self.scene)["object_mass"].size
+        share = tolerances(self.scene)[MASS].size
         return abs(effect.parameters["gain"] - 1.0) < share
 
     def inseparable(self, effect: Effect) -> Effect | None:

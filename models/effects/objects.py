@@ -288,6 +288,7 @@ def _some_are_given(effect: Effect) -> None:
         raise ValueError(f"effect {effect.kind} at {effect.at} needs {names}")
 
 
+MASS = "object_mass"  # Whose tolerance is that of a link's mass.
 KINDS = {
     # The body's mass stays (object_mass is a kind of its own): com goes with the
     # scale, inertia with its square. The body's initial pose stays as well.
