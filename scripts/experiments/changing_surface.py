@@ -243,7 +243,7 @@ def summary(logs, done, changes, surplus, task: SurfaceTask, k_max: float) -> di
         delays = [c.decided - getattr(c, since) for c in rows]
         return float(np.nanmax(delays)) if np.isfinite(delays).any() else np.nan
 
-    confidence = np.array([c.confidence for c in changes])
+    confidence = np.array([c.confidence for c in changes]).reshape(-1, 2)
     result: dict = {
         "success": False,
         "friction": task.friction.tolist(),
@@ -251,8 +251,10 @@ def summary(logs, done, changes, surplus, task: SurfaceTask, k_max: float) -> di
         "changes_right": sum(c.right for c in changes),
         "changes_surplus": surplus,
         "modes": len(modes_of(main)),
-        "confidence_min": float(np.nanmin(confidence[:, 0])),
-        "confidence_second_max": float(np.nanmax(confidence[:, 1])),
+        "confidence_min": float(np.fmin.reduce(confidence[:, 0], initial=np.nan)),
+        "confidence_second_max": float(
+            np.fmax.reduce(confidence[:, 1], initial=np.nan)
+        ),
     }
     for name, rows in (("known", known), ("new", new)):
         result[f"delay_{name}_max_s"] = most(rows, "ends")
@@ -260,19 +262,21 @@ def summary(logs, done, changes, surplus, task: SurfaceTask, k_max: float) -> di
     for label, log in logs.items():
         error = tracking_error(log)[sliding(log)]
         K = log["stiffness"][sliding(log), :2]
+        if not len(error):  # A run that ended before the block slid.
+            error, K = np.full(1, np.nan), np.full((1, 2), np.nan)
         result[f"tracking_error_rms_m_{label}"] = float(np.sqrt(np.mean(error**2)))
         result[f"tracking_error_max_m_{label}"] = float(error.max())
         result[f"stiffness_mean_Npm_{label}"] = float(K.mean())
         result[f"done_{label}"] = bool(done[label])
     share = result["stiffness_mean_Npm_adaptive"] / k_max
     result["stiffness_share"] = float(share)
-    surfaces = len({c.after for c in changes} | {changes[0].before})
+    surfaces = len({c.after for c in changes} | {c.before for c in changes[:1]})
     right, modes = result["changes_right"], result["modes"]
     criteria = Criteria()
     criteria.holds("done", "every motion is carried out", all(done.values()))
     criteria.holds(
         "right", "changes recognised, and surplus ones; modes",
-        right == len(changes) and surplus == 0 and modes == surfaces,
+        0 < right == len(changes) and surplus == 0 and modes == surfaces,
         f"{right}, {surplus}; {modes}", f"{len(changes)}, 0; {surfaces}",
     )  # fmt: skip
     known_sec, new_sec = result["delay_known_max_s"], result["delay_new_max_s"]
