@@ -78,10 +78,14 @@ class Comparison:
     def needs_more(self, fitted: Fitted) -> bool:
         """Whether an effect is missing: held-out rows, or one channel, are above the
         noise, or nuisances are beyond what their tolerance allows."""
-        far = not is_plausible(fitted.b, self.nuisances.prior)
         loud = self.problem.noise_error(fitted.left) > NOISE_RMS_MAX
         loud |= self.problem.loudest(fitted)[1] > self.plan.loud
-        return loud or far or bool(self.nuisances_beyond(fitted))
+        return loud or self.is_strained(fitted)
+
+    def is_strained(self, fitted: Fitted) -> bool:
+        """Whether nuisances are where they should not be, all together or one alone."""
+        far = not is_plausible(fitted.b, self.nuisances.prior)
+        return far or bool(self.nuisances_beyond(fitted))
 
     def nuisances_beyond(self, fitted: Fitted) -> tuple[tuple[str, float], ...]:
         """(name, tolerances) of nuisances that would go clearly beyond their limit if

@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-from makebreak.gap.numerics.selection import is_plausible
 from makebreak.gap.problem import Fitted
 from makebreak.gap.result import Considered
 from makebreak.gap.search.add import add_next
@@ -116,11 +115,8 @@ def _converged(search: Comparison, chosen: Sequence[Choice], current: Fitted) ->
 
 def _is_unexplained(search: Comparison, fitted: Fitted) -> bool:
     """Whether much is left, or nuisances are where they should not be."""
-    return (
-        search.problem.noise_error(fitted.left) > UNEXPLAINED_RMS
-        or not is_plausible(fitted.b, search.nuisances.prior)
-        or bool(search.nuisances_beyond(fitted))
-    )
+    much = search.problem.noise_error(fitted.left) > UNEXPLAINED_RMS
+    return much or search.is_strained(fitted)
 
 
 def _branches(search: Comparison, path: Path) -> Iterator[tuple[int, int, Path]]:
@@ -153,7 +149,7 @@ def _with_tie(
     chosen, current = list(state.chosen), search.refit(state.chosen, state.fitted)
     found = [
         c for c in search.problem.candidates(search.nuisances, current)
-        if (c.kind, tuple(c.at)) == (tie.kind, tuple(tie.at))
+        if (c.kind, c.at) == (tie.kind, tuple(tie.at))
     ]  # fmt: skip
     trial = in_place_of(search, found[0], k, chosen, current) if found else None
     if trial is None:

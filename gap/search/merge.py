@@ -53,7 +53,7 @@ def _best(
     taken = places(chosen)
     free = [
         c for c in search.problem.candidates(search.nuisances, current)
-        if (c.kind, tuple(c.at)) not in taken
+        if (c.kind, c.at) not in taken
     ]  # fmt: skip
     for i, j in pairs:
         others = [c for k, c in enumerate(chosen) if k != j]
