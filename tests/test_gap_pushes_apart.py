@@ -117,7 +117,10 @@ def test_a_step_of_an_effort_between_rows_is_not_known_to_the_row(rate, sure):
     track = SimpleNamespace(time=t, episode=SimpleNamespace(rows=slice(None)))
     phi = SimpleNamespace(track=track, recording=log, centres=centres)
     held = held_means(t, centres, 0.1)
-    mean, var, _ = ContactMeans._commanded_effort(means, "j", phi, held)
+    mean, var, rate = ContactMeans._commanded_effort(means, "j", phi, held)
+    # By which a late command is corrected: half of the step in 0.2 s.
+    np.testing.assert_allclose(rate, (mean[1] - mean[0]) / 0.2)
+    assert mean[0] == pytest.approx(0.0, abs=1e-9) and rate[0] > 5.0
     np.testing.assert_allclose(mean, [0.0, 1.5], atol=0.02)
     assert var[0] == 0.0 and (var[1] == 0.0) == sure
     if not sure:

@@ -18,6 +18,7 @@ from makebreak.gap.report.clock import extents_of
 from makebreak.gap.report.comparison import comparison_html, measured_state
 from makebreak.gap.report.files import write_report
 from makebreak.gap.report.pictures import picture_of_series, picture_of_where
+from makebreak.gap.report.sections import considered
 from makebreak.gap.report.summary import next_best, summary_lines
 from makebreak.gap.result import (
     Considered,
@@ -273,6 +274,14 @@ def test_a_runner_up_that_is_ahead_is_said_to_be(case, tmp_path):
     effect = replace(case[2].effects[0], evidence=evidence)
     text = text_of(written(case, tmp_path, replace(case[2], effects=[effect])))
     assert "error 8 % smaller: too little to prefer it." in text
+
+
+def test_the_other_candidates_are_listed_with_what_each_would_have_left(case):
+    result = case[2]
+    assert result.candidates
+    for each in result.candidates:
+        assert each.kind in considered(result)
+    assert considered(replace(result, candidates=())) == ""
 
 
 def test_no_gap_and_no_name_are_said_and_nothing_is_added(case, tmp_path):
