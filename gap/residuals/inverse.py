@@ -30,21 +30,10 @@ MOST_MOTIONS, MOST_MEANS, MOST_DYNAMICS = 40, 1500, 8  # That are kept in memory
 
 
 class InverseModel(WhitenedRows):
-    """Residuals of a mechanism all of whose joints have measured positions.
+    """Residuals of a mechanism all of whose joints have measured positions."""
 
-    Args: bump_sec: width of the test functions. block_sec: every third block of time
-        of this length is held out.
-    """
-
-    def __init__(
-        self,
-        scene: Scene,
-        recordings: Sequence[Recording],
-        bump_sec: float = 0.2,
-        block_sec: float = 1.2,
-        most_sec: float = 60.0,
-    ):
-        super().__init__(scene, recordings, bump_sec, block_sec, most_sec)
+    def __init__(self, scene: Scene, recordings: Sequence[Recording]):
+        super().__init__(scene, recordings)
         self._base: np.ndarray | None = None
         self._motions: list[Motion] | None = None
         # Of a track and what moves it: the motion, and the effort that it needs.

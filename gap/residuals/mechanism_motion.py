@@ -25,6 +25,10 @@ from makebreak.models.effects.signature import Motion
 from makebreak.models.scene import Scene
 from makebreak.systems.numerics.filters import mean_delay, with_lag
 
+BUMP_SEC = 0.2  # Width of the test functions.
+BLOCK_SEC = 1.2  # Every third block of time of this length is held out.
+MOST_SEC = 60.0  # Of the recordings that are looked at.
+
 
 class RememberingDynamics(SceneDynamics):
     """Remembers how bodies moved: a dozen kinds ask for it."""
@@ -54,19 +58,10 @@ class RememberingDynamics(SceneDynamics):
 class MechanismMotion:
     """The motion of a mechanism all of whose joints have measured positions.
 
-    Args: bump_sec: width of the test functions. block_sec: every third block of time
-        of this length is held out. most_sec: of the recordings that are looked at.
     Raises: ValueError where no episode is long enough.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        recordings: Sequence[Recording],
-        bump_sec: float = 0.2,
-        block_sec: float = 1.2,
-        most_sec: float = 60.0,
-    ):
+    def __init__(self, scene: Scene, recordings: Sequence[Recording]):
         self.scene = scene
         self._remembering = RememberingDynamics(scene)
         self.dynamics: SceneDynamics = self._remembering
@@ -85,7 +80,7 @@ class MechanismMotion:
         ]  # fmt: skip
         self._read_noise()
         self._read_drives()
-        self._read_tracks(bump_sec, block_sec, most_sec)
+        self._read_tracks()
 
     def is_motor_side(self, i: int) -> bool:
         """Whether a joint's measured effort is the motor's, before its gear."""
@@ -151,15 +146,15 @@ class MechanismMotion:
         )
         self._unseen_rotor = self._link_rotor * np.array(self.by_measured)
 
-    def _read_tracks(self, bump_sec: float, block_sec: float, most_sec: float) -> None:
+    def _read_tracks(self) -> None:
         self.tracks: list[Track] = []
         seconds = 0.0
         for recording in self.recordings:
             for episode in recording.episodes:
-                if seconds > most_sec:
+                if seconds > MOST_SEC:
                     break
                 track = track_of(
-                    recording, episode, self.joints, self.noise, bump_sec, block_sec
+                    recording, episode, self.joints, self.noise, BUMP_SEC, BLOCK_SEC
                 )
                 if track is not None:
                     self.tracks.append(track)
@@ -167,7 +162,7 @@ class MechanismMotion:
         if not self.tracks:
             raise ValueError(
                 f"no episode of the recordings is long enough for windows of "
-                f"{bump_sec} s"
+                f"{BUMP_SEC} s"
             )
         self.period = float(
             np.median(np.concatenate([np.diff(t.time) for t in self.tracks]))

@@ -34,15 +34,8 @@ class WhitenedRows(MechanismMotion):
     Arguments: as of MechanismMotion.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        recordings: Sequence[Recording],
-        bump_sec: float = 0.2,
-        block_sec: float = 1.2,
-        most_sec: float = 60.0,
-    ):
-        super().__init__(scene, recordings, bump_sec, block_sec, most_sec)
+    def __init__(self, scene: Scene, recordings: Sequence[Recording]):
+        super().__init__(scene, recordings)
         self._noises = self._noise_of_rows()
         # What models are off by, beside noise [N m, rad/s].
         self.model_error = {
