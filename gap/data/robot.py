@@ -20,7 +20,7 @@ from makebreak.gap.data.proposal import (
     propose,
     sidecar_text,
 )
-from makebreak.gap.data.servo_gains import Motion, ServoGains, servo_gains
+from makebreak.gap.data.servo_gains import ServoGains, ServoLog, servo_gains
 from makebreak.gap.data.table import RecordingTable, read_table, stem_of, suffix_of
 from makebreak.models.effects.kind import actuator_of, one_dof_joints
 
@@ -310,7 +310,7 @@ def _gains_by_motion(robot: Robot, every, logs) -> dict[str, ServoGains]:
         told = [channels.get(f"{j.name}.position_command", none) for j in robot.joints]
         good = np.isfinite(q).all(axis=1) & np.isfinite(time)
         good &= np.diff(time, prepend=-np.inf) > 0.0
-        motions.append(Motion(time[good], q[good], np.stack(told, axis=1)[good]))
+        motions.append(ServoLog(time[good], q[good], np.stack(told, axis=1)[good]))
     if robot.plant.num_positions() != len(robot.joints) or not motions:
         return {}
     found = servo_gains(robot.plant, motions)

@@ -37,7 +37,7 @@ class ServoGains:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class ServoLog:
     """One log: time (n,) [s], positions q (n, n_q) and position commands (n, n_q), NaN
     where there is none, as each is held from its row on."""
 
@@ -47,7 +47,7 @@ class Motion:
 
 
 def servo_gains(
-    plant: MultibodyPlant, motions: Sequence[Motion]
+    plant: MultibodyPlant, motions: Sequence[ServoLog]
 ) -> list[ServoGains | None]:
     """Of each joint, in the order of the plant's coordinates; None where the data do
     not say: parts of them differ, or the stiffness explains too little.
@@ -78,7 +78,7 @@ def _joints(plant: MultibodyPlant) -> list:
     return sorted(one_dof_joints(plant), key=lambda joint: joint.position_start())
 
 
-def _equations(plant: MultibodyPlant, motion: Motion):
+def _equations(plant: MultibodyPlant, motion: ServoLog):
     """Of each joint the regressors (m, 4) of kp, kd, friction and rotor, and the effort
     that the robot needs (m,), while it moves; all averaged by one kernel."""
     t, n = motion.time, motion.q.shape[1]

@@ -25,7 +25,7 @@ def gain_changes(
     `size` that they are known to; none where the scene has no such tolerance."""
     share = float(scene.tolerance.get(KEY, 0.0))
     for joint in joints if share else ():
-        yield from _changes(scene, joint, share, share)
+        yield from _changes(scene, joint, share)
 
 
 def with_moved_gains(scene: Scene, names: Sequence[str], values) -> Scene:
@@ -57,7 +57,7 @@ def gain_columns(model) -> tuple[list[np.ndarray], list[float], list[str]]:
     joints = [j for j, told in zip(model.joints, model.commanded, strict=True) if told]
     for joint in joints if share else ():
         i = model.joints.index(joint)
-        for name, effect, size in _changes(model.scene, joint, _STEP, _STEP):
+        for name, effect, size in _changes(model.scene, joint, _STEP):
             efforts = []
             for track, motion in zip(model.tracks, model.motions(), strict=True):
                 less = np.zeros((*motion.v.shape, 1))
@@ -77,12 +77,14 @@ def _name(joint: str, gain: str) -> str:
     return f"{KEY} of {joint}, {gain}"
 
 
-def _changes(scene: Scene, joint: str, more_kp: float, more_kd: float):
+def _changes(
+    scene: Scene, joint: str, more: float
+) -> Iterator[tuple[str, Effect, float]]:
+    """(name, effect, more) of a joint's stiffness and damping, more by this share."""
     law = law_of(scene.actuation, joint)
     if law is None:
         return
     if law.kp > 0.0:
-        kp = float(law.kp) * (1.0 + more_kp)
-        yield _name(joint, "kp"), other_kp(joint, kp), more_kp
+        yield _name(joint, "kp"), other_kp(joint, float(law.kp) * (1.0 + more)), more
     if (damping := float(law.kd + law.emf)) > 0.0:
-        yield _name(joint, "kd"), more_damping(joint, more_kd * damping), more_kd
+        yield _name(joint, "kd"), more_damping(joint, more * damping), more
