@@ -32,11 +32,15 @@ NESTED_GAIN = 0.10
 P_VALUE_MIN = 0.01
 # The p-value above which a rival below the noise may still be as good as the effect.
 RIVAL_P_VALUE = 0.05
-# Of two effects neither of which contains the other, the one with more parameters is
-# taken if held-out rows prefer it by this much: the difference of squared residuals in
-# noise units over independent rows, 36 for six standard deviations. Two that differ by
+# Of two effects neither of which contains the other, the one with less evidence gives
+# way if the difference is larger than this: twice the logarithm of a ratio of
+# likelihoods, 25 for five standard deviations (Comparison.evidence). Two that differ by
 # less than the second number (three) do as well as each other.
-EVIDENCE_MIN, SAME_EVIDENCE = 36.0, 9.0
+EVIDENCE_MIN, SAME_EVIDENCE = 25.0, 9.0
+
+# The same that an effect needs where all rows together are near the noise and only one
+# channel is above CHANNEL_RMS_MIN: ten standard deviations.
+BESIDE_NOISE_EVIDENCE = 100.0
 
 # ----- An effect of one channel
 

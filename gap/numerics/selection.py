@@ -291,18 +291,24 @@ def benjamini_hochberg(p, rate: float = 0.05) -> np.ndarray:
     return rejected
 
 
+def by_block(x, train) -> np.ndarray:
+    """Sums of x (m,) over blocks of time: the stretches of rows that `train` (m,) has
+    in one piece."""
+    train = np.asarray(train, bool)
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(train.astype(int))) + 1])
+    return np.add.reduceat(np.asarray(x, float), starts)
+
+
 def paired(one, two, train) -> float:
     """p-value of two models being equally good: Wilcoxon's signed ranks of how their
-    squared residuals (m,) differ over blocks of time, which are the stretches of rows
-    that `train` (m,) has in one piece. 1 if there are fewer than 6.
+    squared residuals (m,) differ over blocks of time (by_block). 1 if there are fewer
+    than 6.
 
     Source: Wilcoxon, Biometrics 1(6), 1945; the pairing as in Vuong, Econometrica
     57(2), 1989.
     """
-    train = np.asarray(train, bool)
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(train.astype(int))) + 1])
-    difference = np.add.reduceat(np.asarray(one) ** 2 - np.asarray(two) ** 2, starts)
-    if len(starts) < 6 or not np.abs(difference).max() > 0.0:
+    difference = by_block(np.asarray(one) ** 2 - np.asarray(two) ** 2, train)
+    if len(difference) < 6 or not np.abs(difference).max() > 0.0:
         return 1.0
     return float(wilcoxon(difference).pvalue)
 

@@ -21,6 +21,7 @@ from makebreak.gap.search.trials import (
     shortlist,
     without_doubles,
 )
+from makebreak.gap.thresholds import EVIDENCE_MIN
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
@@ -88,11 +89,13 @@ def add_next(
         trials.append(pair)
         pick = len(trials) - 1
     before = screen.fit_nuisances(current.r)[1]
+    strained = search.is_strained(current)
     worth = [
         search.earns_its_place(
             before, t.fit.left,
             search.error(t.fit.score) < search.enough(base.score),
         )
+        or (strained and _relieves(search, t, current))
         for t in trials
     ]  # fmt: skip
     if not worth[pick]:
@@ -105,6 +108,14 @@ def add_next(
         pick = next(k for k, t in enumerate(trials) if t is instead)
     added = _choices(rivals, trials, pick, chosen, base.score, before)
     return Step(added, trials[pick].fit, table)
+
+
+def _relieves(search: Comparison, trial: Trial, current: Fitted) -> bool:
+    """Whether nuisances that were where they should not be need not be there any more,
+    and the data say the same. (A gap is there then, however little is left.)"""
+    more = trial.ranked.candidate.size
+    evident = search.evidence(trial.fit, current, more) > EVIDENCE_MIN
+    return evident and not search.is_strained(trial.fit)
 
 
 def _ranked(

@@ -4,7 +4,13 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from makebreak.gap.numerics.selection import Screen, is_plausible, paired, paired_t
+from makebreak.gap.numerics.selection import (
+    Screen,
+    by_block,
+    is_plausible,
+    paired,
+    paired_t,
+)
 from makebreak.gap.problem import Fitted, GapProblem, rms
 from makebreak.gap.search.choice import Choice, fixed_parameters
 from makebreak.gap.search.fit import fit_effects
@@ -14,6 +20,7 @@ from makebreak.gap.thresholds import (
     CHANNEL_MODEL_ERROR_SHARE,
     CHANNEL_RMS_MIN,
     CHANNEL_T_MIN,
+    EVIDENCE_MIN,
     FREE_TOLERANCE,
     MODEL_ERROR_SHARE,
     NOISE_RMS_MAX,
@@ -82,6 +89,15 @@ class Comparison:
         loud |= self.problem.loudest(fitted)[1] > self.plan.loud
         return loud or self.is_strained(fitted)
 
+    def may_need_more(self, fitted: Fitted) -> bool:
+        """Whether one channel is above what an effect of it alone must be beyond, and
+        models can be compared by evidence."""
+        if not self.plan.by_channel or self.problem.weighed_by(()) is not None:
+            return False
+        noisy = self.problem.in_noise(fitted.left)
+        channels = (noisy[self.channel == k] for k in np.unique(self.channel))
+        return any(rms(x) > CHANNEL_RMS_MIN for x in channels)
+
     def is_strained(self, fitted: Fitted) -> bool:
         """Whether nuisances are where they should not be, all together or one alone."""
         far = not is_plausible(fitted.b, self.nuisances.prior)
@@ -142,9 +158,16 @@ class Comparison:
             found[int(k)] = 1.0 - b / a
         return found
 
-    def is_worse(self, rival: Fitted, fit: Fitted) -> bool:
-        """Whether a rival that seems as good is clearly worse, below the noise too, by
-        the weights of either model."""
+    def is_worse(self, rival: Fitted, fit: Fitted, more: int) -> bool:
+        """Whether a rival that seems as good is clearly worse: there is less evidence
+        for it by EVIDENCE_MIN, or it leaves more, below the noise too, by the weights
+        of either model.
+
+        Args: more: parameters that the fit has more than the rival.
+        """
+        alike = self.problem.weighed_by(()) is None
+        if alike and self.evidence(fit, rival, more) > EVIDENCE_MIN:
+            return True
         screen = self.screen(fit.r, fit.fit.train)
         pairs = self.problem.weighed_alike(rival.effects, fit.effects)
         for worse, better in pairs:
@@ -159,6 +182,26 @@ class Comparison:
             ):
                 return False
         return bool(pairs)
+
+    def evidence(self, one: Fitted, other: Fitted, more: int) -> float:
+        """How much the data and the nuisances' tolerances prefer one model: the
+        difference of the squared residuals of all rows, over what is left and what laws
+        may be off by, and of the cost of the nuisances, less log(rows) for each
+        parameter that it has more. The block of time that prefers it most does not
+        count: no single stretch decides.
+
+        Source: Schwarz, Ann. Stat. 6(2), 1978 (BIC), as -2 times the logarithm of the
+        ratio of likelihoods, with the nuisances' prior.
+        """
+        least = max(min(one.fit.held_out, other.fit.held_out), 1.0)
+        off = MODEL_ERROR_SHARE * self.start.score
+        together = self.problem.correlation  # Neighbouring rows that say the same.
+        squares = (other.left**2 - one.left**2) / (together * (least**2 + off**2))
+        blocks = by_block(squares, self.train)
+        cost = [float(np.sum((f.b / self.nuisances.prior) ** 2)) for f in (one, other)]
+        rows = max(len(squares) / together, 1.0)
+        data = float(blocks.sum() - blocks.max(initial=0.0))
+        return data + cost[1] - cost[0] - more * float(np.log(rows))
 
     # ----- Fits
 

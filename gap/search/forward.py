@@ -7,7 +7,7 @@ from itertools import pairwise
 
 from makebreak.gap.problem import Fitted
 from makebreak.gap.result import Considered
-from makebreak.gap.search.add import add_next
+from makebreak.gap.search.add import Step, add_next
 from makebreak.gap.search.choice import (
     Choice,
     fixed_parameters,
@@ -18,7 +18,12 @@ from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.fit import derivative_free_search, fit_effects
 from makebreak.gap.search.merge import merge
 from makebreak.gap.search.rivals import Rivals, in_place_of
-from makebreak.gap.thresholds import BRANCHES_MAX, SAME_ERROR, UNEXPLAINED_RMS
+from makebreak.gap.thresholds import (
+    BESIDE_NOISE_EVIDENCE,
+    BRANCHES_MAX,
+    SAME_ERROR,
+    UNEXPLAINED_RMS,
+)
 from makebreak.models.effects.kind import Effect
 
 
@@ -72,11 +77,12 @@ def _to_the_end(search: Comparison, path: Path) -> Path:
 def _step(search: Comparison, rivals: Rivals, path: Path) -> Path:
     problem, current = search.problem, path.end.fitted
     full = len(path.states) > search.plan.most_effects  # A group counts as one.
-    if full or not search.needs_more(current):
+    clear = search.needs_more(current)
+    if full or not (clear or search.may_need_more(current)):
         return replace(path, ended=True)
     found = problem.candidates(search.nuisances, current)
     step = add_next(search, rivals, found, path.end.chosen, current)
-    if step.fitted is None:
+    if step.fitted is None or not (clear or _is_evident(search, step, current)):
         return replace(path, table=path.table or step.table, ended=True)
     chosen = [*path.end.chosen, *step.added]
     current = _converged(search, chosen, step.fitted)
@@ -88,6 +94,14 @@ def _step(search: Comparison, rivals: Rivals, path: Path) -> Path:
         chosen = refreshed(chosen, current)
     chosen, current = merge(search, chosen, current)
     return path.plus(State(tuple(chosen), current), step.table)
+
+
+def _is_evident(search: Comparison, step: Step, current: Fitted) -> bool:
+    """Whether what is added is there beyond doubt, although all rows together are near
+    the noise."""
+    assert step.fitted is not None
+    more = sum(c.size for c in step.added)
+    return search.evidence(step.fitted, current, more) > BESIDE_NOISE_EVIDENCE
 
 
 def _converged(search: Comparison, chosen: Sequence[Choice], current: Fitted) -> Fitted:

@@ -171,7 +171,8 @@ class Rivals:
                 or max(f.score, fit.score) < floor
             )
             near = search.error(f.score) <= (1.0 + SAME_ERROR) * search.error(fit.score)
-            if near and alike and search.is_worse(f, fit):
+            more = ranked.candidate.size - r.candidate.size
+            if near and alike and search.is_worse(f, fit, more):
                 continue
             if most is not None:
                 there = search.channel_gains(before, f.left)[most]
@@ -215,7 +216,8 @@ def still_tied(
             current.score
         )
         alike = paired(fit.left, current.left, search.train) > P_VALUE_MIN
-        if near and alike and not search.is_worse(fit, current):
+        more = chosen[k].size - len(fit.std[k])
+        if near and alike and not search.is_worse(fit, current, more):
             tied.append(fit.effects[k])
     return tuple(tied)
 

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from makebreak.gap.numerics.selection import Screen, paired, simplest
-from makebreak.gap.problem import Candidate, rms
+from makebreak.gap.numerics.selection import Screen, simplest
+from makebreak.gap.problem import Candidate
 from makebreak.gap.search.choice import (
     Choice,
     Trial,
@@ -22,7 +22,6 @@ from makebreak.gap.thresholds import (
     FINALISTS,
     NESTED_GAIN,
     NOISE_RMS_MAX,
-    P_VALUE_MIN,
     SAME_ERROR,
     SAME_EVIDENCE,
     SINGLE_SHARE_OF_GROUP,
@@ -168,8 +167,8 @@ def pick_simplest(
     search: Comparison, trials: Sequence[Trial], found: Sequence[Candidate], base: float
 ) -> int:
     """Index of the simplest of those that do as well as the best, with four
-    exceptions: a single effect that does nearly all that a group does, the outermost of
-    bodies that are alike, another effect that explains held-out rows clearly better,
+    exceptions: a single effect that does nearly all that a group does, another effect
+    for which there is clearly more evidence, the outermost of bodies that are alike,
     and a kind inside the chosen one that does nearly as well.
 
     Args: found: all candidates, from the base outwards. base: the error without any.
@@ -190,6 +189,8 @@ def pick_simplest(
     if best.candidate.members and alone:
         pick = min(alone, key=lambda k: errors[k])
         fit, best = trials[pick]
+    pick = _clearly_better(search, trials, pick)
+    fit, best = trials[pick]
     # Loads and forces mostly act on the outermost; the others are reported as ties.
     order = {id(c): k for k, c in enumerate(found)}
     for k, (other, r) in enumerate(trials):
@@ -198,8 +199,6 @@ def pick_simplest(
         if same and search.error(other.score) <= _SAME_BODY * search.error(fit.score):
             if order.get(id(one), -1) > order.get(id(two), -1):
                 pick, fit, best = k, other, r
-    pick = _clearly_better(search, trials, pick)
-    fit, best = trials[pick]
     for k, (inner, r) in enumerate(trials):
         inside = r.candidate.kind in KINDS[best.candidate.kind].contains
         near = search.error(inner.score) <= (1.0 + NESTED_GAIN) * search.error(
@@ -211,37 +210,29 @@ def pick_simplest(
 
 
 def _clearly_better(search: Comparison, trials: Sequence[Trial], pick: int) -> int:
-    """The one that is picked, or a larger single effect, without it as a special case,
-    that explains held-out rows better by EVIDENCE_MIN and the blocks of time too
-    (P_VALUE_MIN); of several such the simplest of those that do as well as the best.
+    """The one that is picked, or another single effect, without it as a special case,
+    for which there is more evidence by EVIDENCE_MIN, and which explains held-out rows
+    no worse; of several such the simplest of those that do as well as the best.
 
     Near the noise two errors within SAME_ERROR of each other may differ by many
-    standard deviations. Held-out rows do not favour the one with more parameters.
+    standard deviations; and the simplest may need nuisances at their limits.
     """
     if search.problem.weighed_by(()) is not None:
         return pick  # The weights depend on the model: errors say nothing so fine.
     fit, best = trials[pick]
     if best.candidate.members:
         return pick
-    held = ~search.train
-    least = min(rms(t.fit.left[held]) for t in trials)
-    independent = search.problem.correlation * max(least, 1.0) ** 2
-
-    def gain(k: int) -> float:
-        squares = fit.left[held] ** 2 - trials[k].fit.left[held] ** 2
-        return float(np.sum(squares)) / independent
-
-    better = [
-        k for k, (other, r) in enumerate(trials)
-        if not r.candidate.members
-        and best.candidate.kind not in KINDS[r.candidate.kind].contains
-        and gain(k) > EVIDENCE_MIN
-        and paired(other.left, fit.left, search.train) < P_VALUE_MIN
-    ]  # fmt: skip
-    most = max((gain(k) for k in better), default=0.0)
-    near = [k for k in better if gain(k) > most - SAME_EVIDENCE]
+    evidence = {
+        k: search.evidence(t.fit, fit, t.ranked.candidate.size - best.candidate.size)
+        for k, t in enumerate(trials)
+        if not t.ranked.candidate.members
+        and best.candidate.kind not in KINDS[t.ranked.candidate.kind].contains
+        and t.fit.fit.held_out <= fit.fit.held_out
+    }
+    most = max(evidence.values(), default=0.0)
+    if not most > EVIDENCE_MIN:
+        return pick
+    near = [k for k, e in evidence.items() if e > max(most - SAME_EVIDENCE, 0.0)]
     return min(
-        near,
-        key=lambda k: (complexity(trials[k].ranked.candidate), -gain(k)),
-        default=pick,
+        near, key=lambda k: (complexity(trials[k].ranked.candidate), -evidence[k])
     )
