@@ -24,6 +24,7 @@ REST_SPEED, REST_SHARE, REST_EFFORT = 0.005, 0.04, 0.3
 DRIVE_VELOCITY = 0.01
 MODEL_ERROR = 2e-4  # Of a joint's rms effort: what smoothing and sampling leave.
 LEAST_EFFORT = 0.1  # Of a joint, as a share of the largest joint's: rms.
+JUMP_Z = 5.0  # Standard deviations of a second difference from which it is a jump.
 LEAST_STD = 1e-12  # Of a channel that has no noise.
 
 
@@ -71,6 +72,7 @@ class WhitenedRows(MechanismMotion):
         e_std = np.hypot(MODEL_ERROR * rms, 0.5 * raw * rms_of(rate))
         direct = (kp * self.noise * g0) ** 2 + (MODEL_ERROR * rms) ** 2
         direct += np.array(self.by_measured) * (self.effort_noise * g_e) ** 2
+        direct = direct + self._unknown_jumps(track) ** 2
         rest = track.bumps.mean((np.abs(v) < REST_SPEED).astype(float))
         held = np.where(rest > REST_SHARE, rest, 0.0) * REST_EFFORT * rms
         centre = np.clip(
@@ -80,7 +82,7 @@ class WhitenedRows(MechanismMotion):
         for b, k in enumerate(centre):
             M = self._mass_matrix(q[k])
             C[b] = (M * (g2 * self.noise) ** 2) @ M.T
-            C[b] += np.diag(direct + held[b] ** 2)
+            C[b] += np.diag(direct[b] + held[b] ** 2)
         # The smoothed velocity's own error, as over one bump.
         own = self.noise * np.sqrt(period * 12.0 / track.bumps.width**3)
         v_std = np.hypot(self.velocity_noise * g_v * self._together, own)
@@ -92,6 +94,30 @@ class WhitenedRows(MechanismMotion):
                 np.hypot(self.effort_noise * g_e, e_std), LEAST_STD
             ),
         }
+
+    def _unknown_jumps(self, track: Track) -> np.ndarray:
+        """(n_bumps, n_v) standard deviations of the means of measured efforts that jump
+        between two samples: at what time, within one period, is not known.
+
+        A jump J that is taken to lie in the middle of a period T is off by J T/sqrt(12).
+        Second differences show it, twice, and nothing of what is smooth.
+        """
+        out = np.zeros((len(track.bumps.centre), len(self.joints)))
+        for i, joint in enumerate(self.joints):
+            if not self.by_measured[i]:
+                continue
+            y = track.samples[f"{joint}.effort_measured"]
+            good = np.flatnonzero(np.isfinite(y))
+            if len(good) < 3:
+                continue
+            second = np.diff(y[good], 2)
+            noise = self.effort_noise[i] * np.sqrt(6.0)
+            second = np.where(np.abs(second) > JUMP_Z * noise, second, 0.0)
+            # A table may have more rows than this channel has samples.
+            rows = (np.gradient(good.astype(float))[1:-1] * second) ** 2 / 24.0
+            weights = track.row_bumps.w[:, good[1:-1]]
+            out[:, i] = np.sqrt(weights.power(2) @ rows)
+        return out
 
     def _gains(self, track: Track, what: str, otherwise: float) -> np.ndarray:
         """(n_v,) how much of a channel's noise a mean over a bump has."""
