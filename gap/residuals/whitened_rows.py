@@ -96,7 +96,7 @@ class WhitenedRows(MechanismMotion):
         }
 
     def _unknown_jumps(self, track: Track) -> np.ndarray:
-        """(n_bumps, n_v) standard deviations of the means of measured efforts that jump
+        """(n_bumps, n_v) standard deviations of means of measured efforts that jump
         between two samples: at what time, within one period, is not known.
 
         A jump J that is taken to lie in the middle of a period T is off by J T/sqrt(12).

@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from makebreak.gap.numerics.selection import Screen, simplest
 from makebreak.gap.problem import Candidate
 from makebreak.gap.search.choice import (
