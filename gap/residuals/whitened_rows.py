@@ -8,6 +8,7 @@ mass matrix into all joints' equations.
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.residuals.mechanism_motion import MechanismMotion
@@ -24,7 +25,9 @@ REST_SPEED, REST_SHARE, REST_EFFORT = 0.005, 0.04, 0.3
 DRIVE_VELOCITY = 0.01
 MODEL_ERROR = 2e-4  # Of a joint's rms effort: what smoothing and sampling leave.
 LEAST_EFFORT = 0.1  # Of a joint, as a share of the largest joint's: rms.
-JUMP_Z = 5.0  # Standard deviations of a second difference from which it is a jump.
+# Standard deviations of a second difference from which it is a jump, beside the median
+# of so many.
+JUMP_Z, JUMP_ROWS = 5.0, 7
 LEAST_STD = 1e-12  # Of a channel that has no noise.
 
 
@@ -99,7 +102,7 @@ class WhitenedRows(MechanismMotion):
         """(n_bumps, n_v) standard deviations of means of measured efforts that jump
         between two samples: at what time, within one period, is not known.
 
-        A jump J that is taken to lie in the middle of a period T is off by J T/sqrt(12).
+        A jump J, taken to be in the middle of a period T, is off by J T/sqrt(12).
         Second differences show it, twice, and nothing of what is smooth.
         """
         out = np.zeros((len(track.bumps.centre), len(self.joints)))
@@ -111,6 +114,7 @@ class WhitenedRows(MechanismMotion):
             if len(good) < 3:
                 continue
             second = np.diff(y[good], 2)
+            second -= median_filter(second, JUMP_ROWS)
             noise = self.effort_noise[i] * np.sqrt(6.0)
             second = np.where(np.abs(second) > JUMP_Z * noise, second, 0.0)
             # A table may have more rows than this channel has samples.

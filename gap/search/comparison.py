@@ -92,7 +92,7 @@ class Comparison:
     def may_need_more(self, fitted: Fitted) -> bool:
         """Whether one channel is above what an effect of it alone must be beyond, and
         models can be compared by evidence."""
-        if not self.plan.by_channel or self.problem.weighed_by(()) is not None:
+        if not self.tells_by_evidence or not self.plan.by_channel:
             return False
         noisy = self.problem.in_noise(fitted.left)
         channels = (noisy[self.channel == k] for k in np.unique(self.channel))
@@ -165,8 +165,7 @@ class Comparison:
 
         Args: more: parameters that the fit has more than the rival.
         """
-        alike = self.problem.weighed_by(()) is None
-        if alike and self.evidence(fit, rival, more) > EVIDENCE_MIN:
+        if self.tells_by_evidence and self.evidence(fit, rival, more) > EVIDENCE_MIN:
             return True
         screen = self.screen(fit.r, fit.fit.train)
         pairs = self.problem.weighed_alike(rival.effects, fit.effects)
@@ -183,6 +182,12 @@ class Comparison:
                 return False
         return bool(pairs)
 
+    @property
+    def tells_by_evidence(self) -> bool:
+        """Whether models that leave as much as noise may can be told apart: rows have
+        the same weights for all of them, and no error is too small to say anything."""
+        return not self.plan.least_error and self.problem.weighed_by(()) is None
+
     def evidence(self, one: Fitted, other: Fitted, more: int) -> float:
         """How much the data and the nuisances' tolerances prefer one model: the
         difference of the squared residuals of all rows, over what is left and what laws
@@ -195,7 +200,7 @@ class Comparison:
         """
         least = max(min(one.fit.held_out, other.fit.held_out), 1.0)
         off = MODEL_ERROR_SHARE * self.start.score
-        together = self.problem.correlation  # Neighbouring rows that say the same.
+        together = self.problem.correlation**2  # Neighbouring rows that say the same.
         squares = (other.left**2 - one.left**2) / (together * (least**2 + off**2))
         blocks = by_block(squares, self.train)
         cost = [float(np.sum((f.b / self.nuisances.prior) ** 2)) for f in (one, other)]
