@@ -150,3 +150,53 @@ def test_one_effect_that_leaves_as_much_is_better_if_nothing_is_missing_then(
     search = SimpleNamespace(error=lambda score: score, needs_more=lambda fit: missing)
     one, two = SimpleNamespace(score=error), SimpleNamespace(score=1.0)
     assert merge._does_better(search, one, two) == better
+
+
+class SharedFriction(Columns):
+    """Joints j1 and j2, with columns of their own; the friction of both is one
+    candidate, and a gain of j2 does nearly what more friction of j2 would do."""
+
+    plan = SearchPlan(least_gain=0.1, most_effects=3, own_values=True)
+
+    def __init__(self):
+        one, two, other = directions(3).T
+        self.joints = {"a.j1": one, "a.j2": two}
+        gain = ("actuator_gain", "a.j2")
+        super().__init__({gain: (two + 0.05 * other)[:, None]}, {})
+        self._base += 1.0 * one + 1.6 * two
+
+    def _column(self, effect):
+        if effect.kind != FRICTION:
+            return self.of[effect.kind, effect.at[0]][:, 0]
+        return sum(c for j, c in self.joints.items() if {j, "a"} & set(effect.at))
+
+    def residual(self, effects=()):
+        r = np.array(self._base)
+        for each in effects:
+            (value,) = each.parameters.values()
+            r -= value * self._column(each)
+        return r
+
+    def column(self, effects, k, name, r):
+        return self._column(effects[k])
+
+    def own_values(self, effects, k, r):
+        shared = effects[k].kind == FRICTION and effects[k].at == ["a"]
+        return self.joints if shared else {}
+
+    def candidates(self, nuisances, current):
+        both = sum(self.joints.values())[:, None]
+        friction = Candidate(
+            FRICTION, ("a",), 1, (both,), (lambda c: {"coulomb": float(c[0])},)
+        )
+        return [friction, *super().candidates(nuisances, current)]
+
+
+def test_joints_get_values_of_their_own_before_another_effect_stands_for_them():
+    found = {
+        (c.effect.kind, tuple(c.effect.at)): c.effect.parameters
+        for c in select(SharedFriction()).choices
+    }
+    assert set(found) == {(FRICTION, ("a.j1",)), (FRICTION, ("a.j2",))}
+    assert found[FRICTION, ("a.j1",)]["coulomb"] == pytest.approx(1.0, abs=0.02)
+    assert found[FRICTION, ("a.j2",)]["coulomb"] == pytest.approx(1.6, abs=0.02)
