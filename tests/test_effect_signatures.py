@@ -91,6 +91,18 @@ def test_what_an_effect_adds_is_what_a_model_with_it_needs_more(tmp_path, kind):
     np.testing.assert_allclose(added, more, atol=1e-9 * np.abs(more).max())
 
 
+def test_a_load_of_some_size_adds_what_a_model_with_it_needs_more(tmp_path):
+    scene, (at, parameters) = double(tmp_path), SMALL["payload"]
+    wide = parameters | {"gyration_radius": 0.09}
+    without = SceneDynamics(scene)
+    motion = motion_of(without)
+    more = -SceneDynamics(with_effects(scene, ("payload", at, wide))).residual(motion)
+    added = added_effort(
+        Effect("payload", [at], wide), KINDS["payload"], without, motion
+    )
+    np.testing.assert_allclose(added, more, atol=1e-9 * np.abs(more).max())
+
+
 def test_what_is_missing_is_what_a_model_with_it_needs_more(tmp_path):
     # 0.2 kg less at the lower link's own centre of mass.
     scene, kind = double(tmp_path), "payload"

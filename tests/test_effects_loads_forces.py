@@ -43,10 +43,11 @@ def simulated(scene, times=TIMES, channels=CHANNELS):
     return SceneSimulation(scene).run(initial, times, channels)
 
 
-def free_fall(m, com):
-    """q'' of a pendulum about y with a point mass m at com = (x, y, z) besides."""
+def free_fall(m, com, extent=0.0):
+    """q'' of a pendulum about y with a mass m of that radius of gyration at
+    com = (x, y, z) besides."""
     x, _, z = com
-    inertia = J + m * (x**2 + z**2)
+    inertia = J + m * (x**2 + z**2 + extent**2)
 
     def acceleration(t, q, v):
         # Turning by q about y moves (x, z) to height z cos q - x sin q.
@@ -56,15 +57,19 @@ def free_fall(m, com):
     return acceleration
 
 
+@pytest.mark.parametrize("extent", [0.0, 0.15])
 @pytest.mark.parametrize("time_step, atol", [(0.0, 1e-4), (0.0005, 0.01)])
-def test_payload_swings_as_a_point_mass(tmp_path, time_step, atol):
+def test_payload_swings_as_a_mass_of_that_size(tmp_path, time_step, atol, extent):
     # atol: accuracy of the integrator; a first-order scheme of 0.5 ms at 15 rad/s2.
     m, com = 0.7, (0.12, 0.05, -0.4)
     parameters = dict(mass=m, com_x=com[0], com_y=com[1], com_z=com[2])
+    if extent:
+        parameters["gyration_radius"] = extent
     scene = with_effects(
         pendulum(tmp_path, time_step), ("payload", "p.rod", parameters)
     )
-    np.testing.assert_allclose(simulated(scene), ode(free_fall(m, com)), atol=atol)
+    expected = ode(free_fall(m, com, extent))
+    np.testing.assert_allclose(simulated(scene), expected, atol=atol)
     assert abs(ode(free_fall(m, com)) - ode(free_fall(0, com))).max() > 0.1
 
 

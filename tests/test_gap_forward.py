@@ -200,3 +200,41 @@ def test_joints_get_values_of_their_own_before_another_effect_stands_for_them():
     assert set(found) == {(FRICTION, ("a.j1",)), (FRICTION, ("a.j2",))}
     assert found[FRICTION, ("a.j1",)]["coulomb"] == pytest.approx(1.0, abs=0.02)
     assert found[FRICTION, ("a.j2",)]["coulomb"] == pytest.approx(1.6, abs=0.02)
+
+
+class WideLoad(Columns):
+    """A load whose extent k adds k^2 times a further column."""
+
+    plan = SearchPlan(least_gain=0.1, most_effects=3)
+
+    def __init__(self, extent: float):
+        *load, self.wide, other = directions(6).T
+        hand, wrist = ("payload", "arm.hand"), (MASS, "arm.wrist")
+        # A heavier wrist does nearly what the extent does.
+        columns = {hand: np.stack(load, axis=1),
+                   wrist: (self.wide + 0.3 * other)[:, None]}  # fmt: skip
+        super().__init__(columns, {hand: (0.8, 0.05, 0.04, 0.15)})
+        self._base += 100.0 * extent**2 * self.wide
+
+    def residual(self, effects=()):
+        r = np.array(self._base)
+        for each in effects:
+            values = dict(each.parameters)
+            k = values.pop("gyration_radius", 0.0)
+            r -= self.of[each.kind, each.at[0]] @ list(values.values())
+            r -= 100.0 * k**2 * self.wide
+        return r
+
+
+def test_a_load_gets_a_size_before_another_effect_stands_for_it():
+    (choice,) = select(WideLoad(0.09)).choices
+    assert choice.effect.kind == "payload" and choice.size == 5
+    found = choice.effect.parameters
+    assert found["gyration_radius"] == pytest.approx(0.09, abs=0.002)
+    assert found["mass"] == pytest.approx(0.8, abs=0.02)
+    assert 0.0 < choice.std["gyration_radius"] < 0.002
+
+
+def test_a_load_without_a_size_that_shows_is_a_point_mass():
+    (choice,) = select(WideLoad(0.01)).choices
+    assert "gyration_radius" not in choice.effect.parameters

@@ -18,6 +18,7 @@ from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.fit import derivative_free_search, fit_effects
 from makebreak.gap.search.merge import merge
 from makebreak.gap.search.own_values import with_own_values
+from makebreak.gap.search.refine import refine
 from makebreak.gap.search.rivals import Rivals, in_place_of
 from makebreak.gap.thresholds import (
     BESIDE_NOISE_EVIDENCE,
@@ -94,6 +95,7 @@ def _step(search: Comparison, rivals: Rivals, path: Path) -> Path:
         current = search.refit(chosen, current)
         chosen = refreshed(chosen, current)
     chosen, current = merge(search, chosen, current)
+    chosen, current = refine(search, chosen, current)
     if search.plan.own_values and search.needs_more(current):
         # Else another effect would stand for what joints do not share.
         chosen, current = with_own_values(search, chosen, current)

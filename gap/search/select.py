@@ -12,6 +12,7 @@ The stages, each in a file of its own:
     rivals.py       needed instead, both needed, or a tie
     pairs.py        two effects at once
     merge.py        one effect in the place of two
+    refine.py       a further parameter of an effect that is named
     own_values.py   one value for each joint
     drop.py         what is not needed, or not certain
 

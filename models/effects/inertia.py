@@ -134,9 +134,16 @@ def inertial_signature(
     )
 
 
-def ten_parameters(mass: float, com: np.ndarray) -> np.ndarray:
-    """(10,) unknowns of inertial_columns of a point mass, perhaps negative, at com."""
-    about = mass * (com @ com * np.eye(3) - np.outer(com, com))
+def about_origin(com: np.ndarray, extent: float) -> np.ndarray:
+    """(3, 3) unit inertia about the origin of a mass at com (3,) [m] with the radius of
+    gyration `extent` [m] about any axis through its centre."""
+    return (com @ com + extent**2) * np.eye(3) - np.outer(com, com)
+
+
+def ten_parameters(mass: float, com: np.ndarray, extent: float = 0.0) -> np.ndarray:
+    """(10,) unknowns of inertial_columns of a mass, perhaps negative, at com (3,) [m]
+    with a radius of gyration [m]."""
+    about = mass * about_origin(com, extent)
     return np.array([mass, *(mass * com), *(about[at] for at in SIX)])
 
 

@@ -56,6 +56,8 @@ class Parameter:
     rough: its effect is discontinuous, so a fit tries values instead of gradients.
     endless: values beyond low and high have the same effect as these, and are allowed.
     ends: a fit does not go above high, where other parameters could compensate it.
+    refines: optional, and added by a search to an effect that is named without it,
+        where that earns its place.
     """
 
     name: str
@@ -68,6 +70,7 @@ class Parameter:
     rough: bool = False
     endless: bool = False
     ends: bool = False
+    refines: bool = False
 
     @property
     def most(self) -> float:

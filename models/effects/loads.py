@@ -11,6 +11,7 @@ from pydrake.multibody.tree import (
 )
 
 from makebreak.models.effects.inertia import (
+    about_origin,
     added_inertia,
     inertial_signature,
     ten_parameters,
@@ -30,6 +31,7 @@ from makebreak.models.effects.signature import Signature, without_momentum
 # ----- payload
 
 _PLACE = ("com_x", "com_y", "com_z")
+_EXTENT = "gyration_radius"
 PLACE_MAX = 0.5  # Coordinates of a load in its body's frame [m].
 
 
@@ -38,15 +40,21 @@ def _payload_name(plant: MultibodyPlant, body: RigidBody) -> str:
 
 
 def _payload_inertia(effect: Effect) -> SpatialInertia:
-    """A point mass, perhaps negative. Drake's check for physical validity is skipped;
-    _check_left checks the sum with the body."""
+    """A point mass or one with an extent, perhaps negative. Drake's check for physical
+    validity is skipped; _check_left checks the sum with the body."""
     com = _payload_place(effect)
-    unit = UnitInertia.PointMass(com)
+    about = about_origin(com, _extent(effect))
+    unit = UnitInertia(*np.diag(about), about[0, 1], about[0, 2], about[1, 2])
     return SpatialInertia(effect.parameters["mass"], com, unit, True)
 
 
 def _payload_place(effect: Effect) -> np.ndarray:
     return np.array([effect.parameters[name] for name in _PLACE])
+
+
+def _extent(effect: Effect) -> float:
+    """Radius of gyration about its centre, the same about all axes [m]."""
+    return effect.parameters.get(_EXTENT, 0.0)
 
 
 def _check_left(
@@ -157,7 +165,8 @@ def _payload_added(effect, model, motion) -> np.ndarray:
     for body in find_bodies(effect, model.plant):
         _check_left(effect, model.plant, body, _payload_inertia(effect))
     mass, com = effect.parameters["mass"], _payload_place(effect)
-    return added_inertia(effect, model, motion, lambda M: ten_parameters(mass, com))
+    ten = ten_parameters(mass, com, _extent(effect))
+    return added_inertia(effect, model, motion, lambda M: ten)
 
 
 # ----- gravity_tilt
@@ -262,11 +271,13 @@ KINDS = {
         parameters=(
             Parameter("mass", "kg", -20.0, 20.0),
             *(Parameter(name, "m", -PLACE_MAX, PLACE_MAX, None) for name in _PLACE),
+            Parameter(_EXTENT, "m", 0.0, 0.3, 0.0, ">= 0", optional=True, refines=True),
         ),
         says="{at} carries {mass} that the model lacks, at ({com_x}, {com_y}, {com_z}) "
-        "in its frame",
+        "in its frame[, with a radius of gyration of {gyration_radius}]",
         says_less="{at} carries {mass} less than the model says, missing at ({com_x}, "
-        "{com_y}, {com_z}) in its frame",
+        "{com_y}, {com_z}) in its frame[, with a radius of gyration of "
+        "{gyration_radius}]",
         confused_with=("object_mass", "link_mass", "actuator_gain", "constant_force"),
         exported="inertia",
         tell_apart="hold three or more orientations of the wrist, and move it fast",
