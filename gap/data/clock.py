@@ -2,8 +2,14 @@
 
 import numpy as np
 from scipy.ndimage import median_filter
+from scipy.stats import chi2
 
 _ROWS = 31  # Over which medians are taken.
+_FEWEST = 3  # Medians in a stretch of a clock that goes at one rate.
+_CHANCE = 1e-4  # Of taking a rate for changed that has not.
+_LEAST = 1e-9  # Standard deviation of a median [s]: what stamps are written with.
+_LOST = 0.75  # Periods by which medians of rows jump where one was lost.
+_CLEAR = 0.15  # Scatter of steps, in periods, beside which each lost row shows.
 
 
 def clock_period(t: np.ndarray) -> float:
@@ -19,6 +25,79 @@ def even_clock(t: np.ndarray) -> np.ndarray:
     and lose rows."""
     if len(t) < 3 * _ROWS:
         return t
-    k, period = np.arange(len(t)), clock_period(t)
-    even = period * k + median_filter(t - period * k, _ROWS, mode="nearest")
+    k = _numbers(t)
+    period = float(np.polyfit(k, t, 1)[0])
+    off = t - period * k
+    slow = median_filter(off, _ROWS, mode="nearest")
+    spread = 1.4826 * float(np.median(np.abs(off - slow)))
+    even = period * k + _drift(off, slow, spread)
     return even if (np.diff(even) > 0.2 * period).all() else t
+
+
+def _numbers(t: np.ndarray) -> np.ndarray:
+    """(n,) number of each row, where lost rows count."""
+    step = np.diff(t)
+    usual = float(np.median(step))  # 0: stamps are coarser than rows.
+    step = step / usual if usual > 0.0 else np.zeros_like(step)
+    if 1.4826 * np.median(np.abs(step - 1.0)) < _CLEAR:
+        return np.append(0.0, np.cumsum(np.maximum(np.round(step), 1.0)))
+    k, quarter = np.arange(len(t)), len(t) // 4
+    period = float(np.median(t[quarter:] - t[:-quarter])) / quarter
+    slow = median_filter(t - period * k, _ROWS, mode="nearest")
+    half = _ROWS // 2
+    jump = np.zeros(len(t))  # Of the medians of rows before and after each row.
+    jump[half + 1 : -half] = (slow[2 * half + 1 :] - slow[: -2 * half - 1]) / period
+    edges = np.diff((jump > _LOST).astype(int), prepend=0, append=0)
+    for first, end in zip(
+        np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True
+    ):
+        middle = (first + end) // 2
+        k[middle:] += int(np.round(jump[middle]))
+    return k
+
+
+def _drift(off: np.ndarray, slow: np.ndarray, spread: float) -> np.ndarray:
+    """How far a clock is off (n,): straight lines through medians of stamps' offsets
+    off (n,), no more than these need. `slow`, a running median, where no lines do: its
+    own errors go together over _ROWS rows, as long as what moves.
+
+    Args: spread: standard deviation of single stamps [s].
+    """
+    n = len(off) // _ROWS
+    if n < _FEWEST:
+        return slow
+    y = np.median(off[: n * _ROWS].reshape(n, _ROWS), axis=1)
+    x = _ROWS * (np.arange(n) + 0.5)
+    # The median of normal values varies 1.25 times as much as their mean.
+    std = max(1.25 * spread / np.sqrt(_ROWS), _LEAST)
+    knots = np.array([x[0], x[-1]])
+    while True:
+        heights, left = _lines(x, y / std, knots)
+        where = np.clip(np.searchsorted(knots, x, "right") - 1, 0, len(knots) - 2)
+        size = np.bincount(where, minlength=len(knots) - 1)
+        square = np.bincount(where, left**2, minlength=len(knots) - 1)
+        bent = square > chi2.isf(_CHANCE, size)
+        if (size[bent] < 2 * _FEWEST).any():
+            return slow
+        middles = 0.5 * (knots[1:] + knots[:-1])
+        for i in np.flatnonzero(~bent & (size >= 2 * _FEWEST)):
+            _, then = _lines(x, y / std, np.insert(knots, i + 1, middles[i]))
+            bent[i] = left @ left - then @ then > chi2.isf(_CHANCE, 1)
+        if not bent.any():
+            break
+        knots = np.sort(np.append(knots, middles[bent]))
+    heights = heights * std
+    k = np.arange(len(off))
+    slopes = np.diff(heights) / np.diff(knots)
+    out = np.interp(k, knots, heights)
+    out += slopes[0] * np.minimum(k - knots[0], 0.0)
+    return out + slopes[-1] * np.maximum(k - knots[-1], 0.0)
+
+
+def _lines(x: np.ndarray, y: np.ndarray, knots: np.ndarray):
+    """Heights (n_knots,) of the broken line through y (n,) at x (n,), and what it
+    leaves (n,)."""
+    at = np.interp(x, knots, np.arange(len(knots)))
+    hats = np.maximum(1.0 - np.abs(at[:, None] - np.arange(len(knots))), 0.0)
+    heights = np.linalg.lstsq(hats, y, rcond=None)[0]
+    return heights, y - hats @ heights
