@@ -161,6 +161,14 @@ def test_a_quantised_signal_has_at_least_the_noise_of_its_grid():
     assert found.step == pytest.approx(0.002)
     assert 0.9 * 0.002 / np.sqrt(12) < found.std < 1.5 * 0.002 / np.sqrt(12)
     assert resolution(np.random.default_rng(0).normal(size=1000)) == 0.0
+    # A joint that moves so fast that few readings of its encoder come back, in degrees
+    # of ten digits; and decimals that are no grid.
+    t = 0.01 * np.arange(2400)
+    angle = np.sin(0.7 * t) + 0.3 * np.sin(2.3 * t)
+    read = np.round(np.rad2deg(3e-4 * np.round(angle / 3e-4)), 9)
+    assert len(np.unique(read)) > 0.5 * len(read)
+    assert np.deg2rad(resolution(read)) == pytest.approx(3e-4, rel=1e-6)
+    assert resolution(np.round(angle, 10)) == 0.0
 
 
 def test_filtered_noise_is_called_coloured_and_not_underestimated_by_half():

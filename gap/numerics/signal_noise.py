@@ -178,14 +178,18 @@ def _first_settled(found: list[tuple[float, float]]) -> tuple[float, float]:
     return min(found, default=(0.0, 0.0))
 
 
+_NEAR = 10  # Steps between most neighbouring values of a signal that has a grid.
+
+
 def resolution(values) -> float:
     """The step of the grid that all values lie on, 0 if there is none.
 
-    A grid is believed if values come back often and all jumps are multiples of the
-    smallest: noise of double precision never does.
+    A grid is believed if values come back often, or most of its points are close to
+    others (so many decimals that a text was written with are no grid), and all jumps
+    are multiples of the smallest: noise of double precision never does.
     """
     unique = np.unique(np.asarray(values, dtype=float))
-    if len(unique) < 3 or len(unique) > 0.5 * np.size(values):
+    if len(unique) < 3:
         return 0.0
     gaps = np.diff(unique)
     # What prints as one decimal may differ in the last bits.
@@ -194,6 +198,8 @@ def resolution(values) -> float:
         return 0.0
     step = float(gaps.min())
     counts = np.rint(gaps / step)
+    if len(unique) > 0.5 * np.size(values) and np.median(counts) > _NEAR:
+        return 0.0
     step = float(gaps.sum() / counts.sum())  # Averages what rounding did to each.
     return step if np.all(np.abs(gaps / step - counts) < 0.05) else 0.0
 
