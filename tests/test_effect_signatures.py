@@ -665,3 +665,39 @@ def test_a_joint_that_slides_has_its_own_units(tmp_path):
 )
 def test_a_value_has_the_digits_that_its_deviation_leaves(value, std, text):
     assert with_deviation(value, std) == text
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters"),
+    [
+        ("payload", dict(mass=0.02, com_x=0.01, com_y=-0.03, com_z=0.04)),
+        ("link_mass", dict(mass=-0.02)),
+        ("link_com", dict(x=0.003, y=-0.002, z=0.004)),
+    ],
+)
+def test_responses_to_probes_add_up_to_that_of_any_small_effect(
+    tmp_path, kind, parameters
+):
+    """The effort that a motion needs: from shares of the probes, and from the effect
+    with the parameters that these shares are read as."""
+    model = SceneDynamics(double(tmp_path))
+    motion = motion_of(model)
+    probes, read = KINDS[kind].probes(0.01)
+
+    def added(values):
+        effect = Effect(kind, ["d.lower"], values)
+        return added_effort(effect, KINDS[kind], model, motion).ravel()
+
+    columns = np.stack([added(p) for p in probes], axis=1)
+    wanted = added(parameters)
+    shares = np.linalg.lstsq(columns, wanted, rcond=None)[0]
+    off = np.linalg.norm(columns @ shares - wanted) / np.linalg.norm(wanted)
+    assert off < 0.02  # Of second order in how far off the load is.
+    for name, value in read(shares).items():
+        assert value == pytest.approx(parameters[name], abs=0.1 * np.abs(value) + 2e-3)
+
+
+def test_a_load_of_which_only_the_moment_shows_starts_from_a_mass_that_can_be():
+    _, read = KINDS["payload"].probes(0.01)
+    found = read([-4.0, 4.0, 0.0, 0.0])  # No mass, and 2 g m along x.
+    assert found["mass"] == pytest.approx(0.02) and found["com_x"] == pytest.approx(0.1)

@@ -164,6 +164,36 @@ def test_joints_that_all_differ_are_found_together(tmp_path):
         )
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_load_on_an_arm_that_sticks_is_named(tmp_path, sign):
+    """By its weight, 1.2 N m at the elbow: as a load, or as the mass of the link and
+    where its centre is. Friction holds 0.5 N m."""
+    place = dict(com_x=0.0, com_y=0.02, com_z=-0.3)
+    hidden = [("payload", ["d.lower"], dict(mass=0.4 * sign) | place)]
+    problem = problem_of(tmp_path, "two", hidden)
+    found = select(problem).effects()
+    assert 1 <= len(found) <= 2 and all(list(e.at) == ["d.lower"] for e in found)
+    assert {e.kind for e in found} <= {"payload", "link_mass", "link_com"}
+    q = np.random.default_rng(0).uniform(-1.0, 1.0, (20, 2))
+    still, time = np.zeros_like(q), np.arange(20.0)
+
+    def weight(effects):
+        scene = with_effects(problem.scene, *effects)
+        return SceneDynamics(scene).inverse_dynamics(q, still, still, time)
+
+    base = weight([])
+    truth, ours = (
+        weight(effects) - base
+        for effects in (hidden, [(e.kind, list(e.at), e.parameters) for e in found])
+    )
+    assert rms(ours - truth) < 0.1 * rms(truth)
+
+
+def rms(x):
+    return float(np.sqrt(np.mean(x**2)))
+
+
 def test_groups_have_joints_and_not_the_value_that_all_share():
     def candidate(at):
         return Candidate("joint_coulomb_friction", (at,), 1, (np.ones((4, 1)),), ())

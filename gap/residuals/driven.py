@@ -44,6 +44,7 @@ from makebreak.models.drives import DRIVEN_BY, law_of
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.joints import rotor
 from makebreak.models.effects.kind import Effect, find_joints, full_name
+from makebreak.models.effects.objects import MASS
 from makebreak.models.scene import Scene
 from makebreak.models.scene_schema import COMMANDS_OF
 
@@ -52,6 +53,7 @@ WINDOW_SEC, MOST_WINDOWS = 0.5, 60
 REST_SPEED, REST_SEC, STICKS = 0.005, 0.2, 0.2
 # How far a parameter is moved to see what it does, in shares of a typical size.
 SMALL = 0.1
+JOINTS = ("joint", "actuator", "drive")  # Kinds at these act on a joint.
 BESIDE_SEC = 0.06  # About a start, within which a jerk spoils what is known of it.
 
 
@@ -285,7 +287,28 @@ class DrivenProblem(DrivenWindows, GapProblem):
                         Candidate(kind, (joint,), 1, own, tuple(readers),
                                   least=self.dynamics.least(kind, [joint]))
                     )  # fmt: skip
+        found += self._of_bodies(current, taken)
         return [c for c in found if any(x.any() for x in c.columns)]
+
+    def _of_bodies(self, current: Fitted, taken) -> list[Candidate]:
+        """Loads, and masses that are otherwise than in the model, by small ones."""
+        masses = [self.dynamics.now(MASS, [at])["mass"] for at in self.dynamics.links()]
+        small = SMALL * float(np.mean(masses))
+        found = []
+        for kind, entry in KINDS.items():
+            if entry.probes is None or not can_have(kind):
+                continue
+            probes, reader = entry.probes(small)
+            for at in self.dynamics.places(kind):
+                if (kind, at) in taken:
+                    continue
+                moved = [self._residual(current, Effect(kind, [at], p)) for p in probes]
+                columns = np.stack([current.r - r for r in moved], axis=1)
+                found.append(
+                    Candidate(kind, (at,), columns.shape[1], (columns,), (reader,),
+                              least=self.dynamics.least(kind, [at]))
+                )  # fmt: skip
+        return found
 
     def _residual(self, current: Fitted, effect: Effect) -> np.ndarray:
         try:
@@ -298,8 +321,9 @@ class DrivenProblem(DrivenWindows, GapProblem):
     ) -> dict[str, np.ndarray]:
         """{joint: (m,) column} of a value of its own for each joint that effect k has,
         beside the shared one."""
-        effect = effects[k]
-        plant = self.dynamics.plant
+        effect, plant = effects[k], self.dynamics.plant
+        if KINDS[effect.kind].at not in JOINTS:
+            return {}
         joints = [full_name(plant, j) for j in find_joints(effect, plant)]
         joints = [j for j in joints if self._takes(effect.kind, j)]
         names = [p.name for p in KINDS[effect.kind].parameters]
@@ -332,7 +356,7 @@ class DrivenProblem(DrivenWindows, GapProblem):
         of all kinds with one parameter at joints."""
         models = list(dict.fromkeys(j.split(".")[0] for j in self.joints))
         for kind, entry in KINDS.items():
-            if entry.at not in ("joint", "actuator", "drive") or not can_have(kind):
+            if entry.at not in JOINTS or not can_have(kind):
                 continue
             if len(entry.parameters) != 1:
                 continue

@@ -173,11 +173,15 @@ def is_clearly_off(choice: Choice) -> bool:
 
 def uses_all_parameters(fit: Fitted, k: int = -1) -> bool:
     """Whether each parameter of effect k of a fit is two deviations off neutral: else
-    it is another, smaller effect under this name."""
+    it is another, smaller effect under this name. One that nothing shows is none of it,
+    and the only one with a neutral value (a load's mass, of which only its moment
+    shows) may be uncertain."""
     last, std = fit.effects[k], fit.std[k]
-    for each in KINDS[last.kind].parameters:
-        if each.neutral is not None and each.name in std:
-            off = abs(last.parameters[each.name] - each.neutral)
-            if not off > 2.0 * std[each.name]:
-                return False
-    return True
+    known = [
+        p for p in KINDS[last.kind].parameters
+        if p.neutral is not None and std.get(p.name, np.inf) < np.inf
+    ]  # fmt: skip
+    return len(known) < 2 or all(
+        abs(last.parameters[p.name] - (p.neutral or 0.0)) > 2.0 * std[p.name]
+        for p in known
+    )

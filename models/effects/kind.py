@@ -148,6 +148,9 @@ class EffectKind:
         effects: that it has; damped: {joint: damping of its drive [N m s/rad]}.
     plausible(effect): whether the combination of parameters occurs in real robots.
     tries(effect, plant, motions): {nonlinear parameter: values that a search tries}.
+    probes(mass): the parameters of small effects, of about so many kilograms, whose
+        responses add up to that of any small effect, and a function from their shares
+        (k,) to its parameters; of kinds at bodies.
     contains: kinds that are special cases of this one with fewer parameters: it is only
         named if it is clearly better than they are.
     signature: see signature.py; None: it is only visible in simulation.
@@ -190,6 +193,7 @@ class EffectKind:
     contains: tuple[str, ...] = ()
     plausible: Callable[[Effect], bool] | None = None
     tries: Callable[..., Mapping[str, Sequence[float]]] | None = None
+    probes: Callable[[float], tuple[list[dict[str, float]], Callable]] | None = None
     static_deflection: Callable[[Effect, float], float] | None = None
     joint_law: Callable | None = None
     joint_numbers: Callable[[Effect, MultibodyPlant, Joint], list[float]] | None = None

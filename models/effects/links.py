@@ -107,6 +107,16 @@ def _com_added(effect: Effect, model, motion) -> np.ndarray:
     return added_inertia(effect, model, motion, more)
 
 
+def _mass_probes(size: float):
+    return [{"mass": size}], lambda c: {"mass": size * float(c[0])}
+
+
+def _com_probes(size: float):
+    arm = 0.01
+    each = [{a: arm * (a == axis) for a in "xyz"} for axis in "xyz"]
+    return each, lambda c: {a: arm * float(x) for a, x in zip("xyz", c, strict=True)}
+
+
 KINDS = {
     # The moments of inertia scale with the mass: its distribution stays.
     "link_mass": EffectKind(
@@ -126,6 +136,7 @@ KINDS = {
         now=_no_change,
         signature=_signature,
         added=_mass_added,
+        probes=_mass_probes,
     ),
     # The inertia about the centre of mass is kept.
     "link_com": EffectKind(
@@ -144,5 +155,6 @@ KINDS = {
         now=_no_change,
         signature=_signature,
         added=_com_added,
+        probes=_com_probes,
     ),
 }

@@ -33,6 +33,7 @@ from makebreak.models.effects.signature import Signature, without_momentum
 _PLACE = ("com_x", "com_y", "com_z")
 _EXTENT = "gyration_radius"
 PLACE_MAX = 0.5  # Coordinates of a load in its body's frame [m].
+_PROBE_ARM, _USUAL_ARM = 0.05, 0.1  # Of small point masses, and of a load [m].
 
 
 def _payload_name(plant: MultibodyPlant, body: RigidBody) -> str:
@@ -159,6 +160,24 @@ def _payload_signature(effect, model, motion, grid=None) -> list[Signature]:
             effect, model, motion, body, unknowns, np.eye(10), to_parameters, False
         )
     ]
+
+
+def _payload_probes(size: float):
+    """Point masses at the body's origin and on its axes."""
+    places = np.vstack([np.zeros(3), _PROBE_ARM * np.eye(3)])
+
+    def parameters(mass: float, place) -> dict[str, float]:
+        return {"mass": mass} | dict(zip(_PLACE, map(float, place), strict=True))
+
+    def from_shares(c):
+        mass, moment = size * float(np.sum(c)), size * (np.asarray(c) @ places)
+        reach = float(np.linalg.norm(moment))
+        # Where only its moment shows the mass may come out as anything.
+        if not mass > 0.0 or reach > PLACE_MAX * mass:
+            mass = max(reach / _USUAL_ARM, 1e-6)
+        return parameters(mass, moment / mass)
+
+    return [parameters(size, place) for place in places], from_shares
 
 
 def _payload_added(effect, model, motion) -> np.ndarray:
@@ -288,6 +307,7 @@ KINDS = {
         set_in_context=_change_payload,
         signature=_payload_signature,
         added=_payload_added,
+        probes=_payload_probes,
     ),
     "gravity_tilt": EffectKind(
         at="base",
