@@ -16,6 +16,7 @@ from makebreak.gap.search.choice import Choice, fixed_parameters
 from makebreak.gap.search.fit import fit_effects
 from makebreak.gap.search.together import WEIGHT_ROUNDS
 from makebreak.gap.thresholds import (
+    BESIDE_NOISE_EVIDENCE,
     CHANNEL_GAIN,
     CHANNEL_MODEL_ERROR_SHARE,
     CHANNEL_RMS_MIN,
@@ -90,13 +91,23 @@ class Comparison:
         return loud or self.is_strained(fitted)
 
     def may_need_more(self, fitted: Fitted) -> bool:
-        """Whether one channel is above what an effect of it alone must be beyond, and
-        models can be compared by evidence."""
+        """The same, or one channel is above what an effect of it alone must be beyond,
+        where models can be compared by evidence."""
+        if self.needs_more(fitted):
+            return True
         if not self.tells_by_evidence or not self.plan.by_channel:
             return False
         noisy = self.problem.in_noise(fitted.left)
         channels = (noisy[self.channel == k] for k in np.unique(self.channel))
         return any(rms(x) > CHANNEL_RMS_MIN for x in channels)
+
+    def is_needed(self, more: Fitted, fitted: Fitted, parameters: int) -> bool:
+        """Whether what a fit has more than another is missing there: an effect is, or
+        all rows together are near the noise and it is there beyond doubt."""
+        return (
+            self.needs_more(fitted)
+            or self.evidence(more, fitted, parameters) > BESIDE_NOISE_EVIDENCE
+        )
 
     def is_strained(self, fitted: Fitted) -> bool:
         """Whether nuisances are where they should not be, all together or one alone."""

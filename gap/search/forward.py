@@ -7,7 +7,7 @@ from itertools import pairwise
 
 from makebreak.gap.problem import Fitted
 from makebreak.gap.result import Considered
-from makebreak.gap.search.add import Step, add_next
+from makebreak.gap.search.add import add_next
 from makebreak.gap.search.choice import (
     Choice,
     fixed_parameters,
@@ -21,7 +21,6 @@ from makebreak.gap.search.own_values import with_own_values
 from makebreak.gap.search.refine import refine
 from makebreak.gap.search.rivals import Rivals, in_place_of
 from makebreak.gap.thresholds import (
-    BESIDE_NOISE_EVIDENCE,
     BRANCHES_MAX,
     SAME_ERROR,
     UNEXPLAINED_RMS,
@@ -79,12 +78,12 @@ def _to_the_end(search: Comparison, path: Path) -> Path:
 def _step(search: Comparison, rivals: Rivals, path: Path) -> Path:
     problem, current = search.problem, path.end.fitted
     full = len(path.states) > search.plan.most_effects  # A group counts as one.
-    clear = search.needs_more(current)
-    if full or not (clear or search.may_need_more(current)):
+    if full or not search.may_need_more(current):
         return replace(path, ended=True)
     found = problem.candidates(search.nuisances, current)
     step = add_next(search, rivals, found, path.end.chosen, current)
-    if step.fitted is None or not (clear or _is_evident(search, step, current)):
+    more = sum(c.size for c in step.added)
+    if step.fitted is None or not search.is_needed(step.fitted, current, more):
         return replace(path, table=path.table or step.table, ended=True)
     chosen = [*path.end.chosen, *step.added]
     current = _converged(search, chosen, step.fitted)
@@ -100,14 +99,6 @@ def _step(search: Comparison, rivals: Rivals, path: Path) -> Path:
         # Else another effect would stand for what joints do not share.
         chosen, current = with_own_values(search, chosen, current)
     return path.plus(State(tuple(chosen), current), step.table)
-
-
-def _is_evident(search: Comparison, step: Step, current: Fitted) -> bool:
-    """Whether what is added is there beyond doubt, although all rows together are near
-    the noise."""
-    assert step.fitted is not None
-    more = sum(c.size for c in step.added)
-    return search.evidence(step.fitted, current, more) > BESIDE_NOISE_EVIDENCE
 
 
 def _converged(search: Comparison, chosen: Sequence[Choice], current: Fitted) -> Fitted:

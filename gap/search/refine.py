@@ -23,7 +23,7 @@ def refine(
         for each in KINDS[choice.effect.kind].parameters:
             if not each.refines or each.name in choice.effect.parameters:
                 continue
-            if not search.needs_more(current):
+            if not search.may_need_more(current):
                 return chosen, current
             now = current.effects[k]
             value = each.low + _START * (each.high - each.low)
@@ -40,8 +40,9 @@ def refine(
             before = screen.evaluate(current.r).score
             gained = search.error(fit.score) < search.enough(before)
             left = screen.fit_nuisances(current.r)[1]
-            if not is_sane(fit.effects[k]) or not search.earns_its_place(
-                left, fit.left, gained
+            earned = search.earns_its_place(left, fit.left, gained)
+            if not (
+                is_sane(fit.effects[k]) and earned and search.is_needed(fit, current, 1)
             ):
                 continue
             chosen[k] = replace(choice, size=choice.size + 1)
