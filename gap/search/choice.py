@@ -173,15 +173,15 @@ def is_clearly_off(choice: Choice) -> bool:
 
 def uses_all_parameters(fit: Fitted, k: int = -1) -> bool:
     """Whether each parameter of effect k of a fit is two deviations off neutral: else
-    it is another, smaller effect under this name. One that nothing shows is none of it,
-    and the only one with a neutral value (a load's mass, of which only its moment
-    shows) may be uncertain."""
+    it is another, smaller effect under this name. Of a vector one component is enough;
+    what nothing shows is no parameter of it; and the only one with a neutral value (a
+    load's mass, of which only its moment shows) may be uncertain."""
     last, std = fit.effects[k], fit.std[k]
-    known = [
-        p for p in KINDS[last.kind].parameters
-        if p.neutral is not None and std.get(p.name, np.inf) < np.inf
-    ]  # fmt: skip
-    return len(known) < 2 or all(
-        abs(last.parameters[p.name] - (p.neutral or 0.0)) > 2.0 * std[p.name]
-        for p in known
-    )
+    clear: dict[str, bool] = {}
+    for p in KINDS[last.kind].parameters:
+        if p.neutral is None or not std.get(p.name, np.inf) < np.inf:
+            continue
+        off = abs(last.parameters[p.name] - p.neutral) > 2.0 * std[p.name]
+        vector = p.name[:-1] if p.name[-1] in "xyz" else p.name
+        clear[vector] = clear.get(vector, False) or off
+    return len(clear) < 2 or all(clear.values())

@@ -155,7 +155,7 @@ class Rivals:
         most = max(gains, key=lambda k: gains[k], default=None)
         for other in others:
             f, r = other
-            if not self._could_tie(ranked, other):
+            if not self._could_tie(best, other):
                 continue
             both = None
             if are_rivals(best, other):
@@ -181,15 +181,21 @@ class Rivals:
                 ties.append(f.effects[-1])
         return tuple(ties)
 
-    def _could_tie(self, best: Ranked, other: Trial) -> bool:
+    def _could_tie(self, best: Trial, other: Trial) -> bool:
         """Whether another candidate is a different statement than the effect: no group,
-        no kind that contains it, no bigger one, and not the same kind on the same rigid
-        body."""
-        one, two = best.candidate, other.ranked.candidate
+        no kind that contains it, and not the same kind on the same rigid body. A bigger
+        one, which has the effect as a special case or nearly, needs evidence for it."""
+        (fit, ranked), two = best, other.ranked.candidate
+        one = ranked.candidate
         if two.members or one.kind in KINDS[two.kind].contains:
             return False
-        if two.size > one.size + EXTRA_PARAMETERS_MAX:
-            return False
+        more = two.size - one.size
+        if more > EXTRA_PARAMETERS_MAX:
+            search = self._search
+            if not search.tells_by_evidence:
+                return False
+            if not search.evidence(other.fit, fit, more) > 0.0:
+                return False
         if not uses_all_parameters(other.fit):
             return False
         same_kind = two.kind == one.kind

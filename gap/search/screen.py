@@ -101,7 +101,7 @@ def candidates(
         if entry.signature is None:
             continue
         waves: list | None = None
-        places = dynamics.places(kind)
+        places, first = dynamics.places(kind), len(found)
         is_wave = any(p.name == "frequency" for p in entry.parameters)
         for at in reversed(places) if is_wave else places:
             if entry.at == "base" and at == "world":
@@ -149,6 +149,8 @@ def candidates(
                     least=dynamics.least(kind, [at]),
                 )
             )  # fmt: skip
+        if is_wave:
+            found[first:] = reversed(found[first:])  # From the base outwards, as all.
     return found
 
 

@@ -471,13 +471,15 @@ KINDS = {
         at="joint",
         parameters=(
             Parameter("amplitude", "N m", 0.0, 10.0),
-            Parameter("periods_per_rev", "periods a turn", 1.0, 100.0, None),
+            Parameter("periods_per_rev", "periods a turn", 2.0, 100.0, None),
             Parameter("phase", "rad", -math.pi, math.pi, None),
         ),
         says="{at} has a torque ripple of {amplitude} with {periods_per_rev} (phase "
         "{phase}) that the model lacks",
         confused_with=("sinusoidal_force", "joint_spring"),
         tries=lambda effect, plant, motions: {"periods_per_rev": TRIED_PERIODS},
+        # Once a turn is the weight of a mass off the axis, less is a spring.
+        plausible=lambda e: e.parameters["periods_per_rev"] >= 2.0,
         tell_apart="move through the same positions at two speeds: the frequency of a "
         "ripple goes with the speed",
         joint_law=ripple_law,
