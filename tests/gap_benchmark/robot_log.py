@@ -99,6 +99,9 @@ def write_log(
     n = len(joints)
     spacing = round(1.0 / how.rate_hz / _GRID)
     rows = np.arange(spacing, len(track.time) - spacing, spacing)
+    # What a slow clock would show at the end has not happened.
+    last = track.time[-1] * (1.0 + min(how.skew, 0.0)) + min(how.delay, 0.0)
+    rows = rows[track.time[rows] <= last]
     true = track.time[rows]
     stamp = true + np.clip(
         how.jitter * rng.normal(size=len(rows)), -0.45 / how.rate_hz,
