@@ -41,6 +41,7 @@ from makebreak.diagrams.ball_rolling_config import (
 )
 from makebreak.diagrams.camera import camera_model
 from makebreak.diagrams.faults import faulty_lcs
+from makebreak.diagrams.realism import draw_errors
 from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.sampled_contacts import (
     add_sampled_contacts,
@@ -132,6 +133,7 @@ def make_world(
         ),
         meshcat,
         world_scene(config) if scene is None else scene,
+        draw_errors(config.realism, config.seed),
         wrong=what_goes_wrong(config),
     )
 

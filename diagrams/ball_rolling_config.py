@@ -133,7 +133,11 @@ class BallRollingConfig:
     start_angle_rad: float | None = None
     world: str = BALL_ROLLING  # Scene file of the simulated world.
     model: str = BALL_ROLLING  # Scene file of the controllers' model.
-    seed: int = 0  # Seed of the ball's start, a fruit's shape and the sensors' noise.
+    # Errors of the station that the model lacks: none, lab or poor.
+    realism: str = "none"
+    # Seed of the ball's start, a fruit's shape, the station's errors and the sensors'
+    # noise.
+    seed: int = 0
     camera: CameraConfig = field(default_factory=CameraConfig)
     tracker: BallTrackerConfig = field(
         default_factory=lambda: BallTrackerConfig(

@@ -27,7 +27,7 @@ from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 from makebreak.diagrams.arm_reach import ArmReach
 from makebreak.diagrams.fault_kinds import read_faults
 from makebreak.diagrams.given_pattern import segment_paths
-from makebreak.diagrams.realism import StationErrors, with_errors
+from makebreak.diagrams.realism import StationErrors
 from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.station import (
     ARM,
@@ -201,13 +201,10 @@ def make_changing_contact(
         seed: of the sensors' noise.
         meshcat: shows the run; None: it is not shown.
         view: settings of Meshcat's view; None: the defaults.
-        errors: of the station, which the model lacks; None: none. The first of the
-            world's objects has to be its table.
+        errors: of the station, which the model lacks; None: none.
     Raises: ValueError for periods or offsets in config that are not the defaults.
     """
     builder = DiagramBuilder()
-    if errors is not None:
-        world = with_errors(world, errors, ARM, tool, objects(world)[0])
     station = builder.AddNamedSystem(
         "station",
         make_station(

@@ -19,6 +19,7 @@ from makebreak.diagrams.changing_contact import (
     make_changing_contact,
 )
 from makebreak.diagrams.given_pattern import expected_contacts, start_at_pattern
+from makebreak.diagrams.realism import StationErrors, draw_errors
 from makebreak.diagrams.tabletop import (
     THREE_SURFACES,
     TOOL,
@@ -50,12 +51,14 @@ DOWN = np.array([0.0, 0.0, -1.0])
 
 @dataclass
 class ContactTypesConfig:
-    seed: int = 0  # Seed of the friction and the noise.
+    seed: int = 0  # Seed of the friction, the station's errors and the noise.
     # Tilt of the block: about one axis on its edge, about two on its corner [deg].
     tilt_deg: float = 10.0
     speed: float = 0.1  # Speed of sliding over the plate [m/s].
     normal_force: float = 8.0  # Normal force on the plate [N].
     friction: float = 0.0  # Coefficient of friction of the plate; 0: drawn by the seed.
+    # Errors of the station that the model lacks: none, lab or poor.
+    realism: str = "none"
     control: ChangingContactConfig = field(
         default_factory=lambda: ChangingContactConfig(
             # The moment of a face wanders by 3 mm times the normal force, which has to
@@ -75,6 +78,7 @@ class TypesTask:
     strokes: tuple[tuple[int, str], ...]  # Each stroke's segment, and its type.
     prior: ContactBelief
     friction: float
+    errors: StationErrors
 
 
 def orientation(kind: str, tilt_deg: float) -> Rotation:
@@ -148,7 +152,8 @@ def make_task(config: ContactTypesConfig) -> TypesTask:
     pattern, strokes = make_pattern(config)
     start_at_pattern(pattern, world, model, TOOL)
     prior = expected_contacts(pattern, PLACE_STD)
-    return TypesTask(world, model, pattern, strokes, prior, friction)
+    errors = draw_errors(config.realism, config.seed)
+    return TypesTask(world, model, pattern, strokes, prior, friction, errors)
 
 
 def make_contact_types(
@@ -164,4 +169,5 @@ def make_contact_types(
         tool=TOOL,
         seed=config.seed,
         meshcat=meshcat,
+        errors=task.errors,
     )

@@ -207,7 +207,11 @@ class GentleRollingConfig:
     # glass. The latter replaces push.table_first, push.table_every, and press_table,
     # slide and survey of push.shape.
     table: str = "plain"
-    seed: int = 0  # Seed of the ball's start, a fruit's shape and the sensors' noise.
+    # Errors of the station that the model lacks: none, lab or poor.
+    realism: str = "none"
+    # Seed of the ball's start, a fruit's shape, the station's errors and the sensors'
+    # noise.
+    seed: int = 0
 
 
 # What `telemetry_log` holds: name -> (system, port, size).
@@ -237,7 +241,7 @@ def ball_config(config: GentleRollingConfig) -> BallRollingConfig:
 
     Raises: ValueError for settings that gentle_rolling's own replace.
     """
-    for name in ("seed", "adapt"):
+    for name in ("seed", "adapt", "realism"):
         default = getattr(BallRollingConfig(), name)
         if getattr(config.ball, name) != default:
             raise ValueError(
@@ -249,7 +253,9 @@ def ball_config(config: GentleRollingConfig) -> BallRollingConfig:
             f"ball.contact_sequence is {config.ball.contact_sequence}, expected cycle: "
             "the gentle touch-down is that of its landing"
         )
-    return replace(config.ball, seed=config.seed, adapt=config.adapt)
+    return replace(
+        config.ball, seed=config.seed, adapt=config.adapt, realism=config.realism
+    )
 
 
 def on_two_surfaces(config: GentleRollingConfig) -> GentleRollingConfig:

@@ -52,6 +52,7 @@ from makebreak.diagrams.push_object_scenes import (
     poses_of,
     world_scene,
 )
+from makebreak.diagrams.realism import draw_errors
 from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.station import (
@@ -232,6 +233,7 @@ def _add_station(builder: DiagramBuilder, config: PushObjectConfig, meshcat) -> 
             ),
             meshcat,
             world_scene(config),
+            draw_errors(config.realism, config.seed),
         ),
     )
 

@@ -146,7 +146,10 @@ class PushObjectConfig:
     rolling_resistance: float | None = None
     model: PushModelConfig = field(default_factory=PushModelConfig)
     scene: str = PUSH_OBJECT  # Scene file of the simulated world.
-    seed: int = 0  # Seed of the initial pose, the goals and the sensors' noise.
+    # Errors of the station that the model lacks: none, lab or poor.
+    realism: str = "none"
+    # Seed of the initial pose, the goals, the station's errors and the sensors' noise.
+    seed: int = 0
     n_goals: int = 1  # Number of goals in a row, drawn by the seed.
     # Initial pose of the object, [x, y, yaw] [m], [rad]; empty: drawn by the seed.
     start: list[float] = field(default_factory=list)

@@ -1,14 +1,17 @@
 """Errors of a real station that its model lacks: the `realism` setting.
 
 A level gives the size of the errors; the seed draws them. They are constant over
-trials, as on a robot, and unknown to the controllers.
+trials, as on a robot, and unknown to the controllers. make_station puts all of them
+into its world.
 """
 
 from copy import deepcopy
 from dataclasses import dataclass, field
 
 import numpy as np
+from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.schema import Transform
+from pydrake.math import RigidTransform, RollPitchYaw
 
 from makebreak.diagrams.scene_facts import N_JOINTS, PANDA_JOINTS
 from makebreak.models.effects.kind import Effect
@@ -34,6 +37,8 @@ REALISM = {
     "poor": Level(1e-3, 0.004, np.radians(1.0), 1.0, 0.03, 0.003),
 }
 REACH = 0.7  # Typical distance from an encoder to the tip [m].
+# Where the arm works, x and y [m]: there a tilted table has the modelled height.
+WORKPLACE = (0.5, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,13 +95,13 @@ def draw_errors(level: str, seed: int) -> StationErrors:
     )
 
 
-def with_errors(
-    scene: Scene, errors: StationErrors, arm: str, tool: str, table: str
-) -> Scene:
-    """The world scene with these errors, except those of the wrench and the delays,
-    which make_station adds.
+def with_errors(scene: Scene, errors: StationErrors, arm: str, tool: str) -> Scene:
+    """The world scene with these errors, except those of the wrench and the delays.
 
-    Args: arm, tool, table: names of models; the tool is welded to the arm.
+    The table is the first model beside the arm that is welded to the world. What
+    stands on it is tilted with it, so that it rests on it as before.
+
+    Args: arm, tool: names of models; the tool is welded to the arm.
     """
     scene = deepcopy(scene)
     joints = [f"{arm}.{joint}" for joint in PANDA_JOINTS]
@@ -104,9 +109,7 @@ def with_errors(
         if offset != 0.0:
             scene.effects.append(Effect("joint_offset", [joint], {"offset": offset}))
     if np.any(errors.tilt):
-        roll, pitch = errors.tilt.tolist()
-        tilt = {"roll": roll, "pitch": pitch}
-        scene.effects.append(Effect("plane_tilt", [table], tilt))
+        _tilt_table(scene, errors, arm)
     for directive in scene.directives:
         weld = directive.add_weld
         if weld is not None and weld.child.split("::")[0] == tool and errors.tool:
@@ -115,3 +118,31 @@ def with_errors(
             x, y, z = np.array(weld.X_PC.translation, dtype=float)
             weld.X_PC.translation = [x, y, z + errors.tool]
     return scene
+
+
+def _tilt_table(scene: Scene, errors: StationErrors, arm: str) -> None:
+    weld = next(
+        weld
+        for weld in (d.add_weld for d in scene.directives)
+        if weld is not None
+        and weld.parent == "world"
+        and weld.child.split("::")[0] != arm
+    )
+    table = weld.child.split("::")[0]
+    roll, pitch = errors.tilt.tolist()
+    scene.effects.append(Effect("plane_tilt", [table], {"roll": roll, "pitch": pitch}))
+    R, lift = RollPitchYaw(roll, pitch, 0.0).ToRotationMatrix(), 0.0
+    if weld.X_PC is None:
+        # Tilted about the arm's base, it would be 5 mm too high where the arm works.
+        origin = np.zeros(3)
+        lift = -float(errors.table_rise(np.array([WORKPLACE]), origin)[0])
+        scene.effects.append(Effect("plane_height", [table], {"height": lift}))
+    else:
+        origin = np.array(weld.X_PC.translation, dtype=float)
+    moved = RigidTransform(R, origin - R @ origin + [0.0, 0.0, lift])
+    for body, pose in scene.initial.poses.items():
+        # Normalised, as a quaternion that was typed in is not exactly.
+        q = np.array(pose[:4], dtype=float)
+        X = moved @ RigidTransform(Quaternion(q / np.linalg.norm(q)), pose[4:])
+        quaternion = X.rotation().ToQuaternion().wxyz()
+        scene.initial.poses[body] = [*quaternion.tolist(), *X.translation().tolist()]

@@ -20,7 +20,7 @@ from makebreak.diagrams.faults import (
     faulty_sensor,
     with_box,
 )
-from makebreak.diagrams.realism import StationErrors
+from makebreak.diagrams.realism import StationErrors, with_errors
 from makebreak.diagrams.scene_facts import actuators_of
 from makebreak.diagrams.wiring import add_generalized_forces
 from makebreak.models.effects import KINDS
@@ -124,8 +124,8 @@ def make_station(
     next step on, a torque written just before it acts at once.
 
     Args: scene: replaces config.scene, for a world that was changed in memory; errors:
-        those of the wrench and the delays (whole periods) are added here, the others
-        are effects of the scene; wrong: the faults to inject.
+        of the station, delays in whole periods; None: none; wrong: the faults to
+        inject.
     Raises: ValueError for a setting out of range, or a body that is not in the scene.
     """
     if len(config.contact) < 2:
@@ -136,6 +136,8 @@ def make_station(
         raise ValueError(f"seed is {config.seed}, expected an integer of 0 or more")
     builder = DiagramBuilder()
     scene = read_scene(config.scene) if scene is None else scene
+    errors = errors or StationErrors()
+    scene = with_errors(scene, errors, ARM, config.tool)
     faults = [] if wrong is None else list(wrong.faults)
     if wrong is not None:
         scene = with_box(scene, faults, wrong.box_at, MODELS)
@@ -148,7 +150,7 @@ def make_station(
     command = _add_command_path(builder, loaded, limit, faults)
     if wrong is not None:
         add_forces(builder, loaded, ARM, config.tool, wrong.ball, wrong.center, faults)
-    sensing = _Sensing(builder, config, loaded, errors or StationErrors(), faults)
+    sensing = _Sensing(builder, config, loaded, errors, faults)
     _add_encoders(sensing)
     _add_torque_sensor(sensing, limit, command)
     _add_wrench_sensor(sensing, tool)

@@ -25,6 +25,7 @@ from pydrake.systems.primitives import (
 from pydrake.trajectories import PiecewisePolynomial
 
 from makebreak.diagrams.fault_kinds import read_faults
+from makebreak.diagrams.realism import draw_errors
 from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.station import (
     ARM,
@@ -120,6 +121,10 @@ class WallFrictionConfig:
     # Standard deviation of the random displacement of the path's corners [m].
     start_spread: float = 0.003
     training: WallTraining = field(default_factory=WallTraining)
+    # Errors of the station that the model lacks, the same in all trials: none, lab or
+    # poor.
+    realism: str = "none"
+    station_seed: int | None = None  # Seed of these errors; null: that of the run.
     seed: int = 0  # Seed of the paths and the sensors' noise.
     # Faults to inject, each NAME[:from=S,for=S] as of --fault.
     faults: list[str] = field(default_factory=list)
@@ -240,6 +245,7 @@ def _add_station(builder, config: WallFrictionConfig, scene, meshcat) -> Diagram
     faults = None
     if config.faults:
         faults = StationFaults(read_faults(config.faults, ()))
+    seed = config.seed if config.station_seed is None else config.station_seed
     return builder.AddNamedSystem(
         "station",
         make_station(
@@ -251,6 +257,7 @@ def _add_station(builder, config: WallFrictionConfig, scene, meshcat) -> Diagram
             ),
             meshcat,
             scene,
+            draw_errors(config.realism, seed),
             wrong=faults,
         ),
     )

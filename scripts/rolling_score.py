@@ -11,10 +11,11 @@ from scipy.signal import lfilter
 from makebreak.diagrams.ball_rolling import BALL_CHANNELS
 from makebreak.diagrams.ball_rolling_config import LEARN, controller_model, world_scene
 from makebreak.diagrams.camera import describe_camera
+from makebreak.diagrams.realism import draw_errors, with_errors
 from makebreak.diagrams.recorder import recorded
 from makebreak.diagrams.scene_facts import sphere_radius, spheres_of
 from makebreak.diagrams.station import ARM, TIP_FRAME, TOOL, make_control_plant
-from makebreak.models.scene import load_scene
+from makebreak.models.scene import load_scene, read_scene
 from makebreak.scripts.criteria import Criteria
 from makebreak.systems.arm.impedance_controller import serial_chain_of
 from makebreak.systems.arm.numerics.contact_force import contact_forces
@@ -123,7 +124,9 @@ def contact_truth(config, diagram, log, plant):
     q = state.data()[q_first : q_first + plant.num_positions(arm)].T
     at = ball.floating_positions_start() + 4
     p_ball = state.data()[at : at + 3].T
-    chain = serial_chain_of(make_control_plant(config.world), TIP_FRAME)
+    errors = draw_errors(config.realism, config.seed)
+    scene = with_errors(read_scene(config.world), errors, ARM, TOOL)
+    chain = serial_chain_of(make_control_plant(scene), TIP_FRAME)
     q = np.ascontiguousarray(q)
     p_tip = np.array([tip_kinematics(chain, row)[0] for row in q])
     away = p_tip - p_ball

@@ -26,7 +26,7 @@ KNOWN = {
     "diagrams/push_object_scenes.py": {
         "contact_friction", "object_com", "object_mass", "object_size"
     },
-    "diagrams/realism.py": {"joint_offset", "plane_tilt"},
+    "diagrams/realism.py": {"joint_offset", "plane_height", "plane_tilt"},
     "diagrams/station.py": {"joint_viscous_damping"},
     "diagrams/tabletop.py": {"contact_friction", "contact_stiffness"},
     "gap/simulation/free_body.py": CONTACT

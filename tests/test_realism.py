@@ -1,11 +1,21 @@
 """Errors of the station that its model does not have."""
 
+from dataclasses import fields, is_dataclass, replace
+
 import numpy as np
 import pytest
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
+from makebreak.diagrams import contact_types
+from makebreak.diagrams.ball_rolling import make_ball_rolling
+from makebreak.diagrams.ball_rolling_config import BallRollingConfig
+from makebreak.diagrams.camera import CameraConfig
+from makebreak.diagrams.contact_types import ContactTypesConfig
+from makebreak.diagrams.gentle_rolling import GentleRollingConfig, make_gentle_rolling
 from makebreak.diagrams.multiple_collisions import MultipleCollisionsConfig, make_task
+from makebreak.diagrams.push_object import PushObjectConfig, make_push_object
 from makebreak.diagrams.realism import (
     REALISM,
     StationErrors,
@@ -20,6 +30,7 @@ from makebreak.diagrams.station import (
     make_station,
 )
 from makebreak.diagrams.tabletop import TABLETOP_WALLS, TOOL, position
+from makebreak.diagrams.wall_friction import WallFrictionConfig, make_wall_friction
 from makebreak.models.scene import load_scene, read_scene
 from makebreak.scripts.experiments import contact_learning, multiple_collisions
 from makebreak.systems.arm.impedance_controller import serial_chain_of
@@ -35,11 +46,14 @@ def errors(**changes):
 
 
 def station(these, sampled=True):
-    world = with_errors(read_scene(TABLETOP_WALLS), these, ARM, TOOL, "table")
     config = StationConfig(
-        noise=QUIET, tool=TOOL, contact=[TOOL, "table"], sampled=sampled
+        scene=TABLETOP_WALLS,
+        noise=QUIET,
+        tool=TOOL,
+        contact=[TOOL, "table"],
+        sampled=sampled,
     )
-    return make_station(config, None, world, these)
+    return make_station(config, errors=these)
 
 
 def test_levels_are_drawn_by_the_seed_and_none_is_nothing():
@@ -110,7 +124,7 @@ def test_what_is_measured_comes_late_with_a_bias_that_drifts(delay):
 
 def test_the_table_is_where_drake_has_it():
     these = errors(tilt=np.array([0.006, -0.009]))
-    scene = with_errors(read_scene(TABLETOP_WALLS), these, ARM, TOOL, "table")
+    scene = with_errors(read_scene(TABLETOP_WALLS), these, ARM, TOOL)
     builder = DiagramBuilder()
     loaded = load_scene(scene, builder)
     root = builder.Build().CreateDefaultContext()
@@ -139,7 +153,7 @@ def test_the_table_is_where_drake_has_it():
 
 def test_the_model_s_scene_is_left_as_it_is():
     scene = read_scene(TABLETOP_WALLS)
-    with_errors(scene, draw_errors("poor", 0), ARM, TOOL, "table")
+    with_errors(scene, draw_errors("poor", 0), ARM, TOOL)
     assert scene.effects == [] and all(
         d.add_weld.X_PC is None for d in scene.directives
         if d.add_weld is not None and d.add_weld.child == "tool::tool"
@@ -165,3 +179,127 @@ def test_contacts_are_scored_by_the_truth():
     assert trial.touched[0] == pytest.approx(0.2, abs=2e-3)
     assert np.isnan(trial.touched[1:]).all() and trial.missed == 1
     assert contact_learning.Config(realism="poor").realism == "poor"
+
+
+def _contact_types(config):
+    return contact_types.make_contact_types(config, contact_types.make_task(config))
+
+
+DRAWN = CameraConfig(renderer="drawn")
+# Of each: how it is built, its settings, the tool, the table, and what stands on it.
+EXPERIMENTS = {
+    "contact_types": (_contact_types, ContactTypesConfig(), "tool", "surfaces", ""),
+    "wall_friction": (make_wall_friction, WallFrictionConfig(), "tool", "table", ""),
+    "ball_rolling": (
+        make_ball_rolling, BallRollingConfig(camera=DRAWN), "finger", "table", "ball",
+    ),
+    "gentle_rolling": (
+        make_gentle_rolling, GentleRollingConfig(), "finger", "table", "ball",
+    ),
+    "push_object": (
+        make_push_object, PushObjectConfig(), "finger", "table", "object",
+    ),
+}  # fmt: skip
+
+
+class Built:
+    """An experiment at its first instant, and what is true of its world there."""
+
+    def __init__(self, name, level):
+        make, config, tool, table, self._stands = EXPERIMENTS[name]
+        self.diagram = make(replace(config, realism=level, seed=3))
+        simulator = Simulator(self.diagram)
+        simulator.Initialize()  # A delayed sensor has a value from here on.
+        self.root = simulator.get_context()
+        self._simulator = simulator  # Owns the context.
+        self.station = self.diagram.GetSubsystemByName("station")
+        self._plant = self.station.GetSubsystemByName("plant")
+        self._graph = self.station.GetSubsystemByName("scene_graph")
+        self._context = self._plant.GetMyContextFromRoot(self.root)
+        self.q = self._plant.GetPositions(
+            self._context, self._plant.GetModelInstanceByName(ARM)
+        )
+        mount = self._plant.GetFrameByName("panda_link8")
+        tip = self._plant.GetFrameByName(TIP_FRAME)
+        X = tip.CalcPose(self._context, mount)
+        self.p_tip = X.translation()
+        body = self._plant.GetBodyIndices(self._plant.GetModelInstanceByName(table))[0]
+        (self._surface,) = self._plant.GetCollisionGeometriesForBody(
+            self._plant.get_body(body)
+        )
+        pose = self._graph.model_inspector().GetPoseInFrame(self._surface)
+        self.normal = pose.rotation().matrix()[:, 2]
+
+    def port(self, name):
+        context = self.station.GetMyContextFromRoot(self.root)
+        return self.station.GetOutputPort(name).Eval(context)
+
+    def clearance(self):
+        """Between the table and what stands on it [m]; 0 without it."""
+        if not self._stands:
+            return 0.0
+        query = self._graph.get_query_output_port().Eval(
+            self._graph.GetMyContextFromRoot(self.root)
+        )
+        body = self._plant.GetBodyByName(self._stands)
+        return min(
+            query.ComputeSignedDistancePairClosestPoints(self._surface, g).distance
+            for g in self._plant.GetCollisionGeometriesForBody(body)
+        )
+
+    def known(self):
+        """{system: all numbers that it holds}, of all systems but the station."""
+        return {
+            system.get_name(): list(numbers(vars(system)))
+            for system in self.diagram.GetSystems()
+            if system is not self.station
+        }
+
+
+def numbers(value, depth=0):
+    """All numbers in an object and its parts."""
+    if isinstance(value, (bool, int, float)):
+        yield repr(value)  # As text, NaN equals NaN.
+    elif isinstance(value, np.ndarray) and value.dtype != object:
+        yield repr(value.tolist())
+    elif isinstance(value, MultibodyPlant):
+        context = value.CreateDefaultContext()
+        tip = value.GetFrameByName(TIP_FRAME).CalcPoseInWorld(context)
+        yield repr(tip.GetAsMatrix34().tolist())
+        yield repr(value.GetPositions(context).tolist())
+        yield repr(value.CalcMassMatrix(context).tolist())
+    elif depth > 8:
+        return
+    elif isinstance(value, dict):
+        for one in value.values():
+            yield from numbers(one, depth + 1)
+    elif isinstance(value, (tuple, list, np.ndarray)):
+        for one in value:
+            yield from numbers(one, depth + 1)
+    elif is_dataclass(value):
+        for one in fields(value):
+            yield from numbers(getattr(value, one.name), depth + 1)
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_the_world_has_the_errors_and_no_controller_knows_them(name):
+    none, lab = Built(name, "none"), Built(name, "lab")
+    these = draw_errors("lab", 3)
+    # Read with noise of 1e-5 rad, of which six deviations are allowed.
+    for built, offsets in ((none, 0.0), (lab, these.encoders)):
+        measured = built.port(f"{ARM}.position_measured")
+        np.testing.assert_allclose(measured - built.q, offsets, atol=6e-5)
+    np.testing.assert_allclose(
+        np.linalg.norm(lab.p_tip - none.p_tip), these.tool, atol=1e-12
+    )
+    np.testing.assert_allclose(none.normal, [0.0, 0.0, 1.0], atol=1e-12)
+    tilt = np.arccos(lab.normal[2])
+    # Roll, then pitch: to second order their root sum square.
+    np.testing.assert_allclose(tilt, np.radians(0.5), rtol=1e-4)
+    np.testing.assert_allclose(lab.clearance(), none.clearance(), atol=1e-9)
+    for part in ("encoders_delay", "wrench_delay", "wrench_bias"):
+        assert lab.station.HasSubsystemNamed(f"{ARM}_{part}")
+        assert not none.station.HasSubsystemNamed(f"{ARM}_{part}")
+    known = none.known()
+    assert len(known["impedance_controller"]) > 5
+    assert known == lab.known()

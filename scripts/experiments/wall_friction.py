@@ -119,6 +119,8 @@ def run(config: WallFrictionConfig, session: Session) -> dict:
         )
     if config.training.tested < 1:
         raise ValueError(f"training.tested is {config.training.tested}, expected > 0")
+    if config.station_seed is None:  # All trials have the same station.
+        config = replace(config, station_seed=config.seed)
     seconds: dict[str, float] = {}  # Not of the result: they differ from run to run.
     trials, knowledge = collect(config, seconds)
     predictors = one_step_predictors(config, trials["varied"], seconds)
