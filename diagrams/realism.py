@@ -79,9 +79,14 @@ class StationErrors:
 
 
 def draw_errors(level: str, seed: int) -> StationErrors:
-    """The errors of the station of this seed. Raises: ValueError: unknown level."""
+    """The errors of the station of this seed.
+
+    Raises: ValueError for an unknown level or a negative seed.
+    """
     if level not in REALISM:
         raise ValueError(f"realism is {level!r}: {nearest(level, REALISM)}")
+    if seed < 0:
+        raise ValueError(f"seed is {seed}, expected an integer of 0 or more")
     size = REALISM[level]
     rng = np.random.default_rng([seed, 23])
     angle = rng.uniform(0.0, 2.0 * np.pi)
