@@ -139,7 +139,7 @@ def of_so101(data: Path, folder: Path) -> Found:
     )
     out, result = gap(folder, fitted)
     scenes = {
-        "as it came": folder / "scene.yaml",
+        "given scene": folder / "scene.yaml",
         "published servo": folder / "published.yaml",
         "with the effects named by `gap`": out / "scene.yaml",
         "six numbers found by hand (below)": folder / "by_hand.yaml",
@@ -158,7 +158,7 @@ def of_so101(data: Path, folder: Path) -> Found:
         }
         every = [*of.values(), *over[says].values()]
         cells.append((says, *(f"{x:.1f}" for x in every)))
-    came, named, *_ = (over[k] for k in ("as it came", [*scenes][2]))
+    came, named, *_ = (over[k] for k in ("given scene", [*scenes][2]))
     rows = [
         Row(what, "mrad", came[name], named[name], 0.5 * came[name])
         for what, name in (
@@ -261,7 +261,7 @@ def table_of(found: dict[str, Found]) -> Table:
     return Table(
         "What `makebreak gap` makes of measured data",
         ("recordings, judged where gap has not seen them", "goal",
-         "scene as it came -> repaired", "verdict", "named"),
+         "given scene -> repaired", "verdict", "named"),
         rows, met,
     )  # fmt: skip
 

@@ -8,7 +8,7 @@ The first writes scene.yaml with the published values and no effects, and fit.cs
 tosses: time and poses alone, as the velocities of the data are filtered differences.
 The last simulates 200 others in Drake, from states fitted to their free flight, and
 prints the rms over the 8 corners and the first 100 ms after touch, each error capped at
-60 mm, of the scene as it came and of the one given.
+60 mm, of the published scene and of the one given.
 """
 
 import argparse
@@ -170,7 +170,7 @@ def main() -> None:
     if args.judge is None:
         convert(args.data, args.out)
         return
-    for name, file in (("as it came", args.out / "scene.yaml"), ("given", args.judge)):
+    for name, file in (("published", args.out / "scene.yaml"), ("given", args.judge)):
         print(f"scene {name}: {1e3 * judge(args.data, file):.2f} mm")
 
 
