@@ -235,6 +235,31 @@ def test_bodies_that_stand_nearer_are_felt_though_the_scene_has_no_contact(tmp_p
     assert off[WALL]["x"] == pytest.approx(-0.02, abs=1e-3)
 
 
+def test_distances_are_computed_anew_only_where_something_stands_elsewhere(
+    displaced, monkeypatch
+):
+    problem = PressingProblem(displaced.scene, displaced.recordings)
+    computed = []
+    slots = problem.shapes.slots
+    monkeypatch.setattr(
+        problem.shapes, "slots", lambda *args: computed.append(1) or slots(*args)
+    )
+    moved = Effect("wall_position", [WALL], {"x": 0.004, "y": 0.0, "z": 0.0})
+    there = problem.residual([moved])
+    assert computed
+    before = len(computed)
+    pair = problem.pair_name(problem._pairs_met[0])
+    problem.residual([moved, Effect("contact_friction", [pair], {"friction": 0.1})])
+    assert len(computed) == before
+    other = Effect("wall_position", [WALL], {"x": 0.001, "y": 0.0, "z": 0.0})
+    problem.residual([other])
+    assert len(computed) > before
+    problem._slots_at.clear()
+    np.testing.assert_array_equal(problem.residual([moved]), there)
+    problem._evaluate_nodes()  # Other rows: what was computed for these is gone.
+    assert problem._slots_at == {}
+
+
 def test_no_contact_is_so_soft_that_a_tool_goes_in_by_centimetres(displaced):
     """A wall that stands elsewhere, met with one force alone, would be one."""
     at = f"{WALL}~gantry.tool"

@@ -39,6 +39,7 @@ WHOLE = 0.9  # Of the squares left: what one more of a body leaves is tried firs
 SOFTER = (0.3, 0.6, 2.0)  # Times the stiffness of the scene: trials.
 MOST_FRICTION = 2.0  # Of what is taken for any.
 MOST_PATCHES, MOST_EFFECTS = 3, 10
+MOST_SLOTS = 12  # Places of what is displaced whose distances are kept.
 SMALL_SHIFT = 1e-3  # First trial of a place [m].
 AXES = "xyz"
 
@@ -102,6 +103,10 @@ class PressingProblem(ContactProblem):
         super()._read_coordinates()
         if self.bodies:
             raise ValueError("something moves freely")
+
+    def _evaluate_nodes(self) -> None:
+        self._slots_at: dict[tuple, tuple] = {}  # Of what is displaced: see _slots.
+        super()._evaluate_nodes()
 
     def pair_name(self, pair: tuple[int, int]) -> str:
         """What is fixed first: its surface is the one that an effect changes."""
@@ -224,18 +229,26 @@ class PressingProblem(ContactProblem):
     # ----- Where it touches
 
     def _slots(self, effects: Sequence[Effect], shift: Shift | None = None):
+        if any(e.kind == "plane_tilt" for e in effects):
+            raise ValueError("plane_tilt: not of what a robot presses on")
+        moving = [e for e in effects if e.kind in MOVES]
+        key = tuple(e.key for e in moving)
+        if key not in self._slots_at:
+            # Most of a fit's parameters move nothing.
+            if len(self._slots_at) >= MOST_SLOTS:
+                del self._slots_at[next(iter(self._slots_at))]
+            self._slots_at[key] = self._new_slots(moving)
+        return self._slots_at[key]
+
+    def _new_slots(self, moving: Sequence[Effect]):
         poses = dict(self._node_poses)
-        for e in effects:
-            if e.kind not in MOVES:
-                continue
+        for e in moving:
             by = np.array([e.parameters.get(a, 0.0) for a in AXES])
             by[2] += e.parameters.get("height", 0.0)
             for k in poses:
                 if k in self.shapes.anchored and self._is_at(e, k):
                     R, p = poses[k]
                     poses[k] = R, p + by
-        if any(e.kind == "plane_tilt" for e in effects):
-            raise ValueError("plane_tilt: not of what a robot presses on")
         return self.shapes.slots(poses, REACH), poses
 
     def _touches(self, slots: Sequence[Slot]) -> list[np.ndarray]:
