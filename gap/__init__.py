@@ -5,6 +5,7 @@ simulation/  scenes simulated from measured states
 residuals/   kinds of data, each as a problem (problem.py) for the search
 search/      which effects a scene lacks
 report/      files and pictures
+fit.py       effects fitted together to a problem
 workflow.py  from a scene and recordings to a result
 
 from makebreak.gap import read_scene, run_gap, write_report

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.problem import GapProblem, is_sane
 from makebreak.gap.result import (
     Differs,
@@ -20,7 +21,6 @@ from makebreak.gap.result import (
     Trust,
 )
 from makebreak.gap.search.choice import Selection
-from makebreak.gap.search.fit import fit_effects
 from makebreak.gap.search.trust import by_recording
 from makebreak.gap.thresholds import DIFFERS_SHARE, DIFFERS_Z
 from makebreak.models.effects import KINDS

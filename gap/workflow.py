@@ -20,6 +20,7 @@ from makebreak.gap.data.reading import check_against_scene, read_recordings
 from makebreak.gap.data.recording import Recording, unit_of
 from makebreak.gap.data.scene_facts import scene_facts, scene_names
 from makebreak.gap.data.split import split, with_noise_of
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.parallel import side_by_side
 from makebreak.gap.problem import DISTANCES, Fitted, GapProblem, Outcome, is_sane
 from makebreak.gap.residuals.driven import DrivenProblem, is_driven, sticks
@@ -32,7 +33,6 @@ from makebreak.gap.residuals.pressing import PressingProblem, presses
 from makebreak.gap.residuals.sap_lift import sap_lift
 from makebreak.gap.result import GapMeasure, GapResult, JudgedChannel
 from makebreak.gap.search.choice import Choice, Selection
-from makebreak.gap.search.fit import fit_effects
 from makebreak.gap.search.select import select, without
 from makebreak.gap.search.trust import scatter, trust_in
 from makebreak.gap.simulation.measure import WINDOW_SEC

@@ -42,6 +42,30 @@ MATHS_OF = {
     "views": {"contact_mpc", "changing_contact", "arm"},
 }
 
+# Rooms of gap/ -> the rooms whose files they may import: data <- simulation <-
+# residuals <- search, and report. What stands in gap/ itself is either shared by all of
+# them (and imports data and numerics alone) or puts the rooms together.
+GAP_ROOMS = {
+    "shared": {"shared", "data"},
+    "data": {"data"},
+    "simulation": {"shared", "data", "simulation"},
+    "residuals": {"shared", "data", "simulation", "residuals"},
+    "search": {"shared", "data", "simulation", "residuals", "search"},
+    "report": {"shared", "data", "simulation", "report"},
+}
+GAP_TOGETHER = ("__init__", "workflow", "by_recording", "verdict")
+
+
+def gap_room_of(parts):
+    """The room of ("gap", "data", "table"): "data"; of numerics and of what puts the
+    rooms together: None, "together"."""
+    if parts[0] != "gap" or "numerics" in parts[1:2]:
+        return None
+    name = parts[1].removesuffix(".py") if len(parts) > 1 else "__init__"
+    if name in GAP_TOGETHER:
+        return "together"
+    return name if name in GAP_ROOMS else "shared"
+
 
 def room_of(parts):
     """The room of ("systems", "arm", "numerics", "packed"): "numerics"."""
@@ -115,6 +139,10 @@ def breaches(root):
                 there = room_of(tuple(rest))
                 if there not in MAY_IMPORT[here]:
                     found.append(f"{where}: {here} must not import {there}")
+                elif (own := gap_room_of(parts)) in GAP_ROOMS and (
+                    other := gap_room_of(tuple(rest))
+                ) not in (None, *GAP_ROOMS[own]):
+                    found.append(f"{where}: gap's {own} must not import {other}")
                 elif parts[0] == "systems" and not may_use(parts, tuple(rest)):
                     own, other = wing_of(parts) or "systems/numerics", rest[1]
                     found.append(f"{where}: {own} must not use the maths of {other}")
@@ -197,6 +225,12 @@ def test_imports_go_one_way():
         ("diagrams/a.py", "if True:\n    import makebreak.gap.fit"),
         ("diagrams/a.py", "from makebreak.gap.numerics.free_body import FreeBody"),
         ("gap/a.py", "from makebreak.scripts.cli import main"),
+        ("gap/a.py", "from makebreak.gap.residuals.inverse import InverseModel"),
+        ("gap/data/a.py", "from makebreak.gap.problem import rms"),
+        ("gap/simulation/a.py", "from makebreak.gap.residuals.track import Track"),
+        ("gap/residuals/a.py", "from makebreak.gap.search.screen import rank"),
+        ("gap/search/a.py", "from makebreak.gap.workflow import run_gap"),
+        ("gap/report/a.py", "from makebreak.gap.search.screen import rank"),
         ("scripts/a.py", "from systems.contact_mpc.numerics.lcs import LCS"),
         ("tests/a.py", "import models"),
     ],
@@ -224,6 +258,9 @@ def test_a_planted_breach_is_found(tmp_path, file, code):
         ("systems/contact_mpc/a.py", "from .multibody.contact_pair import Contact"),
         ("gap/a.py", "from makebreak.systems.arm.numerics.packed import packed"),
         ("gap/numerics/a.py", "from makebreak.systems.arm.numerics.packed import p"),
+        ("gap/search/a.py", "from makebreak.gap.residuals.track import Track"),
+        ("gap/residuals/a.py", "from makebreak.gap.simulation.windows import Window"),
+        ("gap/workflow.py", "from makebreak.gap.search.select import select"),
         ("models/a.py", "import makebreak.models.b"),
         (
             "diagrams/a.py",

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from makebreak.gap import workflow
 from makebreak.gap.data.reading import read_recordings
+from makebreak.gap.fit import _Free, fit_effects
 from makebreak.gap.numerics import permitted_forces
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Outcome, SearchPlan, is_sane
@@ -28,13 +29,12 @@ from makebreak.gap.residuals.contact_candidates import _best_rectangles
 from makebreak.gap.residuals.contact_dynamics import ContactDynamics
 from makebreak.gap.residuals.contact_means import variance_of_means
 from makebreak.gap.residuals.contact_problem import ContactProblem
-from makebreak.gap.residuals.contact_shapes import _Point, _Surface
 from makebreak.gap.residuals.permitted_contacts import Shift
 from makebreak.gap.residuals.wrench_sensor import felt_motion
 from makebreak.gap.result import Considered, GapMeasure
 from makebreak.gap.search.choice import Choice, Selection
-from makebreak.gap.search.fit import _Free, fit_effects
 from makebreak.gap.simulation import contact_windows
+from makebreak.gap.simulation.contact_shapes import _Point, _Surface
 from makebreak.gap.simulation.contact_windows import PushWindows, led_as_measured
 from makebreak.gap.simulation.windows import WindowModel
 from makebreak.gap.workflow import problem_for, run_gap

@@ -6,7 +6,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.gap.residuals.contact_shapes import ContactShapes
+from makebreak.gap.simulation.contact_shapes import ContactShapes
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import load_scene, read_scene
 

@@ -8,6 +8,7 @@ from gap_benchmark import cart_world
 from gap_benchmark.cart_world import PAIR
 
 from makebreak.gap.data.reading import read_recordings
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.residuals.impacts import (
     FREE_SEC,
@@ -15,7 +16,6 @@ from makebreak.gap.residuals.impacts import (
     ImpactProblem,
     runs_against,
 )
-from makebreak.gap.search.fit import fit_effects
 from makebreak.gap.workflow import problem_for, run_gap
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect

@@ -15,9 +15,9 @@ from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.numerics.edge_crossings import FAR, crossing, edges_of_box
 from makebreak.gap.numerics.free_body import FreeBody, simulate
 from makebreak.gap.residuals.contact_dynamics import ContactDynamics
-from makebreak.gap.residuals.contact_shapes import ContactShapes
 from makebreak.gap.residuals.pressing import PressingProblem
 from makebreak.gap.result import GapMeasure
+from makebreak.gap.simulation.contact_shapes import ContactShapes
 from makebreak.gap.verdict import after_simulation
 from makebreak.models.scene import load_scene, read_scene
 from makebreak.scripts.cli import main

@@ -9,8 +9,8 @@ from effect_scenes import pendulum
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.residuals.inverse import InverseModel
+from makebreak.gap.residuals.mechanism_measure import measure
 from makebreak.gap.simulation.commands import Commands
-from makebreak.gap.simulation.measure import measure
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.effects.kind import Effect
 from makebreak.models.effects.transmission import twist_deviations, twists

@@ -13,15 +13,15 @@ from scipy.sparse import csr_matrix
 from test_gap_statistics import TwoChannels
 
 from makebreak.gap.data.reading import read_recordings
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.permitted_forces import held_means, test_functions
 from makebreak.gap.problem import Candidate, SearchPlan
 from makebreak.gap.residuals.contact_means import ContactMeans
 from makebreak.gap.residuals.contact_problem import ContactProblem
-from makebreak.gap.residuals.contact_shapes import Slot
 from makebreak.gap.residuals.permitted_contacts import STEADY, PermittedContacts
-from makebreak.gap.search.fit import fit_effects
 from makebreak.gap.search.screen import rank
 from makebreak.gap.search.select import select
+from makebreak.gap.simulation.contact_shapes import Slot
 from makebreak.gap.simulation.contact_windows import BEFORE_SEC, PushWindows
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene

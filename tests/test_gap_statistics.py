@@ -10,7 +10,8 @@ import pytest
 from scipy.optimize import lsq_linear
 from scipy.signal import lfilter
 
-from makebreak.gap import workflow
+from makebreak.gap import fit, workflow
+from makebreak.gap.fit import derivative_free_search, fit_effects
 from makebreak.gap.numerics.selection import (
     LinearFit,
     Screen,
@@ -38,11 +39,10 @@ from makebreak.gap.problem import (
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.residuals.whitened_rows import WhitenedRows
 from makebreak.gap.result import GapMeasure
-from makebreak.gap.search import comparison, fit
+from makebreak.gap.search import comparison
 from makebreak.gap.search.choice import Choice, Selection, Trial, is_significant
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.drop import _is_certain
-from makebreak.gap.search.fit import derivative_free_search, fit_effects
 from makebreak.gap.search.screen import Ranked
 from makebreak.gap.search.select import select
 from makebreak.gap.search.trials import pick_simplest, shortlist

@@ -9,6 +9,7 @@ from gap_benchmark.push_world import BLOCK, TABLE
 from push_problems import screen_of
 
 from makebreak.gap.data.reading import read_recordings
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.permitted_forces import tangents
 from makebreak.gap.problem import Fitted
 from makebreak.gap.residuals.contact_candidates import FRICTION_SPREAD
@@ -22,7 +23,6 @@ from makebreak.gap.residuals.widened_contacts import (
 )
 from makebreak.gap.result import GapMeasure
 from makebreak.gap.search.comparison import Comparison
-from makebreak.gap.search.fit import fit_effects
 from makebreak.gap.thresholds import AGREEMENT_RMS_MAX
 from makebreak.gap.verdict import two_figures
 from makebreak.models.effects import KINDS

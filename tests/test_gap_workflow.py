@@ -11,9 +11,9 @@ from gap_benchmark.cases import cases, make, write
 from test_gap_report import small_case
 
 from makebreak.gap import read_recordings, workflow
+from makebreak.gap.residuals import mechanism_candidates
 from makebreak.gap.residuals.mechanism import MechanismProblem
-from makebreak.gap.search import screen
-from makebreak.gap.simulation.measure import measure
+from makebreak.gap.residuals.mechanism_measure import measure
 from makebreak.gap.workflow import run_gap
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
@@ -142,9 +142,9 @@ def test_a_gain_does_not_explain_away_what_models_are_off_by(tmp_path):
     scene = read_scene(scene_path)
     problem = MechanismProblem(scene, read_recordings([recording_path]))
     nuisances = problem.nuisances()
-    found = screen.candidates(problem, nuisances, problem.base())
+    found = mechanism_candidates.candidates(problem, nuisances, problem.base())
     problem._found = [c for c in found if c.kind == "actuator_gain"]
-    rich = screen.rich_columns(problem, problem._found)
+    rich = mechanism_candidates.rich_columns(problem, problem._found)
     assert rich.shape[1] == 1
     left = problem.base()  # Friction, as something that models lack.
     np.testing.assert_array_equal(problem._with_best(left, rich), left)

@@ -398,3 +398,13 @@ def test_units_of_quantities():
     assert unit_of("position") == "rad" and unit_of("position_command", True) == "m"
     assert unit_of("effort_measured") == "N m" and unit_of("wz") == "rad/s"
     assert unit_of("fx") == "N" and unit_of("velocity_command", True) == "m/s"
+
+
+def test_half_an_episode_is_refused_and_the_file_is_named_once(tmp_path):
+    rows = [f"{0.01 * k},0.5,0.1" for k in range(30)]
+    path = tmp_path / "half.csv"
+    path.write_text("\n".join(["time,episode,arm.j1.position", *rows]))
+    with pytest.raises(ValueError) as caught:
+        read_recording(path)
+    expected = "column episode, row 1: got 0.5, expected an integer"
+    assert str(caught.value) == f"recording {path}: {expected}"

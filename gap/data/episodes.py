@@ -12,7 +12,7 @@ LONGEST_HOLE_SEC, LONGEST_HOLE_ROWS = 1.0, 50
 
 
 def counted_parts(
-    path: Path, columns: Mapping[str, np.ndarray], row: np.ndarray, is_excerpt: bool
+    columns: Mapping[str, np.ndarray], row: np.ndarray, is_excerpt: bool
 ) -> np.ndarray:
     """(n,) counts from 0 the parts of the table in which time must increase; rows of an
     excerpt jump where some were left out."""
@@ -22,7 +22,7 @@ def counted_parts(
         bad = np.flatnonzero(~(np.mod(episode, 1.0) == 0.0))
         if bad.size:
             raise ValueError(
-                f"recording {path}: column episode, row {row[bad[0]]}: got "
+                f"column episode, row {row[bad[0]]}: got "
                 f"{episode[bad[0]]}, expected an integer"
             )
         new = new | np.concatenate([[0], np.diff(episode) != 0])

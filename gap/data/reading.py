@@ -92,7 +92,7 @@ def read_recording(
     number = columns.get("episode")
     try:
         columns = check_columns(
-            columns | {"episode": counted_parts(path, columns, row, is_excerpt)}
+            columns | {"episode": counted_parts(columns, row, is_excerpt)}
         )
     except ValueError as error:
         raise ValueError(_with_rows(path, error, row)) from None

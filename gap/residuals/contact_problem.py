@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from makebreak.gap.data.recording import Recording
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import Screen, benjamini_hochberg
 from makebreak.gap.problem import (
     Fitted,
@@ -36,7 +37,6 @@ from makebreak.gap.residuals.widened_contacts import (
 )
 from makebreak.gap.residuals.wrench_sensor import felt_motion
 from makebreak.gap.result import Where
-from makebreak.gap.search.fit import fit_effects
 from makebreak.gap.simulation.contact_windows import (
     PushWindows,
     led_as_measured,

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from makebreak.gap.data.recording import Recording
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import (
     Candidate,
@@ -32,11 +33,10 @@ from makebreak.gap.residuals.mechanism import (
     link_changes,
     moved_links,
 )
+from makebreak.gap.residuals.mechanism_candidates import NUISANCE_LIMIT
 from makebreak.gap.residuals.objects import unexplained_in_windows
+from makebreak.gap.residuals.where import where_in_windows
 from makebreak.gap.result import Where
-from makebreak.gap.search.fit import fit_effects
-from makebreak.gap.search.screen import NUISANCE_LIMIT
-from makebreak.gap.search.where import where_in_windows
 from makebreak.gap.simulation.driven_arm import DrivenArmSimulation, can_have
 from makebreak.gap.simulation.measure import gap_measure, series_of
 from makebreak.gap.simulation.windows import LARGEST, WindowModel

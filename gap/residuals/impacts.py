@@ -17,9 +17,9 @@ from makebreak.gap.data.pieces import part_of
 from makebreak.gap.data.recording import FEWEST_ROWS, Episode, Recording
 from makebreak.gap.problem import Candidate, Fitted, Nuisances, SearchPlan
 from makebreak.gap.residuals.contact_candidates import reader_of_trial
-from makebreak.gap.residuals.contact_shapes import ContactShapes, poses_of
 from makebreak.gap.residuals.mechanism import link_changes
 from makebreak.gap.residuals.objects import WindowedProblem
+from makebreak.gap.simulation.contact_shapes import ContactShapes, poses_of
 from makebreak.gap.simulation.windows import Window, WindowModel, with_step
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS

@@ -21,17 +21,17 @@ from makebreak.gap.problem import (
 )
 from makebreak.gap.residuals.drive_gains import with_moved_gains
 from makebreak.gap.residuals.inverse import InverseModel
-from makebreak.gap.residuals.pushes import ROBUST, Push, find_pushes
-from makebreak.gap.result import Where
-from makebreak.gap.search.screen import (
+from makebreak.gap.residuals.mechanism_candidates import (
     candidates,
     inseparable,
     nuisances,
     rich_columns,
     tolerances,
 )
-from makebreak.gap.search.where import unexplained, where_in_motion
-from makebreak.gap.simulation.measure import measure
+from makebreak.gap.residuals.mechanism_measure import measure
+from makebreak.gap.residuals.pushes import ROBUST, Push, find_pushes
+from makebreak.gap.residuals.where import unexplained, where_in_motion
+from makebreak.gap.result import Where
 from makebreak.gap.simulation.windows import Window
 from makebreak.gap.thresholds import UNEXPLAINED_RMS
 from makebreak.models.dynamics import SceneDynamics

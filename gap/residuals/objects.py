@@ -16,8 +16,8 @@ from makebreak.gap.problem import (
 )
 from makebreak.gap.residuals.contact import contact_candidates, contact_nuisances
 from makebreak.gap.residuals.touch import TouchModel, touch_candidates
+from makebreak.gap.residuals.where import where_in_windows
 from makebreak.gap.result import Unexplained, Where
-from makebreak.gap.search.where import where_in_windows
 from makebreak.gap.simulation.free_windows import FreeBodyModel
 from makebreak.gap.simulation.measure import gap_measure, series_of
 from makebreak.gap.simulation.windows import WindowModel

@@ -22,8 +22,8 @@ from makebreak.gap.numerics.permitted_forces import (
     unshared_load,
 )
 from makebreak.gap.residuals.contact_means import FEWEST_MEANS, SLIDES, ContactMeans
-from makebreak.gap.residuals.contact_shapes import Slot
 from makebreak.gap.residuals.touching import BESIDE, MEETS, NEAR
+from makebreak.gap.simulation.contact_shapes import Slot
 from makebreak.gap.simulation.windows import TURN
 from makebreak.models.effects.kind import Effect
 from makebreak.models.effects.loads import rotation

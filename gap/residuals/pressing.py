@@ -18,11 +18,11 @@ from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate, Fitted, Nuisances
 from makebreak.gap.residuals.contact_dynamics import THIN
 from makebreak.gap.residuals.contact_problem import ContactProblem
-from makebreak.gap.residuals.contact_shapes import Slot
 from makebreak.gap.residuals.impacts import MOST_SHARE, nearest, positions, walls_of
 from makebreak.gap.residuals.permitted_contacts import SLACK, Geometry, Shift
 from makebreak.gap.residuals.touching import MEETS
 from makebreak.gap.residuals.wrench_sensor import FORCE
+from makebreak.gap.simulation.contact_shapes import Slot
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene

@@ -8,8 +8,8 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.numerics.permitted_forces import FEWEST
-from makebreak.gap.residuals.contact_shapes import ContactShapes, poses_of
 from makebreak.gap.residuals.wrench_sensor import wrench_sensors
+from makebreak.gap.simulation.contact_shapes import ContactShapes, poses_of
 from makebreak.gap.simulation.windows import TURN, spin_of
 from makebreak.models.drives import law_of
 from makebreak.models.dynamics import SceneDynamics

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from makebreak.gap.data.recording import Recording
-from makebreak.gap.residuals.contact_shapes import Slot
 from makebreak.gap.residuals.scene_motion import SceneMotion, SmoothedEpisode
 from makebreak.gap.residuals.wrench_sensor import FORCE, WrenchSensor, felt_motion
+from makebreak.gap.simulation.contact_shapes import Slot
 from makebreak.gap.simulation.free_windows import IMPACT_ACCELERATION
 from makebreak.models.scene import Scene
 

@@ -14,7 +14,7 @@ from makebreak.gap.numerics.permitted_forces import explain, tangents
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Fitted, rms
 from makebreak.gap.residuals.contact_dynamics import SHAPED, ContactDynamics
-from makebreak.gap.residuals.contact_shapes import Slot
+from makebreak.gap.simulation.contact_shapes import Slot
 from makebreak.gap.simulation.windows import LARGEST
 from makebreak.models.effects.kind import Effect
 

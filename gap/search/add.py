@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from makebreak.gap.fit import tangents
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate, Fitted
 from makebreak.gap.result import Considered
 from makebreak.gap.search.choice import Choice, Trial, fixed_parameters, places
 from makebreak.gap.search.comparison import Comparison
-from makebreak.gap.search.fit import tangents
 from makebreak.gap.search.groups import groups_of, with_pruned_groups
 from makebreak.gap.search.pairs import look_ahead, pair_instead
 from makebreak.gap.search.rivals import Rivals

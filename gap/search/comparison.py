@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import (
     Screen,
     by_block,
@@ -13,7 +14,6 @@ from makebreak.gap.numerics.selection import (
 )
 from makebreak.gap.problem import Fitted, GapProblem, rms
 from makebreak.gap.search.choice import Choice, fixed_parameters
-from makebreak.gap.search.fit import fit_effects
 from makebreak.gap.search.together import WEIGHT_ROUNDS
 from makebreak.gap.thresholds import (
     BESIDE_NOISE_EVIDENCE,

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.problem import Candidate, Fitted, is_sane
 from makebreak.gap.search.choice import (
     Choice,
@@ -14,7 +15,6 @@ from makebreak.gap.search.choice import (
     refreshed,
 )
 from makebreak.gap.search.comparison import Comparison
-from makebreak.gap.search.fit import fit_effects
 from makebreak.gap.search.rivals import in_place_of
 from makebreak.gap.search.trust import consistency
 from makebreak.gap.thresholds import (

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
+from makebreak.gap.fit import derivative_free_search, fit_effects
 from makebreak.gap.problem import Fitted
 from makebreak.gap.result import Considered
 from makebreak.gap.search.add import add_next
@@ -15,7 +16,6 @@ from makebreak.gap.search.choice import (
     refreshed,
 )
 from makebreak.gap.search.comparison import Comparison
-from makebreak.gap.search.fit import derivative_free_search, fit_effects
 from makebreak.gap.search.merge import merge
 from makebreak.gap.search.own_values import with_own_values
 from makebreak.gap.search.refine import refine

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.problem import Fitted, is_sane
 from makebreak.gap.search.choice import Choice, fixed_parameters, refreshed
 from makebreak.gap.search.comparison import Comparison
-from makebreak.gap.search.fit import fit_effects
 from makebreak.gap.thresholds import OWN_VALUES_MAX, OWN_VALUES_TRIED
 from makebreak.models.effects.kind import Effect
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from makebreak.gap.fit import tangents
 from makebreak.gap.numerics.selection import Screen, simplest
 from makebreak.gap.search.choice import (
     Choice,
@@ -17,7 +18,6 @@ from makebreak.gap.search.choice import (
     refreshed,
 )
 from makebreak.gap.search.comparison import Comparison
-from makebreak.gap.search.fit import tangents
 from makebreak.gap.search.screen import Ranked, rank
 from makebreak.gap.search.trials import fit_each
 from makebreak.gap.thresholds import (

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.problem import Fitted, is_sane
 from makebreak.gap.search.choice import Choice, fixed_parameters, refreshed
 from makebreak.gap.search.comparison import Comparison
-from makebreak.gap.search.fit import fit_effects
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 

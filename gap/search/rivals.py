@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import Screen, paired
 from makebreak.gap.problem import Candidate, Fitted, rms
 from makebreak.gap.search.choice import (
@@ -17,7 +18,6 @@ from makebreak.gap.search.choice import (
     uses_all_parameters,
 )
 from makebreak.gap.search.comparison import Comparison
-from makebreak.gap.search.fit import fit_effects
 from makebreak.gap.search.screen import Ranked, rank
 from makebreak.gap.search.together import Together, fit_together
 from makebreak.gap.thresholds import (

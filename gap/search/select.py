@@ -4,7 +4,7 @@ where they are not needed.
 Models are fitted to the rows that a problem's `train` names and chosen by the others.
 The stages, each in a file of its own:
 
-    screen.py       every candidate, ranked by its linear columns
+    screen.py       candidates, ranked by their linear columns
     groups.py       one kind at all joints as one candidate
     forward.py      step by step, and back to a tie where much is left
     add.py          one step: rank, fit the best exactly, take the simplest
@@ -22,6 +22,7 @@ comparison.py says what "better" means in all of them, gap/thresholds.py by how 
 from collections.abc import Callable
 from dataclasses import replace
 
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import is_plausible
 from makebreak.gap.problem import GapProblem
 from makebreak.gap.search.choice import (
@@ -31,7 +32,6 @@ from makebreak.gap.search.choice import (
 )
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.drop import drop_needless, keep_certain, simplify
-from makebreak.gap.search.fit import fit_effects
 from makebreak.gap.search.forward import forward
 from makebreak.gap.search.own_values import with_own_values
 from makebreak.gap.search.rivals import still_tied, with_rivals_of_pairs

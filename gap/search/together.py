@@ -15,9 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Fitted, GapProblem, Nuisances, rms
-from makebreak.gap.search.fit import fit_effects
 from makebreak.gap.thresholds import NEEDED_Z
 from makebreak.models.effects.kind import Effect
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from makebreak.gap.fit import derivative_free_search, fit_effects
 from makebreak.gap.numerics.selection import Screen, simplest
 from makebreak.gap.problem import Candidate
 from makebreak.gap.search.choice import (
@@ -12,7 +13,6 @@ from makebreak.gap.search.choice import (
     is_possible,
 )
 from makebreak.gap.search.comparison import Comparison
-from makebreak.gap.search.fit import derivative_free_search, fit_effects
 from makebreak.gap.search.screen import Ranked
 from makebreak.gap.thresholds import (
     EVIDENCE_MIN,

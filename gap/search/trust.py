@@ -5,10 +5,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.stats import t as student_t
 
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import Screen, between_parts, random_effects
 from makebreak.gap.problem import Fitted, GapProblem
 from makebreak.gap.result import Trust
-from makebreak.gap.search.fit import fit_effects
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 

@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 
 from makebreak.gap.data.recording import Episode, Recording
-from makebreak.gap.residuals.contact_shapes import ContactShapes, poses_of
+from makebreak.gap.simulation.contact_shapes import ContactShapes, poses_of
 from makebreak.gap.simulation.face_supports import LiesOn, add_supports
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.gap.simulation.windows import TURN, Window, WindowModel

@@ -1,23 +1,16 @@
 """The gap before and after, over held-out windows simulated from measured states."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import partial
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
 
 from makebreak.gap.data.recording import Recording, unit_of
-from makebreak.gap.parallel import side_by_side
 from makebreak.gap.problem import rms
-from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.gap.result import GapMeasure, InUnits, Series
-from makebreak.gap.simulation.windows import Window, WindowModel, seen_in
+from makebreak.gap.simulation.windows import seen_in
 from makebreak.models.dynamics import SceneDynamics
-from makebreak.models.effects import KINDS
-from makebreak.models.effects.kind import Effect, sliding_joints
-from makebreak.models.effects.transmission import twist_deviations, twists
-from makebreak.models.scene import Scene
+from makebreak.models.effects.kind import sliding_joints
 
 WINDOW_SEC = 0.3
 # What a perfect model would leave: an error is divided by what the channel's noise and
@@ -38,172 +31,6 @@ class Windows(Protocol):
     def errors_over(
         self, simulated: Sequence[np.ndarray], std: Sequence[np.ndarray]
     ) -> list[np.ndarray]: ...
-
-
-def measure(
-    scene: Scene,
-    effects: Sequence[Effect],
-    moved: Sequence[Effect],
-    motion: InverseModel,
-    every: bool,
-    jobs: int = 1,
-    skip: Callable[[Window], bool] = lambda window: False,
-) -> tuple[GapMeasure, list[Series]] | None:
-    """Before and after over windows of the recordings that `motion` has; None where no
-    window counts.
-
-    Args: effects: to be added. moved: the background as far as its tolerance lets it,
-        in both, as it is neither the gap nor its cure. motion: what tells how far a
-        joint lags its motor where a window starts. every: all windows, of recordings
-        that are only reported on; else those that were not fitted. skip: windows that
-        count in neither.
-    """
-    model = WindowModel(scene, motion.recordings, WINDOW_SEC, most=240)
-    taken = {(e.kind, tuple(e.at)) for e in effects}
-    moved = [e for e in moved if (e.kind, tuple(e.at)) not in taken]
-    trials = [moved, [*moved, *effects]] if effects else [moved]
-    held = [(every or not w.train) and not skip(w) for w in model.windows]
-    if not any(held):
-        return None
-    lag = _twists(motion, effects)
-    calls = [partial(model.simulate, trial, held, lag) for trial in trials]
-    try:
-        found = list(side_by_side(calls, jobs))
-    except ValueError:  # A link that its nuisances would make impossible.
-        trials = [[], list(effects)]
-        found = [_simulated(model, each, held, lag) for each in trials]
-    found = [
-        _with_fitted_twists(model, motion, each, held, lag, y)
-        for each, y in zip(trials, found, strict=True)
-    ]
-    before, after = found[0], found[-1]
-    gap = gap_measure(model, before, after, held)
-    gap = replace(
-        gap,
-        equations=_equations(motion, trials[0], trials[-1], every),
-    )
-    return gap, series_of(model, before, after, held)
-
-
-def _simulated(model: WindowModel, effects: Sequence[Effect], held, lag):
-    """As model.simulate; infinite in every window if the scene cannot have these
-    effects (a link without mass, a joint too light for its drive)."""
-    try:
-        return model.simulate(effects, held, lag)
-    except ValueError:
-        lengths = [
-            w.rows.stop - w.rows.start if h else 0
-            for w, h in zip(model.windows, held, strict=True)
-        ]
-        return [np.full((n, len(model.channels)), np.inf) for n in lengths]
-
-
-def _equations(motion: InverseModel, before, after, every: bool) -> dict[str, InUnits]:
-    """What the model leaves of each joint's effort, in its unit."""
-    rows = np.ones(len(motion.train()), bool) if every else ~motion.train()
-    rows = rows.reshape(-1, len(motion.names()))[:, 0]
-    try:
-        left = [motion.in_units(motion.residual(each)) for each in (before, after)]
-    except ValueError:
-        return {}
-    noise = motion.noise_in_units()
-    slides = sliding_joints(motion.dynamics.plant)
-    return {
-        f"{joint}.effort": InUnits(
-            "N" if joint in slides else "N m", rms(left[0][rows, k]),
-            rms(left[1][rows, k]), rms(noise[rows, k]),
-        )
-        for k, (what, joint) in enumerate(motion.names())
-        if what == "effort"
-    }  # fmt: skip
-
-
-def _twists(motion: InverseModel, effects: Sequence[Effect]):
-    """Function of a window: {joint: (twist, its rate)} at its start, of the motion as
-    measured in the scene as it came. None if nothing twists."""
-    every = (*motion.scene.effects, *effects)
-    hidden = [e for e in every if KINDS[e.kind].hidden_state]
-    if not hidden:
-        return None
-    known: dict[tuple[str, int], list[tuple[np.ndarray, dict]]] = {}
-    for track, each in zip(motion.tracks, motion.motions(), strict=True):
-        of: dict[str, np.ndarray] = {}
-        for effect in hidden:
-            of |= twists(effect, motion.dynamics, each)
-        stretches = known.setdefault((track.recording, track.episode), [])
-        stretches.append((each.time, of))
-
-    def at(window) -> dict[str, tuple[float, float]]:
-        name = motion.recordings[window.recording].name
-        for time, of in known.get((name, window.episode), []):
-            if time[0] - 0.05 <= window.start <= time[-1]:
-                k = int(np.searchsorted(time, window.start))
-                return {j: (float(z[0, k]), float(z[1, k])) for j, z in of.items()}
-        return {}  # Too short a stretch to tell.
-
-    return at
-
-
-def _with_fitted_twists(
-    model: WindowModel, motion: InverseModel, effects: Sequence[Effect], held, lag,
-    simulated: list[np.ndarray],
-) -> list[np.ndarray]:  # fmt: skip
-    """The windows simulated again, each from the twists of elastic joints that fit it
-    best. No channel measures a twist at a window's start, and an error of it, which the
-    torque's noise makes, grows with the window.
-
-    How far a twist and its rate may go is weighed against what the torque's noise makes
-    of them, so that a stiff joint has no such freedom.
-    """
-    deviations = _twist_deviations(motion, [*motion.scene.effects, *effects])
-    if lag is None or not deviations:
-        return simulated
-    prior = np.ravel(list(deviations.values()))
-    moved: list[dict[str, np.ndarray]] = [
-        {joint: np.zeros(2) for joint in deviations} for _ in model.windows
-    ]
-    number = {id(w): k for k, w in enumerate(model.windows)}
-
-    def start(window) -> dict[str, tuple[float, float]]:
-        found, by = lag(window), moved[number[id(window)]]
-        return {
-            joint: (z + by[joint][0], w + by[joint][1]) if joint in by else (z, w)
-            for joint, (z, w) in found.items()
-        }
-
-    slopes = []
-    for joint, size in deviations.items():
-        for k in range(2):
-            for each in moved:
-                each[joint][k] = size[k]
-            slopes.append(_simulated(model, effects, held, start))
-            for each in moved:
-                each[joint][k] = 0.0
-    for k, w in enumerate(model.windows):
-        if not held[k]:
-            continue
-        seen = seen_in(model, w)
-        e = (seen - simulated[k]) / w.std
-        columns = [(y[k] - simulated[k]) / w.std for y in slopes]
-        known = np.isfinite(e) & np.all([np.isfinite(c) for c in columns], axis=0)
-        J = np.stack([c[known] for c in columns], axis=1)
-        x = np.linalg.solve(J.T @ J + np.eye(len(prior)), J.T @ e[known])
-        for joint, by in zip(deviations, (prior * x).reshape(-1, 2), strict=True):
-            moved[k][joint] = by
-    return _simulated(model, effects, held, start)
-
-
-def _twist_deviations(
-    motion: InverseModel, effects: Sequence[Effect]
-) -> dict[str, np.ndarray]:
-    """{joint: standard deviations of the twist and its rate (2,)} at a window's start,
-    the largest of all stretches of the recordings."""
-    found: dict[str, np.ndarray] = {}
-    for effect in effects:
-        for each in motion.motions():
-            for joint, size in twist_deviations(effect, motion.dynamics, each).items():
-                found[joint] = np.maximum(size, found.get(joint, 0.0))
-    return found
 
 
 def gap_measure(model: Windows, before, after, held: Sequence[bool]) -> GapMeasure:

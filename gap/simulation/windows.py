@@ -54,7 +54,7 @@ class Window:
 
 class WindowedResidual:
     """The residual of a model compared window by window, and which of it is
-    fitted: what a fit asks of a model (gap/search/fit.py).
+    fitted: what a fit asks of a model (gap/fit.py).
 
     A model has `channels`, `windows` (each with `rows` and `train`),
     `simulate(effects)` and `errors(simulated)`, a list of (n, channels) per window.
