@@ -133,7 +133,7 @@ def run_gap(
     ):
 
         def alone(name: str) -> Alone:
-            say(f"looking at {name} by itself")
+            say(f"searching {name} separately")
             mine, its = ([r for r in some if r.name == name]
                          for some in (decided, reported))  # fmt: skip
             one, _ = problem_for(scene, mine, dynamics, jobs)

@@ -334,13 +334,13 @@ def table_of(
     )  # fmt: skip
     extra = sum(s.extra for s in scores) - invented
     others = len(scores) - len(calm)
-    add("effects named in vain elsewhere", "-", f"{extra} in {others} cases")
+    add("effects invented in the other cases", "-", f"{extra} in {others} cases")
     for verdict in dict.fromkeys([*VERDICTS, *(s.verdict for s in scores)]):
         of_it = [s.found for s in scores if s.verdict == verdict]
         if of_it:
             counts = {v: of_it.count(v) for v in (*VERDICTS, "failed")}
             text = ", ".join(f"{v} {n}" for v, n in counts.items() if n)
-            add(f"said of {verdict} ({len(of_it)})", "-", text)
+            add(f"verdicts where {verdict} is right ({len(of_it)})", "-", text)
     times = [s.seconds for s in scores if np.isfinite(s.seconds)]
     if times:
         add("seconds a case, median (most)", "-", f"{np.median(times):.0f} "

@@ -174,7 +174,7 @@ KINDS = {
         says="the drive of {at} pulls towards its command with {kp}",
         confused_with=("actuator_gain", "payload", "joint_elasticity", "joint_spring"),
         exported="kp",
-        tell_apart="hold known loads: the error of position goes with load over gain, "
+        tell_apart="hold known loads: the error of position is load over gain, "
         "and measure the torque",
         path="kp",
         drive="kp",

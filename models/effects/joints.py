@@ -481,7 +481,7 @@ KINDS = {
         # Once a turn is the weight of a mass off the axis, less is a spring.
         plausible=lambda e: e.parameters["periods_per_rev"] >= 2.0,
         tell_apart="move through the same positions at two speeds: the frequency of a "
-        "ripple goes with the speed",
+        "ripple is proportional to the speed",
         joint_law=ripple_law,
         joint_numbers=_numbers("amplitude", "periods_per_rev", "phase"),
         signature=_ripple_signature,
