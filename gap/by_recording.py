@@ -99,8 +99,8 @@ def with_differences(
     return replace(
         result,
         verdict="ambiguous" if is_tied else "gap_named",
-        says=f"{words} {named} With each recording searched separately, the held-out error falls from "
-        f"{gap.before:.3g} to {gap.after:.3g} times the noise.",
+        says=f"{words} {named} With each recording searched separately, the "
+        f"held-out error falls from {gap.before:.3g} to {gap.after:.3g} times the noise.",
         effects=effects,
         gap=gap,
         unexplained=(),

@@ -340,7 +340,7 @@ def table_of(
         if of_it:
             counts = {v: of_it.count(v) for v in (*VERDICTS, "failed")}
             text = ", ".join(f"{v} {n}" for v, n in counts.items() if n)
-            add(f"verdicts where {verdict} is right ({len(of_it)})", "-", text)
+            add(f"right verdict {verdict} ({len(of_it)})", "-", text)
     times = [s.seconds for s in scores if np.isfinite(s.seconds)]
     if times:
         add("seconds a case, median (most)", "-", f"{np.median(times):.0f} "

@@ -222,9 +222,7 @@ def test_the_table_has_the_goals_of_its_set():
     name = "named intervals that hold the truth"
     assert rows[name] == ("85%", "1 of 2 (50%)", False)
     assert rows["hidden effects that were named"] == ("-", "3 of 4", None)
-    assert (
-        rows["verdicts where gap_named or ambiguous is right (1)"][1] == "ambiguous 1"
-    )
+    assert rows["right verdict gap_named or ambiguous (1)"][1] == "ambiguous 1"
     assert "--set logs-final" in table.rows[0][3]
     # A push with nothing else is a case without an effect.
     push = Score("p", "gap_unnamed or no_gap", "gap_named", None, None, (), None, 2,
@@ -272,7 +270,7 @@ def test_the_table_counts_and_names_what_went_wrong():
     assert rows[name] == ("86% (90%)", True)
     assert rows["effects invented where nothing is hidden"] == ("0 in 10 cases", True)
     assert rows["effects invented in the other cases"] == ("1 in 10 cases", None)
-    assert rows["verdicts where gap_named is right (10)"] == (
+    assert rows["right verdict gap_named (10)"] == (
         "gap_named 9, ambiguous 1",
         None,
     )
@@ -341,8 +339,8 @@ def test_a_case_that_never_ends_is_stopped_and_the_others_are_scored(
     )
     table = gap_benchmark.run_benchmark(tmp_path, 2)
     rows = {row[0]: row[2] for row in table.rows}
-    assert rows["verdicts where no_gap is right (1)"] == "failed 1"
-    assert rows["verdicts where gap_named is right (1)"] == "no_gap 1"
+    assert rows["right verdict no_gap (1)"] == "failed 1"
+    assert rows["right verdict gap_named (1)"] == "no_gap 1"
     scores = json.loads((tmp_path / "scores.json").read_text())
     assert scores[0]["says"] == "stopped after 3 s"
 
