@@ -100,7 +100,8 @@ def with_differences(
         result,
         verdict="ambiguous" if is_tied else "gap_named",
         says=f"{words} {named} With each recording searched separately, the "
-        f"held-out error falls from {gap.before:.3g} to {gap.after:.3g} times the noise.",
+        f"held-out error falls from {gap.before:.3g} to {gap.after:.3g} times the "
+        "noise.",
         effects=effects,
         gap=gap,
         unexplained=(),
