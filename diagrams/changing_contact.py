@@ -265,6 +265,9 @@ def _add_systems(
     # The approach speed of the anticipator depends on how hard the reflex brakes.
     own = ("reflex_gain", "reflex_force_least")
     refuse_changed("anticipator.speed", config.anticipator.speed, own)
+    # What variable_impedance and the damping ratio give instead.
+    unused = ["stiffness", *(["damping"] if config.hybrid.damping_ratio > 0.0 else [])]
+    refuse_changed("impedance", config.impedance, unused)
     speed = replace(
         config.anticipator.speed,
         reflex_gain=config.reflex.gain,

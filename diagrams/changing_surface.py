@@ -29,6 +29,7 @@ from makebreak.diagrams.tabletop import (
     set_tool,
     tool_half_width,
 )
+from makebreak.diagrams.wiring import refuse_changed
 from makebreak.models.friction_zones import FrictionZone
 from makebreak.models.scene import Scene, read_scene
 from makebreak.systems.changing_contact.numerics.contact_task import (
@@ -228,6 +229,8 @@ def make_changing_surface(
     """The diagram of one trial. Args: knowledge: from an earlier trial; None: prior."""
     modes = config.control.modes
     # The length of a crossing follows from the tool's own geometry.
+    if not task.feet:
+        refuse_changed("control.modes", modes, ("crossing",))
     crossing = modes.crossing if task.feet else SPHERE_CROSSING
     return make_changing_contact(
         replace(config.control, modes=replace(modes, crossing=crossing)),

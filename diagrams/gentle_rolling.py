@@ -46,7 +46,7 @@ from makebreak.diagrams.station import (
     from_wrist,
     make_control_plant,
 )
-from makebreak.diagrams.wiring import timed
+from makebreak.diagrams.wiring import refuse_changed, timed
 from makebreak.models.friction_zones import FrictionZone
 from makebreak.models.scene import Scene
 from makebreak.systems.arm.impedance_controller import HybridConfig, serial_chain_of
@@ -263,7 +263,16 @@ def on_two_surfaces(config: GentleRollingConfig) -> GentleRollingConfig:
 
     The ball starts before the seam. Once a circle the finger touches the table ahead
     of it and slides over the seam to and fro, from rest each time.
+
+    Raises: ValueError for a setting that is another one on this table.
     """
+    refuse_changed("push", config.push, ("table_first", "table_every"))
+    refuse_changed("push.shape", config.push.shape, ("press_table", "slide", "survey"))
+    refuse_changed(
+        "touch.forward_model.handover",
+        config.touch.forward_model.handover,
+        ("from_rest",),
+    )
     angle = config.ball.start_angle_rad
     if angle is None:
         angle = float(np.random.default_rng([config.seed, 5]).uniform(*START_ANGLE))

@@ -233,6 +233,8 @@ def make_surface_switch(
     control = config.control
     modes, models = control.modes, control.forward_model
     # The length of a crossing follows from the tool's own geometry.
+    if not task.feet:
+        refuse_changed("control.modes", modes, ("crossing",))
     crossing = modes.crossing if task.feet else SPHERE_CROSSING
     refuse_changed("forward_model.handover", models.handover, ("rows",))
     handover = replace(models.handover, rows=2.0 * task.feet)

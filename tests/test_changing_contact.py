@@ -237,6 +237,19 @@ def test_the_anticipator_has_the_gain_of_the_reflex_and_no_other():
         build(config=config)
 
 
+def test_a_stiffness_that_the_law_never_uses_is_refused():
+    config = ChangingContactConfig()
+    config.impedance.stiffness = [500.0] * 3 + [50.0] * 3
+    with pytest.raises(ValueError, match="impedance.stiffness is .*the diagram sets"):
+        build(config=config)
+    config = ChangingContactConfig()
+    config.impedance.damping = [300.0] * 3 + [15.0] * 3
+    with pytest.raises(ValueError, match="impedance.damping is .*the diagram sets"):
+        build(config=config)
+    config.hybrid.damping_ratio = 0.0  # The law then uses this damping.
+    build(config=config)
+
+
 def test_all_that_read_the_wrench_read_it_without_the_sensor_s_bias():
     bias = np.array([0.4, -0.3, 0.5])
     diagram = build(errors=StationErrors(force_bias=bias))

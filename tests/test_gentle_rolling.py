@@ -459,6 +459,13 @@ def test_felt_begins_at_the_seam_and_the_models_have_none():
     assert given.ball.start_angle_rad == 0.5
 
 
+def test_settings_that_felt_and_glass_replaces_are_refused():
+    changed = GentleRollingConfig()
+    changed.push.shape.survey = 2
+    with pytest.raises(ValueError, match="push.shape.survey is 2, .*the diagram sets"):
+        on_two_surfaces(changed)
+
+
 def test_what_cannot_be_frozen_is_refused_by_name():
     with pytest.raises(ValueError, match="frozen has 'shaper', expected some of"):
         make_gentle_rolling(config(frozen=["shaper"]))
