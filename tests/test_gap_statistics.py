@@ -36,6 +36,7 @@ from makebreak.gap.problem import (
     Outcome,
     SearchPlan,
 )
+from makebreak.gap.residuals.late_poses import wanted
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.residuals.whitened_rows import WhitenedRows
 from makebreak.gap.result import GapMeasure
@@ -1204,3 +1205,16 @@ def test_a_smooth_effort_has_no_jumps():
     track = SimpleNamespace(samples={"a.effort_measured": y}, row_bumps=bumps,
                             bumps=bumps)  # fmt: skip
     assert WhitenedRows._unknown_jumps(model, track).max() == 0.0
+
+
+def test_how_late_poses_are_is_read_by_name():
+    """By the weights that were learned a body's clock may be one nuisance of others
+    than before."""
+    problem = SimpleNamespace(
+        bodies=["a", "b"], rich_nuisances={"clock of a": 0.02},
+        nuisances=lambda: SimpleNamespace(
+            names=("mass of b", "clock of b", "mass of a", "clock of a"),
+            prior=np.full(4, 1e-3),
+        ),
+    )  # fmt: skip
+    assert wanted(problem) == {"a": 0.02}

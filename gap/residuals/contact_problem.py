@@ -132,14 +132,16 @@ class ContactProblem(ContactCandidates, GapProblem):
         screen = Screen(base, n, nuisances.prior, self.train())
         plain = screen.fit()
         left, least = base, plain.score
-        # What is left with all effects, and how far nuisances are moved beside them.
-        self.rich_left, self.rich_nuisances = plain.score, plain.b
+        # What is left with all effects, and how far nuisances are moved beside them, by
+        # name: by other weights others may be among them.
+        self.rich_left, b = plain.score, plain.b
         if found:
             X = np.hstack([c.columns[0] for c in found])
             rich = screen.fit(X)
             if rich.score < least:
-                self.rich_left, self.rich_nuisances = rich.score, rich.b
+                self.rich_left, b = rich.score, rich.b
                 left, least = base - X @ rich.c - n @ rich.b, rich.score
+        self.rich_nuisances = dict(zip(nuisances.names, map(float, b), strict=True))
         singles = [
             (fit.score, c.effects(k, fit.c))
             for c in found
@@ -376,9 +378,8 @@ class ContactProblem(ContactCandidates, GapProblem):
         std = {"delay": 0.5 * self._row_sec()}
         found = []
         for body, late in self.late.items():
-            name, names = f"clock of {body}", self.nuisances().names
-            more = self.rich_nuisances[names.index(name)] if name in names else 0.0
-            effect = Effect(DELAY, [body], {"delay": late + float(more)})
+            more = self.rich_nuisances.get(f"clock of {body}", 0.0)
+            effect = Effect(DELAY, [body], {"delay": late + more})
             found.append(Found(effect, std, *self.late_errors))
         return found
 

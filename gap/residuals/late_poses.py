@@ -63,8 +63,7 @@ def wanted(problem: ContactProblem) -> dict[str, float]:
     for body in problem.bodies:
         name = f"clock of {body}"
         if name in n.names:
-            k = n.names.index(name)
-            late = float(problem.rich_nuisances[k])
-            if late > BEYOND * n.prior[k]:
+            late = problem.rich_nuisances.get(name, 0.0)
+            if late > BEYOND * n.prior[n.names.index(name)]:
                 out[body] = late
     return out

@@ -174,14 +174,17 @@ def is_clearly_off(choice: Choice) -> bool:
 def uses_all_parameters(fit: Fitted, k: int = -1) -> bool:
     """Whether each parameter of effect k of a fit is two deviations off neutral: else
     it is another, smaller effect under this name. Of a vector one component is enough;
-    what nothing shows is no parameter of it; and the only one with a neutral value (a
-    load's mass, of which only its moment shows) may be uncertain."""
+    what nothing shows is no parameter of it; and the mass of a load may be uncertain,
+    of which only the moment shows."""
     last, std = fit.effects[k], fit.std[k]
     clear: dict[str, bool] = {}
+    placed = False
     for p in KINDS[last.kind].parameters:
+        is_component = p.name[-1] in "xyz"
+        placed |= is_component and p.neutral is None
         if p.neutral is None or not std.get(p.name, np.inf) < np.inf:
             continue
         off = abs(last.parameters[p.name] - p.neutral) > 2.0 * std[p.name]
-        vector = p.name[:-1] if p.name[-1] in "xyz" else p.name
+        vector = p.name[:-1] if is_component else p.name
         clear[vector] = clear.get(vector, False) or off
-    return len(clear) < 2 or all(clear.values())
+    return placed or all(clear.values())
