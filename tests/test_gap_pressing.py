@@ -253,7 +253,10 @@ def test_distances_are_computed_anew_only_where_something_stands_elsewhere(
     assert len(computed) == before
     other = Effect("wall_position", [WALL], {"x": 0.001, "y": 0.0, "z": 0.0})
     problem.residual([other])
-    assert len(computed) > before
+    assert len(computed) == before + 1  # Of the wall alone.
+    lower = Effect("wall_position", [TABLE], {"z": -0.012})
+    problem.residual([other, lower])
+    assert len(computed) == before + 2  # Of the table alone.
     problem._slots_at.clear()
     np.testing.assert_array_equal(problem.residual([moved]), there)
     problem._evaluate_nodes()  # Other rows: what was computed for these is gone.

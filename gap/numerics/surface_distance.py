@@ -13,18 +13,30 @@ from makebreak.systems.contact_mpc.numerics.convex_hull import point_on_hull
 
 def box(p, half):
     """p (n, 3), half (3,). Returns: distance (n,), normal (n, 3)."""
-    half = np.asarray(half, float)
-    off = p - np.clip(p, -half, half)
-    out = np.linalg.norm(off, axis=1)
-    q = np.abs(p) - half
-    axis = np.argmax(q, axis=1)
-    row = np.arange(len(p))
-    inside = out <= 1e-12
-    distance = np.where(inside, q[row, axis], out)
-    normal = off / np.where(inside, 1.0, out)[:, None]
-    face = np.zeros_like(p)
-    face[row, axis] = np.where(p[row, axis] < 0.0, -1.0, 1.0)
-    return distance, np.where(inside[:, None], face, normal)
+    p = np.ascontiguousarray(p, float)
+    distance, normal = np.empty(len(p)), np.empty_like(p)
+    _from_box(p, np.asarray(half, float), distance, normal)
+    return distance, normal
+
+
+@njit(cache=True)
+def _from_box(p, half, distance, normal):
+    """Writes distance (n,) and normal (n, 3) of points p (n, 3)."""
+    for i in range(len(p)):
+        axis, deepest, square = 0, -np.inf, 0.0
+        for k in range(3):
+            out = abs(p[i, k]) - half[k]
+            if out > deepest:
+                axis, deepest = k, out
+            normal[i, k] = p[i, k] - min(max(p[i, k], -half[k]), half[k])
+            square += normal[i, k] ** 2
+        distance[i] = np.sqrt(square)
+        if distance[i] > 1e-12:
+            normal[i] /= distance[i]
+        else:
+            distance[i] = deepest
+            normal[i] = 0.0
+            normal[i, axis] = -1.0 if p[i, axis] < 0.0 else 1.0
 
 
 def sphere(p, radius: float):

@@ -39,7 +39,7 @@ WHOLE = 0.9  # Of the squares left: what one more of a body leaves is tried firs
 SOFTER = (0.3, 0.6, 2.0)  # Times the stiffness of the scene: trials.
 MOST_FRICTION = 2.0  # Of what is taken for any.
 MOST_PATCHES, MOST_EFFECTS = 3, 10
-MOST_SLOTS = 12  # Places of what is displaced whose distances are kept.
+MOST_SLOTS = 12  # Places of a fixed body at which its distances are kept.
 SMALL_SHIFT = 1e-3  # First trial of a place [m].
 AXES = "xyz"
 
@@ -105,7 +105,7 @@ class PressingProblem(ContactProblem):
             raise ValueError("something moves freely")
 
     def _evaluate_nodes(self) -> None:
-        self._slots_at: dict[tuple, tuple] = {}  # Of what is displaced: see _slots.
+        self._slots_at: dict[tuple, list[Slot]] = {}  # See _slots_with.
         super()._evaluate_nodes()
 
     def pair_name(self, pair: tuple[int, int]) -> str:
@@ -231,25 +231,37 @@ class PressingProblem(ContactProblem):
     def _slots(self, effects: Sequence[Effect], shift: Shift | None = None):
         if any(e.kind == "plane_tilt" for e in effects):
             raise ValueError("plane_tilt: not of what a robot presses on")
-        moving = [e for e in effects if e.kind in MOVES]
-        key = tuple(e.key for e in moving)
-        if key not in self._slots_at:
-            # Most of a fit's parameters move nothing.
-            if len(self._slots_at) >= MOST_SLOTS:
-                del self._slots_at[next(iter(self._slots_at))]
-            self._slots_at[key] = self._new_slots(moving)
-        return self._slots_at[key]
-
-    def _new_slots(self, moving: Sequence[Effect]):
         poses = dict(self._node_poses)
-        for e in moving:
-            by = np.array([e.parameters.get(a, 0.0) for a in AXES])
-            by[2] += e.parameters.get("height", 0.0)
-            for k in poses:
-                if k in self.shapes.anchored and self._is_at(e, k):
-                    R, p = poses[k]
-                    poses[k] = R, p + by
-        return self.shapes.slots(poses, REACH), poses
+        by = {k: np.zeros(3) for k in poses if k in self.shapes.anchored}
+        for e in effects:
+            for k in by if e.kind in MOVES else ():
+                if self._is_at(e, k):
+                    by[k] = by[k] + [e.parameters.get(a, 0.0) for a in AXES]
+                    by[k][2] += e.parameters.get("height", 0.0)
+        for k, x in by.items():
+            if x.any():
+                R, p = poses[k]
+                poses[k] = R, p + x
+        found = self._slots_with(None, np.zeros(3), poses)
+        for k, x in by.items():
+            found = found + self._slots_with(k, x, poses)
+        return sorted(found, key=lambda s: s.key), poses
+
+    def _slots_with(self, body: int | None, by: np.ndarray, poses) -> list[Slot]:
+        """Slots of a fixed body that is displaced by (3,) [m]; None: of what moves.
+        They are kept: most of a fit's parameters displace nothing, and no other one
+        displaces this body."""
+        key = body, *by
+        if key not in self._slots_at:
+            if len(self._slots_at) >= MOST_SLOTS * (1 + len(self.shapes.anchored)):
+                del self._slots_at[next(iter(self._slots_at))]
+
+            def counts(a: int, b: int) -> bool:
+                fixed = {a, b} & self.shapes.anchored
+                return not fixed if body is None else body in fixed
+
+            self._slots_at[key] = self.shapes.slots(poses, REACH, counts)
+        return self._slots_at[key]
 
     def _touches(self, slots: Sequence[Slot]) -> list[np.ndarray]:
         """Of each slot (n_nodes,) whether it may act: points nearly as near as the

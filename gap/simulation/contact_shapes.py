@@ -83,14 +83,17 @@ class _Point:
         d, _ = s.distance(np.einsum("nji,nj->ni", R_b, c - p_b))
         return c, d - self.radius, n, side
 
-    def stays_away(self, s: "_Surface", R_a, p_a, R_b, p_b, near: float) -> bool:
+    def stays_away(self, s: "_Surface", c, middle, R_b, p_b, near: float) -> bool:
         """Whether it is farther than `near` [m] at all poses, as balls about the two
-        say, or the distance of its middle: what takes little time."""
-        c = p_a + R_a @ self.p_B
+        say, or the distance of its middle: what takes little time.
+
+        Args: c, middle (n, 3): its place and the middle of the surface in world.
+        """
         half = 0.0 if self.along is None else float(np.linalg.norm(self.along))
         most = near + self.radius + self.rim + half
-        between = np.linalg.norm(c - (p_b + R_b @ s.p_BG), axis=1)
-        if between.min() > most + s.reach():
+        between = c - middle
+        least = np.einsum("ni,ni->n", between, between).min()
+        if least > (most + s.reach()) ** 2:
             return True
         if self.along is None:
             return False
@@ -346,21 +349,29 @@ class ContactShapes:
         return sorted({p.body for p in self.points} | {s.body for s in self.surfaces})
 
     def slots(
-        self, poses: Mapping[int, tuple[np.ndarray, np.ndarray]], near: float
+        self,
+        poses: Mapping[int, tuple[np.ndarray, np.ndarray]],
+        near: float,
+        counts: Callable[[int, int], bool] = lambda a, b: True,
     ) -> list[Slot]:
         """Those that come nearer than `near` [m] at any pose.
 
-        Args: poses: {body: R (n, 3, 3), p (n, 3)} of all bodies that have shapes.
+        Args:
+            poses: {body: R (n, 3, 3), p (n, 3)} of all bodies that have shapes.
+            counts: whether points of body a against surfaces of body b are asked for.
         """
         found = []
         facing: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
         of_points = {p.geometry for p in self.points}
         of_surfaces = {s.geometry for s in self.surfaces}
+        middles = [p + R @ s.p_BG for s in self.surfaces for R, p in (poses[s.body],)]
         for i, point in enumerate(self.points):
+            R_a, p_a = poses[point.body]
+            place = p_a + R_a @ point.p_B
             each: list[tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
             for j, s in enumerate(self.surfaces):
                 fixed = point.body in self.anchored and s.body in self.anchored
-                if s.body == point.body or fixed:
+                if s.body == point.body or fixed or not counts(point.body, s.body):
                     continue
                 if self._apart[point.geometry, s.geometry]:
                     continue
@@ -373,7 +384,7 @@ class ContactShapes:
                     if s.body > point.body:
                         continue  # Two spheres are one pair.
                 at, to = poses[point.body], poses[s.body]
-                if point.stays_away(s, *at, *to, near):
+                if point.stays_away(s, place, middles[j], *to, near):
                     continue
                 c, phi, n, may = point.near(s, *at, *to)
                 if s.kind == "box" and point.is_edge and phi.min() < near:
@@ -406,7 +417,7 @@ class ContactShapes:
                         _in_row(point.stiffness, s.stiffness),
                     )
                 )  # fmt: skip
-        return found + self._crossings(poses, near)
+        return found + self._crossings(poses, near, counts)
 
     def _facing(self, corner: _Point, s: _Surface, poses):
         """Of the box that a corner is of, or the cylinder of a point on a rim, axis
@@ -424,7 +435,7 @@ class ContactShapes:
         best = apart.argmax(axis=1)
         return best // 2, np.where(best % 2, -1.0, 1.0), apart.max(axis=1)
 
-    def _crossings(self, poses, near: float) -> list[Slot]:
+    def _crossings(self, poses, near: float, counts) -> list[Slot]:
         """Of edges of a free box and those of another body's."""
         found = []
         for i, one in enumerate(self.boxes):
@@ -433,6 +444,8 @@ class ContactShapes:
                 if not one.is_free or other.body == one.body or twice:
                     continue
                 if self._apart[one.geometry, other.geometry]:
+                    continue
+                if not counts(one.body, other.body):
                     continue
                 at, to = poses[one.body], poses[other.body]
                 centre = at[1] + at[0] @ one.centre
