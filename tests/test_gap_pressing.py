@@ -192,10 +192,43 @@ def test_bodies_that_stand_elsewhere_are_felt_there(displaced):
     assert off[WALL]["x"] == pytest.approx(0.025, abs=1e-3)
 
 
+def test_what_stands_on_something_is_displaced_with_it(displaced):
+    """The wall stands on the table, nothing stands on the wall."""
+    number = {name: k for k, name in displaced.shapes.names.items()}
+    assert displaced._carried[number[TABLE]] == {number[WALL]}
+    assert displaced._carried[number[WALL]] == set()
+    plain = displaced._plain_candidates(displaced.base(), ())
+    [height] = [c for c in plain if c.kind == "plane_height"]
+    assert height.at == (TABLE, WALL)
+    lower = Effect("plane_height", list(height.at), {"height": -0.012})
+    before, after = (displaced._slots(effects)[0] for effects in ((), [lower]))
+    wall = {s.key: s for s in before if number[WALL] in (s.a, s.b)}
+    moved = [s for s in after if s.key in wall and s.b == number[WALL]]
+    assert moved
+    # Its upper edge is lower, too: distances from above are so much larger.
+    above = [(s, wall[s.key].normal[:, 2] > 0.99) for s in moved]
+    for s, rows in above:
+        np.testing.assert_allclose(
+            s.phi[rows] - wall[s.key].phi[rows], 0.012, atol=1e-9
+        )
+
+
+def test_a_wall_is_felt_though_the_tool_is_below_it_as_the_scene_has_it(tmp_path):
+    """A ball of 40 mm on a table that is 45 mm lower is below the wall, which stands on
+    the table: 22 mm off, it is found all the same."""
+    scene = write_scene(tmp_path)
+    problem = PressingProblem(scene, record(tmp_path, table=-0.045, wall=0.322))
+    off = {problem.shapes.names[k]: by for k, by in problem.off.items()}
+    assert off[TABLE]["z"] == pytest.approx(-0.045, abs=1e-3)
+    assert off[WALL]["x"] == pytest.approx(0.022, abs=1e-3)
+
+
 def test_places_and_frictions_are_named(displaced):
     found = {(c.effect.kind, *c.effect.at): c.effect.parameters
              for c in select(displaced).choices}  # fmt: skip
-    assert found["plane_height", TABLE]["height"] == pytest.approx(-0.012, abs=5e-4)
+    # The wall stands on the table.
+    height = found["plane_height", TABLE, WALL]["height"]
+    assert height == pytest.approx(-0.012, abs=5e-4)
     assert found["wall_position", WALL]["x"] == pytest.approx(0.025, abs=5e-4)
     for body, mu in ((TABLE, 0.42), (WALL, 0.35)):
         friction = found["contact_friction", f"{body}~gantry.tool"]["friction"]
@@ -207,7 +240,7 @@ def test_a_wall_that_is_put_right_explains_forces_and_distance(displaced):
     names = displaced.row_names()
     there = [
         Effect("wall_position", [WALL], {"x": 0.025}),
-        Effect("plane_height", [TABLE], {"height": -0.012}),
+        Effect("plane_height", [TABLE, WALL], {"height": -0.012}),
     ]
     k = names.index(f"{WALL}~gantry.tool.distance")
     before, after = displaced.left(), displaced.left(there)

@@ -70,10 +70,11 @@ class ContactCandidates(ContactRows):
             if (kind, at) in taken:
                 continue
             columns, readers = [], []
+            places = self._acts_at(kind, at)
             for trial in trials:
                 made = []
                 for step, parameters in trial:
-                    moved = self._try(there, Effect(kind, [at], parameters))
+                    moved = self._try(there, Effect(kind, places, parameters))
                     if moved is None:
                         break
                     made.append((r - moved) / step)
@@ -87,10 +88,14 @@ class ContactCandidates(ContactRows):
             if columns:
                 least = self.dynamics.least(kind, [at])
                 found.append(
-                    Candidate(kind, (at,), size, tuple(columns), tuple(readers), fixed,
-                              least=least)
+                    Candidate(kind, tuple(places), size, tuple(columns),
+                              tuple(readers), fixed, least=least)
                 )  # fmt: skip
         return found
+
+    def _acts_at(self, kind: str, at: str) -> list[str]:
+        """All places of an effect that is tried at one."""
+        return [at]
 
     def _try(self, there: Sequence[Effect], effect: Effect) -> np.ndarray | None:
         """With the weights of what is there: columns are then as linear as can be."""

@@ -7,10 +7,11 @@ it is off, if forces without another cause are felt there, or if the scene's fac
 passed. What touches what, and its distance, follow from that.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from pydrake.multibody.tree import BodyIndex
 
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.numerics.permitted_forces import explain
@@ -41,17 +42,25 @@ MOST_FRICTION = 2.0  # Of what is taken for any.
 MOST_PATCHES, MOST_EFFECTS = 3, 10
 MOST_SLOTS = 12  # Places of a fixed body at which its distances are kept.
 SMALL_SHIFT = 1e-3  # First trial of a place [m].
-AXES = "xyz"
+AXES, UP = "xyz", np.array([0.0, 0.0, 1.0])
+STANDS, LEVEL = 1e-3, 0.9  # It stands on what is so near below it [m]; cosine.
 
 
 @dataclass(frozen=True, eq=False)
 class _Face:
     """A face of a fixed body: its normal (3,) and by how far along it the body may be
-    off [m]; passed: by so much the tool went through it as the scene has it."""
+    off [m]; below zero: by so much the tool went through it as the scene has it. lift:
+    how much higher the body is with what it stands on [m]."""
 
     body: int
     normal: np.ndarray
     off: float
+    lift: float = 0.0
+
+    @property
+    def by(self) -> np.ndarray:
+        """(3,) by which the body is displaced [m]."""
+        return self.off * self.normal + self.lift * UP
 
 
 def presses(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
@@ -121,11 +130,12 @@ class PressingProblem(ContactProblem):
         """As the scene has it, and as it might be: no contact may come or go within a
         test function."""
         poses = self._poses_at(self._q)
+        self._carried = self._find_carried(poses)
         self.faces = self._possible_faces(poses)
         found = super()._touching_rows()
         for number, face in enumerate(self.faces):
             R, p = poses[face.body]
-            moved = poses | {face.body: (R, p + face.off * face.normal)}
+            moved = poses | {face.body: (R, p + face.by)}
             for s in self.shapes.slots(moved, MEETS):
                 if face.body in (s.a, s.b):
                     key = (-1 - number, s.a if s.b == face.body else s.b)
@@ -162,14 +172,58 @@ class PressingProblem(ContactProblem):
                 found.append(near[normal] & (f > least))
         return found
 
+    def _find_carried(self, poses) -> dict[int, set[int]]:
+        """{fixed body: those that stand on it, or on one that does, in the scene}."""
+        robots = {
+            self.plant.get_body(BodyIndex(k)).model_instance()
+            for k in self.shapes.bodies() if k not in self.shapes.anchored
+        }  # fmt: skip
+        fixed = {
+            k: (poses[k][0][:1], poses[k][1][:1]) for k in self.shapes.anchored
+            if k in poses
+            and self.plant.get_body(BodyIndex(k)).model_instance() not in robots
+        }  # fmt: skip
+        on: dict[int, set[int]] = {k: set() for k in fixed}
+        for point in self.shapes.points:
+            for s in self.shapes.surfaces:
+                if point.body == s.body or not {point.body, s.body} <= set(fixed):
+                    continue
+                _, d, normal, _ = point.near(s, *fixed[point.body], *fixed[s.body])
+                if abs(d[0]) < STANDS and normal[0] @ UP > LEVEL:
+                    on[s.body].add(point.body)
+                elif abs(d[0]) < STANDS and normal[0] @ UP < -LEVEL:
+                    on[point.body].add(s.body)
+        for _ in on:  # What stands on what stands on it.
+            for k, mine in on.items():
+                on[k] = mine.union(*(on[each] for each in mine)) - {k}
+        return on
+
     def _possible_faces(self, poses) -> list[_Face]:
         """Faces of fixed boxes over which the tool came, with how near it kept to them:
-        so far they may be off, if it pressed on them there."""
+        so far they may be off, if it pressed on them there. Of what stands on another
+        body also those that it has where that body may be."""
+        found = self._faces_at(poses, self.shapes.anchored)
+        for below in list(found):
+            carried = self._carried.get(below.body, set())
+            if not carried or below.normal @ UP < LEVEL or abs(below.off) < SAME:
+                continue
+            if not self.sensors and below.off > -PASSED:
+                continue  # Never touched, perhaps.
+            by = {k: (poses[k][0], poses[k][1] + below.off * UP) for k in carried}
+            faces = self._faces_at(poses | by, carried)
+            found += [
+                replace(f, lift=below.off) for f in faces
+                if abs(f.normal @ UP) < LEVEL
+            ]  # fmt: skip
+        return found
+
+    def _faces_at(self, poses, bodies: Collection[int]) -> list[_Face]:
+        """Those of some bodies."""
         moving = [p for p in self.shapes.points
                   if p.body not in self.shapes.anchored and not p.rim]  # fmt: skip
         found = []
         for s in self.shapes.surfaces:
-            if s.body not in self.shapes.anchored or s.kind != "box":
+            if s.body not in bodies or s.kind != "box":
                 continue
             R_b, p_b = poses[s.body][0][0], poses[s.body][1][0]
             R, centre = R_b @ s.R_BG, p_b + R_b @ s.p_BG
@@ -315,45 +369,64 @@ class PressingProblem(ContactProblem):
         self._pairs_met = sorted({*self._met, *map(self._pair_of, self.slots)})
 
     def _displacing(self, off: dict[int, dict[str, float]]) -> list[Effect]:
+        """Effects of bodies that are off, and of what stands on them."""
+        of = {k: dict(by) for k, by in off.items()}
+        for body, by in off.items():
+            for k in self._carried.get(body, ()) if "z" in by else ():
+                of.setdefault(k, {}).setdefault("z", by["z"])
         return [
-            Effect("wall_position", [self.shapes.names[body]], by)
-            for body, by in off.items()
+            Effect("wall_position", [self.shapes.names[k]], by) for k, by in of.items()
         ]
 
     def _felt_faces(self) -> dict[int, dict[str, float]]:
         """{body: {axis: by how far [m]}} of faces that are off and felt, or passed."""
         off: dict[int, dict[str, float]] = {}
         left = [f for f in self.faces if abs(f.off) > SAME]
-        for face in [f for f in left if f.off < -PASSED]:
+        left.sort(key=lambda f: -abs(f.normal @ UP))  # What others stand on first.
+        while left:
+            face = next(
+                (f for f in left if f.off < -PASSED and self._is_of(f, off)), None
+            ) or self._best_felt(left, off)
+            if face is None:
+                break
             self._add(off, face)
             left.remove(face)
-        while left:
-            before = self._mean_squares(off)
-            best, gain = None, 0.0
-            for face in left:
-                trial = {k: dict(v) for k, v in off.items()}
-                self._add(trial, face)
-                geometry = self._geometry(self._displacing(trial))
-                on = np.zeros(len(before), bool)
-                for s in geometry.slots:
-                    if face.body in (s.a, s.b):
-                        on |= self._when(geometry, s) > 0.999
-                if on.sum() < 3:
-                    continue
-                after = self._mean_squares(trial)
-                if (
-                    before[on].mean() < FELT
-                    or after[on].mean() > LESS * before[on].mean()
-                ):
-                    continue
-                taken = float(before.sum() - after.sum())
-                if taken > gain:
-                    best, gain = face, taken
-            if best is None:
-                break
-            self._add(off, best)
-            left.remove(best)
         return off
+
+    def _is_of(self, face: _Face, off: dict[int, dict[str, float]]) -> bool:
+        """Whether a face was found at the height that its body has with others off."""
+        lift = [
+            by["z"] for k, by in off.items()
+            if "z" in by and face.body in self._carried.get(k, ())
+        ]  # fmt: skip
+        return abs(face.lift - sum(lift[:1])) < SAME
+
+    def _best_felt(
+        self, left: Sequence[_Face], off: dict[int, dict[str, float]]
+    ) -> _Face | None:
+        """The face that explains most, of those that are felt."""
+        before = self._mean_squares(off)
+        best, gain = None, 0.0
+        for face in left:
+            if not self._is_of(face, off):
+                continue
+            trial = {k: dict(v) for k, v in off.items()}
+            self._add(trial, face)
+            geometry = self._geometry(self._displacing(trial))
+            on = np.zeros(len(before), bool)
+            for s in geometry.slots:
+                if face.body in (s.a, s.b):
+                    on |= self._when(geometry, s) > 0.999
+            if on.sum() < 3:
+                continue
+            after = self._mean_squares(trial)
+            is_felt = before[on].mean() >= FELT
+            if not (is_felt and after[on].mean() <= LESS * before[on].mean()):
+                continue
+            taken = float(before.sum() - after.sum())
+            if taken > gain:
+                best, gain = face, taken
+        return best
 
     def _add(self, off: dict[int, dict[str, float]], face: _Face) -> None:
         axis = int(np.argmax(np.abs(face.normal)))
@@ -533,9 +606,19 @@ class PressingProblem(ContactProblem):
 
     def _plain_candidates(self, r: np.ndarray, there: Sequence[Effect]):
         found = super()._plain_candidates(r, there)
-        taken = {at for e in there if e.kind in MOVES for at in e.at}
+        taken = {e.at[0] for e in there if e.kind in MOVES}
         # Trials of any other size than what is felt would tell nothing.
-        return [c for c in found if c.kind not in MOVES or not taken & set(c.at)]
+        return [c for c in found if c.kind not in MOVES or c.at[0] not in taken]
+
+    def _acts_at(self, kind: str, at: str) -> list[str]:
+        """A height is that of what stands there, too."""
+        if kind != "plane_height":
+            return [at]
+        (body,) = [k for k, name in self.shapes.names.items() if name == at]
+        return [
+            at,
+            *(self.shapes.names[k] for k in sorted(self._carried.get(body, ()))),
+        ]
 
     def _may_have_patch(self, pair, there: Sequence[Effect]) -> bool:
         """Of level ground, up to MOST_PATCHES."""

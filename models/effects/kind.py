@@ -363,6 +363,8 @@ def _place(effect: Effect, kind: EffectKind) -> str:
         what = "each channel of"
     elif len(places) > 1 and what in ("joint", "channel"):
         what = f"each of the {what}s"
+    elif len(places) > 1 and what == "body":
+        what = "bodies"
     if len(places) > 1:
         places = [f"{', '.join(places[:-1])} and {places[-1]}"]
     return f"{what} {places[0]}".strip()
