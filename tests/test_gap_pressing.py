@@ -5,7 +5,11 @@ import pytest
 
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.table import write_recording
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.residuals.pressing import PressingProblem, presses
+from makebreak.gap.search.choice import Choice
+from makebreak.gap.search.comparison import Comparison
+from makebreak.gap.search.rivals import still_tied
 from makebreak.gap.search.select import select
 from makebreak.gap.workflow import judged_channels, problem_for, unjudged_channels
 from makebreak.models.dynamics import SceneDynamics
@@ -303,3 +307,27 @@ def test_no_contact_is_so_soft_that_a_tool_goes_in_by_centimetres(displaced):
     displaced.left([Effect("contact_stiffness", [at], {"stiffness": 0.5 * now})])
     with pytest.raises(ValueError, match="goes in too far"):
         displaced.left([Effect("contact_stiffness", [at], {"stiffness": 0.01 * now})])
+
+
+def test_a_rival_that_leaves_one_channel_a_gap_is_no_tie(tmp_path):
+    """Few rows are distances of a wall that is 0.9 mm off: all rows together leave as
+    much with its friction changed as with the wall put right."""
+    scene = write_scene(tmp_path)
+    problem = PressingProblem(scene, record(tmp_path, wall=0.3009))
+    search = Comparison(problem, lambda text: None)
+    place = Effect("wall_position", [WALL], {"x": 0.0009})
+    rival = Effect("contact_friction", [f"{WALL}~gantry.tool"], {"friction": 0.21})
+    other = Effect("contact_friction", [f"{TABLE}~gantry.tool"], {"friction": 0.31})
+
+    def fitted(*effects):
+        screen = search.screen(problem.residual(effects))
+        return fit_effects(problem, screen, effects)
+
+    fit, instead = fitted(place, other), fitted(rival, other)
+    assert search.error(instead.score) <= 1.05 * search.error(fit.score)
+    assert problem.loudest(instead)[0] == f"{WALL}~gantry.tool.distance"
+    chosen = [
+        Choice(effect, std, 1.0, 1.0, "", np.inf, ties, fixed=(), size=1)
+        for effect, std, ties in zip(fit.effects, fit.std, ((rival,), ()), strict=True)
+    ]
+    assert still_tied(search, chosen, fit, 0) == ()

@@ -27,6 +27,7 @@ from makebreak.gap.thresholds import (
     NOISE_RMS_MAX,
     NUISANCE_EXCESS,
     REFIT_LOSS_MAX,
+    RIVAL_ERROR_RATIO,
     RIVAL_P_VALUE,
     SAME_ERROR,
 )
@@ -192,6 +193,12 @@ class Comparison:
             ):
                 return False
         return bool(pairs)
+
+    def is_louder(self, rival: Fitted, fit: Fitted) -> bool:
+        """Whether a rival leaves one channel a gap, and the fit does not: among all
+        rows together few say so."""
+        ours, theirs = (self.problem.loudest(each)[1] for each in (fit, rival))
+        return theirs > max(self.plan.loud, RIVAL_ERROR_RATIO * ours)
 
     @property
     def tells_by_evidence(self) -> bool:

@@ -223,7 +223,8 @@ def still_tied(
         )
         alike = paired(fit.left, current.left, search.train) > P_VALUE_MIN
         more = chosen[k].size - len(fit.std[k])
-        if near and alike and not search.is_worse(fit, current, more):
+        worse = search.is_worse(fit, current, more) or search.is_louder(fit, current)
+        if near and alike and not worse:
             tied.append(fit.effects[k])
     return tuple(tied)
 
