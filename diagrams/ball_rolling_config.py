@@ -91,7 +91,10 @@ class LearnerConfig:
     slip_noise: float = 0.03
     posterior: PosteriorConfig = field(
         default_factory=lambda: PosteriorConfig(
-            free_states=[V_BALL.start, V_BALL.start + 1]
+            prior_std=0.16,
+            drift=0.02,
+            spacing=0.01,
+            free_states=[V_BALL.start, V_BALL.start + 1],
         )
     )
 

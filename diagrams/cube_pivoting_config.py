@@ -87,6 +87,7 @@ def _learner() -> ResidualLearnerConfig:
         learning_rate=0.01,
         n_steps=5,
         groups=[[0, 1], [2, 3], [4, 5, 6, 7]],
+        r_max=1.0,
     )
 
 

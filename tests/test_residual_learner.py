@@ -566,6 +566,72 @@ def test_the_enable_port_may_stay_unconnected():
     assert outputs(simulator, learner)[2] == LearnerStatus.LEARNED
 
 
+@pytest.mark.parametrize("dt", [0.005, 0.02, 0.05, 0.1])
+def test_defaults_find_a_gap_at_any_time_step(dt):
+    """The wall is 8 mm further than in the model, and a mass rests against it."""
+    near, far = point_mass(0.0, dt, 0.01 * dt), point_mass(8e-3, dt, 0.01 * dt)
+    x = np.array([8e-3, 0.0])
+    x, _ = simulate(far, x, [PUSH])  # At rest, eps_c gives way.
+    steps = Script(x[None], np.array([[PUSH]]), [near], np.ones((1, 1)), dt)
+    builder = DiagramBuilder()
+    script = builder.AddSystem(steps)
+    learner = builder.AddSystem(ResidualLearner(ResidualLearnerConfig(), near, dt))
+    for port, name in (("x", "x"), ("u", "u_measured"), ("lcs", "lcs")):
+        builder.Connect(script.GetOutputPort(port), learner.GetInputPort(name))
+    simulator = Simulator(builder.Build())
+    simulator.AdvanceTo(200 * dt)
+    # 200 of Adam's steps of 0.15 mm; it dithers by about one.
+    r = outputs(simulator, learner)[0]
+    np.testing.assert_allclose(r * dt, 8e-3, atol=3e-4)
+
+
+def test_a_state_too_large_to_be_squared_is_dropped_with_both_its_pairs():
+    def edit(x, u, lcs, enable):
+        x[3, 1] = 1e200
+
+    simulator, learner = scripted(edit=edit)
+    after_tick(simulator, 2)
+    before = outputs(simulator, learner)[0]
+    for k in (3, 4):
+        after_tick(simulator, k)
+        r, _, status = outputs(simulator, learner)
+        assert status == LearnerStatus.NOT_FINITE
+        np.testing.assert_array_equal(r, before)
+    after_tick(simulator, 5)  # Nothing of it is left in the buffer.
+    r, loss, status = outputs(simulator, learner)
+    assert status == LearnerStatus.LEARNED and r < before and np.isfinite(loss)
+
+
+def test_of_an_lcs_for_each_knot_the_first_is_used():
+    n = 8
+    one, many = scripted(n), scripted(n, lcs=[(point_mass(5e-3), point_mass(1.0))] * n)
+    for simulator, _ in (one, many):
+        after_tick(simulator, n - 1)
+    np.testing.assert_array_equal(outputs(*one), outputs(*many))
+    assert outputs(*one)[0] < 0.0
+
+
+def test_a_friction_model_that_is_not_convex_is_refused_by_its_name():
+    # A force of 1 N opens what another closes: F + F' has eigenvalues 0.1 +- 1.
+    wedge = point_mass()
+    F = [[0.05, 0.5], [0.5, 0.05]]
+    lcs = LCS(wedge.A, wedge.B, np.zeros((2, 2)), wedge.d, np.zeros((2, 2)), F,
+              np.zeros((2, 1)), np.zeros(2), 0.05)  # fmt: skip
+    with pytest.raises(ValueError, match="eigenvalue -0.9, expected a positive"):
+        ResidualLearner(ResidualLearnerConfig(), lcs, 0.05)
+
+
+@pytest.mark.parametrize("lcs", [None, (), [point_mass()]])
+def test_what_is_not_an_lcs_is_refused(lcs):
+    with pytest.raises(ValueError, match="lcs is a .*, expected an LCS"):
+        ResidualLearner(ResidualLearnerConfig(), lcs, 0.05)
+
+
+def test_arrays_may_stand_for_lists():
+    config = ResidualLearnerConfig(Q_d=np.ones(2), groups=np.array([[0]]))
+    ResidualLearner(config, point_mass(), 0.05)
+
+
 @pytest.mark.parametrize(
     "changes, message",
     [
@@ -579,7 +645,16 @@ def test_the_enable_port_may_stay_unconnected():
         (dict(r_max=np.inf), "r_max is inf"),
         (dict(n_b=0), "n_b is 0"),
         (dict(n_steps=0), "n_steps is 0"),
+        (dict(n_b=2.5), "n_b is 2.5, expected an integer"),
+        (dict(n_steps=np.inf), "n_steps is inf"),
         (dict(groups=[[1]]), "entry 1"),
+        (dict(groups=[[0.5]]), "entry 0.5"),
+        (dict(groups=[0]), "expected lists of entries"),
+        (dict(Q_d=[1.0, np.nan]), r"Q_d is \[1.0, nan\], expected 2 weights"),
+        (dict(Q_d=[np.inf, 1.0]), "Q_d"),
+        (dict(Q_d=[0.0, 0.0]), "not all 0"),
+        (dict(Q_d=["a", 1.0]), "Q_d"),
+        (dict(eps="1"), "eps is 1, expected a positive number"),
     ],
 )
 def test_wrong_settings_are_refused_by_name(changes, message):
@@ -590,6 +665,8 @@ def test_wrong_settings_are_refused_by_name(changes, message):
 def test_a_period_that_is_not_the_lcs_time_step_is_refused():
     with pytest.raises(ValueError, match="period_sec is 0.1, expected the LCS's dt"):
         ResidualLearner(ResidualLearnerConfig(), point_mass(), 0.1)
+    with pytest.raises(ValueError, match="period_sec is nan, expected"):
+        ResidualLearner(ResidualLearnerConfig(), point_mass(), np.nan)
 
 
 # The baseline: a residual on the dynamics.

@@ -21,7 +21,7 @@ from makebreak.systems.contact_mpc.lcs_builder import (
     LcsBuilderConfig,
 )
 from makebreak.systems.contact_mpc.numerics.ball_state import V_TIP, pack
-from makebreak.systems.contact_mpc.numerics.lcs import opening_speed, simulate
+from makebreak.systems.contact_mpc.numerics.lcs import LCS, opening_speed, simulate
 from makebreak.systems.contact_mpc.numerics.residual_learner import (
     measured_step,
     violation_loss,
@@ -291,10 +291,144 @@ def test_a_gap_that_is_too_large_has_no_gradient_but_a_likelihood():
     assert mode_and_std(GRID, belief)[0] == pytest.approx(-0.1, abs=0.01)  # 5 mm/dt.
 
 
+# The learner alone, on a mass of 1 kg between two walls of which the model is wrong.
+
+
+def between_walls(left, right, dt=LEARN):
+    """w = (q + left)/dt + v_next, (right - q)/dt - v_next: walls at -left and right."""
+    one = point_mass(right, dt, 0.01 * dt)
+    F = np.array([[dt, -dt], [-dt, dt]]) + 0.01 * dt * np.eye(2)
+    E, H = np.vstack([-one.E, one.E]), np.vstack([-one.H, one.H])
+    c = np.array([left, right]) / dt
+    phi = np.array([left, right])
+    return LCS(one.A, one.B, np.hstack([-one.D, one.D]), one.d, E, F, H, c, dt, phi)
+
+
+def visits(truth, pushes, noise=0.0):
+    """States of the mass that is pushed with these forces, and the forces [N]."""
+    rng = np.random.default_rng(0)
+    x = [np.zeros(2)]
+    for u in pushes[:-1]:
+        v = 0.9 * x[-1][1]  # Some friction, so that it comes to rest.
+        x.append(simulate(truth, [x[-1][0], v], [u])[0])
+    x = np.array(x)
+    x[:, 1] += noise * rng.normal(size=len(x))
+    return x, np.array(pushes)[:, None]
+
+
+def follow(model, x, u, ticks, **posterior):
+    """(r, r_std) of the learner at some ticks, as gaps [m], on x (n, 2), u (n, 1)."""
+    dt = model.dt
+    config = ResidualLearnerConfig(
+        Q_d=[0.0, 1e4], eps=1e-3, posterior=PosteriorConfig(**posterior)
+    )
+    diagram = DiagramBuilder()
+    u = np.vstack([u[:1], u[:-1]])  # That of the step that ends.
+    script = diagram.AddSystem(Script(x, u, [model], np.ones((1, 1)), dt))
+    learner = diagram.AddSystem(ResidualLearner(config, model, dt, 1e-2 * dt))
+    for port, name in (("x", "x"), ("u", "u_measured"), ("lcs", "lcs")):
+        diagram.Connect(script.GetOutputPort(port), learner.GetInputPort(name))
+    simulator = Simulator(diagram.Build())
+    context = learner.GetMyContextFromRoot(simulator.get_context())
+    found = []
+    for k in ticks:
+        simulator.AdvanceTo(dt * (k + 0.1))
+        r, std = (
+            learner.GetOutputPort(name).Eval(context) for name in ("r_comp", "r_std")
+        )
+        found.append((dt * r, dt * std))
+    return found
+
+
+@pytest.mark.parametrize("left, right", [(-8e-3, 5e-3), (6e-3, 6e-3), (0.0, -5e-3)])
+@pytest.mark.parametrize("dt", [0.005, 0.05])
+def test_each_of_two_contacts_gets_its_own_residual_and_deviation(left, right, dt):
+    model, truth = between_walls(0.03, 0.03, dt), between_walls(0.03, 0.03, dt)
+    truth = truth.with_residual(np.array([left, right]) / dt)
+    n = int(2.0 / dt)
+    x, u = visits(truth, ([3.0] * n + [-3.0] * n) * 2, noise=2e-3)
+    [(r, std)] = follow(model, x, u, [4 * n - 1])
+    # Pressed 2 s in all on each; the friction of the world is not in the model.
+    np.testing.assert_allclose(r, [left, right], atol=1e-3)
+    assert (abs(r - [left, right]) < 2.0 * std).all() and std.max() < 3e-3
+
+
+@pytest.mark.parametrize("error", [-8e-3, 8e-3])
+def test_what_was_learned_stays_where_nothing_is_touched(error):
+    """One wall is 8 mm off; the mass then floats for ten minutes 3 mm before it."""
+    model = between_walls(1.0, 0.03)
+    truth = model.with_residual(np.array([0.0, error / LEARN]))
+    x, u = visits(truth, [3.0] * 40)
+    away = np.tile([0.03 + error - 3e-3, 0.0], (12000, 1))
+    x, u = np.vstack([x, away]), np.vstack([u, np.zeros((12000, 1))])
+    first, after, last = follow(model, x, u, [39, 100, 12039], hold_sec=2.0)
+    assert abs(first[0][1] - error) < 5e-4
+    # It may walk for two seconds, in which a large residual shrinks by a few percent.
+    assert abs(after[0][1] - error) < 1e-3
+    np.testing.assert_allclose(last, after, atol=1e-5)  # A fiftieth of the grid.
+
+
+def test_before_anything_is_touched_the_prior_stays():
+    model = between_walls(1.0, 1.0)
+    n = 1200
+    found = follow(model, np.zeros((n, 2)), np.zeros((n, 1)), [2, n - 1])
+    for r, std in found:
+        np.testing.assert_allclose(r, 0.0, atol=1e-9)
+        np.testing.assert_allclose(std, 8e-3, rtol=0.05)  # It walks for 2 s at first.
+
+
+def test_a_wall_that_was_moved_is_found_again():
+    """15 mm nearer, where ten minutes of air had ruled it out; the model with what was
+    learned so far sees no contact there, as a push moves the mass by half of it."""
+    model, n = between_walls(1.0, 0.03), 12000
+    x, u = visits(model, [3.0] * 40)
+    away, still = np.tile([0.029, 0.0], (n, 1)), np.zeros((n, 1))
+    moved = model.with_residual(np.array([0.0, -15e-3 / LEARN]))
+    on_it = np.tile(simulate(moved, [0.015, 0.0], [3.0])[0], (80, 1))
+    x, u = np.vstack([x, away, on_it]), np.vstack([u, still, np.full((80, 1), 3.0)])
+    [(r, std)] = follow(model, x, u, [len(x) - 1])
+    assert abs(r[1] + 15e-3) < 1e-3 and std[1] < 2e-3
+
+
+def on_a_floor(dt=LEARN):
+    """Two masses of 1 kg on a line: the lower one on a floor, the upper one on it."""
+    J = np.array([[1.0, 0.0], [-1.0, 1.0]])
+    A = np.block([[np.eye(2), dt * np.eye(2)], [np.zeros((2, 2)), np.eye(2)]])
+    B = np.array([[0.0], [dt**2], [0.0], [dt]])
+    D = np.vstack([dt**2 * J.T, dt * J.T])
+    E = np.hstack([J / dt, J @ np.eye(2)])
+    F = dt * J @ J.T + 0.01 * dt * np.eye(2)
+    return LCS(A, B, D, np.zeros(4), E, F, dt * J[:, 1:], np.zeros(2), dt, np.zeros(2))
+
+
+def test_of_two_contacts_in_a_row_neither_takes_the_others_error():
+    """A push from above goes through both; the floor is 6 mm lower than modelled."""
+    model, gaps = on_a_floor(), np.array([6e-3, -2e-3])
+    truth = model.with_residual(gaps / LEARN)
+    x, u = [np.array([6e-3, 4e-3, 0.0, 0.0])], np.full((60, 1), -4.0)
+    x[0][:2] = 0.01  # Both in the air.
+    for _ in range(59):
+        x.append(simulate(truth, x[-1], [-4.0])[0])
+    config = ResidualLearnerConfig(
+        Q_d=[0.0, 0.0, 1e4, 1e4], eps=1e-3, posterior=PosteriorConfig()
+    )
+    learner = ResidualLearner(config, model, LEARN)
+    memory = learner.CreateDefaultContext().get_abstract_state(0).get_value()
+    for row in x:
+        memory = learner._after(memory, row.copy(), u[0], model, True)
+    r, std = LEARN * memory.residual.value, LEARN * memory.std
+    np.testing.assert_allclose(r, gaps, atol=5e-4)  # The grid's spacing.
+    assert (abs(r - gaps) < 2.0 * std).all()
+
+
 @pytest.mark.parametrize(
     "changes, message",
     [
-        (dict(groups=[]), "expected one group with a posterior"),
+        (dict(posterior=PosteriorConfig(hold_sec=np.nan)), "hold_sec is nan"),
+        (dict(posterior=PosteriorConfig(spacing=1e-5)), "spacing is 1e-05, expected"),
+        (dict(posterior=PosteriorConfig(spacing=0.5)), "spacing is 0.5, expected"),
+        (dict(posterior=PosteriorConfig(free_states=[1.5])), "free_states names 1.5"),
+        (dict(posterior=PosteriorConfig(), Q_d=[]), "Q_d is empty, expected"),
         (dict(posterior=PosteriorConfig(trust=0.0)), "posterior.trust is 0.0"),
         (dict(posterior=PosteriorConfig(drift=np.nan)), "posterior.drift is nan"),
         (dict(posterior=PosteriorConfig(growth=-1.0)), "posterior.growth is -1.0"),
@@ -306,5 +440,6 @@ def test_a_gap_that_is_too_large_has_no_gradient_but_a_likelihood():
 def test_wrong_settings_are_refused_by_name(builder, changes, message):
     lcs = builder.build(builder.x_default, np.zeros(3))
     settings = dict(groups=[[0, 1, 2, 3]], posterior=PosteriorConfig()) | changes
+    settings = dict(Q_d=[1.0] * lcs.n_x) | settings
     with pytest.raises(ValueError, match=message):
         ResidualLearner(ResidualLearnerConfig(**settings), lcs, LEARN)

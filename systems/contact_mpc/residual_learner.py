@@ -22,6 +22,7 @@ from makebreak.systems.contact_mpc.numerics.residual_learner import (
 )
 from makebreak.systems.contact_mpc.numerics.residual_posterior import (
     ResidualGrid,
+    is_felt,
     losses_on_grid,
     mode_and_std,
     residual_grid,
@@ -44,19 +45,28 @@ class LearnerStatus(IntEnum):
     BAD_LCS = 7  # lcs has other sizes or another dt: the pair was dropped.
 
 
+# Defaults that are lengths, and so velocities at the learner's time step [m].
+GAP_MAX, GAP_RATE, GAP_STD, GAP_DRIFT, GAP_SPACING = 0.05, 1.5e-4, 8e-3, 1e-3, 5e-4
+# eps times dt and gamma over dt, the paper's for forces as impulses.
+EPS_IMPULSE, GAMMA_IMPULSE = 1e-7, 0.01
+GRID_MAX = 2001  # Largest number of residuals on the grid.
+
+
 @dataclass
 class PosteriorConfig:
     """The residual's probability on a grid (numerics/residual_posterior.py)."""
 
-    # Standard deviation of the residual's prior, whose mean is zero [m/s]; 0.16 is 8 mm
-    # at dt = 0.05 s.
-    prior_std: float = 0.16
-    # Standard deviation of the residual's random walk after one second [m/s / sqrt(s)].
-    drift: float = 0.02
+    # Standard deviation of the residual's prior, whose mean is zero [m/s]; null: that
+    # of a gap of 8 mm.
+    prior_std: float | None = None
+    # Standard deviation of the residual's random walk after one second of contact [m/s
+    # / sqrt(s)]; null: that of a gap of 1 mm.
+    drift: float | None = None
     # Standard deviation that is added to the drift in proportion to the residual's own
     # size [1 / sqrt(s)].
     growth: float = 0.08
-    spacing: float = 0.01  # Spacing of the grid of residuals [m/s].
+    # Spacing of the grid of residuals [m/s]; null: that of gaps of 0.5 mm.
+    spacing: float | None = None
     # Factor on the loss of a step; below 1, as the errors of steps are correlated.
     trust: float = 0.2
     loss_max: float = 20.0  # Largest loss of a step, against outliers.
@@ -66,37 +76,40 @@ class PosteriorConfig:
     # Time over which the variance of the free states' changes is averaged, while
     # nothing can touch [s].
     free_sec: float = 2.0
+    # Time after the last contact after which the residual no longer walks [s].
+    hold_sec: float = 2.0
 
 
 @dataclass
 class ResidualLearnerConfig:
-    """Defaults: the paper's for rolling a ball at dt = .05 s, with lam in newtons."""
+    """Defaults: the paper's for rolling a ball at any time step, lam in newtons."""
 
     # Weights (n_x,) of the one-step error in each state [1/SI^2]; empty: all 1.
     Q_d: list[float] = field(default_factory=list)
-    # Weight eps of the dynamics against the contact equation [m/s N]; the paper's is
-    # 2e-6 at dt = 0.05 s.
-    eps: float = 2e-6
-    # Softness gamma of the contact equation [m/s per N]; the paper's is 5e-4 at dt =
-    # 0.05 s.
-    gamma: float = 5e-4
+    # Weight eps of the dynamics against the contact equation [m/s N]; null: the
+    # paper's, 1e-7 over the time step.
+    eps: float | None = None
+    # Softness gamma of the contact equation [m/s per N]; null: the paper's, 0.01 times
+    # the time step.
+    gamma: float | None = None
     n_b: int = 10  # Number of measured steps in the buffer.
     # Learning rate of Adam, about the change of r_comp per step [m/s] (cartpole_walls:
-    # [m]).
-    learning_rate: float = 3e-3
+    # [m]); null: 0.15 mm of the gap.
+    learning_rate: float | None = None
     n_steps: int = 1  # Number of Adam's steps per update.
     # Entries of r_comp that share one value, as lists of indices; entries in no list
     # stay zero; empty: each entry has its own value.
     groups: list[list[int]] = field(default_factory=list)
-    # Largest magnitude of an entry of r_comp [m/s] (cartpole_walls: [m]).
-    r_max: float = 1.0
+    # Largest magnitude of an entry of r_comp [m/s] (cartpole_walls: [m]); null: 50 mm
+    # of the gap.
+    r_max: float | None = None
     # Noise of the measured gap speed mu |v_t| of a sliding Anitescu contact; what
     # exceeds it is not taken for a gap [m/s]; inf: nothing is corrected, as in the
     # paper.
     slip_noise: float = np.inf
-    # Posterior of the residual, for a single group: r_comp is its mode instead of
-    # Adam's result, Q_d are inverse variances, and n_b, learning_rate and n_steps are
-    # not used; null: Adam.
+    # Posterior of each group's residual: r_comp is its mode instead of Adam's result,
+    # Q_d are inverse variances, and n_b, learning_rate and n_steps are not used; null:
+    # Adam.
     posterior: PosteriorConfig | None = None
 
 
@@ -109,8 +122,11 @@ class LearnerMemory:
     residual: Residual
     loss: float
     status: LearnerStatus
-    density: np.ndarray | None = None  # (n,) the posterior on its grid.
-    std: float = 0.0  # Of the residual [m/s]; 0 without a posterior.
+    # With a posterior: its density on the grid, (n_groups, n).
+    density: np.ndarray | None = None
+    # Standard deviation (n_groups,) of the residual [m/s]; (1,), 0 without a posterior.
+    std: np.ndarray = field(default_factory=lambda: np.zeros(1))
+    idle: np.ndarray | None = None  # (n_groups,) time since it was last felt [s].
     # Of each free state: mean square of the changes that the model lacks [SI^2].
     unexplained: np.ndarray | None = None
 
@@ -125,12 +141,14 @@ class ResidualLearner(LeafSystem):
         x (n_x,): measured state.
         u_measured (n_u,): mean of the measured input over the period that ends now.
         lcs (abstract): LCS about the measured state x of the same instant, with
-            dt = period_sec: its builder must be updated just before the learner.
+            dt = period_sec: its builder must be updated just before the learner. Of a
+            tuple (one for each knot of a plan) the first is used.
         enable (1,), optional: 0 drops the pairs that this sample belongs to.
 
     Outputs:
         r_comp (n_lam,) [m/s]: for the contact equation at dt = period_sec.
-        r_std (1,): its standard deviation [m/s]; 0 without a posterior.
+        r_std (n_groups,): standard deviation of each group's residual [m/s]; (1,), 0
+            without a posterior.
         loss (1,): mean loss per buffered pair before the last update.
         status (1,): a LearnerStatus.
 
@@ -152,7 +170,8 @@ class ResidualLearner(LeafSystem):
         Raises: ValueError for a setting out of range, or gamma above the bound of F.
         """
         super().__init__()
-        self._config = _checked(config, lcs, period_sec)
+        lcs = _first(lcs)
+        self._config = config = _checked(config, lcs, period_sec)
         self._dt, self._sizes = lcs.dt, (lcs.n_x, lcs.n_u, lcs.n_lam)
         self._Q_d = np.array(config.Q_d or np.ones(lcs.n_x), dtype=float)
         self._group = group_of_entry(config.groups, lcs.n_lam)
@@ -171,6 +190,7 @@ class ResidualLearner(LeafSystem):
         )
         c = self._config.posterior
         if c is not None:
+            assert config.r_max and c.spacing and c.prior_std and c.drift  # _checked.
             root = np.sqrt(period_sec)
             self._grid = residual_grid(
                 config.r_max, c.spacing, c.prior_std, c.drift * root, c.growth * root
@@ -178,14 +198,15 @@ class ResidualLearner(LeafSystem):
             _, std = mode_and_std(self._grid, self._grid.prior)
             memory = replace(
                 memory,
-                density=self._grid.prior,
-                std=std,
-                unexplained=np.zeros(len(c.free_states)),
+                density=_frozen(np.tile(self._grid.prior, (n_groups, 1))),
+                std=_frozen(np.full(n_groups, std)),
+                idle=_frozen(np.zeros(n_groups)),
+                unexplained=_frozen(np.zeros(len(c.free_states))),
             )
         self._memory = self.DeclareAbstractState(Value(memory))
         ticket = {self.abstract_state_ticket(self._memory)}
         self.DeclareVectorOutputPort("r_comp", lcs.n_lam, self._calc_r_comp, ticket)
-        self.DeclareVectorOutputPort("r_std", 1, self._calc_r_std, ticket)
+        self.DeclareVectorOutputPort("r_std", len(memory.std), self._calc_r_std, ticket)
         self.DeclareVectorOutputPort("loss", 1, self._calc_loss, ticket)
         self.DeclareVectorOutputPort("status", 1, self._calc_status, ticket)
         self.DeclarePeriodicUnrestrictedUpdateEvent(
@@ -199,13 +220,14 @@ class ResidualLearner(LeafSystem):
             first = measured_step(lcs, x, u, x, self._Q_d, self._config.eps)
             self._learned(memory, first)
         else:
-            self._with_posterior(memory, (x, lcs), (lcs, x, u, x))
+            first = measured_step(lcs, x, u, x, self._Q_d, self._config.eps)
+            self._with_posterior(memory, (x, lcs), first, memory.unexplained)
 
     @timed
     def _update(self, context, state):
         memory = self._memory_of(context)
         x, u = self._x.Eval(context), self._u.Eval(context)
-        lcs = self._lcs.Eval(context)
+        lcs = _first(self._lcs.Eval(context))
         enable: Any = [1.0]
         if self._enable.HasValue(context):
             enable = self._enable.Eval(context)
@@ -231,44 +253,54 @@ class ResidualLearner(LeafSystem):
         x_before, lcs_before = memory.sample
         if not self._config.gamma < gamma_bound(lcs_before.F):
             return _held(memory, sample, LearnerStatus.GAMMA_REFUSED)
-        c = self._config
+        c, Q_d, unexplained = self._config, self._Q_d, None
         pair = lcs_before, x_before, u, x
-        if self._grid is not None:
-            return self._with_posterior(memory, sample, pair)
-        step = measured_step(*pair, self._Q_d, c.eps, c.slip_noise)
-        buffer = memory.buffer.append(step, self._config.n_b)
+        if c.posterior is not None:
+            unexplained = self._unexplained(memory, lcs, *pair)
+            Q_d = Q_d.copy()
+            for i, square in zip(c.posterior.free_states, unexplained, strict=True):
+                Q_d[i] = min(Q_d[i], 1.0 / max(square, 1e-300))
+        with np.errstate(over="ignore", invalid="ignore"):  # Told by the status.
+            step = measured_step(*pair, Q_d, c.eps, c.slip_noise)
+        if not step.is_finite():
+            return _held(memory, sample, LearnerStatus.NOT_FINITE)
+        if c.posterior is not None:
+            return self._with_posterior(memory, sample, step, unexplained)
+        buffer = memory.buffer.append(step, c.n_b)
         residual, loss, status = self._learned(memory, buffer)
-        return LearnerMemory(sample, buffer, residual, loss, status)
+        return replace(
+            memory, sample=sample, buffer=buffer, residual=residual, loss=loss,
+            status=status,
+        )  # fmt: skip
 
-    def _with_posterior(self, memory, sample, pair) -> LearnerMemory:
-        """The memory after one more pair (lcs, x, u, x_next), with a posterior."""
+    def _with_posterior(self, memory, sample, step, unexplained) -> LearnerMemory:
+        """The memory after one more measured step, with a posterior."""
         c, grid = self._config, self._grid
-        assert grid is not None and c.posterior is not None
-        shared = self._group == 0
-        unexplained = self._unexplained(memory, sample[1], *pair)
-        Q_d = self._Q_d.copy()
-        for i, square in zip(c.posterior.free_states, unexplained, strict=True):
-            Q_d[i] = min(Q_d[i], 1.0 / max(square, 1e-300))
-        lcs, x, u, x_next = pair
-        step = measured_step(lcs, x, u, x_next, Q_d, c.eps, c.slip_noise)
-        loss = losses_on_grid(step, shared, grid.values, c.eps, c.gamma)
-        solved = bool(np.isfinite(loss).all())
-        density = updated(
-            grid, memory.density, loss, c.posterior.trust, c.posterior.loss_max
-        )
-        density.setflags(write=False)
-        mode, std = mode_and_std(grid, density)
-        before = float(memory.residual.value[0])
-        residual = replace(memory.residual, value=np.array([mode]))
+        assert grid is not None and c.posterior is not None and c.r_max is not None
+        before, others = memory.residual.value, spread(memory.residual, self._group)
+        modes, std, idle = before.copy(), memory.std.copy(), memory.idle + self._dt
+        density, loss_before, solved = memory.density.copy(), memory.loss, True
+        for j in range(len(before)):
+            shared = self._group == j
+            loss = losses_on_grid(step, shared, grid.values, c.eps, c.gamma, others)
+            if not np.isfinite(loss).all():
+                solved = False
+            else:
+                loss_before = float(np.interp(before[j], grid.values, loss))
+                if is_felt(grid, loss, before[j]):
+                    idle[j] = 0.0
+            density[j] = updated(
+                grid, density[j], loss, c.posterior.trust, c.posterior.loss_max,
+                idle[j] < c.posterior.hold_sec,
+            )  # fmt: skip
+            modes[j], std[j] = mode_and_std(grid, density[j])
         status = LearnerStatus.LEARNED if solved else LearnerStatus.NOT_SOLVED
-        if abs(mode) > c.r_max - c.posterior.spacing:
+        if abs(modes).max() > c.r_max - (grid.values[1] - grid.values[0]):
             status = LearnerStatus.AT_BOUND
-        loss_before = memory.loss
-        if solved:
-            loss_before = float(np.interp(before, grid.values, loss))
+        residual = replace(memory.residual, value=modes)
         return LearnerMemory(
-            sample, memory.buffer, residual, loss_before, status, density, std,
-            unexplained,
+            sample, memory.buffer, residual, loss_before, status, _frozen(density),
+            _frozen(std), _frozen(idle), unexplained,
         )  # fmt: skip
 
     def _unexplained(self, memory, lcs_next, lcs, x, u, x_next):
@@ -278,15 +310,15 @@ class ResidualLearner(LeafSystem):
         assert c is not None
         if not len(c.free_states):
             return memory.unexplained
-        least = float(memory.residual.value[0]) - 2.0 * memory.std
+        adapts = self._group >= 0
+        least = (memory.residual.value - 2.0 * memory.std)[self._group[adapts]]
         for phi in (lcs.phi, lcs_next.phi):
-            if phi is None or (phi[self._group == 0] + least * lcs.dt <= 0.0).any():
+            if phi is None or (phi[adapts] + least * lcs.dt <= 0.0).any():
                 return memory.unexplained
         change = (lcs.A @ x + lcs.B @ u + lcs.d - x_next)[c.free_states]
         share = min(lcs.dt / c.free_sec, 1.0)
         after = (1.0 - share) * memory.unexplained + share * change**2
-        after.setflags(write=False)
-        return after
+        return _frozen(after)
 
     def _learned(self, memory, buffer):
         c = self._config
@@ -320,7 +352,7 @@ class ResidualLearner(LeafSystem):
         output.SetFromVector(spread(self._memory_of(context).residual, self._group))
 
     def _calc_r_std(self, context, output):
-        output.SetFromVector([self._memory_of(context).std])
+        output.SetFromVector(self._memory_of(context).std)
 
     def _calc_loss(self, context, output):
         output.SetFromVector([self._memory_of(context).loss])
@@ -329,57 +361,130 @@ class ResidualLearner(LeafSystem):
         output.SetFromVector([float(self._memory_of(context).status)])
 
 
+def _first(lcs):
+    """The first LCS of a tuple with one for each knot; anything else as it is."""
+    return lcs[0] if isinstance(lcs, tuple) and lcs else lcs
+
+
+def _frozen(array: np.ndarray) -> np.ndarray:
+    array.setflags(write=False)
+    return array
+
+
 def _held(memory: LearnerMemory, sample, status: LearnerStatus) -> LearnerMemory:
     return replace(memory, sample=sample, status=status)
 
 
 def _checked(config: ResidualLearnerConfig, lcs: LCS, period_sec: float):
-    """A copy of the config, so that a later edit does not reach the system.
+    """A copy of the config with its defaults at this time step, so that a later edit
+    does not reach the system.
 
     Raises: ValueError that names a setting out of range.
     """
-    c = config
-    if abs(lcs.dt - period_sec) > 1e-9 * lcs.dt:
+    if not isinstance(lcs, LCS):
+        raise ValueError(f"lcs is a {type(lcs).__name__}, expected an LCS")
+    dt = lcs.dt
+    if not (_is_number(period_sec) and abs(dt - period_sec) <= 1e-9 * dt):
         raise ValueError(
-            f"period_sec is {period_sec}, expected the LCS's dt, {lcs.dt}: a pair is "
+            f"period_sec is {period_sec}, expected the LCS's dt, {dt}: a pair is "
             "one time step of the LCS"
         )
-    if c.Q_d and (len(c.Q_d) != lcs.n_x or not min(c.Q_d) >= 0.0):
-        raise ValueError(f"Q_d is {c.Q_d}, expected {lcs.n_x} weights >= 0")
+    c = _with_defaults(config, dt)
+    if c.Q_d:
+        fits = len(c.Q_d) == lcs.n_x and all(map(_is_number, c.Q_d))
+        if not (fits and min(c.Q_d) >= 0.0 and max(c.Q_d) > 0.0):
+            raise ValueError(
+                f"Q_d is {c.Q_d}, expected {lcs.n_x} weights >= 0, not all 0"
+            )
     for name in ("eps", "learning_rate", "r_max"):
         value = getattr(c, name)
-        if not (np.isfinite(value) and value > 0.0):
+        if not (_is_number(value) and value > 0.0):
             raise ValueError(f"{name} is {value}, expected a positive number")
     if not c.slip_noise >= 0.0:
         raise ValueError(f"slip_noise is {c.slip_noise}, expected 0 or more")
     for name in ("n_b", "n_steps"):
-        if not getattr(c, name) >= 1:
-            raise ValueError(f"{name} is {getattr(c, name)}, expected 1 or more")
+        value = getattr(c, name)
+        if not (_is_number(value) and value >= 1 and value == int(value)):
+            raise ValueError(f"{name} is {value}, expected an integer of 1 or more")
+        setattr(c, name, int(value))
     bound = gamma_bound(lcs.F)
-    if not 0.0 < c.gamma < bound:
+    if not bound > 0.0:
+        raise ValueError(
+            "F + F' of the LCS has the eigenvalue "
+            f"{bound:.3g}, expected a positive definite one: contacts of Anitescu's "
+            "model with eps_c > 0 (Stewart-Trinkle's has none with friction)"
+        )
+    if c.gamma is None or not (_is_number(c.gamma) and 0.0 < c.gamma < bound):
         raise ValueError(
             f"gamma is {c.gamma}, expected 0 < gamma < {bound:.6g}, the smallest "
             "eigenvalue of F + F' (eps_c in the LCS makes it positive)"
         )
-    group = group_of_entry(c.groups, lcs.n_lam)
+    group_of_entry(c.groups, lcs.n_lam)
     if c.posterior is not None:
-        if group.max() > 0:
-            raise ValueError(
-                f"groups is {c.groups}, expected one group with a posterior"
-            )
-        for i in c.posterior.free_states:
-            if not 0 <= i < lcs.n_x:
-                raise ValueError(
-                    f"posterior.free_states names {i}, expected 0..{lcs.n_x - 1}"
-                )
-        for name, value in vars(c.posterior).items():
-            if name == "free_states":
-                continue
-            least, what = np.nextafter(0.0, 1.0), "a positive number"
-            if name == "growth":
-                least, what = 0.0, "0 or more"
-            if not least <= value < np.inf:
-                raise ValueError(f"posterior.{name} is {value}, expected {what}")
-    return ResidualLearnerConfig(
-        **{**vars(c), "Q_d": list(c.Q_d), "groups": [list(g) for g in c.groups]}
+        _check_posterior(c.posterior, c, lcs.n_x)
+    return c
+
+
+def _is_number(value) -> bool:
+    return isinstance(value, (int, float, np.number)) and bool(np.isfinite(value))
+
+
+def _with_defaults(config: ResidualLearnerConfig, dt: float) -> ResidualLearnerConfig:
+    """A copy in which every number is given."""
+
+    def filled(part, **defaults):
+        return {k: v for k, v in defaults.items() if getattr(part, k) is None}
+
+    posterior = config.posterior
+    if posterior is not None:
+        posterior = replace(
+            posterior,
+            free_states=list(posterior.free_states),
+            **filled(
+                posterior,
+                prior_std=GAP_STD / dt,
+                drift=GAP_DRIFT / dt,
+                spacing=GAP_SPACING / dt,
+            ),
+        )
+    return replace(
+        config,
+        Q_d=list(config.Q_d),
+        groups=[list(g) if np.iterable(g) else g for g in config.groups],
+        posterior=posterior,
+        **filled(
+            config,
+            eps=EPS_IMPULSE / dt,
+            gamma=GAMMA_IMPULSE * dt,
+            learning_rate=GAP_RATE / dt,
+            r_max=GAP_MAX / dt,
+        ),
     )
+
+
+def _check_posterior(c: PosteriorConfig, config: ResidualLearnerConfig, n_x: int):
+    """Raises: ValueError that names a setting of the posterior out of range."""
+    for i in c.free_states:
+        if i not in range(n_x):
+            raise ValueError(f"posterior.free_states names {i}, expected 0..{n_x - 1}")
+    for name, value in vars(c).items():
+        if name == "free_states":
+            continue
+        least, what = np.nextafter(0.0, 1.0), "a positive number"
+        if name in ("growth", "hold_sec"):
+            least, what = 0.0, "0 or more"
+        finite = _is_number(value) or (name == "hold_sec" and value == np.inf)
+        if not (finite and least <= value):
+            raise ValueError(f"posterior.{name} is {value}, expected {what}")
+    assert config.r_max and c.spacing and c.prior_std  # _with_defaults.
+    least, most = 2.0 * config.r_max / (GRID_MAX - 1), min(c.prior_std, config.r_max)
+    if not least <= c.spacing <= most:
+        raise ValueError(
+            f"posterior.spacing is {c.spacing}, expected {least:.3g} (r_max over "
+            f"{GRID_MAX // 2}) to {most:.3g} (the smaller of prior_std and r_max)"
+        )
+    if not config.Q_d:
+        raise ValueError(
+            "Q_d is empty, expected the inverse variances of the states' one-step "
+            "errors: with a posterior they decide how fast it learns"
+        )

@@ -61,6 +61,9 @@ class Buffer:
     def __len__(self) -> int:
         return self.constant.size
 
+    def is_finite(self) -> bool:
+        return all(np.isfinite(getattr(self, f.name)).all() for f in fields(self))
+
     def append(self, newest: "Buffer", n_b: int) -> "Buffer":
         """This buffer and the newest steps, of which the last n_b are kept."""
         pairs = [(getattr(self, f.name), getattr(newest, f.name)) for f in fields(self)]
@@ -150,10 +153,12 @@ def group_of_entry(groups, n_lam: int) -> np.ndarray:
         return np.arange(n_lam)
     group = np.full(n_lam, -1)
     for index, entries in enumerate(groups):
-        if not len(entries):
+        if not np.iterable(entries):
+            raise ValueError(f"groups is {groups}, expected lists of entries")
+        if not list(entries):
             raise ValueError(f"groups is {groups}, expected no empty group")
         for entry in entries:
-            if not 0 <= entry < n_lam:
+            if entry not in range(n_lam):
                 raise ValueError(f"groups names entry {entry}, expected 0..{n_lam - 1}")
             if group[entry] >= 0:
                 raise ValueError(f"groups names entry {entry} twice")

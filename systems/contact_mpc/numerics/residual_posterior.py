@@ -1,4 +1,4 @@
-"""The residual of one contact as a probability, given what was measured.
+"""The residual of a contact as a probability, given what was measured.
 
 The violation-based loss l_k(r) of a measured step (residual_learner.py), with weights
 that are inverse variances, is a negative log-likelihood. Over a grid of values of r
@@ -18,6 +18,13 @@ the more it changes while the ball rolls under the tip; a right model stays righ
 l_max bounds what a single step can say, for an impact within it or a wrong reading;
 trust < 1 because the errors of successive steps are correlated.
 
+A residual changes because the object is touched at another place. So p(r) is spread
+only while the contact is felt, and for a while after it. In the air it would otherwise
+be forgotten, or move away from where the air was seen, although nothing is measured.
+
+Several contacts have a grid each, and a contact's losses are those with the others'
+residuals at their most probable values (a mean-field approximation).
+
 Source: the loss, ACI-MPC section VI; the filter is Bayes' rule on a grid (a histogram
 filter: Thrun, Burgard, Fox, "Probabilistic robotics", 4.1).
 """
@@ -28,6 +35,10 @@ import numpy as np
 from numba import njit
 
 from makebreak.systems.contact_mpc.numerics.residual_learner import Buffer, solve_step
+
+# Least probability of a value of the grid: what data ruled out for long can be believed
+# again after a few steps, as when the object was replaced.
+LEAST = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,15 +66,24 @@ def residual_grid(r_max, spacing, prior_std, drift_std, growth_std=0.0) -> Resid
     return ResidualGrid(values, transition, prior)
 
 
-def losses_on_grid(step: Buffer, shared, values, eps, gamma):
+def losses_on_grid(step: Buffer, shared, values, eps, gamma, others=0.0):
     """The loss of one measured step for each value of its residual.
 
     Args: step: a buffer of one; shared (n_lam,): which entries of the contact equation
-        have the residual; values (n,) [m/s]; eps, gamma as in residual_learner.py.
+        have the residual; values (n,) [m/s]; eps, gamma as in residual_learner.py;
+        others (n_lam,) [m/s]: the residuals of the entries that do not share this one.
     Returns: loss (n,); nan where a QP was not solved.
     """
-    data = (step.P[0], step.p[0], step.F[0], step.q[0])
+    q = step.q[0] + np.where(shared, 0.0, others)
+    data = (step.P[0], step.p[0], step.F[0], q)
     return step.constant[0] + _costs(*data, shared, values, gamma) / eps
+
+
+def is_felt(grid: ResidualGrid, loss, residual) -> bool:
+    """Whether a step with these losses (n,) has contact in the model with the residual
+    [m/s]: without contact, a larger residual has the same loss to rounding."""
+    scale = 1e-9 * (1.0 + abs(loss[-1]))
+    return bool(abs(np.interp(residual, grid.values, loss) - loss[-1]) > scale)
 
 
 @njit(cache=True)
@@ -78,12 +98,17 @@ def _costs(P, p, F, q, shared, values, gamma):
     return costs
 
 
-def updated(grid: ResidualGrid, belief, loss, trust, loss_max):
-    """The belief (n,) after a step with these losses (n,); as it was, had the residual
-    had time to change, where the losses are not finite."""
-    belief = grid.transition @ belief
+def updated(grid: ResidualGrid, belief, loss, trust, loss_max, spreads=True):
+    """The belief (n,) after a step with these losses (n,), or without them where they
+    are not finite.
+
+    Args: spreads: whether the residual may have changed since the last step.
+    """
+    if spreads:
+        belief = grid.transition @ belief
     if np.isfinite(loss).all():
         belief = belief * np.exp(-trust * np.minimum(loss - loss.min(), loss_max))
+    belief = np.maximum(belief / belief.sum(), LEAST)
     return belief / belief.sum()
 
 
