@@ -2,9 +2,10 @@
 
 from pydrake.geometry import Meshcat
 
-_OPEN = "<script>viewer.gui.closed = false;</script>"
+OPEN_CONTROLS = "viewer.gui.closed = false"  # JavaScript in a page of Meshcat.
 
 
 def page_of(meshcat: Meshcat) -> str:
     """Meshcat's page with its controls open: play, pause and the time."""
-    return meshcat.StaticHtml().replace("</body>", f"{_OPEN}</body>")
+    opened = f"<script>{OPEN_CONTROLS};</script>"
+    return meshcat.StaticHtml().replace("</body>", f"{opened}</body>")

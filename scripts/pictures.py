@@ -5,15 +5,19 @@ python -m makebreak.scripts.pictures [--out docs/pictures] [PICTURE ...]
 
 import argparse
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from time import sleep
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from makebreak.scripts.outputs import STAGE
 from makebreak.scripts.screenshot import screenshot
 from makebreak.scripts.trials import makebreak_command
 from makebreak.systems.changing_contact.numerics.velocity_profile import (
@@ -25,12 +29,14 @@ DOCS = Path(__file__).resolve().parent.parent / "docs" / "pictures"
 
 @dataclass(frozen=True)
 class Picture:
-    """The source of a picture: a page at a time of its own clock, or a plot."""
+    """The source of a picture: a page at a time of its own clock, a plot, or, with
+    live_sec, the Meshcat of a run that has simulated so many seconds."""
 
     command: str
-    file: str
+    file: str = ""
     wait_ms: int = 15000
     size: tuple[int, int] = (1280, 800)
+    live_sec: float = 0.0
 
 
 def _figure(experiment: str, plot: str) -> Picture:
@@ -40,6 +46,7 @@ def _figure(experiment: str, plot: str) -> Picture:
 _LOOP = "close-the-loop --seed 2"
 PICTURES = {
     "ball_rolling.png": Picture("run ball_rolling --duration 24", "meshcat.html"),
+    "meshcat_live.png": Picture("run ball_rolling --seed 2", live_sec=14.0),
     "multiple_collisions.png": Picture("run multiple_collisions", "meshcat.html"),
     "push_object.png": Picture(
         "run push_object --seed 3 --set pose_from=camera model.friction=0.25 n_goals=3",
@@ -104,6 +111,11 @@ def make_pictures(names: list[str], out: Path, work: Path) -> None:
         folder = work / str(k)
         words = [word.replace("OUT", str(folder)) for word in command.split()]
         print(f"makebreak {command}", flush=True)
+        pictures = [name for name in names if PICTURES[name].command == command]
+        if PICTURES[pictures[0]].live_sec:
+            _photograph(PICTURES[pictures[0]], folder, out / pictures[0])
+            print(f"    {out / pictures[0]}", flush=True)
+            continue
         done = subprocess.run(
             [*makebreak_command(*words), "--out", str(folder)],
             capture_output=True,
@@ -113,10 +125,8 @@ def make_pictures(names: list[str], out: Path, work: Path) -> None:
         if done.returncode not in (0, 1):
             lines = done.stderr.strip().splitlines() or ["no output"]
             raise RuntimeError(f"{command}: {lines[-1]}")
-        for name in names:
+        for name in pictures:
             picture = PICTURES[name]
-            if picture.command != command:
-                continue
             made = folder / picture.file
             if not made.is_file():
                 raise RuntimeError(f"{command}: it made no {picture.file}")
@@ -125,6 +135,35 @@ def make_pictures(names: list[str], out: Path, work: Path) -> None:
             else:
                 shutil.copy(made, out / name)
             print(f"    {out / name}", flush=True)
+
+
+def _photograph(picture: Picture, folder: Path, to: Path) -> None:
+    """Takes the picture of a run's Meshcat, and then ends the run.
+
+    Raises: RuntimeError if the run ends before.
+    """
+    words = makebreak_command(*picture.command.split(), "--out", str(folder))
+    run = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+    try:
+        assert run.stdout is not None
+        lines = (line for line in run.stdout if line.startswith("Meshcat: "))
+        address = next(lines, "").removeprefix("Meshcat: ").strip()
+        while _last_time(folder / STAGE / "recording.csv") < picture.live_sec:
+            if not address or run.poll() is not None:
+                raise RuntimeError(f"{picture.command}: it ended before the picture")
+            sleep(0.2)
+        screenshot(address, to, picture.size, picture.wait_ms)
+    finally:
+        run.send_signal(signal.SIGINT)
+        run.communicate()
+
+
+def _last_time(recording: Path) -> float:
+    """The time of the last whole row of a recording that grows [s]."""
+    lines = recording.read_text().splitlines() if recording.is_file() else []
+    with suppress(IndexError, ValueError):
+        return float(lines[-2].split(",")[0])
+    return 0.0
 
 
 def main() -> int:

@@ -1,6 +1,7 @@
-"""Takes a screenshot of a meshcat.html without a display; needs Debian's chromium.
+"""Takes a screenshot of a Meshcat page without a display; needs Debian's chromium.
 
 python -m makebreak.scripts.screenshot runs/<run>/meshcat.html picture.png
+python -m makebreak.scripts.screenshot http://localhost:7000 picture.png
 """
 
 import argparse
@@ -9,65 +10,67 @@ import subprocess
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from time import sleep
+
+from makebreak.scripts.browser import Browser, browser_command
+from makebreak.scripts.meshcat_page import OPEN_CONTROLS
 
 LIMIT_SEC = 300
-_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
 def screenshot(page: Path | str, picture: Path, size=(1280, 800), wait_ms: int = 15000):
     """Renders `page` in a headless browser and writes `picture`.
 
     Args:
-        page: an HTML file, or an address such as that of a running Meshcat.
+        page: an HTML file, or the address of a running Meshcat, whose controls are
+            opened.
         picture: the PNG to write.
         size: width and height [pixels].
-        wait_ms: time at which it is taken, on the page's own clock [ms].
+        wait_ms: time at which it is taken: of a file on the page's own clock, of a
+            running Meshcat in real time after it was opened [ms].
     Raises: ValueError without page or browser; RuntimeError if the browser writes no
         picture.
     """
-    address = str(page)
-    if not address.startswith("http://"):
-        if not Path(page).is_file():
-            raise ValueError(f'page: got "{page}", expected an HTML file')
-        address = Path(page).resolve().as_uri()
-    browser = next(filter(None, map(shutil.which, _BROWSERS)), None)
-    if browser is None:
-        raise ValueError("no browser found, expected one of: " + ", ".join(_BROWSERS))
+    if str(page).startswith("http://"):
+        _of_running(str(page), picture, size, wait_ms)
+        return
+    if not Path(page).is_file():
+        raise ValueError(f'page: got "{page}", expected an HTML file')
     with TemporaryDirectory() as folder:
-        profile, taken = Path(folder) / "profile", Path(folder) / "page.png"
-        options = [
-            "--headless=new",
-            "--no-sandbox",
-            "--use-angle=swiftshader",
-            "--enable-unsafe-swiftshader",
-            "--ignore-gpu-blocklist",
-            "--disable-quic",
-            "--hide-scrollbars",
-            "--no-first-run",
-            "--disable-background-networking",
-            "--disable-component-update",
-            "--disable-sync",
-            f"--user-data-dir={profile}",
-            f"--window-size={size[0]},{size[1]}",
+        taken = Path(folder) / "page.png"
+        # The page's own clock waits while meshes and textures are loaded. It would not
+        # wait for a socket.
+        command = [
+            *browser_command(Path(folder), size),
             f"--virtual-time-budget={wait_ms}",
             f"--screenshot={taken}",
-            address,
+            Path(page).resolve().as_uri(),
         ]
         try:
             done = subprocess.run(
-                [browser, *options], capture_output=True, text=True, timeout=LIMIT_SEC
+                command, capture_output=True, text=True, timeout=LIMIT_SEC
             )
         except subprocess.TimeoutExpired as error:
-            raise RuntimeError(f"{browser} took more than {LIMIT_SEC} s") from error
+            raise RuntimeError(f"{command[0]} took more than {LIMIT_SEC} s") from error
         if not taken.is_file():
             lines = done.stderr.strip().splitlines() or ["no output"]
-            raise RuntimeError(f"{browser} wrote no picture: {lines[-1]}")
+            raise RuntimeError(f"{command[0]} wrote no picture: {lines[-1]}")
         shutil.move(taken, picture)
+
+
+def _of_running(address: str, picture: Path, size, wait_ms: int) -> None:
+    """As `screenshot`, of a running Meshcat: in real time, since its scene comes
+    through a socket."""
+    with Browser(size, LIMIT_SEC) as browser:
+        browser.open(address)
+        browser.run(OPEN_CONTROLS)
+        sleep(1e-3 * wait_ms)
+        Path(picture).write_bytes(browser.screenshot())
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(
-        description="A picture of a meshcat.html, taken without a screen."
+        description="An image of a meshcat.html or a running Meshcat, without a screen."
     )
     parser.add_argument("page", help="an HTML file, or http://...")
     parser.add_argument("picture", type=Path)

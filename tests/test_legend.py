@@ -1,5 +1,8 @@
 """The legend in Meshcat, and tracks that grow."""
 
+import base64
+import json
+
 import cv2
 import numpy as np
 import pytest
@@ -102,18 +105,31 @@ def test_a_board_has_the_words_and_the_colour_and_is_read_from_left_to_right():
     upper, lower = np.where(dark[:LINE].any(axis=0))[0], np.where(dark[LINE:])[1]
     assert upper.min() >= LINE and upper.max() < picture.shape[1]
     assert len(lower) and lower.max() < LINE  # A short word, without a square.
-    # The picture's left is at y = 0 and its top at z = 0; it faces x.
-    lines = board.obj.decode().split("\n")
-    corner = [[float(x) for x in w.split()[1:]] for w in lines if w.startswith("v ")]
-    texture = [[float(x) for x in w.split()[1:]] for w in lines if w.startswith("vt ")]
-    for (_, y, z), (u, v) in zip(corner, texture, strict=True):
-        assert (u, v) == (y / board.width, 1.0 + z / board.height)
-    for line in lines:
-        if line.startswith("f "):
-            a, b, c = (
-                np.array(corner[int(w.split("/")[0]) - 1]) for w in line.split()[1:]
-            )
-            assert np.cross(b - a, c - a)[0] > 0.0
+    # The picture's left is at y = 0 and its top at z = 0; it faces x. In glTF Drake's y
+    # is -z, and its z is y.
+    file = json.loads(board.gltf)
+
+    def content(uri):
+        return base64.b64decode(uri.split(",")[1])
+
+    assert content(file["images"][0]["uri"]) == board.png
+    data, arrays = content(file["buffers"][0]["uri"]), []
+    kinds = {5126: ("<f4", 4), 5123: ("<u2", 2)}
+    views = file["bufferViews"]
+    for k, accessor in enumerate(file["accessors"]):
+        view = views[accessor["bufferView"]]
+        kind, size = kinds[accessor["componentType"]]
+        assert view["byteOffset"] == sum(v["byteLength"] for v in views[:k])
+        assert view["byteLength"] % (size * accessor["count"]) == 0
+        part = data[view["byteOffset"] :][: view["byteLength"]]
+        arrays.append(np.frombuffer(part, kind).reshape(accessor["count"], -1))
+    position, texture, index = arrays
+    corner = np.column_stack([position[:, 0], -position[:, 2], position[:, 1]])
+    uv = np.column_stack([corner[:, 1] / board.width, -corner[:, 2] / board.height])
+    np.testing.assert_allclose(texture, uv, atol=1e-6)  # Single precision.
+    assert sorted(uv.round(6).tolist()) == [[0, 0], [0, 1], [1, 0], [1, 1]]
+    for a, b, c in corner[index.ravel()].reshape(-1, 3, 3):
+        assert np.cross(b - a, c - a)[0] > 0.0
 
 
 class Scene(Page):
@@ -158,7 +174,8 @@ def test_a_legend_is_in_the_upper_left_of_what_the_camera_sees_and_faces_it():
         assert 0.0 < y < np.tan(np.radians(37.5))
     below = scene.poses[f"{ROOT}/lines"].translation()
     below = below - scene.poses[f"{ROOT}/phase/0"].translation()
-    assert below @ up > 2 * 0.04  # Below both lines.
+    height = scene.objects[f"{ROOT}/lines"].scale3()[2]
+    assert below @ up > 2 * height  # Below both lines.
 
 
 def test_a_camera_that_looks_straight_down_sees_the_legend_too():
@@ -168,7 +185,8 @@ def test_a_camera_that_looks_straight_down_sees_the_legend_too():
     X = scene.poses[f"{ROOT}/lines"]
     np.testing.assert_allclose(X.rotation().matrix()[:, 0], [0.0, 0.0, 1.0])
     x, y, z = X.translation()
-    assert z == 1.0 and -0.767 < x < 0.0 < y < 0.767  # Meshcat has x right, y up.
+    x, y = x / (2.0 - z), y / (2.0 - z)
+    assert z < 2.0 and -0.767 < x < 0.0 < y < 0.767  # Meshcat has x right, y up.
     np.testing.assert_allclose(X.rotation().matrix()[:, 1], [1.0, 0.0, 0.0])
 
 

@@ -1,13 +1,21 @@
 """The command that makes the documents' pictures."""
 
 import re
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from makebreak.scripts import pictures
-from makebreak.scripts.pictures import DOCS, PICTURES, PLOTS, make_pictures
+from makebreak.scripts.outputs import STAGE
+from makebreak.scripts.pictures import (
+    DOCS,
+    PICTURES,
+    PLOTS,
+    _last_time,
+    make_pictures,
+)
 
 
 def test_every_picture_of_the_documents_is_there_and_made_by_the_command():
@@ -46,6 +54,50 @@ def test_one_run_gives_all_its_pictures_and_a_failed_one_is_told(tmp_path, monke
         make_pictures(["cube_pivoting.png"], out, tmp_path / "v")
     with pytest.raises(RuntimeError, match="run porridge .*: it made no prediction"):
         make_pictures(["contact_figure_4.png"], out, tmp_path / "w")
+
+
+def test_a_live_picture_waits_for_the_simulated_time_and_ends_the_run(
+    tmp_path, monkeypatch
+):
+    """The stand-in records a simulated second in 20 ms."""
+    stand_in = tmp_path / "run.py"
+    stand_in.write_text(
+        "import pathlib, sys, time\n"
+        f"folder = pathlib.Path(sys.argv[-1]) / '{STAGE}'\n"
+        "folder.mkdir(parents=True)\n"
+        "print('Meshcat: http://localhost:7000', flush=True)\n"
+        "with (folder / 'recording.csv').open('w', buffering=1) as file:\n"
+        "    file.write('time,x\\n')\n"
+        "    try:\n"
+        "        for t in range(10**6):\n"
+        "            file.write(f'{t},1.0\\n')\n"
+        "            time.sleep(0.02)\n"
+        "    except KeyboardInterrupt:\n"
+        "        (folder / 'ended').touch()\n"
+    )
+    monkeypatch.setattr(
+        pictures, "makebreak_command", lambda *words: [sys.executable, stand_in, *words]
+    )
+    seen = []
+    stage = tmp_path / "work" / "0" / STAGE
+
+    def screenshot(page, picture, size, wait_ms):
+        seen.append((page, _last_time(stage / "recording.csv")))
+
+    monkeypatch.setattr(pictures, "screenshot", screenshot)
+    make_pictures(["meshcat_live.png"], tmp_path / "out", tmp_path / "work")
+    ((page, time),) = seen
+    assert page == "http://localhost:7000"
+    assert PICTURES["meshcat_live.png"].live_sec <= time < 1000
+    assert (stage / "ended").is_file()
+
+
+def test_a_live_picture_of_a_run_that_ends_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        pictures, "makebreak_command", lambda *_: [sys.executable, "-c", "print(1)"]
+    )
+    with pytest.raises(RuntimeError, match="it ended before the picture"):
+        make_pictures(["meshcat_live.png"], tmp_path / "out", tmp_path / "work")
 
 
 def test_an_unknown_picture_is_refused(monkeypatch, capsys):

@@ -9,9 +9,12 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 from makebreak.systems.contact_mpc.numerics.ball_state import pack
-from makebreak.systems.views.rolling_view import RollingView, RollingViewConfig
+from makebreak.systems.views.rolling_view import (
+    GAP_SLIDER,
+    RollingView,
+    RollingViewConfig,
+)
 
-SLIDER = "learned gap [mm]"
 BALL = np.array([0.6, 0.1, 0.0315])
 
 
@@ -38,17 +41,17 @@ def test_path_ghost_and_bar_are_there_at_once_and_the_track_after_it_moved(meshc
     for name in ("path", "model_ball", "r_comp"):
         assert meshcat.HasPath(f"/makebreak/{name}"), name
     assert not meshcat.HasPath("/makebreak/track")
-    meshcat.DeleteSlider(SLIDER)
+    meshcat.DeleteSlider(GAP_SLIDER)
     show(meshcat, 0.01)
     assert meshcat.HasPath("/makebreak/track")
-    meshcat.DeleteSlider(SLIDER)
+    meshcat.DeleteSlider(GAP_SLIDER)
 
 
 @pytest.mark.parametrize("gap, mm", [(0.0073, 7.3), (-0.004, -4.0), (np.nan, 0.0)])
 def test_slider_shows_the_gap_in_millimetres_and_a_nan_breaks_nothing(meshcat, gap, mm):
     show(meshcat, gap)
-    assert meshcat.GetSliderValue(SLIDER) == pytest.approx(mm)
-    meshcat.DeleteSlider(SLIDER)
+    assert meshcat.GetSliderValue(GAP_SLIDER) == pytest.approx(mm)
+    meshcat.DeleteSlider(GAP_SLIDER)
 
 
 @pytest.mark.parametrize("gap", [0.01, 0.005, 0.0002])

@@ -39,7 +39,7 @@ _MODE_COLORS = (
     Rgba(0.75, 0.3, 0.8),
     Rgba(0.9, 0.85, 0.1),
 )
-FORCE_SLIDER, SPEED_SLIDER = "contact force [N]", "target speed [mm/s]"
+FORCE_SLIDER, SPEED_SLIDER = "force [N]", "speed [mm/s]"  # Longer ones are cut off.
 
 
 @dataclass
@@ -50,7 +50,7 @@ class ContactViewConfig:
     peaks: list[list[float]] = field(default_factory=list)
     peak_limit: float = 8.5  # Bars above it are red [N].
     bars_at: list[float] = field(default_factory=lambda: [0.25, -0.42])  # [m]
-    camera: list[float] = field(default_factory=lambda: [1.0, -0.6, 0.5])  # [m]
+    camera: list[float] = field(default_factory=lambda: [1.1, -0.72, 0.6])  # [m]
     period_sec: float = 1.0 / 15.0
 
 
@@ -67,7 +67,7 @@ class ContactView(LeafSystem):
     Args: plan: positions (n, 3) of each piece of the planned path [m].
     """
 
-    LOOK_AT = (0.48, 0.0, 0.05)  # [m]
+    LOOK_AT = (0.42, 0.0, 0.14)  # [m]
     LEGEND = (
         ("an impact is expected", _KIND_COLORS[IMPACT]),
         ("a change of contact is expected", _KIND_COLORS[IMPACTLESS]),

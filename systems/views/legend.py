@@ -13,8 +13,10 @@ from makebreak.systems.views.numerics.text_board import text_board
 
 ROOT = "/makebreak/legend"
 # Position of the board's upper left corner in the camera's frame (right, up, away), and
-# a line's height [m]. Meshcat's field of view is 37 degrees up and down.
-_CORNER, _LINE = np.array([-0.75, 0.62, 1.0]), 0.04
+# a line's height [m]; in front of the robot, which may come within 1 m of the camera.
+# Meshcat's field of view is 37 degrees up and down.
+_AWAY = 0.5
+_CORNER, _LINE = _AWAY * np.array([-0.75, 0.62, 1.0]), _AWAY * 0.04
 
 
 @dataclass
@@ -52,13 +54,7 @@ class Legend(LeafSystem):
         if not lines:
             return
         board = text_board(lines)
-        files = {
-            "board.mtl": MemoryFile(board.mtl, ".mtl", "board.mtl"),
-            "board.png": MemoryFile(board.png, ".png", "board.png"),
-        }
-        mesh = InMemoryMesh(
-            mesh_file=MemoryFile(board.obj, ".obj", "board.obj"), supporting_files=files
-        )
+        mesh = InMemoryMesh(mesh_file=MemoryFile(board.gltf, ".gltf", "board.gltf"))
         self._meshcat.SetObject(path, Mesh(mesh, _LINE), Rgba(1.0, 1.0, 1.0))
         camera = np.array(self._config.camera, dtype=float)
         away = np.array(self._config.look_at) - camera

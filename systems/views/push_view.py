@@ -14,7 +14,7 @@ from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL, Q_BAL
 from makebreak.systems.views.numerics.trail import Trail
 
 _GOAL, _MODEL = Rgba(0.1, 0.7, 0.2, 0.35), Rgba(0.3, 0.5, 1.0, 0.25)
-_TRACK = Rgba(1.0, 0.5, 0.0)
+_TRACK = Rgba(0.65, 0.25, 0.75)
 
 
 @dataclass

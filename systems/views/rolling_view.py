@@ -11,6 +11,7 @@ from pydrake.systems.framework import LeafSystem
 from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL
 from makebreak.systems.views.numerics.trail import Trail
 
+GAP_SLIDER = "learned [mm]"  # A longer name would be cut off.
 _PATH, _TRACK = Rgba(0.1, 0.1, 0.2), Rgba(1.0, 0.5, 0.0)
 _MODEL, _RESIDUAL = Rgba(0.3, 0.5, 1.0, 0.25), Rgba(0.2, 0.45, 1.0)
 
@@ -64,7 +65,7 @@ class RollingView(LeafSystem):
         meshcat.SetObject(self.BAR, Box(0.012, 0.012, 1.0), _RESIDUAL)
         self._trail = Trail(meshcat, "/makebreak/track", _TRACK)
         self._show_gap(0.0, 0.0)
-        meshcat.AddSlider("learned gap [mm]", -20.0, 40.0, 0.1, 0.0)
+        meshcat.AddSlider(GAP_SLIDER, -20.0, 40.0, 0.1, 0.0)
         self.DeclarePeriodicPublishEvent(config.period_sec, 0.0, self._publish)
         self.DeclarePeriodicUnrestrictedUpdateEvent(0.1, 0.0, self._remember)
 
@@ -91,6 +92,6 @@ class RollingView(LeafSystem):
         meshcat.SetTransform("/makebreak/model_ball", ghost, t)
         self._show_gap(gap, t)
         if np.isfinite(gap):
-            meshcat.SetSliderValue("learned gap [mm]", 1e3 * gap)
+            meshcat.SetSliderValue(GAP_SLIDER, 1e3 * gap)
         track = context.get_abstract_state(int(self._track)).get_value()
         self._trail.show(track, t)
