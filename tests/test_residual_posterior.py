@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from test_residual_learner import PUSH, Script, point_mass
@@ -16,6 +18,7 @@ from makebreak.diagrams.ball_rolling_config import (
 )
 from makebreak.models.tip_and_ball import TipAndBall, make_tip_and_ball
 from makebreak.systems.contact_mpc.lcs_builder import (
+    AnitescuLcs,
     AnitescuLcsBuilder,
     ContactPair,
     LcsBuilderConfig,
@@ -421,10 +424,112 @@ def test_of_two_contacts_in_a_row_neither_takes_the_others_error():
     assert (abs(r - gaps) < 2.0 * std).all()
 
 
+def finger_and_puck(damping, dt=LEARN):
+    """Two masses of 1 kg on a line, [N s/m] at the one that is pushed through the
+    other, with a contact between them."""
+    J = np.array([[-1.0, 1.0]])
+    V = np.eye(2) - dt * np.diag([0.0, damping])
+    A = np.block([[np.eye(2), dt * V], [np.zeros((2, 2)), V]])
+    B = np.array([[dt**2], [0.0], [dt], [0.0]])
+    D = np.vstack([dt**2 * J.T, dt * J.T])
+    E = np.hstack([J / dt, J @ V])
+    F = dt * J @ J.T + [[0.01 * dt]]
+    return LCS(A, B, D, np.zeros(4), E, F, J @ B[2:], np.zeros(1), dt, np.zeros(1))
+
+
+@pytest.mark.parametrize("drag", [6.0, 10.0])
+@pytest.mark.parametrize("error", [-5e-3, 0.0, 5e-3])
+def test_the_deviation_covers_what_an_unmodelled_drag_does_to_the_residual(error, drag):
+    """In the model it is 3 N s/m; a part of the missing force is taken for a gap."""
+    model = finger_and_puck(3.0)
+    world = finger_and_puck(drag).with_residual([error / LEARN])
+
+    def covered(**posterior):
+        config = ResidualLearnerConfig(
+            Q_d=[0.0, 0.0, 1e4, 4e4], eps=1e-3, posterior=PosteriorConfig(**posterior)
+        )
+        learner = ResidualLearner(config, model, LEARN)
+        memory = learner.CreateDefaultContext().get_abstract_state(0).get_value()
+        rng, x, within = np.random.default_rng(0), np.array([-0.01, 0, 0, 0]), []
+        u = np.zeros(1)
+        for _ in range(200):
+            seen = x + [0, 0, *(2e-3 * rng.normal(size=2))]
+            memory = learner._after(memory, seen, u, model, True)
+            r, std = LEARN * memory.residual.value[0], LEARN * memory.std[0]
+            within.append(abs(r - error) < 1.645 * std)
+            u = np.array([4.0])
+            x, _ = simulate(world, x, u)
+        return np.mean(within)
+
+    assert covered() >= 0.9 > 0.5 > covered(misfit_sec=np.inf)
+
+
+def fingers_and_box(left, right):
+    """SDF of two fingers of radius 2 cm at either side of a box, all on one rail, the
+    box's faces at -left and right of its origin [m]."""
+    sphere = "<sphere><radius>0.02</radius></sphere>"
+    box = f"<box><size>{left + right} 0.1 0.1</size></box>"
+    text = "<sdf version='1.7'><model name='m'>"
+    for name, x, y, shape, limit in (
+        ("a", -0.15, 0.0, sphere, ""),
+        ("b", 0.15, 0.0, sphere, ""),
+        ("o", 0.0, (right - left) / 2, box, "<limit><effort>0</effort></limit>"),
+    ):
+        text += (
+            f"<link name='{name}'><pose>{x} 0 0 0 0 0</pose><inertial><mass>1</mass>"
+            f"</inertial><collision name='{name}'><pose>{y} 0 0 0 0 0</pose>"
+            f"<geometry>{shape}</geometry></collision></link>"
+            f"<joint name='rail_{name}' type='prismatic'><parent>world</parent>"
+            f"<child>{name}</child><axis><xyz>1 0 0</xyz><dynamics><damping>5"
+            f"</damping></dynamics>{limit}</axis></joint>"
+        )
+    return text + "</model></sdf>"
+
+
+@pytest.mark.parametrize("left, right", [(6e-3, 6e-3), (-6e-3, -6e-3), (6e-3, -6e-3)])
+def test_two_fingers_find_both_faces_of_a_box_of_another_width(left, right):
+    """The world is a MultibodyPlant; the fingers move the box to and fro."""
+    plants = []
+    for text, step in (
+        (fingers_and_box(0.05, 0.05), 0.0),
+        (fingers_and_box(0.05 - left, 0.05 - right), 1e-3),
+    ):
+        diagram = DiagramBuilder()
+        plant, _ = AddMultibodyPlantSceneGraph(diagram, step)
+        Parser(plant).AddModelsFromString(text, "sdf")
+        plant.Finalize()
+        plants.append((diagram.Build(), plant))
+    pairs = [ContactPair("m::a", "m::o", 0.3), ContactPair("m::b", "m::o", 0.3)]
+    model, (world, plant) = AnitescuLcs(plants[0][0], pairs, LEARN), plants[1]
+    config = ResidualLearnerConfig(
+        Q_d=[0.0] * 3 + [1e4] * 3,
+        eps=1e-3,
+        groups=[[0, 1, 2, 3], [4, 5, 6, 7]],
+        posterior=PosteriorConfig(),
+    )
+    learner = ResidualLearner(config, model.at_default(), LEARN)
+    memory = learner.CreateDefaultContext().get_abstract_state(0).get_value()
+    simulator, u = Simulator(world), np.zeros(2)
+    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    errors, stds = [], []
+    for k in range(120):
+        x = plant.GetPositionsAndVelocities(context)
+        memory = learner._after(memory, x.copy(), u, model.build(x, u), True)
+        errors.append(LEARN * memory.residual.value - [left, right])
+        stds.append(LEARN * memory.std)
+        u = 3.0 * np.sin(2.0 * np.pi * k * LEARN / 3.0) + np.array([3.0, -3.0])
+        plant.get_actuation_input_port().FixValue(context, u)
+        simulator.AdvanceTo((k + 1) * LEARN)
+    errors, stds = np.abs(errors), np.array(stds)
+    assert errors[60:].max() < 1e-3  # The world's contact gives way by less.
+    assert np.mean(errors < 1.645 * stds) >= 0.9
+
+
 @pytest.mark.parametrize(
     "changes, message",
     [
         (dict(posterior=PosteriorConfig(hold_sec=np.nan)), "hold_sec is nan"),
+        (dict(posterior=PosteriorConfig(misfit_sec=0.0)), "misfit_sec is 0.0"),
         (dict(posterior=PosteriorConfig(spacing=1e-5)), "spacing is 1e-05, expected"),
         (dict(posterior=PosteriorConfig(spacing=0.5)), "spacing is 0.5, expected"),
         (dict(posterior=PosteriorConfig(free_states=[1.5])), "free_states names 1.5"),

@@ -78,6 +78,11 @@ class PosteriorConfig:
     free_sec: float = 2.0
     # Time after the last contact after which the residual no longer walks [s].
     hold_sec: float = 2.0
+    # Time over which the loss that no residual explains is averaged, while a contact is
+    # felt [s]. Where it is s times what noise with these Q_d would leave, the model is
+    # wrong elsewhere (a mass, a friction) and stays so: trust is divided by s^2. inf:
+    # trust is fixed.
+    misfit_sec: float = 1.0
 
 
 @dataclass
@@ -129,6 +134,7 @@ class LearnerMemory:
     idle: np.ndarray | None = None  # (n_groups,) time since it was last felt [s].
     # Of each free state: mean square of the changes that the model lacks [SI^2].
     unexplained: np.ndarray | None = None
+    misfit: float = 0.0  # Mean of the smallest loss of each step with contact.
 
     def __deepcopy__(self, memo):
         return self  # Every part is immutable, so a Context may share it.
@@ -278,29 +284,37 @@ class ResidualLearner(LeafSystem):
         c, grid = self._config, self._grid
         assert grid is not None and c.posterior is not None and c.r_max is not None
         before, others = memory.residual.value, spread(memory.residual, self._group)
-        modes, std, idle = before.copy(), memory.std.copy(), memory.idle + self._dt
-        density, loss_before, solved = memory.density.copy(), memory.loss, True
+        idle, loss_before = memory.idle + self._dt, memory.loss
+        losses, solved = [], []
         for j in range(len(before)):
             shared = self._group == j
             loss = losses_on_grid(step, shared, grid.values, c.eps, c.gamma, others)
-            if not np.isfinite(loss).all():
-                solved = False
-            else:
+            losses.append(loss)
+            solved.append(np.isfinite(loss).all())
+            if solved[j]:
                 loss_before = float(np.interp(before[j], grid.values, loss))
                 if is_felt(grid, loss, before[j]):
                     idle[j] = 0.0
+        misfit, trust = memory.misfit, c.posterior.trust
+        if all(solved) and (idle == 0.0).any():
+            least = min(min(loss.min() for loss in losses), c.posterior.loss_max)
+            misfit += min(self._dt / c.posterior.misfit_sec, 1.0) * (least - misfit)
+        # Once for the larger errors, and once because they repeat at each step.
+        trust /= max(1.0, misfit / (0.5 * np.count_nonzero(self._Q_d))) ** 2
+        modes, std, density = before.copy(), memory.std.copy(), memory.density.copy()
+        for j, loss in enumerate(losses):
             density[j] = updated(
-                grid, density[j], loss, c.posterior.trust, c.posterior.loss_max,
+                grid, density[j], loss, trust, c.posterior.loss_max,
                 idle[j] < c.posterior.hold_sec,
             )  # fmt: skip
             modes[j], std[j] = mode_and_std(grid, density[j])
-        status = LearnerStatus.LEARNED if solved else LearnerStatus.NOT_SOLVED
+        status = LearnerStatus.LEARNED if all(solved) else LearnerStatus.NOT_SOLVED
         if abs(modes).max() > c.r_max - (grid.values[1] - grid.values[0]):
             status = LearnerStatus.AT_BOUND
         residual = replace(memory.residual, value=modes)
         return LearnerMemory(
             sample, memory.buffer, residual, loss_before, status, _frozen(density),
-            _frozen(std), _frozen(idle), unexplained,
+            _frozen(std), _frozen(idle), unexplained, misfit,
         )  # fmt: skip
 
     def _unexplained(self, memory, lcs_next, lcs, x, u, x_next):
@@ -467,13 +481,14 @@ def _check_posterior(c: PosteriorConfig, config: ResidualLearnerConfig, n_x: int
     for i in c.free_states:
         if i not in range(n_x):
             raise ValueError(f"posterior.free_states names {i}, expected 0..{n_x - 1}")
+    endless = ("hold_sec", "misfit_sec")
     for name, value in vars(c).items():
         if name == "free_states":
             continue
         least, what = np.nextafter(0.0, 1.0), "a positive number"
         if name in ("growth", "hold_sec"):
             least, what = 0.0, "0 or more"
-        finite = _is_number(value) or (name == "hold_sec" and value == np.inf)
+        finite = _is_number(value) or (name in endless and value == np.inf)
         if not (finite and least <= value):
             raise ValueError(f"posterior.{name} is {value}, expected {what}")
     assert config.r_max and c.spacing and c.prior_std  # _with_defaults.
