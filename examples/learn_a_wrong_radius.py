@@ -6,11 +6,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from makebreak import AnitescuLcsBuilder, ContactPair, LcsBuilderConfig, model_path
-from makebreak import ResidualLearner as Learner
-from makebreak import ResidualLearnerConfig as LearnerConfig
+import makebreak as mb
 
-text = open(model_path("puck.sdf")).read()
+text = open(mb.model_path("puck.sdf")).read()
 puck = text.rindex("<link name")  # Its radius alone.
 smaller = text[:puck] + text[puck:].replace("0.05", "0.042")
 builders = []
@@ -19,12 +17,13 @@ for time_step, sdf in ((0.0, text), (0.001, smaller)):  # The model, and the wor
     plant, _ = AddMultibodyPlantSceneGraph(builder, time_step)
     Parser(plant).AddModelsFromString(sdf, "sdf")
     plant.Finalize()
-pairs = [ContactPair("finger", "puck", 0.3)]
-config = LcsBuilderConfig(pairs, dt_sec=0.05, period_sec=0.05)
-lcs = builder.AddSystem(AnitescuLcsBuilder(builders[0].Build(), config))
+pairs = [mb.ContactPair("finger", "puck", 0.3)]
+config = mb.LcsBuilderConfig(pairs, dt_sec=0.05, period_sec=0.05)
+lcs = builder.AddSystem(mb.AnitescuLcsBuilder(builders[0].Build(), config))
 lcs_0 = lcs.model.build(lcs.model.x_default, [0.0])
-config = LearnerConfig(n_steps=5, groups=[[0, 1, 2, 3]])
-learner = builder.AddSystem(Learner(config, lcs_0, 0.05, offset_sec=1e-3))
+config = mb.ResidualLearnerConfig(Q_d=[0, 0, 1e4, 1e4], eps=1e-3, groups=[[0, 1, 2, 3]])
+config.posterior = mb.PosteriorConfig()  # Q_d: velocities are predicted to 1 cm/s.
+learner = builder.AddSystem(mb.ResidualLearner(config, lcs_0, 0.05, offset_sec=1e-3))
 push = builder.AddSystem(ConstantVectorSource([3.0])).get_output_port()
 builder.Connect(push, plant.get_actuation_input_port())
 builder.Connect(push, lcs.GetInputPort("u"))
@@ -35,5 +34,5 @@ builder.Connect(lcs.GetOutputPort("lcs"), learner.GetInputPort("lcs"))
 simulator = Simulator(builder.Build())
 simulator.AdvanceTo(4.0)
 context = learner.GetMyContextFromRoot(simulator.get_context())
-r_comp = learner.GetOutputPort("r_comp").Eval(context)
-print(f"the gap is {1e3 * 0.05 * r_comp[0]:.1f} mm larger than modelled")
+r, std = (learner.GetOutputPort(name).Eval(context)[0] for name in ("r_comp", "r_std"))
+print(f"the gap is {50 * r:.1f} mm (+- {50 * std:.1f} mm) larger than modelled")

@@ -27,6 +27,7 @@ _EXPORTS = {
     "LCS": "systems.contact_mpc.numerics.lcs",
     "simulate": "systems.contact_mpc.numerics.lcs",
     "LcsPlant": "systems.contact_mpc.lcs_plant",
+    "PosteriorConfig": "systems.contact_mpc.residual_learner",
     "ResidualLearner": "systems.contact_mpc.residual_learner",
     "ResidualLearnerConfig": "systems.contact_mpc.residual_learner",
     "ContactDetector": "systems.changing_contact.contact_detector",

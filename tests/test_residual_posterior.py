@@ -525,6 +525,14 @@ def test_two_fingers_find_both_faces_of_a_box_of_another_width(left, right):
     assert np.mean(errors < 1.645 * stds) >= 0.9
 
 
+@pytest.mark.parametrize("groups", [[[0, 1]], [[0, 1, 2, 3], [4]], [[4, 5, 6]]])
+def test_a_part_of_a_contacts_entries_is_refused(builder, groups):
+    """Four of them each: the other ones would keep the modelled gap."""
+    lcs = builder.build(builder.x_default, np.zeros(3))
+    with pytest.raises(ValueError, match="of the 4 entries of contact [01]"):
+        ResidualLearner(ResidualLearnerConfig(groups=groups), lcs, LEARN)
+
+
 @pytest.mark.parametrize(
     "changes, message",
     [

@@ -433,10 +433,26 @@ def _checked(config: ResidualLearnerConfig, lcs: LCS, period_sec: float):
             f"gamma is {c.gamma}, expected 0 < gamma < {bound:.6g}, the smallest "
             "eigenvalue of F + F' (eps_c in the LCS makes it positive)"
         )
-    group_of_entry(c.groups, lcs.n_lam)
+    _check_groups(c.groups, lcs)
     if c.posterior is not None:
         _check_posterior(c.posterior, c, lcs.n_x)
     return c
+
+
+def _check_groups(groups: list[list[int]], lcs: LCS):
+    """Raises: ValueError for entries that do not exist, or a part of a contact's: its
+    other entries would keep the modelled gap, whatever is learned."""
+    adapts = group_of_entry(groups, lcs.n_lam) >= 0
+    if lcs.contact is None:
+        return
+    for contact in np.unique(lcs.contact):
+        of = lcs.contact == contact
+        if adapts[of].any() and not adapts[of].all():
+            raise ValueError(
+                f"groups is {groups}, with {adapts[of].sum()} of the {of.sum()} "
+                f"entries of contact {int(contact)} ({np.flatnonzero(of).tolist()}), "
+                "expected all or none of a contact's"
+            )
 
 
 def _is_number(value) -> bool:
