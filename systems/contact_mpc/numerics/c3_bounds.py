@@ -14,12 +14,16 @@ from numba import njit
 
 from makebreak.systems.contact_mpc.numerics.c3_qp import factor, new_factor, solve
 
-# An interior point solve ends when its complementarity and its residuals are this
-# small relative to where it started; rounding may end it before, and then an iterate
-# of the second, looser size is a solution ...
-IPM_TOLERANCE, IPM_ACCEPTED = 1e-13, 1e-9
-# ... and it has failed (as a rule: the bounds cannot be met) after so many steps.
-IPM_STEPS = 60
+# An interior point solve ends when its duality gap, relative to what the bounds cost,
+# and its residuals, relative to where it started, are this small; rounding may end it
+# before, and then an iterate of the second, looser size is a solution ...
+IPM_TOLERANCE, IPM_ACCEPTED = 1e-12, 1e-8
+# ... and it has failed after so many steps.
+IPM_STEPS = 80
+# It starts with each bound's complementarity at so many times the free plan's cost:
+# far from the bounds, whose multipliers may be millions of times what they start from
+# where an object is light. Rounding may make the factorisation fail there: then nearer.
+IPM_STARTS = (1e4, 1e2, 1.0)
 # Bounds that the dual active-set method holds at once, at most.
 ACTIVE_MAX = 256
 # Breach of a bound that counts as none, relative to the entry's size.
@@ -55,11 +59,17 @@ def solve_bounded(fac, T, T_N, h, x0, v0_fixed, lower, upper, sides, x, v):
         all zero: the breached ones. Overwritten by the active ones.
     Returns: whether it converged. If not, as a rule no plan meets the bounds.
     """
+    x_free, v_free = x.copy(), v.copy()
     status = solve_active(fac, h, x0, v0_fixed, lower, upper, sides, x, v)
     if status == MET:
         return True
     sides[:] = 0
-    return solve_interior(fac, T, T_N, h, x0, v0_fixed, lower, upper, x, v)
+    for start in IPM_STARTS:
+        # The active set may have left a plan that breaks the dynamics.
+        x[:], v[:] = x_free, v_free
+        if solve_interior(fac, T, T_N, h, v0_fixed, lower, upper, start, x, v):
+            return True
+    return False
 
 
 @njit(cache=True)
@@ -360,9 +370,11 @@ def _responses(fac, causes, entry, n_fixed, out):
 
 
 @njit(cache=True)
-def solve_interior(fac, T, T_N, h, x0, v0_fixed, lower, upper, x, v):
+def solve_interior(fac, T, T_N, h, v0_fixed, lower, upper, start, x, v):
     """solve_bounded by an interior point method; whatever the number of active bounds.
 
+    Args: as of solve_bounded; start: complementarity of each bound at the start, in
+        units of the cost of the states in x.
     Returns: whether it converged. If not, as a rule no plan meets the bounds.
     """
     (N, n_v), K = v.shape, len(T)
@@ -386,7 +398,10 @@ def solve_interior(fac, T, T_N, h, x0, v0_fixed, lower, upper, x, v):
     gap = np.zeros((2, N + 1, n))
     active = np.zeros((2, N + 1, n), np.bool_)
     _pack(x, v, y)
-    count, mu = 0, 0.0
+    y_free = y.copy()
+    unit = _sizes(y, lower, upper, n_v)
+    mu = start * _cost_of_states(T, T_N, x, unit)
+    count = 0
     for side in range(2):
         for k in range(N + 1):
             for i in range(n):
@@ -395,19 +410,14 @@ def solve_interior(fac, T, T_N, h, x0, v0_fixed, lower, upper, x, v):
                 if not (exists and np.isfinite(bound)):
                     continue
                 active[side, k, i] = True
-                breach = bound - y[k, i] if side == 0 else y[k, i] - bound
-                width = upper[i] - lower[i]
-                least = 0.1 * width if np.isfinite(width) else 0.1 * (1.0 + abs(bound))
-                s[side, k, i] = max(abs(breach), least)
-                # A multiplier of the size that undoes the breach.
-                weight = T_N[i - n_v, i - n_v] if k == N else T[k % K, i, i]
-                z[side, k, i] = max(weight, 1e-8) * max(breach, least)
-                mu += s[side, k, i] * z[side, k, i]
+                # Wide of a narrow box, too: from within it, one bound after the other
+                # would stop the steps.
+                s[side, k, i] = max(abs(y[k, i] - bound), unit[i])
+                z[side, k, i] = mu / s[side, k, i]
                 count += 1
     if count == 0:
         return True
-    mu /= count
-    mu_start, residual, careful = mu, 1.0, False
+    least_price, residual, careful = 1e-14 * mu / start, 1.0, False
     best, found = np.inf, False
     diagonal, g, h_step = (
         np.zeros((N + 1, n)),
@@ -476,7 +486,7 @@ def solve_interior(fac, T, T_N, h, x0, v0_fixed, lower, upper, x, v):
                                 dz[side, k, i] - z[side, k, i] * s_new
                             ) / s[side, k, i]
         alpha = min(1.0, 0.995 * _step_length(s, z, ds, dz, active))
-        if not alpha > 1e-8:
+        if not alpha > 1e-10:
             break
         mu_last, mu = mu, 0.0
         for k in range(N + 1):
@@ -493,7 +503,8 @@ def solve_interior(fac, T, T_N, h, x0, v0_fixed, lower, upper, x, v):
         careful = mu > 0.7 * mu_last
         if not np.isfinite(mu):
             break
-        progress = max(mu / mu_start, residual)
+        price = max(_distance(T, T_N, y, y_free, n_v), least_price)
+        progress = max(mu * count / price, residual)
         if progress < min(best, IPM_ACCEPTED):
             best, found = progress, True
             for k in range(N):
@@ -504,6 +515,56 @@ def solve_interior(fac, T, T_N, h, x0, v0_fixed, lower, upper, x, v):
             if best < IPM_TOLERANCE:
                 break
     return found
+
+
+@njit(cache=True)
+def _sizes(y, lower, upper, n_v):
+    """(n,) of [v, x]: the greatest of each entry's bounds and free values."""
+    N, n = y.shape[0] - 1, y.shape[1]
+    unit = np.empty(n)
+    for i in range(n):
+        size = 1e-100
+        for bound in (lower[i], upper[i]):
+            if np.isfinite(bound):
+                size = max(size, abs(bound))
+        for k in range(N) if i < n_v else range(1, N + 1):
+            size = max(size, abs(y[k, i]))
+        unit[i] = size
+    return unit
+
+
+@njit(cache=True)
+def _cost_of_states(T, T_N, x, unit):
+    """Of all knots, as at the end; where that is nothing, of entries of their size."""
+    n_x = x.shape[1]
+    cost = 0.0
+    for k in range(1, x.shape[0]):
+        for i in range(n_x):
+            for j in range(n_x):
+                cost += 0.5 * x[k, i] * T_N[i, j] * x[k, j]
+    if cost > 0.0:
+        return cost
+    for i in range(unit.size):
+        cost = max(cost, T[0, i, i] * unit[i] ** 2)
+    return cost
+
+
+@njit(cache=True)
+def _distance(T, T_N, y, y_free, n_v):
+    """By how much y costs more than the free minimiser: 1/2 |y - y_free|_T^2."""
+    N, n = y.shape[0] - 1, y.shape[1]
+    total = 0.0
+    for k in range(N + 1):
+        for i in range(n if k < N else n - n_v):
+            for j in range(n if k < N else n - n_v):
+                if k < N:
+                    weight, a, b = T[k % len(T), i, j], i, j
+                else:
+                    weight, a, b = T_N[i, j], n_v + i, n_v + j
+                total += (
+                    0.5 * weight * (y[k, a] - y_free[k, a]) * (y[k, b] - y_free[k, b])
+                )
+    return total
 
 
 @njit(cache=True)
