@@ -94,7 +94,7 @@ class LearnerConfig:
             prior_std=0.16,
             drift=0.02,
             spacing=0.01,
-            misfit_sec=float("inf"),  # `trust` was chosen for this model's errors.
+            misfit_sec=None,  # `trust` was chosen for this model's errors.
             free_states=[V_BALL.start, V_BALL.start + 1],
         )
     )

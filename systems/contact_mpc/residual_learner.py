@@ -80,9 +80,9 @@ class PosteriorConfig:
     hold_sec: float = 2.0
     # Time over which the loss that no residual explains is averaged, while a contact is
     # felt [s]. Where it is s times what noise with these Q_d would leave, the model is
-    # wrong elsewhere (a mass, a friction) and stays so: trust is divided by s^2. inf:
+    # wrong elsewhere (a mass, a friction) and stays so: trust is divided by s^2. null:
     # trust is fixed.
-    misfit_sec: float = 1.0
+    misfit_sec: float | None = 1.0
 
 
 @dataclass
@@ -296,7 +296,7 @@ class ResidualLearner(LeafSystem):
                 if is_felt(grid, loss, before[j]):
                     idle[j] = 0.0
         misfit, trust = memory.misfit, c.posterior.trust
-        if all(solved) and (idle == 0.0).any():
+        if c.posterior.misfit_sec and all(solved) and (idle == 0.0).any():
             least = min(min(loss.min() for loss in losses), c.posterior.loss_max)
             misfit += min(self._dt / c.posterior.misfit_sec, 1.0) * (least - misfit)
         # Once for the larger errors, and once because they repeat at each step.
@@ -497,14 +497,13 @@ def _check_posterior(c: PosteriorConfig, config: ResidualLearnerConfig, n_x: int
     for i in c.free_states:
         if i not in range(n_x):
             raise ValueError(f"posterior.free_states names {i}, expected 0..{n_x - 1}")
-    endless = ("hold_sec", "misfit_sec")
     for name, value in vars(c).items():
-        if name == "free_states":
+        if name == "free_states" or (name == "misfit_sec" and value is None):
             continue
         least, what = np.nextafter(0.0, 1.0), "a positive number"
         if name in ("growth", "hold_sec"):
             least, what = 0.0, "0 or more"
-        finite = _is_number(value) or (name in endless and value == np.inf)
+        finite = _is_number(value) or (name == "hold_sec" and value == np.inf)
         if not (finite and least <= value):
             raise ValueError(f"posterior.{name} is {value}, expected {what}")
     assert config.r_max and c.spacing and c.prior_std  # _with_defaults.
