@@ -37,8 +37,15 @@ class ContactMpcConfig:
 def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
     """C3+ on the LCS about the present state.
 
-    Inputs:  x (n_x,), the state [q, v] of the model's plant.
-    Outputs: u (n_u,) [N, N m]; status (1,), a C3Status; plan, a Plan (abstract).
+    Inputs:  x (n_x,), the state [q, v] of the model's plant; r_comp (n_lam,),
+             optional, of a ResidualLearner whose period is dt_sec.
+    Outputs: u (n_u,) [N, N m]; status (1,), a C3Status; plan, a Plan (abstract); lcs,
+             what the plan is for (abstract; a tuple with lcs_along_plan), about the x
+             of each multiple of period_sec.
+
+    The LCS is updated at that time, and u 0.1 ms later: a learner between both reads
+    the new LCS and the input that has acted since its last sample, if period_sec is
+    dt_sec.
 
     Args: model: a diagram of the controller's own plant and scene graph (AnitescuLcs).
     Raises: ValueError for weights or a goal of another size, a plant without actuators.
@@ -81,7 +88,9 @@ def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
     c3 = builder.AddNamedSystem(
         "c3",
         C3Mpc(
-            C3Config(weights, options=c.options, bounds=c.bounds),
+            C3Config(
+                weights, options=c.options, bounds=c.bounds, residual_dt_sec=c.dt_sec
+            ),
             c.period_sec,
             offset_sec=1e-4,  # After the builder, so that the LCS is about this state.
         ),
@@ -97,8 +106,10 @@ def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
         builder.Connect(c3.GetOutputPort("plan"), lcs.GetInputPort("plan"))
     builder.ExportInput(lcs.GetInputPort("x"), "x")
     builder.ConnectInput("x", c3.GetInputPort("x"))
+    builder.ExportInput(c3.GetInputPort("r_comp"), "r_comp")
     for name in ("u", "status", "plan"):
         builder.ExportOutput(c3.GetOutputPort(name), name)
+    builder.ExportOutput(lcs.GetOutputPort("lcs"), "lcs")
     diagram = builder.Build()
     diagram.set_name("contact_mpc")
     return diagram

@@ -34,6 +34,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 from scipy.optimize import nnls
 
+from makebreak import model_path
 from makebreak.diagrams.contact_mpc import ContactMpcConfig, make_contact_mpc
 from makebreak.systems.contact_mpc.lcs_builder import (
     Anitescu,
@@ -1422,3 +1423,34 @@ def test_a_planned_state_that_is_none_is_told_and_the_present_one_stands_in(
     np.testing.assert_array_equal(models[2].A, models[0].A)
     with pytest.raises(ValueError, match="knots is 1.5"):
         AnitescuLcsBuilder(ball_diagram, LcsBuilderConfig(ball_pairs(), knots=1.5))
+
+
+@pytest.mark.parametrize("dt", [0.02, 0.1])
+def test_a_learned_gap_is_planned_with_as_if_it_were_modelled(dt):
+    """A puck that is 8 mm smaller, or the same puck and r_comp = 8 mm / dt_sec."""
+    text = Path(model_path("puck.sdf")).read_text()
+    puck = text.rindex("<link name")
+    smaller = text[:puck] + text[puck:].replace("0.05", "0.042")
+
+    def planned(text, r_comp=None):
+        c = ContactMpcConfig(
+            [ContactPair("finger", "puck", 0.3)],
+            Q=[0, 200, 1, 20],
+            R=[0.01],
+            x_desired=[0.4, 0.5, 0, 0],
+            dt_sec=dt,
+        )
+        mpc = make_contact_mpc(diagram_of(text), c)
+        simulator = Simulator(mpc)
+        context = simulator.get_mutable_context()
+        # The finger is 10 mm before the modelled contact and moves to it at 0.3 m/s.
+        mpc.GetInputPort("x").FixValue(context, [0.09, 0.0, 0.3, 0.0])
+        if r_comp is not None:
+            mpc.GetInputPort("r_comp").FixValue(context, r_comp)
+        simulator.AdvanceTo(1e-3)
+        return mpc.GetOutputPort("u").Eval(context)[0]
+
+    expected = planned(smaller)
+    # Both spheres on one line: only the constant of the gap differs.
+    assert planned(text, np.full(4, 8e-3 / dt)) == pytest.approx(expected, abs=1e-6)
+    assert abs(planned(text) - expected) > 1e-2
