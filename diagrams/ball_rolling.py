@@ -32,6 +32,8 @@ from makebreak.diagrams.ball_rolling_config import (
     N_TIP,
     PLAN_DT,
     BallRollingConfig,
+    LearnerConfig,
+    PlannerConfig,
     c3_config,
     controller_model,
     learner_config,
@@ -44,6 +46,7 @@ from makebreak.diagrams.faults import faulty_lcs
 from makebreak.diagrams.realism import draw_errors
 from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.sampled_contacts import (
+    SampledContactsConfig,
     add_sampled_contacts,
     check_contacts,
     sampled_c3_config,
@@ -57,7 +60,12 @@ from makebreak.diagrams.station import (
     make_control_plant,
     make_station,
 )
-from makebreak.diagrams.wiring import add_legend, check_own, connect_command
+from makebreak.diagrams.wiring import (
+    add_legend,
+    check_own,
+    connect_command,
+    refuse_unused,
+)
 from makebreak.models.fruit import FRUITS
 from makebreak.models.scene import Scene
 from makebreak.models.tip_and_ball import make_tip_and_ball
@@ -82,7 +90,7 @@ from makebreak.systems.contact_mpc.lcs_builder import (
 from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL
 from makebreak.systems.contact_mpc.path_target import PathTargetConfig
 from makebreak.systems.contact_mpc.residual_learner import ResidualLearner
-from makebreak.systems.contact_mpc.rolling_task import RollingTask
+from makebreak.systems.contact_mpc.rolling_task import RollingTask, RollingTaskConfig
 from makebreak.systems.perception.ball_tracker import BallTracker
 from makebreak.systems.perception.state_estimator import (
     StateEstimator,
@@ -199,6 +207,7 @@ def add_ball_rolling(
     samples = config.contact_sequence == "sampled"
     if samples:
         _check_sampled(config, projection, learner_kind)
+    _refuse_unused(config)
     wrong = what_goes_wrong(config)
     if station is None:
         station = make_world(config, meshcat, sampled)
@@ -345,6 +354,28 @@ def _check_sampled(
                 f"{name}={value} with contact_sequence=sampled, expected "
                 + " or ".join(expected)
             )
+
+
+def _refuse_unused(config: BallRollingConfig) -> None:
+    """Raises: ValueError for settings of parts that the chosen ones replace."""
+    why = f"not used with contact_sequence={config.contact_sequence}"
+    learner = LearnerConfig()
+    if config.contact_sequence == "cycle":
+        refuse_unused("contacts", config.contacts, SampledContactsConfig(), why)
+    else:
+        circle = dict(center=config.task.center, radius=config.task.radius)
+        refuse_unused("task", config.task, replace(RollingTaskConfig(), **circle), why)
+        refuse_unused("planner", config.planner, PlannerConfig(), why)
+        # `contacts` has its own in their place.
+        for name in ("weight_ball", "weight_tip", "eps"):
+            values = (getattr(of, name) for of in (config.learning, learner))
+            refuse_unused(f"learning.{name}", *values, why)
+        for name in ("drift", "growth"):
+            values = (getattr(of.posterior, name) for of in (config.learning, learner))
+            refuse_unused(f"learning.posterior.{name}", *values, why)
+    if config.controller == "paper":
+        why = "not used with controller=paper"
+        refuse_unused("learning", config.learning, learner, why)
 
 
 def _add_models(

@@ -253,6 +253,11 @@ def ball_config(config: GentleRollingConfig) -> BallRollingConfig:
             f"ball.contact_sequence is {config.ball.contact_sequence}, expected cycle: "
             "the gentle touch-down is that of its landing"
         )
+    if config.ball.learner != "r_comp":
+        raise ValueError(
+            f"ball.learner is {config.ball.learner}, expected r_comp; adapt=false "
+            "switches the learner off"
+        )
     return replace(
         config.ball, seed=config.seed, adapt=config.adapt, realism=config.realism
     )

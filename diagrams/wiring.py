@@ -1,7 +1,7 @@
 """Helpers that several diagrams share: connections, and settings that they compute."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 from pydrake.geometry import Meshcat
@@ -24,6 +24,17 @@ def refuse_changed(name: str, part: Any, keys: Sequence[str]) -> None:
             raise ValueError(
                 f"{name}.{key} is {value}, expected {default}: the diagram sets it"
             )
+
+
+def refuse_unused(name: str, part: Any, default: Any, why: str) -> None:
+    """Raises: ValueError if a setting, or one in a config, is not the default although
+    nothing reads it. Args: why: what makes it unused, for the message."""
+    if is_dataclass(part) and type(part) is type(default):
+        for field in fields(part):
+            values = (getattr(of, field.name) for of in (part, default))
+            refuse_unused(f"{name}.{field.name}", *values, why)
+    elif part != default:
+        raise ValueError(f"{name} is {part}, expected {default}: {why}")
 
 
 def check_own(config: Any, own: Mapping[str, Sequence[str]]) -> None:

@@ -59,6 +59,7 @@ from makebreak.systems.contact_mpc.numerics.rolling_task import CirclePath
 from makebreak.systems.contact_mpc.numerics.tip_travel import way_around, way_is_free
 from makebreak.systems.contact_mpc.path_target import PathTarget, PathTargetConfig
 from makebreak.systems.contact_mpc.push_task import PushTask, PushTaskConfig
+from makebreak.systems.contact_mpc.rolling_task import RollingTaskConfig
 
 MODEL = TipAndBall(ball_radius=0.0315)
 HEIGHT, R_BALL, R_TIP = 0.038, 0.0315, 0.0195
@@ -489,6 +490,42 @@ def test_a_touch_speed_has_the_force_that_it_asks_for():
     assert arm.GetInputPort("tip_force").HasValue(own)
 
 
+def _set(config, setting, value):
+    *parts, last = setting.split(".")
+    for part in parts:
+        config = getattr(config, part)
+    setattr(config, last, value)
+
+
+@pytest.mark.parametrize(
+    ("choice", "setting", "value"),
+    [
+        ({}, "contacts.gap_allowance", 0.002),
+        ({}, "contacts.push.speed", 0.5),
+        ({"contact_sequence": "sampled"}, "task.rolling.lift", 0.02),
+        ({"contact_sequence": "sampled"}, "task.speed", 0.03),
+        ({"contact_sequence": "sampled"}, "planner.N", 6),
+        ({"contact_sequence": "sampled"}, "learning.eps", 1e-4),
+        ({"contact_sequence": "sampled"}, "learning.posterior.drift", 0.01),
+        ({"controller": "paper"}, "learning.posterior.hold_sec", 3.0),
+    ],
+)
+def test_a_setting_that_the_chosen_parts_do_not_read_is_refused(choice, setting, value):
+    made = BallRollingConfig(camera=CameraConfig(renderer="drawn"), **choice)
+    make_ball_rolling(made)
+    _set(made, setting, value)
+    ((name, chosen),) = (choice or {"contact_sequence": "cycle"}).items()
+    with pytest.raises(ValueError, match=f"^{setting} is {value}, .*{name}={chosen}$"):
+        make_ball_rolling(made)
+
+
+def test_the_chosen_parts_settings_are_taken():
+    made = config(task=RollingTaskConfig(center=[0.52, 0.0], radius=0.09))
+    made.learning.r_max = 0.6
+    made.contacts.gap_allowance = 0.002
+    make_ball_rolling(made)
+
+
 def test_what_does_not_go_with_it_is_refused_in_one_line():
     for change, message in (
         ({"controller": "paper"}, "controller=paper"),
@@ -501,6 +538,9 @@ def test_what_does_not_go_with_it_is_refused_in_one_line():
         experiment.run_on_lcm(config(), None, "")
     gentle = GentleRollingConfig(ball=config())
     with pytest.raises(ValueError, match="ball.contact_sequence is sampled"):
+        ball_config(gentle)
+    gentle = GentleRollingConfig(ball=BallRollingConfig(learner="none"))
+    with pytest.raises(ValueError, match="ball.learner is none, .*adapt=false"):
         ball_config(gentle)
 
 
