@@ -32,8 +32,6 @@ from makebreak.diagrams.ball_rolling_config import (
     N_TIP,
     PLAN_DT,
     BallRollingConfig,
-    LearnerConfig,
-    PlannerConfig,
     c3_config,
     controller_model,
     learner_config,
@@ -46,7 +44,6 @@ from makebreak.diagrams.faults import faulty_lcs
 from makebreak.diagrams.realism import draw_errors
 from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.sampled_contacts import (
-    SampledContactsConfig,
     add_sampled_contacts,
     check_contacts,
     sampled_c3_config,
@@ -90,7 +87,7 @@ from makebreak.systems.contact_mpc.lcs_builder import (
 from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL
 from makebreak.systems.contact_mpc.path_target import PathTargetConfig
 from makebreak.systems.contact_mpc.residual_learner import ResidualLearner
-from makebreak.systems.contact_mpc.rolling_task import RollingTask, RollingTaskConfig
+from makebreak.systems.contact_mpc.rolling_task import RollingTask
 from makebreak.systems.perception.ball_tracker import BallTracker
 from makebreak.systems.perception.state_estimator import (
     StateEstimator,
@@ -358,24 +355,20 @@ def _check_sampled(
 
 def _refuse_unused(config: BallRollingConfig) -> None:
     """Raises: ValueError for settings of parts that the chosen ones replace."""
-    why = f"not used with contact_sequence={config.contact_sequence}"
-    learner = LearnerConfig()
-    if config.contact_sequence == "cycle":
-        refuse_unused("contacts", config.contacts, SampledContactsConfig(), why)
-    else:
-        circle = dict(center=config.task.center, radius=config.task.radius)
-        refuse_unused("task", config.task, replace(RollingTaskConfig(), **circle), why)
-        refuse_unused("planner", config.planner, PlannerConfig(), why)
-        # `contacts` has its own in their place.
-        for name in ("weight_ball", "weight_tip", "eps"):
-            values = (getattr(of, name) for of in (config.learning, learner))
-            refuse_unused(f"learning.{name}", *values, why)
-        for name in ("drift", "growth"):
-            values = (getattr(of.posterior, name) for of in (config.learning, learner))
-            refuse_unused(f"learning.posterior.{name}", *values, why)
+    plain = BallRollingConfig()
+    # Both ways of choosing contacts read the circle.
+    plain.task.center, plain.task.radius = config.task.center, config.task.radius
+    unused = ["contacts"]
+    if config.contact_sequence == "sampled":
+        # `contacts` has its own in place of those of the learner.
+        learner = ("weight_ball", "weight_tip", "eps", "posterior.drift")
+        unused = ["task", "planner", *(f"learning.{name}" for name in learner)]
+        unused.append("learning.posterior.growth")
+    for name in unused:
+        why = f"not used with contact_sequence={config.contact_sequence}"
+        refuse_unused(config, plain, name, why)
     if config.controller == "paper":
-        why = "not used with controller=paper"
-        refuse_unused("learning", config.learning, learner, why)
+        refuse_unused(config, plain, "learning", "not used with controller=paper")
 
 
 def _add_models(

@@ -69,6 +69,7 @@ from makebreak.diagrams.wiring import (
     check_own,
     connect_command,
     refuse_changed,
+    refuse_unused,
 )
 from makebreak.models.pushed_object import (
     HUE,
@@ -141,6 +142,7 @@ def make_push_object(
     """
     check_own(config, SET_BY_DIAGRAM)
     refuse_changed("sampler.sampling", config.sampler.sampling, ("wrist",))
+    _refuse_unused(config)
     builder = DiagramBuilder()
     model = _make_model(config)
     station = _add_station(builder, config, meshcat)
@@ -192,6 +194,25 @@ class _Model:
     @property
     def rolls(self) -> bool:
         return bool(rolling_axis(self.spec))
+
+
+def _refuse_unused(config: PushObjectConfig) -> None:
+    """Raises: ValueError for settings of parts that the chosen ones replace."""
+    plain = PushObjectConfig()
+    # A renderer does no harm: sweeps set it for all cases.
+    plain.camera.renderer = config.camera.renderer
+    if config.pose_from == "sensor":
+        unused = ["camera", "tracker", "learning.weight_late"]
+    else:
+        unused = ["pose", "learning.weight"]
+    for name in unused:
+        why = f"not used with pose_from={config.pose_from}"
+        refuse_unused(config, plain, name, why)
+    if not config.gentle:
+        refuse_unused(config, plain, "touch", "not used with gentle=false")
+    if not rolling_axis(config.object):
+        why = f"not used with object.shape={config.object.shape}"
+        refuse_unused(config, plain, "planner.coast_sec", why)
 
 
 def _make_model(config: PushObjectConfig) -> _Model:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
+from operator import attrgetter
 from typing import Any, TypeVar
 
 from pydrake.geometry import Meshcat
@@ -26,15 +27,15 @@ def refuse_changed(name: str, part: Any, keys: Sequence[str]) -> None:
             )
 
 
-def refuse_unused(name: str, part: Any, default: Any, why: str) -> None:
-    """Raises: ValueError if a setting, or one in a config, is not the default although
-    nothing reads it. Args: why: what makes it unused, for the message."""
-    if is_dataclass(part) and type(part) is type(default):
+def refuse_unused(config: Any, default: Any, setting: str, why: str) -> None:
+    """Raises: ValueError if a setting, or one below it, is not the default although
+    nothing reads it. Args: setting: its name, as in --set; why: nothing reads it."""
+    part, plain = (attrgetter(setting)(each) for each in (config, default))
+    if is_dataclass(part) and type(part) is type(plain):
         for field in fields(part):
-            values = (getattr(of, field.name) for of in (part, default))
-            refuse_unused(f"{name}.{field.name}", *values, why)
-    elif part != default:
-        raise ValueError(f"{name} is {part}, expected {default}: {why}")
+            refuse_unused(config, default, f"{setting}.{field.name}", why)
+    elif part != plain:
+        raise ValueError(f"{setting} is {part}, expected {plain}: {why}")
 
 
 def check_own(config: Any, own: Mapping[str, Sequence[str]]) -> None:

@@ -1,5 +1,6 @@
 """The parts of push_object beside its planner, and the whole diagram for a moment."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 from scipy.spatial.transform import Rotation
 
+from makebreak.diagrams.camera import CameraConfig
 from makebreak.diagrams.push_object import (
     PUSH_OBJECT,
     PushModelConfig,
@@ -510,6 +512,29 @@ def test_a_gentle_touch_is_wired_and_its_speed_is_checked(gentle):
             make_push_object(
                 PushObjectConfig(gentle=True, touch=TouchDownConfig(most=0.3))
             )
+
+
+@pytest.mark.parametrize(
+    ("choice", "setting", "value"),
+    [
+        ({"pose_from": "sensor"}, "camera.width", 160),
+        ({"pose_from": "sensor"}, "tracker.yaw_std", 0.02),
+        ({"pose_from": "sensor"}, "learning.weight_late", 100.0),
+        ({"pose_from": "camera"}, "pose.delay_sec", 0.05),
+        ({"pose_from": "camera"}, "learning.weight", 100.0),
+        ({"gentle": False}, "touch.most", 0.1),
+        ({}, "planner.coast_sec", 2.0),
+    ],
+)
+def test_a_setting_that_the_chosen_parts_do_not_read_is_refused(choice, setting, value):
+    config = PushObjectConfig(camera=CameraConfig(renderer="drawn"), **choice)
+    make_push_object(config)
+    part, name = setting.split(".")
+    setattr(getattr(config, part), name, value)
+    ((key, chosen),) = (choice or {"object.shape": "t"}).items()
+    why = rf"^{setting} is {value}, expected .*: not used with {key}={chosen}$"
+    with pytest.raises(ValueError, match=re.compile(why, re.IGNORECASE)):
+        make_push_object(config)
 
 
 def test_the_wrist_is_the_arm_s_and_no_setting():
