@@ -1,5 +1,6 @@
 """Success criteria of a run: each has a name, a value and a bound."""
 
+import math
 from collections.abc import Mapping
 
 from makebreak.scripts.table import format_cell
@@ -35,8 +36,8 @@ class Criteria:
 
     def _add(self, key, met, what, value, wanted, unit) -> None:
         shown = format_cell(value) + f" {unit}".rstrip()
-        if unit and format_cell(value) == "-":
-            shown = "-"  # No value, so no unit either.
+        if value is None or (isinstance(value, float) and math.isnan(value)):
+            shown = "not measured"
         line = f"{what}: {shown}, wanted {wanted} {unit}".rstrip()
         self._met[f"met_{key}"] = met
         self._lines.append(f"{'met   ' if met else 'MISSED'}  {line}")
