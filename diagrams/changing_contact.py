@@ -39,7 +39,12 @@ from makebreak.diagrams.station import (
     make_station,
 )
 from makebreak.diagrams.tabletop import TOOL, objects
-from makebreak.diagrams.wiring import add_legend, refuse_changed, timed
+from makebreak.diagrams.wiring import (
+    add_legend,
+    refuse_changed,
+    refuse_unused,
+    timed,
+)
 from makebreak.models.scene import Scene
 from makebreak.systems.arm.impedance_controller import (
     HybridConfig,
@@ -268,6 +273,9 @@ def _add_systems(
     # What variable_impedance and the damping ratio give instead.
     unused = ["stiffness", *(["damping"] if config.hybrid.damping_ratio > 0.0 else [])]
     refuse_changed("impedance", config.impedance, unused)
+    if not config.reflex.gain > 0.0:
+        for name in ("reflex.force_max", "reflex.fade_sec"):
+            refuse_unused(config, type(config)(), name, "not used with reflex.gain=0")
     speed = replace(
         config.anticipator.speed,
         reflex_gain=config.reflex.gain,

@@ -355,7 +355,7 @@ def make_multiple_collisions(
                 search=replace(control.shaper.search, speed=config.speed),
             ),
             variable_impedance=replace(control.variable_impedance, transition=False),
-            reflex=replace(control.reflex, gain=0.0),
+            reflex=ImpactReflexConfig(force_least=control.reflex.force_least),
         )
     return make_changing_contact(
         control, task.world, task.model, task.pattern, knowledge, TOOL,

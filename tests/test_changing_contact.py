@@ -250,6 +250,15 @@ def test_a_stiffness_that_the_law_never_uses_is_refused():
     build(config=config)
 
 
+def test_settings_of_a_reflex_that_is_not_there_are_refused():
+    config = ChangingContactConfig()
+    config.reflex.force_max = 12.0
+    with pytest.raises(ValueError, match="reflex.force_max is 12.0, .*reflex.gain=0"):
+        build(config=config)
+    config.reflex.gain = 2.0
+    build(config=config)
+
+
 def test_all_that_read_the_wrench_read_it_without_the_sensor_s_bias():
     bias = np.array([0.4, -0.3, 0.5])
     diagram = build(errors=StationErrors(force_bias=bias))
