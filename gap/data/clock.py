@@ -2,6 +2,7 @@
 
 import numpy as np
 from scipy.ndimage import median_filter
+from scipy.optimize import isotonic_regression
 from scipy.stats import chi2
 
 _ROWS = 31  # Over which medians are taken.
@@ -9,7 +10,11 @@ _FEWEST = 3  # Medians in a stretch of a clock that goes at one rate.
 _CHANCE = 1e-4  # Of taking a rate for changed that has not.
 _LEAST = 1e-9  # Standard deviation of a median [s]: what stamps are written with.
 _LOST = 0.75  # Periods by which medians of rows jump where one was lost.
-_CLEAR = 0.15  # Scatter of steps, in periods, beside which each lost row shows.
+_PHASE_ROWS = 32, 64, 128, 256, 512, 1024  # Whose stamps have one phase: tried.
+_RATE_RANGE = 0.1  # Rates tried, about the usual one.
+_TRIED_ROWS = 20000  # As many at most tell the rate.
+_COHERENT = 8.0  # Deviations by which a clock's power is above that of no clock.
+_SURE = 12.0  # Times that power: phases are known to 0.2 rad.
 
 
 def clock_period(t: np.ndarray) -> float:
@@ -36,11 +41,10 @@ def even_clock(t: np.ndarray) -> np.ndarray:
 
 def _numbers(t: np.ndarray) -> np.ndarray:
     """(n,) number of each row, where lost rows count."""
-    step = np.diff(t)
-    usual = float(np.median(step))  # 0: stamps are coarser than rows.
-    step = step / usual if usual > 0.0 else np.zeros_like(step)
-    if 1.4826 * np.median(np.abs(step - 1.0)) < _CLEAR:
-        return np.append(0.0, np.cumsum(np.maximum(np.round(step), 1.0)))
+    usual = float(np.median(np.diff(t)))  # 0: stamps are coarser than rows.
+    numbers = _numbers_by_phase(t, usual) if usual > 0.0 else None
+    if numbers is not None:
+        return numbers
     k, quarter = np.arange(len(t)), len(t) // 4
     period = float(np.median(t[quarter:] - t[:-quarter])) / quarter
     slow = median_filter(t - period * k, _ROWS, mode="nearest")
@@ -54,6 +58,42 @@ def _numbers(t: np.ndarray) -> np.ndarray:
         middle = (first + end) // 2
         k[middle:] += int(np.round(jump[middle]))
     return k
+
+
+def _numbers_by_phase(t: np.ndarray, usual: float) -> np.ndarray | None:
+    """The same from the phase of all stamps in a clock's period, which lost rows do not
+    change, whatever their number. None: the stamps scatter too much to have a phase.
+
+    Args: usual: about the period [s].
+    """
+    power = 0.0
+    for rows in [n for n in _PHASE_ROWS if n <= len(t)]:
+        first = np.append(np.arange(0, len(t) - rows, rows // 2), len(t) - rows)
+        blocks = t[first[:, None] + np.arange(rows)]
+        some = blocks[:: int(np.ceil(blocks.size / _TRIED_ROWS))]
+        steps = int(np.ceil(4 * rows * _RATE_RANGE))
+        rates = (1.0 + np.linspace(-1, 1, 2 * steps + 1) * _RATE_RANGE) / usual
+        # Of stamps that follow no clock the power is 1 +- 1 / sqrt(blocks).
+        powers = [rows * np.mean(np.abs(_phasors(some, rate)) ** 2) for rate in rates]
+        if (max(powers) - 1.0) * np.sqrt(some.size / rows) < _COHERENT:
+            continue
+        if max(powers) > power:
+            power, rate = max(powers), rates[np.argmax(powers)]
+            turns, middles = _phasors(blocks, rate), blocks.mean(axis=1)
+        if power > _SURE:
+            break  # Short blocks follow a clock that wanders.
+    if power == 0.0:
+        return None
+    number = rate * t - np.interp(t, middles, np.unwrap(np.angle(turns)) / 2.0 / np.pi)
+    # Rows come in order, each one or more after the last: the closest whole numbers are
+    # those of the closest real ones.
+    row = np.arange(len(t))
+    return row + np.round(isotonic_regression(number - row).x)
+
+
+def _phasors(blocks: np.ndarray, rate: float) -> np.ndarray:
+    """Means (n,) over blocks (n, rows) of stamps on the unit circle."""
+    return np.exp(2j * np.pi * rate * blocks).mean(axis=1)
 
 
 def _drift(off: np.ndarray, slow: np.ndarray, spread: float) -> np.ndarray:
