@@ -6,6 +6,7 @@ import pytest
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.fit import fit_effects
+from makebreak.gap.residuals import contact_dynamics
 from makebreak.gap.residuals.pressing import PressingProblem, presses
 from makebreak.gap.search.choice import Choice
 from makebreak.gap.search.comparison import Comparison
@@ -331,3 +332,26 @@ def test_a_rival_that_leaves_one_channel_a_gap_is_no_tie(tmp_path):
         for effect, std, ties in zip(fit.effects, fit.std, ((rival,), ()), strict=True)
     ]
     assert still_tied(search, chosen, fit, 0) == ()
+
+
+def test_faces_that_press_against_each_other_do_not_loosen_the_rows(
+    tmp_path, monkeypatch
+):
+    """In a scene that has the tool inside a body, forces of opposing faces may be
+    anything; rows were weighed as if so much acted in them, and nothing was felt."""
+    explain = contact_dynamics.explain
+
+    def squeezing(needs, G, there, root, sharing, left, weights, rank):
+        explain(needs, G, there, root, sharing, left, weights, rank)
+        weights[::20] *= 1e4
+
+    scene, recordings = (
+        write_scene(tmp_path),
+        record(tmp_path, table=-0.012, wall=0.325),
+    )
+    plain = PressingProblem(scene, recordings)
+    monkeypatch.setattr(contact_dynamics, "explain", squeezing)
+    problem = PressingProblem(scene, recordings)
+    needs = np.sqrt(np.mean(problem._all_needs(()) ** 2, axis=0))
+    assert (problem.acting <= 10.01 * needs).all()
+    assert problem.off == plain.off

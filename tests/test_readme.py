@@ -57,8 +57,10 @@ def test_the_seven_systems_are_where_the_table_says():
         assert hasattr(import_module(f"makebreak.systems.{wing}.{name}"), cls)
         (ROOT / "systems" / wing / "numerics" / f"{name}.py").stat()
         (ROOT / "tests" / f"test_{name}.py").stat()
-        example, page = re.findall(r"\]\((.*?)\)", rest)
-        assert cls in (ROOT / example).read_text()
+        *examples, page = re.findall(r"\]\((.*?)\)", rest)
+        assert examples
+        for example in examples:
+            assert cls in (ROOT / example).read_text()
         (ROOT / page).stat()
 
 
