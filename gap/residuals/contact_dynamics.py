@@ -40,7 +40,6 @@ SHAPES = 2e-4  # How well shapes are known where the scene does not say [m].
 PRESSED = 4.0  # Times a body's noise [N]: a force that tells that it is touched.
 ROUNDING = 1e-11  # Of a column, per newton [-], [m].
 THIN = 4  # Distances change slowly: every so many test functions are told.
-SQUEEZED = 10.0  # Times what a row needs: forces that act in it, at most.
 WRENCHED = 0.05  # A wrench sampled amid a drive's ripple is off by as much.
 SHAPED = (*SURFACES, *CONTACT_LAW)
 # What changes a free body's inertial parameters.
@@ -180,11 +179,13 @@ class ContactDynamics(PermittedContacts):
             weights, np.zeros(K, np.int64),
         )  # fmt: skip
         acting = np.abs(G * weights[:, None, :]).sum(axis=2) + np.abs(needs)
-        # Where the scene has a tool inside a body, faces may press against each other
-        # as hard as they like.
-        self.acting = np.minimum(np.sqrt(np.mean(acting**2, axis=0)), SQUEEZED * size)
+        self.acting = np.sqrt(np.mean(acting**2, axis=0))
+        self._limit_acting(size)
         share = np.append(np.full(n_v, MODELLED), np.full(n - n_v, WRENCHED))
         self.allow(share * self.acting)
+
+    def _limit_acting(self, needed: np.ndarray) -> None:
+        """Hook: forces that act in rows (rows,), beside what these need."""
 
     def allow(self, allowance: np.ndarray) -> None:
         """Weighs rows anew. allowance (rows,): what models are off by, in N and N m."""

@@ -38,6 +38,7 @@ CLEAR, LEAST_FORCE, FELT_SHARE = 6.0, 0.5, 0.03  # Times noise, [N], of the rows
 MOVES = ("wall_position", "plane_height")
 WHOLE = 0.9  # Of the squares left: what one more of a body leaves is tried first.
 SOFTER = (0.3, 0.6, 2.0)  # Times the stiffness of the scene: trials.
+SQUEEZED = 10.0  # Times what a row needs: forces that act in it, at most.
 MOST_FRICTION = 2.0  # Of what is taken for any.
 MOST_PATCHES, MOST_EFFECTS = 3, 10
 MOST_SLOTS = 12  # Places of a fixed body at which its distances are kept.
@@ -478,6 +479,11 @@ class PressingProblem(ContactProblem):
         return max([LEAST_FORCE, *(CLEAR * float(np.sqrt(x)) for x in var)])
 
     # ----- Rows
+
+    def _limit_acting(self, needed: np.ndarray) -> None:
+        # Where the scene has a tool inside a body, faces may press against each other
+        # as hard as they like.
+        self.acting = np.minimum(self.acting, SQUEEZED * needed)
 
     def allow(self, allowance: np.ndarray) -> None:
         # Which rows forces take up is asked of the scene as it came.
