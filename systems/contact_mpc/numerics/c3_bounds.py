@@ -59,14 +59,13 @@ def solve_bounded(fac, T, T_N, h, x0, v0_fixed, lower, upper, sides, x, v):
         all zero: the breached ones. Overwritten by the active ones.
     Returns: whether it converged. If not, as a rule no plan meets the bounds.
     """
-    x_free, v_free = x.copy(), v.copy()
     status = solve_active(fac, h, x0, v0_fixed, lower, upper, sides, x, v)
     if status == MET:
         return True
     sides[:] = 0
+    # The active set may have left a plan that breaks the dynamics.
+    solve(fac, h, x0, v0_fixed, x, v)
     for start in IPM_STARTS:
-        # The active set may have left a plan that breaks the dynamics.
-        x[:], v[:] = x_free, v_free
         if solve_interior(fac, T, T_N, h, v0_fixed, lower, upper, start, x, v):
             return True
     return False
