@@ -343,6 +343,30 @@ def follow(model, x, u, ticks, **posterior):
     return found
 
 
+@pytest.mark.parametrize(
+    "gaps, is_free",
+    [
+        ((3.0, 3.0), True),
+        ((1.5, 3.0), False),
+        ((3.0, 1.5), False),
+        ((9.0, -1.0), False),
+    ],
+)
+def test_what_moves_a_free_state_is_learned_only_where_nothing_touches(gaps, is_free):
+    """Nothing: no wall within two deviations of its residual. Gaps in deviations."""
+    model, x, u = between_walls(0.1, 0.1), np.zeros(2), np.zeros(1)
+    config = ResidualLearnerConfig(
+        Q_d=[0.0, 1e4], eps=1e-3, posterior=PosteriorConfig(free_states=[1])
+    )
+    learner = ResidualLearner(config, model, LEARN, 1e-2 * LEARN)
+    memory = learner._memory_of(learner.CreateDefaultContext())
+    memory = replace(memory, std=np.full(2, 0.1), unexplained=np.zeros(1))
+    near = replace(model, phi=0.1 * LEARN * np.array(gaps))
+    for pair in ((near, model), (model, near)):
+        after = learner._unexplained(memory, *pair, x, u, x + 0.3)
+        assert (after > 0.0).all() == is_free
+
+
 @pytest.mark.parametrize("left, right", [(-8e-3, 5e-3), (6e-3, 6e-3), (0.0, -5e-3)])
 @pytest.mark.parametrize("dt", [0.005, 0.05])
 def test_each_of_two_contacts_gets_its_own_residual_and_deviation(left, right, dt):
