@@ -19,6 +19,7 @@ import yaml
 DEPTH_MAX = 40  # Of nested brackets or indents; a scene needs about six.
 BYTES_MAX = 4_000_000
 ALIASES_MAX = 1000  # Nine lines with ten aliases each would expand to a billion.
+LISTED_MAX = 16  # Names that a message lists where none is like what came.
 _EXPECTED = {int: "an integer", float: "a number", bool: "true or false", str: "a text"}
 
 
@@ -123,7 +124,8 @@ def one_line(error: BaseException) -> str:
 
 
 def nearest(name: str, valid: Iterable[str]) -> str:
-    """Hint of an error message: the valid names nearest to `name`, or all of them."""
+    """Hint of an error message: the valid names nearest to `name`; where none is like
+    it, all of them, if they are few."""
     valid = list(valid)
 
     def likeness(other: str) -> tuple[float, float]:
@@ -140,6 +142,8 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     close = [v for v in ranked[:3] if likeness(v)[0] >= least]
     if close:
         return f"did you mean {' or '.join(close)}?"
+    if len(valid) > LISTED_MAX:
+        return f"nearest of {len(valid)}: {', '.join(ranked[:3])}"
     return f"expected one of: {', '.join(valid)}"
 
 

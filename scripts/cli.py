@@ -259,7 +259,8 @@ def _close_the_loop(args) -> int:
         duration = number(args.duration, "--duration", 0.0)
         if args.experiment in SETTINGS:
             raise ValueError(f"--duration: {args.experiment} ends by itself")
-    apply_settings(experiment_module(args.experiment).Config(), args.set)  # Or refuses.
+    right = experiment_module(args.experiment).Config()
+    apply_settings(right, args.set, args.experiment)  # Or refuses.
     out = Path(args.out) if args.out else default_out("close-the-loop")
     try:
         jobs, settings = number_of_processes(args.jobs), args.set

@@ -69,7 +69,7 @@ def experiment_config(module, args: argparse.Namespace):
             raise ValueError(f"--{option}: {args.experiment} has no {option} scene")
         path = scene_file(text, f"--{option}")
         config = dataclasses.replace(config, **{option: path})
-    config = apply_settings(config, args.set)
+    config = apply_settings(config, args.set, args.experiment)
     motion = getattr(config, "pattern", "")
     if isinstance(motion, str) and Path(motion).is_file():
         config = dataclasses.replace(config, pattern=str(Path(motion).resolve()))

@@ -198,7 +198,7 @@ def station(args) -> int:
     from makebreak.diagrams.lcm_station import URL
     from makebreak.scripts.session import CatchInterrupt
     from makebreak.scripts.stand_in import StandIn, StandInConfig
-    from makebreak.scripts.table import Table
+    from makebreak.scripts.table import Table, json_value
 
     module = experiment_module(args.experiment)
     if not hasattr(module, "run_on_lcm"):
@@ -219,5 +219,6 @@ def station(args) -> int:
         stand_in.run(duration, lambda: interrupt.hit)
     result = stand_in.report.result()
     print(Table("station", ("result", "value"), list(result.items())).to_text())
-    print(json.dumps(result), flush=True)
+    plain = {key: json_value(value) for key, value in result.items()}
+    print(json.dumps(plain, allow_nan=False), flush=True)
     return 0

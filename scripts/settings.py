@@ -53,9 +53,22 @@ def load_config(schema: type, path: Path):
         raise ValueError(f"--config {path}: {one_line(error)}") from error
 
 
-def apply_settings(config, settings: Iterable[str]):
+def unknown_key(option: str, key: str, schema: type, listed_as: str = ""):
+    """The error for a key that the config has not: the names that are most like it, and
+    the command that lists all.
+
+    Args: listed_as: the experiment's name, for that command.
+    """
+    hint = nearest(shown(key), field_types(schema))
+    if listed_as:
+        hint += f" (makebreak list {listed_as} lists all)"
+    return ValueError(f"{option}: unknown key {shown(key)}; {hint}")
+
+
+def apply_settings(config, settings: Iterable[str], listed_as: str = ""):
     """`config` with `key=value` settings applied, in order; keys may be dotted.
 
+    Args: listed_as: the experiment's name, for the message about an unknown key.
     Raises: ValueError in one line: no `=`, an unknown key, a value that is not YAML or
         not of the field's type.
     """
@@ -66,7 +79,7 @@ def apply_settings(config, settings: Iterable[str]):
         if not equals or not key:
             raise ValueError(f'--set: got "{setting}", expected key=value')
         if key not in types_of:
-            raise ValueError(f"--set: unknown key {key}; {nearest(key, types_of)}")
+            raise unknown_key("--set", key, type(config), listed_as)
         try:
             value = load_yaml(raw)
         except ValueError as error:
@@ -90,6 +103,7 @@ _BOUNDS = {
     "offset_sec": Between(0.0, 10.0, "s"),
     "seed": Between(None, 2.0**63 - 1.0),
     "friction": Between(0.0, 100.0),
+    "integral_sec": Between(1e-3, None, "s"),  # Infinite: no integral.
 }
 # Limits of other numbers: real ones over the default (or 1), integers over it (or 10).
 _RATIO_MAX, _COUNT_RATIO_MAX = 1e4, 1000
@@ -97,14 +111,16 @@ _MAGNITUDE_MIN = 1e-30  # The inverse of a smaller number may overflow.
 
 
 def check_sizes(config, default, prefix: str = "") -> None:
-    """Raises: ValueError for numbers that must be a mistake: infinite where the default
-    is finite, or thousands of times the default."""
+    """Raises: ValueError for numbers that must be a mistake: infinite where neither the
+    default nor that of the field's own class is, or thousands of times the default."""
     hints = hints_of(type(config))
     for f in dataclasses.fields(config):
         value, usual = getattr(config, f.name), getattr(default, f.name)
         name = f"{prefix}{f.name}"
         if dataclasses.is_dataclass(value):
             check_sizes(value, usual, name + ".")
+        elif value == f.default == np.inf:  # As without such a limit.
+            continue
         elif typing.get_origin(hints[f.name]) is not typing.Annotated:
             _check_size(name, value, usual)
 

@@ -21,8 +21,8 @@ from makebreak.scripts.settings import (
     convert,
     dump_config,
     field_types,
-    nearest,
     to_plain,
+    unknown_key,
 )
 from makebreak.scripts.table import Table, json_value
 from makebreak.scripts.trials import run_many, setting_texts
@@ -77,7 +77,7 @@ class Sweep:
                     f'--vary: got "{text}", expected key=lo:hi or key=a,b,c'
                 )
             if key not in types_of:
-                raise ValueError(f"--vary: unknown key {key}; {nearest(key, types_of)}")
+                raise unknown_key("--vary", key, type(self.config), self.experiment)
             if key in self.ranges or key in self.cases_of:
                 raise ValueError(f"--vary: got {key} twice, expected once")
             if key == "seed":
@@ -296,7 +296,11 @@ def _write_csv(path, runs, results, varied):
         writer.writeheader()
         for (settings, _), result in zip(runs, results, strict=True):
             row = {k: settings[k] for k in varied if k in settings}
-            writer.writerow(row | {k: v for k, v in result.items() if k in columns})
+            row |= {k: v for k, v in result.items() if k in columns}
+            # Lists as JSON, where a value that was not measured is null.
+            writer.writerow(
+                {k: json.dumps(v) if isinstance(v, list) else v for k, v in row.items()}
+            )
 
 
 def _plot(sweep, key, runs, results, measured) -> Figure:

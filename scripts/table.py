@@ -1,9 +1,14 @@
 """A table of results: plain text for the terminal, Markdown and JSON for files."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+
+# A figure that was not measured, within a text such as "nan mm (nan to nan)"; not the
+# word in a quotation or in a name such as position_nan.
+_NAN = re.compile(r"(?<![\w.\"'])nan(?![\w\"'])")
 
 
 @dataclass(frozen=True)
@@ -97,9 +102,13 @@ class Table:
 
     def to_dict(self) -> dict:
         """For JSON: title, columns, one {column: value} per row with `met`, notes."""
+
+        def plain(value):
+            return format_cell(value) if isinstance(value, str) else json_value(value)
+
         met = self.met or [None] * len(self.rows)
         rows = [
-            dict(zip(self.columns, map(json_value, row), strict=True))
+            dict(zip(self.columns, map(plain, row), strict=True))
             | ({} if m is None else {"met": bool(m)})
             for row, m in zip(self.rows, met, strict=True)
         ]
@@ -116,7 +125,8 @@ def _is_number(value) -> bool:
 
 
 def format_cell(value) -> str:
-    """A value as text: four significant digits, yes or no, - for None."""
+    """A value as text: four significant digits, yes or no, - for None and NaN (not
+    measured), within a text too."""
     if isinstance(value, list | tuple | np.ndarray):
         return ", ".join(map(format_cell, value))
     if value is None:
@@ -124,8 +134,11 @@ def format_cell(value) -> str:
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
     if isinstance(value, float | np.floating):
-        return f"{float(value):.4g}"
-    return " ".join(str(value).split())
+        return "-" if np.isnan(value) else f"{float(value):.4g}"
+    text = " ".join(str(value).split())
+    without = _NAN.sub("-", text)
+    alone = without != text and not any(map(str.isdigit, text))  # "nan mm (nan to nan)"
+    return "-" if alone else without
 
 
 def json_value(value):

@@ -104,6 +104,8 @@ def run(config, session):
         **criteria.result(),
         "position_end_m": q[-1],
         "settled_s": float("inf"),
+        "touched_s": float("nan"),
+        "bounces_error_m": [0.5, float("nan")],
         "spring_stiffness": config.spring.stiffness,
     }
 

@@ -13,6 +13,7 @@ import sys
 import tempfile
 import termios
 import time
+from functools import reduce
 from importlib import import_module
 from pathlib import Path
 
@@ -57,6 +58,9 @@ def test_a_run_writes_its_files_and_a_table(capsys):
     assert "position_end_m" in shown.out and "success" in shown.out
     assert "x real time" in shown.err
     assert read("result.json")["settled_s"] is None  # Infinity is not JSON.
+    assert "nan" not in shown.out and re.search(r"touched_s +-\n", shown.out)
+    assert read("result.json")["touched_s"] is None
+    assert read("result.json")["bounces_error_m"] == [0.5, None]
     timing = read("timing.json")
     assert timing["simulated_s"] == 10.0
     assert timing["systems"]["mass"]["updates"] == 1000
@@ -163,7 +167,10 @@ BAD = [
     (["bench", "lsc"], "unknown bench lsc; did you mean lcs?"),
 ]
 BAD_RUN = [
-    (["--set", "nois=1"], "unknown key nois; did you mean noise?"),
+    (
+        ["--set", "nois=1"],
+        "unknown key nois; did you mean noise? (makebreak list spring_mass lists all)",
+    ),
     (["--set", "stiffness=1"], "unknown key stiffness; did you mean spring.stiffness?"),
     (["--set", "spring.stifness=1"], "did you mean spring.stiffness?"),
     (["--set", "noise"], '--set: got "noise", expected key=value'),
@@ -217,6 +224,29 @@ def test_bad_input_is_one_line_on_stderr_and_status_2(args, message, capsys):
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and error.startswith("makebreak: ")
     assert message in error
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_an_unknown_key_is_a_short_line_that_begins_with_what_is_near(name):
+    config = import_module(ALL[name]).Config()
+    with pytest.raises(ValueError) as error:
+        apply_settings(config, ["typo=1"], name)
+    said = str(error.value)
+    assert re.match("--set: unknown key typo; (nearest of|did you mean)", said), said
+    assert said.endswith(f"(makebreak list {name} lists all)") and len(said) < 200
+
+
+def test_infinity_is_accepted_where_it_means_that_there_is_no_limit():
+    config = import_module(ALL["push_object"]).Config()
+    for key in ("impedance.force_max", "reference.touch_speed", "sampler.budget_sec"):
+        before = reduce(getattr, key.split("."), apply_settings(config, [f"{key}=0.5"]))
+        after = reduce(getattr, key.split("."), apply_settings(config, [f"{key}=inf"]))
+        assert (before, after) == (0.5, np.inf)
+    for key in ("reference.speed_max", "impedance.posture_damping", "friction"):
+        with pytest.raises(ValueError, match=f'{key}: got ".inf", expected a number'):
+            apply_settings(config, [f"{key}=inf"])
+    with pytest.raises(ValueError, match="expected a number"):
+        apply_settings(config, ["impedance.force_max=-inf"])
 
 
 def test_a_fault_of_the_program_is_not_called_bad_input(capsys):

@@ -311,6 +311,9 @@ def test_missing_scene_file_is_named(tmp_path):
 def test_nearest_name_or_all_names():
     assert nearest("object_sise", KINDS) == ("did you mean object_size or object_mass?")
     assert nearest("zzz", ["b", "a"]) == "expected one of: b, a"
+    many = [f"name_{i}" for i in range(20)]
+    assert nearest("lane", many).startswith("nearest of 20: name_")
+    assert nearest("lane", many).count(",") == 2
 
 
 def test_model_files_are_found_in_a_folder_with_an_odd_name(tmp_path):

@@ -442,6 +442,26 @@ def test_a_table_is_aligned_and_says_which_rows_miss_their_target():
         Table("Title", ("a",), [(1,), (2,)], met=(True,))
 
 
+@pytest.mark.parametrize(
+    ("value", "text", "in_json"),
+    [
+        (np.nan, "-", None),
+        (np.float32("nan"), "-", None),
+        ([0.25, np.nan], "0.25, -", [0.25, None]),
+        (f"{np.nan:.1f} mm ({np.nan:.1f} to {np.nan:.1f})", "-", "-"),
+        (f"{np.nan:.2f} -> {0.5:.2f} m/s2", "- -> 0.50 m/s2", "- -> 0.50 m/s2"),
+        ("3 of 4, position_nan", "3 of 4, position_nan", "3 of 4, position_nan"),
+        ("a nanometre", "a nanometre", "a nanometre"),
+        ('got "nan"', 'got "nan"', 'got "nan"'),
+    ],
+)
+def test_a_table_shows_a_dash_for_what_was_not_measured(value, text, in_json):
+    table = Table("Title", ("what", "ours"), [("time", value)])
+    assert table.to_text().splitlines()[-1].split(maxsplit=1) == ["time", text]
+    assert table.to_markdown().splitlines()[-1] == f"| time | {text} |"
+    assert table.to_dict()["rows"] == [{"what": "time", "ours": in_json}]
+
+
 def test_a_transposed_table_has_a_column_for_each_row():
     table = Table(
         "Title", ("case", "rate", "error"), [("a=1", "2 of 2", 0.5)], notes="n"
