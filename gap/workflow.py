@@ -20,6 +20,7 @@ from makebreak.gap.data.reading import check_against_scene, read_recordings
 from makebreak.gap.data.recording import Recording, unit_of
 from makebreak.gap.data.scene_facts import scene_facts, scene_names
 from makebreak.gap.data.split import split, with_noise_of
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.parallel import side_by_side
 from makebreak.gap.problem import DISTANCES, Fitted, GapProblem, Outcome, is_sane
@@ -157,17 +158,19 @@ def problem_for(
     """The problem that a scene and recordings are, and what was found on the way.
 
     Args: dynamics: of the scene.
+    Raises: ValueError where no kind of problem fits; and whatever else goes wrong in
+        one that does.
     """
     if _is_mechanism(dynamics, recordings):
         if presses(dynamics, recordings):
             try:
                 return PressingProblem(scene, recordings), []
-            except ValueError:  # Too little motion.
+            except DoesNotFit:  # Too little motion.
                 pass
         if runs_against(dynamics, recordings):
             try:
                 return ImpactProblem(scene, recordings), []
-            except ValueError:  # Too few touches to tell.
+            except DoesNotFit:  # Too few touches to tell.
                 pass
         if is_driven(scene, recordings):
             try:
@@ -179,7 +182,7 @@ def problem_for(
                 if sticks(scene, recordings):
                     driven.learn_misfit()
                     return driven, []
-            except ValueError:  # It takes Drake's steps.
+            except DoesNotFit:  # It takes Drake's steps.
                 pass
         recordings, touches = without_contact(dynamics, recordings)
         scene, finding = _settle_step(scene, recordings, dynamics, jobs)
@@ -189,15 +192,15 @@ def problem_for(
         try:
             contact = contact_problem(scene, recordings)
             return contact, sap_lift(contact) + point_on_face(contact)
-        except ValueError:  # Not the whole motion is measured, or nothing touches.
+        except DoesNotFit:  # Not the whole motion is measured, or nothing touches.
             pass
         try:
             return TouchProblem(scene, recordings), []
-        except ValueError:  # Nothing tells when it touches.
+        except DoesNotFit:  # Nothing tells when it touches.
             pass
     try:
         return FlightProblem(scene, recordings), []
-    except ValueError:  # More than one free body, or other shapes: by Drake's steps.
+    except DoesNotFit:  # More than one free body, or other shapes: by Drake's steps.
         scene, finding = _settle_step(scene, recordings, dynamics, jobs)
         return RolloutProblem(scene, recordings), finding
 

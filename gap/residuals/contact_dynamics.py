@@ -49,7 +49,7 @@ INERTIAL = ("object_mass", "object_com", "object_inertia", "object_size")
 class ContactDynamics(PermittedContacts):
     """Residuals (K, rows) of a scene's equations of motion with permitted forces.
 
-    Raises: ValueError where the recordings do not tell the whole motion (a position of
+    Raises: DoesNotFit where the recordings do not tell the whole motion (a position of
         every joint, a whole pose of every free body), no effort, or nothing touches.
     """
 

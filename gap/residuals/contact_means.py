@@ -13,6 +13,7 @@ from scipy.sparse import block_diag, csr_matrix
 from scipy.spatial.transform import Rotation
 
 from makebreak.gap.data.recording import Recording
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.permitted_forces import (
     RATE_OF_MEAN,
     held_means,
@@ -104,7 +105,7 @@ class _TestFunctions:
 class ContactMeans(Touching):
     """The recordings of a scene as means over test functions.
 
-    Raises: ValueError where the recordings lack a part of the motion (a position of
+    Raises: DoesNotFit where the recordings lack a part of the motion (a position of
         every joint, a whole pose of every free body), or hold too little of it.
     """
 
@@ -112,13 +113,13 @@ class ContactMeans(Touching):
         super().__init__(scene, recordings)
         self.means = self._all_means()
         if len(self.means.time) < FEWEST_MEANS:
-            raise ValueError("the recordings hold too little motion")
+            raise DoesNotFit("the recordings hold too little motion")
 
     def _all_means(self) -> Means:
         of_each = [self._means_of(number) for number in range(len(self.tracks))]
         parts = [part for part in of_each if part is not None]
         if not parts:
-            raise ValueError("no test function fits between changes of contact")
+            raise DoesNotFit("no test function fits between changes of contact")
         joined = {
             name: np.concatenate([getattr(p, name) for p in parts])
             for name in vars(parts[0])

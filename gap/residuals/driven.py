@@ -61,7 +61,7 @@ class DrivenWindows(WindowModel):
     """Windows of a mechanism, simulated by compiled code. What an uncertain start does
     is simulated, too: a stiff drive soon makes it forgotten.
 
-    Raises: ValueError where the scene takes Drake's steps, or no window fits in.
+    Raises: DoesNotFit where the scene takes Drake's steps, or no window fits in.
     """
 
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):

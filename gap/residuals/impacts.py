@@ -15,6 +15,7 @@ import numpy as np
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.pieces import part_of
 from makebreak.gap.data.recording import FEWEST_ROWS, Episode, Recording
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.problem import Candidate, Fitted, Nuisances, SearchPlan
 from makebreak.gap.residuals.contact_candidates import reader_of_trial
 from makebreak.gap.residuals.mechanism import link_changes
@@ -59,7 +60,7 @@ def _met_walls(
     for own in (False, True):
         try:
             shapes = walls_of(dynamics, own)
-        except ValueError:
+        except DoesNotFit:
             return None
         if shapes is not None and _now_and_then(dynamics, shapes, recordings):
             return shapes
@@ -76,7 +77,7 @@ def without_contact(
     for own in (False, True):
         try:
             shapes = walls_of(dynamics, own)
-        except ValueError:
+        except DoesNotFit:
             return kept, []
         if shapes is None:
             continue
@@ -146,7 +147,7 @@ def _now_and_then(dynamics: SceneDynamics, shapes, recordings) -> bool:
 
 def walls_of(dynamics: SceneDynamics, own: bool = False) -> ContactShapes | None:
     """Shapes of links, and of what is fixed and, unless `own`, no part of a robot; None
-    if there are not both. Raises: ValueError as ContactShapes."""
+    if there are not both. Raises: DoesNotFit as ContactShapes."""
     plant = dynamics.plant
     moving = {
         plant.GetModelInstanceName(j.model_instance()) for j in one_dof_joints(plant)
@@ -193,20 +194,20 @@ def nearest(shapes: ContactShapes, dynamics: SceneDynamics, q) -> np.ndarray:
 class ImpactWindows(WindowModel):
     """Windows about touches, and of free motion.
 
-    Raises: ValueError where there are fewer than FEWEST touches.
+    Raises: DoesNotFit where there are fewer than FEWEST touches.
     """
 
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
         scene = with_step(scene, 0.0)
         self.shapes = _met_walls(SceneDynamics(scene), recordings)
         if self.shapes is None:
-            raise ValueError("nothing fixed that a link touches now and then")
+            raise DoesNotFit("nothing fixed that a link touches now and then")
         self._touches = 0
         self._touch_sec: list[float] = []  # How long each lasts.
         self._free: list[Window] = []
         super().__init__(scene, recordings, LONGEST_SEC, most=10**6)
         if self._touches < FEWEST:
-            raise ValueError(f"{self._touches} touches, expected {FEWEST} or more")
+            raise DoesNotFit(f"{self._touches} touches, expected {FEWEST} or more")
         both = []
         touching = [w for w in self.windows if w not in self._free]
         for some, most in ((touching, MOST_TOUCHES), (self._longest(), MOST_FREE)):

@@ -9,6 +9,7 @@ by as much as the equations ask for, until they ask for no more; then the search
 from collections.abc import Iterable, Sequence
 
 from makebreak.gap.data.recording import Recording
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.residuals.contact_problem import BEYOND, MISFIT, ContactProblem
 from makebreak.gap.residuals.pose_times import earlier
@@ -22,7 +23,7 @@ def contact_problem(scene: Scene, recordings: Sequence[Recording]) -> ContactPro
     """The problem with poses where they belong in time; `late` says by how much each
     body's were moved.
 
-    Raises: ValueError as ContactProblem.
+    Raises: DoesNotFit as ContactProblem.
     """
     problem = first = ContactProblem(scene, recordings)
     late: dict[str, float] = {}
@@ -34,7 +35,7 @@ def contact_problem(scene: Scene, recordings: Sequence[Recording]) -> ContactPro
             break
         try:
             other = ContactProblem(scene, earlier(recordings, trial))
-        except ValueError:  # Too little is left to say so.
+        except DoesNotFit:  # Too little is left to say so.
             break
         problem, late = other, trial
     if not late or wanted(problem):

@@ -14,6 +14,7 @@ import numpy as np
 from pydrake.multibody.tree import BodyIndex
 
 from makebreak.gap.data.recording import Recording
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.permitted_forces import explain
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate, Fitted, Nuisances
@@ -69,7 +70,7 @@ def presses(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
     of the time shapes are in touch."""
     try:
         shapes = walls_of(dynamics)
-    except ValueError:
+    except DoesNotFit:
         return False
     if shapes is None:
         return False
@@ -96,7 +97,7 @@ def presses(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
 
 
 class PressingProblem(ContactProblem):
-    """Raises: ValueError where anything but joints moves, or as ContactDynamics."""
+    """Raises: DoesNotFit where anything but joints moves, or as ContactDynamics."""
 
     moves = MOVES
     # A wall that was met for a moment shows in its own distance alone.
@@ -112,7 +113,7 @@ class PressingProblem(ContactProblem):
     def _read_coordinates(self) -> None:
         super()._read_coordinates()
         if self.bodies:
-            raise ValueError("something moves freely")
+            raise DoesNotFit("something moves freely")
 
     def _evaluate_nodes(self) -> None:
         self._slots_at: dict[tuple, list[Slot]] = {}  # See _slots_with.

@@ -7,6 +7,7 @@ import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 
 from makebreak.gap.data.recording import Episode, Recording
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.permitted_forces import FEWEST
 from makebreak.gap.residuals.wrench_sensor import wrench_sensors
 from makebreak.gap.simulation.contact_shapes import ContactShapes, poses_of
@@ -48,7 +49,7 @@ class SceneMotion:
         tracks: the episodes, smoothed; their rows one after the other are those of all.
         half: half width of a test function [s].
 
-    Raises: ValueError where the recordings lack a part of the motion (a position of
+    Raises: DoesNotFit where the recordings lack a part of the motion (a position of
         every joint, a whole pose of every free body), or no episode is long enough.
     """
 
@@ -70,7 +71,7 @@ class SceneMotion:
                 if track is not None:
                     self.tracks.append(track)
         if not self.tracks:
-            raise ValueError("no episode is long enough for equations of motion")
+            raise DoesNotFit("no episode is long enough for equations of motion")
         self._offset = np.cumsum([0, *(len(t.time) for t in self.tracks)])
         self._q = np.vstack([t.q for t in self.tracks])
         self._v = np.vstack([t.v for t in self.tracks])
@@ -91,14 +92,14 @@ class SceneMotion:
         for i in sorted(plant.GetFloatingBaseBodies()):
             body = plant.get_body(i)
             if not body.has_quaternion_dofs():
-                raise ValueError("a floating base without a quaternion")
+                raise DoesNotFit("a floating base without a quaternion")
             self.bodies[full_name(plant, body)] = (
                 body.floating_positions_start(),
                 body.floating_velocities_start_in_v(),
             )
         n = len(self.joints) + 6 * len(self.bodies)
         if n != plant.num_velocities():
-            raise ValueError(
+            raise DoesNotFit(
                 "the scene has other joints than those with one coordinate"
             )
         self.coordinates = [""] * plant.num_velocities()
@@ -112,10 +113,10 @@ class SceneMotion:
         for recording in self.recordings:
             for joint in self.joints:
                 if f"{joint}.position" not in recording:
-                    raise ValueError(f"expected {joint}.position")
+                    raise DoesNotFit(f"expected {joint}.position")
             for body in self.bodies:
                 if not all(f"{body}.{a}" in recording for a in POSE):
-                    raise ValueError(f"expected the whole pose of {body}")
+                    raise DoesNotFit(f"expected the whole pose of {body}")
 
     def _read_drives(self) -> None:
         """by: {joint: how its effort is known}: "law" (the drive's, from commands and

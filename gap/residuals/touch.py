@@ -14,6 +14,7 @@ from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.gap.data.recording import Recording
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.selection import benjamini_hochberg
 from makebreak.gap.problem import Candidate, Nuisances, rms
 from makebreak.gap.result import GapMeasure, InUnits, Series, Where
@@ -57,7 +58,7 @@ class TouchModel:
     """The distances (n,) over their noise, while something is touched: the questions
     that InverseModel answers, for a mechanism that touches free bodies.
 
-    Raises: ValueError if the recordings hold no such touch: they need the joints'
+    Raises: DoesNotFit if the recordings hold no such touch: they need the joints'
         positions, a force at a body of the mechanism, and x and y of a free body.
     """
 
@@ -76,7 +77,7 @@ class TouchModel:
         self._loaded_of: tuple = ()
         self.touches = self._find(plant)
         if not sum(len(touch.rows) for touch in self.touches) >= 20:
-            raise ValueError("the recordings hold no touch that a wrench tells of")
+            raise DoesNotFit("the recordings hold no touch that a wrench tells of")
         self._slope = [self._slopes(touch) for touch in self.touches]
         self._stds = [
             self._std(touch, slopes)

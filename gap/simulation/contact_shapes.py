@@ -18,6 +18,7 @@ from pydrake.geometry import Box, Capsule, Convex, Cylinder, HalfSpace, Mesh, Sp
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics import surface_distance
 from makebreak.gap.numerics.edge_crossings import Edge, crossing, edges_of_box
 from makebreak.models.effects.kind import full_name
@@ -196,14 +197,14 @@ class ContactShapes:
     """The points and surfaces of a loaded scene.
 
     Args: hulls: whether meshes count, as their convex hulls.
-    Raises: ValueError for friction zones, or a free body with another shape.
+    Raises: DoesNotFit for friction zones, or a free body with another shape.
     """
 
     def __init__(self, loaded: LoadedScene, hulls: bool = True):
         self._hulls = hulls
         plant, inspector = loaded.plant, loaded.scene_graph.model_inspector()
         if loaded.scene.friction_zones:
-            raise ValueError("friction zones are Drake's alone")
+            raise DoesNotFit("friction zones are Drake's alone")
         self.points: list[_Point] = []
         self.surfaces: list[_Surface] = []
         self.boxes: list[_BoxEdges] = []
@@ -235,7 +236,7 @@ class ContactShapes:
                     self.boxes.append(_BoxEdges(k, g, free, edges, p, radius, *own))
                 if not self._add(k, g, shape, R, p, own):
                     if body.is_floating_base_body():
-                        raise ValueError(
+                        raise DoesNotFit(
                             f"{full_name(plant, body)}: no contact of a "
                             f"{type(shape).__name__} is known here"
                         )

@@ -15,6 +15,7 @@ from functools import partial
 import numpy as np
 
 from makebreak.gap.data.recording import Episode, Recording
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.simulation.contact_shapes import ContactShapes, poses_of
 from makebreak.gap.simulation.face_supports import LiesOn, add_supports
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
@@ -47,7 +48,7 @@ class PushWindows(WindowModel):
     """Args: episodes: (recording, number) of those that count, else all. lying: bodies
     that lie on faces, which are carried by face_supports.
 
-    Raises: ValueError where no window fits in.
+    Raises: DoesNotFit where no window fits in.
     """
 
     def __init__(
@@ -74,7 +75,7 @@ class PushWindows(WindowModel):
             if c.rsplit(".", 1)[0] not in led and varies(recordings, c)
         ]  # fmt: skip
         if not keep:
-            raise ValueError("nothing but joints that are led as they were measured")
+            raise DoesNotFit("nothing but joints that are led as they were measured")
         self.channels = [self.channels[k] for k in keep]
         self.noise = self.noise[keep]
         self.windows = [replace(w, std=w.std[:, keep]) for w in self.windows]

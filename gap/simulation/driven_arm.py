@@ -8,6 +8,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, PrismaticJoint, RevoluteJoint
 from pydrake.systems.framework import DiagramBuilder
 
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.driven_arm import (
     EFFORT,
     LOOP,
@@ -54,7 +55,7 @@ class DrivenArmScene:
     """A scene's joints and drives, read off its plant; effects that do not change the
     plant change the numbers without another plant.
 
-    Contact is left out. Raises: ValueError where anything moves that is no joint of
+    Contact is left out. Raises: DoesNotFit where anything moves that is no joint of
     one degree of freedom, or effects do what is not in DrivenArm.
     """
 
@@ -73,7 +74,7 @@ class DrivenArmScene:
         every.sort(key=lambda e: KINDS[e.kind].rank)
         for effect in every:
             if not can_have(effect.kind):
-                raise ValueError(f"effect {effect.kind} takes Drake's own steps")
+                raise DoesNotFit(f"effect {effect.kind} takes Drake's own steps")
         plant, body_numbers = self._plant([e for e in every if _in_plant(e.kind)])
         for effect in every:
             possible = KINDS[effect.kind].possible
@@ -168,7 +169,7 @@ class DrivenArmSimulation(SceneSimulation):
     """As SceneSimulation, by compiled code: some hundred times as fast. A plant with a
     time step is taken as a continuous one.
 
-    Raises: ValueError as DrivenArmScene.
+    Raises: DoesNotFit as DrivenArmScene.
     """
 
     def __init__(self, scene: Scene):
@@ -227,7 +228,7 @@ def _in_plant(kind: str) -> bool:
 def _tree(plant: MultibodyPlant) -> dict:
     """The joints and links of a plant, as of a DrivenArm.
 
-    Raises: ValueError for anything else that moves, or pulls.
+    Raises: DoesNotFit for anything else that moves, or pulls.
     """
     joints = sorted(
         (j for j in one_dof_joints(plant) if j.num_velocities()),
@@ -235,13 +236,13 @@ def _tree(plant: MultibodyPlant) -> dict:
     )
     n = plant.num_velocities()
     if len(joints) != n or plant.num_positions() != n:
-        raise ValueError(
+        raise DoesNotFit(
             "expected joints that turn or slide and nothing else that moves"
         )
     if not all(isinstance(j, RevoluteJoint | PrismaticJoint) for j in joints):
-        raise ValueError("expected joints that turn or slide")
+        raise DoesNotFit("expected joints that turn or slide")
     if plant.num_force_elements() > 1:
-        raise ValueError("expected no force elements but gravity")
+        raise DoesNotFit("expected no force elements but gravity")
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, np.zeros(n))
     carried = {j.child_body().index(): i for i, j in enumerate(joints)}
@@ -261,7 +262,7 @@ def _tree(plant: MultibodyPlant) -> dict:
     X_WM = [j.frame_on_child().CalcPoseInWorld(context) for j in joints]
     parent = np.array([link_of(j.parent_body().index()) for j in joints])
     if (parent >= np.arange(n)).any():
-        raise ValueError("expected joints in order, from the base outwards")
+        raise DoesNotFit("expected joints in order, from the base outwards")
     R_PJ, p_PJ, axis = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3))
     mass, moment, about = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3, 3))
     for i, joint in enumerate(joints):

@@ -10,6 +10,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.free_body import FreeBody
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.contact_surface import DEFAULT_DISSIPATION
@@ -30,7 +31,7 @@ class FreeBodyScene:
     """A scene's one free body, read off its plant once; effects change its numbers
     without another plant, which would take longer than all windows' steps.
 
-    Raises: ValueError where the scene has anything else that moves, shapes other than
+    Raises: DoesNotFit where the scene has anything else that moves, shapes other than
         a body of spheres on boxes and half-spaces, or effects of other kinds.
     """
 
@@ -38,16 +39,16 @@ class FreeBodyScene:
         self.scene = scene
         for effect in scene.effects:
             if effect.kind not in (*_FORCES, "length_scale", *_PLANT):
-                raise ValueError(f"effect {effect.kind} is not one of a free body")
+                raise DoesNotFit(f"effect {effect.kind} is not one of a free body")
         if scene.friction_zones or scene.plant.contact_model != "point":
-            raise ValueError(
+            raise DoesNotFit(
                 "friction zones and hydroelastic contact are Drake's alone"
             )
         loaded = load_scene(scene, DiagramBuilder())
         plant = loaded.plant
         bodies = [plant.get_body(i) for i in sorted(plant.GetFloatingBaseBodies())]
         if len(bodies) != 1 or plant.num_velocities() != 6:
-            raise ValueError("expected one free body and nothing else that moves")
+            raise DoesNotFit("expected one free body and nothing else that moves")
         self.name = full_name(plant, bodies[0])
         self._read(loaded, bodies[0])
 
@@ -81,12 +82,12 @@ class FreeBodyScene:
         plant, inspector = loaded.plant, loaded.scene_graph.model_inspector()
         mine = plant.GetCollisionGeometriesForBody(body)
         if not mine:
-            raise ValueError(f"{self.name} has nothing to touch with")
+            raise DoesNotFit(f"{self.name} has nothing to touch with")
         spheres = []
         for g in mine:
             shape = inspector.GetShape(g)
             if not isinstance(shape, Sphere):
-                raise ValueError(f"a {type(shape).__name__} of a free body")
+                raise DoesNotFit(f"a {type(shape).__name__} of a free body")
             centre = inspector.GetPoseInFrame(g).translation()
             spheres.append([*centre, shape.radius()])
         context = plant.CreateDefaultContext()
@@ -106,7 +107,7 @@ class FreeBodyScene:
                 elif isinstance(shape, HalfSpace):
                     half = np.array([-1.0, 0.0, 0.0])
                 else:
-                    raise ValueError(f"a {type(shape).__name__} that is fixed")
+                    raise DoesNotFit(f"a {type(shape).__name__} that is fixed")
                 fixed.append([*X.rotation().matrix().ravel(), *X.translation(), *half])
                 others.append(g)
                 origins.append(X_WB.translation())

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from makebreak.gap.data.recording import Episode, Recording
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.free_body import FreeBody, lowest_gap, placed, simulate
 from makebreak.gap.numerics.free_flight import fit_flight, turned_by
 from makebreak.gap.simulation.free_body import FreeBodyScene
@@ -60,7 +61,7 @@ class FreeWindow:
 class FreeBodyModel(WindowedResidual):
     """Residuals of windows of one free body, as InverseModel gives those of mechanisms.
 
-    Raises: ValueError where scene or recordings hold anything else (FreeBodyScene); the
+    Raises: DoesNotFit where scene or recordings hold anything else (FreeBodyScene); the
         body's x, y and z must be measured.
     """
 
@@ -77,10 +78,10 @@ class FreeBodyModel(WindowedResidual):
         self.bodies, self.joints = [self.name], list[str]()
         self.dynamics = SceneDynamics(scene)
         if not all(f"{self.name}.{a}" in r for a in _PLACE for r in recordings):
-            raise ValueError(f"expected x, y and z of {self.name} in all recordings")
+            raise DoesNotFit(f"expected x, y and z of {self.name} in all recordings")
         self._turns = all(f"{self.name}.{a}" in r for a in TURN for r in recordings)
         if not self._turns and (len(self._body.spheres) > 1 or self._body.com.any()):
-            raise ValueError(f"expected the orientation of {self.name}")
+            raise DoesNotFit(f"expected the orientation of {self.name}")
         self.channels = [
             c for a in _STATE if all((c := f"{self.name}.{a}") in r for r in recordings)
         ]
@@ -112,7 +113,7 @@ class FreeBodyModel(WindowedResidual):
             order = np.argsort([w.after_hits for w in self.windows], kind="stable")
             self.windows = [self.windows[k] for k in sorted(order[:most])]
         if not self.windows:
-            raise ValueError(
+            raise DoesNotFit(
                 f"no episode holds {FEWEST_ROWS} samples of {self.name} between impacts"
             )
         self._seen = [self._measured(w) for w in self.windows]

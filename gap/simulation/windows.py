@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from makebreak.gap.data.recording import Episode, Recording
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.simulation.channel_effects import (
     given_late,
     lag_of,
@@ -165,7 +166,7 @@ class WindowModel(WindowedResidual):
             and name.rsplit(".", 1)[0] in (*self.joints, *self.bodies)
         ]
         if not self.channels:
-            raise ValueError(
+            raise DoesNotFit(
                 "no measured channel of the recordings can be simulated: expected "
                 "positions of joints or poses of free bodies"
             )
@@ -192,7 +193,7 @@ class WindowModel(WindowedResidual):
             keep = np.unique(np.linspace(0, len(self.windows) - 1, most).astype(int))
             self.windows = [self.windows[k] for k in keep]
         if not self.windows:
-            raise ValueError(
+            raise DoesNotFit(
                 f"no episode of the recordings holds a window of {window_sec} s"
             )
         self._commands: dict[tuple[float, ...], list[dict[int, Commands]]] = {}

@@ -1,0 +1,56 @@
+"""Which kind of problem a scene and recordings are: the next one is asked only where
+one says that it is not for them."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from makebreak.gap import workflow
+from makebreak.gap.does_not_fit import DoesNotFit
+
+# Of joints alone, and beside free bodies: the order in which problems are asked.
+OF_JOINTS = ["PressingProblem", "ImpactProblem", "DrivenProblem", "MechanismProblem"]
+OF_BODIES = ["contact_problem", "TouchProblem", "FlightProblem", "RolloutProblem"]
+
+
+def with_problems(monkeypatch, first_that_fits, order, error=DoesNotFit):
+    """A workflow whose problems are their own names, of which those before one do not
+    fit; the one just before it raises `error`."""
+    fits = order.index(first_that_fits)
+    for k, name in enumerate(order):
+
+        def make(scene, recordings, k=k, name=name):
+            if k < fits:
+                raise (error if k == fits - 1 else DoesNotFit)("setting an element")
+            return SimpleNamespace(
+                name=name, is_explained=lambda: True, push_findings=lambda: []
+            )
+
+        monkeypatch.setattr(workflow, name, make)
+    for name in ("presses", "runs_against", "is_driven"):
+        monkeypatch.setattr(workflow, name, lambda *_: True)
+    is_mechanism = order is OF_JOINTS
+    monkeypatch.setattr(workflow, "_is_mechanism", lambda *_: is_mechanism)
+    joint = SimpleNamespace(num_velocities=lambda: 1)
+    monkeypatch.setattr(workflow, "one_dof_joints", lambda plant: [joint])
+    monkeypatch.setattr(workflow, "without_contact", lambda *_: ([], []))
+    monkeypatch.setattr(workflow, "_settle_step", lambda scene, *_: (scene, []))
+    for name in ("sap_lift", "point_on_face"):
+        monkeypatch.setattr(workflow, name, lambda problem: [])
+    return workflow.problem_for(None, [], SimpleNamespace(plant=None))
+
+
+@pytest.mark.parametrize("order", [OF_JOINTS, OF_BODIES])
+def test_the_first_problem_that_fits_is_taken(monkeypatch, order):
+    for name in order:
+        problem, _ = with_problems(monkeypatch, name, order)
+        assert problem.name == name
+
+
+@pytest.mark.parametrize("order", [OF_JOINTS, OF_BODIES])
+def test_a_defect_inside_a_problem_is_not_taken_for_one_that_does_not_fit(
+    monkeypatch, order
+):
+    for name in order[1:]:
+        with pytest.raises(ValueError, match="setting an element"):
+            with_problems(monkeypatch, name, order, error=ValueError)
