@@ -1,7 +1,8 @@
 """`makebreak bench`: measures computing times.
 
 Each benchmark is a module with `rows() -> list[dict]`: what is measured, value, unit,
-and further columns. Values are process CPU time, or ratios from one run.
+and further columns. Values are process CPU time, ratios from one run, or, of those that
+run only where they are named, errors and counts.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,7 +27,10 @@ BENCHES: dict[str, str] = {
     "latency": "makebreak.scripts.bench_latency",
     "diagrams": "makebreak.scripts.bench_diagrams",
     "gap": "makebreak.scripts.bench_gap",
+    "c3_light": "makebreak.scripts.bench_c3_light",
+    "learner_plants": "makebreak.scripts.bench_learner_plants",
 }
+NAMED_ONLY = ("c3_light", "learner_plants")
 
 
 def median_call_ms(
@@ -49,7 +53,7 @@ def median_call_ms(
 
 
 def bench(names: Sequence[str] = ()) -> Table:
-    """Runs the benchmarks of these names, or all.
+    """Runs the benchmarks of these names, or all that measure times.
 
     One that fails gives a row with the error, and does not stop the others.
 
@@ -61,7 +65,7 @@ def bench(names: Sequence[str] = ()) -> Table:
         if name not in here:
             raise ValueError(f"unknown bench {name}; {nearest(name, here)}")
     found: list[dict] = []
-    for name in names or here:
+    for name in names or [name for name in here if name not in NAMED_ONLY]:
         try:
             rows = import_module(BENCHES[name]).rows()
         except Exception as error:  # Of any kind, so that the others still run.

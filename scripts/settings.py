@@ -104,6 +104,7 @@ _BOUNDS = {
     "seed": Between(None, 2.0**63 - 1.0),
     "friction": Between(0.0, 100.0),
     "integral_sec": Between(1e-3, None, "s"),  # Infinite: no integral.
+    "hold_sec": Between(0.0, None, "s"),  # Infinite: without end.
 }
 # Limits of other numbers: real ones over the default (or 1), integers over it (or 10).
 _RATIO_MAX, _COUNT_RATIO_MAX = 1e4, 1000
