@@ -8,6 +8,7 @@ from makebreak.gap.data.table import write_recording
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.residuals import contact_dynamics
 from makebreak.gap.residuals.pressing import PressingProblem, presses
+from makebreak.gap.residuals.touching import MEETS
 from makebreak.gap.search.choice import Choice
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.rivals import still_tied
@@ -49,7 +50,7 @@ tolerance: {link_mass: 0.001, link_com_m: 0.0001}
 TABLE, WALL = "table.table", "wall.wall"
 
 
-def write_scene(folder):
+def write_scene(folder, wall_size=(0.1, 1.0, 0.2)):
     light = LINK.format(name="{}", mass=1e-6, shape="")
     ball = SHAPE.format(
         at="0 0 0 0 0 0", what=f"<sphere><radius>{RADIUS}</radius></sphere>", mu=1.0
@@ -64,9 +65,10 @@ def write_scene(folder):
         body += JOINT.format(name=name, parent=parent, child=child, axis=axis)
     body += '<frame name="tip" attached_to="tool"/>'
     (folder / "gantry.sdf").write_text(MODEL.format(name="gantry", body=body))
+    x, y, z = wall_size
     for name, at, size, mu in (
         ("table", "0 0 -0.05 0 0 0", "2 2 0.1", TABLE_MU),
-        ("wall", "0.05 0 0.1 0 0 0", "0.1 1 0.2", WALL_MU),
+        ("wall", f"{x / 2} 0 {z / 2} 0 0 0", f"{x} {y} {z}", WALL_MU),
     ):
         shape = SHAPE.format(
             at=at, what=f"<box><size>{size}</size></box>", mu=mu / (2 - mu)
@@ -218,6 +220,39 @@ def test_what_stands_on_something_is_displaced_with_it(displaced):
         )
 
 
+def test_the_lower_edge_of_what_stands_on_a_table_pushes_nothing_down_into_it(right):
+    """With the table 25 mm too high the middle of the ball is below the wall."""
+    problem = right[2]
+    higher = Effect("plane_height", [TABLE, WALL], {"height": 0.025})
+    number = {name: k for k, name in problem.shapes.names.items()}
+    slots, _ = problem._slots([higher])
+    pressing = 0
+    for s in slots:
+        if s.b == number[WALL]:
+            on = s.phi < MEETS
+            np.testing.assert_allclose(
+                s.normal[on], np.tile([-1.0, 0.0, 0.0], (on.sum(), 1))
+            )
+            pressing += on.sum()
+    assert pressing > 100
+
+
+def test_what_stands_on_another_body_with_a_part_of_its_bottom_ends_there(tmp_path):
+    scene = write_scene(tmp_path)
+    over = SCENE.replace("[0.3, 0, 0]", "[0.95, 0, 0]")
+    (tmp_path / "over.yaml").write_text(over)
+    recordings = record(tmp_path)
+    half = []
+    for each in (scene, read_scene(tmp_path / "over.yaml")):
+        problem = PressingProblem(each, recordings)
+        number = {name: k for k, name in problem.shapes.names.items()}
+        assert problem._carried[number[TABLE]] == {number[WALL]}
+        [wall] = [s for s in problem.shapes.surfaces if s.body == number[WALL]]
+        half.append(wall.size[0])
+    np.testing.assert_allclose(half[0], [0.05, 0.5, 0.1 + 0.1 / 2])  # The table's.
+    np.testing.assert_allclose(half[1], [0.05, 0.5, 0.1])
+
+
 def test_a_wall_is_felt_though_the_tool_is_below_it_as_the_scene_has_it(tmp_path):
     """A ball of 40 mm on a table that is 45 mm lower is below the wall, which stands on
     the table: 22 mm off, it is found all the same."""
@@ -226,6 +261,24 @@ def test_a_wall_is_felt_though_the_tool_is_below_it_as_the_scene_has_it(tmp_path
     off = {problem.shapes.names[k]: by for k, by in problem.off.items()}
     assert off[TABLE]["z"] == pytest.approx(-0.045, abs=1e-3)
     assert off[WALL]["x"] == pytest.approx(0.022, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    "size, table, wall",
+    [((0.06, 1.0, 0.2), 0.0, 0.36), ((0.1, 1.0, 0.03), 0.0, 0.34),
+     ((0.1, 1.0, 0.03), 0.012, 0.325)],
+    ids=["beyond its middle", "near its top", "whose top stands in for the table"],
+)  # fmt: skip
+def test_a_wall_in_which_the_tool_is_deep_was_passed_on_the_side_that_it_presses_on(
+    tmp_path, size, table, wall
+):
+    """The nearest face is another one: the far one where the tool is beyond the middle,
+    the upper one where the wall is low."""
+    scene = write_scene(tmp_path, size)
+    problem = PressingProblem(scene, record(tmp_path, table=table, wall=wall))
+    off = {problem.shapes.names[k]: by for k, by in problem.off.items()}
+    assert off[WALL] == {"x": pytest.approx(wall - 0.3, abs=1e-3)}
+    assert off.get(TABLE, {"z": 0.0})["z"] == pytest.approx(table, abs=1e-3)
 
 
 def test_places_and_frictions_are_named(displaced):

@@ -9,6 +9,7 @@ passed. What touches what, and its distance, follow from that.
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from pydrake.multibody.tree import BodyIndex
@@ -34,10 +35,11 @@ KNOCKED = 8e-3  # A knock goes no deeper than this [m].
 FEWEST_ROWS = 5  # In which a face is pressed on.
 SAME = 5e-4  # A face that is off by less is where the scene has it [m].
 PASSED = 4e-3  # No contact lets a tool so far in [m].
+STILL_DEEP = 0.1  # Of the nodes at which it was: knocks go deeper, too.
 FELT, LESS = 4.0, 0.5  # Mean square of what is left where a face is felt; with it.
 CLEAR, LEAST_FORCE, FELT_SHARE = 6.0, 0.5, 0.03  # Times noise, [N], of the rows.
 MOVES = ("wall_position", "plane_height")
-WHOLE = 0.9  # Of the squares left: what one more of a body leaves is tried first.
+WHOLE = 0.9  # Of the squares left: one more place or friction must leave less.
 SOFTER = (0.3, 0.6, 2.0)  # Times the stiffness of the scene: trials.
 SQUEEZED = 10.0  # Times what a row needs: forces that act in it, at most.
 MOST_FRICTION = 2.0  # Of what is taken for any.
@@ -52,12 +54,14 @@ STANDS, LEVEL = 1e-3, 0.9  # It stands on what is so near below it [m]; cosine.
 class _Face:
     """A face of a fixed body: its normal (3,) and by how far along it the body may be
     off [m]; below zero: by so much the tool went through it as the scene has it. lift:
-    how much higher the body is with what it stands on [m]."""
+    how much higher the body is with what it stands on [m]. is_alone: whether no other
+    face of the body was passed; else each point went through the nearest one."""
 
     body: int
     normal: np.ndarray
     off: float
     lift: float = 0.0
+    is_alone: bool = False
 
     @property
     def by(self) -> np.ndarray:
@@ -133,6 +137,7 @@ class PressingProblem(ContactProblem):
         test function."""
         poses = self._poses_at(self._q)
         self._carried = self._find_carried(poses)
+        self._sink_what_stands(poses)
         self.faces = self._possible_faces(poses)
         found = super()._touching_rows()
         for number, face in enumerate(self.faces):
@@ -200,6 +205,45 @@ class PressingProblem(ContactProblem):
                 on[k] = mine.union(*(on[each] for each in mine)) - {k}
         return on
 
+    def _sink_what_stands(self, poses) -> None:
+        """A box whose whole bottom is on another box, or a half-space, goes on into
+        that. Its lower edge would push down a tool that is a little too deep in what it
+        stands on, and a place that is wrong by so much would explain forces by that."""
+        stands = {k for own in self._carried.values() for k in own}
+        for number, s in enumerate(self.shapes.surfaces):
+            if s.kind != "box" or s.body not in stands:
+                continue
+            R_b, p_b = poses[s.body][0][0], poses[s.body][1][0]
+            R = R_b @ s.R_BG
+            axis = int(np.argmax(np.abs(R[2])))
+            down = -np.sign(R[2, axis])
+            (half,) = s.size
+            corners = np.array(list(product((-1.0, 1.0), repeat=3))) * half
+            bottom = corners[corners[:, axis] * down > 0.0]
+            places = p_b + (s.p_BG + bottom @ s.R_BG.T) @ R_b.T
+            below = self._thickness_below(places, s.body, poses)
+            if abs(R[2, axis]) > LEVEL and below:
+                longer = np.eye(3)[axis] * 0.5 * below
+                self.shapes.surfaces[number] = replace(
+                    s, size=(half + longer,), p_BG=s.p_BG + s.R_BG @ (down * longer)
+                )
+
+    def _thickness_below(self, places, body: int, poses) -> float:
+        """How thick the box or half-space is on which all places (n, 3) of a body are,
+        REACH at most [m]; 0 where they are on none."""
+        for s in self.shapes.surfaces:
+            is_flat = s.kind in ("box", "half_space")
+            if not is_flat or body not in self._carried.get(s.body, ()):
+                continue
+            R, p = poses[s.body][0][0], poses[s.body][1][0]
+            d, _ = s.distance((places - p) @ R)
+            if (np.abs(d) < STANDS).all():
+                if s.kind == "half_space":
+                    return REACH
+                thick = 2.0 * np.abs((R @ s.R_BG)[2]) @ s.size[0]
+                return min(float(thick), REACH)
+        return 0.0
+
     def _possible_faces(self, poses) -> list[_Face]:
         """Faces of fixed boxes over which the tool came, with how near it kept to them:
         so far they may be off, if it pressed on them there. Of what stands on another
@@ -230,28 +274,37 @@ class PressingProblem(ContactProblem):
             R_b, p_b = poses[s.body][0][0], poses[s.body][1][0]
             R, centre = R_b @ s.R_BG, p_b + R_b @ s.p_BG
             (half,) = s.size
-            nearest = np.full((len(self._q), 3, 2), np.inf)
+            # From each face with its normals -x, x, ...: where a point inside went
+            # through the nearest face, and where all of them went through one.
+            nearest, alone = np.full((2, 6, len(self._q)), np.inf)
+            deepest = np.full(len(self._q), np.inf)
             for point in moving:
                 if self.shapes.never_touch(point, s):
                     continue
                 R_a, p_a = poses[point.body]
                 local = (p_a + R_a @ point.p_B - centre) @ R
-                # How far outside of each pair of faces; of the deepest inside of all
-                # the nearest face is the one that was passed.
                 out = np.abs(local) - half
+                deepest = np.minimum(deepest, out.max(axis=1) - point.radius)
                 for axis in range(3):
                     others = np.delete(out, axis, axis=1).max(axis=1)
-                    over = (others < 0.0) & (out[:, axis] > others)
-                    d = np.where(over, out[:, axis] - point.radius, np.inf)
-                    side = (local[:, axis] > 0.0).astype(int)
-                    rows = np.arange(len(d))
-                    nearest[rows, axis, side] = np.minimum(nearest[rows, axis, side], d)
-            for axis in range(3):
-                for side, sign in enumerate((-1.0, 1.0)):
-                    normal = sign * R[:, axis]
-                    off = self._kept_distance(nearest[:, axis, side], normal)
-                    if abs(off) < REACH:
-                        found.append(_Face(s.body, normal, off))
+                    for k, sign in ((2 * axis, -1.0), (2 * axis + 1, 1.0)):
+                        x = sign * local[:, axis]
+                        d = x - half[axis] - point.radius
+                        over = others < 0.0
+                        alone[k] = np.minimum(alone[k], np.where(over, d, np.inf))
+                        over &= (x >= 0.0) & (out[:, axis] > others)
+                        nearest[k] = np.minimum(nearest[k], np.where(over, d, np.inf))
+            is_deep = np.sum(deepest < -PASSED) >= FEWEST_ROWS
+            for k in range(6):
+                normal = (-1.0, 1.0)[k % 2] * R[:, k // 2]
+                off = self._kept_distance(nearest[k], normal)
+                if abs(off) < REACH:
+                    found.append(_Face(s.body, normal, off))
+                if not is_deep:
+                    continue
+                more = self._kept_distance(alone[k], normal)
+                if -REACH < more < min(-PASSED, off - SAME):
+                    found.append(_Face(s.body, normal, more, is_alone=True))
         return found
 
     def _kept_distance(self, d: np.ndarray, normal: np.ndarray) -> float:
@@ -382,18 +435,77 @@ class PressingProblem(ContactProblem):
 
     def _felt_faces(self) -> dict[int, dict[str, float]]:
         """{body: {axis: by how far [m]}} of faces that are off and felt, or passed."""
-        off: dict[int, dict[str, float]] = {}
         left = [f for f in self.faces if abs(f.off) > SAME]
         left.sort(key=lambda f: -abs(f.normal @ UP))  # What others stand on first.
+        return self._completed({}, left)
+
+    def _completed(
+        self,
+        off: dict[int, dict[str, float]],
+        left: Sequence[_Face],
+        looks_ahead: bool = True,
+    ) -> dict[int, dict[str, float]]:
+        """`off` with those of the faces left that are passed, or felt beside others.
+
+        Args: looks_ahead: whether each way in which a body may have been passed is
+            judged with all that is felt then: forces of a body that is still to be
+            displaced would be put down to the wrong way.
+        """
         while left:
-            face = next(
-                (f for f in left if f.off < -PASSED and self._is_of(f, off)), None
-            ) or self._best_felt(left, off)
+            body, ways, rest = self._ways_passed(left, off)
+            if ways:
+                deep = self._deep_nodes(off)[body]
+                if looks_ahead and self._may_be_lifted(body, left, off):
+                    ways = [*ways, []]  # Then it was not passed.
+
+                def quality(way: list[_Face], off=off, rest=rest, body=body, deep=deep):
+                    trial = self._with(off, way)
+                    if looks_ahead:
+                        trial = self._completed(trial, rest, looks_ahead=False)
+                    still = self._deep_nodes(trial).get(body, 0) > STILL_DEEP * deep
+                    places = sum(map(len, trial.values()))
+                    return still, self._mean_squares(trial).sum() / WHOLE**places
+
+                best = min(ways, key=quality) if len(ways) > 1 else ways[0]
+                off, left = self._with(off, best), rest
+                continue
+            face = self._best_felt([f for f in left if not f.is_alone], off)
             if face is None:
                 break
-            self._add(off, face)
-            left.remove(face)
+            off, left = self._with(off, [face]), [f for f in left if f is not face]
         return off
+
+    def _ways_passed(
+        self, left: Sequence[_Face], off: dict[int, dict[str, float]]
+    ) -> tuple[int, list[list[_Face]], list[_Face]]:
+        """The first body that the tool is deep in; the faces of it that may have been
+        passed: all that are nearest to the tool's points, or one alone; and the faces
+        left beside those. No way where it is in no body."""
+        passed = [f for f in left if f.off < -PASSED and self._is_of(f, off)]
+        deep = self._deep_nodes(off) if passed else {}
+        body = next((f.body for f in passed if f.body in deep), -1)
+        mine = [f for f in passed if f.body == body]
+        near = [f for f in mine if not f.is_alone]
+        ways = [near] * bool(near) + [[f] for f in mine if f.is_alone]
+        return body, ways, [f for f in left if f not in mine]
+
+    def _may_be_lifted(
+        self, body: int, left: Sequence[_Face], off: dict[int, dict[str, float]]
+    ) -> bool:
+        """Whether what a body stands on may be higher or lower, and is not yet."""
+        return any(
+            body in self._carried.get(f.body, ()) and "z" not in off.get(f.body, {})
+            for f in left if f.normal @ UP > LEVEL
+        )  # fmt: skip
+
+    def _deep_nodes(self, off: dict[int, dict[str, float]]) -> dict[int, int]:
+        """{fixed body: at how many nodes the tool is deeper in it than any contact
+        lets it in}, with bodies displaced."""
+        deep: dict[int, np.ndarray] = {}
+        for s in self._slots(self._displacing(off))[0]:
+            for k in {s.a, s.b} & self.shapes.anchored:
+                deep[k] = deep.get(k, np.zeros(len(s.phi), bool)) | (s.phi < -PASSED)
+        return {k: int(on.sum()) for k, on in deep.items() if on.any()}
 
     def _is_of(self, face: _Face, off: dict[int, dict[str, float]]) -> bool:
         """Whether a face was found at the height that its body has with others off."""
@@ -412,8 +524,7 @@ class PressingProblem(ContactProblem):
         for face in left:
             if not self._is_of(face, off):
                 continue
-            trial = {k: dict(v) for k, v in off.items()}
-            self._add(trial, face)
+            trial = self._with(off, [face])
             geometry = self._geometry(self._displacing(trial))
             on = np.zeros(len(before), bool)
             for s in geometry.slots:
@@ -429,6 +540,15 @@ class PressingProblem(ContactProblem):
             if taken > gain:
                 best, gain = face, taken
         return best
+
+    def _with(
+        self, off: dict[int, dict[str, float]], faces: Iterable[_Face]
+    ) -> dict[int, dict[str, float]]:
+        """`off` with some faces more."""
+        more = {k: dict(by) for k, by in off.items()}
+        for face in faces:
+            self._add(more, face)
+        return more
 
     def _add(self, off: dict[int, dict[str, float]], face: _Face) -> None:
         axis = int(np.argmax(np.abs(face.normal)))
