@@ -271,6 +271,8 @@ def test_a_meshcat_shows_cart_pole_and_walls():
     simulator.AdvanceTo(0.05)
     for path in ("/makebreak/model_wall_1", "/drake/visualizer/cartpole/pole"):
         assert meshcat.HasPath(path), path
+    for path in ("/Grid", "/Axes"):  # Not seen; as MessagePack writes false.
+        assert meshcat._GetPackedProperty(path, "visible").endswith(b"\xc2")
 
 
 def test_command_line_writes_the_result(tmp_path, capsys):

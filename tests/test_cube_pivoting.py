@@ -368,6 +368,8 @@ def test_meshcat_shows_cube_and_fingers():
     for path in ("pivot/cube", "left/finger", "right/finger", "pivot/platform"):
         assert meshcat.HasPath(f"/drake/visualizer/{path}"), path
     assert meshcat.HasPath("/makebreak/legend/lines")
+    for path in ("/Grid", "/Axes"):  # Not seen; as MessagePack writes false.
+        assert meshcat._GetPackedProperty(path, "visible").endswith(b"\xc2")
     model = (MODELS / "cube_pivoting.sdf").read_text()
     model += (MODELS / "planar_finger.sdf").read_text()
     for _, color in LEGEND:  # Which are those of the models.

@@ -229,6 +229,12 @@ def test_a_second_simulation_says_its_phase_from_the_beginning():
         assert scene.visible[f"{ROOT}/phase/1"] == [(0.0, True)]
 
 
+def test_the_grid_and_the_axes_of_meshcat_are_hidden():
+    page = Page()
+    Legend(LegendConfig(), page)
+    assert page.visible == {"/Grid": [(None, False)], "/Axes": [(None, False)]}
+
+
 def test_a_real_meshcat_takes_a_legend():
     meshcat = Meshcat()
     _, _, diagram = legend(meshcat)

@@ -99,8 +99,6 @@ class ContactView(LeafSystem):
         # Points of the target path and of the track.
         self._path = self.DeclareAbstractState(AbstractValue.Make(np.zeros((0, 6))))
         meshcat.Delete(_ROOT)
-        meshcat.SetProperty("/Grid", "visible", False)
-        meshcat.SetProperty("/Axes", "visible", False)
         self.camera, self.legend = config.camera, list(self.LEGEND)
         if config.peaks:
             limit = f"{config.peak_limit:g} N"

@@ -30,7 +30,8 @@ class LegendConfig:
 
 class Legend(LeafSystem):
     """A board in Meshcat at the upper left of the initial view, with the meaning of
-    each colour and the phase. It is part of Meshcat's recording.
+    each colour and the phase. It is part of Meshcat's recording. Meshcat's grid and
+    axes are hidden, as the scene has its own.
 
     Inputs: phase (1,), optional: index into config.phases.
     """
@@ -40,6 +41,8 @@ class Legend(LeafSystem):
         self._config, self._meshcat = config, meshcat
         self._phase = self.DeclareVectorInputPort("phase", 1)
         meshcat.Delete(ROOT)
+        for path in ("/Grid", "/Axes"):
+            meshcat.SetProperty(path, "visible", False)
         lines = [(text, _on_white(color)) for text, color in config.lines]
         self._draw(f"{ROOT}/lines", lines, 0.0)
         for k, text in enumerate(config.phases):

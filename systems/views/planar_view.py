@@ -52,8 +52,6 @@ class PlanarView(LeafSystem):
         self._viscosity, self._ramp = c.viscosity, c.ramp_sec
         self._state = self.DeclareVectorInputPort("state", 4)
         self._target = self.DeclareVectorInputPort("x_desired", 6)
-        meshcat.SetProperty("/Grid", "visible", False)
-        meshcat.SetProperty("/Axes", "visible", False)
         meshcat.SetCameraPose(self.CAMERA, self.LOOK_AT)
         floor = Rgba(0.96, 0.94, 0.88)
         meshcat.SetObject(f"{_ROOT}/floor", Box(2.4, 2.4, 0.002), floor)

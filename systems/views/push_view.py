@@ -63,8 +63,6 @@ class PushView(LeafSystem):
         self._track = self.DeclareAbstractState(
             AbstractValue.Make((np.full(3, np.nan), np.zeros((0, 3))))
         )
-        meshcat.SetProperty("/Grid", "visible", False)
-        meshcat.SetProperty("/Axes", "visible", False)
         meshcat.SetCameraPose(self.CAMERA, self.LOOK_AT)
         self._trail = Trail(meshcat, self.TRACK, _TRACK)
         for path, color in ((self.GOAL, _GOAL), (self.MODEL, _MODEL)):

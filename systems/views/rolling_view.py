@@ -50,8 +50,6 @@ class RollingView(LeafSystem):
         self._x = self.DeclareVectorInputPort("x", N_X)
         self._gap = self.DeclareVectorInputPort("gap", 1)
         self._track = self.DeclareAbstractState(AbstractValue.Make(np.zeros((0, 3))))
-        meshcat.SetProperty("/Grid", "visible", False)
-        meshcat.SetProperty("/Axes", "visible", False)
         meshcat.SetCameraPose(self.CAMERA, self.LOOK_AT)
         angle = np.linspace(0.0, 2.0 * np.pi, 121)
         c = config
