@@ -8,6 +8,7 @@
     contact_anticipator --contacts--> velocity_shaper; --hints--> mode_detector
     mode_detector --touch_mode--> contact_anticipator
     velocity_shaper --x_desired, force directions and targets--> impedance_controller
+    (x_desired by way of surface_alignment, if the tool is to be laid flat)
     variable_impedance --stiffness, feed-forward--> impedance_controller
     impedance_controller --tau--> station
 
@@ -51,6 +52,10 @@ from makebreak.systems.arm.impedance_controller import (
     ImpedanceConfig,
     ImpedanceController,
     serial_chain_of,
+)
+from makebreak.systems.arm.surface_alignment import (
+    SurfaceAlignment,
+    SurfaceAlignmentConfig,
 )
 from makebreak.systems.arm.tip_state import TipState
 from makebreak.systems.arm.variable_impedance import (
@@ -119,6 +124,7 @@ class ChangingContactConfig:
         default_factory=lambda: HybridConfig(damping_ratio=0.9)
     )
     reflex: ImpactReflexConfig = field(default_factory=ImpactReflexConfig)
+    align: SurfaceAlignmentConfig = field(default_factory=SurfaceAlignmentConfig)
     # Faults to inject, each NAME[:from=S,for=S] as of --fault.
     faults: list[str] = field(default_factory=list)
 
@@ -276,6 +282,11 @@ def _add_systems(
     if not config.reflex.gain > 0.0:
         for name in ("reflex.force_max", "reflex.fade_sec"):
             refuse_unused(config, type(config)(), name, "not used with reflex.gain=0")
+    if config.align.angle_max_deg == 0.0:
+        for name in ("align.damping", "align.speed_max"):
+            refuse_unused(
+                config, type(config)(), name, "not used with align.angle_max_deg=0"
+            )
     speed = replace(
         config.anticipator.speed,
         reflex_gain=config.reflex.gain,
@@ -349,7 +360,16 @@ def _connect_systems(builder: DiagramBuilder, station, s: _Systems, config) -> N
     connect(s.tare, "force_directions", *watching, s.impedance)
     connect(s.shaper, "force_targets", s.detector, s.variable, s.impedance)
     connect(s.shaper, "phase", s.detector, s.anticipator, s.variable)
-    connect(s.shaper, "x_desired", s.impedance, s.forward)
+    connect(s.shaper, "x_desired", s.forward)
+    planned = s.shaper
+    if config.align.angle_max_deg != 0.0:
+        planned = builder.AddNamedSystem(
+            "surface_alignment", SurfaceAlignment(timed(config.align, TICK, OFFSET))
+        )
+        connect(s.shaper, "x_desired", planned)
+        connect(s.tare, "wrench", planned)
+        connect(s.shaper, "force_directions", planned)
+    connect(planned, "x_desired", s.impedance)
     connect(s.detector, "contact", s.anticipator, s.shaper, s.variable)
     connect(s.modes, "transition", s.anticipator, s.forward)
     connect(s.modes, "mode", s.forward)

@@ -28,6 +28,7 @@ from makebreak.diagrams.tabletop import (
     set_tool,
 )
 from makebreak.models.scene import Scene, read_scene
+from makebreak.systems.arm.surface_alignment import SurfaceAlignmentConfig
 from makebreak.systems.changing_contact.mode_detector import ModeDetectorConfig
 from makebreak.systems.changing_contact.numerics.contact_task import ContactBelief
 from makebreak.systems.changing_contact.numerics.motion_pattern import (
@@ -61,9 +62,11 @@ class ContactTypesConfig:
     realism: str = "none"
     control: ChangingContactConfig = field(
         default_factory=lambda: ChangingContactConfig(
-            # The moment of a face wanders by 3 mm times the normal force, which has to
-            # stay within one mode: 0.04 of the feature. No seam is crossed.
-            modes=ModeDetectorConfig(torque_arm=0.08, crossing=0.0)
+            # Edge and corner differ by 6 mm times the normal force at little friction:
+            # by 0.1, 2.5 thresholds of the feature. No seam is crossed.
+            modes=ModeDetectorConfig(torque_arm=0.06, crossing=0.0),
+            # A table that is not quite level makes an edge of a face otherwise.
+            align=SurfaceAlignmentConfig(angle_max_deg=1.5),
         )
     )
 
@@ -143,6 +146,12 @@ def make_task(config: ContactTypesConfig) -> TypesTask:
             raise ValueError(f"{name} is {getattr(config, name)}, expected > 0")
     if not 3.0 <= config.tilt_deg <= 25.0:
         raise ValueError(f"tilt_deg is {config.tilt_deg}, expected 3 to 25")
+    turn = config.control.align.angle_max_deg
+    if turn >= config.tilt_deg:
+        raise ValueError(
+            f"control.align.angle_max_deg is {turn}, expected less than tilt_deg, "
+            f"{config.tilt_deg}: an edge would be laid flat"
+        )
     rng = np.random.default_rng([config.seed, 11])
     friction = config.friction or float(rng.uniform(*FRICTION))
     model = read_model("", THREE_SURFACES, "block")

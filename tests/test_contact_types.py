@@ -19,6 +19,12 @@ from makebreak.scripts.session import Session
 from makebreak.systems.changing_contact.numerics.contact_task import PHASE_SEGMENT
 
 
+def laid_flat(angle_deg):
+    control = ContactTypesConfig().control
+    control.align.angle_max_deg = angle_deg
+    return control
+
+
 def lowest(kind, tilt=10.0):
     """How many of the block's eight corners are lowest, and how low, from the tip."""
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
@@ -63,6 +69,10 @@ def test_friction_is_the_seed_s_or_the_given_one():
         (dict(tilt_deg=0.0), "tilt_deg is 0"),
         (dict(speed=0.0), "speed is 0"),
         (dict(normal_force=-1.0), "normal_force is -1"),
+        (
+            dict(control=laid_flat(4.0), tilt_deg=4.0),
+            "angle_max_deg is 4",
+        ),
     ],
 )
 def test_bad_settings_are_refused_by_name(change, message):
@@ -116,11 +126,15 @@ def test_a_stroke_has_the_mode_of_its_end_and_the_feature_before_it():
 
 
 @pytest.mark.slow
-def test_face_edge_and_corner_are_found_and_recognised(tmp_path):
+@pytest.mark.parametrize("realism, seed", [("none", 0), ("lab", 3)])
+def test_face_edge_and_corner_are_found_and_recognised(tmp_path, realism, seed):
+    # On the table of seed 3, tilted by 0.5 deg, a block that is not laid flat stands on
+    # an edge: face and edge are one mode then, and 2 of 6 strokes are right.
     result = contact_types.run(
-        ContactTypesConfig(seed=0), Session(tmp_path, progress=False)
+        ContactTypesConfig(seed=seed, realism=realism),
+        Session(tmp_path, progress=False),
     )
     assert result["success"], result["criteria"]
     # The edge is 9.7 mm beside the tip, and friction adds to its moment.
     assert 0.009 < result["torque_arm_edge_m"] < 0.015
-    assert result["torque_arm_face_m"] < 0.007
+    assert result["torque_arm_face_m"] < 0.005

@@ -6,6 +6,7 @@ variable_impedance    stiffness and feed-forward from the forward model's predic
 force_feedforward     a predicted force cancelled along the motion
 tool_wrench           force-torque sensor between flange and tool
 wrench_tare           the sensor's bias, found in free space and taken off
+surface_alignment     the tool laid flat on what it is pressed on
 tip_state             pose and velocity of the tip
 gravity_left_out      torques for a robot that compensates gravity itself
 """
