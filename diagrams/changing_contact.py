@@ -143,6 +143,29 @@ def friction_from_rest() -> ForwardModelConfig:
     return ForwardModelConfig(handover=HandoverConfig(from_rest=True))
 
 
+def refuse_unused_control(config, plain) -> None:
+    """Raises: ValueError for settings of config.control that another of its settings
+    leaves out. Args: plain: the experiment's defaults, with the same `control`."""
+    c = config.control
+    unused = {}
+    if c.anticipator.speed.regression:
+        unused["anticipator.speed.beta"] = "anticipator.speed.regression=true"
+    if c.anticipator.speed.stiffness_most > 0.0:
+        unused["anticipator.speed.first"] = "anticipator.speed.stiffness_most > 0"
+    else:
+        unused["anticipator.speed.force_first"] = "anticipator.speed.stiffness_most=0"
+    if not c.shaper.region.anticipate:
+        for name in ("sigmas", "margin", "settle_sec"):
+            unused[f"shaper.region.{name}"] = "shaper.region.anticipate=false"
+    if not c.variable_impedance.transition:
+        for name in ("blend_sec", "stiffness.impact"):
+            unused[f"variable_impedance.{name}"] = "variable_impedance.transition=false"
+    if not c.forward_model.learns:
+        unused["forward_model.tau_nov"] = "forward_model.learns=false"
+    for name, why in unused.items():
+        refuse_unused(config, plain, f"control.{name}", f"not used with {why}")
+
+
 def tip_mass(arm: MultibodyPlant):
     """The arm's effective mass at its tip as a function of position and direction.
 

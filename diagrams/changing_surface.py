@@ -17,6 +17,7 @@ from makebreak.diagrams.changing_contact import (
     Knowledge,
     friction_from_rest,
     make_changing_contact,
+    refuse_unused_control,
 )
 from makebreak.diagrams.given_pattern import expected_contacts, start_at_pattern
 from makebreak.diagrams.realism import StationErrors, draw_errors
@@ -29,7 +30,7 @@ from makebreak.diagrams.tabletop import (
     set_tool,
     tool_half_width,
 )
-from makebreak.diagrams.wiring import refuse_changed
+from makebreak.diagrams.wiring import refuse_changed, refuse_unused
 from makebreak.models.friction_zones import FrictionZone
 from makebreak.models.scene import Scene, read_scene
 from makebreak.systems.changing_contact.numerics.contact_task import (
@@ -101,7 +102,7 @@ class ChangingSurfaceConfig:
     # Coefficients of friction of the three surfaces; empty: drawn by the seed.
     friction: list[float] = field(default_factory=list)
     # File of a motion to follow in place of the shipped one: a pattern (.yaml) or a
-    # recorded demonstration; speed and normal_force have no meaning then.
+    # recorded demonstration, with its own speed and normal_force.
     pattern: str = ""
     model: str = ""  # Scene file of the controllers' model; empty: the shipped one.
     # Number of trials that are simulated in the model before the first real one.
@@ -150,6 +151,11 @@ def make_task(
             raise ValueError(f"{name} is {value}, expected a positive number")
     if config.seed < 0:
         raise ValueError(f"seed is {config.seed}, expected an integer of 0 or more")
+    if config.pattern:
+        for name in ("speed", "normal_force"):
+            why = "the pattern of your own has it"
+            refuse_unused(config, ChangingSurfaceConfig(), name, why)
+    refuse_unused_control(config, ChangingSurfaceConfig())
     rng = np.random.default_rng([config.seed, 7])
     model = read_model(config.model, THREE_SURFACES, config.tool)
     world = read_scene(THREE_SURFACES)

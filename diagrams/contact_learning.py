@@ -16,6 +16,7 @@ from makebreak.diagrams.changing_contact import (
     ChangingContactConfig,
     Knowledge,
     make_changing_contact,
+    refuse_unused_control,
 )
 from makebreak.diagrams.realism import StationErrors, draw_errors
 from makebreak.diagrams.tabletop import (
@@ -130,6 +131,7 @@ def make_task(config: ContactLearningConfig) -> ContactTask:
         if not 0.0 < value < np.inf:
             raise ValueError(f"{name} is {value}, expected a positive number")
     check_spread(config.spread)
+    refuse_unused_control(config, ContactLearningConfig())
     rng = np.random.default_rng([config.seed, 3])
     model = read_model(config.model, TABLETOP_WALLS, config.tool)
     world = read_scene(TABLETOP_WALLS)

@@ -17,6 +17,7 @@ from makebreak.diagrams.changing_contact import (
     ChangingContactConfig,
     Knowledge,
     make_changing_contact,
+    refuse_unused_control,
 )
 from makebreak.diagrams.given_pattern import expected_contacts, start_at_pattern
 from makebreak.diagrams.realism import StationErrors, draw_errors
@@ -38,6 +39,7 @@ from makebreak.diagrams.tabletop import (
     tool_corner,
     tool_half_width,
 )
+from makebreak.diagrams.wiring import refuse_unused
 from makebreak.models.scene import Scene, read_scene
 from makebreak.systems.changing_contact.contact_anticipator import (
     ApproachSpeedConfig,
@@ -175,6 +177,7 @@ def make_task(
     if not 0.0 <= config.error_max <= 0.1:
         raise ValueError(f"error_max is {config.error_max}, expected 0 to 0.1 m")
     check_spread(config.spread)
+    _refuse_unused(config)
     rng = np.random.default_rng([config.seed, 5])
     half = tool_half_width(config.tool)
     model = read_model(config.model, TABLETOP_WALLS, config.tool)
@@ -225,6 +228,30 @@ def make_task(
         draw_errors(config.realism, config.seed),
         tool_corner(config.tool),
     )
+
+
+def _refuse_unused(config: MultipleCollisionsConfig) -> None:
+    """Raises: ValueError for settings that nothing reads without handling, or with a
+    motion of the user's own."""
+    plain, unused = MultipleCollisionsConfig(), []
+    refuse_unused_control(config, plain)
+    if not config.handling:
+        region = ("sigmas", "margin", "settle_sec", "anticipate")
+        impedance = ("transition", "blend_sec", "stiffness.impact")
+        unused = [
+            "trials",
+            "control.shaper.search.speed",
+            *(f"control.shaper.region.{name}" for name in region),
+            *(f"control.variable_impedance.{name}" for name in impedance),
+            *(f"control.reflex.{name}" for name in ("gain", "force_max", "fade_sec")),
+        ]
+        if not config.rehearse:  # Then no contact is expected.
+            unused += ["error_max", "known_heights"]
+    for name in unused:
+        refuse_unused(config, plain, name, "not used with handling=false")
+    if config.pattern:
+        why = "not used with a pattern of your own"
+        refuse_unused(config, plain, "known_heights", why)
 
 
 def with_known_height(contacts, distance: float, error_max: float):

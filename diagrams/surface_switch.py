@@ -18,6 +18,7 @@ from makebreak.diagrams.changing_contact import (
     Knowledge,
     friction_from_rest,
     make_changing_contact,
+    refuse_unused_control,
 )
 from makebreak.diagrams.realism import StationErrors, draw_errors
 from makebreak.diagrams.tabletop import (
@@ -133,6 +134,7 @@ def make_task(config: SurfaceSwitchConfig) -> SwitchTask:
             raise ValueError(f"{name} is {value}, expected a positive number")
     if config.seed < 0:
         raise ValueError(f"seed is {config.seed}, expected an integer of 0 or more")
+    refuse_unused_control(config, SurfaceSwitchConfig())
     rng = np.random.default_rng([config.seed, 11])
     model = read_model(config.model, SURFACE_SWITCH, config.tool)
     world = read_scene(SURFACE_SWITCH)

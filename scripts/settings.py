@@ -103,6 +103,7 @@ _BOUNDS = {
     "offset_sec": Between(0.0, 10.0, "s"),
     "seed": Between(None, 2.0**63 - 1.0),
     "friction": Between(0.0, 100.0),
+    "stiffness_most": Between(0.0, 1e9, "N/m"),  # Its default may be 0.
     "integral_sec": Between(1e-3, None, "s"),  # Infinite: no integral.
     "hold_sec": Between(0.0, None, "s"),  # Infinite: without end.
 }

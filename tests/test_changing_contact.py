@@ -23,6 +23,13 @@ from makebreak.diagrams.realism import StationErrors
 from makebreak.diagrams.station import make_control_plant
 from makebreak.diagrams.tabletop import TABLETOP_WALLS, move, set_friction, set_tool
 from makebreak.models.scene import read_scene
+from makebreak.scripts.experiments import (
+    changing_surface,
+    contact_learning,
+    multiple_collisions,
+    surface_switch,
+)
+from makebreak.scripts.settings import apply_settings
 from makebreak.systems.changing_contact.numerics.contact_task import (
     DONE,
     MADE,
@@ -283,3 +290,38 @@ def test_all_that_read_the_wrench_read_it_without_the_sensor_s_bias():
             value(system, port, "GetInputPort"),
             value("wrench_tare", "wrench", "GetOutputPort"),
         )
+
+
+UNUSED = [
+    ("anticipator.speed.beta=0.01", "anticipator.speed.regression=false"),
+    ("shaper.region.margin=0.05", "shaper.region.anticipate=true"),
+    ("variable_impedance.blend_sec=0.3", "variable_impedance.transition=true"),
+    ("variable_impedance.stiffness.impact=99", "variable_impedance.transition=true"),
+    ("forward_model.tau_nov=0.01", "forward_model.learns=true"),
+]
+OPPOSITE = {"true": "false", "false": "true"}
+
+
+@pytest.mark.parametrize("module", [
+    changing_surface, contact_learning, multiple_collisions, surface_switch,
+])  # fmt: skip
+def test_settings_that_another_one_leaves_out_are_refused(module):
+    def task(*settings):
+        words = [f"control.{setting}" for setting in settings]
+        return module.make_task(apply_settings(module.Config(), words))
+
+    for setting, chosen in UNUSED:
+        key, _, value = chosen.partition("=")
+        without = f"{key}={OPPOSITE[value]}"
+        with pytest.raises(ValueError, match=f"expected .*: not used with {without}"):
+            task(setting, without)
+        task(setting, chosen)
+    speed = "anticipator.speed"
+    used, other = "first=0.02", "force_first=5"
+    if module in (contact_learning, multiple_collisions):
+        used, other = other, used
+    task(f"{speed}.{used}")
+    with pytest.raises(ValueError, match=f"not used with {speed}.stiffness_most"):
+        task(f"{speed}.{other}")
+    stiffest = "0" if used.startswith("force") else "1e5"
+    task(f"{speed}.{other}", f"{speed}.stiffness_most={stiffest}")

@@ -343,6 +343,21 @@ def test_a_motion_that_crosses_no_seam_is_refused_by_changing_surface(tmp_path):
         changing_surface.task_of(config)
 
 
+def test_what_a_motion_of_ones_own_replaces_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="known_heights is False, .* of your own"):
+        make_task(
+            MultipleCollisionsConfig(pattern="p.yaml", known_heights=False),
+            down_and_along(),
+        )
+    path = tmp_path / "p.yaml"
+    save_pattern(down_and_along(), path)
+    for change in (dict(speed=0.05), dict(normal_force=5.0)):
+        config = changing_surface.Config(pattern=str(path), **change)
+        with pytest.raises(ValueError, match="the pattern of your own has it"):
+            changing_surface.task_of(config)
+    changing_surface.task_of(changing_surface.Config(pattern=str(path)))
+
+
 # --- The score.
 
 

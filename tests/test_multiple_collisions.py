@@ -29,6 +29,7 @@ from makebreak.scripts.experiments.multiple_collisions import (
     summary,
 )
 from makebreak.scripts.session import Session
+from makebreak.scripts.settings import apply_settings
 from makebreak.systems.changing_contact.numerics.contact_task import (
     BROKEN,
     DIRECTION,
@@ -160,6 +161,28 @@ def test_the_model_does_not_know_where_the_world_is(task):
 def test_bad_settings_are_refused_by_name(change, message):
     with pytest.raises(ValueError, match=message):
         make_task(MultipleCollisionsConfig(**change))
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("trials", "3"),
+        ("error_max", "0.01"),
+        ("known_heights", "false"),
+        ("control.shaper.region.margin", "0.01"),
+        ("control.shaper.search.speed", "0.1"),
+        ("control.variable_impedance.transition", "false"),
+        ("control.reflex.gain", "1"),
+    ],
+)
+def test_what_only_handling_uses_is_refused_without_it(key, value):
+    settings = ["handling=false", f"{key}={value}"]
+    config = apply_settings(MultipleCollisionsConfig(), settings)
+    with pytest.raises(ValueError, match=f"{key} is .*: not used with handling=false"):
+        make_task(config)
+    make_task(replace(config, handling=True))
+    if key in ("error_max", "known_heights"):  # A rehearsal uses them.
+        make_task(replace(config, rehearse=1))
 
 
 def test_without_handling_nothing_is_anticipated():

@@ -36,6 +36,7 @@ from makebreak.scripts.experiments.wall_friction import (
     without_noise,
 )
 from makebreak.scripts.session import Session
+from makebreak.scripts.settings import apply_settings
 from makebreak.systems.baselines.long_term_predictor import OneStepPredictor
 from makebreak.systems.baselines.numerics.long_term_predictor import (
     LongTermPredictor,
@@ -330,6 +331,20 @@ def test_too_few_trials_are_refused_by_name(tmp_path):
     config = WallFrictionConfig()
     config.training.trials = 3
     with pytest.raises(ValueError, match="training.trials is 3, expected 7 or more"):
+        run(config, Session(tmp_path, progress=False))
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        (["training.one_step.predict_change=true"], "both are trained"),
+        (["training.joints=false", "stiffness_high=900"], "training.joints=false"),
+        (["station_seed=3"], "station_seed is 3, expected None: not used with realism"),
+    ],
+)
+def test_settings_that_nothing_reads_are_refused(tmp_path, settings, says):
+    config = apply_settings(WallFrictionConfig(), settings)
+    with pytest.raises(ValueError, match=says):
         run(config, Session(tmp_path, progress=False))
 
 

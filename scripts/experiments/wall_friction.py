@@ -45,6 +45,7 @@ from makebreak.diagrams.wall_friction import (
     telemetry,
     tip_states,
 )
+from makebreak.diagrams.wiring import refuse_unused
 from makebreak.models.scene import read_scene
 from makebreak.scripts.comparison import Comparison
 from makebreak.scripts.criteria import Criteria
@@ -119,6 +120,7 @@ def run(config: WallFrictionConfig, session: Session) -> dict:
         )
     if config.training.tested < 1:
         raise ValueError(f"training.tested is {config.training.tested}, expected > 0")
+    _refuse_unused(config)
     if config.station_seed is None:  # All trials have the same station.
         config = replace(config, station_seed=config.seed)
     seconds: dict[str, float] = {}  # Not of the result: they differ from run to run.
@@ -155,6 +157,18 @@ def run(config: WallFrictionConfig, session: Session) -> dict:
     session.save_plot(plot_forces(data, scratch, force), "force_prediction")
     session.write_recording(recording, read_scene(TABLETOP_WALLS))
     return result
+
+
+def _refuse_unused(config: WallFrictionConfig) -> None:
+    """Raises: ValueError for settings that nothing reads."""
+    plain = WallFrictionConfig()
+    unused = {"training.one_step.predict_change": "both are trained"}
+    if not config.training.joints:
+        unused["stiffness_high"] = "not used with training.joints=false"
+    if config.realism == "none":
+        unused["station_seed"] = "not used with realism=none"
+    for name, why in unused.items():
+        refuse_unused(config, plain, name, why)
 
 
 def one_step_predictors(config, trials, seconds) -> dict:
