@@ -98,8 +98,9 @@ def contact(p, v, table, wall, mu, longer=0.0):
 
 
 def record(
-    folder, table=0.0, wall=0.3, mu=(TABLE_MU, WALL_MU), wrench=True, n=1, longer=0.0
-):
+    folder, table=0.0, wall=0.3, mu=(TABLE_MU, WALL_MU), wrench=True, n=1, longer=0.0,
+    effort="effort_command",
+):  # fmt: skip
     """Down on the table, along it to the wall, along both; pressed with about 8 N."""
     rng = np.random.default_rng(0)
     names = ("x", "y", "z")
@@ -141,7 +142,7 @@ def record(
         for i, axis in enumerate(names):
             noise = rng.normal(size=(3, len(mean)))
             columns[f"gantry.{axis}.position"] = x[rows, i] + 1e-5 * noise[0]
-            columns[f"gantry.{axis}.effort_command"] = mean[:, i]
+            columns[f"gantry.{axis}.{effort}"] = mean[:, i]
             if wrench:
                 columns[f"gantry.tip.f{axis}"] = F[rows, i] + 0.1 * noise[1]
                 columns[f"gantry.tip.t{axis}"] = F[rows, 3 + i] + 0.005 * noise[2]
@@ -408,3 +409,16 @@ def test_faces_that_press_against_each_other_do_not_loosen_the_rows(
     needs = np.sqrt(np.mean(problem._all_needs(()) ** 2, axis=0))
     assert (problem.acting <= 10.01 * needs).all()
     assert problem.off == plain.off
+
+
+def test_where_only_efforts_were_measured_simulation_confirms_a_place(tmp_path):
+    """A robot's states and efforts, without a command: windows take the efforts."""
+    scene = write_scene(tmp_path)
+    recordings = record(tmp_path, table=-0.012, n=2, effort="effort_measured")
+    problem = PressingProblem(scene, recordings)
+    there = [Effect("plane_height", [TABLE, WALL], {"height": -0.012})]
+    unused = (None, None, None)  # Fits and nuisances: the equations'.
+    for held in (None, recordings):
+        outcome = problem.outcome(there, *unused, held)
+        assert outcome.gap.before > 5.0
+        assert outcome.gap.after < 2.0

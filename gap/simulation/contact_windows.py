@@ -61,6 +61,7 @@ class PushWindows(WindowModel):
         self._only = episodes
         self._shapes: ContactShapes | None = None
         scene, led = led_as_measured(scene, recordings)
+        self._led = led
         every = [_most_of(r, e) for r in recordings for e in r.episodes]
         most = max(MOST, min(2 * sum(n for n in every if n > 2), MOST_OF_LONG))
         simulation = SceneSimulation(
@@ -82,7 +83,9 @@ class PushWindows(WindowModel):
         self._add_spread()
 
     def _given(self, recording: Recording, episode: Episode, i: int, late):
-        """times and columns of commands: the smoothed motion."""
+        """times and columns of commands: the smoothed motion, where joints are led."""
+        if not self._led:
+            return super()._given(recording, episode, i, late)
         path = self._paths.get((i, episode.first))
         if path is None:  # No window begins here.
             return recording.time[episode.rows], {}
@@ -283,8 +286,8 @@ def led_as_measured(
     """The scene with joints led along their measured motion, and these joints, where
     efforts were measured and no command: with these efforts as an input a robot drifts
     by their noise, and by what an impact does between two rows. What the joints do is
-    then judged by the equations alone, what objects do in simulation. Else the scene as
-    it is, and none."""
+    then judged by the equations alone, what objects do in simulation. Else, and where
+    nothing but joints moves, the scene as it is, and none."""
     act = scene.actuation
     takes = COMMANDS_OF[act.type]
     commanded = any(f"{j}.{what}" in r for r in recordings for j in act.joints
@@ -297,6 +300,8 @@ def led_as_measured(
     if commanded or not known or len(known) < len(act.joints):
         return scene, []
     plant = SceneDynamics(scene).plant
+    if not plant.GetFloatingBaseBodies():
+        return scene, []
     context = plant.CreateDefaultContext()
     of = {full_name(plant, j): j for j in one_dof_joints(plant)}
     q = plant.GetPositions(context)
