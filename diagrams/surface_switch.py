@@ -32,7 +32,7 @@ from makebreak.diagrams.tabletop import (
     set_tool,
     tool_half_width,
 )
-from makebreak.diagrams.wiring import refuse_changed
+from makebreak.diagrams.wiring import refuse_changed, refuse_unused
 from makebreak.models.friction_zones import FrictionZone
 from makebreak.models.scene import Scene, read_scene
 from makebreak.systems.arm.impedance_controller import HybridConfig
@@ -135,6 +135,9 @@ def make_task(config: SurfaceSwitchConfig) -> SwitchTask:
     if config.seed < 0:
         raise ValueError(f"seed is {config.seed}, expected an integer of 0 or more")
     refuse_unused_control(config, SurfaceSwitchConfig())
+    if config.trials == 1 and not config.rehearse:
+        why = "nothing is known in a first trial"
+        refuse_unused(config, SurfaceSwitchConfig(), "anticipation", why)
     rng = np.random.default_rng([config.seed, 11])
     model = read_model(config.model, SURFACE_SWITCH, config.tool)
     world = read_scene(SURFACE_SWITCH)

@@ -152,6 +152,10 @@ def test_the_criterion_is_the_one_that_was_set(spikes, errors, regions, success)
         (dict(normal_force=0.0), "normal_force is 0.0"),
         (dict(tool="brush"), "brush"),
         (dict(seed=-2), "seed is -2"),
+        (
+            dict(trials=1, anticipation=Anticipation(models=False)),
+            "anticipation.models is False, expected True: nothing is known",
+        ),
     ],
 )
 def test_wrong_settings_are_refused_by_name(changes, message):
