@@ -56,6 +56,7 @@ from makebreak.systems.arm.variable_impedance import (
     VariableImpedance,
     VariableImpedanceConfig,
 )
+from makebreak.systems.arm.wrench_tare import WrenchTare, WrenchTareConfig
 from makebreak.systems.baselines.frozen import Frozen
 from makebreak.systems.changing_contact.contact_anticipator import (
     ApproachSpeedConfig,
@@ -149,6 +150,10 @@ class TouchConfig:
             impact_force=1.2, loss_force=0.3, tool_mass=FINGER_MASS
         )
     )
+    # Without its estimates from sliding: a ball is not a plane.
+    tare: WrenchTareConfig = field(
+        default_factory=lambda: WrenchTareConfig(sideways=False)
+    )
     modes: ModeDetectorConfig = field(
         default_factory=lambda: ModeDetectorConfig(
             threshold=0.08, crossing=0.0, normal_force_min=0.5, tool_mass=FINGER_MASS
@@ -183,7 +188,7 @@ class TouchConfig:
 
 
 def _brisk_ball() -> BallRollingConfig:
-    rolling = RollingConfig(reposition_sec=BRISK_SEC, integral_sec=np.inf)
+    rolling = RollingConfig(reposition_sec=BRISK_SEC)
     return BallRollingConfig(
         camera=CameraConfig(renderer="drawn"),
         task=RollingTaskConfig(rolling=rolling),
@@ -222,7 +227,9 @@ SIGNALS = {
     "active": ("push_motion", "active", 1),
     "ee_pose": ("tip_state", "ee_pose", 7),
     "in_frame": ("moving_frame", "ee_pose", 7),
-    "wrench": ("station", f"{ARM}.external_wrench", 6),
+    "wrench": ("wrench_tare", "wrench", 6),
+    "tare_status": ("wrench_tare", "status", 1),
+    "bias": ("wrench_tare", "bias", 6),
     "x_desired": ("reference_blend", "x_desired", 19),
     "shaped": ("velocity_shaper", "x_desired", 19),
     "phase": ("velocity_shaper", "phase", 6),
@@ -415,7 +422,11 @@ def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) ->
     add("push_motion", motion)
     add("tip_state", TipState(chain))
     add("moving_frame", MovingFrame())
-    add("contact_detector", ContactDetector(timed(touch.detector, ARM_TICK, OFFSET)))
+    add("wrench_tare", WrenchTare(timed(touch.tare, ARM_TICK, OFFSET)))
+    add(
+        "contact_detector",
+        ContactDetector(timed(touch.detector, ARM_TICK, OFFSET), tared=True),
+    )
     add("mode_detector", ModeDetector(touch.modes, None, ESTIMATE, OFFSET))
     add(
         "forward_model_bank",
@@ -450,6 +461,7 @@ def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) ->
     impedance = "impedance_controller"
     connect("state_estimator", "x", "push_motion", "reference_blend")
     connect("rolling_task", "phase", ("push_motion", "task_phase"))
+    connect("rolling_task", "downhill", "push_motion")
     connect("rolling_task", "reference", ("reference_blend", "task_reference"))
     connect("push_motion", "landed", "rolling_task")
     connect("push_motion", "motion", "velocity_shaper")
@@ -460,7 +472,7 @@ def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) ->
     connect("station", f"{ARM}.velocity_measured", ("tip_state", "v"))
     connect("tip_state", "ee_pose", "moving_frame")
     connect(
-        "tip_state", "ee_velocity", "moving_frame", "mode_detector",
+        "tip_state", "ee_velocity", "moving_frame", "wrench_tare", "mode_detector",
         "forward_model_bank",
     )  # fmt: skip
     connect(
@@ -469,10 +481,10 @@ def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) ->
     connect("moving_frame", "ee_height", ("contact_anticipator", "ee_pose"))
     connect("moving_frame", "contact_height", ("contact_anticipator", "contact"))
     connect("moving_frame", "ee_velocity", "contact_detector")
+    connect("station", f"{ARM}.external_wrench", ("wrench_tare", "wrench"))
     connect(
-        "station", f"{ARM}.external_wrench", ("contact_detector", "wrench"),
-        ("mode_detector", "wrench"), ("forward_model_bank", "wrench"),
-        (impedance, "wrench_measured"),
+        "wrench_tare", "wrench", "contact_detector", "mode_detector",
+        "forward_model_bank", (impedance, "wrench_measured"),
     )  # fmt: skip
     connect("velocity_shaper", "direction", "contact_detector")
     connect("velocity_shaper", "force_directions", "contact_detector",
@@ -516,7 +528,7 @@ def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) ->
     connect("reference_blend", "reference", "arm_reference")
     connect("reference_blend", "direction", "mode_detector", "forward_model_bank")
     connect("reference_blend", "contact_directions",
-            ("mode_detector", "force_directions"),
+            ("wrench_tare", "force_directions"), ("mode_detector", "force_directions"),
             ("forward_model_bank", "force_directions"))  # fmt: skip
     connect("reference_blend", "x_desired", impedance)
     connect("reference_blend", "wrench", (impedance, "wrench_feedforward"))

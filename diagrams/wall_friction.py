@@ -2,7 +2,8 @@
 figure 1b): an impedance controller of constant stiffness follows a motion.
 
     motion --x_desired, gains, push--> impedance_controller --tau--> station
-    station --wrench, q, v--> mode_detector, forward_model_bank, one-step predictors
+    station --wrench--> wrench_tare --wrench without the sensor's bias--> all
+    station --q, v--> mode_detector, forward_model_bank, one-step predictors
 
 The block comes down on the table, slides to the wall, and along wall and table. When it
 reaches a surface, the stiffness along the normal fades out and a constant force fades
@@ -36,7 +37,7 @@ from makebreak.diagrams.station import (
     make_station,
 )
 from makebreak.diagrams.tabletop import TABLETOP_WALLS, TOOL, set_friction
-from makebreak.diagrams.wiring import add_legend
+from makebreak.diagrams.wiring import add_legend, timed
 from makebreak.models.scene import read_scene
 from makebreak.systems.arm.force_feedforward import (
     ForceFeedforward,
@@ -49,6 +50,7 @@ from makebreak.systems.arm.impedance_controller import (
 )
 from makebreak.systems.arm.numerics.serial_chain import tip_kinematics
 from makebreak.systems.arm.tip_state import TipState
+from makebreak.systems.arm.wrench_tare import WrenchTare, WrenchTareConfig
 from makebreak.systems.baselines.long_term_predictor import OneStepPredictor
 from makebreak.systems.baselines.numerics.long_term_predictor import (
     LongTermPredictor,
@@ -228,12 +230,13 @@ def make_wall_friction(
     station = _add_station(builder, config, scene, meshcat)
     plan = _add_plan(builder, motion(config, start_of(control_plant)))
     impedance, tip = _add_controller(builder, station, plan, control_plant)
-    _add_predictors(builder, station, tip, plan, predictors or {}, knowledge)
+    wrench = _add_tare(builder, station, tip, plan)
+    _add_predictors(builder, station, wrench, tip, plan, predictors or {}, knowledge)
     builder.Connect(
-        _add_feedforward(builder, station, plan, feedforward),
+        _add_feedforward(builder, wrench, plan, feedforward),
         impedance.GetInputPort("wrench_feedforward"),
     )
-    builder.ExportOutput(station.GetOutputPort(f"{ARM}.external_wrench"), "wrench")
+    builder.ExportOutput(wrench, "wrench")
     record_station(builder, station, impedance.GetOutputPort("tau"), TOOL)
     if meshcat is not None:
         meshcat.SetCameraPose(*CAMERA)
@@ -307,9 +310,24 @@ def _add_controller(
     return impedance, tip
 
 
+def _add_tare(builder, station, tip: TipState, plan) -> OutputPort:
+    """The measured wrench without the bias that the sensor has in the air."""
+    tare = builder.AddNamedSystem(
+        "wrench_tare", WrenchTare(timed(WrenchTareConfig(), TICK, OFFSET))
+    )
+    for port, source in (
+        ("wrench", station.GetOutputPort(f"{ARM}.external_wrench")),
+        ("ee_velocity", tip.GetOutputPort("ee_velocity")),
+        ("force_directions", plan["force_directions"]),
+    ):
+        builder.Connect(source, tare.GetInputPort(port))
+    return tare.GetOutputPort("wrench")
+
+
 def _add_predictors(
     builder,
     station,
+    wrench: OutputPort,
     tip: TipState,
     plan: dict[str, OutputPort],
     predictors: Mapping[str, LongTermPredictor],
@@ -332,7 +350,6 @@ def _add_predictors(
             OFFSET,
         ),
     )
-    wrench = station.GetOutputPort(f"{ARM}.external_wrench")
     signals = [
         station.GetOutputPort(f"{ARM}.position_measured"),
         station.GetOutputPort(f"{ARM}.velocity_measured"),
@@ -367,7 +384,7 @@ def _add_predictors(
 
 
 def _add_feedforward(
-    builder, station, plan: dict[str, OutputPort], source: str
+    builder, wrench: OutputPort, plan: dict[str, OutputPort], source: str
 ) -> OutputPort:
     """The wrench that is fed forward: the plan's push, and the prediction of `source`,
     as of make_wall_friction."""
@@ -380,7 +397,7 @@ def _add_feedforward(
         ),
     )
     if source == LAST:
-        predicted = station.GetOutputPort(f"{ARM}.external_wrench")
+        predicted = wrench
     else:
         name = "forward_model_bank" if source == OURS else f"predictor_{source}"
         predicted = builder.GetSubsystemByName(name).GetOutputPort("wrench_predicted")

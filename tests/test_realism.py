@@ -303,3 +303,42 @@ def test_the_world_has_the_errors_and_no_controller_knows_them(name):
     known = none.known()
     assert len(known["impedance_controller"]) > 5
     assert known == lab.known()
+
+
+@pytest.mark.parametrize("name", ["gentle_rolling", "wall_friction", "contact_types"])
+def test_nobody_but_the_recorder_reads_the_wrench_before_the_tare(name):
+    if name == "gentle_rolling":
+        config = GentleRollingConfig()
+        config.ball.camera = CameraConfig(renderer="drawn")
+        diagram = make_gentle_rolling(config)
+    elif name == "wall_friction":
+        diagram = make_wall_friction(WallFrictionConfig(), feedforward="last")
+    else:
+        config = ContactTypesConfig()
+        diagram = contact_types.make_contact_types(
+            config, contact_types.make_task(config)
+        )
+    wrench = diagram.GetSubsystemByName("station").GetOutputPort(
+        "panda.external_wrench"
+    )
+    readers = {
+        target[0].get_name()
+        for target, (source, port) in diagram.connection_map().items()
+        if source.get_name() == "station" and port == wrench.get_index()
+    }
+    logs = {reader for reader in readers if "record" in reader or "telem" in reader}
+    assert readers - logs == {"wrench_tare"}
+
+
+def test_the_bias_is_taken_off_before_the_wall_friction_block_lands():
+    config = WallFrictionConfig(seed=3, realism="lab")
+    simulator = Simulator(make_wall_friction(config))
+    diagram, root = simulator.get_system(), simulator.get_mutable_context()
+    simulator.AdvanceTo(0.5)
+    wrenches = []
+    for k in range(100):
+        simulator.AdvanceTo(0.5 + 0.001 * k)
+        wrenches.append(diagram.GetOutputPort("wrench").Eval(root)[:3])
+    # 4 x 0.1/sqrt(100) of noise, and 0.3 kg times the motion's 0.2 m/s2.
+    np.testing.assert_allclose(np.mean(wrenches, axis=0), 0.0, atol=0.1)
+    assert np.linalg.norm(draw_errors("lab", 3).force_bias) > 0.3

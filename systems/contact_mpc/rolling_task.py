@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import LeafSystem
 
-from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL
+from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL, V_BALL
 from makebreak.systems.contact_mpc.numerics.rolling_task import (
     ROLL,
     WAIT,
@@ -17,11 +17,20 @@ from makebreak.systems.contact_mpc.numerics.rolling_task import (
     shifted,
     target_over_horizon,
 )
+from makebreak.systems.contact_mpc.numerics.untouched_ball import (
+    UntouchedBall,
+    downhill,
+    watched,
+)
 from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.timing import timed
 
 # The tip waits for a ball that is farther than this outside of the circle [m].
 OUT_OF_REACH = 0.12
+# So far uphill of the path, in units of s T^2, a ball is aimed that rolls away while
+# the tip goes back in a time T. It is off by s T^2/6 on average meanwhile, by s T^2/2
+# at the end, and the push that follows takes that back.
+UPHILL = 0.25
 
 
 @dataclass
@@ -56,7 +65,9 @@ class RollingTask(LeafSystem):
     Outputs: x_desired ((N + 1) 19,) for C3; reference (9,) = p, v, a of the tip at the
              next tick, used unless rolling; phase (1,): 0 roll, 1 reposition, 2 wait,
              3 approach; feel (1,): 1 while the tip pushes a ball that did not coast as
-             a ball should, so that the tip has to feel for it.
+             a ball should, so that the tip has to feel for it; downhill (2,) [m/s2]:
+             the slope's acceleration of a ball that does not wait where nobody touches
+             it, zero for one that may.
 
     A ball beyond OUT_OF_REACH is treated as one that is not seen. Before the first
     update the phase is WAIT, with the tip at p_tip.
@@ -94,6 +105,7 @@ class RollingTask(LeafSystem):
         self._landed = self.DeclareVectorInputPort("landed", 1)
         start = TaskState(WAIT, 0.0, p_tip, np.zeros(3), np.zeros(3), p_tip[2])
         self._task = self.DeclareAbstractState(AbstractValue.Make(start))
+        self._ball = self.DeclareAbstractState(AbstractValue.Make(UntouchedBall()))
         x_desired = np.tile(np.eye(N_X)[3], n_knots)
         circle = (self._path, np.zeros(N_X), 0.0, 0.0, 0.0)
         first_call(target_over_horizon, *circle, radius_ball, knot_sec, n_knots)
@@ -102,10 +114,12 @@ class RollingTask(LeafSystem):
         self._shift = self.DeclareDiscreteState([0.0])  # Added to the radius [m].
         self._phase = self.DeclareDiscreteState([float(WAIT)])
         self._feel = self.DeclareDiscreteState([0.0])
+        self._slope = self.DeclareDiscreteState([0.0, 0.0])
         self.DeclareStateOutputPort("x_desired", self._x_desired)
         self.DeclareStateOutputPort("reference", self._reference)
         self.DeclareStateOutputPort("phase", self._phase)
         self.DeclareStateOutputPort("feel", self._feel)
+        self.DeclareStateOutputPort("downhill", self._slope)
         self.DeclarePeriodicUnrestrictedUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
@@ -141,7 +155,14 @@ class RollingTask(LeafSystem):
         shift = float(context.get_discrete_state(self._shift).value()[0])
         if valid:
             shift = shifted(c.rolling, self._path, shift, x, c.period_sec)
-        path = replace(self._path, radius=self._path.radius + shift)
+        ball = context.get_abstract_state(int(self._ball)).get_value()
+        ball = watched(ball, t, x[V_BALL][:2], task.phase == ROLL, valid)
+        slope = downhill(ball)
+        path = replace(
+            self._path,
+            center=self._path.center - UPHILL * ball.coast_sec**2 * slope,
+            radius=self._path.radius + shift,
+        )
         task = next_state(
             c.rolling, path, task, t, c.period_sec, x, gap, valid,
             self._radius_ball, self._radius_tip, landed, gap_std, force_z,
@@ -154,8 +175,10 @@ class RollingTask(LeafSystem):
             path, x, np.deg2rad(c.lead_deg), c.speed, z_tip, self._radius_ball,
             self._knot_sec, self._n_knots,
         )  # fmt: skip
-        state.get_mutable_abstract_state(int(self._task)).set_value(task)
+        state.get_mutable_abstract_state(int(self._ball)).set_value(ball)
         discrete = state.get_mutable_discrete_state()
+        discrete.set_value(int(self._slope), slope)
+        state.get_mutable_abstract_state(int(self._task)).set_value(task)
         discrete.set_value(int(self._x_desired), goal.ravel())
         discrete.set_value(
             int(self._reference), np.concatenate([task.p, task.v, task.a])
