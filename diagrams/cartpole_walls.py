@@ -7,7 +7,7 @@ The plant is either the LCS itself, with the true walls, or a scene's MultibodyP
 a nonlinear pole and walls of Drake's compliant point contact.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Literal
 
 import numpy as np
@@ -23,7 +23,7 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
 from makebreak.diagrams.recorder import add_recorder
-from makebreak.diagrams.wiring import add_legend
+from makebreak.diagrams.wiring import add_legend, refuse_unused
 from makebreak.models.model_files import MODELS
 from makebreak.models.scene import load_scene
 from makebreak.systems.baselines.dynamics_residual_learner import (
@@ -85,6 +85,23 @@ class CartpoleWallsConfig:
     # Scene file of the simulated world, where the plant is a MultibodyPlant.
     world: str = SCENE
     learning: ResidualLearnerConfig = field(default_factory=_learner)
+
+
+def refuse_unused_settings(config: CartpoleWallsConfig) -> None:
+    """Raises: ValueError for settings that nothing reads with the chosen learner."""
+    plain = CartpoleWallsConfig()
+    refuse_unused(config, plain, "learning.slip_noise", "the walls have no friction")
+    learned = config.learner if config.adapt else "none"
+    if not config.adapt:
+        refuse_unused(config, plain, "learner", "not used with adapt=false")
+    if learned in ("r_comp", "both"):
+        return
+    read = {"eps", "gamma", "Q_d"}  # For the map of gradients.
+    if learned == "r_dyn":
+        read.add("n_b")
+    why = f"not used with {f'learner={learned}' if config.adapt else 'adapt=false'}"
+    for name in {one.name for one in fields(config.learning)} - read:
+        refuse_unused(config, plain, f"learning.{name}", why)
 
 
 def true_lcs() -> LCS:

@@ -18,12 +18,15 @@ from makebreak.diagrams.cartpole_walls import (
     initial_state,
     make_cartpole_walls,
     model_lcs,
+    refuse_unused_settings,
     start,
     true_lcs,
 )
 from makebreak.models.scene import load_scene
 from makebreak.scripts.cli import main
 from makebreak.scripts.experiments import cartpole_walls as experiment
+from makebreak.scripts.session import Session
+from makebreak.scripts.settings import apply_settings
 from makebreak.systems.contact_mpc.numerics.cartpole import (
     CartPole,
     cartpole_lcs,
@@ -206,6 +209,37 @@ def test_wrong_settings_are_refused_by_name(changes, message):
     with pytest.raises(ValueError, match=message):
         make_cartpole_walls(config)
         initial_state(config)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["learning.slip_noise=0.1"], "slip_noise is 0.1, .* have no friction"),
+        (["learner=none", "learning.r_max=0.3"], "not used with learner=none"),
+        (["learner=r_dyn", "learning.n_steps=2"], "not used with learner=r_dyn"),
+        (["adapt=false", "learning.n_b=5"], "n_b is 5, expected 10: .* adapt=false"),
+        (["adapt=false", "learner=both"], "learner is both"),
+    ],
+)
+def test_settings_that_the_learner_does_not_read_are_refused(
+    settings, message, tmp_path
+):
+    config = apply_settings(CartpoleWallsConfig(), settings)
+    with pytest.raises(ValueError, match=message), Session(tmp_path) as session:
+        experiment.run(config, session)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ["learning.gamma=0.005", "learning.n_b=5"],
+        ["learner=both", "learning.n_steps=2"],
+        ["learner=r_dyn", "learning.n_b=5"],
+        ["learner=none", "learning.eps=10"],  # Of the map of gradients.
+    ],
+)
+def test_settings_that_are_read_are_accepted(settings):
+    refuse_unused_settings(apply_settings(CartpoleWallsConfig(), settings))
 
 
 @pytest.mark.parametrize("learner", ["none", "r_comp", "r_dyn", "both"])

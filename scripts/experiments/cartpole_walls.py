@@ -28,6 +28,7 @@ from makebreak.diagrams.cartpole_walls import (
     CartpoleWallsConfig,
     initial_state,
     make_cartpole_walls,
+    refuse_unused_settings,
     start,
     true_lcs,
 )
@@ -62,6 +63,7 @@ QUADRANTS = {
 
 def run(config: CartpoleWallsConfig, session: Session) -> dict:
     """Runs both plants; see the module for the criterion."""
+    refuse_unused_settings(config)
     x = initial_state(config)
     plain = replace(config, adapt=False)
     # All are built before any is run, so that bad settings raise at once. Meshcat's
