@@ -364,6 +364,33 @@ def test_no_contact_is_so_soft_that_a_tool_goes_in_by_centimetres(displaced):
         displaced.left([Effect("contact_stiffness", [at], {"stiffness": 0.01 * now})])
 
 
+def test_a_softer_contact_is_looked_for_only_where_no_place_explains_more(
+    right, displaced
+):
+    """Met with one force, a soft wall and one that is a little off have the same
+    distance, and in a soft one the tool stays deep, where more forces are permitted."""
+    for problem, is_tried in ((right[2], True), (displaced, False)):
+        search = Comparison(problem, lambda text: None)
+        start = fit_effects(problem, search.screen(problem.base()), ())
+        found = problem.candidates(search.nuisances, start)
+        for some in (found, problem.next_candidates(start)):
+            assert any(c.kind == "wall_position" for c in some)
+            assert any(c.kind == "contact_stiffness" for c in some) == is_tried
+
+
+def test_a_fit_of_a_place_starts_where_it_is_felt(displaced):
+    """A part of it, which columns may say, has the tool deep in the body."""
+    off = {displaced.shapes.names[k]: by for k, by in displaced.off.items()}
+    plain = displaced._plain_candidates(displaced.base(), ())
+    for kind, at, name, felt in (
+        ("wall_position", WALL, "x", off[WALL]["x"]),
+        ("plane_height", TABLE, "height", off[TABLE]["z"]),
+    ):
+        [found] = [c for c in plain if c.kind == kind and c.at[0] == at]
+        [effect] = found.effects(0, np.array([0.26 * felt]))
+        assert effect.parameters[name] == felt
+
+
 def test_a_rival_that_leaves_one_channel_a_gap_is_no_tie(tmp_path):
     """Few rows are distances of a wall that is 0.9 mm off: all rows together leave as
     much with its friction changed as with the wall put right."""

@@ -715,27 +715,65 @@ class PressingProblem(ContactProblem):
         return 0.0
 
     def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
-        """Patches of friction, which explain much at some places, only where no other
-        place or friction of a whole body explains more."""
-        found = self._plain_candidates(current.r, current.effects)
-        train = self.train()
-        screen = Screen(current.r, nuisances.columns, nuisances.prior, train)
-        r = screen.fit_nuisances(current.r)[1][train]
-        for c in found:
-            if c.kind in (*MOVES, "contact_friction"):
-                for X in c.columns:
-                    fit = np.linalg.lstsq(X[train], r, rcond=None)[0]
-                    if np.sum((r - X[train] @ fit) ** 2) < WHOLE * np.sum(r**2):
-                        return found
-        for pair in self._pairs_met:
-            found += self._patches(pair, current)
+        """Softer contacts, and patches of friction, which explain much at some places,
+        only where no place and no friction of a whole body explains more."""
+        found, is_enough = self._whole_candidates(current)
+        if not is_enough:
+            for pair in self._pairs_met:
+                found += self._patches(pair, current)
         return found
+
+    def next_candidates(self, current: Fitted) -> list[Candidate]:
+        return self._whole_candidates(current)[0]
+
+    def _whole_candidates(self, current: Fitted) -> tuple[list[Candidate], bool]:
+        """Candidates but patches, and whether a place or the friction of a body takes
+        off a tenth of what is left. Then a softer contact is none: it lets a tool stay
+        deeper in a body, where forces may act that in truth do not."""
+        found = self._plain_candidates(current.r, current.effects)
+        n, train = self.nuisances(), self.train()
+        screen = Screen(current.r, n.columns, n.prior, train)
+        r = screen.fit_nuisances(current.r)[1][train]
+        whole = [
+            X[train] for c in found if c.kind in (*MOVES, "contact_friction")
+            for X in c.columns
+        ]  # fmt: skip
+        is_enough = any(
+            np.sum((r - X @ np.linalg.lstsq(X, r, rcond=None)[0]) ** 2)
+            < WHOLE * np.sum(r**2)
+            for X in whole
+        )
+        if is_enough:
+            found = [c for c in found if c.kind != "contact_stiffness"]
+        return found, is_enough
 
     def _plain_candidates(self, r: np.ndarray, there: Sequence[Effect]):
         found = super()._plain_candidates(r, there)
         taken = {e.at[0] for e in there if e.kind in MOVES}
         # Trials of any other size than what is felt would tell nothing.
-        return [c for c in found if c.kind not in MOVES or c.at[0] not in taken]
+        return [
+            self._from_what_is_felt(c) if c.kind in MOVES else c for c in found
+            if c.kind not in MOVES or c.at[0] not in taken
+        ]  # fmt: skip
+
+    def _from_what_is_felt(self, c: Candidate) -> Candidate:
+        """A candidate of which a fit starts where the body is felt. What explains most
+        along a line from the scene may be a part of that: there the tool is deep in the
+        body, and a fit may stay where it starts."""
+        (by,) = [
+            self.off.get(k, {}) for k, name in self.shapes.names.items()
+            if name == c.at[0]
+        ]  # fmt: skip
+        if c.kind == "plane_height":
+            by = {"height": by["z"]} if "z" in by else {}
+
+        def starting(read):
+            def at_felt(x) -> dict[str, float]:
+                return {n: by.get(n, value) for n, value in read(x).items()}
+
+            return at_felt
+
+        return replace(c, to_parameters=tuple(map(starting, c.to_parameters)))
 
     def _acts_at(self, kind: str, at: str) -> list[str]:
         """A height is that of what stands there, too."""
