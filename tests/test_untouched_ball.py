@@ -58,6 +58,13 @@ def test_a_slope_of_half_a_degree_is_told_from_the_rolling_resistance(seed):
     np.testing.assert_array_equal(downhill(level), 0.0)
 
 
+def test_a_table_that_is_level_within_the_noise_is_no_slope_without_resistance_either():
+    ball = rolled(np.array([0.01, 0.0]), 0.0)
+    slope, resistance = slope_and_resistance(ball)
+    assert np.linalg.norm(slope) > resistance
+    np.testing.assert_array_equal(downhill(ball), 0.0)
+
+
 def test_nothing_is_said_at_first_and_a_touch_is_no_slope():
     true = np.array([SLOPE, 0.0])
     np.testing.assert_array_equal(downhill(rolled(true, RESISTANCE, pushes=2)), 0.0)

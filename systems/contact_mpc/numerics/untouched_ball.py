@@ -22,6 +22,8 @@ STEEP = 0.25  # More than a slope of 2 deg: the ball was touched, or not seen [m
 COAST_MAX = 1.0  # The first approach, and a search, take longer: no example [s].
 PRIOR = 0.5  # Weight of s = c = 0, in windows.
 WINDOWS_LEAST = 8  # With fewer nothing is known.
+# Less is not told from a level table: 0.16 deg, 5 mm in 0.7 s [m/s2].
+SLOPE_MIN = 0.02
 
 
 def _zeros(*shape):
@@ -89,8 +91,9 @@ def slope_and_resistance(ball: UntouchedBall):
 
 def downhill(ball: UntouchedBall) -> np.ndarray:
     """s (2,) [m/s2] of a ball that does not wait; zero as long as it may wait: then s
-    is not told from the resistance, or not known yet."""
+    is less than the resistance or SLOPE_MIN, or not known yet."""
     if ball.windows < WINDOWS_LEAST:
         return np.zeros(2)
     slope, resistance = slope_and_resistance(ball)
-    return slope if np.sqrt(slope @ slope) >= resistance else np.zeros(2)
+    steep = np.sqrt(slope @ slope) >= max(resistance, SLOPE_MIN)
+    return slope if steep else np.zeros(2)
