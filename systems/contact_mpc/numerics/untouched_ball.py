@@ -21,7 +21,7 @@ STILL = 0.005  # A slower ball has no direction [m/s].
 STEEP = 0.25  # More than a slope of 2 deg: the ball was touched, or not seen [m/s2].
 COAST_MAX = 1.0  # The first approach, and a search, take longer: no example [s].
 PRIOR = 0.5  # Weight of s = c = 0, in windows.
-WINDOWS_LEAST = 8  # With fewer nothing is known.
+WINDOWS_LEAST = 12  # With fewer nothing is known.
 # Less is not told from a level table: 0.16 deg, 5 mm in 0.7 s [m/s2].
 SLOPE_MIN = 0.02
 
