@@ -239,15 +239,16 @@ def _scale(effect: Effect, name: str) -> float:
 
 
 def _lowest(kind: str, name: str) -> float:
-    valid = KINDS[kind].parameter(name).valid
-    return {">= 0": 0.0, "> 0": 1e-9, "share": 0.0}.get(valid, -np.inf)
+    parameter = KINDS[kind].parameter(name)
+    lowest = {">= 0": 0.0, "> 0": 1e-9, "share": 0.0}
+    return lowest.get(parameter.valid, -parameter.most)
 
 
 def _highest(kind: str, name: str) -> float:
     """A share ends where robots' do: at 1 nothing is left."""
     parameter = KINDS[kind].parameter(name)
     ends = parameter.ends or parameter.valid == "share"
-    return parameter.high if ends else np.inf
+    return parameter.high if ends else parameter.most
 
 
 def _tidy(effect: Effect) -> Effect:

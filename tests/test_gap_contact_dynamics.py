@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from makebreak.gap import workflow
 from makebreak.gap.data.reading import read_recordings
-from makebreak.gap.fit import _Free, fit_effects
+from makebreak.gap.fit import _Free, _highest, _lowest, fit_effects
 from makebreak.gap.numerics import permitted_forces
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Outcome, SearchPlan, is_sane
@@ -251,6 +251,22 @@ def test_a_side_of_a_patch_that_nothing_crosses_is_said_not_to_be_known(tmp_path
     # No foot comes near this one, as these pushes go; across the others they do.
     assert 0.004 <= std["x_min"] < np.inf
     assert max(std["y_min"], std["y_max"]) <= 0.002
+    # A fit that has wandered off comes back to where something slid.
+    places = problem._slid_over(next(p for p in problem._pairs_met
+                                     if problem.pair_name(p) == PAIR))  # fmt: skip
+    far = replace(patch, parameters={**patch.parameters, "x_max": 40.0})
+    assert problem.prior_rows([patch]).max() < 0.1 * problem.prior_rows([far]).max()
+    (back,) = fit_effects(problem, screen, [far]).effects
+    assert places[:, 0].max() < back.parameters["x_max"] < places[:, 0].max() + 0.2
+    assert back.parameters["y_min"] == pytest.approx(sides["y_min"], abs=0.004)
+
+
+def test_no_fit_goes_where_a_parameter_is_refused():
+    """Nothing shows where a patch's side is that nothing slid across."""
+    kind = KINDS["friction_patch"]
+    for p in kind.parameters:
+        assert _highest("friction_patch", p.name) <= p.most
+        assert _lowest("friction_patch", p.name) >= -p.most
 
 
 def test_of_a_friction_s_deviation_held_out_rows_are_asked(tmp_path, monkeypatch):
@@ -327,7 +343,7 @@ def test_a_patch_s_friction_ends_where_surfaces_do():
                 "x_max": 0.1, "y_min": 0.0, "y_max": 0.1})], [()],
     )  # fmt: skip
     assert free.x0[0] <= free.high[0] == 1.5
-    assert np.isinf(free.high[1:]).all()
+    assert (free.high[1:] == KINDS["friction_patch"].parameter("x_max").most).all()
 
 
 @pytest.mark.parametrize(("mass", "friction"), [(4.0, 1.6), (4.0, 3.9), (1.2, 0.5)])

@@ -29,6 +29,9 @@ PATCH_RUNS, PATCH_STARTS, PATCHES = 120, 8, 3
 # A friction that sticks may be anything larger: its logarithm is known to be off the
 # scene's by about so much.
 FRICTION_SPREAD = 1.0
+# A side of a patch that is so far beyond what was slid over is as good as nearer, which
+# is taken, with this deviation [m].
+BESIDE, BEYOND = 0.01, 0.05
 # Of what the scene has, tried: small steps, and far ones, for what a friction changes
 # ends where the contact holds.
 FRICTIONS, MASSES = (0.85, 1.3, 0.5, 2.0), (0.85, 1.2, 0.6, 1.6)
@@ -320,8 +323,9 @@ class ContactCandidates(ContactRows):
 
     def prior_rows(self, effects: Sequence[Effect]) -> np.ndarray:
         """Where something sticks all friction that is enough explains alike: what is
-        nearest to the scene's is taken."""
-        rows = []
+        nearest to the scene's is taken. So do all sides of a patch that are beyond what
+        was slid over: there a fit would go on for kilometres."""
+        rows: list[float] = []
         for e in effects:
             if e.kind == "contact_friction":
                 for pair in self._pairs_met:
@@ -329,7 +333,22 @@ class ContactCandidates(ContactRows):
                     if now > 0.0 and self._at_pair(e, pair):
                         off = np.log(max(e.parameters["friction"], 1e-3) / now)
                         rows.append(off / FRICTION_SPREAD)
+            elif e.kind == "friction_patch":
+                rows += self._sides_beyond(e)
         return np.array(rows)
+
+    def _sides_beyond(self, patch: Effect) -> list[float]:
+        """By how much sides are beyond what was slid over, over BEYOND."""
+        slid = [self._slid_over(p) for p in self._pairs_met if self._at_pair(patch, p)]
+        places = np.vstack([*slid, np.zeros((0, 2))])
+        if not len(places):
+            return []
+        off = []
+        for axis, c in zip("xy", places.T, strict=True):
+            sides = [patch.parameters[f"{axis}_{end}"] for end in ("min", "max")]
+            off += [c.min() - BESIDE - side for side in sides]
+            off += [side - c.max() - BESIDE for side in sides]
+        return [float(max(each, 0.0) / BEYOND) for each in off]
 
     def _now_at(self, effect: Effect) -> float:
         """Friction in the scene, of the pair that an effect is of."""

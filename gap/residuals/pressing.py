@@ -40,7 +40,10 @@ FELT, LESS = 4.0, 0.5  # Mean square of what is left where a face is felt; with 
 CLEAR, LEAST_FORCE, FELT_SHARE = 6.0, 0.5, 0.03  # Times noise, [N], of the rows.
 MOVES = ("wall_position", "plane_height")
 WHOLE = 0.9  # Of the squares left: one more place or friction must leave less.
-SOFTER = (0.3, 0.6, 2.0)  # Times the stiffness of the scene: trials.
+# Times the stiffness of the scene: trials. Drake's default is a hundred times that of
+# a rubber tip.
+SOFTER = (0.03, 0.1, 0.3, 0.6, 2.0)
+LOUD = 1.5  # Times its noise: a channel for which the search goes on.
 SQUEEZED = 10.0  # Times what a row needs: forces that act in it, at most.
 MOST_FRICTION = 2.0  # Of what is taken for any.
 MOST_PATCHES, MOST_EFFECTS = 3, 10
@@ -104,8 +107,11 @@ class PressingProblem(ContactProblem):
     """Raises: DoesNotFit where anything but joints moves, or as ContactDynamics."""
 
     moves = MOVES
-    # A wall that was met for a moment shows in its own distance alone.
-    plan = replace(ContactProblem.plan, by_channel=True, most_effects=MOST_EFFECTS)
+    # A wall that was met for a moment shows in its own distance alone, and how soft it
+    # is in a small part of that.
+    plan = replace(
+        ContactProblem.plan, by_channel=True, most_effects=MOST_EFFECTS, loud=LOUD
+    )
 
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
         self._any_friction = False
