@@ -192,6 +192,9 @@ class _Free:
             ]
         )
         self.high = np.array([_highest(start[i].kind, name) for i, name in self.names])
+        self._most = np.array(
+            [KINDS[start[i].kind].parameter(name).most for i, name in self.names]
+        )
         x0 = np.array([start[i].parameters[name] for i, name in self.names])
         x0 = np.maximum(x0, self.low + 1e-9 * self.scale)
         self.x0 = np.minimum(x0, self.high - 1e-9 * self.scale)
@@ -199,7 +202,9 @@ class _Free:
     def effects(self, z: np.ndarray) -> list[Effect]:
         """Effects of parameters z (n,), in units of `scale`."""
         parameters = [dict(effect.parameters) for effect in self._start]
-        for (i, name), value in zip(self.names, z * self.scale, strict=True):
+        # A number that is refused is not where a fit ends, which may not see it at all.
+        values = np.clip(z * self.scale, -self._most, self._most)
+        for (i, name), value in zip(self.names, values, strict=True):
             parameters[i][name] = float(value)
         return [
             Effect(e.kind, list(e.at), p)
@@ -239,16 +244,15 @@ def _scale(effect: Effect, name: str) -> float:
 
 
 def _lowest(kind: str, name: str) -> float:
-    parameter = KINDS[kind].parameter(name)
-    lowest = {">= 0": 0.0, "> 0": 1e-9, "share": 0.0}
-    return lowest.get(parameter.valid, -parameter.most)
+    valid = KINDS[kind].parameter(name).valid
+    return {">= 0": 0.0, "> 0": 1e-9, "share": 0.0}.get(valid, -np.inf)
 
 
 def _highest(kind: str, name: str) -> float:
     """A share ends where robots' do: at 1 nothing is left."""
     parameter = KINDS[kind].parameter(name)
     ends = parameter.ends or parameter.valid == "share"
-    return parameter.high if ends else parameter.most
+    return parameter.high if ends else np.inf
 
 
 def _tidy(effect: Effect) -> Effect:
