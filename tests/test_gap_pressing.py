@@ -15,6 +15,7 @@ from makebreak.gap.search.rivals import still_tied
 from makebreak.gap.search.select import select
 from makebreak.gap.workflow import judged_channels, problem_for, unjudged_channels
 from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
 
@@ -99,7 +100,7 @@ def contact(p, v, table, wall, mu, longer=0.0):
 
 def record(
     folder, table=0.0, wall=0.3, mu=(TABLE_MU, WALL_MU), wrench=True, n=1, longer=0.0,
-    effort="effort_command",
+    effort="effort_command", mass=MASS,
 ):  # fmt: skip
     """Down on the table, along it to the wall, along both; pressed with about 8 N."""
     rng = np.random.default_rng(0)
@@ -116,9 +117,9 @@ def record(
                 0.02 if t < 3.0 else 0.2 * (1.0 if (t + episode) % 2.0 < 1.0 else -1.0),
                 -0.15 if t < 1.2 else 0.0,
             ])  # fmt: skip
-            u = MASS * 25.0 * (target - v)
+            u = mass * 25.0 * (target - v)
             pressed = [8.0 * (t > 3.0), 0.0, -8.0 * (t > 1.2)]
-            u = np.clip(u, -12.0, 12.0) + pressed + np.array([0.0, 0.0, MASS * 9.81])
+            u = np.clip(u, -12.0, 12.0) + pressed + np.array([0.0, 0.0, mass * 9.81])
             F = contact(p, v, table, wall, mu, longer)
             states.append(state)
             efforts.append(u)
@@ -126,7 +127,7 @@ def record(
 
             def rate(y, u=u):
                 a = u + contact(y[:3], y[3:], table, wall, mu)[:3]
-                return np.append(y[3:], a / MASS - GRAVITY)
+                return np.append(y[3:], a / mass - GRAVITY)
 
             for _ in range(2):  # The classical Runge-Kutta rule.
                 h = dt / 2
@@ -449,3 +450,13 @@ def test_where_only_efforts_were_measured_simulation_confirms_a_place(tmp_path):
         outcome = problem.outcome(there, *unused, held)
         assert outcome.gap.before > 5.0
         assert outcome.gap.after < 2.0
+
+
+def test_a_tool_that_is_heavier_is_no_gain(tmp_path):
+    """With no load among the candidates it came out as gains of all drives."""
+    scene = write_scene(tmp_path)
+    problem = PressingProblem(scene, record(tmp_path, mass=MASS + 0.25))
+    (choice,) = select(problem).choices
+    assert KINDS[choice.effect.kind].weighs
+    assert choice.effect.at == ["gantry.tool"]
+    assert choice.effect.parameters["mass"] == pytest.approx(0.25, abs=0.01)

@@ -27,6 +27,7 @@ from makebreak.gap.residuals.touching import MEETS
 from makebreak.gap.residuals.wrench_sensor import FORCE
 from makebreak.gap.simulation.contact_shapes import Slot
 from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
 
@@ -49,6 +50,7 @@ MOST_FRICTION = 2.0  # Of what is taken for any.
 MOST_PATCHES, MOST_EFFECTS = 3, 10
 MOST_SLOTS = 12  # Places of a fixed body at which its distances are kept.
 SMALL_SHIFT = 1e-3  # First trial of a place [m].
+LOAD = 0.1  # First trial of a load, of what a link weighs on average.
 AXES, UP = "xyz", np.array([0.0, 0.0, 1.0])
 STANDS, LEVEL = 1e-3, 0.9  # It stands on what is so near below it [m]; cosine.
 
@@ -760,7 +762,31 @@ class PressingProblem(ContactProblem):
         return [
             self._from_what_is_felt(c) if c.kind in MOVES else c for c in found
             if c.kind not in MOVES or c.at[0] not in taken
-        ]  # fmt: skip
+        ] + self._loads(r, there)  # fmt: skip
+
+    def _loads(self, r: np.ndarray, there: Sequence[Effect]) -> list[Candidate]:
+        """Loads on links, and links that are otherwise than in the model, by small
+        ones."""
+        links = self.dynamics.links()
+        small = LOAD * float(np.mean(list(links.values())))
+        taken = {(e.kind, at) for e in there for at in e.at}
+        found = []
+        for kind, entry in KINDS.items():
+            if entry.probes is None:
+                continue
+            probes, reader = entry.probes(small)
+            for at in links:
+                if (kind, at) in taken:
+                    continue
+                moved = [self._try(there, Effect(kind, [at], p)) for p in probes]
+                if any(each is None for each in moved):
+                    continue
+                columns = np.stack([r - each for each in moved], axis=1)
+                found.append(
+                    Candidate(kind, (at,), columns.shape[1], (columns,), (reader,),
+                              least=self.dynamics.least(kind, [at]))
+                )  # fmt: skip
+        return found
 
     def _from_what_is_felt(self, c: Candidate) -> Candidate:
         """A candidate of which a fit starts where the body is felt. What explains most
