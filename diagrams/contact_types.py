@@ -17,6 +17,7 @@ from makebreak.diagrams.changing_contact import (
     ChangingContactConfig,
     Knowledge,
     make_changing_contact,
+    refuse_unused_control,
 )
 from makebreak.diagrams.given_pattern import expected_contacts, start_at_pattern
 from makebreak.diagrams.realism import StationErrors, draw_errors
@@ -141,6 +142,7 @@ def make_task(config: ContactTypesConfig) -> TypesTask:
 
     Raises: ValueError for a setting out of range.
     """
+    refuse_unused_control(config, ContactTypesConfig())
     for name in ("speed", "normal_force"):
         if not 0.0 < getattr(config, name) < np.inf:
             raise ValueError(f"{name} is {getattr(config, name)}, expected > 0")

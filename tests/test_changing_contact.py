@@ -26,6 +26,7 @@ from makebreak.models.scene import read_scene
 from makebreak.scripts.experiments import (
     changing_surface,
     contact_learning,
+    contact_types,
     multiple_collisions,
     surface_switch,
 )
@@ -303,7 +304,8 @@ OPPOSITE = {"true": "false", "false": "true"}
 
 
 @pytest.mark.parametrize("module", [
-    changing_surface, contact_learning, multiple_collisions, surface_switch,
+    changing_surface, contact_learning, contact_types, multiple_collisions,
+    surface_switch,
 ])  # fmt: skip
 def test_settings_that_another_one_leaves_out_are_refused(module):
     def task(*settings):
