@@ -121,8 +121,8 @@ def check_sizes(config, default, prefix: str = "") -> None:
         name = f"{prefix}{f.name}"
         if dataclasses.is_dataclass(value):
             check_sizes(value, usual, name + ".")
-        elif value == f.default == np.inf:  # As without such a limit.
-            continue
+        elif isinstance(value, float) and value == f.default == np.inf:
+            continue  # As without such a limit.
         elif typing.get_origin(hints[f.name]) is not typing.Annotated:
             _check_size(name, value, usual)
 
