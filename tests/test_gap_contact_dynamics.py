@@ -261,13 +261,18 @@ def test_a_side_of_a_patch_that_nothing_crosses_is_said_not_to_be_known(tmp_path
     assert back.parameters["y_min"] == pytest.approx(sides["y_min"], abs=0.004)
 
 
-def test_no_fit_goes_where_a_parameter_is_refused():
-    """Nothing shows where a patch's side is that nothing slid across."""
-    free = _Free(
+def free_patch(friction: float) -> _Free:
+    """What a fit may move of a patch."""
+    return _Free(
         SimpleNamespace(dynamics=SimpleNamespace(least=lambda kind, at: {})),
-        [Effect("friction_patch", [PAIR], {"friction": 0.4, "x_min": 0.0,
+        [Effect("friction_patch", [PAIR], {"friction": friction, "x_min": 0.0,
                 "x_max": 0.1, "y_min": 0.0, "y_max": 0.1})], [()],
     )  # fmt: skip
+
+
+def test_no_fit_goes_where_a_parameter_is_refused():
+    """Nothing shows where a patch's side is that nothing slid across."""
+    free = free_patch(0.4)
     (far,) = free.effects(free.x0 / free.scale + np.array([0.0, -1e9, 1e9, 0.0, 0.0]))
     check_parameters(far, KINDS["friction_patch"])
     assert far.parameters["x_max"] == KINDS["friction_patch"].parameter("x_max").most
@@ -341,11 +346,7 @@ def test_a_place_that_explains_less_is_among_the_rectangles_too():
 
 def test_a_patch_s_friction_ends_where_surfaces_do():
     """A corner of a patch with friction of 45 leaves as little in few rows."""
-    free = _Free(
-        SimpleNamespace(dynamics=SimpleNamespace(least=lambda kind, at: {})),
-        [Effect("friction_patch", [PAIR], {"friction": 45.0, "x_min": 0.0,
-                "x_max": 0.1, "y_min": 0.0, "y_max": 0.1})], [()],
-    )  # fmt: skip
+    free = free_patch(45.0)
     assert free.x0[0] <= free.high[0] == 1.5
     assert np.isinf(free.high[1:]).all()
 

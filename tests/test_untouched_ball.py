@@ -7,8 +7,11 @@ from pydrake.systems.analysis import Simulator
 from makebreak.systems.contact_mpc.numerics.ball_state import P_BALL, pack
 from makebreak.systems.contact_mpc.numerics.rolling_task import ROLL
 from makebreak.systems.contact_mpc.numerics.untouched_ball import (
+    CLEAR_SEC,
     COAST_MAX,
     LEAVE_SEC,
+    WINDOW_SEC,
+    WINDOWS_LEAST,
     UntouchedBall,
     downhill,
     slope_and_resistance,
@@ -70,6 +73,18 @@ def test_nothing_is_said_at_first_and_a_touch_is_no_slope():
     np.testing.assert_array_equal(downhill(rolled(true, RESISTANCE, pushes=2)), 0.0)
     ball = rolled(true, RESISTANCE, kick=0.02)
     np.testing.assert_allclose(slope_and_resistance(ball)[0], true, atol=0.015)
+
+
+def test_a_slope_is_believed_from_the_least_number_of_windows_on():
+    ball, ends = UntouchedBall(), []
+    for t in DT * np.arange(240):  # One long coast down the slope.
+        before, v = ball, np.array([0.2 + SLOPE * t, 0.0])
+        ball = watched(ball, t, v, t == 0.0, True)
+        if ball.moment is not before.moment:
+            ends.append(t)
+        assert bool(downhill(ball).any()) == (len(ends) >= WINDOWS_LEAST)
+    assert len(ends) > WINDOWS_LEAST
+    np.testing.assert_allclose(np.diff(ends), WINDOW_SEC + CLEAR_SEC, atol=1e-9)
 
 
 def test_the_time_of_a_coast_is_that_between_pushes_but_for_long_ones():

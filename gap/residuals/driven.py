@@ -9,6 +9,7 @@ would do is seen by differences.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -33,7 +34,7 @@ from makebreak.gap.residuals.mechanism import (
     link_changes,
     moved_links,
 )
-from makebreak.gap.residuals.mechanism_candidates import NUISANCE_LIMIT
+from makebreak.gap.residuals.mechanism_candidates import NUISANCE_LIMIT, loads
 from makebreak.gap.residuals.objects import unexplained_in_windows
 from makebreak.gap.residuals.where import where_in_windows
 from makebreak.gap.result import Where
@@ -44,7 +45,6 @@ from makebreak.models.drives import DRIVEN_BY, law_of
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.joints import rotor
 from makebreak.models.effects.kind import Effect, find_joints, full_name
-from makebreak.models.effects.objects import MASS
 from makebreak.models.scene import Scene
 from makebreak.models.scene_schema import COMMANDS_OF
 
@@ -287,28 +287,11 @@ class DrivenProblem(DrivenWindows, GapProblem):
                         Candidate(kind, (joint,), 1, own, tuple(readers),
                                   least=self.dynamics.least(kind, [joint]))
                     )  # fmt: skip
-        found += self._of_bodies(current, taken)
+        found += loads(
+            self.dynamics, taken, current.r, partial(self._residual, current),
+            lambda kind: self.dynamics.places(kind) if can_have(kind) else (),
+        )  # fmt: skip
         return [c for c in found if any(x.any() for x in c.columns)]
-
-    def _of_bodies(self, current: Fitted, taken) -> list[Candidate]:
-        """Loads, and masses that are otherwise than in the model, by small ones."""
-        masses = [self.dynamics.now(MASS, [at])["mass"] for at in self.dynamics.links()]
-        small = SMALL * float(np.mean(masses))
-        found = []
-        for kind, entry in KINDS.items():
-            if entry.probes is None or not can_have(kind):
-                continue
-            probes, reader = entry.probes(small)
-            for at in self.dynamics.places(kind):
-                if (kind, at) in taken:
-                    continue
-                moved = [self._residual(current, Effect(kind, [at], p)) for p in probes]
-                columns = np.stack([current.r - r for r in moved], axis=1)
-                found.append(
-                    Candidate(kind, (at,), columns.shape[1], (columns,), (reader,),
-                              least=self.dynamics.least(kind, [at]))
-                )  # fmt: skip
-        return found
 
     def _residual(self, current: Fitted, effect: Effect) -> np.ndarray:
         try:

@@ -1,6 +1,6 @@
 """What could act in a mechanism, and its nuisances, as columns of its equations."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ from makebreak.gap.residuals.drive_gains import gain_columns
 from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.gap.simulation.channel_effects import SENSED
 from makebreak.gap.thresholds import SINGLE_SHARE_OF_GROUP
+from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import (
     Effect,
@@ -27,6 +28,7 @@ _DELAYS = (0.004, 0.01, 0.02, 0.04)  # [s] at which a delay's column is taken.
 _STEPS = {"offset": (1e-3,), "bias": (1e-3,), "skew": (1e-4,)}
 _VELOCITY_DELAYS = (0.01,)
 _WAVES = 12  # Frequencies of a force that are tried on links other than the last.
+LOAD = 0.1  # First trial of a load, of what a link weighs on average.
 _HIDDEN_STATE_JOINTS = 3  # Joints at which a spring or a gap is tried: the worst ones.
 
 
@@ -184,6 +186,39 @@ def nuisances(model: InverseModel) -> Nuisances:
     return Nuisances(
         np.stack(columns, axis=1), np.array(prior), tuple(names), NUISANCE_LIMIT
     )
+
+
+def loads(
+    dynamics: SceneDynamics,
+    taken: Collection[tuple[str, str]],
+    r: np.ndarray,
+    left: Callable[[Effect], np.ndarray | None],
+    places: Callable[[str], Iterable[str]],
+) -> list[Candidate]:
+    """Loads, and masses that are otherwise than in the model, by small ones.
+
+    Args: taken: (kind, place) of effects that are there. r (m,): what these leave.
+        left: what one more leaves, None where there can be no such. places: of a kind.
+    """
+    small = LOAD * float(np.mean(list(dynamics.links().values())))
+    found = []
+    for kind, entry in KINDS.items():
+        if entry.probes is None:
+            continue
+        probes, reader = entry.probes(small)
+        for at in places(kind):
+            if (kind, at) in taken:
+                continue
+            moved = [each for p in probes
+                     if (each := left(Effect(kind, [at], p))) is not None]  # fmt: skip
+            if len(moved) < len(probes):
+                continue
+            columns = np.stack([r - each for each in moved], axis=1)
+            found.append(
+                Candidate(kind, (at,), columns.shape[1], (columns,), (reader,),
+                          least=dynamics.least(kind, [at]))
+            )  # fmt: skip
+    return found
 
 
 def _driven(model: InverseModel, joint: str) -> bool:

@@ -9,6 +9,7 @@ passed. What touches what, and its distance, follow from that.
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -22,12 +23,12 @@ from makebreak.gap.problem import Candidate, Fitted, Nuisances
 from makebreak.gap.residuals.contact_dynamics import THIN
 from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.impacts import MOST_SHARE, nearest, positions, walls_of
+from makebreak.gap.residuals.mechanism_candidates import loads
 from makebreak.gap.residuals.permitted_contacts import SLACK, Geometry, Shift
 from makebreak.gap.residuals.touching import MEETS
 from makebreak.gap.residuals.wrench_sensor import FORCE
 from makebreak.gap.simulation.contact_shapes import Slot
 from makebreak.models.dynamics import SceneDynamics
-from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
 
@@ -50,7 +51,6 @@ MOST_FRICTION = 2.0  # Of what is taken for any.
 MOST_PATCHES, MOST_EFFECTS = 3, 10
 MOST_SLOTS = 12  # Places of a fixed body at which its distances are kept.
 SMALL_SHIFT = 1e-3  # First trial of a place [m].
-LOAD = 0.1  # First trial of a load, of what a link weighs on average.
 AXES, UP = "xyz", np.array([0.0, 0.0, 1.0])
 STANDS, LEVEL = 1e-3, 0.9  # It stands on what is so near below it [m]; cosine.
 
@@ -759,34 +759,14 @@ class PressingProblem(ContactProblem):
         found = super()._plain_candidates(r, there)
         taken = {e.at[0] for e in there if e.kind in MOVES}
         # Trials of any other size than what is felt would tell nothing.
-        return [
+        found = [
             self._from_what_is_felt(c) if c.kind in MOVES else c for c in found
             if c.kind not in MOVES or c.at[0] not in taken
-        ] + self._loads(r, there)  # fmt: skip
-
-    def _loads(self, r: np.ndarray, there: Sequence[Effect]) -> list[Candidate]:
-        """Loads on links, and links that are otherwise than in the model, by small
-        ones."""
-        links = self.dynamics.links()
-        small = LOAD * float(np.mean(list(links.values())))
-        taken = {(e.kind, at) for e in there for at in e.at}
-        found = []
-        for kind, entry in KINDS.items():
-            if entry.probes is None:
-                continue
-            probes, reader = entry.probes(small)
-            for at in links:
-                if (kind, at) in taken:
-                    continue
-                moved = [self._try(there, Effect(kind, [at], p)) for p in probes]
-                if any(each is None for each in moved):
-                    continue
-                columns = np.stack([r - each for each in moved], axis=1)
-                found.append(
-                    Candidate(kind, (at,), columns.shape[1], (columns,), (reader,),
-                              least=self.dynamics.least(kind, [at]))
-                )  # fmt: skip
-        return found
+        ]  # fmt: skip
+        return found + loads(
+            self.dynamics, {(e.kind, at) for e in there for at in e.at}, r,
+            partial(self._try, there), lambda kind: self.dynamics.links(),
+        )  # fmt: skip
 
     def _from_what_is_felt(self, c: Candidate) -> Candidate:
         """A candidate of which a fit starts where the body is felt. What explains most
