@@ -1,7 +1,10 @@
 """The plants of `makebreak bench learner_plants`, and what its table says."""
 
+import re
+
 import numpy as np
 import pytest
+from pydrake.multibody.tree import BodyIndex
 
 from makebreak.scripts import bench
 from makebreak.scripts.bench_learner_plants import (
@@ -16,7 +19,14 @@ from makebreak.scripts.bench_learner_plants import (
     runs,
     summary,
 )
-from makebreak.scripts.bench_plants import DISC, FREE_BOX, PUCK, SQUEEZED
+from makebreak.scripts.bench_plants import (
+    DISC,
+    FREE_BOX,
+    OF_MASS,
+    PUCK,
+    SQUEEZED,
+    diagram_of,
+)
 
 RAIL = np.array([0.02, 0.21, 0.0, 0.0])  # Finger and puck, with radii of 5 cm each.
 
@@ -38,6 +48,26 @@ def test_a_positive_error_is_a_larger_gap_of_the_world():
         for e in (5e-3, 0.0)
     )
     np.testing.assert_allclose(wrong - right, 5e-3, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", OF_MASS)
+def test_an_object_has_the_mass_that_is_asked_for_spread_over_its_size(name):
+    _, plant = diagram_of(OF_MASS[name](0.37)[0])
+    bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
+    inertias = [b.default_spatial_inertia() for b in bodies]
+    (M,) = [M for M in inertias if M.get_mass() == pytest.approx(0.37)]
+    about = M.Shift(M.get_com()).get_unit_inertia().get_moments()
+    radii = np.sqrt(about)  # Of gyration: a door is as wide as 0.8 m, the rest 26 cm.
+    assert (radii > 0.01).all() and (radii < (0.8 if name == "door" else 0.13)).all()
+
+
+def test_a_row_that_is_named_by_one_period_has_it():
+    named = [(re.search(r"([\d.]+) ms$", row.what), row.periods) for row in ROWS]
+    found = [(float(m[1]), [1e3 * dt for dt in dts]) for m, dts in named
+             if m and len(dts) == 1]  # fmt: skip
+    assert len(found) >= 6
+    for ms, periods in found:
+        assert periods == [pytest.approx(ms)]
 
 
 def test_a_learner_that_finds_the_gap_has_a_small_error():
