@@ -241,8 +241,9 @@ def make_surface_switch(
     if not task.feet:
         refuse_changed("control.modes", modes, ("crossing",))
     crossing = modes.crossing if task.feet else SPHERE_CROSSING
-    refuse_changed("forward_model.handover", models.handover, ("rows",))
-    handover = replace(models.handover, rows=2.0 * task.feet)
+    refuse_changed("forward_model.handover", models.handover, ("rows", "height"))
+    height = tool_half_width(config.tool) if task.feet else 0.0
+    handover = replace(models.handover, rows=2.0 * task.feet, height=height)
     return make_changing_contact(
         replace(
             control,

@@ -281,16 +281,19 @@ def test_all_that_read_the_wrench_read_it_without_the_sensor_s_bias():
     tared = value("wrench_tare", "bias", "GetOutputPort")
     # The mean of 100 samples with 0.1 N, four times over, and the tool's inertia.
     np.testing.assert_allclose(tared[:3], bias, atol=0.055)
-    for system, port in (
-        ("contact_detector", "wrench"),
-        ("mode_detector", "wrench"),
-        ("forward_model_bank", "wrench"),
-        ("impedance_controller", "wrench_measured"),
+    for system, port, output in (
+        ("contact_detector", "wrench", "wrench"),
+        ("mode_detector", "wrench", "wrench"),
+        ("forward_model_bank", "wrench", "wrench_mean"),
+        ("impedance_controller", "wrench_measured", "wrench"),
     ):
         np.testing.assert_array_equal(
             value(system, port, "GetInputPort"),
-            value("wrench_tare", "wrench", "GetOutputPort"),
+            value("wrench_tare", output, "GetOutputPort"),
         )
+    # In free space: five samples of 0.1 N, and what the tare is off by.
+    mean = value("wrench_tare", "wrench_mean", "GetOutputPort")
+    np.testing.assert_allclose(mean[:3], 0.0, atol=4 * 0.1 / np.sqrt(5) + 0.055)
 
 
 UNUSED = [

@@ -23,6 +23,7 @@ from makebreak.systems.changing_contact.numerics.forward_model import (
     ModelBank,
     against_motion,
     bank_tuning,
+    load_ahead,
     observe,
     speed_along,
 )
@@ -458,6 +459,59 @@ def test_two_rows_of_feet_are_handed_over_in_two_steps():
     assert memories[-1].before is None
 
 
+def block(N_1, N_2, mu_1, mu_2, d, rows=0.024, height=0.015):
+    """The wrench at the tip of a tool on a row of feet ahead and one behind: the sum of
+    r x f over both, naively."""
+    wrench = np.zeros(6)
+    for N, mu, ahead in ((N_1, mu_1, rows / 2), (N_2, mu_2, -rows / 2)):
+        r = ahead * d + height * DOWN[:3]
+        f = -N * DOWN[:3] - mu * N * d
+        wrench += [*f, *np.cross(r, f)]
+    return wrench
+
+
+def test_the_moment_tells_what_the_first_row_carries():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        angle = rng.uniform(0.0, 2.0 * np.pi)
+        d = np.array([np.cos(angle), np.sin(angle), 0.0])
+        N_1, N_2 = rng.uniform(0.5, 8.0, size=2)
+        wrench = block(N_1, N_2, *rng.uniform(0.1, 0.6, size=2), d)
+        share = load_ahead(wrench, d, DOWN, 0.024, 0.015)
+        np.testing.assert_allclose(share, N_1 / (N_1 + N_2), rtol=1e-9)
+    # Free, at rest, in a corner, and a moment that no two rows could have.
+    corner = DOWN + [0.0, 0.0, 0.0, 1.0, 0.0, 0.0]
+    x = np.array([1.0, 0.0, 0.0])
+    for rows, direction in ((np.zeros(6), x), (DOWN, np.zeros(3)), (corner, x)):
+        wrench = block(6.0, 2.0, 0.2, 0.2, x)
+        assert load_ahead(wrench, direction, rows, 0.024, 0.015) == 0.5
+    assert load_ahead(block(6.0, -2.0, 0.2, 0.2, x), x, DOWN, 0.024, 0.015) == 1.0
+
+
+def test_the_first_step_of_two_is_what_the_first_row_carries():
+    """Three quarters of the load are on the first row: the friction goes from 1.6 N to
+    3.4 N and, when the second row is across, to 4 N."""
+    t = tuning(handover=10, rows=0.024, height=0.015)
+    memory = BankMemory(known_bank(t))
+    d, velocity = np.array([1.0, 0.0, 0.0]), np.array([0.1, 0, 0, 0, 0, 0])
+    said = []
+    for k in range(200):
+        mu_1 = 0.5 if k >= 60 else 0.2
+        mu_2 = 0.5 if k >= 108 else 0.2
+        wrench = block(6.0, 2.0, mu_1, mu_2, d)
+        mode = 1 if k < 59 else 2  # Announced a sample ahead.
+        memory = observe(memory, t, wrench, velocity, d, DOWN, mode, 0.0)
+        said.append(memory)
+    # Before each step is felt. The models were learned with a noise of 0.1 N; half of
+    # the load on each row would be 2.8 N.
+    np.testing.assert_allclose(said[59].predicted[0], 3.4, atol=0.1)
+    np.testing.assert_allclose(said[107].predicted[0], 4.0, atol=0.1)
+    # On two surfaces: the force that is felt, of which no mode learns anything.
+    for memory in said[90:106]:
+        np.testing.assert_allclose(memory.predicted[0], 3.4, atol=0.01)
+        assert memory.bank is said[59].bank
+
+
 def test_a_model_that_has_seen_little_is_not_handed_over():
     t = tuning(handover=10)
     memory = feed(BankMemory(ModelBank()), t, Slide(), 0.2, 1, 100)[-1]
@@ -496,6 +550,12 @@ def test_the_friction_of_a_mode_is_the_mean_share_of_the_normal_force():
     # The torque's lever is 15 mm; 100 samples of 0.1 N over 8 N are good to 1e-3.
     ratios = memory.bank.ratios(1)
     np.testing.assert_allclose(ratios, [0.3, 0.015 * 0.3], atol=3e-3)
+    # On two surfaces at once it is the mean of both, which is kept apart.
+    both = DOWN + [0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+    two = memory
+    for _ in range(100):
+        two = observe(two, t, *Slide(2).sample(0.5), both, 1)
+    np.testing.assert_array_equal(two.bank.ratios(1), ratios)
     # While it may be another surface, nothing is learned of it.
     for _ in range(100):
         sample = Slide(2).sample(0.6)

@@ -171,10 +171,14 @@ def test_rows_of_feet_are_those_of_the_tool():
 
 
 def test_the_tool_decides_how_a_seam_is_crossed():
-    for tool, rows, crossing in (("block", 0.024, 0.03), ("sphere", 0.0, 0.01)):
+    for tool, rows, height, crossing in (
+        ("block", 0.024, 0.015, 0.03),
+        ("sphere", 0.0, 0.0, 0.01),
+    ):
         config = SurfaceSwitchConfig(tool=tool)
         diagram = make_surface_switch(config, make_task(config))
         bank = diagram.GetSubsystemByName("forward_model_bank")
         detector = diagram.GetSubsystemByName("mode_detector")
         np.testing.assert_allclose(bank._tuning.rows, rows)
+        np.testing.assert_allclose(bank._tuning.height, height)
         np.testing.assert_allclose(detector._tuning.crossing, crossing)

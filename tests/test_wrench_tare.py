@@ -18,6 +18,7 @@ from makebreak.systems.arm.numerics.wrench_tare import (
     new_memory,
     sloped,
     tared,
+    tared_mean,
     tick,
 )
 from makebreak.systems.arm.wrench_tare import WrenchTare, WrenchTareConfig
@@ -208,6 +209,22 @@ def test_bad_wrenches_pass_and_teach_nothing():
     lost = np.full(6, np.nan)
     assert after(noisy(400), velocities=lost)[STATUS] == NOT_TARED
     assert after(noisy(400), rows=lost)[STATUS] == NOT_TARED
+
+
+def test_the_mean_is_that_of_five_samples_and_of_good_ones_alone():
+    rows = noisy(120)
+    memory = after(rows[:119])
+    expected = rows[115:].mean(axis=0) - bias_of(memory)
+    # Sums of six numbers below 1 in another order.
+    np.testing.assert_allclose(tared_mean(LAW, memory, rows[119]), expected, atol=1e-14)
+    first = new_memory()
+    np.testing.assert_array_equal(tared_mean(LAW, first, rows[0]), rows[0])
+    lost = after(np.full((1, 6), np.nan), memory=memory)
+    two = after(rows[:1], memory=lost)
+    expected = rows[:2].mean(axis=0) - bias_of(memory)
+    np.testing.assert_allclose(tared_mean(LAW, two, rows[1]), expected, atol=1e-14)
+    nan = np.full(6, np.nan)
+    np.testing.assert_array_equal(tared_mean(LAW, memory, nan), nan)
 
 
 def test_the_system_does_what_the_numerics_do_and_a_context_replays():

@@ -13,6 +13,7 @@ from makebreak.systems.arm.numerics.wrench_tare import (
     new_memory,
     sloped,
     tared,
+    tared_mean,
     tick,
     warm_up,
 )
@@ -49,6 +50,8 @@ class WrenchTare(LeafSystem):
     Outputs:
         wrench (6,) minus the bias, without delay. A wrench that is NaN or at its limit
             passes as it is.
+        wrench_mean (6,) the same, the mean of the last 5 samples: for systems that run
+            at 200 Hz. It is 2 ms late.
         force_directions (6,) turned to be at right angles to the surface.
         bias (6,) of now [N], [N m].
         slope (3,) s of the surface: its outward normal is s - n [rad].
@@ -91,6 +94,7 @@ class WrenchTare(LeafSystem):
 
         for name, size, value, inputs in (
             ("wrench", 6, self._tared, {self._wrench.ticket()}),
+            ("wrench_mean", 6, self._tared_mean, {self._wrench.ticket()}),
             ("force_directions", 6, self._sloped, {self._rows.ticket()}),
             ("bias", 6, lambda c: bias_of(memory(c)), set()),
             ("slope", 3, lambda c: memory(c)[SLOPE], set()),
@@ -104,6 +108,10 @@ class WrenchTare(LeafSystem):
     def _tared(self, context: Context) -> np.ndarray:
         memory = context.get_discrete_state(self._memory).value()
         return tared(self._law, memory, self._wrench.Eval(context))
+
+    def _tared_mean(self, context: Context) -> np.ndarray:
+        memory = context.get_discrete_state(self._memory).value()
+        return tared_mean(self._law, memory, self._wrench.Eval(context))
 
     def _sloped(self, context: Context) -> np.ndarray:
         memory = context.get_discrete_state(self._memory).value()

@@ -39,6 +39,9 @@ class HandoverConfig:
     # Distance along the motion of the two rows of feet on which the tool stands [m]; 0:
     # it touches with one point. In surface_switch the tool sets it.
     rows: float = 0.0
+    # Height of the tip above these feet, with which the moment tells how much of the
+    # load each row carries [m]; 0: half. In surface_switch the tool sets it.
+    height: float = 0.0
     # Whether the friction of a motion from rest is predicted from its commanded speed,
     # the normal force and the mode (in an unknown mode: as the last force); an
     # announced mode then has the friction of the present normal force.
@@ -119,7 +122,7 @@ class ForwardModelBank(LeafSystem):
             raise ValueError(
                 f"correction is {config.correction}, expected a number in [0, 1)"
             )
-        for name in ("duration_sec", "rows"):
+        for name in ("duration_sec", "rows", "height"):
             if not 0.0 <= getattr(config.handover, name) < np.inf:
                 raise ValueError(
                     f"handover.{name} is {getattr(config.handover, name)}, expected a "
@@ -137,6 +140,7 @@ class ForwardModelBank(LeafSystem):
             error_unknown=float(config.error_unknown),
             handover=round(config.handover.duration_sec / period_sec),
             rows=float(config.handover.rows),
+            height=float(config.handover.height),
             period=float(period_sec),
             from_rest=bool(config.handover.from_rest),
         )

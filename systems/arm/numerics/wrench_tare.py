@@ -11,6 +11,9 @@ bias_max is no bias but a contact: the run has begun in it, and waits for free s
 
 While the tool is pressed on one surface and slides, the drift goes on to be followed,
 and the surface's slope found, from the force across the motion (sideways_force.py).
+
+Systems that read the wrench at a lower rate read the mean of the last AVERAGED samples:
+every fifth sample alone would have the noise of all frequencies up to 500 Hz.
 """
 
 from typing import NamedTuple
@@ -36,14 +39,18 @@ STEADY = 0.05  # Of the tip, mean acceleration over a window [m/s2].
 TURNING = 0.05  # Faster than that, a tool's moment changes [rad/s].
 LEFT = 1.0  # More than that beyond the bias is a contact, no drift [N].
 
+AVERAGED = 5  # Samples in the mean, as many as a period of 200 Hz has.
+
 SAME_SURFACE = 0.98  # Cosine of two directions of pressing.
 
 # Memory: ticks; samples in the window, their sum (6), v at the window's start (3); bias
 # at the last tare (6); 1 when tared; status; the wrench before (6); the direction in
 # which the surface is pressed whose slope is known (3); 1 while the tool is pressed;
-# the estimate of sideways_force.py.
+# how many good wrenches came one after the other, and the last ones of these, newest
+# first (AVERAGED - 1, 6); the estimate of sideways_force.py.
 _TICKS, _N, _SUM, _V, _BIAS, _TARED, _STATUS, _LAST = 0, 1, 2, 8, 11, 17, 18, 19
-_ROW, _PRESSED, _SIDEWAYS = 25, 28, 29
+_ROW, _PRESSED, _GOOD, _RECENT = 25, 28, 29, 30
+_SIDEWAYS = _RECENT + 6 * (AVERAGED - 1)
 _SLOPE = _SIDEWAYS + sideways_force.S.start
 N_MEMORY = _SIDEWAYS + sideways_force.N_MEMORY
 STATUS, SLOPE = slice(_STATUS, _STATUS + 1), slice(_SLOPE, _SLOPE + 3)
@@ -109,6 +116,19 @@ def tared(law, memory, wrench):
 
 
 @numba.njit(cache=True)
+def tared_mean(law, memory, wrench):
+    """The mean of this wrench (6,) and the last good ones, without their bias; one that
+    cannot be used is left as it is."""
+    if not is_usable(wrench, law.wrench_limit):
+        return wrench.copy()
+    out = wrench.copy()
+    n = min(int(memory[_GOOD]), AVERAGED - 1)
+    for k in range(n):
+        out += memory[_RECENT + 6 * k : _RECENT + 6 * k + 6]
+    return out / (n + 1) - bias_of(memory)
+
+
+@numba.njit(cache=True)
 def tick(law, memory, wrench, velocity, force_directions):
     """The memory after one sample.
 
@@ -120,7 +140,7 @@ def tick(law, memory, wrench, velocity, force_directions):
     m[_TICKS] += 1.0
     known = m[_TARED] > 0.0
     if not is_usable(wrench, law.wrench_limit):
-        m[_STATUS], m[_N] = BAD_WRENCH, 0.0
+        m[_STATUS], m[_N], m[_GOOD] = BAD_WRENCH, 0.0, 0.0
         return m
     if known:
         m[_STATUS] = TARED
@@ -137,6 +157,9 @@ def tick(law, memory, wrench, velocity, force_directions):
     free = pressed < 0.25 and turning < TURNING**2
     if law.sideways and known and np.isfinite(turning + pressed):
         _slide(law, m, wrench, velocity, force_directions)
+    m[_GOOD] += 1.0
+    m[_RECENT + 6 : _SIDEWAYS] = m[_RECENT : _SIDEWAYS - 6].copy()
+    m[_RECENT : _RECENT + 6] = wrench
     # A sensor that is stuck says nothing of its drift.
     if not free or (known and not changed) or m[_TICKS] * law.period <= SKIP_SEC:
         m[_N] = 0.0
@@ -203,5 +226,6 @@ def warm_up(law: TareLaw) -> None:
     memory.setflags(write=False)
     tick(law, memory, zero, zero, zero)
     tared(law, memory, zero)
+    tared_mean(law, memory, zero)
     sloped(memory, zero)
     bias_of(memory)

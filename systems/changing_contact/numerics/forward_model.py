@@ -12,8 +12,10 @@ A model that sees the last force says, in the main, that nothing will change. So
 mode was announced before it begins, its model is asked without the last force, which is
 still the old surface's: E[D | |v|, |w|]. That is a *hand-over*. It lasts for a short
 time, in which nothing is learned. A tool that stands on two rows of feet crosses a seam
-in two steps: half of the difference is handed over at first, the whole when it has gone
-from one row to the other.
+in two steps: at first the share of the difference that the first row carries is handed
+over, the whole when it has gone from one row to the other. In between it stands on two
+surfaces, of which no mode's model is true: the force that is felt is predicted, and
+nothing is learned.
 
 The same holds for a motion that begins from rest (`from_rest`): there the last force is
 that of the tool at rest. So the friction of the commanded motion is predicted before it
@@ -61,8 +63,10 @@ class ModelBank:
 
     models: tuple[tuple[int, Mixture], ...] = ()
     with_torque: bool = True
-    # Of each mode (3,): mean |F_t|/R, |tau|/R [m], and the samples that they rest on.
-    friction: tuple[tuple[int, np.ndarray], ...] = ()
+    # Of each mode and number of surfaces pressed (3,): mean |F_t|/R, |tau|/R [m], and
+    # the samples that they rest on. Pressed on a table and a wall, a tool has the mean
+    # friction of both, in the mode of the table if that is much the same.
+    friction: tuple[tuple[tuple[int, int], np.ndarray], ...] = ()
 
     def __copy__(self):
         return self
@@ -84,24 +88,24 @@ class ModelBank:
             models.append((mode, mixture))
         return replace(self, models=tuple(models))
 
-    def ratios(self, mode: int) -> np.ndarray | None:
-        """(2,) mean |F_t|/R and |tau|/R [m] of a mode; None: too few samples."""
-        for known, mean in self.friction:
-            if known == mode and mean[2] >= SUPPORT_MIN:
-                return mean[:2]
-        return None
+    def ratios(self, mode: int, surfaces: int = 1) -> np.ndarray | None:
+        """(2,) mean |F_t|/R and |tau|/R [m] of a mode with so many surfaces pressed;
+        None: too few samples."""
+        mean = dict(self.friction).get((mode, surfaces))
+        return mean[:2] if mean is not None and mean[2] >= SUPPORT_MIN else None
 
-    def with_sample(self, mode: int, ratios) -> "ModelBank":
+    def with_sample(self, mode: int, surfaces: int, ratios) -> "ModelBank":
         """The bank after a sample of ratios (2,) in a mode."""
-        mean = dict(self.friction).get(mode, np.zeros(3))
+        known, key = dict(self.friction), (mode, surfaces)
+        mean = known.get(key, np.zeros(3))
         n = min(mean[2] + 1.0, FRICTION_SAMPLES)
         new = np.append(mean[:2] + (ratios - mean[:2]) / n, n)
         new.setflags(write=False)
-        return replace(self, friction=tuple({**dict(self.friction), mode: new}.items()))
+        return replace(self, friction=tuple({**known, key: new}.items()))
 
     def save(self, path: str | Path) -> None:
         """Writes it as JSON."""
-        friction = {str(mode): mean.tolist() for mode, mean in self.friction}
+        friction = [[*key, *mean.tolist()] for key, mean in self.friction]
         rows = {str(mode): as_vector(mixture).tolist() for mode, mixture in self.models}
         n_max = self.models[0][1].mean.shape[0] if self.models else 0
         Path(path).write_text(
@@ -133,8 +137,8 @@ class ModelBank:
                 ),
                 with_torque,
                 tuple(
-                    (int(mode), np.array(mean, dtype=float).reshape(3))
-                    for mode, mean in data.get("friction", {}).items()
+                    ((int(mode), int(n)), np.array(mean, dtype=float).reshape(3))
+                    for mode, n, *mean in data.get("friction", [])
                 ),
             )
         except (OSError, KeyError, TypeError, AttributeError, ValueError) as error:
@@ -172,6 +176,7 @@ class BankMemory:
     # (2,) what the model has been off by of late, in `predicted` already [N], [N m].
     offset: np.ndarray = None  # type: ignore[assignment]
     normal: float = 0.0  # R, low-passed [N].
+    load: float = 0.5  # Share of R on the first row of feet, low-passed.
     starting: int = 0  # Samples for which friction is predicted from the command.
     ahead: bool = False  # What is predicted has not been felt yet.
 
@@ -200,6 +205,7 @@ class BankTuning:
     error_unknown: float  # What the error is said to be without a wrench [N].
     handover: int = 10  # Samples for which a step is handed over; 0: never.
     rows: float = 0.0  # From the first row of feet to the second; 0: one point [m].
+    height: float = 0.0  # Of the tip above the feet; 0: both rows carry half [m].
     period: float = 0.005  # [s]
     correction: float = 0.0  # Of the offset, per sample; 0: there is none.
     from_rest: bool = False  # The friction of a motion that begins is predicted.
@@ -247,6 +253,12 @@ def observe(
         smoothed = memory.error + tuning.smoothing * (error - memory.error)
     normal = memory.normal + tuning.smoothing * (size[4] - memory.normal)
     starting = _starting(memory, tuning, size[0], speed_desired)
+    load = memory.load
+    if memory.before is None and tuning.rows > 0.0 and tuning.height > 0.0:
+        ahead = load_ahead(
+            wrench, direction, force_directions, tuning.rows, tuning.height
+        )
+        load += LOAD_SMOOTHING * (ahead - load)
     if mode < 1:
         predicted, acting = np.zeros(2), np.zeros(6)
         if tuning.from_rest and mode == UNKNOWN_MODE:
@@ -254,7 +266,7 @@ def observe(
             acting = against_motion(predicted, direction, velocity, force_directions)
         return BankMemory(
             memory.bank, mode, predicted=predicted, error=smoothed, wrench=acting,
-            normal=normal, starting=starting,
+            normal=normal, load=load, starting=starting,
         )  # fmt: skip
     bank = memory.bank
     mixture = bank.get(mode)
@@ -270,19 +282,21 @@ def observe(
         off = np.clip(off, -OFFSET_MOST, OFFSET_MOST)
         offset = memory.offset + tuning.correction * (off - memory.offset)
     memory = _handing_over(memory, tuning, mixture, actual, size[0], mode, changes)
-    ratios = bank.ratios(mode)
+    surfaces = int(motion_wrench(wrench, force_directions)[7])
+    ratios = bank.ratios(mode, surfaces)
     begins = starting > 0 and speed_desired > 0.0 and ratios is not None
     if memory.left > 0 or begins:
         # What is fed forward belongs to a place that the tool is about to reach, or to
         # a motion that is about to begin: it cannot be judged by what the sensor says
         # meanwhile.
         smoothed = memory.error
-    if tuning.learns and memory.state is not None and memory.left == 0:
+    crossing = memory.before is not None
+    if tuning.learns and memory.state is not None and not crossing:
         x = np.concatenate([memory.state, actual if tuning.with_torque else actual[:1]])
         mixture, _ = learned(mixture, x, tuning.mixtures)
         bank = bank.put(mode, mixture)
         if not starting and not undecided and size[0] > SLIDING and size[4] > PRESSED:
-            bank = bank.with_sample(mode, actual / size[4])
+            bank = bank.with_sample(mode, surfaces, actual / size[4])
     predicted = np.zeros(2)
     if mixture.count:
         n = 2 if tuning.with_torque else 1
@@ -293,12 +307,16 @@ def observe(
         predicted = predicted + offset
     else:
         offset = np.zeros(2)
+    if crossing and memory.left == 0:
+        # On two surfaces at once: the force that is felt, with less of its noise.
+        predicted = memory.predicted + BETWEEN_SMOOTHING * (actual - memory.predicted)
+        offset = np.zeros(2)
     if memory.before is not None and memory.left > 0:
         whole = memory.way >= tuning.rows
         predicted = _without_force(mixture, state, tuning.with_torque)
         if tuning.from_rest and ratios is not None:
             predicted = ratios * normal
-        predicted = memory.before + (1.0 if whole else 0.5) * (
+        predicted = memory.before + (1.0 if whole else load) * (
             predicted - memory.before
         )
     if begins and memory.left == 0:
@@ -321,6 +339,7 @@ def observe(
         memory.count,
         offset,
         normal,
+        load,
         starting,
         begins or memory.left > 0,
     )
@@ -348,6 +367,9 @@ def _starting(memory, tuning, speed, speed_desired) -> int:
 # More than that of |F_t|, |tau| in one sample is a change or an impact, which the model
 # follows by itself, and no offset [N], [N m].
 OFFSET_MOST = np.array([0.3, 0.03])
+# Weights of the newest sample in the share of load (100 ms) and in the force between
+# the two rows, which does not change (25 ms).
+LOAD_SMOOTHING, BETWEEN_SMOOTHING = 0.05, 0.2
 # A model that has seen fewer samples than this is not handed over.
 SUPPORT_MIN = 20.0
 
@@ -378,6 +400,31 @@ def _handing_over(memory, tuning, mixture, actual, speed, mode, changes) -> Bank
     elif left == 0 and way >= tuning.rows or mode != memory.mode:
         before, left = None, 0
     return replace(memory, before=before, way=way, left=left, count=count)
+
+
+def load_ahead(wrench, direction, force_directions, rows, height) -> float:
+    """The share of the normal force on the first of two rows of feet, 0 to 1.
+
+    Rows at height h below the tip, a before and behind it, with normal forces N_1, N_2
+    and a friction F against the motion d. About the tip, with the pressing n,
+
+        tau . (d x n) = h F - a (N_1 - N_2)
+
+    Args: wrench (6,), direction (3,), force_directions (6,) as motion_wrench; rows: 2 a
+        [m]; height: h [m].
+    Returns: 1/2 where the tool is pressed in no direction, or in two.
+    """
+    split = motion_wrench(wrench, force_directions)
+    d = motion_part(direction, force_directions)
+    length = np.sqrt(d @ d)
+    if split[7] != 1.0 or split[6] < PRESSED or length < 1e-6:
+        return 0.5
+    d = d / length
+    n = force_directions[:3] if force_directions[:3].any() else force_directions[3:]
+    about = np.cross(d, n / np.sqrt(n @ n))
+    friction, moment = -float(split[:3] @ d), float(split[3:6] @ about)
+    difference = 2.0 * (height * friction - moment) / rows
+    return float(np.clip(0.5 + 0.5 * difference / split[6], 0.0, 1.0))
 
 
 def _without_force(mixture, state, with_torque) -> np.ndarray:
