@@ -554,7 +554,7 @@ def _settle_step(
     try:
         coarse_model = WindowModel(scene, recordings, WINDOW_SEC, most=24)
         fine_model = WindowModel(fine, recordings, WINDOW_SEC, most=24)
-    except ValueError:
+    except DoesNotFit:
         return scene, []
     both = [partial(m.simulate, ()) for m in (coarse_model, fine_model)]
     a, b = side_by_side(both, jobs)

@@ -1,12 +1,14 @@
 """Which kind of problem a scene and recordings are: the next one is asked only where
 one says that it is not for them."""
 
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
 
 from makebreak.gap import workflow
 from makebreak.gap.does_not_fit import DoesNotFit
+from makebreak.gap.residuals import contact_problem, driven, mechanism, objects
 
 # Of joints alone, and beside free bodies: the order in which problems are asked.
 OF_JOINTS = ["PressingProblem", "ImpactProblem", "DrivenProblem", "MechanismProblem"]
@@ -54,3 +56,45 @@ def test_a_defect_inside_a_problem_is_not_taken_for_one_that_does_not_fit(
     for name in order[1:]:
         with pytest.raises(ValueError, match="setting an element"):
             with_problems(monkeypatch, name, order, error=ValueError)
+
+
+def outcomes(monkeypatch, error):
+    """Each method that simulates other recordings, with windows that raise an error."""
+
+    def windows(*args, **kwargs):
+        raise error("setting an element")
+
+    for module, name in (
+        (contact_problem, "PushWindows"), (driven, "DrivenWindows"),
+        (mechanism, "InverseModel"), (objects, "TouchModel"),
+    ):  # fmt: skip
+        monkeypatch.setattr(module, name, windows)
+    monkeypatch.setattr(contact_problem, "lying_on_faces", lambda problem: ())
+    for module in (driven, mechanism):
+        monkeypatch.setattr(module, "with_moved_gains", lambda scene, *_: scene)
+    windowed = SimpleNamespace(
+        _model=lambda: SimpleNamespace(windows=[]), _again=windows
+    )
+    problem = SimpleNamespace(scene=None, recordings=[], tracks=[], _windows=None)
+    end = SimpleNamespace(b=None)
+    names = SimpleNamespace(names=())
+    for kind, own, recordings in (
+        (contact_problem.ContactProblem, problem, []),
+        (contact_problem.ContactProblem, problem, None),
+        (driven.DrivenProblem, problem, []),
+        (mechanism.MechanismProblem, problem, []),
+        (objects.TouchProblem, problem, []),
+        (objects.WindowedProblem, windowed, []),
+    ):
+        yield partial(kind.outcome, own, [], None, end, names, recordings)
+
+
+def test_without_a_window_there_is_no_outcome(monkeypatch):
+    for outcome in outcomes(monkeypatch, DoesNotFit):
+        assert outcome() is None
+
+
+def test_a_defect_in_a_window_is_not_taken_for_too_little_data(monkeypatch):
+    for outcome in outcomes(monkeypatch, ValueError):
+        with pytest.raises(ValueError, match="setting an element"):
+            outcome()

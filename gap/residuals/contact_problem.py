@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from makebreak.gap.data.recording import Recording
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import Screen, benjamini_hochberg
 from makebreak.gap.problem import (
@@ -501,7 +502,7 @@ class ContactProblem(ContactCandidates, GapProblem):
         if recordings is not None:
             try:
                 model = PushWindows(self.scene, recordings, lying=lying_on_faces(self))
-            except ValueError:  # No window fits in.
+            except DoesNotFit:  # No window fits in.
                 return None
             held = [True] * len(model.windows)
         else:
@@ -515,7 +516,7 @@ class ContactProblem(ContactCandidates, GapProblem):
                     self._windows = PushWindows(
                         self.scene, self.recordings, episodes, lying_on_faces(self)
                     )
-                except ValueError:
+                except DoesNotFit:
                     return None
             model = self._windows
             held = [True] * len(model.windows)

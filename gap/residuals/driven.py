@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 
 from makebreak.gap.data.recording import Recording
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import (
@@ -432,7 +433,7 @@ class DrivenProblem(DrivenWindows, GapProblem):
         if recordings is not None or scene is not self.scene:
             try:
                 model = DrivenWindows(scene, recordings or self.recordings)
-            except ValueError:  # No window fits in.
+            except DoesNotFit:  # No window fits in.
                 return None
         held = [recordings is not None or not w.train for w in model.windows]
         if not any(held):

@@ -8,6 +8,7 @@ import numpy as np
 
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.recording import Recording
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.selection import Screen, is_predicted
 from makebreak.gap.problem import (
     Candidate,
@@ -433,7 +434,7 @@ class MechanismProblem(InverseModel, GapProblem):
         if recordings is not None:
             try:
                 model = InverseModel(self.scene, recordings)
-            except ValueError:  # No episode is long enough.
+            except DoesNotFit:  # No episode is long enough.
                 return None
         elif self.train().all():
             return None

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from makebreak.gap.data.recording import Recording
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.residuals.track import Track, track_of
 from makebreak.gap.simulation.channel_effects import (
     PATH,
@@ -160,7 +161,7 @@ class MechanismMotion:
                     self.tracks.append(track)
                     seconds += track.time[-1] - track.time[0]
         if not self.tracks:
-            raise ValueError(
+            raise DoesNotFit(
                 f"no episode of the recordings is long enough for windows of "
                 f"{BUMP_SEC} s"
             )

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from makebreak.gap.data.recording import Recording
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.problem import (
     DISTANCES,
     Candidate,
@@ -66,7 +67,7 @@ class TouchProblem(TouchModel, GapProblem):
             return Outcome(gap, self.series(start.left, end.left))
         try:
             other = TouchModel(self.scene, recordings)
-        except ValueError:  # Nothing is touched in them.
+        except DoesNotFit:  # Nothing is touched in them.
             return None
         there = other.nuisances()
         left = []
@@ -104,7 +105,7 @@ class WindowedProblem(GapProblem):
         if recordings is not None:
             try:
                 model = self._again(recordings)
-            except ValueError:  # No window fits in.
+            except DoesNotFit:  # No window fits in.
                 return None
             held = [True] * len(model.windows)
         if not any(held):

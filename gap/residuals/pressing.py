@@ -15,6 +15,7 @@ from itertools import product
 import numpy as np
 from pydrake.multibody.tree import BodyIndex
 
+from makebreak.gap.data.pieces import excerpt
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.permitted_forces import explain
@@ -34,7 +35,8 @@ from makebreak.models.scene import Scene
 
 REACH = 0.12  # What is fixed is no farther off than this [m].
 KNOCKED = 8e-3  # A knock goes no deeper than this [m].
-FEWEST_ROWS = 5  # In which a face is pressed on.
+FEWEST_ROWS = 5  # In which a face is pressed on,
+FEWEST_SEEN = 3  # and test functions.
 SAME = 5e-4  # A face that is off by less is where the scene has it [m].
 PASSED = 4e-3  # No contact lets a tool so far in [m].
 STILL_DEEP = 0.1  # Of the nodes at which it was: knocks go deeper, too.
@@ -51,6 +53,10 @@ MOST_FRICTION = 2.0  # Of what is taken for any.
 MOST_PATCHES, MOST_EFFECTS = 3, 10
 MOST_SLOTS = 12  # Places of a fixed body at which its distances are kept.
 SMALL_SHIFT = 1e-3  # First trial of a place [m].
+# A touch that lasts so long is no impact [s]. Of the squares that a pressing force
+# would take off where the tool is at a face, so much at most is left where it is a
+# little above that face [m]. Of longer recordings pieces are asked [s].
+LASTS_SEC, GONE, ABOVE, ASKED_SEC, ASKED_ROWS = 0.3, 0.25, 0.05, 60.0, 120_000
 AXES, UP = "xyz", np.array([0.0, 0.0, 1.0])
 STANDS, LEVEL = 1e-3, 0.9  # It stands on what is so near below it [m]; cosine.
 
@@ -75,8 +81,9 @@ class _Face:
 
 
 def presses(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
-    """Whether a mechanism rests on what is fixed: a wrench is felt for a while, or most
-    of the time shapes are in touch."""
+    """Whether a mechanism rests on what is fixed: a wrench is felt for a while, shapes
+    are in touch for most of the time or in touches that last, or the drives' efforts
+    tell that a face is pressed on which the scene has elsewhere."""
     try:
         shapes = walls_of(dynamics)
     except DoesNotFit:
@@ -96,13 +103,33 @@ def presses(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
             felt += int((size[good] > max(CLEAR * noise, LEAST_FORCE)).sum())
     if rows and felt > FELT_SHARE * rows:
         return True
-    inside = whole = 0
+    inside = lasting = close = whole = 0
     for recording in recordings:
         q = positions(dynamics, recording)
-        q = q[:: max(len(q) // 2000, 1)]
-        inside += int((nearest(shapes, dynamics, q) < MEETS).sum())
-        whole += len(q)
-    return inside > MOST_SHARE * whole
+        step = max(len(q) // 4000, 1)
+        apart = nearest(shapes, dynamics, q[::step])
+        inside += int((apart < MEETS).sum())
+        lasting += _rows_of_lasting(apart < MEETS, recording.time[::step])
+        close += int((apart < REACH).sum())
+        whole += len(apart)
+    if inside > MOST_SHARE * whole or lasting > FELT_SHARE * whole:
+        return True
+    if rows or close <= FELT_SHARE * whole:
+        return False
+    try:
+        some = excerpt(recordings, ASKED_SEC, ASKED_ROWS)
+        return bool(PressingProblem(dynamics.loaded.scene, some).off)
+    except DoesNotFit:
+        return False
+
+
+def _rows_of_lasting(touching: np.ndarray, time: np.ndarray) -> int:
+    """How many rows (n,) are in touches that last."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], touching, [0]]).astype(int)))
+    return sum(
+        int(b - a) for a, b in zip(edges[::2], edges[1::2], strict=True)
+        if time[b - 1] - time[a] > LASTS_SEC
+    )  # fmt: skip
 
 
 class PressingProblem(ContactProblem):
@@ -261,8 +288,6 @@ class PressingProblem(ContactProblem):
             carried = self._carried.get(below.body, set())
             if not carried or below.normal @ UP < LEVEL or abs(below.off) < SAME:
                 continue
-            if not self.sensors and below.off > -PASSED:
-                continue  # Never touched, perhaps.
             by = {k: (poses[k][0], poses[k][1] + below.off * UP) for k in carried}
             faces = self._faces_at(poses | by, carried)
             found += [
@@ -538,16 +563,44 @@ class PressingProblem(ContactProblem):
             for s in geometry.slots:
                 if face.body in (s.a, s.b):
                     on |= self._when(geometry, s) > 0.999
-            if on.sum() < 3:
+            if on.sum() < FEWEST_SEEN:
                 continue
             after = self._mean_squares(trial)
             is_felt = before[on].mean() >= FELT
             if not (is_felt and after[on].mean() <= LESS * before[on].mean()):
                 continue
+            if not self.sensors and not self._begins_at(face, trial):
+                continue
             taken = float(before.sum() - after.sum())
             if taken > gain:
                 best, gain = face, taken
         return best
+
+    def _begins_at(self, face: _Face, off: dict[int, dict[str, float]]) -> bool:
+        """Without a wrench: whether drives give a force along the face's normal where
+        the tool is at the face, with bodies displaced, and none where it is a little
+        above. A load or a friction that the scene lacks would be there, too."""
+        n = len(self._rows)
+        apart, lever = np.full(n, np.inf), np.zeros((n, self._all_needs(()).shape[1]))
+        for s in self._slots(self._displacing(off))[0]:
+            if face.body not in (s.a, s.b):
+                continue
+            sign = -1.0 if s.a == face.body else 1.0
+            nearer = (s.phi < apart) & (sign * (s.normal @ face.normal) > LEVEL)
+            apart[nearer] = s.phi[nearer]
+            lever[nearer] = self._felt(s, self._relative(s), s.normal)[nearer]
+        pull = np.einsum("kij,kj->ki", self.root, self._W @ lever)
+        needs = np.einsum("kij,kj->ki", self.root, self._all_needs(()))
+        along = np.maximum(np.sum(pull * needs, axis=1), 0.0)
+        taken = along**2 / np.maximum(np.sum(pull**2, axis=1), 1e-300)
+
+        def whole(rows) -> np.ndarray:
+            return np.asarray(self._W @ rows.astype(float)).ravel() > 0.999
+
+        at, above = whole(apart < MEETS), whole((apart > PASSED) & (apart < ABOVE))
+        if min(at.sum(), above.sum()) < FEWEST_SEEN:
+            return False
+        return bool(np.median(taken[above]) < GONE * np.median(taken[at]))
 
     def _with(
         self, off: dict[int, dict[str, float]], faces: Iterable[_Face]

@@ -8,6 +8,7 @@ import numpy as np
 from makebreak.gap.data.reading import check_against_scene
 from makebreak.gap.data.recording import Recording, unit_of
 from makebreak.gap.data.scene_facts import scene_names
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.simulation.driven_arm import DrivenArmScene, DrivenArmSimulation
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.gap.simulation.windows import WindowModel, seen_in
@@ -97,6 +98,6 @@ def _rms(e: np.ndarray) -> float:
 def _simulation(scene: Scene) -> SceneSimulation:
     try:
         arms = DrivenArmScene(scene)
-    except ValueError:
+    except DoesNotFit:
         return SceneSimulation(scene)
     return SceneSimulation(scene) if arms.has_shapes else DrivenArmSimulation(scene)
