@@ -164,7 +164,8 @@ def problem_for(
     if _is_mechanism(dynamics, recordings):
         if presses(dynamics, recordings):
             try:
-                return PressingProblem(scene, recordings), []
+                pressing = PressingProblem(scene, recordings)
+                return pressing, point_on_face(pressing, pressing.lying())
             except DoesNotFit:  # Too little motion.
                 pass
         if runs_against(dynamics, recordings):
@@ -191,7 +192,7 @@ def problem_for(
     if any(joint.num_velocities() for joint in one_dof_joints(dynamics.plant)):
         try:
             contact = contact_problem(scene, recordings)
-            return contact, sap_lift(contact) + point_on_face(contact)
+            return contact, sap_lift(contact) + point_on_face(contact, contact.lying())
         except DoesNotFit:  # Not the whole motion is measured, or nothing touches.
             pass
         try:

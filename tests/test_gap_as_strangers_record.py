@@ -66,7 +66,7 @@ def right(tmp_path_factory):
 
 
 def test_a_block_on_feet_needs_no_stand_ins_and_one_on_its_face_does(right, tmp_path):
-    assert lying_on_faces(right) == [] and point_on_face(right) == []
+    assert lying_on_faces(right) == [] and point_on_face(right, []) == []
     world, scene = written(tmp_path)
     # The same block without its feet: as high as they had lifted it.
     flat = (tmp_path / "block.sdf").read_text()
@@ -79,7 +79,7 @@ def test_a_block_on_feet_needs_no_stand_ins_and_one_on_its_face_does(right, tmp_
     [one] = lying_on_faces(problem)
     names = problem.shapes.names
     assert (names[one.body], names[one.ground]) == (BLOCK, TABLE) and not one.on_side
-    [finding] = point_on_face(problem)
+    [finding] = point_on_face(problem, [one])
     assert finding.severity == "warning" and PAIR in finding.says
     # With stand-ins it is pushed in simulation as it was measured to be.
     windows = PushWindows(problem.scene, problem.recordings, None, [one])

@@ -25,7 +25,7 @@ def with_problems(monkeypatch, first_that_fits, order, error=DoesNotFit):
             if k < fits:
                 raise (error if k == fits - 1 else DoesNotFit)("setting an element")
             return SimpleNamespace(
-                name=name, is_explained=lambda: True, push_findings=lambda: []
+                name=name, is_explained=lambda: True, push_findings=list, lying=list
             )
 
         monkeypatch.setattr(workflow, name, make)
@@ -38,7 +38,7 @@ def with_problems(monkeypatch, first_that_fits, order, error=DoesNotFit):
     monkeypatch.setattr(workflow, "without_contact", lambda *_: ([], []))
     monkeypatch.setattr(workflow, "_settle_step", lambda scene, *_: (scene, []))
     for name in ("sap_lift", "point_on_face"):
-        monkeypatch.setattr(workflow, name, lambda problem: [])
+        monkeypatch.setattr(workflow, name, lambda *_: [])
     return workflow.problem_for(None, [], SimpleNamespace(plant=None))
 
 
@@ -69,13 +69,14 @@ def outcomes(monkeypatch, error):
         (mechanism, "InverseModel"), (objects, "TouchModel"),
     ):  # fmt: skip
         monkeypatch.setattr(module, name, windows)
-    monkeypatch.setattr(contact_problem, "lying_on_faces", lambda problem: ())
     for module in (driven, mechanism):
         monkeypatch.setattr(module, "with_moved_gains", lambda scene, *_: scene)
     windowed = SimpleNamespace(
         _model=lambda: SimpleNamespace(windows=[]), _again=windows
     )
-    problem = SimpleNamespace(scene=None, recordings=[], tracks=[], _windows=None)
+    problem = SimpleNamespace(
+        scene=None, recordings=[], tracks=[], _windows=None, lying=list
+    )
     end = SimpleNamespace(b=None)
     names = SimpleNamespace(names=())
     for kind, own, recordings in (

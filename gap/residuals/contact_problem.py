@@ -43,6 +43,7 @@ from makebreak.gap.simulation.contact_windows import (
     led_as_measured,
     varies,
 )
+from makebreak.gap.simulation.face_supports import LiesOn
 from makebreak.gap.simulation.measure import gap_measure, series_of
 from makebreak.gap.thresholds import AGREEMENT_RMS_MAX
 from makebreak.models.effects import KINDS
@@ -495,13 +496,17 @@ class ContactProblem(ContactCandidates, GapProblem):
                 how[name] = "equations"
         return how
 
+    def lying(self) -> list[LiesOn]:
+        """What touches with more points than Drake's point contact makes of it."""
+        return lying_on_faces(self)
+
     def outcome(
         self, effects, start: Fitted, end: Fitted, nuisances: Nuisances,
         recordings=None, jobs: int = 1,
     ) -> Outcome | None:  # fmt: skip
         if recordings is not None:
             try:
-                model = PushWindows(self.scene, recordings, lying=lying_on_faces(self))
+                model = PushWindows(self.scene, recordings, lying=self.lying())
             except DoesNotFit:  # No window fits in.
                 return None
             held = [True] * len(model.windows)
@@ -514,7 +519,7 @@ class ContactProblem(ContactCandidates, GapProblem):
                 }
                 try:
                     self._windows = PushWindows(
-                        self.scene, self.recordings, episodes, lying_on_faces(self)
+                        self.scene, self.recordings, episodes, self.lying()
                     )
                 except DoesNotFit:
                     return None

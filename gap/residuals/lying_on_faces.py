@@ -1,7 +1,10 @@
 """What lies on faces in a scene whose contacts are points, and what to say of it."""
 
+from collections.abc import Iterable, Sequence
+
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.residuals.permitted_contacts import PermittedContacts
+from makebreak.gap.simulation.contact_shapes import Slot
 from makebreak.gap.simulation.face_supports import LiesOn
 
 
@@ -41,6 +44,32 @@ def lying_on_faces(contacts: PermittedContacts) -> list[LiesOn]:
     return found
 
 
+def pressed_with_corners(
+    contacts: PermittedContacts, touching: Sequence[Slot]
+) -> list[LiesOn]:
+    """The same of a robot's tools, which touch something fixed with corners of boxes
+    alone: on an edge there are two, of which Drake's point contact makes one. Not where
+    the tool also hangs over an edge of what is fixed, or both are hydroelastic.
+
+    Args: touching: slots that touch.
+    """
+    found, shapes = [], contacts.shapes
+    for pair in sorted({contacts._pair_of(s) for s in touching}):
+        mine = [s for s in touching if contacts._pair_of(s) == pair]
+        body, ground = sorted(pair, key=lambda k: k in shapes.anchored)
+        corners = all(
+            s.key[0] >= 0 and s.a == body and shapes.points[s.key[0]].is_corner
+            for s in mine
+        )
+        if corners and not all(
+            _meets_in_an_area(contacts, shapes.points[s.key[0]].geometry,
+                              shapes.surfaces[s.key[1]].geometry)
+            for s in mine
+        ):  # fmt: skip
+            found.append(LiesOn(body, ground, is_tool=True))
+    return found
+
+
 def _meets_in_an_area(contacts: PermittedContacts, a, b) -> bool:
     """Whether Drake makes a contact surface of two shapes, and not a point."""
     if contacts.scene.plant.contact_model == "point":
@@ -54,20 +83,25 @@ def _meets_in_an_area(contacts: PermittedContacts, a, b) -> bool:
     )
 
 
-def point_on_face(contacts: PermittedContacts) -> list[Finding]:
-    """A warning for each pair of lying_on_faces()."""
+def point_on_face(
+    contacts: PermittedContacts, lying: Iterable[LiesOn]
+) -> list[Finding]:
+    """A warning for each pair of lying_on_faces() or pressed_with_corners()."""
     found = []
-    for one in lying_on_faces(contacts):
+    for one in lying:
         pair = contacts.pair_name((one.body, one.ground))
         name = contacts.shapes.names[one.body]
-        where = "on its side" if one.on_side else "on a face"
+        how = "lies on its side" if one.on_side else "lies on a face"
+        how = "presses with edges or a face" if one.is_tool else how
         says = (
-            f"{name} lies {where}, and Drake's point contact gives {pair} a single "
+            f"{name} {how}, and Drake's point contact gives {pair} a single "
             "point, which jumps about: in the scene's own simulation it rocks, slides "
             "and turns wrongly. Here it was simulated standing on "
             + (
                 "two spheres of its own radius"
                 if one.on_side
+                else "small spheres at its corners"
+                if one.is_tool
                 else "small spheres at the corners of that face"
             )
             + ". Give it such spheres in its model, or use hydroelastic contact, "

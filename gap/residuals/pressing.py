@@ -24,11 +24,13 @@ from makebreak.gap.problem import Candidate, Fitted, Nuisances
 from makebreak.gap.residuals.contact_dynamics import THIN
 from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.impacts import MOST_SHARE, nearest, positions, walls_of
+from makebreak.gap.residuals.lying_on_faces import pressed_with_corners
 from makebreak.gap.residuals.mechanism_candidates import loads
 from makebreak.gap.residuals.permitted_contacts import SLACK, Geometry, Shift
 from makebreak.gap.residuals.touching import MEETS
 from makebreak.gap.residuals.wrench_sensor import FORCE
 from makebreak.gap.simulation.contact_shapes import Slot
+from makebreak.gap.simulation.face_supports import LiesOn
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
@@ -760,6 +762,10 @@ class PressingProblem(ContactProblem):
         return out
 
     # ----- What may be slightly wrong, and candidates
+
+    def lying(self) -> list[LiesOn]:
+        touching = self._geometry(self._displacing(self.off)).slots
+        return pressed_with_corners(self, touching)
 
     def hint(self, end: Fitted) -> str:
         """None: where what is fixed stands is felt, and is not widened beside that."""

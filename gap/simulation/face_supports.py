@@ -1,4 +1,4 @@
-"""Spheres that stand in for the faces on which free bodies lie.
+"""Spheres that stand in for the faces on which free bodies lie, and tools press.
 
 Drake's point contact gives two shapes one point, however large the area is in which
 they meet. Of a box on a table that point jumps from corner to corner: the box rocks,
@@ -28,6 +28,7 @@ from pydrake.multibody.tree import BodyIndex
 
 RADIUS = 2e-3  # Of a sphere [m], or this share of a small shape's least half size.
 SHARE = 0.2
+POINT = 1e-5  # Of a sphere at the corner of a tool, which may be tilted [m].
 RIM = 12  # Spheres along a cylinder's rim.
 MOST = 48  # Spheres of a hull; of more corners, every n-th has one.
 ALIKE = 1e-6  # Normals of one face differ by no more than this.
@@ -36,11 +37,13 @@ ALIKE = 1e-6  # Normals of one face differ by no more than this.
 @dataclass(frozen=True)
 class LiesOn:
     """A free body that lies on something fixed with a face, or with the side of a
-    cylinder; both are body indices."""
+    cylinder; both are body indices. is_tool: whether it is a robot's instead, which
+    presses with edges too: its corners are where they are, not rounded."""
 
     body: int
     ground: int
     on_side: bool = False
+    is_tool: bool = False
 
 
 def add_supports(
@@ -54,13 +57,19 @@ def add_supports(
         body, faces, planned = bodies[one.body], [], []
         for i, g in enumerate(plant.GetCollisionGeometriesForBody(body)):
             properties = inspector.GetProximityProperties(g)
-            found = centres_of(inspector.GetShape(g), one.on_side)
+            largest = POINT if one.is_tool else RADIUS
+            found = centres_of(inspector.GetShape(g), one.on_side, largest)
             if properties is None or found is None:
                 continue
             faces.append(i)
             X, (centres, radius) = inspector.GetPoseInFrame(g), found
             planned += [
-                (RigidTransform(X @ p), radius, f"support_{i}_{k}", properties)
+                (
+                    RigidTransform(X @ p),
+                    radius,
+                    f"support_{one.ground}_{i}_{k}",
+                    properties,
+                )
                 for k, p in enumerate(centres)
             ]
         added = [
@@ -85,24 +94,27 @@ def add_supports(
         scene_graph.collision_filter_manager().Apply(declare)
 
 
-def centres_of(shape, on_side: bool = False) -> tuple[np.ndarray, float] | None:
+def centres_of(
+    shape, on_side: bool = False, largest: float = RADIUS
+) -> tuple[np.ndarray, float] | None:
     """(n, 3) centres of spheres in the shape's frame, and their radius [m]: each
     touches the faces that meet in its corner from within. None for a shape that meets a
     plane in one point anyway.
 
     Args: on_side: whether a cylinder lies on its side; then two spheres of its own
-        radius touch where the ends of that line do.
+        radius touch where the ends of that line do. largest: radius of a sphere at a
+        corner, at most [m].
     """
     if isinstance(shape, Box):
         half = shape.size() / 2.0
-        radius = min(RADIUS, SHARE * float(half.min()))
+        radius = min(largest, SHARE * float(half.min()))
         signs = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T
         return signs * (half - radius), radius
     if isinstance(shape, Cylinder):
         r, h = shape.radius(), 0.5 * shape.length()
         if on_side:
             return np.array([[0.0, 0.0, -h], [0.0, 0.0, h]]), r
-        radius = min(RADIUS, SHARE * min(r, h))
+        radius = min(largest, SHARE * min(r, h))
         angle = np.arange(RIM) * 2.0 * np.pi / RIM
         x, y = (r - radius) * np.cos(angle), (r - radius) * np.sin(angle)
         return np.vstack(
@@ -114,7 +126,7 @@ def centres_of(shape, on_side: bool = False) -> tuple[np.ndarray, float] | None:
         normals = np.array([mesh.face_normal(i) for i in range(mesh.num_faces())])
         offsets = (corners @ normals.T).max(axis=0)
         size = float(np.ptp(corners, axis=0).min()) / 2.0
-        radius = min(RADIUS, SHARE * size)
+        radius = min(largest, SHARE * size)
         step = -(-len(corners) // MOST)
         return np.array(
             [_within(p, normals, offsets, radius) for p in corners[::step]]
