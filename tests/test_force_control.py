@@ -413,7 +413,7 @@ def run_ticks(chain, law, n, state, directions, targets, measured=None):
             packed(chain), packed(law), tau, memory,
             law.q_nominal, np.zeros(7), reference(), law.stiffness, law.damping, 0.0,
             np.zeros(6), directions, targets,
-            np.zeros(6) if measured is None else measured,
+            np.zeros(6) if measured is None else measured, 0.0,
         )  # fmt: skip
     return (tau, memory), status
 

@@ -29,9 +29,7 @@ from makebreak.systems.arm.impedance_controller import (
     serial_chain_of,
 )
 from makebreak.systems.arm.numerics.impedance_controller import (
-    EFFORT_LIMITED,
     N_SLOTS,
-    RATE_LIMITED,
     REFERENCE_HELD,
     SENSORS_HELD,
     SLOT,
@@ -42,6 +40,7 @@ from makebreak.systems.arm.numerics.impedance_controller import (
     rotation_error,
     rotation_of,
 )
+from makebreak.systems.arm.numerics.joint_limits import EFFORT_LIMITED, RATE_LIMITED
 from makebreak.systems.arm.numerics.packed import packed
 from makebreak.systems.arm.numerics.serial_chain import chain_state, tip_kinematics
 
@@ -49,7 +48,8 @@ EFFORT = np.repeat([87.0, 12.0], [4, 3])
 NO_NOISE = SensorNoise(0.0, 0.0, 0.0, 0.0, 0.0)
 P_TIP = np.array([0.5, 0.0, 0.1])
 NO_SLOTS = np.zeros((N_SLOTS, SLOT))
-NO_FORCE = (np.zeros(6), np.zeros(2), np.zeros(6))  # Directions, targets, measured.
+# Directions, targets, measured wrench; delay.
+NO_FORCE = (np.zeros(6), np.zeros(2), np.zeros(6), 0.0)
 
 
 @pytest.fixture(scope="module")

@@ -87,7 +87,9 @@ class ImpedanceController(LeafSystem):
     tau is the motors' torque: the mass matrix contains the rotors' inertia.
 
     tau stays within the effort limits of the control plant and changes by at most
-    torque_rate_max x period per tick. If an entry of q or v is NaN, tau changes, at
+    torque_rate_max x period per tick. Near the control plant's limits of joint speeds
+    and positions the joints brake (numerics/joint_limits.py). If an entry of q or v is
+    NaN, tau changes, at
     that rate, to the torque that carries the arm and slows it down, qdd = -20/s qd,
     with the measured entries and predictions of the others from their last good values.
     If the reference is NaN (or a stiffness or damping negative), the last good pose is
@@ -107,7 +109,8 @@ class ImpedanceController(LeafSystem):
              of a mass m with this delay is stable while d delay < pi/2 m, so the tip's
              damping is bounded to DELAY_DAMPING_MAX m / delay.
     Outputs: tau (n,) [N m]; status (1,), a sum: 1 reference held, 2 sensors held,
-             4 effort limit reached, 8 torque rate limit reached, 16 wrench not used.
+             4 effort limit reached, 8 torque rate limit reached, 16 wrench not used, 32
+             a joint braked at its speed or range.
 
     Args: config; plant: finalized, the arm with its tool alone, never the simulated
         one; tip_frame: name of E; torque_rate_max [N m/s]; hybrid: settings of force
@@ -157,6 +160,9 @@ class ImpedanceController(LeafSystem):
             step_max=np.full(n, torque_rate_max * config.period_sec),
             q_lower=plant.GetPositionLowerLimits(),
             q_upper=plant.GetPositionUpperLimits(),
+            speed_max=np.minimum(
+                plant.GetVelocityUpperLimits(), -plant.GetVelocityLowerLimits()
+            ),
             q_nominal=q_nominal,
             R_upright=np.ascontiguousarray(
                 frame.CalcPoseInWorld(context).rotation().matrix()
@@ -227,12 +233,13 @@ class ImpedanceController(LeafSystem):
             damping = self._or(self._damped, context, stiffness)
         else:
             damping = self._law.damping
-        if ratio == 0.0 and self._delay.HasValue(context):
+        delay = 0.0
+        if self._delay.HasValue(context):
             delay = float(self._delay.Eval(context)[0])
-            if delay > self._law.period:  # A period is the delay of every tick.
-                damping = np.array(damping)
-                most = DELAY_DAMPING_MAX * self._mass / delay
-                damping[:3] = np.minimum(damping[:3], most)
+        if ratio == 0.0 and delay > self._law.period:  # Each tick has one.
+            damping = np.array(damping)
+            most = DELAY_DAMPING_MAX * self._mass / delay
+            damping[:3] = np.minimum(damping[:3], most)
         directions, targets = self._none, self._no_targets
         measured = self._none
         if self._directions.HasValue(context):  # Otherwise there is no force control.
@@ -253,6 +260,7 @@ class ImpedanceController(LeafSystem):
             directions,
             targets,
             measured,
+            delay,
         )
         discrete_state.set_value(self._tau, tau)
         discrete_state.set_value(self._status, [status])

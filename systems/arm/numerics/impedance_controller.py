@@ -25,13 +25,16 @@ from makebreak.systems.arm.numerics.cholesky import (
     cholesky_solve,
     forward_solve,
 )
+from makebreak.systems.arm.numerics.joint_limits import (
+    braked,
+    is_free,
+    within_limits,
+)
 from makebreak.systems.arm.numerics.serial_chain import chain_state, tip_kinematics
 
 # Status bits.
 REFERENCE_HELD = 1
 SENSORS_HELD = 2
-EFFORT_LIMITED = 4
-RATE_LIMITED = 8
 FORCE_SENSOR_HELD = 16
 
 IK_DAMPING = 0.02  # Of the posture's damped inverse kinematics [m], [rad].
@@ -81,6 +84,7 @@ class Law(NamedTuple):
     step_max: np.ndarray  # (n,) change of torque in one tick [N m].
     q_lower: np.ndarray  # (n,) [rad]
     q_upper: np.ndarray  # (n,) [rad]
+    speed_max: np.ndarray  # (n,) [rad/s], infinite for none.
     q_nominal: np.ndarray  # (n,) posture in the null space of the task [rad].
     R_upright: np.ndarray  # (3, 3) orientation of the tip frame in the posture.
     stiffness: np.ndarray  # (6,) [N/m] x 3, [N m/rad] x 3
@@ -381,11 +385,13 @@ def tick(
     directions,
     targets,
     measured,
+    delay,
 ):
     """One tick of the controller.
 
     Args: tau (n,): of the last tick; memory: of memory_size; others as in
-        impedance_torque and force_control; any of them may contain NaN.
+        impedance_torque and force_control; any of them may contain NaN. delay: from a
+        reading to the time when its torque acts [s].
     Returns: tau (n,) within all limits, status (bits), memory.
     """
     n = q.shape[0]
@@ -460,16 +466,13 @@ def tick(
         status |= REFERENCE_HELD
     memory[2 * n + 7] = (count + 1) % law.posture_every
 
-    out = np.empty(n)
-    for i in range(n):
-        allowed = min(max(asked[i], -law.effort_max[i]), law.effort_max[i])
-        if allowed != asked[i]:
-            status |= EFFORT_LIMITED
-        change = min(max(allowed - tau[i], -law.step_max[i]), law.step_max[i])
-        out[i] = tau[i] + change
-        if abs(allowed - tau[i]) > law.step_max[i]:
-            status |= RATE_LIMITED
-    return out, status, memory
+    out, limited = within_limits(law, tau, asked)
+    if not is_free(law, q_now, v_now):
+        now = chain_state(chain, q_now, v_now)
+        kept, by = braked(law, tau, out, q_now, v_now, now.M, now.bias, delay)
+        if np.all(np.isfinite(kept)):  # Else an overflow.
+            out, limited = kept, limited | by
+    return out, status | limited, memory
 
 
 @numba.njit(cache=True)
@@ -493,12 +496,12 @@ def _reference(chain, memory, q, x_d, has_pose, n):
 @numba.njit(cache=True)
 def packed_tick(
     chain, law, tau, memory, q, v, x_d, stiffness, damping, ratio, wrench,
-    directions, targets, measured,
+    directions, targets, measured, delay,
 ):  # fmt: skip
     """The tick with packed chain and law (packed.py)."""
     return tick(
         chain[0], law[0], tau, memory, q, v, x_d, stiffness, damping, ratio, wrench,
-        directions, targets, measured,
+        directions, targets, measured, delay,
     )  # fmt: skip
 
 
@@ -514,5 +517,5 @@ def warm_up(chain: np.ndarray, law: np.ndarray) -> None:
         state.setflags(write=False)
     args = (np.zeros(n), np.zeros(n), np.full(19, np.nan))
     none = np.zeros(6)
-    gains = (none, none, 0.0)
-    packed_tick(chain, law, tau, memory, *args, *gains, none, none, np.zeros(2), none)
+    gains, forces = (none, none, 0.0), (none, none, np.zeros(2), none)
+    packed_tick(chain, law, tau, memory, *args, *gains, *forces, 0.0)
