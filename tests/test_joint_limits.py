@@ -19,9 +19,11 @@ from makebreak.systems.arm.numerics.joint_limits import (
     FREE_SHARE,
     GAIN,
     JOINT_BRAKED,
+    OVERSPEED,
     RANGE_MARGIN,
     RANGE_RATE,
     SPEED_SHARE,
+    STOP_RATE,
     braked,
     is_free,
     own_brakes,
@@ -183,6 +185,21 @@ def test_an_arm_that_is_pushed_keeps_its_speeds_and_ranges(seed):
     )
     assert (abs(v) <= LAW.speed_max).all()
     assert beyond(q) < 0.0
+
+
+def test_a_joint_that_is_driven_too_fast_against_its_motor_stops_all_motors():
+    """Joint 6 brakes with all its torque, but something drives it on."""
+    q, v = LAW.q_nominal.copy(), np.zeros(7)
+    v[5] = -(1.0 + 2.0 * OVERSPEED) * V[5]
+    s = chain_state(CHAIN, q, v)
+    stop = s.bias - STOP_RATE * s.M @ v
+    before = s.bias + [0.0, 0.0, 0.0, 40.0, 0.0, 0.0, 0.0]
+    before[5] = LAW.effort_max[5]
+    asked, _ = within_limits(LAW, before, before + [0, 0, 0, 1.0, 0, 0, 0])
+    tau, status = braked(LAW, before, asked, q, v, s.M, s.bias, 0.0)
+    assert status & JOINT_BRAKED
+    assert np.abs((tau - before) / LAW.step_max).max() == pytest.approx(1.0)
+    assert (tau - before)[3] * (stop - before)[3] > 0.0
 
 
 def test_a_joint_at_the_end_of_its_range_does_not_stop_the_others():

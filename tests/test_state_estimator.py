@@ -145,7 +145,7 @@ def test_u_measured_is_the_mean_of_the_window_and_forgets_what_is_older(bench, c
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("port", ["q", "v", "torque", "p_ball", "v_ball"])
+@pytest.mark.parametrize("port", ["q", "v", "p_ball", "v_ball"])
 def test_a_reading_that_is_not_finite_leaves_x_and_u_and_is_not_valid(bench, port, bad):
     x, u, _ = bench.tick(torque=np.full(7, 5.0))
     value = np.array(bench.good[port], dtype=float)
@@ -159,6 +159,26 @@ def test_a_reading_that_is_not_finite_leaves_x_and_u_and_is_not_valid(bench, por
     assert bench.tick()[2] == 1.0
 
 
+def test_without_torques_the_tip_is_followed_and_the_forces_are_held(bench, arm):
+    def tip_force():
+        return bench.estimator.GetOutputPort("tip_force").Eval(bench.context)
+
+    for _ in range(3):
+        _, u, _ = bench.tick(torque=np.full(7, 5.0))
+    force = tip_force()
+    assert np.linalg.norm(force) > 0.1
+    q, v, _, p, v_tip, _ = random_motion(arm, np.random.default_rng(1))
+    x, u_after, valid = bench.tick(q=q, v=v, torque=np.full(7, np.nan))
+    np.testing.assert_allclose(x[P_TIP], p, atol=1e-14)
+    np.testing.assert_allclose(x[V_TIP], v_tip, atol=1e-14)
+    np.testing.assert_array_equal(u_after, u)
+    np.testing.assert_array_equal(tip_force(), force)
+    assert valid == 1.0
+    # The speed that the tip gained meanwhile is not taken for a force.
+    bench.tick(q=q, v=v)
+    np.testing.assert_array_equal(tip_force(), 0.0)
+
+
 @pytest.mark.parametrize("seen", [0.0, np.nan])
 def test_a_ball_that_is_not_seen_is_not_valid_but_the_tip_is_followed(bench, seen):
     q = bench.good["q"] + 0.1
@@ -168,7 +188,10 @@ def test_a_ball_that_is_not_seen_is_not_valid_but_the_tip_is_followed(bench, see
     assert np.linalg.norm(x[P_TIP] - before[P_TIP]) > 0.01
 
 
-@pytest.mark.parametrize("fault", [{"seen": [0.0]}, {"v": np.full(7, np.nan)}])
+@pytest.mark.parametrize(
+    "fault",
+    [{"seen": [0.0]}, {"v": np.full(7, np.nan)}, {"torque": np.full(7, np.nan)}],
+)
 def test_a_fault_spoils_the_window_until_it_has_left_it(bench, fault):
     def window_valid():
         port = bench.estimator.GetOutputPort("window_valid")

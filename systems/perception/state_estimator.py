@@ -41,12 +41,13 @@ class StateEstimator(LeafSystem):
              object of known orientation: q_object (4,) [w x y z], w_object (3,)
              [rad/s]. Without them the object is a rolling ball.
     Outputs: x (19,) of contact_mpc/numerics/ball_state.py; u_measured (3,) [N];
-             valid (1,): 1 if all readings are finite and the object is seen, 0 if it is
-             not seen, -1 if a reading is not finite; window_valid (1,): 1 if valid was
-             1 during the whole window; tip_force (3,) [N]: estimated contact force on
-             the tip, from joint torques and velocities.
+             valid (1,): 1 if all readings but torque are finite and the object is seen,
+             0 if it is not seen, -1 if one is not finite; window_valid (1,): 1 if valid
+             was 1 and torque finite during the whole window; tip_force (3,) [N]:
+             estimated contact force on the tip, from joint torques and velocities.
 
-    x, u_measured and tip_force are held while a reading is not finite.
+    x, u_measured and tip_force are held while a reading is not finite. While torque
+    alone is not, x goes on, and only the forces are held.
     """
 
     def __init__(self, config: StateEstimatorConfig, chain: SerialChain, q_default):
@@ -147,7 +148,7 @@ class StateEstimator(LeafSystem):
     @timed
     def _update(self, context, discrete_state):
         window = context.get_discrete_state(self._window).value()
-        finite, x, after, valid = estimate(
+        finite, felt, x, after, valid = estimate(
             self._chain,
             self._q.Eval(context),
             self._v.Eval(context),
@@ -171,15 +172,19 @@ class StateEstimator(LeafSystem):
         if finite:
             discrete_state.set_value(self._x, x)
             discrete_state.set_value(self._window, after)
-            u = after[-4:-1]
-            observer = observe_force(
-                context.get_discrete_state(self._observer).value(),
-                x[V_TIP],
-                u / self._tip_mass,
-                tip_mobility(self._chain[0], np.asarray(self._q.Eval(context))),
-                self._gain,
-                self._dt,
-            )
+            observer = context.get_discrete_state(self._observer).value()
+            if felt:
+                u = after[-4:-1]
+                observer = observe_force(
+                    observer,
+                    x[V_TIP],
+                    u / self._tip_mass,
+                    tip_mobility(self._chain[0], np.asarray(self._q.Eval(context))),
+                    self._gain,
+                    self._dt,
+                )
+            else:  # It starts again with the next torque.
+                observer = np.append(observer[:-1], 0.0)
             discrete_state.set_value(self._observer, observer)
         else:
             discrete_state.set_value(self._window, np.append(window[:-1], 0.0))

@@ -18,7 +18,8 @@ own motor brakes with the least torque that keeps it, like a mechanical stop,
 
 This may not be enough: the torque tau_stop that stops all joints is
 T = max |tau - tau_stop| / rate away. Where an acceleration is above (v_hi - v) / T, all
-motors turn to tau_stop together.
+motors turn to tau_stop together; so they do by degrees where a speed is above V after
+all, because something unknown pushes, such as a contact.
 
 Source: Faverjon and Tournassoud, "A local based approach for path planning of
 manipulators with a high number of degrees of freedom" (1987), eq. 3:
@@ -39,6 +40,7 @@ RANGE_MARGIN = 0.02  # Of the position limits [rad]; errors of encoders are smal
 RANGE_RATE = 10.0  # c [1/s]
 GAIN = 100.0  # k [1/s]; with a delay at most DELAY_GAIN over it.
 DELAY_GAIN = 0.5  # k delay; above pi/2 the brake would swing by itself.
+OVERSPEED = 0.1  # Of V; so far above V all motors turn to a stop, whatever is asked.
 STOP_RATE = 20.0  # tau_stop gives qdd = -STOP_RATE v [1/s].
 # As long as all speeds are below this fraction of their bounds the torque is not looked
 # at: half of the way is enough to stop what the other half has brought about.
@@ -174,6 +176,8 @@ def braked(law, tau, asked, q, v, M, bias, delay):
             over, gained = least - qdd[i], -gained
         if over > SLACK and gained > 0.0:
             share = max(share, min(over / gained, 1.0))
+        fastest = SPEED_SHARE * law.speed_max[i]
+        share = max(share, min((abs(v[i]) - fastest) / (OVERSPEED * fastest), 1.0))
     if share > 0.0:
         out = out + share * (stopping - out)
         status |= JOINT_BRAKED

@@ -76,21 +76,29 @@ def estimate(chain, q, v, torque, p_ball, v_ball, seen, tip_mass, radius, window
         radius: of the modelled ball [m].
         window: (3 n + 1,) the last n forces, oldest first [N], and the number of valid
             readings in a row, at most n.
-    Returns: whether all readings are finite (if not, ignore the rest); x (19,); window;
-        valid: 1.0, or 0.0 if the ball is not seen, or -1.0 if not all are finite.
+    Returns: whether all readings but torque are finite (if not, ignore the rest);
+        whether torque is; x (19,); window, without a new force where torque is not
+        finite; valid: 1.0, or 0.0 if the ball is not seen, or -1.0 if not all but
+        torque are finite.
     """
     after = np.empty(window.size)
-    total = q.sum() + v.sum() + torque.sum() + p_ball.sum() + v_ball.sum()
-    if not np.isfinite(total):
-        return False, after, after, -1.0
-    p_tip, v_tip, u = tip_motion(chain[0], q, v, torque, tip_mass)
+    if not np.isfinite(q.sum() + v.sum() + p_ball.sum() + v_ball.sum()):
+        return False, False, after, after, -1.0
+    felt = np.isfinite(torque.sum())
+    p_tip, v_tip, u = tip_motion(
+        chain[0], q, v, torque if felt else np.zeros(q.size), tip_mass
+    )
     n = window.size // 3
-    after[: 3 * n - 3] = window[3 : 3 * n]
-    after[3 * n - 3 : 3 * n] = u
     valid = 1.0 if seen[0] > 0.5 else 0.0
-    after[3 * n] = min(valid * (window[3 * n] + 1.0), n)
+    if felt:
+        after[: 3 * n - 3] = window[3 : 3 * n]
+        after[3 * n - 3 : 3 * n] = u
+        after[3 * n] = min(valid * (window[3 * n] + 1.0), n)
+    else:
+        after[:] = window
+        after[3 * n] = 0.0
     x = compiled_pack(p_tip, v_tip, p_ball, v_ball, radius)
-    return True, x, after, valid
+    return True, felt, x, after, valid
 
 
 def with_pose(finite, x, valid, q_object, w_object):
