@@ -105,6 +105,9 @@ FREE_TOLERANCE = 1e3
 # deviations from neutral. Set after a drag was named for the log of an SO-101, which
 # had another sign in each recording.
 CONSISTENT_Z = 2.0
+# The same beside other effects: of the dozens that are tried on what they leave, noise
+# that goes together over a while imitates one or the other with 2 to 3.
+CONSISTENT_Z_BESIDE = 3.0
 # A kind whose parameters may end anywhere (a small patch with much friction does what a
 # larger one with less does) is kept, whatever its intervals, if it takes this share off
 # the held-out error; the second number is for one beside other effects.

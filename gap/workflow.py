@@ -220,8 +220,9 @@ def conclude(
     back; they change no effect and no parameter.
     """
     nuisances = selection.nuisances
-    if problem.error(selection.start) <= AGREEMENT_RMS_MAX and all(
-        problem.is_within_law(c.effect) for c in selection.choices
+    start, end = problem.error(selection.start), problem.error(selection.end)
+    if start <= AGREEMENT_RMS_MAX and (
+        end >= start or all(problem.is_within_law(c.effect) for c in selection.choices)
     ):
         selection = replace(selection, choices=(), end=selection.start)
     selection, chosen_on = kept_by_simulation(problem, selection, jobs)

@@ -74,6 +74,13 @@ def check(which: str = "standard", only: str = "") -> None:
             "reproduce gap makes its recordings with MuJoCo: "
             "pip install 'makebreak[dev]'"
         )
+    if only:
+        words = [sys.executable, str(SETS[which].maker), "--set", which, "--names"]
+        names = subprocess.check_output(words, text=True).split()
+        if not any(only in name for name in names):
+            raise ValueError(
+                f"--only: got {only}, expected part of: {'; '.join(names)}"
+            )
 
 
 def reproduce(

@@ -36,6 +36,7 @@ from makebreak.gap.data.reading import check_against_scene, read_recordings
 from makebreak.gap.data.scene_facts import scene_names
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.scene import read_scene
+from makebreak.scripts.cli import main
 
 G = 9.81
 
@@ -71,6 +72,13 @@ def test_there_are_enough_cases_and_their_seeds_are_apart():
     assert options >= {"camera30", "camera60", "no_wrench", "effort"}
     assert any(c.recipe.ties for c in final)
     assert any(len(c.recipe.hide.split()) == 2 for c in final)
+
+
+def test_a_name_that_no_case_has_is_told_with_those_that_there_are(capsys):
+    words = ["reproduce", "gap", "--set", "contact-final", "--only", "no_such_case"]
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert "--only: got no_such_case, expected part of: 00_push_mujoco_mass; " in said
 
 
 def test_a_set_can_be_drawn_anew_from_another_seed():

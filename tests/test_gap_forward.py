@@ -207,12 +207,13 @@ class WideLoad(Columns):
 
     plan = SearchPlan(least_gain=0.1, most_effects=3)
 
-    def __init__(self, extent: float):
+    def __init__(self, extent: float, heavier: str = "arm.wrist"):
         *load, self.wide, other = directions(6).T
-        hand, wrist = ("payload", "arm.hand"), (MASS, "arm.wrist")
-        # A heavier wrist does nearly what the extent does.
-        columns = {hand: np.stack(load, axis=1),
-                   wrist: (self.wide + 0.3 * other)[:, None]}  # fmt: skip
+        hand, link = ("payload", "arm.hand"), (MASS, heavier)
+        # A heavier wrist does nearly what the extent does, a heavier hand all but what
+        # the place of the load does.
+        mass = self.wide + (load[0] if heavier == "arm.hand" else 0.3 * other)
+        columns = {hand: np.stack(load, axis=1), link: mass[:, None]}
         super().__init__(columns, {hand: (0.8, 0.05, 0.04, 0.15)})
         self._base += 100.0 * extent**2 * self.wide
 
@@ -233,6 +234,13 @@ def test_a_load_gets_a_size_before_another_effect_stands_for_it():
     assert found["gyration_radius"] == pytest.approx(0.09, abs=0.002)
     assert found["mass"] == pytest.approx(0.8, abs=0.02)
     assert 0.0 < choice.std["gyration_radius"] < 0.002
+
+
+def test_a_load_with_a_size_takes_the_place_of_a_heavier_link():
+    (choice,) = select(WideLoad(0.09, "arm.hand")).choices
+    assert choice.effect.kind == "payload" and choice.size == 5
+    assert choice.effect.parameters["mass"] == pytest.approx(0.8, abs=0.02)
+    assert choice.runner_up == f"{MASS} at arm.hand" and choice.margin > 0.5
 
 
 def test_a_load_without_a_size_that_shows_is_a_point_mass():

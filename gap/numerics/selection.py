@@ -256,8 +256,9 @@ def predictable_share(y, X, block, folds: int = 5) -> float:
 
 def is_predicted(y, X, block, least: float, shifts: int = 60) -> bool:
     """Whether features X (m, k) predict at least a share `least` of y (m,), and no
-    chance does it: more than of any y that is shifted in time against them. (What goes
-    together over a while is followed by chance by whatever else does.)
+    chance does it: more than of any y that is shifted in time against them, forwards
+    or backwards in time. (What goes together over a while is followed by chance by
+    whatever else does.)
 
     Args: y, X, block: as predictable_share, in the order of time.
     """
@@ -266,7 +267,11 @@ def is_predicted(y, X, block, least: float, shifts: int = 60) -> bool:
         return False
     n = len(y)
     steps = np.linspace(0.1 * n, 0.9 * n, shifts).astype(int)
-    return all(share > predictable_share(np.roll(y, k), X, block) for k in steps)
+    return all(
+        share > predictable_share(np.roll(other, k), X, block)
+        for other in (y, y[::-1])
+        for k in steps
+    )
 
 
 def is_plausible(b, prior, rate: float = 1e-4) -> bool:

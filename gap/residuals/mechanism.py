@@ -441,9 +441,11 @@ class MechanismProblem(InverseModel, GapProblem):
         else:
             model = self
         moved = moved_links(self, nuisances, end.b)
+        found = self.wandering(end.r)
         measured = measure(
             scene, effects, moved, model, model is not self, jobs,
             self._is_pushed if model is self else lambda window: False,
+            {joint: found[k] for k, (_, joint) in enumerate(self.names()) if found[k]},
         )  # fmt: skip
         if measured is None:  # In every window something pushes.
             return None

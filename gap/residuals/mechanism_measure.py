@@ -1,6 +1,6 @@
 """The gap of a mechanism before and after, over windows of its measured motion."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -26,6 +26,7 @@ def measure(
     every: bool,
     jobs: int = 1,
     skip: Callable[[Window], bool] = lambda window: False,
+    wander: Mapping[str, float] | None = None,
 ) -> tuple[GapMeasure, list[Series]] | None:
     """Before and after over windows of the recordings that `motion` has; None where no
     window counts.
@@ -34,9 +35,9 @@ def measure(
         in both, as it is neither the gap nor its cure. motion: what tells how far a
         joint lags its motor where a window starts. every: all windows, of recordings
         that are only reported on; else those that were not fitted. skip: windows that
-        count in neither.
+        count in neither. wander: as WindowModel.
     """
-    model = WindowModel(scene, motion.recordings, WINDOW_SEC, most=240)
+    model = WindowModel(scene, motion.recordings, WINDOW_SEC, most=240, wander=wander)
     taken = {(e.kind, tuple(e.at)) for e in effects}
     moved = [e for e in moved if (e.kind, tuple(e.at)) not in taken]
     trials = [moved, [*moved, *effects]] if effects else [moved]

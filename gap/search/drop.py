@@ -19,6 +19,7 @@ from makebreak.gap.search.rivals import in_place_of
 from makebreak.gap.search.trust import consistency
 from makebreak.gap.thresholds import (
     CONSISTENT_Z,
+    CONSISTENT_Z_BESIDE,
     MEMBER_GAIN,
     NESTED_GAIN,
     PAIR_GAIN,
@@ -130,7 +131,8 @@ def keep_certain(
         if len(sure) == len(chosen):
             off = consistency(search.problem, current)
             k = int(np.argmin(off))
-            if not off[k] < CONSISTENT_Z:
+            alone = len(chosen) == 1
+            if not off[k] < (CONSISTENT_Z if alone else CONSISTENT_Z_BESIDE):
                 return chosen, current
             sure = [*chosen[:k], *chosen[k + 1 :]]
         chosen = sure

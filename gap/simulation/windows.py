@@ -5,7 +5,7 @@ grows with time in the window and counts as noise. Which windows are held out is
 by their block of time before anything is fitted.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -125,7 +125,8 @@ class WindowModel(WindowedResidual):
 
     Args: window_sec, hop_sec: length, and from one start to the next. most: windows at
         most; a larger number is thinned evenly. simulation: of the scene, if not by
-        Drake's steps.
+        Drake's steps. wander: {joint: noise of its measured effort [N m] that goes
+        together for longer than a window}, beside that of a sample.
     """
 
     def __init__(
@@ -138,9 +139,11 @@ class WindowModel(WindowedResidual):
         most: int = 400,
         by_episode: bool = False,
         simulation: SceneSimulation | None = None,
+        wander: Mapping[str, float] | None = None,
     ):
         self.scene, self.recordings = scene, list(recordings)
         self.window_sec = window_sec
+        self._wander = wander or {}
         self.simulation = simulation or SceneSimulation(scene)
         self.dynamics = SceneDynamics(scene)
         plant = self.dynamics.plant
@@ -262,9 +265,11 @@ class WindowModel(WindowedResidual):
                 for c, name in enumerate(self.channels):
                     std[:, c] = self._std(name, c, spreads, start_row, after)
                     joint, what = name.rsplit(".", 1)
-                    if joint in shaken:  # White noise, integrated once or twice.
-                        t = after**3 / 3.0 if what == "position" else after
-                        std[:, c] = np.sqrt(std[:, c] ** 2 + shaken[joint] * t)
+                    if joint in shaken:  # Integrated once or twice.
+                        once = np.stack([after, after**2])
+                        twice = np.stack([after**3 / 3.0, after**4 / 4.0])
+                        made = shaken[joint] @ (twice if what == "position" else once)
+                        std[:, c] = np.sqrt(std[:, c] ** 2 + made)
                 block_number = number
                 if number is None:
                     block_number = int((t0 - time[0]) / block)
@@ -352,9 +357,10 @@ class WindowModel(WindowedResidual):
             columns[f"{joint}.effort_command"] = y
         return time, columns
 
-    def _effort_noise(self, recording: Recording, state) -> dict[str, float]:
-        """{joint: (rad/s2)^2 s} white noise of acceleration that the noise of measured
-        efforts makes where these stand in for commands."""
+    def _effort_noise(self, recording: Recording, state) -> dict[str, np.ndarray]:
+        """{joint: (2,)} noise of acceleration that the noise of measured efforts makes
+        where these stand in for commands: the density of what is white [(rad/s2)^2 s],
+        and the variance of what is the same throughout a window [(rad/s2)^2]."""
         driven = self._driven("effort_command")
         keys = [f"{joint}.effort_measured" for joint in driven]
         if self._commanded(recording) or not any(k in recording for k in keys):
@@ -367,18 +373,19 @@ class WindowModel(WindowedResidual):
         }
         context = plant.CreateDefaultContext()
         q = np.array(plant.GetPositions(context))
-        density = np.zeros(plant.num_velocities())
+        noise = np.zeros((plant.num_velocities(), 2))
         for name, i in joints.items():
             if f"{name}.position" in state:
                 q[i] = state[f"{name}.position"][0]
             key = f"{name}.effort_measured"
             if name in driven and key in recording:
                 channel = recording.channels[key]
-                density[i] = channel.noise**2 / max(channel.rate_hz, 1e-6)
+                white = channel.noise**2 / max(channel.rate_hz, 1e-6)
+                noise[i] = white, self._wander.get(name, 0.0) ** 2
         plant.SetPositions(context, q)
         W = np.linalg.inv(plant.CalcMassMatrix(context))
-        made = (W**2) @ density
-        return {name: float(made[i]) for name, i in joints.items()}
+        made = (W**2) @ noise
+        return {name: made[i] for name, i in joints.items()}
 
     def _commanded(self, recording: Recording) -> list[str]:
         """Names of the commands that the scene's drives take."""

@@ -37,14 +37,18 @@ def make_cases(
     """
     parser = argparse.ArgumentParser(description=f"Writes {what}.")
     parser.add_argument("--set", choices=sorted(sets), required=True)
-    parser.add_argument("--out", type=Path, required=True, help="folder of the cases")
-    parser.add_argument("--truth", type=Path, required=True, help="file, elsewhere")
+    parser.add_argument("--names", action="store_true", help="print the cases' names")
+    parser.add_argument("--out", type=Path, default="cases", help="folder of the cases")
+    parser.add_argument("--truth", type=Path, default="truth.json", help="elsewhere")
     parser.add_argument("--seed", type=int, help="of the first case; else the set's")
     parser.add_argument("--only", default="", help="cases whose name has this in it")
     parser.add_argument("--jobs", type=int, default=1, help="processes at once")
     args = parser.parse_args()
     if args.out.resolve() in args.truth.resolve().parents:
         parser.error("--truth must not lie in --out: the workflow could read it")
+    if args.names:
+        print(*(case.name for case in cases(args.set, args.seed)), sep="\n")
+        return
     wanted = [case for case in cases(args.set, args.seed) if args.only in case.name]
     truths = {}
     with ProcessPoolExecutor(args.jobs) as pool:
