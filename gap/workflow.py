@@ -23,7 +23,14 @@ from makebreak.gap.data.split import split, with_noise_of
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.parallel import side_by_side
-from makebreak.gap.problem import DISTANCES, Fitted, GapProblem, Outcome, is_sane
+from makebreak.gap.problem import (
+    DISTANCES,
+    Fitted,
+    GapProblem,
+    Outcome,
+    is_sane,
+    share_left,
+)
 from makebreak.gap.residuals.driven import DrivenProblem, is_driven, sticks
 from makebreak.gap.residuals.impacts import ImpactProblem, runs_against, without_contact
 from makebreak.gap.residuals.late_poses import contact_problem
@@ -220,9 +227,10 @@ def conclude(
     back; they change no effect and no parameter.
     """
     nuisances = selection.nuisances
-    start, end = problem.error(selection.start), problem.error(selection.end)
-    if start <= AGREEMENT_RMS_MAX and (
-        end >= start or all(problem.is_within_law(c.effect) for c in selection.choices)
+    agrees = problem.error(selection.start) <= AGREEMENT_RMS_MAX
+    if agrees and (
+        _follows_noise(problem, selection)
+        or all(problem.is_within_law(c.effect) for c in selection.choices)
     ):
         selection = replace(selection, choices=(), end=selection.start)
     selection, chosen_on = kept_by_simulation(problem, selection, jobs)
@@ -400,6 +408,15 @@ def preferred_by_simulation(
             selection = replace(selection, choices=(new,), end=fit)
             outcome = other
     return selection, outcome
+
+
+def _follows_noise(problem: GapProblem, selection: Selection) -> bool:
+    """Whether effects leave most of what they were found in, and that is noise which
+    goes together over a while: without it they gain nothing."""
+    start, end = selection.start, selection.end
+    left = share_left(problem.noise_error(start.left), problem.noise_error(end.left))
+    nothing_gained = problem.error(end) >= problem.error(start)
+    return nothing_gained and left > 1.0 - CLOSED_SHARE_MIN
 
 
 def _is_confirmed(gap: GapMeasure) -> bool:

@@ -16,7 +16,7 @@ from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.result import Evidence, GapMeasure, GapResult, NamedEffect
 from makebreak.gap.search.groups import _needless_member
-from makebreak.gap.workflow import _unless_doubtful
+from makebreak.gap.workflow import _follows_noise, _unless_doubtful
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
 
@@ -224,3 +224,22 @@ def test_a_member_of_a_group_within_the_tolerance_must_show_by_itself(within):
     )  # fmt: skip
     screen = Screen(left, np.zeros((m, 0)), np.zeros(0), train)
     assert _needless_member(search, screen, members) == (1 if within else None)
+
+
+@pytest.mark.parametrize(
+    "start, end, follows",
+    [
+        ((1.0, 2.5), (1.0, 2.4), True),
+        ((1.0, 2.5), (1.0, 1.05), False),  # With it, nothing goes together any more.
+        ((1.3, 2.5), (1.0, 2.4), False),  # Another channel gains.
+        ((1.0, 2.5), (1.0, 2.5), True),
+    ],
+)
+def test_an_effect_that_leaves_the_noise_it_was_found_in_is_none(start, end, follows):
+    """Each pair: the error with noise that goes together taken out, and with it in."""
+    problem = SimpleNamespace(
+        error=lambda fitted: fitted.left[0], noise_error=lambda left: left[1]
+    )
+    fits = [SimpleNamespace(left=each) for each in (start, end)]
+    selection = SimpleNamespace(start=fits[0], end=fits[1])
+    assert _follows_noise(problem, selection) is follows

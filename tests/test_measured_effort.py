@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from effect_scenes import J, pendulum
+from scipy.signal import lfilter
 
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.table import write_recording
@@ -12,8 +13,9 @@ SIZE, RATE = 2.0, 8.0  # [N m], [rad/s] of a sine.
 ENCODER = 1e-5  # [rad]
 
 
-def windows(folder, noise, hz=50.0, seconds=20.0):
-    """Of a joint that a sine of effort swings about its middle, without gravity."""
+def windows(folder, noise, hz=50.0, seconds=20.0, wander=0.0, known=True):
+    """Of a joint that a sine of effort swings about its middle, without gravity.
+    wander [N m]: of the effort's noise that lasts for 3 s; known: to the windows."""
     scene = pendulum(folder, gravity=0.0)
     rng = np.random.default_rng(0)
     time = np.arange(0.0, seconds, 1.0 / hz)
@@ -22,11 +24,18 @@ def windows(folder, noise, hz=50.0, seconds=20.0):
         "time": time,
         "p.j1.position": position + ENCODER * rng.normal(size=len(time)),
         "p.j1.effort_measured": SIZE * np.sin(RATE * time)
-        + noise * rng.normal(size=len(time)),
+        + noise * rng.normal(size=len(time))
+        + wander * lasting(len(time), np.exp(-1.0 / (3.0 * hz)), rng),
     }
     said = {"p.j1.position": ENCODER, "p.j1.effort_measured": max(noise, 1e-4)}
     write_recording(folder / "run.csv", columns, noise=said)
-    return WindowModel(scene, read_recordings([folder / "run.csv"]))
+    recordings = read_recordings([folder / "run.csv"])
+    return WindowModel(scene, recordings, wander={"p.j1": wander if known else 0.0})
+
+
+def lasting(n, keep, rng):
+    """(n,) of unit variance, of which a share `keep` lasts from row to row."""
+    return lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.normal(size=n))
 
 
 def test_a_measured_effort_is_a_line_between_rows_and_is_not_held(tmp_path):
@@ -52,3 +61,14 @@ def test_noise_of_a_measured_effort_is_expected_in_the_windows(tmp_path, noise):
     t = 0.28  # Some windows have a row less.
     expected = noise / J * np.sqrt(t**3 / 3.0 / 50.0)
     assert (last > 0.95 * expected).all() and np.median(last) < 2.0 * expected
+
+
+def test_noise_of_a_measured_effort_that_lasts_is_expected_in_the_windows(tmp_path):
+    rms = {}
+    for known in (True, False):
+        model = windows(tmp_path, 0.1, seconds=120.0, wander=0.5, known=known)
+        e = np.concatenate(model.errors(model.simulate(())))
+        rms[known] = np.sqrt(np.mean(e**2))
+    # 120 s have some 20 independent values of it.
+    assert rms[True] == pytest.approx(1.0, abs=0.3)
+    assert rms[False] > 2.0 * rms[True]
