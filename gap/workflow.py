@@ -36,7 +36,12 @@ from makebreak.gap.residuals.impacts import ImpactProblem, runs_against, without
 from makebreak.gap.residuals.late_poses import contact_problem
 from makebreak.gap.residuals.lying_on_faces import point_on_face
 from makebreak.gap.residuals.mechanism import MechanismProblem
-from makebreak.gap.residuals.objects import FlightProblem, RolloutProblem, TouchProblem
+from makebreak.gap.residuals.objects import (
+    FlightProblem,
+    RolloutProblem,
+    TouchProblem,
+    point_on_face_of,
+)
 from makebreak.gap.residuals.pressing import PressingProblem, presses
 from makebreak.gap.residuals.sap_lift import sap_lift
 from makebreak.gap.result import GapMeasure, GapResult, JudgedChannel
@@ -207,7 +212,8 @@ def problem_for(
         except DoesNotFit:  # Nothing tells when it touches.
             pass
     try:
-        return FlightProblem(scene, recordings), []
+        flight = FlightProblem(scene, recordings)
+        return flight, point_on_face_of(flight)
     except DoesNotFit:  # More than one free body, or other shapes: by Drake's steps.
         scene, finding = _settle_step(scene, recordings, dynamics, jobs)
         return RolloutProblem(scene, recordings), finding

@@ -6,9 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gap_benchmark.cases import cases, make, write
+from pydrake.geometry import Box, Cylinder
 
-from makebreak.gap.numerics.free_body import simulate
-from makebreak.gap.simulation.free_body import FreeBodyScene
+from makebreak.gap.numerics.free_body import lowest_gap, simulate
+from makebreak.gap.simulation.face_supports import centres_of, within_faces
+from makebreak.gap.simulation.free_body import REST_DEPTH, FreeBodyScene
 from makebreak.gap.simulation.scene_simulation import SceneSimulation, SimulationConfig
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import InitialSection, read_scene
@@ -35,6 +37,7 @@ def scene(tmp_path_factory):
         Effect("contact_stiffness", [PAIR], {"stiffness": 2e5}),
         Effect("contact_dissipation", [PAIR], {"dissipation": 0.1}),
         Effect("contact_dissipation", [PAIR], {"dissipation": 4.0}),
+        Effect("contact_damping", [PAIR], {"damping": 3.0}),
         Effect("object_mass", ["cube.cube"], {"mass": 0.5}),
         Effect("object_com", ["cube"], {"x": 0.003, "z": -0.002}),
         Effect("object_inertia", ["cube"], {"ixx": 9e-4, "iyy": 8e-4, "izz": 7e-4}),
@@ -107,3 +110,74 @@ def test_a_patch_of_ground_has_its_own_friction(scene):
         v2 -= 2.0 * (friction if inside else mu) * g * rest
         np.testing.assert_allclose(x[-1, 10] ** 2, v2, atol=1e-4)
         assert rest > 0.03
+
+
+def test_a_linear_damper_gives_back_the_same_share_of_any_speed(scene):
+    numbers = FreeBodyScene(scene).body()
+    m, k, zeta = numbers.mass, 5e4, 0.1
+    pair = np.array([[[k, 0.0, 0.0, 0.0, 0.5, 2.0 * zeta * np.sqrt(k * m)]]])
+    ball = replace(
+        numbers, spheres=np.array([[0.0, 0.0, 0.0, 0.02]]), com=np.zeros(3),
+        pairs=pair, levers=numbers.levers[:1], gravity=np.zeros(3),
+    )  # fmt: skip
+    top = ball.fixed[0, 11] + ball.fixed[0, 14]
+    # Until the force is zero again, which is before the spring is at its length: m x''
+    # = -(k x + c x'), of which x = sin(w t) exp(-zeta w0 t).
+    root = np.sqrt(1.0 - zeta**2)
+    share = np.exp(-zeta / root * np.arctan2(2.0 * zeta * root, 2.0 * zeta**2 - 1.0))
+    for speed in (0.2, 1.0, 4.0):
+        start = np.array([1, 0, 0, 0, 0, 0, top + 0.021, 0, 0, 0, 0, 0, -speed])
+        x = simulate(ball, start, [0.0, 0.03 + 2e-3 / speed], tol=1e-8)
+        np.testing.assert_allclose(x[-1, 12], share * speed, rtol=1e-4)
+
+
+def test_corners_and_inner_points_turn_as_a_face_that_presses_evenly():
+    """With what is said of it at WITHIN_BOX: mean distance and mean square of it from
+    the middle, of a disc exactly, of a square's to 1 %."""
+    rng, n = np.random.default_rng(0), 200_000
+    square = rng.uniform(-0.1, 0.1, (n, 2))
+    for shape, even, share in (
+        (Box(0.2, 0.2, 0.05), square, 0.16),
+        (Cylinder(0.1, 0.05), square[np.hypot(*square.T) < 0.1], 1.0 / 3.0),
+    ):
+        corners, radius = centres_of(shape)
+        inner = within_faces(shape)
+        sides = [x[x[:, 2] > 0.025 - 1.5 * radius] for x in (corners, inner)]
+        # The corners' spheres lie within the edge by their radius.
+        ways = [np.hypot(*x[:, :2].T) for x in sides]
+        ways = [x * 0.1 / (0.1 - radius) for x in ways]
+        if len(inner) > 8:  # A box's other faces have points at this height too.
+            ways[1] = ways[1][ways[1] < 0.08]
+        for power, tol in ((1, 0.01), (2, 0.02)):
+            got = share * np.mean(ways[0] ** power)
+            got += (1.0 - share) * np.mean(ways[1] ** power)
+            want = np.mean(np.hypot(*even.T) ** power)
+            np.testing.assert_allclose(got, want, rtol=tol)
+
+
+def test_a_box_has_spheres_at_its_corners_and_within_its_faces(scene, tmp_path):
+    (tmp_path / "brick.sdf").write_text(
+        '<sdf version="1.9"><model name="brick"><link name="brick"><collision name="c">'
+        "<geometry><box><size>0.2 0.1 0.06</size></box></geometry></collision></link>"
+        "</model></sdf>"
+    )
+    brick = copy.deepcopy(scene.directives[-1])
+    brick.add_model.name, brick.add_model.file = "brick", f"file://{tmp_path}/brick.sdf"
+    hard = Effect(
+        "contact_stiffness", ["brick.brick~ground.ground"], {"stiffness": 1e6}
+    )
+    numbers = FreeBodyScene(
+        replace(scene, directives=[*scene.directives[:-1], brick],
+                initial=type(scene.initial)(), effects=[hard])
+    )  # fmt: skip
+    assert numbers.has_faces
+    body = numbers.body()
+    assert lowest_gap(body, np.array([1, 0, 0, 0, 0, 0, 5.0])) == pytest.approx(
+        5.0 - 0.03 - body.fixed[0, 11] - body.fixed[0, 14]
+    )
+    whole = numbers.body((), at_corners=1.0)
+    assert (whole.pairs[8:, :, 0] == 0.0).all() and (whole.pairs[:8, :, 0] > 0.0).all()
+    numbers.ease()  # At rest on a face it is as deep as is said.
+    face = numbers.body().pairs[:, 0, 0].sum() / 2.0
+    weight = body.mass * np.linalg.norm(body.gravity)
+    assert weight / face == pytest.approx(REST_DEPTH)

@@ -275,7 +275,7 @@ def test_boxes_that_are_far_change_nothing():
 
     def fall(fixed):
         n = len(fixed)
-        pair = np.array([2e4, 1.0, 0.4, 0.4, 0.5])
+        pair = np.array([2e4, 1.0, 0.4, 0.4, 0.5, 0.0])
         body = FreeBody(
             0.1, np.zeros(3), 1e-5 * np.eye(3), np.array([0.0, 0.0, -9.81]),
             np.array([[0.0, 0.0, 0.0, 0.02]]), fixed, np.tile(pair, (1, n, 1)),

@@ -4,6 +4,7 @@ The law is that of Drake's continuous point contact, so that what is fitted here
 there; it is stepped a hundred times as fast, for searches over thousands of windows:
 
     f_n = k depth (1 + d depth_rate)+,    f_t = -mu(|v_t|) f_n v_t/|v_t|
+    or f_n = (k depth + c depth_rate)+ where a linear damper c stands in for d
 
 with mu(v) rising smoothly to the static value at the speed v_s and falling to the
 dynamic one at 3 v_s. Source: Hunt, Crossley, J. Appl. Mech. 42(2), 1975; Drake's
@@ -26,9 +27,10 @@ class FreeBody:
 
     spheres (n, 4): centre in the body's frame and radius [m]. fixed (m, 15): rotation
     (9, by rows) and centre (3) in world, half sizes (3) [m]; a half-space has its
-    origin on its surface and a first half size of -1. pairs (n, m, 5): stiffness [N/m],
-    dissipation [s/m], static and dynamic friction, and the share of the contact point
-    that lies on the sphere's surface. levers (n, m): of rolling resistance [m].
+    origin on its surface and a first half size of -1. pairs (n, m, 6): stiffness [N/m],
+    dissipation [s/m], static and dynamic friction, the share of the contact point that
+    lies on the sphere's surface, and a linear damper [N s/m]. levers (n, m): of rolling
+    resistance [m].
     forces (p, 6): fx, fy, fz [N, world, on the body's origin], frequency [Hz] (0:
     constant), phase, 0. patches (k, 6): number of a fixed shape, and the friction there
     where x and y of the world are within x_min, x_max, y_min, y_max.
@@ -47,6 +49,11 @@ class FreeBody:
     slip: float = 1e-3  # v_s [m/s]
     fade: float = 0.05  # Below this rate rolling resistance fades [rad/s].
     patches: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
+
+    def __post_init__(self):
+        shape = (len(self.spheres), len(self.fixed), 6)
+        if self.pairs.shape != shape:  # Compiled steps would read beyond its end.
+            raise ValueError(f"FreeBody.pairs is {self.pairs.shape}, expected {shape}")
 
 
 def simulate(
@@ -97,15 +104,18 @@ def _matrix(q):
 
 
 @njit(cache=True)
-def _is_far(c, radius, fixed):
-    """Whether a sphere at c is outside of the ball about a box, where it cannot touch
-    it: most boxes are, where a scene has many of them."""
+def _is_apart(c0, c1, c2, radius, fixed):
+    """Whether a sphere is outside of a fixed shape: beyond one of its faces. What is
+    near an edge is left to _gap."""
+    d0, d1, d2 = c0 - fixed[9], c1 - fixed[10], c2 - fixed[11]
+    a2 = fixed[2] * d0 + fixed[5] * d1 + fixed[8] * d2
     if fixed[12] < 0.0:
-        return False
-    d0, d1, d2 = c[0] - fixed[9], c[1] - fixed[10], c[2] - fixed[11]
-    h0, h1, h2 = fixed[12], fixed[13], fixed[14]
-    far = radius + np.sqrt(h0 * h0 + h1 * h1 + h2 * h2)
-    return d0 * d0 + d1 * d1 + d2 * d2 > far * far
+        return a2 - radius >= 0.0
+    if abs(a2) - fixed[14] >= radius:
+        return True
+    if abs(fixed[0] * d0 + fixed[3] * d1 + fixed[6] * d2) - fixed[12] >= radius:
+        return True
+    return abs(fixed[1] * d0 + fixed[4] * d1 + fixed[7] * d2) - fixed[13] >= radius
 
 
 @njit(cache=True)
@@ -190,7 +200,7 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, fixed, pairs, lev
             c[i] = s[4 + i] + R[i, 0] * b0 + R[i, 1] * b1 + R[i, 2] * b2
         radius = spheres[j, 3]
         for m in range(len(fixed)):
-            if _is_far(c, radius, fixed[m]):
+            if _is_apart(c[0], c[1], c[2], radius, fixed[m]):
                 continue
             gap, n = _gap(c, radius, fixed[m])
             if gap >= 0.0:
@@ -205,6 +215,7 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, fixed, pairs, lev
             u2 = s[12] + w0 * a1 - w1 * a0
             un = u0 * n[0] + u1 * n[1] + u2 * n[2]
             fn = pairs[j, m, 0] * depth * (1.0 - pairs[j, m, 1] * un)
+            fn -= pairs[j, m, 5] * un
             if fn <= 0.0:
                 continue
             u0 -= un * n[0]

@@ -13,6 +13,7 @@ from makebreak.gap.problem import Candidate, Nuisances
 from makebreak.gap.simulation.free_windows import FreeBodyModel, touched
 from makebreak.gap.simulation.windows import WindowModel
 from makebreak.models.effects import KINDS
+from makebreak.models.effects.contact import CONTACT_LAW, DAMPER, STIFFNESS
 from makebreak.models.effects.kind import Effect
 
 # What a value is multiplied by, or what is added to it.
@@ -35,6 +36,7 @@ _POSITIVE = dict.fromkeys(
      "izz"), True,
 )  # fmt: skip
 _SIZES = (0.95, 0.99, 1.05)
+_DAMPED = (0.02, 0.06, 0.12, 0.25, 0.5)  # Of critical damping: a linear damper's.
 _INERTIAS = (0.97, 1.2)
 # Cells a side of the ground that was touched, in search of a patch; their least size.
 CELLS, LEAST_CELL = 6, 0.01  # [m]
@@ -47,7 +49,7 @@ _OF_BODIES = ("constant_force", "body_drag", "object_mass", "object_com",
 def contact_nuisances(model: FreeBodyModel | WindowModel) -> Nuisances:
     """Contact stiffness and dissipation within the scene's tolerance (relative)."""
     columns, prior, names = [], [], []
-    for kind in ("contact_stiffness", "contact_dissipation"):
+    for kind in CONTACT_LAW:
         share = float(model.scene.tolerance.get(kind, 0.0))
         if share <= 0.0:
             continue
@@ -125,6 +127,13 @@ def _trials(model, kind: str, at: str):
             ("angular", 0.3 * mass * 1e-3, "linear"),
         ):
             yield [[(step, {**zero, name: step})]], (name,), (other,)
+    elif kind == DAMPER:
+        if not isinstance(model, FreeBodyModel):
+            return  # Drake's steps bound it, and are too long.
+        stiffness = model.dynamics.now(STIFFNESS, [at])["stiffness"]
+        critical = 2.0 * np.sqrt(stiffness * model.body.mass)
+        values = [share * critical for share in _DAMPED]
+        yield [[(c, {"damping": c})] for c in values], ("damping",), ()
     elif kind in _TIMES:
         ((name, value),) = now.items()
         yield (

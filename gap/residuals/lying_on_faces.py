@@ -91,24 +91,33 @@ def point_on_face(
     for one in lying:
         pair = contacts.pair_name((one.body, one.ground))
         name = contacts.shapes.names[one.body]
-        how = "lies on its side" if one.on_side else "lies on a face"
-        how = "presses with edges or a face" if one.is_tool else how
-        says = (
-            f"{name} {how}, and Drake's point contact gives {pair} a single "
-            "point, which jumps about: in the scene's own simulation it rocks, slides "
-            "and turns wrongly. Here it was simulated standing on "
-            + (
-                "two spheres of its own radius"
-                if one.on_side
-                else "small spheres at its corners"
-                if one.is_tool
-                else "small spheres at the corners of that face"
-            )
-            + ". Give it such spheres in its model, or use hydroelastic contact, "
-            "before you simulate with the scene."
-        )
         recording = contacts.recordings[0].name
-        found.append(
-            Finding("point_on_face", recording, pair, 1.0, "1", "warning", says)
-        )
+        found.append(one_point(name, pair, one.on_side, recording, one.is_tool))
     return found
+
+
+def one_point(
+    name: str, pair: str, on_side: bool, recording: str, is_tool: bool = False
+) -> Finding:
+    """The warning for a body that lies on something with an area or a line.
+
+    Args: name, pair: of the body, and of it with what it lies on; on_side: of a
+        cylinder; recording: in which it does; is_tool: it presses with its corners.
+    """
+    how = "lies on its side" if on_side else "lies on a face"
+    how = "presses with edges or a face" if is_tool else how
+    says = (
+        f"{name} {how}, and Drake's point contact gives {pair} a single "
+        "point, which jumps about: in the scene's own simulation it rocks, slides "
+        "and turns wrongly. Here it was simulated standing on "
+        + (
+            "two spheres of its own radius"
+            if on_side
+            else "small spheres at its corners"
+            if is_tool
+            else "small spheres at the corners of that face"
+        )
+        + ". Give it such spheres in its model, or use hydroelastic contact, "
+        "before you simulate with the scene."
+    )
+    return Finding("point_on_face", recording, pair, 1.0, "1", "warning", says)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.problem import (
@@ -16,12 +17,14 @@ from makebreak.gap.problem import (
     SearchPlan,
 )
 from makebreak.gap.residuals.contact import contact_candidates, contact_nuisances
+from makebreak.gap.residuals.lying_on_faces import one_point
 from makebreak.gap.residuals.touch import TouchModel, touch_candidates
 from makebreak.gap.residuals.where import where_in_windows
 from makebreak.gap.result import Unexplained, Where
-from makebreak.gap.simulation.free_windows import FreeBodyModel
+from makebreak.gap.simulation.free_windows import FreeBodyModel, touched
 from makebreak.gap.simulation.measure import gap_measure, series_of
 from makebreak.gap.simulation.windows import WindowModel
+from makebreak.models.effects.contact import STIFFNESS
 from makebreak.models.scene import Scene
 
 # A real object differs from its model in more ways than a mechanism.
@@ -125,7 +128,7 @@ class WindowedProblem(GapProblem):
 
 
 class FlightProblem(FreeBodyModel, WindowedProblem):
-    """One body of spheres that flies, bounces, slides or rolls on what is fixed."""
+    """One body that flies, bounces, slides or rolls on what is fixed."""
 
     plan = SearchPlan(
         jumps=True,  # Where an object's spheres land in another order.
@@ -160,6 +163,20 @@ class RolloutProblem(WindowModel, WindowedProblem):
 
     def _again(self, recordings: Sequence[Recording]) -> WindowModel:
         return WindowModel(self.scene, recordings, DRAKE_SEC, most=DRAKE_MOST)
+
+
+def point_on_face_of(model: FreeBodyModel) -> list[Finding]:
+    """A warning where a body that has faces touches something: Drake gives it one
+    point there, and here it stands on spheres."""
+    if not model.has_faces or not len(touched(model)):
+        return []
+    grounds = sorted(at.split("~")[1] for at in model.dynamics.places(STIFFNESS))
+    return [
+        one_point(
+            model.name, f"{model.name} on {', '.join(grounds)}", model.on_side,
+            model.recordings[0].name,
+        )
+    ]  # fmt: skip
 
 
 def unexplained_in_windows(

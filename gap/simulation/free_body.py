@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pydrake.geometry import Box, HalfSpace, Sphere
+from pydrake.geometry import Box, Cylinder, HalfSpace, Sphere
 from pydrake.math import RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody
@@ -12,15 +12,26 @@ from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.free_body import FreeBody
+from makebreak.gap.simulation.face_supports import (
+    INNER,
+    RIM,
+    centres_of,
+    within_faces,
+)
 from makebreak.models.effects import KINDS
+from makebreak.models.effects.contact import DAMPER
 from makebreak.models.effects.contact_surface import DEFAULT_DISSIPATION
 from makebreak.models.effects.kind import Effect, check_parameters, full_name
 from makebreak.models.effects.rolling_resistance import FADE_RATE
 from makebreak.models.scene import LoadedScene, Scene, load_scene
 
+SPHERE, CORNER, WITHIN = range(3)  # What a sphere is: the body's own, or stands in.
+REST_DEPTH = 2e-5  # [m] Of a body on a face that is not stiffer than it need be.
+AT_CORNERS = 0.4  # Of a face's load; it is 0.16 (a disc's rim: 0.33) if pressed evenly.
 # Forces that have their own numbers here; what changes shapes, inertias and surfaces is
 # read off the plant.
-_FORCES = ("constant_force", "sinusoidal_force", "body_drag", "rolling_resistance")
+_FORCES = ("constant_force", "sinusoidal_force", "body_drag", "rolling_resistance",
+           DAMPER)  # fmt: skip
 _SENSORS = ("length_scale", "sensor_delay", "sensor_bias", "clock_skew")
 _PLANT = ("object_size", "corner_radius", "object_mass", "object_com", "object_inertia",
           "contact_friction", "contact_stiffness", "contact_dissipation",
@@ -31,12 +42,17 @@ class FreeBodyScene:
     """A scene's one free body, read off its plant once; effects change its numbers
     without another plant, which would take longer than all windows' steps.
 
-    Raises: DoesNotFit where the scene has anything else that moves, shapes other than
-        a body of spheres on boxes and half-spaces, or effects of other kinds.
+    A box, a cylinder or a hull of the body touches with spheres at its corners and
+    within its faces (face_supports.py), as an area would and Drake's point does not.
+
+    Args: on_side: whether a cylinder of it lies on its side.
+    Raises: DoesNotFit where the scene has anything else that moves, shapes that have no
+        such spheres, anything fixed but boxes and half-spaces, or effects of other
+        kinds.
     """
 
-    def __init__(self, scene: Scene):
-        self.scene = scene
+    def __init__(self, scene: Scene, on_side: bool = False):
+        self.scene, self._on_side, self._eased = scene, on_side, 1.0
         for effect in scene.effects:
             if effect.kind not in (*_FORCES, "length_scale", *_PLANT):
                 raise DoesNotFit(f"effect {effect.kind} is not one of a free body")
@@ -52,14 +68,31 @@ class FreeBodyScene:
         self.name = full_name(plant, bodies[0])
         self._read(loaded, bodies[0])
 
-    def body(self, effects: Sequence[Effect] = ()) -> FreeBody:
+    @property
+    def has_faces(self) -> bool:
+        """Whether spheres stand in for its shapes."""
+        return bool((self._numbers.role != SPHERE).any())
+
+    def ease(self) -> None:
+        """Makes faces no stiffer than what lies on them needs to be carried. Of what
+        never hits anything, a stiffness shows nowhere but in how short steps are."""
+        k = self.body().pairs[self._numbers.role != SPHERE, :, 0].sum(axis=0).max()
+        weight = float(self._numbers.mass) * float(np.linalg.norm(self._gravity))
+        self._eased = min(1.0, weight / REST_DEPTH / max(0.5 * k, 1e-9))
+
+    def body(
+        self, effects: Sequence[Effect] = (), at_corners: float = AT_CORNERS
+    ) -> FreeBody:
         """Its numbers with these effects added to the scene's own.
 
+        Args: at_corners: share of a face's load that its corners carry.
         Raises: ValueError for effects that no body can have.
         """
         if not all(e.kind in _CHANGES or e.kind in _SENSORS for e in effects):
             more = replace(self.scene, effects=[*self.scene.effects, *effects])
-            return FreeBodyScene(more).body()
+            other = FreeBodyScene(more, self._on_side)
+            other._eased = self._eased
+            return other.body((), at_corners)
         now = _Numbers(**{k: np.array(v) for k, v in vars(self._numbers).items()})
         for effect in sorted(effects, key=lambda e: KINDS[e.kind].rank):
             check_parameters(effect, KINDS[effect.kind])
@@ -71,9 +104,15 @@ class FreeBodyScene:
             mine = np.array([ground in at for ground in self._grounds], bool)
             if self.name in at or mine.any():
                 change(now, effect.parameters, mine)
+        pairs = _pairs(now, self._guess) * self._touch[:, :, None]
+        # Spring and damper of what stands within a face, whose corners have the pair's.
+        inner = now.role == WITHIN
+        pairs[inner, :, 0] *= now.inner * (1.0 / at_corners - 1.0)
+        pairs[inner, :, 5] *= now.inner * (1.0 / at_corners - 1.0)
+        pairs[now.role != SPHERE, :, 0] *= self._eased
         return FreeBody(
             float(now.mass), now.com, now.inertia, self._gravity, now.spheres,
-            now.fixed, _pairs(now, self._guess) * self._touch[:, :, None],
+            now.fixed, pairs,
             now.rolling[None, :] * now.spheres[:, 3:], now.forces, now.drag,
             fade=FADE_RATE, patches=now.patches,
         )  # fmt: skip
@@ -83,13 +122,27 @@ class FreeBodyScene:
         mine = plant.GetCollisionGeometriesForBody(body)
         if not mine:
             raise DoesNotFit(f"{self.name} has nothing to touch with")
-        spheres = []
-        for g in mine:
-            shape = inspector.GetShape(g)
-            if not isinstance(shape, Sphere):
-                raise DoesNotFit(f"a {type(shape).__name__} of a free body")
-            centre = inspector.GetPoseInFrame(g).translation()
-            spheres.append([*centre, shape.radius()])
+        self.axes: list[np.ndarray] = []  # Of its cylinders, in the body's frame.
+        spheres, role, of = [], list[int](), list[int]()
+        inner = 0.0
+        for i, g in enumerate(mine):
+            shape, X = inspector.GetShape(g), inspector.GetPoseInFrame(g)
+            if isinstance(shape, Sphere):
+                each = [(SPHERE, [0.0, 0.0, 0.0, shape.radius()])]
+            else:
+                corners = centres_of(shape, self._on_side)
+                if corners is None:
+                    raise DoesNotFit(f"a {type(shape).__name__} of a free body")
+                each = [(CORNER, [*p, corners[1]]) for p in corners[0]]
+                if not (self._on_side and isinstance(shape, Cylinder)):
+                    each += [(WITHIN, list(s)) for s in within_faces(shape)]
+                    inner = 1.0 if isinstance(shape, Box) else RIM / INNER
+            if isinstance(shape, Cylinder):
+                self.axes.append(X.rotation().col(2))
+            for what, (*p, radius) in each:
+                spheres.append([*(X @ np.array(p)), radius])
+                role.append(what)
+                of.append(i)
         context = plant.CreateDefaultContext()
         fixed, others, origins = [], [], []
         self._grounds: list[str] = []
@@ -123,13 +176,14 @@ class FreeBodyScene:
         self._touch = np.array(
             [[not inspector.CollisionFiltered(a, b) for b in others] for a in mine],
             float,
-        ).reshape(len(mine), len(others))
+        ).reshape(len(mine), len(others))[of]
         self._numbers = _Numbers(
             np.array(mass), com, central, np.array(spheres),
             np.array(fixed).reshape(-1, 15), np.array(origins).reshape(-1, 3),
-            np.array([_surface(inspector, g) for g in mine]),
+            np.array([_surface(inspector, g) for g in mine])[of],
             np.array([_surface(inspector, g) for g in others]).reshape(-1, 4),
             np.zeros(len(others)), np.zeros((0, 6)), np.zeros(2), np.zeros((0, 6)),
+            np.full(len(others), np.nan), np.array(role), np.array(inner),
         )  # fmt: skip
         for effect in loaded.effects:
             if effect.kind in _FORCES:
@@ -143,7 +197,9 @@ class FreeBodyScene:
 @dataclass(eq=False)
 class _Numbers:
     """What effects change. own (n, 4), other (m, 4): stiffness (inf: Drake's guess),
-    dissipation, static and dynamic friction of each surface; rolling (m,)."""
+    dissipation, static and dynamic friction of each surface; rolling (m,); damper (m,):
+    in the place of the dissipation, NaN where there is none; role (n,) of each sphere;
+    inner: corners of a face for each sphere within it."""
 
     mass: np.ndarray
     com: np.ndarray
@@ -157,6 +213,9 @@ class _Numbers:
     forces: np.ndarray
     drag: np.ndarray
     patches: np.ndarray
+    damper: np.ndarray
+    role: np.ndarray
+    inner: np.ndarray
 
 
 def _surface(inspector, geometry) -> list[float]:
@@ -170,7 +229,7 @@ def _surface(inspector, geometry) -> list[float]:
 
 
 def _pairs(now: _Numbers, guess: float) -> np.ndarray:
-    """(n, m, 5) as Drake combines two surfaces."""
+    """(n, m, 6) as Drake combines two surfaces."""
     own, other = now.own[:, None], now.other[None, :]
     k1 = np.where(np.isfinite(own[..., 0]), own[..., 0], guess)
     k2 = np.where(np.isfinite(other[..., 0]), other[..., 0], guess)
@@ -180,7 +239,9 @@ def _pairs(now: _Numbers, guess: float) -> np.ndarray:
         for i in (2, 3)
     ]  # fmt: skip
     d = (k2 * own[..., 1] + k1 * other[..., 1]) / (k1 + k2)
-    return np.stack([k1 * k2 / (k1 + k2), d, *mu, k1 / (k1 + k2)], axis=-1)
+    d = np.where(np.isfinite(now.damper), 0.0, d)
+    damper = np.broadcast_to(np.nan_to_num(now.damper), d.shape)
+    return np.stack([k1 * k2 / (k1 + k2), d, *mu, k1 / (k1 + k2), damper], axis=-1)
 
 
 # ----- Effects: the same as in models/effects, on these numbers.
@@ -194,13 +255,20 @@ def _size(now: _Numbers, p, on) -> None:
 
 
 def _corners(now: _Numbers, p, on) -> None:
-    middle = now.spheres[:, :3].mean(axis=0)
-    half = abs(now.spheres[:, :3] - middle).mean(axis=0) + now.spheres[0, 3]
-    if len(now.spheres) != 8 or not 0.0 < p["radius"] <= half.min():
+    if (now.role == CORNER).sum() == 8:  # A box becomes spheres, which have no faces.
+        now.spheres[now.role == WITHIN] = now.spheres[now.role == CORNER][0]
+        now.inner[...] = 0.0
+        corners = now.role == CORNER
+    else:
+        corners = now.role == SPHERE
+    of = now.spheres[corners]
+    middle = of[:, :3].mean(axis=0)
+    half = abs(of[:, :3] - middle).mean(axis=0) + of[0, 3]
+    if len(of) != 8 or not 0.0 < p["radius"] <= half.min():
         raise ValueError(f"corner_radius: radius is {p['radius']}, half size {half}")
-    sign = np.sign(now.spheres[:, :3] - middle)
-    now.spheres[:, :3] = middle + sign * (half - p["radius"])
-    now.spheres[:, 3] = p["radius"]
+    sign = np.sign(of[:, :3] - middle)
+    now.spheres[corners, :3] = middle + sign * (half - p["radius"])
+    now.spheres[corners, 3] = p["radius"]
 
 
 def _mass(now: _Numbers, p, on) -> None:
@@ -250,6 +318,10 @@ def _dissipation(now: _Numbers, p, on) -> None:
     now.other[on, 1] = d1
 
 
+def _damper(now: _Numbers, p, on) -> None:
+    now.damper[on] = p["damping"]
+
+
 def _height(now: _Numbers, p, on) -> None:
     now.fixed[on, 11] += p["height"]
 
@@ -289,6 +361,7 @@ _CHANGES = {
     "contact_stiffness": _stiffness, "contact_dissipation": _dissipation,
     "plane_height": _height, "plane_tilt": _tilt, "rolling_resistance": _rolling,
     "constant_force": _force, "sinusoidal_force": _force, "body_drag": _drag,
+    DAMPER: _damper,
 }  # fmt: skip
 
 

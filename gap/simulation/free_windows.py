@@ -15,6 +15,7 @@ from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.free_body import FreeBody, lowest_gap, placed, simulate
 from makebreak.gap.numerics.free_flight import fit_flight, turned_by
+from makebreak.gap.numerics.struck import struck_rows
 from makebreak.gap.simulation.free_body import FreeBodyScene
 from makebreak.gap.simulation.windows import TURN, WindowedResidual, spin_of
 from makebreak.models.dynamics import SceneDynamics
@@ -33,6 +34,11 @@ BLUR = 0.02  # Laws of contact are approximations, which noise alone does not te
 DRAWS = 12  # Of uncertain starts.
 ENOUGH = 30  # Windows up to the first impact: then later ones are not needed.
 FEWEST_ROWS, FEWEST_IN_FLIGHT = 8, 6
+AT_CORNERS_BETWEEN = (0.15, 1.0)  # Of the load of a face.
+# Cosine of a cylinder's axis to the vertical below which it lies on its side; share of
+# the rows that say so.
+ACROSS, MOSTLY = 0.3, 0.95
+SURE = 5.0  # Deviations by which a flight is bent otherwise than gravity bends it.
 FLIES = 1.5  # Times the noise that a fit of free flight may leave, to be one.
 UNEVEN = 0.5  # Of the error of all windows: what is held out must have as much of it.
 NEAR = 2e-3  # [m] So near it is taken to touch.
@@ -74,6 +80,10 @@ class FreeBodyModel(WindowedResidual):
     ):
         self.scene, self.recordings = scene, list(recordings)
         self._numbers = FreeBodyScene(scene)
+        self.on_side = lies_on_side(self._numbers, recordings)
+        if self.on_side:
+            self._numbers = FreeBodyScene(scene, on_side=True)
+        self.has_faces = self._numbers.has_faces
         self.name, self._body = self._numbers.name, self._numbers.body()
         self.bodies, self.joints = [self.name], list[str]()
         self.dynamics = SceneDynamics(scene)
@@ -82,6 +92,8 @@ class FreeBodyModel(WindowedResidual):
         self._turns = all(f"{self.name}.{a}" in r for a in TURN for r in recordings)
         if not self._turns and (len(self._body.spheres) > 1 or self._body.com.any()):
             raise DoesNotFit(f"expected the orientation of {self.name}")
+        if self.has_faces:
+            _check_edges(self._body, self.name, recordings)
         self.channels = [
             c for a in _STATE if all((c := f"{self.name}.{a}") in r for r in recordings)
         ]
@@ -99,13 +111,19 @@ class FreeBodyModel(WindowedResidual):
             for r in recordings
         ]
         self._after = after_sec
-        self.windows: list[FreeWindow] = []
-        number = 0
-        total = sum(len(r.episodes) for r in recordings)
-        for i, recording in enumerate(recordings):
-            for episode in recording.episodes:
-                self._cut(i, recording, episode, number if total >= 6 else None)
-                number += 1
+        # Of each flight, and how much a curvature of its path that gravity does not
+        # make takes off its squared residuals.
+        self._curvatures: list[float] = []
+        self._falls_freely = True
+        self._cut_all()
+        if self.has_faces and not self._is_struck:
+            self._numbers.ease()
+            self._body = self._numbers.body()
+        if _is_beyond_chance(self._curvatures):
+            # Drag, say: a start fitted by gravity alone would be wrong, and the effect
+            # that is looked for would make it worse.
+            self._falls_freely = False
+            self._cut_all()
         first = [w for w in self.windows if w.after_hits == 0]
         if len(first) >= ENOUGH and len(first) < len(self.windows):
             self.windows = first  # Later ones start from states that are less sure.
@@ -142,6 +160,16 @@ class FreeBodyModel(WindowedResidual):
         turns = TURN if self._turns else ()
         return [f"{self.name}.{a}" for a in (*turns, *_PLACE)]
 
+    def _cut_all(self) -> None:
+        self.windows: list[FreeWindow] = []
+        self._is_struck = False
+        number = 0
+        total = sum(len(r.episodes) for r in self.recordings)
+        for i, recording in enumerate(self.recordings):
+            for episode in recording.episodes:
+                self._cut(i, recording, episode, number if total >= 6 else None)
+                number += 1
+
     def _cut(self, i: int, recording: Recording, episode: Episode, number) -> None:
         time = recording.time[episode.rows]
         values = {n: recording[n][episode.rows] for n in self._signals()}
@@ -151,8 +179,11 @@ class FreeBodyModel(WindowedResidual):
         for a in _PLACE:
             c = f"{self.name}.{a}"
             stages = recording.channels[c].stages or ()
-            s = smooth_filtered(time, values[c], recording.channels[c].noise, stages)
-            rough |= np.abs(s.x[:, 2]) > IMPACT_ACCELERATION
+            noise = recording.channels[c].noise
+            rough |= struck_rows(
+                time, values[c], noise, stages, IMPACT_ACCELERATION, BESIDE
+            )
+        self._is_struck |= bool(rough.any())
         hit = np.flatnonzero(rough)
         near = np.zeros(len(time), bool)
         late = max(mean_delay(recording.channels[c].stages or ()) for c in values)
@@ -264,11 +295,16 @@ class FreeBodyModel(WindowedResidual):
         if not np.isfinite(path).all() or not np.isfinite(covariance).all():
             return False
         covariance *= max(flight.rms, 1.0) ** 2
+        self._curvatures.append(
+            _curvature(time, (pose[:, 4:] - path[:, 4:7]) / noise[4:])
+            / max(flight.rms, 1.0) ** 2
+        )
         for k, (x, C) in enumerate(zip(path, covariance, strict=True)):
-            states[k, 4:] = np.stack([x[4:7], x[10:], self._body.gravity], axis=1)
-            for i in range(3):
-                of = np.ix_([3 + i, 9 + i], [3 + i, 9 + i])
-                spreads[k, 4 + i] = C[of]
+            if self._falls_freely:
+                states[k, 4:] = np.stack([x[4:7], x[10:], self._body.gravity], axis=1)
+                for i in range(3):
+                    of = np.ix_([3 + i, 9 + i], [3 + i, 9 + i])
+                    spreads[k, 4 + i] = C[of]
             if self._turns:
                 x[:4] *= np.sign(x[:4] @ states[k, :4, 0])
                 states[k, :4, 0], states[k, :4, 1] = x[:4], turned_by(x[:4], x[7:10])
@@ -296,7 +332,11 @@ class FreeBodyModel(WindowedResidual):
                 state = np.array(w.state)
                 for k, L in enumerate(roots):
                     state[k, :2] += L @ rng.normal(size=2)
-                off = self._simulate(self._body, w, state, 1.0) - y
+                unseen = None if self._turns else self._unseen_spin(w, rng)
+                body = self._body
+                if self.has_faces:  # Nobody knows where a face presses.
+                    body = self._numbers.body((), rng.uniform(*AT_CORNERS_BETWEEN))
+                off = self._simulate(body, w, state, 1.0, unseen) - y
                 off[~np.isfinite(off)] = 1e3
                 wide += np.minimum(off**2, self._cap**2) / DRAWS
             stds.append(np.sqrt(self.noise**2 + wide))
@@ -310,6 +350,12 @@ class FreeBodyModel(WindowedResidual):
             replace(w, std=np.sqrt(std**2 + floor**2))
             for w, std in zip(self.windows, stds, strict=True)
         ]
+
+    def _unseen_spin(self, w: FreeWindow, rng: np.random.Generator) -> np.ndarray:
+        """(3,) [rad/s] as a ball may have whose orientation is not measured: about as
+        fast as one that rolls. What friction makes of it in a bounce, nobody knows."""
+        speed = float(np.linalg.norm(w.state[4:, 1]))
+        return speed / self._body.spheres[0, 3] * rng.normal(size=3)
 
     def _share_out(self) -> None:
         """Other blocks are held out if those that are hold next to nothing of the gap:
@@ -333,9 +379,10 @@ class FreeBodyModel(WindowedResidual):
     # ----- Simulating
 
     def _simulate(
-        self, body: FreeBody, w: FreeWindow, state, length: float
-    ) -> np.ndarray:
-        """(n, n_channels) of a window."""
+        self, body: FreeBody, w: FreeWindow, state, length: float,
+        unseen: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        """(n, n_channels) of a window. unseen: spin of a ball in flight."""
         q = state[:4, 0] / np.linalg.norm(state[:4, 0])
         dq = state[:4, 1] - q * (q @ state[:4, 1])
         place, velocity = state[4:, 0] / length, state[4:, 1] / length
@@ -344,6 +391,8 @@ class FreeBodyModel(WindowedResidual):
             radius = body.spheres[0, 3]
             if lowest_gap(body, np.concatenate([q, place])) < 0.03 * radius:
                 spin = np.array([-velocity[1], velocity[0], 0.0]) / radius
+            elif unseen is not None:
+                spin = unseen
         times = self.recordings[w.recording].time[w.rows]
         filters = self._filters[w.recording]
         n = DENSE if filters and len(times) > 1 else 1
@@ -394,6 +443,57 @@ class FreeBodyModel(WindowedResidual):
         return out
 
 
+def lies_on_side(body: FreeBodyScene, recordings: Sequence[Recording]) -> bool:
+    """Whether a body's cylinders lie on their sides in all that was measured.
+
+    Raises: DoesNotFit where they lie at times and stand at others: what they touch with
+        is not the same then.
+    """
+    across = []
+    for recording in recordings:
+        pose = _poses(body.name, recording)
+        for axis in body.axes:
+            up = [
+                placed(x, axis[None])[0, 2] - x[6]
+                for x in pose[:: len(pose) // 500 + 1]
+            ]
+            across.append(np.abs(up) < ACROSS)
+    known = np.concatenate([np.zeros(0), *across])
+    share = float(known.mean()) if len(known) else 0.0
+    if 1.0 - MOSTLY < share < MOSTLY:
+        raise DoesNotFit(f"{body.name} lies and stands")
+    return share >= MOSTLY
+
+
+def _check_edges(body: FreeBody, name: str, recordings: Sequence[Recording]) -> None:
+    """Raises: DoesNotFit where a body whose corners stand in for its faces comes to the
+    edge of a fixed box, which would be between them."""
+    size = float(
+        (np.linalg.norm(body.spheres[:, :3], axis=1) + body.spheres[:, 3]).max()
+    )
+    for recording in recordings:
+        place = _poses(name, recording)[:, 4:]
+        for each in body.fixed:
+            if each[12] < 0.0:
+                continue
+            R, half = each[:9].reshape(3, 3), each[12:]
+            beyond = np.abs((place - each[9:12]) @ R) - half
+            near = (beyond < size).all(axis=1)
+            # Of a face, what it stands on, the body is farther beyond than of others.
+            sides = np.sort(beyond[near], axis=1)[:, :2]
+            if (sides > -size).any():
+                raise DoesNotFit(f"{name} is near an edge of what it touches")
+
+
+def _poses(name: str, recording: Recording) -> np.ndarray:
+    """(n, 7) quaternion wxyz and place of a body, of rows that have all of it."""
+    channels = [f"{name}.{a}" for a in (*TURN, *_PLACE)]
+    if not all(c in recording for c in channels):
+        return np.zeros((0, 7))
+    pose = np.stack([recording[c] for c in channels], axis=1)
+    return pose[np.isfinite(pose).all(axis=1)]
+
+
 def touched(model: FreeBodyModel) -> np.ndarray:
     """(n, 2) where in x and y the body's spheres touched what is fixed, as measured."""
     body, found = model.body, [np.zeros((0, 2))]
@@ -411,6 +511,25 @@ def touched(model: FreeBodyModel) -> np.ndarray:
                 low = feet[:, 2] - body.spheres[:, 3]
                 found.append(feet[low < low.min() + NEAR, :2])
     return np.concatenate(found)
+
+
+def _curvature(time: np.ndarray, left: np.ndarray) -> float:
+    """How much a parabola in each column takes off the squares of what a flight left,
+    (n, 3) over the noise, NaN where there was no sample. 3 is expected by chance."""
+    found = 0.0
+    for column in left.T:
+        good = np.isfinite(column)
+        t = time[good] - time[good].mean()
+        bend = t**2 - np.polyval(np.polyfit(t, t**2, 1), t)
+        found += float(bend @ column[good]) ** 2 / max(float(bend @ bend), 1e-30)
+    return found
+
+
+def _is_beyond_chance(curvatures: Sequence[float]) -> bool:
+    """Whether so many values of _curvature() are no chance (five deviations of a
+    chi-squared one of three degrees of freedom each)."""
+    n = 3.0 * len(curvatures)
+    return sum(curvatures) > n + SURE * np.sqrt(2.0 * n)
 
 
 def _root(P: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 
 from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.does_not_fit import DoesNotFit
+from makebreak.gap.numerics.struck import struck_rows
 from makebreak.gap.simulation.channel_effects import (
     given_late,
     lag_of,
@@ -32,6 +33,7 @@ from makebreak.systems.numerics.smoother import smooth_filtered
 _POSITIONS = ("x", "y", "z")
 TURN = ("qw", "qx", "qy", "qz")
 _G = 9.81
+BESIDE = 4  # Rows beside an impact that a smoothed state would mix with it.
 MARGIN_SEC = 0.1  # Before the first window of an episode.
 MEASURED_SEC = 0.005  # Between rows a measured effort is given in steps of this.
 LARGEST = 200.0  # An error beyond so many standard deviations counts as this: after a
@@ -237,12 +239,13 @@ class WindowModel(WindowedResidual):
                 ".y",
                 ".z",
             ):
-                rough |= np.abs(s.x[:, 2]) > 2.0 * _G
+                noise = recording.channels[name].noise
+                rough |= struck_rows(time, y, noise, stages, 2.0 * _G, BESIDE)
         self._paths[i, episode.first] = {"time": time, **states}
         if rough.any():  # No start amid an impact, where the smoothed state is a mean.
             at = np.flatnonzero(rough)
             for k in at:
-                rough[max(k - 4, 0) : k + 5] = True
+                rough[max(k - BESIDE, 0) : k + BESIDE + 1] = True
         commands = [recording.held(c.name)[episode.rows] for c in recording.commands()]
         # At an end a smoothed state is less sure than it knows, and what was commanded
         # before is not known.
