@@ -18,6 +18,7 @@ from makebreak.models.effects.kind import (
     find_joints,
     full_name,
 )
+from makebreak.models.effects.objects import MASS
 from makebreak.models.scene import Scene
 
 # The limit of a nuisance, in tolerances: a link that is off by more is wrong, and not
@@ -28,6 +29,7 @@ _DELAYS = (0.004, 0.01, 0.02, 0.04)  # [s] at which a delay's column is taken.
 _STEPS = {"offset": (1e-3,), "bias": (1e-3,), "skew": (1e-4,)}
 _VELOCITY_DELAYS = (0.01,)
 _WAVES = 12  # Frequencies of a force that are tried on links other than the last.
+ALL_OF_IT = 1e-6  # Of equations that masses alone make: so much is rounding.
 LOAD = 0.1  # First trial of a load, of what a link weighs on average.
 _HIDDEN_STATE_JOINTS = 3  # Joints at which a spring or a gap is tried: the worst ones.
 
@@ -68,6 +70,7 @@ def candidates(
         for joint in find_joints(e, dynamics.plant)
     }  # fmt: skip
     screen = Screen(left, nuisances.columns, nuisances.prior, model.train())
+    unit = unit_of_mass(model)
     found: list[Candidate] = []
     for kind, entry in KINDS.items():
         of_things = entry.at in ("free body", "length", "pair", "ground")
@@ -94,6 +97,8 @@ def candidates(
                 continue
             if entry.hidden_state and (at not in worst or at in elastic):
                 continue
+            if at == unit and _is_mass_alone(kind):
+                continue
             columns, readers = [], []
             grids = _grids(model, kind, at, motions)
             if is_wave:
@@ -107,6 +112,8 @@ def candidates(
             if not columns:
                 continue
             if not any(np.abs(x).max(initial=0.0) > 0.0 for x in columns):
+                continue
+            if unit is not None and _is_all_of_it(model, columns[0]):
                 continue
             if is_wave and waves is None:
                 # All frequencies at the last link, and the best of them elsewhere.
@@ -165,8 +172,11 @@ def nuisances(model: InverseModel) -> Nuisances:
     """The links' masses and centres of mass, instants of sampling, gains of drives."""
     dynamics, motions = model.dynamics, model.motions()
     columns, prior, names = [], [], []
+    unit = unit_of_mass(model)
     for kind, tolerance in tolerances(model.scene).items():
         for at in dynamics.links():
+            if at == unit and _is_mass_alone(kind):
+                continue
             groups = [dynamics.signatures(kind, [at], m) for m in motions]
             for same in zip(*groups, strict=True):
                 x = model.columns_of([s.columns for s in same])
@@ -186,6 +196,40 @@ def nuisances(model: InverseModel) -> Nuisances:
     return Nuisances(
         np.stack(columns, axis=1), np.array(prior), tuple(names), NUISANCE_LIMIT
     )
+
+
+def unit_of_mass(model: InverseModel) -> str | None:
+    """The heaviest link, where all masses are known up to a common factor alone:
+    nothing drives the mechanism, and no force acts that does not grow with them.
+    Without masses at all such equations would leave nothing, whatever the motion is;
+    so the masses of the others are found in units of this one. None where something
+    gives their size."""
+    if any(model.commanded) or any(model.by_measured):
+        return None
+    links = model.dynamics.links()
+    whole = np.zeros((len(model.train()), 1))
+    for at, mass in links.items():
+        groups = [model.dynamics.signatures(MASS, [at], m) for m in model.motions()]
+        for same in zip(*groups, strict=True):
+            whole += mass * model.columns_of([s.columns for s in same])
+    return max(links, key=lambda at: links[at]) if _is_all_of_it(model, whole) else None
+
+
+def _is_all_of_it(model: InverseModel, columns: np.ndarray) -> bool:
+    """Whether some multiple of columns (m, k) is what the scene as it came leaves of
+    the equations, whatever the motion is."""
+    of_efforts = [k for k, (what, _) in enumerate(model.names()) if what == "effort"]
+    mine = np.isin(model.channel_of_rows(), of_efforts)
+    base, X = model.base()[mine], columns[mine]
+    size = np.linalg.norm(X, axis=0)
+    X = X[:, size > 0.0] / size[size > 0.0]
+    left = base - X @ np.linalg.lstsq(X, base, rcond=1e-12)[0]
+    return bool(np.linalg.norm(left) < ALL_OF_IT * np.linalg.norm(base))
+
+
+def _is_mass_alone(kind: str) -> bool:
+    entry = KINDS[kind]
+    return entry.weighs and [p.name for p in entry.parameters] == ["mass"]
 
 
 def loads(
