@@ -285,6 +285,39 @@ class MechanismProblem(InverseModel, GapProblem):
             self._nuisances = nuisances(self)
         return self._nuisances
 
+    def replaced(self, effects: Sequence[Effect]) -> np.ndarray | None:
+        """The mass of the heaviest link beside gains of all drives. These multiply all
+        that the motors give, as if every mass were another: with both free, all of it
+        would shrink together, and with it what noise leaves."""
+        if not self._gains_are_free(effects):
+            return None
+        links = self.dynamics.links()
+        mine = f"{MASS} of {max(links, key=lambda at: links[at])}, "
+        return np.array([name.startswith(mine) for name in self.nuisances().names])
+
+    def _gains_are_free(self, effects: Sequence[Effect]) -> bool:
+        driven = {
+            joint
+            for joint, told, given in zip(
+                self.joints, self.commanded, self.by_measured, strict=True
+            )
+            if told or given
+        }
+        gains = {at for e in effects if KINDS[e.kind].path == "gain" for at in e.at}
+        return bool(driven) and driven <= gains
+
+    def widened(self, end: Fitted, k: int) -> tuple[dict[str, float], tuple[str, ...]]:
+        # What the masses are known to, a gain of all drives is known to.
+        std, or_more = super().widened(end, k)
+        effect = end.effects[k]
+        if KINDS[effect.kind].path == "gain" and self._gains_are_free(end.effects):
+            share = tolerances(self.scene)[MASS].size
+            std = {
+                name: float(np.hypot(x, share * effect.parameters[name]))
+                for name, x in std.items()
+            }
+        return std, or_more
+
     def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
         if self._found is None:
             self._found = candidates(self, nuisances, current.left)

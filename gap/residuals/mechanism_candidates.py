@@ -13,12 +13,14 @@ from makebreak.gap.simulation.channel_effects import SENSED
 from makebreak.gap.thresholds import SINGLE_SHARE_OF_GROUP
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
+from makebreak.models.effects.joints import rotor
 from makebreak.models.effects.kind import (
     Effect,
     find_joints,
     full_name,
 )
 from makebreak.models.effects.objects import MASS
+from makebreak.models.effects.signature import added_effort
 from makebreak.models.scene import Scene
 
 # The limit of a nuisance, in tolerances: a link that is off by more is wrong, and not
@@ -387,7 +389,10 @@ def _late_efforts(
 
 def inseparable(effect: Effect, model: InverseModel) -> Effect | None:
     """What no recording of commands and joints can tell from an effect: commands that
-    act late, and all channels that show late. (A measured effort would tell.)"""
+    act late, and all channels that show late (a measured effort would tell); of one
+    driven joint that lifts nothing, a gain and another inertia."""
+    if (alike := _inertia_for_gain(effect, model)) is not None:
+        return alike
     models = sorted({joint.split(".")[0] for joint in model.joints})
     sensed = {
         f"{joint}.{what}"
@@ -406,6 +411,40 @@ def inseparable(effect: Effect, model: InverseModel) -> Effect | None:
     if entry.channel == "delay" and (at == set(models) or at >= sensed):
         return Effect(late_command, models, dict(effect.parameters))
     return None
+
+
+def _inertia_for_gain(effect: Effect, model: InverseModel) -> Effect | None:
+    """What stands for a gain g where a single joint's effort does nothing but
+    accelerate one constant inertia J: J/g - J of more inertia. For more inertia, a
+    gain."""
+    entry = KINDS[effect.kind]
+    is_gain = entry.path == "gain"
+    is_rotor = effect.kind == rotor(model.joints[0], 0.0).kind
+    if len(model.joints) != 1 or not (is_gain or is_rotor or entry.weighs):
+        return None
+    if not (_driven(model, model.joints[0]) or model.by_measured[0]):
+        return None
+    motions = model.needed_motions()
+    vd = np.concatenate([m.vd[:, 0] for m in motions])
+
+    def inertia_of(efforts) -> float | None:
+        need = np.concatenate([each[:, 0] for each in efforts])
+        inertia = float(vd @ need) / float(vd @ vd)
+        rest = np.abs(need - inertia * vd).max()
+        return inertia if rest < ALL_OF_IT * np.abs(need).max() else None
+
+    inertia = inertia_of([m.effort for m in motions])
+    if inertia is None:
+        return None
+    if is_gain:
+        more_of_it = inertia / effect.parameters["gain"] - inertia
+        return rotor(model.joints[0], more_of_it)
+    added = [added_effort(effect, entry, model.dynamics, m) for m in motions]
+    more = inertia_of([each for each in added if each is not None])
+    if more is None or not inertia + more > 0.0:
+        return None
+    (gain,) = (kind for kind, each in KINDS.items() if each.path == "gain")
+    return Effect(gain, list(model.joints), {"gain": inertia / (inertia + more)})
 
 
 def _secant(model: InverseModel, kind: str, at, name: str) -> Candidate | None:
