@@ -14,11 +14,12 @@ SURE = 3.0  # Standard deviations of an acceleration.
 def struck_rows(
     time, samples, noise: float, stages: Sequence[Stage], least: float, beside: int
 ) -> np.ndarray:
-    """(n,) where the second derivative of samples is above `least` and beyond doubt.
+    """(n,) where the second derivative of samples is above `least`.
 
     The density of a smoother that has to follow impacts lets it follow the noise in
-    between as well (0.6 mm at 100 Hz: 30 m/s2). So what lies between impacts is
-    smoothed anew, until it holds no more of them: weak ones show only then.
+    between as well (0.6 mm at 100 Hz: 30 m/s2). Where that is more than `least`, what
+    is beyond doubt is an impact, and what lies between such impacts is smoothed anew:
+    it is quiet then, or holds impacts that only show now.
 
     Args: time (n,) [s]; samples (n,), NaN where there is none; noise: of a sample;
         stages: the samples' filters; least: [unit/s2], above half of which nothing is
@@ -33,13 +34,17 @@ def struck_rows(
         if np.isfinite(y[a:b]).sum() < FEWEST_ROWS:
             continue
         s = smooth_filtered(t[a:b], y[a:b], noise, stages)
-        doubt = SURE * np.sqrt(np.maximum(s.P[:, 2, 2], 0.0))
-        sure = np.maximum(least, 0.5 * least + doubt)
+        std = np.sqrt(np.maximum(s.P[:, 2, 2], 0.0))
+        sure = np.maximum(least, 0.5 * least + SURE * std)
+        usual = float(np.median(std))
         found = np.abs(s.x[:, 2]) > sure
+        if usual > least and found.any():
+            near = np.convolve(found, np.ones(2 * beside + 1), "same") > 0.5
+            edges = np.flatnonzero(np.diff(np.r_[1, near, 1]))
+            left += [
+                (a + i, a + j) for i, j in zip(edges[::2], edges[1::2], strict=True)
+            ]
+        elif b - a == len(t) or SURE * usual > 0.5 * least:
+            found = np.abs(s.x[:, 2]) > least
         struck[a:b] |= found
-        if not found.any() or (sure == least).all():
-            continue
-        near = np.convolve(found, np.ones(2 * beside + 1), "same") > 0.5
-        edges = np.flatnonzero(np.diff(np.r_[1, near, 1]))
-        left += [(a + i, a + j) for i, j in zip(edges[::2], edges[1::2], strict=True)]
     return struck
