@@ -166,7 +166,11 @@ class TouchConfig:
         default_factory=lambda: ContactAnticipatorConfig(
             # The ball's place is known to 1 mm or so: on its slope, 0.4 mm of height.
             filter=ContactFilterConfig(std_along=0.0005, std_drift=0.00025),
-            speed=ApproachSpeedConfig(force_desired=7.5, first=0.015, most=0.03),
+            # Slower than 10 mm/s a landing takes so long that a ball on a slope of half
+            # a degree rolls a centimetre meanwhile.
+            speed=ApproachSpeedConfig(
+                force_desired=7.5, first=0.015, least=0.01, most=0.03
+            ),
         )
     )
     shaper: VelocityShaperConfig = field(
@@ -461,7 +465,7 @@ def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) ->
     impedance = "impedance_controller"
     connect("state_estimator", "x", "push_motion", "reference_blend")
     connect("rolling_task", "phase", ("push_motion", "task_phase"))
-    connect("rolling_task", "downhill", "push_motion")
+    connect("rolling_task", "waits", "push_motion")
     connect("rolling_task", "reference", ("reference_blend", "task_reference"))
     connect("push_motion", "landed", "rolling_task")
     connect("push_motion", "motion", "velocity_shaper")

@@ -140,14 +140,14 @@ def test_a_survey_rests_and_then_goes_to_and_fro_into_the_circle():
         np.testing.assert_array_equal(segment.force_directions, [[0, 0, -1]])
 
 
-def motion_system(from_wrist=(0.0, -1.0), push=None, downhill=(0.0, 0.0)):
+def motion_system(from_wrist=(0.0, -1.0), push=None, waits=1.0):
     path = CirclePath(np.array([0.5, 0.0]), 0.1)
     push = push or PushMotionConfig()
     system = PushMotion(push, path, R_BALL, R_TIP, 5.0, from_wrist)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
 
-    system.GetInputPort("downhill").FixValue(context, downhill)
+    system.GetInputPort("waits").FixValue(context, [waits])
 
     def tick(t, task, p_tip, segment=0.0, stage=0.0, ball=(0.6, 0.0, R_BALL)):
         """Returns the outputs after an update at time t."""
@@ -192,13 +192,11 @@ def test_a_push_begins_where_the_ball_was_met_and_nowhere_else():
     assert (got["landed"], got["active"]) == (0, 0)
 
 
-@pytest.mark.parametrize(
-    "downhill, expected", [((0.0, 0.0), [0, 0, 1, 0]), ((0.06, 0.0), [0, 0, 0, 0])]
-)
-def test_the_third_reposition_goes_to_the_table_unless_the_ball_rolls_away(
-    downhill, expected
+@pytest.mark.parametrize("waits, expected", [(1.0, [0, 0, 1, 0]), (0.0, [0, 0, 0, 0])])
+def test_the_third_reposition_goes_to_the_table_if_the_ball_is_known_to_wait(
+    waits, expected
 ):
-    tick, kinds, t = motion_system(downhill=downhill), [], 0.0
+    tick, kinds, t = motion_system(waits=waits), [], 0.0
     front = np.array([0.6, 0.027, 0.0755])
     for _ in range(4):
         tick(t + 0.02, ROLL, front)

@@ -15,6 +15,7 @@ from makebreak.systems.contact_mpc.numerics.untouched_ball import (
     UntouchedBall,
     downhill,
     slope_and_resistance,
+    waits,
     watched,
 )
 from makebreak.systems.contact_mpc.rolling_task import UPHILL, RollingTask
@@ -73,6 +74,23 @@ def test_nothing_is_said_at_first_and_a_touch_is_no_slope():
     np.testing.assert_array_equal(downhill(rolled(true, RESISTANCE, pushes=2)), 0.0)
     ball = rolled(true, RESISTANCE, kick=0.02)
     np.testing.assert_allclose(slope_and_resistance(ball)[0], true, atol=0.015)
+
+
+def test_a_ball_waits_only_where_that_is_known():
+    assert not waits(UntouchedBall())
+    # It lies still for a second before anything touches it; on a slope it does not.
+    for slope, expected in ((0.0, True), (SLOPE - RESISTANCE, False)):
+        ball = UntouchedBall()
+        for t in DT * np.arange(80):
+            ball = watched(ball, t, [slope * t, 0.0], False, True)
+            assert not (waits(ball) and t < 0.8)  # Four windows of 0.2 s.
+        assert waits(ball) == expected
+    # Then what is known of slope and resistance decides.
+    level, steep = np.zeros(2), np.array([SLOPE, 0.0])
+    assert waits(rolled(level, RESISTANCE)) and not waits(rolled(steep, RESISTANCE))
+    # Felt: the ball would wait; but 0.061 of 0.075 m/s2 is too near to rely on it.
+    assert not waits(rolled(steep, SLOPE + 0.014))
+    assert waits(rolled(steep, 3.0 * SLOPE))
 
 
 def test_a_slope_is_believed_from_the_least_number_of_windows_on():

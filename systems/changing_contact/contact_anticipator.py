@@ -106,6 +106,7 @@ class ApproachSpeedConfig:
     beta: float = 0.002  # Gain beta of eq. 9, used without regression [m/s per N].
     # Largest factor of the approach speed from one trial to the next.
     growth: float = 1.4
+    least: float = 0.001  # Smallest approach speed after a contact was felt [m/s].
     most: float = 0.2  # Largest approach speed [m/s].
     # Whether the first stiffness that is felt is assumed of all contacts that have not
     # been felt.
@@ -149,7 +150,6 @@ class AnticipatorMemory:
         return self  # Every part is immutable, so a Context may share it.
 
 
-LEAST_SPEED = 0.001  # [m/s]
 MAY_BE_ZERO = ("stiffness_most", "reflex_gain", "reflex_force_least")
 
 
@@ -228,6 +228,11 @@ class KalmanContactAnticipator(LeafSystem):
                 continue
             if not 0.0 < value < np.inf:
                 raise ValueError(f"{name} is {value}, expected a positive number")
+        if self._speed.least > self._speed.most:
+            raise ValueError(
+                f"least is {self._speed.least}, expected at most `most`, "
+                f"{self._speed.most}"
+            )
         if self._speed.growth < 1.0:
             raise ValueError(f"growth is {self._speed.growth}, expected 1 or more")
         if not config.period_sec > 0.0:
@@ -485,7 +490,7 @@ class KalmanContactAnticipator(LeafSystem):
             )
         else:
             speed = speed_by_error(before, s.force_desired, impacts[-1, 1], s.beta)
-        return capped(speed, before, s.growth, LEAST_SPEED, s.most)
+        return capped(speed, before, s.growth, s.least, s.most)
 
     def _carried_over(self, belief, k):
         """The belief with the stiffness of contact k assumed of contacts never felt."""
@@ -501,7 +506,7 @@ class KalmanContactAnticipator(LeafSystem):
             mass = self._mass(contact.mean, contact.direction)
             new = impact_speed(wanted, stiffness, mass)
             first = self._first_speed(contact.mean, contact.direction)
-            new = capped(new, first, s.growth, LEAST_SPEED, s.most)
+            new = capped(new, first, s.growth, s.least, s.most)
             belief = belief.changed(i, approach_speed=new)
         return belief
 

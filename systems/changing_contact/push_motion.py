@@ -83,8 +83,8 @@ class PushMotion(LeafSystem):
 
     Inputs:  x (19,) estimated; task_phase (1,) of RollingTask; phase (6,) of the
              velocity shaper; arm (19,) x_desired of the arm's reference, in the world;
-             shaped (19,) the shaper's x_desired, in the frame; downhill (2,) of
-             RollingTask, optional: not zero if the ball rolls away.
+             shaped (19,) the shaper's x_desired, in the frame; waits (1,) of
+             RollingTask, optional: 1 if the ball is known to stay where it is left.
     Outputs: motion (MotionPattern), in the frame; frame (7,) origin, velocity, time;
              active (1,) 1 while the shaper leads the arm; landed (1,) 1 when the
              reposition is over; trial (1,) counts the motions; kind (1,) 0: to the
@@ -92,7 +92,7 @@ class PushMotion(LeafSystem):
 
     The table is touched ahead of the ball, and only where that leads the tip towards
     the wrist's side: else the arm comes between the ball and the camera above. It is
-    not touched as long as the ball would roll away meanwhile.
+    not touched before it is known that the ball stays where it is meanwhile.
 
     Args: path; radii as modelled [m]; acceleration_max [m/s2] of the patterns;
         from_wrist (2,), from the wrist to the tip, seen from above.
@@ -120,7 +120,7 @@ class PushMotion(LeafSystem):
             self.DeclareVectorInputPort(name, size) for name, size in inputs
         ]
         self._shaped = self.DeclareVectorInputPort("shaped", 19)
-        self._downhill = self.DeclareVectorInputPort("downhill", 2)
+        self._waits = self.DeclareVectorInputPort("waits", 1)
         pattern = self.first_pattern()
         due = config.table_first if config.table_every > 0 else sys.maxsize
         none = _Push(pattern, np.zeros(N_FRAME), due=due)
@@ -184,8 +184,8 @@ class PushMotion(LeafSystem):
         if not push.running:
             n = push.repositions + 1
             table = n >= push.due and self._path.heading(p) @ self._from_wrist <= 0.0
-            if self._downhill.HasValue(context):
-                table = table and not np.any(self._downhill.Eval(context))
+            if self._waits.HasValue(context):
+                table = table and self._waits.Eval(context)[0] > 0.5
             frame = frame_under(p, v, t)
             start = self._arm.Eval(context)[:3] - frame[:3]
             push = replace(

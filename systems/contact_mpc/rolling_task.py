@@ -20,6 +20,7 @@ from makebreak.systems.contact_mpc.numerics.rolling_task import (
 from makebreak.systems.contact_mpc.numerics.untouched_ball import (
     UntouchedBall,
     downhill,
+    waits,
     watched,
 )
 from makebreak.systems.numerics.first_calls import first_call
@@ -67,7 +68,8 @@ class RollingTask(LeafSystem):
              3 approach; feel (1,): 1 while the tip pushes a ball that did not coast as
              a ball should, so that the tip has to feel for it; downhill (2,) [m/s2]:
              the slope's acceleration of a ball that does not wait where nobody touches
-             it, zero for one that may.
+             it, zero for one that may; waits (1,): 1 if the ball is known to stay where
+             it is left.
 
     A ball beyond OUT_OF_REACH is treated as one that is not seen. Before the first
     update the phase is WAIT, with the tip at p_tip.
@@ -115,11 +117,13 @@ class RollingTask(LeafSystem):
         self._phase = self.DeclareDiscreteState([float(WAIT)])
         self._feel = self.DeclareDiscreteState([0.0])
         self._slope = self.DeclareDiscreteState([0.0, 0.0])
+        self._waits = self.DeclareDiscreteState([0.0])
         self.DeclareStateOutputPort("x_desired", self._x_desired)
         self.DeclareStateOutputPort("reference", self._reference)
         self.DeclareStateOutputPort("phase", self._phase)
         self.DeclareStateOutputPort("feel", self._feel)
         self.DeclareStateOutputPort("downhill", self._slope)
+        self.DeclareStateOutputPort("waits", self._waits)
         self.DeclarePeriodicUnrestrictedUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
@@ -178,6 +182,7 @@ class RollingTask(LeafSystem):
         state.get_mutable_abstract_state(int(self._ball)).set_value(ball)
         discrete = state.get_mutable_discrete_state()
         discrete.set_value(int(self._slope), slope)
+        discrete.set_value(int(self._waits), [float(waits(ball))])
         state.get_mutable_abstract_state(int(self._task)).set_value(task)
         discrete.set_value(int(self._x_desired), goal.ravel())
         discrete.set_value(
