@@ -33,6 +33,7 @@ from makebreak.diagrams.tabletop import (
 from makebreak.diagrams.wiring import refuse_changed, refuse_unused
 from makebreak.models.friction_zones import FrictionZone
 from makebreak.models.scene import Scene, read_scene
+from makebreak.systems.arm.surface_alignment import SurfaceAlignmentConfig
 from makebreak.systems.changing_contact.numerics.contact_task import (
     ContactBelief,
     ExpectedContact,
@@ -80,8 +81,13 @@ SPHERE_CROSSING = 0.01
 
 def _control() -> ChangingContactConfig:
     """The defaults, but for a first touch that is no blow: at 50 mm/s the tool bounces,
-    and is in the air while the motion along the surface begins."""
-    config = ChangingContactConfig(forward_model=friction_from_rest())
+    and is in the air while the motion along the surface begins. A block is laid flat on
+    a table that is not quite level: on one row of feet it would cross a seam in one
+    step, up to a tool's length early or late."""
+    config = ChangingContactConfig(
+        forward_model=friction_from_rest(),
+        align=SurfaceAlignmentConfig(angle_max_deg=1.5),
+    )
     speed = replace(config.anticipator.speed, first=TOUCH_SPEED)
     return replace(config, anticipator=replace(config.anticipator, speed=speed))
 
@@ -156,6 +162,9 @@ def make_task(
             why = "the pattern of your own has it"
             refuse_unused(config, ChangingSurfaceConfig(), name, why)
     refuse_unused_control(config, ChangingSurfaceConfig())
+    if config.tool == "sphere":
+        why = "a sphere has no face"
+        refuse_unused(config, ChangingSurfaceConfig(), "control.align", why)
     rng = np.random.default_rng([config.seed, 7])
     model = read_model(config.model, THREE_SURFACES, config.tool)
     world = read_scene(THREE_SURFACES)
@@ -238,8 +247,9 @@ def make_changing_surface(
     if not task.feet:
         refuse_changed("control.modes", modes, ("crossing",))
     crossing = modes.crossing if task.feet else SPHERE_CROSSING
+    align = config.control.align if task.feet else SurfaceAlignmentConfig()
     return make_changing_contact(
-        replace(config.control, modes=replace(modes, crossing=crossing)),
+        replace(config.control, modes=replace(modes, crossing=crossing), align=align),
         task.world,
         task.model,
         task.pattern,

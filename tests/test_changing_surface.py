@@ -162,6 +162,17 @@ def test_wrong_settings_are_refused_by_name(changes, message):
         make_task(ChangingSurfaceConfig(**changes))
 
 
+@pytest.mark.parametrize("tool, laid", [("block", True), ("sphere", False)])
+def test_what_has_a_face_is_laid_flat(tool, laid):
+    config = ChangingSurfaceConfig(tool=tool)
+    diagram = make_changing_surface(config, make_task(config))
+    assert diagram.HasSubsystemNamed("surface_alignment") == laid
+    config.control.align.angle_max_deg = 1.0
+    if not laid:
+        with pytest.raises(ValueError, match="align.angle_max_deg is 1.0, .* no face"):
+            make_task(config)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("tool", ["block", "sphere"])
 def test_the_first_three_changes_are_recognised(tool):
