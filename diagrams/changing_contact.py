@@ -32,6 +32,7 @@ from makebreak.diagrams.realism import StationErrors
 from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.station import (
     ARM,
+    DELAY,
     TIP_FRAME,
     SensorNoise,
     StationConfig,
@@ -372,6 +373,8 @@ def _connect_systems(builder: DiagramBuilder, station, s: _Systems, config) -> N
     connect = partial(_connect, builder)
     for q, measured in (("q", "position"), ("v", "velocity")):
         connect(station, f"{ARM}.{measured}_measured", s.tip, s.impedance, port=q)
+    if station.HasOutputPort(DELAY):
+        connect(station, DELAY, s.impedance, port="delay")
     watching = (s.detector, s.modes, s.forward, s.variable)
     connect(station, WRENCH, s.tare, port="wrench")
     connect(s.tare, "wrench", s.detector, s.modes, s.variable)

@@ -26,6 +26,7 @@ from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
 from makebreak.diagrams import wiring
 from makebreak.diagrams.camera import camera_model
+from makebreak.diagrams.fault_kinds import read_faults
 from makebreak.diagrams.push_object_config import (
     ARM_TICK,
     CONTROL,
@@ -57,9 +58,11 @@ from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.station import (
     ARM,
+    DELAY,
     TIP_FRAME,
     TOOL,
     StationConfig,
+    StationFaults,
     from_wrist,
     make_control_plant,
     make_station,
@@ -166,6 +169,8 @@ def make_push_object(
         _add_touch_down(builder, config, model, planning, estimator, reference)
     wiring.connect(builder, station, f"{ARM}.position_measured", impedance, "q")
     wiring.connect(builder, station, f"{ARM}.velocity_measured", impedance, "v")
+    if station.HasOutputPort(DELAY):
+        wiring.connect(builder, station, DELAY, impedance, "delay")
     connect_command(builder, reference, impedance)
     tau = impedance.GetOutputPort("tau")
     builder.Connect(tau, station.GetInputPort(f"{ARM}.torque_commanded"))
@@ -243,6 +248,9 @@ def _make_model(config: PushObjectConfig) -> _Model:
 
 
 def _add_station(builder: DiagramBuilder, config: PushObjectConfig, meshcat) -> Diagram:
+    faults = None
+    if config.faults:
+        faults = StationFaults(read_faults(config.faults, ()))
     return builder.AddNamedSystem(
         "station",
         make_station(
@@ -255,6 +263,7 @@ def _add_station(builder: DiagramBuilder, config: PushObjectConfig, meshcat) -> 
             meshcat,
             world_scene(config),
             draw_errors(config.realism, config.seed),
+            wrong=faults,
         ),
     )
 

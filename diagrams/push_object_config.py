@@ -185,6 +185,9 @@ class PushObjectConfig:
     impedance: ImpedanceConfig = field(
         default_factory=lambda: ImpedanceConfig(force_max=20.0)
     )
+    # Faults of sensors, motors and arm to inject, each NAME[:from=S,for=S] as of
+    # --fault.
+    faults: list[str] = field(default_factory=list)
 
 
 def rolling_axis(spec: PushedObject) -> list[float]:

@@ -22,6 +22,8 @@ from makebreak.diagrams.changing_contact import Knowledge
 from makebreak.diagrams.contact_learning import ContactLearningConfig, make_task
 from makebreak.diagrams.fault_kinds import FAULTS, FROM, read_fault, read_faults
 from makebreak.diagrams.faults import GLARE_SHARE
+from makebreak.diagrams.push_object import make_push_object
+from makebreak.diagrams.push_object_config import PushObjectConfig
 from makebreak.diagrams.station import (
     BALL_ROLLING,
     MONITOR,
@@ -526,6 +528,20 @@ def test_a_run_says_whether_its_limits_were_kept(tmp_path):
     assert said["limits_kept"] and said["ticks_not_finite"] == 0
     assert 0.1 < said["torque_share_max"] < 1.0  # It carries the arm.
     assert said["joint_range_excess_rad"] < 0.0
+
+
+def test_push_object_has_the_faults_of_its_arm():
+    diagram = make_push_object(
+        PushObjectConfig(faults=["compute_delay:from=0,sec=0.01"])
+    )
+    simulator = Simulator(diagram)
+    simulator.AdvanceTo(0.03)
+    impedance = diagram.GetSubsystemByName("impedance_controller")
+    context = impedance.GetMyContextFromRoot(simulator.get_context())
+    assert impedance.GetInputPort("delay").Eval(context)[0] == pytest.approx(0.01)
+    assert diagram.GetSubsystemByName("station").HasOutputPort(MONITOR)
+    with pytest.raises(ValueError, match="glare: there is no camera here"):
+        make_push_object(PushObjectConfig(faults=["glare"]))
 
 
 def test_beside_a_run_that_does_not_roll_nothing_is_recovered():
