@@ -303,6 +303,11 @@ class GapProblem(ABC):
         may be off by could stand for it: among others it must then show by itself."""
         return False
 
+    def softer(self) -> list[tuple[Effect, tuple[str, ...]]]:
+        """Stiffnesses of contacts that press, as the scene has them, each with kinds of
+        effects that stand for it in the equations; simulated windows are asked."""
+        return []
+
     def hint(self, end: Fitted) -> str:
         """Where to look for what no effect explains, as sentences; "": not known."""
         return ""

@@ -50,6 +50,7 @@ from makebreak.gap.search.select import select, without
 from makebreak.gap.search.trust import scatter, trust_in
 from makebreak.gap.simulation.measure import WINDOW_SEC
 from makebreak.gap.simulation.windows import WindowModel, with_step
+from makebreak.gap.softer_by_simulation import softer_by_simulation
 from makebreak.gap.thresholds import (
     AGREEMENT_RMS_MAX,
     CLOSED_SHARE_MIN,
@@ -241,6 +242,7 @@ def conclude(
         selection = replace(selection, choices=(), end=selection.start)
     selection, chosen_on = kept_by_simulation(problem, selection, jobs)
     selection, chosen_on = preferred_by_simulation(problem, selection, chosen_on, jobs)
+    selection, chosen_on = softer_by_simulation(problem, selection, chosen_on, jobs)
     scattered = scatter(problem, selection.end)
     choices = [
         _with_inseparable(_widened(c, problem, selection.end, scattered), problem)

@@ -1,5 +1,6 @@
 """A robot that presses on what is fixed: a gantry with a ball for a tool, by an ODE."""
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -16,7 +17,12 @@ from makebreak.gap.search.choice import Choice
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.rivals import still_tied
 from makebreak.gap.search.select import select
-from makebreak.gap.workflow import judged_channels, problem_for, unjudged_channels
+from makebreak.gap.workflow import (
+    conclude,
+    judged_channels,
+    problem_for,
+    unjudged_channels,
+)
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
@@ -58,7 +64,7 @@ MIDDLE = ((0.0, 0.0, 0.0),)
 CORNERS = tuple(product((-RADIUS, RADIUS), repeat=3))
 
 
-def write_scene(folder, wall_size=(0.1, 1.0, 0.2), tool=BALL):
+def write_scene(folder, wall_size=(0.1, 1.0, 0.2), tool=BALL, stiffness="4e4"):
     light = LINK.format(name="{}", mass=1e-6, shape="")
     ball = SHAPE.format(at="0 0 0 0 0 0", what=tool, mu=1.0)
     body = '<link name="base"/>' + light.replace("{}", "a") + light.replace("{}", "b")
@@ -81,6 +87,8 @@ def write_scene(folder, wall_size=(0.1, 1.0, 0.2), tool=BALL):
         )
         link = f'<link name="{name}">{shape}</link>'
         (folder / f"{name}.sdf").write_text(MODEL.format(name=name, body=link))
+    for file in folder.glob("*.sdf"):
+        file.write_text(file.read_text().replace(">4e4\n", f">{stiffness}\n"))
     (folder / "scene.yaml").write_text(SCENE)
     return read_scene(folder / "scene.yaml")
 
@@ -498,6 +506,46 @@ def test_where_only_efforts_were_measured_simulation_confirms_a_place(tmp_path):
         outcome = problem.outcome(there, *unused, held)
         assert outcome.gap.before > 5.0
         assert outcome.gap.after < 2.0
+
+
+@pytest.mark.slow
+def test_a_soft_contact_that_equations_take_for_a_place_is_told_by_simulation(tmp_path):
+    """With one force all the time 0.4 mm lower and 2e4 N/m are one thing in them."""
+    scene = write_scene(tmp_path, stiffness="2e6")
+    recordings = record(tmp_path, wrench=False, n=2, effort="effort_measured")
+    problem = PressingProblem(scene, recordings)
+    found = select(problem)
+    place = Effect("plane_height", [TABLE, WALL], {"height": -4e-4})
+    screen = found.screen(problem)
+    fit = fit_effects(problem, screen, [place])
+    assert problem.noise_error(fit.left) < 1.5
+    chosen = Choice(fit.effects[0], fit.std[0], 1.0, 1.0, "", np.inf, (), (), 1)
+    as_place = replace(found, choices=(chosen,), end=fit)
+    result = conclude(problem, as_place, recordings)
+    assert result.gap.after < 0.1 * result.gap.before
+    found = {(e.kind, e.at[0]): e.parameters for e in result.effects}
+    assert ("plane_height", TABLE) not in found
+    # In a row with the tool's 2e6 N/m.
+    stiffness = found["contact_stiffness", f"{TABLE}~gantry.tool"]["stiffness"].value
+    assert stiffness == pytest.approx(2e4 / 0.99, rel=0.1)
+
+
+def test_how_hard_a_tool_presses_is_asked_of_the_model_that_is_tried(displaced):
+    """It was asked of the scene: with a friction that is wrong by 0.12 the pressing
+    force was wrong by (1 + 0.42 0.3)/(1 + 0.3^2) = 1.033, and so were stiffnesses."""
+    (table,) = [k for k, name in displaced.shapes.names.items() if name == TABLE]
+    (pair,) = [pair for pair in displaced._met if table in pair]
+    on = displaced._met[pair]
+    friction = [
+        Effect("contact_friction", [f"{body}~gantry.tool"], {"friction": mu})
+        for body, mu in ((TABLE, 0.42), (WALL, 0.35))
+    ]
+    of_scene = displaced._pressed_with(())[pair][on]
+    of_model = displaced._pressed_with(friction)[pair][on]
+    assert np.median(of_model) == pytest.approx(8.0, rel=0.01)
+    assert np.median(of_scene) > 8.1
+    displaced.left(friction)
+    np.testing.assert_array_equal(displaced._pressed_now[pair][on], of_model)
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.permitted_forces import explain
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate, Fitted, Nuisances
-from makebreak.gap.residuals.contact_dynamics import THIN
+from makebreak.gap.residuals.contact_dynamics import SHAPED, THIN
 from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.impacts import MOST_SHARE, nearest, positions, walls_of
 from makebreak.gap.residuals.lying_on_faces import pressed_with_corners
@@ -32,6 +32,7 @@ from makebreak.gap.residuals.wrench_sensor import FORCE
 from makebreak.gap.simulation.contact_shapes import Slot
 from makebreak.gap.simulation.face_supports import LiesOn
 from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.contact import STIFFNESS
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
 
@@ -147,6 +148,9 @@ class PressingProblem(ContactProblem):
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
         self._any_friction = False
         self._mu: float | None = None
+        # How often rows were weighed; what last pressed, and for which effects.
+        self._weighed = 0
+        self._pressed_at: tuple[tuple | None, dict] = (None, {})
         super().__init__(scene, recordings)
 
     # ----- What may touch
@@ -629,12 +633,15 @@ class PressingProblem(ContactProblem):
         )  # fmt: skip
         return np.mean(left**2, axis=1)
 
-    def _pressing(self):
+    def _pressing(self, effects: Sequence[Effect] = ()):
         """Where bodies may really be: {pair: (K,) the sum of its normal forces over how
-        many points share it}, {pair: (K,) when it presses}."""
+        many points share it}, {pair: (K,) when it presses}. effects: those of the model
+        but places and stiffnesses: with a friction that is wrong, or a load that is
+        lacking, other forces press."""
         there = self._displacing(self.off)
-        needs = self._all_needs(())
-        G, can, of, geometry, sharing = self._generators(there)
+        needs = self._all_needs(effects)
+        shaped = [e for e in effects if e.kind in SHAPED]
+        G, can, of, geometry, sharing = self._generators([*shaped, *there])
         slots = geometry.slots
         weights = np.zeros(can.shape)
         explain(
@@ -676,6 +683,7 @@ class PressingProblem(ContactProblem):
             super().allow(allowance)
         finally:
             self._any_friction = kept
+        self._weighed += 1
         if hasattr(self, "_met"):  # Else not all is prepared.
             self._pressed, _ = self._pressing()
 
@@ -718,11 +726,22 @@ class PressingProblem(ContactProblem):
         shift: Shift | None = None,
         weighed_as: Sequence[Effect] | None = None,
     ):
-        self._softened = [e for e in effects if e.kind == "contact_stiffness"]
+        self._softened = [e for e in effects if e.kind == STIFFNESS]
+        self._pressed_now = self._pressed_with(effects)
         self._placed = [e for e in effects if e.kind in MOVES]
         if self._any_friction:
             self._placed += self._displacing(self.off)
         return super().left(effects, shift, weighed_as)
+
+    def _pressed_with(self, effects: Sequence[Effect]) -> dict:
+        """{pair: (K,)} as _pressing() has it; the last one is kept."""
+        others = [e for e in effects if e.kind not in (*MOVES, STIFFNESS)]
+        if self._any_friction or not others or not hasattr(self, "_met"):
+            return self._pressed
+        key = tuple((e.kind, *e.at, *sorted(e.parameters.items())) for e in others)
+        if self._pressed_at[0] != (key, self._weighed):
+            self._pressed_at = (key, self._weighed), self._pressing(others)[0]
+        return self._pressed_at[1]
 
     def _distances(self, geometry: Geometry) -> np.ndarray:
         """(K, pairs) over what shapes are known to: of each pair, when it is felt."""
@@ -738,7 +757,8 @@ class PressingProblem(ContactProblem):
                 columns.append(np.zeros(K))
                 continue
             nearest = np.min([s.phi for s in mine], axis=0)
-            stiffness, pressed = mine[0].stiffness, self._pressed.get(pair, np.zeros(K))
+            stiffness = mine[0].stiffness
+            pressed = self._pressed_now.get(pair, np.zeros(K))
             for e in self._softened:
                 if self._at_pair(e, pair):
                     stiffness = e.parameters["stiffness"]
@@ -897,6 +917,17 @@ class PressingProblem(ContactProblem):
                 for a, step in ((a, by[a] or SMALL_SHIFT) for a in names)
             ]
             yield "wall_position", at, len(names), names, (), [trial]
+
+    def softer(self) -> list[tuple[Effect, tuple[str, ...]]]:
+        found: list[tuple[Effect, tuple[str, ...]]] = []
+        for pair in self._met:
+            at = self.pair_name(pair)
+            try:
+                now = self.dynamics.now(STIFFNESS, [at])
+            except ValueError:
+                continue
+            found.append((Effect(STIFFNESS, [at], now), MOVES))
+        return found
 
     def _touched_axes(self) -> dict[int, dict[str, float]]:
         """{fixed body: {axis along which it is felt: how far it is off there [m]}}."""
