@@ -530,6 +530,21 @@ def test_a_soft_contact_that_equations_take_for_a_place_is_told_by_simulation(tm
     assert stiffness == pytest.approx(2e4 / 0.99, rel=0.1)
 
 
+def test_no_place_has_a_body_where_the_tool_has_passed_freely(displaced):
+    """It comes down at x = 0.1 and goes to the wall at 0.325: with its face at 0.11 or
+    0.285 the wall would have been in its way. Rows of distances are of moments at which
+    it presses on the wall. Farther along y the wall is in no one's way."""
+    at_its_place = {"x": 0.025, "y": 0.0, "z": -0.012}
+    for more, is_possible in (({}, True), ({"y": 0.3}, True), ({"x": -0.19}, False),
+                              ({"x": -0.015}, False)):  # fmt: skip
+        place = [Effect("wall_position", [WALL], at_its_place | more)]
+        if is_possible:
+            displaced.left(place)
+        else:
+            with pytest.raises(ValueError, match="the tool was where wall.wall would"):
+                displaced.left(place)
+
+
 def test_how_hard_a_tool_presses_is_asked_of_the_model_that_is_tried(displaced):
     """It was asked of the scene: with a friction that is wrong by 0.12 the pressing
     force was wrong by (1 + 0.42 0.3)/(1 + 0.3^2) = 1.033, and so were stiffnesses."""

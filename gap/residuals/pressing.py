@@ -151,6 +151,7 @@ class PressingProblem(ContactProblem):
         # How often rows were weighed; what last pressed, and for which effects.
         self._weighed = 0
         self._pressed_at: tuple[tuple | None, dict] = (None, {})
+        self._not_passed: tuple = ()  # Places with which the tool went through nothing.
         super().__init__(scene, recordings)
 
     # ----- What may touch
@@ -540,11 +541,9 @@ class PressingProblem(ContactProblem):
     def _deep_nodes(self, off: dict[int, dict[str, float]]) -> dict[int, int]:
         """{fixed body: at how many nodes the tool is deeper in it than any contact
         lets it in}, with bodies displaced."""
-        deep: dict[int, np.ndarray] = {}
-        for s in self._slots(self._displacing(off))[0]:
-            for k in {s.a, s.b} & self.shapes.anchored:
-                deep[k] = deep.get(k, np.zeros(len(s.phi), bool)) | (s.phi < -PASSED)
-        return {k: int(on.sum()) for k, on in deep.items() if on.any()}
+        inside = self._inside(self._displacing(off))
+        deep = {k: int((d < -PASSED).sum()) for k, d in inside.items()}
+        return {k: n for k, n in deep.items() if n}
 
     def _is_of(self, face: _Face, off: dict[int, dict[str, float]]) -> bool:
         """Whether a face was found at the height that its body has with others off."""
@@ -729,9 +728,36 @@ class PressingProblem(ContactProblem):
         self._softened = [e for e in effects if e.kind == STIFFNESS]
         self._pressed_now = self._pressed_with(effects)
         self._placed = [e for e in effects if e.kind in MOVES]
+        self._refuse_passing(self._placed)
         if self._any_friction:
             self._placed += self._displacing(self.off)
         return super().left(effects, shift, weighed_as)
+
+    def _refuse_passing(self, placed: Sequence[Effect]) -> None:
+        """Raises: ValueError where a place has the tool deeper in a body than a knock
+        goes, at moments at which it is not in the scene: no row would tell, since
+        distances are those of moments at which the tool presses."""
+        key = tuple((*e.at, *sorted(e.parameters.items())) for e in placed)
+        if not placed or key == self._not_passed:
+            return
+        inside = self._inside(placed)
+        before = self._inside(())
+        for body, depth in inside.items():
+            more = (depth < -KNOCKED) & ~(before.get(body, depth + 1.0) < -KNOCKED)
+            if more.sum() >= FEWEST_ROWS:
+                name = self.shapes.names[body]
+                raise ValueError(
+                    f"{placed[0].kind}: the tool was where {name} would be"
+                )
+        self._not_passed = key
+
+    def _inside(self, placed: Sequence[Effect]) -> dict[int, np.ndarray]:
+        """{fixed body: (n_nodes,) distance of the tool from it}, where it is near."""
+        found: dict[int, np.ndarray] = {}
+        for s in self._slots(placed)[0]:
+            for k in {s.a, s.b} & self.shapes.anchored:
+                found[k] = np.minimum(found.get(k, s.phi), s.phi)
+        return found
 
     def _pressed_with(self, effects: Sequence[Effect]) -> dict:
         """{pair: (K,)} as _pressing() has it; the last one is kept."""
