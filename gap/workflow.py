@@ -47,10 +47,10 @@ from makebreak.gap.residuals.sap_lift import sap_lift
 from makebreak.gap.result import GapMeasure, GapResult, JudgedChannel
 from makebreak.gap.search.choice import Choice, Selection
 from makebreak.gap.search.select import select, without
+from makebreak.gap.search.softer_by_simulation import softer_by_simulation
 from makebreak.gap.search.trust import scatter, trust_in
 from makebreak.gap.simulation.measure import WINDOW_SEC
 from makebreak.gap.simulation.windows import WindowModel, with_step
-from makebreak.gap.softer_by_simulation import softer_by_simulation
 from makebreak.gap.thresholds import (
     AGREEMENT_RMS_MAX,
     CLOSED_SHARE_MIN,
