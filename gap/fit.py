@@ -1,6 +1,6 @@
 """Effects fitted together, exactly and not by their columns."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.optimize import differential_evolution, least_squares, minimize
@@ -8,9 +8,12 @@ from scipy.optimize import differential_evolution, least_squares, minimize
 from makebreak.gap.numerics.selection import Screen, spread_by_blocks
 from makebreak.gap.problem import Fitted, GapProblem
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.kind import Effect, check_parameters
+from makebreak.models.effects.kind import Effect, Parameter, check_parameters
 
 AT_BOUND = 1e-9  # A parameter that may not be negative is zero.
+# Of the largest slope: a parameter with less may not show at all, if all rows together
+# do not change by this share of the noise without it.
+HARDLY, UNSEEN = 1e-3, 1e-3
 SHORT = 8  # Evaluations: a fit of no more is not asked to converge.
 # Of a parameter's size: first steps of a search without slopes, and how far around one
 # looks where that ended.
@@ -66,10 +69,13 @@ def fit_effects(
     if solved is not None:  # What does not show is not told: it stays neutral.
         shows = np.linalg.norm(solved.jac, axis=0)
         for k, (i, name) in enumerate(free.names):
-            neutral = KINDS[start[i].kind].parameter(name).neutral
-            if shows[k] <= 1e-6 * shows.max() and neutral is not None:
-                z = np.array(z)
-                z[k] = neutral / scale[k]
+            if shows[k] > HARDLY * shows.max():
+                continue
+            there = np.array(z)
+            there[k] = _untold(KINDS[start[i].kind].parameter(name), x0[k]) / scale[k]
+            # Slopes are differences over short steps, and have noise of their own.
+            if shows[k] <= 1e-6 * shows.max() or _is_same(residual, z, there):
+                z = there
     try:
         r = residual(z)
     except (ValueError, RuntimeError):  # Back to where it came from, which may raise.
@@ -100,6 +106,23 @@ def fit_effects(
         J, np.array(solved.fun) if solved is not None else np.zeros(0),
         tuple(free.names),
     )  # fmt: skip
+
+
+def _untold(parameter: Parameter, start: float) -> float:
+    """What a parameter is taken to be of which the data tell nothing: neutral; a
+    coordinate zero (of a load across a planar arm's plane); else as it came."""
+    if parameter.neutral is not None:
+        return parameter.neutral
+    return 0.0 if parameter.low < 0.0 < parameter.high else start
+
+
+def _is_same(residual: Callable, z: np.ndarray, there: np.ndarray) -> bool:
+    """Whether two sets of parameters leave the same, as far as noise is concerned."""
+    try:
+        off = residual(z) - residual(there)
+    except (ValueError, RuntimeError):
+        return False
+    return bool(np.sqrt(np.mean(off**2)) < UNSEEN)
 
 
 def tangents(

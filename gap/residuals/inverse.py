@@ -15,7 +15,13 @@ import numpy as np
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.residuals.track import Track
 from makebreak.gap.residuals.whitened_rows import WhitenedRows
-from makebreak.gap.simulation.channel_effects import PATH, SENSED, lag_of, sensing
+from makebreak.gap.simulation.channel_effects import (
+    PATH,
+    SENSED,
+    lag_of,
+    path_of,
+    sensing,
+)
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
@@ -26,6 +32,7 @@ from makebreak.systems.numerics.filters import LowPass, filtered, with_lag
 
 # Loops of drives run at a kilohertz or more: what they hold is late by half a period.
 LOOP_SEC = 2.5e-4
+LEAST_GAIN = 0.05  # That equations are divided by.
 MOST_MOTIONS, MOST_MEANS, MOST_DYNAMICS = 40, 1500, 8  # That are kept in memory.
 
 
@@ -80,6 +87,9 @@ class InverseModel(WhitenedRows):
             dynamics = self._with(heavy)
             ours = [e for e in ours if e not in heavy]
         on_top = [e for e in ours if KINDS[e.kind].on_top is not None]
+        # In units of what is commanded or measured: a small gain would make all that is
+        # left small, whatever it is.
+        gains = [max(path_of(effects, joint).gain, LEAST_GAIN) for joint in self.joints]
         parts = []
         for k, (track, white) in enumerate(
             zip(self.tracks, self._whiteners, strict=True)
@@ -88,6 +98,7 @@ class InverseModel(WhitenedRows):
                 r, motion = self._unmet(k, dynamics, effects, ours, moving)
             else:
                 r, motion = self._unmet_sum(k, dynamics, effects, heavy, ours, moving)
+            r = r / gains
             others = self._other_rows(k, effects, motion)
             parts.append(self._stacked(track, white, r, others))
         return np.concatenate(parts)

@@ -25,6 +25,7 @@ from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.gap.residuals.mechanism_candidates import (
     candidates,
     inseparable,
+    is_mass_of,
     nuisances,
     rich_columns,
     tolerances,
@@ -291,11 +292,15 @@ class MechanismProblem(InverseModel, GapProblem):
         would shrink together, and with it what noise leaves."""
         if not self._gains_are_free(effects):
             return None
-        links = self.dynamics.links()
-        mine = f"{MASS} of {max(links, key=lambda at: links[at])}, "
+        mine = f"{MASS} of {self._unit()}, "
         return np.array([name.startswith(mine) for name in self.nuisances().names])
 
-    def _gains_are_free(self, effects: Sequence[Effect]) -> bool:
+    def _unit(self) -> str:
+        """The heaviest link, in whose mass the others' are where gains are free."""
+        links = self.dynamics.links()
+        return max(links, key=lambda at: links[at])
+
+    def _gains_are_free(self, effects: Sequence[Effect] | Sequence[Candidate]) -> bool:
         driven = {
             joint
             for joint, told, given in zip(
@@ -321,6 +326,11 @@ class MechanismProblem(InverseModel, GapProblem):
     def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
         if self._found is None:
             self._found = candidates(self, nuisances, current.left)
+        if self._gains_are_free(current.effects):
+            unit = self._unit()
+            return [c for c in self._found if not is_mass_of(c, unit)]
+        if any(is_mass_of(c, self._unit()) for c in current.effects):
+            return [c for c in self._found if not self._gains_are_free(c.members)]
         return self._found
 
     def error(self, fitted: Fitted) -> float:

@@ -229,6 +229,11 @@ def _is_all_of_it(model: InverseModel, columns: np.ndarray) -> bool:
     return bool(np.linalg.norm(left) < ALL_OF_IT * np.linalg.norm(base))
 
 
+def is_mass_of(thing: Candidate | Effect, link: str) -> bool:
+    """Whether it is the mass of this link."""
+    return _is_mass_alone(thing.kind) and list(thing.at) == [link]
+
+
 def _is_mass_alone(kind: str) -> bool:
     entry = KINDS[kind]
     return entry.weighs and [p.name for p in entry.parameters] == ["mass"]
