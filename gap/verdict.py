@@ -28,6 +28,11 @@ from makebreak.models.effects.kind import (
 OF_CHANNEL = "(unit of the channel)"
 
 
+def figure(x: float, digits: int = 3) -> str:
+    """So many digits of x, in full: 3700 and not 3.7e+03."""
+    return f"{float(f'{x:.{digits}g}'):g}"
+
+
 def verdict_of(
     choices: Sequence[Choice], start: float, end: float, far: bool = False
 ) -> str:
@@ -72,8 +77,8 @@ def why_not_confirmed(verdict: str, gap: GapMeasure) -> str:
         return ""
     return (
         " The data used for the decision show no error beyond noise, but on the data "
-        f"held out for the report the simulation error is {gap.before:.2g} times the "
-        "noise."
+        f"held out for the report the simulation error is {figure(gap.before, 2)} "
+        "times the noise."
     )
 
 
@@ -104,8 +109,8 @@ def two_figures(start: float, end: float, gap: GapMeasure) -> str:
     if gap.before <= AGREEMENT_RMS_MAX:
         return (
             " Simulated windows do not show this gap; in the equations of motion the "
-            + (f"error falls from {start:.3g} to {end:.3g} times the noise."
-               if end < start else f"error is {start:.3g} times the noise.")
+            + (f"error falls from {figure(start)} to {figure(end)} times the noise."
+               if end < start else f"error is {figure(start)} times the noise.")
         )  # fmt: skip
 
     equations, simulated = (
@@ -174,17 +179,17 @@ def says(
     more: str = "",
 ) -> str:
     """The first screen's sentence. more: what is to be added to it."""
-    before, after = f"{gap.before:.3g}", f"{gap.after:.3g}"
+    before, after = figure(gap.before), figure(gap.after)
     if verdict == "no_gap":
         return (
             "The scene and the recordings agree to within noise and tolerance "
-            f"(held-out error {gap.before:.2g} times the noise).{more}"
+            f"(held-out error {figure(gap.before, 2)} times the noise).{more}"
         )
     if verdict == "not_judged":
         return (
             "The channels that were compared agree (held-out error "
-            f"{gap.before:.2g} times the noise), but not every measured channel was "
-            f"compared, so the scene is not confirmed.{more} "
+            f"{figure(gap.before, 2)} times the noise), but not every measured channel "
+            f"was compared, so the scene is not confirmed.{more} "
             "To leave a channel out, write `columns: {name: null}` in the recording's "
             "sidecar."
         )

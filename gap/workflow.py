@@ -61,6 +61,7 @@ from makebreak.gap.thresholds import (
 )
 from makebreak.gap.verdict import (
     after_simulation,
+    figure,
     named,
     says,
     two_figures,
@@ -252,9 +253,10 @@ def conclude(
     start, end = problem.error(selection.start), problem.error(selection.end)
     verdict = verdict_of(choices, start, end, selection.far)
     near, differs = "", ""
-    if verdict == "no_gap" and problem.plan.simulation_agrees:
+    if verdict == "no_gap":
         if chosen_on is None:
-            verdict, differs = "not_judged", " No window could be simulated."
+            if problem.plan.simulation_agrees:
+                verdict, differs = "not_judged", " No window could be simulated."
         elif chosen_on.gap.before > UNEXPLAINED_RMS:
             verdict = "gap_unnamed"
             differs = " The equations of motion agree, simulated windows do not."
@@ -262,7 +264,7 @@ def conclude(
     if verdict == "no_gap" and size > max(problem.plan.loud, UNEXPLAINED_RMS):
         # Among many others one that is off would not show.
         verdict = "gap_unnamed"
-        differs = f" {name} is off by {size:.2g} times its noise."
+        differs = f" {name} is off by {figure(size, 2)} times its noise."
     if chosen_on is not None:
         verdict = after_simulation(verdict, choices, chosen_on.gap, selection.far)
         every = selection
@@ -296,16 +298,14 @@ def conclude(
     else:
         final, data = Outcome(_nothing(start, end)), "fitted"
     final = replace(final, gap=replace(final.gap, data=data))
-    if problem.plan.simulation_agrees and (
-        why := why_not_confirmed(verdict, final.gap)
-    ):
+    if why := why_not_confirmed(verdict, final.gap):
         verdict, differs = "gap_unnamed", why
     if verdict in ("gap_named", "ambiguous") and not _is_confirmed(final.gap):
         verdict = "gap_unnamed"
         near += (
             " On the data held out for the report the effects take the simulated "
-            f"error from {final.gap.before:.3g} to {final.gap.after:.3g}: simulation "
-            "does not confirm them."
+            f"error from {figure(final.gap.before)} to {figure(final.gap.after)}: "
+            "simulation does not confirm them."
         )
     near += differs
     if selection.beyond:
@@ -422,9 +422,12 @@ def _follows_noise(problem: GapProblem, selection: Selection) -> bool:
     """Whether effects leave most of what they were found in, and that is noise which
     goes together over a while: without it they gain nothing."""
     start, end = selection.start, selection.end
-    left = share_left(problem.noise_error(start.left), problem.noise_error(end.left))
-    nothing_gained = problem.error(end) >= problem.error(start)
-    return nothing_gained and left > 1.0 - CLOSED_SHARE_MIN
+    loud, left = (problem.noise_error(fitted.left) for fitted in (start, end))
+    return (
+        loud > AGREEMENT_RMS_MAX
+        and share_left(loud, left) > 1.0 - CLOSED_SHARE_MIN
+        and problem.error(end) >= problem.error(start)
+    )
 
 
 def _is_confirmed(gap: GapMeasure) -> bool:
@@ -605,8 +608,8 @@ def _settle_step(
             size,
             "noise",
             "warning" if grave else "info",
-            f"The scene's time step of {step:g} s errs by {size:.2g} times the noise "
-            f"within {WINDOW_SEC} s; the comparison uses "
+            f"The scene's time step of {step:g} s errs by {figure(size, 2)} times the "
+            f"noise within {WINDOW_SEC} s; the comparison uses "
             f"{fine.plant.time_step or 'a continuous plant'}.",
         )
     ]

@@ -92,6 +92,19 @@ def test_late_states_are_named_beside_the_efforts(scene, tmp_path, late):
     assert found.parameters["delay"].value == pytest.approx(late, abs=5e-4)
 
 
+def test_what_happens_only_at_the_end_is_no_agreement(scene, tmp_path):
+    """The last fifth is for the report only: nothing is fitted there."""
+    path = log(tmp_path, "a", 0)
+    assert run_gap(scene, [path]).verdict == "no_gap"
+    header, *lines = path.read_text().splitlines()
+    rows = np.array([[float(x) for x in line.split(",")] for line in lines])
+    rows[int(0.9 * len(rows)) :, 3] *= 2.0
+    np.savetxt(path, rows, "%.9g", ",", header=header, comments="")
+    result = run_gap(scene, [path])
+    assert (result.verdict, result.effects) == ("gap_unnamed", [])
+    assert "on the data held out for the report the simulation error is" in result.says
+
+
 def test_late_efforts_are_named_at_the_efforts(scene, tmp_path):
     result = run_gap(scene, [log(tmp_path, "a", 1, effort_late=0.008)])
     assert result.verdict == "gap_named"

@@ -1045,7 +1045,12 @@ def windows_leave(before: float, after: float) -> GapMeasure:
 
 @pytest.mark.parametrize(
     "verdict, before, said",
-    [("no_gap", 2.1, "2.1 times"), ("no_gap", 1.9, ""), ("gap_named", 9.0, "")],
+    [
+        ("no_gap", 2.1, "2.1 times"),
+        ("no_gap", 3695.0, "3700 times"),
+        ("no_gap", 1.9, ""),
+        ("gap_named", 9.0, ""),
+    ],  # fmt: skip
 )
 def test_an_agreement_that_simulation_does_not_show_at_the_end_is_taken_back(
     verdict, before, said
