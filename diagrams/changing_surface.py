@@ -86,6 +86,7 @@ def _control() -> ChangingContactConfig:
     step, up to a tool's length early or late."""
     config = ChangingContactConfig(
         forward_model=friction_from_rest(),
+        mean_wrench=True,
         align=SurfaceAlignmentConfig(angle_max_deg=1.5),
     )
     speed = replace(config.anticipator.speed, first=TOUCH_SPEED)

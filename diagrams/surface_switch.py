@@ -85,6 +85,7 @@ def _control() -> ChangingContactConfig:
     while it fades, the tool stays there, and the reference moves on."""
     config = ChangingContactConfig(
         forward_model=friction_from_rest(),
+        mean_wrench=True,
         hybrid=HybridConfig(damping_ratio=0.9, release_sec=0.03),
     )
     return replace(config, anticipator=replace(config.anticipator, hint_lead_sec=0.014))

@@ -267,9 +267,11 @@ def test_settings_of_a_reflex_that_is_not_there_are_refused():
     build(config=config)
 
 
-def test_all_that_read_the_wrench_read_it_without_the_sensor_s_bias():
+@pytest.mark.parametrize("mean_wrench", [False, True])
+def test_all_that_read_the_wrench_read_it_without_the_sensor_s_bias(mean_wrench):
     bias = np.array([0.4, -0.3, 0.5])
-    diagram = build(errors=StationErrors(force_bias=bias))
+    config = ChangingContactConfig(mean_wrench=mean_wrench)
+    diagram = build(config=config, errors=StationErrors(force_bias=bias))
     simulator = Simulator(diagram)
     simulator.AdvanceTo(0.7)  # Above the table still.
     root = simulator.get_context()
@@ -284,7 +286,7 @@ def test_all_that_read_the_wrench_read_it_without_the_sensor_s_bias():
     for system, port, output in (
         ("contact_detector", "wrench", "wrench"),
         ("mode_detector", "wrench", "wrench"),
-        ("forward_model_bank", "wrench", "wrench_mean"),
+        ("forward_model_bank", "wrench", "wrench_mean" if mean_wrench else "wrench"),
         ("impedance_controller", "wrench_measured", "wrench"),
     ):
         np.testing.assert_array_equal(
