@@ -95,7 +95,8 @@ def test_where_all_is_pushed_no_window_is_simulated(tmp_path):
     _, file = recorded(tmp_path, FRICTION, PUSH)
     problem = MechanismProblem(double(tmp_path), read_recordings([file]))
     n = problem.nuisances()
-    fitted = SimpleNamespace(b=np.zeros(len(n.prior)), left=problem.base())
+    base = problem.base()
+    fitted = SimpleNamespace(b=np.zeros(len(n.prior)), left=base, r=base)
     assert problem.outcome([], fitted, fitted, n) is not None
     (push,) = problem.pushes
     problem.pushes = [replace(push, start=-1.0, end=SECONDS + 1.0)]
