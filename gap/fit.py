@@ -72,7 +72,8 @@ def fit_effects(
             if shows[k] > HARDLY * shows.max():
                 continue
             there = np.array(z)
-            there[k] = _untold(KINDS[start[i].kind].parameter(name), x0[k]) / scale[k]
+            parameter = KINDS[start[i].kind].parameter(name)
+            there[k] = _unidentified(parameter, x0[k]) / scale[k]
             # Slopes are differences over short steps, and have noise of their own.
             if shows[k] <= 1e-6 * shows.max() or _is_same(residual, z, there):
                 z = there
@@ -108,7 +109,7 @@ def fit_effects(
     )  # fmt: skip
 
 
-def _untold(parameter: Parameter, start: float) -> float:
+def _unidentified(parameter: Parameter, start: float) -> float:
     """What a parameter is taken to be of which the data tell nothing: neutral; a
     coordinate zero (of a load across a planar arm's plane); else as it came."""
     if parameter.neutral is not None:

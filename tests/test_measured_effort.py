@@ -13,9 +13,9 @@ SIZE, RATE = 2.0, 8.0  # [N m], [rad/s] of a sine.
 ENCODER = 1e-5  # [rad]
 
 
-def windows(folder, noise, hz=50.0, seconds=20.0, wander=0.0, known=True):
+def windows(folder, noise, hz=50.0, seconds=20.0, slow=0.0, known=True):
     """Of a joint that a sine of effort swings about its middle, without gravity.
-    wander [N m]: of the effort's noise that lasts for 3 s; known: to the windows."""
+    slow [N m]: of the effort's noise that lasts for 3 s; known: to the windows."""
     scene = pendulum(folder, gravity=0.0)
     rng = np.random.default_rng(0)
     time = np.arange(0.0, seconds, 1.0 / hz)
@@ -25,12 +25,12 @@ def windows(folder, noise, hz=50.0, seconds=20.0, wander=0.0, known=True):
         "p.j1.position": position + ENCODER * rng.normal(size=len(time)),
         "p.j1.effort_measured": SIZE * np.sin(RATE * time)
         + noise * rng.normal(size=len(time))
-        + wander * lasting(len(time), np.exp(-1.0 / (3.0 * hz)), rng),
+        + slow * lasting(len(time), np.exp(-1.0 / (3.0 * hz)), rng),
     }
     said = {"p.j1.position": ENCODER, "p.j1.effort_measured": max(noise, 1e-4)}
     write_recording(folder / "run.csv", columns, noise=said)
     recordings = read_recordings([folder / "run.csv"])
-    return WindowModel(scene, recordings, wander={"p.j1": wander if known else 0.0})
+    return WindowModel(scene, recordings, slow_noise={"p.j1": slow if known else 0.0})
 
 
 def lasting(n, keep, rng):
@@ -66,7 +66,7 @@ def test_noise_of_a_measured_effort_is_expected_in_the_windows(tmp_path, noise):
 def test_noise_of_a_measured_effort_that_lasts_is_expected_in_the_windows(tmp_path):
     rms = {}
     for known in (True, False):
-        model = windows(tmp_path, 0.1, seconds=120.0, wander=0.5, known=known)
+        model = windows(tmp_path, 0.1, seconds=120.0, slow=0.5, known=known)
         e = np.concatenate(model.errors(model.simulate(())))
         rms[known] = np.sqrt(np.mean(e**2))
     # 120 s have some 20 independent values of it.

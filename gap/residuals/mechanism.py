@@ -336,8 +336,8 @@ class MechanismProblem(InverseModel, GapProblem):
     def error(self, fitted: Fitted) -> float:
         # Which blocks are held out is by the clock: some hold next to nothing of it.
         rows = self.in_noise(fitted.left)
-        wanders = self.wandering(fitted.r)
-        for k in np.flatnonzero(wanders > 0.0):
+        slow = self.slow_noise(fitted.r)
+        for k in np.flatnonzero(slow > 0.0):
             mine = self.channel_of_rows() == k
             rows[mine] /= max(rms(rows[mine]), 1.0)
         held = rows[~self.train()] if not self.train().all() else rows
@@ -347,11 +347,11 @@ class MechanismProblem(InverseModel, GapProblem):
         """By the rows that were fitted and by those that were not, whichever is less:
         one of many joints hardly shows in what all leave together."""
         rows = self.in_noise(fitted.left)
-        wanders, held = self.wandering(fitted.r), ~self.train()
+        slow, held = self.slow_noise(fitted.r), ~self.train()
         found = ("", 0.0)
         for k, (what, joint) in enumerate(self.names()):
             mine = self.channel_of_rows() == k
-            if wanders[k] > 0.0 or not (mine & held).any():
+            if slow[k] > 0.0 or not (mine & held).any():
                 continue
             size = min(rms(rows[mine & some]) for some in (held, ~held))
             found = max(found, (f"{joint}.{what}", size), key=lambda each: each[1])
@@ -372,7 +372,7 @@ class MechanismProblem(InverseModel, GapProblem):
                     each.append(1.0 - share_left(before, after))
         return max(each)
 
-    def wandering(self, r: np.ndarray) -> np.ndarray:
+    def slow_noise(self, r: np.ndarray) -> np.ndarray:
         """(n_names,) what rows (m,), before the nuisances, leave of an effort that is
         measured, in its unit [N m], where that is no gap but noise that goes together
         over a while: nothing of it is told by where the joint is, how it moves and what
@@ -484,7 +484,7 @@ class MechanismProblem(InverseModel, GapProblem):
         else:
             model = self
         moved = moved_links(self, nuisances, end.b)
-        found = self.wandering(end.r)
+        found = self.slow_noise(end.r)
         measured = measure(
             scene, effects, moved, model, model is not self, jobs,
             self._is_pushed if model is self else lambda window: False,

@@ -26,7 +26,7 @@ def measure(
     every: bool,
     jobs: int = 1,
     skip: Callable[[Window], bool] = lambda window: False,
-    wander: Mapping[str, float] | None = None,
+    slow_noise: Mapping[str, float] | None = None,
 ) -> tuple[GapMeasure, list[Series]] | None:
     """Before and after over windows of the recordings that `motion` has; None where no
     window counts.
@@ -35,9 +35,11 @@ def measure(
         in both, as it is neither the gap nor its cure. motion: what tells how far a
         joint lags its motor where a window starts. every: all windows, of recordings
         that are only reported on; else those that were not fitted. skip: windows that
-        count in neither. wander: as WindowModel.
+        count in neither. slow_noise: as WindowModel.
     """
-    model = WindowModel(scene, motion.recordings, WINDOW_SEC, most=240, wander=wander)
+    model = WindowModel(
+        scene, motion.recordings, WINDOW_SEC, most=240, slow_noise=slow_noise
+    )
     taken = {(e.kind, tuple(e.at)) for e in effects}
     moved = [e for e in moved if (e.kind, tuple(e.at)) not in taken]
     trials = [moved, [*moved, *effects]] if effects else [moved]

@@ -127,7 +127,7 @@ class WindowModel(WindowedResidual):
 
     Args: window_sec, hop_sec: length, and from one start to the next. most: windows at
         most; a larger number is thinned evenly. simulation: of the scene, if not by
-        Drake's steps. wander: {joint: noise of its measured effort [N m] that goes
+        Drake's steps. slow_noise: {joint: noise of its measured effort [N m] that goes
         together for longer than a window}, beside that of a sample.
     """
 
@@ -141,11 +141,11 @@ class WindowModel(WindowedResidual):
         most: int = 400,
         by_episode: bool = False,
         simulation: SceneSimulation | None = None,
-        wander: Mapping[str, float] | None = None,
+        slow_noise: Mapping[str, float] | None = None,
     ):
         self.scene, self.recordings = scene, list(recordings)
         self.window_sec = window_sec
-        self._wander = wander or {}
+        self._slow_noise = slow_noise or {}
         self.simulation = simulation or SceneSimulation(scene)
         self.dynamics = SceneDynamics(scene)
         plant = self.dynamics.plant
@@ -384,7 +384,7 @@ class WindowModel(WindowedResidual):
             if name in driven and key in recording:
                 channel = recording.channels[key]
                 white = channel.noise**2 / max(channel.rate_hz, 1e-6)
-                noise[i] = white, self._wander.get(name, 0.0) ** 2
+                noise[i] = white, self._slow_noise.get(name, 0.0) ** 2
         plant.SetPositions(context, q)
         W = np.linalg.inv(plant.CalcMassMatrix(context))
         made = (W**2) @ noise
