@@ -5,7 +5,13 @@ from dataclasses import replace
 
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.problem import Fitted, is_sane
-from makebreak.gap.search.choice import Choice, fixed_parameters, places, refreshed
+from makebreak.gap.search.choice import (
+    Choice,
+    called,
+    fixed_parameters,
+    places,
+    refreshed,
+)
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.rivals import in_place_of
 from makebreak.models.effects import KINDS
@@ -88,7 +94,7 @@ def _in_their_place(
                 continue
             other = replace(
                 choice, effect=trial.fit.effects[k], ties=(), fixed=candidate.fixed,
-                size=candidate.size + 1, runner_up=_called(choice.effect),
+                size=candidate.size + 1, runner_up=called(choice.effect),
             )  # fmt: skip
             others = [*chosen[:k], other, *chosen[k + 1 :]]
             for each in _refining(other.effect):
@@ -102,7 +108,3 @@ def _in_their_place(
                     chosen, current = refreshed(others, fit), fit
                     break
     return chosen, current
-
-
-def _called(effect: Effect) -> str:
-    return f"{effect.kind} at {', '.join(effect.at)}"

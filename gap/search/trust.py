@@ -9,6 +9,7 @@ from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import Screen, between_parts, random_effects
 from makebreak.gap.problem import Fitted, GapProblem
 from makebreak.gap.result import Trust
+from makebreak.gap.search.choice import called
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
@@ -50,7 +51,7 @@ def trust_in(
         other = ""
         if ridge[k] >= 0:
             j, its = fitted.names[ridge[k]]
-            other = f"{its} of {_called(fitted.effects[j])}"
+            other = f"{its} of {called(fitted.effects[j])}"
         found.append(
             Trust(
                 effect.kind, tuple(effect.at), name,
@@ -255,7 +256,3 @@ def _from_elsewhere(problem, screen, fitted: Fitted, fixed, factor: float):
     except ValueError:
         return None
     return [e.parameters for e in again.effects]
-
-
-def _called(effect: Effect) -> str:
-    return f"{effect.kind} at {', '.join(effect.at)}"
