@@ -14,7 +14,7 @@ from makebreak.gap.data.check_drives import check_drives, check_initial_names
 from makebreak.gap.data.check_meshes import check_meshes
 from makebreak.gap.data.checks import check_recordings
 from makebreak.gap.data.conditioning import condition
-from makebreak.gap.data.findings import GUESSED_GAINS, NO_DRIVE, Finding
+from makebreak.gap.data.findings import GUESSED_GAINS, NO_COLUMN, NO_DRIVE, Finding
 from makebreak.gap.data.pieces import excerpt
 from makebreak.gap.data.reading import check_against_scene, read_recordings
 from makebreak.gap.data.recording import Recording, unit_of
@@ -494,8 +494,10 @@ def _unless_doubtful(result: GapResult) -> GapResult:
         )
     undriven = [c.says for c in result.checks if c.kind == NO_DRIVE]
     if not result.effects:
-        if result.verdict == "gap_unnamed" and undriven:
-            return replace(result, says=f"{result.says} {undriven[0]}")
+        kinds = (NO_DRIVE, NO_COLUMN)
+        missing = " ".join(c.says for c in result.checks if c.kind in kinds)
+        if result.verdict == "gap_unnamed" and missing:
+            return replace(result, says=f"{result.says} {missing}")
         return result
     guessed = any(c.kind == GUESSED_GAINS for c in result.checks)
     if any(c.severity == "error" for c in result.checks):

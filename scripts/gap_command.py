@@ -12,7 +12,7 @@ from time import perf_counter
 
 from tqdm import tqdm
 
-from makebreak.gap.data.findings import Finding
+from makebreak.gap.data.findings import NO_COLUMN, Finding
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.sidecar import has_sidecar, sidecar_of
 from makebreak.gap.report.comparison import comparison_html
@@ -173,7 +173,9 @@ def _proposed(
         f"Correct {' and '.join(names)} where they are wrong. Then run: "
         f"makebreak gap {quote(names[0])} {again}"
     )
-    return scene, sidecars, notes, proposal.findings()
+    doubts = proposal.findings()
+    notes += [finding.says for finding in doubts if finding.kind == NO_COLUMN]
+    return scene, sidecars, notes, doubts
 
 
 def exported(scene: Scene, formats: Sequence[str]) -> dict[str, str]:

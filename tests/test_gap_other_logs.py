@@ -9,7 +9,7 @@ import pytest
 
 from makebreak.gap import read_recordings, run_gap, write_report
 from makebreak.gap.by_recording import _apart
-from makebreak.gap.data.findings import GUESSED_GAINS, NO_DRIVE, Finding
+from makebreak.gap.data.findings import GUESSED_GAINS, NO_COLUMN, NO_DRIVE, Finding
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate
 from makebreak.gap.residuals.inverse import InverseModel
@@ -190,8 +190,10 @@ def test_where_nothing_drives_the_joints_only_what_explains_all_is_named():
     assert _unless_doubtful(passive) == passive
 
 
-def test_a_gap_where_nothing_drives_the_joints_says_so():
-    check = Finding(NO_DRIVE, "a", "time", 0.0, "", "warning", "Nothing drives it.")
+@pytest.mark.parametrize("kind", [NO_DRIVE, NO_COLUMN])
+def test_a_gap_where_nothing_drives_the_joints_says_so(kind):
+    """So does one where the log has joints' columns that nobody took for theirs."""
+    check = Finding(kind, "a", "time", 0.0, "", "warning", "Nothing drives it.")
     gap = GapMeasure(460.0, 460.0, 1.0, 0.3)
     result = GapResult("gap_unnamed", "A gap.", (), [], gap, (), {}, [check])
     assert _unless_doubtful(result).says == "A gap. Nothing drives it."

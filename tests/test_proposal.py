@@ -1,12 +1,13 @@
 """A robot's file and a log with foreign names: what is proposed, and that it runs."""
 
 import json
-from dataclasses import astuple
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
 from gap_benchmark.cases import cases, make
 
+from makebreak.gap.data.findings import NO_COLUMN
 from makebreak.gap.data.proposal import JointName, of_one_drive, propose
 from makebreak.gap.data.reading import read_recording
 from makebreak.gap.data.robot import propose_scene, read_log, read_robot
@@ -147,6 +148,50 @@ def test_there_is_one_drive():
     assert kept["tau_cmd1"].endswith("effort_command")
     assert kept["q1_cmd"] is None and kept["dq1_cmd"] is None
     assert kept["tau1"].endswith("effort_measured")
+
+
+UR = [JointName(f"ur.{n}_joint", lower=-6.3, upper=6.3)
+      for n in ("shoulder_pan", "shoulder_lift", "elbow",
+                "wrist_1", "wrist_2", "wrist_3")]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "name, channel",
+    [
+        ("pan angle [deg]", "shoulder_pan_joint.position"),
+        ("Lift torque [mNm]", "shoulder_lift_joint.effort_measured"),
+        ("elbow_vel", "elbow_joint.velocity"),
+        ("wrist 2 position", "wrist_2_joint.position"),  # Not the second joint's.
+        ("shoulder angle", None),  # Two have it.
+        ("q2", "shoulder_lift_joint.position"),
+    ],
+)
+def test_a_word_that_one_joint_alone_has_names_it(name, channel):
+    found = channels({"time": T} | sines([name]), UR)[name]
+    assert found == (channel and f"ur.{channel}")
+
+
+def test_of_two_arms_side_and_number_name_a_joint():
+    arms = [
+        JointName(f"r.{side}_joint{k}") for side in ("left", "right") for k in (1, 2)
+    ]
+    found = channels({"time": T} | sines(["q_right_1", "left tau 2", "right q"]), arms)
+    assert found["q_right_1"] == "r.right_joint1.position"
+    assert found["left tau 2"] == "r.left_joint2.effort_measured"
+    assert found["right q"] is None
+
+
+def test_a_joint_without_a_column_is_told_with_the_columns_left_out(robot_and_log):
+    _, robot, log, table, joints = robot_and_log
+    known = read_log(log)
+    assert not propose_scene(read_robot(robot), [known]).findings()
+    columns = dict(known.table.columns)
+    columns["front angle [deg]"] = columns.pop("Angle 1 [deg]")
+    other = replace(known, table=replace(known.table, columns=columns))
+    (finding,) = propose_scene(read_robot(robot), [other]).findings()
+    assert finding.kind == NO_COLUMN
+    assert f"position of {joints[0]}; " in finding.says
+    assert "left out: front angle [deg]." in finding.says
 
 
 @pytest.fixture(scope="module")

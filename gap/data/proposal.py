@@ -13,6 +13,7 @@ import numpy as np
 from makebreak.gap.data.table import COMMANDS, is_channel
 
 DEG = np.pi / 180.0
+UNKNOWN_JOINT = "of an unknown joint"  # Why such a column is left out.
 _COMMAND = set(
     "cmd command commands commanded target desired des ref reference goal goals "
     "setpoint action sp control".split()
@@ -125,7 +126,7 @@ def propose(
                 continue
             quantity = _OF_A_SLIDE[quantity]
         if joint is None:
-            found[name] = Match(name, None, why=f"{quantity} of an unknown joint")
+            found[name] = Match(name, None, why=f"{quantity} {UNKNOWN_JOINT}")
         else:
             found[name] = Match(name, f"{joint.name}.{quantity}", why="by its name")
     found = _once(_without_unknown_efforts(found, joints))
@@ -243,8 +244,10 @@ def _names(column: str, joint: JointName) -> bool:
 def _joints_of(
     quantities: Mapping[str, str], joints: Sequence[JointName]
 ) -> dict[str, JointName | None]:
-    """By the joint's own name in the column's; else by the number in it."""
+    """By the joint's own name in the column's, or by words of it that no other joint
+    has; else by the number in the column's."""
     found: dict[str, JointName | None] = {}
+    own_words = _own_words(joints)
     plain = {_plain(j.name.split(".", 1)[1]): j for j in joints}
     rest: dict[str, list[tuple[int, str]]] = {}
     for name in quantities:
@@ -253,6 +256,9 @@ def _joints_of(
         # joint1 is in joint10: the longest that is there.
         if inside:
             found[name] = plain[max(inside, key=len)]
+            continue
+        if joint := _by_words(name, own_words):
+            found[name] = joint
             continue
         numbers = list(re.finditer(r"\d+", name))
         if not numbers:
@@ -269,6 +275,27 @@ def _joints_of(
             k = number - base
             found[name] = joints[k] if 0 <= k < len(joints) else None
     return found
+
+
+def _own_words(joints: Sequence[JointName]) -> list[tuple[JointName, set[str]]]:
+    """Of each joint the words of its name that not all joints have, and that are no
+    word for a quantity or a command."""
+    common = _COMMAND.union(*_WORDS.values())
+    words = [set(words_of(joint.name.split(".", 1)[1])) for joint in joints]
+    if len(words) > 1:
+        common |= set.intersection(*words)
+    return [(joint, own - common) for joint, own in zip(joints, words, strict=True)]
+
+
+def _by_words(column: str, own: Sequence[tuple[JointName, set[str]]]):
+    """The one joint of which most words are in a column's name, as shoulder_pan_joint
+    of `pan angle`; None if no word of three letters is, or if two have as many."""
+    here = set(words_of(column))
+    shared = [(len(words & here), joint) for joint, words in own
+              if any(len(w) > 2 and w.isalpha() for w in words & here)]  # fmt: skip
+    most = max((n for n, _ in shared), default=0)
+    best = [joint for n, joint in shared if n == most]
+    return best[0] if len(best) == 1 else None
 
 
 def _once(found: dict[str, Match]) -> dict[str, Match]:

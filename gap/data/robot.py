@@ -12,8 +12,9 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
 from makebreak.gap.data.csv_table import text_columns
-from makebreak.gap.data.findings import GUESSED_GAINS, NO_DRIVE, Finding
+from makebreak.gap.data.findings import GUESSED_GAINS, NO_COLUMN, NO_DRIVE, Finding
 from makebreak.gap.data.proposal import (
+    UNKNOWN_JOINT,
     JointName,
     Match,
     of_one_drive,
@@ -134,14 +135,17 @@ FROM_MOTION = "from how joints followed their commands"
 class Proposal:
     """A scene and a sidecar for each log, as texts. notes: what was guessed. gains_of:
     how drives' gains were guessed, in words; "" where none had to be, or where motion
-    tells them. is_driven:
-    whether a column says what drives the joints."""
+    tells them. is_driven: whether a column says what drives the joints. without: of
+    joints that have no column of a position; unused: columns of quantities of unknown
+    joints."""
 
     scene: str
     sidecars: dict[Path, str]
     notes: tuple[str, ...]
     gains_of: str = ""
     is_driven: bool = True
+    without: tuple[str, ...] = ()
+    unused: tuple[str, ...] = ()
 
     def findings(self) -> list[Finding]:
         """What a result must not forget."""
@@ -160,7 +164,17 @@ class Proposal:
                 "sidecar; without it, effects may only stand for the missing torque."
             )
             found.append(Finding(NO_DRIVE, name, "time", 0, "", "warning", says))
+        if self.without:
+            says = self._says_what_is_missing()
+            found.append(Finding(NO_COLUMN, name, "time", 0, "", "warning", says))
         return found
+
+    def _says_what_is_missing(self) -> str:
+        says = f"No column is taken for the position of {', '.join(self.without)}"
+        if self.unused:
+            shown = ", ".join(self.unused[:6]) + (", ..." if self.unused[6:] else "")
+            says += f"; columns of unknown joints are left out: {shown}"
+        return says + ". If the log has these positions, name them in the sidecar."
 
 
 def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
@@ -204,7 +218,19 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
     lines += ["plant: {time_step: 0.001}", *actuation]
     sidecars = {path: sidecar_text(matches) for path, matches in every.items()}
     is_driven = actuation != NO_ACTUATION
-    return Proposal("\n".join(lines) + "\n", sidecars, tuple(notes), gains, is_driven)
+    seen = kinds.get("position", ())
+    without = tuple(j.name for j in robot.joints if j.name not in seen)
+    unused = dict.fromkeys(m.column for matches in every.values() for m in matches
+                           if m.why.endswith(UNKNOWN_JOINT))  # fmt: skip
+    return Proposal(
+        "\n".join(lines) + "\n",
+        sidecars,
+        tuple(notes),
+        gains,
+        is_driven,
+        without,
+        tuple(unused),
+    )
 
 
 def _file(robot: Robot) -> str:
