@@ -30,6 +30,7 @@ from makebreak.diagrams.realism import draw_errors
 from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.station import (
     ARM,
+    DELAY,
     TIP_FRAME,
     StationConfig,
     StationFaults,
@@ -304,6 +305,8 @@ def _add_controller(
             )
     for name in ("x_desired", "stiffness", "damping"):
         builder.Connect(plan[name], impedance.GetInputPort(name))
+    if station.HasOutputPort(DELAY):
+        builder.Connect(station.GetOutputPort(DELAY), impedance.GetInputPort("delay"))
     builder.Connect(
         impedance.GetOutputPort("tau"), station.GetInputPort(f"{ARM}.torque_commanded")
     )

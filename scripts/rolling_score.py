@@ -19,7 +19,7 @@ from makebreak.models.scene import load_scene, read_scene
 from makebreak.scripts.criteria import Criteria
 from makebreak.systems.arm.impedance_controller import serial_chain_of
 from makebreak.systems.arm.numerics.contact_force import contact_forces
-from makebreak.systems.arm.numerics.serial_chain import tip_kinematics
+from makebreak.systems.arm.numerics.serial_chain import SerialChain, tip_kinematics
 from makebreak.systems.contact_mpc.numerics.ball_state import P_BALL, P_TIP
 from makebreak.systems.contact_mpc.numerics.rolling_task import ROLL
 
@@ -61,6 +61,23 @@ def progress_of(p, center, radius):
     """Angle (n,) [rad] that the points p (n, 3) have covered around the circle."""
     off = p[:, :2] - center
     return np.append(0.0, np.cumsum(turned(off[:-1], off[1:], radius)))
+
+
+class Progress:
+    """progress_of, place by place, while a run goes on."""
+
+    def __init__(self, center, radius):
+        self._center, self._radius = np.array(center), radius
+        self._last = None
+        self.angle = 0.0  # [rad]
+
+    def went_to(self, p) -> float:
+        """How far it has gone around with the ball at p (2,) or (3,) [rad]."""
+        off = np.asarray(p)[:2] - self._center
+        if self._last is not None:
+            self.angle += float(turned(self._last, off, self._radius))
+        self._last = off
+        return self.angle
 
 
 def speed_at_the_end(track: Track) -> float:
@@ -114,6 +131,13 @@ def ground_truth(config, log, plant) -> Track:
     )
 
 
+def true_arm(config) -> SerialChain:
+    """The arm and its tool as they are in the world, with the station's errors."""
+    errors = draw_errors(config.realism, config.seed)
+    scene = with_errors(read_scene(config.world), errors, ARM, TOOL)
+    return serial_chain_of(make_control_plant(scene), TIP_FRAME)
+
+
 def contact_truth(config, diagram, log, plant):
     """Time (n,) [s] and normal force (n,) [N] of the ball on the tip, each ms."""
     system = diagram.GetSubsystemByName
@@ -124,9 +148,7 @@ def contact_truth(config, diagram, log, plant):
     q = state.data()[q_first : q_first + plant.num_positions(arm)].T
     at = ball.floating_positions_start() + 4
     p_ball = state.data()[at : at + 3].T
-    errors = draw_errors(config.realism, config.seed)
-    scene = with_errors(read_scene(config.world), errors, ARM, TOOL)
-    chain = serial_chain_of(make_control_plant(scene), TIP_FRAME)
+    chain = true_arm(config)
     q = np.ascontiguousarray(q)
     p_tip = np.array([tip_kinematics(chain, row)[0] for row in q])
     away = p_tip - p_ball

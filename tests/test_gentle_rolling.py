@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from makebreak.diagrams.ball_rolling_config import controller_model
+from makebreak.diagrams.ball_rolling_config import BallRollingConfig, controller_model
 from makebreak.diagrams.gentle_rolling import (
     FELT,
     SEAM_Y,
@@ -31,7 +31,9 @@ from makebreak.diagrams.gentle_rolling import (
 from makebreak.scripts.cli import main
 from makebreak.scripts.experiments import gentle_rolling as experiment
 from makebreak.scripts.export_tests import export_tests
+from makebreak.scripts.rolling_score import progress_of, true_arm
 from makebreak.systems.arm import impedance_controller
+from makebreak.systems.arm.numerics.serial_chain import tip_kinematics
 from makebreak.systems.baselines.frozen import Frozen
 from makebreak.systems.changing_contact import (
     contact_anticipator,
@@ -469,6 +471,39 @@ def test_settings_that_felt_and_glass_replaces_are_refused():
     changed.push.shape.survey = 2
     with pytest.raises(ValueError, match="push.shape.survey is 2, .*the diagram sets"):
         on_two_surfaces(changed)
+
+
+def test_a_run_ends_by_the_circles_that_are_scored():
+    """The ball cuts through 120 degrees of its fourth circle within half a radius of
+    the centre, which is not scored: the run goes on until four circles are."""
+    diagram = make_gentle_rolling(GentleRollingConfig())
+    plant = diagram.GetSubsystemByName("station").GetSubsystemByName("plant")
+    ball = ball_config(GentleRollingConfig())
+    ending = experiment._Ending(ball, plant)
+    angle = np.arange(0.0, 10.0 * np.pi, 0.05)
+    cut = abs(angle - 7.0 * np.pi) < np.pi / 3.0
+    radius = np.where(cut, 0.04, ball.task.radius)
+    p = np.array([*ball.task.center, 0.0])
+    p = p + np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle])
+    at = plant.GetBodyByName("ball").floating_positions_start() + 4
+    sample = {"state": np.zeros(plant.num_multibody_states())}
+    for k in range(len(p)):
+        sample["state"][at : at + 3] = p[k]
+        if ending(0.2 * k, sample):
+            break
+    scored = progress_of(p[: k + 1], ball.task.center, ball.task.radius)
+    assert scored[-1] == pytest.approx(8.0 * np.pi, abs=0.05)
+    assert angle[k] == pytest.approx(8.0 * np.pi + 2.0 * np.pi / 3.0, abs=0.15)
+
+
+def test_forces_are_scored_at_the_tip_that_the_world_has():
+    """A laboratory's tool is 2 mm longer than modelled, and hangs straight down."""
+    q = np.array([0.0, 0.3, 0.0, -2.2, 0.0, 2.5, 0.785])  # Sums to upright.
+    modelled, true = (
+        tip_kinematics(true_arm(BallRollingConfig(realism=level)), q)[0]
+        for level in ("none", "lab")
+    )
+    np.testing.assert_allclose(true - modelled, [0.0, 0.0, -0.002], atol=1e-5)
 
 
 def test_what_cannot_be_frozen_is_refused_by_name():

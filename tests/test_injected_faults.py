@@ -33,6 +33,7 @@ from makebreak.diagrams.station import (
     make_control_plant,
     make_station,
 )
+from makebreak.diagrams.wall_friction import WallFrictionConfig, make_wall_friction
 from makebreak.scripts import cli
 from makebreak.scripts.command_inputs import with_faults
 from makebreak.scripts.contact_runs import rehearsed
@@ -530,16 +531,21 @@ def test_a_run_says_whether_its_limits_were_kept(tmp_path):
     assert said["joint_range_excess_rad"] < 0.0
 
 
-def test_push_object_has_the_faults_of_its_arm():
-    diagram = make_push_object(
-        PushObjectConfig(faults=["compute_delay:from=0,sec=0.01"])
-    )
+@pytest.mark.parametrize(
+    ("make", "config"),
+    [(make_push_object, PushObjectConfig), (make_wall_friction, WallFrictionConfig)],
+)
+def test_an_arm_with_faults_knows_how_late_its_torques_act(make, config):
+    diagram = make(config(faults=["compute_delay:from=0,sec=0.01"]))
     simulator = Simulator(diagram)
     simulator.AdvanceTo(0.03)
     impedance = diagram.GetSubsystemByName("impedance_controller")
     context = impedance.GetMyContextFromRoot(simulator.get_context())
     assert impedance.GetInputPort("delay").Eval(context)[0] == pytest.approx(0.01)
     assert diagram.GetSubsystemByName("station").HasOutputPort(MONITOR)
+
+
+def test_push_object_has_no_faults_of_a_camera():
     with pytest.raises(ValueError, match="glare: there is no camera here"):
         make_push_object(PushObjectConfig(faults=["glare"]))
 

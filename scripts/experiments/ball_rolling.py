@@ -25,6 +25,7 @@ from makebreak.scripts.rolling_score import (
     DURATION_SEC,
     ERROR_MAX,
     SAMPLE,
+    Progress,
     contact_truth,
     first_time,
     ground_truth,
@@ -33,7 +34,6 @@ from makebreak.scripts.rolling_score import (
     progress_of,
     score,
     speed_at_the_end,
-    turned,
     write_recording,
 )
 from makebreak.systems.contact_mpc.numerics.ball_state import P_BALL
@@ -78,18 +78,16 @@ def run(config, session):
         record["r_std"] = learner.GetOutputPort("r_std")
     at = plant.GetBodyByName("ball").floating_positions_start() + 4
     center = np.array(config.task.center)
-    run_through: list = [0.0, None]  # Progress and the last place.
+    progress = Progress(center, config.task.radius)
     taken = any(read_fault(text).kind.on == "ball" for text in config.faults)
 
     def done(t, sample):
-        p = sample["state"][at : at + 2] - center
-        if run_through[1] is not None:
-            run_through[0] += float(turned(run_through[1], p, config.task.radius))
-        run_through[1] = p
-        stuck = t >= GIVE_UP_SEC and run_through[0] < np.pi / 2
+        p = sample["state"][at : at + 2]
+        angle = progress.went_to(p)
+        stuck = t >= GIVE_UP_SEC and angle < np.pi / 2
         # Out of reach for good, that is: not in a hand.
-        lost = np.hypot(*p) > config.task.radius + LOST and not taken
-        return ending(run_through[0], stuck, lost)
+        lost = np.hypot(*(p - center)) > config.task.radius + LOST and not taken
+        return ending(angle, stuck, lost)
 
     log = session.simulate(diagram, DURATION_SEC, record, SAMPLE, until=done)
     track = ground_truth(config, log, plant)
@@ -134,16 +132,14 @@ def run_on_lcm(config, session, url: str) -> dict:
     if diagram.HasSubsystemNamed("residual_learner"):
         ports["r_std"] = system("residual_learner").GetOutputPort("r_std")
     center, radius = np.array(config.task.center), config.task.radius
-    rolled: list = [0.0, None]
+    rolled = Progress(center, radius)
 
     def done(t, sample) -> str:
         if sample["seen"][0] < 0.5:
             return ""
-        p = sample["x"][P_BALL][:2] - center
-        if rolled[1] is not None:
-            rolled[0] += float(turned(rolled[1], p, radius))
-        rolled[1] = p
-        return ending(rolled[0], False, np.hypot(*p) > radius + LOST)
+        p = sample["x"][P_BALL][:2]
+        lost = np.hypot(*(p - center)) > radius + LOST
+        return ending(rolled.went_to(p), False, lost)
 
     def begin(_, context, q):
         start_where_it_is(diagram, context, q, arm)

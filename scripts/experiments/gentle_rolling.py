@@ -23,19 +23,13 @@ from makebreak.diagrams.gentle_rolling import (
     telemetry,
 )
 from makebreak.diagrams.scene_facts import sphere_radius
-from makebreak.diagrams.station import (
-    ARM,
-    TIP_FRAME,
-    TOOL,
-    make_control_plant,
-)
+from makebreak.diagrams.station import ARM, TOOL
 from makebreak.models.scene import load_scene
 from makebreak.scripts import rolling_score
 from makebreak.scripts.comparison import Rows
 from makebreak.scripts.experiments import ball_rolling as rolling
 from makebreak.scripts.table import Table
 from makebreak.scripts.trials import run_many
-from makebreak.systems.arm.impedance_controller import serial_chain_of
 from makebreak.systems.arm.numerics.contact_force import contact_forces
 from makebreak.systems.arm.numerics.serial_chain import tip_kinematics
 from makebreak.systems.changing_contact.numerics.contact_task import (
@@ -109,21 +103,18 @@ class _Ending:
     def __init__(self, ball, plant):
         self._center, self._radius = np.array(ball.task.center), ball.task.radius
         self._at = plant.GetBodyByName("ball").floating_positions_start() + 4
-        self._turned, self._angle = 0.0, None
+        # As it is scored: where it does not count, the run may not end either.
+        self._progress = rolling_score.Progress(self._center, self._radius)
         self._rolled = 0.0, 0.0  # When, and how far, it last was a quarter on.
 
     def __call__(self, t, sample):
-        p = sample["state"][self._at : self._at + 2] - self._center
-        angle = np.arctan2(p[1], p[0])
-        if self._angle is not None:
-            turn = angle - self._angle
-            self._turned += (turn + np.pi) % (2.0 * np.pi) - np.pi
-        self._angle = angle
-        if self._turned >= self._rolled[1] + np.pi / 2:
-            self._rolled = t, self._turned
+        p = sample["state"][self._at : self._at + 2]
+        angle = self._progress.went_to(p)
+        if angle >= self._rolled[1] + np.pi / 2:
+            self._rolled = t, angle
         stuck = t - self._rolled[0] >= STUCK_SEC
-        lost = bool(np.hypot(*p) > self._radius + rolling.LOST)
-        return rolling.ending(self._turned, stuck, lost)
+        lost = bool(np.hypot(*(p - self._center)) > self._radius + rolling.LOST)
+        return rolling.ending(angle, stuck, lost)
 
 
 def contact_truth(ball, diagram, log, plant):
@@ -137,7 +128,7 @@ def contact_truth(ball, diagram, log, plant):
     first = plant.GetJointByName("panda_joint1").position_start()
     q = np.ascontiguousarray(state.data()[first : first + plant.num_positions(arm)].T)
     at = body.floating_positions_start() + 4
-    chain = serial_chain_of(make_control_plant(ball.world), TIP_FRAME)
+    chain = rolling_score.true_arm(ball)
     p_tip = np.array([tip_kinematics(chain, row)[0] for row in q])
     away = p_tip - state.data()[at : at + 3].T
     away /= np.linalg.norm(away, axis=1, keepdims=True)
