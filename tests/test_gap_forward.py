@@ -97,6 +97,17 @@ def test_a_tie_that_does_no_better_in_the_end_stays_a_tie(monkeypatch):
     assert (MASS, mass.effect.at[0]) in named(problem)
 
 
+def test_progress_is_said_after_the_last_effect_was_added_too():
+    """Whether each effect is needed, and whether a tie is still one, are fits as well,
+    which take most of the time where an arm has many contacts."""
+    problem = where_a_mass_is(0.0, wrong=0.02)
+    problem._base += 3.0 * np.random.default_rng(2).normal(size=600)
+    said: list[str] = []
+    select(problem, said.append)
+    for words in ("  without joint_coulomb_friction at arm.joint6: ", ", as a tie: "):
+        assert any(words in text for text in said), words
+
+
 class LateLoad(Columns):
     """A load is no candidate before the link's mass and its centre of mass are there
     (as where links that may be off by their tolerance imitate what it does more)."""

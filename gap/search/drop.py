@@ -9,6 +9,7 @@ from makebreak.gap.fit import fit_effects
 from makebreak.gap.problem import Candidate, Fitted, is_sane
 from makebreak.gap.search.choice import (
     Choice,
+    called,
     is_clearly_off,
     is_significant,
     places,
@@ -51,6 +52,7 @@ def drop_needless(
                 )
             except ValueError:  # What is left would be no scene.
                 continue
+            search.say(f"  without {called(chosen[k].effect)}: {smaller.score:.3g}")
             # Rivals that were separated by one model's weights differ below the noise.
             two = chosen[k].of_two and alike is not None
             error = search.error_without_floor if two else search.error

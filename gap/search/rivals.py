@@ -12,6 +12,7 @@ from makebreak.gap.problem import Candidate, Fitted, rms
 from makebreak.gap.search.choice import (
     Choice,
     Trial,
+    called,
     fixed_parameters,
     pair_of,
     places,
@@ -218,6 +219,7 @@ def still_tied(
             fit = fit_effects(search.problem, screen, trial, held)
         except ValueError:
             continue
+        search.say(f"  {called(rival)}, as a tie: {fit.score:.3g}")
         near = search.error(fit.score) <= (1.0 + SAME_ERROR) * search.error(
             current.score
         )
@@ -280,6 +282,8 @@ def in_place_of(
         fit = fit_effects(search.problem, screen, trial, fixed)
     except (ValueError, RuntimeError):
         return None
+    replaced = called(current.effects[k])
+    search.say(f"  {candidate.name} in place of {replaced}: {fit.score:.3g}")
     sane = candidate.is_sane(fit.effects[k : k + 1])
     return Trial(fit, ranked) if sane and np.isfinite(fit.score) else None
 
