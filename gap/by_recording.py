@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.problem import GapProblem, is_sane
 from makebreak.gap.result import (
@@ -64,8 +65,8 @@ def with_differences(
     Effects that differ are named for the recordings in which they are, if each
     recording by itself is explained; otherwise the result says only that they differ.
 
-    Args: names: of the recordings. alone: judges one of them; ValueError where it is
-        too short by itself.
+    Args: names: of the recordings. alone: judges one of them; DoesNotFit where it
+        is too short by itself.
     """
     if len(names) > MOST_RECORDINGS:
         more = (
@@ -75,7 +76,7 @@ def with_differences(
         return replace(result, says=result.says + more)
     try:
         each = [alone(name) for name in names]
-    except ValueError:
+    except DoesNotFit:
         return result
     told = [one for one in each if one.result.verdict in EXPLAINED]
     found = _found([one.result for one in told] + [result])

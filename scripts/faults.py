@@ -1,8 +1,9 @@
 """Error messages and exit statuses: one line, and the place of the traceback.
 
-2: an input was refused by a check of makebreak's, or anything failed (in Drake, numpy
-or makebreak) before any computation, so that the input must be at fault.
-3: any other failure, of makebreak itself or of a library.
+2: an input was refused by a check of makebreak's, or a value failed (in Drake, numpy or
+makebreak) before any computation, so that the input must be at fault.
+3: any other failure, of makebreak itself or of a library; at any time what no input can
+cause, as a name that does not exist.
 MAKEBREAK_DEBUG=1 prints the traceback, too.
 """
 
@@ -18,6 +19,8 @@ from types import TracebackType
 _PACKAGE = Path(__file__).resolve().parent.parent
 _LIBRARIES = [Path(each).resolve() for each in set(sysconfig.get_paths().values())]
 _ROOMS = ("models", "systems", "diagrams", "gap", "scripts")
+# What a slip in a program raises, whatever its input is.
+_SLIPS = (NameError, AttributeError, TypeError, AssertionError, NotImplementedError)
 # Modules in which errors of worker processes are raised again.
 _PASSES_ON = ("concurrent/futures", "multiprocessing")
 
@@ -46,7 +49,12 @@ def is_drakes(error: BaseException) -> bool:
 
 
 def refused(error: BaseException) -> int:
-    """Prints why an input is refused. Returns: the exit status."""
+    """Prints why an input is refused; of a slip in the program, that it is one.
+
+    Returns: the exit status.
+    """
+    if isinstance(error, _SLIPS):
+        return fault(error)
     message = _one_line(error)
     if on_purpose(error):
         print(f"makebreak: {message}", file=sys.stderr)

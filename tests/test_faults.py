@@ -58,6 +58,21 @@ def test_what_fails_before_anything_was_simulated_is_bad_input(
 
 
 @pytest.mark.parametrize(
+    "slip",
+    [lambda: undefined, lambda: len(), lambda: Path.nothing],  # noqa: F821
+    ids=["NameError", "TypeError", "AttributeError"],
+)
+def test_what_no_input_can_cause_is_a_fault_whenever_it_happens(
+    slip, monkeypatch, capsys
+):
+    monkeypatch.setattr(spring_mass, "run", lambda *_: slip())
+    assert run() == 3
+    said = capsys.readouterr().err
+    assert "a fault of makebreak itself" in said
+    assert "in <lambda>" in the_file(said).read_text()
+
+
+@pytest.mark.parametrize(
     "slip", [lambda: np.zeros(2) + np.zeros(3), lambda: np.linalg.inv(np.zeros((2, 2)))]
 )
 def test_a_slip_of_numpy_is_told_with_its_traceback(slip, monkeypatch, capsys):
