@@ -98,6 +98,20 @@ def test_bad_rows_are_refused_by_row_and_left_out_where_asked(tmp_path):
     assert kind == "rows_bad" and "4 bad rows" in says and "row 7" in says
 
 
+def test_a_row_that_comes_twice_is_read_once_and_another_one_is_refused(tmp_path):
+    lines = rows().splitlines()
+    file = tmp_path / "a.csv"
+    file.write_text("\n".join([*lines[:6], lines[5], lines[5], *lines[6:]]))
+    recording = read_recording(file)
+    np.testing.assert_array_equal(recording["a.j.position"], Q)
+    ((kind, says),) = recording.notes
+    assert kind == "rows_twice" and "2 rows" in says
+    time = lines[5].split(",")[0]
+    file.write_text("\n".join([*lines[:6], f"{time},0.123", *lines[6:]]))
+    with pytest.raises(ValueError, match="not increase at row 6.*--skip-bad-rows"):
+        read_recording(file)
+
+
 @pytest.mark.parametrize(
     "scale, unit", [(1e9, "ns"), (1e6, "us"), (1e3, "ms")], ids=["ns", "us", "ms"]
 )

@@ -50,6 +50,7 @@ class BadRows:
     def __init__(self, path: Path, skip: bool):
         self._path, self.skip = path, skip
         self.count, self.why = 0, list[str]()
+        self.twice = 0  # Rows that are the row before once more.
 
     def add(self, why: str) -> None:
         """Raises: ValueError with the reason, unless such rows are left out."""
@@ -62,12 +63,16 @@ class BadRows:
             self.why.append(why)
 
     def note(self) -> list[tuple[str, str]]:
+        found = []
+        if self.twice:
+            says = f"{self._path.name}: {self.twice} rows are the row before once more "
+            found.append(("rows_twice", says + "(time and all values): left out"))
         if not self.count:
-            return []
+            return found
         more = self.count - len(self.why)
         says = f"{self._path.name}: {self.count} bad rows are left out: "
         says += "; ".join(self.why) + (f"; and {more} more" if more else "")
-        return [("rows_bad", says)]
+        return [*found, ("rows_bad", says)]
 
 
 def open_csv(path: Path):

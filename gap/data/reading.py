@@ -40,7 +40,8 @@ def read_recordings(
     skip_bad_rows: bool = False,
     sidecars: Mapping[Path, Path] | None = None,
 ) -> list[Recording]:
-    """Several recordings, with names that tell them apart.
+    """Several recordings, with names that tell them apart. Their time counts from the
+    first row: a clock that runs fast does so from there, and not since 1970.
 
     Args: skip_bad_rows: as of read_recording. sidecars: {recording: sidecar}, where it
         is not beside it.
@@ -59,12 +60,14 @@ def read_recordings(
         stems = [f"{path.resolve().parent.name}/{stem_of(path)}" for path in files]
     if len(set(stems)) < len(stems):
         stems = [str(path) for path in files]
-    return [
+    each = [
         read_recording(
             path, name, MOST_CELLS, skip_bad_rows, (sidecars or {}).get(path)
         )
         for path, name in zip(files, stems, strict=True)
     ]
+    return [replace(recording, time=recording.time - recording.time[0])
+            for recording in each]  # fmt: skip
 
 
 def read_recording(
@@ -88,14 +91,17 @@ def read_recording(
     sidecar = read_sidecars(path, sidecar_path)
     bad = BadRows(path, skip_bad_rows)
     columns, row, n_rows = _read_columns(path, sidecar, most_cells, bad)
-    is_excerpt = len(row) + bad.count < n_rows
+    is_excerpt = len(row) + bad.count + bad.twice < n_rows
     number = columns.get("episode")
     try:
         columns = check_columns(
             columns | {"episode": counted_parts(columns, row, is_excerpt)}
         )
     except ValueError as error:
-        raise ValueError(_with_rows(path, error, row)) from None
+        says = _with_rows(path, error, row)
+        if "does not increase" in says:
+            says += " (--skip-bad-rows leaves such rows out)"
+        raise ValueError(says) from None
     time, part = columns.pop("time"), columns.pop("episode")
     if not columns:
         raise ValueError(f"recording {path} has no channel beside time")
@@ -142,7 +148,8 @@ def _read_columns(
         table = joined(path, table, tables, time_column(names))
     columns = renamed(path, table.columns, names, unused)
     _check_time(path, columns)
-    columns, row = _without_bad_rows(columns, table.row, bad)
+    columns, row = _without_twice(columns, table.row, bad)
+    columns, row = _without_bad_rows(columns, row, bad)
     return columns, row, table.n_rows
 
 
@@ -166,6 +173,23 @@ def _check_time(path: Path, columns: Mapping[str, np.ndarray]) -> None:
             f"recording {path}: rows are {step:.6g} s apart, as if time were in {unit}:"
             f" expected seconds; map it in {sidecar}: columns: {mapping}"
         )
+
+
+def _without_twice(
+    columns: dict[str, np.ndarray], row: np.ndarray, bad: BadRows
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Columns and row numbers without rows that say nothing new: some loggers write a
+    message that comes twice, with its stamp, as two rows."""
+    again = np.flatnonzero(np.diff(columns["time"]) == 0.0) + 1
+    for value in columns.values():
+        new, old = value[again], value[again - 1]
+        again = again[(new == old) | (np.isnan(new) & np.isnan(old))]
+    good = np.ones(len(row), bool)
+    good[again] = False
+    bad.twice = len(again)
+    if not bad.twice:
+        return columns, row
+    return {name: value[good] for name, value in columns.items()}, row[good]
 
 
 def _without_bad_rows(
