@@ -312,10 +312,10 @@ class GapProblem(ABC):
         """Where to look for what no effect explains, as sentences; "": not known."""
         return ""
 
-    def reweigh(self, left: np.ndarray) -> bool:
-        """Weighs rows by what is left now (m,), where that is clearly less than what
-        models were taken to be off by. Returns: whether anything changed; then
-        residuals, columns and nuisances are others."""
+    def reweigh(self, fitted: Fitted) -> bool:
+        """Weighs rows by what a fit leaves, where that is clearly less than what models
+        were taken to be off by, and by the noise in the fitted model. Returns: whether
+        anything changed; then residuals, columns and nuisances are others."""
         return False
 
     def column(

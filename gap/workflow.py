@@ -9,12 +9,23 @@ from pathlib import Path
 import numpy as np
 
 from makebreak.gap.by_recording import Alone, may_differ, with_differences
+from makebreak.gap.data import sampled_commands
 from makebreak.gap.data.channel_noise import in_newton_metres
-from makebreak.gap.data.check_drives import check_drives, check_initial_names
+from makebreak.gap.data.check_drives import (
+    check_couplings,
+    check_drives,
+    check_initial_names,
+)
 from makebreak.gap.data.check_meshes import check_meshes
 from makebreak.gap.data.checks import check_recordings
 from makebreak.gap.data.conditioning import condition
-from makebreak.gap.data.findings import GUESSED_GAINS, NO_COLUMN, NO_DRIVE, Finding
+from makebreak.gap.data.findings import (
+    GUESSED_GAINS,
+    NO_COLUMN,
+    NO_DRIVE,
+    SAMPLED_COMMANDS,
+    Finding,
+)
 from makebreak.gap.data.pieces import excerpt
 from makebreak.gap.data.reading import check_against_scene, read_recordings
 from makebreak.gap.data.recording import Recording, unit_of
@@ -48,7 +59,7 @@ from makebreak.gap.result import GapMeasure, GapResult, JudgedChannel
 from makebreak.gap.search.choice import Choice, Selection
 from makebreak.gap.search.select import select, without
 from makebreak.gap.search.softer_by_simulation import softer_by_simulation
-from makebreak.gap.search.trust import scatter, trust_in
+from makebreak.gap.search.trust import drift_sentences, scatter, trust_in
 from makebreak.gap.simulation.measure import WINDOW_SEC
 from makebreak.gap.simulation.windows import WindowModel, with_step
 from makebreak.gap.thresholds import (
@@ -115,6 +126,7 @@ def run_gap(
         check_against_scene(recording, joints, bodies)
         check_drives(recording, scene)
     check_initial_names(scene, recordings)
+    check_couplings(scene, dynamics.plant)
     check_meshes(dynamics.loaded, recordings)
     # What is reported on is cut off before anything is looked at.
     parts = split(recordings)
@@ -134,6 +146,8 @@ def run_gap(
     seconds["checks"] = clock.lap()
     say("preparing motions and windows")
     problem, found = problem_for(scene, decided, dynamics, jobs)
+    if any(f.kind == SAMPLED_COMMANDS for f in found):
+        reported = sampled_commands.as_samples(reported)
     checks += found
     seconds["screen"] = clock.lap()
     say("searching the catalogue")
@@ -202,6 +216,10 @@ def problem_for(
         recordings, touches = without_contact(dynamics, recordings)
         scene, finding = _settle_step(scene, recordings, dynamics, jobs)
         mechanism = MechanismProblem(scene, recordings)
+        if mechanism.commands_are_samples():
+            recordings = sampled_commands.as_samples(recordings)
+            finding.append(sampled_commands.finding(recordings))
+            mechanism = MechanismProblem(scene, recordings)
         return mechanism, [*touches, *finding, *mechanism.push_findings()]
     if any(joint.num_velocities() for joint in one_dof_joints(dynamics.plant)):
         try:
@@ -250,6 +268,7 @@ def conclude(
         for c in selection.choices
     ]
     selection = replace(selection, choices=tuple(choices))
+    drifting = drift_sentences(problem, selection.end) if choices else ""
     start, end = problem.error(selection.start), problem.error(selection.end)
     verdict = verdict_of(choices, start, end, selection.far)
     near, differs = "", ""
@@ -315,6 +334,7 @@ def conclude(
         verdict = "not_judged"
         near += unjudged
     near += two_figures(start, problem.error(selection.end), final.gap)
+    near += drifting
     if verdict == "gap_unnamed":
         near += problem.hint(selection.end)
     before = [

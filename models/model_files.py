@@ -40,6 +40,7 @@ from makebreak.models.effects.model_text import (
     read_inertial,
     text,
 )
+from makebreak.models.fixed_joints import coupled_joints, fix_joints
 from makebreak.models.scene_schema import COMMANDS_OF, Scene
 from makebreak.models.typed_yaml import one_line, read_yaml
 
@@ -91,6 +92,33 @@ def add_models(scene: Scene, effects: Sequence[Effect], plant: MultibodyPlant) -
             except DRAKE_ERRORS as error:
                 raise ValueError(f"scene's directives: {one_line(error)}") from None
         _refuse_inertias(flat.directives, packages, warnings)
+    if scene.fixed_joints:
+        _check_fixed_together(scene)
+        fix_joints(plant, scene.fixed_joints)
+
+
+def couplings_of(scene: Scene) -> dict[str, str]:
+    """{<model>.<joint>: the one that it follows} of the models' files."""
+    packages = PackageMap()
+    _add_packages(scene, packages)
+    found: dict[str, str] = {}
+    for directive in _flattened(scene.directives, packages).directives:
+        add = directive.add_model
+        path = None if add is None else _path_of(add.file, Path("/"), packages)
+        if add is not None and path is not None:
+            found |= {
+                f"{add.name}.{joint}": f"{add.name}.{other}"
+                for joint, other in coupled_joints(path).items()
+            }
+    return found
+
+
+def _check_fixed_together(scene: Scene) -> None:
+    for joint, other in couplings_of(scene).items():
+        if not {joint, other} <= set(scene.fixed_joints):
+            raise ValueError(
+                f"fixed_joints: {joint} follows {other} (mimic), so it needs both"
+            )
 
 
 def with_actuated_joints(scene: Scene) -> Scene:

@@ -108,6 +108,8 @@ class Scene:
     directives: list[ModelDirective] = field(default_factory=list)
     plant: PlantSection = field(default_factory=PlantSection)
     actuation: ActuationSection = field(default_factory=ActuationSection)
+    # {<model>.<joint>: position} of joints that do not move.
+    fixed_joints: dict[str, Coordinate] = field(default_factory=dict)
     initial: InitialSection = field(default_factory=InitialSection)
     # {recording's file name: {episode: initial state}}. In a file it is `initial` with
     # file names instead of positions, velocities, poses, body_velocities.

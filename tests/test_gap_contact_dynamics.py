@@ -245,7 +245,7 @@ def test_a_side_of_a_patch_that_nothing_crosses_is_said_not_to_be_known(tmp_path
     screen = screen_of(problem)
     patch = Effect("friction_patch", [PAIR], {"friction": mu, **sides})
     end = fit_effects(problem, screen, [patch], [tuple(sides)])
-    assert problem.reweigh(end.left)  # As the search does with what it has chosen.
+    assert problem.reweigh(end)  # As the search does with what it has chosen.
     std, _ = problem.widened(end, 0)
     assert std["x_max"] == np.inf
     # No foot comes near this one, as these pushes go; across the others they do.

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 
 from makebreak.gap import read_recordings, run_gap, write_report
-from makebreak.gap.by_recording import _apart
+from makebreak.gap.by_recording import _apart, with_differences
+from makebreak.gap.data import sampled_commands
 from makebreak.gap.data.findings import GUESSED_GAINS, NO_COLUMN, NO_DRIVE, Finding
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate
 from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.gap.residuals.mechanism import MechanismProblem
+from makebreak.gap.residuals.mechanism_candidates import nuisances
 from makebreak.gap.result import Evidence, GapMeasure, GapResult, NamedEffect
 from makebreak.gap.search.groups import _needless_member
 from makebreak.gap.workflow import _follows_noise, _unless_doubtful
@@ -37,9 +40,14 @@ URDF = f"""<robot name="rig"><link name="base"/><link name="rod"><inertial>
 <actuator name="m"/></transmission></robot>"""
 
 
-def log(folder, name, seed, damping=0.0, late=0.0, effort_late=0.0, seconds=14.0):
+def log(
+    folder, name, seed, damping=0.0, late=0.0, effort_late=0.0, seconds=14.0,
+    mass=MASS, longer=1.0, inertia=1e-3, position_noise=2e-5, fall=0.0,
+    effort_noise=0.02,
+):  # fmt: skip
     """Writes a log of a pendulum that follows sums of sines exactly, 200 rows a second;
-    velocities and positions late, or the efforts."""
+    velocities and positions late, or the efforts. inertia: about its centre. fall: the
+    share of its damping that it loses."""
     rng = np.random.default_rng(seed)
     w, phase = rng.uniform(2.0, 7.0, 4), rng.uniform(0.0, 2 * np.pi, 4)
     size = 0.5 / w
@@ -52,17 +60,21 @@ def log(folder, name, seed, damping=0.0, late=0.0, effort_late=0.0, seconds=14.0
 
     def effort(t):
         q, v, a = state(t)
-        inertia = MASS * LENGTH**2 + 1e-3
-        return inertia * a + MASS * G * LENGTH * np.sin(q) + damping * v
+        about = mass * (longer * LENGTH) ** 2 + inertia
+        return (
+            about * a
+            + mass * G * longer * LENGTH * np.sin(q)
+            + (damping * (1.0 - fall * t / seconds) * v)
+        )
 
     t = np.arange(0.0, seconds, 0.005)
     q, v, _ = state(t - late)
     rows = np.column_stack(
         [
             t,
-            q + 2e-5 * rng.standard_normal(len(t)),
+            q + position_noise * rng.standard_normal(len(t)),
             v + 1e-3 * rng.standard_normal(len(t)),
-            effort(t - effort_late) + 0.02 * rng.standard_normal(len(t)),
+            effort(t - effort_late) + effort_noise * rng.standard_normal(len(t)),
         ]
     )
     names = ["time"] + [
@@ -90,6 +102,75 @@ def test_late_states_are_named_beside_the_efforts(scene, tmp_path, late):
     assert "beside its measured efforts" in result.says
     # Half a millisecond is what users were promised; noise alone gives 0.05 ms.
     assert found.parameters["delay"].value == pytest.approx(late, abs=5e-4)
+
+
+def test_a_clock_is_off_from_the_first_row_on_and_not_since_1970(scene, tmp_path):
+    """After 500 s a clock that is off by 2e-5 would be late by 10 ms: a delay."""
+    rows = []
+    for first in (0.0, 500.0):
+        path = log(tmp_path, f"a{first:.0f}", 0)
+        header, *lines = path.read_text().splitlines()
+        each = [line.partition(",") for line in lines]
+        text = [f"{float(t) + first:.9g},{rest}" for t, _, rest in each]
+        path.write_text("\n".join([header, *text]))
+        model = InverseModel(read_scene(scene), read_recordings([path]))
+        skew = Effect("clock_skew", ["rig"], {"skew": 2e-5})
+        rows.append(model.residual([skew]) - model.base())
+    # To the digits of the stamps.
+    np.testing.assert_allclose(rows[0], rows[1], atol=0.05 * np.abs(rows[0]).max())
+
+
+def log_of_a_fast_loop(folder):
+    """Samples of commands that change all the time, 67 rows a second."""
+    path = log(folder, "a", 13, effort_noise=0.0)
+    header, *lines = path.read_text().splitlines()
+    header = header.replace("effort_measured", "effort_command")
+    path.write_text("\n".join([header, *lines[::3]]))
+    return path
+
+
+def test_commands_of_a_faster_loop_are_no_gap(scene, tmp_path):
+    result = run_gap(scene, [log_of_a_fast_loop(tmp_path)])
+    assert (result.verdict, result.effects) == ("no_gap", [])
+    assert "sampled_commands" in {c.kind for c in result.checks}
+
+
+def test_commands_that_hold_or_damping_are_no_samples(scene, tmp_path):
+    """Damping that the scene lacks acts earlier than gravity and inertia, too."""
+    recordings = read_recordings([log_of_a_fast_loop(tmp_path)])
+    problem = MechanismProblem(read_scene(scene), recordings)
+    assert problem.commands_are_samples()
+    held = sampled_commands.as_samples(recordings)
+    assert not MechanismProblem(read_scene(scene), held).commands_are_samples()
+    path = log(tmp_path, "b", 14, damping=0.5)
+    path.write_text(path.read_text().replace("effort_measured", "effort_command"))
+    damped = MechanismProblem(read_scene(scene), read_recordings([path]))
+    assert not damped.commands_are_samples()
+
+
+def test_another_direction_of_gravity_is_said(tmp_path, scene):
+    path = log(tmp_path, "a", 15)
+    text = scene.read_text() + "plant: {time_step: 0, gravity: [-9.81, 0, 0]}\n"
+    scene.write_text(text.replace("plant: {time_step: 0}\n", ""))
+    result = run_gap(scene, [path])
+    if result.verdict == "gap_unnamed":
+        assert "Gravity of" in result.says
+    problem = MechanismProblem(read_scene(scene), read_recordings([path]))
+    assert "is the base mounted as the scene says?" in problem.hint(None)
+    standing = scene.read_text().replace("gravity: [-9.81, 0, 0]", "")
+    scene.write_text(standing.replace("time_step: 0, ", "time_step: 0"))
+    problem = MechanismProblem(read_scene(scene), read_recordings([path]))
+    assert problem.hint(None) == ""
+
+
+def test_friction_that_falls_is_said_to_and_constant_friction_is_not(scene, tmp_path):
+    said = []
+    for fall in (0.0, 0.6):
+        path = log(tmp_path, f"a{fall}", 16, damping=1.0, seconds=20.0, fall=fall)
+        result = run_gap(scene, [path])
+        assert "joint_viscous_damping" in {e.kind for e in result.effects}
+        said.append("goes from" in result.says)
+    assert said == [False, True]
 
 
 def test_what_happens_only_at_the_end_is_no_agreement(scene, tmp_path):
@@ -129,6 +210,65 @@ def test_low_passes_of_a_position_are_told_apart_by_their_time_constants(
     # To first order what a low-pass takes is proportional to its time constant.
     ratio = np.linalg.norm(off(2e-3)) / np.linalg.norm(off(1e-3))
     assert ratio == pytest.approx(2.0, rel=0.05)
+
+
+def test_a_longer_rod_is_a_tie_with_a_rotor(tmp_path, scene):
+    """Half of what is longer is hidden in the tolerance of the mass and its centre; the
+    other half is as well a rotor as a centre that is farther out."""
+    rod = MASS * LENGTH**2 / 3.0  # A thin rod about its centre.
+    text = URDF.replace("1e-3", f"{rod:.6g}")
+    (tmp_path / "robot.urdf").write_text(text)
+    path = log(tmp_path, "a", 11, longer=1.1, inertia=1.21 * rod)
+    result = run_gap(scene, [path])
+    assert result.verdict == "ambiguous"
+    kinds = {e.kind for e in result.effects}
+    ties = {t.kind for e in result.effects for t in e.indistinguishable_from}
+    assert {"rotor_inertia", "link_com"} <= kinds | ties
+
+
+def test_rows_have_the_noise_and_the_nuisances_of_the_model_that_is_tried(
+    scene, tmp_path
+):
+    """As if the scene itself had been of that mass and centre: twice the mass, and the
+    same noise of a position is twice the effort."""
+    path = log(tmp_path, "a", 12, mass=2.0 * MASS, position_noise=1e-3)
+    recordings = read_recordings([path])
+    effects = [
+        Effect("link_mass", ["rig.rod"], {"mass": MASS}),
+        Effect("link_com", ["rig.rod"], {"x": 0.1, "y": 0.0, "z": -0.05}),
+    ]
+    problem = MechanismProblem(read_scene(scene), recordings)
+    before = problem.noise_in_units()[:, 0]
+    nothing = problem.nuisances()
+    r = problem.residual(effects)
+    fitted = SimpleNamespace(effects=effects, left=r)
+    assert problem.reweigh(fitted) and not problem.reweigh(fitted)
+    heavy = replace(read_scene(scene), effects=effects)
+    expected = InverseModel(heavy, recordings)
+    now = problem.noise_in_units()[:, 0]
+    np.testing.assert_allclose(now, expected.noise_in_units()[:, 0], rtol=1e-9)
+    assert np.median(now / before) > 1.5
+    columns, own = problem.nuisances(), nuisances(expected)
+    assert columns.names == nothing.names
+    np.testing.assert_array_equal(columns.prior, nothing.prior)
+    units = [p.in_units(n.columns[:, 0])[:, 0]
+             for p, n in ((problem, columns), (expected, own))]  # fmt: skip
+    np.testing.assert_allclose(units[0], units[1], atol=1e-9 * np.abs(units[1]).max())
+
+
+def test_only_a_recording_that_is_too_short_is_not_searched_alone():
+    gap = GapMeasure(9.0, 9.0, 1.0, 0.3)
+    result = GapResult("gap_unnamed", "", (), [], gap, (), {}, [])
+
+    def short(name):
+        raise DoesNotFit("too short")
+
+    def wrong(name):
+        raise ValueError("operands could not be broadcast")
+
+    assert with_differences(result, ["a", "b"], short) is result
+    with pytest.raises(ValueError, match="broadcast"):
+        with_differences(result, ["a", "b"], wrong)
 
 
 def test_an_effect_in_one_of_two_recordings_is_named_for_that_one(scene, tmp_path):

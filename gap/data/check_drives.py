@@ -6,7 +6,10 @@ verdict wrong: an effect mends the equations, and the simulation stays as far of
 
 from collections.abc import Sequence
 
+from pydrake.multibody.plant import MultibodyPlant
+
 from makebreak.gap.data.recording import Recording
+from makebreak.models.model_files import couplings_of
 from makebreak.models.scene import ActuationSection, Scene, initial_for
 from makebreak.models.scene_schema import COMMANDS_OF
 from makebreak.models.typed_yaml import nearest
@@ -52,6 +55,26 @@ def check_drives(recording: Recording, scene: Scene) -> None:
         "or leave the columns out: map them to null under `columns` in "
         f"{recording.path.with_suffix('.yaml').name}"
     )
+
+
+def check_couplings(scene: Scene, plant: MultibodyPlant) -> None:
+    """Raises: ValueError if the models tie joints or bodies together (a mimic, a closed
+    loop): forces of constraints are in no equation here."""
+    if not plant.num_constraints():
+        return
+    pairs = couplings_of(scene)
+    joints = dict.fromkeys(each for pair in pairs.items() for each in pair)
+    says = f"the scene's models have {plant.num_constraints()} constraints"
+    if pairs:
+        says += f" ({', '.join(f'{a} follows {b}' for a, b in pairs.items())})"
+    says += ", which equations of motion lack"
+    if joints:
+        where = ", ".join(f"{name}: 0" for name in joints)
+        says += (
+            f"; where they hardly move, add to the scene: fixed_joints: {{{where}}}, "
+            "with their positions, and map their columns to null"
+        )
+    raise ValueError(says)
 
 
 def check_initial_names(scene: Scene, recordings: Sequence[Recording]) -> None:

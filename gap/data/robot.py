@@ -2,8 +2,8 @@
 
 import json
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,13 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
 from makebreak.gap.data.csv_table import text_columns
-from makebreak.gap.data.findings import GUESSED_GAINS, NO_COLUMN, NO_DRIVE, Finding
+from makebreak.gap.data.findings import (
+    FIXED,
+    GUESSED_GAINS,
+    NO_COLUMN,
+    NO_DRIVE,
+    Finding,
+)
 from makebreak.gap.data.proposal import (
     UNKNOWN_JOINT,
     JointName,
@@ -24,6 +30,7 @@ from makebreak.gap.data.proposal import (
 from makebreak.gap.data.servo_gains import ServoGains, ServoLog, servo_gains
 from makebreak.gap.data.table import RecordingTable, read_table, stem_of, suffix_of
 from makebreak.models.effects.kind import actuator_of, one_dof_joints
+from makebreak.models.fixed_joints import coupled_joints, fix_joints
 
 ROBOTS = (".urdf", ".sdf", ".xml")
 GUESSED_KP = 10.0  # [N m/rad], where the log does not show it.
@@ -79,7 +86,10 @@ def read_robot(path: Path) -> Robot:
     return Robot(path, model, tuple(joints), bases, limits, plant)
 
 
-def _load(path: Path, welded: Sequence[str] = ()) -> MultibodyPlant:
+def _load(
+    path: Path, welded: Sequence[str] = (), fixed: Mapping[str, float] | None = None
+) -> MultibodyPlant:
+    """fixed: {joint, without the model's name: where it stands}."""
     if not path.is_file():
         raise ValueError(f"robot {path} does not exist")
     plant = MultibodyPlant(0.0)
@@ -90,6 +100,8 @@ def _load(path: Path, welded: Sequence[str] = ()) -> MultibodyPlant:
             raise ValueError(f"it holds {len(models)} models, expected one")
         for base in welded:
             plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(base))
+        model = plant.GetModelInstanceName(models[0])
+        fix_joints(plant, {f"{model}.{name}": q for name, q in (fixed or {}).items()})
         plant.Finalize()
     except (RuntimeError, ValueError) as error:
         why = " ".join(str(error).split())[:300]
@@ -99,6 +111,67 @@ def _load(path: Path, welded: Sequence[str] = ()) -> MultibodyPlant:
 
 def _instance(plant: MultibodyPlant):
     return ModelInstanceIndex(plant.num_model_instances() - 1)  # World, default, it.
+
+
+# ----- Joints that stand still
+
+
+def _standing(robot: Robot, every, logs, some_unknown: bool) -> dict[str, float]:
+    """{<model>.<joint>: position} of joints that a scene takes to stand still: those
+    that follow one another (mimic), where they were in the middle of a log, and those
+    that no log has a column of. Neither may carry others, as a gripper's fingers.
+
+    Args: some_unknown: whether there are columns of unknown joints, maybe theirs.
+    Raises: ValueError for coupled joints that carry others.
+    """
+    coupled = {
+        f"{robot.model}.{one}": f"{robot.model}.{other}"
+        for one, other in coupled_joints(robot.path).items()
+    }
+    scaled = [_scaled(log, every[log.path]) for log in logs]
+    seen = {name.rpartition(".")[0] for channels in scaled for name in channels}
+    follow = {*coupled, *coupled.values()}
+    found = {}
+    for joint in robot.joints:
+        if joint.name in seen and joint.name not in follow:
+            continue
+        carried = _carried_by(robot, joint.name) - follow
+        if joint.name in follow and carried:
+            raise ValueError(
+                f"robot {robot.path.name}: joint {joint.name} is coupled to another "
+                f"(mimic) and carries {', '.join(sorted(carried))}; coupled joints are "
+                "covered only at the end of a robot, as a gripper's fingers"
+            )
+        if joint.name not in follow and (carried & seen or some_unknown):
+            continue  # Where it stands would be a guess.
+        q = [c[f"{joint.name}.position"] for c in scaled
+             if f"{joint.name}.position" in c]  # fmt: skip
+        middle = float(np.nanmedian(np.concatenate(q))) if q else 0.0
+        found[joint.name] = float(
+            f"{np.clip(np.nan_to_num(middle), joint.lower, joint.upper):.6g}"
+        )
+    return found if len(found) < len(robot.joints) else {}
+
+
+def _carried_by(robot: Robot, name: str) -> set[str]:
+    """Joints that another one carries."""
+    plant = robot.plant
+    joints = {f"{robot.model}.{j.name()}": j for j in one_dof_joints(plant)}
+    bodies = plant.GetBodiesKinematicallyAffectedBy([joints[name].index()])
+    return {
+        each for each, joint in joints.items()
+        if each != name and joint.child_body().index() in bodies
+    }  # fmt: skip
+
+
+def _with_fixed(robot: Robot, fixed: Mapping[str, float]) -> Robot:
+    """The robot with joints that do not move."""
+    names = {name.partition(".")[2]: q for name, q in fixed.items()}
+    return replace(
+        robot,
+        joints=tuple(j for j in robot.joints if j.name not in fixed),
+        plant=_load(robot.path, robot.bases, names),
+    )
 
 
 # ----- A log, and what is proposed for it
@@ -137,7 +210,7 @@ class Proposal:
     how drives' gains were guessed, in words; "" where none had to be, or where motion
     tells them. is_driven: whether a column says what drives the joints. without: of
     joints that have no column of a position; unused: columns of quantities of unknown
-    joints."""
+    joints. fixed: joints that are taken to stand still."""
 
     scene: str
     sidecars: dict[Path, str]
@@ -146,6 +219,7 @@ class Proposal:
     is_driven: bool = True
     without: tuple[str, ...] = ()
     unused: tuple[str, ...] = ()
+    fixed: tuple[str, ...] = ()
 
     def findings(self) -> list[Finding]:
         """What a result must not forget."""
@@ -157,6 +231,13 @@ class Proposal:
                 "they are not known."
             )
             found.append(Finding(GUESSED_GAINS, name, "time", 0, "", "warning", says))
+        if self.fixed:
+            says = (
+                f"{', '.join(self.fixed)} {_stands(self.fixed)} (fixed_joints of the "
+                "proposed scene), as the log has no column of it or the model couples "
+                "it to another joint: what it does is not compared."
+            )
+            found.append(Finding(FIXED, name, "time", 0, "", "warning", says))
         if not self.is_driven:
             says = (
                 "No column is an effort or a command, so no torque acts on the joints "
@@ -183,6 +264,12 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
     Raises: ValueError where no joint's position or no time is found.
     """
     every = {log.path: of_one_drive(matches_of(log, robot)) for log in logs}
+    unused = dict.fromkeys(m.column for matches in every.values() for m in matches
+                           if m.why.endswith(UNKNOWN_JOINT))  # fmt: skip
+    fixed = _standing(robot, every, logs, bool(unused))
+    if fixed:
+        robot = _with_fixed(robot, fixed)
+        every = {path: _left_out(matches, fixed) for path, matches in every.items()}
     kinds: dict[str, list[str]] = {}
     for path, matches in every.items():
         channels = {m.channel for m in matches if m.channel}
@@ -214,14 +301,18 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
             "  # It stands upright on the world's origin."
         )
         notes.append(f"{base} is welded to the world, upright")
+    if fixed:
+        where = ", ".join(f"{name}: {q:g}" for name, q in fixed.items())
+        lines.append(
+            f"fixed_joints: {{{where}}}  # Not in the log, or coupled (mimic)."
+        )
+        notes.append(f"{', '.join(fixed)} {_stands(fixed)}")
     actuation, gains = _actuation(robot, kinds, every, logs, notes)
     lines += ["plant: {time_step: 0.001}", *actuation]
     sidecars = {path: sidecar_text(matches) for path, matches in every.items()}
     is_driven = actuation != NO_ACTUATION
     seen = kinds.get("position", ())
     without = tuple(j.name for j in robot.joints if j.name not in seen)
-    unused = dict.fromkeys(m.column for matches in every.values() for m in matches
-                           if m.why.endswith(UNKNOWN_JOINT))  # fmt: skip
     return Proposal(
         "\n".join(lines) + "\n",
         sidecars,
@@ -230,7 +321,20 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
         is_driven,
         without,
         tuple(unused),
+        tuple(fixed),
     )
+
+
+def _stands(fixed: Collection[str]) -> str:
+    return "is taken to stand still" if len(fixed) == 1 else "are taken to stand still"
+
+
+def _left_out(matches: Sequence[Match], fixed: Collection[str]) -> list[Match]:
+    return [
+        Match(m.column, None, why=f"{m.channel}: taken to stand still")
+        if (m.channel or "").rpartition(".")[0] in fixed else m
+        for m in matches
+    ]  # fmt: skip
 
 
 def _file(robot: Robot) -> str:

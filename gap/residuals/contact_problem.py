@@ -186,8 +186,8 @@ class ContactProblem(ContactCandidates, GapProblem):
         self.allow(allowance)
         self._base, self._nuisances = None, None
 
-    def reweigh(self, left: np.ndarray) -> bool:
-        less = np.minimum(self._misfit(left), self.allowance)
+    def reweigh(self, fitted: Fitted) -> bool:
+        less = np.minimum(self._misfit(fitted.left), self.allowance)
         if (less >= LESS * self.allowance).all():
             return False
         self._set(less)

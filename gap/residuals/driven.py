@@ -200,8 +200,8 @@ class DrivenProblem(DrivenWindows, GapProblem):
                 n = max(n, len(x))
         return float(np.sqrt(np.clip(sums / max(squares, 1e-300), 1.0, max(n, 1))))
 
-    def reweigh(self, left: np.ndarray) -> bool:
-        less = np.minimum(self._misfit_of(left), self.misfit)
+    def reweigh(self, fitted: Fitted) -> bool:
+        less = np.minimum(self._misfit_of(fitted.left), self.misfit)
         if (less >= LESS * self.misfit).all():
             return False
         self.misfit, self._base, self._nuisances = less, None, None

@@ -62,6 +62,33 @@ class InverseModel(WhitenedRows):
         self._base = None
         return super().allow(error, more)
 
+    def weigh_by(
+        self, dynamics: SceneDynamics, gains: np.ndarray
+    ) -> Callable[[np.ndarray], np.ndarray]:
+        """As of WhitenedRows; the base is then in the new units."""
+        self._base = None
+        return super().weigh_by(dynamics, gains)
+
+    def model_with(
+        self, effects: Sequence[Effect], weights_only: bool = False
+    ) -> SceneDynamics:
+        """The scene with those of these effects that change masses, gravity, or, unless
+        `weights_only`, anything else of its plant."""
+        mine = [
+            e for e in effects
+            if KINDS[e.kind].weighs or
+            (not weights_only and KINDS[e.kind].before_finalize is not None
+             and not KINDS[e.kind].hidden_state)
+        ]  # fmt: skip
+        return self._with(mine) if mine else self.dynamics
+
+    def gains_with(self, effects: Sequence[Effect]) -> np.ndarray:
+        """(n_joints,) of the drives, by which their equations are divided: a small gain
+        would make all that is left small, whatever it is."""
+        return np.array(
+            [max(path_of(effects, joint).gain, LEAST_GAIN) for joint in self.joints]
+        )
+
     def motions(self) -> list[Motion]:
         """Of each track, as measured."""
         if self._motions is None:
@@ -87,9 +114,7 @@ class InverseModel(WhitenedRows):
             dynamics = self._with(heavy)
             ours = [e for e in ours if e not in heavy]
         on_top = [e for e in ours if KINDS[e.kind].on_top is not None]
-        # In units of what is commanded or measured: a small gain would make all that is
-        # left small, whatever it is.
-        gains = [max(path_of(effects, joint).gain, LEAST_GAIN) for joint in self.joints]
+        gains = self.gains_with(effects)  # In units of what is commanded or measured.
         parts = []
         for k, (track, white) in enumerate(
             zip(self.tracks, self._whiteners, strict=True)

@@ -1,6 +1,6 @@
 """A mechanism whose joints are measured, as a problem for the search."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -35,7 +35,12 @@ from makebreak.gap.residuals.pushes import ROBUST, Push, find_pushes
 from makebreak.gap.residuals.where import unexplained, where_in_motion
 from makebreak.gap.result import Where
 from makebreak.gap.simulation.windows import Window
-from makebreak.gap.thresholds import UNEXPLAINED_RMS
+from makebreak.gap.thresholds import (
+    BESIDE_NOISE_EVIDENCE,
+    CLOSED_SHARE_MIN,
+    NOISE_RMS_MAX,
+    UNEXPLAINED_RMS,
+)
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, find_body, sliding_joints
@@ -59,7 +64,10 @@ TRIMS, TRIMMED, TRIM_Z = 8, 0.3, 4.0
 UNWEIGHTED = 10.0  # Times what a push left, as its rows' noise.
 LAGS = 9  # Test functions over which errors may go together (0.9 s).
 OVERLAP = 1.3  # What neighbouring test functions share of white noise.
-KEPT = 0.1  # Of its mass, that a link keeps at least when nuisances move it.
+# A base is mounted otherwise than the scene says from this angle [rad] on, where its
+# gravity comes out as large as it is, to this share.
+TURNED, SAME_GRAVITY = 0.3, 0.1
+KEPT = 0.1  # Of its mass, that a link keeps at least; of inertia, a joint.
 
 
 class MechanismProblem(InverseModel, GapProblem):
@@ -72,6 +80,7 @@ class MechanismProblem(InverseModel, GapProblem):
         )
         self._found: list[Candidate] | None = None
         self._nuisances: Nuisances | None = None
+        self._weighed: tuple = ()  # Effects in whose model rows have their noise.
         # Stretches in which something else moved it: they have next to no weight.
         self.pushes: list[Push] = []
         self._learn_misfit()
@@ -263,21 +272,95 @@ class MechanismProblem(InverseModel, GapProblem):
         return float(np.sqrt(max((1.0 + 2.0 * rho[1:last].sum()) / OVERLAP, 1.0)))
 
     def _set(self, error: dict[str, np.ndarray], more=None) -> None:
-        to_new = self.allow(error, more)
+        self._reexpress(self.allow(error, more))
+
+    def _reexpress(self, to_new: Callable[[np.ndarray], np.ndarray]) -> None:
+        """Columns that are kept, in new units of rows."""
         if self._found is not None:
             self._found = [_moved(c, to_new) for c in self._found]
         if self._nuisances is not None:
             n = self._nuisances
             self._nuisances = replace(n, columns=to_new(n.columns))
 
-    def reweigh(self, left: np.ndarray) -> bool:
-        error = self._misfit(left)
+    def reweigh(self, fitted: Fitted) -> bool:
+        error = self._misfit(fitted.left)
         old = self.model_error
         less = {w: np.minimum(error[w], old[w]) for w in old}
-        if all((less[w] >= LESS * old[w]).all() for w in old):
+        is_less = any((less[w] < LESS * old[w]).any() for w in old)
+        is_another = self._weigh_by(fitted.effects)
+        if is_less:
+            self._set(less)
+        return is_less or is_another
+
+    def _weigh_by(self, effects: Sequence[Effect]) -> bool:
+        """Takes noise and nuisances as they are in the scene with these effects: with
+        an arm twice as heavy, positions' noise is twice as much effort, and links'
+        masses are where their centres are now. Returns: whether that is another."""
+        key = tuple(e.key for e in effects if self._reweighs(e))
+        if key == self._weighed:
             return False
-        self._set(less)
+        model, gains = self.model_with(effects), self.gains_with(effects)
+        if not self._moves_as_much(model):
+            return False
+        self._weighed = key
+        self._reexpress(self.weigh_by(model, gains))
+        before = self.nuisances()
+        now = nuisances(self, effects)
+        # What hardly shows may show in one of the two models alone.
+        shown = dict(zip(now.names, now.columns.T, strict=True))
+        columns = np.array(before.columns)
+        for k, name in enumerate(before.names):
+            columns[:, k] = shown.get(name, columns[:, k])
+        self._nuisances = replace(before, columns=columns)
         return True
+
+    def _moves_as_much(self, model: SceneDynamics) -> bool:
+        """Whether a model has at least a share of each joint's inertia. One that takes
+        nearly all of it away has next to no noise, and all that it leaves is large."""
+        q = self.motions()[0].q[0]
+        sizes = []
+        for plant in (self.dynamics.plant, model.plant):
+            context = plant.CreateDefaultContext()
+            plant.SetPositions(context, q)
+            sizes.append(np.diag(plant.CalcMassMatrix(context)))
+        return bool((sizes[1] > KEPT * sizes[0]).all())
+
+    def _reweighs(self, effect: Effect) -> bool:
+        entry = KINDS[effect.kind]
+        return (
+            entry.weighs
+            or entry.path == "gain"
+            or (entry.before_finalize is not None and not entry.hidden_state)
+        )
+
+    def commands_are_samples(self) -> bool:
+        """Whether commanded efforts fit half a period earlier: a loop that is faster
+        than the table gave them, and a row has what it gave at that instant. What else
+        makes them seem early (damping that the scene has too much of) does not say so
+        at half a period, to the noise or to half of what is left."""
+        given = [j for j, has in zip(self.joints, self.has["effort_command"],
+                                     strict=True) if has]  # fmt: skip
+        if not given or any(law is not None for law in self.laws):
+            return False
+        kind = next(k for k, entry in KINDS.items() if entry.path == "delay")
+        n = self.nuisances()
+        screen = Screen(self.base(), n.columns, n.prior, self.train(), reach=n.reach)
+
+        def left(periods: float) -> float:
+            """Robust: where an effort jumps, no sample says when."""
+            late = Effect(kind, given, {"delay": -periods * self.period})
+            r = self.residual([late]) if periods else self.base()
+            off = np.abs(self.in_noise(screen.fit_nuisances(r)[1]))
+            return ROBUST * float(np.median(off))
+
+        held, less, half, more = (left(periods) for periods in (0.0, 0.25, 0.5, 0.75))
+        gained = len(self.base()) * (held**2 - half**2)
+        enough = max(NOISE_RMS_MAX, (1.0 - CLOSED_SHARE_MIN) * held)
+        return (
+            half < min(less, more)
+            and half <= enough
+            and gained > BESIDE_NOISE_EVIDENCE * self.correlation**2
+        )
 
     # ----- The search
 
@@ -465,6 +548,37 @@ class MechanismProblem(InverseModel, GapProblem):
         return b.index() in {body.index() for body in plant.GetBodiesWeldedTo(a)}
 
     # ----- What it comes to
+
+    def hint(self, end: Fitted) -> str:
+        """Another direction of gravity, if that explains most of the gap: a robot on a
+        wall or a ceiling, of which the scene says that it stands."""
+        weight = [
+            self.dynamics.mass_times_com_jacobian(m.q).transpose(0, 2, 1)
+            for m in self.motions()
+        ]
+        X, n = self.columns_of(weight), self.nuisances()
+        if not np.abs(X).max(initial=0.0) > 0.0:
+            return ""
+        screen = Screen(self.base(), n.columns, n.prior, self.train(), reach=n.reach)
+        less = screen.fit(X).c
+        held = ~self.train()
+        before = rms(self.in_noise(screen.fit_nuisances(self.base())[1])[held])
+        left = screen.fit_nuisances(self.base() - X @ less)[1]
+        after = rms(self.in_noise(left)[held])
+        old = self.dynamics.gravity
+        new = old - less
+        size = [float(np.linalg.norm(g)) for g in (old, new)]
+        if not min(size) > 0.0 or not after < (1.0 - CLOSED_SHARE_MIN) * before:
+            return ""
+        angle = float(np.arccos(np.clip(old @ new / (size[0] * size[1]), -1.0, 1.0)))
+        if angle < TURNED or abs(size[1] / size[0] - 1.0) > SAME_GRAVITY:
+            return ""
+        along = ", ".join(f"{x:.1f}" for x in new)
+        return (
+            f" Gravity of ({along}) m/s2 instead of the scene's would take the error "
+            f"of the equations from {before:.3g} to {after:.3g}: is the base mounted "
+            "as the scene says?"
+        )
 
     def where(self, left: np.ndarray) -> list[Where]:
         return where_in_motion(self, self.in_noise(left))

@@ -170,18 +170,23 @@ def rich_columns(model: InverseModel, found: Sequence[Candidate]) -> np.ndarray:
     return np.hstack(columns) if columns else np.zeros((len(model.train()), 0))
 
 
-def nuisances(model: InverseModel) -> Nuisances:
-    """The links' masses and centres of mass, instants of sampling, gains of drives."""
+def nuisances(model: InverseModel, effects: Sequence[Effect] = ()) -> Nuisances:
+    """The links' masses and centres of mass, instants of sampling, gains of drives.
+
+    Args: effects: that the scene has beside its own; a mass shows where its centre is
+        and as gravity is in them.
+    """
     dynamics, motions = model.dynamics, model.motions()
+    moved, gains = model.model_with(effects, True), model.gains_with(effects)
     columns, prior, names = [], [], []
     unit = unit_of_mass(model)
     for kind, tolerance in tolerances(model.scene).items():
         for at in dynamics.links():
             if at == unit and _is_mass_alone(kind):
                 continue
-            groups = [dynamics.signatures(kind, [at], m) for m in motions]
+            groups = [moved.signatures(kind, [at], m) for m in motions]
             for same in zip(*groups, strict=True):
-                x = model.columns_of([s.columns for s in same])
+                x = model.columns_of([s.columns / gains[:, None] for s in same])
                 now = list(dynamics.now(kind, [at]).values())
                 for k, unknown in enumerate(same[0].unknowns):
                     if not np.abs(x[:, k]).max(initial=0.0) > 0.0:

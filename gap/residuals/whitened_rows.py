@@ -13,6 +13,7 @@ from scipy.ndimage import median_filter
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.residuals.mechanism_motion import MechanismMotion
 from makebreak.gap.residuals.track import Track
+from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.scene import Scene
 
 OTHERS = ("velocity", "effort_measured")  # Channels that are compared beside.
@@ -40,6 +41,10 @@ class WhitenedRows(MechanismMotion):
 
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
         super().__init__(scene, recordings)
+        # Through which the noise of positions goes into equations: the scene's, or that
+        # of a model with effects, divided by its drives' gains.
+        self._weighed_by, self._divided_by = self.dynamics, np.ones(len(self.joints))
+        self._more: list[np.ndarray] = []
         self._noises = self._noise_of_rows()
         # What models are off by, beside noise [N m, rad/s].
         self.model_error = {
@@ -83,7 +88,7 @@ class WhitenedRows(MechanismMotion):
         )
         C = np.empty((len(centre), len(self.joints), len(self.joints)))
         for b, k in enumerate(centre):
-            M = self._mass_matrix(q[k])
+            M = self._mass_matrix(q[k]) / self._divided_by[:, None]
             C[b] = (M * (g2 * self.noise) ** 2) @ M.T
             C[b] += np.diag(direct[b] + held[b] ** 2)
         # The smoothed velocity's own error, as over one bump.
@@ -150,17 +155,38 @@ class WhitenedRows(MechanismMotion):
 
         Args: more (n_bumps, n_joints): further noise of the joints' equations [N m].
         """
-        old = self._whiteners
         if more is not None:
-            first = 0
-            for noise in self._noises:
-                C = noise["effort"]
-                each = more[first : first + len(C)]
-                first += len(C)
-                C += np.eye(C.shape[1]) * each[:, None] ** 2
-            self._plain = self._whitened_by({w: 0.0 * x for w, x in error.items()})
-        self.model_error = error
-        self._whiteners = self._whitened_by(error)
+            self._more.append(more)
+            self._add_noise(more)
+        return self._whitened_anew(error)
+
+    def weigh_by(
+        self, dynamics: SceneDynamics, gains: np.ndarray
+    ) -> Callable[[np.ndarray], np.ndarray]:
+        """Takes the noise that positions have in another model's equations. Returns: as
+        of allow.
+
+        Args: dynamics: of a scene with effects. gains (n_joints,): of its drives.
+        """
+        self._weighed_by, self._divided_by = dynamics, gains
+        self._noises = self._noise_of_rows()
+        for more in self._more:
+            self._add_noise(more)
+        return self._whitened_anew(self.model_error)
+
+    def _add_noise(self, more: np.ndarray) -> None:
+        """Further noise (n_bumps, n_joints) of the joints' equations."""
+        first = 0
+        for noise in self._noises:
+            C = noise["effort"]
+            each = more[first : first + len(C)]
+            first += len(C)
+            C += np.eye(C.shape[1]) * each[:, None] ** 2
+
+    def _whitened_anew(self, error) -> Callable[[np.ndarray], np.ndarray]:
+        old = self._whiteners
+        self._plain = self._whitened_by({w: 0.0 * x for w, x in error.items()})
+        self.model_error, self._whiteners = error, self._whitened_by(error)
         new = self._whiteners
         return lambda rows: self._rewhitened(rows, old, new)
 
@@ -207,7 +233,7 @@ class WhitenedRows(MechanismMotion):
         return np.concatenate(parts)
 
     def _mass_matrix(self, q) -> np.ndarray:
-        plant, context = self.dynamics.plant, self.dynamics._context
+        plant, context = self._weighed_by.plant, self._weighed_by._context
         plant.SetPositions(context, q)
         return plant.CalcMassMatrix(context)
 

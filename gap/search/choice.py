@@ -176,6 +176,16 @@ def is_clearly_off(choice: Choice) -> bool:
     )
 
 
+def identifiable(fit: Fitted, k: int = -1) -> int:
+    """Number of parameters of effect k of a fit of which the data tell anything."""
+    last, std = fit.effects[k], fit.std[k]
+    return sum(
+        std.get(p.name, np.inf) < p.high - p.low
+        for p in KINDS[last.kind].parameters
+        if p.name in last.parameters
+    )
+
+
 def uses_all_parameters(fit: Fitted, k: int = -1) -> bool:
     """Whether each parameter of effect k of a fit is two deviations off neutral: else
     it is another, smaller effect under this name. Of a vector one component is enough;

@@ -88,8 +88,8 @@ def _step(search: Comparison, rivals: Rivals, path: Path) -> Path:
     chosen = [*path.end.chosen, *step.added]
     current = _converged(search, chosen, step.fitted)
     chosen = refreshed(chosen, current)  # The next fit starts from here.
-    if problem.reweigh(current.left):
-        # Less is left than models were taken to be off by.
+    if problem.reweigh(current):
+        # Less is left than models were taken to be off by, or noise is another in them.
         search.start_again()
         current = search.refit(chosen, current)
         chosen = refreshed(chosen, current)

@@ -14,6 +14,7 @@ from makebreak.gap.search.choice import (
     Trial,
     called,
     fixed_parameters,
+    identifiable,
     pair_of,
     places,
     uses_all_parameters,
@@ -172,7 +173,7 @@ class Rivals:
                 or max(f.score, fit.score) < floor
             )
             near = search.error(f.score) <= (1.0 + SAME_ERROR) * search.error(fit.score)
-            more = ranked.candidate.size - r.candidate.size
+            more = identifiable(fit) - identifiable(f)
             if near and alike and search.is_worse(f, fit, more):
                 continue
             if most is not None:
@@ -190,7 +191,7 @@ class Rivals:
         one = ranked.candidate
         if two.members or one.kind in KINDS[two.kind].contains:
             return False
-        more = two.size - one.size
+        more = identifiable(other.fit) - identifiable(fit)
         if more > EXTRA_PARAMETERS_MAX:
             search = self._search
             if not search.tells_by_evidence:
@@ -224,7 +225,7 @@ def still_tied(
             current.score
         )
         alike = paired(fit.left, current.left, search.train) > P_VALUE_MIN
-        more = chosen[k].size - len(fit.std[k])
+        more = identifiable(current, k) - identifiable(fit, k)
         worse = search.is_worse(fit, current, more) or search.is_louder(fit, current)
         if near and alike and not worse:
             tied.append(fit.effects[k])

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from scipy.stats import linregress
 from scipy.stats import t as student_t
 
 from makebreak.gap.fit import fit_effects
@@ -10,6 +11,7 @@ from makebreak.gap.numerics.selection import Screen, between_parts, random_effec
 from makebreak.gap.problem import Fitted, GapProblem
 from makebreak.gap.result import Trust
 from makebreak.gap.search.choice import called
+from makebreak.gap.thresholds import DIFFERS_SHARE, DIFFERS_Z
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
@@ -21,6 +23,8 @@ STRAIGHT = 0.2  # part knows less well it puts where columns are no longer strai
 STARTS = (0.5, 1.6)  # Of each parameter's distance from neutral.
 NORMAL_975 = 1.96  # Deviations of a 95 % interval.
 Known = tuple[np.ndarray, np.ndarray] | None
+BY_CHANCE = 1e-3  # p of a straight line through values that only scatter.
+BETWEEN = 0.2  # Of a drift, by which values may go beyond those at its ends.
 RIDGE = 0.98  # Two parameters whose errors go together like this: their sum shows.
 
 
@@ -127,6 +131,50 @@ def scatter(problem: GapProblem, fitted: Fitted) -> list[dict[str, float]]:
         own = variance + few**2 * between_parts(x[telling], variance[telling])
         out[i][name] = float(np.sqrt(np.sum(w**2 * own)) / np.sum(w))
     return out
+
+
+def drifts(problem: GapProblem, fitted: Fitted) -> dict[tuple[int, str], np.ndarray]:
+    """{(effect, parameter): its values in stretches of time} of those that go from one
+    value to another over a recording: friction while a gear warms up, a load that is
+    picked up. None of several recordings, which are compared one by one."""
+    if not fitted.names or len(problem.recordings) > 1:
+        return {}
+    J, r, known = _rows(problem, fitted)
+    _, parts = _parts(problem)
+    if len(parts) < FEWEST_PARTS:
+        return {}
+    value = _values(fitted)
+    x = np.array([value + gauss_newton(J, r, some, known) for some in parts])
+    std = np.sqrt(np.array([_variances(J, r, some, known) for some in parts]))
+    found = {}
+    for k, (i, name) in enumerate(fitted.names):
+        neutral = KINDS[fitted.effects[i].kind].parameter(name).neutral
+        ends, sure = x[[0, -1], k], float(np.hypot(std[0, k], std[-1, k]))
+        if neutral is None or not np.isfinite(x[:, k]).all() or not sure > 0.0:
+            continue
+        far = float(np.abs(ends - neutral).max())
+        apart = float(abs(ends[1] - ends[0]))
+        # Their own deviations have in common what links are not known to: steps that
+        # go one way are told by how straight they go, too.
+        steps = linregress(np.arange(len(x)), x[:, k])
+        is_sure = apart > DIFFERS_Z * sure or steps.pvalue < BY_CHANCE
+        off = np.maximum(x[:, k] - ends.max(), ends.min() - x[:, k])
+        between = bool((off <= BETWEEN * apart).all())
+        if apart > DIFFERS_SHARE * far and is_sure and between:
+            found[i, name] = x[:, k]
+    return found
+
+
+def drift_sentences(problem: GapProblem, fitted: Fitted) -> str:
+    """What is to be said of parameters that change over a recording; "": none does."""
+    text = ""
+    for (i, name), x in drifts(problem, fitted).items():
+        unit = KINDS[fitted.effects[i].kind].parameter(name).unit
+        text += (
+            f" The {name.replace('_', ' ')} of {called(fitted.effects[i])} goes from "
+            f"{x[0]:.3g} to {x[-1]:.3g} {unit} over the recording: it is not constant."
+        )
+    return text
 
 
 def _over_parts(

@@ -1,0 +1,75 @@
+"""Joints that are held where they stand, and joints that a model's file couples.
+
+The fingers of a gripper are often not logged, or move together by a `mimic`. Equations
+of motion of the arm need to know only where they stand.
+"""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from xml.dom import minidom
+from xml.parsers.expat import ExpatError
+
+from pydrake.common.eigen_geometry import AngleAxis
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import Joint, PrismaticJoint, WeldJoint
+
+from makebreak.models.effects.kind import actuator_of, full_name, one_dof_joints
+
+
+def fix_joints(plant: MultibodyPlant, fixed: Mapping[str, float]) -> None:
+    """Welds joints at these positions, before Finalize. All constraints between joints
+    are removed with them: those that are left must be of joints that are fixed.
+
+    Args: fixed: {<model>.<joint>: position [rad] or [m]}.
+    Raises: ValueError for a joint that there is not.
+    """
+    if not fixed:
+        return
+    joints = {full_name(plant, joint): joint for joint in one_dof_joints(plant)}
+    for name in fixed:
+        if name not in joints:
+            raise ValueError(
+                f"fixed_joints: no joint {name}, the scene has {', '.join(joints)}"
+            )
+    for constraint in plant.GetConstraintIds():
+        plant.RemoveConstraint(constraint)
+    for name, position in fixed.items():
+        _weld(plant, joints[name], position)
+
+
+def _weld(plant: MultibodyPlant, joint: Joint, position: float) -> None:
+    actuator = actuator_of(plant, joint)
+    if actuator is not None:
+        plant.RemoveJointActuator(actuator)
+    if isinstance(joint, PrismaticJoint):
+        X = RigidTransform(position * joint.translation_axis())
+    else:
+        turn = AngleAxis(angle=position, axis=joint.revolute_axis())
+        X = RigidTransform(RotationMatrix(turn))
+    name, parent, child = joint.name(), joint.frame_on_parent(), joint.frame_on_child()
+    plant.RemoveJoint(joint)
+    plant.AddJoint(WeldJoint(name, parent, child, X))
+
+
+def coupled_joints(path: Path) -> dict[str, str]:
+    """{joint: the one that it follows} of a URDF, SDF or MJCF; none where it cannot be
+    read, which a parser says better."""
+    try:
+        document = minidom.parse(str(path))
+    except (ExpatError, OSError):
+        return {}
+    return dict(_couplings(document))
+
+
+def _couplings(document: minidom.Document) -> Iterator[tuple[str, str]]:
+    for mimic in document.getElementsByTagName("mimic"):
+        joint = mimic.parentNode
+        if isinstance(joint, minidom.Element) and joint.tagName == "axis":  # SDF.
+            joint = joint.parentNode
+        if isinstance(joint, minidom.Element):
+            yield joint.getAttribute("name"), mimic.getAttribute("joint")
+    for equality in document.getElementsByTagName("equality"):  # MJCF.
+        for pair in equality.getElementsByTagName("joint"):
+            if pair.hasAttribute("joint2"):
+                yield pair.getAttribute("joint1"), pair.getAttribute("joint2")
