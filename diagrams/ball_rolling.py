@@ -186,6 +186,7 @@ def add_ball_rolling(
     sampled: bool = False,
     hybrid: HybridConfig | None = None,
     station: Diagram | None = None,
+    follow_hard: bool = False,
 ) -> None:
     """Adds and connects all but what leads from the task to the arm: that is
     connect_reference's, or another diagram's.
@@ -193,7 +194,8 @@ def add_ball_rolling(
     Args: sampled: of the station's sensors, StationConfig; hybrid: of the arm's force
         control, which nothing here asks for; station, in place of the simulated world:
         it has the sensors' ports, but may lack the truth and the wrench, and have ball
-        positions (`ball.p_WB`, `ball.v_WB`, `ball.seen`) in place of pictures.
+        positions (`ball.p_WB`, `ball.v_WB`, `ball.seen`) in place of pictures;
+        follow_hard: of the arm's reference.
     """
     check_own(config, _OWN)
     model, model_scene = controller_model(config)
@@ -233,7 +235,7 @@ def add_ball_rolling(
     else:
         c3_settings = c3_config(config.planner, n_lam, projection)
         target = task = _add_cycle(builder, config, model, n_lam, p_tip)
-        reference_settings = ArmReferenceConfig()
+        reference_settings = ArmReferenceConfig(follow_hard=follow_hard)
     c3 = builder.AddNamedSystem("c3_mpc", C3Mpc(c3_settings, CONTROL, OFFSET["c3"]))
     reference = builder.AddNamedSystem(
         "arm_reference",
@@ -317,7 +319,6 @@ def add_ball_rolling(
     connect(c3, "lam", reference, "lam")
     connect(c3, "status", reference, "status")
     connect(lcs["command"], "lcs", reference, "lcs")
-    connect(estimator, "tip_force", reference, "tip_force")
     if not samples:
         connect(task, "feel", reference, "feel")
     connect(station, f"{ARM}.position_measured", impedance, "q")
@@ -619,7 +620,8 @@ def task_name(diagram: Diagram | DiagramBuilder) -> str:
 
 
 def connect_reference(builder: DiagramBuilder) -> None:
-    """The task's own reposition, and the reference straight to the arm."""
+    """The task's own reposition, the force as the joints feel it, and the reference
+    straight to the arm."""
     task, reference, arm = (
         builder.GetSubsystemByName(name)
         for name in (task_name(builder), "arm_reference", "impedance_controller")
@@ -627,4 +629,6 @@ def connect_reference(builder: DiagramBuilder) -> None:
     builder.Connect(
         task.GetOutputPort("reference"), reference.GetInputPort("reference")
     )
+    estimator = builder.GetSubsystemByName("state_estimator")
+    wiring.connect(builder, estimator, "tip_force", reference, "tip_force")
     connect_command(builder, reference, arm)

@@ -23,6 +23,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import (
     ConstantVectorSource,
     LogVectorOutput,
+    MatrixGain,
     Multiplexer,
 )
 
@@ -359,7 +360,7 @@ def make_gentle_rolling(
     builder = _Freezer(freeze)
     if not config.gentle:
         hybrid = None
-    add_ball_rolling(builder, ball, meshcat, True, hybrid, station)
+    add_ball_rolling(builder, ball, meshcat, True, hybrid, station, config.gentle)
     if config.gentle:
         _add_touch(builder, config, ball)
     else:
@@ -490,6 +491,13 @@ def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) ->
         "wrench_tare", "wrench", "contact_detector", "mode_detector",
         "forward_model_bank", (impedance, "wrench_measured"),
     )  # fmt: skip
+    # Whether a push touches the ball: the wrist feels it better than the joints.
+    add("felt_force", MatrixGain(np.eye(3, 6)))
+    builder.Connect(
+        builder.GetSubsystemByName("wrench_tare").GetOutputPort("wrench_mean"),
+        builder.GetSubsystemByName("felt_force").get_input_port(),
+    )
+    connect("felt_force", "y0", ("arm_reference", "tip_force"))
     connect("velocity_shaper", "direction", "contact_detector")
     connect("velocity_shaper", "force_directions", "contact_detector",
             "reference_blend")  # fmt: skip

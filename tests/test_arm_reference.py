@@ -12,6 +12,12 @@ from makebreak.systems.arm.numerics.arm_reference import (
     no_nearer,
     on_the_line,
 )
+from makebreak.systems.contact_mpc.numerics.ball_state import (
+    P_BALL,
+    P_TIP,
+    V_BALL,
+    V_TIP,
+)
 from makebreak.systems.contact_mpc.numerics.lcs import LCS
 from makebreak.systems.contact_mpc.numerics.rolling_task import REPOSITION, ROLL
 
@@ -237,6 +243,25 @@ def test_a_tip_that_has_lost_its_contact_goes_down_and_with_the_ball():
     found["needs it not"] = x_desired[[0, 7, 9]]
     for felt in (1.0, 3.0, None, "needs it not"):  # In contact, or without a feeling.
         np.testing.assert_allclose(found[felt], [3e-4, 0.012, 0.0], atol=2e-6)
+
+
+@pytest.mark.parametrize(("felt", "lost"), [(-1.0, 1.0), (0.5, 0.5), (3.0, 0.0)])
+def test_a_tip_that_has_lost_a_hard_ball_goes_towards_it_and_pushes_on(felt, lost):
+    """C3 has it climb over the ball; from 3 cm behind and 4 cm above."""
+    x_next = np.zeros(19)
+    x_next[P_TIP], x_next[P_BALL] = [1e-4, 0.0, 2e-4], [0.0301, 0.0, -0.0398]
+    v_tip, v_ball = np.array([0.006, 0.002, 0.005]), np.array([0.002, 0.0, 0.0])
+    x_next[V_TIP], x_next[V_BALL] = v_tip, v_ball
+    x_desired, _ = run(
+        ROLL, x_next, [0.0], 0.012499, tip_force=felt, follow_hard=True
+    )  # fmt: skip
+    n = np.array([-0.6, 0.0, 0.8])
+    v = v_tip - lost * ((v_tip - v_ball) @ n + 0.015) * n
+    np.testing.assert_allclose(x_desired[7:10], v, atol=3e-6)
+    p = x_next[P_TIP] + 0.0125 * (v - v_tip)
+    np.testing.assert_allclose(x_desired[:3], p, atol=3e-6)
+    if lost == 1.0:
+        assert (v - v_ball) @ n == pytest.approx(-0.015, abs=1e-12)
 
 
 def test_a_tip_that_feels_nothing_yet_goes_slowly():

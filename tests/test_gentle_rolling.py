@@ -410,6 +410,23 @@ def test_nothing_but_what_a_robot_measures_reaches_a_controller(running):
                 and w[2] in ("contact_anticipator", "push_motion")]  # fmt: skip
 
 
+def test_a_push_is_told_what_the_wrist_feels(running):
+    """Of a port that the reference can do without: a loose one fails nowhere else."""
+    diagram, context = running.diagram, running.context
+    felt, wrench = (
+        system.GetOutputPort(port).Eval(system.GetMyContextFromRoot(context))
+        for system, port in (
+            (diagram.GetSubsystemByName("felt_force"), "y0"),
+            (diagram.GetSubsystemByName("wrench_tare"), "wrench_mean"),
+        )
+    )
+    np.testing.assert_array_equal(felt, wrench[:3])
+    reference = diagram.GetSubsystemByName("arm_reference")
+    port = reference.GetInputPort("tip_force")
+    own = reference.GetMyContextFromRoot(context)
+    np.testing.assert_array_equal(port.Eval(own), felt)
+
+
 def test_any_half_can_be_left_out():
     for gentle in (True, False):
         for adapt in (True, False):

@@ -26,6 +26,7 @@ from makebreak.systems.contact_mpc.numerics.rolling_task import (
     surface_height,
     target_over_horizon,
 )
+from makebreak.systems.contact_mpc.numerics.untouched_ball import UntouchedBall
 from makebreak.systems.contact_mpc.rolling_task import RollingTask, RollingTaskConfig
 
 PATH = CirclePath(np.array([0.5, 0.0]), 0.1)
@@ -307,6 +308,42 @@ def test_only_a_ball_that_is_hidden_is_pushed_on(valid, outside, phase):
     context.SetAbstractState(0, pushes)
     simulator.AdvanceTo(0.1)
     assert system.GetOutputPort("phase").Eval(context)[0] == phase
+
+
+@pytest.mark.parametrize(
+    ("slope", "windows", "landed", "feels"),
+    [
+        (0.0, 20, True, False),
+        (0.06, 20, True, True),
+        (0.06, 20, False, False),
+        (0.0, 0, True, True),  # Nothing is known yet.
+    ],
+)
+def test_a_gentle_push_feels_for_a_ball_that_may_roll_away(
+    slope, windows, landed, feels
+):
+    """Untouched windows as on a table that slopes or not; c of 0.035 m/s2."""
+    system = RollingTask(RollingTaskConfig(), 6, 0.1, R_BALL, R_TIP, 8, 4, 0.05)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    ball = np.array([0.5, 0.1, R_BALL])
+    tip = ball + [0.0, 0.0, R_BALL + R_TIP]
+    x = pack(tip, np.zeros(3), ball, np.zeros(3), R_BALL)
+    for name, value in (("x", x), ("valid", [1.0]), ("r_comp", np.zeros(8))):
+        system.GetInputPort(name).FixValue(context, value)
+    if landed:
+        system.GetInputPort("landed").FixValue(context, [0.0])
+    seen = UntouchedBall(
+        normal=windows * np.eye(3),
+        moment=windows * np.array([slope, 0.0, 0.035]),
+        windows=windows,
+    )
+    pushes = TaskState(ROLL, 0.0, tip, np.zeros(3), np.zeros(3))
+    for k, value in enumerate((pushes, seen)):
+        context.SetAbstractState(k, value)
+    simulator.AdvanceTo(DT / 2)
+    assert system.GetOutputPort("phase").Eval(context)[0] == ROLL
+    assert (system.GetOutputPort("feel").Eval(context)[0] == 1.0) == feels
 
 
 def radii_aimed_at(distance, integral_sec, valid=1.0):

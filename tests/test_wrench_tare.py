@@ -88,6 +88,22 @@ def test_a_motion_that_speeds_up_or_turns_is_no_time_to_tare():
     assert after(noisy(400), steady)[STATUS] == TARED
 
 
+def test_a_tip_that_follows_something_is_tared_too():
+    """A finger above a ball that rolls is steady over half a second, not over 0.1 s."""
+    t = 1e-3 * np.arange(600)
+    mass, swing, w = 0.3, 0.02, 2.0 * np.pi * 2.3  # [kg], [m/s], [rad/s]
+    follows = np.zeros((600, 6))
+    follows[:, 0] = 0.05 + swing * np.sin(w * t)
+    wrench = noisy(600)
+    wrench[:, 0] -= mass * swing * w * np.cos(w * t)  # Up to 0.09 N.
+    windows = follows[100:, 0] - follows[:-100, 0]
+    assert np.median(abs(windows)) > 0.005  # STEADY over 0.1 s.
+    memory = after(wrench, follows)
+    assert memory[STATUS] == TARED
+    # The inertia of STEADY, and 3 x 0.1/sqrt(100).
+    np.testing.assert_allclose(bias_of(memory), TRUE_BIAS, atol=0.015 + 0.03)
+
+
 def test_drift_is_followed_in_free_space_and_kept_under_pressure():
     rate = np.array([0.02, -0.01, 0.0, 0.0, 0.0, 0.0])
     t = 1e-3 * np.arange(20000)[:, None]

@@ -13,7 +13,13 @@ from makebreak.systems.arm.numerics.arm_reference import (
     on_the_line,
     pose_and_wrench,
 )
-from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_TIP, V_BALL, V_TIP
+from makebreak.systems.contact_mpc.numerics.ball_state import (
+    N_X,
+    P_BALL,
+    P_TIP,
+    V_BALL,
+    V_TIP,
+)
 from makebreak.systems.contact_mpc.numerics.lcs import LCS
 from makebreak.systems.contact_mpc.numerics.rolling_task import ROLL
 from makebreak.systems.numerics.first_calls import first_call
@@ -37,6 +43,10 @@ class ArmReferenceConfig:
     # Force from which on a tip that feels for the ball has found it [N]. Without effect
     # where contacts are sampled.
     follow_force: float = 1.0
+    # Whether a tip that feels for the ball moves at follow_speed towards its centre,
+    # and across that line as C3 has it: for a ball that is hard and smooth;
+    # gentle_rolling sets it. Without effect where contacts are sampled.
+    follow_hard: bool = False
     # Largest speed while the tip follows C3 and feels less than touch_force: it may
     # touch earlier than planned, and the impact grows with the speed [m/s].
     touch_speed: float = np.inf
@@ -79,8 +89,8 @@ class ArmReference(LeafSystem):
     The fed-forward force alone moves a well damped tip by some mm/s: too slow for the
     dents of an object that rolls by under it, and without contact C3's tip runs ahead
     of the ball. So a tip that has to feel for the ball and measures no force moves down
-    and along with the ball until it does. (On a hard and smooth ball, which does not
-    need this, it would hop.)
+    and along with the ball until it does. (On a hard ball it would hop on the spot:
+    there it pushes on meanwhile, see follow_hard.)
 
     Inputs:  phase (1,), reference (9,) of RollingTask or PushTask; x_next (19,), lam
              (n_lam,), status (1,) of C3; lcs (abstract): the LCS of C3's command;
@@ -166,10 +176,17 @@ class ArmReference(LeafSystem):
             if self._feel.HasValue(context) and self._feel.Eval(context)[0] > 0.5:
                 felt = self._tip_force.Eval(context)[2]
                 lost = 1.0 - min(max(felt / c.follow_force, 0.0), 1.0)
-                change = lost * (x_next[V_BALL][:2] - v[:2])
-                p[:2] += change * c.period_sec
-                v[:2] += change
-                v[2] -= lost * c.follow_speed
+                change = np.zeros(3)
+                if c.follow_hard:
+                    n = x_next[P_TIP] - x_next[P_BALL]
+                    n /= max(np.sqrt(n @ n), 1e-9)
+                    away = (v - x_next[V_BALL]) @ n
+                    change = -lost * (away + c.follow_speed) * n
+                else:
+                    change[:2] = lost * (x_next[V_BALL] - v)[:2]
+                    v[2] -= lost * c.follow_speed
+                p += change * c.period_sec
+                v += change
             v[2] = max(v[2], -c.down_max)
             if c.height is not None:
                 p[2], v[2], force[2] = c.height, 0.0, 0.0

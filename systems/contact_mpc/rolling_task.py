@@ -65,8 +65,9 @@ class RollingTask(LeafSystem):
              ends when this is 1, instead of after its time.
     Outputs: x_desired ((N + 1) 19,) for C3; reference (9,) = p, v, a of the tip at the
              next tick, used unless rolling; phase (1,): 0 roll, 1 reposition, 2 wait,
-             3 approach; feel (1,): 1 while the tip pushes a ball that did not coast as
-             a ball should, so that the tip has to feel for it; downhill (2,) [m/s2]:
+             3 approach; feel (1,): 1 while the tip has to feel for the ball that it
+             pushes: one that did not coast as a ball should, or, with `landed`, one
+             that is not known to wait where it is left; downhill (2,) [m/s2]:
              the slope's acceleration of a ball that does not wait where nobody touches
              it, zero for one that may; waits (1,): 1 if the ball is known to stay where
              it is left.
@@ -189,7 +190,11 @@ class RollingTask(LeafSystem):
             int(self._reference), np.concatenate([task.p, task.v, task.a])
         )
         discrete.set_value(int(self._phase), [float(task.phase)])
-        pushes = task.feel and task.phase == ROLL
+        # A tip that was landed by others may bounce. C3 does not know that a ball may
+        # roll away by itself, and where that is the right way it sees no reason to
+        # touch it again.
+        may_leave = landed is not None and not waits(ball)
+        pushes = (task.feel or may_leave) and task.phase == ROLL
         discrete.set_value(int(self._feel), [float(pushes)])
         discrete.set_value(int(self._shift), [shift])
 

@@ -2,9 +2,11 @@
 
 Where nothing touches the tool the wrench is the sensor's bias: its mean over a window
 of WINDOW_SEC in which the motion presses on nothing and the tip rests or moves
-steadily. (The tool's own inertia, 0.3 kg times STEADY, is 15 mN.) Later windows follow
-the drift, by no more than a sensor may drift in a window. So a contact that nobody
-knows of, or the first milliseconds of an expected one, is not taken for a bias.
+steadily. (The tool's own inertia, 0.3 kg times STEADY, is 15 mN.) The first window goes
+on until it is steady as a whole: a tip that follows something never is for WINDOW_SEC,
+but over half a second. Later windows follow the drift, by no more than a sensor may
+drift in a window. So a contact that nobody knows of, or the first milliseconds of an
+expected one, is not taken for a bias.
 
 Nothing is subtracted before the first window is complete. A first mean larger than
 bias_max is no bias but a contact: the run has begun in it, and waits for free space.
@@ -35,6 +37,7 @@ TARED, NOT_TARED, REFUSED, BAD_WRENCH = range(4)
 
 SKIP_SEC = 0.01  # At the start: nothing is known of a sensor that is late.
 WINDOW_SEC = 0.1
+WINDOW_MOST_SEC = 1.0  # Of the first one.
 STEADY = 0.05  # Of the tip, mean acceleration over a window [m/s2].
 TURNING = 0.05  # Faster than that, a tool's moment changes [rad/s].
 LEFT = 1.0  # More than that beyond the bias is a contact, no drift [N].
@@ -174,9 +177,11 @@ def tick(law, memory, wrench, velocity, force_directions):
     if seconds < WINDOW_SEC - 1e-9:
         return m
     mean = m[_SUM : _SUM + 6] / m[_N]
-    m[_N] = 0.0
     if np.sum((velocity[:3] - m[_V : _V + 3]) ** 2) > (STEADY * seconds) ** 2:
+        if known or seconds > WINDOW_MOST_SEC:
+            m[_N] = 0.0
         return m
+    m[_N] = 0.0
     off = mean - bias_of(m)
     force = np.sqrt(np.sum(off[:3] ** 2))
     if not known and force > law.bias_max:
