@@ -2,11 +2,14 @@
 
 import copy
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 from gap_benchmark.cases import cases, make, write
+from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import Box, Cylinder
+from pydrake.math import RotationMatrix
 
 from makebreak.gap.numerics.free_body import lowest_gap, simulate
 from makebreak.gap.simulation.face_supports import centres_of, within_faces
@@ -155,21 +158,26 @@ def test_corners_and_inner_points_turn_as_a_face_that_presses_evenly():
             np.testing.assert_allclose(got, want, rtol=tol)
 
 
-def test_a_box_has_spheres_at_its_corners_and_within_its_faces(scene, tmp_path):
-    (tmp_path / "brick.sdf").write_text(
+def with_brick(scene, folder, effects=()):
+    """The scene with a box of 0.2 x 0.1 x 0.06 m in the place of the cube."""
+    (folder / "brick.sdf").write_text(
         '<sdf version="1.9"><model name="brick"><link name="brick"><collision name="c">'
         "<geometry><box><size>0.2 0.1 0.06</size></box></geometry></collision></link>"
         "</model></sdf>"
     )
     brick = copy.deepcopy(scene.directives[-1])
-    brick.add_model.name, brick.add_model.file = "brick", f"file://{tmp_path}/brick.sdf"
+    brick.add_model.name, brick.add_model.file = "brick", f"file://{folder}/brick.sdf"
+    return replace(
+        scene, directives=[*scene.directives[:-1], brick],
+        initial=type(scene.initial)(), effects=list(effects),
+    )  # fmt: skip
+
+
+def test_a_box_has_spheres_at_its_corners_and_within_its_faces(scene, tmp_path):
     hard = Effect(
         "contact_stiffness", ["brick.brick~ground.ground"], {"stiffness": 1e6}
     )
-    numbers = FreeBodyScene(
-        replace(scene, directives=[*scene.directives[:-1], brick],
-                initial=type(scene.initial)(), effects=[hard])
-    )  # fmt: skip
+    numbers = FreeBodyScene(with_brick(scene, tmp_path, [hard]))
     assert numbers.has_faces
     body = numbers.body()
     assert lowest_gap(body, np.array([1, 0, 0, 0, 0, 0, 5.0])) == pytest.approx(
@@ -181,3 +189,17 @@ def test_a_box_has_spheres_at_its_corners_and_within_its_faces(scene, tmp_path):
     face = numbers.body().pairs[:, 0, 0].sum() / 2.0
     weight = body.mass * np.linalg.norm(body.gravity)
     assert weight / face == pytest.approx(REST_DEPTH)
+
+
+def test_a_box_lands_on_corners_as_sharp_as_it_has(scene, tmp_path):
+    """Rounded by 2 mm, as those of what lies on a face may be, corners let a cube that
+    lands on one turn otherwise; that a real one's are sharp then looked like a gap."""
+    body = FreeBodyScene(with_brick(scene, tmp_path)).body()
+    floor = body.fixed[0, 11] + body.fixed[0, 14]
+    q = np.array([0.8, 0.3, -0.4, 0.33])
+    q /= np.linalg.norm(q)
+    corners = np.array(list(product((-1, 1), repeat=3))) * [0.1, 0.05, 0.03]
+    lowest = (corners @ RotationMatrix(Quaternion(q)).matrix().T)[:, 2].min()
+    gap = lowest_gap(body, np.array([*q, 0.0, 0.0, floor + 0.2]))
+    # Spheres of 0.01 mm stand in for the corners.
+    np.testing.assert_allclose(gap, 0.2 + lowest, atol=1e-5)

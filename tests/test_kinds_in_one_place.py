@@ -41,6 +41,7 @@ KNOWN = {
         "contact_friction", "friction_patch", "object_size", "plane_height",
         "plane_tilt", "wall_position",
     },
+    "gap/residuals/felt_places.py": {"plane_height", "plane_tilt", "wall_position"},
     "gap/residuals/pressing.py": {
         "contact_friction", "contact_stiffness", "friction_patch", "plane_height",
         "plane_tilt", "wall_position",

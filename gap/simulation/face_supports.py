@@ -28,7 +28,7 @@ from pydrake.multibody.tree import BodyIndex
 
 RADIUS = 2e-3  # Of a sphere [m], or this share of a small shape's least half size.
 SHARE = 0.2
-POINT = 1e-5  # Of a sphere at the corner of a tool, which may be tilted [m].
+POINT = 1e-5  # Of a sphere at a corner that lands, or presses, by itself [m].
 RIM = 12  # Spheres along a cylinder's rim.
 MOST = 48  # Spheres of a hull; of more corners, every n-th has one.
 # Points within a face, beside those at its corners: at this share of the corners'
@@ -138,11 +138,11 @@ def centres_of(
     return None
 
 
-def within_faces(shape) -> np.ndarray:
+def within_faces(shape, largest: float = RADIUS) -> np.ndarray:
     """(n, 4) spheres within the faces of a box or of a cylinder's ends: centre in the
     shape's frame and radius [m], as centres_of() has them at the corners; none for
     others."""
-    found = centres_of(shape)
+    found = centres_of(shape, largest=largest)
     if found is None:
         return np.zeros((0, 4))
     corners, radius = found

@@ -14,6 +14,7 @@ from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.free_body import FreeBody
 from makebreak.gap.simulation.face_supports import (
     INNER,
+    POINT,
     RIM,
     centres_of,
     within_faces,
@@ -130,12 +131,12 @@ class FreeBodyScene:
             if isinstance(shape, Sphere):
                 each = [(SPHERE, [0.0, 0.0, 0.0, shape.radius()])]
             else:
-                corners = centres_of(shape, self._on_side)
+                corners = centres_of(shape, self._on_side, POINT)
                 if corners is None:
                     raise DoesNotFit(f"a {type(shape).__name__} of a free body")
                 each = [(CORNER, [*p, corners[1]]) for p in corners[0]]
                 if not (self._on_side and isinstance(shape, Cylinder)):
-                    each += [(WITHIN, list(s)) for s in within_faces(shape)]
+                    each += [(WITHIN, list(s)) for s in within_faces(shape, POINT)]
                     inner = 1.0 if isinstance(shape, Box) else RIM / INNER
             if isinstance(shape, Cylinder):
                 self.axes.append(X.rotation().col(2))
