@@ -10,12 +10,14 @@ from gap_benchmark.cart_world import PAIR
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import Screen
+from makebreak.gap.residuals.fixed_faces import PASSED
 from makebreak.gap.residuals.impacts import (
     FREE_SEC,
     MOST_FREE,
     ImpactProblem,
     runs_against,
 )
+from makebreak.gap.residuals.pressing import PressingProblem, presses
 from makebreak.gap.workflow import problem_for, run_gap
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
@@ -169,3 +171,41 @@ def test_from_files_to_what_is_missing(tmp_path, seed, hidden):
     expected = {_PARAMETER.get(n, n): getattr(true, n) for n in hidden}
     assert found == pytest.approx(expected, rel=0.03)
     assert result.verdict == ("gap_named" if hidden else "no_gap")
+
+
+def test_a_wall_that_stands_elsewhere_is_found_by_what_runs_against_it(tmp_path):
+    scene_file, file, _ = ran(tmp_path, 3, 5.0)
+    wall = tmp_path / "wall.sdf"
+    text = wall.read_text()
+    for model, shown in (("-0.35", "-0.354"), ("0.35", "0.346")):  # True: + 4 mm.
+        text = text.replace(f"<pose>{model} ", f"<pose>{shown} ")
+    wall.write_text(text)
+    scene, recordings = read_scene(scene_file), read_recordings([file])
+    problem, _ = problem_for(scene, recordings, SceneDynamics(scene))
+    assert isinstance(problem, ImpactProblem)
+    n = problem.nuisances()
+    screen = Screen(problem.base(), n.columns, n.prior, problem.train())
+    start = fit_effects(problem, screen, [])
+    found = [c for c in problem.candidates(n, start) if c.kind == "wall_position"]
+    assert [c.at for c in found] == [("wall.wall",)]
+    end = fit_effects(problem, screen, [Effect("wall_position", ["wall.wall"],
+                                               {"x": 0.003})])  # fmt: skip
+    # The encoder's noise is 0.01 mm; a touch of the softest wall here is 20 times that.
+    assert end.effects[0].parameters["x"] == pytest.approx(0.004, abs=1e-4)
+    assert np.sqrt(np.mean(end.r**2)) < 1.1 < np.sqrt(np.mean(start.r**2))
+
+
+def test_a_soft_bumper_that_is_struck_is_not_pressed_on(tmp_path):
+    """A strike goes deeper than a tool that presses may be in a face; that the face is
+    elsewhere does not follow, as no touch there lasts."""
+    cart = cart_world.Cart(stiffness=1500.0)
+    table, noise = cart_world.record(cart, np.random.default_rng(4), 8.0, 250.0)
+    scene = read_scene(cart_world.write(tmp_path, cart, table, noise))
+    recordings = read_recordings([tmp_path / "recording.csv"])
+    deep = np.abs(table["cart.rail.position"]).max() - (cart.reach - cart.half)
+    assert deep > 2.0 * PASSED
+    dynamics = SceneDynamics(scene)
+    assert PressingProblem(scene, recordings).off  # What made it one that is pressed.
+    assert not presses(dynamics, recordings)
+    problem, _ = problem_for(scene, recordings, dynamics)
+    assert isinstance(problem, ImpactProblem)

@@ -139,6 +139,19 @@ class FeltPlaces(FixedFaces):
             Effect("wall_position", [self.shapes.names[k]], by) for k, by in of.items()
         ]
 
+    def touches_where_felt(self) -> np.ndarray:
+        """(n_rows,) whether a face is touched that is felt elsewhere, where it is."""
+        poses = self._poses_at(self._q)
+        for e in self._displacing(self.off):
+            (k,) = [k for k, name in self.shapes.names.items() if name == e.at[0]]
+            R, p = poses[k]
+            poses[k] = R, p + [e.parameters.get(a, 0.0) for a in AXES]
+        found = np.zeros(len(self._q), bool)
+        for s in self.shapes.slots(poses, MEETS):
+            if {s.a, s.b} & set(self.off):
+                found |= s.phi < MEETS
+        return found
+
     def _felt_faces(self) -> dict[int, dict[str, float]]:
         """{body: {axis: by how far [m]}} of faces that are off and felt, or passed."""
         left = [f for f in self.faces if abs(f.off) > SAME]

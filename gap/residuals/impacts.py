@@ -25,6 +25,7 @@ from makebreak.gap.simulation.windows import Window, WindowModel, with_step
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.contact import CONTACT_LAW, DAMPER, DISSIPATION, STIFFNESS
+from makebreak.models.effects.ground import PLACE
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import Scene
 from makebreak.systems.numerics.smoother import smooth_filtered
@@ -42,6 +43,7 @@ DRAWS = 3  # Of uncertain starts.
 BLUR = 0.003  # Of how far a channel goes in a window: laws are no better.
 TRIED = (0.2, 0.4, 0.7, 0.9, 1.15, 1.7, 2.6, 4.5)  # Times what the scene has.
 DAMPED = (0.02, 0.06, 0.12, 0.25, 0.5, 1.0)  # Of critical damping: a linear damper's.
+PLACES = (-0.02, -0.008, -0.003, 0.003, 0.008, 0.02)  # Of a wall, tried [m].
 SMALL = 0.2  # First trial of an effect on joints, of the efforts there.
 REACH = 3.0
 
@@ -386,8 +388,25 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
 
     def _pairs(self) -> list[str]:
         """Links and walls that come near each other."""
+        return list(self._near())
+
+    def _met_axes(self) -> list[tuple[str, str]]:
+        """Walls, and the axes of the world along which they are met."""
         assert self.shapes is not None
-        found = {}
+        anchored = self.shapes.anchored
+        fixed = {name for k, name in self.shapes.names.items() if k in anchored}
+        found = {
+            (at, "xyz"[int(np.argmax(across))]): True
+            for pair, across in self._near().items()
+            for at in pair.split("~") if at in fixed
+        }  # fmt: skip
+        return list(found)
+
+    def _near(self) -> dict[str, np.ndarray]:
+        """{pair of a link and a wall that come near each other: (3,) how much of the
+        way between them is along each axis}."""
+        assert self.shapes is not None
+        found: dict[str, np.ndarray] = {}
         for recording in self.recordings:
             q = positions(self.dynamics, recording)
             q = q[:: max(len(q) // LOOKS, 1)]
@@ -395,8 +414,10 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
             for s in self.shapes.slots(poses, NEAR):
                 if (s.a in self.shapes.anchored) != (s.b in self.shapes.anchored):
                     a, b = (s.a, s.b) if s.b in self.shapes.anchored else (s.b, s.a)
-                    found[f"{self.shapes.names[a]}~{self.shapes.names[b]}"] = True
-        return list(found)
+                    pair = f"{self.shapes.names[a]}~{self.shapes.names[b]}"
+                    across = np.abs(s.normal[s.phi < NEAR]).sum(axis=0)
+                    found[pair] = found.get(pair, np.zeros(3)) + across
+        return found
 
     def _try(self, there: Sequence[Effect], effect: Effect) -> np.ndarray | None:
         try:
@@ -407,7 +428,9 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
     def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
         found = []
         taken = {(e.kind, at) for e in current.effects for at in e.at}
-        for kind, at, name, trials in [*self._of_contacts(), *self._of_joints()]:
+        for kind, at, name, trials in [
+            *self._of_contacts(), *self._of_places(), *self._of_joints(),
+        ]:  # fmt: skip
             if (kind, at) in taken:
                 continue
             columns, readers = [], []
@@ -445,6 +468,11 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
             critical = 2.0 * stiffness * float(np.median(self._touch_sec)) / np.pi
             values = [share * critical for share in DAMPED]
             yield DAMPER, at, "damping", [(c, c) for c in values]
+
+    def _of_places(self):
+        for at, axis in self._met_axes():
+            if at in self.dynamics.places(PLACE):
+                yield PLACE, at, axis, [(x, x) for x in PLACES]
 
     def _of_joints(self):
         """Kinds with one parameter, at each joint."""

@@ -92,9 +92,17 @@ def presses(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
         return False
     try:
         some = excerpt(recordings, ASKED_SEC, ASKED_ROWS)
-        return bool(PressingProblem(dynamics.loaded.scene, some).off)
+        problem = PressingProblem(dynamics.loaded.scene, some)
     except DoesNotFit:
         return False
+    # What merely runs against a face goes in deeper, the harder it strikes: that is no
+    # place at which the face is.
+    touching, first, lasting = problem.touches_where_felt(), 0, 0
+    for track in problem.tracks:
+        last = first + len(track.time)
+        lasting += _rows_of_lasting(touching[first:last], track.time)
+        first = last
+    return lasting > FELT_SHARE * len(touching)
 
 
 def _rows_of_lasting(touching: np.ndarray, time: np.ndarray) -> int:

@@ -63,6 +63,8 @@ def _tilt(effect: Effect, plant: MultibodyPlant, scene_graph: SceneGraph) -> Non
         _move(effect, plant, scene_graph, body, moved)
 
 
+PLACE = "wall_position"
+
 KINDS = {
     "plane_height": EffectKind(
         at="ground",
@@ -73,7 +75,7 @@ KINDS = {
         tell_apart="rest on several faces, or use a second object of another size",
         before_finalize=_lift,
     ),
-    "wall_position": EffectKind(
+    PLACE: EffectKind(
         at="ground",
         parameters=tuple(
             Parameter(a, "m", -0.2, 0.2, 0.0, optional=True) for a in "xyz"
