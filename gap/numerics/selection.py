@@ -12,6 +12,8 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import chi2, wilcoxon
 
+from makebreak.gap.numerics.runs import starts_of_runs
+
 _PENALTIES = 10.0 ** np.arange(-4.0, 2.0)  # Of a ridge, times the number of rows.
 
 
@@ -300,7 +302,7 @@ def by_block(x, train) -> np.ndarray:
     """Sums of x (m,) over blocks of time: the stretches of rows that `train` (m,) has
     in one piece."""
     train = np.asarray(train, bool)
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(train.astype(int))) + 1])
+    starts = starts_of_runs(train)
     return np.add.reduceat(np.asarray(x, float), starts)
 
 
@@ -323,7 +325,7 @@ def paired_t(one, two, train, channel) -> float:
     of time (the stretches of rows that are not `train`): of each block the mean over
     channels of the log of the ratio of their rms. 0 for fewer than four blocks."""
     train, channel = np.asarray(train, bool), np.asarray(channel)
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(train.astype(int))) + 1])
+    starts = starts_of_runs(train)
     ends, gains = [*starts[1:], len(train)], []
     for a, b in zip(starts, ends, strict=True):
         if train[a]:

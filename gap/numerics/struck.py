@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from makebreak.gap.numerics.runs import runs_of
 from makebreak.systems.numerics.filters import Stage
 from makebreak.systems.numerics.smoother import smooth_filtered
 
@@ -40,10 +41,7 @@ def struck_rows(
         found = np.abs(s.x[:, 2]) > sure
         if usual > least and found.any():
             near = np.convolve(found, np.ones(2 * beside + 1), "same") > 0.5
-            edges = np.flatnonzero(np.diff(np.r_[1, near, 1]))
-            left += [
-                (a + i, a + j) for i, j in zip(edges[::2], edges[1::2], strict=True)
-            ]
+            left += [(a + i, a + j) for i, j in runs_of(~near)]
         elif b - a == len(t) or SURE * usual > 0.5 * least:
             found = np.abs(s.x[:, 2]) > least
         struck[a:b] |= found

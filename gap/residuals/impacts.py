@@ -16,6 +16,7 @@ from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.pieces import part_of
 from makebreak.gap.data.recording import FEWEST_ROWS, Episode, Recording
 from makebreak.gap.does_not_fit import DoesNotFit
+from makebreak.gap.numerics.runs import runs_of
 from makebreak.gap.problem import Candidate, Fitted, Nuisances, SearchPlan
 from makebreak.gap.residuals.contact_candidates import reader_of_trial
 from makebreak.gap.residuals.mechanism import link_changes
@@ -116,11 +117,10 @@ def _apart(dynamics: SceneDynamics, shapes, recording: Recording):
         some |= bool(near.any())
         for k in np.flatnonzero(near):
             near |= np.abs(time - time[k]) < BESIDE_SEC
-        edges = np.flatnonzero(np.diff(np.concatenate([[1], near, [1]]).astype(int)))
         seconds += float(np.median(np.diff(time)) * near.sum())
-        for number, (a, b) in enumerate(zip(edges[::2], edges[1::2], strict=True)):
+        for number, (a, b) in enumerate(runs_of(~near)):
             if b - a >= FEWEST_ROWS and time[b - 1] - time[a] >= LEAST_SEC:
-                first, last = episode.first + int(a), episode.first + int(b)
+                first, last = episode.first + a, episode.first + b
                 episodes.append(
                     Episode(episode.number, first, last, episode.stretch + number)
                 )
@@ -232,8 +232,7 @@ class ImpactWindows(WindowModel):
             return
         q = positions(self.dynamics, recording)[episode.rows]
         near = nearest(self.shapes, self.dynamics, q) < 0.0
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], near, [0]]).astype(int)))
-        touches = list(zip(edges[::2], edges[1::2], strict=True))
+        touches = runs_of(near)
         # Free stretches, and the states in them: a smoother across a touch blurs both.
         names = self._signals()
         paths = {name: np.zeros((len(time), 3)) for name in names}

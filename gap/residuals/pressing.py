@@ -15,6 +15,7 @@ import numpy as np
 from makebreak.gap.data.pieces import excerpt
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.does_not_fit import DoesNotFit
+from makebreak.gap.numerics.runs import runs_of
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate, Fitted, Nuisances
 from makebreak.gap.residuals.contact_dynamics import THIN
@@ -107,11 +108,7 @@ def presses(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
 
 def _rows_of_lasting(touching: np.ndarray, time: np.ndarray) -> int:
     """How many rows (n,) are in touches that last."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], touching, [0]]).astype(int)))
-    return sum(
-        int(b - a) for a, b in zip(edges[::2], edges[1::2], strict=True)
-        if time[b - 1] - time[a] > LASTS_SEC
-    )  # fmt: skip
+    return sum(b - a for a, b in runs_of(touching) if time[b - 1] - time[a] > LASTS_SEC)
 
 
 class PressingProblem(FeltPlaces):

@@ -16,6 +16,7 @@ import numpy as np
 
 from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.does_not_fit import DoesNotFit
+from makebreak.gap.numerics.runs import runs_of
 from makebreak.gap.simulation.contact_shapes import ContactShapes, poses_of
 from makebreak.gap.simulation.face_supports import LiesOn, add_supports
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
@@ -127,14 +128,13 @@ class PushWindows(WindowModel):
         self._paths[i, episode.first] = {"time": time, **states}
         rests = np.ones(len(time), bool)
         for body in self.bodies:
-            for a in (*TURN, "x", "y", "z"):
-                if (name := f"{body}.{a}") in states:
-                    limit = RESTS * (10.0 if a in TURN else 1.0)
+            for axis in (*TURN, "x", "y", "z"):
+                if (name := f"{body}.{axis}") in states:
+                    limit = RESTS * (10.0 if axis in TURN else 1.0)
                     rests &= np.abs(states[name][:, 1]) < limit
         # Stretches of rest that end in motion.
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], rests, [0]]).astype(int)))
         found = []
-        for a, b in zip(edges[::2], edges[1::2], strict=True):
+        for a, b in runs_of(rests):
             if b >= len(time) or time[b] - time[a] < REST_SEC + BEFORE_SEC:
                 continue
             k = int(np.searchsorted(time, time[b] - BEFORE_SEC))

@@ -15,6 +15,7 @@ from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.free_body import FreeBody, lowest_gap, placed, simulate
 from makebreak.gap.numerics.free_flight import fit_flight, turned_by
+from makebreak.gap.numerics.runs import runs_of
 from makebreak.gap.numerics.struck import struck_rows
 from makebreak.gap.simulation.free_body import FreeBodyScene
 from makebreak.gap.simulation.windows import TURN, WindowedResidual, spin_of
@@ -176,8 +177,8 @@ class FreeBodyModel(WindowedResidual):
         if any(np.isfinite(y).sum() < FEWEST_ROWS for y in values.values()):
             return
         rough = np.zeros(len(time), bool)
-        for a in _PLACE:
-            c = f"{self.name}.{a}"
+        for axis in _PLACE:
+            c = f"{self.name}.{axis}"
             stages = recording.channels[c].stages or ()
             noise = recording.channels[c].noise
             rough |= struck_rows(
@@ -190,8 +191,7 @@ class FreeBodyModel(WindowedResidual):
         for k in hit:  # What a filter remembers of it is gone after a while.
             gone = int(np.searchsorted(time, time[k] + 4.0 * late))
             near[max(k - BESIDE, 0) : gone + BESIDE + 1] = True
-        edges = np.flatnonzero(np.diff(np.concatenate([[1], near, [1]]).astype(int)))
-        for a, b in zip(edges[::2], edges[1::2], strict=True):
+        for a, b in runs_of(~near):
             before = int(np.sum(np.diff(rough[:a].astype(int), prepend=0) == 1))
             self._cut_segment(
                 i, recording, episode, time, values, a, b, rough, number, before
