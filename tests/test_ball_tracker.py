@@ -500,14 +500,14 @@ def test_a_saved_context_replays_bit_for_bit():
     "config, message",
     [
         (dict(ball_radius=0.0), "ball_radius must be positive, got 0.0"),
-        (dict(ball_radius=np.nan), "ball_radius must be positive, got nan"),
+        (dict(ball_radius=np.nan), "ball_radius is nan, expected a number"),
         (dict(position_std=-1e-3), "position_std must be positive, got -0.001"),
         (dict(acceleration_density=0.0), "acceleration_density must be positive"),
         (dict(driven_density=-1.0), "driven_density is -1.0, expected 0 or more"),
         (dict(driven_sec=0.0), "driven_sec must be positive, got 0.0"),
         (dict(table_z=0.9), "the camera at height 0.8 must be above the ball"),
         (dict(hue=np.inf), "hue must be finite, got inf"),
-        (dict(period_sec=0.0), "period_sec must be positive, got 0.0"),
+        (dict(period_sec=0.0), "period_sec is 0.0, expected a positive time"),
     ],
 )
 def test_a_tracker_that_cannot_be_is_refused_by_name(config, message):

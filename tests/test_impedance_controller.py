@@ -40,7 +40,11 @@ from makebreak.systems.arm.numerics.impedance_controller import (
     rotation_error,
     rotation_of,
 )
-from makebreak.systems.arm.numerics.joint_limits import EFFORT_LIMITED, RATE_LIMITED
+from makebreak.systems.arm.numerics.joint_limits import (
+    EFFORT_LIMITED,
+    JOINT_BRAKED,
+    RATE_LIMITED,
+)
 from makebreak.systems.arm.numerics.packed import packed
 from makebreak.systems.arm.numerics.serial_chain import chain_state, tip_kinematics
 
@@ -324,6 +328,22 @@ def test_effort_limit_is_reached_and_said(law, chain):
     assert np.abs(tau / EFFORT).max() == 1.0
 
 
+@pytest.mark.parametrize("delay", [np.nan, np.inf, -1.0])
+def test_a_delay_that_is_no_time_counts_as_none_and_is_said(law, chain, delay):
+    """At 2 rad/s near the end of its range a joint is braked all the same."""
+    args = packed(chain), packed(law)
+    q, v = law.q_nominal.copy(), np.zeros(7)
+    q[0], v[0] = law.q_upper[0] - 0.05, 2.0
+    gains = law.stiffness, law.damping, 0.0, np.zeros(6)
+    start = chain_state(chain, q, v).bias, np.zeros(memory_size(7)), q, v, reference()
+    *others, none = NO_FORCE
+    tau, status, _ = packed_tick(*args, *start, *gains, *others, delay)
+    without, status_without, _ = packed_tick(*args, *start, *gains, *others, none)
+    assert status_without & JOINT_BRAKED
+    assert status == status_without | REFERENCE_HELD
+    np.testing.assert_array_equal(tau, without)
+
+
 @pytest.mark.parametrize("which", ["q", "v"])
 def test_nan_sensors_ramp_to_carrying_the_arm(law, chain, which):
     still = np.zeros(7)
@@ -603,9 +623,9 @@ def test_a_delay_bounds_the_damping_of_the_tips_position(plant, chain):
     [
         ({"stiffness": [1.0] * 5}, "stiffness is .* expected 6 numbers"),
         ({"damping": [-1.0] * 6}, "damping is .* expected 6 numbers"),
-        ({"stiffness": [np.nan] * 6}, "stiffness is .* expected 6 numbers"),
+        ({"stiffness": [np.nan] * 6}, r"stiffness\[0\] is nan, expected a number"),
         ({"posture_stiffness": -1.0}, "posture_stiffness is -1.0"),
-        ({"period_sec": 0.0}, "period_sec is 0.0, expected > 0"),
+        ({"period_sec": 0.0}, "period_sec is 0.0, expected a positive time"),
     ],
 )
 def test_bad_configs_are_refused(plant, change, words):

@@ -1289,7 +1289,7 @@ def test_bad_kinds_of_contact_are_refused_in_one_line(ball_diagram):
         with pytest.raises(ValueError, match=message):
             AnitescuLcs(ball_diagram, pairs, closest=closest)
 
-    refused("finger_link~ball_link: contact_model is 'st', exp", contact_model="st")
+    refused("finger_link~ball_link.contact_model is 'st', exp", contact_model="st")
     refused("stiffness is 0.0, expected a positive number", stiffness=0.0)
     refused("stiffness is inf, expected a positive", stiffness=np.inf)
     refused("closest is 3, expected an integer from 1 to 2", 3)

@@ -325,6 +325,17 @@ def test_a_sensor_that_drops_out_is_said_and_changes_nothing(bad):
     assert all(mode == known or known == 0 for _, known, mode, _, _ in changes)
 
 
+def test_a_sensor_of_a_wider_range_is_used_to_its_limit():
+    """A tool that is pressed with 400 N, as for grinding."""
+    slide = Slide([0.2, 0.5], [0.3], seed=2)
+    tuning = ModeTuning(crossing=0.03, wrench_limit=1000.0)
+    rows = follow(slide, tuning, 20.0, normal=lambda _: 400.0)
+    assert not any(memory.status == BAD_WRENCH for *_, memory in rows)
+    check_changes(slide, rows, 0.4, 0.4)
+    held = follow(slide, ModeTuning(crossing=0.03), 2.0, normal=lambda _: 400.0)
+    assert held[-1][2].status == BAD_WRENCH
+
+
 def test_a_blow_is_an_anomaly_and_leaves_the_mode():
     """Algorithm 1: high stiffness for a moment, then on with the same model."""
     slide = Slide([0.3], [], length=2.0)

@@ -491,7 +491,7 @@ def test_marker_is_followed_in_place_of_an_outline():
     ("changes", "message"),
     [
         (dict(position_std=0.0), "position_std is 0.0, expected above 0"),
-        (dict(yaw_std=np.nan), "yaw_std is nan, expected above 0"),
+        (dict(yaw_std=np.nan), "yaw_std is nan, expected a number"),
         (dict(hue=np.inf), "hue is inf, expected a number"),
         (dict(z=0.9), "the camera at height 0.8 must be above the object"),
     ],

@@ -648,13 +648,13 @@ def test_arrays_may_stand_for_lists():
         (dict(n_b=2.5), "n_b is 2.5, expected an integer"),
         (dict(n_steps=np.inf), "n_steps is inf"),
         (dict(groups=[[1]]), "entry 1"),
-        (dict(groups=[[0.5]]), "entry 0.5"),
-        (dict(groups=[0]), "expected lists of entries"),
-        (dict(Q_d=[1.0, np.nan]), r"Q_d is \[1.0, nan\], expected 2 weights"),
+        (dict(groups=[[0.5]]), r"groups\[0\]\[0\] is 0.5, expected an integer"),
+        (dict(groups=[0]), r"groups\[0\] is 0, expected a list"),
+        (dict(Q_d=[1.0, np.nan]), r"Q_d\[1\] is nan, expected a number"),
         (dict(Q_d=[np.inf, 1.0]), "Q_d"),
         (dict(Q_d=[0.0, 0.0]), "not all 0"),
         (dict(Q_d=["a", 1.0]), "Q_d"),
-        (dict(eps="1"), "eps is 1, expected a positive number"),
+        (dict(eps="1"), "eps is '1', expected a number"),
     ],
 )
 def test_wrong_settings_are_refused_by_name(changes, message):

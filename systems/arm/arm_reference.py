@@ -23,6 +23,7 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
 from makebreak.systems.contact_mpc.numerics.lcs import LCS
 from makebreak.systems.contact_mpc.numerics.rolling_task import ROLL
 from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 
@@ -108,6 +109,7 @@ class ArmReference(LeafSystem):
 
     def __init__(self, config: ArmReferenceConfig, n_lam: int, p_tip, lcs: LCS):
         super().__init__()
+        check_settings(config)
         if not config.follow_force > 0.0:
             raise ValueError(
                 f"follow_force is {config.follow_force}, expected more than 0"

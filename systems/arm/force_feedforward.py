@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.systems.framework import Context, LeafSystem
 
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 
@@ -35,6 +36,7 @@ class ForceFeedforward(LeafSystem):
 
     def __init__(self, config: ForceFeedforwardConfig):
         super().__init__()
+        check_settings(config)
         for name, value in vars(config).items():
             if not (0.0 < value < np.inf or (name == "offset_sec" and value == 0.0)):
                 raise ValueError(f"{name} is {value}, expected > 0")

@@ -19,6 +19,7 @@ from makebreak.systems.arm.numerics.impedance_controller import (
 from makebreak.systems.arm.numerics.packed import packed
 from makebreak.systems.arm.numerics.serial_chain import SerialChain, chain_state
 from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 # Largest damping over (mass of the tip / delay). Damping alone is unstable above pi/2;
@@ -92,8 +93,9 @@ class ImpedanceController(LeafSystem):
     NaN, tau changes, at
     that rate, to the torque that carries the arm and slows it down, qdd = -20/s qd,
     with the measured entries and predictions of the others from their last good values.
-    If the reference is NaN (or a stiffness or damping negative), the last good pose is
-    held at rest. `status` reports these cases.
+    If the reference is NaN, the last good pose is held at rest. A stiffness or damping
+    that is NaN or negative is replaced by the config's, a delay that is no time by 0.
+    `status` reports these cases.
 
     Inputs:  q (n,) [rad], v (n,) [rad/s]; x_desired (19,) = [p_WE 3, quaternion wxyz 4,
              v 3, w 3, a 3, alpha 3] of E in the world. Optional:
@@ -128,7 +130,9 @@ class ImpedanceController(LeafSystem):
         hybrid: HybridConfig | None = None,
     ):
         super().__init__()
+        check_settings(config)
         hybrid = HybridConfig() if hybrid is None else hybrid
+        check_settings(hybrid)
         for name, number in vars(hybrid).items():
             least = name in ("closing_speed", "ramp_sec", "release_sec")
             if not (number > 0.0 if least else number >= 0.0):
@@ -201,7 +205,8 @@ class ImpedanceController(LeafSystem):
         self._delay = self.DeclareVectorInputPort("delay", 1)
         at_rest = chain_state(self._packed[0][0], q_nominal, np.zeros(n))
         mobility = at_rest.J[:3] @ np.linalg.solve(at_rest.M, at_rest.J[:3].T)
-        self._mass = 1.0 / np.diag(mobility)  # Of the tip along each axis [kg].
+        with np.errstate(divide="ignore"):  # Infinite where the arm cannot move it.
+            self._mass = 1.0 / np.diag(mobility)  # Of the tip along each axis [kg].
         # The initial torque carries the arm at its nominal position.
         carrying = chain_state(self._packed[0][0], q_nominal, np.zeros(n)).bias
         self._tau = self.DeclareDiscreteState(carrying)
@@ -236,7 +241,7 @@ class ImpedanceController(LeafSystem):
         delay = 0.0
         if self._delay.HasValue(context):
             delay = float(self._delay.Eval(context)[0])
-        if ratio == 0.0 and delay > self._law.period:  # Each tick has one.
+        if ratio == 0.0 and self._law.period < delay < math.inf:  # Each tick has one.
             damping = np.array(damping)
             most = DELAY_DAMPING_MAX * self._mass / delay
             damping[:3] = np.minimum(damping[:3], most)

@@ -14,6 +14,7 @@ from makebreak.systems.arm.numerics.surface_alignment import (
     warm_up,
 )
 from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 
@@ -47,6 +48,7 @@ class SurfaceAlignment(LeafSystem):
 
     def __init__(self, config: SurfaceAlignmentConfig):
         super().__init__()
+        check_settings(config)
         if not 0.0 < config.angle_max_deg <= 5.0:
             raise ValueError(
                 f"angle_max_deg is {config.angle_max_deg}, expected 0 to 5"

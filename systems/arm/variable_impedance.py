@@ -13,6 +13,7 @@ from makebreak.systems.arm.numerics.variable_impedance import (
 )
 from makebreak.systems.changing_contact.numerics.contact_task import N_PHASE
 from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 # Filter of the feed-forward while a learned model is handed over [s]: its prediction
@@ -84,6 +85,7 @@ class VariableImpedance(LeafSystem):
 
     def __init__(self, config: VariableImpedanceConfig):
         super().__init__()
+        check_settings(config)
         stiffness = config.stiffness
         for name in ("free", "maximum", "impact", "rotational"):
             if not 0.0 < getattr(stiffness, name) < np.inf:

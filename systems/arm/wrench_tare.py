@@ -18,6 +18,7 @@ from makebreak.systems.arm.numerics.wrench_tare import (
     warm_up,
 )
 from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 
@@ -68,6 +69,7 @@ class WrenchTare(LeafSystem):
 
     def __init__(self, config: WrenchTareConfig):
         super().__init__()
+        check_settings(config)
         for name, value in vars(config).items():
             positive = name in ("wrench_limit", "period_sec")
             if not (0.0 < value if positive else 0.0 <= value) or value == np.inf:

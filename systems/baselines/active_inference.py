@@ -6,6 +6,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from makebreak.systems.baselines.numerics.active_inference import MEMORY, tick
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 HELD, AT_LIMIT = 1, 2  # Bits of the status.
@@ -44,6 +45,7 @@ class ActiveInference(LeafSystem):
         offset_sec: float = 0.0,
     ):
         super().__init__()
+        check_settings(config)
         c = config
         variance = np.array(c.variance, dtype=float)
         if variance.shape != (4,) or not np.all(variance > 0.0):

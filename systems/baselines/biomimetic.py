@@ -11,6 +11,7 @@ from makebreak.systems.baselines.numerics.biomimetic import (
     force_command,
     no_gains,
 )
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 HELD, AT_LIMIT = 1, 2  # Bits of the status.
@@ -57,6 +58,7 @@ class Biomimetic(LeafSystem):
         offset_sec: float = 0.0,
     ):
         super().__init__()
+        check_settings(config)
         c = config
         rates = np.array(c.rates, dtype=float)
         if rates.shape != (3,) or not np.all((rates >= 0.0) & np.isfinite(rates)):

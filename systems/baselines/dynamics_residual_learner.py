@@ -13,6 +13,7 @@ from makebreak.systems.baselines.numerics.dynamics_residual import (
     with_dynamics_residual,
 )
 from makebreak.systems.contact_mpc.numerics.lcs import LCS
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 
@@ -59,6 +60,7 @@ class DynamicsResidualLearner(LeafSystem):
     ):
         """Args: lcs: an example of the input's LCS, with the dt period_sec."""
         super().__init__()
+        check_settings(config)
         if config.n_b < 1:
             raise ValueError(f"n_b is {config.n_b}, expected 1 or more")
         if abs(lcs.dt - period_sec) > 1e-9 * lcs.dt:

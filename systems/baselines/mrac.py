@@ -6,6 +6,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from makebreak.systems.baselines.numerics.mrac import MEMORY, error_weights, tick
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 HELD, AT_LIMIT = 1, 2  # Bits of the status.
@@ -46,6 +47,7 @@ class Mrac(LeafSystem):
         offset_sec: float = 0.0,
     ):
         super().__init__()
+        check_settings(config)
         c = config
         for name, number in (
             ("omega", c.omega),

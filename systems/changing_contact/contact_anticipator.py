@@ -52,6 +52,7 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
     ContactBelief,
     ExpectedContact,
 )
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 HISTORY = 150  # Poses kept: 1.5 s at 100 Hz.
@@ -219,6 +220,7 @@ class KalmanContactAnticipator(LeafSystem):
         Raises: ValueError for numbers in config that are not positive.
         """
         super().__init__()
+        check_settings(config)
         self._filter, self._speed = replace(config.filter), replace(config.speed)
         numbers = {**vars(config.filter), **vars(config.speed)}
         for name, value in numbers.items():
@@ -235,8 +237,6 @@ class KalmanContactAnticipator(LeafSystem):
             )
         if self._speed.growth < 1.0:
             raise ValueError(f"growth is {self._speed.growth}, expected 1 or more")
-        if not config.period_sec > 0.0:
-            raise ValueError(f"period_sec is {config.period_sec}, expected > 0")
         if not 0.0 <= config.hint_lead_sec < np.inf:
             raise ValueError(
                 f"hint_lead_sec is {config.hint_lead_sec}, expected 0 or more"

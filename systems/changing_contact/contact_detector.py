@@ -14,6 +14,7 @@ from makebreak.systems.changing_contact.numerics.contact_detector import (
 )
 from makebreak.systems.changing_contact.numerics.contact_task import N_CONTACT, N_PHASE
 from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 
@@ -61,6 +62,7 @@ class ContactDetector(LeafSystem):
         """Raises: ValueError for a number that is not positive (tool_mass, offset_sec:
         that is negative) or a period above 2 ms."""
         super().__init__()
+        check_settings(config)
         for name, value in vars(config).items():
             may_be_zero = name in ("tool_mass", "offset_sec")
             if not (0.0 < value or may_be_zero and value == 0.0) or value == np.inf:

@@ -22,6 +22,7 @@ from makebreak.systems.changing_contact.numerics.forward_model import (
     warm_up,
 )
 from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.settings import check_settings, check_times
 from makebreak.systems.numerics.timing import timed
 
 # From the reference to the arm: half of this period, a tick, and the filter of what is
@@ -109,6 +110,8 @@ class ForwardModelBank(LeafSystem):
         """Raises: ValueError for a setting out of its range, and for knowledge over
         other entries or of another number of components."""
         super().__init__()
+        check_settings(config)
+        check_times("ForwardModelBank", period_sec, offset_sec)
         for name in ("wrench_limit", "error_unknown"):
             if not 0.0 < getattr(config, name) < np.inf:
                 raise ValueError(
@@ -128,8 +131,6 @@ class ForwardModelBank(LeafSystem):
                     f"handover.{name} is {getattr(config.handover, name)}, expected a "
                     "number of 0 or more"
                 )
-        if not period_sec > 0.0:
-            raise ValueError(f"period_sec is {period_sec}, expected > 0")
         self._tuning = BankTuning(
             mixtures=bank_tuning(config.with_torque, tau_nov=config.tau_nov),
             with_torque=bool(config.with_torque),

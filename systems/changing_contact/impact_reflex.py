@@ -13,6 +13,7 @@ from makebreak.systems.changing_contact.numerics.impact_reflex import (
     warm_up,
 )
 from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 
@@ -44,6 +45,7 @@ class ImpactReflex(LeafSystem):
 
     def __init__(self, config: ImpactReflexConfig):
         super().__init__()
+        check_settings(config)
         for name, least in (
             ("gain", 0.0),
             ("force_least", 0.0),

@@ -19,6 +19,7 @@ from makebreak.systems.changing_contact.numerics.mode_detector import (
 )
 from makebreak.systems.changing_contact.numerics.mode_table import ModeTable, no_modes
 from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.settings import check_settings, check_times
 from makebreak.systems.numerics.timing import timed
 
 
@@ -42,6 +43,8 @@ class ModeDetectorConfig:
     torque_arm: float = 0.0
     # Mass between force sensor and tip, whose inertia is subtracted [kg].
     tool_mass: float = 0.3
+    # Force or moment at which the sensor saturates [N], [N m].
+    wrench_limit: float = 200.0
 
 
 class ModeDetector(LeafSystem):
@@ -87,6 +90,8 @@ class ModeDetector(LeafSystem):
         """Raises: ValueError for a setting out of its range, and for knowledge of
         another feature or threshold."""
         super().__init__()
+        check_settings(config)
+        check_times("ModeDetector", period_sec, offset_sec)
         self._tuning = _checked(config, period_sec)
         table = no_modes(self._tuning.n_features, self._tuning.threshold)
         if knowledge is not None:
@@ -170,6 +175,7 @@ def _checked(config: ModeDetectorConfig, period_sec: float) -> ModeTuning:
         ("normal_force_min", np.nextafter(0.0, 1.0)),
         ("torque_arm", 0.0),
         ("tool_mass", 0.0),
+        ("wrench_limit", np.nextafter(0.0, 1.0)),
     ):
         if not least <= getattr(c, name) < np.inf:
             bound = "a positive number" if least else "a number of 0 or more"
@@ -189,4 +195,5 @@ def _checked(config: ModeDetectorConfig, period_sec: float) -> ModeTuning:
         torque_arm=float(c.torque_arm),
         tool_mass=float(c.tool_mass),
         period=float(period_sec),
+        wrench_limit=float(c.wrench_limit),
     )

@@ -29,6 +29,7 @@ from makebreak.systems.changing_contact.numerics.push_motion import (
 )
 from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL, P_TIP, V_BALL
 from makebreak.systems.contact_mpc.numerics.rolling_task import REPOSITION, CirclePath
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 NEAR = 0.005  # Farther apart tip and ball, as modelled, do not touch [m].
@@ -111,6 +112,7 @@ class PushMotion(LeafSystem):
         offset_sec: float = 0.0,
     ):
         super().__init__()
+        check_settings(config)
         _check(config)
         self._config, self._path, self._period = replace(config), path, period_sec
         self._radii = radius_ball, radius_tip

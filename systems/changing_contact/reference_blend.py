@@ -22,6 +22,7 @@ from makebreak.systems.changing_contact.numerics.reference_blend import (
 )
 from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL, P_TIP, V_TIP
 from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 SPEED_MIN = 1e-3  # [m/s] A slower reference has no direction.
@@ -57,6 +58,7 @@ class ReferenceBlend(LeafSystem):
 
     def __init__(self, config: ReferenceBlendConfig):
         super().__init__()
+        check_settings(config)
         for name in ("blend_sec", "damping", "damping_impact", "period_sec"):
             if not 0.0 < getattr(config, name) < np.inf:
                 raise ValueError(f"{name} is {getattr(config, name)}, expected > 0")

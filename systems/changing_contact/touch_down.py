@@ -25,6 +25,7 @@ from makebreak.systems.contact_mpc.numerics.outline import (
     outline_of,
 )
 from makebreak.systems.contact_mpc.numerics.push_task import CONTACT
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 
@@ -52,6 +53,7 @@ class TouchDown(LeafSystem):
         offset_sec: float = 0.0,
     ):
         super().__init__()
+        check_settings(config, "touch")
         _check(config)
         self._config, self._shape, self._dt = config, shape, period_sec
         self._x = self.DeclareVectorInputPort("x", N_X)

@@ -31,6 +31,7 @@ from makebreak.systems.changing_contact.numerics.velocity_shaper import (
     warm_up,
 )
 from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 
@@ -130,6 +131,7 @@ class VelocityShaper(LeafSystem):
         restarts: bool = False,
     ):
         super().__init__()
+        check_settings(config)
         self._law = law = _law(config)
         if not 0.0 < plan_sec < np.inf:
             raise ValueError(f"plan_sec is {plan_sec}, expected > 0")

@@ -33,6 +33,7 @@ from makebreak.systems.contact_mpc.numerics.lcs import (
     is_finite_model,
 )
 from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.settings import check_settings, check_times
 from makebreak.systems.numerics.timing import timed
 
 
@@ -98,6 +99,8 @@ class C3Mpc(LeafSystem):
 
     def __init__(self, config: C3Config, period_sec: float, offset_sec: float = 0.0):
         super().__init__()
+        check_settings(config)
+        check_times("C3Mpc", period_sec, offset_sec)
         if not config.residual_dt_sec > 0.0:
             raise ValueError(
                 f"C3Config.residual_dt_sec is {config.residual_dt_sec}, expected > 0"

@@ -19,6 +19,7 @@ from makebreak.systems.contact_mpc.numerics.contact_sampling import (
 from makebreak.systems.contact_mpc.numerics.lcs import is_finite
 from makebreak.systems.contact_mpc.numerics.plan_scores import score_plans
 from makebreak.systems.contact_mpc.numerics.push_task import CONTACT, errors
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 PLACES_MAX = 1000  # Candidate places in a round.
@@ -91,6 +92,7 @@ class ContactSampler(LeafSystem):
         shape: ObjectShape,
     ):
         super().__init__()
+        check_settings(config)
         _check(config)
         self._config, self._model, self._shape = config, model, shape
         self._problem = p = problem

@@ -18,6 +18,7 @@ from makebreak.systems.contact_mpc.multibody.contact_pair import (
     StewartTrinkle,
 )
 from makebreak.systems.contact_mpc.numerics.c3_plan import Plan
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 __all__ = [
@@ -71,6 +72,7 @@ class AnitescuLcsBuilder(LeafSystem):
 
     def __init__(self, diagram, config: LcsBuilderConfig):
         super().__init__()
+        check_settings(config)
         c = config
         if c.knots != int(c.knots) or c.knots < 0:
             raise ValueError(

@@ -16,6 +16,7 @@ from makebreak.systems.contact_mpc.numerics.rolling_task import (
     RollingConfig,
     shifted,
 )
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 AWAY = 0.001  # Distance of the tip's target from the ball, so that it is no push [m].
@@ -72,6 +73,7 @@ class PathTarget(LeafSystem):
         residual_dt_sec: float,
     ):
         super().__init__()
+        check_settings(config)
         c = config
         if np.shape(c.center) != (2,) or not np.isfinite(c.center).all():
             raise ValueError(f"path.center is {c.center}, expected 2 numbers")

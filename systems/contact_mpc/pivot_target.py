@@ -11,6 +11,7 @@ from makebreak.systems.contact_mpc.numerics.pivot_target import (
     pivot_target,
     share_of_rate,
 )
+from makebreak.systems.numerics.settings import check_settings
 
 
 @dataclass
@@ -41,6 +42,7 @@ class PivotTarget(LeafSystem):
 
     def __init__(self, config: PivotTargetConfig, dt_sec: float, N: int):
         super().__init__()
+        check_settings(config)
         c = config
         for name in ("side", "finger_radius", "rate"):
             if not 0.0 < getattr(c, name) < np.inf:

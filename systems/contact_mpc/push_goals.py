@@ -11,6 +11,7 @@ from makebreak.systems.contact_mpc.numerics.push_task import (
     errors,
     heading,
 )
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 
@@ -76,6 +77,7 @@ class PushGoals(LeafSystem):
 
     def __init__(self, config: PushGoalsConfig, goals, fold: int = 1):
         super().__init__()
+        check_settings(config)
         _check(config)
         self._config = config
         self._goals = np.array(goals, dtype=float)

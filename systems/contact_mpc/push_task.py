@@ -16,6 +16,7 @@ from makebreak.systems.contact_mpc.numerics.push_task import (
     look_ahead,
     next_push,
 )
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 
@@ -50,6 +51,7 @@ class PushTask(LeafSystem):
 
     def __init__(self, config: PushTaskConfig, n_knots: int, shape: ObjectShape, p_tip):
         super().__init__()
+        check_settings(config)
         for name in ("speed", "acceleration", "descent", "margin", "look_ahead",
                      "look_ahead_angle", "unseen_sec", "believed_sec",
                      "nearest", "farthest", "bearing"):  # fmt: skip

@@ -29,6 +29,7 @@ from makebreak.systems.contact_mpc.numerics.residual_posterior import (
     updated,
 )
 from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.settings import check_settings, check_times
 from makebreak.systems.numerics.timing import timed
 
 
@@ -176,6 +177,8 @@ class ResidualLearner(LeafSystem):
         Raises: ValueError for a setting out of range, or gamma above the bound of F.
         """
         super().__init__()
+        check_settings(config)
+        check_times("ResidualLearner", period_sec, offset_sec)
         lcs = _first(lcs)
         self._config = config = _checked(config, lcs, period_sec)
         self._dt, self._sizes = lcs.dt, (lcs.n_x, lcs.n_u, lcs.n_lam)

@@ -10,6 +10,7 @@ from pydrake.systems.framework import LeafSystem
 from pydrake.systems.sensors import ImageRgba8U
 
 from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 from makebreak.systems.perception.numerics import constant_velocity, interacting_models
 from makebreak.systems.perception.numerics.ball_tracker import (
@@ -78,6 +79,7 @@ class BallTracker(LeafSystem):
 
     def __init__(self, config: BallTrackerConfig, camera: Pinhole):
         super().__init__()
+        check_settings(config)
         for name in (
             "ball_radius",
             "position_std",

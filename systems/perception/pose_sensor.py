@@ -8,6 +8,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import LeafSystem
 
 from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 from makebreak.systems.perception.numerics import interacting_models
 from makebreak.systems.perception.numerics.pose_filter import (
@@ -66,6 +67,7 @@ class PoseSensor(LeafSystem):
 
     def __init__(self, config: PoseSensorConfig, body: int, seed: int = 0):
         super().__init__()
+        check_settings(config)
         for name in ("noise", "density"):
             values = getattr(config, name)
             if len(values) != 2 or not all(v >= 0.0 for v in values):

@@ -10,6 +10,7 @@ from pydrake.systems.framework import LeafSystem
 from pydrake.systems.sensors import ImageRgba8U
 
 from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 from makebreak.systems.perception.numerics import constant_velocity
 from makebreak.systems.perception.numerics.aruco_marker import find_marker
@@ -110,6 +111,7 @@ class PoseTracker(LeafSystem):
         Raises: ValueError for a setting out of range.
         """
         super().__init__()
+        check_settings(config)
         for name in (
             "position_std",
             "yaw_std",

@@ -9,6 +9,7 @@ from makebreak.systems.arm.numerics.packed import packed
 from makebreak.systems.arm.numerics.serial_chain import SerialChain
 from makebreak.systems.contact_mpc.numerics.ball_state import V_TIP, pack
 from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 from makebreak.systems.perception.numerics.state_estimator import (
     estimate,
@@ -57,6 +58,7 @@ class StateEstimator(LeafSystem):
         Raises: ValueError for a setting out of range.
         """
         super().__init__()
+        check_settings(config)
         if not config.ball_radius > 0.0 or not config.tip_mass > 0.0:
             raise ValueError(
                 "ball_radius and tip_mass must be positive, got "

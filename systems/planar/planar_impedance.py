@@ -14,6 +14,7 @@ from makebreak.systems.changing_contact.numerics.igmm import (
     warm_up,
 )
 from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 from makebreak.systems.planar.numerics.planar_impedance import (
     ForceModel,
@@ -96,6 +97,7 @@ class PlanarImpedance(LeafSystem):
         offset_sec: float = 0.0,
     ):
         super().__init__()
+        check_settings(config)
         c = config
         for name, number in (
             ("stiffness_free", c.stiffness_free),

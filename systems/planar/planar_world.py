@@ -6,6 +6,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.planar.numerics.planar_world import (
     circle_target,
     external_force,
@@ -66,6 +67,7 @@ class PlanarWorld(LeafSystem):
 
     def __init__(self, config: PlanarWorldConfig, state, lead_sec: float = 1e-4):
         super().__init__()
+        check_settings(config)
         c = config
         for name, number in (
             ("mass", c.mass),
@@ -141,6 +143,7 @@ class CircleTarget(LeafSystem):
 
     def __init__(self, config: CircleTargetConfig):
         super().__init__()
+        check_settings(config)
         c = config
         for name in ("radius", "duration_sec"):
             if not 0.0 < getattr(c, name) < np.inf:

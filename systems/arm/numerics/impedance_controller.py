@@ -391,7 +391,8 @@ def tick(
 
     Args: tau (n,): of the last tick; memory: of memory_size; others as in
         impedance_torque and force_control; any of them may contain NaN. delay: from a
-        reading to the time when its torque acts [s].
+        reading to the time when its torque acts [s]; no time (NaN, negative, infinite)
+        counts as 0.
     Returns: tau (n,) within all limits, status (bits), memory.
     """
     n = q.shape[0]
@@ -427,6 +428,9 @@ def tick(
         status |= REFERENCE_HELD
     if not np.all(np.isfinite(wrench)):
         wrench = np.zeros(6)
+        status |= REFERENCE_HELD
+    if not 0.0 <= delay < np.inf:  # With NaN the brakes would do nothing.
+        delay = 0.0
         status |= REFERENCE_HELD
 
     kept = memory[2 * n + 10 : 2 * n + 18]

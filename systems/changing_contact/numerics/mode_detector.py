@@ -80,7 +80,6 @@ HINT_WAY = 0.015  # Beyond a crossing, until a hint must have come true [m].
 STIFF_SEC = 0.1  # After a departure, while the models follow the change.
 BATCH_MAX = 64
 TURNED = 0.98  # Cosine: another direction of pressing.
-WRENCH_LIMIT = 200.0  # At which the sensor saturates [N], [N m].
 
 
 class ModeTuning(NamedTuple):
@@ -94,6 +93,7 @@ class ModeTuning(NamedTuple):
     torque_arm: float = 0.0  # 0: the feature has no torque [m].
     tool_mass: float = 0.3  # [kg]
     period: float = 0.005  # [s]
+    wrench_limit: float = 200.0  # At which the sensor saturates [N], [N m].
 
     @property
     def n_features(self) -> int:
@@ -225,7 +225,8 @@ def detect(
     """
     rows = np.array(force_directions, dtype=float)
     values = np.concatenate([wrench, velocity[:3], rows, direction])
-    if not np.all(np.isfinite(values)) or np.max(np.abs(wrench)) >= WRENCH_LIMIT:
+    in_range = np.max(np.abs(wrench)) < tuning.wrench_limit
+    if not (np.all(np.isfinite(values)) and in_range):
         return replace(
             memory, ring=memory.ring[:0], over=0, strays=0, slow=0.0, status=BAD_WRENCH
         )

@@ -9,6 +9,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 
 from makebreak.systems.contact_mpc.numerics.contact_rows import friction_edges
+from makebreak.systems.numerics.settings import check_settings
 
 
 @dataclass
@@ -84,6 +85,9 @@ def contacts_of(
     contacts: list[Contact] = []
     groups: list[tuple[np.ndarray, int]] = []
     for number, pair in enumerate(pairs):
+        if not isinstance(pair, ContactPair):
+            raise ValueError(f"pairs[{number}] is {pair!r}, expected a ContactPair")
+        check_settings(pair, f"ContactPair {pair.a}~{pair.b}")
         first = len(contacts)
         contacts += _combinations(number, pair, named)
         indices = np.arange(first, len(contacts))
@@ -145,9 +149,7 @@ def _check_pair(name: str, pair: ContactPair) -> tuple[np.ndarray, bool]:
     """
     if not (np.isfinite(pair.friction) and pair.friction >= 0.0):
         raise ValueError(f"{name}: friction is {pair.friction}, expected at least 0")
-    if pair.friction_directions != int(pair.friction_directions) or not (
-        pair.friction_directions >= 1
-    ):
+    if not pair.friction_directions >= 1:
         raise ValueError(
             f"{name}: friction_directions is {pair.friction_directions}, "
             "expected an integer of at least 1"
@@ -162,11 +164,6 @@ def _check_pair(name: str, pair: ContactPair) -> tuple[np.ndarray, bool]:
         raise ValueError(
             f"{name}: friction_directions is 1 without a direction, expected "
             "a plane_normal (of a plant in a plane) or a tangent"
-        )
-    if not isinstance(pair.contact_model, (Anitescu, StewartTrinkle)):
-        raise ValueError(
-            f"{name}: contact_model is {pair.contact_model!r}, expected "
-            "Anitescu() or StewartTrinkle()"
         )
     if pair.stiffness is not None and not 0.0 < pair.stiffness < np.inf:
         raise ValueError(
