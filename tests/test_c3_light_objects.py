@@ -9,12 +9,11 @@ import pytest
 from makebreak.scripts.bench_c3_light import problem_at, row
 from makebreak.scripts.bench_plants import OF_MASS, diagram_of, held_box
 from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs
-from makebreak.systems.contact_mpc.numerics.c3_bounds import (
+from makebreak.systems.contact_mpc.numerics.c3_active_set import MET, solve_active
+from makebreak.systems.contact_mpc.numerics.c3_bounds import within
+from makebreak.systems.contact_mpc.numerics.c3_interior import (
     IPM_STARTS,
-    MET,
-    solve_active,
     solve_interior,
-    within,
 )
 from makebreak.systems.contact_mpc.numerics.c3_mpc import solve_c3
 from makebreak.systems.contact_mpc.numerics.c3_qp import factor, new_factor, solve

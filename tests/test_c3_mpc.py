@@ -27,19 +27,18 @@ from makebreak.scripts.bench_c3 import (
 from makebreak.systems.contact_mpc.c3_mpc import C3Config, C3Mpc, C3Status
 from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs, ContactPair
 from makebreak.systems.contact_mpc.lcs_plant import LcsPlant
+from makebreak.systems.contact_mpc.numerics.c3_active_set import (
+    CANNOT_BE_MET,
+    MET,
+    solve_active,
+)
 from makebreak.systems.contact_mpc.numerics.c3_admm import (
     C3Failure,
     compiled_once,
     qp_step,
 )
-from makebreak.systems.contact_mpc.numerics.c3_bounds import (
-    CANNOT_BE_MET,
-    MET,
-    solve_active,
-    solve_bounded,
-    solve_interior,
-    within,
-)
+from makebreak.systems.contact_mpc.numerics.c3_bounds import solve_bounded, within
+from makebreak.systems.contact_mpc.numerics.c3_interior import solve_interior
 from makebreak.systems.contact_mpc.numerics.c3_mpc import (
     C3Bounds,
     C3Options,
