@@ -26,17 +26,21 @@ from makebreak.diagrams.wall_friction import (
 )
 from makebreak.scripts.experiments import wall_friction
 from makebreak.scripts.experiments.wall_friction import (
-    along_the_wall,
-    contact_time,
     force_trial,
     run,
-    share_in_band,
     simulated,
     tracking_error,
-    without_noise,
 )
 from makebreak.scripts.session import Session
 from makebreak.scripts.settings import apply_settings
+from makebreak.scripts.wall_friction_paper import _loop_rows
+from makebreak.scripts.wall_friction_score import (
+    FED,
+    along_the_wall,
+    contact_time,
+    share_in_band,
+    without_noise,
+)
 from makebreak.systems.baselines.long_term_predictor import OneStepPredictor
 from makebreak.systems.baselines.numerics.long_term_predictor import (
     LongTermPredictor,
@@ -289,19 +293,17 @@ def test_each_prediction_is_fed_forward_in_turn_and_scored(monkeypatch):
         ("ours", "known", ()),
         ("ours", None, ()),
     ]
-    fed = {
-        name: each[f"{name}_fed_rmse_N"] for name in wall_friction.FED if name != "none"
-    }
+    fed = {name: each[f"{name}_fed_rmse_N"] for name in FED if name != "none"}
     expected = dict(
         last=0.0, one_step=0.4, one_step_change=0.5, ours=0.3, ours_from_scratch=0.3
     )
     assert fed == {name: [pytest.approx(x)] for name, x in expected.items()}
-    assert all(len(each[f"tracking_error_{name}_m"]) == 1 for name in wall_friction.FED)
+    assert all(len(each[f"tracking_error_{name}_m"]) == 1 for name in FED)
 
 
 def test_reproduce_has_a_row_for_each_that_was_fed_forward(tmp_path):
-    each = {f"tracking_error_{name}_m": [0.001, 0.003] for name in wall_friction.FED}
-    each |= {f"{name}_fed_rmse_N": [0.2, 0.2] for name in wall_friction.FED}
+    each = {f"tracking_error_{name}_m": [0.001, 0.003] for name in FED}
+    each |= {f"{name}_fed_rmse_N": [0.2, 0.2] for name in FED}
     (tmp_path / "tested_trials.json").write_text(json.dumps(each))
     rows = []
 
@@ -313,8 +315,8 @@ def test_reproduce_has_a_row_for_each_that_was_fed_forward(tmp_path):
             rows.append(row)
 
     results = [{"out_dir": str(tmp_path)}, {"error": "failed"}]
-    wall_friction._loop_rows(Comparison(), results)
-    assert len(rows) == len(wall_friction.FED)
+    _loop_rows(Comparison(), results)
+    assert len(rows) == len(FED)
     assert rows[1][2].startswith("2.00 mm (1.00 to 3.00); predicts to 0.200 N, 0.173 N")
     assert "2 trials" in rows[0][0]
 

@@ -20,13 +20,10 @@ that of every variant of the baseline.
 Ours: everything that figure 1b does not show; docs/wall_friction.md says it all.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from time import perf_counter
 
-import matplotlib.pyplot as plt
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
@@ -36,7 +33,6 @@ from makebreak.diagrams.wall_friction import (
     DURATION,
     LAST,
     OURS,
-    TIMES,
     WallFrictionConfig,
     learned,
     make_wall_friction,
@@ -47,10 +43,22 @@ from makebreak.diagrams.wall_friction import (
 )
 from makebreak.diagrams.wiring import refuse_unused
 from makebreak.models.scene import read_scene
-from makebreak.scripts.comparison import Comparison
+from makebreak.scripts import wall_friction_paper
 from makebreak.scripts.criteria import Criteria
 from makebreak.scripts.session import Session
-from makebreak.scripts.table import Table
+from makebreak.scripts.wall_friction_plots import plot_forces, plot_joints
+from makebreak.scripts.wall_friction_score import (
+    EACH_FILE,
+    ONE_STEP,
+    SETS,
+    TIMES_FILE,
+    VARIED,
+    Y,
+    along_the_wall,
+    contact_time,
+    rms,
+    share_in_band,
+)
 from makebreak.systems.baselines.numerics.long_term_predictor import (
     LongTermPredictor,
     Prediction,
@@ -73,32 +81,9 @@ BENCH = {
 }
 
 BENCH_SEC = DURATION  # The plan's, of which all predictions are.
-
-VARIED = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]
-# name -> frictions of the wall, stiff controller, figure.
-SETS = {
-    "same": ([0.6], False, "11a"),
-    "varied": (VARIED, False, "11b"),
-    "stiff": (VARIED, True, "12"),
-}
-# One step ahead: name -> whether the GPs' output is the change of force.
-ONE_STEP = {"one_step": False, "one_step_change": True}
 FORCE_INPUTS = range(6)  # F and velocity; the position is for the SVM.
-Y = 1  # The axis along the wall.
-TIMES_FILE = "training_times.json"
-EACH_FILE = "tested_trials.json"  # Scores of each tested trial; the result has means.
-NOISE = 0.1  # Of the force sensor [N].
-# As many training trials as in the paper; no joints, which take most of the time.
-IN_LOOP = {"training.trials": 40, "training.tested": 5, "training.joints": False}
-FED = {
-    "none": "nothing",
-    "last": "the last force",
-    "one_step": "GP of the next force",
-    "one_step_change": "GP of its change",
-    "ours": "our forward models",
-    "ours_from_scratch": "ours, from nothing",
-}
-CONTACT_FORCE = 3.0  # [N] of the wall, by which pictures mark the contact.
+
+reproduce = wall_friction_paper.reproduce
 
 
 def run(config: WallFrictionConfig, session: Session) -> dict:
@@ -391,212 +376,3 @@ def from_the_start(predictor, trials, modes, u, T, seed) -> Prediction:
     covariance = np.cov(starts.T) + 1e-12 * np.eye(starts.shape[1])
     first = int(np.bincount([m[0] for m in modes]).argmax())
     return predict_long_term(predictor, starts.mean(0), covariance, u, T, first, seed)
-
-
-def along_the_wall(time) -> np.ndarray:
-    """Which samples are of the way along the wall."""
-    return (time >= TIMES[4]) & (time <= TIMES[5])
-
-
-def rms(values) -> float:
-    """Root of the mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
-def share_in_band(truth, mean, std) -> float:
-    """Share of the samples that are within two standard deviations of the mean."""
-    return float(np.mean(abs(truth - mean) <= 2.0 * std))
-
-
-def contact_time(data) -> float:
-    """When the wall is felt first [s]."""
-    felt = (data["wrench"][:, 0] < -CONTACT_FORCE) & (data["time"] > TIMES[2])
-    return float(data["time"][np.argmax(felt)])
-
-
-def plot_joints(ahead: dict[str, tuple]):
-    """Figures 11 and 12: joint 1, true and predicted from the start."""
-    figure, axes = plt.subplots(
-        1, 3, figsize=(15, 4.2), sharey=True, layout="constrained"
-    )
-    for ax, (name, values) in zip(axes, ahead.items(), strict=True):
-        time, q, mean, std, contact = values
-        frictions, is_stiff, number = SETS[name]
-        ax.fill_between(
-            time, mean - 2 * std, mean + 2 * std, alpha=0.3, label="2 std", color="C0"
-        )
-        ax.plot(time, mean, color="C0", label="predicted")
-        ax.plot(time, q, "k--", label="true")
-        ax.axvline(contact, color="0.4", ls=":")
-        learned_from = f"{frictions[0]} to {frictions[-1]}" if frictions[1:] else "0.6"
-        ax.set(
-            title=f"fig. {number}: learned at {learned_from}"
-            + (", stiff" if is_stiff else ""),
-            xlabel="time [s]",
-        )
-    axes[0].set_ylabel("joint 1 [rad]")
-    axes[0].legend(loc="upper left")
-    return figure
-
-
-def plot_forces(data, scratch, ahead):
-    """Figures 13 and 14: the force along the wall, true and predicted."""
-    figure, axes = plt.subplots(
-        2, 3, figsize=(15, 7.5), sharex=True, height_ratios=(2, 1), layout="constrained"
-    )
-    time, force = data["time"], data["wrench"][:, Y]
-    window, contact = along_the_wall(time), contact_time(data)
-    mean, std = (np.interp(time, ahead[0], values) for values in ahead[1:])
-    one = data["one_step.wrench_predicted"][:, Y], data["one_step.std"][:, Y]
-    panels: tuple = (
-        ("fig. 13: baseline, from the start", mean, std),
-        ("fig. 14a: baseline, one step with feedback", *one),
-        ("fig. 14b: our forward models", data["wrench_predicted"][:, Y], None),
-    )
-    for k, (title, mean, std) in enumerate(panels):
-        ax, below = axes[:, k]
-        for a, centre in ((ax, mean), (below, mean - force)):
-            if std is not None:
-                a.fill_between(
-                    time, centre - 2 * std, centre + 2 * std, alpha=0.3, label="2 std"
-                )
-            a.axvline(contact, color="0.4", ls=":")
-        ax.plot(time, force, "k", lw=0.6, label="measured")
-        ax.plot(time, mean, color="C0", label="predicted")
-        below.plot(time[window], (mean - force)[window], color="C0", lw=0.7)
-        ax.set(title=title, ylim=(-14.0, 6.0))
-        below.set(xlabel="time [s]", ylim=(-1.0, 1.0) if k else (-7.0, 7.0))
-        below.axhline(0.0, color="0.4", lw=0.6)
-    predicted = scratch["wrench_predicted"][:, Y]
-    axes[1, 2].plot(
-        time[window],
-        (predicted - force)[window],
-        color="C1",
-        lw=0.7,
-        zorder=1,
-        label="nothing known before",
-    )
-    axes[1, 2].legend(loc="lower right")
-    axes[0, 0].legend(loc="lower left")
-    axes[0, 0].set_ylabel("force along the wall [N]")
-    axes[1, 0].set_ylabel("error along the wall [N]")
-    return figure
-
-
-def reproduce(session: Session, seeds: int, jobs: int) -> Table:
-    """Figures 11 to 14 beside ours; each seed has its own training."""
-    comparison = Comparison("wall_friction", session, jobs)
-    row, results = comparison.row, comparison.runs({}, seeds)
-    done = [r for r in results if "error" not in r]
-
-    def mean(key):
-        return float(np.mean([r[key] for r in done])) if done else float("nan")
-
-    def error(key):
-        values = [r[key] for r in done]
-        if not values:
-            return "-"
-        return f"{np.mean(values):.3f} N ({min(values):.3f} to {max(values):.3f})"
-
-    def joint(name):
-        # Now and then a prediction diverges: a mean would show nothing else.
-        errors = [1e3 * r[f"joint_{name}_rmse_rad"] for r in done]
-        bands = [1e3 * r[f"joint_{name}_band_rad"] for r in done]
-        if not done:
-            return "-"
-        return (
-            f"{np.median(errors):.1f} mrad rms ({min(errors):.1f} to "
-            f"{max(errors):.1f}), band {np.median(bands):.1f}, "
-            f"{100 * mean(f'joint_{name}_in_band'):.0f} % in it"
-        )
-
-    row("fig. 11a: joint 1, learned at 0.6", "true one lags", joint("same"))
-    row("fig. 11b: learned at 0.1 to 0.7", "the same, wider band", joint("varied"))
-    row("fig. 12: the same, stiff", "narrow band, better", joint("stiff"))
-    ahead = f"{error('task_long_rmse_N')}, {100 * mean('task_long_in_band'):.0f} % in"
-    row("fig. 13: force, from the start", "not in the band", ahead + " band")
-    row("fig. 14a: one step, next force", "not accurate", error("one_step_rmse_N"))
-    row("one step, change of force", "-", error("one_step_change_rmse_N"))
-    row("the last force, unchanged", "-", error("persistence_rmse_N"))
-
-    def below(key):
-        variants = [f"{name}_rmse_N" for name in (*ONE_STEP, "task_long")]
-        wins = sum(r[key] < min(r[v] for v in variants) for r in done)
-        return f"{error(key)}; below all: {wins} of {len(results)}", (
-            bool(results) and wins == len(results)
-        )
-
-    row("fig. 14b: our forward models", "reliable", *below("ours_rmse_N"))
-    row("the same, from nothing", "-", *below("ours_from_scratch_rmse_N"))
-    seconds, online = times(done)
-    joints = [seconds.get(f"joint_{name}_training_s", np.nan) for name in SETS]
-    row("training, joint space", "55 min, 40 trials", f"{np.mean(joints):.0f} s")
-    row(
-        "training, one step", "-", f"{seconds.get('one_step_training_s', np.nan):.0f} s"
-    )
-    joints = [seconds.get(f"joint_{name}_prediction_s", np.nan) for name in SETS]
-    row("prediction of a trial, joints", "20 min", f"{np.mean(joints):.1f} s")
-    for name, label in (
-        ("forward_model_bank", "our learning and prediction, a sample"),
-        ("mode_detector", "our mode detection, a sample"),
-        ("predictor_one_step", "the baseline's prediction, a sample"),
-    ):
-        row(label, "-", f"{online.get(name, np.nan):.2f} ms")
-    _loop_rows(comparison, comparison.runs(IN_LOOP, seeds))
-    return comparison.to_table(
-        "A wall of unknown friction (CC 4.4)",
-        [
-            "Errors along the wall, rms, mean (joints: median) over seeds (least to "
-            "greatest); the sensor's noise alone is 0.1 N. Band: two standard "
-            "deviations.",
-            "The baseline's GPs are given "
-            f"{Config().training.one_step.points_per_mode} points per mode of "
-            f"{Config().training.trials} trials; the paper's 55 min are for all points "
-            "of 40 trials.",
-        ],
-    )
-
-
-def _loop_rows(comparison: Comparison, results) -> None:
-    """What predictions that are fed forward do to the tracking error, over the tested
-    trials of all runs, beside their errors, with the sensor's noise and without."""
-    each: dict[str, list[float]] = {}
-    for result in results:
-        if "error" not in result:
-            path = Path(result["out_dir"]) / EACH_FILE
-            for key, values in json.loads(path.read_text()).items():
-                each.setdefault(key, []).extend(values)
-    its = comparison.with_settings(IN_LOOP)
-    n = len(each.get("tracking_error_none_m", []))
-    for label, what in FED.items():
-        x = 1e3 * np.array(each.get(f"tracking_error_{label}_m", [np.nan]))
-        text = f"{np.mean(x):.2f} mm ({np.min(x):.2f} to {np.max(x):.2f})"
-        if label != "none":
-            error = float(np.mean(each.get(f"{label}_fed_rmse_N", [np.nan])))
-            text += f"; predicts to {error:.3f} N, {without_noise(error):.3f} N of it "
-            text += "not the sensor's noise"
-        row = f"fed forward: {what}; tracking error, {n} trials"
-        comparison.row(row, "-", text, None, its)
-
-
-def without_noise(error: float) -> float:
-    """What is left of a prediction's rms error against a measured force when the
-    sensor's noise, which is independent of the prediction, is taken out [N]."""
-    return float(np.sqrt(max(error**2 - NOISE**2, 0.0)))
-
-
-def times(results) -> tuple[dict, dict]:
-    """Means over runs: seconds of training and prediction; ms per sample, p50."""
-    seconds: dict[str, list[float]] = {}
-    online: dict[str, list[float]] = {}
-    for result in results:
-        folder = Path(result["out_dir"])
-        for key, value in json.loads((folder / TIMES_FILE).read_text()).items():
-            seconds.setdefault(key, []).append(value)
-        timing = json.loads((folder / "timing.json").read_text())
-        for key, value in timing["simulations"]["ours"]["systems"].items():
-            online.setdefault(key, []).append(value["p50_ms"])
-    return (
-        {key: float(np.mean(values)) for key, values in seconds.items()},
-        {key: float(np.mean(values)) for key, values in online.items()},
-    )
