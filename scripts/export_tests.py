@@ -31,7 +31,8 @@ from makebreak.models.typed_yaml import nearest
 from makebreak.scripts.interrupts import undisturbed
 from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.replay import Track, Unsupported
-from makebreak.scripts.session import Log, Session, leaf_systems
+from makebreak.scripts.run_timing import leaf_systems
+from makebreak.scripts.session import Log, Session
 from makebreak.systems.arm.impedance_controller import serial_chain_of
 from makebreak.systems.numerics.timing import observed
 

@@ -28,6 +28,29 @@ def handled(handler: Callable[[int, object], None]) -> Iterator[None]:
             signal.signal(number, before)
 
 
+class CatchInterrupt:
+    """While entered, Ctrl-C sets `hit`, as SIGTERM and SIGHUP do; the second Ctrl-C
+    raises KeyboardInterrupt."""
+
+    def __init__(self):
+        self.hit = False
+        self._handled = handled(self._handle)
+
+    def _handle(self, number, _):
+        leave_terminal(number)
+        # The others may come twice by themselves, as when a terminal is closed.
+        if self.hit and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.hit = True
+
+    def __enter__(self):
+        self._handled.__enter__()
+        return self
+
+    def __exit__(self, *_):
+        self._handled.__exit__(None, None, None)
+
+
 def interrupts():
     """Context in which all three signals raise KeyboardInterrupt."""
 

@@ -32,8 +32,9 @@ from makebreak.diagrams.lcm_station import (
 )
 from makebreak.diagrams.scene_facts import N_JOINTS
 from makebreak.diagrams.station import TORQUE_RATE_MAX
+from makebreak.scripts.interrupts import CatchInterrupt
 from makebreak.scripts.recording_stream import RecordingStream
-from makebreak.scripts.session import CatchInterrupt, Log, Session
+from makebreak.scripts.session import Log, Session
 
 TICK = 0.001  # Period of the robot [s].
 WITHIN = 0.0009  # Time after a tick by which all updates of that tick have run [s].

@@ -196,7 +196,7 @@ def _open_meshcat():
 def station(args) -> int:
     """Carries out `makebreak station`. Returns: the exit status."""
     from makebreak.diagrams.lcm_station import URL
-    from makebreak.scripts.session import CatchInterrupt
+    from makebreak.scripts.interrupts import CatchInterrupt
     from makebreak.scripts.stand_in import StandIn, StandInConfig
     from makebreak.scripts.table import Table, json_value
 

@@ -1,7 +1,6 @@
 """One run of an experiment: simulates, records, and writes the files of the run."""
 
 import json
-import signal
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -33,11 +32,12 @@ from makebreak.models.scene import Scene, apply_initial_velocities
 from makebreak.models.scene_file import write_scene
 from makebreak.scripts.compiling import CompilingShown
 from makebreak.scripts.diagram_picture import draw_diagram, shown_systems
-from makebreak.scripts.interrupts import handled, leave_terminal, undisturbed
+from makebreak.scripts.interrupts import CatchInterrupt, undisturbed
 from makebreak.scripts.meshcat_page import page_of
 from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.recording_stream import RecordingStream
 from makebreak.scripts.run_buttons import RunButtons
+from makebreak.scripts.run_timing import RunTiming, leaf_systems
 from makebreak.scripts.table import json_value
 from makebreak.scripts.trials import run_many
 from makebreak.systems.faults.safety_monitor import verdict
@@ -66,38 +66,6 @@ class Log(Mapping):
 
     def __len__(self) -> int:
         return len(self.columns)
-
-
-class CatchInterrupt:
-    """While entered, Ctrl-C sets `hit`, as SIGTERM and SIGHUP do; the second Ctrl-C
-    raises KeyboardInterrupt."""
-
-    def __init__(self):
-        self.hit = False
-        self._handled = handled(self._handle)
-
-    def _handle(self, number, _):
-        leave_terminal(number)
-        # The others may come twice by themselves, as when a terminal is closed.
-        if self.hit and number == signal.SIGINT:
-            raise KeyboardInterrupt
-        self.hit = True
-
-    def __enter__(self):
-        self._handled.__enter__()
-        return self
-
-    def __exit__(self, *_):
-        self._handled.__exit__(None, None, None)
-
-
-def leaf_systems(system: System):
-    """All leaf systems of a diagram, those of nested diagrams too."""
-    if isinstance(system, Diagram):
-        for child in system.GetSystems():
-            yield from leaf_systems(child)
-    else:
-        yield system
 
 
 class Session:
@@ -153,7 +121,7 @@ class Session:
         self.picture: Path | None = None  # File for a drawing of the diagram.
         self._drawn = 0  # Number of systems in the diagram drawn so far.
         self._partial: dict[str, dict[str, np.ndarray]] = {}
-        self._timing: dict[str, dict] = {}
+        self._timing = RunTiming()
         self._streams: list[Path] = []  # Recordings that are written while it runs.
         self._watched: list[np.ndarray] = []  # Output of each simulation's monitor.
         self.compared_by = ""  # The command that compares recording and model.
@@ -230,10 +198,7 @@ class Session:
                     f"record: {name} is a port of {owner.GetSystemName()}, "
                     "expected one of the diagram that is simulated"
                 ) from error
-        timed = [s for s in leaf_systems(diagram) if hasattr(s, "compute_sec")]
-        for system in timed:
-            system.compute_sec.clear()
-
+        RunTiming.start(diagram)
         label = label or f"simulation_{len(self._timing)}" * bool(self._timing)
         name = f"recording_{label}.csv" if label else "recording.csv"
         stream = RecordingStream(self.outputs.file(name), diagram)
@@ -292,7 +257,8 @@ class Session:
                 log = self._finish_log(
                     label, time, samples, interrupt.hit, root, diagram
                 )
-                self._time(label, log, wall, cpu, leaf_systems(diagram))
+                simulated = float(log.time[-1]) if log.time.size else 0.0
+                self._timing.note(label, diagram, simulated, wall, cpu)
                 self._note_limits(diagram, root)
                 if self.meshcat is not None:
                     self.meshcat.StopRecording()
@@ -324,46 +290,9 @@ class Session:
         self._partial[label] = {"time": np.array(time)} | columns
         return Log(np.array(time), columns, interrupted, root, diagram)
 
-    def _time(self, label: str, log: Log, wall: float, cpu: float, systems):
-        """Notes the times of one simulation, for timing.json."""
-        simulated = float(log.time[-1]) if log.time.size else 0.0
-        entry: dict = {
-            "simulated_s": simulated,
-            "wall_s": wall,
-            "cpu_s": cpu,
-            "real_time_factor": simulated / wall,
-            "systems": {},
-        }
-        for system in systems:
-            ms = 1e3 * np.array(getattr(system, "compute_sec", ()))
-            if ms.size:
-                name = system.get_name()  # Unique in one diagram, not in nested ones.
-                if name in entry["systems"]:
-                    name = system.GetSystemPathname()
-                period_ms = 1e3 * simulated / ms.size
-                entry["systems"][name] = {
-                    "updates": int(ms.size),
-                    "period_ms": period_ms,
-                    "p50_ms": float(np.percentile(ms, 50)),
-                    "p99_ms": float(np.percentile(ms, 99)),
-                    "max_ms": float(ms.max()),
-                    "overruns": int((ms > period_ms).sum()),
-                }
-        self._timing[label] = entry
-
     def too_slow(self) -> list[str]:
-        """A line for each system that would not keep real time on this machine: more
-        than one update in a hundred took longer than its period."""
-        lines = {}
-        for entry in self._timing.values():
-            for name, system in entry["systems"].items():
-                if system["p99_ms"] > system["period_ms"]:
-                    lines[name] = (
-                        f"Too slow for real time: {name}, {system['overruns']} of "
-                        f"{system['updates']} updates took longer than its period of "
-                        f"{system['period_ms']:.3g} ms (99 %: {system['p99_ms']:.3g})"
-                    )
-        return list(lines.values())
+        """A line for each system that would not keep real time on this machine."""
+        return self._timing.too_slow()
 
     def _note_limits(self, diagram: Diagram, root: Context) -> None:
         if not diagram.HasSubsystemNamed("station"):
@@ -508,7 +437,7 @@ class Session:
         """
         with undisturbed():
             if self._timing:
-                self.write_json("timing.json", self._timing_summary())
+                self.write_json("timing.json", self._timing.summary())
             if complete:
                 self._drop_streams()
             try:
@@ -528,21 +457,6 @@ class Session:
     def __exit__(self, *_) -> None:
         self._deferred.__exit__(None, None, None)
         self.outputs.close()
-
-    def _timing_summary(self) -> dict:
-        """Sums over the whole run, and figures of each simulation if there were more
-        than one."""
-        entries = list(self._timing.values())
-        total = {
-            key: sum(e[key] for e in entries)
-            for key in ("simulated_s", "wall_s", "cpu_s")
-        }
-        summary = {"real_time_factor": total["simulated_s"] / total["wall_s"]}
-        summary["real_time_factor_cpu"] = total["simulated_s"] / total["cpu_s"]
-        summary |= total
-        if len(entries) == 1:
-            return summary | {"systems": entries[0]["systems"]}
-        return summary | {"simulations": self._timing}
 
 
 def _show_scene(diagram: Diagram, root: Context) -> None:

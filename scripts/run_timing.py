@@ -1,0 +1,95 @@
+"""How long simulations and the systems in them took: timing.json."""
+
+import numpy as np
+from pydrake.systems.framework import Diagram, System
+
+
+def leaf_systems(system: System):
+    """All leaf systems of a diagram, those of nested diagrams too."""
+    if isinstance(system, Diagram):
+        for child in system.GetSystems():
+            yield from leaf_systems(child)
+    else:
+        yield system
+
+
+class RunTiming:
+    """Times of one or several simulations of a run; len() is how many."""
+
+    def __init__(self):
+        self._entries: dict[str, dict] = {}
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def clear(self) -> None:
+        """Discards all simulations."""
+        self._entries.clear()
+
+    @staticmethod
+    def start(diagram: Diagram) -> None:
+        """Forgets what the diagram's systems took before."""
+        for system in leaf_systems(diagram):
+            if hasattr(system, "compute_sec"):
+                system.compute_sec.clear()
+
+    def note(
+        self, label: str, diagram: Diagram, simulated: float, wall: float, cpu: float
+    ) -> None:
+        """Notes one simulation.
+
+        Args: label: its name among several. simulated: seconds of its time; wall, cpu:
+            seconds of the clock and of the process that it took.
+        """
+        entry: dict = {
+            "simulated_s": simulated,
+            "wall_s": wall,
+            "cpu_s": cpu,
+            "real_time_factor": simulated / wall,
+            "systems": {},
+        }
+        for system in leaf_systems(diagram):
+            ms = 1e3 * np.array(getattr(system, "compute_sec", ()))
+            if ms.size:
+                name = system.get_name()  # Unique in one diagram, not in nested ones.
+                if name in entry["systems"]:
+                    name = system.GetSystemPathname()
+                period_ms = 1e3 * simulated / ms.size
+                entry["systems"][name] = {
+                    "updates": int(ms.size),
+                    "period_ms": period_ms,
+                    "p50_ms": float(np.percentile(ms, 50)),
+                    "p99_ms": float(np.percentile(ms, 99)),
+                    "max_ms": float(ms.max()),
+                    "overruns": int((ms > period_ms).sum()),
+                }
+        self._entries[label] = entry
+
+    def too_slow(self) -> list[str]:
+        """A line for each system that would not keep real time on this machine: more
+        than one update in a hundred took longer than its period."""
+        lines = {}
+        for entry in self._entries.values():
+            for name, system in entry["systems"].items():
+                if system["p99_ms"] > system["period_ms"]:
+                    lines[name] = (
+                        f"Too slow for real time: {name}, {system['overruns']} of "
+                        f"{system['updates']} updates took longer than its period of "
+                        f"{system['period_ms']:.3g} ms (99 %: {system['p99_ms']:.3g})"
+                    )
+        return list(lines.values())
+
+    def summary(self) -> dict:
+        """Sums over the whole run, and figures of each simulation if there were more
+        than one."""
+        entries = list(self._entries.values())
+        total = {
+            key: sum(e[key] for e in entries)
+            for key in ("simulated_s", "wall_s", "cpu_s")
+        }
+        summary = {"real_time_factor": total["simulated_s"] / total["wall_s"]}
+        summary["real_time_factor_cpu"] = total["simulated_s"] / total["cpu_s"]
+        summary |= total
+        if len(entries) == 1:
+            return summary | {"systems": entries[0]["systems"]}
+        return summary | {"simulations": self._entries}
