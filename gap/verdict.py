@@ -9,7 +9,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from makebreak.gap.data.recording import unit_of
 from makebreak.gap.problem import share_left
 from makebreak.gap.result import Estimate, Evidence, GapMeasure, NamedEffect
-from makebreak.gap.search.choice import Choice, Selection
+from makebreak.gap.search.choice import Choice, Selection, called
 from makebreak.gap.thresholds import (
     AGREEMENT_RMS_MAX,
     CLOSED_SHARE_MIN,
@@ -90,7 +90,7 @@ def withdraw_if_weak(
     the equations."""
     if verdict != "gap_unnamed" or not selection.choices or closed >= CLOSED_SHARE_MIN:
         return selection, ""
-    names = [f"{c.effect.kind} at {', '.join(c.effect.at)}" for c in selection.choices]
+    names = [called(c.effect) for c in selection.choices]
     near = f" The best candidates ({'; '.join(names)}) "
     if isnan(closed):  # No window could be simulated to its end.
         near += "could not be judged by simulation, so none is named."

@@ -56,7 +56,7 @@ from makebreak.gap.residuals.objects import (
 from makebreak.gap.residuals.pressing import PressingProblem, presses
 from makebreak.gap.residuals.sap_lift import sap_lift
 from makebreak.gap.result import GapMeasure, GapResult, JudgedChannel
-from makebreak.gap.search.choice import Choice, Selection
+from makebreak.gap.search.choice import Choice, Selection, called
 from makebreak.gap.search.select import select, without
 from makebreak.gap.search.softer_by_simulation import softer_by_simulation
 from makebreak.gap.search.trust import drift_sentences, scatter, trust_in
@@ -430,7 +430,7 @@ def preferred_by_simulation(
         ):
             new = replace(
                 choice, effect=fit.effects[0], std=fit.std[0], after=fit.score,
-                runner_up=f"{choice.effect.kind} at {', '.join(choice.effect.at)}",
+                runner_up=called(choice.effect),
                 margin=choice.after / fit.score - 1.0, ties=(), fixed=(), size=1,
             )  # fmt: skip
             selection = replace(selection, choices=(new,), end=fit)

@@ -166,6 +166,10 @@ install_packages() {
 pip_install() {
     "$venv/bin/python" -m pip install --quiet --no-input --progress-bar off \
         --disable-pip-version-check "$@" >>"$log" 2>&1 && return
+    if grep -q 'CERTIFICATE_VERIFY_FAILED' "$log"; then
+        fail "the package index's certificate is not trusted (a proxy with its own?);" \
+            "set PIP_CERT to the file with its certificate, then try again (log: $log)"
+    fi
     if grep -qE 'Retrying|[Tt]imed out|Timeout|ConnectionError|IncompleteRead' "$log"; then
         fail "the Python package index cannot be reached; check the network," \
             "then try again (log: $log)"

@@ -141,6 +141,20 @@ def test_network_failure_is_one_line(checkout):
     assert "setting up .venv" in first
 
 
+def test_a_certificate_that_is_not_trusted_is_told_from_a_missing_network(checkout):
+    """Seen behind a proxy that signs anew what passes it."""
+    failure = (
+        "WARNING: Retrying (Retry(total=0)) after connection broken by 'SSLError("
+        "SSLCertVerificationError(1, '[SSL: CERTIFICATE_VERIFY_FAILED] certificate "
+        "verify failed: self-signed certificate in certificate chain'))'\n"
+    )
+    (checkout.tools / "fail").write_text(failure)
+    done = checkout("setup.sh")
+    assert done.returncode == 4
+    assert "certificate is not trusted" in done.stderr.splitlines()[-1]
+    assert "PIP_CERT" in done.stderr.splitlines()[-1]
+
+
 def test_other_pip_failure_gives_its_last_error(checkout):
     (checkout.tools / "fail").write_text("ERROR: a\nERROR: disk is full\nhint\n")
     done = checkout("run.sh")
