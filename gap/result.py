@@ -10,6 +10,8 @@ from makebreak.gap.data.findings import Finding
 from makebreak.models.effects.kind import Effect
 
 VERDICTS = ("no_gap", "not_judged", "gap_named", "ambiguous", "gap_unnamed")
+# Those that find no gap, as far as anything was compared.
+AGREES = ("no_gap", "not_judged")
 
 
 @dataclass(frozen=True)

@@ -19,27 +19,20 @@ from makebreak.gap.data.check_drives import (
 from makebreak.gap.data.check_meshes import check_meshes
 from makebreak.gap.data.checks import check_recordings
 from makebreak.gap.data.conditioning import condition
-from makebreak.gap.data.findings import (
-    GUESSED_GAINS,
-    NO_COLUMN,
-    NO_DRIVE,
-    SAMPLED_COMMANDS,
-    Finding,
-)
+from makebreak.gap.data.findings import SAMPLED_COMMANDS, Finding
 from makebreak.gap.data.pieces import excerpt
 from makebreak.gap.data.reading import check_against_scene, read_recordings
 from makebreak.gap.data.recording import Recording, unit_of
 from makebreak.gap.data.scene_facts import scene_facts, scene_names
 from makebreak.gap.data.split import split, with_noise_of
 from makebreak.gap.does_not_fit import DoesNotFit
-from makebreak.gap.fit import fit_effects
+from makebreak.gap.doubts import unless_doubtful
 from makebreak.gap.parallel import side_by_side
 from makebreak.gap.problem import (
     DISTANCES,
     Fitted,
     GapProblem,
     Outcome,
-    is_sane,
     share_left,
 )
 from makebreak.gap.residuals.driven import DrivenProblem, is_driven, sticks
@@ -55,9 +48,13 @@ from makebreak.gap.residuals.objects import (
 )
 from makebreak.gap.residuals.pressing import PressingProblem, presses
 from makebreak.gap.residuals.sap_lift import sap_lift
-from makebreak.gap.result import GapMeasure, GapResult, JudgedChannel
-from makebreak.gap.search.choice import Choice, Selection, called
-from makebreak.gap.search.select import select, without
+from makebreak.gap.result import AGREES, GapMeasure, GapResult, JudgedChannel
+from makebreak.gap.search.choice import Choice, Selection
+from makebreak.gap.search.chosen_by_simulation import (
+    kept_by_simulation,
+    preferred_by_simulation,
+)
+from makebreak.gap.search.select import select
 from makebreak.gap.search.softer_by_simulation import softer_by_simulation
 from makebreak.gap.search.trust import drift_sentences, scatter, trust_in
 from makebreak.gap.simulation.measure import WINDOW_SEC
@@ -65,9 +62,6 @@ from makebreak.gap.simulation.windows import WindowModel, with_step
 from makebreak.gap.thresholds import (
     AGREEMENT_RMS_MAX,
     CLOSED_SHARE_MIN,
-    SIMULATED_RIVAL_GAIN,
-    SIMULATED_RIVAL_RATIO,
-    SIMULATED_RIVALS_MAX,
     UNEXPLAINED_RMS,
 )
 from makebreak.gap.verdict import (
@@ -81,9 +75,7 @@ from makebreak.gap.verdict import (
     withdraw_if_weak,
 )
 from makebreak.models.dynamics import SceneDynamics
-from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import (
-    Effect,
     full_name,
     one_dof_joints,
     sliding_joints,
@@ -92,7 +84,6 @@ from makebreak.models.scene import Scene, read_scene
 
 # Of longer recordings of a mechanism, and of more rows of anything, pieces are used.
 MOST_SEC, MOST_ROWS = 60.0, 120_000
-AGREES = ("no_gap", "not_judged")  # As far as anything was compared.
 # Of what is only reported on.
 REPORTED_SEC, REPORTED_ROWS = 20.0, 40_000
 
@@ -174,7 +165,7 @@ def run_gap(
         names = list(dict.fromkeys(r.name for r in decided))
         result = with_differences(result, names, alone)
         seconds["recordings"] = clock.lap()
-    return _unless_doubtful(result).with_seconds(seconds)
+    return unless_doubtful(result).with_seconds(seconds)
 
 
 def problem_for(
@@ -365,79 +356,6 @@ def conclude(
     )  # fmt: skip
 
 
-def kept_by_simulation(
-    problem: GapProblem, selection: Selection, jobs: int
-) -> tuple[Selection, Outcome | None]:
-    """The selection without those of several effects with a state of their own (a
-    spring or a gap in a joint) that make simulated windows no better: equations only
-    approximate them, and they imitate what else is fast. And what it comes to, on what
-    was chosen on."""
-
-    def outcome_of(some: Selection) -> Outcome | None:
-        return problem.outcome(
-            some.effects(), some.start, some.end, some.nuisances, jobs=jobs
-        )
-
-    outcome = outcome_of(selection)
-    for choice in selection.choices:
-        if outcome is None or len(selection.choices) < 2:
-            break
-        if not KINDS[choice.effect.kind].hidden_state:
-            continue
-        fewer = without(problem, selection, choice.effect)
-        other = outcome_of(fewer)
-        if other is not None and other.gap.after <= outcome.gap.after:
-            selection, outcome = fewer, other
-    return selection, outcome
-
-
-def preferred_by_simulation(
-    problem: GapProblem, selection: Selection, outcome: Outcome | None, jobs: int
-) -> tuple[Selection, Outcome | None]:
-    """Of contact, where a law that is written down otherwise (how friction sets in) may
-    make equations prefer the wrong one of two effects: if with the one that they chose
-    simulated windows still show a gap, those with one parameter that they found nearly
-    as good are simulated too, and one that leaves clearly less is taken."""
-    if not problem.plan.simulation_agrees or len(selection.choices) != 1:
-        return selection, outcome
-    if outcome is None or outcome.gap.after <= AGREEMENT_RMS_MAX or not selection.table:
-        return selection, outcome
-    (choice,) = selection.choices
-    known, limit = (
-        {choice.effect.kind},
-        SIMULATED_RIVAL_RATIO * selection.table[0].score,
-    )
-    screen = selection.screen(problem)
-    for each in selection.table:
-        if each.kind in known or len(each.parameters) != 1 or len(each.at) != 1:
-            continue
-        if each.score > limit or len(known) > SIMULATED_RIVALS_MAX:
-            break
-        known.add(each.kind)
-        start = Effect(each.kind, list(each.at), dict(each.parameters))
-        try:
-            fit = fit_effects(problem, screen, [start])
-        except ValueError:
-            continue
-        if not all(map(is_sane, fit.effects)):
-            continue
-        other = problem.outcome(
-            fit.effects, selection.start, fit, selection.nuisances, jobs=jobs
-        )
-        if (
-            other is not None
-            and other.gap.after < SIMULATED_RIVAL_GAIN * outcome.gap.after
-        ):
-            new = replace(
-                choice, effect=fit.effects[0], std=fit.std[0], after=fit.score,
-                runner_up=called(choice.effect),
-                margin=choice.after / fit.score - 1.0, ties=(), fixed=(), size=1,
-            )  # fmt: skip
-            selection = replace(selection, choices=(new,), end=fit)
-            outcome = other
-    return selection, outcome
-
-
 def _follows_noise(problem: GapProblem, selection: Selection) -> bool:
     """Whether effects leave most of what they were found in, and that is noise which
     goes together over a while: without it they gain nothing."""
@@ -499,62 +417,6 @@ def unjudged_channels(channels: Sequence[JudgedChannel]) -> str:
             " not compared."
         )
     return text
-
-
-def _unless_doubtful(result: GapResult) -> GapResult:
-    """Without effects where units, signs, axes or drives' gains are wrong, as they
-    would explain that; and without agreement where a channel's motion was taken for
-    noise."""
-    hunting = [c.says for c in result.checks if c.kind == "hunting"]
-    if result.verdict in AGREES and hunting:
-        return replace(
-            result,
-            verdict="gap_unnamed",
-            says=f"These recordings are inconclusive: {hunting[0]}",
-        )
-    undriven = [c.says for c in result.checks if c.kind == NO_DRIVE]
-    if not result.effects:
-        kinds = (NO_DRIVE, NO_COLUMN)
-        missing = " ".join(c.says for c in result.checks if c.kind in kinds)
-        if result.verdict == "gap_unnamed" and missing:
-            return replace(result, says=f"{result.says} {missing}")
-        return result
-    guessed = any(c.kind == GUESSED_GAINS for c in result.checks)
-    if any(c.severity == "error" for c in result.checks):
-        says = (
-            "The scene and the recordings disagree, but units, signs or axes of what "
-            "was measured are wrong (see the checks): put that right first, for until "
-            "then nothing can be named."
-        )
-    elif undriven and not result.gap.after <= UNEXPLAINED_RMS:
-        # Whatever is named makes up for torques that are not in the log.
-        says = (
-            "The scene and the recordings disagree, and no effect explains all of it. "
-            f"{undriven[0]}"
-        )
-    elif guessed and not result.gap.after <= UNEXPLAINED_RMS:
-        # Whatever else is free makes up for a gain that is wrong.
-        says = (
-            "The scene and the recordings disagree, but the gains of the drives are a "
-            "guess, and no effect explains all of it: write the gains into the scene, "
-            "or record what the motors give, for until then nothing can be named."
-        )
-    else:
-        return result
-    per_channel = {
-        name: {"before": each["before"], "after": each["before"]}
-        for name, each in result.gap.per_channel.items()
-    }
-    gap = replace(result.gap, after=result.gap.before, per_channel=per_channel)
-    return replace(
-        result,
-        verdict="gap_unnamed",
-        says=says,
-        effects=[],
-        differs=(),
-        gap=gap,
-        series=[replace(each, after=each.before) for each in result.series],
-    )
 
 
 class _Clock:

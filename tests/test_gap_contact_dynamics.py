@@ -32,6 +32,7 @@ from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.permitted_contacts import Shift
 from makebreak.gap.residuals.wrench_sensor import felt_motion
 from makebreak.gap.result import Considered, GapMeasure
+from makebreak.gap.search import chosen_by_simulation
 from makebreak.gap.search.choice import Choice, Selection
 from makebreak.gap.simulation import contact_windows
 from makebreak.gap.simulation.contact_shapes import _Point, _Surface
@@ -370,7 +371,7 @@ def test_simulation_decides_between_what_equations_find_alike(
     def fit(problem, screen, start, *_):
         return SimpleNamespace(effects=tuple(start), std=({},), score=1.1)
 
-    monkeypatch.setattr(workflow, "fit_effects", fit)
+    monkeypatch.setattr(chosen_by_simulation, "fit_effects", fit)
     problem = SimpleNamespace(
         plan=SearchPlan(simulation_agrees=True), outcome=outcome
     )  # fmt: skip
@@ -381,7 +382,9 @@ def test_simulation_decides_between_what_equations_find_alike(
     )  # fmt: skip
     monkeypatch.setattr(Selection, "screen", lambda self, problem: None)
     before = Outcome(GapMeasure(60.0, mass, 1.0, 0.6))
-    got, after = workflow.preferred_by_simulation(problem, selection, before, 1)
+    got, after = chosen_by_simulation.preferred_by_simulation(
+        problem, selection, before, 1
+    )
     taken = got.choices[0].effect.kind
     if mass > 1.5 and friction < 0.8 * mass:
         assert (taken, after.gap.after) == ("contact_friction", friction)

@@ -12,6 +12,7 @@ from makebreak.gap.by_recording import _apart, with_differences
 from makebreak.gap.data import sampled_commands
 from makebreak.gap.data.findings import GUESSED_GAINS, NO_COLUMN, NO_DRIVE, Finding
 from makebreak.gap.does_not_fit import DoesNotFit
+from makebreak.gap.doubts import unless_doubtful
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate
 from makebreak.gap.residuals.inverse import InverseModel
@@ -19,7 +20,7 @@ from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.residuals.mechanism_candidates import nuisances
 from makebreak.gap.result import Evidence, GapMeasure, GapResult, NamedEffect
 from makebreak.gap.search.groups import _needless_member
-from makebreak.gap.workflow import _follows_noise, _unless_doubtful
+from makebreak.gap.workflow import _follows_noise
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
 
@@ -308,13 +309,13 @@ def test_beside_guessed_gains_only_what_explains_all_is_named():
     found = NamedEffect("link_mass", ("rig.rod",), {}, "", Evidence(9.0, 1.0, "", 1.0))
     gap = GapMeasure(368.0, 79.7, 1.0, 0.3)
     result = GapResult("gap_named", "", (), [found], gap, (), {}, [guess])
-    after = _unless_doubtful(result)
+    after = unless_doubtful(result)
     assert (after.verdict, after.effects) == ("gap_unnamed", [])
     assert "guess" in after.says
     explained = replace(result, gap=replace(gap, after=1.2))
-    assert _unless_doubtful(explained) == explained
+    assert unless_doubtful(explained) == explained
     known = replace(result, checks=[])
-    assert _unless_doubtful(known) == known
+    assert unless_doubtful(known) == known
 
 
 def test_where_nothing_drives_the_joints_only_what_explains_all_is_named():
@@ -323,11 +324,11 @@ def test_where_nothing_drives_the_joints_only_what_explains_all_is_named():
     found = NamedEffect("link_mass", ("rig.rod",), {}, "", Evidence(9.0, 1.0, "", 1.0))
     gap = GapMeasure(460.0, 198.0, 1.0, 0.3)
     result = GapResult("gap_named", "", (), [found], gap, (), {}, [check])
-    after = _unless_doubtful(result)
+    after = unless_doubtful(result)
     assert (after.verdict, after.effects) == ("gap_unnamed", [])
     assert after.says.endswith("Nothing drives it.") and after.gap.after == 460.0
     passive = replace(result, gap=replace(gap, after=1.2))  # A pendulum that swings.
-    assert _unless_doubtful(passive) == passive
+    assert unless_doubtful(passive) == passive
 
 
 @pytest.mark.parametrize("kind", [NO_DRIVE, NO_COLUMN])
@@ -336,9 +337,9 @@ def test_a_gap_where_nothing_drives_the_joints_says_so(kind):
     check = Finding(kind, "a", "time", 0.0, "", "warning", "Nothing drives it.")
     gap = GapMeasure(460.0, 460.0, 1.0, 0.3)
     result = GapResult("gap_unnamed", "A gap.", (), [], gap, (), {}, [check])
-    assert _unless_doubtful(result).says == "A gap. Nothing drives it."
+    assert unless_doubtful(result).says == "A gap. Nothing drives it."
     agrees = replace(result, verdict="no_gap")
-    assert _unless_doubtful(agrees) == agrees
+    assert unless_doubtful(agrees) == agrees
 
 
 def test_a_gain_within_the_masses_tolerance_is_told_from_a_larger_one(scene, tmp_path):

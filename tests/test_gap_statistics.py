@@ -42,6 +42,7 @@ from makebreak.gap.residuals.whitened_rows import WhitenedRows
 from makebreak.gap.result import GapMeasure
 from makebreak.gap.search import comparison
 from makebreak.gap.search.choice import Choice, Selection, Trial, is_significant
+from makebreak.gap.search.chosen_by_simulation import kept_by_simulation
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.drop import _is_certain
 from makebreak.gap.search.screen import Ranked
@@ -55,7 +56,6 @@ from makebreak.gap.verdict import (
     why_not_confirmed,
     withdraw_if_weak,
 )
-from makebreak.gap.workflow import kept_by_simulation
 from makebreak.models.effects.kind import Effect
 from makebreak.systems.numerics.smoother import smooth
 
