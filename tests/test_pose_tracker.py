@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from object_alone import object_alone
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.analysis import Simulator
@@ -15,15 +16,13 @@ from makebreak.diagrams.camera import (
     camera_model,
     vtk_works,
 )
-from makebreak.models.model_files import MODELS
 from makebreak.models.pushed_object import (
     HUE,
     PushedObject,
-    object_file,
     rest_height,
     seen_parts,
 )
-from makebreak.models.scene import load_scene, read_scene
+from makebreak.models.scene import load_scene
 from makebreak.systems.perception.numerics import constant_velocity
 from makebreak.systems.perception.numerics.aruco_marker import find_marker
 from makebreak.systems.perception.numerics.ball_tracker import strength_weights
@@ -90,17 +89,7 @@ def photograph(pose, name="t", renderer="drawn", **changes):
     spec = PushedObject(name, **changes)
     key = (repr(spec), renderer)
     if key not in _photographers:
-        scene = read_scene(MODELS / "push_object.scene.yaml")
-        own = ("table", "object")
-        scene.directives = [
-            d for d in scene.directives
-            if (d.add_model is not None and d.add_model.name in own)
-            or (d.add_weld is not None and d.add_weld.child == "table::table")
-        ]  # fmt: skip
-        for d in scene.directives:
-            if d.add_model is not None and d.add_model.name == "object":
-                d.add_model.file = f"file://{object_file(spec)}"
-        scene.actuation.type, scene.actuation.joints = "none", []
+        scene = object_alone(spec)
         scene.initial.positions = {}
         builder = DiagramBuilder()
         loaded = load_scene(scene, builder)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from object_alone import object_alone
 from pydrake.geometry import Box, Convex
 from pydrake.multibody.math import SpatialVelocity
 from pydrake.multibody.parsing import Parser
@@ -67,17 +68,7 @@ class World:
     """The object of a spec alone on the table, at (0.4, 0), at rest."""
 
     def __init__(self, spec, friction=0.5):
-        scene = read_scene(MODELS / "push_object.scene.yaml")
-        own = ("table", "object")
-        scene.directives = [
-            d for d in scene.directives
-            if (d.add_model is not None and d.add_model.name in own)
-            or (d.add_weld is not None and d.add_weld.child == "table::table")
-        ]  # fmt: skip
-        for d in scene.directives:
-            if d.add_model is not None and d.add_model.name == "object":
-                d.add_model.file = f"file://{object_file(spec)}"
-        scene.actuation.type, scene.actuation.joints = "none", []
+        scene = object_alone(spec)
         scene.initial.positions = {}
         pose = [1.0, 0.0, 0.0, 0.0, 0.4, 0.0, rest_height(spec)]
         scene.initial.poses = {"object.object": pose}
