@@ -165,6 +165,10 @@ def test_code_is_formatted():
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.skipif(
+    sys.version_info < (3, 11),
+    reason="arrays have other types in numpy 2.2, the last for Python 3.10",
+)
 def test_types_are_right():
     done = run_module("mypy")
     assert done.returncode == 0, done.stdout + done.stderr
