@@ -7,14 +7,19 @@ import pytest
 from gap_benchmark import cart_world
 from gap_benchmark.cart_world import PAIR
 
+from makebreak.gap.data.pieces import part_of
 from makebreak.gap.data.reading import read_recordings
+from makebreak.gap.data.recording import Episode
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.fit import fit_effects
+from makebreak.gap.numerics.runs import runs_of
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.residuals.fixed_faces import PASSED
 from makebreak.gap.residuals.impacts import (
     FREE_SEC,
     MOST_FREE,
     ImpactProblem,
+    ImpactWindows,
     runs_against,
 )
 from makebreak.gap.residuals.pressing import PressingProblem, presses
@@ -209,3 +214,20 @@ def test_a_soft_bumper_that_is_struck_is_not_pressed_on(tmp_path):
     assert not presses(dynamics, recordings)
     problem, _ = problem_for(scene, recordings, dynamics)
     assert isinstance(problem, ImpactProblem)
+
+
+def test_a_report_needs_no_more_than_one_touch(tmp_path):
+    """That a link runs against walls is decided on the rest; a short last episode with
+    one or two touches left nothing to report on, and nothing was named."""
+    scene_file, file, _ = ran(tmp_path, 3, 5.0)
+    scene, (recording,) = read_scene(scene_file), read_recordings([file])
+    problem, _ = problem_for(scene, [recording], SceneDynamics(scene))
+    assert isinstance(problem, ImpactProblem)
+    near = np.abs(recording["cart.rail.position"]) > 0.2  # Where the walls' faces are.
+    (first, last), second = runs_of(near)[:2]
+    short = part_of(recording, [Episode(0, 0, (last + second[0]) // 2)])
+    with pytest.raises(DoesNotFit):
+        ImpactWindows(scene, [short])
+    model = problem._again([short])
+    assert model._touches == 1
+    assert np.sqrt(np.mean(model.residual(()) ** 2)) < 1.2

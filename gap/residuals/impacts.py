@@ -196,20 +196,27 @@ def nearest(shapes: ContactShapes, dynamics: SceneDynamics, q) -> np.ndarray:
 class ImpactWindows(WindowModel):
     """Windows about touches, and of free motion.
 
+    Args: shapes: those that touch, if that was decided on other recordings; then one
+        touch is enough.
     Raises: DoesNotFit where there are fewer than FEWEST touches.
     """
 
-    def __init__(self, scene: Scene, recordings: Sequence[Recording]):
-        scene = with_step(scene, 0.0)
-        self.shapes = _met_walls(SceneDynamics(scene), recordings)
+    def __init__(
+        self,
+        scene: Scene,
+        recordings: Sequence[Recording],
+        shapes: ContactShapes | None = None,
+    ):
+        scene, fewest = with_step(scene, 0.0), FEWEST if shapes is None else 1
+        self.shapes = shapes or _met_walls(SceneDynamics(scene), recordings)
         if self.shapes is None:
             raise DoesNotFit("nothing fixed that a link touches now and then")
         self._touches = 0
         self._touch_sec: list[float] = []  # How long each lasts.
         self._free: list[Window] = []
         super().__init__(scene, recordings, LONGEST_SEC, most=10**6)
-        if self._touches < FEWEST:
-            raise DoesNotFit(f"{self._touches} touches, expected {FEWEST} or more")
+        if self._touches < fewest:
+            raise DoesNotFit(f"{self._touches} touches, expected {fewest} or more")
         both = []
         touching = [w for w in self.windows if w not in self._free]
         for some, most in ((touching, MOST_TOUCHES), (self._longest(), MOST_FREE)):
@@ -337,7 +344,7 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
         return self
 
     def _again(self, recordings: Sequence[Recording]) -> WindowModel:
-        return ImpactWindows(self.scene, recordings)
+        return ImpactWindows(self.scene, recordings, self.shapes)
 
     def nuisances(self) -> Nuisances:
         """The links' masses and centres, and contact stiffness and dissipation as far
