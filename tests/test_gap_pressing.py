@@ -11,7 +11,7 @@ from makebreak.gap.data.table import write_recording
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.residuals import contact_dynamics
 from makebreak.gap.residuals.lying_on_faces import point_on_face
-from makebreak.gap.residuals.pressing import PressingProblem, presses
+from makebreak.gap.residuals.pressing import PressingProblem, presses, thinned
 from makebreak.gap.residuals.touching import MEETS
 from makebreak.gap.search.choice import Choice
 from makebreak.gap.search.comparison import Comparison
@@ -410,6 +410,18 @@ def test_distances_are_computed_anew_only_where_something_stands_elsewhere(
     np.testing.assert_array_equal(problem.residual([moved]), there)
     problem._evaluate_nodes()  # Other rows: what was computed for these is gone.
     assert problem._slots_at == {}
+
+
+def test_each_touch_is_told_of_however_short():
+    """Every fourth test function by its number would leave out the touches of one, two
+    and three here."""
+    on = np.zeros(40, bool)
+    for first, last in ((1, 2), (9, 11), (17, 20), (24, 37)):
+        on[first:last] = True
+    assert list(np.flatnonzero(thinned(on))) == [1, 9, 17, 24, 28, 32, 36]
+    # A touch that is lost for a moment is not told twice.
+    on = np.array([False, True, True, False, True, False, False, True])
+    assert list(np.flatnonzero(thinned(on))) == [1, 7]
 
 
 def test_no_contact_is_so_soft_that_a_tool_goes_in_by_centimetres(displaced):

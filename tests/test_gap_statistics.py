@@ -209,6 +209,25 @@ def test_blocks_drawn_anew_tell_how_a_slope_scatters_from_one_recording_to_the_n
     assert spread_by_blocks(x[:125, None], noise(1.0)[:125], block[:125])[0] == 0.0
 
 
+def test_what_two_of_many_blocks_tell_has_no_scatter_by_blocks():
+    """A wall that was met twice: most draws are without a touch, or with one alone, and
+    have the wall where slopes that are all but zero put it."""
+    rng = np.random.default_rng(0)
+    block = np.repeat(np.arange(40), 25)
+    friction = rng.normal(size=1000)
+    wall = 1e-4 * rng.normal(size=1000)
+    r = rng.normal(size=1000)
+    alone = spread_by_blocks(friction[:, None], r, block)
+    for touched, told in (([3, 17], False), ([2, 5, 9, 14, 20, 31, 33, 38], True)):
+        place = np.array(wall)
+        place[np.array(touched) * 25] = 10.0
+        both = spread_by_blocks(np.stack([friction, place], axis=1), r, block)
+        assert both[0] == pytest.approx(alone[0], rel=0.05)
+        # Of eight touches with noise of 1 and slopes of 10: the mean's scatter.
+        expected = 0.1 / np.sqrt(8) if told else 0.0
+        assert both[1] == pytest.approx(expected, rel=0.6)
+
+
 def test_a_mean_of_what_differs_from_time_to_time():
     # Measured alike well, and no more apart than that: the plain mean and its error.
     mean, std = random_effects([1.0, 1.0, 1.0, 1.0], [0.04] * 4)

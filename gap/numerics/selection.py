@@ -14,6 +14,7 @@ from scipy.stats import chi2, wilcoxon
 
 from makebreak.gap.numerics.runs import starts_of_runs
 
+FEWEST_TELL = 3.0  # Blocks that tell a parameter, of which a scatter is taken.
 _PENALTIES = 10.0 ** np.arange(-4.0, 2.0)  # Of a ridge, times the number of rows.
 
 
@@ -354,11 +355,13 @@ def simplest(errors: Sequence[float], sizes: Sequence[int], same: float) -> int:
 def spread_by_blocks(J, r, block, draws: int = 200) -> np.ndarray:
     """(k,) standard deviations of least squares whose errors go together within a block
     (of time, an episode): the blocks are drawn anew with replacement, each time with
-    one Gauss-Newton step. Zeros for fewer than six blocks.
+    one Gauss-Newton step. Zeros for fewer than six blocks, and of a parameter that
+    fewer than FEWEST_TELL blocks tell: most draws would be without them.
 
     Args: J (m, k), r (m,): rows and their derivatives at the solution; block (m,): a
         number of each; negative: rows that are always there, once (a prior's).
-    Source: Efron, Tibshirani, An Introduction to the Bootstrap, 1993, ch. 8-9.
+    Source: Efron, Tibshirani, An Introduction to the Bootstrap, 1993, ch. 8-9; the
+        number of blocks that tell: Kish, Survey Sampling, 1965.
     """
     J, r, block = np.asarray(J, float), np.asarray(r, float), np.asarray(block)
     names, group = np.unique(block, return_inverse=True)
@@ -373,14 +376,19 @@ def spread_by_blocks(J, r, block, draws: int = 200) -> np.ndarray:
         mine = J[group == g]
         H[g], s[g] = mine.T @ mine, mine.T @ r[group == g]
     n = int(free.sum())
+    told = np.einsum("gkk->gk", H)[free]
+    many = told.sum(axis=0) ** 2 >= FEWEST_TELL * np.sum(told**2, axis=0)
+    H, s = H[:, many][:, :, many], s[:, many]
     weights = np.ones((draws, len(names)))
     weights[:, free] = np.random.default_rng(0).multinomial(n, np.full(n, 1 / n), draws)
     steps = [
         np.linalg.lstsq(np.tensordot(w, H, 1), -(w @ s), rcond=1e-10)[0]
         for w in weights
     ]
+    out = np.zeros(k)
     # Of n blocks a sum's variance comes out (n - 1)/n of what it is.
-    return np.std(steps, axis=0) * np.sqrt(n / (n - 1)) / size
+    out[many] = np.std(steps, axis=0) * np.sqrt(n / (n - 1))
+    return out / size
 
 
 def random_effects(x, variance) -> tuple[float, float]:

@@ -106,6 +106,16 @@ def presses(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
     return lasting > FELT_SHARE * len(touching)
 
 
+def thinned(on: np.ndarray) -> np.ndarray:
+    """Of test functions (K,) in which a pair touches those that are told: the first one
+    of each touch, even of the shortest, and each that is THIN after the last such."""
+    out, last = np.zeros(len(on), bool), -THIN
+    for k in np.flatnonzero(on):
+        if k - last >= THIN:
+            out[k], last = True, k
+    return out
+
+
 def _rows_of_lasting(touching: np.ndarray, time: np.ndarray) -> int:
     """How many rows (n,) are in touches that last."""
     return sum(b - a for a, b in runs_of(touching) if time[b - 1] - time[a] > LASTS_SEC)
@@ -227,12 +237,11 @@ class PressingProblem(FeltPlaces):
         """(K, pairs) over what shapes are known to: of each pair, when it is felt."""
         shape = self.shape_std()
         K = len(self.means.time)
-        thinned = np.arange(K) % THIN == 0
         every, _ = self._slots(self._placed)
         columns = []
         for pair in self._pairs_met:
             mine = [s for s in every if self._pair_of(s) == pair]
-            on = self._met.get(pair, np.zeros(K, bool)) & thinned
+            on = thinned(self._met.get(pair, np.zeros(K, bool)))
             if not mine or not on.any():
                 columns.append(np.zeros(K))
                 continue
@@ -246,8 +255,7 @@ class PressingProblem(FeltPlaces):
                         # Softer, and with one parameter it would explain a wall that
                         # stands elsewhere.
                         raise ValueError("contact_stiffness: a tool goes in too far")
-            depth = pressed / stiffness
-            d = self._W @ nearest + depth
+            d = self._W @ nearest + pressed / stiffness
             columns.append(np.where(on, d / shape, 0.0))
         return -np.stack(columns, axis=1) if columns else np.zeros((K, 0))
 
@@ -256,9 +264,7 @@ class PressingProblem(FeltPlaces):
         n = out.shape[1] - len(self._pairs_met)
         for k, pair in enumerate(self._pairs_met):
             on = self._met.get(pair)
-            out[:, n + k] = (
-                False if on is None else on & (np.arange(len(on)) % THIN == 0)
-            )
+            out[:, n + k] = False if on is None else thinned(on)
         return out
 
     # ----- What may be slightly wrong, and candidates
