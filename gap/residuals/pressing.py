@@ -110,7 +110,7 @@ def thinned(on: np.ndarray) -> np.ndarray:
     """Of test functions (K,) in which a pair touches those that are told: the first one
     of each touch, even of the shortest, and each that is THIN after the last such."""
     out, last = np.zeros(len(on), bool), -THIN
-    for k in np.flatnonzero(on):
+    for k in map(int, np.flatnonzero(on)):
         if k - last >= THIN:
             out[k], last = True, k
     return out
