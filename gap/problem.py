@@ -312,6 +312,11 @@ class GapProblem(ABC):
         """Where to look for what no effect explains, as sentences; "": not known."""
         return ""
 
+    def other_gravity(self, end: Fitted) -> tuple[str, bool]:
+        """That another direction of gravity explains as much as what is named, as a
+        sentence ("": it does not), and whether it explains clearly more."""
+        return "", False
+
     def reweigh(self, fitted: Fitted) -> bool:
         """Weighs rows by what a fit leaves, where that is clearly less than what models
         were taken to be off by, and by the noise in the fitted model. Returns: whether

@@ -19,12 +19,12 @@ from makebreak.gap.data.check_drives import (
 from makebreak.gap.data.check_meshes import check_meshes
 from makebreak.gap.data.checks import check_recordings
 from makebreak.gap.data.conditioning import condition
-from makebreak.gap.data.findings import SAMPLED_COMMANDS, Finding
+from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.pieces import excerpt
 from makebreak.gap.data.reading import check_against_scene, read_recordings
 from makebreak.gap.data.recording import Recording, unit_of
 from makebreak.gap.data.scene_facts import scene_facts, scene_names
-from makebreak.gap.data.split import split, with_noise_of
+from makebreak.gap.data.split import Split, split, with_noise_of
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.doubts import unless_doubtful
 from makebreak.gap.parallel import side_by_side
@@ -128,18 +128,19 @@ def run_gap(
     meets = is_mechanism and (
         runs_against(dynamics, parts.decided) or presses(dynamics, parts.decided)
     )
-    decided, done = condition(parts.decided, is_mechanism and not meets)
-    checks += done
-    reported, _ = condition(parts.reported, is_mechanism and not meets)
-    reported = with_noise_of(reported, decided)
-    decided, cut = _shortened(decided, dynamics)
-    checks += cut
+    decided, reported, done = _conditioned(parts, dynamics, is_mechanism and not meets)
     seconds["checks"] = clock.lap()
     say("preparing motions and windows")
     problem, found = problem_for(scene, decided, dynamics, jobs)
-    if any(f.kind == SAMPLED_COMMANDS for f in found):
-        reported = sampled_commands.as_samples(reported)
-    checks += found
+    if isinstance(problem, MechanismProblem) and problem.commands_are_samples():
+        parts = replace(
+            parts, decided=sampled_commands.as_samples(parts.decided),
+            reported=sampled_commands.as_samples(parts.reported),
+        )  # fmt: skip
+        decided, reported, done = _conditioned(parts, dynamics, not meets)
+        problem, found = problem_for(scene, decided, dynamics, jobs)
+        found.append(sampled_commands.finding(decided))
+    checks += [*done, *found]
     seconds["screen"] = clock.lap()
     say("searching the catalogue")
     selection = select(problem, say)
@@ -166,6 +167,17 @@ def run_gap(
         result = with_differences(result, names, alone)
         seconds["recordings"] = clock.lap()
     return unless_doubtful(result).with_seconds(seconds)
+
+
+def _conditioned(
+    parts: Split, dynamics: SceneDynamics, average: bool
+) -> tuple[list[Recording], list[Recording], list[Finding]]:
+    """What is decided on, as it is compared, what is reported on, and what was done."""
+    decided, done = condition(parts.decided, average)
+    reported, _ = condition(parts.reported, average)
+    reported = with_noise_of(reported, decided)
+    decided, cut = _shortened(decided, dynamics)
+    return decided, reported, [*done, *cut]
 
 
 def problem_for(
@@ -207,10 +219,6 @@ def problem_for(
         recordings, touches = without_contact(dynamics, recordings)
         scene, finding = _settle_step(scene, recordings, dynamics, jobs)
         mechanism = MechanismProblem(scene, recordings)
-        if mechanism.commands_are_samples():
-            recordings = sampled_commands.as_samples(recordings)
-            finding.append(sampled_commands.finding(recordings))
-            mechanism = MechanismProblem(scene, recordings)
         return mechanism, [*touches, *finding, *mechanism.push_findings()]
     if any(joint.num_velocities() for joint in one_dof_joints(dynamics.plant)):
         try:
@@ -259,6 +267,10 @@ def conclude(
         for c in selection.choices
     ]
     selection = replace(selection, choices=tuple(choices))
+    turned, is_better = problem.other_gravity(selection.end) if choices else ("", False)
+    if is_better:  # Forces and loads stand for a robot that hangs on a wall.
+        choices = []
+        selection = replace(selection, choices=(), end=selection.start)
     drifting = drift_sentences(problem, selection.end) if choices else ""
     start, end = problem.error(selection.start), problem.error(selection.end)
     verdict = verdict_of(choices, start, end, selection.far)
@@ -325,6 +337,9 @@ def conclude(
         verdict = "not_judged"
         near += unjudged
     near += two_figures(start, problem.error(selection.end), final.gap)
+    if turned and verdict in ("gap_named", "ambiguous"):
+        verdict = "ambiguous"
+        near += turned
     near += drifting
     if verdict == "gap_unnamed":
         near += problem.hint(selection.end)

@@ -10,6 +10,7 @@ import pytest
 from makebreak.gap import read_recordings, run_gap, write_report
 from makebreak.gap.by_recording import _apart, with_differences
 from makebreak.gap.data import sampled_commands
+from makebreak.gap.data.conditioning import condition
 from makebreak.gap.data.findings import GUESSED_GAINS, NO_COLUMN, NO_DRIVE, Finding
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.doubts import unless_doubtful
@@ -44,7 +45,7 @@ URDF = f"""<robot name="rig"><link name="base"/><link name="rod"><inertial>
 def log(
     folder, name, seed, damping=0.0, late=0.0, effort_late=0.0, seconds=14.0,
     mass=MASS, longer=1.0, inertia=1e-3, position_noise=2e-5, fall=0.0,
-    effort_noise=0.02,
+    effort_noise=0.02, every=0.005,
 ):  # fmt: skip
     """Writes a log of a pendulum that follows sums of sines exactly, 200 rows a second;
     velocities and positions late, or the efforts. inertia: about its centre. fall: the
@@ -68,7 +69,7 @@ def log(
             + (damping * (1.0 - fall * t / seconds) * v)
         )
 
-    t = np.arange(0.0, seconds, 0.005)
+    t = np.arange(0.0, seconds, every)
     q, v, _ = state(t - late)
     rows = np.column_stack(
         [
@@ -136,6 +137,18 @@ def test_commands_of_a_faster_loop_are_no_gap(scene, tmp_path):
     assert "sampled_commands" in {c.kind for c in result.checks}
 
 
+def test_commands_of_a_faster_loop_are_found_among_means_over_many_rows(
+    scene, tmp_path
+):
+    """A log of 500 rows a second is averaged over 10 ms: half a row is 1 ms all the
+    same."""
+    path = log(tmp_path, "a", 13, effort_noise=0.0, every=0.002)
+    path.write_text(path.read_text().replace("effort_measured", "effort_command"))
+    averaged, found = condition(read_recordings([path]))
+    assert "averaged" in {f.kind for f in found}
+    assert MechanismProblem(read_scene(scene), averaged).commands_are_samples()
+
+
 def test_commands_that_hold_or_damping_are_no_samples(scene, tmp_path):
     """Damping that the scene lacks acts earlier than gravity and inertia, too."""
     recordings = read_recordings([log_of_a_fast_loop(tmp_path)])
@@ -162,6 +175,23 @@ def test_another_direction_of_gravity_is_said(tmp_path, scene):
     scene.write_text(standing.replace("time_step: 0, ", "time_step: 0"))
     problem = MechanismProblem(read_scene(scene), read_recordings([path]))
     assert problem.hint(None) == ""
+
+
+def test_what_another_direction_of_gravity_explains_better_is_not_named(
+    tmp_path, scene
+):
+    """Two forces, or a load that weighs less than nothing, stood for a wall mount."""
+    path = log(tmp_path, "a", 17)
+    problem = MechanismProblem(read_scene(scene), read_recordings([path]))
+    much, little = (SimpleNamespace(left=np.full(len(problem.base()), x))
+                    for x in (50.0, 0.5))  # fmt: skip
+    assert problem.other_gravity(much) == ("", False)  # It is as the scene says.
+    turned = scene.read_text() + "plant: {time_step: 0, gravity: [-9.81, 0, 0]}\n"
+    scene.write_text(turned.replace("plant: {time_step: 0}\n", ""))
+    problem = MechanismProblem(read_scene(scene), read_recordings([path]))
+    says, is_better = problem.other_gravity(much)
+    assert is_better and "Gravity of (" in says
+    assert not problem.other_gravity(little)[1]  # What is named does as well.
 
 
 def test_friction_that_falls_is_said_to_and_constant_friction_is_not(scene, tmp_path):

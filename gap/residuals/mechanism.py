@@ -39,6 +39,8 @@ from makebreak.gap.thresholds import (
     BESIDE_NOISE_EVIDENCE,
     CLOSED_SHARE_MIN,
     NOISE_RMS_MAX,
+    SAME_ERROR,
+    SIMULATED_RIVAL_GAIN,
     UNEXPLAINED_RMS,
 )
 from makebreak.models.dynamics import SceneDynamics
@@ -345,22 +347,23 @@ class MechanismProblem(InverseModel, GapProblem):
         kind = next(k for k, entry in KINDS.items() if entry.path == "delay")
         n = self.nuisances()
         screen = Screen(self.base(), n.columns, n.prior, self.train(), reach=n.reach)
+        written = min(r.period_sec() for r in self.recordings)  # Rows may be means.
 
-        def left(periods: float) -> float:
-            """Robust: where an effort jumps, no sample says when."""
-            late = Effect(kind, given, {"delay": -periods * self.period})
+        def left(periods: float) -> np.ndarray:
+            """By rms, and robust, as no sample says when an effort jumps; of each
+            channel, as most joints may be at rest."""
+            late = Effect(kind, given, {"delay": -periods * written})
             r = self.residual([late]) if periods else self.base()
-            off = np.abs(self.in_noise(screen.fit_nuisances(r)[1]))
-            return ROBUST * float(np.median(off))
+            off = self.in_noise(screen.fit_nuisances(r)[1])
+            each = np.median(np.abs(off).reshape(-1, len(self.names())), axis=0)
+            return np.array([rms(off), ROBUST * rms(each)])
 
         held, less, half, more = (left(periods) for periods in (0.0, 0.25, 0.5, 0.75))
         gained = len(self.base()) * (held**2 - half**2)
-        enough = max(NOISE_RMS_MAX, (1.0 - CLOSED_SHARE_MIN) * held)
-        return (
-            half < min(less, more)
-            and half <= enough
-            and gained > BESIDE_NOISE_EVIDENCE * self.correlation**2
-        )
+        enough = np.maximum(NOISE_RMS_MAX, (1.0 - CLOSED_SHARE_MIN) * held)
+        is_half = (half < less) & (half < more) & (half <= enough)
+        is_sure = gained > BESIDE_NOISE_EVIDENCE * self.correlation**2
+        return bool((is_half & is_sure).any())
 
     # ----- The search
 
@@ -550,15 +553,26 @@ class MechanismProblem(InverseModel, GapProblem):
     # ----- What it comes to
 
     def hint(self, end: Fitted) -> str:
-        """Another direction of gravity, if that explains most of the gap: a robot on a
-        wall or a ceiling, of which the scene says that it stands."""
+        return self._other_gravity()[0]
+
+    def other_gravity(self, end: Fitted) -> tuple[str, bool]:
+        says, error = self._other_gravity()
+        named = rms(self.in_noise(end.left)[~self.train()])
+        if not says or error > (1.0 + SAME_ERROR) * max(named, 1.0):
+            return "", False
+        return says, error < SIMULATED_RIVAL_GAIN * named
+
+    def _other_gravity(self) -> tuple[str, float]:
+        """Another direction of gravity, in words, if that explains most of the gap, and
+        the error that it leaves: a robot on a wall or a ceiling, of which the scene
+        says that it stands."""
         weight = [
             self.dynamics.mass_times_com_jacobian(m.q).transpose(0, 2, 1)
             for m in self.motions()
         ]
         X, n = self.columns_of(weight), self.nuisances()
         if not np.abs(X).max(initial=0.0) > 0.0:
-            return ""
+            return "", np.inf
         screen = Screen(self.base(), n.columns, n.prior, self.train(), reach=n.reach)
         less = screen.fit(X).c
         held = ~self.train()
@@ -569,16 +583,17 @@ class MechanismProblem(InverseModel, GapProblem):
         new = old - less
         size = [float(np.linalg.norm(g)) for g in (old, new)]
         if not min(size) > 0.0 or not after < (1.0 - CLOSED_SHARE_MIN) * before:
-            return ""
+            return "", np.inf
         angle = float(np.arccos(np.clip(old @ new / (size[0] * size[1]), -1.0, 1.0)))
         if angle < TURNED or abs(size[1] / size[0] - 1.0) > SAME_GRAVITY:
-            return ""
+            return "", np.inf
         along = ", ".join(f"{x:.1f}" for x in new)
-        return (
+        says = (
             f" Gravity of ({along}) m/s2 instead of the scene's would take the error "
             f"of the equations from {before:.3g} to {after:.3g}: is the base mounted "
             "as the scene says?"
         )
+        return says, after
 
     def where(self, left: np.ndarray) -> list[Where]:
         return where_in_motion(self, self.in_noise(left))
