@@ -325,6 +325,38 @@ def test_a_sensor_that_drops_out_is_said_and_changes_nothing(bad):
     assert all(mode == known or known == 0 for _, known, mode, _, _ in changes)
 
 
+def slid(friction, normal, seconds):
+    """Rows (time, memory) of a tool that slides along x; friction(t), normal(t) [N]."""
+    tuning, rng = ModeTuning(), np.random.default_rng(0)
+    memory, rows = start(tuning), []
+    motion = np.array([0.1, 0, 0, 0, 0, 0]), np.array([1.0, 0, 0])
+    for k in range(round(seconds / tuning.period)):
+        time = k * tuning.period
+        wrench = np.zeros(6)
+        wrench[:3] = np.array([-friction(time), 0.0, 1.0]) * normal(time)
+        wrench[:3] += tuning.force_noise * rng.normal(size=3)
+        memory = detect(memory, tuning, time, wrench, *motion, DOWN, -1, -1)
+        rows.append((time, memory))
+    return rows
+
+
+def test_no_mode_is_made_while_the_normal_force_rises():
+    """It doubles every 60 ms up to 96 N, and the halves of a batch are 40 ms apart."""
+    rows = slid(lambda _: 0.3, lambda t: 1.5 * 2.0 ** min(t / 0.06, 6.0), 1.0)
+    assert all(memory.mode < 1 for time, memory in rows if time <= 0.36)
+    assert rows[-1][1].mode == 1
+
+
+def test_a_feature_that_creeps_away_from_its_mode_is_another_mode_in_the_end():
+    """By 0.015 a second, to which the reference alone would be near all the time."""
+    rows = slid(lambda t: 0.2 + 0.015 * max(t - 1.0, 0.0), lambda _: 10.0, 20.0)
+    friction = {}
+    for time, memory in rows:
+        friction.setdefault(memory.mode, 0.2 + 0.015 * max(time - 1.0, 0.0))
+    threshold = ModeTuning().threshold
+    assert 0.2 + threshold < friction[2] < 0.2 + 4.0 * threshold
+
+
 def test_a_sensor_of_a_wider_range_is_used_to_its_limit():
     """A tool that is pressed with 400 N, as for grinding."""
     slide = Slide([0.2, 0.5], [0.3], seed=2)
