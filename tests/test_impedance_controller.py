@@ -615,6 +615,45 @@ def test_a_delay_bounds_the_damping_of_the_tips_position(plant, chain):
     assert np.max(abs(bounded - torque())) > 0.1
 
 
+@pytest.mark.parametrize("control_orientation", [False, True])
+def test_a_tip_that_no_joint_moves_is_no_error(control_orientation):
+    """One joint whose axis goes through the tip: only its own weight is carried."""
+    arm = MultibodyPlant(0.0)
+    inertia = SpatialInertia.SolidBoxWithMass(2.0, 0.1, 0.2, 0.3)
+    link = arm.AddRigidBody("link", inertia)
+    base = arm.AddFrame(
+        FixedOffsetFrame(
+            "base", arm.world_frame(), RigidTransform(RotationMatrix.MakeXRotation(1.0))
+        )
+    )
+    side = arm.AddFrame(
+        FixedOffsetFrame("side", link.body_frame(), RigidTransform([0.1, 0.0, 0.0]))
+    )
+    joint = arm.AddJoint(RevoluteJoint("joint", base, side, [0.0, 0.0, 1.0]))
+    arm.AddJointActuator("motor", joint, 50.0)
+    arm.AddFrame(FixedOffsetFrame("tip", side, RigidTransform([0.0, 0.0, 0.2])))
+    arm.Finalize()
+    config = ImpedanceConfig(
+        stiffness=[100.0] * 3 + [0.0] * 3,
+        damping=[10.0] * 3 + [0.0] * 3,
+        control_orientation=control_orientation,
+    )
+    controller = ImpedanceController(config, arm)
+    context = controller.CreateDefaultContext()
+    q, at = np.array([0.7]), arm.CreateDefaultContext()
+    arm.SetPositions(at, q)
+    pose = arm.GetFrameByName("tip").CalcPoseInWorld(at)
+    wxyz = pose.rotation().ToQuaternion().wxyz()
+    x_d = reference(pose.translation() + [0.0, 0.1, 0.0], quaternion=wxyz)
+    for name, value in {"q": q, "v": np.zeros(1), "x_desired": x_d}.items():
+        controller.GetInputPort(name).FixValue(context, value)
+    Simulator(controller, context).AdvanceTo(0.1)
+    tau = controller.GetOutputPort("tau").Eval(context)
+    expected = -arm.CalcGravityGeneralizedForces(at)
+    assert abs(expected) > 0.1
+    np.testing.assert_allclose(tau, expected, atol=1e-9)
+
+
 # Refusals.
 
 

@@ -284,7 +284,7 @@ def impedance_torque(
         forward_solve(L, column)
         X[:, j] = column
     mobility = X.T @ X  # J inv(M) J'
-    largest = 0.0
+    largest = 1e-3  # A tip that no joint moves has one, too [1/kg].
     for i in range(m):
         largest = max(largest, mobility[i, i])
     for i in range(m):
