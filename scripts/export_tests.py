@@ -273,13 +273,15 @@ class _RecordingSession(Session):
 
     def simulate(self, diagram, duration_sec, record, *args, **kwargs) -> Log:
         self.seen |= {s.get_name() for s in leaf_systems(diagram)}
+        # A simulation without a label is the only one of its run. Of several ones, the
+        # later may have other systems and may depend on the end of the earlier.
+        only = not kwargs.get("label")
+        if only and not set(self._wanted) <= self.seen:
+            raise _Done  # An unknown name is refused without a run.
         kwargs["context"] = kwargs.get("context") or diagram.CreateDefaultContext()
         initial = kwargs["context"].Clone()
         recorder = _Recorder(diagram, self._wanted, self._seconds, initial)
         self.recorders.append(recorder)
-        # A simulation without a label is the only one of its run. Of several ones, the
-        # later may have other systems and may depend on the end of the earlier.
-        only = not kwargs.get("label")
         if self._wanted or only:
             duration_sec = min(duration_sec, self._seconds)
         with observed(recorder):

@@ -6,9 +6,12 @@ import shutil
 import subprocess
 import sys
 from enum import IntEnum
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.systems.sensors import ImageRgba8U
 
 from makebreak.diagrams.cartpole_walls import CartpoleWallsConfig
@@ -167,6 +170,20 @@ def test_equal_values_in_a_row_are_kept_once():
 
 def run_main(*words):
     return main(["export-tests", *words])
+
+
+def test_an_unknown_system_of_a_single_simulation_is_refused_before_it_runs(tmp_path):
+    builder = DiagramBuilder()
+    builder.AddNamedSystem("learner", ConstantVectorSource([1.0]))
+    diagram = builder.Build()
+
+    def run(config, session):
+        session.simulate(diagram, 5.0, record=None)  # It would fail if it ran.
+
+    with pytest.raises(ValueError, match="has no system lerner; did you mean learner"):
+        export_tests(
+            "own", SimpleNamespace(run=run), None, tmp_path / "out", ["lerner"]
+        )
 
 
 def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capsys, monkeypatch):
