@@ -1,5 +1,6 @@
 """A robot that presses on what is fixed: a gantry with a ball for a tool, by an ODE."""
 
+import sys
 from dataclasses import replace
 from itertools import product
 
@@ -321,6 +322,37 @@ def test_places_and_frictions_are_named(displaced):
     assert len(found) == 4
 
 
+def test_a_place_is_known_no_better_than_how_deep_the_tool_goes_in(
+    tmp_path, monkeypatch
+):
+    """The world is four times as stiff as the scene says, and is pressed with one
+    force: 8 N, which are 0.4 mm in the scene and 0.1 mm in the world. Where the
+    stiffness is fitted along, it is nothing more to the place."""
+    monkeypatch.setattr(sys.modules[__name__], "STIFFNESS", 4 * STIFFNESS)
+    scene, recordings = write_scene(tmp_path), record(tmp_path, table=-0.012)
+    problem = PressingProblem(scene, recordings)
+    search = Comparison(problem, print)
+
+    def fitted(*more):
+        height = Effect("plane_height", [TABLE, WALL], {"height": -0.012})
+        return fit_effects(
+            problem, search.screen(search.start.r), [height, *more],
+            [(), *[("stiffness",)] * len(more)],
+        )  # fmt: skip
+
+    end = fitted()
+    off = abs(end.effects[0].parameters["height"] + 0.012)
+    assert off == pytest.approx(8.0 / 2e4 - 8.0 / 8e4, abs=5e-5)
+    std, _ = problem.widened(end, 0)
+    assert off < 2.0 * std["height"] < 1e-3 and off > 2.0 * end.std[0]["height"]
+    known = fitted(
+        Effect("contact_stiffness", [f"{TABLE}~gantry.tool"], {"stiffness": 8e4})
+    )
+    assert abs(known.effects[0].parameters["height"] + 0.012) < 5e-5
+    std, _ = problem.widened(known, 0)
+    assert std["height"] == pytest.approx(known.std[0]["height"])
+
+
 def test_a_wall_that_is_put_right_explains_forces_and_distance(displaced):
     names = displaced.row_names()
     there = [
@@ -412,16 +444,18 @@ def test_distances_are_computed_anew_only_where_something_stands_elsewhere(
     assert problem._slots_at == {}
 
 
-def test_each_touch_is_told_of_however_short():
+def test_each_touch_is_told_of_where_it_is_pressed_hardest():
     """Every fourth test function by its number would leave out the touches of one, two
-    and three here."""
-    on = np.zeros(40, bool)
+    and three here; the first one of a touch is where a tool may still approach."""
+    on, force = np.zeros(40, bool), np.zeros(40)
     for first, last in ((1, 2), (9, 11), (17, 20), (24, 37)):
         on[first:last] = True
-    assert list(np.flatnonzero(thinned(on))) == [1, 9, 17, 24, 28, 32, 36]
+    force[on] = 1.0
+    force[[10, 19, 28]] = 5.0
+    assert list(np.flatnonzero(thinned(on, force))) == [1, 10, 19, 24, 28, 32, 36]
     # A touch that is lost for a moment is not told twice.
     on = np.array([False, True, True, False, True, False, False, True])
-    assert list(np.flatnonzero(thinned(on))) == [1, 7]
+    assert list(np.flatnonzero(thinned(on, 1.0 * on))) == [1, 7]
 
 
 def test_no_contact_is_so_soft_that_a_tool_goes_in_by_centimetres(displaced):

@@ -26,6 +26,7 @@ from makebreak.gap.numerics.selection import (
     random_effects,
     simplest,
     spread_by_blocks,
+    std_of_shared_errors,
 )
 from makebreak.gap.numerics.signal_noise import noise_beside
 from makebreak.gap.numerics.weak_form import make_bumps
@@ -207,6 +208,29 @@ def test_blocks_drawn_anew_tell_how_a_slope_scatters_from_one_recording_to_the_n
     r, there = np.append(noise(1.0), 0.0), np.append(block, -1)
     assert spread_by_blocks(stiff, r, there)[0] < 1e-6
     assert spread_by_blocks(x[:125, None], noise(1.0)[:125], block[:125])[0] == 0.0
+
+
+def test_what_a_factor_that_all_rows_share_adds_to_a_deviation():
+    """Distances of which each is off by force times a compliance."""
+    n, c = 50, 3e-3
+    place = np.ones((n, 1))
+    # With one force only place and compliance are one: the depth is what it is off by.
+    constant = np.full((n, 1), 7.0)
+    assert std_of_shared_errors(place, constant, [c]) == pytest.approx(7.0 * c)
+    # Least squares with the compliance as one more row, in general.
+    rng = np.random.default_rng(0)
+    force = rng.uniform(0.0, 900.0, (n, 1))
+    H = np.hstack([place, force]).T @ np.hstack([place, force])
+    H[1, 1] += c**-2
+    added = np.linalg.inv(H)[0, 0] - 1.0 / n
+    told = std_of_shared_errors(place, force, [c])
+    assert told == pytest.approx(np.sqrt(added))
+    assert told < 0.2 * force.mean() * c  # Forces that differ tell it.
+    # A compliance that is known, a channel that the place does not move.
+    assert std_of_shared_errors(place, force, [0.0]) == 0.0
+    both, loads = np.hstack([place, 0.0 * place]), np.hstack([force, 9.0 * force])
+    assert std_of_shared_errors(both, loads, [c, 1.0]) == pytest.approx(told)
+    assert std_of_shared_errors(0.0 * place, force, [c]) == 0.0
 
 
 def test_what_two_of_many_blocks_tell_has_no_scatter_by_blocks():

@@ -14,7 +14,8 @@ from scipy.stats import chi2, wilcoxon
 
 from makebreak.gap.numerics.runs import starts_of_runs
 
-FEWEST_TELL = 3.0  # Blocks that tell a parameter, of which a scatter is taken.
+# Blocks that tell a parameter, of which a scatter is taken: one in 400 draws has none.
+FEWEST_TELL = 6.0
 _PENALTIES = 10.0 ** np.arange(-4.0, 2.0)  # Of a ridge, times the number of rows.
 
 
@@ -389,6 +390,24 @@ def spread_by_blocks(J, r, block, draws: int = 200) -> np.ndarray:
     # Of n blocks a sum's variance comes out (n - 1)/n of what it is.
     out[many] = np.std(steps, axis=0) * np.sqrt(n / (n - 1))
     return out / size
+
+
+def std_of_shared_errors(columns, errors, prior) -> float:
+    """What a parameter's standard deviation has, beside noise, from an unknown factor
+    of each channel that acts on all rows of it: the difference of its variances with
+    the factors fitted along, and with these known.
+
+    Args: columns (m, n): how rows of n channels change with the parameter; errors
+        (m, n): with their factors; prior (n,): standard deviation of each factor.
+    """
+    a, b, s = (np.asarray(x, float) for x in (columns, errors, prior))
+    known = np.sum(a**2)
+    if not known > 0.0:
+        return 0.0
+    both = np.sum(a * b, axis=0)
+    own = np.sum(b**2, axis=0) + 1.0 / np.maximum(s, 1e-150) ** 2
+    left = known - np.sum(both**2 / own)
+    return float(np.sqrt(max(1.0 / left - 1.0 / known, 0.0))) if left > 0.0 else np.inf
 
 
 def random_effects(x, variance) -> tuple[float, float]:

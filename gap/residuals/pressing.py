@@ -16,7 +16,7 @@ from makebreak.gap.data.pieces import excerpt
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.runs import runs_of
-from makebreak.gap.numerics.selection import Screen
+from makebreak.gap.numerics.selection import Screen, std_of_shared_errors
 from makebreak.gap.problem import Candidate, Fitted, Nuisances
 from makebreak.gap.residuals.contact_dynamics import THIN
 from makebreak.gap.residuals.contact_problem import ContactProblem
@@ -51,6 +51,9 @@ SQUEEZED = 10.0  # Times what a row needs: forces that act in it, at most.
 MOST_FRICTION = 2.0  # Of what is taken for any.
 MOST_PATCHES, MOST_EFFECTS = 3, 10
 SMALL_SHIFT = 1e-3  # First trial of a place [m].
+# What a contact may give at least, whatever stiffness the scene has [m/N]: Drake's
+# default is a hundred times stiffer than a rubber tip.
+COMPLIANCE, SHORT_SHIFT = 5e-5, 1e-5
 # A touch that lasts so long is no impact [s]. Of longer recordings pieces are asked.
 LASTS_SEC, ASKED_SEC, ASKED_ROWS = 0.3, 60.0, 120_000
 
@@ -106,13 +109,18 @@ def presses(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
     return lasting > FELT_SHARE * len(touching)
 
 
-def thinned(on: np.ndarray) -> np.ndarray:
-    """Of test functions (K,) in which a pair touches those that are told: the first one
-    of each touch, even of the shortest, and each that is THIN after the last such."""
-    out, last = np.zeros(len(on), bool), -THIN
-    for k in map(int, np.flatnonzero(on)):
-        if k - last >= THIN:
-            out[k], last = True, k
+def thinned(on: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """Of test functions (K,) in which a pair touches those that are told: none within
+    THIN of another one, the hardest pressed first. Each touch has one, however short;
+    as it begins a tool may still be above what it is about to touch, with a force that
+    is another contact's friction.
+
+    Args: force (K,): with which the pair is pressed.
+    """
+    out = np.zeros(len(on), bool)
+    for k in np.argsort(-force, kind="stable"):
+        if on[k] and not out[max(k - THIN + 1, 0) : k + THIN].any():
+            out[k] = True
     return out
 
 
@@ -233,6 +241,12 @@ class PressingProblem(FeltPlaces):
             self._pressed_at = (key, self._weighed), self._pressing(others)[0]
         return self._pressed_at[1]
 
+    def _prepare(self) -> None:
+        super()._prepare()
+        self._told = {
+            pair: thinned(on, self._pressed[pair]) for pair, on in self._met.items()
+        }
+
     def _distances(self, geometry: Geometry) -> np.ndarray:
         """(K, pairs) over what shapes are known to: of each pair, when it is felt."""
         shape = self.shape_std()
@@ -241,7 +255,7 @@ class PressingProblem(FeltPlaces):
         columns = []
         for pair in self._pairs_met:
             mine = [s for s in every if self._pair_of(s) == pair]
-            on = thinned(self._met.get(pair, np.zeros(K, bool)))
+            on = self._told.get(pair, np.zeros(K, bool))
             if not mine or not on.any():
                 columns.append(np.zeros(K))
                 continue
@@ -259,12 +273,54 @@ class PressingProblem(FeltPlaces):
             columns.append(np.where(on, d / shape, 0.0))
         return -np.stack(columns, axis=1) if columns else np.zeros((K, 0))
 
+    def widened(self, end: Fitted, k: int) -> tuple[dict[str, float], tuple[str, ...]]:
+        """A place is known no better than how deep the tool goes in there, where no
+        stiffness is fitted: as far as forces of several sizes do not tell it."""
+        std, or_more = super().widened(end, k)
+        effect, p = end.effects[k], end.effects[k].parameters
+        if effect.kind not in MOVES:
+            return std, or_more
+
+        def distances(parameters) -> np.ndarray:
+            others = [*end.effects]
+            others[k] = replace(effect, parameters=parameters)
+            self.left(others)
+            return self._distances(self._geometry(others))[self._train]
+
+        here = distances(p)
+        depths, priors = self._depths_per_compliance(end.effects)
+        for name in std:
+            try:
+                there = distances({**p, name: p[name] + SHORT_SHIFT})
+            except ValueError:  # The tool was there.
+                continue
+            more = std_of_shared_errors(
+                (there - here) / SHORT_SHIFT, depths[self._train], priors
+            )
+            std[name] = float(np.hypot(std[name], more))
+        return std, or_more
+
+    def _depths_per_compliance(self, effects: Sequence[Effect]):
+        """(K, pairs) how distances change with what a contact gives per newton, and
+        (pairs,) how well that is known [m/N]; 0 where its stiffness is fitted."""
+        slots, _ = self._slots(self._placed)
+        columns, priors = [], []
+        for pair in self._pairs_met:
+            on = self._told.get(pair, np.zeros(len(self.means.time), bool))
+            pressed = self._pressed_now.get(pair, np.zeros(len(on)))
+            columns.append(np.where(on, pressed, 0.0) / self.shape_std())
+            mine = [s.stiffness for s in slots if self._pair_of(s) == pair]
+            fitted = any(
+                e.kind == STIFFNESS and self._at_pair(e, pair) for e in effects
+            )
+            priors.append(0.0 if fitted or not mine else max(COMPLIANCE, 1.0 / mine[0]))
+        return np.stack(columns, axis=1), np.array(priors)
+
     def counts(self) -> np.ndarray:
         out = super().counts()
         n = out.shape[1] - len(self._pairs_met)
         for k, pair in enumerate(self._pairs_met):
-            on = self._met.get(pair)
-            out[:, n + k] = False if on is None else thinned(on)
+            out[:, n + k] = self._told.get(pair, False)
         return out
 
     # ----- What may be slightly wrong, and candidates
