@@ -271,6 +271,10 @@ def conclude(
     if is_better:  # Forces and loads stand for a robot that hangs on a wall.
         choices = []
         selection = replace(selection, choices=(), end=selection.start)
+        if chosen_on is not None:
+            chosen_on = problem.outcome(
+                [], selection.start, selection.end, nuisances, jobs=jobs
+            )
     drifting = drift_sentences(problem, selection.end) if choices else ""
     start, end = problem.error(selection.start), problem.error(selection.end)
     verdict = verdict_of(choices, start, end, selection.far)
@@ -340,7 +344,7 @@ def conclude(
     if turned and verdict in ("gap_named", "ambiguous"):
         verdict = "ambiguous"
         near += turned
-    near += drifting
+    near += drifting if selection.choices else ""
     if verdict == "gap_unnamed":
         near += problem.hint(selection.end)
     before = [

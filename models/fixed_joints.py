@@ -6,7 +6,7 @@ of motion of the arm need to know only where they stand.
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from xml.dom import minidom
+from xml.dom import expatbuilder, minidom
 from xml.parsers.expat import ExpatError
 
 from pydrake.common.eigen_geometry import AngleAxis
@@ -17,12 +17,16 @@ from pydrake.multibody.tree import Joint, PrismaticJoint, WeldJoint
 from makebreak.models.effects.kind import actuator_of, full_name, one_dof_joints
 
 
-def fix_joints(plant: MultibodyPlant, fixed: Mapping[str, float]) -> None:
-    """Welds joints at these positions, before Finalize. All constraints between joints
-    are removed with them: those that are left must be of joints that are fixed.
+def fix_joints(
+    plant: MultibodyPlant, fixed: Mapping[str, float], couplings: int = 0
+) -> None:
+    """Welds joints at these positions, before Finalize. Couplings, which must be of
+    joints that are fixed, are removed with them.
 
-    Args: fixed: {<model>.<joint>: position [rad] or [m]}.
-    Raises: ValueError for a joint that there is not.
+    Args: fixed: {<model>.<joint>: position [rad] or [m]}. couplings: how many of the
+        plant's constraints are couplings; Drake does not tell what a constraint holds.
+    Raises: ValueError for a joint that there is not, or for other constraints, as of a
+        closed loop: they would be lost.
     """
     if not fixed:
         return
@@ -32,6 +36,12 @@ def fix_joints(plant: MultibodyPlant, fixed: Mapping[str, float]) -> None:
             raise ValueError(
                 f"fixed_joints: no joint {name}, the scene has {', '.join(joints)}"
             )
+    if plant.num_constraints() > couplings:
+        raise ValueError(
+            f"fixed_joints: the models have {plant.num_constraints()} constraints, of "
+            f"which {couplings} are couplings of joints (mimic); expected no others: "
+            "closed loops are not covered beside fixed joints"
+        )
     for constraint in plant.GetConstraintIds():
         plant.RemoveConstraint(constraint)
     for name, position in fixed.items():
@@ -56,7 +66,8 @@ def coupled_joints(path: Path) -> dict[str, str]:
     """{joint: the one that it follows} of a URDF, SDF or MJCF; none where it cannot be
     read, which a parser says better."""
     try:
-        document = minidom.parse(str(path))
+        # Drake knows `drake:` without a declaration of it.
+        document = expatbuilder.parse(str(path), namespaces=False)
     except (ExpatError, OSError):
         return {}
     return dict(_couplings(document))

@@ -94,7 +94,7 @@ def add_models(scene: Scene, effects: Sequence[Effect], plant: MultibodyPlant) -
         _refuse_inertias(flat.directives, packages, warnings)
     if scene.fixed_joints:
         _check_fixed_together(scene)
-        fix_joints(plant, scene.fixed_joints)
+        fix_joints(plant, scene.fixed_joints, len(couplings_of(scene)))
 
 
 def couplings_of(scene: Scene) -> dict[str, str]:

@@ -48,6 +48,22 @@ def scene(folder, more=""):
     return path
 
 
+LOOP = """<drake:ball_constraint>
+<drake:ball_constraint_body_A name="upper"/><drake:ball_constraint_body_B name="fore"/>
+<drake:ball_constraint_p_AP value="0.3 0 0"/>
+<drake:ball_constraint_p_BQ value="0 0 0"/></drake:ball_constraint>"""
+
+
+@pytest.mark.parametrize("right", ["", MIMIC])
+def test_a_closed_loop_of_other_joints_is_not_lost(tmp_path, right):
+    """Its forces would be missing in the equations of the joints that move."""
+    path = robot(tmp_path, right, beyond=LOOP)
+    assert coupled_joints(path) == ({"right": "left"} if right else {})
+    fixed = "fixed_joints: {arm.left: 0, arm.right: 0}\n"
+    with pytest.raises(ValueError, match="expected no others: closed loops"):
+        SceneDynamics(read_scene(scene(tmp_path, fixed)))
+
+
 def log(folder, names):
     """Sines, 100 rows a second, of joints' positions and of the arm's efforts."""
     t = np.arange(0.0, 8.0, 0.01)

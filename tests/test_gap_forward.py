@@ -97,6 +97,23 @@ def test_a_tie_that_does_no_better_in_the_end_stays_a_tie(monkeypatch):
     assert (MASS, mass.effect.at[0]) in named(problem)
 
 
+def test_rows_are_weighed_in_the_end_by_what_is_named():
+    """And not as in a branch that was given up, or with an effect that was dropped."""
+    problem = where_a_mass_is(0.0, wrong=0.02)
+    problem._base += 3.0 * np.random.default_rng(2).normal(size=600)
+    weighed: list[set] = []
+
+    def reweigh(fitted):
+        weighed.append({(e.kind, e.at[0]) for e in fitted.effects})
+        return False
+
+    problem.reweigh = reweigh
+    found = named(problem)
+    tie = {(MASS, t.at[0]) for t in found[next(k for k in found if k[0] == MASS)].ties}
+    assert any(tie & each for each in weighed)  # The branch was tried.
+    assert weighed[-1] == set(found)
+
+
 def test_progress_is_said_after_the_last_effect_was_added_too():
     """Whether each effect is needed, and whether a tie is still one, are fits as well,
     which take most of the time where an arm has many contacts."""

@@ -452,10 +452,15 @@ def test_each_touch_is_told_of_where_it_is_pressed_hardest():
         on[first:last] = True
     force[on] = 1.0
     force[[10, 19, 28]] = 5.0
-    assert list(np.flatnonzero(thinned(on, force))) == [1, 10, 19, 24, 28, 32, 36]
+    first = np.zeros(40, int)
+    told = np.flatnonzero(thinned(on, force, first))
+    assert list(told) == [1, 10, 19, 24, 28, 32, 36]
     # A touch that is lost for a moment is not told twice.
     on = np.array([False, True, True, False, True, False, False, True])
-    assert list(np.flatnonzero(thinned(on, 1.0 * on))) == [1, 7]
+    assert list(np.flatnonzero(thinned(on, 1.0 * on, first[:8]))) == [1, 7]
+    # One in the next episode is another.
+    episodes = np.array([0, 0, 0, 1, 1, 1, 1, 1])
+    assert list(np.flatnonzero(thinned(on, 1.0 * on, episodes))) == [1, 4]
 
 
 def test_no_contact_is_so_soft_that_a_tool_goes_in_by_centimetres(displaced):

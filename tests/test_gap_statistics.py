@@ -250,6 +250,10 @@ def test_what_two_of_many_blocks_tell_has_no_scatter_by_blocks():
         # Of eight touches with noise of 1 and slopes of 10: the mean's scatter.
         expected = 0.1 / np.sqrt(8) if told else 0.0
         assert both[1] == pytest.approx(expected, rel=0.6)
+    # Of eight blocks none may be missing, though some say more than others.
+    short = np.repeat(np.arange(8), 25)
+    loud = np.repeat([1.0, 2.0, 1.0, 3.0, 1.0, 2.0, 1.0, 1.0], 25)[:, None]
+    assert spread_by_blocks(loud * friction[:200, None], r[:200], short)[0] > 0.0
 
 
 def test_a_mean_of_what_differs_from_time_to_time():

@@ -181,6 +181,23 @@ def test_of_two_arms_side_and_number_name_a_joint():
     assert found["right q"] is None
 
 
+@pytest.mark.parametrize("first", [0, 1])
+def test_columns_may_be_counted_from_0_or_1_beside_joints_of_other_names(first):
+    """A gripper makes "arm" a word that not all joints have. arm_q_1 is the second
+    joint where arm_q_0 is there too."""
+    names = [*(f"arm_joint_{k}" for k in (1, 2, 3)), "gripper_joint"]
+    columns = [f"arm_{q}_{k + first}" for q in ("q", "tau") for k in range(3)]
+    found = channels(
+        {"time": T} | sines([*columns, "gripper pos"]),
+        [JointName(f"r.{name}") for name in names],
+    )
+    for k in range(3):
+        assert found[f"arm_q_{k + first}"] == f"r.arm_joint_{k + 1}.position"
+        tau = found[f"arm_tau_{k + first}"]
+        assert tau == f"r.arm_joint_{k + 1}.effort_measured"
+    assert found["gripper pos"] == "r.gripper_joint.position"
+
+
 def test_a_joint_without_a_column_is_told_with_the_columns_left_out(robot_and_log):
     _, robot, log, table, joints = robot_and_log
     known = read_log(log)

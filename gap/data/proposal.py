@@ -245,11 +245,11 @@ def _joints_of(
     quantities: Mapping[str, str], joints: Sequence[JointName]
 ) -> dict[str, JointName | None]:
     """By the joint's own name in the column's, or by words of it that no other joint
-    has; else by the number in the column's."""
+    has; else by the number in the column's, among the joints that share such words."""
     found: dict[str, JointName | None] = {}
     own_words = _own_words(joints)
     plain = {_plain(j.name.split(".", 1)[1]): j for j in joints}
-    rest: dict[str, list[tuple[int, str]]] = {}
+    numbered: dict[tuple[JointName, ...], dict[str, int]] = {}
     for name in quantities:
         own = _plain(name)
         inside = [key for key in plain if key and key in own]
@@ -257,45 +257,60 @@ def _joints_of(
         if inside:
             found[name] = plain[max(inside, key=len)]
             continue
-        if joint := _by_words(name, own_words):
-            found[name] = joint
-            continue
-        numbers = list(re.finditer(r"\d+", name))
-        if not numbers:
-            found[name] = joints[0] if len(joints) == 1 else None
-            continue
-        last = numbers[-1]
-        template = f"{name[: last.start()]}#{name[last.end() :]}"
-        rest.setdefault(template, []).append((int(last.group()), name))
-    # All groups count alike: from 0 if any does, else from 1.
-    counted = [number for group in rest.values() for number, _ in group]
-    base = 0 if 0 in counted else 1
-    for group in rest.values():
-        for number, name in group:
-            k = number - base
-            found[name] = joints[k] if 0 <= k < len(joints) else None
+        group = _sharing_words(name, own_words) or tuple(joints)
+        numbers = re.findall(r"\d+", name)
+        if numbers and len(group) > 1:
+            numbered.setdefault(group, {})[name] = int(numbers[-1])
+        else:
+            found[name] = group[0] if len(group) == 1 else None
+    for group, of in numbered.items():
+        found |= _by_number(of, group, joints)
     return found
+
+
+def _by_number(
+    of: Mapping[str, int], group: Sequence[JointName], joints: Sequence[JointName]
+) -> dict[str, JointName | None]:
+    """{column: joint of a group}, by the numbers in the columns' names: those of the
+    joints' own names where some joints are told by words and all have such a number;
+    else counted, from 0 if any does, else from 1."""
+    numbers = [re.findall(r"\d+", j.name.split(".", 1)[1]) for j in group]
+    own = {int(n[-1]): j for n, j in zip(numbers, group, strict=True) if n}
+    if (
+        len(group) < len(joints)
+        and len(own) == len(group)
+        and set(of.values()) <= {*own}
+    ):
+        return {name: own[number] for name, number in of.items()}
+    base = 0 if 0 in of.values() else 1
+    places = {name: number - base for name, number in of.items()}
+    return {
+        name: group[k] if 0 <= k < len(group) else None for name, k in places.items()
+    }
 
 
 def _own_words(joints: Sequence[JointName]) -> list[tuple[JointName, set[str]]]:
     """Of each joint the words of its name that not all joints have, and that are no
-    word for a quantity or a command."""
+    word for a quantity or a command, and no number."""
     common = _COMMAND.union(*_WORDS.values())
     words = [set(words_of(joint.name.split(".", 1)[1])) for joint in joints]
     if len(words) > 1:
         common |= set.intersection(*words)
-    return [(joint, own - common) for joint, own in zip(joints, words, strict=True)]
+    return [
+        (joint, {w for w in own - common if len(w) > 2 and w.isalpha()})
+        for joint, own in zip(joints, words, strict=True)
+    ]
 
 
-def _by_words(column: str, own: Sequence[tuple[JointName, set[str]]]):
-    """The one joint of which most words are in a column's name, as shoulder_pan_joint
-    of `pan angle`; None if no word of three letters is, or if two have as many."""
+def _sharing_words(
+    column: str, own: Sequence[tuple[JointName, set[str]]]
+) -> tuple[JointName, ...]:
+    """The joints of which most words are in a column's name, as shoulder_pan_joint of
+    `pan angle`, and all three wrists of `wrist 2 angle`; none if no word is."""
     here = set(words_of(column))
-    shared = [(len(words & here), joint) for joint, words in own
-              if any(len(w) > 2 and w.isalpha() for w in words & here)]  # fmt: skip
+    shared = [(len(words & here), joint) for joint, words in own if words & here]
     most = max((n for n, _ in shared), default=0)
-    best = [joint for n, joint in shared if n == most]
-    return best[0] if len(best) == 1 else None
+    return tuple(joint for n, joint in shared if n == most)
 
 
 def _once(found: dict[str, Match]) -> dict[str, Match]:

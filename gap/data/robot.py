@@ -101,7 +101,8 @@ def _load(
         for base in welded:
             plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(base))
         model = plant.GetModelInstanceName(models[0])
-        fix_joints(plant, {f"{model}.{name}": q for name, q in (fixed or {}).items()})
+        there = {f"{model}.{name}": q for name, q in (fixed or {}).items()}
+        fix_joints(plant, there, len(coupled_joints(path)))
         plant.Finalize()
     except (RuntimeError, ValueError) as error:
         why = " ".join(str(error).split())[:300]

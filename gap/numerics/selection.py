@@ -14,8 +14,9 @@ from scipy.stats import chi2, wilcoxon
 
 from makebreak.gap.numerics.runs import starts_of_runs
 
-# Blocks that tell a parameter, of which a scatter is taken: one in 400 draws has none.
-FEWEST_TELL = 6.0
+# Blocks that tell a parameter, of which a scatter is taken (one draw in 400 has none of
+# six), or this share of few: those that say more than others count as fewer.
+FEWEST_TELL, LEAST_TELL = 6.0, 0.25
 _PENALTIES = 10.0 ** np.arange(-4.0, 2.0)  # Of a ridge, times the number of rows.
 
 
@@ -357,7 +358,7 @@ def spread_by_blocks(J, r, block, draws: int = 200) -> np.ndarray:
     """(k,) standard deviations of least squares whose errors go together within a block
     (of time, an episode): the blocks are drawn anew with replacement, each time with
     one Gauss-Newton step. Zeros for fewer than six blocks, and of a parameter that
-    fewer than FEWEST_TELL blocks tell: most draws would be without them.
+    fewer than FEWEST_TELL of many blocks tell: draws would be without them.
 
     Args: J (m, k), r (m,): rows and their derivatives at the solution; block (m,): a
         number of each; negative: rows that are always there, once (a prior's).
@@ -378,7 +379,9 @@ def spread_by_blocks(J, r, block, draws: int = 200) -> np.ndarray:
         H[g], s[g] = mine.T @ mine, mine.T @ r[group == g]
     n = int(free.sum())
     told = np.einsum("gkk->gk", H)[free]
-    many = told.sum(axis=0) ** 2 >= FEWEST_TELL * np.sum(told**2, axis=0)
+    many = told.sum(axis=0) ** 2 >= min(FEWEST_TELL, LEAST_TELL * n) * np.sum(
+        told**2, axis=0
+    )
     H, s = H[:, many][:, :, many], s[:, many]
     weights = np.ones((draws, len(names)))
     weights[:, free] = np.random.default_rng(0).multinomial(n, np.full(n, 1 / n), draws)

@@ -109,17 +109,19 @@ def presses(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
     return lasting > FELT_SHARE * len(touching)
 
 
-def thinned(on: np.ndarray, force: np.ndarray) -> np.ndarray:
+def thinned(on: np.ndarray, force: np.ndarray, episode: np.ndarray) -> np.ndarray:
     """Of test functions (K,) in which a pair touches those that are told: none within
-    THIN of another one, the hardest pressed first. Each touch has one, however short;
-    as it begins a tool may still be above what it is about to touch, with a force that
-    is another contact's friction.
+    THIN of another one of its episode, the hardest pressed first. So a touch is told,
+    however short, but for one that follows another at once. As it begins a tool may
+    still be above what it is about to touch, with a force that is another contact's
+    friction.
 
-    Args: force (K,): with which the pair is pressed.
+    Args: force (K,): with which the pair is pressed; episode (K,): its number.
     """
     out = np.zeros(len(on), bool)
     for k in np.argsort(-force, kind="stable"):
-        if on[k] and not out[max(k - THIN + 1, 0) : k + THIN].any():
+        near = slice(max(k - THIN + 1, 0), k + THIN)
+        if on[k] and not (out[near] & (episode[near] == episode[k])).any():
             out[k] = True
     return out
 
@@ -244,7 +246,8 @@ class PressingProblem(FeltPlaces):
     def _prepare(self) -> None:
         super()._prepare()
         self._told = {
-            pair: thinned(on, self._pressed[pair]) for pair, on in self._met.items()
+            pair: thinned(on, self._pressed[pair], self.means.episode)
+            for pair, on in self._met.items()
         }
 
     def _distances(self, geometry: Geometry) -> np.ndarray:
@@ -290,14 +293,16 @@ class PressingProblem(FeltPlaces):
         here = distances(p)
         depths, priors = self._depths_per_compliance(end.effects)
         for name in std:
-            try:
-                there = distances({**p, name: p[name] + SHORT_SHIFT})
-            except ValueError:  # The tool was there.
-                continue
-            more = std_of_shared_errors(
-                (there - here) / SHORT_SHIFT, depths[self._train], priors
-            )
-            std[name] = float(np.hypot(std[name], more))
+            for shift in (SHORT_SHIFT, -SHORT_SHIFT):
+                try:
+                    there = distances({**p, name: p[name] + shift})
+                except ValueError:  # The tool was there.
+                    continue
+                more = std_of_shared_errors(
+                    (there - here) / shift, depths[self._train], priors
+                )
+                std[name] = float(np.hypot(std[name], more))
+                break
         return std, or_more
 
     def _depths_per_compliance(self, effects: Sequence[Effect]):

@@ -24,8 +24,9 @@ from dataclasses import replace
 
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import is_plausible
-from makebreak.gap.problem import GapProblem
+from makebreak.gap.problem import Fitted, GapProblem
 from makebreak.gap.search.choice import (
+    Choice,
     Selection,
     fixed_parameters,
     refreshed,
@@ -45,13 +46,15 @@ def select(
     whatever is not needed any more is dropped."""
     search = Comparison(problem, say)
     path = forward(search)
-    chosen, current, table = list(path.end.chosen), path.end.fitted, path.table
+    chosen, current = _reweighed(search, list(path.end.chosen), path.end.fitted)
+    table = path.table
     if search.plan.own_values and chosen:
         chosen, current = with_own_values(search, chosen, current)
     chosen, current = drop_needless(search, chosen, current)
     chosen, current = simplify(search, chosen, current)
     if chosen:
         chosen, current = keep_certain(search, chosen, current)
+    chosen, current = _reweighed(search, chosen, current)
     if len(chosen) > 1 and any(c.paired for c in chosen):
         chosen = with_rivals_of_pairs(search, chosen, current)
     chosen = [
@@ -63,6 +66,18 @@ def select(
     return Selection(
         tuple(chosen), search.start, current, search.nuisances, table, beyond, far
     )
+
+
+def _reweighed(
+    search: Comparison, chosen: list[Choice], current: Fitted
+) -> tuple[list[Choice], Fitted]:
+    """By the weights of what is chosen: those of a branch that was given up, or of an
+    effect that was dropped, may be left."""
+    if not search.problem.reweigh(current):
+        return chosen, current
+    search.start_again()
+    current = search.refit(chosen, current) if chosen else search.start
+    return refreshed(chosen, current), current
 
 
 def without(problem: GapProblem, selection: Selection, effect: Effect) -> Selection:

@@ -13,7 +13,7 @@ from makebreak.gap.result import Trust
 from makebreak.gap.search.choice import called
 from makebreak.gap.thresholds import DIFFERS_SHARE, DIFFERS_Z
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.kind import Effect
+from makebreak.models.effects.kind import Effect, sliding_joints, unit_at
 
 PARTS = 5  # Stretches of time of a recording.
 FEWEST_PARTS = 4  # Of which a scatter is taken.
@@ -169,9 +169,11 @@ def drift_sentences(problem: GapProblem, fitted: Fitted) -> str:
     """What is to be said of parameters that change over a recording; "": none does."""
     text = ""
     for (i, name), x in drifts(problem, fitted).items():
-        unit = KINDS[fitted.effects[i].kind].parameter(name).unit
+        effect = fitted.effects[i]
+        slides = {*effect.at} <= sliding_joints(problem.dynamics.plant)
+        unit = unit_at(KINDS[effect.kind].parameter(name).unit, slides)
         text += (
-            f" The {name.replace('_', ' ')} of {called(fitted.effects[i])} goes from "
+            f" The {name.replace('_', ' ')} of {called(effect)} goes from "
             f"{x[0]:.3g} to {x[-1]:.3g} {unit} over the recording: it is not constant."
         )
     return text
