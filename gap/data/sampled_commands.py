@@ -33,6 +33,7 @@ def finding(recordings: Sequence[Recording]) -> Finding:
     says = (
         "The commanded efforts fit the motion as samples of a faster loop, and not as "
         f"commands that hold for the {1e3 * period:.3g} ms until the next row: they "
-        "are interpolated, as if they were mapped to effort_measured."
+        "are interpolated, as if they were mapped to effort_measured. Where efforts "
+        "were measured too, those drive the model in their place."
     )
     return Finding(SAMPLED_COMMANDS, name, "time", period, "s", "warning", says)
