@@ -564,7 +564,10 @@ def test_a_part_of_a_contacts_entries_is_refused(builder, groups):
         (dict(posterior=PosteriorConfig(misfit_sec=0.0)), "misfit_sec is 0.0"),
         (dict(posterior=PosteriorConfig(spacing=1e-5)), "spacing is 1e-05, expected"),
         (dict(posterior=PosteriorConfig(spacing=0.5)), "spacing is 0.5, expected"),
-        (dict(posterior=PosteriorConfig(free_states=[1.5])), "free_states names 1.5"),
+        (
+            dict(posterior=PosteriorConfig(free_states=[1.5])),
+            r"free_states\[0\] is 1.5, expected an integer",
+        ),
         (dict(posterior=PosteriorConfig(), Q_d=[]), "Q_d is empty, expected"),
         (dict(posterior=PosteriorConfig(trust=0.0)), "posterior.trust is 0.0"),
         (dict(posterior=PosteriorConfig(drift=np.nan)), "posterior.drift is nan"),

@@ -2,10 +2,10 @@
 
 Where nothing touches the tool the wrench is the sensor's bias: its mean over a window
 of WINDOW_SEC in which the motion presses on nothing and the tip rests or moves
-steadily. (The tool's own inertia, 0.3 kg times STEADY, is 15 mN.) The first window goes
-on until it is steady as a whole: a tip that follows something never is for WINDOW_SEC,
-but over half a second. Later windows follow the drift, by no more than a sensor may
-drift in a window. So a contact that nobody knows of, or the first milliseconds of an
+steadily. (The tool's own inertia, 0.3 kg times STEADY, is 15 mN.) The first one may
+also be longer, if it is steady as a whole: a tip that follows something never is for
+WINDOW_SEC, but over half a second. Later windows follow the drift, by no more than a
+sensor may drift in a window. So a contact that nobody knows of, or the first milliseconds of an
 expected one, is not taken for a bias.
 
 Nothing is subtracted before the first window is complete. A first mean larger than
@@ -49,10 +49,11 @@ SAME_SURFACE = 0.98  # Cosine of two directions of pressing.
 # Memory: ticks; samples in the window, their sum (6), v at the window's start (3); bias
 # at the last tare (6); 1 when tared; status; the wrench before (6); the direction in
 # which the surface is pressed whose slope is known (3); 1 while the tool is pressed;
-# how many good wrenches came one after the other, and the last ones of these, newest
+# how many good wrenches came one after the other; of the long window, samples, sum and
+# v (10) as above; the last ones of the good wrenches, newest
 # first (AVERAGED - 1, 6); the estimate of sideways_force.py.
 _TICKS, _N, _SUM, _V, _BIAS, _TARED, _STATUS, _LAST = 0, 1, 2, 8, 11, 17, 18, 19
-_ROW, _PRESSED, _GOOD, _RECENT = 25, 28, 29, 30
+_ROW, _PRESSED, _GOOD, _LONG, _RECENT = 25, 28, 29, 30, 40
 _SIDEWAYS = _RECENT + 6 * (AVERAGED - 1)
 _SLOPE = _SIDEWAYS + sideways_force.S.start
 N_MEMORY = _SIDEWAYS + sideways_force.N_MEMORY
@@ -165,23 +166,19 @@ def tick(law, memory, wrench, velocity, force_directions):
     m[_RECENT : _RECENT + 6] = wrench
     # A sensor that is stuck says nothing of its drift.
     if not free or (known and not changed) or m[_TICKS] * law.period <= SKIP_SEC:
-        m[_N] = 0.0
+        m[_N] = m[_LONG] = 0.0
         return m
-    if m[_N] == 0.0:
-        m[_SUM : _SUM + 6] = 0.0
-        m[_V : _V + 3] = velocity[:3]
-    for i in range(6):
-        m[_SUM + i] += wrench[i]
-    m[_N] += 1.0
-    seconds = m[_N] * law.period
-    if seconds < WINDOW_SEC - 1e-9:
-        return m
-    mean = m[_SUM : _SUM + 6] / m[_N]
-    if np.sum((velocity[:3] - m[_V : _V + 3]) ** 2) > (STEADY * seconds) ** 2:
-        if known or seconds > WINDOW_MOST_SEC:
+    is_long = not known and _add(m, _LONG, wrench, velocity, law.period)
+    is_short = _add(m, _N, wrench, velocity, law.period)
+    if not (is_short or is_long):
+        if m[_N] * law.period >= WINDOW_SEC - 1e-9:
             m[_N] = 0.0
+        if m[_LONG] * law.period > WINDOW_MOST_SEC:
+            m[_LONG] = 0.0
         return m
-    m[_N] = 0.0
+    first = _N if is_short else _LONG
+    seconds, mean = m[first] * law.period, m[first + 1 : first + 7] / m[first]
+    m[_N] = m[_LONG] = 0.0
     off = mean - bias_of(m)
     force = np.sqrt(np.sum(off[:3] ** 2))
     if not known and force > law.bias_max:
@@ -194,6 +191,21 @@ def tick(law, memory, wrench, velocity, force_directions):
             most = seconds * (law.drift_max if i < 3 else law.drift_moment_max)
             m[_BIAS + i] += min(max(off[i], -most), most)
     return m
+
+
+@numba.njit(cache=True)
+def _add(m, first, wrench, velocity, period):
+    """Adds a sample to the window whose memory begins at `first`. Returns: whether it
+    is long enough, and was steady as a whole."""
+    if m[first] == 0.0:
+        m[first + 1 : first + 7] = 0.0
+        m[first + 7 : first + 10] = velocity[:3]
+    for i in range(6):
+        m[first + 1 + i] += wrench[i]
+    m[first] += 1.0
+    seconds = m[first] * period
+    changed = np.sum((velocity[:3] - m[first + 7 : first + 10]) ** 2)
+    return seconds >= WINDOW_SEC - 1e-9 and changed <= (STEADY * seconds) ** 2
 
 
 @numba.njit(cache=True)
