@@ -5,8 +5,8 @@ of WINDOW_SEC in which the motion presses on nothing and the tip rests or moves
 steadily. (The tool's own inertia, 0.3 kg times STEADY, is 15 mN.) The first one may
 also be longer, if it is steady as a whole: a tip that follows something never is for
 WINDOW_SEC, but over half a second. Later windows follow the drift, by no more than a
-sensor may drift in a window. So a contact that nobody knows of, or the first milliseconds of an
-expected one, is not taken for a bias.
+sensor may drift in a window. So a contact that nobody knows of, or the first
+milliseconds of an expected one, is not taken for a bias.
 
 Nothing is subtracted before the first window is complete. A first mean larger than
 bias_max is no bias but a contact: the run has begun in it, and waits for free space.
