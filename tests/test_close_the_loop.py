@@ -235,6 +235,27 @@ def test_a_displacement_is_the_sum_of_what_moves_a_model_along_an_axis():
         assert contact_loop.displacement(effects, model, axis) == by
 
 
+@pytest.mark.parametrize(
+    ("experiment", "forces", "good"),
+    [
+        ("contact_learning", [7.4, 8.6], True), ("contact_learning", [7.3, 8], False),
+        ("contact_learning", [8, 8.7], False), ("contact_learning", [8, np.nan], False),
+        ("multiple_collisions", [5.0, 8.0], True),
+        ("multiple_collisions", [7.0, 8.1], False),
+        ("multiple_collisions", [np.nan, 7.0], False),
+    ],
+)  # fmt: skip
+def test_impacts_after_the_repair_meet_the_goal_of_their_experiment(
+    experiment, forces, good
+):
+    rows: list[tuple] = []
+    goal = contact_loop.FORCES[experiment]
+    contact_loop._first_trial(
+        lambda *row: rows.append(row), "impact_force_peak_N", [90, 90], forces, goal
+    )
+    assert [row[-1] for row in rows] == [good]
+
+
 def test_the_contact_loop_passes_nothing_on_but_recording_and_scenes(
     monkeypatch, tmp_path, capsys
 ):
