@@ -215,7 +215,7 @@ class _Free:
                 for i, name in self.names
             ]
         )
-        self.high = np.array([_highest(start[i].kind, name) for i, name in self.names])
+        self.high = np.array([highest(start[i].kind, name) for i, name in self.names])
         self._most = np.array(
             [KINDS[start[i].kind].parameter(name).most for i, name in self.names]
         )
@@ -272,8 +272,9 @@ def _lowest(kind: str, name: str) -> float:
     return {">= 0": 0.0, "> 0": 1e-9, "share": 0.0}.get(valid, -np.inf)
 
 
-def _highest(kind: str, name: str) -> float:
-    """A share ends where robots' do: at 1 nothing is left."""
+def highest(kind: str, name: str) -> float:
+    """The highest value to which a fit takes a parameter. A share ends where robots'
+    do: at 1 nothing is left."""
     parameter = KINDS[kind].parameter(name)
     ends = parameter.ends or parameter.valid == "share"
     return parameter.high if ends else np.inf

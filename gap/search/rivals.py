@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from makebreak.gap.fit import fit_effects
+from makebreak.gap.fit import fit_effects, highest
 from makebreak.gap.numerics.selection import Screen, paired
 from makebreak.gap.problem import Candidate, Fitted, rms
 from makebreak.gap.search.choice import (
@@ -60,8 +60,8 @@ class Rivals:
     def together(
         self, chosen: Sequence[Choice], one: Trial, other: Trial
     ) -> Together | None:
-        """None where one of them has more parameters, or weights do not depend on the
-        model, so that nothing is gained by it."""
+        """None where one of them has more parameters or goes to the end of its range,
+        or weights do not depend on the model, so that nothing is gained by it."""
         for _, r in (one, other):
             if r.candidate.members or r.candidate.size != 1 or r.candidate.fixed:
                 return None
@@ -75,6 +75,10 @@ class Rivals:
                     (_neutral(one.ranked), _neutral(other.ranked)),
                 )  # fmt: skip
             except (ValueError, RuntimeError):
+                found = None
+            # One that goes to the end of its range would go on, and the other along
+            # with it: what each is beside the other is not known.
+            if found is not None and _goes_to_an_end(found.fitted):
                 found = None
             # The pair is kept too, so that no other object gets its id.
             self._known[key] = found, one, other
@@ -287,6 +291,17 @@ def in_place_of(
     search.say(f"  {candidate.name} in place of {replaced}: {fit.score:.3g}")
     sane = candidate.is_sane(fit.effects[k : k + 1])
     return Trial(fit, ranked) if sane and np.isfinite(fit.score) else None
+
+
+def _goes_to_an_end(both: Fitted) -> bool:
+    """Whether one of the last two effects is within a deviation of its highest
+    value."""
+    last = zip(both.effects[-2:], both.std[-2:], strict=True)
+    return any(
+        value + std.get(name, 0.0) >= highest(effect.kind, name)
+        for effect, std in last
+        for name, value in effect.parameters.items()
+    )
 
 
 def _neutral(ranked: Ranked) -> Effect:
