@@ -156,7 +156,7 @@ def named(choice: Choice, plant: MultibodyPlant, beside: str = "") -> NamedEffec
     apart = ""
     if choice.ties or kind.tell_apart:
         apart = kind.tell_apart[:1].upper() + kind.tell_apart[1:] + "."
-    says = sentence(choice.effect, kind, std, slides, choice.or_more)
+    says = sentence(choice.effect, kind, std, slides, choice.or_more, choice.fixed)
     says = says.replace(OF_CHANNEL, own_unit)
     if beside:
         says += f" beside {beside}"

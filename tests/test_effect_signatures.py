@@ -18,6 +18,8 @@ from effect_scenes import (
 from scipy.integrate import solve_ivp
 
 from makebreak.gap.numerics.weak_form import make_bumps
+from makebreak.gap.search.choice import Choice
+from makebreak.gap.verdict import named
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sentence, with_deviation
@@ -648,6 +650,16 @@ def test_a_joint_that_slides_has_its_own_units(tmp_path):
     assert "N m/rad" in sentence(spring, KINDS["joint_spring"])
     vague = sentence(spring, KINDS["joint_spring"], {"rest": float("inf")})
     assert "0.1 rad (not identifiable from these data)" in vague
+
+
+def test_a_parameter_that_was_not_fitted_is_said_to_be_as_modelled():
+    com = Effect("object_com", ["b.b"], {"x": 0.015, "y": -0.01, "z": 0.0})
+    choice = Choice(
+        com, {"x": 1e-4, "y": 1e-4}, 2.0, 0.8, "", 1.0, (), fixed=("z",), size=2
+    )
+    says = named(choice, None).says  # type: ignore[arg-type]
+    assert "x = 0.01500 +- 0.00010 m y = -0.01000 +- 0.00010 m" in says
+    assert "z = 0 m (as modelled)" in says and says.count("as modelled") == 1
 
 
 @pytest.mark.parametrize(

@@ -307,12 +307,14 @@ def sentence(
     std: Mapping[str, float] | None = None,
     slides: bool = False,
     or_more: Collection[str] = (),
+    kept: Collection[str] = (),
 ) -> str:
     """The report's sentence about an effect.
 
     Args: std: standard deviations of parameters, written as "+- ..." (an infinite one
         in words); slides: whether its joints are prismatic; or_more: parameters of
-        which only a lower bound, two std below the value, is known.
+        which only a lower bound, two std below the value, is known; kept: parameters
+        that were not fitted.
     """
     first = effect.parameters.get(kind.parameters[0].name, 0.0)
     is_less = bool(kind.says_less) and first < 0.0
@@ -330,6 +332,8 @@ def sentence(
         words[each.name] = f"{text} {unit_at(each.unit, slides)}".rstrip()
         if spread is not None and not np.isfinite(spread):
             words[each.name] += " (not identifiable from these data)"
+        elif each.name in kept:
+            words[each.name] += " (as modelled)"
     # A [bracket] with an optional parameter that is not set is left out.
     says = re.sub(
         r"\[([^\]]*)\]", lambda m: "" if "(unset)" in _fill(m[1], words) else m[1],
