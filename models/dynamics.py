@@ -37,6 +37,8 @@ from makebreak.models.effects.signature import Grid, Motion, Signature
 from makebreak.models.scene import LoadedScene, Scene, load_scene, read_scene
 from makebreak.models.scene_schema import COMMANDS_OF
 
+SLOPE_STEPS = (1e-4, 0.05)  # Of positions and velocities, for slopes of accelerations.
+
 
 class SceneDynamics:
     """Residuals of a scene's model, and signatures of effects in them.
@@ -99,6 +101,28 @@ class SceneDynamics:
         before = self.momentum(self.shifted(q, v, -step), v)
         still = self.inverse_dynamics(q, v, np.zeros_like(v), time)
         return still - (after - before) / (2.0 * step)
+
+    def slopes(self, q, v, vd) -> tuple[np.ndarray, np.ndarray]:
+        """How accelerations change about a motion (m, n_v), without free bodies:
+        d(acceleration)/d(q, v) at given efforts (m, n_v, 2 n_v); M^-1 (m, n_v, n_v).
+
+        A step of SLOPE_STEPS in velocity crosses the fade of dry friction: it damps a
+        joint that moves little, and does not hold it."""
+        n = v.shape[1]
+        slopes, mobility = np.empty((len(v), n, 2 * n)), np.empty((len(v), n, n))
+        for k in range(len(v)):
+            self.plant.SetPositions(self._context, q[k])
+            mobility[k] = np.linalg.inv(self.plant.CalcMassMatrix(self._context))
+            moved = np.zeros((2, 2 * n, n)) + np.stack([q[k], v[k]])[:, None]
+            moved[0, :n] += SLOPE_STEPS[0] * np.eye(n)
+            moved[1, n:] += SLOPE_STEPS[1] * np.eye(n)
+            back = 2.0 * np.stack([q[k], v[k]])[:, None] - moved
+            same = np.tile(vd[k], (2 * n, 1))
+            effort = self.inverse_dynamics(moved[0], moved[1], same)
+            effort -= self.inverse_dynamics(back[0], back[1], same)
+            effort /= 2.0 * np.repeat(SLOPE_STEPS, n)[:, None]
+            slopes[k] = -mobility[k] @ effort.T
+        return slopes, mobility
 
     def residual(self, motion: Motion) -> np.ndarray:
         """effort - ID, (n, n_v)."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.does_not_fit import DoesNotFit
+from makebreak.gap.numerics.growth import spread_along
 from makebreak.gap.numerics.struck import struck_rows
 from makebreak.gap.simulation.channel_effects import (
     given_late,
@@ -34,6 +35,7 @@ _POSITIONS = ("x", "y", "z")
 TURN = ("qw", "qx", "qy", "qz")
 _G = 9.81
 BESIDE = 4  # Rows beside an impact that a smoothed state would mix with it.
+PARTS = 3  # Of a window, in each of which the equations of motion are linear once.
 MARGIN_SEC = 0.1  # Before the first window of an episode.
 MEASURED_SEC = 0.005  # Between rows a measured effort is given in steps of this.
 LARGEST = 200.0  # An error beyond so many standard deviations counts as this: after a
@@ -264,15 +266,14 @@ class WindowModel(WindowedResidual):
                 after = time[start_row:last] - t0
                 std = np.empty((last - start_row, len(self.channels)))
                 state = {n: x[start_row] for n, x in states.items()}
-                shaken = self._effort_noise(recording, state)
+                grown = self._grown(
+                    recording, states, spreads, slice(start_row, last), after
+                )
                 for c, name in enumerate(self.channels):
-                    std[:, c] = self._std(name, c, spreads, start_row, after)
-                    joint, what = name.rsplit(".", 1)
-                    if joint in shaken:  # Integrated once or twice.
-                        once = np.stack([after, after**2])
-                        twice = np.stack([after**3 / 3.0, after**4 / 4.0])
-                        made = shaken[joint] @ (twice if what == "position" else once)
-                        std[:, c] = np.sqrt(std[:, c] ** 2 + made)
+                    if name in grown:
+                        std[:, c] = np.sqrt(self.noise[c] ** 2 + grown[name])
+                    else:
+                        std[:, c] = self._std(name, c, spreads, start_row, after)
                 block_number = number
                 if number is None:
                     block_number = int((t0 - time[0]) / block)
@@ -360,35 +361,57 @@ class WindowModel(WindowedResidual):
             columns[f"{joint}.effort_command"] = y
         return time, columns
 
-    def _effort_noise(self, recording: Recording, state) -> dict[str, np.ndarray]:
-        """{joint: (2,)} noise of acceleration that the noise of measured efforts makes
-        where these stand in for commands: the density of what is white [(rad/s2)^2 s],
-        and the variance of what is the same throughout a window [(rad/s2)^2]."""
-        driven = self._driven("effort_command")
-        keys = [f"{joint}.effort_measured" for joint in driven]
-        if self._commanded(recording) or not any(k in recording for k in keys):
-            return {}
+    def _grown(
+        self, recording: Recording, states, spreads, rows: slice, after
+    ) -> dict[str, np.ndarray]:
+        """{channel of a joint: (m,) variance} that the uncertain start of a window, and
+        noise of measured efforts that stand in for commands, have made of it: along
+        the measured motion, as a joint that stands on its head, or is light beside its
+        load, turns a small error into a large one. Empty where the scene has drives
+        that act against errors, free bodies, or joints that were not measured."""
         plant = self.dynamics.plant
-        if plant.num_positions() != plant.num_velocities():
-            return {}
         joints = {
-            full_name(plant, j): j.velocity_start() for j in one_dof_joints(plant)
+            full_name(plant, j): j.velocity_start()
+            for j in one_dof_joints(plant)
+            if j.num_velocities()
         }
-        context = plant.CreateDefaultContext()
-        q = np.array(plant.GetPositions(context))
-        noise = np.zeros((plant.num_velocities(), 2))
+        n = plant.num_velocities()
+        if not (
+            self.scene.actuation.type in ("effort", "none")
+            and plant.num_positions() == n == len(joints)
+            and set(joints) == set(self.joints)
+        ):
+            return {}
+        knots = np.linspace(rows.start, rows.stop - 1, 2 * PARTS + 1)
+        at = knots[1::2].round().astype(int)
+        q, v, vd = (np.zeros((PARTS, n)) for _ in range(3))
+        start = np.zeros((2 * n, 2 * n))
         for name, i in joints.items():
-            if f"{name}.position" in state:
-                q[i] = state[f"{name}.position"][0]
-            key = f"{name}.effort_measured"
-            if name in driven and key in recording:
-                channel = recording.channels[key]
-                white = channel.noise**2 / max(channel.rate_hz, 1e-6)
-                noise[i] = white, self._slow_noise.get(name, 0.0) ** 2
-        plant.SetPositions(context, q)
-        W = np.linalg.inv(plant.CalcMassMatrix(context))
-        made = (W**2) @ noise
-        return {name: made[i] for name, i in joints.items()}
+            key = f"{name}.position"
+            q[:, i], v[:, i], vd[:, i] = states[key][at].T
+            start[np.ix_([i, n + i], [i, n + i])] = spreads[key][rows.start, :2, :2]
+        white, steady = self._effort_noise(recording, joints, n)
+        slopes, mobility = self.dynamics.slopes(q, v, vd)
+        made = spread_along(slopes, mobility, start, white, steady, after)
+        return {
+            f"{name}.{what}": made[:, i + k * n]
+            for name, i in joints.items()
+            for k, what in enumerate(("position", "velocity"))
+        }
+
+    def _effort_noise(self, recording: Recording, joints, n: int):
+        """Noise of measured efforts where these stand in for commands: (n,) the density
+        of what is white [(N m)^2 s], and (n,) the variance of what is the same
+        throughout a window [(N m)^2]."""
+        white, steady = np.zeros(n), np.zeros(n)
+        if not self._commanded(recording):
+            for name in self._driven("effort_command"):
+                if (key := f"{name}.effort_measured") in recording:
+                    channel = recording.channels[key]
+                    i = joints[name]
+                    white[i] = channel.noise**2 / max(channel.rate_hz, 1e-6)
+                    steady[i] = self._slow_noise.get(name, 0.0) ** 2
+        return white, steady
 
     def _commanded(self, recording: Recording) -> list[str]:
         """Names of the commands that the scene's drives take."""
