@@ -302,7 +302,7 @@ def _add_systems(
     builder: DiagramBuilder, config, arm: MultibodyPlant, pattern, known: Knowledge
 ) -> _Systems:
     # The approach speed of the anticipator depends on how hard the reflex brakes.
-    own = ("reflex_gain", "reflex_force_least")
+    own = ("reflex_gain", "reflex_force_least", "reflex_force_known")
     refuse_changed("anticipator.speed", config.anticipator.speed, own)
     # What variable_impedance and the damping ratio give instead.
     unused = ["stiffness", *(["damping"] if config.hybrid.damping_ratio > 0.0 else [])]
@@ -319,6 +319,7 @@ def _add_systems(
         config.anticipator.speed,
         reflex_gain=config.reflex.gain,
         reflex_force_least=config.reflex.force_least,
+        reflex_force_known=config.reflex.force_known,
     )
     anticipator = replace(config.anticipator, speed=speed)
     add = builder.AddNamedSystem
@@ -425,6 +426,7 @@ def _connect_systems(builder: DiagramBuilder, station, s: _Systems, config) -> N
             connect(s.tip, "ee_velocity", source)
             connect(s.shaper, "direction", source)
             connect(s.shaper, "phase", source)
+            connect(s.anticipator, "impact_known", source)
         if source.HasOutputPort(port):
             connect(source, port, s.impedance)
     connect(s.impedance, "tau", station, port=f"{ARM}.torque_commanded")

@@ -100,7 +100,7 @@ class ContactLearningConfig:
             # Contacts are located to 0.1 mm here, so a smaller margin will do.
             shaper=VelocityShaperConfig(region=RegionConfig(margin=0.002)),
             detector=ContactDetectorConfig(impact_force=1.0),
-            reflex=ImpactReflexConfig(gain=4.0, force_least=2.0),
+            reflex=ImpactReflexConfig(gain=4.0, force_least=2.0, force_known=8.0),
         )
     )
 

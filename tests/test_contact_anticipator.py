@@ -14,9 +14,12 @@ from makebreak.systems.changing_contact.contact_anticipator import (
     KalmanContactAnticipator,
 )
 from makebreak.systems.changing_contact.numerics.contact_anticipator import (
+    BEND,
+    DRIFT,
+    FORCE_STD,
+    REPEATS,
     capped,
     contact_stiffness,
-    force_per_speed,
     impact_speed,
     is_expected,
     measurement_covariance,
@@ -47,6 +50,7 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
     N_TRANSITION,
     PEAK_FORCE,
     PHASE_SEGMENT,
+    PHASE_SPEED,
     POSITION,
     SPEED,
     TIME,
@@ -256,15 +260,66 @@ def test_what_was_never_felt_is_met_as_the_stiffest_surface_asks(gain):
     assert trial.belief().contacts[0].approach_speed == 0.004
 
 
-def test_regression_is_the_weighted_least_squares_slope():
+def test_regression_is_the_conditional_mean_of_all_impacts():
+    # log z_i = a_i + b x_i + noise with a walk a_i, b ~ N(1, BEND^2) and nothing known
+    # of a_1: a joint Gaussian, conditioned at once.
     rng = np.random.default_rng(9)
-    impacts = rng.uniform(0.1, 1.0, (6, 2))
-    w = np.sqrt(0.2 ** np.arange(5, -1, -1)) / impacts[:, 0]
-    expected = np.linalg.lstsq(w[:, None] * impacts[:, :1], w * impacts[:, 1])[0][0]
-    np.testing.assert_allclose(force_per_speed(impacts), expected)
-    assert force_per_speed(np.zeros((0, 2))) is None
-    assert force_per_speed([[0.0, 5.0], [np.nan, 3.0], [0.1, -1.0]]) is None
+    for _ in range(20):
+        v = 0.02 * np.exp(0.3 * rng.normal(size=6))
+        F = 400.0 * v * np.exp(0.02 * rng.normal(size=6))
+        x, n = np.log(v), np.arange(6)
+        prior = DRIFT**2 * np.minimum.outer(n, n) + 1e4  # Of a.
+        noise = np.diag(REPEATS**2 + (FORCE_STD / F) ** 2)
+        x_0 = x[0]
+        S = prior + BEND**2 * np.outer(x - x_0, x - x_0) + noise
+        innovation = np.linalg.solve(S, np.log(F) - (x - x_0))
+        a = prior[-1] @ innovation
+        b = 1.0 + BEND**2 * (x - x_0) @ innovation
+        expected = np.exp(x_0 + (np.log(8.0) - a) / b)
+        # 1e4 beside 1e-3 costs seven digits.
+        np.testing.assert_allclose(
+            speed_by_regression(np.c_[v, F], 8.0), expected, rtol=1e-6
+        )
+    assert speed_by_regression(np.zeros((0, 2)), 8.0) is None
+    wrong = [[0.0, 5.0], [np.nan, 3.0], [0.1, -1.0]]
+    assert speed_by_regression(wrong, 8.0) is None
     assert speed_by_regression([[0.02, 6.0]], 8.0) == pytest.approx(0.08 / 3)
+
+
+def test_impacts_that_scatter_are_averaged_and_a_new_surface_is_followed_at_once():
+    rng = np.random.default_rng(10)
+    slope, v, forces, speeds = 400.0, 0.01, [], []
+    impacts: list = []
+    for _ in range(20):
+        forces.append(slope * v * np.exp(0.04 * rng.normal()))
+        impacts.append((v, forces[-1]))
+        v = speed_by_regression(impacts, 8.0)
+        speeds.append(v)
+    # The speed varies by less than half of what a single impact does.
+    assert np.std(np.log(speeds[4:])) < 0.02
+    np.testing.assert_allclose(speeds[-1], 8.0 / slope, rtol=0.03)
+    impacts.append((v, 2.0 * slope * v))  # Four times as stiff.
+    assert speed_by_regression(impacts, 8.0) == pytest.approx(4.0 / slope, rel=1e-6)
+
+
+def test_a_force_that_is_not_proportional_to_speed_is_met_by_the_third_impact():
+    # F = 2 N + s v: a push that the arm adds while the impact lasts.
+    v, impacts = 0.01, []
+    for _ in range(3):
+        impacts.append((v, 2.0 + 260.0 * v))
+        v = speed_by_regression(impacts, 8.0)
+    np.testing.assert_allclose(2.0 + 260.0 * v, 8.0, atol=0.3)
+
+
+def test_the_first_impact_is_braked_otherwise_than_those_on_a_known_contact():
+    k_m = 500.0  # sqrt(k m)
+    F = 4.0
+    first = np.sqrt(F**2 + 4.0 * (F - 2.0) ** 2) / k_m  # Braked from 2 N on.
+    v = speed_by_regression([(first, F)], 8.0, 4.0, 2.0, 8.0)
+    np.testing.assert_allclose(v, 8.0 / k_m)  # Not braked up to 8 N.
+    np.testing.assert_allclose(
+        speed_by_regression([(first, F), (v, 8.0)], 8.0, 4.0, 2.0, 8.0), v
+    )
 
 
 def test_stiffness_of_one_contact_gives_the_speed_at_another_mass():
@@ -461,6 +516,19 @@ def test_speed_by_eq_9_and_its_caps():
     trial.step(np.array([0.5, 0, 0.1]), 0)
     trial.impact([0.5, 0, 0], DOWN, 0.05, 1.0)  # Would be eight times as fast.
     assert trial.belief().contacts[0].approach_speed == pytest.approx(0.07)
+
+
+def test_an_impact_counts_with_the_speed_that_was_planned_where_there_was_one():
+    # A tip that lags behind will lag again.
+    for planned, expected in ((0.0, 0.04), (0.05, 0.05)):
+        trial = Trial(ContactBelief((prior(0.0),)))
+        trial.values["phase"][PHASE_SPEED] = planned
+        trial.walk(np.array([0.5, 0, 0.1]), DOWN, 0.1, 0.5, 0)
+        assert trial.out("impact_known") == 0.0
+        trial.impact([0.5, 0, 0], DOWN, 0.04, 8.0)
+        impacts = trial.belief().contacts[0].impacts
+        np.testing.assert_allclose(impacts, [[expected, 8.0]])
+        assert trial.out("impact_known") == 1.0
 
 
 def test_the_first_stiffness_is_carried_over_to_contacts_not_felt():

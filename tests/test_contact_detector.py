@@ -30,6 +30,7 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
     STATUS,
     TIME,
 )
+from makebreak.systems.changing_contact.numerics.impact_score import impact
 
 # A block on an arm of one direction: what the tool would feel.
 #   (mass) a = K (x_d - x) + D (v_d - v) - friction - contact
@@ -299,6 +300,18 @@ def test_the_peak_is_the_impact_s_and_not_of_the_push_after_it():
     rows = run(world)
     assert (world.push + push)[touch : touch + 80].max() > 1.25 * impact
     np.testing.assert_allclose(rows[-1, PEAK_FORCE], impact, rtol=0.1)
+
+
+@pytest.mark.parametrize("stiffness", [1e4, 5e4, 2e5])
+def test_the_peak_is_the_one_that_impacts_are_scored_by(stiffness):
+    rng = np.random.default_rng(6)
+    speed = 9.0 / np.sqrt(stiffness * 4.0)
+    world = World(speed, 1.6, rng, wall=0.9 * speed, stiffness=stiffness, mass=4.0)
+    rows, time = run(world), 1e-3 * np.arange(len(world.x))
+    touch = 1e-3 * world.touch()
+    F100 = impact(time, world.wrench[:, :3], world.velocity[:, :3], world.d, touch).peak
+    # The mean before the contact is taken over other samples.
+    np.testing.assert_allclose(rows[-1, PEAK_FORCE], F100, atol=0.1)
 
 
 def test_the_bias_of_the_wrench_is_taken_off():

@@ -29,7 +29,15 @@ LAW = ReflexLaw(gain=3.0, force_least=0.0, force_max=100.0, fade_sec=0.1, period
 REGION_OF_IMPACT = np.array([0.0, REGION, IMPACT, 0.03, 0.1, 0.0])
 
 
-def peak(law, mass=7.0, stiffness=2e4, v=0.03, phase=REGION_OF_IMPACT, friction=0.0):
+def peak(
+    law,
+    mass=7.0,
+    stiffness=2e4,
+    v=0.03,
+    phase=REGION_OF_IMPACT,
+    friction=0.0,
+    known=0.0,
+):
     """Peak force of a mass that falls onto a spring, without gravity, and the speed at
     which it leaves it; the reflex acts a tick late."""
     memory, x, last = np.zeros(N_MEMORY), -0.003, np.zeros(3)
@@ -39,7 +47,7 @@ def peak(law, mass=7.0, stiffness=2e4, v=0.03, phase=REGION_OF_IMPACT, friction=
         f = stiffness * max(x, 0.0)
         wrench = np.array([0.0, 0.0, f + friction, 0, 0, 0])
         velocity = np.array([0, 0, -v, 0, 0, 0])
-        memory, force = tick(law, memory, wrench, velocity, DOWN, phase)
+        memory, force = tick(law, memory, wrench, velocity, DOWN, phase, known)
         for _ in range(sub):
             a = (last @ DOWN - stiffness * max(x, 0.0)) / mass
             v += a * 1e-3 / sub
@@ -76,6 +84,18 @@ def test_the_speed_law_knows_what_the_reflex_takes():
     assert unbraked_force(5.0) == 5.0
     np.testing.assert_allclose(unbraked_force([1.0, 2.0, 5.0], 4.0, 2.0)[:2], [1, 2])
     np.testing.assert_allclose(unbraked_force(5.0, 4.0, 2.0), np.sqrt(25 + 4 * 9))
+
+
+def test_a_known_contact_is_braked_only_beyond_its_force():
+    law = LAW._replace(force_known=8.0)
+    # 0.02 m/s into 2e4 N/m with 7 kg: 7.5 N.
+    known, unknown = (peak(law, v=0.02, known=k)[0] for k in (1.0, 0.0))
+    assert known == pytest.approx(0.02 * np.sqrt(2e4 * 7.0), rel=1e-3)
+    assert unknown == peak(LAW, v=0.02)[0] < 0.8 * known
+    free = 0.06 * np.sqrt(2e4 * 7.0)  # 22 N
+    assert peak(LAW, v=0.06)[0] < peak(law, v=0.06, known=1.0)[0] < 0.8 * free
+    # Without a force of its own a known contact is as any other.
+    assert peak(LAW, v=0.02, known=1.0) == peak(LAW, v=0.02)
 
 
 def test_it_does_not_throw_the_arm_back():
@@ -115,7 +135,9 @@ def test_nan_gives_no_reflex(which):
     assert np.all(np.isfinite(memory)) and not force.any()
 
 
-@pytest.mark.parametrize("name", ["gain", "force_least", "force_max", "fade_sec"])
+@pytest.mark.parametrize(
+    "name", ["gain", "force_least", "force_known", "force_max", "fade_sec"]
+)
 def test_bad_numbers_are_refused_by_name(name):
     with pytest.raises(ValueError, match=f"{name} is -1.0"):
         ImpactReflex(ImpactReflexConfig(**{name: -1.0}))

@@ -42,6 +42,7 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
     N_TRANSITION,
     PEAK_FORCE,
     PHASE_SEGMENT,
+    PHASE_SPEED,
     POSITION,
     SPEED,
     STATUS,
@@ -101,6 +102,9 @@ class ApproachSpeedConfig:
     # Least force of the arm's impact reflex [N]. Taken from reflex.force_least where
     # there is that setting.
     reflex_force_least: float = 0.0
+    # The same for contacts that were felt before [N]; 0: the same. Taken from
+    # reflex.force_known where there is that setting.
+    reflex_force_known: float = 0.0
     # Whether the next approach speed follows from a regression F = s v over all
     # impacts; false: from eq. 9.
     regression: bool = True
@@ -129,7 +133,7 @@ class AnticipatorMemory:
     """All that the anticipator remembers, as a value: an update makes a new one."""
 
     belief: ContactBelief
-    history: np.ndarray  # (n, 5): time, p_WE, segment; oldest first.
+    history: np.ndarray  # (n, 6): time, p_WE, segment, speed [m/s]; oldest first.
     made: float = 0.0  # Counters that were seen last.
     broken: float = 0.0
     measured: float = 0.0
@@ -151,7 +155,12 @@ class AnticipatorMemory:
         return self  # Every part is immutable, so a Context may share it.
 
 
-MAY_BE_ZERO = ("stiffness_most", "reflex_gain", "reflex_force_least")
+MAY_BE_ZERO = (
+    "stiffness_most",
+    "reflex_gain",
+    "reflex_force_least",
+    "reflex_force_known",
+)
 
 
 def reduced_mass_one(p, d) -> float:
@@ -198,6 +207,7 @@ class KalmanContactAnticipator(LeafSystem):
              mode_hint (1,) the mode that begins at the expected place of an impact-less
              change, from hint_lead_sec before the tip passes it until HINT_WAY past its
              region; -1: none;
+             impact_known (1,) 1 if this impact was felt before, else 0;
              touch_hint (1,) the mode that the last felt contact brought in an earlier
              trial, until its present mode is identified; -1: none;
              status (1,) 0, or BAD_INPUT: the belief is held.
@@ -245,7 +255,7 @@ class KalmanContactAnticipator(LeafSystem):
         self._period = float(config.period_sec)
         self._mass = effective_mass
         belief = self._next_trial(ContactBelief() if knowledge is None else knowledge)
-        memory = AnticipatorMemory(belief, np.zeros((0, 5)))
+        memory = AnticipatorMemory(belief, np.zeros((0, 6)))
         self._pose = self.DeclareVectorInputPort("ee_pose", 7)
         self._contact = self.DeclareVectorInputPort("contact", N_CONTACT)
         self._transition = self.DeclareVectorInputPort("transition", N_TRANSITION)
@@ -262,6 +272,7 @@ class KalmanContactAnticipator(LeafSystem):
         )
         for name, calc in (
             ("approach_speed", self._approach_speed),
+            ("impact_known", _impact_known),
             ("touch_hint", _touch_hint),
             ("status", lambda memory: float(memory.status)),
         ):
@@ -285,11 +296,8 @@ class KalmanContactAnticipator(LeafSystem):
         output.SetFromVector([calc(self._memory_of(context))])
 
     def _approach_speed(self, memory) -> float:
-        if len(memory.history) == 0:
-            return 0.0
-        p, segment = memory.history[-1, 1:4], int(memory.history[-1, 4])
-        k = next_impact(memory.belief.contacts, IMPACT, segment, p)
-        return 0.0 if k is None else memory.belief.contacts[k].approach_speed
+        contact = _next_impact(memory)
+        return 0.0 if contact is None else contact.approach_speed
 
     def _put_hint(self, context, output):
         memory = self._memory_of(context)
@@ -364,7 +372,7 @@ class KalmanContactAnticipator(LeafSystem):
             return replace(memory, status=BAD_INPUT)
         status = BAD_INPUT if contact[STATUS] else 0
         segment = phase[PHASE_SEGMENT]
-        row = np.array([[time, *pose[:3], segment]])
+        row = np.array([[time, *pose[:3], segment, phase[PHASE_SPEED]]])
         history = np.vstack([memory.history[-(HISTORY - 1) :], row])
         history.setflags(write=False)
         began = len(memory.history) == 0 or memory.history[-1, 4] != segment
@@ -465,7 +473,11 @@ class KalmanContactAnticipator(LeafSystem):
     def _measured(self, memory, contact):
         """The memory after the last contact's peak force is known: its next speed."""
         memory = replace(memory, measured=contact[MEASURED])
-        speed, force = contact[SPEED], contact[PEAK_FORCE]
+        # Where the motion's own speed is known it is the one that can be chosen next: a
+        # tip that lags behind will lag again, and it has no noise.
+        planned = _before(memory.history, contact[TIME])[5]
+        speed = planned if planned > 0.0 else contact[SPEED]
+        force = contact[PEAK_FORCE]
         k = memory.last
         if k < 0 or not (speed > 0.0 and force > 0.0):
             return memory
@@ -486,7 +498,11 @@ class KalmanContactAnticipator(LeafSystem):
         before = contact.approach_speed
         if s.regression:
             speed = speed_by_regression(
-                impacts, s.force_desired, s.reflex_gain, s.reflex_force_least
+                impacts,
+                s.force_desired,
+                s.reflex_gain,
+                s.reflex_force_least,
+                s.reflex_force_known or None,
             )
         else:
             speed = speed_by_error(before, s.force_desired, impacts[-1, 1], s.beta)
@@ -497,9 +513,11 @@ class KalmanContactAnticipator(LeafSystem):
         s, source = self._speed, belief.contacts[k]
         speed, force = source.impacts[-1]
         mass = self._mass(source.mean, source.direction)
-        reflex = s.reflex_gain, s.reflex_force_least
-        stiffness = contact_stiffness(speed, unbraked_force(force, *reflex), mass)
-        wanted = unbraked_force(s.force_desired, *reflex)
+        least = s.reflex_force_least
+        known = (s.reflex_force_known or least) if len(source.impacts) > 1 else least
+        force = unbraked_force(force, s.reflex_gain, known)
+        stiffness = contact_stiffness(speed, force, mass)
+        wanted = unbraked_force(s.force_desired, s.reflex_gain, least)
         for i, contact in enumerate(belief.contacts):
             if contact.kind != IMPACT or len(contact.impacts):
                 continue
@@ -577,6 +595,21 @@ class KalmanContactAnticipator(LeafSystem):
         return memory
 
 
+def _next_impact(memory: AnticipatorMemory) -> ExpectedContact | None:
+    """The next impact that is expected in this segment."""
+    if len(memory.history) == 0:
+        return None
+    p, segment = memory.history[-1, 1:4], int(memory.history[-1, 4])
+    k = next_impact(memory.belief.contacts, IMPACT, segment, p)
+    return None if k is None else memory.belief.contacts[k]
+
+
+def _impact_known(memory: AnticipatorMemory) -> float:
+    """Whether the force of the next impact was measured before."""
+    contact = _next_impact(memory)
+    return float(contact is not None and len(contact.impacts) > 0)
+
+
 def _touch_hint(memory: AnticipatorMemory) -> float:
     """The mode that the last felt contact brought in an earlier trial."""
     if memory.touch < 0:
@@ -594,10 +627,15 @@ def _found(memory: AnticipatorMemory, touch_mode) -> AnticipatorMemory:
     return replace(memory, belief=belief, touch=-1, found=touch_mode[FOUND])
 
 
+def _before(history, time) -> np.ndarray:
+    """The row of the history just before `time`."""
+    before = history[history[:, 0] < time]
+    return before[-1] if len(before) else history[0]
+
+
 def _segment_at(history, time) -> int:
     """The number of the segment that the tip was in just before `time`."""
-    before = history[history[:, 0] < time]
-    return int(before[-1, 4] if len(before) else history[0, 4])
+    return int(_before(history, time)[4])
 
 
 def _is_same(contact: ExpectedContact, p, d) -> bool:

@@ -23,6 +23,9 @@ class ImpactReflexConfig:
     gain: float = 0.0
     # Force beyond friction below which what is felt is noise [N].
     force_least: float = 0.5
+    # The same for a contact that was felt before, whose force is chosen by its approach
+    # speed: the reflex only limits what is beyond it; 0: force_least [N].
+    force_known: float = 0.0
     # Largest force beyond force_least that counts; more does not brake more [N].
     force_max: float = 10.0
     fade_sec: float = 0.1  # Time in which the reflex fades out after the impact [s].
@@ -36,7 +39,8 @@ class ImpactReflex(LeafSystem):
 
     Inputs:  wrench (6,) on the tool [N], [N m]; ee_velocity (6,) of the tip; direction
              (3,) of the motion; phase (6,); wrench_feedforward (6,), of the variable
-             impedance.
+             impedance; optional impact_known (1,): 1 if the contact ahead was felt
+             before.
     Output:  wrench_feedforward (6,), the sum; state.
 
     Raises: ValueError for numbers out of their range.
@@ -49,6 +53,7 @@ class ImpactReflex(LeafSystem):
         for name, least in (
             ("gain", 0.0),
             ("force_least", 0.0),
+            ("force_known", 0.0),
             ("force_max", 0.0),
             ("fade_sec", 1e-6),
             ("period_sec", 1e-6),
@@ -63,6 +68,7 @@ class ImpactReflex(LeafSystem):
             force_max=float(config.force_max),
             fade_sec=float(config.fade_sec),
             period=float(config.period_sec),
+            force_known=float(config.force_known),
         )
         first_call(warm_up, self._law)
         self._ports = [
@@ -75,6 +81,7 @@ class ImpactReflex(LeafSystem):
             )
         ]
         self._fed = self.DeclareVectorInputPort("wrench_feedforward", 6)
+        self._known = self.DeclareVectorInputPort("impact_known", 1)
         self._memory = self.DeclareDiscreteState(N_MEMORY)
         self._wrench = self.DeclareDiscreteState(6)
         self.DeclareStateOutputPort("wrench_feedforward", self._wrench)
@@ -86,6 +93,8 @@ class ImpactReflex(LeafSystem):
     def _update(self, context: Context, discrete_state):
         memory = context.get_discrete_state(self._memory).value()
         values = [port.Eval(context) for port in self._ports]
+        if self._known.HasValue(context):
+            values.append(self._known.Eval(context)[0])
         memory, force = tick(self._law, memory, *values)
         wrench = self._fed.Eval(context)
         wrench[:3] += force

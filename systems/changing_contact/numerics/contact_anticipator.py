@@ -84,6 +84,13 @@ def semi_axes(covariance, radius):
 
 # The speed of approach.
 
+# Standard deviations: of an impact's force, in proportion and by noise [N]; of the
+# exponent b in z ~ v^b; of what the reflex is thought to take off, log(z / F), beside
+# that at the desired force, in proportion; and of log(z) from one trial to the next.
+REPEATS, FORCE_STD, BEND, BRAKED, DRIFT = 0.03, 0.2, 0.2, 0.5, 0.01
+EXPONENT_MIN = 0.3
+GATE = 3.0  # Standard deviations beyond which an impact is of another surface.
+
 
 def speed_by_error(speed, force_desired, force, beta) -> float:
     """The next approach speed by eq. 9, v + beta (F_d - F_m) [m/s].
@@ -93,25 +100,6 @@ def speed_by_error(speed, force_desired, force, beta) -> float:
     With F in N and v in m/s the former is some 0.002, the latter some 400.)
     """
     return float(speed + beta * (force_desired - force))
-
-
-def force_per_speed(impacts, forget=0.2) -> float | None:
-    """Slope s of F = s v by least squares through the origin [N s/m].
-
-    What is squared are the errors relative to v: F = s v is only nearly true, and a
-    first impact at five times the speed must not outweigh those near the desired force.
-
-    Args: impacts (n, 2) of [speed, peak force], oldest first; forget: weight of each
-        relative to the one after it: the last one is nearest to the next.
-    Returns: None if there is no impact with a positive speed and force.
-    """
-    impacts = np.asarray(impacts, dtype=float).reshape(-1, 2)
-    good = np.all(np.isfinite(impacts), axis=1) & np.all(impacts > 0.0, axis=1)
-    v, F = impacts[good].T
-    if v.size == 0:
-        return None
-    weight = forget ** np.arange(v.size - 1, -1, -1)
-    return float((weight * F / v).sum() / weight.sum())
 
 
 def unbraked_force(force, gain=0.0, force_least=0.0):
@@ -127,17 +115,49 @@ def unbraked_force(force, gain=0.0, force_least=0.0):
 
 
 def speed_by_regression(
-    impacts, force_desired, gain=0.0, force_least=0.0
+    impacts, force_desired, gain=0.0, force_least=0.0, force_known=None
 ) -> float | None:
     """The speed at which an impact has force_desired [m/s]; None without impacts.
 
-    Args: impacts (n, 2) of [speed, peak force]; gain, force_least of the reflex.
+    A Kalman filter over the impacts estimates a line, log z = a + b log v with b near 1
+    (z: unbraked_force). One impact gives the speed with b = 1. The more there are, the
+    less does the last one alone decide: impacts at the same speed differ by some per
+    cent. One beyond GATE is of a surface that has changed; all before are forgotten.
+
+    Args: impacts (n, 2) of [speed, peak force], oldest first; gain of the reflex and
+        the force from which on it brakes, at the first impact and, force_known, at all
+        later ones; None: the same.
     """
-    impacts = np.array(impacts, dtype=float).reshape(-1, 2)
-    impacts[:, 1] = unbraked_force(impacts[:, 1], gain, force_least)
-    slope = force_per_speed(impacts)
-    wanted = float(unbraked_force(force_desired, gain, force_least))
-    return None if slope is None else wanted / slope
+    impacts = np.asarray(impacts, dtype=float).reshape(-1, 2)
+    good = np.all(np.isfinite(impacts), axis=1) & np.all(impacts > 0.0, axis=1)
+    if not good.any():
+        return None
+    known = force_least if force_known is None else force_known
+    least = np.where(np.arange(len(impacts)) == 0, force_least, known)[good]
+    v, F = impacts[good].T
+    z = unbraked_force(F, gain, least)
+    wanted = unbraked_force(force_desired, gain, known)
+    off = np.log(z / F) - np.log(wanted / force_desired)
+    R = REPEATS**2 + (FORCE_STD / F) ** 2 + (BRAKED * off) ** 2
+    x, y = np.log(v), np.log(z)
+
+    def begin(i):
+        """The line after impact i alone: its origin, (a, b), and their covariance."""
+        return x[i], np.array([y[i], 1.0]), np.diag([R[i], BEND**2])
+
+    origin, mean, P = begin(0)
+    for i in range(1, len(x)):
+        P[0, 0] += DRIFT**2
+        H = np.array([1.0, x[i] - origin])
+        S = H @ P @ H + R[i]
+        error = y[i] - H @ mean
+        if error**2 > GATE**2 * S:
+            origin, mean, P = begin(i)
+            continue
+        K = P @ H / S
+        mean, P = mean + K * error, P - np.outer(K, K) * S
+    a, b = mean
+    return float(np.exp(origin + (np.log(wanted) - a) / max(b, EXPONENT_MIN)))
 
 
 def capped(speed, before, growth, least, most) -> float:

@@ -11,7 +11,11 @@ sqrt(1 + g). The last factor lets go when the tip has stopped: braking does not 
 throw back.
 
 It needs no decision that there is a contact, and so no time for one. What limits it is
-the arm's torque rate and the delay of a tick.
+the arm's torque rate and the delay of a tick. They also make it uneven: a touch falls
+anywhere between two ticks, and where the force rises by as much in a tick as the brake
+may, a tick more or less is several per cent of the peak. A contact that was felt before
+is approached at a speed that needs no brake. There f_least may be another, f_known, so
+that the reflex is only a guard.
 """
 
 from typing import NamedTuple
@@ -29,9 +33,9 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
     REGION,
 )
 
-# Memory: d (3), f_0, weight, half of the approach speed.
-N_MEMORY = 6
-_BASE, _WEIGHT, _SLOW = 3, 4, 5
+# Memory: d (3), f_0, weight, half of the approach speed, f_least or f_known.
+N_MEMORY = 7
+_BASE, _WEIGHT, _SLOW, _LEAST = 3, 4, 5, 6
 SPEED_MIN = 0.003  # [m/s]
 # f_0 follows f within this time: of friction alone, and where f is beyond f_least.
 BASE_SEC, BASE_SLOW_SEC = 0.05, 0.2
@@ -45,15 +49,17 @@ class ReflexLaw(NamedTuple):
     force_max: float  # f_max [N]
     fade_sec: float
     period: float  # Of a tick [s].
+    force_known: float = 0.0  # f_known [N]; 0: f_least.
 
 
 @numba.njit(cache=True)
-def tick(law, memory, wrench, velocity, direction, phase):
+def tick(law, memory, wrench, velocity, direction, phase, known=0.0):
     """One tick.
 
     Args: law; memory (N_MEMORY,), zero at first; wrench (6,) on the tool [N], [N m];
         velocity (6,) of the tip; direction (3,) of the motion; phase (6,): anything may
-        be NaN, and then there is no reflex.
+        be NaN, and then there is no reflex; known: 1 if the contact ahead was felt
+        before.
     Returns: memory; force (3,) [N], world axes.
     """
     m, force = memory.copy(), np.zeros(3)
@@ -68,6 +74,8 @@ def tick(law, memory, wrench, velocity, direction, phase):
     if expected and moving:
         m[:3] = direction
         m[_SLOW] = max(0.5 * phase[PHASE_SPEED], SPEED_MIN)
+        guards = known > 0.5 and law.force_known > 0.0
+        m[_LEAST] = law.force_known if guards else law.force_least
     f = -(wrench[0] * m[0] + wrench[1] * m[1] + wrench[2] * m[2])
     if expected and moving:
         if m[_WEIGHT] < 1.0:
@@ -81,7 +89,7 @@ def tick(law, memory, wrench, velocity, direction, phase):
         m[_WEIGHT] = max(m[_WEIGHT] - law.period / law.fade_sec, 0.0)
     if m[_WEIGHT] > 0.0:
         v = velocity[0] * m[0] + velocity[1] * m[1] + velocity[2] * m[2]
-        beyond = min(max(f - m[_BASE] - law.force_least, 0.0), law.force_max)
+        beyond = min(max(f - m[_BASE] - m[_LEAST], 0.0), law.force_max)
         size = law.gain * m[_WEIGHT] * beyond * min(max(v / m[_SLOW], 0.0), 1.0)
         for i in range(3):
             force[i] = -size * m[i]
@@ -127,4 +135,4 @@ def warm_up(law: ReflexLaw) -> None:
     """Compiles the tick, for a memory that is read-only as a Context's state is."""
     memory = np.zeros(N_MEMORY)
     memory.setflags(write=False)
-    tick(law, memory, np.zeros(6), np.zeros(6), np.zeros(3), np.zeros(N_PHASE))
+    tick(law, memory, np.zeros(6), np.zeros(6), np.zeros(3), np.zeros(N_PHASE), 0.0)
