@@ -90,9 +90,9 @@ class ImpedanceController(LeafSystem):
     tau stays within the effort limits of the control plant and changes by at most
     torque_rate_max x period per tick. Near the control plant's limits of joint speeds
     and positions the joints brake (numerics/joint_limits.py). If an entry of q or v is
-    NaN, tau changes, at
-    that rate, to the torque that carries the arm and slows it down, qdd = -20/s qd,
-    with the measured entries and predictions of the others from their last good values.
+    NaN, tau changes, at that rate, to the torque that carries the arm and slows it
+    down, qdd = -20/s qd, with the measured entries and predictions of the others from
+    their last good values.
     If the reference is NaN, the last good pose is held at rest. A stiffness or damping
     that is NaN or negative is replaced by the config's, a delay that is no time by 0.
     `status` reports these cases.
@@ -110,9 +110,10 @@ class ImpedanceController(LeafSystem):
              delay (1,) [s]: from a reading to the time when its torque acts. Damping d
              of a mass m with this delay is stable while d delay < pi/2 m, so the tip's
              damping is bounded to DELAY_DAMPING_MAX m / delay.
-    Outputs: tau (n,) [N m]; status (1,), a sum: 1 reference held, 2 sensors held,
-             4 effort limit reached, 8 torque rate limit reached, 16 wrench not used, 32
-             a joint braked at its speed or range.
+    Outputs: tau (n,) [N m], in the order of q (that of a plant's actuation port is the
+             order of its actuators, which may be another); status (1,), a sum: 1
+             reference held, 2 sensors held, 4 effort limit reached, 8 torque rate limit
+             reached, 16 wrench not used, 32 a joint braked at its speed or range.
 
     Args: config; plant: finalized, the arm with its tool alone, never the simulated
         one; tip_frame: name of E; torque_rate_max [N m/s]; hybrid: settings of force
