@@ -163,9 +163,8 @@ def _proposed(
     scene.write_text(proposal.scene)
     sidecars = {}
     for path, text in proposal.sidecars.items():
-        if not has_sidecar(path):
-            sidecars[path] = out.file(sidecar_of(path).name)
-            sidecars[path].write_text(text)
+        sidecars[path] = out.file(sidecar_of(path).name)
+        sidecars[path].write_text(text)
     notes = ["A proposal, to be checked: " + "; ".join(proposal.notes) + "."]
     names = [str(out_dir / file.name) for file in (scene, *sidecars.values())]
     again = " ".join(quote(str(path)) for path in recording_paths)
@@ -173,6 +172,12 @@ def _proposed(
         f"Correct {' and '.join(names)} where they are wrong. Then run: "
         f"makebreak gap {quote(names[0])} {again}"
     )
+    for path, sidecar in sidecars.items():
+        if has_sidecar(path):
+            notes.append(
+                f"{out_dir / sidecar.name} has what the sidecar of {path.name} says, "
+                "and a proposal for other columns: first put it in that one's place."
+            )
     doubts = proposal.findings()
     notes += [finding.says for finding in doubts if finding.kind == NO_COLUMN]
     return scene, sidecars, notes, doubts

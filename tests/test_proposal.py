@@ -27,7 +27,7 @@ def sines(names, size=1.0):
     return {n: size * np.sin(3.0 * T + k) for k, n in enumerate(names)}
 
 
-def channels(columns, joints, text=()):
+def channels(columns, joints, text=None):
     return {m.column: m.channel for m in propose(columns, joints, text)}
 
 
@@ -209,6 +209,81 @@ def test_a_joint_without_a_column_is_told_with_the_columns_left_out(robot_and_lo
     assert finding.kind == NO_COLUMN
     assert f"position of {joints[0]}; " in finding.says
     assert "left out: front angle [deg]." in finding.says
+
+
+@pytest.mark.parametrize("lists", [False, True])
+def test_names_in_columns_of_text_say_which_number_is_which_joint(lists):
+    """A driver sends its joints sorted by name, not in the robot's order."""
+    order = ["elbow_flex", "shoulder_pan", "wrist_roll"]
+    text = {f"field.name{k}": name for k, name in enumerate(order)}
+    if lists:
+        text = {"name": str(order), "frame_id": "base"}
+    names = [f"field.{what}{k}" for what in ("position", "effort") for k in range(3)]
+    found = channels({"time": T} | sines(names), NAMED, text)
+    for k, joint in enumerate(order):
+        assert found[f"field.position{k}"] == f"so.{joint}.position"
+        assert found[f"field.effort{k}"] == f"so.{joint}.effort_measured"
+
+
+def test_a_joints_name_with_no_other_word_is_its_position():
+    names = ["present.elbow_flex", "goal.elbow_flex", "wrist_roll", "elbow_flex_load"]
+    found = channels({"time": T} | sines(names), NAMED)
+    assert [found[n] for n in names] == [
+        "so.elbow_flex.position", "so.elbow_flex.position_command",
+        "so.wrist_roll.position", None,
+    ]  # fmt: skip
+
+
+def test_a_unit_in_brackets_tells_the_time_in_any_language():
+    columns = {"Zeit [ms]": 7731.0 + 10.0 * np.arange(400)} | sines(["q1"])
+    time, _ = propose(columns, [JointName("a.q1")])
+    assert (time.channel, time.scale) == ("time", 1e-3)
+
+
+ONE = """<robot name="one"><link name="base"/><link name="rod"><inertial>
+<origin xyz="0 0 -0.3"/><mass value="2"/>
+<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="hinge" type="revolute"><parent link="base"/><child link="rod"/>
+<axis xyz="0 1 0"/><limit lower="-3" upper="3" effort="9" velocity="9"/></joint></robot>
+"""
+
+
+def with_currents(folder):
+    (folder / "one.urdf").write_text(ONE)
+    q = 0.5 * np.sin(3.0 * T)
+    torque = (0.1 + 2.0 * 0.09) * -9.0 * q + 2.0 * 9.81 * 0.3 * np.sin(q)
+    rows = np.stack([5.0 + T, np.degrees(q), torque / 1.7], axis=1)
+    head = "tick,hinge_pos [deg],hinge_current_A"
+    np.savetxt(folder / "log.csv", rows, "%.9g", ",", header=head, comments="")
+    return read_robot(folder / "one.urdf"), folder / "log.csv"
+
+
+def test_a_sidecar_beside_the_log_is_kept_and_completed(tmp_path):
+    """What the messages ask for, a line for the time, is enough for a proposal."""
+    robot, log = with_currents(tmp_path)
+    (tmp_path / "log.yaml").write_text(
+        "columns:\n  tick: time\n  hinge_current_A: "
+        "{channel: one.hinge.effort_measured, scale: 1.7}\n"
+        "ignore: [{from: 6, to: 7}]\n"
+    )
+    proposal = propose_scene(robot, [read_log(log)])
+    assert "type: effort" in proposal.scene
+    (tmp_path / "whole.yaml").write_text(proposal.sidecars[log])
+    recording = read_recording(log, sidecar_path=tmp_path / "whole.yaml")
+    position = recording["one.hinge.position"]
+    assert len(recording.episodes) == 2  # What is to be ignored still is.
+    assert np.ptp(position) == pytest.approx(1.0, abs=0.02)
+    assert np.ptp(recording["one.hinge.effort_measured"]) > 2.0
+    # One that says all is left alone.
+    (tmp_path / "log.yaml").write_text(proposal.sidecars[log])
+    assert not propose_scene(robot, [read_log(log)]).sidecars
+
+
+def test_currents_alone_are_asked_for_their_torque_constant(tmp_path):
+    robot, log = with_currents(tmp_path)
+    (tmp_path / "log.yaml").write_text("columns: {tick: time}\n")
+    with pytest.raises(ValueError, match="hinge_current_A.*one.hinge.effort_measured"):
+        propose_scene(robot, [read_log(log)])
 
 
 @pytest.fixture(scope="module")

@@ -264,18 +264,22 @@ def _numbers(dialect: Dialect, name: str, cell: str) -> tuple[list[float], str]:
     return [], why + " none"
 
 
-def text_columns(path: Path) -> tuple[str, ...]:
-    """Columns whose first cells are neither numbers nor lists of them."""
+def text_columns(path: Path) -> dict[str, str]:
+    """{column whose first cells are neither numbers nor lists of them: the text that is
+    in all of these, "" where they differ}."""
     with open_csv(path) as file:
         header = file.readline()
         sample = file.read(1 << 16)
     dialect = dialect_of(path, header, sample)
     lines = sample.decode(errors="replace").splitlines()[:20]
-    found: dict[str, int] = {}
+    found: dict[str, list[str]] = {}
     for cells in csv.reader(lines, delimiter=dialect.separator):
         if len(cells) == len(dialect.names):
             for name, cell in zip(dialect.names, cells, strict=True):
-                found[name] = found.get(name, 0) + bool(
-                    _numbers(dialect, name, cell)[1]
-                )
-    return tuple(name for name, n in found.items() if 2 * n > len(lines))
+                if _numbers(dialect, name, cell)[1]:
+                    found.setdefault(name, []).append(cell.strip())
+    return {
+        name: cells[0] if len(set(cells)) == 1 else ""
+        for name, cells in found.items()
+        if 2 * len(cells) > len(lines)
+    }

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import yaml
 
 from makebreak.gap.data.table import COMMANDS, is_channel
 
@@ -31,6 +32,7 @@ _WORDS = {
         "joint joints encoder action".split()
     ),
 }
+CURRENT = "a current"  # Why such a column is left out begins so.
 # Of a joint that slides a force is its effort; else it is a wrench's, or nobody's.
 _FORCE, _FORCE_COMMAND = "force", "force_command"
 _OF_A_SLIDE = {_FORCE: "effort_measured", _FORCE_COMMAND: "effort_command"}
@@ -56,6 +58,10 @@ _TORQUES = {"nm": 1.0, "n.m": 1.0, "ncm": 1e-2, "nmm": 1e-3, "mnm": 1e-3, "knm":
             "meganm": 1e6}  # fmt: skip
 # Of an effort these need a number that the log does not have.
 _NO_EFFORT = ("%", "a", "ma", "percent", "permille", "‰")
+# A joint's name with nothing but these is where it is.
+_NOW = set(
+    "present actual measured meas act observation obs observed real value".split()
+)
 # These may be anything, such as a part of a joint's name, if not in brackets.
 _IN_BRACKETS = ("rev", "ma")
 
@@ -91,17 +97,21 @@ def words_of(name: str) -> list[str]:
 def propose(
     columns: Mapping[str, np.ndarray],
     joints: Sequence[JointName],
-    text: Sequence[str] = (),
+    text: Mapping[str, str] | None = None,
+    said: Mapping[str, Match] | None = None,
 ) -> list[Match]:
     """One for each column, in their order.
 
     Args: columns {name: (n,)}, NaN where nothing is; joints in the robot's order; text:
-        columns that hold no numbers.
+        {column that holds no numbers: what is in all its cells, or ""}; said: what the
+        log's own sidecar says of columns, which stays.
     """
+    text, said = text or {}, said or {}
+    found = {name: Match(name, None, why="text") for name in text}
+    found |= {name: match for name, match in said.items() if name in columns}
     time = _find_time(columns)
-    found: dict[str, Match] = {name: Match(name, None, why="text") for name in text}
-    if time is not None:
-        found[time.column] = time
+    if time is not None and "time" not in {m.channel for m in said.values()}:
+        found.setdefault(time.column, time)
     quantities = {}
     for name in columns:
         if name in found:
@@ -112,12 +122,13 @@ def propose(
         if set(words_of(name)) & _EPISODE and _counts(columns[name]):
             found[name] = Match(name, "episode", why="counts episodes")
             continue
-        quantity = _quantity(name, any(_names(name, joint) for joint in joints))
+        quantity = _quantity(name, [j for j in joints if _names(name, j)])
         if quantity is None:
             found[name] = Match(name, None, why="not a quantity that gap compares")
         else:
             quantities[name] = quantity
-    for name, joint in _joints_of(quantities, joints).items():
+    listed = _listed(text, joints)
+    for name, joint in _joints_of(quantities, joints, listed).items():
         quantity = quantities[name]
         if quantity in _OF_A_SLIDE:
             if joint is None or not joint.prismatic or not _names(name, joint):
@@ -125,13 +136,31 @@ def propose(
                 found[name] = Match(name, None, why=why)
                 continue
             quantity = _OF_A_SLIDE[quantity]
-        if joint is None:
+        if quantity == CURRENT:
+            why = "not a quantity that gap compares"
+            if joint is not None:
+                why = f"a current: {joint.name}.effort_measured with its N m/A as scale"
+            found[name] = Match(name, None, why=why)
+        elif joint is None:
             found[name] = Match(name, None, why=f"{quantity} {UNKNOWN_JOINT}")
         else:
             found[name] = Match(name, f"{joint.name}.{quantity}", why="by its name")
-    found = _once(_without_unknown_efforts(found, joints))
+    found = _once(_without_unknown_efforts(found, joints), said)
     found = _in_si(_by_motion(found, columns), columns, joints)
+    found |= {name: match for name, match in said.items() if name in found}
     return [found[name] for name in [*columns, *text]]
+
+
+def said_of(columns: Mapping) -> dict[str, Match]:
+    """{column: what a sidecar's `columns` says of it}."""
+    found = {}
+    for name, target in columns.items():
+        own = target if isinstance(target, dict) else {"channel": target}
+        found[str(name)] = Match(
+            str(name), own.get("channel"), float(own.get("scale", 1.0)),
+            float(own.get("offset", 0.0)), "as the recording's sidecar says",
+        )  # fmt: skip
+    return found
 
 
 def of_one_drive(matches: Sequence[Match]) -> list[Match]:
@@ -153,8 +182,10 @@ def of_one_drive(matches: Sequence[Match]) -> list[Match]:
     return out
 
 
-def sidecar_text(matches: Sequence[Match]) -> str:
-    """A sidecar with the columns, to be corrected."""
+def sidecar_text(matches: Sequence[Match], own: Mapping | None = None) -> str:
+    """A sidecar with the columns, to be corrected. own: sections of the log's own, of
+    which all but the columns are kept."""
+    rest = {key: value for key, value in (own or {}).items() if key != "columns"}
     lines = ["# What each column is: a proposal, to be corrected. docs/recordings.md",
              "columns:"]  # fmt: skip
     for match in matches:
@@ -171,7 +202,8 @@ def sidecar_text(matches: Sequence[Match]) -> str:
         lines.append(f"  {key}: {target}  # {match.why}")
     if len(lines) == 2:
         lines[1] = "columns: {}"
-    return "\n".join(lines) + "\n"
+    kept = yaml.safe_dump(rest, sort_keys=False) if rest else ""
+    return "\n".join(lines) + "\n" + kept
 
 
 def _quoted(name: str) -> str:
@@ -193,8 +225,9 @@ def _quoted(name: str) -> str:
 # ----- Quantities
 
 
-def _quantity(name: str, of_joint: bool) -> str | None:
-    """What a column is by its words, and by its unit where it has a joint's name."""
+def _quantity(name: str, named: Sequence[JointName]) -> str | None:
+    """What a column is by its words, and by its unit where it has a joint's name.
+    named: joints whose name is in the column's."""
     words = words_of(name)
     if set(words) & _NEVER:
         return None
@@ -202,8 +235,11 @@ def _quantity(name: str, of_joint: bool) -> str | None:
     kind = next((kind for kind, own in _WORDS.items() if own & set(words)), None)
     if kind == "position":  # A joint's own name may be q1, or have a `joint` in it.
         kind = _quantity_of_unit(name) or kind
-    elif kind is None and of_joint and not command:
+    elif kind is None and named and not command:
         kind = _quantity_of_unit(name)
+        own = {w for joint in named for w in words_of(joint.name.split(".", 1)[1])}
+        if kind is None and set(words) <= own | _NOW:
+            kind = "position"
     if re.search(r"(^|[^a-z])[qv]_d_?\d*$", name.lower()):  # q_d, as in papers.
         command = True
     if kind is None and command:  # The joint's name says the rest.
@@ -211,7 +247,7 @@ def _quantity(name: str, of_joint: bool) -> str | None:
     if kind is None or kind == "acceleration":
         return None
     if kind == "current":  # Without its gain it is no effort.
-        return None
+        return None if command else CURRENT
     if kind == "effort":
         return "effort_command" if command or "u" in words else "effort_measured"
     if kind == "force":
@@ -241,11 +277,32 @@ def _names(column: str, joint: JointName) -> bool:
     return _plain(joint.name.split(".", 1)[1]) in _plain(column)
 
 
+def _listed(
+    text: Mapping[str, str], joints: Sequence[JointName]
+) -> dict[int, JointName]:
+    """{number of a column: its joint}, where columns of text name the joints: one with
+    a list, or one for each number (`name0`, `name1`). Drivers sort joints by name."""
+    plain = {_plain(j.name.split(".", 1)[1]): j for j in joints}
+    one_each: dict[int, JointName] = {}
+    for name, cell in text.items():
+        parts = [_plain(part) for part in re.split(r"[\s,;\[\]()'\"]+", cell) if part]
+        here = [plain[part] for part in parts if part in plain]
+        if len(here) > 1 and len(set(here)) == len(here):
+            return {k: plain[p] for k, p in enumerate(parts) if p in plain}
+        numbers = re.findall(r"\d+", name)
+        if len(here) == len(parts) == 1 and numbers:
+            one_each[int(numbers[-1])] = here[0]
+    return one_each if len(set(one_each.values())) == len(one_each) else {}
+
+
 def _joints_of(
-    quantities: Mapping[str, str], joints: Sequence[JointName]
+    quantities: Mapping[str, str],
+    joints: Sequence[JointName],
+    listed: Mapping[int, JointName],
 ) -> dict[str, JointName | None]:
     """By the joint's own name in the column's, or by words of it that no other joint
-    has; else by the number in the column's, among the joints that share such words."""
+    has; else by the number in the column's, among the joints that share such words, or
+    as columns of text list them."""
     found: dict[str, JointName | None] = {}
     own_words = _own_words(joints)
     plain = {_plain(j.name.split(".", 1)[1]): j for j in joints}
@@ -264,7 +321,10 @@ def _joints_of(
         else:
             found[name] = group[0] if len(group) == 1 else None
     for group, of in numbered.items():
-        found |= _by_number(of, group, joints)
+        if listed and set(of.values()) <= {*listed}:
+            found |= {name: listed[number] for name, number in of.items()}
+        else:
+            found |= _by_number(of, group, joints)
     return found
 
 
@@ -313,14 +373,15 @@ def _sharing_words(
     return tuple(joint for n, joint in shared if n == most)
 
 
-def _once(found: dict[str, Match]) -> dict[str, Match]:
-    """Each channel of one column: the first that has it."""
+def _once(found: dict[str, Match], said: Mapping[str, Match]) -> dict[str, Match]:
+    """Each channel of one column: what is said, else the first that has it."""
     taken: set[str | None] = {
         m.channel for m in found.values() if m.channel == m.column
     }
+    taken |= {m.channel for m in said.values()}
     out = {}
     for name, match in found.items():
-        if match.channel is not None and match.channel != match.column:
+        if name not in said and match.channel not in (None, match.column):
             if match.channel in taken:
                 match = Match(name, None, why=f"{match.channel} is another column")
             else:
@@ -333,9 +394,16 @@ def _once(found: dict[str, Match]) -> dict[str, Match]:
 
 
 def _find_time(columns: Mapping[str, np.ndarray]) -> Match | None:
+    """The first column that increases and has a word for time in its name, or a unit of
+    it in brackets (in any language)."""
     for name, value in columns.items():
         words = words_of(name)
-        if not set(words) & _TIME and not (words and words[0] in _TIME_UNITS):
+        if not (
+            set(words) & _TIME
+            or words
+            and words[0] in _TIME_UNITS
+            or re.search(r"[\[(](ns|us|ms|s|sec)[\])]\s*$", name.lower())
+        ):
             continue
         step = np.diff(value[np.isfinite(value)])
         if len(step) < 5 or not np.mean(step >= 0.0) > 0.9:

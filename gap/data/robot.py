@@ -3,8 +3,9 @@
 import json
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydrake.multibody.parsing import Parser
@@ -20,15 +21,24 @@ from makebreak.gap.data.findings import (
     Finding,
 )
 from makebreak.gap.data.proposal import (
+    CURRENT,
     UNKNOWN_JOINT,
     JointName,
     Match,
     of_one_drive,
     propose,
+    said_of,
     sidecar_text,
 )
 from makebreak.gap.data.servo_gains import ServoGains, ServoLog, servo_gains
-from makebreak.gap.data.table import RecordingTable, read_table, stem_of, suffix_of
+from makebreak.gap.data.sidecar import own_sections
+from makebreak.gap.data.table import (
+    RecordingTable,
+    is_channel,
+    read_table,
+    stem_of,
+    suffix_of,
+)
 from makebreak.models.effects.kind import actuator_of, one_dof_joints
 from makebreak.models.fixed_joints import coupled_joints, fix_joints
 
@@ -180,24 +190,29 @@ def _with_fixed(robot: Robot, fixed: Mapping[str, float]) -> Robot:
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """A log as it is: the table of its numbers, and columns of text."""
+    """A log as it is: the table of its numbers, columns of text with what is in all
+    their cells, and what its own sidecar says."""
 
     path: Path
     table: RecordingTable
-    text: tuple[str, ...]
+    text: Mapping[str, str] = field(default_factory=dict)
+    own: Mapping[str, Any] = field(default_factory=dict)
 
 
 def read_log(path: Path) -> Log:
     """Raises: ValueError, one line, for a file that cannot be read."""
-    text: tuple[str, ...] = ()
+    text: dict[str, str] = {}
     if suffix_of(path) in (".csv", ".csv.gz") and path.is_file():
         text = text_columns(path)
-    return Log(path, read_table(path, unused=frozenset(text)), text)
+    table = read_table(path, unused=frozenset(text))
+    return Log(path, table, text, own_sections(path))
 
 
 def matches_of(log: Log, robot: Robot | None) -> list[Match]:
     joints = robot.joints if robot is not None else ()
-    return propose(log.table.columns, joints, log.text)
+    return propose(
+        log.table.columns, joints, log.text, said_of(log.own.get("columns") or {})
+    )
 
 
 NO_ACTUATION = ["actuation: {type: none}"]
@@ -211,7 +226,8 @@ class Proposal:
     how drives' gains were guessed, in words; "" where none had to be, or where motion
     tells them. is_driven: whether a column says what drives the joints. without: of
     joints that have no column of a position; unused: columns of quantities of unknown
-    joints. fixed: joints that are taken to stand still."""
+    joints. fixed: joints that are taken to stand still. first: the first log's name.
+    """
 
     scene: str
     sidecars: dict[Path, str]
@@ -221,10 +237,11 @@ class Proposal:
     without: tuple[str, ...] = ()
     unused: tuple[str, ...] = ()
     fixed: tuple[str, ...] = ()
+    first: str = ""
 
     def findings(self) -> list[Finding]:
         """What a result must not forget."""
-        name = next(iter(self.sidecars), Path("")).stem
+        name = self.first
         found = []
         if self.gains_of:
             says = (
@@ -309,8 +326,14 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
         )
         notes.append(f"{', '.join(fixed)} {_stands(fixed)}")
     actuation, gains = _actuation(robot, kinds, every, logs, notes)
+    if actuation == NO_ACTUATION:
+        _check_currents(every)
     lines += ["plant: {time_step: 0.001}", *actuation]
-    sidecars = {path: sidecar_text(matches) for path, matches in every.items()}
+    sidecars = {
+        log.path: sidecar_text(every[log.path], log.own)
+        for log in logs
+        if not _says_all(log)
+    }
     is_driven = actuation != NO_ACTUATION
     seen = kinds.get("position", ())
     without = tuple(j.name for j in robot.joints if j.name not in seen)
@@ -323,6 +346,34 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
         without,
         tuple(unused),
         tuple(fixed),
+        stem_of(logs[0].path),
+    )
+
+
+def _check_currents(every: Mapping[Path, Sequence[Match]]) -> None:
+    """Raises: ValueError where motors' currents are all that says what drives a robot:
+    no effect could be told from the torques that are missing."""
+    for path, matches in every.items():
+        currents = [m for m in matches if m.why.startswith(f"{CURRENT}: ")]
+        if not currents:
+            continue
+        joint = currents[0].why.removeprefix(f"{CURRENT}: ").split()[0]
+        more = f" (and {len(currents) - 1} more)" if len(currents) > 1 else ""
+        raise ValueError(
+            f"recording {path}: motors' currents are all that says what drives the "
+            f"joints; give their N m/A at the joint in {stem_of(path)}.yaml beside it: "
+            f'columns: {{"{currents[0].column}": {{channel: {joint}, scale: 0.11}}}}'
+            f"{more}"
+        )
+
+
+def _says_all(log: Log) -> bool:
+    """Whether a log's own sidecar needs no proposal beside it."""
+    said = log.own.get("columns") or {}
+    return (
+        "join" in log.own
+        or bool(log.own)
+        and all(name in said or is_channel(name) for name in log.table.columns)
     )
 
 

@@ -23,6 +23,16 @@ def has_sidecar(path: Path) -> bool:
     return bool(_own_sidecars(path))
 
 
+def own_sections(path: Path) -> dict:
+    """{section: as written} of the sidecar beside a recording; none: {}.
+
+    Raises: ValueError as read_sidecars.
+    """
+    read_sidecars(path, None)
+    own = _own_sidecars(path)
+    return (_sections(own[0]) or {}) if own else {}
+
+
 def _own_sidecars(path: Path) -> list[Path]:
     own = [sidecar_of(path), path.with_name(f"{path.name}.yaml")]
     own += [file.with_suffix(".yml") for file in own]
