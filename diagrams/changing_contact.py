@@ -155,6 +155,9 @@ def refuse_unused_control(config, plain) -> None:
     unused = {}
     if c.anticipator.speed.regression:
         unused["anticipator.speed.beta"] = "anticipator.speed.regression=true"
+    else:
+        why = "anticipator.speed.regression=false"
+        unused["anticipator.speed.force_drift"] = why
     if c.anticipator.speed.stiffness_most > 0.0:
         unused["anticipator.speed.first"] = "anticipator.speed.stiffness_most > 0"
     else:

@@ -170,7 +170,12 @@ class TouchConfig:
             # Slower than 10 mm/s a landing takes so long that a ball on a slope of half
             # a degree rolls a centimetre meanwhile.
             speed=ApproachSpeedConfig(
-                force_desired=7.5, first=0.015, least=0.01, most=0.03
+                force_desired=7.5,
+                first=0.015,
+                least=0.01,
+                most=0.03,
+                # Force over speed varies by a factor of two around the circle.
+                force_drift=0.1,
             ),
         )
     )

@@ -15,7 +15,6 @@ from makebreak.systems.changing_contact.contact_anticipator import (
 )
 from makebreak.systems.changing_contact.numerics.contact_anticipator import (
     BEND,
-    DRIFT,
     FORCE_STD,
     REPEATS,
     capped,
@@ -264,11 +263,11 @@ def test_regression_is_the_conditional_mean_of_all_impacts():
     # log z_i = a_i + b x_i + noise with a walk a_i, b ~ N(1, BEND^2) and nothing known
     # of a_1: a joint Gaussian, conditioned at once.
     rng = np.random.default_rng(9)
-    for _ in range(20):
+    for drift in np.tile([0.01, 0.1], 10):
         v = 0.02 * np.exp(0.3 * rng.normal(size=6))
         F = 400.0 * v * np.exp(0.02 * rng.normal(size=6))
         x, n = np.log(v), np.arange(6)
-        prior = DRIFT**2 * np.minimum.outer(n, n) + 1e4  # Of a.
+        prior = drift**2 * np.minimum.outer(n, n) + 1e4  # Of a.
         noise = np.diag(REPEATS**2 + (FORCE_STD / F) ** 2)
         x_0 = x[0]
         S = prior + BEND**2 * np.outer(x - x_0, x - x_0) + noise
@@ -278,7 +277,7 @@ def test_regression_is_the_conditional_mean_of_all_impacts():
         expected = np.exp(x_0 + (np.log(8.0) - a) / b)
         # 1e4 beside 1e-3 costs seven digits.
         np.testing.assert_allclose(
-            speed_by_regression(np.c_[v, F], 8.0), expected, rtol=1e-6
+            speed_by_regression(np.c_[v, F], 8.0, drift=drift), expected, rtol=1e-6
         )
     assert speed_by_regression(np.zeros((0, 2)), 8.0) is None
     wrong = [[0.0, 5.0], [np.nan, 3.0], [0.1, -1.0]]

@@ -108,6 +108,10 @@ class ApproachSpeedConfig:
     # Whether the next approach speed follows from a regression F = s v over all
     # impacts; false: from eq. 9.
     regression: bool = True
+    # Standard deviation, in proportion, by which the force of an impact at one speed
+    # changes from one impact to the next: 0.01 for a surface that stays as it is, more
+    # where the contact is never made at the same place.
+    force_drift: float = 0.01
     beta: float = 0.002  # Gain beta of eq. 9, used without regression [m/s per N].
     # Largest factor of the approach speed from one trial to the next.
     growth: float = 1.4
@@ -503,6 +507,7 @@ class KalmanContactAnticipator(LeafSystem):
                 s.reflex_gain,
                 s.reflex_force_least,
                 s.reflex_force_known or None,
+                s.force_drift,
             )
         else:
             speed = speed_by_error(before, s.force_desired, impacts[-1, 1], s.beta)

@@ -86,8 +86,8 @@ def semi_axes(covariance, radius):
 
 # Standard deviations: of an impact's force, in proportion and by noise [N]; of the
 # exponent b in z ~ v^b; of what the reflex is thought to take off, log(z / F), beside
-# that at the desired force, in proportion; and of log(z) from one trial to the next.
-REPEATS, FORCE_STD, BEND, BRAKED, DRIFT = 0.03, 0.2, 0.2, 0.5, 0.01
+# that at the desired force, in proportion.
+REPEATS, FORCE_STD, BEND, BRAKED = 0.03, 0.2, 0.2, 0.5
 EXPONENT_MIN = 0.3
 GATE = 3.0  # Standard deviations beyond which an impact is of another surface.
 
@@ -115,7 +115,7 @@ def unbraked_force(force, gain=0.0, force_least=0.0):
 
 
 def speed_by_regression(
-    impacts, force_desired, gain=0.0, force_least=0.0, force_known=None
+    impacts, force_desired, gain=0.0, force_least=0.0, force_known=None, drift=0.01
 ) -> float | None:
     """The speed at which an impact has force_desired [m/s]; None without impacts.
 
@@ -126,7 +126,8 @@ def speed_by_regression(
 
     Args: impacts (n, 2) of [speed, peak force], oldest first; gain of the reflex and
         the force from which on it brakes, at the first impact and, force_known, at all
-        later ones; None: the same.
+        later ones; None: the same; drift: standard deviation of log(z) at one speed
+        from one impact to the next.
     """
     impacts = np.asarray(impacts, dtype=float).reshape(-1, 2)
     good = np.all(np.isfinite(impacts), axis=1) & np.all(impacts > 0.0, axis=1)
@@ -147,7 +148,7 @@ def speed_by_regression(
 
     origin, mean, P = begin(0)
     for i in range(1, len(x)):
-        P[0, 0] += DRIFT**2
+        P[0, 0] += drift**2
         H = np.array([1.0, x[i] - origin])
         S = H @ P @ H + R[i]
         error = y[i] - H @ mean

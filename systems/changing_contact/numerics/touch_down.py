@@ -40,6 +40,9 @@ class TouchDownConfig:
     first: float = 0.05
     # Largest factor of the speed in the region from one touch to the next.
     growth: float = 1.4
+    # Standard deviation, in proportion, by which the force of a touch at one speed
+    # changes from one touch to the next; sides and places differ.
+    force_drift: float = 0.1
     least: float = 0.01  # Least speed in the region of anticipated contact [m/s].
     # Largest speed of a tip that has not touched, in the region and before it [m/s].
     most: float = 0.15
@@ -106,7 +109,7 @@ def next_touch(
     elif s.peak > 0.0:  # The touch is over: v_a of the next one.
         slow = s.at < 0.5 * c.least  # It leaned on it; that was no impact.
         impacts = s.impacts if slow else (*s.impacts, (s.at, s.peak))[-KEPT:]
-        wanted = speed_by_regression(impacts, c.force_desired)
+        wanted = speed_by_regression(impacts, c.force_desired, drift=c.force_drift)
         if wanted is not None:
             wanted = capped(wanted, s.speed, c.growth, c.least, c.most)
             s = replace(s, speed=wanted)
