@@ -1,4 +1,7 @@
-"""Edits of URDF and SDF files, for properties that Drake reads only from a file."""
+"""Edits of URDF, SDF and MJCF files, for properties that Drake reads only from a file.
+
+Of an MJCF file only inertias can be edited.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,7 +10,8 @@ from xml.dom import minidom
 
 import numpy as np
 from pydrake.math import RollPitchYaw
-from pydrake.multibody.parsing import PackageMap
+from pydrake.multibody.parsing import PackageMap, Parser
+from pydrake.multibody.plant import MultibodyPlant
 
 from makebreak.models.effects.kind import Effect
 
@@ -25,14 +29,15 @@ def edited_model_file(
     Args: uri: of the model; body: name of the link, or empty if there is only one;
         copy: path of the copy without its suffix.
     Returns: the copy's URI.
-    Raises: ValueError if the file is neither URDF nor SDF, or has no such link.
+    Raises: ValueError if the file is none of URDF, SDF and MJCF, or has no such link.
     """
     path = model_path(uri, package_map)
     where = f"effect {effect.kind} at {effect.at}"
-    if path.suffix not in (".urdf", ".sdf"):
-        raise ValueError(f"{where}: {path.name} is neither URDF nor SDF")
+    if path.suffix not in (".urdf", ".sdf", ".xml"):
+        raise ValueError(f"{where}: {path.name} is neither URDF nor SDF nor MJCF")
     document = minidom.parse(str(path))  # Keeps prefixes such as drake: as they are.
-    links = [x for x in document.getElementsByTagName("link") if x.hasAttribute("name")]
+    tag = "body" if path.suffix == ".xml" else "link"
+    links = [x for x in document.getElementsByTagName(tag) if x.hasAttribute("name")]
     chosen = [
         link
         for link in links
@@ -41,7 +46,10 @@ def edited_model_file(
     if len(chosen) != 1:
         names = ", ".join(link.getAttribute("name") for link in links)
         raise ValueError(f"{where}: expected one link of {path.name}: {names}")
-    edit(effect, chosen[0])
+    if tag == "body":
+        _edit_mjcf(document, chosen[0], path, effect, edit)
+    else:
+        edit(effect, chosen[0])
     make_mesh_paths_absolute(document, path.parent)
     target = copy.with_suffix(path.suffix)
     target.write_text(document.toxml())
@@ -59,8 +67,79 @@ def model_path(uri: str, package_map: PackageMap) -> Path:
     return path
 
 
+def _edit_mjcf(
+    document: minidom.Document,
+    body: minidom.Element,
+    path: Path,
+    effect: Effect,
+    edit: Callable[[Effect, minidom.Element], None],
+) -> None:
+    """Gives a body of an MJCF file the inertia that Drake reads for it (which may be of
+    its geoms, or by defaults), with the edit made, as its own `inertial`."""
+    for compiler in document.getElementsByTagName("compiler"):
+        if compiler.getAttribute("inertiafromgeom") == "true":
+            compiler.setAttribute("inertiafromgeom", "auto")
+            for unused in document.getElementsByTagName("inertial"):
+                if unused.parentNode is not None:
+                    unused.parentNode.removeChild(unused)
+    name = body.getAttribute("name")
+    inertial = _inertial_by_drake(path, name)
+    link = _element(document, "link", name=name)
+    own = link.appendChild(_element(document, "inertial"))
+    own.appendChild(_element(document, "mass", value=repr(inertial.mass)))
+    own.appendChild(_element(document, "origin", xyz=_numbers(inertial.com)))
+    moments = {
+        f"i{key}": repr(float(inertial.central[i, j]))
+        for key, (i, j) in (MOMENTS | PRODUCTS).items()
+    }
+    own.appendChild(_element(document, "inertia", **moments))
+    edit(effect, link)
+    new = read_inertial(link)
+    for old in children(body, "inertial"):
+        body.removeChild(old)
+    full = [new.central[i, j] for i, j in (MOMENTS | PRODUCTS).values()]
+    written = _element(
+        document, "inertial", pos=_numbers(new.com), mass=repr(new.mass),
+        fullinertia=_numbers(full),
+    )  # fmt: skip
+    body.insertBefore(written, body.firstChild)
+
+
+def _inertial_by_drake(path: Path, body: str) -> "Inertial":
+    plant = MultibodyPlant(0.0)  # Without a scene graph no mesh is looked for.
+    (model,) = Parser(plant).AddModels(str(path))
+    M = plant.GetBodyByName(body, model).default_spatial_inertia()
+    central = M.Shift(M.get_com()).CalcRotationalInertia().CopyToFullMatrix3()
+    return Inertial(float(M.get_mass()), np.array(M.get_com()), np.array(central))
+
+
+def _element(document: minidom.Document, tag: str, **attributes) -> minidom.Element:
+    element = document.createElement(tag)
+    for key, value in attributes.items():
+        element.setAttribute(key, value)
+    return element
+
+
+def _numbers(values) -> str:
+    return " ".join(repr(float(x)) for x in values)
+
+
 def make_mesh_paths_absolute(document: minidom.Document, folder: Path) -> None:
     """Makes paths relative to `folder` absolute, so that the document can be moved."""
+    for compiler in document.getElementsByTagName("compiler"):
+        for key in ("meshdir", "texturedir", "assetdir"):
+            if compiler.hasAttribute(key):
+                where = (folder / compiler.getAttribute(key)).resolve()
+                compiler.setAttribute(key, str(where))
+    for element in document.getElementsByTagName("mesh"):
+        file = element.getAttribute("file")
+        beside = not any(
+            compiler.hasAttribute(key)
+            for compiler in document.getElementsByTagName("compiler")
+            for key in ("meshdir", "assetdir")
+        )
+        if file and beside:
+            element.setAttribute("file", str((folder / file).resolve()))
     for element in document.getElementsByTagName("uri"):
         uri = text(element).strip()
         if "://" not in uri:
@@ -203,7 +282,7 @@ def write_inertial(link: minidom.Element, inertial: Inertial) -> None:
             element.ownerDocument = link.ownerDocument
             inertia.appendChild(element)
             set_text(element, value)
-    com = " ".join(repr(float(x)) for x in inertial.com)
+    com = _numbers(inertial.com)
     is_urdf = mass.hasAttribute("value")
     tag = "origin" if is_urdf else "pose"
     places = children(link, "inertial", tag)
