@@ -7,7 +7,7 @@ that include themselves) or refuse without need (missing visual meshes).
 import logging
 import re
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
@@ -237,35 +237,21 @@ def _usable(uri: str, packages: PackageMap, copy: Path) -> str:
     if path.suffix.lower() not in (".urdf", ".sdf") or not path.is_file():
         return uri
     source = path.read_text(errors="replace")
-    meshes = {a or b for a, b in _MESH.findall(source)}
-    lost = {}
-    for mesh in meshes:
-        where = _path_of(mesh, path, packages)
-        if where is None or not where.exists():
-            lost[mesh] = where
+    lost = _lost_meshes(source, path, packages)
     if not lost:
         return uri
     try:
         document = minidom.parseString(source.encode())
     except ExpatError:
         return uri  # Drake's own message is better.
-    gone = []
-    for visual in document.getElementsByTagName("visual"):
-        shapes = children(visual, "geometry", "mesh")
-        names = [mesh.getAttribute("filename") for mesh in shapes]
-        names += [text(uri).strip() for m in shapes for uri in children(m, "uri")]
-        if any(name in lost for name in names):
-            gone.append(visual)
-    for visual in gone:
-        assert visual.parentNode is not None
-        visual.parentNode.removeChild(visual)
+    gone = _without_meshes(document, "visual", lost)
     left = {a or b for a, b in _MESH.findall(document.toxml())} & set(lost)
     for mesh in sorted(left):
         if lost[mesh] is None:
             raise _unknown_package(mesh, path)
         raise ValueError(f"{path}: {mesh} does not exist ({lost[mesh]})")
     _warn_once(
-        f"{path.name}: {len(gone)} visual meshes are left out, as they are not there "
+        f"{path.name}: {gone} visual meshes are left out, as they are not there "
         f"({sorted(lost)[0]}{', ...' if len(lost) > 1 else ''})"
         + ("; --package NAME=PATH says where" if None in lost.values() else "")
     )
@@ -273,6 +259,61 @@ def _usable(uri: str, packages: PackageMap, copy: Path) -> str:
     target = copy.with_suffix(path.suffix)
     target.write_text(document.toxml())
     return f"file://{target}"
+
+
+def _lost_meshes(
+    source: str, path: Path, packages: PackageMap
+) -> dict[str, Path | None]:
+    """{mesh of a file that is not there: where it should be; None: package unknown}."""
+    lost = {}
+    for mesh in {a or b for a, b in _MESH.findall(source)}:
+        where = _path_of(mesh, path, packages)
+        if where is None or not where.exists():
+            lost[mesh] = where
+    return lost
+
+
+def _without_meshes(
+    document: minidom.Document, kind: str, lost: Collection[str]
+) -> int:
+    """Takes out elements of a kind, visual or collision, that have one of these meshes.
+    Returns: how many."""
+    gone = []
+    for element in document.getElementsByTagName(kind):
+        shapes = children(element, "geometry", "mesh")
+        names = [mesh.getAttribute("filename") for mesh in shapes]
+        names += [text(uri).strip() for m in shapes for uri in children(m, "uri")]
+        if any(name in lost for name in names):
+            gone.append(element)
+    for element in gone:
+        assert element.parentNode is not None
+        element.parentNode.removeChild(element)
+    return len(gone)
+
+
+def without_lost_collisions(path: Path, given: Mapping[str, str]) -> tuple[str, int]:
+    """The text of a robot's file without the collision meshes that are not there, nor
+    visual ones, for use where it touches nothing; and how many collision meshes are
+    left out. given: {package: folder}."""
+    source = path.read_text(errors="replace")
+    packages = PackageMap()
+    for name, where in given.items():
+        packages.Add(name, where)
+    lost = _lost_meshes(source, path, packages)
+    if path.suffix.lower() not in (".urdf", ".sdf") or not lost:
+        return source, 0
+    try:
+        document = minidom.parseString(source.encode())
+    except ExpatError:
+        return source, 0  # Drake's own message is better.
+    gone = _without_meshes(document, "collision", lost)
+    _without_meshes(document, "visual", lost)
+    for element in document.getElementsByTagName("mesh"):  # Packages that were found.
+        file = _path_of(element.getAttribute("filename"), path, packages)
+        if element.getAttribute("filename") and file is not None:
+            element.setAttribute("filename", f"file://{file.resolve()}")
+    make_mesh_paths_absolute(document, path.parent)
+    return document.toxml(), gone
 
 
 def _unknown_package(uri: str, path: Path | None = None) -> ValueError:

@@ -90,7 +90,7 @@ def _scene(raw: Any, folder: Path) -> Scene:
     scene.directives = directives
     scene.packages = {
         name: str((folder / where).resolve()) for name, where in scene.packages.items()
-    } | _given_packages()
+    } | given_packages()
     return scene
 
 
@@ -200,7 +200,7 @@ def _check_numbers(name: str, value: Any) -> None:
             )
 
 
-def _given_packages() -> dict[str, str]:
+def given_packages() -> dict[str, str]:
     """The packages of `--package`, which have priority over the file's."""
     text = os.environ.get(PACKAGES_VARIABLE, "")
     pairs = (each.partition("=") for each in text.split(os.pathsep) if each)

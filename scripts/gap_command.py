@@ -161,6 +161,8 @@ def _proposed(
     proposal = propose_scene(robot, [read_log(path) for path in recording_paths])
     scene = out.file("proposed_scene.yaml")
     scene.write_text(proposal.scene)
+    for name, text in proposal.copies.items():
+        out.file(name).write_text(text)
     sidecars = {}
     for path, text in proposal.sidecars.items():
         sidecars[path] = out.file(sidecar_of(path).name)

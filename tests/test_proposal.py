@@ -248,6 +248,26 @@ ONE = """<robot name="one"><link name="base"/><link name="rod"><inertial>
 """
 
 
+def test_a_robot_without_its_collision_meshes_is_compared(tmp_path):
+    """A log in the air needs no shapes; the scene has a copy without them."""
+    shape = '<{0}><geometry><mesh filename="package://gone/a.obj"/></geometry></{0}>'
+    shapes = shape.format("visual") + shape.format("collision")
+    text = ONE.replace("</inertial>", "</inertial>" + shapes)
+    (tmp_path / "one.urdf").write_text(text)
+    rows = np.stack([T, 0.5 * np.sin(3.0 * T), np.cos(3.0 * T)], axis=1)
+    head = "time,hinge_pos,hinge_torque"
+    np.savetxt(tmp_path / "log.csv", rows, "%.9g", ",", header=head, comments="")
+    proposal = propose_scene(
+        read_robot(tmp_path / "one.urdf"), [read_log(tmp_path / "log.csv")]
+    )
+    assert any("1 collision meshes" in note for note in proposal.notes)
+    (tmp_path / "out").mkdir()
+    for name, copy in proposal.copies.items():
+        (tmp_path / "out" / name).write_text(copy)
+    (tmp_path / "out" / "scene.yaml").write_text(proposal.scene)
+    SceneDynamics(read_scene(tmp_path / "out" / "scene.yaml"))
+
+
 def with_currents(folder):
     (folder / "one.urdf").write_text(ONE)
     q = 0.5 * np.sin(3.0 * T)

@@ -41,6 +41,8 @@ from makebreak.gap.data.table import (
 )
 from makebreak.models.effects.kind import actuator_of, one_dof_joints
 from makebreak.models.fixed_joints import coupled_joints, fix_joints
+from makebreak.models.model_files import without_lost_collisions
+from makebreak.models.scene_reader import given_packages
 
 ROBOTS = (".urdf", ".sdf", ".xml")
 GUESSED_KP = 10.0  # [N m/rad], where the log does not show it.
@@ -227,7 +229,7 @@ class Proposal:
     tells them. is_driven: whether a column says what drives the joints. without: of
     joints that have no column of a position; unused: columns of quantities of unknown
     joints. fixed: joints that are taken to stand still. first: the first log's name.
-    """
+    copies: {name beside the scene: text} of models that are not used as they are."""
 
     scene: str
     sidecars: dict[Path, str]
@@ -238,6 +240,7 @@ class Proposal:
     unused: tuple[str, ...] = ()
     fixed: tuple[str, ...] = ()
     first: str = ""
+    copies: Mapping[str, str] = field(default_factory=dict)
 
     def findings(self) -> list[Finding]:
         """What a result must not forget."""
@@ -278,6 +281,7 @@ class Proposal:
 
 def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
     """Base welded, columns matched by name, actuation by the commands there are.
+    Collision meshes that are not there are left out, as the robot touches nothing.
 
     Raises: ValueError where no joint's position or no time is found.
     """
@@ -308,11 +312,22 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
             if at and at not in kinds.setdefault(what, []):
                 kinds[what].append(at)
     notes: list[str] = []
+    copies: dict[str, str] = {}
     lines = [
         "# A proposal, to be corrected. docs/station.md, docs/recordings.md",
         "directives:",
         f"- add_model: {{name: {robot.model}, file: {json.dumps(_file(robot))}}}",
     ]
+    copy, left_out = without_lost_collisions(robot.path, given_packages())
+    if left_out:
+        name = f"{robot.path.stem}_without_meshes{robot.path.suffix}"
+        lines[-1] = f"- add_model: {{name: {robot.model}, file: {name}}}"
+        lines[-1] += "  # A copy: collision meshes are not there."
+        copies = {name: copy}
+        notes.append(
+            f"{left_out} collision meshes of {robot.path.name} are not there and left "
+            "out, so it touches nothing (--package NAME=PATH says where they are)"
+        )
     for base in robot.bases:
         lines.append(
             f"- add_weld: {{parent: world, child: {robot.model}::{base}}}"
@@ -347,6 +362,7 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
         tuple(unused),
         tuple(fixed),
         stem_of(logs[0].path),
+        copies,
     )
 
 
